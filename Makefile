@@ -7,6 +7,7 @@
 #   make bench    the tracer's speed, then models against it; fails when a promised ratio is lost
 #   make models   fit again every model of models/
 #   make gallery  what real lenses do: render and measure every effect
+#   make docs     the documentation in build/docs, after its links, commands and how-tos were tried (3 CPU minutes)
 #   make lint     lint, format and types only
 #   make format   rewrite the code in the project's format
 #   make clean    remove .venv and caches
@@ -31,7 +32,7 @@ export PIP_DEFAULT_TIMEOUT ?= 120
 export OMP_NUM_THREADS ?= 2
 export MPLBACKEND ?= Agg
 
-.PHONY: demo test test-blender bench models gallery lint format clean
+.PHONY: demo test test-blender docs bench models gallery lint format clean
 .DELETE_ON_ERROR:
 
 demo: $(INSTALLED)
@@ -47,6 +48,11 @@ test: $(INSTALLED)
 test-blender: $(BLENDER_INSTALLED) $(INSTALLED)
 	PYTHONPATH=. $(BIN)/python tests/blender/expect.py build/blender
 	NEUROLENS_BLENDER_SHOTS=build/blender $(BLENDER_VENV)/bin/python -m pytest -q --confcutdir=tests/blender tests/blender
+
+docs: $(INSTALLED) $(VENV)/.docs
+	OMP_NUM_THREADS=1 NEUROLENS_DOCS=1 $(BIN)/python -m pytest -q -n 2 tests/test_docs.py
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict -f docs/mkdocs.yml
+	@echo "Look at build/docs/index.html"
 
 bench: $(INSTALLED)
 	$(BIN)/python -m experiments trace
@@ -84,6 +90,10 @@ $(INSTALLED): pyproject.toml constraints.txt
 	"$$found" -m venv $(VENV) || { echo "'$$found -m venv' failed: is the venv module installed (Debian: python3-venv)?" >&2; exit 1; }
 	$(BIN)/python -m pip install --quiet -c constraints.txt torch
 	$(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[train,dev]'
+	@touch $@
+
+$(VENV)/.docs: $(INSTALLED)
+	$(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[docs]'
 	@touch $@
 
 $(BLENDER_INSTALLED): Makefile

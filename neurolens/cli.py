@@ -54,20 +54,22 @@ def build_parser() -> Parser:
         flare,
         glass,
         lens,
+        merge,
         mitsuba,
         models,
         plan,
         projection,
         render,
         stmap,
+        survey,
         train,
     )
 
     parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
-    read = lens, analyse, glass, convert, stmap, projection
-    for command in (*read, plan, train, models, evaluate, export, render, flare, mitsuba, blender, bench):
+    read = lens, analyse, glass, convert, survey, stmap, projection
+    for command in (*read, plan, train, models, evaluate, export, render, merge, flare, mitsuba, blender, bench):
         command.add_parser(subparsers)
     return parser
 

@@ -30,7 +30,7 @@ GAUSS, SINGLET, PHONE, ZOOM, TESSAR = (
 )
 COMMANDS = (
     *("lens", "analyse", "glass", "convert", "train", "models", "evaluate", "export", "render"),
-    *("stmap", "projection"),
+    *("stmap", "projection", "survey"),
 )
 
 

@@ -24,9 +24,10 @@ from neurolens.base.progress import Report
 from neurolens.cameras.build import Shot, ideal_as
 from neurolens.cameras.contract import RAYS_A_CALL, Camera
 from neurolens.cameras.exact import FusedExactCamera
-from neurolens.cameras.field import WIDEST_DEG
 from neurolens.cameras.fused import FusedCamera
 from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.warped import WarpedPinhole
 from neurolens.evaluate import footprints as prints
 from neurolens.evaluate.footprints import Footprints, Places
 from neurolens.evaluate.probe import COUNTED, LIGHT, Asked, Effect, Probed, effects_of, probe
@@ -152,22 +153,12 @@ def _ideal(found: Probed, target: Target) -> Iterator[Choice]:
             camera = ideal_as(kind, found.exact.lens, shot)
             spec = f"{kind}{path}"
             yield _judged(found, kind.rstrip(":"), spec, camera)
-            by_map = kind == "pinhole:" and "distortion" not in found.asked.afterwards
-            if by_map and (area := _overscan(found)) < _MOST_OVERSCAN:
-                flat = prints.collapsed(found.seen, found.places.share)
-                how = f"then the ST map of 'neurolens stmap' over the picture, of {area:.3g} times the area"
-                warped = _judged(found, "pinhole + ST map", spec, camera, flat, how)
-                yield replace(warped, ns=area * warped.ns * warped.passed, passed=1.0)  # its own rays all pass
-
-
-def _overscan(found: Probed) -> float:
-    """Area of the plane picture that holds all that the lens shows, over that of the film; inf for half a sphere."""
-    way = found.places.direction
-    if (-way[2] < math.cos(math.radians(WIDEST_DEG))).any():
-        return math.inf
-    reach = found.exact.settings["lens_state"]["pinhole_focal_length_mm"]
-    slope = np.abs(way[:2] / way[2]).max(1) * reach / np.maximum(np.abs(found.places.film_mm).max(1), 1e-9)
-    return float(np.maximum(slope, 1.0).prod())
+            if isinstance(camera, Pinhole) and "distortion" not in found.asked.afterwards:
+                warped = WarpedPinhole(camera, found.exact, found.asked.focus_m)
+                if (area := warped.area) < _MOST_OVERSCAN:
+                    how = f"then the ST map of 'neurolens stmap' over the picture, of {area:.3g} times the area"
+                    choice = _judged(found, "pinhole + ST map", spec, warped, how=how, timed=False)
+                    yield replace(choice, ns=area * _ns_a_ray(camera, found.places), passed=1.0)
 
 
 def _exact(found: Probed, target: Target) -> Iterator[Choice]:

@@ -76,3 +76,8 @@ def format_of(path: str | Path) -> Format:
         known = ", ".join(f"{f.name} ({', '.join(f.suffixes)})" for f in FORMATS)
         raise InputError(path, "format", suffix or "(no suffix)", f"one of {known}, or a lens file (.toml)")
     return found
+
+
+def kind_of(path: str | Path) -> str:
+    """The name of a file's format, "neurolens" for our own; raises as `format_of`."""
+    return "neurolens" if Path(path).suffix.lower() == ".toml" else format_of(path).name

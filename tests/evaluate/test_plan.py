@@ -9,8 +9,11 @@ import pytest
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.field import spectrum_of
+from neurolens.cameras.pinhole import Pinhole
+from neurolens.cameras.warped import WarpedPinhole
 from neurolens.cli import main
-from neurolens.evaluate.footprints import Footprints, blur_mm, distance_mm, effects_mm, footprints, places_of
+from neurolens.evaluate.footprints import Footprints, blur_mm, centroids, distance_mm, effects_mm, footprints, places_of
 from neurolens.evaluate.plan import plan
 from neurolens.evaluate.probe import effects_of, probe
 from neurolens.evaluate.scenes import seen_depths_m
@@ -116,10 +119,27 @@ def test_what_a_shot_needs_falls_with_its_stop() -> None:
     assert small["diffraction"] > 3 * wide["diffraction"]
 
 
+@pytest.mark.parametrize("lens", ["canon_gauss_35", "cooke_anamorphic_42"])
+def test_a_warped_pinhole_shows_what_is_in_focus_where_the_lens_does(lens: str) -> None:
+    shot = Shot((18.0, 10.0), 2.0, f_number=16.0)
+    exact, hole = make_camera(f"lenses/{lens}.toml", shot), make_camera(f"pinhole:lenses/{lens}.toml", shot)
+    assert isinstance(hole, Pinhole)
+    flat, film = WarpedPinhole(hole, exact, 2.0), 0.7 * FILM
+    nanometres, light = spectrum_of(exact)
+    share = light / light.sum()
+    for depth_m, most in ((2.0, 5e-4), (0.5, math.inf)):  # what is nearer is seen from elsewhere
+        places = places_of(exact, film, np.full(4, depth_m), nanometres, share)
+        seen = footprints(exact, places)
+        sharp = replace(seen, place_mm=np.broadcast_to(centroids(seen, share)[0][..., None, None], seen.place_mm.shape))
+        apart, without = (distance_mm(sharp, footprints(c, places), share).max() for c in (flat, hole))
+        assert apart < min(most, without)
+
+
 @pytest.mark.parametrize(("budget", "distance_m", "f_number"), [(0.0, 4.0, None), (1e9, 4.0, 45.0), (1e9, 0.12, 45.0)])
 def test_budgets_at_the_extremes(budget: float, distance_m: float, f_number: float | None) -> None:
     """No budget leaves the exact lens; any budget, a point whose picture is warped, for it costs least."""
-    found = plan(scene_from_tables(wall(distance_m, f_number)), read_lens(LENS).at(), budget)
+    film = {"film_width_mm": 28.0, "film_height_mm": 15.75}  # less than its circle of light, for the maps
+    found = plan(scene_from_tables(wall(distance_m, f_number, **film)), read_lens(LENS).at(), budget)
     assert found.best is not None and found.best.light_error <= 0.01
     assert found.best.name == ("exact" if budget == 0 else "pinhole + ST map")
     assert all(c.ns >= found.best.ns for c in found.choices if c.within)
