@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from neurolens.optics.apertures import Aperture
     from neurolens.optics.prescription import Lens
 
-RANGE = "range"  # as a zoom position: all of them
 T = TypeVar("T")
 
 

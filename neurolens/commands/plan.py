@@ -16,8 +16,10 @@ from neurolens.commands.arguments import add_glass, add_json, lens_path, project
 from neurolens.commands.output import answer, number, table
 
 if TYPE_CHECKING:
-    from neurolens.evaluate.plan import Plan
+    from neurolens.evaluate.plan import Choice, Plan
 
+# Repeated here, so that help imports no torch; a test compares with `evaluate.plan`.
+TARGETS = ("render", "c", "onnx", "osl", "glsl")
 _DESCRIPTION = """\
 Look through the exact lens at a scene, say what each of its effects is worth there in pixels, and choose
 the cheapest camera whose error stays within the budget: a pinhole, with or without its picture warped
@@ -27,8 +29,9 @@ exact lens. Needs the extra "train" (torch).
 Errors are distances between footprints, the picture of a point by a camera and by the exact lens: the
 least RMS way on which light moves to turn one into the other, in pixels of the scene's picture (place,
 size and shape of the blur, each wavelength by itself), and the relative error of light, of which 1%% is
-allowed. Both are those that 95%% of the picture keep. Times are measured here, on one thread, a ray that
-passes."""
+allowed. Both are those that 95%% of the picture keep. The cost of a ray, times the noise of its weights,
+is proportional to the time to equal error: measured here, on one thread; of Cycles counted and turned
+into its nanoseconds, measured once; of GLSL in operations."""
 _EPILOG = """\
 examples:
   neurolens plan experiments/scenes/garden.toml --lens laikin_double_gauss_50 --budget 0.25px
@@ -50,14 +53,16 @@ def add_parser(subparsers: Any) -> None:
         "--budget", metavar="PIXELS", type=_pixels, default=0.25, help="error allowed, as 0.25px (default: 0.25px)"
     )
     parser.add_argument(
-        "--for", dest="target", choices=("render", "c", "onnx"), default="render",
-        help="what runs the camera: our renderer, compiled C, or onnxruntime (default: render)",
+        "--for", dest="target", choices=TARGETS, default="render",
+        help="what runs the camera: our renderer, compiled C, onnxruntime, Blender's Cycles (osl), or a renderer in "
+        "GLSL (default: render)",
     )  # fmt: skip
     parser.add_argument(
         "--comp", metavar="EFFECTS", type=_afterwards, default=(), dest="afterwards",
         help="what compositing makes of the picture later, distortion (with its light, by an ST map), defocus or both "
         "with a comma: the camera is held against the lens without it",
     )  # fmt: skip
+    parser.add_argument("--denoise", action="store_true", help="noise is taken out later: charge no camera for it")
     parser.add_argument("--explain", action="store_true", help="time and list every camera tried")
     parser.add_argument(
         "--samples", action="store_true",
@@ -108,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
     with progress.stage("plan") as report:
         found = plan(
             scene, lens, args.budget, target=args.target, models=shipped, explain=args.explain, report=report,
-            folder=folder / "models" if args.fit else None, afterwards=args.afterwards,
+            folder=folder / "models" if args.fit else None, afterwards=args.afterwards, denoised=args.denoise,
         )  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)
     data = {"scene": str(args.scene), "lens": str(file), **found.to_dict()}
@@ -167,20 +172,46 @@ def _text(args: argparse.Namespace, found: Plan, folder: Path) -> str:
     if stray := [e.name for e in found.effects if e.name in STRAY.values() and e.needed]:
         parts.append(f"No camera makes {', '.join(stray)}: a table [flare] in the scene does, or 'neurolens flare'.")
     if args.explain:
-        header = ("", "camera", "px", "light", "ns", "passes", "")
+        header = ("", "camera", "px", "light", found.unit, "noise", "")
         parts.append(table(header, [
             ("*" if c == found.best else "+" if c.within else "", c.name, number(c.error_px, 3),
-             number(c.light_error, 2), number(c.ns, 3), number(c.passed, 2), c.how)
+             number(c.light_error, 2), number(c.cost, 3), number(c.noise, 3), c.how)
             for c in found.choices
         ], left=2))  # fmt: skip
-        parts.append("* to use, + within the budget; px, light: errors that 95% of the picture keep; ns a ray")
+        parts.append(
+            "* to use, + within the budget; px, light: errors that 95% of the picture keep; "
+            f"{found.unit} a ray times noise, the rays it takes for equal error"
+        )
     best = found.best
     if best is None:
         nearest = min(found.choices, key=lambda c: c.error_px, default=None)
         closest = f"; the closest is {nearest.name} with {number(nearest.error_px, 3)} px" if nearest else ""
         parts.append(f"No camera for --for {found.target} keeps {found.budget_px:g} px{closest}.")
     else:
-        told = f"Use {best.name}: {number(best.error_px, 3)} px of {found.budget_px:g}, {number(best.ns, 3)} ns a ray"
-        command = f"neurolens render {shlex.quote(str(args.scene))} --camera {shlex.quote(best.camera)} -o render.exr"
-        parts.append(f"{told}{', ' + best.how if best.how else ''}\n  {command}")
+        told = f"Use {best.name}: {number(best.error_px, 3)} px of {found.budget_px:g}, {number(best.cost, 3)} "
+        told += f"{found.unit} a ray times noise"
+        parts.append("\n".join([f"{told}{', ' + best.how if best.how else ''}", *_commands(args, found, best)]))
     return "\n\n".join([*parts, f"Written: {folder}/plan.json, effects.png{', samples.exr' if args.samples else ''}"])
+
+
+def _commands(args: argparse.Namespace, found: Plan, best: Choice) -> list[str]:
+    """How the camera is made where the target runs it; ideal cameras are everybody's own."""
+    ideal = best.camera.startswith(("pinhole:", "thin:", "thick:"))
+    words = ["neurolens", "render", str(args.scene), "--camera", best.camera, "-o", "render.exr"]
+    if found.target != "render":
+        if ideal or found.target == "onnx":
+            return []
+        language, asked = found.target, found.asked
+        words = [
+            "neurolens",
+            "export",
+            best.camera.removeprefix("fused:"),
+            "--to",
+            language,
+            "-o",
+            f"camera.{language}",
+        ]
+        if language != "osl":  # whose inputs they are
+            film, focus = "x".join(f"{v:g}" for v in asked.film_mm), f"{asked.focus_m:g}"
+            words[3:3] = ["--camera", "--film", film, "--focus", focus, "--f-number", f"{asked.f_number:.6g}"]
+    return [f"  {shlex.join(words)}"]

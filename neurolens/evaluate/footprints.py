@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -72,10 +73,11 @@ class Footprints:
         """[N] film value of white surroundings, mean over wavelengths."""
         return self.weight.mean((1, 2))
 
-    @property
-    def passed(self) -> float:
-        """Share of the rays that carry light."""
-        return float((self.weight > 0).mean())
+    @cached_property
+    def quantiles(self) -> list[Array]:
+        """[N, W, Q] mm at equal steps of the light along each of some lines through the film."""
+        x, y = self.place_mm
+        return [_quantiles(np.cos(t) * x + np.sin(t) * y, self.weight) for t in np.arange(_LINES) * (np.pi / _LINES)]
 
 
 def places_of(exact: Camera, film_mm: Array, depth_m: Array, wavelength_nm: Array, share: Array) -> Places:
@@ -150,11 +152,9 @@ def distance_mm(a: Footprints, b: Footprints, share: Array) -> Array:
 
     NaN where one of the two has light and the other none.
     """
-    turn = np.arange(_LINES) * (np.pi / _LINES)
     total = np.zeros(a.weight.shape[:2])
-    for c, s in zip(np.cos(turn), np.sin(turn), strict=True):
-        at = [_quantiles(c * f.place_mm[0] + s * f.place_mm[1], f.weight) for f in (a, b)]
-        total += ((at[0] - at[1]) ** 2).mean(-1)
+    for of_a, of_b in zip(a.quantiles, b.quantiles, strict=True):
+        total += ((of_a - of_b) ** 2).mean(-1)
     return np.asarray(np.sqrt((2 / _LINES * total * share).sum(1)))
 
 

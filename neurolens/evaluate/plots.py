@@ -191,17 +191,17 @@ def _bars_and_trade(plan: Plan, figure: Any) -> None:
     bars.set_xscale("log")
     bars.set_xlim(left=least)
     bars.set_xlabel("worth (pixels), grey: left out")
-    timed = [c for c in plan.choices if 0 < c.ns < float("inf") and c.error_px < float("inf")]
+    timed = [c for c in plan.choices if 0 < c.cost < float("inf") and c.error_px < float("inf")]
     errors = [max(c.error_px, 1e-4) for c in timed]
-    trade.scatter([c.ns for c in timed], errors, c=["#0072b2" if c.within else "#b8b8b8" for c in timed], s=26)
+    trade.scatter([c.cost for c in timed], errors, c=["#0072b2" if c.within else "#b8b8b8" for c in timed], s=26)
     chosen = [k for k, c in enumerate(timed) if c == plan.best]
     ring = {"s": 150, "fc": "none", "ec": "#d55e00", "lw": 1.8}
-    trade.scatter([timed[k].ns for k in chosen], [errors[k] for k in chosen], **ring)
+    trade.scatter([timed[k].cost for k in chosen], [errors[k] for k in chosen], **ring)
     trade.set_xscale("log")
     trade.set_yscale("log")
-    trade.set_xlabel("time (ns a ray that passes), one thread")
+    trade.set_xlabel(f"cost ({plan.unit} a ray times noise), --for {plan.target}")
     trade.set_ylabel("error (pixels; none is drawn at 0.0001)")
-    place_labels(trade, [(c.ns, e) for c, e in zip(timed, errors, strict=True)], [_short(c.name) for c in timed])
+    place_labels(trade, [(c.cost, e) for c, e in zip(timed, errors, strict=True)], [_short(c.name) for c in timed])
     if plan.budget_px > 0:
         bars.axvline(plan.budget_px, color="#d55e00", lw=1.2)
         trade.axhline(plan.budget_px, color="#d55e00", lw=1.2, label=f"budget {plan.budget_px:g} px; ring: chosen")

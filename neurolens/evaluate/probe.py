@@ -56,6 +56,7 @@ class Asked:
             there whose blur differs by more than a pixel. edge_contrast: median contrast at those, None without any: if
             it is little, how well blur is made there matters little.
         filter_px: side of the pixel filter, a box. afterwards: what compositing makes, of `footprints.AFTERWARDS`.
+            denoised: whether noise is taken out, so that cameras are not charged for it.
     """
 
     film_mm: tuple[float, float]
@@ -73,6 +74,7 @@ class Asked:
     edge_contrast: float | None
     filter_px: float = 1.0
     afterwards: tuple[str, ...] = ()
+    denoised: bool = False
 
 
 @dataclass(frozen=True)
@@ -125,12 +127,14 @@ class Probed:
         return upright(found)
 
 
-def probe(scene: Scene, lens: Lens, *, across: int = _ACROSS, afterwards: Collection[str] = ()) -> Probed:
+def probe(
+    scene: Scene, lens: Lens, *, across: int = _ACROSS, afterwards: Collection[str] = (), denoised: bool = False
+) -> Probed:
     """Look through the exact lens at a scene.
 
     Args:
         across: places along the longer side. afterwards: effects that compositing makes, of `footprints.AFTERWARDS`:
-            distortion, where the ST map corrects the picture's light, too, and defocus.
+            distortion, where the ST map corrects the picture's light, too, and defocus. denoised: see `Asked`.
 
     Raises:
         InputError: a scene's camera that the lens cannot be; a picture that the lens leaves dark; other names.
@@ -159,7 +163,7 @@ def probe(scene: Scene, lens: Lens, *, across: int = _ACROSS, afterwards: Collec
         float(met.min()) if met.size else None, float(met.max()) if met.size else None,
         float(np.isinf(depth).mean()), 1 - places.film_mm.shape[1] / points.shape[1],
         small.range_nm, float(np.median(small.contrast)),
-        *_edges(scene, exact, small, film[0] / shot.width), afterwards=tuple(sorted(afterwards)),
+        *_edges(scene, exact, small, film[0] / shot.width), afterwards=tuple(sorted(afterwards)), denoised=denoised,
     )  # fmt: skip
     seen, ideal = (prints.footprints(c, places) for c in (exact, thin))
     wanted = prints.left_to(seen, ideal, places.share, afterwards)
