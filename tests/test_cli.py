@@ -374,7 +374,7 @@ WITHOUT_TORCH = (
 
 def test_without_torch_a_lens_file_names_the_extra_and_the_thin_lens_renders(scene: Path, tmp_path: Path) -> None:
     done = python(WITHOUT_TORCH, "render", scene, "--camera", GAUSS, "-o", tmp_path / "a.exr", "--quiet")
-    assert done.returncode == 2 and "pip install '.[train]'" in done.stderr and len(done.stderr.splitlines()) == 1
+    assert done.returncode == 2 and "'neurolens[train]'" in done.stderr and len(done.stderr.splitlines()) == 1
     done = python(WITHOUT_TORCH, "render", scene, "--camera", "thin", "-o", tmp_path / "a.exr", "--quiet")
     assert done.returncode == 0 and (tmp_path / "a.exr").exists()
 
@@ -490,3 +490,15 @@ def test_a_shot_outside_the_model_is_one_line(
 ) -> None:
     line = failure(capsys, "render", scene, "--camera", model, "-o", tmp_path / "a.exr", "--quiet", *args)
     assert all(word in line for word in words), line
+
+
+def test_the_demo_is_a_page_of_pictures_with_their_commands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["demo", "--width", "32", "--samples", "1"]) == 0
+    page = (tmp_path / "neurolens-demo" / "index.html").read_text(encoding="utf-8")
+    pictures = re.findall(r"img src='./([a-z]+\.png)'", page)
+    assert pictures == ["model.png", "exact.png", "thin.png", "pinhole.png", "fisheye.png"]
+    assert all((tmp_path / "neurolens-demo" / name).stat().st_size > 100 for name in pictures)
+    assert page.count("neurolens render") == 5 and "missing" not in page

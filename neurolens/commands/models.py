@@ -10,8 +10,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import neurolens
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
+from neurolens.base.files import library
 from neurolens.commands.arguments import add_json
 from neurolens.commands.output import answer, number, table
 from neurolens.evaluate.records import CLOSE_UM, reaches, to_use, use_command
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
 def _places() -> list[Path]:
     """Folders of models that exist; the same one once."""
     near = [Path("models"), *sorted(Path("runs").glob("*/models"))]
-    shipped = Path(neurolens.__file__).parents[1] / "models"
+    shipped = library() / "models"
     found = [p for p in near if p.is_dir()]
     return found + [shipped] * (shipped.is_dir() and all(p.resolve() != shipped for p in found))
 
