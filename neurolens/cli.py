@@ -55,6 +55,7 @@ def build_parser() -> Parser:
         flare,
         glass,
         lens,
+        library,
         merge,
         mitsuba,
         models,
@@ -69,7 +70,7 @@ def build_parser() -> Parser:
     parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
-    read = lens, analyse, glass, convert, survey, stmap, projection
+    read = lens, analyse, glass, convert, survey, library, stmap, projection
     for command in (*read, plan, train, models, evaluate, export, render, merge, flare, mitsuba, blender, bench, demo):
         command.add_parser(subparsers)
     return parser
