@@ -9,6 +9,7 @@
 #   make bench    the tracer's speed, then models against it; fails when a promised ratio is lost
 #   make models   fit again every model of models/
 #   make gallery  what real lenses do: render and measure every effect
+#   make docs     the documentation in build/docs, after its links, commands and how-tos were tried (3 CPU minutes)
 #   make lint     lint, format and types only
 #   make format   rewrite the code in the project's format
 #   make clean    remove .venv and caches
@@ -35,7 +36,7 @@ export PIP_DEFAULT_TIMEOUT ?= 120
 export OMP_NUM_THREADS ?= 2
 export MPLBACKEND ?= Agg
 
-.PHONY: demo test test-blender test-web bench models gallery lint format clean
+.PHONY: demo test test-blender test-web docs bench models gallery lint format clean
 .DELETE_ON_ERROR:
 
 demo: $(INSTALLED)
@@ -61,6 +62,11 @@ test-web: $(INSTALLED)
 	ort=build/web/node_modules/onnxruntime-web/dist; \
 	NEUROLENS_BROWSER="$(CHROMIUM)" NEUROLENS_ORT="$$(test -d $$ort && echo $$ort)" \
 	    $(BIN)/python -m pytest -q -rs tests/view/test_view_in_browser.py
+
+docs: $(INSTALLED) $(VENV)/.docs
+	OMP_NUM_THREADS=1 NEUROLENS_DOCS=1 $(BIN)/python -m pytest -q -n 2 tests/test_docs.py
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict -f docs/mkdocs.yml
+	@echo "Look at build/docs/index.html"
 
 bench: $(INSTALLED)
 	$(BIN)/python -m experiments trace
@@ -98,6 +104,10 @@ $(INSTALLED): pyproject.toml constraints.txt
 	"$$found" -m venv $(VENV) || { echo "'$$found -m venv' failed: is the venv module installed (Debian: python3-venv)?" >&2; exit 1; }
 	$(BIN)/python -m pip install --quiet -c constraints.txt torch
 	$(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[train,dev]'
+	@touch $@
+
+$(VENV)/.docs: $(INSTALLED)
+	$(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[docs]'
 	@touch $@
 
 $(BLENDER_INSTALLED): Makefile

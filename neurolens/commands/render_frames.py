@@ -77,10 +77,13 @@ def run_frames(args: argparse.Namespace, render: Callable[[argparse.Namespace], 
     Raises:
         InputError: a key that is none, or of a quantity that the command line sets too.
     """
+    from neurolens.render.tiles import tile_path
+
     kept = 0
     for frame, number, values in frames_of(args):
         out = args.out.with_name(f"{args.out.stem}.{number}{args.out.suffix}")
-        if out.is_file() and not Files.of(out).checkpoint.exists() and not args.restart:
+        written = tile_path(out, args.tile)
+        if written.is_file() and not Files.of(written).checkpoint.exists() and not args.restart:
             kept += 1
             continue
         values |= {"out": out, "seed": args.seed + frame, "frame": frame}

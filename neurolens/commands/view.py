@@ -9,9 +9,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.files import library as shipped
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import RANGE, add_glass, add_json, check_folder, check_suffix, lens_path, project_root
+from neurolens.commands.arguments import add_glass, add_json, check_folder, check_suffix, lens_path
 from neurolens.commands.output import answer
 
 if TYPE_CHECKING:
@@ -104,7 +106,7 @@ def _library() -> Iterator[_Entry]:
     from neurolens.commands.blender_lenses import key_of, library
     from neurolens.optics.lensfile import read_lens
 
-    root = project_root()
+    root = shipped()
     for models, file in library(root / "models", root / "lenses", ()):
         base, _, state = key_of(models[0]).partition("-")
         if file is None:
@@ -120,7 +122,7 @@ def _asked(words: Sequence[str]) -> Iterator[_Entry]:
     from neurolens.commands.blender_lenses import library
     from neurolens.readers.any_format import read_any
 
-    root = project_root()
+    root = shipped()
     lenses: dict[str, Lens | None] = {}
     models: dict[str, list[Path]] = {}
     brought: dict[str, list[Path]] = {}
