@@ -254,8 +254,18 @@ def lens_path(name: str | Path, command: str) -> Path:
 
 
 def named_camera(text: str) -> str:
-    """Type of a camera's argument: a name of lenses/ in the project, also after `fused:` and the like, is its file."""
+    """Type of a camera's argument: a name of lenses/ in the project, also after `fused:` and the like, is its file.
+
+    A TOML file that names a `camera` (that of `neurolens plan`) stands for it.
+    """
     kind, colon, word = text.rpartition(":")
+    if word.endswith(".toml") and Path(word).is_file():
+        from neurolens.base.tomlfile import read_toml
+
+        with suppress(InputError):  # said where the camera is made
+            if isinstance(named := read_toml(word).get("camera"), str) and named != "none":
+                own, own_colon, path = named.rpartition(":")
+                return f"{kind or own}{colon or own_colon}{os.path.normpath(Path(word).parent / path)}"
     with suppress(InputError):
         if not set(word) & set("./\\") and (file := project_root() / "lenses" / f"{word}.toml").is_file():
             found = os.path.relpath(file) if file.is_relative_to(Path.cwd()) else str(file)
