@@ -12,6 +12,7 @@ rays, and holds what a picture shows: place, size and shape of the blur, and of 
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -30,6 +31,7 @@ EFFECTS = (
     "distortion", "defocus", "spherical aberration", "coma", "astigmatism", "field curvature", "higher orders",
     "longitudinal colour", "lateral colour",
 )  # fmt: skip
+AFTERWARDS = ("distortion", "defocus")  # what compositing may do to a picture
 
 
 @dataclass(frozen=True)
@@ -129,6 +131,20 @@ def footprints(camera: Camera, places: Places, samples: int = 16) -> Footprints:
     across = 1e3 * np.einsum("icn,cnk->ink", places.across, at_pupil).reshape(2, *shape)
     weight = np.where(np.isfinite(place).all(0), found.weight.astype(np.float64).reshape(shape), 0.0)
     return Footprints(np.where(weight > 0, place, 0.0), np.where(weight > 0, across, 0.0), weight)
+
+
+def left_to(exact: Footprints, thin: Footprints, share: Array, afterwards: Collection[str]) -> Footprints:
+    """The exact camera's footprints without what `AFTERWARDS` makes of the picture later.
+
+    Without distortion they lie where a thin lens's do; without defocus they are points.
+    """
+    if not afterwards:
+        return exact
+    centre, place = centroids(exact, share)[0], exact.place_mm
+    goal = centroids(thin, share)[0] if "distortion" in afterwards else centre
+    from_centre = np.zeros_like(place) if "defocus" in afterwards else place - centre[:, :, None, None]
+    moved = np.where(exact.weight > 0, from_centre + goal[:, :, None, None], 0.0)
+    return Footprints(moved, exact.pupil_mm, exact.weight)
 
 
 def distance_mm(a: Footprints, b: Footprints, share: Array) -> Array:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -30,7 +30,7 @@ from neurolens.cameras.exact import FusedExactCamera
 from neurolens.cameras.fused import FusedCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.warped import WarpedPinhole
+from neurolens.cameras.warped import Warped
 from neurolens.evaluate import footprints as prints
 from neurolens.evaluate.costs import (
     CYCLES_NS,
@@ -109,10 +109,13 @@ class Plan:
     effects: tuple[Effect, ...]
     choices: tuple[Choice, ...]
     best: Choice | None
+    probed: Probed
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return asdict(self)
+        """JSON-able: what is above `probed`."""
+        told = asdict(replace(self, probed=None))  # type: ignore[arg-type]
+        del told["probed"]
+        return told
 
     def to_toml(self, lens: Lens, folder: Path) -> str:
         """The text of a file in a folder that `render` and `export` take for the best camera, and `train` as the
@@ -130,7 +133,8 @@ class Plan:
 
 def plan(
     scene: Scene, lens: Lens, budget_px: float, *, target: Target = "render", models: Sequence[Path] = (),
-    folder: Path | None = None, explain: bool = False, report: Report | None = None,
+    folder: Path | None = None, explain: bool = False, afterwards: Collection[str] = (), denoised: bool = False,
+    report: Report | None = None,
 ) -> Plan:  # fmt: skip
     """The cheapest camera for a scene whose error stays within a budget.
 
@@ -140,13 +144,14 @@ def plan(
             a renderer in GLSL.
         models: exported models of this lens to try. folder: where models fitted for the shot go; None fits none.
         explain: whether cameras beyond the budget are compiled and timed, too; else their cost is infinite.
+        afterwards, denoised: what is made of the picture later, see `probe`.
 
     Raises:
         InputError: a budget that is negative or no number; as `probe`.
     """
     if not budget_px >= 0:
         raise InputError("plan", "budget_px", budget_px, "0 or more pixels")
-    found = probe(scene, lens)
+    found = probe(scene, lens, afterwards=afterwards, denoised=denoised)
     tried = candidates(found, (budget_px,), target, models=models, folder=folder, explain=explain, report=report)
     return decided(found, tried, budget_px, target)
 
@@ -174,7 +179,7 @@ def decided(found: Probed, tried: Sequence[Choice], budget_px: float, target: Ta
     ranked = tuple(replace(c, within=c.meets(budget_px)) for c in sorted(tried, key=lambda c: c.cost))
     best = next((c for c in ranked if c.within), None)
     effects = effects_of(found, budget_px)
-    return Plan(found.asked, budget_px, target, UNIT[target], _shot_domain(found), effects, ranked, best)
+    return Plan(found.asked, budget_px, target, UNIT[target], _shot_domain(found), effects, ranked, best, found)
 
 
 @dataclass(frozen=True)
@@ -202,15 +207,22 @@ class _Trial:
     ) -> Choice:
         """A camera's error against the exact footprints; its cost (of a ray, noise) where that matters."""
         found = self.found
-        apart = prints.distance_mm(found.seen, seen, self.share) / found.asked.pixel_mm
-        light = np.abs(seen.light / np.maximum(found.seen.light, 1e-30) - 1)
+        apart = prints.distance_mm(found.wanted, seen, self.share) / found.asked.pixel_mm
+        light = np.abs(seen.light / np.maximum(found.wanted.light, 1e-30) - 1)
+        if "distortion" in found.asked.afterwards:  # its map corrects light, too
+            light = np.where(seen.light > 0, 0.0, light)
         error, dim = (float(np.percentile(np.where(np.isfinite(v), v, np.inf), COUNTED)) for v in (apart, light))
         choice = Choice(name, spec, error, dim, math.inf, noise(seen.weight, self.share), how)
         if not (choice.meets(self.costed_px) or math.isinf(self.costed_px)):
             return choice
         ray, times = cost()
         # A shader that does not focus so near shows nothing.
-        return replace(choice, cost=ray * times, noise=times, error_px=error if math.isfinite(times) else math.inf)
+        return replace(
+            choice,
+            cost=ray * (1.0 if found.asked.denoised else times),
+            noise=times,
+            error_px=error if math.isfinite(times) else math.inf,
+        )
 
     def timed(self, camera: Camera, seen: Footprints) -> tuple[float, float]:
         return ns_a_ray(camera, self.found.places), noise(seen.weight, self.share)
@@ -234,7 +246,6 @@ def _ideal(trial: _Trial) -> Iterator[Choice]:
     In C and GLSL they are their own source.
     """
     found, shot = trial.found, Shot(trial.found.asked.film_mm, trial.found.asked.focus_m)
-    area = math.inf
     kinds = {"onnx": (), "osl": ("pinhole:", "thin:")}.get(trial.target, ("pinhole:", "thin:", "thick:"))
     for kind in kinds:
         name, spec = kind.rstrip(":"), f"{kind}{found.lens.path}"
@@ -242,16 +253,18 @@ def _ideal(trial: _Trial) -> Iterator[Choice]:
             camera = ideal_as(kind, found.exact.lens, shot)
             seen = prints.footprints(camera, found.places)
             yield trial.judged(name, spec, seen, partial(trial.ideal, name, camera, seen))
+            if "distortion" in found.asked.afterwards:
+                continue
             where = "" if kind == "thick:" or trial.target in _OURS else "from the entrance pupil, "
-            warped: Footprints | None
-            if isinstance(camera, Pinhole):
-                hole = WarpedPinhole(camera, found.exact, found.asked.focus_m)
-                area, warped = hole.area, prints.footprints(hole, found.places)
-                where = ""
-            elif kind == "thin:" and not where:
+            if kind == "thin:" and not where:
                 continue  # in our renderer the thick lens stands in its place
+            maps = Warped(camera, found.exact, found.asked.focus_m)
+            area = maps.area
+            if isinstance(camera, Pinhole) or not where:
+                where = ""
+                warped: Footprints | None = prints.footprints(maps, found.places)
             else:
-                warped = _warped(found, _FromPupil(camera, found) if where else camera)
+                warped = _warped(found, _FromPupil(camera, found))
             if area < _MOST_OVERSCAN and warped is not None:
                 how = f"{where}then the ST map of 'neurolens stmap' over the picture, of {area:.3g} times the area"
                 cost = partial(trial.ideal, name, camera, seen, area)
