@@ -28,6 +28,7 @@ from neurolens.commands.render_files import (
     Stopping,
     Unfinished,
     add_safety,
+    add_tile,
     so_far,
     summary,
     warn,
@@ -109,6 +110,7 @@ def add_parser(subparsers: Any) -> None:
     )  # fmt: skip
     _add_colour(parser)
     add_frames(parser)
+    add_tile(parser)
     add_safety(parser)
     add_lens_state(
         parser,
@@ -172,13 +174,14 @@ def run(args: argparse.Namespace) -> int:
 
 def _run_one(args: argparse.Namespace) -> int:
     """Render, write both pictures, print a summary."""
-    files = Files.of(args.out)
     from neurolens.cameras.build import make_camera
     from neurolens.render.film import PixelGrid
     from neurolens.render.illuminants import check_name
     from neurolens.render.renderer import render
     from neurolens.render.scene import files_named, load_scene, seen_from
+    from neurolens.render.tiles import rows_of, tile_path
 
+    files = Files.of(tile_path(args.out, args.tile))
     scene = seen_from(load_scene(args.scene), args.scene, args.position_m, args.look_at_m)
     files.spare(args.scene.parent / name for name in files_named(scene.settings))
     settings, film = scene.settings.camera, film_of(scene.settings.film, args)
@@ -190,6 +193,7 @@ def _run_one(args: argparse.Namespace) -> int:
             args.width = settings.width
     width, height = picture_size(settings, args.width, args.height)
     PixelGrid(width, height, (settings.film_width_mm, settings.film_height_mm))  # before the slow make_camera
+    rows = None if args.tile is None else rows_of(height, args.tile)
     progress = Progress(quiet=args.quiet)
     camera = make_camera(args.camera, shot_of(settings, args, scene.aperture), progress)
     for note in (*camera.settings.get("notes", ()), *_pixel_notes(camera, width)):
@@ -198,7 +202,7 @@ def _run_one(args: argparse.Namespace) -> int:
     with Stopping() as stopping, progress.stage(f"render {scene.name}, {camera.name}") as report:
         result = render(
             scene, camera, width=width, height=height, samples=args.samples, seed=args.seed,
-            threads=args.threads, max_depth=args.max_depth, film=film, progress=report,
+            threads=args.threads, max_depth=args.max_depth, film=film, rows=rows, progress=report,
             watch=watch_of(args, files, stopping),
         )  # fmt: skip
         if not result.stats["complete"]:

@@ -70,7 +70,7 @@ def add_frames(parser: argparse.ArgumentParser, does: str = _RENDERED, names: Se
 
 @dataclass
 class Shared:
-    """What the frames of a command share: the options that keys set in each, and the flare's `Choice` once it is made."""
+    """What the frames of a command share: options that keys set in each, and the `Choice` of flare once it is made."""
 
     states: list[dict[str, Any]]
     flare: Any = None
@@ -85,11 +85,14 @@ def run_frames(args: argparse.Namespace, render: Callable[[argparse.Namespace], 
     Raises:
         InputError: a key that is none, or of a quantity that the command line sets too.
     """
+    from neurolens.render.tiles import tile_path
+
     kept, every = 0, list(frames_of(args))
     shared = Shared([values for _, _, values in every])
     for frame, number, values in every:
         out = args.out.with_name(f"{args.out.stem}.{number}{args.out.suffix}")
-        if out.is_file() and not Files.of(out).checkpoint.exists() and not args.restart:
+        written = tile_path(out, args.tile)
+        if written.is_file() and not Files.of(written).checkpoint.exists() and not args.restart:
             kept += 1
             continue
         values = {**values, "out": out, "seed": args.seed + frame, "frame": frame, "shared": shared}
