@@ -22,7 +22,7 @@ _SCOUTS = 48  # cells a side of the grid that looks for ghosts
 _FEW = 4  # of the scouts, one in so many a side, tell how far apart colours are
 _NEAR = 2.0  # r^2 / R^2 to which rays beyond rims tell it, too
 _AT_ONCE = 128  # ghosts
-_ERROR = 2.5  # share of light beside its place, times the cells that the film is wide
+_ERROR, _WORST = 2.5, 0.25  # light beside its place, times the cells that half the film is wide; at most
 
 
 @dataclass(frozen=True)
@@ -65,11 +65,15 @@ def grids_of(
 ) -> dict[Way, Grid]:
     """The grids of all ghosts that reach the film.
 
+    A cell has one density, and a wavelength stands for those beside it: both put light beside its place, by a / n with
+    n cells a side and b / k with k wavelengths. Edges drawn are n k times what is seen of the ghost; of all sums of
+    errors that is least where a / n and b / k of each ghost are the cube root of a b size, times what is the same for
+    all: so most cells go to what is bright, small and uneven.
+
     Args:
         wavelength_nm: of the rays that look for them; others differ little.
         half_mm: half the film's width and height.
-        cell_mm: size of cells on the film, of a ghost a tenth as bright as all on average; fainter ones are drawn
-            coarser, brighter ones finer, as the root of their brightness, within `_COARSER`.
+        cell_mm: size of cells on the film, about, which the share of light beside its place follows.
         range_nm: of light.
     """
     whole = Grid((-1.0, -1.0), (1.0, 1.0), _SCOUTS, _SCOUTS)
@@ -85,7 +89,8 @@ def grids_of(
             (pair, kept, _look(kept, of_one, spread, half_mm)) for pair, kept, of_one, spread in looks if kept.any()
         ]
     work = np.array([((look.along_u + look.along_v) * look.colours * look.size_mm) ** (1 / 3) for *_, look in found])
-    error = work * (_ERROR * cell_mm / (half_mm[0] * max(work.sum(), 1e-300))) + 1e-30
+    most = min(_ERROR * cell_mm / half_mm[0], _WORST)
+    error = work * (most / max(float(work.sum()), 1e-300)) + 1e-30
     return {pair: _around(kept, look, each) for (pair, kept, look), each in zip(found, error.tolist(), strict=True)}
 
 

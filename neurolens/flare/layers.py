@@ -38,7 +38,7 @@ class FlareSettings:
 
     Attributes:
         wavelength_nm: range of light. wavelengths: of equal shares of it.
-        cell_px: size on film of the cells that ghosts are drawn by.
+        cell_px: size on film, about, of the cells that ghosts are drawn by.
         photons: if above 0, ghosts by photons with up to `most_reflections`, so many a light and wavelength, smoothed
             by kernels from radius `kernel_px` on, instead of by all pairs of reflections; 0 leaves them.
         glare: if above 0, so many photons of the layer "glare": light that was reflected more than twice, or scattered.

@@ -210,7 +210,8 @@ def ghost_picture(
     """The ghosts of lights, [layers, H, W, 3] linear sRGB, each drawn as the areas of a grid of rays (`flare.area`).
 
     Args:
-        wavelengths: of equal shares of the range. cell_px: size of a grid's cells on the film: see `grids_of`.
+        wavelengths: of equal shares of the range, which fewer stand for where a ghost's colours part little. cell_px:
+            size of a grid's cells on the film, about: see `grids_of`.
         layers: of each pair the layer that takes it; None puts all into one.
         done: told the share of the work that is done.
     """
