@@ -14,8 +14,8 @@ Out of focus u counts from where the rays of each element meet the film (Born an
 diffraction wave at short wavelengths). Elements are summed in three groups by the direction of n. A pixel has light
 of those of which u lies along n, and no group holds both the near and the far edge of an image: of each group one u
 is enough, that of the element whose n is closest to it. Phases of the wave of another wavelength differ, and so do the
-fringes: out of focus each of five parts of the range has a spectrum of its own, and at 400 and 700 nm rings 1 mm out of focus
-at f/8 are right to 5%.
+fringes: out of focus each of five parts of the range has a spectrum of its own, and at 400 and 700 nm rings 1 mm out of
+focus at f/8 are right to 5%.
 """
 
 from __future__ import annotations
