@@ -222,6 +222,8 @@ def _model_form(file: Path, folder: Path, kinds: Sequence[str]) -> Form:
 
     loaded = load_model(file)
     card, domain, errors = loaded.card, loaded.card["domain"], loaded.card["errors"]
+    if any(axis.name != "zoom" for axis in loaded.axes):
+        raise InputError(file, "states", [axis.name for axis in loaded.axes], "a zoom, or a model of one state")
     extras, notes = model_extras(loaded)
     written = {to: export_file(file, folder / f"model.{to}", to, None, extras, notes) for to in ("glsl", "c")}
     told = {
