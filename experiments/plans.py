@@ -91,21 +91,23 @@ class Case:
 CASES = tuple(Case(lens, scene) for lens in LENSES for scene in SCENES)
 
 
-def suited(scene: Scene, lens: Lens, width: int = _WIDTH) -> Scene:
-    """A scene at `width` x 9/16 of it pixels on a film that the lens lights; what is too near for it is moved away.
+def suited(scene: Scene, lens: Lens, f_number: float | None = None, focus_m: float | None = None) -> Scene:
+    """A scene at 1920 x 1080 pixels on a film that the lens lights, as far away as it has to be in focus.
 
-    The lens opens as far as the scene asks, where it can; by night and near ("lights") as far as it can.
+    Args:
+        f_number: as far as the lens opens; else as the scene asks, and of "lights", at night and near, wide open.
+        focus_m: distance of what is in focus; else that of the scene, but no nearer than the lens focuses.
     """
     shot = scene.settings.camera
     across = min(2 * _LIT * image_radius_mm(lens)[0] * 16 / math.hypot(16, 9), _LARGEST_MM)
-    back = max(near_limit_m(lens) - shot.focus_m, 0.0)
+    focus = max(shot.focus_m, near_limit_m(lens)) if focus_m is None else focus_m
     eye, target = np.array(shot.position_m), np.array(shot.look_at_m)
-    x, y, z = (float(v) for v in eye - back * (target - eye) / np.linalg.norm(target - eye))
+    x, y, z = (float(v) for v in eye - (focus - shot.focus_m) * (target - eye) / np.linalg.norm(target - eye))
     widest = first_order(lens).f_number
-    f_number = widest if scene.name == "lights" else max(shot.f_number or widest, widest)
+    asked = f_number or (0.0 if scene.name == "lights" else shot.f_number or widest)
     camera = replace(
-        shot, position_m=(x, y, z), focus_m=shot.focus_m + back, f_number=f_number,
-        film_width_mm=across, film_height_mm=across * 9 / 16, width=width, height=width * 9 // 16,
+        shot, position_m=(x, y, z), focus_m=focus, f_number=max(asked, widest), film_width_mm=across,
+        film_height_mm=across * 9 / 16, width=_WIDTH, height=_WIDTH * 9 // 16,
     )  # fmt: skip
     return replace(scene, settings=replace(scene.settings, camera=camera))
 
