@@ -10,6 +10,7 @@ measured here, with one thread; of shaders it is counted.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -19,8 +20,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from neurolens.base.config import to_toml
 from neurolens.base.errors import InputError, ModelError
 from neurolens.base.progress import Report
+from neurolens.base.tomlfile import format_toml
 from neurolens.cameras.build import Shot, ideal_as
 from neurolens.cameras.contract import Camera, CameraRays, FloatArray
 from neurolens.cameras.exact import FusedExactCamera
@@ -38,13 +41,15 @@ from neurolens.evaluate.costs import (
     ns_a_ray,
     shader_cost,
 )
+from neurolens.evaluate.experiment import DomainChoice, EvaluationChoice, Experiment, LensChoice
 from neurolens.evaluate.footprints import Footprints
 from neurolens.evaluate.probe import COUNTED, LIGHT, Asked, Effect, Probed, effects_of, probe
-from neurolens.evaluate.shaders import lens_of
+from neurolens.evaluate.shaders import IDLE, lens_of
 from neurolens.graph.compiler import has_compiler
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.render.scene import Scene
+from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import fit_model, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs
@@ -53,8 +58,10 @@ from neurolens.surrogates.settings import ModelSettings
 Target = Literal["render", "c", "onnx", "osl", "glsl"]
 Cost = Callable[[], tuple[float, float]]  # of a ray, and noise
 _OURS = ("render", "c")  # run compiled C
-_TERMS = (4, 6, 8, 12, 16, 22, 28, 36, 48)  # of the polynomials that are fitted on the spot
+_TERMS = (2, 4, 6, 8, 12, 16, 22, 28, 36, 48, 64, 90)  # of the polynomials that are fitted on the spot
 _SHOT = "fitted for this shot"
+_FIT = ModelSettings("ols", planes=False, elimination=False, idle_gates=IDLE)
+_FOCUS_SPARE = 0.25  # of a pixel of blur: what a model may place its film beside the lens's
 _PAIRS = PairSettings(train=5000, held_out=1000, rim=5000)
 _MOST_OVERSCAN = 4.0  # of a plane picture that is warped afterwards
 
@@ -68,6 +75,7 @@ class Choice:
             where it has no light that the lens has. cost: of a ray, in the plan's unit, times `noise`; inf where it was
             not asked for. noise: how many times the rays it needs for equal error, see `costs`.
         how: what else it needs, or how it was made. within: whether it meets the budget of its plan.
+        settings: of a model that was fitted for the shot.
     """
 
     name: str
@@ -78,6 +86,7 @@ class Choice:
     noise: float
     how: str = ""
     within: bool = False
+    settings: ModelSettings | None = None
 
     def meets(self, budget_px: float) -> bool:
         """Whether it may be used."""
@@ -89,13 +98,14 @@ class Plan:
     """What was asked, the effects in falling order of worth, every camera tried by rising cost, the one to use.
 
     Attributes:
-        unit: of costs: "ns" or, where no time is known, "operations".
+        unit: of costs: "ns" or, where no time is known, "operations". domain: of models that are fitted.
     """
 
     asked: Asked
     budget_px: float
     target: Target
     unit: str
+    domain: DomainChoice
     effects: tuple[Effect, ...]
     choices: tuple[Choice, ...]
     best: Choice | None
@@ -106,6 +116,19 @@ class Plan:
         told = asdict(replace(self, probed=None))  # type: ignore[arg-type]
         del told["probed"]
         return told
+
+    def to_toml(self, lens: Lens, folder: Path) -> str:
+        """The text of a file in a folder that `render` and `export` take for the best camera, and `train` as the
+        experiment that fits it, where it is a model of the shot. Paths in it are relative to the folder."""
+        best = self.best
+        assert best is not None
+        kind, colon, path = best.camera.rpartition(":")
+        camera, title = f"{kind}{colon}{os.path.relpath(path, folder)}", f"{lens.name}: {best.name}"
+        if best.settings is None:
+            return format_toml({"title": title, "camera": camera})
+        choice = LensChoice(Path(os.path.relpath(lens.path, folder)), f_number=self.asked.f_number)
+        checks = EvaluationChoice(vignetting_rays=50_000, rounds=0, compile_exact=False)
+        return to_toml(Experiment(title, choice, (best.settings,), self.domain, _PAIRS, checks, camera=camera))
 
 
 def plan(
@@ -155,7 +178,8 @@ def decided(found: Probed, tried: Sequence[Choice], budget_px: float, target: Ta
     """The plan for a budget, from candidates that serve it."""
     ranked = tuple(replace(c, within=c.meets(budget_px)) for c in sorted(tried, key=lambda c: c.cost))
     best = next((c for c in ranked if c.within), None)
-    return Plan(found.asked, budget_px, target, UNIT[target], effects_of(found, budget_px), ranked, best, found)
+    effects = effects_of(found, budget_px)
+    return Plan(found.asked, budget_px, target, UNIT[target], _shot_domain(found), effects, ranked, best, found)
 
 
 @dataclass(frozen=True)
@@ -315,6 +339,15 @@ def _model(trial: _Trial, file: Path, how: str = "") -> Iterator[Choice]:
             yield trial.judged(file.stem, f"{'fused:' if compiled else ''}{file}", seen, cost, how)
 
 
+def _shot_domain(found: Probed) -> DomainChoice:
+    """The shot's, with as much more of the film's way as blurs a quarter of a pixel: models have their own focus."""
+    asked = found.asked
+    move = _FOCUS_SPARE * asked.f_number * asked.pixel_mm / first_order(found.lens).efl_mm ** 2  # of the vergence, 1/mm
+    vergence = 1e-3 / asked.focus_m
+    ends = 1e-3 / (vergence - move) if vergence > move else math.inf, 1e-3 / (vergence + move)
+    return DomainChoice(found.domain.film_radius_mm, ends, asked.wavelength_nm)
+
+
 def _fitted(
     trial: _Trial, budgets_px: Sequence[float], folder: Path, tried: Sequence[Choice], say: Report
 ) -> Iterator[Choice]:
@@ -327,7 +360,10 @@ def _fitted(
     asked = [b for b in budgets_px if explain or not any(c.meets(b) and c.name.startswith(ideal) for c in tried)]
     if not asked:
         return
-    prepared = prepare(make_pairs(found.lens, found.domain, _PAIRS))
+    lens, domain, choice = found.lens.with_aperture(None), found.domain, _shot_domain(found)
+    with suppress(InputError):  # a lens that goes no nearer
+        domain = domain_of(lens, **asdict(choice))
+    prepared = prepare(make_pairs(lens, domain, _PAIRS))
     folder.mkdir(parents=True, exist_ok=True)
     known: dict[int, tuple[Path, list[Choice]]] = {}
     smallest = set()
@@ -336,12 +372,14 @@ def _fitted(
         while low < high:
             size = (low + high) // 2
             if size not in known:
-                settings = ModelSettings("ols", terms=_TERMS[size], planes=False, elimination=False)
-                file = folder / f"{Path(found.lens.path).stem}.shot-{settings.label}.onnx"
+                settings = replace(_FIT, name=f"shot-ols-{_TERMS[size]}", terms=_TERMS[size])
+                file = folder / f"{Path(found.lens.path).stem}.{settings.label}.onnx"
                 export_onnx(fit_model(prepared, settings), file, errors={})
-                known[size] = file, list(_model(trial if explain else replace(trial, costed_px=-1.0), file, _SHOT))
+                shown = trial if explain else replace(trial, costed_px=-1.0)
+                known[size] = file, [replace(c, settings=settings) for c in _model(shown, file, _SHOT)]
             low, high = (low, size) if any(c.meets(budget_px) for c in known[size][1]) else (size + 1, high)
             say((k + 1 - (high - low) / len(_TERMS)) / len(asked))
         smallest.add(low)
     for size, (file, made) in known.items():  # what is larger than the smallest costs more, and is not compiled
-        yield from _model(trial, file, _SHOT) if size in smallest and not explain else made
+        again = _model(trial, file, _SHOT) if size in smallest and not explain else made
+        yield from (replace(c, settings=made[0].settings) for c in again)
