@@ -1,9 +1,9 @@
 """Measure what fitting on one shot gains over the models that ship, which know every stop, focus and wavelength.
 
 Typical shots of a lens: a portrait at f/2, a landscape at f/8, a close-up, lights at night. For each the error of the
-shipped polynomial of 64 terms on it, and the smallest polynomial fitted on the shot alone that has no more:
-coefficients, operations and nanoseconds of a ray of the whole camera as C. A minute of a core for each lens; those that
-are in the table are kept. Writes shots.md, shots.json.
+shipped polynomial (64 terms or the most below) on it, and the smallest polynomial fitted on the shot alone that has no
+more: coefficients, operations and nanoseconds of a ray of the whole camera as C. A minute of a core for each lens;
+those that are in the table are kept. Writes shots.md, shots.json.
 """
 
 from __future__ import annotations
@@ -78,11 +78,12 @@ def measure_lens(name: str, folder: Path, report: Report) -> dict[str, Any]:
     """All shots of a lens."""
     lens = read_lens(lab.LENSES / f"{name}.toml").at()
     shots = []
+    terms = max(n for n in range(SHIPPED_TERMS + 1) if (lab.MODELS / f"{name}.ols-{n}.onnx").is_file())
     for number, sitting in enumerate(SITTINGS):
         near = near_limit_m(lens) if sitting.near else None
         scene = suited(load_scene(lab.SCENES / f"{sitting.scene}.toml"), lens, sitting.f_number, near)
         found = probe(scene, lens)
-        shipped = _measured(found, lab.MODELS / f"{name}.ols-{SHIPPED_TERMS}.onnx", SHIPPED_TERMS)
+        shipped = _measured(found, lab.MODELS / f"{name}.ols-{terms}.onnx", terms)
         own = _smallest(found, shipped, folder / f"{name}.onnx")
         facts = {"shot": sitting.name, "f_number": found.asked.f_number, "focus_m": found.asked.focus_m}
         shots.append(facts | {"shipped": asdict(shipped), "own": asdict(own)})
@@ -145,7 +146,7 @@ def _measured(found: Probed, file: Path, terms: int) -> Model:
 _HEAD = """\
 # Models of one shot
 
-The shipped polynomial of {terms} terms a vector, for all stops, focus and wavelengths, on typical shots of 1920 pixels;
+The shipped polynomial of {terms} terms a vector (60 of the laikin), for all stops, focus and wavelengths, on typical shots of 1920 pixels;
 and the smallest polynomial fitted to the shot alone whose error (95% of the picture, um on the film) is no larger, and
 of light neither, or within 1%. Operations and nanoseconds are of a ray of the whole camera as C on one thread: pupil,
 focus and decoding are in both. Made by `python -m experiments shots`."""
