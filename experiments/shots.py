@@ -42,6 +42,7 @@ LENSES = (
     "merte_biotar_100", "sony_sonnar_55",
 )  # fmt: skip
 SHIPPED_TERMS = 64
+_NEAR = 1.05  # of the nearest focus of models
 TERMS = (4, 6, 8, 11, 14, 18, 23, 28, 36, 46, SHIPPED_TERMS)
 
 
@@ -80,7 +81,7 @@ def measure_lens(name: str, folder: Path, report: Report) -> dict[str, Any]:
     shots = []
     terms = max(n for n in range(SHIPPED_TERMS + 1) if (lab.MODELS / f"{name}.ols-{n}.onnx").is_file())
     for number, sitting in enumerate(SITTINGS):
-        near = near_limit_m(lens) if sitting.near else None
+        near = _NEAR * near_limit_m(lens) if sitting.near else None
         scene = suited(load_scene(lab.SCENES / f"{sitting.scene}.toml"), lens, sitting.f_number, near)
         found = probe(scene, lens)
         shipped = _measured(found, lab.MODELS / f"{name}.ols-{terms}.onnx", terms)
@@ -146,10 +147,10 @@ def _measured(found: Probed, file: Path, terms: int) -> Model:
 _HEAD = """\
 # Models of one shot
 
-The shipped polynomial of {terms} terms a vector (60 of the laikin), for all stops, focus and wavelengths, on typical shots of 1920 pixels;
-and the smallest polynomial fitted to the shot alone whose error (95% of the picture, um on the film) is no larger, and
-of light neither, or within 1%. Operations and nanoseconds are of a ray of the whole camera as C on one thread: pupil,
-focus and decoding are in both. Made by `python -m experiments shots`."""
+The shipped polynomial of {terms} terms a vector (60 of the laikin), for all stops, focus and wavelengths, on typical
+shots of 1920 pixels; and the smallest polynomial fitted to the shot alone whose error (95% of the picture, um on the
+film) is no larger, and of light neither, or within 1%. Operations and nanoseconds are of a ray of the whole camera as C
+on one thread: pupil, focus and decoding are in both. Made by `python -m experiments shots`."""
 _COLUMNS = lab.columns(
     ("lens", "lens"), ("shot", "shot"), ("f/", "f_number", ".3g"), ("m", "focus_m", ".3g"),
     ("shipped um", "shipped.um", ".2g"), ("own um", "own.um", ".2g"), ("terms", "own.terms"),
