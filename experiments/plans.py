@@ -34,10 +34,6 @@ from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm
 from neurolens.render.scene import Scene, load_scene
 from neurolens.surrogates.bases import pinned_threads
-from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.fit import fit_model, prepare
-from neurolens.surrogates.pairs import make_pairs
-from neurolens.surrogates.settings import ModelSettings
 
 LENSES = (
     "laikin_double_gauss_50", "ogawa_zoom_70_200@135mm", "horimoto_fisheye_16", "phone_lens_6", "cooke_anamorphic_42",
@@ -177,15 +173,12 @@ def _more(
     """
     trial = plans._Trial(found, target, _TRIED_PX)
     costs = {c.name: c for c in picks}
-    prepared = None
-    for terms in sorted({*plans._TERMS, *MORE_TERMS}):
-        settings = ModelSettings("ols", terms=terms, planes=False, elimination=False)
-        file = folder / f"{Path(found.lens.path).stem}.shot-{settings.label}.onnx"
+    fit: Any = None
+    for terms in sorted({*plans.shot_terms(found), *MORE_TERMS}):
+        file = folder / f"{Path(found.lens.path).stem}.shot-ols-{terms}.onnx"
         if file.stem not in costs and file not in made:
-            prepared = prepared or prepare(make_pairs(found.lens, found.domain, plans._PAIRS))
-            folder.mkdir(parents=True, exist_ok=True)
-            export_onnx(fit_model(prepared, settings), file, errors={})
-            made.append(file)
+            fit = fit or plans.shot_fits(found, folder)
+            made.append(fit(terms)[0])
         choice = costs.get(file.stem)
         if choice is None or not math.isfinite(choice.cost):
             choice = next(iter(plans._model(trial, file)), None)

@@ -23,17 +23,13 @@ from neurolens.base.progress import Report
 from neurolens.cameras.fused import FusedCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.evaluate import footprints as prints
+from neurolens.evaluate import plan as plans
 from neurolens.evaluate.costs import glsl_operations, ns_a_ray
 from neurolens.evaluate.experiment import near_limit_m
-from neurolens.evaluate.plan import _PAIRS
 from neurolens.evaluate.probe import COUNTED, LIGHT, Probed, probe
 from neurolens.optics.lensfile import read_lens
 from neurolens.render.scene import load_scene
 from neurolens.surrogates.bases import pinned_threads
-from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.fit import fit_model, prepare
-from neurolens.surrogates.pairs import make_pairs
-from neurolens.surrogates.settings import ModelSettings
 
 # All kinds: wide to long, f/1 to f/5.4, simple and not, from plastic, a zoom's default state.
 LENSES = (
@@ -85,35 +81,27 @@ def measure_lens(name: str, folder: Path, report: Report) -> dict[str, Any]:
         scene = suited(load_scene(lab.SCENES / f"{sitting.scene}.toml"), lens, sitting.f_number, near)
         found = probe(scene, lens)
         shipped = _measured(found, lab.MODELS / f"{name}.ols-{terms}.onnx", terms)
-        own = _smallest(found, shipped, folder / f"{name}.onnx")
+        own = _smallest(found, shipped, folder)
         facts = {"shot": sitting.name, "f_number": found.asked.f_number, "focus_m": found.asked.focus_m}
         shots.append(facts | {"shipped": asdict(shipped), "own": asdict(own)})
         report((number + 1) / len(SITTINGS))
     return {"lens": name, "shots": shots}
 
 
-def _smallest(found: Probed, shipped: Model, file: Path) -> Model:
+def _smallest(found: Probed, shipped: Model, folder: Path) -> Model:
     """The smallest polynomial of the shot with errors no larger than the shipped one's, by halves; else the largest."""
-    prepared = prepare(make_pairs(found.lens, found.domain, _PAIRS))
+    fit = plans.shot_fits(found, folder)
     low, high = 0, len(TERMS) - 1
     best = -1
     while low <= high:
         size = (low + high) // 2
-        _fit(prepared, TERMS[size], file)
-        um, light = _errors(found, _onnx(found, file))
+        um, light = _errors(found, _onnx(found, fit(TERMS[size])[0]))
         # Light that a plan takes for right is no reason for more terms.
         if um <= shipped.um and light <= max(shipped.light, LIGHT):
             best, high = size, size - 1
         else:
             low = size + 1
-    terms = TERMS[best]
-    _fit(prepared, terms, file)
-    return _measured(found, file, terms)
-
-
-def _fit(prepared: Any, terms: int, file: Path) -> None:
-    settings = ModelSettings("ols", terms=terms, planes=False, elimination=False)
-    export_onnx(fit_model(prepared, settings), file, errors={})
+    return _measured(found, fit(TERMS[best])[0], TERMS[best])
 
 
 def _real(found: Probed) -> dict[str, Any]:
