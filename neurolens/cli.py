@@ -64,6 +64,7 @@ def build_parser() -> Parser:
         render,
         stmap,
         survey,
+        trade,
         train,
     )
 
@@ -71,7 +72,22 @@ def build_parser() -> Parser:
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
     read = lens, analyse, glass, convert, survey, library, stmap, projection
-    for command in (*read, plan, train, models, evaluate, export, render, merge, flare, mitsuba, blender, bench, demo):
+    for command in (
+        *read,
+        plan,
+        trade,
+        train,
+        models,
+        evaluate,
+        export,
+        render,
+        merge,
+        flare,
+        mitsuba,
+        blender,
+        bench,
+        demo,
+    ):
         command.add_parser(subparsers)
     return parser
 
