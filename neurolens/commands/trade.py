@@ -163,14 +163,10 @@ def _page(found: Trade, folder: Path, title: str) -> str:
     told = f"{found.samples} samples a pixel each, the same random numbers: equal samples, and noise that is nearly "
     told += "the same. Below each its FLIP difference from the exact lens's picture."
     figures = [
-        {
-            "file": "trade.png",
-            "title": "Error against time",
-            "caption": "Ring: the choice for the budget.",
-            "wide": True,
-        },
-        {"file": "pictures.png", "title": "What is seen", "caption": told, "wide": True},
+        {"file": "trade.png", "title": "Error against time", "caption": "Ring: the choice for the budget."},
+        {"file": "pictures.png", "title": "What is seen", "caption": told},
     ]
+    shown = pages.figure_grid(folder, [{**f, "wide": True} for f in figures], inside=True)
     body = f"<h1>{pages.text(title)}</h1>{lead}{shown}"
     body += pages.section("Every camera", pages.table(names, records, columns))
     body += "<p class='note'>● for the budget, ○ no other betters both.</p>" + pages.legend(columns)

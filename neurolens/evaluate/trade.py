@@ -1,9 +1,9 @@
 """What a scene's error costs: every camera by its error and by the seconds to equal noise, and what half of them buys.
 
 Seconds are of one thread, for the scene's own size and samples, and what a camera adds to those of one that costs
-nothing and whose rays all weigh the same: what its own rays take, and what the scene takes for the further rays that its
-noise asks for (see `costs`). What a ray takes in the scene is measured by a small picture, in our renderer; in other
-targets the camera alone counts, in Cycles under a white sky.
+nothing and whose rays all weigh the same: what its own rays take, and what the scene takes for the further rays that
+its noise asks for (see `costs`). What a ray takes in the scene is measured by a small picture, in our renderer; in
+other targets the camera alone counts, in Cycles under a white sky.
 """
 
 from __future__ import annotations
@@ -61,7 +61,8 @@ class Trade:
     """Every camera that was priced, by rising seconds; the plan for the budget; and pictures of those to look at.
 
     Attributes:
-        base: what the scene takes by itself. unit: of it and of `Offer.seconds`. samples: of pictures. exact: the lens's.
+        base: what the scene takes by itself. unit: of it and of `Offer.seconds`. samples: a pixel of the pictures.
+        exact: the lens's picture.
     """
 
     plan: Plan
