@@ -66,28 +66,15 @@ def build_parser() -> Parser:
         survey,
         trade,
         train,
+        view,
     )
 
     parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
     read = lens, analyse, glass, convert, survey, library, stmap, projection
-    for command in (
-        *read,
-        plan,
-        trade,
-        train,
-        models,
-        evaluate,
-        export,
-        render,
-        merge,
-        flare,
-        mitsuba,
-        blender,
-        bench,
-        demo,
-    ):
+    made = train, models, evaluate, export, render, merge, flare, mitsuba, blender, view
+    for command in (*read, plan, trade, *made, bench, demo):
         command.add_parser(subparsers)
     return parser
 
