@@ -9,7 +9,9 @@ import json
 import os
 import re
 import secrets
+import site
 import stat
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -44,6 +46,15 @@ def noted_files() -> Iterator[set[Path]]:
         _noted.reset(before)
         cached = cache_folder()
         found -= {path for path in found if path.is_relative_to(cached)}
+
+
+def library() -> Path:
+    """The folder of what ships beside the code, lenses/, models/ and experiments/scenes/: the checkout's; of an
+    installed package, share/neurolens in the environment (the user's, pip's --target); else the working folder."""
+    code = Path(__file__).parents[2]
+    shares = (Path(sys.prefix), Path(site.getuserbase()), code)
+    roots = (code, *(share / "share" / "neurolens" for share in shares))
+    return next((root for root in roots if (root / "lenses").is_dir()), Path.cwd())
 
 
 @contextmanager

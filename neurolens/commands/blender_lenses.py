@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.signals import end_at_once, held
 from neurolens.blender.pack import Form, PackedLens
-from neurolens.commands.arguments import RANGE
 from neurolens.commands.blender_kept import kept_form
-from neurolens.commands.export_osl import shader_of
+from neurolens.evaluate.shaders import shader_of
 from neurolens.render.film import CONTEXT
 
 if TYPE_CHECKING:

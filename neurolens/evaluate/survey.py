@@ -20,7 +20,7 @@ from typing import Any
 
 from neurolens import __version__
 from neurolens.analysis.layout import thumbnail
-from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning, one_line
+from neurolens.base.errors import AssumedWarning, InputError, NeurolensError, NeurolensWarning, one_line
 from neurolens.base.files import fingerprint_of
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.check import check_model
@@ -148,8 +148,11 @@ def _survey(task: Task, file: Path, record: dict[str, Any]) -> None:
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always", NeurolensWarning)
         lens, assumed = _read(file, task.settings)
-    notes = [str(w.message).removeprefix(f"{file}: ") for w in heard if issubclass(w.category, NeurolensWarning)]
-    record["notes"] = list(dict.fromkeys([*assumed, *notes]))
+    notes: dict[str, type[Warning]] = {
+        str(w.message).removeprefix(f"{file}: "): w.category for w in heard if issubclass(w.category, NeurolensWarning)
+    }
+    assumed += [note for note, kind in notes.items() if issubclass(kind, AssumedWarning)]
+    record["notes"] = [note for note in notes if note not in assumed]
     record["format"] = kind_of(file)
     warnings.simplefilter("ignore", NeurolensWarning)
     record |= lens_row(lens, check_lens(lens))
