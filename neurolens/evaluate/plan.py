@@ -25,11 +25,10 @@ from neurolens.base.errors import InputError, ModelError
 from neurolens.base.progress import Report
 from neurolens.base.tomlfile import format_toml
 from neurolens.cameras.build import Shot, ideal_as
-from neurolens.cameras.contract import Camera, CameraRays, FloatArray
+from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import FusedExactCamera
 from neurolens.cameras.fused import FusedCamera
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.warped import Warped
 from neurolens.evaluate import footprints as prints
 from neurolens.evaluate.costs import (
@@ -59,6 +58,8 @@ Target = Literal["render", "c", "onnx", "osl", "glsl"]
 Cost = Callable[[], tuple[float, float]]  # of a ray, and noise
 _OURS = ("render", "c")  # run compiled C
 _TERMS = (2, 4, 6, 8, 12, 16, 22, 28, 36, 48, 64, 90)  # of the polynomials that are fitted on the spot
+_EXACT, _IDEAL = "exact", ("pinhole", "thin", "thick")
+_MAPPED = " + ST map"  # after the name of an ideal camera
 _SHOT = "fitted for this shot"
 _FIT = ModelSettings("ols", planes=False, elimination=False, idle_gates=IDLE)
 _FOCUS_SPARE = 0.25  # of a pixel of blur: what a model may place its film beside the lens's
@@ -98,11 +99,13 @@ class Plan:
     """What was asked, the effects in falling order of worth, every camera tried by rising cost, the one to use.
 
     Attributes:
+        budget_s: seconds of a plan for a time, whose `budget_px` is then the error of the best camera.
         unit: of costs: "ns" or, where no time is known, "operations". domain: of models that are fitted.
     """
 
     asked: Asked
     budget_px: float
+    budget_s: float | None
     target: Target
     unit: str
     domain: DomainChoice
@@ -179,7 +182,7 @@ def decided(found: Probed, tried: Sequence[Choice], budget_px: float, target: Ta
     ranked = tuple(replace(c, within=c.meets(budget_px)) for c in sorted(tried, key=lambda c: c.cost))
     best = next((c for c in ranked if c.within), None)
     effects = effects_of(found, budget_px)
-    return Plan(found.asked, budget_px, target, UNIT[target], _shot_domain(found), effects, ranked, best, found)
+    return Plan(found.asked, budget_px, None, target, UNIT[target], _shot_domain(found), effects, ranked, best, found)
 
 
 @dataclass(frozen=True)
@@ -194,13 +197,6 @@ class _Trial:
     def share(self) -> prints.Array:
         """Of the wavelengths."""
         return self.found.places.share
-
-    @property
-    def real(self) -> dict[str, Any]:
-        """The shot as cameras of lenses take it."""
-        asked = self.found.asked
-        shot = {"film_mm": asked.film_mm, "focus_m": asked.focus_m, "f_number": asked.f_number}
-        return {**shot, "wavelength_nm": asked.wavelength_nm}
 
     def judged(
         self, name: str, spec: str, seen: Footprints, cost: Callable[[], tuple[float, float]], how: str = ""
@@ -240,67 +236,50 @@ class _Trial:
         return shader_cost(lens, self.found.places, asked.film_mm, asked.f_number, asked.focus_m)
 
 
+def camera_of(found: Probed, choice: Choice) -> Camera:
+    """The camera of a choice, in our renderer; with the maps of its picture, where it needs them.
+
+    Raises:
+        InputError, ModelError: as the cameras.
+    """
+    kind, _, path = choice.camera.rpartition(":")
+    if choice.name == _EXACT:
+        return found.exact
+    if kind in _IDEAL:
+        flat = ideal_as(f"{kind}:", found.exact.lens, Shot(found.asked.film_mm, found.asked.focus_m))
+        mapped = choice.name.endswith(_MAPPED)
+        return Warped(flat, found.exact, found.asked.focus_m, tables=True) if mapped else flat
+    return (FusedCamera if kind else OnnxCamera)(load_model(path), **_real(found))
+
+
+def _real(found: Probed) -> dict[str, Any]:
+    """The shot as cameras of lenses take it."""
+    asked = found.asked
+    shot = {"film_mm": asked.film_mm, "focus_m": asked.focus_m, "f_number": asked.f_number}
+    return {**shot, "wavelength_nm": asked.wavelength_nm}
+
+
 def _ideal(trial: _Trial) -> Iterator[Choice]:
     """Pinhole, thin and thick lens, as they are and with their picture warped afterwards, where the target has them.
 
     In C and GLSL they are their own source.
     """
     found, shot = trial.found, Shot(trial.found.asked.film_mm, trial.found.asked.focus_m)
-    kinds = {"onnx": (), "osl": ("pinhole:", "thin:")}.get(trial.target, ("pinhole:", "thin:", "thick:"))
-    for kind in kinds:
-        name, spec = kind.rstrip(":"), f"{kind}{found.lens.path}"
+    for name in {"onnx": (), "osl": _IDEAL[:2]}.get(trial.target, _IDEAL):
+        spec = f"{name}:{found.lens.path}"
         with suppress(InputError):  # no thick lens of cylinders; no maps of half a sphere, or of a film that is dark
-            camera = ideal_as(kind, found.exact.lens, shot)
+            camera = ideal_as(f"{name}:", found.exact.lens, shot)
             seen = prints.footprints(camera, found.places)
             yield trial.judged(name, spec, seen, partial(trial.ideal, name, camera, seen))
             if "distortion" in found.asked.afterwards:
                 continue
-            where = "" if kind == "thick:" or trial.target in _OURS else "from the entrance pupil, "
-            if kind == "thin:" and not where:
+            if name == "thin" and trial.target in _OURS:
                 continue  # in our renderer the thick lens stands in its place
             maps = Warped(camera, found.exact, found.asked.focus_m)
-            area = maps.area
-            if isinstance(camera, Pinhole) or not where:
-                where = ""
-                warped: Footprints | None = prints.footprints(maps, found.places)
-            else:
-                warped = _warped(found, _FromPupil(camera, found))
-            if area < _MOST_OVERSCAN and warped is not None:
-                how = f"{where}then the ST map of 'neurolens stmap' over the picture, of {area:.3g} times the area"
-                cost = partial(trial.ideal, name, camera, seen, area)
-                yield trial.judged(f"{name} + ST map", spec, warped, cost, how)
-
-
-class _FromPupil:
-    """An ideal camera that stands in the lens's entrance pupil: its rays meet the plane in focus where they did."""
-
-    def __init__(self, camera: Camera, found: Probed) -> None:
-        lens = found.exact.lens
-        self.camera, self.focus_m = camera, min(found.asked.focus_m, 1e6)
-        self.z_m = (first_order(lens).entrance_pupil_z_mm - float(lens.film_z_mm or 0.0)) / 1000
-
-    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `Camera.sample`."""
-        rays = self.camera.sample(film_mm, pupil, wavelength_nm)
-        origin, way = rays.origin_m.astype(np.float64), rays.direction.astype(np.float64)
-        met = origin + way * ((-self.focus_m - origin[2]) / way[2])
-        start = np.stack([origin[0], origin[1], np.full(origin.shape[1], self.z_m)])
-        way = (met - start) / np.linalg.norm(met - start, axis=0)
-        return replace(rays, origin_m=start.astype(np.float32), direction=way.astype(np.float32))
-
-
-def _warped(found: Probed, camera: Any) -> Footprints | None:
-    """Footprints of a camera whose picture is moved, and its light scaled, by maps for the plane in focus."""
-    places = found.places
-    focus = np.full(places.film_mm.shape[1], found.asked.focus_m)
-    flat = prints.places_of(found.exact, places.film_mm, focus, places.wavelength_nm, places.share)
-    if flat.film_mm.shape != places.film_mm.shape:
-        return None
-    by = np.subtract(*(prints.centroids(prints.footprints(c, flat), places.share)[0] for c in (found.exact, camera)))
-    seen = prints.footprints(camera, places)
-    lit = seen.weight > 0
-    weight = seen.weight * (found.seen.light / np.maximum(seen.light, 1e-30))[:, None, None]
-    return Footprints(np.where(lit, seen.place_mm + by[:, :, None, None], 0.0), seen.pupil_mm, weight)
+            if maps.area < _MOST_OVERSCAN:
+                how = f"then the ST map of 'neurolens stmap' over the picture, of {maps.area:.3g} times the area"
+                cost = partial(trial.ideal, name, camera, seen, maps.area)
+                yield trial.judged(f"{name}{_MAPPED}", spec, prints.footprints(maps, found.places), cost, how)
 
 
 def _exact(trial: _Trial) -> Iterator[Choice]:
@@ -313,7 +292,7 @@ def _exact(trial: _Trial) -> Iterator[Choice]:
     }.get(target, lambda: trial.timed(exact, found.seen))
     if target == "render" or (target != "onnx" and compiled) or target in ("osl", "glsl"):
         with suppress(InputError):  # coatings, and glass that absorbs
-            yield trial.judged("exact", f"{'fused:' if compiled and target in _OURS else ''}{path}", found.seen, cost)
+            yield trial.judged(_EXACT, f"{'fused:' if compiled and target in _OURS else ''}{path}", found.seen, cost)
 
 
 def _model(trial: _Trial, file: Path, how: str = "") -> Iterator[Choice]:
@@ -325,7 +304,7 @@ def _model(trial: _Trial, file: Path, how: str = "") -> Iterator[Choice]:
     compiled = target in _OURS and has_compiler()
     with suppress(InputError, ModelError):
         model = load_model(file)
-        camera = OnnxCamera(model, **trial.real)
+        camera = OnnxCamera(model, **_real(trial.found))
         seen = prints.footprints(camera, trial.found.places)
 
         def cost() -> tuple[float, float]:
@@ -333,7 +312,7 @@ def _model(trial: _Trial, file: Path, how: str = "") -> Iterator[Choice]:
                 return trial.shader(file)
             if target == "glsl":
                 return glsl_operations(camera), noise(seen.weight, trial.share)
-            return trial.timed(FusedCamera(model, **trial.real) if compiled else camera, seen)
+            return trial.timed(FusedCamera(model, **_real(trial.found)) if compiled else camera, seen)
 
         if compiled or target != "c":
             yield trial.judged(file.stem, f"{'fused:' if compiled else ''}{file}", seen, cost, how)
@@ -348,6 +327,28 @@ def _shot_domain(found: Probed) -> DomainChoice:
     return DomainChoice(found.domain.film_radius_mm, ends, asked.wavelength_nm)
 
 
+def shot_terms(found: Probed) -> list[int]:
+    """Sizes of polynomials that are tried for a shot; those of lenses with cylinders have terms of x and of y."""
+    return [n for n in _TERMS if n >= (4 if found.lens.anamorphic else 2)]
+
+
+def shot_fits(found: Probed, folder: Path) -> Callable[[int], tuple[Path, ModelSettings]]:
+    """What fits a polynomial of so many terms to a shot alone: its file, in a folder, and its settings."""
+    lens, domain, choice = found.lens.with_aperture(None), found.domain, _shot_domain(found)
+    with suppress(InputError):  # a lens that goes no nearer
+        domain = domain_of(lens, **asdict(choice))
+    prepared = prepare(make_pairs(lens, domain, _PAIRS))
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def fit(terms: int) -> tuple[Path, ModelSettings]:
+        settings = replace(_FIT, name=f"shot-ols-{terms}", terms=terms)
+        file = folder / f"{Path(found.lens.path).stem}.{settings.label}.onnx"
+        export_onnx(fit_model(prepared, settings), file, errors={})
+        return file, settings
+
+    return fit
+
+
 def _fitted(
     trial: _Trial, budgets_px: Sequence[float], folder: Path, tried: Sequence[Choice], say: Report
 ) -> Iterator[Choice]:
@@ -360,25 +361,19 @@ def _fitted(
     asked = [b for b in budgets_px if explain or not any(c.meets(b) and c.name.startswith(ideal) for c in tried)]
     if not asked:
         return
-    lens, domain, choice = found.lens.with_aperture(None), found.domain, _shot_domain(found)
-    with suppress(InputError):  # a lens that goes no nearer
-        domain = domain_of(lens, **asdict(choice))
-    prepared = prepare(make_pairs(lens, domain, _PAIRS))
-    folder.mkdir(parents=True, exist_ok=True)
+    fit, sizes = shot_fits(found, folder), shot_terms(found)
     known: dict[int, tuple[Path, list[Choice]]] = {}
     smallest = set()
     for k, budget_px in enumerate(asked):
-        low, high = 0, len(_TERMS)  # sizes below `low` do not hold, those from `high` on do
+        low, high = 0, len(sizes)  # sizes below `low` do not hold, those from `high` on do
         while low < high:
             size = (low + high) // 2
             if size not in known:
-                settings = replace(_FIT, name=f"shot-ols-{_TERMS[size]}", terms=_TERMS[size])
-                file = folder / f"{Path(found.lens.path).stem}.{settings.label}.onnx"
-                export_onnx(fit_model(prepared, settings), file, errors={})
+                file, settings = fit(sizes[size])
                 shown = trial if explain else replace(trial, costed_px=-1.0)
                 known[size] = file, [replace(c, settings=settings) for c in _model(shown, file, _SHOT)]
             low, high = (low, size) if any(c.meets(budget_px) for c in known[size][1]) else (size + 1, high)
-            say((k + 1 - (high - low) / len(_TERMS)) / len(asked))
+            say((k + 1 - (high - low) / len(sizes)) / len(asked))
         smallest.add(low)
     for size, (file, made) in known.items():  # what is larger than the smallest costs more, and is not compiled
         again = _model(trial, file, _SHOT) if size in smallest and not explain else made
