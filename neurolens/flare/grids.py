@@ -16,14 +16,14 @@ from neurolens.flare.lights import Light, rays_across
 from neurolens.flare.stack import Floats
 from neurolens.flare.steps import LOST
 
-FEWEST, MOST = 150, 512  # lit cells, and cells along a side
+FEWEST, MOST = 320, 512  # lit cells, and cells along a side
 REACH = 16.0  # of `GhostTracer.trace`: rims are cut between rays inside and outside
 _SCOUTS = 48  # cells a side of the grid that looks for ghosts
 _FEW = 4  # of the scouts, one in so many a side, tell how far apart colours are
 _NEAR = 2.0  # r^2 / R^2 to which rays beyond rims tell it, too
 _EVEN = 0.02  # least unevenness, and spread of colours over the size, of a ghost
 _AT_ONCE = 128  # ghosts
-_ERROR, _WORST = 2.5, 0.25  # light beside its place, times the cells that half the film is wide; at most
+_ERROR, _WORST = 3.0, 0.25  # light beside its place, times the cells that half the film is wide; at most
 
 
 @dataclass(frozen=True)
