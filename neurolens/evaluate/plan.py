@@ -327,6 +327,28 @@ def _shot_domain(found: Probed) -> DomainChoice:
     return DomainChoice(found.domain.film_radius_mm, ends, asked.wavelength_nm)
 
 
+def shot_terms(found: Probed) -> list[int]:
+    """Sizes of polynomials that are tried for a shot; those of lenses with cylinders have terms of x and of y."""
+    return [n for n in _TERMS if n >= (4 if found.lens.anamorphic else 2)]
+
+
+def shot_fits(found: Probed, folder: Path) -> Callable[[int], tuple[Path, ModelSettings]]:
+    """What fits a polynomial of so many terms to a shot alone: its file, in a folder, and its settings."""
+    lens, domain, choice = found.lens.with_aperture(None), found.domain, _shot_domain(found)
+    with suppress(InputError):  # a lens that goes no nearer
+        domain = domain_of(lens, **asdict(choice))
+    prepared = prepare(make_pairs(lens, domain, _PAIRS))
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def fit(terms: int) -> tuple[Path, ModelSettings]:
+        settings = replace(_FIT, name=f"shot-ols-{terms}", terms=terms)
+        file = folder / f"{Path(found.lens.path).stem}.{settings.label}.onnx"
+        export_onnx(fit_model(prepared, settings), file, errors={})
+        return file, settings
+
+    return fit
+
+
 def _fitted(
     trial: _Trial, budgets_px: Sequence[float], folder: Path, tried: Sequence[Choice], say: Report
 ) -> Iterator[Choice]:
@@ -339,25 +361,19 @@ def _fitted(
     asked = [b for b in budgets_px if explain or not any(c.meets(b) and c.name.startswith(ideal) for c in tried)]
     if not asked:
         return
-    lens, domain, choice = found.lens.with_aperture(None), found.domain, _shot_domain(found)
-    with suppress(InputError):  # a lens that goes no nearer
-        domain = domain_of(lens, **asdict(choice))
-    prepared = prepare(make_pairs(lens, domain, _PAIRS))
-    folder.mkdir(parents=True, exist_ok=True)
+    fit, sizes = shot_fits(found, folder), shot_terms(found)
     known: dict[int, tuple[Path, list[Choice]]] = {}
     smallest = set()
     for k, budget_px in enumerate(asked):
-        low, high = 0, len(_TERMS)  # sizes below `low` do not hold, those from `high` on do
+        low, high = 0, len(sizes)  # sizes below `low` do not hold, those from `high` on do
         while low < high:
             size = (low + high) // 2
             if size not in known:
-                settings = replace(_FIT, name=f"shot-ols-{_TERMS[size]}", terms=_TERMS[size])
-                file = folder / f"{Path(found.lens.path).stem}.{settings.label}.onnx"
-                export_onnx(fit_model(prepared, settings), file, errors={})
+                file, settings = fit(sizes[size])
                 shown = trial if explain else replace(trial, costed_px=-1.0)
                 known[size] = file, [replace(c, settings=settings) for c in _model(shown, file, _SHOT)]
             low, high = (low, size) if any(c.meets(budget_px) for c in known[size][1]) else (size + 1, high)
-            say((k + 1 - (high - low) / len(_TERMS)) / len(asked))
+            say((k + 1 - (high - low) / len(sizes)) / len(asked))
         smallest.add(low)
     for size, (file, made) in known.items():  # what is larger than the smallest costs more, and is not compiled
         again = _model(trial, file, _SHOT) if size in smallest and not explain else made
