@@ -10,6 +10,7 @@ measured here, with one thread; of shaders it is counted.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -19,7 +20,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from neurolens.base.errors import InputError, ModelError
+from neurolens.base.errors import InputError, ModelError, NeurolensWarning
 from neurolens.base.progress import Report
 from neurolens.cameras.build import Shot, ideal_as
 from neurolens.cameras.contract import Camera, CameraRays, FloatArray
@@ -46,16 +47,16 @@ from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.render.scene import Scene
 from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.fit import fit_model, prepare
+from neurolens.surrogates.fit import Prepared, fit_model, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.settings import ModelSettings
 
 Target = Literal["render", "c", "onnx", "osl", "glsl"]
 Cost = Callable[[], tuple[float, float]]  # of a ray, and noise
 _OURS = ("render", "c")  # run compiled C
-_TERMS = (4, 6, 8, 12, 16, 22, 28, 36, 48)  # of the polynomials that are fitted on the spot
+TERMS = (4, 6, 8, 12, 16, 22, 28, 36, 48)  # of the polynomials that are fitted on the spot
 _SHOT = "fitted for this shot"
-_PAIRS = PairSettings(train=5000, held_out=1000, rim=5000)
+PAIRS = PairSettings(train=5000, held_out=1000, rim=5000)
 _MOST_OVERSCAN = 4.0  # of a plane picture that is warped afterwards
 
 
@@ -316,6 +317,22 @@ def _model(trial: _Trial, file: Path, how: str = "") -> Iterator[Choice]:
             yield trial.judged(file.stem, f"{'fused:' if compiled else ''}{file}", seen, cost, how)
 
 
+def model_choice(found: Probed, target: Target, file: Path, how: str, costed: bool) -> Choice | None:
+    """A model in the form that the target runs; None where it has none, or its domain is not the shot's."""
+    with warnings.catch_warnings():  # film beyond the end of its range: its error counts
+        warnings.simplefilter("ignore", NeurolensWarning)
+        return next(_model(_Trial(found, target, math.inf if costed else -1.0), file, how), None)
+
+
+def fitted_file(prepared: Prepared, lens: Lens, terms: int, folder: Path, name: str) -> Path:
+    """A polynomial of a shot, fitted and written."""
+    settings = ModelSettings("ols", terms=terms, planes=False, elimination=False)
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / f"{Path(lens.path).stem}.{name}-{settings.label}.onnx"
+    export_onnx(fit_model(prepared, settings), file, errors={})
+    return file
+
+
 def _fitted(
     trial: _Trial, budgets_px: Sequence[float], folder: Path, tried: Sequence[Choice], say: Report
 ) -> Iterator[Choice]:
@@ -328,21 +345,18 @@ def _fitted(
     asked = [b for b in budgets_px if explain or not any(c.meets(b) and c.name.startswith(ideal) for c in tried)]
     if not asked:
         return
-    prepared = prepare(make_pairs(found.lens, found.domain, _PAIRS))
-    folder.mkdir(parents=True, exist_ok=True)
+    prepared = prepare(make_pairs(found.lens, found.domain, PAIRS))
     known: dict[int, tuple[Path, list[Choice]]] = {}
     smallest = set()
     for k, budget_px in enumerate(asked):
-        low, high = 0, len(_TERMS)  # sizes below `low` do not hold, those from `high` on do
+        low, high = 0, len(TERMS)  # sizes below `low` do not hold, those from `high` on do
         while low < high:
             size = (low + high) // 2
             if size not in known:
-                settings = ModelSettings("ols", terms=_TERMS[size], planes=False, elimination=False)
-                file = folder / f"{Path(found.lens.path).stem}.shot-{settings.label}.onnx"
-                export_onnx(fit_model(prepared, settings), file, errors={})
+                file = fitted_file(prepared, found.lens, TERMS[size], folder, "shot")
                 known[size] = file, list(_model(trial if explain else replace(trial, costed_px=-1.0), file, _SHOT))
             low, high = (low, size) if any(c.meets(budget_px) for c in known[size][1]) else (size + 1, high)
-            say((k + 1 - (high - low) / len(_TERMS)) / len(asked))
+            say((k + 1 - (high - low) / len(TERMS)) / len(asked))
         smallest.add(low)
     for size, (file, made) in known.items():  # what is larger than the smallest costs more, and is not compiled
         yield from _model(trial, file, _SHOT) if size in smallest and not explain else made
