@@ -23,6 +23,7 @@ NAMES = {
     "fused": ("fused_speed", "models as C against the exact lens as C"),
     "models": ("make_models", "make the models that ship"),
     "inverse": ("inverse", "inverse maps: how often they arrive"),
+    "plans": ("plans", "plans of scenes: whether budgets are kept, and what the cheapest camera costs"),
     "zoom": ("zoom", "models of whole zooms, of internal focus"),
     "equal-time": ("equal_time_page", "error over render time of every camera"),
     "render": ("render_times_page", "render time by camera and scene"),

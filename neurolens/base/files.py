@@ -9,7 +9,9 @@ import json
 import os
 import re
 import secrets
+import site
 import stat
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -27,6 +29,15 @@ _DIGEST = 32  # bytes of SHA-256
 # Opened without waiting for a writer of a FIFO; what a system lacks it does not need.
 _READ = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
+
+
+def library() -> Path:
+    """The folder of what ships beside the code, lenses/, models/ and experiments/scenes/: the checkout's; of an
+    installed package, share/neurolens in the environment (the user's, pip's --target); else the working folder."""
+    code = Path(__file__).parents[2]
+    shares = (Path(sys.prefix), Path(site.getuserbase()), code)
+    roots = (code, *(share / "share" / "neurolens" for share in shares))
+    return next((root for root in roots if (root / "lenses").is_dir()), Path.cwd())
 
 
 @contextmanager

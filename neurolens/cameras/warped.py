@@ -1,4 +1,4 @@
-"""A pinhole whose picture is warped afterwards, as a camera."""
+"""An ideal camera whose picture is warped afterwards, as a camera."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from neurolens.base.errors import InputError
-from neurolens.cameras.contract import CameraRays, FloatArray
+from neurolens.cameras.contract import Camera, CameraRays, FloatArray
 from neurolens.cameras.field import (
     BEYOND,
     RECTILINEAR,
@@ -17,65 +17,88 @@ from neurolens.cameras.field import (
     Array,
     Complex,
     Field,
+    field_of,
     film_edge,
     frame_of,
     laid,
     seen,
     spectrum_of,
 )
-from neurolens.cameras.pinhole import Pinhole
 
 
-class WarpedPinhole(Pinhole):
-    """What compositing makes of a pinhole's picture by the maps of a camera's rectilinear field: its places and light.
+class Warped:
+    """What compositing makes of an ideal camera's picture by maps of a lens's plane field: its places and light.
 
     Args:
-        hole: any, of the same film. camera: to be shown. focus_m: from the film to the plane that the maps are of.
-        field: of both, which takes seconds; without it every film point is traced by itself.
+        flat: pinhole, thin or thick lens, of the same film. camera: to be shown. focus_m: from the film to the plane
+            that the maps are of. tables: of both fields, which take seconds; without them film points are traced.
 
     Raises:
         InputError: a camera that sees some of the film's edge beyond `WIDEST_DEG`, or not at all.
     """
 
-    name = "pinhole, warped"
-
-    def __init__(self, hole: Pinhole, camera: Any, focus_m: float, field: Field | None = None) -> None:
-        super().__init__(hole.focal_mm, hole.film_mm, hole.f_number)
-        self._shown, self._focus_m, self._field = camera, focus_m, field
-        self._frame, self._spectrum = frame_of(camera), spectrum_of(camera)
-        self._axis = float(self._traced(np.zeros(1, complex))[1][0])
-        near, frame = 1e-3 / focus_m, self._frame
-        # Sizes of things in focus, of the hole over the ideal camera: 1, but for the other meridian of cylinders.
+    def __init__(self, flat: Camera, camera: Camera, focus_m: float, tables: bool = False) -> None:
+        self.name, self.film_mm, self.settings = f"{flat.name}, warped", flat.film_mm, flat.settings
+        self.wavelength_nm, self.dispersive = flat.wavelength_nm, flat.dispersive
+        self.achromatic = getattr(flat, "achromatic", False)
+        self._flat, self._focus_m = flat, focus_m
+        self._frames = {id(c): frame_of(c) for c in (flat, camera)}
+        self._shown = camera
+        self._fields: dict[int, Field] = {}
+        self._axis = {id(c): self._traced(c, np.zeros(1, complex))[1][0] for c in (flat, camera)}
+        near, own, frame = 1e-3 / focus_m, self._frames[id(flat)], self._frames[id(camera)]
+        # Sizes of things in focus, of the one over the other: 1, but for the other meridian of cylinders.
         self._size = [
-            (1 - near * before) / reach * self.focal_mm / (1 - near * self.focal_mm)
-            for before, reach in zip(frame.pupil_mm, frame.reach_mm, strict=True)
-        ]
-        edge = film_edge(self.film_mm) / BEYOND
-        ideal, light = self._traced(edge)
-        if not ((light > 0) & (np.abs(ideal) < math.tan(math.radians(WIDEST_DEG)) * max(frame.reach_mm))).all():
-            raise InputError(
-                camera.name, "film_mm", self.film_mm, "a film within the image circle, and a narrower field"
+            (1 - near * before) / reach * own_reach / (1 - near * own_before)
+            for before, reach, own_before, own_reach in zip(
+                frame.pupil_mm, frame.reach_mm, own.pupil_mm, own.reach_mm, strict=True
             )
-        sides = 2 * BEYOND * np.abs(self._before(ideal)).max(1) / self.film_mm
+        ]
+        ideal, light = self._traced(camera, film_edge(self.film_mm) / BEYOND)
+        if not ((light > 0) & (np.abs(ideal) < math.tan(math.radians(WIDEST_DEG)) * max(frame.reach_mm))).all():
+            expected = "a film within the image circle, and a narrower field"
+            raise InputError(camera.name, "film_mm", self.film_mm, expected)
+        before = self._before(ideal)
+        sides = 2 * BEYOND * np.array([np.abs(before.real).max(), np.abs(before.imag).max()]) / self.film_mm
         self.area = float(np.maximum(sides, 1.0).prod())  # of the picture before it is warped, over that of the film
+        if tables:
+            wide: Any = _OfFilm(flat, (float(sides[0] * self.film_mm[0]), float(sides[1] * self.film_mm[1])))
+            self._fields = {id(camera): field_of(camera, focus_m), id(flat): field_of(wide, focus_m)}
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Rays of film points [2, N] in mm, as of the hole."""
-        point = -(film_mm[0] + 1j * film_mm[1]).astype(np.complex128)
-        if self._field is None:
-            each, back = np.unique(point, return_inverse=True)
-            places, lights = self._traced(each)
-            ideal, light = places[back], lights[back] / self._axis
-        else:
-            ideal, light = self._field.ideal(point), self._field.relative_light(point)
-        rays = super().sample(-self._before(ideal).astype(np.float32), pupil, wavelength_nm)
-        return replace(rays, weight=light.astype(np.float32))
+        """Rays of film points [2, N] in mm, as of the ideal camera."""
+        each, back = -(film_mm[0] + 1j * film_mm[1]).astype(np.complex128), np.arange(film_mm.shape[1])
+        if not self._fields:
+            each, back = np.unique(each, return_inverse=True)
+        ideal, light = self._seen(self._shown, each)
+        place = self._before(ideal)
+        light = light / np.maximum(self._seen(self._flat, place)[1], 1e-30)
+        film = -np.stack([place.real, place.imag])[:, back].astype(np.float32)
+        rays = self._flat.sample(np.ascontiguousarray(film), pupil, wavelength_nm)
+        return replace(rays, weight=rays.weight * light[back].astype(np.float32))
 
-    def _traced(self, point: Complex) -> tuple[Complex, Array]:
-        picture = np.stack([point.real, point.imag])
-        found = seen(self._shown, picture, self._spectrum, self._frame, RECTILINEAR, self._focus_m)
-        return laid(found.direction, self._frame, RECTILINEAR), found.light
+    def _seen(self, camera: Camera, point: Complex) -> tuple[Complex, Array]:
+        """Undistorted places of picture points, and light over that on the axis."""
+        if field := self._fields.get(id(camera)):
+            return field.ideal(point), field.relative_light(point)
+        ideal, light = self._traced(camera, point)
+        return ideal, light / self._axis[id(camera)]
 
-    def _before(self, ideal: Complex) -> Array:
-        """Places [2, N] in the hole's picture, mm."""
-        return np.stack([self._size[0] * ideal.real, self._size[1] * ideal.imag])
+    def _traced(self, camera: Camera, point: Complex) -> tuple[Complex, Array]:
+        picture, frame = np.stack([point.real, point.imag]), self._frames[id(camera)]
+        found = seen(camera, picture, spectrum_of(camera), frame, RECTILINEAR, self._focus_m)
+        return laid(found.direction, frame, RECTILINEAR), found.light
+
+    def _before(self, ideal: Complex) -> Complex:
+        """Places in the ideal camera's picture, mm."""
+        return np.asarray(self._size[0] * ideal.real + 1j * (self._size[1] * ideal.imag))
+
+
+class _OfFilm:
+    """A camera with another film."""
+
+    def __init__(self, camera: Camera, film_mm: tuple[float, float]) -> None:
+        self._camera, self.film_mm = camera, film_mm
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._camera, name)

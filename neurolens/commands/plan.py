@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path
+from neurolens.base.files import atomic_path, library
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, lens_path, project_root
+from neurolens.commands.arguments import add_glass, add_json, lens_path
 from neurolens.commands.output import answer, number, plain_numbers, table
 from neurolens.commands.plan_frames import run_plan_frames
 from neurolens.commands.render_frames import add_frames
@@ -112,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
     folder = args.output or Path("runs") / f"plan-{scene.name}-{file.stem}"
     if folder.exists() and not folder.is_dir():
         raise InputError("neurolens plan", "-o", str(folder), "a folder")
-    shipped = sorted((project_root() / "models").glob(f"{file.stem}.*.onnx"))
+    shipped = sorted((library() / "models").glob(f"{file.stem}.*.onnx"))
     if args.frames is not None:
         return run_plan_frames(args, file, shipped, folder)
     progress = Progress({"plan": 10} | ({"map of samples": 2} if args.samples else {}), quiet=args.quiet)

@@ -64,8 +64,10 @@ def _text(args: argparse.Namespace, found: FramesPlan, folder: Path) -> str:
     if found.cost is not None:
         told += f"; {number(found.cost, 3)} {found.unit} a ray times noise, the mean of all frames"
     parts = [
-        table(("effect", "worth", "", "beyond", ""), effects), table(("frames", "camera", "px", found.unit, ""), runs, left=2), told,
-    ]  # fmt: skip
+        table(("effect", "worth", "", "beyond", ""), effects),
+        table(("frames", "camera", "px", found.unit, ""), runs, left=2),
+        told,
+    ]
     if found.target == "render":
         keys = [word for key in args.key for word in ("--key", key)]
         for r in found.runs:

@@ -28,7 +28,7 @@ from neurolens.cameras.exact import FusedExactCamera
 from neurolens.cameras.fused import FusedCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.warped import WarpedPinhole
+from neurolens.cameras.warped import Warped
 from neurolens.evaluate import footprints as prints
 from neurolens.evaluate.costs import (
     CYCLES_NS,
@@ -223,7 +223,6 @@ def _ideal(trial: _Trial) -> Iterator[Choice]:
     In C and GLSL they are their own source.
     """
     found, shot = trial.found, Shot(trial.found.asked.film_mm, trial.found.asked.focus_m)
-    area = math.inf
     kinds = {"onnx": (), "osl": ("pinhole:", "thin:")}.get(trial.target, ("pinhole:", "thin:", "thick:"))
     for kind in kinds:
         name, spec = kind.rstrip(":"), f"{kind}{found.lens.path}"
@@ -234,15 +233,15 @@ def _ideal(trial: _Trial) -> Iterator[Choice]:
             if "distortion" in found.asked.afterwards:
                 continue
             where = "" if kind == "thick:" or trial.target in _OURS else "from the entrance pupil, "
-            warped: Footprints | None
-            if isinstance(camera, Pinhole):
-                hole = WarpedPinhole(camera, found.exact, found.asked.focus_m)
-                area, warped = hole.area, prints.footprints(hole, found.places)
-                where = ""
-            elif kind == "thin:" and not where:
+            if kind == "thin:" and not where:
                 continue  # in our renderer the thick lens stands in its place
+            maps = Warped(camera, found.exact, found.asked.focus_m)
+            area = maps.area
+            if isinstance(camera, Pinhole) or not where:
+                where = ""
+                warped: Footprints | None = prints.footprints(maps, found.places)
             else:
-                warped = _warped(found, _FromPupil(camera, found) if where else camera)
+                warped = _warped(found, _FromPupil(camera, found))
             if area < _MOST_OVERSCAN and warped is not None:
                 how = f"{where}then the ST map of 'neurolens stmap' over the picture, of {area:.3g} times the area"
                 cost = partial(trial.ideal, name, camera, seen, area)

@@ -28,7 +28,7 @@ from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.fit import Prepared, prepare
 from neurolens.surrogates.pairs import make_pairs
 
-_MOST = 9  # frames that are probed
+_MOST = 5  # frames that are probed, but for more extremes
 _HOW = "fitted for this shot"
 
 
@@ -113,11 +113,12 @@ def plan_frames(
     if folder is not None:
         # What has no camera, or one that costs more than a small model may.
         asks = [k for k, c in enumerate(best) if c is None or not c.name.startswith(("pinhole", "thin"))]
-        for rows, choice in _stretches([founds[k] for k in asks], lens, target, budget_px, folder):
+        for rows, choice in _stretches([founds[k] for k in asks], target, budget_px, folder):
             cheaper = [asks[k] for k in rows if (now := best[asks[k]]) is None or choice.cost < now.cost]
             fits += bool(cheaper)
             for k in cheaper:
                 best[k] = choice
+            say(0.7 + 0.3 * (1 + max(rows)) / len(asks))
     say(1.0)
     served = [best[_nearest(frame, chosen)] for frame in frames]
     costs = [c.cost if c else math.nan for c in served]
@@ -138,7 +139,7 @@ def representatives(frames: Sequence[Frame]) -> list[Frame]:
         extremes |= {int(np.argmin(values)), int(np.argmax(values))}
     between = [int(k) for k in np.linspace(0, len(frames) - 1, _MOST)]
     kept = dict.fromkeys([*sorted(extremes), *between])
-    return [frames[k] for k in sorted(list(kept)[:_MOST])]
+    return [frames[k] for k in sorted(list(kept)[: max(_MOST, len(extremes))])]
 
 
 def _nearest(frame: Frame, chosen: Sequence[Frame]) -> int:
@@ -163,7 +164,7 @@ def _camera(choice: Choice | None) -> tuple[str, str] | None:
 
 
 def _stretches(
-    founds: Sequence[Probed], lens: Lens, target: Target, budget_px: float, folder: Path
+    founds: Sequence[Probed], target: Target, budget_px: float, folder: Path
 ) -> Iterable[tuple[list[int], Choice]]:
     """Rows of `founds` that one model serves, and the model; what none serves is left out."""
     order = sorted(range(len(founds)), key=lambda k: (_zoom(founds[k]), founds[k].asked.focus_m))

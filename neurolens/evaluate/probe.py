@@ -202,8 +202,8 @@ def effect_maps(found: Probed) -> Maps:
     """Unit and map [H, W] of each effect over the picture, upright; NaN where the lens is dark. See `effects_mm`.
 
     An Airy disc has no RMS radius: diffraction is worth the radius that holds half its light, 0.53 wavelengths times
-    the f-number (Born and Wolf, 8.5.2). Transmittance is the colour that the lens gives, by its glass and coatings and an
-    aperture that changes with the wavelength: RMS over wavelengths of the light there relative to its mean.
+    the f-number (Born and Wolf, 8.5.2). Transmittance is the colour that the lens gives, by its glass and coatings and
+    an aperture that changes with the wavelength: RMS over wavelengths of the light there relative to its mean.
     """
     pixel, share = found.asked.pixel_mm, found.places.share
     parts = {k: v / pixel for k, v in prints.effects_mm(found.seen, found.thin_seen, share).items()}

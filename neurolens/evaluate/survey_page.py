@@ -34,7 +34,7 @@ COLUMNS = (
 )  # fmt: skip
 _TEXTS = ("file", "verdict", "format", "name", "rims", "reason")
 _LISTS = ("notes", "doubts")
-_STYLE = """<style>
+TABLE_STYLE = """<style>
 .survey td.t { text-align: left; white-space: normal; min-width: 22rem; max-width: 34rem; overflow-wrap: anywhere; }
 .survey tbody th { max-width: 16rem; white-space: normal; overflow-wrap: anywhere; }
 .survey tbody th small { color: var(--dim); display: block; }
@@ -48,7 +48,7 @@ _STYLE = """<style>
 body { max-width: 1800px; }
 </style>"""
 # Sorts by a heading (numbers as numbers, what is missing last), and shows rows that hold all words and a chosen kind.
-_SCRIPT = """<script>
+TABLE_SCRIPT = """<script>
 (() => {
   const table = document.querySelector('.survey table'), body = table.tBodies[0], rows = [...body.rows];
   const words = document.getElementById('words'), kinds = [...document.querySelectorAll('.kind')];
@@ -154,7 +154,7 @@ def survey_page(records: Sequence[Mapping[str, Any]], collection: Collection, se
     table = f"<div class='survey'><table>{body}</table></div>"
     title = f"Survey of {collection.folder.name or collection.folder}"
     top = f"<header><h1>{text(title)}</h1></header><ul>{said}</ul>"
-    return page(title, f"{_STYLE}{top}{tools}{table}{legend(columns)}{about}{_SCRIPT}")
+    return page(title, f"{TABLE_STYLE}{top}{tools}{table}{legend(columns)}{about}{TABLE_SCRIPT}")
 
 
 def _row(record: Mapping[str, Any], columns: Sequence[Column]) -> str:

@@ -12,7 +12,7 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.field import spectrum_of
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.warped import WarpedPinhole
+from neurolens.cameras.warped import Warped
 from neurolens.cli import main
 from neurolens.commands.plan import TARGETS
 from neurolens.evaluate import plan as planned
@@ -130,7 +130,7 @@ def test_a_warped_pinhole_shows_what_is_in_focus_where_the_lens_does(lens: str) 
     shot = Shot((18.0, 10.0), 2.0, f_number=16.0)
     exact, hole = make_camera(f"lenses/{lens}.toml", shot), make_camera(f"pinhole:lenses/{lens}.toml", shot)
     assert isinstance(hole, Pinhole)
-    flat, film = WarpedPinhole(hole, exact, 2.0), 0.7 * FILM
+    flat, film = Warped(hole, exact, 2.0), 0.7 * FILM
     nanometres, light = spectrum_of(exact)
     share = light / light.sum()
     for depth_m, most in ((2.0, 5e-4), (0.5, math.inf)):  # what is nearer is seen from elsewhere

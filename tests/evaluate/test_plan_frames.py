@@ -19,11 +19,11 @@ from neurolens.render.scene import Scene, scene_from_tables
 LENS = "lenses/laikin_double_gauss_50.toml"
 
 
-def frames(focus: list[float], f_number: float = 2.8, width: int = 160) -> list[Frame]:
+def frames(focus: list[float], f_number: float = 2.8, film_mm: float = 28.0) -> list[Frame]:
     shot = {"position_m": [0.0, 0.0, 0.0], "look_at_m": [0.0, 0.0, -1.0], "focus_m": 3.0, "f_number": f_number}
     plane = {"point_m": [0.0, 0.0, -4.0], "normal": [0.0, 0.0, 1.0], "material": "grey"}
     tables = {
-        "camera": shot | {"width": width, "height": width * 9 // 16, "film_width_mm": 28.0, "film_height_mm": 15.75},
+        "camera": shot | {"width": 160, "height": 90, "film_width_mm": film_mm, "film_height_mm": film_mm * 9 / 16},
         "environment": {"colour": [1.0, 1.0, 1.0]}, "planes": [plane],
         "materials": {"grey": {"kind": "diffuse", "reflectance": [0.5, 0.5, 0.5]}},
     }  # fmt: skip
@@ -39,19 +39,19 @@ def test_frames_at_the_extremes_are_probed() -> None:
     focus = [3.0 + 0.01 * k for k in range(40)]
     focus[17], focus[29] = 0.7, 50.0
     numbers = [f.number for f in representatives(frames(focus))]
-    assert {1, 18, 30, 40} <= set(numbers) and len(numbers) == 9 and numbers == sorted(numbers)
+    assert {1, 18, 30, 40} <= set(numbers) and len(numbers) == 5 and numbers == sorted(numbers)
     assert [f.number for f in representatives(frames([2.0] * 5))] == [1]  # all alike
 
 
 def test_breathing_is_that_of_the_picture() -> None:
-    """A lens focused by its film shows less as the film moves away: sizes go as the distance from pupil to film."""
+    """A lens focused by its film shows less as that moves away: near the axis, sizes go as the chief ray's reach."""
     lens = read_lens(LENS).at()
-    far, near = (probe(f.scene, lens, across=8) for f in frames([1e4, 0.8], 11.0))
+    far, near = (probe(f.scene, lens, across=8) for f in frames([1e4, 0.8], 11.0, 8.0))
     found = breathing_px([near, far])
     assert found is not None
     reach = [p.exact.settings["lens_state"]["pinhole_focal_length_mm"] for p in (far, near)]
     height = np.hypot(*far.places.film_mm)
-    expected = np.percentile(height * (reach[1] / reach[0] - 1) / far.asked.pixel_mm, 95)
+    expected = np.percentile(height * (1 - reach[0] / reach[1]) / far.asked.pixel_mm, 95)
     assert found[0] == pytest.approx(expected, rel=0.03) and found[0] > 1
     assert breathing_px([far, far]) is None
 
@@ -59,7 +59,7 @@ def test_breathing_is_that_of_the_picture() -> None:
 def test_a_rack_takes_as_few_fits_as_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "probe", partial(probe, across=5))
     monkeypatch.setattr(module, "TERMS", (8, 28))
-    lens, rack = read_lens(LENS).at(), frames([0.7, 0.7, 30.0])
+    lens, rack = read_lens(LENS).at(), frames([0.7, 0.7, 1.2])
     moved = plan_frames(rack, lens, 0.5, folder=tmp_path)
     assert moved.fits == 1 and [(r.first, r.last) for r in moved.runs] == [(1, 3)] and moved.probed == (1, 3)
     assert moved.runs[0].choice is not None and moved.runs[0].choice.error_px <= 0.5
@@ -84,7 +84,7 @@ def test_stretches_are_the_fewest(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
             return terms if max(self.reach) - min(self.reach) <= 0.5 + 1e-9 and terms >= 12 else None
 
     monkeypatch.setattr(module, "_Stretch", Short)
-    found = list(module._stretches(founds, lens, "render", 1.0, tmp_path))
+    found = list(module._stretches(founds, "render", 1.0, tmp_path))
     got = [sorted(near[k] for k in rows) for rows, _ in found]
     assert sorted(v for g in got for v in g) == near and all(max(g) - min(g) <= 0.5 + 1e-9 for g in got)
     assert len(got) == 4  # 1.85, 1.3, and 0.2 to 0.75 is two
