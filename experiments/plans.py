@@ -160,9 +160,9 @@ def measure_case(case: Case, folder: Path, report: Report) -> dict[str, Any]:
 def _ladder(found: Probed, folder: Path) -> list[Path]:
     """Polynomials of the shot, of all sizes, made as plans make theirs."""
     folder.mkdir(parents=True, exist_ok=True)
-    prepared = prepare(make_pairs(found.lens, found.domain, plans._PAIRS))
+    prepared = prepare(make_pairs(found.lens, found.domain, plans.PAIRS))
     made = []
-    for terms in sorted({*plans._TERMS, *MORE_TERMS}):
+    for terms in sorted({*plans.TERMS, *MORE_TERMS}):
         settings = ModelSettings("ols", terms=terms, planes=False, elimination=False)
         file = folder / f"{Path(found.lens.path).stem}.shot-{settings.label}.onnx"
         export_onnx(fit_model(prepared, settings), file, errors={})
@@ -321,7 +321,7 @@ def page(rows: Sequence[Mapping[str, Any]]) -> str:
         {"lens": r["lens"], "scene": r["scene"]} | e for r in rows for e in r["effects"] if not effect_holds(e)
     ]  # fmt: skip
     tried = [len(r["cameras"]) for r in rows] or [0]
-    head = _HEAD.format(cases=len(rows), tried=f"{min(tried)} to {max(tried)}", sizes=len({*plans._TERMS, *MORE_TERMS}))
+    head = _HEAD.format(cases=len(rows), tried=f"{min(tried)} to {max(tried)}", sizes=len({*plans.TERMS, *MORE_TERMS}))
     named = lab.columns(
         ("lens", "lens"), ("scene", "scene"), ("effect", "name"), ("probe", "probe", ".3g"), ("fresh", "fresh", ".3g"),
         ("", "unit"),

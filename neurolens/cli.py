@@ -65,13 +65,15 @@ def build_parser() -> Parser:
         stmap,
         survey,
         train,
+        view,
     )
 
     parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
     read = lens, analyse, glass, convert, survey, library, stmap, projection
-    for command in (*read, plan, train, models, evaluate, export, render, merge, flare, mitsuba, blender, bench, demo):
+    made = train, models, evaluate, export, render, merge, flare, mitsuba, blender, view
+    for command in (*read, plan, *made, bench, demo):
         command.add_parser(subparsers)
     return parser
 

@@ -36,11 +36,13 @@ PARTS = {
     "evaluate": {
         *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba", "flare")
     },
+    "view": {"graph", "optics", "analysis", "cameras"},
     "blender": set(),
     "commands": {
         *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba", "flare"),
         "blender",
         "evaluate",
+        "view",
     },
     "cli": {"commands"},
 }

@@ -7,7 +7,7 @@ import math
 import os
 import re
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
@@ -243,11 +243,21 @@ def lens_path(name: str | Path, command: str) -> Path:
 
 
 def named_camera(text: str) -> str:
-    """Type of a camera's argument: lenses and models that ship by name, after `fused:` and the like, too, as files."""
+    """Type of a camera's argument: lenses and models that ship by name, after `fused:` and the like, too, as files.
+
+    A TOML file that names a `camera` (that of `neurolens plan`) stands for it.
+    """
     kind, colon, word = text.rpartition(":")
     for file in (library() / "lenses" / f"{word}.toml", library() / "models" / f"{word}.onnx"):
         if not set(word) & set("/\\") and file.is_file():
             return f"{kind}{colon}{os.path.relpath(file) if file.is_relative_to(Path.cwd()) else file}"
+    if word.endswith(".toml") and Path(word).is_file():
+        from neurolens.base.tomlfile import read_toml
+
+        with suppress(InputError):  # said where the camera is made
+            if isinstance(named := read_toml(word).get("camera"), str) and named != "none":
+                own, own_colon, path = named.rpartition(":")
+                return f"{kind or own}{colon or own_colon}{os.path.normpath(Path(word).parent / path)}"
     return text
 
 

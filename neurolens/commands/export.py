@@ -66,7 +66,7 @@ def add_parser(subparsers: Any) -> None:
         epilog=_EPILOG,
     )  # fmt: skip
     parser.add_argument(
-        "model", metavar="MODEL", type=lambda text: Path(named_camera(text)),
+        "model", metavar="MODEL", type=lambda text: Path(named_camera(text).removeprefix("fused:")),
         help="exported model (.onnx), or a run folder with one model; of C, GLSL, OSL also a lens file or name",
     )  # fmt: skip
     parser.add_argument("--to", choices=("c", "glsl", "osl", "onnx"), required=True, help="form to write")

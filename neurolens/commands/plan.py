@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path, library
+from neurolens.base.files import atomic_path, atomic_write_text, library
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_glass, add_json, lens_path
 from neurolens.commands.output import answer, number, plain_numbers, table
@@ -40,8 +40,9 @@ examples:
   neurolens plan scene.toml --lens my_lens.toml --budget 1px --for onnx --explain -o runs/plan
   neurolens plan scene.toml --lens my_lens.toml --frames 1:48 --key focus=1:0.8,48:3
 
--o leaves plan.json (all of it), effects.png (effects, and where in the picture those are that a camera needs)
-and models/ with what was fitted."""
+-o leaves plan.json (all of it), effects.png (effects, and where in the picture those are that a camera needs),
+models/ with what was fitted, and plan.toml: 'render' and 'export' take it for the camera, and 'train' fits a
+model of the shot from it, from scratch."""
 
 
 def add_parser(subparsers: Any) -> None:
@@ -125,6 +126,8 @@ def run(args: argparse.Namespace) -> int:
     data = plain_numbers({"scene": str(args.scene), "lens": str(file), **found.to_dict()})
     with atomic_path(folder / "plan.json") as part:
         part.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    if found.best:
+        atomic_write_text(folder / "plan.toml", found.to_toml(lens, folder))
     plot_effects(found, folder / "effects.png", f"{scene.name} through {lens.name}")
     if args.samples:
         with progress.stage("map of samples"):
@@ -187,27 +190,20 @@ def _text(args: argparse.Namespace, found: Plan, folder: Path) -> str:
     else:
         told = f"Use {best.name}: {number(best.error_px, 3)} px of {found.budget_px:g}, {number(best.cost, 3)} "
         told += f"{found.unit} a ray times noise"
-        parts.append("\n".join([f"{told}{', ' + best.how if best.how else ''}", *_commands(args, found, best)]))
-    return "\n\n".join([*parts, f"Written: {folder}/plan.json, effects.png{', samples.exr' if args.samples else ''}"])
+        parts.append("\n".join([f"{told}{', ' + best.how if best.how else ''}", *_commands(args, found, best, folder)]))
+    written = ["plan.json", "effects.png", *["plan.toml"] * bool(best), *["samples.exr"] * args.samples]
+    return "\n\n".join([*parts, f"Written: {folder}/{', '.join(written)}"])
 
 
-def _commands(args: argparse.Namespace, found: Plan, best: Choice) -> list[str]:
+def _commands(args: argparse.Namespace, found: Plan, best: Choice, folder: Path) -> list[str]:
     """How the camera is made where the target runs it; ideal cameras are everybody's own."""
     ideal = best.camera.startswith(("pinhole:", "thin:", "thick:"))
-    words = ["neurolens", "render", str(args.scene), "--camera", best.camera, "-o", "render.exr"]
+    words = ["neurolens", "render", str(args.scene), "--camera", f"{folder}/plan.toml", "-o", "render.exr"]
     if found.target != "render":
         if ideal or found.target == "onnx":
             return []
         language, asked = found.target, found.asked
-        words = [
-            "neurolens",
-            "export",
-            best.camera.removeprefix("fused:"),
-            "--to",
-            language,
-            "-o",
-            f"camera.{language}",
-        ]
+        words = ["neurolens", "export", f"{folder}/plan.toml", "--to", language, "-o", f"camera.{language}"]
         if language != "osl":  # whose inputs they are
             film, focus = "x".join(f"{v:g}" for v in asked.film_mm), f"{asked.focus_m:g}"
             words[3:3] = ["--camera", "--film", film, "--focus", focus, "--f-number", f"{asked.f_number:.6g}"]

@@ -10,6 +10,7 @@ measured here, with one thread; of shaders it is counted.
 from __future__ import annotations
 
 import math
+import os
 import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
@@ -20,8 +21,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from neurolens.base.config import to_toml
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
 from neurolens.base.progress import Report
+from neurolens.base.tomlfile import format_toml
 from neurolens.cameras.build import Shot, ideal_as
 from neurolens.cameras.contract import Camera, CameraRays, FloatArray
 from neurolens.cameras.exact import FusedExactCamera
@@ -39,13 +42,15 @@ from neurolens.evaluate.costs import (
     ns_a_ray,
     shader_cost,
 )
+from neurolens.evaluate.experiment import DomainChoice, EvaluationChoice, Experiment, LensChoice
 from neurolens.evaluate.footprints import Footprints
 from neurolens.evaluate.probe import COUNTED, LIGHT, Asked, Effect, Probed, effects_of, probe
-from neurolens.evaluate.shaders import lens_of
+from neurolens.evaluate.shaders import IDLE, lens_of
 from neurolens.graph.compiler import has_compiler
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.render.scene import Scene
+from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import Prepared, fit_model, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs
@@ -54,8 +59,10 @@ from neurolens.surrogates.settings import ModelSettings
 Target = Literal["render", "c", "onnx", "osl", "glsl"]
 Cost = Callable[[], tuple[float, float]]  # of a ray, and noise
 _OURS = ("render", "c")  # run compiled C
-TERMS = (4, 6, 8, 12, 16, 22, 28, 36, 48)  # of the polynomials that are fitted on the spot
+TERMS = (2, 4, 6, 8, 12, 16, 22, 28, 36, 48, 64, 90)  # of the polynomials that are fitted on the spot
 _SHOT = "fitted for this shot"
+_FIT = ModelSettings("ols", planes=False, elimination=False, idle_gates=IDLE)
+_FOCUS_SPARE = 0.25  # of a pixel of blur: what a model may place its film beside the lens's
 PAIRS = PairSettings(train=5000, held_out=1000, rim=5000)
 _MOST_OVERSCAN = 4.0  # of a plane picture that is warped afterwards
 
@@ -69,6 +76,7 @@ class Choice:
             where it has no light that the lens has. cost: of a ray, in the plan's unit, times `noise`; inf where it was
             not asked for. noise: how many times the rays it needs for equal error, see `costs`.
         how: what else it needs, or how it was made. within: whether it meets the budget of its plan.
+        settings: of a model that was fitted for the shot.
     """
 
     name: str
@@ -79,6 +87,7 @@ class Choice:
     noise: float
     how: str = ""
     within: bool = False
+    settings: ModelSettings | None = None
 
     def meets(self, budget_px: float) -> bool:
         """Whether it may be used."""
@@ -90,13 +99,14 @@ class Plan:
     """What was asked, the effects in falling order of worth, every camera tried by rising cost, the one to use.
 
     Attributes:
-        unit: of costs: "ns" or, where no time is known, "operations".
+        unit: of costs: "ns" or, where no time is known, "operations". domain: of models that are fitted.
     """
 
     asked: Asked
     budget_px: float
     target: Target
     unit: str
+    domain: DomainChoice
     effects: tuple[Effect, ...]
     choices: tuple[Choice, ...]
     best: Choice | None
@@ -107,6 +117,19 @@ class Plan:
         told = asdict(replace(self, probed=None))  # type: ignore[arg-type]
         del told["probed"]
         return told
+
+    def to_toml(self, lens: Lens, folder: Path) -> str:
+        """The text of a file in a folder that `render` and `export` take for the best camera, and `train` as the
+        experiment that fits it, where it is a model of the shot. Paths in it are relative to the folder."""
+        best = self.best
+        assert best is not None
+        kind, colon, path = best.camera.rpartition(":")
+        camera, title = f"{kind}{colon}{os.path.relpath(path, folder)}", f"{lens.name}: {best.name}"
+        if best.settings is None:
+            return format_toml({"title": title, "camera": camera})
+        choice = LensChoice(Path(os.path.relpath(lens.path, folder)), f_number=self.asked.f_number)
+        checks = EvaluationChoice(vignetting_rays=50_000, rounds=0, compile_exact=False)
+        return to_toml(Experiment(title, choice, (best.settings,), self.domain, PAIRS, checks, camera=camera))
 
 
 def plan(
@@ -156,7 +179,8 @@ def decided(found: Probed, tried: Sequence[Choice], budget_px: float, target: Ta
     """The plan for a budget, from candidates that serve it."""
     ranked = tuple(replace(c, within=c.meets(budget_px)) for c in sorted(tried, key=lambda c: c.cost))
     best = next((c for c in ranked if c.within), None)
-    return Plan(found.asked, budget_px, target, UNIT[target], effects_of(found, budget_px), ranked, best, found)
+    effects = effects_of(found, budget_px)
+    return Plan(found.asked, budget_px, target, UNIT[target], shot_domain(found), effects, ranked, best, found)
 
 
 @dataclass(frozen=True)
@@ -323,13 +347,22 @@ def model_choice(found: Probed, target: Target, file: Path, how: str, costed: bo
         return next(_model(_Trial(found, target, math.inf if costed else -1.0), file, how), None)
 
 
-def fitted_file(prepared: Prepared, lens: Lens, terms: int, folder: Path, name: str) -> Path:
-    """A polynomial of a shot, fitted and written."""
-    settings = ModelSettings("ols", terms=terms, planes=False, elimination=False)
+def fitted_file(prepared: Prepared, lens: Lens, terms: int, folder: Path, name: str) -> tuple[Path, ModelSettings]:
+    """A polynomial of a shot, fitted and written, and how it was fitted."""
+    settings = replace(_FIT, name=f"{name}-ols-{terms}", terms=terms)
     folder.mkdir(parents=True, exist_ok=True)
-    file = folder / f"{Path(lens.path).stem}.{name}-{settings.label}.onnx"
+    file = folder / f"{Path(lens.path).stem}.{settings.label}.onnx"
     export_onnx(fit_model(prepared, settings), file, errors={})
-    return file
+    return file, settings
+
+
+def shot_domain(found: Probed) -> DomainChoice:
+    """The shot's, with as much more of the film's way as blurs a quarter of a pixel: models have their own focus."""
+    asked = found.asked
+    move = _FOCUS_SPARE * asked.f_number * asked.pixel_mm / first_order(found.lens).efl_mm ** 2  # of the vergence, 1/mm
+    vergence = 1e-3 / asked.focus_m
+    ends = 1e-3 / (vergence - move) if vergence > move else math.inf, 1e-3 / (vergence + move)
+    return DomainChoice(found.domain.film_radius_mm, ends, asked.wavelength_nm)
 
 
 def _fitted(
@@ -344,7 +377,10 @@ def _fitted(
     asked = [b for b in budgets_px if explain or not any(c.meets(b) and c.name.startswith(ideal) for c in tried)]
     if not asked:
         return
-    prepared = prepare(make_pairs(found.lens, found.domain, PAIRS))
+    lens, domain, choice = found.lens.with_aperture(None), found.domain, shot_domain(found)
+    with suppress(InputError):  # a lens that goes no nearer
+        domain = domain_of(lens, **asdict(choice))
+    prepared = prepare(make_pairs(lens, domain, PAIRS))
     known: dict[int, tuple[Path, list[Choice]]] = {}
     smallest = set()
     for k, budget_px in enumerate(asked):
@@ -352,10 +388,12 @@ def _fitted(
         while low < high:
             size = (low + high) // 2
             if size not in known:
-                file = fitted_file(prepared, found.lens, TERMS[size], folder, "shot")
-                known[size] = file, list(_model(trial if explain else replace(trial, costed_px=-1.0), file, _SHOT))
+                file, settings = fitted_file(prepared, found.lens, TERMS[size], folder, "shot")
+                shown = trial if explain else replace(trial, costed_px=-1.0)
+                known[size] = file, [replace(c, settings=settings) for c in _model(shown, file, _SHOT)]
             low, high = (low, size) if any(c.meets(budget_px) for c in known[size][1]) else (size + 1, high)
             say((k + 1 - (high - low) / len(TERMS)) / len(asked))
         smallest.add(low)
     for size, (file, made) in known.items():  # what is larger than the smallest costs more, and is not compiled
-        yield from _model(trial, file, _SHOT) if size in smallest and not explain else made
+        again = _model(trial, file, _SHOT) if size in smallest and not explain else made
+        yield from (replace(c, settings=made[0].settings) for c in again)

@@ -19,7 +19,17 @@ import numpy as np
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Report
 from neurolens.evaluate import footprints as prints
-from neurolens.evaluate.plan import PAIRS, TERMS, UNIT, Choice, Target, candidates, fitted_file, model_choice
+from neurolens.evaluate.plan import (
+    PAIRS,
+    TERMS,
+    UNIT,
+    Choice,
+    Target,
+    candidates,
+    fitted_file,
+    model_choice,
+    shot_domain,
+)  # fmt: skip
 from neurolens.evaluate.probe import COUNTED, Effect, Probed, effects_of, probe
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
@@ -27,6 +37,7 @@ from neurolens.render.scene import Scene
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.fit import Prepared, prepare
 from neurolens.surrogates.pairs import make_pairs
+from neurolens.surrogates.settings import ModelSettings
 
 _MOST = 5  # frames that are probed, but for more extremes
 _HOW = "fitted for this shot"
@@ -204,38 +215,37 @@ class _Stretch:
     def __init__(self, founds: Sequence[Probed], target: Target, budget_px: float, folder: Path) -> None:
         self.founds, self.target, self.budget_px, self.folder = founds, target, budget_px, folder
         self._prepared: Prepared | None = None
-        self._files: dict[int, Path] = {}
+        self._files: dict[int, tuple[Path, ModelSettings]] = {}
         near, far = (f(p.asked.focus_m for p in founds) for f in (min, max))
         self.name = f"shot-{near:.4g}-{far:.4g}m" if near < far else f"shot-{near:.4g}m"
-        self.widest = min(founds, key=lambda p: p.asked.f_number)
-        self.focus_m = (far, near)
+        self.lens = min(founds, key=lambda p: p.asked.f_number).lens.with_aperture(None)
 
     def prepared(self) -> Prepared:
         """Rays of the domain that holds those of all frames."""
         if self._prepared is None:
-            domains = [p.domain for p in self.founds]
-            depths = [p.asked.nearest_m for p in self.founds if p.asked.nearest_m is not None]
-            near = min(depths, default=None)
-            low, high = (f(x for d in domains for x in d.wavelength_nm) for f in (min, max))
+            ends = [focus for p in self.founds for focus in shot_domain(p).focus_m or ()]
+            low, high = (f(nm for p in self.founds for nm in p.asked.wavelength_nm) for f in (min, max))
             domain = domain_of(
-                self.widest.lens, film_radius_mm=max(d.film_radius_mm for d in domains), focus_m=self.focus_m,
-                wavelength_nm=(low, high), nearest_m=near if near is not None and near < self.focus_m[1] else None,
+                self.lens, film_radius_mm=max(p.domain.film_radius_mm for p in self.founds),
+                focus_m=(max(ends), min(ends)), wavelength_nm=(low, high),
             )  # fmt: skip
-            self._prepared = prepare(make_pairs(self.widest.lens, domain, PAIRS))
+            self._prepared = prepare(make_pairs(self.lens, domain, PAIRS))
         return self._prepared
 
     def choice(self, terms: int, costed: bool = False) -> Choice | None:
         """The model of a size, with its largest error over the frames; None where one is beyond the budget."""
         if terms not in self._files:
-            self._files[terms] = fitted_file(self.prepared(), self.widest.lens, terms, self.folder, self.name)
+            self._files[terms] = fitted_file(self.prepared(), self.lens, terms, self.folder, self.name)
+        file, settings = self._files[terms]
         found: list[Choice] = []
         for probed in self.founds:
-            made = model_choice(probed, self.target, self._files[terms], _HOW, costed and not found)
+            made = model_choice(probed, self.target, file, _HOW, costed and not found)
             if made is None or not made.meets(self.budget_px):
                 return None
             found.append(made)
         worst = max(found, key=lambda c: c.error_px)
-        return replace(worst, cost=found[0].cost, noise=found[0].noise, light_error=max(c.light_error for c in found))
+        light = max(c.light_error for c in found)
+        return replace(worst, cost=found[0].cost, noise=found[0].noise, light_error=light, settings=settings)
 
 
 def _effects(founds: Sequence[Probed], budget_px: float) -> tuple[Effect, ...]:

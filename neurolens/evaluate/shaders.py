@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 # Of an exact lens: its wavelengths; its nearest focus in focal lengths; best focus lies beside the paraxial one by less
 # than this share of the film's travel.
 LIGHT_NM, _NEAR_EFL, _SPARE = (400.0, 700.0), 10.0, 0.1
-_IDLE = 5e-4  # of the domain's rays: gates that alone block fewer go, and darken no pixel by a thousandth
+IDLE = 5e-4  # of the domain's rays: gates that alone block fewer go, and darken no pixel by a thousandth
 MAX_STEPS = 12_000  # of a ray: compilers take minutes for more
 
 
@@ -120,7 +120,7 @@ def _smallest(file: Path, has_states: bool) -> Graph | None:
     from neurolens.surrogates.specialise import without_idle_gates
     from neurolens.surrogates.stored import load_fitted
 
-    (model,) = without_idle_gates((load_fitted(file),), _IDLE)
+    (model,) = without_idle_gates((load_fitted(file),), IDLE)
     return model_graph(model, largest_angle(model), SCALARS)
 
 

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from neurolens.base.errors import InputError
+from neurolens.base.tomlfile import format_toml
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.field import spectrum_of
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.warped import Warped
 from neurolens.cli import main
+from neurolens.commands.arguments import named_camera
 from neurolens.commands.plan import TARGETS
 from neurolens.evaluate import plan as planned
 from neurolens.evaluate.costs import noise, shader_cost
@@ -23,7 +25,10 @@ from neurolens.evaluate.probe import effects_of, probe
 from neurolens.evaluate.scenes import seen_depths_m
 from neurolens.evaluate.shaders import lens_of
 from neurolens.optics.lensfile import read_lens
+from neurolens.render.pictures import read_exr
 from neurolens.render.scene import load_scene, scene_from_tables
+from neurolens.surrogates.cores import InvariantPolynomial
+from neurolens.surrogates.stored import load_fitted
 
 LENS = "lenses/cooke_triplet_50.toml"  # of absorbing glass: nothing is compiled
 GAUSS = "lenses/laikin_double_gauss_50.toml"
@@ -185,7 +190,7 @@ def test_noise_of_weights_is_how_many_times_the_rays_it_takes() -> None:
 def test_what_is_cheapest_differs_by_target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Blender's own thin lens costs less than any shader; in our renderer a small polynomial costs less than it."""
     found = probe(load_scene(Path("experiments/scenes/garden.toml")), read_lens(GAUSS).at(), across=8)
-    monkeypatch.setattr(planned, "_TERMS", (8,))
+    monkeypatch.setattr(planned, "TERMS", (8,))
     targets: tuple[Target, ...] = ("render", "osl")
     best = {t: decided(found, candidates(found, (1.0,), t, folder=tmp_path), 1.0, t).best for t in targets}
     assert best["osl"] is not None and best["osl"].name == "thin + ST map" and best["osl"].error_px < 1
@@ -221,3 +226,36 @@ def test_a_warped_pinhole_lacks_the_blur_alone() -> None:
 
 def test_targets_are_those_of_the_command() -> None:
     assert TARGETS == get_args(Target)
+
+
+def test_a_plan_s_file_is_taken_by_train_render_and_export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same model again from scratch, in numbers; the pictures of the file and of the model that it names agree."""
+    monkeypatch.setattr(planned, "TERMS", (6,))
+    scene, folder = tmp_path / "scene.toml", tmp_path / "plan"
+    film = {"film_width_mm": 18.0, "film_height_mm": 10.125, "width": 64, "height": 36, "samples": 2}
+    scene.write_text(format_toml(wall(4.0, 4.0, **film)))
+    lens = tmp_path / "own.toml"  # no model of it ships
+    lens.write_bytes(Path(LENS).read_bytes())
+    asked = ["--lens", str(lens), "--budget", "0.03px", "--for", "onnx", "-o", str(folder), "--quiet"]
+    assert main(["plan", str(scene), *asked]) == 0
+    file, model = folder / "plan.toml", next((folder / "models").glob("*.onnx"))
+    quick = ["--quiet", "--set", "evaluation.vignetting_rays=2000"]
+    assert main(["train", str(file), "--out", str(tmp_path / "run"), *quick]) == 0
+    made, again = (load_fitted(f) for f in (model, tmp_path / "run" / "models" / "shot-ols-6.onnx"))
+    assert isinstance(made.core, InvariantPolynomial) and isinstance(again.core, InvariantPolynomial)
+    np.testing.assert_array_equal(made.core.exponents, again.core.exponents)
+    np.testing.assert_allclose(made.core.ab, again.core.ab, rtol=1e-9, atol=1e-12)
+    pictures = [tmp_path / f"{k}.exr" for k in range(2)]
+    for camera, picture in zip((file, model), pictures, strict=True):
+        assert main(["render", str(scene), "--camera", str(camera), "-o", str(picture), "--quiet"]) == 0
+    np.testing.assert_allclose(*(read_exr(p)[0] for p in pictures), rtol=1e-3, atol=1e-4)
+    assert main(["export", str(file), "--to", "c", "-o", str(tmp_path / "lens.h")]) == 0
+    assert "film radius 10.3" in (tmp_path / "lens.h").read_text().lower()  # of the shot
+
+
+def test_a_plan_s_file_names_cameras_that_nothing_is_fitted_for(tmp_path: Path) -> None:
+    found = plan(scene_from_tables(wall(4.0)), read_lens(LENS).at(), 0.0)
+    file = tmp_path / "plan.toml"
+    file.write_text(found.to_toml(read_lens(LENS).at(), tmp_path))
+    assert Path(named_camera(str(file))).resolve() == Path(LENS).resolve()
+    assert named_camera("experiments/quickstart.toml") == "experiments/quickstart.toml"

@@ -1,7 +1,6 @@
 """Plans of animations: which frames are probed, breathing, and how many models are fitted."""
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -46,7 +45,7 @@ def test_frames_at_the_extremes_are_probed() -> None:
 def test_breathing_is_that_of_the_picture() -> None:
     """A lens focused by its film shows less as that moves away: near the axis, sizes go as the chief ray's reach."""
     lens = read_lens(LENS).at()
-    far, near = (probe(f.scene, lens, across=8) for f in frames([1e4, 0.8], 11.0, 8.0))
+    far, near = (probe(f.scene, lens, across=5) for f in frames([1e4, 0.8], 11.0, 8.0))
     found = breathing_px([near, far])
     assert found is not None
     reach = [p.exact.settings["lens_state"]["pinhole_focal_length_mm"] for p in (far, near)]
@@ -57,17 +56,21 @@ def test_breathing_is_that_of_the_picture() -> None:
 
 
 def test_a_rack_takes_as_few_fits_as_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "probe", partial(probe, across=5))
+    probed: dict[int, Any] = {}
+
+    def once(scene: Scene, at: Any, **more: Any) -> Any:
+        return probed[id(scene)] if id(scene) in probed else probed.setdefault(id(scene), probe(scene, at, across=4))
+
+    monkeypatch.setattr(module, "probe", once)
     monkeypatch.setattr(module, "TERMS", (8, 28))
     lens, rack = read_lens(LENS).at(), frames([0.7, 0.7, 1.2])
     moved = plan_frames(rack, lens, 0.5, folder=tmp_path)
     assert moved.fits == 1 and [(r.first, r.last) for r in moved.runs] == [(1, 3)] and moved.probed == (1, 3)
     assert moved.runs[0].choice is not None and moved.runs[0].choice.error_px <= 0.5
     assert {"breathing", "distortion"} <= {e.name for e in moved.effects}
-    for budget, name in ((1e9, "pinhole + ST map"), (0.0, "exact")):
-        free = plan_frames(rack, lens, budget)
-        assert free.fits == 0 and len(free.runs) == 1 and free.cost is not None
-        assert free.runs[0].choice is not None and free.runs[0].choice.name == name
+    free = plan_frames(rack, lens, 0.0)
+    assert free.fits == 0 and len(free.runs) == 1 and free.cost is not None
+    assert free.runs[0].choice is not None and free.runs[0].choice.name == "exact"
 
 
 def test_stretches_are_the_fewest(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
