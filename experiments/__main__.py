@@ -35,6 +35,7 @@ NAMES = {
     "spectral-noise": ("spectral_noise", "noise of the ways to sample wavelengths"),
     "refine-spacing": ("refine_spacing", "a spacing refined by gradients through the tracer"),
     "gallery": ("gallery.run", "what real lenses do: figures and numbers"),
+    "random-lenses": ("random_lenses", "random valid lenses as files, for neurolens survey"),
     "fuzz": ("fuzz", "hostile files and command lines: one clear line each, in bounded time and memory"),
     "photons": ("photons", "flare by photons, as in Keshmirian 2008"),
     "glare": ("glare", "contrast that veiling glare takes; ways to sample light that turns round"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,8 +43,12 @@ if TYPE_CHECKING:
     from neurolens.cameras.build import Shot
     from neurolens.cameras.contract import Camera, FloatArray
     from neurolens.optics.apertures import Aperture
+    from neurolens.optics.prescription import Lens
     from neurolens.render.renderer import RenderResult
     from neurolens.render.scene import CameraSettings, Scene
+
+_LENS_STATE = "focus", "f_number", "zoom"
+_FLARE_FRAMES = 16  # that tell which lights and ghosts are brightest
 
 _DESCRIPTION = """\
 Path-trace a scene (experiments/scenes/*.toml) and write OpenEXR, linear sRGB or ACEScg, with
@@ -119,7 +123,7 @@ def add_parser(subparsers: Any) -> None:
         help="workers, each pinned to a core if there are as many as cores (default: 2)",
     )  # fmt: skip
     add_json(parser, quiet=True)
-    parser.set_defaults(position_m=None, look_at_m=None, frame=None)
+    parser.set_defaults(position_m=None, look_at_m=None, frame=None, shared=None)
     parser.set_defaults(run=run_kept, kept="no picture was written; older files of that name are untouched")
 
 
@@ -221,13 +225,33 @@ def _flare(
     if lens is None:
         warn(f"no flare of {camera.name}: that takes a lens file that is traced as it is")
         return {}
-    from neurolens.flare.layers import scene_flare
+    from neurolens.flare.layers import scene_choice, scene_flare
     from neurolens.flare.picture import Raster
 
     try:
-        return scene_flare(scene, lens, Raster(camera.film_mm, *size), film.white_balance, args.threads, progress)
+        if args.shared is not None and args.shared.flare is None:
+            args.shared.flare = scene_choice(list(_flare_frames(scene, lens, args)))
+        choice = None if args.shared is None else args.shared.flare
+        raster = Raster(camera.film_mm, *size)
+        return scene_flare(scene, lens, raster, film.white_balance, args.threads, progress, choice)
     except InputError as error:
         raise InputError(args.scene, f"[flare]: {error.file}, {error.field}", error.value, error.expected) from None
+
+
+def _flare_frames(scene: Scene, lens: Lens, args: argparse.Namespace) -> Iterator[tuple[Scene, Lens]]:
+    """The scene and the lens in some of the frames that a command makes."""
+    from neurolens.cameras.build import make_camera
+    from neurolens.render.scene import seen_from
+
+    lenses = {tuple(getattr(args, name) for name in _LENS_STATE): lens}
+    states = args.shared.states
+    for values in states[:: -(-len(states) // _FLARE_FRAMES)]:
+        there = argparse.Namespace(**vars(args) | values)
+        state = tuple(getattr(there, name) for name in _LENS_STATE)
+        if state not in lenses:
+            shot = shot_of(scene.settings.camera, there, scene.aperture)
+            lenses[state] = make_camera(args.camera, shot, Progress(quiet=True)).lens  # type: ignore[attr-defined]
+        yield seen_from(scene, args.scene, there.position_m, there.look_at_m), lenses[state]
 
 
 def _pixel_notes(camera: Camera, width: int) -> list[str]:

@@ -68,6 +68,14 @@ def add_frames(parser: argparse.ArgumentParser, does: str = _RENDERED, names: Se
     )  # fmt: skip
 
 
+@dataclass
+class Shared:
+    """What the frames of a command share: options that keys set in each, and the `Choice` of flare once it is made."""
+
+    states: list[dict[str, Any]]
+    flare: Any = None
+
+
 def run_frames(args: argparse.Namespace, render: Callable[[argparse.Namespace], int]) -> int:
     """Render the frames that are missing, by `render`, as the keys say; the exit code of the first that fails.
 
@@ -79,14 +87,15 @@ def run_frames(args: argparse.Namespace, render: Callable[[argparse.Namespace], 
     """
     from neurolens.render.tiles import tile_path
 
-    kept = 0
-    for frame, number, values in frames_of(args):
+    kept, every = 0, list(frames_of(args))
+    shared = Shared([values for _, _, values in every])
+    for frame, number, values in every:
         out = args.out.with_name(f"{args.out.stem}.{number}{args.out.suffix}")
         written = tile_path(out, args.tile)
         if written.is_file() and not Files.of(written).checkpoint.exists() and not args.restart:
             kept += 1
             continue
-        values |= {"out": out, "seed": args.seed + frame, "frame": frame}
+        values = {**values, "out": out, "seed": args.seed + frame, "frame": frame, "shared": shared}
         code = render(argparse.Namespace(**vars(args) | values))
         if code:
             return code

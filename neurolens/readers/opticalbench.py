@@ -21,7 +21,7 @@ from neurolens.optics.lensfile import MAX_SURFACES
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.readers.assemble import same_glass
 from neurolens.readers.draft import INFINITE, Draft, Given, Row, State, lens_of
-from neurolens.readers.source import Line, assume, read_lines
+from neurolens.readers.source import Line, assume, read_lines, warn
 
 SECTIONS = ("descriptive data", "constants", "variable distances", "lens data", "aspherical data")
 _PLANE = ("AS", "FS", "CG", "INFINITY", "INF")
@@ -41,6 +41,7 @@ class _File:
     ids: dict[str, int] = field(default_factory=dict)
     gaps: dict[int, tuple[Line, str]] = field(default_factory=dict)
     aspheres: list[tuple[Line, list[str]]] = field(default_factory=list)
+    field_stops: set[int] = field(default_factory=set)
 
     def value(self, name: str, place: int) -> float | None:
         """A variable in a state, None where it is not told; "Infinity" is `math.inf`."""
@@ -60,7 +61,7 @@ def read_opticalbench(path: str | Path, given: Given | None = None) -> Lens:
     found = _File(Draft(str(path), "Optical Bench", unit="mm", drawn=True, rims="estimated"))
     section = ""
     for line in read_lines(path):
-        text = line.text.partition("#")[0]
+        text = line.text.partition("#")[0].partition("//")[0]
         words = [word.strip() for word in text.rstrip().split("\t")]
         if text.strip().startswith("["):
             section = text.strip().strip("[]").strip().lower()
@@ -68,6 +69,9 @@ def read_opticalbench(path: str | Path, given: Given | None = None) -> Lens:
             _read(found, section, line, words)
     if not found.surfaces:
         raise InputError(str(path), "[lens data]", "(no rows)", "the table of surfaces")
+    if found.surfaces[-1].n_d != 1:
+        assume(str(path), "the last medium is glass: a plane is assumed behind it, the film in the focus")
+        found.surfaces.append(Surface(math.inf, 0.0, found.surfaces[-1].diameter_mm))
     for line, words in found.aspheres:
         _bend(found, line, words)
     return lens_of(_complete(found), given)
@@ -109,7 +113,9 @@ def _row(found: _File, line: Line, words: list[str]) -> None:
         thickness = float(gap)
     except ValueError:
         found.gaps[k], thickness = (line, gap), math.nan
-    plane = radius.upper() in _PLANE
+    if radius.upper() == "FS":
+        found.field_stops.add(k)
+    plane = radius.upper().lstrip("+-") in _PLANE
     medium: dict[str, Any] = {}
     if index:
         n_d, V_d = line.number_of("n_d", index), line.number_of("V_d", abbe) if abbe else None
@@ -127,12 +133,15 @@ def _row(found: _File, line: Line, words: list[str]) -> None:
 
 def _bend(found: _File, line: Line, words: list[str]) -> None:
     """Add a row of aspheric data to its surface."""
+    if words[0].partition("(")[0] in found.ids and words[0].endswith(")"):
+        warn(line.file, f"line {line.number}: the data of {words[0]}, another version of its surface, are left out")
+        return
     if words[0] not in found.ids:
         raise line.error("[aspherical data]", words[0], f"the number of a surface: {', '.join(found.ids)}")
     k = found.ids[words[0]]
     values = [line.number_of("coefficient", w) if w else 0.0 for w in words[2:]]
     surface = found.surfaces[k]
-    if len(words) > 1 and words[1].upper() not in (*_PLANE, ""):
+    if len(words) > 1 and words[1].upper().lstrip("+-") not in (*_PLANE, ""):
         radius = line.number_of("radius", words[1])
         if abs(radius - surface.radius_mm) > _SAME * abs(radius):
             raise line.error("radius", radius, f"{surface.radius_mm:g}, as the table has for surface {words[0]}")
@@ -163,7 +172,7 @@ def _complete(found: _File) -> Draft:
     if opening is not None and opening > 0:
         rows = [replace(s, diameter_mm=opening) if s.stop else s for s in rows]
     draft.object_distance = table.object_distance
-    draft.rows = tuple(Row(s, aperture=not s.stop and not math.isnan(s.diameter_mm)) for s in rows)
+    draft.rows = tuple(Row(s, aperture=_cuts(found, rows, k)) for k, s in enumerate(rows))
     draft.f_number = table.f_number
     draft.film_given = table.film_given
     if math.isinf(table.object_distance):
@@ -176,6 +185,15 @@ def _complete(found: _File) -> Draft:
         assume(file, "an NA in the place of an f-number: the stop's diameter is taken")
     draft.states = tuple(states) if len(states) > 1 else ()
     return draft
+
+
+def _cuts(found: _File, rows: list[Surface], k: int) -> bool:
+    """Whether the file sets an aperture: a rim on glass, or a field stop that does not reach into an element."""
+    before = rows[k - 1].thickness_mm if k else 0.0
+    if k in found.field_stops and min(before, rows[k].thickness_mm) < 0:
+        assume(found.draft.file, f"field stop {k}, a ring about an element, is left out: rims are assumed to decide")
+        return False
+    return not rows[k].stop and not math.isnan(rows[k].diameter_mm)
 
 
 def _positive(value: float | None) -> float | None:

@@ -192,6 +192,15 @@ def test_collection_mistakes(suffix: str, old: str, new: str, said: str, tmp_pat
         read_text(swapped(old, new, DRAWN[suffix](GAUSS)), suffix, tmp_path)
 
 
+def test_optical_bench_oddities(tmp_path: Path) -> None:
+    text = swapped("d2\t2.0", "d2\t2.0 // a word", swapped("4\tInfinity", "4\t-Infinity", ZOOM))
+    text = swapped("5\tInfinity\tBf\t\t24\n", "", text) + "1(WX)\t60\t0\t1\n"
+    lens, assumed = read_text(text, ".txt", tmp_path)
+    assert len(assumed) == 1 and "the last medium is glass" in assumed[0]
+    assert [s.radius_mm for s in lens.surfaces[3:]] == [math.inf, math.inf] and lens.surfaces[-1].n_d == 1
+    assert lens.surfaces[0].conic == -0.5
+
+
 def test_near_state_of_a_camera_file(tmp_path: Path) -> None:
     text = DRAWN[".camera.toml"](GAUSS)
     text += "[focus]\nclose_distance = 500.0\n[[focus.variable]]\nsurface = 1\nthickness_close = 0.5\n"
