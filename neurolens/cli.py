@@ -64,6 +64,7 @@ def build_parser() -> Parser:
         render,
         stmap,
         survey,
+        trade,
         train,
         view,
     )
@@ -73,7 +74,7 @@ def build_parser() -> Parser:
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
     read = lens, analyse, glass, convert, survey, library, stmap, projection
     made = train, models, evaluate, export, render, merge, flare, mitsuba, blender, view
-    for command in (*read, plan, *made, bench, demo):
+    for command in (*read, plan, trade, *made, bench, demo):
         command.add_parser(subparsers)
     return parser
 

@@ -54,8 +54,10 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("scene", metavar="SCENE", type=Path, help="scene file (.toml)")
     parser.add_argument("--lens", metavar="LENS", required=True, help="lens file (.toml), or a name in lenses/")
     parser.add_argument(
-        "--budget", metavar="PIXELS", type=_pixels, default=0.25, help="error allowed, as 0.25px (default: 0.25px)"
-    )
+        "--budget", metavar="BUDGET", type=_budget, default=0.25,
+        help="error allowed, as 0.25px (default); or time, as 20s: of one thread, for the scene's size and samples, "
+        "for which the most faithful camera is chosen",
+    )  # fmt: skip
     parser.add_argument(
         "--for", dest="target", choices=TARGETS, default="render",
         help="what runs the camera: our renderer, compiled C, onnxruntime, Blender's Cycles (osl), or a renderer in "
@@ -83,14 +85,29 @@ def add_parser(subparsers: Any) -> None:
     parser.set_defaults(run=run, kept="models fitted so far are kept, the plan is not written")
 
 
-def _pixels(text: str) -> float:
-    match = re.fullmatch(r"([0-9.]{1,20}(?:e[+-]?[0-9]{1,3})?)(px)?", text)
+class Seconds(float):
+    """A budget of time."""
+
+
+def pixels(text: str) -> float:
+    """Type of a budget in pixels."""
+    return _number(text, "px", "pixels, as 0.25px")
+
+
+def _budget(text: str) -> float:
+    if text.endswith("s"):
+        return Seconds(_number(text, "s", "seconds, as 20s"))
+    return _number(text, "px", "pixels, as 0.25px, or seconds, as 20s")
+
+
+def _number(text: str, unit: str, expected: str) -> float:
+    match = re.fullmatch(rf"([0-9.]{{1,20}}(?:e[+-]?[0-9]{{1,3}})?)({unit})?", text)
     try:
         if match and 0 <= (value := float(match[1])) < 1e12:
             return value
     except ValueError:
         pass
-    raise argparse.ArgumentTypeError(f"got {text!r}, expected pixels, as 0.25px")
+    raise argparse.ArgumentTypeError(f"got {text!r}, expected {expected}")
 
 
 def _afterwards(text: str) -> tuple[str, ...]:
@@ -104,6 +121,7 @@ def run(args: argparse.Namespace) -> int:
     """Plan, write, print; 1 where no camera for this target is within the budget."""
     from neurolens.evaluate.plan import plan
     from neurolens.evaluate.plots import plot_effects
+    from neurolens.evaluate.trade import plan_within
     from neurolens.optics.lensfile import read_lens
     from neurolens.render.scene import load_scene
 
@@ -118,10 +136,12 @@ def run(args: argparse.Namespace) -> int:
         return run_plan_frames(args, file, shipped, folder)
     progress = Progress({"plan": 10} | ({"map of samples": 2} if args.samples else {}), quiet=args.quiet)
     with progress.stage("plan") as report:
-        found = plan(
-            scene, lens, args.budget, target=args.target, models=shipped, explain=args.explain, report=report,
-            folder=folder / "models" if args.fit else None, afterwards=args.afterwards, denoised=args.denoise,
-        )  # fmt: skip
+        look: dict[str, Any] = {"afterwards": args.afterwards, "denoised": args.denoise, "report": report}
+        look |= {"target": args.target, "models": shipped, "folder": folder / "models" if args.fit else None}
+        if isinstance(args.budget, Seconds):
+            found = plan_within(scene, lens, args.budget, **look)
+        else:
+            found = plan(scene, lens, args.budget, explain=args.explain, **look)
     folder.mkdir(parents=True, exist_ok=True)
     data = plain_numbers({"scene": str(args.scene), "lens": str(file), **found.to_dict()})
     with atomic_path(folder / "plan.json") as part:
@@ -183,12 +203,15 @@ def _text(args: argparse.Namespace, found: Plan, folder: Path) -> str:
             f"{found.unit} a ray times noise, the rays it takes for equal error"
         )
     best = found.best
-    if best is None:
+    if best is None and found.budget_s is not None:
+        parts.append(f"No camera for --for {found.target} takes {found.budget_s:g} s.")
+    elif best is None:
         nearest = min(found.choices, key=lambda c: c.error_px, default=None)
         closest = f"; the closest is {nearest.name} with {number(nearest.error_px, 3)} px" if nearest else ""
         parts.append(f"No camera for --for {found.target} keeps {found.budget_px:g} px{closest}.")
     else:
-        told = f"Use {best.name}: {number(best.error_px, 3)} px of {found.budget_px:g}, {number(best.cost, 3)} "
+        allowed = f"within {found.budget_s:g} s" if found.budget_s is not None else f"of {found.budget_px:g}"
+        told = f"Use {best.name}: {number(best.error_px, 3)} px {allowed}, {number(best.cost, 3)} "
         told += f"{found.unit} a ray times noise"
         parts.append("\n".join([f"{told}{', ' + best.how if best.how else ''}", *_commands(args, found, best, folder)]))
     written = ["plan.json", "effects.png", *["plan.toml"] * bool(best), *["samples.exr"] * args.samples]

@@ -26,11 +26,10 @@ from neurolens.base.errors import InputError, ModelError, NeurolensWarning
 from neurolens.base.progress import Report
 from neurolens.base.tomlfile import format_toml
 from neurolens.cameras.build import Shot, ideal_as
-from neurolens.cameras.contract import Camera, CameraRays, FloatArray
+from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import FusedExactCamera
 from neurolens.cameras.fused import FusedCamera
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.warped import Warped
 from neurolens.evaluate import footprints as prints
 from neurolens.evaluate.costs import (
@@ -60,6 +59,8 @@ Target = Literal["render", "c", "onnx", "osl", "glsl"]
 Cost = Callable[[], tuple[float, float]]  # of a ray, and noise
 _OURS = ("render", "c")  # run compiled C
 TERMS = (2, 4, 6, 8, 12, 16, 22, 28, 36, 48, 64, 90)  # of the polynomials that are fitted on the spot
+_EXACT, _IDEAL = "exact", ("pinhole", "thin", "thick")
+_MAPPED = " + ST map"  # after the name of an ideal camera
 _SHOT = "fitted for this shot"
 _FIT = ModelSettings("ols", planes=False, elimination=False, idle_gates=IDLE)
 _FOCUS_SPARE = 0.25  # of a pixel of blur: what a model may place its film beside the lens's
@@ -99,11 +100,13 @@ class Plan:
     """What was asked, the effects in falling order of worth, every camera tried by rising cost, the one to use.
 
     Attributes:
+        budget_s: seconds of a plan for a time, whose `budget_px` is then the error of the best camera.
         unit: of costs: "ns" or, where no time is known, "operations". domain: of models that are fitted.
     """
 
     asked: Asked
     budget_px: float
+    budget_s: float | None
     target: Target
     unit: str
     domain: DomainChoice
@@ -180,7 +183,7 @@ def decided(found: Probed, tried: Sequence[Choice], budget_px: float, target: Ta
     ranked = tuple(replace(c, within=c.meets(budget_px)) for c in sorted(tried, key=lambda c: c.cost))
     best = next((c for c in ranked if c.within), None)
     effects = effects_of(found, budget_px)
-    return Plan(found.asked, budget_px, target, UNIT[target], shot_domain(found), effects, ranked, best, found)
+    return Plan(found.asked, budget_px, None, target, UNIT[target], shot_domain(found), effects, ranked, best, found)
 
 
 @dataclass(frozen=True)
@@ -195,13 +198,6 @@ class _Trial:
     def share(self) -> prints.Array:
         """Of the wavelengths."""
         return self.found.places.share
-
-    @property
-    def real(self) -> dict[str, Any]:
-        """The shot as cameras of lenses take it."""
-        asked = self.found.asked
-        shot = {"film_mm": asked.film_mm, "focus_m": asked.focus_m, "f_number": asked.f_number}
-        return {**shot, "wavelength_nm": asked.wavelength_nm}
 
     def judged(
         self, name: str, spec: str, seen: Footprints, cost: Callable[[], tuple[float, float]], how: str = ""
@@ -241,67 +237,50 @@ class _Trial:
         return shader_cost(lens, self.found.places, asked.film_mm, asked.f_number, asked.focus_m)
 
 
+def camera_of(found: Probed, choice: Choice) -> Camera:
+    """The camera of a choice, in our renderer; with the maps of its picture, where it needs them.
+
+    Raises:
+        InputError, ModelError: as the cameras.
+    """
+    kind, _, path = choice.camera.rpartition(":")
+    if choice.name == _EXACT:
+        return found.exact
+    if kind in _IDEAL:
+        flat = ideal_as(f"{kind}:", found.exact.lens, Shot(found.asked.film_mm, found.asked.focus_m))
+        mapped = choice.name.endswith(_MAPPED)
+        return Warped(flat, found.exact, found.asked.focus_m, tables=True) if mapped else flat
+    return (FusedCamera if kind else OnnxCamera)(load_model(path), **_real(found))
+
+
+def _real(found: Probed) -> dict[str, Any]:
+    """The shot as cameras of lenses take it."""
+    asked = found.asked
+    shot = {"film_mm": asked.film_mm, "focus_m": asked.focus_m, "f_number": asked.f_number}
+    return {**shot, "wavelength_nm": asked.wavelength_nm}
+
+
 def _ideal(trial: _Trial) -> Iterator[Choice]:
     """Pinhole, thin and thick lens, as they are and with their picture warped afterwards, where the target has them.
 
     In C and GLSL they are their own source.
     """
     found, shot = trial.found, Shot(trial.found.asked.film_mm, trial.found.asked.focus_m)
-    kinds = {"onnx": (), "osl": ("pinhole:", "thin:")}.get(trial.target, ("pinhole:", "thin:", "thick:"))
-    for kind in kinds:
-        name, spec = kind.rstrip(":"), f"{kind}{found.lens.path}"
+    for name in {"onnx": (), "osl": _IDEAL[:2]}.get(trial.target, _IDEAL):
+        spec = f"{name}:{found.lens.path}"
         with suppress(InputError):  # no thick lens of cylinders; no maps of half a sphere, or of a film that is dark
-            camera = ideal_as(kind, found.exact.lens, shot)
+            camera = ideal_as(f"{name}:", found.exact.lens, shot)
             seen = prints.footprints(camera, found.places)
             yield trial.judged(name, spec, seen, partial(trial.ideal, name, camera, seen))
             if "distortion" in found.asked.afterwards:
                 continue
-            where = "" if kind == "thick:" or trial.target in _OURS else "from the entrance pupil, "
-            if kind == "thin:" and not where:
+            if name == "thin" and trial.target in _OURS:
                 continue  # in our renderer the thick lens stands in its place
             maps = Warped(camera, found.exact, found.asked.focus_m)
-            area = maps.area
-            if isinstance(camera, Pinhole) or not where:
-                where = ""
-                warped: Footprints | None = prints.footprints(maps, found.places)
-            else:
-                warped = _warped(found, _FromPupil(camera, found))
-            if area < _MOST_OVERSCAN and warped is not None:
-                how = f"{where}then the ST map of 'neurolens stmap' over the picture, of {area:.3g} times the area"
-                cost = partial(trial.ideal, name, camera, seen, area)
-                yield trial.judged(f"{name} + ST map", spec, warped, cost, how)
-
-
-class _FromPupil:
-    """An ideal camera that stands in the lens's entrance pupil: its rays meet the plane in focus where they did."""
-
-    def __init__(self, camera: Camera, found: Probed) -> None:
-        lens = found.exact.lens
-        self.camera, self.focus_m = camera, min(found.asked.focus_m, 1e6)
-        self.z_m = (first_order(lens).entrance_pupil_z_mm - float(lens.film_z_mm or 0.0)) / 1000
-
-    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `Camera.sample`."""
-        rays = self.camera.sample(film_mm, pupil, wavelength_nm)
-        origin, way = rays.origin_m.astype(np.float64), rays.direction.astype(np.float64)
-        met = origin + way * ((-self.focus_m - origin[2]) / way[2])
-        start = np.stack([origin[0], origin[1], np.full(origin.shape[1], self.z_m)])
-        way = (met - start) / np.linalg.norm(met - start, axis=0)
-        return replace(rays, origin_m=start.astype(np.float32), direction=way.astype(np.float32))
-
-
-def _warped(found: Probed, camera: Any) -> Footprints | None:
-    """Footprints of a camera whose picture is moved, and its light scaled, by maps for the plane in focus."""
-    places = found.places
-    focus = np.full(places.film_mm.shape[1], found.asked.focus_m)
-    flat = prints.places_of(found.exact, places.film_mm, focus, places.wavelength_nm, places.share)
-    if flat.film_mm.shape != places.film_mm.shape:
-        return None
-    by = np.subtract(*(prints.centroids(prints.footprints(c, flat), places.share)[0] for c in (found.exact, camera)))
-    seen = prints.footprints(camera, places)
-    lit = seen.weight > 0
-    weight = seen.weight * (found.seen.light / np.maximum(seen.light, 1e-30))[:, None, None]
-    return Footprints(np.where(lit, seen.place_mm + by[:, :, None, None], 0.0), seen.pupil_mm, weight)
+            if maps.area < _MOST_OVERSCAN:
+                how = f"then the ST map of 'neurolens stmap' over the picture, of {maps.area:.3g} times the area"
+                cost = partial(trial.ideal, name, camera, seen, maps.area)
+                yield trial.judged(f"{name}{_MAPPED}", spec, prints.footprints(maps, found.places), cost, how)
 
 
 def _exact(trial: _Trial) -> Iterator[Choice]:
@@ -314,7 +293,7 @@ def _exact(trial: _Trial) -> Iterator[Choice]:
     }.get(target, lambda: trial.timed(exact, found.seen))
     if target == "render" or (target != "onnx" and compiled) or target in ("osl", "glsl"):
         with suppress(InputError):  # coatings, and glass that absorbs
-            yield trial.judged("exact", f"{'fused:' if compiled and target in _OURS else ''}{path}", found.seen, cost)
+            yield trial.judged(_EXACT, f"{'fused:' if compiled and target in _OURS else ''}{path}", found.seen, cost)
 
 
 def _model(trial: _Trial, file: Path, how: str = "") -> Iterator[Choice]:
@@ -326,7 +305,7 @@ def _model(trial: _Trial, file: Path, how: str = "") -> Iterator[Choice]:
     compiled = target in _OURS and has_compiler()
     with suppress(InputError, ModelError):
         model = load_model(file)
-        camera = OnnxCamera(model, **trial.real)
+        camera = OnnxCamera(model, **_real(trial.found))
         seen = prints.footprints(camera, trial.found.places)
 
         def cost() -> tuple[float, float]:
@@ -334,7 +313,7 @@ def _model(trial: _Trial, file: Path, how: str = "") -> Iterator[Choice]:
                 return trial.shader(file)
             if target == "glsl":
                 return glsl_operations(camera), noise(seen.weight, trial.share)
-            return trial.timed(FusedCamera(model, **trial.real) if compiled else camera, seen)
+            return trial.timed(FusedCamera(model, **_real(trial.found)) if compiled else camera, seen)
 
         if compiled or target != "c":
             yield trial.judged(file.stem, f"{'fused:' if compiled else ''}{file}", seen, cost, how)

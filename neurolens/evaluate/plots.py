@@ -13,7 +13,8 @@ from neurolens.evaluate.pages import Record, number
 from neurolens.evaluate.records import pareto_front
 
 if TYPE_CHECKING:
-    from neurolens.evaluate.plan import Plan
+    from neurolens.evaluate.plan import Choice, Plan
+    from neurolens.evaluate.trade import Trade
 
 # Names, Okabe and Ito's colours, and markers, which tell kinds apart without colours; black is the exact tracer's.
 Kinds = Mapping[str, tuple[str, str, str]]
@@ -192,21 +193,42 @@ def _bars_and_trade(plan: Plan, figure: Any) -> None:
     bars.set_xlim(left=least)
     bars.set_xlabel("worth (pixels), grey: left out")
     timed = [c for c in plan.choices if 0 < c.cost < float("inf") and c.error_px < float("inf")]
-    errors = [max(c.error_px, 1e-4) for c in timed]
-    trade.scatter([c.cost for c in timed], errors, c=["#0072b2" if c.within else "#b8b8b8" for c in timed], s=26)
-    chosen = [k for k, c in enumerate(timed) if c == plan.best]
-    ring = {"s": 150, "fc": "none", "ec": "#d55e00", "lw": 1.8}
-    trade.scatter([timed[k].cost for k in chosen], [errors[k] for k in chosen], **ring)
-    trade.set_xscale("log")
-    trade.set_yscale("log")
+    _cameras(trade, timed, [c.cost for c in timed], plan.best)
     trade.set_xlabel(f"cost ({plan.unit} a ray times noise), --for {plan.target}")
-    trade.set_ylabel("error (pixels; none is drawn at 0.0001)")
-    place_labels(trade, [(c.cost, e) for c, e in zip(timed, errors, strict=True)], [_short(c.name) for c in timed])
     if plan.budget_px > 0:
         bars.axvline(plan.budget_px, color="#d55e00", lw=1.2)
         trade.axhline(plan.budget_px, color="#d55e00", lw=1.2, label=f"budget {plan.budget_px:g} px; ring: chosen")
         trade.legend(loc="lower right", bbox_to_anchor=(1, 1), frameon=False)
     plain_log_ticks(bars.xaxis, trade.xaxis, trade.yaxis)
+
+
+def _cameras(axes: Any, choices: Sequence[Choice], places: Sequence[float], best: Choice | None) -> None:
+    """Errors of cameras over something, those within the budget in colour, the chosen one with a ring."""
+    errors = [max(c.error_px, 1e-4) for c in choices]
+    axes.scatter(places, errors, c=["#0072b2" if c.within else "#b8b8b8" for c in choices], s=26)
+    chosen = [k for k, c in enumerate(choices) if c == best]
+    ring = {"s": 150, "fc": "none", "ec": "#d55e00", "lw": 1.8}
+    axes.scatter([places[k] for k in chosen], [errors[k] for k in chosen], **ring)
+    axes.set(xscale="log", yscale="log", ylabel="error (pixels; none is drawn at 0.0001)")
+    place_labels(axes, list(zip(places, errors, strict=True)), [_short(c.name) for c in choices])
+
+
+def plot_trade(trade: Trade, path: Path, title: str) -> None:
+    """Error of every camera against its seconds, with the front of those that no other betters."""
+    plan, offered = trade.plan, [o for o in trade.offered if o.choice.error_px < float("inf")]
+    subtitle = f"--for {plan.target}; 95% of the picture keeps these errors"
+    subtitle += f"; the scene itself takes {trade.base:.3g} {trade.unit}" * bool(trade.base)
+    with drawing(path, 8.5, 5.0, title, subtitle) as figure:
+        axes = figure.subplots()
+        _cameras(axes, [o.choice for o in offered], [o.seconds for o in offered], plan.best)
+        best = trade.front
+        at = [o.seconds for o in best], [max(o.choice.error_px, 1e-4) for o in best]
+        axes.step(*at, where="post", color=INK, lw=1.2, alpha=0.7, label="no camera betters both")
+        axes.set_xlabel(f"{trade.unit} that the camera adds, one thread, to equal noise")
+        if plan.budget_px > 0:
+            axes.axhline(plan.budget_px, color="#d55e00", lw=1.2, label=f"budget {plan.budget_px:g} px; ring: chosen")
+        axes.legend(loc="lower right", bbox_to_anchor=(1, 1), frameon=False, ncols=2)
+        plain_log_ticks(axes.xaxis, axes.yaxis)
 
 
 def _short(name: str) -> str:
