@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import math
 import sys
+import zipfile
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -12,8 +13,6 @@ from typing import Any
 import pytest
 
 from neurolens.blender import pack
-from neurolens.commands.blender_lenses import field_table
-from neurolens.optics.lensfile import read_lens
 
 
 def _extension() -> tuple[ModuleType, ModuleType]:
@@ -77,6 +76,10 @@ def test_what_keeps_no_tolerance_names_the_best() -> None:
 
 def test_field_is_that_of_the_lens_and_goes_through_the_zip(tmp_path: Path) -> None:
     """A stopped and scaled form of the same lens has the field scaled; the facts are read as they were written."""
+    pytest.importorskip("torch")
+    from neurolens.commands.blender_lenses import field_table
+    from neurolens.optics.lensfile import read_lens
+
     path = "lenses/cooke_triplet_50.toml"
     once, twice = (field_table(read_lens(path).at(focal_length_mm=f), r) for f, r in ((50.0, 18.0), (100.0, 36.0)))
     assert once is not None and twice is not None
@@ -86,8 +89,6 @@ def test_field_is_that_of_the_lens_and_goes_through_the_zip(tmp_path: Path) -> N
     assert once["light"][0] == sorted(once["light"][0], reverse=True) and once["light"][0][0] == 1
     form = pack.Form("polynomial", "ols", "shader", 0.5, 18.0, 5.0, 0.7)
     pack.write_pack(tmp_path / "n.zip", [pack.PackedLens("a", "A", 50.0, 5.0, "", None, [form], once)])
-    import zipfile
-
     with zipfile.ZipFile(tmp_path / "n.zip") as packed:
         packed.extractall(tmp_path)
     found, wrong = library.read_library([tmp_path])

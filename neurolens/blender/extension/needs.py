@@ -45,8 +45,8 @@ def needs(lens: LensFacts, setting: Setting, depths_m: Sequence[float], f_number
         # Of all aberrations none shrinks less than the aperture does.
         blurred = lens.field.at(lens.field.blur_um, corner, focus) / pixel_um * lens.f_number / f_number
         dark = 1 - lens.field.at(lens.field.light, corner, focus)
-        worth = f"distortion up to {moved:.2g} px, aberrations {blurred:.2g} px, corners {100 * dark:.0f}% darker"
-    asked = f"At f/{f_number:.3g} depths in view are blurred by up to {defocus:.2g} px; {worth}."
+        worth = f"distortion up to {_px(moved)} px, aberrations {_px(blurred)} px, corners {100 * dark:.0f}% darker"
+    asked = f"At f/{f_number:.3g} depths in view are blurred by up to {_px(defocus)} px; {worth}."
     if moved is not None and blurred is not None and max(moved, blurred) <= tolerance_px:
         if defocus <= tolerance_px:
             return Advice(PINHOLE, ("Use Blender's camera without depth of field.", asked))
@@ -65,6 +65,10 @@ def needs(lens: LensFacts, setting: Setting, depths_m: Sequence[float], f_number
     if errors:
         best = f"; the best is {min(errors)[1]} with {min(errors)[0]:.2g} px"
     return Advice("", (f"No form of this lens keeps {tolerance_px:g} px{best}.", asked))
+
+
+def _px(value: float) -> str:
+    return f"{value:.2g}" if value >= 1e-3 else "0"
 
 
 def confusion_mm(efl_mm: float, f_number: float, focus_m: float, depth_m: float) -> float:
