@@ -9,8 +9,9 @@ change of blur and a change of light would make of it, to second order in the si
 
 All are filtered by one Gaussian before, so that derivatives are of what is sampled. Noise would bend a fit towards 0:
 derivatives and differences that are multiplied come from renders of different seeds (an instrument's variables, Lucas
-and Kanade's rule otherwise), and each part counts as far as it is above twice its standard error, from leaving a seed
-out. A change of variance becomes a way that light moves by the blur that the exact lens has there.
+and Kanade's rule otherwise), and each part counts as far as it is above three times its standard error, from leaving
+a seed out. A change of variance becomes a way that light moves by the blur that the exact lens and the pixel have
+there: a picture shows no finer one.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ _SMOOTH_PX = 1.2  # of pictures before derivatives
 _EDGE = 4  # pixels at a piece's rim that the filter spoils
 _COLOURS = np.array([0.2126, 0.7152, 0.0722])  # luminance of linear sRGB: what each colour counts
 _DEPTH = 2  # of paths: light that comes directly has all edges
-_PART = 2.0  # standard errors above which a part of a difference is one
+_PART = 3.0  # standard errors, of four seeds, above which a part of a difference is one
+_PIXEL = 1 / 6  # squared RMS distance of a pixel's points from its centre, px^2: a picture shows no finer blur
 
 
 # ---- By rays. --------------------------------------------------------------------------------------------------------
@@ -164,7 +166,8 @@ def moved(exact: Array, other: Array, blur_px: float) -> Moved:
         # A shift's own second order looks like a variance.
         wider = found[2] - found[0] ** 2 - found[1] ** 2
         wider = np.sign(wider) * max(abs(wider) - _PART * error[2], 0.0)
-        spread = np.sqrt(max(blur_px**2 + wider, 0.0)) - blur_px
+        before = blur_px**2 + _PIXEL
+        spread = np.sqrt(max(before + wider, 0.0)) - np.sqrt(before)
         total += share * (sure[0] ** 2 + sure[1] ** 2 + spread**2)
         noise += share * (error[0] ** 2 + error[1] ** 2)
         gain += share * found[3]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from experiments import lab, plan_errors
 from neurolens.base.progress import Report
 from neurolens.cameras.build import Shot, ideal_as, make_camera
 from neurolens.cameras.contract import Camera
+from neurolens.cameras.exact import FusedExactCamera
 from neurolens.cameras.warped import Warped
 from neurolens.evaluate import footprints as prints
 from neurolens.evaluate import plan as plans
@@ -33,10 +34,6 @@ from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm
 from neurolens.render.scene import Scene, load_scene
 from neurolens.surrogates.bases import pinned_threads
-from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.fit import fit_model, prepare
-from neurolens.surrogates.pairs import make_pairs
-from neurolens.surrogates.settings import ModelSettings
 
 LENSES = (
     "laikin_double_gauss_50", "ogawa_zoom_70_200@135mm", "horimoto_fisheye_16", "phone_lens_6", "cooke_anamorphic_42",
@@ -44,14 +41,14 @@ LENSES = (
 )  # fmt: skip
 SCENES = ("distant", "garden", "room", "lights")  # stopped down and grey, to wide open among coloured lights
 BUDGETS = (1.0, 0.25, 0.05)
-TARGETS: tuple[plans.Target, ...] = ("render", "osl")
-MORE_TERMS = (5, 10, 19, 64)  # besides those of plans
+TARGETS: tuple[plans.Target, ...] = ("render", "onnx")
+MORE_TERMS = (10, 19)  # besides those of plans
 _WIDTH = 1920
 _LIT = 0.95  # of the image circle that the film's corners reach
 _LARGEST_MM = 36.0
 _PIECE_PX, _SAMPLES, _SEEDS = 40, 24, 4
-_TIMED_PX = 2.0  # error in the plan's places up to which a camera may hold at others, and is timed
-_UNSURE_PX = 0.2  # noise of a piece beyond which it tells nothing
+_TRIED_PX = 1.5  # error in the plan's places up to which a camera may hold at others, and is timed
+_UNSURE, _FEWEST = 0.5, 3  # noise over the budget beyond which a piece tells nothing; pieces that decide
 _EFFECT = 0.2, 0.02  # relative, or in pixels: what the probe's effects may be wrong by
 
 
@@ -91,21 +88,23 @@ class Case:
 CASES = tuple(Case(lens, scene) for lens in LENSES for scene in SCENES)
 
 
-def suited(scene: Scene, lens: Lens, width: int = _WIDTH) -> Scene:
-    """A scene at `width` x 9/16 of it pixels on a film that the lens lights; what is too near for it is moved away.
+def suited(scene: Scene, lens: Lens, f_number: float | None = None, focus_m: float | None = None) -> Scene:
+    """A scene at 1920 x 1080 pixels on a film that the lens lights, as far away as it has to be in focus.
 
-    The lens opens as far as the scene asks, where it can; by night and near ("lights") as far as it can.
+    Args:
+        f_number: as far as the lens opens; else as the scene asks, and of "lights", at night and near, wide open.
+        focus_m: distance of what is in focus; else that of the scene, but no nearer than the lens focuses.
     """
     shot = scene.settings.camera
     across = min(2 * _LIT * image_radius_mm(lens)[0] * 16 / math.hypot(16, 9), _LARGEST_MM)
-    back = max(near_limit_m(lens) - shot.focus_m, 0.0)
+    focus = max(shot.focus_m, near_limit_m(lens)) if focus_m is None else focus_m
     eye, target = np.array(shot.position_m), np.array(shot.look_at_m)
-    x, y, z = (float(v) for v in eye - back * (target - eye) / np.linalg.norm(target - eye))
+    x, y, z = (float(v) for v in eye - (focus - shot.focus_m) * (target - eye) / np.linalg.norm(target - eye))
     widest = first_order(lens).f_number
-    f_number = widest if scene.name == "lights" else max(shot.f_number or widest, widest)
+    asked = f_number or (0.0 if scene.name == "lights" else shot.f_number or widest)
     camera = replace(
-        shot, position_m=(x, y, z), focus_m=shot.focus_m + back, f_number=f_number,
-        film_width_mm=across, film_height_mm=across * 9 / 16, width=width, height=width * 9 // 16,
+        shot, position_m=(x, y, z), focus_m=focus, f_number=max(asked, widest), film_width_mm=across,
+        film_height_mm=across * 9 / 16, width=_WIDTH, height=_WIDTH * 9 // 16,
     )  # fmt: skip
     return replace(scene, settings=replace(scene.settings, camera=camera))
 
@@ -119,55 +118,74 @@ def measure_case(case: Case, folder: Path, report: Report) -> dict[str, Any]:
     began = time.process_time()
     found = probe(scene, lens)
     probe_s = time.process_time() - began
-    places = plan_errors.fresh_places(scene, found.exact)
-    fresh = Fresh(places, plan_errors.fresh_prints(found.exact, places))
+    asked = found.asked
+    shot = Shot(asked.film_mm, asked.focus_m, asked.f_number, zoom=case.state, wavelength_nm=asked.wavelength_nm)
+    compiled = "fused:" if isinstance(found.exact, FusedExactCamera) else ""
+    exact = make_camera(
+        f"{compiled}{lens.path}", shot
+    )  # as a render has it: a plan's own has another outline of pupils
+    places = plan_errors.fresh_places(scene, exact)
+    fresh = Fresh(exact, places, plan_errors.fresh_prints(exact, places))
     report(0.1)
-    extra = [*case.shipped(), *_ladder(found, folder / "all")]
-    report(0.2)
     rows: dict[str, dict[str, Any]] = {}
     chosen: dict[str, plans.Choice] = {}
-    decisions = []
+    decisions: list[dict[str, Any]] = []
+    sizes: list[Path] = []
     for number, target in enumerate(TARGETS):
         began = time.process_time()
-        picks = plans.candidates(found, BUDGETS, target, models=case.shipped(), folder=folder / "shot")
+        if number == 0:
+            picks = plans.candidates(found, BUDGETS, target, models=case.shipped(), folder=folder)
+            fitted = [folder / f"{c.name}.onnx" for c in picks if c.how == plans._SHOT]
+        else:  # fits are the same for all targets
+            picks = plans.candidates(found, BUDGETS, target, models=[*case.shipped(), *fitted])
         plan_s = probe_s + time.process_time() - began
-        every = plans.candidates(found, (_TIMED_PX, 0.0), target, models=extra)
-        report(0.3 + 0.2 * number)
-        for choice in every:
-            if choice.name not in rows:
+        report(0.2 + 0.3 * number)
+        every = {c.name: c for c in picks} | {c.name: c for c in _more(found, target, folder, picks, sizes)}
+        report(0.3 + 0.3 * number)
+        for choice in every.values():
+            row = rows.setdefault(choice.name, {"plan_px": choice.error_px, "plan_light": choice.light_error})
+            row[f"cost_{target}"] = choice.cost if math.isfinite(choice.cost) else None
+            if "px" not in row and row["plan_px"] <= _TRIED_PX:
                 camera = camera_of(choice, found, case.state)
                 apart, light = plan_errors.by_rays(camera, fresh.places, fresh.seen, found.asked.pixel_mm)
-                rows[choice.name] = {
-                    "plan_px": choice.error_px, "plan_light": choice.light_error, "px": _counted(apart),
-                    "light": _counted(light),
-                }  # fmt: skip
-            rows[choice.name][f"cost_{target}"] = choice.cost if math.isfinite(choice.cost) else None
+                row |= {"px": _counted(apart), "light": _counted(light)}
         for budget in BUDGETS:
             best = plans.decided(found, picks, budget, target).best
-            decisions.append(_decision(target, budget, best, every, rows) | {"plan_s": plan_s})
+            decisions.append(_decision(target, budget, best, list(every.values()), rows) | {"plan_s": plan_s})
             if best is not None and best.name != "exact":
                 chosen.setdefault(best.name, best)
     report(0.7)
     told = _by_renders(case, scene, found, fresh, list(chosen.values()))
     for decision in decisions:
-        decision["render"] = told.get(decision["chosen"])
+        decision["render"] = _seen_in(told.get(decision["chosen"]), decision["budget_px"])
     dense = replace(found, places=places, seen=fresh.seen, thin_seen=plan_errors.fresh_prints(_thin(found), places))
     facts = {"lens": case.lens, "scene": case.scene, "f_number": found.asked.f_number}
     facts |= {"pixel_um": 1e3 * found.asked.pixel_mm, "nearest_m": found.asked.nearest_m}
     return facts | {"effects": _effects(found, dense), "cameras": rows, "decisions": decisions}
 
 
-def _ladder(found: Probed, folder: Path) -> list[Path]:
-    """Polynomials of the shot, of all sizes, made as plans make theirs."""
-    folder.mkdir(parents=True, exist_ok=True)
-    prepared = prepare(make_pairs(found.lens, found.domain, plans.PAIRS))
-    made = []
-    for terms in sorted({*plans.TERMS, *MORE_TERMS}):
-        settings = ModelSettings("ols", terms=terms, planes=False, elimination=False)
-        file = folder / f"{Path(found.lens.path).stem}.shot-{settings.label}.onnx"
-        export_onnx(fit_model(prepared, settings), file, errors={})
-        made.append(file)
-    return made
+def _more(
+    found: Probed, target: plans.Target, folder: Path, picks: Sequence[plans.Choice], made: list[Path]
+) -> Iterator[plans.Choice]:
+    """Polynomials of the shot of all sizes that the plan fitted without their cost, or not at all, made as it does.
+
+    None are larger than what has half of the least budget: they cost more. `made` keeps files for the next target.
+    """
+    trial = plans._Trial(found, target, _TRIED_PX)
+    costs = {c.name: c for c in picks}
+    fit: Any = None
+    for terms in sorted({*plans.shot_terms(found), *MORE_TERMS}):
+        file = folder / f"{Path(found.lens.path).stem}.shot-ols-{terms}.onnx"
+        if file.stem not in costs and file not in made:
+            fit = fit or plans.shot_fits(found, folder)
+            made.append(fit(terms)[0])
+        choice = costs.get(file.stem)
+        if choice is None or not math.isfinite(choice.cost):
+            choice = next(iter(plans._model(trial, file)), None)
+        if choice is not None:
+            yield choice
+            if choice.error_px < min(BUDGETS) / 2:
+                return
 
 
 def camera_of(choice: plans.Choice, found: Probed, state: str | None, smooth: bool = False) -> Camera:
@@ -196,10 +214,10 @@ def _decision(
     """What was chosen, whether it holds at fresh places, and the cheapest camera that does."""
 
     def holds(name: str) -> bool:
-        return bool(rows[name]["px"] <= budget and rows[name]["light"] <= LIGHT)
+        return bool(rows[name].get("px", math.inf) <= budget and rows[name]["light"] <= LIGHT)
 
     costs = {c.name: c.cost for c in every}
-    good = sorted((n for n in costs if holds(n)), key=costs.__getitem__)
+    good = sorted((n for n, cost in costs.items() if math.isfinite(cost) and holds(n)), key=costs.__getitem__)
     cheapest = good[0] if good else None
     made: dict[str, Any] = {"target": target, "budget_px": budget, "chosen": best and best.name, "cheapest": cheapest}
     if best is None:
@@ -210,8 +228,9 @@ def _decision(
 
 @dataclass(frozen=True)
 class Fresh:
-    """Places that no plan saw, and the exact lens's footprints there."""
+    """The exact lens as a render has it, places that no plan saw, and its footprints there."""
 
+    exact: Any
     places: prints.Places
     seen: prints.Footprints
 
@@ -224,27 +243,27 @@ class Fresh:
 
 def _by_renders(
     case: Case, scene: Scene, found: Probed, fresh: Fresh, chosen: Sequence[plans.Choice]
-) -> dict[str, dict[str, Any]]:
-    """Errors of some cameras in renders of pieces of the picture: the counted percentile of those that tell."""
-    centres = plan_errors.pieces_of(scene, found.exact, _PIECE_PX)
+) -> dict[str | None, list[plan_errors.Moved]]:
+    """What some cameras do to pieces of the picture."""
+    centres = plan_errors.pieces_of(scene, fresh.exact, _PIECE_PX)
     blur = fresh.blur_px(centres, found.asked.pixel_mm)
-    truth = plan_errors.rendered(scene, found.exact, centres, _PIECE_PX, _SAMPLES, _SEEDS)
-    made: dict[str, dict[str, Any]] = {}
+    truth = plan_errors.rendered(scene, fresh.exact, centres, _PIECE_PX, _SAMPLES, _SEEDS)
+    made: dict[str | None, list[plan_errors.Moved]] = {}
     for choice in chosen:
         camera = camera_of(choice, found, case.state, smooth=True)
         other = plan_errors.rendered(scene, camera, centres, _PIECE_PX, _SAMPLES, _SEEDS)
-        told = [plan_errors.moved(truth[:, k], other[:, k], float(blur[k])) for k in range(len(blur))]
-        sure = [t for t in told if t.noise_px < _UNSURE_PX]
-        made[choice.name] = {"pieces": len(sure)} | (
-            {
-                "px": _counted([t.px for t in sure]),
-                "noise_px": float(np.median([t.noise_px for t in sure])),
-                "gain": _counted([abs(t.gain) for t in sure]),
-            }
-            if sure
-            else {}
-        )
+        pairs = [(truth[:, k], other[:, k], float(blur[k])) for k in range(len(blur))]
+        made[choice.name] = [plan_errors.moved(*pair) for pair in pairs]
     return made
+
+
+def _seen_in(pieces: Sequence[plan_errors.Moved] | None, budget_px: float) -> dict[str, Any] | None:
+    """The counted percentile of the pieces whose noise lets a budget be told; None where too few do."""
+    sure = [t for t in pieces or () if t.noise_px < _UNSURE * budget_px]
+    if len(sure) < _FEWEST:
+        return None
+    noise = float(np.median([t.noise_px for t in sure]))
+    return {"pieces": len(sure), "px": _counted([t.px for t in sure]), "noise_px": noise}
 
 
 def _effects(found: Probed, dense: Probed) -> list[dict[str, Any]]:
@@ -269,7 +288,7 @@ _HEAD = """\
 # Plans against all cameras tried
 
 {cases} cases: each lens with each scene ("distant": f/11, one line of light; "lights": wide open, near, coloured), 1920
-pixels across the film, for our renderer and for Blender's Cycles (osl). *px*: error of the camera chosen in pixels that
+pixels across the film, for our renderer and for onnxruntime. *px*: error of the camera chosen in pixels that
 95% of the picture keep, at places, pupil samples and wavelengths that the plan did not see; *render*: the same from
 renders of pieces of the picture, as far as it is above the noise. *times*: its cost over that of the cheapest camera
 that holds among all that were tried ({tried}, polynomials of {sizes} sizes among them).
@@ -321,7 +340,7 @@ def page(rows: Sequence[Mapping[str, Any]]) -> str:
         {"lens": r["lens"], "scene": r["scene"]} | e for r in rows for e in r["effects"] if not effect_holds(e)
     ]  # fmt: skip
     tried = [len(r["cameras"]) for r in rows] or [0]
-    head = _HEAD.format(cases=len(rows), tried=f"{min(tried)} to {max(tried)}", sizes=len({*plans.TERMS, *MORE_TERMS}))
+    head = _HEAD.format(cases=len(rows), tried=f"{min(tried)} to {max(tried)}", sizes=len({*plans._TERMS, *MORE_TERMS}))
     named = lab.columns(
         ("lens", "lens"), ("scene", "scene"), ("effect", "name"), ("probe", "probe", ".3g"), ("fresh", "fresh", ".3g"),
         ("", "unit"),

@@ -51,20 +51,20 @@ from neurolens.optics.prescription import Lens
 from neurolens.render.scene import Scene
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.fit import Prepared, fit_model, prepare
+from neurolens.surrogates.fit import fit_model, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.settings import ModelSettings
 
 Target = Literal["render", "c", "onnx", "osl", "glsl"]
 Cost = Callable[[], tuple[float, float]]  # of a ray, and noise
 _OURS = ("render", "c")  # run compiled C
-TERMS = (2, 4, 6, 8, 12, 16, 22, 28, 36, 48, 64, 90)  # of the polynomials that are fitted on the spot
+_TERMS = (2, 4, 6, 8, 12, 16, 22, 28, 36, 48, 64, 90)  # of the polynomials that are fitted on the spot
 _EXACT, _IDEAL = "exact", ("pinhole", "thin", "thick")
 _MAPPED = " + ST map"  # after the name of an ideal camera
 _SHOT = "fitted for this shot"
 _FIT = ModelSettings("ols", planes=False, elimination=False, idle_gates=IDLE)
 _FOCUS_SPARE = 0.25  # of a pixel of blur: what a model may place its film beside the lens's
-PAIRS = PairSettings(train=5000, held_out=1000, rim=5000)
+_PAIRS = PairSettings(train=5000, held_out=1000, rim=5000)
 _MOST_OVERSCAN = 4.0  # of a plane picture that is warped afterwards
 
 
@@ -132,7 +132,7 @@ class Plan:
             return format_toml({"title": title, "camera": camera})
         choice = LensChoice(Path(os.path.relpath(lens.path, folder)), f_number=self.asked.f_number)
         checks = EvaluationChoice(vignetting_rays=50_000, rounds=0, compile_exact=False)
-        return to_toml(Experiment(title, choice, (best.settings,), self.domain, PAIRS, checks, camera=camera))
+        return to_toml(Experiment(title, choice, (best.settings,), self.domain, _PAIRS, checks, camera=camera))
 
 
 def plan(
@@ -326,15 +326,6 @@ def model_choice(found: Probed, target: Target, file: Path, how: str, costed: bo
         return next(_model(_Trial(found, target, math.inf if costed else -1.0), file, how), None)
 
 
-def fitted_file(prepared: Prepared, lens: Lens, terms: int, folder: Path, name: str) -> tuple[Path, ModelSettings]:
-    """A polynomial of a shot, fitted and written, and how it was fitted."""
-    settings = replace(_FIT, name=f"{name}-ols-{terms}", terms=terms)
-    folder.mkdir(parents=True, exist_ok=True)
-    file = folder / f"{Path(lens.path).stem}.{settings.label}.onnx"
-    export_onnx(fit_model(prepared, settings), file, errors={})
-    return file, settings
-
-
 def shot_domain(found: Probed) -> DomainChoice:
     """The shot's, with as much more of the film's way as blurs a quarter of a pixel: models have their own focus."""
     asked = found.asked
@@ -342,6 +333,31 @@ def shot_domain(found: Probed) -> DomainChoice:
     vergence = 1e-3 / asked.focus_m
     ends = 1e-3 / (vergence - move) if vergence > move else math.inf, 1e-3 / (vergence + move)
     return DomainChoice(found.domain.film_radius_mm, ends, asked.wavelength_nm)
+
+
+def shot_terms(found: Probed) -> list[int]:
+    """Sizes of polynomials that are tried for a shot; those of lenses with cylinders have terms of x and of y."""
+    return [n for n in _TERMS if n >= (4 if found.lens.anamorphic else 2)]
+
+
+def shot_fits(
+    found: Probed, folder: Path, choice: DomainChoice | None = None, name: str = "shot"
+) -> Callable[[int], tuple[Path, ModelSettings]]:
+    """What fits a polynomial of so many terms to a shot alone, or to another domain of its lens: its file, in a folder,
+    and its settings."""
+    lens, domain, choice = found.lens.with_aperture(None), found.domain, choice or shot_domain(found)
+    with suppress(InputError):  # a lens that goes no nearer
+        domain = domain_of(lens, **asdict(choice))
+    prepared = prepare(make_pairs(lens, domain, _PAIRS))
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def fit(terms: int) -> tuple[Path, ModelSettings]:
+        settings = replace(_FIT, name=f"{name}-ols-{terms}", terms=terms)
+        file = folder / f"{Path(found.lens.path).stem}.{settings.label}.onnx"
+        export_onnx(fit_model(prepared, settings), file, errors={})
+        return file, settings
+
+    return fit
 
 
 def _fitted(
@@ -356,22 +372,19 @@ def _fitted(
     asked = [b for b in budgets_px if explain or not any(c.meets(b) and c.name.startswith(ideal) for c in tried)]
     if not asked:
         return
-    lens, domain, choice = found.lens.with_aperture(None), found.domain, shot_domain(found)
-    with suppress(InputError):  # a lens that goes no nearer
-        domain = domain_of(lens, **asdict(choice))
-    prepared = prepare(make_pairs(lens, domain, PAIRS))
+    fit, sizes = shot_fits(found, folder), shot_terms(found)
     known: dict[int, tuple[Path, list[Choice]]] = {}
     smallest = set()
     for k, budget_px in enumerate(asked):
-        low, high = 0, len(TERMS)  # sizes below `low` do not hold, those from `high` on do
+        low, high = 0, len(sizes)  # sizes below `low` do not hold, those from `high` on do
         while low < high:
             size = (low + high) // 2
             if size not in known:
-                file, settings = fitted_file(prepared, found.lens, TERMS[size], folder, "shot")
+                file, settings = fit(sizes[size])
                 shown = trial if explain else replace(trial, costed_px=-1.0)
                 known[size] = file, [replace(c, settings=settings) for c in _model(shown, file, _SHOT)]
             low, high = (low, size) if any(c.meets(budget_px) for c in known[size][1]) else (size + 1, high)
-            say((k + 1 - (high - low) / len(TERMS)) / len(asked))
+            say((k + 1 - (high - low) / len(sizes)) / len(asked))
         smallest.add(low)
     for size, (file, made) in known.items():  # what is larger than the smallest costs more, and is not compiled
         again = _model(trial, file, _SHOT) if size in smallest and not explain else made

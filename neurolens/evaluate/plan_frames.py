@@ -9,8 +9,9 @@ nearest focus on, reach as far as the largest model keeps the budget. Each has t
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,23 +21,19 @@ from neurolens.base.errors import InputError
 from neurolens.base.progress import Report
 from neurolens.evaluate import footprints as prints
 from neurolens.evaluate.plan import (
-    PAIRS,
-    TERMS,
     UNIT,
     Choice,
     Target,
     candidates,
-    fitted_file,
     model_choice,
     shot_domain,
+    shot_fits,
+    shot_terms,
 )  # fmt: skip
 from neurolens.evaluate.probe import COUNTED, Effect, Probed, effects_of, probe
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.render.scene import Scene
-from neurolens.surrogates.domain import domain_of
-from neurolens.surrogates.fit import Prepared, prepare
-from neurolens.surrogates.pairs import make_pairs
 from neurolens.surrogates.settings import ModelSettings
 
 _MOST = 5  # frames that are probed, but for more extremes
@@ -179,7 +176,7 @@ def _stretches(
 ) -> Iterable[tuple[list[int], Choice]]:
     """Rows of `founds` that one model serves, and the model; what none serves is left out."""
     order = sorted(range(len(founds)), key=lambda k: (_zoom(founds[k]), founds[k].asked.focus_m))
-    done = 0
+    sizes, done = shot_terms(founds[0]) if founds else [], 0
     while done < len(order):
         # From here on to as far as the largest model reaches: halves, for less is easier.
         same = sum(_zoom(founds[k]) == _zoom(founds[order[done]]) for k in order[done:])
@@ -187,18 +184,18 @@ def _stretches(
         while low < high:
             count = (low + high + 1) // 2
             trial = _Stretch([founds[k] for k in order[done : done + count]], target, budget_px, folder)
-            if trial.choice(TERMS[-1]) is not None:
+            if trial.choice(sizes[-1]) is not None:
                 low, fit = count, trial
             else:
                 high = count - 1
         if fit is None:
             done += 1
             continue
-        small, large = 0, len(TERMS) - 1  # the least that holds
+        small, large = 0, len(sizes) - 1  # the least that holds
         while small < large:
             middle = (small + large) // 2
-            small, large = (small, middle) if fit.choice(TERMS[middle]) is not None else (middle + 1, large)
-        choice = fit.choice(TERMS[small], costed=True)
+            small, large = (small, middle) if fit.choice(sizes[middle]) is not None else (middle + 1, large)
+        choice = fit.choice(sizes[small], costed=True)
         assert choice is not None
         yield order[done : done + low], choice
         done += low
@@ -214,28 +211,23 @@ class _Stretch:
 
     def __init__(self, founds: Sequence[Probed], target: Target, budget_px: float, folder: Path) -> None:
         self.founds, self.target, self.budget_px, self.folder = founds, target, budget_px, folder
-        self._prepared: Prepared | None = None
-        self._files: dict[int, tuple[Path, ModelSettings]] = {}
         near, far = (f(p.asked.focus_m for p in founds) for f in (min, max))
         self.name = f"shot-{near:.4g}-{far:.4g}m" if near < far else f"shot-{near:.4g}m"
-        self.lens = min(founds, key=lambda p: p.asked.f_number).lens.with_aperture(None)
+        self._files: dict[int, tuple[Path, ModelSettings]] = {}
 
-    def prepared(self) -> Prepared:
-        """Rays of the domain that holds those of all frames."""
-        if self._prepared is None:
-            ends = [focus for p in self.founds for focus in shot_domain(p).focus_m or ()]
-            low, high = (f(nm for p in self.founds for nm in p.asked.wavelength_nm) for f in (min, max))
-            domain = domain_of(
-                self.lens, film_radius_mm=max(p.domain.film_radius_mm for p in self.founds),
-                focus_m=(max(ends), min(ends)), wavelength_nm=(low, high),
-            )  # fmt: skip
-            self._prepared = prepare(make_pairs(self.lens, domain, PAIRS))
-        return self._prepared
+    @cached_property
+    def fit(self) -> Callable[[int], tuple[Path, ModelSettings]]:
+        """Of the domain that holds those of all frames."""
+        ends = [focus for p in self.founds for focus in shot_domain(p).focus_m or ()]
+        widest = min(self.founds, key=lambda p: p.asked.f_number)
+        radius = max(p.domain.film_radius_mm for p in self.founds)
+        choice = replace(shot_domain(widest), film_radius_mm=radius, focus_m=(max(ends), min(ends)))
+        return shot_fits(widest, self.folder, choice, self.name)
 
     def choice(self, terms: int, costed: bool = False) -> Choice | None:
         """The model of a size, with its largest error over the frames; None where one is beyond the budget."""
         if terms not in self._files:
-            self._files[terms] = fitted_file(self.prepared(), self.lens, terms, self.folder, self.name)
+            self._files[terms] = self.fit(terms)
         file, settings = self._files[terms]
         found: list[Choice] = []
         for probed in self.founds:

@@ -190,7 +190,7 @@ def test_noise_of_weights_is_how_many_times_the_rays_it_takes() -> None:
 def test_what_is_cheapest_differs_by_target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Blender's own thin lens costs less than any shader; in our renderer a small polynomial costs less than it."""
     found = probe(load_scene(Path("experiments/scenes/garden.toml")), read_lens(GAUSS).at(), across=8)
-    monkeypatch.setattr(planned, "TERMS", (8,))
+    monkeypatch.setattr(planned, "_TERMS", (8,))
     targets: tuple[Target, ...] = ("render", "osl")
     best = {t: decided(found, candidates(found, (1.0,), t, folder=tmp_path), 1.0, t).best for t in targets}
     assert best["osl"] is not None and best["osl"].name == "thin + ST map" and best["osl"].error_px < 1
@@ -230,7 +230,7 @@ def test_targets_are_those_of_the_command() -> None:
 
 def test_a_plan_s_file_is_taken_by_train_render_and_export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same model again from scratch, in numbers; the pictures of the file and of the model that it names agree."""
-    monkeypatch.setattr(planned, "TERMS", (6,))
+    monkeypatch.setattr(planned, "_TERMS", (6,))
     scene, folder = tmp_path / "scene.toml", tmp_path / "plan"
     film = {"film_width_mm": 18.0, "film_height_mm": 10.125, "width": 64, "height": 36, "samples": 2}
     scene.write_text(format_toml(wall(4.0, 4.0, **film)))

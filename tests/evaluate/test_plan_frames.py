@@ -62,7 +62,7 @@ def test_a_rack_takes_as_few_fits_as_hold(tmp_path: Path, monkeypatch: pytest.Mo
         return probed[id(scene)] if id(scene) in probed else probed.setdefault(id(scene), probe(scene, at, across=4))
 
     monkeypatch.setattr(module, "probe", once)
-    monkeypatch.setattr(module, "TERMS", (8, 28))
+    monkeypatch.setattr(module, "shot_terms", lambda found: [8, 28])
     lens, rack = read_lens(LENS).at(), frames([0.7, 0.7, 1.2])
     moved = plan_frames(rack, lens, 0.5, folder=tmp_path)
     assert moved.fits == 1 and [(r.first, r.last) for r in moved.runs] == [(1, 3)] and moved.probed == (1, 3)
