@@ -31,6 +31,7 @@ NAMES = {
     "mitsuba": ("mitsuba_speed", "speed of the renderer beside Mitsuba 3"),
     "osl": ("osl_speed", "cameras in Blender's Cycles: shaders of models beside its own"),
     "osl-pictures": ("osl_pictures", "lenses in Cycles beside its own depth of field"),
+    "view": ("view_speed", "the page of `neurolens view` in software WebGL: first picture, each change"),
     "promises": ("promises", "models against the speed that their index promises"),
     "white-cards": ("white_cards", "light on the film, by integral and rendered four ways"),
     "spectral-noise": ("spectral_noise", "noise of the ways to sample wavelengths"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -63,8 +63,10 @@ def run(args: argparse.Namespace) -> int:
     return answer(args, {"pictures": pictures}, lambda: "\n".join(str(p["file"]) for p in pictures))
 
 
-def write_picture(tiles: Sequence[Tile], out: Path, exposure: float) -> dict[str, Any]:
-    """Write the picture of these tiles and its preview; its file and statistics."""
+def write_picture(
+    tiles: Sequence[Tile], out: Path, exposure: float, correct: Callable[[dict[str, Any]], None] = lambda _: None
+) -> dict[str, Any]:
+    """Write the picture of these tiles and its preview; its file and statistics. `correct` may change its metadata."""
     import numpy as np
 
     from neurolens.render.colour import COLOUR_SPACES, SRGB, conversion, converted
@@ -72,6 +74,7 @@ def write_picture(tiles: Sequence[Tile], out: Path, exposure: float) -> dict[str
     from neurolens.render.tiles import merged, write_merged
 
     channels, told = merged(tiles)
+    correct(told)
     rgb = np.stack([channels[name].astype(np.float32) for name in "RGB"], axis=-1)
     if (space := told["colour"]["space"]) != SRGB.name:
         rgb = converted(rgb, conversion(COLOUR_SPACES[space], SRGB)).astype(np.float32)

@@ -18,6 +18,7 @@ from neurolens.base.files import check_writable
 from neurolens.base.progress import duration
 from neurolens.base.signals import handled
 from neurolens.commands.arguments import check_folder, check_suffix, positive
+from neurolens.commands.farm import add_dask
 from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ def add_tile(parser: argparse.ArgumentParser) -> None:
         help="render the I-th of N bands of rows, to OUT.tile-I-of-N.exr (goes with --frames); \"neurolens merge\" "
         "puts together the picture that one run gives, bit for bit. A scene's [flare] is computed whole for each tile",
     )  # fmt: skip
+    add_dask(group)
 
 
 def _tile(text: str) -> tuple[int, int]:

@@ -85,6 +85,15 @@ def run_frames(args: argparse.Namespace, render: Callable[[argparse.Namespace], 
     Raises:
         InputError: a key that is none, or of a quantity that the command line sets too.
     """
+    for each in shots_of(args):
+        code = render(each)
+        if code:
+            return code
+    return 0
+
+
+def shots_of(args: argparse.Namespace) -> Iterator[argparse.Namespace]:
+    """The arguments of every frame that is missing; warns and raises as `run_frames`."""
     from neurolens.render.tiles import tile_path
 
     kept, every = 0, list(frames_of(args))
@@ -96,13 +105,10 @@ def run_frames(args: argparse.Namespace, render: Callable[[argparse.Namespace], 
             kept += 1
             continue
         values = {**values, "out": out, "seed": args.seed + frame, "frame": frame, "shared": shared}
-        code = render(argparse.Namespace(**vars(args) | values))
-        if code:
-            return code
+        yield argparse.Namespace(**vars(args) | values)
     if kept:
         told = f"{kept} of {len(args.frames)} frames exist and are kept, whatever their settings"
         warnings.warn(f"{told}; --restart renders them again", NeurolensWarning, stacklevel=2)
-    return 0
 
 
 def frames_of(

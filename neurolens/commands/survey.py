@@ -10,6 +10,7 @@ from typing import Any
 from neurolens.base.errors import InputError, printable
 from neurolens.base.files import read_bytes
 from neurolens.commands.arguments import QUIET_HELP, add_glass, add_json, between, check_run_folder, whole
+from neurolens.commands.farm import add_dask
 from neurolens.commands.output import answer
 
 _DESCRIPTION = """\
@@ -49,6 +50,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "--jobs", metavar="N", type=whole(1, 256), default=cores, help="files at a time (default: all cores)"
     )
+    add_dask(parser)
     parser.add_argument("--again", action="store_true", help="do finished files again")
     add_glass(parser)
     add_json(parser)
@@ -61,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.base.progress import Progress
     from neurolens.evaluate.survey import SurveySettings, summary_of
     from neurolens.evaluate.survey_page import summary_lines
-    from neurolens.evaluate.survey_run import collection_of, in_processes, survey
+    from neurolens.evaluate.survey_run import collection_of, in_processes, on_cluster, survey
     from neurolens.readers.source import MAX_BYTES
 
     check_run_folder(args.out, "neurolens survey", "--out")
@@ -71,8 +73,8 @@ def run(args: argparse.Namespace) -> int:
     settings = SurveySettings(not args.no_fit, args.terms, args.rays, args.seed, args.half_field)
     glasses = [(file.name, read_bytes(file, MAX_BYTES, "a glass catalogue")) for file in args.glass_files]
     records = survey(
-        collection, args.out, settings, in_processes(args.jobs), Progress(quiet=args.quiet), glasses=glasses,
-        again=args.again,
+        collection, args.out, settings, in_processes(args.jobs) if args.dask is None else on_cluster(args.dask),
+        Progress(quiet=args.quiet), glasses=glasses, again=args.again,
     )  # fmt: skip
     summary = {**summary_of(records), "others": collection.others, "page": str(args.out / "survey.html")}
     lines = [*summary_lines(records, collection.others), f"Look at {args.out / 'survey.html'}"]

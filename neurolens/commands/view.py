@@ -36,9 +36,10 @@ examples:
 _NETWORK = "mlp"
 _ERRORS = ("rms_um", "p99_um", "rms_infinity_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
 _LIGHT_NM = (400.0, 700.0)
-_NEAR_EFL = 10.0
+_NEAR_EFL = 10.0  # of an exact lens: nearest focus in focal lengths
+_SAME = 1e-3  # of the focal length: what models and lens file of one id may differ by
 _DOWNLOADS = ("glsl", "onnx", "c", "osl")
-_OSL_LENSES = 4  # of more lenses the page leaves OSL out: fitting a pupil takes seconds each, and it is large
+_FEW = 4  # of more lenses the page leaves C and OSL out: seconds each, and they are large
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "--downloads", metavar="KINDS", type=_kinds, default=None,
         help="of glsl, onnx, c, osl what the page brings as files of each form (default: all, of more than "
-        f"{_OSL_LENSES} lenses glsl,onnx,c: OSL takes seconds each); the last are left out where the page grows beyond "
+        f"{_FEW} lenses glsl,onnx: others take seconds each); the last are left out where the page grows beyond "
         "3 MB",
     )  # fmt: skip
     add_glass(parser)
@@ -85,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     check_suffix(args.out, "--out", (".html", ".htm"))
     check_folder(args.out, "--out")
     entries = list(_asked(args.lenses) if args.lenses else _library())
-    kinds = args.downloads or [k for k in _DOWNLOADS if k != "osl" or len(entries) <= _OSL_LENSES]
+    kinds = args.downloads or list(_DOWNLOADS if len(entries) <= _FEW else _DOWNLOADS[:2])
     progress = Progress(quiet=args.json)
     made: list[ViewLens] = []
     with progress.stage(f"{len(entries)} lenses") as report, tempfile.TemporaryDirectory() as folder:
@@ -176,13 +177,15 @@ def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str]) -> ViewLens:
     if entry.lens is not None:
         lens = entry.lens.at() if entry.zoom == RANGE else entry.lens.at(zoom=entry.zoom)
         try:
-            forms.append(_exact_form(entry, folder))
+            forms.append(_exact_form(entry, folder, kinds))
             path = _path(lens) if entry.zoom != RANGE else None
         except NeurolensError:
             if not forms:
                 raise  # a model of the lens stands in for it: coatings and the like have no code
         drawn = _section(lens)
-    best = forms[0]
+    best, focal_mm = forms[0], [float(f.card["efl_mm"]) for f in forms]
+    if entry.zoom != RANGE and max(focal_mm) - min(focal_mm) > _SAME * abs(focal_mm[0]):
+        raise InputError("neurolens view", f"{entry.key}: efl_mm", focal_mm, "models of the lens file, in its state")
     return ViewLens(
         entry.key, str(best.card["name"]), str(best.card["source"]), float(best.card["efl_mm"]),
         min(float(f.card["film_radius_mm"]) for f in forms), _squeeze(entry), best.card["f_numbers"],
@@ -222,8 +225,10 @@ def _model_form(file: Path, folder: Path, kinds: Sequence[str]) -> Form:
 
     loaded = load_model(file)
     card, domain, errors = loaded.card, loaded.card["domain"], loaded.card["errors"]
+    if any(axis.name != "zoom" for axis in loaded.axes):
+        raise InputError(file, "states", [axis.name for axis in loaded.axes], "a zoom, or a model of one state")
     extras, notes = model_extras(loaded)
-    written = {to: export_file(file, folder / f"model.{to}", to, None, extras, notes) for to in ("glsl", "c")}
+    written = {to: export_file(file, folder / f"model.{to}", to, None, extras, notes) for to in _written(kinds)}
     told = {
         **_facts(card["lens"]),
         "film_radius_mm": domain["film_radius_mm"],
@@ -233,13 +238,18 @@ def _model_form(file: Path, folder: Path, kinds: Sequence[str]) -> Form:
         "zones": errors.get("zones") or {},
         "poor": list(errors.get("poor") or ()),
     }
-    files = {"c": (folder / "model.c").read_bytes(), "onnx": file.read_bytes()}
+    files = {"onnx": file.read_bytes()} | {to: w.path.read_bytes() for to, w in written.items() if to != "glsl"}
     if "osl" in kinds:
         from neurolens.commands.blender_lenses import form_of
 
         files["osl"] = form_of(file, quiet=True).osl.encode()
-    text = (folder / "model.glsl").read_text(encoding="utf-8")
-    return Form(_kind_of(card), str(card["fit"]["method"]), text, written["glsl"].signature, told, files)
+    glsl = written["glsl"]
+    return Form(_kind_of(card), str(card["fit"]["method"]), glsl.path.read_text("utf-8"), glsl.signature, told, files)
+
+
+def _written(kinds: Sequence[str]) -> list[str]:
+    """The languages that a form is written in."""
+    return [kind for kind in ("glsl", "c") if kind in kinds]
 
 
 def _lens_nodes(card: Mapping[str, Any]) -> list[Mapping[str, Any]]:
@@ -251,7 +261,7 @@ def _facts(lens: Mapping[str, Any]) -> dict[str, Any]:
     return {key: lens[key] for key in ("name", "source", "efl_mm")}
 
 
-def _exact_form(entry: _Entry, folder: Path) -> Form:
+def _exact_form(entry: _Entry, folder: Path, kinds: Sequence[str]) -> Form:
     from neurolens.commands.export_lens import write_lens
     from neurolens.optics.lenswriter import write_lens as write_file
     from neurolens.optics.paraxial import first_order
@@ -263,7 +273,7 @@ def _exact_form(entry: _Entry, folder: Path) -> Form:
     file = folder / f"{lens.lens_id}.toml"
     write_file(lens, file)
     written = {}
-    for to in ("glsl", "c"):
+    for to in _written(kinds):
         options = argparse.Namespace(to=to, name=None, zoom=entry.zoom, json=True, out=folder / f"exact.{to}")
         written[to] = write_lens(file, options)
     at = lens.at() if entry.zoom == RANGE else lens.at(zoom=entry.zoom)
@@ -275,6 +285,6 @@ def _exact_form(entry: _Entry, folder: Path) -> Form:
         "f_numbers": [(float(data.efl_mm), float(data.f_number))],
         "errors": {}, "zones": {}, "poor": [],
     }  # fmt: skip
-    text = (folder / "exact.glsl").read_text(encoding="utf-8")
-    return Form("exact", "every surface traced", text, written["glsl"].signature, told,
-                {"c": (folder / "exact.c").read_bytes()})  # fmt: skip
+    glsl = written["glsl"]
+    files = {to: w.path.read_bytes() for to, w in written.items() if to != "glsl"}
+    return Form("exact", "every surface traced", glsl.path.read_text("utf-8"), glsl.signature, told, files)

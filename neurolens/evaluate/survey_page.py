@@ -42,6 +42,7 @@ TABLE_STYLE = """<style>
 .survey thead th { cursor: pointer; position: sticky; top: 0; background: var(--back); z-index: 2; }
 .survey thead th[aria-sort=ascending]::after { content: " ▲"; }
 .survey thead th[aria-sort=descending]::after { content: " ▼"; }
+.survey thead th:not([data-kind]), .survey td.v, .survey td.v + td { text-align: left; }
 .survey tr.refused, .survey tr.fault { color: var(--dim); } .survey .v { font-weight: 600; }
 .tools { display: flex; gap: .8rem; flex-wrap: wrap; align-items: center; margin: 1rem 0; }
 .tools input[type=search] { font: inherit; padding: .3rem .5rem; min-width: 18rem; }

@@ -13,6 +13,7 @@ from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.engine import Failed, on_dask
 from neurolens.base.errors import InputError, one_line
 from neurolens.base.files import atomic_path, read_bytes
 from neurolens.base.progress import Progress
@@ -182,6 +183,20 @@ def in_processes(jobs: int, limit_s: float = TIME_LIMIT_S) -> Engine:
                 process.kill()
 
     return run
+
+
+def on_cluster(address: str) -> Engine:
+    """The engine of a Dask cluster, see `base.engine.on_dask`."""
+
+    def run(tasks: Iterable[Task]) -> Iterator[tuple[Task, bytes]]:
+        for task, came in on_dask(address, _on_worker)(tasks):
+            yield task, unread_record(task.name, "fault", came.reason) if isinstance(came, Failed) else came
+
+    return run
+
+
+def _on_worker(_: bytes, task: Task) -> bytes:
+    return run_task(task)
 
 
 def _begin(context: Any, task: Task) -> tuple[Any, Any]:

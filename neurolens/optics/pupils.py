@@ -30,14 +30,15 @@ _BETWEEN_RADII = 0.03
 def pupil_plane_z_mm(lens: Lens) -> float:
     """z of the plane on which pupil points lie: the paraxial exit pupil, where passing rays crowd together.
 
-    The rear vertex stands in where the exit pupil lies near or behind the film or too far in front of it to be useful.
+    The rear vertex, that of the glass before a cover glass on the film, stands in where the exit pupil lies near or
+    behind the film or too far in front of it to be useful.
     """
     data = first_order(lens)
     rear = float(lens.vertices_mm[len(lens.surfaces) - 1])
     film = data.rear_focal_z_mm
     z = data.exit_pupil_z_mm
     useful = math.isfinite(z) and 0.25 * (film - rear) < film - z < 20 * abs(data.efl_mm)
-    return float(z) if useful else rear
+    return float(z) if useful else _rear_opening_mm(lens, film)[1]
 
 
 def camera_rays(

@@ -27,7 +27,7 @@ SCRIPTS = ("gl.js", "scene.js", "engine.js", "layout.js", "main.js")
 SHADERS = ("scene.glsl", "trace.glsl")
 # A form's download that would carry the page beyond this is left out.
 MOST_BYTES = 3_000_000
-_AIR, _ARC = 1.01, 8  # a medium of a smaller index is drawn as air; of 65 points of an arc every eighth is drawn
+_AIR, _ARC = 1.01, 4  # a medium of a smaller index is drawn as air; of 65 points of an arc every fourth is drawn
 _CONSTANT = re.compile(r"^const float ([A-Z][A-Z0-9_]*_(?:MM|NM)) = ", re.MULTILINE)
 _FUNCTION = re.compile(r"^float ([a-z]\w*)\(([^)]*)\)$", re.MULTILINE)
 _GIVEN = {"zoom_mm": "zoom", "focus_m": "focus", "stop_radius_mm": "stop_radius"}
@@ -187,6 +187,6 @@ def section_svg(layout: Layout) -> dict[str, Any]:
 
 
 def _path(points: np.ndarray[Any, Any]) -> str:
-    """A closed path; of an outline's arcs every eighth point."""
+    """A closed path; of an outline's arcs every fourth point."""
     kept = np.concatenate([points[:65:_ARC], points[65:-65], points[-65::_ARC]])
     return "M" + "L".join(f"{z:.2f} {h:.2f}" for z, h in kept) + "Z"

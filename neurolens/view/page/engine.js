@@ -1,5 +1,5 @@
 // Lenses on the GPU: what a setting comes to, where rays pass, pictures that add up.
-const AIM_FILM = 6, AIM_PUPIL = 32, AXIS = 128; // points a side: of the film's quarter and pupil; of the exposure
+const AIM_FILM = 5, AIM_PUPIL = 28, AXIS = 100; // points a side: of the film's quarter and pupil; of the exposure
 const FREE_BENCH = 640;
 
 /** The text of an element, unpacked. */
@@ -165,16 +165,24 @@ class Engine {
    */
   async prepare(lens, kinds, set, scene) {
     const made = {}, cells = AIM_FILM - 1;
+    const { focus, f_number, zoom, blades, roundness, rotation, wavelength } = set;
+    const key = JSON.stringify([lens.key, kinds, String(focus), f_number, zoom, blades, roundness, rotation, wavelength]);
+    if (key === this.prepared) {
+      for (const side of Object.keys(kinds)) Object.assign(this.sides[side], { values: { ...this.sides[side].values, ...scene }, samples: 0 });
+      return;
+    }
+    this.prepared = null;
     const first = (a, b) => (b[1] === "exact") - (a[1] === "exact");
     for (const [side, kind] of Object.entries(kinds).sort(first)) {
-      const values = await this.setting(lens, kind, set), key = kind === "thin" ? kind : values.pupil_z.toFixed(2);
-      made[key] ??= await this.aimed(lens, kind, values);
-      const { boxes, exposure } = made[key], known = this.sides[side] ?? {};
+      const values = await this.setting(lens, kind, set), plane = kind === "thin" ? kind : values.pupil_z.toFixed(2);
+      made[plane] ??= await this.aimed(lens, kind, values);
+      const { boxes, exposure } = made[plane], known = this.sides[side] ?? {};
       if (known.boxes) this.gpu.free(known.boxes);
       values.scale = values.per_distance ** 2 / exposure;
       this.sides[side] = { ...known, kind, program: await this.program(lens, kind), values: { ...values, ...scene },
         boxes: this.gpu.target(cells, cells, boxes), samples: 0 };
     }
+    this.prepared = key;
   }
 
   run(program, values, target, window = null) {

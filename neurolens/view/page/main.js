@@ -61,6 +61,9 @@ function say() {
   const form = engine.form(set.lens, set.a), files = form.kind === "thin" ? [] : form.files;
   $("downloads").replaceChildren(...files.map((kind) => Object.assign(document.createElement("button"),
     { type: "button", textContent: { glsl: "GLSL", c: "C", onnx: "ONNX", osl: "OSL" }[kind], title: `Download: ${NAMES[set.a]}`, onclick: () => download(kind) })));
+  const can = form.kind === "thin" ? [] : ["glsl", "onnx", "c", "osl"].filter((kind) => kind !== "onnx" || form.kind !== "exact");
+  const others = can.filter((kind) => !files.includes(kind));
+  $("elsewhere").textContent = others.length ? `Not on this page: neurolens export ${form.kind === "exact" ? "LENS.toml" : "MODEL.onnx"} --to ${others.join("|")}` : "";
   facts();
 }
 
@@ -84,7 +87,7 @@ function facts() {
       const { rms, where } = errorAt(form), num = (v) => (v < 0.01 ? v.toExponential(1) : v.toPrecision(2));
       text = `RMS ${num(rms)} µm (${num(rms / pixel_um)} px) at ${where}; 99 % within ${num(form.card.errors.p99_um ?? NaN)} µm`;
     }
-    rows.push([`${NAMES[form.kind]}${form.kind === set.a || form.kind === set.b ? "" : ""}: error on its film`, text]);
+    rows.push([`${NAMES[form.kind]}: error on the film`, text]);
     rows.push([`${NAMES[form.kind]}: a ray on this GPU`, known ? `${known.toPrecision(3)} ns` : "not measured"]);
   }
   $("facts").replaceChildren(...rows.map(([name, value]) => {
@@ -144,7 +147,7 @@ async function rays() {
   const [, film_h] = engine.sides.a.values.film_mm, [film_w] = engine.sides.a.values.film_mm;
   const [x, y] = set.clicked, height = Math.hypot((x - 0.5) * film_w, (y - 0.5) * film_h) * (y > 0.5 ? -1 : 1);
   const count = await layout.rays(height, engine.sides.a);
-  $("layout-said").textContent = count === null ? "No exact lens here: no rays can be drawn."
+  $("layout-said").textContent = count === null ? (set.lens.f_numbers.length > 1 ? "The section shows one zoom position: no rays are drawn in it." : "No exact lens here: no rays can be drawn.")
     : `Image height ${Math.abs(height).toFixed(1)} mm: ${count ? "rays in the plane of axis and place, traced through every surface" : "no ray passes"}.`;
 }
 

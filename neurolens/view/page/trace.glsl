@@ -17,15 +17,15 @@ uint mixed(uint x) {
     return x;
 }
 
-uint shift_of;
-// The next number in [0, 1): the camera's five of an additive recurrence (Roberts 2018), shifted by pixel; then hashes.
-float next(inout int dimension) {
-    const float steps[5] = float[5](0.8812714616335, 0.7766393890898, 0.6844301295853, 0.6031687406857, 0.5315553977157);
-    shift_of = mixed(shift_of + 0x9e3779b9u + (dimension == 5 ? uint(sample_number) * 0x85ebca6bu : 0u));
-    float shift = float(shift_of >> 8) / 16777216.0;
-    dimension++;
-    return dimension > 5 ? shift : fract(shift + fract(float(sample_number) * steps[dimension - 1]));
+uint state;  // of the random numbers of a pixel
+
+float next() {
+    state = mixed(state + 0x9e3779b9u);
+    return float(state >> 8) / 16777216.0;
 }
+
+// Of the camera's five: an additive recurrence over the samples (Roberts 2018), shifted by pixel.
+float even(float step_) { return fract(next() + fract(float(sample_number) * step_)); }
 
 vec3 colour_of(float nm) {  // Bernstein's polynomials: never negative, mean 1 over the wavelengths
     if (wavelength_nm > 0.0) return vec3(1.0);
@@ -33,8 +33,8 @@ vec3 colour_of(float nm) {  // Bernstein's polynomials: never negative, mean 1 o
     return vec3(3.0 * t * t, 6.0 * t * (1.0 - t), 3.0 * (1.0 - t) * (1.0 - t));
 }
 
-vec3 lit_by_key(vec3 x, vec3 normal, inout int dimension) {
-    float z = 2.0 * next(dimension) - 1.0, turn = 6.2831853 * next(dimension);
+vec3 lit_by_key(vec3 x, vec3 normal) {
+    float z = 2.0 * next() - 1.0, turn = 6.2831853 * next();
     vec3 to = key.xyz + key.w * vec3(sqrt(1.0 - z * z) * vec2(cos(turn), sin(turn)), z) - x;
     float far2 = dot(to, to), facing = dot(normal, to) * inversesqrt(far2);
     if (facing <= 0.0) return vec3(0.0);
@@ -43,7 +43,7 @@ vec3 lit_by_key(vec3 x, vec3 normal, inout int dimension) {
     return vec3(1.0, 0.87, 0.72) * (key_power * facing / far2);
 }
 
-vec3 radiance(vec3 o, vec3 d, inout int dimension, out float way) {
+vec3 radiance(vec3 o, vec3 d, out float way) {
     way = FAR;
     if (scene == 2) return vec3(1.0);
     if (scene == 1) {
@@ -55,30 +55,29 @@ vec3 radiance(vec3 o, vec3 d, inout int dimension, out float way) {
     way = hit.way;
     if (way >= FAR) return sky(d);
     if (hit.light) return hit.colour;
-    vec3 x = o + d * way, sum = hit.colour * lit_by_key(x, hit.normal, dimension);
-    float z = 2.0 * next(dimension) - 1.0, turn = 6.2831853 * next(dimension);
+    vec3 x = o + d * way, sum = hit.colour * lit_by_key(x, hit.normal);
+    float z = 2.0 * next() - 1.0, turn = 6.2831853 * next();
     vec3 bounce = normalize(hit.normal + 0.999 * vec3(sqrt(1.0 - z * z) * vec2(cos(turn), sin(turn)), z));
     Hit second = struck(x + 1e-3 * hit.normal, bounce, solids);
     if (second.way >= FAR) return sum + hit.colour * (sky(bounce) + 0.05);
     vec3 y = x + bounce * second.way;
-    return sum + hit.colour * second.colour * lit_by_key(y, second.normal, dimension);
+    return sum + hit.colour * second.colour * lit_by_key(y, second.normal);
 }
 
 void main() {
     ivec2 at_pixel = ivec2(gl_FragCoord.xy) - window.xy;
-    shift_of = mixed(uint(at_pixel.x) * 1973u + uint(at_pixel.y) * 9277u * 4099u + uint(seed));
-    int dimension = 0;
+    state = mixed(uint(at_pixel.x) * 1973u + uint(at_pixel.y) * 9277u * 4099u + uint(seed));
     vec2 film, pupil;
     float area = 1.0, nm = wavelength_nm;
     if (task == 0 || task == 3) {
-        vec2 spot = task == 0 ? vec2(at_pixel) + vec2(next(dimension), next(dimension)) : probe * pixels;
+        vec2 spot = task == 0 ? vec2(at_pixel) + vec2(even(0.8812714616), even(0.7766393891)) : probe * pixels;
         film = (0.5 - spot / pixels) * film_mm;
         vec2 cells = vec2(textureSize(boxes, 0));
         vec4 box = texelFetch(boxes, ivec2(min(abs(film) / (0.5 * film_mm) * cells, cells - 1.0)), 0);
-        vec2 u = task == 0 ? vec2(next(dimension), next(dimension)) : vec2(0.5);
+        vec2 u = task == 0 ? vec2(even(0.6844301296), even(0.6031687407)) : vec2(0.5);
         pupil = (box.xy + box.zw * u) * vec2(film.x < 0.0 ? -1.0 : 1.0, film.y < 0.0 ? -1.0 : 1.0);
         area = box.z * box.w;
-        if (nm <= 0.0) nm = mix(light_nm.x, light_nm.y, task == 0 ? next(dimension) : 0.5);
+        if (nm <= 0.0) nm = mix(light_nm.x, light_nm.y, task == 0 ? even(0.5315553977) : 0.5);
     } else {
         ivec2 corner = at_pixel / grid.y, point = at_pixel % grid.y;
         film = task == 1 ? vec2(corner) / float(grid.x - 1) * 0.5 * film_mm : vec2(0.0);
@@ -104,7 +103,8 @@ void main() {
     }
     vec3 colour = vec3(0.0);
     float way = FAR;
-    if (weight > 0.0 || task == 3) colour = radiance(from, to, dimension, way);
+    state += uint(sample_number) * 0x85ebca6bu;
+    if (weight > 0.0 || task == 3) colour = radiance(from, to, way);
     if (task == 3) {
         result = vec4(-(from.z + way * to.z), float(status), 0.0, 1.0);
         return;
