@@ -148,7 +148,7 @@ def probe(
         lens, film_mm=film, focus_m=shot.focus_m, f_number=f_number, wavelength_nm=shot.wavelengths_nm
     )
     real: dict[str, Any] = {"film_mm": film, "focus_m": shot.focus_m, "f_number": f_number}
-    exact = exact_camera(lens, {**real, "wavelength_nm": shot.wavelengths_nm})  # its pupils as a render has them
+    exact = exact_camera(lens, {**real, "bounds": domain.bounds, "wavelength_nm": shot.wavelengths_nm})
     shape = _shape(film, across)
     points = _grid(film, shape)
     depth, small = seen_depths_m(scene, exact, points), glance(scene, exact)
