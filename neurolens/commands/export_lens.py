@@ -38,8 +38,12 @@ _DISTANCES = 12  # about as many are placed for each lens
 _CHECKED = (0.12, 0.42, 0.83)  # of the range: where the film's position is measured
 
 
-def write_lens(file: Path, args: argparse.Namespace) -> Written:
-    """The lens as a function of film and pupil point, wavelength, film position, stop radius and, of a range, zoom."""
+def write_lens(file: Path, args: argparse.Namespace, *, as_bare: str = "") -> Written:
+    """The lens as a function of film and pupil point, wavelength, film position, stop radius and, of a range, zoom.
+
+    Args:
+        as_bare: a line for the comment, of a lens whose coatings and absorption are left out; else it is refused.
+    """
     lens = read_lens(file)
     name = checked_name(args.to, lens.lens_id, args.name)
     axes: tuple[Axis, ...] = ()
@@ -57,7 +61,8 @@ def write_lens(file: Path, args: argparse.Namespace) -> Written:
             lines.append("One zoom position: its gaps are numbers in the code (--zoom range makes it an argument).")
     if focus_states(lens):
         lines.append("Groups stand at infinity focus: the film focuses, for how groups move is no graph.")
-    for node in nodes:
+    lines += [as_bare] * bool(as_bare)
+    for node in nodes if not as_bare else ():
         check_bare(node, "a model of the lens has them")
     planes = pupil_planes_mm(nodes, axes)
     program = lens_program(nodes, axes, planes)

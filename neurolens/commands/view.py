@@ -36,6 +36,7 @@ examples:
 _NETWORK = "mlp"
 _ERRORS = ("rms_um", "p99_um", "rms_infinity_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
 _LIGHT_NM = (400.0, 700.0)
+_AS_BARE = "coatings and absorption left out"
 _NEAR_EFL = 10.0  # of an exact lens: nearest focus in focal lengths
 _SAME = 1e-3  # of the focal length: what models and lens file of one id may differ by
 _DOWNLOADS = ("glsl", "onnx", "c", "osl")
@@ -261,6 +262,16 @@ def _facts(lens: Mapping[str, Any]) -> dict[str, Any]:
     return {key: lens[key] for key in ("name", "source", "efl_mm")}
 
 
+def _is_bare(lens: Lens) -> bool:
+    from neurolens.cameras.exact import check_bare
+
+    try:
+        check_bare(lens)
+    except InputError:
+        return False
+    return True
+
+
 def _exact_form(entry: _Entry, folder: Path, kinds: Sequence[str]) -> Form:
     from neurolens.commands.export_lens import write_lens
     from neurolens.optics.lenswriter import write_lens as write_file
@@ -272,10 +283,10 @@ def _exact_form(entry: _Entry, folder: Path, kinds: Sequence[str]) -> Form:
     lens = entry.lens
     file = folder / f"{lens.lens_id}.toml"
     write_file(lens, file)
-    written = {}
+    written, as_bare = {}, "" if _is_bare(lens) else f"In this form: {_AS_BARE}."
     for to in _written(kinds):
         options = argparse.Namespace(to=to, name=None, zoom=entry.zoom, json=True, out=folder / f"exact.{to}")
-        written[to] = write_lens(file, options)
+        written[to] = write_lens(file, options, as_bare=as_bare)
     at = lens.at() if entry.zoom == RANGE else lens.at(zoom=entry.zoom)
     data = first_order(at)
     told = {
@@ -287,4 +298,5 @@ def _exact_form(entry: _Entry, folder: Path, kinds: Sequence[str]) -> Form:
     }  # fmt: skip
     glsl = written["glsl"]
     files = {to: w.path.read_bytes() for to, w in written.items() if to != "glsl"}
-    return Form("exact", "every surface traced", glsl.path.read_text("utf-8"), glsl.signature, told, files)
+    said = f"every surface traced, {_AS_BARE}" if as_bare else "every surface traced"
+    return Form("exact", said, glsl.path.read_text("utf-8"), glsl.signature, told, files)

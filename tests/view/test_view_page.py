@@ -165,6 +165,49 @@ def test_crossings_are_those_of_the_tracer() -> None:
     assert np.allclose(found, wanted[: len(found)], atol=2e-4)
 
 
+ZMX = """\
+MODE SEQ
+NAME My singlet
+UNIT MM X W X CM MR CPMM
+ENPD 10.0
+FTYP 0 0 1 3 0 0 0
+WAVM 1 0.5876 1
+PWAV 1
+SURF 0
+  TYPE STANDARD
+  CURV 0.0
+  DISZ INFINITY
+SURF 1
+  TYPE STANDARD
+  STOP
+  CURV 0.02
+  DISZ 5.0
+  GLAS N-BK7 0 0 1.5168 64.17
+  DIAM 12 1
+SURF 2
+  TYPE STANDARD
+  CURV -0.02
+  DISZ 46.0
+  DIAM 12 1
+SURF 3
+  TYPE STANDARD
+  CURV 0.0
+  DISZ 0
+  DIAM 12
+"""
+
+
+def test_a_lens_of_your_own_says_what_is_left_out(tmp_path: Path) -> None:
+    """Its glass absorbs, which traced code does not follow."""
+    (tmp_path / "my_lens.zmx").write_text(ZMX)
+    out = tmp_path / "view.html"
+    assert main(["view", str(tmp_path / "my_lens.zmx"), "--downloads", "glsl", "-o", str(out), "--json"]) == 0
+    (lens,) = json.loads(out.read_text(encoding="utf-8").split('id="data">')[1].split("</script")[0])["lenses"]
+    (form,) = lens["forms"]
+    assert lens["name"] == "My singlet"
+    assert form["method"] == "every surface traced, coatings and absorption left out"
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

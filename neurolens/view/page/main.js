@@ -82,7 +82,7 @@ function facts() {
   for (const side of set.view === "one" ? ["a"] : ["a", "b"]) {
     const form = engine.form(set.lens, set[side]), known = engine.sides[side]?.cost?.[`${set.lens.key}/${set[side]}`];
     const pixel_um = engine.sides.a?.values ? (1000 * engine.sides.a.values.film_mm[0]) / set.width : NaN;
-    let text = form.kind === "exact" ? "every surface traced: the truth" : form.kind === "thin" ? "paraxial: no aberration, no rims" : "";
+    let text = form.kind === "exact" ? form.method : form.kind === "thin" ? "paraxial: no aberration, no rims" : "";
     if (form.card?.errors?.rms_um !== undefined) {
       const { rms, where } = errorAt(form), num = (v) => (v < 0.01 ? v.toExponential(1) : v.toPrecision(2));
       text = `RMS ${num(rms)} µm (${num(rms / pixel_um)} px) at ${where}; 99 % within ${num(form.card.errors.p99_um ?? NaN)} µm`;
@@ -115,15 +115,19 @@ function show() {
   return busy;
 }
 
-/** One more sample of what is seen. */
+/** One more sample of what is seen, and on the canvas. */
 function pass() {
+  sample();
+  paint();
+}
+
+function sample() {
   const width = set.width, height = (width * 9) / 16, canvas = $("picture"), edge = Math.floor(set.wipe * width);
   if (canvas.width !== width) Object.assign(canvas, { width, height });
   if (set.view === "wipe") {
     engine.add("a", width, height, 0, edge);
     engine.add("b", width, height, edge, width);
   } else for (const side of set.view === "one" ? ["a"] : ["a", "b"]) engine.add(side, width, height);
-  paint();
 }
 
 function paint() {
@@ -133,14 +137,23 @@ function paint() {
   $("said").textContent = `${samples} of ${set.most} samples a pixel`;
 }
 
-let last = 0, passes = 1;
+let fence = null, issued = 0, passes = 1;
+/** Samples while the GPU keeps up: none before it is done with the last ones, as many at a time as it takes in 25 ms. */
 function frame(now) {
-  const took = now - last;
-  last = now;
-  passes = took < 20 ? Math.min(16, passes + 1) : took > 34 ? Math.max(1, passes >> 1) : passes;
-  const side = engine.sides.a;
-  if (side?.film && !set.still) for (let k = 0; k < passes && side.samples < set.most; k++) pass();
   requestAnimationFrame(frame);
+  const { gl } = engine.gpu, side = engine.sides.a;
+  if (fence) {
+    if (gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED) return;
+    gl.deleteSync(fence);
+    fence = null;
+    passes = now - issued < 20 ? Math.min(16, passes + 1) : now - issued > 40 ? Math.max(1, passes >> 1) : passes;
+  }
+  if (!side?.film || set.still || side.samples >= set.most) return;
+  for (let k = 0; k < passes && side.samples < set.most; k++) sample();
+  paint();
+  fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+  gl.flush();
+  issued = now;
 }
 
 async function rays() {
