@@ -48,7 +48,11 @@ def add_parser(subparsers: Any) -> None:
     )  # fmt: skip
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     parser.add_argument(
-        "--jobs", metavar="N", type=whole(1, 256), default=cores, help="files at a time (default: all cores)"
+        "--jobs",
+        metavar="N",
+        type=whole(1, 256),
+        default=cores,
+        help="files at a time, about 1 GB of memory each (default: all cores)",
     )
     add_dask(parser)
     parser.add_argument("--again", action="store_true", help="do finished files again")
