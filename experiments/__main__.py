@@ -39,6 +39,7 @@ NAMES = {
     "gallery": ("gallery.run", "what real lenses do: figures and numbers"),
     "random-lenses": ("random_lenses", "random valid lenses as files, for neurolens survey"),
     "fuzz": ("fuzz", "hostile files and command lines: one clear line each, in bounded time and memory"),
+    "survive": ("survive", "commands killed at random moments, on full disks, two at once"),
     "photons": ("photons", "flare by photons, as in Keshmirian 2008"),
     "glare": ("glare", "contrast that veiling glare takes; ways to sample light that turns round"),
     "starburst": ("starburst", "stars by diffraction: shapes, checks, Keller's cones beside"),

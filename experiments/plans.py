@@ -287,11 +287,12 @@ def effect_holds(effect: Mapping[str, Any]) -> bool:
 _HEAD = """\
 # Plans against all cameras tried
 
-{cases} cases: each lens with each scene ("distant": f/11, one line of light; "lights": wide open, near, coloured), 1920
-pixels across the film, for our renderer and for onnxruntime. *px*: error of the camera chosen in pixels that
-95% of the picture keep, at places, pupil samples and wavelengths that the plan did not see; *render*: the same from
-renders of pieces of the picture, as far as it is above the noise. *times*: its cost over that of the cheapest camera
-that holds among all that were tried ({tried}, polynomials of {sizes} sizes among them).
+{cases} of {all} cases, those measured so far: a lens and a scene ("distant": f/11, one line of light; "lights": wide
+open, near, coloured), 1920 pixels across the film, for our renderer and for onnxruntime. *px*: error of the camera
+chosen in pixels that 95% of the picture keep, at places, pupil samples and wavelengths that the plan did not see;
+*render*: the same from renders of pieces of the picture, as far as it is above the noise; a dash where too few pieces
+can tell. *times*: its cost over that of the cheapest camera that holds among all that were tried ({tried}, polynomials
+of {sizes} sizes among them).
 Made by `python -m experiments plans`."""
 _COLUMNS = lab.columns(
     ("lens", "lens"), ("scene", "scene"), ("f/", "f_number", ".3g"), ("pixel um", "pixel_um", ".3g"), ("for", "target"),
@@ -340,7 +341,9 @@ def page(rows: Sequence[Mapping[str, Any]]) -> str:
         {"lens": r["lens"], "scene": r["scene"]} | e for r in rows for e in r["effects"] if not effect_holds(e)
     ]  # fmt: skip
     tried = [len(r["cameras"]) for r in rows] or [0]
-    head = _HEAD.format(cases=len(rows), tried=f"{min(tried)} to {max(tried)}", sizes=len({*plans._TERMS, *MORE_TERMS}))
+    head = _HEAD.format(
+        cases=len(rows), all=len(CASES), tried=f"{min(tried)} to {max(tried)}", sizes=len({*plans._TERMS, *MORE_TERMS})
+    )
     named = lab.columns(
         ("lens", "lens"), ("scene", "scene"), ("effect", "name"), ("probe", "probe", ".3g"), ("fresh", "fresh", ".3g"),
         ("", "unit"),

@@ -13,7 +13,9 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text, library
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_glass, add_json, lens_path
-from neurolens.commands.output import answer, number, table
+from neurolens.commands.output import answer, number, plain_numbers, table
+from neurolens.commands.plan_frames import run_plan_frames
+from neurolens.commands.render_frames import add_frames
 
 if TYPE_CHECKING:
     from neurolens.evaluate.plan import Choice, Plan
@@ -36,6 +38,7 @@ _EPILOG = """\
 examples:
   neurolens plan experiments/scenes/garden.toml --lens laikin_double_gauss_50 --budget 0.25px
   neurolens plan scene.toml --lens my_lens.toml --budget 1px --for onnx --explain -o runs/plan
+  neurolens plan scene.toml --lens my_lens.toml --frames 1:48 --key focus=1:0.8,48:3
 
 -o leaves plan.json (all of it), effects.png (effects, and where in the picture those are that a camera needs),
 models/ with what was fitted, and plan.toml: 'render' and 'export' take it for the camera, and 'train' fits a
@@ -76,6 +79,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "-o", "--output", metavar="FOLDER", type=Path, help="for the plan (default: runs/plan-SCENE-LENS)"
     )
+    add_frames(parser, "one plan for these frames, whose models are reused: the fewest that keep the budget")
     add_glass(parser)
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="models fitted so far are kept, the plan is not written")
@@ -128,6 +132,8 @@ def run(args: argparse.Namespace) -> int:
     if folder.exists() and not folder.is_dir():
         raise InputError("neurolens plan", "-o", str(folder), "a folder")
     shipped = sorted((library() / "models").glob(f"{file.stem}.*.onnx"))
+    if args.frames is not None:
+        return run_plan_frames(args, file, shipped, folder)
     progress = Progress({"plan": 10} | ({"map of samples": 2} if args.samples else {}), quiet=args.quiet)
     with progress.stage("plan") as report:
         look: dict[str, Any] = {"afterwards": args.afterwards, "denoised": args.denoise, "report": report}
@@ -137,16 +143,16 @@ def run(args: argparse.Namespace) -> int:
         else:
             found = plan(scene, lens, args.budget, explain=args.explain, **look)
     folder.mkdir(parents=True, exist_ok=True)
-    data = {"scene": str(args.scene), "lens": str(file), **found.to_dict()}
+    data = plain_numbers({"scene": str(args.scene), "lens": str(file), **found.to_dict()})
     with atomic_path(folder / "plan.json") as part:
-        part.write_text(json.dumps(plain(data), indent=1) + "\n", encoding="utf-8")
+        part.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
     if found.best:
         atomic_write_text(folder / "plan.toml", found.to_toml(lens, folder))
     plot_effects(found, folder / "effects.png", f"{scene.name} through {lens.name}")
     if args.samples:
         with progress.stage("map of samples"):
             _write_samples(found, folder / "samples.exr")
-    answer(args, plain(data), lambda: _text(args, found, folder))
+    answer(args, data, lambda: _text(args, found, folder))
     return 0 if found.best else 1
 
 
@@ -160,15 +166,6 @@ def _write_samples(found: Plan, path: Path) -> None:
     meaning = {"blur": "diameter in pixels of the disc whose light is as far from its middle, RMS"}
     rgb = blur[..., None].repeat(3, -1)
     write_exr(path, rgb, metadata={"meaning": meaning}, layers={"blur": blur, "depth": depth}, attributes=attributes)
-
-
-def plain(value: Any) -> Any:
-    """JSON has no infinity: null."""
-    if isinstance(value, dict):
-        return {k: plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    return None if isinstance(value, float) and value in (float("inf"), float("-inf")) else value
 
 
 def _text(args: argparse.Namespace, found: Plan, folder: Path) -> str:

@@ -12,8 +12,8 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text, library
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_glass, add_json, lens_path, whole
-from neurolens.commands.output import answer, number, table
-from neurolens.commands.plan import TARGETS, pixels, plain
+from neurolens.commands.output import answer, number, plain_numbers, table
+from neurolens.commands.plan import TARGETS, pixels
 
 if TYPE_CHECKING:
     from neurolens.evaluate.trade import Offer, Trade
@@ -95,8 +95,8 @@ def run(args: argparse.Namespace) -> int:
     data = {"scene": str(args.scene), "lens": str(file), "target": args.target, "unit": found.unit}
     data |= {"base": found.base, "cameras": rows, "front": [o.choice.name for o in found.front]}
     data |= {"chosen": found.chosen and found.chosen.choice.name, "half": found.half and found.half.choice.name}
-    atomic_write_text(folder / "trade.json", json.dumps(plain(data), indent=1, default=str) + "\n")
-    answer(args, json.loads(json.dumps(plain(data), default=str)), lambda: _text(found, folder))
+    atomic_write_text(folder / "trade.json", json.dumps(plain_numbers(data), indent=1, default=str) + "\n")
+    answer(args, json.loads(json.dumps(plain_numbers(data), default=str)), lambda: _text(found, folder))
     return 0 if found.chosen else 1
 
 
@@ -136,7 +136,7 @@ def _text(found: Trade, folder: Path) -> str:
     ]  # fmt: skip
     shown = table(("", "camera", "px", "light", found.unit, "FLIP", ""), rows, left=2)
     legend = f"* for the budget, + no other betters it; {found.unit}: added, of one thread to equal noise; FLIP at "
-    legend += f"{found.samples} samples a pixel, of the same random numbers"
+    legend += f"{found.samples} samples a pixel of the same random numbers, with noise where cameras use them otherwise"
     written = f"Written: {folder}/trade.html, trade.png, pictures.png, trade.json"
     return "\n\n".join([shown, legend, "\n".join(_said(found)), written])
 
@@ -160,8 +160,8 @@ def _page(found: Trade, folder: Path, title: str) -> str:
     marks = ["● " if o == found.chosen else "○ " if o in front else "" for o in found.offered]
     names = [f"{m}{_short(o)}" for m, o in zip(marks, found.offered, strict=True)]
     lead = "".join(f"<p class='lead'>{pages.text(line)}</p>" for line in _said(found))
-    told = f"{found.samples} samples a pixel each, the same random numbers: equal samples, and noise that is nearly "
-    told += "the same. Below each its FLIP difference from the exact lens's picture."
+    told = f"{found.samples} samples a pixel each, the same random numbers. Below each its FLIP difference from the "
+    told += "exact lens's picture: with noise, where a camera makes other rays of the same numbers, as thin lenses do."
     figures = [
         {"file": "trade.png", "title": "Error against time", "caption": "Ring: the choice for the budget."},
         {"file": "pictures.png", "title": "What is seen", "caption": told},

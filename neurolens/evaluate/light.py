@@ -34,11 +34,11 @@ ACROSS = 48  # pixels of the small picture along its longer side
 BLACK = 0.01  # of the picture's mean: relative to less than that nothing counts
 STRAY = {"ghosts": "flare", "glare": "glare", "starburst": "star-bursts"}  # layers, and what a plan calls them
 _SAMPLES = 16
-_MOST_LIGHTS = 12
+_MOST_LIGHTS = 8
 _STARS = 2  # lights whose stars are drawn, the brightest in view: a second each
 _HIGHLIGHT = 4.0  # times the picture's mean: what shines or mirrors what does
 _NEAR_DEG = 2.0  # between a highlight and a light that it is the image of
-_WAVES, _CELL_PX, _PHOTONS = 3, 2.0, 1 << 14
+_WAVES, _CELL_PX, _PHOTONS = 3, 2.0, 1 << 18  # photons of all lights together
 _TAIL = 1e-3  # of the light, that its range leaves out at either end
 
 
@@ -133,7 +133,7 @@ def stray_light(scene: Scene, camera: Any, seen: Glance, white_balance: str | No
     if not lights:
         return dict.fromkeys(STRAY.values(), none)
     raster, given = Raster(camera.film_mm, width, height), (scene.settings.camera.wavelengths_nm, _WAVES, _CELL_PX)
-    layers = flare_layers(lens, lights, raster, FlareSettings(*given, glare=_PHOTONS, threads=1))
+    layers = flare_layers(lens, lights, raster, FlareSettings(*given, glare=_PHOTONS // len(lights), threads=1))
     half = np.array(camera.film_mm) / 2 / camera.settings["lens_state"]["pinhole_focal_length_mm"]
     stars = [a for a in lights if (np.abs(a.towards[:2]) < -1.1 * half * a.towards[2]).all()][:_STARS]
     only = FlareSettings(*given, starburst=True, without=("ghosts",), threads=1)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -21,7 +22,7 @@ from typing import Any, Literal
 import numpy as np
 
 from neurolens.base.config import to_toml
-from neurolens.base.errors import InputError, ModelError
+from neurolens.base.errors import InputError, ModelError, NeurolensWarning
 from neurolens.base.progress import Report
 from neurolens.base.tomlfile import format_toml
 from neurolens.cameras.build import Shot, ideal_as
@@ -182,7 +183,7 @@ def decided(found: Probed, tried: Sequence[Choice], budget_px: float, target: Ta
     ranked = tuple(replace(c, within=c.meets(budget_px)) for c in sorted(tried, key=lambda c: c.cost))
     best = next((c for c in ranked if c.within), None)
     effects = effects_of(found, budget_px)
-    return Plan(found.asked, budget_px, None, target, UNIT[target], _shot_domain(found), effects, ranked, best, found)
+    return Plan(found.asked, budget_px, None, target, UNIT[target], shot_domain(found), effects, ranked, best, found)
 
 
 @dataclass(frozen=True)
@@ -318,7 +319,14 @@ def _model(trial: _Trial, file: Path, how: str = "") -> Iterator[Choice]:
             yield trial.judged(file.stem, f"{'fused:' if compiled else ''}{file}", seen, cost, how)
 
 
-def _shot_domain(found: Probed) -> DomainChoice:
+def model_choice(found: Probed, target: Target, file: Path, how: str, costed: bool) -> Choice | None:
+    """A model in the form that the target runs; None where it has none, or its domain is not the shot's."""
+    with warnings.catch_warnings():  # film beyond the end of its range: its error counts
+        warnings.simplefilter("ignore", NeurolensWarning)
+        return next(_model(_Trial(found, target, math.inf if costed else -1.0), file, how), None)
+
+
+def shot_domain(found: Probed) -> DomainChoice:
     """The shot's, with as much more of the film's way as blurs a quarter of a pixel: models have their own focus."""
     asked = found.asked
     move = _FOCUS_SPARE * asked.f_number * asked.pixel_mm / first_order(found.lens).efl_mm ** 2  # of the vergence, 1/mm
@@ -332,16 +340,19 @@ def shot_terms(found: Probed) -> list[int]:
     return [n for n in _TERMS if n >= (4 if found.lens.anamorphic else 2)]
 
 
-def shot_fits(found: Probed, folder: Path) -> Callable[[int], tuple[Path, ModelSettings]]:
-    """What fits a polynomial of so many terms to a shot alone: its file, in a folder, and its settings."""
-    lens, domain, choice = found.lens.with_aperture(None), found.domain, _shot_domain(found)
+def shot_fits(
+    found: Probed, folder: Path, choice: DomainChoice | None = None, name: str = "shot"
+) -> Callable[[int], tuple[Path, ModelSettings]]:
+    """What fits a polynomial of so many terms to a shot alone, or to another domain of its lens: its file, in a folder,
+    and its settings."""
+    lens, domain, choice = found.lens.with_aperture(None), found.domain, choice or shot_domain(found)
     with suppress(InputError):  # a lens that goes no nearer
         domain = domain_of(lens, **asdict(choice))
     prepared = prepare(make_pairs(lens, domain, _PAIRS))
     folder.mkdir(parents=True, exist_ok=True)
 
     def fit(terms: int) -> tuple[Path, ModelSettings]:
-        settings = replace(_FIT, name=f"shot-ols-{terms}", terms=terms)
+        settings = replace(_FIT, name=f"{name}-ols-{terms}", terms=terms)
         file = folder / f"{Path(found.lens.path).stem}.{settings.label}.onnx"
         export_onnx(fit_model(prepared, settings), file, errors={})
         return file, settings

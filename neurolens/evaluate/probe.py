@@ -114,9 +114,17 @@ class Probed:
     glance: Glance
 
     @cached_property
-    def maps(self) -> Maps:
+    def camera_maps(self) -> Maps:
         """`effect_maps`, made once."""
         return effect_maps(self)
+
+    @cached_property
+    def maps(self) -> Maps:
+        """The same, and those of the light that the lens adds, on more pixels; without that where it is not known."""
+        with suppress(InputError):
+            added = stray_light(self.scene, self.exact, self.glance)
+            return self.camera_maps | {k: ("relative", v) for k, v in added.items()}
+        return self.camera_maps
 
     def on_film(self, value: Array) -> Array:
         """Values [N] of places as a picture [rows, columns], as prints show it: upright; NaN where none is."""
@@ -193,10 +201,9 @@ def upright(film: NDArray[_Real]) -> NDArray[_Real]:
 def effect_maps(found: Probed) -> Maps:
     """Unit and map [H, W] of each effect over the picture, upright; NaN where the lens is dark. See `effects_mm`.
 
-    Flare, glare and star-bursts are on more pixels; they are left out where they are not known (`effects_of`). An Airy
-    disc has no RMS radius: diffraction is worth the radius that holds half its light, 0.53 wavelengths times the
-    f-number (Born and Wolf, 8.5.2). Transmittance is the colour that the lens gives, by its glass and coatings and an
-    aperture that changes with the wavelength: RMS over wavelengths of the light there relative to its mean.
+    An Airy disc has no RMS radius: diffraction is worth the radius that holds half its light, 0.53 wavelengths times
+    the f-number (Born and Wolf, 8.5.2). Transmittance is the colour that the lens gives, by its glass and coatings and
+    an aperture that changes with the wavelength: RMS over wavelengths of the light there relative to its mean.
     """
     pixel, share = found.asked.pixel_mm, found.places.share
     parts = {k: v / pixel for k, v in prints.effects_mm(found.seen, found.thin_seen, share).items()}
@@ -212,15 +219,13 @@ def effect_maps(found: Probed) -> Maps:
     }
     maps: Maps = {k: ("px", found.on_film(v)) for k, v in parts.items()}
     maps |= {k: ("relative", found.on_film(v)) for k, v in light.items()}
-    with suppress(InputError):
-        maps |= {k: ("relative", v) for k, v in stray_light(found.scene, found.exact, found.glance).items()}
     return maps
 
 
-def effects_of(found: Probed, budget_px: float) -> tuple[Effect, ...]:
-    """What each effect is worth in this picture, the dearest first."""
+def effects_of(found: Probed, budget_px: float, stray: bool = True) -> tuple[Effect, ...]:
+    """What each effect is worth in this picture, the dearest first; `stray`: light that the lens adds among them."""
     effects = []
-    for name, (unit, value) in found.maps.items():
+    for name, (unit, value) in (found.maps if stray else found.camera_maps).items():
         budget = budget_px if unit == "px" else LIGHT
         known = value[np.isfinite(value)]
         worth, later = (
@@ -230,7 +235,7 @@ def effects_of(found: Probed, budget_px: float) -> tuple[Effect, ...]:
         why = "made afterwards" if later else "left out" if worth <= budget else ""
         over = float((known > budget).mean())
         effects.append(Effect(name, worth, float(np.median(known)), over, unit, not why, why))
-    if not {*STRAY.values()} & {e.name for e in effects}:
+    if stray and not {*STRAY.values()} & {e.name for e in effects}:
         effects.append(Effect("flare", math.inf, math.inf, 1.0, "relative", True, "not known"))
     return tuple(sorted(effects, key=lambda e: (e.unit, -e.worth)))
 

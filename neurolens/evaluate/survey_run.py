@@ -7,6 +7,7 @@ import multiprocessing
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from hashlib import sha256
 from multiprocessing.connection import wait
@@ -210,7 +211,8 @@ def _begin(context: Any, task: Task) -> tuple[Any, Any]:
 
 def _work(place: Any, task: Task) -> None:
     end_at_once()
-    place.send_bytes(run_task(task))
+    with suppress(BrokenPipeError):  # whoever asked was killed
+        place.send_bytes(run_task(task))
 
 
 def _answer(place: Any, process: Any, task: Task) -> bytes:

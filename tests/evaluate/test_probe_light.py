@@ -12,7 +12,7 @@ from neurolens.cameras.build import Shot, make_camera
 from neurolens.evaluate.footprints import Footprints, blur_mm, distance_mm, left_to
 from neurolens.evaluate.light import glance, stray_light
 from neurolens.evaluate.plan import plan
-from neurolens.evaluate.probe import probe
+from neurolens.evaluate.probe import effects_of, probe
 from neurolens.evaluate.samples import blur_map
 from neurolens.flare.layers import FlareSettings, flare_layers
 from neurolens.flare.picture import Raster
@@ -141,3 +141,33 @@ def test_blur_of_each_pixel_is_the_circle_of_confusion_at_its_depth(f_number: fl
     rendered = render(scene, thin, samples=1).layers.depth
     assert np.median(np.abs(rendered - depth)) < 0.01  # and the card is where a render shows it
     assert (np.abs(rendered - depth) < 0.01).mean() > 0.95
+
+
+EXTREMES: dict[str, dict[str, Any]] = {
+    "distant": {"planes": []},
+    "at the front glass": {"quads": [card(0.2, 0.0635, (-0.1, -0.1))]},  # 2 mm before it, 61.5 mm from the film
+    "one pixel": {"camera": {"width": 1, "height": 1, "film_width_mm": 0.01, "film_height_mm": 0.01}},
+    "dark": {"environment": {"colour": [0.0, 0.0, 0.0]}},
+}
+
+
+@pytest.mark.parametrize("name", EXTREMES)
+def test_extremes_have_an_answer(name: str) -> None:
+    found = probe(wall(**EXTREMES[name]), read_lens(LENS).at(), across=3)
+    effects = effects_of(found, 0.25)
+    assert all(e.worth >= 0 for e in effects) and {"defocus", "flare"} <= {e.name for e in effects}
+    assert (found.asked.nearest_m is None) == (name == "distant")
+    blur, _ = blur_map(found)
+    assert np.isfinite(blur).all() and blur.shape == (found.scene.settings.camera.height, blur.shape[1])
+    if name == "at the front glass":
+        assert np.median(blur) > 20  # pixels
+
+
+def test_lights_beyond_number_are_bounded() -> None:
+    """Of many lights those that are strongest at the lens are looked at: a near one among weak ones is found."""
+    place = np.random.default_rng(0).uniform([-9, -9, -60], [9, 9, -40], (20_000, 3))
+    points = [{"position_m": [float(v) for v in p], "intensity": [1e-6] * 3} for p in place]
+    points[12_345] = {"position_m": [0.2, 0.1, -2.0], "intensity": [5.0] * 3}
+    scene = wall(100.0, points=points)
+    seen = SceneLights(scene).seen(scene, 60.0, most=8)
+    assert len(seen) <= 8 and max(a.rgb[0] for a in seen) == pytest.approx(5 / 2.01**2, rel=0.1)

@@ -108,6 +108,13 @@ def test_rims_that_touch_are_narrowed_to_where_they_meet(tmp_path: Path) -> None
     assert 0 <= gap < 0.01
 
 
+def test_a_folded_table_is_refused_by_its_thickness(tmp_path: Path) -> None:
+    """Of a mirror lens: light goes back, which the format cannot say."""
+    rows = [replace(s, thickness_mm=-s.thickness_mm) if k == 3 else s for k, s in enumerate(GAUSS.surfaces)]
+    with pytest.raises(InputError, match="surface 3, thickness_mm: got -.*expected at least 0"):
+        read_text(DRAWN[".lens"](replace(GAUSS, surfaces=tuple(rows))), ".lens", tmp_path)
+
+
 ZOOM = """[descriptive data]
 title\tA zoom
 [variable distances]
