@@ -190,8 +190,9 @@ def _ray_ns(tracer: GhostTracer, model: GhostModel, rounds: int) -> tuple[float,
     rays = {pair: rays_across(model.lens, LIGHT, grid.places)[0] for pair, grid in found.items()}
     count = WAVELENGTHS * sum(of_ghost.shape[1] for of_ghost in rays.values())
     nm = np.linspace(405.0, 695.0, WAVELENGTHS).tolist()
+    tried: tuple[GhostTracer | GhostModel, ...] = (tracer, model)
     for _ in range(rounds):
-        for k, of in enumerate((tracer, model)):
+        for k, of in enumerate(tried):
             began = time.process_time()
             for pair, of_ghost in rays.items():
                 of.follow_each(of.start(of_ghost), nm, pair, grids.REACH)

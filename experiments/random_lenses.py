@@ -111,10 +111,12 @@ def _changed(lens: Lens, strength: float, chance: random.Random) -> Lens:
         )  # fmt: skip
         rows.append(row)
     edge = lens.half_field_deg or math.degrees(math.atan(image_radius_mm(lens.at())[0] / abs(first_order(lens).efl_mm)))
-    figures = {"f_number": lens.f_number * chance.uniform(1.0, 1.6), "half_field_deg": edge * chance.uniform(0.7, 1.0)}
-    names = {"designer": "", "source": "random", "notes": "", "rims": "derived"}
-    none = {"image_radius_mm": None, "stated_efl_mm": None, "stated_efl_x_mm": None, "configurations": ()}
-    return replace(lens, surfaces=tuple(rows), aperture=None, **figures, **names, **none)
+    return replace(
+        lens, surfaces=tuple(rows), aperture=None, configurations=(),
+        f_number=lens.f_number * chance.uniform(1.0, 1.6), half_field_deg=edge * chance.uniform(0.7, 1.0),
+        designer="", source="random", notes="", rims="derived",
+        image_radius_mm=None, stated_efl_mm=None, stated_efl_x_mm=None,
+    )  # fmt: skip
 
 
 def _finished(lens: Lens, chance: random.Random, family: str) -> Lens:
