@@ -16,13 +16,14 @@ from neurolens.flare.lights import Light, rays_across
 from neurolens.flare.stack import Floats
 from neurolens.flare.steps import LOST
 
-FEWEST, MOST = 150, 512  # lit cells, and cells along a side
+FEWEST, MOST = 320, 512  # lit cells, and cells along a side
 REACH = 16.0  # of `GhostTracer.trace`: rims are cut between rays inside and outside
 _SCOUTS = 48  # cells a side of the grid that looks for ghosts
 _FEW = 4  # of the scouts, one in so many a side, tell how far apart colours are
 _NEAR = 2.0  # r^2 / R^2 to which rays beyond rims tell it, too
+_EVEN = 0.02  # least unevenness, and spread of colours over the size, of a ghost
 _AT_ONCE = 128  # ghosts
-_ERROR, _WORST = 2.5, 0.25  # light beside its place, times the cells that half the film is wide; at most
+_ERROR, _WORST = 3.0, 0.25  # light beside its place, times the cells that half the film is wide; at most
 
 
 @dataclass(frozen=True)
@@ -130,8 +131,9 @@ def _look(kept: NDArray[np.bool_], rows: Floats, spread: float, half_mm: tuple[f
         off.append(0.125 * float((step * _pairs(light, axis, np.add)).sum()) * box[-1])
     places = np.clip(np.stack([x[lit], y[lit]]), -half, half) if lit.any() else np.zeros((2, 1))
     share = (lit.sum() + 0.5) / ((box[0] + 1) * (box[1] + 1))
-    size = max(float(np.ptp(places, 1).max()), 1e-3 * half_mm[0])
-    return _Look(off[0], off[1], float(light.sum()) * min(spread / size, 1.0), size, share)
+    size, whole_light = max(float(np.ptp(places, 1).max()), 1e-3 * half_mm[0]), float(light.sum())
+    along_u, along_v = (max(v, _EVEN * whole_light) for v in off)
+    return _Look(along_u, along_v, whole_light * min(max(spread / size, _EVEN), 1.0), size, share)
 
 
 def _pairs(a: NDArray[Any], axis: int, of: Callable[[Any, Any], Any]) -> NDArray[Any]:

@@ -12,7 +12,7 @@ from neurolens.base.errors import InputError
 from neurolens.readers import draft
 from neurolens.readers.draft import INFINITE, State
 from neurolens.readers.forbes import MAX_TERMS, qbfs_terms, qcon_terms
-from neurolens.readers.source import Line
+from neurolens.readers.source import Line, assume
 
 # Settings of the program and of its analyses.
 IGNORED_SYSTEM = frozenset(
@@ -142,6 +142,8 @@ def shape_of(block: Block) -> dict[str, Any]:
 def _q_type(block: Block) -> dict[str, Any]:
     form, (radius, values) = block.parameter(1), block.extras()
     rim = radius if math.isnan(block.semi_diameter) else block.semi_diameter
+    place = f"{block.start.file}, line {block.start.number}"
+    assume(place, f"{block.kind}: PARM 1 is taken as 0 for Qbfs, 1 for Qcon, XDAT as that of XASPHERE")
     if form not in (0, 1) or len(values) > MAX_TERMS:
         found, expected = f"(PARM 1 {form:g}, {len(values)} terms)", f"0 (Qbfs) or 1 (Qcon), at most {MAX_TERMS} terms"
         raise block.start.error(block.kind, found, expected)

@@ -9,7 +9,7 @@ import pytest
 from lens_formats import swapped as swapped_in
 from shipped import singlet_mm
 
-from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.errors import AssumedWarning, InputError, NeurolensWarning
 from neurolens.optics import catalogue
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
@@ -126,6 +126,12 @@ def test_units_scale_every_length(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--units"):
         read(HEAD + BODY + TAIL, tmp_path, Given(units="cm"))
     assert read(swapped("UNIT MM X W X CM MR CPMM\n", ""), tmp_path, Given(units="in")) == inches
+
+
+def test_a_q_type_asphere_says_how_its_rows_were_taken(tmp_path: Path) -> None:
+    block = "TYPE QED_TYPE\n  CURV 0.02\n  CONI -1\n  PARM 1 1\n  XDAT 1 1\n  XDAT 2 10\n  XDAT 3 0.5"
+    with pytest.warns(AssumedWarning, match="PARM 1 is taken as 0 for Qbfs"):
+        read(swapped('TYPE STANDARD\n  CURV 2.0E-2 0 0 0 0 ""', block), tmp_path)
 
 
 @pytest.mark.parametrize(
