@@ -4,9 +4,12 @@
 #   make test     tests, then lint, format and types
 #   make test-blender   the extension in Blender 5.0, in .venv-blender (Python 3.11; about 400 MB, once);
 #                       BLENDER=4.5.0 or 5.2.3 for another (from 5.1 on it needs Python 3.13)
+#   make test-web the page of `neurolens view` in headless Chromium (Debian: chromium; CHROMIUM=/path/to/another), and its
+#                 models in onnxruntime-web where npm is
 #   make bench    the tracer's speed, then models against it; fails when a promised ratio is lost
 #   make models   fit again every model of models/
 #   make gallery  what real lenses do: render and measure every effect
+#   make docs     the documentation in build/docs, after its links, commands and how-tos were tried (3 CPU minutes)
 #   make lint     lint, format and types only
 #   make format   rewrite the code in the project's format
 #   make clean    remove .venv and caches
@@ -18,6 +21,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+CHROMIUM ?= $(shell command -v chromium || command -v chromium-browser || command -v google-chrome)
+ORT_WEB := 1.30.0
 BLENDER ?= 5.0.0
 BLENDER_VENV := .venv-blender$(if $(filter 5.0.0,$(BLENDER)),,-$(BLENDER))
 BLENDER_INSTALLED := $(BLENDER_VENV)/.installed
@@ -31,7 +36,7 @@ export PIP_DEFAULT_TIMEOUT ?= 120
 export OMP_NUM_THREADS ?= 2
 export MPLBACKEND ?= Agg
 
-.PHONY: demo test test-blender bench models gallery lint format clean
+.PHONY: demo test test-blender test-web docs bench models gallery lint format clean
 .DELETE_ON_ERROR:
 
 demo: $(INSTALLED)
@@ -47,6 +52,21 @@ test: $(INSTALLED)
 test-blender: $(BLENDER_INSTALLED) $(INSTALLED)
 	PYTHONPATH=. $(BIN)/python tests/blender/expect.py build/blender
 	NEUROLENS_BLENDER_SHOTS=build/blender $(BLENDER_VENV)/bin/python -m pytest -q --confcutdir=tests/blender tests/blender
+
+# A browser is not for pip to bring; without one this says so. onnxruntime-web comes of npm, once, into build/web.
+test-web: $(INSTALLED)
+	@set -e; if [ -z "$(CHROMIUM)" ]; then echo "no browser: the page is not tested (Debian: apt-get install chromium)"; exit 0; fi; \
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[web]' --no-build-isolation; \
+	if command -v npm >/dev/null; then npm install --silent --no-audit --no-fund --prefix build/web onnxruntime-web@$(ORT_WEB); \
+	else echo "no npm: models are not run in onnxruntime-web"; fi; \
+	ort=build/web/node_modules/onnxruntime-web/dist; \
+	NEUROLENS_BROWSER="$(CHROMIUM)" NEUROLENS_ORT="$$(test -d $$ort && echo $$ort)" \
+	    $(BIN)/python -m pytest -q -rs tests/view/test_view_in_browser.py
+
+docs: $(INSTALLED) $(VENV)/.docs
+	OMP_NUM_THREADS=1 NEUROLENS_DOCS=1 $(BIN)/python -m pytest -q -n 2 tests/test_docs.py
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict -f docs/mkdocs.yml
+	@echo "Look at build/docs/index.html"
 
 bench: $(INSTALLED)
 	$(BIN)/python -m experiments trace
@@ -84,6 +104,10 @@ $(INSTALLED): pyproject.toml constraints.txt
 	"$$found" -m venv $(VENV) || { echo "'$$found -m venv' failed: is the venv module installed (Debian: python3-venv)?" >&2; exit 1; }
 	$(BIN)/python -m pip install --quiet -c constraints.txt torch
 	$(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[train,dev]'
+	@touch $@
+
+$(VENV)/.docs: $(INSTALLED)
+	$(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[docs]'
 	@touch $@
 
 $(BLENDER_INSTALLED): Makefile

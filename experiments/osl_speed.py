@@ -128,7 +128,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _shaders(quiet: bool) -> tuple[dict[str, str | None], dict[str, int]]:
     """Texts by camera, None for Blender's own, and the operations of ours."""
-    from neurolens.commands.export_osl import shader_of
+    from neurolens.evaluate.shaders import shader_of
 
     made = {name: shader_of(file, quiet=quiet) for name, file in SHADERS.items()}
     own: dict[str, str | None] = {BUILT_IN: None, DEPTH: None, THIN: THIN_LENS}

@@ -49,25 +49,32 @@ def build_parser() -> Parser:
         bench,
         blender,
         convert,
+        demo,
         evaluate,
         export,
         flare,
         glass,
         lens,
+        library,
+        merge,
         mitsuba,
         models,
         plan,
         projection,
         render,
         stmap,
+        survey,
+        trade,
         train,
+        view,
     )
 
     parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
-    read = lens, analyse, glass, convert, stmap, projection
-    for command in (*read, plan, train, models, evaluate, export, render, flare, mitsuba, blender, bench):
+    read = lens, analyse, glass, convert, survey, library, stmap, projection
+    made = train, models, evaluate, export, render, merge, flare, mitsuba, blender, view
+    for command in (*read, plan, trade, *made, bench, demo):
         command.add_parser(subparsers)
     return parser
 
@@ -109,7 +116,9 @@ def _fault(error: Exception) -> int:
     """Report what no command expects: a package or memory that is missing, or a fault of neurolens itself."""
     package = (getattr(error, "name", None) or "").partition(".")[0]
     if isinstance(error, ModuleNotFoundError) and package in _TRAIN_PACKAGES:
-        return _fail(f"this needs {package}, which is not installed: pip install '.[train]' in the project's folder")
+        return _fail(
+            f"this needs {package}, which is not installed: pip install 'neurolens[train]', or '.[train]' in a checkout"
+        )
     if os.environ.get(_TRACEBACK):
         import traceback
 

@@ -30,7 +30,7 @@ GAUSS, SINGLET, PHONE, ZOOM, TESSAR = (
 )
 COMMANDS = (
     *("lens", "analyse", "glass", "convert", "train", "models", "evaluate", "export", "render"),
-    *("stmap", "projection"),
+    *("stmap", "projection", "survey"),
 )
 
 
@@ -374,7 +374,7 @@ WITHOUT_TORCH = (
 
 def test_without_torch_a_lens_file_names_the_extra_and_the_thin_lens_renders(scene: Path, tmp_path: Path) -> None:
     done = python(WITHOUT_TORCH, "render", scene, "--camera", GAUSS, "-o", tmp_path / "a.exr", "--quiet")
-    assert done.returncode == 2 and "pip install '.[train]'" in done.stderr and len(done.stderr.splitlines()) == 1
+    assert done.returncode == 2 and "'neurolens[train]'" in done.stderr and len(done.stderr.splitlines()) == 1
     done = python(WITHOUT_TORCH, "render", scene, "--camera", "thin", "-o", tmp_path / "a.exr", "--quiet")
     assert done.returncode == 0 and (tmp_path / "a.exr").exists()
 
@@ -490,3 +490,42 @@ def test_a_shot_outside_the_model_is_one_line(
 ) -> None:
     line = failure(capsys, "render", scene, "--camera", model, "-o", tmp_path / "a.exr", "--quiet", *args)
     assert all(word in line for word in words), line
+
+
+def test_the_demo_is_a_page_of_pictures_with_their_commands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["demo", "--width", "32", "--samples", "1"]) == 0
+    page = (tmp_path / "neurolens-demo" / "index.html").read_text(encoding="utf-8")
+    pictures = re.findall(r"img src='./([a-z]+\.png)'", page)
+    assert pictures == ["model.png", "exact.png", "thin.png", "pinhole.png", "fisheye.png"]
+    assert all((tmp_path / "neurolens-demo" / name).stat().st_size > 100 for name in pictures)
+    assert page.count("neurolens render") == 5 and "missing" not in page
+
+
+@pytest.mark.slow
+def test_the_library_is_pages_of_lenses_and_an_index_that_are_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["library", "-o", tmp_path / "pages", "thorlabs_lb1471_biconvex_50", "--quiet", "--json"]
+    assert main([str(word) for word in command]) == 0
+    found = json.loads(capsys.readouterr().out)
+    folder = tmp_path / "pages" / "thorlabs_lb1471_biconvex_50"
+    page = (folder / "index.html").read_text(encoding="utf-8")
+    for name in re.findall(r"img src='./([a-z]+\.png)'", page):
+        assert (folder / name).read_bytes()[:4] == b"\x89PNG"
+    assert page.count("<img") == 8 and "mlp-16x2" in page and "Picture missing" not in page
+    assert found["bytes"] < 1e6 and found["lenses"][0]["efl_mm"] == pytest.approx(50, rel=0.02)
+    index = (tmp_path / "pages" / "index.html").read_text(encoding="utf-8")
+    assert (
+        "thorlabs_lb1471_biconvex_50/index.html" in index
+        and "<svg" in index
+        and not re.search("(src|href)='http", index)
+    )
+    before = (folder / "layout.png").stat().st_mtime_ns
+    assert main([str(word) for word in command]) == 0 and (folder / "layout.png").stat().st_mtime_ns == before
+    (tmp_path / "bad.toml").write_text("schema = 1\n")
+    capsys.readouterr()
+    assert main(["library", "-o", str(tmp_path / "pages"), str(tmp_path / "bad.toml"), "--quiet"]) == 1
+    assert "bad.toml" in capsys.readouterr().out

@@ -36,11 +36,13 @@ PARTS = {
     "evaluate": {
         *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba", "flare")
     },
+    "view": {"graph", "optics", "analysis", "cameras"},
     "blender": set(),
     "commands": {
         *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba", "flare"),
         "blender",
         "evaluate",
+        "view",
     },
     "cli": {"commands"},
 }
@@ -60,6 +62,7 @@ PACKAGES = {
 # Besides those: the writer of ONNX; the one camera that traces rays exactly, the maker of cameras, which imports it
 # when one is asked for; the shapes of the stop, which are parts of graphs.
 EXCEPTIONS: dict[str, tuple[set[str], set[str]]] = {
+    "neurolens.base.engine": (set(), {"distributed"}),  # where a cluster is asked for
     "neurolens.graph.onnx": (set(), {"onnx"}),
     "neurolens.optics.apertures": ({"graph"}, set()),
     "neurolens.optics.sag": ({"optics"}, set()),  # for a type

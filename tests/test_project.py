@@ -47,3 +47,22 @@ def test_examples_run(code: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     monkeypatch.chdir(ROOT)
     exec(compile(code, "example", "exec"), {})  # noqa: S102 - our own pages
     assert capsys.readouterr().out
+
+
+def test_an_installed_package_holds_the_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the wheel's data files are, laid out as an installation has them, is what names find."""
+    from neurolens.base import files
+    from neurolens.commands.arguments import named_camera
+
+    data = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["data-files"]
+    for folder, patterns in data.items():
+        (tmp_path / "env" / folder).mkdir(parents=True)
+        for found in (f for pattern in patterns for f in ROOT.glob(pattern)):
+            (tmp_path / "env" / folder / found.name).write_bytes(found.read_bytes())
+    monkeypatch.setattr(files, "__file__", str(tmp_path / "env" / "lib" / "neurolens" / "base" / "files.py"))
+    monkeypatch.setattr(files.sys, "prefix", str(tmp_path / "env"))
+    assert files.library() == tmp_path / "env" / "share" / "neurolens"
+    for name in ("laikin_double_gauss_50", "laikin_double_gauss_50.mlp-16x2", "isshiki_fisheye_10.mlp-16x2"):
+        assert Path(named_camera(name)).is_file()
+    assert (files.library() / "experiments" / "scenes" / "lights.toml").is_file()
+    assert named_camera("no_such_lens") == "no_such_lens"

@@ -239,3 +239,38 @@ def _draw_rims(axes: Any, surfaces: Sequence[Section]) -> None:
         look = {"color": INK, "lw": 3.2 if s.stop else 1.3, "solid_capstyle": "butt", "zorder": 4 if s.stop else 3}
         for sign, label in ((-1, "stop" if s.stop else None), (1, None)):
             axes.plot((z, z), (sign * h, sign * reach), label=label, **look)
+
+
+_WIDTH, _LEAST, _MOST = 240.0, 60.0, 200.0  # pixels of a thumbnail: width; height
+_SVG_RAYS = ("#3b6fb6", "#3d9a50", "#c2502e")
+
+
+def thumbnail(layout: Layout) -> str:
+    """The section as a small SVG element (a few kB, no ids), for tables of many lenses."""
+    (left, right), top = _limits(layout)
+    scale = min(_WIDTH / (right - left), _MOST / (2 * top))
+    width, height = scale * (right - left), max(2 * scale * top, _LEAST)
+
+    def path(points: Array, look: str, close: str = "") -> str:
+        x = np.clip(scale * (points[:, 0] - left), -9 * _WIDTH, 9 * _WIDTH)
+        y = np.clip(height / 2 - scale * points[:, 1], -9 * _WIDTH, 9 * _WIDTH)
+        moves = "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, y, strict=True))
+        return f"<path d='M{moves}{close}' {look}/>"
+
+    parts = []
+    for front, back in zip(layout.surfaces, layout.surfaces[1:], strict=False):
+        if front.n_after >= _AIR:
+            outline = element_outline(front, back)[::4]
+            parts.append(path(outline, "fill='#a9cbe4' stroke='#3d5a75' stroke-width='.7'", "Z"))
+    for ray in layout.rays[:: max(1, RAYS_A_FIELD // 3)]:
+        parts.append(path(ray.points, f"fill='none' stroke='{_SVG_RAYS[ray.field % 3]}' stroke-width='.6'"))
+    for s in layout.surfaces:
+        if s.stop:
+            h, reach = s.semi_diameter_mm, max(1.15 * s.semi_diameter_mm, s.semi_diameter_mm + 0.14 * top)
+            for sign in (1, -1):
+                bar = np.array([[s.z_mm, sign * h], [s.z_mm, sign * reach]])
+                parts.append(path(bar, "stroke='currentColor' stroke-width='2'"))
+    film, half = layout.film_z_mm, layout.film_half_height_mm
+    parts.append(path(np.array([[film, -half], [film, half]]), "stroke='#b02a2a' stroke-width='1.6'"))
+    box = f"viewBox='0 0 {width:.0f} {height:.0f}' width='{width:.0f}' height='{height:.0f}'"
+    return f"<svg xmlns='http://www.w3.org/2000/svg' {box}>{''.join(parts)}</svg>"

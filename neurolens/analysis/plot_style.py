@@ -105,5 +105,7 @@ def _matplotlib() -> Any:
     try:
         import matplotlib
     except ImportError as error:
-        raise NeurolensError("plots need matplotlib: pip install '.[train]' in the project's folder") from error
+        raise NeurolensError(
+            "plots need matplotlib: pip install 'neurolens[train]', or '.[train]' in a checkout"
+        ) from error
     return matplotlib

@@ -151,12 +151,15 @@ _SHIFTS = 5
 
 def plot_spots(data: Spots, path: str | Path, title: str, subtitle: str) -> None:
     """Spots: rows are fields, columns the film moved through focus, the middle one unshifted, with the Airy disc."""
-    shifts = np.linspace(data.shift_mm[0], data.shift_mm[-1], _SHIFTS)
+    columns = min(_SHIFTS, len(data.shift_mm))
+    shifts = np.linspace(data.shift_mm[0], data.shift_mm[-1], columns)
     rows = len(data.field_deg)
     half = _half_width(data)
-    with drawing(path, 9.4, 1.75 * rows + 1.3, title, f"Spots through focus; {subtitle}") as figure:
-        grid = figure.subplots(rows, _SHIFTS, sharex=True, sharey=True, squeeze=False)
-        for i, j in np.ndindex(rows, _SHIFTS):
+    with drawing(
+        path, 1.4 + 1.6 * max(columns, 2), 1.75 * rows + 1.3, title, f"Spots through focus; {subtitle}"
+    ) as figure:
+        grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+        for i, j in np.ndindex(rows, columns):
             axes = grid[i, j]
             _spot(axes, data, i, float(shifts[j]))
             axes.set(xlim=(-half, half), ylim=(-half, half), aspect="equal")

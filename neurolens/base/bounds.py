@@ -5,6 +5,7 @@ from __future__ import annotations
 F_NUMBER = 0.1, 10_000.0
 FOCAL_MM = 1e-3, 1e6
 FILM_MM = 1e-3, 1e4  # a side
+RANGE = "range"  # as a zoom position: all of them
 
 
 def within(bounds: tuple[float, float], value: float) -> bool:

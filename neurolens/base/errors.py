@@ -53,3 +53,7 @@ class ModelError(NeurolensError, ValueError):
 
 class NeurolensWarning(UserWarning):
     """A condition that is not an error but affects results, such as a glass without dispersion data."""
+
+
+class AssumedWarning(NeurolensWarning):
+    """Something that a file does not say, or says wrongly, was assumed: what is read from it is doubtful."""

@@ -9,10 +9,13 @@ import json
 import os
 import re
 import secrets
+import site
 import stat
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from functools import cache
 from io import BufferedReader
 from pathlib import Path
@@ -27,6 +30,31 @@ _DIGEST = 32  # bytes of SHA-256
 # Opened without waiting for a writer of a FIFO; what a system lacks it does not need.
 _READ = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
+
+
+_noted: ContextVar[set[Path] | None] = ContextVar("_noted", default=None)
+
+
+@contextmanager
+def noted_files() -> Iterator[set[Path]]:
+    """Collect the files that are opened for reading inside the block, absolute paths; none of caches."""
+    found: set[Path] = set()
+    before = _noted.set(found)
+    try:
+        yield found
+    finally:
+        _noted.reset(before)
+        cached = cache_folder()
+        found -= {path for path in found if path.is_relative_to(cached)}
+
+
+def library() -> Path:
+    """The folder of what ships beside the code, lenses/, models/ and experiments/scenes/: the checkout's; of an
+    installed package, share/neurolens in the environment (the user's, pip's --target); else the working folder."""
+    code = Path(__file__).parents[2]
+    shares = (Path(sys.prefix), Path(site.getuserbase()), code)
+    roots = (code, *(share / "share" / "neurolens" for share in shares))
+    return next((root for root in roots if (root / "lenses").is_dir()), Path.cwd())
 
 
 @contextmanager
@@ -111,6 +139,8 @@ def open_regular(path: str | Path) -> BufferedReader:
     except ValueError:  # a zero byte or half a surrogate pair
         raise OSError(errno.EINVAL, "no name of a file", repr(str(path))) from None
     if stat.S_ISREG(os.fstat(descriptor).st_mode):
+        if (noted := _noted.get()) is not None:
+            noted.add(Path(os.path.abspath(path)))
         return os.fdopen(descriptor, "rb")
     os.close(descriptor)
     raise OSError(errno.EINVAL, "not a regular file", str(path))

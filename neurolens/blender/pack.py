@@ -25,7 +25,7 @@ from neurolens.base.files import atomic_path
 EXTENSION = Path(__file__).parent / "extension"
 FACTS, SCHEMA = "lenses.json", 1
 _ID = "neurolens"
-_CODE = ("__init__.py", "camera.py", "library.py", "panel.py", "blender_manifest.toml")
+_CODE = ("__init__.py", "camera.py", "library.py", "needs.py", "panel.py", "blender_manifest.toml")
 _THEN = (1980, 1, 1, 0, 0, 0)  # the zip of the same lenses is the same, byte for byte
 _YEAR = re.compile(r"\b(1[89]\d\d|20\d\d)\b(?!,?\d)")
 _LARGEST = 1 << 26
@@ -48,7 +48,8 @@ class Form:
 
 @dataclass(frozen=True)
 class PackedLens:
-    """A lens of the menu: `lens_id` names its files; `picture` is a PNG, None without."""
+    """A lens of the menu: `lens_id` names its files; `picture` is a PNG, `lens_field` an `extension.library.Field` as a
+    table, None without."""
 
     lens_id: str
     name: str
@@ -57,6 +58,7 @@ class PackedLens:
     source: str
     picture: bytes | None
     forms: list[Form]
+    lens_field: dict[str, Any] | None = None
 
     def files(self) -> dict[str, bytes]:
         """Contents by place."""
@@ -80,6 +82,7 @@ class PackedLens:
             "source": self.source,
             "picture": None if self.picture is None else f"thumbnails/{self.lens_id}.png",
             "variants": variants,
+            "field": self.lens_field,
         }
 
     def _stem(self, form: Form) -> str:

@@ -37,7 +37,7 @@ LIGHT_NM = (400.0, 700.0)
 _PUPIL = 6, 24  # rings of pupil samples, and samples of a ring
 _RAYS = 1 << 17  # at once
 _ROUND, _OTHER = (513, 1), (97, 64)  # radii and azimuths of the tables
-_BEYOND = 1.02  # radius of the film's corner over that of the light: as lenses are engraved
+BEYOND = 1.02  # radius of the film's corner over that of the light: as lenses are engraved
 _FINER = 64, 4  # rings (and azimuths) of the map back over those of the map there, of round cameras and of others
 _EDGE = 16  # points on each side of the film
 _TRIED, _AZIMUTHS, _UNEVEN = (0.4, 0.7, 0.95), 7, 3e-6  # where roundness is tried; of the radius
@@ -363,8 +363,8 @@ def field_of(
     end = corner if azimuths > 1 else _end_of_light(lambda r: at(np.array([r + 0j]), distance)[1].light[0] > 0, corner)
     points = (np.linspace(0, end, rings)[:, None] * turns(azimuths)).reshape(-1)
     place, found = at(points, distance)
-    edge = _film_edge(camera.film_mm)
-    edge_place, _ = at(edge / _BEYOND, distance)
+    edge = film_edge(camera.film_mm)
+    edge_place, _ = at(edge / BEYOND, distance)
     widest = math.degrees(float(np.where(found.light > 0, found.angle, 0.0).max()))
     if target == RECTILINEAR:
         _check_plane(camera, widest, bool(np.isfinite(edge_place).all()), end)
@@ -375,13 +375,13 @@ def field_of(
         raise InputError(camera.name, "film_mm", camera.film_mm, f"no picture beyond {fold:.4g} mm, where it folds")
     ideal, light = Polar.of(end, place), found.light.reshape(rings, azimuths)
     others = [] if math.isinf(distance) else [d for d in (math.inf, 2 * distance, distance / 2) if d > 2 * nearest]
-    moved = {d: np.abs(at(edge / _BEYOND, d)[0] - edge_place) for d in others}
+    moved = {d: np.abs(at(edge / BEYOND, d)[0] - edge_place) for d in others}
     parallax = {d: float(np.nanmax(m, initial=0.0)) for d, m in moved.items()}
     light = light / light[0].mean()
     return Field(ideal, _inverted(ideal), frame, target, end, widest, light, parallax, spectrum)
 
 
-def _film_edge(film_mm: tuple[float, float]) -> Complex:
+def film_edge(film_mm: tuple[float, float]) -> Complex:
     """Points round the edge of a film, mm."""
     line, half = np.linspace(-1, 1, _EDGE), np.array(film_mm) / 2
     sides = [line * half[0] + 1j * half[1], line * half[0] - 1j * half[1],

@@ -58,7 +58,9 @@ examples:
   neurolens analyse lenses/brendel_tessar_100.toml spots mtf --f-number 5.6 --focusing best --json"""
 
 
-class _Analysis(NamedTuple):
+class Analysis(NamedTuple):
+    """Computes a result of a scene, draws it (result, path, title, subtitle), and tells its figures as a table."""
+
     compute: Callable[..., Any]
     draw: Callable[..., None]
     table: Callable[[dict[str, Any]], str]
@@ -125,7 +127,7 @@ def run(args: argparse.Namespace) -> int:
     shown = {w: {k: v for k, v in d.items() if k not in bulk.get(w, ())} for w, d in found.items()}
 
     def text() -> str:
-        parts = [f"{scene.lens.name}\n{state_text(scene)}", *(_analysis(w).table(d) for w, d in found.items())]
+        parts = [f"{scene.lens.name}\n{state_text(scene)}", *(analysis_of(w).table(d) for w, d in found.items())]
         parts += [*(f"Note: {n}" for n in notes), *(f"Warning: {w}" for w in doubts)]
         if pictures:
             parts.append(f"{len(pictures)} pictures drawn in {args.output}")
@@ -156,7 +158,7 @@ def _one(what: str, scene: Scene, args: argparse.Namespace) -> tuple[dict[str, A
     from neurolens.analysis.fields import DEFAULT_NM
     from neurolens.analysis.layout import state_text
 
-    analysis = _analysis(what)
+    analysis = analysis_of(what)
     options = {"field_deg": args.fields, "wavelength_nm": args.wavelengths}
     asked = {k: v for k, v in options.items() if v is not None} if what in _OF_FIELDS else {}
     if what in _OF_FIELDS:
@@ -171,7 +173,7 @@ def _one(what: str, scene: Scene, args: argparse.Namespace) -> tuple[dict[str, A
     return data, path
 
 
-def _analysis(what: str) -> _Analysis:
+def analysis_of(what: str) -> Analysis:
     """The analysis of a name; torch and matplotlib are imported here, not when the command line starts."""
     from neurolens.analysis import plots
     from neurolens.analysis.field_curves import colour, curvature, distortion, illumination
@@ -181,16 +183,16 @@ def _analysis(what: str) -> _Analysis:
     from neurolens.analysis.wavefront import psf
 
     return {
-        "layout": _Analysis(layout_profile, lens_layout, _layout_text),
-        "spots": _Analysis(spots, plots.plot_spots, _spots_text),
-        "fans": _Analysis(fans, plots.plot_fans, _fans_text),
-        "colour": _Analysis(colour, plots.plot_colour, _colour_text),
-        "curvature": _Analysis(curvature, plots.plot_curvature, _curvature_text),
-        "distortion": _Analysis(distortion, plots.plot_distortion, _distortion_text),
-        "vignetting": _Analysis(illumination, plots.plot_vignetting, _vignetting_text),
-        "mtf": _Analysis(mtf, plots.plot_mtf, _mtf_text),
-        "seidel": _Analysis(seidel, plots.plot_seidel, _seidel_text),
-        "psf": _Analysis(psf, plots.plot_psf, _psf_text),
+        "layout": Analysis(layout_profile, lens_layout, _layout_text),
+        "spots": Analysis(spots, plots.plot_spots, _spots_text),
+        "fans": Analysis(fans, plots.plot_fans, _fans_text),
+        "colour": Analysis(colour, plots.plot_colour, _colour_text),
+        "curvature": Analysis(curvature, plots.plot_curvature, _curvature_text),
+        "distortion": Analysis(distortion, plots.plot_distortion, _distortion_text),
+        "vignetting": Analysis(illumination, plots.plot_vignetting, _vignetting_text),
+        "mtf": Analysis(mtf, plots.plot_mtf, _mtf_text),
+        "seidel": Analysis(seidel, plots.plot_seidel, _seidel_text),
+        "psf": Analysis(psf, plots.plot_psf, _psf_text),
     }[what]
 
 

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from neurolens.base.bounds import F_NUMBER, FOCAL_MM
 from neurolens.base.errors import InputError, one_line
+from neurolens.base.files import library
 
 if TYPE_CHECKING:
     from neurolens.optics.apertures import Aperture
     from neurolens.optics.prescription import Lens
 
-RANGE = "range"  # as a zoom position: all of them
 T = TypeVar("T")
 
 
@@ -231,36 +231,33 @@ def add_json(parser: argparse.ArgumentParser, quiet: bool = False) -> None:
     )
 
 
-def project_root() -> Path:
-    """The project's folder: that of the source, or else, for a package installed away from it, the working folder.
-
-    Raises:
-        InputError: neither has the folder experiments/.
-    """
-    for root in (Path(__file__).parents[2], Path.cwd()):
-        if (root / "experiments").is_dir():
-            return root
-    raise InputError(Path.cwd(), "experiments/", "(missing)", "the project's folder as the working folder")
-
-
 def lens_path(name: str | Path, command: str) -> Path:
     """The lens file of an argument: a path, or a name of lenses/ in the project; raises InputError for another word."""
     path = Path(name)
     if path.exists() or path.suffix:  # the reader says what is wrong with a path
         return path
-    folder = project_root() / "lenses"
+    folder = library() / "lenses"
     if (folder / f"{path}.toml").is_file():
         return folder / f"{path}.toml"
     raise InputError(f"neurolens {command}", "LENS", str(name), f"a lens file, or a name in {folder}")
 
 
 def named_camera(text: str) -> str:
-    """Type of a camera's argument: a name of lenses/ in the project, also after `fused:` and the like, is its file."""
+    """Type of a camera's argument: lenses and models that ship by name, after `fused:` and the like, too, as files.
+
+    A TOML file that names a `camera` (that of `neurolens plan`) stands for it.
+    """
     kind, colon, word = text.rpartition(":")
-    with suppress(InputError):
-        if not set(word) & set("./\\") and (file := project_root() / "lenses" / f"{word}.toml").is_file():
-            found = os.path.relpath(file) if file.is_relative_to(Path.cwd()) else str(file)
-            return f"{kind}{colon}{found}"
+    for file in (library() / "lenses" / f"{word}.toml", library() / "models" / f"{word}.onnx"):
+        if not set(word) & set("/\\") and file.is_file():
+            return f"{kind}{colon}{os.path.relpath(file) if file.is_relative_to(Path.cwd()) else file}"
+    if word.endswith(".toml") and Path(word).is_file():
+        from neurolens.base.tomlfile import read_toml
+
+        with suppress(InputError):  # said where the camera is made
+            if isinstance(named := read_toml(word).get("camera"), str) and named != "none":
+                own, own_colon, path = named.rpartition(":")
+                return f"{kind or own}{colon or own_colon}{os.path.normpath(Path(word).parent / path)}"
     return text
 
 

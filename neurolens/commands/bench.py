@@ -9,11 +9,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurolens.base.errors import InputError, printable
+from neurolens.base.errors import InputError, NeurolensError, printable
 from neurolens.commands.arguments import QUIET_HELP, Parser, add_glass, check_run_folder, lens_path, whole
+from neurolens.commands.farm import Task, add_dask, files_of, spread
 
 if TYPE_CHECKING:
-    from neurolens.evaluate.methods import BenchSettings
+    from neurolens.evaluate.methods import Bench, BenchSettings
 
 SURROGATES = """\
 Fit every method for every lens on the same rays, measure errors, size and time against the exact
@@ -59,6 +60,7 @@ def add_surrogate_arguments(parser: argparse.ArgumentParser, lenses: str) -> Non
     parser.add_argument("--rounds", metavar="N", type=whole(0), help="of the race, 0 for none (default 10)")
     parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=1, help="of the race (default 1)")
     parser.add_argument("--again", action="store_true", help="recompute the chosen records")
+    add_dask(parser)
     parser.add_argument(
         "--out", metavar="DIR", type=Path, default=Path("runs/surrogates"), help="folder (default: runs/surrogates)"
     )
@@ -71,7 +73,7 @@ def run_surrogates(args: argparse.Namespace) -> int:
     from neurolens.base.files import atomic_write_text, write_json
     from neurolens.base.progress import Progress
     from neurolens.evaluate.experiment import LensChoice
-    from neurolens.evaluate.methods import Bench, chosen_rows, run_bench
+    from neurolens.evaluate.methods import Bench, chosen_rows, lacks, run_bench
     from neurolens.evaluate.methods_page import NOTES, summary_page, write_lens
     from neurolens.evaluate.records import plain, versions
 
@@ -91,13 +93,38 @@ def run_surrogates(args: argparse.Namespace) -> int:
     write_json(out / "config.json", plain(config))
     facts = f"{_conditions(args, settings)} {NOTES}"
     found: dict[str, Any] = {}
-    for bench, records in run_bench(benches, rows, Progress(quiet=args.quiet), again=args.again):
+    progress = Progress(quiet=args.quiet)
+    again = args.again
+    if args.dask is not None:
+        asked = [bench for bench in benches if again or lacks(bench, rows)]
+        with progress.stage(f"{len(asked)} of {len(benches)} lenses") as report:
+            tasks = [_task(args, bench) for bench in asked]
+            failed = spread(args.dask, tasks, {*files, *files_of(args)}, out, report) if tasks else {}
+        for name, why in failed.items():
+            raise NeurolensError(f"{name}: {why}; finished records are kept: the same command resumes")
+        again = False
+    for bench, records in run_bench(benches, rows, progress, again=again):
         found[bench.name] = records
         write_lens(bench.name, records, facts, out)
         atomic_write_text(out / "summary.md", summary_page(found, facts))
     pages = f"Look at\n  {out / 'summary.md'}\n  {out / (benches[0].name + '.md')}, ..."
     print(printable(f"{summary_page(found, facts)}\n{pages}"))
     return 0
+
+
+def _task(args: argparse.Namespace, bench: Bench) -> Task:
+    alone = argparse.Namespace(**vars(args) | {"lenses": [bench.choice.file]})
+    return Task.of(bench.name, bench_alone, alone, args.out)
+
+
+def bench_alone(args: argparse.Namespace) -> None:
+    """Make the records of the lenses, without pages, as a task of a cluster does."""
+    from neurolens.base.progress import Progress
+    from neurolens.evaluate.experiment import LensChoice
+    from neurolens.evaluate.methods import Bench, chosen_rows, run_bench
+
+    benches = [Bench(LensChoice(file), _settings(args), args.out) for file in args.lenses]
+    list(run_bench(benches, chosen_rows(args.methods), Progress(quiet=True)))
 
 
 def _settings(args: argparse.Namespace) -> BenchSettings:

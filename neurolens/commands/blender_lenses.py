@@ -8,6 +8,7 @@ import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.signals import end_at_once, held
 from neurolens.blender.pack import Form, PackedLens
-from neurolens.commands.arguments import RANGE
 from neurolens.commands.blender_kept import kept_form
-from neurolens.commands.export_osl import shader_of
+from neurolens.evaluate.shaders import shader_of
 from neurolens.render.film import CONTEXT
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 _SIDE_IN, _DOTS, _MARGIN = 2.56, 100, 1.08  # of a thumbnail: 256 pixels; its side over the glass's
 _NETWORK = "mlp"
+_RADII, _NEAR = (0.0, 0.35, 0.6, 0.8, 0.97), 20.0  # of the picture's radius; focal lengths
 Forms = dict[Path, Form]
 
 
@@ -149,7 +151,40 @@ def packed_of(
         data = first_order(lens)
         name, efl, f_number, source = lens.name, data.efl_mm, data.f_number, lens.source
     picture = None if lens is None else thumbnail(lens)
-    return PackedLens(key_of(first), str(name), float(efl), float(f_number), source, picture, list(forms))
+    table = None if lens is None or not forms else field_table(lens, min(form.film_radius_mm for form in forms))
+    return PackedLens(key_of(first), str(name), float(efl), float(f_number), source, picture, list(forms), table)
+
+
+def field_table(lens: Lens, radius_mm: float) -> dict[str, Any] | None:
+    """What a lens does to its picture wide open, as `extension.library.Field`; None where it cannot be traced."""
+    if find_spec("torch") is None:
+        return None
+    from neurolens.cameras.build import Shot, ideal_as
+    from neurolens.cameras.exact import ExactCamera
+    from neurolens.cameras.field import spectrum_of
+    from neurolens.evaluate import footprints as prints
+    from neurolens.optics.paraxial import first_order
+
+    film, radii = (2 * radius_mm, 2 * radius_mm), radius_mm * np.array(_RADII)
+    points = np.stack([radii, np.zeros_like(radii)])
+    near = round(_NEAR * float(first_order(lens).efl_mm) / 1000, 6)
+    rows: dict[str, list[Any]] = {"distortion_um": [], "blur_um": [], "light": []}
+    with suppress(InputError):
+        for focus in (math.inf, near):
+            camera = ExactCamera(lens, film_mm=film, focus_m=focus)
+            nm, share = spectrum_of(camera)
+            share = share / share.sum()
+            places = prints.places_of(camera, points, np.full(radii.size, focus), nm, share)
+            if places.film_mm.shape[1] < radii.size:
+                return None  # dark at the edge
+            thin = ideal_as("thin:", camera.lens, Shot(film, focus))
+            seen, ideal = (prints.footprints(c, places) for c in (camera, thin))
+            rows["distortion_um"].append(1e3 * prints.effects_mm(seen, ideal, share)["distortion"])
+            rows["blur_um"].append(1e3 * math.sqrt(2) * prints.blur_mm(seen, share))
+            rows["light"].append(seen.light / seen.light[0])
+        table = {name: [[float(f"{v:.4g}") for v in row] for row in both] for name, both in rows.items()}
+        return {"radius_mm": [round(float(r), 4) for r in radii], "near_m": near, **table}
+    return None
 
 
 def key_of(file: Path) -> str:

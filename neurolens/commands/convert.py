@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 _DESCRIPTION = """\
 Read a lens file of another program and write it as a lens file of neurolens (.toml).
 
-Formats: Zemax (.zmx), CODE V (.seq), OSLO (.len, the simple ones), plain tables of four
+Formats: Zemax (.zmx), CODE V (.seq), OSLO (.len, the simple ones), texts of the Optical Bench (.txt), FlareSim
+(.lens), the TOML of the Blender add-on Physical Camera, plain tables of four
 columns as in pbrt and appleseed (.dat, .txt), and JSON (our own, DeepLens, ISET). The content decides.
 Unsupported content is an error that names the line; what was left out, computed, assumed or
 doubtful is printed as a warning. Rims that a file does not give, and the check of the lens against its own

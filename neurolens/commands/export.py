@@ -66,7 +66,7 @@ def add_parser(subparsers: Any) -> None:
         epilog=_EPILOG,
     )  # fmt: skip
     parser.add_argument(
-        "model", metavar="MODEL", type=lambda text: Path(named_camera(text)),
+        "model", metavar="MODEL", type=lambda text: Path(named_camera(text).removeprefix("fused:")),
         help="exported model (.onnx), or a run folder with one model; of C, GLSL, OSL also a lens file or name",
     )  # fmt: skip
     parser.add_argument("--to", choices=("c", "glsl", "osl", "onnx"), required=True, help="form to write")
@@ -170,7 +170,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _write_osl(file: Path, args: argparse.Namespace, partly: bool) -> int:
     """A camera for Cycles."""
-    from neurolens.commands.export_osl import shader_of
+    from neurolens.evaluate.shaders import shader_of
 
     if partly or args.camera or args.f_number is not None or args.focus != math.inf:
         expected = "none of them: stop and focus are inputs of the shader, which is a whole camera"

@@ -13,11 +13,11 @@ import numpy as np
 
 from neurolens import __version__
 from neurolens.base import status as st
+from neurolens.base.bounds import RANGE
 from neurolens.base.progress import Progress
 from neurolens.cameras.exact import check_bare
 from neurolens.cameras.focus_function import Array, Focusing
 from neurolens.cameras.source import film_extras, followed, state_ranges
-from neurolens.commands.arguments import RANGE
 from neurolens.graph.c import Extras
 from neurolens.graph.program import Program
 from neurolens.graph.scalars import lower
@@ -30,18 +30,20 @@ from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm, pupil_bounds, pupil_plane_z_mm
 from neurolens.optics.tracegraph import exact_graph
 from neurolens.surrogates.source import Written, checked_name, lines_of, write_program
-from neurolens.surrogates.states import zoom_axis
+from neurolens.surrogates.states import gap_axis, zoom_axis
 
 _LIGHT_NM = (400.0, 700.0)
 _NEAR_EFL = 10.0  # nearest focus of the function of that, in focal lengths
-_GAP_MM, _MOST = 1e-4, 12  # error of interpolated gaps that is enough, and the highest degree tried for it
-_BETWEEN = (0.08, 0.35, 0.5, 0.77, 0.93)  # of the way from knot to knot: where gaps are measured
 _DISTANCES = 12  # about as many are placed for each lens
 _CHECKED = (0.12, 0.42, 0.83)  # of the range: where the film's position is measured
 
 
-def write_lens(file: Path, args: argparse.Namespace) -> Written:
-    """The lens as a function of film and pupil point, wavelength, film position, stop radius and, of a range, zoom."""
+def write_lens(file: Path, args: argparse.Namespace, *, as_bare: str = "") -> Written:
+    """The lens as a function of film and pupil point, wavelength, film position, stop radius and, of a range, zoom.
+
+    Args:
+        as_bare: a line for the comment, of a lens whose coatings and absorption are left out; else it is refused.
+    """
     lens = read_lens(file)
     name = checked_name(args.to, lens.lens_id, args.name)
     axes: tuple[Axis, ...] = ()
@@ -59,7 +61,8 @@ def write_lens(file: Path, args: argparse.Namespace) -> Written:
             lines.append("One zoom position: its gaps are numbers in the code (--zoom range makes it an argument).")
     if focus_states(lens):
         lines.append("Groups stand at infinity focus: the film focuses, for how groups move is no graph.")
-    for node in nodes:
+    lines += [as_bare] * bool(as_bare)
+    for node in nodes if not as_bare else ():
         check_bare(node, "a model of the lens has them")
     planes = pupil_planes_mm(nodes, axes)
     program = lens_program(nodes, axes, planes)
@@ -112,31 +115,6 @@ def lens_program(nodes: Sequence[Lens], axes: Sequence[Axis], planes_mm: Sequenc
     program = lower([exact_graph(n, z, _LIGHT_NM) for n, z in zip(nodes, planes_mm, strict=True)])
     program.mixture = mixture_of(axes) if axes else None
     return program
-
-
-def gap_axis(first: Axis, lens_at: Callable[[float], Lens]) -> tuple[Axis, float]:
-    """An axis with nodes enough for the gaps of the lens at its values, and their largest error in mm between nodes.
-
-    Args:
-        first: the axis, of the least degree that is tried.
-    """
-
-    def places(value: float) -> Array:
-        lens = lens_at(value)
-        return np.array(lens.vertices_mm[: len(lens.surfaces)])
-
-    def turned(value: float) -> float:
-        return 1 / value if first.reciprocal else value
-
-    ends = [(turned(a), turned(b)) for a, b in zip(first.knots, first.knots[1:], strict=False)]
-    known = [(v, places(v)) for a, b in ends for v in (turned(a + (b - a) * share) for share in _BETWEEN)]
-    for degree in range(first.degree, _MOST + 1):
-        axis = replace(first, degree=degree)
-        nodes = np.array([places(v) for v in axis.nodes])
-        error = max(float(np.abs(weights((axis,), (v,)) @ nodes - exact).max()) for v, exact in known)
-        if error < _GAP_MM:
-            break
-    return axis, error
 
 
 def pupil_planes_mm(nodes: Sequence[Lens], axes: Sequence[Axis]) -> list[float]:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.files import library
 from neurolens.commands.arguments import (
     add_json,
     add_lens_state,
@@ -20,7 +21,6 @@ from neurolens.commands.arguments import (
     focus_of,
     given_options,
     lens_path,
-    project_root,
     state_of,
 )
 from neurolens.commands.output import answer, number, table
@@ -254,7 +254,7 @@ def _run_list(args: argparse.Namespace) -> int:
 
     if args.layouts is not None:
         check_folder(args.layouts, "--layouts")
-    rows = [library_row(file) for file in lens_files(args.folder or project_root() / "lenses")]
+    rows = [library_row(file) for file in lens_files(args.folder or library() / "lenses")]
     if args.layouts is not None:
         from neurolens.evaluate.figures import sheet
 

@@ -10,8 +10,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import neurolens
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
+from neurolens.base.files import library
 from neurolens.commands.arguments import add_json
 from neurolens.commands.output import answer, number, table
 from neurolens.evaluate.records import CLOSE_UM, reaches, to_use, use_command
@@ -59,7 +59,7 @@ def _error(text: str) -> tuple[str, float]:
 def run(args: argparse.Namespace) -> int:
     """Print the models; 1 where none is left."""
     places = _places()
-    found = [m for place in places for m in _models_in(place)]
+    found = [m for place in places for m in models_in(place)]
     of_lens = [m for m in found if args.lens is None or _is_of(m, args.lens)]
     if not of_lens:
         asked = "(none)" if args.lens is None else args.lens
@@ -81,12 +81,12 @@ def run(args: argparse.Namespace) -> int:
 def _places() -> list[Path]:
     """Folders of models that exist; the same one once."""
     near = [Path("models"), *sorted(Path("runs").glob("*/models"))]
-    shipped = Path(neurolens.__file__).parents[1] / "models"
+    shipped = library() / "models"
     found = [p for p in near if p.is_dir()]
     return found + [shipped] * (shipped.is_dir() and all(p.resolve() != shipped for p in found))
 
 
-def _models_in(folder: Path) -> Iterator[dict[str, Any]]:
+def models_in(folder: Path) -> Iterator[dict[str, Any]]:
     """What the cards of a folder say, with the times beside them; a file that is no model is left out."""
     from neurolens.modelfile.onnxfile import card_in, read_metadata
 

@@ -10,14 +10,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path
+from neurolens.base.files import atomic_path, atomic_write_text, library
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, lens_path, project_root
-from neurolens.commands.output import answer, number, table
+from neurolens.commands.arguments import add_glass, add_json, lens_path
+from neurolens.commands.output import answer, number, plain_numbers, table
+from neurolens.commands.plan_frames import run_plan_frames
+from neurolens.commands.render_frames import add_frames
 
 if TYPE_CHECKING:
-    from neurolens.evaluate.plan import Plan
+    from neurolens.evaluate.plan import Choice, Plan
 
+# Repeated here, so that help imports no torch; a test compares with `evaluate.plan`.
+TARGETS = ("render", "c", "onnx", "osl", "glsl")
 _DESCRIPTION = """\
 Look through the exact lens at a scene, say what each of its effects is worth there in pixels, and choose
 the cheapest camera whose error stays within the budget: a pinhole, with or without its picture warped
@@ -27,14 +31,18 @@ exact lens. Needs the extra "train" (torch).
 Errors are distances between footprints, the picture of a point by a camera and by the exact lens: the
 least RMS way on which light moves to turn one into the other, in pixels of the scene's picture (place,
 size and shape of the blur, each wavelength by itself), and the relative error of light, of which 1%% is
-allowed. Both are those that 95%% of the picture keep. Times are measured here, on one thread, a ray that
-passes."""
+allowed. Both are those that 95%% of the picture keep. The cost of a ray, times the noise of its weights,
+is proportional to the time to equal error: measured here, on one thread; of Cycles counted and turned
+into its nanoseconds, measured once; of GLSL in operations."""
 _EPILOG = """\
 examples:
   neurolens plan experiments/scenes/garden.toml --lens laikin_double_gauss_50 --budget 0.25px
   neurolens plan scene.toml --lens my_lens.toml --budget 1px --for onnx --explain -o runs/plan
+  neurolens plan scene.toml --lens my_lens.toml --frames 1:48 --key focus=1:0.8,48:3
 
--o leaves plan.json (all of it), effects.png and models/ with what was fitted."""
+-o leaves plan.json (all of it), effects.png (effects, and where in the picture those are that a camera needs),
+models/ with what was fitted, and plan.toml: 'render' and 'export' take it for the camera, and 'train' fits a
+model of the shot from it, from scratch."""
 
 
 def add_parser(subparsers: Any) -> None:
@@ -46,36 +54,74 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("scene", metavar="SCENE", type=Path, help="scene file (.toml)")
     parser.add_argument("--lens", metavar="LENS", required=True, help="lens file (.toml), or a name in lenses/")
     parser.add_argument(
-        "--budget", metavar="PIXELS", type=_pixels, default=0.25, help="error allowed, as 0.25px (default: 0.25px)"
-    )
-    parser.add_argument(
-        "--for", dest="target", choices=("render", "c", "onnx"), default="render",
-        help="what runs the camera: our renderer, compiled C, or onnxruntime (default: render)",
+        "--budget", metavar="BUDGET", type=_budget, default=0.25,
+        help="error allowed, as 0.25px (default); or time, as 20s: of one thread, for the scene's size and samples, "
+        "for which the most faithful camera is chosen",
     )  # fmt: skip
+    parser.add_argument(
+        "--for", dest="target", choices=TARGETS, default="render",
+        help="what runs the camera: our renderer, compiled C, onnxruntime, Blender's Cycles (osl), or a renderer in "
+        "GLSL (default: render)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--comp", metavar="EFFECTS", type=_afterwards, default=(), dest="afterwards",
+        help="what compositing makes of the picture later, distortion (with its light, by an ST map), defocus or both "
+        "with a comma: the camera is held against the lens without it",
+    )  # fmt: skip
+    parser.add_argument("--denoise", action="store_true", help="noise is taken out later: charge no camera for it")
     parser.add_argument("--explain", action="store_true", help="time and list every camera tried")
+    parser.add_argument(
+        "--samples", action="store_true",
+        help="write samples.exr, too, of the scene's size: the diameter of each pixel's blur in pixels (layer blur, "
+        "and R, G and B) and its depth in m (Z), for samplers that give more samples where blur is wide",
+    )  # fmt: skip
     parser.add_argument("--no-fit", dest="fit", action="store_false", help="fit nothing for the shot")
     parser.add_argument(
         "-o", "--output", metavar="FOLDER", type=Path, help="for the plan (default: runs/plan-SCENE-LENS)"
     )
+    add_frames(parser, "one plan for these frames, whose models are reused: the fewest that keep the budget")
     add_glass(parser)
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="models fitted so far are kept, the plan is not written")
 
 
-def _pixels(text: str) -> float:
-    match = re.fullmatch(r"([0-9.]{1,20}(?:e[+-]?[0-9]{1,3})?)(px)?", text)
+class Seconds(float):
+    """A budget of time."""
+
+
+def pixels(text: str) -> float:
+    """Type of a budget in pixels."""
+    return _number(text, "px", "pixels, as 0.25px")
+
+
+def _budget(text: str) -> float:
+    if text.endswith("s"):
+        return Seconds(_number(text, "s", "seconds, as 20s"))
+    return _number(text, "px", "pixels, as 0.25px, or seconds, as 20s")
+
+
+def _number(text: str, unit: str, expected: str) -> float:
+    match = re.fullmatch(rf"([0-9.]{{1,20}}(?:e[+-]?[0-9]{{1,3}})?)({unit})?", text)
     try:
         if match and 0 <= (value := float(match[1])) < 1e12:
             return value
     except ValueError:
         pass
-    raise argparse.ArgumentTypeError(f"got {text!r}, expected pixels, as 0.25px")
+    raise argparse.ArgumentTypeError(f"got {text!r}, expected {expected}")
+
+
+def _afterwards(text: str) -> tuple[str, ...]:
+    words = tuple(text.split(","))
+    if set(words) <= {"distortion", "defocus"}:
+        return words
+    raise argparse.ArgumentTypeError(f"got {text!r}, expected distortion, defocus or distortion,defocus")
 
 
 def run(args: argparse.Namespace) -> int:
     """Plan, write, print; 1 where no camera for this target is within the budget."""
     from neurolens.evaluate.plan import plan
     from neurolens.evaluate.plots import plot_effects
+    from neurolens.evaluate.trade import plan_within
     from neurolens.optics.lensfile import read_lens
     from neurolens.render.scene import load_scene
 
@@ -85,59 +131,103 @@ def run(args: argparse.Namespace) -> int:
     folder = args.output or Path("runs") / f"plan-{scene.name}-{file.stem}"
     if folder.exists() and not folder.is_dir():
         raise InputError("neurolens plan", "-o", str(folder), "a folder")
-    shipped = sorted((project_root() / "models").glob(f"{file.stem}.*.onnx"))
-    progress = Progress({"plan": 10}, quiet=args.quiet)
+    shipped = sorted((library() / "models").glob(f"{file.stem}.*.onnx"))
+    if args.frames is not None:
+        return run_plan_frames(args, file, shipped, folder)
+    progress = Progress({"plan": 10} | ({"map of samples": 2} if args.samples else {}), quiet=args.quiet)
     with progress.stage("plan") as report:
-        found = plan(
-            scene, lens, args.budget, target=args.target, models=shipped, explain=args.explain, report=report,
-            folder=folder / "models" if args.fit else None,
-        )  # fmt: skip
+        look: dict[str, Any] = {"afterwards": args.afterwards, "denoised": args.denoise, "report": report}
+        look |= {"target": args.target, "models": shipped, "folder": folder / "models" if args.fit else None}
+        if isinstance(args.budget, Seconds):
+            found = plan_within(scene, lens, args.budget, **look)
+        else:
+            found = plan(scene, lens, args.budget, explain=args.explain, **look)
     folder.mkdir(parents=True, exist_ok=True)
-    data = {"scene": str(args.scene), "lens": str(file), **found.to_dict()}
+    data = plain_numbers({"scene": str(args.scene), "lens": str(file), **found.to_dict()})
     with atomic_path(folder / "plan.json") as part:
-        part.write_text(json.dumps(_plain(data), indent=1) + "\n", encoding="utf-8")
+        part.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    if found.best:
+        atomic_write_text(folder / "plan.toml", found.to_toml(lens, folder))
     plot_effects(found, folder / "effects.png", f"{scene.name} through {lens.name}")
-    answer(args, _plain(data), lambda: _text(args, found, folder))
+    if args.samples:
+        with progress.stage("map of samples"):
+            _write_samples(found, folder / "samples.exr")
+    answer(args, data, lambda: _text(args, found, folder))
     return 0 if found.best else 1
 
 
-def _plain(value: Any) -> Any:
-    """JSON has no infinity: null."""
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    return None if isinstance(value, float) and value in (float("inf"), float("-inf")) else value
+def _write_samples(found: Plan, path: Path) -> None:
+    from neurolens.evaluate.samples import blur_map
+    from neurolens.render.exr_attributes import standard_attributes
+    from neurolens.render.pictures import write_exr
+
+    blur, depth = blur_map(found.probed)
+    attributes = standard_attributes(found.probed.exact.settings, *blur.shape[::-1])
+    meaning = {"blur": "diameter in pixels of the disc whose light is as far from its middle, RMS"}
+    rgb = blur[..., None].repeat(3, -1)
+    write_exr(path, rgb, metadata={"meaning": meaning}, layers={"blur": blur, "depth": depth}, attributes=attributes)
 
 
 def _text(args: argparse.Namespace, found: Plan, folder: Path) -> str:
+    from neurolens.evaluate.light import STRAY
+
     asked = found.asked
     view = "nothing with a distance" if asked.nearest_m is None else (
         f"{asked.nearest_m:.4g} to {asked.farthest_m:.4g} m"
     )  # fmt: skip
     facts = f"f/{asked.f_number:.3g}, focus {asked.focus_m:g} m, in view {view}"
     facts += f", {100 * asked.distant:.0f}% of the picture is distant; a pixel is {1e3 * asked.pixel_mm:.3g} um"
+    facts += (
+        f"\nlight from {asked.light_nm[0]:.0f} to {asked.light_nm[1]:.0f} nm; blur differs between neighbours over "
+    )
+    facts += f"{100 * asked.edges:.0f}% of the picture"
+    if asked.edge_contrast is not None:
+        facts += f", of contrast {number(asked.edge_contrast, 2)} there (elsewhere {number(asked.contrast, 2)})"
     rows = [
         (e.name, number(e.worth, 3), number(e.median, 3), "px" if e.unit == "px" else "of light",
-         "" if e.needed else "left out")
+         f"{100 * e.over:.0f}%", e.why)
         for e in found.effects
     ]  # fmt: skip
-    parts = [facts, table(("effect", "worth", "median", "", ""), rows)]
+    parts = [facts, table(("effect", "worth", "median", "", "beyond", ""), rows)]
+    if stray := [e.name for e in found.effects if e.name in STRAY.values() and e.needed]:
+        parts.append(f"No camera makes {', '.join(stray)}: a table [flare] in the scene does, or 'neurolens flare'.")
     if args.explain:
-        header = ("", "camera", "px", "light", "ns", "passes", "")
+        header = ("", "camera", "px", "light", found.unit, "noise", "")
         parts.append(table(header, [
             ("*" if c == found.best else "+" if c.within else "", c.name, number(c.error_px, 3),
-             number(c.light_error, 2), number(c.ns, 3), number(c.passed, 2), c.how)
+             number(c.light_error, 2), number(c.cost, 3), number(c.noise, 3), c.how)
             for c in found.choices
         ], left=2))  # fmt: skip
-        parts.append("* to use, + within the budget; px, light: errors that 95% of the picture keep; ns a ray")
+        parts.append(
+            "* to use, + within the budget; px, light: errors that 95% of the picture keep; "
+            f"{found.unit} a ray times noise, the rays it takes for equal error"
+        )
     best = found.best
-    if best is None:
+    if best is None and found.budget_s is not None:
+        parts.append(f"No camera for --for {found.target} takes {found.budget_s:g} s.")
+    elif best is None:
         nearest = min(found.choices, key=lambda c: c.error_px, default=None)
         closest = f"; the closest is {nearest.name} with {number(nearest.error_px, 3)} px" if nearest else ""
         parts.append(f"No camera for --for {found.target} keeps {found.budget_px:g} px{closest}.")
     else:
-        told = f"Use {best.name}: {number(best.error_px, 3)} px of {found.budget_px:g}, {number(best.ns, 3)} ns a ray"
-        command = f"neurolens render {shlex.quote(str(args.scene))} --camera {shlex.quote(best.camera)} -o render.exr"
-        parts.append(f"{told}{', ' + best.how if best.how else ''}\n  {command}")
-    return "\n\n".join([*parts, f"Written: {folder}/plan.json, effects.png"])
+        allowed = f"within {found.budget_s:g} s" if found.budget_s is not None else f"of {found.budget_px:g}"
+        told = f"Use {best.name}: {number(best.error_px, 3)} px {allowed}, {number(best.cost, 3)} "
+        told += f"{found.unit} a ray times noise"
+        parts.append("\n".join([f"{told}{', ' + best.how if best.how else ''}", *_commands(args, found, best, folder)]))
+    written = ["plan.json", "effects.png", *["plan.toml"] * bool(best), *["samples.exr"] * args.samples]
+    return "\n\n".join([*parts, f"Written: {folder}/{', '.join(written)}"])
+
+
+def _commands(args: argparse.Namespace, found: Plan, best: Choice, folder: Path) -> list[str]:
+    """How the camera is made where the target runs it; ideal cameras are everybody's own."""
+    ideal = best.camera.startswith(("pinhole:", "thin:", "thick:"))
+    words = ["neurolens", "render", str(args.scene), "--camera", f"{folder}/plan.toml", "-o", "render.exr"]
+    if found.target != "render":
+        if ideal or found.target == "onnx":
+            return []
+        language, asked = found.target, found.asked
+        words = ["neurolens", "export", f"{folder}/plan.toml", "--to", language, "-o", f"camera.{language}"]
+        if language != "osl":  # whose inputs they are
+            film, focus = "x".join(f"{v:g}" for v in asked.film_mm), f"{asked.focus_m:g}"
+            words[3:3] = ["--camera", "--film", film, "--focus", focus, "--f-number", f"{asked.f_number:.6g}"]
+    return [f"  {shlex.join(words)}"]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,11 +23,13 @@ from neurolens.commands.arguments import (
     whole,
 )
 from neurolens.commands.output import answer
+from neurolens.commands.render_dask import run_on_dask
 from neurolens.commands.render_files import (
     Files,
     Stopping,
     Unfinished,
     add_safety,
+    add_tile,
     so_far,
     summary,
     warn,
@@ -42,8 +44,12 @@ if TYPE_CHECKING:
     from neurolens.cameras.build import Shot
     from neurolens.cameras.contract import Camera, FloatArray
     from neurolens.optics.apertures import Aperture
+    from neurolens.optics.prescription import Lens
     from neurolens.render.renderer import RenderResult
     from neurolens.render.scene import CameraSettings, Scene
+
+_LENS_STATE = "focus", "f_number", "zoom"
+_FLARE_FRAMES = 16  # that tell which lights and ghosts are brightest
 
 _DESCRIPTION = """\
 Path-trace a scene (experiments/scenes/*.toml) and write OpenEXR, linear sRGB or ACEScg, with
@@ -105,6 +111,7 @@ def add_parser(subparsers: Any) -> None:
     )  # fmt: skip
     _add_colour(parser)
     add_frames(parser)
+    add_tile(parser)
     add_safety(parser)
     add_lens_state(
         parser,
@@ -117,7 +124,7 @@ def add_parser(subparsers: Any) -> None:
         help="workers, each pinned to a core if there are as many as cores (default: 2)",
     )  # fmt: skip
     add_json(parser, quiet=True)
-    parser.set_defaults(position_m=None, look_at_m=None, frame=None)
+    parser.set_defaults(position_m=None, look_at_m=None, frame=None, shared=None)
     parser.set_defaults(run=run_kept, kept="no picture was written; older files of that name are untouched")
 
 
@@ -159,6 +166,8 @@ def run_kept(args: argparse.Namespace) -> int:
 
 def run(args: argparse.Namespace) -> int:
     """Render one picture, or one a frame."""
+    if args.dask is not None:
+        return run_on_dask(args, prepared, render_alone)
     if args.frames is not None:
         return run_frames(args, _run_one)
     if args.key:
@@ -166,15 +175,30 @@ def run(args: argparse.Namespace) -> int:
     return _run_one(args)
 
 
-def _run_one(args: argparse.Namespace) -> int:
-    """Render, write both pictures, print a summary."""
-    files = Files.of(args.out)
+@dataclass(frozen=True)
+class Prepared:
+    """What the arguments of a picture name, read and checked; `rows`: of its tile, None: all of them."""
+
+    files: Files
+    scene: Scene
+    film: FilmSettings
+    camera: Camera
+    size: tuple[int, int]
+    rows: tuple[int, int] | None
+
+    def metadata(self, args: argparse.Namespace) -> dict[str, Any]:
+        return {"version": __version__, "scene": str(args.scene), "camera": plain(self.camera.settings)}
+
+
+def prepared(args: argparse.Namespace, progress: Progress) -> Prepared:
+    """Read and check all that a picture needs, before it is rendered."""
     from neurolens.cameras.build import make_camera
     from neurolens.render.film import PixelGrid
     from neurolens.render.illuminants import check_name
-    from neurolens.render.renderer import render
     from neurolens.render.scene import files_named, load_scene, seen_from
+    from neurolens.render.tiles import rows_of, tile_path
 
+    files = Files.of(tile_path(args.out, args.tile))
     scene = seen_from(load_scene(args.scene), args.scene, args.position_m, args.look_at_m)
     files.spare(args.scene.parent / name for name in files_named(scene.settings))
     settings, film = scene.settings.camera, film_of(scene.settings.film, args)
@@ -186,44 +210,80 @@ def _run_one(args: argparse.Namespace) -> int:
             args.width = settings.width
     width, height = picture_size(settings, args.width, args.height)
     PixelGrid(width, height, (settings.film_width_mm, settings.film_height_mm))  # before the slow make_camera
-    progress = Progress(quiet=args.quiet)
+    rows = None if args.tile is None else rows_of(height, args.tile)
     camera = make_camera(args.camera, shot_of(settings, args, scene.aperture), progress)
     for note in (*camera.settings.get("notes", ()), *_pixel_notes(camera, width)):
         warn(note)
-    flare = _flare(scene, camera, (width, height), film, args, progress)
-    with Stopping() as stopping, progress.stage(f"render {scene.name}, {camera.name}") as report:
-        result = render(
-            scene, camera, width=width, height=height, samples=args.samples, seed=args.seed,
-            threads=args.threads, max_depth=args.max_depth, film=film, progress=report,
-            watch=watch_of(args, files, stopping),
-        )  # fmt: skip
+    return Prepared(files, scene, film, camera, (width, height), rows)
+
+
+def _run_one(args: argparse.Namespace) -> int:
+    """Render, write both pictures, print a summary."""
+    progress = Progress(quiet=args.quiet)
+    made = prepared(args, progress)
+    flare = _flare(made, args, progress)
+    with Stopping() as stopping, progress.stage(f"render {made.scene.name}, {made.camera.name}") as report:
+        result = _rendered(made, args, args.threads, progress=report, watch=watch_of(args, made.files, stopping))
         if not result.stats["complete"]:
             raise Unfinished
-    return _deliver(args, files, result, camera, film, stopping, flare)
+    return _deliver(args, made, result, stopping, flare)
 
 
-def _flare(
-    scene: Scene,
-    camera: Camera,
-    size: tuple[int, int],
-    film: FilmSettings,
-    args: argparse.Namespace,
-    progress: Progress,
-) -> dict[str, FloatArray]:
+def render_alone(args: argparse.Namespace) -> None:
+    """Render in this process and write the EXR alone, as a task of a farm does."""
+    quiet = Progress(quiet=True)
+    made = prepared(args, quiet)
+    result = _rendered(made, args, 1)
+    write_pictures(made.files, result, made.metadata(args), made.film, args, _flare(made, args, quiet))
+    made.files.preview.unlink()
+
+
+def _rendered(made: Prepared, args: argparse.Namespace, threads: int, **more: Any) -> RenderResult:
+    from neurolens.render.renderer import render
+
+    width, height = made.size
+    return render(
+        made.scene, made.camera, width=width, height=height, samples=args.samples, seed=args.seed,
+        threads=threads, max_depth=args.max_depth, film=made.film, rows=made.rows, **more,
+    )  # fmt: skip
+
+
+def _flare(made: Prepared, args: argparse.Namespace, progress: Progress) -> dict[str, FloatArray]:
     """The layers of flare that a scene asks for."""
+    scene, camera = made.scene, made.camera
     if scene.settings.flare is None:
         return {}
     lens = getattr(camera, "lens", None)
     if lens is None:
         warn(f"no flare of {camera.name}: that takes a lens file that is traced as it is")
         return {}
-    from neurolens.flare.layers import scene_flare
+    from neurolens.flare.layers import scene_choice, scene_flare
     from neurolens.flare.picture import Raster
 
     try:
-        return scene_flare(scene, lens, Raster(camera.film_mm, *size), film.white_balance, args.threads, progress)
+        if args.shared is not None and args.shared.flare is None:
+            args.shared.flare = scene_choice(list(_flare_frames(scene, lens, args)))
+        choice = None if args.shared is None else args.shared.flare
+        raster = Raster(camera.film_mm, *made.size)
+        return scene_flare(scene, lens, raster, made.film.white_balance, args.threads, progress, choice)
     except InputError as error:
         raise InputError(args.scene, f"[flare]: {error.file}, {error.field}", error.value, error.expected) from None
+
+
+def _flare_frames(scene: Scene, lens: Lens, args: argparse.Namespace) -> Iterator[tuple[Scene, Lens]]:
+    """The scene and the lens in some of the frames that a command makes."""
+    from neurolens.cameras.build import make_camera
+    from neurolens.render.scene import seen_from
+
+    lenses = {tuple(getattr(args, name) for name in _LENS_STATE): lens}
+    states = args.shared.states
+    for values in states[:: -(-len(states) // _FLARE_FRAMES)]:
+        there = argparse.Namespace(**vars(args) | values)
+        state = tuple(getattr(there, name) for name in _LENS_STATE)
+        if state not in lenses:
+            shot = shot_of(scene.settings.camera, there, scene.aperture)
+            lenses[state] = make_camera(args.camera, shot, Progress(quiet=True)).lens  # type: ignore[attr-defined]
+        yield seen_from(scene, args.scene, there.position_m, there.look_at_m), lenses[state]
 
 
 def _pixel_notes(camera: Camera, width: int) -> list[str]:
@@ -235,20 +295,18 @@ def _pixel_notes(camera: Camera, width: int) -> list[str]:
 
 def _deliver(
     args: argparse.Namespace,
-    files: Files,
+    made: Prepared,
     result: RenderResult,
-    camera: Camera,
-    film: FilmSettings,
     stopping: Stopping,
     flare: Mapping[str, FloatArray],
 ) -> int:
     """Write the pictures, complete or not, and print a summary; the exit code."""
+    files = made.files
     if stopping():
         args.kept = files.kept()
     if not result.stats["paths"]:
         return stopping.say(args.kept)
-    metadata = {"version": __version__, "scene": str(args.scene), "camera": plain(camera.settings)}
-    write_pictures(files, result, metadata, film, args, flare)
+    write_pictures(files, result, made.metadata(args), made.film, args, flare)
     if dropped := result.stats["dropped_samples"]:
         warn(f"{dropped} of {result.stats['paths']} samples were not finite and count as black")
     if not result.stats["complete"]:
@@ -256,7 +314,7 @@ def _deliver(
     if not args.keep_checkpoint:
         files.checkpoint.unlink(missing_ok=True)
     stats = plain(result.stats)
-    data = {"file": str(files.out), "preview": str(files.preview), **stats, "camera": camera.settings}
+    data = {"file": str(files.out), "preview": str(files.preview), **stats, "camera": made.camera.settings}
     return answer(args, data, lambda: summary(stats, files))
 
 

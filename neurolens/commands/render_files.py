@@ -18,6 +18,7 @@ from neurolens.base.files import check_writable
 from neurolens.base.progress import duration
 from neurolens.base.signals import handled
 from neurolens.commands.arguments import check_folder, check_suffix, positive
+from neurolens.commands.farm import add_dask
 from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
@@ -26,6 +27,27 @@ if TYPE_CHECKING:
     from neurolens.render.renderer import RenderResult, Watch
 
 _AT_ONCE_S = 1.0
+
+
+def add_tile(parser: argparse.ArgumentParser) -> None:
+    """Add --tile."""
+    group = parser.add_argument_group("farms")
+    group.add_argument(
+        "--tile", metavar="I/N", type=_tile,
+        help="render the I-th of N bands of rows, to OUT.tile-I-of-N.exr (goes with --frames); \"neurolens merge\" "
+        "puts together the picture that one run gives, bit for bit. A scene's [flare] is computed whole for each tile",
+    )  # fmt: skip
+    add_dask(group)
+
+
+def _tile(text: str) -> tuple[int, int]:
+    """Type of --tile."""
+    words = text.split("/")
+    if len(words) == 2 and all(w.isascii() and w.isdecimal() and len(w) <= 6 for w in words):
+        number, count = map(int, words)
+        if 1 <= number <= count:
+            return number, count
+    raise argparse.ArgumentTypeError(f"got {text!r}, expected I/N, tile I of N, from 1/N to N/N")
 
 
 def add_safety(parser: argparse.ArgumentParser) -> None:
@@ -157,10 +179,11 @@ def write_pictures(
     Raises:
         NeurolensError: they cannot be written; with the way to resume.
     """
-    from neurolens.render.colour import COLOUR_SPACES, SRGB, conversion
+    from neurolens.render.colour import COLOUR_SPACES, SRGB, conversion, converted
     from neurolens.render.exr_attributes import standard_attributes
     from neurolens.render.job import MEANING
     from neurolens.render.pictures import write_exr, write_png
+    from neurolens.render.tiles import rows_of, windows
 
     space = COLOUR_SPACES[film.colour_space]
     told = metadata | {"render": plain(result.stats)}
@@ -168,11 +191,17 @@ def write_pictures(
     layers: dict[str, FloatArray] = {}
     if args.layers == "all" or not result.stats["complete"]:
         layers, told["layers"] = asdict(result.layers), MEANING
+    width, height = result.stats["width"], result.stats["height"]
+    rows = (0, height) if args.tile is None else rows_of(height, args.tile)
     for name, picture in flare.items():
-        colour = picture @ conversion(SRGB, space).T.astype(picture.dtype)
+        colour = converted(picture[slice(*rows)], conversion(SRGB, space)).astype(picture.dtype)
         layers |= {f"{name}.{c}": colour[..., k] for k, c in enumerate("RGB")}
-    height, width = result.rgb.shape[:2]
     attributes = standard_attributes(metadata["camera"], width, height, args.frame)
+    if args.tile is not None:
+        number, count = args.tile
+        told["tile"] = {"number": number, "of": count, "frame": args.frame, "half": args.half}
+        told["tile"]["identity"] = plain(result.identity)
+        attributes |= windows(width, height, rows)
     try:
         write_exr(
             files.out, result.rgb, half=args.half, metadata=told, space=space, layers=layers, attributes=attributes

@@ -68,6 +68,14 @@ def add_frames(parser: argparse.ArgumentParser, does: str = _RENDERED, names: Se
     )  # fmt: skip
 
 
+@dataclass
+class Shared:
+    """What the frames of a command share: options that keys set in each, and the `Choice` of flare once it is made."""
+
+    states: list[dict[str, Any]]
+    flare: Any = None
+
+
 def run_frames(args: argparse.Namespace, render: Callable[[argparse.Namespace], int]) -> int:
     """Render the frames that are missing, by `render`, as the keys say; the exit code of the first that fails.
 
@@ -77,20 +85,30 @@ def run_frames(args: argparse.Namespace, render: Callable[[argparse.Namespace], 
     Raises:
         InputError: a key that is none, or of a quantity that the command line sets too.
     """
-    kept = 0
-    for frame, number, values in frames_of(args):
-        out = args.out.with_name(f"{args.out.stem}.{number}{args.out.suffix}")
-        if out.is_file() and not Files.of(out).checkpoint.exists() and not args.restart:
-            kept += 1
-            continue
-        values |= {"out": out, "seed": args.seed + frame, "frame": frame}
-        code = render(argparse.Namespace(**vars(args) | values))
+    for each in shots_of(args):
+        code = render(each)
         if code:
             return code
+    return 0
+
+
+def shots_of(args: argparse.Namespace) -> Iterator[argparse.Namespace]:
+    """The arguments of every frame that is missing; warns and raises as `run_frames`."""
+    from neurolens.render.tiles import tile_path
+
+    kept, every = 0, list(frames_of(args))
+    shared = Shared([values for _, _, values in every])
+    for frame, number, values in every:
+        out = args.out.with_name(f"{args.out.stem}.{number}{args.out.suffix}")
+        written = tile_path(out, args.tile)
+        if written.is_file() and not Files.of(written).checkpoint.exists() and not args.restart:
+            kept += 1
+            continue
+        values = {**values, "out": out, "seed": args.seed + frame, "frame": frame, "shared": shared}
+        yield argparse.Namespace(**vars(args) | values)
     if kept:
         told = f"{kept} of {len(args.frames)} frames exist and are kept, whatever their settings"
         warnings.warn(f"{told}; --restart renders them again", NeurolensWarning, stacklevel=2)
-    return 0
 
 
 def frames_of(

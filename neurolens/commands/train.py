@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import argparse
 import shlex
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from neurolens.base.errors import InputError
+from neurolens import __version__
+from neurolens.base.errors import InputError, NeurolensError, one_line
+from neurolens.base.files import fingerprint_of, sha256_of
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_glass, add_json, check_run_folder, lens_path, positive, whole
+from neurolens.commands.farm import Task, add_dask, files_of, spread
 from neurolens.commands.output import answer, number, table
 from neurolens.evaluate.records import CLOSE_UM, to_use, use_command
 
+_MARK = "task.sha256"  # in a run folder that came from a cluster
 _DESCRIPTION = """\
 Run an experiment: trace ray pairs of the lens, fit the surrogates, export them as ONNX,
 measure errors and speed against the exact tracer, render the scenes, and write one report.
@@ -33,6 +38,7 @@ examples:
   neurolens train experiments/quickstart.toml --out runs/try --set render.samples=4 --set pairs.seed=2
   neurolens train --lens lenses/cooke_triplet_50.toml
   neurolens train --lens lenses/cooke_triplet_50.toml --target-px 0.1 --no-race
+  neurolens train --lens lenses/*_50.toml --out runs/fifties --dask tcp://cluster:8786
   neurolens train --lens lenses/nikon_zoom_70_200.toml --zoom-range --out runs/zoom
   neurolens train --lens lenses/brendel_tessar_100.toml --out runs/tessar \\
       --set lens.efl_mm=50
@@ -48,8 +54,9 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("experiment", metavar="EXPERIMENT.toml", nargs="?", type=Path, help="experiment file")
     parser.add_argument(
-        "--lens", metavar="FILE", type=Path, help="lens file or name of lenses/, instead of an experiment"
-    )
+        "--lens", metavar="FILE", type=Path, nargs="+",
+        help="lens file or name of lenses/, instead of an experiment; of several, each has a run folder in DIR (runs)",
+    )  # fmt: skip
     parser.add_argument(
         "--out", metavar="DIR", type=Path,
         help="run folder, made if needed (default: runs/NAME of the experiment or lens file)",
@@ -82,13 +89,84 @@ def add_parser(subparsers: Any) -> None:
         help="width of the picture of --target-px (default: 4000)",
     )  # fmt: skip
     parser.add_argument("--no-race", action="store_true", help="time no model")
+    add_dask(parser)
     add_glass(parser)
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="fitted models are kept in the run folder; the same command resumes")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the experiment and print a summary."""
+    """Run the experiment, or one a lens, and print a summary."""
+    if args.dask is not None or (args.lens is not None and len(args.lens) > 1):
+        return _run_many(args)
+    if args.lens is not None:
+        (args.lens,) = args.lens
+    results, folder = _run_one(args, Progress(quiet=args.quiet))
+    data = {"folder": str(folder), "report": str(folder / "report.html"), **results}
+    answer(args, data, lambda: _text(results, folder))
+    return 0 if (results.get("target") or {"met": True})["met"] else 1
+
+
+def _run_many(args: argparse.Namespace) -> int:
+    """One run a lens, here or on a cluster; a lens that fails is a line, and the exit code is 2 then."""
+    if args.lens is None:
+        raise InputError("neurolens train", "--dask", args.dask, "--lens FILE ... beside it")
+    files = [lens_path(name, "train") for name in args.lens]
+    if twice := sorted({f.stem for f in files if sum(g.stem == f.stem for g in files) > 1}):
+        raise InputError("neurolens train", "--lens", twice, "files whose names differ")
+    base = args.out if args.out is not None else Path("runs")
+    check_run_folder(base, "neurolens train", "--out")
+    progress, failed = Progress(quiet=args.quiet), dict[str, str]()
+    each = [argparse.Namespace(**vars(args) | {"lens": f, "out": base / f.stem, "dask": None}) for f in files]
+    if args.dask is None:
+        for one in each:
+            try:
+                _run_one(one, progress)
+            except NeurolensError as error:
+                failed[one.lens.stem] = str(error)
+    else:
+        failed = _on_dask(args.dask, each, base, progress)
+    for name, why in failed.items():
+        print(f"neurolens: {one_line(f'{name}: {why}', 3000)}", file=sys.stderr)
+    done = [one.out for one in each if one.lens.stem not in failed]
+    answer(args, {"folders": [str(folder) for folder in done], "failed": failed}, lambda: "\n".join(map(str, done)))
+    return 2 if failed else 0
+
+
+def _on_dask(address: str, each: list[argparse.Namespace], base: Path, progress: Progress) -> dict[str, str]:
+    """Run what is not there yet on a cluster; the reasons of what failed."""
+    marks = {one.lens.stem: _mark(one) for one in each}
+    missing = [one for one in each if _marked(one.out) != marks[one.lens.stem]]
+    tasks = [Task.of(one.lens.stem, train_alone, one, one.out) for one in missing]
+    base.mkdir(parents=True, exist_ok=True)
+    with progress.stage(f"train {len(tasks)} of {len(each)} lenses") as report:
+        files = {path for one in missing for path in files_of(one)}
+        return spread(address, tasks, files, base, report) if tasks else {}
+
+
+def train_alone(args: argparse.Namespace) -> None:
+    """One lens, as a task of a cluster; the folder's mark, written last, says that it is whole, and of what."""
+    mark = _mark(args)
+    _run_one(args, Progress(quiet=True))
+    (args.out / _MARK).write_text(mark)
+
+
+def _mark(args: argparse.Namespace) -> str:
+    """Hash of what a run's models depend on: the lens, catalogues of glass, options, the version."""
+    options = [args.overrides, args.zoom_range, args.internal_focus, args.target_um, args.target_px, args.pixels_across]
+    hashes = [sha256_of(file) for file in (args.lens, *args.glass_files)]
+    return fingerprint_of([__version__, args.no_race, *options, *hashes])
+
+
+def _marked(folder: Path) -> str | None:
+    try:
+        return (folder / _MARK).read_text()
+    except OSError:
+        return None
+
+
+def _run_one(args: argparse.Namespace, progress: Progress) -> tuple[dict[str, Any], Path]:
+    """Run the experiment; its results and folder."""
     folder = _run_folder(args)
     from neurolens.evaluate.experiment import default_experiment, read_experiment
     from neurolens.evaluate.train import run_experiment
@@ -106,11 +184,7 @@ def run(args: argparse.Namespace) -> int:
         experiment = default_experiment(_own_format(args.lens, folder), args.overrides)
     else:
         experiment = read_experiment(args.experiment, args.overrides)
-    progress = Progress(quiet=args.quiet)
-    results = run_experiment(experiment, folder, progress=progress, command=_command(args))
-    data = {"folder": str(folder), "report": str(folder / "report.html"), **results}
-    answer(args, data, lambda: _text(results, folder))
-    return 0 if (results.get("target") or {"met": True})["met"] else 1
+    return run_experiment(experiment, folder, progress=progress, command=_command(args)), folder
 
 
 def _run_folder(args: argparse.Namespace) -> Path:

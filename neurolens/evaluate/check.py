@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-import neurolens
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.files import library
 from neurolens.cameras.model import OnnxLens
 from neurolens.evaluate.measure import (
     STOPS,
@@ -229,7 +229,7 @@ def find_lens(lens_id: str, model_file: Path) -> Path:
         InputError: no such file.
     """
     name, beside = f"{Path(lens_id).name}.toml", model_file.resolve().parent
-    for root in (beside, beside.parent, Path("."), Path(neurolens.__file__).parents[1]):
+    for root in (beside, beside.parent, Path("."), library()):
         if (root / "lenses" / name).is_file():
             return root / "lenses" / name
     raise InputError(model_file, "lens", lens_id, f"lenses/{name}, or a lens file given with --lens")

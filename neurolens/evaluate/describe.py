@@ -16,7 +16,7 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.optics.focusing import at_infinity
 from neurolens.optics.glass import glass_of
-from neurolens.optics.lenscheck import check_lens, doubts, film_edge_mm, verdict
+from neurolens.optics.lenscheck import Check, check_lens, doubts, film_edge_mm, verdict
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
@@ -219,21 +219,28 @@ def read_quietly(path: Path) -> Lens:
 def library_row(path: Path) -> dict[str, Any]:
     """A lens file in the table of its folder.
 
-    Returns: lens, file, name, efl_mm and efl_x_mm computed (the latter of an anamorphic lens only), stated_efl_mm,
-        f_number of the stop, half_field_deg as stated, image_radius_mm as stated, refractions, aspheres, cylinders,
-        states (zoom or focus), rims, verdict ("ok", "doubtful", or "unreadable" with the error as its doubt), doubts,
-        and checks: a list of {state, quantity, computed, stated, doubt}.
+    Returns: lens, file, and `lens_row`; of a file that cannot be read the verdict "unreadable" with the error as its
+        doubt.
     """
+    place = {"lens": path.stem, "file": str(path)}
     try:
         lens = read_quietly(path)
-        checks = check_lens(lens)
+        return {**place, **lens_row(lens, check_lens(lens))}
     except NeurolensError as error:
-        return {"lens": path.stem, "file": str(path), "verdict": "unreadable", "doubts": [str(error)]}
+        return {**place, "verdict": "unreadable", "doubts": [str(error)]}
+
+
+def lens_row(lens: Lens, checks: list[Check]) -> dict[str, Any]:
+    """A lens as read from its file, with its `check_lens`, in a table of many.
+
+    Returns: name, efl_mm and efl_x_mm computed (the latter of an anamorphic lens only), stated_efl_mm, f_number of the
+        stop, half_field_deg as stated, image_radius_mm as stated, refractions, aspheres, cylinders, states (zoom or
+        focus), rims, verdict ("ok" or "doubtful"), doubts, and checks: a list of {state, quantity, computed, stated,
+        doubt}.
+    """
     data = first_order(lens)
     cylinders = sum(s.cylinder is not None for s in lens.surfaces)
     return {
-        "lens": path.stem,
-        "file": str(path),
         "name": lens.name,
         "efl_mm": float(data.efl_mm),
         "efl_x_mm": float(first_order(lens, meridian="x").efl_mm) if cylinders else None,

@@ -214,7 +214,8 @@ class SceneDomainChoice:
 class Experiment:
     """One resolved run: lens, domain, ray pairs, models, measurements and renders.
 
-    Models are fitted in their order, with a `target` only until one has its error.
+    Models are fitted in their order, with a `target` only until one has its error. `camera` is what `render` and
+    `export` take where this file is named (that of a plan): as `--camera`, a path in it relative to the file.
     """
 
     title: str
@@ -227,6 +228,7 @@ class Experiment:
     scene_domain: SceneDomainChoice | None = None
     target: TargetChoice | None = None
     save_pairs: bool = False
+    camera: str | None = None
 
     def __post_init__(self) -> None:
         labels = [m.label for m in self.model]
@@ -297,7 +299,7 @@ def keep_inputs(experiment: Experiment, folder: Path) -> dict[str, Any]:
         except ValueError:  # another drive
             return place
 
-    resolved = _with_files(experiment, moved)
+    resolved = replace(_with_files(experiment, moved), camera=None)  # the run's own models are fitted from it
     atomic_write_text(folder / "config.toml", to_toml(resolved))
     source, kept = experiment.lens.file, folder / "lenses" / experiment.lens.file.name
     kept.parent.mkdir(parents=True, exist_ok=True)

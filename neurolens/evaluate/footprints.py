@@ -12,7 +12,9 @@ rays, and holds what a picture shows: place, size and shape of the blur, and of 
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -29,6 +31,7 @@ EFFECTS = (
     "distortion", "defocus", "spherical aberration", "coma", "astigmatism", "field curvature", "higher orders",
     "longitudinal colour", "lateral colour",
 )  # fmt: skip
+AFTERWARDS = ("distortion", "defocus")  # what compositing may do to a picture
 
 
 @dataclass(frozen=True)
@@ -70,10 +73,11 @@ class Footprints:
         """[N] film value of white surroundings, mean over wavelengths."""
         return self.weight.mean((1, 2))
 
-    @property
-    def passed(self) -> float:
-        """Share of the rays that carry light."""
-        return float((self.weight > 0).mean())
+    @cached_property
+    def quantiles(self) -> list[Array]:
+        """[N, W, Q] mm at equal steps of the light along each of some lines through the film."""
+        x, y = self.place_mm
+        return [_quantiles(np.cos(t) * x + np.sin(t) * y, self.weight) for t in np.arange(_LINES) * (np.pi / _LINES)]
 
 
 def places_of(exact: Camera, film_mm: Array, depth_m: Array, wavelength_nm: Array, share: Array) -> Places:
@@ -129,11 +133,18 @@ def footprints(camera: Camera, places: Places, samples: int = 16) -> Footprints:
     return Footprints(np.where(weight > 0, place, 0.0), np.where(weight > 0, across, 0.0), weight)
 
 
-def collapsed(exact: Footprints, share: Array) -> Footprints:
-    """Footprints of a point camera whose picture is warped, and its light corrected, by maps of the exact one."""
-    centre, _ = _centroids(exact, share)
-    place = np.broadcast_to(centre[:, :, None, None], exact.place_mm.shape)
-    return Footprints(np.array(place), exact.pupil_mm, exact.weight)
+def left_to(exact: Footprints, thin: Footprints, share: Array, afterwards: Collection[str]) -> Footprints:
+    """The exact camera's footprints without what `AFTERWARDS` makes of the picture later.
+
+    Without distortion they lie where a thin lens's do; without defocus they are points.
+    """
+    if not afterwards:
+        return exact
+    centre, place = centroids(exact, share)[0], exact.place_mm
+    goal = centroids(thin, share)[0] if "distortion" in afterwards else centre
+    from_centre = np.zeros_like(place) if "defocus" in afterwards else place - centre[:, :, None, None]
+    moved = np.where(exact.weight > 0, from_centre + goal[:, :, None, None], 0.0)
+    return Footprints(moved, exact.pupil_mm, exact.weight)
 
 
 def distance_mm(a: Footprints, b: Footprints, share: Array) -> Array:
@@ -141,11 +152,9 @@ def distance_mm(a: Footprints, b: Footprints, share: Array) -> Array:
 
     NaN where one of the two has light and the other none.
     """
-    turn = np.arange(_LINES) * (np.pi / _LINES)
     total = np.zeros(a.weight.shape[:2])
-    for c, s in zip(np.cos(turn), np.sin(turn), strict=True):
-        at = [_quantiles(c * f.place_mm[0] + s * f.place_mm[1], f.weight) for f in (a, b)]
-        total += ((at[0] - at[1]) ** 2).mean(-1)
+    for of_a, of_b in zip(a.quantiles, b.quantiles, strict=True):
+        total += ((of_a - of_b) ** 2).mean(-1)
     return np.asarray(np.sqrt((2 / _LINES * total * share).sum(1)))
 
 
@@ -156,9 +165,9 @@ def effects_mm(exact: Footprints, thin: Footprints, share: Array) -> dict[str, A
     the pupil point: by degree, each part orthogonal to those below it over the light that passes (as Zernike's are over
     a disc: coma with the tilt that balances it, spherical aberration with its best focus).
     """
-    (centre, by_wave), (ideal, _) = _centroids(exact, share), _centroids(thin, share)
+    (centre, by_wave), (ideal, _) = centroids(exact, share), centroids(thin, share)
     linear, parts = _expanded(exact, by_wave)
-    plain, _ = _expanded(thin, _centroids(thin, share)[1])
+    plain, _ = _expanded(thin, centroids(thin, share)[1])
     size = _pupil_size(exact)
     mean = np.einsum("ijnw,w->ijn", linear, share)
     own = np.einsum("ijnw,w->ijn", plain, share)
@@ -185,7 +194,7 @@ def effects_mm(exact: Footprints, thin: Footprints, share: Array) -> dict[str, A
 
 def blur_mm(prints: Footprints, share: Array) -> Array:
     """RMS diameter [N] of footprints: twice the RMS distance from their centroid, all wavelengths together, mm."""
-    centre, _ = _centroids(prints, share)
+    centre, _ = centroids(prints, share)
     weight = prints.weight * share[:, None]
     away = ((prints.place_mm - centre[:, :, None, None]) ** 2).sum(0)
     return np.asarray(2 * np.sqrt((weight * away).sum((1, 2)) / np.maximum(weight.sum((1, 2)), 1e-300)))
@@ -214,7 +223,7 @@ def _meet(places: Places, origin: Array, way: Array) -> Array:
     return np.asarray((axes * meet).sum(1))
 
 
-def _centroids(prints: Footprints, share: Array) -> tuple[Array, Array]:
+def centroids(prints: Footprints, share: Array) -> tuple[Array, Array]:
     """Centroid over all light [2, N], and of each wavelength [2, N, W]."""
     light = np.maximum(prints.weight.sum(2), 1e-300)
     by_wave = (prints.place_mm * prints.weight).sum(3) / light

@@ -81,7 +81,9 @@ def flip_map(test: ArrayLike, reference: ArrayLike) -> Image:
     try:
         import flip_evaluator
     except ImportError as error:
-        raise NeurolensError("FLIP needs flip-evaluator: pip install '.[train]' in the project's folder") from error
+        raise NeurolensError(
+            "FLIP needs flip-evaluator: pip install 'neurolens[train]', or '.[train]' in a checkout"
+        ) from error
     shown_a, shown_b = (np.ascontiguousarray(to_srgb(x), dtype=np.float32) for x in (a, b))
     options = {"applyMagma": False, "computeMeanError": False, "parameters": {"ppd": PIXELS_PER_DEGREE}}
     errors, _, _ = flip_evaluator.evaluate(shown_b, shown_a, "LDR", **options)

@@ -178,6 +178,18 @@ class Bench:
         return fingerprint_of(asked)
 
 
+def lacks(bench: Bench, rows: Sequence[Row]) -> bool:
+    """Whether `run_bench` would have to make a record or a race."""
+    known = [_known_record(bench.record_file(row), bench.fingerprint(row)) for row in rows]
+    return any(
+        record is None
+        or not (
+            record["failed"] or (bench.model_file(row).is_file() and ("race" in record or not bench.settings.rounds))
+        )
+        for row, record in zip(rows, known, strict=True)
+    )
+
+
 def run_bench(
     benches: Sequence[Bench], rows: Sequence[Row], progress: Progress, *, again: bool = False
 ) -> Iterator[tuple[Bench, list[dict[str, Any]]]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import html
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -115,13 +116,16 @@ def _plain(value: Any) -> str:
     return str(value)
 
 
-def figure_grid(folder: Path, figures: Iterable[Mapping[str, Any]], small: bool = False) -> str:
-    """Pictures with title, caption and links; one whose file is not in `folder` leaves a line that says so."""
-    shown = "".join(_figure(folder, figure) for figure in figures)
+def figure_grid(folder: Path, figures: Iterable[Mapping[str, Any]], small: bool = False, inside: bool = False) -> str:
+    """Pictures with title, caption and links; one whose file is not in `folder` leaves a line that says so.
+
+    `inside`: PNG files as part of the page, which then needs no others.
+    """
+    shown = "".join(_figure(folder, figure, inside) for figure in figures)
     return f"<div class='figures{' small' if small else ''}'>{shown}</div>" if shown else ""
 
 
-def _figure(folder: Path, figure: Mapping[str, Any]) -> str:
+def _figure(folder: Path, figure: Mapping[str, Any], inside: bool) -> str:
     name, caption = str(figure.get("title") or ""), str(figure.get("caption") or "")
     links = {label: local_url(folder, file) for label, file in (figure.get("links") or {}).items()}
     files = " · ".join(f"<a href='{url}'>{text(label)}</a>" for label, url in links.items() if url)
@@ -129,7 +133,11 @@ def _figure(folder: Path, figure: Mapping[str, Any]) -> str:
     url = local_url(folder, figure.get("file"))
     if url is None:
         return f"<p class='note'>Picture missing: {text(figure.get('file'))}</p>"
-    picture = f"<a href='{url}'><img src='{url}' alt='{text(name or caption)}' loading='lazy'></a>"
+    if inside:
+        data = base64.b64encode((folder / str(figure["file"])).read_bytes()).decode("ascii")
+        picture = f"<img src='data:image/png;base64,{data}' alt='{text(name or caption)}'>"
+    else:
+        picture = f"<a href='{url}'><img src='{url}' alt='{text(name or caption)}' loading='lazy'></a>"
     kind = " class='wide'" if figure.get("wide") else ""
     return f"<figure{kind}>{picture}<figcaption>{words}</figcaption></figure>"
 

@@ -3,47 +3,69 @@
 A camera's error is the distance of its footprints from the exact lens's in pixels, and of its light, at the places of a
 scene that a `probe` finds; both count where they are largest but for 5% of the picture.
 
-Cost is nanoseconds a ray that passes, measured on this machine with one thread: a camera that wastes samples is charged
-for them.
+Cost is what a ray takes in the target named, times the noise of its weights: see `costs`. In C and onnxruntime that is
+measured here, with one thread; of shaders it is counted.
 """
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Iterator, Sequence
+import os
+import warnings
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from neurolens.base.errors import InputError, ModelError
+from neurolens.base.config import to_toml
+from neurolens.base.errors import InputError, ModelError, NeurolensWarning
 from neurolens.base.progress import Report
+from neurolens.base.tomlfile import format_toml
 from neurolens.cameras.build import Shot, ideal_as
-from neurolens.cameras.contract import RAYS_A_CALL, Camera
+from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import FusedExactCamera
-from neurolens.cameras.field import WIDEST_DEG
 from neurolens.cameras.fused import FusedCamera
 from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.cameras.warped import Warped
 from neurolens.evaluate import footprints as prints
-from neurolens.evaluate.footprints import Footprints, Places
+from neurolens.evaluate.costs import (
+    CYCLES_NS,
+    GLSL_OPERATIONS,
+    UNIT,
+    glsl_operations,
+    noise,
+    ns_a_ray,
+    shader_cost,
+)
+from neurolens.evaluate.experiment import DomainChoice, EvaluationChoice, Experiment, LensChoice
+from neurolens.evaluate.footprints import Footprints
 from neurolens.evaluate.probe import COUNTED, LIGHT, Asked, Effect, Probed, effects_of, probe
+from neurolens.evaluate.shaders import IDLE, lens_of
 from neurolens.graph.compiler import has_compiler
+from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.render.scene import Scene
+from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import fit_model, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.settings import ModelSettings
 
-Target = Literal["render", "c", "onnx"]
-TARGETS: tuple[Target, ...] = ("render", "c", "onnx")
-_TERMS = (8, 16, 28, 48)  # of the polynomials that are fitted on the spot
+Target = Literal["render", "c", "onnx", "osl", "glsl"]
+Cost = Callable[[], tuple[float, float]]  # of a ray, and noise
+_OURS = ("render", "c")  # run compiled C
+_TERMS = (2, 4, 6, 8, 12, 16, 22, 28, 36, 48, 64, 90)  # of the polynomials that are fitted on the spot
+_EXACT, _IDEAL = "exact", ("pinhole", "thin", "thick")
+_MAPPED = " + ST map"  # after the name of an ideal camera
+_SHOT = "fitted for this shot"
+_FIT = ModelSettings("ols", planes=False, elimination=False, idle_gates=IDLE)
+_FOCUS_SPARE = 0.25  # of a pixel of blur: what a model may place its film beside the lens's
 _PAIRS = PairSettings(train=5000, held_out=1000, rim=5000)
 _MOST_OVERSCAN = 4.0  # of a plane picture that is warped afterwards
-_ROUNDS = 7
 
 
 @dataclass(frozen=True)
@@ -51,164 +73,319 @@ class Choice:
     """A camera that was tried.
 
     Attributes:
-        camera: as `--camera` takes it. error_px, light_error: at the counted percentile; inf where it has no light
-            that the lens has. ns: a ray that passes, inf where it was not timed. passed: share of rays.
-        within: whether it meets the budget. how: what else it needs, or how it was made.
+        camera: as `--camera` takes it, or what `export` takes. error_px, light_error: at the counted percentile; inf
+            where it has no light that the lens has. cost: of a ray, in the plan's unit, times `noise`; inf where it was
+            not asked for. noise: how many times the rays it needs for equal error, see `costs`.
+        how: what else it needs, or how it was made. within: whether it meets the budget of its plan.
+        settings: of a model that was fitted for the shot.
     """
 
     name: str
     camera: str
     error_px: float
     light_error: float
-    ns: float
-    passed: float
-    within: bool
+    cost: float
+    noise: float
     how: str = ""
+    within: bool = False
+    settings: ModelSettings | None = None
+
+    def meets(self, budget_px: float) -> bool:
+        """Whether it may be used."""
+        return self.error_px <= budget_px and self.light_error <= LIGHT
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What was asked, the effects in falling order of worth, every camera tried by rising cost, the one to use."""
+    """What was asked, the effects in falling order of worth, every camera tried by rising cost, the one to use.
+
+    Attributes:
+        budget_s: seconds of a plan for a time, whose `budget_px` is then the error of the best camera.
+        unit: of costs: "ns" or, where no time is known, "operations". domain: of models that are fitted.
+    """
 
     asked: Asked
     budget_px: float
+    budget_s: float | None
     target: Target
+    unit: str
+    domain: DomainChoice
     effects: tuple[Effect, ...]
     choices: tuple[Choice, ...]
     best: Choice | None
+    probed: Probed
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return asdict(self)
+        """JSON-able: what is above `probed`."""
+        told = asdict(replace(self, probed=None))  # type: ignore[arg-type]
+        del told["probed"]
+        return told
+
+    def to_toml(self, lens: Lens, folder: Path) -> str:
+        """The text of a file in a folder that `render` and `export` take for the best camera, and `train` as the
+        experiment that fits it, where it is a model of the shot. Paths in it are relative to the folder."""
+        best = self.best
+        assert best is not None
+        kind, colon, path = best.camera.rpartition(":")
+        camera, title = f"{kind}{colon}{os.path.relpath(path, folder)}", f"{lens.name}: {best.name}"
+        if best.settings is None:
+            return format_toml({"title": title, "camera": camera})
+        choice = LensChoice(Path(os.path.relpath(lens.path, folder)), f_number=self.asked.f_number)
+        checks = EvaluationChoice(vignetting_rays=50_000, rounds=0, compile_exact=False)
+        return to_toml(Experiment(title, choice, (best.settings,), self.domain, _PAIRS, checks, camera=camera))
 
 
 def plan(
     scene: Scene, lens: Lens, budget_px: float, *, target: Target = "render", models: Sequence[Path] = (),
-    folder: Path | None = None, explain: bool = False, report: Report | None = None,
+    folder: Path | None = None, explain: bool = False, afterwards: Collection[str] = (), denoised: bool = False,
+    report: Report | None = None,
 ) -> Plan:  # fmt: skip
     """The cheapest camera for a scene whose error stays within a budget.
 
     Args:
         lens: as its file has it. budget_px: error of place and blur in pixels of the scene's picture.
-        target: what runs the camera: our renderer with all it has, compiled C, or onnxruntime.
+        target: what runs the camera: our renderer with all it has, compiled C, onnxruntime, Blender's Cycles (osl), or
+            a renderer in GLSL.
         models: exported models of this lens to try. folder: where models fitted for the shot go; None fits none.
-        explain: whether models beyond the budget are compiled and timed, too; else their time is infinite.
+        explain: whether cameras beyond the budget are compiled and timed, too; else their cost is infinite.
+        afterwards, denoised: what is made of the picture later, see `probe`.
 
     Raises:
         InputError: a budget that is negative or no number; as `probe`.
     """
     if not budget_px >= 0:
         raise InputError("plan", "budget_px", budget_px, "0 or more pixels")
-    found = probe(scene, lens)
-    say = report or (lambda done: None)
+    found = probe(scene, lens, afterwards=afterwards, denoised=denoised)
+    tried = candidates(found, (budget_px,), target, models=models, folder=folder, explain=explain, report=report)
+    return decided(found, tried, budget_px, target)
+
+
+def candidates(
+    found: Probed, budgets_px: Sequence[float], target: Target, *, models: Sequence[Path] = (),
+    folder: Path | None = None, explain: bool = False, report: Report | None = None,
+) -> tuple[Choice, ...]:  # fmt: skip
+    """Cameras with error and cost, enough to decide for each of some budgets; arguments as of `plan`."""
+    say = report or (lambda done, left=None: None)
     say(0.3)
-    tried = [*_ideal(found, budget_px, target), *_exact(found, budget_px, target)]
+    # Infinity: all are timed, whatever their light.
+    trial = _Trial(found, target, math.inf if explain else max(budgets_px))
+    tried = [*_ideal(trial), *_exact(trial)]
     for file in models:
-        tried += _try_model(found, file, budget_px, target, explain)
+        tried += _model(trial, file)
     say(0.6)
     if folder is not None:
-        for choice in _fitted(found, budget_px, target, folder, explain):
-            tried.append(choice)
-            say(0.8)
-            if choice.within or (math.isfinite(choice.ns) and any(c.within and c.ns < choice.ns for c in tried)):
-                break  # larger ones cost more
-    tried.sort(key=lambda c: c.ns)
-    best = next((c for c in tried if c.within), None)
-    return Plan(found.asked, budget_px, target, effects_of(found, budget_px), tuple(tried), best)
+        tried += _fitted(trial, budgets_px, folder, tried, lambda done, left=None: say(0.6 + 0.4 * done))
+    return tuple(tried)
 
 
-def _ideal(found: Probed, budget_px: float, target: Target) -> Iterator[Choice]:
-    """Pinhole, the same with its picture warped afterwards, thin and thick lens; they are their own source in C."""
-    if target == "onnx":
-        return
-    path, shot = found.lens.path, Shot(found.asked.film_mm, found.asked.focus_m)
-    for kind in ("pinhole:", "thin:", "thick:"):
-        with suppress(InputError):  # no thick lens of cylinders
-            camera = ideal_as(kind, found.exact.lens, shot)
-            spec = f"{kind}{path}"
-            yield _judged(found, kind.rstrip(":"), spec, camera, budget_px)
-            if kind == "pinhole:" and (area := _overscan(found)) < _MOST_OVERSCAN:
-                flat = prints.collapsed(found.seen, found.places.share)
-                how = f"then the ST map of 'neurolens stmap' over the picture, of {area:.3g} times the area"
-                warped = _judged(found, "pinhole + ST map", spec, camera, budget_px, flat, how)
-                yield replace(warped, ns=area * warped.ns * warped.passed, passed=1.0)  # its own rays all pass
+def decided(found: Probed, tried: Sequence[Choice], budget_px: float, target: Target) -> Plan:
+    """The plan for a budget, from candidates that serve it."""
+    ranked = tuple(replace(c, within=c.meets(budget_px)) for c in sorted(tried, key=lambda c: c.cost))
+    best = next((c for c in ranked if c.within), None)
+    effects = effects_of(found, budget_px)
+    return Plan(found.asked, budget_px, None, target, UNIT[target], shot_domain(found), effects, ranked, best, found)
 
 
-def _overscan(found: Probed) -> float:
-    """Area of the plane picture that holds all that the lens shows, over that of the film; inf for half a sphere."""
-    way = found.places.direction
-    if (-way[2] < math.cos(math.radians(WIDEST_DEG))).any():
-        return math.inf
-    reach = found.exact.settings["lens_state"]["pinhole_focal_length_mm"]
-    slope = np.abs(way[:2] / way[2]).max(1) * reach / np.maximum(np.abs(found.places.film_mm).max(1), 1e-9)
-    return float(np.maximum(slope, 1.0).prod())
+@dataclass(frozen=True)
+class _Trial:
+    """What cameras are tried for; those with an error up to `costed_px` are compiled and timed, all where it is inf."""
+
+    found: Probed
+    target: Target
+    costed_px: float
+
+    @property
+    def share(self) -> prints.Array:
+        """Of the wavelengths."""
+        return self.found.places.share
+
+    def judged(
+        self, name: str, spec: str, seen: Footprints, cost: Callable[[], tuple[float, float]], how: str = ""
+    ) -> Choice:
+        """A camera's error against the exact footprints; its cost (of a ray, noise) where that matters."""
+        found = self.found
+        apart = prints.distance_mm(found.wanted, seen, self.share) / found.asked.pixel_mm
+        light = np.abs(seen.light / np.maximum(found.wanted.light, 1e-30) - 1)
+        if "distortion" in found.asked.afterwards:  # its map corrects light, too
+            light = np.where(seen.light > 0, 0.0, light)
+        error, dim = (float(np.percentile(np.where(np.isfinite(v), v, np.inf), COUNTED)) for v in (apart, light))
+        choice = Choice(name, spec, error, dim, math.inf, noise(seen.weight, self.share), how)
+        if not (choice.meets(self.costed_px) or math.isinf(self.costed_px)):
+            return choice
+        ray, times = cost()
+        # A shader that does not focus so near shows nothing.
+        return replace(
+            choice,
+            cost=ray * (1.0 if found.asked.denoised else times),
+            noise=times,
+            error_px=error if math.isfinite(times) else math.inf,
+        )
+
+    def timed(self, camera: Camera, seen: Footprints) -> tuple[float, float]:
+        return ns_a_ray(camera, self.found.places), noise(seen.weight, self.share)
+
+    def ideal(self, name: str, camera: Camera, seen: Footprints, area: float = 1.0) -> tuple[float, float]:
+        """Of a camera without a lens, whose picture is so many times as large."""
+        known = {"osl": CYCLES_NS, "glsl": GLSL_OPERATIONS}.get(self.target)
+        ray, times = self.timed(camera, seen) if known is None else (known[name], noise(seen.weight, self.share))
+        return area * ray, times
+
+    def shader(self, file: str | Path) -> tuple[float, float]:
+        """Of the shader of a model or a lens."""
+        asked = self.found.asked
+        lens = lens_of(Path(file), None, lambda done, left=None: None)[1]
+        return shader_cost(lens, self.found.places, asked.film_mm, asked.f_number, asked.focus_m)
 
 
-def _exact(found: Probed, budget_px: float, target: Target) -> Iterator[Choice]:
-    """The exact lens, which has no error; as C where that runs."""
-    compiled = isinstance(found.exact, FusedExactCamera)
-    if target == "render" or (target == "c" and compiled):
-        spec = f"{'fused:' if compiled else ''}{found.lens.path}"
-        yield _judged(found, "exact", spec, found.exact, budget_px, found.seen)
+def camera_of(found: Probed, choice: Choice) -> Camera:
+    """The camera of a choice, in our renderer; with the maps of its picture, where it needs them.
+
+    Raises:
+        InputError, ModelError: as the cameras.
+    """
+    kind, _, path = choice.camera.rpartition(":")
+    if choice.name == _EXACT:
+        return found.exact
+    if kind in _IDEAL:
+        flat = ideal_as(f"{kind}:", found.exact.lens, Shot(found.asked.film_mm, found.asked.focus_m))
+        mapped = choice.name.endswith(_MAPPED)
+        return Warped(flat, found.exact, found.asked.focus_m, tables=True) if mapped else flat
+    return (FusedCamera if kind else OnnxCamera)(load_model(path), **_real(found))
 
 
-def _try_model(
-    found: Probed, file: Path, budget_px: float, target: Target, explain: bool, how: str = ""
-) -> Iterator[Choice]:
+def _real(found: Probed) -> dict[str, Any]:
+    """The shot as cameras of lenses take it."""
+    asked = found.asked
+    shot = {"film_mm": asked.film_mm, "focus_m": asked.focus_m, "f_number": asked.f_number}
+    return {**shot, "wavelength_nm": asked.wavelength_nm}
+
+
+def _ideal(trial: _Trial) -> Iterator[Choice]:
+    """Pinhole, thin and thick lens, as they are and with their picture warped afterwards, where the target has them.
+
+    In C and GLSL they are their own source.
+    """
+    found, shot = trial.found, Shot(trial.found.asked.film_mm, trial.found.asked.focus_m)
+    for name in {"onnx": (), "osl": _IDEAL[:2]}.get(trial.target, _IDEAL):
+        spec = f"{name}:{found.lens.path}"
+        with suppress(InputError):  # no thick lens of cylinders; no maps of half a sphere, or of a film that is dark
+            camera = ideal_as(f"{name}:", found.exact.lens, shot)
+            seen = prints.footprints(camera, found.places)
+            yield trial.judged(name, spec, seen, partial(trial.ideal, name, camera, seen))
+            if "distortion" in found.asked.afterwards:
+                continue
+            if name == "thin" and trial.target in _OURS:
+                continue  # in our renderer the thick lens stands in its place
+            maps = Warped(camera, found.exact, found.asked.focus_m)
+            if maps.area < _MOST_OVERSCAN:
+                how = f"then the ST map of 'neurolens stmap' over the picture, of {maps.area:.3g} times the area"
+                cost = partial(trial.ideal, name, camera, seen, maps.area)
+                yield trial.judged(f"{name}{_MAPPED}", spec, prints.footprints(maps, found.places), cost, how)
+
+
+def _exact(trial: _Trial) -> Iterator[Choice]:
+    """The exact lens, which has no error: as C where that runs, and as code where its surfaces have a form in it."""
+    found, target = trial.found, trial.target
+    exact, path, compiled = found.exact, found.lens.path, isinstance(found.exact, FusedExactCamera)
+    cost: Cost = {
+        "osl": lambda: trial.shader(path),
+        "glsl": lambda: (glsl_operations(exact), noise(found.seen.weight, trial.share)),
+    }.get(target, lambda: trial.timed(exact, found.seen))
+    if target == "render" or (target != "onnx" and compiled) or target in ("osl", "glsl"):
+        with suppress(InputError):  # coatings, and glass that absorbs
+            yield trial.judged(_EXACT, f"{'fused:' if compiled and target in _OURS else ''}{path}", found.seen, cost)
+
+
+def _model(trial: _Trial, file: Path, how: str = "") -> Iterator[Choice]:
     """A model in the form that the target runs; none where its domain is not the shot's, or it has no such form.
 
-    Errors are of onnxruntime: compilers take seconds, and C gives the same rays.
+    Errors are of onnxruntime: compilers take seconds, and C and shaders give the same rays.
     """
-    asked = found.asked
-    real: dict[str, Any] = {"film_mm": asked.film_mm, "focus_m": asked.focus_m, "f_number": asked.f_number}
-    real["wavelength_nm"] = asked.wavelength_nm
-    compiled = target != "onnx" and has_compiler()
+    target = trial.target
+    compiled = target in _OURS and has_compiler()
     with suppress(InputError, ModelError):
         model = load_model(file)
-        spec = f"{'fused:' if compiled else ''}{file}"
-        choice = _judged(found, file.stem, spec, OnnxCamera(model, **real), budget_px, how=how, timed=not compiled)
-        if compiled and (choice.within or explain):
-            cost = _ns_a_ray(FusedCamera(model, **real), found.places) / max(choice.passed, 1e-9)
-            choice = replace(choice, ns=cost)
+        camera = OnnxCamera(model, **_real(trial.found))
+        seen = prints.footprints(camera, trial.found.places)
+
+        def cost() -> tuple[float, float]:
+            if target == "osl":
+                return trial.shader(file)
+            if target == "glsl":
+                return glsl_operations(camera), noise(seen.weight, trial.share)
+            return trial.timed(FusedCamera(model, **_real(trial.found)) if compiled else camera, seen)
+
         if compiled or target != "c":
-            yield choice
+            yield trial.judged(file.stem, f"{'fused:' if compiled else ''}{file}", seen, cost, how)
 
 
-def _fitted(found: Probed, budget_px: float, target: Target, folder: Path, explain: bool) -> Iterator[Choice]:
-    """Polynomials fitted for the shot alone, of rising size."""
-    prepared = prepare(make_pairs(found.lens, found.domain, _PAIRS))
+def model_choice(found: Probed, target: Target, file: Path, how: str, costed: bool) -> Choice | None:
+    """A model in the form that the target runs; None where it has none, or its domain is not the shot's."""
+    with warnings.catch_warnings():  # film beyond the end of its range: its error counts
+        warnings.simplefilter("ignore", NeurolensWarning)
+        return next(_model(_Trial(found, target, math.inf if costed else -1.0), file, how), None)
+
+
+def shot_domain(found: Probed) -> DomainChoice:
+    """The shot's, with as much more of the film's way as blurs a quarter of a pixel: models have their own focus."""
+    asked = found.asked
+    move = _FOCUS_SPARE * asked.f_number * asked.pixel_mm / first_order(found.lens).efl_mm ** 2  # of the vergence, 1/mm
+    vergence = 1e-3 / asked.focus_m
+    ends = 1e-3 / (vergence - move) if vergence > move else math.inf, 1e-3 / (vergence + move)
+    return DomainChoice(found.domain.film_radius_mm, ends, asked.wavelength_nm)
+
+
+def shot_terms(found: Probed) -> list[int]:
+    """Sizes of polynomials that are tried for a shot; those of lenses with cylinders have terms of x and of y."""
+    return [n for n in _TERMS if n >= (4 if found.lens.anamorphic else 2)]
+
+
+def shot_fits(
+    found: Probed, folder: Path, choice: DomainChoice | None = None, name: str = "shot"
+) -> Callable[[int], tuple[Path, ModelSettings]]:
+    """What fits a polynomial of so many terms to a shot alone, or to another domain of its lens: its file, in a folder,
+    and its settings."""
+    lens, domain, choice = found.lens.with_aperture(None), found.domain, choice or shot_domain(found)
+    with suppress(InputError):  # a lens that goes no nearer
+        domain = domain_of(lens, **asdict(choice))
+    prepared = prepare(make_pairs(lens, domain, _PAIRS))
     folder.mkdir(parents=True, exist_ok=True)
-    for terms in _TERMS:
-        settings = ModelSettings("ols", terms=terms, planes=False, elimination=False)
-        file = folder / f"{Path(found.lens.path).stem}.shot-{settings.label}.onnx"
+
+    def fit(terms: int) -> tuple[Path, ModelSettings]:
+        settings = replace(_FIT, name=f"{name}-ols-{terms}", terms=terms)
+        file = folder / f"{Path(found.lens.path).stem}.{settings.label}.onnx"
         export_onnx(fit_model(prepared, settings), file, errors={})
-        yield from _try_model(found, file, budget_px, target, explain, "fitted for this shot")
+        return file, settings
+
+    return fit
 
 
-def _judged(
-    found: Probed, name: str, spec: str, camera: Camera, budget_px: float, seen: Footprints | None = None,
-    how: str = "", timed: bool = True,
-) -> Choice:  # fmt: skip
-    """A camera's error against the exact footprints, and its cost."""
-    share = found.places.share
-    seen = prints.footprints(camera, found.places) if seen is None else seen
-    apart = prints.distance_mm(found.seen, seen, share) / found.asked.pixel_mm
-    light = np.abs(seen.light / np.maximum(found.seen.light, 1e-30) - 1)
-    error, dim = (float(np.percentile(np.where(np.isfinite(v), v, np.inf), COUNTED)) for v in (apart, light))
-    cost = _ns_a_ray(camera, found.places) / max(seen.passed, 1e-9) if timed else math.inf
-    return Choice(name, spec, error, dim, cost, seen.passed, error <= budget_px and dim <= LIGHT, how)
+def _fitted(
+    trial: _Trial, budgets_px: Sequence[float], folder: Path, tried: Sequence[Choice], say: Report
+) -> Iterator[Choice]:
+    """Polynomials fitted for the shot alone, by halves of their sizes: the smallest that holds, and those on the way.
 
-
-def _ns_a_ray(camera: Camera, places: Places) -> float:
-    """Least nanoseconds of some calls, over their rays."""
-    rays = int(getattr(camera, "rays_a_call", RAYS_A_CALL))
-    rng = np.random.default_rng(1)
-    rows = rng.integers(0, places.film_mm.shape[1], rays)
-    film, pupil = places.film_mm[:, rows].astype(np.float32), rng.random((2, rays), np.float32)
-    waves = rng.choice(places.wavelength_nm, rays, p=places.share).astype(np.float32)
-    best = math.inf
-    for _ in range(_ROUNDS):
-        began = time.perf_counter()
-        camera.sample(film, pupil, waves)
-        best = min(best, time.perf_counter() - began)
-    return 1e9 * best / rays
+    None where a camera without a lens does, in targets where it costs less than any, unless all is asked for.
+    """
+    found, ideal = trial.found, ("pinhole",) if trial.target in _OURS else ("pinhole", "thin")
+    explain = math.isinf(trial.costed_px)
+    asked = [b for b in budgets_px if explain or not any(c.meets(b) and c.name.startswith(ideal) for c in tried)]
+    if not asked:
+        return
+    fit, sizes = shot_fits(found, folder), shot_terms(found)
+    known: dict[int, tuple[Path, list[Choice]]] = {}
+    smallest = set()
+    for k, budget_px in enumerate(asked):
+        low, high = 0, len(sizes)  # sizes below `low` do not hold, those from `high` on do
+        while low < high:
+            size = (low + high) // 2
+            if size not in known:
+                file, settings = fit(sizes[size])
+                shown = trial if explain else replace(trial, costed_px=-1.0)
+                known[size] = file, [replace(c, settings=settings) for c in _model(shown, file, _SHOT)]
+            low, high = (low, size) if any(c.meets(budget_px) for c in known[size][1]) else (size + 1, high)
+            say((k + 1 - (high - low) / len(sizes)) / len(asked))
+        smallest.add(low)
+    for size, (file, made) in known.items():  # what is larger than the smallest costs more, and is not compiled
+        again = _model(trial, file, _SHOT) if size in smallest and not explain else made
+        yield from (replace(c, settings=made[0].settings) for c in again)

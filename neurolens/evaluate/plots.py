@@ -6,12 +6,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from neurolens.analysis.plot_style import INK, drawing, plain_log_ticks
 from neurolens.evaluate.pages import Record, number
 from neurolens.evaluate.records import pareto_front
 
 if TYPE_CHECKING:
-    from neurolens.evaluate.plan import Plan
+    from neurolens.evaluate.plan import Choice, Plan
+    from neurolens.evaluate.trade import Trade
 
 # Names, Okabe and Ito's colours, and markers, which tell kinds apart without colours; black is the exact tracer's.
 Kinds = Mapping[str, tuple[str, str, str]]
@@ -148,35 +151,84 @@ def _cost(box: tuple[float, float, float, float], points: Sequence[Any], taken: 
     return cost
 
 
+_COLUMNS = 4  # of maps
+
+
 def plot_effects(plan: Plan, path: Path, title: str) -> None:
-    """What a plan found: effects as bars with the budget, and error against time of every camera that was timed."""
-    asked, wide = plan.asked, [e for e in plan.effects if e.unit == "px"][::-1]
+    """What a plan found: effects as bars with the budget, error against time of every camera that was timed, and where
+    in the picture the effects are that a camera needs."""
+    asked = plan.asked
+    shown = [e for e in plan.effects if e.needed and e.name in plan.probed.maps]
+    rows = -(-len(shown) // _COLUMNS)
     subtitle = f"f/{asked.f_number:.3g}, focus {asked.focus_m:g} m; 95% of the picture keeps these figures"
-    with drawing(path, 9.5, 4.2, title, subtitle) as figure:
-        bars, trade = figure.subplots(1, 2, width_ratios=(1.0, 1.1))
-        least = max(min((e.worth for e in wide if e.worth > 0), default=1e-3) / 3, 1e-4)
-        colours = [family_colour("ols") if e.needed else "#b8b8b8" for e in wide]
-        bars.barh([e.name for e in wide], [max(e.worth, least) for e in wide], color=colours, left=0)
-        bars.set_xscale("log")
-        bars.set_xlim(left=least)
-        bars.set_xlabel("worth (pixels), grey: left out")
-        timed = [c for c in plan.choices if 0 < c.ns < float("inf") and c.error_px < float("inf")]
-        errors = [max(c.error_px, 1e-4) for c in timed]
-        trade.scatter([c.ns for c in timed], errors, c=["#0072b2" if c.within else "#b8b8b8" for c in timed], s=26)
-        chosen = [k for k, c in enumerate(timed) if c == plan.best]
-        trade.scatter(
-            [timed[k].ns for k in chosen], [errors[k] for k in chosen], s=150, fc="none", ec="#d55e00", lw=1.8
-        )
-        trade.set_xscale("log")
-        trade.set_yscale("log")
-        trade.set_xlabel("time (ns a ray that passes), one thread")
-        trade.set_ylabel("error (pixels; none is drawn at 0.0001)")
-        place_labels(trade, [(c.ns, e) for c, e in zip(timed, errors, strict=True)], [_short(c.name) for c in timed])
+    with drawing(path, 9.5, 4.2 + 1.75 * rows, title, subtitle) as figure:
+        if not rows:
+            _bars_and_trade(plan, figure)
+            return
+        above, below = figure.subfigures(2, 1, height_ratios=(4.2, 1.75 * rows))
+        _bars_and_trade(plan, above)
+        cells = below.subplots(rows, _COLUMNS, squeeze=False).ravel()
+        for axes, effect in zip(cells, shown, strict=False):
+            unit, value = plan.probed.maps[effect.name]
+            value = value if unit == "px" else 100 * value
+            # What is beyond 95% would leave the rest dark.
+            top = float(np.nanpercentile(value, 98)) or 1e-30
+            look = {"cmap": "magma", "vmin": 0, "vmax": top, "interpolation": "nearest"}
+            picture = axes.imshow(value, extent=(0, asked.film_mm[0], 0, asked.film_mm[1]), **look)
+            bar = below.colorbar(picture, ax=axes, shrink=min(1.25 * value.shape[0] / value.shape[1], 1), extend="max")
+            bar.ax.tick_params(labelsize=6)
+            axes.set_title(f"{effect.name} ({'px' if unit == 'px' else '% of the light'})", fontsize=7.5)
+            axes.set(xticks=[], yticks=[])
+        for axes in cells[len(shown) :]:
+            axes.remove()
+
+
+def _bars_and_trade(plan: Plan, figure: Any) -> None:
+    wide = [e for e in plan.effects if e.unit == "px"][::-1]
+    bars, trade = figure.subplots(1, 2, width_ratios=(1.0, 1.1))
+    least = max(min((e.worth for e in wide if e.worth > 0), default=1e-3) / 3, 1e-4)
+    colours = [family_colour("ols") if e.needed else "#b8b8b8" for e in wide]
+    bars.barh([e.name for e in wide], [max(e.worth, least) for e in wide], color=colours, left=0)
+    bars.set_xscale("log")
+    bars.set_xlim(left=least)
+    bars.set_xlabel("worth (pixels), grey: left out")
+    timed = [c for c in plan.choices if 0 < c.cost < float("inf") and c.error_px < float("inf")]
+    _cameras(trade, timed, [c.cost for c in timed], plan.best)
+    trade.set_xlabel(f"cost ({plan.unit} a ray times noise), --for {plan.target}")
+    if plan.budget_px > 0:
+        bars.axvline(plan.budget_px, color="#d55e00", lw=1.2)
+        trade.axhline(plan.budget_px, color="#d55e00", lw=1.2, label=f"budget {plan.budget_px:g} px; ring: chosen")
+        trade.legend(loc="lower right", bbox_to_anchor=(1, 1), frameon=False)
+    plain_log_ticks(bars.xaxis, trade.xaxis, trade.yaxis)
+
+
+def _cameras(axes: Any, choices: Sequence[Choice], places: Sequence[float], best: Choice | None) -> None:
+    """Errors of cameras over something, those within the budget in colour, the chosen one with a ring."""
+    errors = [max(c.error_px, 1e-4) for c in choices]
+    axes.scatter(places, errors, c=["#0072b2" if c.within else "#b8b8b8" for c in choices], s=26)
+    chosen = [k for k, c in enumerate(choices) if c == best]
+    ring = {"s": 150, "fc": "none", "ec": "#d55e00", "lw": 1.8}
+    axes.scatter([places[k] for k in chosen], [errors[k] for k in chosen], **ring)
+    axes.set(xscale="log", yscale="log", ylabel="error (pixels; none is drawn at 0.0001)")
+    place_labels(axes, list(zip(places, errors, strict=True)), [_short(c.name) for c in choices])
+
+
+def plot_trade(trade: Trade, path: Path, title: str) -> None:
+    """Error of every camera against its seconds, with the front of those that no other betters."""
+    plan, offered = trade.plan, [o for o in trade.offered if o.choice.error_px < float("inf")]
+    subtitle = f"--for {plan.target}; 95% of the picture keeps these errors"
+    subtitle += f"; the scene itself takes {trade.base:.3g} {trade.unit}" * bool(trade.base)
+    with drawing(path, 8.5, 5.0, title, subtitle) as figure:
+        axes = figure.subplots()
+        _cameras(axes, [o.choice for o in offered], [o.seconds for o in offered], plan.best)
+        best = trade.front
+        at = [o.seconds for o in best], [max(o.choice.error_px, 1e-4) for o in best]
+        axes.step(*at, where="post", color=INK, lw=1.2, alpha=0.7, label="no camera betters both")
+        axes.set_xlabel(f"{trade.unit} that the camera adds, one thread, to equal noise")
         if plan.budget_px > 0:
-            bars.axvline(plan.budget_px, color="#d55e00", lw=1.2)
-            trade.axhline(plan.budget_px, color="#d55e00", lw=1.2, label=f"budget {plan.budget_px:g} px; ring: chosen")
-            figure.legend(loc="upper right", frameon=False)
-        plain_log_ticks(bars.xaxis, trade.xaxis, trade.yaxis)
+            axes.axhline(plan.budget_px, color="#d55e00", lw=1.2, label=f"budget {plan.budget_px:g} px; ring: chosen")
+        axes.legend(loc="lower right", bbox_to_anchor=(1, 1), frameon=False, ncols=2)
+        plain_log_ticks(axes.xaxis, axes.yaxis)
 
 
 def _short(name: str) -> str:

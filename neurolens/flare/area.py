@@ -18,52 +18,60 @@ from neurolens.flare.stack import Floats
 from neurolens.flare.steps import LOST
 from neurolens.graph.compiler import load_compiled
 
+_PER_CELL = 8  # edges at most: of two triangles that rims cut
 
-class Canvas:
-    """Light on a film of `width` x `height` pixels, centred and upright (the film turned by 180 degrees).
+
+def edges_of(found: Floats, columns: int, size: tuple[int, int], per_mm: float) -> NDArray[np.float64]:
+    """The light of a grid of rays of one wavelength as edges, which `draw_edges` draws: none where it misses the film.
+
+    Args:
+        found: [4, N] film x, y (mm), power, worst of the rays, row after row, each one ray longer than `columns`.
+        size: of the whole film in pixels. per_mm: pixels.
 
     Raises:
         InputError: no C compiler, or one that fails.
     """
+    rows = found.shape[1] // (columns + 1) - 1
+    assert found.dtype == np.float32 and found.flags.c_contiguous and found.shape == (4, (rows + 1) * (columns + 1))
+    edges, room = np.empty((_PER_CELL * found.shape[1], 5)), np.zeros((5, found.shape[1]))
+    pointers = [a.ctypes.data for a in (found, room, edges)]
+    return edges[: _compiled().edges(columns, rows, *size, per_mm, *pointers)].copy()
 
-    def __init__(self, width: int, height: int) -> None:
-        self.width, self.height = width, height
-        self._sums = np.zeros((height, width + 2))  # what each pixel's light differs by from that of the one before
 
-    def add(self, found: Floats, columns: int, share: float, per_mm: float) -> None:
-        """Add the light of a grid of rays.
+def draw_edges(
+    picture: Floats, rows: range, edges: NDArray[np.float64], counts: NDArray[np.int64], light: NDArray[np.float64]
+) -> None:
+    """Add light to some rows of a picture [H, W, 3], centred and upright (the film turned by 180 degrees).
 
-        Args:
-            found: [4, N] film x, y (mm), power, worst of the rays, row after row, each one ray longer than `columns`.
-            share: light of a cell whose power is 1. per_mm: pixels.
-        """
-        rows = found.shape[1] // (columns + 1) - 1
-        assert found.dtype == np.float32 and found.flags.c_contiguous and found.shape == (4, (rows + 1) * (columns + 1))
-        steps = np.zeros((3, found.shape[1]))
-        pointers = [a.ctypes.data for a in (found, steps, self._sums)]
-        _compiled().cover(columns, rows, self.width, self.height, share, per_mm, *pointers)
+    Each row is what it is with all others.
 
-    def onto(self, picture: Floats, colour: NDArray[np.float64]) -> None:
-        """Add all light, times a colour [3], to a picture [H, W, 3], and be empty."""
-        assert picture.dtype == np.float32 and picture.flags.c_contiguous
-        assert picture.shape == (self.height, self.width, 3)
-        given = np.ascontiguousarray(colour, np.float64)
-        _compiled().settle(self.width, self.height, *(a.ctypes.data for a in (self._sums, given, picture)))
+    Args:
+        edges: [N, 5], of several grids, so many of each. counts: [K]. light: [K, 3], of a cell whose power is 1.
+
+    Raises:
+        InputError: as of `edges_of`.
+    """
+    height, width, _ = picture.shape
+    assert picture.dtype == np.float32 and picture.flags.c_contiguous and rows.stop <= height
+    given, sums = np.zeros((len(light), 4)), np.zeros((len(rows), width + 3, 4))
+    given[:, :3] = light
+    pointers = [a.ctypes.data for a in (counts, edges, given, sums, picture[rows.start :])]
+    _compiled().draw(width, rows.start, len(rows), len(light), *pointers)
 
 
 @cache
 def _compiled() -> ctypes.CDLL:
     library = load_compiled(_TEXT.replace("$LOST", str(LOST)))
     whole, real, pointer = ctypes.c_int, ctypes.c_double, ctypes.c_void_p
-    library.cover.argtypes = [whole, whole, whole, whole, real, real, pointer, pointer, pointer]
-    library.settle.argtypes = [whole, whole, pointer, pointer, pointer]
-    library.cover.restype = library.settle.restype = None
+    library.edges.argtypes, library.edges.restype = [*[whole] * 4, real, *[pointer] * 3], ctypes.c_size_t
+    library.draw.argtypes, library.draw.restype = [*[whole] * 4, *[pointer] * 5], None
     return library
 
 
 _TEXT = """
 #include <math.h>
 #include <stddef.h>
+#include <stdint.h>
 
 #define SMALL 1e-6 /* square pixels, whose light goes to its corners instead */
 #define FAR 1e7 /* pixels */
@@ -74,7 +82,14 @@ _TEXT = """
 #endif
 
 struct point { double x, y; };
-struct canvas { int width, height; double *sums; };
+/* Red, green, blue and nothing: one register. */
+typedef double rgb __attribute__((vector_size(32), aligned(8)));
+/* Right of it, where y grows along it, the density is larger; of two equal points, light that lies there. */
+struct edge { struct point p, q; double density; };
+struct canvas {
+    int width, first, last;
+    rgb *sums, light; /* of a pixel, what it has more than the one before */
+};
 
 static inline ALWAYS struct point between(struct point p, struct point q, double share)
 {
@@ -83,42 +98,55 @@ static inline ALWAYS struct point between(struct point p, struct point q, double
 
 /* One row's part of an edge, from x = a to b > a, `amount` high. With r(t) the mean of max(t - x, 0) along it, what it
    covers of pixel k is r(k + 1) - r(k). */
-static inline ALWAYS void in_row(double *row, double a, double b, double amount)
+static inline ALWAYS void in_row(rgb *row, double a, double b, rgb amount)
 {
     const int first = (int)a, last = (int)b;
     if (first == last) {
-        const double right = amount * (0.5 * (a + b) - first);
+        const rgb right = amount * (0.5 * (a + b) - first);
         row[first] += amount - right;
         row[first + 1] += right;
         return;
     }
-    const double half = 0.5 * amount / (b - a);
+    const double half = 0.5 / (b - a);
     double covered = 0.0, before = 0.0;
     for (int k = first; k <= last + 1; k++) {
-        const double t = k + 1 - a, r = k + 1 <= b ? half * t * t : amount * (k + 1 - 0.5 * (a + b));
-        row[k] += r - before - covered;
+        const double t = k + 1 - a, r = k + 1 <= b ? half * t * t : k + 1 - 0.5 * (a + b);
+        row[k] += amount * (r - before - covered);
         covered = r - before;
         before = r;
     }
 }
 
-/* An edge that lies on the canvas: right of it the density is larger. */
+/* An edge between the left and the right border, p above q; rows that are not the canvas's are left out. */
 static void line(struct canvas c, struct point p, struct point q, double density)
 {
-    const double slope = (q.x - p.x) / (q.y - p.y);
-    double x = p.x, y = p.y;
-    for (int k = (int)p.y; k < c.height && y < q.y; k++) {
-        const double next = k + 1 < q.y ? k + 1 : q.y, end = k + 1 < q.y ? x + slope * (next - y) : q.x;
-        double *const row = c.sums + (size_t)k * (c.width + 2);
-        if (x < end) in_row(row, x, end, (next - y) * density);
-        else in_row(row, end, x, (next - y) * density);
+    if (!(p.y < q.y && p.y < c.last && q.y > c.first)) return;
+    const double slope = (q.x - p.x) / (q.y - p.y), wide = fabs(slope), half = 0.5 / wide;
+    const rgb light = density * c.light;
+    const int last = q.y < c.last ? (int)q.y : c.last - 1;
+    int k = p.y > c.first ? (int)p.y : c.first;
+    double y = p.y > k ? p.y : k, x = p.y > k ? p.x : p.x + slope * (k - p.y);
+    rgb *row = c.sums + (size_t)(k - c.first) * (c.width + 3);
+    for (; k <= last; k++, row += c.width + 3) {
+        const int ends = q.y <= k + 1;
+        const double next = ends ? q.y : k + 1, end = ends ? q.x : p.x + slope * (k + 1 - p.y);
+        if (next - y == 1.0 && wide <= 1.0) { /* a whole row, of at most two pixels: as below, without a branch */
+            const double a = x < end ? x : end;
+            const int first = (int)a;
+            const double t = first + 1 - a, all = t - 0.5 * wide, r = t < wide ? half * t * t : all;
+            const double rest = 1.0 + all - r;
+            row[first] += r * light;
+            row[first + 1] += (rest - r) * light;
+            row[first + 2] += (1.0 - rest) * light;
+        } else if (x < end) in_row(row, x, end, (next - y) * light);
+        else in_row(row, end, x, (next - y) * light);
         x = end;
         y = next;
     }
 }
 
-/* Any edge: right of it, where y grows along it, the density is larger. Left of the canvas it counts at its border. */
-static void edge(struct canvas c, struct point p, struct point q, double density)
+/* Any edge. Left of the film it counts at its border. */
+static void draw_edge(struct canvas c, struct point p, struct point q, double density)
 {
     if (p.y > q.y) {
         const struct point other = p;
@@ -126,41 +154,72 @@ static void edge(struct canvas c, struct point p, struct point q, double density
         q = other;
         density = -density;
     }
-    if (!(density != 0.0 && p.y < q.y && p.y < c.height && q.y > 0.0)) return;
-    const struct point from = p, to = q;
-    const double high = q.y - p.y, wide = q.x - p.x;
-    if (p.y < 0.0) p = (struct point){ from.x - from.y * wide / high, 0.0 };
-    if (q.y > c.height) q = (struct point){ from.x + (c.height - from.y) * wide / high, c.height };
+    if (!(p.y < c.last && q.y > c.first && (p.x < c.width || q.x < c.width))) return;
+    const struct point from = p;
+    const double per_x = (q.y - p.y) / (q.x - p.x);
     for (int right = 0; right < 2; right++) {
         const double border = right ? c.width : 0.0;
         const int p_in = right ? p.x <= border : p.x >= 0.0, q_in = right ? q.x <= border : q.x >= 0.0;
         if (p_in && q_in) continue;
-        const double y = from.y + (border - from.x) * high / wide;
-        const struct point m = { border, p_in == q_in ? q.y : fmin(fmax(y, p.y), q.y) };
-        const struct point out[2] = { { border, q_in ? p.y : m.y }, { border, q_in ? m.y : q.y } };
+        const struct point top = { border, p.y }, below = { border, q.y };
         if (p_in == q_in) {
             p.x = q.x = border;
-        } else {
-            if (!right && out[0].y < out[1].y) line(c, out[0], out[1], density);
-            *(p_in ? &q : &p) = m;
+            continue;
         }
+        const double y = from.y + (border - from.x) * per_x;
+        const struct point m = { border, fmin(fmax(y, p.y), q.y) };
+        if (!right && p_in) line(c, m, below, density);
+        if (!right && q_in) line(c, top, m, density);
+        *(p_in ? &q : &p) = m;
     }
-    if (p.y < q.y && !(p.x >= c.width && q.x >= c.width)) line(c, p, q, density);
+    line(c, p, q, density);
 }
 
 /* Light at a point, shared among the four pixels round it. */
 static void dot(struct canvas c, struct point p, double light)
 {
     const double u = p.x - 0.5, v = p.y - 0.5;
-    if (!(u > -1.0 && v > -1.0 && u < c.width && v < c.height)) return;
+    if (!(u > -1.0 && v > c.first - 1.0 && u < c.width && v < c.last)) return;
     const int left = (int)floor(u), top = (int)floor(v);
     for (int k = 0; k < 4; k++) {
         const int x = left + (k & 1), y = top + (k >> 1);
         const double part = (k & 1 ? u - left : 1.0 - u + left) * (k >> 1 ? v - top : 1.0 - v + top) * light;
-        if (x < 0 || y < 0 || x >= c.width || y >= c.height) continue;
-        c.sums[(size_t)y * (c.width + 2) + x] += part;
-        c.sums[(size_t)y * (c.width + 2) + x + 1] -= part;
+        if (x < 0 || y < c.first || x >= c.width || y >= c.last) continue;
+        rgb *const at = c.sums + (size_t)(y - c.first) * (c.width + 3) + x;
+        at[0] += part * c.light;
+        at[1] -= part * c.light;
     }
+}
+
+/* A pixel is the sum of what is left of it; what would be 0 but for rounding is 0. */
+static void settle(int width, int height, const rgb *sums, float *picture)
+{
+    for (int j = 0; j < height; j++) {
+        const rgb *const row = sums + (size_t)j * (width + 3);
+        rgb light = { 0.0 }, most = { 0.0 };
+        float *pixel = picture + (size_t)j * width * 3;
+        for (int i = 0; i < width; i++, pixel += 3) {
+            light += row[i];
+            for (int k = 0; k < 3; k++) {
+                const double size = fabs(light[k]);
+                most[k] = size > most[k] ? size : most[k];
+                pixel[k] += size > 1e-12 * most[k] ? light[k] : 0.0;
+            }
+        }
+    }
+}
+/* `sums`: of the canvas, 0. */
+void draw(
+    int width, int first, int rows, int grids, const int64_t *counts, const struct edge *e,
+    const rgb *light, rgb *sums, float *picture)
+{
+    for (int k = 0; k < grids; k++) {
+        const struct canvas c = { width, first, first + rows, sums, light[k] };
+        for (const struct edge *const end = e + counts[k]; e < end; e++)
+            if (e->p.x == e->q.x && e->p.y == e->q.y) dot(c, e->p, e->density);
+            else draw_edge(c, e->p, e->q, e->density);
+    }
+    settle(width, rows, sums, picture);
 }
 
 static inline ALWAYS double area_of(struct point a, struct point b, struct point c)
@@ -187,8 +246,16 @@ static int beyond(int columns, int rows, size_t o, const float *x, const float *
     return told > 0;
 }
 
+/* Edges along rows of pixels step nowhere. */
+static inline ALWAYS struct edge *step(struct edge *to, struct point p, struct point q, double density)
+{
+    if (p.y != q.y) *to++ = (struct edge){ p, q, density };
+    return to;
+}
+
 /* A triangle of which rims cut off some: `light` would be all of it. Half the way to a corner that is lost is lit. */
-static void cut(struct canvas c, const struct point *corner, const double *power, const double *worst, double light)
+static struct edge *cut(
+    struct edge *to, const struct point *corner, const double *power, const double *worst, double light)
 {
     static const struct point unit[3] = { { 0.0, 0.0 }, { 1.0, 0.0 }, { 0.0, 1.0 } };
     struct point kept[4], pupil[4];
@@ -204,8 +271,8 @@ static void cut(struct canvas c, const struct point *corner, const double *power
         }
         if (in == on) continue;
         const int lost = !(worst[k] < $LOST && worst[l] < $LOST);
-        const double from = sqrt(fmax(worst[k], 0.0)), to = sqrt(fmax(worst[l], 0.0));
-        const double f = lost ? 0.5 : (1.0 - from) / (to - from);
+        const double here = sqrt(fmax(worst[k], 0.0)), there = sqrt(fmax(worst[l], 0.0));
+        const double f = lost ? 0.5 : (1.0 - here) / (there - here);
         kept[n] = between(corner[k], corner[l], f);
         pupil[n++] = between(unit[k], unit[l], f);
     }
@@ -215,52 +282,69 @@ static void cut(struct canvas c, const struct point *corner, const double *power
     }
     light *= share * mean / inside;
     for (int k = 0; k < n; k++) {
-        if (fabs(area) > SMALL) edge(c, kept[k], kept[(k + 1) % n], -light / area);
-        else dot(c, kept[k], light / n);
+        if (fabs(area) > SMALL) to = step(to, kept[k], kept[(k + 1) % n], -light / area);
+        else *to++ = (struct edge){ kept[k], kept[k], light / n };
     }
+    return to;
 }
 
-/* Whole cells share edges, each of which is drawn once: `steps` are the steps of density across edges along rows, along
-   columns and along diagonals. */
-void cover(
-    int columns, int rows, int width, int height, double share, double per_mm, const float *found, double *steps,
-    double *sums)
+/* Whether four points lie on one side of the film, a pixel away. */
+static inline ALWAYS int apart(int width, int height, struct point p, struct point q, struct point r, struct point s)
 {
-    const struct canvas c = { width, height, sums };
+    const double right = width + 1.0, below = height + 1.0;
+    return (p.x < -1.0 && q.x < -1.0 && r.x < -1.0 && s.x < -1.0)
+        || (p.y < -1.0 && q.y < -1.0 && r.y < -1.0 && s.y < -1.0)
+        || (p.x > right && q.x > right && r.x > right && s.x > right)
+        || (p.y > below && q.y > below && r.y > below && s.y > below);
+}
+
+/* How many edges there are. Whole cells share theirs: steps of density across edges along rows, along columns and along
+   diagonals are summed first. Cells of which nothing is on the film are left out. `room`: [5, N] zeros. */
+size_t edges(
+    int columns, int rows, int width, int height, double per_mm, const float *found, double *room, struct edge *to)
+{
     const size_t wide = columns + 1, all = wide * (rows + 1);
     const float *const x = found, *const y = x + all, *const power = y + all, *const worst = power + all;
-    double *const level = steps, *const upright = level + all, *const slanted = upright + all;
+    struct point *const place = (struct point *)room;
+    double *const level = room + 2 * all, *const upright = level + all, *const slanted = upright + all;
+    const struct edge *const from = to;
 #define ON_FILM(x, y) ((struct point){ 0.5 * width - per_mm * (x), 0.5 * height + per_mm * (y) })
-#define PLACE(k) ON_FILM(x[k], y[k])
+    for (size_t k = 0; k < all; k++)
+        place[k] = ON_FILM(x[k], y[k]);
     for (int j = 0; j < rows; j++)
         for (int i = 0; i < columns; i++) {
             const size_t o = j * wide + i, at[2][3] = { { o, o + 1, o + wide + 1 }, { o, o + wide + 1, o + wide } };
             double light[2], area[2], density[2];
+            const float w[4] = { worst[o], worst[o + 1], worst[o + wide], worst[o + wide + 1] };
+            if (!(w[0] <= 1.0f || w[1] <= 1.0f || w[2] <= 1.0f || w[3] <= 1.0f)) continue;
+            if (w[0] < $LOST && w[1] < $LOST && w[2] < $LOST && w[3] < $LOST
+                && apart(width, height, place[o], place[o + 1], place[o + wide], place[o + wide + 1]))
+                continue;
             for (int h = 0; h < 2; h++) {
                 struct point corner[3];
                 double p[3], w[3];
                 int in = 0, near = 1;
                 for (int k = 0; k < 3; k++) {
-                    corner[k] = PLACE(at[h][k]);
+                    corner[k] = place[at[h][k]];
                     p[k] = power[at[h][k]];
                     w[k] = worst[at[h][k]];
                     in += w[k] <= 1.0;
                     near &= !(w[k] < $LOST) || (fabs(corner[k].x) < FAR && fabs(corner[k].y) < FAR);
                 }
-                light[h] = share * (p[0] + p[1] + p[2]) / 6.0;
+                light[h] = (p[0] + p[1] + p[2]) / 6.0;
                 area[h] = area_of(corner[0], corner[1], corner[2]);
                 density[h] = in == 3 && near && fabs(area[h]) > SMALL ? -light[h] / area[h] : 0.0;
                 for (int k = 0; k < 3 && in > 0 && in < 3; k++) {
                     const int next = (k + 1) % 3, kept = w[next] <= 1.0 ? next : (k + 2) % 3;
-                    double to[2];
+                    double ahead[2];
                     if (w[k] < $LOST) continue;
-                    const int told = beyond(columns, rows, at[h][k], x, y, worst, to);
-                    const struct point there = ON_FILM(to[0], to[1]);
+                    const int told = beyond(columns, rows, at[h][k], x, y, worst, ahead);
+                    const struct point there = ON_FILM(ahead[0], ahead[1]);
                     corner[k] = told && fabs(there.x) < FAR && fabs(there.y) < FAR ? there : corner[kept];
                 }
-                if (in > 0 && in < 3 && near) cut(c, corner, p, w, 0.5 * share);
+                if (in > 0 && in < 3 && near) to = cut(to, corner, p, w, 0.5);
                 for (int k = 0; k < 3 && in == 3 && near && density[h] == 0.0; k++)
-                    dot(c, corner[k], light[h] / 3.0);
+                    *to++ = (struct edge){ corner[k], corner[k], light[h] / 3.0 };
             }
             const double ratio = area[0] / area[1];
             if (density[0] != 0.0 && density[1] != 0.0 && ratio > 0.5 && ratio < 2.0) /* no fold: one cell */
@@ -274,25 +358,11 @@ void cover(
     for (int j = 0; j <= rows; j++)
         for (int i = 0; i <= columns; i++) {
             const size_t o = j * wide + i;
-            if (level[o] != 0.0) edge(c, PLACE(o), PLACE(o + 1), level[o]);
-            if (upright[o] != 0.0) edge(c, PLACE(o), PLACE(o + wide), upright[o]);
-            if (slanted[o] != 0.0) edge(c, PLACE(o), PLACE(o + wide + 1), slanted[o]);
+            const struct point p = place[o];
+            if (level[o] != 0.0) to = step(to, p, place[o + 1], level[o]);
+            if (upright[o] != 0.0) to = step(to, p, place[o + wide], upright[o]);
+            if (slanted[o] != 0.0) to = step(to, p, place[o + wide + 1], slanted[o]);
         }
-}
-
-void settle(int width, int height, double *sums, const double *colour, float *picture)
-{
-    for (int j = 0; j < height; j++) {
-        double *const row = sums + (size_t)j * (width + 2);
-        double light = 0.0;
-        float *const pixel = picture + (size_t)j * width * 3;
-        for (int i = 0; i < width; i++) {
-            light += row[i];
-            row[i] = 0.0;
-            for (int k = 0; k < 3; k++)
-                pixel[3 * i + k] += colour[k] * fmax(light, 0.0);
-        }
-        row[width] = row[width + 1] = 0.0;
-    }
+    return (size_t)(to - from);
 }
 """

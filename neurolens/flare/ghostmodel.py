@@ -67,10 +67,11 @@ class GhostPolynomial:
         rest, place = np.unique(self.exponents[:, 1:3], axis=0, return_inverse=True)
         return rest, (place.reshape(-1, 1) == np.arange(len(rest))).astype(np.float64)
 
-    def fixed(self, rho: float, w: float) -> Array:
-        """The table [rows, L] of one direction and wavelength, over the first of `places`."""
-        known = rho ** self.exponents[:, 0].astype(np.float64) * w ** self.exponents[:, 3].astype(np.float64)
-        return np.asarray((self.table * known) @ self.places[1])
+    def fixed(self, rho: float, w: Array) -> Array:
+        """The tables [W, rows, L] of one direction and wavelengths [W], over the first of `places`."""
+        of_rho, of_w = (np.vander(v, 1 + self.exponents[:, k].max(), True) for v, k in ((np.array([rho]), 0), (w, 3)))
+        known = of_rho[:, self.exponents[:, 0]] * of_w[:, self.exponents[:, 3]]
+        return np.asarray((self.table * known[:, None]) @ self.places[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +160,7 @@ class GhostModel:
         """Rays of one direction by compiled code, whose coefficients are numbers of the call."""
         p, (middle, half) = direction / self.sine, self.w_middle_half
         w = (inverse_square_um(np.asarray(wavelengths_nm, np.float64)) - middle) / half
-        tables = np.stack([ghost.fixed(float(p @ p), float(v)) for v in w]).astype(np.float32)
+        tables = ghost.fixed(float(p @ p), w).astype(np.float32)
         head = [*p, *(ghost.chief_mm * p), 1 / ghost.scale_mm, self.lens.stop_radius_mm]
         call = np.array(head, np.float32)
         given = np.ascontiguousarray(places, np.float32)
@@ -171,7 +172,11 @@ class GhostModel:
 
     def _stops(self, ghost: GhostPolynomial) -> tuple[bool, ...]:
         """Which crossings are with the stop."""
-        return tuple(k == self.lens.stop_index for k in ghost.surfaces)
+        return tuple(k == self._stop for k in ghost.surfaces)
+
+    @cached_property
+    def _stop(self) -> int:
+        return self.lens.stop_index
 
     @cached_property
     def _compiled(self) -> tuple[Any, dict[Any, int], dict[Any, int]]:
@@ -252,30 +257,38 @@ def _monomial_graph(exponents: Sequence[tuple[int, ...]]) -> Graph:
 
 # Monomials serve all wavelengths; a table's products with them are what the graphs of light take.
 _DRIVER = """
-enum { BLOCK = 256, MOST = $MOST, ROWS = $ROWS };
+enum { BLOCK = 256, LANES = 16, MOST = $MOST, ROWS = $ROWS };
+typedef float lanes __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
 typedef void step(size_t, const float *const *, const float *, float *const *);
 static step *const terms_of[] = { $TERMS }, *const light_of[] = { $LIGHTS };
 
+/* Four rows of so few rays at a time that their sums stay in registers. */
 static void product(int rows, int terms, const float *table, float term[][BLOCK], float row[][BLOCK])
 {
-    for (int r = 0; r < rows; r += 2) {
-        float *const a = row[r], *const b = row[r + 1];
-        const float *const s = table + r * terms, *const t = r + 1 < rows ? s + terms : s;
-        for (int i = 0; i < BLOCK; i++)
-            a[i] = b[i] = 0.0f;
-        for (int k = 0; k < terms; k++)
-            for (int i = 0; i < BLOCK; i++) {
-                a[i] += s[k] * term[k][i];
-                b[i] += t[k] * term[k][i];
+    for (int i = 0; i < BLOCK; i += LANES)
+        for (int r = 0; r < rows; r += 4) {
+            const float *const a = table + r * terms, *const b = a + (r + 1 < rows) * terms;
+            const float *const c = b + (r + 2 < rows) * terms, *const d = c + (r + 3 < rows) * terms;
+            lanes s = { 0.0f }, t = s, u = s, v = s;
+            for (int k = 0; k < terms; k++) {
+                const lanes x = *(const lanes *)&term[k][i];
+                s += a[k] * x;
+                t += b[k] * x;
+                u += c[k] * x;
+                v += d[k] * x;
             }
-    }
+            *(lanes *)&row[r][i] = s;
+            *(lanes *)&row[r + 1][i] = t;
+            *(lanes *)&row[r + 2][i] = u;
+            *(lanes *)&row[r + 3][i] = v;
+        }
 }
 
 void ghosts(
     size_t count, int wavelengths, int rows, int terms, int monomials, int lights, const float *places,
     const float *call, const float *tables, float *out)
 {
-    static __thread float term[MOST][BLOCK], row[ROWS + 1][BLOCK];
+    static __thread float term[MOST][BLOCK], row[ROWS + 3][BLOCK];
     for (size_t at = 0; at < count; at += BLOCK) {
         const size_t n = count - at < BLOCK ? count - at : BLOCK;
         const float *in[ROWS] = { places + at, places + count + at };

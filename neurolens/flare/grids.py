@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +16,14 @@ from neurolens.flare.lights import Light, rays_across
 from neurolens.flare.stack import Floats
 from neurolens.flare.steps import LOST
 
-FEWEST, MOST = 24, 512  # cells along a side
+FEWEST, MOST = 320, 512  # lit cells, and cells along a side
 REACH = 16.0  # of `GhostTracer.trace`: rims are cut between rays inside and outside
 _SCOUTS = 48  # cells a side of the grid that looks for ghosts
+_FEW = 4  # of the scouts, one in so many a side, tell how far apart colours are
+_NEAR = 2.0  # r^2 / R^2 to which rays beyond rims tell it, too
+_EVEN = 0.02  # least unevenness, and spread of colours over the size, of a ghost
 _AT_ONCE = 128  # ghosts
-_COARSER = (0.5, 4.0)  # cells of a ghost than those of a ghost of some brightness
+_ERROR, _WORST = 3.0, 0.25  # light beside its place, times the cells that half the film is wide; at most
 
 
 @dataclass(frozen=True)
@@ -27,12 +32,14 @@ class Grid:
 
     Attributes:
         low, high: corners of the rectangle, in disc radii. columns, rows: cells.
+        wavelengths: about so many stand for all of the range.
     """
 
     low: tuple[float, float]
     high: tuple[float, float]
     columns: int
     rows: int
+    wavelengths: int = 1
 
     @property
     def places(self) -> NDArray[np.float64]:
@@ -50,38 +57,99 @@ class Grid:
 
 
 def grids_of(
-    tracer: GhostTracer | GhostModel, light: Light, wavelength_nm: float, half_mm: tuple[float, float], cell_mm: float
+    tracer: GhostTracer | GhostModel,
+    light: Light,
+    wavelength_nm: float,
+    half_mm: tuple[float, float],
+    cell_mm: float,
+    range_nm: tuple[float, float] = (400.0, 700.0),
 ) -> dict[Way, Grid]:
     """The grids of all ghosts that reach the film.
+
+    A cell has one density, and a wavelength stands for those beside it: both put light beside its place, by a / n with
+    n cells a side and b / k with k wavelengths. Edges drawn are n k times what is seen of the ghost; of all sums of
+    errors that is least where a / n and b / k of each ghost are the cube root of a b size, times what is the same for
+    all: so most cells go to what is bright, small and uneven.
 
     Args:
         wavelength_nm: of the rays that look for them; others differ little.
         half_mm: half the film's width and height.
-        cell_mm: size of cells on the film, of a ghost a tenth as bright as all on average; fainter ones are drawn
-            coarser, brighter ones finer, as the root of their brightness, within `_COARSER`.
+        cell_mm: size of cells on the film, about, which the share of light beside its place follows.
+        range_nm: of light.
     """
     whole = Grid((-1.0, -1.0), (1.0, 1.0), _SCOUTS, _SCOUTS)
     start = tracer.start(rays_across(tracer.lens, light, whole.places)[0])
-    seen: dict[Way, tuple[NDArray[np.bool_], Floats, float, float]] = {}
+    few = np.ascontiguousarray(start.reshape(len(start), _SCOUTS + 1, -1)[:, ::_FEW, ::_FEW].reshape(len(start), -1))
+    found: list[tuple[Way, NDArray[np.bool_], _Look]] = []
     for k in range(0, len(tracer.pairs), _AT_ONCE):
         some = tracer.pairs[k : k + _AT_ONCE]
         rays = tracer.follow(start, wavelength_nm, only=some, reach=REACH)
-        power = rays.power.reshape(-1, _SCOUTS + 1, _SCOUTS + 1)[:, 1:, 1:]
-        for pair, kept, steps, of_cells in zip(some, *_lit(rays, half_mm), power, strict=True):
-            if kept.any():
-                area = float(np.prod(steps, 0, dtype=np.float64, where=kept).sum(where=kept))
-                seen[pair] = kept, steps, float(of_cells.sum(where=kept)), area
-    mean = sum(light for *_, light, _ in seen.values()) / (4 * half_mm[0] * half_mm[1])
-    found = {}
-    for pair, (kept, steps, light_here, area) in seen.items():
-        with np.errstate(divide="ignore", invalid="ignore"):
-            coarser = np.nan_to_num(np.sqrt(0.1 * mean * area / np.float64(light_here)), nan=np.inf)
-        found[pair] = _around(kept, steps / (cell_mm * float(np.clip(coarser, *_COARSER))))
-    return found
+        ends = [tracer.follow(few, nm, only=some, reach=REACH).rows for nm in range_nm]
+        looks = zip(some, _kept(rays, half_mm), rays.rows, _spread(ends, half_mm), strict=True)
+        found += [
+            (pair, kept, _look(kept, of_one, spread, half_mm)) for pair, kept, of_one, spread in looks if kept.any()
+        ]
+    work = np.array([((look.along_u + look.along_v) * look.colours * look.size_mm) ** (1 / 3) for *_, look in found])
+    most = min(_ERROR * cell_mm / half_mm[0], _WORST)
+    error = work * (most / max(float(work.sum()), 1e-300)) + 1e-30
+    return {pair: _around(kept, look, each) for (pair, kept, look), each in zip(found, error.tolist(), strict=True)}
 
 
-def _lit(rays: GhostRays, half_mm: tuple[float, float]) -> tuple[NDArray[np.bool_], Floats]:
-    """[P, S, S] whether light of a cell may reach the film, and lengths [P, 2, S, S] on film of its first two sides.
+class _Look(NamedTuple):
+    """What scouts tell of a ghost.
+
+    Attributes:
+        along_u, along_v: light that cells of one density put beside its place, times the cells of a side.
+        colours: the same of wavelengths, times their number. size_mm: of what is on the film.
+        lit: share of the rectangle that holds its light.
+    """
+
+    along_u: float
+    along_v: float
+    colours: float
+    size_mm: float
+    lit: float
+
+
+def _look(kept: NDArray[np.bool_], rows: Floats, spread: float, half_mm: tuple[float, float]) -> _Look:
+    """Of a ghost's rays `rows` [4, N] and the cells that are kept."""
+    x, y, power, worst = rows.reshape(4, _SCOUTS + 1, _SCOUTS + 1).astype(np.float64)
+    lit, half = worst <= 1, np.array(half_mm)[:, None]
+    whole = kept & _corners(lit, np.logical_and)
+    light = np.where(whole, 0.25 * _corners(power, np.add), 0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        area = np.abs(
+            (x[1:, 1:] - x[:-1, :-1]) * (y[1:, :-1] - y[:-1, 1:])
+            - (x[1:, :-1] - x[:-1, 1:]) * (y[1:, 1:] - y[:-1, :-1])
+        )
+    level = np.log(np.where(whole, np.maximum(light, 1e-30) / np.maximum(area, 1e-30), 1))
+    off, box = [], []
+    for axis in (1, 0):
+        step = np.minimum(np.abs(np.diff(level, axis=axis)), 1) * _pairs(whole, axis, np.logical_and)
+        at = np.flatnonzero(kept.any(1 - axis))
+        box.append(int(at[-1]) + 1 - int(at[0]))
+        off.append(0.125 * float((step * _pairs(light, axis, np.add)).sum()) * box[-1])
+    places = np.clip(np.stack([x[lit], y[lit]]), -half, half) if lit.any() else np.zeros((2, 1))
+    share = (lit.sum() + 0.5) / ((box[0] + 1) * (box[1] + 1))
+    size, whole_light = max(float(np.ptp(places, 1).max()), 1e-3 * half_mm[0]), float(light.sum())
+    along_u, along_v = (max(v, _EVEN * whole_light) for v in off)
+    return _Look(along_u, along_v, whole_light * min(max(spread / size, _EVEN), 1.0), size, share)
+
+
+def _pairs(a: NDArray[Any], axis: int, of: Callable[[Any, Any], Any]) -> NDArray[Any]:
+    return of(a[1:], a[:-1]) if axis == 0 else of(a[:, 1:], a[:, :-1])
+
+
+def _spread(ends: Sequence[Floats], half_mm: tuple[float, float]) -> list[float]:
+    """Of ghosts at two wavelengths, [P, 4, N] each, how far apart they are in mm; inf of those that have no light."""
+    one, other = ends
+    here = (one[:, 3] <= _NEAR) & (other[:, 3] <= _NEAR) & (np.abs(one[:, :2]).max(1) < 2 * max(half_mm))
+    off = np.where(here, ((other[:, :2] - one[:, :2]).astype(np.float64) ** 2).sum(1), 0).sum(1)
+    return np.where(here.any(1), np.sqrt(off / np.maximum(here.sum(1), 1)), np.inf).tolist()
+
+
+def _kept(rays: GhostRays, half_mm: tuple[float, float]) -> NDArray[np.bool_]:
+    """[P, S, S] whether light of a cell may reach the film.
 
     A cell all of whose corners a rim stops is kept where the worst, going on as it does within it, may reach 1.
     """
@@ -92,26 +160,20 @@ def _lit(rays: GhostRays, half_mm: tuple[float, float]) -> tuple[NDArray[np.bool
     low, high = _corners(np.where(lost, inf, xy), np.minimum), _corners(np.where(lost, -inf, xy), np.maximum)
     near, far = (_corners(np.where(lost, v, worst), op)[:, 0] for v, op in ((inf, np.minimum), (-inf, np.maximum)))
     half = np.array(half_mm, np.float32)[:, None, None]
-    kept = ((near <= 1) | (2 * near - far <= 1)) & ((low < half) & (high > -half)).all(1)
-    xy = np.where(lost, np.float32(0), xy)
-    u, v = (np.hypot(*np.moveaxis(np.diff(xy, axis=axis), 1, 0)) for axis in (3, 2))
-    u *= ~(lost[:, 0, :, 1:] | lost[:, 0, :, :-1])
-    v *= ~(lost[:, 0, 1:] | lost[:, 0, :-1])
-    return kept, np.stack([np.maximum(u[:, :-1], u[:, 1:]), np.maximum(v[..., :-1], v[..., 1:])], 1)
+    return np.asarray(((near <= 1) | (2 * near - far <= 1)) & ((low < half) & (high > -half)).all(1))
 
 
-def _corners(a: Floats, of: Callable[[Floats, Floats], Floats]) -> Floats:
+def _corners(a: NDArray[Any], of: Callable[[Any, Any], Any]) -> NDArray[Any]:
     rows = of(a[..., :-1, :], a[..., 1:, :])
     return of(rows[..., :-1], rows[..., 1:])
 
 
-def _around(kept: NDArray[np.bool_], steps: Floats) -> Grid:
-    """About the cells that are kept [S, S], with `steps` [2, S, S] cells on each of theirs."""
-    low, high, cells = [], [], []
-    for axis, length in zip((0, 1), steps, strict=True):
+def _around(kept: NDArray[np.bool_], look: _Look, error: float) -> Grid:
+    """About the cells that are kept [S, S], so fine that so much light is beside its place each way."""
+    low, high, fewest = [], [], math.sqrt(FEWEST / look.lit)
+    for axis in (0, 1):
         at = np.flatnonzero(kept.any(axis))
         low.append(2 * int(at[0]) / _SCOUTS - 1)
         high.append(2 * (int(at[-1]) + 1) / _SCOUTS - 1)
-        size = float(np.sqrt(np.mean(np.square(length[kept], dtype=np.float64))))
-        cells.append(int(np.clip(np.ceil((at[-1] + 1 - at[0]) * size), FEWEST, MOST)))
-    return Grid((low[0], low[1]), (high[0], high[1]), cells[0], cells[1])
+    columns, rows = (int(min(max(math.ceil(a / error), fewest), MOST)) for a in (look.along_u, look.along_v))
+    return Grid((low[0], low[1]), (high[0], high[1]), columns, rows, max(1, math.ceil(look.colours / error)))

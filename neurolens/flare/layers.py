@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from neurolens.flare.lights import Light
 from neurolens.flare.photons import PhotonTracer
 from neurolens.flare.picture import Ghost, Raster, ghost_picture, ghost_table, photon_picture
 from neurolens.flare.scatter import Scatter
-from neurolens.flare.sources import SceneLights, keep
+from neurolens.flare.sources import Name, SceneLights, chosen, keep_named
 from neurolens.flare.stack import Floats
 from neurolens.optics.prescription import Lens
 from neurolens.render.film import check_memory
@@ -37,7 +38,7 @@ class FlareSettings:
 
     Attributes:
         wavelength_nm: range of light. wavelengths: of equal shares of it.
-        cell_px: size on film of the cells that ghosts are drawn by.
+        cell_px: size on film, about, of the cells that ghosts are drawn by.
         photons: if above 0, ghosts by photons with up to `most_reflections`, so many a light and wavelength, smoothed
             by kernels from radius `kernel_px` on, instead of by all pairs of reflections; 0 leaves them.
         glare: if above 0, so many photons of the layer "glare": light that was reflected more than twice, or scattered.
@@ -115,23 +116,60 @@ def flare_layers(
     return found
 
 
+class Choice(NamedTuple):
+    """What all frames of a scene show: names of lights (`sources.chosen`), and of ghosts that become layers."""
+
+    lights: frozenset[Name]
+    single: tuple[str, ...]
+
+
+def scene_choice(frames: Sequence[tuple[Scene, Lens]]) -> Choice:
+    """The lights and ghosts of the most energy in all frames together, of a scene that has the table [flare].
+
+    Args:
+        frames: the scene, its camera in the frame's place, and the lens in its state.
+
+    Raises:
+        InputError: as of `coated`.
+    """
+    scene = frames[0][0]
+    table, sources = scene.settings.flare, SceneLights(scene)
+    assert table is not None
+    seen = [sources.named(at, lens.film_z_mm or 0.0) for at, lens in frames]
+    names, lights, tables = chosen(seen, table.most), list[Light](), list[list[Ghost]]()
+    for (_, lens), there in zip(frames if table.brightest else (), seen, strict=False):
+        tracer = GhostTracer(lens if table.coating is None else coated(lens, table.coating))
+        some = keep_named(there, names).lights
+        lights += some
+        tables += [ghost_table(tracer, light, 550.0) for light in some]
+    return Choice(names, brightest(lights, tables, table.brightest))
+
+
 def scene_flare(
-    scene: Scene, lens: Lens, raster: Raster, white_balance: str | None, threads: int, progress: Progress
+    scene: Scene,
+    lens: Lens,
+    raster: Raster,
+    white_balance: str | None,
+    threads: int,
+    progress: Progress,
+    choice: Choice | None = None,
 ) -> Layers:
     """The layers of a scene that has the table [flare], of its own lights, by a lens whose film is placed.
+
+    Args:
+        choice: of all frames; None: of this picture.
 
     Raises:
         InputError: as of `flare_layers` and `coated`.
     """
     table, sources = scene.settings.flare, SceneLights(scene)
     assert table is not None and lens.film_z_mm is not None
-    lights = keep(sources.seen(scene, lens.film_z_mm), table.most).lights
+    names, single = choice or scene_choice([(scene, lens)])
+    lights = keep_named(sources.named(scene, lens.film_z_mm), names).lights
     lens = lens if table.coating is None else coated(lens, table.coating)
-    tracer = GhostTracer(lens)
-    tables = [ghost_table(tracer, light, 550.0) for light in lights] if table.brightest else [[] for _ in lights]
     settings = FlareSettings(
         scene.settings.camera.wavelengths_nm, table.bins, table.cell_px, without=table.without, threads=threads,
-        single=brightest(lights, tables, table.brightest), glare=table.glare, starburst=table.starburst,
+        single=single, glare=table.glare, starburst=table.starburst,
     )  # fmt: skip
     found = flare_layers(lens, lights, raster, settings, progress)
     matrix = sources.balance(white_balance).T.astype(np.float32)

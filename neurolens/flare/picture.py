@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -20,13 +20,14 @@ from neurolens.analysis.fields import Scene
 from neurolens.analysis.layout import Layout, Line, layout_profile
 from neurolens.base.errors import InputError
 from neurolens.base.status import PASSED
-from neurolens.flare.area import Canvas
+from neurolens.flare.area import draw_edges, edges_of
 from neurolens.flare.ghostmodel import GhostModel
 from neurolens.flare.ghosts import Four, GhostTracer, Way, four_reflections
 from neurolens.flare.grids import REACH, Grid, grids_of
 from neurolens.flare.lights import Light, disc, light_rays, rays_across
 from neurolens.flare.photons import LEVELS, Photons, PhotonTracer
 from neurolens.flare.stack import Floats
+from neurolens.optics.glass import inverse_square_um
 from neurolens.optics.prescription import Lens
 from neurolens.optics.sequence import follow, turning
 from neurolens.optics.trace import Rays, trace
@@ -40,8 +41,13 @@ _ENOUGH = 200  # photons of a kernel: a noise of 8%
 _WAIT_S = 0.5  # between two reports
 _AXIS = 1 << 15  # rays of the exposure
 _GOLDEN = 0.6180339887498949
-_CANVASES = 1 << 28  # bytes of pictures under way, of a thread
+_STRIP = 1 << 22  # bytes of a canvas
+_ROOM = 1 << 26  # bytes of edges that wait to be drawn
+_EDGES = 128  # bytes, of a cell
+FEWEST = 4  # wavelengths that stand for all
 
+Doubles = NDArray[np.float64]
+_Task = tuple[Light, Way, Grid, list[float], Doubles]  # with wavelengths [K] and their colours [K, 3]
 _T = TypeVar("_T")
 _R = TypeVar("_R")
 
@@ -204,46 +210,67 @@ def ghost_picture(
     """The ghosts of lights, [layers, H, W, 3] linear sRGB, each drawn as the areas of a grid of rays (`flare.area`).
 
     Args:
-        wavelengths: of equal shares of the range. cell_px: size of a grid's cells on the film: see `grids_of`.
+        wavelengths: of equal shares of the range, which fewer stand for where a ghost's colours part little. cell_px:
+            size of a grid's cells on the film, about: see `grids_of`.
         layers: of each pair the layer that takes it; None puts all into one.
         done: told the share of the work that is done.
     """
     lens, spectral = tracer.lens, SpectralRange(*wavelength_nm, bins=wavelengths)
     layer = dict(zip(tracer.pairs, [0] * len(tracer.pairs) if layers is None else layers, strict=True))
     picture = np.zeros((1 + max(layer.values(), default=0), raster.height, raster.width, 3), np.float32)
-    middle = 0.5 * (spectral.low_nm + spectral.high_nm)
-    exposure = axis_irradiance(lens, middle)
-    half = raster.film_mm[0] / 2, raster.height / raster.per_mm / 2
-    grids = [grids_of(tracer, light, middle, half, cell_px / raster.per_mm) for light in lights]
-    # As many wavelengths at once as have room, of each layer and light: their rays start alike.
-    at_once = max(1, min(-(-wavelengths // threads), _CANVASES // (8 * raster.width * raster.height)))
-    tasks = [
-        (light, {pair: grid for pair, grid in of_light.items() if layer[pair] == number}, number, first)
-        for light, of_light in zip(lights, grids, strict=True)
-        for number in range(len(picture))
-        for first in range(0, wavelengths, at_once)
-    ]
-    work = _Work(sum(len(some) for _, some, _, _ in tasks), done)
+    middle, size = 0.5 * sum(wavelength_nm), (raster.width, raster.height)
+    unit = raster.per_mm**2 / axis_irradiance(lens, middle) / wavelengths
+    half, nm = (raster.film_mm[0] / 2, raster.height / raster.per_mm / 2), spectral.centres_nm
+    tasks: list[_Task] = []
+    for light in lights:
+        of_light = grids_of(tracer, light, middle, half, cell_px / raster.per_mm, (float(nm[0]), float(nm[-1])))
+        response = np.asarray(unit * spectral.response * spectral.spectrum(light.rgb), np.float64).T
+        tasks += [(light, pair, grid, *_bands(nm, response, grid.wavelengths)) for pair, grid in of_light.items()]
+    work, rows, high = _Work(len(tasks), done), range(raster.height), max(1, _STRIP // (32 * raster.width))
+    strips = [rows[k : k + high] for k in range(0, raster.height, high)]
 
-    def one(task: tuple[Light, dict[Way, Grid], int, int]) -> list[Canvas]:
-        light, some, _, first = task
-        bins = range(first, min(first + at_once, wavelengths))
-        canvases = [Canvas(raster.width, raster.height) for _ in bins]
-        for pair, grid in some.items():
-            if not work.step():
-                break
-            rays, area = rays_across(lens, light, grid.places)
-            start = tracer.start(rays)
-            each = tracer.follow_each(start, spectral.centres_nm[bins.start : bins.stop].tolist(), pair, REACH)
-            for found, canvas in zip(each, canvases, strict=True):
-                canvas.add(found, grid.columns, area * grid.cell, raster.per_mm)
-        return canvases
+    def edges(task: _Task) -> tuple[list[Doubles], Doubles]:
+        """Of each wavelength, and light of their cells."""
+        light, pair, grid, wavelengths_nm, colours = task
+        if not work.step():
+            return [], colours[:0]
+        rays, area = rays_across(lens, light, grid.places)
+        found = tracer.follow_each(tracer.start(rays), wavelengths_nm, pair, REACH)
+        return [edges_of(of_one, grid.columns, size, raster.per_mm) for of_one in found], area * grid.cell * colours
 
-    for (light, _, number, first), canvases in work.results(one, tasks, threads):
-        for k, canvas in enumerate(canvases, first):
-            colour = spectral.response[:, k] * spectral.spectrum(light.rgb)[k] / wavelengths
-            canvas.onto(picture[number], colour * (raster.per_mm**2 / exposure))
+    for number in range(len(picture)):
+        for batch in _batches([task for task in tasks if layer[task[1]] == number]):
+            found = [found for _, found in work.results(edges, batch, threads)]
+            each = [edges for of_ghost, _ in found for edges in of_ghost]
+            drawn = np.concatenate(each), np.array(list(map(len, each))), np.concatenate([of for _, of in found])
+            one = partial(lambda number, drawn, rows: draw_edges(picture[number], rows, *drawn), number, drawn)
+            for _ in work.results(one, strips, threads):
+                pass
     return picture
+
+
+def _batches(tasks: Sequence[_Task]) -> Iterator[list[_Task]]:
+    """In order; of one light, and as many at a time as have room for their edges."""
+    some, used = list[_Task](), 0
+    for task in tasks:
+        size = _EDGES * len(task[3]) * task[2].columns * task[2].rows
+        if some and (used + size > _ROOM or task[0] is not some[0][0]):
+            yield some
+            some, used = [], 0
+        some.append(task)
+        used += size
+    if some:
+        yield some
+
+
+def _bands(nm: Doubles, response: Doubles, count: int) -> tuple[list[float], Doubles]:
+    """About so many wavelengths that stand for all of `nm` [W], and their colours [K, 3] for responses [W, 3]."""
+    count = min(max(count, FEWEST), len(nm))
+    w = inverse_square_um(nm)  # glass moves light about evenly with it
+    at = np.arange(count) if count == len(nm) else (count * (w[0] - w) / (1.000001 * (w[0] - w[-1]))).astype(int)
+    of_band = (at == np.unique(at)[:, None]).astype(np.float64)
+    share = of_band * (np.abs(response).sum(1) + 1e-30)
+    return (share @ nm / share.sum(1)).tolist(), of_band @ response
 
 
 # Photons by what became of them; those of "ghosts" and "glare" are the flare.
@@ -347,8 +374,9 @@ class _Work:
                             self._done(min(self._count / self._steps, 1.0))
                         yield task, future.result()
                     self._done(min(self._count / self._steps, 1.0))
-            finally:
+            except BaseException:
                 self._stopping = True
+                raise
 
 
 def _smoothed(picture: Floats, sums: Floats, radius: float) -> Floats:

@@ -46,7 +46,8 @@ class SceneLights:
         spectral = SpectralRange(low, high)
         self._world, self._spectral, every = World(scene, spectral), spectral, np.arange(spectral.bins)
         rows, palette = self._world.light_emission_row, self._world.palette
-        self._rgb = [spectral.film_rgb(palette.look_up(np.full_like(every, row), every)[0]) for row in rows]
+        each, self._colour = np.unique(rows, return_inverse=True)
+        self._rgb = [spectral.film_rgb(palette.look_up(np.full_like(every, row), every)[0]) for row in each]
 
     def balance(self, illuminant: str | None) -> Array:
         """Matrix [3, 3] on linear sRGB that makes an illuminant neutral, as renders of the scene have it."""
@@ -54,15 +55,16 @@ class SceneLights:
             return np.eye(3)
         return balance(self._spectral.film_rgb(self._world.palette.illuminant(illuminant)))
 
-    def seen(self, scene: Scene, film_z_mm: float) -> list[Light]:
+    def seen(self, scene: Scene, film_z_mm: float, most: int | None = None) -> list[Light]:
         """The lights of `named`."""
-        return list(self.named(scene, film_z_mm).values())
+        return list(self.named(scene, film_z_mm, most).values())
 
-    def named(self, scene: Scene, film_z_mm: float) -> dict[Name, Light]:
+    def named(self, scene: Scene, film_z_mm: float, most: int | None = None) -> dict[Name, Light]:
         """The lights before the lens of a camera of `scene`, whose place may be another.
 
         Args:
             film_z_mm: of the lens: the front vertex lies so far before the film.
+            most: lights to look at, those that are strongest there if nothing hides them; None: all.
         """
         pose = scene.settings.camera
         axes = camera_axes(pose).astype(np.float64)
@@ -71,8 +73,10 @@ class SceneLights:
         square = np.stack([a.ravel() for a in np.meshgrid(side, side)]).astype(np.float32)
         point = np.repeat(front[:, None], square.shape[1], 1).astype(np.float32)
         found: dict[Name, Light] = {}
-        each = zip(self._world.lights.each(point, square), self._rgb, strict=False)
-        for number, ((direction, distance, scale), rgb) in enumerate(each):
+        lights = self._world.lights
+        numbers = range(lights.count) if most is None else lights.strongest(tuple(front.tolist()), most)
+        for number, (direction, distance, scale) in zip(numbers, lights.each(numbers, point, square), strict=True):
+            rgb = self._rgb[self._colour[number]]
             seen = np.where(self._world.visible(point, direction, distance), scale, 0).astype(np.float64)
             parts = _lights(axes.T @ direction, distance, seen, rgb)
             found |= {(number, part): light for part, light in parts.items()}

@@ -27,7 +27,7 @@ def libraries() -> tuple[Any, Any]:
         return importlib.import_module("mitsuba"), importlib.import_module("drjit")
     except ImportError as error:
         raise NeurolensError(
-            f"Mitsuba 3 cannot be imported ({error}): pip install '.[mitsuba]' in the project's folder"
+            f"Mitsuba 3 cannot be imported ({error}): pip install 'neurolens[mitsuba]', or '.[mitsuba]' in a checkout"
         ) from None
 
 

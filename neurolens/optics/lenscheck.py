@@ -201,6 +201,8 @@ def _blur(lens: Lens, data: FirstOrder) -> Check:
     doubt = ""
     if blur > BLUR_LIMIT and lens.refractions > SIMPLE:
         doubt = f"the image on the axis is blurred to {100 * blur:.2g}% of the focal length"
+        if not any(s.asphere or s.conic for s in lens.surfaces):
+            doubt += " (are aspheres missing?)"
     return Check("axial blur, RMS over focal length", blur, None, doubt)
 
 

@@ -30,14 +30,15 @@ _BETWEEN_RADII = 0.03
 def pupil_plane_z_mm(lens: Lens) -> float:
     """z of the plane on which pupil points lie: the paraxial exit pupil, where passing rays crowd together.
 
-    The rear vertex stands in where the exit pupil lies near or behind the film or too far in front of it to be useful.
+    The rear vertex, that of the glass before a cover glass on the film, stands in where the exit pupil lies near or
+    behind the film or too far in front of it to be useful.
     """
     data = first_order(lens)
     rear = float(lens.vertices_mm[len(lens.surfaces) - 1])
     film = data.rear_focal_z_mm
     z = data.exit_pupil_z_mm
     useful = math.isfinite(z) and 0.25 * (film - rear) < film - z < 20 * abs(data.efl_mm)
-    return float(z) if useful else rear
+    return float(z) if useful else _rear_opening_mm(lens, film)[1]
 
 
 def camera_rays(
@@ -207,6 +208,7 @@ def _may_widen(passed: Tensor, u: Tensor, v: Tensor, du: Tensor, dv: Tensor) -> 
 # Where rays are looked for again: within so many paraxial exit pupils of the axis, where the box of the rear rim is so
 # many times wider than that.
 _NEAR, _FAR = 3.0, 4.0
+_CLOSE = 0.25  # of its radius: a rim so close to the film
 _COARSE = 8  # film radii of the illumination that the search for its end leaves out at first
 
 _AT_MANY_AZIMUTHS = 64  # points of a grid, at most, where each is traced at many azimuths
@@ -384,7 +386,7 @@ def image_radius_mm(lens: Lens) -> tuple[float, str]:
 def _illumination(lens: Lens, radii: Tensor, points: int = 48) -> tuple[Tensor, Tensor]:
     """Relative film irradiance (any unit) and mean angle (rad) of the passing rays at each film radius."""
     film_z = lens.film_z_mm if lens.film_z_mm is not None else float(lens.vertices_mm[-1])
-    rear, rear_z = lens.surfaces[-1].semi_diameter_mm, float(lens.vertices_mm[len(lens.surfaces) - 1])
+    rear, rear_z = _rear_opening_mm(lens, film_z)
     grid = torch.linspace(-rear, rear, points, dtype=torch.float64)
     # The half above the axis stands for both.
     film, px, py = (t.reshape(-1) for t in torch.meshgrid(radii, grid, grid[points // 2 :], indexing="ij"))
@@ -394,3 +396,18 @@ def _illumination(lens: Lens, radii: Tensor, points: int = 48) -> tuple[Tensor, 
     weight = passed * (rays.dz**4).reshape(passed.shape)
     theta = torch.atan2(torch.hypot(traced.rays.dx, traced.rays.dy), -traced.rays.dz).reshape(passed.shape)
     return weight.sum(1), (theta * weight).sum(1) / weight.sum(1).clamp_min(1e-30)
+
+
+def _rear_opening_mm(lens: Lens, film_z: float) -> tuple[float, float]:
+    """Radius and z of the disc through which light comes to the film: the last rim.
+
+    Of a cover glass that all but lies on the film the light of one film point fills a speck; then it is the rim before,
+    so much wider as the plates between shift rays.
+    """
+    last, shift = len(lens.surfaces) - 1, 0.0
+    while last > 1 and film_z - float(lens.vertices_mm[last]) < _CLOSE * lens.surfaces[last].semi_diameter_mm:
+        if not all(math.isinf(s.radius_mm) and not s.asphere for s in lens.surfaces[last - 1 : last + 1]):
+            break
+        shift += float(lens.surfaces[last - 1].thickness_mm)
+        last -= 2
+    return lens.surfaces[last].semi_diameter_mm + shift, float(lens.vertices_mm[last])

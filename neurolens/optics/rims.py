@@ -100,6 +100,21 @@ def derive_rims(lens: Lens, rule: RimRule | None = None) -> tuple[Lens, list[Rim
     return replace(lens, surfaces=surfaces, configurations=configurations, rims="derived"), rims
 
 
+def narrowed_rims(lens: Lens) -> Lens:
+    """The lens with rims, but never the stop's, narrowed to where spheres end and neighbours touch in any state.
+
+    Rims of surfaces whose vertices lie in the wrong order stay: no width helps, and the check of clearance says so.
+    """
+    states = [lens, *(lens.with_gaps(dict(c.thickness_mm)) for c in lens.configurations)]
+    ends = [s.diameter_mm if s.stop else min(s.diameter_mm, 2 * end_mm(s) * (1 - 1e-9)) for s in lens.surfaces]
+    fitted = _clear_of_neighbours(states, ends)
+    rows = (
+        s if d <= 0 or d >= s.diameter_mm - _STEP_MM else replace(s, diameter_mm=d)
+        for s, d in zip(lens.surfaces, fitted, strict=True)
+    )
+    return replace(lens, surfaces=tuple(rows))
+
+
 def with_derived_rims(lens: Lens) -> Lens:
     """The lens with a diameter wherever it has none (NaN), by the rule as it is; given ones stay.
 

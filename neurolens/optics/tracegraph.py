@@ -25,16 +25,22 @@ Number = float | Value
 Test = tuple[Value, Value]  # passed where the first is at most the second
 
 
-def exact_graph(lens: Lens, pupil_z_mm: float, wavelength_nm: tuple[float, float], *, whole: bool = True) -> Graph:
+def exact_graph(
+    lens: Lens, pupil_z_mm: float, wavelength_nm: tuple[float, float], *, whole: bool = True, path: bool = False
+) -> Graph:
     """Film and pupil points in, scene ray and status out: inputs and outputs are those of a model's graph.
 
     Args:
         pupil_z_mm: plane of the pupil points. wavelength_nm: range in which the indices hold to float32's last bit.
         whole: with stop, rims and transmittance; else the ray alone, and whether it gets through.
+        path: an output more, `path` [2 K]: z and y of the crossing with each surface, that next to the film first.
 
     Coatings and absorption are not followed: callers that need them must refuse such lenses.
     """
-    return _Tracing(lens, pupil_z_mm, wavelength_nm, whole).graph
+    tracing = _Tracing(lens, pupil_z_mm, wavelength_nm, whole)
+    if path:
+        tracing.graph.outputs["path"] = tracing.graph.concat(*tracing.crossings)
+    return tracing.graph
 
 
 class _Tracing:
@@ -47,6 +53,7 @@ class _Tracing:
         self.indices: dict[object, Value] = {}
         self.tests: list[tuple[Test, int]] = []  # in the order in which rays meet them, with their codes
         self.at_stop, self.power = rays[0:2], g.constant(1.0)
+        self.crossings: list[Value] = []
         way = g.concat(rays[2:4] - rays[0:2], pupil_z_mm - film_z)
         self.d = way * (1.0 / g.square(way).sqrt())
         self.x = g.concat(rays[0:2], film_z)
@@ -60,6 +67,7 @@ class _Tracing:
             gap = float(lens.surfaces[k].thickness_mm) if k < last else -float(lens.vertices_mm[k])
             self.x = g.concat(self.x[0:2], self.x[2] + gap)
             self._surface(k, lens.surfaces[k])
+            self.crossings += [self.x[2] + float(lens.vertices_mm[k]), self.x[1]]
         g.outputs["scene_ray"] = g.concat(self.x, self.d)
         if self.whole:
             g.outputs |= {"transmittance": self.power, "stop_xy_mm": self.at_stop}

@@ -7,16 +7,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from neurolens.base.errors import InputError
+from neurolens.base.tomlfile import read_toml
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
+from neurolens.readers.blender_toml import is_blender, read_blender
 from neurolens.readers.codev import looks_like_seq, read_seq
 from neurolens.readers.draft import Given
+from neurolens.readers.flaresim import looks_like_flaresim, read_flaresim
 from neurolens.readers.json_lens import looks_like_json, read_json_lens
+from neurolens.readers.opticalbench import looks_like_opticalbench, read_opticalbench
 from neurolens.readers.oslo import looks_like_len, read_len
 from neurolens.readers.source import read_text
 from neurolens.readers.tables import looks_like_table, read_table
 from neurolens.readers.zemax import looks_like_zmx, read_zmx
 
+_OURS = "neurolens"
 _HEAD = 20_000  # characters by which a format is recognised
 
 
@@ -35,6 +40,8 @@ FORMATS = (
     Format("OSLO", (".len", ".osl"), read_len, looks_like_len),
     Format("CODE V", (".seq",), read_seq, looks_like_seq),
     Format("JSON", (".json",), read_json_lens, looks_like_json),
+    Format("Optical Bench", (".txt",), read_opticalbench, looks_like_opticalbench),
+    Format("FlareSim", (".lens",), read_flaresim, looks_like_flaresim),
     Format("lens table", (".dat", ".txt", ".lens"), read_table, looks_like_table),
 )
 
@@ -49,6 +56,8 @@ def read_any(path: str | Path, given: Given | None = None) -> Lens:
     """
     given = given or Given()
     if Path(path).suffix.lower() == ".toml":
+        if kind_of(path) != _OURS:
+            return read_blender(read_toml(path), str(path), given)
         lens = read_lens(path)
         lens = replace(lens, name=given.name or lens.name, source=given.source or lens.source)
         if given != Given(name=given.name, source=given.source):
@@ -76,3 +85,10 @@ def format_of(path: str | Path) -> Format:
         known = ", ".join(f"{f.name} ({', '.join(f.suffixes)})" for f in FORMATS)
         raise InputError(path, "format", suffix or "(no suffix)", f"one of {known}, or a lens file (.toml)")
     return found
+
+
+def kind_of(path: str | Path) -> str:
+    """The name of a file's format, "neurolens" for our own; raises as `format_of` and `read_toml`."""
+    if Path(path).suffix.lower() == ".toml":
+        return "Physical Camera" if is_blender(read_toml(path)) else _OURS
+    return format_of(path).name

@@ -12,9 +12,9 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import MAX_SURFACES, check_states
 from neurolens.optics.prescription import Configuration, Lens, Surface
-from neurolens.optics.sag import same_medium
+from neurolens.optics.sag import end_mm, same_medium
 from neurolens.readers.assemble import UNKNOWN, finish, first_order, smaller_stop, with_rims
-from neurolens.readers.source import UNITS_MM, Line, warn
+from neurolens.readers.source import UNITS_MM, Line, assume, warn
 
 
 @dataclass(frozen=True)
@@ -110,6 +110,11 @@ class Draft:
         notes: lines of text.
         pupil, f_number: if given, they size the stop; else its diameter does.
         unit: "mm", "cm", "in", "m", or None if unknown.
+        stated_efl: focal length as the file states it, to be checked.
+        drawn: rims are somebody's measures of a drawing, some of them radii where diameters are meant: halved where
+            they are twice what they can be, and narrowed where neighbours would touch; both is told. A missing stop is
+            assumed.
+        nominal: f-number that the file states with few digits, to tell radii from diameters by.
     """
 
     file: str
@@ -126,6 +131,9 @@ class Draft:
     film_given: bool = True
     unit: str | None = None
     rims: str = "source"
+    stated_efl: float | None = None
+    drawn: bool = False
+    nominal: float | None = None
 
 
 def lens_of(draft: Draft, given: Given | None = None) -> Lens:
@@ -151,7 +159,10 @@ def lens_of(draft: Draft, given: Given | None = None) -> Lens:
         notes="\n".join(draft.notes),
         rims=draft.rims,
         path=draft.file,
+        stated_efl_mm=draft.stated_efl,
     )
+    if draft.drawn:
+        lens = _with_likely_rims(_with_stop(lens), draft.f_number or draft.nominal)
     if draft.f_number is not None and draft.pupil is None and lens.surfaces:
         # The file's f-number overrides a diameter of the stop, except for an aperture set on it.
         rows = (replace(s, diameter_mm=math.nan) if s.stop else s for s in lens.surfaces)
@@ -159,8 +170,54 @@ def lens_of(draft: Draft, given: Given | None = None) -> Lens:
     lens = finish(lens, pupil_mm=draft.pupil, film_given=draft.film_given, stop_limit_mm=_stop_aperture(draft))
     lens = replace(lens, configurations=tuple(_configuration(lens, draft, state) for state in _states(draft)))
     lens = with_rims(lens.scaled(factor) if factor != 1 else lens)
+    lens = _narrowed(lens) if draft.drawn else lens
     check_states(lens)
     return lens
+
+
+_TWICE, _SAME = (0.4, 0.7), (0.7, 1.4)  # f-number by the stop's diameter over the stated one: rims twice as wide, right
+
+
+def _with_stop(lens: Lens) -> Lens:
+    """The lens with a stop: where no row is marked, that of the narrowest rim."""
+    known = [k for k, s in enumerate(lens.surfaces) if not math.isnan(s.diameter_mm)]
+    if any(s.stop for s in lens.surfaces) or not known:
+        return lens
+    k = min(known, key=lambda k: lens.surfaces[k].diameter_mm)
+    assume(lens.path, f"no stop is marked: surface {k}, whose rim is the narrowest, is assumed to be it")
+    rows = (replace(s, stop=i == k) for i, s in enumerate(lens.surfaces))
+    return replace(lens, surfaces=tuple(rows))
+
+
+def _with_likely_rims(lens: Lens, f_number: float | None) -> Lens:
+    """The lens with rims of half the width, where stop and spheres say that radii were meant by diameters."""
+    if not any(s.stop for s in lens.surfaces):
+        return lens  # `finish` says so
+    beyond = [k for k, s in enumerate(lens.surfaces) if s.semi_diameter_mm > end_mm(s) * (1 + 1e-6)]
+    evidence = f"the rim of surface {beyond[0]} is wider than its sphere" if beyond else ""
+    if f_number is not None and not math.isnan(lens.stop_radius_mm):
+        by_stop = first_order(lens).f_number
+        if _SAME[0] <= by_stop / f_number <= _SAME[1]:
+            return lens
+        if _TWICE[0] <= by_stop / f_number < _TWICE[1]:
+            evidence = f"the stop would give f/{by_stop:.3g}, the file says f/{f_number:.3g}"
+    if not evidence:
+        return lens
+    assume(lens.path, f"rims are assumed to be half as wide as the format has them: {evidence}")
+    rows = (replace(s, diameter_mm=s.diameter_mm / 2) for s in lens.surfaces)
+    return replace(lens, surfaces=tuple(rows))
+
+
+def _narrowed(lens: Lens) -> Lens:
+    """The lens with rims no wider than their spheres and than where neighbours touch, in every state."""
+    from neurolens.optics.rims import narrowed_rims  # which needs torch
+
+    found = narrowed_rims(lens)
+    pairs = enumerate(zip(lens.surfaces, found.surfaces, strict=True))
+    changed = [f"{k} ({a.diameter_mm:.4g} to {b.diameter_mm:.4g} mm)" for k, (a, b) in pairs if a != b]
+    if changed:
+        warn(lens.path, f"rims narrowed to where spheres end or neighbours touch: surface {', '.join(changed)}")
+    return found
 
 
 def _stop_aperture(draft: Draft) -> float | None:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.errors import AssumedWarning, InputError, NeurolensWarning
 from neurolens.base.files import read_bytes
 from neurolens.base.tomlfile import suggestion
 
@@ -121,3 +121,8 @@ def read_lines(path: str | Path) -> list[Line]:
 def warn(file: str, message: str) -> None:
     """Warn about something in a file that is still read."""
     warnings.warn(f"{file}: {message}", NeurolensWarning, stacklevel=3)
+
+
+def assume(file: str, message: str) -> None:
+    """Warn about something that was assumed in the place of what a file lacks."""
+    warnings.warn(f"{file}: {message}", AssumedWarning, stacklevel=3)

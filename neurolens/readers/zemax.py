@@ -24,6 +24,7 @@ from neurolens.readers.zemax_model import (
     IGNORED_SURFACE,
     IGNORED_SYSTEM,
     MERIT,
+    Q_TYPE,
     TYPES,
     VIGNETTING,
     Block,
@@ -196,8 +197,8 @@ def _surface(file: File, block: Block, line: Line, word: str, rest: list[str]) -
     match word:
         case "TYPE":
             block.kind = rest[0].upper() if rest else ""
-            if block.kind not in TYPES:
-                raise line.error(word, block.kind, f"one of {', '.join(TYPES)}")
+            if block.kind not in TYPES and not block.kind.startswith(Q_TYPE):
+                raise line.error(word, block.kind, f"one of {', '.join(TYPES)}, or a Q-type asphere")
         case "CURV":
             block.curvature = line.numbers(word, rest[:1])[0]
             block.bends = line if block.curvature else None

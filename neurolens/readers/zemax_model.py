@@ -11,7 +11,8 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.readers import draft
 from neurolens.readers.draft import INFINITE, State
-from neurolens.readers.source import Line
+from neurolens.readers.forbes import MAX_TERMS, qbfs_terms, qcon_terms
+from neurolens.readers.source import Line, assume
 
 # Settings of the program and of its analyses.
 IGNORED_SYSTEM = frozenset(
@@ -49,7 +50,9 @@ MERIT = frozenset(
 CONFIGURATION = frozenset("MOFF MCOM XFIE YFIE FLWT FVDX FVDY FVCX FVCY FVAN WAVE WLWT PRWV GCRS".split())
 
 
-TYPES = ("STANDARD", "EVENASPH", "ODDASPHE", "TOROIDAL", "BICONICX", "COORDBRK")
+TYPES = ("STANDARD", "EVENASPH", "ODDASPHE", "XASPHERE", "XOSPHERE", "TOROIDAL", "BICONICX", "COORDBRK")
+MAX_EXTRAS = 240
+Q_TYPE = "Q"  # what the names of Q-type aspheres, and of no other type, begin with
 
 
 @dataclass
@@ -70,6 +73,19 @@ class Block(draft.Block):
     def parameter(self, n: int) -> float:
         return self.parameters.pop(n, (0.0, self.start))[0]
 
+    def extras(self) -> tuple[float, list[float]]:
+        """Normalisation radius and coefficients of a surface whose extra data begin with their count.
+
+        Raises:
+            InputError: a count that is not whole, or beyond `MAX_EXTRAS`; a radius that is not above 0.
+        """
+        (count, line), (radius, _) = (self.extra.pop(n, (given, self.start)) for n, given in ((1, 0.0), (2, 1.0)))
+        if not (0 <= count <= MAX_EXTRAS and count == int(count)):
+            raise line.error(f"XDAT 1 of {self.kind}", count, f"how many terms there are, at most {MAX_EXTRAS}")
+        if not radius > 0:
+            raise line.error(f"XDAT 2 of {self.kind}", radius, "a normalisation radius above 0")
+        return radius, [self.extra.pop(n, (0.0, self.start))[0] for n in range(3, 3 + int(count))]
+
 
 def thickness(line: Line, word: str, rest: list[str], *, is_object: bool) -> float:
     """A thickness; that of the object may be infinite, in words or as a number from 1e9."""
@@ -82,9 +98,10 @@ def thickness(line: Line, word: str, rest: list[str], *, is_object: bool) -> flo
 def shape_of(block: Block) -> dict[str, Any]:
     """Radius, conic, asphere and cylinder of a surface, for `Surface`.
 
-    Even asphere: sum of PARM i r^(2 i); odd asphere: sum of PARM i r^i. Toroidal: CURV and CONI in the y-z plane,
-    turned about an axis at PARM 1 (0 is infinity: a cylinder). Biconic: CURV, CONI in y, PARM 1 (a radius, 0 is
-    infinity) and PARM 2 (a conic) in x.
+    Even asphere: sum of PARM i r^(2 i); odd asphere: sum of PARM i r^i; the extended ones have XDAT in the place of
+    PARM, and powers of r over a normalisation radius. Q-type: PARM 1 is 0 for Qbfs and 1 for Qcon. Toroidal: CURV and
+    CONI in the y-z plane, turned about an axis at PARM 1 (0 is infinity: a cylinder). Biconic: CURV, CONI in y, PARM 1
+    (a radius, 0 is infinity) and PARM 2 (a conic) in x.
 
     Raises:
         InputError: a type, a parameter or a combination of them that the lens model cannot represent; by name and line.
@@ -99,6 +116,14 @@ def shape_of(block: Block) -> dict[str, Any]:
             if terms[0][1]:
                 raise block.start.error("PARM 1 of ODDASPHE", terms[0][1], "0: a cone's tip has no normal")
             shape = block.rotational(terms)
+        case "XASPHERE" | "XOSPHERE":
+            step = 2 if block.kind == "XASPHERE" else 1
+            radius, values = block.extras()
+            if step == 1 and values[:1] not in ([], [0.0]):
+                raise block.start.error("XDAT 3 of XOSPHERE", values[0], "0: a cone's tip has no normal")
+            shape = block.rotational((step * i, a / radius ** (step * i)) for i, a in enumerate(values, start=1))
+        case kind if kind.startswith(Q_TYPE):
+            shape = _q_type(block)
         case "TOROIDAL" | "BICONICX":
             shape = _crossed(block)
         case "COORDBRK":
@@ -112,6 +137,23 @@ def shape_of(block: Block) -> dict[str, Any]:
         if block.kind == "COORDBRK" and given is not None:
             raise given.error(f"{word} of COORDBRK", given.text.strip(), "none: a coordinate break is no surface")
     return shape
+
+
+def _q_type(block: Block) -> dict[str, Any]:
+    form, (radius, values) = block.parameter(1), block.extras()
+    rim = radius if math.isnan(block.semi_diameter) else block.semi_diameter
+    place = f"{block.start.file}, line {block.start.number}"
+    assume(place, f"{block.kind}: PARM 1 is taken as 0 for Qbfs, 1 for Qcon, XDAT as that of XASPHERE")
+    if form not in (0, 1) or len(values) > MAX_TERMS:
+        found, expected = f"(PARM 1 {form:g}, {len(values)} terms)", f"0 (Qbfs) or 1 (Qcon), at most {MAX_TERMS} terms"
+        raise block.start.error(block.kind, found, expected)
+    if form == 0 and block.conic:
+        raise block.start.error(f"CONI of {block.kind}", block.conic, "0: Qbfs departs from a sphere")
+    try:
+        terms = qcon_terms(values, radius, rim) if form else qbfs_terms(values, radius, block.curvature, rim)
+    except ValueError as error:
+        raise block.start.error(block.kind, f"(curvature {block.curvature:g}, rim {rim:g})", str(error)) from None
+    return block.rotational(terms)
 
 
 def _crossed(block: Block) -> dict[str, Any]:

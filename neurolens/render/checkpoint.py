@@ -76,6 +76,17 @@ def _leaves(tree: Any, place: str = "") -> dict[str, Any]:
     return found
 
 
+def difference(there: dict[str, Any], here: dict[str, Any]) -> tuple[str, Any, str] | None:
+    """The first place where two identities differ and what each has there, short for a message; None: nowhere."""
+    found, wanted = _leaves(there), _leaves(here)
+    for place in [*wanted, *found]:
+        values = found.get(place, _NOTHING), wanted.get(place, _NOTHING)
+        if json.dumps(values[0]) != json.dumps(values[1]):  # as text: NaN equals NaN
+            shown = values[0] if len(repr(values[0])) <= _LONGEST else f"({_short(values[0])})"
+            return place, shown, _short(values[1])
+    return None
+
+
 def digest(value: Any) -> str:
     """Hexadecimal digest of a value made of dataclasses, mappings, sequences, arrays and plain values."""
     return fingerprint_of([_plain(value)])[:_DIGITS]
@@ -183,12 +194,9 @@ def _check_length(path: Path, length: int) -> None:
 def _check_render(path: Path, about: dict[str, Any], identity: dict[str, Any]) -> None:
     if about["format"] != _FORMAT:
         raise InputError(path, "format", about["format"], f"{_FORMAT}, {_AGAIN}")
-    found, wanted = _leaves(about["render"]), _leaves(identity)
-    for place in [*wanted, *found]:
-        there, here = found.get(place, _NOTHING), wanted.get(place, _NOTHING)
-        if json.dumps(there) != json.dumps(here):  # as text: NaN equals NaN
-            shown = there if len(repr(there)) <= _LONGEST else f"({_short(there)})"
-            raise InputError(path, place, shown, f"{_short(here)} as asked now, {_AGAIN}")
+    if differs := difference(about["render"], identity):
+        place, there, here = differs
+        raise InputError(path, place, there, f"{here} as asked now, {_AGAIN}")
 
 
 def _short(value: Any) -> str:

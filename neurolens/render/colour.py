@@ -76,6 +76,18 @@ def conversion(source: ColourSpace, target: ColourSpace) -> Matrix:
     return _solve(target.to_xyz, adapt @ source.to_xyz)
 
 
+def converted(colours: NDArray[np.floating], matrix: ArrayLike) -> NDArray[np.floating]:
+    """Colours [..., 3] times rows of a matrix [n, 3]: [..., n], each rounded the same in whatever array it stands.
+
+    A product by BLAS rounds the last rows of an array otherwise, and a tile would not be that part of its picture.
+    """
+    columns = np.asarray(matrix).T
+    total = colours[..., :1] * columns[0]
+    for k in (1, 2):
+        total += colours[..., k : k + 1] * columns[k]
+    return total
+
+
 def balance(white_rgb: ArrayLike) -> Matrix:
     """Matrix [3, 3] on linear sRGB that makes the colour `white_rgb` [3] neutral and keeps its luminance."""
     white = SRGB.to_xyz @ np.asarray(white_rgb, np.float64)

@@ -11,7 +11,7 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -99,18 +99,25 @@ class Tiling:
 
     Attributes:
         pixels, samples: of the picture. tile: pixels per tile. step: samples per pass; the last pass may have fewer.
+        start: the picture's number of the first pixel, where these are the tiles of a part of it.
     """
 
     pixels: int
     samples: int
     tile: int
     step: int
+    start: int = 0
 
     @classmethod
     def of(cls, pixels: int, samples: int) -> Tiling:
         """Tiles of about `BATCH` paths per pass."""
         step = min(samples, SAMPLES_A_PASS)
         return cls(pixels, samples, max(1, BATCH // step), step)
+
+    def around(self, first: int, stop: int) -> Tiling:
+        """The tiles that hold the pixels from `first` up to `stop`, whole: other batches might round differently."""
+        start = first - first % self.tile
+        return replace(self, pixels=min(-(-stop // self.tile) * self.tile, self.pixels) - start, start=start)
 
     @property
     def tiles(self) -> int:
@@ -121,7 +128,7 @@ class Tiling:
         return -(-self.samples // self.step)
 
     def pixels_of(self, first: int, stop: int | None = None) -> slice:
-        """The pixels of a tile, or of the tiles from `first` up to `stop`."""
+        """The pixels of a tile, or of the tiles from `first` up to `stop`, counted from `start`."""
         return slice(first * self.tile, min((first + 1 if stop is None else stop) * self.tile, self.pixels))
 
     def samples_done(self, done: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
 from neurolens.render import film as columns
-from neurolens.render.colour import SRGB, balance
+from neurolens.render.colour import SRGB, balance, converted
 from neurolens.render.film import Film, PixelGrid, Tiling, shared
 from neurolens.render.film_settings import FilmSettings
 from neurolens.render.integrator import lit, trace
@@ -42,6 +42,8 @@ class Job:
         scene, camera, grid, seed, max_depth, settings: as requested; settings are those of the film.
         mode: how wavelengths are taken. balance: matrix [3, 3] on the film's linear sRGB that makes the light of the
             white balance neutral; where there is none, `neutral`. luminance_row: [3], of the film's sRGB after that.
+        rows: first row and the one after the last, of the part of the picture that is rendered; own: its pixels among
+            those of the tiles, which may begin before it and end after it.
         paths_a_sample: lanes of a sample; film: see `Film`.
         seconds: [2] of all workers: in the camera, and total.
         message: text of a worker's error. stop: set to end the work early.
@@ -56,6 +58,7 @@ class Job:
         seed: int,
         max_depth: int,
         settings: FilmSettings,
+        rows: tuple[int, int] | None = None,
     ) -> None:
         self.scene, self.camera, self.grid = scene, camera, grid
         self.seed, self.max_depth, self.settings = seed, max_depth, settings
@@ -74,7 +77,10 @@ class Job:
         self._axes, self._position = camera_axes(pose), np.array(pose.position_m, np.float32)
         # Paths of one sample: four lanes share their random numbers, and are independent of the others only together.
         self.paths_a_sample = LANES if self.mode == "lanes" else 1
-        self.tiling = Tiling.of(grid.width * grid.height, samples)
+        self.rows = rows or (0, grid.height)
+        first, stop = (row * grid.width for row in self.rows)
+        self.tiling = Tiling.of(grid.width * grid.height, samples).around(first, stop)
+        self.own = slice(first - self.tiling.start, stop - self.tiling.start)
         self.film = Film(self.tiling)
         self.seconds = shared((2,), np.float64)
         self.message, self.stop = shared((4096,), np.uint8), shared((1,), np.uint8)
@@ -90,7 +96,7 @@ class Job:
         """Sums [pixels, columns] of one pass of one tile, and the seconds that the camera took."""
         within = self.tiling.pixels_of(tile)
         step = self.tiling.step
-        pixels = np.arange(within.start, within.stop)
+        pixels = np.arange(within.start, within.stop) + self.tiling.start
         indices = np.arange(part * step, min((part + 1) * step, self.tiling.samples))
         pixel, sample = np.repeat(pixels, len(indices)), np.tile(indices, len(pixels))
         keys = self.sampler.keys(pixel, sample // self.paths_a_sample)
@@ -219,8 +225,8 @@ class Layers:
 
 
 def develop(job: Job) -> tuple[FloatArray, Layers]:
-    """Picture [H, W, 3] float32 linear sRGB and its layers, each tile divided by its samples so far; safe while workers
-    run.
+    """The job's rows of the picture, [H, W, 3] float32 linear sRGB, and its layers, each tile divided by its samples so
+    far; safe while workers run.
     """
     tiling, grid = job.tiling, job.grid
     rgb = np.zeros((tiling.pixels, 3), np.float32)
@@ -230,15 +236,15 @@ def develop(job: Job) -> tuple[FloatArray, Layers]:
         part = tiling.pixels_of(first, stop)
         samples = np.repeat(tiling.samples_done(done), tiling.tile)[: len(sums)]
         colour = sums[:, columns.RGB] / np.maximum(samples, 1)[:, None]
-        rgb[part] = colour if job.neutral else colour @ job.balance.T
+        rgb[part] = colour if job.neutral else converted(colour, job.balance)
         planes[:, part] = _layers(job, sums, samples)
-    shape = (grid.height, grid.width)
-    return rgb.reshape(*shape, 3), Layers(*(plane.reshape(shape) for plane in planes))
+    shape = (job.rows[1] - job.rows[0], grid.width)
+    return rgb[job.own].reshape(*shape, 3), Layers(*(plane[job.own].reshape(shape) for plane in planes))
 
 
 def _layers(job: Job, sums: NDArray[np.float64], samples: NDArray[np.int64]) -> FloatArray:
     """Samples, variance, depth and blocked share [4, n]; what float32 does not hold is infinite."""
-    total = sums[:, columns.RGB] @ job.luminance_row
+    total = converted(sums[:, columns.RGB], job.luminance_row[None])[:, 0]
     groups = -(-samples // job.paths_a_sample)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # Of the sum over independent samples, then of the mean over paths.

@@ -8,7 +8,7 @@ it fills. (The sky and the sun are groups of `neurolens.render.environment`.)
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,11 +117,17 @@ class Lights:
         density *= self.probability.take(light)
         return density
 
-    def each(self, point: FloatArray, square: FloatArray) -> Iterator[Aimed]:
-        """As `LightGroup.sample` from points [3, N] to all lights, one after another."""
-        for _, group in self._groups:
-            for number in range(group.count):
-                yield group.sample(np.full(point.shape[1], number), point, square)
+    def each(self, numbers: Iterable[int], point: FloatArray, square: FloatArray) -> Iterator[Aimed]:
+        """As `LightGroup.sample` from points [3, N] to lights, one after another."""
+        for number in numbers:
+            first, group = next(part for part in reversed(self._groups) if part[0] <= number)
+            yield group.sample(np.full(point.shape[1], number - first), point, square)
+
+    def strongest(self, target_m: Vector, most: int) -> list[int]:
+        """So many lights that bring a point the most light if nothing is between, by rising number."""
+        importance = [group.importance(target_m) for _, group in self._groups]
+        order = np.argsort(-np.concatenate([np.zeros(0), *importance]), kind="stable")
+        return sorted(order[:most].tolist())
 
     def _by_group(self, light: Numbers) -> Iterator[tuple[LightGroup, Numbers, Numbers]]:
         """The groups that lights [N] belong to, the places of theirs, and their numbers in the group."""

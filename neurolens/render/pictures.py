@@ -12,7 +12,7 @@ import math
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, open_regular, read_bytes
 from neurolens.cameras.contract import FloatArray
 from neurolens.optics.apertures import MAX_MASK, THRESHOLD, Aperture
-from neurolens.render.colour import SRGB, ColourSpace, conversion, linear_to_srgb, srgb_to_linear
+from neurolens.render.colour import SRGB, ColourSpace, conversion, converted, linear_to_srgb, srgb_to_linear
 from neurolens.render.scenetables import BRIGHTEST
 
 METADATA_KEY = "neurolens"
@@ -72,18 +72,31 @@ def write_exr(
     if picture.dtype.kind not in "fiub":
         raise InputError(path, "rgb type", str(picture.dtype), "real numbers")
     with np.errstate(over="ignore", invalid="ignore"):
-        picture = (picture if space is SRGB else picture @ conversion(SRGB, space).T).astype(np.float32, copy=False)
+        picture = (picture if space is SRGB else converted(picture, conversion(SRGB, space))).astype(
+            np.float32, copy=False
+        )
     if bad := int(np.sum(~np.isfinite(picture))):
         raise InputError(path, "rgb", f"({bad} values not finite)", "finite float32 values")
+    stored = np.clip(picture, -_HALF_MAX, _HALF_MAX).astype(np.float16) if half else picture
+    channels = {name: np.ascontiguousarray(stored[..., k]) for k, name in enumerate(_COLOURS)}
+    channels |= _layer_channels(path, layers or {}, picture.shape[:2])
+    write_stored(path, channels, space, metadata, attributes)
+
+
+def write_stored(
+    path: Path,
+    channels: Mapping[str, NDArray[Any]],
+    space: ColourSpace,
+    metadata: Mapping[str, Any] | None = None,
+    attributes: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a picture's channels [H, W], contiguous, as they are to be stored; the rest as in `write_exr`."""
     try:
         text = json.dumps(metadata or {}, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise InputError(path, "metadata", f"({error})", "values that JSON can hold") from None
     if not path.parent.is_dir():
         raise InputError(path, "folder", str(path.parent), "a folder that exists")
-    stored = np.clip(picture, -_HALF_MAX, _HALF_MAX).astype(np.float16) if half else picture
-    channels = {name: np.ascontiguousarray(stored[..., k]) for k, name in enumerate(_COLOURS)}
-    channels |= _layer_channels(path, layers or {}, picture.shape[:2])
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
@@ -93,7 +106,7 @@ def write_exr(
         METADATA_KEY: text,
         **(attributes or {}),
     }
-    _write_part(path, header, channels)
+    _write_part(path, header, dict(channels))
 
 
 def write_data_exr(
@@ -150,12 +163,37 @@ def read_exr(path: str | Path) -> tuple[FloatArray, dict[str, Any]]:
     Raises:
         InputError: missing, no OpenEXR file, truncated, or without channels R, G and B.
     """
-    planes, text = _read_channels(Path(path), wanted=_COLOURS)
-    picture = _colours(planes, path, "channels")
+    planes, told = read_channels(path, _COLOURS)
+    return _colours(planes, path, "channels"), told
+
+
+def read_channels(path: str | Path, wanted: Sequence[str] = ()) -> tuple[dict[str, FloatArray], dict[str, Any]]:
+    """The channels [H, W] float32 of a picture by name, or those wanted where it has them, and its metadata.
+
+    Raises:
+        InputError: missing, no OpenEXR file, truncated, metadata that are no JSON object.
+    """
+    planes, text = _read_channels(Path(path), wanted=wanted)
+    return planes, _metadata(path, text)
+
+
+def read_metadata(path: str | Path) -> dict[str, Any]:
+    """The metadata of a picture alone, {} without ours; raises InputError as `read_channels`."""
+    with _whole(path, "file", "(missing)", named=False), _silent():
+        open_regular(path).close()
+        with OpenEXR.File(str(path), header_only=True) as header:
+            text = header.parts[0].header.get(METADATA_KEY, "{}")
+    return _metadata(path, text)
+
+
+def _metadata(path: str | Path, text: str) -> dict[str, Any]:
     try:
-        return picture, json.loads(text)
-    except ValueError:
-        raise InputError(path, METADATA_KEY, text, "JSON text") from None
+        told = json.loads(text)
+        if isinstance(told, dict):
+            return told
+    except (ValueError, RecursionError):
+        pass
+    raise InputError(path, METADATA_KEY, text, "JSON text, an object")
 
 
 def read_layers(path: str | Path) -> dict[str, FloatArray]:
@@ -186,7 +224,7 @@ def _read_channels(
     """
     file, field = place or (path, "file")
     name = str(path) if place else "(missing)"
-    try:
+    with _whole(file, field, name, named=place is not None):
         open_regular(path).close()
         with _silent(), OpenEXR.File(str(path), header_only=True) as header:
             parts = [dict(part.header) for part in header.parts]
@@ -206,12 +244,19 @@ def _read_channels(
             part = whole.parts[0]
             planes = {name: np.array(channel.pixels, np.float32) for name, channel in part.channels.items()}
             return planes, part.header.get(METADATA_KEY, "{}")
+
+
+@contextmanager
+def _whole(file: str | Path, field: str, name: str, named: bool) -> Iterator[None]:
+    """Turn errors of reading an OpenEXR file inside the block into InputError; `named`: the value found is `name`."""
+    try:
+        yield
     except (InputError, MemoryError):
         raise
     except OSError as error:
         raise InputError(file, field, name, f"an OpenEXR file that exists ({error.strerror})") from None
     except Exception as error:  # the library raises bare RuntimeError, ValueError and its own
-        raise InputError(file, field, name if place else f"({error})", f"a whole OpenEXR file ({error})") from None
+        raise InputError(file, field, name if named else f"({error})", f"a whole OpenEXR file ({error})") from None
 
 
 def _some_channels(path: Path, names: Sequence[str], size: Sequence[int]) -> dict[str, FloatArray]:
@@ -229,13 +274,14 @@ def _some_channels(path: Path, names: Sequence[str], size: Sequence[int]) -> dic
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Without stderr, on which the library prints what it also raises."""
+    """Without stderr and Python's stdout, on which the library prints what it also raises."""
     sys.stderr.flush()
     kept = os.dup(2)
     nowhere = os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 2)
-        yield
+        with redirect_stdout(io.StringIO()):
+            yield
     finally:
         os.dup2(kept, 2)
         os.close(kept)

@@ -57,7 +57,7 @@ class Keeper:
 
     def __init__(self, job: Job, watch: Watch, progress: Progress | None) -> None:
         self._job, self._watch, self._progress = job, watch, progress
-        self._identity = identity(job) if watch.checkpoint is not None else {}
+        self._identity = {**identity(job), "rows": list(job.rows)} if watch.checkpoint is not None else {}
         self._earlier_s, self._written = 0.0, False
         if watch.checkpoint is not None and watch.checkpoint.exists() and not watch.restart:
             spent = read_checkpoint(watch.checkpoint, job.film, self._identity)
@@ -137,6 +137,7 @@ class RenderResult:
             camera_fraction (their ratio), dropped_samples (not finite; they count as black). Seconds and dropped
             samples count those before a checkpoint, too.
         layers: additional channels.
+        identity: what pictures of the same settings have in common, to tell whether rows belong together; of a part.
         save: writes the watch's checkpoint, for use if the picture cannot be written; raises OSError or
             NeurolensError. None without a watch that names one.
     """
@@ -144,6 +145,7 @@ class RenderResult:
     rgb: FloatArray
     stats: dict[str, Any]
     layers: Layers
+    identity: dict[str, Any] | None = None
     save: Callable[[], None] | None = None
 
 
@@ -158,6 +160,7 @@ def render(
     threads: int = 2,
     max_depth: int | None = None,
     film: FilmSettings | None = None,
+    rows: tuple[int, int] | None = None,
     progress: Progress | None = None,
     watch: Watch | None = None,
 ) -> RenderResult:
@@ -172,6 +175,8 @@ def render(
     Args:
         width, height, samples, max_depth: as in `CameraSettings`; left out, those of the scene.
         film: spectral sampling and white balance; left out, those of the scene.
+        rows: the first row and the one after the last, of a part of the picture: its pixels are those of the whole
+            one, bit for bit, and the result holds no others. Statistics are of these pixels, too.
         threads: workers. A camera may have `for_worker() -> Camera`, called once in each, to open its own sessions.
         progress: called with the fraction done and the estimated seconds left.
         watch: previews, checkpoints and an early end.
@@ -189,8 +194,11 @@ def render(
     max_depth = _count("max_depth", settings.max_depth if max_depth is None else max_depth)
     threads = _count("threads", threads)
     grid = PixelGrid(width or settings.width, height or settings.height, camera.film_mm)
-    check_memory(grid.width, grid.height)
-    job = Job(scene, camera, grid, samples, seed, max_depth, film)
+    first, stop = rows or (0, grid.height)
+    if not 0 <= first < stop <= grid.height:
+        raise InputError("render", "rows", rows, f"two numbers from 0 to {grid.height}, the first below the second")
+    check_memory(grid.width, stop - first)
+    job = Job(scene, camera, grid, samples, seed, max_depth, film, (first, stop))
     keeper = Keeper(job, watch or Watch(), progress)
     try:
         idle = watch is None and progress is None
@@ -207,18 +215,20 @@ def render(
     stats = {"scene": scene.name, "threads": threads, **_stats(job, seconds)}
     # Otherwise the result would keep the film's sums in memory.
     save = keeper.save if watch is not None and watch.checkpoint is not None else None
-    return RenderResult(rgb, stats, layers, save)
+    return RenderResult(rgb, stats, layers, None if rows is None else identity(job), save)
 
 
 def _stats(job: Job, seconds: float) -> dict[str, Any]:
     tiling = job.tiling
-    pixels = np.minimum(tiling.tile, tiling.pixels - tiling.tile * np.arange(tiling.tiles))
+    began = tiling.tile * np.arange(tiling.tiles)
+    pixels = np.minimum(began + tiling.tile, job.own.stop) - np.maximum(began, job.own.start)  # of the job's rows
     paths = int(np.sum(pixels * tiling.samples_done(job.film.done)))
+    sums = job.film.sums[job.own]
     camera_s, thread_s = (float(s) for s in job.seconds)
     return {
         "camera": job.camera.name,
         "samples": tiling.samples,
-        "samples_done": paths / tiling.pixels,
+        "samples_done": paths / len(sums),
         "complete": job.film.fraction == 1,
         **job.asked(),
         "wavelengths": job.mode,
@@ -226,8 +236,8 @@ def _stats(job: Job, seconds: float) -> dict[str, Any]:
         "seconds": seconds,
         "paths": paths,
         "mpaths_per_s": paths / seconds * 1e-6,
-        "passed_fraction": float(job.film.sums[:, PASSED].sum()) / max(paths, 1),
-        "dropped_samples": int(job.film.sums[:, DROPPED].sum()),
+        "passed_fraction": float(sums[:, PASSED].sum()) / max(paths, 1),
+        "dropped_samples": int(sums[:, DROPPED].sum()),
         "thread_seconds": thread_s,
         "camera_thread_seconds": camera_s,
         "camera_fraction": camera_s / max(thread_s, 1e-12),

@@ -7,6 +7,7 @@ work.
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import threading
@@ -36,8 +37,12 @@ def run(job: Job, workers: int, watch: Callable[[], bool] | None = None) -> None
     if workers == 1 and watch is None:
         _work(job, claimed)
         return
-    kind: Any = CONTEXT.Process if FORKS else threading.Thread
-    team = [kind(target=_quiet, args=(job, claimed, k, workers, os.getpid()), daemon=True) for k in range(workers)]
+    forks = FORKS and not multiprocessing.current_process().daemon  # such as a worker of Dask: it may have no children
+    kind: Any = CONTEXT.Process if forks else threading.Thread
+    team = [
+        kind(target=_quiet, args=(job, claimed, k, workers, os.getpid() if forks else None), daemon=True)
+        for k in range(workers)
+    ]
     killed: list[int] = []
     try:
         with held():  # inherited by forked workers: only this process handles Ctrl-C
@@ -45,13 +50,13 @@ def run(job: Job, workers: int, watch: Callable[[], bool] | None = None) -> None
                 worker.start()
         while alive := [worker for worker in team if worker.is_alive()]:
             alive[0].join(_POLL_S)
-            if FORKS:
+            if forks:
                 killed = [worker.exitcode for worker in team if worker.exitcode]
             if killed or (watch is not None and watch()):
                 break  # after a kill the others may wait for its tile forever
     finally:
         job.stop[0] = 1
-        _dismiss(job, [worker for worker in team if worker.ident is not None])
+        _dismiss(job, [worker for worker in team if worker.ident is not None], forks)
     if job.message[0]:
         raise NeurolensError(bytes(job.message).rstrip(bytes(1)).decode(errors="replace"))
     if killed:
@@ -60,11 +65,11 @@ def run(job: Job, workers: int, watch: Callable[[], bool] | None = None) -> None
         raise NeurolensError(f"a render worker was killed{why} before it had finished")
 
 
-def _dismiss(job: Job, team: Sequence[Any]) -> None:
+def _dismiss(job: Job, team: Sequence[Any], forks: bool) -> None:
     """Let workers finish their tiles; forked ones that take long are killed, none of them while it holds the film."""
     until = time.monotonic() + _PATIENCE_S
     for worker in team:
-        worker.join(max(until - time.monotonic(), 0) if FORKS else None)
+        worker.join(max(until - time.monotonic(), 0) if forks else None)
     late = [worker for worker in team if worker.is_alive()]
     if late:
         with suppress(NeurolensError), job.film.held():
@@ -101,10 +106,10 @@ def _work(job: Job, claimed: Any) -> None:
             job.seconds += camera_s, time.perf_counter() - began
 
 
-def _quiet(job: Job, claimed: Any, number: int, workers: int, parent: int) -> None:
-    """One of several workers: its error goes to the shared message only."""
+def _quiet(job: Job, claimed: Any, number: int, workers: int, parent: int | None) -> None:
+    """One of several workers: its error goes to the shared message only; a thread has no `parent`."""
     try:
-        if FORKS:
+        if parent is not None:
             threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
             _pin(number, workers)
         _work(job, claimed)

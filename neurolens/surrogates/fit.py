@@ -29,6 +29,7 @@ from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import RayPairs, trace_pairs
 from neurolens.surrogates.published import fit_published
 from neurolens.surrogates.settings import NETWORKS, PLANES_SEARCHED, POLYNOMIALS, ModelSettings, PublishedName
+from neurolens.surrogates.specialise import without_idle_gates
 from neurolens.surrogates.targets import Prepared, scales_of, squared_error
 
 # Rays drawn over the domain to find what blocks anything: a share of 1e-4 is 20 of them.
@@ -89,7 +90,7 @@ def fit_model(
             if settings.planes and settings.basis == "invariants" and settings.method in PLANES_SEARCHED:
                 encoding = fit_planes(pairs, encoding, settings.terms, settings.position_weight)
             core = _fit_core(replace(prepared, encoding=encoding), settings, progress, checkpoint)
-    return LensModel(
+    model = LensModel(
         lens=pairs.lens,
         domain=pairs.domain,
         encoding=encoding,
@@ -101,6 +102,7 @@ def fit_model(
         direction="slope" if settings.family == "paraxial" else "angle",
         fit_s=max(time.perf_counter() - start, spent_s(checkpoint)),
     )
+    return without_idle_gates((model,), settings.idle_gates)[0] if settings.idle_gates else model
 
 
 def _fit_core(

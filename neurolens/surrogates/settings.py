@@ -38,6 +38,7 @@ class ModelSettings:
             each variable: terms of higher degree where they help.
         position_weight: how much more than to first order the position counts in the choice of terms.
         transmittance_terms: how many more terms the transmittance may have where it needs them.
+        idle_gates: rims that alone block at most this share of the domain's rays are left out.
         planes: whether `PLANES_SEARCHED` methods in the invariants search the planes of the light field.
         partitions: zones of the film with a fit of their own (polynomials and networks).
         units, layers: of the network.
@@ -60,6 +61,7 @@ class ModelSettings:
     growth: int = 2
     position_weight: float = 2.0
     transmittance_terms: int = 16
+    idle_gates: float = 0.0
     planes: bool = True
     partitions: int = 1
     units: int = 16
@@ -82,6 +84,8 @@ class ModelSettings:
         for name, (least, most) in limits.items():
             if not least <= getattr(self, name) <= most:
                 raise InputError("settings", name, getattr(self, name), f"an integer from {least} to {most}")
+        if not 0 <= self.idle_gates < 1:
+            raise InputError("settings", "idle_gates", self.idle_gates, "a share from 0 to below 1")
         if not 0 < self.position_weight < math.inf:
             raise InputError("settings", "position_weight", self.position_weight, "a number above 0")
 

@@ -38,6 +38,8 @@ _FEWER = 1
 _SAME = 1e-3  # focal lengths that differ by less than this share are one
 # Zoom positions at which the common near limit of internal focus is sought.
 _LIMITS = 9
+_GAP_MM, _MOST = 1e-4, 12  # error of interpolated gaps that is enough, and the highest degree tried for it
+_BETWEEN = (0.08, 0.35, 0.5, 0.77, 0.93)  # of the way from knot to knot: where gaps are measured
 
 
 @dataclass(frozen=True)
@@ -257,3 +259,28 @@ def mix(values: Sequence[Any], weights: Array) -> Any:
     if not all(np.array_equal(v, first) for v in values):
         raise InputError("state model", "nodes", f"({type(first).__name__})", "the same at every node")
     return first
+
+
+def gap_axis(first: Axis, lens_at: Callable[[float], Lens]) -> tuple[Axis, float]:
+    """An axis with nodes enough for the gaps of the lens at its values, and their largest error in mm between nodes.
+
+    Args:
+        first: the axis, of the least degree that is tried.
+    """
+
+    def places(value: float) -> Array:
+        lens = lens_at(value)
+        return np.array(lens.vertices_mm[: len(lens.surfaces)])
+
+    def turned(value: float) -> float:
+        return 1 / value if first.reciprocal else value
+
+    ends = [(turned(a), turned(b)) for a, b in zip(first.knots, first.knots[1:], strict=False)]
+    known = [(v, places(v)) for a, b in ends for v in (turned(a + (b - a) * share) for share in _BETWEEN)]
+    for degree in range(first.degree, _MOST + 1):
+        axis = replace(first, degree=degree)
+        nodes = np.array([places(v) for v in axis.nodes])
+        error = max(float(np.abs(weights((axis,), (v,)) @ nodes - exact).max()) for v, exact in known)
+        if error < _GAP_MM:
+            break
+    return axis, error

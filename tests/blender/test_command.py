@@ -20,7 +20,7 @@ from neurolens.base.errors import InputError  # noqa: E402
 from neurolens.cli import main  # noqa: E402
 from neurolens.commands import blender_lenses  # noqa: E402
 from neurolens.commands.blender_lenses import thumbnail  # noqa: E402
-from neurolens.commands.export_osl import Shader  # noqa: E402
+from neurolens.evaluate.shaders import Shader  # noqa: E402
 from neurolens.optics.lensfile import read_lens  # noqa: E402
 from neurolens.render.film import FORKS  # noqa: E402
 

@@ -44,7 +44,9 @@ def packed(lens_id: str = "gauss", osl: str = SHADER, picture: bytes | None = No
         Form("polynomial", "ols-60", osl, 0.17, 21.6, 1.81, 0.7),
         Form("exact", "", osl, None, 21.6, 1.81, None),
     ]
-    return PackedLens(lens_id, f"Lens {lens_id}", 49.6, 1.8, "US 2,701,982 (Angenieux, 1955)", picture, forms)
+    rows: dict[str, Any] = {"distortion_um": [[0.0, 50.0]] * 2, "blur_um": [[9.0, 20.0]] * 2, "light": [[1.0, 0.6]] * 2}
+    field = {"radius_mm": [0.0, 21.0], "near_m": 1.0} | rows
+    return PackedLens(lens_id, f"Lens {lens_id}", 49.6, 1.8, "US 2,701,982 (Angenieux, 1955)", picture, forms, field)
 
 
 def phone() -> PackedLens:
@@ -400,3 +402,24 @@ def test_lenses_of_the_user_folder_join_the_menu(scene: Any) -> None:
     finally:
         (folder / "lenses.json").unlink()
         bpy.ops.neurolens.reload()
+
+
+def test_a_shot_that_needs_no_lens_is_told_so(scene: Any) -> None:
+    """A wall at the focus, wide tolerance: Blender's own camera; what is near needs depth of field; then the lens."""
+    camera = scene.camera
+    camera.location, camera.rotation_euler = (0, 0, 0), (0, 0, 0)
+    bpy.ops.mesh.primitive_plane_add(size=100, location=(0, 0, -4))
+    camera.data.dof.focus_distance, camera.data.sensor_width = 4.0, 36.0
+    bpy.ops.neurolens.apply(lens="gauss", kind="polynomial")
+    told = {}
+    for name, tolerance in (("all", 1e3), ("little", 0.005)):
+        camera.data.neurolens.tolerance_px = tolerance
+        assert bpy.ops.neurolens.needs() == {"FINISHED"}
+        told[name] = camera.data.neurolens.advice.splitlines()
+    assert told["all"][0].startswith("Use Blender's camera without") and "by up to 0 px" in told["all"][1]
+    assert "form polynomial" in told["little"][0]  # 0.17 um where a pixel is 1125 um
+    bpy.ops.mesh.primitive_plane_add(size=0.1, location=(0, 0, -0.5))
+    bpy.context.view_layer.update()
+    camera.data.neurolens.tolerance_px = 1.5
+    bpy.ops.neurolens.needs()
+    assert "by up to 2" in camera.data.neurolens.advice or "by up to 1" in camera.data.neurolens.advice

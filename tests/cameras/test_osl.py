@@ -16,7 +16,7 @@ from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cameras.pupil_arcs import unit_disc
 from neurolens.cli import main
-from neurolens.commands.export_osl import exact_lens
+from neurolens.evaluate.shaders import exact_lens
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.scalars import lower

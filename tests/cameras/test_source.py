@@ -21,14 +21,14 @@ from neurolens.cameras.fused import lens_graph
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.source import camera_program, film_extras, model_extras
 from neurolens.cli import main
-from neurolens.commands.export_lens import gap_axis, lens_program, pupil_planes_mm
+from neurolens.commands.export_lens import lens_program, pupil_planes_mm
 from neurolens.optics.focusing import best_focus_of_stops_mm, best_focus_z_mm
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import film_z_mm, first_order
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 from neurolens.surrogates.domain import sample_domain
-from neurolens.surrogates.states import zoom_axis
+from neurolens.surrogates.states import gap_axis, zoom_axis
 
 ROOT = Path(__file__).parents[2]
 LENS = ROOT / "lenses" / "laikin_double_gauss_50.toml"

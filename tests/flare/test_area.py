@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neurolens.flare.area import Canvas
+from neurolens.flare.area import draw_edges, edges_of
 from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.grids import REACH, grids_of
 from neurolens.flare.lights import Light, light_rays, rays_across
@@ -17,17 +17,12 @@ from neurolens.graph.ir import Graph
 from neurolens.optics.apertures import Aperture
 from tests.flare.test_ghosts import lens_of
 
-White = np.ones(3)
-
 
 def drawn(found: np.ndarray, columns: int, share: float, size: tuple[int, int] = (12, 10)) -> np.ndarray:
     """One channel [H, W]; places in pixels from the middle, x to the left."""
-    canvas, picture = Canvas(*size), np.zeros((size[1], size[0], 3), np.float32)
-    canvas.add(np.ascontiguousarray(found, np.float32), columns, share, 1.0)
-    canvas.onto(picture, White)
-    before = picture.copy()
-    canvas.onto(picture, White)
-    assert np.array_equal(picture, before)  # it is empty then
+    picture = np.zeros((size[1], size[0], 3), np.float32)
+    edges = edges_of(np.ascontiguousarray(found, np.float32), columns, size, 1.0)
+    draw_edges(picture, range(size[1]), edges, np.array([len(edges)]), np.full((1, 3), share))
     return picture[..., 1].astype(np.float64)
 
 
@@ -66,6 +61,20 @@ def test_what_lies_off_the_film_changes_nothing_on_it() -> None:
         large, small = (drawn(found, 5, 3.0, size) for size in ((200, 160), (12, 10)))
         np.testing.assert_allclose(small, large[75:85, 94:106], atol=1e-5 * large.max())
         assert large.min() >= 0
+
+
+def test_rows_alone_are_those_of_the_whole() -> None:
+    """Bit by bit, wherever a picture is cut into strips: cells on and off it, folds, cut cells and points."""
+    rng = np.random.default_rng(5)
+    place, worst = 9 * rng.standard_normal((2, 42)), rng.uniform(0, 1.5, 42)
+    place[:, 14:17] = 0.3  # a cell without area
+    edges = edges_of(rays(place, 0.7, worst).astype(np.float32), 6, (40, 30), 2.0)
+    given = np.array([len(edges)]), np.array([[1.0, 0.5, -0.2]])
+    whole, parts = np.zeros((2, 30, 40, 3), np.float32)
+    draw_edges(whole, range(30), edges, *given)
+    for rows in (range(7), range(7, 8), range(8, 30)):
+        draw_edges(parts, rows, edges, *given)
+    assert np.array_equal(whole, parts) and whole.any()
 
 
 def test_a_fold_is_its_closed_form() -> None:
@@ -128,15 +137,23 @@ def test_ghosts_have_the_light_of_their_rays(case: str, distance_m: float) -> No
     for pair, wanted, off in zip(tracer.pairs, expected, noise, strict=True):
         if wanted < 2e-3 * expected.sum():
             continue
-        grid, canvas = grids[pair], Canvas(96, 64)
+        grid = grids[pair]
         rows, area = rays_across(lens, light, grid.places)
         found = tracer.follow(tracer.start(rows), 550.0, only=[pair], reach=REACH)
-        canvas.add(found.rows[0], grid.columns, area * grid.cell, 96 / size)
+        edges = edges_of(found.rows[0], grid.columns, (96, 64), 96 / size)
         picture = np.zeros((64, 96, 3), np.float32)
-        canvas.onto(picture, White)
+        draw_edges(picture, range(64), edges, np.array([len(edges)]), np.full((1, 3), area * grid.cell))
         assert picture[..., 0].sum(dtype=np.float64) == pytest.approx(wanted, rel=0.01 + off)
     total = sum(w for p, w in zip(tracer.pairs, expected, strict=True) if p not in grids)
     assert total < 1e-3 * expected.sum()
+
+
+def test_light_of_one_wavelength_takes_no_finer_grids() -> None:
+    """What costs nothing is no reason for cells: neither colours that do not part, nor ghosts of one density."""
+    tracer, light = GhostTracer(lens_of("laikin_double_gauss_50")), Light(15.0, 8.0)
+    one, many = (grids_of(tracer, light, 550.0, (18.0, 12.0), 0.6, ends) for ends in ((550.0, 550.0), (400.0, 700.0)))
+    costs = [sum(grid.columns * grid.rows * grid.wavelengths for grid in grids.values()) for grids in (one, many)]
+    assert costs[0] < 0.7 * costs[1] and np.median([grid.columns for grid in one.values()]) < 40
 
 
 def test_any_number_of_threads_and_layers_is_one_picture() -> None:

@@ -223,6 +223,40 @@ def test_renders_of_a_scene_have_its_flare(tmp_path: Path, capsys: pytest.Captur
         assert said in capsys.readouterr().err
 
 
+def test_rendered_frames_have_the_same_lights_and_layers(tmp_path: Path) -> None:
+    """A camera that turns from one lamp to the other: each alone would be kept there, and its ghosts be the layers."""
+    scene, out = tmp_path / "scene.toml", tmp_path / "a.exr"
+    lamp = "{ position_m = [1.1, 1.2, 0.0], intensity = [0.0, 0.0, 4.0] }"
+    text = SCENE.replace("points = [", f"points = [{lamp}, ").replace(', illuminant = "2900 K"', "")
+    text = (
+        text.replace('colour_space = "ACEScg"', "")
+        .replace('white_balance = "2900 K"', "")
+        .replace("bins = 3", "bins = 6")
+    )
+    text = text.replace("[2.0, 1.0, 0.5]", "[3.0, 0.0, 0.0]").replace("brightest = 2", "brightest = 3")
+    scene.write_text(text + "most = 1\n")
+    words = ["render", str(scene), "--camera", "lenses/cooke_triplet_50.toml", "--layers", "beauty", "--quiet"]
+    keys = [
+        "--key",
+        "look-at=1:-0.3/1.3/0,3:0.5/1/0",
+        "--key",
+        "position=1:-0.3/1.3/2,3:0.5/1/2",
+        "--key",
+        "focus=1:2,3:1",
+    ]
+    names, red = [], []
+    for frame in ("1:1", "3:3", "1:3"):
+        assert main([*words, *keys, "--frames", frame, "-o", str(out), "--restart"]) == 0
+        found = [read_layers(file) for file in sorted(tmp_path.glob("a.*.exr"))]
+        names.append([sorted(layers) for layers in found])
+        red.append([layers["ghosts.R"].sum() > layers["ghosts.B"].sum() for layers in found])
+        for file in tmp_path.glob("a.*"):
+            file.unlink()
+    assert names[2][0] == names[2][1] == names[2][2] and len(names[2][0]) == 15
+    assert red[0] == [True] and red[1] == [False] and len(set(red[2])) == 1
+    assert names[0][0] != names[1][0]  # so the choice matters
+
+
 def test_ghosts_and_glare_are_all(tmp_path: Path) -> None:
     """Of the same seeds' photons; what scatters adds to the glare, and a share of the film is no share of the rest."""
     common = ["laikin_double_gauss_50", "--light", "12,5", "--width", "24", "--wavelengths", "2", "--quiet"]

@@ -124,6 +124,20 @@ def test_image_radius_rules() -> None:
     assert "half field" in why and radius / first_order(wider).efl_mm == pytest.approx(1.86, abs=0.03)
 
 
+@pytest.mark.parametrize("gap", [0.01, 0.5])
+def test_a_cover_glass_on_the_film_changes_little(gap: float) -> None:
+    """The light of a film point fills a speck of it; without field and image circle its rim would seem to be dark."""
+    tessar = replace(focused("brendel_tessar_100"), image_radius_mm=None, half_field_deg=None)
+    dark, _ = image_radius_mm(tessar)
+    *rows, last = tessar.surfaces
+    back = tessar.film_z_mm - tessar.vertices_mm[-2]
+    plate = Surface(math.inf, 3.0, 150.0, 1.5), Surface(math.inf, gap, 150.0)
+    rows = [*rows, replace(last, thickness_mm=back - 3.0 / 1.5 - gap), *plate]
+    covered = replace(tessar, surfaces=tuple(rows), film_z_mm=None).at()
+    assert image_radius_mm(covered)[0] == pytest.approx(dark, rel=0.05)
+    assert covered.film_z_mm - pupil_plane_z_mm(covered) > 10
+
+
 FILM_RADIUS = 18.0
 METHODS: dict[str, Callable[[Lens, float], RadialPupil]] = {
     "hull": hull_disc,

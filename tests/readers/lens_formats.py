@@ -7,8 +7,12 @@ import json
 import math
 from dataclasses import replace
 
+import pytest
+import torch
+
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.trace import Rays, trace
 
 
 class CannotSay(Exception):
@@ -186,3 +190,99 @@ def js(lens: Lens) -> str:
 
 
 WRITERS = {".zmx": zmx, ".seq": seq, ".len": osl, ".dat": dat, ".txt": txt, ".json": js}
+
+
+def optical_bench(lens: Lens) -> str:
+    """The text of the Optical Bench, for one state."""
+    head = ["[descriptive data]", f"title\t{lens.name}", "[constants]"]
+    gaps, rows, aspheres = [], [], []
+    odd = any(p % 2 for s in lens.surfaces for p, _ in s.asphere)
+    squares = any(p == 2 for s in lens.surfaces for p, _ in s.asphere)
+    if odd and squares:
+        raise CannotSay("odd powers and the 2nd")
+    powers = [*([2] if squares else []), *(range(3, 41) if odd else range(4, 41, 2))]
+    head += ["AsphericalOddCount\t19"] * odd + ["AsphericalA2"] * squares
+    for k, s in enumerate(lens.surfaces):
+        if s.cylinder or (s.stop and not math.isinf(s.radius_mm)):
+            raise CannotSay(s)
+        radius = "AS" if s.stop else "Infinity" if math.isinf(s.radius_mm) else repr(s.radius_mm)
+        gap = f"d{k + 1}" if k % 3 == 1 else repr(s.thickness_mm)
+        gaps += [f"d{k + 1}\t{s.thickness_mm!r}"] * (k % 3 == 1)
+        medium = ("", "") if s.n_d == 1 else (repr(s.n_d), "" if s.V_d is None else repr(s.V_d))
+        rows.append(f"{k + 1}\t{radius}\t{gap}\t{medium[0]}\t{s.diameter_mm!r}\t{medium[1]}")
+        if s.conic or s.asphere:
+            terms = dict(s.asphere)
+            if not set(terms) <= set(powers) or (s.conic and s.stop):
+                raise CannotSay(s)
+            aspheres.append(f"{k + 1}\t{radius}\t{s.conic!r}\t" + "\t".join(repr(terms.get(p, 0.0)) for p in powers))
+    n = first_order(lens).f_number
+    head += ["[variable distances]", f"F-Number\t{n!r}", "Magnification\t0", "d0\tInfinity", *gaps]
+    return "\n".join([*head, "[lens data]", *rows, "[aspherical data]", *aspheres, "[figure]", "anything", ""])
+
+
+def flaresim(lens: Lens) -> str:
+    """A .lens file with semi-diameters, as the format has them."""
+    rows = []
+    for s in lens.surfaces:
+        if s.conic or s.asphere or (s.stop and not math.isinf(s.radius_mm)):
+            raise CannotSay(s)
+        radius = "stop" if s.stop else "0" if math.isinf(s.radius_mm) else repr(s.radius_mm)
+        kind = {None: "", "x": "cyl_y", "y": "cyl_x"}[s.cylinder]
+        rows.append(f"  {radius} {s.thickness_mm!r} {s.n_d!r} {s.V_d or 0.0!r} {s.semi_diameter_mm!r} 1 {kind} # row")
+    return "\n".join(["# A comment", f"name: {lens.name}", "focal_length: 0", "", "surfaces:", *rows, ""])
+
+
+def camera_toml(lens: Lens) -> str:
+    """The TOML of a lens camera for Blender."""
+    kinds = {None: "spherical", "x": "cylindrical_x", "y": "cylindrical_y"}
+    text = f'[lens]\nname = "{lens.name}"\nfocal_length = {first_order(lens).efl_mm!r}\nmax_fstop = '
+    text += f'{first_order(lens).f_number!r}\ncoating = "multi"\n'
+    for s in lens.surfaces:
+        terms = dict(s.asphere)
+        if any(p % 2 or p < 4 for p in terms) or (s.stop and not math.isinf(s.radius_mm)):
+            raise CannotSay(s)
+        curved = bool(terms or s.conic)
+        if curved and s.cylinder:
+            raise CannotSay(s)
+        kind = "stop" if s.stop else "aspheric" if curved else kinds[s.cylinder]
+        text += f'[[surface]]\ntype = "{kind}"\nradius = {0.0 if math.isinf(s.radius_mm) else s.radius_mm!r}\n'
+        text += f"thickness = {s.thickness_mm!r}\nior = {s.n_d!r}\naperture = {s.diameter_mm!r}\n"
+        text += f"abbe_v = {s.V_d or 0.0!r}\n"
+        if curved:
+            listed = [terms.get(p, 0.0) for p in range(4, max(terms, default=2) + 1, 2)]
+            text += f"conic = {s.conic!r}\naspheric_coeffs = {listed!r}\n"
+    return text
+
+
+# Rims of these are somebody's measures of a drawing.
+DRAWN = {".bench.txt": optical_bench, ".lens": flaresim, ".camera.toml": camera_toml}
+
+
+def beam(lens: Lens, count: int = 60) -> Rays:
+    """Light from the scene at up to 6 degrees to each side, over the entrance pupil and a little beyond it."""
+    g = torch.Generator().manual_seed(1)
+    u = 2 * torch.rand((4, count), generator=g, dtype=torch.float64) - 1
+    d = torch.stack([0.1 * u[0], 0.1 * u[1], torch.ones(count, dtype=torch.float64)])
+    d = d / d.norm(dim=0)
+    pupil = first_order(lens)
+    semi = 0.55 * pupil.entrance_pupil_diameter_mm
+    start = torch.stack([semi * u[2], semi * u[3], torch.full_like(u[0], pupil.entrance_pupil_z_mm)])
+    # Back to well in front of the lens.
+    travel = (pupil.entrance_pupil_z_mm + lens.surfaces[0].diameter_mm) / d[2]
+    return Rays(*(start - travel * d), *d)
+
+
+def assert_same_optics(found: Lens, expected: Lens) -> None:
+    """Paraxial figures in both meridians to 1e-9, and real rays to 1e-9 mm of a 50 mm lens with the same endings."""
+    for axis in ("x", "y"):
+        a, b = (first_order(lens, meridian=axis) for lens in (found, expected))
+        for key in ("efl_mm", "back_focus_mm", "entrance_pupil_diameter_mm", "front_focal_z_mm"):
+            assert getattr(a, key) == pytest.approx(getattr(b, key), rel=1e-9, abs=1e-9), key
+    rays = beam(expected)
+    for wavelength_nm in (587.5618, 450.0):
+        there, here = (trace(lens, rays, wavelength_nm, towards="film") for lens in (found, expected))
+        assert torch.equal(there.status, here.status)
+        tolerance = 2e-11 * abs(first_order(expected).efl_mm)
+        for p, q in zip(there.rays, here.rays, strict=True):
+            assert (p - q).abs().max() < tolerance + 1e-12
+        assert (here.status == 0).any()

@@ -7,51 +7,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import torch
 from command_line import failure
-from lens_formats import WRITERS, CannotSay, plain
+from lens_formats import WRITERS, CannotSay, assert_same_optics, plain
 from shipped import PATHS
 
 from neurolens.base.errors import InputError
 from neurolens.cli import main
 from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
-from neurolens.optics.trace import Rays, trace
 from neurolens.readers.any_format import read_any
 from neurolens.readers.source import MAX_BYTES
 
 NO_DISPERSION = (".len", ".dat", ".txt")
-
-
-def beam(lens: Lens, count: int = 60) -> Rays:
-    """Light from the scene at up to 6 degrees to each side, over the entrance pupil and a little beyond it."""
-    g = torch.Generator().manual_seed(1)
-    u = 2 * torch.rand((4, count), generator=g, dtype=torch.float64) - 1
-    d = torch.stack([0.1 * u[0], 0.1 * u[1], torch.ones(count, dtype=torch.float64)])
-    d = d / d.norm(dim=0)
-    pupil = first_order(lens)
-    semi = 0.55 * pupil.entrance_pupil_diameter_mm
-    start = torch.stack([semi * u[2], semi * u[3], torch.full_like(u[0], pupil.entrance_pupil_z_mm)])
-    # Back to well in front of the lens.
-    travel = (pupil.entrance_pupil_z_mm + lens.surfaces[0].diameter_mm) / d[2]
-    return Rays(*(start - travel * d), *d)
-
-
-def assert_same_optics(found: Lens, expected: Lens) -> None:
-    """Paraxial figures in both meridians to 1e-9, and real rays to 1e-9 mm of a 50 mm lens with the same endings."""
-    for axis in ("x", "y"):
-        a, b = (first_order(lens, meridian=axis) for lens in (found, expected))
-        for key in ("efl_mm", "back_focus_mm", "entrance_pupil_diameter_mm", "front_focal_z_mm"):
-            assert getattr(a, key) == pytest.approx(getattr(b, key), rel=1e-9, abs=1e-9), key
-    rays = beam(expected)
-    for wavelength_nm in (587.5618, 450.0):
-        there, here = (trace(lens, rays, wavelength_nm, towards="film") for lens in (found, expected))
-        assert torch.equal(there.status, here.status)
-        tolerance = 2e-11 * abs(first_order(expected).efl_mm)
-        for p, q in zip(there.rays, here.rays, strict=True):
-            assert (p - q).abs().max() < tolerance + 1e-12
-        assert (here.status == 0).any()
 
 
 @pytest.mark.parametrize("suffix", WRITERS)

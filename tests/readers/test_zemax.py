@@ -9,7 +9,7 @@ import pytest
 from lens_formats import swapped as swapped_in
 from shipped import singlet_mm
 
-from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.errors import AssumedWarning, InputError, NeurolensWarning
 from neurolens.optics import catalogue
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
@@ -128,6 +128,12 @@ def test_units_scale_every_length(tmp_path: Path) -> None:
     assert read(swapped("UNIT MM X W X CM MR CPMM\n", ""), tmp_path, Given(units="in")) == inches
 
 
+def test_a_q_type_asphere_says_how_its_rows_were_taken(tmp_path: Path) -> None:
+    block = "TYPE QED_TYPE\n  CURV 0.02\n  CONI -1\n  PARM 1 1\n  XDAT 1 1\n  XDAT 2 10\n  XDAT 3 0.5"
+    with pytest.warns(AssumedWarning, match="PARM 1 is taken as 0 for Qbfs"):
+        read(swapped('TYPE STANDARD\n  CURV 2.0E-2 0 0 0 0 ""', block), tmp_path)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -151,6 +157,12 @@ def test_what_is_left_out_is_told(old: str, new: str, message: str, tmp_path: Pa
         ("TYPE TOROIDAL\n  CURV 0.02\n  PARM 1 0\n  XDAT 1 0 0 0 1\n  XDAT 2 100 0 0 1", (50, 0, {}, "y")),
         ("TYPE TOROIDAL\n  CURV 0.0\n  PARM 1 40", (40, 0, {}, "x")),
         ("TYPE TOROIDAL\n  CURV 0.025\n  PARM 1 40", (40, 0, {}, None)),
+        ("TYPE XASPHERE\n  CURV 0.02\n  CONI -1\n  XDAT 1 2\n  XDAT 2 10\n  XDAT 4 2E-6", (50, -1, {4: 2e-10}, None)),
+        ("TYPE XOSPHERE\n  CURV 0.02\n  XDAT 1 3\n  XDAT 2 10\n  XDAT 5 2E-6", (50, 0, {3: 2e-9}, None)),
+        (
+            "TYPE QED_TYPE\n  CURV 0.02\n  CONI -1\n  PARM 1 1\n  XDAT 1 1\n  XDAT 2 10\n  XDAT 3 0.5",
+            (50, -1, {4: 5e-5}, None),
+        ),
         ("TYPE BICONICX\n  CURV 0.02\n  CONI -2\n  PARM 1 0\n  PARM 2 3", (50, -2, {}, "y")),
         ("TYPE BICONICX\n  CURV 0\n  PARM 1 40\n  PARM 2 -3", (40, -3, {}, "x")),
         ("TYPE BICONICX\n  CURV 0.025\n  CONI -1\n  PARM 1 40\n  PARM 2 -1", (40, -1, {}, None)),
@@ -159,7 +171,7 @@ def test_what_is_left_out_is_told(old: str, new: str, message: str, tmp_path: Pa
 def test_surface_types(block: str, shape: tuple[float, float, dict[int, float], str | None], tmp_path: Path) -> None:
     lens = read(swapped('TYPE STANDARD\n  CURV 2.0E-2 0 0 0 0 ""', block), tmp_path)
     s = lens.surfaces[0]
-    assert (pytest.approx(s.radius_mm), s.conic, dict(s.asphere), s.cylinder) == shape
+    assert (pytest.approx(s.radius_mm), s.conic, pytest.approx(dict(s.asphere)), s.cylinder) == shape
 
 
 @pytest.mark.parametrize(
@@ -171,6 +183,12 @@ def test_surface_types(block: str, shape: tuple[float, float, dict[int, float], 
         ("ENPD 10", "ENPD 0", r"line 7, ENPD: got 0.0, expected a number above 0"),
         ("GLAS N-BK7", "GLAS N-BK8", r"GLAS: got 'N-BK8', expected a glass.*N-BK7"),
         ("GLAS N-BK7 0", "GLAS N-BK7 4", r"GLAS: got 'N-BK7 with solve 4'"),
+        ("TYPE STANDARD\n  CURV -2", "TYPE PARAXIAL\n  CURV -2", r"TYPE: got 'PARAXIAL'"),
+        ("TYPE STANDARD\n  CURV -2", "TYPE QT\n  CONI 1\n  XDAT 1 1\n  XDAT 3 1\n  CURV -2", r"CONI of QT: got 1.0"),
+        ("TYPE STANDARD\n  CURV -2", "TYPE QT\n  PARM 1 2\n  XDAT 1 1\n  XDAT 3 1\n  CURV -2", r"0 \(Qbfs\) or 1"),
+        ("TYPE STANDARD\n  CURV -2", "TYPE XASPHERE\n  XDAT 1 1.5\n  CURV -2", r"XDAT 1 of XASPHERE: got 1.5"),
+        ("TYPE STANDARD\n  CURV -2", "TYPE XASPHERE\n  XDAT 1 1\n  XDAT 4 1\n  CURV -2", r"XDAT 4 of XASPHERE"),
+        ("TYPE STANDARD\n  CURV -2", "TYPE XOSPHERE\n  XDAT 1 1\n  XDAT 3 1\n  CURV -2", r"a cone's tip"),
         ("GLAS N-BK7", "GLAS MIRROR", r"line 29, GLAS: got 'MIRROR'.*no mirrors"),
         ("GLAS N-BK7 0 0 1.5 4.0E+1", "GLAS ___BLANK 1 0 0.5 60", r"index: got 0.5"),
         ("SURF 2", "SURF 4", r"SURF: got '4', expected surface 2"),

@@ -7,6 +7,7 @@ properties: the file renders where the extension is missing, and keyframes and d
 from __future__ import annotations
 
 import json
+import math
 from typing import Any
 
 import bpy
@@ -18,6 +19,7 @@ _CAMERA = (
     "type", "custom_mode", "custom_filepath", "custom_bytecode", "custom_bytecode_hash",
     "sensor_fit", "sensor_width", "sensor_height", "lens",
 )  # fmt: skip
+_RAYS = (24, 14)  # across and down, that tell the depths in view
 _TEXT = "neurolens "  # the names of our shaders in a file start so
 _ZOOM = 'cycles_custom["zoom_mm"]'
 
@@ -71,6 +73,20 @@ def focus_m(found: Any) -> float:
     frame = found.matrix_world.normalized()
     away = dof.focus_object.matrix_world.translation - frame.translation
     return abs(float(away.dot(frame.col[2].xyz)))
+
+
+def depths_in_view(context: Any, found: Any, setting: Setting, efl_mm: float) -> list[float]:
+    """Depths along the view, in m, of what rays of a pinhole of this focal length meet; inf where they meet nothing."""
+    graph = context.evaluated_depsgraph_get()
+    frame = found.evaluated_get(graph).matrix_world.normalized()
+    right, up, back = (frame.col[k].xyz for k in range(3))
+    (width, height), (across, down), depths = setting.sensor_mm, _RAYS, []
+    for k in range(across * down):
+        x, y = ((k % across + 0.5) / across - 0.5) * width, ((k // across + 0.5) / down - 0.5) * height
+        way = right * (x / efl_mm) + up * (y / efl_mm) - back
+        hit, point, *_ = context.scene.ray_cast(graph, frame.translation, way.normalized())
+        depths.append((frame.translation - point).dot(back) * setting.unit_m if hit else math.inf)
+    return depths
 
 
 def sensor_mm(camera: Any, render: Any) -> tuple[float, float]:

@@ -46,8 +46,35 @@ class Variant:
 
 
 @dataclass(frozen=True)
+class Field:
+    """What a lens, wide open, does to its picture at film radii, focused far away (first row) and near (second).
+
+    Attributes:
+        radius_mm: rising. near_m: the second row's focus. distortion_um: away from where a thin lens has it. blur_um:
+            diameter of what is in focus. light: over that of the middle.
+    """
+
+    radius_mm: tuple[float, ...]
+    near_m: float
+    distortion_um: tuple[tuple[float, ...], ...]
+    blur_um: tuple[tuple[float, ...], ...]
+    light: tuple[tuple[float, ...], ...]
+
+    def at(self, rows: Sequence[Sequence[float]], radius_mm: float, focus_m: float) -> float:
+        """The largest value (of light the least) up to a radius, between the rows by the inverse focus."""
+        share = min(self.near_m / max(focus_m, 1e-6), 1.0)
+        values = [a + share * (b - a) for a, b in zip(*rows, strict=True)]
+        inside = [v for r, v in zip(self.radius_mm, values, strict=True) if r <= radius_mm]
+        for k in range(1, len(values)):
+            low, high = self.radius_mm[k - 1 : k + 1]
+            if low < radius_mm < high:
+                inside.append(values[k - 1] + (values[k] - values[k - 1]) * (radius_mm - low) / (high - low))
+        return max(inside) if rows is not self.light else min(inside)
+
+
+@dataclass(frozen=True)
 class LensFacts:
-    """One lens of the menu; `variants` by kind, `picture` None without a thumbnail."""
+    """One lens of the menu; `variants` by kind, `picture` None without a thumbnail, `field` where it is not known."""
 
     lens_id: str
     name: str
@@ -57,6 +84,7 @@ class LensFacts:
     source: str
     picture: Path | None
     variants: dict[str, Variant]
+    field: Field | None = None
 
     @property
     def line(self) -> str:
@@ -118,7 +146,19 @@ def _lens(folder: Path, entry: dict[str, Any]) -> LensFacts:
         source=str(entry.get("source") or ""),
         picture=None if picture is None else _inside(folder, picture),
         variants=variants,
+        field=None if entry.get("field") is None else _field(entry["field"]),
     )
+
+
+def _field(entry: dict[str, Any]) -> Field:
+    radius = tuple(map(float, entry["radius_mm"]))
+    rows = {
+        name: tuple(tuple(map(float, row)) for row in entry[name]) for name in ("distortion_um", "blur_um", "light")
+    }
+    whole = len(radius) > 0 and list(radius) == sorted(radius)
+    if not whole or any(len(v) != 2 or {len(row) for row in v} != {len(radius)} for v in rows.values()):
+        raise ValueError("a field of rising radii, and two rows of each quantity")
+    return Field(radius_mm=radius, near_m=float(entry["near_m"]), **rows)
 
 
 def _inside(folder: Path, name: str) -> Path:

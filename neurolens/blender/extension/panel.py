@@ -11,6 +11,7 @@ import bpy.utils.previews
 
 from . import camera as on_camera
 from .library import KINDS, LensError, LensFacts, error_px, notes, read_library, refusals, refused, too_large
+from .needs import needs
 
 _FIRST = ("f_number", "focus_m", "zoom_mm")  # of the settings, before the others
 _LABELS = {  # where Blender would show the name alone
@@ -64,7 +65,7 @@ def _lens_items(_props: Any, _context: Any) -> list[tuple[str, str, str, int, in
 
 def _changed(props: Any, context: Any) -> None:
     """A lens chosen in the menu of a camera that carries one is put on at once."""
-    props.message = ""
+    props.message = props.advice = ""
     camera = props.id_data
     if not on_camera.applied(camera) or props.busy:
         return
@@ -94,6 +95,14 @@ class CameraSettings(bpy.types.PropertyGroup):
         "message": bpy.props.StringProperty(options={"HIDDEN", "SKIP_SAVE"}),
         "before": bpy.props.StringProperty(options={"HIDDEN"}),
         "on": bpy.props.StringProperty(options={"HIDDEN"}),
+        "tolerance_px": bpy.props.FloatProperty(
+            name="Tolerance",
+            description="Error of place and blur that is allowed, in pixels of this render",
+            default=0.25,
+            min=0.001,
+            soft_max=5.0,
+        ),
+        "advice": bpy.props.StringProperty(options={"HIDDEN", "SKIP_SAVE"}),
         "busy": bpy.props.BoolProperty(options={"HIDDEN", "SKIP_SAVE"}),
     }
 
@@ -172,6 +181,22 @@ class NEUROLENS_OT_take_back(_Operator):
         on_camera.take_back(context.scene, found)
 
 
+class NEUROLENS_OT_needs(_Operator):
+    """Look at the depths in view, and say whether this shot needs the chosen lens: or a pinhole, or Cycles' own depth
+    of field, would show the same"""
+
+    bl_idname = "neurolens.needs"
+    bl_label = "What Does This Shot Need?"
+
+    def act(self, context: Any, found: Any, props: Any) -> None:
+        lens, setting = lens_of(props), on_camera.setting_of(context.scene, found)
+        opened = setting.f_number or (found.data.dof.aperture_fstop if found.data.dof.use_dof else lens.f_number)
+        depths = on_camera.depths_in_view(context, found, setting, lens.efl_mm)
+        told = needs(lens, setting, depths, opened, props.tolerance_px)
+        props.advice = "\n".join(told.why)
+        self.report({"INFO"}, told.why[0])
+
+
 class NEUROLENS_OT_reload(bpy.types.Operator):
     """Read the library again, after `neurolens blender add`"""
 
@@ -236,6 +261,10 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
             layout.operator("neurolens.take_back", icon="LOOP_BACK")
             self._draw_settings(camera)
         layout.operator("neurolens.reload", icon="FILE_REFRESH")
+        layout.prop(camera.neurolens, "tolerance_px")
+        layout.operator("neurolens.needs", icon="QUESTION")
+        for line in camera.neurolens.advice.splitlines():
+            _wrapped(layout, line, "INFO")
         error = error_px(variant, setting)
         layout.label(text="Every surface is traced" if error is None else f"Error: {error:.2g} pixels (RMS)")
         for line in (*wrong, *notes(variant, setting)):
@@ -279,4 +308,7 @@ def _wrapped(layout: Any, text: str, icon: str, width: int = 60) -> None:
             line = f"{line} {word}".strip()
 
 
-CLASSES = (CameraSettings, NEUROLENS_OT_apply, NEUROLENS_OT_take_back, NEUROLENS_OT_reload, NEUROLENS_PT_lens)
+CLASSES = (
+    CameraSettings, NEUROLENS_OT_apply, NEUROLENS_OT_take_back, NEUROLENS_OT_needs, NEUROLENS_OT_reload,
+    NEUROLENS_PT_lens,
+)  # fmt: skip

@@ -1,4 +1,4 @@
-"""Shaders of `neurolens export --to osl`: of a model, or of a lens itself, every surface traced."""
+"""Shaders for Blender's Cycles (`neurolens export --to osl`): of a model, or of a lens itself, every surface traced."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
+from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress, Report
-from neurolens.commands.arguments import RANGE
 
 if TYPE_CHECKING:
     from neurolens.cameras.osl import OslLens, Seen
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 # Of an exact lens: its wavelengths; its nearest focus in focal lengths; best focus lies beside the paraxial one by less
 # than this share of the film's travel.
 LIGHT_NM, _NEAR_EFL, _SPARE = (400.0, 700.0), 10.0, 0.1
-_IDLE = 5e-4  # of the domain's rays: gates that alone block fewer go, and darken no pixel by a thousandth
+IDLE = 5e-4  # of the domain's rays: gates that alone block fewer go, and darken no pixel by a thousandth
 MAX_STEPS = 12_000  # of a ray: compilers take minutes for more
 
 
@@ -60,8 +60,7 @@ def shader_of(file: Path, *, zoom: str | None = None, name: str | None = None, q
     from neurolens.surrogates.source import OSL, checked_name, lines_of
 
     with Progress(quiet=quiet).stage(f"fit the pupil of {file.stem}") as report:
-        make = exact_lens if file.suffix == ".toml" else _of_model
-        lens_id, lens, told = make(file, zoom, report)
+        lens_id, lens, told = lens_of(file, zoom, report)
     own = checked_name(OSL, lens_id, name)
     passed = {f"{lens.f_number / share:.3g}": value for share, value in lens.passing().items()}
     near, least = lens.near_m
@@ -87,6 +86,12 @@ def shader_of(file: Path, *, zoom: str | None = None, name: str | None = None, q
         own, text, operations, tuple(p.name for p in parameters(lens)), passed, lens.film_radius_mm, lens.f_number,
         near or None, tuple(notes),
     )  # fmt: skip
+
+
+def lens_of(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:
+    """Of a model (.onnx) or a lens file: its id, itself, and lines on it. Arguments and errors as of `shader_of`."""
+    make = exact_lens if file.suffix == ".toml" else _of_model
+    return make(file, zoom, report)
 
 
 def _of_model(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:
@@ -115,7 +120,7 @@ def _smallest(file: Path, has_states: bool) -> Graph | None:
     from neurolens.surrogates.specialise import without_idle_gates
     from neurolens.surrogates.stored import load_fitted
 
-    (model,) = without_idle_gates((load_fitted(file),), _IDLE)
+    (model,) = without_idle_gates((load_fitted(file),), IDLE)
     return model_graph(model, largest_angle(model), SCALARS)
 
 
@@ -132,12 +137,11 @@ def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLe
     """
     from neurolens.cameras.exact import check_bare
     from neurolens.cameras.osl import osl_lens, states_between
-    from neurolens.commands.export_lens import gap_axis
     from neurolens.modelfile.axes import product, weights
     from neurolens.optics.focusing import focus_states
     from neurolens.optics.lensfile import read_lens
     from neurolens.optics.pupils import pupil_plane_z_mm
-    from neurolens.surrogates.states import StateSpace, axes_of
+    from neurolens.surrogates.states import StateSpace, axes_of, gap_axis
 
     lens, state = read_lens(file), None if zoom == RANGE else zoom
     ranged, internal = zoom == RANGE, bool(focus_states(lens))

@@ -1,0 +1,377 @@
+"""Prove plans: whether the camera chosen keeps its budget against the exact lens, and what the cheapest such one costs.
+
+Every case is a lens and a scene at 1920 pixels across a film that the lens lights; budgets are 1, 0.25 and 0.05 pixels.
+A plan is made for each; then all cameras are tried: all that plans know, and polynomials of more sizes than theirs.
+Each is measured at places, pupil samples and wavelengths that no plan saw, and those chosen once more in renders
+(`plan_errors`). A minute of a core for each case; those that are in the table are kept. Writes plans.md, plans.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments import lab, plan_errors
+from neurolens.base.progress import Report
+from neurolens.cameras.build import Shot, ideal_as, make_camera
+from neurolens.cameras.contract import Camera
+from neurolens.cameras.exact import FusedExactCamera
+from neurolens.cameras.warped import Warped
+from neurolens.evaluate import footprints as prints
+from neurolens.evaluate import plan as plans
+from neurolens.evaluate.experiment import near_limit_m
+from neurolens.evaluate.probe import COUNTED, LIGHT, Probed, effects_of, probe
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens
+from neurolens.optics.pupils import image_radius_mm
+from neurolens.render.scene import Scene, load_scene
+from neurolens.surrogates.bases import pinned_threads
+
+LENSES = (
+    "laikin_double_gauss_50", "ogawa_zoom_70_200@135mm", "horimoto_fisheye_16", "phone_lens_6", "cooke_anamorphic_42",
+    "canon_aspheric_50",
+)  # fmt: skip
+SCENES = ("distant", "garden", "room", "lights")  # stopped down and grey, to wide open among coloured lights
+BUDGETS = (1.0, 0.25, 0.05)
+TARGETS: tuple[plans.Target, ...] = ("render", "onnx")
+MORE_TERMS = (10, 19)  # besides those of plans
+_WIDTH = 1920
+_LIT = 0.95  # of the image circle that the film's corners reach
+_LARGEST_MM = 36.0
+_PIECE_PX, _SAMPLES, _SEEDS = 40, 24, 4
+_TRIED_PX = 1.5  # error in the plan's places up to which a camera may hold at others, and is timed
+_UNSURE, _FEWEST = 0.5, 3  # noise over the budget beyond which a piece tells nothing; pieces that decide
+_EFFECT = 0.2, 0.02  # relative, or in pixels: what the probe's effects may be wrong by
+
+
+@dataclass(frozen=True)
+class Case:
+    """A lens, after "@" its zoom state, and a scene."""
+
+    lens: str
+    scene: str
+
+    @property
+    def name(self) -> str:
+        """For files and --only."""
+        return f"{self.lens}-{self.scene}"
+
+    @property
+    def state(self) -> str | None:
+        """Of the zoom."""
+        return self.lens.partition("@")[2] or None
+
+    @property
+    def file(self) -> Path:
+        """Of the lens."""
+        return lab.LENSES / f"{self.lens.partition('@')[0]}.toml"
+
+    def load(self) -> tuple[Lens, Scene]:
+        """The lens in its state, and the scene on a film that suits it."""
+        lens = read_lens(self.file).at(zoom=self.state)
+        return lens, suited(load_scene(lab.SCENES / f"{self.scene}.toml"), lens)
+
+    def shipped(self) -> list[Path]:
+        """Models of this state."""
+        stem = f"{self.file.stem}-{self.state}" if self.state else self.file.stem
+        return sorted(lab.MODELS.glob(f"{stem}.*.onnx"))
+
+
+CASES = tuple(Case(lens, scene) for lens in LENSES for scene in SCENES)
+
+
+def suited(scene: Scene, lens: Lens, f_number: float | None = None, focus_m: float | None = None) -> Scene:
+    """A scene at 1920 x 1080 pixels on a film that the lens lights, as far away as it has to be in focus.
+
+    Args:
+        f_number: as far as the lens opens; else as the scene asks, and of "lights", at night and near, wide open.
+        focus_m: distance of what is in focus; else that of the scene, but no nearer than the lens focuses.
+    """
+    shot = scene.settings.camera
+    across = min(2 * _LIT * image_radius_mm(lens)[0] * 16 / math.hypot(16, 9), _LARGEST_MM)
+    focus = max(shot.focus_m, near_limit_m(lens)) if focus_m is None else focus_m
+    eye, target = np.array(shot.position_m), np.array(shot.look_at_m)
+    x, y, z = (float(v) for v in eye - (focus - shot.focus_m) * (target - eye) / np.linalg.norm(target - eye))
+    widest = first_order(lens).f_number
+    asked = f_number or (0.0 if scene.name == "lights" else shot.f_number or widest)
+    camera = replace(
+        shot, position_m=(x, y, z), focus_m=focus, f_number=max(asked, widest), film_width_mm=across,
+        film_height_mm=across * 9 / 16, width=_WIDTH, height=_WIDTH * 9 // 16,
+    )  # fmt: skip
+    return replace(scene, settings=replace(scene.settings, camera=camera))
+
+
+# ---- One case. -------------------------------------------------------------------------------------------------------
+
+
+def measure_case(case: Case, folder: Path, report: Report) -> dict[str, Any]:
+    """Plan, try all, measure; see the module."""
+    lens, scene = case.load()
+    began = time.process_time()
+    found = probe(scene, lens)
+    probe_s = time.process_time() - began
+    asked = found.asked
+    shot = Shot(asked.film_mm, asked.focus_m, asked.f_number, zoom=case.state, wavelength_nm=asked.wavelength_nm)
+    compiled = "fused:" if isinstance(found.exact, FusedExactCamera) else ""
+    exact = make_camera(
+        f"{compiled}{lens.path}", shot
+    )  # as a render has it: a plan's own has another outline of pupils
+    places = plan_errors.fresh_places(scene, exact)
+    fresh = Fresh(exact, places, plan_errors.fresh_prints(exact, places))
+    report(0.1)
+    rows: dict[str, dict[str, Any]] = {}
+    chosen: dict[str, plans.Choice] = {}
+    decisions: list[dict[str, Any]] = []
+    sizes: list[Path] = []
+    for number, target in enumerate(TARGETS):
+        began = time.process_time()
+        if number == 0:
+            picks = plans.candidates(found, BUDGETS, target, models=case.shipped(), folder=folder)
+            fitted = [folder / f"{c.name}.onnx" for c in picks if c.how == plans._SHOT]
+        else:  # fits are the same for all targets
+            picks = plans.candidates(found, BUDGETS, target, models=[*case.shipped(), *fitted])
+        plan_s = probe_s + time.process_time() - began
+        report(0.2 + 0.3 * number)
+        every = {c.name: c for c in picks} | {c.name: c for c in _more(found, target, folder, picks, sizes)}
+        report(0.3 + 0.3 * number)
+        for choice in every.values():
+            row = rows.setdefault(choice.name, {"plan_px": choice.error_px, "plan_light": choice.light_error})
+            row[f"cost_{target}"] = choice.cost if math.isfinite(choice.cost) else None
+            if "px" not in row and row["plan_px"] <= _TRIED_PX:
+                camera = camera_of(choice, found, case.state)
+                apart, light = plan_errors.by_rays(camera, fresh.places, fresh.seen, found.asked.pixel_mm)
+                row |= {"px": _counted(apart), "light": _counted(light)}
+        for budget in BUDGETS:
+            best = plans.decided(found, picks, budget, target).best
+            decisions.append(_decision(target, budget, best, list(every.values()), rows) | {"plan_s": plan_s})
+            if best is not None and best.name != "exact":
+                chosen.setdefault(best.name, best)
+    report(0.7)
+    told = _by_renders(case, scene, found, fresh, list(chosen.values()))
+    for decision in decisions:
+        decision["render"] = _seen_in(told.get(decision["chosen"]), decision["budget_px"])
+    dense = replace(found, places=places, seen=fresh.seen, thin_seen=plan_errors.fresh_prints(_thin(found), places))
+    facts = {"lens": case.lens, "scene": case.scene, "f_number": found.asked.f_number}
+    facts |= {"pixel_um": 1e3 * found.asked.pixel_mm, "nearest_m": found.asked.nearest_m}
+    return facts | {"effects": _effects(found, dense), "cameras": rows, "decisions": decisions}
+
+
+def _more(
+    found: Probed, target: plans.Target, folder: Path, picks: Sequence[plans.Choice], made: list[Path]
+) -> Iterator[plans.Choice]:
+    """Polynomials of the shot of all sizes that the plan fitted without their cost, or not at all, made as it does.
+
+    None are larger than what has half of the least budget: they cost more. `made` keeps files for the next target.
+    """
+    trial = plans._Trial(found, target, _TRIED_PX)
+    costs = {c.name: c for c in picks}
+    fit: Any = None
+    for terms in sorted({*plans.shot_terms(found), *MORE_TERMS}):
+        file = folder / f"{Path(found.lens.path).stem}.shot-ols-{terms}.onnx"
+        if file.stem not in costs and file not in made:
+            fit = fit or plans.shot_fits(found, folder)
+            made.append(fit(terms)[0])
+        choice = costs.get(file.stem)
+        if choice is None or not math.isfinite(choice.cost):
+            choice = next(iter(plans._model(trial, file)), None)
+        if choice is not None:
+            yield choice
+            if choice.error_px < min(BUDGETS) / 2:
+                return
+
+
+def camera_of(choice: plans.Choice, found: Probed, state: str | None, smooth: bool = False) -> Camera:
+    """The camera that a plan names, as a render makes it; with `smooth`, a warped picture by tables of the field."""
+    asked = found.asked
+    shot = Shot(asked.film_mm, asked.focus_m, asked.f_number, wavelength_nm=asked.wavelength_nm)
+    if choice.camera.endswith(".onnx"):
+        return make_camera(choice.camera, shot)
+    if "ST map" not in choice.name:
+        return make_camera(choice.camera, replace(shot, zoom=state))
+    flat = ideal_as(f"{choice.name.partition(' ')[0]}:", found.exact.lens, Shot(asked.film_mm, asked.focus_m))
+    return Warped(flat, found.exact, asked.focus_m, tables=smooth)
+
+
+def _thin(found: Probed) -> Camera:
+    return ideal_as("thin:", found.exact.lens, Shot(found.asked.film_mm, found.asked.focus_m))
+
+
+def _counted(value: Any) -> float:
+    return float(np.percentile(value, COUNTED))
+
+
+def _decision(
+    target: str, budget: float, best: plans.Choice | None, every: Sequence[plans.Choice], rows: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What was chosen, whether it holds at fresh places, and the cheapest camera that does."""
+
+    def holds(name: str) -> bool:
+        return bool(rows[name].get("px", math.inf) <= budget and rows[name]["light"] <= LIGHT)
+
+    costs = {c.name: c.cost for c in every}
+    good = sorted((n for n, cost in costs.items() if math.isfinite(cost) and holds(n)), key=costs.__getitem__)
+    cheapest = good[0] if good else None
+    made: dict[str, Any] = {"target": target, "budget_px": budget, "chosen": best and best.name, "cheapest": cheapest}
+    if best is None:
+        return made | {"holds": cheapest is None, "px": None, "ratio": None}
+    ratio = costs[best.name] / costs[cheapest] if cheapest else None
+    return made | {"holds": holds(best.name), "ratio": ratio, **{k: rows[best.name][k] for k in ("px", "light")}}
+
+
+@dataclass(frozen=True)
+class Fresh:
+    """The exact lens as a render has it, places that no plan saw, and its footprints there."""
+
+    exact: Any
+    places: prints.Places
+    seen: prints.Footprints
+
+    def blur_px(self, film_mm: Any, pixel_mm: float) -> Any:
+        """RMS distance from the centroid of the footprints nearest to film points [2, K]."""
+        blur = prints.blur_mm(self.seen, self.places.share) / 2 / pixel_mm
+        apart = np.hypot(*(self.places.film_mm[:, :, None] - film_mm[:, None, :]))
+        return blur[apart.argmin(0)]
+
+
+def _by_renders(
+    case: Case, scene: Scene, found: Probed, fresh: Fresh, chosen: Sequence[plans.Choice]
+) -> dict[str | None, list[plan_errors.Moved]]:
+    """What some cameras do to pieces of the picture."""
+    centres = plan_errors.pieces_of(scene, fresh.exact, _PIECE_PX)
+    blur = fresh.blur_px(centres, found.asked.pixel_mm)
+    truth = plan_errors.rendered(scene, fresh.exact, centres, _PIECE_PX, _SAMPLES, _SEEDS)
+    made: dict[str | None, list[plan_errors.Moved]] = {}
+    for choice in chosen:
+        camera = camera_of(choice, found, case.state, smooth=True)
+        other = plan_errors.rendered(scene, camera, centres, _PIECE_PX, _SAMPLES, _SEEDS)
+        pairs = [(truth[:, k], other[:, k], float(blur[k])) for k in range(len(blur))]
+        made[choice.name] = [plan_errors.moved(*pair) for pair in pairs]
+    return made
+
+
+def _seen_in(pieces: Sequence[plan_errors.Moved] | None, budget_px: float) -> dict[str, Any] | None:
+    """The counted percentile of the pieces whose noise lets a budget be told; None where too few do."""
+    sure = [t for t in pieces or () if t.noise_px < _UNSURE * budget_px]
+    if len(sure) < _FEWEST:
+        return None
+    noise = float(np.median([t.noise_px for t in sure]))
+    return {"pieces": len(sure), "px": _counted([t.px for t in sure]), "noise_px": noise}
+
+
+def _effects(found: Probed, dense: Probed) -> list[dict[str, Any]]:
+    """What the probe says of each effect, and what it is at fresh places."""
+    truth = {e.name: e for e in effects_of(dense, 0.0)}
+    return [
+        {"name": e.name, "unit": e.unit, "probe": e.worth, "fresh": truth[e.name].worth}
+        for e in effects_of(found, 0.0)
+        if e.name != "diffraction"
+    ]
+
+
+def effect_holds(effect: Mapping[str, Any]) -> bool:
+    """Whether the probe is right about an effect."""
+    wrong = abs(effect["probe"] - effect["fresh"])
+    return bool(wrong <= max(_EFFECT[0] * effect["fresh"], _EFFECT[1]))
+
+
+# ---- The page. -------------------------------------------------------------------------------------------------------
+
+_HEAD = """\
+# Plans against all cameras tried
+
+{cases} of {all} cases, those measured so far: a lens and a scene ("distant": f/11, one line of light; "lights": wide
+open, near, coloured), 1920 pixels across the film, for our renderer and for onnxruntime. *px*: error of the camera
+chosen in pixels that 95% of the picture keep, at places, pupil samples and wavelengths that the plan did not see;
+*render*: the same from renders of pieces of the picture, as far as it is above the noise; a dash where too few pieces
+can tell. *times*: its cost over that of the cheapest camera that holds among all that were tried ({tried}, polynomials
+of {sizes} sizes among them).
+Made by `python -m experiments plans`."""
+_COLUMNS = lab.columns(
+    ("lens", "lens"), ("scene", "scene"), ("f/", "f_number", ".3g"), ("pixel um", "pixel_um", ".3g"), ("for", "target"),
+    ("budget px", "budget_px", "g"), ("chosen", lambda r: (r["chosen"] or "none").rpartition(".")[2]),
+    ("px", "px", ".2g"), ("light %", "light", ".2g", 100), ("render px", "render.px", ".2g"),
+    ("noise", "render.noise_px", ".1g"), ("holds", lambda r: "yes" if r["holds"] else "no"),
+    ("cheapest", lambda r: (r["cheapest"] or "none").rpartition(".")[2]), ("times", "ratio", ".2f"),
+    ("plan s", "plan_s", ".1f"),
+)  # fmt: skip
+
+
+def decisions_of(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """All decisions with their case."""
+    kept = ("lens", "scene", "f_number", "pixel_um")
+    return [{k: r[k] for k in kept} | d for r in rows for d in r["decisions"]]
+
+
+def render_holds(decision: Mapping[str, Any]) -> bool:
+    """Whether renders agree that a budget is kept, within twice their noise."""
+    told = decision["render"] or {}
+    return "px" not in told or told["px"] <= decision["budget_px"] + 2 * told["noise_px"]
+
+
+def goals(rows: Sequence[Mapping[str, Any]]) -> list[lab.Goal]:
+    """Of issue and page."""
+    made = decisions_of(rows)
+    if not made:
+        return []
+    told = [d for d in made if d["render"] and "px" in d["render"]]
+    effects = [e for r in rows for e in r["effects"]]
+    ratios = [d["ratio"] for d in made if d["ratio"] is not None and d["holds"]]
+    share = lambda kept: float(np.mean(list(kept))) if kept else None  # noqa: E731
+    return [
+        lab.Goal("budgets kept at fresh places, share", 0.95, share([d["holds"] for d in made]), at_least=True),
+        lab.Goal("budgets kept in renders, share", 0.95, share([render_holds(d) for d in told]), at_least=True),
+        lab.Goal("cost over the cheapest that holds, largest", 1.3, max(ratios, default=None)),
+        lab.Goal("the same, share within 1.3", 0.95, share([r <= 1.3 for r in ratios]), at_least=True),
+        lab.Goal("effects within 20% or 0.02 px, share", 1.0, share([effect_holds(e) for e in effects]), at_least=True),
+        lab.Goal("a plan for all three budgets, s of a core", 15.0, max(d["plan_s"] for d in made)),
+    ]
+
+
+def page(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The tables."""
+    wrong = [
+        {"lens": r["lens"], "scene": r["scene"]} | e for r in rows for e in r["effects"] if not effect_holds(e)
+    ]  # fmt: skip
+    tried = [len(r["cameras"]) for r in rows] or [0]
+    head = _HEAD.format(
+        cases=len(rows), all=len(CASES), tried=f"{min(tried)} to {max(tried)}", sizes=len({*plans._TERMS, *MORE_TERMS})
+    )
+    named = lab.columns(
+        ("lens", "lens"), ("scene", "scene"), ("effect", "name"), ("probe", "probe", ".3g"), ("fresh", "fresh", ".3g"),
+        ("", "unit"),
+    )  # fmt: skip
+    return lab.page(
+        head, lab.goal_table("goal", goals(rows)), lab.table(_COLUMNS, decisions_of(rows), "–"),
+        "Effects that the probe has wrong:" if wrong else "", lab.table(named, wrong) if wrong else "",
+    )  # fmt: skip
+
+
+OPTIONS = (
+    lab.option("--only", metavar="TEXT", default="", help="cases whose LENS-SCENE holds this text"),
+    lab.option("--again", action="store_true", help="measure the chosen cases again"),
+    lab.option("--models", metavar="DIR", type=Path, default=Path("runs/plans"), help="for them (default: runs/plans)"),
+    lab.out(),
+)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure what is missing, and write the tables after each case."""
+    lab.quiet_glasses()
+    cases = lab.chosen(CASES, lambda c: c.name, args.only, "plans")
+    maker = "experiments plans"
+    kept = lab.kept_rows(args.out / "plans.json", maker, lambda r: f"{r['lens']}-{r['scene']}", "cases")
+    missing = [c for c in cases if args.again or c.name not in kept]
+    with pinned_threads():
+        for case, report in lab.stages(missing, lambda c: c.name, args.quiet, 90.0):
+            kept[case.name] = measure_case(case, args.models / case.name, report)
+            rows = [kept[c.name] for c in CASES if c.name in kept]
+            lab.write_results(args.out, "plans", page(rows), {"cases": rows})
+    print(page([kept[c.name] for c in CASES if c.name in kept]))

@@ -1,0 +1,187 @@
+"""Measure what fitting on one shot gains over the models that ship, which know every stop, focus and wavelength.
+
+Typical shots of a lens: a portrait at f/2, a landscape at f/8, a close-up, lights at night. For each the error of the
+shipped polynomial (64 terms or the most below) on it, and the smallest polynomial fitted on the shot alone that has no
+more: coefficients, operations and nanoseconds of a ray of the whole camera as C. A minute of a core for each lens;
+those that are in the table are kept. Writes shots.md, shots.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from experiments import lab
+from experiments.plans import suited
+from neurolens.base.progress import Report
+from neurolens.cameras.fused import FusedCamera
+from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.evaluate import footprints as prints
+from neurolens.evaluate import plan as plans
+from neurolens.evaluate.costs import glsl_operations, ns_a_ray
+from neurolens.evaluate.experiment import near_limit_m
+from neurolens.evaluate.probe import COUNTED, LIGHT, Probed, probe
+from neurolens.optics.lensfile import read_lens
+from neurolens.render.scene import load_scene
+from neurolens.surrogates.bases import pinned_threads
+
+# All kinds: wide to long, f/1 to f/5.4, simple and not, from plastic, a zoom's default state.
+LENSES = (
+    "laikin_double_gauss_50", "canon_aspheric_50", "tajima_retrofocus_24", "sigler_telephoto_100", "phone_lens_6",
+    "brendel_tessar_100", "canon_gauss_35", "petzval_portrait_100", "horimoto_fisheye_16", "nikon_zoom_70_200",
+    "merte_biotar_100", "sony_sonnar_55",
+)  # fmt: skip
+SHIPPED_TERMS = 64
+_NEAR = 1.05  # of the nearest focus of models
+TERMS = (4, 6, 8, 11, 14, 18, 23, 28, 36, 46, SHIPPED_TERMS)
+
+
+@dataclass(frozen=True)
+class Sitting:
+    """A typical shot: its scene, stop (as far as the lens opens), and whether it is as near as the lens focuses."""
+
+    name: str
+    scene: str
+    f_number: float
+    near: bool = False
+
+
+SITTINGS = (
+    Sitting("portrait, f/2", "room", 2.0),
+    Sitting("landscape, f/8", "garden", 8.0),
+    Sitting("close-up, f/4", "room", 4.0, near=True),
+    Sitting("night lights, open", "lights", 0.1),
+)
+
+
+@dataclass(frozen=True)
+class Model:
+    """A polynomial on a shot: counted errors, in um on the film and of light; operations and ns of its camera."""
+
+    terms: int
+    um: float
+    light: float
+    operations: int
+    ns: float
+
+
+def measure_lens(name: str, folder: Path, report: Report) -> dict[str, Any]:
+    """All shots of a lens."""
+    lens = read_lens(lab.LENSES / f"{name}.toml").at()
+    shots = []
+    terms = max(n for n in range(SHIPPED_TERMS + 1) if (lab.MODELS / f"{name}.ols-{n}.onnx").is_file())
+    for number, sitting in enumerate(SITTINGS):
+        near = _NEAR * near_limit_m(lens) if sitting.near else None
+        scene = suited(load_scene(lab.SCENES / f"{sitting.scene}.toml"), lens, sitting.f_number, near)
+        found = probe(scene, lens)
+        shipped = _measured(found, lab.MODELS / f"{name}.ols-{terms}.onnx", terms)
+        own = _smallest(found, shipped, folder)
+        facts = {"shot": sitting.name, "f_number": found.asked.f_number, "focus_m": found.asked.focus_m}
+        shots.append(facts | {"shipped": asdict(shipped), "own": asdict(own)})
+        report((number + 1) / len(SITTINGS))
+    return {"lens": name, "shots": shots}
+
+
+def _smallest(found: Probed, shipped: Model, folder: Path) -> Model:
+    """The smallest polynomial of the shot with errors no larger than the shipped one's, by halves; else the largest."""
+    fit = plans.shot_fits(found, folder)
+    low, high = 0, len(TERMS) - 1
+    best = -1
+    while low <= high:
+        size = (low + high) // 2
+        um, light = _errors(found, _onnx(found, fit(TERMS[size])[0]))
+        # Light that a plan takes for right is no reason for more terms.
+        if um <= shipped.um and light <= max(shipped.light, LIGHT):
+            best, high = size, size - 1
+        else:
+            low = size + 1
+    return _measured(found, fit(TERMS[best])[0], TERMS[best])
+
+
+def _real(found: Probed) -> dict[str, Any]:
+    asked = found.asked
+    shot = {"film_mm": asked.film_mm, "focus_m": asked.focus_m, "f_number": asked.f_number}
+    return {**shot, "wavelength_nm": asked.wavelength_nm}
+
+
+def _onnx(found: Probed, file: Path) -> OnnxCamera:
+    return OnnxCamera(load_model(file), **_real(found))
+
+
+def _errors(found: Probed, camera: OnnxCamera) -> tuple[float, float]:
+    """Counted: of place and blur in um on the film, and of light."""
+    seen = prints.footprints(camera, found.places)
+    apart = prints.distance_mm(found.seen, seen, found.places.share)
+    light = np.abs(seen.light / np.maximum(found.seen.light, 1e-30) - 1)
+    um, dim = (float(np.percentile(np.where(np.isfinite(v), v, np.inf), COUNTED)) for v in (1e3 * apart, light))
+    return um, dim
+
+
+def _measured(found: Probed, file: Path, terms: int) -> Model:
+    camera = _onnx(found, file)
+    um, light = _errors(found, camera)
+    ns = ns_a_ray(FusedCamera(load_model(file), **_real(found)), found.places)
+    return Model(terms, um, light, glsl_operations(camera), ns)
+
+
+# ---- The page. -------------------------------------------------------------------------------------------------------
+
+_HEAD = """\
+# Models of one shot
+
+The shipped polynomial of {terms} terms a vector (60 of the laikin), for all stops, focus and wavelengths, on typical
+shots of 1920 pixels; and the smallest polynomial fitted to the shot alone whose error (95% of the picture, um on the
+film) is no larger, and of light neither, or within 1%. Operations and nanoseconds are of a ray of the whole camera as C
+on one thread: pupil, focus and decoding are in both. Made by `python -m experiments shots`."""
+_COLUMNS = lab.columns(
+    ("lens", "lens"), ("shot", "shot"), ("f/", "f_number", ".3g"), ("m", "focus_m", ".3g"),
+    ("shipped um", "shipped.um", ".2g"), ("own um", "own.um", ".2g"), ("terms", "own.terms"),
+    ("operations", lambda r: f"{r['shipped']['operations']} to {r['own']['operations']}"),
+    ("share", lambda r: r["own"]["operations"] / r["shipped"]["operations"], ".2f"),
+    ("ns", lambda r: f"{r['shipped']['ns']:.1f} to {r['own']['ns']:.1f}"),
+)  # fmt: skip
+
+
+def page(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The table."""
+    shots = [{"lens": r["lens"]} | s for r in rows for s in r["shots"]]
+
+    def middle(key: str) -> float | None:
+        ratios = [s["own"][key] / s["shipped"][key] for s in shots]
+        return median(ratios) if ratios else None
+
+    goals = [
+        lab.Goal("operations of the camera over the shipped model's, median", 0.5, middle("operations")),
+        lab.Goal("coefficients, median", 0.5, middle("terms")),
+        lab.Goal("nanoseconds, median", 0.5, middle("ns")),
+    ]
+    return lab.page(_HEAD.format(terms=SHIPPED_TERMS), lab.goal_table("goal", goals), lab.table(_COLUMNS, shots, "–"))
+
+
+OPTIONS = (
+    lab.ONLY,
+    lab.option("--again", action="store_true", help="measure the chosen lenses again"),
+    lab.option("--models", metavar="DIR", type=Path, default=Path("runs/shots"), help="for them (default: runs/shots)"),
+    lab.out(),
+)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure what is missing, and write the table after each lens."""
+    lab.quiet_glasses()
+    names = lab.chosen(LENSES, lambda n: n, args.only, "shots")
+    kept = lab.kept_rows(args.out / "shots.json", "experiments shots", lambda r: r["lens"], "lenses")
+    args.models.mkdir(parents=True, exist_ok=True)
+    with pinned_threads():
+        missing = [n for n in names if args.again or n not in kept]
+        for name, report in lab.stages(missing, lambda n: n, args.quiet, 60.0):
+            kept[name] = measure_lens(name, args.models, report)
+            rows = [kept[n] for n in LENSES if n in kept]
+            lab.write_results(args.out, "shots", page(rows), {"lenses": rows})
+    print(page([kept[n] for n in LENSES if n in kept]))

@@ -1,0 +1,114 @@
+"""How soon the page of `neurolens view` shows its first picture and each change, in a browser with software WebGL2.
+
+480 x 270 pixels, one sample, headless Chromium with SwiftShader (the extra "web"; Debian: chromium): the time from a
+setting to the first picture with it, and the processor's time that the GPU process of the browser took for it (Linux),
+which other work on the machine changes little: SwiftShader spreads it over the cores.
+Writes view_speed.md and view_speed.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import statistics
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from experiments import lab
+from neurolens.base.errors import InputError
+from neurolens.cli import main
+
+FLAGS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+OPTIONS = (
+    lab.option("--lens", metavar="LENS", default="petzval_portrait_100", help="lens (default: petzval_portrait_100)"),
+    lab.count("repeats", 7, "of each change (default: 7)"),
+    lab.out(),
+)
+FIRST_MS, CHANGE_MS = 3000, 200
+_ONE = "Object.assign(neurolens.set, {still: true, view: 'one'})"
+# Each change, `k` counting its repeats; the rest of the page stands as it was.
+CHANGES = {
+    "focus": "set.focus = 3 + 0.1 * k",
+    "stop": "set.f_number = 4 + 0.2 * k",
+    "blades": "set.blades = 5 + k % 8",
+    "wavelength": "set.wavelength = 450 + 10 * k",
+    "scene": "set.scene = ['chart', 'white', 'night'][k % 3]",
+    "exact": "set.a = 'exact', set.focus = 4 + 0.1 * k",
+    "network": "set.a = 'network', set.focus = 4 + 0.1 * k",
+    "thin lens": "set.a = 'thin', set.focus = 4 + 0.1 * k",
+    "wipe, polynomial and exact": "set.a = 'polynomial', set.view = 'wipe', set.focus = 5 + 0.1 * k",
+}
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure and write the table."""
+    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if browser is None:
+        raise InputError("experiments view", "browser", "(none)", f"one of {', '.join(BROWSERS)}")
+    from playwright.sync_api import sync_playwright
+
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as play:
+        page_file = Path(folder) / "view.html"
+        main(["view", args.lens, "--downloads", "glsl", "-o", str(page_file)])
+        opened = play.chromium.launch(executable_path=browser, args=list(FLAGS))
+        rows = [_first(opened, page_file, args.repeats)]
+        page = opened.new_page()
+        page.goto(page_file.as_uri())
+        page.evaluate(f"neurolens.ready.then(() => {_ONE})")
+        rows += [_change(page, name, script, args.repeats) for name, script in CHANGES.items()]
+        opened.close()
+    head = ("change", "least ms", "median ms", "processor ms", "wanted ms")
+    keys = ("least_ms", "median_ms", "processor_ms", "wanted_ms")
+    lines = [[r["change"], *("–" if r[key] is None else f"{r[key]:.0f}" for key in keys)] for r in rows]
+    text = lab.page("# The page in software WebGL", __doc__ or "", lab.machine_line(), lab.table(head, lines))
+    print(lab.write_results(args.out, "view_speed", text, {"machine": lab.machine(), "lens": args.lens, "rows": rows}))
+    return 0
+
+
+def _first(browser: Any, file: Path, repeats: int) -> dict[str, Any]:
+    """From opening the file to the first picture, shaders compiled."""
+    took = []
+    for _ in range(min(repeats, 5)):
+        page = browser.new_page()
+        page.goto(file.as_uri())
+        took.append(page.evaluate("neurolens.ready.then(() => performance.now())"))
+        page.close()
+    return _row("first picture", took, [], FIRST_MS)
+
+
+def _change(page: Any, name: str, script: str, repeats: int) -> dict[str, Any]:
+    """After one change that is not counted: it compiles what the change needs."""
+    once = f"""async (k) => {{
+      const {{ set, engine }} = neurolens, start = performance.now();
+      {script};
+      await neurolens.show();
+      for (const side of set.view === "one" ? ["a"] : ["a", "b"]) engine.gpu.read(engine.sides[side].film, 0, 0, 1, 1);
+      return performance.now() - start;
+    }}"""  # reading a pixel waits for the GPU
+    page.evaluate(once, 0)
+    took, spent = [], []
+    for k in range(1, repeats + 1):
+        before = _processor_ms()
+        took.append(page.evaluate(once, k))
+        spent.append(_processor_ms() - before)
+    return _row(name, took, spent, CHANGE_MS)
+
+
+def _processor_ms() -> float:
+    """Processor time of every GPU process of a browser on this machine; 0 where /proc does not tell."""
+    total = 0.0
+    for place in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            if b"--type=gpu-process" in (place / "cmdline").read_bytes():
+                user, system = (place / "stat").read_text().rsplit(")", 1)[1].split()[11:13]
+                total += (int(user) + int(system)) * 1000 / os.sysconf("SC_CLK_TCK")
+    return total
+
+
+def _row(name: str, took: list[float], spent: list[float], wanted: int) -> dict[str, Any]:
+    found = {"change": name, "least_ms": min(took), "median_ms": statistics.median(took), "wanted_ms": wanted}
+    return found | {"processor_ms": statistics.median(spent) if spent else None}

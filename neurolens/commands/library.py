@@ -1,0 +1,217 @@
+"""`neurolens library`: a page for each lens of a folder, and an index that searches and sorts."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.files import atomic_path, atomic_write_text, library, write_json
+from neurolens.base.progress import Progress
+from neurolens.commands.arguments import add_json, lens_path
+from neurolens.commands.output import answer
+
+if TYPE_CHECKING:
+    from neurolens.optics.prescription import Lens
+
+_DESCRIPTION = """\
+Write a folder of pages: of each lens its section, spots, MTF, distortion, vignetting, colour, breathing and bokeh at
+three points of the field, its models with error and cost, its source and what is doubtful about it; and an
+index with search, sorted by year, focal length, speed, error. A lens whose page is there, from the same file
+by the same version, is kept. Needs the extra "train" (torch)."""
+_EPILOG = """\
+examples:
+  neurolens library -o pages
+  neurolens library -o pages laikin_double_gauss_50 my_lens.toml"""
+_SHOWN = {
+    "layout": "Section", "spots": "Spots through focus", "mtf": "Geometric MTF", "distortion": "Distortion",
+    "vignetting": "Vignetting", "colour": "Colour",
+}  # fmt: skip
+_BOKEH_FOCUS, _BOKEH_FIELDS = 30, (0.0, 0.6, 0.95)  # focal lengths; shares of the field
+_COLOURS = 96  # of the palettes of the pictures
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command to the command line."""
+    parser = subparsers.add_parser(
+        "library", help="pages of lenses: pictures, figures, models", description=_DESCRIPTION, epilog=_EPILOG
+    )
+    parser.add_argument("lenses", metavar="LENS", nargs="*", help="lens files or names (default: all of lenses/)")
+    parser.add_argument("-o", "--output", metavar="FOLDER", type=Path, required=True, help="for the pages")
+    add_json(parser, quiet=True)
+    parser.set_defaults(run=run, kept="finished pages are kept; the same command goes on")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the pages; 1 where a lens could not be shown."""
+    from neurolens.evaluate.describe import lens_files
+
+    folder = args.output
+    if folder.exists() and not folder.is_dir():
+        raise InputError("neurolens library", "-o", str(folder), "a folder")
+    files = [lens_path(word, "library") for word in args.lenses] or lens_files(library() / "lenses")
+    progress, records = Progress({"lenses": 12.0 * len(files)}, quiet=args.quiet), []
+    with progress.stage("lenses") as report:
+        for k, file in enumerate(files):
+            records.append(_record(file, folder))
+            report((k + 1) / len(files))
+    atomic_write_text(folder / "index.html", _index(records))
+    failed = [f"{r['lens']}: {r['fault']}" for r in records if "fault" in r]
+    size = sum(f.stat().st_size for f in folder.rglob("*") if f.is_file())
+    told = [f"{len(records) - len(failed)} lenses, {size / 1e6:.1f} MB: {folder}/index.html", *failed]
+    answer(args, {"folder": str(folder), "bytes": size, "lenses": records}, lambda: "\n".join(told))
+    return 1 if failed else 0
+
+
+def _record(file: Path, folder: Path) -> dict[str, Any]:
+    """A lens's row of the index, its page written unless it is there."""
+    from neurolens import __version__
+    from neurolens.evaluate.describe import read_quietly
+
+    kept = folder / file.stem / "record.json"
+    try:
+        lens = read_quietly(file)
+        try:
+            found = json.loads(kept.read_text(encoding="utf-8"))
+            if (found["sha256"], found["version"]) == (lens.sha256, __version__):
+                return dict(found)
+        except (OSError, ValueError, KeyError):
+            pass
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        record = {"lens": file.stem, "sha256": lens.sha256, "version": __version__} | _page(lens, file, kept.parent)
+        write_json(kept, record)
+        return record
+    except NeurolensError as error:
+        return {"lens": file.stem, "fault": str(error)}
+
+
+def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
+    """Draw a lens, write its page, and say what the index shows of it."""
+    from neurolens.analysis.layout import thumbnail
+    from neurolens.blender.pack import year_of
+    from neurolens.commands.models import models_in
+    from neurolens.evaluate import pages
+    from neurolens.evaluate.describe import lens_row, rim_doubts, section
+    from neurolens.optics.lenscheck import check_lens
+
+    row = lens_row(lens, check_lens(lens))
+    figures, notes = [], []
+    for name, title, draw in _drawings(lens):
+        picture = folder / f"{name}.png"
+        try:
+            draw(picture)
+        except InputError as error:
+            notes.append(f"{title} is left out: {error}")
+            continue
+        _lessen(picture)
+        figures.append({"file": picture.name, "title": title})
+    models = [m for m in models_in(library() / "models") if m["lens"] == lens.lens_id]
+    doubts = [*row["doubts"], *rim_doubts(lens), *notes]
+    source = pages.facts({"designer": lens.designer or pages.DASH, "source": lens.source, "rims": lens.rims})
+    body = f"<p><a href='../index.html'>All lenses</a></p><h1>{pages.text(lens.name)}</h1>{source}"
+    body += "".join(f"<p class='note'>{pages.text(d)}</p>" for d in doubts)
+    body += f"<p>{pages.text(lens.notes)}</p>" if lens.notes else ""
+    body += pages.figure_grid(folder, figures)
+    names = [Path(m["file"]).stem.removeprefix(f"{lens.lens_id}.") for m in models]
+    body += pages.section("Models", pages.table(names, models, _model_columns()))
+    body += pages.section("File", f"<pre>{pages.text(file.read_text(encoding='utf-8', errors='replace'))}</pre>")
+    atomic_write_text(folder / "index.html", pages.page(lens.name, body))
+    best = min((m["rms_um"] for m in models if m["rms_um"] is not None), default=None)
+    keys = ("name", "efl_mm", "f_number", "half_field_deg", "refractions", "states")
+    times = [pages.number(m, "fused_ns_per_ray.min") or pages.number(m, "ns_per_ray.min") for m in models]
+    fastest = min((t for t in times if t), default=None)
+    more = {"ns": fastest, "year": year_of(lens.source), "designer": lens.designer, "rms_um": best, "doubts": doubts}
+    return {**{k: row[k] for k in keys}, **more, "layout": thumbnail(section(file))}
+
+
+def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
+    """Name, title and what draws it to a path."""
+    from neurolens.analysis.fields import Scene
+    from neurolens.analysis.layout import state_text
+    from neurolens.analysis.spots import spots
+    from neurolens.commands.analyse import analysis_of
+    from neurolens.evaluate.figures import draw_breathing
+
+    scene = Scene(lens.at(focus_m=math.inf))
+
+    def drawn(what: str) -> Any:
+        def draw(path: Path) -> None:
+            analysis = analysis_of(what)
+            titles = () if what == "layout" else (lens.name, state_text(scene))
+            analysis.draw(analysis.compute(scene), path, *titles)
+
+        return draw
+
+    def bokeh(path: Path) -> None:
+        """Lights at infinity, the lens focused near; at three points of the field."""
+        near = 1e-3 * _BOKEH_FOCUS * abs(scene.first_order.efl_mm)
+        edge = max(scene.default_fields())
+        blurred = Scene(lens.at(focus_m=near))
+        found = spots(blurred, [share * edge for share in _BOKEH_FIELDS], rings=20, shift_mm=[0.0])
+        analysis_of("spots").draw(replace(found, airy_um=math.nan), path, lens.name, f"focused at {near:.3g} m")
+
+    yield from ((what, title, drawn(what)) for what, title in _SHOWN.items())
+    yield "bokeh", "Bokeh: lights at infinity, the lens focused near", bokeh
+    yield "breathing", "Breathing", lambda path: draw_breathing(lens, path)
+
+
+def _lessen(picture: Path) -> None:
+    """A picture with a palette: a third of the bytes."""
+    from PIL import Image
+
+    with Image.open(picture) as image:
+        small = image.convert("RGB").quantize(_COLOURS, dither=Image.Dither.NONE)
+    with atomic_path(picture) as part:
+        small.save(part, optimize=True)
+
+
+def _model_columns() -> tuple[Any, ...]:
+    from neurolens.evaluate.pages import Column
+
+    return (
+        Column("RMS (µm)", "rms_um", about="film-equivalent, rays held out, whole domain"),
+        Column("RMS (px)", "rms_px", about="of a picture 4000 pixels wide"),
+        Column("direction (°)", "direction_rms_deg", about="root mean square"),
+        Column("onnxruntime (ns)", "ns_per_ray.min", about="a ray, one core"),
+        Column("as C (ns)", "fused_ns_per_ray.min", about="a ray, one core, compiled"),
+        Column("kB", "bytes", 1e-3),
+    )
+
+
+def _index(records: Sequence[Mapping[str, Any]]) -> str:
+    """All lenses in a table with thumbnails, which searches and sorts by itself."""
+    from neurolens.evaluate import pages
+    from neurolens.evaluate.survey_page import TABLE_SCRIPT, TABLE_STYLE
+
+    columns = (
+        pages.Column("year", "year", digits=4), pages.Column("f (mm)", "efl_mm", digits=4),
+        pages.Column("f-number", "f_number"), pages.Column("half field (°)", "half_field_deg"),
+        pages.Column("refractions", "refractions"), pages.Column("states", "states"),
+        pages.Column("fastest model (ns)", "ns", about="a ray, one core, as C where that was timed"),
+        pages.Column("best model (µm)", "rms_um", about="film-equivalent RMS"),
+    )  # fmt: skip
+    heads = "".join(
+        f"<th scope='col' data-kind='number' title='{pages.text(c.about)}'>{pages.text(c.heading)}</th>"
+        for c in columns
+    )
+    rows = []
+    for r in records:
+        cells = "".join(
+            f"<td data-v='{'' if (v := pages.number(r, c.key)) is None else v}'>{c.cell(r)}</td>" for c in columns
+        )
+        link = f"<a href='{pages.text(r['lens'])}/index.html'>{pages.text(r.get('name', r['lens']))}</a>"
+        said = r.get("fault") or "<br>".join(pages.text(d) for d in r.get("doubts", ()))
+        rows.append(
+            f"<tr data-kinds='all'><th scope='row'>{link}<small>{pages.text(r.get('designer') or '')}</small></th>"
+            f"<td class='p' data-v=''>{r.get('layout', '')}</td>{cells}<td class='t'>{said}</td></tr>"
+        )
+    head = f"<tr><th scope='col'>lens</th><th scope='col'>section</th>{heads}<th scope='col'>doubts</th></tr>"
+    tools = "<div class='tools'><input id='words' type='search' placeholder='words that a row holds'>"
+    tools += "<input class='kind' type='checkbox' value='all' checked hidden><span id='shown'></span></div>"
+    table = f"<div class='survey'><table><thead>{head}</thead><tbody>{''.join(rows)}</tbody></table></div>"
+    return pages.page("Lenses", f"{TABLE_STYLE}<h1>{len(records)} lenses</h1>{tools}{table}{TABLE_SCRIPT}")

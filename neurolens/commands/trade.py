@@ -1,0 +1,173 @@
+"""`neurolens trade SCENE --lens LENS`: the error of every camera for a scene against the time it takes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_write_text, library
+from neurolens.base.progress import Progress
+from neurolens.commands.arguments import add_glass, add_json, lens_path, whole
+from neurolens.commands.output import answer, number, plain_numbers, table
+from neurolens.commands.plan import TARGETS, pixels
+
+if TYPE_CHECKING:
+    from neurolens.evaluate.trade import Offer, Trade
+
+_DESCRIPTION = """\
+Draw what a scene's error costs: every camera that 'neurolens plan' would try, by its error in pixels and by
+its seconds to equal noise, those that no other betters, and the choice for the budget. Says what half of the
+chosen one's time would buy. Needs the extra "train" (torch).
+
+Seconds are of one thread, for the scene's own size and samples, and what a camera adds to them: its rays, and
+what the scene takes for the further rays that its noise asks for. What the scene takes by itself is told beside;
+a small picture in our renderer measures it. Of other targets the camera alone counts, in Cycles under a white
+sky; of GLSL its operations."""
+_EPILOG = """\
+examples:
+  neurolens trade experiments/scenes/garden.toml --lens laikin_double_gauss_50
+  neurolens trade scene.toml --lens my_lens.toml --for osl --budget 0.5px -o runs/trade
+
+-o leaves trade.html (one page that needs no other file: small pictures side by side, their difference from the
+exact lens's, the table), trade.png, trade.json and models/ with what was fitted."""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command to the command line."""
+    parser = subparsers.add_parser(
+        "trade", help="what a scene's error costs: every camera's error against its time", description=_DESCRIPTION,
+        epilog=_EPILOG,
+    )  # fmt: skip
+    parser.add_argument("scene", metavar="SCENE", type=Path, help="scene file (.toml)")
+    parser.add_argument("--lens", metavar="LENS", required=True, help="lens file (.toml), or a name in lenses/")
+    parser.add_argument(
+        "--budget", metavar="PIXELS", type=pixels, default=0.25, help="whose choice is marked (default: 0.25px)"
+    )
+    parser.add_argument(
+        "--for", dest="target", choices=TARGETS, default="render", help="what runs the camera, as of 'plan'"
+    )
+    parser.add_argument(
+        "--samples", metavar="N", type=whole(1, 4096), default=16, help="a pixel of the small pictures (default: 16)"
+    )
+    parser.add_argument("--no-fit", dest="fit", action="store_false", help="fit nothing for the shot")
+    parser.add_argument("-o", "--output", metavar="FOLDER", type=Path, help="default: runs/trade-SCENE-LENS")
+    add_glass(parser)
+    add_json(parser, quiet=True)
+    parser.set_defaults(run=run, kept="models fitted so far are kept, nothing else is written")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Price, draw, write, print."""
+    from neurolens.evaluate.figures import side_by_side
+    from neurolens.evaluate.plots import plot_trade
+    from neurolens.evaluate.trade import trade
+    from neurolens.optics.lensfile import read_lens
+    from neurolens.render.scene import load_scene
+
+    file = lens_path(args.lens, "trade")
+    lens, scene = read_lens(file).at(), load_scene(args.scene)
+    folder = args.output or Path("runs") / f"trade-{scene.name}-{file.stem}"
+    if folder.exists() and not folder.is_dir():
+        raise InputError("neurolens trade", "-o", str(folder), "a folder")
+    shipped = sorted((library() / "models").glob(f"{file.stem}.*.onnx"))
+    with Progress({"trade": 30}, quiet=args.quiet).stage("trade") as report:
+        found = trade(
+            scene, lens, args.budget, target=args.target, models=shipped, samples=args.samples, report=report,
+            folder=folder / "models" if args.fit else None,
+        )  # fmt: skip
+    folder.mkdir(parents=True, exist_ok=True)
+    title = f"{scene.name} through {lens.name}"
+    plot_trade(found, folder / "trade.png", title)
+    pictures = {_short(s.offer): s for s in found.shown if s.offer.choice.error_px > 0}
+    side_by_side(
+        {"exact": found.exact, **{k: s.rgb for k, s in pictures.items()}},
+        {k: s.difference for k, s in pictures.items()}, folder / "pictures.png",
+        {k: f"{_time(found, s.offer)}, {number(s.offer.choice.error_px, 2)} px\nFLIP {number(s.flip, 2)}"
+         for k, s in pictures.items()},
+    )  # fmt: skip
+    atomic_write_text(folder / "trade.html", _page(found, folder, title))
+    flips = {s.offer.choice.name: s.flip for s in found.shown}
+    rows = [{**asdict(o.choice), "seconds": o.seconds, "flip": flips.get(o.choice.name)} for o in found.offered]
+    data = {"scene": str(args.scene), "lens": str(file), "target": args.target, "unit": found.unit}
+    data |= {"base": found.base, "cameras": rows, "front": [o.choice.name for o in found.front]}
+    data |= {"chosen": found.chosen and found.chosen.choice.name, "half": found.half and found.half.choice.name}
+    atomic_write_text(folder / "trade.json", json.dumps(plain_numbers(data), indent=1, default=str) + "\n")
+    answer(args, json.loads(json.dumps(plain_numbers(data), default=str)), lambda: _text(found, folder))
+    return 0 if found.chosen else 1
+
+
+def _short(offer: Offer) -> str:
+    return offer.choice.name.rpartition(".")[2]
+
+
+def _time(found: Trade, offer: Offer) -> str:
+    return f"{number(offer.seconds, 3)} {found.unit}"
+
+
+def _said(found: Trade) -> list[str]:
+    """The choice for the budget, and what half of its time buys."""
+    chosen, half = found.chosen, found.half
+    if chosen is None:
+        return [f"No camera keeps {found.plan.budget_px:g} px."]
+    told = [f"For {found.plan.budget_px:g} px: {_short(chosen)}, which adds {_time(found, chosen)}, "
+            f"{number(chosen.choice.error_px, 3)} px"]  # fmt: skip
+    if found.base:
+        told[0] += f"; the scene itself takes {number(found.base, 3)} {found.unit}"
+    if half is None:
+        least = found.front[0]
+        told.append(f"Half of that buys no camera: the least is {_time(found, least)}, {_short(least)}, "
+                    f"{number(least.choice.error_px, 3)} px")  # fmt: skip
+    else:
+        told.append(f"Half of that buys {_short(half)}: {_time(found, half)}, "
+                    f"{number(half.choice.error_px, 3)} px")  # fmt: skip
+    return told
+
+
+def _text(found: Trade, folder: Path) -> str:
+    flips, front = {s.offer.choice.name: s.flip for s in found.shown}, found.front
+    rows = [
+        ("*" if o == found.chosen else "+" if o in front else "", o.choice.name, number(o.choice.error_px, 3),
+         number(o.choice.light_error, 2), number(o.seconds, 3), number(flips.get(o.choice.name), 2), o.choice.how)
+        for o in found.offered
+    ]  # fmt: skip
+    shown = table(("", "camera", "px", "light", found.unit, "FLIP", ""), rows, left=2)
+    legend = f"* for the budget, + no other betters it; {found.unit}: added, of one thread to equal noise; FLIP at "
+    legend += f"{found.samples} samples a pixel of the same random numbers, with noise where cameras use them otherwise"
+    written = f"Written: {folder}/trade.html, trade.png, pictures.png, trade.json"
+    return "\n\n".join([shown, legend, "\n".join(_said(found)), written])
+
+
+def _page(found: Trade, folder: Path, title: str) -> str:
+    from neurolens.evaluate import pages
+
+    flips = {s.offer.choice.name: s.flip for s in found.shown}
+    records = [{**asdict(o.choice), "seconds": o.seconds, "flip": flips.get(o.choice.name)} for o in found.offered]
+    columns = (
+        pages.Column("error, px", "error_px", about="distance of footprints that 95% of the picture keep"),
+        pages.Column("light, %", "light_error", 100, 2, "relative error of light that 95% of the picture keep"),
+        pages.Column(
+            f"{found.unit} added", "seconds", about="one thread, the scene's size and samples, to equal noise"
+        ),
+        pages.Column("a ray", "cost", about=f"{found.plan.unit} times the noise"),
+        pages.Column("noise", "noise", about="times the rays that equal error takes"),
+        pages.Column("FLIP", "flip", digits=2, about="of the small pictures, from the exact lens's"),
+    )
+    front = found.front
+    marks = ["● " if o == found.chosen else "○ " if o in front else "" for o in found.offered]
+    names = [f"{m}{_short(o)}" for m, o in zip(marks, found.offered, strict=True)]
+    lead = "".join(f"<p class='lead'>{pages.text(line)}</p>" for line in _said(found))
+    told = f"{found.samples} samples a pixel each, the same random numbers. Below each its FLIP difference from the "
+    told += "exact lens's picture: with noise, where a camera makes other rays of the same numbers, as thin lenses do."
+    figures = [
+        {"file": "trade.png", "title": "Error against time", "caption": "Ring: the choice for the budget."},
+        {"file": "pictures.png", "title": "What is seen", "caption": told},
+    ]
+    shown = pages.figure_grid(folder, [{**f, "wide": True} for f in figures], inside=True)
+    body = f"<h1>{pages.text(title)}</h1>{lead}{shown}"
+    body += pages.section("Every camera", pages.table(names, records, columns))
+    body += "<p class='note'>● for the budget, ○ no other betters both.</p>" + pages.legend(columns)
+    return pages.page(title, body)

@@ -1,0 +1,302 @@
+"""`neurolens view`: one page in which lenses and their models run, for a browser."""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neurolens.base.bounds import RANGE
+from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.files import library as shipped
+from neurolens.base.progress import Progress
+from neurolens.commands.arguments import add_glass, add_json, check_folder, check_suffix, lens_path
+from neurolens.commands.output import answer
+
+if TYPE_CHECKING:
+    from neurolens.optics.prescription import Lens
+    from neurolens.view.page import Form, ViewLens
+
+_DESCRIPTION = """\
+Write one page for a browser, which needs neither server nor network: lenses traced exactly and their
+models as GLSL in a path tracer of WebGL2, side by side or as their difference, at any focus, stop,
+blades and wavelength; their layout with the rays of a pixel, their error and what a ray costs there.
+
+LENS is a lens file of any format that `neurolens convert` reads, or a name of lenses/; MODEL an exported
+model, shown with the lens of its name. Without any, every lens of lenses/ with the best polynomial and
+the best network of models/."""
+_EPILOG = """\
+examples:
+  neurolens view -o view.html
+  neurolens view petzval_portrait_100 laikin_double_gauss_50 -o two.html
+  neurolens view my_lens.zmx runs/mine/models/ols-64.onnx -o mine.html"""
+_NETWORK = "mlp"
+_ERRORS = ("rms_um", "p99_um", "rms_infinity_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
+_LIGHT_NM = (400.0, 700.0)
+_AS_BARE = "coatings and absorption left out"
+_NEAR_EFL = 10.0  # of an exact lens: nearest focus in focal lengths
+_SAME = 1e-3  # of the focal length: what models and lens file of one id may differ by
+_DOWNLOADS = ("glsl", "onnx", "c", "osl")
+_FEW = 4  # of more lenses the page leaves C and OSL out: seconds each, and they are large
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A lens with its models, in one state; `zoom` "range" is all of a zoom."""
+
+    key: str
+    models: Sequence[Path]
+    lens: Lens | None
+    zoom: str | None = None
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command to the command line."""
+    parser = subparsers.add_parser(
+        "view", help="write a page that runs lenses and models in a browser", description=_DESCRIPTION, epilog=_EPILOG
+    )
+    parser.add_argument("lenses", metavar="LENS|MODEL", nargs="*", help="lens files, names of lenses, models")
+    parser.add_argument(
+        "-o", "--out", metavar="FILE.html", type=Path, default=Path("view.html"), help="page (default: view.html)"
+    )
+    parser.add_argument(
+        "--downloads", metavar="KINDS", type=_kinds, default=None,
+        help="of glsl, onnx, c, osl what the page brings as files of each form (default: all, of more than "
+        f"{_FEW} lenses glsl,onnx: others take seconds each); the last are left out where the page grows beyond "
+        "3 MB",
+    )  # fmt: skip
+    add_glass(parser)
+    add_json(parser)
+    parser.set_defaults(run=run, kept="nothing was written")
+
+
+def _kinds(text: str) -> list[str]:
+    words = text.split(",")
+    if words[0] != "glsl" or len(set(words)) < len(words) or not set(words) <= set(_DOWNLOADS):
+        raise argparse.ArgumentTypeError(
+            f"got {text!r}, expected glsl, and of {', '.join(_DOWNLOADS[1:])} what is wanted"
+        )
+    return words
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the page."""
+    check_suffix(args.out, "--out", (".html", ".htm"))
+    check_folder(args.out, "--out")
+    entries = list(_asked(args.lenses) if args.lenses else _library())
+    kinds = args.downloads or list(_DOWNLOADS if len(entries) <= _FEW else _DOWNLOADS[:2])
+    progress = Progress(quiet=args.json)
+    made: list[ViewLens] = []
+    with progress.stage(f"{len(entries)} lenses") as report, tempfile.TemporaryDirectory() as folder:
+        for entry in entries:
+            made.append(_view_lens(entry, Path(folder), kinds))
+            report(len(made) / len(entries))
+    from neurolens.view.page import write_page
+
+    about = write_page(args.out, made, kinds)
+    left = [kind for kind in kinds if kind not in about["downloads"]]
+    data = {"file": str(args.out), **about, "lenses": [lens.key for lens in made]}
+    more = f"; left out for its size: {', '.join(left)}" if left else ""
+    return answer(args, data, lambda: f"{args.out}: {len(made)} lenses, {about['bytes'] / 1e6:.2f} MB{more}")
+
+
+def _library() -> Iterator[_Entry]:
+    """Every lens of lenses/ with its best models; zooms over their range where a model has it."""
+    from neurolens.commands.blender_lenses import key_of, library
+    from neurolens.optics.lensfile import read_lens
+
+    root = shipped()
+    for models, file in library(root / "models", root / "lenses", ()):
+        base, _, state = key_of(models[0]).partition("-")
+        if file is None:
+            file = root / "lenses" / f"{base}.toml"
+        zoom = RANGE if state == "range" else None
+        if state and not zoom:
+            continue  # a second model of a lens that is here already
+        yield _Entry(key_of(models[0]), models, read_lens(file) if file.is_file() else None, zoom)
+
+
+def _asked(words: Sequence[str]) -> Iterator[_Entry]:
+    """Lenses in the order of their first word; models join the lens of their id, in place of those of the library."""
+    from neurolens.commands.blender_lenses import library
+    from neurolens.readers.any_format import read_any
+
+    root = shipped()
+    lenses: dict[str, Lens | None] = {}
+    models: dict[str, list[Path]] = {}
+    brought: dict[str, list[Path]] = {}
+    for word in words:
+        path = Path(word) if word.endswith(".onnx") else lens_path(word, "view")
+        if path.suffix == ".onnx":
+            lens_id = str(_card(path)["lens"]["id"])
+            lenses.setdefault(lens_id, None)
+            models.setdefault(lens_id, []).append(path)
+            continue
+        lens = read_any(path)
+        lenses[lens.lens_id] = lens
+        if path.parent == root / "lenses":  # one of the library brings its models
+            known = library(root / "models", root / "lenses", [path.stem]) if _has_models(root, path.stem) else ()
+            brought[lens.lens_id] = [m for files, _ in known for m in files]
+    for lens_id, own in lenses.items():
+        found = models.get(lens_id) or brought.get(lens_id, [])
+        zoom = RANGE if any(_card(m).get("states") for m in found) else None
+        yield _Entry(lens_id, found, own, zoom)
+
+
+def _has_models(root: Path, key: str) -> bool:
+    return any((root / "models").glob(f"{key}.*.onnx"))
+
+
+def _card(file: Path) -> dict[str, Any]:
+    from neurolens.modelfile.onnxfile import read_checked
+
+    return read_checked(file)[1]
+
+
+def _kind_of(card: Mapping[str, Any]) -> str:
+    family = str(card["fit"]["settings"].get("method", card["fit"]["method"]))
+    return "network" if family.startswith(_NETWORK) else "polynomial"
+
+
+def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str]) -> ViewLens:
+    """A lens of the page.
+
+    Raises:
+        InputError: two models of one kind; a lens that the exact tracer's code cannot hold, without any model.
+    """
+    from neurolens.view.page import ViewLens
+
+    found = [_kind_of(_card(file)) for file in entry.models]
+    if len(set(found)) < len(found):
+        raise InputError("neurolens view", entry.key, f"({' and '.join(found)})", "one model of each kind")
+    forms = [_model_form(file, folder, kinds) for file in entry.models]
+    drawn: dict[str, Any] = {}
+    path = None
+    if entry.lens is not None:
+        lens = entry.lens.at() if entry.zoom == RANGE else entry.lens.at(zoom=entry.zoom)
+        try:
+            forms.append(_exact_form(entry, folder, kinds))
+            path = _path(lens) if entry.zoom != RANGE else None
+        except NeurolensError:
+            if not forms:
+                raise  # a model of the lens stands in for it: coatings and the like have no code
+        drawn = _section(lens)
+    best, focal_mm = forms[0], [float(f.card["efl_mm"]) for f in forms]
+    if entry.zoom != RANGE and max(focal_mm) - min(focal_mm) > _SAME * abs(focal_mm[0]):
+        raise InputError("neurolens view", f"{entry.key}: efl_mm", focal_mm, "models of the lens file, in its state")
+    return ViewLens(
+        entry.key, str(best.card["name"]), str(best.card["source"]), float(best.card["efl_mm"]),
+        min(float(f.card["film_radius_mm"]) for f in forms), _squeeze(entry), best.card["f_numbers"],
+        max(float(f.card["nearest_m"]) for f in forms), drawn, path, forms,
+    )  # fmt: skip
+
+
+def _squeeze(entry: _Entry) -> float:
+    from neurolens.optics.paraxial import first_order
+
+    if entry.lens is None or not entry.lens.anamorphic:
+        return 1.0
+    lens = entry.lens.at()
+    return abs(float(first_order(lens).efl_mm / first_order(lens, meridian="x").efl_mm))
+
+
+def _section(lens: Lens) -> dict[str, Any]:
+    from neurolens.analysis.fields import Scene
+    from neurolens.analysis.layout import layout_profile
+    from neurolens.view.page import section_svg
+
+    return section_svg(replace(layout_profile(Scene(lens, axis="y")), rays=()))
+
+
+def _path(lens: Lens) -> tuple[str, Sequence[str]]:
+    from neurolens.optics.pupils import pupil_plane_z_mm
+    from neurolens.view.shaders import path_glsl
+
+    return path_glsl(lens, pupil_plane_z_mm(lens), _LIGHT_NM)
+
+
+def _model_form(file: Path, folder: Path, kinds: Sequence[str]) -> Form:
+    from neurolens.cameras.onnxlens import load_model
+    from neurolens.cameras.source import model_extras
+    from neurolens.surrogates.source import export_file
+    from neurolens.view.page import Form
+
+    loaded = load_model(file)
+    card, domain, errors = loaded.card, loaded.card["domain"], loaded.card["errors"]
+    if any(axis.name != "zoom" for axis in loaded.axes):
+        raise InputError(file, "states", [axis.name for axis in loaded.axes], "a zoom, or a model of one state")
+    extras, notes = model_extras(loaded)
+    written = {to: export_file(file, folder / f"model.{to}", to, None, extras, notes) for to in _written(kinds)}
+    told = {
+        **_facts(card["lens"]),
+        "film_radius_mm": domain["film_radius_mm"],
+        "nearest_m": domain["focus_m"][1],
+        "f_numbers": [(float(n["efl_mm"]), float(n["f_number"])) for n in _lens_nodes(card)],
+        "errors": {key: errors[key] for key in _ERRORS if isinstance(errors.get(key), (int, float))},
+        "zones": errors.get("zones") or {},
+        "poor": list(errors.get("poor") or ()),
+    }
+    files = {"onnx": file.read_bytes()} | {to: w.path.read_bytes() for to, w in written.items() if to != "glsl"}
+    if "osl" in kinds:
+        from neurolens.commands.blender_lenses import form_of
+
+        files["osl"] = form_of(file, quiet=True).osl.encode()
+    glsl = written["glsl"]
+    return Form(_kind_of(card), str(card["fit"]["method"]), glsl.path.read_text("utf-8"), glsl.signature, told, files)
+
+
+def _written(kinds: Sequence[str]) -> list[str]:
+    """The languages that a form is written in."""
+    return [kind for kind in ("glsl", "c") if kind in kinds]
+
+
+def _lens_nodes(card: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The lens's facts at each node of a zoom, else of the one state."""
+    return [node["lens"] for node in card["states"]["nodes"]] if card.get("states") else [card["lens"]]
+
+
+def _facts(lens: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: lens[key] for key in ("name", "source", "efl_mm")}
+
+
+def _is_bare(lens: Lens) -> bool:
+    from neurolens.cameras.exact import check_bare
+
+    try:
+        check_bare(lens)
+    except InputError:
+        return False
+    return True
+
+
+def _exact_form(entry: _Entry, folder: Path, kinds: Sequence[str]) -> Form:
+    from neurolens.commands.export_lens import write_lens
+    from neurolens.optics.lenswriter import write_lens as write_file
+    from neurolens.optics.paraxial import first_order
+    from neurolens.optics.pupils import image_radius_mm
+    from neurolens.view.page import Form
+
+    assert entry.lens is not None
+    lens = entry.lens
+    file = folder / f"{lens.lens_id}.toml"
+    write_file(lens, file)
+    written, as_bare = {}, "" if _is_bare(lens) else f"In this form: {_AS_BARE}."
+    for to in _written(kinds):
+        options = argparse.Namespace(to=to, name=None, zoom=entry.zoom, json=True, out=folder / f"exact.{to}")
+        written[to] = write_lens(file, options, as_bare=as_bare)
+    at = lens.at() if entry.zoom == RANGE else lens.at(zoom=entry.zoom)
+    data = first_order(at)
+    told = {
+        "name": lens.name, "source": lens.source, "efl_mm": float(data.efl_mm),
+        "film_radius_mm": image_radius_mm(at)[0],
+        "nearest_m": _NEAR_EFL * abs(float(data.efl_mm)) / 1000 * 1.05,
+        "f_numbers": [(float(data.efl_mm), float(data.f_number))],
+        "errors": {}, "zones": {}, "poor": [],
+    }  # fmt: skip
+    glsl = written["glsl"]
+    files = {to: w.path.read_bytes() for to, w in written.items() if to != "glsl"}
+    said = f"every surface traced, {_AS_BARE}" if as_bare else "every surface traced"
+    return Form("exact", said, glsl.path.read_text("utf-8"), glsl.signature, told, files)

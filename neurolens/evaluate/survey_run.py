@@ -1,0 +1,228 @@
+"""A survey of a folder: its files as tasks, processes that run them, records that are kept, pages."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import re
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from hashlib import sha256
+from multiprocessing.connection import wait
+from pathlib import Path
+from typing import Any
+
+from neurolens.base.engine import Failed, on_dask
+from neurolens.base.errors import InputError, one_line
+from neurolens.base.files import atomic_path, read_bytes
+from neurolens.base.progress import Progress
+from neurolens.base.signals import end_at_once, held
+from neurolens.evaluate.survey import SurveySettings, Task, known_record, run_task, unread_record
+from neurolens.evaluate.survey_page import write_pages
+from neurolens.readers.any_format import FORMATS
+from neurolens.readers.source import MAX_BYTES
+
+SUFFIXES = frozenset([".toml", *(suffix for f in FORMATS for suffix in f.suffixes)])
+# Tasks to their records, in any order; tasks are taken one by one as there is room for them.
+Engine = Callable[[Iterable[Task]], Iterator[tuple[Task, bytes]]]
+_KEPT_EVERY_S = 60.0  # pages are written so often beside the last time
+_POLL_S = 0.5
+TIME_LIMIT_S = 1800.0  # of one file, far more than any lens takes
+
+
+@dataclass(frozen=True)
+class Collection:
+    """The files of a folder: those that may be lenses, by name with "/" between its parts, and how many are not.
+
+    Attributes:
+        others: how many files of other kinds lie in the folder, by suffix.
+    """
+
+    folder: Path
+    names: tuple[str, ...]
+    others: dict[str, int] = field(default_factory=dict)
+
+
+def collection_of(folder: Path) -> Collection:
+    """The files of a folder and of its folders, hidden ones left out, by suffix; links to folders are not followed.
+
+    Raises:
+        InputError: no such folder, or no lens file in it.
+    """
+    if not folder.is_dir():
+        raise InputError(folder, "FOLDER", "(no folder)", "a folder of lens files")
+    names, others = list[str](), dict[str, int]()
+    for file in sorted(folder.rglob("*")):
+        parts = file.relative_to(folder).parts
+        if any(part.startswith(".") for part in parts) or file.is_dir():
+            continue
+        suffix = file.suffix.lower()
+        if suffix in SUFFIXES:
+            names.append("/".join(parts))
+        else:
+            others[suffix or "(none)"] = others.get(suffix or "(none)", 0) + 1
+    if not names:
+        known = ", ".join(sorted(SUFFIXES))
+        raise InputError(folder, "FOLDER", f"({sum(others.values())} files of other kinds)", f"lens files: {known}")
+    return Collection(folder, tuple(names), others)
+
+
+def survey(
+    collection: Collection,
+    out: Path,
+    settings: SurveySettings,
+    engine: Engine,
+    progress: Progress,
+    *,
+    glasses: Sequence[tuple[str, bytes]] = (),
+    again: bool = False,
+) -> list[dict[str, Any]]:
+    """Survey all files of a collection; records that are there are not made again. Returns them in the files' order.
+
+    Writes records/ (one JSON a file), survey.json, survey.csv and survey.html to the folder `out`.
+    """
+    (out / "records").mkdir(parents=True, exist_ok=True)
+    found: dict[str, dict[str, Any]] = {}
+    missing: list[str] = []
+    for name in collection.names:
+        task = _task(collection, name, settings, glasses)
+        kept = None if again or isinstance(task, bytes) else _kept(out, task)
+        if kept is not None:
+            found[name] = kept
+        elif isinstance(task, bytes):
+            found[name] = json.loads(task)
+        else:
+            missing.append(name)
+    if found and missing:
+        progress.note(f"{len(found)} of {len(collection.names)} files are done already")
+
+    def tasks() -> Iterator[Task]:
+        for name in missing:
+            task = _task(collection, name, settings, glasses)
+            if isinstance(task, bytes):  # it changed meanwhile
+                found[name] = json.loads(task)
+            else:
+                yield task
+
+    def pages() -> None:
+        write_pages([found[name] for name in collection.names if name in found], collection, out, settings)
+
+    written = time.monotonic()
+    if missing:
+        with progress.stage("survey") as report:
+            for done, (task, data) in enumerate(engine(tasks()), start=1):
+                with atomic_path(_record_file(out, task.name)) as temporary:
+                    temporary.write_bytes(data)
+                found[task.name] = record = json.loads(data)
+                if record["reason"]:
+                    progress.note(one_line(f"{task.name}: {record['verdict']}: {record['reason']}", 400))
+                report(done / len(missing))
+                if time.monotonic() - written > _KEPT_EVERY_S:
+                    pages()
+                    written = time.monotonic()
+    pages()
+    return [found[name] for name in collection.names]
+
+
+def _task(
+    collection: Collection, name: str, settings: SurveySettings, glasses: Sequence[tuple[str, bytes]]
+) -> Task | bytes:
+    """The task of a file, or the record of one that cannot be read."""
+    try:
+        data = read_bytes(collection.folder / name, MAX_BYTES, "a lens file")
+    except InputError as error:
+        return unread_record(name, "refused", f"{error.field}: got {error.value}, expected {error.expected}")
+    return Task(name, data, settings, tuple(glasses))
+
+
+def _record_file(out: Path, name: str) -> Path:
+    readable = re.sub(r"[^A-Za-z0-9._-]+", "_", name)[-60:].lstrip(".")
+    return out / "records" / f"{readable}-{sha256(name.encode(errors='surrogateescape')).hexdigest()[:16]}.json"
+
+
+def _kept(out: Path, task: Task) -> dict[str, Any] | None:
+    try:
+        return known_record(_record_file(out, task.name).read_bytes(), task)
+    except OSError:
+        return None
+
+
+def in_processes(jobs: int, limit_s: float = TIME_LIMIT_S) -> Engine:
+    """An engine of this machine: every task in a process of its own, `jobs` at a time, whose memory ends with it.
+
+    A process that is killed, or takes longer than `limit_s`, costs its own task only.
+    """
+    kind = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+    context: Any = multiprocessing.get_context(kind)
+    if kind == "forkserver":
+        context.set_forkserver_preload([__name__])  # torch is loaded once; no thread of it runs there
+
+    def run(tasks: Iterable[Task]) -> Iterator[tuple[Task, bytes]]:
+        waiting, running = iter(tasks), dict[Any, tuple[Any, Task, float]]()
+        try:
+            more = True
+            while more or running:
+                while more and len(running) < jobs:
+                    task = next(waiting, None)
+                    more = task is not None
+                    if task is not None:
+                        place, process = _begin(context, task)
+                        running[place] = process, task, time.monotonic()
+                for place in wait(list(running), _POLL_S):
+                    process, task, _ = running.pop(place)
+                    yield task, _answer(place, process, task)
+                for place, (process, task, began) in list(running.items()):
+                    if time.monotonic() - began > limit_s:
+                        del running[place]
+                        process.kill()
+                        place.close()
+                        yield task, unread_record(task.name, "fault", f"took longer than {limit_s:g} s")
+        finally:
+            for process, _, _ in running.values():
+                process.kill()
+
+    return run
+
+
+def on_cluster(address: str) -> Engine:
+    """The engine of a Dask cluster, see `base.engine.on_dask`."""
+
+    def run(tasks: Iterable[Task]) -> Iterator[tuple[Task, bytes]]:
+        for task, came in on_dask(address, _on_worker)(tasks):
+            yield task, unread_record(task.name, "fault", came.reason) if isinstance(came, Failed) else came
+
+    return run
+
+
+def _on_worker(_: bytes, task: Task) -> bytes:
+    return run_task(task)
+
+
+def _begin(context: Any, task: Task) -> tuple[Any, Any]:
+    here, there = context.Pipe(duplex=False)
+    process = context.Process(target=_work, args=(there, task), daemon=True)
+    with held():  # this process handles Ctrl-C
+        process.start()
+    there.close()
+    return here, process
+
+
+def _work(place: Any, task: Task) -> None:
+    end_at_once()
+    with suppress(BrokenPipeError):  # whoever asked was killed
+        place.send_bytes(run_task(task))
+
+
+def _answer(place: Any, process: Any, task: Task) -> bytes:
+    try:
+        return place.recv_bytes()
+    except EOFError:
+        process.join()
+        code = process.exitcode
+        why = f"killed by signal {-code}: did the memory run out?" if code < 0 else f"ended with code {code}"
+        return unread_record(task.name, "fault", f"its process was {why}" if code < 0 else f"its process {why}")
+    finally:
+        place.close()
+        process.join()

@@ -1,0 +1,182 @@
+"""Tiles of a picture, rendered apart and put together: the picture that one run gives, bit for bit.
+
+A tile is a band of whole rows, an OpenEXR file whose data window is the band and whose display window is the picture:
+other programs show it in its place. Its metadata say what it was rendered from and with; tiles of other settings do
+not go together.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.base.errors import InputError
+from neurolens.cameras.contract import FloatArray
+from neurolens.render.checkpoint import difference
+from neurolens.render.colour import COLOUR_SPACES
+from neurolens.render.exr_attributes import standard_attributes
+from neurolens.render.film import check_memory
+from neurolens.render.pictures import read_channels, read_metadata, write_stored
+
+_EXPECTED = 'a tile of "neurolens render --tile"'
+# What a merged picture's statistics add up; the rest follows from these, or is the same in all tiles.
+_COLOURS = ("R", "G", "B")
+_BYTES_A_PIXEL = 40  # seven channels, and those of the tile that is read
+_SUMMED = ("seconds", "paths", "dropped_samples", "thread_seconds", "camera_thread_seconds")
+
+
+def rows_of(height: int, tile: tuple[int, int]) -> tuple[int, int]:
+    """First row of tile I of N, and the one after its last; InputError: more tiles than rows."""
+    number, count = tile
+    if count > height:
+        raise InputError("neurolens render", "--tile", f"{number}/{count}", f"at most {height} tiles, one a row")
+    return (number - 1) * height // count, number * height // count
+
+
+def tile_path(out: Path, tile: tuple[int, int] | None) -> Path:
+    """Where a tile of the picture `out` is written: OUT.tile-03-of-16.exr; no tile: `out`."""
+    if tile is None:
+        return out
+    number, count = tile
+    return out.with_name(f"{out.stem}.tile-{number:0{len(str(count))}d}-of-{count}{out.suffix}")
+
+
+def windows(width: int, height: int, rows: Sequence[int]) -> dict[str, Any]:
+    """Header values that place a band of rows in a picture of width x height."""
+
+    def box(first: int, last: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        return np.array([0, first], np.int32), np.array([width - 1, last], np.int32)
+
+    return {"dataWindow": box(rows[0], rows[1] - 1), "displayWindow": box(0, height - 1)}
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A tile in a file: tile `number` of `count`, its rows, first and the one after the last, and its metadata."""
+
+    path: Path
+    number: int
+    count: int
+    rows: tuple[int, int]
+    told: dict[str, Any]
+
+    @property
+    def frame(self) -> int | None:
+        """Number of its picture in a sequence."""
+        frame = self.told["tile"]["frame"]
+        return None if frame is None else int(frame)
+
+    def settings(self) -> dict[str, Any]:
+        """What tiles of one picture have in common."""
+        told, render = self.told, self.told["render"]
+        chosen = {name: render[name] for name in ("width", "height", "samples")}
+        stored = {"half": told["tile"]["half"], "colour": told["colour"], "layers": sorted(told.get("layers", ()))}
+        return {**told["tile"]["identity"], **chosen, **stored, "tiles": self.count}
+
+    def channels(self) -> dict[str, FloatArray]:
+        """Its channels [rows, width] by name, R, G and B among them; InputError: a file of other rows than it says."""
+        found, _ = read_channels(self.path)
+        shape = self.rows[1] - self.rows[0], self.told["render"]["width"]
+        if not found.keys() >= set("RGB") or any(plane.shape != shape for plane in found.values()):
+            raise InputError(self.path, "channels", "(other channels or rows than its metadata tell)", _EXPECTED)
+        return found
+
+
+def read_tile(path: Path) -> Tile:
+    """A tile from its file, of which the pixels are read later.
+
+    Raises:
+        InputError: no OpenEXR file, none of ours, or one that an interrupted run left.
+    """
+    told = read_metadata(path)
+    try:
+        facts, render = told["tile"], told["render"]
+        number, count = (int(facts[name]) for name in ("number", "of"))
+        if not 1 <= number <= count <= int(render["height"]) or int(render["width"]) < 1:
+            raise ValueError(f"tile {number} of {count}")
+        tile = Tile(path, number, count, rows_of(int(render["height"]), (number, count)), told)
+        if tile.settings()["colour"]["space"] not in COLOUR_SPACES or not isinstance(told["camera"], dict):
+            raise ValueError("other metadata")
+        if not math.isfinite(sum(float(render[name]) for name in (*_SUMMED, "passed_fraction"))):
+            raise ValueError("other statistics")
+        complete, done = bool(render["complete"]), float(render["samples_done"])
+        int(facts["frame"] or 0)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        why = f"no {error}" if isinstance(error, KeyError) else str(error)
+        raise InputError(path, "metadata", f"({why})", _EXPECTED) from None
+    if not complete:
+        raise InputError(path, "samples", done, f"{render['samples']}: it is not done; its command goes on")
+    return tile
+
+
+def check_together(tiles: Sequence[Tile]) -> None:
+    """Raise InputError unless these are all the tiles of one picture, each once; it names what differs or lacks."""
+    first = tiles[0]
+    for other in tiles[1:]:
+        if differs := difference(other.settings(), first.settings()):
+            place, there, here = differs
+            raise InputError(other.path, place, there, f"{here} as in {first.path}")
+    seen: dict[int, Path] = {}
+    for tile in tiles:
+        if tile.number in seen:
+            name = f"{tile.number} of {tile.count}"
+            raise InputError(tile.path, "tile", name, f"each tile once: {seen[tile.number]} is that one, too")
+        seen[tile.number] = tile.path
+    if missing := [number for number in range(1, first.count + 1) if number not in seen]:
+        of = "" if first.frame is None else f" of frame {first.frame}"
+        shown = ", ".join(map(str, missing[:20])) + (", ..." if len(missing) > 20 else "")
+        raise InputError("neurolens merge", f"tiles{of}", f"({shown} missing)", f"all {first.count}")
+
+
+def merged(tiles: Sequence[Tile]) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """Channels [H, W] as one run stores them, and its metadata, of all tiles of a picture.
+
+    Times are summed over the tiles; the remaining metadata are those of one run.
+
+    Raises:
+        InputError: as `check_together`; a picture beyond memory.
+    """
+    check_together(tiles)
+    first, *_ = tiles = sorted(tiles, key=lambda tile: tile.number)
+    width, height = first.told["render"]["width"], first.told["render"]["height"]
+    check_memory(width, height, _BYTES_A_PIXEL)
+    half = first.told["tile"]["half"]
+    channels: dict[str, NDArray[Any]] = {}
+    for tile in tiles:
+        planes = tile.channels()
+        if not channels:
+            kinds = {name: np.float16 if half and name in _COLOURS else np.float32 for name in planes}
+            channels = {name: np.empty((height, width), kind) for name, kind in kinds.items()}
+        if planes.keys() != channels.keys():
+            raise InputError(tile.path, "channels", sorted(planes), f"{sorted(channels)} as in {first.path}")
+        for name, plane in planes.items():
+            channels[name][slice(*tile.rows)] = plane
+    told = {key: value for key, value in first.told.items() if key != "tile"}
+    told["render"] = _statistics([tile.told["render"] for tile in tiles])
+    return channels, told
+
+
+def _statistics(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Statistics of a picture from those of its tiles."""
+    sums = {name: sum(part[name] for part in parts) for name in _SUMMED}
+    passed = sum(round(part["passed_fraction"] * part["paths"]) for part in parts)
+    return {
+        **{key: value for key, value in parts[0].items() if key != "rows"},
+        **sums,
+        "mpaths_per_s": sums["paths"] / max(sums["seconds"], 1e-12) * 1e-6,
+        "passed_fraction": passed / max(sums["paths"], 1),
+        "camera_fraction": sums["camera_thread_seconds"] / max(sums["thread_seconds"], 1e-12),
+    }
+
+
+def write_merged(path: Path, channels: Mapping[str, NDArray[Any]], told: Mapping[str, Any], frame: int | None) -> None:
+    """Write a merged picture as one run writes it; OSError, InputError as `pictures.write_exr`."""
+    render = told["render"]
+    attributes = standard_attributes(told["camera"], render["width"], render["height"], frame)
+    write_stored(path, channels, COLOUR_SPACES[told["colour"]["space"]], told, attributes)

@@ -1,0 +1,192 @@
+"""The page as one file: its template, style, scripts and shaders, and the lenses as packed data."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import html
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neurolens import __version__
+from neurolens.analysis.layout import Layout, element_outline
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_write_text
+from neurolens.graph.c import Signature
+from neurolens.view.shaders import call_of, shared_glsl
+
+FOLDER = Path(__file__).parent / "page"
+SCRIPTS = ("gl.js", "scene.js", "engine.js", "layout.js", "main.js")
+SHADERS = ("scene.glsl", "trace.glsl")
+# A form's download that would carry the page beyond this is left out.
+MOST_BYTES = 3_000_000
+_AIR, _ARC = 1.01, 4  # a medium of a smaller index is drawn as air; of 65 points of an arc every fourth is drawn
+_CONSTANT = re.compile(r"^const float ([A-Z][A-Z0-9_]*_(?:MM|NM)) = ", re.MULTILINE)
+_FUNCTION = re.compile(r"^float ([a-z]\w*)\(([^)]*)\)$", re.MULTILINE)
+_GIVEN = {"zoom_mm": "zoom", "focus_m": "focus", "stop_radius_mm": "stop_radius"}
+
+
+@dataclass(frozen=True)
+class Form:
+    """A lens as one of its models, or traced.
+
+    Attributes:
+        kind: "exact", "polynomial" or "network". method: of the model, as "ols-64".
+        glsl: the text of `neurolens export --to glsl`. signature: of its function.
+        card: what the page says of it: numbers of the domain and errors.
+        files: other downloads, contents by kind ("c", "onnx", "osl").
+    """
+
+    kind: str
+    method: str
+    glsl: str
+    signature: Signature
+    card: Mapping[str, Any]
+    files: Mapping[str, bytes] = field(default_factory=dict)
+
+    def program(self) -> dict[str, Any]:
+        """What a shader needs besides the text: the call, and an expression for each number of the lens."""
+        own = self.signature.name
+        values = {name.removeprefix(f"{own.upper()}_").lower(): name for name in _CONSTANT.findall(self.glsl)}
+        for name, arguments in _FUNCTION.findall(self.glsl):
+            given = [_GIVEN[a.split()[-1]] for a in arguments.split(",")]
+            values[name.removeprefix(f"{own}_")] = f"{name}({', '.join(given)})"
+        return {"name": own, "call": call_of(self.signature), "values": values, "state": list(self.signature.state)}
+
+
+@dataclass(frozen=True)
+class ViewLens:
+    """A lens of the menu: `key` tells it from others, `path` is of `shaders.path_glsl`.
+
+    Attributes:
+        squeeze: of an anamorphic picture across. f_numbers: the widest stop's by zoom position (mm). focus_m: nearest.
+        section: of `section_svg`.
+    """
+
+    key: str
+    name: str
+    source: str
+    efl_mm: float
+    film_radius_mm: float
+    squeeze: float
+    f_numbers: Sequence[tuple[float, float]]
+    nearest_m: float
+    section: Mapping[str, Any]
+    path: tuple[str, Sequence[str]] | None
+    forms: Sequence[Form]
+
+
+def write_page(
+    out: Path, lenses: Sequence[ViewLens], kinds: Sequence[str], most_bytes: int = MOST_BYTES
+) -> dict[str, Any]:
+    """Write the page; of the `kinds` of files that it brings, "glsl" first, the last go where they do not fit.
+
+    Returns its size and what of the downloads is there.
+
+    Raises:
+        InputError: no lens; lenses that do not fit without any download.
+    """
+    if not lenses:
+        raise InputError(out, "lenses", "(none)", "at least one lens")
+    for count in range(len(kinds), 0, -1):
+        text = _page(lenses, kinds[:count])
+        if len(text.encode()) <= most_bytes:
+            atomic_write_text(out, text)
+            return {"bytes": len(text.encode()), "downloads": list(kinds[:count])}
+    raise InputError(out, "bytes", len(text.encode()), f"at most {most_bytes}: fewer lenses")
+
+
+def _page(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> str:
+    shared = {
+        "version": __version__,
+        "functions": {name: {"text": text, "call": call} for name, (text, call) in shared_glsl().items()},
+        "shaders": {name.removesuffix(".glsl"): _text(name) for name in SHADERS},
+        "lenses": [_entry(lens, kinds) for lens in lenses],
+    }
+    parts = {
+        "TITLE": html.escape(lenses[0].name if len(lenses) == 1 else "neurolens: lenses and their models"),
+        "STYLE": _text("style.css"),
+        "DATA": _json(shared),
+        "LENSES": "\n".join(_packed(lens, kinds) for lens in lenses),
+        "SCRIPT": "\n".join(_text(name) for name in SCRIPTS),
+    }
+    return re.sub(r"@([A-Z]+)@", lambda m: parts[m[1]], _text("page.html"))
+
+
+def _entry(lens: ViewLens, kinds: Sequence[str]) -> dict[str, Any]:
+    """What the menu and the first picture need."""
+    found = {k: v for k, v in asdict(lens).items() if k not in ("forms", "path", "section")}
+    forms = [
+        {"kind": f.kind, "method": f.method, **f.program(), "card": f.card, "files": _kept(f, kinds)}
+        for f in lens.forms
+    ]
+    return found | {"forms": forms, "paths": lens.path is not None}
+
+
+def _kept(form: Form, kinds: Sequence[str]) -> list[str]:
+    return [kind for kind in kinds if kind == "glsl" or kind in form.files]
+
+
+@cache
+def _zipped(text: str) -> str:
+    return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
+
+
+def _packed(lens: ViewLens, kinds: Sequence[str]) -> str:
+    """One element a text or file, gzip in base64: browsers unpack them when they are asked for."""
+    path = {} if lens.path is None else {"text": lens.path[0], "outputs": list(lens.path[1])}
+    texts = {f"{lens.key}/lens": json.dumps({"section": lens.section, "path": path})}
+    for form in lens.forms:
+        for kind in _kept(form, kinds):
+            data = form.glsl.encode() if kind == "glsl" else form.files[kind]
+            texts[f"{lens.key}/{form.kind}/{kind}"] = data.decode("latin-1" if kind == "onnx" else "utf-8")
+    return "\n".join(
+        f'<script type="application/gzip" id="{html.escape(key)}">{_zipped(text)}</script>'
+        for key, text in texts.items()
+    )
+
+
+def _text(name: str) -> str:
+    return (FOLDER / name).read_text(encoding="utf-8")
+
+
+def _json(data: Any) -> str:
+    """JSON that ends no script element."""
+    return json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def section_svg(layout: Layout) -> dict[str, Any]:
+    """The section of a lens as paths of SVG in mm, z to the right and heights upwards: glass, rims, stop, film."""
+    glass = [
+        {"path": _path(element_outline(front, back)), "n": round(front.n_after, 3)}
+        for front, back in zip(layout.surfaces, layout.surfaces[1:], strict=False)
+        if front.n_after >= _AIR
+    ]
+    high = max(s.semi_diameter_mm for s in layout.surfaces)
+    rims, stop = "", ""
+    for s in layout.surfaces:
+        h, z = s.semi_diameter_mm, s.arc()[-1, 0]
+        reach = max(h * 1.15, h + 0.16 * high) if s.stop else h + 0.035 * high
+        ticks = "".join(f"M{z:.2f} {sign * h:.2f}V{sign * reach:.2f}" for sign in (-1, 1))
+        rims, stop = (rims, stop + ticks) if s.stop else (rims + ticks, stop)
+    film, half = layout.film_z_mm, layout.film_half_height_mm
+    arcs = np.concatenate([s.arc()[:, 0] for s in layout.surfaces])
+    z = float(arcs.min()) - 0.55 * high, max(film, float(arcs.max())) + 0.05 * high
+    top = max(high * 1.2, 1.06 * half)
+    return {
+        "glass": glass, "rims": rims, "stop": stop, "film": f"M{film:.2f} {-half:.2f}V{half:.2f}",
+        "box": [round(v, 2) for v in (z[0], -top, z[1] - z[0], 2 * top)],
+    }  # fmt: skip
+
+
+def _path(points: np.ndarray[Any, Any]) -> str:
+    """A closed path; of an outline's arcs every fourth point."""
+    kept = np.concatenate([points[:65:_ARC], points[65:-65], points[-65::_ARC]])
+    return "M" + "L".join(f"{z:.2f} {h:.2f}" for z, h in kept) + "Z"

@@ -1,0 +1,103 @@
+"""What the page's shaders take from graphs besides the functions of lenses and models: weights, blades, a thin lens,
+and the crossings of rays with the surfaces of a lens.
+"""
+
+from __future__ import annotations
+
+import re
+
+from neurolens.cameras.blades import Blades
+from neurolens.cameras.cameragraph import weight_graph
+from neurolens.graph.c import Signature
+from neurolens.graph.glsl import write_glsl
+from neurolens.graph.ir import Graph
+from neurolens.graph.program import FILM_Z, STOP_RADIUS, WAVELENGTH, Program
+from neurolens.graph.scalars import lower
+from neurolens.optics.prescription import Lens
+from neurolens.optics.tracegraph import exact_graph
+
+# What stands in the page's shaders for inputs and outputs of functions.
+_PLACES = {
+    "film_x_mm": "film.x", "film_y_mm": "film.y", "pupil_x_mm": "pupil.x", "pupil_y_mm": "pupil.y",
+    WAVELENGTH: "nm", FILM_Z: "film_z", STOP_RADIUS: "stop_radius", "x_mm": "p.x", "y_mm": "p.y", "z_mm": "p.z",
+    "dx": "d.x", "dy": "d.y", "dz": "d.z", "transmittance": "through", "stop_x_mm": "at.x", "stop_y_mm": "at.y",
+    **{name: name for name in ("distance_mm", "per_depth", "per_distance", "scale", "roundness", "weight", "inside")},
+    **{name: name for name in ("half_cos", "half_sin", "edge_cos", "edge_sin")}, "count": "blades",
+    "area_mm2": "area", "lens_status": "float(status)",
+    **dict(zip((f"seen_{k}" for k in range(6)), ("from.x", "from.y", "from.z", "to.x", "to.y", "to.z"), strict=True)),
+}  # fmt: skip
+_COMMENT = re.compile(r"/\*.*?\*/\s*", re.DOTALL)
+
+
+def call_of(signature: Signature) -> str:
+    """The call of a lens's function, its arguments as the page's shaders name them; a state is a uniform."""
+    given = [_PLACES[name] for name in signature.inputs]
+    found = [*(_PLACES[o] for o in signature.outputs), *["status"] * signature.status]
+    return f"{signature.name}({', '.join([*given, *found])})"
+
+
+def shared_glsl() -> dict[str, tuple[str, str]]:
+    """Functions for all lenses, by name, and their calls.
+
+    `weigh`: the ray in the camera's frame and its weight. `opened`: whether it goes through the blades. `thin`: a lens.
+    """
+    graphs = {"weigh": _weight_in_frame(), "opened": _blades_opened(), "thin": _thin_lens()}
+    programs = {name: lower(graph) for name, graph in graphs.items()}
+    return {name: (_text(p, name), call_of(Signature.of(p, name))) for name, p in programs.items()}
+
+
+def _blades_opened() -> Graph:
+    """Whether a crossing with the stop lies between the blades, 1 or 0."""
+    g = Graph()
+    g.outputs["inside"] = Blades(g).opened(g.input("stop_xy_mm", 2) * (1.0 / g.input(STOP_RADIUS, per_call=True)))
+    return g
+
+
+def _weight_in_frame() -> Graph:
+    """`cameragraph.weight_graph` with outputs of names of their own."""
+    g = Graph()
+    inputs = {"film_mm": 2, "pupil_mm": 2, "area_mm2": 1, "scene_ray": 6, "transmittance": 1, "lens_status": 1}
+    given = {name: g.input(name, rows) for name, rows in inputs.items()}
+    given |= {name: g.input(name, per_call=True) for name in ("per_distance", "scale", FILM_Z)}
+    found = g.inline(weight_graph(), given)
+    g.outputs["seen"] = found["ray"]  # under a name of its own: the ray of the lens is an input
+    g.outputs["weight"] = found["weight"]
+    return g
+
+
+def _thin_lens() -> Graph:
+    """A thin lens with the contract of models.
+
+    Pupil points are on the lens, `distance_mm` before the film; besides it takes `per_depth`, 1 / f - 1 / distance
+    (per mm): the ray goes on towards the point conjugate to the film point.
+    """
+    g = Graph()
+    film, pupil = g.input("film_mm", 2), g.input("pupil_mm", 2)
+    film_z, stop, distance, per_depth = (
+        g.input(name, per_call=True) for name in (FILM_Z, STOP_RADIUS, "distance_mm", "per_depth")
+    )
+    way = g.concat(film * (-1.0 / distance) - pupil * per_depth, g.constant(-1.0))
+    g.outputs["scene_ray"] = g.concat(pupil, film_z - distance, way * (1.0 / g.square(way).sqrt()))
+    g.outputs["transmittance"] = g.constant(1.0)
+    g.outputs["stop_xy_mm"] = pupil
+    g.outputs["status"] = g.first_failure([(g.square(pupil), stop * stop)], [6]).whole()
+    return g
+
+
+def path_glsl(lens: Lens, pupil_z_mm: float, light_nm: tuple[float, float]) -> tuple[str, list[str]]:
+    """`lens_path`, of meridional rays (film and pupil points on the y axis): its text, and the names of its outputs.
+
+    These are z and y (mm) at each surface from the film on, the direction in front of the lens, and the status.
+    """
+    g = Graph()
+    zero = g.constant(0.0)
+    rays = g.concat(zero, g.input("film_y_mm"), zero, g.input("pupil_y_mm"), g.input(WAVELENGTH))
+    found = g.inline(exact_graph(lens, pupil_z_mm, light_nm, path=True), {"rays": rays})
+    g.outputs = {"path": found["path"], "dy": found["scene_ray"][4], "dz": found["scene_ray"][5]}
+    g.outputs["status"] = found["status"]
+    program = lower(g)
+    return _text(program, "lens_path"), list(Signature.of(program, "lens_path").outputs)
+
+
+def _text(program: Program, name: str) -> str:
+    return _COMMENT.sub("", write_glsl(program, name, []))

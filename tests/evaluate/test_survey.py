@@ -1,0 +1,199 @@
+"""A survey: the same record for the same task, reasons for what is not fitted, runs that go on, a page that parses."""
+
+import csv
+import json
+import os
+import re
+import signal
+from collections.abc import Iterable, Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from neurolens.base.errors import InputError
+from neurolens.base.progress import Progress
+from neurolens.cli import main
+from neurolens.evaluate import survey_run
+from neurolens.evaluate.survey import SurveySettings, Task, known_record, run_task, summary_of
+from neurolens.evaluate.survey_run import collection_of, in_processes, survey
+
+LENSES = Path(__file__).parents[2] / "lenses"
+TRIPLET = (LENSES / "cooke_triplet_50.toml").read_bytes()
+SMALL = SurveySettings(terms=12, rays=2000)
+READ = SurveySettings(fit=False)
+QUIET = Progress(quiet=True)
+
+
+def here(tasks: Iterable[Task]) -> Iterator[tuple[Task, bytes]]:
+    """An engine without processes."""
+    return ((task, run_task(task)) for task in tasks)
+
+
+@pytest.fixture(scope="module")
+def fitted() -> bytes:
+    return run_task(Task("a/triplet.toml", TRIPLET, SMALL))
+
+
+def test_record_of_a_lens_is_whole_and_the_same_bytes_again(fitted: bytes) -> None:
+    record = json.loads(fitted)
+    assert fitted == run_task(Task("a/triplet.toml", TRIPLET, SMALL))
+    assert (record["verdict"], record["reason"], record["format"]) == ("ok", "", "neurolens")
+    assert record["efl_mm"] == pytest.approx(50.02, abs=0.01)
+    fit = record["fit"]
+    assert 0 < fit["direction_rms_deg"] < 0.05
+    assert fit["coefficients"] == 12
+    assert fit["promises"] > 10
+    assert record["layout"].startswith("<svg")
+
+
+def test_a_task_is_known_by_all_that_decides_its_record(fitted: bytes) -> None:
+    task = Task("a/triplet.toml", TRIPLET, SMALL)
+    assert known_record(fitted, task) == json.loads(fitted)
+    others = (
+        Task("a/triplet.toml", TRIPLET + b"\n", SMALL),
+        Task("a/triplet.toml", TRIPLET, SurveySettings(terms=12, rays=2001)),
+        Task("a/triplet.toml", TRIPLET, SMALL, (("x.agf", b"CC"),)),
+    )
+    assert [known_record(fitted, other) for other in others] == [None, None, None]
+    assert known_record(b"[1]", task) is None
+    assert known_record(fitted[:-5], task) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "said"),
+    [
+        ("empty.zmx", b"", "empty.zmx: file: got (empty)"),
+        ("bits.len", bytes(range(256)), "bytes that are not text"),
+        ("x.json", b"{}", "x.json"),
+        ("cut.toml", TRIPLET[:700], "cut.toml"),
+        ("../../up.seq", b"RDM;LEN\n", "up.seq"),
+        ("nostop.dat", b"50 5 1.5 20\n-50 90 1 20\n", "exactly one row of index 0"),
+    ],
+)
+def test_what_cannot_be_read_is_refused_with_its_reason(name: str, data: bytes, said: str) -> None:
+    record = json.loads(run_task(Task(name, data, READ)))
+    assert record["verdict"] == "refused"
+    assert said in record["reason"]
+    assert "/tmp" not in record["reason"]
+
+
+def test_a_fault_is_a_record_and_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("of a test")
+
+    monkeypatch.setattr("neurolens.evaluate.survey.check_lens", broken)
+    task = Task("t.toml", TRIPLET, READ)
+    data = run_task(task)
+    assert json.loads(data)["verdict"] == "fault"
+    assert "ZeroDivisionError: of a test (test_survey.py:" in json.loads(data)["reason"]
+    assert known_record(data, task) is None
+
+
+def _folder(tmp_path: Path) -> Path:
+    folder = tmp_path / "lenses"
+    (folder / "in").mkdir(parents=True)
+    (folder / "in" / "=triplet <b>.toml").write_bytes(TRIPLET)
+    (folder / "no.zmx").write_text("no lens")
+    (folder / "read.me").write_text("words")
+    (folder / ".hidden.zmx").write_text("no")
+    return folder
+
+
+class Rows(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.rows: list[dict[str, str | None]] = []
+        self.links: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in ("meta", "input", "br", "path"):
+            self.open.append(tag)
+        if tag == "tr" and "tbody" in self.open:
+            self.rows.append(dict(attrs))
+        self.links += [value or "" for name, value in attrs if name in ("src", "href")]
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in ("path",):
+            assert self.open.pop() == tag
+
+
+def test_a_survey_leaves_nothing_out_and_goes_on(tmp_path: Path) -> None:
+    collection, out, asked = collection_of(_folder(tmp_path)), tmp_path / "out", list[str]()
+
+    def engine(tasks: Iterable[Task]) -> Iterator[tuple[Task, bytes]]:
+        for task, data in here(tasks):
+            asked.append(task.name)
+            yield task, data
+            if len(asked) == 1:
+                raise KeyboardInterrupt
+
+    assert collection.names == ("in/=triplet <b>.toml", "no.zmx")
+    assert collection.others == {".me": 1}
+    with pytest.raises(KeyboardInterrupt):
+        survey(collection, out, READ, engine, QUIET)
+    records = survey(collection, out, READ, engine, QUIET)
+    assert asked == list(collection.names)  # each once
+    assert [r["verdict"] for r in records] == ["ok", "refused"]
+    page = (out / "survey.html").read_text(encoding="utf-8")
+    found = Rows()
+    found.feed(page)
+    assert [row["data-kinds"] for row in found.rows] == ["ok unfitted", "refused"]
+    assert found.open == []
+    assert found.links == []  # self-contained
+    assert "triplet &lt;b&gt;" in page
+    with (out / "survey.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["verdict"] for row in rows] == ["ok", "refused"]
+    data = json.loads((out / "survey.json").read_text())
+    assert data["summary"]["files"] == 2
+    assert data["lenses"][1]["reason"] == records[1]["reason"]
+
+
+def test_a_killed_process_costs_its_own_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(survey_run, "_POLL_S", 0.0)
+    collection = collection_of(_folder(tmp_path))
+    records = survey(collection, tmp_path / "out", READ, in_processes(2, limit_s=0.0), QUIET)
+    assert {r["verdict"] for r in records} == {"fault"}
+    assert "took longer than 0 s" in records[0]["reason"]
+
+
+def test_the_end_of_a_process_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    task = Task("a.toml", b"")
+
+    class Process:
+        exitcode = -signal.SIGKILL
+
+        def join(self) -> None: ...
+
+    read, write = os.pipe()
+    os.close(write)
+    from multiprocessing.connection import Connection
+
+    record = json.loads(survey_run._answer(Connection(read), Process(), task))
+    assert record["verdict"] == "fault"
+    assert "killed by signal 9" in record["reason"]
+
+
+def test_summary_counts_goals_and_takes_a_missing_figure_for_the_worst() -> None:
+    good = {"direction_rms_deg": 1e-3, "false_pass": 0.0, "false_block": 1e-4, "reaches": True, "broken": []}
+    bad = {**good, "direction_rms_deg": None, "reaches": False, "broken": ["x"]}
+    records = [{"verdict": "ok", "fit": good}, {"verdict": "doubtful", "fit": bad}, {"verdict": "refused"}]
+    found = summary_of(records)
+    assert (found["read"], found["refused"], found["fitted"], found["reach_goals"]) == (2, 1, 2, 1)
+    assert found["promises_held"] == 1
+    assert summary_of(records[1:])["median"]["direction_rms_deg"] is None
+
+
+def test_the_command_says_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = _folder(tmp_path)
+    assert main(["survey", str(folder), "--no-fit", "--out", str(tmp_path / "o"), "--jobs", "1"]) == 0
+    out, err = capsys.readouterr()
+    assert "2 files: 1 read (0 of them doubtful), 1 refused" in out
+    assert "1 .me" in out
+    assert re.search(r"no\.zmx: refused: .*expected", err)
+    assert main(["survey", str(tmp_path / "nowhere")]) == 2
+    with pytest.raises(InputError, match="files of other kinds"):
+        (tmp_path / "empty").mkdir()
+        collection_of(tmp_path / "empty")

@@ -1,0 +1,128 @@
+"""Whether what plans are judged by tells what was done to a picture, and a case of each table."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from experiments import lab, plans, shots
+from experiments.plan_errors import by_rays, fresh_places, fresh_prints, moved, pieces_of, rendered
+from neurolens.cameras.build import Shot, make_camera
+from neurolens.evaluate.experiment import near_limit_m
+from neurolens.evaluate.plan import Choice
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.pupils import image_radius_mm
+from neurolens.render.scene import load_scene
+
+SIDE, SEEDS = 56, 4
+
+
+def pictures(shift: tuple[float, float], blur_px: float, gain: float, noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """Renders of a wavy picture, and of the same moved by `shift` (right, down), spread and brighter."""
+    rng = np.random.default_rng(2)
+    waves = [(rng.normal(0, 0.35, 2), rng.random() * 6.3, rng.random()) for _ in range(14)]
+    y, x = np.mgrid[:SIDE, :SIDE]
+
+    def seen(right: float, down: float, variance: float) -> np.ndarray:
+        return 4 + sum(
+            a * np.exp(-0.5 * variance * (k @ k)) * np.cos(k[0] * (x - right) + k[1] * (y - down) + p)
+            for k, p, a in waves
+        )  # fmt: skip
+
+    own, made = seen(0, 0, 0.5), (1 + gain) * seen(*shift, 0.5 + blur_px**2)
+    grain = rng.normal(0, noise, (SEEDS, SIDE, SIDE, 3))  # as of the same random numbers, mostly the same
+    more = rng.normal(0, noise / 4, grain.shape)
+    return own[None, ..., None] + grain, made[None, ..., None] + grain + more
+
+
+@pytest.mark.parametrize("size", [0.05, 0.25, 1.0])
+def test_a_shift_is_found(size: float) -> None:
+    found = moved(*pictures((0.6 * size, -0.8 * size), 0.0, 0.0, 0.02), blur_px=0.0)
+    assert found.px == pytest.approx(size, rel=0.1, abs=3 * found.noise_px) and found.noise_px < 0.01
+
+
+def test_a_blur_is_found_as_the_way_that_light_moves() -> None:
+    exact, blurred = pictures((0.0, 0.0), 0.8, 0.0, 0.02)
+    for before in (0.0, 2.0):  # RMS distance from the centroid: sqrt 2 of the width along an axis
+        own = before**2 + 1 / 6  # with the pixel's
+        wanted = np.sqrt(own + 2 * 0.8**2) - np.sqrt(own)
+        assert moved(exact, blurred, before).px == pytest.approx(wanted, rel=0.12)
+
+
+def test_light_alone_moves_nothing() -> None:
+    found = moved(*pictures((0.0, 0.0), 0.0, 0.03, 0.02), blur_px=0.0)
+    assert found.gain == pytest.approx(0.03, rel=0.05) and found.px < 0.02
+
+
+def test_noise_is_no_shift_and_flat_pictures_tell_nothing() -> None:
+    exact, same = pictures((0.0, 0.0), 0.0, 0.0, 0.3)
+    found = moved(exact, same, 1.0)
+    assert found.px < 0.02 and 0 < found.noise_px < 0.1
+    flat = np.ones((SEEDS, SIDE, SIDE, 3))
+    assert np.isinf(moved(flat, 1.1 * flat, 1.0).noise_px)
+
+
+class Shifted:
+    """A camera whose picture is moved on its film by `by_mm` along x."""
+
+    def __init__(self, camera: Any, by_mm: float) -> None:
+        self._camera, self._by = camera, np.array([[by_mm], [0.0]], np.float32)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._camera, name)
+
+    def sample(self, film_mm: Any, pupil: Any, wavelength_nm: Any) -> Any:
+        return self._camera.sample(film_mm + self._by, pupil, wavelength_nm)
+
+
+def test_a_shifted_camera_is_as_far_off_by_rays_and_by_renders() -> None:
+    scene = plans.suited(load_scene(lab.SCENES / "grid.toml"), read_lens("lenses/canon_gauss_35.toml"), 4.0, 2.0)
+    shot = scene.settings.camera
+    exact = make_camera("thin", Shot((shot.film_width_mm, shot.film_height_mm), 2.0, efl_mm=35.0, f_number=4.0))
+    pixel = shot.film_width_mm / shot.width
+    other = Shifted(exact, 0.4 * pixel)
+    places = fresh_places(scene, exact, across=5)
+    apart, light = by_rays(other, places, fresh_prints(exact, places), pixel)
+    assert apart == pytest.approx(0.4, rel=1e-2) and light.max() < 1e-3
+    centres = pieces_of(scene, exact, 40, cells=(2, 1))
+    renders = [rendered(scene, c, centres, 40, samples=16, seeds=3) for c in (exact, other)]
+    for k in range(2):
+        found = moved(renders[0][:, k], renders[1][:, k], blur_px=0.5)
+        assert found.px == pytest.approx(0.4, rel=0.1, abs=3 * found.noise_px) and found.noise_px < 0.04
+
+
+def test_scenes_suit_lenses() -> None:
+    for name in ("phone_lens_6", "ogawa_zoom_70_200"):
+        lens = read_lens(f"lenses/{name}.toml").at()
+        own = load_scene(lab.SCENES / "lights.toml").settings.camera
+        shot = plans.suited(load_scene(lab.SCENES / "lights.toml"), lens).settings.camera
+        assert shot.focus_m >= near_limit_m(lens) and shot.width == 1920
+        moved_m = np.linalg.norm(np.subtract(shot.position_m, own.position_m))
+        assert moved_m == pytest.approx(shot.focus_m - own.focus_m, abs=1e-6)  # what is in focus stays so
+        corner = np.hypot(shot.film_width_mm, shot.film_height_mm) / 2
+        assert corner == pytest.approx(0.95 * image_radius_mm(lens)[0]) or shot.film_width_mm == 36.0
+
+
+def test_a_decision_is_held_against_the_cheapest_that_holds() -> None:
+    every = [Choice(n, n, 0.0, 0.0, cost, 1.0) for n, cost in (("a", 10.0), ("b", 20.0), ("c", 30.0))]
+    rows = {"a": {"px": 0.3, "light": 0.0}, "b": {"px": 0.1, "light": 0.0}, "c": {"px": 0.0, "light": 0.02}}
+    for budget, best, holds, cheapest, ratio in (
+        (0.5, 1, True, "a", 2.0), (0.2, 0, False, "b", 0.5), (0.2, 2, False, "b", 1.5), (0.05, None, True, None, None),
+    ):  # fmt: skip
+        made = plans._decision("render", budget, None if best is None else every[best], every, rows)
+        assert (made["holds"], made["cheapest"], made["ratio"]) == (holds, cheapest, ratio)
+
+
+def test_tables_tell_misses() -> None:
+    told = {"px": 0.3, "noise_px": 0.01, "pieces": 3}
+    decision = {"target": "render", "budget_px": 0.25, "chosen": "x.shot-ols-8", "cheapest": "x.ols-64", "holds": False}
+    decision |= {"px": 0.26, "light": 0.0, "ratio": 0.9, "plan_s": 9.0, "render": told}
+    effects = [{"name": "coma", "unit": "px", "probe": 1.0, "fresh": 1.3}]
+    row = {"lens": "x", "scene": "room", "f_number": 2.0, "pixel_um": 18.0, "cameras": {}, "effects": effects}
+    text = plans.page([row | {"decisions": [decision, decision | {"holds": True, "render": None, "ratio": 1.1}]}])
+    assert "| 0.5 | missed |" in text and "| coma | 1 | 1.3 | px |" in text and "| 1.1 | reached |" in text
+    model = {"terms": 64, "um": 1.0, "light": 0.0, "operations": 300, "ns": 20.0}
+    shot = {"shot": "portrait", "f_number": 2.0, "focus_m": 3.0, "shipped": model}
+    own = model | {"terms": 16, "operations": 120, "ns": 14.0}
+    text = shots.page([{"lens": "x", "shots": [shot | {"own": own}]}])
+    assert "| 300 to 120 | 0.40 | 20.0 to 14.0 |" in text and "| 0.7 | missed |" in text

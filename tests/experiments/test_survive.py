@@ -1,0 +1,16 @@
+"""The harness that kills commands: one small command through all that it does."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from experiments.__main__ import main
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="it forks, and reads /proc")
+def test_merging_survives_what_the_harness_does(tmp_path: Path) -> None:
+    assert main(["survive", "--only", "merge", "--kills", "3", "--out", str(tmp_path)]) == 0
+    row = (tmp_path / "survive.md").read_text().splitlines()[-1].split(" | ")
+    assert row[0] == "| merge" and row[1] == "1" and row[3] == "1 of 1" and row[4] == "0"
+    assert row[5:] == ["exit 2, 1 line, same after", "exit 0 and 0, same", "same", "exit 2, 1 line |"]

@@ -1,0 +1,289 @@
+"""The page in a browser with software WebGL2: its pictures against those of the renderer, every control, no request.
+
+Run by `make test-web`, which sets NEUROLENS_BROWSER to a Chromium, and NEUROLENS_ORT to the files of onnxruntime-web.
+"""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.onnxlens import load_model
+from neurolens.cli import main
+from neurolens.render.renderer import render
+from neurolens.render.scene import scene_from_tables
+
+BROWSER = os.environ.get("NEUROLENS_BROWSER")
+if not BROWSER:
+    pytest.skip("no browser is named (NEUROLENS_BROWSER, see make test-web)", allow_module_level=True)
+sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright (pip install '.[web]')")
+
+ROOT = Path(__file__).parents[2]
+LENS = "petzval_portrait_100"
+ZOOM = "nikon_zoom_80_200"
+FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+WIDE, HIGH = 240, 135  # of compared pictures
+NM = 550.0
+
+
+@pytest.fixture(scope="module")
+def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("view") / "view.html"
+    words = [str(ROOT / "models" / f"{ZOOM}-range.states-64.onnx"), LENS, ZOOM]
+    assert main(["view", *words, "--downloads", "glsl,onnx,c", "-o", str(out), "--json"]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with sync_api.sync_playwright() as play:
+        found = play.chromium.launch(executable_path=BROWSER, args=FLAGS)
+        yield found
+        found.close()
+
+
+class Opened:
+    """A page with what it said and asked for."""
+
+    def __init__(self, browser: Any, file: Path, **options: Any) -> None:
+        self.page = browser.new_page(**options)
+        self.said: list[str] = []
+        self.asked: list[str] = []
+        self.page.on("console", lambda m: self.said.append(m.text))
+        self.page.on("pageerror", lambda e: self.said.append(str(e)))
+        self.page.on("request", lambda r: self.asked.append(r.url))
+        self.page.goto(file.as_uri())
+        self.page.evaluate("neurolens.ready")
+
+    def set(self, **settings: Any) -> None:
+        """Settings of the page's own object, and the first sample with them."""
+        self.page.evaluate("s => { Object.assign(neurolens.set, s); return neurolens.show(); }", settings)
+
+    def lens(self, key: str) -> None:
+        self.page.evaluate(
+            "k => { const n = neurolens; n.chooseLens(n.shared.lenses.find((l) => l.key === k)); return n.show(); }",
+            key,
+        )
+
+    def picture(self, samples: int) -> np.ndarray:
+        """[HIGH, WIDE] green of the left side, the first row on top."""
+        script = (
+            "n => { for (let k = 1; k < n; k++) neurolens.pass(); return Array.from(neurolens.engine.picture('a')); }"
+        )
+        rows = np.array(self.page.evaluate(script, samples)).reshape(HIGH, WIDE, 4)
+        return rows[::-1, :, 1]
+
+    def number(self, script: str) -> Any:
+        return self.page.evaluate(script)
+
+
+@pytest.fixture(scope="module")
+def opened(browser: Any, page_file: Path) -> Iterator[Opened]:
+    found = Opened(browser, page_file)
+    found.lens(LENS)
+    found.set(still=True, view="one", a="polynomial", width=WIDE, wavelength=NM)
+    yield found
+    assert found.said == []
+    assert found.asked == [page_file.as_uri()]
+
+
+BALLS = """b => {
+  const n = neurolens, empty = n.sceneUniforms("night", 1, 1), ball = new Float32Array(empty.ball.length);
+  const coat = new Float32Array(empty.coat.length);
+  b.forEach((v, k) => { ball.set(v, 4 * k); coat.set([100, 100, 100, -1], 4 * k); });
+  const scene = { ...empty, ball, coat, solids: 0, balls: b.length, floor_y: -1e6, key_power: 0 };
+  return n.engine.prepare(n.set.lens, { a: n.set.a }, n.set, scene).then(() => {
+    n.pass();
+    return n.engine.sides.a.values.film_mm;
+  });
+}"""
+
+
+def ours(
+    camera: str, film_mm: list[float], settings: dict[str, Any], tables: dict[str, Any], samples: int
+) -> np.ndarray:
+    """[HIGH, WIDE] of our renderer, in the same light."""
+    shot = Shot(tuple(film_mm), settings["focus"], settings["f_number"], wavelength_nm=(NM, NM), clamp_f_number=True)
+    place = {"position_m": [0.0, 0.0, 0.0], "look_at_m": [0.0, 0.0, -1.0], "focus_m": settings["focus"]}
+    sizes = {"film_width_mm": film_mm[0], "film_height_mm": film_mm[1], "wavelengths_nm": [NM, NM]}
+    scene = scene_from_tables({"camera": {**place, **sizes}, **tables})
+    result = render(scene, make_camera(camera, shot), width=WIDE, height=HIGH, samples=samples, threads=1)
+    return result.rgb[..., 1].astype(float)
+
+
+CAMERAS = {"polynomial": str(ROOT / "models" / f"{LENS}.ols-64.onnx"), "exact": str(ROOT / "lenses" / f"{LENS}.toml")}
+
+
+@pytest.mark.parametrize("kind", CAMERAS)
+@pytest.mark.parametrize("f_number", [3.6, 8.0])
+def test_white_card_darkens_as_in_our_renderer(opened: Opened, kind: str, f_number: float) -> None:
+    settings = {"focus": 4.0, "f_number": f_number}
+    opened.set(scene="white", a=kind, blades=0, **settings)
+    found = opened.picture(64)
+    film = opened.number("neurolens.engine.sides.a.values.film_mm")
+    wanted = ours(CAMERAS[kind], film, settings, {"environment": {"colour": [1.0, 1.0, 1.0]}}, 16)
+    blocks = [p.reshape(9, 15, 16, 15).mean((1, 3)) for p in (found, wanted)]
+    middle = [b[4, 7:9].mean() for b in blocks]
+    assert np.abs(blocks[0] / middle[0] - blocks[1] / middle[1]).max() < 0.01
+    assert middle[0] == pytest.approx(1, abs=0.01)  # exposed as every camera: uniform light of radiance 1 gives 1
+
+
+def spots(picture: np.ndarray, places: list[tuple[int, int]], half: int) -> list[tuple[float, float, float]]:
+    """Centre (x, y) in pixels and area, that of a disc with the same second moments, of the light around each place."""
+    found = []
+    for x, y in places:
+        part = picture[y - half : y + half + 1, x - half : x + half + 1]
+        ys, xs = np.mgrid[y - half : y + half + 1, x - half : x + half + 1]
+        part = np.where(part > 0.02 * part.max(), part, 0) / part[part > 0.02 * part.max()].sum()
+        cx, cy = (part * xs).sum(), (part * ys).sum()
+        moments = np.cov(np.stack([xs.ravel(), ys.ravel()]), aweights=part.ravel(), ddof=0)
+        found.append((cx, cy, 4 * np.pi * np.sqrt(np.linalg.det(moments))))
+    return found
+
+
+@pytest.mark.parametrize("kind", CAMERAS)
+@pytest.mark.parametrize(("far", "radius", "half"), [(4.0, 0.012, 5), (20.0, 0.12, 12)])
+def test_small_lights_lie_and_spread_as_in_our_renderer(
+    opened: Opened, kind: str, far: float, radius: float, half: int
+) -> None:
+    """In focus at 4 m, and as discs from 20 m."""
+    settings = {"focus": 4.0, "f_number": 3.6}
+    opened.set(scene="night", a=kind, blades=0, **settings)
+    film = opened.number("neurolens.engine.sides.a.values.film_mm")
+    per_pixel = far * film[0] / WIDE / 100.0  # about: the lens is one of 100 mm
+    places = [(x, y) for x in (-85, -30, 30, 85) for y in (-40, 0, 40)]
+    balls = [[x * per_pixel, y * per_pixel, -far, radius] for x, y in places]
+    opened.page.evaluate(BALLS, balls)
+    found = opened.picture(128)
+    lights = [{"centre_m": b[:3], "radius_m": b[3], "emission": [100.0] * 3} for b in balls]
+    wanted = ours(CAMERAS[kind], film, settings, {"environment": {"colour": [0.0, 0.0, 0.0]}, "spheres": lights}, 64)
+    near = [(round((WIDE - 1) / 2 + x * 1.03), round((HIGH - 1) / 2 - y * 1.03)) for x, y in places]
+    pairs = list(zip(spots(found, near, half), spots(wanted, near, half), strict=True))
+    assert max(np.hypot(a[0] - b[0], a[1] - b[1]) for a, b in pairs) < 0.1
+    areas = np.array([[a[2], b[2]] for a, b in pairs])
+    assert areas[:, 0].mean() == pytest.approx(areas[:, 1].mean(), rel=0.02)
+    sky = 0.1  # brighter than it
+    assert found[found > sky].sum() == pytest.approx(wanted[wanted > sky].sum(), rel=0.02)
+
+
+def test_every_control_changes_the_picture(browser: Any, page_file: Path) -> None:
+    opened = Opened(browser, page_file)
+    page = opened.page
+    opened.set(still=True)
+    page.select_option("#lens", LENS)
+    last = page.locator("#picture").screenshot()
+    moves: list[tuple[str, Any]] = [
+        *((f"#{name}", None) for name in ("focus", "stop", "blades", "roundness", "light")),
+        ("input[name=view][value=one]", True), ("#a", "exact"), ("#a", "thin"), ("#a", "network"),
+        ("input[name=scene][value=chart]", True), ("input[name=scene][value=white]", True),
+        ("input[name=scene][value=night]", True), ("input[name=view][value=difference]", True), ("#b", "thin"),
+        ("input[name=view][value=wipe]", True), ("#wipe", None), ("#size", "960"), ("#lens", ZOOM), ("#zoom", None),
+    ]  # fmt: skip
+    for place, value in moves:
+        if value is True:
+            page.locator(place).check(force=True)
+        elif value is None:
+            page.locator(place).evaluate(
+                "e => { e.value = +e.min + 0.7 * (e.max - e.min); e.dispatchEvent(new Event('input')); }"
+            )
+        else:
+            page.select_option(place, value)
+        page.evaluate("neurolens.idle()")
+        now = page.locator("#picture").screenshot()
+        assert now != last, place
+        last = now
+    assert opened.said == []
+    assert opened.asked == [page_file.as_uri()]
+
+
+def test_clicks_focus_and_draw_rays_by_mouse_and_by_keys(opened: Opened) -> None:
+    page = opened.page
+    opened.set(scene="chart", tool="focus", focus=10.0, a="polynomial")
+    page.locator("#picture").click(position={"x": 300, "y": 100})
+    page.evaluate("neurolens.idle()")
+    framing = opened.number("neurolens.framing()")
+    assert opened.number("neurolens.set.focus") == pytest.approx(framing["far"], rel=1e-3)
+    opened.set(tool="rays")
+    page.locator("#picture").press("ArrowUp")
+    page.locator("#picture").press("Enter")
+    page.wait_for_selector("#layout .ray", state="attached")
+    assert page.locator("#layout .ray").count() == 9
+    page.locator("#picture").press("[")
+    assert opened.number("neurolens.set.wipe") < 0.5
+
+
+def test_downloads_are_the_files(opened: Opened) -> None:
+    opened.set(a="polynomial", tool="focus")
+    wanted = (ROOT / "models" / f"{LENS}.ols-64.onnx").read_bytes()
+    with opened.page.expect_download() as download:
+        opened.page.locator("#downloads button", has_text="ONNX").click()
+    assert Path(download.value.path()).read_bytes() == wanted
+    with opened.page.expect_download() as download:
+        opened.page.locator("#downloads button", has_text="GLSL").click()
+    assert f"void {LENS}(" in Path(download.value.path()).read_text()
+
+
+def test_it_says_what_is_missing(browser: Any, page_file: Path) -> None:
+    for lacking, word in (("getContext", "WebGL2"), ("getExtension", "EXT_color_buffer_float")):
+        page = browser.new_page()
+        owner = "HTMLCanvasElement" if lacking == "getContext" else "WebGL2RenderingContext"
+        page.add_init_script(f"{owner}.prototype.{lacking} = () => null;")
+        page.goto(page_file.as_uri())
+        page.evaluate("neurolens.ready")
+        assert word in page.locator("#missing").inner_text()
+        page.close()
+
+
+def test_a_phone_shows_everything_in_its_width(browser: Any, page_file: Path) -> None:
+    opened = Opened(browser, page_file, viewport={"width": 360, "height": 740}, has_touch=True)
+    assert opened.number("document.documentElement.scrollWidth") <= 360
+    opened.page.locator("#picture").tap(position={"x": 200, "y": 60})
+    opened.page.evaluate("neurolens.idle()")
+    assert opened.number("neurolens.set.clicked") is not None
+    assert opened.said == []
+
+
+def test_models_give_the_same_rays_in_onnxruntime_web(browser: Any, tmp_path: Path) -> None:
+    folder = os.environ.get("NEUROLENS_ORT")
+    if not folder:
+        pytest.skip("no onnxruntime-web is named (NEUROLENS_ORT, see make test-web)")
+    page = browser.new_page()
+    kinds = {".mjs": "text/javascript", ".wasm": "application/wasm", ".onnx": "application/octet-stream"}
+
+    def serve(route: Any) -> None:
+        name = route.request.url.rsplit("/", 1)[1].split("?")[0]
+        file = ROOT / "models" / name if name.endswith(".onnx") else Path(folder) / name
+        if file.is_file():
+            route.fulfill(body=file.read_bytes(), content_type=kinds[file.suffix])
+        else:
+            route.fulfill(body="<!DOCTYPE html>", content_type="text/html")
+
+    page.route("**/*", serve)
+    page.goto("http://neurolens.test/")
+    for method in ("ols-64", "mlp-16x2"):
+        name = f"{LENS}.{method}.onnx"
+        reference = load_model(ROOT / "models" / name).card["reference"]
+        rays = np.array(reference["rays"], np.float32)
+        script = """async ([name, rays, film, stop]) => {
+          const ort = await import("http://neurolens.test/ort.wasm.min.mjs");
+          ort.env.wasm.numThreads = 1;
+          const session = await ort.InferenceSession.create("http://neurolens.test/" + name);
+          const tensor = (data, shape) => new ort.Tensor("float32", Float32Array.from(data), shape);
+          const count = rays.length / 5;
+          const out = await session.run({ rays: tensor(rays, [5, count]), film_z_mm: tensor(film, [1]),
+            stop_radius_mm: tensor([stop], [1]) });
+          return Object.fromEntries(Object.entries(out).map(([k, v]) => [k, Array.from(v.data, Number)]));
+        }"""
+        film = reference["film_z_mm"]
+        found = page.evaluate(script, [name, rays.ravel().tolist(), film[:1], reference["stop_radius_mm"]])
+        status = np.array(reference["status"])
+        assert found["status"] == status.tolist()
+        passed = status == 0
+        ray = np.array(found["scene_ray"]).reshape(6, -1)
+        known = np.array(reference["scene_ray"])
+        assert np.abs(ray - known)[:3, passed].max() < 4 * reference["rounding"]["position_mm"]
+        assert np.abs(ray - known)[3:, passed].max() < 4 * reference["rounding"]["direction"]

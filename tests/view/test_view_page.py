@@ -1,0 +1,234 @@
+"""The page without a browser: that it is whole, small and safe, its shaders compile, and what it takes from graphs."""
+
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from neurolens.base.errors import InputError
+from neurolens.cli import main
+from neurolens.graph.interpret import evaluate
+from neurolens.graph.ir import Graph
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.surfaces import Rays
+from neurolens.optics.trace import trace
+from neurolens.optics.tracegraph import exact_graph
+from neurolens.view import page as pages
+from neurolens.view import shaders
+
+ROOT = Path(__file__).parents[2]
+LENS = "thorlabs_lb1471_biconvex_50"
+GLSLANG, NODE = shutil.which("glslangValidator"), shutil.which("node")
+
+
+@pytest.fixture(scope="module")
+def view(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("view") / "view.html"
+    assert main(["view", LENS, "--downloads", "glsl", "-o", str(out), "--json"]) == 0
+    return out
+
+
+class Elements(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+
+
+def test_it_fetches_nothing(view: Path) -> None:
+    text = view.read_text(encoding="utf-8")
+    elements = Elements()
+    elements.feed(text)
+    tags = {tag for tag, _ in elements.found}
+    assert not tags & {"img", "iframe", "object", "embed", "video", "audio", "base"}
+    assert all("src" not in given for _, given in elements.found)
+    assert {given["href"] for _, given in elements.found if "href" in given} == {"data:,"}
+    assert not re.search(r"@import|url\(|fetch\(|XMLHttpRequest|WebSocket|import\(|eval\(|new Function", text)
+    policy = next(given["content"] for _, given in elements.found if "http-equiv" in given)
+    assert policy is not None and policy.startswith("default-src 'none'")
+
+
+def test_it_is_whole(view: Path) -> None:
+    text = view.read_text(encoding="utf-8")
+    assert not re.search(r"@[A-Z]+@", text)
+    data = json.loads(text.split('id="data">')[1].split("</script")[0])
+    (lens,) = data["lenses"]
+    assert {form["kind"] for form in lens["forms"]} == {"polynomial", "network", "exact"}
+    for form in lens["forms"]:
+        assert f'id="{LENS}/{form["kind"]}/glsl"' in text
+        assert {"efl_mm", "film_z_mm", "pupil_z_mm", "pupil_radius_mm", "stop_radius_max_mm"} <= set(form["values"])
+
+
+def test_every_control_has_a_label(view: Path) -> None:
+    elements = Elements()
+    text = view.read_text(encoding="utf-8")
+    elements.feed(text)
+    for tag, given in elements.found:
+        if tag in ("input", "select"):
+            assert re.search(
+                rf"<label[^>]*>(?:(?!</label>).)*{re.escape(given.get('id') or given.get('value') or '')}", text
+            )
+
+
+@pytest.mark.skipif(not (GLSLANG and NODE), reason="no glslangValidator or no node")
+def test_shaders_compile(view: Path, tmp_path: Path) -> None:
+    """As the page's own script puts them together."""
+    text = view.read_text(encoding="utf-8")
+    data = json.loads(text.split('id="data">')[1].split("</script")[0])
+    scripts = "\n".join(
+        (pages.FOLDER / name).read_text(encoding="utf-8") for name in ("gl.js", "scene.js", "engine.js")
+    )
+    script = f"""{scripts}
+const data = {json.dumps(data)}, zlib = require("zlib"), fs = require("fs");
+const packed = {json.dumps(dict(re.findall(r'application/gzip" id="([^"]*)">([^<]*)<', text)))};
+const unpacked = (id) => zlib.gunzipSync(Buffer.from(packed[id], "base64")).toString();
+fs.writeFileSync("thin.frag", HEAD + pictureShader(data, data.functions.thin.text, data.functions.thin.call));
+for (const form of data.lenses[0].forms)
+  fs.writeFileSync(form.kind + ".frag", HEAD + pictureShader(data, unpacked(`{LENS}/${{form.kind}}/glsl`), form.call));
+"""
+    subprocess.run([str(NODE), "-e", script], check=True, cwd=tmp_path, capture_output=True)
+    files = sorted(tmp_path.glob("*.frag"))
+    assert len(files) == 4
+    done = subprocess.run([str(GLSLANG), *map(str, files)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+def test_a_page_that_grows_too_large_leaves_files_out(view: Path, tmp_path: Path) -> None:
+    lens = tiny_lens()
+    out = tmp_path / "small.html"
+    whole = pages.write_page(out, [lens], ["glsl", "c"])
+    assert whole["downloads"] == ["glsl", "c"]
+    assert pages.write_page(out, [lens], ["glsl", "c"], whole["bytes"] - 1)["downloads"] == ["glsl"]
+    assert out.stat().st_size < whole["bytes"]
+    with pytest.raises(InputError, match="fewer lenses"):
+        pages.write_page(tmp_path / "none.html", [lens], ["glsl"], 1000)
+    assert not (tmp_path / "none.html").exists()
+    with pytest.raises(InputError, match="at least one lens"):
+        pages.write_page(out, [], ["glsl"])
+
+
+def tiny_lens() -> pages.ViewLens:
+    signature = shaders.Signature("tiny", ("film_x_mm",), (), ("x_mm",))
+    card = {"film_radius_mm": 20.0}
+    noise = "".join(chr(33 + n) for n in np.random.default_rng(0).integers(0, 80, 3000)).replace("\\", "x")
+    form = pages.Form("exact", "traced", "const float TINY_EFL_MM = 50.0f;\n", signature, card, {"c": noise.encode()})
+    return pages.ViewLens(
+        "tiny", 'A "lens" </script><b>', "a & b", 50.0, 20.0, 1.0, [(50.0, 2.0)], 1.0, {}, None, [form]
+    )
+
+
+def test_names_are_text_and_never_markup(tmp_path: Path) -> None:
+    out = tmp_path / "view.html"
+    pages.write_page(out, [tiny_lens(), replace(tiny_lens(), key="</script><i>")], ["glsl"])
+    elements = Elements()
+    elements.feed(out.read_text(encoding="utf-8"))
+    assert not {"b", "i"} & {tag for tag, _ in elements.found}
+
+
+def test_a_thin_lens_sends_rays_to_the_conjugate_point() -> None:
+    rng = np.random.default_rng(3)
+    film, pupil = rng.uniform(-15, 15, (2, 50)), rng.uniform(-8, 8, (2, 50))
+    focal, distance = 50.0, 52.0
+    call = {"film_z_mm": 80.0, "stop_radius_mm": 9.0, "distance_mm": distance, "per_depth": 1 / focal - 1 / distance}
+    given = {"film_mm": film, "pupil_mm": pupil} | {k: np.array([[v]]) for k, v in call.items()}
+    found = evaluate(shaders._thin_lens(), given)
+    x, y, z, dx, dy, dz = found["scene_ray"]
+    away = 1 / (1 / focal - 1 / distance)  # in front of the lens, at z = 28
+    at = np.stack([x, y]) + np.stack([dx, dy]) * ((28.0 - away) - z) / dz
+    assert np.allclose(at, -film * away / distance, atol=1e-6)
+    assert (found["status"][0] == np.where(np.hypot(*pupil) <= 9, 0, 6)).all()
+
+
+def test_crossings_are_those_of_the_tracer() -> None:
+    lens = read_lens(ROOT / "lenses" / "cooke_triplet_50.toml").at()
+    plane, film_z = 20.0, float(lens.film_z_mm if lens.film_z_mm is not None else lens.vertices_mm[-1])
+    y, v = np.linspace(-9, 9, 7), np.linspace(2, -2, 7)
+    zero = np.zeros_like(y)
+    rays = np.stack([zero, y, zero, v, zero + 550.0])
+    graph: Graph = exact_graph(lens, plane, (400.0, 700.0), path=True)
+    call = {"film_z_mm": np.array([[film_z]]), "stop_radius_mm": np.array([[float(lens.stop_radius_mm)]])}
+    found = evaluate(graph, {"rays": rays, **call})["path"]
+    way = np.stack([zero, v - y, zero + plane - film_z])
+    way /= np.linalg.norm(way, axis=0)
+    start = Rays(*(torch.tensor(a) for a in (zero, y, zero + film_z, *way)))
+    path = trace(lens, start, towards="scene", wavelength_nm=550.0, path=True).path
+    wanted = np.stack([c.numpy() for p in path for c in (p.z, p.y)])
+    assert np.allclose(found, wanted[: len(found)], atol=2e-4)
+
+
+ZMX = """\
+MODE SEQ
+NAME My singlet
+UNIT MM X W X CM MR CPMM
+ENPD 10.0
+FTYP 0 0 1 3 0 0 0
+WAVM 1 0.5876 1
+PWAV 1
+SURF 0
+  TYPE STANDARD
+  CURV 0.0
+  DISZ INFINITY
+SURF 1
+  TYPE STANDARD
+  STOP
+  CURV 0.02
+  DISZ 5.0
+  GLAS N-BK7 0 0 1.5168 64.17
+  DIAM 12 1
+SURF 2
+  TYPE STANDARD
+  CURV -0.02
+  DISZ 46.0
+  DIAM 12 1
+SURF 3
+  TYPE STANDARD
+  CURV 0.0
+  DISZ 0
+  DIAM 12
+"""
+
+
+def test_a_lens_of_your_own_says_what_is_left_out(tmp_path: Path) -> None:
+    """Its glass absorbs, which traced code does not follow."""
+    (tmp_path / "my_lens.zmx").write_text(ZMX)
+    out = tmp_path / "view.html"
+    assert main(["view", str(tmp_path / "my_lens.zmx"), "--downloads", "glsl", "-o", str(out), "--json"]) == 0
+    (lens,) = json.loads(out.read_text(encoding="utf-8").split('id="data">')[1].split("</script")[0])["lenses"]
+    (form,) = lens["forms"]
+    assert lens["name"] == "My singlet"
+    assert form["method"] == "every surface traced, coatings and absorption left out"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["no_such_lens"], "no_such_lens"),
+        (["lenses/missing.toml"], "missing.toml"),
+        ([LENS, "-o", "view.txt"], "--out"),
+        ([LENS, "-o", "nowhere/view.html"], "nowhere"),
+        ([LENS, "--downloads", "pdf"], "glsl"),
+        ([f"models/{LENS}.ols-64.onnx", f"models/{LENS}.ols-64.onnx"], "one model of each kind"),
+    ],
+)
+def test_bad_input_is_one_line_and_no_page(
+    words: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "models").symlink_to(ROOT / "models")
+    try:
+        code = main(["view", *words])
+    except SystemExit as error:
+        code = int(str(error.code))
+    assert code == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert said in error
+    assert not list(tmp_path.glob("*.html"))
