@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 from vignetting_oracle import vignetting_errors
 
-import neurolens
 from neurolens.cameras.model import OnnxLens, load_model
 from neurolens.cli import main
+from neurolens.commands import models as models_command
 from neurolens.evaluate.check import check_states, promises_of, space_of_card
 from neurolens.evaluate.measure import FreshRays, fresh_rays, measure, onnx_predictor
 from neurolens.optics.lensfile import read_lens
@@ -122,7 +122,7 @@ def test_the_folder_is_small_and_holds_what_the_index_says() -> None:
 def test_models_are_listed_with_the_one_to_use(tmp_path, monkeypatch, capsys) -> None:
     """Of a working folder with runs, where the package ships no models."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(neurolens, "__file__", str(tmp_path / "site" / "neurolens" / "__init__.py"))
+    monkeypatch.setattr(models_command, "library", lambda: tmp_path / "site")
     assert main(["models"]) == 2
     assert "models/, runs/*/models/" in capsys.readouterr().err
     own = tmp_path / "runs" / "mine" / "models"
