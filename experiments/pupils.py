@@ -1,6 +1,8 @@
 """What share of the rays that a pupil sends pass the lens: pupils of the literature, and the outlines of our cameras.
 
-On the lenses of the theses, beside their figures (half a minute). Writes passage.md and passage.json.
+On the lenses of the theses, beside their figures (half a minute). Writes passage.md and passage.json. With --shaders
+the library's models as shaders in OSL instead, up to half a minute each: writes osl_passing.md and osl_passing.json
+after each, and goes on with those that these have not; --only measures anew.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +24,7 @@ from neurolens.base.progress import Progress
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
+from neurolens.evaluate.shaders import shader_of
 from neurolens.optics import pupil_methods as known
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
@@ -294,11 +298,18 @@ def page(passages: Sequence[lab.Row], pixel: Sequence[Sequence[float]], samples:
     return lab.page(*parts)
 
 
-OPTIONS = (lab.count("rays", SAMPLES, "rays per method (default 131072)", 1000), lab.ONLY, lab.out())
+OPTIONS = (
+    lab.count("rays", SAMPLES, "rays per method (default 131072)", 1000),
+    lab.option("--shaders", action="store_true", help="the library's models as shaders in OSL"),
+    lab.ONLY,
+    lab.out(),
+)
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure every case of the theses."""
+    """Measure every case of the theses, or every shader."""
+    if args.shaders:
+        return shaders(args)
     lab.quiet_glasses()
     cases = lab.chosen(CASES, lambda case: case.lens, args.only, "pupils")
     with Progress(quiet=args.quiet).stage("pupils") as report:
@@ -309,3 +320,41 @@ def run(args: argparse.Namespace) -> None:
         pixel = [] if args.only else list(pixel_rates(args.rays))
     data = {"film_mm": FILM_MM, "samples": args.rays, "cases": done, "tessar_pixel": pixel}
     print(lab.write_results(args.out, "passage", page(done, pixel, args.rays), data))
+
+
+SHADERS = lab.columns(
+    ("Model", "model"),
+    ("Open", "open", ".3f"),
+    ("2 stops down", "stopped_2", ".3f"),
+    ("4 stops down", "stopped_4", ".3f"),
+    ("Operations", "operations"),
+    ("CPU (s)", "cpu_s", ".1f"),
+)
+_SHADERS_TEXT = """\
+By `python -m experiments pupils --shaders`: share of the samples that pass the lens, from film points that have light
+at that stop, all over film, focus and wavelength; operations of a ray through a round stop; CPU to make the shader."""
+
+
+def shaders(args: argparse.Namespace) -> None:
+    """Share of the samples that pass, operations and CPU seconds of shaders of the library's models."""
+    files = lab.chosen(sorted(lab.MODELS.glob("*.ols-64.onnx")), lambda file: file.name, args.only, "pupils")
+    kept = args.out / "osl_passing.json"
+    done = lab.kept_rows(kept, "experiments pupils --shaders", lambda row: row["model"], "rows")
+    files = [file for file in files if args.only or file.stem not in done]
+    with Progress(quiet=args.quiet).stage("shaders") as report:
+        for k, file in enumerate(files):
+            done[file.stem] = shader_row(file)
+            rows = sorted(done.values(), key=lambda row: str(row["model"]))
+            data = {"machine": lab.machine(), "rows": rows}
+            text = lab.page("# Samples of shaders in OSL that pass", _SHADERS_TEXT, lab.table(SHADERS, rows))
+            lab.write_results(args.out, "osl_passing", text, data)
+            report((k + 1) / len(files))
+
+
+def shader_row(file: Path) -> lab.Row:
+    """Of a model."""
+    begun = time.process_time()
+    made = shader_of(file, quiet=True)
+    shares = dict(zip(("open", "stopped_2", "stopped_4"), made.passing.values(), strict=True))
+    cpu = time.process_time() - begun
+    return {"model": file.stem, **shares, "operations": made.operations, "cpu_s": cpu}

@@ -23,8 +23,8 @@ from neurolens.graph.ir import Graph
 Array = NDArray[np.float64]
 Truths = NDArray[np.bool_]
 Rows = NDArray[np.floating[Any]]
-# Where light ends is sought: film radii, ways, and of anamorphic lenses azimuths of a quadrant.
-_ROWS, _ANGLES, _AZIMUTHS = 17, np.linspace(0, np.pi, 17), 4
+# Where light ends is sought: ways, and of anamorphic lenses azimuths of a quadrant.
+_ANGLES, _AZIMUTHS = np.linspace(0, np.pi, 17), 4
 _HALVINGS, _WIDER = 14, 1.15  # that place the end of the light; boxes of a stop over the last one's pupil
 _ROUNDS, _LOOSE = 40, 1e-4  # of asymmetric least squares: weight of slack
 _MARGIN = 0.001  # of half the pupil
@@ -33,12 +33,11 @@ _ENOUGH = 0.97  # of points, at the widest stop, that pass
 _FEWEST = 12  # vertices that rims of a side block
 _PLENTY = 0.96  # of points, that no other way to fit needs to pass
 _REFIT_SEED, _CHECK_SEED, _NO_SIDE = 10, 20, 2  # such rays lie on no arc
-_LOST = 1e-3  # of rays that pass, that a way may miss
+_LOST = 2e-3  # of rays that pass, that a way may miss
 _HELD = 0.9998  # of random rays that pass
 _RISE, _STEP, _STEPS = 1.03, 0.004, 12  # of arcs that do not hold them: in y^2, and of half the pupil along x
-_ASKED = 20_000
+_ASKED, _TRIED = 20_000, 64
 _RAYS = 60_000  # random ones that must lie inside
-_POWERS_TURNED = 8  # of the film radius, of anamorphic lenses at most
 _LIMIT = 1.6  # stop radii: points in the image of the stop lie within
 
 
@@ -47,34 +46,38 @@ class Way:
     """How arcs are fitted.
 
     Attributes:
-        stops: as shares of the widest, where the end of the light is sought. powers: of the film radius.
+        rows: film radii, and stops: as shares of the widest, where the end of the light is sought.
+        powers: of the film radius. film: how many of the film radius and the stop move with the film's position.
         push: weight of what lies outside. refits: fits again to random rays that are missed: arcs that are moved as a
             whole until they hold those are wide everywhere for the sake of one place. image: in that of the stop.
     """
 
+    rows: int
     stops: tuple[float, ...]
     powers: int
+    film: tuple[int, int]
     push: float
     refits: int
     image: bool
 
     def exponents(self, anamorphic: bool) -> NDArray[np.int64]:
         """Of film radius, stop, film position, wavelength and azimuth, see `PupilArcs`."""
-        powers = min(self.powers, _POWERS_TURNED) if anamorphic else self.powers
-        found = [(i, j, 0, 0, 0) for i in range(powers + 1) for j in range(3)]
-        found += [(i, j, 1, 0, 0) for i in range(3) for j in range(2)]  # few: renderers may learn the focus late
+        found = [(i, j, 0, 0, 0) for i in range(self.powers + 1) for j in range(3)]
+        found += [(i, j, 1, 0, 0) for i, j in np.ndindex(*self.film)]  # few: renderers may learn the focus late
         found += [(i, j, 0, 1, 0) for i in range(4) for j in range(2)]  # the stop's image moves with the wavelength
         if anamorphic and self.image:
-            found += [(i, 0, 0, 0, k) for k in (1, 2) for i in range(k, powers + 1)]
+            found += [(i, 0, 0, 0, k) for k in (1, 2) for i in range(k, self.powers + 1)]
         return np.array(found)
 
 
-# The next where too little passes.
+# In turn until enough passes: the best is kept.
 _WAYS = (
-    Way((1.0, 0.75, 0.5, 0.25, 0.1), 4, 300.0, 0, False),
-    Way((1.0, 0.85, 0.7, 0.55, 0.4, 0.28, 0.18, 0.08), 4, 3000.0, 3, False),
-    Way((1.0, 0.7, 0.4, 0.2, 0.08), 12, 3000.0, 2, True),
+    Way(17, (1.0, 0.75, 0.5, 0.25, 0.1), 4, (3, 2), 300.0, 0, False),
+    Way(25, (1.0, 0.85, 0.7, 0.55, 0.4, 0.28, 0.18, 0.08), 4, (3, 2), 3000.0, 3, False),
+    Way(25, (1.0, 0.85, 0.7, 0.55, 0.4, 0.28, 0.18, 0.08), 4, (5, 3), 3000.0, 3, False),
+    Way(25, (1.0, 0.7, 0.4, 0.2, 0.08), 12, (6, 3), 3000.0, 2, True),
 )
+_ANAMORPHIC = _WAYS[0], Way(17, (1.0, 0.7, 0.4, 0.2, 0.08), 8, (3, 2), 3000.0, 2, True)
 
 
 @dataclass(frozen=True)
@@ -175,7 +178,7 @@ def fit_arcs(sights: Sequence[Sight], report: Report, between: Sequence[tuple[Ar
     single = len(sights) == 1
     if not single:  # refitted by themselves, nodes hold less of what lies between them
         return _by(_WAYS[0], sights, report, between)[0]
-    ways = _WAYS[::2] if sights[0].anamorphic else _WAYS
+    ways = _ANAMORPHIC if sights[0].anamorphic else _WAYS
     kept: list[PupilArcs] = []
     best, lost = -1.0, 1.0
     for part, way in enumerate(ways):
@@ -274,7 +277,7 @@ def _places(way: Way, sight: Sight, report: Report) -> _Places:
             film_radius = end_of_light(table, ask) if film_radius is None else film_radius
             if film_radius is None:
                 break
-            radius = film_radius * (1 - 1e-6) * (1 - (1 - np.arange(_ROWS) / (_ROWS - 1)) ** 2)
+            radius = film_radius * (1 - 1e-6) * (1 - (1 - np.arange(way.rows) / (way.rows - 1)) ** 2)
             frame = frame_of(table, radius, ask)
             across = (frame.reach[:, None] * v[:, None] for v in frame.stretch)
             x, y = (way * side for way, side in zip(across, (np.cos(_ANGLES), np.sin(_ANGLES)), strict=True))
@@ -293,7 +296,7 @@ def _places(way: Way, sight: Sight, report: Report) -> _Places:
             found.append([np.broadcast_to(row, shape).ravel() for row in rows])
             # The next stop's pupil lies within this one's.
             around = frame.centre - _WIDER * frame.stretch[0], frame.centre + _WIDER * frame.stretch[0]
-            even = np.linspace(0, film_radius, _ROWS)
+            even = np.linspace(0, film_radius, way.rows)
             boxes = [np.interp(even, radius, row) for row in (*around, _WIDER * frame.stretch[1])]
             table = replace(table, film_radius_mm=film_radius, rows=np.array(boxes, np.float32))
     if not found:
@@ -478,18 +481,31 @@ def _widened(nodes: list[PupilArcs], seen: Sequence[tuple[Array, Sight]], report
 
 
 def passing(sight: Sight, arcs: PupilArcs) -> dict[float, float]:
-    """Share of the points of the arcs through which rays pass, all over the film, by shares of the widest stop."""
+    """Share of the points of the arcs through which rays pass, all over the film, by shares of the widest stop.
+
+    Of film points that have light at that stop: of those whose ray is blocked, where any of `_TRIED` others passes.
+    """
     rng, found = np.random.default_rng(3), {}
     for share in (1.0, 0.5, 0.25):
         angle, radius = 2 * np.pi * rng.random(_ASKED), 0.98 * arcs.film_radius_mm * np.sqrt(rng.random(_ASKED))
         film = radius * np.stack([np.cos(angle), np.sin(angle)])
-        rows = {
-            "film_z_mm": rng.uniform(*sight.film_z_mm, _ASKED),
-            "wavelength_nm": rng.uniform(*sight.wavelength_nm, _ASKED),
-        }
-        rows |= {"stop_radius_mm": np.full(_ASKED, share * sight.stop_radius_mm)}
-        given = {"film_mm": film, "square": rng.random((2, _ASKED))} | {name: row[None] for name, row in rows.items()}
-        pupil = evaluate(arcs.graph, given)["pupil_mm"]
-        status = sight.status(film, pupil, rows["wavelength_nm"], rows["film_z_mm"], rows["stop_radius_mm"])
-        found[share] = float(np.mean(status == st.PASSED))
+        stop = np.full(_ASKED, share * sight.stop_radius_mm)
+        call = rng.uniform(*sight.film_z_mm, _ASKED), rng.uniform(*sight.wavelength_nm, _ASKED), stop
+        passed = _sampled(sight, arcs, rng.random((2, _ASKED)), film, call)
+        blocked = np.flatnonzero(~passed)
+        lit = np.zeros(blocked.size, bool)
+        for _ in range(_TRIED):
+            dark = blocked[~lit]
+            own = film[:, dark], [row[dark] for row in call]
+            lit[~lit] = _sampled(sight, arcs, rng.random((2, dark.size)), *own)
+        found[share] = float(passed.sum() / max(passed.sum() + lit.sum(), 1))
     return found
+
+
+def _sampled(sight: Sight, arcs: PupilArcs, square: Array, film: Array, call: Sequence[Array]) -> Truths:
+    """[N] whether rays of points [2, N] of the unit square pass; film positions, wavelengths and stops."""
+    film_z, nm, stop = call
+    given = {"film_mm": film, "square": square}
+    given |= {"film_z_mm": film_z[None], "wavelength_nm": nm[None], "stop_radius_mm": stop[None]}
+    pupil = evaluate(arcs.graph, given)["pupil_mm"]
+    return np.asarray(sight.status(film, pupil, nm, film_z, stop) == st.PASSED)
