@@ -177,7 +177,7 @@ def test_at_least_95_percent_of_rays_pass() -> None:
 @pytest.mark.parametrize(
     "name, least",
     [
-        ("phone_lens_6.ols-64", 0.95),
+        pytest.param("phone_lens_6.ols-64", 0.95, marks=pytest.mark.slow),
         pytest.param("muller_fisheye_100.ols-64", 0.95, marks=pytest.mark.slow),
         pytest.param("panavision_anamorphic_zoom_21.ols-64", 0.904, marks=pytest.mark.slow),
     ],
