@@ -420,26 +420,17 @@ def _above(rows: Array, wanted: Array, own: Truths, size: Array, push: float) ->
 
 def _random(sight: Sight, arcs: PupilArcs, seed: int) -> tuple[dict[str, Array], Array]:
     """Random rays that pass, from film points on +x, as inputs of `PupilArcs.checked`, and stops."""
-    rng = np.random.default_rng(seed)
-    count = _RAYS
+    rng, count = np.random.default_rng(seed), _RAYS
     radius = arcs.film_radius_mm * np.sqrt(rng.random(count)) * 0.9999
     stop = sight.stop_radius_mm * rng.choice(np.linspace(0.08, 1, 12), count)
-    film_z = rng.uniform(*sight.film_z_mm, count)
-    nm = rng.uniform(*sight.wavelength_nm, count)
-    low, high, half = (
-        np.interp(radius, np.linspace(0, sight.table.film_radius_mm, sight.table.rows.shape[1]), a)
-        for a in sight.table.rows
-    )
+    film_z, nm = (rng.uniform(*span, count) for span in (sight.film_z_mm, sight.wavelength_nm))
+    radii = np.linspace(0, sight.table.film_radius_mm, sight.table.rows.shape[1])
+    low, high, half = (np.interp(radius, radii, a) for a in sight.table.rows)
     # Narrow stops are seldom met by rays all over the table: half of them go to the middle of the arcs.
-    film = np.stack([radius, np.zeros(count)])
+    film = np.stack([radius, 0 * radius])
     pupil = np.stack([low + (high - low) * rng.random(count), half * rng.random(count)])
-    given = {
-        "film_mm": film,
-        "square": rng.random((2, count)),
-        "stop_radius_mm": stop[None],
-        "film_z_mm": film_z[None],
-        "wavelength_nm": nm[None],
-    }
+    given = {"film_mm": film, "square": rng.random((2, count)), "stop_radius_mm": stop[None]}
+    given |= {"film_z_mm": film_z[None], "wavelength_nm": nm[None]}
     azimuth = np.pi / 2 * rng.random(count) if arcs.turns else None
     back = 0.0 if azimuth is None else azimuth
     there = given | {"film_mm": turned(film, back)}
@@ -489,15 +480,13 @@ def passing(sight: Sight, arcs: PupilArcs) -> dict[float, float]:
     for share in (1.0, 0.5, 0.25):
         angle, radius = 2 * np.pi * rng.random(_ASKED), 0.98 * arcs.film_radius_mm * np.sqrt(rng.random(_ASKED))
         film = radius * np.stack([np.cos(angle), np.sin(angle)])
-        stop = np.full(_ASKED, share * sight.stop_radius_mm)
-        call = rng.uniform(*sight.film_z_mm, _ASKED), rng.uniform(*sight.wavelength_nm, _ASKED), stop
+        call = [rng.uniform(*span, _ASKED) for span in (sight.film_z_mm, sight.wavelength_nm)]
+        call.append(np.full(_ASKED, share * sight.stop_radius_mm))
         passed = _sampled(sight, arcs, rng.random((2, _ASKED)), film, call)
-        blocked = np.flatnonzero(~passed)
-        lit = np.zeros(blocked.size, bool)
+        lit = np.zeros((blocked := np.flatnonzero(~passed)).size, bool)
         for _ in range(_TRIED):
             dark = blocked[~lit]
-            own = film[:, dark], [row[dark] for row in call]
-            lit[~lit] = _sampled(sight, arcs, rng.random((2, dark.size)), *own)
+            lit[~lit] = _sampled(sight, arcs, rng.random((2, dark.size)), film[:, dark], [row[dark] for row in call])
         found[share] = float(passed.sum() / max(passed.sum() + lit.sum(), 1))
     return found
 
