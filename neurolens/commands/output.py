@@ -47,12 +47,3 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -
         return "  ".join(placed).rstrip()
 
     return "\n".join(row(line) for line in lines)
-
-
-def plain_numbers(value: Any) -> Any:
-    """A value for JSON, which has no infinity: null."""
-    if isinstance(value, dict):
-        return {k: plain_numbers(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain_numbers(v) for v in value]
-    return None if isinstance(value, float) and value in (float("inf"), float("-inf")) else value

@@ -13,9 +13,10 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text, library
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_glass, add_json, lens_path
-from neurolens.commands.output import answer, number, plain_numbers, table
+from neurolens.commands.output import answer, number, table
 from neurolens.commands.plan_frames import run_plan_frames
 from neurolens.commands.render_frames import add_frames
+from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
     from neurolens.evaluate.plan import Choice, Plan
@@ -143,7 +144,7 @@ def run(args: argparse.Namespace) -> int:
         else:
             found = plan(scene, lens, args.budget, explain=args.explain, **look)
     folder.mkdir(parents=True, exist_ok=True)
-    data = plain_numbers({"scene": str(args.scene), "lens": str(file), **found.to_dict()})
+    data = plain({"scene": str(args.scene), "lens": str(file), **found.to_dict()})
     with atomic_path(folder / "plan.json") as part:
         part.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
     if found.best:

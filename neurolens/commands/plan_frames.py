@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path
 from neurolens.base.progress import Progress
-from neurolens.commands.output import answer, number, plain_numbers, table
+from neurolens.commands.output import answer, number, table
 from neurolens.commands.render_frames import frames_of
+from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
     from neurolens.evaluate.plan_frames import FramesPlan
@@ -42,7 +43,7 @@ def run_plan_frames(args: argparse.Namespace, file: Path, models: list[Path], fo
             folder=folder / "models" if args.fit else None, afterwards=args.afterwards, denoised=args.denoise,
         )  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)
-    data = plain_numbers({"scene": str(args.scene), "lens": str(file), **found.to_dict()})
+    data = plain({"scene": str(args.scene), "lens": str(file), **found.to_dict()})
     with atomic_path(folder / "plan.json") as part:
         part.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
     answer(args, data, lambda: _text(args, found, folder))

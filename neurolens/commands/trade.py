@@ -12,8 +12,9 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text, library
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_glass, add_json, lens_path, whole
-from neurolens.commands.output import answer, number, plain_numbers, table
+from neurolens.commands.output import answer, number, table
 from neurolens.commands.plan import TARGETS, pixels
+from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
     from neurolens.evaluate.trade import Offer, Trade
@@ -95,8 +96,8 @@ def run(args: argparse.Namespace) -> int:
     data = {"scene": str(args.scene), "lens": str(file), "target": args.target, "unit": found.unit}
     data |= {"base": found.base, "cameras": rows, "front": [o.choice.name for o in found.front]}
     data |= {"chosen": found.chosen and found.chosen.choice.name, "half": found.half and found.half.choice.name}
-    atomic_write_text(folder / "trade.json", json.dumps(plain_numbers(data), indent=1, default=str) + "\n")
-    answer(args, json.loads(json.dumps(plain_numbers(data), default=str)), lambda: _text(found, folder))
+    atomic_write_text(folder / "trade.json", json.dumps(plain(data), indent=1) + "\n")
+    answer(args, data, lambda: _text(found, folder))
     return 0 if found.chosen else 1
 
 
