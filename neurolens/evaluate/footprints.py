@@ -54,6 +54,11 @@ class Places:
     wavelength_nm: Array
     share: Array
 
+    def at(self, index: NDArray[np.intp]) -> Places:
+        """Some of the places."""
+        parts = (self.film_mm, self.distance_m, self.origin_m, self.direction, self.across, self.to_film)
+        return Places(*(p[..., index] for p in parts), self.wavelength_nm, self.share)
+
 
 @dataclass(frozen=True)
 class Footprints:
