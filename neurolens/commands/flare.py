@@ -116,7 +116,8 @@ def run(args: argparse.Namespace) -> int:
     progress, began = Progress(quiet=args.quiet or args.json), time.perf_counter()
     if args.preview:
         progress.note(f"preview: {args.width} pixels wide, {args.wavelengths} wavelengths, cells of {args.cell_px:g}")
-    states, model = list(_states(args)), fitted(args)
+    states = list(_states(args))
+    model = fitted(args, states)
     tabled = read_lens(lens_path(args.file, "flare")) if model is None else model.lens
     if args.fit is not None:
         return run_fit(args, None if model else _lens(states[0], tabled), model)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,8 +41,8 @@ def add_fit(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def fitted(args: argparse.Namespace) -> GhostModel | None:
-    """The model where the file is one; None for a lens.
+def fitted(args: argparse.Namespace, states: Sequence[argparse.Namespace]) -> GhostModel | None:
+    """The model where the file is one; None for a lens. `states`: the arguments of each frame.
 
     Raises:
         InputError: options that would change what the model was fitted for. ModelError: as `read_ghosts`.
@@ -51,9 +52,10 @@ def fitted(args: argparse.Namespace) -> GhostModel | None:
     from neurolens.flare.ghostfile import read_ghosts
 
     other = [name for name in given_options(args) if name not in _FREE]
-    never = "coating", "photons", "glare", "frames", "polarised", "starburst"
-    other += [f"--{name}" for name in never if getattr(args, name)]
+    other += [f"--{name}" for name in ("coating", "photons", "polarised") if getattr(args, name)]
     other += ["--reflections"] * args.fours
+    other += ["--key focus"] * any(math.isfinite(s.focus) for s in states)
+    other += ["--key zoom"] * any(s.zoom is not None for s in states)
     if other:
         raise InputError(_COMMAND, other[0], args.file, "a lens: fitted ghosts have one state and two reflections")
     return read_ghosts(args.file)
