@@ -139,7 +139,7 @@ def _check(args: argparse.Namespace) -> None:
     if args.frames is None and args.key:
         raise InputError(_COMMAND, "--key", args.key[0], "--frames beside it")
     if args.frames is not None:
-        if args.out is None:
+        if args.out is None and args.fit is None:
             raise InputError(_COMMAND, "--frames", f"({len(args.frames)})", "-o beside it")
         args.kept = "the frames that are there are kept: the same command goes on"
     by_chance = args.photons or args.glare

@@ -125,6 +125,7 @@ def fit_ghosts(lens: Lens, settings: GhostSettings, done: Callable[[float], None
     um = np.array([row["film_rms_um"] for row in rows])
     report = {
         "pairs": len(every),
+        "film_radius_mm": settings.film_radius_mm,
         "kept": len(pairs),
         "kept_energy": float(share.sum()),
         "film_rms_um": float(np.sqrt((share * um**2).sum() / share.sum())),
