@@ -21,7 +21,7 @@ from neurolens.commands.arguments import (
     lens_path,
     state_of,
 )
-from neurolens.commands.flare_fit import add_fit, fitted, run_fit, stopped
+from neurolens.commands.flare_fit import add_fit, check_fit, fitted, run_fit, stopped
 from neurolens.commands.flare_lights import add_lights
 from neurolens.commands.flare_options import add_made, complete, settings_of
 from neurolens.commands.output import answer, number, table
@@ -71,7 +71,7 @@ _FEWEST = 256  # rays of a table
 _RANKED_FRAMES = 16  # that tell which ghosts are brightest
 _FRAMES = (
     "flare of these frames to OUT.0001.exr and so on, of lights by their keys in lists, the lens, and the camera of a "
-    "scene of --lights by --key; a frame that exists is kept"
+    "scene of --lights by --key; a frame that exists is kept. Fitted ghosts keep their focus and zoom"
 )
 
 
@@ -136,10 +136,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
+    check_fit(args)
     if args.frames is None and args.key:
         raise InputError(_COMMAND, "--key", args.key[0], "--frames beside it")
     if args.frames is not None:
-        if args.out is None and args.fit is None:
+        if args.out is None:
             raise InputError(_COMMAND, "--frames", f"({len(args.frames)})", "-o beside it")
         args.kept = "the frames that are there are kept: the same command goes on"
     by_chance = args.photons or args.glare
