@@ -109,6 +109,7 @@ def run(args: argparse.Namespace) -> int:
     """Trace, print, write."""
     from neurolens.commands.flare_lights import Sources
     from neurolens.flare.ghosts import ghost_pairs
+    from neurolens.flare.layers import kept_beside
     from neurolens.optics.lensfile import read_lens
 
     complete(args)
@@ -130,7 +131,12 @@ def run(args: argparse.Namespace) -> int:
         found["path"] = args.path[1]
     if args.out is not None:
         found["out"] = [str(state.out) for state in states]
-        _write_all(states, shots, progress)
+        try:
+            _write_all(states, shots, progress)
+        except KeyboardInterrupt:
+            if args.frames is None and (kept := [str(path) for path in kept_beside(args.out)]):
+                args.kept = f"the same command goes on from {' and '.join(kept)}"
+            raise
     found["seconds"] = time.perf_counter() - began
     return answer(args, found, lambda: _text(first, found))
 
@@ -240,13 +246,13 @@ def _write_all(states: list[argparse.Namespace], shots: _Shots, progress: Progre
 
 def _write(args: argparse.Namespace, shot: _Shot, single: tuple[str, ...], progress: Progress) -> None:
     from neurolens.cameras.exact import placed_settings
-    from neurolens.flare.layers import flare_layers, sum_of
+    from neurolens.flare.layers import flare_layers, kept_beside, sum_of
     from neurolens.flare.picture import Raster
     from neurolens.render.exr_attributes import standard_attributes
     from neurolens.render.pictures import write_exr
 
     raster = Raster(args.film, args.width, max(1, round(args.width * args.film[1] / args.film[0])))
-    settings = replace(settings_of(args), single=single, ghosts=shot.tracer)
+    settings = replace(settings_of(args), single=single, ghosts=shot.tracer, keep=args.out)
     found = flare_layers(shot.lens, shot.lights, raster, settings, progress)
     layers = {f"{name}.{c}": picture[..., k] for name, picture in found.items() for k, c in enumerate("RGB")}
     told = {k: v for k, v in vars(args).items() if isinstance(v, str | int | float | list | tuple | None)}
@@ -254,6 +260,8 @@ def _write(args: argparse.Namespace, shot: _Shot, single: tuple[str, ...], progr
     camera = placed_settings(shot.lens, args.film, args.focus)
     header = standard_attributes(camera, raster.width, raster.height, args.frame)
     write_exr(args.out, sum_of(found, raster), metadata=metadata, layers=layers, attributes=header)
+    for path in kept_beside(args.out):
+        path.unlink()
 
 
 def _draw(shot: _Shot, name: str, out: Path) -> None:
