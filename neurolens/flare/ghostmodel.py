@@ -86,7 +86,13 @@ class GhostPolynomial:
             direction *= (value ** np.arange(1 + power.max()))[power]
         found = np.zeros((len(self.table), powers * len(self.places[0])))
         found[:, numbers] = np.add.reduceat((self.table * direction)[:, order], first, axis=1)
-        return np.asarray(np.tensordot(np.vander(w, powers, True), found.reshape(len(found), powers, -1), (1, 1)))
+        of_w = w[:, None] ** np.arange(powers)
+        return (of_w @ found.reshape(len(found), powers, -1)).swapaxes(0, 1)
+
+    @cached_property
+    def key(self) -> tuple[tuple[int, ...], ...]:
+        """The exponents of `places`, hashable."""
+        return tuple(map(tuple, self.places[0].tolist()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +187,7 @@ class GhostModel:
         given = np.ascontiguousarray(places, np.float32)
         out = np.empty((len(w), 4, given.shape[1]), np.float32)
         run, monomials, lights = self._compiled
-        kinds = monomials[_key(ghost.places[0])], lights[self._stops(ghost)]
+        kinds = monomials[ghost.key], lights[self._stops(ghost)]
         run(given.shape[1], len(w), *tables.shape[1:], *kinds, *(a.ctypes.data for a in (given, call, tables, out)))
         return out
 
@@ -196,7 +202,7 @@ class GhostModel:
     @cached_property
     def _compiled(self) -> tuple[Any, dict[Any, int], dict[Any, int]]:
         """The driver, and the number of each set of monomials and of each sort of crossings."""
-        monomials = {key: n for n, key in enumerate(dict.fromkeys(_key(ghost.places[0]) for ghost in self.ghosts))}
+        monomials = {key: n for n, key in enumerate(dict.fromkeys(ghost.key for ghost in self.ghosts))}
         lights = {key: n for n, key in enumerate(dict.fromkeys(map(self._stops, self.ghosts)))}
         text = ""
         for key, n in monomials.items():
@@ -265,10 +271,6 @@ def ghost_graph(model: GhostModel, ghost: GhostPolynomial, g: Graph | None = Non
     rows = g.polynomial(ghost.exponents, ghost.table, variables)
     g.outputs[output] = model._light(stops, p, u, rows, radius)
     return g
-
-
-def _key(exponents: Exponents) -> tuple[tuple[int, ...], ...]:
-    return tuple(map(tuple, exponents.tolist()))
 
 
 # Monomials serve all wavelengths; a table's products with them are what the graphs of light take.
