@@ -49,14 +49,39 @@ def _decades(first: int, last: int) -> tuple[int, ...]:
 
 CURVES = (
     Curve("surfaces", "exact rays, torch", (2, 8, 32, 100, 200), "traced"),
-    Curve("surfaces", "exact camera as C, made", (2, 8, 32, 100, 200), "compiled"),
-    Curve("surfaces", "survey of the lens, fit and all", (2, 8, 32, 100, 200), "surveyed"),
-    Curve("pixels", "whole picture, a sample", _decades(4, 7), "whole"),
+    Curve(
+        "surfaces",
+        "exact camera as C, made",
+        (2, 8, 32, 100, 200),
+        "compiled",
+        time_power=1.5,
+        why="three quarters are the C compiler's, which takes longer over one long function than in proportion",
+    ),
+    Curve(
+        "surfaces",
+        "survey of the lens, fit and all",
+        (2, 8, 32, 100, 200),
+        "surveyed",
+        why="memory holds the crossings of 200,000 rays with every surface, 32 bytes each",
+    ),
+    Curve(
+        "pixels",
+        "whole picture, a sample",
+        _decades(4, 7),
+        "whole",
+        why="memory holds the picture's sums: 10^8 pixels take 16 GB, or a hundredth of that by the tile",
+    ),
     Curve("pixels", "a tile of a hundredth", _decades(4, 8), "tile"),
-    Curve("pixels", "tiles merged", _decades(4, 7), "merged"),
+    Curve("pixels", "tiles merged", _decades(4, 7), "merged", why="OpenEXR's writer takes whole channels"),
     Curve("samples", "128 x 72 pixels", (1, 4, 16, 64, 256, 1024), "sampled", memory_power=0.0),
     Curve("lights", "points", _decades(0, 6), "points"),
-    Curve("lights", "spheres", _decades(0, 6), "spheres"),
+    Curve(
+        "lights",
+        "spheres",
+        _decades(0, 6),
+        "spheres",
+        why="beyond 1,000 lights reading their tables takes most of the time; rays find them by a tree",
+    ),
     Curve("lights", "quads", _decades(0, 5), "quads"),
     Curve("triangles", "PLY file, Embree", _decades(2, 7), "triangles"),
     Curve("triangles", "PLY file, built-in tree", _decades(2, 6), "tree"),
@@ -95,12 +120,12 @@ def measured(probe: str, count: int) -> Row:
     with place:
         steps = PROBES[probe](count, Path(place.name))
         next(steps)  # imports and what is no part of it
-        before, began = _resident_kb("VmRSS"), _cpu_s()
+        before, began = resident_kb("VmRSS"), _cpu_s()
         Path("/proc/self/clear_refs").write_text("5")
         for _ in steps:
             pass
         children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-        return {"seconds": _cpu_s() - began, "mb": max(_resident_kb("VmHWM") - before, children - before) / 1024}
+        return {"seconds": _cpu_s() - began, "mb": max(resident_kb("VmHWM") - before, children - before) / 1024}
 
 
 def _cpu_s() -> float:
@@ -108,7 +133,7 @@ def _cpu_s() -> float:
     return sum(each.ru_utime + each.ru_stime for each in used)
 
 
-def _resident_kb(field: str) -> int:
+def resident_kb(field: str) -> int:
     lines = Path("/proc/self/status").read_text().splitlines()
     return int(next(line for line in lines if line.startswith(field)).split()[1])
 
@@ -374,7 +399,9 @@ def _page(found: list[Found], rows: list[Row]) -> str:
     failed = [f"{r['probe']} of {r['count']:,}: {r['failed']}" for r in rows if "failed" in r]
     return lab.page(
         "# How the cost grows", " ".join((__doc__ or "").split()), lab.machine_line(), "![growth](growth.png)",
-        lab.table(head, [cells(f) for f in found]), "Not measured: " + "; ".join(failed) if failed else "",
+        lab.table(head, [cells(f) for f in found]),
+        "\n".join(f"- {c.name}, {c.what}: {c.why}" for c in CURVES if c.why),
+        "Not measured: " + "; ".join(failed) if failed else "",
         "## All points", every,
     )  # fmt: skip
 
