@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -53,8 +53,10 @@ from neurolens.render.scene import Scene
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import fit_model, prepare
+from neurolens.surrogates.fits.planes import fit_planes
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.settings import ModelSettings
+from neurolens.surrogates.targets import Prepared
 
 Target = Literal["render", "c", "onnx", "osl", "glsl"]
 Cost = Callable[[], tuple[float, float]]  # of a ray, and noise
@@ -65,6 +67,7 @@ _MAPPED = " + ST map"  # after the name of an ideal camera
 _SHOT = "fitted for this shot"
 _FIT = ModelSettings("ols", planes=False, elimination=False, idle_gates=IDLE)
 _FIT_MIRROR = replace(_FIT, degree=5)  # of lenses with cylinders: more candidates cost ten times, for the same errors
+_MOVED_TERMS = 16, 22  # from so many on, planes are searched: once, for the second number
 _FOCUS_SPARE = 0.25  # of a pixel of blur: what a model may place its film beside the lens's
 _PAIRS = PairSettings(train=5000, held_out=1000, rim=5000)
 _MOST_OVERSCAN = 4.0  # of a plane picture that is warped afterwards
@@ -354,14 +357,19 @@ def shot_fits(
     lens, domain, choice = found.lens.with_aperture(None), found.domain, choice or shot_domain(found)
     with suppress(InputError):  # a lens that goes no nearer
         domain = domain_of(lens, **asdict(choice))
-    prepared, model = prepare(make_pairs(lens, domain, _PAIRS)), _FIT_MIRROR if lens.anamorphic else _FIT
+    plain, model = prepare(make_pairs(lens, domain, _PAIRS)), _FIT_MIRROR if lens.anamorphic else _FIT
     folder.mkdir(parents=True, exist_ok=True)
+
+    @cache
+    def moved() -> Prepared:  # the planes of one size: a search takes a second, and others of its kind agree on them
+        return replace(plain, encoding=fit_planes(plain.pairs, plain.encoding, _MOVED_TERMS[1], model.position_weight))
 
     def fit(terms: int) -> tuple[Path, ModelSettings]:
         settings = replace(model, name=f"{name}-ols-{terms}", terms=terms)
         file = folder / f"{Path(found.lens.path).stem}.{settings.label}.onnx"
-        export_onnx(fit_model(prepared, settings), file, errors={})
-        return file, settings
+        planes = terms >= _MOVED_TERMS[0] and not lens.anamorphic
+        export_onnx(fit_model(moved() if planes else plain, settings), file, errors={})
+        return file, replace(settings, planes=planes)  # as a training from scratch has it
 
     return fit
 
