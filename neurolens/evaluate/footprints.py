@@ -13,7 +13,7 @@ rays, and holds what a picture shows: place, size and shape of the blur, and of 
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -56,8 +56,8 @@ class Places:
 
     def at(self, index: NDArray[np.intp]) -> Places:
         """Some of the places."""
-        parts = (self.film_mm, self.distance_m, self.origin_m, self.direction, self.across, self.to_film)
-        return Places(*(p[..., index] for p in parts), self.wavelength_nm, self.share)
+        each = ("film_mm", "distance_m", "origin_m", "direction", "across", "to_film")
+        return replace(self, **{name: getattr(self, name)[..., index] for name in each})
 
 
 @dataclass(frozen=True)
