@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import os
 import re
+import select
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
@@ -227,8 +230,18 @@ def _begin(context: Any, task: Task) -> tuple[Any, Any]:
 
 def _work(place: Any, task: Task) -> None:
     end_at_once()
+    threading.Thread(target=_end_unread, args=(place.fileno(),), daemon=True).start()
     with suppress(BrokenPipeError):  # whoever asked was killed
         place.send_bytes(run_task(task))
+
+
+def _end_unread(pipe: int) -> None:
+    """End this process once nobody is left to read from a pipe: a survey that was killed can ask nobody to stop."""
+    if hasattr(select, "poll"):
+        waiting = select.poll()
+        waiting.register(pipe, 0)  # errors alone, such as a closed end
+        waiting.poll()
+        os._exit(1)
 
 
 def _answer(place: Any, process: Any, task: Task) -> bytes:

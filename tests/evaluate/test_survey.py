@@ -5,6 +5,7 @@ import json
 import os
 import re
 import signal
+import time
 from collections.abc import Iterable, Iterator
 from html.parser import HTMLParser
 from pathlib import Path
@@ -159,6 +160,21 @@ def test_a_killed_process_costs_its_own_file(tmp_path: Path, monkeypatch: pytest
     records = survey(collection, tmp_path / "out", READ, in_processes(2, limit_s=0.0), QUIET)
     assert {r["verdict"] for r in records} == {"fault"}
     assert "took longer than 0 s" in records[0]["reason"]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_process_ends_once_its_survey_is_gone() -> None:
+    read, write = os.pipe()
+    child = os.fork()
+    if not child:
+        os.close(read)
+        survey_run._end_unread(write)
+        os._exit(0)
+    time.sleep(0.05)
+    assert os.waitpid(child, os.WNOHANG) == (0, 0)
+    os.close(read)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1
+    os.close(write)
 
 
 def test_the_end_of_a_process_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
