@@ -49,7 +49,7 @@ class Collection:
 
 
 def collection_of(folder: Path) -> Collection:
-    """The files of a folder and of its folders, hidden ones left out, by suffix; links to folders are not followed.
+    """The files of a folder and of its folders by suffix; hidden ones and links to folders are others.
 
     Raises:
         InputError: no such folder, or no lens file in it.
@@ -59,13 +59,17 @@ def collection_of(folder: Path) -> Collection:
     names, others = list[str](), dict[str, int]()
     for file in sorted(folder.rglob("*")):
         parts = file.relative_to(folder).parts
-        if any(part.startswith(".") for part in parts) or file.is_dir():
-            continue
-        suffix = file.suffix.lower()
-        if suffix in SUFFIXES:
+        kind = file.suffix.lower() or "(none)"
+        if file.is_dir():
+            if not file.is_symlink():
+                continue
+            kind = "(link to a folder)"
+        elif any(part.startswith(".") for part in parts):
+            kind = "(hidden)"
+        elif kind in SUFFIXES:
             names.append("/".join(parts))
-        else:
-            others[suffix or "(none)"] = others.get(suffix or "(none)", 0) + 1
+            continue
+        others[kind] = others.get(kind, 0) + 1
     if not names:
         known = ", ".join(sorted(SUFFIXES))
         raise InputError(folder, "FOLDER", f"({sum(others.values())} files of other kinds)", f"lens files: {known}")

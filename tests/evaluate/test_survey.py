@@ -131,7 +131,7 @@ def test_a_survey_leaves_nothing_out_and_goes_on(tmp_path: Path) -> None:
                 raise KeyboardInterrupt
 
     assert collection.names == ("in/=triplet <b>.toml", "no.zmx")
-    assert collection.others == {".me": 1}
+    assert collection.others == {".me": 1, "(hidden)": 1}
     with pytest.raises(KeyboardInterrupt):
         survey(collection, out, READ, engine, QUIET)
     records = survey(collection, out, READ, engine, QUIET)
@@ -152,6 +152,19 @@ def test_a_survey_leaves_nothing_out_and_goes_on(tmp_path: Path) -> None:
     data = json.loads((out / "survey.json").read_text())
     assert data["summary"]["files"] == 2
     assert data["lenses"][1]["reason"] == records[1]["reason"]
+
+
+def test_names_that_are_no_text(tmp_path: Path) -> None:
+    folder = tmp_path / "odd"
+    folder.mkdir()
+    try:
+        Path(os.fsdecode(os.fsencode(folder) + b"/\xff\xfe.zmx")).write_text("VERS")
+    except OSError:
+        pytest.skip("this system takes names that are text alone")
+    (record,) = survey(collection_of(folder), tmp_path / "out", READ, here, QUIET)
+    assert record["verdict"] == "refused"
+    for kind in ("html", "csv"):
+        assert "\\udcff\\udcfe.zmx" in (tmp_path / "out" / f"survey.{kind}").read_text(encoding="utf-8")
 
 
 def test_a_killed_process_costs_its_own_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
