@@ -226,7 +226,7 @@ def _words(rows: Sequence[Row], simulated: Sequence[Row]) -> str:
 
 
 def _draw(file: Path, rows: Sequence[Row], simulated: Sequence[Row]) -> None:
-    from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, drawing
+    from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, drawing, plain_log_ticks
 
     with drawing(file, 9.0, 3.8, "A Dask cluster", "left: measured, tasks that do nothing; right: simulated") as figure:
         left, right = figure.subplots(1, 2)
@@ -243,5 +243,6 @@ def _draw(file: Path, rows: Sequence[Row], simulated: Sequence[Row]) -> None:
         right.plot(_WORKERS, _WORKERS, "--", color=FAINT, lw=0.8)
         right.set(xscale="log", yscale="log", xlabel="workers", ylabel="speed-up")
         for axis in (left, right):
+            plain_log_ticks(axis.xaxis, axis.yaxis)
             axis.grid(True)
             axis.legend()
