@@ -120,15 +120,15 @@ def measured(probe: str, count: int) -> Row:
     with place:
         steps = PROBES[probe](count, Path(place.name))
         next(steps)  # imports and what is no part of it
-        before, began = resident_kb("VmRSS"), _cpu_s()
+        before, began = resident_kb("VmRSS"), cpu_s()
         Path("/proc/self/clear_refs").write_text("5")
         for _ in steps:
             pass
         children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-        return {"seconds": _cpu_s() - began, "mb": max(resident_kb("VmHWM") - before, children - before) / 1024}
+        return {"seconds": cpu_s() - began, "mb": max(resident_kb("VmHWM") - before, children - before) / 1024}
 
 
-def _cpu_s() -> float:
+def cpu_s() -> float:
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(each.ru_utime + each.ru_stime for each in used)
 

@@ -89,7 +89,7 @@ def survey(
     """Survey all files of a collection; records that are there are not made again. Returns them in the files' order.
 
     Writes records/ (one JSON a file), survey.json, survey.csv and survey.html to the folder `out`. The sections stay
-    in the files alone: what a survey holds in memory is some ten thousand bytes a lens.
+    in the files alone: a survey holds some tens of thousands of bytes a lens in memory.
     """
     (out / "records").mkdir(parents=True, exist_ok=True)
     found: dict[str, dict[str, Any]] = {}
