@@ -179,19 +179,12 @@ def simulations(rows: Sequence[Row]) -> Iterator[Row]:
 
 def _page(rows: Sequence[Row], simulated: Sequence[Row]) -> str:
     plain = {row["what"]: row["seconds"] for row in rows if row.get("how") == "plain"}
-    fast = [
-        [
-            r["what"],
-            r["how"],
-            f"{r['seconds']:.1f}",
-            f"{plain[r['what']] / r['seconds']:.2f}",
-            f"{r['cpu_s']:.1f}",
-            f"{r['load']:.1f}",
-            "yes" if r["same"] else "NO",
-        ]
-        for r in rows
-        if r["part"] == "speed-up"
-    ]
+    fast = [r | {"gain": plain[r["what"]] / r["seconds"]} for r in rows if r["part"] == "speed-up"]
+    columns = lab.columns(
+        ("what", "what"), ("how", "how"), ("wall s", "seconds", ".1f"), ("speed-up", "gain", ".2f"),
+        ("CPU s of all processes", "cpu_s", ".1f"), ("load average", "load", ".1f"),
+        ("same result", lambda r: "yes" if r["same"] else "NO"),
+    )  # fmt: skip
     small = [
         [r["what"], f"{r['count']:,}", f"{r['wall_ms']:.2f}", f"{r['cpu_ms']:.2f}", f"{r['mb']:.0f}"]
         for r in rows
@@ -205,7 +198,7 @@ def _page(rows: Sequence[Row], simulated: Sequence[Row]) -> str:
     return lab.page(
         "# Dask: speed-up and overhead", " ".join((__doc__ or "").split()), lab.machine_line(), "![dask](dask.png)",
         "## Speed-up (measured)",
-        lab.table("what|how|wall s|speed-up|CPU s of all processes|load average|same result", fast),
+        lab.table(columns, fast, missing="not taken"),
         "## Tasks that do nothing (measured)",
         lab.table("payload of a|tasks|wall ms a task|CPU ms of driver and scheduler a task|MB above the start", small),
         "## Many tasks and workers (simulated)",
