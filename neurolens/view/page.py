@@ -24,7 +24,7 @@ from neurolens.view.shaders import call_of, shared_glsl
 
 FOLDER = Path(__file__).parent / "page"
 SCRIPTS = ("gl.js", "scene.js", "engine.js", "layout.js", "main.js")
-SHADERS = ("scene.glsl", "trace.glsl")
+SHADERS = ("random.glsl", "scene.glsl", "rays.glsl")
 # A form's download that would carry the page beyond this is left out.
 MOST_BYTES = 3_000_000
 _AIR, _ARC = 1.01, 4  # a medium of a smaller index is drawn as air; of 65 points of an arc every fourth is drawn

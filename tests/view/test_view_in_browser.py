@@ -94,8 +94,9 @@ def opened(browser: Any, page_file: Path) -> Iterator[Opened]:
 BALLS = """b => {
   const n = neurolens, empty = n.sceneUniforms("night", 1, 1), ball = new Float32Array(empty.ball.length);
   const coat = new Float32Array(empty.coat.length);
+  const boxes = [0, 0, 0, 0, 0, 0, -1e3, -1e3, -1e3, 1e3, 1e3, 1e3];
   b.forEach((v, k) => { ball.set(v, 4 * k); coat.set([100, 100, 100, -1], 4 * k); });
-  const scene = { ...empty, ball, coat, solids: 0, balls: b.length, floor_y: -1e6, key_power: 0 };
+  const scene = { ...empty, ball, coat, around: boxes, person: 0, solids: 0, balls: b.length, floor_y: -1e6, key_power: 0 };
   return n.engine.prepare(n.set.lens, { a: n.set.a }, n.set, scene).then(() => {
     n.pass();
     return n.engine.sides.a.values.film_mm;

@@ -34,21 +34,24 @@ class Gpu {
     return { program, uniforms };
   }
 
-  /** A texture of floats that can be drawn into. */
-  target(width, height, data = null) {
-    const gl = this.gl, texture = gl.createTexture();
-    gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, width, height, 0, gl.RGBA, gl.FLOAT, data);
-    for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, key, gl.NEAREST);
-    for (const key of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, key, gl.CLAMP_TO_EDGE);
-    const frame = gl.createFramebuffer();
+  /** Textures of floats that are drawn into at once, `data` in the first. */
+  target(width, height, data = null, count = 1) {
+    const gl = this.gl, frame = gl.createFramebuffer(), textures = [];
     gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
-    return { texture, frame, width, height };
+    for (let k = 0; k < count; k++) {
+      textures.push(gl.createTexture());
+      gl.bindTexture(gl.TEXTURE_2D, textures[k]);
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, width, height, 0, gl.RGBA, gl.FLOAT, k ? null : data);
+      for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, key, gl.NEAREST);
+      for (const key of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, key, gl.CLAMP_TO_EDGE);
+      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + k, gl.TEXTURE_2D, textures[k], 0);
+    }
+    gl.drawBuffers(textures.map((_, k) => gl.COLOR_ATTACHMENT0 + k));
+    return { texture: textures[0], textures, frame, width, height };
   }
 
   free(target) {
-    this.gl.deleteTexture(target.texture);
+    for (const texture of target.textures) this.gl.deleteTexture(texture);
     this.gl.deleteFramebuffer(target.frame);
   }
 

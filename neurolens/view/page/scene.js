@@ -10,10 +10,11 @@ const PORTRAIT = [ // centre and radius in units, depth behind the subject; heig
   [[-0.39, 0.25, -0.195], 0.032, 1, [0.03, 0.03, 0.04]],
   [[-0.21, 0.25, -0.195], 0.032, 1, [0.03, 0.03, 0.04]],
   [[-0.3, -0.12, 0.04], 0.1, 1.6, [0.66, 0.41, 0.3]], // neck
-  [[-0.3, -0.92, 0.1], 0.52, 1.25, [0.12, 0.2, 0.42]], // coat
+  [[-0.3, -0.92, 0.1], 0.52, 1.25, [0.12, 0.2, 0.42]], // coat, the last of the person
   [[0.98, -0.72, -0.22], 0.17, 1, [0.65, 0.1, 0.07]], // in front
   [[0.62, -0.6, 1.1], 0.4, 1.3, [0.08, 0.3, 0.14]], // behind
 ];
+const PERSON = 7;
 const LAMPS = [ // place in the picture (units), distance over the subject's, radius in the picture, colour
   [-1.55, 0.62, 4.2, 0.022, 0], [-1.32, 0.18, 3.1, 0.018, 1], [-1.2, 0.8, 5, 0.024, 2], [-1.02, 0.44, 3.8, 0.02, 0],
   [-0.86, 0.86, 4.6, 0.018, 1], [-0.78, 0.12, 2.6, 0.016, 3], [-0.05, 0.84, 5.2, 0.022, 0], [0.12, 0.5, 3.4, 0.02, 1],
@@ -36,8 +37,21 @@ function sceneUniforms(name, far, unit) {
   const solids = n;
   for (const [x, y, times, radius, light] of LAMPS)
     put([x, y, 0].map((v, k) => (k < 2 ? v * unit * times : -far * times)), radius * unit * times, LIGHTS[light], -1);
+  const around = [...boxAround(ball, coat, 0, PERSON), ...boxAround(ball, coat, solids, n)];
   return {
-    scene: SCENES.indexOf(name), ball, coat, solids, balls: n, chart_z: -far, chart_half: unit, floor_y: -1.25 * unit,
+    scene: SCENES.indexOf(name), ball, coat, around, person: PERSON, solids, balls: n, chart_z: -far, chart_half: unit, floor_y: -1.25 * unit,
     key: [1.3 * unit, 1.5 * unit, -far + 1.6 * unit, 0.3 * unit], key_power: 5.5 * unit * unit,
   };
+}
+
+/** Low and high corners of the box around some balls. */
+function boxAround(ball, coat, from, to) {
+  const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+  for (let n = from; n < to; n++)
+    for (let k = 0; k < 3; k++) {
+      const reach = ball[4 * n + 3] * (k === 1 ? Math.abs(coat[4 * n + 3]) : 1);
+      low[k] = Math.min(low[k], ball[4 * n + k] - reach);
+      high[k] = Math.max(high[k], ball[4 * n + k] + reach);
+    }
+  return [...low, ...high];
 }
