@@ -1,8 +1,8 @@
 """How soon the page of `neurolens view` shows its first picture and each change, in a browser with software WebGL2.
 
 480 x 270 pixels, one sample, headless Chromium with SwiftShader (the extra "web"; Debian: chromium): the time from a
-setting, the page at rest, to the first picture with it, and the processor's time that the GPU process of the browser took for it (Linux),
-which other work on the machine changes little: SwiftShader spreads it over the cores.
+setting, the page at rest, to the first picture with it, and the processor's time that the GPU process of the browser
+took for it (Linux), which other work on the machine changes little: SwiftShader spreads it over the cores.
 Writes view_speed.md and view_speed.json.
 """
 

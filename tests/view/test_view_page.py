@@ -98,7 +98,7 @@ for (const form of data.lenses[0].forms)
 """
     subprocess.run([str(NODE), "-e", script], check=True, cwd=tmp_path, capture_output=True)
     files = sorted(tmp_path.glob("*.frag"))
-    assert len(files) == 4
+    assert len(files) == 5
     done = subprocess.run([str(GLSLANG), *map(str, files)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
 

@@ -183,7 +183,7 @@ class Engine {
       made[plane] ??= await this.aimed(lens, kind, values);
       const { boxes, exposure } = made[plane], known = this.sides[side] ?? {};
       if (known.boxes) this.gpu.free(known.boxes);
-      values.scale = values.per_distance ** 2 / exposure;
+      Object.assign(values, { scale: values.per_distance ** 2 / exposure, exposure });
       this.sides[side] = { ...known, kind, program: await this.program(lens, kind), values: { ...values, ...scene },
         boxes: this.gpu.target(cells, cells, boxes), samples: 0 };
     }
@@ -243,6 +243,13 @@ class Engine {
     return far > 0 && far < 1e6 ? far : Infinity;
   }
 
+  /** The direction, in the camera's frame, that a place of the picture looks in. */
+  direction(side, place) {
+    const s = this.sides[side], ray = this.once("ray", () => this.gpu.target(1, 1, null, 2));
+    this.run(s.program, { ...s.values, task: 3, probe: place, boxes: s.boxes }, ray);
+    return [...this.gpu.read(ray, 0, 0, 1, 1, 1).subarray(0, 3)];
+  }
+
   /** Nanoseconds a ray of a side's lens: its function and weight, no scene; the least of some runs. */
   cost(side) {
     const s = this.sides[side], target = this.once("bench", () => this.gpu.target(FREE_BENCH, FREE_BENCH, null, 2));
@@ -259,18 +266,18 @@ class Engine {
     return (best * 1e6) / FREE_BENCH ** 2;
   }
 
-  /** Show sides on the canvas: `view` is "one", "wipe" or "difference". */
-  paint(view, wipe, gain) {
+  /** Show sides on the canvas: `view` is "one", "wipe" or "difference"; ghosts are added to both. */
+  paint(view, wipe, gain, ghosts = null) {
     const { a, b } = this.sides, other = b?.film ? b : a;
     this.gpu.draw(this.show, { a: a.film, b: other.film, counts: [a.samples, other.samples],
-      view: ["one", "wipe", "difference"].indexOf(view), wipe, gain }, null);
+      view: ["one", "wipe", "difference"].indexOf(view), wipe, gain, ghosts, flared: +!!ghosts }, null);
   }
 }
 
 const SHOW = `
-uniform sampler2D a, b;
+uniform sampler2D a, b, ghosts;
 uniform vec2 counts;
-uniform int view;
+uniform int view, flared;
 uniform float wipe, gain;
 out vec4 result;
 vec3 mapped(vec3 x) {
@@ -282,6 +289,7 @@ void main() {
   vec3 left = texelFetch(a, at, 0).rgb / counts.x, right = texelFetch(b, at, 0).rgb / counts.y;
   float edge = floor(wipe * float(textureSize(a, 0).x));
   vec3 seen = view == 1 && float(at.x) >= edge ? right : left;
+  if (flared == 1) seen += texelFetch(ghosts, at, 0).rgb;
   if (view == 2) { result = vec4(mapped(1000.0 * abs(left - right)), 1.0); return; }
   result = vec4(mapped(gain > 1.0 ? 1.0 - exp(-gain * seen) : seen), 1.0); // of the night, lights keep their colour
 }`;

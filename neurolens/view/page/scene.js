@@ -24,8 +24,13 @@ const LAMPS = [ // place in the picture (units), distance over the subject's, ra
 ];
 const LIGHTS = [[12, 6.4, 2.4], [10, 8.5, 5.6], [3.4, 5.8, 11], [12, 2.2, 1.3], [2.8, 9.5, 4]];
 
-/** Uniforms of a scene: `unit` in m at the distance `far` in m. */
-function sceneUniforms(name, far, unit) {
+const LAMP_FAR = 30, LAMP_RADIUS = 0.25; // times the subject's distance; degrees
+
+/**
+ * Uniforms of a scene: `unit` in m at the distance `far` in m; `lamp` one more, {towards, irradiance at the lens in sr,
+ * over the radiance of white}.
+ */
+function sceneUniforms(name, far, unit, lamp = null) {
   const ball = new Float32Array(4 * MOST_BALLS), coat = new Float32Array(4 * MOST_BALLS);
   let n = 0;
   const put = (place, radius, colour, height) => {
@@ -37,6 +42,10 @@ function sceneUniforms(name, far, unit) {
   const solids = n;
   for (const [x, y, times, radius, light] of LAMPS)
     put([x, y, 0].map((v, k) => (k < 2 ? v * unit * times : -far * times)), radius * unit * times, LIGHTS[light], -1);
+  if (lamp) {
+    const radius = Math.sin((LAMP_RADIUS * Math.PI) / 180), bright = lamp.irradiance / (Math.PI * radius ** 2);
+    put(lamp.towards.map((v) => v * LAMP_FAR * far), LAMP_FAR * far * radius, [bright, bright, bright], -1);
+  }
   const around = [...boxAround(ball, coat, 0, PERSON), ...boxAround(ball, coat, solids, n)];
   return {
     scene: SCENES.indexOf(name), ball, coat, around, person: PERSON, solids, balls: n, chart_z: -far, chart_half: unit, floor_y: -1.25 * unit,
