@@ -116,7 +116,8 @@ def run(args: argparse.Namespace) -> int:
     progress, began = Progress(quiet=args.quiet or args.json), time.perf_counter()
     if args.preview:
         progress.note(f"preview: {args.width} pixels wide, {args.wavelengths} wavelengths, cells of {args.cell_px:g}")
-    states, model = list(_states(args)), fitted(args)
+    states = list(_states(args))
+    model = fitted(args, states)
     tabled = read_lens(lens_path(args.file, "flare")) if model is None else model.lens
     if args.fit is not None:
         return run_fit(args, None if model else _lens(states[0], tabled), model)
@@ -138,7 +139,7 @@ def _check(args: argparse.Namespace) -> None:
     if args.frames is None and args.key:
         raise InputError(_COMMAND, "--key", args.key[0], "--frames beside it")
     if args.frames is not None:
-        if args.out is None:
+        if args.out is None and args.fit is None:
             raise InputError(_COMMAND, "--frames", f"({len(args.frames)})", "-o beside it")
         args.kept = "the frames that are there are kept: the same command goes on"
     by_chance = args.photons or args.glare

@@ -16,7 +16,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress, Report
 from neurolens.flare.diffraction import starburst_picture
 from neurolens.flare.ghostmodel import GhostModel
-from neurolens.flare.ghosts import GhostTracer, Way, coated
+from neurolens.flare.ghosts import GhostTracer, Way, coated, ghost_pairs
 from neurolens.flare.lights import Light
 from neurolens.flare.photons import PhotonTracer
 from neurolens.flare.picture import Ghost, Raster, ghost_picture, ghost_table, photon_picture
@@ -198,7 +198,7 @@ def _ghosts(lens: Lens, lights: Sequence[Light], raster: Raster, settings: Flare
         part = "ghosts" if settings.glare else "flare"
         return {"ghosts": _photons(lens, lights, raster, settings, done, part, settings.photons)}
     ghosts = settings.ghosts or GhostTracer(lens)
-    factors = _factors(ghosts.pairs, settings)
+    factors = _factors(ghosts.pairs, settings, ghost_pairs(lens))
     # Ghosts of one layer and of equal factors share a picture.
     keys = [(p.name if p.name in settings.single else REST, factors[p]) for p in ghosts.pairs]
     kinds = list(dict.fromkeys([*keys, *((name, _ONE) for name in (*settings.single, REST))]))
@@ -240,13 +240,15 @@ def _photons(
     )  # fmt: skip
 
 
-def _factors(pairs: Sequence[Way], settings: FlareSettings) -> dict[Way, tuple[float, float, float]]:
-    """Of every ghost."""
-    surfaces = {k for pair in pairs for k in pair.reflections}
-    known = {*MAKERS, *(pair.name for pair in pairs), *(f"s{k:02d}" for k in surfaces)}
+def _factors(
+    pairs: Sequence[Way], settings: FlareSettings, every: Sequence[Way]
+) -> dict[Way, tuple[float, float, float]]:
+    """Of each of the pairs; names may be those of `every` ghost of the lens, of which a fit leaves some out."""
+    surfaces = {k for pair in every for k in pair.reflections}
+    known = {*MAKERS, *(pair.name for pair in (*pairs, *every)), *(f"s{k:02d}" for k in surfaces)}
     for name, _ in settings.gains:
         if name not in known:
-            named = pairs[0].name if pairs else "g01-00"
+            named = every[0].name if every else "g01-00"
             expected = (
                 f"a layer ({', '.join(MAKERS)}), a ghost ({named}) or a surface (s{min(surfaces, default=0):02d})"
             )
