@@ -106,13 +106,13 @@ def path_glsl(lens: Lens, pupil_z_mm: float, light_nm: tuple[float, float]) -> t
 
 @dataclass(frozen=True)
 class GhostFunction:
-    """One ghost: `name` of its two surfaces; what its rays cross on the plane z = 0 is chief_mm p + scale_mm u."""
+    """One ghost: `name` of its two surfaces; its rays cross the plane z = 0 at chief_mm p + scale_mm u, of x and y."""
 
     name: str
     text: str
     call: str
-    chief_mm: float
-    scale_mm: float
+    chief_mm: Sequence[float]
+    scale_mm: Sequence[float]
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,8 @@ def ghosts_glsl(model: GhostModel, most: int) -> Ghosts:
         program = lower(ghost_graph(model, ghost))
         given = [_ENTERING[i] for i in Signature.of(program, name).inputs]
         call = f"{name}({', '.join([*given, *_ARRIVING])})"
-        found.append(GhostFunction(pair.name, _text(program, name), call, ghost.chief_mm, ghost.scale_mm))
+        places = ghost.chief_mm.tolist(), ghost.scale_mm.tolist()
+        found.append(GhostFunction(pair.name, _text(program, name), call, *places))
     light = sum(energy[:most]) / sum(energy)
     return Ghosts(found, model.sine, model.wavelength_nm, model.stop_radius_mm, light)
 

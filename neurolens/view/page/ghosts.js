@@ -36,7 +36,7 @@ class GhostView {
     for (const ghost of inside ? all.slice(0, known) : []) {
       const given = { p: [d[0] / ghosts.sine, d[1] / ghosts.sine], d, chief: ghost.chief_mm, size: ghost.scale_mm, span_nm: [low, high],
         stop_radius: Math.min(values.stop_radius, ghosts.stop_radius_mm), film_mm: values.film_mm, one_colour: values.wavelength_nm ? 1 : 0,
-        nodes: this.nodes, cell_light: (Math.abs(d[2]) * irradiance * (2 * ghost.scale_mm / GHOST_CELLS) ** 2) / 2 / values.exposure };
+        nodes: this.nodes, cell_light: (Math.abs(d[2]) * irradiance * (2 / GHOST_CELLS) ** 2 * ghost.scale_mm[0] * ghost.scale_mm[1]) / 2 / values.exposure };
       this.gpu.draw(this.program(lens, ghost), given, this.nodes);
       gl.enable(gl.BLEND);
       gl.blendFunc(gl.ONE, gl.ONE);
@@ -49,9 +49,9 @@ class GhostView {
 
 // Nodes of a grid over the square about the ghost's light, side by side for each wavelength.
 const GHOST_NODES = `
-uniform vec2 p, span_nm;
+uniform vec2 p, span_nm, chief, size;
 uniform vec3 d;
-uniform float chief, size, stop_radius;
+uniform float stop_radius;
 out vec4 arriving;
 void main() {
   ivec2 node = ivec2(gl_FragCoord.xy);
