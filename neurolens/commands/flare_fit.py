@@ -42,6 +42,14 @@ def add_fit(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def check_fit(args: argparse.Namespace) -> None:
+    """Raise InputError where --fit has beside it what asks for a picture."""
+    for name in ("light", "lights", "image", "out", "path", "frames", "photons", "glare", "starburst"):
+        if args.fit is not None and getattr(args, name):
+            expected = f"no --{name} beside it: it writes the ghosts of one state, for any light"
+            raise InputError(_COMMAND, "--fit", args.fit, expected)
+
+
 def fitted(args: argparse.Namespace, states: Sequence[argparse.Namespace]) -> GhostModel | None:
     """The model where the file is one; None for a lens. `states`: the arguments of each frame.
 
@@ -80,9 +88,6 @@ def run_fit(args: argparse.Namespace, lens: Lens | None, model: GhostModel | Non
     from neurolens.flare.ghostfile import write_ghost_source, write_ghosts
     from neurolens.flare.ghostfit import GhostSettings, fit_ghosts
 
-    for name in ("light", "lights", "image", "out", "path", "frames", "photons", "glare", "starburst"):
-        if getattr(args, name):
-            raise InputError(_COMMAND, "--fit", args.fit, f"no --{name} beside it: it writes ghosts of any light alone")
     progress = Progress(quiet=args.quiet or args.json)
     if model is not None:
         check_suffix(args.fit, "--fit", (".h", ".glsl"))

@@ -89,7 +89,7 @@ class Spectrum:
     """The power spectrum of an outline, |sum of sqrt(e) n exp(i k W) dl|^2 in mm^2, smoothed.
 
     Attributes:
-        values: [G, N, N], the parts of groups of elements, at multiples of `step` in x and y, 0 at N // 2.
+        values: [G, N, N], the parts of groups of elements, at multiples of `step` in y and x, 0 at N // 2.
         step: cycles per unit of cosine.
         edges: [G] of [M, 4], some elements of each: x, y in mm from the centre where their rays meet the film, and n
             of length 1. M = 0: all rays meet at the centre.
@@ -103,14 +103,14 @@ class Spectrum:
         """Mean irradiance [Y, X] about points away from the image, for 1 at the lens."""
         total = np.zeros((len(y_mm), len(x_mm)), np.float32)
         for found, edges in zip(self.values, self.edges, strict=True):
-            for axis, place in ((0, x_mm), (1, y_mm)):
+            for axis, place in ((0, y_mm), (1, x_mm)):
                 at = place * (1e6 / wavelength_nm / self.step) + found.shape[axis] // 2
                 first = np.floor(at).astype(int)
                 part = (at - first).astype(np.float32)
                 part = part[:, None] if axis == 0 else part
                 low, high = (found.take(first + k, axis, mode="clip") for k in (0, 1))
                 found = low * (1 - part) + high * part
-            total += found.T / np.maximum(4 * math.pi**2 * _squares(edges, x_mm, y_mm), 1e-30)
+            total += found / np.maximum(4 * math.pi**2 * _squares(edges, x_mm, y_mm), 1e-30)
         return np.maximum(total, 0)
 
 
@@ -171,8 +171,9 @@ def outline_spectrum(
         total[2] += total[0, opposite].conj()
         total[1] += total[1, opposite].conj()
         half = torch.fft.ifft(torch.from_numpy(total[1:-1]), norm="forward")[:, near]  # the last lag's window is 0
-        power = torch.fft.irfft(half.T.contiguous(), samples, norm="forward")[:, near].numpy().T
-        own[:] = power * (len(order) / len(some)) * raised * raised[:, None]
+        power = torch.fft.irfft(half.T.contiguous(), samples, norm="forward")[:, near].numpy()
+        np.multiply(power, raised * (len(order) / len(some)), out=own)
+        own *= raised[:, None]
         kept = np.nonzero(group == k)[0]
         kept = kept[:: max(len(kept) // (_SAMPLES * min(len(lines), 8)), 1)][: 0 if focused else None]
         way = normal[:, kept] / np.hypot(*normal[:, kept])

@@ -64,17 +64,35 @@ class GhostPolynomial:
         return np.concatenate([self.ab.reshape(-1, len(self.power)), self.power[None]])
 
     @cached_property
-    def places(self) -> tuple[Exponents, Array]:
-        """[L, 2] the exponents of sigma and tau (of u_x and u_y), and [M, L] which of them each term has."""
+    def places(self) -> tuple[Exponents, Exponents]:
+        """[L, 2] the exponents of sigma and tau (of u_x and u_y), and [M] which of them each term has."""
         rest, place = np.unique(self.exponents[:, -3:-1], axis=0, return_inverse=True)
-        return rest, (place.reshape(-1, 1) == np.arange(len(rest))).astype(np.float64)
+        return rest, place.reshape(-1).astype(np.int64)
+
+    @cached_property
+    def _grouped(self) -> tuple[Exponents, Exponents, Exponents]:
+        """Terms of one place and one power of w: the order that has them side by side, where each begins, and its
+        number, the power's times L and the place's."""
+        number = self.exponents[:, -1] * len(self.places[0]) + self.places[1]
+        order = np.argsort(number, kind="stable")
+        numbers, first = np.unique(number[order], return_index=True)
+        return order.astype(np.int64), first.astype(np.int64), numbers
 
     def fixed(self, p: Array, w: Array) -> Array:
         """The tables [W, rows, L] of one direction and wavelengths [W], over the first of `places`."""
-        of_p, of_w = self.exponents[:, :-3], self.exponents[:, -1]
-        direction = (p if of_p.shape[1] == 2 else p @ p) ** of_p
-        known = direction.prod(1) * np.vander(w, 1 + of_w.max(), True)[:, of_w]
-        return np.asarray((self.table * known[:, None]) @ self.places[1])
+        order, first, numbers = self._grouped
+        of_p, powers, direction = self.exponents[:, :-3], 1 + int(self.exponents[:, -1].max()), np.ones(len(self.power))
+        for value, power in zip(p if of_p.shape[1] == 2 else [p @ p], of_p.T, strict=True):
+            direction *= (value ** np.arange(1 + power.max()))[power]
+        found = np.zeros((len(self.table), powers * len(self.places[0])))
+        found[:, numbers] = np.add.reduceat((self.table * direction)[:, order], first, axis=1)
+        of_w = w[:, None] ** np.arange(powers)
+        return (of_w @ found.reshape(len(found), powers, -1)).swapaxes(0, 1)
+
+    @cached_property
+    def key(self) -> tuple[tuple[int, ...], ...]:
+        """The exponents of `places`, hashable."""
+        return tuple(map(tuple, self.places[0].tolist()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,13 +181,13 @@ class GhostModel:
         """Rays of one direction by compiled code, whose coefficients are numbers of the call."""
         p, (middle, half) = direction / self.sine, self.w_middle_half
         w = (inverse_square_um(np.asarray(wavelengths_nm, np.float64)) - middle) / half
-        tables = ghost.fixed(p.astype(np.float64), w).astype(np.float32)
+        tables = np.ascontiguousarray(ghost.fixed(p.astype(np.float64), w), np.float32)
         head = [*p, *(ghost.chief_mm * p), *(1 / ghost.scale_mm), self.lens.stop_radius_mm]
         call = np.array(head, np.float32)
         given = np.ascontiguousarray(places, np.float32)
         out = np.empty((len(w), 4, given.shape[1]), np.float32)
         run, monomials, lights = self._compiled
-        kinds = monomials[_key(ghost.places[0])], lights[self._stops(ghost)]
+        kinds = monomials[ghost.key], lights[self._stops(ghost)]
         run(given.shape[1], len(w), *tables.shape[1:], *kinds, *(a.ctypes.data for a in (given, call, tables, out)))
         return out
 
@@ -184,7 +202,7 @@ class GhostModel:
     @cached_property
     def _compiled(self) -> tuple[Any, dict[Any, int], dict[Any, int]]:
         """The driver, and the number of each set of monomials and of each sort of crossings."""
-        monomials = {key: n for n, key in enumerate(dict.fromkeys(_key(ghost.places[0]) for ghost in self.ghosts))}
+        monomials = {key: n for n, key in enumerate(dict.fromkeys(ghost.key for ghost in self.ghosts))}
         lights = {key: n for n, key in enumerate(dict.fromkeys(map(self._stops, self.ghosts)))}
         text = ""
         for key, n in monomials.items():
@@ -253,10 +271,6 @@ def ghost_graph(model: GhostModel, ghost: GhostPolynomial, g: Graph | None = Non
     rows = g.polynomial(ghost.exponents, ghost.table, variables)
     g.outputs[output] = model._light(stops, p, u, rows, radius)
     return g
-
-
-def _key(exponents: Exponents) -> tuple[tuple[int, ...], ...]:
-    return tuple(map(tuple, exponents.tolist()))
 
 
 # Monomials serve all wavelengths; a table's products with them are what the graphs of light take.

@@ -15,10 +15,11 @@ import pytest
 
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cli import main
+from neurolens.flare import ghostfit
 from neurolens.flare.ghostfile import output_of, read_ghosts, write_ghost_source, write_ghosts
 from neurolens.flare.ghostfit import GhostSettings, fit_ghosts
 from neurolens.flare.ghostmodel import GhostModel
-from neurolens.flare.ghosts import GhostTracer
+from neurolens.flare.ghosts import GhostTracer, Pair
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.picture import Raster, ghost_picture
 from neurolens.graph.compiler import compile_c
@@ -160,6 +161,15 @@ def test_ghosts_of_one_term_compile() -> None:
         compiled, other = (first_order.follow_each(s, [550.0], pair)[0][:, :500] for s in (start, alone))
         here = (compiled[3] < 4) & (other[3] < 4)
         assert here.sum() > 300 and np.abs(compiled - other)[:, here].max() < 1e-4, pair
+
+
+def test_ghosts_that_too_few_rays_show_are_left_out_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a zoom at one state: light of some ghosts comes through a part of all directions that hardly a ray meets."""
+    lens = read_lens(LENS.with_name("ogawa_zoom_70_200.toml")).at(zoom=100.0).at(focus_m=math.inf)
+    monkeypatch.setattr(ghostfit, "ghost_pairs", lambda lens: (Pair(14, 15), Pair(10, 22)))
+    found = fit_ghosts(lens, GhostSettings(keep=1.0, rays=1000, target_um=100.0))
+    assert found.pairs == (Pair(14, 15),) and found.report["pairs"] == 2
+    assert 0.99 < found.report["kept_energy"] < 1
 
 
 def test_symmetry_is_exact(model: GhostModel) -> None:
