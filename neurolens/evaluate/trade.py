@@ -141,8 +141,9 @@ def plan_seen(
 ) -> Plan:  # fmt: skip
     """The plan with the cheapest camera whose picture differs from the exact lens's by no more than so much FLIP.
 
-    Told from strips of the picture at its own pixels (`_strips`), the same random numbers: with noise, where a camera
-    uses them otherwise. Of cameras that no other betters, by halves: with less error they are taken to have less FLIP.
+    Told from strips of the picture at its own pixels (`_strips`), 16 samples, the same random numbers: with the noise
+    of what samples meet otherwise, so that it is more than of finished pictures (0.02 for 0.01 px among many edges). Of
+    cameras that no other betters, by halves: with less error they are taken to have less FLIP.
     Arguments and errors as of `plan`; InputError, too, for a budget that is no number from 0 to 1.
     """
     if not 0 <= flip_budget <= 1:
