@@ -46,6 +46,8 @@ NAMES = {
     "flare": ("flare_speed", "ghosts: nanoseconds a ray, compiled and path by path"),
     "flare-gallery": ("flare_gallery", "pictures of flare: suns, headlights, coatings, stops, an animation"),
     "ghosts": ("ghosts", "ghosts drawn in several ways: error and time a picture"),
+    "dask": ("cluster", "a Dask cluster: speed-up, overhead a task, 100,000 tasks by simulation"),
+    "growth": ("growth", "how time and memory grow with surfaces, pixels, samples, lights, triangles, lenses"),
     "coatings": ("coatings", "what flare loses by one-layer coatings and dropped aspheres"),
     "optiland": ("compare_optiland", "speed of the exact tracer beside Optiland"),
 }

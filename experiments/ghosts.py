@@ -111,18 +111,18 @@ def run(args: argparse.Namespace) -> int:
 def first_order_ghosts(model: GhostModel) -> GhostModel:
     """The same ghosts and rims to first order (Lee and Eisemann 2013): constant A and B, and power, as on the axis."""
     settings = GhostSettings(0.01, model.wavelength_nm)
-    lens, found = replace(model.lens, aperture=None), []
+    lens, found, scale = replace(model.lens, aperture=None), [], np.full(2, 1e-3)
     for pair, fit in zip(model.pairs, model.ghosts, strict=True):
         steps = [k for k, _ in ghost(len(lens.surfaces), *pair)]
         rims = _places_of(fit.surfaces, steps)
-        data = sample(lens, pair, 0.0, 1e-3, settings, 1000, np.random.default_rng(0))
+        data = sample(lens, pair, 0 * scale, scale, settings, 1000, np.random.default_rng(0))
         use = np.arange(1000)
-        near = solved(np.zeros((1, 4), np.int64), data, use, np.ones(1000), rims, steps, 0.0, 1e-3)
+        near = solved(np.zeros((1, 4), np.int64), data, use, np.ones(1000), rims, steps, 0 * scale, scale)
         # From the scales of this small sample to those of the model: p = d / sine, u = place / scale.
-        grown = np.array([model.sine / settings.sine, fit.scale_mm / 1e-3])
+        grown = np.array([model.sine / settings.sine, fit.scale_mm[0] / scale[0]])
         ab = near.ab * grown[:, None]
         # u is counted from the chief's part, which first order has in A.
-        ab[:, 0] += ab[:, 1] * (fit.chief_mm / fit.scale_mm)
+        ab[:, 0] += ab[:, 1] * (fit.chief_mm[0] / fit.scale_mm[0])
         found.append(replace(near, chief_mm=fit.chief_mm, scale_mm=fit.scale_mm, ab=ab))
     return replace(model, ghosts=tuple(found))
 

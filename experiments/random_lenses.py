@@ -24,6 +24,7 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.pupils import image_radius_mm
+from neurolens.optics.rims import narrowed_rims
 from neurolens.readers.assemble import finish, with_rims
 
 MOST_BLUR = 0.02
@@ -133,7 +134,7 @@ def _finished(lens: Lens, chance: random.Random, family: str) -> Lens:
     lens = with_rims(finish(lens, film_given=False))
     if family == "asphere" or chance.random() < 0.2:
         rows = [_aspheric(s, chance) if chance.random() < 0.25 and not s.stop else s for s in lens.surfaces]
-        lens = finish(replace(lens, surfaces=tuple(rows)), film_given=False)
+        lens = finish(narrowed_rims(replace(lens, surfaces=tuple(rows))), film_given=False)
     if axial_blur_mm(lens) > MOST_BLUR * first_order(lens).efl_mm:
         raise InputError(lens.path, "blur", axial_blur_mm(lens), f"at most {MOST_BLUR} of the focal length")
     return lens

@@ -2,7 +2,7 @@
 
 Each case runs a small command once, undisturbed, and then again and again, disturbed: killed by SIGKILL at random
 moments of its time and started again, until it is done. What it writes must be the same bytes (of pictures: pixels and
-previews; of records: all but times), no file under its final name may be half-written at any moment, and what does not
+previews; of results: all but times), no file under its final name may be half-written at any moment, and what does not
 work must be one line. Commands run in processes forked from this one, so that killing is not spent on imports.
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import json
 import os
 import random
 import resource
@@ -33,7 +34,7 @@ from neurolens.render.pictures import read_channels
 
 OPTIONS = [
     lab.count("kills", 100, "random moments, over all cases (default 100)"),
-    lab.option("--only", metavar="COMMAND", nargs="+", default=[], help="some of render, merge, survey"),
+    lab.option("--only", metavar="COMMAND", nargs="+", default=[], help="some of render, merge, train, survey"),
     lab.count("seed", 0, "of the moments (default 0)", least=0),
     lab.out(),
 ]
@@ -70,21 +71,37 @@ def _lenses(folder: Path) -> None:
         shutil.copy(lab.LENSES / f"{name}.toml", folder / "lenses")
 
 
+def _experiment(folder: Path) -> None:
+    shutil.copy(lab.LENSES / "cooke_triplet_50.toml", folder / "lens.toml")
+    (folder / "train.toml").write_text(_TRAIN)
+
+
 _RENDER = (
     *("render", "scene.toml", "--camera", "pinhole", "-o", "out.exr", "--width", "96", "--samples", "64"),
     *("--threads", "2", "--checkpoint-every", "0.02", "--quiet"),
 )
 _MERGE = ("merge", *(f"out.tile-{k}-of-3.exr" for k in (1, 2, 3)), "-o", "out.exr")
-_SURVEY = ("survey", "lenses", "--no-fit", "--out", "run", "--jobs", "1", "--quiet")
+_SURVEY = ("survey", "lenses", "--rays", "1000", "--terms", "16", "--out", "run", "--jobs", "1", "--quiet")
+_TRAIN = """title = "survive"
+lens = { file = "lens.toml" }
+domain = { focus_m = [inf, inf], wavelength_nm = [400, 700] }
+pairs = { train = 1000, held_out = 500, rim = 1000 }
+model = [{ method = "ols", terms = 12 }, { method = "mlp", units = 4, layers = 1, steps = 40 }]
+evaluation = { vignetting_rays = 2000, rounds = 0 }
+"""
 CASES = [
-    Case("render", _RENDER, _scene, 0.6),
-    Case("merge", _MERGE, _tiles, 0.35),
-    Case("survey", _SURVEY, _lenses, 0.05),
+    Case("render", _RENDER, _scene, 0.35),
+    Case("merge", _MERGE, _tiles, 0.25),
+    Case("train", ("train", "train.toml", "--out", "run", "--quiet"), _experiment, 0.25),
+    Case("survey", _SURVEY, _lenses, 0.15),
 ]
+_TIMES = ("started", "seconds", "wall_s", "fit_s", "load_s", "bytes")  # of results and cards
 
 
 def run(args: argparse.Namespace) -> None:
     """Disturb every case, and write the table."""
+    import torch  # noqa: F401  before forks: kills shall meet the work
+
     chance = random.Random(args.seed)
     rows = [
         _case(case, max(1, round(case.share * args.kills)), chance, Path(place))
@@ -226,21 +243,47 @@ def _written(folder: Path) -> dict[str, str]:
     found = {}
     for path in sorted(folder.rglob("*")):
         name = str(path.relative_to(folder))
-        if path.is_dir() or path.name.startswith(".neurolens-") or name == "scene.toml":
+        if path.is_dir() or path.name.startswith(".neurolens-") or name in ("scene.toml", "run/report.html"):
             continue
         if path.suffix == ".exr":
             planes, _ = read_channels(path)
             data = b"".join(planes[key].tobytes() for key in sorted(planes))
+        elif path.suffix == ".onnx":
+            data = _model(path)
+        elif path.suffix == ".json":
+            told = json.loads(path.read_text())
+            told.pop("sha256", None)  # of a model file with its times
+            data = _timeless(told)
         else:
             data = path.read_bytes()
         found[name] = sha256(data).hexdigest()
     return found
 
 
-def _whole(folder: Path) -> bool:
-    """Whether every picture and record under its final name can be read."""
-    import json
+def _model(path: Path) -> bytes:
+    """A model file without the seconds that its card tells."""
+    import onnx
 
+    model = onnx.load(path)
+    told = {p.key: p.value for p in model.metadata_props}
+    del model.metadata_props[:]
+    cards = [_timeless(json.loads(text)) if text.startswith("{") else text.encode() for text in told.values()]
+    return b"".join([model.SerializeToString(deterministic=True), *cards])
+
+
+def _timeless(told: Any) -> bytes:
+    """Results as JSON without times, and sizes that follow from their digits."""
+
+    def without(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: without(v) for key, v in value.items() if key not in _TIMES}
+        return [without(v) for v in value] if isinstance(value, list) else value
+
+    return json.dumps(without(told), sort_keys=True).encode()
+
+
+def _whole(folder: Path) -> bool:
+    """Whether every picture, model and record under its final name can be read."""
     from PIL import Image
 
     try:
@@ -251,8 +294,10 @@ def _whole(folder: Path) -> bool:
                 read_channels(path)
             elif path.suffix == ".png":
                 Image.open(path).load()
+            elif path.suffix == ".onnx":
+                _model(path)
             elif path.suffix == ".json":
-                _: Any = json.loads(path.read_text())
+                json.loads(path.read_text())
     except (InputError, OSError, ValueError):
         return False
     return True

@@ -67,7 +67,7 @@ def test_runs_that_share_a_folder_do_not_share_names(tmp_path: Path, monkeypatch
     assert other.read_bytes() == b"kept"
 
 
-def test_what_killed_runs_left_is_removed_after_a_day(tmp_path: Path) -> None:
+def test_what_killed_runs_left_is_removed_after_a_day(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = (f".neurolens-{k:016x}.tmp{suffix}" for k, suffix in enumerate((".exr", "", ".so")))
     left, fresh, users = tmp_path / next(names), tmp_path / next(names), tmp_path / ".mine.tmp.so"
     for file in (left, fresh, users):
@@ -76,6 +76,12 @@ def test_what_killed_runs_left_is_removed_after_a_day(tmp_path: Path) -> None:
         os.utime(file, (time.time() - 2 * 86400,) * 2)
     atomic_write_text(tmp_path / "a.txt", "a")
     assert sorted(tmp_path.iterdir()) == sorted([fresh, users, tmp_path / "a.txt"])
+    os.utime(fresh, (time.time() - 2 * 86400,) * 2)
+    atomic_write_text(tmp_path / "a.txt", "a")
+    assert fresh.exists()  # looked for once an hour: thousands of files in a folder cost each as much as one
+    monkeypatch.setattr("neurolens.base.files._CLEANED_S", 0.0)
+    atomic_write_text(tmp_path / "a.txt", "a")
+    assert not fresh.exists()
 
 
 @dataclass(frozen=True)

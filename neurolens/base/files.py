@@ -13,6 +13,7 @@ import site
 import stat
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -26,6 +27,8 @@ from neurolens.base.errors import InputError
 _LARGEST_LIST = 1 << 24
 _LEFT_OVER = re.compile(r"\.neurolens-[0-9a-f]{16}\.tmp(\.\w{1,16})?")  # a temporary file of ours
 _ABANDONED_S = 24 * 3600.0  # nothing is written for a day
+_CLEANED_S = 3600.0  # folders of thousands of files are not searched at each one
+_cleaned: dict[Path, float] = {}
 _DIGEST = 32  # bytes of SHA-256
 # Opened without waiting for a writer of a FIFO; what a system lacks it does not need.
 _READ = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
@@ -120,6 +123,9 @@ def _flush(temporary: Path) -> None:
 
 def _remove_abandoned(new: Path) -> None:
     """Remove temporary files beside `new` that are much older, by the clock of that disk."""
+    if (looked := _cleaned.get(new.parent)) is not None and time.monotonic() - looked < _CLEANED_S:
+        return
+    _cleaned[new.parent] = time.monotonic()
     with suppress(OSError):
         now = new.stat().st_mtime
         for entry in os.scandir(new.parent):
@@ -219,6 +225,9 @@ def keep_newest(new: Path, most: int) -> None:
 
     A clock that went back leaves files of the future: they go as the oldest do.
     """
+    if (looked := _cleaned.get(new.parent)) is not None and time.monotonic() - looked < _CLEANED_S:
+        return
+    _cleaned[new.parent] = time.monotonic()
     with suppress(OSError):
         now = new.stat().st_mtime
         others = [(abs(now - file.stat().st_mtime), file) for file in new.parent.glob(f"*{new.suffix}") if file != new]

@@ -21,7 +21,7 @@ from neurolens.commands.arguments import (
     lens_path,
     state_of,
 )
-from neurolens.commands.flare_fit import add_fit, fitted, run_fit, stopped
+from neurolens.commands.flare_fit import add_fit, check_fit, fitted, run_fit, stopped
 from neurolens.commands.flare_lights import add_lights
 from neurolens.commands.flare_options import add_made, complete, settings_of
 from neurolens.commands.output import answer, number, table
@@ -71,7 +71,7 @@ _FEWEST = 256  # rays of a table
 _RANKED_FRAMES = 16  # that tell which ghosts are brightest
 _FRAMES = (
     "flare of these frames to OUT.0001.exr and so on, of lights by their keys in lists, the lens, and the camera of a "
-    "scene of --lights by --key; a frame that exists is kept"
+    "scene of --lights by --key; a frame that exists is kept. Fitted ghosts keep their focus and zoom"
 )
 
 
@@ -109,6 +109,7 @@ def run(args: argparse.Namespace) -> int:
     """Trace, print, write."""
     from neurolens.commands.flare_lights import Sources
     from neurolens.flare.ghosts import ghost_pairs
+    from neurolens.flare.layers import kept_beside
     from neurolens.optics.lensfile import read_lens
 
     complete(args)
@@ -116,7 +117,8 @@ def run(args: argparse.Namespace) -> int:
     progress, began = Progress(quiet=args.quiet or args.json), time.perf_counter()
     if args.preview:
         progress.note(f"preview: {args.width} pixels wide, {args.wavelengths} wavelengths, cells of {args.cell_px:g}")
-    states, model = list(_states(args)), fitted(args)
+    states = list(_states(args))
+    model = fitted(args, states)
     tabled = read_lens(lens_path(args.file, "flare")) if model is None else model.lens
     if args.fit is not None:
         return run_fit(args, None if model else _lens(states[0], tabled), model)
@@ -129,12 +131,18 @@ def run(args: argparse.Namespace) -> int:
         found["path"] = args.path[1]
     if args.out is not None:
         found["out"] = [str(state.out) for state in states]
-        _write_all(states, shots, progress)
+        try:
+            _write_all(states, shots, progress)
+        except KeyboardInterrupt:
+            if args.frames is None and (kept := [str(path) for path in kept_beside(args.out)]):
+                args.kept = f"the same command goes on from {' and '.join(kept)}"
+            raise
     found["seconds"] = time.perf_counter() - began
     return answer(args, found, lambda: _text(first, found))
 
 
 def _check(args: argparse.Namespace) -> None:
+    check_fit(args)
     if args.frames is None and args.key:
         raise InputError(_COMMAND, "--key", args.key[0], "--frames beside it")
     if args.frames is not None:
@@ -238,13 +246,13 @@ def _write_all(states: list[argparse.Namespace], shots: _Shots, progress: Progre
 
 def _write(args: argparse.Namespace, shot: _Shot, single: tuple[str, ...], progress: Progress) -> None:
     from neurolens.cameras.exact import placed_settings
-    from neurolens.flare.layers import flare_layers, sum_of
+    from neurolens.flare.layers import flare_layers, kept_beside, sum_of
     from neurolens.flare.picture import Raster
     from neurolens.render.exr_attributes import standard_attributes
     from neurolens.render.pictures import write_exr
 
     raster = Raster(args.film, args.width, max(1, round(args.width * args.film[1] / args.film[0])))
-    settings = replace(settings_of(args), single=single, ghosts=shot.tracer)
+    settings = replace(settings_of(args), single=single, ghosts=shot.tracer, keep=args.out)
     found = flare_layers(shot.lens, shot.lights, raster, settings, progress)
     layers = {f"{name}.{c}": picture[..., k] for name, picture in found.items() for k, c in enumerate("RGB")}
     told = {k: v for k, v in vars(args).items() if isinstance(v, str | int | float | list | tuple | None)}
@@ -252,6 +260,8 @@ def _write(args: argparse.Namespace, shot: _Shot, single: tuple[str, ...], progr
     camera = placed_settings(shot.lens, args.film, args.focus)
     header = standard_attributes(camera, raster.width, raster.height, args.frame)
     write_exr(args.out, sum_of(found, raster), metadata=metadata, layers=layers, attributes=header)
+    for path in kept_beside(args.out):
+        path.unlink()
 
 
 def _draw(shot: _Shot, name: str, out: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import aperture_of, between, check_suffix, given_options
 from neurolens.commands.output import answer, number, table
+from neurolens.commands.render_files import warn
 
 if TYPE_CHECKING:
     from neurolens.flare.ghostmodel import GhostModel
@@ -40,8 +42,16 @@ def add_fit(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def fitted(args: argparse.Namespace) -> GhostModel | None:
-    """The model where the file is one; None for a lens.
+def check_fit(args: argparse.Namespace) -> None:
+    """Raise InputError where --fit has beside it what asks for a picture."""
+    for name in ("light", "lights", "image", "out", "path", "frames", "photons", "glare", "starburst"):
+        if args.fit is not None and getattr(args, name):
+            expected = f"no --{name} beside it: it writes the ghosts of one state, for any light"
+            raise InputError(_COMMAND, "--fit", args.fit, expected)
+
+
+def fitted(args: argparse.Namespace, states: Sequence[argparse.Namespace]) -> GhostModel | None:
+    """The model where the file is one; None for a lens. `states`: the arguments of each frame.
 
     Raises:
         InputError: options that would change what the model was fitted for. ModelError: as `read_ghosts`.
@@ -51,12 +61,16 @@ def fitted(args: argparse.Namespace) -> GhostModel | None:
     from neurolens.flare.ghostfile import read_ghosts
 
     other = [name for name in given_options(args) if name not in _FREE]
-    never = "coating", "photons", "glare", "frames", "polarised", "starburst"
-    other += [f"--{name}" for name in never if getattr(args, name)]
+    other += [f"--{name}" for name in ("coating", "photons", "polarised") if getattr(args, name)]
     other += ["--reflections"] * args.fours
+    other += ["--key focus"] * any(math.isfinite(s.focus) for s in states)
+    other += ["--key zoom"] * any(s.zoom is not None for s in states)
     if other:
         raise InputError(_COMMAND, other[0], args.file, "a lens: fitted ghosts have one state and two reflections")
-    return read_ghosts(args.file)
+    model, half = read_ghosts(args.file), math.hypot(*args.film) / 2
+    if half > 1.001 * (known := float(model.report.get("film_radius_mm", math.inf))):
+        warn(f"{args.file}: fitted up to {known:.4g} mm from the axis, and the film's corners are at {half:.4g} mm")
+    return model
 
 
 def stopped(args: argparse.Namespace, model: GhostModel) -> GhostModel:

@@ -90,12 +90,12 @@ class Sources:
                 self._chosen[path] = chosen(of_all or [seen], args.most)
             found += _kept(keep_named(seen, self._chosen[path]), path)
         if args.image is not None:
-            found += self._of_picture(args, progress)
+            found += self._of_picture(args, lens, progress)
         if not found:
             warn(f"no light: the flare is black{_at(args)}")
         return found
 
-    def _of_picture(self, args: argparse.Namespace, progress: Progress) -> list[Light]:
+    def _of_picture(self, args: argparse.Namespace, lens: Lens, progress: Progress) -> list[Light]:
         from neurolens.flare.sources import highlights
         from neurolens.render.pictures import read_exr
 
@@ -107,23 +107,28 @@ class Sources:
             raise InputError(path, "shape", f"({size})", "the film's, {:g}x{:g}".format(*args.film))
         try:
             fade = args.frame is not None and path != args.image
-            found = highlights(picture, self._field(args, progress), args.film, args.threshold, args.most, fade)
+            found = highlights(picture, self._field(args, lens, progress), args.film, args.threshold, args.most, fade)
         except InputError as error:
             raise InputError(path, error.field, error.value, error.expected) from None
         return _kept(found, path)
 
-    def _field(self, args: argparse.Namespace, progress: Progress) -> Field:
+    def _field(self, args: argparse.Namespace, lens: Lens, progress: Progress) -> Field:
         from neurolens.cameras.build import Shot, make_camera
+        from neurolens.cameras.exact import ExactCamera
         from neurolens.cameras.field import field_of
 
         state = args.focus, args.f_number, args.zoom
-        if state not in self._fields:
+        if state not in self._fields and args.file.suffix.lower() == ".onnx":  # fitted ghosts, with their film
+            moved = (lens.film_z_mm or 0.0) - (lens.at(focus_m=math.inf).film_z_mm or 0.0)
+            camera = ExactCamera(lens, film_mm=args.film, focus_m=math.inf, film_offset_mm=moved, progress=progress)
+            self._fields[state] = field_of(camera, args.focus, "equidistant")
+        elif state not in self._fields:
             shot = Shot(
                 film_mm=args.film, focus_m=args.focus, f_number=args.f_number, efl_mm=args.efl, zoom=args.zoom,
                 field_deg=args.field, focus=args.focusing, aperture=aperture_of(args),
             )  # fmt: skip
-            camera = make_camera(str(lens_path(args.file, "flare")), shot, progress)
-            self._fields[state] = field_of(camera, args.focus, "equidistant")
+            exact = make_camera(str(lens_path(args.file, "flare")), shot, progress)
+            self._fields[state] = field_of(exact, args.focus, "equidistant")
         return self._fields[state]
 
 

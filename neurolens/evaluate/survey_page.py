@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurolens.base.files import atomic_write_text, write_json
+from neurolens.base.files import atomic_path, atomic_write_text, write_json
 from neurolens.evaluate.pages import DASH, Column, facts, legend, number, page, text
 from neurolens.evaluate.records import versions
 from neurolens.evaluate.survey import GOALS, VERDICTS, SurveySettings, summary_of
@@ -82,6 +82,7 @@ TABLE_SCRIPT = """<script>
   words.addEventListener('input', filter); kinds.forEach(k => k.addEventListener('change', filter)); filter();
 })();
 </script>"""
+_ROWS = "<!--rows-->"  # where they come: no name or text holds it, as those are escaped
 _KINDS = {
     **dict.fromkeys(VERDICTS, ""),
     "unfitted": "read, but without a fit",
@@ -91,15 +92,19 @@ _KINDS = {
 
 
 def write_pages(
-    records: Sequence[Mapping[str, Any]], collection: Collection, out: Path, settings: SurveySettings
+    records: Sequence[Mapping[str, Any]],
+    layout_of: Callable[[str], str],
+    collection: Collection,
+    out: Path,
+    settings: SurveySettings,
 ) -> None:
-    """Write survey.json (all of the records but their pictures), survey.csv and survey.html to a folder."""
+    """Write survey.json, survey.csv and survey.html to a folder; a file's section, an SVG, is asked for one by one."""
     summary = summary_of(records)
-    kept = [{key: value for key, value in r.items() if key != "layout"} for r in records]
     head = {"folder": str(collection.folder), "settings": asdict(settings), "others": collection.others}
-    write_json(out / "survey.json", {**head, "summary": summary, "versions": versions(), "lenses": kept})
+    write_json(out / "survey.json", {**head, "summary": summary, "versions": versions(), "lenses": records})
     atomic_write_text(out / "survey.csv", _csv(records))
-    atomic_write_text(out / "survey.html", survey_page(records, collection, settings))
+    with atomic_path(out / "survey.html") as temporary, temporary.open("w", encoding="utf-8") as stream:
+        stream.writelines(survey_page(records, layout_of, collection, settings))
 
 
 def summary_lines(records: Sequence[Mapping[str, Any]], others: Mapping[str, int]) -> list[str]:
@@ -130,8 +135,13 @@ def _kinds(record: Mapping[str, Any]) -> list[str]:
     return kinds
 
 
-def survey_page(records: Sequence[Mapping[str, Any]], collection: Collection, settings: SurveySettings) -> str:
-    """The page: what was found in words, then one row a file with its section, figures and reasons."""
+def survey_page(
+    records: Sequence[Mapping[str, Any]],
+    layout_of: Callable[[str], str],
+    collection: Collection,
+    settings: SurveySettings,
+) -> Iterator[str]:
+    """The page in parts: what was found in words, then one row a file with its section, figures and reasons."""
     columns = [c for c in COLUMNS if any(number(r, c.key) is not None for r in records)]
     heads = "".join(
         f"<th scope='col' data-kind='number' title='{text(c.about)}'>{text(c.heading)}</th>" for c in columns
@@ -139,8 +149,7 @@ def survey_page(records: Sequence[Mapping[str, Any]], collection: Collection, se
     head = (
         "<th scope='col'>file</th><th scope='col'>section</th><th scope='col'>verdict</th><th scope='col'>format</th>"
     )
-    rows = "".join(_row(r, columns) for r in records)
-    body = f"<thead><tr>{head}{heads}<th scope='col'>what was found</th></tr></thead><tbody>{rows}</tbody>"
+    body = f"<thead><tr>{head}{heads}<th scope='col'>what was found</th></tr></thead><tbody>{_ROWS}</tbody>"
     counts = {kind: sum(kind in _kinds(r) for r in records) for kind in _KINDS}
     boxes = "".join(
         f"<label title='{text(about)}'><input type='checkbox' class='kind' value='{kind}' checked> {kind} "
@@ -155,10 +164,15 @@ def survey_page(records: Sequence[Mapping[str, Any]], collection: Collection, se
     table = f"<div class='survey'><table>{body}</table></div>"
     title = f"Survey of {collection.folder.name or collection.folder}"
     top = f"<header><h1>{text(title)}</h1></header><ul>{said}</ul>"
-    return page(title, f"{TABLE_STYLE}{top}{tools}{table}{legend(columns)}{about}{TABLE_SCRIPT}")
+    whole = page(title, f"{TABLE_STYLE}{top}{tools}{table}{legend(columns)}{about}{TABLE_SCRIPT}")
+    before, _, after = whole.partition(_ROWS)
+    yield before
+    for r in records:
+        yield _row(r, layout_of(r["file"]), columns)
+    yield after
 
 
-def _row(record: Mapping[str, Any], columns: Sequence[Column]) -> str:
+def _row(record: Mapping[str, Any], picture: str, columns: Sequence[Column]) -> str:
     cells = "".join(
         f"<td data-v='{'' if (v := number(record, c.key)) is None else v}'>{c.cell(record)}</td>" for c in columns
     )
@@ -166,7 +180,6 @@ def _row(record: Mapping[str, Any], columns: Sequence[Column]) -> str:
     said = [record["reason"], *record.get("doubts", ()), *record.get("notes", ())]
     said += [f"promise not held: {b}" for b in (record.get("fit") or {}).get("broken", ())]
     listed = "<br>".join(text(line) for line in dict.fromkeys(said) if line)
-    picture = record.get("layout") or ""
     return (
         f"<tr class='{text(record['verdict'])}' data-kinds='{' '.join(_kinds(record))}'><th scope='row'>{named}</th>"
         f"<td class='p' data-v=''>{picture}</td><td class='v'>{text(record['verdict'])}</td>"

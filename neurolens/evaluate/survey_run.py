@@ -27,7 +27,7 @@ from neurolens.readers.source import MAX_BYTES
 SUFFIXES = frozenset([".toml", *(suffix for f in FORMATS for suffix in f.suffixes)])
 # Tasks to their records, in any order; tasks are taken one by one as there is room for them.
 Engine = Callable[[Iterable[Task]], Iterator[tuple[Task, bytes]]]
-_KEPT_EVERY_S = 60.0  # pages are written so often beside the last time
+_KEPT_EVERY_S, _SHARE = 60.0, 20.0  # pages are written so often beside the last time, for 1/20 of the time
 _POLL_S = 0.5
 TIME_LIMIT_S = 1800.0  # of one file, far more than any lens takes
 
@@ -81,7 +81,8 @@ def survey(
 ) -> list[dict[str, Any]]:
     """Survey all files of a collection; records that are there are not made again. Returns them in the files' order.
 
-    Writes records/ (one JSON a file), survey.json, survey.csv and survey.html to the folder `out`.
+    Writes records/ (one JSON a file), survey.json, survey.csv and survey.html to the folder `out`. The sections stay
+    in the files alone: what a survey holds in memory is some ten thousand bytes a lens.
     """
     (out / "records").mkdir(parents=True, exist_ok=True)
     found: dict[str, dict[str, Any]] = {}
@@ -90,7 +91,7 @@ def survey(
         task = _task(collection, name, settings, glasses)
         kept = None if again or isinstance(task, bytes) else _kept(out, task)
         if kept is not None:
-            found[name] = kept
+            found[name] = _without_layout(kept)
         elif isinstance(task, bytes):
             found[name] = json.loads(task)
         else:
@@ -107,21 +108,24 @@ def survey(
                 yield task
 
     def pages() -> None:
-        write_pages([found[name] for name in collection.names if name in found], collection, out, settings)
+        there = [found[name] for name in collection.names if name in found]
+        write_pages(there, lambda name: _layout(_record_file(out, name)), collection, out, settings)
 
-    written = time.monotonic()
+    written, spent = time.monotonic(), 0.0
     if missing:
         with progress.stage("survey") as report:
             for done, (task, data) in enumerate(engine(tasks()), start=1):
                 with atomic_path(_record_file(out, task.name)) as temporary:
                     temporary.write_bytes(data)
-                found[task.name] = record = json.loads(data)
+                found[task.name] = record = _without_layout(json.loads(data))
                 if record["reason"]:
                     progress.note(one_line(f"{task.name}: {record['verdict']}: {record['reason']}", 400))
                 report(done / len(missing))
-                if time.monotonic() - written > _KEPT_EVERY_S:
+                if time.monotonic() - written > max(_KEPT_EVERY_S, _SHARE * spent):
+                    began = time.monotonic()
                     pages()
                     written = time.monotonic()
+                    spent = written - began
     pages()
     return [found[name] for name in collection.names]
 
@@ -147,6 +151,18 @@ def _kept(out: Path, task: Task) -> dict[str, Any] | None:
         return known_record(_record_file(out, task.name).read_bytes(), task)
     except OSError:
         return None
+
+
+def _without_layout(record: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in record.items() if key != "layout"}
+
+
+def _layout(file: Path) -> str:
+    """The section that a record holds; none where there is no record."""
+    try:
+        return json.loads(file.read_bytes()).get("layout") or ""
+    except (OSError, ValueError):
+        return ""
 
 
 def in_processes(jobs: int, limit_s: float = TIME_LIMIT_S) -> Engine:

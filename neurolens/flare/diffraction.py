@@ -89,7 +89,7 @@ class Spectrum:
     """The power spectrum of an outline, |sum of sqrt(e) n exp(i k W) dl|^2 in mm^2, smoothed.
 
     Attributes:
-        values: [G, N, N], the parts of groups of elements, at multiples of `step` in x and y, counted round.
+        values: [G, N, N], the parts of groups of elements, at multiples of `step` in y and x, 0 at N // 2.
         step: cycles per unit of cosine.
         edges: [G] of [M, 4], some elements of each: x, y in mm from the centre where their rays meet the film, and n
             of length 1. M = 0: all rays meet at the centre.
@@ -103,21 +103,23 @@ class Spectrum:
         """Mean irradiance [Y, X] about points away from the image, for 1 at the lens."""
         total = np.zeros((len(y_mm), len(x_mm)), np.float32)
         for found, edges in zip(self.values, self.edges, strict=True):
-            for axis, place in ((0, x_mm), (1, y_mm)):
-                at = place * (1e6 / wavelength_nm / self.step)
+            for axis, place in ((0, y_mm), (1, x_mm)):
+                at = place * (1e6 / wavelength_nm / self.step) + found.shape[axis] // 2
                 first = np.floor(at).astype(int)
                 part = (at - first).astype(np.float32)
                 part = part[:, None] if axis == 0 else part
-                low, high = (found.take(first + k, axis, mode="wrap") for k in (0, 1))
+                low, high = (found.take(first + k, axis, mode="clip") for k in (0, 1))
                 found = low * (1 - part) + high * part
-            total += found.T / np.maximum(4 * math.pi**2 * _squares(edges, x_mm, y_mm), 1e-30)
+            total += found / np.maximum(4 * math.pi**2 * _squares(edges, x_mm, y_mm), 1e-30)
         return np.maximum(total, 0)
 
 
 def _squares(edges: Array, x_mm: Array, y_mm: Array) -> Floats:
     """|u|^2 [Y, X] of points from those of elements (`Spectrum.edges`) that each has light of."""
     found = np.empty((len(y_mm), len(x_mm)), np.float32)
-    given: list[Array] = [np.ascontiguousarray(a, np.float64) for a in (x_mm, y_mm, edges)]
+    between = np.pad((np.diff(edges[:, :2], axis=0) ** 2).sum(1), 1, constant_values=np.inf)
+    edges = np.column_stack([edges, np.minimum(between[1:], between[:-1]) if len(edges) else edges[:, :1]])
+    given: list[Array] = [np.ascontiguousarray(a, np.float32) for a in (x_mm, y_mm, edges)]
     call = load_compiled(_PAIRS).squares
     call.argtypes, call.restype = [ctypes.c_int64] * 3 + [ctypes.c_void_p] * 4, None
     call(len(x_mm), len(y_mm), len(edges), *(a.ctypes.data for a in (*given, found)))
@@ -125,12 +127,20 @@ def _squares(edges: Array, x_mm: Array, y_mm: Array) -> Floats:
 
 
 def outline_spectrum(
-    pupil: ExitPupil, lines: Sequence[Array], shortest_nm: float, pixel_mm: float, reach_mm: float
+    pupil: ExitPupil,
+    lines: Sequence[Array],
+    shortest_nm: float,
+    pixel_mm: float,
+    reach_mm: float,
+    part: tuple[int, int] = (0, 1),
 ) -> Spectrum:
     """The spectrum that holds film points up to `reach_mm` from the centre.
 
     It is smoothed as by pixels (or as many samples allow) at the shortest wavelength: there by the fourth power of
     sinc(x / 2), x in pixels, whose samples a pixel apart have always the same sum.
+
+    Args:
+        part: number of it, and of how many, whose sum is wanted: each starts pairs at its own share of the places.
     """
     wave = shortest_nm * 1e-6
     pixel = max(pixel_mm, 8 * reach_mm / _SPECTRUM)
@@ -143,19 +153,27 @@ def outline_spectrum(
     vector = normal * (np.abs(field) if focused else field)
     order = np.argsort(place[0], kind="stable")
     given = (place[:, order] / reach).copy(), np.ascontiguousarray(vector[:, order], np.complex64)
-    rank, every = np.argsort(order), math.ceil(len(order) / _STARTS)
+    every = math.ceil(len(order) * part[1] / _STARTS)
+    some = np.arange(part[0] * every // part[1], len(order), every)
+    rank = np.argsort(order)[some]
     call = load_compiled(_PAIRS).pairs
     call.argtypes, call.restype = [ctypes.c_int64] * 3 + [ctypes.c_void_p] * 4, None
     # What was laid down on the nearest nine lags is lower by the third power of a sinc.
-    raised = (np.sinc(np.fft.fftfreq(samples)) ** -3).astype(np.float32)
+    near = np.arange(-(samples // 4) - 2, samples // 4 + 3)  # samples of film points
+    raised = (np.sinc(near / samples) ** -3).astype(np.float32)
     group = np.zeros(len(order), int) if focused else _groups(normal)
-    values, edges = np.empty((group.max() + 1, samples, samples), np.float32), []
-    for k, part in enumerate(values):
-        total = np.zeros((samples, samples), np.complex64)
-        starts = rank[::every][group[::every] == k].astype(np.int64)
+    values, edges = np.empty((group.max() + 1, len(near), len(near)), np.float32), []
+    for k, own in enumerate(values):
+        total = np.zeros((samples // 2 + 3, samples), np.complex64)  # of lags in x from -1 on
+        starts = rank[group[some] == k].astype(np.int64)
         call(len(order), len(starts), samples, *(a.ctypes.data for a in (starts, *given, total)))
-        power = torch.fft.ifft2(torch.from_numpy(total), norm="forward").real.numpy()
-        part[:] = power * (2 * len(order) / len(order[::every])) * raised * raised[:, None]
+        opposite = -np.arange(samples)
+        total[2] += total[0, opposite].conj()
+        total[1] += total[1, opposite].conj()
+        half = torch.fft.ifft(torch.from_numpy(total[1:-1]), norm="forward")[:, near]  # the last lag's window is 0
+        power = torch.fft.irfft(half.T.contiguous(), samples, norm="forward")[:, near].numpy()
+        np.multiply(power, raised * (len(order) / len(some)), out=own)
+        own *= raised[:, None]
         kept = np.nonzero(group == k)[0]
         kept = kept[:: max(len(kept) // (_SAMPLES * min(len(lines), 8)), 1)][: 0 if focused else None]
         way = normal[:, kept] / np.hypot(*normal[:, kept])
@@ -232,13 +250,12 @@ def _stars(lens: Lens, light: Light, wavelengths_nm: Array, raster: Raster, thre
             return np.zeros((raster.height, raster.width), np.float32)
         return star(pupil, lines, far, x - pupil.centre_mm[0], y - pupil.centre_mm[1], pixel)
 
+    parts = np.array_split(wavelengths_nm, 1 if middle.blur_mm < pixel / 8 else min(_PARTS, len(wavelengths_nm)))
     with ThreadPoolExecutor(threads) as pool:
-        for part in np.array_split(
-            wavelengths_nm, 1 if middle.blur_mm < pixel / 8 else min(_PARTS, len(wavelengths_nm))
-        ):
+        for number, part in enumerate(parts):
             # Their mean phase, which is as 1 / wavelength.
             like = exit_pupil(lens, light, float(1 / np.mean(1 / part)), middle) or middle
-            far = outline_spectrum(like, lines, float(part.min()), pixel, reach + pixel)
+            far = outline_spectrum(like, lines, float(part.min()), pixel, reach + pixel, (number, len(parts)))
             yield from pool.map(partial(one, far=far), part)
 
 
@@ -288,13 +305,18 @@ def _image(pupil: ExitPupil, x: Array, y: Array, pixel_mm: float) -> NDArray[np.
 _PAIRS = """
 #include <math.h>
 #include <stdint.h>
+#if defined(__GNUC__)
+#define ALWAYS __attribute__((always_inline))
+#else
+#define ALWAYS
+#endif
 
-static inline float window(float t)
+static inline ALWAYS float window(float t)
 {
     return t < 0.5f ? 1.0f - 6.0f * t * t * (1.0f - t) : 2.0f * (1.0f - t) * (1.0f - t) * (1.0f - t);
 }
 
-static inline int64_t laid(float at, float *share)
+static inline ALWAYS int64_t laid(float at, float *share)
 {
     const float middle = floorf(at + 0.5f), t = at - middle;
     share[0] = 0.5f * (0.5f - t) * (0.5f - t);
@@ -303,31 +325,39 @@ static inline int64_t laid(float at, float *share)
     return (int64_t)middle;
 }
 
-static inline double apart(const double *e, const double *f)
+enum { LANES = 16 };
+typedef float lanes __attribute__((vector_size(4 * LANES)));
+typedef int32_t truth __attribute__((vector_size(4 * LANES)));
+
+static inline ALWAYS lanes chosen(truth first, lanes a, lanes b)
 {
-    return (e[0] - f[0]) * (e[0] - f[0]) + (e[1] - f[1]) * (e[1] - f[1]);
+    return (lanes)((first & (truth)a) | (~first & (truth)b));
 }
 
 void squares(
-    int64_t width, int64_t height, int64_t count, const double *x, const double *y, const double *edge, float *found)
+    int64_t width, int64_t height, int64_t count, const float *x, const float *y, const float *edge, float *found)
 {
-    const double *const last = edge + 4 * (count - 1);
-    for (int64_t p = 0; p < width * height; p++) {
-        const double q = x[p % width], r = y[p / width];
-        double least = 1.0, chosen = q * q + r * r;
-        for (const double *e = edge; e <= last; e += 4) {
-            const double a = q - e[0], b = r - e[1], whole = a * a + b * b, aside = a * e[3] - b * e[2];
-            if (aside * aside < least * whole) {
-                double gap = 0.9 * whole;
-                if (e > edge)
-                    gap = fmin(gap, apart(e, e - 4));
-                if (e < last)
-                    gap = fmin(gap, apart(e, e + 4));
-                least = aside * aside / whole;
-                chosen = whole - fmin(aside * aside, gap);
-            }
+    for (int64_t first = 0; first < width * height; first += LANES) {
+        const int64_t some = width * height - first < LANES ? width * height - first : LANES;
+        lanes q = { 0.0f }, r = q, none = q;
+        for (int64_t i = 0; i < some; i++) {
+            q[i] = x[(first + i) % width];
+            r[i] = y[(first + i) / width];
         }
-        found[p] = (float)chosen;
+        lanes least = none + 1.0f, of = least; /* the least is least / of */
+        lanes result = q * q + r * r;
+        for (const float *e = edge; e < edge + 5 * count; e += 5) {
+            const lanes a = q - e[0], b = r - e[1], whole = a * a + b * b, aside = a * e[3] - b * e[2];
+            const lanes square = aside * aside, most = 0.9f * whole, gap = none + e[4];
+            const truth closer = square * of < least * whole;
+            lanes less = chosen(most < gap, most, gap);
+            less = chosen(square < less, square, less);
+            least = chosen(closer, square, least);
+            of = chosen(closer, whole, of);
+            result = chosen(closer, whole - less, result);
+        }
+        for (int64_t i = 0; i < some; i++)
+            found[first + i] = result[i];
     }
 }
 
@@ -348,14 +378,15 @@ void pairs(
             const float re = weight * (a * u[2 * j] + b * u[2 * j + 1] + c * v[2 * j] + d * v[2 * j + 1]);
             const float im = weight * (a * u[2 * j + 1] - b * u[2 * j] + c * v[2 * j + 1] - d * v[2 * j]);
             float across[3], along[3];
-            const int64_t column = laid(0.5f * dx * side, across) - 1, row = laid(0.5f * dy * side, along) - 1;
-            for (int p = 0; p < 3; p++)
-                for (int q = 0; q < 3; q++) {
-                    const float share = across[p] * along[q];
-                    float *const at = total + 2 * ((column + p + side) % side * side + (row + q + side) % side);
-                    at[0] += share * re;
-                    at[1] += share * im;
+            const int64_t column = laid(0.5f * dx * side, across), row = laid(0.5f * dy * side, along) - 1;
+            for (int q = 0; q < 3; q++) {
+                const int64_t y = row + q < 0 ? row + q + side : row + q < side ? row + q : row + q - side;
+                float *const at = total + 2 * (column * side + y);
+                for (int p = 0; p < 3; p++) {
+                    at[2 * p * side] += across[p] * along[q] * re;
+                    at[2 * p * side + 1] += across[p] * along[q] * im;
                 }
+            }
         }
     }
 }

@@ -64,8 +64,8 @@ def write_ghosts(model: GhostModel, path: str | Path) -> Path:
     rows = [
         [
             *pair,
-            ghost.chief_mm,
-            ghost.scale_mm,
+            list(ghost.chief_mm),
+            list(ghost.scale_mm),
             list(ghost.surfaces),
             *map(pack, (ghost.exponents, ghost.ab, ghost.power)),
         ]
@@ -123,10 +123,11 @@ def read_ghosts(path: str | Path) -> GhostModel:
         if data["schema"] != SCHEMA or len(data["ghosts"]) > _MOST:
             raise ValueError(f"schema {data['schema']!r}, {len(data['ghosts'])} ghosts")
         low, high = map(float, card["domain"]["wavelength_nm"])
+        lens = unpacked_lens(data["lens"])
         model = GhostModel(
-            unpacked_lens(data["lens"]),
+            lens,
             tuple(Pair(int(first), int(second)) for first, second, *_ in data["ghosts"]),
-            tuple(_ghost(*row[2:]) for row in data["ghosts"]),
+            tuple(_ghost(5 if lens.anamorphic else 4, *row[2:]) for row in data["ghosts"]),
             float(card["domain"]["sine"]),
             (low, high),
             float(card["lens"]["stop_radius_mm"]),
@@ -146,14 +147,15 @@ def read_ghosts(path: str | Path) -> GhostModel:
     return model
 
 
-def _ghost(chief: Any, scale: Any, surfaces: Any, exponents: Any, ab: Any, power: Any) -> GhostPolynomial:
-    ghost = GhostPolynomial(
-        float(chief), float(scale), tuple(map(int, surfaces)), unpack(exponents), unpack(ab), unpack(power)
-    )
+def _ghost(
+    variables: int, chief: Any, scale: Any, surfaces: Any, exponents: Any, ab: Any, power: Any
+) -> GhostPolynomial:
+    middle, size = (np.array(v, np.float64).reshape(2) for v in (chief, scale))
+    ghost = GhostPolynomial(middle, size, tuple(map(int, surfaces)), unpack(exponents), unpack(ab), unpack(power))
     terms = len(ghost.exponents)
-    if ghost.exponents.shape != (terms, 4) or ghost.ab.shape != (1 + len(ghost.surfaces), 2, terms):
+    if ghost.exponents.shape != (terms, variables) or ghost.ab.shape != (1 + len(ghost.surfaces), 2, terms):
         raise ValueError(f"tables of {ghost.exponents.shape}, {ghost.ab.shape}")
-    if ghost.power.shape != (terms,) or not ghost.scale_mm > 0:
+    if ghost.power.shape != (terms,) or not (ghost.scale_mm > 0).all():
         raise ValueError(f"tables of {ghost.power.shape}, scale {ghost.scale_mm}")
     return ghost
 
@@ -162,8 +164,9 @@ def _reference(model: GhostModel) -> dict[str, Any]:
     """Rays near the middle of each ghost's light, and what it gives for them."""
     share, found = np.linspace(0, 0.5, _REFERENCE), {}
     for pair, ghost in zip(model.pairs, model.ghosts, strict=True):
-        place = ghost.chief_mm * share + 0.3 * ghost.scale_mm * share, 0 * share
-        rays = np.stack([share * model.sine, 0 * share, *place, np.linspace(*model.wavelength_nm, _REFERENCE)])
+        p = np.stack([share, -0.5 * share])
+        place = ghost.chief_mm[:, None] * p + ghost.scale_mm[:, None] * np.stack([0.3 * share, 0.1 * share])
+        rays = np.stack([*(model.sine * p), *place, np.linspace(*model.wavelength_nm, _REFERENCE)])
         rays = rays.astype(np.float32).astype(np.float64)
         found[output_of(pair)] = {"rays": rays.tolist(), "light": _light(model, ghost, rays).tolist()}
     return found

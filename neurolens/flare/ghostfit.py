@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -20,12 +20,22 @@ from neurolens.optics.glass import inverse_square_um
 from neurolens.optics.prescription import Lens
 from neurolens.optics.sequence import follow, ghost
 from neurolens.optics.trace import Rays
-from neurolens.surrogates.bases import invariant_exponents, monomials, pinned_threads, solve, vector_columns
+from neurolens.surrogates.bases import (
+    invariant_exponents,
+    monomials,
+    pinned_threads,
+    raw_exponents,
+    raw_variables,
+    solve,
+    vector_columns,
+)
 from neurolens.surrogates.lightfield import LightField
 
 Array = NDArray[np.float64]
 DEGREES = (3, 4, 5, 6, 7, 9)  # in the invariants; the first that is good enough
+_MIRROR_DEGREES = (5, 7, 9, 11)  # in p and u, of lenses with cylinders
 _SEARCH = 1 << 16  # rays that look for the light of each ghost
+_DRAWS = 4  # at most, where few rays serve
 _MARGIN = 1.12  # of the disc in which they find it
 _FAR = 2.0  # film radii: light beyond counts little
 _OPEN = 50.0  # times the diameters of a lens whose rims stop nothing
@@ -89,8 +99,8 @@ def fit_ghosts(lens: Lens, settings: GhostSettings, done: Callable[[float], None
         done: told the share of the work that is done.
 
     Raises:
-        InputError: a lens with cylinders, with a mask in its stop or without film; settings out of range; no ghost that
-            reaches the film.
+        InputError: a lens with a mask in its stop or without film; settings out of range; no ghost that reaches the
+            film.
     """
     _check(lens, settings)
     began, plain, rng = time.perf_counter(), replace(lens, aperture=None), np.random.default_rng(settings.seed)
@@ -101,17 +111,21 @@ def fit_ghosts(lens: Lens, settings: GhostSettings, done: Callable[[float], None
     if not total > 0:
         raise InputError(lens.path, "ghosts", f"({len(found)} pairs)", "one whose light reaches the film")
     kept = order[: int(np.searchsorted(np.cumsum(energy[order]) / total, settings.keep)) + 1]
-    pairs, fits, rows = tuple(every[k] for k in kept), [], []
+    pairs, fits, rows = list[Pair](), list[GhostPolynomial](), list[dict[str, Any]]()
     with pinned_threads():
-        for number, (pair, k) in enumerate(zip(pairs, kept, strict=True)):
-            fit, row = _fit(plain, pair, *found[pair][1:], settings, rng)
-            fits.append(fit)
-            rows.append({"ghost": pair.name, "energy": float(energy[k] / total), **row})
-            done((number + 1) / len(pairs))
+        for number, k in enumerate(kept):
+            if (fitted := _fit(plain, every[k], *found[every[k]][1:], settings, rng)) is not None:
+                pairs.append(every[k])
+                fits.append(fitted[0])
+                rows.append({"ghost": every[k].name, "energy": float(energy[k] / total), **fitted[1]})
+            done((number + 1) / len(kept))
+    if not fits:
+        raise InputError("ghost fit", "rays", settings.rays, "more: of no ghost there are enough that serve")
     share = np.array([row["energy"] for row in rows])
     um = np.array([row["film_rms_um"] for row in rows])
     report = {
         "pairs": len(every),
+        "film_radius_mm": settings.film_radius_mm,
         "kept": len(pairs),
         "kept_energy": float(share.sum()),
         "film_rms_um": float(np.sqrt((share * um**2).sum() / share.sum())),
@@ -120,13 +134,10 @@ def fit_ghosts(lens: Lens, settings: GhostSettings, done: Callable[[float], None
         "ghosts": rows,
     }
     radius = float(lens.stop_radius_mm)
-    return GhostModel(lens, pairs, tuple(fits), settings.sine, settings.wavelength_nm, radius, report)
+    return GhostModel(lens, tuple(pairs), tuple(fits), settings.sine, settings.wavelength_nm, radius, report)
 
 
 def _check(lens: Lens, settings: GhostSettings) -> None:
-    if any(s.cylinder for s in lens.surfaces):
-        expected = "a lens with an axis of symmetry: of others ghosts are traced"
-        raise InputError(lens.path, "cylinder", "(some)", expected)
     if lens.aperture is not None and lens.aperture.mask is not None:
         raise InputError(lens.path, "aperture", "(a mask)", "a round stop or blades: fitted ghosts take no mask")
     bounds = {"angle_deg": (0.1, 89.0), "keep": (0.0, 1.0), "target_um": (1e-3, 1e6), "rays": (1000, 1e9)}
@@ -141,45 +152,49 @@ def _rays(direction: Array, place: Array) -> Array:
     return np.concatenate([np.concatenate([place, np.zeros((1, place.shape[1]))]) - 1000.0 * d, d])
 
 
-def _drawn(count: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """p [2, N], of all lengths as the disc has them, along x, which by symmetry stands for all; u [2, N] of a disc."""
+def _drawn(lens: Lens, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """p and u [2, N], each of a disc; with an axis of symmetry p along x alone, which stands for all."""
     r, turn = np.sqrt(rng.random(count)), 2 * np.pi * rng.random(count)
     length = np.sqrt(rng.random(count))
-    return np.stack([r, np.zeros(count)]), length * np.stack([np.cos(turn), np.sin(turn)])
+    about = 2 * np.pi * rng.random(count) if lens.anamorphic else np.zeros(count)
+    return r * np.stack([np.cos(about), np.sin(about)]), length * np.stack([np.cos(turn), np.sin(turn)])
 
 
 def _search(
     tracer: GhostTracer, every: Sequence[Pair], settings: GhostSettings, rng: np.random.Generator
-) -> dict[Pair, tuple[float, float, float]]:
+) -> dict[Pair, tuple[float, Array, Array]]:
     """Of every ghost its light on the film, all directions alike, and chief and scale of u where it enters (mm)."""
     sine, front = settings.sine, tracer.lens.surfaces[0].semi_diameter_mm
-    p, u = _drawn(_SEARCH, rng)
+    p, u = _drawn(tracer.lens, _SEARCH, rng)
     place = 1.3 * front * u
-    cos = np.sqrt(1 - (sine * p[0]) ** 2)
+    cos = np.sqrt(1 - sine**2 * (p**2).sum(0))
     found = tracer.trace(_rays(sine * p, place).astype(np.float64), 0.5 * sum(settings.wavelength_nm))
     on_film = np.hypot(*np.moveaxis(found.film_xy_mm, 1, 0)) < settings.film_radius_mm
     known = {}
     for pair, power, here in zip(every, found.power, on_film, strict=True):
         lit = here & (power > 0)
         light = float((np.where(lit, power, 0) * cos).mean(dtype=np.float64))
-        chief, scale = 0.0, 1.3 * front
+        chief, scale = np.zeros(2), np.full(2, 1.3 * front)
         if lit.sum() >= 8:
-            chief = float((place[0, lit] * p[0, lit]).sum() / (p[0, lit] ** 2).sum())
-            few = 1 + 2 / math.sqrt(float(lit.sum()))
-            scale = few * float(np.hypot(place[0, lit] - chief * p[0, lit], place[1, lit]).max())
+            along, off = p[:, lit], place[:, lit]
+            chief[:] = (off * along).sum(1) / np.maximum((along**2).sum(1), 1e-300)
+            chief[1] = chief[1] if tracer.lens.anamorphic else chief[0]
+            off = off - chief[:, None] * along
+            wide = np.abs(off).max(1) if tracer.lens.anamorphic else np.ones(2)
+            scale = (1 + 2 / math.sqrt(float(lit.sum()))) * float(np.hypot(*(off / wide[:, None])).max()) * wide
         known[pair] = light, chief, _MARGIN * scale
     return known
 
 
 def sample(
-    lens: Lens, pair: Pair, chief: float, scale: float, settings: GhostSettings, count: int, rng: np.random.Generator
+    lens: Lens, pair: Pair, chief: Array, scale: Array, settings: GhostSettings, count: int, rng: np.random.Generator
 ) -> Sample:
     """Random rays of a ghost, by the scales of `GhostPolynomial`; rims stop none."""
-    p, u = _drawn(count, rng)
+    p, u = _drawn(lens, count, rng)
     short, long = (float(inverse_square_um(v)) for v in settings.wavelength_nm)
     w = 2 * rng.random(count) - 1
     nm = 1000 / np.sqrt(0.5 * (short + long) + 0.5 * (short - long) * w)
-    rays = Rays(*torch.from_numpy(_rays(settings.sine * p, chief * p + scale * u)))
+    rays = Rays(*torch.from_numpy(_rays(settings.sine * p, chief[:, None] * p + scale[:, None] * u)))
     open_lens = replace(
         lens, surfaces=tuple(replace(s, diameter_mm=_OPEN * s.diameter_mm) for s in lens.surfaces), aperture=None
     )
@@ -195,30 +210,36 @@ def sample(
 
 
 def _fit(
-    lens: Lens, pair: Pair, chief: float, scale: float, settings: GhostSettings, rng: np.random.Generator
-) -> tuple[GhostPolynomial, dict[str, Any]]:
-    """A ghost of the lowest degree that is good enough, and what was measured on rays held out."""
+    lens: Lens, pair: Pair, chief: Array, scale: Array, settings: GhostSettings, rng: np.random.Generator
+) -> tuple[GhostPolynomial, dict[str, Any]] | None:
+    """A ghost of the lowest degree that is good enough, and what was measured on rays held out; None of so few rays
+    that none can be fitted."""
     steps = [k for k, _ in ghost(len(lens.surfaces), *pair)]
-    data = sample(lens, pair, chief, scale, settings, 4 * settings.rays, rng)
-    ratio = np.sqrt(data.ratio)
-    near = data.whole & (ratio.max(0) < _REACH) & (np.hypot(*data.film) < _FAR * settings.film_radius_mm)
-    rims = _rims(data, steps, lens.stop_index)
-    use = np.flatnonzero(near)[: settings.rays]
-    weight = np.where(ratio[:, use].max(0) <= 1, 1.0, _BEYOND)
+    drawn, near, rims = list[Sample](), list[NDArray[np.int_]](), list[int]()
+    while len(drawn) < _DRAWS and sum(map(len, near)) < settings.rays:
+        more = sample(lens, pair, chief, scale, settings, 4 * settings.rays, rng)
+        met = more.whole & (more.ratio.max(0) < _REACH**2)
+        near.append(np.flatnonzero(met & (np.hypot(*more.film) < _FAR * settings.film_radius_mm)))
+        rims = rims or _rims(more, steps, lens.stop_index)
+        drawn.append(more)
+    data = Sample(*(
+        np.concatenate([getattr(some, f.name)[..., k] for some, k in zip(drawn, near, strict=True)], -1)
+        for f in fields(Sample)
+    ))  # fmt: skip
+    use = np.arange(min(settings.rays, len(data.w)))
+    weight = np.where(data.ratio[:, use].max(0) <= 1, 1.0, _BEYOND)
     weight /= 1 + (np.hypot(*data.film[:, use]) / settings.film_radius_mm) ** 4
     test = sample(lens, pair, chief, scale, settings, 2 * settings.rays, rng)
     fit, row = None, {}
-    for degree in DEGREES:
-        exponents = invariant_exponents(degree)
-        if 4 * len(exponents) > len(use):
+    for degree in _MIRROR_DEGREES if lens.anamorphic else DEGREES:
+        exponents = mirror_exponents(degree) if lens.anamorphic else invariant_exponents(degree)
+        if 4 * len(exponents) > len(use) * (2 if lens.anamorphic else 1):
             break
         fit = solved(exponents, data, use, weight, rims, steps, chief, scale)
         row = _measured(fit, test, settings.film_radius_mm) | {"degree": degree, "rims": len(rims)}
         if row["film_rms_um"] <= settings.target_um:
             break
-    if fit is None:
-        raise InputError("ghost fit", "rays", settings.rays, f"more: {pair.name} has only {len(use)} that serve")
-    return fit, row
+    return None if fit is None else (fit, row)
 
 
 def _rims(data: Sample, steps: list[int], stop: int) -> list[int]:
@@ -242,24 +263,48 @@ def solved(
     weight: Array,
     rims: list[int],
     steps: list[int],
-    chief: float,
-    scale: float,
+    chief: Array,
+    scale: Array,
 ) -> GhostPolynomial:
     """The ghost by least squares from rays number `use` with weights; `rims`: which of the `steps` have crossings."""
     field = LightField(*(torch.from_numpy(v[..., use]) for v in (data.p, data.u, data.w)))
-    features, count = monomials(field.invariants(), exponents), len(exponents)
     vectors = torch.from_numpy(np.concatenate([data.film[None], data.crossings[rims]])[..., use])
-    found = solve(vector_columns(features, field), vectors.flatten(1), torch.from_numpy(np.tile(weight, 2))).numpy()
-    power = solve(features, torch.from_numpy(data.power[None, use]), torch.from_numpy(weight)).numpy()
-    surfaces = tuple(steps[n] for n in rims)
-    return GhostPolynomial(chief, scale, surfaces, exponents, found.reshape(len(found), 2, count), power[0])
+    given, weights = torch.from_numpy(data.power[None, use]), torch.from_numpy(weight)
+    surfaces, count = tuple(steps[n] for n in rims), len(exponents)
+    if exponents.shape[1] == 4:
+        features = monomials(field.invariants(), exponents)
+        ab = solve(vector_columns(features, field), vectors.flatten(1), weights.repeat(2)).numpy()
+        power = solve(features, given, weights).numpy()[0]
+        return GhostPolynomial(chief, scale, surfaces, exponents, ab.reshape(len(ab), 2, count), power)
+    ab, power = np.zeros((len(vectors), 2, count)), np.zeros(count)
+    features = monomials(raw_variables(field), exponents)
+    odd = exponents[:, :2] + exponents[:, 2:4] & 1
+    for axis in (0, 1):
+        own = np.flatnonzero((odd == np.eye(2)[axis]).all(1))
+        ab[:, axis, own] = solve(features[own], vectors[:, axis], weights).numpy()
+    even = np.flatnonzero(~odd.any(1))
+    power[even] = solve(features[even], given, weights).numpy()[0]
+    return GhostPolynomial(chief, scale, surfaces, exponents, ab, power)
+
+
+def mirror_exponents(degree: int) -> Any:
+    """[M, 5] exponents of p_x, p_y, u_x, u_y, w up to a total `degree` in the first four, of lower degrees with w, that
+    are odd in x or in y but not in both: components of vectors, and scalars, where x and y each may be mirrored."""
+    rows = raw_exponents(degree)
+    reach = np.array([degree, degree - 4, degree - 8, degree - 10])
+    low = rows[(rows[:, 4] < 4) & (rows[:, :4].sum(1) <= reach[rows[:, 4].clip(max=3)])]
+    return low[((low[:, :2] + low[:, 2:4]) % 2).sum(1) < 2]
 
 
 def _measured(fit: GhostPolynomial, test: Sample, film_radius: float) -> dict[str, float]:
     """Of light on the film: RMS distance in um, shares that are wrongly there or missing, and the error of all."""
     field = LightField(*(torch.from_numpy(v) for v in (test.p, test.u, test.w)))
-    features = monomials(field.invariants(), fit.exponents).numpy()
-    vectors = np.einsum("vam,mn,acn->vcn", fit.ab, features, np.stack([test.p, test.u]), optimize=True)
+    if fit.exponents.shape[1] == 4:
+        features = monomials(field.invariants(), fit.exponents).numpy()
+        vectors = np.einsum("vam,mn,acn->vcn", fit.ab, features, np.stack([test.p, test.u]), optimize=True)
+    else:
+        features = monomials(raw_variables(field), fit.exponents).numpy()
+        vectors = np.einsum("vcm,mn->vcn", fit.ab, features, optimize=True)
     power, inside = np.maximum(fit.power @ features, 0), (test.u**2).sum(0) <= 1
     passes = inside & ((vectors[1:] ** 2).sum(1) <= 1).all(0) & (np.hypot(*vectors[0]) < film_radius)
     lit = test.whole & (test.ratio <= 1).all(0) & (np.hypot(*test.film) < film_radius)

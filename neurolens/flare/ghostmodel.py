@@ -3,7 +3,9 @@
 Of every ghost the film point and the crossings with the rims that stop light are vectors A p + B u, and the power is a
 scalar, with A, B and the power polynomials in rho = p.p, sigma = p.u, tau = u.u and w: the form of the surrogates of
 images (`surrogates.cores`) with other inputs. p is the light's direction, u the point on the plane of the front vertex
-less its part that follows p. Stop and blades are tests on the crossings with the stop: they need no new fit.
+less its part that follows p. Of a lens with cylinders x and y of vectors and the power are polynomials in p, u and w
+themselves, each of the terms that its two planes of symmetry leave. Stop and blades are tests on the crossings with the
+stop: they need no new fit.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ from neurolens.optics.prescription import Lens
 from neurolens.surrogates.cores import ROUND
 
 Array = NDArray[np.float64]
-_CALL = 6  # numbers of the call: p, what chief is of it (mm), 1 / scale, the stop's radius
+_CALL = 7  # numbers of the call: p, what chief is of it (mm), 1 / scale, the stop's radius
 _FITTED = 1.5  # of u^2: beyond it polynomials mean nothing
 _SLACK = 1.02  # of the largest angle: rays of a near light differ
 
@@ -41,16 +43,16 @@ class GhostPolynomial:
     """One ghost.
 
     Attributes:
-        chief_mm: u = (place - chief_mm p) / scale_mm, for places [2] in mm on the plane z = 0. scale_mm: see there; the
-            ghost's light has |u| below 1.
+        chief_mm: [2] of x and y, u = (place - chief_mm p) / scale_mm for places [2] in mm on the plane z = 0.
+        scale_mm: [2], see there; the ghost's light has |u| below 1.
         surfaces: of each crossing the surface whose rim it is in units of.
-        exponents: [M, 4] of rho, sigma, tau, w.
-        ab: [1 + K, 2, M] coefficients of A and B of the film point (mm) and of the K crossings.
+        exponents: [M, 4] of rho, sigma, tau, w; of a lens with cylinders [M, 5] of p_x, p_y, u_x, u_y, w.
+        ab: [1 + K, 2, M] coefficients of A and B, with cylinders of x and y, of the film point (mm) and K crossings.
         power: [M].
     """
 
-    chief_mm: float
-    scale_mm: float
+    chief_mm: Array
+    scale_mm: Array
     surfaces: tuple[int, ...]
     exponents: Exponents
     ab: Array
@@ -62,16 +64,35 @@ class GhostPolynomial:
         return np.concatenate([self.ab.reshape(-1, len(self.power)), self.power[None]])
 
     @cached_property
-    def places(self) -> tuple[Exponents, Array]:
-        """[L, 2] the exponents of sigma and tau, and [M, L] which of them each term has."""
-        rest, place = np.unique(self.exponents[:, 1:3], axis=0, return_inverse=True)
-        return rest, (place.reshape(-1, 1) == np.arange(len(rest))).astype(np.float64)
+    def places(self) -> tuple[Exponents, Exponents]:
+        """[L, 2] the exponents of sigma and tau (of u_x and u_y), and [M] which of them each term has."""
+        rest, place = np.unique(self.exponents[:, -3:-1], axis=0, return_inverse=True)
+        return rest, place.reshape(-1).astype(np.int64)
 
-    def fixed(self, rho: float, w: Array) -> Array:
+    @cached_property
+    def _grouped(self) -> tuple[Exponents, Exponents, Exponents]:
+        """Terms of one place and one power of w: the order that has them side by side, where each begins, and its
+        number, the power's times L and the place's."""
+        number = self.exponents[:, -1] * len(self.places[0]) + self.places[1]
+        order = np.argsort(number, kind="stable")
+        numbers, first = np.unique(number[order], return_index=True)
+        return order.astype(np.int64), first.astype(np.int64), numbers
+
+    def fixed(self, p: Array, w: Array) -> Array:
         """The tables [W, rows, L] of one direction and wavelengths [W], over the first of `places`."""
-        of_rho, of_w = (np.vander(v, 1 + self.exponents[:, k].max(), True) for v, k in ((np.array([rho]), 0), (w, 3)))
-        known = of_rho[:, self.exponents[:, 0]] * of_w[:, self.exponents[:, 3]]
-        return np.asarray((self.table * known[:, None]) @ self.places[1])
+        order, first, numbers = self._grouped
+        of_p, powers, direction = self.exponents[:, :-3], 1 + int(self.exponents[:, -1].max()), np.ones(len(self.power))
+        for value, power in zip(p if of_p.shape[1] == 2 else [p @ p], of_p.T, strict=True):
+            direction *= (value ** np.arange(1 + power.max()))[power]
+        found = np.zeros((len(self.table), powers * len(self.places[0])))
+        found[:, numbers] = np.add.reduceat((self.table * direction)[:, order], first, axis=1)
+        of_w = w[:, None] ** np.arange(powers)
+        return (of_w @ found.reshape(len(found), powers, -1)).swapaxes(0, 1)
+
+    @cached_property
+    def key(self) -> tuple[tuple[int, ...], ...]:
+        """The exponents of `places`, hashable."""
+        return tuple(map(tuple, self.places[0].tolist()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,13 +181,13 @@ class GhostModel:
         """Rays of one direction by compiled code, whose coefficients are numbers of the call."""
         p, (middle, half) = direction / self.sine, self.w_middle_half
         w = (inverse_square_um(np.asarray(wavelengths_nm, np.float64)) - middle) / half
-        tables = ghost.fixed(float(p @ p), w).astype(np.float32)
-        head = [*p, *(ghost.chief_mm * p), 1 / ghost.scale_mm, self.lens.stop_radius_mm]
+        tables = np.ascontiguousarray(ghost.fixed(p.astype(np.float64), w), np.float32)
+        head = [*p, *(ghost.chief_mm * p), *(1 / ghost.scale_mm), self.lens.stop_radius_mm]
         call = np.array(head, np.float32)
         given = np.ascontiguousarray(places, np.float32)
         out = np.empty((len(w), 4, given.shape[1]), np.float32)
         run, monomials, lights = self._compiled
-        kinds = monomials[_key(ghost.places[0])], lights[self._stops(ghost)]
+        kinds = monomials[ghost.key], lights[self._stops(ghost)]
         run(given.shape[1], len(w), *tables.shape[1:], *kinds, *(a.ctypes.data for a in (given, call, tables, out)))
         return out
 
@@ -181,11 +202,11 @@ class GhostModel:
     @cached_property
     def _compiled(self) -> tuple[Any, dict[Any, int], dict[Any, int]]:
         """The driver, and the number of each set of monomials and of each sort of crossings."""
-        monomials = {key: n for n, key in enumerate(dict.fromkeys(_key(ghost.places[0]) for ghost in self.ghosts))}
+        monomials = {key: n for n, key in enumerate(dict.fromkeys(ghost.key for ghost in self.ghosts))}
         lights = {key: n for n, key in enumerate(dict.fromkeys(map(self._stops, self.ghosts)))}
         text = ""
         for key, n in monomials.items():
-            text += function_text(_monomial_graph(key), f"terms_{n}", f"run_terms_{n}", "place", "term", "call")
+            text += function_text(self._monomial_graph(key), f"terms_{n}", f"run_terms_{n}", "place", "term", "call")
         for stops, n in lights.items():
             text += function_text(self._light_graph(stops), f"lit_{n}", f"run_lit_{n}", "row", "light", "call")
         driver = Template(_DRIVER).substitute(
@@ -203,14 +224,23 @@ class GhostModel:
         """Input `row`, the place (mm) and what the rows of a table give, and the numbers of `_CALL`; output `light`."""
         g, rows = Graph(), 2 * len(stops) + 3
         row, call = g.input("row", 2 + rows), g.input("call", _CALL, per_call=True)
-        u = (row[0:2] - call[2:4]) * call[4]
-        g.outputs["light"] = self._light(stops, call[0:2], u, row[2:], call[5])
+        u = (row[0:2] - call[2:4]) * call[4:6]
+        g.outputs["light"] = self._light(stops, call[0:2], u, row[2:], call[6])
+        return g
+
+    def _monomial_graph(self, exponents: Sequence[tuple[int, ...]]) -> Graph:
+        """Input `place` (mm) and the numbers of `_CALL`; output `term`, monomials of sigma and tau (of u_x and u_y)."""
+        g, count = Graph(), len(exponents)
+        place, call = g.input("place", 2), g.input("call", _CALL, per_call=True)
+        u = (place - call[2:4]) * call[4:6]
+        both = u if self.lens.anamorphic else g.concat(g.dot(call[0:2], u), g.square(u))
+        g.outputs["term"] = g.polynomial(np.array(exponents, np.int64), np.eye(count), both)
         return g
 
     def _light(self, stops: Sequence[bool], p: Value, u: Value, rows: Value, stop_radius: Value) -> Value:
         """Rows `LIGHT` of the rows of a table; `stops`: which of the crossings are with the stop."""
-        g = rows.graph
-        film, *crossings = (rows[2 * k] * p + rows[2 * k + 1] * u for k in range(1 + len(stops)))
+        g, pairs = rows.graph, [rows[k : k + 2] for k in range(0, 2 + 2 * len(stops), 2)]
+        film, *crossings = pairs if self.lens.anamorphic else (a[0] * p + a[1] * u for a in pairs)
         worst = g.square(u)
         for crossing, at_stop in zip(crossings, stops, strict=True):
             if not at_stop:
@@ -232,26 +262,14 @@ def ghost_graph(model: GhostModel, ghost: GhostPolynomial, g: Graph | None = Non
     rays, radius = g.input("entering", 5), g.input("stop_radius_mm", per_call=True)
     p = rays[0:2] * (1 / model.sine)
     u = (rays[2:4] - p * ghost.chief_mm) * (1 / ghost.scale_mm)
+    planes = g.concat(p, u)
     middle, half = model.w_middle_half
     v = (1000 / math.sqrt(half)) / rays[4]
-    invariants = g.concat(g.quadratic(g.concat(p, u), ROUND), g.quadratic(v, [((0, 0),)], [-middle / half]))
+    w = g.quadratic(v, [((0, 0),)], [-middle / half])
+    variables = g.concat(planes if model.lens.anamorphic else g.quadratic(planes, ROUND), w)
     stops = [k == model.lens.stop_index for k in ghost.surfaces]
-    rows = g.polynomial(ghost.exponents, ghost.table, invariants)
+    rows = g.polynomial(ghost.exponents, ghost.table, variables)
     g.outputs[output] = model._light(stops, p, u, rows, radius)
-    return g
-
-
-def _key(exponents: Exponents) -> tuple[tuple[int, ...], ...]:
-    return tuple(map(tuple, exponents.tolist()))
-
-
-def _monomial_graph(exponents: Sequence[tuple[int, ...]]) -> Graph:
-    """Input `place` (mm) and the numbers of `_CALL`; output `term`, monomials of sigma and tau."""
-    g, count = Graph(), len(exponents)
-    place, call = g.input("place", 2), g.input("call", _CALL, per_call=True)
-    u = (place - call[2:4]) * call[4]
-    both = g.concat(g.dot(call[0:2], u), g.square(u))
-    g.outputs["term"] = g.polynomial(np.array(exponents, np.int64), np.eye(count), both)
     return g
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -16,10 +17,10 @@ from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress, Report
 from neurolens.flare.diffraction import starburst_picture
 from neurolens.flare.ghostmodel import GhostModel
-from neurolens.flare.ghosts import GhostTracer, Way, coated
+from neurolens.flare.ghosts import GhostTracer, Way, coated, ghost_pairs
 from neurolens.flare.lights import Light
 from neurolens.flare.photons import PhotonTracer
-from neurolens.flare.picture import Ghost, Raster, ghost_picture, ghost_table, photon_picture
+from neurolens.flare.picture import PARTS, Ghost, Raster, ghost_picture, ghost_table, photon_picture
 from neurolens.flare.scatter import Scatter
 from neurolens.flare.sources import Name, SceneLights, chosen, keep_named
 from neurolens.flare.stack import Floats
@@ -51,6 +52,7 @@ class FlareSettings:
         gains: factors of red, green and blue by the name of a layer, of a ghost (g07-03), or of a surface (s07: of all
             ghosts that it reflects); several for one ghost are multiplied.
         seed: of the places and chances of photons, the same for all frames. threads: of the work.
+        keep: picture beside which photons of long work are kept until they are whole (see `kept_beside`).
     """
 
     wavelength_nm: tuple[float, float] = (400.0, 700.0)
@@ -68,6 +70,7 @@ class FlareSettings:
     gains: tuple[tuple[str, tuple[float, float, float]], ...] = ()
     seed: int = 0
     threads: int = 2
+    keep: Path | None = None
 
     def __post_init__(self) -> None:
         for name in self.without:
@@ -198,7 +201,7 @@ def _ghosts(lens: Lens, lights: Sequence[Light], raster: Raster, settings: Flare
         part = "ghosts" if settings.glare else "flare"
         return {"ghosts": _photons(lens, lights, raster, settings, done, part, settings.photons)}
     ghosts = settings.ghosts or GhostTracer(lens)
-    factors = _factors(ghosts.pairs, settings)
+    factors = _factors(ghosts.pairs, settings, ghost_pairs(lens))
     # Ghosts of one layer and of equal factors share a picture.
     keys = [(p.name if p.name in settings.single else REST, factors[p]) for p in ghosts.pairs]
     kinds = list(dict.fromkeys([*keys, *((name, _ONE) for name in (*settings.single, REST))]))
@@ -237,16 +240,28 @@ def _photons(
         PhotonTracer(lens, settings.scatter), lights, raster, part=part, wavelength_nm=settings.wavelength_nm,
         wavelengths=settings.wavelengths, photons=count, most_reflections=settings.most_reflections,
         kernel_px=settings.kernel_px, seed=settings.seed, threads=settings.threads, done=done,
+        keep=None if settings.keep is None else _kept_file(settings.keep, part),
     )  # fmt: skip
 
 
-def _factors(pairs: Sequence[Way], settings: FlareSettings) -> dict[Way, tuple[float, float, float]]:
-    """Of every ghost."""
-    surfaces = {k for pair in pairs for k in pair.reflections}
-    known = {*MAKERS, *(pair.name for pair in pairs), *(f"s{k:02d}" for k in surfaces)}
+def kept_beside(picture: Path) -> list[Path]:
+    """Files of photons that are there beside a picture, of work that was interrupted."""
+    return [path for part in PARTS if (path := _kept_file(picture, part)).is_file()]
+
+
+def _kept_file(picture: Path, part: str) -> Path:
+    return picture.with_name(f"{picture.name}.{part}.part")
+
+
+def _factors(
+    pairs: Sequence[Way], settings: FlareSettings, every: Sequence[Way]
+) -> dict[Way, tuple[float, float, float]]:
+    """Of each of the pairs; names may be those of `every` ghost of the lens, of which a fit leaves some out."""
+    surfaces = {k for pair in every for k in pair.reflections}
+    known = {*MAKERS, *(pair.name for pair in (*pairs, *every)), *(f"s{k:02d}" for k in surfaces)}
     for name, _ in settings.gains:
         if name not in known:
-            named = pairs[0].name if pairs else "g01-00"
+            named = every[0].name if every else "g01-00"
             expected = (
                 f"a layer ({', '.join(MAKERS)}), a ghost ({named}) or a surface (s{min(surfaces, default=0):02d})"
             )

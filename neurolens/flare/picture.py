@@ -6,10 +6,12 @@ Values are those of a render: film irradiance over the irradiance that a white c
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -19,6 +21,7 @@ from numpy.typing import NDArray
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.layout import Layout, Line, layout_profile
 from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_path, seal, sealed_bytes
 from neurolens.base.status import PASSED
 from neurolens.flare.area import draw_edges, edges_of
 from neurolens.flare.ghostmodel import GhostModel
@@ -31,6 +34,7 @@ from neurolens.optics.glass import inverse_square_um
 from neurolens.optics.prescription import Lens
 from neurolens.optics.sequence import follow, turning
 from neurolens.optics.trace import Rays, trace
+from neurolens.render.checkpoint import digest
 from neurolens.render.spectrum import SpectralRange
 
 RANKED = 4096  # rays that decide which ghosts are brightest
@@ -39,6 +43,7 @@ _PROBES = 512  # rays
 _AT_ONCE = 1 << 16  # rays of a call
 _ENOUGH = 200  # photons of a kernel: a noise of 8%
 _WAIT_S = 0.5  # between two reports
+_KEEP_S = 30.0  # between two states of long work
 _AXIS = 1 << 15  # rays of the exposure
 _GOLDEN = 0.6180339887498949
 _STRIP = 1 << 22  # bytes of a canvas
@@ -295,6 +300,7 @@ def photon_picture(
     kernel_px: float = 3.0,
     seed: int = 0,
     threads: int = 2,
+    keep: Path | None = None,
     done: Callable[[float], None] = lambda share: None,
 ) -> Floats:
     """The photons of lights on the film, [H, W, 3] linear sRGB, by density estimation.
@@ -303,13 +309,18 @@ def photon_picture(
         part: of `PARTS`: those that were reflected or scattered ("flare"), at most twice reflected alone ("ghosts"),
             more often or scattered ("glare"), or neither ("image").
         photons: of each light and wavelength. kernel_px: radius of the narrowest kernel: see `_smoothed`.
+        keep: file that has what is done of long work, until that is whole; the same call goes on from it.
     """
     lens, spectral = tracer.lens, SpectralRange(*wavelength_nm, bins=wavelengths)
     exposure = axis_irradiance(lens, 0.5 * (spectral.low_nm + spectral.high_nm))
     edges = (np.arange(raster.height + 1) - raster.height / 2, np.arange(raster.width + 1) - raster.width / 2)
     firsts = range(0, photons, _AT_ONCE)
     tasks = [(number, light, k) for number, light in enumerate(lights) for k in range(wavelengths)]
-    work = _Work(len(tasks) * len(firsts), done)
+    picture = np.zeros((raster.height, raster.width, 3), np.float32)
+    sums = np.zeros((2, raster.height, raster.width), np.float32)
+    same = lens, tracer.scatter, list(lights), raster, part, spectral.centres_nm, photons, most_reflections, seed
+    kept = _Kept(keep, digest(same), (picture, sums))
+    work = _Work((len(tasks) - kept.done) * len(firsts), done)
 
     def one(task: tuple[int, Light, int]) -> tuple[Floats, NDArray[np.float64]]:
         """Sums of weights and of their squares, [2, H, W], and the colour [3] of a weight of 1."""
@@ -329,11 +340,10 @@ def photon_picture(
         colour = spectral.response[:, k] * spectral.spectrum(light.rgb)[k] / wavelengths
         return film, colour * (area * raster.per_mm**2 / photons / exposure)
 
-    picture = np.zeros((raster.height, raster.width, 3), np.float32)
-    sums = np.zeros((2, raster.height, raster.width), np.float32)
-    for _, (film, colour) in work.results(one, tasks, threads):
+    for _, (film, colour) in work.results(one, tasks[kept.done :], threads):
         picture += film[0, ..., None] * colour.astype(np.float32)
         sums += film * (np.abs(colour).max() ** np.array([1, 2], np.float32))[:, None, None]
+        kept.add()
     return _smoothed(picture, sums, kernel_px) if kernel_px > 0 else picture
 
 
@@ -350,6 +360,32 @@ def _arrivals(
             which &= (found.scattered > 0) == scatters
         # A film that sends light back is exposed by what it keeps.
         yield found.film_xy_mm[:, which], found.weight[which] / (1 - tracer.scatter.sensor)
+
+
+class _Kept:
+    """Sums of work, and how many of its tasks they hold, in a file that is as old as half a minute at most."""
+
+    def __init__(self, path: Path | None, same: str, sums: Sequence[Floats]) -> None:
+        self.done, self._path, self._head, self._sums, self._at = 0, path, same.encode(), sums, time.monotonic()
+        size = len(self._head) + 8 + sum(a.nbytes for a in sums)
+        if path is None or not path.is_file() or path.stat().st_size > 2 * size:
+            return
+        data, at = sealed_bytes(path), len(self._head) + 8
+        if data is not None and len(data) == size and data.startswith(self._head):
+            self.done = int.from_bytes(data[at - 8 : at], "little")
+            for a in sums:
+                a[:] = np.frombuffer(data, a.dtype, a.size, at).reshape(a.shape)
+                at += a.nbytes
+
+    def add(self) -> None:
+        """One more task is done."""
+        self.done += 1
+        if self._path is not None and time.monotonic() - self._at > _KEEP_S:
+            with atomic_path(self._path) as temporary:
+                parts = self._head, self.done.to_bytes(8, "little"), *(a.tobytes() for a in self._sums)
+                temporary.write_bytes(b"".join(parts))
+                seal(temporary)
+            self._at = time.monotonic()
 
 
 class _Work:

@@ -83,7 +83,7 @@ def derive_rims(lens: Lens, rule: RimRule | None = None) -> tuple[Lens, list[Rim
         axis, field = list(map(max, axis, on_axis)), list(map(max, field, off_axis))
     needed = [2 * max(pair) for pair in zip(axis, field, strict=True)]
     wide = [
-        min(math.ceil(d * (1 + rule.clear_edge) / _STEP_MM) * _STEP_MM, 2 * end_mm(s) * (1 - 1e-9))
+        min(math.ceil(d * (1 + rule.clear_edge) / _STEP_MM) * _STEP_MM, _end_mm(s))
         for d, s in zip(needed, lens.surfaces, strict=True)
     ]
     wide[lens.stop_index] = 2 * states[0].stop_radius_mm
@@ -106,10 +106,10 @@ def narrowed_rims(lens: Lens) -> Lens:
     Rims of surfaces whose vertices lie in the wrong order stay: no width helps, and the check of clearance says so.
     """
     states = [lens, *(lens.with_gaps(dict(c.thickness_mm)) for c in lens.configurations)]
-    ends = [s.diameter_mm if s.stop else min(s.diameter_mm, 2 * end_mm(s) * (1 - 1e-9)) for s in lens.surfaces]
+    ends = [s.diameter_mm if s.stop else min(s.diameter_mm, _end_mm(s)) for s in lens.surfaces]
     fitted = _clear_of_neighbours(states, ends)
     rows = (
-        s if d <= 0 or d >= s.diameter_mm - _STEP_MM else replace(s, diameter_mm=d)
+        s if s.stop or d <= 0 or s.diameter_mm <= min(d + _STEP_MM, _end_mm(s)) else replace(s, diameter_mm=d)
         for s, d in zip(lens.surfaces, fitted, strict=True)
     )
     return replace(lens, surfaces=tuple(rows))
@@ -212,6 +212,11 @@ def _beams(lens: Lens, rule: RimRule, field_deg: float) -> tuple[list[float], li
     return at[:, 0].amax(1).tolist(), at[:, 1:].amax((1, 2)).tolist()
 
 
+def _end_mm(surface: Surface) -> float:
+    """The widest diameter, just inside where the surface's conic ends."""
+    return 2 * end_mm(surface) * (1 - 1e-9)
+
+
 def _clear_of_neighbours(states: Sequence[Lens], diameters: Sequence[float]) -> list[float]:
     """Diameters shrunk so that in no state two neighbours overlap inside the smaller of their rims; never the stop."""
     found = list(diameters)
@@ -225,7 +230,7 @@ def _clear_of_neighbours(states: Sequence[Lens], diameters: Sequence[float]) -> 
                     trimmed = (after if k == state.stop_index else k,)
                 for which in trimmed:
                     found[which] = min(found[which], math.floor(2 * room / _STEP_MM) * _STEP_MM)
-    return [round(d, 4) for d in found]
+    return [min(round(d, 4), _end_mm(s)) for d, s in zip(found, states[0].surfaces, strict=True)]
 
 
 def _which_to_trim(before: Surface, after: Surface, k: int, k_after: int, h: float) -> tuple[int, ...]:

@@ -1,7 +1,7 @@
-"""Triangle meshes: a bounding-volume tree traversed by whole batches of rays.
+"""Triangle meshes, and many spheres or rectangles: a bounding-volume tree traversed by whole batches of rays.
 
-Nodes have 16 children and leaves 8 triangles: few levels, and at each level one dense test of every (ray, node) pair
-against 16 boxes or 8 triangles, which suits numpy. Triangles carry the three planes of Havel and Herout
+Nodes have 16 children and leaves 8 shapes: few levels, and at each level one dense test of every (ray, node) pair
+against 16 boxes or 8 shapes, which suits numpy. Triangles carry the three planes of Havel and Herout
 2010, "Yet faster ray-triangle intersection".
 
 Where the Python binding of Embree is installed (`pip install neurolens[embree]`), Embree takes the place of the tree.
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
-from neurolens.render.primitives import NEAREST, FloatArray64, IntArray, Primitive, Rays, slabs
+from neurolens.render.primitives import NEAREST, FloatArray64, IntArray, Primitive, Rays, Spheres, slabs
 
 _BRANCHES, _LEAF = 16, 8
 _PAIRS_AT_ONCE = 4096  # keeps the [pairs, 8] temporaries inside the L2 cache
@@ -70,24 +70,20 @@ def _tree(centres: FloatArray64, low: FloatArray64, high: FloatArray64) -> tuple
     return boxes, children, leaves
 
 
-class Mesh:
-    """Triangles [T, 3] of vertices [V, 3] in m with a tree over them; triangle k is surface `first` + k."""
+class Tree:
+    """Shapes within boxes, from `low` to `high` [T, 3] m, with a tree over them; shape k is surface `first` + k."""
 
-    def __init__(self, first: int, vertices: FloatArray64, faces: NDArray[np.int64]) -> None:
+    def __init__(self, first: int, centres: FloatArray64, low: FloatArray64, high: FloatArray64) -> None:
         self.first = first
-        corners = vertices[faces]  # [T, 3 corners, 3]
-        low, high = corners.min(axis=1), corners.max(axis=1)
-        boxes, children, leaves = _tree(corners.mean(axis=1), low, high)
+        boxes, children, leaves = _tree(centres, low, high)
         self._low, self._high = low.min(axis=0).astype(np.float32), high.max(axis=0).astype(np.float32)
         bounds = np.array(boxes)  # [nodes, 16, 6]
-        # Slightly wider, so that rounding to float32 never cuts a triangle off.
-        grow = 1e-6 * max(1.0, float(np.abs(vertices).max()))
+        # Slightly wider, so that rounding to float32 never cuts a shape off.
+        grow = 1e-6 * max(1.0, float(np.abs(low).max()), float(np.abs(high).max()))
         self._node_low = np.ascontiguousarray((bounds[..., :3] - grow).transpose(2, 0, 1), np.float32)
         self._node_high = np.ascontiguousarray((bounds[..., 3:] + grow).transpose(2, 0, 1), np.float32)
         self._children = np.array(children)
         self._leaf_rows = np.array(leaves, np.int32)  # [L, 8]
-        planes = triangle_planes(corners).astype(np.float32)[self._leaf_rows]
-        self._leaf_planes = np.ascontiguousarray(planes.transpose(2, 3, 0, 1))  # [3, 4, leaves, 8]
 
     def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
         entry, exit_ = slabs(rays, self._low, self._high)
@@ -127,6 +123,38 @@ class Mesh:
     def _meet_leaves(
         self, rays: Rays, best: FloatArray, found: IntArray, ray: NDArray[np.intp], leaf: IntArray
     ) -> None:
+        """Test pairs of rays and leaves, and keep the nearest shape of each ray."""
+        raise NotImplementedError
+
+
+class SphereTree(Tree):
+    """As `Spheres`, for many of them: their exact test of the pairs that a tree leaves over."""
+
+    def __init__(self, first: int, centres: FloatArray64, radii: FloatArray64) -> None:
+        super().__init__(first, centres, centres - radii[:, None], centres + radii[:, None])
+        self._spheres = Spheres(first, centres, radii)
+
+    def _meet_leaves(
+        self, rays: Rays, best: FloatArray, found: IntArray, ray: NDArray[np.intp], leaf: IntArray
+    ) -> None:
+        number = self._leaf_rows[leaf].astype(np.intp).ravel()
+        self._spheres.meet(rays, best, found, number, np.repeat(ray, _LEAF))
+
+
+class Mesh(Tree):
+    """Triangles of corners [T, 3, 3] in m, or rectangles, whose corner 0 lies between the other two."""
+
+    def __init__(self, first: int, corners: FloatArray64, rectangles: bool = False) -> None:
+        far = corners[:, 1:2] + corners[:, 2:] - corners[:, :1]
+        outline = np.concatenate([corners, far], axis=1) if rectangles else corners
+        super().__init__(first, outline.mean(axis=1), outline.min(axis=1), outline.max(axis=1))
+        self._rectangles = rectangles
+        planes = triangle_planes(corners).astype(np.float32)[self._leaf_rows]
+        self._leaf_planes = np.ascontiguousarray(planes.transpose(2, 3, 0, 1))  # [3, 4, leaves, 8]
+
+    def _meet_leaves(
+        self, rays: Rays, best: FloatArray, found: IntArray, ray: NDArray[np.intp], leaf: IntArray
+    ) -> None:
         """Test pairs of rays and leaves, and keep the nearest triangle of each ray."""
         origin = [rays.origin[k].take(ray)[:, None] for k in range(3)]
         direction = [rays.direction[k].take(ray)[:, None] for k in range(3)]
@@ -147,7 +175,8 @@ class Mesh:
         u, v = plane(1, point, True), plane(2, point, True)
         # A sliver of overlap closes the seams that rounding opens between neighbours; NaN fails every comparison.
         edge = np.float32(-5e-5)
-        ok = (distance > NEAREST) & (u >= edge) & (v >= edge) & (u + v <= 1 - edge)
+        most = np.maximum(u, v) if self._rectangles else u + v
+        ok = (distance > NEAREST) & (u >= edge) & (v >= edge) & (most <= 1 - edge)
         distance[~ok] = np.inf
         column = np.argmin(distance, axis=1)
         nearest = distance[np.arange(len(ray)), column]
@@ -171,11 +200,11 @@ def triangle_planes(corners: FloatArray64) -> FloatArray64:
 
 
 def make_mesh(first: int, vertices: FloatArray64, faces: NDArray[np.int64]) -> Primitive:
-    """Triangles to hit, through Embree if it is installed; arguments as for `Mesh`."""
+    """Triangles [T, 3] of vertices [V, 3] in m to hit, through Embree if it is installed."""
     try:
         return EmbreeMesh(first, vertices, faces)
     except ImportError:
-        return Mesh(first, vertices, faces)
+        return Mesh(first, vertices[faces])
 
 
 def tracer() -> str:
@@ -193,7 +222,7 @@ def _library() -> tuple[Any, Any]:
 
 
 class EmbreeMesh:
-    """Triangles in an Embree scene, arguments as for `Mesh`; ImportError where embreex is not installed."""
+    """Triangles in an Embree scene, arguments as for `make_mesh`; ImportError where embreex is not installed."""
 
     def __init__(self, first: int, vertices: FloatArray64, faces: NDArray[np.int64]) -> None:
         mesh_construction, rtcore_scene = _library()

@@ -251,9 +251,9 @@ class Spheres:
             if near.size:
                 number, ray = np.divmod(near, loose.shape[1])
                 ray += start
-                self._meet(rays, best, found, number, ray)
+                self.meet(rays, best, found, number, ray)
 
-    def _meet(
+    def meet(
         self, rays: Rays, best: FloatArray, found: IntArray, number: NDArray[np.intp], ray: NDArray[np.intp]
     ) -> None:
         """Test pairs of spheres and rays.

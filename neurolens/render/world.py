@@ -17,7 +17,7 @@ from neurolens.render import textures
 from neurolens.render.environment import SunLight, make_surroundings
 from neurolens.render.lights import FlatLights, Lights, LightSamples, PointLights, SphereLights
 from neurolens.render.materials import CoatTable
-from neurolens.render.mesh import make_mesh, triangle_planes
+from neurolens.render.mesh import Mesh, SphereTree, make_mesh, triangle_planes
 from neurolens.render.primitives import AxisQuad, Box, Disc, IntArray, Plane, Primitive, Quad, Rays, Spheres
 from neurolens.render.scene import Scene
 from neurolens.render.scenetables import BLACK, Emitter, Material, Vector
@@ -25,6 +25,7 @@ from neurolens.render.spectrum import Index, Palette, SpectralRange
 
 DIFFUSE, GLOSSY, MIRROR, GLASS, NOTHING = range(5)
 _KINDS = {"diffuse": DIFFUSE, "glossy": GLOSSY, "mirror": MIRROR, "glass": GLASS}
+_MANY_QUADS, _MANY_SPHERES = 128, 1024  # beyond, a tree is faster than testing one after the other
 
 
 @dataclass(frozen=True)
@@ -77,13 +78,19 @@ class Assembly:
 
     def _add_flat(self) -> None:
         settings = self._scene.settings
+        many = len(settings.quads) > _MANY_QUADS
+        if many:
+            corners = np.array([(q.corner_m, q.edge_u_m, q.edge_v_m) for q in settings.quads], np.float64)
+            corners[:, 1:] += corners[:, :1]
+            self.primitives.append(Mesh(self._count, corners, rectangles=True))
         for quad in settings.quads:
             corner, u, v = (np.array(x, np.float64) for x in (quad.corner_m, quad.edge_u_m, quad.edge_v_m))
             normal = np.cross(u, v) / np.linalg.norm(np.cross(u, v))
-            aligned = np.count_nonzero(u) == 1 and np.count_nonzero(v) == 1
-            axis, first = int(np.argmax(np.abs(normal))), self._count
-            shape = AxisQuad(first, corner, corner + u + v, axis) if aligned else Quad(first, corner, u, v)
-            self.primitives.append(shape)
+            if not many:
+                aligned = np.count_nonzero(u) == 1 and np.count_nonzero(v) == 1
+                axis, first = int(np.argmax(np.abs(normal))), self._count
+                shape = AxisQuad(first, corner, corner + u + v, axis) if aligned else Quad(first, corner, u, v)
+                self.primitives.append(shape)
             self._add(normal[None], quad.material, textures.quad_frame(corner, u, v)[None], quad)
         for disc in settings.discs:
             centre, normal = np.array(disc.centre_m, np.float64), _unit(disc.normal)
@@ -111,7 +118,8 @@ class Assembly:
     def _add_spheres(self) -> None:
         if spheres := self._scene.settings.spheres:
             centres, radii = np.array([s.centre_m for s in spheres]), np.array([s.radius_m for s in spheres])
-            self.primitives.append(Spheres(self._count, centres, radii))
+            make = SphereTree if len(spheres) > _MANY_SPHERES else Spheres
+            self.primitives.append(make(self._count, centres, radii))
         for sphere in spheres:
             self._add(np.zeros((1, 3)), sphere.material, None, sphere)
 

@@ -142,6 +142,8 @@ def test_a_survey_leaves_nothing_out_and_goes_on(tmp_path: Path) -> None:
     assert [row["data-kinds"] for row in found.rows] == ["ok unfitted", "refused"]
     assert found.open == []
     assert found.links == []  # self-contained
+    assert page.count("<svg") == 1  # the section is in the record's file and in the page, not in memory
+    assert "layout" not in records[0]
     assert "triplet &lt;b&gt;" in page
     with (out / "survey.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))

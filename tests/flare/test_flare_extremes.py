@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from neurolens.cli import main
+from neurolens.flare import picture
 from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.lights import Light
 from neurolens.flare.photons import PhotonTracer
-from neurolens.flare.picture import Raster, ghost_picture
+from neurolens.flare.picture import Raster, ghost_picture, photon_picture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.render.pictures import read_exr, write_exr
@@ -52,6 +53,10 @@ def test_no_light_is_a_black_picture_and_said(tmp_path: Path, capsys: pytest.Cap
         assert not read_exr(out)[0].any()
 
 
+def cooke() -> Lens:
+    return read_lens(Path(__file__).parents[2] / "lenses" / "cooke_triplet_50.toml").at(focus_m=math.inf)
+
+
 def interrupted_after(seconds: float, words: list[str]) -> int:
     timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT))
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background of a shell ignore it
@@ -69,6 +74,38 @@ def test_a_thousand_million_photons_end_when_asked(tmp_path: Path, capsys: pytes
     assert interrupted_after(1.5, words) == 130
     assert "nothing is written" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_photons_go_on_where_they_were_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same picture to the bit, without the wavelengths that were done; of a damaged file or another seed nothing is
+    taken."""
+    tracer, lights = PhotonTracer(cooke()), [Light(5.0, 3.0)]
+    raster, keep, started = Raster((36.0, 24.0), 36, 24), tmp_path / "photons.part", list[float]()
+    monkeypatch.setattr(picture, "_KEEP_S", -1.0)
+    trace = PhotonTracer.trace
+    monkeypatch.setattr(
+        PhotonTracer, "trace", lambda self, r, nm, **k: (started.append(nm), trace(self, r, nm, **k))[1]
+    )
+
+    def drawn(seed: int = 0, keep: Path | None = None, end: float = 2.0) -> np.ndarray:
+        def done(share: float) -> None:
+            if share >= end:
+                raise KeyboardInterrupt
+
+        more = {"wavelengths": 6, "photons": 2000, "seed": seed, "threads": 1, "keep": keep, "done": done}
+        started.clear()
+        return photon_picture(tracer, lights, raster, **more)
+
+    wanted, other = drawn(), drawn(seed=1)
+    with pytest.raises(KeyboardInterrupt):
+        drawn(keep=keep, end=0.6)
+    saved = keep.read_bytes()
+    assert len(started) == 4 and np.array_equal(drawn(keep=keep), wanted) and len(started) == 2
+    keep.write_bytes(saved)
+    assert np.array_equal(drawn(seed=1, keep=keep), other) and len(started) == 6
+    for bad in (saved[:-1], saved[:100] + b"x" + saved[101:], b"", saved * 3):
+        keep.write_bytes(bad)
+        assert np.array_equal(drawn(keep=keep), wanted) and len(started) == 6
 
 
 def test_frames_end_when_asked_and_are_whole(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,7 +14,7 @@ from neurolens.optics.aiming import aim_at_stop, without_rims
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order, stop_radius_mm
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.rims import RimRule, derive_rims, half_field_deg
+from neurolens.optics.rims import RimRule, derive_rims, half_field_deg, narrowed_rims
 from neurolens.optics.sag import check_clearance
 from neurolens.optics.trace import trace
 
@@ -118,6 +118,16 @@ def test_neighbours_that_would_touch_are_trimmed() -> None:
     check_clearance(derived.surfaces, "derived")
     assert [r.surface for r in rims if r.trimmed] == [1]
     assert derived.surfaces[1].diameter_mm < derived.surfaces[2].diameter_mm
+
+
+@pytest.mark.parametrize("radius_mm", [34.68604705, 1.00000004, 7.77777777])
+def test_a_rim_a_little_beyond_the_half_sphere_is_narrowed_to_it(radius_mm: float) -> None:
+    """Also where its last digit would round up beyond the end again."""
+    lens = tabled("laikin_double_gauss_50")
+    first = replace(lens.surfaces[0], radius_mm=radius_mm, diameter_mm=2.00001 * radius_mm, thickness_mm=2 * radius_mm)
+    found = narrowed_rims(replace(lens, surfaces=(first, *lens.surfaces[1:]))).surfaces[0]
+    assert found.diameter_mm == pytest.approx(2 * radius_mm, rel=1e-6)
+    assert found.semi_diameter_mm < radius_mm
 
 
 def test_field_of_a_lens_that_states_only_its_image_circle() -> None:

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from render_helpers import diffuse, world
 
-from neurolens.render.mesh import EmbreeMesh, Mesh, make_mesh
-from neurolens.render.primitives import Rays
+from neurolens.render.mesh import EmbreeMesh, Mesh, SphereTree, make_mesh
+from neurolens.render.primitives import Quad, Rays, Spheres
+from neurolens.render.world import World
 
 RANDOM = np.random.default_rng(11)
 
@@ -55,7 +56,7 @@ def test_mesh_of_any_size_matches_every_triangle_in_turn(count: int) -> None:
     centre = RANDOM.normal(size=(count, 1, 3))
     corners = centre + RANDOM.normal(size=(count, 3, 3)) * (2.0 / count**0.4)
     batch = rays(1500)
-    mesh = Mesh(5, corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3))
+    mesh = Mesh(5, corners)
     best, found = hits(mesh, batch)
     expected = meet_triangles(corners, batch)
     agree(best, expected)
@@ -76,7 +77,7 @@ def test_closed_mesh_has_no_seams() -> None:
     i, j = np.meshgrid(np.arange(columns), np.arange(rows - 1), indexing="ij")
     a, b, c, d = i * rows + j, i * rows + j + 1, (i + 1) % columns * rows + j + 1, (i + 1) % columns * rows + j
     faces = np.concatenate([np.stack(x, axis=-1).reshape(-1, 3) for x in ((a, b, c), (a, c, d))])
-    mesh = Mesh(0, shell.reshape(-1, 3) + [2.0, 1.0, -3.0], faces)
+    mesh = Mesh(0, (shell.reshape(-1, 3) + [2.0, 1.0, -3.0])[faces])
     direction = RANDOM.normal(size=(3, 60000))
     direction /= np.linalg.norm(direction, axis=0)
     direction = direction[:, np.abs(direction[1]) < 0.99]  # but for the holes at the poles
@@ -175,6 +176,46 @@ def test_smooth_normals_follow_the_curve() -> None:
     assert np.sum(smooth * radial, axis=0).min() > 0.9995 > np.sum(flat * radial, axis=0).min()
 
 
+def test_trees_of_many_spheres_and_rectangles_hit_what_each_in_turn_does() -> None:
+    batch, count = rays(4000), 300
+    limit = np.where(RANDOM.random(4000) < 0.5, np.inf, RANDOM.uniform(0, 4, 4000)).astype(np.float32)
+    centres, radii = RANDOM.normal(size=(count, 3)), RANDOM.uniform(0.01, 0.4, count)
+    (a, tree), (b, each) = (hits(made(7, centres, radii), batch, limit) for made in (SphereTree, Spheres))
+    assert np.array_equal(a, b) and np.array_equal(tree, each) and 0.2 < np.mean(tree >= 0) < 0.98
+    edges = RANDOM.normal(size=(count, 2, 3)) * 0.1
+    edges[:, 1] -= (
+        edges[:, 0] * np.sum(edges[:, 0] * edges[:, 1], axis=1, keepdims=True) / np.sum(edges[:, :1] ** 2, axis=2)
+    )
+    corners = np.stack([centres, centres + edges[:, 0], centres + edges[:, 1]], axis=1)
+    a, tree = hits(Mesh(7, corners, rectangles=True), batch, limit)
+    b, each = limit.copy(), np.full(4000, -1, np.int32)
+    for k in range(count):
+        Quad(7 + k, centres[k], edges[k, 0], edges[k, 1]).nearer(batch, b, each)
+    same = (tree == each) & np.isclose(a, b, rtol=1e-5, atol=1e-5)
+    same |= (tree == each) & np.isinf(a) & np.isinf(b)
+    assert np.mean(~same) < 2e-3 and np.mean(tree >= 0) > 0.1
+
+
+def test_a_scene_of_many_lights_is_hit_as_one_of_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    def made() -> World:
+        at = np.random.default_rng(2).uniform(-1, 1, (40, 3)).tolist()
+        small = {"edge_u_m": [0.2, 0.0, 0.0], "edge_v_m": [0.0, 0.2, 0.0], "emission": [1.0, 1.0, 1.0]}
+        return world(
+            spheres=[{"centre_m": p, "radius_m": 0.1, "emission": [1.0, 1.0, 1.0]} for p in at[:20]],
+            quads=[{"corner_m": p, **small} for p in at[20:]],
+        )
+
+    batch, few = rays(4000), made()
+    monkeypatch.setattr("neurolens.render.world._MANY_QUADS", 10)
+    monkeypatch.setattr("neurolens.render.world._MANY_SPHERES", 10)
+    many = made()
+    assert [type(p).__name__ for p in many._primitives] == ["Mesh", "SphereTree"]
+    (a, there), (b, here) = many.nearest(batch), few.nearest(batch)
+    assert np.mean(there != here) < 1e-3 and np.mean(here >= 0) > 0.1
+    same = there == here
+    assert np.allclose(a[same], b[same], rtol=1e-4) and np.array_equal(many.light, few.light)
+
+
 def test_embree_and_the_tree_give_the_same_hits() -> None:
     pytest.importorskip("embreex", reason="embreex is not installed: only the tree in numpy is tested")
     centre = RANDOM.normal(size=(500, 1, 3))
@@ -184,7 +225,9 @@ def test_embree_and_the_tree_give_the_same_hits() -> None:
     on = corners[faces].mean(axis=1)[RANDOM.integers(500, size=5000)].T.astype(np.float32)
     batch.origin[:, :5000] = on + batch.direction[:, :5000] * np.float32(1e-3)
     limit = np.where(RANDOM.random(20000) < 0.5, np.inf, RANDOM.uniform(0, 12, 20000)).astype(np.float32)
-    (a, tree), (b, embree) = (hits(made(7, corners, faces), batch, limit) for made in (Mesh, EmbreeMesh))
+    (a, tree), (b, embree) = (
+        hits(made, batch, limit) for made in (Mesh(7, corners[faces]), EmbreeMesh(7, corners, faces))
+    )
     # The tree's triangles are a hair larger.
     same = (tree == embree) & ((tree < 0) | np.isclose(a, b, rtol=1e-5, atol=1e-5))
     assert np.mean(~same) < 2e-3 and 0.2 < np.mean(tree >= 0) < 0.9
