@@ -124,14 +124,14 @@ def fit_arcs(sights: Sequence[Sight], report: Report, between: Sequence[tuple[Ar
         return _by(_WAYS[0], sights, report, between)[0]
     ways = _ANAMORPHIC if sights[0].anamorphic else _WAYS
     kept: list[PupilArcs] = []
-    best = False, -2.0
+    best, lost = -1.0, 1.0
     for part, way in enumerate(ways):
         seen = imaged(sights[0]) if way.image else sights[0]
         own, beyond = _by(way, [seen], partial(_within, report, part / len(ways), 1 / len(ways)))
-        rank = beyond <= _LOST, min(passing(seen, own[0]).values()) if beyond <= _LOST else -beyond
-        if rank > best:
-            kept, best = [replace(own[0], image=seen.image)], rank
-        if best >= (True, _PLENTY):
+        least, held = min(passing(seen, own[0]).values()), beyond <= _LOST < lost and _by_zones(seen)
+        if held or (least > best and beyond <= max(lost, _LOST)):
+            kept, best, lost = [replace(own[0], image=seen.image)], least, beyond
+        if best >= _PLENTY and (lost <= _LOST or not _by_zones(seen)):
             break
     return kept
 
@@ -347,18 +347,21 @@ def _above(rows: Array, wanted: Array, own: Truths, size: Array, push: float) ->
 def _random(sight: Sight, arcs: PupilArcs, seed: int) -> tuple[dict[str, Array], Array]:
     """Random rays that pass, from film points on +x, as inputs of `PupilArcs.checked`, and stops."""
     rng, count = np.random.default_rng(seed), _RAYS * (1 + 2 * sight.anamorphic)
-    azimuth = np.pi / 2 * rng.random(count) * sight.anamorphic
-    place = 0.9999 * arcs.film_radius_mm * np.sqrt(rng.random(count)) * np.stack([np.cos(azimuth), np.sin(azimuth)])
-    x, y = place * [[1.0], [arcs.squeeze]]
-    radius, azimuth = np.hypot(x, y), np.arctan2(y, x)
+    radius = arcs.film_radius_mm * np.sqrt(rng.random(count)) * 0.9999
     stop = sight.stop_radius_mm * rng.choice(np.linspace(0.08, 1, 12), count)
     film_z, nm = (rng.uniform(*span, count) for span in (sight.film_z_mm, sight.wavelength_nm))
     radii = np.linspace(0, sight.table.film_radius_mm, sight.table.rows.shape[1])
     low, high, half = (np.interp(radius, radii, a) for a in sight.table.rows)
     # Narrow stops are seldom met by rays all over the table: most of them go to the middle of the arcs.
-    pupil = np.stack([low + (high - low) * rng.random(count), half * (2 * rng.random(count) - 1)])
-    given = {"film_mm": place, "square": rng.random((2, count)), "stop_radius_mm": stop[None]}
-    given |= {"film_z_mm": film_z[None], "wavelength_nm": nm[None]}
+    pupil = np.stack([low + (high - low) * rng.random(count), half * rng.random(count)])
+    given = {"square": rng.random((2, count)), "stop_radius_mm": stop[None]}
+    azimuth = np.zeros(count)
+    if sight.anamorphic:
+        azimuth, pupil[1] = np.pi / 2 * rng.random(count), pupil[1] * rng.choice([-1.0, 1.0], count)
+    place = turned(np.stack([radius, 0 * radius]), azimuth)
+    x, y = place * [[1.0], [arcs.squeeze]]
+    radius, azimuth = np.hypot(x, y), np.arctan2(y, x)
+    given |= {"film_mm": place, "film_z_mm": film_z[None], "wavelength_nm": nm[None]}
     near = turned(evaluate(arcs.graph, given)["pupil_mm"], -azimuth)
     middle = turned(evaluate(arcs.graph, given | {"square": np.full((2, count), 0.5)})["pupil_mm"], -azimuth)
     pupil = np.where(rng.random(count) < 0.7, middle + 1.25 * (near - middle), pupil)
