@@ -9,7 +9,8 @@
 #   make bench    the tracer's speed, then models against it; fails when a promised ratio is lost
 #   make models   fit again every model of models/
 #   make gallery  what real lenses do: render and measure every effect
-#   make docs     the documentation in build/docs, after its links, commands and how-tos were tried (3 CPU minutes)
+#   make docs     the documentation in build/docs, after its links, commands and how-tos were tried (3 CPU minutes);
+#                 NEUROLENS_ORT_HEADERS=/folder/of/onnxruntime_cxx_api.h also builds the how-to in C++
 #   make lint     lint, format and types only
 #   make format   rewrite the code in the project's format
 #   make clean    remove .venv and caches

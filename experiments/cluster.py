@@ -14,6 +14,7 @@ import argparse
 import heapq
 import io
 import json
+import os
 import random
 import resource
 import shutil
@@ -26,7 +27,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 from experiments import lab
-from experiments.growth import resident_kb
+from experiments.growth import cpu_s, resident_kb
 from experiments.lab import Row
 from neurolens.base.engine import on_dask
 
@@ -80,13 +81,13 @@ def speed_up(quiet: bool) -> list[Row]:
             said: list[str] = []
             for k, more in enumerate((plain, ("--dask", "local:1"), ("--dask", "local:2"))):
                 out = folder / (f"{what[:6]}{k}" + (".exr" if argv[0] == "render" else ""))
-                began = time.perf_counter()
+                began, cpu = time.perf_counter(), cpu_s()
                 _quietly([*argv, str(out), *more, "--quiet"])
-                seconds = time.perf_counter() - began
+                seconds, cpu = time.perf_counter() - began, cpu_s() - cpu
                 said.append(_result(out))
                 how = "plain" if k == 0 else f"{k} worker" + "s" * (k > 1)
                 rows.append({"part": "speed-up", "what": what, "how": how, "seconds": seconds,
-                             "same": said[-1] == said[0]})  # fmt: skip
+                             "cpu_s": cpu, "load": os.getloadavg()[0], "same": said[-1] == said[0]})  # fmt: skip
         return rows
 
 
@@ -178,17 +179,12 @@ def simulations(rows: Sequence[Row]) -> Iterator[Row]:
 
 def _page(rows: Sequence[Row], simulated: Sequence[Row]) -> str:
     plain = {row["what"]: row["seconds"] for row in rows if row.get("how") == "plain"}
-    fast = [
-        [
-            r["what"],
-            r["how"],
-            f"{r['seconds']:.1f}",
-            f"{plain[r['what']] / r['seconds']:.2f}",
-            "yes" if r["same"] else "NO",
-        ]
-        for r in rows
-        if r["part"] == "speed-up"
-    ]
+    fast = [r | {"gain": plain[r["what"]] / r["seconds"]} for r in rows if r["part"] == "speed-up"]
+    columns = lab.columns(
+        ("what", "what"), ("how", "how"), ("wall s", "seconds", ".1f"), ("speed-up", "gain", ".2f"),
+        ("CPU s of all processes", "cpu_s", ".1f"), ("load average", "load", ".1f"),
+        ("same result", lambda r: "yes" if r["same"] else "NO"),
+    )  # fmt: skip
     small = [
         [r["what"], f"{r['count']:,}", f"{r['wall_ms']:.2f}", f"{r['cpu_ms']:.2f}", f"{r['mb']:.0f}"]
         for r in rows
@@ -201,7 +197,8 @@ def _page(rows: Sequence[Row], simulated: Sequence[Row]) -> str:
     ]  # fmt: skip
     return lab.page(
         "# Dask: speed-up and overhead", " ".join((__doc__ or "").split()), lab.machine_line(), "![dask](dask.png)",
-        "## Speed-up (measured)", lab.table("what|how|wall s|speed-up|same result", fast),
+        "## Speed-up (measured)",
+        lab.table(columns, fast, missing="not taken"),
         "## Tasks that do nothing (measured)",
         lab.table("payload of a|tasks|wall ms a task|CPU ms of driver and scheduler a task|MB above the start", small),
         "## Many tasks and workers (simulated)",
@@ -226,7 +223,7 @@ def _words(rows: Sequence[Row], simulated: Sequence[Row]) -> str:
 
 
 def _draw(file: Path, rows: Sequence[Row], simulated: Sequence[Row]) -> None:
-    from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, drawing
+    from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, drawing, plain_log_ticks
 
     with drawing(file, 9.0, 3.8, "A Dask cluster", "left: measured, tasks that do nothing; right: simulated") as figure:
         left, right = figure.subplots(1, 2)
@@ -243,5 +240,6 @@ def _draw(file: Path, rows: Sequence[Row], simulated: Sequence[Row]) -> None:
         right.plot(_WORKERS, _WORKERS, "--", color=FAINT, lw=0.8)
         right.set(xscale="log", yscale="log", xlabel="workers", ylabel="speed-up")
         for axis in (left, right):
+            plain_log_ticks(axis.xaxis, axis.yaxis)
             axis.grid(True)
             axis.legend()

@@ -120,15 +120,15 @@ def measured(probe: str, count: int) -> Row:
     with place:
         steps = PROBES[probe](count, Path(place.name))
         next(steps)  # imports and what is no part of it
-        before, began = resident_kb("VmRSS"), _cpu_s()
+        before, began = resident_kb("VmRSS"), cpu_s()
         Path("/proc/self/clear_refs").write_text("5")
         for _ in steps:
             pass
         children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-        return {"seconds": _cpu_s() - began, "mb": max(resident_kb("VmHWM") - before, children - before) / 1024}
+        return {"seconds": cpu_s() - began, "mb": max(resident_kb("VmHWM") - before, children - before) / 1024}
 
 
-def _cpu_s() -> float:
+def cpu_s() -> float:
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(each.ru_utime + each.ru_stime for each in used)
 
@@ -411,20 +411,25 @@ def _figures(row: Row) -> list[str]:
 
 
 def _draw(file: Path, found: list[Found]) -> None:
-    from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, drawing
+    from matplotlib.ticker import LogLocator
+
+    from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, drawing, plain_log_ticks
 
     names = list(dict.fromkeys(f.curve.name for f in found))
     with drawing(file, 3.1 * len(names), 6.2, "How the cost grows", "dashed: as the count") as figure:
         axes = figure.subplots(2, len(names), squeeze=False)
         for column, name in enumerate(names):
-            for row, (key, unit) in enumerate((("seconds", "CPU seconds"), ("mb", "MB above the imports"))):
+            for row, (key, unit, least) in enumerate((("seconds", "CPU seconds", 0.01), ("mb", "MB above imports", 1))):
                 axis = axes[row][column]
                 for k, f in enumerate(f for f in found if f.curve.name == name):
                     x, y = ([r[part] for r in f.rows] for part in ("count", key))
-                    axis.plot(x, np.maximum(y, 1e-3), "o-", color=FIELD_COLOURS[k], ms=4, label=f.curve.what)
-                    if y[-1] > 0 and x[-1] > x[0]:
+                    axis.plot(x, np.maximum(y, least), "o-", color=FIELD_COLOURS[k], ms=4, label=f.curve.what)
+                    if y[-1] > 10 * least and x[-1] > x[0]:
                         axis.plot([x[-1] / 10, x[-1]], [y[-1] / 10, y[-1]], "--", color=FAINT, lw=0.8)
                 axis.set(xscale="log", yscale="log", xlabel=name, ylabel=unit if not column else "")
+                plain_log_ticks(axis.xaxis, axis.yaxis)
+                if max(f.rows[-1]["count"] for f in found if f.curve.name == name) > 1e4:
+                    axis.xaxis.set_major_locator(LogLocator(base=100))
                 axis.grid(True)
                 if not row:
                     axis.legend(fontsize=7.5)

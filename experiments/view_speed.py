@@ -1,8 +1,8 @@
 """How soon the page of `neurolens view` shows its first picture and each change, in a browser with software WebGL2.
 
 480 x 270 pixels, one sample, headless Chromium with SwiftShader (the extra "web"; Debian: chromium): the time from a
-setting to the first picture with it, and the processor's time that the GPU process of the browser took for it (Linux),
-which other work on the machine changes little: SwiftShader spreads it over the cores.
+setting, the page at rest, to the first picture with it, and the processor's time that the GPU process of the browser
+took for it (Linux), which other work on the machine changes little: SwiftShader spreads it over the cores.
 Writes view_speed.md and view_speed.json.
 """
 
@@ -83,7 +83,9 @@ def _first(browser: Any, file: Path, repeats: int) -> dict[str, Any]:
 def _change(page: Any, name: str, script: str, repeats: int) -> dict[str, Any]:
     """After one change that is not counted: it compiles what the change needs."""
     once = f"""async (k) => {{
-      const {{ set, engine }} = neurolens, start = performance.now();
+      const {{ set, engine }} = neurolens;
+      await new Promise((settled) => setTimeout(settled, 300));
+      const start = performance.now();
       {script};
       await neurolens.show();
       for (const side of set.view === "one" ? ["a"] : ["a", "b"]) engine.gpu.read(engine.sides[side].film, 0, 0, 1, 1);

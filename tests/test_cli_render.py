@@ -271,7 +271,7 @@ def test_frames_follow_their_keys_and_what_exists_is_kept(
 ) -> None:
     """Focus is linear in 1/m, the stop in stops, places in metres; held before the first key and after the last."""
     keys = ("--key", "focus=2:1,4:inf", "--key", "f-number=1:2,3:8", "--key", "position=1:0/0.5/5,3:1/0.5/5")
-    command = ("render", str(scene), "--camera", "thin", "--frames", "1:5:2", *keys, "--quiet", "--samples", "1")
+    command = ("render", str(scene), "--camera", "thin", "--frames", "1-5:2", *keys, "--quiet", "--samples", "1")
     (tmp_path / "a.0003.exr").write_bytes(b"kept")
     assert main([*command, "-o", str(tmp_path / "a.exr")]) == 0
     assert sorted(p.name for p in tmp_path.glob("a.*.exr")) == ["a.0001.exr", "a.0003.exr", "a.0005.exr"]

@@ -1,5 +1,6 @@
 """The documentation: its links lead somewhere, its commands are commands, its how-tos run (`make docs`)."""
 
+import importlib.util
 import os
 import re
 import shlex
@@ -56,6 +57,11 @@ def test_how_tos_run(page: Path, tmp_path: Path) -> None:
         if language == "js":
             npm = f"command -v npm >/dev/null && npm install --silent --no-fund --ignore-scripts {NODE} || exit 77; "
             command = ["sh", "-ec", f"{npm} node {title}"]
+        if language == "cpp" and (headers := os.environ.get("NEUROLENS_ORT_HEADERS")):  # its wheel has none
+            capi = Path(importlib.util.find_spec("onnxruntime").origin).parent / "capi"
+            link = f"ln -s {next(capi.glob('libonnxruntime.so.*'))} libonnxruntime.so.1"
+            build = f"c++ -std=c++17 -I{headers} {title} libonnxruntime.so.1 -Wl,-rpath,. -o program"
+            command = ["sh", "-ec", f"{link}; {build}; ./program"]
         if command:
             done = subprocess.run(
                 command, cwd=tmp_path, env={**os.environ, "PATH": path}, capture_output=True, text=True

@@ -36,7 +36,7 @@ PARTS = {
     "evaluate": {
         *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba", "flare")
     },
-    "view": {"graph", "optics", "analysis", "cameras"},
+    "view": {"graph", "optics", "analysis", "cameras", "flare"},
     "blender": set(),
     "commands": {
         *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba", "flare"),

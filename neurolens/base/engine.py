@@ -151,7 +151,7 @@ def _keep_memory() -> None:
     """Let the C library (glibc) keep freed memory, once a worker, up to the sizes that it comes to by itself.
 
     Dask's nannies have it given back at once (MALLOC_TRIM_THRESHOLD_), which also ends those sizes' growth: getting the
-    pages of every larger array anew costs a third of a fit's time.
+    pages of every larger array anew takes two fifths of a fit's time.
     """
     with suppress(AttributeError, OSError):  # another C library
         library = ctypes.CDLL(None)

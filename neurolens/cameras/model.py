@@ -23,7 +23,8 @@ from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.onnxmaps import InverseRays, OnnxDerivatives, OnnxInverse, load_inverse
 from neurolens.cameras.onnxsession import joined, open_session, run_batches
 from neurolens.cameras.pupil_boxes import PupilTable
-from neurolens.cameras.pupil_search import outline_of
+from neurolens.cameras.pupil_outline import PupilOutline
+from neurolens.cameras.pupil_search import COARSE, outline_of
 from neurolens.cameras.sampling import arrived, check_film, common_light, positive
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
@@ -102,7 +103,7 @@ class OnnxCamera:
         film_z = _film_z(model, best, film_offset_mm, lens["f_number"] * lens["stop_radius_mm"] / stop)
         scene = replace(start, film_z_mm=film_z)
         round_stop = replace(scene, aperture=None)
-        outline = outline_of(PupilTable.of(domain["bounds"]), round_stop.passes, used)
+        outline = _outline_of(round_stop, used)
         self.film = LensFilm(outline, film_z, used, scene)
         self.settings: dict[str, Any] = {
             "camera": "model",
@@ -259,7 +260,20 @@ class ModelScene:
         """Whether rays pass at one wavelength; bool [N]."""
         return self(film, pupil, np.full(film.shape[1], wavelength_nm, np.float32)).status == st.PASSED
 
+    def passes_at_any_azimuth(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
+        """As `passes`, of a lens with cylinders: whether rays pass when film and pupil points turn about the axis."""
+        passed = np.zeros(film.shape[1], bool)
+        for azimuth in _AZIMUTHS:
+            left = np.flatnonzero(~passed)
+            if len(left):
+                cos, sin = math.cos(azimuth), math.sin(azimuth)
+                turn = np.array([[cos, -sin], [sin, cos]], np.float32)
+                passed[left] = self.passes(turn @ film[:, left], turn @ pupil[:, left], wavelength_nm)
+        return passed
 
+
+# Of lenses with cylinders, as `optics.pupils.AZIMUTHS`; those that differ most come first.
+_AZIMUTHS = [math.radians(5 * k) for k in sorted(range(-18, 19), key=lambda k: k % 9)]
 _RINGS, _SPOKES = 192, 24  # rays of the best focus; many rings, since the stop's edge falls between two
 _WIDER = 1.3  # their disc over the axial pupil at the stop in use
 _STEPS = 4  # towards the film points from which rays go to the object
@@ -351,6 +365,15 @@ def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, f
         best = scene.film_z_mm - float(along / across)
         film = np.where(np.isfinite(film), film, 0.0)
     return _Spot(best, (film.astype(np.float32), pupil.astype(np.float32), nanometres), moments, passed)
+
+
+def _outline_of(scene: ModelScene, wavelength_nm: tuple[float, float]) -> PupilOutline | None:
+    """The pupil of a model with a round stop; one for all azimuths of a lens with cylinders, which fits none."""
+    domain = scene.model.card["domain"]
+    bounds = PupilTable.of(domain["bounds"])
+    if squeeze_of(scene, _SQUEEZED * domain["film_radius_mm"], wavelength_nm) == 1.0:
+        return outline_of(bounds, scene.passes, wavelength_nm)
+    return outline_of(bounds, scene.passes_at_any_azimuth, wavelength_nm, COARSE._replace(tighten=True))
 
 
 def _state_of(scene: ModelScene, wavelength_nm: tuple[float, float], f_number: float) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -134,8 +135,8 @@ def frames_of(
 
 
 def _frames(text: str) -> range:
-    """Type of --frames."""
-    words = text.split(":")
+    """Type of --frames; farms write FIRST-LAST."""
+    words = re.split("[:-]", text)
     if 2 <= len(words) <= 3 and all(w.isascii() and w.isdecimal() and len(w) <= 7 for w in words):
         first, last, step = (*map(int, words), 1)[:3]
         if first <= last and step > 0 and (last - first) // step < _MOST:

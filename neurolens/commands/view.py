@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.bounds import RANGE
-from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.errors import InputError, ModelError, NeurolensError
 from neurolens.base.files import library as shipped
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_glass, add_json, check_folder, check_suffix, lens_path
 from neurolens.commands.output import answer
 
 if TYPE_CHECKING:
+    from neurolens.flare.ghostmodel import GhostModel
     from neurolens.optics.prescription import Lens
     from neurolens.view.page import Form, ViewLens
 
@@ -26,13 +27,15 @@ models as GLSL in a path tracer of WebGL2, side by side or as their difference, 
 blades and wavelength; their layout with the rays of a pixel, their error and what a ray costs there.
 
 LENS is a lens file of any format that `neurolens convert` reads, or a name of lenses/; MODEL an exported
-model, shown with the lens of its name. Without any, every lens of lenses/ with the best polynomial and
+model, shown with the lens of its name; fitted ghosts (`neurolens flare --fit`) are drawn where a lamp
+is dragged. Without any, every lens of lenses/ with the best polynomial and
 the best network of models/."""
 _EPILOG = """\
 examples:
   neurolens view -o view.html
   neurolens view petzval_portrait_100 laikin_double_gauss_50 -o two.html
-  neurolens view my_lens.zmx runs/mine/models/ols-64.onnx -o mine.html"""
+  neurolens view my_lens.zmx runs/mine/models/ols-64.onnx -o mine.html
+  neurolens view laikin_double_gauss_50 ghosts.onnx -o flare.html"""
 _NETWORK = "mlp"
 _ERRORS = ("rms_um", "p99_um", "rms_infinity_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
 _LIGHT_NM = (400.0, 700.0)
@@ -40,6 +43,7 @@ _AS_BARE = "coatings and absorption left out"
 _NEAR_EFL = 10.0  # of an exact lens: nearest focus in focal lengths
 _SAME = 1e-3  # of the focal length: what models and lens file of one id may differ by
 _DOWNLOADS = ("glsl", "onnx", "c", "osl")
+_GHOSTS = 24  # of a lens at most: the brightest
 _FEW = 4  # of more lenses the page leaves C and OSL out: seconds each, and they are large
 
 
@@ -51,6 +55,7 @@ class _Entry:
     models: Sequence[Path]
     lens: Lens | None
     zoom: str | None = None
+    ghosts: GhostModel | None = None
 
 
 def add_parser(subparsers: Any) -> None:
@@ -128,8 +133,12 @@ def _asked(words: Sequence[str]) -> Iterator[_Entry]:
     lenses: dict[str, Lens | None] = {}
     models: dict[str, list[Path]] = {}
     brought: dict[str, list[Path]] = {}
+    flares = {path: model for path in map(Path, words) if path.suffix == ".onnx" and (model := _flare(path))}
+    of = {model.lens.lens_id: model for model in flares.values()}
     for word in words:
         path = Path(word) if word.endswith(".onnx") else lens_path(word, "view")
+        if path in flares:
+            continue
         if path.suffix == ".onnx":
             lens_id = str(_card(path)["lens"]["id"])
             lenses.setdefault(lens_id, None)
@@ -140,14 +149,29 @@ def _asked(words: Sequence[str]) -> Iterator[_Entry]:
         if path.parent == root / "lenses":  # one of the library brings its models
             known = library(root / "models", root / "lenses", [path.stem]) if _has_models(root, path.stem) else ()
             brought[lens.lens_id] = [m for files, _ in known for m in files]
+    if not of.keys() <= lenses.keys():
+        lens_id = next(iter(of.keys() - lenses.keys()))
+        raise InputError("neurolens view", f"ghosts of {lens_id}", "(no such lens)", "the lens beside its ghosts")
     for lens_id, own in lenses.items():
         found = models.get(lens_id) or brought.get(lens_id, [])
         zoom = RANGE if any(_card(m).get("states") for m in found) else None
-        yield _Entry(lens_id, found, own, zoom)
+        yield _Entry(lens_id, found, own, zoom, of.get(lens_id))
 
 
 def _has_models(root: Path, key: str) -> bool:
     return any((root / "models").glob(f"{key}.*.onnx"))
+
+
+def _flare(file: Path) -> GhostModel | None:
+    """The ghosts of a file that holds such; others are refused or read elsewhere."""
+    from neurolens.flare.ghostfile import KIND, read_ghosts
+    from neurolens.modelfile.onnxfile import card_in, read_metadata
+
+    try:
+        card_in(file, read_metadata(file)[2], KIND)
+    except ModelError:
+        return None
+    return read_ghosts(file)
 
 
 def _card(file: Path) -> dict[str, Any]:
@@ -168,6 +192,7 @@ def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str]) -> ViewLens:
         InputError: two models of one kind; a lens that the exact tracer's code cannot hold, without any model.
     """
     from neurolens.view.page import ViewLens
+    from neurolens.view.shaders import ghosts_glsl
 
     found = [_kind_of(_card(file)) for file in entry.models]
     if len(set(found)) < len(found):
@@ -191,6 +216,7 @@ def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str]) -> ViewLens:
         entry.key, str(best.card["name"]), str(best.card["source"]), float(best.card["efl_mm"]),
         min(float(f.card["film_radius_mm"]) for f in forms), _squeeze(entry), best.card["f_numbers"],
         max(float(f.card["nearest_m"]) for f in forms), drawn, path, forms,
+        None if entry.ghosts is None else ghosts_glsl(entry.ghosts, _GHOSTS),
     )  # fmt: skip
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurolens.base.files import atomic_path, atomic_write_text, write_json
+from neurolens.base.files import atomic_path, write_json
 from neurolens.evaluate.pages import DASH, Column, facts, legend, number, page, text
 from neurolens.evaluate.records import versions
 from neurolens.evaluate.survey import GOALS, VERDICTS, SurveySettings, summary_of
@@ -35,8 +35,8 @@ COLUMNS = (
 _TEXTS = ("file", "verdict", "format", "name", "rims", "reason")
 _LISTS = ("notes", "doubts")
 TABLE_STYLE = """<style>
-.survey td.t { text-align: left; white-space: normal; min-width: 22rem; max-width: 34rem; overflow-wrap: anywhere; }
-.survey tbody th { max-width: 16rem; white-space: normal; overflow-wrap: anywhere; }
+.survey td.t { text-align: left; white-space: normal; min-width: 16rem; max-width: 34rem; overflow-wrap: anywhere; }
+.survey tbody th { min-width: 11rem; max-width: 16rem; white-space: normal; overflow-wrap: anywhere; }
 .survey tbody th small { color: var(--dim); display: block; }
 .survey td.p { padding: 2px; background: #fff; color: #222; } .survey td.p svg { display: block; }
 .survey thead th { cursor: pointer; position: sticky; top: 0; background: var(--back); z-index: 2; }
@@ -102,9 +102,15 @@ def write_pages(
     summary = summary_of(records)
     head = {"folder": str(collection.folder), "settings": asdict(settings), "others": collection.others}
     write_json(out / "survey.json", {**head, "summary": summary, "versions": versions(), "lenses": records})
-    atomic_write_text(out / "survey.csv", _csv(records))
-    with atomic_path(out / "survey.html") as temporary, temporary.open("w", encoding="utf-8") as stream:
-        stream.writelines(survey_page(records, layout_of, collection, settings))
+    pages: dict[str, Iterable[str]] = {"csv": [_csv(records)]}
+    pages["html"] = survey_page(records, layout_of, collection, settings)
+    for name, parts in pages.items():
+        # Names of files may be bytes that are no text.
+        with (
+            atomic_path(out / f"survey.{name}") as temporary,
+            temporary.open("w", encoding="utf-8", errors="backslashreplace") as stream,
+        ):
+            stream.writelines(parts)
 
 
 def summary_lines(records: Sequence[Mapping[str, Any]], others: Mapping[str, int]) -> list[str]:
@@ -114,7 +120,7 @@ def summary_lines(records: Sequence[Mapping[str, Any]], others: Mapping[str, int
     lines[0] += f", {s['fault']} ended by a fault" if s["fault"] else ""
     if others:
         kinds = ", ".join(f"{count} {suffix}" for suffix, count in sorted(others.items()))
-        lines.append(f"not lens files by their suffix: {kinds}")
+        lines.append(f"not taken as lens files: {kinds}")
     if s["fitted"]:
         goals = f"{GOALS['direction_rms_deg']:g} deg and {100 * GOALS['false_pass']:g}% false pass and block"
         lines.append(f"{s['fitted']} fitted: {s['reach_goals']} reach {goals}, {s['promises_held']} hold all promises")

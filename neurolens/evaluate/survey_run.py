@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import os
 import re
+import select
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
@@ -46,7 +49,7 @@ class Collection:
 
 
 def collection_of(folder: Path) -> Collection:
-    """The files of a folder and of its folders, hidden ones left out, by suffix; links to folders are not followed.
+    """The files of a folder and of its folders by suffix; hidden ones and links to folders are others.
 
     Raises:
         InputError: no such folder, or no lens file in it.
@@ -56,13 +59,17 @@ def collection_of(folder: Path) -> Collection:
     names, others = list[str](), dict[str, int]()
     for file in sorted(folder.rglob("*")):
         parts = file.relative_to(folder).parts
-        if any(part.startswith(".") for part in parts) or file.is_dir():
-            continue
-        suffix = file.suffix.lower()
-        if suffix in SUFFIXES:
+        kind = file.suffix.lower() or "(none)"
+        if file.is_dir():
+            if not file.is_symlink():
+                continue
+            kind = "(link to a folder)"
+        elif any(part.startswith(".") for part in parts):
+            kind = "(hidden)"
+        elif kind in SUFFIXES:
             names.append("/".join(parts))
-        else:
-            others[suffix or "(none)"] = others.get(suffix or "(none)", 0) + 1
+            continue
+        others[kind] = others.get(kind, 0) + 1
     if not names:
         known = ", ".join(sorted(SUFFIXES))
         raise InputError(folder, "FOLDER", f"({sum(others.values())} files of other kinds)", f"lens files: {known}")
@@ -82,7 +89,7 @@ def survey(
     """Survey all files of a collection; records that are there are not made again. Returns them in the files' order.
 
     Writes records/ (one JSON a file), survey.json, survey.csv and survey.html to the folder `out`. The sections stay
-    in the files alone: what a survey holds in memory is some ten thousand bytes a lens.
+    in the files alone: a survey holds some tens of thousands of bytes a lens in memory.
     """
     (out / "records").mkdir(parents=True, exist_ok=True)
     found: dict[str, dict[str, Any]] = {}
@@ -227,8 +234,18 @@ def _begin(context: Any, task: Task) -> tuple[Any, Any]:
 
 def _work(place: Any, task: Task) -> None:
     end_at_once()
+    threading.Thread(target=_end_unread, args=(place.fileno(),), daemon=True).start()
     with suppress(BrokenPipeError):  # whoever asked was killed
         place.send_bytes(run_task(task))
+
+
+def _end_unread(pipe: int) -> None:
+    """End this process once nobody is left to read from a pipe: a survey that was killed can ask nobody to stop."""
+    if hasattr(select, "poll"):
+        waiting = select.poll()
+        waiting.register(pipe, 0)  # errors alone, such as a closed end
+        waiting.poll()
+        os._exit(1)
 
 
 def _answer(place: Any, process: Any, task: Task) -> bytes:

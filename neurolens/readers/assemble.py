@@ -96,8 +96,9 @@ def with_rims(lens: Lens) -> Lens:
 def first_order(lens: Lens) -> FirstOrder:
     """First-order data in the y-z plane; of a lens without power there, in the x-z plane.
 
-    Raises InputError for a lens without power, or whose entrance pupil is a point or infinite.
+    Raises InputError for a lens without power, or whose entrance pupil is a point or infinite; a figure out of range.
     """
+    _check_rows(lens.surfaces, lens.path)
     try:
         data = paraxial.first_order(lens, meridian="y")
     except InputError:

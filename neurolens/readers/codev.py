@@ -89,6 +89,13 @@ IGNORED = frozenset(
     """LEN WL REF WTW WTF WTA INI DOR PRE DER UID SLB GO END CCY CCX THC GLC KC AC BC CC DC EC FC GC HC JC DLT
     DLN DLF DLR IRR""".split()
 )
+# Of a surface: what the lens model has not, by name; files that show how Q-types are laid out were not found.
+REFUSED = {
+    "SPS": "special surface (Q-types QBF and QCN, odd polynomials, Zernikes and others)",
+    "MOD": "ideal lens (a module)",
+    "GRT": "grating",
+    "DIF": "diffractive surface",
+}
 VIGNETTING = frozenset(["VUX", "VLX", "VUY", "VLY"])
 READ = (
     *"S SO SI RDM TIT DIM EPD FNO TEM".split(),
@@ -178,6 +185,8 @@ def _surface(file: File, command: Command) -> None:
     if name in ("S", "SO", "SI"):
         _new_surface(file, command)
         return
+    if name in REFUSED:
+        raise line.error(name, " ".join(words) or "(given)", f"a surface that is no {REFUSED[name]}")
     if name not in READ:
         raise line.unknown(name, READ)
     block = file.blocks[-1] if file.blocks else None

@@ -198,7 +198,8 @@ def _surface(file: File, block: Block, line: Line, word: str, rest: list[str]) -
         case "TYPE":
             block.kind = rest[0].upper() if rest else ""
             if block.kind not in TYPES and not block.kind.startswith(Q_TYPE):
-                raise line.error(word, block.kind, f"one of {', '.join(TYPES)}, or a Q-type asphere")
+                what = " (an ideal lens has no glass to trace)" if block.kind == "PARAXIAL" else ""
+                raise line.error(word, block.kind, f"one of {', '.join(TYPES)}, or a Q-type asphere{what}")
         case "CURV":
             block.curvature = line.numbers(word, rest[:1])[0]
             block.bends = line if block.curvature else None

@@ -8,7 +8,7 @@ import html
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,11 +20,11 @@ from neurolens.analysis.layout import Layout, element_outline
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.graph.c import Signature
-from neurolens.view.shaders import call_of, shared_glsl
+from neurolens.view.shaders import Ghosts, call_of, shared_glsl
 
 FOLDER = Path(__file__).parent / "page"
-SCRIPTS = ("gl.js", "scene.js", "engine.js", "layout.js", "main.js")
-SHADERS = ("scene.glsl", "trace.glsl")
+SCRIPTS = ("gl.js", "scene.js", "engine.js", "ghosts.js", "layout.js", "main.js")
+SHADERS = ("random.glsl", "scene.glsl", "rays.glsl")
 # A form's download that would carry the page beyond this is left out.
 MOST_BYTES = 3_000_000
 _AIR, _ARC = 1.01, 4  # a medium of a smaller index is drawn as air; of 65 points of an arc every fourth is drawn
@@ -67,7 +67,7 @@ class ViewLens:
 
     Attributes:
         squeeze: of an anamorphic picture across. f_numbers: the widest stop's by zoom position (mm). focus_m: nearest.
-        section: of `section_svg`.
+        section: of `section_svg`. ghosts: fitted.
     """
 
     key: str
@@ -81,6 +81,7 @@ class ViewLens:
     section: Mapping[str, Any]
     path: tuple[str, Sequence[str]] | None
     forms: Sequence[Form]
+    ghosts: Ghosts | None = None
 
 
 def write_page(
@@ -122,12 +123,13 @@ def _page(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> str:
 
 def _entry(lens: ViewLens, kinds: Sequence[str]) -> dict[str, Any]:
     """What the menu and the first picture need."""
-    found = {k: v for k, v in asdict(lens).items() if k not in ("forms", "path", "section")}
+    found = {k: v for k, v in asdict(lens).items() if k not in ("forms", "path", "section", "ghosts")}
     forms = [
         {"kind": f.kind, "method": f.method, **f.program(), "card": f.card, "files": _kept(f, kinds)}
         for f in lens.forms
     ]
-    return found | {"forms": forms, "paths": lens.path is not None}
+    ghosts = None if lens.ghosts is None else asdict(replace(lens.ghosts, functions=()))
+    return found | {"forms": forms, "paths": lens.path is not None, "ghosts": ghosts}
 
 
 def _kept(form: Form, kinds: Sequence[str]) -> list[str]:
@@ -143,6 +145,8 @@ def _packed(lens: ViewLens, kinds: Sequence[str]) -> str:
     """One element a text or file, gzip in base64: browsers unpack them when they are asked for."""
     path = {} if lens.path is None else {"text": lens.path[0], "outputs": list(lens.path[1])}
     texts = {f"{lens.key}/lens": json.dumps({"section": lens.section, "path": path})}
+    if lens.ghosts is not None:
+        texts[f"{lens.key}/ghosts"] = json.dumps([asdict(ghost) for ghost in lens.ghosts.functions])
     for form in lens.forms:
         for kind in _kept(form, kinds):
             data = form.glsl.encode() if kind == "glsl" else form.files[kind]

@@ -1,13 +1,16 @@
 """What the page's shaders take from graphs besides the functions of lenses and models: weights, blades, a thin lens,
-and the crossings of rays with the surfaces of a lens.
+the crossings of rays with the surfaces of a lens, and its fitted ghosts.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from neurolens.cameras.blades import Blades
 from neurolens.cameras.cameragraph import weight_graph
+from neurolens.flare.ghostmodel import GhostModel, ghost_graph
 from neurolens.graph.c import Signature
 from neurolens.graph.glsl import write_glsl
 from neurolens.graph.ir import Graph
@@ -26,6 +29,8 @@ _PLACES = {
     "area_mm2": "area", "lens_status": "float(status)",
     **dict(zip((f"seen_{k}" for k in range(6)), ("from.x", "from.y", "from.z", "to.x", "to.y", "to.z"), strict=True)),
 }  # fmt: skip
+_ENTERING = {"dx": "d.x", "dy": "d.y", "x_mm": "at.x", "y_mm": "at.y", WAVELENGTH: "nm", STOP_RADIUS: "stop_radius"}
+_ARRIVING = ("arriving.x", "arriving.y", "arriving.z", "arriving.w")  # as `program.ARRIVING`
 _COMMENT = re.compile(r"/\*.*?\*/\s*", re.DOTALL)
 
 
@@ -97,6 +102,44 @@ def path_glsl(lens: Lens, pupil_z_mm: float, light_nm: tuple[float, float]) -> t
     g.outputs["status"] = found["status"]
     program = lower(g)
     return _text(program, "lens_path"), list(Signature.of(program, "lens_path").outputs)
+
+
+@dataclass(frozen=True)
+class GhostFunction:
+    """One ghost: `name` of its two surfaces; its rays cross the plane z = 0 at chief_mm p + scale_mm u, of x and y."""
+
+    name: str
+    text: str
+    call: str
+    chief_mm: Sequence[float]
+    scale_mm: Sequence[float]
+
+
+@dataclass(frozen=True)
+class Ghosts:
+    """Fitted ghosts, brightest first; p = direction / sine, and a stop beyond `stop_radius_mm` means nothing."""
+
+    functions: Sequence[GhostFunction]
+    sine: float
+    wavelength_nm: tuple[float, float]
+    stop_radius_mm: float
+    light: float
+
+
+def ghosts_glsl(model: GhostModel, most: int) -> Ghosts:
+    """The brightest ghosts of a model, at most so many, and their share of its light."""
+    of = {row["ghost"]: float(row["energy"]) for row in model.report["ghosts"]}
+    energy = [of[pair.name] for pair in model.pairs]
+    found = []
+    for pair, ghost in list(zip(model.pairs, model.ghosts, strict=True))[:most]:
+        name = f"ghost_{pair.name.replace('-', '_')}"
+        program = lower(ghost_graph(model, ghost))
+        given = [_ENTERING[i] for i in Signature.of(program, name).inputs]
+        call = f"{name}({', '.join([*given, *_ARRIVING])})"
+        places = ghost.chief_mm.tolist(), ghost.scale_mm.tolist()
+        found.append(GhostFunction(pair.name, _text(program, name), call, *places))
+    light = sum(energy[:most]) / sum(energy)
+    return Ghosts(found, model.sine, model.wavelength_nm, model.stop_radius_mm, light)
 
 
 def _text(program: Program, name: str) -> str:

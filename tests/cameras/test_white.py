@@ -3,6 +3,7 @@
 import math
 from copy import copy
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import lens_models
@@ -17,9 +18,12 @@ from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import ThickLens, ThinLens
+from neurolens.cameras.onnxlens import load_model
 from neurolens.cameras.pinhole import PROJECTIONS, Pinhole
 from neurolens.cameras.vignetting import VIGNETTINGS, Vignetted
 from neurolens.optics.paraxial import first_order
+
+MODELS = Path(__file__).parents[2] / "models"
 
 
 def expected(kind: str) -> np.ndarray:
@@ -51,6 +55,24 @@ def test_film_values_of_white_surroundings(kind: str) -> None:
     found = np.array([film_value(camera(kind), (0.8 * r, -0.6 * r), wavelength_nm=550.0) for r in RADII])
     assert film_value(camera(kind), (0.0, 0.0)) == pytest.approx(1, abs=1e-3)
     assert found / found[0] == pytest.approx(expected(kind), abs=1.2e-3)
+
+
+def test_models_of_anamorphic_lenses_are_lit_at_every_azimuth() -> None:
+    """As by a lattice over the whole pupil: near the end of the light each azimuth has another pupil."""
+    name = "cooke_anamorphic_42.ols-64.onnx"
+    found = make_camera(str(MODELS / name), Shot((26.0, 20.0), 4.0, wavelength_nm=(550.0, 550.0), clamp_f_number=True))
+    model = load_model(MODELS / name)
+    film_z, domain = float(found.settings["film_z_mm"]), model.card["domain"]
+    across = domain["pupil_radius_mm"] * ((np.arange(160) + 0.5) / 80 - 1)
+    pupil = np.stack(np.meshgrid(across, across)).reshape(2, -1)
+    lattice, value = [], []
+    for point in ((0.0, 0.0), (9.0, 9.8), (12.8, 1.0), (-1.0, 12.8)):
+        value.append(film_value(found, point, wavelength_nm=550.0))
+        film = np.repeat(np.array(point)[:, None], pupil.shape[1], axis=1)
+        rays = model.rays(film, pupil, 550.0, film_z, float(found.settings["stop_radius_mm"]))
+        cos2 = 1 / (1 + ((film - pupil) ** 2).sum(0) / (film_z - domain["pupil_z_mm"]) ** 2)
+        lattice.append((np.where(rays.status == st.PASSED, rays.transmittance, 0) * cos2**2).sum())
+    assert np.divide(value, value[0]) == pytest.approx(np.divide(lattice, lattice[0]), rel=0.01)
 
 
 @pytest.mark.parametrize("f_number", [0.7, 45.0])

@@ -5,6 +5,7 @@ import json
 import os
 import re
 import signal
+import time
 from collections.abc import Iterable, Iterator
 from html.parser import HTMLParser
 from pathlib import Path
@@ -130,7 +131,7 @@ def test_a_survey_leaves_nothing_out_and_goes_on(tmp_path: Path) -> None:
                 raise KeyboardInterrupt
 
     assert collection.names == ("in/=triplet <b>.toml", "no.zmx")
-    assert collection.others == {".me": 1}
+    assert collection.others == {".me": 1, "(hidden)": 1}
     with pytest.raises(KeyboardInterrupt):
         survey(collection, out, READ, engine, QUIET)
     records = survey(collection, out, READ, engine, QUIET)
@@ -153,12 +154,40 @@ def test_a_survey_leaves_nothing_out_and_goes_on(tmp_path: Path) -> None:
     assert data["lenses"][1]["reason"] == records[1]["reason"]
 
 
+def test_names_that_are_no_text(tmp_path: Path) -> None:
+    folder = tmp_path / "odd"
+    folder.mkdir()
+    try:
+        Path(os.fsdecode(os.fsencode(folder) + b"/\xff\xfe.zmx")).write_text("VERS")
+    except OSError:
+        pytest.skip("this system takes names that are text alone")
+    (record,) = survey(collection_of(folder), tmp_path / "out", READ, here, QUIET)
+    assert record["verdict"] == "refused"
+    for kind in ("html", "csv"):
+        assert "\\udcff\\udcfe.zmx" in (tmp_path / "out" / f"survey.{kind}").read_text(encoding="utf-8")
+
+
 def test_a_killed_process_costs_its_own_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(survey_run, "_POLL_S", 0.0)
     collection = collection_of(_folder(tmp_path))
     records = survey(collection, tmp_path / "out", READ, in_processes(2, limit_s=0.0), QUIET)
     assert {r["verdict"] for r in records} == {"fault"}
     assert "took longer than 0 s" in records[0]["reason"]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_process_ends_once_its_survey_is_gone() -> None:
+    read, write = os.pipe()
+    child = os.fork()
+    if not child:
+        os.close(read)
+        survey_run._end_unread(write)
+        os._exit(0)
+    time.sleep(0.05)
+    assert os.waitpid(child, os.WNOHANG) == (0, 0)
+    os.close(read)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1
+    os.close(write)
 
 
 def test_the_end_of_a_process_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

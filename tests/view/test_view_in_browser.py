@@ -14,6 +14,11 @@ import pytest
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import main
+from neurolens.flare.ghostfile import write_ghosts
+from neurolens.flare.ghostfit import GhostSettings, fit_ghosts
+from neurolens.flare.lights import Light
+from neurolens.flare.picture import Raster, ghost_picture
+from neurolens.optics.lensfile import read_lens
 from neurolens.render.renderer import render
 from neurolens.render.scene import scene_from_tables
 
@@ -94,8 +99,10 @@ def opened(browser: Any, page_file: Path) -> Iterator[Opened]:
 BALLS = """b => {
   const n = neurolens, empty = n.sceneUniforms("night", 1, 1), ball = new Float32Array(empty.ball.length);
   const coat = new Float32Array(empty.coat.length);
+  const boxes = [0, 0, 0, 0, 0, 0, -1e3, -1e3, -1e3, 1e3, 1e3, 1e3];
   b.forEach((v, k) => { ball.set(v, 4 * k); coat.set([100, 100, 100, -1], 4 * k); });
-  const scene = { ...empty, ball, coat, solids: 0, balls: b.length, floor_y: -1e6, key_power: 0 };
+  const around = { around: boxes, person: 0, solids: 0, balls: b.length };
+  const scene = { ...empty, ...around, ball, coat, floor_y: -1e6, key_power: 0 };
   return n.engine.prepare(n.set.lens, { a: n.set.a }, n.set, scene).then(() => {
     n.pass();
     return n.engine.sides.a.values.film_mm;
@@ -106,15 +113,20 @@ BALLS = """b => {
 def ours(
     camera: str, film_mm: list[float], settings: dict[str, Any], tables: dict[str, Any], samples: int
 ) -> np.ndarray:
-    """[HIGH, WIDE] of our renderer, in the same light."""
+    """[HIGH, WIDE] of our renderer, in the same light; its pixels are square, those of an anamorphic page are not."""
     shot = Shot(tuple(film_mm), settings["focus"], settings["f_number"], wavelength_nm=(NM, NM), clamp_f_number=True)
     place = {"position_m": [0.0, 0.0, 0.0], "look_at_m": [0.0, 0.0, -1.0], "focus_m": settings["focus"]}
     sizes = {"film_width_mm": film_mm[0], "film_height_mm": film_mm[1], "wavelengths_nm": [NM, NM]}
     scene = scene_from_tables({"camera": {**place, **sizes}, **tables})
-    result = render(scene, make_camera(camera, shot), width=WIDE, height=HIGH, samples=samples, threads=1)
-    return result.rgb[..., 1].astype(float)
+    height = round(WIDE * film_mm[1] / film_mm[0])
+    result = render(scene, make_camera(camera, shot), width=WIDE, height=height, samples=samples, threads=1)
+    edges = np.linspace(0, height, HIGH + 1)
+    rows = np.clip(np.arange(1, height + 1) - edges[:, None], 0, 1)  # of each how much lies above an edge, from below
+    share = np.diff(-rows, axis=0) * HIGH / height
+    return share @ result.rgb[..., 1].astype(float)
 
 
+OTHERS = "laikin_double_gauss_50", "isshiki_fisheye_10", "cooke_anamorphic_42"
 CAMERAS = {"polynomial": str(ROOT / "models" / f"{LENS}.ols-64.onnx"), "exact": str(ROOT / "lenses" / f"{LENS}.toml")}
 
 
@@ -168,6 +180,79 @@ def test_small_lights_lie_and_spread_as_in_our_renderer(
     assert areas[:, 0].mean() == pytest.approx(areas[:, 1].mean(), rel=0.02)
     sky = 0.1  # brighter than it
     assert found[found > sky].sum() == pytest.approx(wanted[wanted > sky].sum(), rel=0.02)
+
+
+@pytest.fixture(scope="module")
+def others(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Opened]:
+    out = tmp_path_factory.mktemp("view") / "others.html"
+    assert main(["view", *OTHERS, "--downloads", "glsl", "-o", str(out), "--json"]) == 0
+    found = Opened(browser, out)
+    found.set(still=True, view="one", a="polynomial", width=WIDE, wavelength=NM)
+    yield found
+    assert found.said == []
+
+
+@pytest.mark.parametrize("key", OTHERS)
+def test_other_lenses_too(others: Opened, key: str) -> None:
+    """White cards, and lights behind the focus, of a rectilinear lens, a fisheye and an anamorphic lens."""
+    others.lens(key)
+    others.set(scene="white", a="polynomial", blades=0)
+    settings = others.number("(({ focus, f_number }) => ({ focus, f_number }))(neurolens.set)")
+    film = others.number("neurolens.engine.sides.a.values.film_mm")
+    method = others.number("neurolens.set.lens.forms.find((f) => f.kind === 'polynomial').method")
+    camera, shown = str(ROOT / "models" / f"{key}.{method}.onnx"), others.picture(64)
+    wanted = ours(camera, film, settings, {"environment": {"colour": [1.0, 1.0, 1.0]}}, 16)
+    blocks = [p.reshape(9, 15, 16, 15).mean((1, 3)) for p in (shown, wanted)]
+    middle = [b[4, 7:9].mean() for b in blocks]
+    assert np.abs(blocks[0] / middle[0] - blocks[1] / middle[1]).max() < 0.01
+
+    near = [(x, y) for x in (30, 75, 165, 210) for y in (25, 67, 110)]
+    far, directions = 3 * settings["focus"], []
+    for x, y in near:
+        script = f"neurolens.engine.direction('a', [{(x + 0.5) / WIDE}, {1 - (y + 0.5) / HIGH}])"
+        directions.append(others.number(script))
+    turn = np.arccos(np.dot(directions[4], directions[7]))  # of 90 pixels
+    balls = [[*(far * np.array(d)), 3 * far * turn / 90] for d in directions]  # of three pixels
+    others.set(scene="night")
+    others.page.evaluate(BALLS, balls)
+    found = others.picture(128)
+    lights = [{"centre_m": b[:3], "radius_m": b[3], "emission": [100.0] * 3} for b in balls]
+    wanted = ours(camera, film, settings, {"environment": {"colour": [0.0, 0.0, 0.0]}, "spheres": lights}, 64)
+    pairs = list(zip(spots(found, near, 12), spots(wanted, near, 12), strict=True))
+    assert max(np.hypot(a[0] - b[0], a[1] - b[1]) for a, b in pairs) < 0.1
+    areas = np.array([[a[2], b[2]] for a, b in pairs])
+    assert areas[:, 0].mean() == pytest.approx(areas[:, 1].mean(), rel=0.02)
+
+
+def test_a_lamp_is_dragged_and_its_ghosts_are_those_of_neurolens_flare(browser: Any, tmp_path: Path) -> None:
+    lens = read_lens(ROOT / "lenses" / "brendel_tessar_100.toml").at(focus_m=np.inf)
+    model = fit_ghosts(lens, GhostSettings(angle_deg=25.0, keep=0.8, rays=2000, target_um=60.0))
+    words = ["brendel_tessar_100", str(write_ghosts(model, tmp_path / "ghosts.onnx")), "--downloads", "glsl"]
+    assert main(["view", *words, "-o", str(tmp_path / "view.html"), "--json"]) == 0
+    opened = Opened(browser, tmp_path / "view.html")
+    opened.set(view="one", tool="lamp", width=WIDE, wavelength=NM, focus=np.inf, most=1)
+    box = opened.page.locator("#picture").bounding_box()
+    assert box is not None
+    opened.page.mouse.move(box["x"] + 0.4 * box["width"], box["y"] + 0.4 * box["height"])
+    opened.page.mouse.down()
+    opened.page.mouse.move(box["x"] + 0.7 * box["width"], box["y"] + 0.3 * box["height"], steps=3)
+    opened.page.mouse.up()
+    opened.page.wait_for_function(f"neurolens.ghosts.shown === {len(model.pairs)}")
+    assert opened.number("neurolens.set.lamp") == pytest.approx([0.7, 0.7], abs=0.01)
+    found = opened.number("Array.from(neurolens.engine.gpu.read(neurolens.ghosts.film))")
+    picture = np.array(found).reshape(HIGH, WIDE, 4)[::-1, :, 1]
+    x, y, z = opened.number("neurolens.ghosts.lamp.towards")
+    rgb = (opened.number("neurolens.set.irradiance"),) * 3
+    light = Light(np.degrees(np.arctan2(x, -z)), np.degrees(np.arcsin(y)), rgb)
+    raster = Raster(tuple(opened.number("neurolens.engine.sides.a.values.film_mm")), WIDE, HIGH)
+    wanted = ghost_picture(model, [light], raster, wavelength_nm=(NM - 1, NM + 1), wavelengths=1, cell_px=4)[0, ..., 1]
+    assert picture.sum() == pytest.approx(wanted.sum(), rel=0.02)
+    coarse = [p.reshape(27, 5, 48, 5).mean((1, 3)) for p in (picture, wanted)]
+    assert np.abs(coarse[0] - coarse[1]).sum() < 0.1 * coarse[1].sum()
+    opened.page.locator("#picture").press("ArrowLeft")
+    opened.page.evaluate("neurolens.idle()")
+    assert opened.number("neurolens.set.lamp[0]") == pytest.approx(0.68, abs=0.01)
+    assert opened.said == []
 
 
 def test_every_control_changes_the_picture(browser: Any, page_file: Path) -> None:

@@ -91,13 +91,14 @@ def test_shaders_compile(view: Path, tmp_path: Path) -> None:
 const data = {json.dumps(data)}, zlib = require("zlib"), fs = require("fs");
 const packed = {json.dumps(dict(re.findall(r'application/gzip" id="([^"]*)">([^<]*)<', text)))};
 const unpacked = (id) => zlib.gunzipSync(Buffer.from(packed[id], "base64")).toString();
-fs.writeFileSync("thin.frag", HEAD + pictureShader(data, data.functions.thin.text, data.functions.thin.call));
+fs.writeFileSync("scene.frag", HEAD + sceneShader(data));
+fs.writeFileSync("thin.frag", HEAD + raysShader(data, data.functions.thin.text, data.functions.thin.call));
 for (const form of data.lenses[0].forms)
-  fs.writeFileSync(form.kind + ".frag", HEAD + pictureShader(data, unpacked(`{LENS}/${{form.kind}}/glsl`), form.call));
+  fs.writeFileSync(form.kind + ".frag", HEAD + raysShader(data, unpacked(`{LENS}/${{form.kind}}/glsl`), form.call));
 """
     subprocess.run([str(NODE), "-e", script], check=True, cwd=tmp_path, capture_output=True)
     files = sorted(tmp_path.glob("*.frag"))
-    assert len(files) == 4
+    assert len(files) == 5
     done = subprocess.run([str(GLSLANG), *map(str, files)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
 

@@ -9,7 +9,7 @@ async function unpack(id) {
   return new Response(stream).text();
 }
 
-/** A form's function for the picture's shader: its state, if any, is uniforms, four numbers each. */
+/** A form's function for the shader of rays: its state, if any, is uniforms, four numbers each. */
 function functionOf(text) {
   const packed = (_, n) => `state_c[${n >> 2}].${"xyzw"[n & 3]}`;
   const count = Number(text.match(/struct \w+_state \{[^}]*float c\[(\d+)\]/)?.[1] ?? 0);
@@ -18,12 +18,16 @@ function functionOf(text) {
   return { count, text: state + own.replace(/state\.c\[(\d+)\]/g, packed).replaceAll("state.inside", "state_inside") };
 }
 
-/** The picture's shader with the function of a lens. */
-function pictureShader({ shaders, functions: { weigh, opened } }, text, call) {
+/** The shader of rays with the function of a lens. */
+function raysShader({ shaders, functions: { weigh, opened } }, text, call) {
   const given = "uniform float film_z, stop_radius, distance_mm, per_depth;\n";
-  const trace = shaders.trace.replace("LENS", call).replace("WEIGH", weigh.call).replace("OPENED", opened.call);
-  const scene = shaders.scene.replaceAll("MOST", MOST_BALLS).replaceAll("DOT", DOT);
-  return given + functionOf(text).text + weigh.text + opened.text + scene + trace;
+  const rays = shaders.rays.replace("LENS", call).replace("WEIGH", weigh.call).replace("OPENED", opened.call);
+  return given + functionOf(text).text + weigh.text + opened.text + shaders.random + rays;
+}
+
+/** The shader of what they meet. */
+function sceneShader({ shaders }) {
+  return shaders.random + shaders.scene.replaceAll("MOST", MOST_BALLS).replaceAll("DOT", DOT);
 }
 
 class Engine {
@@ -31,6 +35,7 @@ class Engine {
     this.gpu = gpu;
     this.shared = shared;
     this.made = new Map(); // programs, texts and numbers by lens and form
+    this.scene = gpu.program(sceneShader(shared));
     this.show = gpu.program(SHOW);
     this.sides = {};
   }
@@ -43,12 +48,12 @@ class Engine {
     return this.once(`${lens.key}/${kind}/text`, () => unpack(`${lens.key}/${kind}/glsl`));
   }
 
-  /** The picture's program of a form, compiled when it is first asked for. */
+  /** The program of a form's rays, compiled when it is first asked for. */
   async program(lens, kind) {
     const key = kind === "thin" ? "thin" : `${lens.key}/${kind}/program`;
     return this.once(key, async () => {
       const { thin } = this.shared.functions, text = kind === "thin" ? thin.text : await this.text(lens, kind);
-      return this.gpu.program(pictureShader(this.shared, text, kind === "thin" ? thin.call : this.form(lens, kind).call));
+      return this.gpu.program(raysShader(this.shared, text, kind === "thin" ? thin.call : this.form(lens, kind).call));
     });
   }
 
@@ -86,7 +91,7 @@ class Engine {
     return { ...numbers, stop_radius: share * numbers.stop_radius_max_mm, state_c, state_inside: +(found[names.length] ?? 1) };
   }
 
-  /** All that the picture's shader takes, but for samples: film, focus, pupil and exposure of one form. */
+  /** All that the shader of rays takes, but for samples: film, focus, pupil and exposure of one form. */
   async setting(lens, kind, set) {
     const reference = lens.forms.find((f) => f.kind === "polynomial") ?? lens.forms[0];
     const placed = await this.numbers(lens, reference.kind, set);
@@ -118,7 +123,7 @@ class Engine {
   async boxes(lens, kind, values) {
     const radius = values.pupil_radius, cells = AIM_FILM - 1;
     if (kind === "thin") return new Float32Array(4 * cells * cells).map((_, i) => radius * (i % 4 < 2 ? -1 : 2));
-    const side = AIM_FILM * AIM_PUPIL, target = this.once("aim", () => this.gpu.target(side, side));
+    const side = AIM_FILM * AIM_PUPIL, target = this.once("aim", () => this.gpu.target(side, side, null, 2));
     const aim = [-radius, -radius, 2 * radius, 2 * radius], step = (2 * radius) / AIM_PUPIL;
     this.run(await this.program(lens, kind), { ...values, task: 1, aim, grid: [AIM_FILM, AIM_PUPIL] }, target);
     const passed = this.gpu.read(target), spans = [];
@@ -127,7 +132,7 @@ class Engine {
       const span = [Infinity, Infinity, -Infinity, -Infinity];
       for (let y = 0; y < AIM_PUPIL; y++)
         for (let x = 0; x < AIM_PUPIL; x++)
-          if (passed[4 * ((cy + y) * side + cx + x)] > 0.5) {
+          if (passed[4 * ((cy + y) * side + cx + x) + 3] > 0) {
             span[0] = Math.min(span[0], x); span[1] = Math.min(span[1], y);
             span[2] = Math.max(span[2], x); span[3] = Math.max(span[3], y);
           }
@@ -150,12 +155,12 @@ class Engine {
   /** Where rays pass and the exposure on the axis, of a form. */
   async aimed(lens, kind, values) {
     const program = await this.program(lens, kind), boxes = await this.boxes(lens, kind, values);
-    const axis = this.once("axis", () => this.gpu.target(AXIS, AXIS));
+    const axis = this.once("axis", () => this.gpu.target(AXIS, AXIS, null, 2));
     const task = { ...values, scale: values.per_distance ** 2, task: 2, aim: [...boxes.subarray(0, 4)], grid: [1, AXIS] };
     this.run(program, task, axis);
     const weights = this.gpu.read(axis);
     let exposure = 0;
-    for (let i = 1; i < weights.length; i += 4) exposure += weights[i] / (AXIS * AXIS);
+    for (let i = 3; i < weights.length; i += 4) exposure += weights[i] / (AXIS * AXIS);
     return { boxes, exposure };
   }
 
@@ -178,7 +183,7 @@ class Engine {
       made[plane] ??= await this.aimed(lens, kind, values);
       const { boxes, exposure } = made[plane], known = this.sides[side] ?? {};
       if (known.boxes) this.gpu.free(known.boxes);
-      values.scale = values.per_distance ** 2 / exposure;
+      Object.assign(values, { scale: values.per_distance ** 2 / exposure, exposure });
       this.sides[side] = { ...known, kind, program: await this.program(lens, kind), values: { ...values, ...scene },
         boxes: this.gpu.target(cells, cells, boxes), samples: 0 };
     }
@@ -186,9 +191,24 @@ class Engine {
   }
 
   run(program, values, target, window = null) {
-    const given = { window: [0, 0, 0, 0], pixels: [1, 1], probe: [0, 0], aim: [0, 0, 1, 1], grid: [1, 1], boxes: null,
-      before: null, sample_number: 0, seed: 0, scale: 1, ...sceneUniforms("night", 1, 1), ...values };
+    const given = { pixels: [1, 1], probe: [0, 0], aim: [0, 0, 1, 1], grid: [1, 1], boxes: null, sample_number: 0, seed: 0,
+      scale: 1, ...values };
     this.gpu.draw(program, given, target, window);
+  }
+
+  /** Rays into what they meet. */
+  meet(values, rays, target, window = null) {
+    const [starts, courses] = rays.textures.map((texture) => ({ texture }));
+    this.gpu.draw(this.scene, { before: null, sample_number: 0, seed: 0, measures: 0, ...values, starts, courses }, target, window);
+  }
+
+  /** Rays of a picture's size, of all sides. */
+  rays(width, height) {
+    if (this.held?.width !== width || this.held.height !== height) {
+      if (this.held) this.gpu.free(this.held);
+      this.held = this.gpu.target(width, height, null, 2);
+    }
+    return this.held;
   }
 
   /** Add a sample to each pixel of a side between the columns `from` and `to`. */
@@ -199,7 +219,11 @@ class Engine {
       Object.assign(s, { film: this.gpu.target(width, height), spare: this.gpu.target(width, height), samples: 0 });
     }
     const given = { ...s.values, task: 0, pixels: [width, height], boxes: s.boxes, before: s.film, sample_number: s.samples, seed: 1 };
-    if (to > from) this.run(s.program, given, s.spare, [from, 0, to - from, height]);
+    const rays = this.rays(width, height), window = [from, 0, to - from, height];
+    if (to > from) {
+      this.run(s.program, given, rays, window);
+      this.meet(given, rays, s.spare, window);
+    }
     [s.film, s.spare] = [s.spare, s.film];
     s.samples++;
   }
@@ -212,15 +236,23 @@ class Engine {
 
   /** Distance (m, from the film along the axis) of what a place of the picture shows; Infinity for the sky. */
   distance(side, place) {
-    const s = this.sides[side], target = this.once("probe", () => this.gpu.target(1, 1));
-    this.run(s.program, { ...s.values, task: 3, probe: place, boxes: s.boxes }, target);
+    const s = this.sides[side], target = this.once("probe", () => this.gpu.target(1, 1)), ray = this.once("ray", () => this.gpu.target(1, 1, null, 2));
+    this.run(s.program, { ...s.values, task: 3, probe: place, boxes: s.boxes }, ray);
+    this.meet({ ...s.values, measures: 1 }, ray, target);
     const far = this.gpu.read(target)[0];
     return far > 0 && far < 1e6 ? far : Infinity;
   }
 
+  /** The direction, in the camera's frame, that a place of the picture looks in. */
+  direction(side, place) {
+    const s = this.sides[side], ray = this.once("ray", () => this.gpu.target(1, 1, null, 2));
+    this.run(s.program, { ...s.values, task: 3, probe: place, boxes: s.boxes }, ray);
+    return [...this.gpu.read(ray, 0, 0, 1, 1, 1).subarray(0, 3)];
+  }
+
   /** Nanoseconds a ray of a side's lens: its function and weight, no scene; the least of some runs. */
   cost(side) {
-    const s = this.sides[side], target = this.once("bench", () => this.gpu.target(FREE_BENCH, FREE_BENCH));
+    const s = this.sides[side], target = this.once("bench", () => this.gpu.target(FREE_BENCH, FREE_BENCH, null, 2));
     const given = { ...s.values, task: 2, scale: s.values.per_distance ** 2, aim: [0, 0, 1, 1], grid: [1, FREE_BENCH] };
     let best = Infinity, repeats = 1;
     for (let turn = 0; turn < 6; turn++) {
@@ -234,18 +266,18 @@ class Engine {
     return (best * 1e6) / FREE_BENCH ** 2;
   }
 
-  /** Show sides on the canvas: `view` is "one", "wipe" or "difference". */
-  paint(view, wipe, gain) {
+  /** Show sides on the canvas: `view` is "one", "wipe" or "difference"; ghosts are added to both. */
+  paint(view, wipe, gain, ghosts = null) {
     const { a, b } = this.sides, other = b?.film ? b : a;
     this.gpu.draw(this.show, { a: a.film, b: other.film, counts: [a.samples, other.samples],
-      view: ["one", "wipe", "difference"].indexOf(view), wipe, gain }, null);
+      view: ["one", "wipe", "difference"].indexOf(view), wipe, gain, ghosts, flared: +!!ghosts }, null);
   }
 }
 
 const SHOW = `
-uniform sampler2D a, b;
+uniform sampler2D a, b, ghosts;
 uniform vec2 counts;
-uniform int view;
+uniform int view, flared;
 uniform float wipe, gain;
 out vec4 result;
 vec3 mapped(vec3 x) {
@@ -257,6 +289,7 @@ void main() {
   vec3 left = texelFetch(a, at, 0).rgb / counts.x, right = texelFetch(b, at, 0).rgb / counts.y;
   float edge = floor(wipe * float(textureSize(a, 0).x));
   vec3 seen = view == 1 && float(at.x) >= edge ? right : left;
+  if (flared == 1) seen += texelFetch(ghosts, at, 0).rgb;
   if (view == 2) { result = vec4(mapped(1000.0 * abs(left - right)), 1.0); return; }
   result = vec4(mapped(gain > 1.0 ? 1.0 - exp(-gain * seen) : seen), 1.0); // of the night, lights keep their colour
 }`;

@@ -11,11 +11,10 @@ class Gpu {
     gl.bindVertexArray(gl.createVertexArray());
   }
 
-  /** A program over the whole viewport; throws with the compiler's words. */
-  program(fragment) {
+  /** A program, over the whole viewport unless it has a vertex shader; throws with the compiler's words. */
+  program(fragment, vertex = VERTEX) {
     const gl = this.gl, program = gl.createProgram();
-    const vertex = "#version 300 es\nvoid main() { gl_Position = vec4(gl_VertexID == 1 ? 3 : -1, gl_VertexID == 2 ? 3 : -1, 0, 1); }";
-    for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, HEAD + fragment]]) {
+    for (const [kind, text] of [[gl.VERTEX_SHADER, HEAD + vertex], [gl.FRAGMENT_SHADER, HEAD + fragment]]) {
       const shader = gl.createShader(kind);
       gl.shaderSource(shader, text);
       gl.compileShader(shader);
@@ -34,26 +33,29 @@ class Gpu {
     return { program, uniforms };
   }
 
-  /** A texture of floats that can be drawn into. */
-  target(width, height, data = null) {
-    const gl = this.gl, texture = gl.createTexture();
-    gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, width, height, 0, gl.RGBA, gl.FLOAT, data);
-    for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, key, gl.NEAREST);
-    for (const key of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, key, gl.CLAMP_TO_EDGE);
-    const frame = gl.createFramebuffer();
+  /** Textures of floats that are drawn into at once, `data` in the first; light adds up in those of `half` precision. */
+  target(width, height, data = null, count = 1, half = false) {
+    const gl = this.gl, frame = gl.createFramebuffer(), textures = [];
     gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
-    return { texture, frame, width, height };
+    for (let k = 0; k < count; k++) {
+      textures.push(gl.createTexture());
+      gl.bindTexture(gl.TEXTURE_2D, textures[k]);
+      gl.texImage2D(gl.TEXTURE_2D, 0, half ? gl.RGBA16F : gl.RGBA32F, width, height, 0, gl.RGBA, gl.FLOAT, k ? null : data);
+      for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, key, gl.NEAREST);
+      for (const key of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, key, gl.CLAMP_TO_EDGE);
+      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + k, gl.TEXTURE_2D, textures[k], 0);
+    }
+    gl.drawBuffers(textures.map((_, k) => gl.COLOR_ATTACHMENT0 + k));
+    return { texture: textures[0], textures, frame, width, height };
   }
 
   free(target) {
-    this.gl.deleteTexture(target.texture);
+    for (const texture of target.textures) this.gl.deleteTexture(texture);
     this.gl.deleteFramebuffer(target.frame);
   }
 
   /** Run a program; `target` null is the canvas, `window` [x, y, width, height] the part that is drawn. */
-  draw({ program, uniforms }, values, target, window = null) {
+  draw({ program, uniforms }, values, target, window = null, vertices = 3) {
     const gl = this.gl;
     gl.useProgram(program);
     let unit = 0;
@@ -75,16 +77,18 @@ class Gpu {
     gl.viewport(0, 0, width, height);
     if (window) gl.scissor(...window);
     gl[window ? "enable" : "disable"](gl.SCISSOR_TEST);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.drawArrays(gl.TRIANGLES, 0, vertices);
   }
 
   /** The floats of a part of a target, four a pixel, rows from below. */
-  read(target, x = 0, y = 0, width = target.width, height = target.height) {
+  read(target, x = 0, y = 0, width = target.width, height = target.height, which = 0) {
     const gl = this.gl, data = new Float32Array(4 * width * height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.frame);
+    gl.readBuffer(gl.COLOR_ATTACHMENT0 + which);
     gl.readPixels(x, y, width, height, gl.RGBA, gl.FLOAT, data);
     return data;
   }
 }
 
+const VERTEX = "void main() { gl_Position = vec4(gl_VertexID == 1 ? 3 : -1, gl_VertexID == 2 ? 3 : -1, 0, 1); }";
 const HEAD = "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler2D;\n";

@@ -3,8 +3,8 @@ const $ = (id) => document.getElementById(id);
 const shared = JSON.parse($("data").textContent);
 const NAMES = { exact: "exact", polynomial: "polynomial", network: "network", thin: "thin lens" };
 const set = { lens: shared.lenses[0], scene: "night", view: "wipe", a: "", b: "", tool: "focus", wipe: 0.5, focus: 1, f_number: 1,
-  zoom: 0, blades: 0, roundness: 0, rotation: 0, wavelength: 0, width: 480, most: 256, clicked: null };
-let engine, layout, turn = 0, busy = Promise.resolve(), begun = performance.now();
+  zoom: 0, blades: 0, roundness: 0, rotation: 0, wavelength: 0, width: 480, most: 256, clicked: null, lamp: null, irradiance: 0.5 };
+let engine, layout, ghosts, turn = 0, busy = Promise.resolve(), begun = performance.now();
 const log = (low, high, share) => low * (high / low) ** share;
 const share = (low, high, value) => Math.log(value / low) / Math.log(high / low);
 
@@ -22,7 +22,9 @@ const focusEnds = () => [set.lens.nearest_m, Math.max(100 * set.lens.nearest_m, 
 function chooseLens(lens) {
   const kinds = lens.forms.map((f) => f.kind), best = ["polynomial", "network", "exact"].find((k) => kinds.includes(k));
   const last = kinds.includes("exact") && best !== "exact" ? "exact" : kinds.find((k) => k !== best) ?? "thin";
-  Object.assign(set, { lens, a: kinds.includes(set.a) || set.a === "thin" ? set.a : best, clicked: null });
+  Object.assign(set, { lens, a: kinds.includes(set.a) || set.a === "thin" ? set.a : best, clicked: null, lamp: null });
+  if (!lens.ghosts && set.tool === "lamp") set.tool = "focus";
+  $("lamp-tool").hidden = !lens.ghosts;
   if (!kinds.includes(set.b) && set.b !== "thin") set.b = last;
   [set.zoom] = zoomEnds();
   set.f_number = wideOf(lens, set.zoom);
@@ -52,6 +54,11 @@ function say() {
   $("blades-said").value = set.blades || "round";
   $("roundness-said").value = `${Math.round(100 * set.roundness)} %`;
   $("light-said").value = set.wavelength ? `${set.wavelength} nm, in grey` : "white";
+  $("lamp-row").hidden = set.tool !== "lamp";
+  $("lamp").value = Math.log10(set.irradiance);
+  $("lamp-said").value = `as ${set.irradiance.toPrecision(2)} sr of white`;
+  $("lamp-mark").hidden = !set.lamp;
+  if (set.lamp) Object.assign($("lamp-mark").style, { left: `${100 * set.lamp[0]}%`, top: `${100 * (1 - set.lamp[1])}%` });
   $("wipe-line").hidden = set.view !== "wipe";
   $("wipe-line").style.left = `${100 * set.wipe}%`;
   $("left-name").textContent = set.view === "difference" ? `|${NAMES[set.a]} − ${NAMES[set.b]}| × 1000` : NAMES[set.a];
@@ -104,8 +111,9 @@ function show() {
   say();
   busy = busy.then(async () => {
     if (mine !== turn) return;
-    const { far, unit } = framing(), scene = sceneUniforms(set.scene, far, unit);
-    await engine.prepare(set.lens, set.view === "one" ? { a: set.a } : { a: set.a, b: set.b }, set, scene);
+    const { far, unit } = framing(), sides = set.view === "one" ? { a: set.a } : { a: set.a, b: set.b };
+    await engine.prepare(set.lens, sides, set, sceneUniforms(set.scene, far, unit));
+    await flare(far, unit, sides);
     pass();
     set.shown_ms = performance.now() - begun;
     facts();
@@ -113,6 +121,26 @@ function show() {
     if (set.clicked && set.tool === "rays") await rays();
   }).catch(fail);
   return busy;
+}
+
+/** The lamp and its ghosts: those that were drawn before at once, further ones with the next frames. */
+async function flare(far, unit, sides) {
+  ghosts.shown = 0;
+  if (!set.lamp) return;
+  const lamp = { towards: engine.direction("a", set.lamp), irradiance: set.irradiance };
+  await engine.prepare(set.lens, sides, set, sceneUniforms(set.scene, far, unit, lamp));
+  const { width } = set, known = ghosts.known.get(set.lens) ?? 1;
+  Object.assign(ghosts, { lamp, shown: known, all: await ghosts.draw(set.lens, engine.sides.a, lamp.towards, lamp.irradiance, width, (width * 9) / 16, known) });
+}
+
+/** One more ghost, until all are drawn. */
+async function moreGhosts() {
+  const { width } = set, { lamp, shown } = ghosts;
+  if (!shown || shown >= ghosts.all) return;
+  ghosts.shown = shown + 1;
+  ghosts.known.set(set.lens, Math.max(ghosts.known.get(set.lens) ?? 1, shown + 1));
+  await ghosts.draw(set.lens, engine.sides.a, lamp.towards, lamp.irradiance, width, (width * 9) / 16, shown + 1);
+  paint();
 }
 
 /** One more sample of what is seen, and on the canvas. */
@@ -132,9 +160,10 @@ function sample() {
 
 function paint() {
   if (!engine.sides.a?.film) return;
-  engine.paint(set.view, set.wipe, set.scene === "night" ? 1.8 : 1);
-  const { samples } = engine.sides.a;
-  $("said").textContent = `${samples} of ${set.most} samples a pixel`;
+  engine.paint(set.view, set.wipe, set.scene === "night" ? 1.8 : 1, ghosts.shown ? ghosts.film : null);
+  const { samples } = engine.sides.a, { lens } = set;
+  const flared = !set.lamp ? "" : ghosts.all ? `; ${ghosts.shown} of ${ghosts.all} ghosts, which have ${(100 * lens.ghosts.light).toFixed(1)} % of all ghosts' light, at the focus of their fit` : "; no ghosts are fitted for a lamp so far from the axis";
+  $("said").textContent = `${samples} of ${set.most} samples a pixel${flared}`;
 }
 
 let fence = null, issued = 0, passes = 1;
@@ -148,6 +177,7 @@ function frame(now) {
     fence = null;
     passes = now - issued < 20 ? Math.min(16, passes + 1) : now - issued > 40 ? Math.max(1, passes >> 1) : passes;
   }
+  if (side?.film && ghosts.shown && ghosts.shown < ghosts.all) busy = busy.then(moreGhosts).catch(fail);
   if (!side?.film || set.still || side.samples >= set.most) return;
   for (let k = 0; k < passes && side.samples < set.most; k++) sample();
   paint();
@@ -168,6 +198,7 @@ async function rays() {
 async function click(place) {
   set.clicked = place;
   if (set.tool === "rays") { say(); return rays(); }
+  if (set.tool === "lamp") { set.lamp = place; set.clicked = null; return show(); }
   const side = set.view === "wipe" && place[0] > set.wipe ? "b" : "a";
   const far = engine.distance(side, place), [near] = focusEnds();
   set.focus = Number.isFinite(far) ? Math.max(near, far) : Infinity;
@@ -201,6 +232,7 @@ function listen() {
   on("blades", (v) => (set.blades = +v < 3 ? 0 : +v));
   on("roundness", (v) => (set.roundness = +v));
   on("light", (v) => (set.wavelength = +v < 400 ? 0 : +v));
+  on("lamp", (v) => (set.irradiance = 10 ** +v));
   on("size", (v) => (set.width = +v));
   $("most").addEventListener("input", () => (set.most = +$("most").value));
   for (const name of ["scene", "view", "tool"])
@@ -211,13 +243,18 @@ function listen() {
     return [(event.clientX - box.left) / box.width, 1 - (event.clientY - box.top) / box.height].map((v) => Math.min(0.9999, Math.max(0, v)));
   };
   $("picture").addEventListener("click", (event) => click(place(event)));
+  $("picture").addEventListener("pointermove", (event) => { if (set.tool === "lamp" && event.buttons) { event.preventDefault(); click(place(event)); } });
   const line = $("wipe-line");
   line.addEventListener("pointerdown", (event) => line.setPointerCapture(event.pointerId));
   line.addEventListener("pointermove", (event) => { if (line.hasPointerCapture(event.pointerId)) { [set.wipe] = place(event); show(); } });
   $("picture").addEventListener("keydown", (event) => {
-    const step = event.shiftKey ? 0.1 : 0.02, at = set.clicked ?? [0.5, 0.5];
+    const step = event.shiftKey ? 0.1 : 0.02, lamp = set.tool === "lamp", at = (lamp ? set.lamp : set.clicked) ?? [0.5, 0.5];
     const moves = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] }[event.key];
-    if (moves) { set.clicked = at.map((v, k) => Math.min(0.9999, Math.max(0, v + moves[k]))); say(); }
+    if (moves) {
+      const to = at.map((v, k) => Math.min(0.9999, Math.max(0, v + moves[k])));
+      if (lamp) click(to);
+      else { set.clicked = to; say(); }
+    }
     else if (event.key === "Enter") click(at);
     else if (event.key === "[" || event.key === "]") { set.wipe = Math.min(1, Math.max(0, set.wipe + (event.key === "[" ? -step : step))); show(); }
     else return;
@@ -245,6 +282,7 @@ async function begin() {
     return fail(error);
   }
   layout = new LayoutView($("layout"), engine);
+  ghosts = Object.assign(new GhostView(engine), { shown: 0, all: 0, known: new Map() });
   chooseLens(set.lens);
   listen();
   await show();
@@ -252,4 +290,4 @@ async function begin() {
 }
 
 // For tests and the curious.
-window.neurolens = { set, show, pass, idle: () => busy, click, measure, framing, chooseLens, shared, sceneUniforms, ready: begin(), get engine() { return engine; }, get layout() { return layout; } };
+window.neurolens = { set, show, pass, idle: () => busy, click, measure, framing, chooseLens, shared, sceneUniforms, ready: begin(), get engine() { return engine; }, get layout() { return layout; }, get ghosts() { return ghosts; } };
