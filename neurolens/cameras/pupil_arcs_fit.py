@@ -358,7 +358,7 @@ def _random(sight: Sight, arcs: PupilArcs, seed: int) -> tuple[dict[str, Array],
     azimuth = np.zeros(count)
     if sight.anamorphic:
         azimuth, pupil[1] = np.pi / 2 * rng.random(count), pupil[1] * rng.choice([-1.0, 1.0], count)
-    place = turned(np.stack([radius, 0 * radius]), azimuth)
+    place: Array = turned(np.stack([radius, 0 * radius]), azimuth).astype(np.float64)
     x, y = place * [[1.0], [arcs.squeeze]]
     radius, azimuth = np.hypot(x, y), np.arctan2(y, x)
     given |= {"film_mm": place, "film_z_mm": film_z[None], "wavelength_nm": nm[None]}
