@@ -179,7 +179,7 @@ def test_at_least_95_percent_of_rays_pass() -> None:
     [
         pytest.param("phone_lens_6.ols-64", 0.95, marks=pytest.mark.slow),
         pytest.param("muller_fisheye_100.ols-64", 0.95, marks=pytest.mark.slow),
-        pytest.param("panavision_anamorphic_zoom_21.ols-64", 0.92, marks=pytest.mark.slow),
+        pytest.param("panavision_anamorphic_zoom_21.ols-64", 0.9, marks=pytest.mark.slow),
     ],
 )
 def test_pupils_of_high_order_pass_and_keep_the_light(name: str, least: float) -> None:
