@@ -147,7 +147,7 @@ def measure_case(case: Case, folder: Path, report: Report) -> dict[str, Any]:
             row[f"cost_{target}"] = choice.cost if math.isfinite(choice.cost) else None
             if "px" not in row and row["plan_px"] <= _TRIED_PX:
                 camera = camera_of(choice, found, case.state)
-                apart, light = plan_errors.by_rays(camera, fresh.places, fresh.seen, found.asked.pixel_mm)
+                apart, light = plan_errors.by_rays(camera, exact, places, fresh.seen, asked.pixel_mm, BUDGETS)
                 row |= {"px": _counted(apart), "light": _counted(light)}
         for budget in BUDGETS:
             best = plans.decided(found, picks, budget, target).best

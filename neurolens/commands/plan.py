@@ -56,20 +56,16 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--lens", metavar="LENS", required=True, help="lens file (.toml), or a name in lenses/")
     parser.add_argument(
         "--budget", metavar="BUDGET", type=_budget, default=0.25,
-        help="error allowed, as 0.25px (default); or time, as 20s: of one thread, for the scene's size and samples, "
-        "for which the most faithful camera is chosen",
+        help="error allowed, as 0.25px (default); or as 0.02flip: mean FLIP of strips of the picture, at its own "
+        "pixels; or time, as 20s: of one thread, for the scene's size and samples, for which the most faithful camera "
+        "is chosen",
     )  # fmt: skip
     parser.add_argument(
         "--for", dest="target", choices=TARGETS, default="render",
         help="what runs the camera: our renderer, compiled C, onnxruntime, Blender's Cycles (osl), or a renderer in "
         "GLSL (default: render)",
     )  # fmt: skip
-    parser.add_argument(
-        "--comp", metavar="EFFECTS", type=_afterwards, default=(), dest="afterwards",
-        help="what compositing makes of the picture later, distortion (with its light, by an ST map), defocus or both "
-        "with a comma: the camera is held against the lens without it",
-    )  # fmt: skip
-    parser.add_argument("--denoise", action="store_true", help="noise is taken out later: charge no camera for it")
+    add_look(parser)
     parser.add_argument("--explain", action="store_true", help="time and list every camera tried")
     parser.add_argument(
         "--samples", action="store_true",
@@ -86,8 +82,35 @@ def add_parser(subparsers: Any) -> None:
     parser.set_defaults(run=run, kept="models fitted so far are kept, the plan is not written")
 
 
+def add_look(parser: argparse.ArgumentParser) -> None:
+    """Add --comp, --denoise and --zoom."""
+    parser.add_argument(
+        "--comp", metavar="EFFECTS", type=_afterwards, default=(), dest="afterwards",
+        help="what compositing makes of the picture later, distortion (with its light, by an ST map), defocus or both "
+        "with a comma: the camera is held against the lens without it",
+    )  # fmt: skip
+    parser.add_argument("--denoise", action="store_true", help="noise is taken out later: charge no camera for it")
+    parser.add_argument(
+        "--zoom", metavar="STATE", help="state of the lens by name, or a focal length in mm between its states"
+    )
+
+
+def look_of(args: argparse.Namespace) -> dict[str, Any]:
+    """What `add_look` added, as arguments of `evaluate.probe.probe`."""
+    return {"afterwards": args.afterwards, "denoised": args.denoise, "zoom": args.zoom}
+
+
+def shipped_models(file: Path, zoom: str | None) -> list[Path]:
+    """Of a lens file, or of a state of its zoom."""
+    return sorted((library() / "models").glob(f"{file.stem if zoom is None else f'{file.stem}-{zoom}'}.*.onnx"))
+
+
 class Seconds(float):
     """A budget of time."""
+
+
+class Flip(float):
+    """A budget of what is seen."""
 
 
 def pixels(text: str) -> float:
@@ -98,7 +121,9 @@ def pixels(text: str) -> float:
 def _budget(text: str) -> float:
     if text.endswith("s"):
         return Seconds(_number(text, "s", "seconds, as 20s"))
-    return _number(text, "px", "pixels, as 0.25px, or seconds, as 20s")
+    if text.endswith("flip"):
+        return Flip(_number(text, "flip", "FLIP, as 0.02flip"))
+    return _number(text, "px", "pixels, as 0.25px, FLIP, as 0.02flip, or seconds, as 20s")
 
 
 def _number(text: str, unit: str, expected: str) -> float:
@@ -122,25 +147,30 @@ def run(args: argparse.Namespace) -> int:
     """Plan, write, print; 1 where no camera for this target is within the budget."""
     from neurolens.evaluate.plan import plan
     from neurolens.evaluate.plots import plot_effects
-    from neurolens.evaluate.trade import plan_within
+    from neurolens.evaluate.trade import plan_seen, plan_within
     from neurolens.optics.lensfile import read_lens
     from neurolens.render.scene import load_scene
 
     file = lens_path(args.lens, "plan")
-    lens = read_lens(file).at()
+    lens = read_lens(file)
     scene = load_scene(args.scene)
     folder = args.output or Path("runs") / f"plan-{scene.name}-{file.stem}"
     if folder.exists() and not folder.is_dir():
         raise InputError("neurolens plan", "-o", str(folder), "a folder")
-    shipped = sorted((library() / "models").glob(f"{file.stem}.*.onnx"))
+    shipped = shipped_models(file, args.zoom)
     if args.frames is not None:
+        if args.zoom is not None or isinstance(args.budget, (Seconds, Flip)):
+            expected = "a budget in pixels, and the zoom as a key, with --frames"
+            raise InputError("neurolens plan", "--budget, --zoom", f"{args.budget:g}, {args.zoom}", expected)
         return run_plan_frames(args, file, shipped, folder)
     progress = Progress({"plan": 10} | ({"map of samples": 2} if args.samples else {}), quiet=args.quiet)
     with progress.stage("plan") as report:
-        look: dict[str, Any] = {"afterwards": args.afterwards, "denoised": args.denoise, "report": report}
+        look: dict[str, Any] = {**look_of(args), "report": report}
         look |= {"target": args.target, "models": shipped, "folder": folder / "models" if args.fit else None}
         if isinstance(args.budget, Seconds):
             found = plan_within(scene, lens, args.budget, **look)
+        elif isinstance(args.budget, Flip):
+            found = plan_seen(scene, lens, args.budget, **look)
         else:
             found = plan(scene, lens, args.budget, explain=args.explain, **look)
     folder.mkdir(parents=True, exist_ok=True)
@@ -206,12 +236,16 @@ def _text(args: argparse.Namespace, found: Plan, folder: Path) -> str:
     best = found.best
     if best is None and found.budget_s is not None:
         parts.append(f"No camera for --for {found.target} takes {found.budget_s:g} s.")
+    elif best is None and found.budget_flip is not None:
+        parts.append(f"No camera for --for {found.target} keeps a FLIP of {found.budget_flip:g}.")
     elif best is None:
         nearest = min(found.choices, key=lambda c: c.error_px, default=None)
         closest = f"; the closest is {nearest.name} with {number(nearest.error_px, 3)} px" if nearest else ""
         parts.append(f"No camera for --for {found.target} keeps {found.budget_px:g} px{closest}.")
     else:
         allowed = f"within {found.budget_s:g} s" if found.budget_s is not None else f"of {found.budget_px:g}"
+        if found.budget_flip is not None:
+            allowed = f"FLIP {number(best.flip, 2)} of {found.budget_flip:g}"
         told = f"Use {best.name}: {number(best.error_px, 3)} px {allowed}, {number(best.cost, 3)} "
         told += f"{found.unit} a ray times noise"
         parts.append("\n".join([f"{told}{', ' + best.how if best.how else ''}", *_commands(args, found, best, folder)]))
@@ -222,12 +256,18 @@ def _text(args: argparse.Namespace, found: Plan, folder: Path) -> str:
 def _commands(args: argparse.Namespace, found: Plan, best: Choice, folder: Path) -> list[str]:
     """How the camera is made where the target runs it; ideal cameras are everybody's own."""
     ideal = best.camera.startswith(("pinhole:", "thin:", "thick:"))
-    words = ["neurolens", "render", str(args.scene), "--camera", f"{folder}/plan.toml", "-o", "render.exr"]
+    lens = found.probed.lens
+    model, shape = best.camera.endswith(".onnx"), lens.aperture
+    state = ["--zoom", args.zoom] if args.zoom is not None and not model else []
+    words = ["neurolens", "render", str(args.scene), "--camera", f"{folder}/plan.toml", *state, "-o", "render.exr"]
+    if model and shape is not None and shape.blades:  # models have none of their own
+        words += ["--blades", f"{shape.blades}", "--blade-rotation", f"{shape.rotation_deg:g}"]
+        words += ["--blade-curvature", f"{shape.curvature:g}"]
     if found.target != "render":
         if ideal or found.target == "onnx":
             return []
         language, asked = found.target, found.asked
-        words = ["neurolens", "export", f"{folder}/plan.toml", "--to", language, "-o", f"camera.{language}"]
+        words = ["neurolens", "export", f"{folder}/plan.toml", "--to", language, *state, "-o", f"camera.{language}"]
         if language != "osl":  # whose inputs they are
             film, focus = "x".join(f"{v:g}" for v in asked.film_mm), f"{asked.focus_m:g}"
             words[3:3] = ["--camera", "--film", film, "--focus", focus, "--f-number", f"{asked.f_number:.6g}"]

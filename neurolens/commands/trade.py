@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_write_text, library
+from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_glass, add_json, lens_path, whole
 from neurolens.commands.output import answer, number, table
-from neurolens.commands.plan import TARGETS, pixels
+from neurolens.commands.plan import TARGETS, add_look, look_of, pixels, shipped_models
 from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
@@ -54,6 +54,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "--samples", metavar="N", type=whole(1, 4096), default=16, help="a pixel of the small pictures (default: 16)"
     )
+    add_look(parser)
     parser.add_argument("--no-fit", dest="fit", action="store_false", help="fit nothing for the shot")
     parser.add_argument("-o", "--output", metavar="FOLDER", type=Path, help="default: runs/trade-SCENE-LENS")
     add_glass(parser)
@@ -70,15 +71,14 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.render.scene import load_scene
 
     file = lens_path(args.lens, "trade")
-    lens, scene = read_lens(file).at(), load_scene(args.scene)
+    lens, scene = read_lens(file), load_scene(args.scene)
     folder = args.output or Path("runs") / f"trade-{scene.name}-{file.stem}"
     if folder.exists() and not folder.is_dir():
         raise InputError("neurolens trade", "-o", str(folder), "a folder")
-    shipped = sorted((library() / "models").glob(f"{file.stem}.*.onnx"))
     with Progress({"trade": 30}, quiet=args.quiet).stage("trade") as report:
         found = trade(
-            scene, lens, args.budget, target=args.target, models=shipped, samples=args.samples, report=report,
-            folder=folder / "models" if args.fit else None,
+            scene, lens, args.budget, target=args.target, models=shipped_models(file, args.zoom), report=report,
+            samples=args.samples, folder=folder / "models" if args.fit else None, **look_of(args),
         )  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)
     title = f"{scene.name} through {lens.name}"

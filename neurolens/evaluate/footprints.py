@@ -13,7 +13,7 @@ rays, and holds what a picture shows: place, size and shape of the blur, and of 
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -53,6 +53,11 @@ class Places:
     to_film: Array
     wavelength_nm: Array
     share: Array
+
+    def at(self, index: NDArray[np.intp]) -> Places:
+        """Some of the places."""
+        each = ("film_mm", "distance_m", "origin_m", "direction", "across", "to_film")
+        return replace(self, **{name: getattr(self, name)[..., index] for name in each})
 
 
 @dataclass(frozen=True)

@@ -148,9 +148,9 @@ def _highlights(camera: Any, seen: Glance, known: list[Light]) -> list[Light]:
     if not threshold > 0 or not (seen.rgb.max(-1) >= threshold).any():
         return []
     focus = float(camera.settings.get("focus_m") or math.inf)
-    found = highlights(
-        seen.rgb.astype(np.float32), field_of(camera, focus, "equidistant"), camera.film_mm, threshold, _MOST_LIGHTS
-    )
+    middle = float((seen.wavelength_nm * seen.share).sum())  # one tells where they are
+    field = field_of(camera, focus, "equidistant", spectrum=(np.array([middle]), np.ones(1)))
+    found = highlights(seen.rgb.astype(np.float32), field, camera.film_mm, threshold, _MOST_LIGHTS)
     near = math.cos(math.radians(_NEAR_DEG + 45 / ACROSS))
     return [a for a in found.lights if all(float(a.towards @ b.towards) < near for b in known)]
 

@@ -12,10 +12,11 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -52,8 +53,10 @@ from neurolens.render.scene import Scene
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import fit_model, prepare
+from neurolens.surrogates.fits.planes import fit_planes
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.settings import ModelSettings
+from neurolens.surrogates.targets import Prepared
 
 Target = Literal["render", "c", "onnx", "osl", "glsl"]
 Cost = Callable[[], tuple[float, float]]  # of a ray, and noise
@@ -63,6 +66,8 @@ _EXACT, _IDEAL = "exact", ("pinhole", "thin", "thick")
 _MAPPED = " + ST map"  # after the name of an ideal camera
 _SHOT = "fitted for this shot"
 _FIT = ModelSettings("ols", planes=False, elimination=False, idle_gates=IDLE)
+_FIT_MIRROR = replace(_FIT, degree=5)  # of lenses with cylinders: more candidates cost ten times, for the same errors
+_MOVED_TERMS = 16, 22  # from so many on, planes are searched: once, for the second number
 _FOCUS_SPARE = 0.25  # of a pixel of blur: what a model may place its film beside the lens's
 _PAIRS = PairSettings(train=5000, held_out=1000, rim=5000)
 _MOST_OVERSCAN = 4.0  # of a plane picture that is warped afterwards
@@ -77,7 +82,7 @@ class Choice:
             where it has no light that the lens has. cost: of a ray, in the plan's unit, times `noise`; inf where it was
             not asked for. noise: how many times the rays it needs for equal error, see `costs`.
         how: what else it needs, or how it was made. within: whether it meets the budget of its plan.
-        settings: of a model that was fitted for the shot.
+        settings: of a model that was fitted for the shot. flip: of its picture, where a budget of FLIP asked for it.
     """
 
     name: str
@@ -89,6 +94,7 @@ class Choice:
     how: str = ""
     within: bool = False
     settings: ModelSettings | None = None
+    flip: float | None = None
 
     def meets(self, budget_px: float) -> bool:
         """Whether it may be used."""
@@ -100,7 +106,8 @@ class Plan:
     """What was asked, the effects in falling order of worth, every camera tried by rising cost, the one to use.
 
     Attributes:
-        budget_s: seconds of a plan for a time, whose `budget_px` is then the error of the best camera.
+        budget_s, budget_flip: seconds, or FLIP difference, of a plan for those, whose `budget_px` is then the error of
+            the best camera.
         unit: of costs: "ns" or, where no time is known, "operations". domain: of models that are fitted.
     """
 
@@ -114,6 +121,7 @@ class Plan:
     choices: tuple[Choice, ...]
     best: Choice | None
     probed: Probed
+    budget_flip: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able: what is above `probed`."""
@@ -130,15 +138,15 @@ class Plan:
         camera, title = f"{kind}{colon}{os.path.relpath(path, folder)}", f"{lens.name}: {best.name}"
         if best.settings is None:
             return format_toml({"title": title, "camera": camera})
-        choice = LensChoice(Path(os.path.relpath(lens.path, folder)), f_number=self.asked.f_number)
+        file, asked = Path(os.path.relpath(lens.path, folder)), self.asked
+        choice = LensChoice(file, configuration=asked.zoom, f_number=asked.f_number)
         checks = EvaluationChoice(vignetting_rays=50_000, rounds=0, compile_exact=False)
         return to_toml(Experiment(title, choice, (best.settings,), self.domain, _PAIRS, checks, camera=camera))
 
 
 def plan(
     scene: Scene, lens: Lens, budget_px: float, *, target: Target = "render", models: Sequence[Path] = (),
-    folder: Path | None = None, explain: bool = False, afterwards: Collection[str] = (), denoised: bool = False,
-    report: Report | None = None,
+    folder: Path | None = None, explain: bool = False, report: Report | None = None, **look: Any,
 ) -> Plan:  # fmt: skip
     """The cheapest camera for a scene whose error stays within a budget.
 
@@ -148,14 +156,14 @@ def plan(
             a renderer in GLSL.
         models: exported models of this lens to try. folder: where models fitted for the shot go; None fits none.
         explain: whether cameras beyond the budget are compiled and timed, too; else their cost is infinite.
-        afterwards, denoised: what is made of the picture later, see `probe`.
+        look: further arguments of `probe`: zoom, and what is made of the picture later.
 
     Raises:
         InputError: a budget that is negative or no number; as `probe`.
     """
     if not budget_px >= 0:
         raise InputError("plan", "budget_px", budget_px, "0 or more pixels")
-    found = probe(scene, lens, afterwards=afterwards, denoised=denoised)
+    found = probe(scene, lens, **look)
     tried = candidates(found, (budget_px,), target, models=models, folder=folder, explain=explain, report=report)
     return decided(found, tried, budget_px, target)
 
@@ -233,7 +241,8 @@ class _Trial:
     def shader(self, file: str | Path) -> tuple[float, float]:
         """Of the shader of a model or a lens."""
         asked = self.found.asked
-        lens = lens_of(Path(file), None, lambda done, left=None: None)[1]
+        state = asked.zoom if str(file) == self.found.lens.path else None  # models are of one
+        lens = lens_of(Path(file), state, lambda done, left=None: None)[1]
         return shader_cost(lens, self.found.places, asked.film_mm, asked.f_number, asked.focus_m)
 
 
@@ -254,10 +263,10 @@ def camera_of(found: Probed, choice: Choice) -> Camera:
 
 
 def _real(found: Probed) -> dict[str, Any]:
-    """The shot as cameras of lenses take it."""
+    """The shot as cameras of models take it."""
     asked = found.asked
     shot = {"film_mm": asked.film_mm, "focus_m": asked.focus_m, "f_number": asked.f_number}
-    return {**shot, "wavelength_nm": asked.wavelength_nm}
+    return {**shot, "wavelength_nm": asked.wavelength_nm, "aperture": found.lens.aperture}
 
 
 def _ideal(trial: _Trial) -> Iterator[Choice]:
@@ -348,14 +357,19 @@ def shot_fits(
     lens, domain, choice = found.lens.with_aperture(None), found.domain, choice or shot_domain(found)
     with suppress(InputError):  # a lens that goes no nearer
         domain = domain_of(lens, **asdict(choice))
-    prepared = prepare(make_pairs(lens, domain, _PAIRS))
+    plain, model = prepare(make_pairs(lens, domain, _PAIRS)), _FIT_MIRROR if lens.anamorphic else _FIT
     folder.mkdir(parents=True, exist_ok=True)
 
+    @cache
+    def moved() -> Prepared:  # the planes of one size: a search takes a second, and others of its kind agree on them
+        return replace(plain, encoding=fit_planes(plain.pairs, plain.encoding, _MOVED_TERMS[1], model.position_weight))
+
     def fit(terms: int) -> tuple[Path, ModelSettings]:
-        settings = replace(_FIT, name=f"{name}-ols-{terms}", terms=terms)
+        settings = replace(model, name=f"{name}-ols-{terms}", terms=terms)
         file = folder / f"{Path(found.lens.path).stem}.{settings.label}.onnx"
-        export_onnx(fit_model(prepared, settings), file, errors={})
-        return file, settings
+        planes = terms >= _MOVED_TERMS[0] and not lens.anamorphic
+        export_onnx(fit_model(moved() if planes else plain, settings), file, errors={})
+        return file, replace(settings, planes=planes)  # as a training from scratch has it
 
     return fit
 
@@ -375,17 +389,20 @@ def _fitted(
     fit, sizes = shot_fits(found, folder), shot_terms(found)
     known: dict[int, tuple[Path, list[Choice]]] = {}
     smallest = set()
-    for k, budget_px in enumerate(asked):
-        low, high = 0, len(sizes)  # sizes below `low` do not hold, those from `high` on do
-        while low < high:
-            size = (low + high) // 2
-            if size not in known:
-                file, settings = fit(sizes[size])
-                shown = trial if explain else replace(trial, costed_px=-1.0)
-                known[size] = file, [replace(c, settings=settings) for c in _model(shown, file, _SHOT)]
-            low, high = (low, size) if any(c.meets(budget_px) for c in known[size][1]) else (size + 1, high)
-            say((k + 1 - (high - low) / len(sizes)) / len(asked))
-        smallest.add(low)
+    with ThreadPoolExecutor(1) as other:
+        if not explain:  # nothing is timed: meanwhile, what the lens adds to the light
+            other.submit(lambda: found.maps)
+        for k, budget_px in enumerate(asked):
+            low, high = 0, len(sizes)  # sizes below `low` do not hold, those from `high` on do
+            while low < high:
+                size = (low + high) // 2
+                if size not in known:
+                    file, settings = fit(sizes[size])
+                    shown = trial if explain else replace(trial, costed_px=-1.0)
+                    known[size] = file, [replace(c, settings=settings) for c in _model(shown, file, _SHOT)]
+                low, high = (low, size) if any(c.meets(budget_px) for c in known[size][1]) else (size + 1, high)
+                say((k + 1 - (high - low) / len(sizes)) / len(asked))
+            smallest.add(low)
     for size, (file, made) in known.items():  # what is larger than the smallest costs more, and is not compiled
         again = _model(trial, file, _SHOT) if size in smallest and not explain else made
         yield from (replace(c, settings=made[0].settings) for c in again)

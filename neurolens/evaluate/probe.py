@@ -56,7 +56,7 @@ class Asked:
             there whose blur differs by more than a pixel. edge_contrast: median contrast at those, None without any: if
             it is little, how well blur is made there matters little.
         filter_px: side of the pixel filter, a box. afterwards: what compositing makes, of `footprints.AFTERWARDS`.
-            denoised: whether noise is taken out, so that cameras are not charged for it.
+            denoised: whether noise is taken out, so that cameras are not charged for it. zoom: state of the lens.
     """
 
     film_mm: tuple[float, float]
@@ -75,6 +75,7 @@ class Asked:
     filter_px: float = 1.0
     afterwards: tuple[str, ...] = ()
     denoised: bool = False
+    zoom: str | None = None
 
 
 @dataclass(frozen=True)
@@ -136,20 +137,23 @@ class Probed:
 
 
 def probe(
-    scene: Scene, lens: Lens, *, across: int = _ACROSS, afterwards: Collection[str] = (), denoised: bool = False
-) -> Probed:
+    scene: Scene, lens: Lens, *, across: int = _ACROSS, afterwards: Collection[str] = (), denoised: bool = False,
+    zoom: str | None = None,
+) -> Probed:  # fmt: skip
     """Look through the exact lens at a scene.
 
     Args:
         across: places along the longer side. afterwards: effects that compositing makes, of `footprints.AFTERWARDS`:
             distortion, where the ST map corrects the picture's light, too, and defocus. denoised: see `Asked`.
+        zoom: state of the lens by name or focal length; None leaves it as it is.
 
     Raises:
-        InputError: a scene's camera that the lens cannot be; a picture that the lens leaves dark; other names.
+        InputError: a scene's camera that the lens cannot be; a picture that the lens leaves dark; other names; an
+            unknown state.
     """
     if not set(afterwards) <= set(AFTERWARDS):
         raise InputError("plan", "afterwards", sorted(afterwards), f"of {', '.join(AFTERWARDS)}")
-    shot = scene.settings.camera
+    lens, shot = lens if zoom is None else lens.at(zoom=zoom), scene.settings.camera
     film, widest = (shot.film_width_mm, shot.film_height_mm), first_order(lens).f_number
     f_number = max(shot.f_number or widest, widest)
     stopped, domain = domain_from_camera(
@@ -172,6 +176,7 @@ def probe(
         float(np.isinf(depth).mean()), 1 - places.film_mm.shape[1] / points.shape[1],
         small.range_nm, float(np.median(small.contrast)),
         *_edges(scene, exact, small, film[0] / shot.width), afterwards=tuple(sorted(afterwards)), denoised=denoised,
+        zoom=zoom,
     )  # fmt: skip
     seen, ideal = (prints.footprints(c, places) for c in (exact, thin))
     wanted = prints.left_to(seen, ideal, places.share, afterwards)

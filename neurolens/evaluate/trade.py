@@ -9,10 +9,11 @@ other targets the camera alone counts, in Cycles under a white sky.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from neurolens.render.scene import Scene
 
 _PROBE_ACROSS, _PROBE_SAMPLES = 96, 4
 _ACROSS, _SAMPLES = 240, 16  # of pictures
+_STRIPS, _STRIP_ROWS, _STRIP_PATHS = 3, 16, 2_000_000  # of a picture: their number, least rows, paths of all
 _SHOWN = 8  # most of them, beside the exact lens
 _BUDGETS = (1.0, 0.25, 0.05)  # that polynomials are fitted for, besides the one asked for
 
@@ -91,7 +93,7 @@ class Trade:
 
 def trade(
     scene: Scene, lens: Lens, budget_px: float, *, target: Target = "render", models: Sequence[Path] = (),
-    folder: Path | None = None, samples: int = _SAMPLES, report: Report | None = None,
+    folder: Path | None = None, samples: int = _SAMPLES, report: Report | None = None, **look: Any,
 ) -> Trade:  # fmt: skip
     """Every camera for a scene with its error and its seconds, and pictures of those that no other betters.
 
@@ -100,7 +102,7 @@ def trade(
     say = report or (lambda done, left=None: None)
     if not budget_px >= 0:
         raise InputError("trade", "budget_px", budget_px, "0 or more pixels")
-    found = probe(scene, lens)
+    found = probe(scene, lens, **look)
     plan, rest = _priced(scene, found, budget_px, target, models, folder, lambda done, left=None: say(0.5 * done))
     offered = offers(scene, plan.probed, plan.choices, rest)
     some = spread(front(offered), plan.best)
@@ -111,7 +113,7 @@ def trade(
 
 def plan_within(
     scene: Scene, lens: Lens, seconds: float, *, target: Target = "render", models: Sequence[Path] = (),
-    folder: Path | None = None, afterwards: Collection[str] = (), denoised: bool = False, report: Report | None = None,
+    folder: Path | None = None, report: Report | None = None, **look: Any,
 ) -> Plan:  # fmt: skip
     """The plan with the most faithful camera that takes no longer than so many seconds of one thread.
 
@@ -119,7 +121,7 @@ def plan_within(
     """
     if not seconds > 0 or UNIT[target] != "ns":
         raise InputError("plan", "budget", f"({seconds:g} s for {target})", "above 0, and a target whose time is known")
-    found = probe(scene, lens, afterwards=afterwards, denoised=denoised)
+    found = probe(scene, lens, **look)
     plan, rest = _priced(scene, found, 0.0, target, models, folder, report)
     offered = offers(scene, plan.probed, plan.choices, rest)
     added = seconds - 1e-9 * paths(scene) * rest
@@ -131,6 +133,55 @@ def plan_within(
     return replace(
         plan, budget_px=error, budget_s=seconds, effects=effects_of(plan.probed, error), choices=choices, best=best
     )
+
+
+def plan_seen(
+    scene: Scene, lens: Lens, flip_budget: float, *, target: Target = "render", models: Sequence[Path] = (),
+    folder: Path | None = None, report: Report | None = None, **look: Any,
+) -> Plan:  # fmt: skip
+    """The plan with the cheapest camera whose picture differs from the exact lens's by no more than so much FLIP.
+
+    Told from strips of the picture at its own pixels (`_strips`), the same random numbers: with noise, where a camera
+    uses them otherwise. Of cameras that no other betters, by halves: with less error they are taken to have less FLIP.
+    Arguments and errors as of `plan`; InputError, too, for a budget that is no number from 0 to 1.
+    """
+    if not 0 <= flip_budget <= 1:
+        raise InputError("plan", "budget", f"{flip_budget:g} FLIP", "0 to 1")
+    if look.get("afterwards"):
+        raise InputError("plan", "afterwards", ", ".join(look["afterwards"]), "nothing with a budget of FLIP")
+    say = report or (lambda done, left=None: None)
+    found = probe(scene, lens, **look)
+    plan, rest = _priced(scene, found, 0.0, target, models, folder, lambda done, left=None: say(0.5 * done))
+    offered = front(offers(scene, plan.probed, plan.choices, rest))
+    exact = _strips(scene, found.exact)
+    seen: dict[str, float] = {}
+    low, high = 0, len(offered)  # those below `low` do not hold, those from `high` on do
+    while low < high:
+        middle = (low + high) // 2
+        choice = offered[middle].choice
+        pairs = zip(_strips(scene, camera_of(found, choice)), exact, strict=True)
+        seen[choice.name] = 0.0 if choice.error_px == 0 else float(np.mean([flip_map(*pair) for pair in pairs]))
+        low, high = (low, middle) if seen[choice.name] <= flip_budget else (middle + 1, high)
+        say(0.5 + 0.5 * (1 - (high - low) / len(offered)))
+
+    def told(choice: Choice) -> Choice:
+        value = seen.get(choice.name)
+        return replace(choice, flip=value, within=value is not None and value <= flip_budget)
+
+    best = told(offered[high].choice) if high < len(offered) else None
+    error = math.inf if best is None else best.error_px
+    choices = tuple(map(told, plan.choices))
+    effects = effects_of(found, error)
+    return replace(plan, budget_px=error, budget_flip=flip_budget, effects=effects, choices=choices, best=best)
+
+
+def _strips(scene: Scene, camera: Camera) -> list[FloatArray]:
+    """Rows of a camera's picture at the scene's own size, in some places."""
+    shot = scene.settings.camera
+    rows = min(max(_STRIP_PATHS // (_STRIPS * _SAMPLES * shot.width), _STRIP_ROWS), shot.height)
+    firsts = np.unique(np.linspace(0, shot.height - rows, _STRIPS + 2).astype(int)[1:-1])
+    drawn = partial(render, scene, camera, samples=_SAMPLES, film=replace(scene.settings.film, wavelengths="one"))
+    return [drawn(rows=(int(first), int(first) + rows)).rgb for first in firsts]
 
 
 def _priced(

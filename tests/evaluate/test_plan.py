@@ -24,6 +24,7 @@ from neurolens.evaluate.plan import Target, candidates, decided, plan
 from neurolens.evaluate.probe import effects_of, probe
 from neurolens.evaluate.scenes import seen_depths_m
 from neurolens.evaluate.shaders import lens_of
+from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.render.pictures import read_exr
 from neurolens.render.scene import load_scene, scene_from_tables
@@ -259,3 +260,24 @@ def test_a_plan_s_file_names_cameras_that_nothing_is_fitted_for(tmp_path: Path) 
     file.write_text(found.to_toml(read_lens(LENS).at(), tmp_path))
     assert Path(named_camera(str(file))).resolve() == Path(LENS).resolve()
     assert named_camera("experiments/quickstart.toml") == "experiments/quickstart.toml"
+
+
+def test_models_have_the_blades_of_the_lens_file() -> None:
+    shaped = read_lens(GAUSS).with_aperture(Aperture(blades=5, rotation_deg=20.0))
+    found = probe(scene_from_tables(wall(1.0, 4.0)), shaped)
+    model = Path("models/laikin_double_gauss_50.ols-60.onnx")
+    own = planned.model_choice(found, "onnx", model, "", False)
+    lens = replace(found.lens, aperture=None)
+    bare = planned.model_choice(replace(found, lens=lens), "onnx", model, "", False)
+    assert own is not None and bare is not None
+    assert own.error_px < 0.05 and own.light_error < 0.01 and bare.error_px > 0.3
+
+
+def test_a_zoom_is_planned_in_its_state() -> None:
+    lens, seen = read_lens("lenses/ogawa_zoom_70_200.toml"), []
+    scene = scene_from_tables(wall(10.0, 5.6, focus_m=8.0))
+    for found in (probe(scene, lens, zoom="135mm"), probe(scene, lens.at(zoom="135mm")), probe(scene, lens)):
+        seen.append(found.exact.settings["efl_mm"])
+    assert seen[0] == seen[1] != seen[2] and seen[0] == pytest.approx(135, rel=0.02)
+    with pytest.raises(InputError, match="zoom"):
+        probe(scene, lens, zoom="9mm")

@@ -8,10 +8,14 @@ from types import SimpleNamespace
 
 import pytest
 
+from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import format_toml
 from neurolens.cli import main
+from neurolens.evaluate import trade as traded
 from neurolens.evaluate.plan import Choice
+from neurolens.evaluate.probe import probe
 from neurolens.evaluate.trade import Offer, best_within, front, offers, small, spread
+from neurolens.optics.lensfile import read_lens
 from neurolens.render.scene import scene_from_tables
 
 LENS = "lenses/cooke_triplet_50.toml"  # of absorbing glass: nothing is compiled
@@ -96,3 +100,19 @@ def test_a_plan_for_a_time_takes_the_most_faithful_camera_that_fits(tmp_path: Pa
     told = json.loads((tmp_path / "plan" / "plan.json").read_text())
     assert told["best"]["name"] == "exact" and told["budget_s"] == 1e6 and told["budget_px"] == 0
     assert main([*asked, "20s", "--for", "glsl"]) == 2  # no time is known
+
+
+def test_a_plan_for_flip_takes_the_cheapest_camera_that_looks_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = scene_from_tables(scene(width=64, height=36, film_width_mm=18.0, film_height_mm=10.125, samples=4))
+    found, seen = probe(shown, read_lens(LENS)), {}
+    priced = traded._priced(shown, found, 0.0, "render", [], None, None)
+    monkeypatch.setattr(traded, "probe", lambda *args: found)  # once for all budgets
+    monkeypatch.setattr(traded, "_priced", lambda *args: priced)
+    for budget in (0.0, 0.05, 1.0):
+        seen[budget] = traded.plan_seen(shown, read_lens(LENS), budget).best
+        assert seen[budget] is not None and seen[budget].flip <= budget
+    right = [c.cost for c in priced[0].choices if c.light_error <= 0.01]
+    assert seen[0.0].name == "exact" and seen[1.0].cost == min(right) <= seen[0.05].cost <= seen[0.0].cost
+    for wrong in ({"flip_budget": 1.5}, {"flip_budget": 0.1, "afterwards": ("distortion",)}):
+        with pytest.raises(InputError):
+            traded.plan_seen(shown, read_lens(LENS), **wrong)
