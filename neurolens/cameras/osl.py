@@ -32,8 +32,9 @@ from neurolens.cameras.lens_state import squeeze_of
 from neurolens.cameras.model import ModelScene
 from neurolens.cameras.onnxlens import OnnxLens
 from neurolens.cameras.pupil_arcs import PupilArcs
-from neurolens.cameras.pupil_arcs_fit import Sight, fit_arcs, passing
+from neurolens.cameras.pupil_arcs_fit import fit_arcs, passing
 from neurolens.cameras.pupil_boxes import PupilTable
+from neurolens.cameras.pupil_sight import Sight
 from neurolens.cameras.sampling import stratified
 from neurolens.cameras.source import model_focusing
 from neurolens.graph.interpret import evaluate

@@ -42,9 +42,10 @@ class PupilArcs:
             are scaled to; the same in all states of a lens.
         numbers: [A, 4, M]: of the stop's image, then of rims, the low end, the high end and two factors, as polynomials
             of the monomials `exponents` [M, 5] in film radius, stop, film position and wavelength, scaled to 1, and the
-            cosine of twice the azimuth of the film point.
+            cosine of twice the azimuth of the film point, squeezed.
         sides: [A] of an arc: 1 of a rim that ends the light on the film point's side, -1 on the other, 0 on both; the
             row of an end that it has not is 0.
+        squeeze: y of film points is scaled by it first: rims before cylinders cut the pupil from that side.
         image: of the stop, which the arcs stand in, in place of the pupil; None: in the pupil.
     """
 
@@ -56,6 +57,7 @@ class PupilArcs:
     numbers: Array
     exponents: NDArray[np.int64]
     sides: tuple[int, ...]
+    squeeze: float = 1.0
     image: StopImage | None = None
 
     def scaled(self, radius: Array, stop: ArrayLike, film_z: ArrayLike, nanometres: Array, azimuth: ArrayLike) -> Array:
@@ -64,11 +66,6 @@ class PupilArcs:
         call = np.divide(stop, self.stop_radius_mm), np.subtract(film_z, middle) / half
         parts = radius / self.unit_mm, *call, ((1000 / nanometres) ** 2 - mean) / reach, np.cos(np.multiply(azimuth, 2))
         return np.stack(np.broadcast_arrays(*parts))
-
-    @property
-    def turns(self) -> bool:
-        """Whether the arcs depend on the azimuth of the film point."""
-        return bool(self.exponents[:, 4].any())
 
     @cached_property
     def graph(self) -> Graph:
@@ -91,8 +88,9 @@ class PupilArcs:
         """
         g = Graph()
         film, square = g.input("film_mm", 2), g.input("square", 2)
-        radius = g.square(film).sqrt()
-        turn = (film + [_HAIR, 0.0]) * (1.0 / (radius + _HAIR))
+        squeezed = film if self.squeeze == 1 else film * [1.0, self.squeeze]
+        radius = g.square(squeezed).sqrt()
+        turn = (squeezed + [_HAIR, 0.0]) * (1.0 / (radius + _HAIR))
         arcs = self._arcs(g, radius * (1 / self.unit_mm), turn[0] * turn[0] - turn[1] * turn[1])
         disc = unit_disc(square)
         low, high = _ends(arcs)
@@ -128,7 +126,7 @@ class PupilArcs:
             disc = disc * share
         here = stretch(disc[0] + 1.0, 1.0 - disc[0])
         x, y = middle + half * disc[0], disc[1] * here
-        inside = radius <= self.film_radius_mm
+        inside = (radius if squeezed is film else g.square(film).sqrt()) <= self.film_radius_mm
         point, unit = turn * x + across * y, g.constant(math.pi)
         if self.image is not None:
             point, wide = self.image.placed(film, g.input("film_z_mm", per_call=True), point)

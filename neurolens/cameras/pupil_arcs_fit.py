@@ -4,27 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from itertools import product
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Report
 from neurolens.cameras.pupil_arcs import PupilArcs
-from neurolens.cameras.pupil_boxes import PupilTable, asking, end_of_light, frame_of
-from neurolens.cameras.stop_image import StopImage, stop_image
+from neurolens.cameras.pupil_boxes import asking, end_of_light, frame_of
+from neurolens.cameras.pupil_sight import Sight, Truths, imaged, turned
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph
 
 Array = NDArray[np.float64]
-Truths = NDArray[np.bool_]
-Rows = NDArray[np.floating[Any]]
 # Where light ends is sought: ways, and of anamorphic lenses azimuths of a quadrant.
-_ANGLES, _AZIMUTHS = np.linspace(0, np.pi, 17), 4
+_ANGLES, _QUADRANT = np.linspace(0, np.pi, 17), np.linspace(0, np.pi / 2, 4)
 _HALVINGS, _WIDER = 14, 1.15  # that place the end of the light; boxes of a stop over the last one's pupil
 _ROUNDS, _LOOSE = 40, 1e-4  # of asymmetric least squares: weight of slack
 _MARGIN = 0.001  # of half the pupil
@@ -33,12 +29,13 @@ _ENOUGH = 0.97  # of points, at the widest stop, that pass
 _FEWEST = 12  # vertices that rims of a side block
 _PLENTY = 0.96  # of points, that no other way to fit needs to pass
 _REFIT_SEED, _CHECK_SEED, _NO_SIDE = 10, 20, 2  # such rays lie on no arc
-_LOST = 1e-3  # of rays that pass, that a way may miss
-_HELD = 0.9998  # of random rays that pass
+_LOST = 1e-3  # of rays that pass in any zone, that a way may miss
+_HELD, _HELD_ROUND = 0.9997, 0.9998  # of random rays that pass, in every zone, or of a round lens of all
 _RISE, _STEP, _STEPS = 1.03, 0.004, 12  # of arcs that do not hold them: in y^2, and of half the pupil along x
+_ZONES, _FEW = (6, 3, 3), 1000  # of film radius, stop and azimuth; rays that tell of one
+_WIDEST = 0.5  # of half the pupil's size, by which arcs that do not hold them grow
 _ASKED, _TRIED = 20_000, 64
-_RAYS = 60_000  # random ones that must lie inside
-_LIMIT = 1.6  # stop radii: points in the image of the stop lie within
+_RAYS = 60_000  # random ones that must lie inside, of an anamorphic lens three times as many
 
 
 @dataclass(frozen=True)
@@ -65,7 +62,7 @@ class Way:
         found = [(i, j, 0, 0, 0) for i in range(self.powers + 1) for j in range(3)]
         found += [(i, j, 1, 0, 0) for i, j in np.ndindex(*self.film)]  # few: renderers may learn the focus late
         found += [(i, j, 0, 1, 0) for i in range(4) for j in range(2)]  # the stop's image moves with the wavelength
-        if anamorphic and self.image:
+        if anamorphic:
             found += [(i, 0, 0, 0, k) for k in (1, 2) for i in range(k, self.powers + 1)]
         return np.array(found)
 
@@ -77,60 +74,7 @@ _WAYS = (
     Way(25, (1.0, 0.85, 0.7, 0.55, 0.4, 0.28, 0.18, 0.08), 4, (5, 3), 3000.0, 3, False),
     Way(25, (1.0, 0.7, 0.4, 0.2, 0.08), 12, (6, 3), 3000.0, 2, True),
 )
-_ANAMORPHIC = _WAYS[0], Way(17, (1.0, 0.7, 0.4, 0.2, 0.08), 8, (3, 2), 3000.0, 2, True)
-
-
-@dataclass(frozen=True)
-class Sight:
-    """A lens whose pupil is sought.
-
-    Attributes:
-        graph: of the lens; see `fused.LensGraph`. table: boxes that hold what passes.
-        film_z_mm, wavelength_nm: ranges. stop_radius_mm: the widest. stop_surface: for the status of its rays.
-        anamorphic: whether it matters on which side of the film a point lies. image: of the stop, that `graph` takes
-            points of in place of pupil points.
-    """
-
-    graph: Graph
-    table: PupilTable
-    film_z_mm: tuple[float, float]
-    wavelength_nm: tuple[float, float]
-    stop_radius_mm: float
-    stop_surface: int
-    anamorphic: bool = False
-    image: StopImage | None = None
-
-    def passes(
-        self, film: Rows, pupil: Rows, nanometres: ArrayLike, film_z: ArrayLike, stop: ArrayLike,
-        azimuth: ArrayLike | None = None,
-    ) -> Truths:  # fmt: skip
-        """[...] whether rays pass, turned by an azimuth about the axis; points [2, ...].
-
-        Of an anamorphic lens also of rays mirrored, which arcs hold too; without an azimuth, at any of a quadrant.
-        """
-        shape, passed = film.shape[1:], np.zeros(film[0].size, bool)
-        wide = np.broadcast_to(nanometres, shape).ravel()
-        quadrant = np.linspace(0, np.pi / 2, _AZIMUTHS) if self.anamorphic else [0.0]
-        for angle in quadrant if azimuth is None else [azimuth]:
-            for side in (1.0, -1.0) if self.anamorphic else (1.0,):
-                f, p = turned(film.reshape(2, -1), angle), turned(pupil.reshape(2, -1) * [[1.0], [side]], angle)
-                passed |= self.status(f, p, wide, film_z, stop) == st.PASSED
-        return passed.reshape(shape)
-
-    def status(
-        self, film: Rows, pupil: Rows, nanometres: ArrayLike, film_z: ArrayLike, stop: ArrayLike
-    ) -> NDArray[Any]:
-        """[N] of film points [2, N] and pupil points [2, N]; the others [N], or one number."""
-        count = film.shape[1]
-        wide = np.broadcast_to(nanometres, (1, count))
-        given = {"rays": np.concatenate([film, pupil, wide]).astype(np.float32)}
-        given |= {"film_z_mm": _call(film_z), "stop_radius_mm": _call(stop)}
-        return np.broadcast_to(evaluate(self._status, given)["status"][0], count)
-
-    @cached_property
-    def _status(self) -> Graph:
-        """The graph of the status alone."""
-        return replace(self.graph, outputs={"status": self.graph.outputs["status"]})
+_ANAMORPHIC = tuple(Way(17, (1.0, 0.7, 0.4, 0.2, 0.08), 4, (3, 2), push, 3, True) for push in (1e5, 1e4))
 
 
 @dataclass(frozen=True)
@@ -182,35 +126,24 @@ def fit_arcs(sights: Sequence[Sight], report: Report, between: Sequence[tuple[Ar
     kept: list[PupilArcs] = []
     best, lost = -1.0, 1.0
     for part, way in enumerate(ways):
-        seen = _imaged(sights[0]) if way.image else sights[0]
+        seen = imaged(sights[0]) if way.image else sights[0]
         own, beyond = _by(way, [seen], partial(_within, report, part / len(ways), 1 / len(ways)))
-        least = min(passing(seen, own[0]).values())
-        if least > best and beyond <= max(lost, _LOST):
+        least, held = min(passing(seen, own[0]).values()), beyond <= _LOST < lost and _by_zones(seen)
+        if held or (least > best and beyond <= max(lost, _LOST)):
             kept, best, lost = [replace(own[0], image=seen.image)], least, beyond
-        if best >= _PLENTY:
+        if best >= _PLENTY and (lost <= _LOST or not _by_zones(seen)):
             break
     return kept
-
-
-def _imaged(sight: Sight) -> Sight:
-    """The lens from points in the image of its stop; itself where that is not found."""
-    nm, radius = float(np.mean(sight.wavelength_nm)), sight.table.film_radius_mm
-    image = stop_image(sight.graph, radius, sight.film_z_mm, nm, sight.stop_radius_mm, sight.anamorphic)
-    if image is None:
-        return sight
-    reach = _LIMIT * sight.stop_radius_mm * np.array([[-1], [1], [1]], np.float32)
-    table = replace(sight.table, rows=np.repeat(reach, sight.table.rows.shape[1], axis=1))
-    return replace(sight, graph=image.before(sight.graph), table=table, image=image)
 
 
 def _by(
     way: Way, sights: Sequence[Sight], report: Report, between: Sequence[tuple[Array, Sight]] = ()
 ) -> tuple[list[PupilArcs], float]:
-    """Arcs with numbers, and the share of random rays that pass beyond them."""
+    """Arcs with numbers, and `_lost`."""
     places = []
     for k, sight in enumerate(sights):
         places.append(_places(way, sight, partial(_within, report, 0.6 * k / len(sights), 0.6 / len(sights))))
-    nodes = _empty(way, sights, [float(p.film_mm.max()) for p in places])
+    nodes = _empty(way, sights, places)
     edges = [_edge(*of_one) for of_one in zip(sights, nodes, places, strict=True)]
     blocked = {side: max(int((edge.side == side).sum()) for edge in edges) for side in (0, 1, -1)}
     if blocked[0] < _FEWEST:
@@ -218,15 +151,27 @@ def _by(
     sides = tuple(side for side, vertices in blocked.items() if vertices >= _FEWEST)
     nodes = _fitted(way, sights, nodes, edges, sides)
     seen = [*zip(np.eye(len(nodes)), sights, strict=True), *between]
-    nodes = _widened(nodes, seen, partial(_within, report, 0.6, 0.4))
-    return nodes, max(float(_beyond(s, a, _CHECK_SEED)[-1].mean()) for s, a in zip(sights, nodes, strict=True))
+    inside = partial(_within, report, 0.6, 0.4)
+    nodes = [_dilated(nodes[0], sights[0], inside)] if _by_zones(sights[0]) else _widened(nodes, seen, inside)
+    return nodes, max(_lost(*of_one) for of_one in zip(sights, nodes, strict=True))
+
+
+def _by_zones(sight: Sight) -> bool:
+    """Whether arcs hold light zone by zone: what an anamorphic lens's lose, they lose in a few places."""
+    return sight.anamorphic and sight.image is not None
+
+
+def _lost(sight: Sight, arcs: PupilArcs) -> float:
+    """Share of random rays that pass beyond the arcs, of an anamorphic lens in the worst zone."""
+    rays, stop, *_, out = _beyond(sight, arcs, _CHECK_SEED)
+    return max(float(out[zone].mean()) for zone in _zones(sight, rays, stop)) if _by_zones(sight) else float(out.mean())
 
 
 def _fitted(
     way: Way, sights: Sequence[Sight], nodes: list[PupilArcs], edges: Sequence[_Edge], sides: tuple[int, ...]
 ) -> list[PupilArcs]:
     """Arcs with numbers."""
-    for coloured in (False, True):
+    for coloured in (True,) if sights[0].anamorphic else (False, True):
         held = edges
         for seed in range(way.refits + 1):
             if seed:
@@ -241,16 +186,19 @@ def _fitted(
     return nodes
 
 
-def _empty(way: Way, sights: Sequence[Sight], radii: Sequence[float]) -> list[PupilArcs]:
+def _empty(way: Way, sights: Sequence[Sight], places: Sequence[_Places]) -> list[PupilArcs]:
     """What numbers of arcs are scaled by."""
     exponents = way.exponents(sights[0].anamorphic)
     long, short = ((1000 / w) ** 2 for w in reversed(sights[0].wavelength_nm))
     wave = (long + short) / 2, max((short - long) / 2, 1e-9)
+    radii = [float(p.film_mm.max()) for p in places]
     unit, stop, nothing = max(radii), max(s.stop_radius_mm for s in sights), np.zeros((0, 4, len(exponents)))
     found = []
-    for radius, (low, high) in zip(radii, (s.film_z_mm for s in sights), strict=True):
+    for radius, sight in zip(radii, sights, strict=True):
+        low, high = sight.film_z_mm
+        radius = min(radius / min(1.0, sight.squeeze), sight.film_radius_mm)
         place = (low + high) / 2, max((high - low) / 2, 1e-6)
-        found.append(PupilArcs(radius, unit, place, stop, wave, nothing, exponents, ()))
+        found.append(PupilArcs(radius, unit, place, stop, wave, nothing, exponents, (), sight.squeeze))
     return found
 
 
@@ -268,7 +216,7 @@ def _places(way: Way, sight: Sight, report: Report) -> _Places:
     ends = sight.wavelength_nm
     found: list[list[Array]] = []
     planes = (low, (low + high) / 2, high) if high > low else (low,)
-    azimuths = np.linspace(0, np.pi / 2, _AZIMUTHS) if sight.anamorphic and way.image else [None]
+    azimuths = _QUADRANT if sight.anamorphic else [0.0]
     for k, (z, azimuth) in enumerate(product(planes, azimuths)):
         report(k / len(planes) / len(azimuths))
         table, film_radius = sight.table, None
@@ -291,7 +239,7 @@ def _places(way: Way, sight: Sight, report: Report) -> _Places:
                 stop,
                 np.reshape(ends, (-1, 1, 1)),
                 _ANGLES,
-                azimuth or 0.0,
+                azimuth,
             )
             found.append([np.broadcast_to(row, shape).ravel() for row in rows])
             # The next stop's pupil lies within this one's.
@@ -307,11 +255,10 @@ def _places(way: Way, sight: Sight, report: Report) -> _Places:
 def _edge(sight: Sight, arcs: PupilArcs, p: _Places) -> _Edge:
     """Where light ends on the way from a centre, and what blocks the rays beyond."""
 
-    azimuth = p.azimuth if arcs.turns else None
-    film, call = np.stack([p.film_mm, 0 * p.film_mm]), (p.nm, p.film_z, p.stop)
+    film, call = np.stack([p.film_mm, 0 * p.film_mm]), (p.nm, p.film_z, p.stop, p.azimuth)
 
     def passes(t: Array) -> Truths:
-        return sight.passes(film, np.stack([p.centre + t * p.x, t * p.y]), *call, azimuth)
+        return sight.passes(film, np.stack([p.centre + t * p.x, t * p.y]), *call)
 
     low, high = np.zeros(p.x.size), np.ones(p.x.size)
     lit = passes(low)
@@ -320,22 +267,11 @@ def _edge(sight: Sight, arcs: PupilArcs, p: _Places) -> _Edge:
         inside = passes(middle)
         low, high = np.where(inside, middle, low), np.where(inside, high, middle)
     x, y, first, last = p.centre + low * p.x, low * p.y, p.angle == 0, p.angle == np.pi
-    side = np.where(
-        _stopped(sight, film, np.stack([p.centre + high * p.x, high * p.y]), call, p.azimuth),
-        0,
-        np.where(p.x > 0, 1, -1),
-    )
+    blocked = sight.sides(film, np.stack([p.centre + high * p.x, high * p.y]), *call)
+    of_stop = (blocked == st.blocked(sight.stop_surface, st.RIM)).all(0)  # of an anamorphic lens also mirrored
+    side = np.where(of_stop, 0, np.where(p.x > 0, 1, -1))
     scaled = arcs.scaled(p.film_mm, p.stop, p.film_z, p.nm, p.azimuth)
     return _Edge(x[lit], y[lit], scaled[:, lit], side[lit], first[lit], last[lit])
-
-
-def _stopped(sight: Sight, film: Array, pupil: Array, call: tuple[Array, Array, Array], azimuth: Array) -> Truths:
-    """Whether the stop blocks rays, of an anamorphic lens also mirrored."""
-    blocked = np.ones(film.shape[1], bool)
-    for side in (1.0, -1.0) if sight.anamorphic else (1.0,):
-        code = sight.status(turned(film, azimuth), turned(pupil * [[1.0], [side]], azimuth), *call)
-        blocked &= code == st.blocked(sight.stop_surface, st.RIM)
-    return blocked
 
 
 def _with_missed(sight: Sight, arcs: PupilArcs, edge: _Edge, seed: int) -> _Edge:
@@ -385,16 +321,6 @@ def _arc(arcs: PupilArcs, edge: _Edge, monomials: Array, side: int, push: float)
     return numbers
 
 
-def turned(points: Rows, angle: ArrayLike) -> Rows:
-    """Points [2, N] about the axis, by angles [N] or one."""
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.stack([cos * points[0] - sin * points[1], sin * points[0] + cos * points[1]])
-
-
-def _call(value: ArrayLike) -> NDArray[np.float32]:
-    return np.asarray(value, np.float32).reshape(1, -1)
-
-
 def _unit(arcs: PupilArcs, of_stop: bool) -> Array:
     """A margin that grows with the stop, for its own arc."""
     return np.all(arcs.exponents == (0, int(of_stop), 0, 0, 0), axis=1).astype(np.float64)
@@ -420,26 +346,38 @@ def _above(rows: Array, wanted: Array, own: Truths, size: Array, push: float) ->
 
 def _random(sight: Sight, arcs: PupilArcs, seed: int) -> tuple[dict[str, Array], Array]:
     """Random rays that pass, from film points on +x, as inputs of `PupilArcs.checked`, and stops."""
-    rng, count = np.random.default_rng(seed), _RAYS
+    rng, count = np.random.default_rng(seed), _RAYS * (1 + 2 * sight.anamorphic)
     radius = arcs.film_radius_mm * np.sqrt(rng.random(count)) * 0.9999
     stop = sight.stop_radius_mm * rng.choice(np.linspace(0.08, 1, 12), count)
     film_z, nm = (rng.uniform(*span, count) for span in (sight.film_z_mm, sight.wavelength_nm))
     radii = np.linspace(0, sight.table.film_radius_mm, sight.table.rows.shape[1])
     low, high, half = (np.interp(radius, radii, a) for a in sight.table.rows)
-    # Narrow stops are seldom met by rays all over the table: half of them go to the middle of the arcs.
-    film = np.stack([radius, 0 * radius])
+    # Narrow stops are seldom met by rays all over the table: most of them go to the middle of the arcs.
     pupil = np.stack([low + (high - low) * rng.random(count), half * rng.random(count)])
-    given = {"film_mm": film, "square": rng.random((2, count)), "stop_radius_mm": stop[None]}
-    given |= {"film_z_mm": film_z[None], "wavelength_nm": nm[None]}
-    azimuth = np.pi / 2 * rng.random(count) if arcs.turns else None
-    back = 0.0 if azimuth is None else azimuth
-    there = given | {"film_mm": turned(film, back)}
-    near = turned(evaluate(arcs.graph, there)["pupil_mm"], -back)
-    middle = turned(evaluate(arcs.graph, there | {"square": np.full((2, count), 0.5)})["pupil_mm"], -back)
+    given = {"square": rng.random((2, count)), "stop_radius_mm": stop[None]}
+    azimuth = np.zeros(count)
+    if sight.anamorphic:
+        azimuth, pupil[1] = np.pi / 2 * rng.random(count), pupil[1] * rng.choice([-1.0, 1.0], count)
+    place: Array = turned(np.stack([radius, 0 * radius]), azimuth).astype(np.float64)
+    x, y = place * [[1.0], [arcs.squeeze]]
+    radius, azimuth = np.hypot(x, y), np.arctan2(y, x)
+    given |= {"film_mm": place, "film_z_mm": film_z[None], "wavelength_nm": nm[None]}
+    near = turned(evaluate(arcs.graph, given)["pupil_mm"], -azimuth)
+    middle = turned(evaluate(arcs.graph, given | {"square": np.full((2, count), 0.5)})["pupil_mm"], -azimuth)
     pupil = np.where(rng.random(count) < 0.7, middle + 1.25 * (near - middle), pupil)
-    passed = sight.passes(film, pupil, nm, film_z, stop, azimuth)
-    given["twice"] = np.cos(2 * np.broadcast_to(back, (1, count)))
-    return {name: rows[:, passed] for name, rows in (given | {"pupil_mm": pupil}).items()}, stop[passed]
+    passed = sight.status(place, turned(pupil, azimuth), nm, film_z, stop) == st.PASSED
+    given |= {"film_mm": np.stack([radius, 0 * radius]), "pupil_mm": pupil, "twice": np.cos(2 * azimuth)[None]}
+    return {name: rows[:, passed] for name, rows in given.items()}, stop[passed]
+
+
+def _zones(sight: Sight, rays: dict[str, Array], stop: Array) -> list[NDArray[np.intp]]:
+    """Rays of `_random` by film radius, stop and azimuth; those of all zones with few rays together."""
+    shares = rays["film_mm"][0] / rays["film_mm"][0].max(), stop / sight.stop_radius_mm, (1 + rays["twice"][0]) / 2
+    places = [np.minimum(share * n, n - 1).astype(int) for share, n in zip(shares, _ZONES, strict=True)]
+    own = np.ravel_multi_index(places, _ZONES)
+    counts = np.bincount(own, minlength=np.prod(_ZONES))
+    own[counts[own] < _FEW] = -1
+    return [np.flatnonzero(own == zone) for zone in np.unique(own)]
 
 
 def _widened(nodes: list[PupilArcs], seen: Sequence[tuple[Array, Sight]], report: Report) -> list[PupilArcs]:
@@ -455,11 +393,11 @@ def _widened(nodes: list[PupilArcs], seen: Sequence[tuple[Array, Sight]], report
         for end, (by, side) in enumerate((("left", -1), ("right", 1))):
             for arc, row in enumerate(found[by]):
                 lack = -row / (1.0 if arc else stop / arcs.stop_radius_mm)
-                push = max(float(np.quantile(lack, _HELD)), 0.0)
+                push = max(float(np.quantile(lack, _HELD_ROUND)), 0.0)
                 numbers[own, arc, end] += side * push * _unit(arcs, arc == 0)
         for _ in range(_STEPS):
             height = evaluate(replace(mixed, numbers=np.tensordot(weights, numbers, 1)).checked, rays)["height"]
-            ratio = np.quantile(rays["pupil_mm"][1] ** 2 / np.maximum(height, 1e-9), _HELD, axis=1)
+            ratio = np.quantile(rays["pupil_mm"][1] ** 2 / np.maximum(height, 1e-9), _HELD_ROUND, axis=1)
             if ratio.max() <= _RISE:
                 break
             # Near the ends of an arc no factor helps: it is made longer.
@@ -469,6 +407,40 @@ def _widened(nodes: list[PupilArcs], seen: Sequence[tuple[Array, Sight]], report
                 numbers[own, arc, 1] += step * _unit(arcs, arc == 0) * (arc_side >= 0)
         numbers[own, :, 2:] *= ratio.clip(1.0, _RISE)[:, None, None]
     return [replace(a, numbers=own) for a, own in zip(nodes, numbers, strict=True)]
+
+
+def _dilated(arcs: PupilArcs, sight: Sight, report: Report) -> PupilArcs:
+    """The arcs, each dilated until in every zone it holds random rays."""
+    for seed in range(2):
+        report(seed / 2)
+        rays, stop = _random(sight, arcs, seed)
+        zones, size = _zones(sight, rays, stop), float(np.abs(rays["pupil_mm"][1]).max())
+        low, high = np.zeros(len(arcs.sides)), np.full(len(arcs.sides), _WIDEST * size)
+        for step in range(_HALVINGS):
+            middle = (low + high) / 2 if step else low  # most arcs hold them as they are
+            held = _holds(replace(arcs, numbers=arcs.numbers + _dilation(arcs, middle, size)), rays, zones)
+            low, high = np.where(held, low, middle), np.where(held, middle, high)
+        arcs = replace(arcs, numbers=arcs.numbers + _dilation(arcs, high, size))
+    return arcs
+
+
+def _dilation(arcs: PupilArcs, ways: Array, size: float) -> Array:
+    """What is added to numbers where ends of arcs move by ways [A], and heights with them; `size`: half the pupil's."""
+    added = np.zeros_like(arcs.numbers)
+    for arc, side in enumerate(arcs.sides):
+        added[arc, 0] = -ways[arc] * _unit(arcs, side == 0) * (side <= 0)
+        added[arc, 1] = ways[arc] * _unit(arcs, side == 0) * (side >= 0)
+        # A rim's far end moves, too; beyond that no arc may stay where its height is negative.
+        added[arc, 2] = ways[arc] * (_unit(arcs, False) / (1 if side else size))
+        added[arc, 2] -= 2 * ways[arc] * arcs.numbers[arc, 3] * (side != 0)
+    return added
+
+
+def _holds(arcs: PupilArcs, rays: dict[str, Array], zones: Sequence[NDArray[np.intp]]) -> Truths:
+    """[A] whether each arc holds all but a few rays of any zone."""
+    found = evaluate(arcs.checked, rays)
+    out = (found["left"] < 0) | (found["right"] < 0) | (found["height"] < rays["pupil_mm"][1] ** 2)
+    return np.all([out[:, zone].mean(1) <= 1 - _HELD for zone in zones], axis=0, keepdims=True)[0]
 
 
 def passing(sight: Sight, arcs: PupilArcs) -> dict[float, float]:

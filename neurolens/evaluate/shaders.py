@@ -178,8 +178,8 @@ def _traced(lens: Lens, plane_mm: float, far: Lens | None = None, inside_m: floa
     """
     from neurolens.cameras.focus_function import Focusing
     from neurolens.cameras.osl import Seen
-    from neurolens.cameras.pupil_arcs_fit import Sight
     from neurolens.cameras.pupil_boxes import PupilTable
+    from neurolens.cameras.pupil_sight import Sight
     from neurolens.optics.focusing import best_focus_of_stops_mm, film_range_mm
     from neurolens.optics.paraxial import film_z_mm, first_order
     from neurolens.optics.pupils import image_radius_mm, pupil_bounds
