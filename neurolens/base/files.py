@@ -225,9 +225,6 @@ def keep_newest(new: Path, most: int) -> None:
 
     A clock that went back leaves files of the future: they go as the oldest do.
     """
-    if (looked := _cleaned.get(new.parent)) is not None and time.monotonic() - looked < _CLEANED_S:
-        return
-    _cleaned[new.parent] = time.monotonic()
     with suppress(OSError):
         now = new.stat().st_mtime
         others = [(abs(now - file.stat().st_mtime), file) for file in new.parent.glob(f"*{new.suffix}") if file != new]
