@@ -9,7 +9,7 @@ class GhostView {
 
   /** Programs of a lens's ghosts, brightest first; `made` is told of each, which takes a software GPU a moment. */
   async functions(lens) {
-    return this.engine.once(`${lens.key}/ghosts`, async () => JSON.parse(await unpack(`${lens.key}/ghosts`)));
+    return this.engine.once(`${lens.key}/ghosts`, () => jsonOf(lens, "ghosts"));
   }
 
   program(lens, ghost) {
