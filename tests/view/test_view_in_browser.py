@@ -241,7 +241,8 @@ def test_a_lamp_is_dragged_and_its_ghosts_are_those_of_neurolens_flare(browser: 
     opened.page.mouse.down()
     opened.page.mouse.move(box["x"] + 0.7 * box["width"], box["y"] + 0.3 * box["height"], steps=3)
     opened.page.mouse.up()
-    opened.page.wait_for_function(f"neurolens.ghosts.shown === {len(model.pairs)}")
+    drawn = f"neurolens.ghosts.shown === {len(model.pairs)} ? done() : setTimeout(look, 20)"
+    opened.page.evaluate(f"new Promise((done) => {{ const look = () => {drawn}; look(); }})")
     assert opened.number("neurolens.set.lamp") == pytest.approx([0.7, 0.7], abs=0.01)
     found = opened.number("Array.from(neurolens.engine.gpu.read(neurolens.ghosts.film))")
     picture = np.array(found).reshape(HIGH, WIDE, 4)[::-1, :, 1]
