@@ -356,7 +356,7 @@ def _ideal(row: Table) -> dict[str, Any]:
     if "focal_mm" not in row:
         return {}
     focal = row.number("focal_mm", unit="mm")
-    shaped = [key for key in ("conic", "asphere", "cylinder", "n_d", "glass", "coating") if key in row]
+    shaped = [key for key in ("conic", "asphere", "cylinder", "coating") if key in row]
     if shaped or not math.isinf(row.number("radius_mm", finite=False)):
         raise row.error(
             shaped[0] if shaped else "radius_mm",

@@ -208,6 +208,8 @@ def check_figures(surfaces: Sequence[Surface], file: str, state: str = "") -> No
         InputError: names the file, the zoom state if there is one, the surface and the figure.
     """
     for k, s in enumerate(surfaces):
+        if s.focal_mm is not None and any(t.n_d != 1 or t.glass for t in surfaces[max(k - 1, 0) : k + 1]):
+            raise InputError(file, f"{state}surface {k}, focal_mm", s.focal_mm, "air on both sides of an ideal lens")
         rim = min(s.semi_diameter_mm, 1e6)
         figures: tuple[tuple[str, Any, float, float], ...] = (
             ("radius_mm", abs(s.radius_mm), 1e-6, math.inf),
