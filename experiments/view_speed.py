@@ -51,7 +51,10 @@ LAMPS = {
     "focus beside a lamp": "set.focus = 20 + k",
 }
 _ALL_GHOSTS = """new Promise((done) => {
-  const look = () => (neurolens.ghosts.shown && neurolens.ghosts.shown === neurolens.ghosts.all ? done(neurolens.ghosts.all) : setTimeout(look, 20));
+  const look = () => {
+    const { shown, all } = neurolens.ghosts;
+    return shown && shown === all ? done(all) : setTimeout(look, 20);
+  };
   neurolens.idle().then(look);
 })"""
 
