@@ -28,13 +28,15 @@ from neurolens.evaluate.scenes import seen_depths_m
 from neurolens.graph.compiler import has_compiler
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
+from neurolens.optics.pupils import image_radius_mm
 from neurolens.render.scene import Scene
-from neurolens.surrogates.domain import Domain, domain_from_camera
+from neurolens.surrogates.domain import Domain, domain_from_camera, domain_of
 
 COUNTED = 95.0  # percentile over the picture that a budget is held against
 _Real = TypeVar("_Real", bound=np.floating[Any])
 Maps = dict[str, tuple[Literal["px", "relative"], Array]]
 LIGHT = 0.01  # relative error of light that a plan allows beside its budget of place
+_FOCUS_SPARE = 0.25  # of a pixel of blur: what a model may place its film beside the lens's
 _ACROSS = 16  # points of the probe along the longer side
 # Of effects, what makes them where the picture is finished: a blur by depth makes all blur.
 _MADE_BY = {"distortion": "distortion", "natural fall-off": "distortion", "vignetting": "distortion"} | dict.fromkeys(
@@ -98,8 +100,9 @@ class Probed:
     """A scene's places as the exact lens sees them: its camera, its footprints there, and those of a thin lens.
 
     Attributes:
-        scene, lens, domain: the lens stopped and focused. places: those with light, of `shape` rows and columns over
-            the film. wanted: what a camera is asked for, `seen` without what is done afterwards.
+        scene, lens, domain: the lens stopped and focused, and what models of this shot must know. places: those with
+            light, of `shape` rows and columns over the film. wanted: what a camera is asked for, `seen` without what is
+            done afterwards.
     """
 
     scene: Scene
@@ -156,9 +159,7 @@ def probe(
     lens, shot = lens if zoom is None else lens.at(zoom=zoom), scene.settings.camera
     film, widest = (shot.film_width_mm, shot.film_height_mm), first_order(lens).f_number
     f_number = max(shot.f_number or widest, widest)
-    stopped, domain = domain_from_camera(
-        lens, film_mm=film, focus_m=shot.focus_m, f_number=f_number, wavelength_nm=shot.wavelengths_nm
-    )
+    stopped, domain = lens.at(f_number=f_number, focus_m=shot.focus_m), _domain(lens, scene, f_number)
     real: dict[str, Any] = {"film_mm": film, "focus_m": shot.focus_m, "f_number": f_number}
     exact = exact_camera(lens, {**real, "bounds": domain.bounds, "wavelength_nm": shot.wavelengths_nm})
     shape = _shape(film, across)
@@ -181,6 +182,23 @@ def probe(
     seen, ideal = (prints.footprints(c, places) for c in (exact, thin))
     wanted = prints.left_to(seen, ideal, places.share, afterwards)
     return Probed(scene, asked, stopped, domain, exact, places, shape, seen, ideal, wanted, small)
+
+
+def _domain(lens: Lens, scene: Scene, f_number: float) -> Domain:
+    """What a model of the shot must know: its film, stop and wavelengths, and as much more of the film's way as blurs a
+    quarter of a pixel, for models have their own focus; none more of a lens that goes no nearer."""
+    shot, plain = scene.settings.camera, lens.with_aperture(None)
+    film = shot.film_width_mm, shot.film_height_mm
+    stopped = plain.at(f_number=f_number, focus_m=shot.focus_m)
+    radius = min(math.hypot(*film) / 2, image_radius_mm(lens)[0])
+    move = _FOCUS_SPARE * f_number * film[0] / shot.width / first_order(stopped).efl_mm ** 2  # of the vergence, 1/mm
+    vergence = 1e-3 / shot.focus_m
+    ends = 1e-3 / (vergence - move) if vergence > move else math.inf, 1e-3 / (vergence + move)
+    with suppress(InputError):
+        return domain_of(stopped, film_radius_mm=radius, focus_m=ends, wavelength_nm=shot.wavelengths_nm)
+    return domain_from_camera(
+        plain, film_mm=film, focus_m=shot.focus_m, f_number=f_number, wavelength_nm=shot.wavelengths_nm
+    )[1]
 
 
 def _edges(scene: Scene, exact: Any, small: Glance, pixel_mm: float) -> tuple[float, float | None]:
