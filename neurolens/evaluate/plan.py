@@ -284,7 +284,7 @@ def camera_of(found: Probed, choice: Choice) -> Camera:
     if kind in _IDEAL:
         flat = ideal_as(f"{kind}:", found.exact.lens, Shot(found.asked.film_mm, found.asked.focus_m))
         mapped = choice.name.endswith(_MAPPED)
-        return Warped(flat, found.exact, found.asked.focus_m, tables=True) if mapped else flat
+        return Warped(flat, found.exact, found.asked.focus_m, tables=found.exact_field) if mapped else flat
     return (FusedCamera if kind else OnnxCamera)(load_model(path), **_real(found))
 
 
@@ -444,7 +444,8 @@ def _fitted(trial: _Trial, folder: Path, tried: Sequence[_Judged], say: Report) 
     """
     found, ideal = trial.found, ("pinhole",) if trial.target in _OURS else ("pinhole", "thin")
     easy = [j.choice for j in tried if j.choice.name.startswith(ideal) and not trial.explain]
-    asked = [b for b in trial.budgets_px if not any(c.meets(b) for c in easy)]
+    # Nothing that is fitted has no error.
+    asked = [b for b in trial.budgets_px if (b > 0 or trial.explain) and not any(c.meets(b) for c in easy)]
     if not asked:
         return []
     fit, sizes = shot_fits(found, folder), shot_terms(found)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, ideal_as
 from neurolens.cameras.exact import ExactCamera, FusedExactCamera
+from neurolens.cameras.field import Field, field_of
 from neurolens.evaluate import footprints as prints
 from neurolens.evaluate.footprints import AFTERWARDS, Array, Footprints, Places
 from neurolens.evaluate.light import STRAY, Glance, glance, small_raster, stray_light
@@ -30,6 +31,7 @@ from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm
 from neurolens.render.scene import Scene
+from neurolens.render.world import shared_worlds
 from neurolens.surrogates.domain import Domain, domain_from_camera, domain_of
 
 COUNTED = 95.0  # percentile over the picture that a budget is held against
@@ -118,6 +120,15 @@ class Probed:
     glance: Glance
 
     @cached_property
+    def exact_field(self) -> Field:
+        """Of the exact camera, for maps of its picture; it takes seconds.
+
+        Raises:
+            InputError: as `field_of`.
+        """
+        return field_of(self.exact, self.asked.focus_m)
+
+    @cached_property
     def camera_maps(self) -> Maps:
         """`effect_maps`, made once."""
         return effect_maps(self)
@@ -164,7 +175,9 @@ def probe(
     exact = exact_camera(lens, {**real, "bounds": domain.bounds, "wavelength_nm": shot.wavelengths_nm})
     shape = _shape(film, across)
     points = _grid(film, shape)
-    depth, small = seen_depths_m(scene, exact, points), glance(scene, exact)
+    with shared_worlds():
+        small, depth = glance(scene, exact), seen_depths_m(scene, exact, points)
+        edges = _edges(scene, exact, small, film[0] / shot.width)
     far = np.where(np.isnan(depth), np.inf, depth)
     places = prints.places_of(exact, points, far, small.wavelength_nm, small.share)
     if not places.film_mm.shape[1]:
@@ -176,7 +189,7 @@ def probe(
         float(met.min()) if met.size else None, float(met.max()) if met.size else None,
         float(np.isinf(depth).mean()), 1 - places.film_mm.shape[1] / points.shape[1],
         small.range_nm, float(np.median(small.contrast)),
-        *_edges(scene, exact, small, film[0] / shot.width), afterwards=tuple(sorted(afterwards)), denoised=denoised,
+        *edges, afterwards=tuple(sorted(afterwards)), denoised=denoised,
         zoom=zoom,
     )  # fmt: skip
     seen, ideal = (prints.footprints(c, places) for c in (exact, thin))
