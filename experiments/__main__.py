@@ -21,6 +21,7 @@ NAMES = {
     "vignetting": ("vignetting", "false passes and blocks, illumination"),
     "outside": ("outside", "random inputs through exported models"),
     "fused": ("fused_speed", "models as C against the exact lens as C"),
+    "gpu": ("gpu", "lenses and models as GLSL compute shaders, on a GPU or by software OpenGL"),
     "models": ("make_models", "make the models that ship"),
     "inverse": ("inverse", "inverse maps: how often they arrive"),
     "plans": ("plans", "plans of scenes: whether budgets are kept, and what the cheapest camera costs"),

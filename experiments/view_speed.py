@@ -2,7 +2,8 @@
 
 480 x 270 pixels, one sample, headless Chromium with SwiftShader (the extra "web"; Debian: chromium): the time from a
 setting, the page at rest, to the first picture with it, and the processor's time that the GPU process of the browser
-took for it (Linux), which other work on the machine changes little: SwiftShader spreads it over the cores.
+took for it (Linux), which other work on the machine changes little: SwiftShader spreads it over the cores. The library
+is the page of all lenses with all downloads. Lamps: with every fitted ghost drawn, once all of them are.
 Writes view_speed.md and view_speed.json.
 """
 
@@ -25,6 +26,7 @@ FLAGS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 OPTIONS = (
     lab.option("--lens", metavar="LENS", default="petzval_portrait_100", help="lens (default: petzval_portrait_100)"),
+    lab.option("--flare", metavar="LENS", default="brendel_tessar_100", help="of ghosts (default: brendel_tessar_100)"),
     lab.count("repeats", 7, "of each change (default: 7)"),
     lab.out(),
 )
@@ -42,6 +44,19 @@ CHANGES = {
     "thin lens": "set.a = 'thin', set.focus = 4 + 0.1 * k",
     "wipe, polynomial and exact": "set.a = 'polynomial', set.view = 'wipe', set.focus = 5 + 0.1 * k",
 }
+# With a lamp and all of its ghosts.
+LAMPS = {
+    "lamp moved": "set.lamp = [0.5 + 0.02 * k, 0.6]",
+    "lamp dimmed": "set.irradiance = 0.5 - 0.05 * k",
+    "focus beside a lamp": "set.focus = 20 + k",
+}
+_ALL_GHOSTS = """new Promise((done) => {
+  const look = () => {
+    const { shown, all } = neurolens.ghosts;
+    return shown && shown === all ? done(all) : setTimeout(look, 20);
+  };
+  neurolens.idle().then(look);
+})"""
 
 
 def run(args: argparse.Namespace) -> int:
@@ -52,24 +67,46 @@ def run(args: argparse.Namespace) -> int:
     from playwright.sync_api import sync_playwright
 
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as play:
-        page_file = Path(folder) / "view.html"
-        main(["view", args.lens, "--downloads", "glsl", "-o", str(page_file)])
+        ghosts, files = str(Path(folder) / "ghosts.onnx"), [Path(folder) / f"{name}.html" for name in "alf"]
+        main(["flare", args.flare, "--fit", ghosts, "--target-um", "60"])
+        for words, file in zip(([args.lens], [], [args.flare, ghosts]), files, strict=True):
+            main(["view", *words, *(["--downloads", "glsl"] if words else []), "-o", str(file)])
         opened = play.chromium.launch(executable_path=browser, args=list(FLAGS))
-        rows = [_first(opened, page_file, args.repeats)]
-        page = opened.new_page()
-        page.goto(page_file.as_uri())
-        page.evaluate(f"neurolens.ready.then(() => {_ONE})")
+        rows = [_first(opened, files[0], "first picture", args.repeats)]
+        rows.append(
+            _first(opened, files[1], f"first picture, library ({files[1].stat().st_size / 1e6:.2f} MB)", args.repeats)
+        )
+        page = _opened(opened, files[0])
         rows += [_change(page, name, script, args.repeats) for name, script in CHANGES.items()]
+        page.close()
+        page = _opened(opened, files[2])
+        page.evaluate("(neurolens.set.tool = 'lamp', neurolens.click([0.5, 0.6]))")
+        count = page.evaluate(_ALL_GHOSTS)
+        rows += [_change(page, f"{name}, {count} ghosts", script, args.repeats) for name, script in LAMPS.items()]
         opened.close()
     head = ("change", "least ms", "median ms", "processor ms", "wanted ms")
     keys = ("least_ms", "median_ms", "processor_ms", "wanted_ms")
     lines = [[r["change"], *("–" if r[key] is None else f"{r[key]:.0f}" for key in keys)] for r in rows]
     text = lab.page("# The page in software WebGL", __doc__ or "", lab.machine_line(), lab.table(head, lines))
-    print(lab.write_results(args.out, "view_speed", text, {"machine": lab.machine(), "lens": args.lens, "rows": rows}))
+    print(
+        lab.write_results(
+            args.out,
+            "view_speed",
+            text,
+            {"machine": lab.machine(), "lens": args.lens, "flare": args.flare, "rows": rows},
+        )
+    )
     return 0
 
 
-def _first(browser: Any, file: Path, repeats: int) -> dict[str, Any]:
+def _opened(browser: Any, file: Path) -> Any:
+    page = browser.new_page()
+    page.goto(file.as_uri())
+    page.evaluate(f"neurolens.ready.then(() => {_ONE})")
+    return page
+
+
+def _first(browser: Any, file: Path, name: str, repeats: int) -> dict[str, Any]:
     """From opening the file to the first picture, shaders compiled."""
     took = []
     for _ in range(min(repeats, 5)):
@@ -77,7 +114,7 @@ def _first(browser: Any, file: Path, repeats: int) -> dict[str, Any]:
         page.goto(file.as_uri())
         took.append(page.evaluate("neurolens.ready.then(() => performance.now())"))
         page.close()
-    return _row("first picture", took, [], FIRST_MS)
+    return _row(name, took, [], FIRST_MS)
 
 
 def _change(page: Any, name: str, script: str, repeats: int) -> dict[str, Any]:

@@ -35,6 +35,7 @@ class Section:
         radius_mm: inf for a plane.
         n_after: index of the medium behind it.
         profile: [M, 2] of (z, height) from rim to rim of what is no sphere, else None.
+        ideal: whether it is an ideal thin lens.
     """
 
     z_mm: float
@@ -43,6 +44,7 @@ class Section:
     n_after: float
     stop: bool = False
     profile: Array | None = None
+    ideal: bool = False
 
     def arc(self) -> Array:
         """[M, 2] of (z, height) from rim to rim.
@@ -110,7 +112,8 @@ def layout_profile(scene: Scene, film_radius_mm: float | None = None) -> Layout:
         rays += [Line(points, label, number) for points in _fan_lines(scene, field)]
     sections = (
         Section(
-            float(z), float(s.radius_mm), s.semi_diameter_mm, float(s.n_d), s.stop, _profile(s, float(z), scene.axis)
+            *(float(z), float(s.radius_mm), s.semi_diameter_mm, float(s.n_d), s.stop),
+            *(_profile(s, float(z), scene.axis), s.focal_mm is not None),
         )
         for s, z in zip(lens.surfaces, lens.vertices_mm[:-1], strict=True)
     )
@@ -234,6 +237,8 @@ def _draw_rims(axes: Any, surfaces: Sequence[Section]) -> None:
     """A tick outside each rim of glass, which blocks rays; the stop as two solid bars."""
     height = max(s.semi_diameter_mm for s in surfaces)
     for s in surfaces:
+        if s.ideal:
+            axes.plot(*s.arc().T, color="#3d5a75", lw=1.6, zorder=2)
         h, z = s.semi_diameter_mm, s.arc()[-1, 0]
         reach = max(h * 1.15, h + 0.16 * height) if s.stop else h + 0.035 * height
         look = {"color": INK, "lw": 3.2 if s.stop else 1.3, "solid_capstyle": "butt", "zorder": 4 if s.stop else 3}
@@ -262,6 +267,8 @@ def thumbnail(layout: Layout) -> str:
         if front.n_after >= _AIR:
             outline = element_outline(front, back)[::4]
             parts.append(path(outline, "fill='#a9cbe4' stroke='#3d5a75' stroke-width='.7'", "Z"))
+    look = "fill='none' stroke='#3d5a75' stroke-width='1.2'"
+    parts += [path(s.arc()[[0, -1]], look) for s in layout.surfaces if s.ideal]
     for ray in layout.rays[:: max(1, RAYS_A_FIELD // 3)]:
         parts.append(path(ray.points, f"fill='none' stroke='{_SVG_RAYS[ray.field % 3]}' stroke-width='.6'"))
     for s in layout.surfaces:

@@ -28,6 +28,8 @@ def plot_colour(data: Colour, path: str | Path, title: str, subtitle: str) -> No
             right.plot(data.field_deg, data.lateral_um[:, k], color=wavelength_colour(nm), label=f"{nm:.0f} nm")
         right.set(xlabel="field (degrees)", ylabel=f"height from that at {data.line_nm[0]:.0f} nm (µm)")
         right.set_title("lateral, chief rays")
+        if (np.nan_to_num(np.abs(data.lateral_um)) < 1e-3).all():
+            right.set_ylim(-1e-3, 1e-3)  # rounding is not drawn as colour
         for axes in (left, right):
             axes.grid(True)
             axes.legend()

@@ -51,12 +51,13 @@ def seidel(scene: Scene, *, wavelength_nm: float = LINE_D_NM, image_height_mm: f
     """Seidel sums at the edge of the field, or at another paraxial image height in mm.
 
     Raises:
-        InputError: a lens with cylinders: these sums are those of lenses symmetric about their axis.
+        InputError: a lens with cylinders: these sums are those of lenses symmetric about their axis; ideal surfaces.
     """
     lens = scene.lens
     if lens.anamorphic:
         raise InputError(lens.path, "cylinder", "(an anamorphic lens)", "a lens that is symmetric about its axis")
     scene.require_power()
+    lens.require_glass("Seidel sums")
     if image_height_mm is None:
         image_height_mm = float(scene.chief_rays([scene.edge_deg()], wavelength_nm).height_mm[0])
     system = system_of(lens, wavelength_nm)

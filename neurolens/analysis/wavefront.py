@@ -27,7 +27,12 @@ def opd_mm(rays: Bundle) -> Tensor:
 
 
 def path_to_chief_mm(rays: Bundle) -> Tensor:
-    """Optical path to the plane through the chief ray's film point that stands on the ray, [F, W, P]."""
+    """Optical path to the plane through the chief ray's film point that stands on the ray, [F, W, P].
+
+    Raises:
+        InputError: a lens with ideal surfaces, which have a law of rays and none of phases.
+    """
+    rays.scene.lens.require_glass("optical path")
     along_t, along_s = cosines(rays)
     return rays.path_mm - rays.tangential_mm * along_t - rays.sagittal_mm * along_s
 

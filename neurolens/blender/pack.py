@@ -27,7 +27,8 @@ FACTS, SCHEMA = "lenses.json", 1
 _ID = "neurolens"
 _CODE = ("__init__.py", "camera.py", "library.py", "needs.py", "panel.py", "blender_manifest.toml")
 _THEN = (1980, 1, 1, 0, 0, 0)  # the zip of the same lenses is the same, byte for byte
-_YEAR = re.compile(r"\b(1[89]\d\d|20\d\d)\b(?!,?\d)")
+_YEAR = re.compile(r"\b(1[89]\d\d|20\d\d)\b(?!,?\d)|\bS\.(\d\d)-\d")  # S.53 of a Japanese patent: Showa 53, 1978
+_SHOWA = 1925
 _LARGEST = 1 << 26
 
 
@@ -92,7 +93,7 @@ class PackedLens:
 def year_of(source: str) -> int | None:
     """The year that a source names, of several the first: the lens's own stands before the book that reprints it."""
     found = _YEAR.search(source)
-    return None if found is None else int(found[1])
+    return None if found is None else int(found[1] or _SHOWA + int(found[2]))
 
 
 def write_pack(out: Path, lenses: Iterable[PackedLens]) -> None:

@@ -144,7 +144,7 @@ class OnnxInverse:
             InputError: no file of the map of scene rays.
         """
         shape = self._map("scene")[1]["inverse"]["front"]
-        return None if shape is None else SimpleNamespace(**shape)
+        return None if shape is None else SimpleNamespace(**{"across": None} | shape)
 
     def _map(self, name: str) -> tuple[Any, dict[str, Any]]:
         if name not in self._maps:
@@ -205,9 +205,15 @@ def _is_front(value: Any) -> bool:
     """Whether this is a front surface as `meet_front` takes it: none, or a table of its shape."""
     if value is None:
         return True
-    if not isinstance(value, dict) or set(value) != {"curvature", "conic", "asphere", "cylinder"}:
+    keys = {"curvature", "conic", "asphere", "cylinder", "across"}
+    if not isinstance(value, dict) or set(value) | {"across"} != keys:
         return False
-    terms = value["asphere"]
+    terms, across = value["asphere"], value.get("across")
+    if across is not None:
+        if not isinstance(across, list) or len(across) != 2 or not is_number(across[0]) or across[0] == 0:
+            return False
+        if value["cylinder"] is None or not (across[1] is None or is_number(across[1])):
+            return False
     return (
         is_number(value["curvature"])
         and is_number(value["conic"])

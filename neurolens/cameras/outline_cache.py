@@ -43,7 +43,8 @@ def search_key(lens: Lens, wavelength_nm: tuple[float, float], shares: tuple[flo
     rows: list[Any] = []
     for s in lens.surfaces:
         numbers = (s.radius_mm, s.thickness_mm, s.diameter_mm, s.conic, *(index_of(s, w) for w in sorted(waves)))
-        rows.append([[float(v) for v in numbers], s.stop, s.cylinder, [(p, float(a)) for p, a in s.asphere]])
+        more = s.across, s.focal_mm, [(p, float(a)) for p, a in s.asphere]
+        rows.append([[float(v) for v in numbers], s.stop, s.cylinder, *more])
     return fingerprint_of([_code(), rows, float(lens.film_z_mm or 0), sorted(waves), *settings])
 
 

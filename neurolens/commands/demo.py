@@ -49,9 +49,9 @@ def run(args: argparse.Namespace) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     parser = Parser()
     render.add_parser(parser.add_subparsers())
-    figures = []
+    figures, traced = [], importlib.util.find_spec("torch") is not None
     for name, camera, caption in _PICTURES:
-        if name == "exact" and importlib.util.find_spec("torch") is None:
+        if name == "exact" and not traced:
             continue
         scene = str(library() / "experiments" / "scenes" / "lights.toml")
         size = ["--width", str(args.width), "--samples", str(args.samples)]
@@ -65,5 +65,6 @@ def run(args: argparse.Namespace) -> int:
     atomic_write_text(
         folder / "index.html", pages.page("One scene, five cameras", f"<h1>One scene, five cameras</h1>{body}")
     )
-    print(f"\nLook at {folder}/index.html\nThen: neurolens --help, neurolens lens list, neurolens models")
+    more = "neurolens lens list" if traced else "with the extra 'train', which traces lenses: neurolens lens list, view"
+    print(f"\nLook at {folder}/index.html\nThen: neurolens --help, neurolens models, {more}")
     return 0

@@ -132,7 +132,9 @@ def run(args: argparse.Namespace) -> int:
             return _answer(args, _about(_write_camera(file, args)))
         from neurolens.commands.export_lens import write_lens
 
-        return _answer(args, _about(write_lens(file, args)))
+        return _answer(
+            args, _about(write_lens(file, args.out, args.to, name=args.name, zoom=args.zoom, quiet=args.json))
+        )
     check_writable(args.out)
     from neurolens.cameras.onnxlens import load_model
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -38,17 +37,21 @@ _DISTANCES = 12  # about as many are placed for each lens
 _CHECKED = (0.12, 0.42, 0.83)  # of the range: where the film's position is measured
 
 
-def write_lens(file: Path, args: argparse.Namespace, *, as_bare: str = "") -> Written:
+def write_lens(
+    file: Path, out: Path, to: str, *, name: str | None = None, zoom: str | None = None, quiet: bool = False,
+    as_bare: str = "",
+) -> Written:  # fmt: skip
     """The lens as a function of film and pupil point, wavelength, film position, stop radius and, of a range, zoom.
 
     Args:
+        to: "c" or "glsl". name: of the function, None takes the lens's id. zoom: a state of `Lens.at`, or "range".
         as_bare: a line for the comment, of a lens whose coatings and absorption are left out; else it is refused.
     """
     lens = read_lens(file)
-    name = checked_name(args.to, lens.lens_id, args.name)
+    name = checked_name(to, lens.lens_id, name)
     axes: tuple[Axis, ...] = ()
     lines = []
-    if args.zoom == RANGE:
+    if zoom == RANGE:
         axis, error_mm = gap_axis(zoom_axis(lens), lambda zoom_mm: lens.at(zoom=zoom_mm))
         axes, nodes = (axis,), [lens.at(zoom=v) for v in axis.nodes]
         lines.append(
@@ -56,7 +59,7 @@ def write_lens(file: Path, args: argparse.Namespace, *, as_bare: str = "") -> Wr
             f"{_span(axis)} mm. Gaps between the source's own positions are within {1e3 * error_mm:.2g} um (measured)."
         )
     else:
-        nodes = [lens.at(zoom=args.zoom)]
+        nodes = [lens.at(zoom=zoom)]
         if lens.configurations:
             lines.append("One zoom position: its gaps are numbers in the code (--zoom range makes it an argument).")
     if focus_states(lens):
@@ -68,10 +71,10 @@ def write_lens(file: Path, args: argparse.Namespace, *, as_bare: str = "") -> Wr
     program = lens_program(nodes, axes, planes)
     constants, functions = followed(axes, numbers(nodes, planes))
     constants |= {**state_ranges(axes), "wavelength_min_nm": _LIGHT_NM[0], "wavelength_max_nm": _LIGHT_NM[1]}
-    placed, said = _film(lens, nodes, axes, Progress(quiet=args.json))
+    placed, said = _film(lens, nodes, axes, Progress(quiet=quiet))
     plane = f"z = {planes[0]:.6g} mm" if "pupil_z_mm" in constants else "z = NAME_pupil_z_mm(zoom_mm)"
     extras = Extras(constants, {**functions, **placed})
-    return write_program(program, args.out, args.to, name, lines_of([*_head(lens, plane), *lines, *said]), extras)
+    return write_program(program, out, to, name, lines_of([*_head(lens, plane), *lines, *said]), extras)
 
 
 def _span(axis: Axis) -> str:

@@ -239,11 +239,18 @@ def _surface_words(row: dict[str, Any]) -> str:
     words = [
         span,
         f"K {row['conic']:.4g}" if row["conic"] else "",
-        f"cylinder {row['cylinder']}" if row["cylinder"] else "",
+        f"cylinder {row['cylinder']}" if row["cylinder"] and not row["across"] else "",
+        _across_words(row["cylinder"], *row["across"]) if row["across"] else "",
+        f"ideal lens, f {row['focal_mm']:.4g} mm" if row["focal_mm"] else "",
         f"coating {row['coating']['name']}" if row["coating"] else "",
         f"absorbs {row['absorption_per_mm']:.3g}/mm" if row["absorption_per_mm"] else "",
     ]
     return ", ".join(word for word in words if word)
+
+
+def _across_words(axis: str, radius_mm: float, conic: float | None) -> str:
+    other = "x" if axis == "y" else "y"
+    return f"{'toroid' if conic is None else f'biconic K {conic:.4g}'}, {radius_mm:.4f} mm along {other}"
 
 
 _LIST_HEADER = ("lens", "name", "EFL mm", "f/", "half field", "refr.", "asph.", "cyl.", "states", "rims", "verdict")

@@ -62,6 +62,8 @@ def run(args: argparse.Namespace) -> int:
         check_folder(args.out, "--out")
         if not args.out.name:
             raise InputError("neurolens projection", "--out", str(args.out), "a name")
+        if args.out.suffix in (".json", ".yaml"):  # the name of a file that will be written
+            args.out = args.out.with_suffix("")
     from neurolens.analysis.projections import fit, residual
     from neurolens.cameras.build import make_camera
     from neurolens.cameras.field import field_of, spectrum_of

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import os
 import tempfile
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.bounds import RANGE
-from neurolens.base.errors import InputError, ModelError, NeurolensError
+from neurolens.base.errors import InputError, ModelError, NeurolensError, NeurolensWarning
 from neurolens.base.files import library as shipped
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, check_folder, check_suffix, lens_path
+from neurolens.commands.arguments import add_glass, add_json, check_folder, check_suffix, lens_path, whole
 from neurolens.commands.output import answer
 
 if TYPE_CHECKING:
@@ -44,7 +46,6 @@ _NEAR_EFL = 10.0  # of an exact lens: nearest focus in focal lengths
 _SAME = 1e-3  # of the focal length: what models and lens file of one id may differ by
 _DOWNLOADS = ("glsl", "onnx", "c", "osl")
 _GHOSTS = 24  # of a lens at most: the brightest
-_FEW = 4  # of more lenses the page leaves C and OSL out: seconds each, and they are large
 
 
 @dataclass(frozen=True)
@@ -68,10 +69,13 @@ def add_parser(subparsers: Any) -> None:
         "-o", "--out", metavar="FILE.html", type=Path, default=Path("view.html"), help="page (default: view.html)"
     )
     parser.add_argument(
-        "--downloads", metavar="KINDS", type=_kinds, default=None,
-        help="of glsl, onnx, c, osl what the page brings as files of each form (default: all, of more than "
-        f"{_FEW} lenses glsl,onnx: others take seconds each); the last are left out where the page grows beyond "
-        "3 MB",
+        "--downloads", metavar="KINDS", type=_kinds, default=_DOWNLOADS,
+        help="of glsl, onnx, c, osl what the page brings as files of each form (default: all; osl takes seconds a "
+        "model, once); the last are left out where the page grows beyond 3 MB",
+    )  # fmt: skip
+    parser.add_argument(
+        "--jobs", metavar="N", type=whole(1, 64), default=min(8, os.cpu_count() or 1),
+        help="processes that write OSL, each of a core and 0.5 GB (default here: %(default)s)",
     )  # fmt: skip
     add_glass(parser)
     add_json(parser)
@@ -92,12 +96,16 @@ def run(args: argparse.Namespace) -> int:
     check_suffix(args.out, "--out", (".html", ".htm"))
     check_folder(args.out, "--out")
     entries = list(_asked(args.lenses) if args.lenses else _library())
-    kinds = args.downloads or list(_DOWNLOADS if len(entries) <= _FEW else _DOWNLOADS[:2])
-    progress = Progress(quiet=args.json)
+    for entry in entries:
+        found = [_kind_of(_card(file)) for file in entry.models]
+        if len(set(found)) < len(found):
+            raise InputError("neurolens view", entry.key, f"({' and '.join(found)})", "one model of each kind")
+    kinds, progress = args.downloads, Progress(quiet=args.json)
+    shaders = _shaders([m for e in entries for m in e.models], args.jobs, progress) if "osl" in kinds else {}
     made: list[ViewLens] = []
     with progress.stage(f"{len(entries)} lenses") as report, tempfile.TemporaryDirectory() as folder:
         for entry in entries:
-            made.append(_view_lens(entry, Path(folder), kinds))
+            made.append(_view_lens(entry, Path(folder), kinds, shaders))
             report(len(made) / len(entries))
     from neurolens.view.page import write_page
 
@@ -106,6 +114,17 @@ def run(args: argparse.Namespace) -> int:
     data = {"file": str(args.out), **about, "lenses": [lens.key for lens in made]}
     more = f"; left out for its size: {', '.join(left)}" if left else ""
     return answer(args, data, lambda: f"{args.out}: {len(made)} lenses, {about['bytes'] / 1e6:.2f} MB{more}")
+
+
+def _shaders(files: Sequence[Path], jobs: int, progress: Progress) -> Mapping[Path, str]:
+    """OSL of models; those that cannot be written so are told of and left out."""
+    from neurolens.commands.blender_lenses import forms_of
+
+    with progress.stage("shaders") as report:
+        forms, left = forms_of(files, min(jobs, len(files)), report) if files else ({}, {})
+    for why in left.values():
+        warnings.warn(f"no OSL: {why}", NeurolensWarning, stacklevel=2)
+    return {file: form.osl for file, form in forms.items()}
 
 
 def _library() -> Iterator[_Entry]:
@@ -134,7 +153,10 @@ def _asked(words: Sequence[str]) -> Iterator[_Entry]:
     models: dict[str, list[Path]] = {}
     brought: dict[str, list[Path]] = {}
     flares = {path: model for path in map(Path, words) if path.suffix == ".onnx" and (model := _flare(path))}
-    of = {model.lens.lens_id: model for model in flares.values()}
+    of: dict[str, GhostModel] = {}
+    for path, model in flares.items():
+        if of.setdefault(model.lens.lens_id, model) is not model:
+            raise InputError("neurolens view", f"ghosts of {model.lens.lens_id}", str(path), "one file a lens")
     for word in words:
         path = Path(word) if word.endswith(".onnx") else lens_path(word, "view")
         if path in flares:
@@ -185,19 +207,16 @@ def _kind_of(card: Mapping[str, Any]) -> str:
     return "network" if family.startswith(_NETWORK) else "polynomial"
 
 
-def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str]) -> ViewLens:
+def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str], shaders: Mapping[Path, str]) -> ViewLens:
     """A lens of the page.
 
     Raises:
-        InputError: two models of one kind; a lens that the exact tracer's code cannot hold, without any model.
+        InputError: models of another state; a lens that the exact tracer's code cannot hold, without any model.
     """
     from neurolens.view.page import ViewLens
     from neurolens.view.shaders import ghosts_glsl
 
-    found = [_kind_of(_card(file)) for file in entry.models]
-    if len(set(found)) < len(found):
-        raise InputError("neurolens view", entry.key, f"({' and '.join(found)})", "one model of each kind")
-    forms = [_model_form(file, folder, kinds) for file in entry.models]
+    forms = [_model_form(file, folder, kinds, shaders.get(file)) for file in entry.models]
     drawn: dict[str, Any] = {}
     path = None
     if entry.lens is not None:
@@ -244,7 +263,7 @@ def _path(lens: Lens) -> tuple[str, Sequence[str]]:
     return path_glsl(lens, pupil_plane_z_mm(lens), _LIGHT_NM)
 
 
-def _model_form(file: Path, folder: Path, kinds: Sequence[str]) -> Form:
+def _model_form(file: Path, folder: Path, kinds: Sequence[str], osl: str | None) -> Form:
     from neurolens.cameras.onnxlens import load_model
     from neurolens.cameras.source import model_extras
     from neurolens.surrogates.source import export_file
@@ -266,10 +285,7 @@ def _model_form(file: Path, folder: Path, kinds: Sequence[str]) -> Form:
         "poor": list(errors.get("poor") or ()),
     }
     files = {"onnx": file.read_bytes()} | {to: w.path.read_bytes() for to, w in written.items() if to != "glsl"}
-    if "osl" in kinds:
-        from neurolens.commands.blender_lenses import form_of
-
-        files["osl"] = form_of(file, quiet=True).osl.encode()
+    files |= {} if osl is None else {"osl": osl.encode()}
     glsl = written["glsl"]
     return Form(_kind_of(card), str(card["fit"]["method"]), glsl.path.read_text("utf-8"), glsl.signature, told, files)
 
@@ -311,8 +327,7 @@ def _exact_form(entry: _Entry, folder: Path, kinds: Sequence[str]) -> Form:
     write_file(lens, file)
     written, as_bare = {}, "" if _is_bare(lens) else f"In this form: {_AS_BARE}."
     for to in _written(kinds):
-        options = argparse.Namespace(to=to, name=None, zoom=entry.zoom, json=True, out=folder / f"exact.{to}")
-        written[to] = write_lens(file, options, as_bare=as_bare)
+        written[to] = write_lens(file, folder / f"exact.{to}", to, zoom=entry.zoom, quiet=True, as_bare=as_bare)
     at = lens.at() if entry.zoom == RANGE else lens.at(zoom=entry.zoom)
     data = first_order(at)
     told = {

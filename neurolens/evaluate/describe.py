@@ -91,6 +91,8 @@ def glass_table(lens: Lens) -> list[dict[str, Any]]:
             "conic": float(s.conic),
             "asphere": {str(power): float(a) for power, a in s.asphere},
             "cylinder": s.cylinder,
+            "across": s.across,
+            "focal_mm": s.focal_mm,
             "glass": s.glass,
             "absorption_per_mm": s.absorption_per_mm,
             "coating": s.coating and {"name": s.coating.name, "layers": [list(layer) for layer in s.coating.layers]},

@@ -35,7 +35,7 @@ COLUMNS = (
 _TEXTS = ("file", "verdict", "format", "name", "rims", "reason")
 _LISTS = ("notes", "doubts")
 TABLE_STYLE = """<style>
-.survey td.t { text-align: left; white-space: normal; min-width: 16rem; max-width: 34rem; overflow-wrap: anywhere; }
+.survey td.t { text-align: left; white-space: normal; min-width: 12rem; max-width: 34rem; overflow-wrap: anywhere; }
 .survey tbody th { min-width: 11rem; max-width: 16rem; white-space: normal; overflow-wrap: anywhere; }
 .survey tbody th small { color: var(--dim); display: block; }
 .survey td.p { padding: 2px; background: #fff; color: #222; } .survey td.p svg { display: block; }

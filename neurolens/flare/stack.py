@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.flare.steps import (
+    ACROSS,
     CALL,
     FIGURE,
     PLAIN,
@@ -54,19 +55,20 @@ class Stack:
         fit_error: the largest relative error of a coating's fitted reflectance so far; see `steps.reflectance_fit`.
 
     Raises:
-        InputError: a lens without film position.
+        InputError: a lens without film position; one with ideal surfaces, which reflect nothing.
     """
 
     def __init__(self, lens: Lens, places: Iterable[Place]) -> None:
         if lens.film_z_mm is None:
             raise InputError(lens.path, "film_z_mm", None, "a focused lens (Lens.at)")
+        lens.require_glass("reflections, of which flare is made")
         self.lens, self.fit_error = lens, 0.0
         # An asphere's polynomial goes as high as the highest of its sort: they share functions.
         self._figures = {k: figure_of(s) for k, s in enumerate(lens.surfaces) if not is_plain(s)}
         figures = self._figures.values()
         most = {even: max([0, *(len(f.terms) for f in figures if f.even == even)]) for even in (True, False)}
         self._terms = {k: most[f.even] if f.terms else 0 for k, f in self._figures.items()}
-        self.width = PLAIN + len(FIGURE) + max(most.values())
+        self.width = PLAIN + len(FIGURE) + ACROSS + max(most.values())
         kinds = {place: self._kind(*place) for place in sorted(places)}
         self._kinds = tuple(dict.fromkeys(kinds.values()))
         self.functions = np.full((len(lens.surfaces), len(ACTIONS)), -1, np.int32)
@@ -104,7 +106,7 @@ class Stack:
         lens, s, f = self.lens, self.lens.surfaces[k], self._figures.get(k)
         return Kind(
             ACTIONS[which][0],
-            None if f is None else Shape(self._terms[k], f.even, f.steps, f.bent),
+            None if f is None else Shape(self._terms[k], f.even, f.steps, f.bent, bool(f.across), f.turned),
             reflects(lens, k),
             bool(s.coating and s.coating.layers),
             any(t.glass is not None or t.absorption_per_mm for t in lens.surfaces),

@@ -25,7 +25,8 @@ STATE = 8  # rows: x, y, z (mm, this step's frame), direction, power, largest r^
 LOST = 1e30  # of that ratio: the ray meets no surface, or is totally reflected where it should go on
 CALL = ("shift_mm", "curvature", "per_rim2", "n_before", "n_after", "n_step", "absorbed_per_mm")
 DEGREE = 10  # of a coating's reflectance
-FIGURE = ("stretch", "start_c", "start_cz", "last_step_mm")  # then the terms of the polynomial; as `tracegraph.Figure`
+FIGURE = ("stretch", "start_c", "start_cz", "last_step_mm")  # as `tracegraph.Figure`; then `across`, then the terms
+ACROSS = 3
 PLAIN = len(CALL) + DEGREE + 1  # numbers of the call of a sphere
 _TINY = 1e-30
 _FAINT = 2e-4  # reflectance that no ghost is seen by
@@ -38,6 +39,8 @@ class Shape(NamedTuple):
     even: bool = True
     steps: int = 0
     bent: tuple[bool, bool] = (True, True)
+    crossed: bool = False
+    turned: bool = False
 
 
 class Kind(NamedTuple):
@@ -66,7 +69,7 @@ def step_graph(kind: Kind) -> Graph:
     terms of the polynomial, as many as the shape has.
     """
     g, shape = Graph(), kind.shape
-    count = PLAIN + (0 if shape is None else len(FIGURE) + shape.terms)
+    count = PLAIN + (0 if shape is None else len(FIGURE) + ACROSS * shape.crossed + shape.terms)
     state, call = g.input("state", STATE), g.input("call", count, per_call=True)
     shift, curvature, per_rim2, n1, n2, n_step, absorbed = (call[k] for k in range(len(CALL)))
     d, power, worst = state[3:6], state[6], state[7]
@@ -162,10 +165,14 @@ def reflectance_fit(
 
 
 def _figure(shape: Shape, call: Value) -> Figure:
-    stretch, c, cz, last_step, *terms = (call[PLAIN + k] for k in range(len(FIGURE) + shape.terms))
-    return Figure(call[CALL.index("curvature")], stretch, terms, (c, cz), last_step, *shape[1:])
+    more = ACROSS * shape.crossed
+    stretch, c, cz, last_step, *rest = (call[PLAIN + k] for k in range(len(FIGURE) + more + shape.terms))
+    figure = Figure(call[CALL.index("curvature")], stretch, rest[more:], (c, cz), last_step, *shape[1:4])
+    return figure._replace(across=tuple(rest[:more]), turned=shape.turned)
 
 
 def figure_numbers(figure: Figure, turn: float) -> list[Any]:
     """`FIGURE` and the terms as numbers, turned by -1.0 for light that travels towards +z in the lens frame."""
-    return [figure.stretch, *(turn * v for v in figure.start), figure.last_step, *(turn * v for v in figure.terms)]
+    across = [turn * figure.across[0], turn * figure.across[1], figure.across[2]] if figure.across else []
+    start = [figure.stretch, *(turn * v for v in figure.start), figure.last_step]
+    return [*start, *across, *(turn * v for v in figure.terms)]

@@ -23,9 +23,10 @@ The format, complete; keys marked optional may be left out:
     # out; they are needed where the catalogue does not know the name). material: name of the glass in the source, for
     # people only. stop = true: the aperture stop, one row.
     # Optional: conic (Schwarzschild's constant K, 0 a sphere, -1 a paraboloid), asphere (power = coefficient:
-    # sag = conic + sum A_p r^p, mm), cylinder = "x" or "y" (the axis along which it is curved), absorption_per_mm
-    # (Napierian, of the medium after the surface), coating (a design such as "quarter-wave 550", or the name of one of
-    # the coatings below).
+    # sag = conic + sum A_p r^p, mm), cylinder = "x" or "y" (the axis along which it is curved; across_mm: a toroid, the
+    # curve turned about a line parallel to that axis at this radius; across_conic, too: a biconic, whose sections have
+    # these radii and conics), focal_mm (an ideal thin lens: a plane in air), absorption_per_mm (Napierian, of the
+    # medium after the surface), coating (a design such as "quarter-wave 550", or the name of one of those below).
     surfaces = [
       { radius_mm = 33.802, thickness_mm = 5.817, diameter_mm = 41.66, n_d = 1.6645, V_d = 35.91, material = "..." },
       { radius_mm = inf, thickness_mm = 10.211, diameter_mm = 19.05, stop = true },
@@ -84,7 +85,7 @@ LENS_KEYS = (
 )
 SURFACE_KEYS = (
     *("radius_mm", "thickness_mm", "diameter_mm", "n_d", "V_d", "glass", "material", "stop", "conic", "asphere"),
-    *("cylinder", "absorption_per_mm", "coating"),
+    *("cylinder", "across_mm", "across_conic", "focal_mm", "absorption_per_mm", "coating"),
 )
 CONFIGURATION_KEYS = (
     *("name", "efl_mm", "half_field_deg", "thickness_mm", "f_number", "stop_diameter_mm", "object_distance_mm"),
@@ -316,6 +317,7 @@ def _shape(row: Table) -> dict[str, Any]:
         shape["cylinder"] = row.text("cylinder")
         if shape["cylinder"] not in ("x", "y"):
             raise row.error("cylinder", shape["cylinder"], 'the axis along which it is curved: "x" or "y"')
+    shape |= _across(row) | _ideal(row)
     if "asphere" not in row:
         return shape
     given = row.data["asphere"]
@@ -330,6 +332,40 @@ def _shape(row: Table) -> dict[str, Any]:
             raise row.error("asphere", power, f"a whole power from 2 to {MAX_POWER}")
         terms.append((int(key), Table(given, row.file, f"{row.where}asphere, power ").number(key)))
     return {**shape, "asphere": tuple(sorted(terms))}
+
+
+def _across(row: Table) -> dict[str, Any]:
+    """What bends a toroid or a biconic across its cylinder; an infinite radius leaves a cylinder."""
+    for key in (k for k in ("across_mm", "across_conic") if k in row):
+        if "cylinder" not in row:
+            raise row.error("cylinder", "(missing)", f'the axis of the curve that {key} goes with: "x" or "y"')
+    if "across_mm" not in row:
+        if "across_conic" in row:
+            raise row.error("across_mm", "(missing)", "the radius that across_conic goes with")
+        return {}
+    radius = row.number("across_mm", unit="mm", finite=False)
+    if "across_conic" in row and "asphere" in row:
+        raise row.error("asphere", row.data["asphere"], "none: a biconic has no polynomial (a toroid has)")
+    if not abs(radius) > 0:
+        raise row.error("across_mm", radius, "a radius of curvature other than 0, or inf")
+    conic = row.number("across_conic") if "across_conic" in row else None
+    return {"across": (radius, conic)} if math.isfinite(radius) else {}
+
+
+def _ideal(row: Table) -> dict[str, Any]:
+    if "focal_mm" not in row:
+        return {}
+    focal = row.number("focal_mm", unit="mm")
+    shaped = [key for key in ("conic", "asphere", "cylinder", "coating") if key in row]
+    if shaped or not math.isinf(row.number("radius_mm", finite=False)):
+        raise row.error(
+            shaped[0] if shaped else "radius_mm",
+            row.data.get((shaped or ["radius_mm"])[0]),
+            "a plane in air (radius_mm = inf, nothing else), as focal_mm makes it an ideal thin lens",
+        )
+    if focal == 0:
+        raise row.error("focal_mm", focal, "a focal length other than 0")
+    return {"focal_mm": focal}
 
 
 def _coatings(table: Table) -> dict[str, Coating]:

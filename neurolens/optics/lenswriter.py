@@ -106,6 +106,11 @@ def _cells(s: Surface) -> dict[str, str]:
         cells["V_d"] = repr(float(s.V_d))
     if s.cylinder is not None:
         cells["cylinder"] = format_value(s.cylinder)
+    for key, value in (("across_mm", s.across and s.across[0]), ("across_conic", s.across and s.across[1])):
+        if value is not None:
+            cells[key] = repr(value)
+    if s.focal_mm is not None:
+        cells["focal_mm"] = repr(s.focal_mm)
     if float(s.conic) != 0:
         cells["conic"] = repr(float(s.conic))
     if s.asphere:

@@ -43,19 +43,24 @@ class FirstOrder:
 
 @dataclass(frozen=True)
 class System:
-    """A lens to first order: curvatures [S] in 1/mm, gaps [S - 1] between surfaces, indices [S + 1] of the media."""
+    """A lens to first order: curvatures [S] in 1/mm, gaps [S - 1] between surfaces, indices [S + 1] of the media.
+
+    `ideal` [S]: powers in 1/mm of ideal thin lenses, 0 of other surfaces.
+    """
 
     curvature: list[Any]
     gap_mm: list[Any]
     index: list[Any]
+    ideal: list[float]
 
     def turned(self) -> System:
         """The system as light meets it that comes from the other side."""
-        return System([-c for c in reversed(self.curvature)], self.gap_mm[::-1], self.index[::-1])
+        return System([-c for c in reversed(self.curvature)], self.gap_mm[::-1], self.index[::-1], self.ideal[::-1])
 
     def behind(self, surface: int) -> System:
         """The surfaces behind one."""
-        return System(self.curvature[surface + 1 :], self.gap_mm[surface + 1 :], self.index[surface + 1 :])
+        rest = slice(surface + 1, None)
+        return System(self.curvature[rest], self.gap_mm[rest], self.index[rest], self.ideal[rest])
 
     def march(self, y: Any, u: Any) -> PathOfRay:
         """The paraxial ray of height y (mm) at the first surface and slope u before it.
@@ -66,7 +71,7 @@ class System:
         n = self.index
         for k, c in enumerate(self.curvature):
             y = y + u * self.gap_mm[k - 1] if k else y
-            after = (n[k] * u - y * c * (n[k + 1] - n[k])) / n[k + 1]
+            after = (n[k] * u - y * c * (n[k + 1] - n[k]) - y * self.ideal[k]) / n[k + 1]
             for values, value in zip(path, (y, u, after), strict=True):
                 values.append(value)
             u = after
@@ -85,7 +90,8 @@ def system_of(lens: Lens, wavelength_nm: float = LINE_D_NM, meridian: Meridian =
     """The lens in one meridian at one wavelength."""
     curvature = [s.vertex_curvature(meridian) for s in lens.surfaces]
     index = [1.0, *(index_of(s, wavelength_nm) for s in lens.surfaces)]
-    return System(curvature, [s.thickness_mm for s in lens.surfaces[:-1]], index)
+    ideal = [0.0 if s.focal_mm is None else 1 / s.focal_mm for s in lens.surfaces]
+    return System(curvature, [s.thickness_mm for s in lens.surfaces[:-1]], index, ideal)
 
 
 def _pupil(system: System, stop: int) -> tuple[Any, Any]:
@@ -100,7 +106,7 @@ def _pupil(system: System, stop: int) -> tuple[Any, Any]:
 
 
 def first_order(lens: Lens, wavelength_nm: float = LINE_D_NM, meridian: Meridian = "y") -> FirstOrder:
-    """First-order data at one wavelength; of one meridian, where a lens has cylinders.
+    """First-order data at one wavelength; of one meridian, where a lens has cylinders, toroids or biconics.
 
     For a lens without power (a pinhole, filters before or behind it) the film's centre counts as the focal point, and
     the distance from the hole to the film, by which it maps angles to the film, as the focal length.
@@ -140,7 +146,8 @@ def first_order(lens: Lens, wavelength_nm: float = LINE_D_NM, meridian: Meridian
 
 def is_pinhole(lens: Lens) -> bool:
     """Whether no surface bends light: a hole, perhaps behind plane filters."""
-    return all(s.radius_mm in (math.inf, -math.inf) and not s.asphere for s in lens.surfaces)
+    flat = all(s.radius_mm in (math.inf, -math.inf) and not (s.asphere or s.across) for s in lens.surfaces)
+    return flat and not lens.ideal
 
 
 def _pinhole(lens: Lens, indices: list[Any]) -> FirstOrder:

@@ -161,6 +161,8 @@ def bend(
     Returns the rays after it, n' times their cosine of refraction, and its square before guarding: the margin by which
     they are not totally reflected.
     """
+    if surface.focal_mm is not None:
+        return _ideal(surface.focal_mm, r, hit), hit.q, hit.q2
     if before is after:
         return Rays(hit.x, hit.y, hit.z, r.dx, r.dy, r.dz), hit.q, hit.q2
     c = 0.0 if _is_plane(surface) else surface.curvature
@@ -169,6 +171,14 @@ def bend(
         # From air nothing is totally reflected.
         tests.require(positive(q2, spend=mode.spend), k, st.TOTAL_REFLECTION)
     return bent, q, q2
+
+
+def _ideal(focal_mm: float, r: Rays, hit: Hit) -> Rays:
+    """Rays in air behind an ideal thin lens: slopes change by -x / f and -y / f, so that points become points."""
+    towards = r.dz.abs() / focal_mm
+    dx, dy = r.dx - towards * hit.x, r.dy - towards * hit.y
+    scale = torch.rsqrt(dx * dx + dy * dy + r.dz * r.dz)
+    return Rays(hit.x, hit.y, hit.z, dx * scale, dy * scale, r.dz * scale)
 
 
 def along_axis(r: Rays, tests: Survival, sense: int, z: Any) -> Rays:

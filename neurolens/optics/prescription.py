@@ -47,6 +47,9 @@ class Surface:
         asphere: (power, coefficient) pairs, sorted by power, added to the conic: sum of A_p r^p, A_p in mm^(1 - p).
             Odd powers and p = 2 (which adds 2 A_2 to the curvature at the vertex) are allowed.
         cylinder: None, or the transverse axis, "x" or "y", along which a cylinder is curved (straight along the other).
+        across: of a cylinder bent along the other axis, too: that radius (mm), and None where the curve is turned about
+            a line parallel to it at this radius (a toroid), or the conic constant of a biconic, which has no asphere.
+        focal_mm: of an ideal thin lens in air, a plane that refracts nothing: slopes change by -x / f and -y / f.
         glass: name in the glass catalogue (`neurolens.optics.catalogue`); its dispersion rules over n_d and V_d.
         absorption_per_mm: Napierian absorption of the medium after the surface at every wavelength (a grey filter),
             added to that of the glass.
@@ -66,6 +69,8 @@ class Surface:
     conic: Any = 0.0
     asphere: tuple[tuple[int, Any], ...] = ()
     cylinder: str | None = None
+    across: tuple[float, float | None] | None = None
+    focal_mm: float | None = None
     glass: str | None = None
     absorption_per_mm: float = 0.0
     coating: Coating | None = None
@@ -78,7 +83,7 @@ class Surface:
     def vertex_curvature(self, meridian: str) -> Any:
         """Curvature at the vertex along "x" or "y" in 1/mm: 1 / radius + 2 A_2, and 0 where a cylinder is straight."""
         if self.cylinder not in (None, meridian):
-            return 0.0
+            return 0.0 if self.across is None else 1.0 / self.across[0]
         return self.curvature + sum(2 * a for p, a in self.asphere if p == 2)
 
     @property
@@ -160,8 +165,19 @@ class Lens:
 
     @property
     def anamorphic(self) -> bool:
-        """Whether any surface is a cylinder: the lens is then not round about its axis."""
+        """Whether any surface is a cylinder, toroid or biconic: the lens is then not round about its axis."""
         return any(s.cylinder is not None for s in self.surfaces)
+
+    @property
+    def ideal(self) -> list[int]:
+        """The surfaces that are ideal thin lenses."""
+        return [k for k, s in enumerate(self.surfaces) if s.focal_mm is not None]
+
+    def require_glass(self, what: str) -> None:
+        """Raise InputError for a lens with ideal surfaces, of which there is no `what`."""
+        for k in self.ideal:
+            expected = f"surfaces of glass: an ideal lens has no {what}"
+            raise InputError(self.path, f"surface {k}, focal_mm", self.surfaces[k].focal_mm, expected)
 
     @property
     def dispersive(self) -> bool:
@@ -252,7 +268,8 @@ class Lens:
                 s,
                 asphere=tuple((p, a * factor ** (1 - p)) for p, a in s.asphere),
                 absorption_per_mm=s.absorption_per_mm / factor,
-                **lengths(s, "radius_mm", "thickness_mm", "diameter_mm"),
+                across=s.across and (s.across[0] * factor, s.across[1]),
+                **lengths(s, "radius_mm", "thickness_mm", "diameter_mm", "focal_mm"),
             )
             for s in self.surfaces
         )
@@ -303,6 +320,8 @@ def _figures(s: Surface) -> list[Any]:
         "conic": float(s.conic),
         "asphere": [(p, float(a)) for p, a in s.asphere],
         "cylinder": s.cylinder,
+        "across": s.across,
+        "focal_mm": s.focal_mm,
         "glass": s.glass,
         "absorption_per_mm": float(s.absorption_per_mm),
         "coating": s.coating and [[float(v) for v in layer] for layer in s.coating.layers],

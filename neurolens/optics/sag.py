@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 TOUCH_MM = 1e-6  # edge contact is common in patents; only rounding is forgiven
 
-# Newton's steps along the ray from the sphere of the vertex to a conic, asphere or cylinder.
+# Newton's steps along the ray from the sphere of the vertex to a conic, asphere, cylinder, toroid or biconic.
 _STEPS = 8
 
 
@@ -31,6 +31,7 @@ class Shape(Protocol):
 
     Attributes:
         curvature: 1/mm. conic: k. asphere: pairs (p, a). cylinder: the axis that is bent, or None.
+        across: what bends it along the other axis, or None; see `Surface`.
     """
 
     @property
@@ -41,6 +42,8 @@ class Shape(Protocol):
     def asphere(self) -> Any: ...
     @property
     def cylinder(self) -> str | None: ...
+    @property
+    def across(self) -> Any: ...
 
 
 def sag_mm(shape: Shape, x: Any, y: Any, *, held: bool = False) -> Any:
@@ -51,15 +54,66 @@ def sag_mm(shape: Shape, x: Any, y: Any, *, held: bool = False) -> Any:
         held: whether a conic goes on as a plane beyond its end, where the depth is else NaN; arrays and tensors only.
     """
     h2, c = _height2(shape, x, y), float(shape.curvature)
-    under_root = 1 - (1 + float(shape.conic)) * c * c * h2
-    sag = c * h2 / (1 + _root(under_root.clip(0.0) if held else under_root))
+    under_root, bent = 1 - (1 + float(shape.conic)) * c * c * h2, c * h2
+    if shape.across is not None:
+        a2, c_across = x * x + y * y - h2, 1 / shape.across[0]
+        if shape.across[1] is not None:
+            under_root, bent = under_root - (1 + shape.across[1]) * c_across**2 * a2, bent + c_across * a2
+    sag = bent / (1 + _root(under_root.clip(0.0) if held else under_root))
     h = _root(h2) if len(shape.asphere) else 0.0
-    return sag + sum(float(a) * h**p for p, a in shape.asphere)
+    sag = sag + sum(float(a) * h**p for p, a in shape.asphere)
+    if shape.across is None or shape.across[1] is not None:
+        return sag
+    way = 1 - c_across * sag  # to the line that the curve is turned about, over the radius there
+    under_root = way * way - c_across**2 * a2
+    return (sag * (1 + way) + c_across * a2) / (1 + _root(under_root.clip(0.0) if held else under_root))
+
+
+def toroid(c: Any, curve: tuple[Any, Any, Any], at: tuple[Any, Any, Any], p: tuple[Any, Any, Any]) -> tuple[Any, ...]:
+    """(c (a^2 + z^2) - c g^2) / 2 - z + g, which is 0 on a toroid; its gradient; its second derivative along p.
+
+    In any arithmetic that has operators.
+
+    Args:
+        c: 1 / radius of rotation. curve: the sag g(h), its slope over h, and the change of that over h by h.
+        at, p: point and direction: across the curve, along it, along z.
+    """
+    (g, slope, turn), (a, h, z), (pa, ph, pz) = curve, at, p
+    way = 1 - g * c
+    value = (a * a + z * z) * c * 0.5 - z + g * (way + 1) * 0.5
+    bend = (pa * pa + pz * pz) * c + ph * ph * ((slope + turn * h * h) * way - slope * slope * h * h * c)
+    return value, (a * c, slope * h * way, z * c - 1), bend
+
+
+def biconic(
+    along: tuple[Any, Any], across: tuple[Any, Any], at: tuple[Any, Any, Any], p: tuple[Any, Any, Any], root: Any
+) -> tuple[Any, ...]:
+    """Sag less z of a biconic, its gradient, its second derivative along p, and what stands under the root.
+
+    Args:
+        along, across: curvature and 1 + conic. at, p: as of `toroid`. root: a square root that is held above 0.
+    """
+    (c, k), (ca, ka), (a, h, z), (pa, ph, _) = along, across, at, p
+    kc, kca = k * c * c, ka * ca * ca
+    square = 1 - (h * h * kc + a * a * kca)
+    r = root(square)
+    over = 1 / (r + 1)
+    sag = (h * h * c + a * a * ca) * over
+    rh, ra = h * kc / r, a * kca / r  # derivatives of the root, negative
+    sh, sa = (h * c * 2 + sag * rh) * over, (a * ca * 2 + sag * ra) * over
+    change, rise = ph * rh + pa * ra, ph * sh + pa * sa
+    bend = (ph * ph * c + pa * pa * ca + rise * change) * 2 + sag * (ph * ph * kc + pa * pa * kca + change * change) / r
+    return sag - z, (sa, sh, -1.0), bend * over, square
 
 
 def sag_and_derivatives(shape: Shape, x: Array, y: Array) -> tuple[Array, Array, Array]:
     """Depth (mm) at points x, y and its derivatives by x and y; NaN beyond the end of a conic."""
     c, k = float(shape.curvature), float(shape.conic)
+    if shape.across is not None and shape.across[1] is not None:
+        swapped = shape.cylinder == "x"
+        at, c_across = ((y, x) if swapped else (x, y)), 1 / shape.across[0]
+        z, slope, *_ = biconic((c, 1 + k), (c_across, 1 + shape.across[1]), (*at, 0.0), (0.0, 0.0, 0.0), np.sqrt)
+        return z, slope[swapped], slope[not swapped]
     h2 = _height2(shape, x, y)
     root = np.sqrt(1 - (1 + k) * c * c * h2)
     z, by_h2 = c * h2 / (1 + root), c / (2 * root)
@@ -67,7 +121,12 @@ def sag_and_derivatives(shape: Shape, x: Array, y: Array) -> tuple[Array, Array,
         z = z + float(a) * h2 ** (power / 2)
         by_h2 = by_h2 + float(a) * (power / 2) * h2 ** (power / 2 - 1)
     gx, gy = _bent(shape)
-    return z, 2 * gx * x * by_h2, 2 * gy * y * by_h2
+    zx, zy = 2 * gx * x * by_h2, 2 * gy * y * by_h2
+    if shape.across is None:
+        return z, zx, zy
+    c, way = 1 / shape.across[0], 1 - z / shape.across[0]
+    z = sag_mm(shape, x, y)
+    return z, ((1 - gx) * c * x + way * zx) / (1 - c * z), ((1 - gy) * c * y + way * zy) / (1 - c * z)
 
 
 def _bent(shape: Shape) -> tuple[float, float]:
@@ -136,8 +195,10 @@ def front_rays(
 
 def end_mm(surface: Surface) -> float:
     """Distance from the axis at which a surface's conic ends: the radius of a sphere; inf where it goes on."""
-    stretch = 1 + float(surface.conic)
-    return abs(float(surface.radius_mm)) / math.sqrt(stretch) if stretch > 0 else math.inf
+    sections = [(float(surface.radius_mm), float(surface.conic))]
+    if surface.across is not None:
+        sections.append((surface.across[0], surface.across[1] or 0.0))
+    return min(abs(radius) / math.sqrt(1 + k) if k > -1 else math.inf for radius, k in sections)
 
 
 def check_figures(surfaces: Sequence[Surface], file: str, state: str = "") -> None:
@@ -147,9 +208,14 @@ def check_figures(surfaces: Sequence[Surface], file: str, state: str = "") -> No
         InputError: names the file, the zoom state if there is one, the surface and the figure.
     """
     for k, s in enumerate(surfaces):
+        if s.focal_mm is not None and any(t.n_d != 1 or t.glass for t in surfaces[max(k - 1, 0) : k + 1]):
+            raise InputError(file, f"{state}surface {k}, focal_mm", s.focal_mm, "air on both sides of an ideal lens")
         rim = min(s.semi_diameter_mm, 1e6)
         figures: tuple[tuple[str, Any, float, float], ...] = (
             ("radius_mm", abs(s.radius_mm), 1e-6, math.inf),
+            ("across_mm", abs(s.across[0]) if s.across else 1.0, 1e-6, math.inf),
+            ("across_conic", abs(s.across[1] or 0.0) if s.across else 0.0, 0.0, 1e9),
+            ("focal_mm", abs(s.focal_mm or 1.0), 1e-6, 1e9),
             ("thickness_mm", abs(s.thickness_mm), 0.0, 1e6),
             ("diameter_mm", s.diameter_mm, 1e-6, 1e6),
             ("V_d", 100.0 if s.V_d is None else s.V_d, 1.0, 1e4),
@@ -219,4 +285,4 @@ def same_medium(surfaces: Sequence[Surface], k: int) -> bool:
     """Whether the medium is the same before and behind surface k; air lies before the first."""
     air = (1.0, None, None)
     before, after = ((s.n_d, s.V_d, s.glass) for s in (surfaces[k - 1], surfaces[k]))
-    return (before if k else air) == after
+    return (before if k else air) == after and surfaces[k].focal_mm is None

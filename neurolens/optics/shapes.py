@@ -1,9 +1,9 @@
-"""Where a ray meets a conic, a cylinder or an asphere. Conventions as in `surfaces`.
+"""Where a ray meets a conic, a cylinder, an asphere, a toroid or a biconic. Conventions as in `surfaces`.
 
 A conic surface of curvature c and constant K is c (x^2 + y^2 + (1 + K) z^2) - 2 z = 0; a cylinder lacks the square of
 the coordinate along which it is straight. Both are met in closed form. An asphere adds A_p h^p, h the distance from
 the axis (from the plane of symmetry, for a cylinder): an iteration of Newton's kind along the ray, started from the
-conic that fits best; started at the vertex plane it fails beyond about 55 degrees.
+conic that fits best; started at the vertex plane it fails beyond about 55 degrees. Toroids and biconics likewise.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from neurolens.optics.prescription import Surface
-from neurolens.optics.sag import sag_mm
+from neurolens.optics.sag import biconic, sag_mm, toroid
 from neurolens.optics.surfaces import (
     Hit,
     Medium,
@@ -55,7 +56,7 @@ def intersect_shape(r: Rays, surface: Surface, mode: Mode, before: Medium) -> Hi
     """Meet a conic, cylinder or asphere at the root next to the vertex. Arguments as for a sphere."""
     w = (float(surface.cylinder != "y"), float(surface.cylinder != "x"))
     nearest = nearest_approach(r, before.inverse_n2)
-    if surface.asphere:
+    if surface.asphere or surface.across:
         return _meet_asphere(r, nearest, surface, w, mode, before)
     c = surface.curvature
     kind = (c * w[0], c * w[1], c * (1 + surface.conic))
@@ -117,12 +118,12 @@ def _meet_asphere(r: Rays, m: Vector, surface: Surface, w: tuple[float, float], 
     that gradients cost no memory for iterations.
     """
     p, sense, guard, spend = (r.dx, r.dy, r.dz), mode.sense, mode.guard, mode.spend
-    (c, cz), steps = start_of(surface)
+    start, steps = start_of(surface)
     with torch.no_grad():
         held = Rays(*(v.detach() for v in r))
         held_m, held_p = (m[0].detach(), m[1].detach(), m[2].detach()), (held.dx, held.dy, held.dz)
         medium = Medium(*(v.detach() if isinstance(v, Tensor) else v for v in before))
-        _, missed, _, t = _meet_quadric(held, held_m, (c * w[0], c * w[1], cz), sense, medium, False, spend)
+        _, missed, _, t = _meet_quadric(held, held_m, start, sense, medium, False, spend)
         t = torch.nan_to_num(t, 0.0, 0.0, 0.0) if guard else t
         polish = POLISH[t.dtype]
         for n in range(steps + polish - 1):
@@ -133,10 +134,15 @@ def _meet_asphere(r: Rays, m: Vector, surface: Surface, w: tuple[float, float], 
     at = _along(m, t.detach(), p)
     step = _step(at, p, surface, w, sense, last=True)
     x, y, z = _along(at, step, p)
-    derivative, cos2 = _derivative(surface, w, x, y)
-    nx, ny = (times(v * -derivative, k) for v, k in zip((x, y), w, strict=True))
-    scale = torch.rsqrt(torch.addcmul(nx * nx, ny, ny) + 1)
-    q = torch.addcmul(torch.addcmul(p[2], nx, p[0]), ny, p[1]) * (scale * sense)
+    if surface.across:
+        _, (nx, ny, nz), _, cos2 = _crossed(surface, w, (x, y, z), p)
+        scale = -torch.rsqrt(nx * nx + ny * ny + nz * nz)
+        q = _weighted((nx, ny, nz), p, (1, 1, 1)) * (scale * sense)
+    else:
+        derivative, cos2 = _derivative(surface, w, x, y)
+        nx, ny = (times(v * -derivative, k) for v, k in zip((x, y), w, strict=True))
+        scale = torch.rsqrt(torch.addcmul(nx * nx, ny, ny) + 1)
+        nz, q = 1.0, torch.addcmul(torch.addcmul(p[2], nx, p[0]), ny, p[1]) * (scale * sense)
     length = times((deciding if polish else step).abs(), before.n)
     met = also(
         at_most(length, LAST_STEP * surface.semi_diameter_mm, spend=spend),
@@ -146,13 +152,18 @@ def _meet_asphere(r: Rays, m: Vector, surface: Surface, w: tuple[float, float], 
         met = also(met, positive(cos2 - STEEPEST, spend=spend))
     # How far a ray misses is of use only where crossings are learnt from.
     q2 = torch.where(met, q * q, torch.minimum(missed, -q * q)) if guard else q * q
-    return Hit(x, y, z, q, q2, met, (nx * scale, ny * scale, scale))
+    return Hit(x, y, z, q, q2, met, (nx * scale, ny * scale, times(scale, nz)))
 
 
-def start_of(surface: Surface) -> tuple[tuple[float, float], int]:
-    """The conic c h^2 + cz z^2 = 2 z nearest to an asphere inside its rim, as (c, cz), and the steps it needs."""
+def start_of(surface: Surface) -> tuple[tuple[float, float, float], int]:
+    """The quadric cx x^2 + cy y^2 + cz z^2 = 2 z nearest to a surface inside its rim, and the steps it needs."""
     asphere = tuple((p, _number(a)) for p, a in surface.asphere)
-    return _fitted(_number(surface.curvature), _number(surface.conic), asphere, surface.semi_diameter_mm)
+    curve = _number(surface.curvature), _number(surface.conic), asphere, surface.semi_diameter_mm
+    if not surface.across:
+        (c, cz), steps = _fitted(*curve)
+        return (c * (surface.cylinder != "y"), c * (surface.cylinder != "x"), cz), steps
+    (c, other, cz), steps = _fitted_crossed(*curve, surface.across)
+    return ((other, c, cz) if surface.cylinder == "y" else (c, other, cz)), steps
 
 
 def _number(value: Any) -> float:
@@ -181,6 +192,52 @@ def _fitted(
     return (c, cz), next(steps for departure, steps in STEPS if worst <= departure * rim_mm)
 
 
+@lru_cache(maxsize=4096)
+def _fitted_crossed(
+    curvature: float,
+    conic: float,
+    asphere: tuple[tuple[int, float], ...],
+    rim_mm: float,
+    across: tuple[float, float | None],
+) -> tuple[tuple[float, float, float], int]:
+    """As `_fitted`, of a toroid or biconic: along the curve, across it, along z."""
+    if not math.isfinite(rim_mm):
+        return (curvature, 1 / across[0], 0.0), STEPS[-1][1]
+    radius_mm = 1 / curvature if curvature else math.inf
+    same = Surface(radius_mm, 0.0, 2 * rim_mm, conic=conic, asphere=asphere, cylinder="y", across=across)
+    h, turn = np.meshgrid(rim_mm * np.arange(1, 25) / 24, np.linspace(0, math.pi / 2, 9))
+    a, h = h.ravel() * np.sin(turn.ravel()), h.ravel() * np.cos(turn.ravel())
+    z = sag_mm(same, a, h)
+    a, h, z = (v[np.isfinite(z)] for v in (a, h, z))
+    found, *_ = np.linalg.lstsq(np.stack([h * h, a * a, z * z], 1), 2 * z, rcond=1e-9)
+    worst = np.abs(found @ np.stack([h * h, a * a, z * z]) - 2 * z).max(initial=0.0) / 2
+    c, other, cz = found.tolist()
+    return (c, other, cz), next(steps for departure, steps in STEPS if worst <= departure * rim_mm)
+
+
+def _crossed(surface: Surface, w: tuple[float, float], at: Vector, p: Vector) -> tuple[Any, ...]:
+    """A function that is 0 on a toroid or biconic and grows with -z, its gradient [3], its second derivative along p,
+    and a number that is positive where the surface exists; each [N]."""
+    assert surface.across is not None
+    (radius, conic), swapped = surface.across, surface.cylinder == "x"
+    (a, h, z), (pa, ph, pz) = ((v[swapped], v[not swapped], v[2]) for v in (at, p))
+    if conic is None:
+        g, slope, turn = _sag(surface, w, *at[:2])
+        curve = g, slope, 0.0 if turn is None else turn
+        value, gradient, bend = toroid(1 / radius, curve, (a, h, z), (pa, ph, pz))
+        own = _derivative(surface, w, *at[:2])[1]
+        cos2 = -gradient[2] if own is None else torch.minimum(own, -gradient[2])
+    else:
+        along = surface.curvature, 1 + surface.conic
+        value, gradient, bend, cos2 = biconic(along, (1 / radius, 1 + conic), (a, h, z), (pa, ph, pz), _held_root)
+        gradient = gradient[0], gradient[1], torch.full_like(z, -1.0)
+    return value, (gradient[swapped], gradient[not swapped], gradient[2]), bend, cos2
+
+
+def _held_root(square: Tensor) -> Tensor:
+    return torch.sqrt(square.clamp_min(STEEPEST))
+
+
 def _step(at: Vector, p: Vector, surface: Surface, w: tuple[float, float], sense: int, last: bool = False) -> Tensor:
     """Euler's step along the rays towards sag(x, y) = z: Newton's with the bend of the surface taken into account.
 
@@ -188,16 +245,23 @@ def _step(at: Vector, p: Vector, surface: Surface, w: tuple[float, float], sense
     parabola has both. The `last` step is Newton's: by then both are the same.
     """
     x, y, z = at
-    sag, derivative, turn = _sag(surface, w, x, y)
-    along = _weighted((x, y, z), p, w)
-    rate = derivative * along - p[2]
-    if last:
-        return (z - sag) / rate
-    # Second derivative of the sag along the ray, but for what the polynomial adds to the change of its own derivative.
-    bend = derivative * _weighted(p, p, w)
-    if turn is not None:
-        bend = torch.addcmul(bend, along * along, turn)
-    lack = 2 * (sag - z)
+    if surface.across:
+        value, gradient, bend, _ = _crossed(surface, w, at, p)
+        rate = _weighted(gradient, p, (1, 1, 1))
+        if last:
+            return -value / rate
+        lack = 2 * value
+    else:
+        sag, derivative, turn = _sag(surface, w, x, y)
+        along = _weighted((x, y, z), p, w)
+        rate = derivative * along - p[2]
+        if last:
+            return (z - sag) / rate
+        # Second derivative of the sag along the ray, but for what the polynomial adds to the change of its derivative.
+        bend = derivative * _weighted(p, p, w)
+        if turn is not None:
+            bend = torch.addcmul(bend, along * along, turn)
+        lack = 2 * (sag - z)
     square = torch.addcmul(rate * rate, bend, lack, value=-1)
     denominator = torch.sub(torch.sqrt(square.clamp_min(1e-30)), rate, alpha=sense) * sense
     return lack / denominator
@@ -210,7 +274,7 @@ def _sag(surface: Surface, w: tuple[float, float], x: Tensor, y: Tensor) -> tupl
     c = surface.curvature
     if not isinstance(c, Tensor) and c == 0:
         return sag * h2, derivative, None
-    cos = torch.sqrt((1 - h2 * ((1 + surface.conic) * c * c)).clamp_min(STEEPEST))
+    cos = _held_root(1 - h2 * ((1 + surface.conic) * c * c))
     # One division for both c h^2 / (1 + cos) and c / cos.
     both = c / torch.addcmul(cos, cos, cos)
     inverse = torch.addcmul(both, both, cos)
@@ -236,6 +300,8 @@ def _height2(w: tuple[float, float], x: Tensor, y: Tensor) -> Tensor:
 def _polynomials(surface: Surface, h2: Tensor, orders: Sequence[int]) -> list[Tensor]:
     """sum A_p h^(p - 2) (order 0) and sum p A_p h^(p - 2) (order 1) by Horner's rule, each [N]."""
     powers = dict(surface.asphere)
+    if not powers:
+        return [torch.zeros_like(h2) for _ in orders]
     even = all(p % 2 == 0 for p in powers)
     # In h^2, or in h where odd powers occur; the root is kept from 0, where its derivative is infinite.
     h = h2 if even else torch.sqrt(h2.clamp_min(1e-30))

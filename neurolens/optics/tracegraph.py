@@ -16,6 +16,7 @@ from neurolens.base import status as st
 from neurolens.graph.ir import Graph, Value
 from neurolens.optics.glass import index_of
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.sag import biconic, toroid
 from neurolens.optics.shapes import LAST_STEP, STEEPEST, is_plain, start_of
 
 # The index is a polynomial in 1 / lambda^2 that holds it to float32's last bit.
@@ -86,6 +87,9 @@ class _Tracing:
             limit = self.stop_square if s.stop else g.constant(s.semi_diameter_mm**2)
             self.tests.append(((g.square(self.x[0:2]), limit), st.blocked(k, st.RIM)))
         before, after = self._index(k + 1), self._index(k)
+        if s.focal_mm is not None:  # slopes change by -x / f and -y / f, as light travels
+            d = g.concat(self.x[0:2] * d[2] * (1 / s.focal_mm) + d[0:2], d[2])
+            self.d = d * (1.0 / g.square(d).sqrt())
         if before == after:
             return
         ratio, q = before / after, met.cosine
@@ -160,13 +164,15 @@ def meet_plain(m: Value, d: Value, c: float | Value) -> _Meeting:
 
 
 class Figure(NamedTuple):
-    """A conic, cylinder or asphere; lengths in mm, as numbers or as values of the call.
+    """A conic, cylinder, asphere, toroid or biconic; lengths in mm, as numbers or as values of the call.
 
     Attributes:
         curvature, stretch: c and 1 + K of the conic. terms: A_p of h^(p - 2), lowest first; empty without a polynomial.
         start: c and c (1 + K) of the conic that the iteration starts from. last_step: how long its last step may be.
         even: whether the terms are those of even powers alone. steps: of the iteration.
         bent: whether along x and y.
+        across: of a toroid or biconic, along the other axis: curvature, that of the start, 1 + K (0 of a toroid).
+        turned: whether it is a toroid.
     """
 
     curvature: Number
@@ -177,26 +183,32 @@ class Figure(NamedTuple):
     even: bool = True
     steps: int = 0
     bent: tuple[bool, bool] = (True, True)
+    across: tuple[Number, ...] = ()
+    turned: bool = False
 
 
 def figure_of(surface: Surface) -> Figure:
     """The figure of a surface that is no sphere and no plane."""
     conic = Figure(float(surface.curvature), 1 + float(surface.conic))
     bent = surface.cylinder != "y", surface.cylinder != "x"
-    if not surface.asphere:
+    if not surface.asphere and not surface.across:
         return conic._replace(bent=bent)
     powers = {n: float(a) for n, a in surface.asphere}
     even = all(n % 2 == 0 for n in powers)
-    terms = tuple(powers.get(n, 0.0) for n in range(2, max(powers) + 1, 2 if even else 1))
-    start, steps = start_of(surface)
-    return conic._replace(
-        terms=terms, start=start, last_step=LAST_STEP * surface.semi_diameter_mm, even=even, steps=steps, bent=bent
-    )
+    terms = tuple(powers.get(n, 0.0) for n in range(2, max(powers, default=0) + 1, 2 if even else 1))
+    (cx, cy, cz), steps = start_of(surface)
+    last_step = LAST_STEP * surface.semi_diameter_mm
+    start = (cx if bent[0] else cy), cz
+    found = conic._replace(terms=terms, start=start, last_step=last_step, even=even, steps=steps, bent=bent)
+    if not surface.across:
+        return found
+    (radius, other), c_start = surface.across, cy if bent[0] else cx
+    return found._replace(across=(1 / radius, c_start, 1 + (other or 0.0)), turned=other is None)
 
 
 def meet_shape(m: Value, d: Value, figure: Figure) -> _Meeting:
     """Meet a surface that is no sphere and no plane, as `meet_plain`."""
-    if figure.terms:
+    if figure.terms or figure.across:
         return _meet_asphere(m, d, figure)
     g, c, bent = m.graph, figure.curvature, figure.bent
     cz = c * figure.stretch
@@ -209,10 +221,19 @@ def meet_shape(m: Value, d: Value, figure: Figure) -> _Meeting:
     return _Meeting(point, q2.sqrt() * scale, tests, normal * scale)
 
 
-def _meet_quadric(m: Value, d: Value, kind: tuple[Number, Number], bent: tuple[bool, bool]) -> tuple[Value, ...]:
-    """Meet c h^2 + cz z^2 = 2 z: discriminant, what the way is divided by, and the way from m."""
+def _meet_quadric(
+    m: Value, d: Value, kind: tuple[Number, Number], bent: tuple[bool, bool], other: Number | None = None
+) -> tuple[Value, ...]:
+    """Meet c h^2 + cz z^2 (+ the other curvature times the square across) = 2 z.
+
+    Returns discriminant, what the way is divided by, and the way from m.
+    """
     c, cz = kind
-    a, b, f = (_across(p, q, bent) * c + p[2] * q[2] * cz for p, q in ((d, d), (m, d), (m, m)))
+    pairs = (d, d), (m, d), (m, m)
+    a, b, f = (_across(p, q, bent) * c + p[2] * q[2] * cz for p, q in pairs)
+    if other is not None:
+        k = bent.index(False)
+        a, b, f = (v + p[k] * q[k] * other for v, (p, q) in zip((a, b, f), pairs, strict=True))
     b, f = b - d[2], m[2] * -2.0 + f
     q2 = b * b + -(a * f)
     q, towards = q2.maximum(0.0).sqrt(), b <= 0.0
@@ -231,9 +252,15 @@ def _across(a: Value, b: Value, bent: tuple[bool, bool]) -> Value:
 def _meet_asphere(m: Value, d: Value, figure: Figure) -> _Meeting:
     """From the conic that fits best, by the steps of `shapes`, of which the last decides whether they converged."""
     g, bent = m.graph, figure.bent
-    _, _, way = _meet_quadric(m, d, figure.start, bent)
+    _, _, way = _meet_quadric(m, d, figure.start, bent, figure.across[1] if figure.across else None)
     for _ in range(figure.steps - 1):
         at = d * way + m
+        if figure.across:
+            value, gradient, bend, _ = _crossed(figure, at, d)
+            rate, lack = g.dot(gradient, d), value * 2.0
+            root = (rate * rate + -(bend * lack)).maximum(_TINY).sqrt()
+            way = way + lack / -(root + rate)
+            continue
         sag, slope, turn = _sag(figure, at)
         along = _across(at, d, bent)
         rate = slope * along + -d[2]
@@ -242,6 +269,15 @@ def _meet_asphere(m: Value, d: Value, figure: Figure) -> _Meeting:
         root = (rate * rate + -(bend * lack)).maximum(_TINY).sqrt()
         way = way + lack / -(root + rate)
     at = d * way + m
+    if figure.across:
+        value, gradient, *_ = _crossed(figure, at, d)
+        step = -value / g.dot(gradient, d)
+        point = d * step + at
+        _, gradient, _, exists = _crossed(figure, point, d)
+        normal = gradient * (-1.0 / g.square(gradient).sqrt())
+        cosine = -g.dot(normal, d)
+        tests = [(step.abs(), g.value(figure.last_step)), _above(cosine), (g.constant(STEEPEST), exists)]
+        return _Meeting(point, cosine, tests, normal)
     sag, slope, _ = _sag(figure, at)
     step = (at[2] - sag) / (slope * _across(at, d, bent) + -d[2])
     point = d * step + at
@@ -255,6 +291,20 @@ def _meet_asphere(m: Value, d: Value, figure: Figure) -> _Meeting:
         (g.constant(STEEPEST), _cos2(figure, _across(point, point, bent))),
     ]
     return _Meeting(point, cosine, tests, g.concat(normal * scale, scale))
+
+
+def _crossed(figure: Figure, at: Value, d: Value) -> tuple[Value, Value, Value, Value]:
+    """As `shapes._crossed`, of a toroid or biconic: value, gradient [3], second derivative along d, what exists."""
+    g, (c, _, stretch), swapped = at.graph, figure.across, figure.bent[0]
+    place, way = ((v[int(swapped)], v[int(not swapped)], v[2]) for v in (at, d))
+    if figure.turned:
+        value, gradient, bend = toroid(c, _sag(figure, at), place, way)
+        exists = (-gradient[2]).minimum(_cos2(figure, place[1] * place[1]))
+    else:
+        along = figure.curvature, figure.stretch
+        value, gradient, bend, exists = biconic(along, (c, stretch), place, way, lambda v: v.maximum(STEEPEST).sqrt())
+        gradient = gradient[0], gradient[1], g.constant(-1.0)
+    return value, g.concat(gradient[swapped], gradient[not swapped], gradient[2]), bend, exists
 
 
 def _sag(figure: Figure, at: Value) -> tuple[Value, Value, Value]:
@@ -277,6 +327,8 @@ def _cos2(figure: Figure, h2: Value) -> Value:
 
 def _polynomial(figure: Figure, h2: Value, order: int) -> Value:
     """sum A_p h^(p - 2) (order 0) or sum p A_p h^(p - 2) (order 1), in h^2 or, where odd powers occur, in h."""
+    if not figure.terms:
+        return h2.graph.constant(0.0)
     h, down = (h2, 2) if figure.even else (h2.maximum(_TINY).sqrt(), 1)
     terms = [a * float((2 + down * k) ** order) for k, a in enumerate(figure.terms)]
     numbers = [a for a in terms if not isinstance(a, Value)]

@@ -12,6 +12,7 @@ from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import MAX_SURFACES
 from neurolens.optics.prescription import Lens
 from neurolens.readers.codev_model import (
+    ALONG,
     LETTERS,
     NONE_BUT_0,
     Block,
@@ -87,11 +88,10 @@ FIELDS = ("XAN", "YAN", "XIM", "YIM", "XRI", "YRI", "XOB", "YOB")
 # Settings, weights, wavelengths, labels, control codes of variables, tolerances.
 IGNORED = frozenset(
     """LEN WL REF WTW WTF WTA INI DOR PRE DER UID SLB GO END CCY CCX THC GLC KC AC BC CC DC EC FC GC HC JC DLT
-    DLN DLF DLR IRR""".split()
+    DLN DLF DLR IRR SCC KXC""".split()
 )
-# Of a surface: what the lens model has not, by name; files that show how Q-types are laid out were not found.
+# Of a surface: what the lens model has not, by name.
 REFUSED = {
-    "SPS": "special surface (Q-types QBF and QCN, odd polynomials, Zernikes and others)",
     "MOD": "ideal lens (a module)",
     "GRT": "grating",
     "DIF": "diffractive surface",
@@ -100,7 +100,8 @@ VIGNETTING = frozenset(["VUX", "VLX", "VUY", "VLY"])
 READ = (
     *"S SO SI RDM TIT DIM EPD FNO TEM".split(),
     *FIELDS,
-    *"RDY CUY RDX CUX THI GLA STO SPH CON ASP CYL YTO XTO K".split(),
+    *"RDY CUY RDX CUX THI GLA STO SPH CON ASP CYL YTO XTO AAS SPS SCO K".split(),
+    *ALONG,
     *LETTERS,
     *NONE_BUT_0,
     *("CIR", "PIM", "PRV", "ZOO"),
@@ -111,7 +112,7 @@ def read_seq(path: str | Path, given: Given | None = None) -> Lens:
     """The lens of a CODE V sequence file.
 
     Raises:
-        InputError: see the module; also tilts, mirrors, tori and everything else that the lens model cannot represent.
+        InputError: see the module; also tilts, mirrors and everything else that the lens model cannot represent.
     """
     file = File(str(path))
     for command in commands(read_lines(path)):
@@ -200,8 +201,10 @@ def _surface(file: File, command: Command) -> None:
     match name:
         case "STO":
             block.stop = True
-        case "SPH" | "CON" | "ASP" | "CYL" | "YTO" | "XTO":
+        case "SPH" | "CON" | "ASP" | "CYL" | "YTO" | "XTO" | "AAS":
             block.kind = name
+        case "SPS" | "SCO":
+            block.put_special(command, words)
         case "PIM":
             block.solved = True
         case "GLA":

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from neurolens.optics import catalogue
 from neurolens.readers import draft
 from neurolens.readers.assemble import named_glass
 from neurolens.readers.draft import INFINITE, State
-from neurolens.readers.source import Line
+from neurolens.readers.source import Line, assume
 
 _MAX_COMMAND = 100_000  # characters of one command with all its continuation lines
 # Fraunhofer lines to which a private glass is reduced, nm.
@@ -120,6 +120,9 @@ def private_glass(command: Command, wavelengths_nm: Sequence[float]) -> dict[str
     return {"n_d": found["d"], "V_d": (found["d"] - 1) / dispersion if dispersion > 0 else None}
 
 
+# Of special surfaces: how the names of their coefficients begin, before the power of the first term.
+SPECIAL = {"ODD": "AR", "QBF": "QB", "QCN": "QC"}
+ALONG = ("KX", "KY", "AR", "BR", "CR", "DR", "AP", "BP", "CP", "DP")  # of AAS
 # Coefficients of an ASP surface: r^4, r^6, ... r^20.
 LETTERS = {letter: 4 + 2 * k for k, letter in enumerate("ABCDEFGHJ")}
 NONE_BUT_0 = ("CUF", "XDE", "YDE", "ZDE", "ADE", "BDE", "CDE")
@@ -133,6 +136,7 @@ class Block(draft.Block):
     curvature_x: float | None = None
     terms: dict[str, float] = field(default_factory=dict)
     solved: bool = False  # whether the thickness is solved for the paraxial image
+    special: dict[str, float] | None = None  # coefficients of a special surface
 
     def put(self, command: Command, value: float) -> None:
         """Set one figure of the surface by the name of its command."""
@@ -150,15 +154,35 @@ class Block(draft.Block):
             case name if name in NONE_BUT_0:
                 if value:
                     raise command.line.error(name, value, "0: Fresnel surfaces, tilts and decentres are not read")
+            case "KY":
+                self.conic = value
             case letter:
                 self.terms[letter] = value
 
+    def put_special(self, command: Command, words: Sequence[str]) -> None:
+        """SPS with a type and a normalisation radius, or SCO with the name and value of a coefficient."""
+        name = words[0].upper() if words else ""
+        if command.name == "SCO":
+            if self.special is None:
+                raise command.line.error("SCO", name, "SPS before it")
+            self.special[name] = command.numbers(words[1:])[0]
+        elif name in SPECIAL:
+            self.kind, self.special = name, {"NRADIUS": command.numbers(words[1:2], 0)[0]} if words[1:] else {}
+        else:
+            expected = f"one of {', '.join(SPECIAL)}: other special surfaces are not read"
+            raise command.line.error("SPS", name or "(none)", expected)
+
 
 def shape_of(block: Block) -> dict[str, Any]:
-    """Radius, conic, asphere and cylinder of a surface, for `Surface`.
+    """Radius, conic, asphere and what bends it across of a surface, for `Surface`.
 
-    CYL, YTO and XTO with one of their curvatures CUY and CUX zero are cylinders; a torus is an error.
+    YTO is a curve in y (curvature CUY, K, A y^4, ...) turned about an axis along y at 1 / CUX; XTO likewise in x; a
+    cylinder where one of both is zero. AAS with its two conics K and KX is a biconic.
     """
+    if block.special is not None:
+        return _special(block)
+    if block.kind == "AAS":
+        return _biconic(block)
     terms = {LETTERS[letter]: value for letter, value in block.terms.items() if value}
     if block.kind in ("SPH", "CON") and terms:
         raise block.start.error(block.kind, f"(with coefficients {', '.join(block.terms)})", "ASP before coefficients")
@@ -168,15 +192,53 @@ def shape_of(block: Block) -> dict[str, Any]:
         if block.curvature_x not in (None, block.curvature):
             raise block.start.error("CUX", block.curvature_x, "a cylinder (CYL, YTO or XTO)")
         return block.rotational(sorted(terms.items()))
-    x, y = block.curvature_x or 0.0, block.curvature
-    if terms or (x and y):
-        found = f"(curvatures {y:g} in y and {x:g} in x{', coefficients' if terms else ''})"
-        raise block.start.error(block.kind, found, "a plain cylinder: a torus or an aspheric cylinder is not read")
-    # K belongs to the curve that is turned: y of YTO and CYL, x of XTO.
-    if block.conic and (block.kind == "XTO") != bool(x):
+    own, other = block.curvature, block.curvature_x or 0.0
+    if block.kind == "XTO":
+        own, other = other, own
+    axes = ("x", "y") if block.kind == "XTO" else ("y", "x")
+    if own or terms:
+        curve = replace(block, curvature=own).rotational(sorted(terms.items()))
+        return curve | {"cylinder": axes[0]} | ({"across": (1 / other, None)} if other else {})
+    if block.conic and other:  # K belongs to the curve that is turned
         raise block.start.error("K", block.conic, "0, as this cylinder's curve is a circle")
-    radius = 1 / (x or y) if x or y else math.inf
-    return {"radius_mm": radius, "conic": block.conic, "cylinder": "x" if x else "y" if y else None}
+    return {"radius_mm": 1 / other, "cylinder": axes[1]} if other else {"radius_mm": math.inf}
+
+
+def _biconic(block: Block) -> dict[str, Any]:
+    """AAS; its higher terms are AR to DR, whose shares in x and y are AP to DP."""
+    conic_x = block.terms.get("KX", 0.0)
+    for name, value in block.terms.items():
+        if value and name != "KX" and not name.endswith("P"):
+            raise block.start.error(f"{name} of AAS", value, "0: a biconic has no terms of higher order")
+    x, y, along_y = block.curvature_x or 0.0, block.curvature, block.rotational()
+    if x == 0:
+        return along_y | ({"cylinder": "y"} if y else {})
+    if y == 0:
+        return {"radius_mm": 1 / x, "conic": conic_x, "cylinder": "x"}
+    same = (x, conic_x) == (y, block.conic)
+    return along_y if same else along_y | {"cylinder": "y", "across": (1 / x, conic_x)}
+
+
+def _special(block: Block) -> dict[str, Any]:
+    """ODD: sum of ARn r^n over NRADIUS^n, which 0 leaves out; Q-types: QBn or QCn, n = 4 + 2 m, of Forbes's sums."""
+    kind, values = block.kind, dict(block.special or {})
+    radius, block.conic = values.pop("NRADIUS", 0.0), values.pop("K", 0.0)
+    found: dict[int, float] = {}
+    for name, value in values.items():
+        match = re.fullmatch(SPECIAL[kind] + "([0-9]{1,2})", name)
+        power = int(match[1]) if match else 0
+        if not match or (kind != "ODD" and (power < 4 or power % 2)) or (power < 2 and value):
+            first = "AR2, AR3, ..." if kind == "ODD" else f"{SPECIAL[kind]}4, {SPECIAL[kind]}6, ..."
+            raise block.start.error(f"SCO of SPS {kind}", name, f"K, NRADIUS or {first}")
+        found[power] = value
+    if kind == "ODD":
+        return block.rotational((n, a / (radius or 1.0) ** n) for n, a in sorted(found.items()))
+    if not radius > 0:
+        raise block.start.error(f"NRADIUS of SPS {kind}", radius, "a normalisation radius above 0")
+    told = f"SPS {kind}: coefficient {SPECIAL[kind]}n is taken as that of Forbes's m = (n - 4) / 2"
+    assume(block.start.file, f"line {block.start.number}: {told}")
+    terms = [found.get(n, 0.0) for n in range(4, max(found, default=2) + 1, 2)]
+    return block.q_type(f"SPS {kind}", kind == "QCN", terms, radius)
 
 
 MAX_POSITIONS = 200

@@ -14,6 +14,7 @@ from neurolens.optics.lensfile import MAX_SURFACES, check_states
 from neurolens.optics.prescription import Configuration, Lens, Surface
 from neurolens.optics.sag import end_mm, same_medium
 from neurolens.readers.assemble import UNKNOWN, finish, first_order, smaller_stop, with_rims
+from neurolens.readers.forbes import MAX_TERMS, qbfs_terms, qcon_terms
 from neurolens.readers.source import UNITS_MM, Line, assume, warn
 
 
@@ -62,6 +63,20 @@ class Block:
         """Fields of `Surface` for a surface of revolution; the conic of a plane has no effect."""
         conic = self.conic if self.curvature else 0.0
         return {"radius_mm": self.radius, "conic": conic, "asphere": tuple((p, a) for p, a in asphere if a)}
+
+    def q_type(self, name: str, qcon: bool, values: list[float], radius: float) -> dict[str, Any]:
+        """As `rotational`, of Forbes's aspheres: coefficients from m = 0 over a normalisation radius."""
+        rim = radius if math.isnan(self.semi_diameter) else self.semi_diameter
+        if len(values) > MAX_TERMS:
+            raise self.start.error(name, f"({len(values)} terms)", f"at most {MAX_TERMS} terms")
+        if not qcon and self.conic:
+            raise self.start.error(f"conic of {name}", self.conic, "0: Qbfs departs from a sphere")
+        try:
+            terms = qcon_terms(values, radius, rim) if qcon else qbfs_terms(values, radius, self.curvature, rim)
+        except ValueError as error:
+            found = f"(curvature {self.curvature:g}, rim {rim:g})"
+            raise self.start.error(name, found, str(error)) from None
+        return self.rotational(terms)
 
     def surface(self, shape: dict[str, Any]) -> Surface:
         diameter = 2 * self.semi_diameter

@@ -111,7 +111,7 @@ def read_zmx(path: str | Path, given: Given | None = None) -> Lens:
     """The lens of a Zemax file.
 
     Raises:
-        InputError: see the module; also tilts, mirrors, tori, obscurations and everything else that the lens model
+        InputError: see the module; also tilts, mirrors, obscurations and everything else that the lens model
             cannot hold, by name and line.
     """
     file = File(str(path))
@@ -198,8 +198,7 @@ def _surface(file: File, block: Block, line: Line, word: str, rest: list[str]) -
         case "TYPE":
             block.kind = rest[0].upper() if rest else ""
             if block.kind not in TYPES and not block.kind.startswith(Q_TYPE):
-                what = " (an ideal lens has no glass to trace)" if block.kind == "PARAXIAL" else ""
-                raise line.error(word, block.kind, f"one of {', '.join(TYPES)}, or a Q-type asphere{what}")
+                raise line.error(word, block.kind, f"one of {', '.join(TYPES)}, or a Q-type asphere")
         case "CURV":
             block.curvature = line.numbers(word, rest[:1])[0]
             block.bends = line if block.curvature else None

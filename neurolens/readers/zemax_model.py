@@ -11,7 +11,6 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.readers import draft
 from neurolens.readers.draft import INFINITE, State
-from neurolens.readers.forbes import MAX_TERMS, qbfs_terms, qcon_terms
 from neurolens.readers.source import Line, assume
 
 # Settings of the program and of its analyses.
@@ -50,7 +49,7 @@ MERIT = frozenset(
 CONFIGURATION = frozenset("MOFF MCOM XFIE YFIE FLWT FVDX FVDY FVCX FVCY FVAN WAVE WLWT PRWV GCRS".split())
 
 
-TYPES = ("STANDARD", "EVENASPH", "ODDASPHE", "XASPHERE", "XOSPHERE", "TOROIDAL", "BICONICX", "COORDBRK")
+TYPES = tuple("STANDARD EVENASPH ODDASPHE XASPHERE XOSPHERE TOROIDAL BICONICX PARAXIAL COORDBRK".split())
 MAX_EXTRAS = 240
 Q_TYPE = "Q"  # what the names of Q-type aspheres, and of no other type, begin with
 
@@ -96,12 +95,13 @@ def thickness(line: Line, word: str, rest: list[str], *, is_object: bool) -> flo
 
 
 def shape_of(block: Block) -> dict[str, Any]:
-    """Radius, conic, asphere and cylinder of a surface, for `Surface`.
+    """Radius, conic, asphere and what else describes the shape of a surface, for `Surface`.
 
     Even asphere: sum of PARM i r^(2 i); odd asphere: sum of PARM i r^i; the extended ones have XDAT in the place of
-    PARM, and powers of r over a normalisation radius. Q-type: PARM 1 is 0 for Qbfs and 1 for Qcon. Toroidal: CURV and
-    CONI in the y-z plane, turned about an axis at PARM 1 (0 is infinity: a cylinder). Biconic: CURV, CONI in y, PARM 1
-    (a radius, 0 is infinity) and PARM 2 (a conic) in x.
+    PARM, and powers of r over a normalisation radius. Q-type: PARM 1 is 0 for Qbfs and 1 for Qcon. Toroidal: CURV,
+    CONI and PARM i y^(2 i - 2), i from 2, in the y-z plane, turned about an axis at PARM 1 (0 is infinity: a cylinder).
+    Biconic: CURV, CONI in y, PARM 1 (a radius, 0 is infinity) and PARM 2 (a conic) in x. Paraxial, an ideal lens:
+    PARM 1 is its focal length; PARM 2 counts path lengths in one way or another and moves no ray.
 
     Raises:
         InputError: a type, a parameter or a combination of them that the lens model cannot represent; by name and line.
@@ -126,6 +126,11 @@ def shape_of(block: Block) -> dict[str, Any]:
             shape = _q_type(block)
         case "TOROIDAL" | "BICONICX":
             shape = _crossed(block)
+        case "PARAXIAL":
+            shape = {"radius_mm": math.inf, "focal_mm": block.parameter(1)}
+            block.parameters.pop(2, None)
+            if not shape["focal_mm"] or block.bends:
+                raise block.start.error("PARAXIAL", shape["focal_mm"], "PARM 1, a focal length other than 0, no CURV")
         case "COORDBRK":
             shape = block.rotational()  # harmless where every tilt and decentre is 0, which is checked below
     for name, table in (("PARM", block.parameters), ("XDAT", block.extra)):
@@ -141,36 +146,25 @@ def shape_of(block: Block) -> dict[str, Any]:
 
 def _q_type(block: Block) -> dict[str, Any]:
     form, (radius, values) = block.parameter(1), block.extras()
-    rim = radius if math.isnan(block.semi_diameter) else block.semi_diameter
-    place = f"{block.start.file}, line {block.start.number}"
-    assume(place, f"{block.kind}: PARM 1 is taken as 0 for Qbfs, 1 for Qcon, XDAT as that of XASPHERE")
-    if form not in (0, 1) or len(values) > MAX_TERMS:
-        found, expected = f"(PARM 1 {form:g}, {len(values)} terms)", f"0 (Qbfs) or 1 (Qcon), at most {MAX_TERMS} terms"
-        raise block.start.error(block.kind, found, expected)
-    if form == 0 and block.conic:
-        raise block.start.error(f"CONI of {block.kind}", block.conic, "0: Qbfs departs from a sphere")
-    try:
-        terms = qcon_terms(values, radius, rim) if form else qbfs_terms(values, radius, block.curvature, rim)
-    except ValueError as error:
-        raise block.start.error(block.kind, f"(curvature {block.curvature:g}, rim {rim:g})", str(error)) from None
-    return block.rotational(terms)
+    told = f"{block.kind}: PARM 1 is taken as 0 for Qbfs, 1 for Qcon, XDAT as that of XASPHERE"
+    assume(block.start.file, f"line {block.start.number}: {told}")
+    if form not in (0, 1):
+        raise block.start.error(block.kind, f"(PARM 1 {form:g})", "0 (Qbfs) or 1 (Qcon)")
+    return block.q_type(block.kind, form == 1, values, radius)
 
 
 def _crossed(block: Block) -> dict[str, Any]:
-    """A toroidal or biconic surface that is a cylinder, or round; PARM 1 and 2 are radius and conic in x."""
-    biconic = block.kind == "BICONICX"
-    radius_x, conic_x = block.parameter(1), block.parameter(2) if biconic else 0.0
-    if radius_x == 0 and block.curvature == 0:
-        return {"radius_mm": math.inf}
+    """A toroidal or biconic surface, a cylinder where one of its radii is infinite, or round."""
+    biconic, radius_x = block.kind == "BICONICX", block.parameter(1)
+    conic_x = block.parameter(2) if biconic else None
+    curve = block.rotational(() if biconic else [(2 * i - 2, block.parameter(i)) for i in range(2, 9)])
+    flat = block.curvature == 0 and not curve["asphere"]
     if radius_x == 0:
-        return {"radius_mm": block.radius, "conic": block.conic, "cylinder": "y"}
-    if block.curvature == 0:
-        return {"radius_mm": radius_x, "conic": conic_x, "cylinder": "x"}
-    if math.isclose(radius_x * block.curvature, 1.0, rel_tol=1e-12) and conic_x == block.conic:
-        return {"radius_mm": radius_x, "conic": conic_x}
-    found = f"(radii {block.radius:g} in y and {radius_x:g} in x)"
-    expected = "a cylinder: one of the two radii infinite" + ("" if biconic else " (a torus is not read)")
-    raise block.start.error(block.kind, found, expected)
+        return curve if flat else curve | {"cylinder": "y"}
+    if flat:
+        return {"radius_mm": radius_x, "conic": conic_x or 0.0, "cylinder": "x"}
+    equal = math.isclose(radius_x * block.curvature, 1.0, rel_tol=1e-12) and (conic_x or 0.0) == block.conic
+    return curve if equal and not curve["asphere"] else curve | {"cylinder": "y", "across": (radius_x, conic_x)}
 
 
 MAX_CONFIGURATIONS = 200

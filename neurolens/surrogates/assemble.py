@@ -243,7 +243,7 @@ def sag(position: Value, surface: Surface, form: Form) -> Value:
         z = c * square / (1 + np.sqrt(np.maximum(1 - bend * square, 0.0)))
         return np.asarray(z + sum(a * square ** (p / 2) for p, a in powers.items()))
 
-    if form.sag_terms:  # in units of the rim, so that high powers stay within float32
+    if form.sag_terms and surface.across is None:  # in units of the rim, so that high powers stay within float32
         reach = (_FRONT_REACH * surface.semi_diameter_mm) ** 2
         series = fit_series(lambda s: exact(s * reach), 1.0, _SAG_MM)
         t = np.linspace(0, 1, 1000)
@@ -251,7 +251,26 @@ def sag(position: Value, surface: Surface, form: Form) -> Value:
         if held and len(series) <= form.sag_terms:
             return g.series(h2, series / reach ** np.arange(len(series)))
     # c h^2 / (1 + root) has no cancellation and no case for a paraboloid.
-    z = h2 * c / ((1.0 - h2 * bend).maximum(0.0).sqrt() + 1.0)
+    other, square, sum_ = surface.across, 1.0 - h2 * bend, h2 * c
+    if other is not None and other[1] is not None:
+        a2 = g.square(position[int(surface.cylinder == "x")])
+        square, sum_ = square - a2 * ((1 + other[1]) / other[0] ** 2), sum_ + a2 * (1 / other[0])
+    z = sum_ / (square.maximum(0.0).sqrt() + 1.0)
+    if other is not None and other[1] is None:
+        return _turned(position, _with_powers(z, h2, surface), surface)
+    return _with_powers(z, h2, surface)
+
+
+def _turned(position: Value, curve: Value, surface: Surface) -> Value:
+    """z of a toroid from that of its curve; see `sag.sag_mm`."""
+    assert surface.across is not None
+    c, a2 = 1 / surface.across[0], position.graph.square(position[int(surface.cylinder == "x")])
+    way = 1.0 - curve * c
+    return (curve * (way + 1.0) + a2 * c) / ((way * way - a2 * (c * c)).maximum(0.0).sqrt() + 1.0)
+
+
+def _with_powers(z: Value, h2: Value, surface: Surface) -> Value:
+    powers = {int(p): float(a) for p, a in surface.asphere}
     if not powers:
         return z
     rim, even = surface.semi_diameter_mm, all(p % 2 == 0 for p in powers)
@@ -259,7 +278,7 @@ def sag(position: Value, surface: Surface, form: Form) -> Value:
     terms = np.zeros(max(powers) // step + 1)
     for p, a in powers.items():
         terms[p // step] = a * rim**p
-    return z + g.series(h, terms)
+    return z + z.graph.series(h, terms)
 
 
 def fit_series(function: Callable[[Array], Array], upper: float, tolerance: float) -> Array:

@@ -118,6 +118,7 @@ def export_inverse(inverse: InverseModel, path: str | Path, errors: dict[str, An
         "conic": float(front.conic),
         "asphere": [[int(p), float(a)] for p, a in front.asphere],
         "cylinder": front.cylinder,
+        "across": front.across,
     }
     written = []
     for name, build in (("stop", stop_graph), ("scene", scene_graph)):

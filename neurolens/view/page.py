@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import base64
-import gzip
 import html
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +17,11 @@ from neurolens.analysis.layout import Layout, element_outline
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.graph.c import Signature
+from neurolens.view.packed import packed, packed_parts
 from neurolens.view.shaders import Ghosts, call_of, shared_glsl
 
 FOLDER = Path(__file__).parent / "page"
-SCRIPTS = ("gl.js", "scene.js", "engine.js", "ghosts.js", "layout.js", "main.js")
+SCRIPTS = ("packed.js", "gl.js", "scene.js", "engine.js", "ghosts.js", "layout.js", "main.js")
 SHADERS = ("random.glsl", "scene.glsl", "rays.glsl")
 # A form's download that would carry the page beyond this is left out.
 MOST_BYTES = 3_000_000
@@ -105,20 +103,29 @@ def write_page(
 
 
 def _page(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> str:
+    streams = [packed_parts(_parts(lens, kinds)) for lens in lenses]
+    entries = [_entry(lens, kinds) | {"parts": parts} for lens, (_, parts) in zip(lenses, streams, strict=True)]
     shared = {
         "version": __version__,
         "functions": {name: {"text": text, "call": call} for name, (text, call) in shared_glsl().items()},
         "shaders": {name.removesuffix(".glsl"): _text(name) for name in SHADERS},
-        "lenses": [_entry(lens, kinds) for lens in lenses],
+        "lenses": entries,
     }
+    data = json.dumps(shared, allow_nan=False, separators=(",", ":")).encode()
+    elements = [_packed("data", packed(data), len(data))]
+    elements += [_packed(f"lens/{lens.key}", text, 0) for lens, (text, _) in zip(lenses, streams, strict=True)]
     parts = {
         "TITLE": html.escape(lenses[0].name if len(lenses) == 1 else "neurolens: lenses and their models"),
         "STYLE": _text("style.css"),
-        "DATA": _json(shared),
-        "LENSES": "\n".join(_packed(lens, kinds) for lens in lenses),
+        "DATA": "\n".join(elements),
         "SCRIPT": "\n".join(_text(name) for name in SCRIPTS),
     }
     return re.sub(r"@([A-Z]+)@", lambda m: parts[m[1]], _text("page.html"))
+
+
+def _packed(key: str, text: str, size: int) -> str:
+    length = f' data-bytes="{size}"' if size else ""
+    return f'<script type="text/plain" id="{html.escape(key)}"{length}>{text}</script>'
 
 
 def _entry(lens: ViewLens, kinds: Sequence[str]) -> dict[str, Any]:
@@ -136,34 +143,25 @@ def _kept(form: Form, kinds: Sequence[str]) -> list[str]:
     return [kind for kind in kinds if kind == "glsl" or kind in form.files]
 
 
-@cache
-def _zipped(text: str) -> str:
-    return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
-
-
-def _packed(lens: ViewLens, kinds: Sequence[str]) -> str:
-    """One element a text or file, gzip in base64: browsers unpack them when they are asked for."""
-    path = {} if lens.path is None else {"text": lens.path[0], "outputs": list(lens.path[1])}
-    texts = {f"{lens.key}/lens": json.dumps({"section": lens.section, "path": path})}
-    if lens.ghosts is not None:
-        texts[f"{lens.key}/ghosts"] = json.dumps([asdict(ghost) for ghost in lens.ghosts.functions])
-    for form in lens.forms:
-        for kind in _kept(form, kinds):
-            data = form.glsl.encode() if kind == "glsl" else form.files[kind]
-            texts[f"{lens.key}/{form.kind}/{kind}"] = data.decode("latin-1" if kind == "onnx" else "utf-8")
-    return "\n".join(
-        f'<script type="application/gzip" id="{html.escape(key)}">{_zipped(text)}</script>'
-        for key, text in texts.items()
-    )
+def _parts(lens: ViewLens, kinds: Sequence[str]) -> Iterator[tuple[str, str | bytes]]:
+    """Texts and files of a lens, what a picture needs first: the page unpacks no further than it is asked."""
+    text, outputs = lens.path or ("", ())
+    yield "lens", json.dumps({"section": lens.section, "outputs": list(outputs)}).encode()
+    for kind in kinds:
+        for form in lens.forms:
+            if kind == "glsl":
+                yield f"{form.kind}/{kind}", form.glsl
+            elif kind in form.files:
+                data = form.files[kind]
+                yield f"{form.kind}/{kind}", data if kind == "onnx" else data.decode()
+        if kind == "glsl":
+            yield "path", text
+            if lens.ghosts is not None:
+                yield "ghosts", json.dumps([asdict(ghost) for ghost in lens.ghosts.functions]).encode()
 
 
 def _text(name: str) -> str:
     return (FOLDER / name).read_text(encoding="utf-8")
-
-
-def _json(data: Any) -> str:
-    """JSON that ends no script element."""
-    return json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def section_svg(layout: Layout) -> dict[str, Any]:

@@ -151,7 +151,9 @@ def test_the_command_fits_a_lens_and_writes_what_programs_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("neurolens.cameras.field._ROUND", (129, 1))
-    told = run_json(capsys, "projection", GAUSS, *PICTURE, "--model", "opencv", "-o", tmp_path / "a")
+    told = run_json(
+        capsys, "projection", GAUSS, *PICTURE, "--model", "opencv", "-o", tmp_path / "a.json"
+    )  # as the file will be called
     assert told["rms_px"] < 0.02 and told["worst_px"] < 0.1 and told["turns_back_at_deg"] is None
     assert -0.3 < told["coefficients"]["k1"] < -0.2 and told["focal_px"][0] == told["focal_px"][1]
     assert len(told["by_field"]) == 5 and told["centre_px"] == [959.5, 539.5]

@@ -141,6 +141,7 @@ def test_blenders_that_cannot_run_lenses() -> None:
 def test_years_of_sources() -> None:
     assert year_of("US 2,854,889 (Brendel, 1958); table as in Smith, Modern Lens Design (1992)") == 1958
     assert year_of("US 2,019,982") is None and year_of("DE 485,798 (1927)") == 1927
+    assert year_of("Japanese patent S.53-131852; table in Smith, 2nd ed. (2005)") == 1978
     assert year_of("US 2014/0300973 A1, tables 1 and 2") == 2014 and year_of("a textbook") is None
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from experiments import inverse, lab, osl_speed
+from experiments import gpu, inverse, lab, osl_speed
 from experiments import pupils as passage
 from experiments.__main__ import main
 from experiments.fused_speed import ray_candidate
@@ -382,3 +382,27 @@ def test_blender_that_fails_says_why(tmp_path: Path) -> None:
     with pytest.raises(lab.Unmeasured, match="no module bpy"):
         osl_speed.race(python, {}, {}, lambda share, left=None: told.append(share))
     assert told == [0.5]
+
+
+def test_shaders_are_raced_and_what_they_give_comes_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    raced = gpu.ShaderRace(tmp_path, 64)
+    (tmp_path / "twice.comp").write_text(
+        "#version 430\nlayout(local_size_x = 64) in;\nlayout(std430, binding = 0) buffer A { float rays[]; };\n"
+        "layout(std430, binding = 1) buffer B { float found[]; };\n"
+        "layout(std430, binding = 2) buffer C { float by; };\n"
+        "void main() { uint i = gl_GlobalInvocationID.x; found[i] = by * rays[i]; }\n"
+    )
+    np.save(tmp_path / "rays.npy", np.arange(64, dtype=np.float32))
+    np.save(tmp_path / "call.npy", np.float32([2]))
+    job = {"shader": "twice.comp", "call": "call.npy", "rays": "rays.npy", "groups": 1, "size": 64}
+    raced.jobs = [job | {"keep": "kept.npy"}, job | {"name": "twice"}]
+    with monkeypatch.context() as none:
+        none.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", str(tmp_path / "none.json"))
+        with pytest.raises(lab.Unmeasured, match="experiments gpu: no OpenGL here"):
+            raced.run(rounds=3)
+    try:
+        found = raced.run(rounds=3)
+    except lab.Unmeasured as reason:
+        pytest.skip(str(reason))
+    assert np.load(tmp_path / "kept.npy").tolist() == [2.0 * k for k in range(64)]
+    assert len(found["seconds"]["twice"]) == 3 and min(found["seconds"]["twice"]) > 0 and found["renderer"]

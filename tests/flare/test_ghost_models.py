@@ -69,7 +69,7 @@ def in_glsl(model: GhostModel, number: int, rays: np.ndarray, folder: Path) -> n
         f"    float o[4];\n    {called}({given});\n    for (uint k = 0u; k < 4u; k++) found[k * n + i] = o[k];\n}}\n"
     )
     np.save(folder / "rays.npy", rays.astype(np.float32))
-    runner = Path(__file__).parents[1] / "gl_compute.py"
+    runner = Path(__file__).parents[2] / "experiments" / "gl_compute.py"
     words = [runner, folder / "ghost.comp", folder / "rays.npy", folder / "found.npy", "4"]
     ran = subprocess.run([sys.executable, *map(str, words)], capture_output=True, text=True)
     assert ran.returncode in (0, 3), ran.stderr

@@ -89,6 +89,10 @@ SHAPES = {
     "cylinder x": surface(25.0, cylinder="x"),
     "cylinder y": surface(-25.0, cylinder="y", conic=-0.7),
     "acylinder": surface(25.0, cylinder="y", asphere=((4, 3e-5),)),
+    "toroid": surface(25.0, cylinder="y", across=(-40.0, None)),
+    "toroid, bent": surface(-18.0, cylinder="x", conic=-0.6, asphere=((2, 1e-3), (4, 2e-5)), across=(30.0, None)),
+    "biconic": surface(25.0, cylinder="y", conic=-1.5, across=(14.0, 0.4)),
+    "saddle": surface(-25.0, cylinder="x", conic=0.5, across=(30.0, -2.0)),
 }
 
 
@@ -300,12 +304,16 @@ BEFORE_FILM: dict[str, tuple[float, dict[str, Any]]] = {
     "asphere on a cylinder": (22.0, {"cylinder": "x", "asphere": ((4, 3e-5),)}),
     "strong asphere": (12.0, {"conic": -3.0, "asphere": ((4, 1.5e-4), (8, -6e-9))}),
     "bent back": (-12.0, {"asphere": ((4, 3e-5), (6, 1e-7))}),
+    "toroid": (13.0, {"cylinder": "y", "across": (-30.0, None)}),
+    "aspheric toroid": (-16.0, {"cylinder": "x", "conic": -1.2, "asphere": ((4, 2e-5),), "across": (14.0, None)}),
+    "biconic": (14.0, {"cylinder": "x", "conic": -1.2, "across": (12.0, 0.2)}),
+    "ideal": (math.inf, {"n_d": 1.0, "V_d": None, "focal_mm": -30.0}),
 }
 
 
 def lens_before_film(radius_mm: float, shape: dict[str, Any]) -> Lens:
     """A plane stop, a plane into glass, and the surface, as light comes from the film; the rim at 10 mm."""
-    front = Surface(radius_mm, 9.0, 20.0, 1.6, 40.0, **shape)
+    front = Surface(radius_mm, 9.0, 20.0, **{"n_d": 1.6, "V_d": 40.0} | shape)
     return Lens("one", "", (front, Surface(math.inf, 3.0, 40.0), Surface(math.inf, 30.0, 30.0, stop=True)), 2.0)
 
 

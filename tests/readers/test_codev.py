@@ -3,17 +3,19 @@
 import math
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 from lens_formats import swapped as swapped_in
 from shipped import singlet_mm
 
-from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.errors import AssumedWarning, InputError, NeurolensWarning
 from neurolens.optics import catalogue
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.readers.codev import read_seq
 from neurolens.readers.draft import Given
+from neurolens.readers.forbes import qbfs_terms, qcon_terms
 
 TEXT = """\
 RDM;LEN       "VERSION: 11.2 SR1       LENS VERSION: 84       Creation Date: 28-May-2019"
@@ -134,11 +136,28 @@ def test_units_and_defocus(tmp_path: Path) -> None:
         ("YTO; CUY 0; CUX 0.025", (40, 0, {}, "x")),
         ("XTO; RDY 0; RDX 40; K -2", (40, -2, {}, "x")),
         ("XDE 0.0; ADE 0.0", (50, 0, {}, None)),
+        ("YTO; K -1; A 1e-6; CUX -0.025", (50, -1, {4: 1e-6}, "y", (-40, None))),
+        ("XTO; RDX 40; K -2; B 1e-9", (40, -2, {6: 1e-9}, "x", (50, None))),
+        ("AAS; RDX 40; KY -1; KX 2; AR 0; AP 0.5", (50, -1, {}, "y", (40, 2))),
+        ("AAS; RDX 50; KY -1; KX -1", (50, -1, {}, None)),
+        ("AAS; RDY 0; RDX 40; KX 2", (40, 2, {}, "x")),
+        ("SPS ODD 10.0\n SCO K -1; SCC K 100\n SCO AR3 2e-3", (50, -1, {3: 2e-6}, None)),
+        ("SPS QCN; SCO NRADIUS 10; SCO K -1; SCO QC4 0.5", (50, -1, {4: 5e-5}, None)),
     ],
 )
-def test_surface_types(block: str, shape: tuple[float, float, dict[int, float], str | None], tmp_path: Path) -> None:
+def test_surface_types(block: str, shape: tuple[Any, ...], tmp_path: Path) -> None:
     s = read(swapped("  CIR 8", f"  {block}\n  CIR 8"), tmp_path).surfaces[0]
-    assert (pytest.approx(s.radius_mm), s.conic, dict(s.asphere), s.cylinder) == shape
+    wanted = shape if len(shape) > 4 else (*shape, None)
+    assert (pytest.approx(s.radius_mm), s.conic, pytest.approx(dict(s.asphere)), s.cylinder, s.across) == wanted
+
+
+@pytest.mark.parametrize(("kind", "names"), [("QBF", "QB"), ("QCN", "QC")])
+def test_q_types_are_the_sums_of_forbes(kind: str, names: str, tmp_path: Path) -> None:
+    values = (2e-2, -3e-3, 4e-4)
+    terms = "".join(f"; SCO {names}{4 + 2 * m} {a}" for m, a in enumerate(values))
+    with pytest.warns(AssumedWarning, match=rf"lens\.seq: line 12: SPS {kind}: coefficient {names}n is taken"):
+        s = read(swapped("  CIR 8", f"  SPS {kind} 9.0{terms}\n  CIR 8"), tmp_path).surfaces[0]
+    assert s.asphere == (qbfs_terms(values, 9.0, 1 / 50, 8.0) if kind == "QBF" else qcon_terms(values, 9.0, 8.0))
 
 
 @pytest.mark.parametrize(
@@ -153,9 +172,14 @@ def test_surface_types(block: str, shape: tuple[float, float, dict[int, float], 
         ("NBK7_SCHOTT", "0.5:60", r"index: got 0.5"),
         ("  STO", "  GRT", r"line 14, GRT: got .*given.*no grating"),
         ("  STO", "  STO; ADE 3", r"line 14, ADE: got 3.0, expected 0"),
-        ("  STO", "  STO; SPS QBF", r"line 14, SPS: got .QBF.*Q-types QBF and QCN"),
+        ("  STO", "  STO; SPS QBF", r"NRADIUS of SPS QBF: got 0.0, expected a normalisation radius above 0"),
+        ("  STO", "  STO; SPS QBF 9; SCO K 1", r"conic of SPS QBF: got 1.0, expected 0"),
+        ("  STO", "  STO; SPS QCN 9; SCO QC5 1", r"SCO of SPS QCN: got 'QC5', expected K, NRADIUS or QC4, QC6"),
+        ("  STO", "  STO; SPS XYP 9", r"line 14, SPS: got 'XYP', expected one of ODD, QBF, QCN"),
+        ("  STO", "  STO; SCO K 1", r"line 14, SCO: got 'K', expected SPS before it"),
+        ("  STO", "  STO; AAS; CUX 1; AR 1e-6", r"AR of AAS: got 1e-06, expected 0"),
         ("  STO", "  STO; CIR OBS 2", r"CIR: got 'OBS'"),
-        ("  STO", "  STO; YTO; CUX 0.1", r"torus"),
+        ("  STO", "  STO; MOD", r"line 14, MOD: got .*no ideal lens \(a module\)"),
         ("  STO", "  STO; A 1e-5", r"ASP before coefficients"),
         ("  STO", "  STO; K -1", r"CON or ASP before a conic"),
         ("  STO", "  STO; RDY S7 3", r"RDY: got 'S7', expected a surface from S0 to S1"),

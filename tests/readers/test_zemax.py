@@ -4,6 +4,7 @@ import math
 import re
 import warnings
 from pathlib import Path
+from typing import Any
 
 import pytest
 from lens_formats import swapped as swapped_in
@@ -166,12 +167,29 @@ def test_what_is_left_out_is_told(old: str, new: str, message: str, tmp_path: Pa
         ("TYPE BICONICX\n  CURV 0.02\n  CONI -2\n  PARM 1 0\n  PARM 2 3", (50, -2, {}, "y")),
         ("TYPE BICONICX\n  CURV 0\n  PARM 1 40\n  PARM 2 -3", (40, -3, {}, "x")),
         ("TYPE BICONICX\n  CURV 0.025\n  CONI -1\n  PARM 1 40\n  PARM 2 -1", (40, -1, {}, None)),
+        ("TYPE BICONICX\n  CURV 0.02\n  CONI -1\n  PARM 1 40\n  PARM 2 3", (50, -1, {}, "y", (40, 3))),
+        (
+            "TYPE TOROIDAL\n  CURV 0.02\n  CONI -1\n  PARM 1 -40\n  PARM 2 1E-4\n  PARM 8 2E-18",
+            (50, -1, {2: 1e-4, 14: 2e-18}, "y", (-40, None)),
+        ),
+        ("TYPE TOROIDAL\n  CURV 0.0\n  PARM 1 40\n  PARM 3 1E-6", (math.inf, 0, {4: 1e-6}, "y", (40, None))),
+        ("TYPE TOROIDAL\n  CURV 0.02\n  PARM 3 1E-6", (50, 0, {4: 1e-6}, "y")),
     ],
 )
-def test_surface_types(block: str, shape: tuple[float, float, dict[int, float], str | None], tmp_path: Path) -> None:
+def test_surface_types(block: str, shape: tuple[Any, ...], tmp_path: Path) -> None:
     lens = read(swapped('TYPE STANDARD\n  CURV 2.0E-2 0 0 0 0 ""', block), tmp_path)
     s = lens.surfaces[0]
-    assert (pytest.approx(s.radius_mm), s.conic, pytest.approx(dict(s.asphere)), s.cylinder) == shape
+    wanted = shape if len(shape) > 4 else (*shape, None)
+    assert (pytest.approx(s.radius_mm), s.conic, pytest.approx(dict(s.asphere)), s.cylinder, s.across) == wanted
+
+
+def test_a_paraxial_surface_is_an_ideal_lens(tmp_path: Path) -> None:
+    front = 'TYPE STANDARD\n  CURV 2.0E-2 0 0 0 0 ""'
+    text = swapped(front, "TYPE PARAXIAL\n  CURV 0.0\n  PARM 1 75\n  PARM 2 1").replace("GLAS N-BK7", "COMM N-BK7")
+    lens = read(text.replace("CURV -2.0E-2", "CURV 0.0"), tmp_path)
+    assert lens.surfaces[0].focal_mm == 75 and first_order(lens).efl_mm == pytest.approx(75, rel=1e-14)
+    with pytest.raises(InputError, match="surface 0, focal_mm: got 75.0, expected air on both sides"):
+        read(swapped(front, "TYPE PARAXIAL\n  CURV 0.0\n  PARM 1 75"), tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -183,8 +201,9 @@ def test_surface_types(block: str, shape: tuple[float, float, dict[int, float], 
         ("ENPD 10", "ENPD 0", r"line 7, ENPD: got 0.0, expected a number above 0"),
         ("GLAS N-BK7", "GLAS N-BK8", r"GLAS: got 'N-BK8', expected a glass.*N-BK7"),
         ("GLAS N-BK7 0", "GLAS N-BK7 4", r"GLAS: got 'N-BK7 with solve 4'"),
-        ("TYPE STANDARD\n  CURV -2", "TYPE PARAXIAL\n  CURV -2", r"TYPE: got 'PARAXIAL'"),
-        ("TYPE STANDARD\n  CURV -2", "TYPE QT\n  CONI 1\n  XDAT 1 1\n  XDAT 3 1\n  CURV -2", r"CONI of QT: got 1.0"),
+        ("TYPE STANDARD\n  CURV -2", "TYPE PARAXIAL\n  CURV -2", r"PARAXIAL: got 0.0, expected PARM 1, a focal length"),
+        ("TYPE STANDARD\n  CURV -2", "TYPE PARAXIAL\n  PARM 1 9\n  PARM 3 9\n  COMM ", r"PARM 3 of PARAXIAL: got 9.0"),
+        ("TYPE STANDARD\n  CURV -2", "TYPE QT\n  CONI 1\n  XDAT 1 1\n  XDAT 3 1\n  CURV -2", r"conic of QT: got 1.0"),
         ("TYPE STANDARD\n  CURV -2", "TYPE QT\n  PARM 1 2\n  XDAT 1 1\n  XDAT 3 1\n  CURV -2", r"0 \(Qbfs\) or 1"),
         ("TYPE STANDARD\n  CURV -2", "TYPE XASPHERE\n  XDAT 1 1.5\n  CURV -2", r"XDAT 1 of XASPHERE: got 1.5"),
         ("TYPE STANDARD\n  CURV -2", "TYPE XASPHERE\n  XDAT 1 1\n  XDAT 4 1\n  CURV -2", r"XDAT 4 of XASPHERE"),
@@ -194,9 +213,9 @@ def test_surface_types(block: str, shape: tuple[float, float, dict[int, float], 
         ("SURF 2", "SURF 4", r"SURF: got '4', expected surface 2"),
         ("TYPE STANDARD\n  CURV -2", "TYPE COORDBRK\n  PARM 3 12\n  CURV -2", r"PARM 3 of COORDBRK: got 12.0"),
         ("TYPE STANDARD\n  CURV -2", "TYPE XPOLYNOM\n  CURV -2", r"line 32, TYPE: got 'XPOLYNOM'"),
-        ("TYPE STANDARD\n  CURV -2", "TYPE TOROIDAL\n  PARM 1 33\n  CURV -2", r"torus is not read"),
-        ("TYPE STANDARD\n  CURV -2", "TYPE TOROIDAL\n  PARM 2 1E-5\n  CURV -2", r"PARM 2 of TOROIDAL"),
-        ("TYPE STANDARD\n  CURV -2", "TYPE BICONICX\n  PARM 1 33\n  CURV -2", r"BICONICX.*radii infinite"),
+        ("TYPE STANDARD\n  CURV -2", "TYPE TOROIDAL\n  PARM 9 1E-5\n  CURV -2", r"PARM 9 of TOROIDAL"),
+        ("TYPE STANDARD\n  CURV -2", "TYPE TOROIDAL\n  XDAT 3 1E-5\n  CURV -2", r"XDAT 3 of TOROIDAL"),
+        ("TYPE STANDARD\n  CURV -2", "TYPE BICONICX\n  PARM 3 1\n  CURV -2", r"PARM 3 of BICONICX"),
         ("TYPE STANDARD\n  CURV -2", "TYPE ODDASPHE\n  PARM 1 1E-3\n  CURV -2", r"PARM 1 of ODDASPHE"),
         ("TYPE STANDARD\n  CURV -2", "TYPE STANDARD\n  PARM 1 1E-3\n  CURV -2", r"PARM 1 of STANDARD"),
         ("  DIAM 9 1", "  OBSC 0 3 0\n  DIAM 9 1", r"line 35, OBSC: got \(unknown keyword\)"),

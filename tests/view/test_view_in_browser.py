@@ -4,6 +4,8 @@ Run by `make test-web`, which sets NEUROLENS_BROWSER to a Chromium, and NEUROLEN
 """
 
 import os
+import shutil
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ import pytest
 
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.onnxlens import load_model
+from neurolens.cameras.source import model_extras
 from neurolens.cli import main
 from neurolens.flare.ghostfile import write_ghosts
 from neurolens.flare.ghostfit import GhostSettings, fit_ghosts
@@ -21,6 +24,7 @@ from neurolens.flare.picture import Raster, ghost_picture
 from neurolens.optics.lensfile import read_lens
 from neurolens.render.renderer import render
 from neurolens.render.scene import scene_from_tables
+from neurolens.surrogates.source import export_file
 
 BROWSER = os.environ.get("NEUROLENS_BROWSER")
 if not BROWSER:
@@ -39,7 +43,7 @@ NM = 550.0
 def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("view") / "view.html"
     words = [str(ROOT / "models" / f"{ZOOM}-range.states-64.onnx"), LENS, ZOOM]
-    assert main(["view", *words, "--downloads", "glsl,onnx,c", "-o", str(out), "--json"]) == 0
+    assert main(["view", *words, "--downloads", "glsl", "-o", str(out), "--json"]) == 0
     return out
 
 
@@ -237,7 +241,8 @@ def test_a_lamp_is_dragged_and_its_ghosts_are_those_of_neurolens_flare(browser: 
     opened.page.mouse.down()
     opened.page.mouse.move(box["x"] + 0.7 * box["width"], box["y"] + 0.3 * box["height"], steps=3)
     opened.page.mouse.up()
-    opened.page.wait_for_function(f"neurolens.ghosts.shown === {len(model.pairs)}")
+    drawn = f"neurolens.ghosts.shown === {len(model.pairs)} ? done() : setTimeout(look, 20)"
+    opened.page.evaluate(f"new Promise((done) => {{ const look = () => {drawn}; look(); }})")
     assert opened.number("neurolens.set.lamp") == pytest.approx([0.7, 0.7], abs=0.01)
     found = opened.number("Array.from(neurolens.engine.gpu.read(neurolens.ghosts.film))")
     picture = np.array(found).reshape(HIGH, WIDE, 4)[::-1, :, 1]
@@ -301,15 +306,39 @@ def test_clicks_focus_and_draw_rays_by_mouse_and_by_keys(opened: Opened) -> None
     assert opened.number("neurolens.set.wipe") < 0.5
 
 
-def test_downloads_are_the_files(opened: Opened) -> None:
-    opened.set(a="polynomial", tool="focus")
-    wanted = (ROOT / "models" / f"{LENS}.ols-64.onnx").read_bytes()
-    with opened.page.expect_download() as download:
-        opened.page.locator("#downloads button", has_text="ONNX").click()
-    assert Path(download.value.path()).read_bytes() == wanted
-    with opened.page.expect_download() as download:
-        opened.page.locator("#downloads button", has_text="GLSL").click()
-    assert f"void {LENS}(" in Path(download.value.path()).read_text()
+def test_downloads_are_the_files(browser: Any, tmp_path: Path) -> None:
+    """Of every form, as they are written without a page: byte for byte; C compiles."""
+    assert main(["view", LENS, "-o", str(tmp_path / "view.html"), "--json"]) == 0
+    opened = Opened(browser, tmp_path / "view.html")
+    models = {kind: ROOT / "models" / f"{LENS}.{kind}.onnx" for kind in ("ols-64", "mlp-16x2")}
+    wanted = {("exact", to): exported(ROOT / "lenses" / f"{LENS}.toml", to, tmp_path) for to in ("glsl", "c")}
+    for form, file in zip(("polynomial", "network"), models.values(), strict=True):
+        extras, notes = model_extras(load_model(file))
+        for to in ("glsl", "c"):
+            path = export_file(file, tmp_path / f"{form}.{to}", to, None, extras, notes).path
+            wanted[form, to] = path.read_bytes()
+        wanted |= {(form, "onnx"): file.read_bytes(), (form, "osl"): exported(file, "osl", tmp_path)}
+    found = {}
+    for form in ("polynomial", "network", "exact"):
+        opened.set(a=form)
+        for button in opened.page.locator("#downloads button").all():
+            with opened.page.expect_download() as download:
+                button.click()
+            place = Path(download.value.path())
+            assert download.value.suggested_filename.startswith(f"{LENS}.{form}.")
+            found[form, button.inner_text().lower()] = place.read_bytes()
+            if button.inner_text() == "C" and (compiler := shutil.which("cc")):
+                flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", "-x", "c"]
+                subprocess.run([compiler, *flags, str(place)], check=True)
+    assert found.keys() == wanted.keys()
+    assert [key for key in found if found[key] != wanted[key]] == []
+    assert opened.said == []
+
+
+def exported(file: Path, to: str, folder: Path) -> bytes:
+    out = folder / f"{file.stem}.{to}"
+    assert main(["export", str(file), "--to", to, "-o", str(out), "--json"]) == 0
+    return out.read_bytes()
 
 
 def test_it_says_what_is_missing(browser: Any, page_file: Path) -> None:

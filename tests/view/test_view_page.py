@@ -1,12 +1,16 @@
 """The page without a browser: that it is whole, small and safe, its shaders compile, and what it takes from graphs."""
 
+import base64
 import json
+import lzma
 import re
 import shutil
 import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,14 +18,15 @@ import torch
 
 from neurolens.base.errors import InputError
 from neurolens.cli import main
+from neurolens.commands import view as view_command
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 from neurolens.optics.tracegraph import exact_graph
+from neurolens.view import packed, shaders
 from neurolens.view import page as pages
-from neurolens.view import shaders
 
 ROOT = Path(__file__).parents[2]
 LENS = "thorlabs_lb1471_biconvex_50"
@@ -33,6 +38,14 @@ def view(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("view") / "view.html"
     assert main(["view", LENS, "--downloads", "glsl", "-o", str(out), "--json"]) == 0
     return out
+
+
+def data_of(text: str) -> Any:
+    """The page's JSON, by the library's own LZMA."""
+    size, letters = re.findall(r'id="data" data-bytes="(\d+)">([^<]*)<', text)[0]
+    values = np.array([packed.CHARACTERS.index(c) for c in letters]).reshape(-1, 2) @ (91, 1)
+    data = np.packbits((values[:, None] >> np.arange(12, -1, -1)) & 1).tobytes()
+    return json.loads(lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=packed.FILTERS).decompress(data, int(size)))
 
 
 class Elements(HTMLParser):
@@ -60,11 +73,11 @@ def test_it_fetches_nothing(view: Path) -> None:
 def test_it_is_whole(view: Path) -> None:
     text = view.read_text(encoding="utf-8")
     assert not re.search(r"@[A-Z]+@", text)
-    data = json.loads(text.split('id="data">')[1].split("</script")[0])
+    data = data_of(text)
     (lens,) = data["lenses"]
     assert {form["kind"] for form in lens["forms"]} == {"polynomial", "network", "exact"}
     for form in lens["forms"]:
-        assert f'id="{LENS}/{form["kind"]}/glsl"' in text
+        assert f"{form['kind']}/glsl" in [name for name, _, _ in lens["parts"]]
         assert {"efl_mm", "film_z_mm", "pupil_z_mm", "pupil_radius_mm", "stop_radius_max_mm"} <= set(form["values"])
 
 
@@ -83,24 +96,60 @@ def test_every_control_has_a_label(view: Path) -> None:
 def test_shaders_compile(view: Path, tmp_path: Path) -> None:
     """As the page's own script puts them together."""
     text = view.read_text(encoding="utf-8")
-    data = json.loads(text.split('id="data">')[1].split("</script")[0])
+    data = data_of(text)
+    (stream,) = re.findall(rf'id="lens/{LENS}">([^<]*)<', text)
     scripts = "\n".join(
-        (pages.FOLDER / name).read_text(encoding="utf-8") for name in ("gl.js", "scene.js", "engine.js")
+        (pages.FOLDER / name).read_text(encoding="utf-8") for name in ("packed.js", "gl.js", "scene.js", "engine.js")
     )
     script = f"""{scripts}
-const data = {json.dumps(data)}, zlib = require("zlib"), fs = require("fs");
-const packed = {json.dumps(dict(re.findall(r'application/gzip" id="([^"]*)">([^<]*)<', text)))};
-const unpacked = (id) => zlib.gunzipSync(Buffer.from(packed[id], "base64")).toString();
+const data = {json.dumps(data)}, fs = require("fs");
+globalThis.document = {{ getElementById: () => ({{ textContent: {json.dumps(stream)} }}) }};
 fs.writeFileSync("scene.frag", HEAD + sceneShader(data));
 fs.writeFileSync("thin.frag", HEAD + raysShader(data, data.functions.thin.text, data.functions.thin.call));
-for (const form of data.lenses[0].forms)
-  fs.writeFileSync(form.kind + ".frag", HEAD + raysShader(data, unpacked(`{LENS}/${{form.kind}}/glsl`), form.call));
+const [lens] = data.lenses;
+for (const form of lens.forms)
+  fs.writeFileSync(form.kind + ".frag", HEAD + raysShader(data, partOf(lens, `${{form.kind}}/glsl`), form.call));
 """
     subprocess.run([str(NODE), "-e", script], check=True, cwd=tmp_path, capture_output=True)
     files = sorted(tmp_path.glob("*.frag"))
     assert len(files) == 5
     done = subprocess.run([str(GLSLANG), *map(str, files)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
+
+
+CODE = """\
+#define A_LENS_FMA(a, b, c) ((a) * (b) + (c))
+/* t1 in µm, <b> & \\ */
+    const float t1 = 1.0f / x;
+    const float t12 = A_LENS_FMA(t1, (-0.5f), t1);
+    const float t13 = A_LENS_FMA(t1, t12, 2.0f);
+    const float t4 = t13 > t12 ? t13 : t1 - t12;
+    return t13;
+"""
+
+
+@pytest.mark.skipif(not NODE, reason="no node")
+def test_parts_are_unpacked_as_they_were() -> None:
+    """Code as C, and texts that its shortening could not give back; bytes that nothing shortens."""
+    others = {"taken": "    float t1 = x;", "sum": "    const float t2 = a * b + c;", "less": "t2-1 t1", "mark": "\x01"}
+    noise = np.random.default_rng(0).integers(0, 256, 3000).astype(np.uint8).tobytes()
+    parts = {
+        "c": CODE,
+        "bytes": noise,
+        "none": "",
+        **{k: f"{CODE}{v}\n" for k, v in others.items()},
+        "again": noise + b"x",
+    }
+    text, index = packed.packed_parts(parts.items())
+    assert len(text) < 1.25 * len(noise) + 900
+    assert [how for _, _, how in index[:4]] == ["A_LENS_FMA", None, "", ""]
+    script = f"""{(pages.FOLDER / "packed.js").read_text(encoding="utf-8")}
+globalThis.document = {{ getElementById: () => ({{ textContent: {json.dumps(text)} }}) }};
+const lens = {{ key: "a", parts: {json.dumps(index)} }}, found = lens.parts.map(([name]) => partOf(lens, name));
+console.log(JSON.stringify(found.map((part) => Buffer.from(part).toString("base64"))));"""
+    done = subprocess.run([str(NODE), "-e", script], check=True, capture_output=True)
+    found = [base64.b64decode(part) for part in json.loads(done.stdout)]
+    assert found == [part if isinstance(part, bytes) else part.encode() for part in parts.values()]
 
 
 def test_a_page_that_grows_too_large_leaves_files_out(view: Path, tmp_path: Path) -> None:
@@ -203,7 +252,7 @@ def test_a_lens_of_your_own_says_what_is_left_out(tmp_path: Path) -> None:
     (tmp_path / "my_lens.zmx").write_text(ZMX)
     out = tmp_path / "view.html"
     assert main(["view", str(tmp_path / "my_lens.zmx"), "--downloads", "glsl", "-o", str(out), "--json"]) == 0
-    (lens,) = json.loads(out.read_text(encoding="utf-8").split('id="data">')[1].split("</script")[0])["lenses"]
+    (lens,) = data_of(out.read_text(encoding="utf-8"))["lenses"]
     (form,) = lens["forms"]
     assert lens["name"] == "My singlet"
     assert form["method"] == "every surface traced, coatings and absorption left out"
@@ -233,3 +282,11 @@ def test_bad_input_is_one_line_and_no_page(
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert said in error
     assert not list(tmp_path.glob("*.html"))
+
+
+def test_two_files_of_ghosts_of_one_lens_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(view_command, "_flare", lambda _: SimpleNamespace(lens=SimpleNamespace(lens_id=LENS)))
+    assert main(["view", LENS, "a.onnx", "b.onnx", "-o", str(tmp_path / "view.html")]) == 2
+    assert f"ghosts of {LENS}: got 'b.onnx', expected one file a lens" in capsys.readouterr().err

@@ -2,13 +2,6 @@
 const AIM_FILM = 5, AIM_PUPIL = 28, AXIS = 100; // points a side: of the film's quarter and pupil; of the exposure
 const FREE_BENCH = 640;
 
-/** The text of an element, unpacked. */
-async function unpack(id) {
-  const bytes = Uint8Array.from(atob(document.getElementById(id).textContent), (c) => c.charCodeAt(0));
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
-  return new Response(stream).text();
-}
-
 /** A form's function for the shader of rays: its state, if any, is uniforms, four numbers each. */
 function functionOf(text) {
   const packed = (_, n) => `state_c[${n >> 2}].${"xyzw"[n & 3]}`;
@@ -45,7 +38,7 @@ class Engine {
   }
 
   async text(lens, kind) {
-    return this.once(`${lens.key}/${kind}/text`, () => unpack(`${lens.key}/${kind}/glsl`));
+    return this.once(`${lens.key}/${kind}/text`, () => partOf(lens, `${kind}/glsl`));
   }
 
   /** The program of a form's rays, compiled when it is first asked for. */

@@ -1,5 +1,5 @@
 // Ghosts of one lamp far away: each fitted ghost's function on a grid of the front, its cells drawn as areas that add up.
-const GHOST_CELLS = 40, GHOST_NM = 3; // cells a side, and wavelengths, of each ghost
+const GHOST_CELLS = 28, GHOST_NM = 3; // cells a side (within 1% of 64), and wavelengths, of each ghost
 
 class GhostView {
   constructor(engine) {
@@ -9,7 +9,7 @@ class GhostView {
 
   /** Programs of a lens's ghosts, brightest first; `made` is told of each, which takes a software GPU a moment. */
   async functions(lens) {
-    return this.engine.once(`${lens.key}/ghosts`, async () => JSON.parse(await unpack(`${lens.key}/ghosts`)));
+    return this.engine.once(`${lens.key}/ghosts`, () => jsonOf(lens, "ghosts"));
   }
 
   program(lens, ghost) {

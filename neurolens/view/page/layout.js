@@ -7,10 +7,10 @@ class LayoutView {
   }
 
   async show(lens) {
-    const { section, path } = JSON.parse(await this.engine.once(`${lens.key}/lens`, () => unpack(`${lens.key}/lens`)));
+    const { section, outputs } = jsonOf(lens, "lens");
     this.svg.replaceChildren();
     this.svg.toggleAttribute("hidden", !section.box);
-    this.path = path;
+    this.outputs = outputs;
     this.lens = lens;
     if (!section.box) return;
     const [x, y, width, height] = (this.box = section.box);
@@ -30,9 +30,9 @@ class LayoutView {
   /** Draw the rays of a film height (mm) at the setting of a side; returns how many of them pass. */
   async rays(height, side) {
     this.svg.querySelectorAll(".ray").forEach((ray) => ray.remove());
-    if (!this.path?.text || !this.box) return null;
-    const { gpu } = this.engine, names = this.path.outputs, count = names.length + 1;
-    const program = await this.engine.once(`${this.lens.key}/path`, () => gpu.program(`${this.path.text}
+    if (!this.outputs?.length || !this.box) return null;
+    const { gpu } = this.engine, names = this.outputs, count = names.length + 1;
+    const program = await this.engine.once(`${this.lens.key}/path`, () => gpu.program(`${partOf(this.lens, "path")}
       uniform float film_y, pupil_low, pupil_step, nm, film_z, stop_radius;
       out vec4 result;
       void main() {

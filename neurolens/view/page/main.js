@@ -1,6 +1,6 @@
 // The page: settings, what they show, keys and touch.
 const $ = (id) => document.getElementById(id);
-const shared = JSON.parse($("data").textContent);
+const shared = JSON.parse(textOf(new Unpacked($("data").textContent, +$("data").dataset.bytes).upTo()));
 const NAMES = { exact: "exact", polynomial: "polynomial", network: "network", thin: "thin lens" };
 const set = { lens: shared.lenses[0], scene: "night", view: "wipe", a: "", b: "", tool: "focus", wipe: 0.5, focus: 1, f_number: 1,
   zoom: 0, blades: 0, roundness: 0, rotation: 0, wavelength: 0, width: 480, most: 256, clicked: null, lamp: null, irradiance: 0.5 };
@@ -205,9 +205,8 @@ async function click(place) {
   return show();
 }
 
-async function download(kind) {
-  const text = await unpack(`${set.lens.key}/${set.a}/${kind}`);
-  const data = kind === "onnx" ? Uint8Array.from(text, (c) => c.charCodeAt(0)) : text;
+function download(kind) {
+  const data = partOf(set.lens, `${set.a}/${kind}`);
   const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(new Blob([data])),
     download: `${set.lens.key}.${set.a}.${{ c: "h" }[kind] ?? kind}` });
   link.click();

@@ -1,0 +1,71 @@
+"""A lens's texts and files as one stream of printable characters, which `page/packed.js` unpacks: a quarter of gzip's.
+
+C, GLSL and OSL of one lens say much the same with temporaries of other numbers. Counted from the line's own number, and
+with C's multiply-adds as GLSL writes them, most lines of one are lines of the others; LZMA, unlike gzip, looks back far
+enough to find them.
+"""
+
+from __future__ import annotations
+
+import lzma
+import re
+from collections.abc import Iterable
+
+import numpy as np
+
+# Of 91 characters two hold 13 bits; none ends an element of HTML, begins an entity or an escape.
+CHARACTERS = "".join(chr(code) for code in range(33, 127) if chr(code) not in "&<\\")
+FILTERS = [
+    {"id": lzma.FILTER_LZMA1, "preset": 9 | lzma.PRESET_EXTREME, "dict_size": 1 << 22, "lc": 3, "lp": 0, "pb": 0}
+]
+_TEMPORARY = re.compile(r"\bt(\d+)\b")
+_UNTOLD = re.compile(r"\x01|\bt\d+-")  # what `_counted` could not give back
+_MULTIPLY_ADD = re.compile(r"^    const (float t\d+ = )\w+_FMA\((\S+), (\S+), (\S+)\);$", re.MULTILINE)
+_CONSTANT = re.compile(r"^    const (float t\d)", re.MULTILINE)
+_TAKEN = re.compile(r"^    (float t\d|const float t\d+ = \S+ \* \S+ \+ \S+;$)", re.MULTILINE)
+_MACRO = re.compile(r"^#define (\w+_FMA)\(", re.MULTILINE)
+
+
+def packed(data: bytes) -> str:
+    """Bytes as LZMA (raw, lc 3, lp 0, pb 0) in `CHARACTERS`, 13 bits a pair, high bits and characters first."""
+    bits = np.unpackbits(np.frombuffer(lzma.compress(data, lzma.FORMAT_RAW, filters=FILTERS), np.uint8))
+    values = np.pad(bits, (0, -bits.size % 13)).reshape(-1, 13) @ (1 << np.arange(12, -1, -1))
+    return np.array(list(CHARACTERS))[np.stack(np.divmod(values, len(CHARACTERS)), 1)].tobytes().decode("utf-32-le")
+
+
+def packed_parts(parts: Iterable[tuple[str, str | bytes]]) -> tuple[str, list[tuple[str, int, str | None]]]:
+    """The stream of named parts, and of each its name, bytes there, and how it is told.
+
+    That is None for bytes as they are, "" for a text whose temporaries are counted, the name of its macro for C.
+    """
+    data, found = b"", []
+    for name, part in parts:
+        told, how = (part, None) if isinstance(part, bytes) else _told(part)
+        found.append((name, len(told), how))
+        data += told
+    return packed(data), found
+
+
+def _told(text: str) -> tuple[bytes, str | None]:
+    """A text of code as its lines differ from others', and how that is undone."""
+    if _UNTOLD.search(text):
+        return text.encode(), None
+    macro = _MACRO.search(text)
+    if macro is None or _TAKEN.search(text):
+        return _counted(text).encode(), ""
+    return _counted(_CONSTANT.sub(r"    \1", _MULTIPLY_ADD.sub(r"    \1\2 * \3 + \4;", text))).encode(), macro[1]
+
+
+def _counted(text: str) -> str:
+    """Each line's first temporary counted from that of the line before (one more is not said), others back from it."""
+    before, lines = 0, []
+    for line in text.split("\n"):
+        numbers = [int(n) for n in _TEMPORARY.findall(line)]
+        if numbers:
+            steps = [numbers[0] - before, *(numbers[0] - n for n in numbers[1:])]
+            between, before = _TEMPORARY.split(line)[::2], numbers[0]
+            line = between[0] + "".join(
+                f"\x01{'' if step == 1 else step}{text}" for step, text in zip(steps, between[1:], strict=True)
+            )
+        lines.append(line)
+    return "\n".join(lines)
