@@ -62,7 +62,7 @@ CURVES = (
         "survey of the lens, fit and all",
         (2, 8, 32, 100, 200),
         "surveyed",
-        why="memory holds the crossings of 200,000 rays with every surface, 32 bytes each",
+        why="memory holds the crossings of a batch of 65,536 rays with every surface, 32 bytes each, and tests of them",
     ),
     Curve(
         "pixels",
@@ -72,7 +72,13 @@ CURVES = (
         why="memory holds the picture's sums: 10^8 pixels take 16 GB, or a hundredth of that by the tile",
     ),
     Curve("pixels", "a tile of a hundredth", _decades(4, 8), "tile"),
-    Curve("pixels", "tiles merged", _decades(4, 7), "merged", why="OpenEXR's writer takes whole channels"),
+    Curve(
+        "pixels",
+        "tiles merged",
+        _decades(4, 7),
+        "merged",
+        why="OpenEXR's writer takes whole channels, 47 bytes a pixel, some of it freed before",
+    ),
     Curve("samples", "128 x 72 pixels", (1, 4, 16, 64, 256, 1024), "sampled", memory_power=0.0),
     Curve("lights", "points", _decades(0, 6), "points"),
     Curve(

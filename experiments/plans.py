@@ -23,6 +23,7 @@ from neurolens.base.progress import Report
 from neurolens.cameras.build import Shot, ideal_as, make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import FusedExactCamera
+from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.warped import Warped
 from neurolens.evaluate import footprints as prints
 from neurolens.evaluate import plan as plans
@@ -140,14 +141,18 @@ def measure_case(case: Case, folder: Path, report: Report) -> dict[str, Any]:
             picks = plans.candidates(found, BUDGETS, target, models=[*case.shipped(), *fitted])
         plan_s = probe_s + time.process_time() - began
         report(0.2 + 0.3 * number)
-        every = {c.name: c for c in picks} | {c.name: c for c in _more(found, target, folder, picks, sizes)}
+        every = {c.name: c for c in picks} | {
+            c.name: c for c in _more(found, target, folder, picks, sizes, case.shipped())
+        }
         report(0.3 + 0.3 * number)
         for choice in every.values():
             row = rows.setdefault(choice.name, {"plan_px": choice.error_px, "plan_light": choice.light_error})
             row[f"cost_{target}"] = choice.cost if math.isfinite(choice.cost) else None
             if "px" not in row and row["plan_px"] <= _TRIED_PX:
-                camera = camera_of(choice, found, case.state)
+                camera = _held(choice, found, case.state, exact)
                 apart, light = plan_errors.by_rays(camera, exact, places, fresh.seen, asked.pixel_mm, BUDGETS)
+                if isinstance(camera, OnnxCamera):
+                    light = light + prints.light_beside(camera, places) / np.maximum(fresh.seen.light, 1e-30)
                 row |= {"px": _counted(apart), "light": _counted(light)}
         for budget in BUDGETS:
             best = plans.decided(found, picks, budget, target).best
@@ -165,27 +170,50 @@ def measure_case(case: Case, folder: Path, report: Report) -> dict[str, Any]:
 
 
 def _more(
-    found: Probed, target: plans.Target, folder: Path, picks: Sequence[plans.Choice], made: list[Path]
+    found: Probed,
+    target: plans.Target,
+    folder: Path,
+    picks: Sequence[plans.Choice],
+    made: list[Path],
+    shipped: Sequence[Path],
 ) -> Iterator[plans.Choice]:
-    """Polynomials of the shot of all sizes that the plan fitted without their cost, or not at all, made as it does.
+    """Models that ship and polynomials of the shot of all sizes that the plan tried without their cost, or not at all,
+    made as it does.
 
-    None are larger than what has half of the least budget: they cost more. `made` keeps files for the next target.
+    No polynomials are larger than what has half of the least budget: they cost more. `made` keeps files for the next
+    target.
     """
-    trial = plans._Trial(found, target, _TRIED_PX)
+    trial = plans._Trial(found, target, (_TRIED_PX,))
     costs = {c.name: c for c in picks}
+
+    def costed(file: Path) -> plans.Choice | None:
+        choice = costs.get(file.stem)
+        if choice is not None and (math.isfinite(choice.cost) or not choice.meets(_TRIED_PX)):
+            return choice
+        judged = next(plans._model(trial, file), None)
+        if judged is None:
+            return None
+        return trial.costed(judged) if judged.choice.meets(_TRIED_PX) else judged.choice
+
+    yield from (c for c in map(costed, shipped) if c is not None)
     fit: Any = None
     for terms in sorted({*plans.shot_terms(found), *MORE_TERMS}):
         file = folder / f"{Path(found.lens.path).stem}.shot-ols-{terms}.onnx"
         if file.stem not in costs and file not in made:
             fit = fit or plans.shot_fits(found, folder)
             made.append(fit(terms)[0])
-        choice = costs.get(file.stem)
-        if choice is None or not math.isfinite(choice.cost):
-            choice = next(iter(plans._model(trial, file)), None)
+        choice = costed(file)
         if choice is not None:
             yield choice
             if choice.error_px < min(BUDGETS) / 2:
                 return
+
+
+def _held(choice: plans.Choice, found: Probed, state: str | None, exact: Any) -> Camera:
+    """The camera that a plan names; of a model within the outline of the exact lens's pupil, see `plans._model`."""
+    if not choice.camera.endswith(".onnx"):
+        return camera_of(choice, found, state)
+    return OnnxCamera(load_model(choice.camera.rpartition(":")[2]), **plans._real(found), outline=exact.film.outline)
 
 
 def camera_of(choice: plans.Choice, found: Probed, state: str | None, smooth: bool = False) -> Camera:

@@ -28,7 +28,7 @@ from neurolens.cameras.lens_state import axial_transmittance, lens_state
 from neurolens.cameras.outline_cache import kept_outline, search_key
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.cameras.pupil_search import COARSE, FINE, Detail, outline_of
+from neurolens.cameras.pupil_search import COARSE, COARSE_TIGHT, FINE, Detail, outline_of
 from neurolens.cameras.sampling import arrived, check_film, positive
 from neurolens.optics import pupil_methods as known
 from neurolens.optics.focusing import best_focused
@@ -106,7 +106,7 @@ class ExactCamera:
             film_z += film_offset_mm
             self.lens = replace(self.lens, film_z_mm=film_z)
         # A lens with cylinders is searched at many azimuths for one outline: coarser, for it fits none of them closely.
-        detail = FINE if not self.lens.anamorphic else COARSE._replace(tighten=bounds is not None)
+        detail = FINE if not self.lens.anamorphic else COARSE if bounds is None else COARSE_TIGHT
         self._film_z_mm, self._pupil_z_mm = film_z, pupil_plane_z_mm(self.lens) if bounds is None else bounds.pupil_z_mm
         self._dtype = torch.float32 if dtype == "float32" else torch.float64
         read = [dtype, self._pupil_z_mm, self.film_mm, detail, bounds and asdict(bounds)]

@@ -192,8 +192,19 @@ class FusedCamera(Compiled, OnnxCamera):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
+        self._compile()
+
+    @classmethod
+    def of(cls, camera: OnnxCamera) -> FusedCamera:
+        """A camera of onnxruntime, compiled: its film and pupil are not searched again."""
+        made = cls.__new__(cls)
+        made.__dict__ |= camera.__dict__
+        made._compile()
+        return made
+
+    def _compile(self) -> None:
         self._fused = FusedFilm(self.film, lens_graph(self), self.film_mm)
-        self.settings |= {"runtime": "fused"}
+        self.settings = self.settings | {"runtime": "fused"}
 
     def for_worker(self) -> FusedCamera:
         """This camera: compiled code needs no session of its own."""

@@ -24,7 +24,7 @@ from neurolens.cameras.onnxmaps import InverseRays, OnnxDerivatives, OnnxInverse
 from neurolens.cameras.onnxsession import joined, open_session, run_batches
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.cameras.pupil_search import COARSE, outline_of
+from neurolens.cameras.pupil_search import COARSE_TIGHT, outline_of
 from neurolens.cameras.sampling import arrived, check_film, common_light, positive
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
@@ -58,6 +58,7 @@ class OnnxCamera:
         wavelength_nm: range of the light, which sets the exposure and the best focus; None takes the model's own.
         focus: "best" places the film where the model's rays from the axis make the least spot, as `Lens.at` does for
             the lens; "paraxial" in the paraxial image. "internal" is as "best": groups move where a model knows them.
+        outline: of the pupil of the lens itself, to hold the model against it; None searches the model's own.
 
     Raises:
         InputError: a focus, stop or zoom position outside the model's domain.
@@ -78,6 +79,7 @@ class OnnxCamera:
         wavelength_nm: tuple[float, float] | None = None,
         focus: Focus = "best",
         film_offset_mm: float = 0.0,
+        outline: PupilOutline | None = None,
     ) -> None:
         self.focus_m = positive("focus_m", focus_m, infinite=True)
         if model.axes or zoom is not None:
@@ -103,7 +105,10 @@ class OnnxCamera:
         film_z = _film_z(model, best, film_offset_mm, lens["f_number"] * lens["stop_radius_mm"] / stop)
         scene = replace(start, film_z_mm=film_z)
         round_stop = replace(scene, aperture=None)
-        outline = _outline_of(round_stop, used)
+        if outline is not None:
+            outline = outline.on_plane(float(domain["pupil_z_mm"]), film_z)
+        else:
+            outline = _outline_of(round_stop, used)
         self.film = LensFilm(outline, film_z, used, scene)
         self.settings: dict[str, Any] = {
             "camera": "model",
@@ -257,8 +262,11 @@ class ModelScene:
         return SceneRays(out.rays.scene_ray, out.rays.transmittance, self.status_of(out.rays), out.d_film)
 
     def passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
-        """Whether rays pass at one wavelength; bool [N]."""
-        return self(film, pupil, np.full(film.shape[1], wavelength_nm, np.float32)).status == st.PASSED
+        """Whether rays pass at one wavelength; bool [N]. Of a round stop directions are not looked at: it is faster."""
+        waves = np.full(film.shape[1], wavelength_nm, np.float32)
+        if self.aperture is not None:
+            return self(film, pupil, waves).status == st.PASSED
+        return self.model.status(film, pupil, waves, self.film_z_mm, self.stop_radius_mm) == st.PASSED
 
     def passes_at_any_azimuth(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
         """As `passes`, of a lens with cylinders: whether rays pass when film and pupil points turn about the axis."""
@@ -373,7 +381,7 @@ def _outline_of(scene: ModelScene, wavelength_nm: tuple[float, float]) -> PupilO
     bounds = PupilTable.of(domain["bounds"])
     if squeeze_of(scene, _SQUEEZED * domain["film_radius_mm"], wavelength_nm) == 1.0:
         return outline_of(bounds, scene.passes, wavelength_nm)
-    return outline_of(bounds, scene.passes_at_any_azimuth, wavelength_nm, COARSE._replace(tighten=True))
+    return outline_of(bounds, scene.passes_at_any_azimuth, wavelength_nm, COARSE_TIGHT)
 
 
 def _state_of(scene: ModelScene, wavelength_nm: tuple[float, float], f_number: float) -> dict[str, Any]:

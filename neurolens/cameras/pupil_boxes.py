@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from neurolens.cameras.contract import FloatArray
 from neurolens.modelfile.cardcheck import pupil_rows
 
-# Lattice on a row's box when the bounds are tightened; along and across (one half).
-_LATTICE = (96, 48)
 # Halvings that place the end of the light; lattice on a box that looks for light.
 _END_HALVINGS = 10
 _COARSE_LATTICE = (40, 20)
@@ -51,18 +49,20 @@ class PupilTable:
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of boxes near the end of float32 nothing passes
-def tightened(table: PupilTable, passes: Passes, wavelength_nm: Sequence[float]) -> PupilTable:
+def tightened(
+    table: PupilTable, passes: Passes, wavelength_nm: Sequence[float], lattice: tuple[int, int] = (96, 48)
+) -> PupilTable:
     """The same rows with boxes cut to what passes now at any of the wavelengths, for example through a closed stop.
 
-    Bounds move on a lattice of the table's own boxes, one step wider than what passes: the boundary lies between two
-    points.
+    Bounds move on a lattice of the table's own boxes, along and across one half, one step wider than what passes: the
+    boundary lies between two points.
     """
     low, high, half = (a[:, None] for a in table.rows)
     count = table.rows.shape[1]
-    u, v = np.linspace(0, 1, _LATTICE[0], dtype=np.float32), np.linspace(0, 1, _LATTICE[1], dtype=np.float32)
+    u, v = (np.linspace(0, 1, n, dtype=np.float32) for n in lattice)
     radius = table.film_radius_mm * np.minimum(np.arange(count) / (count - 1), 1 - 1e-6)
     along, across = low + (high - low) * u, half * v
-    shape = (2, count, *_LATTICE)
+    shape = (2, count, *lattice)
     film, pupil = np.zeros(shape, np.float32), np.empty(shape, np.float32)
     film[0] = radius[:, None, None]
     pupil[0], pupil[1] = along[:, :, None], across[:, None, :]

@@ -8,7 +8,7 @@ over the visible range in a double Gauss, and so do the polygons.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import numpy as np
@@ -64,6 +64,13 @@ class PupilOutline:
         found = evaluate(self.graph, given)
         area = found["area_mm2"][0]
         return found["pupil_mm"], np.where(area > 0, area, np.float32(0))
+
+    def on_plane(self, pupil_z_mm: float, film_z_mm: float) -> PupilOutline:
+        """The same rays on another plane, those of the film at a place."""
+        scale = np.float32((pupil_z_mm - film_z_mm) / (self.pupil_z_mm - film_z_mm))
+        film = self.radii(np.arange(self.centre.size, dtype=np.float64)).astype(np.float32)
+        centre = film + (self.centre - film) * scale
+        return replace(self, pupil_z_mm=pupil_z_mm, centre=centre, x=self.x * scale, y=self.y * scale)
 
     @property
     def graph(self) -> Graph:

@@ -47,7 +47,7 @@ class Detail(NamedTuple):
         wavelengths: shares of the way from the shortest to the longest, in 1 / wavelength^2, the ends among them.
         steps, coarse, fine: steps outwards, and halvings of the one that crosses the boundary, of two searches.
         reach: how many times farther than the first search found the second looks.
-        tighten: whether the table may be much wider than what passes.
+        tighten: lattice on each box, along and across, where the table may be much wider than what passes.
     """
 
     rows: int = 65
@@ -57,13 +57,14 @@ class Detail(NamedTuple):
     coarse: int = 5
     fine: int = 12
     reach: float = math.inf
-    tighten: bool = True
+    tighten: tuple[int, int] | None = (96, 48)
 
 
 FINE = Detail()
 # For a lens with cylinders, each question about which takes tracing at many azimuths, and no outline fits all of them.
 # What is left out errs towards outlines too wide: halvings end outside what passes.
-COARSE = Detail(33, 16, (0.0, 0.5, 1.0), 12, 2, 5, 1.2, False)
+COARSE = Detail(33, 16, (0.0, 0.5, 1.0), 12, 2, 5, 1.2, None)
+COARSE_TIGHT = COARSE._replace(tighten=(48, 24))
 
 
 def outline_of(
@@ -88,7 +89,7 @@ def outline_of(
     ends = tuple(sorted(set(wavelength_nm)))
     looked_at = sorted({wavelength_between(ends, share) for share in detail.wavelengths})
     ask = asking(passes, looked_at)
-    tight = tightened(table, passes, looked_at) if detail.tighten else table
+    tight = tightened(table, passes, looked_at, detail.tighten) if detail.tighten else table
     end = end_of_light(tight, ask)
     if end is None:
         return None

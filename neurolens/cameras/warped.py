@@ -31,13 +31,14 @@ class Warped:
 
     Args:
         flat: pinhole, thin or thick lens, of the same film. camera: to be shown. focus_m: from the film to the plane
-            that the maps are of. tables: of both fields, which take seconds; without them film points are traced.
+            that the maps are of. tables: of both fields, which take seconds, or that of the camera, made before;
+            without them film points are traced.
 
     Raises:
         InputError: a camera that sees some of the film's edge beyond `WIDEST_DEG`, or not at all.
     """
 
-    def __init__(self, flat: Camera, camera: Camera, focus_m: float, tables: bool = False) -> None:
+    def __init__(self, flat: Camera, camera: Camera, focus_m: float, tables: bool | Field = False) -> None:
         self.name, self.film_mm, self.settings = f"{flat.name}, warped", flat.film_mm, flat.settings
         self.wavelength_nm, self.dispersive = flat.wavelength_nm, flat.dispersive
         self.achromatic = getattr(flat, "achromatic", False)
@@ -63,7 +64,8 @@ class Warped:
         self.area = float(np.maximum(sides, 1.0).prod())  # of the picture before it is warped, over that of the film
         if tables:
             wide: Any = _OfFilm(flat, (float(sides[0] * self.film_mm[0]), float(sides[1] * self.film_mm[1])))
-            self._fields = {id(camera): field_of(camera, focus_m), id(flat): field_of(wide, focus_m)}
+            shown = tables if isinstance(tables, Field) else field_of(camera, focus_m)
+            self._fields = {id(camera): shown, id(flat): field_of(wide, focus_m)}
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """Rays of film points [2, N] in mm, as of the ideal camera."""

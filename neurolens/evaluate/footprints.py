@@ -20,12 +20,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.cameras.contract import Camera
+from neurolens.cameras.contract import Camera, CameraRays
 
 Array = NDArray[np.float64]
 
 _LINES = 8  # directions of the sliced distance
 _QUANTILES = 64
+_BESIDE, _BESIDE_POINTS = 0.005, 24  # of a pupil's radius, outside its outline; points there
 _STEP = 1e-3  # of the film's width: step of the first-order map
 EFFECTS = (
     "distortion", "defocus", "spherical aberration", "coma", "astigmatism", "field curvature", "higher orders",
@@ -120,13 +121,8 @@ def places_of(exact: Camera, film_mm: Array, depth_m: Array, wavelength_nm: Arra
 def footprints(camera: Camera, places: Places, samples: int = 16) -> Footprints:
     """Footprints of a camera at places, by `samples` by `samples` stratified points of its pupil."""
     steps = (np.arange(samples) + 0.5) / samples
-    pupil = np.stack(np.meshgrid(steps, steps)).reshape(2, -1)
-    points, waves, rays = places.film_mm.shape[1], len(places.wavelength_nm), pupil.shape[1]
-    shape = (points, waves, rays)
-    film = np.broadcast_to(places.film_mm[:, :, None, None], (2, *shape)).reshape(2, -1)
-    square = np.broadcast_to(pupil[:, None, None, :], (2, *shape)).reshape(2, -1)
-    nanometres = np.broadcast_to(places.wavelength_nm[None, :, None], shape).reshape(-1)
-    found = camera.sample(*(np.ascontiguousarray(a, np.float32) for a in (film, square, nanometres)))
+    found, shape = _sampled(camera, places, np.stack(np.meshgrid(steps, steps)).reshape(2, -1))
+    points = shape[0]
     origin, way = (a.astype(np.float64).reshape(3, points, -1) for a in (found.origin_m, found.direction))
     slope = _meet(places, origin, way)
     place = np.einsum("ijn,jnk->ink", places.to_film, slope).reshape(2, *shape)
@@ -136,6 +132,15 @@ def footprints(camera: Camera, places: Places, samples: int = 16) -> Footprints:
     across = 1e3 * np.einsum("icn,cnk->ink", places.across, at_pupil).reshape(2, *shape)
     weight = np.where(np.isfinite(place).all(0), found.weight.astype(np.float64).reshape(shape), 0.0)
     return Footprints(np.where(weight > 0, place, 0.0), np.where(weight > 0, across, 0.0), weight)
+
+
+def light_beside(camera: Camera, places: Places) -> Array:
+    """Light [N] within half a percent of a pupil's radius outside its outline, if all is as that distance away."""
+    angle = 2 * np.pi * (np.arange(_BESIDE_POINTS) + 0.5) / _BESIDE_POINTS
+    edge = np.stack([np.cos(angle), np.sin(angle)])
+    square = 0.5 + 0.5 * (1 + _BESIDE) * edge / np.abs(edge).max(0)  # outlines go on beyond the edge of the square
+    found, shape = _sampled(camera, places, square)
+    return np.asarray(2 * _BESIDE * found.weight.astype(np.float64).reshape(shape).mean((1, 2)))
 
 
 def left_to(exact: Footprints, thin: Footprints, share: Array, afterwards: Collection[str]) -> Footprints:
@@ -203,6 +208,15 @@ def blur_mm(prints: Footprints, share: Array) -> Array:
     weight = prints.weight * share[:, None]
     away = ((prints.place_mm - centre[:, :, None, None]) ** 2).sum(0)
     return np.asarray(2 * np.sqrt((weight * away).sum((1, 2)) / np.maximum(weight.sum((1, 2)), 1e-300)))
+
+
+def _sampled(camera: Camera, places: Places, pupil: Array) -> tuple[CameraRays, tuple[int, int, int]]:
+    """Rays of N places, W wavelengths and points [2, P] of the square that fills the pupil, and (N, W, P)."""
+    shape = places.film_mm.shape[1], len(places.wavelength_nm), pupil.shape[1]
+    film = np.broadcast_to(places.film_mm[:, :, None, None], (2, *shape)).reshape(2, -1)
+    square = np.broadcast_to(pupil[:, None, None, :], (2, *shape)).reshape(2, -1)
+    nanometres = np.broadcast_to(places.wavelength_nm[None, :, None], shape).reshape(-1)
+    return camera.sample(*(np.ascontiguousarray(a, np.float32) for a in (film, square, nanometres))), shape
 
 
 def _chief(camera: Camera, film_mm: Array, nanometres: float) -> tuple[Array, Array, NDArray[np.bool_]]:

@@ -104,7 +104,9 @@ def _stop_square(lens: Lens, pairs: PairSet) -> Tensor:
 
 def _without_crossings(pairs: PairSet) -> PairSet:
     """The same rays without the data per surface, which is most of their memory."""
-    return replace(pairs, **{name: getattr(pairs, name)[:0] for name in ("cross_x", "cross_y", "meets", "refracts")})
+    return replace(
+        pairs, **{name: getattr(pairs, name)[:0].clone() for name in ("cross_x", "cross_y", "meets", "refracts")}
+    )
 
 
 @dataclass(frozen=True)

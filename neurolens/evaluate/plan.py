@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -30,7 +30,7 @@ from neurolens.cameras.build import Shot, ideal_as
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import FusedExactCamera
 from neurolens.cameras.fused import FusedCamera
-from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.cameras.model import OnnxCamera, OnnxLens, load_model
 from neurolens.cameras.warped import Warped
 from neurolens.evaluate import footprints as prints
 from neurolens.evaluate.costs import (
@@ -47,7 +47,8 @@ from neurolens.evaluate.footprints import Footprints
 from neurolens.evaluate.probe import COUNTED, LIGHT, Asked, Effect, Probed, effects_of, probe
 from neurolens.evaluate.shaders import IDLE, lens_of
 from neurolens.graph.compiler import has_compiler
-from neurolens.optics.paraxial import first_order
+from neurolens.graph.scalars import lower
+from neurolens.modelfile.graph import graph_of
 from neurolens.optics.prescription import Lens
 from neurolens.render.scene import Scene
 from neurolens.surrogates.domain import domain_of
@@ -68,7 +69,7 @@ _SHOT = "fitted for this shot"
 _FIT = ModelSettings("ols", planes=False, elimination=False, idle_gates=IDLE)
 _FIT_MIRROR = replace(_FIT, degree=5)  # of lenses with cylinders: more candidates cost ten times, for the same errors
 _MOVED_TERMS = 16, 22  # from so many on, planes are searched: once, for the second number
-_FOCUS_SPARE = 0.25  # of a pixel of blur: what a model may place its film beside the lens's
+_CLOSE = 1.3  # times the operations of the smallest model that holds, up to which others of its form are timed
 _PAIRS = PairSettings(train=5000, held_out=1000, rim=5000)
 _MOST_OVERSCAN = 4.0  # of a plane picture that is warped afterwards
 
@@ -174,16 +175,17 @@ def candidates(
 ) -> tuple[Choice, ...]:  # fmt: skip
     """Cameras with error and cost, enough to decide for each of some budgets; arguments as of `plan`."""
     say = report or (lambda done, left=None: None)
-    say(0.3)
-    # Infinity: all are timed, whatever their light.
-    trial = _Trial(found, target, math.inf if explain else max(budgets_px))
+    say(0.2)
+    trial = _Trial(found, target, tuple(budgets_px), explain)
     tried = [*_ideal(trial), *_exact(trial)]
-    for file in models:
-        tried += _model(trial, file)
-    say(0.6)
-    if folder is not None:
-        tried += _fitted(trial, budgets_px, folder, tried, lambda done, left=None: say(0.6 + 0.4 * done))
-    return tuple(tried)
+    with ThreadPoolExecutor(1) as other:  # what one fits and the other looks at has nothing to do with each other
+        shipped = other.submit(_shipped, trial, models)
+        if not explain:  # what the lens adds to the light
+            other.submit(lambda: found.maps)
+        fitted = [] if folder is None else _fitted(trial, folder, tried, lambda done, left=None: say(0.2 + 0.6 * done))
+        tried += shipped.result() + fitted
+    say(0.8)
+    return tuple(_costed(trial, tried))
 
 
 def decided(found: Probed, tried: Sequence[Choice], budget_px: float, target: Target) -> Plan:
@@ -195,38 +197,62 @@ def decided(found: Probed, tried: Sequence[Choice], budget_px: float, target: Ta
 
 
 @dataclass(frozen=True)
+class _Judged:
+    """A camera with its errors, and what tells the cost of a ray and its noise.
+
+    Attributes:
+        form: of models, "ols" or another method. size: operations of a ray. Where both are given, a model of more size
+            is taken to cost no less than one of the same form.
+    """
+
+    choice: Choice
+    cost: Cost
+    form: str = ""
+    size: int = 0
+
+
+@dataclass(frozen=True)
 class _Trial:
-    """What cameras are tried for; those with an error up to `costed_px` are compiled and timed, all where it is inf."""
+    """What cameras are tried for, and whether all are to have their cost."""
 
     found: Probed
     target: Target
-    costed_px: float
+    budgets_px: tuple[float, ...]
+    explain: bool = False
 
     @property
     def share(self) -> prints.Array:
         """Of the wavelengths."""
         return self.found.places.share
 
+    @property
+    def by_size(self) -> bool:
+        """Whether costs rise with size; shaders of models have pupils and noise of their own."""
+        return self.target != "osl" and not self.explain
+
     def judged(
-        self, name: str, spec: str, seen: Footprints, cost: Callable[[], tuple[float, float]], how: str = ""
-    ) -> Choice:
-        """A camera's error against the exact footprints; its cost (of a ray, noise) where that matters."""
+        self, name: str, spec: str, seen: Footprints, cost: Cost, how: str = "", form: str = "", size: int = 0,
+        beside: prints.Array | float = 0.0,
+    ) -> _Judged:  # fmt: skip
+        """A camera's error against the exact footprints, its cost not told yet; `beside`: light outside the lens's."""
         found = self.found
         apart = prints.distance_mm(found.wanted, seen, self.share) / found.asked.pixel_mm
-        light = np.abs(seen.light / np.maximum(found.wanted.light, 1e-30) - 1)
+        light = np.abs(seen.light / np.maximum(found.wanted.light, 1e-30) - 1) + beside
         if "distortion" in found.asked.afterwards:  # its map corrects light, too
             light = np.where(seen.light > 0, 0.0, light)
         error, dim = (float(np.percentile(np.where(np.isfinite(v), v, np.inf), COUNTED)) for v in (apart, light))
         choice = Choice(name, spec, error, dim, math.inf, noise(seen.weight, self.share), how)
-        if not (choice.meets(self.costed_px) or math.isinf(self.costed_px)):
-            return choice
-        ray, times = cost()
+        return _Judged(choice, cost, form, size)
+
+    def costed(self, judged: _Judged) -> Choice:
+        """A camera with its cost."""
+        choice, (ray, times) = judged.choice, judged.cost()
         # A shader that does not focus so near shows nothing.
         return replace(
             choice,
-            cost=ray * (1.0 if found.asked.denoised else times),
+            cost=ray * (1.0 if self.found.asked.denoised else times),
             noise=times,
-            error_px=error if math.isfinite(times) else math.inf,
+            error_px=choice.error_px if math.isfinite(times) else math.inf,
         )
 
     def timed(self, camera: Camera, seen: Footprints) -> tuple[float, float]:
@@ -258,7 +284,7 @@ def camera_of(found: Probed, choice: Choice) -> Camera:
     if kind in _IDEAL:
         flat = ideal_as(f"{kind}:", found.exact.lens, Shot(found.asked.film_mm, found.asked.focus_m))
         mapped = choice.name.endswith(_MAPPED)
-        return Warped(flat, found.exact, found.asked.focus_m, tables=True) if mapped else flat
+        return Warped(flat, found.exact, found.asked.focus_m, tables=found.exact_field) if mapped else flat
     return (FusedCamera if kind else OnnxCamera)(load_model(path), **_real(found))
 
 
@@ -269,7 +295,7 @@ def _real(found: Probed) -> dict[str, Any]:
     return {**shot, "wavelength_nm": asked.wavelength_nm, "aperture": found.lens.aperture}
 
 
-def _ideal(trial: _Trial) -> Iterator[Choice]:
+def _ideal(trial: _Trial) -> Iterator[_Judged]:
     """Pinhole, thin and thick lens, as they are and with their picture warped afterwards, where the target has them.
 
     In C and GLSL they are their own source.
@@ -292,7 +318,7 @@ def _ideal(trial: _Trial) -> Iterator[Choice]:
                 yield trial.judged(f"{name}{_MAPPED}", spec, prints.footprints(maps, found.places), cost, how)
 
 
-def _exact(trial: _Trial) -> Iterator[Choice]:
+def _exact(trial: _Trial) -> Iterator[_Judged]:
     """The exact lens, which has no error: as C where that runs, and as code where its surfaces have a form in it."""
     found, target = trial.found, trial.target
     exact, path, compiled = found.exact, found.lens.path, isinstance(found.exact, FusedExactCamera)
@@ -305,43 +331,79 @@ def _exact(trial: _Trial) -> Iterator[Choice]:
             yield trial.judged(_EXACT, f"{'fused:' if compiled and target in _OURS else ''}{path}", found.seen, cost)
 
 
-def _model(trial: _Trial, file: Path, how: str = "") -> Iterator[Choice]:
-    """A model in the form that the target runs; none where its domain is not the shot's, or it has no such form.
+def _model(trial: _Trial, file: Path, how: str = "", without: Collection[str] = ()) -> Iterator[_Judged]:
+    """A model in the form that the target runs; none where its domain is not the shot's, or it has no such form, or is
+    of a form to do without.
 
-    Errors are of onnxruntime: compilers take seconds, and C and shaders give the same rays.
+    Errors are of onnxruntime: compilers take seconds, and C and shaders give the same rays. They are told within the
+    outline of the exact lens's pupil, from the same points of it: rows of samples leave out the rim of what fills an
+    outline, and two outlines of one lens would differ by a percent of light and 0.2% of the blur. What a model lets
+    pass outside it counts as its light's error.
     """
     target = trial.target
     compiled = target in _OURS and has_compiler()
     with suppress(InputError, ModelError):
         model = load_model(file)
-        camera = OnnxCamera(model, **_real(trial.found))
+        form = model.card["fit"]["method"].partition("-")[0]
+        if form in without or not (compiled or target != "c"):
+            return
+        camera = OnnxCamera(model, **_real(trial.found), outline=trial.found.exact.film.outline)
         seen = prints.footprints(camera, trial.found.places)
+        beside = prints.light_beside(camera, trial.found.places) / np.maximum(trial.found.seen.light, 1e-30)
 
         def cost() -> tuple[float, float]:
             if target == "osl":
                 return trial.shader(file)
             if target == "glsl":
                 return glsl_operations(camera), noise(seen.weight, trial.share)
-            return trial.timed(FusedCamera(model, **_real(trial.found)) if compiled else camera, seen)
+            return trial.timed(FusedCamera.of(camera) if compiled else camera, seen)
 
-        if compiled or target != "c":
-            yield trial.judged(file.stem, f"{'fused:' if compiled else ''}{file}", seen, cost, how)
+        spec = f"{'fused:' if compiled else ''}{file}"
+        yield trial.judged(file.stem, spec, seen, cost, how, form, _operations(model), beside)
+
+
+def _operations(model: OnnxLens) -> int:
+    """Of a ray of a model; 0 where its operators have no such form."""
+    with suppress(InputError):
+        return sum(lower(graph_of(model.path, model.data, model.state if model.axes else ())).count().values())
+    return 0
+
+
+def _shipped(trial: _Trial, files: Sequence[Path]) -> list[_Judged]:
+    """Models that are there; of one form from the smallest on, up to one that holds the least budget."""
+    found: list[_Judged] = []
+    for file in sorted(files, key=lambda f: f.stat().st_size if f.is_file() else 0):
+        done = {j.form for j in found if trial.by_size and j.choice.meets(min(trial.budgets_px))}
+        found += _model(trial, file, without=done)
+    return found
+
+
+def _costed(trial: _Trial, tried: Sequence[_Judged]) -> Iterator[Choice]:
+    """Cameras with their cost where it matters: of those that hold a budget, and of models of one form the smallest
+    and what is about as small."""
+    asked = {id(j) for j in tried} if trial.explain else set[int]()
+    for budget_px in trial.budgets_px:
+        holds = [j for j in tried if j.choice.meets(budget_px)]
+        for j in holds:
+            least = min(k.size for k in holds if k.form == j.form)
+            if not (trial.by_size and j.size > _CLOSE * least > 0):
+                asked.add(id(j))
+    for j in tried:
+        yield trial.costed(j) if id(j) in asked else j.choice
 
 
 def model_choice(found: Probed, target: Target, file: Path, how: str, costed: bool) -> Choice | None:
     """A model in the form that the target runs; None where it has none, or its domain is not the shot's."""
     with warnings.catch_warnings():  # film beyond the end of its range: its error counts
         warnings.simplefilter("ignore", NeurolensWarning)
-        return next(_model(_Trial(found, target, math.inf if costed else -1.0), file, how), None)
+        trial = _Trial(found, target, ())
+        judged = next(_model(trial, file, how), None)
+        return None if judged is None else trial.costed(judged) if costed else judged.choice
 
 
 def shot_domain(found: Probed) -> DomainChoice:
-    """The shot's, with as much more of the film's way as blurs a quarter of a pixel: models have their own focus."""
-    asked = found.asked
-    move = _FOCUS_SPARE * asked.f_number * asked.pixel_mm / first_order(found.lens).efl_mm ** 2  # of the vergence, 1/mm
-    vergence = 1e-3 / asked.focus_m
-    ends = 1e-3 / (vergence - move) if vergence > move else math.inf, 1e-3 / (vergence + move)
-    return DomainChoice(found.domain.film_radius_mm, ends, asked.wavelength_nm)
+    """That of `Probed.domain`, as an experiment asks for it."""
+    return DomainChoice(found.domain.film_radius_mm, found.domain.focus_m, found.asked.wavelength_nm)
 
 
 def shot_terms(found: Probed) -> list[int]:
@@ -354,9 +416,10 @@ def shot_fits(
 ) -> Callable[[int], tuple[Path, ModelSettings]]:
     """What fits a polynomial of so many terms to a shot alone, or to another domain of its lens: its file, in a folder,
     and its settings."""
-    lens, domain, choice = found.lens.with_aperture(None), found.domain, choice or shot_domain(found)
-    with suppress(InputError):  # a lens that goes no nearer
-        domain = domain_of(lens, **asdict(choice))
+    lens, domain = found.lens.with_aperture(None), found.domain
+    if choice is not None:
+        with suppress(InputError):  # a lens that goes no nearer
+            domain = domain_of(lens, **asdict(choice))
     plain, model = prepare(make_pairs(lens, domain, _PAIRS)), _FIT_MIRROR if lens.anamorphic else _FIT
     folder.mkdir(parents=True, exist_ok=True)
 
@@ -374,35 +437,40 @@ def shot_fits(
     return fit
 
 
-def _fitted(
-    trial: _Trial, budgets_px: Sequence[float], folder: Path, tried: Sequence[Choice], say: Report
-) -> Iterator[Choice]:
-    """Polynomials fitted for the shot alone, by halves of their sizes: the smallest that holds, and those on the way.
+def _fitted(trial: _Trial, folder: Path, tried: Sequence[_Judged], say: Report) -> list[_Judged]:
+    """Polynomials fitted for the shot alone: the smallest that holds each budget, and those on the way to it.
 
     None where a camera without a lens does, in targets where it costs less than any, unless all is asked for.
     """
     found, ideal = trial.found, ("pinhole",) if trial.target in _OURS else ("pinhole", "thin")
-    explain = math.isinf(trial.costed_px)
-    asked = [b for b in budgets_px if explain or not any(c.meets(b) and c.name.startswith(ideal) for c in tried)]
+    easy = [j.choice for j in tried if j.choice.name.startswith(ideal) and not trial.explain]
+    # Nothing that is fitted has no error.
+    asked = [b for b in trial.budgets_px if (b > 0 or trial.explain) and not any(c.meets(b) for c in easy)]
     if not asked:
-        return
+        return []
     fit, sizes = shot_fits(found, folder), shot_terms(found)
-    known: dict[int, tuple[Path, list[Choice]]] = {}
-    smallest = set()
-    with ThreadPoolExecutor(1) as other:
-        if not explain:  # nothing is timed: meanwhile, what the lens adds to the light
-            other.submit(lambda: found.maps)
-        for k, budget_px in enumerate(asked):
-            low, high = 0, len(sizes)  # sizes below `low` do not hold, those from `high` on do
-            while low < high:
-                size = (low + high) // 2
-                if size not in known:
-                    file, settings = fit(sizes[size])
-                    shown = trial if explain else replace(trial, costed_px=-1.0)
-                    known[size] = file, [replace(c, settings=settings) for c in _model(shown, file, _SHOT)]
-                low, high = (low, size) if any(c.meets(budget_px) for c in known[size][1]) else (size + 1, high)
-                say((k + 1 - (high - low) / len(sizes)) / len(asked))
-            smallest.add(low)
-    for size, (file, made) in known.items():  # what is larger than the smallest costs more, and is not compiled
-        again = _model(trial, file, _SHOT) if size in smallest and not explain else made
-        yield from (replace(c, settings=made[0].settings) for c in again)
+    known: dict[int, list[_Judged]] = {}
+    for k, budget_px in enumerate(asked):
+        low, high = 0, len(sizes)  # sizes below `low` do not hold, those from `high` on do
+        while low < high:
+            errors = {n: j.choice.error_px for n, judged in known.items() for j in judged}
+            size = _next_size(sizes, low, high, budget_px, errors)
+            if size not in known:
+                file, settings = fit(sizes[size])
+                made = _model(trial, file, _SHOT)
+                known[size] = [replace(j, choice=replace(j.choice, settings=settings)) for j in made]
+            holds = any(j.choice.meets(budget_px) for j in known[size])
+            low, high = (low, size) if holds else (size + 1, high)
+            say((k + 1 - (high - low) / len(sizes)) / len(asked))
+    return [j for js in known.values() for j in js]
+
+
+def _next_size(sizes: Sequence[int], low: int, high: int, budget_px: float, errors: Mapping[int, float]) -> int:
+    """The size to try next of those from `low` up to `high`: the least that holds if from what is known beside them
+    errors fall with the square of the terms; where nothing is, the one in the middle."""
+    ends = [n for n in (low - 1, high) if 0 < budget_px * errors.get(n, 0.0) < math.inf]
+    if not ends:
+        return (low + high) // 2
+    near = min(ends, key=lambda n: abs(math.log(errors[n] / budget_px)))
+    wanted = sizes[near] * math.sqrt(errors[near] / budget_px)
+    return min(max(int(np.searchsorted(sizes, wanted)), low), high - 1)

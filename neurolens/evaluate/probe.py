@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, ideal_as
 from neurolens.cameras.exact import ExactCamera, FusedExactCamera
+from neurolens.cameras.field import Field, field_of
 from neurolens.evaluate import footprints as prints
 from neurolens.evaluate.footprints import AFTERWARDS, Array, Footprints, Places
 from neurolens.evaluate.light import STRAY, Glance, glance, small_raster, stray_light
@@ -28,13 +29,16 @@ from neurolens.evaluate.scenes import seen_depths_m
 from neurolens.graph.compiler import has_compiler
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
+from neurolens.optics.pupils import image_radius_mm
 from neurolens.render.scene import Scene
-from neurolens.surrogates.domain import Domain, domain_from_camera
+from neurolens.render.world import shared_worlds
+from neurolens.surrogates.domain import Domain, domain_from_camera, domain_of
 
 COUNTED = 95.0  # percentile over the picture that a budget is held against
 _Real = TypeVar("_Real", bound=np.floating[Any])
 Maps = dict[str, tuple[Literal["px", "relative"], Array]]
 LIGHT = 0.01  # relative error of light that a plan allows beside its budget of place
+_FOCUS_SPARE = 0.25  # of a pixel of blur: what a model may place its film beside the lens's
 _ACROSS = 16  # points of the probe along the longer side
 # Of effects, what makes them where the picture is finished: a blur by depth makes all blur.
 _MADE_BY = {"distortion": "distortion", "natural fall-off": "distortion", "vignetting": "distortion"} | dict.fromkeys(
@@ -98,8 +102,9 @@ class Probed:
     """A scene's places as the exact lens sees them: its camera, its footprints there, and those of a thin lens.
 
     Attributes:
-        scene, lens, domain: the lens stopped and focused. places: those with light, of `shape` rows and columns over
-            the film. wanted: what a camera is asked for, `seen` without what is done afterwards.
+        scene, lens, domain: the lens stopped and focused, and what models of this shot must know. places: those with
+            light, of `shape` rows and columns over the film. wanted: what a camera is asked for, `seen` without what is
+            done afterwards.
     """
 
     scene: Scene
@@ -113,6 +118,15 @@ class Probed:
     thin_seen: Footprints
     wanted: Footprints
     glance: Glance
+
+    @cached_property
+    def exact_field(self) -> Field:
+        """Of the exact camera, for maps of its picture; it takes seconds.
+
+        Raises:
+            InputError: as `field_of`.
+        """
+        return field_of(self.exact, self.asked.focus_m)
 
     @cached_property
     def camera_maps(self) -> Maps:
@@ -156,14 +170,14 @@ def probe(
     lens, shot = lens if zoom is None else lens.at(zoom=zoom), scene.settings.camera
     film, widest = (shot.film_width_mm, shot.film_height_mm), first_order(lens).f_number
     f_number = max(shot.f_number or widest, widest)
-    stopped, domain = domain_from_camera(
-        lens, film_mm=film, focus_m=shot.focus_m, f_number=f_number, wavelength_nm=shot.wavelengths_nm
-    )
+    stopped, domain = lens.at(f_number=f_number, focus_m=shot.focus_m), _domain(lens, scene, f_number)
     real: dict[str, Any] = {"film_mm": film, "focus_m": shot.focus_m, "f_number": f_number}
     exact = exact_camera(lens, {**real, "bounds": domain.bounds, "wavelength_nm": shot.wavelengths_nm})
     shape = _shape(film, across)
     points = _grid(film, shape)
-    depth, small = seen_depths_m(scene, exact, points), glance(scene, exact)
+    with shared_worlds():
+        small, depth = glance(scene, exact), seen_depths_m(scene, exact, points)
+        edges = _edges(scene, exact, small, film[0] / shot.width)
     far = np.where(np.isnan(depth), np.inf, depth)
     places = prints.places_of(exact, points, far, small.wavelength_nm, small.share)
     if not places.film_mm.shape[1]:
@@ -175,12 +189,29 @@ def probe(
         float(met.min()) if met.size else None, float(met.max()) if met.size else None,
         float(np.isinf(depth).mean()), 1 - places.film_mm.shape[1] / points.shape[1],
         small.range_nm, float(np.median(small.contrast)),
-        *_edges(scene, exact, small, film[0] / shot.width), afterwards=tuple(sorted(afterwards)), denoised=denoised,
+        *edges, afterwards=tuple(sorted(afterwards)), denoised=denoised,
         zoom=zoom,
     )  # fmt: skip
     seen, ideal = (prints.footprints(c, places) for c in (exact, thin))
     wanted = prints.left_to(seen, ideal, places.share, afterwards)
     return Probed(scene, asked, stopped, domain, exact, places, shape, seen, ideal, wanted, small)
+
+
+def _domain(lens: Lens, scene: Scene, f_number: float) -> Domain:
+    """What a model of the shot must know: its film, stop and wavelengths, and as much more of the film's way as blurs a
+    quarter of a pixel, for models have their own focus; none more of a lens that goes no nearer."""
+    shot, plain = scene.settings.camera, lens.with_aperture(None)
+    film = shot.film_width_mm, shot.film_height_mm
+    stopped = plain.at(f_number=f_number, focus_m=shot.focus_m)
+    radius = min(math.hypot(*film) / 2, image_radius_mm(lens)[0])
+    move = _FOCUS_SPARE * f_number * film[0] / shot.width / first_order(stopped).efl_mm ** 2  # of the vergence, 1/mm
+    vergence = 1e-3 / shot.focus_m
+    ends = 1e-3 / (vergence - move) if vergence > move else math.inf, 1e-3 / (vergence + move)
+    with suppress(InputError):
+        return domain_of(stopped, film_radius_mm=radius, focus_m=ends, wavelength_nm=shot.wavelengths_nm)
+    return domain_from_camera(
+        plain, film_mm=film, focus_m=shot.focus_m, f_number=f_number, wavelength_nm=shot.wavelengths_nm
+    )[1]
 
 
 def _edges(scene: Scene, exact: Any, small: Glance, pixel_mm: float) -> tuple[float, float | None]:

@@ -35,7 +35,7 @@ from neurolens.render.primitives import Rays
 from neurolens.render.renderer import render
 from neurolens.render.scene import CameraSettings, Scene, load_scene
 from neurolens.render.spectrum import SpectralRange
-from neurolens.render.world import World
+from neurolens.render.world import world_of
 from neurolens.surrogates.domain import Domain, domain_from_camera
 from neurolens.surrogates.fit import prepare
 from neurolens.surrogates.pairs import make_pairs
@@ -220,7 +220,7 @@ def seen_depths_m(scene: Scene, camera: Camera, film_mm: NDArray[np.float64]) ->
     nanometres = np.full(count, np.mean(shot.wavelengths_nm), np.float32)
     rays = camera.sample(film_mm.astype(np.float32), np.full((2, count), 0.5, np.float32), nanometres)
     axes, position = camera_axes(shot), np.array(shot.position_m, np.float32)[:, None]
-    world = World(scene, SpectralRange(*shot.wavelengths_nm))
+    world = world_of(scene, SpectralRange(*shot.wavelengths_nm), geometry=True)
     distance, _ = world.nearest(Rays.of(axes @ rays.origin_m + position, axes @ rays.direction))
     with np.errstate(invalid="ignore"):
         depth = -(rays.origin_m[2] + distance * rays.direction[2])  # the camera looks along -z

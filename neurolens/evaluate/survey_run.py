@@ -10,6 +10,7 @@ import select
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 from hashlib import sha256
@@ -33,6 +34,7 @@ Engine = Callable[[Iterable[Task]], Iterator[tuple[Task, bytes]]]
 _KEPT_EVERY_S, _SHARE = 60.0, 20.0  # pages are written so often beside the last time, for 1/20 of the time
 _POLL_S = 0.5
 TIME_LIMIT_S = 1800.0  # of one file, far more than any lens takes
+_ANSWERED_S = 5.0  # until a worker's answer has gone
 
 
 @dataclass(frozen=True)
@@ -210,7 +212,7 @@ def in_processes(jobs: int, limit_s: float = TIME_LIMIT_S) -> Engine:
 
 
 def on_cluster(address: str) -> Engine:
-    """The engine of a Dask cluster, see `base.engine.on_dask`."""
+    """The engine of a Dask cluster, see `base.engine.on_dask`; a file that takes beyond `TIME_LIMIT_S` is a fault."""
 
     def run(tasks: Iterable[Task]) -> Iterator[tuple[Task, bytes]]:
         for task, came in on_dask(address, _on_worker)(tasks):
@@ -220,7 +222,15 @@ def on_cluster(address: str) -> Engine:
 
 
 def _on_worker(_: bytes, task: Task) -> bytes:
-    return run_task(task)
+    """The record of a file. A worker whose file takes too long ends once it has answered: threads cannot be stopped."""
+    pool = ThreadPoolExecutor(1)
+    try:
+        return pool.submit(run_task, task).result(TIME_LIMIT_S)
+    except TimeoutError:
+        threading.Timer(_ANSWERED_S, os._exit, (1,)).start()
+        return unread_record(task.name, "fault", f"took longer than {TIME_LIMIT_S:g} s")
+    finally:
+        pool.shutdown(wait=False)
 
 
 def _begin(context: Any, task: Task) -> tuple[Any, Any]:

@@ -235,8 +235,8 @@ def _special(block: Block) -> dict[str, Any]:
         return block.rotational((n, a / (radius or 1.0) ** n) for n, a in sorted(found.items()))
     if not radius > 0:
         raise block.start.error(f"NRADIUS of SPS {kind}", radius, "a normalisation radius above 0")
-    place = f"{block.start.file}, line {block.start.number}"
-    assume(place, f"SPS {kind}: coefficient {SPECIAL[kind]}n is taken as that of Forbes's m = (n - 4) / 2")
+    told = f"SPS {kind}: coefficient {SPECIAL[kind]}n is taken as that of Forbes's m = (n - 4) / 2"
+    assume(block.start.file, f"line {block.start.number}: {told}")
     terms = [found.get(n, 0.0) for n in range(4, max(found, default=2) + 1, 2)]
     return block.q_type(f"SPS {kind}", kind == "QCN", terms, radius)
 

@@ -2,9 +2,10 @@
 
 `name: TEXT`, `focal_length: MM`, then `surfaces:` and one row a surface, from the scene to the film: radius (0 a plane,
 "stop" the stop), thickness, index behind, Abbe number (0 unknown), semi-diameter of the rim, layers of coating, and
-for surfaces that are not round the type: cyl_x (axis along x, bent in y), cyl_y, toric with its second radius. "#"
-begins a comment. The format has no aspheres and no f-number; a collection of it states that in a comment ("f/4.1"), and
-its rims are diameters in the column of radii.
+for surfaces that are not round the type: cyl_x (axis along x, bent in y), cyl_y, toric with the radius of a circle
+along y, which is turned about a line along y at the radius of the first column. "#" begins a comment. The format has no
+aspheres and no f-number; a collection of it states that in a comment ("f/4.1"), and its rims are diameters in the
+column of radii.
 """
 
 from __future__ import annotations
@@ -76,11 +77,15 @@ def _surface(line: Line, words: list[str]) -> Surface:
     radius = math.inf if stop else line.number_of("radius", words[0]) or math.inf
     kind: str | None = words[6].lower() if len(words) > 6 else None
     shape: dict[str, Any] = {}
-    if kind == "toric":
-        raise line.error("type", "toric", "a sphere or a cylinder")
-    if kind in _BENT:
+    if kind == "toric" and not math.isinf(radius):
+        along_y = line.number_of("type", words[7]) if len(words) > 7 else 0.0
+        if along_y == 0:
+            raise line.error("type", " ".join(words[6:]), "toric with a radius other than 0")
+        shape = {} if along_y == radius else {"cylinder": "y", "across": (radius, None)}
+        radius = along_y
+    elif kind in _BENT:
         shape["cylinder"] = None if math.isinf(radius) else _BENT[kind]
-    elif kind not in (None, *_ROUND):
+    elif kind not in (None, "toric", *_ROUND):
         raise line.error("type", words[6], f"one of {', '.join((*_ROUND, *_BENT, 'toric'))}")
     glass = index != 1
     return Surface(

@@ -146,8 +146,8 @@ def shape_of(block: Block) -> dict[str, Any]:
 
 def _q_type(block: Block) -> dict[str, Any]:
     form, (radius, values) = block.parameter(1), block.extras()
-    place = f"{block.start.file}, line {block.start.number}"
-    assume(place, f"{block.kind}: PARM 1 is taken as 0 for Qbfs, 1 for Qcon, XDAT as that of XASPHERE")
+    told = f"{block.kind}: PARM 1 is taken as 0 for Qbfs, 1 for Qcon, XDAT as that of XASPHERE"
+    assume(block.start.file, f"line {block.start.number}: {told}")
     if form not in (0, 1):
         raise block.start.error(block.kind, f"(PARM 1 {form:g})", "0 (Qbfs) or 1 (Qcon)")
     return block.q_type(block.kind, form == 1, values, radius)

@@ -19,7 +19,7 @@ from neurolens.render.sampler import FILM, PUPIL, WAVELENGTH, Sampler
 from neurolens.render.scene import CameraSettings, Scene
 from neurolens.render.spectrum import Index
 from neurolens.render.wavelengths import LANES, mode_for, spectral_range
-from neurolens.render.world import World
+from neurolens.render.world import world_of
 
 WeightedRays = tuple[FloatArray, FloatArray, FloatArray]  # origin, direction [3, N] and weight ([lanes,] N)
 # Of a sample's luminance; sums of colours up to a million times as bright stay within float32.
@@ -65,7 +65,7 @@ class Job:
         pose = scene.settings.camera
         self.mode = mode_for(camera, grid, pose.wavelengths_nm, settings)
         self.spectral = spectral_range(scene, camera, settings, LANES if self.mode == "hero" else 1)
-        self.world = World(scene, self.spectral)
+        self.world = world_of(scene, self.spectral)
         white = settings.white_balance if self.spectral.colours else None
         self.neutral, self.balance = white is None, np.eye(3)
         if white is not None:

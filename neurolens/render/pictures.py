@@ -30,6 +30,7 @@ from neurolens.render.scenetables import BRIGHTEST
 
 METADATA_KEY = "neurolens"
 _HALF_MAX = 65504.0
+_BAND = 1 << 17  # pixels of a preview that are encoded at a time
 _COLOURS = "RGB"
 LARGEST_PICTURE, LARGEST_ENVIRONMENT, LARGEST_FILM = 8192, 4096, 1 << 16  # pixels per side
 MOST_PIXELS = 1 << 26  # of all textures of a scene: 0.8 GB
@@ -294,7 +295,11 @@ def write_png(path: str | Path, rgb: ArrayLike, exposure: float = 0.0) -> None:
     InputError: another shape.
     """
     picture = _shaped(path, np.asarray(rgb, np.float32))
-    encoded = np.rint(255 * linear_to_srgb(picture * np.float32(2.0**exposure))).astype(np.uint8)
+    encoded = np.empty(picture.shape, np.uint8)
+    rows = max(1, _BAND // picture.shape[1])
+    for first in range(0, len(picture), rows):  # of a whole large picture every step takes pages of memory anew
+        band = picture[first : first + rows] * np.float32(2.0**exposure)
+        encoded[first : first + rows] = np.rint(255 * linear_to_srgb(band))
     with atomic_path(path) as temporary:
         Image.fromarray(encoded).save(temporary)
 

@@ -59,6 +59,11 @@ class SpectralRange:
         if light is not None and self.colours:
             self._set_edges(self._quantiles(*light))
 
+    def same(self, other: SpectralRange) -> bool:
+        """Whether its tables are those of another."""
+        tables = ("edges_nm", "basis", "response")
+        return self.lanes == other.lanes and all(np.array_equal(getattr(self, n), getattr(other, n)) for n in tables)
+
     def _set_edges(self, edges: FloatArray64) -> None:
         self.edges_nm, self.centres_nm = edges, 0.5 * (edges[1:] + edges[:-1])
         self._edges, self._widths = edges[:-1].astype(np.float32), np.diff(edges).astype(np.float32)

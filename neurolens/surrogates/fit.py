@@ -15,9 +15,10 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.optics.trace import CHUNK
 from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.cores import Core, InvariantPolynomial, Network, Partitioned, RawPolynomial, Residual
-from neurolens.surrogates.domain import draw_everywhere
+from neurolens.surrogates.domain import FilmRays, draw_everywhere
 from neurolens.surrogates.fits.checkpoint import of_zone, spent_s
 from neurolens.surrogates.fits.mirror import fit_mirror
 from neurolens.surrogates.fits.network import fit_network
@@ -26,7 +27,7 @@ from neurolens.surrogates.fits.polynomial import fit_paraxial, fit_polynomial
 from neurolens.surrogates.gates import choose_gates, explained
 from neurolens.surrogates.lightfield import fit_encoding
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.pairs import RayPairs, trace_pairs
+from neurolens.surrogates.pairs import RayPairs, join_pairs, trace_pairs
 from neurolens.surrogates.published import fit_published
 from neurolens.surrogates.settings import NETWORKS, PLANES_SEARCHED, POLYNOMIALS, ModelSettings, PublishedName
 from neurolens.surrogates.specialise import without_idle_gates
@@ -49,9 +50,15 @@ def prepare(pairs: RayPairs) -> Prepared:
             plane, or on the far half of a sphere).
     """
     seed = pairs.settings.seed + 1_000_003
+    drawn, ended = draw_everywhere(pairs.domain, _GATE_RAYS, seed), []
     with pinned_threads():
-        drawn = trace_pairs(pairs.lens, draw_everywhere(pairs.domain, _GATE_RAYS, seed), pairs.domain.pupil_z_mm)
-    blocked = drawn.select(drawn.status != st.PASSED)
+        for start in range(0, len(drawn), CHUNK):  # crossings with many surfaces are large: of blocked rays alone
+            some = FilmRays(*(c[start : start + CHUNK] for c in drawn.columns()))
+            traced = trace_pairs(pairs.lens, some, pairs.domain.pupil_z_mm)
+            ended.append(traced.select(traced.status != st.PASSED))
+            del traced
+    blocked = join_pairs(ended)
+    del ended
     gates = choose_gates(pairs.lens, blocked, len(drawn))
     untold = (blocked.status % 4 != st.RIM) & ~explained(pairs.lens, gates, blocked)
     lost = float(untold.double().sum()) / len(drawn)

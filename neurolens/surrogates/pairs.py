@@ -17,7 +17,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays
-from neurolens.optics.trace import Rays, trace
+from neurolens.optics.trace import CHUNK, Rays, trace
 from neurolens.surrogates.domain import SPARSE, Domain, FilmRays, draw, lit_share, sample_domain
 
 SCHEMA = 3
@@ -105,12 +105,20 @@ class RayPairs:
 def trace_pairs(lens: Lens, inputs: FilmRays, pupil_z: float) -> PairSet:
     """Exact images of camera rays, with every crossing."""
     rays = camera_rays(inputs.film_x, inputs.film_y, inputs.film_z, inputs.pupil_x, inputs.pupil_y, pupil_z)
-    every = range(len(lens.surfaces))
-    with torch.no_grad():
-        out = trace(lens, rays, inputs.wavelength_nm, transmittance=True, record=every)
-    assert out.transmittance is not None
-    fields = (torch.stack([getattr(out.crossings[k], name) for k in every]) for name in ("x", "y", "meets", "refracts"))
-    return PairSet(inputs, out.rays, out.transmittance, out.status, *fields)
+    every, parts = range(len(lens.surfaces)), []
+    fields = rays.x.new_empty(4, len(every), len(rays.x))  # most of the memory of a lens with many surfaces: had once
+    for start in range(0, len(rays.x), CHUNK):
+        here = slice(start, start + CHUNK)
+        with torch.no_grad():
+            chunk = Rays(*(c[here] for c in rays))
+            out = trace(lens, chunk, inputs.wavelength_nm[here], transmittance=True, record=every)
+        assert out.transmittance is not None
+        for k in every:
+            for field, values in zip(fields, out.crossings[k], strict=True):
+                field[k, here] = values
+        parts.append((*out.rays, out.transmittance, out.status))
+    *ended, transmittance, status = (torch.cat(c) for c in zip(*parts, strict=True))
+    return PairSet(inputs, Rays(*ended), transmittance, status, *fields)
 
 
 def make_pairs(
@@ -151,15 +159,16 @@ def make_pairs(
             used = int(order[needed - 1]) + 1 if len(order) >= needed else len(batch)
             tested += stands_for * used / max(len(batch), 1)
             _keep(found, counts, batch, _taught(lens, batch), settings)
-        found[split].append(batch.select(passed).select(slice(0, wanted[split] - counts[split])))
+        found[split].append(batch.select(torch.nonzero(passed)[: wanted[split] - counts[split], 0]))
         counts[split] += len(found[split][-1])
+        del batch, passed  # before the next one: they are large
         drawn += _BATCH
         if drawn > 10000 * (counts["train"] + counts["held_out"] + 10):
             shown = f"({drawn} rays, {sum(counts.values())} passed)"
             raise InputError(lens.path, "domain", shown, "a domain that the lens can reach")
         if progress:
             progress((counts["train"] + counts["held_out"]) / total)
-    joined = {name: join_pairs(sets) for name, sets in found.items()}
+    joined = {name: join_pairs(found.pop(name)) for name in SPLITS}
     joined |= {name: _without_the_rest(joined[name]) for name in ("edge", "far")}
     return RayPairs(lens, domain, settings, **joined, tested=round(tested))
 
@@ -174,7 +183,7 @@ def _keep(
     """Add the chosen rays of a batch to their splits, as far as those are not full."""
     for name, rays in chosen.items():
         most = settings.rim if name == "rim" else (settings.rim + 1) // 2
-        found[name].append(batch.select(rays).select(slice(0, most - counts[name])))
+        found[name].append(batch.select(torch.nonzero(rays)[: most - counts[name], 0]))
         counts[name] += len(found[name][-1])
 
 
@@ -196,7 +205,7 @@ def reached(pairs: PairSet) -> Tensor:
     before = torch.cat([torch.ones_like(goes_on[:1]), goes_on[:-1]])
     # A ray that meets the far half of a sphere, or a plane from behind, ends there with a positive discriminant.
     end = torch.where(_lost(pairs), pairs.status // 4 - 1, -1)
-    return (before.cumprod(0).flip(0) > 0) & (torch.arange(len(goes_on))[:, None] >= end)
+    return (before.cumprod(0, dtype=torch.uint8).flip(0) > 0) & (torch.arange(len(goes_on))[:, None] >= end)
 
 
 def _lost(pairs: PairSet) -> Tensor:

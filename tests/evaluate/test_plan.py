@@ -11,6 +11,7 @@ import pytest
 from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import format_toml
 from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.field import spectrum_of
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.warped import Warped
@@ -19,7 +20,16 @@ from neurolens.commands.arguments import named_camera
 from neurolens.commands.plan import TARGETS
 from neurolens.evaluate import plan as planned
 from neurolens.evaluate.costs import noise, shader_cost
-from neurolens.evaluate.footprints import Footprints, blur_mm, centroids, distance_mm, effects_mm, footprints, places_of
+from neurolens.evaluate.footprints import (
+    Footprints,
+    blur_mm,
+    centroids,
+    distance_mm,
+    effects_mm,
+    footprints,
+    light_beside,
+    places_of,
+)
 from neurolens.evaluate.plan import Target, candidates, decided, plan
 from neurolens.evaluate.probe import effects_of, probe
 from neurolens.evaluate.scenes import seen_depths_m
@@ -29,6 +39,7 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.render.pictures import read_exr
 from neurolens.render.scene import load_scene, scene_from_tables
 from neurolens.surrogates.cores import InvariantPolynomial
+from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.stored import load_fitted
 
 LENS = "lenses/cooke_triplet_50.toml"  # of absorbing glass: nothing is compiled
@@ -111,6 +122,24 @@ def test_exact_footprints_are_the_spots_of_the_lens() -> None:
     lens = read_lens(LENS).at()
     found = blur_mm(footprints(camera, places, samples=48), np.ones(1))[0] / 2
     assert 1000 * found == pytest.approx(spots(Scene(lens), [0.0], [587.56]).rms_um[0], rel=0.03)
+
+
+def test_a_pupil_s_outline_serves_any_plane_and_tells_what_passes_beside_it() -> None:
+    lens, film, real = read_lens(LENS), (24.0, 16.0), {"film_mm": (24.0, 16.0), "focus_m": 2.0, "f_number": 8.0}
+    camera, waves = ExactCamera(lens, **real), np.full(FILM.shape[1], 550.0, np.float32)
+    outline, film_z = camera.film.outline, camera.film.film_z_mm
+    stopped, other = lens.at(f_number=8.0, focus_m=2.0), outline.pupil_z_mm - 15.0
+    bounds = domain_of(stopped, film_radius_mm=math.hypot(*film) / 2, focus_m=(2.0, 2.0), pupil_z_mm=other).bounds
+    searched, moved = ExactCamera(lens, **real, bounds=bounds).film.outline, outline.on_plane(other, film_z)
+    for square in (np.full(FILM.shape, 0.5), np.full(FILM.shape, 0.9)):
+        (there, area), (own, size) = (o.sample(FILM.astype(np.float32), square, waves) for o in (moved, searched))
+        assert np.abs(there - own).max() < 0.03 and area == pytest.approx(size, rel=0.005)  # of radii of 2 mm and more
+    places = places_of(camera, FILM, np.full(4, 4.0), NM, SHARE)
+    light = footprints(camera, places).light
+    assert (light_beside(camera, places) < 1e-3 * light).all()  # the outline holds all that passes
+    camera.film.outline = camera.film.pupil = replace(outline, x=0.98 * outline.x, y=0.98 * outline.y)
+    narrow = footprints(camera, places).light
+    assert light_beside(camera, places) == pytest.approx(0.01 * narrow, rel=0.02)  # 0.5% of the radius, all of it lit
 
 
 def test_depths_are_along_the_axis() -> None:

@@ -14,6 +14,7 @@ from neurolens.evaluate.light import glance, stray_light
 from neurolens.evaluate.plan import plan
 from neurolens.evaluate.probe import effects_of, probe
 from neurolens.evaluate.samples import blur_map
+from neurolens.evaluate.scenes import seen_depths_m
 from neurolens.flare.layers import FlareSettings, flare_layers
 from neurolens.flare.picture import Raster
 from neurolens.flare.sources import SceneLights
@@ -21,6 +22,7 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.trace import Rays, trace
 from neurolens.render.renderer import render
 from neurolens.render.scene import scene_from_tables
+from neurolens.render.world import World
 
 LENS = "lenses/cooke_triplet_50.toml"  # of absorbing glass
 GREYS = {name: {"kind": "diffuse", "reflectance": [value] * 3} for name, value in (("grey", 0.2), ("light", 0.8))}
@@ -171,3 +173,15 @@ def test_lights_beyond_number_are_bounded() -> None:
     scene = wall(100.0, points=points)
     seen = SceneLights(scene).seen(scene, 60.0, most=8)
     assert len(seen) <= 8 and max(a.rgb[0] for a in seen) == pytest.approx(5 / 2.01**2, rel=0.1)
+
+
+def test_a_probe_makes_its_scene_ready_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a million lights that takes half a minute."""
+    made, whole = [], World.__init__
+    monkeypatch.setattr(World, "__init__", lambda self, *args: (made.append(1), whole(self, *args))[1])
+    bulb = {"centre_m": [0.0, 0.0, -2.5], "radius_m": 0.5, "emission": [5.0, 4.0, 3.0]}
+    scene = wall(spheres=[bulb])
+    found = probe(scene, read_lens(LENS).at(), across=4)
+    assert len(made) == 1 and 2.0 < found.asked.nearest_m < 2.3
+    seen_depths_m(scene, found.exact, found.places.film_mm)  # outside nothing is kept
+    assert len(made) == 2

@@ -5,10 +5,12 @@ import json
 import os
 import re
 import signal
+import threading
 import time
 from collections.abc import Iterable, Iterator
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -173,6 +175,20 @@ def test_a_killed_process_costs_its_own_file(tmp_path: Path, monkeypatch: pytest
     records = survey(collection, tmp_path / "out", READ, in_processes(2, limit_s=0.0), QUIET)
     assert {r["verdict"] for r in records} == {"fault"}
     assert "took longer than 0 s" in records[0]["reason"]
+
+
+def test_a_worker_of_a_cluster_ends_after_a_file_that_never_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It answers first; a file in time leaves it alone."""
+    ended: list[float] = []
+    stuck, timer = threading.Event(), SimpleNamespace(start=lambda: None)
+    monkeypatch.setattr(survey_run.threading, "Timer", lambda after, *_: (ended.append(after), timer)[1])
+    task = Task("a.zmx", b"", READ)
+    assert json.loads(survey_run._on_worker(b"", task))["verdict"] == "refused" and not ended
+    monkeypatch.setattr(survey_run, "run_task", lambda _: stuck.wait())
+    monkeypatch.setattr(survey_run, "TIME_LIMIT_S", 0.01)
+    record = json.loads(survey_run._on_worker(b"", task))
+    stuck.set()
+    assert (record["verdict"], record["reason"]) == ("fault", "took longer than 0.01 s") and len(ended) == 1
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")

@@ -51,6 +51,15 @@ def exact(lens: Lens, rays: np.ndarray, way: Way, wavelength_nm: float) -> tuple
     return place.numpy(), found.power.numpy(), (found.status == st.PASSED).numpy()
 
 
+def toric() -> Lens:
+    """A triplet with an aspheric toroid at its front and a biconic at its back."""
+    lens = lens_of("cooke_triplet_50")
+    first, *middle, last = lens.surfaces
+    ends = (first.radius_mm * 1.2, None), (last.radius_mm * 0.9, -0.6)
+    front = replace(first, cylinder="x", asphere=((4, -1e-6),), across=ends[0])
+    return replace(lens, surfaces=(front, *middle, replace(last, cylinder="y", conic=0.3, across=ends[1])))
+
+
 # The letter F.
 LETTER = np.zeros((50, 50), bool)
 LETTER[5:45, 10:20] = LETTER[5:15, 10:40] = LETTER[22:30, 10:32] = True
@@ -62,6 +71,7 @@ CASES = {
     "coated": lambda: coated(double_gauss(), "broadband"),
     "aspheres": lambda: lens_of("phone_lens_6"),
     "cylinders": lambda: lens_of("schneider_anamorphic_31"),
+    "toroids": toric,
     "absorbing": lambda: replace(
         double_gauss(),
         surfaces=tuple(replace(s, absorption_per_mm=0.02 * (s.n_d > 1)) for s in double_gauss().surfaces),

@@ -2,6 +2,8 @@
 
 import math
 import shutil
+import sysconfig
+from pathlib import Path
 
 import mpmath
 import pytest
@@ -331,9 +333,11 @@ def test_passing_is_status_0_without_the_lost_rays(name: str, towards: Towards) 
 
 @pytest.mark.slow
 def test_compiled_equals_eager() -> None:
-    """Skipped without a C++ compiler, which the project does not need."""
+    """Skipped without what torch compiles with, which the project does not need."""
     if not any(map(shutil.which, ("c++", "g++", "clang++"))):
         pytest.skip("no C++ compiler")
+    if not Path(sysconfig.get_paths()["include"], "Python.h").is_file():
+        pytest.skip("no Python.h (Debian: python3-dev)")
     singlet = focused("thorlabs_lb1471_biconvex_50")
     start = Rays(*(c.float() for c in bundle(singlet, 1024)))
     wavelength = torch.linspace(400, 700, 1024)

@@ -262,7 +262,8 @@ def test_lens_files_hold_them(name: str, tmp_path: Path) -> None:
         ('cylinder = "x", across_mm = 9, across_conic = 0, asphere = { 4 = 1e-6 }', "a biconic has no polynomial"),
         ('cylinder = "x", across_mm = 9', "diameter_mm: got 20.0, expected at most 18 mm"),
         ("focal_mm = 0.0", "focal_mm: got 0.0, expected a focal length other than 0"),
-        ("focal_mm = 60.0, n_d = 1.5", "n_d: got 1.5, expected a plane in air"),
+        ("focal_mm = 60.0, n_d = 1.5", "focal_mm: got 60.0, expected air on both sides of an ideal lens"),
+        ("focal_mm = 60.0, conic = 1.0", "conic: got 1.0, expected a plane in air"),
     ],
 )
 def test_bad_rows_are_named(row: str, message: str, tmp_path: Path) -> None:

@@ -186,7 +186,7 @@ def test_optical_bench_mistakes(old: str, new: str, said: str, tmp_path: Path) -
     [
         (".lens", "surfaces:", "surfaces", "expected one of the keywords"),
         (".lens", " 1  # row", " 1 torus # row", "one of spherical"),
-        (".lens", " 1  # row", " 1 toric 20 # row", "toric"),
+        (".lens", " 1  # row", " 1 toric # row", "toric with a radius other than 0"),
         (".lens", " 1  # row", " # row", "6 figures"),
         (".camera.toml", "ior = 1.0", "iro = 1.0", "iro"),
         (".camera.toml", 'type = "spherical"', 'type = "round"', "one of spherical"),
@@ -198,6 +198,12 @@ def test_optical_bench_mistakes(old: str, new: str, said: str, tmp_path: Path) -
 def test_collection_mistakes(suffix: str, old: str, new: str, said: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=re.escape(said)):
         read_text(swapped(old, new, DRAWN[suffix](GAUSS)), suffix, tmp_path)
+
+
+def test_a_toric_row_is_a_circle_along_y_turned_about_y(tmp_path: Path) -> None:
+    lens, _ = read_text(swapped(" 1  # row", " 1 toric 95.5 # row", DRAWN[".lens"](GAUSS)), ".lens", tmp_path)
+    first, plain_first = lens.surfaces[0], GAUSS.surfaces[0]
+    assert first == replace(plain_first, radius_mm=95.5, cylinder="y", across=(plain_first.radius_mm, None))
 
 
 def test_optical_bench_oddities(tmp_path: Path) -> None:
