@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.progress import Report
+from neurolens.cameras.arcs_passing import passing
 from neurolens.cameras.blades import MAX_BLADES, Blades
 from neurolens.cameras.cameragraph import D_FILM, weight_graph
 from neurolens.cameras.focus_function import FOCUS, SMALLEST, Focusing, film_function, followed_rows
@@ -32,7 +33,7 @@ from neurolens.cameras.lens_state import squeeze_of
 from neurolens.cameras.model import ModelScene
 from neurolens.cameras.onnxlens import OnnxLens
 from neurolens.cameras.pupil_arcs import PupilArcs
-from neurolens.cameras.pupil_arcs_fit import fit_arcs, passing
+from neurolens.cameras.pupil_arcs_fit import fit_arcs
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_sight import Sight
 from neurolens.cameras.sampling import stratified
@@ -464,9 +465,8 @@ def osl_lens(
     for seen, graph, own in zip(nodes, graphs, arcs, strict=True):
         near = seen.focusing.nearest_m
         limit, entrance = near if math.isfinite(near) else inside, _entrance_mm(seen.sight)
-        film = _film(seen.focusing)
         numbers = near, limit, seen.f_number, seen.efl_mm, entrance, _stop_image(seen.sight, own)
-        cameras.append(OslCamera(seen.sight, graph, own, film, *numbers))
+        cameras.append(OslCamera(seen.sight, graph, own, _film(seen.focusing), *numbers))
     return OslLens(cameras, axes, between)
 
 

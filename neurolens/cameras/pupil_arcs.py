@@ -129,7 +129,7 @@ class PupilArcs:
         inside = (radius if squeezed is film else g.square(film).sqrt()) <= self.film_radius_mm
         point, unit = turn * x + across * y, g.constant(math.pi)
         if self.image is not None:
-            point, wide = self.image.placed(film, g.input("film_z_mm", per_call=True), point)
+            point, wide = self.image.placed(film, g.input("film_z_mm", per_call=True), g.input("wavelength_nm"), point)
             unit = wide * math.pi
         g.outputs["pupil_mm"] = point
         g.outputs["at_stop"] = at_stop(x, y)
@@ -198,7 +198,7 @@ class PupilArcs:
     @cached_property
     def checked(self) -> Graph:
         """Whether rays lie inside: inputs `film_mm`, `pupil_mm` [2] of film points on +x, from the azimuth whose double
-        has the cosine `twice`, turned; outputs by arc. Points are those of the image, where there is one."""
+        has the cosine `twice`, turned; outputs by arc, its factors too. Points are of the image, where there is one."""
         g = Graph()
         pupil = g.input("pupil_mm", 2)
         arcs = self._arcs(g, g.input("film_mm", 2)[0] * (1 / self.unit_mm), g.input("twice"))
@@ -209,6 +209,7 @@ class PupilArcs:
         for name, side in zip(("left", "right"), zip(*rows, strict=True), strict=True):
             g.outputs[name] = g.concat(*(pupil[0] * 0.0 + 1.0 if v is None else v for v in side))
         g.outputs["height"] = g.concat(*(arc.height(*row) for arc, row in zip(arcs, rows, strict=True)))
+        g.outputs |= {name: g.concat(*(getattr(arc, name) for arc in arcs)) for name in ("first", "change")}
         return g
 
 

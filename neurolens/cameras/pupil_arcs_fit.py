@@ -1,4 +1,4 @@
-"""Fits the arcs of `pupil_arcs` to what passes a lens, from nothing but its graph, and measures how much passes."""
+"""Fits the arcs of `pupil_arcs` to what passes a lens, from nothing but its graph."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from functools import partial
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Report
+from neurolens.cameras.arcs_passing import passing
 from neurolens.cameras.pupil_arcs import PupilArcs
 from neurolens.cameras.pupil_boxes import asking, end_of_light, frame_of
 from neurolens.cameras.pupil_sight import Sight, Truths, imaged, turned
@@ -27,14 +28,15 @@ _MARGIN = 0.001  # of half the pupil
 _RIDGE = 1e-10
 _ENOUGH = 0.97  # of points, at the widest stop, that pass
 _FEWEST = 12  # vertices that rims of a side block
-_PLENTY = 0.96  # of points, that no other way to fit needs to pass
+_PLENTY, _GOAL = 0.96, 0.952  # of points, that no other way to fit needs to pass: of a round lens, by zones
 _REFIT_SEED, _CHECK_SEED, _NO_SIDE = 10, 20, 2  # such rays lie on no arc
 _LOST = 1e-3  # of rays that pass in any zone, that a way may miss
 _HELD, _HELD_ROUND = 0.9997, 0.9998  # of random rays that pass, in every zone, or of a round lens of all
 _RISE, _STEP, _STEPS = 1.03, 0.004, 12  # of arcs that do not hold them: in y^2, and of half the pupil along x
 _ZONES, _FEW = (6, 3, 3), 1000  # of film radius, stop and azimuth; rays that tell of one
 _WIDEST = 0.5  # of half the pupil's size, by which arcs that do not hold them grow
-_ASKED, _TRIED = 20_000, 64
+_MOVES, _DRAWS, _FIRM, _SURE = 3, 2, 1e4, 0.9999  # of arcs moved until they hold them
+_CELLS, _LEADERS = (10, 12, 3, 3), 3  # of radius, stop, focus and azimuth: rays that need most
 _RAYS = 60_000  # random ones that must lie inside, of an anamorphic lens three times as many
 
 
@@ -74,7 +76,7 @@ _WAYS = (
     Way(25, (1.0, 0.85, 0.7, 0.55, 0.4, 0.28, 0.18, 0.08), 4, (5, 3), 3000.0, 3, False),
     Way(25, (1.0, 0.7, 0.4, 0.2, 0.08), 12, (6, 3), 3000.0, 2, True),
 )
-_ANAMORPHIC = tuple(Way(17, (1.0, 0.7, 0.4, 0.2, 0.08), 4, (3, 2), push, 3, True) for push in (1e5, 1e4))
+_ANAMORPHIC = tuple(Way(17, (1.0, 0.7, 0.4, 0.2, 0.08), 4, (3, 2), push, 3, True) for push in (1e4, 1e5))
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,7 @@ def fit_arcs(sights: Sequence[Sight], report: Report, between: Sequence[tuple[Ar
         least, held = min(passing(seen, own[0]).values()), beyond <= _LOST < lost and _by_zones(seen)
         if held or (least > best and beyond <= max(lost, _LOST)):
             kept, best, lost = [replace(own[0], image=seen.image)], least, beyond
-        if best >= _PLENTY and (lost <= _LOST or not _by_zones(seen)):
+        if best >= _PLENTY if not _by_zones(seen) else best >= _GOAL and lost <= _LOST:
             break
     return kept
 
@@ -163,7 +165,7 @@ def _by_zones(sight: Sight) -> bool:
 
 def _lost(sight: Sight, arcs: PupilArcs) -> float:
     """Share of random rays that pass beyond the arcs, of an anamorphic lens in the worst zone."""
-    rays, stop, *_, out = _beyond(sight, arcs, _CHECK_SEED)
+    rays, stop, *_, out = _beyond(sight, arcs, _CHECK_SEED, _DRAWS if _by_zones(sight) else 1)
     return max(float(out[zone].mean()) for zone in _zones(sight, rays, stop)) if _by_zones(sight) else float(out.mean())
 
 
@@ -277,16 +279,35 @@ def _edge(sight: Sight, arcs: PupilArcs, p: _Places) -> _Edge:
 def _with_missed(sight: Sight, arcs: PupilArcs, edge: _Edge, seed: int) -> _Edge:
     """With random rays that pass beyond the arcs as vertices that they must hold."""
     rays, stop, left, right, out = _beyond(sight, arcs, _REFIT_SEED + seed)
-    azimuth = np.arccos(rays["twice"][0]) / 2
-    scaled = arcs.scaled(rays["film_mm"][0], stop, rays["film_z_mm"][0], rays["wavelength_nm"][0], azimuth)
-    missed = *rays["pupil_mm"], scaled, np.full(out.size, _NO_SIDE), right, left
+    if _by_zones(sight):  # a fold of the model or the lens sends a few far away: not worth an arc
+        found, y = evaluate(arcs.checked, rays), rays["pupil_mm"][1]
+        height = (y * y - found["height"]) / (2 * np.abs(y).max())
+        far = np.maximum(np.maximum(-found["left"], -found["right"]), height).max(0)
+        out = out & ~_worst(far, _zones(sight, rays, stop))
+    missed = *rays["pupil_mm"], _scaled(arcs, rays, stop), np.full(out.size, _NO_SIDE), right, left
     own = edge.x, edge.y, edge.scaled, edge.side, edge.first, edge.last
     return _Edge(*(np.concatenate([a, b[..., out]], -1) for a, b in zip(own, missed, strict=True)))
 
 
-def _beyond(sight: Sight, arcs: PupilArcs, seed: int) -> tuple[dict[str, Array], Array, Truths, Truths, Truths]:
+def _scaled(arcs: PupilArcs, rays: dict[str, Array], stop: Array) -> Array:
+    """`PupilArcs.scaled` of rays of `_random`."""
+    azimuth = np.arccos(rays["twice"][0]) / 2
+    return arcs.scaled(rays["film_mm"][0], stop, rays["film_z_mm"][0], rays["wavelength_nm"][0], azimuth)
+
+
+def _worst(values: Array, zones: Sequence[NDArray[np.intp]]) -> Truths:
+    """[N] the few greatest of every zone."""
+    found = np.zeros(values.size, bool)
+    for zone in zones:
+        found[zone] = values[zone] > np.quantile(values[zone], _HELD)
+    return found
+
+
+def _beyond(
+    sight: Sight, arcs: PupilArcs, seed: int, draws: int = 1
+) -> tuple[dict[str, Array], Array, Truths, Truths, Truths]:
     """Rays and stops of `_random`, and which of them lie beyond a low end, a high end, any arc."""
-    rays, stop = _random(sight, arcs, seed)
+    rays, stop = _random(sight, arcs, seed, draws)
     found = evaluate(arcs.checked, rays)
     left, right = ((found[name] < 0).any(0) for name in ("left", "right"))
     return rays, stop, left, right, left | right | (found["height"] < rays["pupil_mm"][1] ** 2).any(0)
@@ -332,22 +353,25 @@ def _above(rows: Array, wanted: Array, own: Truths, size: Array, push: float) ->
     a, b = (rows[used] / size).T, wanted / size
     scale = np.maximum(np.sqrt((a**2).mean(0)), 1e-30)
     a = a / scale
-    weight = np.where(own, 1.0, _LOOSE)
-    found = np.zeros(a.shape[1])
+    weight = plain = np.where(own, 1.0, _LOOSE)
+    found, products = np.zeros(a.shape[1]), (a * weight[:, None]).T @ a + _RIDGE * len(a) * np.eye(a.shape[1])
     for _ in range(_ROUNDS):
-        heavy = a * weight[:, None]
-        found = np.linalg.solve(heavy.T @ a + _RIDGE * len(a) * np.eye(a.shape[1]), heavy.T @ b)
-        over = a @ found - b
-        weight = np.where(over < 0, push, np.where(own, 1.0, _LOOSE))
+        found = np.linalg.solve(products, (weight * b) @ a)
+        last, weight = weight, np.where(a @ found < b, push, plain)
+        changed = np.flatnonzero(weight != last)
+        if not changed.size:
+            break
+        part = a[changed]  # few
+        products += (part * (weight - last)[changed, None]).T @ part
     out = np.zeros(len(rows))
     out[used] = found / scale
     return out
 
 
-def _random(sight: Sight, arcs: PupilArcs, seed: int) -> tuple[dict[str, Array], Array]:
+def _random(sight: Sight, arcs: PupilArcs, seed: int, draws: int = 1) -> tuple[dict[str, Array], Array]:
     """Random rays that pass, from film points on +x, as inputs of `PupilArcs.checked`, and stops."""
-    rng, count = np.random.default_rng(seed), _RAYS * (1 + 2 * sight.anamorphic)
-    radius = arcs.film_radius_mm * np.sqrt(rng.random(count)) * 0.9999
+    rng, count = np.random.default_rng(seed), _RAYS * draws * (1 + 2 * sight.anamorphic)
+    radius = arcs.film_radius_mm * rng.random(count) ** (0.75 if sight.anamorphic else 0.5) * 0.9999
     stop = sight.stop_radius_mm * rng.choice(np.linspace(0.08, 1, 12), count)
     film_z, nm = (rng.uniform(*span, count) for span in (sight.film_z_mm, sight.wavelength_nm))
     radii = np.linspace(0, sight.table.film_radius_mm, sight.table.rows.shape[1])
@@ -371,12 +395,13 @@ def _random(sight: Sight, arcs: PupilArcs, seed: int) -> tuple[dict[str, Array],
 
 
 def _zones(sight: Sight, rays: dict[str, Array], stop: Array) -> list[NDArray[np.intp]]:
-    """Rays of `_random` by film radius, stop and azimuth; those of all zones with few rays together."""
+    """Rays of `_random` by film radius, stop and azimuth; those of zones with few rays by film radius alone."""
     shares = rays["film_mm"][0] / rays["film_mm"][0].max(), stop / sight.stop_radius_mm, (1 + rays["twice"][0]) / 2
     places = [np.minimum(share * n, n - 1).astype(int) for share, n in zip(shares, _ZONES, strict=True)]
     own = np.ravel_multi_index(places, _ZONES)
     counts = np.bincount(own, minlength=np.prod(_ZONES))
-    own[counts[own] < _FEW] = -1
+    few = counts[own] < _FEW
+    own[few] = -1 - places[0][few]
     return [np.flatnonzero(own == zone) for zone in np.unique(own)]
 
 
@@ -410,63 +435,62 @@ def _widened(nodes: list[PupilArcs], seen: Sequence[tuple[Array, Sight]], report
 
 
 def _dilated(arcs: PupilArcs, sight: Sight, report: Report) -> PupilArcs:
-    """The arcs, each dilated until in every zone it holds random rays."""
-    for seed in range(2):
-        report(seed / 2)
-        rays, stop = _random(sight, arcs, seed)
-        zones, size = _zones(sight, rays, stop), float(np.abs(rays["pupil_mm"][1]).max())
-        low, high = np.zeros(len(arcs.sides)), np.full(len(arcs.sides), _WIDEST * size)
-        for step in range(_HALVINGS):
-            middle = (low + high) / 2 if step else low  # most arcs hold them as they are
-            held = _holds(replace(arcs, numbers=arcs.numbers + _dilation(arcs, middle, size)), rays, zones)
-            low, high = np.where(held, low, middle), np.where(held, middle, high)
-        arcs = replace(arcs, numbers=arcs.numbers + _dilation(arcs, high, size))
+    """The arcs, each moved by as little as random rays in every zone need, outwards or inwards."""
+    for seed in range(_MOVES):
+        report(seed / _MOVES)
+        rays, stop, *_, out = _beyond(sight, arcs, seed, _DRAWS)
+        if seed and max(out[zone].mean() for zone in _zones(sight, rays, stop)) <= _LOST / 4:
+            break
+        # What the first ones asked for holds.
+        arcs = replace(arcs, numbers=arcs.numbers + _moved(arcs, sight, rays, stop, 0.0 if seed else -np.inf))
     return arcs
 
 
-def _dilation(arcs: PupilArcs, ways: Array, size: float) -> Array:
-    """What is added to numbers where ends of arcs move by ways [A], and heights with them; `size`: half the pupil's."""
-    added = np.zeros_like(arcs.numbers)
+def _moved(arcs: PupilArcs, sight: Sight, rays: dict[str, Array], stop: Array, least: float) -> Array:
+    """[A, 4, M]: what is added to numbers of arcs whose ends move by polynomials of film radius, stop and azimuth.
+
+    `least`: of what rays need.
+    """
+    found, zones, scaled = evaluate(arcs.checked, rays), _zones(sight, rays, stop), _scaled(arcs, rays, stop)
+    y, added, powers = rays["pupil_mm"][1], np.zeros_like(arcs.numbers), [tuple(row) for row in arcs.exponents.tolist()]
+    size = float(np.abs(y).max())
     for arc, side in enumerate(arcs.sides):
-        added[arc, 0] = -ways[arc] * _unit(arcs, side == 0) * (side <= 0)
-        added[arc, 1] = ways[arc] * _unit(arcs, side == 0) * (side >= 0)
-        # A rim's far end moves, too; beyond that no arc may stay where its height is negative.
-        added[arc, 2] = ways[arc] * (_unit(arcs, False) / (1 if side else size))
-        added[arc, 2] -= 2 * ways[arc] * arcs.numbers[arc, 3] * (side != 0)
+        own = {name: found[name][arc] for name in ("left", "right", "first", "change")}
+        # The stop's ends move with the stop. A rim's far end moves, too.
+        step, bend = (scaled[1], 1 / size) if side == 0 else (1.0, 1 + 2 * max(-float(own["change"].min()), 0.0))
+        need = np.maximum(_needed(own, y * y, side, step, bend, size), least)
+        ends = {e: (e[0], e[1] + (side == 0), *e[2:]) for e in powers if not (e[2] or e[3] or (side and e[1]))}
+        ends = {e: end for e, end in ends.items() if end in powers}
+        rows = np.prod(scaled[:, None] ** np.array(list(ends)).T[:, :, None], axis=0)
+        of_all = _leaders(scaled, np.where(_worst(need, zones), -np.inf, need))
+        way = _above(rows[:, of_all], need[of_all], np.ones(of_all.size, bool), np.ones(of_all.size), _FIRM)
+        way[0] += max(float(np.quantile((need - way @ rows)[zone], _SURE)) for zone in zones)
+        for (e, end), value in zip(ends.items(), way, strict=True):
+            added[arc, 0, powers.index(end)] -= value * (side <= 0)
+            added[arc, 1, powers.index(end)] += value * (side >= 0)
+            added[arc, 2, powers.index(e)] += value * bend
     return added
 
 
-def _holds(arcs: PupilArcs, rays: dict[str, Array], zones: Sequence[NDArray[np.intp]]) -> Truths:
-    """[A] whether each arc holds all but a few rays of any zone."""
-    found = evaluate(arcs.checked, rays)
-    out = (found["left"] < 0) | (found["right"] < 0) | (found["height"] < rays["pupil_mm"][1] ** 2)
-    return np.all([out[:, zone].mean(1) <= 1 - _HELD for zone in zones], axis=0, keepdims=True)[0]
+def _needed(own: dict[str, Array], squared: Array, side: int, step: ArrayLike, bend: float, size: float) -> Array:
+    """[N] by how much an arc must move to hold rays, y^2 `squared`: its ends by that many steps, its first factor by
+    that many bends."""
+    low, high = np.full(squared.size, -_WIDEST / 4 * size), np.full(squared.size, _WIDEST * size)
+    for _ in range(_HALVINGS):
+        way = (low + high) / 2
+        left, right = (own[name] + way * step for name in ("left", "right"))
+        away, other = (right if side > 0 else left), (right if side == 0 else 1.0)
+        height = away * other * (own["first"] + bend * way + own["change"] * away)
+        held = (np.minimum(away, other) >= 0) & (height >= squared)
+        low, high = np.where(held, low, way), np.where(held, way, high)
+    return high
 
 
-def passing(sight: Sight, arcs: PupilArcs) -> dict[float, float]:
-    """Share of the points of the arcs through which rays pass, all over the film, by shares of the widest stop.
-
-    Of film points that have light at that stop: of those whose ray is blocked, where any of `_TRIED` others passes.
-    """
-    rng, found = np.random.default_rng(3), {}
-    for share in (1.0, 0.5, 0.25):
-        angle, radius = 2 * np.pi * rng.random(_ASKED), 0.98 * arcs.film_radius_mm * np.sqrt(rng.random(_ASKED))
-        film = radius * np.stack([np.cos(angle), np.sin(angle)])
-        call = [rng.uniform(*span, _ASKED) for span in (sight.film_z_mm, sight.wavelength_nm)]
-        call.append(np.full(_ASKED, share * sight.stop_radius_mm))
-        passed = _sampled(sight, arcs, rng.random((2, _ASKED)), film, call)
-        lit = np.zeros((blocked := np.flatnonzero(~passed)).size, bool)
-        for _ in range(_TRIED):
-            dark = blocked[~lit]
-            lit[~lit] = _sampled(sight, arcs, rng.random((2, dark.size)), film[:, dark], [row[dark] for row in call])
-        found[share] = float(passed.sum() / max(passed.sum() + lit.sum(), 1))
-    return found
-
-
-def _sampled(sight: Sight, arcs: PupilArcs, square: Array, film: Array, call: Sequence[Array]) -> Truths:
-    """[N] whether rays of points [2, N] of the unit square pass; film positions, wavelengths and stops."""
-    film_z, nm, stop = call
-    given = {"film_mm": film, "square": square}
-    given |= {"film_z_mm": film_z[None], "wavelength_nm": nm[None], "stop_radius_mm": stop[None]}
-    pupil = evaluate(arcs.graph, given)["pupil_mm"]
-    return np.asarray(sight.status(film, pupil, nm, film_z, stop) == st.PASSED)
+def _leaders(scaled: Array, need: Array) -> NDArray[np.intp]:
+    """Rays that need most, a few of every small cell."""
+    parts = (scaled[0], scaled[1], (scaled[2] + 1) / 2, (scaled[4] + 1) / 2)
+    places = [np.clip((part * n).astype(int), 0, n - 1) for part, n in zip(parts, _CELLS, strict=True)]
+    cell = np.ravel_multi_index(places, _CELLS)
+    order = np.lexsort((-need, cell))
+    rank = np.arange(order.size) - np.searchsorted(cell[order], cell[order])
+    return order[(rank < _LEADERS) & np.isfinite(need[order])]

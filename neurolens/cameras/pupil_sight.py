@@ -95,8 +95,8 @@ class Sight:
 
 def imaged(sight: Sight) -> Sight:
     """The lens from points in the image of its stop; itself where that is not found."""
-    nm, radius = float(np.mean(sight.wavelength_nm)), sight.table.film_radius_mm
-    image = stop_image(sight.graph, radius, sight.film_z_mm, nm, sight.stop_radius_mm, sight.anamorphic)
+    radius, (low, high) = sight.table.film_radius_mm, sight.wavelength_nm
+    image = stop_image(sight.graph, radius, sight.film_z_mm, (low, high), sight.stop_radius_mm, sight.anamorphic)
     if image is None:
         return sight
     reach = _LIMIT * sight.stop_radius_mm * np.array([[-1], [1], [1]], np.float32)
