@@ -87,7 +87,10 @@ def run(args: argparse.Namespace) -> int:
     head = ("change", "least ms", "median ms", "processor ms", "wanted ms")
     keys = ("least_ms", "median_ms", "processor_ms", "wanted_ms")
     lines = [[r["change"], *("–" if r[key] is None else f"{r[key]:.0f}" for key in keys)] for r in rows]
-    text = lab.page("# The page in software WebGL", __doc__ or "", lab.machine_line(), lab.table(head, lines))
+    machine = (
+        f"{lab.machine_line()} Load at the end: {os.getloadavg()[0]:.1f} (one process of ours and the browser: 1 to 2)."
+    )
+    text = lab.page("# The page in software WebGL", __doc__ or "", machine, lab.table(head, lines))
     print(
         lab.write_results(
             args.out,
