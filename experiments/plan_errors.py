@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 from neurolens.cameras.contract import Camera, CameraRays, FloatArray
 from neurolens.evaluate import footprints as prints
 from neurolens.evaluate.footprints import Footprints, Places
+from neurolens.evaluate.light import parts_of, spectrum_seen
 from neurolens.evaluate.probe import COUNTED
 from neurolens.evaluate.scenes import seen_depths_m
-from neurolens.optics.film_plane import colours
 from neurolens.render.film_settings import FilmSettings
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene
@@ -38,6 +38,7 @@ from neurolens.render.scene import Scene
 Array = NDArray[np.float64]
 _PUPILS = 18, 64, 160  # squared: pupil samples of a fresh footprint, and where those leave its error unsure
 _RIM = 0.002, 0.1  # errors that samples of another outline may make: of a blur's diameter; times rows of samples
+_WAVES = 5  # of the light
 _CHUNK = 2_000_000  # rays at once
 _SMOOTH_PX = 1.2  # of pictures before derivatives
 _EDGE = 4  # pixels at a piece's rim that the filter spoils
@@ -50,8 +51,9 @@ _PIXEL = 1 / 6  # squared RMS distance of a pixel's points from its centre, px^2
 # ---- By rays. --------------------------------------------------------------------------------------------------------
 
 
-def fresh_places(scene: Scene, exact: Camera, across: int = 22, seed: int = 5) -> Places:
-    """Places at random in the cells of a grid, `across` along the width, at wavelengths in steps of a fifth."""
+def fresh_places(scene: Scene, exact: Camera, rgb: Array, across: int = 22, seed: int = 5) -> Places:
+    """Places at random in the cells of a grid, `across` along the width, at the centroids of fifths of the range of the
+    light, whose picture has this mean colour."""
     shot = scene.settings.camera
     film = np.array([shot.film_width_mm, shot.film_height_mm])
     cells = across, max(round(across * film[1] / film[0]), 1)
@@ -60,13 +62,9 @@ def fresh_places(scene: Scene, exact: Camera, across: int = 22, seed: int = 5) -
         :, None
     ]
     depth = seen_depths_m(scene, exact, points)
-    low, high = exact.wavelength_nm or shot.wavelengths_nm
-    nanometres = low + (high - low) * (np.arange(5) + 0.5) / 5
-    near, weight = colours((low, high))
-    share = np.interp(nanometres, near, weight) if len(near) > 1 else np.ones(5)
-    if not exact.dispersive:
-        nanometres, share = np.array([(low + high) / 2]), np.ones(1)
-    return prints.places_of(exact, points, np.where(np.isnan(depth), np.inf, depth), nanometres, share / share.sum())
+    nm, seen = spectrum_seen(scene, rgb)
+    nanometres, share = parts_of(nm, seen, 0, len(nm) - 1, _WAVES if exact.dispersive else 1)
+    return prints.places_of(exact, points, np.where(np.isnan(depth), np.inf, depth), nanometres, share)
 
 
 def by_rays(

@@ -125,7 +125,7 @@ def measure_case(case: Case, folder: Path, report: Report) -> dict[str, Any]:
     exact = make_camera(
         f"{compiled}{lens.path}", shot
     )  # as a render has it: a plan's own has another outline of pupils
-    places = plan_errors.fresh_places(scene, exact)
+    places = plan_errors.fresh_places(scene, exact, found.glance.rgb.mean((0, 1)))
     fresh = Fresh(exact, places, plan_errors.fresh_prints(exact, places))
     report(0.1)
     rows: dict[str, dict[str, Any]] = {}

@@ -87,29 +87,40 @@ def small_raster(film_mm: tuple[float, float]) -> tuple[int, int]:
 
 
 def light_of(scene: Scene, camera: Camera, rgb: Array) -> tuple[tuple[float, float], Array, Array]:
-    """Range and wavelengths in nm and their shares of a picture's light, as the eye weighs it.
+    """Range and wavelengths in nm and their shares of a picture's light, as the eye weighs it: see `spectrum_seen`.
 
-    It is that of the scene's lights, tinted so that the picture has its mean colour. Equal parts of the range that
-    holds all but the last of it are each one wavelength, their centroid: a narrow line is one.
+    Equal parts of the range that holds all but the last of it are each one wavelength, their centroid: a narrow line
+    is one.
     """
     low, high = scene.settings.camera.wavelengths_nm
     if not camera.dispersive and getattr(camera, "achromatic", False):
         return (low, high), np.array([(low + high) / 2]), np.ones(1)
+    nm, seen = spectrum_seen(scene, rgb)
+    reached = np.cumsum(seen) / seen.sum()
+    first, last = (int(np.searchsorted(reached, q)) for q in (_TAIL, 1 - _TAIL))
+    return (float(nm[first]), float(nm[last])), *parts_of(nm, seen, first, last, len(colours((low, high))[0]))
+
+
+def spectrum_seen(scene: Scene, rgb: Array) -> tuple[Array, Array]:
+    """Wavelengths in nm and their light as the eye weighs it: of the scene's lights, tinted so that its picture has the
+    mean colour [3]."""
+    low, high = scene.settings.camera.wavelengths_nm
     nm, light = expected_light(scene)
     spectral = SpectralRange(low, high, len(nm))
     if spectral.colours and rgb.max() > 0:
         white = spectral.film_rgb(light)
         light = light * spectral.spectrum(np.clip(rgb / np.maximum(white, 1e-3 * white.max()), 0, None))
     eye = np.interp(nm, *colours((low, high))) if low < high else np.ones_like(nm)
-    seen = np.maximum(light * eye, 0)
-    reached = np.cumsum(seen) / seen.sum()
-    first, last = (int(np.searchsorted(reached, q)) for q in (_TAIL, 1 - _TAIL))
-    edges = np.linspace(nm[first], nm[last], len(colours((low, high))[0]) + 1)
-    part = np.clip(np.searchsorted(edges, nm, side="right") - 1, 0, len(edges) - 2)
-    share = np.bincount(part, seen, len(edges) - 1)
+    return nm, np.maximum(light * eye, 0)
+
+
+def parts_of(nm: Array, seen: Array, first: int, last: int, count: int) -> tuple[Array, Array]:
+    """Centroids of equal parts of a spectrum from one index to another, and their shares; dark parts left out."""
+    edges = np.linspace(nm[first], nm[last], count + 1)
+    part = np.clip(np.searchsorted(edges, nm, side="right") - 1, 0, count - 1)
+    share = np.bincount(part, seen, count)
     lit = share > 1e-6 * share.sum()
-    middle = np.bincount(part, seen * nm, len(edges) - 1)[lit] / share[lit]
-    return (float(nm[first]), float(nm[last])), middle, share[lit] / share[lit].sum()
+    return np.bincount(part, seen * nm, count)[lit] / share[lit], share[lit] / share[lit].sum()
 
 
 def stray_light(scene: Scene, camera: Any, seen: Glance, white_balance: str | None = None) -> dict[str, Array]:

@@ -84,7 +84,7 @@ def test_a_shifted_camera_is_as_far_off_by_rays_and_by_renders() -> None:
     exact = make_camera("thin", Shot((shot.film_width_mm, shot.film_height_mm), 2.0, efl_mm=35.0, f_number=4.0))
     pixel = shot.film_width_mm / shot.width
     other = Shifted(exact, 0.4 * pixel)
-    places = fresh_places(scene, exact, across=5)
+    places = fresh_places(scene, exact, np.ones(3), across=5)
     apart, light = by_rays(other, exact, places, fresh_prints(exact, places), pixel, (0.05,))
     assert apart == pytest.approx(0.4, rel=1e-2) and light.max() < 1e-3
     centres = pieces_of(scene, exact, 40, cells=(2, 1))
