@@ -259,19 +259,19 @@ class Engine {
     return (best * 1e6) / FREE_BENCH ** 2;
   }
 
-  /** Show sides on the canvas: `view` is "one", "wipe" or "difference"; ghosts are added to both. */
-  paint(view, wipe, gain, ghosts = null) {
+  /** Show sides on the canvas: `view` is "one", "wipe" or "difference"; `dimmed` times the ghosts are added to both. */
+  paint(view, wipe, gain, ghosts = null, dimmed = 1) {
     const { a, b } = this.sides, other = b?.film ? b : a;
     this.gpu.draw(this.show, { a: a.film, b: other.film, counts: [a.samples, other.samples],
-      view: ["one", "wipe", "difference"].indexOf(view), wipe, gain, ghosts, flared: +!!ghosts }, null);
+      view: ["one", "wipe", "difference"].indexOf(view), wipe, gain, ghosts, flared: ghosts ? dimmed : 0 }, null);
   }
 }
 
 const SHOW = `
 uniform sampler2D a, b, ghosts;
 uniform vec2 counts;
-uniform int view, flared;
-uniform float wipe, gain;
+uniform int view;
+uniform float wipe, gain, flared;
 out vec4 result;
 vec3 mapped(vec3 x) {
   x = clamp(x, 0.0, 1.0);
@@ -282,7 +282,7 @@ void main() {
   vec3 left = texelFetch(a, at, 0).rgb / counts.x, right = texelFetch(b, at, 0).rgb / counts.y;
   float edge = floor(wipe * float(textureSize(a, 0).x));
   vec3 seen = view == 1 && float(at.x) >= edge ? right : left;
-  if (flared == 1) seen += texelFetch(ghosts, at, 0).rgb;
+  if (flared > 0.0) seen += flared * texelFetch(ghosts, at, 0).rgb;
   if (view == 2) { result = vec4(mapped(1000.0 * abs(left - right)), 1.0); return; }
   result = vec4(mapped(gain > 1.0 ? 1.0 - exp(-gain * seen) : seen), 1.0); // of the night, lights keep their colour
 }`;

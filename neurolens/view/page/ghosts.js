@@ -17,32 +17,40 @@ class GhostView {
   }
 
   /**
-   * Draw the ghosts of a lamp into `this.film`: irradiance over that of a white card of radiance 1 on the axis.
+   * Draw the ghosts of a lamp into `this.film`: `this.dimmed` times it is the irradiance over that of a white card of
+   * radiance 1 on the axis. Ghosts that stand there already are kept: a dimmer scales them, as light is linear.
    * `towards`: the lamp's direction in the camera's frame. `irradiance` at the lens, in sr: over that card's radiance.
    * `known`: how many of the brightest. Returns how many there are.
    */
   async draw(lens, side, towards, irradiance, width, height, known) {
     const { gl } = this.gpu, { values } = side, { ghosts } = lens, all = await this.functions(lens);
+    const { film_mm, stop_radius, wavelength_nm, light_nm, exposure } = values;
+    const key = JSON.stringify([lens.key, width, towards, [...film_mm], stop_radius, wavelength_nm, light_nm, exposure]);
     if (this.film?.width !== width) {
       if (this.film) this.gpu.free(this.film);
-      this.film = this.gpu.target(width, height, null, 1, true);
+      this.film = this.gpu.target(width, height, null, 1, !this.gpu.blends);
     }
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.film.frame);
-    gl.disable(gl.SCISSOR_TEST);
-    gl.clearColor(0, 0, 0, 0);
-    gl.clear(gl.COLOR_BUFFER_BIT);
+    if (key !== this.kept?.key || known < this.kept.count) {
+      gl.bindFramebuffer(gl.FRAMEBUFFER, this.film.frame);
+      gl.disable(gl.SCISSOR_TEST);
+      gl.clearColor(0, 0, 0, 0);
+      gl.clear(gl.COLOR_BUFFER_BIT);
+      this.kept = { key, irradiance, count: 0 };
+    }
+    this.dimmed = irradiance / this.kept.irradiance;
     const d = towards.map((v) => -v), inside = Math.hypot(d[0], d[1]) <= ghosts.sine;
     const [low, high] = [0, 1].map((k) => (values.wavelength_nm ? values.wavelength_nm : k ? Math.min(values.light_nm[1], ghosts.wavelength_nm[1]) : Math.max(values.light_nm[0], ghosts.wavelength_nm[0])));
-    for (const ghost of inside ? all.slice(0, known) : []) {
+    for (const ghost of inside ? all.slice(this.kept.count, known) : []) {
       const given = { p: [d[0] / ghosts.sine, d[1] / ghosts.sine], d, chief: ghost.chief_mm, size: ghost.scale_mm, span_nm: [low, high],
         stop_radius: Math.min(values.stop_radius, ghosts.stop_radius_mm), film_mm: values.film_mm, one_colour: values.wavelength_nm ? 1 : 0,
-        nodes: this.nodes, cell_light: (Math.abs(d[2]) * irradiance * (2 / GHOST_CELLS) ** 2 * ghost.scale_mm[0] * ghost.scale_mm[1]) / 2 / values.exposure };
+        nodes: this.nodes, cell_light: (Math.abs(d[2]) * this.kept.irradiance * (2 / GHOST_CELLS) ** 2 * ghost.scale_mm[0] * ghost.scale_mm[1]) / 2 / values.exposure };
       this.gpu.draw(this.program(lens, ghost), given, this.nodes);
       gl.enable(gl.BLEND);
       gl.blendFunc(gl.ONE, gl.ONE);
       this.gpu.draw(this.cells, given, this.film, null, 6 * GHOST_CELLS ** 2 * GHOST_NM);
       gl.disable(gl.BLEND);
     }
+    this.kept.count = known;
     return inside ? all.length : 0;
   }
 }

@@ -7,6 +7,7 @@ class Gpu {
     if (!gl.getExtension("EXT_color_buffer_float"))
       throw Error("WebGL2 is here, but this GPU cannot draw into float textures (EXT_color_buffer_float), in which pictures add up.");
     this.gl = gl;
+    this.blends = !!gl.getExtension("EXT_float_blend"); // into 32 bits, which software does twice as fast as into 16
     this.blank = this.target(1, 1);
     gl.bindVertexArray(gl.createVertexArray());
   }
@@ -33,7 +34,7 @@ class Gpu {
     return { program, uniforms };
   }
 
-  /** Textures of floats that are drawn into at once, `data` in the first; light adds up in those of `half` precision. */
+  /** Textures of floats that are drawn into at once, `data` in the first; `half` for light that adds up where `blends` is false. */
   target(width, height, data = null, count = 1, half = false) {
     const gl = this.gl, frame = gl.createFramebuffer(), textures = [];
     gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
