@@ -125,6 +125,8 @@ def _said(found: Trade) -> list[str]:
     else:
         told.append(f"Half of that buys {_short(half)}: {_time(found, half)}, "
                     f"{number(half.choice.error_px, 3)} px")  # fmt: skip
+    if later := " and ".join(found.plan.asked.afterwards):
+        told.append(f"Pixels leave out {later}, which compositing adds; FLIP and the pictures, taken before it, do not")
     return told
 
 

@@ -178,14 +178,17 @@ def candidates(
     say(0.2)
     trial = _Trial(found, target, tuple(budgets_px), explain)
     tried = [*_ideal(trial), *_exact(trial)]
-    with ThreadPoolExecutor(1) as other:  # what one fits and the other looks at has nothing to do with each other
+    # What one thread fits and the other looks at has nothing to do with each other. A film beyond the end of a model's
+    # range is not told of: its error counts.
+    with warnings.catch_warnings(), ThreadPoolExecutor(1) as other:
+        warnings.simplefilter("ignore", NeurolensWarning)
         shipped = other.submit(_shipped, trial, models)
         if not explain:  # what the lens adds to the light
             other.submit(lambda: found.maps)
         fitted = [] if folder is None else _fitted(trial, folder, tried, lambda done, left=None: say(0.2 + 0.6 * done))
         tried += shipped.result() + fitted
-    say(0.8)
-    return tuple(_costed(trial, tried))
+        say(0.8)
+        return tuple(_costed(trial, tried))
 
 
 def decided(found: Probed, tried: Sequence[Choice], budget_px: float, target: Target) -> Plan:

@@ -138,10 +138,10 @@ def meet(lens: Lens, k: int, r: Rays, before: Medium, entering: bool, mode: Mode
     else:
         hit = intersect_shape(r, surface, mode, before)
     tests.require(hit.met, k, st.MISSED)
-    if _is_deep(surface):
+    if is_deep(surface):
         # By its depth: a point on the far half of the sphere may be near the axis, but there is no glass.
         depth = hit.z * surface.curvature
-        tests.require(at_most(depth, 1 - math.sqrt(1 - _rim_sine(surface) ** 2), spend=mode.spend), k, st.RIM)
+        tests.require(at_most(depth, 1 - math.sqrt(1 - rim_sine(surface) ** 2), spend=mode.spend), k, st.RIM)
     else:
         distance2 = (hit.x * hit.x).addcmul_(hit.y, hit.y)
         if plane:
@@ -187,14 +187,27 @@ def along_axis(r: Rays, tests: Survival, sense: int, z: Any) -> Rays:
     return Rays(*(tests.only(c, a) for a, c in zip(on_axis, r, strict=True)))
 
 
-def _is_deep(surface: Surface) -> bool:
+def unfolded(surface: Surface, hit: Hit) -> tuple[Tensor, Tensor]:
+    """x and y of a meeting, [N] each, mm; on the far half of a deep sphere mirrored outwards at its equator.
+
+    So the distance from the axis grows on beyond a deep rim, where it would fall again, and tells the half.
+    """
+    if not is_deep(surface):
+        return hit.x, hit.y
+    height = torch.hypot(hit.x, hit.y).clamp_min(1e-300)
+    outwards = torch.where(hit.z * surface.curvature > 1, 2 * abs(surface.radius_mm) / height - 1, 1.0)
+    return hit.x * outwards, hit.y * outwards
+
+
+def is_deep(surface: Surface) -> bool:
     """Whether a sphere's depth at its rim tells heights as exactly as their squares do."""
     if isinstance(surface.radius_mm, Tensor) or not is_plain(surface):
         return False
-    return DEEP < _rim_sine(surface) <= 1
+    return DEEP < rim_sine(surface) <= 1
 
 
-def _rim_sine(surface: Surface) -> float:
+def rim_sine(surface: Surface) -> float:
+    """Rim radius over radius of curvature."""
     return abs(surface.semi_diameter_mm * surface.curvature)
 
 

@@ -17,7 +17,18 @@ from torch.autograd import forward_ad
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.optics import glass
-from neurolens.optics.passing import Mode, along_axis, bend, check_rays, media, meet, sound_wavelength, start, unit
+from neurolens.optics.passing import (
+    Mode,
+    along_axis,
+    bend,
+    check_rays,
+    media,
+    meet,
+    sound_wavelength,
+    start,
+    unfolded,
+    unit,
+)
 from neurolens.optics.prescription import Lens
 from neurolens.optics.shapes import start_of
 from neurolens.optics.surfaces import Counts, Rays, times
@@ -35,7 +46,8 @@ _FEWER = 0.8
 class Crossing(NamedTuple):
     """Where rays cross one surface, each [N]; mm, and the margins of Snell's and the sphere's square roots.
 
-    `meets` is positive where the ray meets the surface, `refracts` where it is not totally reflected there.
+    `meets` is positive where the ray meets the surface, `refracts` where it is not totally reflected there. Points on
+    the far half of a sphere, beyond any rim, lie mirrored outwards (see `passing.unfolded`).
     """
 
     x: Tensor
@@ -224,7 +236,8 @@ def _trace_chunk(
         if power is not None:
             power.pass_surface(k, r, hit, bent, q, before, after)
         if k in wanted.record:
-            crossings[k] = Crossing(hit.x, hit.y, times(hit.q2, before.inverse_n2), times(q2, after.inverse_n2))
+            margins = times(hit.q2, before.inverse_n2), times(q2, after.inverse_n2)
+            crossings[k] = Crossing(*unfolded(lens.surfaces[k], hit), *margins)
         # A lost ray goes on along the axis: no overflow there can reach the gradients of the others.
         r = along_axis(bent, tests, sense, 0.0) if freeze else bent
         if wanted.path:

@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from neurolens.base import status as st
-from neurolens.optics.prescription import Lens
+from neurolens.optics.passing import is_deep, rim_sine
+from neurolens.optics.prescription import Lens, Surface
 from neurolens.surrogates.model import Gate
-from neurolens.surrogates.pairs import PairSet, RayPairs, join_pairs, reached
+from neurolens.surrogates.pairs import RIM_REACH, PairSet, RayPairs, join_pairs, reached
 
 # Rays of the boundary fits are mixed by this seed: networks use the first of them.
 _MIXING_SEED = 1
@@ -49,13 +50,27 @@ def gate_values(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
     for gate in gates:
         k = gate.surface
         if gate.reason == st.RIM:
-            radius = lens.surfaces[k].semi_diameter_mm
-            rows.append((pairs.cross_x[k] ** 2 + pairs.cross_y[k] ** 2) / radius**2 - 1)
+            rows.append(_beyond_rim(lens.surfaces[k], torch.hypot(pairs.cross_x[k], pairs.cross_y[k])))
         else:
             rows.append(-(pairs.meets[k] if gate.reason == st.MISSED else pairs.refracts[k]))
     if not rows:
         return torch.empty((0, len(pairs)), dtype=pairs.transmittance.dtype)
     return torch.where(gate_reach(gates, pairs), torch.stack(rows), 0.0)
+
+
+def _beyond_rim(surface: Surface, height: Tensor) -> Tensor:
+    """[N] a rim's gate at crossings `height` [N] mm from the axis: squares over the rim's, less 1.
+
+    Where the rays that tell of a rim go on to its sphere's equator the square turns there, and a fit of it tells
+    nothing: there it is the depth over the rim's, which to first order is the same and never turns.
+    """
+    if not (is_deep(surface) and RIM_REACH * rim_sine(surface) > 1):
+        return height**2 / surface.semi_diameter_mm**2 - 1
+    sine = height * abs(surface.curvature)
+    near = sine <= 1
+    cosine = torch.sqrt((1 - torch.where(near, sine, 2 - sine) ** 2).clamp_min(0.0))
+    depth = 1 - torch.where(near, cosine, -cosine)
+    return depth / (1 - math.sqrt(1 - rim_sine(surface) ** 2)) - 1
 
 
 def boundary_weights(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> tuple[Tensor, Tensor]:

@@ -39,7 +39,8 @@ ANY_WAVELENGTH_NM = (1e-30, 3e38)
 class Gate:
     """A boundary that blocks rays: the scalar output is positive where surface `surface` stops the ray for `reason`.
 
-    `reason` RIM: scalar = (r / rim radius)^2 - 1. MISSED or TOTAL_REFLECTION: the negated discriminant.
+    `reason` RIM: scalar = (r / rim radius)^2 - 1, or of depths where a sphere ends near its rim. MISSED or
+    TOTAL_REFLECTION: the negated discriminant.
     """
 
     surface: int

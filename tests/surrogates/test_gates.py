@@ -16,7 +16,7 @@ from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.surrogates.cores import InvariantPolynomial
-from neurolens.surrogates.domain import SPARSE, Domain, domain_of, lit_share, sample_domain, sample_lit
+from neurolens.surrogates.domain import SPARSE, Domain, FilmRays, domain_of, lit_share, sample_domain, sample_lit
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.fits.polynomial import fit_polynomial
@@ -119,6 +119,26 @@ def test_gate_values_say_what_stopped_each_ray() -> None:
         # But for the few that meet the far half of the ball.
         assert (value[rays.status == gate.status] >= 0).double().mean() > 0.999
         assert (value[rays.status == st.PASSED] < 0).all()
+
+
+def test_a_rim_near_the_end_of_its_sphere_is_told_beyond_the_equator() -> None:
+    """A bowl seen from inside, past its equator: what its rim stops has a gate above 0 that only grows."""
+    bowl = Surface(13.5, 20.0, 26.9)
+    surfaces = (Surface(40.0, 3.0, 60.0, 1.78, 25.0), bowl, Surface(math.inf, 0.5, 22.0, stop=True))
+    lens = Lens("bowl", "", surfaces, 2.0, path="bowl.toml")
+    pupil_z, angle = float(lens.vertices_mm[2]), torch.deg2rad(torch.linspace(1, 86, 200, dtype=torch.float64))
+    zero, at = torch.zeros_like(angle), 0.5 * torch.tan(angle)
+    rays = FilmRays(zero, zero, zero + pupil_z + 0.5, at, zero, zero + 550.0)
+    traced = trace_pairs(lens, rays, pupil_z)
+    value = gate_values(lens, (Gate(1, st.RIM),), traced)[0]
+    exact = 20.5 - torch.tan(math.pi / 2 - angle) * traced.cross_x[1]  # depth of the crossing, on the near half
+    stopped = traced.status == st.blocked(1, st.RIM)
+    assert 3 < int(stopped.sum()) < 150
+    assert torch.equal(value > 0, stopped)
+    assert (value.diff()[value[1:] > -0.5] > 0.5 * value.diff().max()).all()
+    near = exact <= 13.5
+    limit = 13.5 - math.sqrt(13.5**2 - 13.45**2)
+    torch.testing.assert_close(value[near & ~stopped], exact[near & ~stopped] / limit - 1, rtol=0, atol=1e-9)
 
 
 def test_only_rays_that_refract_all_the_way_choose_rims() -> None:
