@@ -30,14 +30,14 @@ class GhostView {
       if (this.film) this.gpu.free(this.film);
       this.film = this.gpu.target(width, height, null, 1, !this.gpu.blends);
     }
-    if (key !== this.kept?.key || known < this.kept.count) {
+    if (key !== this.kept?.key || known < this.kept.count || !this.kept.irradiance) {
       gl.bindFramebuffer(gl.FRAMEBUFFER, this.film.frame);
       gl.disable(gl.SCISSOR_TEST);
       gl.clearColor(0, 0, 0, 0);
       gl.clear(gl.COLOR_BUFFER_BIT);
       this.kept = { key, irradiance, count: 0 };
     }
-    this.dimmed = irradiance / this.kept.irradiance;
+    this.dimmed = irradiance && irradiance / this.kept.irradiance;
     const d = towards.map((v) => -v), inside = Math.hypot(d[0], d[1]) <= ghosts.sine;
     const [low, high] = [0, 1].map((k) => (values.wavelength_nm ? values.wavelength_nm : k ? Math.min(values.light_nm[1], ghosts.wavelength_nm[1]) : Math.max(values.light_nm[0], ghosts.wavelength_nm[0])));
     for (const ghost of inside ? all.slice(this.kept.count, known) : []) {
