@@ -39,7 +39,7 @@ LENSES = (
 )  # fmt: skip
 SHIPPED_TERMS = 64
 _NEAR = 1.05  # of the nearest focus of models
-TERMS = (4, 6, 8, 11, 14, 18, 23, 28, 36, 46, SHIPPED_TERMS)
+TERMS = range(4, SHIPPED_TERMS + 1)
 
 
 @dataclass(frozen=True)
