@@ -15,6 +15,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.progress import Report
 from neurolens.cameras.arcs_passing import passing
 from neurolens.cameras.pupil_arcs import PupilArcs
+from neurolens.cameras.pupil_arcs_tune import moved
 from neurolens.cameras.pupil_boxes import asking, end_of_light, frame_of
 from neurolens.cameras.pupil_sight import Sight, Truths, imaged, turned
 from neurolens.graph.interpret import evaluate
@@ -124,6 +125,10 @@ def fit_arcs(sights: Sequence[Sight], report: Report, between: Sequence[tuple[Ar
     single = len(sights) == 1
     if not single:  # refitted by themselves, nodes hold less of what lies between them
         return _by(_WAYS[0], sights, report, between)[0]
+    if not sights[0].anamorphic:
+        arcs, lost = moved(*_begun(_WAYS[0], sights, report), sights[0], report)
+        if lost <= _LOST and min(passing(sights[0], arcs).values()) >= _GOAL:
+            return [arcs]
     ways = _ANAMORPHIC if sights[0].anamorphic else _WAYS
     kept: list[PupilArcs] = []
     best, lost = -1.0, 1.0
@@ -142,20 +147,24 @@ def _by(
     way: Way, sights: Sequence[Sight], report: Report, between: Sequence[tuple[Array, Sight]] = ()
 ) -> tuple[list[PupilArcs], float]:
     """Arcs with numbers, and `_lost`."""
-    places = []
-    for k, sight in enumerate(sights):
-        places.append(_places(way, sight, partial(_within, report, 0.6 * k / len(sights), 0.6 / len(sights))))
+    nodes = _begun(way, sights, partial(_within, report, 0.0, 0.6))[0]
+    seen = [*zip(np.eye(len(nodes)), sights, strict=True), *between]
+    inside = partial(_within, report, 0.6, 0.4)
+    nodes = [_dilated(nodes[0], sights[0], inside)] if _by_zones(sights[0]) else _widened(nodes, seen, inside)
+    return nodes, max(_lost(*of_one) for of_one in zip(sights, nodes, strict=True))
+
+
+def _begun(way: Way, sights: Sequence[Sight], report: Report) -> tuple[list[PupilArcs], float]:
+    """Arcs through the ends of the light, and half the width of the pupil (mm)."""
+    parts = [partial(_within, report, k / len(sights), 1 / len(sights)) for k in range(len(sights))]
+    places = [_places(way, *of_one) for of_one in zip(sights, parts, strict=True)]
     nodes = _empty(way, sights, places)
     edges = [_edge(*of_one) for of_one in zip(sights, nodes, places, strict=True)]
     blocked = {side: max(int((edge.side == side).sum()) for edge in edges) for side in (0, 1, -1)}
     if blocked[0] < _FEWEST:
         raise InputError("export", "stop", "(blocks nothing)", "a lens whose stop blocks light")
     sides = tuple(side for side, vertices in blocked.items() if vertices >= _FEWEST)
-    nodes = _fitted(way, sights, nodes, edges, sides)
-    seen = [*zip(np.eye(len(nodes)), sights, strict=True), *between]
-    inside = partial(_within, report, 0.6, 0.4)
-    nodes = [_dilated(nodes[0], sights[0], inside)] if _by_zones(sights[0]) else _widened(nodes, seen, inside)
-    return nodes, max(_lost(*of_one) for of_one in zip(sights, nodes, strict=True))
+    return _fitted(way, sights, nodes, edges, sides), float(np.ptp(edges[0].x)) / 2
 
 
 def _by_zones(sight: Sight) -> bool:
@@ -232,18 +241,9 @@ def _places(way: Way, sight: Sight, report: Report) -> _Places:
             across = (frame.reach[:, None] * v[:, None] for v in frame.stretch)
             x, y = (way * side for way, side in zip(across, (np.cos(_ANGLES), np.sin(_ANGLES)), strict=True))
             shape = (len(ends), *x.shape)
-            rows = (
-                radius[:, None],
-                frame.centre[:, None],
-                x,
-                y,
-                z,
-                stop,
-                np.reshape(ends, (-1, 1, 1)),
-                _ANGLES,
-                azimuth,
-            )
-            found.append([np.broadcast_to(row, shape).ravel() for row in rows])
+            row = radius[:, None], frame.centre[:, None], x, y, z, stop
+            rows = *row, np.reshape(ends, (-1, 1, 1)), _ANGLES, azimuth
+            found.append([np.broadcast_to(one, shape).ravel() for one in rows])
             # The next stop's pupil lies within this one's.
             around = frame.centre - _WIDER * frame.stretch[0], frame.centre + _WIDER * frame.stretch[0]
             even = np.linspace(0, film_radius, way.rows)

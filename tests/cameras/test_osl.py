@@ -15,7 +15,8 @@ from neurolens.cameras.arcs_passing import passing
 from neurolens.cameras.blades import Blades
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.onnxlens import load_model
-from neurolens.cameras.pupil_arcs import unit_disc
+from neurolens.cameras.pupil_arcs import PupilArcs, unit_disc
+from neurolens.cameras.pupil_sight import Sight
 from neurolens.cli import main
 from neurolens.evaluate.shaders import exact_lens
 from neurolens.graph.interpret import evaluate
@@ -214,10 +215,28 @@ def test_arcs_of_an_anamorphic_lens_lose_no_light_in_any_zone_of_the_film(monkey
     (arcs,) = pupil_arcs_fit.fit_arcs([plain], lambda share: None)
     assert arcs.image is not None
     sight = replace(plain, graph=arcs.image.before(plain.graph))
-    rng, count, stop = np.random.default_rng(21), 400_000, plain.stop_radius_mm
+    counts, missed = missed_by_zone(sight, arcs, 1.5 * plain.stop_radius_mm)  # in the image of the stop
+    assert (counts > 1000).all()
+    assert (missed <= 1e-3 * counts).all()
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_arcs_of_a_round_lens_lose_no_light_in_any_zone_of_the_film(share: float) -> None:
+    sight, arcs = written().sight, written().arcs
+    low, high, half = sight.table.rows
+    reach = (0.6 + 0.4 * share) * float(np.abs([low, high, half])[:, low <= high].max())
+    counts, missed = missed_by_zone(sight, arcs, reach, share)
+    counts, missed = (row.reshape(5, 4).sum(1) for row in (counts, missed))  # all sides are the same
+    assert (counts > 2000).all()
+    assert (missed <= 1e-3 * counts).all()
+
+
+def missed_by_zone(sight: Sight, arcs: PupilArcs, reach: float, share: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Of random rays through a box, those that pass and those of them beyond the arcs: of five parts of the film's
+    radius and of four of its half turn."""
+    rng, count, stop = np.random.default_rng(21), 400_000, share * sight.stop_radius_mm
     place = np.sqrt(rng.random(count)), 2 * np.pi * rng.random(count)
     film = arcs.film_radius_mm * place[0] * np.stack([np.cos(place[1]), np.sin(place[1])])
-    reach = 1.5 * stop  # in the image of the stop
     pupil, z, nm = rng.uniform(-reach, reach, (2, count)), *(rng.uniform(*span, count) for span in (
         sight.film_z_mm, sight.wavelength_nm))  # fmt: skip
     passed = sight.status(film, pupil, nm, z, stop) == 0
@@ -229,9 +248,7 @@ def test_arcs_of_an_anamorphic_lens_lose_no_light_in_any_zone_of_the_film(monkey
     found = evaluate(arcs.checked, given)
     missed = ((found["left"] < 0) | (found["right"] < 0) | (found["height"] < turn.imag**2)).any(0)
     zone = (place[0] * 5).astype(int) * 4 + (place[1] * 4 / np.pi).astype(int) % 4
-    counts = np.bincount(zone[passed], minlength=20)
-    assert (counts > 1000).all()
-    assert (np.bincount(zone[passed], missed, 20) <= 1e-3 * counts).all()
+    return np.bincount(zone[passed], minlength=20), np.bincount(zone[passed], missed, 20)
 
 
 def test_arcs_that_let_little_pass_are_fitted_again_and_lose_no_light() -> None:

@@ -1,0 +1,296 @@
+"""Moves the arcs of `pupil_arcs` to where they hold the rays that pass a lens, and as few others as they can.
+
+Rays near the arcs either pass, and should lie inside every arc, or are blocked, and should lie outside the arc of what
+blocks them: arcs are lines between two kinds of points. Newton's rule takes their numbers to the least sum of how
+far rays lie on the wrong side; those that pass weigh more, zone by zone of the film, until few enough are lost there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.base import status as st
+from neurolens.base.progress import Report
+from neurolens.cameras.pupil_arcs import PupilArcs
+from neurolens.cameras.pupil_sight import Sight, Truths, turned
+from neurolens.graph.interpret import evaluate
+
+Array = NDArray[np.float64]
+_RAYS = 90_000  # random ones, of an anamorphic lens twice as many
+_ZONES, _FEW = (
+    (8, 3, 3),
+    400,
+)  # of the root of the film radius (exposure is of the axis), stop and azimuth; rays that tell of one
+_ALL = int(np.prod(_ZONES)) + _ZONES[0]  # and of film radius alone, for the others
+_BAND, _ALL_OVER = (0.75, 1.2), 0.15  # of arcs, from their middle, where rays are told apart; share of rays anywhere
+_WITHIN = 0.45  # of the light of a pupil lies in that band
+_ROUNDS, _MOST = 7, 4  # of Newton's rule with the same rays, and draws of rays
+_WIDTHS = (
+    0.02,
+    0.01,
+    0.005,
+    0.003,
+)  # of an arc's step, in half widths of the pupil, by rays drawn
+_GOAL, _ENOUGH = 2e-4, 4e-4  # of rays that pass, in a zone, that may be lost; of others, where it is done
+_HEAVY, _HEAVIER, _LIGHTEST, _HEAVIEST = 10.0, 1.6, 2.0, 3e4  # weight of rays that pass: at first, its step, ends
+_DEEP = 0.08  # half widths of the pupil: blocked rays deeper inside are given up
+_FLOOR, _CALM, _CALM_SHARE = 0.05, 0.002, 0.05  # of curvature: near an arc, far from it; share of those rays that count
+_HALVINGS, _MORE = 6, 2e-3  # of a step by which arcs would lose so many more rays of a zone
+_LOST = 7e-4  # of random rays that check, where a margin is enough
+_CHECK_SEED, _DRAWS, _TELLING = 20, 3, 2500  # fewer rays of a zone do not tell
+_MARGINS, _RIMS = (
+    (0.0, 0.001, 0.002, 0.003, 0.005, 0.008),
+    4.0,
+)  # that widen arcs which lose light, rims by so much more
+_SMALLEST = 0.05  # stop, of the widest, that pupils are scaled by
+_RIDGE = 1e-6
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """Random rays [N] of a lens whose numbers are a mixture of those of nodes.
+
+    Attributes:
+        weights: of the nodes. monomials: [M, N] of `PupilArcs.exponents`. x, y: in the frame of the film point.
+        passed, of_stop: what becomes of them: the stop blocks them. zone: see `zones_of`. unit: half the
+            pupil's width.
+    """
+
+    weights: Array
+    monomials: Array
+    x: Array
+    y: Array
+    passed: Truths
+    of_stop: Truths
+    zone: NDArray[np.intp]
+    unit: Array
+
+    def shares(self, these: Truths) -> Array:
+        """[Z] of rays that pass in each zone."""
+        count, found = (np.bincount(self.zone[own], minlength=_ALL) for own in (self.passed, self.passed & these))
+        return np.asarray(_WITHIN * found / np.maximum(count, 1))
+
+    def within(self, numbers: Array, sides: Sequence[int]) -> Array:
+        """[A, N] the margins in every arc of nodes' numbers."""
+        own = np.tensordot(self.weights, numbers, 1)
+        return np.stack([self.margins(a, side)[0] for a, side in zip(own, sides, strict=True)])
+
+    def margins(self, numbers: Array, side: int) -> tuple[Array, list[Array | None], Array]:
+        """How far rays lie within an arc [4, M], in half widths of the pupil, and its slopes by the arc's four."""
+        low, high, first, change = numbers @ self.monomials
+        left, right, by_low, by_high = self.x - low, high - self.x, None, None
+        if side == 0:
+            away, wide = left, first + change * left
+            height, reach, ends = left * right * wide, right * left, np.minimum(left, right)
+            by_low, by_high = -right * (wide + left * change), left * wide
+        else:
+            away = ends = reach = right if side > 0 else left
+            height, slope = away * (first + change * away), first + 2 * change * away
+            by_low, by_high = (None, slope) if side > 0 else (-slope, None)
+        along = sum(-row for row in (by_low, by_high) if row is not None)
+        scale = (np.hypot(along, 2 * self.y) + 1e-9) * self.unit
+        return np.minimum((height - self.y**2) / scale, ends / self.unit), [by_low, by_high, reach, reach * away], scale
+
+
+def moved(nodes: list[PupilArcs], half_mm: float, sight: Sight, report: Report) -> tuple[PupilArcs, float]:
+    """The arcs of a lens in one state, moved, and the share of the rays of the worst zone that they lose.
+
+    Args:
+        nodes: the arcs. half_mm: half the width of the pupil.
+    """
+    (arcs,) = _tuned(nodes, [(np.ones(1), sight)], report)
+    rays, stop, codes = random_rays(sight, arcs, np.random.default_rng(_CHECK_SEED), draws=_DRAWS)
+    passed = codes == st.PASSED
+    rays, stop = {name: row[:, passed] for name, row in rays.items()}, stop[passed]
+    zone = zones_of(arcs, rays, scaled_of(arcs, rays, stop), np.ones(stop.size, bool))
+    for margin in _MARGINS:
+        wider = _wider(arcs, rays, margin, half_mm)
+        found = evaluate(wider.checked, rays)
+        inside = (found["left"] >= 0) & (found["right"] >= 0) & (found["height"] >= rays["pupil_mm"][1] ** 2)
+        counts, missed = (np.bincount(zone, own, _ALL) for own in (None, ~inside.all(0)))
+        if (lost := float((missed / np.maximum(counts, _TELLING)).max())) <= _LOST:
+            break
+    return wider, lost
+
+
+def _wider(arcs: PupilArcs, rays: dict[str, Array], margin: float, half_mm: float) -> PupilArcs:
+    """The arcs, moved outwards by a share of half the pupil's width."""
+    numbers, changes = arcs.numbers.copy(), evaluate(arcs.checked, rays)["change"].min(1)
+    for own, side, change in zip(numbers, arcs.sides, changes, strict=True):
+        step = margin * half_mm * (_RIMS if side else 1.0)
+        still, along = ((arcs.exponents == (0, power, 0, 0, 0)).all(1) for power in (0, int(side == 0)))
+        own[0] -= step * along * (side <= 0)
+        own[1] += step * along * (side >= 0)
+        own[2] += (step * (1 + 2 * max(-float(change), 0.0)) if side else margin) * still  # the far end of a rim, too
+    return replace(arcs, numbers=numbers)
+
+
+def _tuned(nodes: list[PupilArcs], seen: Sequence[tuple[Array, Sight]], report: Report) -> list[PupilArcs]:
+    """The arcs, moved; `seen`: weights of nodes, and the lens there."""
+    numbers, weight = np.stack([a.numbers for a in nodes]), np.full((len(seen), _ALL), _HEAVY)
+    used = [_used(nodes, arc, side) for arc, side in enumerate(nodes[0].sides)]
+    for seed in range(_MOST):
+        width, drawn = _WIDTHS[min(seed, len(_WIDTHS) - 1)], []
+        for weights, sight in seen:
+            arcs = nodes[0].mixed(nodes[1:], weights)
+            drawn.append(_drawn(sight, replace(arcs, numbers=np.tensordot(weights, numbers, 1)), weights, seed))
+        for k in range(_ROUNDS + 1):
+            report((seed + k / _ROUNDS) / _MOST)
+            within = [rays.within(numbers, nodes[0].sides) for rays in drawn]
+            lost = np.stack([rays.shares(np.any(own < 0, axis=0)) for rays, own in zip(drawn, within, strict=True)])
+            if k == 0 and seed >= len(_WIDTHS) - 1 and lost.max() < _ENOUGH:  # of rays that it has not been fitted to
+                break
+            weight = (weight * ((lost + _GOAL / 5) / (_GOAL * 1.2)).clip(1 / _HEAVIER, _HEAVIER)).clip(
+                _LIGHTEST, _HEAVIEST
+            )
+            if k < _ROUNDS:
+                blame = [_blame(rays, own, nodes[0].sides) for rays, own in zip(drawn, within, strict=True)]
+                for node, arc in np.ndindex(numbers.shape[:2]):
+                    _step(numbers, node, arc, nodes[0].sides[arc], used[arc], drawn, blame, weight, width)
+        else:
+            continue
+        break
+    return [replace(a, numbers=own) for a, own in zip(nodes, numbers, strict=True)]
+
+
+def _used(nodes: list[PupilArcs], arc: int, side: int) -> list[Truths]:
+    """[M] of each of the arc's four: the terms that it has, of all its nodes."""
+    powers, found = nodes[0].exponents, []
+    coloured = any(a.numbers[arc][:, powers[:, 3] > 0].any() for a in nodes)
+    for row, ends in enumerate((side <= 0, side >= 0, False, False)):
+        own = (powers[:, 1] == 0) | (side == 0)  # rims do not move with the stop
+        white = powers[:, 3] == 0
+        found.append(own & (white | coloured) & ends if row < 2 else own & white)
+    return found
+
+
+def _blame(rays: _Rays, within: Array, sides: Sequence[int]) -> NDArray[np.intp]:
+    """[N] the arc beyond which a blocked ray should lie: the stop's, or the nearest of the rims'."""
+    rims = np.flatnonzero(sides)
+    if not rims.size:
+        return np.zeros(rays.x.size, np.intp)
+    return np.where(rays.of_stop, 0, rims[within[rims].argmin(0)])
+
+
+def _step(
+    numbers: Array, node: int, arc: int, side: int, used: list[Truths], drawn: Sequence[_Rays],
+    blame: Sequence[NDArray[np.intp]], weight: Sequence[Array], width: float,
+) -> None:  # fmt: skip
+    """One step of Newton's rule for an arc of a node."""
+    parts, slopes, near, seen = [], [], [], []
+    for rays, blamed, heavy in zip(drawn, blame, weight, strict=True):
+        share = float(rays.weights[node])
+        if abs(share) < 0.1:
+            continue
+        within, by, scale = rays.margins(np.tensordot(rays.weights, numbers[:, arc], 1), side)
+        beside = np.where(
+            rays.passed, within < 8 * width, (blamed == arc) & (within > -6 * width) & (within < 4 * _DEEP)
+        )
+        calm = np.random.default_rng(1).random(within.size) < _CALM_SHARE
+        rows = np.flatnonzero(beside | (rays.passed & calm))
+        factors = [(row[rows] * share / scale[rows], own) for row, own in zip(by, used, strict=True) if row is not None]
+        slopes.append(np.concatenate([rays.monomials[np.ix_(own, rows)] * row for row, own in factors]))
+        own, passed = within[rows], rays.passed[rows]
+        in_it = 1 / (1 + np.exp(-np.clip(own / width, -40, 40)))
+        force = np.where(passed, heavy[rays.zone[rows]], 1.0)
+        pull = np.where(passed, -force * (1 - in_it), in_it * np.exp(-np.maximum(own, 0) / _DEEP))
+        close = np.abs(own) < 8 * width
+        least = np.where(close, _FLOOR, _CALM / (1 + np.abs(own)) ** 2)
+        parts.append((pull, np.maximum(force * in_it * (1 - in_it), least) / width))
+        near.append(close)
+        seen.append((rays, rays.shares(within < 0)))
+    if not slopes or not any(row.any() for row in near):
+        return
+    rows = np.concatenate(slopes, 1)
+    pull, curve = (np.concatenate(row) for row in zip(*parts, strict=True))
+    matrix = (rows * curve) @ rows.T
+    size = np.sqrt(np.diag(matrix)) + 1e-30
+    matrix = matrix / size / size[:, None] + _RIDGE * np.eye(size.size)
+    step = -np.linalg.solve(matrix, rows @ pull / size) / size
+    step *= min(1.0, 2 * width / float(np.quantile(np.abs(step @ rows[:, np.concatenate(near)]), 0.98)))
+    places = np.concatenate([np.flatnonzero(own) + k * own.size for k, own in enumerate(used)])
+    before = numbers[node, arc].copy()
+    for _ in range(_HALVINGS):
+        numbers[node, arc].flat[places] = before.flat[places] + step
+        worse = 0.0
+        for rays, lost in seen:
+            within = rays.margins(np.tensordot(rays.weights, numbers[:, arc], 1), side)[0]
+            worse = max(worse, float((rays.shares(within < 0) - lost).max()))
+        if worse < _MORE:
+            return
+        step = step / 2
+    numbers[node, arc] = before
+
+
+def _drawn(sight: Sight, arcs: PupilArcs, weights: Array, seed: int) -> _Rays:
+    rng = np.random.default_rng(100 + seed)
+    given, stop, codes = random_rays(sight, arcs, rng, near=True)
+    scaled = scaled_of(arcs, given, stop)
+    monomials = np.ones((len(arcs.exponents), stop.size))
+    for row, powers in zip(monomials, arcs.exponents, strict=True):
+        for value, power in zip(scaled, powers, strict=True):
+            if power:
+                row *= value**power
+    passed, of_stop = codes == st.PASSED, codes == st.blocked(sight.stop_surface, st.RIM)
+    x, y = given["pupil_mm"]
+    if not passed.any():
+        passed[0] = True
+    unit = np.maximum(scaled[1], _SMALLEST) * float(np.abs(y[passed]).max())
+    return _Rays(weights, monomials, x, y, passed, of_stop, zones_of(arcs, given, scaled, passed), unit)
+
+
+def scaled_of(arcs: PupilArcs, rays: dict[str, Array], stop: Array) -> Array:
+    """`PupilArcs.scaled` of rays of `random_rays`."""
+    azimuth = np.arccos(rays["twice"][0]) / 2
+    return arcs.scaled(rays["film_mm"][0], stop, rays["film_z_mm"][0], rays["wavelength_nm"][0], azimuth)
+
+
+def zones_of(arcs: PupilArcs, rays: dict[str, Array], scaled: Array, passed: Truths) -> NDArray[np.intp]:
+    """[N] zones of rays of `random_rays` by film radius, stop and azimuth; few rays by film radius alone."""
+    shares = (
+        np.sqrt(rays["film_mm"][0] / rays["film_mm"][0].max()),
+        scaled[1] * 0.7501,
+        (1 + scaled[4]) / 2,
+    )  # the widest stop alone
+    places = [np.minimum(share * n, n - 1).astype(np.intp) for share, n in zip(shares, _ZONES, strict=True)]
+    own = np.ravel_multi_index(places, _ZONES)
+    few = np.bincount(own[passed], minlength=np.prod(_ZONES))[own] < _FEW
+    return np.where(few, np.prod(_ZONES) + places[0], own).astype(np.intp)
+
+
+def random_rays(
+    sight: Sight, arcs: PupilArcs, rng: np.random.Generator, near: bool = False, draws: int = 1
+) -> tuple[dict[str, Array], Array, NDArray[np.int32]]:
+    """Random rays from film points on +x, as inputs of `PupilArcs.checked`, stops, and what becomes of them.
+
+    Narrow stops are seldom met by rays all over the table: most go to the middle of the arcs, or `near` to their edge.
+    """
+    count = _RAYS * draws * (1 + sight.anamorphic)
+    radius = arcs.film_radius_mm * rng.random(count) * 0.9999
+    stop = sight.stop_radius_mm * rng.choice(np.append(np.linspace(0.08, 1, 12), [1.0] * 4), count)
+    film_z, nm = (rng.uniform(*span, count) for span in (sight.film_z_mm, sight.wavelength_nm))
+    azimuth = np.pi / 2 * rng.random(count) * sight.anamorphic
+    place: Array = turned(np.stack([radius, 0 * radius]), azimuth).astype(np.float64)
+    x, y = place * [[1.0], [arcs.squeeze]]
+    radius, azimuth = np.hypot(x, y), np.arctan2(y, x)
+    radii = np.linspace(0, sight.table.film_radius_mm, sight.table.rows.shape[1])
+    low, high, half = (np.interp(radius, radii, a) for a in sight.table.rows)
+    pupil = np.stack([low + (high - low) * rng.random(count), half * rng.random(count)])
+    pupil[1] *= rng.choice([-1.0, 1.0], count) if sight.anamorphic else 1.0
+    square, wide = rng.random((2, count)), np.full(count, 1.25)
+    if near:  # points on the edge of the square are those on the edge of the arcs
+        square[0], wide = np.round(square[0]), np.sqrt(rng.uniform(_BAND[0] ** 2, _BAND[1] ** 2, count))
+        square = np.where(rng.random(count) < 0.5, square, square[::-1])
+    given = {"square": square, "stop_radius_mm": stop[None], "film_mm": place}
+    given |= {"film_z_mm": film_z[None], "wavelength_nm": nm[None]}
+    edge = turned(evaluate(arcs.graph, given)["pupil_mm"], -azimuth)
+    middle = turned(evaluate(arcs.graph, given | {"square": np.full((2, count), 0.5)})["pupil_mm"], -azimuth)
+    all_over = rng.random(count) < (_ALL_OVER if near else 0.3)
+    pupil = np.where(all_over, pupil, middle + wide * (edge - middle))
+    codes = sight.status(place, turned(pupil, azimuth), nm, film_z, stop)
+    given |= {"film_mm": np.stack([radius, 0 * radius]), "pupil_mm": pupil, "twice": np.cos(2 * azimuth)[None]}
+    return given, stop, codes
