@@ -288,8 +288,8 @@ def arcs_inputs(film: np.ndarray, square: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def film_z(focus_m: float, stop_mm: float) -> np.ndarray:
-    share, vergence = stop_mm / written().sight.stop_radius_mm, written().near_m / focus_m
-    return np.array([[np.polynomial.polynomial.polyval2d(share, vergence, written().film)]])
+    share, vergence = stop_mm / written().sight.stop_radius_mm, written().nearest_m[0] / focus_m
+    return np.array([[np.polynomial.polynomial.polyval2d(share, vergence, written().film[0])]])
 
 
 def test_film_is_where_the_camera_of_the_model_has_it() -> None:
