@@ -326,12 +326,12 @@ def _light(camera: OslCamera, random: Value, in_colour: Value) -> tuple[Value, V
     return nanometres, g.select(grey, 1.0, colour)
 
 
-def _samples(sight: Sight, arcs: PupilArcs, count: int = 16384) -> dict[str, NDArray[np.float32]]:
-    """Rays through the arcs, as inputs of the lens's graph, and `at_stop` of the sampler."""
+def _samples(sight: Sight, arcs: PupilArcs, count: int = 32768) -> dict[str, NDArray[np.float32]]:
+    """Rays through the arcs, nearly half at the widest stop, as inputs of the lens's graph; `at_stop` of the arcs."""
     rng = np.random.default_rng(0)
     angle, radius = 2 * np.pi * rng.random(count), 0.99 * arcs.film_radius_mm * np.sqrt(rng.random(count))
     film = radius * np.stack([np.cos(angle), np.sin(angle)])
-    stop = (sight.stop_radius_mm * rng.uniform(0.2, 1, count))[None]
+    stop = sight.stop_radius_mm * rng.uniform(0.2, 1.6, (1, count)).clip(max=1)
     given = {"film_mm": film, "square": rng.random((2, count)), "stop_radius_mm": stop}
     given |= {
         "film_z_mm": rng.uniform(*sight.film_z_mm, (1, count)),
