@@ -87,9 +87,10 @@ class ViewLens:
 def write_page(
     out: Path, lenses: Sequence[ViewLens], kinds: Sequence[str], most_bytes: int = MOST_BYTES
 ) -> dict[str, Any]:
-    """Write the page; of the `kinds` of files that it brings, "glsl" first, the last go where they do not fit.
+    """Write the page; of the `kinds` of files that it brings, "glsl" first, the last go where they do not fit, of each
+    those of exact lenses first.
 
-    Returns its size and what of the downloads is there.
+    Returns its size and what of the downloads is there and what is left out.
 
     Raises:
         InputError: no lens; lenses that do not fit without any download.
@@ -97,11 +98,25 @@ def write_page(
     if not lenses:
         raise InputError(out, "lenses", "(none)", "at least one lens")
     for count in range(len(kinds), 0, -1):
-        text = _page(lenses, kinds[:count])
-        if len(text.encode()) <= most_bytes:
-            atomic_write_text(out, text)
-            return {"bytes": len(text.encode()), "downloads": list(kinds[:count])}
+        last, left = kinds[count - 1], list(kinds[count:])
+        for given, of_exact in ((lenses, []), (_without_exact(lenses, last), [f"{last} of exact lenses"])):
+            text = _page(given, kinds[:count])
+            if len(text.encode()) <= most_bytes:
+                atomic_write_text(out, text)
+                return {
+                    "bytes": len(text.encode()), "downloads": list(kinds[:count]), "left_out": [*of_exact, *left]
+                }  # fmt: skip
     raise InputError(out, "bytes", len(text.encode()), f"at most {most_bytes}: fewer lenses")
+
+
+def _without_exact(lenses: Sequence[ViewLens], kind: str) -> list[ViewLens]:
+    """Lenses whose exact forms bring no such file."""
+
+    def forms(lens: ViewLens) -> list[Form]:
+        files = [{k: v for k, v in f.files.items() if f.kind != "exact" or k != kind} for f in lens.forms]
+        return [replace(f, files=own) for f, own in zip(lens.forms, files, strict=True)]
+
+    return [replace(lens, forms=forms(lens)) for lens in lenses]
 
 
 def _page(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> str:
