@@ -41,11 +41,16 @@ def view(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def data_of(text: str) -> Any:
-    """The page's JSON, by the library's own LZMA."""
+    """The page's JSON."""
     size, letters = re.findall(r'id="data" data-bytes="(\d+)">([^<]*)<', text)[0]
+    return json.loads(unpacked(letters, int(size)))
+
+
+def unpacked(letters: str, size: int) -> bytes:
+    """By the library's own LZMA."""
     values = np.array([packed.CHARACTERS.index(c) for c in letters]).reshape(-1, 2) @ (91, 1)
     data = np.packbits((values[:, None] >> np.arange(12, -1, -1)) & 1).tobytes()
-    return json.loads(lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=packed.FILTERS).decompress(data, int(size)))
+    return lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=packed.FILTERS).decompress(data, size)
 
 
 class Elements(HTMLParser):
@@ -146,13 +151,19 @@ console.log(JSON.stringify(found.map((part) => Buffer.from(part).toString("base6
     assert found == [part if isinstance(part, bytes) else part.encode() for part in parts.values()]
 
 
-def test_a_page_that_grows_too_large_leaves_files_out(view: Path, tmp_path: Path) -> None:
-    lens = tiny_lens()
-    out = tmp_path / "small.html"
-    whole = pages.write_page(out, [lens], ["glsl", "c"])
-    assert whole["downloads"] == ["glsl", "c"]
-    assert pages.write_page(out, [lens], ["glsl", "c"], whole["bytes"] - 1)["downloads"] == ["glsl"]
-    assert out.stat().st_size < whole["bytes"]
+def test_a_page_that_grows_too_large_leaves_files_out(tmp_path: Path) -> None:
+    """The last kind first, and of that the exact lens's."""
+    exact = tiny_lens().forms[0]
+    model = replace(exact, kind="network", files={"c": exact.files["c"][::-1]})
+    lens, out = replace(tiny_lens(), forms=[model, exact]), tmp_path / "small.html"
+    sizes, most = [], pages.MOST_BYTES
+    for left in ([], ["c of exact lenses"], ["c"]):
+        about = pages.write_page(out, [lens], ["glsl", "c"], most)
+        assert (about["left_out"], about["bytes"]) == (left, out.stat().st_size)
+        forms = data_of(out.read_text(encoding="utf-8"))["lenses"][0]["forms"]
+        assert ["c" in form["files"] for form in forms] == [left != ["c"], not left]
+        sizes.append(most := about["bytes"] - 1)
+    assert sizes == sorted(sizes, reverse=True)
     with pytest.raises(InputError, match="fewer lenses"):
         pages.write_page(tmp_path / "none.html", [lens], ["glsl"], 1000)
     assert not (tmp_path / "none.html").exists()
@@ -242,14 +253,19 @@ SURF 3
 
 
 def test_a_lens_of_your_own_says_what_is_left_out(tmp_path: Path) -> None:
-    """Its glass absorbs, which traced code does not follow."""
+    """Its glass absorbs, which traced code does not follow: in none of its forms."""
     (tmp_path / "my_lens.zmx").write_text(ZMX)
     out = tmp_path / "view.html"
-    assert main(["view", str(tmp_path / "my_lens.zmx"), "--downloads", "glsl", "-o", str(out), "--json"]) == 0
-    (lens,) = data_of(out.read_text(encoding="utf-8"))["lenses"]
+    assert main(["view", str(tmp_path / "my_lens.zmx"), "--jobs", "1", "-o", str(out), "--json"]) == 0
+    text = out.read_text(encoding="utf-8")
+    (lens,) = data_of(text)["lenses"]
     (form,) = lens["forms"]
     assert lens["name"] == "My singlet"
     assert form["method"] == "every surface traced, coatings and absorption left out"
+    assert form["files"] == ["glsl", "c", "osl"]
+    (stream,) = re.findall(r'id="lenses-0">([^<]*)<', text)
+    written = unpacked(stream, lens["stream"][1])
+    assert written.count(b"In this form: coatings and absorption left out.") == 3
 
 
 @pytest.mark.parametrize(
