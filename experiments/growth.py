@@ -67,17 +67,17 @@ CURVES = (
     Curve(
         "pixels",
         "whole picture, a sample",
-        _decades(4, 7),
+        _decades(4, 8),
         "whole",
-        why="memory holds the picture's sums: 10^8 pixels take 16 GB, or a hundredth of that by the tile",
+        why="memory holds the picture's sums, 90 bytes a pixel, or a hundredth of that by the tile",
     ),
     Curve("pixels", "a tile of a hundredth", _decades(4, 8), "tile"),
     Curve(
         "pixels",
         "tiles merged",
-        _decades(4, 7),
+        _decades(4, 8),
         "merged",
-        why="OpenEXR's writer takes whole channels, 47 bytes a pixel, some of it freed before",
+        why="OpenEXR's writer takes whole channels, 50 bytes a pixel with those that are read",
     ),
     Curve("samples", "128 x 72 pixels", (1, 4, 16, 64, 256, 1024), "sampled", memory_power=0.0),
     Curve("lights", "points", _decades(0, 6), "points"),
@@ -88,9 +88,9 @@ CURVES = (
         "spheres",
         why="beyond 1,000 lights reading their tables takes most of the time; rays find them by a tree",
     ),
-    Curve("lights", "quads", _decades(0, 5), "quads"),
+    Curve("lights", "quads", _decades(0, 6), "quads"),
     Curve("triangles", "PLY file, Embree", _decades(2, 7), "triangles"),
-    Curve("triangles", "PLY file, built-in tree", _decades(2, 6), "tree"),
+    Curve("triangles", "PLY file, built-in tree", _decades(2, 7), "tree"),
     Curve("lenses", "driver of a survey", _decades(0, 4), "lenses"),
 )
 OPTIONS = [

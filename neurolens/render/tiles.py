@@ -27,7 +27,7 @@ from neurolens.render.pictures import read_channels, read_metadata, write_stored
 _EXPECTED = 'a tile of "neurolens render --tile"'
 # What a merged picture's statistics add up; the rest follows from these, or is the same in all tiles.
 _COLOURS = ("R", "G", "B")
-_BYTES_A_PIXEL = 40  # seven channels, and those of the tile that is read
+_BYTES_A_PIXEL = 50  # seven channels, those of the tile that is read, and what the writer packs
 _SUMMED = ("seconds", "paths", "dropped_samples", "thread_seconds", "camera_thread_seconds")
 
 
