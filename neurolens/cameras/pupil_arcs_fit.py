@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import partial
 from itertools import product
 
@@ -280,8 +280,7 @@ def _with_missed(sight: Sight, arcs: PupilArcs, edge: _Edge, seed: int) -> _Edge
         far = np.maximum(np.maximum(-found["left"], -found["right"]), height).max(0)
         out = out & ~_worst(far, _zones(sight, rays, stop))
     missed = *rays["pupil_mm"], _scaled(arcs, rays, stop), np.full(out.size, _NO_SIDE), right, left
-    own = edge.x, edge.y, edge.scaled, edge.side, edge.first, edge.last
-    return _Edge(*(np.concatenate([a, b[..., out]], -1) for a, b in zip(own, missed, strict=True)))
+    return _Edge(*(np.concatenate([a, b[..., out]], -1) for a, b in zip(astuple(edge), missed, strict=True)))
 
 
 def _scaled(arcs: PupilArcs, rays: dict[str, Array], stop: Array) -> Array:
@@ -409,11 +408,11 @@ def _widened(nodes: list[PupilArcs], seen: Sequence[tuple[Array, Sight]], report
         mixed = nodes[0].mixed(nodes[1:], weights)
         arcs = replace(mixed, numbers=np.tensordot(weights, numbers, 1))
         rays, stop = _random(sight, arcs, seed)
-        found = evaluate(arcs.checked, rays)
+        found, step = evaluate(arcs.checked, rays), _STEP * float(np.abs(rays["pupil_mm"][1]).max())
         for end, name in enumerate(("left", "right")):
             for arc, row in enumerate(found[name]):
                 lack = -row / (1.0 if arc else stop / arcs.stop_radius_mm)
-                push = max(float(np.quantile(lack, _HELD_ROUND)), 0.0)
+                push = max(np.quantile(lack, _HELD_ROUND), 0.0)
                 numbers[own, arc] += push * _longer(arcs, arc, end, found["change"][arc])
         for _ in range(_STEPS):
             height = evaluate(replace(mixed, numbers=np.tensordot(weights, numbers, 1)).checked, rays)["height"]
@@ -423,7 +422,6 @@ def _widened(nodes: list[PupilArcs], seen: Sequence[tuple[Array, Sight]], report
             # Near the ends of an arc no factor helps: it is made longer.
             for arc, end in product(np.flatnonzero(ratio > _RISE).tolist(), (0, 1)):
                 if arcs.sides[arc] != 1 - 2 * end:
-                    step = _STEP * float(np.abs(rays["pupil_mm"][1]).max())
                     numbers[own, arc] += step * _longer(arcs, arc, end, found["change"][arc])
         numbers[own, :, 2:] *= ratio.clip(1.0, _RISE)[:, None, None]
     return [replace(a, numbers=own) for a, own in zip(nodes, numbers, strict=True)]
