@@ -92,7 +92,7 @@ def _fit_invariant(data: Prepared, settings: ModelSettings) -> InvariantPolynomi
             exponents = _grown(exponents, chosen, dispersive=dispersive)
         chosen = _choose(_sweep(exponents, field, wanted), settings)
         first = kept(exponents, chosen)[0]
-        if settings.method == "ols" and settings.replacement and settings.growth > 1:
+        if settings.method == "ols" and settings.replacement and settings.growth > 1 and len(chosen) == settings.terms:
             exponents, chosen = _grown_on(data, exponents, chosen, lambda e: _sweep(e, field, wanted), settings.terms)
     chosen = chosen or [0]  # rays on the axis alone choose nothing
     exponents, columns = kept(exponents, chosen)
@@ -134,7 +134,7 @@ def _grown_on(
         start = [c if c < len(own) else c - len(own) + len(more) for c in columns]
         trial.restart(start)
         before, best = trial.residual, (trial.residual, start)
-        if len(start) < terms or trial.residuals[0] < fine**2 * min(len(data.pairs.train), _CHOICE_RAYS):
+        if trial.residuals[0] < fine**2 * min(len(data.pairs.train), _CHOICE_RAYS):
             break
         for surplus, known in ((1.25, start), (1.5, start), (2.0, start), (1.5, [])):
             trial.restart(known)
