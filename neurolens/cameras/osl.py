@@ -269,12 +269,13 @@ class _Call:
     def __init__(self, g: Graph, camera: OslCamera) -> None:
         self.g, self.camera = g, camera
         self.sensor = g.concat(self.number("sensor_x_mm"), self.number("sensor_y_mm"))
-        widest = camera.sight.stop_radius_mm
-        self.stop = (camera.f_number * widest / self.number("f_number")).minimum(widest)
+        # Before the radius: the share of it in the pupil's numbers, of all states, would be this one's own in some.
+        self.share = (camera.f_number / self.number("f_number")).minimum(1.0)
+        self.stop = self.share * camera.sight.stop_radius_mm
         at_pupil, asked = self.number("at_pupil"), self.number("asked_m")
         away = _away(asked)
         ways = zip(camera.film, camera.nearest_m, strict=True)
-        places = (_in_turn(g, f, self.stop * (1 / widest), (near / away).clip(0.0, 1.0)) for f, near in ways)
+        places = (_in_turn(g, f, self.share, (near / away).clip(0.0, 1.0)) for f, near in ways)
         self.film_z = g.select(at_pupil <= 0.5, *places)
         distance = away + (self.film_z - camera.entrance_mm) * at_pupil * 1e-3
         self.focused = g.constant(camera.limit_m * _NEAR) <= distance
@@ -288,8 +289,7 @@ class _Call:
         """The numbers of `weight_graph`."""
         g, camera = self.g, self.camera
         per_distance = 1.0 / (self.film_z - camera.pupil_z_mm)
-        share = self.stop * (1 / camera.sight.stop_radius_mm)
-        own = _in_turn(g, _exposure(camera), share, _place(camera, self.film_z)) * share * share
+        own = _in_turn(g, _exposure(camera), self.share, _place(camera, self.film_z)) * self.share * self.share
         nominal = math.pi / (4 * camera.f_number**2)
         exposure = g.select(self.number("as_lens") <= 0.5, own, nominal)
         return {"per_distance": per_distance, "scale": per_distance * per_distance / exposure}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import partial
 from itertools import product
 
@@ -236,17 +236,8 @@ def _places(way: Way, sight: Sight, report: Report) -> _Places:
             across = (frame.reach[:, None] * v[:, None] for v in frame.stretch)
             x, y = (way * side for way, side in zip(across, (np.cos(_ANGLES), np.sin(_ANGLES)), strict=True))
             shape = (len(ends), *x.shape)
-            rows = (
-                radius[:, None],
-                frame.centre[:, None],
-                x,
-                y,
-                z,
-                stop,
-                np.reshape(ends, (-1, 1, 1)),
-                _ANGLES,
-                azimuth,
-            )
+            lengths = np.reshape(ends, (-1, 1, 1))
+            rows = radius[:, None], frame.centre[:, None], x, y, z, stop, lengths, _ANGLES, azimuth
             found.append([np.broadcast_to(row, shape).ravel() for row in rows])
             # The next stop's pupil lies within this one's.
             around = frame.centre - _WIDER * frame.stretch[0], frame.centre + _WIDER * frame.stretch[0]
@@ -289,8 +280,7 @@ def _with_missed(sight: Sight, arcs: PupilArcs, edge: _Edge, seed: int) -> _Edge
         far = np.maximum(np.maximum(-found["left"], -found["right"]), height).max(0)
         out = out & ~_worst(far, _zones(sight, rays, stop))
     missed = *rays["pupil_mm"], _scaled(arcs, rays, stop), np.full(out.size, _NO_SIDE), right, left
-    own = edge.x, edge.y, edge.scaled, edge.side, edge.first, edge.last
-    return _Edge(*(np.concatenate([a, b[..., out]], -1) for a, b in zip(own, missed, strict=True)))
+    return _Edge(*(np.concatenate([a, b[..., out]], -1) for a, b in zip(astuple(edge), missed, strict=True)))
 
 
 def _scaled(arcs: PupilArcs, rays: dict[str, Array], stop: Array) -> Array:
@@ -418,24 +408,33 @@ def _widened(nodes: list[PupilArcs], seen: Sequence[tuple[Array, Sight]], report
         mixed = nodes[0].mixed(nodes[1:], weights)
         arcs = replace(mixed, numbers=np.tensordot(weights, numbers, 1))
         rays, stop = _random(sight, arcs, seed)
-        found = evaluate(arcs.checked, rays)
-        for end, (by, side) in enumerate((("left", -1), ("right", 1))):
-            for arc, row in enumerate(found[by]):
+        found, step = evaluate(arcs.checked, rays), _STEP * float(np.abs(rays["pupil_mm"][1]).max())
+        for end, name in enumerate(("left", "right")):
+            for arc, row in enumerate(found[name]):
                 lack = -row / (1.0 if arc else stop / arcs.stop_radius_mm)
-                push = max(float(np.quantile(lack, _HELD_ROUND)), 0.0)
-                numbers[own, arc, end] += side * push * _unit(arcs, arc == 0)
+                push = max(np.quantile(lack, _HELD_ROUND), 0.0)
+                numbers[own, arc] += push * _longer(arcs, arc, end, found["change"][arc])
         for _ in range(_STEPS):
             height = evaluate(replace(mixed, numbers=np.tensordot(weights, numbers, 1)).checked, rays)["height"]
             ratio = np.quantile(rays["pupil_mm"][1] ** 2 / np.maximum(height, 1e-9), _HELD_ROUND, axis=1)
             if ratio.max() <= _RISE:
                 break
             # Near the ends of an arc no factor helps: it is made longer.
-            for arc, arc_side in enumerate(arcs.sides):
-                step = _STEP * float(np.abs(rays["pupil_mm"][1]).max()) * (ratio[arc] > _RISE)
-                numbers[own, arc, 0] -= step * _unit(arcs, arc == 0) * (arc_side <= 0)
-                numbers[own, arc, 1] += step * _unit(arcs, arc == 0) * (arc_side >= 0)
+            for arc, end in product(np.flatnonzero(ratio > _RISE).tolist(), (0, 1)):
+                if arcs.sides[arc] != 1 - 2 * end:
+                    numbers[own, arc] += step * _longer(arcs, arc, end, found["change"][arc])
         numbers[own, :, 2:] *= ratio.clip(1.0, _RISE)[:, None, None]
     return [replace(a, numbers=own) for a, own in zip(nodes, numbers, strict=True)]
+
+
+def _longer(arcs: PupilArcs, arc: int, end: int, change: Array) -> Array:
+    """[4, M] what is added to numbers of an arc for a millimetre more at its low end, 0, or its high end, 1."""
+    return np.outer([end - 1, end, _bend(change) if arc else 0.0, 0.0], _unit(arcs, arc == 0))
+
+
+def _bend(change: Array) -> float:
+    """By how much a rim's first factor grows with its length (mm), so that it holds whatever it has held."""
+    return 1 + 2 * max(-float(change.min()), 0.0)
 
 
 def _dilated(arcs: PupilArcs, sight: Sight, report: Report) -> PupilArcs:
@@ -461,7 +460,7 @@ def _moved(arcs: PupilArcs, sight: Sight, rays: dict[str, Array], stop: Array, l
     for arc, side in enumerate(arcs.sides):
         own = {name: found[name][arc] for name in ("left", "right", "first", "change")}
         # The stop's ends move with the stop. A rim's far end moves, too.
-        step, bend = (scaled[1], 1 / size) if side == 0 else (1.0, 1 + 2 * max(-float(own["change"].min()), 0.0))
+        step, bend = (scaled[1], 1 / size) if side == 0 else (1.0, _bend(own["change"]))
         need = np.maximum(_needed(own, y * y, side, step, bend, size), least)
         ends = {e: (e[0], e[1] + (side == 0), *e[2:]) for e in powers if not (e[2] or e[3] or (side and e[1]))}
         ends = {e: end for e, end in ends.items() if end in powers}

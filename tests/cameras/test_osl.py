@@ -166,6 +166,17 @@ def test_zoom_is_an_input(coarse: None) -> None:
         assert np.mean(found["throughput_0"]) == pytest.approx(rays.weight.mean(dtype=np.float64), rel=0.02)
 
 
+def test_a_zoom_whose_stop_changes_and_whose_rims_cut_on_both_sides(monkeypatch) -> None:
+    """One set of operations serves its states, and hardly any ray that passes lies beyond its arcs."""
+    monkeypatch.setattr(pupil_arcs_fit, "_RAYS", 10_000)
+    model = load_model(ROOT / "models" / "nikon_zoom_70_200-range.states-64.onnx")
+    nodes = osl.osl_lens([osl._seen(model.at(zoom_mm), None) for zoom_mm in (71.5, 130.0)], lambda share: None).nodes
+    assert nodes[0].sight.stop_radius_mm != nodes[1].sight.stop_radius_mm
+    assert set(nodes[0].arcs.sides) == {0, 1, -1}
+    assert max(pupil_arcs_fit._lost(c.sight, c.arcs) for c in nodes) < 2e-3
+    lower([osl.osl_graph(camera) for camera in nodes])
+
+
 def test_groups_of_a_lens_file_move_where_the_camera_is_focused(coarse: None) -> None:
     file = ROOT / "lenses" / "tajima_retrofocus_24.toml"
     _, made, _ = exact_lens(file, None, lambda share: None)
