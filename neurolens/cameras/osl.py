@@ -189,7 +189,8 @@ def parameters(lens: OslLens) -> list[Parameter]:
 
 def write_camera(lens: OslLens, name: str, comment: list[str]) -> tuple[str, int]:
     """The text of a camera's shader, and the operations of one ray through a round stop: compilers know the blades."""
-    text = write_osl(osl_program(lens).in_order_of_need(), name, comment, parameters(lens), _FRAME, OUTPUTS)
+    program = osl_program(lens).with_shorter_sums().in_order_of_need()
+    text = write_osl(program, name, comment, parameters(lens), _FRAME, OUTPUTS)
     return text, sum(osl_program(lens, {"count": 0.0}).count().values())
 
 
@@ -224,9 +225,8 @@ def osl_graph(camera: OslCamera) -> Graph:
     """The camera as a graph. Inputs are floats of `_FRAME` and the parameters, outputs `OUTPUTS` [3] each."""
     g = Graph()
     call = _Call(g, camera)
-    raster = g.concat(g.input("raster_x"), g.input("raster_y"))
     square = g.concat(g.input("first"), g.input("second"))
-    film = (raster - 0.5) * -call.sensor
+    film = (g.concat(g.input("raster_x"), g.input("raster_y")) - 0.5) * -call.sensor
     nanometres, colour = _light(camera, square[0], call.number("in_colour"))
     per_call = {"film_z_mm": call.film_z, "stop_radius_mm": call.stop}
     sampler = camera.arcs.sampler(Blades, *camera.stop_image)

@@ -78,7 +78,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "--downloads", metavar="KINDS", type=_kinds, default=_DOWNLOADS,
         help="of glsl, onnx, c, osl what the page brings as files of each form (default: all; osl takes seconds a "
-        "model, once); the last are left out where the page grows beyond 3 MB",
+        "form, a minute of a zoom, once); the last are left out where the page grows beyond 3 MB, exact lenses' first",
     )  # fmt: skip
     parser.add_argument(
         "--jobs", metavar="N", type=whole(1, 64), default=min(8, os.cpu_count() or 1),
