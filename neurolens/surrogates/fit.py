@@ -103,7 +103,7 @@ def fit_model(
         if settings.method in get_args(PublishedName):
             core, encoding, gates = fit_published(prepared, settings, progress)
         else:
-            shown, refracts = pairs, settings.family != "paraxial" and settings.basis == "invariants" and grazes(pairs)
+            shown, refracts = pairs, settings.method in POLYNOMIALS and settings.basis == "invariants" and grazes(pairs)
             if refracts:
                 shown = replace(pairs, train=inside_front(pairs.lens, pairs.train))
             if settings.planes and settings.basis == "invariants" and settings.method in PLANES_SEARCHED:

@@ -281,8 +281,9 @@ def stop_graph(inverse: InverseModel, form: Form, angle: float, steps: int = STE
 def scene_graph(inverse: InverseModel, form: Form, angle: float, steps: int = STEPS) -> Graph:
     """The map from scene rays to camera rays: as `stop_graph`, but for its input and what density is of.
 
-    Input front_rays: x and y on the front surface (mm), direction vector of the model (angle vector in rad, or slope),
-    wavelength. Density is mm^2 of film times mm^2 of the pupil plane per mm^2 of (x, y) and area of direction vectors.
+    Input front_rays: x and y on the front surface (mm), direction vector of the model (angle vector in rad, or slope;
+    inside the front glass where `front_index` says so), wavelength. Density is mm^2 of film times mm^2 of the pupil
+    plane per mm^2 of (x, y) and area of direction vectors.
     """
     model, e, g = inverse.model, inverse.model.encoding, Graph()
     position, direction, wavelength = g.split(g.input("front_rays", 5), [2, 2, 1])

@@ -77,6 +77,11 @@ def test_the_error_of_a_grazing_fisheye_falls_to_half(monkeypatch: pytest.Monkey
     assert refracting < 0.5 * _rms_deg(settings)
 
 
+def test_networks_of_a_grazing_fisheye_give_the_direction_outside() -> None:
+    settings = ModelSettings("ols+mlp", terms=12, degree=5, steps=2, units=4, layers=1, planes=False)
+    assert _rms_deg(settings) < 0.2
+
+
 def test_fits_see_the_ray_inside_the_glass_and_the_model_its_index() -> None:
     data, model = lens_models.prepared(lens_models.FISHEYE), lens_models.model("fisheye")
     assert isinstance(model.core, Refracted) and not isinstance(lens_models.model("colourless").core, Refracted)
