@@ -31,7 +31,7 @@ from neurolens.optics.sag import front_rays
 from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.domain import Domain, FilmRays, domain_of, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
-from neurolens.surrogates.inverse import STEPS, TOLERANCE, InverseModel, scene_system, stop_system
+from neurolens.surrogates.inverse import STEPS, TOLERANCE, InverseModel, front_index, scene_system, stop_system
 from neurolens.surrogates.inverse_fit import convergence, fit_inverse
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
@@ -91,7 +91,10 @@ def _published(inverse: InverseModel, rays: FilmRays) -> dict[str, Any]:
     passed = forward.status == st.PASSED
     rays = rays.select(passed)
     x, y = forward.stop_x[passed], forward.stop_y[passed]
-    position, v = torch.from_numpy(front_rays(model.front, *(c[passed].numpy() for c in forward.rays))[0]).split(2)
+    scene_rays = (c[passed].numpy() for c in forward.rays)
+    wavelength = rays.wavelength_nm.numpy()
+    known, _ = front_rays(model.front, *scene_rays, index=front_index(model), wavelength_nm=wavelength)
+    position, v = torch.from_numpy(known).split(2)
     wanted = torch.cat([position / model.scales.position_mm, v])
     scene = _plain(scene_system(model), {"wanted": wanted, "wavelength_nm": rays.wavelength_nm[None]})
     return {"stop": _plain(stop_system(model), _stop_inputs(model, rays, x, y)), "scene": scene}

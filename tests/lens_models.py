@@ -32,7 +32,7 @@ from neurolens.surrogates.specialise import at_wavelength
 from neurolens.surrogates.targets import scales_of, targets_of
 
 LENSES = Path(__file__).parents[1] / "lenses"
-GAUSS, FISHEYE = "laikin_double_gauss_50", "muller_fisheye_100"
+GAUSS, FISHEYE, COLOURLESS = "laikin_double_gauss_50", "horimoto_fisheye_16", "muller_fisheye_100"
 KINDS = ("invariants", "raw", "network", "thick", "fisheye")
 GATED = ("singlet", "hemisphere")  # lenses whose rays are lost at surfaces, too
 PUBLISHED = ("hanika", "schrade", "rtf", "taylor", "cells", "neurolens2017", "ray-lut")
@@ -111,12 +111,12 @@ def hemisphere() -> Lens:
 def model(kind: str) -> LensModel:
     """A model of each kind.
 
-    `KINDS` (each kind of core, first order, a lens that sees beyond 75 degrees), `GATED`, `PUBLISHED` (after which
-    " fisheye" takes that lens), or "zones" of the film, "residual" network, "laser" (one wavelength), "cylinders",
-    "cylinders network".
+    `KINDS` (each kind of core, first order, a fisheye whose rays graze its front), `GATED`, `PUBLISHED` (after which
+    " fisheye" takes that lens), or "zones" of the film, "residual" network, "laser" (one wavelength), "colourless" (a
+    fisheye without known dispersion), "cylinders", "cylinders network".
     """
-    if kind == "fisheye":
-        return fit_model(prepared(FISHEYE), _FITS["invariants"])
+    if kind in ("fisheye", "colourless"):
+        return fit_model(prepared(FISHEYE if kind == "fisheye" else COLOURLESS), _FITS["invariants"])
     if kind == "network":
         return _network(prepared(), 12)
     if kind == "laser":

@@ -46,7 +46,9 @@ def status_graph(aperture: Aperture | None = None, stopped: int = 0) -> Graph:
 
 
 @lru_cache(maxsize=16)
-def weight_graph(derivatives: tuple[str, ...] = (), aperture: Aperture | None = None, stopped: int = 0) -> Graph:
+def weight_graph(
+    derivatives: tuple[str, ...] = (), aperture: Aperture | None = None, stopped: int = 0, unit: bool = False
+) -> Graph:
     """Weighted rays in the camera's frame, of rays of a lens.
 
     w = T A cos^4 / Z^2 over the exposure on the axis; see `cameras.contract`. Film points that nothing reaches (area 0
@@ -54,7 +56,7 @@ def weight_graph(derivatives: tuple[str, ...] = (), aperture: Aperture | None = 
 
     Args:
         derivatives: names of derivatives of `scene_ray`, inputs and outputs, too.
-        aperture, stopped: see `status_graph`.
+        aperture, stopped: see `status_graph`. unit: directions are known to be of unit length, and not tested.
 
     Inputs: `film_mm`, `pupil_mm` [2], `area_mm2`, `scene_ray` [6] (mm, lens frame), `transmittance`, `lens_status`, and
     derivatives [6] of the ray; of the call `film_z_mm`, `per_distance` (1 / Z), `scale` (1 / (Z^2 exposure)).
@@ -64,7 +66,8 @@ def weight_graph(derivatives: tuple[str, ...] = (), aperture: Aperture | None = 
     film, pupil, area, ray = g.input("film_mm", 2), g.input("pupil_mm", 2), g.input("area_mm2"), g.input("scene_ray", 6)
     through, status = g.input("transmittance"), g.input("lens_status")
     per_distance, scale, film_z = (g.input(name, per_call=True) for name in ("per_distance", "scale", "film_z_mm"))
-    status = g.inline(status_graph(aperture, stopped), {"scene_ray": ray, "lens_status": status})["status"]
+    if not unit:
+        status = g.inline(status_graph(aperture, stopped), {"scene_ray": ray, "lens_status": status})["status"]
     lit = g.constant(_NO_AREA) <= area
     passed = (status <= float(st.PASSED)) & lit
     cos2 = 1.0 / (1.0 + g.square((pupil - film) * per_distance))

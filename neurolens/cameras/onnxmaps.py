@@ -26,6 +26,7 @@ from neurolens.optics.sag import front_rays
 _DERIVATIVES_BATCH, _INVERSE_BATCH = 8192, 4096
 _CALL = {"film_z_mm": ("tensor(float)", 1), "stop_radius_mm": ("tensor(float)", 1)}
 _OUTPUTS = {"rays": ("tensor(float)", 5, None), **OUTPUTS, "density": ("tensor(float)", None)}
+_NEWER: dict[str, Any] = {"across": None, "index": None}  # of fronts, which older files lack
 _GIVEN = {"stop": "stop_rays", "scene": "front_rays"}
 
 
@@ -131,7 +132,8 @@ class OnnxInverse:
         """
         lines = {"origin_mm": origin_mm, "direction": direction}
         *rays, wavelength = ray_columns("OnnxInverse", 3, lines, wavelength_nm, np.float64)
-        known, solid = front_rays(self.front, *rays)
+        index = None if self.front is None else self.front.index
+        known, solid = front_rays(self.front, *rays, index=index, wavelength_nm=wavelength)
         out = self._run("scene", np.concatenate([known, [wavelength]]), film_z_mm, stop_radius_mm)
         with np.errstate(all="ignore"):  # area of direction vectors to solid angle
             return out._replace(density=(out.density / solid).astype(np.float32))
@@ -144,7 +146,7 @@ class OnnxInverse:
             InputError: no file of the map of scene rays.
         """
         shape = self._map("scene")[1]["inverse"]["front"]
-        return None if shape is None else SimpleNamespace(**{"across": None} | shape)
+        return None if shape is None else SimpleNamespace(**_NEWER | shape)
 
     def _map(self, name: str) -> tuple[Any, dict[str, Any]]:
         if name not in self._maps:
@@ -205,10 +207,12 @@ def _is_front(value: Any) -> bool:
     """Whether this is a front surface as `meet_front` takes it: none, or a table of its shape."""
     if value is None:
         return True
-    keys = {"curvature", "conic", "asphere", "cylinder", "across"}
-    if not isinstance(value, dict) or set(value) | {"across"} != keys:
+    keys = {"curvature", "conic", "asphere", "cylinder", *_NEWER}
+    if not isinstance(value, dict) or set(value) | set(_NEWER) != keys:
         return False
-    terms, across = value["asphere"], value.get("across")
+    terms, across, index = value["asphere"], value.get("across"), value.get("index")
+    if index is not None and not (isinstance(index, list) and index and all(map(is_number, index))):
+        return False
     if across is not None:
         if not isinstance(across, list) or len(across) != 2 or not is_number(across[0]) or across[0] == 0:
             return False

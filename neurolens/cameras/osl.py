@@ -41,6 +41,7 @@ from neurolens.cameras.source import model_focusing
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value
 from neurolens.graph.loworder import low_orders, with_film_derivatives
+from neurolens.graph.lowtests import low_tests
 from neurolens.graph.osl import Parameter, write_osl
 from neurolens.graph.program import STOP_RADIUS, Mixture, Program
 from neurolens.graph.scalars import lower
@@ -57,10 +58,10 @@ _LOW_BITS = 4096.0  # of a random number: what lies below 1 / 4096 of it
 _NEARLY, _EDGES = 0.99, 0.75  # of rays beyond this share of the stop's radius: their places at the stop are known
 _LEAST = 1.7e-3  # of the stop's radius, by which blades are widened; no other number of a graph, which would share it
 _QUADRATURE = 64  # points a side of the exposure on the axis
-_NEAR = 0.999  # of the near limit: rounding
-# Errors of derivatives by output, and of all of them.
-_DERIVATIVES, _WORST = 0.03, 0.05
-_ACROSS, _FILM_POWERS = 16, 7  # distances and stops at which the film is placed, and powers of each
+_NEAR, _ROUNDS = 0.999, 4  # of the near limit: rounding; that place a film
+# Errors of derivatives, whose mean size Cycles takes, by output and in all; nothing is nearer than this share of focus.
+_DERIVATIVES, _WORST, _SEEN = 0.05, 0.05, 0.25
+_ACROSS, _FILM_POWERS = 16, (7, 5)  # distances and stops at which the film is placed; powers of stop and distance
 _BESIDE = 0.01  # of the film radius: near the axis
 _LIGHT_NM = (400.0, 700.0)  # colours beyond would spread fringes that no eye and no film sees
 FOCUS_AXIS = "focus"
@@ -97,33 +98,28 @@ class OslCamera:
     """What a shader of a lens in one state is made of.
 
     Attributes:
-        sight: the lens. lens: its graph with derivatives by the film point. arcs: its pupil. film: its position
-            (mm) by powers of stop and focus, see `_film`. near_m: nearest distance, inf where the film does not focus.
-            limit_m: nearer than that nothing is in focus; 0 where nothing moves.
-        f_number: of the widest stop. efl_mm: focal length.
-        entrance_mm: z of the entrance pupil, lens frame. stop_image: see `_stop_image`.
+        sight: the lens. lens: its graph with derivatives by the film point. arcs: its pupil. film, nearest_m: see
+            `_film`. limit_m: nearer than that nothing is in focus; 0 where nothing moves.
+        f_number: of the widest stop. efl_mm: focal length. entrance_mm: z of the entrance pupil, lens frame.
+            stop_image: see `_stop_image`. unit: whether directions are sure to be of unit length.
     """
 
     sight: Sight
     lens: Graph
     arcs: PupilArcs
     film: Array
-    near_m: float
+    nearest_m: tuple[float, float]
     limit_m: float
     f_number: float
     efl_mm: float
     entrance_mm: float
     stop_image: tuple[float, float]
+    unit: bool
 
     @property
     def pupil_z_mm(self) -> float:
         """Of the plane of pupil points."""
         return self.sight.table.pupil_z_mm
-
-    @property
-    def nearest_m(self) -> float:
-        """The distance that vergences are shares of."""
-        return self.near_m if math.isfinite(self.near_m) else 1.0
 
 
 @dataclass(frozen=True)
@@ -193,7 +189,8 @@ def parameters(lens: OslLens) -> list[Parameter]:
 
 def write_camera(lens: OslLens, name: str, comment: list[str]) -> tuple[str, int]:
     """The text of a camera's shader, and the operations of one ray through a round stop: compilers know the blades."""
-    text = write_osl(osl_program(lens), name, comment, parameters(lens), _FRAME, OUTPUTS)
+    program = osl_program(lens).with_shorter_sums().in_order_of_need()
+    text = write_osl(program, name, comment, parameters(lens), _FRAME, OUTPUTS)
     return text, sum(osl_program(lens, {"count": 0.0}).count().values())
 
 
@@ -228,9 +225,8 @@ def osl_graph(camera: OslCamera) -> Graph:
     """The camera as a graph. Inputs are floats of `_FRAME` and the parameters, outputs `OUTPUTS` [3] each."""
     g = Graph()
     call = _Call(g, camera)
-    raster = g.concat(g.input("raster_x"), g.input("raster_y"))
     square = g.concat(g.input("first"), g.input("second"))
-    film = (raster - 0.5) * -call.sensor
+    film = (g.concat(g.input("raster_x"), g.input("raster_y")) - 0.5) * -call.sensor
     nanometres, colour = _light(camera, square[0], call.number("in_colour"))
     per_call = {"film_z_mm": call.film_z, "stop_radius_mm": call.stop}
     sampler = camera.arcs.sampler(Blades, *camera.stop_image)
@@ -238,10 +234,9 @@ def osl_graph(camera: OslCamera) -> Graph:
     rays = g.concat(film, pupil["pupil_mm"], nanometres)
     found = g.inline(camera.lens, {"rays": rays, **per_call})
     given = {"film_mm": film, **pupil, **found, "lens_status": found["status"], **per_call, **call.weighting()}
-    done = g.inline(weight_graph(D_FILM), given)
-    shaded = done["weight"]
+    done = g.inline(weight_graph(unit=camera.unit), given) | {name: found[name] for name in D_FILM}
     even = g.select(done["status"] <= float(st.PASSED), pupil["area_mm2"] / pupil["mean_area_mm2"], 0.0)
-    weight = g.select(call.number("shaded") <= 0.5, even, shaded)
+    weight = g.select(call.number("shaded") <= 0.5, even, done["weight"])
     weight = g.select(Blades(g).opened(found["stop_xy_mm"] * (1.0 / call.stop)), weight, 0.0)
     known = (g.square(film) <= camera.arcs.film_radius_mm**2) & call.focused
     warned = g.select(known, 0.0, call.number("warned"))
@@ -263,8 +258,9 @@ def _set_outputs(
     g.outputs["direction"] = g.select(plain, ray[3:] * turned, ahead)
     g.outputs["throughput"] = g.select(plain, throughput, g.constant([1.0, 0.0, 1.0]))
     for axis, name, step in zip((0, 1), D_FILM, ("x", "y"), strict=True):
-        moved = done[name] * (call.sensor[axis] * -call.number(f"pixel_{step}"))
-        g.outputs[f"dPd{step}"], g.outputs[f"dDd{step}"] = moved[0:3] * turned, moved[3:] * turned
+        way = call.sensor[axis] * -call.number(f"pixel_{step}")
+        way = g.concat(way, way, -way)
+        g.outputs[f"dPd{step}"], g.outputs[f"dDd{step}"] = done[name][0:3] * (way * 1e-3), done[name][3:] * way
 
 
 class _Call:
@@ -273,15 +269,15 @@ class _Call:
     def __init__(self, g: Graph, camera: OslCamera) -> None:
         self.g, self.camera = g, camera
         self.sensor = g.concat(self.number("sensor_x_mm"), self.number("sensor_y_mm"))
-        widest = camera.sight.stop_radius_mm
-        self.stop = (camera.f_number * widest / self.number("f_number")).minimum(widest)
+        # Before the radius: the share of it in the pupil's numbers, of all states, would be this one's own in some.
+        self.share = (camera.f_number / self.number("f_number")).minimum(1.0)
+        self.stop = self.share * camera.sight.stop_radius_mm
         at_pupil, asked = self.number("at_pupil"), self.number("asked_m")
         away = _away(asked)
-        self.film_z = g.constant(camera.sight.film_z_mm[0])
-        for film in (_rough(camera.film), camera.film):  # distances are from the film there
-            distance = away + (self.film_z - camera.entrance_mm) * at_pupil * 1e-3
-            vergence = (camera.nearest_m / distance).clip(0.0, 1.0)
-            self.film_z = _in_turn(g, film, self.stop * (1 / widest), vergence)
+        ways = zip(camera.film, camera.nearest_m, strict=True)
+        places = (_in_turn(g, f, self.share, (near / away).clip(0.0, 1.0)) for f, near in ways)
+        self.film_z = g.select(at_pupil <= 0.5, *places)
+        distance = away + (self.film_z - camera.entrance_mm) * at_pupil * 1e-3
         self.focused = g.constant(camera.limit_m * _NEAR) <= distance
         # Of the ray in the camera's frame, turned: from the film, or from the entrance pupil.
         self.shift_m = (camera.entrance_mm - self.film_z) * at_pupil * 1e-3
@@ -293,19 +289,10 @@ class _Call:
         """The numbers of `weight_graph`."""
         g, camera = self.g, self.camera
         per_distance = 1.0 / (self.film_z - camera.pupil_z_mm)
-        share = self.stop * (1 / camera.sight.stop_radius_mm)
-        own = _in_turn(g, _exposure(camera), share, _place(camera, self.film_z)) * share * share
+        own = _in_turn(g, _exposure(camera), self.share, _place(camera, self.film_z)) * self.share * self.share
         nominal = math.pi / (4 * camera.f_number**2)
         exposure = g.select(self.number("as_lens") <= 0.5, own, nominal)
         return {"per_distance": per_distance, "scale": per_distance * per_distance / exposure}
-
-
-def _rough(film: Array) -> Array:
-    """Of low order: a tenth of a millimetre of film moves the focus by a micrometre."""
-    vergence, powers = np.linspace(0, 1, 2 * _FILM_POWERS), np.polynomial.polynomial
-    order = min(2, film.shape[1] - 1)
-    widest = powers.polyval2d(np.ones_like(vergence), vergence, film)
-    return np.asarray(powers.polyfit(vergence, widest, order), np.float64)[None]
 
 
 def _in_turn(g: Graph, weights: Array, first: Value, then: Value) -> Value:
@@ -339,12 +326,12 @@ def _light(camera: OslCamera, random: Value, in_colour: Value) -> tuple[Value, V
     return nanometres, g.select(grey, 1.0, colour)
 
 
-def _samples(sight: Sight, arcs: PupilArcs, count: int = 4096) -> dict[str, NDArray[np.float32]]:
-    """Rays through the arcs, as inputs of the lens's graph, and `at_stop` of the sampler."""
+def _samples(sight: Sight, arcs: PupilArcs, count: int = 32768) -> dict[str, NDArray[np.float32]]:
+    """Rays through the arcs, nearly half at the widest stop, as inputs of the lens's graph; `at_stop` of the arcs."""
     rng = np.random.default_rng(0)
     angle, radius = 2 * np.pi * rng.random(count), 0.99 * arcs.film_radius_mm * np.sqrt(rng.random(count))
     film = radius * np.stack([np.cos(angle), np.sin(angle)])
-    stop = (sight.stop_radius_mm * rng.uniform(0.2, 1, count))[None]
+    stop = sight.stop_radius_mm * rng.uniform(0.2, 1.6, (1, count)).clip(max=1)
     given = {"film_mm": film, "square": rng.random((2, count)), "stop_radius_mm": stop}
     given |= {
         "film_z_mm": rng.uniform(*sight.film_z_mm, (1, count)),
@@ -390,17 +377,28 @@ def _powers(at: Array, values: Array, shape: tuple[int, int]) -> Array:
     return np.asarray(np.linalg.lstsq(a, values, rcond=None)[0]).reshape(shape)
 
 
-def _film(focusing: Focusing) -> Array:
-    """Best focus (mm) by powers of the stop's share and of the nearest distance over the distance."""
-    function = film_function([focusing])
-    moves = math.isfinite(focusing.nearest_m)
+def _film(focusing: Focusing, entrance_mm: float) -> tuple[Array, tuple[float, float]]:
+    """Best focus (mm) by powers [2, N, M] of the stop's share and of the nearest distance over the distance, from the
+    film and from the entrance pupil; and that distance from either."""
+    function, moves = film_function([focusing]), math.isfinite(focusing.nearest_m)
     side = (1 - np.cos(np.pi * (np.arange(_ACROSS) + 0.5) / _ACROSS)) / 2
     share, vergence = (a.ravel() for a in np.meshgrid(SMALLEST + (1 - SMALLEST) * side, side if moves else [0.0]))
-    nearest = focusing.nearest_m if moves else 1.0
-    call = {FOCUS: nearest / np.maximum(vergence, 1e-9), STOP_RADIUS: share * focusing.stop_radius_mm}
-    z = evaluate(function.graph, {name: value[None] for name, value in call.items()})["film_z_mm"][0]
-    z = np.broadcast_to(z, share.shape)
-    return _powers(np.stack([share, vergence], 1), z, (_FILM_POWERS, _FILM_POWERS if moves else 1))
+
+    def place(share: Array, away_m: Array, at_pupil: bool) -> Array:
+        z = np.full(share.shape, entrance_mm)
+        for _ in range(_ROUNDS):  # distances are from the film there
+            away = away_m + (z - entrance_mm) * (at_pupil * 1e-3)
+            call = {FOCUS: away, STOP_RADIUS: share * focusing.stop_radius_mm}
+            found = evaluate(function.graph, {name: value[None] for name, value in call.items()})["film_z_mm"][0]
+            z = np.broadcast_to(found.astype(np.float64), share.shape)
+        return z
+
+    nearest = ahead = focusing.nearest_m if moves else 1.0
+    if moves:
+        ahead -= float(place(np.ones(1), np.full(1, nearest), False)[0] - entrance_mm) * 1e-3
+    powers, at = (_FILM_POWERS[0], _FILM_POWERS[1] if moves else 1), np.stack([share, vergence], 1)
+    places = [place(share, near / np.maximum(vergence, 1e-9), near != nearest) for near in (nearest, ahead)]
+    return np.stack([_powers(at, z, powers) for z in places]), (nearest, ahead)
 
 
 def model_lens(model: OnnxLens, graph: Graph | None, report: Report, *, fixed: bool = False) -> OslLens:
@@ -457,16 +455,18 @@ def osl_lens(
     sights = [node.sight for node in nodes]
     arcs = fit_arcs(sights, report, between)
     samples = [_samples(*of_one) for of_one in zip(sights, arcs, strict=True)]
-    # Cycles takes the mean size of derivatives, for the footprint of a pixel.
-    fitted = low_orders([s.graph for s in sights], samples, _DERIVATIVES, _WORST)
-    graphs = [with_film_derivatives(s.graph) for s in sights] if fitted is None else [f.graph for f in fitted]
+    graphs = [s.graph for s in sights]
+    graphs = (tested := low_tests(graphs, samples)) or graphs
+    reach = _SEEN * min(1.0, *(node.focusing.nearest_m for node in nodes)) * 1e3
+    fitted = low_orders(graphs, samples, _DERIVATIVES, _WORST, reach)
+    graphs = [with_film_derivatives(g) for g in graphs] if fitted is None else [f.graph for f in fitted]
     inside = next((1 / a.range[1] for a in axes if a.name == FOCUS_AXIS), 0.0)
     cameras = []
     for seen, graph, own in zip(nodes, graphs, arcs, strict=True):
-        near = seen.focusing.nearest_m
-        limit, entrance = near if math.isfinite(near) else inside, _entrance_mm(seen.sight)
-        numbers = near, limit, seen.f_number, seen.efl_mm, entrance, _stop_image(seen.sight, own)
-        cameras.append(OslCamera(seen.sight, graph, own, _film(seen.focusing), *numbers))
+        near, entrance = seen.focusing.nearest_m, _entrance_mm(seen.sight)
+        numbers = near if math.isfinite(near) else inside, seen.f_number, seen.efl_mm, entrance
+        film, image = _film(seen.focusing, entrance), _stop_image(seen.sight, own)
+        cameras.append(OslCamera(seen.sight, graph, own, *film, *numbers, image, tested is not None))
     return OslLens(cameras, axes, between)
 
 

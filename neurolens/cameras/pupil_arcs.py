@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -106,7 +106,7 @@ class PupilArcs:
                 )
                 for arc in arcs
             ]
-            return (_least(rows) / (left * right).maximum(_TIP)).maximum(0.0).sqrt()
+            return (reduce(Value.minimum, rows) / (left * right).maximum(_TIP)).maximum(0.0).sqrt()
 
         def at_stop(x: Value, y: Value) -> Value:
             stop = arcs[0]
@@ -254,13 +254,6 @@ _COS = _chebyshev(lambda s: np.cos(np.pi / 4 * np.sqrt(np.maximum(s, 0))))
 _SIN = _chebyshev(lambda s: np.pi / 4 * np.sinc(np.sqrt(np.maximum(s, 0)) / 4))
 
 
-def _least(values: list[Value]) -> Value:
-    found = values[0]
-    for value in values[1:]:
-        found = found.minimum(value)
-    return found
-
-
 def _ends(arcs: list[Arc]) -> tuple[Value, Value]:
-    lows, highs = [-arc.low for arc in arcs if arc.low is not None], [arc.high for arc in arcs if arc.high is not None]
-    return -_least(lows), _least(highs)
+    lows, highs = [arc.low for arc in arcs if arc.low is not None], [arc.high for arc in arcs if arc.high is not None]
+    return reduce(Value.maximum, lows), reduce(Value.minimum, highs)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import partial
 from itertools import product
 
@@ -15,7 +15,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.progress import Report
 from neurolens.cameras.arcs_passing import passing
 from neurolens.cameras.pupil_arcs import PupilArcs
-from neurolens.cameras.pupil_arcs_tune import moved
+from neurolens.cameras.pupil_arcs_tune import leaders, moved
 from neurolens.cameras.pupil_boxes import asking, end_of_light, frame_of
 from neurolens.cameras.pupil_sight import Sight, Truths, imaged, turned
 from neurolens.graph.interpret import evaluate
@@ -37,7 +37,8 @@ _RISE, _STEP, _STEPS = 1.03, 0.004, 12  # of arcs that do not hold them: in y^2,
 _ZONES, _FEW = (6, 3, 3), 1000  # of film radius, stop and azimuth; rays that tell of one
 _WIDEST = 0.5  # of half the pupil's size, by which arcs that do not hold them grow
 _MOVES, _DRAWS, _FIRM, _SURE = 3, 2, 1e4, 0.9999  # of arcs moved until they hold them
-_CELLS, _LEADERS = (10, 12, 3, 3), 3  # of radius, stop, focus and azimuth: rays that need most
+# Of the stop's and of rims' ends and two factors: highest power of the film radius, and how many move with the film.
+_LEAN = (((4, 3), (4, 2), (2, 0)), ((3, 2), (2, 1), (1, 0)))
 _RAYS = 60_000  # random ones that must lie inside, of an anamorphic lens three times as many
 
 
@@ -49,7 +50,8 @@ class Way:
         rows: film radii, and stops: as shares of the widest, where the end of the light is sought.
         powers: of the film radius. film: how many of the film radius and the stop move with the film's position.
         push: weight of what lies outside. refits: fits again to random rays that are missed: arcs that are moved as a
-            whole until they hold those are wide everywhere for the sake of one place. image: in that of the stop.
+            whole until they hold those are wide everywhere for the sake of one place. image: in that of the stop. lean:
+            see `_LEAN`.
     """
 
     rows: int
@@ -59,6 +61,7 @@ class Way:
     push: float
     refits: int
     image: bool
+    lean: bool = False
 
     def exponents(self, anamorphic: bool) -> NDArray[np.int64]:
         """Of film radius, stop, film position, wavelength and azimuth, see `PupilArcs`."""
@@ -72,7 +75,7 @@ class Way:
 
 # In turn until enough passes: the best is kept.
 _WAYS = (
-    Way(17, (1.0, 0.75, 0.5, 0.25, 0.1), 4, (3, 2), 300.0, 0, False),
+    Way(17, (1.0, 0.75, 0.5, 0.25, 0.1), 4, (3, 2), 300.0, 0, False, True),
     Way(25, (1.0, 0.85, 0.7, 0.55, 0.4, 0.28, 0.18, 0.08), 4, (3, 2), 3000.0, 3, False),
     Way(25, (1.0, 0.85, 0.7, 0.55, 0.4, 0.28, 0.18, 0.08), 4, (5, 3), 3000.0, 3, False),
     *(Way(25, (1.0, 0.7, 0.4, 0.2, 0.08), 12, (6, 3), 3000.0, refits, True) for refits in (1, 2)),  # rays are chance
@@ -188,7 +191,7 @@ def _fitted(
             if seed:
                 held = [_with_missed(*of_one, seed) for of_one in zip(sights, nodes, held, strict=True)]
             nodes = [
-                replace(a, sides=sides, numbers=_arcs(a, edge, sides, coloured, way.push))
+                replace(a, sides=sides, numbers=_arcs(a, edge, sides, coloured, way))
                 for a, edge in zip(nodes, held, strict=True)
             ]
         # Rims that move with the wavelength, as those of fisheyes do, cost time in a shader: only where it pays.
@@ -241,9 +244,9 @@ def _places(way: Way, sight: Sight, report: Report) -> _Places:
             across = (frame.reach[:, None] * v[:, None] for v in frame.stretch)
             x, y = (way * side for way, side in zip(across, (np.cos(_ANGLES), np.sin(_ANGLES)), strict=True))
             shape = (len(ends), *x.shape)
-            row = radius[:, None], frame.centre[:, None], x, y, z, stop
-            rows = *row, np.reshape(ends, (-1, 1, 1)), _ANGLES, azimuth
-            found.append([np.broadcast_to(one, shape).ravel() for one in rows])
+            lengths = np.reshape(ends, (-1, 1, 1))
+            rows = radius[:, None], frame.centre[:, None], x, y, z, stop, lengths, _ANGLES, azimuth
+            found.append([np.broadcast_to(row, shape).ravel() for row in rows])
             # The next stop's pupil lies within this one's.
             around = frame.centre - _WIDER * frame.stretch[0], frame.centre + _WIDER * frame.stretch[0]
             even = np.linspace(0, film_radius, way.rows)
@@ -285,8 +288,7 @@ def _with_missed(sight: Sight, arcs: PupilArcs, edge: _Edge, seed: int) -> _Edge
         far = np.maximum(np.maximum(-found["left"], -found["right"]), height).max(0)
         out = out & ~_worst(far, _zones(sight, rays, stop))
     missed = *rays["pupil_mm"], _scaled(arcs, rays, stop), np.full(out.size, _NO_SIDE), right, left
-    own = edge.x, edge.y, edge.scaled, edge.side, edge.first, edge.last
-    return _Edge(*(np.concatenate([a, b[..., out]], -1) for a, b in zip(own, missed, strict=True)))
+    return _Edge(*(np.concatenate([a, b[..., out]], -1) for a, b in zip(astuple(edge), missed, strict=True)))
 
 
 def _scaled(arcs: PupilArcs, rays: dict[str, Array], stop: Array) -> Array:
@@ -313,31 +315,31 @@ def _beyond(
     return rays, stop, left, right, left | right | (found["height"] < rays["pupil_mm"][1] ** 2).any(0)
 
 
-def _arcs(arcs: PupilArcs, edge: _Edge, sides: Sequence[int], coloured: bool, push: float) -> Array:
+def _arcs(arcs: PupilArcs, edge: _Edge, sides: Sequence[int], coloured: bool, way: Way) -> Array:
     """[A, 4, M]: the numbers of arcs of these sides; `coloured`: whether rims move with the wavelength."""
     monomials = np.prod(edge.scaled[:, None] ** arcs.exponents.T[:, :, None], axis=0)  # [M, N]
     still = arcs.exponents[:, [1] if coloured else [1, 3]].sum(1) == 0  # rims do not move with the stop
-    return np.stack([_arc(arcs, edge, monomials * still[:, None] if side else monomials, side, push) for side in sides])
+    return np.stack([_arc(arcs, edge, monomials * still[:, None] if side else monomials, side, way) for side in sides])
 
 
-def _arc(arcs: PupilArcs, edge: _Edge, monomials: Array, side: int, push: float) -> Array:
+def _arc(arcs: PupilArcs, edge: _Edge, monomials: Array, side: int, way: Way) -> Array:
     """[4, M]: the numbers of an arc."""
-    own = edge.side == side
+    own, push, (radius, _, film, wave, _) = edge.side == side, way.push, arcs.exponents.T
+    kept = [(radius <= most) & ((film == 0) | (radius < moving)) | (not way.lean) for most, moving in _LEAN[side != 0]]
+    ends, first, change = (monomials * rows[:, None] for rows in kept)
     size = np.maximum(edge.scaled[1], 0.05)
-    numbers = np.zeros((4, len(monomials)))
-    high, low = edge.first, edge.last
+    numbers, high, low = np.zeros((4, len(monomials))), edge.first, edge.last
     margin = _MARGIN * float(np.ptp(edge.x)) / 2 * _unit(arcs, side == 0)
     both = np.ones_like(edge.x)
     if side <= 0:
-        numbers[0] = -_above(monomials[:, low], -edge.x[low], own[low], size[low], push) - margin
+        numbers[0] = -_above(ends[:, low], -edge.x[low], own[low], size[low], push) - margin
         both *= (away := np.maximum(edge.x - numbers[0] @ monomials, 1e-6))
     if side >= 0:
-        numbers[1] = _above(monomials[:, high], edge.x[high], own[high], size[high], push) + margin
+        numbers[1] = _above(ends[:, high], edge.x[high], own[high], size[high], push) + margin
         both *= (right := np.maximum(numbers[1] @ monomials - edge.x, 1e-6))
         away = right if side else away
-    white = monomials * (arcs.exponents[:, 3] == 0)[:, None]
-    rows = np.concatenate([white * both, white * both * away])
-    factors = _above(rows, edge.y**2, own, size**2, push)
+    white = both * (wave == 0)[:, None]
+    factors = _above(np.concatenate([first * white, change * white * away]), edge.y**2, own, size**2, push)
     numbers[2:] = factors.reshape(2, -1)
     return numbers
 
@@ -414,24 +416,33 @@ def _widened(nodes: list[PupilArcs], seen: Sequence[tuple[Array, Sight]], report
         mixed = nodes[0].mixed(nodes[1:], weights)
         arcs = replace(mixed, numbers=np.tensordot(weights, numbers, 1))
         rays, stop = _random(sight, arcs, seed)
-        found = evaluate(arcs.checked, rays)
-        for end, (by, side) in enumerate((("left", -1), ("right", 1))):
-            for arc, row in enumerate(found[by]):
+        found, step = evaluate(arcs.checked, rays), _STEP * float(np.abs(rays["pupil_mm"][1]).max())
+        for end, name in enumerate(("left", "right")):
+            for arc, row in enumerate(found[name]):
                 lack = -row / (1.0 if arc else stop / arcs.stop_radius_mm)
-                push = max(float(np.quantile(lack, _HELD_ROUND)), 0.0)
-                numbers[own, arc, end] += side * push * _unit(arcs, arc == 0)
+                push = max(np.quantile(lack, _HELD_ROUND), 0.0)
+                numbers[own, arc] += push * _longer(arcs, arc, end, found["change"][arc])
         for _ in range(_STEPS):
             height = evaluate(replace(mixed, numbers=np.tensordot(weights, numbers, 1)).checked, rays)["height"]
             ratio = np.quantile(rays["pupil_mm"][1] ** 2 / np.maximum(height, 1e-9), _HELD_ROUND, axis=1)
             if ratio.max() <= _RISE:
                 break
             # Near the ends of an arc no factor helps: it is made longer.
-            for arc, arc_side in enumerate(arcs.sides):
-                step = _STEP * float(np.abs(rays["pupil_mm"][1]).max()) * (ratio[arc] > _RISE)
-                numbers[own, arc, 0] -= step * _unit(arcs, arc == 0) * (arc_side <= 0)
-                numbers[own, arc, 1] += step * _unit(arcs, arc == 0) * (arc_side >= 0)
+            for arc, end in product(np.flatnonzero(ratio > _RISE).tolist(), (0, 1)):
+                if arcs.sides[arc] != 1 - 2 * end:
+                    numbers[own, arc] += step * _longer(arcs, arc, end, found["change"][arc])
         numbers[own, :, 2:] *= ratio.clip(1.0, _RISE)[:, None, None]
     return [replace(a, numbers=own) for a, own in zip(nodes, numbers, strict=True)]
+
+
+def _longer(arcs: PupilArcs, arc: int, end: int, change: Array) -> Array:
+    """[4, M] what is added to numbers of an arc for a millimetre more at its low end, 0, or its high end, 1."""
+    return np.outer([end - 1, end, _bend(change) if arc else 0.0, 0.0], _unit(arcs, arc == 0))
+
+
+def _bend(change: Array) -> float:
+    """By how much a rim's first factor grows with its length (mm), so that it holds whatever it has held."""
+    return 1 + 2 * max(-float(change.min()), 0.0)
 
 
 def _dilated(arcs: PupilArcs, sight: Sight, report: Report) -> PupilArcs:
@@ -457,12 +468,12 @@ def _moved(arcs: PupilArcs, sight: Sight, rays: dict[str, Array], stop: Array, l
     for arc, side in enumerate(arcs.sides):
         own = {name: found[name][arc] for name in ("left", "right", "first", "change")}
         # The stop's ends move with the stop. A rim's far end moves, too.
-        step, bend = (scaled[1], 1 / size) if side == 0 else (1.0, 1 + 2 * max(-float(own["change"].min()), 0.0))
+        step, bend = (scaled[1], 1 / size) if side == 0 else (1.0, _bend(own["change"]))
         need = np.maximum(_needed(own, y * y, side, step, bend, size), least)
         ends = {e: (e[0], e[1] + (side == 0), *e[2:]) for e in powers if not (e[2] or e[3] or (side and e[1]))}
         ends = {e: end for e, end in ends.items() if end in powers}
         rows = np.prod(scaled[:, None] ** np.array(list(ends)).T[:, :, None], axis=0)
-        of_all = _leaders(scaled, np.where(_worst(need, zones), -np.inf, need))
+        of_all = leaders(scaled, np.where(_worst(need, zones), -np.inf, need))
         way = _above(rows[:, of_all], need[of_all], np.ones(of_all.size, bool), np.ones(of_all.size), _FIRM)
         way[0] += max(float(np.quantile((need - way @ rows)[zone], _SURE)) for zone in zones)
         for (e, end), value in zip(ends.items(), way, strict=True):
@@ -484,13 +495,3 @@ def _needed(own: dict[str, Array], squared: Array, side: int, step: ArrayLike, b
         held = (np.minimum(away, other) >= 0) & (height >= squared)
         low, high = np.where(held, low, way), np.where(held, way, high)
     return high
-
-
-def _leaders(scaled: Array, need: Array) -> NDArray[np.intp]:
-    """Rays that need most, a few of every small cell."""
-    parts = (scaled[0], scaled[1], (scaled[2] + 1) / 2, (scaled[4] + 1) / 2)
-    places = [np.clip((part * n).astype(int), 0, n - 1) for part, n in zip(parts, _CELLS, strict=True)]
-    cell = np.ravel_multi_index(places, _CELLS)
-    order = np.lexsort((-need, cell))
-    rank = np.arange(order.size) - np.searchsorted(cell[order], cell[order])
-    return order[(rank < _LEADERS) & np.isfinite(need[order])]

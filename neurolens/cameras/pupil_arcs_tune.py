@@ -46,6 +46,7 @@ _MARGINS, _RIMS = (
     (0.0, 0.001, 0.002, 0.003, 0.005, 0.008),
     4.0,
 )  # that widen arcs which lose light, rims by so much more
+_CELLS, _LEADERS = (10, 12, 3, 3), 3  # of radius, stop, focus and azimuth: rays that need most
 _SMALLEST = 0.05  # stop, of the widest, that pupils are scaled by
 _RIDGE = 1e-6
 
@@ -132,7 +133,7 @@ def _wider(arcs: PupilArcs, rays: dict[str, Array], margin: float, half_mm: floa
 def _tuned(nodes: list[PupilArcs], seen: Sequence[tuple[Array, Sight]], report: Report) -> list[PupilArcs]:
     """The arcs, moved; `seen`: weights of nodes, and the lens there."""
     numbers, weight = np.stack([a.numbers for a in nodes]), np.full((len(seen), _ALL), _HEAVY)
-    used = [_used(nodes, arc, side) for arc, side in enumerate(nodes[0].sides)]
+    used = [_used(nodes, arc) for arc in range(len(nodes[0].sides))]
     for seed in range(_MOST):
         width, drawn = _WIDTHS[min(seed, len(_WIDTHS) - 1)], []
         for weights, sight in seen:
@@ -157,15 +158,9 @@ def _tuned(nodes: list[PupilArcs], seen: Sequence[tuple[Array, Sight]], report: 
     return [replace(a, numbers=own) for a, own in zip(nodes, numbers, strict=True)]
 
 
-def _used(nodes: list[PupilArcs], arc: int, side: int) -> list[Truths]:
+def _used(nodes: list[PupilArcs], arc: int) -> list[Truths]:
     """[M] of each of the arc's four: the terms that it has, of all its nodes."""
-    powers, found = nodes[0].exponents, []
-    coloured = any(a.numbers[arc][:, powers[:, 3] > 0].any() for a in nodes)
-    for row, ends in enumerate((side <= 0, side >= 0, False, False)):
-        own = (powers[:, 1] == 0) | (side == 0)  # rims do not move with the stop
-        white = powers[:, 3] == 0
-        found.append(own & (white | coloured) & ends if row < 2 else own & white)
-    return found
+    return [np.any([a.numbers[arc][row] != 0 for a in nodes], axis=0) for row in range(4)]
 
 
 def _blame(rays: _Rays, within: Array, sides: Sequence[int]) -> NDArray[np.intp]:
@@ -294,3 +289,13 @@ def random_rays(
     codes = sight.status(place, turned(pupil, azimuth), nm, film_z, stop)
     given |= {"film_mm": np.stack([radius, 0 * radius]), "pupil_mm": pupil, "twice": np.cos(2 * azimuth)[None]}
     return given, stop, codes
+
+
+def leaders(scaled: Array, need: Array) -> NDArray[np.intp]:
+    """Rays that need most, a few of every small cell."""
+    parts = (scaled[0], scaled[1], (scaled[2] + 1) / 2, (scaled[4] + 1) / 2)
+    places = [np.clip((part * n).astype(int), 0, n - 1) for part, n in zip(parts, _CELLS, strict=True)]
+    cell = np.ravel_multi_index(places, _CELLS)
+    order = np.lexsort((-need, cell))
+    rank = np.arange(order.size) - np.searchsorted(cell[order], cell[order])
+    return order[(rank < _LEADERS) & np.isfinite(need[order])]

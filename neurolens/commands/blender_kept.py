@@ -23,9 +23,9 @@ from neurolens.blender.pack import Form
 _KEPT = 512  # files of some 100 kB
 
 
-def kept_form(file: Path, zoom: str | None, make: Callable[[], Form]) -> Form:
-    """The form of a model or lens file: from the cache, else what `make` gives, kept if a file can be written."""
-    key = fingerprint_of([_code(), file.name, sha256_of(file), zoom])
+def kept_form(file: Path, *given: str | None, make: Callable[[], Form]) -> Form:
+    """The form of a file, and of what else is given: from the cache, else what `make` gives, kept if it can be."""
+    key = fingerprint_of([_code(), file.name, sha256_of(file), *given])
     place = cache_folder() / f"{key[:32]}.form"
     data = sealed_bytes(place)
     if data is not None:

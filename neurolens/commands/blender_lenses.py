@@ -5,13 +5,14 @@ from __future__ import annotations
 import io
 import math
 import multiprocessing
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,19 +34,19 @@ _RADII, _NEAR = (0.0, 0.35, 0.6, 0.8, 0.97), 20.0  # of the picture's radius; fo
 Forms = dict[Path, Form]
 
 
-def form_of(file: Path, *, zoom: str | None = None, quiet: bool = False) -> Form:
-    """The shader of a model (.onnx) or of a lens file (.toml), with its facts; kept between runs.
+def form_of(file: Path, *, zoom: str | None = None, as_bare: str = "", quiet: bool = False) -> Form:
+    """The shader of a model (.onnx) or of a lens file (.toml), with its facts; kept between runs. See `shader_of`.
 
     Raises:
         InputError: neither; a lens that cannot be a shader. ModelError: a broken model.
     """
     if file.suffix not in (".onnx", ".toml"):
         raise InputError(file, "file", file.suffix or "(no suffix)", "a model (.onnx) or a lens file (.toml)")
-    return kept_form(file, zoom, lambda: _made_form(file, zoom, quiet))
+    return kept_form(file, zoom, as_bare, make=lambda: _made_form(file, zoom, as_bare, quiet))
 
 
-def _made_form(file: Path, zoom: str | None, quiet: bool) -> Form:
-    shader = shader_of(file, zoom=zoom, quiet=quiet)
+def _made_form(file: Path, zoom: str | None, as_bare: str, quiet: bool) -> Form:
+    shader = shader_of(file, zoom=zoom, as_bare=as_bare, quiet=quiet)
     kind, model, error, poor = "exact", "", None, []
     if file.suffix == ".onnx":
         card = _card(file)
@@ -77,8 +78,14 @@ def _squeeze(file: Path, zoom: str | None) -> float:
     return float(make_camera(str(file), Shot((1.0, 1.0), math.inf, zoom=zoom)).settings["lens_state"]["squeeze"] or 1.0)
 
 
-def forms_of(files: Sequence[Path], jobs: int, report: Callable[[float], object]) -> tuple[Forms, dict[Path, str]]:
+def forms_of(
+    files: Sequence[Path], jobs: int, report: Callable[[float], object],
+    given: Mapping[Path, tuple[str | None, str]] = MappingProxyType({}),
+) -> tuple[Forms, dict[Path, str]]:  # fmt: skip
     """Forms of many files, `jobs` at a time in processes of their own, and why others have none.
+
+    Args:
+        given: zoom and as_bare of `form_of`, of files that have any.
 
     Raises:
         NeurolensError: a process ended by itself, as where memory is short.
@@ -95,11 +102,11 @@ def forms_of(files: Sequence[Path], jobs: int, report: Callable[[float], object]
 
     if jobs == 1:
         for file in files:
-            keep(file, _form_or_why(file))
+            keep(file, _form_or_why(file, *given.get(file, ())))
         return found, left
     with ProcessPoolExecutor(jobs, CONTEXT, _begin_job) as pool:
         with held():  # a process just forked would raise what this one raises, and run on as a second command
-            waiting = {pool.submit(_form_or_why, file): file for file in files}
+            waiting = {pool.submit(_form_or_why, file, *given.get(file, ())): file for file in files}
         try:
             for done in as_completed(waiting):
                 keep(waiting[done], done.result())
@@ -124,9 +131,9 @@ def _begin_job() -> None:
         torch.set_num_threads(1)
 
 
-def _form_or_why(file: Path) -> Form | str:
+def _form_or_why(file: Path, zoom: str | None = None, as_bare: str = "") -> Form | str:
     try:
-        return form_of(file, quiet=True)
+        return form_of(file, zoom=zoom, as_bare=as_bare, quiet=True)
     except NeurolensError as error:
         return str(error)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import tempfile
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,6 +22,7 @@ from neurolens.commands.output import answer
 if TYPE_CHECKING:
     from neurolens.flare.ghostmodel import GhostModel
     from neurolens.optics.prescription import Lens
+    from neurolens.surrogates.source import Written
     from neurolens.view.page import Form, ViewLens
 
 _DESCRIPTION = """\
@@ -50,13 +52,18 @@ _GHOSTS = 24  # of a lens at most: the brightest
 
 @dataclass(frozen=True)
 class _Entry:
-    """A lens with its models, in one state; `zoom` "range" is all of a zoom."""
+    """A lens with its models, in one state; `zoom` "range" is all of a zoom.
+
+    `file` is of the lens, where it has been written; `as_bare` says what is left out where it is traced.
+    """
 
     key: str
     models: Sequence[Path]
     lens: Lens | None
     zoom: str | None = None
     ghosts: GhostModel | None = None
+    file: Path | None = None
+    as_bare: str = ""
 
 
 def add_parser(subparsers: Any) -> None:
@@ -71,7 +78,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "--downloads", metavar="KINDS", type=_kinds, default=_DOWNLOADS,
         help="of glsl, onnx, c, osl what the page brings as files of each form (default: all; osl takes seconds a "
-        "model, once); the last are left out where the page grows beyond 3 MB",
+        "form, a minute of a zoom, once); the last are left out where the page grows beyond 3 MB, exact lenses' first",
     )  # fmt: skip
     parser.add_argument(
         "--jobs", metavar="N", type=whole(1, 64), default=min(8, os.cpu_count() or 1),
@@ -101,29 +108,45 @@ def run(args: argparse.Namespace) -> int:
         if len(set(found)) < len(found):
             raise InputError("neurolens view", entry.key, f"({' and '.join(found)})", "one model of each kind")
     kinds, progress = args.downloads, Progress(quiet=args.json)
-    shaders = _shaders([m for e in entries for m in e.models], args.jobs, progress) if "osl" in kinds else {}
     made: list[ViewLens] = []
-    with progress.stage(f"{len(entries)} lenses") as report, tempfile.TemporaryDirectory() as folder:
-        for entry in entries:
-            made.append(_view_lens(entry, Path(folder), kinds, shaders))
-            report(len(made) / len(entries))
+    with tempfile.TemporaryDirectory() as place, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", re.escape(place), NeurolensWarning)  # said of the lens's own file
+        entries = [_with_file(entry, Path(place) / str(number)) for number, entry in enumerate(entries)]
+        shaders = _shaders(entries, args.jobs, progress) if "osl" in kinds else {}
+        with progress.stage(f"{len(entries)} lenses") as report:
+            for entry in entries:
+                made.append(_view_lens(entry, Path(place), kinds, shaders))
+                report(len(made) / len(entries))
     from neurolens.view.page import write_page
 
     about = write_page(args.out, made, kinds)
-    left = [kind for kind in kinds if kind not in about["downloads"]]
+    left = about["left_out"]
     data = {"file": str(args.out), **about, "lenses": [lens.key for lens in made]}
     more = f"; left out for its size: {', '.join(left)}" if left else ""
     return answer(args, data, lambda: f"{args.out}: {len(made)} lenses, {about['bytes'] / 1e6:.2f} MB{more}")
 
 
-def _shaders(files: Sequence[Path], jobs: int, progress: Progress) -> Mapping[Path, str]:
-    """OSL of models; those that cannot be written so are told of and left out."""
+def _with_file(entry: _Entry, folder: Path) -> _Entry:
+    from neurolens.optics.lenswriter import write_lens
+
+    if entry.lens is None:
+        return entry
+    folder.mkdir()
+    file = folder / f"{entry.lens.lens_id}.toml"
+    write_lens(entry.lens, file)
+    return replace(entry, file=file, as_bare="" if _is_bare(entry.lens) else f"In this form: {_AS_BARE}.")
+
+
+def _shaders(entries: Sequence[_Entry], jobs: int, progress: Progress) -> Mapping[Path, str]:
+    """OSL of lens files and models; those that cannot be written so are told of and left out."""
     from neurolens.commands.blender_lenses import forms_of
 
+    given = {e.file: (e.zoom, e.as_bare) for e in entries if e.file is not None}
+    files = [*given, *(model for entry in entries for model in entry.models)]
     with progress.stage("shaders") as report:
-        forms, left = forms_of(files, min(jobs, len(files)), report) if files else ({}, {})
-    for why in left.values():
-        warnings.warn(f"no OSL: {why}", NeurolensWarning, stacklevel=2)
+        forms, left = forms_of(files, min(jobs, len(files)), report, given)
+    for file, why in left.items():
+        warnings.warn(f"no OSL: {why.replace(str(file), file.name)}", NeurolensWarning, stacklevel=2)
     return {file: form.osl for file, form in forms.items()}
 
 
@@ -219,10 +242,10 @@ def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str], shaders: Mappi
     forms = [_model_form(file, folder, kinds, shaders.get(file)) for file in entry.models]
     drawn: dict[str, Any] = {}
     path = None
-    if entry.lens is not None:
+    if entry.lens is not None and entry.file is not None:
         lens = entry.lens.at() if entry.zoom == RANGE else entry.lens.at(zoom=entry.zoom)
         try:
-            forms.append(_exact_form(entry, folder, kinds))
+            forms.append(_exact_form(entry, entry.file, lens, kinds, shaders.get(entry.file)))
             path = _path(lens) if entry.zoom != RANGE else None
         except NeurolensError:
             if not forms:
@@ -267,7 +290,6 @@ def _model_form(file: Path, folder: Path, kinds: Sequence[str], osl: str | None)
     from neurolens.cameras.onnxlens import load_model
     from neurolens.cameras.source import model_extras
     from neurolens.surrogates.source import export_file
-    from neurolens.view.page import Form
 
     loaded = load_model(file)
     card, domain, errors = loaded.card, loaded.card["domain"], loaded.card["errors"]
@@ -284,10 +306,7 @@ def _model_form(file: Path, folder: Path, kinds: Sequence[str], osl: str | None)
         "zones": errors.get("zones") or {},
         "poor": list(errors.get("poor") or ()),
     }
-    files = {"onnx": file.read_bytes()} | {to: w.path.read_bytes() for to, w in written.items() if to != "glsl"}
-    files |= {} if osl is None else {"osl": osl.encode()}
-    glsl = written["glsl"]
-    return Form(_kind_of(card), str(card["fit"]["method"]), glsl.path.read_text("utf-8"), glsl.signature, told, files)
+    return _form(_kind_of(card), str(card["fit"]["method"]), written, told, {"onnx": file.read_bytes()}, osl)
 
 
 def _written(kinds: Sequence[str]) -> list[str]:
@@ -314,30 +333,34 @@ def _is_bare(lens: Lens) -> bool:
     return True
 
 
-def _exact_form(entry: _Entry, folder: Path, kinds: Sequence[str]) -> Form:
+def _exact_form(entry: _Entry, file: Path, at: Lens, kinds: Sequence[str], osl: str | None) -> Form:
     from neurolens.commands.export_lens import write_lens
-    from neurolens.optics.lenswriter import write_lens as write_file
     from neurolens.optics.paraxial import first_order
     from neurolens.optics.pupils import image_radius_mm
-    from neurolens.view.page import Form
 
-    assert entry.lens is not None
-    lens = entry.lens
-    file = folder / f"{lens.lens_id}.toml"
-    write_file(lens, file)
-    written, as_bare = {}, "" if _is_bare(lens) else f"In this form: {_AS_BARE}."
-    for to in _written(kinds):
-        written[to] = write_lens(file, folder / f"exact.{to}", to, zoom=entry.zoom, quiet=True, as_bare=as_bare)
-    at = lens.at() if entry.zoom == RANGE else lens.at(zoom=entry.zoom)
+    written = {
+        to: write_lens(file, file.with_suffix(f".{to}"), to, zoom=entry.zoom, quiet=True, as_bare=entry.as_bare)
+        for to in _written(kinds)
+    }
     data = first_order(at)
     told = {
-        "name": lens.name, "source": lens.source, "efl_mm": float(data.efl_mm),
+        "name": at.name, "source": at.source, "efl_mm": float(data.efl_mm),
         "film_radius_mm": image_radius_mm(at)[0],
         "nearest_m": _NEAR_EFL * abs(float(data.efl_mm)) / 1000 * 1.05,
         "f_numbers": [(float(data.efl_mm), float(data.f_number))],
         "errors": {}, "zones": {}, "poor": [],
     }  # fmt: skip
+    said = f"every surface traced, {_AS_BARE}" if entry.as_bare else "every surface traced"
+    return _form("exact", said, written, told, {}, osl)
+
+
+def _form(
+    kind: str, method: str, written: Mapping[str, Written], card: Mapping[str, Any], files: dict[str, bytes],
+    osl: str | None,
+) -> Form:  # fmt: skip
+    from neurolens.view.page import Form
+
     glsl = written["glsl"]
-    files = {to: w.path.read_bytes() for to, w in written.items() if to != "glsl"}
-    said = f"every surface traced, {_AS_BARE}" if as_bare else "every surface traced"
-    return Form("exact", said, glsl.path.read_text("utf-8"), glsl.signature, told, files)
+    files |= {to: w.path.read_bytes() for to, w in written.items() if to != "glsl"}
+    files |= {} if osl is None else {"osl": osl.encode()}
+    return Form(kind, method, glsl.path.read_text("utf-8"), glsl.signature, card, files)

@@ -161,6 +161,9 @@ def _survey(task: Task, file: Path, record: dict[str, Any]) -> None:
     record |= {"sha256": lens.sha256, "layout": None, "fit": None}
     lens = lens.with_aperture(None).at()
     domain = DomainChoice(focus_m=(math.inf, math.inf), wavelength_nm=_WAVELENGTHS_NM).of(lens)
+    if lens.half_field_deg is None and lens.image_radius_mm is None:
+        found = f"a film radius of {domain.film_radius_mm:.4g} mm, where its light falls to 10%"
+        record["notes"].append(f"neither field nor film is stated: taken to {found}")
     record["layout"] = thumbnail(layout_profile(lens, domain))
     if task.settings.fit:
         record["fit"] = _fit(lens, domain, task.settings, file.parent)

@@ -182,18 +182,18 @@ def write_c(program: Program, name: str, comment: Sequence[str], extras: Extras 
     text += "".join(f"#define {macro}_{key.upper()} {literal(v)}\n" for key, v in extras.constants.items())
     for key, function in extras.functions.items():
         own = Writer(function, f"{name}_sqrt", f"{macro}_FMA")
-        text += f"\n{macro}_INLINE {one_number(own, f'{name}_{key}', 'const float')}"
+        text += f"\n{macro}_INLINE {one_number(own, f'{name}_{key}')}"
     lookup = f"{{table}}[{name}_cell({{index}}, {{cells}}) * {{width}} + {{place}}]"
     writer = Writer(
         program, f"{name}_sqrt", f"{macro}_FMA", clamp=f"{name}_clamp", floor="floorf", lookup=lookup, name=name
     )
-    body = [f"    const float t{k} = {writer.step(program.steps[k])};" for k in live if not _input(program, k)]
+    body = steps_of(writer)
     results = [f"    ray.{o} = {writer.value(program.outputs[o].argument)};" for o in signature.outputs]
     if "status" in program.outputs:
         results.append(f"    ray.status = (int){writer.value(program.outputs['status'].argument)};")
     if program.mixture is not None:
         own = Writer(program.mixture.program, "sqrtf", f"{macro}_FMA")
-        parts = state_parts(program.mixture, writer.table, own, "const float")
+        parts = state_parts(program.mixture, writer.table, own)
         text += _STATE.format(name=name, macro=macro, **parts)
         body.insert(0, "    const float *const c = state->c;")
     elif writer.table:
@@ -209,19 +209,19 @@ def _numbers(name: str, rows: NDArray[np.float64]) -> str:
     return f"\nstatic const float {name}[{rows.size}] = {{\n{lines}}};\n"
 
 
-def one_number(writer: Writer, name: str, local: str) -> str:
-    """A function of the inputs of a program that gives its one output; `local` declares its variables."""
+def one_number(writer: Writer, name: str) -> str:
+    """A function of the inputs of a program that gives its one output."""
     program = writer.program
     arguments = ", ".join(f"float {program.steps[k].name}" for k in program.live() if _input(program, k))
     (found,) = program.outputs.values()
-    lines = steps_of(writer, local)
+    lines = steps_of(writer)
     return "\n".join([f"float {name}({arguments})", "{", *lines, f"    return {writer.value(found.argument)};", "}\n"])
 
 
-def steps_of(writer: Writer, local: str) -> list[str]:
-    """The steps of a program as lines; `local` declares their variables."""
+def steps_of(writer: Writer) -> list[str]:
+    """The steps of a program as lines."""
     steps = [(k, writer.program.steps[k]) for k in writer.program.live() if not _input(writer.program, k)]
-    return [f"    {local} t{k} = {writer.step(step)};" for k, step in steps]
+    return [f"    float t{k} = {writer.step(step)};" for k, step in steps]
 
 
 _STATE = """
@@ -250,7 +250,7 @@ static const float {name}_nodes[{size}] = {{
 """
 
 
-def state_parts(mixture: Mixture, table: Sequence[Sequence[float]], writer: Writer, local: str) -> dict[str, Any]:
+def state_parts(mixture: Mixture, table: Sequence[Sequence[float]], writer: Writer) -> dict[str, Any]:
     """What the function of a state is written of: numbers [n][nodes] and, by a writer of its program, its features."""
     rows = np.array(table or [[0.0] * mixture.transform.shape[1]]) @ mixture.transform.T
     program = mixture.program
@@ -260,7 +260,7 @@ def state_parts(mixture: Mixture, table: Sequence[Sequence[float]], writer: Writ
         "size": rows.size,
         "rows": ",\n    ".join(", ".join(literal(v) for v in row) for row in rows),
         "arguments": ", ".join(f"float {step.name}" for step in program.steps if step.kind == "input"),
-        "steps": "\n".join(steps_of(writer, local)),
+        "steps": "\n".join(steps_of(writer)),
         "made": ", ".join(writer.value(e.argument) for key, e in program.outputs.items() if key != "inside"),
         "inside": writer.value(program.outputs["inside"].argument),
     }

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from neurolens.graph.c import NOTHING, Extras, Signature, Writer, literal, one_number, state_parts
+from neurolens.graph.c import NOTHING, Extras, Signature, Writer, literal, one_number, state_parts, steps_of
 from neurolens.graph.program import Program
 
 _HEAD = """\
@@ -16,6 +16,7 @@ _HEAD = """\
  * For GLSL 3.30, GLSL ES 3.00 (with highp floats) and later. Results mean something where status is 0. A language that
  * may ignore NaN cannot promise the status of one: rays handed in must be numbers.
  */
+#define {fma}(a, b, c) ((a) * (b) + (c))
 """
 # Tables of the caller are textures of one float a texel, a cell a line; NaN is less than nothing in no language.
 _LOOKUP = "texelFetch({table}, ivec2({place}, clamp(int({index}), 0, textureSize({table}, 0).y - 1)), 0).r"
@@ -54,19 +55,19 @@ def write_glsl(program: Program, name: str, comment: Sequence[str], extras: Extr
     signature = Signature.of(program, name)
     lines = "\n".join(f" * {line}".rstrip() for line in comment).replace("*/", "* /")
     place = "state.c[{}]" if signature.state else f"{name}_table[band_first + {{}}]"
-    writer = Writer(program, "sqrt", place=place, lookup=_LOOKUP, own_lookup=_OWN_LOOKUP, name=name)
-    live = program.live()
-    body = [f"    float t{k} = {writer.step(program.steps[k])};" for k in live if program.steps[k].kind != "input"]
+    fma = f"{name.upper()}_FMA"  # as in C: the steps of both are the same lines
+    writer = Writer(program, "sqrt", fma, place, lookup=_LOOKUP, own_lookup=_OWN_LOOKUP, name=name)
+    body = steps_of(writer)
     results = [f"    {o} = {writer.value(program.outputs[o].argument)};" for o in signature.outputs]
     status = program.outputs.get("status")
     results += [] if status is None else [f"    status = int({writer.value(status.argument)});"]
-    text = _HEAD.format(comment=lines) + "\n" * bool(extras.constants)
+    text = _HEAD.format(comment=lines, fma=fma) + "\n" * bool(extras.constants)
     text += "".join(f"const float {name.upper()}_{k.upper()} = {literal(v)};\n" for k, v in extras.constants.items())
     for key, function in extras.functions.items():
-        text += f"\n{one_number(Writer(function, 'sqrt'), f'{name}_{key}', 'float')}"
+        text += f"\n{one_number(Writer(function, 'sqrt', fma), f'{name}_{key}')}"
     constants = {table: numbers.reshape(-1) for table, numbers in program.own_tables.items()}
     if program.mixture is not None:
-        parts = state_parts(program.mixture, writer.table, Writer(program.mixture.program, "sqrt"), "float")
+        parts = state_parts(program.mixture, writer.table, Writer(program.mixture.program, "sqrt", fma))
         text += _STATE.format(name=name, **parts)
     elif writer.table:
         constants["table"] = np.array(writer.table).T.reshape(-1)

@@ -70,21 +70,27 @@ def low_orders(
     samples: Sequence[Mapping[str, NDArray[np.float32]]],
     enough: float = _STOP,
     worst: float = WORST,
+    reach_mm: float = 0.0,
 ) -> list[LowOrder] | None:
-    """`with_low_order_derivatives` of a lens in several states: the terms are those of all, their weights of each."""
+    """`with_low_order_derivatives` of a lens in several states: the terms are those of all, their weights of each.
+
+    Args:
+        reach_mm: nothing is seen from nearer: errors of the point's derivatives are shares of what the direction's make
+            of them there, where that is more.
+    """
     states = [_Fitted.of(graph, given) for graph, given in zip(graphs, samples, strict=True)]
     if any(state is None for state in states):
         return None
     known = [state for state in states if state is not None]
-    for group in _GROUPS:
-        good = [enough * float(np.sqrt(np.mean(np.square(s.wanted[group])))) for s in known]
+    for group, least in zip(_GROUPS, (reach_mm, 0.0), strict=True):
+        good = [enough * max(_rms(s.wanted[group]), least * _rms(s.wanted[_GROUPS[1]])) for s in known]
         for row in range(group.start, group.stop):
             for by in range(2):
-                chosen, values = _pursue([s.products for s in known], [s.wanted[row, by] for s in known], good)
+                chosen, values = pursue([s.products for s in known], [s.wanted[row, by] for s in known], good)
                 for state, own in zip(known, values, strict=True):
                     state.weights[row, by, chosen] = own
     used = np.any([s.weights.any((0, 1)) for s in known], axis=0)
-    found = [s.finished(used) for s in known]
+    found = [s.finished(used, reach_mm) for s in known]
     return found if max(f.error for f in found) <= worst else None
 
 
@@ -119,7 +125,7 @@ class _Fitted:
         weights = np.zeros((6, 2, len(monomials)))
         return _Fitted(found, samples, passed, variables, monomials, products, _matrices(exact, passed), weights)
 
-    def finished(self, used: NDArray[np.bool_]) -> LowOrder:
+    def finished(self, used: NDArray[np.bool_], reach_mm: float) -> LowOrder:
         """The graph with its derivatives, of the monomials that any state uses."""
         count = self.variables.rows
         exponents = np.array([np.bincount(m, minlength=count) for m in self.monomials], np.int64)[used]
@@ -127,7 +133,9 @@ class _Fitted:
         rows = self.graph.polynomial(exponents, weights, self.variables)
         self.graph.outputs |= dict(zip(_NAMES, self.graph.split(rows, (6, 6)), strict=True))
         fitted = _matrices(evaluate(self.graph, self.samples), self.passed)  # in float32, as it will be used
-        error = max(_error(fitted[group], self.wanted[group]) for group in _GROUPS)
+        point, direction = (np.linalg.norm(self.wanted[group], axis=(0, 1)) for group in _GROUPS)
+        sizes = np.maximum(point, reach_mm * direction), direction
+        error = max(_error(fitted[g], self.wanted[g], size) for g, size in zip(_GROUPS, sizes, strict=True))
         return LowOrder(self.graph, error, int(np.count_nonzero(self.weights)))
 
 
@@ -137,10 +145,13 @@ def _matrices(results: Mapping[str, NDArray[np.float32]], passed: NDArray[np.boo
     return np.stack(rows, axis=1).astype(np.float64)
 
 
-def _error(found: Array, wanted: Array) -> float:
-    """RMS over rays of the relative error in the Frobenius norm."""
-    size = np.maximum(np.linalg.norm(wanted, axis=(0, 1)), 1e-30)
-    return float(np.sqrt(np.mean((np.linalg.norm(found - wanted, axis=(0, 1)) / size) ** 2)))
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _error(found: Array, wanted: Array, size: Array) -> float:
+    """RMS over rays of the error in the Frobenius norm over a size [N]."""
+    return _rms(np.linalg.norm(found - wanted, axis=(0, 1)) / np.maximum(size, 1e-30))
 
 
 def _variables(g: Graph, rays: Array) -> tuple[Array, Value]:
@@ -160,7 +171,9 @@ def _monomials(count: int) -> list[Monomial]:
     return points + [(*m, 4) for m in points if len(m) <= _DEGREE_WAVE and count > 4]
 
 
-def _pursue(columns: Sequence[Array], wanted: Sequence[Array], good: Sequence[float]) -> tuple[list[int], list[Array]]:
+def pursue(
+    columns: Sequence[Array], wanted: Sequence[Array], good: Sequence[float], most: int = _MOST_TERMS
+) -> tuple[list[int], list[Array]]:
     """Rows of `columns` [M, N] of each state, and their weights there, whose sum comes within `good` (RMS) of `wanted`
     [N] in all.
 
@@ -170,7 +183,7 @@ def _pursue(columns: Sequence[Array], wanted: Sequence[Array], good: Sequence[fl
     scales = [max(float(np.linalg.norm(w)), 1e-30) for w in wanted]
     chosen: list[int] = []
     weights, left = [np.zeros(0) for _ in columns], list(wanted)
-    while len(chosen) < _MOST_TERMS and any(np.sqrt(np.mean(v**2)) > g for v, g in zip(left, good, strict=True)):
+    while len(chosen) < most and any(np.sqrt(np.mean(v**2)) > g for v, g in zip(left, good, strict=True)):
         gain = sum((c @ v / size / scale) ** 2 for c, v, size, scale in zip(columns, left, sizes, scales, strict=True))
         gain = np.asarray(gain)
         gain[chosen] = 0

@@ -75,8 +75,7 @@ def write_osl(
     for table, numbers in program.own_tables.items():
         values = ", ".join(_plain(literal(v)) for v in numbers.reshape(-1))
         tables += f"    float {name}_{table}[{numbers.size}] = {{{values}}};\n"
-    steps = [(k, program.steps[k]) for k in program.live() if program.steps[k].kind != "input"]
-    body = "\n".join(f"    float t{k} = {_plain(writer.step(step))};" for k, step in steps)
+    body = _plain("\n".join(steps_of(writer)))
     results = ""
     for o in outputs:
         rows = (_plain(writer.value(program.outputs[f"{o}_{k}"].argument)) for k in range(3))
@@ -90,7 +89,7 @@ def _mixed(mixture: Mixture, writer: Writer) -> str:
     """The state's features `s0` ..., and of them the coefficients `c0` ... that differ between tables."""
     made = _Writer(mixture.program, "sqrt")
     names = [made.value(e.argument) for key, e in mixture.program.outputs.items() if key != "inside"]
-    text = "\n".join(f"    {line.strip()}" for line in steps_of(made, "float"))
+    text = "\n".join(f"    {line.strip()}" for line in steps_of(made))
     rows = np.array(writer.table, np.float64) @ mixture.transform.T
     for k, row in enumerate(rows):
         terms = (f"{literal(v)} * {name}" for v, name in zip(row, names, strict=True) if v)

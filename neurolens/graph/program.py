@@ -6,8 +6,10 @@ program (one table, unless several wavelengths are fixed), so that all tables sh
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from typing import Any, TypeVar
 
 import numpy as np
@@ -296,6 +298,48 @@ class Program:
             found._append(replace(step, arguments=tuple(moved(a) for a in step.arguments)))
         found.outputs = {name: Expr(found, moved(e.argument)) for name, e in self.outputs.items()}
         return found
+
+    def with_shorter_sums(self, parts: int = 3, least: int = 8) -> Program:
+        """The same program but for rounding: sums of at least so many products in parts, for one that is added up in
+        turn keeps a core waiting after every product."""
+        found, place = Program(self.tables, mixture=self.mixture, own_tables=self.own_tables), dict[int, Expr]()
+        totals: dict[int, list[Expr]] = {}
+        sums = self._sums(least)
+
+        def moved(argument: Argument) -> Expr:
+            return place[argument] if isinstance(argument, int) else Expr(found, argument)
+
+        for k in self.live():
+            step = self.steps[k]
+            if k not in sums:
+                place[k] = found._append(replace(step, arguments=tuple(moved(a).argument for a in step.arguments)))
+                continue
+            (last, number), a, b = sums[k], moved(step.arguments[0]), moved(step.arguments[1])
+            total = totals.setdefault(last, [])
+            if number == 0:
+                total.append(found.fma(a, b, moved(step.arguments[2])))
+            elif number < parts:
+                total.append(a * b)
+            else:
+                total[number % parts] = found.fma(a, b, total[number % parts])
+            if k == last:
+                place[k] = reduce(Expr.__add__, total)
+        found.outputs = {name: moved(e.argument) for name, e in self.outputs.items()}
+        return found
+
+    def _sums(self, least: int) -> dict[int, tuple[int, int]]:
+        """Steps of sums of at least so many products, each spent by the next alone: the last of its sum, and how many
+        are before it."""
+        live = self.live()
+        uses = Counter(a for k in live for a in self.steps[k].arguments)
+        uses.update(e.argument for e in self.outputs.values())
+        sums: dict[int, list[int]] = {}
+        for k in (k for k in live if self.steps[k].kind == "fma"):
+            *factors, before = self.steps[k].arguments
+            alone = isinstance(before, int) and before in sums and uses[before] == 1 and before not in factors
+            sums[k] = [*(sums.pop(before) if alone and isinstance(before, int) else []), k]
+        long = (steps for steps in sums.values() if len(steps) >= least)
+        return {k: (steps[-1], number) for steps in long for number, k in enumerate(steps)}
 
     def around_lookups(self) -> tuple[Program, list[Step], Program]:
         """The steps that lookups need, the lookups, and the steps after them, which take what was made as inputs.

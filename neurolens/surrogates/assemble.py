@@ -31,6 +31,8 @@ Array = NDArray[np.float64]
 _FRONT_REACH = 1.02
 _SAG_MM = 1e-6
 _SERIES = 3e-8  # of a direction: float32's last bit
+_TILT = 1e-7  # of the front's normal
+_GRAZING = 1e-12  # least squared cosine of a ray that leaves the front surface
 
 
 @dataclass(frozen=True)
@@ -225,7 +227,48 @@ def scene_ray(model: LensModel, values: CoreValues, series: DirectionSeries, for
     g, position = values.transmittance.graph, values.vectors[POSITION]
     z = g.affine(np.zeros((1, 2)), position) if model.front is None else sag(position, model.front, form)
     direction = series.decode(values.vectors[DIRECTION]) if values.unit is None else values.unit
+    if values.index is not None:
+        assert model.front is not None
+        direction = refracted(position, direction, values.index, model.front)
     return g.concat(position, z, direction)
+
+
+def refracted(position: Value, inside: Value, index: Value, front: Surface) -> Value:
+    """Unit direction (3 rows) of a ray beyond the front surface, of that inside the glass; see `tilt_series`."""
+    g, tilt = position.graph, tilt_series(front)
+    assert tilt is not None
+    across = position * (g.series(g.square(position), tilt) if len(tilt) > 1 else float(tilt[0]))
+    normal = g.concat(across, -(1.0 - g.square(across)).maximum(0.0).sqrt())
+    cosine = index * g.dot(inside, normal)
+    # Of no length but 1, by a little, where the model's ray is beyond the grazing one.
+    square = (cosine * cosine - index * index + 1.0).maximum(_GRAZING)
+    way = inside * index + normal * (square.sqrt() - cosine)
+    return way * (1.0 / g.square(way).sqrt())
+
+
+def tilt_series(front: Surface) -> Array | None:
+    """Power series in the squared height h^2 (mm^2) of the sine of a round surface's tilt over h.
+
+    None: not round, no glass behind it, or no short series tells it.
+    """
+    if front.cylinder or front.across is not None or front.focal_mm is not None or float(front.n_d) == 1.0:
+        return None
+    c, bend = float(front.curvature), (1 + float(front.conic)) * float(front.curvature) ** 2
+    if not front.asphere and not front.conic:
+        return np.array([c])
+    reach = (_FRONT_REACH * front.semi_diameter_mm) ** 2
+
+    def exact(s: Array) -> Array:
+        h2 = s * reach
+        rise = c / np.sqrt(np.maximum(1 - bend * h2, 1e-6))
+        rise = rise + sum(int(p) * float(a) * h2 ** (int(p) / 2 - 1) for p, a in front.asphere)
+        return np.asarray(rise / np.sqrt(1 + rise * rise * h2))
+
+    with np.errstate(all="ignore"):
+        series = fit_series(exact, 1.0, _TILT / math.sqrt(reach))
+        t = np.linspace(0, 1, 1000)
+        off = np.abs(np.polynomial.Polynomial(series)(t) - exact(t)).max()
+    return series / reach ** np.arange(len(series)) if off * math.sqrt(reach) < 2 * _TILT else None
 
 
 def sag(position: Value, surface: Surface, form: Form) -> Value:

@@ -67,13 +67,13 @@ class Field:
             return g.quadratic(self.planes, [*forms, ((4, 4),)], [*np.zeros(len(forms)), self.w_bias])
         return g.quadratic(self.planes, forms)
 
+    def colour(self) -> Value:
+        """w, where it varies."""
+        return self.w if self.w is not None else self.planes.graph.quadratic(self.planes, [((4, 4),)], [self.w_bias])
+
     def raw(self) -> Value:
         """p, u and, where it varies, w."""
-        g = self.planes.graph
-        if not self.dispersive:
-            return self.planes
-        w = self.w if self.w is not None else g.quadratic(self.planes, [((4, 4),)], [self.w_bias])
-        return g.concat(self.planes[0:4], w)
+        return self.planes.graph.concat(self.planes[0:4], self.colour()) if self.dispersive else self.planes
 
 
 @dataclass(frozen=True)
@@ -93,12 +93,14 @@ class CoreValues:
     """What a core gives: three vectors (2 rows each), transmittance, gates (a row each; None without any).
 
     `unit`: where a core gives it, the unit direction (3 rows) itself, which then stands for `vectors[DIRECTION]`.
+    `index`: where a core gives it, its direction is that inside the front glass, which has this index: see `Refracted`.
     """
 
     vectors: tuple[Value, Value, Value]
     transmittance: Value
     gates: Value | None
     unit: Value | None = None
+    index: Value | None = None
 
     def chosen(self, truth: Value, other: CoreValues) -> CoreValues:
         """These values where `truth`, those of `other` elsewhere."""
@@ -426,3 +428,26 @@ class Partitioned(Composite):
         for edge, outer in zip(self.edges, values[1:], strict=True):
             chosen = chosen.chosen(rho <= edge, outer)
         return chosen
+
+
+@dataclass(frozen=True, eq=False)
+class Refracted(Composite):
+    """A core whose rays end inside the front glass: the refraction there follows exactly, by `assemble.refracted`.
+
+    Where rays leave the front surface at grazing angles their direction turns as the square root of what is left to the
+    grazing ray. No polynomial follows that, while the direction inside the glass is as smooth as anywhere.
+
+    Attributes:
+        parts: the one core; its direction vector is the angle vector of the ray inside the glass.
+        index: [K] the index of the glass as a power series in w.
+    """
+
+    parts: tuple[Any]
+    index: Array
+
+    def build(self, g: Graph, field: Field, units: Units) -> CoreValues:
+        n = g.series(field.colour(), self.index) if field.dispersive else g.constant(self.index[0])
+        return replace(self.parts[0].build(g, field, units), index=n)
+
+    def fixed(self, w: float) -> Self:
+        return replace(super().fixed(w), index=np.array([np.polyval(self.index[::-1], w)]))

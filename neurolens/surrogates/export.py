@@ -24,8 +24,9 @@ from neurolens.optics.focusing import at_infinity
 from neurolens.optics.paraxial import first_order
 from neurolens.surrogates.assemble import ONNX, model_graph
 from neurolens.surrogates.card import card_of, card_to_json, lens_facts, reference_rays
+from neurolens.surrogates.cores import DIRECTION
 from neurolens.surrogates.domain import sample_domain
-from neurolens.surrogates.inverse import STEPS, TOLERANCE, InverseModel, scene_graph, stop_graph
+from neurolens.surrogates.inverse import STEPS, TOLERANCE, InverseModel, front_index, scene_graph, stop_graph
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.stored import model_to_text, storable
 
@@ -88,12 +89,11 @@ def check_gates(model: LensModel) -> None:
 
 
 def largest_angle(model: LensModel, count: int = 32768) -> float:
-    """Largest angle (rad) from the axis of the model's passing rays, a little enlarged. Sets the length of series."""
+    """Largest direction vector (rad) of the model's passing rays, a little enlarged. Sets the length of series."""
     rays = sample_domain(model.domain, count, seed=5)
     with torch.no_grad():
-        out = model.predict(rays)
-    passed = out.status == st.PASSED
-    angle = torch.atan2(torch.hypot(out.rays.dx, out.rays.dy), -out.rays.dz)
+        passed = model.predict(rays).status == st.PASSED
+        angle = model.core(model.encoding(rays))[0][DIRECTION].norm(dim=0)
     return 1.03 * float(angle[passed].max()) if bool(passed.any()) else math.pi / 2
 
 
@@ -119,6 +119,7 @@ def export_inverse(inverse: InverseModel, path: str | Path, errors: dict[str, An
         "asphere": [[int(p), float(a)] for p, a in front.asphere],
         "cylinder": front.cylinder,
         "across": front.across,
+        "index": front_index(model),
     }
     written = []
     for name, build in (("stop", stop_graph), ("scene", scene_graph)):

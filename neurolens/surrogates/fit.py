@@ -17,9 +17,18 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics.trace import CHUNK
 from neurolens.surrogates.bases import pinned_threads
-from neurolens.surrogates.cores import Core, InvariantPolynomial, Network, Partitioned, RawPolynomial, Residual
+from neurolens.surrogates.cores import (
+    Core,
+    InvariantPolynomial,
+    Network,
+    Partitioned,
+    RawPolynomial,
+    Refracted,
+    Residual,
+)
 from neurolens.surrogates.domain import FilmRays, draw_everywhere
 from neurolens.surrogates.fits.checkpoint import of_zone, spent_s
+from neurolens.surrogates.fits.front import grazes, index_series, inside_front
 from neurolens.surrogates.fits.mirror import fit_mirror
 from neurolens.surrogates.fits.network import fit_network
 from neurolens.surrogates.fits.planes import fit_planes
@@ -94,9 +103,14 @@ def fit_model(
         if settings.method in get_args(PublishedName):
             core, encoding, gates = fit_published(prepared, settings, progress)
         else:
+            shown, refracts = pairs, settings.method in POLYNOMIALS and settings.basis == "invariants" and grazes(pairs)
+            if refracts:
+                shown = replace(pairs, train=inside_front(pairs.lens, pairs.train))
             if settings.planes and settings.basis == "invariants" and settings.method in PLANES_SEARCHED:
-                encoding = fit_planes(pairs, encoding, settings.terms, settings.position_weight)
-            core = _fit_core(replace(prepared, encoding=encoding), settings, progress, checkpoint)
+                encoding = fit_planes(shown, encoding, settings.terms, settings.position_weight)
+            core = _fit_core(replace(prepared, pairs=shown, encoding=encoding), settings, progress, checkpoint)
+            if refracts:
+                core = Refracted((core,), index_series(pairs.lens, encoding))
     model = LensModel(
         lens=pairs.lens,
         domain=pairs.domain,

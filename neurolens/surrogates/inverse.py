@@ -41,7 +41,7 @@ from neurolens.surrogates.assemble import (
     wavelength_row,
     within_domain,
 )  # fmt: skip
-from neurolens.surrogates.cores import DIRECTION, MIRROR, POSITION, ROUND, STOP, CoreValues, Field, Units
+from neurolens.surrogates.cores import DIRECTION, MIRROR, POSITION, ROUND, STOP, CoreValues, Field, Refracted, Units
 from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import LensModel, Prediction, prediction_of
@@ -167,7 +167,8 @@ class InverseModel:
         Raises:
             InputError: as `LensModel.predict`.
         """
-        found = front_rays(self.model.front, *(c.detach().double().numpy() for c in scene))
+        *lines, wavelength = (c.detach().double().numpy() for c in (*scene, wavelength_nm))
+        found = front_rays(self.model.front, *lines, index=front_index(self.model), wavelength_nm=wavelength)
         known, solid = (torch.from_numpy(a).to(film_z.dtype) for a in found)
         given = {"front_rays": torch.cat([known, wavelength_nm[None]])}
         out = self._solved("scene", given, film_z, stop_radius_mm, steps)
@@ -184,6 +185,15 @@ class InverseModel:
         density, residual = (out[n].expand(1, len(rays))[0] for n in ("density", "residual"))
         residual = torch.where(torch.isfinite(residual), residual, torch.inf)
         return InverseRays(rays, prediction_of(out, len(rays)), density, residual)
+
+
+def front_index(model: LensModel) -> list[float] | None:
+    """Power series in 1 / lambda^2 (1/um^2) of the front glass's index, where direction vectors are those inside it."""
+    if not isinstance(model.core, Refracted):
+        return None
+    e, series = model.encoding, np.polynomial.Polynomial(model.core.index)
+    w = np.polynomial.Polynomial([-e.w_middle / e.w_half, 1 / e.w_half] if e.w_half else [0.0])
+    return [float(a) for a in series(w).coef]
 
 
 @lru_cache(maxsize=16)
@@ -271,8 +281,9 @@ def stop_graph(inverse: InverseModel, form: Form, angle: float, steps: int = STE
 def scene_graph(inverse: InverseModel, form: Form, angle: float, steps: int = STEPS) -> Graph:
     """The map from scene rays to camera rays: as `stop_graph`, but for its input and what density is of.
 
-    Input front_rays: x and y on the front surface (mm), direction vector of the model (angle vector in rad, or slope),
-    wavelength. Density is mm^2 of film times mm^2 of the pupil plane per mm^2 of (x, y) and area of direction vectors.
+    Input front_rays: x and y on the front surface (mm), direction vector of the model (angle vector in rad, or slope;
+    inside the front glass where `front_index` says so), wavelength. Density is mm^2 of film times mm^2 of the pupil
+    plane per mm^2 of (x, y) and area of direction vectors.
     """
     model, e, g = inverse.model, inverse.model.encoding, Graph()
     position, direction, wavelength = g.split(g.input("front_rays", 5), [2, 2, 1])
@@ -294,7 +305,8 @@ def scene_graph(inverse: InverseModel, form: Form, angle: float, steps: int = ST
     core, planes = _core_graph(model, light, units_of(model, series, form)), (2, 3, 0, 1)
     found = g.inline(with_derivatives(core, _SCENE, [("planes", k) for k in planes]), {"planes": light.planes})
     vectors = (found["position"], found["direction"], found["stop"])
-    status = add_outputs(model, CoreValues(vectors, found["transmittance"], found.get("gates")), inside, series, form)
+    values = CoreValues(vectors, found["transmittance"], found.get("gates"), index=found.get("index"))
+    status = add_outputs(model, values, inside, series, form)
     area = determinant([g.concat(*(found[derivative(n, f"planes_{k}")] for n in _SCENE)) for k in planes]).abs()
     # Of (p, u), scaled, per mm^2 and (kappa rad)^2.
     factor = e.film_scale_mm**2 * math.prod(e.pupil_scales_mm) * series.kappa**2
@@ -312,6 +324,8 @@ def _core_graph(model: LensModel, light: Field, units: Units) -> Graph:
     g.outputs = dict(zip((*_SCENE, "stop"), values.vectors, strict=True)) | {"transmittance": values.transmittance}
     if values.gates is not None:
         g.outputs["gates"] = values.gates
+    if values.index is not None:
+        g.outputs["index"] = values.index
     return g
 
 

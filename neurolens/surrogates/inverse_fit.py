@@ -15,8 +15,9 @@ from neurolens.base.errors import InputError
 from neurolens.graph.interpret import monomials
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.bases import Exponents, kept, ordered, pinned_threads, solve
-from neurolens.surrogates.cores import DIRECTION, POSITION, STOP
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Refracted
 from neurolens.surrogates.domain import FilmRays
+from neurolens.surrogates.fits.front import inside_front
 from neurolens.surrogates.fits.selection import Sweep, forward
 from neurolens.surrogates.inverse import STEPS, TOLERANCE, Guess, InverseModel, InverseRays, scaled_film_z
 from neurolens.surrogates.lightfield import LightField
@@ -117,7 +118,8 @@ def _teaching(model: LensModel, pairs: RayPairs) -> tuple[FilmRays, Tensor]:
     """
     size = min(len(pairs.train), len(pairs.rim))
     sets = join_pairs([pairs.train.select(slice(0, 2 * size)), pairs.rim.select(slice(0, size))])
-    exact = targets_of(model.lens, model.encoding, sets).vectors
+    known_to = inside_front(model.lens, sets) if isinstance(model.core, Refracted) else sets
+    exact = targets_of(model.lens, model.encoding, known_to).vectors
     away = (model.core(model.encoding(sets.inputs))[0] - exact).norm(dim=1)  # [3, N]
     known = (away < _AWAY * exact.norm(dim=1).amax(1, keepdim=True)).all(0)
     weight = torch.ones(len(sets), dtype=torch.float64)

@@ -35,7 +35,7 @@ class ModelSettings:
         replacement: whether "ols" exchanges terms afterwards.
         elimination: whether "ols" first chooses half as many terms again, and drops those that cost least.
         growth: rounds in which "ols" in the invariants adds to the candidates what the chosen terms give, multiplied by
-            each variable: terms of higher degree where they help.
+            each variable: terms of higher degree where they help. From 2 on a few more follow where directions err yet.
         position_weight: how much more than to first order the position counts in the choice of terms.
         transmittance_terms: how many more terms the transmittance may have where it needs them.
         idle_gates: rims that alone block at most this share of the domain's rays are left out.

@@ -33,6 +33,7 @@ from neurolens.surrogates.cores import (
     Network,
     Partitioned,
     RawPolynomial,
+    Refracted,
     Residual,
 )
 from neurolens.surrogates.domain import Domain, FilmRays
@@ -53,6 +54,7 @@ CORES: dict[str, type] = {
     "network": Network,
     "partitioned": Partitioned,
     "residual": Residual,
+    "refracted": Refracted,
     "outer-pupil": OuterPupil,
     "cells": Cells,
     "averaged": Averaged,

@@ -1,8 +1,7 @@
-"""A lens's texts and files as one stream of printable characters, which `page/packed.js` unpacks: a quarter of gzip's.
+"""Texts and files of lenses as one stream of printable characters, which `page/packed.js` unpacks: a fifth of gzip's.
 
-C, GLSL and OSL of one lens say much the same with temporaries of other numbers. Counted from the line's own number, and
-with C's multiply-adds as GLSL writes them, most lines of one are lines of the others; LZMA, unlike gzip, looks back far
-enough to find them.
+C, GLSL and OSL of lenses say much the same with temporaries of other numbers. Counted from the line's own number most
+lines of one are lines of the others; LZMA, unlike gzip, looks back far enough to find them.
 """
 
 from __future__ import annotations
@@ -20,10 +19,6 @@ FILTERS = [
 ]
 _TEMPORARY = re.compile(r"\bt(\d+)\b")
 _UNTOLD = re.compile(r"\x01|\bt\d+-")  # what `_counted` could not give back
-_MULTIPLY_ADD = re.compile(r"^    const (float t\d+ = )\w+_FMA\((\S+), (\S+), (\S+)\);$", re.MULTILINE)
-_CONSTANT = re.compile(r"^    const (float t\d)", re.MULTILINE)
-_TAKEN = re.compile(r"^    (float t\d|const float t\d+ = \S+ \* \S+ \+ \S+;$)", re.MULTILINE)
-_MACRO = re.compile(r"^#define (\w+_FMA)\(", re.MULTILINE)
 
 
 def packed(data: bytes) -> str:
@@ -33,27 +28,15 @@ def packed(data: bytes) -> str:
     return np.array(list(CHARACTERS))[np.stack(np.divmod(values, len(CHARACTERS)), 1)].tobytes().decode("utf-32-le")
 
 
-def packed_parts(parts: Iterable[tuple[str, str | bytes]]) -> tuple[str, list[tuple[str, int, str | None]]]:
-    """The stream of named parts, and of each its name, bytes there, and how it is told.
-
-    That is None for bytes as they are, "" for a text whose temporaries are counted, the name of its macro for C.
-    """
+def packed_parts(parts: Iterable[tuple[str, str | bytes]]) -> tuple[str, list[tuple[str, int, int, bool]]]:
+    """The stream of named parts, and of each its name, place and bytes there, and whether temporaries are counted."""
     data, found = b"", []
     for name, part in parts:
-        told, how = (part, None) if isinstance(part, bytes) else _told(part)
-        found.append((name, len(told), how))
+        counted = isinstance(part, str) and not _UNTOLD.search(part)
+        told = part if isinstance(part, bytes) else (_counted(part) if counted else part).encode()
+        found.append((name, len(data), len(told), counted))
         data += told
     return packed(data), found
-
-
-def _told(text: str) -> tuple[bytes, str | None]:
-    """A text of code as its lines differ from others', and how that is undone."""
-    if _UNTOLD.search(text):
-        return text.encode(), None
-    macro = _MACRO.search(text)
-    if macro is None or _TAKEN.search(text):
-        return _counted(text).encode(), ""
-    return _counted(_CONSTANT.sub(r"    \1", _MULTIPLY_ADD.sub(r"    \1\2 * \3 + \4;", text))).encode(), macro[1]
 
 
 def _counted(text: str) -> str:

@@ -7,6 +7,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ SCRIPTS = ("packed.js", "gl.js", "scene.js", "engine.js", "ghosts.js", "layout.j
 SHADERS = ("random.glsl", "scene.glsl", "rays.glsl")
 # A form's download that would carry the page beyond this is left out.
 MOST_BYTES = 3_000_000
+_TOGETHER = 6  # lenses of a stream: each says less for those before, and takes longer to unpack
 _AIR, _ARC = 1.01, 4  # a medium of a smaller index is drawn as air; of 65 points of an arc every fourth is drawn
 _CONSTANT = re.compile(r"^const float ([A-Z][A-Z0-9_]*_(?:MM|NM)) = ", re.MULTILINE)
 _FUNCTION = re.compile(r"^float ([a-z]\w*)\(([^)]*)\)$", re.MULTILINE)
@@ -85,9 +87,10 @@ class ViewLens:
 def write_page(
     out: Path, lenses: Sequence[ViewLens], kinds: Sequence[str], most_bytes: int = MOST_BYTES
 ) -> dict[str, Any]:
-    """Write the page; of the `kinds` of files that it brings, "glsl" first, the last go where they do not fit.
+    """Write the page; of the `kinds` of files that it brings, "glsl" first, the last go where they do not fit, of each
+    those of exact lenses first.
 
-    Returns its size and what of the downloads is there.
+    Returns its size and what of the downloads is there and what is left out.
 
     Raises:
         InputError: no lens; lenses that do not fit without any download.
@@ -95,16 +98,38 @@ def write_page(
     if not lenses:
         raise InputError(out, "lenses", "(none)", "at least one lens")
     for count in range(len(kinds), 0, -1):
-        text = _page(lenses, kinds[:count])
-        if len(text.encode()) <= most_bytes:
-            atomic_write_text(out, text)
-            return {"bytes": len(text.encode()), "downloads": list(kinds[:count])}
+        last, left = kinds[count - 1], list(kinds[count:])
+        for given, of_exact in ((lenses, []), (_without_exact(lenses, last), [f"{last} of exact lenses"])):
+            text = _page(given, kinds[:count])
+            if len(text.encode()) <= most_bytes:
+                atomic_write_text(out, text)
+                return {
+                    "bytes": len(text.encode()), "downloads": list(kinds[:count]), "left_out": [*of_exact, *left]
+                }  # fmt: skip
     raise InputError(out, "bytes", len(text.encode()), f"at most {most_bytes}: fewer lenses")
 
 
+def _without_exact(lenses: Sequence[ViewLens], kind: str) -> list[ViewLens]:
+    """Lenses whose exact forms bring no such file."""
+
+    def forms(lens: ViewLens) -> list[Form]:
+        files = [{k: v for k, v in f.files.items() if f.kind != "exact" or k != kind} for f in lens.forms]
+        return [replace(f, files=own) for f, own in zip(lens.forms, files, strict=True)]
+
+    return [replace(lens, forms=forms(lens)) for lens in lenses]
+
+
 def _page(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> str:
-    streams = [packed_parts(_parts(lens, kinds)) for lens in lenses]
-    entries = [_entry(lens, kinds) | {"parts": parts} for lens, (_, parts) in zip(lenses, streams, strict=True)]
+    elements, entries = [], []
+    for first in range(0, len(lenses), _TOGETHER):
+        group, key = lenses[first : first + _TOGETHER], f"lenses-{first}"
+        text, index = packed_parts(_parts(group, kinds))
+        elements.append(_packed(key, text, 0))
+        stream = key, index[-1][1] + index[-1][2]
+        for lens in group:
+            own = f"{lens.key}/"
+            places = [(name.removeprefix(own), *place) for name, *place in index if name.startswith(own)]
+            entries.append(_entry(lens, kinds) | {"stream": stream, "parts": places})
     shared = {
         "version": __version__,
         "functions": {name: {"text": text, "call": call} for name, (text, call) in shared_glsl().items()},
@@ -112,8 +137,7 @@ def _page(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> str:
         "lenses": entries,
     }
     data = json.dumps(shared, allow_nan=False, separators=(",", ":")).encode()
-    elements = [_packed("data", packed(data), len(data))]
-    elements += [_packed(f"lens/{lens.key}", text, 0) for lens, (text, _) in zip(lenses, streams, strict=True)]
+    elements.insert(0, _packed("data", packed(data), len(data)))
     parts = {
         "TITLE": html.escape(lenses[0].name if len(lenses) == 1 else "neurolens: lenses and their models"),
         "STYLE": _text("style.css"),
@@ -143,21 +167,21 @@ def _kept(form: Form, kinds: Sequence[str]) -> list[str]:
     return [kind for kind in kinds if kind == "glsl" or kind in form.files]
 
 
-def _parts(lens: ViewLens, kinds: Sequence[str]) -> Iterator[tuple[str, str | bytes]]:
-    """Texts and files of a lens, what a picture needs first: the page unpacks no further than it is asked."""
-    text, outputs = lens.path or ("", ())
-    yield "lens", json.dumps({"section": lens.section, "outputs": list(outputs)}).encode()
-    for kind in kinds:
+def _parts(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> Iterator[tuple[str, str | bytes]]:
+    """Texts and files of lenses, what a picture needs first: the page unpacks no further than it is asked."""
+    for lens in lenses:
+        text, outputs = lens.path or ("", ())
+        yield f"{lens.key}/lens", json.dumps({"section": lens.section, "outputs": list(outputs)}).encode()
         for form in lens.forms:
-            if kind == "glsl":
-                yield f"{form.kind}/{kind}", form.glsl
-            elif kind in form.files:
+            yield f"{lens.key}/{form.kind}/glsl", form.glsl
+        yield f"{lens.key}/path", text
+        if lens.ghosts is not None:
+            yield f"{lens.key}/ghosts", json.dumps([asdict(ghost) for ghost in lens.ghosts.functions]).encode()
+    for kind, lens in product(kinds, lenses):
+        for form in lens.forms:
+            if kind in form.files:
                 data = form.files[kind]
-                yield f"{form.kind}/{kind}", data if kind == "onnx" else data.decode()
-        if kind == "glsl":
-            yield "path", text
-            if lens.ghosts is not None:
-                yield "ghosts", json.dumps([asdict(ghost) for ghost in lens.ghosts.functions]).encode()
+                yield f"{lens.key}/{form.kind}/{kind}", data if kind == "onnx" else data.decode()
 
 
 def _text(name: str) -> str:

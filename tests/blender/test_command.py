@@ -32,7 +32,7 @@ ABSORBS = "its glass absorbs"
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of three models and their lens file, and shaders that cost nothing."""
 
-    def written(file: Path, *, zoom: str | None = None, name: str | None = None, quiet: bool = False) -> Shader:
+    def written(file: Path, *, zoom: str | None = None, as_bare: str = "", quiet: bool = False) -> Shader:
         if file.stem == "absorbs":
             raise InputError(file, "surface 0", ABSORBS, "a bare lens")
         return Shader("camera", f"shader of {file.name}, {zoom}", 1, (), {}, 21.6, 1.8, 0.7)

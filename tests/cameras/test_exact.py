@@ -121,7 +121,7 @@ def test_fisheye_sees_beyond_75_degrees() -> None:
         bounds=lens_models.domain("muller_fisheye_100").bounds,
     )
     assert len(exact.film.outline.wavelength_nm) == 1  # no dispersion is known
-    model = camera("fisheye", math.inf)
+    model = camera("colourless", math.inf)
     radius = 0.98 * lens_models.domain("muller_fisheye_100").film_radius_mm
     for lens in (exact, model):
         rays = lens.sample(at((radius, 0.0), 1024), jittered(32)[0], np.full(1024, 587.6, np.float32))

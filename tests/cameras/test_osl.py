@@ -18,13 +18,17 @@ from neurolens.cameras.onnxlens import load_model
 from neurolens.cameras.pupil_arcs import PupilArcs, unit_disc
 from neurolens.cameras.pupil_sight import Sight
 from neurolens.cli import main
-from neurolens.evaluate.shaders import exact_lens
+from neurolens.evaluate.shaders import _smallest, exact_lens
+from neurolens.graph import lowtests
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
+from neurolens.graph.passes import pruned
 from neurolens.graph.scalars import lower
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
+from neurolens.optics.pupils import pupil_plane_z_mm
+from neurolens.optics.tracegraph import exact_graph
 
 MODEL = ROOT / "models" / f"{GAUSS.stem}.ols-36.onnx"
 FAR = 1e9
@@ -32,7 +36,7 @@ FAR = 1e9
 
 @cache
 def lens() -> osl.OslLens:
-    return osl.model_lens(load_model(MODEL), None, lambda share: None)
+    return osl.model_lens(load_model(MODEL), _smallest(MODEL, False), lambda share: None)
 
 
 def written() -> osl.OslCamera:
@@ -116,6 +120,32 @@ def test_rays_are_those_of_the_model_in_the_frame_of_cycles() -> None:
     np.testing.assert_allclose(np.linalg.norm(found["direction"], axis=0), 1, atol=1e-4)
 
 
+def test_fewer_terms_tell_which_rays_pass_and_move_none() -> None:
+    plain, ours = written().sight.graph, written().lens
+    given = osl._samples(written().sight, written().arcs, 60_000)
+    wanted, found = evaluate(plain, given), evaluate(ours, given)
+    np.testing.assert_array_equal(found["scene_ray"], wanted["scene_ray"])
+    passed, told = (v["status"][0] == 0 for v in (wanted, found))
+    assert (passed != told).mean() < 5e-3
+    zone = (6 * np.hypot(*given["rays"][:2]) / written().arcs.film_radius_mm).astype(int)
+    light = [np.bincount(zone, v["transmittance"][0] * p, 6) for v, p in ((wanted, passed), (found, told))]
+    np.testing.assert_allclose(light[1], light[0], rtol=4e-3)
+    counts = [sum(lower(pruned(g, {k: g.outputs[k] for k in wanted})).count().values()) for g in (plain, ours)]
+    assert counts[1] < 0.7 * counts[0]
+
+
+def test_tests_that_few_terms_cannot_tell_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = osl._samples(written().sight, written().arcs)
+    monkeypatch.setattr(lowtests, "_MOST_TERMS", 2)
+    assert lowtests.low_tests([written().sight.graph], [given]) is None
+
+
+def test_an_exact_lens_keeps_its_tests() -> None:
+    lens = read_lens(GAUSS)
+    traced = exact_graph(lens, pupil_plane_z_mm(lens), (400.0, 700.0))
+    assert lowtests.low_tests([traced], [osl._samples(written().sight, written().arcs)]) is None
+
+
 def test_zoom_is_an_input(coarse: None) -> None:
     file = ROOT / "models" / "nikon_zoom_80_200-range.states-64.onnx"
     made = osl.model_lens(load_model(file), None, lambda share: None)
@@ -135,6 +165,17 @@ def test_zoom_is_an_input(coarse: None) -> None:
             mean = np.array([np.mean(found[f"{name}_{k}"][passed]) for k in range(3)]) * [1, 1, -1]
             np.testing.assert_allclose(mean, wanted[:, lit].mean(1), atol=within)
         assert np.mean(found["throughput_0"]) == pytest.approx(rays.weight.mean(dtype=np.float64), rel=0.02)
+
+
+def test_a_zoom_whose_stop_changes_and_whose_rims_cut_on_both_sides(monkeypatch) -> None:
+    """One set of operations serves its states, and hardly any ray that passes lies beyond its arcs."""
+    monkeypatch.setattr(pupil_arcs_fit, "_RAYS", 10_000)
+    model = load_model(ROOT / "models" / "nikon_zoom_70_200-range.states-64.onnx")
+    nodes = osl.osl_lens([osl._seen(model.at(zoom_mm), None) for zoom_mm in (71.5, 130.0)], lambda share: None).nodes
+    assert nodes[0].sight.stop_radius_mm != nodes[1].sight.stop_radius_mm
+    assert set(nodes[0].arcs.sides) == {0, 1, -1}
+    assert max(pupil_arcs_fit._lost(c.sight, c.arcs) for c in nodes) < 2e-3
+    lower([osl.osl_graph(camera) for camera in nodes])
 
 
 def test_groups_of_a_lens_file_move_where_the_camera_is_focused(coarse: None) -> None:
@@ -305,8 +346,8 @@ def arcs_inputs(film: np.ndarray, square: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def film_z(focus_m: float, stop_mm: float) -> np.ndarray:
-    share, vergence = stop_mm / written().sight.stop_radius_mm, written().near_m / focus_m
-    return np.array([[np.polynomial.polynomial.polyval2d(share, vergence, written().film)]])
+    share, vergence = stop_mm / written().sight.stop_radius_mm, written().nearest_m[0] / focus_m
+    return np.array([[np.polynomial.polynomial.polyval2d(share, vergence, written().film[0])]])
 
 
 def test_film_is_where_the_camera_of_the_model_has_it() -> None:
@@ -314,6 +355,11 @@ def test_film_is_where_the_camera_of_the_model_has_it() -> None:
         camera = OnnxCamera(load_model(MODEL), film_mm=FILM, focus_m=focus_m, f_number=f_number)
         stop = camera.settings["stop_radius_mm"]
         assert float(film_z(focus_m, stop)[0, 0]) == pytest.approx(camera.film.film_z_mm, abs=2e-3)
+    # The same distance from the entrance pupil, which stands before the film.
+    behind = (float(film_z(1.5, 9.525)[0, 0]) - written().entrance_mm) / 1e3
+    shares = np.array(written().nearest_m) / (1.5, 1.5 - behind)
+    ways = [np.polynomial.polynomial.polyval2d(1.0, v, f) for v, f in zip(shares, written().film, strict=True)]
+    assert ways[1] == pytest.approx(ways[0], abs=2e-4)
 
 
 def lens_ray(film: np.ndarray, pupil: np.ndarray) -> np.ndarray:

@@ -50,6 +50,16 @@ def test_record_of_a_lens_is_whole_and_the_same_bytes_again(fitted: bytes) -> No
     assert record["layout"].startswith("<svg")
 
 
+def test_a_rim_wider_than_its_sphere_is_doubted_and_a_film_that_nothing_states_is_told() -> None:
+    rows = ["stop 5 1 0 6.25 0", "50 5 1.5168 64.17 %g 1", "-50 47 1 0 12 0"]
+    table = "# 3 surfaces, 1 glass element, f/4.0\nname: singlet\nfocal_length: 49.2\nsurfaces:\n" + "\n".join(rows)
+    for rim, verdict in ((12.0, "ok"), (50.5, "doubtful")):
+        record = json.loads(run_task(Task("s.lens", (table % rim).encode(), READ)))
+        assert record["verdict"] == verdict and record["reason"] == ""
+        assert any("rims narrowed" in doubt for doubt in record["doubts"]) == (verdict == "doubtful")
+        assert any(re.match(r"neither field nor film is stated: .* film radius of \d", n) for n in record["notes"])
+
+
 def test_a_task_is_known_by_all_that_decides_its_record(fitted: bytes) -> None:
     task = Task("a/triplet.toml", TRIPLET, SMALL)
     assert known_record(fitted, task) == json.loads(fitted)

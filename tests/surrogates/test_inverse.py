@@ -25,7 +25,7 @@ from neurolens.surrogates.inverse_fit import convergence, fit_inverse
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSet
 
-GAUSS, FISHEYE, ASPHERE = "laikin_double_gauss_50", "muller_fisheye_100", "canon_aspheric_50"
+GAUSS, FISHEYE, ASPHERE = "laikin_double_gauss_50", "horimoto_fisheye_16", "canon_aspheric_50"
 
 
 @cache

@@ -25,7 +25,7 @@ KINDS = ("invariants", "raw", "network", "thick", "fisheye")
 
 @cache
 def inverse(kind: str) -> InverseModel:
-    name = "muller_fisheye_100" if kind == "fisheye" else "laikin_double_gauss_50"
+    name = "horimoto_fisheye_16" if kind == "fisheye" else "laikin_double_gauss_50"
     return fit_inverse(lens_models.model(kind), prepared(name).pairs)
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import lens_models
 import pytest
 import torch
 from torch import Tensor
@@ -15,8 +16,10 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import stop_radius_mm
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import trace
-from neurolens.surrogates.cores import InvariantPolynomial, RawPolynomial
+from neurolens.surrogates.cores import DIRECTION, STOP, InvariantPolynomial, RawPolynomial
 from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain
+from neurolens.surrogates.fits import polynomial
+from neurolens.surrogates.fits.boundaries import stop_crossing
 from neurolens.surrogates.fits.polynomial import ParaxialMethod, fit_paraxial, fit_polynomial
 from neurolens.surrogates.gates import choose_gates
 from neurolens.surrogates.lightfield import fit_encoding
@@ -221,3 +224,21 @@ def test_more_terms_than_candidates_keep_all_candidates() -> None:
     dense = model(ModelSettings("dense", degree=2))
     assert fitted.core.coefficients_per_vector == dense.core.coefficients_per_vector
     assert film_um(fitted) == pytest.approx(film_um(dense), rel=1e-6)
+
+
+def test_growth_goes_on_where_directions_err_and_takes_nothing_from_the_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = lens_models.prepared(lens_models.FISHEYE)
+
+    def errors() -> tuple[float, float]:
+        core = fit_polynomial(data, ModelSettings("ols", terms=36))
+        crossing, weight = stop_crossing(data)
+        off = core(data.boundary_field)[0][STOP] - crossing
+        train = data.train
+        angle = (core(train.field)[0][DIRECTION] - train.vectors[DIRECTION]).norm(dim=0)
+        return float((angle**2).mean().sqrt()), float(((off * weight) ** 2).sum() / (weight**2).sum()) ** 0.5
+
+    more, stop = errors()
+    monkeypatch.setattr(polynomial, "FINE_DEG", math.inf)
+    two_rounds, first_stop = errors()
+    assert math.degrees(two_rounds) > 0.002 and more < 0.9 * two_rounds
+    assert stop < 1.1 * max(first_stop, 5e-4)

@@ -312,7 +312,7 @@ def test_downloads_are_the_files(browser: Any, tmp_path: Path) -> None:
     assert main(["view", LENS, "-o", str(tmp_path / "view.html"), "--json"]) == 0
     opened = Opened(browser, tmp_path / "view.html")
     models = {kind: ROOT / "models" / f"{LENS}.{kind}.onnx" for kind in ("ols-64", "mlp-16x2")}
-    wanted = {("exact", to): exported(ROOT / "lenses" / f"{LENS}.toml", to, tmp_path) for to in ("glsl", "c")}
+    wanted = {("exact", to): exported(ROOT / "lenses" / f"{LENS}.toml", to, tmp_path) for to in ("glsl", "c", "osl")}
     for form, file in zip(("polynomial", "network"), models.values(), strict=True):
         extras, notes = model_extras(load_model(file))
         for to in ("glsl", "c"):

@@ -41,11 +41,16 @@ def view(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def data_of(text: str) -> Any:
-    """The page's JSON, by the library's own LZMA."""
+    """The page's JSON."""
     size, letters = re.findall(r'id="data" data-bytes="(\d+)">([^<]*)<', text)[0]
+    return json.loads(unpacked(letters, int(size)))
+
+
+def unpacked(letters: str, size: int) -> bytes:
+    """By the library's own LZMA."""
     values = np.array([packed.CHARACTERS.index(c) for c in letters]).reshape(-1, 2) @ (91, 1)
     data = np.packbits((values[:, None] >> np.arange(12, -1, -1)) & 1).tobytes()
-    return json.loads(lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=packed.FILTERS).decompress(data, int(size)))
+    return lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=packed.FILTERS).decompress(data, size)
 
 
 class Elements(HTMLParser):
@@ -72,12 +77,12 @@ def test_it_fetches_nothing(view: Path) -> None:
 
 def test_it_is_whole(view: Path) -> None:
     text = view.read_text(encoding="utf-8")
-    assert not re.search(r"@[A-Z]+@", text)
+    assert not [word for word in re.findall(r"@[A-Z]+@", (pages.FOLDER / "page.html").read_text()) if word in text]
     data = data_of(text)
     (lens,) = data["lenses"]
     assert {form["kind"] for form in lens["forms"]} == {"polynomial", "network", "exact"}
     for form in lens["forms"]:
-        assert f"{form['kind']}/glsl" in [name for name, _, _ in lens["parts"]]
+        assert f"{form['kind']}/glsl" in [name for name, *_ in lens["parts"]]
         assert {"efl_mm", "film_z_mm", "pupil_z_mm", "pupil_radius_mm", "stop_radius_max_mm"} <= set(form["values"])
 
 
@@ -97,7 +102,7 @@ def test_shaders_compile(view: Path, tmp_path: Path) -> None:
     """As the page's own script puts them together."""
     text = view.read_text(encoding="utf-8")
     data = data_of(text)
-    (stream,) = re.findall(rf'id="lens/{LENS}">([^<]*)<', text)
+    (stream,) = re.findall(r'id="lenses-0">([^<]*)<', text)
     scripts = "\n".join(
         (pages.FOLDER / name).read_text(encoding="utf-8") for name in ("packed.js", "gl.js", "scene.js", "engine.js")
     )
@@ -118,47 +123,47 @@ for (const form of lens.forms)
 
 
 CODE = """\
-#define A_LENS_FMA(a, b, c) ((a) * (b) + (c))
 /* t1 in µm, <b> & \\ */
-    const float t1 = 1.0f / x;
-    const float t12 = A_LENS_FMA(t1, (-0.5f), t1);
-    const float t13 = A_LENS_FMA(t1, t12, 2.0f);
-    const float t4 = t13 > t12 ? t13 : t1 - t12;
+    float t1 = 1.0f / x;
+    float t12 = A_LENS_FMA(t1, (-0.5f), t1);
+    float t13 = A_LENS_FMA(t1, t12, 2.0f);
+    float t4 = t13 > t12 ? t13 : t1 - t12;
     return t13;
 """
 
 
 @pytest.mark.skipif(not NODE, reason="no node")
 def test_parts_are_unpacked_as_they_were() -> None:
-    """Code as C, and texts that its shortening could not give back; bytes that nothing shortens."""
-    others = {"taken": "    float t1 = x;", "sum": "    const float t2 = a * b + c;", "less": "t2-1 t1", "mark": "\x01"}
+    """Code, and texts that counting could not give back; bytes that nothing shortens."""
     noise = np.random.default_rng(0).integers(0, 256, 3000).astype(np.uint8).tobytes()
-    parts = {
-        "c": CODE,
-        "bytes": noise,
-        "none": "",
-        **{k: f"{CODE}{v}\n" for k, v in others.items()},
-        "again": noise + b"x",
-    }
+    parts = {"c": CODE, "bytes": noise, "none": "", "less": f"{CODE}t2-1 t1\n", "mark": f"{CODE}\x01\n"}
+    parts |= {"again": noise + b"x"}
     text, index = packed.packed_parts(parts.items())
     assert len(text) < 1.25 * len(noise) + 900
-    assert [how for _, _, how in index[:4]] == ["A_LENS_FMA", None, "", ""]
+    assert [counted for *_, counted in index] == [True, False, True, False, False, False]
     script = f"""{(pages.FOLDER / "packed.js").read_text(encoding="utf-8")}
 globalThis.document = {{ getElementById: () => ({{ textContent: {json.dumps(text)} }}) }};
-const lens = {{ key: "a", parts: {json.dumps(index)} }}, found = lens.parts.map(([name]) => partOf(lens, name));
+const lens = {{ stream: ["a", {sum(index[-1][1:3])}], parts: {json.dumps(index)} }};
+const found = lens.parts.map(([name]) => partOf(lens, name));
 console.log(JSON.stringify(found.map((part) => Buffer.from(part).toString("base64"))));"""
     done = subprocess.run([str(NODE), "-e", script], check=True, capture_output=True)
     found = [base64.b64decode(part) for part in json.loads(done.stdout)]
     assert found == [part if isinstance(part, bytes) else part.encode() for part in parts.values()]
 
 
-def test_a_page_that_grows_too_large_leaves_files_out(view: Path, tmp_path: Path) -> None:
-    lens = tiny_lens()
-    out = tmp_path / "small.html"
-    whole = pages.write_page(out, [lens], ["glsl", "c"])
-    assert whole["downloads"] == ["glsl", "c"]
-    assert pages.write_page(out, [lens], ["glsl", "c"], whole["bytes"] - 1)["downloads"] == ["glsl"]
-    assert out.stat().st_size < whole["bytes"]
+def test_a_page_that_grows_too_large_leaves_files_out(tmp_path: Path) -> None:
+    """The last kind first, and of that the exact lens's."""
+    exact = tiny_lens().forms[0]
+    model = replace(exact, kind="network", files={"c": exact.files["c"][::-1]})
+    lens, out = replace(tiny_lens(), forms=[model, exact]), tmp_path / "small.html"
+    sizes, most = [], pages.MOST_BYTES
+    for left in ([], ["c of exact lenses"], ["c"]):
+        about = pages.write_page(out, [lens], ["glsl", "c"], most)
+        assert (about["left_out"], about["bytes"]) == (left, out.stat().st_size)
+        forms = data_of(out.read_text(encoding="utf-8"))["lenses"][0]["forms"]
+        assert ["c" in form["files"] for form in forms] == [left != ["c"], not left]
+        sizes.append(most := about["bytes"] - 1)
+    assert sizes == sorted(sizes, reverse=True)
     with pytest.raises(InputError, match="fewer lenses"):
         pages.write_page(tmp_path / "none.html", [lens], ["glsl"], 1000)
     assert not (tmp_path / "none.html").exists()
@@ -248,14 +253,19 @@ SURF 3
 
 
 def test_a_lens_of_your_own_says_what_is_left_out(tmp_path: Path) -> None:
-    """Its glass absorbs, which traced code does not follow."""
+    """Its glass absorbs, which traced code does not follow: in none of its forms."""
     (tmp_path / "my_lens.zmx").write_text(ZMX)
     out = tmp_path / "view.html"
-    assert main(["view", str(tmp_path / "my_lens.zmx"), "--downloads", "glsl", "-o", str(out), "--json"]) == 0
-    (lens,) = data_of(out.read_text(encoding="utf-8"))["lenses"]
+    assert main(["view", str(tmp_path / "my_lens.zmx"), "--jobs", "1", "-o", str(out), "--json"]) == 0
+    text = out.read_text(encoding="utf-8")
+    (lens,) = data_of(text)["lenses"]
     (form,) = lens["forms"]
     assert lens["name"] == "My singlet"
     assert form["method"] == "every surface traced, coatings and absorption left out"
+    assert form["files"] == ["glsl", "c", "osl"]
+    (stream,) = re.findall(r'id="lenses-0">([^<]*)<', text)
+    written = unpacked(stream, lens["stream"][1])
+    assert written.count(b"In this form: coatings and absorption left out.") == 3
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from neurolens.surrogates.targets import Prepared
 # Terms are added for boundaries until each is met to this RMS: of a gate (twice the relative radius of a rim), and of
 # the stop crossing in stop radii.
 GATE_ERROR, STOP_ERROR = 2e-3, 5e-4
+STOP_KEPT = 0.04  # least share of that error, squared, to which growth may hold the stop crossing
 MOST_BOUNDARY_TERMS = 64
 _DEGREE = 9  # of the terms among which those for boundaries are found
 _RAYS = 12_000  # on which they are found
@@ -84,23 +85,29 @@ def solve_scalars(data: Prepared, features: Callable[[LightField], Tensor]) -> T
     return torch.cat([solve(train, pairs.train.transmittance[None]), fit.coefficients()])
 
 
-def boundary_terms(data: Prepared, exponents: Exponents) -> Exponents:
+def boundary_terms(data: Prepared, exponents: Exponents, first: Exponents) -> Exponents:
     """[K, 4] further exponents, where those given [M, 4] meet the stop crossing or a gate badly; often none.
 
     Forward selection by the gain of all those boundaries together, in squares of the error that each may have.
+
+    Args:
+        first: the exponents before those were grown for position and direction alone, which takes nothing from the stop
+            crossing: where those meet it better it is met as well.
     """
     every = invariant_exponents(_DEGREE, dispersive=data.encoding.dispersive)
     known = {tuple(e) for e in exponents.tolist()}
     added = np.array([e for e in every.tolist() if tuple(e) not in known], dtype=np.int64).reshape(-1, 4)
     candidates = np.concatenate([exponents, added])
     field = LightField(*(c[..., :_RAYS] for c in data.boundary_field))
-    bad = [
-        k for k, f in enumerate(_boundary_fits(data, field, monomials(field.invariants(), exponents))) if f.error > 1
-    ]
+    invariants, share = field.invariants(), 1.0
+    if not np.array_equal(first, exponents[: len(first)]):
+        (stop,) = _boundary_fits(data, field, monomials(invariants, first), only=[0])
+        share = min(max(stop.error, STOP_KEPT), 1.0)
+    met = _boundary_fits(data, field, monomials(invariants, exponents), stop_share=share)
+    bad = [k for k, f in enumerate(met) if f.error > 1]
     if not bad:
         return added[:0]
-    features = monomials(field.invariants(), candidates)
-    fits = _boundary_fits(data, field, features, len(exponents), bad)
+    fits = _boundary_fits(data, field, monomials(invariants, candidates), len(exponents), bad, share)
     chosen: list[int] = []
     while fits and len(chosen) < min(MOST_BOUNDARY_TERMS, len(added)):
         scores = np.sum([f.scores() for f in fits], axis=0)
@@ -135,9 +142,17 @@ class _BoundaryFit:
 
 
 def _boundary_fits(
-    data: Prepared, field: LightField, features: Tensor, start: int | None = None, only: list[int] | None = None
+    data: Prepared,
+    field: LightField,
+    features: Tensor,
+    start: int | None = None,
+    only: list[int] | None = None,
+    stop_share: float = 1.0,
 ) -> list[_BoundaryFit]:
-    """The fits of the stop crossing and of every gate, or `only` some of them, with the first `start` terms in."""
+    """The fits of the stop crossing and of every gate, or `only` some of them, with the first `start` terms in.
+
+    `stop_share`: of the squared error that the stop crossing may have otherwise.
+    """
     crossing, weight = stop_crossing(data)
     values, weights = gate_values(data.pairs.lens, data.gates, data.boundary), data.boundary_weights[0]
     rays, terms, fits = features.shape[1], len(features), []
@@ -148,7 +163,7 @@ def _boundary_fits(
         else:
             weighed = LightField(field.p * w, field.u * w, field.w)  # only p.p, p.u and u.u of it are used
             sweep = Sweep.of_vectors(features, weighed, (crossing[:, :rays] * w)[None])
-        allowed = (GATE_ERROR if k else STOP_ERROR) ** 2 * max(float((w * w).sum()), 1e-300)
+        allowed = (GATE_ERROR**2 if k else STOP_ERROR**2 * stop_share) * max(float((w * w).sum()), 1e-300)
         fit = _BoundaryFit(sweep, terms, 1 / allowed)
         for term in range(terms if start is None else start):
             fit.add(term)

@@ -10,6 +10,7 @@ first-order rim crossings are.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal, get_args
 
@@ -45,12 +46,14 @@ from neurolens.surrogates.fits.selection import Sweep, backward, forward, grow, 
 from neurolens.surrogates.gates import gate_values
 from neurolens.surrogates.lightfield import Encoding, LightField
 from neurolens.surrogates.settings import POLYNOMIALS, ModelSettings
-from neurolens.surrogates.targets import Prepared, scales_of, weighed_apart
+from neurolens.surrogates.targets import Prepared, film_equivalent_weights, scales_of, weighed_apart
 
 ParaxialMethod = Literal["thin", "thick"]
 
 _CHOICE_RAYS = 10_000
 SURPLUS = 1.5
+# Growth goes on while directions err by more than this, a round taking away at least a share of the squared residual.
+FINE_DEG, _MORE_ROUNDS, _LEAST_FALL, _PASSES = 0.002, 4, 0.03, 3
 
 
 def fit_polynomial(data: Prepared, settings: ModelSettings) -> InvariantPolynomial | RawPolynomial:
@@ -77,6 +80,7 @@ def _fit_invariant(data: Prepared, settings: ModelSettings) -> InvariantPolynomi
     dispersive = data.encoding.dispersive
     if settings.method == "adaptive":
         exponents, chosen = grow(invariants, train.field, outputs, settings.terms, dispersive=dispersive)
+        first = exponents
     else:
         # Many rays more than candidates make a choice no better; the coefficients are fitted on all of them.
         field, wanted = LightField(*(c[..., :_CHOICE_RAYS] for c in train.field)), outputs[..., :_CHOICE_RAYS]
@@ -87,12 +91,15 @@ def _fit_invariant(data: Prepared, settings: ModelSettings) -> InvariantPolynomi
             chosen = _choose(_sweep(exponents, field, wanted), replace(settings, replacement=False))
             exponents = _grown(exponents, chosen, dispersive=dispersive)
         chosen = _choose(_sweep(exponents, field, wanted), settings)
+        first = kept(exponents, chosen)[0]
+        if settings.method == "ols" and settings.replacement and settings.growth > 1 and len(chosen) == settings.terms:
+            exponents, chosen = _grown_on(data, exponents, chosen, lambda e: _sweep(e, field, wanted), settings.terms)
     chosen = chosen or [0]  # rays on the axis alone choose nothing
     exponents, columns = kept(exponents, chosen)
     own, features = len(exponents), monomials(invariants, exponents)
     # The chosen columns only; position and direction share them.
     coefficients = solve(vector_columns(features, train.field)[columns], train.vectors[:2].flatten(1))
-    exponents = np.concatenate([exponents, boundary_terms(data, exponents)])
+    exponents = np.concatenate([exponents, boundary_terms(data, exponents, first)])
     exponents = np.concatenate([exponents, transmittance_terms(data, exponents, settings.transmittance_terms)])
     columns = [c if c < own else c - own + len(exponents) for c in columns]
     return invariant_core(data, exponents, columns, coefficients)
@@ -109,6 +116,36 @@ def _grown(exponents: Exponents, chosen: list[int], *, dispersive: bool) -> Expo
     known = {tuple(e) for e in exponents.tolist()}
     new = [e for e in dict.fromkeys(map(tuple, children.tolist())) if e not in known]
     return np.concatenate([exponents, np.array(new, dtype=np.int64).reshape(-1, 4)])
+
+
+def _grown_on(
+    data: Prepared, exponents: Exponents, chosen: list[int], sweep: Callable[[Exponents], Sweep], terms: int
+) -> tuple[Exponents, list[int]]:
+    """The exponents and columns after more rounds, each from the chosen terms and what they give alone.
+
+    Rounds end where directions err by less than `FINE_DEG`, or where one takes off less than `_LEAST_FALL`. Searches of
+    several widths, from the chosen terms and from none, because each ends in another place.
+    """
+    fine = math.radians(FINE_DEG) * film_equivalent_weights(data.pairs.lens, data.pairs.domain)[1]
+    for _ in range(_MORE_ROUNDS):
+        own, columns = kept(exponents, chosen)
+        more = _grown(own, columns, dispersive=data.encoding.dispersive)
+        trial = sweep(more)
+        start = [c if c < len(own) else c - len(own) + len(more) for c in columns]
+        trial.restart(start)
+        before, best = trial.residual, (trial.residual, start)
+        if trial.residuals[0] < fine**2 * min(len(data.pairs.train), _CHOICE_RAYS):
+            break
+        for surplus, known in ((1.25, start), (1.5, start), (2.0, start), (1.5, [])):
+            trial.restart(known)
+            forward(trial, math.ceil(surplus * terms))
+            backward(trial, terms)
+            replace_terms(trial, _PASSES)
+            best = min(best, (trial.residual, sorted(trial.chosen)))
+        if best[0] > (1 - _LEAST_FALL) * before:
+            break
+        exponents, chosen = more, best[1]
+    return exponents, chosen
 
 
 def _choose(sweep: Sweep, settings: ModelSettings) -> list[int]:

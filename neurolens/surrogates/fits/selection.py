@@ -63,9 +63,14 @@ class Sweep:
         return Sweep(gram, moments, (outputs.flatten(1) ** 2).sum(1).numpy())
 
     @property
+    def residuals(self) -> Floats:
+        """[R] the squared residual of every output."""
+        return np.diag(self._table)[self.count :]
+
+    @property
     def residual(self) -> float:
         """Sum over outputs of the squared residual."""
-        return float(np.trace(self._table[self.count :, self.count :]))
+        return float(self.residuals.sum())
 
     def add(self, k: int) -> None:
         """Take a column in, unless nothing but rounding is left of it."""

@@ -6,7 +6,7 @@ const FREE_BENCH = 640;
 function functionOf(text) {
   const packed = (_, n) => `state_c[${n >> 2}].${"xyzw"[n & 3]}`;
   const count = Number(text.match(/struct \w+_state \{[^}]*float c\[(\d+)\]/)?.[1] ?? 0);
-  const own = text.slice(Math.max(0, text.lastIndexOf("\nvoid "))).replace(/\s*in \w+_state state,/, "");
+  const own = text.match(/^#define .*$/m)[0] + text.slice(text.lastIndexOf("\nvoid ")).replace(/\s*in \w+_state state,/, "");
   const state = count ? `uniform vec4 state_c[${(count + 3) >> 2}];\nuniform bool state_inside;\n` : "";
   return { count, text: state + own.replace(/state\.c\[(\d+)\]/g, packed).replaceAll("state.inside", "state_inside") };
 }

@@ -130,36 +130,26 @@ class Unpacked {
   }
 }
 
-/** A text of code from its lines' differences: see _told of view/packed.py. */
-function written(text, macro) {
+/** A text whose temporaries are counted: see _counted of view/packed.py. */
+function written(text) {
   let before = 0;
   return text.split("\n").map((line) => {
     let own = null;
-    const plain = line.replace(/\x01(-?\d*)/g, (_, said) => {
+    return line.replace(/\x01(-?\d*)/g, (_, said) => {
       const step = said === "" ? 1 : +said;
       if (own !== null) return `t${own - step}`;
       own = before += step;
       return `t${own}`;
     });
-    if (!macro) return plain;
-    return plain.replace(/^    (float t\d+ = )(\S+) \* (\S+) \+ (\S+);$/, `    $1${macro}($2, $3, $4);`).replace(/^    float t(?=\d)/, "    const float t");
   }).join("\n");
 }
 
 const streams = new Map(), textOf = (bytes) => new TextDecoder().decode(bytes), jsonOf = (lens, name) => JSON.parse(textOf(partOf(lens, name)));
 
 /** A part of a lens: bytes, or the text of code. */
-function partOf(lens, name) {
-  if (!streams.has(lens)) {
-    const length = lens.parts.reduce((sum, [, bytes]) => sum + bytes, 0);
-    streams.set(lens, new Unpacked(document.getElementById(`lens/${lens.key}`).textContent, length));
-  }
-  let from = 0;
-  for (const [part, bytes, how] of lens.parts) {
-    if (part !== name) from += bytes;
-    else {
-      const found = streams.get(lens).upTo(from + bytes).slice(from, from + bytes);
-      return how === null ? found : written(textOf(found), how);
-    }
-  }
+function partOf({ stream: [id, length], parts }, name) {
+  if (!streams.has(id)) streams.set(id, new Unpacked(document.getElementById(id).textContent, length));
+  const [, from, bytes, counted] = parts.find(([part]) => part === name);
+  const found = streams.get(id).upTo(from + bytes).slice(from, from + bytes);
+  return counted ? written(textOf(found)) : found;
 }
