@@ -129,7 +129,8 @@ def fit_arcs(sights: Sequence[Sight], report: Report, between: Sequence[tuple[Ar
     if not single:  # refitted by themselves, nodes hold less of what lies between them
         return _by(_WAYS[0], sights, report, between)[0]
     if not sights[0].anamorphic:
-        arcs, lost = moved(*_begun(_WAYS[0], sights, report), sights[0], report)
+        (begun,), half = _begun(_WAYS[0], sights, report)
+        arcs, lost = moved(begun, half, sights[0], report)
         if lost <= _LOST and min(passing(sights[0], arcs).values()) >= _GOAL:
             return [arcs]
     ways = _ANAMORPHIC if sights[0].anamorphic else _WAYS

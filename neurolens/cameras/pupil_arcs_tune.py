@@ -15,26 +15,21 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.progress import Report
+from neurolens.cameras.arcs_passing import passing
 from neurolens.cameras.pupil_arcs import PupilArcs
 from neurolens.cameras.pupil_sight import Sight, Truths, turned
 from neurolens.graph.interpret import evaluate
 
 Array = NDArray[np.float64]
 _RAYS = 90_000  # random ones, of an anamorphic lens twice as many
-_ZONES, _FEW = (
-    (8, 3, 3),
-    400,
-)  # of the root of the film radius (exposure is of the axis), stop and azimuth; rays that tell of one
+# Of the root of the film radius (exposure is of the axis), stop and azimuth; rays that tell of one.
+_ZONES, _FEW = (8, 3, 3), 400
 _ALL = int(np.prod(_ZONES)) + _ZONES[0]  # and of film radius alone, for the others
 _BAND, _ALL_OVER = (0.75, 1.2), 0.15  # of arcs, from their middle, where rays are told apart; share of rays anywhere
 _WITHIN = 0.45  # of the light of a pupil lies in that band
 _ROUNDS, _MOST = 7, 4  # of Newton's rule with the same rays, and draws of rays
-_WIDTHS = (
-    0.02,
-    0.01,
-    0.005,
-    0.003,
-)  # of an arc's step, in half widths of the pupil, by rays drawn
+_WIDTHS = (0.02, 0.01, 0.005, 0.003)  # of an arc's step, in half widths of the pupil, by rays drawn
+_HOPELESS = 0.9  # of points that pass after the first draw: arcs of so few terms do not fit the lens
 _GOAL, _ENOUGH = 2e-4, 4e-4  # of rays that pass, in a zone, that may be lost; of others, where it is done
 _HEAVY, _HEAVIER, _LIGHTEST, _HEAVIEST = 10.0, 1.6, 2.0, 3e4  # weight of rays that pass: at first, its step, ends
 _DEEP = 0.08  # half widths of the pupil: blocked rays deeper inside are given up
@@ -42,10 +37,7 @@ _FLOOR, _CALM, _CALM_SHARE = 0.05, 0.002, 0.05  # of curvature: near an arc, far
 _HALVINGS, _MORE = 6, 2e-3  # of a step by which arcs would lose so many more rays of a zone
 _LOST = 7e-4  # of random rays that check, where a margin is enough
 _CHECK_SEED, _DRAWS, _TELLING = 20, 3, 2500  # fewer rays of a zone do not tell
-_MARGINS, _RIMS = (
-    (0.0, 0.001, 0.002, 0.003, 0.005, 0.008),
-    4.0,
-)  # that widen arcs which lose light, rims by so much more
+_MARGINS, _RIMS = (0.0, 0.001, 0.002, 0.003, 0.005, 0.008), 4.0  # that widen arcs which lose light; rims by more
 _CELLS, _LEADERS = (10, 12, 3, 3), 3  # of radius, stop, focus and azimuth: rays that need most
 _SMALLEST = 0.05  # stop, of the widest, that pupils are scaled by
 _RIDGE = 1e-6
@@ -53,15 +45,14 @@ _RIDGE = 1e-6
 
 @dataclass(frozen=True)
 class _Rays:
-    """Random rays [N] of a lens whose numbers are a mixture of those of nodes.
+    """Random rays [N] of a lens.
 
     Attributes:
-        weights: of the nodes. monomials: [M, N] of `PupilArcs.exponents`. x, y: in the frame of the film point.
+        monomials: [M, N] of `PupilArcs.exponents`. x, y: in the frame of the film point.
         passed, of_stop: what becomes of them: the stop blocks them. zone: see `zones_of`. unit: half the
             pupil's width.
     """
 
-    weights: Array
     monomials: Array
     x: Array
     y: Array
@@ -76,9 +67,8 @@ class _Rays:
         return np.asarray(_WITHIN * found / np.maximum(count, 1))
 
     def within(self, numbers: Array, sides: Sequence[int]) -> Array:
-        """[A, N] the margins in every arc of nodes' numbers."""
-        own = np.tensordot(self.weights, numbers, 1)
-        return np.stack([self.margins(a, side)[0] for a, side in zip(own, sides, strict=True)])
+        """[A, N] the margins in every arc."""
+        return np.stack([self.margins(own, side)[0] for own, side in zip(numbers, sides, strict=True)])
 
     def margins(self, numbers: Array, side: int) -> tuple[Array, list[Array | None], Array]:
         """How far rays lie within an arc [4, M], in half widths of the pupil, and its slopes by the arc's four."""
@@ -97,13 +87,13 @@ class _Rays:
         return np.minimum((height - self.y**2) / scale, ends / self.unit), [by_low, by_high, reach, reach * away], scale
 
 
-def moved(nodes: list[PupilArcs], half_mm: float, sight: Sight, report: Report) -> tuple[PupilArcs, float]:
+def moved(arcs: PupilArcs, half_mm: float, sight: Sight, report: Report) -> tuple[PupilArcs, float]:
     """The arcs of a lens in one state, moved, and the share of the rays of the worst zone that they lose.
 
     Args:
-        nodes: the arcs. half_mm: half the width of the pupil.
+        half_mm: half the width of the pupil.
     """
-    (arcs,) = _tuned(nodes, [(np.ones(1), sight)], report)
+    arcs = _tuned(arcs, sight, report)
     rays, stop, codes = random_rays(sight, arcs, np.random.default_rng(_CHECK_SEED), draws=_DRAWS)
     passed = codes == st.PASSED
     rays, stop = {name: row[:, passed] for name, row in rays.items()}, stop[passed]
@@ -130,37 +120,28 @@ def _wider(arcs: PupilArcs, rays: dict[str, Array], margin: float, half_mm: floa
     return replace(arcs, numbers=numbers)
 
 
-def _tuned(nodes: list[PupilArcs], seen: Sequence[tuple[Array, Sight]], report: Report) -> list[PupilArcs]:
-    """The arcs, moved; `seen`: weights of nodes, and the lens there."""
-    numbers, weight = np.stack([a.numbers for a in nodes]), np.full((len(seen), _ALL), _HEAVY)
-    used = [_used(nodes, arc) for arc in range(len(nodes[0].sides))]
-    for seed in range(_MOST):
-        width, drawn = _WIDTHS[min(seed, len(_WIDTHS) - 1)], []
-        for weights, sight in seen:
-            arcs = nodes[0].mixed(nodes[1:], weights)
-            drawn.append(_drawn(sight, replace(arcs, numbers=np.tensordot(weights, numbers, 1)), weights, seed))
+def _tuned(arcs: PupilArcs, sight: Sight, report: Report) -> PupilArcs:
+    """The arcs, moved; only the terms that they have."""
+    numbers, weight = arcs.numbers.copy(), np.full(_ALL, _HEAVY)
+    used = arcs.numbers != 0
+    for draw in range(_MOST):
+        rays = _drawn(sight, replace(arcs, numbers=numbers), draw)
         for k in range(_ROUNDS + 1):
-            report((seed + k / _ROUNDS) / _MOST)
-            within = [rays.within(numbers, nodes[0].sides) for rays in drawn]
-            lost = np.stack([rays.shares(np.any(own < 0, axis=0)) for rays, own in zip(drawn, within, strict=True)])
-            if k == 0 and seed >= len(_WIDTHS) - 1 and lost.max() < _ENOUGH:  # of rays that it has not been fitted to
-                break
-            weight = (weight * ((lost + _GOAL / 5) / (_GOAL * 1.2)).clip(1 / _HEAVIER, _HEAVIER)).clip(
-                _LIGHTEST, _HEAVIEST
-            )
+            report((draw + k / _ROUNDS) / _MOST)
+            within = rays.within(numbers, arcs.sides)
+            lost = rays.shares(np.any(within < 0, axis=0))
+            if k == 0 and draw == _MOST - 1 and lost.max() < _ENOUGH:  # of rays that it has not been fitted to
+                return replace(arcs, numbers=numbers)
+            change = ((lost + _GOAL / 5) / (_GOAL * 1.2)).clip(1 / _HEAVIER, _HEAVIER)
+            weight = (weight * change).clip(_LIGHTEST, _HEAVIEST)
             if k < _ROUNDS:
-                blame = [_blame(rays, own, nodes[0].sides) for rays, own in zip(drawn, within, strict=True)]
-                for node, arc in np.ndindex(numbers.shape[:2]):
-                    _step(numbers, node, arc, nodes[0].sides[arc], used[arc], drawn, blame, weight, width)
-        else:
-            continue
-        break
-    return [replace(a, numbers=own) for a, own in zip(nodes, numbers, strict=True)]
-
-
-def _used(nodes: list[PupilArcs], arc: int) -> list[Truths]:
-    """[M] of each of the arc's four: the terms that it has, of all its nodes."""
-    return [np.any([a.numbers[arc][row] != 0 for a in nodes], axis=0) for row in range(4)]
+                blame = _blame(rays, within, arcs.sides)
+                for arc, side in enumerate(arcs.sides):
+                    beside = rays.passed | (blame == arc)
+                    numbers[arc] = _stepped(numbers[arc], side, used[arc], rays, beside, weight, _WIDTHS[draw])
+        if draw == 0 and min(passing(sight, replace(arcs, numbers=numbers)).values()) < _HOPELESS:
+            break
+    return replace(arcs, numbers=numbers)
 
 
 def _blame(rays: _Rays, within: Array, sides: Sequence[int]) -> NDArray[np.intp]:
@@ -171,57 +152,41 @@ def _blame(rays: _Rays, within: Array, sides: Sequence[int]) -> NDArray[np.intp]
     return np.where(rays.of_stop, 0, rims[within[rims].argmin(0)])
 
 
-def _step(
-    numbers: Array, node: int, arc: int, side: int, used: list[Truths], drawn: Sequence[_Rays],
-    blame: Sequence[NDArray[np.intp]], weight: Sequence[Array], width: float,
-) -> None:  # fmt: skip
-    """One step of Newton's rule for an arc of a node."""
-    parts, slopes, near, seen = [], [], [], []
-    for rays, blamed, heavy in zip(drawn, blame, weight, strict=True):
-        share = float(rays.weights[node])
-        if abs(share) < 0.1:
-            continue
-        within, by, scale = rays.margins(np.tensordot(rays.weights, numbers[:, arc], 1), side)
-        beside = np.where(
-            rays.passed, within < 8 * width, (blamed == arc) & (within > -6 * width) & (within < 4 * _DEEP)
-        )
-        calm = np.random.default_rng(1).random(within.size) < _CALM_SHARE
-        rows = np.flatnonzero(beside | (rays.passed & calm))
-        factors = [(row[rows] * share / scale[rows], own) for row, own in zip(by, used, strict=True) if row is not None]
-        slopes.append(np.concatenate([rays.monomials[np.ix_(own, rows)] * row for row, own in factors]))
-        own, passed = within[rows], rays.passed[rows]
-        in_it = 1 / (1 + np.exp(-np.clip(own / width, -40, 40)))
-        force = np.where(passed, heavy[rays.zone[rows]], 1.0)
-        pull = np.where(passed, -force * (1 - in_it), in_it * np.exp(-np.maximum(own, 0) / _DEEP))
-        close = np.abs(own) < 8 * width
-        least = np.where(close, _FLOOR, _CALM / (1 + np.abs(own)) ** 2)
-        parts.append((pull, np.maximum(force * in_it * (1 - in_it), least) / width))
-        near.append(close)
-        seen.append((rays, rays.shares(within < 0)))
-    if not slopes or not any(row.any() for row in near):
-        return
-    rows = np.concatenate(slopes, 1)
-    pull, curve = (np.concatenate(row) for row in zip(*parts, strict=True))
-    matrix = (rows * curve) @ rows.T
+def _stepped(
+    numbers: Array, side: int, used: Truths, rays: _Rays, told: Truths, weight: Array, width: float
+) -> Array:  # fmt: skip
+    """An arc's numbers [4, M] after a step of Newton's rule. `told`: rays that pass, and those this arc blocks."""
+    within, by, scale = rays.margins(numbers, side)
+    beside = told & np.where(rays.passed, within < 8 * width, (within > -6 * width) & (within < 4 * _DEEP))
+    calm = np.random.default_rng(1).random(within.size) < _CALM_SHARE
+    chosen = np.flatnonzero(beside | (rays.passed & calm))
+    parts = [(row[chosen] / scale[chosen], own) for row, own in zip(by, used, strict=True) if row is not None]
+    rows = np.concatenate([rays.monomials[np.ix_(own, chosen)] * row for row, own in parts])
+    own, passed = within[chosen], rays.passed[chosen]
+    near = np.abs(own) < 8 * width
+    if not len(rows) or not near.any():
+        return numbers
+    in_it = 1 / (1 + np.exp(-np.clip(own / width, -40, 40)))
+    force = np.where(passed, weight[rays.zone[chosen]], 1.0)
+    pull = np.where(passed, -force * (1 - in_it), in_it * np.exp(-np.maximum(own, 0) / _DEEP))
+    least = np.where(near, _FLOOR, _CALM / (1 + np.abs(own)) ** 2)
+    matrix = (rows * (np.maximum(force * in_it * (1 - in_it), least) / width)) @ rows.T
     size = np.sqrt(np.diag(matrix)) + 1e-30
     matrix = matrix / size / size[:, None] + _RIDGE * np.eye(size.size)
     step = -np.linalg.solve(matrix, rows @ pull / size) / size
-    step *= min(1.0, 2 * width / float(np.quantile(np.abs(step @ rows[:, np.concatenate(near)]), 0.98)))
-    places = np.concatenate([np.flatnonzero(own) + k * own.size for k, own in enumerate(used)])
-    before = numbers[node, arc].copy()
+    step *= min(1.0, 2 * width / float(np.quantile(np.abs(step @ rows[:, near]), 0.98)))
+    moves = np.array([row is not None for row in by])[:, None] & used
+    lost = rays.shares(within < 0)
     for _ in range(_HALVINGS):
-        numbers[node, arc].flat[places] = before.flat[places] + step
-        worse = 0.0
-        for rays, lost in seen:
-            within = rays.margins(np.tensordot(rays.weights, numbers[:, arc], 1), side)[0]
-            worse = max(worse, float((rays.shares(within < 0) - lost).max()))
-        if worse < _MORE:
-            return
+        after = numbers.copy()
+        after[moves] += step
+        if (rays.shares(rays.margins(after, side)[0] < 0) - lost).max() < _MORE:
+            return after
         step = step / 2
-    numbers[node, arc] = before
+    return numbers
 
 
-def _drawn(sight: Sight, arcs: PupilArcs, weights: Array, seed: int) -> _Rays:
+def _drawn(sight: Sight, arcs: PupilArcs, seed: int) -> _Rays:
     rng = np.random.default_rng(100 + seed)
     given, stop, codes = random_rays(sight, arcs, rng, near=True)
     scaled = scaled_of(arcs, given, stop)
@@ -235,7 +200,7 @@ def _drawn(sight: Sight, arcs: PupilArcs, weights: Array, seed: int) -> _Rays:
     if not passed.any():
         passed[0] = True
     unit = np.maximum(scaled[1], _SMALLEST) * float(np.abs(y[passed]).max())
-    return _Rays(weights, monomials, x, y, passed, of_stop, zones_of(arcs, given, scaled, passed), unit)
+    return _Rays(monomials, x, y, passed, of_stop, zones_of(arcs, given, scaled, passed), unit)
 
 
 def scaled_of(arcs: PupilArcs, rays: dict[str, Array], stop: Array) -> Array:
@@ -246,11 +211,8 @@ def scaled_of(arcs: PupilArcs, rays: dict[str, Array], stop: Array) -> Array:
 
 def zones_of(arcs: PupilArcs, rays: dict[str, Array], scaled: Array, passed: Truths) -> NDArray[np.intp]:
     """[N] zones of rays of `random_rays` by film radius, stop and azimuth; few rays by film radius alone."""
-    shares = (
-        np.sqrt(rays["film_mm"][0] / rays["film_mm"][0].max()),
-        scaled[1] * 0.7501,
-        (1 + scaled[4]) / 2,
-    )  # the widest stop alone
+    radius = np.sqrt(rays["film_mm"][0] / rays["film_mm"][0].max())
+    shares = radius, scaled[1] * 0.7501, (1 + scaled[4]) / 2  # the widest stop is a zone of its own
     places = [np.minimum(share * n, n - 1).astype(np.intp) for share, n in zip(shares, _ZONES, strict=True)]
     own = np.ravel_multi_index(places, _ZONES)
     few = np.bincount(own[passed], minlength=np.prod(_ZONES))[own] < _FEW
