@@ -233,7 +233,7 @@ def test_shaders_cost_what_cycles_took() -> None:
     lens = lens_of(Path(GAUSS), None, lambda done, left=None: None)[1]
     asked = found.asked
     ns, times = shader_cost(lens, found.places, asked.film_mm, asked.f_number, asked.focus_m)
-    assert ns == pytest.approx(1516, rel=0.02)
+    assert ns == pytest.approx(699, rel=0.02)
     place = (np.arange(1000) + 0.5) / 1000
     colour = np.stack([3 * (1 - place) ** 2, 6 * place * (1 - place), 3 * place**2])
     y = np.array([0.2126, 0.7152, 0.0722]) @ colour

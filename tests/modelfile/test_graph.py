@@ -6,6 +6,7 @@ import lens_models
 import numpy as np
 import onnx
 import pytest
+from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
@@ -16,13 +17,21 @@ from neurolens.graph.scalars import lower
 from neurolens.modelfile.graph import graph_of
 from neurolens.modelfile.onnxfile import read_checked
 from neurolens.modelfile.protobuf import message, walk
+from neurolens.optics.lensfile import read_lens
 from neurolens.surrogates.precision import store_weights
 
 ROOT = Path(__file__).parents[2]
 
 
-def evaluated_as_onnxruntime(file: Path, state: tuple[float, ...] = (), differ: float = 2e-4) -> None:
-    """A graph, and its program, evaluated in numpy against onnxruntime."""
+def evaluated_as_onnxruntime(
+    file: Path, state: tuple[float, ...] = (), differ: float = 2e-4, grazing: bool = False
+) -> None:
+    """A graph, and its program, evaluated in numpy against onnxruntime.
+
+    Args:
+        grazing: rays leave the front at grazing angles, where Snell's law makes more of a direction's rounding inside
+            the glass, by the cosine outside.
+    """
     model = load_model(file)
     model = model.at(*state) if state else model
     domain, rng = model.card["domain"], np.random.default_rng(2)
@@ -38,15 +47,24 @@ def evaluated_as_onnxruntime(file: Path, state: tuple[float, ...] = (), differ: 
     assert np.mean(stepwise["status"][0] != found["status"]) <= differ
     ok = same & (wanted.status == st.PASSED)
     assert same.mean() >= 1 - differ and ok.mean() > 0.05 and len(np.unique(wanted.status)) > 2
+    outside = _cosine_at_front(wanted.scene_ray) if grazing else 1.0
     for name, row, other in zip(SCENE_RAY, wanted.scene_ray, stepwise["scene_ray"], strict=True):
         for values in (found[name], other):
-            assert np.abs(values - row)[ok].max() < (1e-4 if name.endswith("mm") else 2e-6)
+            off = np.abs(values - row) * (1.0 if name.endswith("mm") else outside)
+            assert off[ok].max() < (1e-4 if name.endswith("mm") else 2e-6)
     assert np.abs(found["transmittance"] - wanted.transmittance)[ok].max() < 1e-5
+
+
+def _cosine_at_front(ray: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Of rays [6, N] of the fisheye, with the normal of its front sphere."""
+    c = float(read_lens(lens_models.LENSES / f"{lens_models.FISHEYE}.toml").at().surfaces[0].curvature)
+    x, y = c * ray[:2]
+    return np.abs(ray[3] * x + ray[4] * y - ray[5] * np.sqrt(1 - x * x - y * y))
 
 
 @pytest.mark.parametrize("kind", lens_models.KINDS)
 def test_graphs_of_every_kind_of_model(kind: str) -> None:
-    evaluated_as_onnxruntime(lens_models.exported(kind))
+    evaluated_as_onnxruntime(lens_models.exported(kind), grazing=kind == "fisheye")
 
 
 @pytest.mark.parametrize("precision", ["int8", "float16"])
