@@ -25,7 +25,7 @@ from neurolens.evaluate.footprints import Array, Places
 UNIT = {"render": "ns", "c": "ns", "onnx": "ns", "osl": "ns", "glsl": "operations"}
 # Of a camera ray in Cycles under a white sky, experiments/results/osl_speed.md: Blender's own cameras; any shader, each
 # of its operations, and what each division and root takes besides. Fitted to the least times of the four cameras of
-# lenses there: within 0.8%, and within 6% of each that is left out (of the medians 1%, and 7%). Taken on a loaded machine.
+# lenses there: within 0.8%, and within 6% of each that is left out (of the medians 1%, and 7%), on a loaded machine.
 CYCLES_NS: Mapping[str, float] = {"pinhole": 120.6, "thin": 147.4}
 SHADER_NS = 134.9
 _STEP_NS, _DEAR_NS, _DEAR = 0.0594, 6.14, ("div", "sqrt")
