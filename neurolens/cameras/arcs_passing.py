@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.cameras.pupil_arcs import PupilArcs
+from neurolens.cameras.pupil_circles import PupilCircles
 from neurolens.cameras.pupil_sight import Sight, Truths
 from neurolens.graph.interpret import evaluate
 
@@ -16,7 +17,7 @@ Array = NDArray[np.float64]
 _ASKED, _TRIED = 20_000, 64
 
 
-def passing(sight: Sight, arcs: PupilArcs) -> dict[float, float]:
+def passing(sight: Sight, arcs: PupilArcs | PupilCircles) -> dict[float, float]:
     """Share of the points of the arcs through which rays pass, all over the film, by shares of the widest stop.
 
     Of film points that have light at that stop: of those whose ray is blocked, where any of `_TRIED` others passes.
@@ -36,10 +37,11 @@ def passing(sight: Sight, arcs: PupilArcs) -> dict[float, float]:
     return found
 
 
-def _sampled(sight: Sight, arcs: PupilArcs, square: Array, film: Array, call: Sequence[Array]) -> Truths:
+def _sampled(sight: Sight, arcs: PupilArcs | PupilCircles, square: Array, film: Array, call: Sequence[Array]) -> Truths:
     """[N] whether rays of points [2, N] of the unit square pass; film positions, wavelengths and stops."""
     film_z, nm, stop = call
     given = {"film_mm": film, "square": square}
     given |= {"film_z_mm": film_z[None], "wavelength_nm": nm[None], "stop_radius_mm": stop[None]}
-    pupil = evaluate(arcs.graph, given)["pupil_mm"]
-    return np.asarray(sight.status(film, pupil, nm, film_z, stop) == st.PASSED)
+    found = evaluate(arcs.graph, given)
+    passed = sight.status(film, found["pupil_mm"], nm, film_z, stop) == st.PASSED
+    return np.asarray(passed & (found["area_mm2"][0] > 0))

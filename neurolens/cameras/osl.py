@@ -35,6 +35,7 @@ from neurolens.cameras.onnxlens import OnnxLens
 from neurolens.cameras.pupil_arcs import PupilArcs
 from neurolens.cameras.pupil_arcs_fit import fit_arcs
 from neurolens.cameras.pupil_boxes import PupilTable
+from neurolens.cameras.pupil_circles import PupilCircles
 from neurolens.cameras.pupil_sight import Sight
 from neurolens.cameras.sampling import stratified
 from neurolens.cameras.source import model_focusing
@@ -106,7 +107,7 @@ class OslCamera:
 
     sight: Sight
     lens: Graph
-    arcs: PupilArcs
+    arcs: PupilArcs | PupilCircles
     film: Array
     nearest_m: tuple[float, float]
     limit_m: float
@@ -153,7 +154,9 @@ class OslLens:
 
     def passing(self) -> dict[float, float]:
         """Share of the samples that pass, in the worst state, by shares of the widest stop."""
-        first, *others = (c.arcs for c in self.nodes)
+        if not self.between and len(self.nodes) == 1:
+            return passing(self.nodes[0].sight, self.nodes[0].arcs)
+        first, *others = (c.arcs for c in self.nodes if isinstance(c.arcs, PupilArcs))  # as all of several states are
         seen = [(np.eye(len(self.nodes))[k], c.sight) for k, c in enumerate(self.nodes)]
         found = [passing(sight, first.mixed(others, weights)) for weights, sight in [*seen, *self.between]]
         return {share: min(f[share] for f in found) for share in found[0]}
@@ -326,7 +329,7 @@ def _light(camera: OslCamera, random: Value, in_colour: Value) -> tuple[Value, V
     return nanometres, g.select(grey, 1.0, colour)
 
 
-def _samples(sight: Sight, arcs: PupilArcs, count: int = 32768) -> dict[str, NDArray[np.float32]]:
+def _samples(sight: Sight, arcs: PupilArcs | PupilCircles, count: int = 32768) -> dict[str, NDArray[np.float32]]:
     """Rays through the arcs, nearly half at the widest stop, as inputs of the lens's graph; `at_stop` of the arcs."""
     rng = np.random.default_rng(0)
     angle, radius = 2 * np.pi * rng.random(count), 0.99 * arcs.film_radius_mm * np.sqrt(rng.random(count))
@@ -470,7 +473,7 @@ def osl_lens(
     return OslLens(cameras, axes, between)
 
 
-def _stop_image(sight: Sight, arcs: PupilArcs) -> tuple[float, float]:
+def _stop_image(sight: Sight, arcs: PupilArcs | PupilCircles) -> tuple[float, float]:
     """The stop in its image in the pupil, as the arcs have it: -1 where it is upside down, and by how much, in the
     stop's radius, nearly no ray within an edge of blades seems to lie beyond it."""
     given = _samples(sight, arcs)

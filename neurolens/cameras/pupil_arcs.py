@@ -14,20 +14,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import cached_property, partial, reduce
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurolens.cameras.blades import Blades
-from neurolens.cameras.stop_image import StopImage
 from neurolens.graph.ir import Graph, Value
 
 Array = NDArray[np.float64]
-_HAIR = 1e-18  # mm
+HAIR = 1e-18  # mm
 # Gauss's nodes and weights over a disc, along a diameter.
 _NODES = ((-(0.5**0.5), 0.25), (0.0, 0.5), (0.5**0.5, 0.25))
-_TIP = 1e-7  # of 1 - X^2, near the ends of an arc
+TIP = 1e-7  # of 1 - X^2, near the ends of an arc
 _ROUNDS = 2  # of the share of a way that blades leave: it depends on the width of the pupil there
 RADIUS = 4  # powers of the film radius
 
@@ -42,11 +41,9 @@ class PupilArcs:
             are scaled to; the same in all states of a lens.
         numbers: [A, 4, M]: of the stop's image, then of rims, the low end, the high end and two factors, as polynomials
             of the monomials `exponents` [M, 5] in film radius, stop, film position and wavelength, scaled to 1, and the
-            cosine of twice the azimuth of the film point, squeezed.
+            cosine of twice the azimuth of the film point.
         sides: [A] of an arc: 1 of a rim that ends the light on the film point's side, -1 on the other, 0 on both; the
             row of an end that it has not is 0.
-        squeeze: y of film points is scaled by it first: rims before cylinders cut the pupil from that side.
-        image: of the stop, which the arcs stand in, in place of the pupil; None: in the pupil.
     """
 
     film_radius_mm: float
@@ -57,8 +54,6 @@ class PupilArcs:
     numbers: Array
     exponents: NDArray[np.int64]
     sides: tuple[int, ...]
-    squeeze: float = 1.0
-    image: StopImage | None = None
 
     def scaled(self, radius: Array, stop: ArrayLike, film_z: ArrayLike, nanometres: Array, azimuth: ArrayLike) -> Array:
         """[5, ...]: film radius, stop, film position, wavelength and azimuth as the polynomials take them."""
@@ -88,17 +83,14 @@ class PupilArcs:
         """
         g = Graph()
         film, square = g.input("film_mm", 2), g.input("square", 2)
-        squeezed = film if self.squeeze == 1 else film * [1.0, self.squeeze]
-        radius = g.square(squeezed).sqrt()
-        turn = (squeezed + [_HAIR, 0.0]) * (1.0 / (radius + _HAIR))
+        radius = g.square(film).sqrt()
+        turn = (film + [HAIR, 0.0]) * (1.0 / (radius + HAIR))
         arcs = self._arcs(g, radius * (1 / self.unit_mm), turn[0] * turn[0] - turn[1] * turn[1])
-        disc = unit_disc(square)
         low, high = _ends(arcs)
-        half, middle = (high - low) * 0.5, (low + high) * 0.5
         across = g.affine([[0.0, -1.0], [1.0, 0.0]], turn)
 
         # Written from the ends, so that rounding leaves no side negative.
-        def stretch(left: Value, right: Value) -> Value:
+        def stretch(left: Value, right: Value) -> tuple[None, Value]:
             rows = [
                 arc.height(
                     None if arc.low is None else half * left + (low - arc.low),
@@ -106,37 +98,23 @@ class PupilArcs:
                 )
                 for arc in arcs
             ]
-            return (reduce(Value.minimum, rows) / (left * right).maximum(_TIP)).maximum(0.0).sqrt()
+            return None, (reduce(Value.minimum, rows) / (left * right).maximum(TIP)).maximum(0.0).sqrt()
 
         def at_stop(x: Value, y: Value) -> Value:
             stop = arcs[0]
             assert stop.low is not None and stop.high is not None
             reach, from_low = (stop.high - stop.low) * 0.5, x - stop.low
-            wide = (stop.first + stop.change * from_low).maximum(_TIP).sqrt()
+            wide = (stop.first + stop.change * from_low).maximum(TIP).sqrt()
             return (turn * (from_low - reach) + across * (y / wide)) * (side / reach)
 
-        share = g.constant(1.0)
-        if blades is not None:
-            opening, start = blades(g), at_stop(middle, g.constant(0.0))
-            way = disc * (1.0 / (g.square(disc).sqrt() + _HAIR))
-            for _ in range(_ROUNDS):
-                x = way[0] * share
-                end = at_stop(middle + half * way[0], way[1] * stretch(1.0 + x, 1.0 - x))
-                share = opening.drawn(start, end - start, margin)
-            disc = disc * share
-        here = stretch(disc[0] + 1.0, 1.0 - disc[0])
-        x, y = middle + half * disc[0], disc[1] * here
-        inside = (radius if squeezed is film else g.square(film).sqrt()) <= self.film_radius_mm
-        point, unit = turn * x + across * y, g.constant(math.pi)
-        if self.image is not None:
-            point, wide = self.image.placed(film, g.input("film_z_mm", per_call=True), g.input("wavelength_nm"), point)
-            unit = wide * math.pi
-        g.outputs["pupil_mm"] = point
+        half = (high - low) * 0.5
+        opening = None if blades is None else partial(blades(g).drawn, margin=margin)
+        x, y, area, mean = fill(unit_disc(square), low, high, stretch, at_stop, opening)
+        inside = radius <= self.film_radius_mm
+        g.outputs["pupil_mm"] = turn * x + across * y
         g.outputs["at_stop"] = at_stop(x, y)
-        g.outputs["area_mm2"] = g.select(inside, half * here * (share * share * unit), 0.0)
-        one = g.constant(1.0)
-        nodes = [stretch(one * (1 + x), one * (1 - x)) * w for x, w in _NODES]
-        g.outputs["mean_area_mm2"] = half * (nodes[0] + nodes[1] + nodes[2]) * unit
+        g.outputs["area_mm2"] = g.select(inside, area, 0.0)
+        g.outputs["mean_area_mm2"] = mean
         return g
 
     def _arcs(self, g: Graph, radius: Value, twice: Value) -> list[Arc]:
@@ -198,7 +176,7 @@ class PupilArcs:
     @cached_property
     def checked(self) -> Graph:
         """Whether rays lie inside: inputs `film_mm`, `pupil_mm` [2] of film points on +x, from the azimuth whose double
-        has the cosine `twice`, turned; outputs by arc, its factors too. Points are of the image, where there is one."""
+        has the cosine `twice`, turned; outputs by arc, its factors too."""
         g = Graph()
         pupil = g.input("pupil_mm", 2)
         arcs = self._arcs(g, g.input("film_mm", 2)[0] * (1 / self.unit_mm), g.input("twice"))
@@ -231,13 +209,45 @@ class Arc:
         return found if left is None or right is None else right * found
 
 
+def fill(
+    disc: Value, low: Value, high: Value, across: Callable[[Value, Value], tuple[Value | None, Value]],
+    at_stop: Callable[[Value, Value], Value], opening: Callable[[Value, Value], Value] | None,
+) -> tuple[Value, Value, Value, Value]:  # fmt: skip
+    """A point of a shape of a point of the unit disc: x, y, the inverse of its density and the mean of that.
+
+    Args:
+        low, high: ends of the shape along x. across: at distances from the ends, in halves of its length, its middle
+            along y (None: 0) and its half height over that of the unit disc. at_stop: of a point, in units of the
+            stop's radius. opening: which share of a way from a point of the stop its blades leave.
+    """
+    g, half, middle = disc.graph, (high - low) * 0.5, (low + high) * 0.5
+
+    def point(x: Value, y: Value) -> tuple[Value, Value, Value]:
+        centre, tall = across(x + 1.0, 1.0 - x)
+        return middle + half * x, y * tall if centre is None else centre + y * tall, tall
+
+    share = g.constant(1.0)
+    if opening is not None:
+        centre, _ = across(g.constant(1.0), g.constant(1.0))
+        start = at_stop(middle, g.constant(0.0) if centre is None else centre)
+        way = disc * (1.0 / (g.square(disc).sqrt() + HAIR))
+        for _ in range(_ROUNDS):
+            end = at_stop(*point(way[0] * share, way[1])[:2])
+            share = opening(start, end - start)
+        disc = disc * share
+    x, y, here = point(disc[0], disc[1])
+    one = g.constant(1.0)
+    nodes = [across(one * (1 + x), one * (1 - x))[1] * w for x, w in _NODES]
+    return x, y, half * here * (share * share * math.pi), half * (nodes[0] + nodes[1] + nodes[2]) * math.pi
+
+
 def unit_disc(square: Value) -> Value:
     """The point [2] of the unit disc of a point of the unit square, evenly (Shirley and Chiu 1997)."""
     g = square.graph
     a, b = g.split(square * 2.0 - 1.0, (1, 1))
     flat = b.abs() <= a.abs()
     size = g.select(flat, a, b)
-    angle = g.select(flat, b, a) / g.select(size.abs() <= _HAIR, 1.0, size)
+    angle = g.select(flat, b, a) / g.select(size.abs() <= HAIR, 1.0, size)
     squared = angle * angle
     cos = size * g.series(squared, _COS)
     sin = size * angle * g.series(squared, _SIN)

@@ -8,16 +8,18 @@ from functools import partial
 from itertools import product
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Report
 from neurolens.cameras.arcs_passing import passing
 from neurolens.cameras.pupil_arcs import PupilArcs
-from neurolens.cameras.pupil_arcs_tune import leaders, moved
+from neurolens.cameras.pupil_arcs_tune import moved
 from neurolens.cameras.pupil_boxes import asking, end_of_light, frame_of
-from neurolens.cameras.pupil_sight import Sight, Truths, imaged, turned
+from neurolens.cameras.pupil_circles import PupilCircles
+from neurolens.cameras.pupil_circles_fit import fit_circles
+from neurolens.cameras.pupil_sight import Sight, Truths, turned
 from neurolens.graph.interpret import evaluate
 
 Array = NDArray[np.float64]
@@ -29,14 +31,11 @@ _MARGIN = 0.001  # of half the pupil
 _RIDGE = 1e-10
 _ENOUGH = 0.97  # of points, at the widest stop, that pass
 _FEWEST = 12  # vertices that rims of a side block
-_PLENTY, _GOAL = 0.96, 0.952  # of points, that no other way to fit needs to pass: of a round lens, by zones
+_PLENTY, _GOAL = 0.96, 0.952  # of points, that no other way to fit needs to pass: by arcs, zone by zone
 _REFIT_SEED, _CHECK_SEED, _NO_SIDE = 10, 20, 2  # such rays lie on no arc
 _LOST = 1e-3  # of rays that pass in any zone, that a way may miss
-_HELD, _HELD_ROUND = 0.9997, 0.9998  # of random rays that pass, in every zone, or of a round lens of all
+_HELD = 0.9998  # of random rays that pass
 _RISE, _STEP, _STEPS = 1.03, 0.004, 12  # of arcs that do not hold them: in y^2, and of half the pupil along x
-_ZONES, _FEW = (6, 3, 3), 1000  # of film radius, stop and azimuth; rays that tell of one
-_WIDEST = 0.5  # of half the pupil's size, by which arcs that do not hold them grow
-_MOVES, _DRAWS, _FIRM, _SURE = 3, 2, 1e4, 0.9999  # of arcs moved until they hold them
 # Of the stop's and of rims' ends and two factors: highest power of the film radius, and how many move with the film.
 _LEAN = (((4, 3), (4, 2), (2, 0)), ((3, 2), (2, 1), (1, 0)))
 _RAYS = 60_000  # random ones that must lie inside, of an anamorphic lens three times as many
@@ -50,8 +49,7 @@ class Way:
         rows: film radii, and stops: as shares of the widest, where the end of the light is sought.
         powers: of the film radius. film: how many of the film radius and the stop move with the film's position.
         push: weight of what lies outside. refits: fits again to random rays that are missed: arcs that are moved as a
-            whole until they hold those are wide everywhere for the sake of one place. image: in that of the stop. lean:
-            see `_LEAN`.
+            whole until they hold those are wide everywhere for the sake of one place. lean: see `_LEAN`.
     """
 
     rows: int
@@ -60,7 +58,6 @@ class Way:
     film: tuple[int, int]
     push: float
     refits: int
-    image: bool
     lean: bool = False
 
     def exponents(self, anamorphic: bool) -> NDArray[np.int64]:
@@ -75,12 +72,10 @@ class Way:
 
 # In turn until enough passes: the best is kept.
 _WAYS = (
-    Way(17, (1.0, 0.75, 0.5, 0.25, 0.1), 4, (3, 2), 300.0, 0, False, True),
-    Way(25, (1.0, 0.85, 0.7, 0.55, 0.4, 0.28, 0.18, 0.08), 4, (3, 2), 3000.0, 3, False),
-    Way(25, (1.0, 0.85, 0.7, 0.55, 0.4, 0.28, 0.18, 0.08), 4, (5, 3), 3000.0, 3, False),
-    *(Way(25, (1.0, 0.7, 0.4, 0.2, 0.08), 12, (6, 3), 3000.0, refits, True) for refits in (1, 2)),  # rays are chance
+    Way(17, (1.0, 0.75, 0.5, 0.25, 0.1), 4, (3, 2), 300.0, 0, True),
+    Way(25, (1.0, 0.85, 0.7, 0.55, 0.4, 0.28, 0.18, 0.08), 4, (3, 2), 3000.0, 3),
+    Way(25, (1.0, 0.85, 0.7, 0.55, 0.4, 0.28, 0.18, 0.08), 4, (5, 3), 3000.0, 3),
 )
-_ANAMORPHIC = tuple(Way(17, (1.0, 0.7, 0.4, 0.2, 0.08), 4, (3, 2), push, 3, True) for push in (1e4, 1e5))
 
 
 @dataclass(frozen=True)
@@ -115,8 +110,11 @@ class _Edge:
     last: Truths
 
 
-def fit_arcs(sights: Sequence[Sight], report: Report, between: Sequence[tuple[Array, Sight]] = ()) -> list[PupilArcs]:
-    """The arcs of a lens, in each of its states: at least every ray found to pass lies inside.
+def fit_arcs(
+    sights: Sequence[Sight], report: Report, between: Sequence[tuple[Array, Sight]] = ()
+) -> list[PupilArcs | PupilCircles]:
+    """The pupil of a lens, in each of its states, by arcs or, of one state that these do not fit, by circles: all but
+    the fewest rays found to pass lie inside.
 
     Args:
         sights: the lens at each node of its state; one of a lens without. between: weights of these nodes and the lens
@@ -125,24 +123,25 @@ def fit_arcs(sights: Sequence[Sight], report: Report, between: Sequence[tuple[Ar
     Raises:
         InputError: no ray passes.
     """
-    single = len(sights) == 1
-    if not single:  # refitted by themselves, nodes hold less of what lies between them
-        return _by(_WAYS[0], sights, report, between)[0]
-    if not sights[0].anamorphic:
+    if len(sights) > 1:  # refitted by themselves, nodes hold less of what lies between them
+        return list(_by(_WAYS[0], sights, report, between)[0])
+    sight, kept, best, lost = sights[0], list[PupilArcs | PupilCircles](), -1.0, 1.0
+    if not sight.anamorphic:
         (begun,), half = _begun(_WAYS[0], sights, report)
-        arcs, lost = moved(begun, half, sights[0], report)
-        if lost <= _LOST and min(passing(sights[0], arcs).values()) >= _GOAL:
+        arcs, lost = moved(begun, half, sight, report)
+        if lost <= _LOST and min(passing(sight, arcs).values()) >= _GOAL:
             return [arcs]
-    ways = _ANAMORPHIC if sights[0].anamorphic else _WAYS
-    kept: list[PupilArcs] = []
-    best, lost = -1.0, 1.0
-    for part, way in enumerate(ways):
-        seen = imaged(sights[0]) if way.image else sights[0]
-        own, beyond = _by(way, [seen], partial(_within, report, part / len(ways), 1 / len(ways)))
-        least, held = min(passing(seen, own[0]).values()), beyond <= _LOST < lost and _by_zones(seen)
-        if held or (least > best and beyond <= max(lost, _LOST)):
-            kept, best, lost = [replace(own[0], image=seen.image)], least, beyond
-        if best >= _PLENTY if not _by_zones(seen) else best >= _GOAL and lost <= _LOST:
+        lost = 1.0
+    if (made := fit_circles(sight, report)) is not None:
+        kept, best, lost = [made[0]], min(passing(sight, made[0]).values()), made[1]
+        if sight.anamorphic or (best >= _GOAL and lost <= _LOST):  # arcs of anamorphic lenses are wide
+            return kept
+    for part, way in enumerate(_WAYS):
+        (arcs,), beyond = _by(way, sights, partial(_within, report, part / len(_WAYS), 1 / len(_WAYS)))
+        least = min(passing(sight, arcs).values())
+        if beyond <= _LOST < lost or (least > best and beyond <= max(lost, _LOST)):
+            kept, best, lost = [arcs], least, beyond
+        if best >= _PLENTY:
             break
     return kept
 
@@ -154,7 +153,7 @@ def _by(
     nodes = _begun(way, sights, partial(_within, report, 0.0, 0.6))[0]
     seen = [*zip(np.eye(len(nodes)), sights, strict=True), *between]
     inside = partial(_within, report, 0.6, 0.4)
-    nodes = [_dilated(nodes[0], sights[0], inside)] if _by_zones(sights[0]) else _widened(nodes, seen, inside)
+    nodes = _widened(nodes, seen, inside)
     return nodes, max(_lost(*of_one) for of_one in zip(sights, nodes, strict=True))
 
 
@@ -171,15 +170,9 @@ def _begun(way: Way, sights: Sequence[Sight], report: Report) -> tuple[list[Pupi
     return _fitted(way, sights, nodes, edges, sides), float(np.ptp(edges[0].x)) / 2
 
 
-def _by_zones(sight: Sight) -> bool:
-    """Whether arcs hold light zone by zone: what an anamorphic lens's lose, they lose in a few places."""
-    return sight.anamorphic and sight.image is not None
-
-
 def _lost(sight: Sight, arcs: PupilArcs) -> float:
-    """Share of random rays that pass beyond the arcs, of an anamorphic lens in the worst zone."""
-    rays, stop, *_, out = _beyond(sight, arcs, _CHECK_SEED, _DRAWS if _by_zones(sight) else 1)
-    return max(float(out[zone].mean()) for zone in _zones(sight, rays, stop)) if _by_zones(sight) else float(out.mean())
+    """Share of random rays that pass beyond the arcs."""
+    return float(_beyond(sight, arcs, _CHECK_SEED)[-1].mean())
 
 
 def _fitted(
@@ -211,9 +204,9 @@ def _empty(way: Way, sights: Sequence[Sight], places: Sequence[_Places]) -> list
     found = []
     for radius, sight in zip(radii, sights, strict=True):
         low, high = sight.film_z_mm
-        radius = min(radius / min(1.0, sight.squeeze), sight.film_radius_mm)
+        radius = min(radius, sight.film_radius_mm)
         place = (low + high) / 2, max((high - low) / 2, 1e-6)
-        found.append(PupilArcs(radius, unit, place, stop, wave, nothing, exponents, (), sight.squeeze))
+        found.append(PupilArcs(radius, unit, place, stop, wave, nothing, exponents, ()))
     return found
 
 
@@ -283,11 +276,6 @@ def _edge(sight: Sight, arcs: PupilArcs, p: _Places) -> _Edge:
 def _with_missed(sight: Sight, arcs: PupilArcs, edge: _Edge, seed: int) -> _Edge:
     """With random rays that pass beyond the arcs as vertices that they must hold."""
     rays, stop, left, right, out = _beyond(sight, arcs, _REFIT_SEED + seed)
-    if _by_zones(sight):  # a fold of the model or the lens sends a few far away: not worth an arc
-        found, y = evaluate(arcs.checked, rays), rays["pupil_mm"][1]
-        height = (y * y - found["height"]) / (2 * np.abs(y).max())
-        far = np.maximum(np.maximum(-found["left"], -found["right"]), height).max(0)
-        out = out & ~_worst(far, _zones(sight, rays, stop))
     missed = *rays["pupil_mm"], _scaled(arcs, rays, stop), np.full(out.size, _NO_SIDE), right, left
     return _Edge(*(np.concatenate([a, b[..., out]], -1) for a, b in zip(astuple(edge), missed, strict=True)))
 
@@ -298,19 +286,9 @@ def _scaled(arcs: PupilArcs, rays: dict[str, Array], stop: Array) -> Array:
     return arcs.scaled(rays["film_mm"][0], stop, rays["film_z_mm"][0], rays["wavelength_nm"][0], azimuth)
 
 
-def _worst(values: Array, zones: Sequence[NDArray[np.intp]]) -> Truths:
-    """[N] the few greatest of every zone."""
-    found = np.zeros(values.size, bool)
-    for zone in zones:
-        found[zone] = values[zone] > np.quantile(values[zone], _HELD)
-    return found
-
-
-def _beyond(
-    sight: Sight, arcs: PupilArcs, seed: int, draws: int = 1
-) -> tuple[dict[str, Array], Array, Truths, Truths, Truths]:
+def _beyond(sight: Sight, arcs: PupilArcs, seed: int) -> tuple[dict[str, Array], Array, Truths, Truths, Truths]:
     """Rays and stops of `_random`, and which of them lie beyond a low end, a high end, any arc."""
-    rays, stop = _random(sight, arcs, seed, draws)
+    rays, stop = _random(sight, arcs, seed)
     found = evaluate(arcs.checked, rays)
     left, right = ((found[name] < 0).any(0) for name in ("left", "right"))
     return rays, stop, left, right, left | right | (found["height"] < rays["pupil_mm"][1] ** 2).any(0)
@@ -371,9 +349,9 @@ def _above(rows: Array, wanted: Array, own: Truths, size: Array, push: float) ->
     return out
 
 
-def _random(sight: Sight, arcs: PupilArcs, seed: int, draws: int = 1) -> tuple[dict[str, Array], Array]:
+def _random(sight: Sight, arcs: PupilArcs, seed: int) -> tuple[dict[str, Array], Array]:
     """Random rays that pass, from film points on +x, as inputs of `PupilArcs.checked`, and stops."""
-    rng, count = np.random.default_rng(seed), _RAYS * draws * (1 + 2 * sight.anamorphic)
+    rng, count = np.random.default_rng(seed), _RAYS * (1 + 2 * sight.anamorphic)
     radius = arcs.film_radius_mm * rng.random(count) ** (0.75 if sight.anamorphic else 0.5) * 0.9999
     stop = sight.stop_radius_mm * rng.choice(np.linspace(0.08, 1, 12), count)
     film_z, nm = (rng.uniform(*span, count) for span in (sight.film_z_mm, sight.wavelength_nm))
@@ -386,8 +364,6 @@ def _random(sight: Sight, arcs: PupilArcs, seed: int, draws: int = 1) -> tuple[d
     if sight.anamorphic:
         azimuth, pupil[1] = np.pi / 2 * rng.random(count), pupil[1] * rng.choice([-1.0, 1.0], count)
     place: Array = turned(np.stack([radius, 0 * radius]), azimuth).astype(np.float64)
-    x, y = place * [[1.0], [arcs.squeeze]]
-    radius, azimuth = np.hypot(x, y), np.arctan2(y, x)
     given |= {"film_mm": place, "film_z_mm": film_z[None], "wavelength_nm": nm[None]}
     near = turned(evaluate(arcs.graph, given)["pupil_mm"], -azimuth)
     middle = turned(evaluate(arcs.graph, given | {"square": np.full((2, count), 0.5)})["pupil_mm"], -azimuth)
@@ -395,17 +371,6 @@ def _random(sight: Sight, arcs: PupilArcs, seed: int, draws: int = 1) -> tuple[d
     passed = sight.status(place, turned(pupil, azimuth), nm, film_z, stop) == st.PASSED
     given |= {"film_mm": np.stack([radius, 0 * radius]), "pupil_mm": pupil, "twice": np.cos(2 * azimuth)[None]}
     return {name: rows[:, passed] for name, rows in given.items()}, stop[passed]
-
-
-def _zones(sight: Sight, rays: dict[str, Array], stop: Array) -> list[NDArray[np.intp]]:
-    """Rays of `_random` by film radius, stop and azimuth; those of zones with few rays by film radius alone."""
-    shares = rays["film_mm"][0] / rays["film_mm"][0].max(), stop / sight.stop_radius_mm, (1 + rays["twice"][0]) / 2
-    places = [np.minimum(share * n, n - 1).astype(int) for share, n in zip(shares, _ZONES, strict=True)]
-    own = np.ravel_multi_index(places, _ZONES)
-    counts = np.bincount(own, minlength=np.prod(_ZONES))
-    few = counts[own] < _FEW
-    own[few] = -1 - places[0][few]
-    return [np.flatnonzero(own == zone) for zone in np.unique(own)]
 
 
 def _widened(nodes: list[PupilArcs], seen: Sequence[tuple[Array, Sight]], report: Report) -> list[PupilArcs]:
@@ -421,11 +386,11 @@ def _widened(nodes: list[PupilArcs], seen: Sequence[tuple[Array, Sight]], report
         for end, name in enumerate(("left", "right")):
             for arc, row in enumerate(found[name]):
                 lack = -row / (1.0 if arc else stop / arcs.stop_radius_mm)
-                push = max(np.quantile(lack, _HELD_ROUND), 0.0)
+                push = max(np.quantile(lack, _HELD), 0.0)
                 numbers[own, arc] += push * _longer(arcs, arc, end, found["change"][arc])
         for _ in range(_STEPS):
             height = evaluate(replace(mixed, numbers=np.tensordot(weights, numbers, 1)).checked, rays)["height"]
-            ratio = np.quantile(rays["pupil_mm"][1] ** 2 / np.maximum(height, 1e-9), _HELD_ROUND, axis=1)
+            ratio = np.quantile(rays["pupil_mm"][1] ** 2 / np.maximum(height, 1e-9), _HELD, axis=1)
             if ratio.max() <= _RISE:
                 break
             # Near the ends of an arc no factor helps: it is made longer.
@@ -444,55 +409,3 @@ def _longer(arcs: PupilArcs, arc: int, end: int, change: Array) -> Array:
 def _bend(change: Array) -> float:
     """By how much a rim's first factor grows with its length (mm), so that it holds whatever it has held."""
     return 1 + 2 * max(-float(change.min()), 0.0)
-
-
-def _dilated(arcs: PupilArcs, sight: Sight, report: Report) -> PupilArcs:
-    """The arcs, each moved by as little as random rays in every zone need, outwards or inwards."""
-    for seed in range(_MOVES):
-        report(seed / _MOVES)
-        rays, stop, *_, out = _beyond(sight, arcs, seed, _DRAWS)
-        if seed and max(out[zone].mean() for zone in _zones(sight, rays, stop)) <= _LOST / 4:
-            break
-        # What the first ones asked for holds.
-        arcs = replace(arcs, numbers=arcs.numbers + _moved(arcs, sight, rays, stop, 0.0 if seed else -np.inf))
-    return arcs
-
-
-def _moved(arcs: PupilArcs, sight: Sight, rays: dict[str, Array], stop: Array, least: float) -> Array:
-    """[A, 4, M]: what is added to numbers of arcs whose ends move by polynomials of film radius, stop and azimuth.
-
-    `least`: of what rays need.
-    """
-    found, zones, scaled = evaluate(arcs.checked, rays), _zones(sight, rays, stop), _scaled(arcs, rays, stop)
-    y, added, powers = rays["pupil_mm"][1], np.zeros_like(arcs.numbers), [tuple(row) for row in arcs.exponents.tolist()]
-    size = float(np.abs(y).max())
-    for arc, side in enumerate(arcs.sides):
-        own = {name: found[name][arc] for name in ("left", "right", "first", "change")}
-        # The stop's ends move with the stop. A rim's far end moves, too.
-        step, bend = (scaled[1], 1 / size) if side == 0 else (1.0, _bend(own["change"]))
-        need = np.maximum(_needed(own, y * y, side, step, bend, size), least)
-        ends = {e: (e[0], e[1] + (side == 0), *e[2:]) for e in powers if not (e[2] or e[3] or (side and e[1]))}
-        ends = {e: end for e, end in ends.items() if end in powers}
-        rows = np.prod(scaled[:, None] ** np.array(list(ends)).T[:, :, None], axis=0)
-        of_all = leaders(scaled, np.where(_worst(need, zones), -np.inf, need))
-        way = _above(rows[:, of_all], need[of_all], np.ones(of_all.size, bool), np.ones(of_all.size), _FIRM)
-        way[0] += max(float(np.quantile((need - way @ rows)[zone], _SURE)) for zone in zones)
-        for (e, end), value in zip(ends.items(), way, strict=True):
-            added[arc, 0, powers.index(end)] -= value * (side <= 0)
-            added[arc, 1, powers.index(end)] += value * (side >= 0)
-            added[arc, 2, powers.index(e)] += value * bend
-    return added
-
-
-def _needed(own: dict[str, Array], squared: Array, side: int, step: ArrayLike, bend: float, size: float) -> Array:
-    """[N] by how much an arc must move to hold rays, y^2 `squared`: its ends by that many steps, its first factor by
-    that many bends."""
-    low, high = np.full(squared.size, -_WIDEST / 4 * size), np.full(squared.size, _WIDEST * size)
-    for _ in range(_HALVINGS):
-        way = (low + high) / 2
-        left, right = (own[name] + way * step for name in ("left", "right"))
-        away, other = (right if side > 0 else left), (right if side == 0 else 1.0)
-        height = away * other * (own["first"] + bend * way + own["change"] * away)
-        held = (np.minimum(away, other) >= 0) & (height >= squared)
-        low, high = np.where(held, low, way), np.where(held, way, high)
-    return high

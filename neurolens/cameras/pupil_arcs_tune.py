@@ -38,7 +38,6 @@ _HALVINGS, _MORE = 6, 2e-3  # of a step by which arcs would lose so many more ra
 _LOST = 7e-4  # of random rays that check, where a margin is enough
 _CHECK_SEED, _DRAWS, _TELLING = 20, 3, 2500  # fewer rays of a zone do not tell
 _MARGINS, _RIMS = (0.0, 0.001, 0.002, 0.003, 0.005, 0.008), 4.0  # that widen arcs which lose light; rims by more
-_CELLS, _LEADERS = (10, 12, 3, 3), 3  # of radius, stop, focus and azimuth: rays that need most
 _SMALLEST = 0.05  # stop, of the widest, that pupils are scaled by
 _RIDGE = 1e-6
 
@@ -232,8 +231,6 @@ def random_rays(
     film_z, nm = (rng.uniform(*span, count) for span in (sight.film_z_mm, sight.wavelength_nm))
     azimuth = np.pi / 2 * rng.random(count) * sight.anamorphic
     place: Array = turned(np.stack([radius, 0 * radius]), azimuth).astype(np.float64)
-    x, y = place * [[1.0], [arcs.squeeze]]
-    radius, azimuth = np.hypot(x, y), np.arctan2(y, x)
     radii = np.linspace(0, sight.table.film_radius_mm, sight.table.rows.shape[1])
     low, high, half = (np.interp(radius, radii, a) for a in sight.table.rows)
     pupil = np.stack([low + (high - low) * rng.random(count), half * rng.random(count)])
@@ -251,13 +248,3 @@ def random_rays(
     codes = sight.status(place, turned(pupil, azimuth), nm, film_z, stop)
     given |= {"film_mm": np.stack([radius, 0 * radius]), "pupil_mm": pupil, "twice": np.cos(2 * azimuth)[None]}
     return given, stop, codes
-
-
-def leaders(scaled: Array, need: Array) -> NDArray[np.intp]:
-    """Rays that need most, a few of every small cell."""
-    parts = (scaled[0], scaled[1], (scaled[2] + 1) / 2, (scaled[4] + 1) / 2)
-    places = [np.clip((part * n).astype(int), 0, n - 1) for part, n in zip(parts, _CELLS, strict=True)]
-    cell = np.ravel_multi_index(places, _CELLS)
-    order = np.lexsort((-need, cell))
-    rank = np.arange(order.size) - np.searchsorted(cell[order], cell[order])
-    return order[(rank < _LEADERS) & np.isfinite(need[order])]
