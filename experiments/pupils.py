@@ -337,7 +337,8 @@ at that stop, all over film, focus and wavelength; operations of a ray through a
 
 def shaders(args: argparse.Namespace) -> None:
     """Share of the samples that pass, operations and CPU seconds of shaders of the library's models."""
-    files = lab.chosen(sorted(lab.MODELS.glob("*.ols-64.onnx")), lambda file: file.name, args.only, "pupils")
+    models = [file for kind in ("*.ols-64.onnx", "*-range.states-64.onnx") for file in lab.MODELS.glob(kind)]
+    files = lab.chosen(sorted(models), lambda file: file.name, args.only, "pupils")
     kept = args.out / "osl_passing.json"
     done = lab.kept_rows(kept, "experiments pupils --shaders", lambda row: row["model"], "rows")
     files = [file for file in files if args.only or file.stem not in done]

@@ -222,9 +222,11 @@ def fill(
     """
     g, half, middle = disc.graph, (high - low) * 0.5, (low + high) * 0.5
 
-    def point(x: Value, y: Value) -> tuple[Value, Value, Value]:
+    def point(place: Value, x: Value) -> tuple[Value, Value, Value]:
+        """Of a place in the disc, as tall as the shape is at x."""
         centre, tall = across(x + 1.0, 1.0 - x)
-        return middle + half * x, y * tall if centre is None else centre + y * tall, tall
+        y = place[1] * tall
+        return middle + half * place[0], y if centre is None else centre + y, tall
 
     share = g.constant(1.0)
     if opening is not None:
@@ -232,10 +234,10 @@ def fill(
         start = at_stop(middle, g.constant(0.0) if centre is None else centre)
         way = disc * (1.0 / (g.square(disc).sqrt() + HAIR))
         for _ in range(_ROUNDS):
-            end = at_stop(*point(way[0] * share, way[1])[:2])
+            end = at_stop(*point(way, way[0] * share)[:2])
             share = opening(start, end - start)
         disc = disc * share
-    x, y, here = point(disc[0], disc[1])
+    x, y, here = point(disc, disc[0])
     one = g.constant(1.0)
     nodes = [across(one * (1 + x), one * (1 - x))[1] * w for x, w in _NODES]
     return x, y, half * here * (share * share * math.pi), half * (nodes[0] + nodes[1] + nodes[2]) * math.pi

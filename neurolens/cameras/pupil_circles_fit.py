@@ -26,10 +26,8 @@ Truths = NDArray[np.bool_]
 _RAYS, _CHECKED = 60_000, 600_000
 _STOPS = (0.08, 0.16, 0.25, 0.35, 0.5, 0.7, 0.85, 1.0, 1.0, 1.0)  # of the widest
 _AROUND, _FOLD = 1.1, 0.25  # stops: where rays are drawn; of the pupil's size: beside it are others
-_DEGREE, _MOVING = (
-    (4, 8),
-    (3, 1),
-)  # of film point, of anamorphic lenses and round ones; of terms with the film position and its square
+# Most powers of the film point, of anamorphic lenses and round ones; of terms with the film position and its square.
+_DEGREE, _MOVING = (4, 8), (3, 1)
 _RARE = 0.006  # of rays, that a rim blocks, from which on it has a circle
 _ZONES, _FEW = (8, 3, 3), 2500  # of film radius squared, azimuth and stop; rays that tell of one
 _ALL = int(np.prod(_ZONES))
@@ -41,7 +39,8 @@ _STRIDE = 30.0  # longest change of a margin in a step
 _GOAL = 2e-4  # of rays that pass, in a zone, that a circle may lose
 _RIDGE, _LEAST = 1e-9, 1e-4
 _FLATTEST = 0.02  # of the size of a circle's other numbers: curvature
-_HELD = 3e-4  # of rays that pass in a zone, that a circle or the disc may lose in the end
+_HELD = (4e-4, 4e-4, 3e-4, 2e-4)  # of rays that pass in a zone, that a circle or the disc may lose, in turn until
+_LOST = 1e-3  # of others at most are lost in all
 _INNER = 0.1  # of what the disc grows by, where it is as on the axis
 
 
@@ -59,41 +58,45 @@ class _Rays:
 
 
 def fit_circles(sight: Sight, report: Report) -> tuple[PupilCircles, float] | None:
-    """The circles of a lens, and the share of rays of the worst zone that they lose; None where its stop has no image
-    that polynomials describe."""
+    """The circles of a lens, and the share of rays of the worst zone that they lose; None where too few rays pass."""
     image = stop_image(sight)
     if image is None:
         return None
     seen = replace(sight, graph=image.before(sight.graph, sight.anamorphic))
-    radius = _film_radius(sight)
-    exponents = _exponents(sight.anamorphic)
-    nothing = PupilCircles(radius, image, sight.anamorphic, (1.0, 0.0), exponents[:0, :3], np.zeros((0, 3, 0)))
-    rays, many = _drawn(seen, nothing, 1, _RAYS), _drawn(seen, nothing, 3, _CHECKED)
-    circles = replace(nothing, wide=_disc(nothing, many))
+    exponents, numbers = _exponents(sight.anamorphic), np.zeros((0, 3, 0))
+    circles = PupilCircles(_film_radius(sight), image, sight.anamorphic, (1.0, 0.0), exponents[:0, :3], numbers)
+    few, many = _drawn(seen, circles, 1, _RAYS), _drawn(seen, circles, 3, _CHECKED)
+    circles = replace(circles, wide=_disc(circles, many))
+    circles = _written(circles, exponents, _rims(sight, few, many, circles, exponents, report))
+    for seed, held in enumerate(_HELD):
+        circles = _held(circles, _drawn(seen, circles, 4 + seed, _CHECKED), held)
+        if (lost := _lost(sight, seen, circles)) <= _LOST:
+            break
+    ways = [replace(circles, squeeze=s) for s in (_SQUEEZES if sight.anamorphic and len(circles.numbers) else (1.0,))]
+    return max(ways, key=lambda way: passing(sight, way)[1.0]) if len(ways) > 1 else circles, lost
+
+
+def _rims(
+    sight: Sight, few: _Rays, many: _Rays, circles: PupilCircles, exponents: NDArray[np.int64], report: Report
+) -> Array:
+    """Numbers [K, M + 1] of the circles of rims that block more than a few rays: from rays all over, then from many
+    that lie near them or on their wrong side."""
     stop = st.blocked(sight.stop_surface, st.RIM)
-    codes, counts = np.unique(rays.codes, return_counts=True)
-    rims = [
-        c
-        for c, n in zip(codes, counts, strict=True)
-        if c > st.NO_SOLUTION and c != stop and n > _RARE * rays.codes.size
-    ]
+    codes, counts = np.unique(few.codes[few.codes > st.NO_SOLUTION], return_counts=True)
+    rims = [int(c) for c, n in zip(codes, counts, strict=True) if c != stop and n > _RARE * few.codes.size]
     numbers = np.zeros((len(rims), len(exponents) + 1))
     for k, code in enumerate(rims):
-        report((k + 1) / (2 * len(rims) + 2))
-        numbers[k] = _parted(rays, np.flatnonzero(rays.passed | (rays.codes == code)), circles, exponents, numbers[k])
+        told = np.flatnonzero(few.passed | (few.codes == code))
+        numbers[k] = _parted(few, told, circles, exponents, numbers[k])
     blame = _blame(many, circles, exponents, rims, numbers)
     for k in range(len(rims)):
-        report((k + len(rims) + 1) / (2 * len(rims) + 2))
+        report((k + 1) / (len(rims) + 1))
         told = np.flatnonzero(many.passed | (blame == k))
-        near = [numbers[k] @ _features(many, circles, exponents, part) for part in np.array_split(told, _PARTS)]
-        margin = np.concatenate(near)
+        parts = [numbers[k] @ _features(many, circles, exponents, part) for part in np.array_split(told, _PARTS)]
+        margin = np.concatenate(parts)
         told = told[np.where(many.passed[told], margin, -margin) < _NEAR]
         numbers[k] = _parted(many, told, circles, exponents, numbers[k])
-    circles = _held(_written(circles, exponents, numbers), _drawn(seen, circles, 4, _CHECKED))
-    if sight.anamorphic and len(rims):
-        ways = [replace(circles, squeeze=s) for s in _SQUEEZES]
-        circles = max(ways, key=lambda way: passing(sight, way)[1.0])
-    return circles, _lost(sight, seen, circles)
+    return numbers
 
 
 def _blame(
@@ -105,7 +108,7 @@ def _blame(
         found[rays.codes == code] = k
     size = rays.given["stop_radius_mm"][0]
     others = ~rays.passed & (found < 0) & (np.hypot(*rays.given["point_mm"]) < _WITHIN * size)
-    for part in np.array_split(np.flatnonzero(others), _PARTS):
+    for part in np.array_split(np.flatnonzero(others), _PARTS) if rims else ():
         found[part] = (numbers @ _features(rays, circles, exponents, part)).argmin(0)
     return found
 
@@ -169,28 +172,28 @@ def _disc(circles: PupilCircles, rays: _Rays) -> tuple[float, float]:
     size = rays.given["stop_radius_mm"][0] / circles.image.stop_mm
     beyond = np.hypot(*rays.given["point_mm"]) / circles.image.stop_mm / size - 1
     place = (np.square(rays.given["film_mm"]).sum(0) / circles.image.unit_mm**2 * size) ** 2
-    found = [(float(place[own].mean()), need) for own, need in _need(rays, -beyond)]
+    found = [(float(place[own].mean()), need) for own, need in _need(rays, -beyond, _HELD[0])]
     inner = max(0.0, *(need for at, need in found if at < _INNER))
     return 1 + inner, max(0.0, *((need - inner) / at for at, need in found if at >= _INNER))
 
 
-def _need(rays: _Rays, within: Array) -> list[tuple[Truths, float]]:
+def _need(rays: _Rays, within: Array, held: float) -> list[tuple[Truths, float]]:
     """Rays that pass in each zone, and by how much more rays should lie within, so that few enough of them do not."""
     found = []
     for zone in np.unique(rays.zone):
         own = rays.passed & (rays.zone == zone)
-        given, spare = within[own], int(_HELD * max(own.sum(), _FEW))
+        given, spare = within[own], round(held * max(own.sum(), _FEW))
         if given.size > spare:
             found.append((own, -float(np.partition(given, spare)[spare])))
     return found
 
 
-def _held(circles: PupilCircles, rays: _Rays) -> PupilCircles:
+def _held(circles: PupilCircles, rays: _Rays, held: float) -> PupilCircles:
     """With circles as much wider as random rays need."""
     within, numbers = evaluate(circles.checked, rays.given)["within"][1:], circles.numbers.copy()
     constant = (circles.exponents == 0).all(1)
     for own, margin in zip(numbers, within, strict=True):
-        own[0, constant] += max([0.0, *(need for _, need in _need(rays, margin))])
+        own[0, constant] += max([0.0, *(need for _, need in _need(rays, margin, held))])
     return replace(circles, numbers=numbers)
 
 
