@@ -17,13 +17,15 @@ Array = NDArray[np.float64]
 _ASKED, _TRIED = 20_000, 64
 
 
-def passing(sight: Sight, arcs: PupilArcs | PupilCircles) -> dict[float, float]:
+def passing(
+    sight: Sight, arcs: PupilArcs | PupilCircles, stops: Sequence[float] = (1.0, 0.5, 0.25)
+) -> dict[float, float]:
     """Share of the points of the arcs through which rays pass, all over the film, by shares of the widest stop.
 
     Of film points that have light at that stop: of those whose ray is blocked, where any of `_TRIED` others passes.
     """
     rng, found = np.random.default_rng(3), {}
-    for share in (1.0, 0.5, 0.25):
+    for share in stops:
         angle, radius = 2 * np.pi * rng.random(_ASKED), 0.98 * arcs.film_radius_mm * np.sqrt(rng.random(_ASKED))
         film = radius * np.stack([np.cos(angle), np.sin(angle)])
         call = [rng.uniform(*span, _ASKED) for span in (sight.film_z_mm, sight.wavelength_nm)]

@@ -123,12 +123,12 @@ def fit_arcs(
     Raises:
         InputError: no ray passes.
     """
-    if len(sights) > 1:  # refitted by themselves, nodes hold less of what lies between them
-        return list(_by(_WAYS[0], sights, report, between)[0])
+    if len(sights) > 1:
+        return _of_states(sights, report, between)
     sight, kept, best, lost = sights[0], list[PupilArcs | PupilCircles](), -1.0, 1.0
     if not sight.anamorphic:
         (begun,), half = _begun(_WAYS[0], sights, report)
-        arcs, lost = moved(begun, half, sight, report)
+        (arcs,), lost = moved([begun], half, sights, report)
         if lost <= _LOST and min(passing(sight, arcs).values()) >= _GOAL:
             return [arcs]
         lost = 1.0
@@ -137,7 +137,7 @@ def fit_arcs(
         if sight.anamorphic or (best >= _GOAL and lost <= _LOST):  # arcs of anamorphic lenses are wide
             return kept
     for part, way in enumerate(_WAYS):
-        (arcs,), beyond = _by(way, sights, partial(_within, report, part / len(_WAYS), 1 / len(_WAYS)))
+        arcs, beyond = _by(way, sight, partial(_within, report, part / len(_WAYS), 1 / len(_WAYS)))
         least = min(passing(sight, arcs).values())
         if beyond <= _LOST < lost or (least > best and beyond <= max(lost, _LOST)):
             kept, best, lost = [arcs], least, beyond
@@ -146,15 +146,24 @@ def fit_arcs(
     return kept
 
 
-def _by(
-    way: Way, sights: Sequence[Sight], report: Report, between: Sequence[tuple[Array, Sight]] = ()
-) -> tuple[list[PupilArcs], float]:
+def _of_states(
+    sights: Sequence[Sight], report: Report, between: Sequence[tuple[Array, Sight]]
+) -> list[PupilArcs | PupilCircles]:
+    """Of a lens in several states: refitted by themselves, nodes hold less of what lies between them, moved as much."""
+    begun, half = _begun(_WAYS[0], sights, partial(_within, report, 0.0, 0.2))
+    seen = [*zip(np.eye(len(begun)), sights, strict=True), *between]
+    wide = _widened(begun, seen, partial(_within, report, 0.2, 0.1))
+    if min(passing(*of_one, (1.0,))[1.0] for of_one in zip(sights, wide, strict=True)) >= _GOAL:
+        return list(wide)
+    arcs, lost = moved(begun, half, sights, partial(_within, report, 0.3, 0.7), between)
+    return list(arcs if lost <= _LOST else wide)
+
+
+def _by(way: Way, sight: Sight, report: Report) -> tuple[PupilArcs, float]:
     """Arcs with numbers, and `_lost`."""
-    nodes = _begun(way, sights, partial(_within, report, 0.0, 0.6))[0]
-    seen = [*zip(np.eye(len(nodes)), sights, strict=True), *between]
-    inside = partial(_within, report, 0.6, 0.4)
-    nodes = _widened(nodes, seen, inside)
-    return nodes, max(_lost(*of_one) for of_one in zip(sights, nodes, strict=True))
+    nodes, _ = _begun(way, [sight], partial(_within, report, 0.0, 0.6))
+    (arcs,) = _widened(nodes, [(np.ones(1), sight)], partial(_within, report, 0.6, 0.4))
+    return arcs, _lost(sight, arcs)
 
 
 def _begun(way: Way, sights: Sequence[Sight], report: Report) -> tuple[list[PupilArcs], float]:

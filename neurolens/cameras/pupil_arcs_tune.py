@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +36,7 @@ _HEAVY, _HEAVIER, _LIGHTEST, _HEAVIEST = 10.0, 1.6, 2.0, 3e4  # weight of rays t
 _DEEP = 0.08  # half widths of the pupil: blocked rays deeper inside are given up
 _FLOOR, _CALM, _CALM_SHARE = 0.05, 0.002, 0.05  # of curvature: near an arc, far from it; share of those rays that count
 _HALVINGS, _MORE = 6, 2e-3  # of a step by which arcs would lose so many more rays of a zone
-_LOST = 7e-4  # of random rays that check, where a margin is enough
+_LOST, _LOST_OF_MANY = 7e-4, 1e-3  # of random rays that check, where a margin is enough: of one state, of many
 _CHECK_SEED, _DRAWS, _TELLING = 20, 3, 2500  # fewer rays of a zone do not tell
 _MARGINS, _RIMS = (0.0, 0.001, 0.002, 0.003, 0.005, 0.008), 4.0  # that widen arcs which lose light; rims by more
 _SMALLEST = 0.05  # stop, of the widest, that pupils are scaled by
@@ -86,25 +87,48 @@ class _Rays:
         return np.minimum((height - self.y**2) / scale, ends / self.unit), [by_low, by_high, reach, reach * away], scale
 
 
-def moved(arcs: PupilArcs, half_mm: float, sight: Sight, report: Report) -> tuple[PupilArcs, float]:
-    """The arcs of a lens in one state, moved, and the share of the rays of the worst zone that they lose.
+def moved(
+    nodes: Sequence[PupilArcs], half_mm: float, sights: Sequence[Sight], report: Report,
+    between: Sequence[tuple[Array, Sight]] = (),
+) -> tuple[list[PupilArcs], float]:  # fmt: skip
+    """The arcs of a lens in each of its states, moved, and the share of the rays of the worst zone that they lose.
 
     Args:
-        half_mm: half the width of the pupil.
+        half_mm: half the width of the pupil. between: weights of these states and the lens there, see `fit_arcs`.
     """
-    arcs = _tuned(arcs, sight, report)
-    rays, stop, codes = random_rays(sight, arcs, np.random.default_rng(_CHECK_SEED), draws=_DRAWS)
-    passed = codes == st.PASSED
-    rays, stop = {name: row[:, passed] for name, row in rays.items()}, stop[passed]
-    zone = zones_of(arcs, rays, scaled_of(arcs, rays, stop), np.ones(stop.size, bool))
+    parts = [partial(_within, report, k / len(nodes), 1 / len(nodes)) for k in range(len(nodes))]
+    alone = len(nodes) == 1
+    nodes = [_tuned(*of_one, alone) for of_one in zip(nodes, sights, parts, strict=True)]
+    seen = [*zip(np.eye(len(nodes)), sights, strict=True), *between]
+    checks = [_checks(nodes[0].mixed(nodes[1:], weights), sight) for weights, sight in seen]
     for margin in _MARGINS:
-        wider = _wider(arcs, rays, margin, half_mm)
-        found = evaluate(wider.checked, rays)
-        inside = (found["left"] >= 0) & (found["right"] >= 0) & (found["height"] >= rays["pupil_mm"][1] ** 2)
-        counts, missed = (np.bincount(zone, own, _ALL) for own in (None, ~inside.all(0)))
-        if (lost := float((missed / np.maximum(counts, _TELLING)).max())) <= _LOST:
+        wider = [_wider(a, rays, margin, half_mm) for a, (rays, _) in zip(nodes, checks, strict=False)]
+        lost = max(
+            _lost(wider[0].mixed(wider[1:], weights), *check) for (weights, _), check in zip(seen, checks, strict=True)
+        )
+        if lost <= (_LOST if len(seen) == 1 else _LOST_OF_MANY):
             break
     return wider, lost
+
+
+def _within(report: Report, begun: float, part: float, share: float) -> None:
+    report(begun + part * share)
+
+
+def _checks(arcs: PupilArcs, sight: Sight) -> tuple[dict[str, Array], NDArray[np.intp]]:
+    """Random rays that pass, and their zones."""
+    rays, stop, codes = random_rays(sight, arcs, np.random.default_rng(_CHECK_SEED), _DRAWS * _RAYS)
+    passed = codes == st.PASSED
+    rays, stop = {name: row[:, passed] for name, row in rays.items()}, stop[passed]
+    return rays, zones_of(arcs, rays, scaled_of(arcs, rays, stop), np.ones(stop.size, bool))
+
+
+def _lost(arcs: PupilArcs, rays: dict[str, Array], zone: NDArray[np.intp]) -> float:
+    """Share of rays of the worst zone that lie beyond arcs."""
+    found = evaluate(arcs.checked, rays)
+    inside = (found["left"] >= 0) & (found["right"] >= 0) & (found["height"] >= rays["pupil_mm"][1] ** 2)
+    counts, missed = (np.bincount(zone, own, _ALL) for own in (None, ~inside.all(0)))
+    return float((missed / np.maximum(counts, _TELLING)).max())
 
 
 def _wider(arcs: PupilArcs, rays: dict[str, Array], margin: float, half_mm: float) -> PupilArcs:
@@ -119,7 +143,7 @@ def _wider(arcs: PupilArcs, rays: dict[str, Array], margin: float, half_mm: floa
     return replace(arcs, numbers=numbers)
 
 
-def _tuned(arcs: PupilArcs, sight: Sight, report: Report) -> PupilArcs:
+def _tuned(arcs: PupilArcs, sight: Sight, report: Report, alone: bool) -> PupilArcs:
     """The arcs, moved; only the terms that they have."""
     numbers, weight = arcs.numbers.copy(), np.full(_ALL, _HEAVY)
     used = arcs.numbers != 0
@@ -138,7 +162,7 @@ def _tuned(arcs: PupilArcs, sight: Sight, report: Report) -> PupilArcs:
                 for arc, side in enumerate(arcs.sides):
                     beside = rays.passed | (blame == arc)
                     numbers[arc] = _stepped(numbers[arc], side, used[arc], rays, beside, weight, _WIDTHS[draw])
-        if draw == 0 and min(passing(sight, replace(arcs, numbers=numbers)).values()) < _HOPELESS:
+        if alone and draw == 0 and min(passing(sight, replace(arcs, numbers=numbers)).values()) < _HOPELESS:
             break
     return replace(arcs, numbers=numbers)
 
@@ -187,7 +211,7 @@ def _stepped(
 
 def _drawn(sight: Sight, arcs: PupilArcs, seed: int) -> _Rays:
     rng = np.random.default_rng(100 + seed)
-    given, stop, codes = random_rays(sight, arcs, rng, near=True)
+    given, stop, codes = random_rays(sight, arcs, rng, _RAYS, near=True)
     scaled = scaled_of(arcs, given, stop)
     monomials = np.ones((len(arcs.exponents), stop.size))
     for row, powers in zip(monomials, arcs.exponents, strict=True):
@@ -219,13 +243,13 @@ def zones_of(arcs: PupilArcs, rays: dict[str, Array], scaled: Array, passed: Tru
 
 
 def random_rays(
-    sight: Sight, arcs: PupilArcs, rng: np.random.Generator, near: bool = False, draws: int = 1
+    sight: Sight, arcs: PupilArcs, rng: np.random.Generator, count: int, near: bool = False
 ) -> tuple[dict[str, Array], Array, NDArray[np.int32]]:
     """Random rays from film points on +x, as inputs of `PupilArcs.checked`, stops, and what becomes of them.
 
     Narrow stops are seldom met by rays all over the table: most go to the middle of the arcs, or `near` to their edge.
     """
-    count = _RAYS * draws * (1 + sight.anamorphic)
+    count *= 1 + sight.anamorphic
     radius = arcs.film_radius_mm * rng.random(count) * 0.9999
     stop = sight.stop_radius_mm * rng.choice(np.append(np.linspace(0.08, 1, 12), [1.0] * 4), count)
     film_z, nm = (rng.uniform(*span, count) for span in (sight.film_z_mm, sight.wavelength_nm))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from camera_helpers import FILM, GAUSS, ROOT
 
-from neurolens.cameras import osl, pupil_arcs_fit, pupil_circles_fit
+from neurolens.cameras import osl, pupil_arcs_fit, pupil_arcs_tune, pupil_circles_fit
 from neurolens.cameras.arcs_passing import passing
 from neurolens.cameras.blades import Blades
 from neurolens.cameras.model import OnnxCamera
@@ -56,6 +56,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pupil_arcs_fit, "_WAYS", (coarse_way,))
     monkeypatch.setattr(osl, "_ACROSS", 8)
     monkeypatch.setattr(pupil_arcs_fit, "_RAYS", 6000)
+    monkeypatch.setattr(pupil_arcs_tune, "_RAYS", 6000)
     monkeypatch.setattr(osl, "states_between", lambda axes: [])
 
 
