@@ -84,7 +84,7 @@ def shader_of(
             notes.append(f"Nearest focus from {near:.3g} to {least:.3g} m over the zoom, {low:.4g} to {high:.4g} mm")
     text, operations = write_camera(lens, own, lines_of([*comment, *(f"{n}." for n in notes)]))
     if operations > MAX_STEPS:
-        raise InputError("export", "operations", operations, f"up to {MAX_STEPS}: a model of the lens is smaller")
+        raise InputError(file, "operations", operations, f"up to {MAX_STEPS}: a model of the lens is smaller")
     return Shader(
         own, text, operations, tuple(p.name for p in parameters(lens)), passed, lens.film_radius_mm, lens.f_number,
         near or None, tuple(notes),

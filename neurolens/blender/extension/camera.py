@@ -35,7 +35,7 @@ def camera_of(context: Any) -> Any:
     if found is None:
         raise LensError("The scene has no camera: add one (Add > Camera), and make it the scene's")
     if found.type != "CAMERA":
-        raise LensError(f"The scene's camera {found.name!r} is a {found.type.lower()}, not a camera")
+        raise LensError(f"The scene's camera {found.name!r} is not a camera, but of type {found.type}")
     if found.data.library is not None:
         raise LensError(f"The camera {found.name!r} is linked from another file: make it local first")
     return found
