@@ -12,7 +12,7 @@ from typing import Any
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import check_writable
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import Parser, add_json, check_folder, check_suffix, whole
+from neurolens.commands.arguments import Parser, add_bare, add_json, bare_of, check_folder, check_suffix, whole
 from neurolens.commands.output import answer
 
 _DESCRIPTION = """\
@@ -57,6 +57,7 @@ def add_parser(subparsers: Any) -> None:
     add = actions.add_parser("add", help="put a lens into the extension", description=_ADD)
     add.add_argument("file", metavar="FILE", type=Path, help="model (.onnx) or lens file (.toml)")
     add.add_argument("--to", metavar="ZIP|DIR", type=Path, help="a packed extension, or a user folder of one")
+    add_bare(add)
     add.add_argument("--zoom", metavar="STATE", help="state of a zoom, by name or focal length in mm; range: a setting")
     add_json(add, quiet=True)
     add.set_defaults(run=run_add, kept="nothing was added")
@@ -106,7 +107,7 @@ def run_build(args: argparse.Namespace) -> int:
 
 def run_add(args: argparse.Namespace) -> int:
     """Add a lens."""
-    from neurolens.blender.pack import add_to_folder, add_to_zip, user_folders
+    from neurolens.blender.pack import add_to_folder, add_to_zip, check_takes, user_folders
     from neurolens.commands.blender_lenses import form_of, packed_of
 
     to = args.to
@@ -117,7 +118,8 @@ def run_add(args: argparse.Namespace) -> int:
         raise InputError("neurolens blender add", "--to", "(missing)", expected)
     if not args.file.is_file():
         raise InputError(args.file, "file", "(missing)", "a model (.onnx) or a lens file (.toml)")
-    form = form_of(args.file, zoom=args.zoom, quiet=args.quiet)
+    check_takes(to)
+    form = form_of(args.file, zoom=args.zoom, as_bare=bare_of(args, args.file), quiet=args.quiet)
     lens = packed_of([args.file], [form], zoom=args.zoom)
     (add_to_zip if to.suffix == ".zip" else add_to_folder)(to, lens)
     data = {"lens": lens.lens_id, "to": str(to), "forms": [f.model or f.kind for f in lens.forms]}

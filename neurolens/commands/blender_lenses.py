@@ -54,7 +54,8 @@ def _made_form(file: Path, zoom: str | None, as_bare: str, quiet: bool) -> Form:
         kind = "network" if _family(card).startswith(_NETWORK) else "polynomial"
         poor = list(card["errors"].get("poor") or ())
     state = None if zoom == RANGE else zoom
-    notes = [*shader.notes, *([] if state is None else [f"The zoom stands at {state}"])]
+    notes = [*shader.notes, *filter(None, [as_bare.removesuffix(".")])]
+    notes += [] if state is None else [f"The zoom stands at {state}"]
     if (squeeze := _squeeze(file, state)) != 1.0:
         axis, aspect = ("Y", squeeze) if squeeze > 1 else ("X", 1 / squeeze)
         side = "across" if squeeze > 1 else "in height"

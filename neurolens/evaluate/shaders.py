@@ -150,7 +150,7 @@ def exact_lens(file: Path, zoom: str | None, report: Report, as_bare: str = "") 
     if ranged and internal:  # before minutes of work
         raise InputError(lens.path, "zoom", RANGE, "one focal length of the zoom: its groups move to focus, too")
     if not as_bare:
-        check_bare(lens.at(zoom=state), "a model of the lens has them")
+        check_bare(lens.at(zoom=state), "a model of the lens has them; --bare leaves them out")
     told = [f"{lens.name}: every surface traced (bare), {lens.source} (sha256 {str(lens.sha256)[:16]})."]
     told += [as_bare] * bool(as_bare)
     if not (ranged or internal):

@@ -93,6 +93,34 @@ def test_lenses_that_cannot_be_shaders_are_left_out_and_said(place: Path, capsys
     assert json.loads(told)["lenses"] == {"absorbs": ["ols-36"]} and ABSORBS in said
 
 
+def test_a_lens_of_glass_that_absorbs_goes_in_bare_and_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The text is a stand-in; whether the lens is refused is asked of the real code."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr("neurolens.cameras.osl.osl_lens", lambda *given: pytest.fail("no shader is to be made"))
+    refused = failed(capsys, "add", "lenses/edmund_asphere_30.toml", "--to", tmp_path / "user")
+    assert "glass that absorbs" in refused and "--bare leaves them out" in refused
+    asked = []
+
+    def written(file: Path, *, zoom: str | None = None, as_bare: str = "", quiet: bool = False) -> Shader:
+        asked.append(as_bare)
+        return Shader("camera", "text", 1, (), {}, 6.0, 1.8, 0.7)
+
+    for slow in ("thumbnail", "field_table"):
+        monkeypatch.setattr(blender_lenses, slow, lambda *given: None)
+    monkeypatch.setattr(blender_lenses, "shader_of", written)
+    for lens in ("edmund_asphere_30", LENS):
+        given = ["add", f"lenses/{lens}.toml", "--bare", "--to", str(tmp_path / "user"), "--quiet"]
+        assert main(["blender", *given]) == 0
+    absorbs, bare = json.loads((tmp_path / "user" / "lenses.json").read_text())["lenses"]
+    told = "In this form: coatings and absorption left out"
+    assert absorbs["variants"][0]["notes"] == [told] and bare["variants"][0]["notes"] == []
+    assert asked == [f"{told}.", ""]
+    capsys.readouterr()
+    assert "expected a lens file" in failed(capsys, "add", f"models/{LENS}.ols-36.onnx", "--bare", "--to", tmp_path)
+
+
 def test_bad_input_is_one_line(
     place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -105,6 +133,11 @@ def test_bad_input_is_one_line(
     assert "no Blender of this machine" in failed(capsys, "add", models / f"{LENS}.ols-36.onnx")
     assert "(missing)" in failed(capsys, "add", place / "no.onnx", "--to", place / "user")
     (place / "a.txt").write_text("x")
+    (place / "a.zip").write_text("no zip")
+    with monkeypatch.context() as early:
+        early.setattr(blender_lenses, "form_of", lambda *given, **options: pytest.fail("no shader is to be made"))
+        for to, expected in (("a.zip", "a zip that `neurolens blender build` wrote"), ("a.txt", "or a folder")):
+            assert expected in failed(capsys, "add", models / f"{LENS}.ols-36.onnx", "--to", place / to)
     assert "a model (.onnx) or a lens file" in failed(capsys, "add", place / "a.txt", "--to", place / "user")
     assert not out.exists() and not (place / "user").exists()
 
