@@ -73,7 +73,8 @@ def shader_of(
         *told,
         f"Film radius {lens.film_radius_mm:.4g} mm, f/{lens.f_number:.3g}, focus {focus}; rays that pass: "
         + ", ".join(f"f/{n} {share:.1%}" for n, share in passed.items()) + ".",
-        "Sensor size and shift are Blender's. Focus: focus_m, or where that is 0 the distance of depth of field.",
+        "Sensor size and shift are Blender's; shift X counts widths of the picture, shift Y heights.",
+        "Focus: focus_m, or where that is 0 the distance of depth of field.",
     ]  # fmt: skip
     notes = []
     for axis in lens.axes:

@@ -193,6 +193,21 @@ def test_exact_shader_shows_what_the_model_does(studio: Studio) -> None:
         assert np.hypot(*(seen[0] - wanted[0])) < 0.1
 
 
+def test_shift_counts_widths_and_heights_where_blenders_own_camera_counts_the_longer_side(studio: Studio) -> None:
+    """What the panel says of it; the picture of a point on the axis moves so."""
+    shot = {**named("grid", "rectilinear")[4], "width": 160, "height": 90, "point_m": [0, 0, -2.0], "radius_m": 0.02}
+    del shot["crop"]
+    data, found = studio.camera.data, []
+    try:
+        for data.shift_x, data.shift_y in ((0.0, 0.0), (0.1, 0.0), (0.0, 0.1)):
+            found.append(measures(studio.picture(shot, 64), (0, 0))["centroid_px"][0])
+        assert np.array(found) == pytest.approx(np.array([[80, 45], [64, 45], [80, 36]]), abs=0.1)
+        data.type = "PERSP"  # 0.1 of 160 pixels
+        assert measures(studio.picture(shot, 64), (0, 0))["centroid_px"][0] == pytest.approx([80, 29], abs=0.1)
+    finally:
+        data.type, data.shift_x, data.shift_y = "CUSTOM", 0.0, 0.0
+
+
 def test_map_uv_reads_st_maps_as_they_are_written(studio: Studio) -> None:
     """A picture of its own pixels' places, led through both maps, holds what the maps say."""
     for kind, other in (("undistort", "redistort"), ("redistort", "undistort")):
