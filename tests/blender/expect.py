@@ -1,7 +1,7 @@
 """What Blender must show, by neurolens's exact lenses: python tests/blender/expect.py FOLDER.
 
-Blender's Python cannot run neurolens. This writes shots.json, numbers for test_optics.py, the shaders named there and ST
-maps.
+Blender's Python cannot run neurolens. This writes shots.json, numbers for test_optics.py, the shaders named there, and
+maps of `neurolens stmap`.
 """
 
 from __future__ import annotations
