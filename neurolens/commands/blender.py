@@ -71,11 +71,12 @@ def run_build(args: argparse.Namespace) -> int:
     if not args.models.is_dir():
         raise InputError("neurolens blender build", "--models", str(args.models), "a folder of models that exists")
     from neurolens.blender.pack import write_pack
-    from neurolens.commands.blender_lenses import forms_of, library, packed_of
+    from neurolens.commands.blender_lenses import forms_of, library, packed_of, stated_lens
     from neurolens.optics.lensfile import read_lens
 
     began, packed = time.perf_counter(), []
-    places = list(library(args.models, args.models.parent / "lenses", args.lens))
+    lens_folder = args.models.parent / "lenses"
+    places = list(library(args.models, lens_folder, args.lens))
     if not places:
         raise InputError("neurolens blender build", "--models", str(args.models), "a folder with models (.onnx)")
     exact = [] if args.no_exact else [lens_file for _, lens_file in places if lens_file is not None]
@@ -87,7 +88,7 @@ def run_build(args: argparse.Namespace) -> int:
         for models, lens_file in places:
             own = [f for f in (*models, lens_file) if f is not None and f in forms]
             if own:
-                lens = None if lens_file is None else read_lens(lens_file)
+                lens = stated_lens(own[0], lens_folder) if lens_file is None else read_lens(lens_file)
                 packed.append(packed_of(own, [forms[f] for f in own], lens=lens))
             report(len(packed) / len(places))
     for why in left.values():

@@ -22,6 +22,7 @@ from neurolens.commands import blender_lenses  # noqa: E402
 from neurolens.commands.blender_lenses import thumbnail  # noqa: E402
 from neurolens.evaluate.shaders import Shader  # noqa: E402
 from neurolens.optics.lensfile import read_lens  # noqa: E402
+from neurolens.optics.paraxial import first_order  # noqa: E402
 from neurolens.render.film import FORKS  # noqa: E402
 
 LENS = "laikin_double_gauss_50"
@@ -144,7 +145,8 @@ def test_bad_input_is_one_line(
 
 def test_a_second_build_makes_no_shader_again(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given = ["blender", "build", "--models", str(place / "models"), "--jobs", "1", "--quiet", "-o"]
-    stand_in, asked = blender_lenses.shader_of, []
+    stand_in, field_table, asked, fields = blender_lenses.shader_of, blender_lenses.field_table, [], []
+    monkeypatch.setattr(blender_lenses, "field_table", lambda *given: fields.append(1) or field_table(*given))
 
     def counted(file: Path, **options: Any) -> Shader:
         asked.append(file.suffix)
@@ -158,7 +160,7 @@ def test_a_second_build_makes_no_shader_again(place: Path, monkeypatch: pytest.M
     stops = False
     for name in ("a.zip", "b.zip"):
         assert main([*given, str(place / name)]) == 0
-    assert asked == [".toml", ".toml", ".onnx", ".onnx"]
+    assert asked == [".toml", ".toml", ".onnx", ".onnx"] and len(fields) == 1
     assert (place / "a.zip").read_bytes() == (place / "b.zip").read_bytes()
     with (place / "lenses" / f"{LENS}.toml").open("a", encoding="utf-8") as lens_file:
         lens_file.write("# another file\n")
@@ -210,6 +212,20 @@ def test_a_squeezed_picture_is_said_of_its_lens(place: Path) -> None:
         [note] = blender_lenses.form_of(Path(file)).notes
         assert "squeezed 1.98 times across" in note and "Aspect Y of 1.98" in note
     assert blender_lenses.form_of(place / "models" / f"{LENS}.ols-36.onnx").notes == []
+
+
+def test_models_of_one_state_have_the_section_of_that_state_and_ranges_their_name() -> None:
+    for model, efl in (
+        ("ogawa_zoom_70_200-135mm.ols-60", 134.95),
+        ("muller_fisheye_100-14mm.ols-40", 14.0),
+        ("nikon_zoom_70_200-range.states-64", 71.5),
+    ):
+        file = Path(f"models/{model}.onnx")
+        lens = blender_lenses.stated_lens(file, Path("lenses"))
+        assert lens is not None and first_order(lens).efl_mm == pytest.approx(efl, rel=1e-3)
+        packed = blender_lenses.packed_of([file], [])
+        assert packed.name.endswith(", any zoom") == ("range" in model)
+    assert blender_lenses.stated_lens(file, Path("models")) is None
 
 
 def test_thumbnails_show_the_lens() -> None:
