@@ -68,12 +68,24 @@ shader thin_lens(float focal_mm = 50.0, float f_number = 1.8,
 }
 """
 
+
+def _named(text: str) -> tuple[str, Path]:
+    name, equals, file = text.partition("=")
+    if not (name and equals and Path(file).is_file()):
+        raise argparse.ArgumentTypeError(f"{text}: expected NAME=FILE.osl, a file that is there")
+    return name, Path(file)
+
+
 BLENDER = lab.option(
     "--blender-python", metavar="PATH", type=Path, default=PYTHON,
     help=f"a Python that has bpy (default: {PYTHON.relative_to(lab.ROOT)}, by make test-blender)",
 )  # fmt: skip
 OPTIONS = [
     BLENDER,
+    lab.option(
+        "--other", metavar="NAME=FILE.osl", type=_named, action="append", default=[],
+        help="a camera of others, a shader as it is, under the white sky, too (repeatable)",
+    ),
     lab.count("rounds", 15, "of the white sky (default: 15)"),
     lab.count("scene-rounds", 5, "of the other scenes (default: 5)"),
     lab.out(),
@@ -116,14 +128,15 @@ def run(args: argparse.Namespace) -> int:
     """Write the shaders, race them, write the tables; 1 where a goal is missed."""
     python = checked_python(args.blender_python, "osl")
     lab.quiet_glasses()
+    others = {name: file.read_text(encoding="utf-8") for name, file in args.other}
     stages = {
-        "sky": Stage((128, 96), 32, args.rounds, (BUILT_IN, DEPTH, THIN, *SHADERS), THIN),
+        "sky": Stage((128, 96), 32, args.rounds, (BUILT_IN, DEPTH, THIN, *SHADERS, *others), THIN),
         "open": Stage((192, 128), 64, args.scene_rounds, (BUILT_IN, DEPTH, THIN, POLYNOMIAL, NETWORK), DEPTH),
         "room": Stage((96, 64), 64, args.scene_rounds, (BUILT_IN, DEPTH, THIN, POLYNOMIAL, NETWORK), DEPTH),
     }
     texts, operations = _shaders(args.quiet)
     with Progress({"race in Blender": 120.0}, quiet=args.quiet).stage("race in Blender") as report:
-        told = race(python, texts, stages, report)
+        told = race(python, texts | others, stages, report)
     rows = [row for name, stage in stages.items() for row in rows_of(name, stage, told["scenes"][name], operations)]
     met = goals(rows)
     data = {"machine": lab.machine(), "blender": told["blender"], "rows": [asdict(r) for r in rows]}

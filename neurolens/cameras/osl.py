@@ -189,7 +189,7 @@ def parameters(lens: OslLens) -> list[Parameter]:
 
 def write_camera(lens: OslLens, name: str, comment: list[str]) -> tuple[str, int]:
     """The text of a camera's shader, and the operations of one ray through a round stop: compilers know the blades."""
-    program = osl_program(lens).with_shared_inverses().with_shorter_sums().in_order_of_urgency()
+    program = osl_program(lens).with_shared_inverses().with_shorter_sums().in_order_of_need()
     text = write_osl(program, name, comment, parameters(lens), _FRAME, OUTPUTS)
     return text, sum(osl_program(lens, {"count": 0.0}).count().values())
 

@@ -292,19 +292,6 @@ class Program:
                     order[stack.pop()] = None
         return self._rewritten(order=order)
 
-    def in_order_of_urgency(self) -> Program:
-        """The same program, steps first from which the longest chain leads to a result: so, few wait for one another.
-
-        For compilers that keep the order they are given, and make no vectors: those have other rays to go on with.
-        """
-        live = self.live()
-        ahead = dict.fromkeys(live, 0)
-        for k in reversed(live):
-            for a in self.steps[k].arguments:
-                if isinstance(a, int):
-                    ahead[a] = max(ahead[a], ahead[k] + 1)
-        return self._rewritten(order=sorted(live, key=lambda k: -ahead[k]))
-
     def with_shorter_sums(self, parts: int = 3, least: int = 8) -> Program:
         """The same program but for rounding: sums of at least so many products in parts, for one that is added up in
         turn keeps a core waiting after every product."""
