@@ -18,6 +18,7 @@ from neurolens.cameras.onnxlens import load_model
 from neurolens.cameras.pupil_arcs import PupilArcs, unit_disc
 from neurolens.cameras.pupil_sight import Sight
 from neurolens.cli import main
+from neurolens.evaluate import shaders
 from neurolens.evaluate.shaders import _smallest, exact_lens
 from neurolens.graph import lowtests
 from neurolens.graph.interpret import evaluate
@@ -486,3 +487,8 @@ def test_command_line_writes_a_shader_and_refuses_what_is_its_input(tmp_path, mo
         other = tmp_path / "other.osl"
         assert main(["export", str(MODEL), "--to", "osl", "-o", str(other), *wrong]) == 2
         assert "neurolens" in capsys.readouterr().err and not other.exists()
+    monkeypatch.setattr(shaders, "MAX_STEPS", 100)
+    assert main(["export", str(MODEL), "--to", "osl", "-o", str(tmp_path / "long.osl")]) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert MODEL.name in said and "up to 100: a model of the lens is smaller" in said
+    assert not (tmp_path / "long.osl").exists()
