@@ -66,7 +66,7 @@ test-web: $(INSTALLED)
 
 docs: $(INSTALLED) $(VENV)/.docs
 	OMP_NUM_THREADS=1 NEUROLENS_DOCS=1 $(BIN)/python -m pytest -q -n 2 tests/test_docs.py
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict -f docs/mkdocs.yml
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -f docs/mkdocs.yml
 	@echo "Look at build/docs/index.html"
 
 bench: $(INSTALLED)
