@@ -36,6 +36,8 @@ export PIP_DEFAULT_TIMEOUT ?= 120
 # Small batches lose speed to threads beyond the free cores.
 export OMP_NUM_THREADS ?= 2
 export MPLBACKEND ?= Agg
+# Tests start Python hundreds of times: it compiles once, whatever the machine's habit.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo test test-blender test-web docs bench models gallery lint format clean
 .DELETE_ON_ERROR:
