@@ -31,7 +31,8 @@ def passing(sight: Sight, arcs: PupilArcs) -> dict[float, float]:
         lit, tried = np.zeros((blocked := np.flatnonzero(~passed)).size, bool), 0
         while tried < _TRIED and not lit.all():
             # As many again of each at once, for few rays cost nearly as much as many.
-            tries = min(max(1, min(tried, _ASKED // np.count_nonzero(~lit))), _TRIED - tried)
+            most = max(1, min(tried, _ASKED // int(np.count_nonzero(~lit))))
+            tries = min(most, _TRIED - tried)
             dark, tried = np.repeat(blocked[~lit], tries), tried + tries
             found_light = _sampled(sight, arcs, rng.random((2, dark.size)), film[:, dark], [row[dark] for row in call])
             lit[~lit] = found_light.reshape(-1, tries).any(1)

@@ -92,7 +92,7 @@ def vector_gram(
 
 
 def _products(features: Tensor, weights: Tensor) -> Tensor:
-    """[M, M] sums over rays of features [M, N] times each other, weighted by [N]: symmetric, a third of it not summed."""
+    """[M, M] sums over rays of features [M, N] times each other, weighted by [N]: symmetric, a third is not summed."""
     found = features.new_empty((len(features), len(features)))
     size = -(-len(features) // 3)
     for start in range(0, len(features), max(size, 1)):

@@ -127,8 +127,8 @@ class Sweep:
 
     def _sweep(self, k: int, sign: float) -> None:
         t = self._table
-        pivot, row = t[k, k], t[k].copy()
-        torch.from_numpy(t).addr_(torch.from_numpy(t[:, k].copy()), torch.from_numpy(row), alpha=-1.0 / pivot)  # in place
+        pivot, row, column = t[k, k], t[k].copy(), t[:, k].copy()
+        torch.from_numpy(t).addr_(torch.from_numpy(column), torch.from_numpy(row), alpha=-1.0 / pivot)  # in place
         t[k] = row / pivot * sign
         t[:, k] = t[k]
         t[k, k] = -1.0 / pivot
