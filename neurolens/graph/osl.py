@@ -7,6 +7,7 @@ text of the caller; everything between these numbers and the outputs is the prog
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ from neurolens.graph.c import Writer, literal, steps_of
 from neurolens.graph.program import Mixture, Program, Step
 
 _LOOKUP = "{table}[{width} * clamp(int({index}), 0, {cells} - 1) + {place}]"
+_TEMPORARY = re.compile(r"\bt(\d+)\b")
 _SUFFIX = re.compile(r"(\d\.?(?:e[+-]\d+)?)f\b")
 _KINDS = {"position": "point", "throughput": "color"}
 
@@ -75,7 +77,7 @@ def write_osl(
     for table, numbers in program.own_tables.items():
         values = ", ".join(_plain(literal(v)) for v in numbers.reshape(-1))
         tables += f"    float {name}_{table}[{numbers.size}] = {{{values}}};\n"
-    body = _plain("\n".join(steps_of(writer)))
+    body = _plain("\n".join(urgent(steps_of(writer))))
     results = ""
     for o in outputs:
         rows = (_plain(writer.value(program.outputs[f"{o}_{k}"].argument)) for k in range(3))
@@ -83,6 +85,17 @@ def write_osl(
     parts = ",\n    ".join(head)
     mixed = "" if program.mixture is None else _mixed(program.mixture, writer)
     return f"/*\n{lines}\n */\nshader {name}(\n    {parts})\n{{\n{tables}{frame}{mixed}{body}\n{results}}}\n"
+
+
+def urgent(lines: Sequence[str]) -> list[str]:
+    """Lines `float tN = ...;`, first those from which the longest chain of others leads on, so that few wait for one
+    another: compilers of shaders, which make no vectors of them, keep much of the order they are given."""
+    numbers = [[int(n) for n in _TEMPORARY.findall(line)] for line in lines]
+    ahead: defaultdict[int, int] = defaultdict(int)
+    for own, *given in reversed(numbers):
+        for n in given:
+            ahead[n] = max(ahead[n], ahead[own] + 1)
+    return [lines[k] for k in sorted(range(len(lines)), key=lambda k: -ahead[numbers[k][0]])]
 
 
 def _mixed(mixture: Mixture, writer: Writer) -> str:
