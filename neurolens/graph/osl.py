@@ -19,6 +19,7 @@ from neurolens.graph.program import Mixture, Program, Step
 _LOOKUP = "{table}[{width} * clamp(int({index}), 0, {cells} - 1) + {place}]"
 _TEMPORARY = re.compile(r"\bt(\d+)\b")
 _SUFFIX = re.compile(r"(\d\.?(?:e[+-]\d+)?)f\b")
+_STATEMENTS, _TOGETHER = 9000, 64  # the compiler of OSL takes 10,000; numbers that a statement of more declares
 _KINDS = {"position": "point", "throughput": "color"}
 
 
@@ -77,7 +78,8 @@ def write_osl(
     for table, numbers in program.own_tables.items():
         values = ", ".join(_plain(literal(v)) for v in numbers.reshape(-1))
         tables += f"    float {name}_{table}[{numbers.size}] = {{{values}}};\n"
-    body = _plain("\n".join(urgent(steps_of(writer))))
+    steps = urgent(steps_of(writer))
+    body = _plain("\n".join(steps if len(steps) < _STATEMENTS else _together(steps)))
     results = ""
     for o in outputs:
         rows = (_plain(writer.value(program.outputs[f"{o}_{k}"].argument)) for k in range(3))
@@ -120,6 +122,13 @@ class _Writer(Writer):
             low, high, then, otherwise = (self.value(a) for a in step.arguments)
             return f"select({otherwise}, {then}, {low} <= {high})"
         return super().step(step)
+
+
+def _together(lines: Sequence[str]) -> list[str]:
+    """The same declarations of floats in fewer statements."""
+    names = [line.strip().removeprefix("float ").removesuffix(";") for line in lines]
+    parts = (names[k : k + _TOGETHER] for k in range(0, len(names), _TOGETHER))
+    return ["    float " + ",\n      ".join(part) + ";" for part in parts]
 
 
 def _plain(text: str) -> str:

@@ -23,6 +23,7 @@ from neurolens.evaluate.shaders import _smallest, exact_lens
 from neurolens.graph import lowtests
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
+from neurolens.graph.osl import write_osl
 from neurolens.graph.passes import pruned
 from neurolens.graph.scalars import lower
 from neurolens.optics.apertures import Aperture
@@ -473,6 +474,18 @@ def test_the_text_is_osl() -> None:
     known = {*declared, *re.findall(r"\b(\w+) = ", code)}
     used = set(re.findall(r"\bt\d+\b", code))
     assert used <= known
+
+
+def test_a_long_program_has_fewer_statements_than_the_compiler_takes() -> None:
+    """10,000 in a block: its parser's stack. Of a lens of aspheres there are more steps."""
+    g = Graph()
+    x = g.input("raster_x", 1)
+    for k in range(12_000):
+        x = x * (1 + k / 7e4) + 1.0
+    for output in osl.OUTPUTS:
+        g.outputs[output] = g.concat(x, x, x)
+    text = write_osl(lower(g), "long", [], [], "", osl.OUTPUTS)
+    assert text.count(" = ") > 12_000 and text.count(";") < 1000
 
 
 def test_command_line_writes_a_shader_and_refuses_what_is_its_input(tmp_path, monkeypatch, capsys) -> None:
