@@ -3,7 +3,7 @@
 The whole camera is a graph: from the place in the picture and two random numbers to a weighted ray, at any stop and
 focus of the lens. Inputs of the shader (`PARAMETERS`) are numbers when the renderer compiles it, and what depends on
 them alone costs nothing then. Besides them it reads, of Blender's camera, the sensor's size (with its fit and the
-picture's aspect), shift and, where `focus_m` is 0, the distance of depth of field.
+picture's aspect) and, where `focus_m` is 0, the distance of depth of field; shift moves the place in the picture.
 
 Of a lens in several states (zoom, internal focus) every number of the camera follows the state, mixed from cameras at
 the nodes of its axes as a model's own numbers are: the zoom is an input, internal focus the distance in focus.
@@ -290,8 +290,7 @@ class _Call:
         g, camera = self.g, self.camera
         per_distance = 1.0 / (self.film_z - camera.pupil_z_mm)
         own = _in_turn(g, _per_exposure(camera), self.share, _place(camera, self.film_z))
-        own = own * (1.0 / (self.share * self.share))
-        nominal = 4 * camera.f_number**2 / math.pi
+        own, nominal = own * (1.0 / (self.share * self.share)), 4 * camera.f_number**2 / math.pi
         per_exposure = g.select(self.number("as_lens") <= 0.5, own, nominal)
         return {"per_distance": per_distance, "scale": per_distance * per_distance * per_exposure}
 
