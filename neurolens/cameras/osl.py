@@ -189,14 +189,14 @@ def parameters(lens: OslLens) -> list[Parameter]:
 
 def write_camera(lens: OslLens, name: str, comment: list[str]) -> tuple[str, int]:
     """The text of a camera's shader, and the operations of one ray through a round stop: compilers know the blades."""
-    program = osl_program(lens).with_shared_inverses().with_shorter_sums().in_order_of_need()
+    program = osl_program(lens).with_shorter_sums().in_order_of_need()
     text = write_osl(program, name, comment, parameters(lens), _FRAME, OUTPUTS)
     return text, sum(osl_program(lens, {"count": 0.0}).count().values())
 
 
 def osl_program(lens: OslLens, fixed: Mapping[str, float] | None = None) -> Program:
     """The camera as a program, some inputs numbers; inputs as of `osl_graph`, and `zoom_mm` of a zoom's range."""
-    program = lower([osl_graph(camera) for camera in lens.nodes], fixed)
+    program = lower([osl_graph(camera) for camera in lens.nodes], fixed).with_shared_inverses()
     program.mixture = _mixture(lens) if lens.axes else None
     return program
 
