@@ -36,6 +36,8 @@ export PIP_DEFAULT_TIMEOUT ?= 120
 # Small batches lose speed to threads beyond the free cores.
 export OMP_NUM_THREADS ?= 2
 export MPLBACKEND ?= Agg
+# Tests start Python hundreds of times: it compiles once, whatever the machine's habit.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo test test-blender test-web docs bench models gallery lint format clean
 .DELETE_ON_ERROR:
@@ -66,7 +68,7 @@ test-web: $(INSTALLED)
 
 docs: $(INSTALLED) $(VENV)/.docs
 	OMP_NUM_THREADS=1 NEUROLENS_DOCS=1 $(BIN)/python -m pytest -q -n 2 tests/test_docs.py
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict -f docs/mkdocs.yml
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -f docs/mkdocs.yml
 	@echo "Look at build/docs/index.html"
 
 bench: $(INSTALLED)

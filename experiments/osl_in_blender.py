@@ -29,7 +29,7 @@ def main(plan_file: str, result_file: str) -> None:
     total = sum((s["rounds"] + 1) * len(s["cameras"]) for s in plan["scenes"].values()) + len(shots)
     done = 0
     for name, wanted in plan["scenes"].items():
-        scene = _scene(bpy, name == "real")
+        scene = _scene(bpy, name)
         cameras = {c["name"]: _camera(bpy, scene, c) for c in plan["cameras"] if c["name"] in wanted["cameras"]}
         times: dict[str, dict[str, list[float]]] = {camera: {"full": [], "tiny": []} for camera in cameras}
         full = (*wanted["size"], wanted["samples"])
@@ -65,21 +65,26 @@ def _blender() -> Any:
     return bpy
 
 
-def _scene(bpy: Any, real: bool) -> Any:
-    """A white sky, or meshes on a floor, lit by lamps; one thread of Cycles, nothing adaptive."""
+def _scene(bpy: Any, name: str) -> Any:
+    """A white sky; open, meshes on a floor, lit by lamps; or these in a room, with the bounces of light that Blender
+    begins with. One thread of Cycles, nothing adaptive."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     scene.render.engine, cycles = "CYCLES", scene.cycles
     cycles.device = "CPU"
     cycles.use_adaptive_sampling = cycles.use_denoising = False
-    cycles.max_bounces = 4
+    if name != "room":
+        cycles.max_bounces = 4
     scene.render.threads_mode, scene.render.threads = "FIXED", 1
     scene.world = bpy.data.worlds.new("sky")
-    level = 0.1 if real else 1.0
+    level = 1.0 if name == "sky" else 0.1
     scene.world.use_nodes = True
     scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (level, level, level, 1.0)
-    if real:
+    if name != "sky":
         _furnish(bpy)
+    if name == "room":
+        bpy.ops.mesh.primitive_cube_add(size=1, location=(0, 1.9, -2.8), scale=(8.0, 5.1, 9.6))
+        _paint(bpy, (0.8, 0.78, 0.75))
     return scene
 
 
@@ -112,7 +117,7 @@ def _paint(bpy: Any, colour: Any, roughness: float = 0.5, glow: float = 0.0) -> 
 
 def _evening(bpy: Any) -> Any:
     """A head between balls on a chequered floor, the subject at the origin; strings of coloured lights behind it."""
-    scene = _scene(bpy, False)
+    scene = _scene(bpy, "sky")
     scene.cycles.max_bounces = 3
     scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (0.012, 0.018, 0.04, 1.0)
     bpy.ops.mesh.primitive_plane_add(size=60, location=(0, -0.12, -20), rotation=(-math.pi / 2, 0, 0))

@@ -130,10 +130,12 @@ def focal_mm(shot: Shot) -> float:
 
 
 def _write_pair(file: Path, folder: Path, shot: Shot) -> None:
-    """Both pictures side by side, Cycles's own on the left."""
-    from PIL import Image
+    """Both pictures side by side, Cycles's own on the left, each with its name."""
+    from PIL import Image, ImageDraw
 
     left, right = (Image.open(folder / f"{shot.name}.{kind}.png").convert("RGB") for kind in ("cycles", "lens"))
+    for picture, label in ((left, "Cycles's own"), (right, shot.title.split(",")[0])):
+        ImageDraw.Draw(picture).text((6, 4), label, "white", font_size=13, stroke_width=2, stroke_fill="black")
     both = Image.new("RGB", (left.width + _GAP + right.width, left.height), "white")
     both.paste(left, (0, 0))
     both.paste(right, (left.width + _GAP, 0))

@@ -1,5 +1,6 @@
 """Order of the tests: those marked slow run last, so that a mistake shows within seconds."""
 
+import gc
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -41,6 +42,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()  # what is imported and collected stays: no need to look through it again and again
 
 
 @pytest.fixture(autouse=True, scope="session")

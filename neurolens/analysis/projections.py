@@ -144,16 +144,16 @@ class Projection:
 
     def _by_angle(self, coefficients: Tensor, u: Tensor, v: Tensor) -> Tensor:
         """Directions of places on the film, by a table and Newton's method."""
-        distance = torch.sqrt(u * u + v * v)
         count = len(coefficients) if self.kind == "table" else _KNOTS
         knots = torch.linspace(0, self.fold_rad, count, dtype=u.dtype, device=u.device)
         radii = self._distance(coefficients, knots)
+        distance = torch.sqrt(u * u + v * v + _TINY * radii[1] ** 2)  # a root has no slope at 0
         row = (torch.searchsorted(radii, distance.contiguous()) - 1).clamp(0, count - 2)
         angle = knots[row] + (distance - radii[row]) / (radii[row + 1] - radii[row]) * (knots[1] - knots[0])
         for _ in range(0 if self.kind == "table" else 3):
             value, slope = jvp(lambda t: self._distance(coefficients, t), (angle,), (torch.ones_like(angle),))[:2]
             angle = (angle + (distance - value) / slope).clamp(0, self.fold_rad)
-        share = torch.sin(angle) / torch.where(distance > 0, distance, 1.0)
+        share = torch.sin(angle) / distance
         return torch.stack([u * share, v * share, torch.cos(angle)], -1)
 
     def _unbent(self, coefficients: Tensor, u: Tensor, v: Tensor) -> Tensor:
@@ -172,7 +172,7 @@ class Projection:
             dx, dy = (by * (u - a) - ay * (v - b)) / det, (ax * (v - b) - bx * (u - a)) / det
             if not bool((dx.abs() + dy.abs() > _CONVERGED).any()):
                 break
-            short = (_TRUST / torch.sqrt(dx * dx + dy * dy).clamp_min(_TRUST)).nan_to_num(0.0)
+            short = (_TRUST / torch.sqrt((dx * dx + dy * dy).clamp_min(_TRUST**2))).nan_to_num(0.0)
             x, y = x + short * dx, y + short * dy
         folded = torch.sqrt(x * x + y * y) > math.tan(self.fold_rad)
         return torch.stack([torch.where(folded, math.nan, x), y, one], -1)

@@ -111,38 +111,59 @@ def write_pack(out: Path, lenses: Iterable[PackedLens]) -> None:
     _write_zip(out, files | {FACTS: _facts(lens.facts() for lens in packed)})
 
 
+def check_takes(to: Path) -> None:
+    """Refuse a zip or a user folder that takes no lens, before there is one.
+
+    Raises:
+        InputError: as of `add_to_zip` and `add_to_folder`.
+    """
+    (_of_zip if to.suffix == ".zip" else _of_folder)(to)
+
+
 def add_to_zip(path: Path, lens: PackedLens) -> None:
     """Put a lens into a packed extension, in place of one of its id.
 
     Raises:
         InputError: no extension of ours.
     """
+    files, known = _of_zip(path)
+    _write_zip(path, files | lens.files() | {FACTS: _facts(_merged(known, lens))})
+
+
+def _of_zip(path: Path) -> tuple[dict[str, bytes], list[dict[str, Any]]]:
+    """The files of a packed extension, and the entries of its facts."""
     try:
         with zipfile.ZipFile(path) as packed:
             if sum(i.file_size for i in packed.infolist()) > _LARGEST:
                 raise InputError(path, "size", "(too large)", f"at most {_LARGEST} bytes unpacked")
             files = {i.filename: packed.read(i) for i in packed.infolist() if not i.is_dir()}
-        known = _entries(json.loads(files[FACTS]))
+        return files, _entries(json.loads(files[FACTS]))
     except (OSError, zipfile.BadZipFile, KeyError, ValueError, TypeError) as error:
         raise InputError(path, "file", f"({error})", "a zip that `neurolens blender build` wrote") from None
-    _write_zip(path, files | lens.files() | {FACTS: _facts(_merged(known, lens))})
 
 
 def add_to_folder(folder: Path, lens: PackedLens) -> None:
     """Put a lens into the extension's user folder, which is made, in place of one of its id.
 
     Raises:
-        InputError: facts there that are not ours. OSError: a place that cannot be written.
+        InputError: facts there that are not ours, or no folder. OSError: a place that cannot be written.
     """
-    file = folder / FACTS
-    try:
-        known = _entries(json.loads(file.read_text(encoding="utf-8"))) if file.exists() else []
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(file, "file", f"({error})", "facts that neurolens wrote") from None
+    known = _of_folder(folder)
     for name, data in {**lens.files(), FACTS: _facts(_merged(known, lens))}.items():  # the facts last: they name files
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(folder / name) as temporary:
             temporary.write_bytes(data)
+
+
+def _of_folder(folder: Path) -> list[dict[str, Any]]:
+    """The entries of the facts of a user folder, none where it is new."""
+    file = folder / FACTS
+    if folder.exists() and not folder.is_dir():
+        raise InputError(folder, "--to", "(a file)", "a zip that `neurolens blender build` wrote, or a folder")
+    try:
+        return _entries(json.loads(file.read_text(encoding="utf-8"))) if file.exists() else []
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(file, "file", f"({error})", "facts that neurolens wrote") from None
 
 
 def user_folders() -> list[Path]:

@@ -31,10 +31,14 @@ def passing(
         call = [rng.uniform(*span, _ASKED) for span in (sight.film_z_mm, sight.wavelength_nm)]
         call.append(np.full(_ASKED, share * sight.stop_radius_mm))
         passed = _sampled(sight, arcs, rng.random((2, _ASKED)), film, call)
-        lit = np.zeros((blocked := np.flatnonzero(~passed)).size, bool)
-        for _ in range(_TRIED):
-            dark = blocked[~lit]
-            lit[~lit] = _sampled(sight, arcs, rng.random((2, dark.size)), film[:, dark], [row[dark] for row in call])
+        lit, tried = np.zeros((blocked := np.flatnonzero(~passed)).size, bool), 0
+        while tried < _TRIED and not lit.all():
+            # As many again of each at once, for few rays cost nearly as much as many.
+            most = max(1, min(tried, _ASKED // int(np.count_nonzero(~lit))))
+            tries = min(most, _TRIED - tried)
+            dark, tried = np.repeat(blocked[~lit], tries), tried + tries
+            found_light = _sampled(sight, arcs, rng.random((2, dark.size)), film[:, dark], [row[dark] for row in call])
+            lit[~lit] = found_light.reshape(-1, tries).any(1)
         found[share] = float(passed.sum() / max(passed.sum() + lit.sum(), 1))
     return found
 

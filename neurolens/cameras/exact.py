@@ -41,6 +41,7 @@ from neurolens.optics.trace import Rays, film_derivatives, trace, trace_differen
 from neurolens.optics.tracegraph import exact_graph
 
 OUTLINE = "outline"
+AS_BARE = "coatings and absorption left out"
 _MAKERS: dict[str, Callable[[Lens, float], RadialPupil]] = {
     "rear-rim": known.rear_rim,
     "exit-pupil": known.global_exit_pupil,
@@ -292,6 +293,15 @@ def check_bare(lens: Lens, instead: str = "without fused: it is traced with them
         if coated or absorbs:
             found = "(a coating)" if coated else "(glass that absorbs)"
             raise InputError(lens.path, f"surface {k}", found, f"a bare, clear lens to compile ({instead})")
+
+
+def bare_line(lens: Lens) -> str:
+    """What a form that holds neither coatings nor absorption says of a lens; "" of one without them."""
+    try:
+        check_bare(lens)
+    except InputError:
+        return f"In this form: {AS_BARE}."
+    return ""
 
 
 @dataclass(frozen=True)

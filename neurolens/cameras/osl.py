@@ -3,7 +3,7 @@
 The whole camera is a graph: from the place in the picture and two random numbers to a weighted ray, at any stop and
 focus of the lens. Inputs of the shader (`PARAMETERS`) are numbers when the renderer compiles it, and what depends on
 them alone costs nothing then. Besides them it reads, of Blender's camera, the sensor's size (with its fit and the
-picture's aspect), shift and, where `focus_m` is 0, the distance of depth of field.
+picture's aspect) and, where `focus_m` is 0, the distance of depth of field; shift moves the place in the picture.
 
 Of a lens in several states (zoom, internal focus) every number of the camera follows the state, mixed from cameras at
 the nodes of its axes as a model's own numbers are: the zoom is an input, internal focus the distance in focus.
@@ -199,7 +199,7 @@ def write_camera(lens: OslLens, name: str, comment: list[str]) -> tuple[str, int
 
 def osl_program(lens: OslLens, fixed: Mapping[str, float] | None = None) -> Program:
     """The camera as a program, some inputs numbers; inputs as of `osl_graph`, and `zoom_mm` of a zoom's range."""
-    program = lower([osl_graph(camera) for camera in lens.nodes], fixed)
+    program = lower([osl_graph(camera) for camera in lens.nodes], fixed).with_shared_inverses()
     program.mixture = _mixture(lens) if lens.axes else None
     return program
 
@@ -229,7 +229,7 @@ def osl_graph(camera: OslCamera) -> Graph:
     g = Graph()
     call = _Call(g, camera)
     square = g.concat(g.input("first"), g.input("second"))
-    film = (g.concat(g.input("raster_x"), g.input("raster_y")) - 0.5) * -call.sensor
+    film = (0.5 - g.concat(g.input("raster_x"), g.input("raster_y"))) * call.sensor
     nanometres, colour = _light(camera, square[0], call.number("in_colour"))
     per_call = {"film_z_mm": call.film_z, "stop_radius_mm": call.stop}
     sampler = camera.arcs.sampler(Blades, *camera.stop_image)
@@ -237,33 +237,34 @@ def osl_graph(camera: OslCamera) -> Graph:
     rays = g.concat(film, pupil["pupil_mm"], nanometres)
     found = g.inline(camera.lens, {"rays": rays, **per_call})
     given = {"film_mm": film, **pupil, **found, "lens_status": found["status"], **per_call, **call.weighting()}
-    done = g.inline(weight_graph(unit=camera.unit), given) | {name: found[name] for name in D_FILM}
+    done = g.inline(weight_graph(unit=camera.unit), given)
     even = g.select(done["status"] <= float(st.PASSED), pupil["area_mm2"] / pupil["mean_area_mm2"], 0.0)
     weight = g.select(call.number("shaded") <= 0.5, even, done["weight"])
     weight = g.select(Blades(g).opened(found["stop_xy_mm"] * (1.0 / call.stop)), weight, 0.0)
     known = (g.square(film) <= camera.arcs.film_radius_mm**2) & call.focused
     warned = g.select(known, 0.0, call.number("warned"))
-    _set_outputs(g, camera, call, film, done, colour * g.select(known, weight, 0.0), warned)
+    # Beyond the film nothing has an area.
+    _set_outputs(g, camera, call, film, found, colour * g.select(call.focused, weight, 0.0), warned)
     return g
 
 
 def _set_outputs(
-    g: Graph, camera: OslCamera, call: _Call, film: Value, done: Mapping[str, Value], throughput: Value, warned: Value
+    g: Graph, camera: OslCamera, call: _Call, film: Value, found: Mapping[str, Value], throughput: Value, warned: Value
 ) -> None:
     """Rays in the frame of Cycles, metres and x right, y up, z ahead; warnings as of a pinhole."""
     turned = [1.0, 1.0, -1.0]
     ahead = g.concat(film * -1.0, g.constant(camera.efl_mm))
     ahead = ahead * (1.0 / g.square(ahead).sqrt())
-    ray = done["ray"]
-    start = g.concat(ray[0:2], call.shift_m - ray[2])
+    ray = found["scene_ray"]
+    start = (ray[0:3] - g.concat(g.constant([0.0, 0.0]), call.origin_mm)) * [1e-3, 1e-3, -1e-3]
     plain = warned <= 0.5
     g.outputs["position"] = g.select(plain, start, 0.0)
     g.outputs["direction"] = g.select(plain, ray[3:] * turned, ahead)
     g.outputs["throughput"] = g.select(plain, throughput, g.constant([1.0, 0.0, 1.0]))
     for axis, name, step in zip((0, 1), D_FILM, ("x", "y"), strict=True):
-        way = call.sensor[axis] * -call.number(f"pixel_{step}")
-        way = g.concat(way, way, -way)
-        g.outputs[f"dPd{step}"], g.outputs[f"dDd{step}"] = done[name][0:3] * (way * 1e-3), done[name][3:] * way
+        way = call.sensor[axis] * call.number(f"pixel_{step}")
+        rows = found[name] * (way * [-1e-3, -1e-3, 1e-3, -1.0, -1.0, 1.0])
+        g.outputs[f"dPd{step}"], g.outputs[f"dDd{step}"] = rows[0:3], rows[3:]
 
 
 class _Call:
@@ -282,8 +283,7 @@ class _Call:
         self.film_z = g.select(at_pupil <= 0.5, *places)
         distance = away + (self.film_z - camera.entrance_mm) * at_pupil * 1e-3
         self.focused = g.constant(camera.limit_m * _NEAR) <= distance
-        # Of the ray in the camera's frame, turned: from the film, or from the entrance pupil.
-        self.shift_m = (camera.entrance_mm - self.film_z) * at_pupil * 1e-3
+        self.origin_mm = g.select(at_pupil <= 0.5, self.film_z, camera.entrance_mm)
 
     def number(self, name: str) -> Value:
         return self.g.input(name, per_call=True)
@@ -292,10 +292,10 @@ class _Call:
         """The numbers of `weight_graph`."""
         g, camera = self.g, self.camera
         per_distance = 1.0 / (self.film_z - camera.pupil_z_mm)
-        own = _in_turn(g, _exposure(camera), self.share, _place(camera, self.film_z)) * self.share * self.share
-        nominal = math.pi / (4 * camera.f_number**2)
-        exposure = g.select(self.number("as_lens") <= 0.5, own, nominal)
-        return {"per_distance": per_distance, "scale": per_distance * per_distance / exposure}
+        own = _in_turn(g, _per_exposure(camera), self.share, _place(camera, self.film_z))
+        own, nominal = own * (1.0 / (self.share * self.share)), 4 * camera.f_number**2 / math.pi
+        per_exposure = g.select(self.number("as_lens") <= 0.5, own, nominal)
+        return {"per_distance": per_distance, "scale": per_distance * per_distance * per_exposure}
 
 
 def _in_turn(g: Graph, weights: Array, first: Value, then: Value) -> Value:
@@ -345,8 +345,8 @@ def _samples(sight: Sight, arcs: PupilArcs | PupilCircles, count: int = 32768) -
     return {k: given[k].astype(np.float32) for k in ("rays", "film_z_mm", "stop_radius_mm", "at_stop")}
 
 
-def _exposure(camera: OslCamera) -> Array:
-    """Exposure on the axis over the square of the stop's share, by powers [N, M] of that share and the place."""
+def _per_exposure(camera: OslCamera) -> Array:
+    """The square of the stop's share over the exposure on the axis, by powers [N, M] of that share and the place."""
     sight = camera.sight
     square, nanometres = stratified(_QUADRATURE, sight.wavelength_nm)
     low, high = sight.film_z_mm
@@ -370,7 +370,7 @@ def _exposure(camera: OslCamera) -> Array:
             )
             weight = evaluate(weight_graph(), given | lens | {"lens_status": lens["status"]})["weight"]
             rows.append((share, (z - camera.arcs.film_z_mm[0]) / camera.arcs.film_z_mm[1]))
-            values.append(float(np.mean(weight, dtype=np.float64)) / share**2)
+            values.append(share**2 / float(np.mean(weight, dtype=np.float64)))
     return _powers(np.array(rows), np.array(values), (4, len(places)))
 
 

@@ -123,8 +123,8 @@ class PupilArcs:
         stop, film_z = g.input("stop_radius_mm", per_call=True), g.input("film_z_mm", per_call=True)
         (middle, half), (mean, reach) = self.film_z_mm, self.wave
         call = g.concat(stop * (1 / self.stop_radius_mm), (film_z - middle) * (1 / half))
-        inverse = 1000.0 / g.input("wavelength_nm")
-        wave = inverse * inverse * (1 / reach) - mean / reach
+        inverse = (1000.0 * reach**-0.5) / g.input("wavelength_nm")
+        wave = inverse * inverse - mean / reach
         factors = {(0, 0): None, (1, 0): wave, (0, 1): twice, (0, 2): twice * twice}
         arcs = []
         for side, numbers in zip(self.sides, self.numbers, strict=True):
@@ -247,9 +247,9 @@ def unit_disc(square: Value) -> Value:
     """The point [2] of the unit disc of a point of the unit square, evenly (Shirley and Chiu 1997)."""
     g = square.graph
     a, b = g.split(square * 2.0 - 1.0, (1, 1))
-    flat = b.abs() <= a.abs()
+    flat = b * b <= a * a
     size = g.select(flat, a, b)
-    angle = g.select(flat, b, a) / g.select(size.abs() <= HAIR, 1.0, size)
+    angle = g.select(flat, b, a) / g.select(size * size <= HAIR, 1.0, size)
     squared = angle * angle
     cos = size * g.series(squared, _COS)
     sin = size * angle * g.series(squared, _SIN)
@@ -258,7 +258,7 @@ def unit_disc(square: Value) -> Value:
 
 def _chebyshev(function: Callable[[Array], Array]) -> Array:
     """On squares of angles of up to pi / 4, in units of that: to float32's last bit."""
-    fit = np.polynomial.Chebyshev.interpolate(function, 4, [0, 1])
+    fit = np.polynomial.Chebyshev.interpolate(function, 3, [0, 1])
     return np.asarray(fit.convert(kind=np.polynomial.Polynomial).coef, np.float64)
 
 

@@ -58,8 +58,9 @@ class StopImage:
         """Of points `point_mm` [2] with derivatives; numbers of the focus are of the call."""
         g = Graph()
         (middle, half), (mean, reach) = self.film_z_mm, self.wave
-        place, inverse = (g.input("film_z_mm", per_call=True) - middle) * (1 / half), 1000.0 / g.input("wavelength_nm")
-        wave = inverse * inverse * (1 / reach) - mean / reach
+        place = (g.input("film_z_mm", per_call=True) - middle) * (1 / half)
+        inverse = (1000.0 * reach**-0.5) / g.input("wavelength_nm")
+        wave = inverse * inverse - mean / reach
         film, point = g.input("film_mm", 2) * (1 / self.unit_mm), g.input("point_mm", 2) * (1 / self.stop_mm)
         rays, own = np.unique(self.exponents[:, :5], axis=0, return_inverse=True)
         monomials = g.polynomial(rays, np.eye(len(rays)), g.concat(film, point, wave))

@@ -12,7 +12,7 @@ from typing import Any
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import check_writable
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import Parser, add_json, check_folder, check_suffix, whole
+from neurolens.commands.arguments import Parser, add_bare, add_json, bare_of, check_folder, check_suffix, whole
 from neurolens.commands.output import answer
 
 _DESCRIPTION = """\
@@ -57,6 +57,7 @@ def add_parser(subparsers: Any) -> None:
     add = actions.add_parser("add", help="put a lens into the extension", description=_ADD)
     add.add_argument("file", metavar="FILE", type=Path, help="model (.onnx) or lens file (.toml)")
     add.add_argument("--to", metavar="ZIP|DIR", type=Path, help="a packed extension, or a user folder of one")
+    add_bare(add)
     add.add_argument("--zoom", metavar="STATE", help="state of a zoom, by name or focal length in mm; range: a setting")
     add_json(add, quiet=True)
     add.set_defaults(run=run_add, kept="nothing was added")
@@ -70,11 +71,12 @@ def run_build(args: argparse.Namespace) -> int:
     if not args.models.is_dir():
         raise InputError("neurolens blender build", "--models", str(args.models), "a folder of models that exists")
     from neurolens.blender.pack import write_pack
-    from neurolens.commands.blender_lenses import forms_of, library, packed_of
+    from neurolens.commands.blender_lenses import forms_of, library, packed_of, stated_lens
     from neurolens.optics.lensfile import read_lens
 
     began, packed = time.perf_counter(), []
-    places = list(library(args.models, args.models.parent / "lenses", args.lens))
+    lens_folder = args.models.parent / "lenses"
+    places = list(library(args.models, lens_folder, args.lens))
     if not places:
         raise InputError("neurolens blender build", "--models", str(args.models), "a folder with models (.onnx)")
     exact = [] if args.no_exact else [lens_file for _, lens_file in places if lens_file is not None]
@@ -86,7 +88,7 @@ def run_build(args: argparse.Namespace) -> int:
         for models, lens_file in places:
             own = [f for f in (*models, lens_file) if f is not None and f in forms]
             if own:
-                lens = None if lens_file is None else read_lens(lens_file)
+                lens = stated_lens(own[0], lens_folder) if lens_file is None else read_lens(lens_file)
                 packed.append(packed_of(own, [forms[f] for f in own], lens=lens))
             report(len(packed) / len(places))
     for why in left.values():
@@ -106,7 +108,7 @@ def run_build(args: argparse.Namespace) -> int:
 
 def run_add(args: argparse.Namespace) -> int:
     """Add a lens."""
-    from neurolens.blender.pack import add_to_folder, add_to_zip, user_folders
+    from neurolens.blender.pack import add_to_folder, add_to_zip, check_takes, user_folders
     from neurolens.commands.blender_lenses import form_of, packed_of
 
     to = args.to
@@ -117,7 +119,8 @@ def run_add(args: argparse.Namespace) -> int:
         raise InputError("neurolens blender add", "--to", "(missing)", expected)
     if not args.file.is_file():
         raise InputError(args.file, "file", "(missing)", "a model (.onnx) or a lens file (.toml)")
-    form = form_of(args.file, zoom=args.zoom, quiet=args.quiet)
+    check_takes(to)
+    form = form_of(args.file, zoom=args.zoom, as_bare=bare_of(args, args.file), quiet=args.quiet)
     lens = packed_of([args.file], [form], zoom=args.zoom)
     (add_to_zip if to.suffix == ".zip" else add_to_folder)(to, lens)
     data = {"lens": lens.lens_id, "to": str(to), "forms": [f.model or f.kind for f in lens.forms]}

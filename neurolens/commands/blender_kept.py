@@ -1,7 +1,7 @@
 """Forms of lenses for Blender kept between runs: an interrupted `neurolens blender build` goes on where it was.
 
-A file holds one form and is named by what it is made of: the model or lens file, the zoom's state, and the code.
-Damaged files, and those of another user, are made again.
+A file holds one form, or a lens's field, and is named by what it is made of: the model or lens file, the zoom's state,
+and the code. Damaged files, and those of another user, are made again.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from dataclasses import asdict
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,20 +26,25 @@ _KEPT = 512  # files of some 100 kB
 
 def kept_form(file: Path, *given: str | None, make: Callable[[], Form]) -> Form:
     """The form of a file, and of what else is given: from the cache, else what `make` gives, kept if it can be."""
+    return Form(**kept(file, *given, make=lambda: asdict(make())))
+
+
+def kept(file: Path, *given: str | None, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """As `kept_form`, of any table that JSON holds."""
     key = fingerprint_of([_code(), file.name, sha256_of(file), *given])
     place = cache_folder() / f"{key[:32]}.form"
     data = sealed_bytes(place)
     if data is not None:
         with suppress(ValueError, TypeError, KeyError):
-            held = json.loads(data)
+            held: dict[str, Any] = json.loads(data)
             if held.pop("key") == key:
-                return Form(**held)
-    form = make()
+                return held
+    made = make()
     with suppress(OSError), atomic_path(place) as temporary:
-        temporary.write_text(json.dumps({"key": key} | asdict(form)), encoding="utf-8")
+        temporary.write_text(json.dumps({"key": key} | made), encoding="utf-8")
         seal(temporary)
     keep_newest(place, _KEPT)
-    return form
+    return made
 
 
 @cache

@@ -21,7 +21,7 @@ from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.signals import end_at_once, held
 from neurolens.blender.pack import Form, PackedLens
-from neurolens.commands.blender_kept import kept_form
+from neurolens.commands.blender_kept import kept, kept_form
 from neurolens.evaluate.shaders import shader_of
 from neurolens.render.film import CONTEXT
 
@@ -54,7 +54,8 @@ def _made_form(file: Path, zoom: str | None, as_bare: str, quiet: bool) -> Form:
         kind = "network" if _family(card).startswith(_NETWORK) else "polynomial"
         poor = list(card["errors"].get("poor") or ())
     state = None if zoom == RANGE else zoom
-    notes = [*shader.notes, *([] if state is None else [f"The zoom stands at {state}"])]
+    notes = [*shader.notes, *filter(None, [as_bare.removesuffix(".")])]
+    notes += [] if state is None else [f"The zoom stands at {state}"]
     if (squeeze := _squeeze(file, state)) != 1.0:
         axis, aspect = ("Y", squeeze) if squeeze > 1 else ("X", 1 / squeeze)
         side = "across" if squeeze > 1 else "in height"
@@ -146,20 +147,42 @@ def packed_of(
     Args:
         lens: its prescription, for the thumbnail, where it is at hand.
     """
-    first = files[0]
+    from neurolens.optics.paraxial import first_order
+
+    first, ranged = files[0], zoom == RANGE
     if first.suffix == ".onnx":
-        card = _card(first)["lens"]
+        told = _card(first)
+        card, ranged = told["lens"], zoom in (None, RANGE) and "zoom" in _axes(told)
         name, efl, f_number, source = card["name"], card["efl_mm"], card["f_number"], str(card.get("source") or "")
+        name = f"{name}, any zoom" if ranged else name
     else:
         from neurolens.optics.lensfile import read_lens
-        from neurolens.optics.paraxial import first_order
 
         lens = read_lens(first).at(zoom=None if zoom == RANGE else zoom)
         data = first_order(lens)
         name, efl, f_number, source = lens.name, data.efl_mm, data.f_number, lens.source
     picture = None if lens is None else thumbnail(lens)
-    table = None if lens is None or not forms else field_table(lens, min(form.film_radius_mm for form in forms))
+    table = None
+    if lens is not None and forms and not ranged:
+        radius = min(form.film_radius_mm for form in forms)
+        given = str(first_order(lens).efl_mm), str(radius)
+        table = kept(Path(lens.path), "field", *given, make=lambda: {"table": field_table(lens, radius)})["table"]
     return PackedLens(key_of(first), str(name), float(efl), float(f_number), source, picture, list(forms), table)
+
+
+def stated_lens(model: Path, lenses: Path) -> Lens | None:
+    """The prescription of a model of one state of a lens file, scaled or zoomed, or of its range; None without it."""
+    from neurolens.optics.lensfile import read_lens
+    from neurolens.optics.paraxial import first_order
+
+    told = _card(model)["lens"]
+    file = lenses / f"{told['id']}.toml"
+    if not file.is_file():
+        return None
+    lens, efl = read_lens(file), float(told["efl_mm"])
+    if math.isclose(first_order(lens).efl_mm, efl, rel_tol=1e-3):
+        return lens
+    return lens.at(zoom=str(efl)) if lens.configurations else lens.at(focal_length_mm=efl)
 
 
 def field_table(lens: Lens, radius_mm: float) -> dict[str, Any] | None:
@@ -255,6 +278,10 @@ def _card(file: Path) -> dict[str, Any]:
     from neurolens.modelfile.onnxfile import read_checked
 
     return read_checked(file)[1]
+
+
+def _axes(card: dict[str, Any]) -> list[str]:
+    return [axis["name"] for axis in (card.get("states") or {}).get("axes", ())]
 
 
 def _family(card: dict[str, Any]) -> str:

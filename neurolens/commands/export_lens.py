@@ -66,7 +66,7 @@ def write_lens(
         lines.append("Groups stand at infinity focus: the film focuses, for how groups move is no graph.")
     lines += [as_bare] * bool(as_bare)
     for node in nodes if not as_bare else ():
-        check_bare(node, "a model of the lens has them")
+        check_bare(node, "a model of the lens has them; --bare leaves them out")
     planes = pupil_planes_mm(nodes, axes)
     program = lens_program(nodes, axes, planes)
     constants, functions = followed(axes, numbers(nodes, planes))

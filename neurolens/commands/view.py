@@ -43,7 +43,6 @@ examples:
 _NETWORK = "mlp"
 _ERRORS = ("rms_um", "p99_um", "rms_infinity_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
 _LIGHT_NM = (400.0, 700.0)
-_AS_BARE = "coatings and absorption left out"
 _NEAR_EFL = 10.0  # of an exact lens: nearest focus in focal lengths
 _SAME = 1e-3  # of the focal length: what models and lens file of one id may differ by
 _DOWNLOADS = ("glsl", "onnx", "c", "osl")
@@ -127,6 +126,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _with_file(entry: _Entry, folder: Path) -> _Entry:
+    from neurolens.cameras.exact import bare_line
     from neurolens.optics.lenswriter import write_lens
 
     if entry.lens is None:
@@ -134,7 +134,7 @@ def _with_file(entry: _Entry, folder: Path) -> _Entry:
     folder.mkdir()
     file = folder / f"{entry.lens.lens_id}.toml"
     write_lens(entry.lens, file)
-    return replace(entry, file=file, as_bare="" if _is_bare(entry.lens) else f"In this form: {_AS_BARE}.")
+    return replace(entry, file=file, as_bare=bare_line(entry.lens))
 
 
 def _shaders(entries: Sequence[_Entry], jobs: int, progress: Progress) -> Mapping[Path, str]:
@@ -323,17 +323,8 @@ def _facts(lens: Mapping[str, Any]) -> dict[str, Any]:
     return {key: lens[key] for key in ("name", "source", "efl_mm")}
 
 
-def _is_bare(lens: Lens) -> bool:
-    from neurolens.cameras.exact import check_bare
-
-    try:
-        check_bare(lens)
-    except InputError:
-        return False
-    return True
-
-
 def _exact_form(entry: _Entry, file: Path, at: Lens, kinds: Sequence[str], osl: str | None) -> Form:
+    from neurolens.cameras.exact import AS_BARE
     from neurolens.commands.export_lens import write_lens
     from neurolens.optics.paraxial import first_order
     from neurolens.optics.pupils import image_radius_mm
@@ -350,7 +341,7 @@ def _exact_form(entry: _Entry, file: Path, at: Lens, kinds: Sequence[str], osl: 
         "f_numbers": [(float(data.efl_mm), float(data.f_number))],
         "errors": {}, "zones": {}, "poor": [],
     }  # fmt: skip
-    said = f"every surface traced, {_AS_BARE}" if entry.as_bare else "every surface traced"
+    said = f"every surface traced, {AS_BARE}" if entry.as_bare else "every surface traced"
     return _form("exact", said, written, told, {}, osl)
 
 

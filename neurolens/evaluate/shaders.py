@@ -73,7 +73,8 @@ def shader_of(
         *told,
         f"Film radius {lens.film_radius_mm:.4g} mm, f/{lens.f_number:.3g}, focus {focus}; rays that pass: "
         + ", ".join(f"f/{n} {share:.1%}" for n, share in passed.items()) + ".",
-        "Sensor size and shift are Blender's. Focus: focus_m, or where that is 0 the distance of depth of field.",
+        "Sensor size and shift are Blender's; shift X counts widths of the picture, shift Y heights.",
+        "Focus: focus_m, or where that is 0 the distance of depth of field.",
     ]  # fmt: skip
     notes = []
     for axis in lens.axes:
@@ -84,7 +85,7 @@ def shader_of(
             notes.append(f"Nearest focus from {near:.3g} to {least:.3g} m over the zoom, {low:.4g} to {high:.4g} mm")
     text, operations = write_camera(lens, own, lines_of([*comment, *(f"{n}." for n in notes)]))
     if operations > MAX_STEPS:
-        raise InputError("export", "operations", operations, f"up to {MAX_STEPS}: a model of the lens is smaller")
+        raise InputError(file, "operations", operations, f"up to {MAX_STEPS}: a model of the lens is smaller")
     return Shader(
         own, text, operations, tuple(p.name for p in parameters(lens)), passed, lens.film_radius_mm, lens.f_number,
         near or None, tuple(notes),
@@ -150,7 +151,7 @@ def exact_lens(file: Path, zoom: str | None, report: Report, as_bare: str = "") 
     if ranged and internal:  # before minutes of work
         raise InputError(lens.path, "zoom", RANGE, "one focal length of the zoom: its groups move to focus, too")
     if not as_bare:
-        check_bare(lens.at(zoom=state), "a model of the lens has them")
+        check_bare(lens.at(zoom=state), "a model of the lens has them; --bare leaves them out")
     told = [f"{lens.name}: every surface traced (bare), {lens.source} (sha256 {str(lens.sha256)[:16]})."]
     told += [as_bare] * bool(as_bare)
     if not (ranged or internal):

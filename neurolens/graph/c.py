@@ -251,7 +251,7 @@ static const float {name}_nodes[{size}] = {{
 
 
 def state_parts(mixture: Mixture, table: Sequence[Sequence[float]], writer: Writer) -> dict[str, Any]:
-    """What the function of a state is written of: numbers [n][nodes] and, by a writer of its program, its features."""
+    """What the function of a state is written of: numbers [n, nodes] and, by a writer of its program, its features."""
     rows = np.array(table or [[0.0] * mixture.transform.shape[1]]) @ mixture.transform.T
     program = mixture.program
     return {

@@ -32,19 +32,25 @@ def evaluate(graph: Graph, inputs: Mapping[str, Rows]) -> dict[str, Rows]:
     space = _Space(first)
     known: dict[int, Rows] = {}
     with np.errstate(all="ignore"):
-        for number, done in _plan(graph):
-            node = graph.nodes[number]
-            known[number] = inputs[node.name] if node.name else _value(space, node, [known[k] for k in node.inputs])
+        for number, node, plain, done in _plan(graph):
+            if node.name:
+                known[number] = inputs[node.name]
+            elif plain is not None:
+                known[number] = plain(*[known[k] for k in node.inputs])
+            else:
+                known[number] = _OTHERS[node.kind](space, node, [known[k] for k in node.inputs])
             for k in done:  # their memory serves the next
                 del known[k]
     return {name: known[v.number] for name, v in graph.outputs.items()}
 
 
-_PLANS: WeakKeyDictionary[Graph, tuple[tuple[int, ...], list[tuple[int, list[int]]]]] = WeakKeyDictionary()
+_Planned = tuple[int, Node, Callable[..., Rows] | None, list[int]]
+_PLANS: WeakKeyDictionary[Graph, tuple[tuple[int, ...], list[_Planned]]] = WeakKeyDictionary()
 
 
-def _plan(graph: Graph) -> list[tuple[int, list[int]]]:
-    """Nodes that the outputs need, in order, each with those that nothing after it needs; kept while a graph stays."""
+def _plan(graph: Graph) -> list[_Planned]:
+    """Nodes that the outputs need, in order, each with its plain operation, if it is one, and with those that nothing
+    after it needs; kept while a graph stays."""
     wanted = (len(graph.nodes), *(v.number for v in graph.outputs.values()))
     kept = _PLANS.get(graph)
     if kept is None or kept[0] != wanted:
@@ -59,15 +65,9 @@ def _plan(graph: Graph) -> list[tuple[int, list[int]]]:
         for k, number in last.items():
             if k not in wanted[1:]:
                 done[number].append(k)
-        kept = _PLANS[graph] = wanted, list(done.items())
+        nodes = graph.nodes
+        kept = _PLANS[graph] = wanted, [(n, nodes[n], _PLAIN.get(nodes[n].kind), left) for n, left in done.items()]
     return kept[1]
-
-
-def _value(space: _Space, node: Node, given: list[Rows]) -> Rows:
-    simple = _EACH.get(node.kind)
-    if simple is not None:
-        return simple(space, *given)
-    return _WHOLE[node.kind](space, node, given)
 
 
 class _Space:
@@ -107,10 +107,18 @@ def monomials(x: Rows, exponents: Exponents) -> Rows:
     powers = [space.ones_like(x)]
     for _ in range(int(exponents.max(initial=0))):
         powers.append(powers[-1] * x)
+    # Of the first variables; many monomials go on from the same.
+    known: dict[tuple[int, ...], Rows] = {}
     rows = []
-    for exponent in exponents:
-        factors = [powers[e][v : v + 1] for v, e in enumerate(exponent) if e]
-        rows.append(functools.reduce(operator.mul, factors) if factors else powers[0][:1])
+    for exponent in exponents.tolist():
+        row, begun = powers[0][:1], ()
+        for v, e in enumerate(exponent):
+            if e:
+                before, begun = begun, tuple(exponent[: v + 1])
+                if begun not in known:
+                    known[begun] = row * powers[e][v : v + 1] if before else powers[e][v : v + 1]
+                row = known[begun]
+        rows.append(row)
     return space.concat(rows)
 
 
@@ -168,24 +176,24 @@ def _first_failure(space: _Space, node: Node, given: list[Rows]) -> Rows:
     return status
 
 
-_EACH: dict[str, Callable[..., Rows]] = {
-    "add": lambda s, a, b: a + b,
-    "sub": lambda s, a, b: a - b,
-    "mul": lambda s, a, b: a * b,
-    "div": lambda s, a, b: a / b,
-    "neg": lambda s, a: -a,
-    "sqrt": lambda s, a: s.sqrt(a),
-    "tanh": lambda s, a: s.tanh(a),
-    "abs": lambda s, a: abs(a),
-    "floor": lambda s, a: s.floor(a),
-    "max": lambda s, a, b: s.maximum(a, b),
-    "min": lambda s, a, b: s.minimum(a, b),
-    "le": lambda s, a, b: s.cast(a <= b),
-    "and": lambda s, a, b: a * b,
-    "select": lambda s, truth, a, b: s.where(truth > 0, a, b),
-    "whole": lambda s, a: s.cast(a, whole=True),
+_PLAIN: dict[str, Callable[..., Rows]] = {
+    "add": operator.add,
+    "sub": operator.sub,
+    "mul": operator.mul,
+    "div": operator.truediv,
+    "neg": operator.neg,
+    "abs": operator.abs,
+    "and": operator.mul,
 }
-_WHOLE: dict[str, Callable[[_Space, Node, list[Rows]], Rows]] = {
+_OTHERS: dict[str, Callable[[_Space, Node, list[Rows]], Rows]] = {
+    "sqrt": lambda s, node, given: s.sqrt(*given),
+    "tanh": lambda s, node, given: s.tanh(*given),
+    "floor": lambda s, node, given: s.floor(*given),
+    "max": lambda s, node, given: s.maximum(*given),
+    "min": lambda s, node, given: s.minimum(*given),
+    "le": lambda s, node, given: s.cast(given[0] <= given[1]),
+    "select": lambda s, node, given: s.where(given[0] > 0, *given[1:]),
+    "whole": lambda s, node, given: s.cast(given[0], whole=True),
     "constant": lambda s, node, given: s.numbers(node.arrays[0][:, None]),
     "table": lambda s, node, given: s.numbers(node.arrays[0]),
     "take": lambda s, node, given: given[0][list(node.static)],

@@ -65,22 +65,31 @@ def low_tests(graphs: Sequence[Graph], samples: Sequence[Mapping[str, NDArray[np
         return None
     known = [s for s in seen if s is not None]
     idle = _idle(known, gates)
-    rows = [r for r in range(graphs[0].nodes[number].rows) if r not in kept]
-    weights = [np.zeros((len(rows), len(exponents))) for _ in known]
-    for k, row in enumerate(rows):
-        columns, wanted = ([a * s.weights[row] for a, s in zip(each, known, strict=True)] for each in (
-            [s.products for s in known], [s.values[row] for s in known]))  # fmt: skip
-        good = _GATE if row in gates else _SMOOTH
-        chosen, own = pursue(columns, wanted, [good] * len(known), 0 if row in idle else _MOST_TERMS)
-        for w, v in zip(weights, own, strict=True):
-            w[k, chosen] = v
-    used = np.any([w.any(0) for w in weights], axis=0)
+    told = live_rows(graphs[0], {"status": graphs[0].outputs["status"]})[number]
+    fitted = dict[int, list[Array]]()
+    for row in (r for r in range(graphs[0].nodes[number].rows) if r not in kept):
+        own, enough = _low_row(known, row, 0 if row in idle else _MOST_TERMS, _GATE if row in gates else _SMOOTH)
+        if enough or row in told:  # rays that pass are counted below; transmittance is not
+            fitted[row] = own
+    rows, weights = list(fitted), np.array(list(fitted.values())).swapaxes(0, 1)
+    used = weights.any((0, 1))
     made = []
     for state, w, given in zip(known, weights, samples, strict=True):
         made.append(_written(state.graph, number, variables, rows, idle, (exponents[used], w[:, used])))
         if not _same(_passed(made[-1], given), state.passed, given):
             return None
     return made
+
+
+def _low_row(seen: Sequence[_Seen], row: int, most: int, good: float) -> tuple[list[Array], bool]:
+    """Weights [M] of at most so many monomials in each state, and whether they come as near as `good`."""
+    columns, wanted = [s.products * s.weights[row] for s in seen], [s.values[row] * s.weights[row] for s in seen]
+    chosen, own = pursue(columns, wanted, [good] * len(seen), most)
+    weights = [np.zeros(len(c)) for c in columns]
+    for w, values in zip(weights, own, strict=True):
+        w[chosen] = values
+    left = [float(np.sqrt(np.mean((v - w @ c) ** 2))) for v, w, c in zip(wanted, weights, columns, strict=True)]
+    return weights, max(left) <= good
 
 
 def _same(found: Truths, wanted: Truths, samples: Mapping[str, NDArray[np.float32]]) -> bool:

@@ -7,6 +7,7 @@ text of the caller; everything between these numbers and the outputs is the prog
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,7 +17,9 @@ from neurolens.graph.c import Writer, literal, steps_of
 from neurolens.graph.program import Mixture, Program, Step
 
 _LOOKUP = "{table}[{width} * clamp(int({index}), 0, {cells} - 1) + {place}]"
+_TEMPORARY = re.compile(r"\bt(\d+)\b")
 _SUFFIX = re.compile(r"(\d\.?(?:e[+-]\d+)?)f\b")
+_STATEMENTS, _TOGETHER = 9000, 64  # the compiler of OSL takes 10,000; numbers that a statement of more declares
 _KINDS = {"position": "point", "throughput": "color"}
 
 
@@ -75,7 +78,8 @@ def write_osl(
     for table, numbers in program.own_tables.items():
         values = ", ".join(_plain(literal(v)) for v in numbers.reshape(-1))
         tables += f"    float {name}_{table}[{numbers.size}] = {{{values}}};\n"
-    body = _plain("\n".join(steps_of(writer)))
+    steps = urgent(steps_of(writer))
+    body = _plain("\n".join(steps if len(steps) < _STATEMENTS else _together(steps)))
     results = ""
     for o in outputs:
         rows = (_plain(writer.value(program.outputs[f"{o}_{k}"].argument)) for k in range(3))
@@ -83,6 +87,17 @@ def write_osl(
     parts = ",\n    ".join(head)
     mixed = "" if program.mixture is None else _mixed(program.mixture, writer)
     return f"/*\n{lines}\n */\nshader {name}(\n    {parts})\n{{\n{tables}{frame}{mixed}{body}\n{results}}}\n"
+
+
+def urgent(lines: Sequence[str]) -> list[str]:
+    """Lines `float tN = ...;`, first those from which the longest chain of others leads on, so that few wait for one
+    another: compilers of shaders, which make no vectors of them, keep much of the order they are given."""
+    numbers = [[int(n) for n in _TEMPORARY.findall(line)] for line in lines]
+    ahead: defaultdict[int, int] = defaultdict(int)
+    for own, *given in reversed(numbers):
+        for n in given:
+            ahead[n] = max(ahead[n], ahead[own] + 1)
+    return [lines[k] for k in sorted(range(len(lines)), key=lambda k: -ahead[numbers[k][0]])]
 
 
 def _mixed(mixture: Mixture, writer: Writer) -> str:
@@ -107,6 +122,13 @@ class _Writer(Writer):
             low, high, then, otherwise = (self.value(a) for a in step.arguments)
             return f"select({otherwise}, {then}, {low} <= {high})"
         return super().step(step)
+
+
+def _together(lines: Sequence[str]) -> list[str]:
+    """The same declarations of floats in fewer statements."""
+    names = [line.strip().removeprefix("float ").removesuffix(";") for line in lines]
+    parts = (names[k : k + _TOGETHER] for k in range(0, len(names), _TOGETHER))
+    return ["    float " + ",\n      ".join(part) + ";" for part in parts]
 
 
 def _plain(text: str) -> str:

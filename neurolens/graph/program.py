@@ -7,7 +7,7 @@ program (one table, unless several wavelengths are fixed), so that all tables sh
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
 from typing import Any, TypeVar
@@ -245,6 +245,8 @@ class Program:
             chosen = {bool(low <= high) for low, high in zip(given[0].literal, given[1].literal, strict=True)}
             if len(chosen) == 1:
                 return given[2 if chosen.pop() else 3]
+        if kind == "select" and given[2].argument == given[3].argument:
+            return given[2]
         if kind == "fma":
             a, b, c = given
             if c.is_literal(0):
@@ -288,42 +290,55 @@ class Program:
                     stack += missing[::-1]
                 else:
                     order[stack.pop()] = None
-        place = {k: n for n, k in enumerate(order)}
-
-        def moved(argument: Argument) -> Argument:
-            return place[argument] if isinstance(argument, int) else argument
-
-        found = Program(self.tables, mixture=self.mixture, own_tables=self.own_tables)
-        for step in (self.steps[k] for k in order):
-            found._append(replace(step, arguments=tuple(moved(a) for a in step.arguments)))
-        found.outputs = {name: Expr(found, moved(e.argument)) for name, e in self.outputs.items()}
-        return found
+        return self._rewritten(order=order)
 
     def with_shorter_sums(self, parts: int = 3, least: int = 8) -> Program:
         """The same program but for rounding: sums of at least so many products in parts, for one that is added up in
         turn keeps a core waiting after every product."""
-        found, place = Program(self.tables, mixture=self.mixture, own_tables=self.own_tables), dict[int, Expr]()
         totals: dict[int, list[Expr]] = {}
         sums = self._sums(least)
+
+        def shorter(k: int, step: Step, given: Sequence[Expr]) -> Expr | None:
+            if k not in sums:
+                return None
+            (last, number), (a, b, before) = sums[k], given
+            total = totals.setdefault(last, [])
+            if number == 0:
+                total.append(a.program.fma(a, b, before))
+            elif number < parts:
+                total.append(a * b)
+            else:
+                total[number % parts] = a.program.fma(a, b, total[number % parts])
+            return reduce(Expr.__add__, total) if k == last else total[-1]
+
+        return self._rewritten(shorter)
+
+    def with_shared_inverses(self) -> Program:
+        """The same program but for rounding: of several numbers that are divided by the same, one division."""
+        live = [self.steps[k] for k in self.live()]
+        uses = Counter(step.arguments[1] for step in live if step.kind == "div")
+
+        def shared(k: int, step: Step, given: Sequence[Expr]) -> Expr | None:
+            if step.kind != "div" or uses[step.arguments[1]] < 2 or not isinstance(step.arguments[1], int):
+                return None  # one over a number that differs between tables could not be mixed
+            return given[0] * given[1].program.op("div", 1.0, given[1])
+
+        return self._rewritten(shared)
+
+    def _rewritten(
+        self, rule: Callable[[int, Step, Sequence[Expr]], Expr | None] | None = None, order: Iterable[int] = ()
+    ) -> Program:
+        """The same program in another order of its live steps, or with others in place of some: what a rule makes of a
+        step's number, itself and what is in place of its arguments, or None."""
+        found, place = Program(self.tables, mixture=self.mixture, own_tables=self.own_tables), dict[int, Expr]()
 
         def moved(argument: Argument) -> Expr:
             return place[argument] if isinstance(argument, int) else Expr(found, argument)
 
-        for k in self.live():
-            step = self.steps[k]
-            if k not in sums:
-                place[k] = found._append(replace(step, arguments=tuple(moved(a).argument for a in step.arguments)))
-                continue
-            (last, number), a, b = sums[k], moved(step.arguments[0]), moved(step.arguments[1])
-            total = totals.setdefault(last, [])
-            if number == 0:
-                total.append(found.fma(a, b, moved(step.arguments[2])))
-            elif number < parts:
-                total.append(a * b)
-            else:
-                total[number % parts] = found.fma(a, b, total[number % parts])
-            if k == last:
-                place[k] = reduce(Expr.__add__, total)
+        for k in order or self.live():
+            step, given = self.steps[k], [moved(a) for a in self.steps[k].arguments]
+            other = rule(k, step, given) if rule else None
+            place[k] = other or found._append(replace(step, arguments=tuple(e.argument for e in given)))
         found.outputs = {name: moved(e.argument) for name, e in self.outputs.items()}
         return found
 

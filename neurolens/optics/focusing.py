@@ -27,7 +27,7 @@ from neurolens.optics.trace import trace
 
 
 def monotone(x: Sequence[float], rows: Sequence[Sequence[float]], place: float) -> list[float]:
-    """Values [M] at a place between rows of values [R][M] at ascending places x [R]: a row's own at its place.
+    """Values [M] at a place between rows of values [R, M] at ascending places x [R]: a row's own at its place.
 
     Of two rows linear, else piecewise cubic with the derivatives of Fritsch and Butland (1984), "A method for
     constructing local monotone piecewise cubic interpolants": a value stays between those of its two rows, so that no

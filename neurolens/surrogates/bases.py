@@ -84,11 +84,22 @@ def vector_gram(
     Formed from rho, sigma and tau, since (m p).(m' u) = m m' sigma: the long columns are never stored.
     """
     rho, sigma, tau, _ = field.invariants()
-    pp, pu, uu = ((features * s) @ features.T for s in (rho, sigma, tau))
+    pp, pu, uu = (_products(features, s) for s in (rho, sigma, tau))
     gram = torch.cat([torch.cat([pp, pu], 1), torch.cat([pu, uu], 1)])
     along_p, along_u = ((outputs * v).sum(1) for v in (field.p, field.u))
     moments = torch.cat([features @ along_p.T, features @ along_u.T])
     return gram.numpy(), moments.numpy()
+
+
+def _products(features: Tensor, weights: Tensor) -> Tensor:
+    """[M, M] sums over rays of features [M, N] times each other, weighted by [N]: symmetric, a third is not summed."""
+    found = features.new_empty((len(features), len(features)))
+    size = -(-len(features) // 3)
+    for start in range(0, len(features), max(size, 1)):
+        rows = slice(start, start + size)
+        part = (features[rows] * weights) @ features[start:].T
+        found[rows, start:], found[start:, rows] = part, part.T
+    return found
 
 
 def solve(columns: Tensor, outputs: Tensor, weights: Tensor | None = None) -> Tensor:

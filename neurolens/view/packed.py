@@ -12,12 +12,15 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from neurolens.graph.osl import urgent
+
 # Of 91 characters two hold 13 bits; none ends an element of HTML, begins an entity or an escape.
 CHARACTERS = "".join(chr(code) for code in range(33, 127) if chr(code) not in "&<\\")
 FILTERS = [
     {"id": lzma.FILTER_LZMA1, "preset": 9 | lzma.PRESET_EXTREME, "dict_size": 1 << 22, "lc": 3, "lp": 0, "pb": 0}
 ]
 _TEMPORARY = re.compile(r"\bt(\d+)\b")
+_STEPS = re.compile(r"(?:^    float t\d+ = .*\n)+", re.M)
 _UNTOLD = re.compile(r"\x01|\bt\d+-")  # what `_counted` could not give back
 
 
@@ -28,15 +31,24 @@ def packed(data: bytes) -> str:
     return np.array(list(CHARACTERS))[np.stack(np.divmod(values, len(CHARACTERS)), 1)].tobytes().decode("utf-32-le")
 
 
-def packed_parts(parts: Iterable[tuple[str, str | bytes]]) -> tuple[str, list[tuple[str, int, int, bool]]]:
-    """The stream of named parts, and of each its name, place and bytes there, and whether temporaries are counted."""
+def packed_parts(parts: Iterable[tuple[str, str | bytes]]) -> tuple[str, list[tuple[str, int, int, int]]]:
+    """The stream of named parts, and of each its name, place and bytes there, and how it is told: 0 as it is, 1 with
+    temporaries counted, 2 in their turn, too, where it has its steps by `urgent`."""
     data, found = b"", []
     for name, part in parts:
-        counted = isinstance(part, str) and not _UNTOLD.search(part)
-        told = part if isinstance(part, bytes) else (_counted(part) if counted else part).encode()
-        found.append((name, len(data), len(told), counted))
-        data += told
+        how = int(isinstance(part, str) and not _UNTOLD.search(part))
+        if isinstance(part, str):
+            in_turn = _STEPS.sub(lambda steps: "".join(sorted(steps[0].splitlines(True), key=_own)), part)
+            if how and in_turn != part == _STEPS.sub(lambda steps: "".join(urgent(steps[0].splitlines(True))), in_turn):
+                how, part = 2, in_turn
+            part = (_counted(part) if how else part).encode()
+        found.append((name, len(data), len(part), how))
+        data += part
     return packed(data), found
+
+
+def _own(line: str) -> int:
+    return int(_TEMPORARY.findall(line)[0])
 
 
 def _counted(text: str) -> str:

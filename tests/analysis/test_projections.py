@@ -74,6 +74,17 @@ def test_there_and_back_and_derivatives(kind: str) -> None:
     assert centre.tolist() == pytest.approx([959.5, 539.5])
 
 
+@pytest.mark.parametrize("kind", NAMES)
+def test_gradients_flow_back_through_unproject(kind: str) -> None:
+    """Pixel to direction to pixel is no change, so the product of both derivatives is 1: on the axis, too."""
+    found = example(kind)
+    pixel = found.project(rays(0.95 * found.widest_rad, 60)).requires_grad_()
+    direction = found.unproject(pixel)
+    rows = [torch.autograd.grad(direction[:, k].sum(), pixel, retain_graph=True)[0] for k in range(3)]
+    product = found.jacobian(direction.detach()) @ torch.stack(rows, 1)
+    assert float((product - torch.eye(2, dtype=torch.float64)).abs().max()) < 1e-6
+
+
 @pytest.mark.parametrize("kind", ["opencv", "opencv-rational", "kannala-brandt"])
 def test_opencv_projects_to_the_same_pixels(kind: str, tmp_path: Path) -> None:
     """Its own functions, with the numbers that its FileStorage reads from our file."""

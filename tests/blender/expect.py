@@ -1,6 +1,7 @@
 """What Blender must show, by neurolens's exact lenses: python tests/blender/expect.py FOLDER.
 
-Blender's Python cannot run neurolens. This writes shots.json, numbers for test_optics.py, and the shaders named there.
+Blender's Python cannot run neurolens. This writes shots.json, numbers for test_optics.py, the shaders named there, and
+maps of `neurolens stmap`.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from neurolens.base.progress import Progress
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.sampling import stratified
+from neurolens.cli import main as command_line
 from neurolens.commands.blender_lenses import form_of
 
 _SIDE = 512  # rays of a point: this squared
@@ -171,13 +173,14 @@ def white_card(lens: Lens, f_number: float) -> dict[str, Any]:
     """Film values of white surroundings in parts of the picture, 1 on the axis."""
     made = lens.camera(5.0, f_number)
     columns, rows = _CARD
+    wide, high = lens.film_mm[0], lens.film_mm[0] * rows / columns
     square, wavelength = stratified(_CARD_SIDE, _LIGHT_NM)
     inside = np.random.default_rng(5).random(square.shape)
     values = np.zeros((rows, columns))
     for row in range(rows):
         for column in range(columns):
             u, v = (column + inside[0]) / columns, (row + inside[1]) / rows
-            film = np.stack([(0.5 - u) * lens.film_mm[0], (0.5 - v) * lens.film_mm[1]]).astype(np.float32)
+            film = np.stack([(0.5 - u) * wide, (0.5 - v) * high]).astype(np.float32)
             values[row, column] = made.sample(film, square, wavelength).weight.mean(dtype=np.float64)
     picture = Picture(lens, 64, 5.0, f_number)
     return {"name": "card", **picture.settings(), "height": 36, "found": values.tolist()}
@@ -207,6 +210,8 @@ def main(folder: Path) -> None:
             shots += grid(LENSES["zoom"], zoom_mm, 4.0)
         shots += grid(LENSES["inside"])
         shots += [white_card(LENSES["rectilinear"], 1.83), white_card(LENSES["anamorphic"], 2.8)]
+        shots += [white_card(LENSES["fisheye"], 2.8)]
+    command_line(["stmap", _GAUSS, "--size", "120x68", "--film", "36x20.4", "-o", str(folder / "maps"), "--quiet"])
     (folder / "shots.json").write_text(json.dumps(shots, indent=1), encoding="utf-8")
 
 

@@ -22,6 +22,7 @@ from neurolens.commands import blender_lenses  # noqa: E402
 from neurolens.commands.blender_lenses import thumbnail  # noqa: E402
 from neurolens.evaluate.shaders import Shader  # noqa: E402
 from neurolens.optics.lensfile import read_lens  # noqa: E402
+from neurolens.optics.paraxial import first_order  # noqa: E402
 from neurolens.render.film import FORKS  # noqa: E402
 
 LENS = "laikin_double_gauss_50"
@@ -93,6 +94,34 @@ def test_lenses_that_cannot_be_shaders_are_left_out_and_said(place: Path, capsys
     assert json.loads(told)["lenses"] == {"absorbs": ["ols-36"]} and ABSORBS in said
 
 
+def test_a_lens_of_glass_that_absorbs_goes_in_bare_and_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The text is a stand-in; whether the lens is refused is asked of the real code."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr("neurolens.cameras.osl.osl_lens", lambda *given: pytest.fail("no shader is to be made"))
+    refused = failed(capsys, "add", "lenses/edmund_asphere_30.toml", "--to", tmp_path / "user")
+    assert "glass that absorbs" in refused and "--bare leaves them out" in refused
+    asked = []
+
+    def written(file: Path, *, zoom: str | None = None, as_bare: str = "", quiet: bool = False) -> Shader:
+        asked.append(as_bare)
+        return Shader("camera", "text", 1, (), {}, 6.0, 1.8, 0.7)
+
+    for slow in ("thumbnail", "field_table"):
+        monkeypatch.setattr(blender_lenses, slow, lambda *given: None)
+    monkeypatch.setattr(blender_lenses, "shader_of", written)
+    for lens in ("edmund_asphere_30", LENS):
+        given = ["add", f"lenses/{lens}.toml", "--bare", "--to", str(tmp_path / "user"), "--quiet"]
+        assert main(["blender", *given]) == 0
+    absorbs, bare = json.loads((tmp_path / "user" / "lenses.json").read_text())["lenses"]
+    told = "In this form: coatings and absorption left out"
+    assert absorbs["variants"][0]["notes"] == [told] and bare["variants"][0]["notes"] == []
+    assert asked == [f"{told}.", ""]
+    capsys.readouterr()
+    assert "expected a lens file" in failed(capsys, "add", f"models/{LENS}.ols-36.onnx", "--bare", "--to", tmp_path)
+
+
 def test_bad_input_is_one_line(
     place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -105,13 +134,19 @@ def test_bad_input_is_one_line(
     assert "no Blender of this machine" in failed(capsys, "add", models / f"{LENS}.ols-36.onnx")
     assert "(missing)" in failed(capsys, "add", place / "no.onnx", "--to", place / "user")
     (place / "a.txt").write_text("x")
+    (place / "a.zip").write_text("no zip")
+    with monkeypatch.context() as early:
+        early.setattr(blender_lenses, "form_of", lambda *given, **options: pytest.fail("no shader is to be made"))
+        for to, expected in (("a.zip", "a zip that `neurolens blender build` wrote"), ("a.txt", "or a folder")):
+            assert expected in failed(capsys, "add", models / f"{LENS}.ols-36.onnx", "--to", place / to)
     assert "a model (.onnx) or a lens file" in failed(capsys, "add", place / "a.txt", "--to", place / "user")
     assert not out.exists() and not (place / "user").exists()
 
 
 def test_a_second_build_makes_no_shader_again(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given = ["blender", "build", "--models", str(place / "models"), "--jobs", "1", "--quiet", "-o"]
-    stand_in, asked = blender_lenses.shader_of, []
+    stand_in, field_table, asked, fields = blender_lenses.shader_of, blender_lenses.field_table, [], []
+    monkeypatch.setattr(blender_lenses, "field_table", lambda *given: fields.append(1) or field_table(*given))
 
     def counted(file: Path, **options: Any) -> Shader:
         asked.append(file.suffix)
@@ -125,7 +160,7 @@ def test_a_second_build_makes_no_shader_again(place: Path, monkeypatch: pytest.M
     stops = False
     for name in ("a.zip", "b.zip"):
         assert main([*given, str(place / name)]) == 0
-    assert asked == [".toml", ".toml", ".onnx", ".onnx"]
+    assert asked == [".toml", ".toml", ".onnx", ".onnx"] and len(fields) == 1
     assert (place / "a.zip").read_bytes() == (place / "b.zip").read_bytes()
     with (place / "lenses" / f"{LENS}.toml").open("a", encoding="utf-8") as lens_file:
         lens_file.write("# another file\n")
@@ -177,6 +212,20 @@ def test_a_squeezed_picture_is_said_of_its_lens(place: Path) -> None:
         [note] = blender_lenses.form_of(Path(file)).notes
         assert "squeezed 1.98 times across" in note and "Aspect Y of 1.98" in note
     assert blender_lenses.form_of(place / "models" / f"{LENS}.ols-36.onnx").notes == []
+
+
+def test_models_of_one_state_have_the_section_of_that_state_and_ranges_their_name() -> None:
+    for model, efl in (
+        ("ogawa_zoom_70_200-135mm.ols-60", 134.95),
+        ("muller_fisheye_100-14mm.ols-40", 14.0),
+        ("nikon_zoom_70_200-range.states-64", 71.5),
+    ):
+        file = Path(f"models/{model}.onnx")
+        lens = blender_lenses.stated_lens(file, Path("lenses"))
+        assert lens is not None and first_order(lens).efl_mm == pytest.approx(efl, rel=1e-3)
+        packed = blender_lenses.packed_of([file], [])
+        assert packed.name.endswith(", any zoom") == ("range" in model)
+    assert blender_lenses.stated_lens(file, Path("models")) is None
 
 
 def test_thumbnails_show_the_lens() -> None:

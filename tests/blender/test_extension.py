@@ -309,7 +309,7 @@ def test_what_cannot_be_is_one_sentence_and_changes_nothing(scene: Any) -> None:
         assert "The focus object 'nose' is 0.5 m away, nearer than the lens focuses: 0.7 m" in said(**gauss)
         assert everything(scene) == before
     scene.camera = near
-    assert "'nose' is a empty, not a camera" in said(**gauss)
+    assert "'nose' is not a camera, but of type EMPTY" in said(**gauss)
     scene.camera = None
     assert "The scene has no camera" in said(**gauss)
     with pytest.raises(RuntimeError, match="no camera"):

@@ -127,6 +127,17 @@ def test_refusals_and_notes_are_sentences() -> None:
     assert library.refusals(variant(), setting(focus_m=math.inf)) == []
 
 
+def test_shift_is_told_where_it_counts_another_side_or_leaves_the_picture() -> None:
+    """As Cycles has it; `test_optics` holds that it does."""
+    small = {"sensor_mm": (24.0, 12.0)}
+    assert library.notes(variant(), setting(**small, shift=(0.1, 0.0), shift_side_mm=24.0)) == []
+    [line] = library.notes(variant(), setting(**small, shift=(0.1, 0.1), shift_side_mm=24.0))
+    assert line == "Shift Y counts heights here: for what 0.1 does in Blender's own camera, set 0.2"
+    assert library.notes(variant(), setting(shift_side_mm=36.0)) == []
+    [line] = library.notes(variant(), setting(shift=(0.1, 0.0), shift_side_mm=36.0))
+    assert "24.71 mm from the axis; the lens's picture ends at 21.6 mm" in line  # hypot(0.6 * 36, 12)
+
+
 def test_error_in_pixels_of_the_render() -> None:
     assert library.error_px(variant(rms_um=5.0), setting()) == pytest.approx(0.5)
     assert library.error_px(variant(rms_um=None), setting()) is None

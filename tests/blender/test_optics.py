@@ -172,7 +172,7 @@ def test_focus_is_pulled_by_keyframes(studio: Studio) -> None:
     assert max(map(abs, wide)) < 0.03
 
 
-@pytest.mark.parametrize("lens", ["rectilinear", "anamorphic"])
+@pytest.mark.parametrize("lens", ["rectilinear", "anamorphic", "fisheye"])
 def test_white_card_is_that_of_the_exact_lens(studio: Studio, lens: str) -> None:
     [shot] = named("card", lens)
     studio.world.default_value, studio.light.hide_render = (1, 1, 1, 1), True
@@ -191,3 +191,78 @@ def test_exact_shader_shows_what_the_model_does(studio: Studio) -> None:
     for shot in named("grid", "rectilinear")[:3]:
         seen, wanted = (np.array(m["centroid_px"]) for m in (studio.measured({**shot, "lens": "exact"}), shot["found"]))
         assert np.hypot(*(seen[0] - wanted[0])) < 0.1
+
+
+def test_shift_counts_widths_and_heights_where_blenders_own_camera_counts_the_longer_side(studio: Studio) -> None:
+    """What the panel says of it; the picture of a point on the axis moves so."""
+    shot = {**named("grid", "rectilinear")[4], "width": 160, "height": 90, "point_m": [0, 0, -2.0], "radius_m": 0.02}
+    del shot["crop"]
+    data, found = studio.camera.data, []
+    try:
+        for data.shift_x, data.shift_y in ((0.0, 0.0), (0.1, 0.0), (0.0, 0.1)):
+            found.append(measures(studio.picture(shot, 64), (0, 0))["centroid_px"][0])
+        assert np.array(found) == pytest.approx(np.array([[80, 45], [64, 45], [80, 36]]), abs=0.1)
+        data.type = "PERSP"  # 0.1 of 160 pixels
+        assert measures(studio.picture(shot, 64), (0, 0))["centroid_px"][0] == pytest.approx([80, 29], abs=0.1)
+    finally:
+        data.type, data.shift_x, data.shift_y = "CUSTOM", 0.0, 0.0
+
+
+def test_map_uv_reads_st_maps_as_they_are_written(studio: Studio) -> None:
+    """A picture of its own pixels' places, led through both maps, holds what the maps say."""
+    for kind, other in (("undistort", "redistort"), ("redistort", "undistort")):
+        (map_, planes), (_, read) = (pixels_of(Path(str(FOLDER)) / f"maps.{k}.exr") for k in (kind, other))
+        height, width = read.shape[:2]
+        rows, columns = np.mgrid[:height, :width].astype(np.float32)
+        places = bpy.data.images.new("places", width, height, float_buffer=True)
+        places.colorspace_settings.name = "Non-Color"
+        places.pixels.foreach_set(np.stack([columns, rows, 0 * rows, 0 * rows + 1], 2).ravel())
+        places.filepath_raw, places.file_format = str(studio.folder / "places.exr"), "OPEN_EXR"
+        places.save()
+        found, reach = composited(studio, places, map_, planes.shape[1], planes.shape[0])
+        x, y = planes[..., 0] * width - 0.5, planes[..., 1] * height - 0.5
+        inside = (planes[..., 2] > 0) & (x > 0) & (x < width - 1) & (y > 0) & (y < height - 1)
+        assert inside.mean() > 0.85
+        assert np.abs(found[..., :2] - np.stack([x, y], 2))[inside].max() < reach
+        assert not found[planes[..., 2] == 0].any()  # what the plate does not hold is clear
+
+
+def pixels_of(file: Path) -> tuple[Any, Any]:
+    """A picture, and its pixels [H, W, 4], the lowest row first."""
+    image = bpy.data.images.load(str(file))
+    image.colorspace_settings.name = "Non-Color"
+    found = np.empty(image.size[0] * image.size[1] * 4, np.float32)
+    image.pixels.foreach_get(found)
+    return image, found.reshape(image.size[1], image.size[0], 4).astype(float)
+
+
+def composited(studio: Studio, picture: Any, map_: Any, width: int, height: int) -> Any:
+    """A picture through Blender's Map UV, the lowest row first, and how far from a place it may read, in pixels."""
+    scene = studio.scene
+    if hasattr(scene, "compositing_node_group"):  # from Blender 5.0
+        tree = bpy.data.node_groups.new("maps", "CompositorNodeTree")
+        tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+        scene.compositing_node_group = tree
+    else:
+        scene.use_nodes = True
+        tree = scene.node_tree
+        tree.nodes.clear()
+    image, uv = (tree.nodes.new("CompositorNodeImage") for _ in range(2))
+    image.image, uv.image = picture, map_
+    node = tree.nodes.new("CompositorNodeMapUV")
+    bilinear = "Interpolation" in node.inputs
+    if bilinear:
+        node.inputs["Interpolation"].default_value = "Bilinear"
+    else:
+        node.filter_type = "NEAREST"
+    out = tree.nodes.new("NodeGroupOutput" if hasattr(scene, "compositing_node_group") else "CompositorNodeComposite")
+    tree.links.new(image.outputs["Image"], node.inputs["Image"])
+    tree.links.new(uv.outputs["Image"], node.inputs["UV"])
+    tree.links.new(node.outputs[0], out.inputs[0])
+    render = scene.render
+    render.resolution_x, render.resolution_y, render.use_border = width, height, False
+    scene.cycles.samples, render.filepath = 1, str(studio.folder / "mapped.exr")
+    render.image_settings.color_mode = "RGBA"
+    scene.view_settings.view_transform = "Raw"
+    bpy.ops.render.render(write_still=True)
+    return pixels_of(Path(render.filepath))[1], 0.001 if bilinear else 0.501

@@ -19,10 +19,12 @@ from neurolens.cameras.pupil_arcs import PupilArcs, unit_disc
 from neurolens.cameras.pupil_circles import PupilCircles
 from neurolens.cameras.pupil_sight import Sight
 from neurolens.cli import main
+from neurolens.evaluate import shaders
 from neurolens.evaluate.shaders import _smallest, exact_lens
 from neurolens.graph import lowtests
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
+from neurolens.graph.osl import write_osl
 from neurolens.graph.passes import pruned
 from neurolens.graph.scalars import lower
 from neurolens.optics.apertures import Aperture
@@ -517,6 +519,18 @@ def test_the_text_is_osl() -> None:
     assert used <= known
 
 
+def test_a_long_program_has_fewer_statements_than_the_compiler_takes() -> None:
+    """10,000 in a block: its parser's stack. Of a lens of aspheres there are more steps."""
+    g = Graph()
+    x = g.input("raster_x", 1)
+    for k in range(12_000):
+        x = x * (1 + k / 7e4) + 1.0
+    for output in osl.OUTPUTS:
+        g.outputs[output] = g.concat(x, x, x)
+    text = write_osl(lower(g), "long", [], [], "", osl.OUTPUTS)
+    assert text.count(" = ") > 12_000 and text.count(";") < 1000
+
+
 def test_command_line_writes_a_shader_and_refuses_what_is_its_input(tmp_path, monkeypatch, capsys) -> None:
     made = lens()
     monkeypatch.setattr(osl, "model_lens", lambda *given, fixed: made)
@@ -529,3 +543,8 @@ def test_command_line_writes_a_shader_and_refuses_what_is_its_input(tmp_path, mo
         other = tmp_path / "other.osl"
         assert main(["export", str(MODEL), "--to", "osl", "-o", str(other), *wrong]) == 2
         assert "neurolens" in capsys.readouterr().err and not other.exists()
+    monkeypatch.setattr(shaders, "MAX_STEPS", 100)
+    assert main(["export", str(MODEL), "--to", "osl", "-o", str(tmp_path / "long.osl")]) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert MODEL.name in said and "up to 100: a model of the lens is smaller" in said
+    assert not (tmp_path / "long.osl").exists()

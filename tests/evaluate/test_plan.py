@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import get_args
 
@@ -31,7 +32,7 @@ from neurolens.evaluate.footprints import (
     places_of,
 )
 from neurolens.evaluate.plan import Target, candidates, decided, plan
-from neurolens.evaluate.probe import effects_of, probe
+from neurolens.evaluate.probe import Probed, effects_of, probe
 from neurolens.evaluate.scenes import seen_depths_m
 from neurolens.evaluate.shaders import lens_of
 from neurolens.optics.apertures import Aperture
@@ -217,9 +218,14 @@ def test_noise_of_weights_is_how_many_times_the_rays_it_takes() -> None:
     assert math.isinf(noise(np.zeros((2, 2, 8)), share))
 
 
+@cache
+def garden() -> Probed:
+    return probe(load_scene(Path("experiments/scenes/garden.toml")), read_lens(GAUSS).at(), across=6)
+
+
 def test_what_is_cheapest_differs_by_target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Blender's own thin lens costs less than any shader; in our renderer a small polynomial costs less than it."""
-    found = probe(load_scene(Path("experiments/scenes/garden.toml")), read_lens(GAUSS).at(), across=6)
+    found = garden()
     monkeypatch.setattr(planned, "_TERMS", (8,))
     targets: tuple[Target, ...] = ("render", "osl")
     best = {t: decided(found, candidates(found, (1.0,), t, folder=tmp_path), 1.0, t).best for t in targets}
@@ -229,7 +235,7 @@ def test_what_is_cheapest_differs_by_target(tmp_path: Path, monkeypatch: pytest.
 
 def test_shaders_cost_what_cycles_took() -> None:
     """The exact lens against the time measured, and 1.08 times the rays: the luminance of its wavelengths' colours."""
-    found = probe(load_scene(Path("experiments/scenes/garden.toml")), read_lens(GAUSS).at(), across=6)
+    found = garden()
     lens = lens_of(Path(GAUSS), None, lambda done, left=None: None)[1]
     asked = found.asked
     ns, times = shader_cost(lens, found.places, asked.film_mm, asked.f_number, asked.focus_m)

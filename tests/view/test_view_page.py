@@ -21,6 +21,7 @@ from neurolens.cli import main
 from neurolens.commands import view as view_command
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
+from neurolens.graph.osl import urgent
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
@@ -134,13 +135,17 @@ CODE = """\
 
 @pytest.mark.skipif(not NODE, reason="no node")
 def test_parts_are_unpacked_as_they_were() -> None:
-    """Code, and texts that counting could not give back; bytes that nothing shortens."""
+    """Code, its steps in turn and as shaders have them, and texts that counting could not give back; bytes that nothing
+    shortens."""
+    steps = [f"    float t{k} = {said};\n" for k, said in enumerate(("x * y", "x * x", "t1 * t1", "t2 * t0"))]
+    in_turn, shader = (f"float x = 1.0;\n{''.join(lines)}P = t3;\n" for lines in (steps, urgent(steps)))
+    assert shader.index("t1 =") < shader.index("t0 =")
     noise = np.random.default_rng(0).integers(0, 256, 3000).astype(np.uint8).tobytes()
     parts = {"c": CODE, "bytes": noise, "none": "", "less": f"{CODE}t2-1 t1\n", "mark": f"{CODE}\x01\n"}
-    parts |= {"again": noise + b"x"}
+    parts |= {"again": noise + b"x", "in turn": in_turn, "shader": shader}
     text, index = packed.packed_parts(parts.items())
     assert len(text) < 1.25 * len(noise) + 900
-    assert [counted for *_, counted in index] == [True, False, True, False, False, False]
+    assert [how for *_, how in index] == [2, 0, 1, 0, 0, 0, 1, 2]
     script = f"""{(pages.FOLDER / "packed.js").read_text(encoding="utf-8")}
 globalThis.document = {{ getElementById: () => ({{ textContent: {json.dumps(text)} }}) }};
 const lens = {{ stream: ["a", {sum(index[-1][1:3])}], parts: {json.dumps(index)} }};

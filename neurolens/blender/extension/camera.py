@@ -35,7 +35,7 @@ def camera_of(context: Any) -> Any:
     if found is None:
         raise LensError("The scene has no camera: add one (Add > Camera), and make it the scene's")
     if found.type != "CAMERA":
-        raise LensError(f"The scene's camera {found.name!r} is a {found.type.lower()}, not a camera")
+        raise LensError(f"The scene's camera {found.name!r} is not a camera, but of type {found.type}")
     if found.data.library is not None:
         raise LensError(f"The camera {found.name!r} is linked from another file: make it local first")
     return found
@@ -54,12 +54,16 @@ def setting_of(scene: Any, found: Any) -> Setting:
     own = float(custom["focus_m"]) if "focus_m" in custom else 0.0  # of the shader; above 0 it rules
     off = applied(camera) and not camera.dof.use_dof  # putting a lens on switches it on
     focus = own if own > 0 else None if off else focus_m(found)
+    sensor = sensor_mm(camera, render)
+    side = {"HORIZONTAL": sensor[0], "VERTICAL": sensor[1]}.get(camera.sensor_fit, max(sensor))
     return Setting(
-        sensor_mm=sensor_mm(camera, render),
+        sensor_mm=sensor,
         pixels=max(1, round(render.resolution_x * render.resolution_percentage / 100)),
         focus_m=focus,
         focus_object="" if own > 0 or camera.dof.focus_object is None else camera.dof.focus_object.name,
         f_number=f_number,
+        shift=(camera.shift_x, camera.shift_y),
+        shift_side_mm=side,
         unit_m=scene.unit_settings.scale_length if scene.unit_settings.system != "NONE" else 1.0,
         on_gpu=_on_other_gpu(scene),
     )

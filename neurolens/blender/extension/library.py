@@ -177,6 +177,7 @@ class Setting:
         sensor_mm: width and height that are exposed. pixels: of the picture's width, as rendered.
         focus_m: distance in focus; None where depth of field is off. focus_object: its name, "" for a distance.
         f_number: None where the shader's own.
+        shift, shift_side_mm: Blender's, and the side that its own camera counts it in.
         unit_m: metres a unit of the scene. on_gpu: whether a GPU that cannot run OSL cameras is chosen.
     """
 
@@ -185,6 +186,8 @@ class Setting:
     focus_m: float | None
     focus_object: str = ""
     f_number: float | None = None
+    shift: tuple[float, float] = (0.0, 0.0)
+    shift_side_mm: float = 0.0
     unit_m: float = 1.0
     on_gpu: bool = False
 
@@ -240,6 +243,14 @@ def notes(variant: Variant, setting: Setting) -> list[str]:
         found.append("Depth of field is off: the lens is focused at infinity")
     if setting.unit_m != 1.0:
         found.append(f"A unit of this scene is {setting.unit_m:g} m; the lens takes it for 1 m")
+    for axis, shift, side, name in zip("XY", setting.shift, setting.sensor_mm, ("widths", "heights"), strict=True):
+        if shift and not math.isclose(side, setting.shift_side_mm, rel_tol=1e-3):  # so Cycles has it
+            same = f"set {shift * setting.shift_side_mm / side:.4g}"
+            found.append(f"Shift {axis} counts {name} here: for what {shift:.4g} does in Blender's own camera, {same}")
+    corner = math.hypot(*(side * (0.5 + abs(s)) for side, s in zip(setting.sensor_mm, setting.shift, strict=True)))
+    if any(setting.shift) and corner > BEYOND * variant.film_radius_mm:
+        reach = f"{corner:.4g} mm from the axis; the lens's picture ends at {variant.film_radius_mm:.4g} mm"
+        found.append(f"The shift takes a corner to {reach}: it is black there")
     if setting.on_gpu:
         found.append("OSL cameras run on the CPU, or on a GPU by OptiX")
     error = error_px(variant, setting)

@@ -54,7 +54,8 @@ class Sweep:
     @staticmethod
     def of_columns(columns: Tensor, outputs: Tensor) -> Sweep:
         """Of columns [M, N] and outputs [R, N]."""
-        return Sweep((columns @ columns.T).numpy(), (columns @ outputs.T).numpy(), (outputs**2).sum(1).numpy())
+        own = columns.numpy()
+        return Sweep(own @ own.T, (columns @ outputs.T).numpy(), (outputs**2).sum(1).numpy())  # numpy sums half of it
 
     @staticmethod
     def of_vectors(features: Tensor, field: LightField, outputs: Tensor) -> Sweep:
@@ -126,8 +127,8 @@ class Sweep:
 
     def _sweep(self, k: int, sign: float) -> None:
         t = self._table
-        pivot, row = t[k, k], t[k].copy()
-        t -= np.outer(t[:, k], row) / pivot
+        pivot, row, column = t[k, k], t[k].copy(), t[:, k].copy()
+        torch.from_numpy(t).addr_(torch.from_numpy(column), torch.from_numpy(row), alpha=-1.0 / pivot)  # in place
         t[k] = row / pivot * sign
         t[:, k] = t[k]
         t[k, k] = -1.0 / pivot

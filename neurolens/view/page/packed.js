@@ -144,12 +144,19 @@ function written(text) {
   }).join("\n");
 }
 
+/** Steps by urgent() of graph/osl.py: first those from which the longest chain of others leads on. */
+function urgent(steps) {
+  const lines = steps.split("\n").slice(0, -1), numbers = lines.map((line) => line.match(/\bt\d+\b/g)), ahead = new Map(), of = (n) => ahead.get(n) ?? 0;
+  for (const [own, ...given] of [...numbers].reverse()) for (const n of given) ahead.set(n, Math.max(of(n), of(own) + 1));
+  return lines.map((_, k) => k).sort((a, b) => of(numbers[b][0]) - of(numbers[a][0])).map((k) => lines[k] + "\n").join("");
+}
+
 const streams = new Map(), textOf = (bytes) => new TextDecoder().decode(bytes), jsonOf = (lens, name) => JSON.parse(textOf(partOf(lens, name)));
 
 /** A part of a lens: bytes, or the text of code. */
 function partOf({ stream: [id, length], parts }, name) {
   if (!streams.has(id)) streams.set(id, new Unpacked(document.getElementById(id).textContent, length));
-  const [, from, bytes, counted] = parts.find(([part]) => part === name);
+  const [, from, bytes, how] = parts.find(([part]) => part === name);
   const found = streams.get(id).upTo(from + bytes).slice(from, from + bytes);
-  return counted ? written(textOf(found)) : found;
+  return how === 2 ? written(textOf(found)).replace(/(?:^    float t\d+ = .*\n)+/gm, urgent) : how ? written(textOf(found)) : found;
 }
