@@ -154,7 +154,7 @@ class OslLens:
 
     def passing(self) -> dict[float, float]:
         """Share of the samples that pass, in the worst state, by shares of the widest stop."""
-        if not self.between and len(self.nodes) == 1:
+        if not self.axes:
             return passing(self.nodes[0].sight, self.nodes[0].arcs)
         first, *others = (c.arcs for c in self.nodes if isinstance(c.arcs, PupilArcs))  # as all of several states are
         seen = [(np.eye(len(self.nodes))[k], c.sight) for k, c in enumerate(self.nodes)]
@@ -336,10 +336,8 @@ def _samples(sight: Sight, arcs: PupilArcs | PupilCircles, count: int = 32768) -
     film = radius * np.stack([np.cos(angle), np.sin(angle)])
     stop = sight.stop_radius_mm * rng.uniform(0.2, 1.6, (1, count)).clip(max=1)
     given = {"film_mm": film, "square": rng.random((2, count)), "stop_radius_mm": stop}
-    given |= {
-        "film_z_mm": rng.uniform(*sight.film_z_mm, (1, count)),
-        "wavelength_nm": rng.uniform(*sight.wavelength_nm, (1, count)),
-    }
+    given["film_z_mm"] = rng.uniform(*sight.film_z_mm, (1, count))
+    given["wavelength_nm"] = rng.uniform(*sight.wavelength_nm, (1, count))
     pupil = evaluate(arcs.graph, given)
     given |= {"rays": np.concatenate([film, pupil["pupil_mm"], given["wavelength_nm"]]), "at_stop": pupil["at_stop"]}
     return {k: given[k].astype(np.float32) for k in ("rays", "film_z_mm", "stop_radius_mm", "at_stop")}
@@ -355,12 +353,8 @@ def _per_exposure(camera: OslCamera) -> Array:
     for z in places:
         for share in (0.1, 0.3, 0.5, 0.7, 0.85, 1.0):
             per_distance = 1 / (z - camera.pupil_z_mm)
-            call = {
-                "film_z_mm": z,
-                "stop_radius_mm": share * sight.stop_radius_mm,
-                "per_distance": per_distance,
-                "scale": per_distance**2,
-            }
+            call = {"film_z_mm": z, "stop_radius_mm": share * sight.stop_radius_mm}
+            call |= {"per_distance": per_distance, "scale": per_distance**2}
             given: dict[str, Any] = {k: np.array([[v]]) for k, v in call.items()}
             given |= {"film_mm": np.zeros_like(square), "square": square, "wavelength_nm": nanometres[None]}
             given |= evaluate(camera.arcs.graph, given)

@@ -6,7 +6,7 @@ y^2 = H(x) that meets the x axis at right angles. So does their intersection, wh
 (X, Y) -> (middle + half width X, Y sqrt(H / (1 - X^2))): neighbours stay neighbours, and densities stay nearly even.
 
 Nothing here is a table: in a renderer's shader a table costs more than all of this. `pupil_outline` is the closer fit
-at one stop and focus.
+at one stop and focus, `pupil_circles` that of lenses whose pupils no such arcs hold closely.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from neurolens.cameras.arcs_passing import passing
 from neurolens.cameras.pupil_boxes import asking, end_of_light
 from neurolens.cameras.pupil_circles import PupilCircles
 from neurolens.cameras.pupil_sight import Sight
-from neurolens.cameras.stop_image import draw_rays, stop_image
+from neurolens.cameras.stop_image import StopImage, draw_rays, stop_image
 from neurolens.graph.interpret import evaluate
 
 Array = NDArray[np.float64]
@@ -28,6 +28,7 @@ _STOPS = (0.08, 0.16, 0.25, 0.35, 0.5, 0.7, 0.85, 1.0, 1.0, 1.0)  # of the wides
 _AROUND, _FOLD = 1.1, 0.25  # stops: where rays are drawn; of the pupil's size: beside it are others
 # Most powers of the film point, of anamorphic lenses and round ones; of terms with the film position and its square.
 _DEGREE, _MOVING = (4, 8), (3, 1)
+_FOLDED = 0.01  # of rays, that are beside it, from which on circles cannot hold a pupil
 _RARE = 0.006  # of rays, that a rim blocks, from which on it has a circle
 _ZONES, _FEW = (8, 3, 3), 2500  # of film radius squared, azimuth and stop; rays that tell of one
 _ALL = int(np.prod(_ZONES))
@@ -58,9 +59,10 @@ class _Rays:
 
 
 def fit_circles(sight: Sight, report: Report) -> tuple[PupilCircles, float] | None:
-    """The circles of a lens, and the share of rays of the worst zone that they lose; None where too few rays pass."""
+    """The circles of a lens, and the share of rays of the worst zone that they lose; None where too few rays pass, or
+    where the pupil folds."""
     image = stop_image(sight)
-    if image is None:
+    if image is None or (folded := _folded(sight, image)) > _FOLDED:
         return None
     seen = replace(sight, graph=image.before(sight.graph, sight.anamorphic))
     exponents, numbers = _exponents(sight.anamorphic), np.zeros((0, 3, 0))
@@ -70,7 +72,7 @@ def fit_circles(sight: Sight, report: Report) -> tuple[PupilCircles, float] | No
     circles = _written(circles, exponents, _rims(sight, few, many, circles, exponents, report))
     for seed, held in enumerate(_HELD):
         circles = _held(circles, _drawn(seen, circles, 4 + seed, _CHECKED), held)
-        if (lost := _lost(sight, seen, circles)) <= _LOST:
+        if (lost := max(_lost(seen, circles), folded)) <= _LOST:
             break
     ways = [replace(circles, squeeze=s) for s in (_SQUEEZES if sight.anamorphic and len(circles.numbers) else (1.0,))]
     return max(ways, key=lambda way: passing(sight, way)[1.0]) if len(ways) > 1 else circles, lost
@@ -235,15 +237,19 @@ def _features(rays: _Rays, circles: PupilCircles, exponents: NDArray[np.int64], 
     return rows
 
 
-def _lost(sight: Sight, seen: Sight, circles: PupilCircles) -> float:
-    """Share of random rays that pass beyond the circles, in the worst zone, or, in the worst part of the film, through
-    pupil points that are no image of the stop's: where a pupil folds."""
+def _lost(seen: Sight, circles: PupilCircles) -> float:
+    """Share of random rays that pass beyond the circles, in the worst zone."""
     rays = _drawn(seen, circles, 2, _CHECKED)
     out = rays.passed & (evaluate(circles.checked, rays.given)["within"] < 0).any(0)
     counts, missed = (np.bincount(rays.zone[own], minlength=_ALL) for own in (rays.passed, out))
+    return float((missed / np.maximum(counts, _FEW)).max())
+
+
+def _folded(sight: Sight, image: StopImage) -> float:
+    """Share of random rays that pass through pupil points which the image does not have, in the worst part of the film:
+    where a pupil folds, two of its points show one point of the stop."""
     film, z, nm, pupil, point = draw_rays(sight, None, np.random.default_rng(5))
     given = {"film_mm": film, "point_mm": point, "film_z_mm": z[None], "wavelength_nm": nm[None]}
-    away = np.hypot(*(evaluate(circles.image.graph, given)["pupil_mm"] - pupil))
-    part = np.minimum(np.square(film).sum(0) / circles.film_radius_mm**2 * _ZONES[0], _ZONES[0] - 1).astype(np.intp)
-    total, folded = (np.bincount(part[own], minlength=_ZONES[0]) for own in (away >= 0, away > _FOLD * pupil.std()))
-    return float(max((missed / np.maximum(counts, _FEW)).max(), (folded / np.maximum(total, _FEW)).max()))
+    away = np.hypot(*(evaluate(image.graph, given)["pupil_mm"] - pupil)) > _FOLD * pupil.std()
+    part = (np.square(film).sum(0) / sight.film_radius_mm**2 * _ZONES[0]).astype(np.intp)
+    return float((np.bincount(part, away) / np.maximum(np.bincount(part), _FEW)).max())

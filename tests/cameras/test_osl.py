@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from camera_helpers import FILM, GAUSS, ROOT
 
-from neurolens.cameras import osl, pupil_arcs_fit, pupil_arcs_tune, pupil_circles_fit
+from neurolens.cameras import osl, pupil_arcs_fit, pupil_arcs_tune, pupil_circles_fit, stop_image
 from neurolens.cameras.arcs_passing import passing
 from neurolens.cameras.blades import Blades
 from neurolens.cameras.model import OnnxCamera
@@ -255,7 +255,8 @@ def test_pupils_of_high_order_pass_and_keep_the_light(name: str, least: float) -
 @pytest.mark.parametrize(
     "name, share",
     [
-        ("schneider_anamorphic_31.ols-64", 1.0),
+        ("muller_fisheye_100.ols-64", 1.0),
+        pytest.param("schneider_anamorphic_31.ols-64", 1.0, marks=pytest.mark.slow),
         pytest.param("cooke_anamorphic_42.ols-64", 0.5, marks=pytest.mark.slow),
         pytest.param("laikin_double_gauss_127.ols-64", 1.0, marks=pytest.mark.slow),
     ],
@@ -277,10 +278,11 @@ def test_circles_lose_no_light_in_any_zone_of_the_film(name: str, share: float) 
     assert min(passing(sight, circles).values()) >= 0.95
 
 
-def test_a_pupil_that_folds_is_told() -> None:
+def test_a_pupil_that_folds_has_no_circles(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of this biconvex lens two parts of the pupil plane lead to one point of the stop: no image has both."""
+    monkeypatch.setattr(stop_image, "_TERMS", ((12, 24), (12, 24)))
     sight = osl._seen(load_model(ROOT / "models" / "thorlabs_lb1471_biconvex_50.ols-64.onnx"), None).sight
-    assert pupil_circles_fit.fit_circles(sight, lambda share: None)[1] > 0.1
+    assert pupil_circles_fit.fit_circles(sight, lambda share: None) is None
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5])
