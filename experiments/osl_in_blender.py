@@ -25,7 +25,8 @@ _LIGHTS = ((1.0, 0.62, 0.25), (0.3, 0.75, 1.0), (1.0, 0.2, 0.25), (0.45, 1.0, 0.
 def main(plan_file: str, result_file: str) -> None:
     """Run the plan; prints the share that is done, and what is wrong with a shader."""
     # On one core Blender starts no threads beside its renderer's: idle ones spin, and their time would count.
-    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    if hasattr(os, "sched_setaffinity"):  # of Linux
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     bpy = _blender()
     plan, found = json.loads(Path(plan_file).read_text(encoding="utf-8")), {}
     shots = plan.get("shots", [])
