@@ -256,7 +256,6 @@ def test_pupils_of_high_order_pass_and_keep_the_light(name: str, least: float) -
     "name, share",
     [
         ("muller_fisheye_100.ols-64", 1.0),
-        pytest.param("schneider_anamorphic_31.ols-64", 1.0, marks=pytest.mark.slow),
         pytest.param("cooke_anamorphic_42.ols-64", 0.5, marks=pytest.mark.slow),
         pytest.param("laikin_double_gauss_127.ols-64", 1.0, marks=pytest.mark.slow),
     ],
