@@ -17,7 +17,7 @@ from neurolens.graph.c import Writer, literal, steps_of
 from neurolens.graph.program import Mixture, Program, Step
 
 _LOOKUP = "{table}[{width} * clamp(int({index}), 0, {cells} - 1) + {place}]"
-_TEMPORARY = re.compile(r"\bt(\d+)\b")
+TEMPORARY = re.compile(r"\bt(\d+)\b")
 _SUFFIX = re.compile(r"(\d\.?(?:e[+-]\d+)?)f\b")
 _STATEMENTS, _TOGETHER = 9000, 64  # the compiler of OSL takes 10,000; numbers that a statement of more declares
 _KINDS = {"position": "point", "throughput": "color"}
@@ -92,7 +92,7 @@ def write_osl(
 def urgent(lines: Sequence[str]) -> list[str]:
     """Lines `float tN = ...;`, first those from which the longest chain of others leads on, so that few wait for one
     another: compilers of shaders, which make no vectors of them, keep much of the order they are given."""
-    numbers = [[int(n) for n in _TEMPORARY.findall(line)] for line in lines]
+    numbers = [[int(n) for n in TEMPORARY.findall(line)] for line in lines]
     ahead: defaultdict[int, int] = defaultdict(int)
     for own, *given in reversed(numbers):
         for n in given:
@@ -109,7 +109,7 @@ def _mixed(mixture: Mixture, writer: Writer) -> str:
     for k, row in enumerate(rows):
         terms = (f"{literal(v)} * {name}" for v, name in zip(row, names, strict=True) if v)
         text += f"\n    float c{k} = {' + '.join(terms) or '0.0'};"
-    return re.sub(r"\bt(\d+)\b", r"s\1", _plain(text)) + "\n"
+    return TEMPORARY.sub(r"s\1", _plain(text)) + "\n"
 
 
 class _Writer(Writer):

@@ -12,14 +12,13 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from neurolens.graph.osl import urgent
+from neurolens.graph.osl import TEMPORARY, urgent
 
 # Of 91 characters two hold 13 bits; none ends an element of HTML, begins an entity or an escape.
 CHARACTERS = "".join(chr(code) for code in range(33, 127) if chr(code) not in "&<\\")
 FILTERS = [
     {"id": lzma.FILTER_LZMA1, "preset": 9 | lzma.PRESET_EXTREME, "dict_size": 1 << 22, "lc": 3, "lp": 0, "pb": 0}
 ]
-_TEMPORARY = re.compile(r"\bt(\d+)\b")
 _STEPS = re.compile(r"(?:^    float t\d+ = .*\n)+", re.M)
 _UNTOLD = re.compile(r"\x01|\bt\d+-")  # what `_counted` could not give back
 
@@ -48,17 +47,17 @@ def packed_parts(parts: Iterable[tuple[str, str | bytes]]) -> tuple[str, list[tu
 
 
 def _own(line: str) -> int:
-    return int(_TEMPORARY.findall(line)[0])
+    return int(TEMPORARY.findall(line)[0])
 
 
 def _counted(text: str) -> str:
     """Each line's first temporary counted from that of the line before (one more is not said), others back from it."""
     before, lines = 0, []
     for line in text.split("\n"):
-        numbers = [int(n) for n in _TEMPORARY.findall(line)]
+        numbers = [int(n) for n in TEMPORARY.findall(line)]
         if numbers:
             steps = [numbers[0] - before, *(numbers[0] - n for n in numbers[1:])]
-            between, before = _TEMPORARY.split(line)[::2], numbers[0]
+            between, before = TEMPORARY.split(line)[::2], numbers[0]
             line = between[0] + "".join(
                 f"\x01{'' if step == 1 else step}{text}" for step, text in zip(steps, between[1:], strict=True)
             )

@@ -253,28 +253,28 @@ def test_pupils_of_high_order_pass_and_keep_the_light(name: str, least: float) -
 
 
 @pytest.mark.parametrize(
-    "name, share",
+    "name",
     [
-        ("muller_fisheye_100.ols-64", 1.0),
-        pytest.param("cooke_anamorphic_42.ols-64", 0.5, marks=pytest.mark.slow),
-        pytest.param("laikin_double_gauss_127.ols-64", 1.0, marks=pytest.mark.slow),
+        "muller_fisheye_100.ols-64",
+        pytest.param("cooke_anamorphic_42.ols-64", marks=pytest.mark.slow),
+        pytest.param("laikin_double_gauss_127.ols-64", marks=pytest.mark.slow),
     ],
 )
-def test_circles_lose_no_light_in_any_zone_of_the_film(name: str, share: float) -> None:
-    """Random rays from all over the film through a box that holds the pupil: all but 1 in 1000 of those that pass, and
-    95 of 100 of the samples pass."""
+def test_circles_lose_no_light_in_any_zone_of_the_film(name: str) -> None:
+    """Random rays from all over the film through a box that holds the pupil, the stop open and half: all but 1 in 1000
+    of those that pass, and 95 of 100 of the samples pass."""
     sight = osl._seen(load_model(ROOT / "models" / f"{name}.onnx"), None).sight
     circles, lost = pupil_circles_fit.fit_circles(sight, lambda share: None)
+    assert lost <= 1e-3 and min(passing(sight, circles).values()) >= 0.95
     low, high, half = sight.table.rows
-    reach = (0.4 + 0.6 * share) * float(np.abs([low, high, half])[:, low <= high].max())
-    counts, missed = missed_by_zone(sight, circles, reach, share)
-    if not sight.anamorphic:
-        counts, missed = (row.reshape(5, 4).sum(1) for row in (counts, missed))
-    assert (counts > 1000).all()
-    assert (missed <= 1e-3 * counts + 3 * np.sqrt(1e-3 * counts)).all()
-    assert missed.sum() <= 4e-4 * counts.sum()
-    assert lost <= 1.5e-3
-    assert min(passing(sight, circles).values()) >= 0.95
+    for share in (1.0, 0.5):
+        reach = (0.4 + 0.6 * share) * float(np.abs([low, high, half])[:, low <= high].max())
+        counts, missed = (row.reshape(5, 4) for row in missed_by_zone(sight, circles, reach, share))
+        # All sides of a round lens are the same, of others those that mirrors bring together.
+        counts, missed = (row + row[:, ::-1] if sight.anamorphic else row.sum(1) for row in (counts, missed))
+        assert (counts > 2000).all()
+        # Few rays tell of a zone near the axis: cooke's loses 0.8 in 1000 of 68,000 rays, and of 5,800 by chance 1.04.
+        assert (missed <= 1e-3 * counts + 3 * np.sqrt(1e-3 * counts)).all() and missed.sum() <= 4e-4 * counts.sum()
 
 
 def test_a_pupil_that_folds_has_no_circles(monkeypatch: pytest.MonkeyPatch) -> None:
