@@ -1,5 +1,6 @@
 """Tasks on a cluster of Dask: the answers of one machine, bit for bit, whatever happens to workers and scheduler."""
 
+import gc
 import io
 import json
 import os
@@ -24,7 +25,7 @@ from neurolens.cli import main
 from neurolens.commands.farm import packed, unpack
 from neurolens.render.pictures import read_channels
 
-pytest.importorskip("distributed", reason="needs the extra dask")
+Client = pytest.importorskip("distributed", reason="needs the extra dask").Client
 
 ROOT = Path(__file__).parents[1]
 CLUSTER = """
@@ -134,6 +135,7 @@ def test_no_such_scheduler(capsys: pytest.CaptureFixture[str], scene: Path, monk
         capsys, "render", scene, "--camera", "thin", "-o", scene.with_name("a.exr"), "--quiet", "--dask", "x"
     )
     assert line.startswith("neurolens: --dask x: ") and "expected tcp://HOST:PORT" in line
+    assert all(c.status == "closed" for c in gc.get_objects() if type(c) is Client)  # none is left to the collector
     options = ("--dask", "local", "--tile", "1/2")
     assert "--tile: got (1, 2), expected left out beside --dask" in failure(
         capsys, "render", scene, "--camera", "thin", "-o", scene.with_name("a.exr"), *options

@@ -176,6 +176,7 @@ class _Cluster:
 
     def __init__(self, distributed: Any, address: str) -> None:
         self._distributed, self._address = distributed, address
+        self._client: Any = None
         self._local: Any = None
 
     def __enter__(self) -> Any:
@@ -187,16 +188,20 @@ class _Cluster:
                     n_workers=int(count or _cores()), threads_per_worker=1, dashboard_address=None,
                     silence_logs=logging.CRITICAL, memory_limit=0,
                 )  # fmt: skip
-            self._client = self._distributed.Client(self._local or self._address, timeout=_TIMEOUT)
+            # At hand before it starts, for one that fails to must be closed: found by the collector amid the start of
+            # the next one, whose lock it wants, it stops both.
+            self._client = self._distributed.Client.__new__(self._distributed.Client)
+            self._client.__init__(self._local or self._address, timeout=_TIMEOUT)
         except (OSError, ValueError) as error:
+            self.__exit__()
             expected = "tcp://HOST:PORT of a scheduler that runs, local, or local:N"
             raise NeurolensError(f"--dask {self._address}: {_line(str(error))}; expected {expected}") from None
         return self._client
 
     def __exit__(self, *_: object) -> None:
-        self._client.close(timeout=2)
-        if self._local is not None:
-            self._local.close(timeout=5)
+        for each, timeout_s in ((self._client, 2), (self._local, 5)):
+            with suppress(Exception):  # every answer is here: a scheduler that is slow to say good-bye spoils none
+                each.close(timeout=timeout_s)
 
 
 def _cores() -> int:

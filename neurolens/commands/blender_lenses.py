@@ -153,7 +153,8 @@ def packed_of(
     if first.suffix == ".onnx":
         told = _card(first)
         card, ranged = told["lens"], zoom in (None, RANGE) and "zoom" in _axes(told)
-        name, efl, f_number, source = card["name"], card["efl_mm"], card["f_number"], str(card.get("source") or "")
+        name, efl, f_number = card["name"], card["efl_mm"], card["f_number"]
+        source = str(card.get("source") or "") if lens is None else lens.source  # which may be told better since
         name = f"{name}, any zoom" if ranged else name
     else:
         from neurolens.optics.lensfile import read_lens
