@@ -18,11 +18,12 @@ from neurolens.base import status as st
 from neurolens.base.progress import Report
 from neurolens.cameras.arcs_passing import passing
 from neurolens.cameras.pupil_arcs import PupilArcs
+from neurolens.cameras.pupil_fold import NUMBERS, fold_margins
 from neurolens.cameras.pupil_sight import Sight, Truths, turned
 from neurolens.graph.interpret import evaluate
 
 Array = NDArray[np.float64]
-_RAYS = 90_000  # random ones, of an anamorphic lens twice as many
+_RAYS = 90_000  # random ones, of an anamorphic lens and of a stop that folds twice as many
 # Of the root of the film radius (exposure is of the axis), stop and azimuth; rays that tell of one.
 _ZONES, _FEW = (8, 3, 3), 400
 _ALL = int(np.prod(_ZONES)) + _ZONES[0]  # and of film radius alone, for the others
@@ -50,7 +51,7 @@ class _Rays:
     Attributes:
         monomials: [M, N] of `PupilArcs.exponents`. x, y: in the frame of the film point.
         passed, of_stop: what becomes of them: the stop blocks them. zone: see `zones_of`. unit: half the
-            pupil's width.
+            pupil's width. size: of the stop, in its widest radii.
     """
 
     monomials: Array
@@ -60,6 +61,7 @@ class _Rays:
     of_stop: Truths
     zone: NDArray[np.intp]
     unit: Array
+    size: Array
 
     def shares(self, these: Truths) -> Array:
         """[Z] of rays that pass in each zone."""
@@ -71,8 +73,11 @@ class _Rays:
         return np.stack([self.margins(own, side)[0] for own, side in zip(numbers, sides, strict=True)])
 
     def margins(self, numbers: Array, side: int) -> tuple[Array, list[Array | None], Array]:
-        """How far rays lie within an arc [4, M], in half widths of the pupil, and its slopes by the arc's four."""
-        low, high, first, change = numbers @ self.monomials
+        """How far rays lie within an arc [4 or 7, M], in half widths of the pupil; its slopes by these, times a scale;
+        the scale."""
+        if side == 0 and len(numbers) == NUMBERS:
+            return fold_margins(numbers @ self.monomials, self.x, self.y, self.size)
+        low, high, first, change = numbers[:4] @ self.monomials
         left, right, by_low, by_high = self.x - low, high - self.x, None, None
         if side == 0:
             away, wide = left, first + change * left
@@ -84,7 +89,8 @@ class _Rays:
             by_low, by_high = (None, slope) if side > 0 else (-slope, None)
         along = sum(-row for row in (by_low, by_high) if row is not None)
         scale = (np.hypot(along, 2 * self.y) + 1e-9) * self.unit
-        return np.minimum((height - self.y**2) / scale, ends / self.unit), [by_low, by_high, reach, reach * away], scale
+        by = [by_low, by_high, reach, reach * away] + [None] * (len(numbers) - 4)
+        return np.minimum((height - self.y**2) / scale, ends / self.unit), by, scale
 
 
 def moved(
@@ -135,6 +141,9 @@ def _wider(arcs: PupilArcs, rays: dict[str, Array], margin: float, half_mm: floa
     """The arcs, moved outwards by a share of half the pupil's width."""
     numbers, changes = arcs.numbers.copy(), evaluate(arcs.checked, rays)["change"].min(1)
     for own, side, change in zip(numbers, arcs.sides, changes, strict=True):
+        if not side and arcs.folds:
+            own[:3], own[4:] = own[:3] * (1 - margin), own[4:] * (1 - margin) ** 2
+            continue
         step = margin * half_mm * (_RIMS if side else 1.0)
         still, along = ((arcs.exponents == (0, power, 0, 0, 0)).all(1) for power in (0, int(side == 0)))
         own[0] -= step * along * (side <= 0)
@@ -211,7 +220,7 @@ def _stepped(
 
 def _drawn(sight: Sight, arcs: PupilArcs, seed: int) -> _Rays:
     rng = np.random.default_rng(100 + seed)
-    given, stop, codes = random_rays(sight, arcs, rng, _RAYS, near=True)
+    given, stop, codes = random_rays(sight, arcs, rng, _RAYS * (1 + arcs.folds), near=True)
     scaled = scaled_of(arcs, given, stop)
     monomials = np.ones((len(arcs.exponents), stop.size))
     for row, powers in zip(monomials, arcs.exponents, strict=True):
@@ -223,7 +232,7 @@ def _drawn(sight: Sight, arcs: PupilArcs, seed: int) -> _Rays:
     if not passed.any():
         passed[0] = True
     unit = np.maximum(scaled[1], _SMALLEST) * float(np.abs(y[passed]).max())
-    return _Rays(monomials, x, y, passed, of_stop, zones_of(arcs, given, scaled, passed), unit)
+    return _Rays(monomials, x, y, passed, of_stop, zones_of(arcs, given, scaled, passed), unit, scaled[1])
 
 
 def scaled_of(arcs: PupilArcs, rays: dict[str, Array], stop: Array) -> Array:
