@@ -48,7 +48,7 @@ class PupilArcs:
         sides: [A] of an arc: 1 of a rim that ends the light on the film point's side, -1 on the other, 0 on both; the
             row of an end that it has not is 0.
 
-    Of a stop whose image folds `numbers` are [A, 7, M]: those of `Fold`, then of rims, with 0 after their four.
+    Of a stop whose image folds `numbers` are [A, 8, M]: those of `Fold`, then of rims, with 0 after their four.
     """
 
     film_radius_mm: float

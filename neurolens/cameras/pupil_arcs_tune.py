@@ -23,7 +23,7 @@ from neurolens.cameras.pupil_sight import Sight, Truths, turned
 from neurolens.graph.interpret import evaluate
 
 Array = NDArray[np.float64]
-_RAYS = 90_000  # random ones, of an anamorphic lens and of a stop that folds twice as many
+_RAYS = 90_000  # random ones, of an anamorphic lens twice as many, to fit a stop that folds three times
 # Of the root of the film radius (exposure is of the axis), stop and azimuth; rays that tell of one.
 _ZONES, _FEW = (8, 3, 3), 400
 _ALL = int(np.prod(_ZONES)) + _ZONES[0]  # and of film radius alone, for the others
@@ -73,7 +73,7 @@ class _Rays:
         return np.stack([self.margins(own, side)[0] for own, side in zip(numbers, sides, strict=True)])
 
     def margins(self, numbers: Array, side: int) -> tuple[Array, list[Array | None], Array]:
-        """How far rays lie within an arc [4 or 7, M], in half widths of the pupil; its slopes by these, times a scale;
+        """How far rays lie within an arc [4 or 8, M], in half widths of the pupil; its slopes by these, times a scale;
         the scale."""
         if side == 0 and len(numbers) == NUMBERS:
             return fold_margins(numbers @ self.monomials, self.x, self.y, self.size)
@@ -142,7 +142,7 @@ def _wider(arcs: PupilArcs, rays: dict[str, Array], margin: float, half_mm: floa
     numbers, changes = arcs.numbers.copy(), evaluate(arcs.checked, rays)["change"].min(1)
     for own, side, change in zip(numbers, arcs.sides, changes, strict=True):
         if not side and arcs.folds:
-            own[:3], own[4:] = own[:3] * (1 - margin), own[4:] * (1 - margin) ** 2
+            own[:3], own[5:] = own[:3] * (1 - margin), own[5:] * (1 - margin) ** 2
             continue
         step = margin * half_mm * (_RIMS if side else 1.0)
         still, along = ((arcs.exponents == (0, power, 0, 0, 0)).all(1) for power in (0, int(side == 0)))
@@ -220,7 +220,7 @@ def _stepped(
 
 def _drawn(sight: Sight, arcs: PupilArcs, seed: int) -> _Rays:
     rng = np.random.default_rng(100 + seed)
-    given, stop, codes = random_rays(sight, arcs, rng, _RAYS * (1 + arcs.folds), near=True)
+    given, stop, codes = random_rays(sight, arcs, rng, _RAYS * (1 + 2 * arcs.folds), near=True)
     scaled = scaled_of(arcs, given, stop)
     monomials = np.ones((len(arcs.exponents), stop.size))
     for row, powers in zip(monomials, arcs.exponents, strict=True):

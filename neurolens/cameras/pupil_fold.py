@@ -1,9 +1,9 @@
 """The image of a stop that folds in the pupil: far off the axis of simple lenses, two parts of the pupil show one part
 of the stop.
 
-Along x the place in the stop rises to a peak and falls again, steeply: s = (a + b x + c x^2) / (1 + d x), in the stop's
-widest radii. A stop of radius r ends where s^2 + y^2 (e + f x + g x^2) = r^2, whatever it is: no number of the seven
-depends on it. Its ends along x are roots: s = -r at both, or, before the image folds, s = r at the high one.
+Along x the place in the stop rises to a peak and falls again, steeply: s = (a + b x + c x^2) / (1 + d x + e x^2), in
+the stop's widest radii. A stop of radius r ends where s^2 + y^2 (f + g x + h x^2) = r^2, whatever it is: no number of
+the eight depends on it. Its ends along x are roots: s = -r at both, or, before the image folds, s = r at the high one.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from neurolens.graph.ir import Value
 Array = NDArray[np.float64]
 # Which share of a way from a point of the stop its blades leave.
 Opening = Callable[[Value, Value], Value]
-NUMBERS = 7
-LEAST, _SMALL = 0.02, 1e-9  # of 1 + d x: beyond lies the pole; of what is divided by
+NUMBERS = 8
+LEAST, _SMALL = 0.02, 1e-9  # of 1 + d x + e x^2: beyond lies the pole; of what is divided by
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class Fold:
     """Such an image of a film point, in place of an `Arc`.
 
     Attributes:
-        low, high: its ends, mm. unfolded: whether s = r at the high one. size: of the stop. slope: -c times the
-            distance of 0 from the end where it has folded. numbers: the seven.
+        low, high: its ends, mm. unfolded: whether s = r at the high one. size: of the stop. slope, bend: s + r is
+            (slope + bend x) / (1 + d x + e x^2) times the distance from the low end. numbers: the eight.
     """
 
     low: Value
@@ -37,34 +37,34 @@ class Fold:
     unfolded: Value
     size: Value
     slope: Value
+    bend: Value
     numbers: Sequence[Value]
 
     @staticmethod
     def of(numbers: Sequence[Value], size: Value, rim: Value) -> Fold:
-        """Of the seven numbers; rim: where light ends at the latest."""
-        a, b, c, d, *_ = numbers
+        """Of the eight numbers; rim: where light ends at the latest."""
+        a, b, c, d, e, *_ = numbers
 
-        def root(r: Value) -> tuple[Value, Value]:
-            """Discriminant of the places where s = -r, and -c times the high one."""
-            way = b + d * r
-            square = way * way - c * (a + r) * 4.0
-            return square, ((way + square.maximum(0.0).sqrt()) * 0.5).maximum(_SMALL)
+        def roots(r: Value) -> tuple[Value, Value, Value, Value, Value]:
+            """Discriminant of the places where s = -r, slope and bend there, and the low and high one."""
+            bend, way = c + e * r, b + d * r
+            square = way * way - bend * (a + r) * 4.0
+            slope = ((way + square.maximum(0.0).sqrt()) * 0.5).maximum(_SMALL)
+            return square, slope, bend, -(a + r) / slope, slope / (-bend).maximum(_SMALL)
 
-        (_, slope), (square, other) = root(size), root(-size)
-        bent = 1.0 / (-c).maximum(_SMALL)
-        unfolded = (-square <= 0.0) & (rim <= other * bent)
-        high = slope.graph.select(unfolded, (size - a) / other, slope * bent)
-        return Fold(-(a + size) / slope, high.minimum(rim), unfolded, size, slope, numbers)
+        (_, slope, bend, low, folded), (square, _, _, high, again) = roots(size), roots(-size)
+        unfolded = (-square <= 0.0) & (rim <= again)
+        return Fold(low, low.graph.select(unfolded, high, folded).minimum(rim), unfolded, size, slope, bend, numbers)
 
     @property
     def first(self) -> Value:
         """What y^2 is multiplied by: at x = 0."""
-        return self.numbers[4]
+        return self.numbers[5]
 
     @property
     def change(self) -> Value:
         """Its slope there."""
-        return self.numbers[5]
+        return self.numbers[6]
 
     def height(self, left: Value | None, right: Value | None) -> Value:
         """y^2 at a distance from the low end."""
@@ -83,19 +83,20 @@ class Fold:
 
     def _above(self, left: Value, x: Value) -> Value:
         """s + r."""
-        return left * (self.slope + self.numbers[2] * x) / (self.numbers[3] * x + 1.0).maximum(LEAST)
+        _, _, _, d, e, *_ = self.numbers
+        return left * (self.slope + self.bend * x) / ((e * x + d) * x + 1.0).maximum(LEAST)
 
     def _wide(self, x: Value) -> Value:
-        e, f, g = self.numbers[4:]
-        return ((g * x + f) * x + e).maximum(_SMALL)
+        f, g, h = self.numbers[5:]
+        return ((h * x + g) * x + f).maximum(_SMALL)
 
 
 def fold_margins(rows: Array, x: Array, y: Array, size: Array) -> tuple[Array, list[Array | None], Array]:
-    """How far points lie within images of these numbers [7, N], about in the stops' radii; its slopes by these, times
+    """How far points lie within images of these numbers [8, N], about in the stops' radii; its slopes by these, times
     the scale; the scale."""
-    a, b, c, d, e, f, g = rows
-    inverse = 1 / np.maximum(1 + d * x, LEAST)
+    a, b, c, d, e, f, g, h = rows
+    inverse = 1 / np.maximum(1 + (d + e * x) * x, LEAST)
     along = (a + (b + c * x) * x) * inverse
     scale, by, wide = 2 * size**2, -2 * along * inverse, y**2
-    within = (size**2 - along**2 - wide * (e + (f + g * x) * x)) / scale
-    return within, [by, by * x, by * x**2, -by * along * x, -wide, -wide * x, -wide * x**2], scale
+    within, bent = (size**2 - along**2 - wide * (f + (g + h * x) * x)) / scale, -by * along * x
+    return within, [by, by * x, by * x**2, bent, bent * x, -wide, -wide * x, -wide * x**2], scale

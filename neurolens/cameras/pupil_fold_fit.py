@@ -34,7 +34,7 @@ def folded(arcs: PupilArcs, sight: Sight) -> PupilArcs:
 
 
 def _numbers(monomials: Array, few: NDArray[np.bool_], pupil: Array, point: Array) -> Array:
-    """[7, M]: numbers of rays through pupil points [2, N] and points of the stop in its widest radii; least squares.
+    """[8, M]: numbers of rays through pupil points [2, N] and points of the stop in its widest radii; least squares.
 
     Args:
         monomials: [M, N]; `few` of them are those of the numbers that tell of y.
@@ -42,13 +42,13 @@ def _numbers(monomials: Array, few: NDArray[np.bool_], pupil: Array, point: Arra
     x, y = pupil
     along, reach = point[0] * np.sign(x @ point[0]), np.hypot(*point)  # an image may be upside down
     weight, own = 1 / (_MIDDLE + reach), monomials[few]
-    rows = np.concatenate([monomials, monomials * x, monomials * x**2, -monomials * x * along, own * y**2])
-    numbers = np.zeros((NUMBERS, len(monomials)))
-    numbers[:4] = _solved(rows * weight, along * weight)[: 4 * len(monomials)].reshape(4, -1)
-    a, b, c, d = numbers[:4] @ monomials
-    centred = (a + (b + c * x) * x) / np.maximum(1 + d * x, LEAST)
+    factors, numbers = (x**0, x, x**2, -x * along, -(x**2) * along), np.zeros((NUMBERS, len(monomials)))
+    rows = np.concatenate([*(monomials * factor for factor in factors), own * y**2])
+    numbers[:5] = _solved(rows * weight, along * weight)[: 5 * len(monomials)].reshape(5, -1)
+    a, b, c, d, e = numbers[:5] @ monomials
+    centred = (a + (b + c * x) * x) / np.maximum(1 + (d + e * x) * x, LEAST)
     rows = np.concatenate([own, own * x, own * x**2]) * y**2
-    numbers[4:, few] = _solved(rows * weight**2, (reach**2 - centred**2) * weight**2).reshape(3, -1)
+    numbers[5:, few] = _solved(rows * weight**2, (reach**2 - centred**2) * weight**2).reshape(3, -1)
     return numbers
 
 

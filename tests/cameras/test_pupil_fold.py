@@ -12,18 +12,18 @@ RIM = 12.0  # mm from the axis
 
 
 def fold(peak: float) -> np.ndarray:
-    """Seven numbers of a stop's place that rises from -1 at -10 mm to a peak within 6 mm, in the widest radii."""
-    c, d = -0.012, -0.08
-    a, b = 0.0, 0.1
+    """Eight numbers of a stop's place that rises to about a peak within 6 mm of the axis, in the widest radii."""
+    b, c, d, e = 0.1, -0.012, -0.08, -0.001
     x = np.linspace(-10, 10, 2001)
-    return np.array([a + peak - float(np.max((a + (b + c * x) * x) / (1 + d * x))), b, c, d, 0.006, 1e-5, 2e-6])
+    a = peak - float(np.max((b + c * x) * x / (1 + (d + e * x) * x)))
+    return np.array([a, b, c, d, e, 0.006, 1e-5, 2e-6])
 
 
 def arcs(peak: float) -> PupilArcs:
-    """With a rim of this radius on the film point's side."""
-    numbers = np.zeros((2, 7, 1))
-    numbers[0, :, 0], numbers[1, :4, 0] = fold(peak), (0.0, RIM, 2 * RIM, -1.0)
-    return PupilArcs(10.0, 10.0, (50.0, 5.0), 8.0, (4.0, 2.0), numbers, np.zeros((1, 5), np.int64), (0, 1))
+    """With a rim of this radius, seen from both sides."""
+    numbers = np.zeros((3, 8, 1))
+    numbers[0, :, 0], numbers[1:, :4, 0] = fold(peak), ((0.0, RIM, 2 * RIM, -1.0), (-RIM, 0.0, 2 * RIM, -1.0))
+    return PupilArcs(10.0, 10.0, (50.0, 5.0), 8.0, (4.0, 2.0), numbers, np.zeros((1, 5), np.int64), (0, 1, -1))
 
 
 def margins(peak: float, pupil: np.ndarray, share: float) -> np.ndarray:
@@ -70,8 +70,8 @@ def test_slopes_of_margins_are_those_of_differences() -> None:
 def test_numbers_are_found_of_rays_upright_or_upside_down() -> None:
     rng, wanted = np.random.default_rng(5), fold(0.3)
     x, y = pupil = np.stack([rng.uniform(-8, 5, 4000), rng.uniform(-3, 3, 4000)])
-    a, b, c, d, e, f, g = wanted
-    along, wide = (a + (b + c * x) * x) / (1 + d * x), np.sqrt(e + (f + g * x) * x)
+    a, b, c, d, e, f, g, h = wanted
+    along, wide = (a + (b + c * x) * x) / (1 + (d + e * x) * x), np.sqrt(f + (g + h * x) * x)
     for side in (1.0, -1.0):
         found = _numbers(np.ones((1, x.size)), np.ones(1, bool), pupil, side * np.stack([along, y * wide]))
         np.testing.assert_allclose(found[:, 0], wanted, rtol=1e-4, atol=1e-7)
