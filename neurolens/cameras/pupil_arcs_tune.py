@@ -34,10 +34,11 @@ _WIDTHS = (0.02, 0.01, 0.005, 0.003)  # of an arc's step, in half widths of the 
 _HOPELESS = 0.9  # of points that pass after the first draw: arcs of so few terms do not fit the lens
 _GOAL, _ENOUGH = 2e-4, 4e-4  # of rays that pass, in a zone, that may be lost; of others, where it is done
 _HEAVY, _HEAVIER, _LIGHTEST, _HEAVIEST = 10.0, 1.6, 2.0, 3e4  # weight of rays that pass: at first, its step, ends
+_LIGHTEST_OF_FOLD = 8.0  # of more numbers, which bend more where few rays tell
 _DEEP = 0.08  # half widths of the pupil: blocked rays deeper inside are given up
 _FLOOR, _CALM, _CALM_SHARE = 0.05, 0.002, 0.05  # of curvature: near an arc, far from it; share of those rays that count
 _HALVINGS, _MORE = 6, 2e-3  # of a step by which arcs would lose so many more rays of a zone
-_LOST, _LOST_OF_MANY = 7e-4, 1e-3  # of random rays that check, where a margin is enough: of one state, of many
+_LOST, _LOST_OF_MANY = 7e-4, 1e-3  # of random rays that check, where a margin is enough; of many states, or of a fold
 _CHECK_SEED, _DRAWS, _TELLING = 20, 3, 2500  # fewer rays of a zone do not tell
 _MARGINS, _RIMS = (0.0, 0.001, 0.002, 0.003, 0.005, 0.008), 4.0  # that widen arcs which lose light; rims by more
 _SMALLEST = 0.05  # stop, of the widest, that pupils are scaled by
@@ -112,7 +113,7 @@ def moved(
         lost = max(
             _lost(wider[0].mixed(wider[1:], weights), *check) for (weights, _), check in zip(seen, checks, strict=True)
         )
-        if lost <= (_LOST if len(seen) == 1 else _LOST_OF_MANY):
+        if lost <= (_LOST if len(seen) == 1 and not nodes[0].folds else _LOST_OF_MANY):
             break
     return wider, lost
 
@@ -155,7 +156,7 @@ def _wider(arcs: PupilArcs, rays: dict[str, Array], margin: float, half_mm: floa
 def _tuned(arcs: PupilArcs, sight: Sight, report: Report, alone: bool) -> PupilArcs:
     """The arcs, moved; only the terms that they have."""
     numbers, weight = arcs.numbers.copy(), np.full(_ALL, _HEAVY)
-    used = arcs.numbers != 0
+    used, least = arcs.numbers != 0, _LIGHTEST_OF_FOLD if arcs.folds else _LIGHTEST
     for draw in range(_MOST):
         rays = _drawn(sight, replace(arcs, numbers=numbers), draw)
         for k in range(_ROUNDS + 1):
@@ -165,7 +166,7 @@ def _tuned(arcs: PupilArcs, sight: Sight, report: Report, alone: bool) -> PupilA
             if k == 0 and draw == _MOST - 1 and lost.max() < _ENOUGH:  # of rays that it has not been fitted to
                 return replace(arcs, numbers=numbers)
             change = ((lost + _GOAL / 5) / (_GOAL * 1.2)).clip(1 / _HEAVIER, _HEAVIER)
-            weight = (weight * change).clip(_LIGHTEST, _HEAVIEST)
+            weight = (weight * change).clip(least, _HEAVIEST)
             if k < _ROUNDS:
                 blame = _blame(rays, within, arcs.sides)
                 for arc, side in enumerate(arcs.sides):

@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 _POWERS = ((4, 0, 0), (3, 1, 0), (2, 2, 0), (3, 0, 1))
 _FIELD = 3  # and of the numbers that tell of y
 _MIDDLE = 0.15  # stops: rays within count as much
+_RIDGE = 1e-6
 
 
 def folded(arcs: PupilArcs, sight: Sight) -> PupilArcs:
@@ -53,5 +54,8 @@ def _numbers(monomials: Array, few: NDArray[np.bool_], pupil: Array, point: Arra
 
 
 def _solved(rows: Array, wanted: Array) -> Array:
+    """Where nothing folds, numerator and denominator may have any factor in common, poles too, but for the ridge."""
     size = np.sqrt((rows**2).mean(1)) + 1e-30
-    return np.asarray(np.linalg.lstsq((rows / size[:, None]).T, wanted, rcond=1e-9)[0] / size)
+    scaled, count = rows / size[:, None], rows.shape[1]
+    products = scaled @ scaled.T / count + _RIDGE * np.eye(len(rows))
+    return np.asarray(np.linalg.solve(products, scaled @ wanted / count) / size)
