@@ -5,6 +5,8 @@ from the side of the film point and from the other. In the frame of the film poi
 y^2 = H(x) that meets the x axis at right angles. So does their intersection, which is filled from the unit disc by
 (X, Y) -> (middle + half width X, Y sqrt(H / (1 - X^2))): neighbours stay neighbours, and densities stay nearly even.
 
+Where the stop's image folds its arc is another, `pupil_fold`.
+
 Nothing here is a table: in a renderer's shader a table costs more than all of this. `pupil_outline` is the closer fit
 at one stop and focus, `pupil_circles` that of lenses whose pupils no such arcs hold closely.
 """
@@ -20,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurolens.cameras.blades import Blades
+from neurolens.cameras.pupil_fold import NUMBERS, Fold, Opening
 from neurolens.graph.ir import Graph, Value
 
 Array = NDArray[np.float64]
@@ -44,6 +47,8 @@ class PupilArcs:
             cosine of twice the azimuth of the film point.
         sides: [A] of an arc: 1 of a rim that ends the light on the film point's side, -1 on the other, 0 on both; the
             row of an end that it has not is 0.
+
+    Of a stop whose image folds `numbers` are [A, 8, M]: those of `Fold`, then of rims, with 0 after their four.
     """
 
     film_radius_mm: float
@@ -87,6 +92,7 @@ class PupilArcs:
         turn = (film + [HAIR, 0.0]) * (1.0 / (radius + HAIR))
         arcs = self._arcs(g, radius * (1 / self.unit_mm), turn[0] * turn[0] - turn[1] * turn[1])
         low, high = _ends(arcs)
+        stop = arcs[0]
         across = g.affine([[0.0, -1.0], [1.0, 0.0]], turn)
 
         # Written from the ends, so that rounding leaves no side negative.
@@ -101,14 +107,13 @@ class PupilArcs:
             return None, (reduce(Value.minimum, rows) / (left * right).maximum(TIP)).maximum(0.0).sqrt()
 
         def at_stop(x: Value, y: Value) -> Value:
-            stop = arcs[0]
-            assert stop.low is not None and stop.high is not None
-            reach, from_low = (stop.high - stop.low) * 0.5, x - stop.low
-            wide = (stop.first + stop.change * from_low).maximum(TIP).sqrt()
-            return (turn * (from_low - reach) + across * (y / wide)) * (side / reach)
+            along, aside, size = stop.at_stop(x, y)
+            return (turn * along + across * aside) * (side / size)
 
         half = (high - low) * 0.5
-        opening = None if blades is None else partial(blades(g).drawn, margin=margin)
+        opening: Opening | None = None if blades is None else partial(blades(g).drawn, margin=margin)
+        if opening is not None and isinstance(stop, Fold):
+            opening = stop.where_unfolded(opening)
         x, y, area, mean = fill(unit_disc(square), low, high, stretch, at_stop, opening)
         inside = radius <= self.film_radius_mm
         g.outputs["pupil_mm"] = turn * x + across * y
@@ -117,7 +122,12 @@ class PupilArcs:
         g.outputs["mean_area_mm2"] = mean
         return g
 
-    def _arcs(self, g: Graph, radius: Value, twice: Value) -> list[Arc]:
+    @property
+    def folds(self) -> bool:
+        """Whether the first of them is the image of a stop that folds."""
+        return self.numbers.shape[1] == NUMBERS
+
+    def _arcs(self, g: Graph, radius: Value, twice: Value) -> list[Arc | Fold]:
         """The arcs of a film radius and the cosine of twice its azimuth, by Horner's rule with coefficients of the
         call."""
         stop, film_z = g.input("stop_radius_mm", per_call=True), g.input("film_z_mm", per_call=True)
@@ -126,8 +136,8 @@ class PupilArcs:
         inverse = (1000.0 * reach**-0.5) / g.input("wavelength_nm")
         wave = inverse * inverse - mean / reach
         factors = {(0, 0): None, (1, 0): wave, (0, 1): twice, (0, 2): twice * twice}
-        arcs = []
-        for side, numbers in zip(self.sides, self.numbers, strict=True):
+        every = []
+        for numbers in self.numbers:
             rows: Value | None = None
             for powers, factor in factors.items():
                 own = (self.exponents[:, 3:] == powers).all(1)
@@ -136,9 +146,14 @@ class PupilArcs:
                     part = part if factor is None else part * factor
                     rows = part if rows is None else rows + part
             assert rows is not None
-            low, high, first, change = g.split(rows, (1, 1, 1, 1))
-            arcs.append(Arc(None if side > 0 else low, None if side < 0 else high, first, change))
-        return arcs
+            every.append(g.split(rows, [1] * numbers.shape[0]))
+        arcs = [
+            Arc(None if side > 0 else low, None if side < 0 else high, first, change)
+            for side, (low, high, first, change, *_) in zip(self.sides, every, strict=True)
+        ]
+        if not self.folds:
+            return [*arcs]
+        return [Fold.of(every[0], call[0], reduce(Value.minimum, (arc.end for arc in arcs[1:]))), *arcs[1:]]
 
     def _horner(self, g: Graph, numbers: Array, own: NDArray[np.bool_], radius: Value, call: Value) -> Value:
         """Rows of the terms `own`."""
@@ -201,6 +216,20 @@ class Arc:
     first: Value
     change: Value
 
+    @property
+    def end(self) -> Value:
+        """Of a rim: where light ends on the film point's side; of one on the other side far off, where it does not."""
+        if self.high is not None:
+            return self.high
+        assert self.low is not None
+        return self.low + self.first.maximum(0.0) / (-self.change).maximum(HAIR)
+
+    def at_stop(self, x: Value, y: Value) -> tuple[Value, Value, Value]:
+        """Of the stop's own: about where in the stop a point lies, and the stop's radius there."""
+        assert self.low is not None and self.high is not None
+        reach, from_low = (self.high - self.low) * 0.5, x - self.low
+        return from_low - reach, y / (self.first + self.change * from_low).maximum(TIP).sqrt(), reach
+
     def height(self, left: Value | None, right: Value | None) -> Value:
         """y^2 at distances from the ends that there are."""
         away = right if left is None else left
@@ -211,7 +240,7 @@ class Arc:
 
 def fill(
     disc: Value, low: Value, high: Value, across: Callable[[Value, Value], tuple[Value | None, Value]],
-    at_stop: Callable[[Value, Value], Value], opening: Callable[[Value, Value], Value] | None,
+    at_stop: Callable[[Value, Value], Value], opening: Opening | None,
 ) -> tuple[Value, Value, Value, Value]:  # fmt: skip
     """A point of a shape of a point of the unit disc: x, y, the inverse of its density and the mean of that.
 
@@ -266,6 +295,6 @@ _COS = _chebyshev(lambda s: np.cos(np.pi / 4 * np.sqrt(np.maximum(s, 0))))
 _SIN = _chebyshev(lambda s: np.pi / 4 * np.sinc(np.sqrt(np.maximum(s, 0)) / 4))
 
 
-def _ends(arcs: list[Arc]) -> tuple[Value, Value]:
+def _ends(arcs: Sequence[Arc | Fold]) -> tuple[Value, Value]:
     lows, highs = [arc.low for arc in arcs if arc.low is not None], [arc.high for arc in arcs if arc.high is not None]
     return reduce(Value.maximum, lows), reduce(Value.minimum, highs)

@@ -19,6 +19,7 @@ from neurolens.cameras.pupil_arcs_tune import moved
 from neurolens.cameras.pupil_boxes import asking, end_of_light, frame_of
 from neurolens.cameras.pupil_circles import PupilCircles
 from neurolens.cameras.pupil_circles_fit import fit_circles
+from neurolens.cameras.pupil_fold_fit import folded
 from neurolens.cameras.pupil_sight import Sight, Truths, turned
 from neurolens.graph.interpret import evaluate
 
@@ -136,6 +137,11 @@ def fit_arcs(
         kept, best, lost = [made[0]], min(passing(sight, made[0]).values()), made[1]
         if sight.anamorphic or (best >= _GOAL and lost <= _LOST):  # arcs of anamorphic lenses are wide
             return kept
+    elif not sight.anamorphic and 1 in begun.sides:
+        (arcs,), beyond = moved([folded(begun, sight)], half, sights, report)
+        if beyond <= _LOST and (best := min(passing(sight, arcs).values())) >= _GOAL:
+            return [arcs]
+        kept, lost = ([arcs], beyond) if beyond <= _LOST else ([], 1.0)
     for part, way in enumerate(_WAYS):
         arcs, beyond = _by(way, sight, partial(_within, report, part / len(_WAYS), 1 / len(_WAYS)))
         least = min(passing(sight, arcs).values())

@@ -18,11 +18,12 @@ from neurolens.base import status as st
 from neurolens.base.progress import Report
 from neurolens.cameras.arcs_passing import passing
 from neurolens.cameras.pupil_arcs import PupilArcs
+from neurolens.cameras.pupil_fold import NUMBERS, fold_margins
 from neurolens.cameras.pupil_sight import Sight, Truths, turned
 from neurolens.graph.interpret import evaluate
 
 Array = NDArray[np.float64]
-_RAYS = 90_000  # random ones, of an anamorphic lens twice as many
+_RAYS = 90_000  # random ones, of an anamorphic lens twice as many, to fit a stop that folds three times
 # Of the root of the film radius (exposure is of the axis), stop and azimuth; rays that tell of one.
 _ZONES, _FEW = (8, 3, 3), 400
 _ALL = int(np.prod(_ZONES)) + _ZONES[0]  # and of film radius alone, for the others
@@ -33,10 +34,11 @@ _WIDTHS = (0.02, 0.01, 0.005, 0.003)  # of an arc's step, in half widths of the 
 _HOPELESS = 0.9  # of points that pass after the first draw: arcs of so few terms do not fit the lens
 _GOAL, _ENOUGH = 2e-4, 4e-4  # of rays that pass, in a zone, that may be lost; of others, where it is done
 _HEAVY, _HEAVIER, _LIGHTEST, _HEAVIEST = 10.0, 1.6, 2.0, 3e4  # weight of rays that pass: at first, its step, ends
+_LIGHTEST_OF_FOLD = 8.0  # of more numbers, which bend more where few rays tell
 _DEEP = 0.08  # half widths of the pupil: blocked rays deeper inside are given up
 _FLOOR, _CALM, _CALM_SHARE = 0.05, 0.002, 0.05  # of curvature: near an arc, far from it; share of those rays that count
 _HALVINGS, _MORE = 6, 2e-3  # of a step by which arcs would lose so many more rays of a zone
-_LOST, _LOST_OF_MANY = 7e-4, 1e-3  # of random rays that check, where a margin is enough: of one state, of many
+_LOST, _LOST_OF_MANY = 7e-4, 1e-3  # of random rays that check, where a margin is enough; of many states, or of a fold
 _CHECK_SEED, _DRAWS, _TELLING = 20, 3, 2500  # fewer rays of a zone do not tell
 _MARGINS, _RIMS = (0.0, 0.001, 0.002, 0.003, 0.005, 0.008), 4.0  # that widen arcs which lose light; rims by more
 _SMALLEST = 0.05  # stop, of the widest, that pupils are scaled by
@@ -50,7 +52,7 @@ class _Rays:
     Attributes:
         monomials: [M, N] of `PupilArcs.exponents`. x, y: in the frame of the film point.
         passed, of_stop: what becomes of them: the stop blocks them. zone: see `zones_of`. unit: half the
-            pupil's width.
+            pupil's width. size: of the stop, in its widest radii.
     """
 
     monomials: Array
@@ -60,6 +62,7 @@ class _Rays:
     of_stop: Truths
     zone: NDArray[np.intp]
     unit: Array
+    size: Array
 
     def shares(self, these: Truths) -> Array:
         """[Z] of rays that pass in each zone."""
@@ -71,8 +74,11 @@ class _Rays:
         return np.stack([self.margins(own, side)[0] for own, side in zip(numbers, sides, strict=True)])
 
     def margins(self, numbers: Array, side: int) -> tuple[Array, list[Array | None], Array]:
-        """How far rays lie within an arc [4, M], in half widths of the pupil, and its slopes by the arc's four."""
-        low, high, first, change = numbers @ self.monomials
+        """How far rays lie within an arc [4 or 8, M], in half widths of the pupil; its slopes by these, times a scale;
+        the scale."""
+        if side == 0 and len(numbers) == NUMBERS:
+            return fold_margins(numbers @ self.monomials, self.x, self.y, self.size)
+        low, high, first, change = numbers[:4] @ self.monomials
         left, right, by_low, by_high = self.x - low, high - self.x, None, None
         if side == 0:
             away, wide = left, first + change * left
@@ -84,7 +90,8 @@ class _Rays:
             by_low, by_high = (None, slope) if side > 0 else (-slope, None)
         along = sum(-row for row in (by_low, by_high) if row is not None)
         scale = (np.hypot(along, 2 * self.y) + 1e-9) * self.unit
-        return np.minimum((height - self.y**2) / scale, ends / self.unit), [by_low, by_high, reach, reach * away], scale
+        by = [by_low, by_high, reach, reach * away] + [None] * (len(numbers) - 4)
+        return np.minimum((height - self.y**2) / scale, ends / self.unit), by, scale
 
 
 def moved(
@@ -106,7 +113,7 @@ def moved(
         lost = max(
             _lost(wider[0].mixed(wider[1:], weights), *check) for (weights, _), check in zip(seen, checks, strict=True)
         )
-        if lost <= (_LOST if len(seen) == 1 else _LOST_OF_MANY):
+        if lost <= (_LOST if len(seen) == 1 and not nodes[0].folds else _LOST_OF_MANY):
             break
     return wider, lost
 
@@ -135,6 +142,9 @@ def _wider(arcs: PupilArcs, rays: dict[str, Array], margin: float, half_mm: floa
     """The arcs, moved outwards by a share of half the pupil's width."""
     numbers, changes = arcs.numbers.copy(), evaluate(arcs.checked, rays)["change"].min(1)
     for own, side, change in zip(numbers, arcs.sides, changes, strict=True):
+        if not side and arcs.folds:
+            own[:3], own[5:] = own[:3] * (1 - margin), own[5:] * (1 - margin) ** 2
+            continue
         step = margin * half_mm * (_RIMS if side else 1.0)
         still, along = ((arcs.exponents == (0, power, 0, 0, 0)).all(1) for power in (0, int(side == 0)))
         own[0] -= step * along * (side <= 0)
@@ -146,7 +156,7 @@ def _wider(arcs: PupilArcs, rays: dict[str, Array], margin: float, half_mm: floa
 def _tuned(arcs: PupilArcs, sight: Sight, report: Report, alone: bool) -> PupilArcs:
     """The arcs, moved; only the terms that they have."""
     numbers, weight = arcs.numbers.copy(), np.full(_ALL, _HEAVY)
-    used = arcs.numbers != 0
+    used, least = arcs.numbers != 0, _LIGHTEST_OF_FOLD if arcs.folds else _LIGHTEST
     for draw in range(_MOST):
         rays = _drawn(sight, replace(arcs, numbers=numbers), draw)
         for k in range(_ROUNDS + 1):
@@ -156,7 +166,7 @@ def _tuned(arcs: PupilArcs, sight: Sight, report: Report, alone: bool) -> PupilA
             if k == 0 and draw == _MOST - 1 and lost.max() < _ENOUGH:  # of rays that it has not been fitted to
                 return replace(arcs, numbers=numbers)
             change = ((lost + _GOAL / 5) / (_GOAL * 1.2)).clip(1 / _HEAVIER, _HEAVIER)
-            weight = (weight * change).clip(_LIGHTEST, _HEAVIEST)
+            weight = (weight * change).clip(least, _HEAVIEST)
             if k < _ROUNDS:
                 blame = _blame(rays, within, arcs.sides)
                 for arc, side in enumerate(arcs.sides):
@@ -211,7 +221,7 @@ def _stepped(
 
 def _drawn(sight: Sight, arcs: PupilArcs, seed: int) -> _Rays:
     rng = np.random.default_rng(100 + seed)
-    given, stop, codes = random_rays(sight, arcs, rng, _RAYS, near=True)
+    given, stop, codes = random_rays(sight, arcs, rng, _RAYS * (1 + 2 * arcs.folds), near=True)
     scaled = scaled_of(arcs, given, stop)
     monomials = np.ones((len(arcs.exponents), stop.size))
     for row, powers in zip(monomials, arcs.exponents, strict=True):
@@ -223,7 +233,7 @@ def _drawn(sight: Sight, arcs: PupilArcs, seed: int) -> _Rays:
     if not passed.any():
         passed[0] = True
     unit = np.maximum(scaled[1], _SMALLEST) * float(np.abs(y[passed]).max())
-    return _Rays(monomials, x, y, passed, of_stop, zones_of(arcs, given, scaled, passed), unit)
+    return _Rays(monomials, x, y, passed, of_stop, zones_of(arcs, given, scaled, passed), unit, scaled[1])
 
 
 def scaled_of(arcs: PupilArcs, rays: dict[str, Array], stop: Array) -> Array:
