@@ -340,7 +340,8 @@ def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, f
     shape = len(colours), _RINGS, _SPOKES
     pupil = np.tile(_axial_pupil(domain, scene.stop_radius_mm), len(colours))
     nanometres = np.repeat(colours, _RINGS * _SPOKES).astype(np.float32)
-    film, best, shift = np.zeros_like(pupil), scene.film_z_mm, _SHIFT * domain["film_radius_mm"]
+    reach = float(domain["film_radius_mm"])
+    film, best, shift = np.zeros_like(pupil), scene.film_z_mm, _SHIFT * reach
 
     def miss(film: FloatArray, object_z_mm: float) -> tuple[FloatArray, FloatArray, NDArray[np.int32]]:
         """By how much rays miss the object, where it sees them in the entrance pupil, and their status."""
@@ -371,7 +372,7 @@ def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, f
         if not across > 0:
             raise InputError(scene.model.path, "focus", "best", "a model that lets axial light pass")
         best = scene.film_z_mm - float(along / across)
-        film = np.where(np.isfinite(film), film, 0.0)
+        film = np.where(np.isfinite(film), film, 0.0).clip(-reach, reach)  # rays that do not pass may go anywhere
     return _Spot(best, (film.astype(np.float32), pupil.astype(np.float32), nanometres), moments, passed)
 
 
