@@ -192,16 +192,19 @@ class _Cluster:
             # the next one, whose lock it wants, it stops both.
             self._client = self._distributed.Client.__new__(self._distributed.Client)
             self._client.__init__(self._local or self._address, timeout=_TIMEOUT)
-        except (OSError, ValueError) as error:
+        except BaseException as error:
             self.__exit__()
+            if not isinstance(error, (OSError, ValueError)):
+                raise
             expected = "tcp://HOST:PORT of a scheduler that runs, local, or local:N"
             raise NeurolensError(f"--dask {self._address}: {_line(str(error))}; expected {expected}") from None
         return self._client
 
     def __exit__(self, *_: object) -> None:
         for each, timeout_s in ((self._client, 2), (self._local, 5)):
-            with suppress(Exception):  # every answer is here: a scheduler that is slow to say good-bye spoils none
-                each.close(timeout=timeout_s)
+            if each is not None:
+                with suppress(Exception):  # a scheduler that is slow to say good-bye spoils no answer
+                    each.close(timeout=timeout_s)
 
 
 def _cores() -> int:

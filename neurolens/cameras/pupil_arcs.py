@@ -202,7 +202,7 @@ class PupilArcs:
         for name, side in zip(("left", "right"), zip(*rows, strict=True), strict=True):
             g.outputs[name] = g.concat(*(pupil[0] * 0.0 + 1.0 if v is None else v for v in side))
         g.outputs["height"] = g.concat(*(arc.height(*row) for arc, row in zip(arcs, rows, strict=True)))
-        g.outputs |= {name: g.concat(*(getattr(arc, name) for arc in arcs)) for name in ("first", "change")}
+        g.outputs["change"] = g.concat(*(arc.change for arc in arcs))
         return g
 
 

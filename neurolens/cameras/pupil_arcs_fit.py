@@ -34,6 +34,7 @@ _ENOUGH = 0.97  # of points, at the widest stop, that pass
 _FEWEST = 12  # vertices that rims of a side block
 _PLENTY, _GOAL = 0.96, 0.952  # of points, that no other way to fit needs to pass: by arcs, zone by zone
 _REFIT_SEED, _CHECK_SEED, _NO_SIDE = 10, 20, 2  # such rays lie on no arc
+_STARTS = 5  # of a fold, by other rays: some end hundredths worse
 _LOST = 1e-3  # of rays that pass in any zone, that a way may miss
 _HELD = 0.9998  # of random rays that pass
 _RISE, _STEP, _STEPS = 1.03, 0.004, 12  # of arcs that do not hold them: in y^2, and of half the pupil along x
@@ -138,10 +139,14 @@ def fit_arcs(
         if sight.anamorphic or (best >= _GOAL and lost <= _LOST):  # arcs of anamorphic lenses are wide
             return kept
     elif not sight.anamorphic and 1 in begun.sides:
-        (arcs,), beyond = moved([folded(begun, sight)], half, sights, report)
-        if beyond <= _LOST and (best := min(passing(sight, arcs).values())) >= _GOAL:
-            return [arcs]
-        kept, lost = ([arcs], beyond) if beyond <= _LOST else ([], 1.0)
+        start = folded(begun, sight)
+        for seed in range(_STARTS):
+            (arcs,), beyond = moved([start], half, sights, report, seed=seed)
+            share = min(passing(sight, arcs).values())
+            if beyond <= _LOST and share > best:
+                kept, lost, best = [arcs], beyond, share
+            if best >= _GOAL:
+                return kept
     for part, way in enumerate(_WAYS):
         arcs, beyond = _by(way, sight, partial(_within, report, part / len(_WAYS), 1 / len(_WAYS)))
         least = min(passing(sight, arcs).values())

@@ -37,7 +37,7 @@ _HEAVY, _HEAVIER, _LIGHTEST, _HEAVIEST = 10.0, 1.6, 2.0, 3e4  # weight of rays t
 _LIGHTEST_OF_FOLD = 8.0  # of more numbers, which bend more where few rays tell
 _DEEP = 0.08  # half widths of the pupil: blocked rays deeper inside are given up
 _FLOOR, _CALM, _CALM_SHARE = 0.05, 0.002, 0.05  # of curvature: near an arc, far from it; share of those rays that count
-_HALVINGS, _MORE = 6, 2e-3  # of a step by which arcs would lose so many more rays of a zone
+_HALVINGS, _MORE, _MORE_OF_FOLD = 6, 2e-3, 4e-4  # of a step by which arcs would lose so many more rays of a zone
 _LOST, _LOST_OF_MANY = 7e-4, 1e-3  # of random rays that check, where a margin is enough; of many states, or of a fold
 _CHECK_SEED, _DRAWS, _TELLING = 20, 3, 2500  # fewer rays of a zone do not tell
 _MARGINS, _RIMS = (0.0, 0.001, 0.002, 0.003, 0.005, 0.008), 4.0  # that widen arcs which lose light; rims by more
@@ -96,16 +96,17 @@ class _Rays:
 
 def moved(
     nodes: Sequence[PupilArcs], half_mm: float, sights: Sequence[Sight], report: Report,
-    between: Sequence[tuple[Array, Sight]] = (),
+    between: Sequence[tuple[Array, Sight]] = (), seed: int = 0,
 ) -> tuple[list[PupilArcs], float]:  # fmt: skip
     """The arcs of a lens in each of its states, moved, and the share of the rays of the worst zone that they lose.
 
     Args:
         half_mm: half the width of the pupil. between: weights of these states and the lens there, see `fit_arcs`.
+        seed: of the rays that tell how.
     """
     parts = [partial(_within, report, k / len(nodes), 1 / len(nodes)) for k in range(len(nodes))]
     alone = len(nodes) == 1
-    nodes = [_tuned(*of_one, alone) for of_one in zip(nodes, sights, parts, strict=True)]
+    nodes = [_tuned(*of_one, alone, seed) for of_one in zip(nodes, sights, parts, strict=True)]
     seen = [*zip(np.eye(len(nodes)), sights, strict=True), *between]
     checks = [_checks(nodes[0].mixed(nodes[1:], weights), sight) for weights, sight in seen]
     for margin in _MARGINS:
@@ -153,12 +154,12 @@ def _wider(arcs: PupilArcs, rays: dict[str, Array], margin: float, half_mm: floa
     return replace(arcs, numbers=numbers)
 
 
-def _tuned(arcs: PupilArcs, sight: Sight, report: Report, alone: bool) -> PupilArcs:
+def _tuned(arcs: PupilArcs, sight: Sight, report: Report, alone: bool, seed: int) -> PupilArcs:
     """The arcs, moved; only the terms that they have."""
     numbers, weight = arcs.numbers.copy(), np.full(_ALL, _HEAVY)
     used, least = arcs.numbers != 0, _LIGHTEST_OF_FOLD if arcs.folds else _LIGHTEST
     for draw in range(_MOST):
-        rays = _drawn(sight, replace(arcs, numbers=numbers), draw)
+        rays = _drawn(sight, replace(arcs, numbers=numbers), draw + seed * _MOST)
         for k in range(_ROUNDS + 1):
             report((draw + k / _ROUNDS) / _MOST)
             within = rays.within(numbers, arcs.sides)
@@ -188,7 +189,7 @@ def _blame(rays: _Rays, within: Array, sides: Sequence[int]) -> NDArray[np.intp]
 def _stepped(
     numbers: Array, side: int, used: Truths, rays: _Rays, told: Truths, weight: Array, width: float
 ) -> Array:  # fmt: skip
-    """An arc's numbers [4, M] after a step of Newton's rule. `told`: rays that pass, and those this arc blocks."""
+    """An arc's numbers [4 or 8, M] after a step of Newton's rule. `told`: rays that pass, and those this arc blocks."""
     within, by, scale = rays.margins(numbers, side)
     beside = told & np.where(rays.passed, within < 8 * width, (within > -6 * width) & (within < 4 * _DEEP))
     calm = np.random.default_rng(1).random(within.size) < _CALM_SHARE
@@ -209,11 +210,11 @@ def _stepped(
     step = -np.linalg.solve(matrix, rows @ pull / size) / size
     step *= min(1.0, 2 * width / float(np.quantile(np.abs(step @ rows[:, near]), 0.98)))
     moves = np.array([row is not None for row in by])[:, None] & used
-    lost = rays.shares(within < 0)
+    lost, more = rays.shares(within < 0), _MORE_OF_FOLD if len(numbers) == NUMBERS else _MORE
     for _ in range(_HALVINGS):
         after = numbers.copy()
         after[moves] += step
-        if (rays.shares(rays.margins(after, side)[0] < 0) - lost).max() < _MORE:
+        if (rays.shares(rays.margins(after, side)[0] < 0) - lost).max() < more:
             return after
         step = step / 2
     return numbers

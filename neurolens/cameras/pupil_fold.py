@@ -46,24 +46,20 @@ class Fold:
         a, b, c, d, e, *_ = numbers
 
         def roots(r: Value) -> tuple[Value, Value, Value, Value, Value]:
-            """Discriminant of the places where s = -r, slope and bend there, and the low and high one."""
+            """Of the places where s = -r, r of either sign: discriminant, slope and bend, the low and the high one."""
             bend, way = c + e * r, b + d * r
             square = way * way - bend * (a + r) * 4.0
             slope = ((way + square.maximum(0.0).sqrt()) * 0.5).maximum(_SMALL)
             return square, slope, bend, -(a + r) / slope, slope / (-bend).maximum(_SMALL)
 
+        # Where it folds deeply, s = r again beyond the pole: an end of nothing.
         (_, slope, bend, low, folded), (square, _, _, high, again) = roots(size), roots(-size)
-        unfolded = (-square <= 0.0) & (rim <= again)
+        unfolded = (-square <= 0.0) & (rim <= again) & (high <= folded)
         return Fold(low, low.graph.select(unfolded, high, folded).minimum(rim), unfolded, size, slope, bend, numbers)
 
     @property
-    def first(self) -> Value:
-        """What y^2 is multiplied by: at x = 0."""
-        return self.numbers[5]
-
-    @property
     def change(self) -> Value:
-        """Its slope there."""
+        """How y^2 is multiplied at x = 0, by x."""
         return self.numbers[6]
 
     def height(self, left: Value | None, right: Value | None) -> Value:

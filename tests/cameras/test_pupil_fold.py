@@ -1,12 +1,16 @@
 """Pupils in which the image of the stop folds."""
 
+import math
+
 import numpy as np
 import pytest
 
+from neurolens.cameras.blades import Blades
 from neurolens.cameras.pupil_arcs import PupilArcs
 from neurolens.cameras.pupil_fold import fold_margins
 from neurolens.cameras.pupil_fold_fit import _numbers
 from neurolens.graph.interpret import evaluate
+from neurolens.graph.ir import Graph
 
 RIM = 12.0  # mm from the axis
 
@@ -19,11 +23,19 @@ def fold(peak: float) -> np.ndarray:
     return np.array([a, b, c, d, e, 0.006, 1e-5, 2e-6])
 
 
-def arcs(peak: float) -> PupilArcs:
+def arcs(eight: np.ndarray) -> PupilArcs:
     """With a rim of this radius, seen from both sides."""
     numbers = np.zeros((3, 8, 1))
-    numbers[0, :, 0], numbers[1:, :4, 0] = fold(peak), ((0.0, RIM, 2 * RIM, -1.0), (-RIM, 0.0, 2 * RIM, -1.0))
+    numbers[0, :, 0], numbers[1:, :4, 0] = eight, ((0.0, RIM, 2 * RIM, -1.0), (-RIM, 0.0, 2 * RIM, -1.0))
     return PupilArcs(10.0, 10.0, (50.0, 5.0), 8.0, (4.0, 2.0), numbers, np.zeros((1, 5), np.int64), (0, 1, -1))
+
+
+def sampled(graph: Graph, share: float, side: int, **more: float) -> dict[str, np.ndarray]:
+    """Samples at a film point, `side` squared of them; `more` is of the call."""
+    square = (np.mgrid[:side, :side].reshape(2, -1) + 0.5) / side
+    film, nanometres = np.tile([[4.0], [-3.0]], side * side), np.full((1, side * side), 550.0)
+    call = {k: np.array([[v]]) for k, v in {"film_z_mm": 50.0, "stop_radius_mm": 8.0 * share, **more}.items()}
+    return evaluate(graph, {"film_mm": film, "square": square, "wavelength_nm": nanometres, **call})
 
 
 def margins(peak: float, pupil: np.ndarray, share: float) -> np.ndarray:
@@ -34,18 +46,13 @@ def margins(peak: float, pupil: np.ndarray, share: float) -> np.ndarray:
 @pytest.mark.parametrize("peak", [2.0, 0.55, 0.5, 0.3, 0.1, -0.1, -0.3])
 def test_samples_fill_what_a_fold_leaves_open(peak: float, share: float) -> None:
     """The stop's disc rises past the fold, touches it, or has it inside; where light has two parts both are met."""
-    square = (np.mgrid[:320, :320].reshape(2, -1) + 0.5) / 320
-    count = square.shape[1]
-    given = {"film_mm": np.tile([[4.0], [-3.0]], count), "square": square, "wavelength_nm": np.full((1, count), 550.0)}
-    found = evaluate(
-        arcs(peak).graph, given | {"film_z_mm": np.array([[50.0]]), "stop_radius_mm": np.array([[8.0 * share]])}
-    )
+    found = sampled(arcs(fold(peak)).graph, share, 320)
     turned = (found["pupil_mm"][0] + 1j * found["pupil_mm"][1]) * (0.8 + 0.6j)
     box = np.stack(np.meshgrid((np.arange(700) + 0.5) / 25 - 14, (np.arange(375) + 0.5) / 25)).reshape(2, -1)
     lit = (margins(peak, box, share) >= 0) & (np.hypot(*box) <= RIM)
     wanted, area = 2 * lit.sum() / 25**2, found["area_mm2"][0]
     inside = area > 0
-    assert area[inside].sum() / count == pytest.approx(wanted, rel=0.006, abs=0.05)
+    assert area[inside].sum() / area.size == pytest.approx(wanted, rel=0.006, abs=0.05)
     if not wanted:
         return
     pupil = np.stack([turned.real, turned.imag])[:, inside]
@@ -53,6 +60,18 @@ def test_samples_fill_what_a_fold_leaves_open(peak: float, share: float) -> None
     assert np.hypot(*pupil).max() < RIM * 1.0001
     along, aside = found["at_stop"][:, inside]
     assert np.hypot(along, aside).max() < 1.0001
+
+
+@pytest.mark.parametrize("share", [1.0, 0.7, 0.5, 0.4])
+def test_ends_are_those_of_the_fold_where_the_stop_is_met_again_beyond_the_pole(share: float) -> None:
+    """No sample is lost there, and ways through the stop are not taken for straight ones: blades draw nothing."""
+    deep = arcs(np.array([-0.373, 0.0334, -0.0057, -0.0671, -0.0089, 0.006, 1e-5, 2e-6]))
+    found = sampled(deep.graph, share, 40)
+    assert (found["area_mm2"] > 0).all()
+    corner = {f"{k}_{f.__name__}": float(f(math.pi / 6)) for k in ("half", "edge") for f in (math.cos, math.sin)}
+    with_blades = sampled(deep.sampler(Blades), share, 40, count=6.0, roundness=0.0, **corner)
+    for name in ("pupil_mm", "area_mm2"):
+        np.testing.assert_array_equal(with_blades[name], found[name])
 
 
 def test_slopes_of_margins_are_those_of_differences() -> None:
