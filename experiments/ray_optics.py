@@ -1,0 +1,241 @@
+"""Lens files as ray-optics 0.9.8 reads and traces them. Run by `python -m experiments collection`, in the environment of
+ray-optics: nothing of neurolens is imported here.
+
+Each line of the standard input is a task in JSON, each line of the output its answer, in the same order:
+
+    {"file", "wavelength_nm", "fields_deg", "stop_z_mm", "mend", "index"}
+    {"efl_mm", "back_mm", "film_mm", "rays": {"efl_mm", "back_mm"}, "heights_mm", "z_mm", "index", "glass", "mended"}
+    {"error"}
+
+Lengths along the axis count from the last surface at which the medium changes, `z_mm` from the first. "rays" has focal
+length and back focus once more, by a real ray near the axis. `stop_z_mm` is for files that mark no stop. With "mend",
+what ray-optics is known to read wrongly is put right first, and "mended" says what: terms of XASPHERE (read as spheres),
+the normalisation radius of XOSPHERE (left out), and, where they differ, the indices of the task (glasses that
+ray-optics does not know and replaces).
+"""
+
+import json
+import math
+import signal
+import sys
+import warnings
+from contextlib import redirect_stdout
+from pathlib import Path
+
+import numpy as np
+from rayoptics.elem.profiles import EvenPolynomial
+from rayoptics.environment import open_model  # noqa: F401  (sets the program up)
+from rayoptics.parax.firstorder import compute_principle_points, paraxial_trace
+from rayoptics.raytr.raytrace import trace_raw
+from rayoptics.raytr.traceerror import TraceError
+from rayoptics.zemax import zmxread
+
+SECONDS = 60  # for one file
+STEPS, LEAST_STEP = 12, 1e-6  # steps to the first field; the least step before the search gives up, in radians
+NEAR_AXIS = 1e-4  # height of a ray near the axis, as a share of the focal length
+SAME_INDEX = 1e-7
+FIELD_LINES = ("XFLN", "YFLN", "XFLD", "YFLD")  # left out: the search for their chief rays fails for some fisheyes
+
+
+class Model:
+    """A sequential model of ray-optics at one wavelength; `index` and `thickness` count from the object."""
+
+    def __init__(self, task):
+        raw = Path(task["file"]).read_bytes()
+        text = raw.decode("utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "latin-1")
+        lines = [line.split() for line in text.splitlines()]
+        kept = (line for line in text.splitlines() if line.split()[:1] and line.split()[0] not in FIELD_LINES)
+        self.model, _ = zmxread.read_lens(Path(task["file"]), "\n".join(kept))
+        self.sequence, self.wavelength_nm, self.mended = self.model["seq_model"], task["wavelength_nm"], []
+        wavelengths = self.model["osp"]["wvls"]
+        wavelengths.set_from_list([[self.wavelength_nm, 1.0]])
+        wavelengths.reference_wvl = 0
+        if task.get("mend"):
+            self.mend(blocks_of(lines))
+        self.update()
+        if task.get("mend") and len(task["index"]) == len(self.changes):
+            self.replace_indices(task["index"])
+        self.stop = self.sequence.stop_surface or self.marked_stop(lines) or self.nearest(task.get("stop_z_mm"))
+
+    def update(self):
+        self.model.update_model()
+        self.index = [float(n[0]) for n in self.sequence.rndx]
+        self.thickness = [float(gap.thi) for gap in self.sequence.gaps]
+        self.changes = [k for k in range(1, len(self.index)) if self.index[k] != self.index[k - 1]]
+        self.first, self.last = self.changes[0], self.changes[-1]
+        self.z = [0.0, *map(float, np.cumsum([0.0, *self.thickness[1:]]))]
+
+    def mend(self, blocks):
+        """Put right how aspheres were read."""
+        for k, (kind, parameters, extra) in enumerate(blocks):
+            profile = self.sequence.ifcs[k].profile
+            radius, terms = extra.get(2, 1.0), [extra[n] for n in sorted(extra) if n > 2]
+            if kind == "XASPHERE":
+                terms = terms or [parameters.get(n, 0.0) for n in range(1, 9)]
+                scaled = [a / radius ** (2 * i) for i, a in enumerate(terms, start=1)]
+                shape = EvenPolynomial(c=profile.cv, cc=getattr(profile, "cc", 0.0), coefs=scaled)
+                self.sequence.ifcs[k].profile = shape
+                self.mended.append("the terms of XASPHERE")
+            elif kind == "XOSPHERE" and radius != 1:
+                profile.coefs = [a / radius**i for i, a in enumerate(terms, start=1)]
+                self.mended.append("the radius of XOSPHERE")
+
+    def replace_indices(self, wanted):
+        """Take the given index behind each surface where the medium changes and they differ."""
+        for k, n in zip(self.changes, wanted):
+            if abs(self.index[k] - n) > SAME_INDEX:
+                self.mended.append(f"the index of {self.glass(k)}")
+                self.index[k] = n
+        for k, changed in enumerate(self.index):
+            if k and k not in self.changes:
+                self.index[k] = self.index[k - 1]
+
+    def glass(self, k):
+        return str(self.sequence.gaps[k].medium.name())
+
+    def marked_stop(self, lines):
+        """The surface that the file marks: ray-optics forgets a stop on the first one."""
+        surface = None
+        for words in lines:
+            surface = int(words[1]) if words[:1] == ["SURF"] else surface
+            if words[:1] == ["STOP"]:
+                return surface
+        return None
+
+    def nearest(self, z_mm):
+        if z_mm is None:
+            return None
+        return min(range(1, len(self.z)), key=lambda k: abs(self.z[k] - self.z[self.first] - z_mm))
+
+    def path(self):
+        """Surfaces from the object, whose plane is moved to the first vertex: 1e10 mm would cost digits."""
+        s = self.sequence
+        nothing = (np.identity(3), np.zeros(3))
+        shifts = [nothing, *((np.identity(3), np.array([0.0, 0.0, t])) for t in self.thickness[1:]), nothing]
+        rows = zip(s.ifcs, [*s.gaps, None], shifts, [*self.index, self.index[-1]], [*s.z_dir, s.z_dir[-1]])
+        return [list(row) for row in rows]
+
+    def first_order(self):
+        """Focal length, back focus, and distance of the film, from the last surface at which the medium changes."""
+        path = self.sequence.path(wl=self.wavelength_nm)
+        _, _, info = compute_principle_points(path, 0.0, self.index[0], self.index[-1])
+        efl, back_focus = info[1], info[8]
+        behind = sum(self.thickness[self.last : -1])
+        return efl, back_focus + behind, behind + self.thickness[-1]
+
+    def near_axis(self, efl):
+        """The same focal length and back focus by two real rays parallel to the axis, extrapolated to height 0."""
+        found = []
+        for height in (abs(efl) * NEAR_AXIS, abs(efl) * NEAR_AXIS / 2):
+            ray = self.trace(0.0, height, 0.0)
+            y, way = ray[self.last][0][1], ray[self.last][1]
+            slope = way[1] / way[2]
+            z = ray[self.last][0][2]
+            found.append((-height / slope, z - y / slope))
+        return [(4 * fine - coarse) / 3 for coarse, fine in zip(*found)]
+
+    def entrance_pupil(self):
+        """Distance behind the first vertex, on the axis."""
+        p, q = paraxial_trace(self.sequence.path(wl=self.wavelength_nm), 1, [1.0, 0.0], [0.0, 1.0])
+        return float(q[self.stop][0] / p[self.stop][0]) if p[self.stop][0] else 1e6
+
+    def trace(self, field, offset, pupil):
+        """A meridional ray at an angle to the axis that passes the axial point `pupil` at a distance of `offset`."""
+        way = np.array([0.0, math.sin(field), math.cos(field)])
+        start = np.array([0.0, offset * math.cos(field), pupil - offset * math.sin(field)])
+        with np.errstate(all="raise"):
+            return trace_raw(iter(self.path()), start, way, self.wavelength_nm, intersect_obj=False)[0]
+
+    def chief_heights(self, fields_deg):
+        """Image heights of the rays through the middle of the stop; None from where no such ray is reached."""
+        pupil, heights, field, offsets = self.entrance_pupil(), [], 0.0, [(0.0, 0.0)]
+        step = math.radians(fields_deg[0]) / STEPS if fields_deg else 0.0
+        for wanted in (math.radians(f) for f in fields_deg):
+            while field < wanted and step > LEAST_STEP:
+                there = wanted if field + 1.01 * step > wanted else field + step
+                offset = self.offset_at(there, pupil, extrapolated(offsets, there))
+                if offset is None:
+                    step /= 2
+                else:
+                    field = there
+                    offsets.append((there, offset))
+            heights.append(float(self.trace(wanted, offsets[-1][1], pupil)[-1][0][1]) if field >= wanted else None)
+        return heights
+
+    def offset_at(self, field, pupil, guess):
+        return root(lambda b: self.trace(field, b, pupil)[self.stop][0][1], guess, 1e-6 * max(1.0, abs(self.z[-1])))
+
+
+def blocks_of(lines):
+    """Type, PARM and XDAT of each surface."""
+    blocks = []
+    for words in lines:
+        if words[:1] == ["SURF"]:
+            blocks.append(["STANDARD", {}, {}])
+        elif blocks and words[:1] == ["TYPE"]:
+            blocks[-1][0] = words[1]
+        elif blocks and words[:1] in (["PARM"], ["XDAT"]):
+            blocks[-1][1 if words[0] == "PARM" else 2][int(words[1])] = float(words[2])
+    return blocks
+
+
+def extrapolated(points, x):
+    """The line through the last two points, at x."""
+    (a, ya), (b, yb) = points[-2:] if len(points) > 1 else (points[-1], points[-1])
+    return yb if a == b else yb + (yb - ya) * (x - b) / (b - a)
+
+
+def root(function, guess, step):
+    """A zero near a guess by secants, or None."""
+    try:
+        a, b = guess, guess + step
+        fa, fb = function(a), function(b)
+        for _ in range(50):
+            if abs(fb) < 1e-12 or fa == fb:
+                break
+            a, b, fa = b, b - fb * (b - a) / (fb - fa), fb
+            fb = function(b)
+        return b if abs(fb) < 1e-9 else None
+    except (TraceError, FloatingPointError, ValueError, ZeroDivisionError):
+        return None
+
+
+def answer(task):
+    """The data of one file."""
+    model = Model(task)
+    efl, back, film = map(float, model.first_order())
+    return {
+        "efl_mm": efl,
+        "back_mm": back,
+        "film_mm": film,
+        "rays": dict(zip(("efl_mm", "back_mm"), map(float, model.near_axis(efl)))),
+        "heights_mm": [] if model.stop is None else model.chief_heights(task["fields_deg"]),
+        "z_mm": [model.z[k] - model.z[model.first] for k in model.changes],
+        "index": [model.index[k] for k in model.changes],
+        "glass": [model.glass(k) for k in model.changes],
+        "mended": list(dict.fromkeys(model.mended)),
+    }
+
+
+def late(*_):
+    raise TimeoutError(f"more than {SECONDS} s")
+
+
+def main():
+    warnings.simplefilter("ignore")
+    signal.signal(signal.SIGALRM, late)
+    out = sys.stdout
+    for line in sys.stdin:
+        signal.alarm(SECONDS)
+        try:
+            with redirect_stdout(sys.stderr):
+                found = answer(json.loads(line))
+        except Exception as error:  # whatever ray-optics raises is its answer
+            found = {"error": f"{type(error).__name__}: {error}"[:300]}
+        signal.alarm(0)
+        out.write(json.dumps(found) + "\n")
+        out.flush()
+
+
+if __name__ == "__main__":
+    main()
