@@ -41,8 +41,8 @@ def finish(
             pupil or f-number ask for is taken, with a warning.
 
     Raises:
-        InputError: no row, too many, no stop or several, a figure out of range, a last medium that is not air, a stop
-            that nothing sizes, no image behind the lens.
+        InputError: no row, too many, no stop or several, a figure out of range, a stop that nothing sizes, no image
+            behind the lens.
     """
     _check_rows(lens.surfaces, lens.path)
     stop = lens.surfaces[lens.stop_index]
@@ -135,8 +135,6 @@ def _check_rows(rows: Sequence[Surface], file: str) -> None:
     if len(stops) != 1:
         found = f"(on surfaces {', '.join(map(str, stops))})" if stops else "(none)"
         raise InputError(file, "stop", found, "exactly one surface that is the aperture stop")
-    if rows[-1].n_d != 1:
-        raise InputError(file, f"surface {len(rows) - 1}, index", rows[-1].n_d, "air between last surface and film")
 
 
 def named_glass(
