@@ -193,7 +193,7 @@ def _first_order(data: dict[str, Any]) -> str:
         rows.append(("medium in front", f"n_d {medium['n_d']:.5f}", medium["material"] or medium["glass"] or ""))
     if data["front_efl_mm"] != data["efl_mm"]:
         rows.append(
-            ("front focal", _mm(data["front_efl_mm"]), "focal length of the object side, whose medium is another")
+            ("front focal", _mm(data["front_efl_mm"]), "focal length of the object side, in its medium")
         )
     if data["wavelength_nm"] != LINE_D_NM:
         note = "of all this: the file's primary one, as its light does not hold the d line"
