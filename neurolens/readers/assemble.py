@@ -15,7 +15,7 @@ from neurolens.optics.lensfile import MAX_INDEX, MAX_POWER, MAX_SURFACES
 from neurolens.optics.paraxial import FirstOrder
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.sag import check_figures
-from neurolens.readers.source import warn
+from neurolens.readers.source import assume, warn
 
 # A diameter that the file does not give, until `finish` has found it.
 UNKNOWN = math.nan
@@ -64,6 +64,9 @@ def finish(
     if math.isnan(stated):
         stated = first_order(trial).f_number
         warn(lens.path, f"no f-number is stated; f/{stated:.4g} follows from the stop's diameter")
+    if lens.surfaces[-1].n_d != 1:
+        name = lens.surfaces[-1].material or "a medium"
+        assume(lens.path, f"the film lies in {name} of index {lens.surfaces[-1].n_d:g}, as the last row says")
     rows = list(trial.surfaces)
     if not film_given:
         rows[-1] = replace(rows[-1], thickness_mm=data.back_focus_mm)
