@@ -1,8 +1,8 @@
 """A public collection of lens files: what is read, what is refused and why, and agreement with ray-optics.
 
 The collection is OpticsDatabase (github.com/amegahed/OpticsDatabase, MIT licence, 1,218 Zemax files); it is not stored
-in this project: clone it, and name its folder. The independent tracer is ray-optics 0.9.8 (BSD 3-clause licence), which
-brings a toolkit for windows and lives in an environment of its own:
+in this project: clone it, and name its folder. The independent tracer is ray-optics 0.9.8 (BSD 3-clause licence); it
+brings a toolkit for windows, and so it lives in an environment of its own:
 
     git clone https://github.com/amegahed/OpticsDatabase
     python3 -m venv /tmp/ray-optics
@@ -10,14 +10,15 @@ brings a toolkit for windows and lives in an environment of its own:
     python -m experiments collection OpticsDatabase --ray-optics /tmp/ray-optics/bin/python
 
 Both programs read each file. Compared are focal length, back focus, and the image heights of real chief rays (through
-the middle of the stop, rims ignored) at ten fields up to the file's own, at one wavelength and with the object at
-infinity. Answers of ray-optics are kept in OUT/ray_optics.json, so that a second run asks it for new files alone.
+the middle of the stop, rims ignored) at 0.3, 0.7 and all of the field that both reach, with the object at infinity.
+Where a figure differs, ray-optics is asked again, with what it is known to read wrongly put right: that names the cause.
+Writes collection.md, collection.json and collection.csv (a row for each file). Answers of ray-optics are kept in
+runs/collection, so that later runs ask it for new files alone.
 """
 
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import math
 import re
@@ -25,7 +26,8 @@ import subprocess
 import time
 import warnings
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -33,28 +35,29 @@ from experiments import lab
 from experiments.lab import Row
 from neurolens.analysis.fields import Scene
 from neurolens.base.errors import AssumedWarning, InputError, NeurolensError, NeurolensWarning
-from neurolens.optics.glass import LINE_D_NM, index_of
+from neurolens.base.files import atomic_write_text
+from neurolens.base.progress import Progress, Report
+from neurolens.optics.glass import index_of
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.readers.any_format import read_any
 
 SCRIPT = Path(__file__).with_name("ray_optics.py")
-LIMIT = 1e-4  # of a difference, relative
-FIELDS = 10  # from a tenth of the file's field to all of it
-SMALL_FIELD_DEG = 1.0  # of files that state no field
+KEPT = lab.ROOT / "runs" / "collection" / "ray_optics.json"
+LIMIT = 1e-4  # relative; a file that differs by more needs a named cause
+READ_GOAL = 0.97
+TENTHS = range(1, 11)  # of the file's field, at which chief rays are traced
+SHARES = (0.3, 0.7, 1.0)  # of the field that both programs reach, at which they are compared
+SMALL_FIELD_DEG = 1.0  # for files that state no field
+AT_ONCE = 50  # files for one process of ray-optics, after which the answers are kept
 
 
-def edge_deg(lens: Lens) -> float:
-    """The field that the file states, as an angle; an image height as without distortion."""
-    if lens.half_field_deg:
-        return lens.half_field_deg
-    radius = lens.image_radius_mm
-    return math.degrees(math.atan(radius / abs(first_order(lens).efl_mm))) if radius else SMALL_FIELD_DEG
+# ---- What neurolens reads. -------------------------------------------------------------------------------------------
 
 
 def own_row(path: Path, name: str) -> Row:
-    """What neurolens says of a file: verdict, reason or notes, and the figures that are compared."""
-    row: Row = {"file": name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "verdict": "refused"}
+    """The verdict on a file, its reason, the notes of the reader, and the figures that are compared."""
+    row: Row = {"file": name, "sha256": sha256(path.read_bytes()).hexdigest(), "reason": ""}
     began = time.perf_counter()
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always", NeurolensWarning)
@@ -62,47 +65,183 @@ def own_row(path: Path, name: str) -> Row:
             lens = read_any(path)
             row |= {"verdict": "read", "seconds": time.perf_counter() - began} | figures_of(lens)
         except NeurolensError as error:
-            row["reason"] = str(error).removeprefix(f"{path}: ")
-        except Exception as error:  # a fault of ours, which the table must show
+            row |= {"verdict": "refused", "reason": str(error).removeprefix(f"{path}: ")}
+        except Exception as error:  # a fault of ours, which the table has to show
             row |= {"verdict": "fault", "reason": f"{type(error).__name__}: {error}"}
-    said = [(str(w.message).removeprefix(f"{path}: "), issubclass(w.category, AssumedWarning)) for w in heard]
-    return row | {"notes": [text for text, _ in said], "assumed": [text for text, assumed in said if assumed]}
+    notes = {str(w.message).removeprefix(f"{path}: "): issubclass(w.category, AssumedWarning) for w in heard}
+    return row | {"notes": list(notes), "assumed": [text for text, assumed in notes.items() if assumed]}
 
 
 def figures_of(lens: Lens) -> Row:
-    """First-order data and chief rays, lengths from the last surface at which the medium changes."""
-    index = [1.0, *(float(index_of(s, LINE_D_NM)) for s in lens.surfaces)]
-    z, data, scene = lens.vertices_mm, first_order(lens), Scene(lens)
+    """First-order data and heights of chief rays; see `ray_optics` for where lengths count from."""
+    light, z, data, scene = lens.reference_nm, lens.vertices_mm, first_order(lens), Scene(lens)
+    index = [float(index_of(medium, light)) for medium in lens.media]
     changes = [k for k in range(len(lens.surfaces)) if index[k + 1] != index[k]]
-    fields = [edge_deg(lens) * k / FIELDS for k in range(1, FIELDS + 1)]
-    heights = scene.chief_rays(fields).height_mm.tolist()
+    fields = [edge_deg(lens) * tenth / 10 for tenth in TENTHS]
+    heights = scene.chief_rays(fields, light).height_mm.tolist()
     return {
-        "wavelength_nm": LINE_D_NM,
-        "efl_mm": data.efl_mm,
-        "back_mm": data.rear_focal_z_mm - z[changes[-1]],
+        "wavelength_nm": light,
+        "efl_mm": float(data.efl_mm),
+        "back_mm": float(data.rear_focal_z_mm) - z[changes[-1]],
         "film_mm": scene.film_z_mm - z[changes[-1]],
         "fields_deg": fields,
-        "heights_mm": [None if math.isnan(h) else h for h in heights],
-        "z_mm": [z[k] - z[changes[0]] for k in changes],
+        "heights_mm": [None if math.isnan(height) else height for height in heights],
+        "stop_z_mm": z[lens.stop_index] - z[changes[0]],
         "index": [index[k + 1] for k in changes],
     }
 
 
-# ---- The other program. ----------------------------------------------------------------------------------------------
+def edge_deg(lens: Lens) -> float:
+    """The field that the file states, as an angle; an image height as a lens without distortion has it."""
+    if lens.half_field_deg:
+        return lens.half_field_deg
+    radius = lens.image_radius_mm
+    return math.degrees(math.atan(radius / abs(first_order(lens).efl_mm))) if radius else SMALL_FIELD_DEG
 
 
-def ask_ray_optics(python: Path, folder: Path, rows: list[Row], quiet: bool) -> Iterable[Row]:
-    """The answers of ray-optics for the files of rows, one after the other.
+# ---- What ray-optics reads. ------------------------------------------------------------------------------------------
 
-    Raises:
-        InputError: no such program, or one without ray-optics.
+
+class RayOptics:
+    """Answers of ray-optics, kept in a file by the hash of what decides them."""
+
+    def __init__(self, python: Path, folder: Path) -> None:
+        self.python, self.folder = python, folder
+        self.kept = lab.kept_rows(KEPT, "experiments collection", lambda row: row["key"])
+
+    def ask(self, rows: Sequence[Row], mend: bool, report: Report) -> dict[str, Row]:
+        """The answers for files that neurolens has read, by name.
+
+        Raises:
+            InputError: a program that does not run ray-optics.
+        """
+        keys = ("wavelength_nm", "fields_deg", "stop_z_mm", *(["index"] if mend else ()))
+        tasks = {r["file"]: {key: r[key] for key in keys} | {"mend": mend} for r in rows}
+        version = sha256(SCRIPT.read_bytes()).hexdigest()
+        decisive = {r["file"]: json.dumps([version, r["sha256"], tasks[r["file"]]]) for r in rows}
+        key = {name: sha256(text.encode()).hexdigest() for name, text in decisive.items()}
+        new = [name for name in tasks if key[name] not in self.kept]
+        for begin in range(0, len(new), AT_ONCE):
+            names = new[begin : begin + AT_ONCE]
+            for name, found in zip(names, self._answers([tasks[n] | {"file": n} for n in names]), strict=True):
+                self.kept[key[name]] = found | {"key": key[name]}
+            atomic_write_text(KEPT, json.dumps(list(self.kept.values())))
+            report((begin + len(names)) / len(new))
+        return {name: self.kept[key[name]] for name in tasks}
+
+    def _answers(self, tasks: Sequence[Row]) -> list[Row]:
+        text = "".join(json.dumps(task | {"file": str((self.folder / task["file"]).resolve())}) + "\n" for task in tasks)
+        KEPT.parent.mkdir(parents=True, exist_ok=True)  # where ray-optics writes its own log, too
+        try:
+            done = subprocess.run(
+                [self.python, SCRIPT], input=text, capture_output=True, text=True, check=False, cwd=KEPT.parent
+            )
+        except OSError as error:
+            raise InputError("experiments collection", "--ray-optics", str(self.python), "a Python program") from error
+        lines = done.stdout.splitlines()
+        if len(lines) != len(tasks):
+            said = " ".join(done.stderr.splitlines()[-1:])
+            raise InputError("experiments collection", "--ray-optics", f"({said})", "a Python with ray-optics 0.9.8")
+        return [json.loads(line) for line in lines]
+
+
+# ---- How they differ, and why. ---------------------------------------------------------------------------------------
+
+
+def differences(own: Row, theirs: Row) -> Row:
+    """Relative differences: of lengths along the axis over the focal length, of image heights over themselves."""
+    focal = abs(theirs["efl_mm"])
+    pairs = list(zip(own["heights_mm"], theirs["heights_mm"], strict=False))
+    reached = next((k for k, pair in enumerate(pairs) if None in pair), len(pairs))
+    found = {key: abs(own[f"{key}_mm"] - theirs[f"{key}_mm"]) / focal for key in ("efl", "back", "film")}
+    for share in SHARES if reached else ():
+        a, b = pairs[max(1, round(share * reached)) - 1]
+        found[f"height {share:g}"] = abs(a / b - 1) if b else abs(a)
+    return found
+
+
+def judged(own: Row, theirs: Row, mended: Row | None) -> Row:
+    """The differences of a file, and their cause: "" where there is none above the limit, None for an unknown one.
+
+    Args:
+        mended: the answer of ray-optics with its known faults put right, None where it was not asked for that.
     """
-    tasks = [
-        {"file": str(folder / r["file"]), "wavelength_nm": r["wavelength_nm"], "fields_deg": r["fields_deg"]}
-        for r in rows
-    ]
-    text = "".join(json.dumps(task) + "\n" for task in tasks)
-    with subprocess.Popen(
-        [python, SCRIPT], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    ) as process:
-        ...
+    if "error" in theirs:
+        return {"cause": "ray-optics does not read it", "detail": theirs["error"]}
+    found = differences(own, theirs)
+    row: Row = {"differences": found, "reach": [reach(own), reach(theirs)], "cause": ""}
+    if max(found.values()) <= LIMIT:
+        return row
+    row["cause"] = None
+    for answer, names in ((theirs, []), (mended or theirs, (mended or {}).get("mended", []))):
+        for rays, more in (({}, []), (answer.get("rays", {}), ["its paraxial rays leave out r^2 terms"])):
+            rest = differences(own, answer | rays)
+            if row["cause"] is None and max(rest.values()) <= LIMIT:
+                row |= {"cause": "; ".join([*names, *more]), "rest": max(rest.values())}
+    return row
+
+
+def reach(row: Row) -> int:
+    """How many tenths of the field have a chief ray."""
+    return next((k for k, height in enumerate(row["heights_mm"]) if height is None), len(row["heights_mm"]))
+
+
+# ---- The page. -------------------------------------------------------------------------------------------------------
+
+
+def kind_of(text: str) -> str:
+    """A message without the figures and names that only one file has."""
+    text = re.sub(r"\bline \d+(, )?", "", text)
+    text = re.sub(r"(\bglass )\S+( is taken as )\S+", r"\1...\2...", text)
+    text = re.sub(r"'[^']*'", "'...'", text)
+    text = re.sub(r"[-+]?\d[\d.]*(e[-+]?\d+)?", "#", text, flags=re.IGNORECASE)
+    return re.sub(r"#(, #)+", "#", text)
+
+
+def grouped(pairs: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+    """Files by the kind of what was said of them, the commonest first."""
+    groups: dict[str, list[str]] = {}
+    for file, text in pairs:
+        files = groups.setdefault(kind_of(text), [])
+        if file not in files:
+            files.append(file)
+    return dict(sorted(groups.items(), key=lambda item: -len(item[1])))
+
+
+def run_all(folder: Path, only: str, python: Path | None, quiet: bool) -> list[Row]:
+    """One row for each file, in the order of their names."""
+    files = sorted(p for p in folder.rglob("*") if p.suffix.lower() == ".zmx")
+    if not files:
+        raise InputError(folder, "files", "(no .zmx)", "a clone of OpticsDatabase: see `experiments collection --help`")
+    names = lab.chosen([str(p.relative_to(folder)) for p in files], str, only, "collection")
+    progress = Progress({"neurolens": len(names) / 20, "ray-optics": len(names) / 5}, quiet=quiet)
+    rows = []
+    with progress.stage("neurolens") as report:
+        for count, name in enumerate(names, start=1):
+            rows.append(own_row(folder / name, name))
+            report(count / len(names))
+    if python is None:
+        return rows
+    read = [r for r in rows if r["verdict"] == "read"]
+    other = RayOptics(python, folder)
+    with progress.stage("ray-optics") as report:
+        first = other.ask(read, False, report)
+    doubtful = [r for r in read if judged(r, first[r["file"]], None)["cause"] is None]
+    with progress.stage("ray-optics, mended") as report:
+        second = other.ask(doubtful, True, report)
+    for row in read:
+        row |= judged(row, first[row["file"]], second.get(row["file"]))
+    return rows
+
+
+OPTIONS = (
+    lab.option("folder", metavar="FOLDER", type=Path, help="clone of github.com/amegahed/OpticsDatabase"),
+    lab.option("--ray-optics", metavar="PYTHON", type=Path, help="Python with ray-optics 0.9.8 (default: only read)"),
+    lab.ONLY,
+    lab.out(),
+)
+
+
+def run(args: argparse.Namespace) -> None:
+    rows = run_all(args.folder, args.only, args.ray_optics, args.quiet)
+    Path("/work/corpus/b_tmp/rows.json").write_text(json.dumps(rows))

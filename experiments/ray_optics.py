@@ -14,6 +14,7 @@ the normalisation radius of XOSPHERE (left out), and, where they differ, the ind
 ray-optics does not know and replaces).
 """
 
+import io
 import json
 import math
 import signal
@@ -23,6 +24,7 @@ from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
+from opticalglass.opticalmedium import ConstantIndex
 from rayoptics.elem.profiles import EvenPolynomial
 from rayoptics.environment import open_model  # noqa: F401  (sets the program up)
 from rayoptics.parax.firstorder import compute_principle_points, paraxial_trace
@@ -55,6 +57,7 @@ class Model:
         self.update()
         if task.get("mend") and len(task["index"]) == len(self.changes):
             self.replace_indices(task["index"])
+            self.update()
         self.stop = self.sequence.stop_surface or self.marked_stop(lines) or self.nearest(task.get("stop_z_mm"))
 
     def update(self):
@@ -75,20 +78,20 @@ class Model:
                 scaled = [a / radius ** (2 * i) for i, a in enumerate(terms, start=1)]
                 shape = EvenPolynomial(c=profile.cv, cc=getattr(profile, "cc", 0.0), coefs=scaled)
                 self.sequence.ifcs[k].profile = shape
-                self.mended.append("the terms of XASPHERE")
+                self.mended.append("XASPHERE, which it reads as a sphere or conic")
             elif kind == "XOSPHERE" and radius != 1:
                 profile.coefs = [a / radius**i for i, a in enumerate(terms, start=1)]
-                self.mended.append("the radius of XOSPHERE")
+                self.mended.append("XOSPHERE, whose normalisation radius it leaves out")
 
     def replace_indices(self, wanted):
         """Take the given index behind each surface where the medium changes and they differ."""
-        for k, n in zip(self.changes, wanted):
+        gaps, ends = self.sequence.gaps, [*self.changes[1:], len(self.index)]
+        for k, end, n in zip(self.changes, ends, wanted):
             if abs(self.index[k] - n) > SAME_INDEX:
-                self.mended.append(f"the index of {self.glass(k)}")
-                self.index[k] = n
-        for k, changed in enumerate(self.index):
-            if k and k not in self.changes:
-                self.index[k] = self.index[k - 1]
+                text = f"a glass that it takes for {self.glass(k)} (n {self.index[k]:.5f} instead of {n:.5f})"
+                self.mended.append(text)
+                for gap in gaps[k:end]:
+                    gap.medium = ConstantIndex(n, "mended")
 
     def glass(self, k):
         return str(self.sequence.gaps[k].medium.name())
@@ -228,7 +231,7 @@ def main():
     for line in sys.stdin:
         signal.alarm(SECONDS)
         try:
-            with redirect_stdout(sys.stderr):
+            with redirect_stdout(io.StringIO()):  # ray-optics prints much
                 found = answer(json.loads(line))
         except Exception as error:  # whatever ray-optics raises is its answer
             found = {"error": f"{type(error).__name__}: {error}"[:300]}
