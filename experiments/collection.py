@@ -11,7 +11,7 @@ brings a toolkit for windows, and so it lives in an environment of its own:
 
 Both programs read each file. Compared are focal length, back focus, and the image heights of real chief rays (through
 the middle of the stop, rims ignored) at 0.3, 0.7 and all of the field that both reach, with the object at infinity.
-Where a figure differs, ray-optics is asked again, with what it is known to read wrongly put right: that names the cause.
+Where a figure differs, ray-optics is asked again with what it is known to read wrongly put right: that names the cause.
 Writes collection.md, collection.json and collection.csv (a row for each file). Answers of ray-optics are kept in
 runs/collection, so that later runs ask it for new files alone.
 """
@@ -26,10 +26,9 @@ import subprocess
 import time
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
 from experiments import lab
 from experiments.lab import Row
@@ -130,7 +129,9 @@ class RayOptics:
         return {name: self.kept[key[name]] for name in tasks}
 
     def _answers(self, tasks: Sequence[Row]) -> list[Row]:
-        text = "".join(json.dumps(task | {"file": str((self.folder / task["file"]).resolve())}) + "\n" for task in tasks)
+        text = "".join(
+            json.dumps(task | {"file": str((self.folder / task["file"]).resolve())}) + "\n" for task in tasks
+        )
         KEPT.parent.mkdir(parents=True, exist_ok=True)  # where ray-optics writes its own log, too
         try:
             done = subprocess.run(
@@ -193,23 +194,104 @@ def kind_of(text: str) -> str:
     """A message without the figures and names that only one file has."""
     text = re.sub(r"\bline \d+(, )?", "", text)
     text = re.sub(r"(\bglass )\S+( is taken as )\S+", r"\1...\2...", text)
-    text = re.sub(r"'[^']*'", "'...'", text)
-    text = re.sub(r"[-+]?\d[\d.]*(e[-+]?\d+)?", "#", text, flags=re.IGNORECASE)
-    return re.sub(r"#(, #)+", "#", text)
+    text = re.sub(r"'[^']*'|\"[^\"]*\"", "'...'", text)
+    text = re.sub(r"[-+]?\b\d[\d.]*(e[-+]?\d+)?", "#", text, flags=re.IGNORECASE)
+    return re.sub(r"#((, | to | )#)+", "#", text)
 
 
-def grouped(pairs: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+def grouped(pairs: Iterable[tuple[Row, str]]) -> list[tuple[str, list[Row]]]:
     """Files by the kind of what was said of them, the commonest first."""
-    groups: dict[str, list[str]] = {}
-    for file, text in pairs:
-        files = groups.setdefault(kind_of(text), [])
-        if file not in files:
-            files.append(file)
-    return dict(sorted(groups.items(), key=lambda item: -len(item[1])))
+    groups: dict[str, list[Row]] = {}
+    for row, text in pairs:
+        rows = groups.setdefault(kind_of(text), [])
+        if row not in rows:
+            rows.append(row)
+    return sorted(groups.items(), key=lambda item: -len(item[1]))
+
+
+def stem(row: Row) -> str:
+    return Path(row["file"]).stem
+
+
+def page(rows: list[Row]) -> str:
+    """The result as Markdown."""
+    read = [r for r in rows if r["verdict"] == "read"]
+    parts = [_summary(rows, read)]
+    refused = [(r, r["reason"]) for r in rows if r["verdict"] != "read"]
+    shown = [[len(found), text, "; ".join(map(stem, found))] for text, found in grouped(refused)]
+    parts += ["## Refused", lab.table("files|reason|which", shown)]
+    for title, key in (("Assumed", "assumed"), ("Told", "notes")):
+        pairs = [(r, text) for r in read for text in r[key] if key == "assumed" or text not in r["assumed"]]
+        shown = [[len(found), text, stem(found[0])] for text, found in grouped(pairs)]
+        parts += [f"## {title}", lab.table("files|what|the first", shown)]
+    if any("cause" in r for r in read):
+        parts += _agreement(read)
+    return lab.page("# A public collection", "`python -m experiments collection`", *parts)
+
+
+def _summary(rows: list[Row], read: list[Row]) -> str:
+    compared = [r for r in read if "differences" in r]
+    counts = Counter("unknown" if r["cause"] is None else "agree" if not r["cause"] else "named" for r in compared)
+    goals = [lab.Goal("share of the files that are read", READ_GOAL, len(read) / len(rows), at_least=True)]
+    if compared:
+        goals.append(lab.Goal("files that differ without a named cause", 0, counts["unknown"]))
+    seconds = sum(r.get("seconds", 0.0) for r in read)
+    return lab.page(
+        f"OpticsDatabase (github.com/amegahed/OpticsDatabase): {len(rows)} Zemax files, {len(read)} read in "
+        f"{seconds:.0f} s, {len(compared)} compared with ray-optics 0.9.8; {counts['agree']} agree within {LIMIT:g}, "
+        f"{counts['named']} differ by a named cause.",
+        lab.goal_table("goal", goals),
+    )
+
+
+def _agreement(read: list[Row]) -> list[str]:
+    agree = [r for r in read if r.get("cause") == ""]
+    spread = []
+    for key in dict.fromkeys(key for r in agree for key in r["differences"]):
+        values = sorted(r["differences"][key] for r in agree if key in r["differences"])
+        spread.append([key, len(values), *(f"{values[int(q * (len(values) - 1))]:.1e}" for q in (0.5, 0.99, 1.0))])
+    causes = [[r, "unknown" if r["cause"] is None else r["cause"]] for r in read if r.get("cause") != ""]
+    shown = []
+    for cause in dict.fromkeys(cause for _, cause in causes):
+        found = [r for r, text in causes if text == cause]
+        most = max((max(r.get("differences", {"": 0.0}).values()) for r in found), default=0.0)
+        rest = max((r.get("rest", 0.0) for r in found), default=0.0)
+        shown.append([len(found), cause, f"{most:.1e}", f"{rest:.1e}", "; ".join(map(stem, found))])
+    short = [[stem(r), *(f"{10 * n}%" for n in r["reach"])] for r in read if "reach" in r and min(r["reach"]) < 10]
+    return [
+        "## Agreement",
+        "Relative differences of the files that agree; lengths along the axis over the focal length, image heights "
+        "over themselves, at shares of the field that both programs reach.",
+        lab.table("figure|files|median|99%|most", spread),
+        "Files that differ by more than 1e-4, and how much is left where ray-optics is given what it reads wrongly:",
+        lab.table("files|cause, in ray-optics|difference|left|which", shown),
+        f"Chief rays reach the whole field of the file in both programs, but in {len(short)} files:" if short else "",
+        lab.table("file|neurolens|ray-optics", short) if short else "",
+    ]
+
+
+COLUMNS = lab.columns(
+    ("file", "file"),
+    ("verdict", "verdict"),
+    ("focal length mm", "efl_mm", ".7g"),
+    ("back focus mm", "back_mm", ".7g"),
+    ("field deg", lambda r: r["fields_deg"][-1] if "fields_deg" in r else None, ".4g"),
+    *((f"d {key}", f"differences.{key}", ".0e") for key in ("efl", "back", "film")),
+    *((f"d height {s:g}", lambda r, s=s: r.get("differences", {}).get(f"height {s:g}"), ".0e") for s in SHARES),
+    ("cause", "cause"),
+    ("reason", "reason"),
+)
+
+
+# ---- The command. ----------------------------------------------------------------------------------------------------
 
 
 def run_all(folder: Path, only: str, python: Path | None, quiet: bool) -> list[Row]:
-    """One row for each file, in the order of their names."""
+    """One row for each file, in the order of their names.
+
+    Raises:
+        InputError: a folder without .zmx files; as `RayOptics.ask`.
+    """
     files = sorted(p for p in folder.rglob("*") if p.suffix.lower() == ".zmx")
     if not files:
         raise InputError(folder, "files", "(no .zmx)", "a clone of OpticsDatabase: see `experiments collection --help`")
@@ -222,8 +304,7 @@ def run_all(folder: Path, only: str, python: Path | None, quiet: bool) -> list[R
             report(count / len(names))
     if python is None:
         return rows
-    read = [r for r in rows if r["verdict"] == "read"]
-    other = RayOptics(python, folder)
+    read, other = [r for r in rows if r["verdict"] == "read"], RayOptics(python, folder)
     with progress.stage("ray-optics") as report:
         first = other.ask(read, False, report)
     doubtful = [r for r in read if judged(r, first[r["file"]], None)["cause"] is None]
@@ -243,5 +324,8 @@ OPTIONS = (
 
 
 def run(args: argparse.Namespace) -> None:
+    """Read, compare, print and write."""
     rows = run_all(args.folder, args.only, args.ray_optics, args.quiet)
-    Path("/work/corpus/b_tmp/rows.json").write_text(json.dumps(rows))
+    summary = {"files": len(rows), "verdicts": Counter(r["verdict"] for r in rows), "machine": lab.machine()}
+    print(lab.write_results(args.out, "collection", page(rows), summary))
+    atomic_write_text(args.out / "collection.csv", lab.csv_text(COLUMNS, rows))

@@ -1,5 +1,6 @@
-"""Lens files as ray-optics 0.9.8 reads and traces them. Run by `python -m experiments collection`, in the environment of
-ray-optics: nothing of neurolens is imported here.
+"""Lens files as ray-optics 0.9.8 reads and traces them; run by `python -m experiments collection`.
+
+This script runs in the environment of ray-optics: it imports nothing of neurolens.
 
 Each line of the standard input is a task in JSON, each line of the output its answer, in the same order:
 
@@ -9,9 +10,9 @@ Each line of the standard input is a task in JSON, each line of the output its a
 
 Lengths along the axis count from the last surface at which the medium changes, `z_mm` from the first. "rays" has focal
 length and back focus once more, by a real ray near the axis. `stop_z_mm` is for files that mark no stop. With "mend",
-what ray-optics is known to read wrongly is put right first, and "mended" says what: terms of XASPHERE (read as spheres),
-the normalisation radius of XOSPHERE (left out), and, where they differ, the indices of the task (glasses that
-ray-optics does not know and replaces).
+what ray-optics is known to read wrongly is put right first, and "mended" says what: terms of XASPHERE (which it reads as
+spheres), the normalisation radius of XOSPHERE (left out), and, where they differ, the indices of the task (of glasses
+that ray-optics does not know and replaces).
 """
 
 import io
@@ -86,7 +87,7 @@ class Model:
     def replace_indices(self, wanted):
         """Take the given index behind each surface where the medium changes and they differ."""
         gaps, ends = self.sequence.gaps, [*self.changes[1:], len(self.index)]
-        for k, end, n in zip(self.changes, ends, wanted):
+        for k, end, n in zip(self.changes, ends, wanted, strict=True):
             if abs(self.index[k] - n) > SAME_INDEX:
                 text = f"a glass that it takes for {self.glass(k)} (n {self.index[k]:.5f} instead of {n:.5f})"
                 self.mended.append(text)
@@ -115,8 +116,8 @@ class Model:
         s = self.sequence
         nothing = (np.identity(3), np.zeros(3))
         shifts = [nothing, *((np.identity(3), np.array([0.0, 0.0, t])) for t in self.thickness[1:]), nothing]
-        rows = zip(s.ifcs, [*s.gaps, None], shifts, [*self.index, self.index[-1]], [*s.z_dir, s.z_dir[-1]])
-        return [list(row) for row in rows]
+        columns = s.ifcs, [*s.gaps, None], shifts, [*self.index, self.index[-1]], [*s.z_dir, s.z_dir[-1]]
+        return [list(row) for row in zip(*columns, strict=True)]
 
     def first_order(self):
         """Focal length, back focus, and distance of the film, from the last surface at which the medium changes."""
@@ -135,7 +136,7 @@ class Model:
             slope = way[1] / way[2]
             z = ray[self.last][0][2]
             found.append((-height / slope, z - y / slope))
-        return [(4 * fine - coarse) / 3 for coarse, fine in zip(*found)]
+        return [(4 * fine - coarse) / 3 for coarse, fine in zip(*found, strict=True)]
 
     def entrance_pupil(self):
         """Distance behind the first vertex, on the axis."""
@@ -207,11 +208,12 @@ def answer(task):
     """The data of one file."""
     model = Model(task)
     efl, back, film = map(float, model.first_order())
+    rays = map(float, model.near_axis(efl))
     return {
         "efl_mm": efl,
         "back_mm": back,
         "film_mm": film,
-        "rays": dict(zip(("efl_mm", "back_mm"), map(float, model.near_axis(efl)))),
+        "rays": dict(zip(("efl_mm", "back_mm"), rays, strict=True)),
         "heights_mm": [] if model.stop is None else model.chief_heights(task["fields_deg"]),
         "z_mm": [model.z[k] - model.z[model.first] for k in model.changes],
         "index": [model.index[k] for k in model.changes],
