@@ -250,13 +250,13 @@ def _agreement(read: list[Row]) -> list[str]:
     for key in dict.fromkeys(key for r in agree for key in r["differences"]):
         values = sorted(r["differences"][key] for r in agree if key in r["differences"])
         spread.append([key, len(values), *(f"{values[int(q * (len(values) - 1))]:.1e}" for q in (0.5, 0.99, 1.0))])
-    causes = [[r, "unknown" if r["cause"] is None else r["cause"]] for r in read if r.get("cause") != ""]
+    differing = [r for r in read if r.get("cause") != ""]
     shown = []
-    for cause in dict.fromkeys(cause for _, cause in causes):
-        found = [r for r, text in causes if text == cause]
+    for cause in dict.fromkeys(r["cause"] for r in differing):
+        found = [r for r in differing if r["cause"] == cause]
         most = max((max(r.get("differences", {"": 0.0}).values()) for r in found), default=0.0)
         rest = max((r.get("rest", 0.0) for r in found), default=0.0)
-        shown.append([len(found), cause, f"{most:.1e}", f"{rest:.1e}", "; ".join(map(stem, found))])
+        shown.append([len(found), cause or "unknown", f"{most:.1e}", f"{rest:.1e}", "; ".join(map(stem, found))])
     short = [[stem(r), *(f"{10 * n}%" for n in r["reach"])] for r in read if "reach" in r and min(r["reach"]) < 10]
     return [
         "## Agreement",

@@ -10,9 +10,9 @@ Each line of the standard input is a task in JSON, each line of the output its a
 
 Lengths along the axis count from the last surface at which the medium changes, `z_mm` from the first. "rays" has focal
 length and back focus once more, by a real ray near the axis. `stop_z_mm` is for files that mark no stop. With "mend",
-what ray-optics is known to read wrongly is put right first, and "mended" says what: terms of XASPHERE (which it reads as
-spheres), the normalisation radius of XOSPHERE (left out), and, where they differ, the indices of the task (of glasses
-that ray-optics does not know and replaces).
+what ray-optics is known to read wrongly is put right first, and "mended" says what: terms of XASPHERE (which it leaves
+out), the normalisation radius of XOSPHERE (left out), and, where they differ, the indices of the task (of glasses that
+ray-optics does not know and replaces).
 """
 
 import io

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from neurolens.base.errors import InputError
@@ -44,6 +44,9 @@ FORMATS = (
     Format("FlareSim", (".lens",), read_flaresim, looks_like_flaresim),
     Format("lens table", (".dat", ".txt", ".lens"), read_table, looks_like_table),
 )
+
+
+SUFFIXES = frozenset([".toml", *(suffix for f in FORMATS for suffix in f.suffixes)])
 
 
 def read_any(path: str | Path, given: Given | None = None) -> Lens:
@@ -92,3 +95,44 @@ def kind_of(path: str | Path) -> str:
     if Path(path).suffix.lower() == ".toml":
         return "Physical Camera" if is_blender(read_toml(path)) else _OURS
     return format_of(path).name
+
+
+@dataclass(frozen=True)
+class Collection:
+    """The files of a folder: those that may be lenses, by name with "/" between its parts, and how many are not.
+
+    Attributes:
+        others: how many files of other kinds lie in the folder, by suffix.
+    """
+
+    folder: Path
+    names: tuple[str, ...]
+    others: dict[str, int] = field(default_factory=dict)
+
+
+def collection_of(folder: Path) -> Collection:
+    """The files of a folder and of its folders by suffix; hidden ones and links to folders are others.
+
+    Raises:
+        InputError: no such folder, or no lens file in it.
+    """
+    if not folder.is_dir():
+        raise InputError(folder, "FOLDER", "(no folder)", "a folder of lens files")
+    names, others = list[str](), dict[str, int]()
+    for file in sorted(folder.rglob("*")):
+        parts = file.relative_to(folder).parts
+        kind = file.suffix.lower() or "(none)"
+        if file.is_dir():
+            if not file.is_symlink():
+                continue
+            kind = "(link to a folder)"
+        elif any(part.startswith(".") for part in parts):
+            kind = "(hidden)"
+        elif kind in SUFFIXES:
+            names.append("/".join(parts))
+            continue
+        others[kind] = others.get(kind, 0) + 1
+    if not names:
+        known = ", ".join(sorted(SUFFIXES))
+        raise InputError(folder, "FOLDER", f"({sum(others.values())} files of other kinds)", f"lens files: {known}")
+    return Collection(folder, tuple(names), others)

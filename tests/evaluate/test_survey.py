@@ -19,7 +19,8 @@ from neurolens.base.progress import Progress
 from neurolens.cli import main
 from neurolens.evaluate import survey_run
 from neurolens.evaluate.survey import SurveySettings, Task, known_record, run_task, summary_of
-from neurolens.evaluate.survey_run import collection_of, in_processes, survey
+from neurolens.evaluate.survey_run import in_processes, survey
+from neurolens.readers.any_format import collection_of
 
 LENSES = Path(__file__).parents[2] / "lenses"
 TRIPLET = (LENSES / "cooke_triplet_50.toml").read_bytes()
