@@ -47,6 +47,7 @@ LIMIT = 1e-4  # relative; a file that differs by more needs a named cause
 READ_GOAL = 0.97
 TENTHS = range(1, 11)  # of the file's field, at which chief rays are traced
 SHARES = (0.3, 0.7, 1.0)  # of the field that both programs reach, at which they are compared
+AS_FILED = "as filed"  # name of the state of a file without states that is focused near
 SMALL_FIELD_DEG = 1.0  # for files that state no field
 AT_ONCE = 50  # files for one process of ray-optics, after which the answers are kept
 
@@ -73,15 +74,22 @@ def own_row(path: Path, name: str) -> Row:
 
 def figures_of(lens: Lens) -> Row:
     """First-order data and heights of chief rays; see `ray_optics` for where lengths count from."""
-    light, z, data, scene = lens.reference_nm, lens.vertices_mm, first_order(lens), Scene(lens)
+    light, z, scene = lens.reference_nm, lens.vertices_mm, Scene(lens)
     index = [float(index_of(medium, light)) for medium in lens.media]
     changes = [k for k in range(len(lens.surfaces)) if index[k + 1] != index[k]]
     fields = [edge_deg(lens) * tenth / 10 for tenth in TENTHS]
     heights = scene.chief_rays(fields, light).height_mm.tolist()
+
+    def focal(state: Lens) -> list[float]:
+        data = first_order(state)
+        return [float(data.efl_mm), float(data.rear_focal_z_mm) - state.vertices_mm[changes[-1]]]
+
+    efl, back = focal(lens)
     return {
         "wavelength_nm": light,
-        "efl_mm": float(data.efl_mm),
-        "back_mm": float(data.rear_focal_z_mm) - z[changes[-1]],
+        "efl_mm": efl,
+        "back_mm": back,
+        "states": [focal(lens.with_gaps(dict(c.thickness_mm))) for c in lens.configurations if c.name != AS_FILED],
         "film_mm": scene.film_z_mm - z[changes[-1]],
         "fields_deg": fields,
         "heights_mm": [None if math.isnan(height) else height for height in heights],
@@ -155,6 +163,11 @@ def differences(own: Row, theirs: Row) -> Row:
     pairs = list(zip(own["heights_mm"], theirs["heights_mm"], strict=False))
     reached = next((k for k, pair in enumerate(pairs) if None in pair), len(pairs))
     found = {key: abs(own[f"{key}_mm"] - theirs[f"{key}_mm"]) / focal for key in ("efl", "back", "film")}
+    if own["states"]:
+        both = zip(own["states"], theirs["states"], strict=True)
+        found["states"] = max(
+            abs(a - b) / abs(other[0]) for one, other in both for a, b in zip(one, other, strict=True)
+        )
     for share in SHARES if reached else ():
         a, b = pairs[max(1, round(share * reached)) - 1]
         found[f"height {share:g}"] = abs(a / b - 1) if b else abs(a)
@@ -175,7 +188,8 @@ def judged(own: Row, theirs: Row, mended: Row | None) -> Row:
         return row
     row["cause"] = None
     for answer, names in ((theirs, []), (mended or theirs, (mended or {}).get("mended", []))):
-        for rays, more in (({}, []), (answer.get("rays", {}), ["its paraxial rays leave out r^2 terms"])):
+        efl, back = answer["rays"]
+        for rays, more in (({}, []), ({"efl_mm": efl, "back_mm": back}, ["its paraxial rays leave out r^2 terms"])):
             rest = differences(own, answer | rays)
             if row["cause"] is None and max(rest.values()) <= LIMIT:
                 row |= {"cause": "; ".join([*names, *more]), "rest": max(rest.values())}

@@ -5,14 +5,14 @@ This script runs in the environment of ray-optics: it imports nothing of neurole
 Each line of the standard input is a task in JSON, each line of the output its answer, in the same order:
 
     {"file", "wavelength_nm", "fields_deg", "stop_z_mm", "mend", "index"}
-    {"efl_mm", "back_mm", "film_mm", "rays": {"efl_mm", "back_mm"}, "heights_mm", "z_mm", "index", "glass", "mended"}
+    {"efl_mm", "back_mm", "film_mm", "rays": [efl, back], "states": [[efl, back]], "heights_mm", "index", "mended"}
     {"error"}
 
-Lengths along the axis count from the last surface at which the medium changes, `z_mm` from the first. "rays" has focal
-length and back focus once more, by a real ray near the axis. `stop_z_mm` is for files that mark no stop. With "mend",
-what ray-optics is known to read wrongly is put right first, and "mended" says what: terms of XASPHERE (which it leaves
-out), the normalisation radius of XOSPHERE (left out), and, where they differ, the indices of the task (of glasses that
-ray-optics does not know and replaces).
+Lengths along the axis count from the last surface at which the medium changes; `stop_z_mm`, for files that mark no
+stop, counts from the first. "rays" has focal length and back focus once more, by real rays near the axis, and so has
+"states" for every configuration of the file. With "mend", what ray-optics is known to read wrongly is put right first,
+and "mended" says what: terms of XASPHERE (which it leaves out), the normalisation radius of XOSPHERE (left out), and,
+where they differ, the indices of the task (of glasses that ray-optics does not know and replaces).
 """
 
 import io
@@ -48,8 +48,10 @@ class Model:
         text = raw.decode("utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "latin-1")
         lines = [line.split() for line in text.splitlines()]
         kept = (line for line in text.splitlines() if line.split()[:1] and line.split()[0] not in FIELD_LINES)
-        self.model, _ = zmxread.read_lens(Path(task["file"]), "\n".join(kept))
+        full = (f"{line} 0" if line.split()[0] == "DIAM" and len(line.split()) == 2 else line for line in kept)
+        self.model, _ = zmxread.read_lens(Path(task["file"]), "\n".join(full))
         self.sequence, self.wavelength_nm, self.mended = self.model["seq_model"], task["wavelength_nm"], []
+        self.lines = lines
         wavelengths = self.model["osp"]["wvls"]
         wavelengths.set_from_list([[self.wavelength_nm, 1.0]])
         wavelengths.reference_wvl = 0
@@ -128,15 +130,31 @@ class Model:
         return efl, back_focus + behind, behind + self.thickness[-1]
 
     def near_axis(self, efl):
-        """The same focal length and back focus by two real rays parallel to the axis, extrapolated to height 0."""
+        """The same focal length and back focus by real rays parallel to the axis, extrapolated to height 0.
+
+        An r^3 term of an asphere makes an error that grows with the height, all others one with its square.
+        """
         found = []
-        for height in (abs(efl) * NEAR_AXIS, abs(efl) * NEAR_AXIS / 2):
+        for height in (abs(efl) * NEAR_AXIS / 2**k for k in range(3)):
             ray = self.trace(0.0, height, 0.0)
-            y, way = ray[self.last][0][1], ray[self.last][1]
+            (_, y, z), way = ray[self.last][0], ray[self.last][1]
             slope = way[1] / way[2]
-            z = ray[self.last][0][2]
-            found.append((-height / slope, z - y / slope))
-        return [(4 * fine - coarse) / 3 for coarse, fine in zip(*found, strict=True)]
+            found.append(np.array([-height / slope, z - y / slope]))
+        wide, middle, narrow = found
+        return [float(v) for v in (4 * (2 * narrow - middle) - (2 * middle - wide)) / 3]
+
+    def states(self, efl):
+        """Focal length and back focus in every configuration of the file, whose operands THIC replace thicknesses."""
+        tabled, states = self.thickness, {}
+        for words in self.lines:
+            if words[:1] == ["THIC"] and words[1] != "0":
+                states.setdefault(int(words[2]), {})[int(words[1])] = float(words[3])
+        found = []
+        for n in sorted(states):
+            self.thickness = [states[n].get(k, t) for k, t in enumerate(tabled)]
+            found.append(self.near_axis(efl))
+        self.thickness = tabled
+        return found
 
     def entrance_pupil(self):
         """Distance behind the first vertex, on the axis."""
@@ -208,16 +226,14 @@ def answer(task):
     """The data of one file."""
     model = Model(task)
     efl, back, film = map(float, model.first_order())
-    rays = map(float, model.near_axis(efl))
     return {
         "efl_mm": efl,
         "back_mm": back,
         "film_mm": film,
-        "rays": dict(zip(("efl_mm", "back_mm"), rays, strict=True)),
+        "rays": model.near_axis(efl),
+        "states": model.states(efl),
         "heights_mm": [] if model.stop is None else model.chief_heights(task["fields_deg"]),
-        "z_mm": [model.z[k] - model.z[model.first] for k in model.changes],
         "index": [model.index[k] for k in model.changes],
-        "glass": [model.glass(k) for k in model.changes],
         "mended": list(dict.fromkeys(model.mended)),
     }
 
