@@ -32,7 +32,7 @@ def plate(**fields: float) -> tuple[Surface, Surface]:
 def test_a_grey_filter_absorbs_by_beer_and_lambert() -> None:
     ray = Rays(*(torch.tensor([v], dtype=torch.float64) for v in (0.0, 0.0, -1.0, 0.0, 0.0, 1.0)))
     clear, grey = (
-        trace(before(pinhole(50.0, 1.0), plate(absorption_per_mm=a)), ray, towards="film", transmittance=True)
+        trace(before(pinhole(50.0, 1.0), *plate(absorption_per_mm=a)), ray, towards="film", transmittance=True)
         for a in (0.0, math.log(8) / PLATE_MM)
     )
     assert clear.transmittance is not None and grey.transmittance is not None
