@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.bounds import WAVELENGTH_NM, within
 from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import MAX_SURFACES, check_states
-from neurolens.optics.prescription import Configuration, Lens, Surface
+from neurolens.optics.prescription import Configuration, Lens, Medium, Surface
 from neurolens.optics.sag import end_mm, same_medium
 from neurolens.readers.assemble import UNKNOWN, finish, first_order, smaller_stop, with_rims
 from neurolens.readers.forbes import MAX_TERMS, qbfs_terms, qcon_terms
@@ -48,6 +50,7 @@ class Block:
     """One surface while a file is read, in the file's unit; readers add what their formats say besides."""
 
     start: Line
+    name: str = ""
     curvature: float = 0.0
     conic: float = 0.0
     thickness: float = 0.0
@@ -90,10 +93,12 @@ class Row:
     Attributes:
         surface: its diameter may be `assemble.UNKNOWN`.
         aperture: whether the file sets a clear aperture on it, so that even a plane in air cuts the beam.
+        name: number by which the file calls it; empty where that is its place in the table, from 0.
     """
 
     surface: Surface
     aperture: bool = False
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -130,6 +135,9 @@ class Draft:
             they are twice what they can be, and narrowed where neighbours would touch; both is told. A missing stop is
             assumed.
         nominal: f-number that the file states with few digits, to tell radii from diameters by.
+        skipped: what was not read since no ray depends on it, and how often it occurs; told in one line.
+        object_medium: fields of `Medium` for the medium in front of the lens.
+        wavelengths_nm: as `Lens.wavelengths_nm`.
     """
 
     file: str
@@ -149,11 +157,27 @@ class Draft:
     stated_efl: float | None = None
     drawn: bool = False
     nominal: float | None = None
+    skipped: Counter[str] = field(default_factory=Counter)
+    object_medium: dict[str, Any] = field(default_factory=dict)
+    wavelengths_nm: tuple[float, ...] = ()
+
+    def numbers(self) -> list[str]:
+        """What the file calls its surfaces."""
+        return [row.name or str(k) for k, row in enumerate(self.rows)]
+
+
+def primary_first(wavelengths_nm: Iterable[float], primary_nm: float) -> tuple[float, ...]:
+    """Wavelengths of a file as `Lens` holds them; those beyond what neurolens traces are left out."""
+    sound = [nm for nm in wavelengths_nm if within(WAVELENGTH_NM, nm)]
+    return tuple(sorted(sound, key=lambda nm: nm != primary_nm))
 
 
 def lens_of(draft: Draft, given: Given | None = None) -> Lens:
     """The lens of a draft, in mm, checked as by `assemble.finish`; a unit other than the file's is an InputError."""
     given = given or Given()
+    if +draft.skipped:
+        listed = (word if count == 1 else f"{word} ({count})" for word, count in (+draft.skipped).items())
+        warn(draft.file, f"left out, since no ray depends on it: {', '.join(listed)}")
     draft = _without_dummies(draft)
     unit = given.units or draft.unit or "mm"
     if given.units and draft.unit and given.units != draft.unit:
@@ -175,6 +199,8 @@ def lens_of(draft: Draft, given: Given | None = None) -> Lens:
         rims=draft.rims,
         path=draft.file,
         stated_efl_mm=draft.stated_efl,
+        object_medium=Medium(**draft.object_medium),
+        wavelengths_nm=draft.wavelengths_nm,
     )
     if draft.drawn:
         lens = _with_likely_rims(_with_stop(lens), draft.f_number or draft.nominal)
@@ -321,4 +347,5 @@ def _without_dummies(draft: Draft) -> Draft:
 def _is_dummy(draft: Draft, k: int) -> bool:
     s = draft.rows[k].surface
     flat = math.isinf(s.radius_mm) and not s.stop and not s.asphere and not draft.rows[k].aperture
-    return flat and same_medium([row.surface for row in draft.rows], k)
+    rows = [row.surface for row in draft.rows]
+    return flat and same_medium(rows, k, Surface(math.inf, 0.0, UNKNOWN, **draft.object_medium))
