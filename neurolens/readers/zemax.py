@@ -286,7 +286,7 @@ def _glass(line: Line, rest: list[str], makers: list[str]) -> dict[str, Any]:
     if name.upper() in ("AIR", "VACUUM"):
         return {}
     if kind == "1" or name == "___BLANK":
-        n_d, V_d = line.numbers("GLAS", rest[3:5], 2)
+        n_d, V_d = (*line.numbers("GLAS", rest[3:5]), 0.0)[:2]
         return {"n_d": n_d, "V_d": V_d if V_d > 0 else None, "material": None if name == "___BLANK" else name}
     if kind == "4":
         raise line.error("GLAS", f"{name} with solve {kind}", "a glass of the catalogue, or n_d and V_d: no offset from it")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from neurolens.base.errors import InputError
@@ -87,6 +87,10 @@ def shape_of(block: Block) -> dict[str, Any]:
     match block.kind:
         case "STANDARD":
             shape = block.rotational()
+        case "XASPHERE" if any(v for v, _ in block.parameters.values()) and not any(v for v, _ in block.extra.values()):
+            told = "an XASPHERE with its terms in PARM is taken as EVENASPH"
+            assume(block.start.file, f"surface {block.name} of the file: {told}")
+            return shape_of(replace(block, kind="EVENASPH", extra={}))
         case "EVENASPH":
             shape = block.rotational([(2 * i, block.parameter(i)) for i in range(1, 9)])
         case "ODDASPHE":
