@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +15,7 @@ from neurolens.optics.glass import by_figures
 from neurolens.optics.lensfile import MAX_INDEX, MAX_POWER, MAX_SURFACES
 from neurolens.optics.paraxial import FirstOrder
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.rims import with_derived_rims
 from neurolens.optics.sag import check_figures
 from neurolens.readers.source import assume, warn
 
@@ -84,15 +86,16 @@ def smaller_stop(file: str, asked: float, limit: float | None, state: str = "") 
     return limit
 
 
-def with_rims(lens: Lens) -> Lens:
-    """The lens with the rims that its file does not give derived by rule (`neurolens.optics.rims`), with a warning."""
+def with_rims(lens: Lens, in_file: Callable[[str], str]) -> Lens:
+    """The lens with the rims that its file does not give derived by rule (`neurolens.optics.rims`), with a warning, in
+    which `in_file` calls surfaces as the file does.
+    """
     missing = [k for k, s in enumerate(lens.surfaces) if math.isnan(s.diameter_mm)]
     if not missing:
         return lens
-    from neurolens.optics.rims import with_derived_rims  # rays are traced, which needs torch
-
     derived = with_derived_rims(lens)
-    warn(lens.path, f"no rim is given for surface {', '.join(map(str, missing))}: derived from f-number and field")
+    surfaces = in_file(f"surface {', '.join(map(str, missing))}")
+    warn(lens.path, f"no rim is given for {surfaces}: derived from f-number and field")
     return derived
 
 
@@ -119,13 +122,14 @@ def _check_rows(rows: Sequence[Surface], file: str) -> None:
         raise InputError(file, "surfaces", "(none)", "at least one surface between object and image")
     if len(rows) > MAX_SURFACES:
         raise InputError(file, "surfaces", f"({len(rows)} of them)", f"at most {MAX_SURFACES}")
+    mirror = " (an index of -1 describes a mirror, and the lens model has none)"
     for k, s in enumerate(rows):
         terms = (s.conic, *(a for _, a in s.asphere))
         figures = (
             ("radius", s.radius_mm, abs(s.radius_mm) > 0, "a number other than 0, or a plane"),
             ("thickness", s.thickness_mm, math.isfinite(s.thickness_mm), "a finite length"),
             ("diameter", s.diameter_mm, math.isnan(s.diameter_mm) or 0 < s.diameter_mm < math.inf, "a length above 0"),
-            ("index", s.n_d, 1 <= s.n_d <= MAX_INDEX, f"a refractive index from 1 to {MAX_INDEX}"),
+            ("index", s.n_d, 1 <= s.n_d <= MAX_INDEX, f"a refractive index from 1 to {MAX_INDEX}{mirror if s.n_d == -1 else ''}"),
             ("Abbe number", s.V_d, s.V_d is None or 0 < s.V_d < math.inf, "a number above 0"),
             ("asphere", (s.conic, s.asphere), all(map(math.isfinite, terms)), "finite coefficients"),
             *(("asphere, power", p, 2 <= p <= MAX_POWER, f"a power from 2 to {MAX_POWER}") for p, _ in s.asphere),
@@ -162,6 +166,10 @@ def named_glass(
         InputError: such a name without figures; the message suggests the nearest.
     """
     same = catalogue.same_name(name)
+    base = re.sub(r"[ _-]?MOLD(ED)?$", "", name, flags=re.IGNORECASE)
+    if not same and base != name and (of := catalogue.same_name(base)):
+        expected = f"a glass of the catalogue: it has {of[0].name}, of which this is the moulded variant; or give --glass"
+        raise InputError(file, field, name, expected)
     known = next((g for m in makers for g in same if g.maker.upper() == m), None)
     replacing = next((g for m in makers for g in catalogue.same_name(f"{m}:N-{name}") if m in _NAMES), None)
     if figures and not (same or replacing):
