@@ -46,12 +46,14 @@ class Model:
     def __init__(self, task):
         raw = Path(task["file"]).read_bytes()
         text = raw.decode("utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "latin-1")
-        lines = [line.split() for line in text.splitlines()]
-        kept = (line for line in text.splitlines() if line.split()[:1] and line.split()[0] not in FIELD_LINES)
-        full = (f"{line} 0" if line.split()[0] == "DIAM" and len(line.split()) == 2 else line for line in kept)
-        self.model, _ = zmxread.read_lens(Path(task["file"]), "\n".join(full))
-        self.sequence, self.wavelength_nm, self.mended = self.model["seq_model"], task["wavelength_nm"], []
+        lines = [line.split() for line in text.splitlines() if line.split()[:1] and line.split()[0] not in FIELD_LINES]
+        lines = [words + ["0"] if words[0] == "DIAM" and len(words) == 2 else words for words in lines]
+        self.wavelength_nm, self.mended = task["wavelength_nm"], []
+        if task.get("mend"):
+            lines = self.with_ends(lines)
         self.lines = lines
+        self.model, _ = zmxread.read_lens(Path(task["file"]), "\n".join(map(" ".join, lines)))
+        self.sequence = self.model["seq_model"]
         wavelengths = self.model["osp"]["wvls"]
         wavelengths.set_from_list([[self.wavelength_nm, 1.0]])
         wavelengths.reference_wvl = 0
@@ -70,6 +72,24 @@ class Model:
         self.changes = [k for k in range(1, len(self.index)) if self.index[k] != self.index[k - 1]]
         self.first, self.last = self.changes[0], self.changes[-1]
         self.z = [0.0, *map(float, np.cumsum([0.0, *self.thickness[1:]]))]
+
+    def with_ends(self, lines):
+        """The lines with an object at infinity and an image surface, which some files lack.
+
+        Their first surface is then SURF 1, or has a glass and a finite thickness, and their last one has a thickness,
+        or is curved and has glass in front.
+        """
+        starts = [k for k, words in enumerate(lines) if words[0] == "SURF"]
+        blocks = [{w[0]: w for w in lines[a:b]} for a, b in zip(starts, [*starts[1:], len(lines)], strict=True)]
+        first, before, last = blocks[0], blocks[-2], blocks[-1]
+        if first["SURF"][1] != "0" or ("GLAS" in first and first["DISZ"][1] != "INFINITY"):
+            lines = [*lines[: starts[0]], ["SURF", "0"], ["DISZ", "INFINITY"], *lines[starts[0] :]]
+            self.mended.append("no object surface in the file")
+        curved = float(last.get("CURV", ["", "0"])[1]) != 0
+        if "GLAS" in last or float(last["DISZ"][1]) != 0 or (curved and "GLAS" in before):
+            lines = [*lines, ["SURF", str(len(blocks))], ["DISZ", "0"]]
+            self.mended.append("no image surface in the file")
+        return lines
 
     def mend(self, blocks):
         """Put right how aspheres were read."""
@@ -101,9 +121,9 @@ class Model:
 
     def marked_stop(self, lines):
         """The surface that the file marks: ray-optics forgets a stop on the first one."""
-        surface = None
+        surface = -1
         for words in lines:
-            surface = int(words[1]) if words[:1] == ["SURF"] else surface
+            surface += words[:1] == ["SURF"]
             if words[:1] == ["STOP"]:
                 return surface
         return None
