@@ -198,18 +198,25 @@ def named_glass(
 def by_indices(line: Line, field: str, indices: Sequence[float], wavelengths_nm: Sequence[float]) -> dict[str, Any]:
     """Fields of a surface from indices at some wavelengths, reduced to n_d and V_d with a warning; one index is n_d.
 
+    Between the wavelengths the index is a polynomial of 1 / lambda^2 through the four that are nearest.
+
     Raises:
-        InputError: several indices, but none at one of the lines d, F and C.
+        InputError: several indices, whose wavelengths do not enclose the lines d, F and C.
     """
     if len(indices) == 1:
         return {"n_d": indices[0]}
+    table = {nm: n for nm, n in zip(wavelengths_nm, indices, strict=False) if nm > 0}
+    lines = (LINE_D_NM, LINE_F_NM, LINE_C_NM)
+    if not table or min(table) > min(lines) + _SAME_LINE_NM or max(table) < max(lines) - _SAME_LINE_NM:
+        expected = "indices from the F line (486.13 nm) to the C line (656.27 nm), to reduce the glass to n_d and V_d"
+        raise line.error(field, f"(wavelengths {list(wavelengths_nm)})", expected)
     found = []
-    for name, line_nm in (("d", LINE_D_NM), ("F", LINE_F_NM), ("C", LINE_C_NM)):
-        near = [n for n, nm in zip(indices, wavelengths_nm, strict=False) if abs(nm - line_nm) <= _SAME_LINE_NM]
-        if not near:
-            expected = f"an index at the {name} line ({line_nm:.2f} nm), to reduce the glass to n_d and V_d"
-            raise line.error(field, f"(wavelengths {list(wavelengths_nm)})", expected)
-        found.append(near[0])
+    for line_nm in lines:
+        near = sorted(table, key=lambda nm: abs(nm - line_nm))[:4]
+        if abs(near[0] - line_nm) <= _SAME_LINE_NM:
+            near = near[:1]
+        shares = (math.prod((line_nm**-2 - b**-2) / (a**-2 - b**-2) for b in near if b != a) for a in near)
+        found.append(sum(table[nm] * share for nm, share in zip(near, shares, strict=True)))
     n_d, n_F, n_C = found
     warn(line.file, f"line {line.number}, {field}: the glass is reduced to n_d and V_d")
     return {"n_d": n_d, "V_d": (n_d - 1) / (n_F - n_C) if n_F > n_C else None}

@@ -21,7 +21,7 @@ from neurolens.readers.codev_model import (
     shape_of,
 )
 from neurolens.readers.draft import INFINITE, Draft, Given, Row, lens_of, primary_first
-from neurolens.readers.source import read_lines, warn
+from neurolens.readers.source import assume, read_lines, warn
 
 
 @dataclass
@@ -243,10 +243,12 @@ def _new_surface(file: File, command: Command) -> None:
         raise line.error(name, "(here)", "one object SO, then surfaces S, then one image SI")
     if len(file.blocks) > MAX_SURFACES + 1:
         raise line.error(name, f"({len(file.blocks)} surfaces)", f"at most {MAX_SURFACES} surfaces")
-    numbers = command.numbers(command.words[:2], 2)
+    far = name == "SO" and command.words[1:2] and command.words[1].lower() in ("inf", "infinity")
+    numbers = command.numbers((command.words[0], str(INFINITE)) if far else command.words[:2], 2)
     if file.radii is None and numbers[0] != 0:
-        file.radii = False
-        warn(file.file, f"line {line.number}: no RDM before it; surfaces have curvatures, CODE V's default, not radii")
+        file.radii = bool(file.pupil) and abs(numbers[0]) * (file.pupil or 0.0) > 2
+        why = "radii: a sphere of that curvature would be smaller than the pupil" if file.radii else "curvatures, not radii"
+        assume(file.file, f"line {line.number}: no RDM before it; the first numbers of surfaces are taken as {why}")
     first = numbers[0]
     block = Block(line, str(len(file.blocks)), curvature=first if not (file.radii and first) else 1 / first, thickness=numbers[1])
     if name == "SO" and block.thickness >= INFINITE:

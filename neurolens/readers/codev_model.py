@@ -98,6 +98,8 @@ def medium(
         # Discontinued glasses are replaced by those with the prefix "N-".
         replacing = catalogue.same_name(f"{maker}:N-{name}")
         qualified = str((*alias, *replacing)[0]) if alias or replacing else qualified
+    if not catalogue.same_name(qualified) and maker.upper() not in map(str.upper, catalogue.MAKERS):
+        qualified = name or word  # the file's own catalogue: a glass of that name is better than none, and is told
     known = named_glass(qualified, command.line.file, f"line {command.line.number}, glass", said=word if name else None)
     return {**known, "material": word}
 
