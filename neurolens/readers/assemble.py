@@ -10,19 +10,22 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.optics import catalogue, paraxial
-from neurolens.optics.catalogue import Glass
+from neurolens.optics.catalogue import LINE_C_NM, LINE_D_NM, LINE_F_NM, Glass
 from neurolens.optics.glass import by_figures
 from neurolens.optics.lensfile import MAX_INDEX, MAX_POWER, MAX_SURFACES
 from neurolens.optics.paraxial import FirstOrder
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.rims import with_derived_rims
 from neurolens.optics.sag import check_figures
-from neurolens.readers.source import assume, warn
+from neurolens.readers.source import Line, assume, warn
 
 # A diameter that the file does not give, until `finish` has found it.
 UNKNOWN = math.nan
 NARROWER = 1e-4  # relative: smaller differences of stop diameters are rounding
 _NAMES = frozenset(m.upper() for m in catalogue.MAKERS)
+_SAME_LINE_NM = 0.1
+# Glasses of Schott that no catalogue with dispersion formulas lists any more: n_d (Elphel's optical-design-viewer), V_d.
+_DISCONTINUED: dict[str, tuple[float, float | None]] = {"LASF14A": (1.82223, None), "SF58": (1.917613, 21.51)}
 SAME_INDEX, SAME_ABBE = 2e-5, 0.005  # tolerance of printed figures against those of a catalogue glass
 
 
@@ -166,12 +169,17 @@ def named_glass(
         InputError: such a name without figures; the message suggests the nearest.
     """
     same = catalogue.same_name(name)
+    if not same and not figures and (left := _DISCONTINUED.get(name.upper())):
+        warn(file, f"{field}: glass {name} is discontinued: taken by n_d {left[0]:g} and V_d {left[1] or 'unknown'}")
+        return {"n_d": left[0], "V_d": left[1], "material": name}
     base = re.sub(r"[ _-]?MOLD(ED)?$", "", name, flags=re.IGNORECASE)
     if not same and base != name and (of := catalogue.same_name(base)):
         expected = f"a glass of the catalogue: it has {of[0].name}, of which this is the moulded variant; or give --glass"
         raise InputError(file, field, name, expected)
     known = next((g for m in makers for g in same if g.maker.upper() == m), None)
     replacing = next((g for m in makers for g in catalogue.same_name(f"{m}:N-{name}") if m in _NAMES), None)
+    if not (same or replacing or makers):
+        replacing = next(iter(catalogue.same_name(f"N-{name}")), None)
     if figures and not (same or replacing):
         return by_figures(name, *figures, f"{file}: {field}")
     taken = known or replacing or catalogue.find(name, file, field)
@@ -185,6 +193,33 @@ def named_glass(
     if why:
         warn(file, f"glass {said or name} is taken as {taken} (n_d {taken.n_d:.5f}, V_d {taken.V_d:.2f}): {why}")
     return {"n_d": taken.n_d, "V_d": taken.V_d, "glass": short_name(taken), "material": name}
+
+
+def by_indices(line: Line, field: str, indices: Sequence[float], wavelengths_nm: Sequence[float]) -> dict[str, Any]:
+    """Fields of a surface from indices at some wavelengths, reduced to n_d and V_d with a warning; one index is n_d.
+
+    Between the wavelengths the index is a polynomial of 1 / lambda^2 through the four that are nearest.
+
+    Raises:
+        InputError: several indices, whose wavelengths do not enclose the lines d, F and C.
+    """
+    if len(indices) == 1:
+        return {"n_d": indices[0]}
+    table = {nm: n for nm, n in zip(wavelengths_nm, indices, strict=False) if nm > 0}
+    lines = (LINE_D_NM, LINE_F_NM, LINE_C_NM)
+    if not table or min(table) > min(lines) + _SAME_LINE_NM or max(table) < max(lines) - _SAME_LINE_NM:
+        expected = "indices from the F line (486.13 nm) to the C line (656.27 nm), to reduce the glass to n_d and V_d"
+        raise line.error(field, f"(wavelengths {list(wavelengths_nm)})", expected)
+    found = []
+    for line_nm in lines:
+        near = sorted(table, key=lambda nm: abs(nm - line_nm))[:4]
+        if abs(near[0] - line_nm) <= _SAME_LINE_NM:
+            near = near[:1]
+        shares = (math.prod((line_nm**-2 - b**-2) / (a**-2 - b**-2) for b in near if b != a) for a in near)
+        found.append(sum(table[nm] * share for nm, share in zip(near, shares, strict=True)))
+    n_d, n_F, n_C = found
+    warn(line.file, f"line {line.number}, {field}: the glass is reduced to n_d and V_d")
+    return {"n_d": n_d, "V_d": (n_d - 1) / (n_F - n_C) if n_F > n_C else None}
 
 
 def _letters(name: str) -> str:

@@ -10,13 +10,11 @@ from typing import Any
 
 from neurolens.optics import catalogue
 from neurolens.readers import draft
-from neurolens.readers.assemble import named_glass
+from neurolens.readers.assemble import by_indices, named_glass
 from neurolens.readers.draft import INFINITE, State
 from neurolens.readers.source import Line, assume
 
 _MAX_COMMAND = 100_000  # characters of one command with all its continuation lines
-# Fraunhofer lines to which a private glass is reduced, nm.
-_D, _F, _C, _SAME_LINE = 587.56, 486.13, 656.27, 0.1
 
 
 @dataclass(frozen=True)
@@ -67,7 +65,9 @@ def _outside_quotes(text: str, mark: str) -> list[str]:
     return [*parts, text[begin:]]
 
 
-def medium(command: Command, words: Sequence[str], private: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+def medium(
+    command: Command, words: Sequence[str], private: Mapping[str, tuple[Command, Sequence[float]]]
+) -> dict[str, Any]:
     """Fields of a surface for the medium behind it: a name, "NAME_MAKER", a code, n:V, n V, or nothing for air.
 
     A code is the fraction of the index and the Abbe number without its point: 517.642, 517642 or 516800.641700.
@@ -78,7 +78,7 @@ def medium(command: Command, words: Sequence[str], private: Mapping[str, dict[st
     if word.upper() == "REFL":
         raise command.line.error(command.name, word, "a glass: the lens model has no mirrors")
     if word in private:
-        return dict(private[word])
+        return {**_private(*private[word]), "material": word}
     pair = word.split(":")
     if len(pair) == 2:
         n_d, V_d = command.numbers(pair, 2)
@@ -98,26 +98,18 @@ def medium(command: Command, words: Sequence[str], private: Mapping[str, dict[st
         # Discontinued glasses are replaced by those with the prefix "N-".
         replacing = catalogue.same_name(f"{maker}:N-{name}")
         qualified = str((*alias, *replacing)[0]) if alias or replacing else qualified
+    if not catalogue.same_name(qualified) and maker.upper() not in map(str.upper, catalogue.MAKERS):
+        qualified = name or word  # the file's own catalogue: a glass of that name is better than none, and is told
     known = named_glass(qualified, command.line.file, f"line {command.line.number}, glass", said=word if name else None)
     return {**known, "material": word}
 
 
-def private_glass(command: Command, wavelengths_nm: Sequence[float]) -> dict[str, Any]:
-    """Fields of a surface from a row of a PRV block: indices at the wavelengths of its PWL line.
-
-    Raises:
-        InputError: not one index a wavelength, or not the lines d, F and C among them, to which it is reduced.
-    """
-    indices = command.numbers(least=len(wavelengths_nm))
-    found = {}
-    for name, line_nm in (("d", _D), ("F", _F), ("C", _C)):
-        near = [k for k, nm in enumerate(wavelengths_nm) if abs(nm - line_nm) <= _SAME_LINE]
-        if not near:
-            expected = f"an index at the {name} line ({line_nm} nm), to reduce the glass to n_d and V_d"
-            raise command.line.error("PRV", f"(wavelengths {wavelengths_nm})", expected)
-        found[name] = indices[near[0]]
-    dispersion = found["F"] - found["C"]
-    return {"n_d": found["d"], "V_d": (found["d"] - 1) / dispersion if dispersion > 0 else None}
+def _private(command: Command, wavelengths_nm: Sequence[float]) -> dict[str, Any]:
+    """Fields of a surface from a row of a PRV block: indices at the wavelengths of its PWL line."""
+    if command.words and not re.match(r"[-+.0-9]", command.words[0]):
+        expected = "an index at each wavelength of PWL: formulas of private glasses are not read"
+        raise command.line.error(f"PRV {command.word}", command.words[0], expected)
+    return by_indices(command.line, f"PRV {command.word}", command.numbers(least=len(wavelengths_nm)), wavelengths_nm)
 
 
 # Of special surfaces: how the names of their coefficients begin, before the power of the first term.

@@ -140,6 +140,7 @@ class Draft:
         drawn: rims are somebody's measures of a drawing, some of them radii where diameters are meant: halved where
             they are twice what they can be, and narrowed by however much neighbours would overlap; both is told.
         nominal: f-number that the file states with few digits, to tell radii from diameters by.
+        stop_given: whether the file states the stop's own diameter, which then rules over its f-number.
         skipped: what was not read since no ray depends on it, and how often it occurs; told in one line.
         object_medium: fields of `Medium` for the medium in front of the lens.
         wavelengths_nm: as `Lens.wavelengths_nm`.
@@ -162,9 +163,14 @@ class Draft:
     stated_efl: float | None = None
     drawn: bool = False
     nominal: float | None = None
+    stop_given: bool = False
     skipped: Counter[str] = field(default_factory=Counter)
     object_medium: dict[str, Any] = field(default_factory=dict)
     wavelengths_nm: tuple[float, ...] = ()
+
+    def f_number_agrees(self, other: float) -> bool:
+        """Whether an f-number is the one that the file states, as far as printed digits tell, or it states none."""
+        return self.f_number is None or abs(other / self.f_number - 1) <= _AGREES
 
     def in_file(self, text: str) -> str:
         """A message about the rows, each called as the file calls its surface."""
@@ -222,11 +228,14 @@ def _lens_of(draft: Draft, given: Given) -> Lens:
     )
     if draft.drawn:
         lens = _with_likely_rims(lens, draft)
-    if draft.f_number is not None and draft.pupil is None and lens.surfaces:
+    if draft.f_number is not None and draft.pupil is None and not draft.stop_given:
         # The file's f-number overrides a diameter of the stop, except for an aperture set on it.
         rows = (replace(s, diameter_mm=math.nan) if s.stop else s for s in lens.surfaces)
         lens = replace(lens, surfaces=tuple(rows))
     lens = finish(lens, pupil_mm=draft.pupil, film_given=draft.film_given, stop_limit_mm=_stop_aperture(draft))
+    if draft.stop_given and not draft.f_number_agrees(by_stop := first_order(lens).f_number):
+        told = f"a stop {lens.stop_radius_mm * 2:g} wide gives f/{by_stop:.3g}"
+        warn(draft.file, f"{told}, the file says f/{draft.f_number:.3g}: the diameter is kept")
     lens = replace(lens, configurations=tuple(_configuration(lens, draft, state) for state in _states(draft)))
     lens = with_rims(lens.scaled(factor) if factor != 1 else lens, draft.in_file)
     with suppress(InputError):
@@ -237,6 +246,7 @@ def _lens_of(draft: Draft, given: Given) -> Lens:
     return lens
 
 
+_AGREES = 0.03  # relative: f-numbers are printed with two digits
 _SLIGHTLY = 0.1  # of a rim's diameter
 _ROWS = re.compile(r"\bsurface ([0-9]+(?:, [0-9]+(?![0-9.]))*)(?! of the file)")
 _TWICE, _SAME = (0.4, 0.7), (0.7, 1.4)  # f-number by the stop's diameter over the stated one: rims twice as wide, right

@@ -169,7 +169,7 @@ def test_optical_bench_powers(constant: str, powers: tuple[int, ...], tmp_path: 
         ("1\t60\t-0.5", "9\t60\t-0.5", "the number of a surface"),
         ("2\t-80", "1\t-80", "a number of its own"),
         ("1.6\t30\t50", "0.6\t30\t50", "index"),
-        ("1.6\t30\t50", "0.0\t30\t50", "surface 0, index"),
+        ("1.6\t30\t50", "0.0\t30\t50", "surface 1 of the file, index"),
         ("1\t60\t6", "1 60 6", "between tabs"),
         ("1E-06", "1E-0x", "coefficient"),
         ("[constants]", "[constants]\nAsphericalOddCount\t-1", "how many odd powers"),
@@ -184,7 +184,7 @@ def test_optical_bench_mistakes(old: str, new: str, said: str, tmp_path: Path) -
 @pytest.mark.parametrize(
     ("suffix", "old", "new", "said"),
     [
-        (".lens", "surfaces:", "surfaces", "expected one of the keywords"),
+        (".lens", "surfaces:", "surfaces", "format: got (not known)"),
         (".lens", " 1  # row", " 1 torus # row", "one of spherical"),
         (".lens", " 1  # row", " 1 toric # row", "toric with a radius other than 0"),
         (".lens", " 1  # row", " # row", "6 figures"),
