@@ -51,8 +51,8 @@ def add_parser(subparsers: Any) -> None:
         help="nominal f-number of a file without one (default: as the stop's diameter gives it)",
     )  # fmt: skip
     group.add_argument(
-        "--stop", metavar="N", help="surface that is the stop, by its number in the file (default: the one marked, else "
-        "the one whose rim limits the beam of the axis)",
+        "--stop", metavar="N",
+        help="number in the file of the surface that is the stop (default: the one marked, else the limiting rim)",
     )  # fmt: skip
     group.add_argument("--units", choices=("mm", "cm", "in", "m"), help="unit of lengths (default: the file's own, mm)")
     group.add_argument(

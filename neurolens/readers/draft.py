@@ -403,4 +403,4 @@ def _is_dummy(draft: Draft, k: int) -> bool:
     s = draft.rows[k].surface
     flat = math.isinf(s.radius_mm) and not s.stop and not s.asphere and not draft.rows[k].aperture
     rows = [row.surface for row in draft.rows]
-    return flat and same_medium(rows, k, Surface(math.inf, 0.0, UNKNOWN, **draft.object_medium))
+    return flat and same_medium(rows, k, Medium(**draft.object_medium))

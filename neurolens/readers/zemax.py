@@ -95,7 +95,9 @@ def _add_ends(file: File) -> None:
     if first.name and first.medium and (first.curvature or last.thickness > 0) and math.isfinite(first.thickness):
         if file.zoom.count > 1:
             raise first.start.error("SURF", "(glass behind the object)", "an object surface in front of the lens")
-        assume(file.file, f"surface {first.name} is a surface of glass: the object is assumed in front of it, at infinity")
+        assume(
+            file.file, f"surface {first.name} is a surface of glass: the object is assumed in front of it, at infinity"
+        )
         file.blocks.insert(0, Block(first.start, thickness=math.inf))
     elif not first.name:
         first.thickness = math.inf
@@ -283,8 +285,8 @@ def _surface(file: File, block: Block, line: Line, word: str, rest: list[str]) -
 def _glass(line: Line, rest: list[str], makers: list[str]) -> dict[str, Any]:
     """GLAS name, type of solve, surface, n_d, V_d.
 
-    Solve 1 is a model glass; others leave the glass that is named (2: a pickup, carried out; 3: one that the program may
-    exchange), except 4, an offset from it.
+    Solve 1 is a model glass; others leave the glass that is named (2: a pickup, carried out; 3: one that the program
+    may exchange), except 4, an offset from it.
     """
     name, kind = rest[0] if rest else "", rest[1] if len(rest) > 1 else "0"
     if name.upper() == "MIRROR" or not name:
@@ -295,7 +297,9 @@ def _glass(line: Line, rest: list[str], makers: list[str]) -> dict[str, Any]:
         n_d, V_d = (*line.numbers("GLAS", rest[3:5]), 0.0)[:2]
         return {"n_d": n_d, "V_d": V_d if V_d > 0 else None, "material": None if name == "___BLANK" else name}
     if kind == "4":
-        raise line.error("GLAS", f"{name} with solve {kind}", "a glass of the catalogue, or n_d and V_d: no offset from it")
+        raise line.error(
+            "GLAS", f"{name} with solve {kind}", "a glass of the catalogue, or n_d and V_d: no offset from it"
+        )
     figures = [] if catalogue.same_name(name) else [line.number_of("GLAS", word) for word in rest[3:5]]
     # 1.5 and 40 is what the program writes in the place of both.
     told = (figures[0], figures[1]) if len(figures) == 2 and min(figures) > 1 and figures != [1.5, 40.0] else None
