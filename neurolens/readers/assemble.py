@@ -24,7 +24,9 @@ UNKNOWN = math.nan
 NARROWER = 1e-4  # relative: smaller differences of stop diameters are rounding
 _NAMES = frozenset(m.upper() for m in catalogue.MAKERS)
 _SAME_LINE_NM = 0.1
-# Glasses of Schott that no catalogue with dispersion formulas lists any more: n_d (Elphel's optical-design-viewer), V_d.
+_MOULDED = re.compile("([ _-]?MOLD(ED)?|M)$", re.IGNORECASE)
+_MOULDING = 0.01  # by how much moulding lowers an index at the most
+# Discontinued glasses of Schott, of which no dispersion formula is at hand: n_d (Elphel's optical-design-viewer), V_d.
 _DISCONTINUED: dict[str, tuple[float, float | None]] = {"LASF14A": (1.82223, None), "SF58": (1.917613, 21.51)}
 SAME_INDEX, SAME_ABBE = 2e-5, 0.005  # tolerance of printed figures against those of a catalogue glass
 
@@ -89,7 +91,7 @@ def smaller_stop(file: str, asked: float, limit: float | None, state: str = "") 
     return limit
 
 
-def with_rims(lens: Lens, in_file: Callable[[str], str]) -> Lens:
+def with_rims(lens: Lens, in_file: Callable[[str], str] = str) -> Lens:
     """The lens with the rims that its file does not give derived by rule (`neurolens.optics.rims`), with a warning, in
     which `in_file` calls surfaces as the file does.
     """
@@ -132,7 +134,12 @@ def _check_rows(rows: Sequence[Surface], file: str) -> None:
             ("radius", s.radius_mm, abs(s.radius_mm) > 0, "a number other than 0, or a plane"),
             ("thickness", s.thickness_mm, math.isfinite(s.thickness_mm), "a finite length"),
             ("diameter", s.diameter_mm, math.isnan(s.diameter_mm) or 0 < s.diameter_mm < math.inf, "a length above 0"),
-            ("index", s.n_d, 1 <= s.n_d <= MAX_INDEX, f"a refractive index from 1 to {MAX_INDEX}{mirror if s.n_d == -1 else ''}"),
+            (
+                "index",
+                s.n_d,
+                1 <= s.n_d <= MAX_INDEX,
+                f"a refractive index from 1 to {MAX_INDEX}{mirror if s.n_d == -1 else ''}",
+            ),
             ("Abbe number", s.V_d, s.V_d is None or 0 < s.V_d < math.inf, "a number above 0"),
             ("asphere", (s.conic, s.asphere), all(map(math.isfinite, terms)), "finite coefficients"),
             *(("asphere, power", p, 2 <= p <= MAX_POWER, f"a power from 2 to {MAX_POWER}") for p, _ in s.asphere),
@@ -158,7 +165,8 @@ def named_glass(
 ) -> dict[str, Any]:
     """Fields of a surface whose glass the file gives by name alone; warns where it is ambiguous.
 
-    For a discontinued glass its replacement, with the prefix "N-", is taken.
+    For a discontinued glass its replacement, with the prefix "N-", is taken. A moulded variant of a glass ("..._MOLD",
+    "...M") has an index lower by some 0.004, which no catalogue here states; its base glass is offered.
 
     Args:
         makers: the makers' catalogues that the file names; the first that has the glass is meant.
@@ -172,10 +180,14 @@ def named_glass(
     if not same and not figures and (left := _DISCONTINUED.get(name.upper())):
         warn(file, f"{field}: glass {name} is discontinued: taken by n_d {left[0]:g} and V_d {left[1] or 'unknown'}")
         return {"n_d": left[0], "V_d": left[1], "material": name}
-    base = re.sub(r"[ _-]?MOLD(ED)?$", "", name, flags=re.IGNORECASE)
-    if not same and base != name and (of := catalogue.same_name(base)):
-        expected = f"a glass of the catalogue: it has {of[0].name}, of which this is the moulded variant; or give --glass"
+    base = next(iter(catalogue.same_name(_MOULDED.sub("", name))), None)
+    if base and not same and not figures:
+        expected = f"a glass of the catalogue: it has {base.name}, whose moulded variant this may be; or give --glass"
         raise InputError(file, field, name, expected)
+    if base and not same and figures and not 0 <= base.n_d - figures[0] <= _MOULDING:
+        told = f"assumed to be {base} (n_d {base.n_d:.5f}), moulded: n_d {figures[0]:g} beside it is not of such a glass"
+        assume(file, f"{field}: glass {name} is {told}")
+        return {"n_d": base.n_d, "V_d": base.V_d, "glass": short_name(base), "material": name}
     known = next((g for m in makers for g in same if g.maker.upper() == m), None)
     replacing = next((g for m in makers for g in catalogue.same_name(f"{m}:N-{name}") if m in _NAMES), None)
     if not (same or replacing or makers):

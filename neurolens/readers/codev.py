@@ -247,10 +247,16 @@ def _new_surface(file: File, command: Command) -> None:
     numbers = command.numbers((command.words[0], str(INFINITE)) if far else command.words[:2], 2)
     if file.radii is None and numbers[0] != 0:
         file.radii = bool(file.pupil) and abs(numbers[0]) * (file.pupil or 0.0) > 2
-        why = "radii: a sphere of that curvature would be smaller than the pupil" if file.radii else "curvatures, not radii"
+        why = (
+            "radii: a sphere of that curvature would be smaller than the pupil"
+            if file.radii
+            else "curvatures, not radii"
+        )
         assume(file.file, f"line {line.number}: no RDM before it; the first numbers of surfaces are taken as {why}")
     first = numbers[0]
-    block = Block(line, str(len(file.blocks)), curvature=first if not (file.radii and first) else 1 / first, thickness=numbers[1])
+    block = Block(
+        line, str(len(file.blocks)), curvature=first if not (file.radii and first) else 1 / first, thickness=numbers[1]
+    )
     if name == "SO" and block.thickness >= INFINITE:
         block.thickness = math.inf
     block.medium = medium(command, command.words[2:], file.private)

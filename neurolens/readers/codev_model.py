@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from neurolens.optics import catalogue
 from neurolens.readers import draft
 from neurolens.readers.assemble import by_indices, named_glass
 from neurolens.readers.draft import INFINITE, State
@@ -91,16 +90,9 @@ def medium(
         numbers = command.numbers(words[:2])
         return {"n_d": numbers[0], "V_d": numbers[1] if len(numbers) > 1 else None}
     name, _, maker = word.rpartition("_")
-    qualified = f"{maker}:{name}" if name else word
-    if name and not catalogue.same_name(qualified):
-        # Aliases of a glass ("BK7") are listed without their maker.
-        alias = [g for g in catalogue.same_name(name) if g.maker.upper() == maker.upper()]
-        # Discontinued glasses are replaced by those with the prefix "N-".
-        replacing = catalogue.same_name(f"{maker}:N-{name}")
-        qualified = str((*alias, *replacing)[0]) if alias or replacing else qualified
-    if not catalogue.same_name(qualified) and maker.upper() not in map(str.upper, catalogue.MAKERS):
-        qualified = name or word  # the file's own catalogue: a glass of that name is better than none, and is told
-    known = named_glass(qualified, command.line.file, f"line {command.line.number}, glass", said=word if name else None)
+    makers = [maker.upper()] if name else []
+    place = f"line {command.line.number}, glass"
+    known = named_glass(name or word, command.line.file, place, makers, said=word if name else None)
     return {**known, "material": word}
 
 

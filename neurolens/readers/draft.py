@@ -184,8 +184,8 @@ class Draft:
 
 def primary_first(wavelengths_nm: Iterable[float], primary_nm: float) -> tuple[float, ...]:
     """Wavelengths of a file as `Lens` holds them; those beyond what neurolens traces are left out."""
-    sound = [nm for nm in wavelengths_nm if within(WAVELENGTH_NM, nm)]
-    return tuple(sorted(sound, key=lambda nm: nm != primary_nm))
+    sound = [round(nm, 6) for nm in wavelengths_nm if within(WAVELENGTH_NM, nm)]  # as read in micrometres
+    return tuple(sorted(sound, key=lambda nm: nm != round(primary_nm, 6)))
 
 
 def lens_of(draft: Draft, given: Given | None = None) -> Lens:
@@ -248,7 +248,7 @@ def _lens_of(draft: Draft, given: Given) -> Lens:
 
 _AGREES = 0.03  # relative: f-numbers are printed with two digits
 _SLIGHTLY = 0.1  # of a rim's diameter
-_ROWS = re.compile(r"\bsurface ([0-9]+(?:, [0-9]+(?![0-9.]))*)(?! of the file)")
+_ROWS = re.compile(r"\bsurface ([0-9]+(?:, [0-9]+(?![0-9.]| mm))*)(?! of the file)")
 _TWICE, _SAME = (0.4, 0.7), (0.7, 1.4)  # f-number by the stop's diameter over the stated one: rims twice as wide, right
 
 
@@ -403,4 +403,4 @@ def _is_dummy(draft: Draft, k: int) -> bool:
     s = draft.rows[k].surface
     flat = math.isinf(s.radius_mm) and not s.stop and not s.asphere and not draft.rows[k].aperture
     rows = [row.surface for row in draft.rows]
-    return flat and same_medium(rows, k, Surface(math.inf, 0.0, UNKNOWN, **draft.object_medium))
+    return flat and same_medium(rows, k, Medium(**draft.object_medium))

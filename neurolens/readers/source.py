@@ -51,7 +51,9 @@ class Line:
             value = math.nan
         if not abs(value) <= LARGEST:
             comma = re.fullmatch("[-+]?[0-9]+,[0-9]+(e[-+]?[0-9]+)?", word, re.IGNORECASE)
-            raise self.error(keyword, word, f"a finite number{', with a point: decimal commas are not read' * bool(comma)}")
+            raise self.error(
+                keyword, word, f"a finite number{', with a point: decimal commas are not read' * bool(comma)}"
+            )
         return value
 
     def positive(self, keyword: str, words: Sequence[str]) -> float:

@@ -7,6 +7,7 @@ tolerances and configurations. Curvatures, semi-diameters, thickness to the next
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -59,7 +60,6 @@ def _complete(file: File) -> None:
             object.
     """
     file.skipped["lines of the merit function"] += file.behind.total()
-    _add_ends(file)
     *_, image = file.blocks
     for before, block in zip(file.blocks, file.blocks[1:], strict=False):
         block.semi_diameter = block.semi_diameter if block.clear is None else block.clear
@@ -89,10 +89,15 @@ def _complete(file: File) -> None:
 def _add_ends(file: File) -> None:
     """Add the object and the image to a file that lists the surfaces of a lens only."""
     first, last = file.blocks[0], file.blocks[-1]
+    odd = next((b for b in file.blocks if b.name and not b.name.isdecimal()), None)
+    if odd and file.zoom.count > 1:
+        raise odd.start.error("SURF", odd.name, "numbers in order, in a file with configurations")
     if first.name and first.medium and (first.curvature or last.thickness > 0) and math.isfinite(first.thickness):
         if file.zoom.count > 1:
             raise first.start.error("SURF", "(glass behind the object)", "an object surface in front of the lens")
-        assume(file.file, f"surface {first.name} is a surface of glass: the object is assumed in front of it, at infinity")
+        assume(
+            file.file, f"surface {first.name} is a surface of glass: the object is assumed in front of it, at infinity"
+        )
         file.blocks.insert(0, Block(first.start, thickness=math.inf))
     elif not first.name:
         first.thickness = math.inf
@@ -137,6 +142,8 @@ def read_zmx(path: str | Path, given: Given | None = None) -> Lens:
     file = File(str(path))
     for line in read_lines(path):
         _read(file, line)
+    if len(file.blocks) > 1:
+        _add_ends(file)
     if len(file.blocks) < 3:
         raise InputError(file.file, "SURF", f"({len(file.blocks)} surfaces)", "object, at least one surface, and image")
     _complete(file)
@@ -179,8 +186,9 @@ def _begin(file: File, line: Line, rest: list[str]) -> None:
     file.behind.clear()
     if not file.blocks and rest[:1] == ["1"]:
         file.blocks.append(Block(line))
-    if not rest or rest[0] != str(len(file.blocks)):
-        raise line.error("SURF", " ".join(rest), f"surface {len(file.blocks)}, as they are numbered in order")
+    last = next((b.name for b in reversed(file.blocks) if b.name.isdecimal()), str(len(file.blocks) - 1))
+    if not rest or not re.fullmatch(f"{int(last) + 1}|{last}[A-Z]+", rest[0]):  # 5AS: a stop behind surface 5
+        raise line.error("SURF", " ".join(rest), f"surface {int(last) + 1}, as they are numbered in order")
     if len(file.blocks) > MAX_SURFACES + 1:
         raise line.error("SURF", rest[0], f"at most {MAX_SURFACES} surfaces")
     file.blocks.append(Block(line, name=rest[0]))
@@ -277,8 +285,8 @@ def _surface(file: File, block: Block, line: Line, word: str, rest: list[str]) -
 def _glass(line: Line, rest: list[str], makers: list[str]) -> dict[str, Any]:
     """GLAS name, type of solve, surface, n_d, V_d.
 
-    Solve 1 is a model glass; others leave the glass that is named (2: a pickup, carried out; 3: one that the program may
-    exchange), except 4, an offset from it.
+    Solve 1 is a model glass; others leave the glass that is named (2: a pickup, carried out; 3: one that the program
+    may exchange), except 4, an offset from it.
     """
     name, kind = rest[0] if rest else "", rest[1] if len(rest) > 1 else "0"
     if name.upper() == "MIRROR" or not name:
@@ -289,7 +297,9 @@ def _glass(line: Line, rest: list[str], makers: list[str]) -> dict[str, Any]:
         n_d, V_d = (*line.numbers("GLAS", rest[3:5]), 0.0)[:2]
         return {"n_d": n_d, "V_d": V_d if V_d > 0 else None, "material": None if name == "___BLANK" else name}
     if kind == "4":
-        raise line.error("GLAS", f"{name} with solve {kind}", "a glass of the catalogue, or n_d and V_d: no offset from it")
+        raise line.error(
+            "GLAS", f"{name} with solve {kind}", "a glass of the catalogue, or n_d and V_d: no offset from it"
+        )
     figures = [] if catalogue.same_name(name) else [line.number_of("GLAS", word) for word in rest[3:5]]
     # 1.5 and 40 is what the program writes in the place of both.
     told = (figures[0], figures[1]) if len(figures) == 2 and min(figures) > 1 and figures != [1.5, 40.0] else None

@@ -15,8 +15,8 @@ from neurolens.readers.source import Line, assume
 
 # Settings of the program, and what its editor shows of a surface: written to most files, and no ray depends on them.
 HARMLESS = frozenset(
-    """VERS PFIL LANG GFAC RAIM PUSH SDMA OMMA ROPD PICB PZUP FWGN FWGT WWGT WWGN POLS GLRS GSTD NSCD COFN LUID EFFL HYPR
-    DBDT HIDE MIRR SLAB POPS FIMP MEMA OEMA VDSZ VPAR PPAR GLCZ""".split()
+    """VERS PFIL LANG GFAC RAIM PUSH SDMA OMMA ROPD PICB PZUP FWGN FWGT WWGT WWGN POLS GLRS GSTD NSCD COFN LUID EFFL
+    HYPR DBDT HIDE MIRR SLAB POPS FIMP MEMA OEMA VDSZ VPAR PPAR GLCZ""".split()
 )
 # Rims and stop decide which rays pass, not the factors that a designer chose.
 VIGNETTING = frozenset("VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN".split())

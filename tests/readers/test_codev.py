@@ -92,8 +92,24 @@ def test_private_glass_by_its_d_f_and_c_lines(tmp_path: Path) -> None:
         s = read(text, tmp_path).surfaces[0]
     assert (s.n_d, s.material) == (1.5168, "MINE")
     assert s.V_d == pytest.approx(0.5168 / 0.0081)
-    with pytest.raises(InputError, match="an index at the C line"):
-        read(swapped("656.3 587.6 546.1", "700.0 587.6 546.1", text), tmp_path)
+    with pytest.raises(InputError, match="expected indices from the F line"):
+        read(swapped("656.3 587.6 546.1", "630.0 587.6 546.1", text), tmp_path)
+
+
+def test_a_private_glass_between_its_wavelengths_is_interpolated(tmp_path: Path) -> None:
+    """Of N-BK7 every 50 nm, none of them a line: to less than the sixth decimal, which catalogues do not print."""
+    bk7 = catalogue.find("N-BK7")
+    waves = (700.0, 650.0, 600.0, 550.0, 500.0, 450.0)
+    rows = f"PRV\n PWL {' '.join(map(str, waves))}\n MINE {' '.join(repr(bk7.index(nm)) for nm in waves)}\nEND\nSO "
+    s = read(swapped("SO ", rows, swapped("NBK7_SCHOTT", "MINE")), tmp_path).surfaces[0]
+    assert (s.n_d, s.V_d) == (pytest.approx(bk7.n_d, abs=1e-6), pytest.approx(bk7.V_d, abs=1e-2))
+
+
+def test_a_private_glass_that_no_surface_uses_is_not_read(tmp_path: Path) -> None:
+    block = "PRV\n PWL 550.0\n 'NOA61' LAU 2.36390625 0.0 0.025493134\nEND\nSO "
+    assert read(swapped("SO ", block), tmp_path).surfaces == read(TEXT, tmp_path).surfaces
+    with pytest.raises(InputError, match="PRV NOA61: got 'LAU', expected an index at each wavelength"):
+        read(swapped("SO ", block, swapped("NBK7_SCHOTT", "NOA61")), tmp_path)
 
 
 def test_radii_or_curvatures(tmp_path: Path) -> None:
@@ -167,7 +183,7 @@ def test_q_types_are_the_sums_of_forbes(kind: str, names: str, tmp_path: Path) -
         ("EPD   10.0", "EPD   -1", r"line 3, EPD: got -1.0"),
         ("EPD   10.0", "NAO   0.1", r"line 3, NAO: got '0.1', expected EPD or FNO"),
         ("EPD   10.0\n", "", r"^$"),
-        ("NBK7_SCHOTT", "NBK8_SCHOTT", r"line 12, glass: got 'SCHOTT:NBK8'.*N-BK7"),
+        ("NBK7_SCHOTT", "NBK8_SCHOTT", r"line 12, glass: got 'NBK8'.*N-BK7"),
         ("NBK7_SCHOTT", "REFL", r"line 12, S: got 'REFL'.*no mirrors"),
         ("NBK7_SCHOTT", "0.5:60", r"index: got 0.5"),
         ("  STO", "  GRT", r"line 14, GRT: got .*given.*no grating"),

@@ -144,7 +144,6 @@ def test_oslo_by_the_lensmakers_formula(tmp_path: Path) -> None:
         ("EBR  5.0", "EBR  0", r"line 3, EBR"),
         ("EBR  5.0", "NAO  0.1", r"line 3, NAO: got '0.1', expected EBR or FNO"),
         ("GLA  BK7", "GLA  BK99", r"line 12, GLA: got 'BK99'"),
-        ("GLA  BK7", "GLA  1.5 1.6 1.7", r"line 12, GLA: got \(wavelengths \[\]\), expected indices from the F line"),
         ("GLA  BK7", "PK GLA -2", r"line 12, PK: got 'GLA -2', expected a figure: solves and pickups"),
         ("GLA  BK7", "GLA  REFL", r"no mirrors"),
         ("TH   5.0", "PY 0.0", r"PY: got \(on surface 1\), expected the last surface"),

@@ -338,7 +338,7 @@ def test_the_stop_s_own_aperture_clips_what_the_pupil_asks_for(sized: str, tmp_p
     ("old", "new", "message"),
     [
         ("DIAM 9 1", "DIAM -12.7 1", r"line 35, DIAM: got -12.7, expected a semi-diameter above 0"),
-        ("DISZ 5.0", "DISZ -600", r"surface 1 of the file, thickness_mm: got -600.0, expected at least 0, except beside a stop"),
+        ("DISZ 5.0", "DISZ -600", r"surface 1 of the file, thickness_mm: got -600.0, expected at least 0"),
         ("TYPE STANDARD\n  CURV 2", "TYPE COORDBRK\n  CURV 2", r"line 24, CURV of COORDBRK"),
         ('TYPE STANDARD\n  CURV 2.0E-2 0 0 0 0 ""\n', "TYPE COORDBRK\n", r"line 28, GLAS of COORDBRK"),
     ],
