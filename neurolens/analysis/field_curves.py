@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,13 +12,13 @@ import torch
 from torch import Tensor
 
 from neurolens.analysis.bundles import bundle, hexapolar, points
-from neurolens.analysis.fields import DEFAULT_NM, Array, Result, Scene, on_plane
+from neurolens.analysis.fields import Array, Result, Scene, on_plane
+from neurolens.analysis.pupil_nodes import LitPart, converged, lit_nodes, lit_part
 from neurolens.analysis.seidel import petzval_curvature
-from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays, pupil_plane_z_mm
 from neurolens.optics.surfaces import Rays
-from neurolens.optics.trace import trace
+from neurolens.optics.trace import passing
 
 LINE_G_NM = 435.8343  # mercury, the usual fourth line
 
@@ -32,7 +33,7 @@ class Colour(Result):
     """Colour of a lens; the film's place counts as zero focus, shifts positive away from the lens.
 
     Attributes:
-        spectrum_nm: [L], 380 to 780.
+        spectrum_nm: [L].
         zone: [3] shares of the stop's radius: paraxial, half of the area, edge.
         focus_shift_mm: [L, 3] where rays of each zone cross the axis; NaN where a rim blocks them.
         field_deg, height_mm: [F], of the chief ray of the first line.
@@ -53,16 +54,22 @@ def colour(
     scene: Scene,
     *,
     spectrum_nm: Sequence[float] | None = None,
-    line_nm: Sequence[float] = (*DEFAULT_NM, LINE_G_NM),
+    line_nm: Sequence[float] | None = None,
     fields: int = 21,
 ) -> Colour:
     """Longitudinal colour on the axis by zones, and lateral colour of chief rays up to the edge of the field.
+
+    The spectrum is 380 to 780 nm and the lines are d, F, C and g; of a lens for other light, its range and wavelengths.
 
     Raises:
         InputError: a pinhole, which has no focus.
     """
     scene.require_power()
-    spectrum = np.linspace(*_VISIBLE_NM, 41) if spectrum_nm is None else np.asarray(spectrum_nm, dtype=np.float64)
+    lens = scene.lens
+    if spectrum_nm is None:
+        spectrum_nm = np.linspace(*(_VISIBLE_NM if lens.visible else lens.light_nm), 41).tolist()
+    spectrum = np.asarray(spectrum_nm, dtype=np.float64)
+    line_nm = line_nm or (*scene.waves_nm, *((LINE_G_NM,) if lens.visible else ()))
     axial = bundle(scene.round, [0.0], spectrum.tolist(), points(list(_ZONES), [0.0] * 3))
     crossing = -(axial.tangential_mm / axial.slopes[0])[0].numpy()
     angles = np.linspace(0, scene.edge_deg(), fields)
@@ -98,7 +105,7 @@ class Curvature(Result):
 
 
 def curvature(
-    scene: Scene, *, wavelength_nm: float = LINE_D_NM, fields: int = 31, edge_deg: float | None = None
+    scene: Scene, *, wavelength_nm: float | None = None, fields: int = 31, edge_deg: float | None = None
 ) -> Curvature:
     """Sagittal and tangential foci up to the edge of the field, rims ignored.
 
@@ -106,6 +113,7 @@ def curvature(
         InputError: a pinhole, which has no focus.
     """
     scene.require_power()
+    wavelength_nm = scene.lens.reference_nm if wavelength_nm is None else wavelength_nm
     angles = np.linspace(0, scene.edge_deg() if edge_deg is None else edge_deg, fields)
     pattern = points([-_CLOSE, _CLOSE, 0.0, 0.0], [0.0, 0.0, -_CLOSE, _CLOSE])
     rays = bundle(scene.open, angles.tolist(), [wavelength_nm], pattern)
@@ -162,9 +170,10 @@ class Distortion(Result):
 
 
 def distortion(
-    scene: Scene, *, wavelength_nm: float = LINE_D_NM, fields: int = 41, edge_deg: float | None = None
+    scene: Scene, *, wavelength_nm: float | None = None, fields: int = 41, edge_deg: float | None = None
 ) -> Distortion:
     """Distortion against every projection. For a near object of a rectilinear lens, object heights are used."""
+    wavelength_nm = scene.lens.reference_nm if wavelength_nm is None else wavelength_nm
     angles = np.linspace(0, scene.edge_deg() if edge_deg is None else edge_deg, fields)
     chief = scene.chief_rays(np.concatenate([[_SMALL_DEG], angles]), wavelength_nm)
     height = chief.height_mm.numpy()
@@ -206,6 +215,7 @@ class Illumination(Result):
         unvignetted: [F] the same without rims: natural falloff, pupil growth and distortion.
         passed: [F] share of the stop's light that no rim takes.
         cos4: [F] cos^4 of the field angle, 0 from 90 degrees on.
+        spread: by figure, [F], by how much two samplings of the pupil differ (`pupil_nodes.converged`).
     """
 
     wavelength_nm: float
@@ -215,45 +225,63 @@ class Illumination(Result):
     unvignetted: Array
     passed: Array
     cos4: Array
+    spread: dict[str, Array]
 
 
-def illumination(scene: Scene, *, fields: int = 21, n: int = 80) -> Illumination:
-    """Relative illumination at the d line up to the edge of the field, with n by n rays from each film point.
+def illumination(scene: Scene, *, fields: int = 21) -> Illumination:
+    """Relative illumination at the reference wavelength up to the edge of the field, from where rays leave the film.
 
     Fields without a chief ray are NaN, and all are where the axis gets no light.
     """
-    angles = np.linspace(0, scene.edge_deg(), fields)
-    rays = bundle(scene.open, angles.tolist(), [LINE_D_NM], hexapolar(6))
-    film = on_plane(Rays(*(c[:, 0] for c in rays.film)), pupil_plane_z_mm(scene.lens))
-    start, area = _grid(scene, rays.chief_height_mm, film, n)
-    with torch.no_grad():
-        light = area[:, None] * start.dz.reshape(fields, -1) ** 4
-        whole, seen = (_sum(light, lens, start) for lens in (scene.open.traced, scene.lens))
+    angles, nm = np.linspace(0, scene.edge_deg(), fields), scene.lens.reference_nm
+    rays = bundle(scene.open, angles.tolist(), [nm], hexapolar(6))
+    pupil = on_plane(Rays(*(c[:, 0] for c in rays.film)), pupil_plane_z_mm(scene.lens))
+    both = [_FilmLight(scene, lens, rays.chief_height_mm, pupil) for lens in (scene.open.traced, scene.lens)]
+
+    def shares(light: list[Array]) -> dict[str, tuple[Array, Array | float]]:
+        whole, seen = light
+        with np.errstate(divide="ignore", invalid="ignore"):  # dark fields, or an axis without light: NaN
+            found = seen / (seen[0] or np.nan), whole / (whole[0] or np.nan), seen / whole
+        return {k: (v, 1.0) for k, v in zip(("relative", "unvignetted", "passed"), found, strict=True)}
+
+    light, spread = converged(lambda level, some: [b.only(some).sums(level) for b in both], shares, fields)
     cos4 = np.where(angles < 90, np.cos(np.radians(angles)), 0.0) ** 4
-    with np.errstate(divide="ignore", invalid="ignore"):  # dark fields, or an axis without light: NaN
-        relative, unvignetted, passed = seen / (seen[0] or np.nan), whole / (whole[0] or np.nan), seen / whole
-    return Illumination(LINE_D_NM, angles, rays.chief_height_mm.numpy(), relative, unvignetted, passed, cos4)
+    found = (values for values, _ in shares(light).values())
+    return Illumination(nm, angles, rays.chief_height_mm.numpy(), *found, cos4, spread)
 
 
-def _sum(light: Tensor, lens: Lens, start: Rays) -> Array:
-    passed = (trace(lens, start).status == 0).reshape(light.shape)
-    found: Array = (light * passed).sum(1).where(torch.isfinite(light).all(1), torch.nan).numpy()
-    return found
+class _FilmLight:
+    """Light that film points at F heights see through a lens, on the plane of the pupil."""
 
-
-def _grid(scene: Scene, height: Tensor, pupil: Rays, n: int) -> tuple[Rays, Tensor]:
-    """Rays [F * n * n] from the film to a grid over the pupil that a bundle fills, and the area of its cells [F]."""
-    share = (torch.arange(n, dtype=torch.float64) + 0.5) / n
-    columns = []
-    area = torch.ones_like(height)
-    for place in (pupil.x, pupil.y):
-        low = torch.nan_to_num(place, nan=torch.inf).amin(1)
-        high = torch.nan_to_num(place, nan=-torch.inf).amax(1)
+    def __init__(self, scene: Scene, lens: Lens, height_mm: Tensor, pupil: Rays) -> None:
+        """`pupil`: rays [F, P] that fill the pupil of each film point, on its plane."""
+        self.scene, self.lens, self.height_mm = scene, lens, height_mm
+        self.plane_z_mm = pupil_plane_z_mm(scene.lens)
+        sound = torch.isfinite(pupil.x)
+        low, high = (
+            torch.stack([pick(c.where(sound, 0.0), 1) for c in (pupil.x, pupil.y)], 1) for pick in (torch.amin, torch.amax)
+        )
         low, high = low - _MARGIN * (high - low), high + _MARGIN * (high - low)
-        columns.append(low[:, None] + (high - low)[:, None] * share)
-        area = area * (high - low) / n**2
-    shape = (len(height), n, n)
-    px, py = columns[0][:, :, None].expand(shape).reshape(-1), columns[1][:, None, :].expand(shape).reshape(-1)
-    h, zero = (-height)[:, None, None].expand(shape).reshape(-1), torch.zeros_like(px)
-    x, y = (h, zero) if scene.axis == "x" else (zero, h)
-    return camera_rays(x, y, scene.film_z_mm, px, py, pupil_plane_z_mm(scene.lens)), area
+        self.part = lit_part(self._passes, low, high)
+
+    def only(self, fields: list[int]) -> _FilmLight:
+        """The same for some of the film points."""
+        found = copy(self)
+        found.height_mm, found.part = self.height_mm[fields], LitPart(*(c[fields] for c in self.part))
+        return found
+
+    def _rays(self, u: Tensor, v: Tensor) -> Rays:
+        h, zero = (-self.height_mm)[:, None].expand(u.shape).reshape(-1), torch.zeros(u.numel(), dtype=torch.float64)
+        x, y = (h, zero) if self.scene.axis == "x" else (zero, h)
+        return camera_rays(x, y, self.scene.film_z_mm, u.reshape(-1), v.reshape(-1), self.plane_z_mm)
+
+    def _passes(self, u: Tensor, v: Tensor) -> Tensor:
+        return passing(self.lens, self._rays(u, v), self.scene.lens.reference_nm).reshape(u.shape)
+
+    def sums(self, level: int) -> Array:
+        """Integral [F] of cos^4 over what is lit, NaN for a film point without a chief ray."""
+        nodes = lit_nodes(self._passes, self.part, level)
+        cos4 = self._rays(*nodes[:2]).dz.reshape(nodes.u.shape) ** 4
+        light = (nodes.area * cos4 * self._passes(*nodes[:2])).sum(1)
+        found: Array = light.where(torch.isfinite(self.height_mm), torch.nan).numpy()
+        return found

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -48,7 +48,7 @@ def _plain(value: Any) -> Any:
     return value
 
 
-DEFAULT_NM = (LINE_D_NM, LINE_F_NM, LINE_C_NM)  # the first is the reference of the others
+DEFAULT_NM = (LINE_D_NM, LINE_F_NM, LINE_C_NM)
 
 # Half field from which a lens counts as a wide one: near objects then lie on a sphere, not on a plane.
 WIDE_DEG = 60.0
@@ -59,8 +59,7 @@ _SEARCH, _ROUNDS = 181, 4  # fields tried, denser near the axis; closer looks at
 _MET = 1e-6  # of the film's radius or the field
 
 
-@dataclass(frozen=True)
-class ChiefRays:
+class ChiefRays(NamedTuple):
     """Chief rays of F fields, traced without rims.
 
     Attributes:
@@ -126,6 +125,11 @@ class Scene:
         return float(self.lens.film_z_mm if self.lens.film_z_mm is not None else self.lens.vertices_mm[-1])
 
     @property
+    def waves_nm(self) -> tuple[float, ...]:
+        """Wavelengths of white light, the reference first: d, F and C, or those of a lens that is made for other light."""
+        return DEFAULT_NM if self.lens.visible else self.lens.wavelengths_nm
+
+    @property
     def first_order(self) -> FirstOrder:
         return first_order(self.lens, meridian=self.axis)
 
@@ -139,15 +143,16 @@ class Scene:
         """z of the object on the axis, mm; -inf for a distant one."""
         return self.film_z_mm - 1000 * self.focus_m
 
-    def chief_rays(self, field_deg: Sequence[float] | Tensor | Any, wavelength_nm: float = LINE_D_NM) -> ChiefRays:
-        """Chief rays of fields in degrees, 0 to below 180."""
+    def chief_rays(self, field_deg: Sequence[float] | Tensor | Any, wavelength_nm: float | None = None) -> ChiefRays:
+        """Chief rays of fields in degrees, 0 to below 180, at one wavelength, that of reference where none is given."""
+        nm = self.lens.reference_nm if wavelength_nm is None else wavelength_nm
         angles = torch.deg2rad(torch.as_tensor(field_deg, dtype=torch.float64).reshape(-1))
         found = aim_at_stop(
             self.lens, angles, torch.zeros(len(angles), 1, dtype=torch.float64), axis=self.axis,
-            wavelength_nm=wavelength_nm,
+            wavelength_nm=nm,
         )  # fmt: skip
         with torch.no_grad():
-            out = trace(without_rims(self.lens), found.rays, wavelength_nm, towards="film")
+            out = trace(without_rims(self.lens), found.rays, nm, towards="film")
         exists = found.reached[:, 0] & (out.status == 0)
         film = on_plane(out.rays, self.film_z_mm)
         height = -(film.x if self.axis == "x" else film.y)
@@ -170,7 +175,7 @@ class Scene:
 
     @property
     def wide(self) -> bool:
-        return (self.lens.half_field_deg or 0.0) >= WIDE_DEG
+        return (self.lens.half_field_deg or self.edge_deg()) >= WIDE_DEG
 
     @property
     def edge(self) -> FieldEdge:
@@ -233,6 +238,12 @@ class Scene:
             return self.lens
         rows = zip(self.lens.surfaces, without_rims(self.lens).surfaces, strict=True)
         return replace(self.lens, surfaces=tuple(old if old.stop else new for old, new in rows))
+
+    @property
+    def to_stop(self) -> Lens:
+        """The lens from the front to the stop, its opening the only rim."""
+        surfaces = self.open.traced.surfaces[: self.lens.stop_index + 1]
+        return replace(self.lens, surfaces=surfaces)
 
     def require_power(self) -> None:
         """Raise InputError for a pinhole, which has no focus."""

@@ -15,7 +15,6 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens
 from neurolens.optics.sag import sag_mm
 from neurolens.optics.shapes import followed_mm
@@ -53,7 +52,7 @@ def without_rims(lens: Lens) -> Lens:
 
 
 def aim_at_stop(
-    lens: Lens, field_rad: Tensor, height_mm: Tensor, *, axis: Axis = "x", wavelength_nm: float = LINE_D_NM
+    lens: Lens, field_rad: Tensor, height_mm: Tensor, *, axis: Axis = "x", wavelength_nm: float | None = None
 ) -> Bundle:
     """Meridional rays of collimated light that cross the stop at given heights, rims ignored.
 
@@ -62,18 +61,20 @@ def aim_at_stop(
             its image lies on the negative side.
         height_mm: [F, H] heights in the stop, along `axis`.
         axis: the meridional plane, for anamorphic lenses.
+        wavelength_nm: that of reference of the lens where none is given.
     """
     front = without_rims(replace(lens, surfaces=lens.surfaces[: lens.stop_index + 1]))
+    nm = lens.reference_nm if wavelength_nm is None else wavelength_nm
     heights = height_mm.reshape(-1)
     target = field_rad[:, None].expand_as(height_mm).reshape(-1)
 
     def outwards(angle: Tensor) -> tuple[Rays, Tensor, Tensor]:
-        return _follow(front, heights[:, None].expand_as(angle), angle, axis, wavelength_nm)
+        return _follow(front, heights[:, None].expand_as(angle), angle, axis, nm)
 
     widest = math.radians(_WIDEST_DEG)
     tried = torch.linspace(-widest, widest, _GRID, dtype=torch.float64)
     each, row = torch.unique(heights, return_inverse=True)
-    _, field, exists = _follow(front, each[:, None].expand(-1, _GRID), tried.expand(len(each), -1), axis, wavelength_nm)
+    _, field, exists = _follow(front, each[:, None].expand(-1, _GRID), tried.expand(len(each), -1), axis, nm)
     exists = exists & (torch.arange(_GRID) >= _axial(tried, field, exists)[:, None])
     ends = bracket(tried.expand(len(heights), -1), field[row], exists[row], target)
     for _ in range(_ROUNDS):
