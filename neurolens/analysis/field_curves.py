@@ -156,7 +156,7 @@ class Distortion(Result):
         error_percent: projection to [F], 100 (height / ideal - 1); 0 on the axis, NaN where the projection ends.
         best: the projection of least root mean square error over the whole field.
         reference: rectilinear below 60 degrees of half field, `best` from there on.
-        edge_percent: error of `reference` at the edge of the field.
+        edge_percent: error of `reference` at the edge of the field. edge: which edge that is.
     """
 
     wavelength_nm: float
@@ -167,6 +167,7 @@ class Distortion(Result):
     best: str
     reference: str
     edge_percent: float
+    edge: str
 
 
 def distortion(
@@ -187,7 +188,7 @@ def distortion(
     reference = best if scene.wide else RECTILINEAR
     return Distortion(
         wavelength_nm, angles, height[1:], float(height[0] / theta[0]), errors, best, reference,
-        float(errors[reference][-1]),
+        float(errors[reference][-1]), scene.edge.name if edge_deg is None else f"{edge_deg:g} degrees",
     )  # fmt: skip
 
 
@@ -215,7 +216,7 @@ class Illumination(Result):
         unvignetted: [F] the same without rims: natural falloff, pupil growth and distortion.
         passed: [F] share of the stop's light that no rim takes.
         cos4: [F] cos^4 of the field angle, 0 from 90 degrees on.
-        spread: by figure, [F], by how much two samplings of the pupil differ (`pupil_nodes.converged`).
+        spread: by figure, [F, ...], by how much two samplings of the pupil differ (`pupil_nodes.converged`).
     """
 
     wavelength_nm: float

@@ -23,7 +23,7 @@ Passes = Callable[[Tensor, Tensor], Tensor]
 _LATTICE = 32  # points a side that find what is lit, twice: in the box that is given, and in that of what is lit
 _SCAN, _ROUNDS = 13, 4  # points along a spoke that find the outline; closer looks
 _SPOKES, _RINGS = 32, 6  # of the coarsest level; every further level has twice as many of both
-LEVELS = 5
+LEVELS = 4
 AGREE = 5e-4  # difference of two levels, over the scale of the figure, that is half of a third digit
 
 
@@ -103,24 +103,20 @@ def converged(
             figures themselves, or 1 for shares of 1.
         fields: their number. first: the level to begin with.
 
-    Returns the arrays, and by name the greatest difference [F] of the last two levels over the scale.
+    Returns the arrays, and by name the difference [F, ...] of the last two levels over the scale.
     """
     rows = list(range(fields))
     result = [np.array(a) for a in compute(first, rows)]
-    spread = {name: np.zeros(fields) for name in figures(result)}
+    spread = {name: np.zeros(values.shape) for name, (values, _) in figures(result).items()}
     for level in range(first + 1, LEVELS):
         before = figures([a.copy() for a in result])
         for whole, part in zip(result, compute(level, rows), strict=True):
             whole[rows] = part
         for name, (values, scale) in figures(result).items():
             off = np.nan_to_num(np.abs(values - before[name][0]) / np.maximum(scale, 1e-300))
-            spread[name][rows] = off.reshape(fields, -1).max(1)[rows]
-        rows = [k for k in rows if any(s[k] > AGREE for s in spread.values())]
+            spread[name][rows] = off[rows]
+        rows = [k for k in rows if any((s[k] > AGREE).any() for s in spread.values())]
         if not rows:
             break
     return result, spread
 
-
-def digits(spread: float) -> int:
-    """Digits, from 1 to 3, to which two levels agree that differ by `spread` of a figure."""
-    return 3 if spread <= AGREE else max(1, math.floor(-math.log10(2 * spread)))

@@ -36,7 +36,7 @@ class Spots(Result):
         airy_um: radius of the first dark ring on the axis, 1.22 lambda N with the working f-number.
         shift_mm, through_focus_um: [K] and [F, K], RMS radius with the film moved.
         best_shift_mm, best_rms_um: [F], where each field's RMS radius is least; NaN where rays stay parallel.
-        spread: by figure, [F], by how much two samplings of the pupil differ (`pupil_nodes.converged`).
+        spread: by figure, [F, ...], by how much two samplings of the pupil differ (`pupil_nodes.converged`).
     """
 
     field_deg: Array
@@ -222,7 +222,7 @@ class Mtf(Result):
         sagittal: [F, K], contrast of lines along it.
         diffraction_limit: [K], of a perfect lens of the same working f-number on the axis, first wavelength.
         shift_mm: how far from the film, positive away from the lens.
-        spread: by direction, [F], by how much two samplings of the pupil differ (`pupil_nodes.converged`).
+        spread: by direction, [F, k] for the first k frequencies, by how much two samplings of the pupil differ (`pupil_nodes.converged`).
     """
 
     field_deg: Array

@@ -63,7 +63,7 @@ class Psf(Result):
         strehl: [F], greatest value of `diffraction`.
         pupil_points: [F], points across the pupil that the diffraction image needs; 0 without light.
         airy_um: radius of the first dark ring on the axis.
-        spread: by figure, [F], by how much two samplings of the pupil differ (`pupil_nodes.converged`).
+        spread: by figure, [F, ...], by how much two samplings of the pupil differ (`pupil_nodes.converged`).
     """
 
     field_deg: Array
