@@ -300,8 +300,7 @@ def bundle(
 class Filled:
     """Bundles that fill what stop and rims leave open of each field and wavelength, to any accuracy.
 
-    Their rays are nodes of a quadrature on the planes across the chief rays at the front of the lens; they are not aimed
-    at points of the stop.
+    Their rays are nodes of a quadrature on the planes across the chief rays at the front of the lens.
     """
 
     def __init__(
@@ -318,9 +317,10 @@ class Filled:
         self.height_mm = self.chief.height_mm.numpy()
         outline = hexapolar(2)
         u, v, aimed, _ = (c.reshape(-1, len(outline.weight)) for c in self._aim(len(outline.weight)).at(outline))
-        low = torch.stack([torch.where(aimed, c, math.inf).amin(1) for c in (u, v)], 1)
-        high = torch.stack([torch.where(aimed, c, -math.inf).amax(1) for c in (u, v)], 1)
-        low, high = (torch.where(aimed.any(1, keepdim=True), c, 0.0) for c in (low, high))
+        # Where no ray meets the edge of the stop, the front surface bounds the light.
+        reach = torch.where(aimed.all(1, keepdim=True), 0.0, scene.lens.surfaces[0].semi_diameter_mm)
+        low = torch.stack([torch.where(aimed, c, 0.0).amin(1) for c in (u, v)], 1) - reach
+        high = torch.stack([torch.where(aimed, c, 0.0).amax(1) for c in (u, v)], 1) + reach
         margin = _MARGIN * (high - low).amax(1, keepdim=True)
         self.part = lit_part(self._passes, low - margin, high + margin)
 
@@ -328,20 +328,24 @@ class Filled:
         """The same for some of the fields, by their numbers."""
         found, waves = copy(self), len(self.waves)
         start, exists, height, film = self.chief
-        found.chief = ChiefRays(Rays(*(c[fields] for c in start)), exists[fields], height[fields], Rays(*(c[fields] for c in film)))
+        found.chief = ChiefRays(
+            Rays(*(c[fields] for c in start)), exists[fields], height[fields], Rays(*(c[fields] for c in film))
+        )
         found.fields = tuple(self.fields[k] for k in fields)
         found.part = LitPart(*(c.reshape(-1, waves)[fields].reshape(-1) for c in self.part))
         return found
 
     def bundle(self, level: int, path: bool = False) -> Bundle:
-        """The bundle of a level of `lit_nodes`; its weights have no light that rims take, neither has `open_weight`.
+        """The bundle of a level of `lit_nodes`; its weights hold no light that rims take, nor does `open_weight`.
 
         Without `path` the optical paths are NaN: they take half of the time.
         """
         nodes = lit_nodes(self._passes, self.part, level)
         aim = self._aim(nodes.u.shape[1])
         u, v, area = (c.reshape(-1) for c in nodes)
-        return _traced(self.scene, self.fields, self.chief, aim, (u, v), aim.exists, area * aim.spread(u, v), None, path)
+        return _traced(
+            self.scene, self.fields, self.chief, aim, (u, v), aim.exists, area * aim.spread(u, v), None, path
+        )
 
     def energy(self, level: int) -> Tensor:
         """Energy [F] of all wavelengths; units as of `Bundle.weight`."""

@@ -247,8 +247,9 @@ def illumination(scene: Scene, *, fields: int = 21) -> Illumination:
 
     light, spread = converged(lambda level, some: [b.only(some).sums(level) for b in both], shares, fields)
     cos4 = np.where(angles < 90, np.cos(np.radians(angles)), 0.0) ** 4
-    found = (values for values, _ in shares(light).values())
-    return Illumination(nm, angles, rays.chief_height_mm.numpy(), *found, cos4, spread)
+    relative, unvignetted, passed = (values for values, _ in shares(light).values())
+    height = rays.chief_height_mm.numpy()
+    return Illumination(nm, angles, height, relative, unvignetted, passed, cos4, spread)
 
 
 class _FilmLight:
@@ -260,7 +261,8 @@ class _FilmLight:
         self.plane_z_mm = pupil_plane_z_mm(scene.lens)
         sound = torch.isfinite(pupil.x)
         low, high = (
-            torch.stack([pick(c.where(sound, 0.0), 1) for c in (pupil.x, pupil.y)], 1) for pick in (torch.amin, torch.amax)
+            torch.stack([pick(c.where(sound, 0.0), 1) for c in (pupil.x, pupil.y)], 1)
+            for pick in (torch.amin, torch.amax)
         )
         low, high = low - _MARGIN * (high - low), high + _MARGIN * (high - low)
         self.part = lit_part(self._passes, low, high)

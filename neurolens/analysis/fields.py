@@ -126,7 +126,7 @@ class Scene:
 
     @property
     def waves_nm(self) -> tuple[float, ...]:
-        """Wavelengths of white light, the reference first: d, F and C, or those of a lens that is made for other light."""
+        """Wavelengths of white light, the reference first: d, F and C, or those of a lens made for other light."""
         return DEFAULT_NM if self.lens.visible else self.lens.wavelengths_nm
 
     @property
@@ -272,9 +272,10 @@ def _image_radius_mm(lens: Lens) -> float:
 def _edge(scene: Scene) -> FieldEdge:
     scene.check()
     lens, stated = scene.lens, scene.lens.half_field_deg
-    by_field = lens.image_radius_mm is None and stated is not None
-    if by_field:
-        meant, wanted = f"the half field that the file states, {stated:.4g} degrees", stated
+    by_field = False
+    if lens.image_radius_mm is None and stated is not None:
+        by_field, wanted = True, stated
+        meant = f"the half field that the file states, {stated:.4g} degrees"
     else:
         wanted = scene.image_radius_mm
         meant = f"the edge of the film, {wanted:.4g} mm"

@@ -1,8 +1,8 @@
-"""Quadrature over the lit part of a plane that rays cross, whatever outline the stop and the rims leave, until it agrees.
+"""Quadrature over what stop and rims leave open of a plane, whatever its outline, refined until two levels agree.
 
 Rays on a grid count the light of an opening with an error that falls only as n^-1.5, and rings of the stop lose what a
 rim cuts between two of them. Here the outline itself is searched, along spokes from the middle of what is lit, and
-Gauss's nodes lie along the spokes: figures that are smooth over the pupil converge exponentially. What is not lit inside
+Gauss's nodes lie along the spokes: figures that are smooth over the pupil converge exponentially. What is dark inside
 the outline is left out ray by ray.
 """
 
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 Passes = Callable[[Tensor, Tensor], Tensor]
 
 _LATTICE = 32  # points a side that find what is lit, twice: in the box that is given, and in that of what is lit
-_SCAN, _ROUNDS = 13, 4  # points along a spoke that find the outline; closer looks
+_SCAN, _ROUNDS = 13, 5  # points along a spoke that find the outline; closer looks
 _SPOKES, _RINGS = 32, 6  # of the coarsest level; every further level has twice as many of both
 LEVELS = 4
 AGREE = 5e-4  # difference of two levels, over the scale of the figure, that is half of a third digit
@@ -36,7 +36,7 @@ class Nodes(NamedTuple):
 
 
 class LitPart(NamedTuple):
-    """The middle of what is lit in each of B planes, [B] each, and how far it reaches from there: 0 where nothing is."""
+    """The middle of what is lit in each of B planes, [B], and how far it reaches from there: 0 where nothing is."""
 
     u: Tensor
     v: Tensor
@@ -95,7 +95,7 @@ def converged(
     fields: int,
     first: int = 0,
 ) -> tuple[list[Array], dict[str, Array]]:
-    """Arrays [F, ...] of fields, each of the first level that agrees with the one before it to three digits, or the last.
+    """Arrays [F, ...]: of each field those of the first level that agrees with the one before it, or of the last.
 
     Args:
         compute: gives the arrays of a level, from 0, for some of the fields.
@@ -119,4 +119,3 @@ def converged(
         if not rows:
             break
     return result, spread
-

@@ -26,7 +26,7 @@ class Spots(Result):
 
     Attributes:
         field_deg, height_mm: [F], of the chief ray of the first wavelength.
-        tangential_um, sagittal_um: [F, W, P] relative to that chief ray, NaN where blocked; rings over the stop, to draw.
+        tangential_um, sagittal_um: [F, W, P] from that chief ray, NaN where blocked; rings over the stop, to draw.
             The figures below are converged over what stop and rims leave open (`pupil_nodes`).
         slope_tangential, slope_sagittal: [F, W, P], for spots at another focus.
         rms_um: [F] root mean square distance from the centroid, over all wavelengths, weighted by energy.
@@ -222,7 +222,8 @@ class Mtf(Result):
         sagittal: [F, K], contrast of lines along it.
         diffraction_limit: [K], of a perfect lens of the same working f-number on the axis, first wavelength.
         shift_mm: how far from the film, positive away from the lens.
-        spread: by direction, [F, k] for the first k frequencies, by how much two samplings of the pupil differ (`pupil_nodes.converged`).
+        spread: by direction, [F, k] for the first k frequencies, by how much two samplings of the pupil differ
+            (`pupil_nodes.converged`).
     """
 
     field_deg: Array
@@ -262,8 +263,9 @@ def mtf(
         return [_contrast(torch.nan_to_num(x).flatten(1), weight, f) for x in rays.at_shift(shift_mm)]
 
     names = ("tangential", "sagittal")
-    both, spread = converged(contrast, lambda c: {k: (v[:, shown], 1.0) for k, v in zip(names, c, strict=True)},
-                             len(filled.fields))
+    both, spread = converged(
+        contrast, lambda c: {k: (v[:, shown], 1.0) for k, v in zip(names, c, strict=True)}, len(filled.fields)
+    )
     n = working_f_number(scene, filled.waves[0])
     return Mtf(
         np.array(filled.fields), filled.height_mm, np.array(filled.waves), f, both[0], both[1],

@@ -77,9 +77,7 @@ class Psf(Result):
     spread: dict[str, Array]
 
 
-def psf(
-    scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: Sequence[float] | None = None
-) -> Psf:
+def psf(scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: Sequence[float] | None = None) -> Psf:
     """Point spread of fields; the window holds the spot and six Airy radii.
 
     Raises:
@@ -106,7 +104,7 @@ def psf(
 
 
 def _images(rays: Bundle, coarse: Bundle, least_mm: float) -> list[Array]:
-    """Half widths (um), geometric and diffraction images, and points across the pupil that the latter need, each [F, ...].
+    """Half widths (um), geometric and diffraction images, and points across the pupil that the latter need, [F, ...].
 
     In windows of at least some half width; `coarse` tells how fast phases turn.
     """

@@ -54,10 +54,11 @@ Trace a lens from the scene and analyse its image. WHAT is any of:
   seidel      Seidel sums S1 to S5 and the colour sums C1 and C2, surface by surface
   psf         point spread, geometric and by diffraction
 
-Without WHAT all are shown. Pupils are sampled finer and finer until two samplings agree to the
-digits that are printed; figures that do not settle have fewer. The edge is that of the film, or
-the text says which; a field that no chief ray reaches is a warning. Rays fill the real stop, not a paraxial pupil; fields are angles
-from the axis in degrees, of the chief ray in the scene. Needs the extra "train" (torch)."""
+Without WHAT all are shown. Rays fill the real stop, not a paraxial pupil; fields are angles
+from the axis in degrees, of the chief ray in the scene. The edge is that of the film, or the
+text says which; one that no chief ray reaches is a warning. Pupils are sampled finer and finer
+until two samplings agree to the digits that are printed; what does not settle has fewer.
+Needs the extra "train" (torch)."""
 _EPILOG = """\
 examples:
   neurolens analyse lenses/laikin_double_gauss_50.toml
@@ -87,8 +88,8 @@ def add_parser(subparsers: Any) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--wavelengths", metavar="NM", nargs="+", type=between(*WAVELENGTH_NM, "wavelengths in nm"),
-        help=f"of spots, fans, the MTF and psf, {said(WAVELENGTH_NM)} nm, the reference first (default: d, F and C, or the "
-        "file's own where these do not hold the d line)",
+        help=f"of spots, fans, the MTF and psf, {said(WAVELENGTH_NM)} nm, the reference first "
+        "(default: d, F and C, or the file's own where its range lacks the d line)",
     )  # fmt: skip
     parser.add_argument(
         "--frequencies", metavar="PER_MM", nargs="+", type=between(0, 1000, "cycles per mm"),
@@ -134,14 +135,23 @@ def run(args: argparse.Namespace) -> int:
             continue
         if picture is not None:
             pictures[what] = str(picture)
-    head = {"file": str(args.file), "name": scene.lens.name, "axis": scene.axis, "focus_m": scene.focus_m, "edge": edge.to_dict()}
+    head = {
+        "file": str(args.file),
+        "name": scene.lens.name,
+        "axis": scene.axis,
+        "focus_m": scene.focus_m,
+        "edge": edge.to_dict(),
+    }
     more = {"pictures": pictures, "notes": notes, "warnings": doubts, "seconds": time.perf_counter() - began}
     bulk = {} if args.full else _BULK
     shown = {w: {k: v for k, v in d.items() if k not in bulk.get(w, ())} for w, d in found.items()}
 
     def text() -> str:
         widest = f"fields to {edge.field_deg:.2f}°, {edge.height_mm:.2f} mm: {edge.name}"
-        parts = [f"{scene.lens.name}\n{state_text(scene)}\n{widest}", *(analysis_of(w).table(d) for w, d in found.items())]
+        parts = [
+            f"{scene.lens.name}\n{state_text(scene)}\n{widest}",
+            *(analysis_of(w).table(d) for w, d in found.items()),
+        ]
         parts += [*(f"Note: {n}" for n in notes), *(f"Warning: {w}" for w in doubts)]
         if pictures:
             parts.append(f"{len(pictures)} pictures drawn in {args.output}")
@@ -411,9 +421,9 @@ def _largest(values: Sequence[float]) -> float:
 
 
 def _three(value: float, spread: float = 0.0) -> str:
-    """Three digits, or fewer: of the last, two samplings that differ by this share of the value differ by one at most."""
-    if not abs(value) >= 1e-6:  # rounding errors of a zero are 0
-        return number(value * 0.0)
+    """Three digits, or fewer: two samplings that differ by `spread` of the value differ by one of the last at most."""
+    if not 1e-6 <= abs(value) < math.inf:
+        return number(0.0 if abs(value) < 1e-6 else value)  # rounding errors of a zero are 0
     units = math.ceil(math.log10(max(spread * abs(value), 1e-300)))
     digits = max(min(math.floor(math.log10(abs(value))) - units + 1, 3), 1)
     return number(float(f"{value:.{digits}g}"))

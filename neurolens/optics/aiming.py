@@ -3,7 +3,7 @@
 Searching the front surface for the ray that meets the stop's centre fails where the pupil moves (a fisheye's chief
 ray enters centimetres beside the paraxial pupil). From the stop every start is a ray that exists: its angle in the
 scene usually grows with its angle at the stop, and the wanted field is bracketed from the axis outwards. Where rays are
-lost in between or turn back, the first ray of that field counts: it belongs to the branch of the axis where that has one.
+lost in between or turn back, the first ray of that field counts: that of the axis's own branch where there is one.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ Axis = Literal["x", "y"]
 _WIDEST_DEG = 89.9  # of the angles tried at the stop
 _GRID = 721  # odd, so that the axis is included; a step of a quarter of a degree
 _ZOOM, _ROUNDS = 17, 4  # each round narrows the bracket 16 times, until a straight line has the last digit
-_JUMP = 1.0  # rad of field between neighbours in the search: more is a jump, from one side of the axis to the other, say
+_JUMP = (
+    1.0  # rad of field between neighbours in the search: more is a jump, from one side of the axis to the other, say
+)
 _MET = 1e-7  # rad from the wanted field
 
 
@@ -45,7 +47,7 @@ class Bundle(NamedTuple):
 
 
 def without_rims(lens: Lens) -> Lens:
-    """The lens with every surface, the stop too, open as far as it goes; aspheres continue smoothly beyond their rims."""
+    """The lens with every surface, the stop too, open as far as it goes; aspheres continue beyond their rims."""
     ends = (followed_mm(s) if s.asphere else math.inf for s in lens.surfaces)
     rows = (replace(s, diameter_mm=math.inf, followed_mm=end) for s, end in zip(lens.surfaces, ends, strict=True))
     return replace(lens, aperture=None, surfaces=tuple(rows))
@@ -107,9 +109,7 @@ def _off(field: Tensor, exists: Tensor, target: Tensor) -> Tensor:
     return torch.where(exists, (field - target[:, None]).abs(), math.inf)
 
 
-def bracket(
-    angle: Tensor, value: Tensor, exists: Tensor, target: Tensor, jump: float = _JUMP
-) -> Tensor:
+def bracket(angle: Tensor, value: Tensor, exists: Tensor, target: Tensor, jump: float = _JUMP) -> Tensor:
     """Of increasing angles [n, G] the first neighbours whose values lie on both sides of a target [n], [n, 3].
 
     Else the neighbours of the ray whose value is nearest to it, between which rays may come nearer yet. In the middle
