@@ -322,7 +322,7 @@ class Filled:
         low = torch.stack([torch.where(aimed, c, 0.0).amin(1) for c in (u, v)], 1) - reach
         high = torch.stack([torch.where(aimed, c, 0.0).amax(1) for c in (u, v)], 1) + reach
         margin = _MARGIN * (high - low).amax(1, keepdim=True)
-        self.part = lit_part(self._passes, low - margin, high + margin)
+        self.part = lit_part(self._passes, low - margin, high + margin, torch.zeros_like(low))
 
     def only(self, fields: list[int]) -> Filled:
         """The same for some of the fields, by their numbers."""
@@ -399,19 +399,22 @@ def _traced(
     )  # fmt: skip
 
 
-def check_light(scene: Scene, field_deg: Sequence[float] | None, wavelength_nm: float) -> None:
-    """Raise InputError for a requested field from which no ray reaches the film, or a lens that passes no ray.
+def check_light(scene: Scene, field_deg: Sequence[float] | None, wavelength_nm: float) -> list[str]:
+    """A warning of each of the default fields (None) from which no ray reaches the film.
 
-    Of the default fields (None) some may be dark.
+    Raises:
+        InputError: a requested field from which no ray reaches the film, or a lens that passes no ray.
     """
     fields = scene.default_fields() if field_deg is None else field_deg
-    seen = bundle(scene, [0.0, *fields], [wavelength_nm], hexapolar(12)).passed.any(2).any(1).tolist()
+    seen = (Filled(scene, [0.0, *fields], [wavelength_nm]).part.reach > 0).tolist()
     if not any(seen):
         raise InputError(scene.lens.path, "surfaces", "(no ray reaches the film)", "a lens that passes light")
     dark = [field for field, lit in zip(field_deg or (), seen[1:], strict=False) if not lit]
     if dark:
         edge = f"at most {scene.edge_deg():.4g} degrees, the edge of the image"
         raise InputError(scene.lens.path, f"field {dark[0]:g}", "(no light reaches the film)", edge)
+    lit = zip(fields, seen[1:], strict=True)
+    return [f"rims leave no light of the field of {field:.4g} degrees" for field, light in lit if not light]
 
 
 def _to_film(scene: Scene, start: Rays, wavelength_nm: Tensor, wanted: bool) -> tuple[Rays, Tensor, Tensor | float]:

@@ -259,13 +259,19 @@ class _FilmLight:
         """`pupil`: rays [F, P] that fill the pupil of each film point, on its plane."""
         self.scene, self.lens, self.height_mm = scene, lens, height_mm
         self.plane_z_mm = pupil_plane_z_mm(scene.lens)
-        sound = torch.isfinite(pupil.x)
-        low, high = (
-            torch.stack([pick(c.where(sound, 0.0), 1) for c in (pupil.x, pupil.y)], 1)
-            for pick in (torch.amin, torch.amax)
-        )
-        low, high = low - _MARGIN * (high - low), high + _MARGIN * (high - low)
-        self.part = lit_part(self._passes, low, high)
+        # Where no ray meets the edge of the stop, the rear surface bounds the light, as seen from the film point.
+        zero = torch.zeros_like(height_mm)
+        film = torch.stack((-height_mm, zero) if scene.axis == "x" else (zero, -height_mm), 1)
+        rear_mm, rear_z_mm = scene.lens.surfaces[-1].semi_diameter_mm, float(scene.lens.vertices_mm[-2])
+        farther = (scene.film_z_mm - self.plane_z_mm) / (scene.film_z_mm - rear_z_mm)
+        rear = [film + (edge - film) * farther for edge in (-rear_mm, rear_mm)]
+        places = torch.stack([pupil.x, pupil.y], 2)
+        sound = torch.isfinite(places)
+        low = torch.where(sound, places, torch.minimum(*rear)[:, None]).amin(1)
+        high = torch.where(sound, places, torch.maximum(*rear)[:, None]).amax(1)
+        margin = _MARGIN * (high - low)
+        near = torch.where(sound, places, 0.0).sum(1) / sound.sum(1).clamp_min(1)
+        self.part = lit_part(self._passes, low - margin, high + margin, near)
 
     def only(self, fields: list[int]) -> _FilmLight:
         """The same for some of the film points."""

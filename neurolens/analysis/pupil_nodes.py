@@ -20,7 +20,8 @@ from torch import Tensor
 Array = NDArray[np.float64]
 Passes = Callable[[Tensor, Tensor], Tensor]
 
-_LATTICE = 32  # points a side that find what is lit, twice: in the box that is given, and in that of what is lit
+_LATTICE, _LOOKS = 32, 6  # points a side that find what is lit: in the box that is given, then in that of what is lit
+_CLOSER = 4  # times, where nothing is found
 _SCAN, _ROUNDS = 13, 5  # points along a spoke that find the outline; closer looks
 _SPOKES, _RINGS = 32, 6  # of the coarsest level; every further level has twice as many of both
 LEVELS = 4
@@ -43,18 +44,31 @@ class LitPart(NamedTuple):
     reach: Tensor
 
 
-def lit_part(passes: Passes, low: Tensor, high: Tensor) -> LitPart:
-    """Find what is lit inside boxes with corners `low` and `high`, [B, 2]; `passes` tells it of points u, v, [B, N]."""
+def lit_part(passes: Passes, low: Tensor, high: Tensor, near: Tensor) -> LitPart:
+    """Find what is lit inside boxes.
+
+    Args:
+        passes: tells of points u, v, [B, N], whether they are lit.
+        low, high: [B, 2], corners of the boxes.
+        near: [B, 2], a point about which smaller boxes are searched where nothing is found.
+    """
     step = (torch.arange(_LATTICE, dtype=torch.float64) + 0.5) / _LATTICE
     a, b = (s.reshape(-1) for s in torch.meshgrid(step, step, indexing="ij"))
-    for _ in range(2):
+    known = torch.zeros(len(low), dtype=torch.bool)
+    for _ in range(_LOOKS):
         u, v = (low[:, k, None] + (high - low)[:, k, None] * s for k, s in enumerate((a, b)))
         lit, cell = passes(u, v), (high - low) / _LATTICE
         any_lit = lit.any(1)
         places = torch.stack([u, v], 2)
         low_lit = torch.where(lit[..., None], places, math.inf).amin(1) - cell
         high_lit = torch.where(lit[..., None], places, -math.inf).amax(1) + cell
-        low, high = (torch.where(any_lit[:, None], new, old) for new, old in ((low_lit, low), (high_lit, high)))
+        low, high = (
+            torch.where(any_lit[:, None], lit_end, near + (end - near) / _CLOSER)
+            for lit_end, end in ((low_lit, low), (high_lit, high))
+        )
+        if (known & any_lit).all():
+            break
+        known = any_lit
     count = lit.sum(1).clamp_min(1)
     middle_u, middle_v = ((lit * p).sum(1) / count for p in (u, v))
     away = torch.hypot(u - middle_u[:, None], v - middle_v[:, None])

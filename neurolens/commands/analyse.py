@@ -127,7 +127,7 @@ def run(args: argparse.Namespace) -> int:
     found, pictures, notes = {}, {}, [f"derived: {scene.lens.derived}"] if scene.lens.derived else []
     for what in args.what or WHATS:
         try:
-            found[what], picture = _one(what, scene, args)
+            found[what], picture = _one(what, scene, args, doubts)
         except InputError as error:
             if args.what:
                 raise
@@ -177,8 +177,8 @@ def _scene_of(args: argparse.Namespace) -> tuple[Scene, list[str]]:
     return scene, notes
 
 
-def _one(what: str, scene: Scene, args: argparse.Namespace) -> tuple[dict[str, Any], Path | None]:
-    """One analysis as plain data, and its picture where a folder is given."""
+def _one(what: str, scene: Scene, args: argparse.Namespace, doubts: list[str]) -> tuple[dict[str, Any], Path | None]:
+    """One analysis as plain data, and its picture where a folder is given; new warnings are added to `doubts`."""
     from neurolens.analysis.bundles import check_light
     from neurolens.analysis.layout import state_text
 
@@ -189,7 +189,8 @@ def _one(what: str, scene: Scene, args: argparse.Namespace) -> tuple[dict[str, A
         options = {"frequency_per_mm": args.frequencies, "wavelength_nm": args.wavelengths}
         asked = {k: v for k, v in options.items() if v is not None}
     if what in _OF_FIELDS:
-        check_light(scene, args.fields, (args.wavelengths or scene.waves_nm)[0])
+        dark = check_light(scene, args.fields, (args.wavelengths or scene.waves_nm)[0])
+        doubts += [d for d in dark if d not in doubts]
     result = analysis.compute(scene, **asked)
     data = result.to_dict()
     if args.output is None:

@@ -23,7 +23,7 @@ BOX = torch.tensor([[-3.0, -3.0]], dtype=torch.float64)
 
 
 def area(passes: object, level: int) -> float:
-    part = lit_part(passes, BOX, -BOX)  # type: ignore[arg-type]
+    part = lit_part(passes, BOX, -BOX, 0 * BOX)  # type: ignore[arg-type]
     nodes = lit_nodes(passes, part, level)  # type: ignore[arg-type]
     return float((nodes.area * passes(nodes.u, nodes.v)).sum())  # type: ignore[operator]
 
