@@ -47,34 +47,18 @@ class Pattern(NamedTuple):
 def hexapolar(rings: int) -> Pattern:
     """The centre and `rings` rings of 6, 12, 18, ... points, the last on the stop's edge; 1 + 3 n (n + 1) points.
 
-    The weights are the areas nearest to each ring, with the least change that makes the means of r^2, r^4, ...,
-    r^12 exact: spots of steep aberrations depend on the edge, where areas alone would be inaccurate.
+    The weights are the areas nearest to each ring.
     """
-    radius = [k / rings for k in range(rings + 1)]
-    weight = _ring_weights(rings)
-    t, s, w = [0.0], [0.0], [weight[0]]
+    t, s, w = [0.0], [0.0], [(0.5 / rings) ** 2]
     for k in range(1, rings + 1):
-        r = radius[k] * (1 - _EDGE)
+        r = k / rings * (1 - _EDGE)
+        area = (min(k + 0.5, rings) / rings) ** 2 - ((k - 0.5) / rings) ** 2
         for i in range(6 * k):
             angle = 2 * math.pi * i / (6 * k)
             t.append(r * math.cos(angle))
             s.append(r * math.sin(angle))
-            w.append(weight[k] / (6 * k))
+            w.append(area / (6 * k))
     return Pattern(_tensor(t), _tensor(s), _tensor(w))
-
-
-def _ring_weights(rings: int) -> list[float]:
-    k = torch.arange(rings + 1, dtype=torch.float64)
-    inner, outer = ((k - 0.5).clamp_min(0) / rings) ** 2, ((k + 0.5).clamp_max(rings) / rings) ** 2
-    area = outer - inner
-    for moments in range(min(7, rings), 0, -1):
-        m = torch.arange(moments, dtype=torch.float64)[:, None]
-        power = (k / rings) ** (2 * m)
-        lack = 1 / (m[:, 0] + 1) - power @ area
-        moved = area + area * (torch.linalg.solve((power * area) @ power.T, lack) @ power)
-        if (moved > 0).all():
-            return moved.tolist()
-    return area.tolist()
 
 
 def grid(n: int) -> Pattern:
@@ -411,7 +395,7 @@ def check_light(scene: Scene, field_deg: Sequence[float] | None, wavelength_nm: 
         raise InputError(scene.lens.path, "surfaces", "(no ray reaches the film)", "a lens that passes light")
     dark = [field for field, lit in zip(field_deg or (), seen[1:], strict=False) if not lit]
     if dark:
-        edge = f"at most {scene.edge_deg():.4g} degrees, the edge of the image"
+        edge = f"at most {scene.edge.field_deg:.4g} degrees, the edge of the image"
         raise InputError(scene.lens.path, f"field {dark[0]:g}", "(no light reaches the film)", edge)
     lit = zip(fields, seen[1:], strict=True)
     return [f"rims leave no light of the field of {field:.4g} degrees" for field, light in lit if not light]

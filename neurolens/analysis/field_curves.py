@@ -72,7 +72,7 @@ def colour(
     line_nm = line_nm or (*scene.waves_nm, *((LINE_G_NM,) if lens.visible else ()))
     axial = bundle(scene.round, [0.0], spectrum.tolist(), points(list(_ZONES), [0.0] * 3))
     crossing = -(axial.tangential_mm / axial.slopes[0])[0].numpy()
-    angles = np.linspace(0, scene.edge_deg(), fields)
+    angles = np.linspace(0, scene.edge.field_deg, fields)
     chief = bundle(scene.open, angles.tolist(), line_nm, points([0.0], [0.0]))
     # Tangential points grow with image height where the field's angle is positive.
     lateral = 1000 * chief.tangential_mm[..., 0].numpy()
@@ -114,7 +114,7 @@ def curvature(
     """
     scene.require_power()
     wavelength_nm = scene.lens.reference_nm if wavelength_nm is None else wavelength_nm
-    angles = np.linspace(0, scene.edge_deg() if edge_deg is None else edge_deg, fields)
+    angles = np.linspace(0, scene.edge.field_deg if edge_deg is None else edge_deg, fields)
     pattern = points([-_CLOSE, _CLOSE, 0.0, 0.0], [0.0, 0.0, -_CLOSE, _CLOSE])
     rays = bundle(scene.open, angles.tolist(), [wavelength_nm], pattern)
     slope_t, slope_s = rays.slopes
@@ -175,7 +175,7 @@ def distortion(
 ) -> Distortion:
     """Distortion against every projection. For a near object of a rectilinear lens, object heights are used."""
     wavelength_nm = scene.lens.reference_nm if wavelength_nm is None else wavelength_nm
-    angles = np.linspace(0, scene.edge_deg() if edge_deg is None else edge_deg, fields)
+    angles = np.linspace(0, scene.edge.field_deg if edge_deg is None else edge_deg, fields)
     chief = scene.chief_rays(np.concatenate([[_SMALL_DEG], angles]), wavelength_nm)
     height = chief.height_mm.numpy()
     theta = np.radians(np.concatenate([[_SMALL_DEG], angles]))
@@ -234,7 +234,7 @@ def illumination(scene: Scene, *, fields: int = 21) -> Illumination:
 
     Fields without a chief ray are NaN, and all are where the axis gets no light.
     """
-    angles, nm = np.linspace(0, scene.edge_deg(), fields), scene.lens.reference_nm
+    angles, nm = np.linspace(0, scene.edge.field_deg, fields), scene.lens.reference_nm
     rays = bundle(scene.open, angles.tolist(), [nm], hexapolar(6))
     pupil = on_plane(Rays(*(c[:, 0] for c in rays.film)), pupil_plane_z_mm(scene.lens))
     both = [_FilmLight(scene, lens, rays.chief_height_mm, pupil) for lens in (scene.open.traced, scene.lens)]

@@ -175,7 +175,7 @@ class Scene:
 
     @property
     def wide(self) -> bool:
-        return (self.lens.half_field_deg or self.edge_deg()) >= WIDE_DEG
+        return (self.lens.half_field_deg or self.edge.field_deg) >= WIDE_DEG
 
     @property
     def edge(self) -> FieldEdge:
@@ -186,13 +186,9 @@ class Scene:
         """
         return _edge(self)
 
-    def edge_deg(self) -> float:
-        """The angle of `edge` in degrees."""
-        return self.edge.field_deg
-
     def default_fields(self) -> tuple[float, ...]:
         """The axis, 50%, 70%, 85% and the edge of the field, degrees."""
-        edge = self.edge_deg()
+        edge = self.edge.field_deg
         return tuple(f * edge for f in _FRACTIONS)
 
     def fields_at(self, height_mm: Sequence[float]) -> list[float]:

@@ -61,7 +61,7 @@ def seidel(scene: Scene, *, wavelength_nm: float | None = None, image_height_mm:
     scene.require_power()
     lens.require_glass("Seidel sums")
     if image_height_mm is None:
-        image_height_mm = float(scene.chief_rays([scene.edge_deg()], wavelength_nm).height_mm[0])
+        image_height_mm = float(scene.chief_rays([scene.edge.field_deg], wavelength_nm).height_mm[0])
     system = system_of(lens, wavelength_nm)
     n = system.index
     blue, red = (system_of(lens, nm).index for nm in ((LINE_F_NM, LINE_C_NM) if lens.visible else lens.light_nm))

@@ -284,7 +284,7 @@ def mtf_over_height(
     fields: int = 21,
 ) -> Mtf:
     """MTF of some frequencies at fields from the axis to the edge: the chart of lens makers."""
-    angles = np.linspace(0, scene.edge_deg(), fields).tolist()
+    angles = np.linspace(0, scene.edge.field_deg, fields).tolist()
     return mtf(scene, angles, wavelength_nm, frequency_per_mm=sorted(set(frequency_per_mm)))
 
 

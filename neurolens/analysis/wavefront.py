@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neurolens.analysis.bundles import Bundle, Filled, bundle, hexapolar, points
+from neurolens.analysis.bundles import Bundle, Filled, bundle, points
 from neurolens.analysis.fields import Array, Result, Scene
 from neurolens.analysis.pupil_nodes import converged
 from neurolens.analysis.spots import working_f_number
@@ -89,9 +89,7 @@ def psf(scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: S
     least_mm = 6e-3 * float(np.nan_to_num(airy))
 
     def images(level: int, fields: list[int]) -> list[Array]:
-        some = filled.only(fields)
-        coarse = bundle(scene, some.fields, some.waves[:1], hexapolar(6))
-        return _images(some.bundle(level, path=True), coarse, least_mm)
+        return _images(filled.only(fields).bundle(level, path=True), least_mm)
 
     def shown(found: list[Array]) -> dict[str, tuple[Array, Array | float]]:
         return {"half_width_um": (found[0], 20 * found[0]), "strehl": (found[2].max((1, 2)), 1.0)}
@@ -103,10 +101,10 @@ def psf(scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: S
     )  # fmt: skip
 
 
-def _images(rays: Bundle, coarse: Bundle, least_mm: float) -> list[Array]:
+def _images(rays: Bundle, least_mm: float) -> list[Array]:
     """Half widths (um), geometric and diffraction images, and points across the pupil that the latter need, [F, ...].
 
-    In windows of at least some half width; `coarse` tells how fast phases turn.
+    In windows of at least some half width.
     """
     rows = []
     for k in range(len(rays.field_deg)):
@@ -115,7 +113,7 @@ def _images(rays: Bundle, coarse: Bundle, least_mm: float) -> list[Array]:
         window = max(least_mm, 1.1 * radius)
         if not (window > 0 and w.sum() > 0):
             window = math.nan
-        needed, image = _needed(coarse, k, window), np.full((_POINTS, _POINTS), np.nan)
+        needed, image = _needed(rays, k, window), np.full((_POINTS, _POINTS), np.nan)
         if 0 < needed <= _FINEST:
             image = diffraction_image(rays, centre, window, field=k)
         rows.append((1000 * window, _histogram(t - centre[0], s - centre[1], w, window), image, float(needed)))

@@ -30,7 +30,7 @@ LENSES = ["laikin_double_gauss_50", "shimizu_fisheye_220", "ogawa_zoom_70_200", 
 @pytest.mark.parametrize("name", LENSES)
 def test_rays_meet_the_stop_where_they_were_aimed(name: str, focus_m: float) -> None:
     given = library(name, focus_m=focus_m)
-    edge = given.edge_deg()
+    edge = given.edge.field_deg
     rays = bundle(given, [0.0, 0.6 * edge, edge], [587.5618, 486.1327], hexapolar(3))
     lens = given.lens
     flat = Rays(*(c.reshape(-1) for c in rays.start))
@@ -110,7 +110,7 @@ def test_a_cylinder_focuses_one_meridian_only() -> None:
 
 def test_rims_take_light_and_the_open_scene_shows_what_is_missing() -> None:
     given = library("laikin_double_gauss_50")
-    field = [given.edge_deg()]
+    field = [given.edge.field_deg]
     seen, whole = bundle(given, field), bundle(given.open, field)
     assert 0.4 < float(seen.weight.sum() / whole.weight.sum()) < 0.8
     assert torch.equal(whole.weight > 0, whole.open_weight > 0) and (seen.status[~seen.passed] > 0).all()

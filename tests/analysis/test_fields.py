@@ -84,4 +84,4 @@ def test_other_light_is_analysed_at_its_own_wavelengths() -> None:
     assert here == pytest.approx(float(given.chief_rays([2.0], 1550.0).height_mm[0])) and abs(here - visible) > 1e-4
     assert distortion(given).wavelength_nm == 1550.0
     json.dumps(given.edge.to_dict())
-    assert scene([*rows]).waves_nm[0] == pytest.approx(587.56, abs=0.01) and math.isfinite(given.edge_deg())
+    assert scene([*rows]).waves_nm[0] == pytest.approx(587.56, abs=0.01) and math.isfinite(given.edge.field_deg)
