@@ -15,7 +15,6 @@ from neurolens.analysis.bundles import Pattern, bundle, fan
 from neurolens.analysis.fields import Array, Result, Scene
 from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, new_figure, save, style
 from neurolens.base.errors import InputError
-from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Surface
 from neurolens.optics.sag import sag_mm
 from neurolens.optics.surfaces import Rays
@@ -97,7 +96,7 @@ class Layout(Result):
 
 
 def layout_profile(scene: Scene, film_radius_mm: float | None = None) -> Layout:
-    """Section of a lens with meridional fans of rays to the axis, 70% and the edge of the film, d line.
+    """Section of a lens with meridional fans of rays to the axis, 70% and the edge of the film, reference wavelength.
 
     The edge of the film is that of the image circle if not given. A field of which none passes has no rays.
     """
@@ -143,7 +142,7 @@ def _fan_lines(scene: Scene, field: float) -> list[Array]:
     """Polylines (z, height) of rays that pass, evenly spread over the open part of the stop."""
     line = fan(_FAN)
     tangential = Pattern(*(v[:_FAN] for v in line))
-    rays = bundle(scene, [field], [LINE_D_NM], tangential)
+    rays = bundle(scene, [field], [scene.lens.reference_nm], tangential)
     passing = torch.nonzero(rays.passed[0, 0])[:, 0]
     if len(passing) == 0:
         return []

@@ -3,7 +3,7 @@
 Searching the front surface for the ray that meets the stop's centre fails where the pupil moves (a fisheye's chief
 ray enters centimetres beside the paraxial pupil). From the stop every start is a ray that exists: its angle in the
 scene usually grows with its angle at the stop, and the wanted field is bracketed from the axis outwards. Where rays are
-lost in between or turn back, the first ray of that field counts: it belongs to the branch of the axis where that has one.
+lost in between or turn back, the first ray of that field counts: that of the axis's own branch where there is one.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens
 from neurolens.optics.sag import sag_mm
 from neurolens.optics.shapes import followed_mm
@@ -26,8 +25,10 @@ Axis = Literal["x", "y"]
 
 _WIDEST_DEG = 89.9  # of the angles tried at the stop
 _GRID = 721  # odd, so that the axis is included; a step of a quarter of a degree
-_ZOOM, _ROUNDS = 17, 9  # each round narrows the bracket 16 times: to the last digit of a double
-_JUMP = 1.0  # rad of field between neighbours in the search: more is a jump, from one side of the axis to the other, say
+_ZOOM, _ROUNDS = 17, 4  # each round narrows the bracket 16 times, until a straight line has the last digit
+_JUMP = (
+    1.0  # rad of field between neighbours in the search: more is a jump, from one side of the axis to the other, say
+)
 _MET = 1e-7  # rad from the wanted field
 
 
@@ -46,14 +47,14 @@ class Bundle(NamedTuple):
 
 
 def without_rims(lens: Lens) -> Lens:
-    """The lens with every surface, the stop too, open as far as it goes; aspheres continue smoothly beyond their rims."""
+    """The lens with every surface, the stop too, open as far as it goes; aspheres continue beyond their rims."""
     ends = (followed_mm(s) if s.asphere else math.inf for s in lens.surfaces)
     rows = (replace(s, diameter_mm=math.inf, followed_mm=end) for s, end in zip(lens.surfaces, ends, strict=True))
     return replace(lens, aperture=None, surfaces=tuple(rows))
 
 
 def aim_at_stop(
-    lens: Lens, field_rad: Tensor, height_mm: Tensor, *, axis: Axis = "x", wavelength_nm: float = LINE_D_NM
+    lens: Lens, field_rad: Tensor, height_mm: Tensor, *, axis: Axis = "x", wavelength_nm: float | None = None
 ) -> Bundle:
     """Meridional rays of collimated light that cross the stop at given heights, rims ignored.
 
@@ -62,27 +63,27 @@ def aim_at_stop(
             its image lies on the negative side.
         height_mm: [F, H] heights in the stop, along `axis`.
         axis: the meridional plane, for anamorphic lenses.
+        wavelength_nm: that of reference of the lens where none is given.
     """
     front = without_rims(replace(lens, surfaces=lens.surfaces[: lens.stop_index + 1]))
+    nm = lens.reference_nm if wavelength_nm is None else wavelength_nm
     heights = height_mm.reshape(-1)
     target = field_rad[:, None].expand_as(height_mm).reshape(-1)
 
     def outwards(angle: Tensor) -> tuple[Rays, Tensor, Tensor]:
-        return _follow(front, heights[:, None].expand_as(angle), angle, axis, wavelength_nm)
+        return _follow(front, heights[:, None].expand_as(angle), angle, axis, nm)
 
     widest = math.radians(_WIDEST_DEG)
     tried = torch.linspace(-widest, widest, _GRID, dtype=torch.float64)
     each, row = torch.unique(heights, return_inverse=True)
-    _, field, exists = _follow(front, each[:, None].expand(-1, _GRID), tried.expand(len(each), -1), axis, wavelength_nm)
+    _, field, exists = _follow(front, each[:, None].expand(-1, _GRID), tried.expand(len(each), -1), axis, nm)
     exists = exists & (torch.arange(_GRID) >= _axial(tried, field, exists)[:, None])
-    low, high = _bracket(tried.expand(len(heights), -1), field[row], exists[row], target)
-    share = torch.linspace(0, 1, _ZOOM, dtype=torch.float64)
+    ends = bracket(tried.expand(len(heights), -1), field[row], exists[row], target)
     for _ in range(_ROUNDS):
-        fine = low[:, None] + (high - low)[:, None] * share
-        low, high = _bracket(fine, *outwards(fine)[1:], target)
-    last = torch.stack([low, (low + high) / 2, high], 1)
-    off = _off(*outwards(last)[1:], target)
-    rays, field, _ = outwards(last.gather(1, off.argmin(1, keepdim=True)))
+        fine = between(ends)
+        ends = bracket(fine, *outwards(fine)[1:], target)
+    off = _off(*outwards(ends)[1:], target)
+    rays, field, _ = outwards(ends.gather(1, off.argmin(1, keepdim=True)))
     reached = off.amin(1) < _MET
     return Bundle(rays, reached.reshape(height_mm.shape), field.reshape(height_mm.shape))
 
@@ -98,9 +99,9 @@ def _axial(angle: Tensor, field: Tensor, exists: Tensor) -> Tensor:
     return torch.where(rises.any(1), inclined.argmin(1), nearest)
 
 
-def _joined(field: Tensor, exists: Tensor) -> Tensor:
+def _joined(value: Tensor, exists: Tensor, jump: float = _JUMP) -> Tensor:
     """Whether neighbours [n, G - 1] both exist and are of one branch."""
-    return exists[:, 1:] & exists[:, :-1] & ((field[:, 1:] - field[:, :-1]).abs() < _JUMP)
+    return exists[:, 1:] & exists[:, :-1] & ((value[:, 1:] - value[:, :-1]).abs() < jump)
 
 
 def _off(field: Tensor, exists: Tensor, target: Tensor) -> Tensor:
@@ -108,17 +109,30 @@ def _off(field: Tensor, exists: Tensor, target: Tensor) -> Tensor:
     return torch.where(exists, (field - target[:, None]).abs(), math.inf)
 
 
-def _bracket(angle: Tensor, field: Tensor, exists: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Two of the angles at the stop [n, G] for each target [n]: the first neighbours whose fields lie on both sides of
-    it; else the neighbours of the ray that is nearest to it, between which rays may come nearer yet.
+def bracket(angle: Tensor, value: Tensor, exists: Tensor, target: Tensor, jump: float = _JUMP) -> Tensor:
+    """Of increasing angles [n, G] the first neighbours whose values lie on both sides of a target [n], [n, 3].
+
+    Else the neighbours of the ray whose value is nearest to it, between which rays may come nearer yet. In the middle
+    of the three stands the angle at which the straight line between the values of the others meets the target.
+
+    Args:
+        value: [n, G] of the ray of each angle. exists: [n, G], whether there is such a ray.
+        jump: values of neighbours that differ by more are of two branches, between which there is nothing.
     """
-    above = field >= target[:, None]
-    crosses = _joined(field, exists) & (above[:, 1:] != above[:, :-1])
+    above = value >= target[:, None]
+    crosses = _joined(value, exists, jump) & (above[:, 1:] != above[:, :-1])
     found = crosses.any(1)
-    first, nearest = crosses.to(torch.int8).argmax(1), _off(field, exists, target).argmin(1)
+    first, nearest = crosses.to(torch.int8).argmax(1), _off(value, exists, target).argmin(1)
     low = torch.where(found, first, (nearest - 1).clamp_min(0))
     high = torch.where(found, first + 1, (nearest + 1).clamp_max(angle.shape[1] - 1))
-    return angle.gather(1, low[:, None])[:, 0], angle.gather(1, high[:, None])[:, 0]
+    (a, b), (va, vb) = ([v.gather(1, k[:, None])[:, 0] for k in (low, high)] for v in (angle, value))
+    share = torch.nan_to_num((target - va) / (vb - va), 0.5).clamp(0, 1)
+    return torch.stack([a, a + (b - a) * share, b], 1)
+
+
+def between(ends: Tensor) -> Tensor:
+    """Angles [n, 17] from the first to the last of `bracket`, for the next closer look."""
+    return ends[:, :1] + (ends[:, 2:] - ends[:, :1]) * torch.linspace(0, 1, _ZOOM, dtype=torch.float64)
 
 
 def _follow(

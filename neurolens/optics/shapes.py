@@ -198,7 +198,7 @@ def _extent_mm(surface: Surface) -> float:
 
 @lru_cache(maxsize=4096)
 def _end_of(surface: Surface) -> tuple[float, float, float]:
-    """Slope and second derivative of the curve where its figures end, and the length over which the latter dies away."""
+    """Slope and second derivative of the curve where its figures end, and the length in which the latter dies away."""
     slope, bend = (float(v) for v in _profile(surface, np.array(surface.followed_mm)))
     return slope, bend, min(TURN * surface.followed_mm, TURN * (1 + slope * slope) / max(abs(bend), 1e-300))
 
