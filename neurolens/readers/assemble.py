@@ -185,7 +185,7 @@ def named_glass(
         expected = f"a glass of the catalogue: it has {base.name}, whose moulded variant this may be; or give --glass"
         raise InputError(file, field, name, expected)
     if base and not same and figures and not 0 <= base.n_d - figures[0] <= _MOULDING:
-        told = f"assumed to be {base} (n_d {base.n_d:.5f}), moulded: n_d {figures[0]:g} beside it is not of such a glass"
+        told = f"assumed to be {base} (n_d {base.n_d:.5f}), moulded: n_d {figures[0]:g} beside it fits no such glass"
         assume(file, f"{field}: glass {name} is {told}")
         return {"n_d": base.n_d, "V_d": base.V_d, "glass": short_name(base), "material": name}
     known = next((g for m in makers for g in same if g.maker.upper() == m), None)
