@@ -34,7 +34,7 @@ from rayoptics.raytr.traceerror import TraceError
 from rayoptics.zemax import zmxread
 
 SECONDS = 60  # for one file
-STEPS, LEAST_STEP = 12, 1e-6  # steps to the first field; the least step before the search gives up, in radians
+STEPS, LEAST_STEP = 3, 1e-6  # steps to the first field; the least step before the search gives up, in radians
 NEAR_AXIS = 1e-4  # height of a ray near the axis, as a share of the focal length
 SAME_INDEX = 1e-7
 FIELD_LINES = ("XFLN", "YFLN", "XFLD", "YFLD")  # left out: the search for their chief rays fails for some fisheyes
@@ -48,7 +48,7 @@ class Model:
         text = raw.decode("utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "latin-1")
         lines = [line.split() for line in text.splitlines() if line.split()[:1] and line.split()[0] not in FIELD_LINES]
         lines = [words + ["0"] if words[0] == "DIAM" and len(words) == 2 else words for words in lines]
-        self.wavelength_nm, self.mended = task["wavelength_nm"], []
+        self.wavelength_nm, self.mended, self.film_at_focus = task["wavelength_nm"], [], False
         if task.get("mend"):
             lines = self.with_ends(lines)
         self.lines = lines
@@ -63,12 +63,15 @@ class Model:
         if task.get("mend") and len(task["index"]) == len(self.changes):
             self.replace_indices(task["index"])
             self.update()
+        if self.film_at_focus:
+            self.sequence.gaps[-1].thi = self.first_order()[1]
+            self.update()
         self.stop = self.sequence.stop_surface or self.marked_stop(lines) or self.nearest(task.get("stop_z_mm"))
 
     def update(self):
         self.model.update_model()
         self.index = [float(n[0]) for n in self.sequence.rndx]
-        self.thickness = [float(gap.thi) for gap in self.sequence.gaps]
+        self.set_thickness([float(gap.thi) for gap in self.sequence.gaps])
         self.changes = [k for k in range(1, len(self.index)) if self.index[k] != self.index[k - 1]]
         self.first, self.last = self.changes[0], self.changes[-1]
         self.z = [0.0, *map(float, np.cumsum([0.0, *self.thickness[1:]]))]
@@ -77,7 +80,7 @@ class Model:
         """The lines with an object at infinity and an image surface, which some files lack.
 
         Their first surface is then SURF 1, or has a glass and a finite thickness, and their last one has a thickness,
-        or is curved and has glass in front.
+        or is curved and has glass in front. Where it has none, the film is placed in the focus.
         """
         starts = [k for k, words in enumerate(lines) if words[0] == "SURF"]
         blocks = [{w[0]: w for w in lines[a:b]} for a, b in zip(starts, [*starts[1:], len(lines)], strict=True)]
@@ -86,9 +89,11 @@ class Model:
             lines = [*lines[: starts[0]], ["SURF", "0"], ["DISZ", "INFINITY"], *lines[starts[0] :]]
             self.mended.append("no object surface in the file")
         curved = float(last.get("CURV", ["", "0"])[1]) != 0
-        if "GLAS" in last or float(last["DISZ"][1]) != 0 or (curved and "GLAS" in before):
+        behind = float(last["DISZ"][1])
+        if behind != 0 or "GLAS" in last or ("GLAS" in before and (curved or self.mended)):
             lines = [*lines, ["SURF", str(len(blocks))], ["DISZ", "0"]]
             self.mended.append("no image surface in the file")
+            self.film_at_focus = behind == 0
         return lines
 
     def mend(self, blocks):
@@ -133,13 +138,13 @@ class Model:
             return None
         return min(range(1, len(self.z)), key=lambda k: abs(self.z[k] - self.z[self.first] - z_mm))
 
-    def path(self):
-        """Surfaces from the object, whose plane is moved to the first vertex: 1e10 mm would cost digits."""
-        s = self.sequence
+    def set_thickness(self, thickness):
+        """Take these thicknesses for real rays; the object's plane moves to the first vertex: 1e10 mm cost digits."""
+        s, self.thickness = self.sequence, thickness
         nothing = (np.identity(3), np.zeros(3))
-        shifts = [nothing, *((np.identity(3), np.array([0.0, 0.0, t])) for t in self.thickness[1:]), nothing]
+        shifts = [nothing, *((np.identity(3), np.array([0.0, 0.0, t])) for t in thickness[1:]), nothing]
         columns = s.ifcs, [*s.gaps, None], shifts, [*self.index, self.index[-1]], [*s.z_dir, s.z_dir[-1]]
-        return [list(row) for row in zip(*columns, strict=True)]
+        self.path = [list(row) for row in zip(*columns, strict=True)]
 
     def first_order(self):
         """Focal length, back focus, and distance of the film, from the last surface at which the medium changes."""
@@ -171,9 +176,9 @@ class Model:
                 states.setdefault(int(words[2]), {})[int(words[1])] = float(words[3])
         found = []
         for n in sorted(states):
-            self.thickness = [states[n].get(k, t) for k, t in enumerate(tabled)]
+            self.set_thickness([states[n].get(k, t) for k, t in enumerate(tabled)])
             found.append(self.near_axis(efl))
-        self.thickness = tabled
+        self.set_thickness(tabled)
         return found
 
     def entrance_pupil(self):
@@ -186,7 +191,7 @@ class Model:
         way = np.array([0.0, math.sin(field), math.cos(field)])
         start = np.array([0.0, offset * math.cos(field), pupil - offset * math.sin(field)])
         with np.errstate(all="raise"):
-            return trace_raw(iter(self.path()), start, way, self.wavelength_nm, intersect_obj=False)[0]
+            return trace_raw(iter(self.path), start, way, self.wavelength_nm, intersect_obj=False)[0]
 
     def chief_heights(self, fields_deg):
         """Image heights of the rays through the middle of the stop; None from where no such ray is reached."""
