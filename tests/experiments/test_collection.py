@@ -44,8 +44,8 @@ def test_reasons_of_one_kind_are_one() -> None:
 
 
 def test_a_table_keeps_figures_and_patent_and_no_words_of_its_author(tmp_path: Any) -> None:
-    text = "VERS 1\nMODE SEQ\nNAME US 2018/0074300 Example 2 (Some 50mm f/2)\nNOTE 0 Prepared by somebody.\nUNIT MM X W\n"
-    text += "FNUM 5 0\nFTYP 3 0 2 1 0 0 0\nYFLN 0 9.5 0 0\nWAVM 1 0.5875618 1\nWAVM 2 0.55 1\nPWAV 1\nSURF 0\n  CURV 0 0 0\n"
+    text = "VERS 1\nMODE SEQ\nNAME US 2018/0074300 Example 2 (Some 50mm f/2)\nNOTE 0 By somebody.\nUNIT MM X W\n"
+    text += "FNUM 5 0\nFTYP 3 0 2 1\nYFLN 0 9.5 0 0\nWAVM 1 0.5875618 1\nWAVM 2 0.55 1\nPWAV 1\nSURF 0\n  CURV 0 0 0\n"
     text += "  DISZ INFINITY\n  DIAM 0 1 0 0\nSURF 1\n  STOP\n  COMM of somebody\n  TYPE EVENASPH\n  CURV 0.02 0 0 0\n"
     text += "  CONI -1\n  PARM 1 0\n  PARM 2 1e-6\n  DISZ 3\n  GLAS ___BLANK 1 0 1.5 60 0 0\n  DIAM 6 1 0 0\nSURF 2\n"
     text += "  CURV 0 0\n  DISZ 98\n  DIAM 6 1 0\nSURF 3\n  DISZ 0\n  DIAM 9.5 1\nTOL TOFF 0\nMNUM 1 1\n"
