@@ -246,8 +246,8 @@ def _lens_of(draft: Draft, given: Given) -> Lens:
     return lens
 
 
-_AGREES = 0.03  # relative: f-numbers are printed with two digits
 _SLIGHTLY = 0.1  # of a rim's diameter
+_AGREES = 0.03  # relative: f-numbers are printed with two digits
 _ROWS = re.compile(r"\bsurface ([0-9]+(?:, [0-9]+(?![0-9.]| mm))*)(?! of the file)")
 _TWICE, _SAME = (0.4, 0.7), (0.7, 1.4)  # f-number by the stop's diameter over the stated one: rims twice as wide, right
 
@@ -303,12 +303,20 @@ def _with_likely_rims(lens: Lens, draft: Draft) -> Lens:
 def _narrowed(lens: Lens, draft: Draft) -> Lens:
     """The lens with rims no wider than their spheres and than where neighbours touch, in every state.
 
-    Unless rims are `drawn`, they are narrowed by no more than `_SLIGHTLY`: rounded figures do not ask for more.
+    Unless rims are `drawn`, a table whose rims would have to be much narrower (`_SLIGHTLY`), and would then cut the beam
+    of the axis, stays as it is: its figures are wrong.
     """
     found = narrowed_rims(lens)
     pairs = list(zip(lens.surfaces, found.surfaces, strict=True))
-    if not draft.drawn and any(b.diameter_mm < (1 - _SLIGHTLY) * a.diameter_mm for a, b in pairs):
-        return lens
+    if not draft.drawn:
+        for state in (lens, *(lens.with_gaps(dict(c.thickness_mm)) for c in lens.configurations)):
+            heights = system_of(state).march(1.0, 0.0).y
+            beam = [abs(2 * lens.stop_radius_mm * y / (heights[lens.stop_index] or math.inf)) for y in heights]
+            if any(
+                b.diameter_mm < min((1 - _SLIGHTLY) * a.diameter_mm, need)
+                for (a, b), need in zip(pairs, beam, strict=True)
+            ):
+                return lens
     widths = [(k, f"{a.diameter_mm:.4g} to {b.diameter_mm:.4g} mm") for k, (a, b) in enumerate(pairs) if a != b]
     changed = [f"{draft.in_file(f'surface {k}')} ({width})" for k, width in widths]
     if changed:  # no rim is wider than its sphere: where one is said to be, table or rims are in doubt
