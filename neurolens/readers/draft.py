@@ -78,10 +78,9 @@ class Block:
         rim = radius if math.isnan(self.semi_diameter) else self.semi_diameter
         if len(values) > MAX_TERMS:
             raise self.start.error(name, f"({len(values)} terms)", f"at most {MAX_TERMS} terms")
-        if not qcon and self.conic:
-            raise self.start.error(f"conic of {name}", self.conic, "0: Qbfs departs from a sphere")
         try:
-            terms = qcon_terms(values, radius, rim) if qcon else qbfs_terms(values, radius, self.curvature, rim)
+            base = self.curvature, rim, self.conic
+            terms = qcon_terms(values, radius, rim) if qcon else qbfs_terms(values, radius, *base)
         except ValueError as error:
             found = f"(curvature {self.curvature:g}, rim {rim:g})"
             raise self.start.error(name, found, str(error)) from None
@@ -303,12 +302,14 @@ def _with_likely_rims(lens: Lens, draft: Draft) -> Lens:
 def _narrowed(lens: Lens, draft: Draft) -> Lens:
     """The lens with rims no wider than their spheres and than where neighbours touch, in every state.
 
-    Unless rims are `drawn`, a table whose rims would have to be much narrower (`_SLIGHTLY`), and would then cut the beam
-    of the axis, stays as it is: its figures are wrong.
+    Unless rims are `drawn`, a table stays as it is where rims are much wider (`_SLIGHTLY`) than their spheres, or would
+    have to be much narrower and then cut the beam of the axis: its figures are wrong.
     """
     found = narrowed_rims(lens)
     pairs = list(zip(lens.surfaces, found.surfaces, strict=True))
     if not draft.drawn:
+        if any((1 - _SLIGHTLY) * s.semi_diameter_mm > end_mm(s) for s in lens.surfaces):
+            return lens
         for state in (lens, *(lens.with_gaps(dict(c.thickness_mm)) for c in lens.configurations)):
             heights = system_of(state).march(1.0, 0.0).y
             beam = [abs(2 * lens.stop_radius_mm * y / (heights[lens.stop_index] or math.inf)) for y in heights]
