@@ -21,7 +21,7 @@ from neurolens.readers.codev_model import (
     shape_of,
 )
 from neurolens.readers.draft import INFINITE, Draft, Given, Row, lens_of, primary_first
-from neurolens.readers.source import assume, read_lines, warn
+from neurolens.readers.source import assume, by_word, read_lines, warn
 
 
 @dataclass
@@ -88,19 +88,15 @@ HARMLESS = frozenset(
     DLN DLF DLR IRR SCC KXC""".split()
 )
 # What changes rays and is not read: what is expected in its place.
-REFUSED = {
-    word: expected
-    for words, expected in (
-        ("NAO NA", "EPD or FNO to size the stop"),
-        ("MOD", "a surface that is no ideal lens (a module)"),
-        ("GRT DIF DOE HOE HOL", "a surface that is no grating, hologram or diffractive surface"),
-        ("GRN", "a medium without a gradient index"),
-        ("FRN SPL UDS NSS", "a surface that is no Fresnel surface, spline, surface of the user or non-sequential part"),
-        ("RMD", "a surface that refracts: the lens model has no mirrors"),
-        ("REX REY ELX ELY REC ELL", "a round opening (CIR)"),
-    )
-    for word in words.split()
-}
+REFUSED = by_word(
+    ("NAO NA", "EPD or FNO to size the stop"),
+    ("MOD", "a surface that is no ideal lens (a module)"),
+    ("GRT DIF DOE HOE HOL", "a surface that is no grating, hologram or diffractive surface"),
+    ("GRN", "a medium without a gradient index"),
+    ("FRN SPL UDS NSS", "a surface that is no Fresnel surface, spline, surface of the user or non-sequential part"),
+    ("RMD", "a surface that refracts: the lens model has no mirrors"),
+    ("REX REY ELX ELY REC ELL", "a round opening (CIR)"),
+)
 VIGNETTING = frozenset(["VUX", "VLX", "VUY", "VLY"])
 READ = (
     *"S SO SI RDM TIT DIM EPD FNO TEM WL REF".split(),

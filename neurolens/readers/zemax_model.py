@@ -12,7 +12,7 @@ from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import MAX_POWER
 from neurolens.readers import draft
 from neurolens.readers.draft import INFINITE, State
-from neurolens.readers.source import Line, assume
+from neurolens.readers.source import Line, assume, by_word
 
 # Settings of the program, and what its editor shows of a surface: written to most files, and no ray depends on them.
 HARMLESS = frozenset(
@@ -22,8 +22,10 @@ HARMLESS = frozenset(
 # Rims and stop decide which rays pass, not the factors that a designer chose.
 VIGNETTING = frozenset("VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN".split())
 # Of a surface: what changes rays, and the lens model has not.
-REFUSED = dict.fromkeys(("OBSC", "SQOB", "ELOB", "USOB", "SPID"), "no obscuration: the lens model has none")
-REFUSED["SCBD"] = "no tilt and no decentre of a surface: the lens model has none"
+REFUSED = by_word(
+    ("OBSC SQOB ELOB USOB SPID", "no obscuration: the lens model has none"),
+    ("SCBD", "no tilt and no decentre of a surface: the lens model has none"),
+)
 # Operands of the multi-configuration editor that move no ray: fields, wavelengths, vignetting factors, comments.
 CONFIGURATION = frozenset("MOFF MCOM XFIE YFIE FLWT FVDX FVDY FVCX FVCY FVAN WAVE WLWT PRWV GCRS".split())
 

@@ -207,7 +207,7 @@ SURF 2
 
 
 def test_a_qbfs_asphere_on_a_conic_focuses_all_zones(tmp_path: Path) -> None:
-    """Thorlabs ASL5040-UV, 50 mm f/0.87: at the wavelength of its file its zones meet within a micrometre of its film."""
+    """Thorlabs ASL5040-UV, f/0.87: at the wavelength of its file its zones meet within a micrometre of its film."""
     body = "SURF 1\n  STOP\n" + QED
     lens = read(HEAD.replace("ENPD 10", "ENPD 45.7").replace("5.875618E-1", "0.405") + body + TAIL, tmp_path)
     assert lens.reference_nm == 405.0
