@@ -192,8 +192,9 @@ def lens_of(draft: Draft, given: Given | None = None) -> Lens:
     if +draft.skipped:
         listed = (word if count == 1 else f"{word} ({count})" for word, count in (+draft.skipped).items())
         warn(draft.file, f"left out, since no ray depends on it: {', '.join(listed)}")
-    draft = _without_dummies(with_stop(draft, given.stop))
     try:
+        draft = with_stop(draft, given.stop)
+        draft = _without_dummies(draft)
         return _lens_of(draft, given)
     except InputError as error:
         value = draft.in_file(error.value) if isinstance(error.value, str) else error.value

@@ -91,8 +91,8 @@ def _add_ends(file: File) -> None:
     """Add the object and the image to a file that lists the surfaces of a lens only."""
     first, last = file.blocks[0], file.blocks[-1]
     begins_in_glass = bool(first.name and first.medium and math.isfinite(first.thickness))
-    # A film in glass is plane, and its object is not in glass, too: else the last surface is one of the lens.
-    ends_in_glass = len(file.blocks) > 1 and bool(file.blocks[-2].medium and (last.curvature or begins_in_glass))
+    # Such a list ends with a surface of the lens; any other file that ends behind glass has been cut off.
+    ends_in_glass = begins_in_glass and bool(file.blocks[-2].medium)
     odd = next((b for b in file.blocks if b.name and not b.name.isdecimal()), None)
     if odd and file.zoom.count > 1:
         raise odd.start.error("SURF", odd.name, "numbers in order, in a file with configurations")

@@ -32,6 +32,7 @@ CONFIGURATION = frozenset("MOFF MCOM XFIE YFIE FLWT FVDX FVDY FVCX FVCY FVAN WAV
 
 TYPES = tuple("STANDARD EVENASPH ODDASPHE XASPHERE XOSPHERE TOROIDAL BICONICX PARAXIAL COORDBRK".split())
 MAX_EXTRAS = 240
+_DEEPEST = 1000  # sag of an asphere over its rim
 _EVEN = 8  # terms of EVENASPH by its definition; other programs write more
 Q_TYPE = "Q"  # what the names of Q-type aspheres, and of no other type, begin with
 
@@ -111,6 +112,10 @@ def shape_of(block: Block) -> dict[str, Any]:
             if step == 1 and values[:1] not in ([], [0.0]):
                 raise block.start.error("XDAT 3 of XOSPHERE", values[0], "0: a cone's tip has no normal")
             shape = block.rotational((step * i, a / radius ** (step * i)) for i, a in enumerate(values, start=1))
+            rim = block.semi_diameter
+            if step == 2 and (depth := sum(abs(a) * rim**p for p, a in shape["asphere"])) > _DEEPEST * rim:
+                expected = "terms of even powers: are these an XOSPHERE's, of odd powers too?"
+                raise block.start.error("XASPHERE", f"(a sag of {depth:.3g} at a rim of {rim:g})", expected)
         case kind if kind.startswith(Q_TYPE):
             shape = _q_type(block)
         case "TOROIDAL" | "BICONICX":

@@ -255,6 +255,7 @@ def test_a_paraxial_surface_is_an_ideal_lens(tmp_path: Path) -> None:
         ("TYPE STANDARD\n  CURV -2", "TYPE XASPHERE\n  XDAT 1 1.5\n  CURV -2", r"XDAT 1 of XASPHERE: got 1.5"),
         ("TYPE STANDARD\n  CURV -2", "TYPE XASPHERE\n  XDAT 1 1\n  XDAT 4 1\n  CURV -2", r"XDAT 4 of XASPHERE"),
         ("TYPE STANDARD\n  CURV -2", "TYPE XOSPHERE\n  XDAT 1 1\n  XDAT 3 1\n  CURV -2", r"a cone's tip"),
+        ("TYPE STANDARD\n  CURV -2", "TYPE XASPHERE\n  XDAT 1 9\n  XDAT 11 1E-9\n  CURV -2", r"an XOSPHERE's"),
         ("GLAS N-BK7", "GLAS MIRROR", r"line 29, GLAS: got 'MIRROR'.*no mirrors"),
         ("GLAS N-BK7 0 0 1.5 4.0E+1", "GLAS ___BLANK 1 0 0.5 60", r"index: got 0.5"),
         ("SURF 2", "SURF 4", r"SURF: got '4', expected surface 2"),
