@@ -98,14 +98,10 @@ REFUSED = by_word(
     ("REX REY ELX ELY REC ELL", "a round opening (CIR)"),
 )
 VIGNETTING = frozenset(["VUX", "VLX", "VUY", "VLY"])
+SHAPES = ("SPH", "CON", "ASP", "CYL", "YTO", "XTO", "AAS")
 READ = (
-    *"S SO SI RDM TIT DIM EPD FNO TEM WL REF".split(),
-    *FIELDS,
-    *"RDY CUY RDX CUX THI GLA STO SPH CON ASP CYL YTO XTO AAS SPS SCO K".split(),
-    *ALONG,
-    *LETTERS,
-    *NONE_BUT_0,
-    *("CIR", "PIM", "PRV", "ZOO"),
+    *"RDY CUY RDX CUX THI GLA STO SPS SCO K CIR PIM".split(),
+    *(*SHAPES, *ALONG, *LETTERS, *NONE_BUT_0),
 )
 
 
@@ -206,7 +202,7 @@ def _surface(file: File, command: Command) -> None:
     match name:
         case "STO":
             block.stop = True
-        case "SPH" | "CON" | "ASP" | "CYL" | "YTO" | "XTO" | "AAS":
+        case _ if name in SHAPES:
             block.kind = name
         case "SPS" | "SCO":
             block.put_special(command, words)

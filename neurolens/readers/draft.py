@@ -166,10 +166,6 @@ class Draft:
     object_medium: dict[str, Any] = field(default_factory=dict)
     wavelengths_nm: tuple[float, ...] = ()
 
-    def f_number_agrees(self, other: float) -> bool:
-        """Whether an f-number is the one that the file states, as far as printed digits tell, or it states none."""
-        return self.f_number is None or abs(other / self.f_number - 1) <= _AGREES
-
     def in_file(self, text: str) -> str:
         """A message about the rows, each called as the file calls its surface."""
 
@@ -232,9 +228,9 @@ def _lens_of(draft: Draft, given: Given) -> Lens:
         rows = (replace(s, diameter_mm=math.nan) if s.stop else s for s in lens.surfaces)
         lens = replace(lens, surfaces=tuple(rows))
     lens = finish(lens, pupil_mm=draft.pupil, film_given=draft.film_given, stop_limit_mm=stop_aperture(draft))
-    if draft.stop_given and not draft.f_number_agrees(by_stop := first_order(lens).f_number):
-        told = f"a stop {lens.stop_radius_mm * 2:g} wide gives f/{by_stop:.3g}"
-        warn(draft.file, f"{told}, the file says f/{draft.f_number:.3g}: the diameter is kept")
+    if draft.stop_given and abs((by_stop := first_order(lens).f_number) / lens.f_number - 1) > _AGREES:
+        told = f"a stop {lens.stop_radius_mm * 2:g} wide gives f/{by_stop:.3g}, the file says f/{lens.f_number:.3g}"
+        warn(draft.file, f"{told}: the diameter is kept")
     lens = replace(lens, configurations=tuple(_configuration(lens, draft, state) for state in _states(draft)))
     lens = with_rims(lens.scaled(factor) if factor != 1 else lens, draft.in_file)
     with suppress(InputError):

@@ -94,8 +94,10 @@ def _read(file: File, line: Line) -> None:
         file.blocks.append(Block(line))
     elif not file.blocks:
         raise line.error(word, "(here)", "LEN NEW before everything else")
-    elif file.ended:
-        _behind(file, line, word)
+    elif file.ended and word in ("CFG", "CF", "C"):
+        raise line.error(word, " ".join(rest) or "(here)", "one configuration: others are not read")
+    elif file.ended:  # variables, operands and tolerances, up to an END of their own
+        file.skipped["lines behind the surfaces"] += word != "END"
     elif word in HARMLESS:
         pass
     elif re.fullmatch("SNO[0-9]*|NOT[0-9]*", word):
@@ -106,13 +108,6 @@ def _read(file: File, line: Line) -> None:
             raise line.error(word, " ".join(rest) or "(here)", REFUSED[word])
     elif not _system(file, line, word, rest):
         _surface(file, line, word, rest)
-
-
-def _behind(file: File, line: Line, word: str) -> None:
-    """A line behind the surfaces: variables, operands and tolerances, up to an END of their own; no configurations."""
-    if word in ("CFG", "CF", "C"):
-        raise line.error(word, " ".join(line.words[1:]) or "(here)", "one configuration: others are not read")
-    file.skipped["lines behind the surfaces"] += word != "END"
 
 
 def _system(file: File, line: Line, word: str, rest: list[str]) -> bool:

@@ -93,15 +93,11 @@ def _add_ends(file: File) -> None:
     begins_in_glass = bool(first.name and first.medium and math.isfinite(first.thickness))
     # Such a list ends with a surface of the lens; any other file that ends behind glass has been cut off.
     ends_in_glass = begins_in_glass and bool(file.blocks[-2].medium)
-    odd = next((b for b in file.blocks if b.name and not b.name.isdecimal()), None)
-    if odd and file.zoom.count > 1:
-        raise odd.start.error("SURF", odd.name, "numbers in order, in a file with configurations")
-    if begins_in_glass and (first.curvature or last.thickness > 0 or ends_in_glass):
-        if file.zoom.count > 1:
-            raise first.start.error("SURF", "(glass behind the object)", "an object surface in front of the lens")
-        assume(
-            file.file, f"surface {first.name} is a surface of glass: the object is assumed in front of it, at infinity"
-        )
+    lists_lens = begins_in_glass and (first.curvature or last.thickness > 0 or ends_in_glass)
+    if file.zoom.count > 1 and (lists_lens or not all(b.name.isdecimal() for b in file.blocks)):
+        raise first.start.error("SURF", first.name, "object, surfaces numbered in order, and image, for configurations")
+    if lists_lens:
+        assume(file.file, f"surface {first.name} is one of glass: the object is assumed in front of it, at infinity")
         file.blocks.insert(0, Block(first.start, thickness=math.inf))
     elif not first.name:
         first.thickness = math.inf
