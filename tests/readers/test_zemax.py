@@ -80,6 +80,12 @@ def read(text: str, tmp_path: Path, given: Given | None = None, encoding: str = 
     return read_zmx(path, given)
 
 
+def test_a_model_glass_s_partial_dispersion_is_told(tmp_path: Path) -> None:
+    with pytest.warns(NeurolensWarning, match="line 29, GLAS: a model glass's departure"):
+        lens = read(swapped("GLAS N-BK7 0 0 1.5 4.0E+1 0", "GLAS MODEL 1 0 1.6 40 0.01"), tmp_path)
+    assert (lens.surfaces[0].n_d, lens.surfaces[0].V_d) == (1.6, 40)
+
+
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "latin-1"])
 def test_singlet_by_the_lensmakers_formula(encoding: str, tmp_path: Path) -> None:
     text = swapped("Singlet", "Einzellinse \u00d8 20")
