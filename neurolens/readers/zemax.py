@@ -298,8 +298,8 @@ def _glass(line: Line, rest: list[str], makers: list[str]) -> dict[str, Any]:
     if kind == "1" or name == "___BLANK":
         n_d, V_d, departure = (*line.numbers("GLAS", rest[3:6]), 0.0, 0.0)[:3]
         if departure:
-            told = "a model glass's departure from normal partial dispersion is left out: colours differ a little"
-            warn(line.file, f"line {line.number}, GLAS: {told}")
+            left_out = "a model glass's departure from normal partial dispersion is left out: colours differ a little"
+            warn(line.file, f"line {line.number}, GLAS: {left_out}")
         return {"n_d": n_d, "V_d": V_d if V_d > 0 else None, "material": None if name == "___BLANK" else name}
     if kind == "4":
         raise line.error(
