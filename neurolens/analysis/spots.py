@@ -238,7 +238,7 @@ class Mtf(Result):
     spread: dict[str, Array]
 
 
-_SHOWN_PER_MM = 50.0  # frequencies up to here must be converged, or all where all lie above
+_SHOWN_PER_MM = 50.0  # of the frequencies that are taken where none are given, those up to here must be converged
 
 
 def mtf(
@@ -255,7 +255,7 @@ def mtf(
     """
     filled = Filled(scene, field_deg, wavelength_nm)
     f = np.linspace(0, 100, 101) if frequency_per_mm is None else np.asarray(frequency_per_mm, dtype=np.float64)
-    shown = f <= max(_SHOWN_PER_MM, f.min())
+    shown = f <= (_SHOWN_PER_MM if frequency_per_mm is None else math.inf)
 
     def contrast(level: int, fields: list[int]) -> list[Array]:
         rays = filled.only(fields).bundle(level)
