@@ -79,7 +79,7 @@ def lit_part(passes: Passes, low: Tensor, high: Tensor, near: Tensor) -> LitPart
 def lit_nodes(passes: Passes, part: LitPart, level: int) -> Nodes:
     """Nodes over what is lit; arguments as of `lit_part`, `level` from 0."""
     spokes, rings = _SPOKES << level, _RINGS << level
-    angle = (torch.arange(spokes, dtype=torch.float64) + 0.5) * (2 * math.pi / spokes)
+    angle = torch.arange(spokes, dtype=torch.float64) * (2 * math.pi / spokes)
     cos, sin = torch.cos(angle)[:, None], torch.sin(angle)[:, None]
     share = torch.linspace(0, 1, _SCAN, dtype=torch.float64)
 

@@ -10,14 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neurolens.analysis.bundles import Bundle, Filled, bundle, fan, hexapolar, points
+from neurolens.analysis.bundles import Bundle, Filled, bundle, fan, hexapolar
 from neurolens.analysis.fields import Array, Result, Scene
 from neurolens.analysis.pupil_nodes import converged
 from neurolens.optics.paraxial import is_pinhole
 
 _RINGS = 16
 _SHIFTS = 21
-_ZONES = 101  # heights in the stop tried for the outermost ray that passes, and again between two of them
 
 
 @dataclass(frozen=True)
@@ -154,19 +153,9 @@ def working_f_number(scene: Scene, wavelength_nm: float) -> float:
     """
     if is_pinhole(scene.lens):
         return float(scene.first_order.f_number)
-    low, high, sine = 0.0, 1 - 1e-7, 0.0
-    for _ in range(2):
-        heights = np.linspace(low, high, _ZONES)
-        rays = bundle(scene.round, [0.0], [wavelength_nm], points(heights.tolist(), [0.0] * _ZONES))
-        passed = rays.passed[0, 0].numpy()
-        if not passed.any():
-            break
-        sines = torch.hypot(rays.film.dx, rays.film.dy)[0, 0].numpy()
-        sine = max(sine, float(sines[passed].max()))
-        last = int(np.flatnonzero(passed)[-1])
-        if last == _ZONES - 1:
-            break
-        low, high = float(heights[last]), float(heights[last + 1])
+    rays = Filled(scene.round, [0.0], [wavelength_nm]).bundle(0)
+    across = rays.film.dx if scene.axis == "x" else rays.film.dy
+    sine = float(torch.where(rays.passed, across.abs(), 0.0).max())
     return 1 / (2 * sine) if sine > 0 else math.nan
 
 
