@@ -112,7 +112,7 @@ class Scene:
         focus_m: distance from the film to the object, inf allowed. An object of a lens of less than 60 degrees half
             field is a plane across the axis; of a wider one a sphere about the entrance pupil.
         axis: transverse axis of the meridional plane; matters for anamorphic lenses only.
-        rims: False opens every rim but the stop's (of aspheres a little, for they end soon after it).
+        rims: False opens every rim but the stop's; aspheres continue smoothly beyond theirs.
     """
 
     lens: Lens

@@ -89,8 +89,10 @@ def spots(
 
 
 def _figures(rays: Bundle, open_energy: Tensor) -> list[Array]:
-    """RMS and greatest radius, the RMS by wavelength, share of the light [F] that enters the stop, best shift and RMS
-    radius there, and the second moments, each [F, ...]."""
+    """The figures of `Spots` that depend on how the pupil is sampled, and the second moments, each [F, ...].
+
+    In the order of `_shown`; `open_energy` [F] is the light that enters the stop.
+    """
     moments, each = _Moments(rays), _Moments(rays, by_wavelength=True)
     away = torch.hypot(*(p - c for p, c in zip((rays.tangential_mm, rays.sagittal_mm), moments.centroid, strict=True)))
     largest = torch.where(rays.passed, away, -math.inf).amax((1, 2))
