@@ -171,7 +171,7 @@ def test_illumination_of_a_real_lens_is_what_the_film_sees() -> None:
     for height in light.height_mm:
         rays = camera_rays(torch.zeros_like(px), torch.full_like(px, -height), given.film_z_mm, px, py, z)
         sums.append(float((rays.dz**4 * (trace(lens, rays).status == 0)).sum()))
-    assert light.relative == pytest.approx(np.array(sums) / sums[0], abs=4e-3)
+    assert light.relative == pytest.approx(np.array(sums) / sums[0], abs=1e-3)
     assert light.relative == pytest.approx(light.unvignetted * light.passed, rel=1e-9)
 
 
