@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from analysis_lenses import INF, cartesian, library, scene, slower, thin
+from analysis_lenses import INF, cartesian, grid, library, scene, slower, thin
 from shipped import pinhole
 
-from neurolens.analysis.bundles import Pattern, bundle, fan, grid, hexapolar, points
+from neurolens.analysis.bundles import Pattern, bundle, fan, hexapolar, points
 from neurolens.analysis.field_curves import distortion, illumination
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.layout import layout_profile
