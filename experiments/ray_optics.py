@@ -25,9 +25,9 @@ from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
+import rayoptics.environment  # noqa: F401  (sets the program up)
 from opticalglass.opticalmedium import ConstantIndex
 from rayoptics.elem.profiles import EvenPolynomial
-from rayoptics.environment import open_model  # noqa: F401  (sets the program up)
 from rayoptics.parax.firstorder import compute_principle_points, paraxial_trace
 from rayoptics.raytr.raytrace import trace_raw
 from rayoptics.raytr.traceerror import TraceError
@@ -47,10 +47,12 @@ class Model:
         raw = Path(task["file"]).read_bytes()
         text = raw.decode("utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "latin-1")
         lines = [line.split() for line in text.splitlines() if line.split()[:1] and line.split()[0] not in FIELD_LINES]
-        lines = [words + ["0"] if words[0] == "DIAM" and len(words) == 2 else words for words in lines]
+        lines = list(map(filled_up, lines))
         self.wavelength_nm, self.mended, self.film_at_focus = task["wavelength_nm"], [], False
         if task.get("mend"):
             lines = self.with_ends(lines)
+        if not any(words[0] in ("WAVM", "WAVL") for words in lines):
+            lines = [["WAVM", "1", str(self.wavelength_nm / 1000), "1"], *lines]
         self.lines = lines
         self.model, _ = zmxread.read_lens(Path(task["file"]), "\n".join(map(" ".join, lines)))
         self.sequence = self.model["seq_model"]
@@ -175,7 +177,7 @@ class Model:
             if words[:1] == ["THIC"] and words[1] != "0":
                 states.setdefault(int(words[2]), {})[int(words[1])] = float(words[3])
         found = []
-        for n in sorted(states):
+        for n in sorted(states) if len(states) > 1 else ():
             self.set_thickness([states[n].get(k, t) for k, t in enumerate(tabled)])
             found.append(self.near_axis(efl))
         self.set_thickness(tabled)
@@ -211,6 +213,12 @@ class Model:
 
     def offset_at(self, field, pupil, guess):
         return root(lambda b: self.trace(field, b, pupil)[self.stop][0][1], guess, 1e-6 * max(1.0, abs(self.z[-1])))
+
+
+def filled_up(words):
+    """A line with the numbers that ray-optics needs and the file leaves out: the kind of a rim, an Abbe number."""
+    wanted = {"DIAM": 3, "GLAS": 6 if "___BLANK" in words else 0}.get(words[0], 0)
+    return words + ["0"] * (wanted - len(words))
 
 
 def blocks_of(lines):

@@ -61,14 +61,6 @@ def hexapolar(rings: int) -> Pattern:
     return Pattern(_tensor(t), _tensor(s), _tensor(w))
 
 
-def grid(n: int) -> Pattern:
-    """Centres of the cells of an n by n square over the stop that lie inside it, all of one weight."""
-    line = (torch.arange(n, dtype=torch.float64) + 0.5) * (2 / n) - 1
-    t, s = (v.reshape(-1) for v in torch.meshgrid(line, line, indexing="ij"))
-    inside = t * t + s * s < 1
-    return Pattern(t[inside], s[inside], torch.full_like(t[inside], 1 / int(inside.sum())))
-
-
 def fan(n: int) -> Pattern:
     """2 n points: n along the meridional plane from -1 to 1, then n across it. Odd n holds the centre."""
     line = torch.linspace(-1, 1, n, dtype=torch.float64) * (1 - _EDGE)

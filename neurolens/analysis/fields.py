@@ -99,8 +99,8 @@ class FieldEdge(Result):
     @property
     def warning(self) -> str | None:
         """What to say of an edge that was not reached."""
-        where = f"{self.field_deg:.4g} degrees, {self.height_mm:.4g} mm from the axis"
-        return None if self.reached else f"the field ends at {where}: no chief ray comes from {self.meant}"
+        where = f"{self.field_deg:.4g} degrees, {self.height_mm:.4g} mm"
+        return None if self.reached else f"no chief ray comes from {self.meant}; fields end at {where}"
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class Scene:
         focus_m: distance from the film to the object, inf allowed. An object of a lens of less than 60 degrees half
             field is a plane across the axis; of a wider one a sphere about the entrance pupil.
         axis: transverse axis of the meridional plane; matters for anamorphic lenses only.
-        rims: False opens every rim but the stop's (of aspheres a little, for they end soon after it).
+        rims: False opens every rim but the stop's; aspheres continue smoothly beyond theirs.
     """
 
     lens: Lens
@@ -271,12 +271,12 @@ def _edge(scene: Scene) -> FieldEdge:
     by_field = False
     if lens.image_radius_mm is None and stated is not None:
         by_field, wanted = True, stated
-        meant = f"the half field that the file states, {stated:.4g} degrees"
+        meant = f"the stated half field, {stated:.4g} degrees"
     else:
         wanted = scene.image_radius_mm
         meant = f"the edge of the film, {wanted:.4g} mm"
         if lens.image_radius_mm is None:
-            meant = f"the edge of the lit film, where 10% of the light is left, {wanted:.4g} mm"
+            meant = f"the edge of the lit film (10% of the light), {wanted:.4g} mm"
     (field,), (reached,) = scene.nearest_fields([wanted], degrees=by_field)
     if not field > 0:
         raise InputError(lens.path, "half_field_deg", stated, "a lens with chief rays off the axis")

@@ -13,7 +13,7 @@ import torch
 
 from neurolens.analysis.bundles import Pattern, bundle, fan
 from neurolens.analysis.fields import Array, Result, Scene
-from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, new_figure, save, style
+from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, heading, new_figure, save, style
 from neurolens.base.errors import InputError
 from neurolens.optics.prescription import Surface
 from neurolens.optics.sag import sag_mm
@@ -165,16 +165,11 @@ def lens_layout(layout: Layout, path: str | Path) -> None:
     """Draw a lens with rays, light from left to right, as PNG, PDF or SVG."""
     with style():
         z, top = _limits(layout)
-        figure = new_figure(9.4, min(9.0, max(3.4, 8.6 * 2 * top / (z[1] - z[0]) + 1.5)))
+        figure = new_figure(9.4, min(9.0, max(3.9, 8.6 * 2 * top / (z[1] - z[0]) + 2.1)))
         axes = figure.add_subplot()
         axes.set(xlabel="z (mm), light travels this way →", ylabel=f"{layout.height} (mm)")
         draw_section(axes, layout, lw=0.7, ls=(0, (12, 3, 2, 3)))
-        # The empty second line of the title keeps room for the subtitle, which has a lighter style.
-        axes.set_title(layout.title + ("\n" if layout.subtitle else ""), loc="left", fontweight="bold")
-        axes.annotate(
-            layout.subtitle, (0, 1), xycoords="axes fraction", xytext=(0, 6), textcoords="offset points",
-            fontsize=9, color="#555b63", in_layout=False,
-        )  # fmt: skip
+        heading(figure, layout.title, layout.subtitle)
         handles, labels = axes.get_legend_handles_labels()
         order = sorted(range(len(labels)), key=lambda i: labels[i] in ("stop", "film"))  # fields first
         handles, labels = [handles[i] for i in order], [labels[i] for i in order]

@@ -79,7 +79,7 @@ def lit_part(passes: Passes, low: Tensor, high: Tensor, near: Tensor) -> LitPart
 def lit_nodes(passes: Passes, part: LitPart, level: int) -> Nodes:
     """Nodes over what is lit; arguments as of `lit_part`, `level` from 0."""
     spokes, rings = _SPOKES << level, _RINGS << level
-    angle = (torch.arange(spokes, dtype=torch.float64) + 0.5) * (2 * math.pi / spokes)
+    angle = torch.arange(spokes, dtype=torch.float64) * (2 * math.pi / spokes)
     cos, sin = torch.cos(angle)[:, None], torch.sin(angle)[:, None]
     share = torch.linspace(0, 1, _SCAN, dtype=torch.float64)
 
@@ -117,7 +117,7 @@ def converged(
             figures themselves, or 1 for shares of 1.
         fields: their number. first: the level to begin with.
 
-    Returns the arrays, and by name the difference [F, ...] of the last two levels over the scale.
+    Returns the arrays, and by name the difference [F, ...] of the last two levels over the scale, at most 1.
     """
     rows = list(range(fields))
     result = [np.array(a) for a in compute(first, rows)]
@@ -128,7 +128,7 @@ def converged(
             whole[rows] = part
         for name, (values, scale) in figures(result).items():
             off = np.nan_to_num(np.abs(values - before[name][0]) / np.maximum(scale, 1e-300))
-            spread[name][rows] = off[rows]
+            spread[name][rows] = off[rows].clip(max=1.0)
         rows = [k for k in rows if any((s[k] > AGREE).any() for s in spread.values())]
         if not rows:
             break

@@ -10,14 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neurolens.analysis.bundles import Bundle, Filled, bundle, fan, hexapolar, points
+from neurolens.analysis.bundles import Bundle, Filled, bundle, fan, hexapolar
 from neurolens.analysis.fields import Array, Result, Scene
 from neurolens.analysis.pupil_nodes import converged
 from neurolens.optics.paraxial import is_pinhole
 
 _RINGS = 16
 _SHIFTS = 21
-_ZONES = 101  # heights in the stop tried for the outermost ray that passes, and again between two of them
 
 
 @dataclass(frozen=True)
@@ -90,8 +89,10 @@ def spots(
 
 
 def _figures(rays: Bundle, open_energy: Tensor) -> list[Array]:
-    """RMS and greatest radius, the RMS by wavelength, share of the light [F] that enters the stop, best shift and RMS
-    radius there, and the second moments, each [F, ...]."""
+    """The figures of `Spots` that depend on how the pupil is sampled, and the second moments, each [F, ...].
+
+    In the order of `_shown`; `open_energy` [F] is the light that enters the stop.
+    """
     moments, each = _Moments(rays), _Moments(rays, by_wavelength=True)
     away = torch.hypot(*(p - c for p, c in zip((rays.tangential_mm, rays.sagittal_mm), moments.centroid, strict=True)))
     largest = torch.where(rays.passed, away, -math.inf).amax((1, 2))
@@ -154,19 +155,9 @@ def working_f_number(scene: Scene, wavelength_nm: float) -> float:
     """
     if is_pinhole(scene.lens):
         return float(scene.first_order.f_number)
-    low, high, sine = 0.0, 1 - 1e-7, 0.0
-    for _ in range(2):
-        heights = np.linspace(low, high, _ZONES)
-        rays = bundle(scene.round, [0.0], [wavelength_nm], points(heights.tolist(), [0.0] * _ZONES))
-        passed = rays.passed[0, 0].numpy()
-        if not passed.any():
-            break
-        sines = torch.hypot(rays.film.dx, rays.film.dy)[0, 0].numpy()
-        sine = max(sine, float(sines[passed].max()))
-        last = int(np.flatnonzero(passed)[-1])
-        if last == _ZONES - 1:
-            break
-        low, high = float(heights[last]), float(heights[last + 1])
+    rays = Filled(scene.round, [0.0], [wavelength_nm]).bundle(0)
+    across = rays.film.dx if scene.axis == "x" else rays.film.dy
+    sine = float(torch.where(rays.passed, across.abs(), 0.0).max())
     return 1 / (2 * sine) if sine > 0 else math.nan
 
 
@@ -238,7 +229,7 @@ class Mtf(Result):
     spread: dict[str, Array]
 
 
-_SHOWN_PER_MM = 50.0  # frequencies up to here must be converged, or all where all lie above
+_SHOWN_PER_MM = 50.0  # of the frequencies that are taken where none are given, those up to here must be converged
 
 
 def mtf(
@@ -255,7 +246,7 @@ def mtf(
     """
     filled = Filled(scene, field_deg, wavelength_nm)
     f = np.linspace(0, 100, 101) if frequency_per_mm is None else np.asarray(frequency_per_mm, dtype=np.float64)
-    shown = f <= max(_SHOWN_PER_MM, f.min())
+    shown = f <= (_SHOWN_PER_MM if frequency_per_mm is None else math.inf)
 
     def contrast(level: int, fields: list[int]) -> list[Array]:
         rays = filled.only(fields).bundle(level)

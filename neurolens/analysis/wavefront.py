@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neurolens.analysis.bundles import Bundle, Filled, bundle, points
 from neurolens.analysis.fields import Array, Result, Scene
-from neurolens.analysis.pupil_nodes import converged
+from neurolens.analysis.pupil_nodes import LEVELS, converged
 from neurolens.analysis.spots import working_f_number
 
 
@@ -94,7 +94,10 @@ def psf(scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: S
     def shown(found: list[Array]) -> dict[str, tuple[Array, Array | float]]:
         return {"half_width_um": (found[0], 20 * found[0]), "strehl": (found[2].max((1, 2)), 1.0)}
 
-    (half, geometric, diffraction, needed), spread = converged(images, shown, len(filled.fields), first=1)
+    (half, centre, diffraction, needed), spread = converged(images, shown, len(filled.fields), first=1)
+    rays = filled.bundle(LEVELS - 1)  # a picture needs rays in every square, whatever figures need
+    spots = zip(rays.tangential_mm, rays.sagittal_mm, rays.weight, centre, half, strict=True)
+    geometric = np.stack([_histogram(t - c[0], s - c[1], w, h / 1000) for t, s, w, c, h in spots])
     return Psf(
         np.array(filled.fields), np.array(filled.waves), half, geometric, diffraction, diffraction.max((1, 2)), needed,
         airy, spread,
@@ -102,7 +105,7 @@ def psf(scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: S
 
 
 def _images(rays: Bundle, least_mm: float) -> list[Array]:
-    """Half widths (um), geometric and diffraction images, and points across the pupil that the latter need, [F, ...].
+    """Half widths (um), centres (mm), diffraction images and points across the pupil that these need, [F, ...].
 
     In windows of at least some half width.
     """
@@ -116,7 +119,7 @@ def _images(rays: Bundle, least_mm: float) -> list[Array]:
         needed, image = _needed(rays, k, window), np.full((_POINTS, _POINTS), np.nan)
         if 0 < needed <= _FINEST:
             image = diffraction_image(rays, centre, window, field=k)
-        rows.append((1000 * window, _histogram(t - centre[0], s - centre[1], w, window), image, float(needed)))
+        rows.append((1000 * window, centre, image, float(needed)))
     return [np.array(column) for column in zip(*rows, strict=True)]
 
 

@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neurolens.base.bounds import WAVELENGTH_NM, said
@@ -197,11 +198,11 @@ def _one(what: str, scene: Scene, args: argparse.Namespace, doubts: list[str]) -
         return data, None
     across = f"_{args.axis}" if any(s.cylinder for s in scene.lens.surfaces) else ""
     path = args.output / f"{scene.lens.lens_id}_{what}{across}.{args.format}"
-    subtitle = "\n".join([state_text(scene), *([f"Warning: {w}"] if (w := scene.edge.warning) else [])])
+    warning = wrap(f"Warning: {scene.edge.warning}", _WRAP) if scene.edge.warning else []
     if what == "layout":
-        analysis.draw(replace(result, subtitle=f"{result.subtitle}{subtitle.removeprefix(state_text(scene))}"), path)
+        analysis.draw(replace(result, subtitle="\n".join([result.subtitle, *warning])), path)
     else:
-        analysis.draw(result, path, scene.lens.name, subtitle)
+        analysis.draw(result, path, scene.lens.name, "\n".join([state_text(scene), *warning]))
     return data, path
 
 
@@ -248,6 +249,7 @@ def _wavelength_warnings(lens: Lens, wavelength_nm: Iterable[float]) -> list[str
 
 
 _ROWS = 6  # of tables over the field
+_WRAP = 90  # characters a line that the narrowest picture has room for
 _MTF_PER_MM = (10, 20, 30, 40, 50)
 
 

@@ -51,7 +51,8 @@ LAST_STEP = 3e-4
 STEEPEST = 1e-7
 # How far (rad) the slope of an asphere may turn beyond its rim before it continues smoothly, and again after that.
 TURN = 0.25
-FARTHEST = 1.5  # rim radii up to which figures are followed in any case
+FARTHEST = 1.5  # rim radii up to which figures are followed at most
+_UPRIGHT = 1e6  # slope and bend that stand for infinite ones
 
 
 def is_plain(surface: Surface) -> bool:
@@ -199,7 +200,9 @@ def _extent_mm(surface: Surface) -> float:
 @lru_cache(maxsize=4096)
 def _end_of(surface: Surface) -> tuple[float, float, float]:
     """Slope and second derivative of the curve where its figures end, and the length in which the latter dies away."""
-    slope, bend = (float(v) for v in _profile(surface, np.array(surface.followed_mm)))
+    with np.errstate(divide="ignore", invalid="ignore"):  # a conic may end at its rim, upright
+        profile = _profile(surface, np.array(surface.followed_mm))
+    slope, bend = (float(np.nan_to_num(v, nan=0.0, posinf=_UPRIGHT, neginf=-_UPRIGHT)) for v in profile)
     return slope, bend, min(TURN * surface.followed_mm, TURN * (1 + slope * slope) / max(abs(bend), 1e-300))
 
 

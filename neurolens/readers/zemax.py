@@ -91,17 +91,13 @@ def _add_ends(file: File) -> None:
     """Add the object and the image to a file that lists the surfaces of a lens only."""
     first, last = file.blocks[0], file.blocks[-1]
     begins_in_glass = bool(first.name and first.medium and math.isfinite(first.thickness))
-    # A film in glass is plane, and its object is not in glass, too: else the last surface is one of the lens.
-    ends_in_glass = len(file.blocks) > 1 and bool(file.blocks[-2].medium and (last.curvature or begins_in_glass))
-    odd = next((b for b in file.blocks if b.name and not b.name.isdecimal()), None)
-    if odd and file.zoom.count > 1:
-        raise odd.start.error("SURF", odd.name, "numbers in order, in a file with configurations")
-    if begins_in_glass and (first.curvature or last.thickness > 0 or ends_in_glass):
-        if file.zoom.count > 1:
-            raise first.start.error("SURF", "(glass behind the object)", "an object surface in front of the lens")
-        assume(
-            file.file, f"surface {first.name} is a surface of glass: the object is assumed in front of it, at infinity"
-        )
+    # Such a list ends with a surface of the lens; any other file that ends behind glass has been cut off.
+    ends_in_glass = begins_in_glass and bool(file.blocks[-2].medium)
+    lists_lens = begins_in_glass and (first.curvature or last.thickness > 0 or ends_in_glass)
+    if file.zoom.count > 1 and (lists_lens or not all(b.name.isdecimal() for b in file.blocks)):
+        raise first.start.error("SURF", first.name, "object, surfaces numbered in order, and image, for configurations")
+    if lists_lens:
+        assume(file.file, f"surface {first.name} is one of glass: the object is assumed in front of it, at infinity")
         file.blocks.insert(0, Block(first.start, thickness=math.inf))
     elif not first.name:
         first.thickness = math.inf
@@ -300,7 +296,10 @@ def _glass(line: Line, rest: list[str], makers: list[str]) -> dict[str, Any]:
     if name.upper() in ("AIR", "VACUUM"):
         return {}
     if kind == "1" or name == "___BLANK":
-        n_d, V_d = (*line.numbers("GLAS", rest[3:5]), 0.0)[:2]
+        n_d, V_d, departure = (*line.numbers("GLAS", rest[3:6]), 0.0, 0.0)[:3]
+        if departure:
+            left_out = "a model glass's departure from normal partial dispersion is left out: colours differ a little"
+            warn(line.file, f"line {line.number}, GLAS: {left_out}")
         return {"n_d": n_d, "V_d": V_d if V_d > 0 else None, "material": None if name == "___BLANK" else name}
     if kind == "4":
         raise line.error(

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from analysis_lenses import cartesian, library
+from analysis_lenses import cartesian, grid, library
 from test_bundles import D, moved
 
-from neurolens.analysis.bundles import Bundle, Filled, bundle, grid
+from neurolens.analysis.bundles import Bundle, Filled, bundle
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.pupil_nodes import LEVELS, converged, lit_nodes, lit_part
 from neurolens.analysis.spots import diffraction_mtf, mtf, mtf_over_height, spots, working_f_number

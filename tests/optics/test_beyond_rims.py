@@ -58,6 +58,16 @@ def test_aspheres_continue_with_slope_and_curvature_and_become_cones(surface: Su
         assert abs(turned) < 1.2 * TURN
 
 
+def test_a_rim_where_the_conic_ends() -> None:
+    surface = Surface(-5.0, 4.0, 10.0, 1.5, asphere=((4, 1e-5),))
+    height = 5 * torch.tensor([0.0, 0.5, 0.9, 0.999], dtype=torch.float64)
+    lens = Lens("", "", (surface, Surface(INF, 50.0, 1e3, stop=True)), 4.0)
+    zero = torch.zeros_like(height)
+    seen = trace(lens, Rays(zero, height, zero - 9, zero, zero, zero + 1), towards="film", path=True)
+    assert (seen.status // 4 != 1).all()  # none ends at the first surface
+    assert curve(surface, height).tolist() == pytest.approx(seen.path[0].z.tolist(), abs=1e-9)
+
+
 def passing_rays(lens: Lens, count: int) -> Rays:
     """Rays from film points to the exit pupil, half as wide again, from which enough pass."""
     data, u = first_order(lens), torch.rand(3, count, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
@@ -75,10 +85,10 @@ def passing_rays(lens: Lens, count: int) -> Rays:
 @pytest.mark.parametrize("name", [*NAMES, "fujinon_35"])
 def test_no_ray_that_passes_with_rims_is_lost_without_them(name: str) -> None:
     lens = read_lens(FUJINON) if name == "fujinon_35" else tabled(name)
-    rays = passing_rays(lens, 2000)
+    rays = passing_rays(lens, 1000)
     seen, whole = trace(lens, rays), trace(without_rims(lens), rays)
     passed = seen.status == 0
-    assert passed.sum() > 100 and (whole.status[passed] == 0).all()
+    assert passed.sum() > 50 and (whole.status[passed] == 0).all()
     for a, b in zip(seen.rays, whole.rays, strict=True):
         assert float((a - b)[passed].abs().max()) < 1e-9
 
