@@ -229,13 +229,31 @@ def stem(row: Row) -> str:
     return Path(row["file"]).stem
 
 
+WHY = {
+    "describes a mirror": "catadioptric lenses: mirrors change rays, and the lens model has none",
+    "XOSPHERE": "the file is wrong: terms of odd and even powers stand in the places of even ones",
+    "GLAS: got '...', expected a glass of the catalogue": "a cement that no catalogue of glasses has, without an index",
+    "overlap": "a figure is wrong: no rims clear it, or only some that cut the axial beam",
+    "PARM": "the file is wrong: question marks in a number",
+    "SURF": "the file is wrong: its surfaces are numbered out of order, one may be missing",
+    "decimal commas": "a decimal comma may also part two numbers",
+    "GLAS": "the file is wrong: a word or a question mark stands for the Abbe number",
+    "back focus": "an eyepiece whose focus lies inside: no film can stand there",
+    "OBNA": "an aperture in the object's space, whose distance is not that of use",
+}
+
+
+def _why(kind: str) -> str:
+    return next((why for part, why in WHY.items() if part in kind), "")
+
+
 def page(rows: list[Row]) -> str:
     """The result as Markdown."""
     read = [r for r in rows if r["verdict"] == "read"]
     parts = [_summary(rows, read)]
     refused = [(r, r["reason"]) for r in rows if r["verdict"] != "read"]
-    shown = [[len(found), text, "; ".join(map(stem, found))] for text, found in grouped(refused)]
-    parts += ["## Refused", lab.table("files|reason|which", shown)]
+    shown = [[len(found), text, _why(text), "; ".join(map(stem, found))] for text, found in grouped(refused)]
+    parts += ["## Refused", lab.table("files|reason|why it is right|which", shown)]
     for title, key in (("Assumed", "assumed"), ("Told", "notes")):
         pairs = [(r, text) for r in read for text in r[key] if key == "assumed" or text not in r["assumed"]]
         shown = [[len(found), text, stem(found[0])] for text, found in grouped(pairs)]
@@ -260,6 +278,10 @@ def _summary(rows: list[Row], read: list[Row]) -> str:
     )
 
 
+def _cause_kind(cause: str) -> str:
+    return "; ".join(dict.fromkeys(re.sub(r" \(.*\)", "", part) for part in cause.split("; ")))
+
+
 def _agreement(read: list[Row]) -> list[str]:
     agree = [r for r in read if r.get("cause") == ""]
     spread = []
@@ -268,11 +290,12 @@ def _agreement(read: list[Row]) -> list[str]:
         spread.append([key, len(values), *(f"{values[int(q * (len(values) - 1))]:.1e}" for q in (0.5, 0.99, 1.0))])
     differing = [r for r in read if r.get("cause") != ""]
     shown = []
-    for cause in dict.fromkeys(r["cause"] for r in differing):
-        found = [r for r in differing if r["cause"] == cause]
+    kinds = {r["file"]: _cause_kind(r["cause"] or "unknown") for r in differing}
+    for cause in dict.fromkeys(kinds.values()):
+        found = [r for r in differing if kinds[r["file"]] == cause]
         most = max((max(r.get("differences", {"": 0.0}).values()) for r in found), default=0.0)
         rest = max((r.get("rest", 0.0) for r in found), default=0.0)
-        shown.append([len(found), cause or "unknown", f"{most:.1e}", f"{rest:.1e}", "; ".join(map(stem, found))])
+        shown.append([len(found), cause, f"{most:.1e}", f"{rest:.1e}", "; ".join(map(stem, found))])
     short = [[stem(r), *(f"{10 * n}%" for n in r["reach"])] for r in read if "reach" in r and min(r["reach"]) < 10]
     return [
         "## Agreement",
@@ -323,7 +346,7 @@ def run_all(folder: Path, only: str, python: Path | None, quiet: bool) -> list[R
     read, other = [r for r in rows if r["verdict"] == "read"], RayOptics(python, folder)
     with progress.stage("ray-optics") as report:
         first = other.ask(read, False, report)
-    doubtful = [r for r in read if judged(r, first[r["file"]], None)["cause"] is None]
+    doubtful = [r for r in read if judged(r, first[r["file"]], None)["cause"] != ""]
     with progress.stage("ray-optics, mended") as report:
         second = other.ask(doubtful, True, report)
     for row in read:

@@ -119,7 +119,7 @@ def write_tables(file: Path, rows: Sequence[Row], other: RayOptics, report: Repo
     for row in rows:
         text = read_text(other.folder / row["file"])
         source = source_of(text, row["file"])
-        independent = row.get("cause") is not None and "takes for" not in row["cause"]  # of our glass catalogue
+        independent = row.get("cause") is not None and "index of a glass" not in row["cause"]  # of our glass catalogue
         name = re.sub("[^a-z0-9]+", "_", (source or "").lower()) + ".zmx"
         if source and independent and name not in texts and reach(row) == len(TENTHS):
             texts[name], candidates[name] = table_of(text, source), row | {"source": source}

@@ -108,23 +108,19 @@ class Model:
                 scaled = [a / radius ** (2 * i) for i, a in enumerate(terms, start=1)]
                 shape = EvenPolynomial(c=profile.cv, cc=getattr(profile, "cc", 0.0), coefs=scaled)
                 self.sequence.ifcs[k].profile = shape
-                self.mended.append("XASPHERE, which it reads as a sphere or conic")
+                self.mended.append("the terms of XASPHERE, which it leaves out")
             elif kind == "XOSPHERE" and radius != 1:
                 profile.coefs = [a / radius**i for i, a in enumerate(terms, start=1)]
-                self.mended.append("XOSPHERE, whose normalisation radius it leaves out")
+                self.mended.append("the normalisation radius of XOSPHERE, which it leaves out")
 
     def replace_indices(self, wanted):
         """Take the given index behind each surface where the medium changes and they differ."""
         gaps, ends = self.sequence.gaps, [*self.changes[1:], len(self.index)]
         for k, end, n in zip(self.changes, ends, wanted, strict=True):
             if abs(self.index[k] - n) > SAME_INDEX:
-                text = f"a glass that it takes for {self.glass(k)} (n {self.index[k]:.5f} instead of {n:.5f})"
-                self.mended.append(text)
+                self.mended.append(f"the index of a glass that it replaces ({self.index[k]:.5f} instead of {n:.5f})")
                 for gap in gaps[k:end]:
                     gap.medium = ConstantIndex(n, "mended")
-
-    def glass(self, k):
-        return str(self.sequence.gaps[k].medium.name())
 
     def marked_stop(self, lines):
         """The surface that the file marks: ray-optics forgets a stop on the first one."""
