@@ -44,6 +44,7 @@ from neurolens.readers.any_format import read_any
 SCRIPT = Path(__file__).with_name("ray_optics.py")
 KEPT = lab.ROOT / "runs" / "collection" / "ray_optics.json"
 LIMIT = 1e-4  # relative; a file that differs by more needs a named cause
+PARAXIAL = "its paraxial rays leave out terms of r^2"  # a cause
 READ_GOAL = 0.97
 TENTHS = range(1, 11)  # of the file's field, at which chief rays are traced
 SHARES = (0.3, 0.7, 1.0)  # of the field that both programs reach, at which they are compared
@@ -191,7 +192,7 @@ def judged(own: Row, theirs: Row, mended: Row | None) -> Row:
         return row | {"cause": ""}
     for answer, names in read:
         efl, back = answer["rays"]
-        for rays, more in (({}, []), ({"efl_mm": efl, "back_mm": back}, ["paraxial rays leave out r^2 terms"])):
+        for rays, more in (({}, []), ({"efl_mm": efl, "back_mm": back}, [PARAXIAL])):
             rest = differences(own, answer | rays)
             if row["cause"] is None and max(rest.values()) <= LIMIT:
                 row |= {"cause": "; ".join([*names, *more]), "rest": max(rest.values())}

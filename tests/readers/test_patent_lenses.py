@@ -72,13 +72,8 @@ def test_a_thousand_files_take_less_than_a_minute(tmp_path: Path, capsys: pytest
     expected = {Path(table["file"]).stem: table["efl_mm"] for table in TABLES}
     assert [row["efl_mm"] for row in rows] == pytest.approx([expected[row["lens"]] for row in rows], abs=AGREE_MM)
     f_numbers, focal = [row["f_number"] for row in rows], [row["efl_mm"] for row in rows]
-    print(
-        sorted(f_numbers)[:3],
-        sorted(f_numbers)[-3:],
-        sorted(focal)[:3],
-        sorted(focal)[-3:],
-        max(t["fields_deg"][-1] for t in TABLES),
-        sum(r["aspheres"] > 0 for r in rows),
-        sum(r["states"] > 2 for r in rows),
-        sorted(r["refractions"] for r in rows)[:8],
-    )
+    assert min(f_numbers) < 0.96 and max(f_numbers) > 13
+    assert min(focal) < 0 and min(f for f in focal if f > 0) < 5 and max(focal) > 1000
+    assert max(table["fields_deg"][-1] for table in TABLES) > 100
+    assert sum(row["aspheres"] > 0 for row in rows) > 100 and sum(row["states"] > 2 for row in rows) > 90
+    assert min(row["refractions"] for row in rows) < 4 and max(row["refractions"] for row in rows) > 40
