@@ -24,6 +24,7 @@ from neurolens.commands.arguments import (
     state_of,
 )
 from neurolens.commands.output import answer, number, table
+from neurolens.optics.film_plane import LINE_D_NM
 
 if TYPE_CHECKING:
     from neurolens.optics.prescription import Lens
@@ -187,6 +188,14 @@ def _first_order(data: dict[str, Any]) -> str:
         ("stop", f"surface {data['stop_surface']}", f"diameter {_mm(data['stop_diameter_mm'])}"),
         ("refractions", str(data["refractions"]), ""),
     ]
+    medium = data["object_medium"]
+    if medium["n_d"] != 1:
+        rows.append(("medium in front", f"n_d {medium['n_d']:.5f}", medium["material"] or medium["glass"] or ""))
+    if data["front_efl_mm"] != data["efl_mm"]:
+        rows.append(("front focal", _mm(data["front_efl_mm"]), "focal length of the object side, in its medium"))
+    if data["wavelength_nm"] != LINE_D_NM:
+        note = "of all this: the file's primary one, as its light does not hold the d line"
+        rows.append(("wavelength", f"{data['wavelength_nm']:g} nm", note))
     return _columns(rows)
 
 
