@@ -120,7 +120,9 @@ class _Tracing:
         if normal is None:
             normal = g.concat(self.x[0:2] * -c, self.x[2] * -c + 1.0) if c else g.constant([0.0, 0.0, 1.0])
         if s.coating and s.coating.layers:
-            shares = coated_shares(s.coating.layers, (cos_i, cos_t), media, self._most_sine(k), self.wave)
+            sides = self.lens.media[k : k + 2]
+            sine = min(max(float(index_of(m, nm)) for nm in self.wavelength_nm) for m in sides)
+            shares = coated_shares(s.coating.layers, (cos_i, cos_t), media, sine, self.wave)
         else:
             shares = fresnel(before * cos_i, after * cos_t, after * cos_i + before * cos_t)
         turn = None
@@ -142,12 +144,6 @@ class _Tracing:
         if absorbed is not None:
             depth = self.graph.dot(to - self.x, self.d) * absorbed
             self.depth = depth if self.depth is None else self.depth + depth
-
-    def _most_sine(self, k: int) -> float:
-        """The largest index times sine of incidence with which light passes surface k."""
-        sides = self.lens.surfaces[max(k - 1, 0) : k + 1] if k else (*self.lens.surfaces[:1],)
-        most = [max(float(index_of(s, nm)) for nm in self.wavelength_nm) for s in sides]
-        return min(most) if k else 1.0
 
     def _index(self, k: int) -> Value:
         """Index of the medium in front of surface k, as light comes from the scene."""
