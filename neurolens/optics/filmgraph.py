@@ -42,7 +42,7 @@ def absorption(surface: Surface, wave: Wave) -> Value | None:
     slope = sum(bend for nm, bend in bends if nm >= high)
     for nm, bend in [(high, slope), *((nm, bend) for nm, bend in bends if low < nm < high)]:
         if bend:
-            total = total + (nm - wave.nanometres).maximum(0.0 if nm < high else low - high) * bend
+            total = total + (nm - wave.nanometres).maximum(0.0) * bend
     return total
 
 

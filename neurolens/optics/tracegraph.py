@@ -21,6 +21,9 @@ from neurolens.optics.sag import biconic, toroid
 from neurolens.optics.shapes import LAST_STEP, STEEPEST, is_plain, start_of
 from neurolens.optics.transmission import Light, crossed, crossed_spheres, fresnel, pass_surface, turned
 
+TRANSMITTANCE = (
+    "Transmittance: of unpolarised light, with the polarisation that surfaces give to it, coatings and absorption."
+)
 # The index is a polynomial in 1 / lambda^2 that holds it to float32's last bit.
 _INDEX = 3e-8
 _TINY = 1e-30  # least value under a root

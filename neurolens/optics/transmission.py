@@ -10,7 +10,6 @@ Principles of Optics, 1.5.2 and 10.9.3; Chipman, Lam and Young, Polarized Light 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -22,7 +21,7 @@ from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.shapes import is_plain
 from neurolens.optics.surfaces import Hit, Medium, Rays, times
 
-Vector = Sequence[Any]  # x, y, z, lens frame
+Vector = Any  # x, y, z in the lens frame: three tensors [N], or the rows of a value
 
 # Added to the square of a turn's cosine: at exactly normal incidence, where there is no plane, nothing is turned.
 _FLOOR = 1e-30
@@ -122,8 +121,8 @@ def crossed(d: Vector, a: Vector, b: Vector) -> Any:
 def crossed_spheres(point: Vector, d: Vector, curvatures: tuple[Any, Any], gap_mm: Any) -> Any:
     """`crossed` of the normals of two spheres with vertices on the axis, so far apart; the point is on the ray.
 
-    Their normals are (0, 0, 1) - c P for points P from the vertex: what is left is the ray's skewness x dy - y dx times a
-    number.
+    Their normals are (0, 0, 1) - c P for points P from the vertex: what is left is the ray's skewness, x dy - y dx, by
+    a number.
     """
     first, second = curvatures
     return (point[0] * d[1] - point[1] * d[0]) * (first - second + first * second * gap_mm)

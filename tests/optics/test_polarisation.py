@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 import tmm
 import torch
-from torch import Tensor
-
 from polarised_fields import Step, pass_surface, power, unpolarised
+from torch import Tensor
 
 from neurolens.optics import transmission
 from neurolens.optics.coatings import Layers, powers, transmittance

@@ -12,13 +12,12 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
-from neurolens.flare.ghosts import coated
 from neurolens.graph.interpret import evaluate
+from neurolens.graph.program import RAY, WAVELENGTH
 from neurolens.graph.scalars import lower
-from neurolens.optics.glass import absorption_of, index_of
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import film_z_mm
-from neurolens.optics.prescription import Coating, Lens, Surface
+from neurolens.optics.prescription import Coating, Lens
 from neurolens.optics.pupils import camera_rays, image_radius_mm, pupil_plane_z_mm
 from neurolens.optics.trace import trace
 from neurolens.optics.tracegraph import exact_graph
@@ -63,19 +62,20 @@ def test_transmittance_is_that_of_the_tracer(name: str, coat: bool, absorb: bool
     inputs, plane = corner_rays(lens, wavelength_nm)
     fx, fy, px, py, nm = (torch.from_numpy(row) for row in inputs["rays"])
     film_z, graph = float(inputs["film_z_mm"][0, 0]), exact_graph(lens, plane, LIGHT_NM)
-    wanted = trace(lens, camera_rays(fx, fy, film_z, px, py, plane), nm, transmittance=True)
+    rays = camera_rays(fx, fy, film_z, px, py, plane)
+    wanted = trace(lens, rays, nm, transmittance=True)
     found = evaluate(graph, inputs)
     assert wanted.transmittance is not None
     passed, power = (wanted.status == st.PASSED).numpy(), wanted.transmittance.numpy()
     np.testing.assert_array_equal(found["status"][0] == st.PASSED, passed)
     assert passed.sum() > 100 and passed[1::2].any()
     if absorb:
-        clear = trace(with_losses(lens, coat, False), camera_rays(fx, fy, film_z, px, py, plane), nm, transmittance=True)
+        clear = trace(with_losses(lens, coat, False), rays, nm, transmittance=True)
         assert (power[passed] < 0.97 * clear.transmittance.numpy()[passed]).all()  # type: ignore[union-attr]
     # The indices are series, good to 3e-8, and grazing rays feel them.
     np.testing.assert_allclose(found["transmittance"][0][passed], power[passed], rtol=0, atol=1e-6)
     written = lower(graph)
-    rows = dict(zip(("film_x_mm", "film_y_mm", "pupil_x_mm", "pupil_y_mm", "wavelength_nm"), inputs["rays"], strict=True))
+    rows = dict(zip((*RAY, WAVELENGTH), inputs["rays"], strict=True))
     single = written.evaluate(rows | {k: np.float32(v[0, 0]) for k, v in inputs.items() if k != "rays"})
     both = passed & (single["status"] == st.PASSED)
     off = np.abs(single["transmittance"] - power)[both]
