@@ -88,6 +88,7 @@ def _places() -> list[Path]:
 
 def models_in(folder: Path) -> Iterator[dict[str, Any]]:
     """What the cards of a folder say, with the times beside them; a file that is no model is left out."""
+    from neurolens.modelfile.cardcheck import transmittance_of
     from neurolens.modelfile.onnxfile import card_in, read_metadata
 
     times = _times(folder / "index.json") | _times(folder.parent / "results.json")
@@ -104,6 +105,7 @@ def models_in(folder: Path) -> Iterator[dict[str, Any]]:
                 "efl_mm": float(card["lens"]["efl_mm"]),
                 "film_radius_mm": float(domain["film_radius_mm"]),
                 "focus_m": list(domain["focus_m"]),
+                "transmittance": transmittance_of(card),
                 "states": [str(a["name"]) for a in (card.get("states") or {}).get("axes", ())],
                 **{k: errors.get(k) for k in ("rms_um", "rms_px", "direction_rms_deg", "poor")},
                 "bytes": file.stat().st_size,

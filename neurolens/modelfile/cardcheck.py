@@ -47,6 +47,9 @@ def _errors(value: Any, depth: int = 3) -> bool:
     )
 
 
+# Transmittance of unpolarised light: with the polarisation that each surface gives to it, or averaged over s and p there.
+POLARISED, AVERAGED = "polarised", "averaged"
+
 Rule = tuple[Callable[[Any], bool], str]
 NUMBER: Rule = (is_number, "a finite number")
 POSITIVE: Rule = (_positive, "a finite number above 0")
@@ -91,12 +94,18 @@ _RULES: dict[str, Rule] = {
     "errors": (_errors, "a table of figures from 0 up, of tables of such, of texts and lists"),
 }
 _OPTIONAL: dict[str, Rule] = {
+    "transmittance": (lambda v: v in (POLARISED, AVERAGED), f'"{POLARISED}" or "{AVERAGED}"'),
     "lens.stop_surface": (lambda v: _integer(v, 0, 9999), "an integer"),
     "lens.index_ratio": POSITIVE,
     "domain.nearest_m": (lambda v: v is None or _positive(v), "a number above 0, or null"),
     "errors.poor": (lambda v: isinstance(v, list) and all(isinstance(t, str) for t in v), "a list of texts"),
     "fit.settings.rays_seed": (lambda v: v is None or _integer(v, -(2**53), 2**53), "an integer up to 2^53, or null"),
 }
+
+
+def transmittance_of(card: Mapping[str, Any]) -> str:
+    """Which transmittance of unpolarised light a model holds: POLARISED, or AVERAGED where its card states none."""
+    return str(card.get("transmittance", AVERAGED))
 
 
 def check_card(file: Any, card: Mapping[str, Any]) -> None:
