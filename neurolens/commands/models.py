@@ -15,6 +15,7 @@ from neurolens.base.files import library
 from neurolens.commands.arguments import add_json
 from neurolens.commands.output import answer, number, table
 from neurolens.evaluate.records import CLOSE_UM, reaches, to_use, use_command
+from neurolens.modelfile.cardcheck import AVERAGED, transmittance_of
 
 _DESCRIPTION = """\
 List exported models by lens: film circle, focus, film-equivalent RMS error on rays held out, and
@@ -88,7 +89,6 @@ def _places() -> list[Path]:
 
 def models_in(folder: Path) -> Iterator[dict[str, Any]]:
     """What the cards of a folder say, with the times beside them; a file that is no model is left out."""
-    from neurolens.modelfile.cardcheck import transmittance_of
     from neurolens.modelfile.onnxfile import card_in, read_metadata
 
     times = _times(folder / "index.json") | _times(folder.parent / "results.json")
@@ -154,11 +154,7 @@ def _text(args: argparse.Namespace, listed: Sequence[dict[str, Any]], kept: Sequ
             number(m["rms_um"], 3),
             number(m["rms_px"], 2),
             *(number((m[k] or {}).get("min"), 3) for k in ("ns_per_ray", "fused_ns_per_ray")),
-            f"poor: {', '.join(m['poor'])}"
-            if m["poor"]
-            else f"in one: {', '.join(m['states'])}"
-            if m["states"]
-            else "",
+            "; ".join(_remarks(m)),
         )
         for m in kept
     ]
@@ -170,6 +166,13 @@ def _text(args: argparse.Namespace, listed: Sequence[dict[str, Any]], kept: Sequ
     if len(chosen) == 1:
         parts.append(f"Use {_said(chosen[0])}:\n  {chosen[0]['use']}")
     return "\n\n".join(parts)
+
+
+def _remarks(model: dict[str, Any]) -> list[str]:
+    """What the last column says of a model."""
+    found = [f"poor: {', '.join(model['poor'])}"] if model["poor"] else []
+    found += [f"in one: {', '.join(model['states'])}"] if model["states"] and not found else []
+    return found + ["averaged transmittance"] * (model["transmittance"] == AVERAGED)
 
 
 def _said(model: dict[str, Any]) -> str:
