@@ -47,7 +47,7 @@ def _errors(value: Any, depth: int = 3) -> bool:
     )
 
 
-# Transmittance of unpolarised light: with the polarisation that each surface gives to it, or averaged over s and p there.
+# Transmittance of unpolarised light: with the polarisation that surfaces give to it, or averaged over it at each.
 POLARISED, AVERAGED = "polarised", "averaged"
 
 Rule = tuple[Callable[[Any], bool], str]
