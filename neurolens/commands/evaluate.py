@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_glass, add_json, whole
 from neurolens.commands.output import answer, number, table
-from neurolens.modelfile.cardcheck import AVERAGED, transmittance_of
+from neurolens.modelfile import AVERAGED, transmittance_of
 
 if TYPE_CHECKING:
     from neurolens.evaluate.check import Promise

@@ -15,7 +15,7 @@ from neurolens.base.files import library
 from neurolens.commands.arguments import add_json
 from neurolens.commands.output import answer, number, table
 from neurolens.evaluate.records import CLOSE_UM, reaches, to_use, use_command
-from neurolens.modelfile.cardcheck import AVERAGED, transmittance_of
+from neurolens.modelfile import AVERAGED, transmittance_of
 
 _DESCRIPTION = """\
 List exported models by lens: film circle, focus, film-equivalent RMS error on rays held out, and

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, ModelError
+from neurolens.modelfile import AVERAGED, POLARISED
 from neurolens.modelfile.states import check_states
 
 
@@ -46,9 +47,6 @@ def _errors(value: Any, depth: int = 3) -> bool:
         for v in value.values()
     )
 
-
-# Transmittance of unpolarised light: with the polarisation that surfaces give to it, or averaged over it at each.
-POLARISED, AVERAGED = "polarised", "averaged"
 
 Rule = tuple[Callable[[Any], bool], str]
 NUMBER: Rule = (is_number, "a finite number")
@@ -101,11 +99,6 @@ _OPTIONAL: dict[str, Rule] = {
     "errors.poor": (lambda v: isinstance(v, list) and all(isinstance(t, str) for t in v), "a list of texts"),
     "fit.settings.rays_seed": (lambda v: v is None or _integer(v, -(2**53), 2**53), "an integer up to 2^53, or null"),
 }
-
-
-def transmittance_of(card: Mapping[str, Any]) -> str:
-    """Which transmittance of unpolarised light a model holds: POLARISED, or AVERAGED where its card states none."""
-    return str(card.get("transmittance", AVERAGED))
 
 
 def check_card(file: Any, card: Mapping[str, Any]) -> None:

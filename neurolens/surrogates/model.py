@@ -21,8 +21,7 @@ from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.program import RAY, WAVELENGTH
-from neurolens.modelfile import DOMAIN_SLACK
-from neurolens.modelfile.cardcheck import POLARISED
+from neurolens.modelfile import DOMAIN_SLACK, POLARISED
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.assemble import EXACT, model_graph

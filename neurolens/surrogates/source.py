@@ -33,8 +33,8 @@ from neurolens.graph.program import (
     Program,
 )
 from neurolens.graph.scalars import lower
+from neurolens.modelfile import POLARISED, transmittance_of
 from neurolens.modelfile.axes import product
-from neurolens.modelfile.cardcheck import POLARISED, transmittance_of
 from neurolens.modelfile.graph import graph_of
 from neurolens.modelfile.onnxfile import read_checked
 from neurolens.modelfile.stategraph import mixture_of, state_names

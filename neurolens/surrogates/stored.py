@@ -22,8 +22,8 @@ from torch import Tensor
 
 from neurolens.base.errors import InputError, ModelError
 from neurolens.base.tomlfile import check_tree
-from neurolens.modelfile import MODEL_KEY
-from neurolens.modelfile.cardcheck import tolerances, transmittance_of
+from neurolens.modelfile import MODEL_KEY, transmittance_of
+from neurolens.modelfile.cardcheck import tolerances
 from neurolens.modelfile.onnxfile import card_in, read_metadata
 from neurolens.optics.prescription import Coating, Lens, Surface
 from neurolens.surrogates.cores import (
