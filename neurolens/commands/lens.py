@@ -24,7 +24,6 @@ from neurolens.commands.arguments import (
     state_of,
 )
 from neurolens.commands.output import answer, number, table
-from neurolens.optics.film_plane import LINE_D_NM
 
 if TYPE_CHECKING:
     from neurolens.optics.prescription import Lens
@@ -172,6 +171,8 @@ def _near(configuration: dict[str, Any]) -> bool:
 
 
 def _first_order(data: dict[str, Any]) -> str:
+    from neurolens.optics.film_plane import LINE_D_NM
+
     focus = "infinity" if math.isinf(data["focus_m"]) else f"{data['focus_m']:g} m"
     across = data["efl_x_mm"] is not None
     planes = f"{_mm(data['front_principal_z_mm'])}, {_mm(data['rear_principal_z_mm'])}"
