@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from experiments.radiometry import film_light
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.flare.ghosts import GhostTracer, Pair, Way, coated, ghost_pairs
@@ -19,7 +20,6 @@ from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Coating, Lens, Surface
-from neurolens.optics.radiometry import film_light
 from neurolens.optics.sequence import follow, turning
 from neurolens.optics.trace import Rays, trace
 
