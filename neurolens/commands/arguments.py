@@ -296,27 +296,3 @@ def check_suffix(path: Path, option: str, suffixes: tuple[str, ...]) -> None:
     if path.suffix.lower() not in suffixes:
         expected = suffixes[0] if len(suffixes) == 1 else f"one of {', '.join(suffixes)}"
         raise InputError(path, option, path.suffix or "(no suffix)", expected)
-
-
-def add_bare(parser: argparse.ArgumentParser) -> None:
-    """Add --bare, for `bare_of`."""
-    parser.add_argument(
-        "--bare", action="store_true",
-        help="of a lens file: leave out coatings and what glass absorbs, and say so; else such a lens is refused",
-    )  # fmt: skip
-
-
-def bare_of(args: argparse.Namespace, file: Path) -> str:
-    """The line on what --bare leaves out of a lens file, "" of nothing.
-
-    Raises:
-        InputError: --bare of a model.
-    """
-    if not args.bare:
-        return ""
-    if file.suffix != ".toml":
-        raise InputError(file, "--bare", "(a model)", "a lens file: a model has what its lens has")
-    from neurolens.cameras.exact import bare_line
-    from neurolens.optics.lensfile import read_lens
-
-    return bare_line(read_lens(file))
