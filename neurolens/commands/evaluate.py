@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, whole
+from neurolens.commands.arguments import add_glass, add_json, lens_argument, whole
 from neurolens.commands.output import answer, number, table
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("model", metavar="MODEL", type=Path, help="exported model (.onnx)")
     parser.add_argument(
-        "--lens", metavar="FILE", type=Path, help="its lens file (default: found by the card's lens id)"
+        "--lens", metavar="FILE", type=lens_argument(), help="its lens file (default: found by the card's lens id)"
     )
     parser.add_argument(
         "--rays", metavar="N", type=whole(1000, 1_000_000), default=30_000,

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text, check_writable
-from neurolens.commands.arguments import add_bare, add_json, bare_of, named_camera, positive
+from neurolens.base.lensname import is_model, split_kind
+from neurolens.commands.arguments import add_bare, add_json, bare_of, lens_argument, positive
 from neurolens.commands.output import answer
 from neurolens.commands.render import film_size
 
@@ -66,7 +67,7 @@ def add_parser(subparsers: Any) -> None:
         epilog=_EPILOG,
     )  # fmt: skip
     parser.add_argument(
-        "model", metavar="MODEL", type=lambda text: Path(named_camera(text).removeprefix("fused:")),
+        "model", metavar="MODEL", type=lambda text: Path(split_kind(lens_argument(models=True, cameras=True)(text))[1]),
         help="exported model (.onnx), or a run folder with one model; of C, GLSL, OSL also a lens file or name",
     )  # fmt: skip
     parser.add_argument("--to", choices=("c", "glsl", "osl", "onnx"), required=True, help="form to write")
@@ -123,7 +124,7 @@ def run(args: argparse.Namespace) -> int:
         checked_name(args.to, "", args.name)
     if args.to == "osl":
         return _write_osl(file, args, bool(given) or set(parts) != set(_PARTS))
-    exact = file.suffix == ".toml"
+    exact = not is_model(file)
     if args.camera or exact:
         if args.to == "onnx" or given or set(parts) != set(_PARTS):
             what = "a camera" if args.camera else "a lens file"

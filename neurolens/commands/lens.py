@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import library
+from neurolens.base.lensname import resolve
 from neurolens.commands.arguments import (
     add_json,
     add_lens_state,
@@ -20,7 +21,6 @@ from neurolens.commands.arguments import (
     check_suffix,
     focus_of,
     given_options,
-    lens_path,
     state_of,
 )
 from neurolens.commands.output import answer, number, table
@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
     _check_mode(args, listing)
     if listing:
         return _run_list(args)
-    args.file = lens_path(args.file, "lens")
+    args.file = resolve(args.file, models=False, cameras=False).file
     if args.derive_rims:
         return _run_rims(args)
     for option, path in (("--layout", args.layout), ("--breathing", args.breathing)):
@@ -107,13 +107,13 @@ def run(args: argparse.Namespace) -> int:
             check_suffix(path, option, _LAYOUT_SUFFIXES)
             check_folder(path, option)
     from neurolens.evaluate.describe import file_doubts, glass_table, layout_profile, lens_facts
-    from neurolens.optics.lensfile import read_lens
+    from neurolens.readers.any_format import read_any
     from neurolens.surrogates.domain import domain_of
 
     began = time.perf_counter()
     with warnings.catch_warnings(record=True) as caught:  # part of the answer
         warnings.simplefilter("always", NeurolensWarning)
-        tabled = read_lens(args.file)
+        tabled = read_any(args.file)
     lens = state_of(args, tabled)
     focus, film_z = focus_of(args, tabled, lens), float(lens.film_z_mm or 0.0)
     domain = domain_of(lens, focus_m=(focus, focus), film_z_mm=(film_z, film_z))

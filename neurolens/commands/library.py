@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import atomic_path, atomic_write_text, library, write_json
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_json, lens_path
+from neurolens.commands.arguments import LENS_HELP, add_json, lens_argument
 from neurolens.commands.output import answer
 
 if TYPE_CHECKING:
@@ -41,7 +41,9 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "library", help="pages of lenses: pictures, figures, models", description=_DESCRIPTION, epilog=_EPILOG
     )
-    parser.add_argument("lenses", metavar="LENS", nargs="*", help="lens files or names (default: all of lenses/)")
+    parser.add_argument(
+        "lenses", metavar="LENS", nargs="*", type=lens_argument(), help=f"{LENS_HELP} (default: all of lenses/)"
+    )
     parser.add_argument("-o", "--output", metavar="FOLDER", type=Path, required=True, help="for the pages")
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="finished pages are kept; the same command goes on")
@@ -54,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     folder = args.output
     if folder.exists() and not folder.is_dir():
         raise InputError("neurolens library", "-o", str(folder), "a folder")
-    files = [lens_path(word, "library") for word in args.lenses] or lens_files(library() / "lenses")
+    files = args.lenses or lens_files(library() / "lenses")
     progress, records = Progress({"lenses": 12.0 * len(files)}, quiet=args.quiet), []
     with progress.stage("lenses") as report:
         for k, file in enumerate(files):
@@ -98,6 +100,7 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
     from neurolens.evaluate import pages
     from neurolens.evaluate.describe import lens_row, rim_doubts, section
     from neurolens.optics.lenscheck import check_lens
+    from neurolens.readers.source import read_text
 
     row = lens_row(lens, check_lens(lens))
     figures, notes = [], []
@@ -119,7 +122,7 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
     body += pages.figure_grid(folder, figures)
     names = [Path(m["file"]).stem.removeprefix(f"{lens.lens_id}.") for m in models]
     body += pages.section("Models", pages.table(names, models, _model_columns()))
-    body += pages.section("File", f"<pre>{pages.text(file.read_text(encoding='utf-8', errors='replace'))}</pre>")
+    body += pages.section("File", f"<pre>{pages.text(read_text(file))}</pre>")
     atomic_write_text(folder / "index.html", pages.page(lens.name, body))
     best = min((m["rms_um"] for m in models if m["rms_um"] is not None), default=None)
     keys = ("name", "efl_mm", "f_number", "half_field_deg", "refractions", "states")

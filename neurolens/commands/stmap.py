@@ -19,7 +19,7 @@ from neurolens.commands.arguments import (
     aperture_of,
     between,
     check_folder,
-    named_camera,
+    lens_argument,
     positive,
 )
 from neurolens.commands.output import answer, number
@@ -102,8 +102,8 @@ def add_parser(subparsers: Any) -> None:
 def add_picture(parser: argparse.ArgumentParser) -> None:
     """Add the camera, --size and --film."""
     parser.add_argument(
-        "camera", metavar="CAMERA", type=named_camera,
-        help="lens file (or a name in lenses/), model or another camera, see below",
+        "camera", metavar="CAMERA", type=lens_argument(models=True, cameras=True),
+        help="lens file of any format, model, name of either, or another camera, see below",
     )  # fmt: skip
     parser.add_argument("--size", metavar="WxH", type=_pixels, required=True, help="of the lens's picture in pixels")
     parser.add_argument("--film", metavar="WxH", type=film_size, required=True, help="size of the film in mm")

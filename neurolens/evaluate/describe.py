@@ -17,11 +17,11 @@ from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.optics.focusing import at_infinity
 from neurolens.optics.glass import glass_of
 from neurolens.optics.lenscheck import Check, check_lens, doubts, film_edge_mm, verdict
-from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays, image_radius_mm
 from neurolens.optics.trace import trace
+from neurolens.readers.any_format import read_any
 from neurolens.surrogates.domain import Domain, sample_domain
 
 _RAYS = 65536
@@ -215,7 +215,7 @@ def read_quietly(path: Path) -> Lens:
     """A lens read without warnings, which its check repeats."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NeurolensWarning)
-        return read_lens(path)
+        return read_any(path)
 
 
 def library_row(path: Path) -> dict[str, Any]:
