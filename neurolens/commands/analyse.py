@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.commands.arguments import (
-    LENS_HELP,
     add_json,
+    add_lens,
     add_lens_state,
     between,
     check_run_folder,
     focus_of,
-    lens_argument,
     state_of,
 )
 from neurolens.commands.output import answer, number, table
@@ -72,7 +71,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "analyse", help="spots, MTF, distortion and more of a lens file", description=_DESCRIPTION, epilog=_EPILOG
     )
-    parser.add_argument("file", metavar="LENS", type=lens_argument(), help=LENS_HELP)
+    add_lens(parser, "file")
     parser.add_argument("what", metavar="WHAT", nargs="*", help="what to show (default: all)")
     add_lens_state(parser, efl="as tabled", f_number="the tabled stop")
     parser.add_argument(

@@ -78,7 +78,6 @@ def _number(kind: Callable[[str], T], good: Callable[[T], bool], expected: str) 
     return convert
 
 
-LENS_HELP = "lens file of any format, or a name in lenses/"
 QUIET_HELP = "neither progress nor warnings on stderr"
 
 # Repeated here, so that help imports no camera; a test compares with `cameras.exact` and `cameras.vignetting`.
@@ -99,11 +98,7 @@ cameras:
 
 def add_camera(parser: argparse.ArgumentParser) -> None:
     """Add --camera, --film-offset, --pupil and --vignetting."""
-    parser.add_argument(
-        "--camera", metavar="CAMERA", required=True, type=lens_argument(models=True, cameras=True),
-        help="lens file of any format (traced exactly), model (.onnx), a name of either, fused: before it, thick:LENS, "
-        "thin, pinhole or fisheye-PROJECTION",
-    )  # fmt: skip
+    add_lens(parser, "--camera", models=True, cameras=True, required=True)
     parser.add_argument(
         "--film-offset", metavar="MM", type=between(-1e3, 1e3, "mm"), default=0.0,
         help="move the film away from the lens after focusing (default: 0)",
@@ -230,8 +225,15 @@ def add_json(parser: argparse.ArgumentParser, quiet: bool = False) -> None:
     )
 
 
-def lens_argument(*, models: bool = False, cameras: bool = False) -> Callable[[str], Any]:
-    """Type of an argument that names a lens, as `resolve`: its path, or with `cameras` the text of a `Named`."""
+def add_lens(
+    parser: argparse._ActionsContainer, name: str, also: str = "", *, models: bool = False, cameras: bool = False,
+    **options: Any,
+) -> None:  # fmt: skip
+    """Add an argument that names a lens, as `resolve`; its value is a path, or with `cameras` the text of a `Named`.
+
+    Args:
+        also: what the help adds. models, cameras: what is taken besides lenses. options: of `add_argument`.
+    """
 
     def named(text: str) -> Any:
         try:
@@ -240,7 +242,10 @@ def lens_argument(*, models: bool = False, cameras: bool = False) -> Callable[[s
         except InputError as error:
             raise argparse.ArgumentTypeError(str(error)) from None
 
-    return named
+    taken = ", model (.onnx), or name of either" if models else ", or its name in lenses/"
+    taken += ", fused: before it, thick:LENS, thin, pinhole or fisheye-PROJECTION" if cameras else ""
+    options = {"metavar": "CAMERA" if cameras else "LENS", "help": f"lens file of any format{taken}{also}"} | options
+    parser.add_argument(name, type=named, **options)
 
 
 def check_ids(files: Sequence[Path], command: str, option: str) -> None:

@@ -10,16 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import NeurolensError, printable
-from neurolens.commands.arguments import (
-    LENS_HELP,
-    QUIET_HELP,
-    Parser,
-    add_glass,
-    check_ids,
-    check_run_folder,
-    lens_argument,
-    whole,
-)
+from neurolens.commands.arguments import QUIET_HELP, Parser, add_glass, add_lens, check_ids, check_run_folder, whole
 from neurolens.commands.farm import Task, add_dask, files_of, spread
 
 if TYPE_CHECKING:
@@ -57,7 +48,7 @@ def add_parser(subparsers: Any) -> None:
 
 def add_surrogate_arguments(parser: argparse.ArgumentParser, lenses: str) -> None:
     """Add the lenses, as many as argparse's `lenses` says, and the options."""
-    parser.add_argument("lenses", metavar="LENS", nargs=lenses, type=lens_argument(), help=LENS_HELP)
+    add_lens(parser, "lenses", nargs=lenses)
     parser.add_argument(
         "--methods", metavar="METHOD", nargs="+", default=[],
         help="rows by name, or groups: paraxial, published, ours, ablations (default: the first three)",

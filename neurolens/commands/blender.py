@@ -16,10 +16,10 @@ from neurolens.commands.arguments import (
     Parser,
     add_bare,
     add_json,
+    add_lens,
     bare_of,
     check_folder,
     check_suffix,
-    lens_argument,
     whole,
 )
 from neurolens.commands.output import answer
@@ -36,7 +36,7 @@ Finished lenses are kept: a build that was stopped goes on where it was, and a s
 
 Install it in Blender: Edit > Preferences > Get Extensions > Install from Disk."""
 _ADD = """\
-Put a model (.onnx) or a lens file (.toml) into the extension: into the user folder of an installed
+Put a model (.onnx) or a lens file of any format into the extension: into the user folder of an installed
 one (the newest Blender of this machine that has it), or into a zip. A form of a lens replaces the one
 that was there. In Blender, "Read Lenses Again" in the panel shows it."""
 
@@ -64,9 +64,7 @@ def add_parser(subparsers: Any) -> None:
     add_json(build, quiet=True)
     build.set_defaults(run=run_build, kept="no zip was written; finished shaders are kept for the next run")
     add = actions.add_parser("add", help="put a lens into the extension", description=_ADD)
-    add.add_argument(
-        "file", metavar="FILE", type=lens_argument(models=True), help="model (.onnx) or lens file of any format"
-    )
+    add_lens(add, "file", models=True)
     add.add_argument("--to", metavar="ZIP|DIR", type=Path, help="a packed extension, or a user folder of one")
     add_bare(add)
     add.add_argument("--zoom", metavar="STATE", help="state of a zoom, by name or focal length in mm; range: a setting")

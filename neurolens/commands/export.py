@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text, check_writable
-from neurolens.base.lensname import is_model, split_kind
-from neurolens.commands.arguments import add_bare, add_json, bare_of, lens_argument, positive
+from neurolens.base.lensname import FUSED, is_model
+from neurolens.commands.arguments import add_bare, add_json, add_lens, bare_of, positive
 from neurolens.commands.output import answer
 from neurolens.commands.render import film_size
 
@@ -66,9 +66,9 @@ def add_parser(subparsers: Any) -> None:
         "export", help="source code (C, GLSL, OSL) of a model; fix what a scene fixes", description=_DESCRIPTION,
         epilog=_EPILOG,
     )  # fmt: skip
-    parser.add_argument(
-        "model", metavar="MODEL", type=lambda text: Path(split_kind(lens_argument(models=True, cameras=True)(text))[1]),
-        help="exported model (.onnx), or a run folder with one model; of C, GLSL, OSL also a lens file or name",
+    add_lens(
+        parser, "model", "; a run folder with one model, a file of neurolens plan; of --to onnx models alone",
+        models=True, cameras=True, metavar="MODEL",
     )  # fmt: skip
     parser.add_argument("--to", choices=("c", "glsl", "osl", "onnx"), required=True, help="form to write")
     parser.add_argument("-o", "--out", metavar="FILE", type=Path, required=True, help="file to write")
@@ -113,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.cameras.source import model_extras
     from neurolens.surrogates.source import checked_name
 
-    file = model_file(args.model)
+    file = model_file(Path(args.model.removeprefix(FUSED)))
     parts = _parts(args.only)
     given = _given(args.fix)
     if args.to == "onnx" and (args.name is not None or set(parts) != set(_PARTS)):

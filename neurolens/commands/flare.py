@@ -14,12 +14,11 @@ from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import (
-    LENS_HELP,
     add_json,
+    add_lens,
     add_lens_state,
     check_folder,
     check_suffix,
-    lens_argument,
     state_of,
 )
 from neurolens.commands.flare_fit import add_fit, check_fit, fitted, run_fit, stopped
@@ -81,7 +80,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "flare", help="ghosts of lights: a table, and a picture with layers", description=_DESCRIPTION, epilog=_EPILOG
     )
-    parser.add_argument("file", metavar="LENS", type=lens_argument(models=True), help=f"{LENS_HELP}, or fitted ghosts")
+    add_lens(parser, "file", "; a model is one of fitted ghosts", models=True)
     add_lights(parser)
     parser.add_argument(
         "--coating", metavar="NAME",

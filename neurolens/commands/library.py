@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import atomic_path, atomic_write_text, library, write_json
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import LENS_HELP, add_json, lens_argument
+from neurolens.commands.arguments import add_json, add_lens
 from neurolens.commands.output import answer
 
 if TYPE_CHECKING:
@@ -41,9 +41,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "library", help="pages of lenses: pictures, figures, models", description=_DESCRIPTION, epilog=_EPILOG
     )
-    parser.add_argument(
-        "lenses", metavar="LENS", nargs="*", type=lens_argument(), help=f"{LENS_HELP} (default: all of lenses/)"
-    )
+    add_lens(parser, "lenses", " (default: all of lenses/)", nargs="*")
     parser.add_argument("-o", "--output", metavar="FOLDER", type=Path, required=True, help="for the pages")
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="finished pages are kept; the same command goes on")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text, library
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import LENS_HELP, add_glass, add_json, lens_argument
+from neurolens.commands.arguments import add_glass, add_json, add_lens
 from neurolens.commands.output import answer, number, table
 from neurolens.commands.plan_frames import run_plan_frames
 from neurolens.commands.render_frames import add_frames
@@ -54,7 +54,7 @@ def add_parser(subparsers: Any) -> None:
         epilog=_EPILOG,
     )  # fmt: skip
     parser.add_argument("scene", metavar="SCENE", type=Path, help="scene file (.toml)")
-    parser.add_argument("--lens", metavar="LENS", required=True, type=lens_argument(), help=LENS_HELP)
+    add_lens(parser, "--lens", required=True)
     parser.add_argument(
         "--budget", metavar="BUDGET", type=_budget, default=0.25,
         help="error allowed, as 0.25px (default); or as 0.02flip: mean FLIP of strips of the picture, at its own "

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import LENS_HELP, add_glass, add_json, lens_argument, whole
+from neurolens.commands.arguments import add_glass, add_json, add_lens, whole
 from neurolens.commands.output import answer, number, table
 from neurolens.commands.plan import TARGETS, add_look, look_of, pixels, shipped_models
 from neurolens.evaluate.records import plain
@@ -44,7 +44,7 @@ def add_parser(subparsers: Any) -> None:
         epilog=_EPILOG,
     )  # fmt: skip
     parser.add_argument("scene", metavar="SCENE", type=Path, help="scene file (.toml)")
-    parser.add_argument("--lens", metavar="LENS", required=True, type=lens_argument(), help=LENS_HELP)
+    add_lens(parser, "--lens", required=True)
     parser.add_argument(
         "--budget", metavar="PIXELS", type=pixels, default=0.25, help="whose choice is marked (default: 0.25px)"
     )

@@ -14,16 +14,7 @@ from neurolens.base.errors import InputError, NeurolensError, one_line
 from neurolens.base.files import fingerprint_of, sha256_of
 from neurolens.base.lensname import lens_id_of
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import (
-    LENS_HELP,
-    add_glass,
-    add_json,
-    check_ids,
-    check_run_folder,
-    lens_argument,
-    positive,
-    whole,
-)
+from neurolens.commands.arguments import add_glass, add_json, add_lens, check_ids, check_run_folder, positive, whole
 from neurolens.commands.farm import Task, add_dask, files_of, spread
 from neurolens.commands.output import answer, number, table
 from neurolens.evaluate.records import CLOSE_UM, to_use, use_command
@@ -63,10 +54,8 @@ def add_parser(subparsers: Any) -> None:
         "train", help="fit, measure and render the models of an experiment", description=_DESCRIPTION, epilog=_EPILOG
     )
     parser.add_argument("experiment", metavar="EXPERIMENT.toml", nargs="?", type=Path, help="experiment file")
-    parser.add_argument(
-        "--lens", metavar="LENS", type=lens_argument(), nargs="+",
-        help=f"{LENS_HELP}, instead of an experiment; of several, each has a run folder in DIR (runs)",
-    )  # fmt: skip
+    instead = ", instead of an experiment; of several, each has a run folder in DIR (runs)"
+    add_lens(parser, "--lens", instead, nargs="+")
     parser.add_argument(
         "--out", metavar="DIR", type=Path,
         help="run folder, made if needed (default: runs/NAME of the experiment or lens file)",

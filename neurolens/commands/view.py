@@ -17,7 +17,7 @@ from neurolens.base.errors import InputError, ModelError, NeurolensError, Neurol
 from neurolens.base.files import library as shipped
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, check_folder, check_suffix, lens_argument, whole
+from neurolens.commands.arguments import add_glass, add_json, add_lens, check_folder, check_suffix, whole
 from neurolens.commands.output import answer
 
 if TYPE_CHECKING:
@@ -71,8 +71,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "view", help="write a page that runs lenses and models in a browser", description=_DESCRIPTION, epilog=_EPILOG
     )
-    parser.add_argument("lenses", metavar="LENS|MODEL", nargs="*", type=lens_argument(models=True),
-        help="lens files of any format, models, names of either")  # fmt: skip
+    add_lens(parser, "lenses", models=True, metavar="LENS|MODEL", nargs="*")
     parser.add_argument(
         "-o", "--out", metavar="FILE.html", type=Path, default=Path("view.html"), help="page (default: view.html)"
     )
