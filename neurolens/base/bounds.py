@@ -5,6 +5,7 @@ from __future__ import annotations
 F_NUMBER = 0.1, 10_000.0
 FOCAL_MM = 1e-3, 1e6
 FILM_MM = 1e-3, 1e4  # a side
+WAVELENGTH_NM = 100.0, 20_000.0  # from lithography to thermal cameras
 RANGE = "range"  # as a zoom position: all of them
 
 

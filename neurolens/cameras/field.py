@@ -91,7 +91,7 @@ def frame_of(camera: Any) -> Frame:
 
         data, film = first_order(lens, meridian="x"), float(camera.settings["film_z_mm"])
         focal, pupil = (data.front_focal_z_mm, data.rear_focal_z_mm), data.entrance_pupil_z_mm
-        x = film_plane.reach_mm(data.efl_mm, focal, pupil, film), film - pupil
+        x = film_plane.reach_mm(data.efl_mm, data.front_efl_mm, focal, pupil, film), film - pupil
     else:
         (reach, _), (pupil, _) = _measured(camera)
         x = reach, pupil

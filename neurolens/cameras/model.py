@@ -389,15 +389,15 @@ def _state_of(scene: ModelScene, wavelength_nm: tuple[float, float], f_number: f
     """The table `lens_state` of the settings, by the first-order data of the card."""
     model, film_z = scene.model, scene.film_z_mm
     lens, radius = model.card["lens"], model.card["domain"]["film_radius_mm"]
-    efl = lens["efl_mm"]
-    focal_points = lens["front_principal_z_mm"] - efl, lens["rear_principal_z_mm"] + efl
+    efl, front_efl = lens["efl_mm"], lens["efl_mm"] * film_plane.index_ratio(lens)
+    focal_points = lens["front_principal_z_mm"] - front_efl, lens["rear_principal_z_mm"] + efl
     exit_z = float(lens.get("exit_pupil_z_mm", math.nan))
-    entrance = film_plane.entrance_pupil_z_mm(efl, focal_points, exit_z)
+    entrance = film_plane.entrance_pupil_z_mm(efl, front_efl, focal_points, exit_z)
     breathes = any(a.name == "focus" for a in model.axes)
     return lens_state(
         nominal_mm=None if breathes else efl,
         efl_mm=efl,
-        pinhole_mm=film_plane.reach_mm(efl, focal_points, entrance, film_z),
+        pinhole_mm=film_plane.reach_mm(efl, front_efl, focal_points, entrance, film_z),
         entrance_pupil_mm=film_z - entrance,
         f_number=f_number,
         transmittance=axial_transmittance(scene, wavelength_nm),
@@ -418,8 +418,7 @@ def _paraxial_film_z(model: OnnxLens, focus_m: float) -> float:
     lens, (near, far) = model.card["lens"], model.card["domain"]["film_z_mm"]
     if any(a.name == "focus" for a in model.axes):
         return float(lens["film_z_mm"])  # its groups have moved
-    planes = lens["front_principal_z_mm"], lens["rear_principal_z_mm"]
-    z = film_plane.film_z_mm(lens["efl_mm"], *planes, focus_m)
+    z = film_plane.film_z_of_card_mm(lens, focus_m)
     # A domain may hold the film of best focus alone: a millimetre from the paraxial one, of a singlet.
     least, most = sorted(float(v) for v in model.card["domain"]["focus_m"])
     if not (near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK or least <= focus_m <= most):

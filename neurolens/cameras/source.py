@@ -23,7 +23,7 @@ from neurolens.graph.program import STOP_RADIUS, Program
 from neurolens.graph.scalars import lower
 from neurolens.modelfile.axes import Axis, product
 from neurolens.modelfile.stategraph import state_names
-from neurolens.optics.film_plane import film_z_mm
+from neurolens.optics.film_plane import film_z_of_card_mm
 
 CAMERA_FRAME = """\
 Camera frame: metres, origin at the film's centre, the camera looks along -z, y up, x right. Film points are mm in the
@@ -131,10 +131,9 @@ def model_focusing(model: OnnxLens, state: Sequence[float] = (), stop_mm: float 
     light, widest = tuple(domain["wavelength_nm"]), float(domain["stop_radius_mm"])
     inside = any(a.name == "focus" for a in at.axes)  # its groups have moved
     nearest, ends = float(domain["focus_m"][1]), tuple(domain["film_z_mm"])
-    planes = lens["efl_mm"], lens["front_principal_z_mm"], lens["rear_principal_z_mm"]
 
     def paraxial(focus_m: float) -> float:
-        return float(lens["film_z_mm"]) if inside else film_z_mm(*planes, focus_m)
+        return float(lens["film_z_mm"]) if inside else film_z_of_card_mm(lens, focus_m)
 
     def best(focus_m: float, stops_mm: Array) -> Array:
         distance = nearest if inside else focus_m

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from neurolens.base.bounds import WAVELENGTH_NM, said
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.commands.arguments import (
     add_json,
@@ -79,8 +80,8 @@ def add_parser(subparsers: Any) -> None:
         help="fields of spots, fans, mtf and psf (default: axis, 50%%, 70%%, 85%% and edge of the field)",
     )  # fmt: skip
     parser.add_argument(
-        "--wavelengths", metavar="NM", nargs="+", type=between(300, 2500, "wavelengths in nm"),
-        help="of spots, fans, mtf and psf, 300 to 2500 nm, the reference first (default: the lines d, F and C)",
+        "--wavelengths", metavar="NM", nargs="+", type=between(*WAVELENGTH_NM, "wavelengths in nm"),
+        help=f"of spots, fans, mtf and psf, {said(WAVELENGTH_NM)} nm, the reference first (default: the lines d, F, C)",
     )  # fmt: skip
     parser.add_argument(
         "--axis", choices=("x", "y"), default="y", help="plane of the field, for anamorphic lenses (default: y)"

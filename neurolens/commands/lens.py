@@ -171,6 +171,8 @@ def _near(configuration: dict[str, Any]) -> bool:
 
 
 def _first_order(data: dict[str, Any]) -> str:
+    from neurolens.optics.film_plane import LINE_D_NM
+
     focus = "infinity" if math.isinf(data["focus_m"]) else f"{data['focus_m']:g} m"
     across = data["efl_x_mm"] is not None
     planes = f"{_mm(data['front_principal_z_mm'])}, {_mm(data['rear_principal_z_mm'])}"
@@ -187,6 +189,14 @@ def _first_order(data: dict[str, Any]) -> str:
         ("stop", f"surface {data['stop_surface']}", f"diameter {_mm(data['stop_diameter_mm'])}"),
         ("refractions", str(data["refractions"]), ""),
     ]
+    medium = data["object_medium"]
+    if medium["n_d"] != 1:
+        rows.append(("medium in front", f"n_d {medium['n_d']:.5f}", medium["material"] or medium["glass"] or ""))
+    if data["front_efl_mm"] != data["efl_mm"]:
+        rows.append(("front focal", _mm(data["front_efl_mm"]), "focal length of the object side, in its medium"))
+    if data["wavelength_nm"] != LINE_D_NM:
+        note = "of all this: the file's primary one, as its light does not hold the d line"
+        rows.append(("wavelength", f"{data['wavelength_nm']:g} nm", note))
     return _columns(rows)
 
 

@@ -57,6 +57,8 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
         **{key: getattr(lens, key) for key in ("name", "designer", "source", "rims", "sha256", "refractions")},
         **{key: float(value) for key, value in asdict(first_order(lens)).items()},
         "efl_x_mm": float(first_order(lens, meridian="x").efl_mm) if lens.anamorphic else None,
+        "wavelength_nm": lens.reference_nm,
+        "object_medium": {**asdict(lens.object_medium), "n_d": float(lens.object_medium.n_d)},
         "working_f_number": working_f_number(lens, domain, film_z),
         "film_z_mm": film_z,
         "focus_m": domain.focus_m[0],

@@ -89,7 +89,7 @@ def coated(lens: Lens, names: str) -> Lens:
     known = [f"s{k:02d}" for k in range(len(lens.surfaces))]
     if len(rest) > 1 or not set(single) <= set(known):
         raise InputError(lens.path, "coating", names, f"one design, and others as {known[0]}=NAME to {known[-1]}=NAME")
-    rows, before = [], 1.0
+    rows, before = [], float(lens.object_medium.n_d)
     for k, s in enumerate(lens.surfaces):
         bare = not (s.coating and s.coating.layers) and reflects(lens, k) and 1.0 in (before, float(s.n_d))
         name = single.get(known[k], rest[0] if bare and rest else None)

@@ -79,7 +79,7 @@ class Scatter:
                 inside = 0 <= last < len(rows)
                 tube = max(r, rows[last].semi_diameter_mm) if inside else 0.0
                 medium = rows[min(k, last)].n_d if inside else 1.0
-                bends = s.n_d != (rows[k - 1].n_d if k else 1.0)
+                bends = s.n_d != lens.media[k].n_d
                 dusty = -math.log1p(-min(self.dust, 1 - 1e-7)) if last < 0 else 0.0
                 found[k, way] = (
                     sense * (z[k] - z[last]) if inside else 0.0,

@@ -117,7 +117,7 @@ class Stack:
     def numbers(self, wavelength_nm: float) -> tuple[Floats, float]:
         """Numbers of the call [surfaces, actions, width] at a wavelength, and the last step's shift to the film."""
         lens, z = self.lens, [float(v) for v in self.lens.vertices_mm]
-        n = [1.0, *(float(glass.index_of(s, wavelength_nm)) for s in lens.surfaces)]
+        n = [float(glass.index_of(medium, wavelength_nm)) for medium in lens.media]
         a = [0.0, *(float(glass.absorption_of(s, wavelength_nm) or 0.0) for s in lens.surfaces)]
         found = np.zeros((len(lens.surfaces), len(ACTIONS), self.width), np.float32)
         for k, s in enumerate(lens.surfaces):
@@ -164,7 +164,7 @@ def entering(rays: Floats) -> Floats:
 def reflects(lens: Lens, k: int) -> bool:
     """Whether surface k reflects any light: the medium changes there, or it is coated."""
     coating = lens.surfaces[k].coating
-    return bool(coating and coating.layers) or not same_medium(lens.surfaces, k)
+    return bool(coating and coating.layers) or not same_medium(lens.surfaces, k, lens.object_medium)
 
 
 def function_text(graph: Graph, name: str, run: str, taken: str, given: str, numbers: str) -> str:

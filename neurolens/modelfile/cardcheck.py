@@ -92,6 +92,7 @@ _RULES: dict[str, Rule] = {
 }
 _OPTIONAL: dict[str, Rule] = {
     "lens.stop_surface": (lambda v: _integer(v, 0, 9999), "an integer"),
+    "lens.index_ratio": POSITIVE,
     "domain.nearest_m": (lambda v: v is None or _positive(v), "a number above 0, or null"),
     "errors.poor": (lambda v: isinstance(v, list) and all(isinstance(t, str) for t in v), "a list of texts"),
     "fit.settings.rays_seed": (lambda v: v is None or _integer(v, -(2**53), 2**53), "an integer up to 2^53, or null"),

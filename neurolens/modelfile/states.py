@@ -152,8 +152,9 @@ def mix_lens(nodes: Sequence[Mapping[str, Any]], weights: Array) -> dict[str, An
     are mixed, and the principal planes follow.
     """
     linear = _mixed_fields(nodes, weights, "f_number", "stop_radius_mm", "film_z_mm", "infinity_film_z_mm")
-    efl = 1 / _mixed([1 / n["efl_mm"] for n in nodes], weights)
-    front = efl * _mixed([(n["front_principal_z_mm"] - n["efl_mm"]) / n["efl_mm"] for n in nodes], weights) + efl
+    efl, ratio = 1 / _mixed([1 / n["efl_mm"] for n in nodes], weights), float(nodes[0].get("index_ratio", 1.0))
+    focal = [(n["front_principal_z_mm"] - ratio * n["efl_mm"]) / n["efl_mm"] for n in nodes]
+    front = efl * _mixed(focal, weights) + ratio * efl
     pupils = [n.get("exit_pupil_z_mm", "inf") for n in nodes]
     return {
         **nodes[0],

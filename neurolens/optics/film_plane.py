@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,16 +18,23 @@ _LEAST = 1e-3  # weight of a colour that the eye does not see: infrared light ha
 
 
 def film_z_mm(
-    efl_mm: float, front_principal_z_mm: float, rear_principal_z_mm: float, focus_m: float, file: str | Path = "camera"
+    efl_mm: float,
+    front_principal_z_mm: float,
+    rear_principal_z_mm: float,
+    focus_m: float,
+    file: str | Path = "camera",
+    ratio: float = 1.0,
 ) -> float:
     """Film plane (mm, frame of the principal planes) that focuses an object `focus_m` metres (or inf) from the film.
 
-    With D that distance less the separation of the principal planes, the image lies behind the rear one by the smaller
-    root of s'^2 - D s' + D f = 0. Written 2 D f / (D + sqrt(D (D - 4 f))) it keeps its digits: the usual form,
-    (D - sqrt(D (D - 4 f))) / 2, is the difference of two numbers that are nearly equal for a far object.
+    `ratio` r is the index of the medium in front of the lens over that of the medium behind it. With D the distance
+    less the separation of the principal planes, the image lies behind the rear one by the smaller root of
+    s'^2 - B s' + D f = 0, B = D + (1 - r) f. Written 2 D f / (B + sqrt(B^2 - 4 D f)) it keeps its digits: the usual
+    form, (B - sqrt(B^2 - 4 D f)) / 2, is the difference of two numbers that are nearly equal for a far object.
 
     Raises:
-        InputError: an object nearer than four focal lengths, or a distance that is not a positive number.
+        InputError: an object nearer than (1 + sqrt(r))^2 focal lengths, which are four in one medium, or a distance
+            that is not a positive number.
     """
     if not focus_m > 0:
         raise InputError(file, "focus_m", focus_m, "a distance in m above 0, or inf")
@@ -33,25 +42,44 @@ def film_z_mm(
         return rear_principal_z_mm + efl_mm
     separation = rear_principal_z_mm - front_principal_z_mm
     d = 1000.0 * focus_m - separation
-    if not (d > 0 and d >= 4 * efl_mm):
-        nearest = (max(4 * efl_mm, 0.0) + separation) / 1000
-        raise InputError(file, "focus_m", focus_m, f"at least {nearest:.4g} m, four focal lengths")
-    return rear_principal_z_mm + 2 * d * efl_mm / (d + math.sqrt(d * (d - 4 * efl_mm)))
+    lengths = (1 + math.sqrt(ratio)) ** 2
+    if not (d > 0 and d >= lengths * efl_mm):
+        nearest = (max(lengths * efl_mm, 0.0) + separation) / 1000
+        count = "four" if ratio == 1 else f"{lengths:.3g}"
+        raise InputError(file, "focus_m", focus_m, f"at least {nearest:.4g} m, {count} focal lengths")
+    b = d + (1 - ratio) * efl_mm
+    return rear_principal_z_mm + 2 * d * efl_mm / (b + math.sqrt(max(b * b - 4 * d * efl_mm, 0.0)))
 
 
-def reach_mm(efl_mm: float, focal_z_mm: tuple[float, float], entrance_pupil_z_mm: float, film_z_mm: float) -> float:
+def index_ratio(card_lens: Mapping[str, Any]) -> float:
+    """The index in front of a model's lens over that behind it, 1 where the card's table of the lens has none."""
+    return float(card_lens.get("index_ratio", 1.0))
+
+
+def film_z_of_card_mm(card_lens: Mapping[str, Any], focus_m: float) -> float:
+    """`film_z_mm` of the lens of a model's card."""
+    efl, front, rear = (card_lens[key] for key in ("efl_mm", "front_principal_z_mm", "rear_principal_z_mm"))
+    return film_z_mm(efl, front, rear, focus_m, ratio=index_ratio(card_lens))
+
+
+def reach_mm(
+    efl_mm: float, front_efl_mm: float, focal_z_mm: tuple[float, float], entrance_pupil_z_mm: float, film_z_mm: float
+) -> float:
     """Film height (mm) over the slope of the chief ray, of a lens known by its focal points, front and rear, and pupil.
 
-    f + x' e / f, with x' the film's distance behind the rear focal point and e the pupil's behind the front one.
+    f + x' e / f', with f and f' the focal lengths of the object and of the image side, x' the film's distance behind
+    the rear focal point and e the pupil's behind the front one.
     """
     film, pupil = film_z_mm - focal_z_mm[1], entrance_pupil_z_mm - focal_z_mm[0]
-    return float(efl_mm + film * pupil / efl_mm)
+    return float(front_efl_mm + film * pupil / efl_mm)
 
 
-def entrance_pupil_z_mm(efl_mm: float, focal_z_mm: tuple[float, float], exit_pupil_z_mm: float) -> float:
-    """The entrance pupil of which the exit pupil (inf allowed) is the image, by the focal points (x x' = -f^2)."""
+def entrance_pupil_z_mm(
+    efl_mm: float, front_efl_mm: float, focal_z_mm: tuple[float, float], exit_pupil_z_mm: float
+) -> float:
+    """The entrance pupil of which the exit pupil (inf allowed) is the image, by the focal points (x x' = -f f')."""
     behind = exit_pupil_z_mm - focal_z_mm[1]
-    return focal_z_mm[0] - efl_mm**2 / behind if behind else math.inf
+    return focal_z_mm[0] - efl_mm * front_efl_mm / behind if behind else math.inf
 
 
 def colours(range_nm: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

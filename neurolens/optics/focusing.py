@@ -19,7 +19,6 @@ from torch import Tensor
 
 from neurolens.base.errors import InputError
 from neurolens.optics import film_plane, paraxial
-from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Configuration, Focus, Lens
 from neurolens.optics.pupils import image_radius_mm
 from neurolens.optics.surfaces import Rays
@@ -214,11 +213,11 @@ def _mover(lens: Lens) -> tuple[FocusPath, Callable[[float], Lens]]:
 
 
 def _vergence(lens: Lens) -> float:
-    """1 / distance (1/mm) from the film to the object that is in focus on it; 0 for infinity (Newton: x x' = -f^2)."""
+    """1 / distance (1/mm) from the film to the object that is in focus on it; 0 for infinity (Newton: x x' = -f f')."""
     data = paraxial.first_order(lens)
     assert lens.film_z_mm is not None
     extension = lens.film_z_mm - data.rear_focal_z_mm
-    return float(extension / (data.efl_mm**2 + extension * (lens.film_z_mm - data.front_focal_z_mm)))
+    return float(extension / (data.efl_mm * data.front_efl_mm + extension * (lens.film_z_mm - data.front_focal_z_mm)))
 
 
 def _solve(excess: Callable[[float], float], furthest: float) -> float:
@@ -244,10 +243,9 @@ _SPARE = 0.05  # of a film range, added at both ends
 _NEAREST = 0.5  # of the way from the last surface to the paraxial image: no film of a range lies nearer
 
 
-def best_focus_z_mm(
-    lens: Lens, focus_m: float = math.inf, wavelength_nm: tuple[float, float] = (400.0, 700.0)
-) -> float:
-    """Film plane (lens frame, mm) of least RMS spot for the axial point `focus_m` metres from it, for a range of light.
+def best_focus_z_mm(lens: Lens, focus_m: float = math.inf, wavelength_nm: tuple[float, float] | None = None) -> float:
+    """Film plane (lens frame, mm) of least RMS spot for the axial point `focus_m` metres from it, for a range of light,
+    by default `Lens.light_nm`.
 
     Rays of the colours of `film_plane.colours` are spread evenly over the entrance pupil, and those that stop and rims
     let through count: the focus of a lens with spherical aberration shifts as it is stopped down. The plane follows in
@@ -261,7 +259,7 @@ def best_focus_z_mm(
     film_z = _paraxial_film_z_mm(lens, focus_m)
     if paraxial.is_pinhole(lens):
         return film_z
-    wavelengths, weights = film_plane.colours(wavelength_nm if lens.dispersive else (LINE_D_NM, LINE_D_NM))
+    wavelengths, weights = _colours(lens, wavelength_nm)
     for _ in range(1 if math.isinf(focus_m) else _ROUNDS):
         along, across = _moments(lens, film_z - 1000 * focus_m, wavelengths)
         w = torch.from_numpy(weights)[:, None, None]
@@ -271,11 +269,17 @@ def best_focus_z_mm(
     return film_z
 
 
+def _colours(lens: Lens, wavelength_nm: tuple[float, float] | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Wavelengths of best focus and their weights in a range, by default `Lens.light_nm`; one without dispersion."""
+    one = (lens.reference_nm, lens.reference_nm)
+    return film_plane.colours(wavelength_nm or lens.light_nm if lens.dispersive else one)
+
+
 _COARSER = 4.0  # stops below the widest by more are left to rays of their own: few rings lie within them
 
 
 def best_focus_of_stops_mm(
-    lens: Lens, focus_m: float, stops_mm: Sequence[float], wavelength_nm: tuple[float, float] = (400.0, 700.0)
+    lens: Lens, focus_m: float, stops_mm: Sequence[float], wavelength_nm: tuple[float, float] | None = None
 ) -> NDArray[np.float64]:
     """`best_focus_z_mm` at some stop radii up to the lens's own, of those of its rays that each lets through.
 
@@ -294,21 +298,22 @@ def best_focus_of_stops_mm(
     if small.any():
         narrow = lens.with_stop_radius(widest / _COARSER)
         found[small] = best_focus_of_stops_mm(narrow, focus_m, stops[small].tolist(), wavelength_nm)
-    wavelengths, weights = film_plane.colours(wavelength_nm if lens.dispersive else (LINE_D_NM, LINE_D_NM))
+    wavelengths, weights = _colours(lens, wavelength_nm)
     moments = _moments(lens, whole - 1000 * focus_m, wavelengths, at_stop=True)
     along, across, squared = (m.numpy() for m in moments)
     # Rings are of equal areas: those at the edge count in part.
     ring = (_WIDER * widest) ** 2 / along.shape[1]
     share = ((stops[~small, None, None, None] ** 2 - squared) / ring + 0.5).clip(0, 1) * weights[:, None, None]
     z = -(share * along).sum((1, 2, 3)) / (share * across).sum((1, 2, 3))
-    # The object keeps its distance from the film: where that moves, its image moves by the square of its scale.
+    # The object keeps its distance from the film: where that moves, its image moves by the square of its scale, times
+    # the index behind the lens over that in front.
     data = paraxial.first_order(lens)
     scale = 0.0 if math.isinf(focus_m) else float((whole - data.rear_focal_z_mm) / data.efl_mm)
-    found[~small] = z + (z - whole) * scale**2
+    found[~small] = z + (z - whole) * scale**2 * (data.efl_mm / data.front_efl_mm)
     return found
 
 
-def best_focused(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float] = (400.0, 700.0)) -> Lens:
+def best_focused(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float] | None = None) -> Lens:
     """A lens that `Lens.at` has placed, by film or groups, with its film where `best_focus_z_mm` says."""
     return replace(lens, film_z_mm=best_focus_z_mm(lens, focus_m, wavelength_nm))
 
@@ -439,7 +444,7 @@ def breathing(lens: Lens, focus_m: Sequence[float], focus: Focus = "paraxial") -
                 magnification=float(-extension / data.efl_mm),
                 field_deg=2 * math.degrees(math.atan2(radius, reach)),
                 film_z_mm=float(state.film_z_mm),
-                working_f_number=float(abs(reach) / data.entrance_pupil_diameter_mm),
+                working_f_number=float(abs(reach * data.efl_mm / data.front_efl_mm) / data.entrance_pupil_diameter_mm),
             )
         )
     return found

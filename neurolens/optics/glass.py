@@ -12,14 +12,11 @@ from typing import Any
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics import catalogue
 from neurolens.optics.catalogue import LINE_C_NM, LINE_D_NM, LINE_F_NM, Glass
-from neurolens.optics.prescription import Surface
+from neurolens.optics.prescription import VISIBLE_NM, Medium, Surface
 
 # How far a stated n_d or V_d may be from the catalogue's: rounding to three decimals and one, and other melts.
 TOLERANCE_N_D = 5e-4
 TOLERANCE_V_D = 0.5
-
-# The visible range, nm: extrapolation of a formula inside it is worth a warning.
-VISIBLE_NM = (400.0, 700.0)
 
 # Glasses looked up so far. A plain dictionary, because torch.compile can trace through it to the coefficients.
 _FOUND: dict[str, Glass] = {}
@@ -65,10 +62,10 @@ def by_figures(name: str, n_d: float, V_d: float, place: str) -> dict[str, Any]:
     return {"n_d": n_d, "V_d": V_d, "material": name}
 
 
-def index_of(surface: Surface, wavelength_nm: Any) -> Any:
-    """Refractive index of the medium after a surface at a wavelength in nm (number, or tensor of any shape).
+def index_of(surface: Surface | Medium, wavelength_nm: Any) -> Any:
+    """Refractive index of a medium, or of that after a surface, at a wavelength in nm (number, or tensor of any shape).
 
-    The catalogue's where the surface names a glass; else by its n_d and V_d, constant where V_d is unknown.
+    The catalogue's where it names a glass; else by its n_d and V_d, constant where V_d is unknown.
 
     Raises:
         InputError: a glass that the catalogue does not have, or one beside an n_d whose gradient is wanted.

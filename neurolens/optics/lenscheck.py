@@ -133,8 +133,7 @@ def _back_focus(lens: Lens, computed: float, efl: float) -> Check:
 
 def _focused(lens: Lens, data: FirstOrder, c: Configuration) -> Iterator[Check]:
     """The image of an object at the state's distance against the tabled film."""
-    distance = (c.object_distance_mm or 0.0) + data.front_principal_z_mm
-    image_z = data.rear_principal_z_mm + 1 / (1 / data.efl_mm - 1 / distance)
+    image_z = data.image_z_mm(-(c.object_distance_mm or 0.0))
     if lens.stated_efl_mm is not None:
         yield _focal_length(lens, data.efl_mm, lens.stated_efl_mm)
     yield _back_focus(lens, image_z - float(lens.vertices_mm[-2]), data.efl_mm)
@@ -289,7 +288,7 @@ def film_edge_mm(lens: Lens) -> float | None:
         r = out.rays
         return abs(float(r.x + (first_order(lens).rear_focal_z_mm - r.z) * r.dx / r.dz))
     if lens.half_field_deg < 60:
-        return abs(first_order(lens).efl_mm) * math.tan(math.radians(lens.half_field_deg))
+        return abs(first_order(lens).front_efl_mm) * math.tan(math.radians(lens.half_field_deg))
     return None
 
 

@@ -13,15 +13,17 @@ The format, complete; keys marked optional may be left out:
     half_field_deg = 23.3       # optional, from the axis
     rims = "source"             # where the diameters come from: "source", "estimated" (by somebody) or "derived"
     notes = "..."               # optional: what was corrected or estimated, and why
+    wavelengths_nm = [587.6, 486.1, 656.3]       # optional: of the source, its primary wavelength first
+    object_medium = { n_d = 1.333, V_d = 55.8 }  # optional: in front of the lens (or glass = "..."); else air
 
     # From the scene to the film, one row per surface, numbered from 0.
     # radius_mm: positive when the centre of curvature lies towards the film, inf for a plane.
     # thickness_mm: to the next surface; the last one to the film. diameter_mm: full clear diameter; with
     # rims = "derived" it may be left out, and follows from f-number and field (see `rims`).
-    # n_d, V_d: of the glass after the surface; without n_d it is air. V_d may be left out where unknown: the index
-    # is then constant. glass: name in the catalogue, whose dispersion then rules over n_d and V_d (which may be left
-    # out; they are needed where the catalogue does not know the name). material: name of the glass in the source, for
-    # people only. stop = true: the aperture stop, one row.
+    # n_d, V_d: of the medium after the surface, in the last row that in which the film lies; without n_d it is air. V_d
+    # may be left out where unknown: the index is then constant. glass: name in the catalogue, whose dispersion then
+    # rules over n_d and V_d (which may be left out; they are needed where the catalogue does not know the name).
+    # material: name of the glass in the source, for people only. stop = true: the aperture stop, one row.
     # Optional: conic (Schwarzschild's constant K, 0 a sphere, -1 a paraboloid), asphere (power = coefficient:
     # sag = conic + sum A_p r^p, mm), cylinder = "x" or "y" (the axis along which it is curved; across_mm: a toroid, the
     # curve turned about a line parallel to that axis at this radius; across_conic, too: a biconic, whose sections have
@@ -61,12 +63,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.bounds import WAVELENGTH_NM, said, within
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.tomlfile import read_toml, reject_unknown
 from neurolens.optics import catalogue, designs
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.glass import by_figures, check_against_table, index_at
-from neurolens.optics.prescription import Coating, Configuration, Lens, Surface
+from neurolens.optics.prescription import Coating, Configuration, Lens, Medium, Surface
 from neurolens.optics.sag import check_clearance
 
 SCHEMA = 1
@@ -81,8 +84,10 @@ MAX_INDEX = 4.5  # germanium, the densest lens material there is, has 4.0
 RIMS = ("source", "estimated", "derived")
 LENS_KEYS = (
     *("schema", "name", "designer", "source", "f_number", "efl_mm", "efl_x_mm", "image_radius_mm", "half_field_deg"),
-    *("rims", "notes", "surfaces", "coating", "configuration", "aperture"),
+    *("rims", "notes", "surfaces", "coating", "configuration", "aperture", "object_medium", "wavelengths_nm"),
 )
+MEDIUM_KEYS = ("n_d", "V_d", "glass", "material")
+MAX_WAVELENGTHS = 100
 SURFACE_KEYS = (
     *("radius_mm", "thickness_mm", "diameter_mm", "n_d", "V_d", "glass", "material", "stop", "conic", "asphere"),
     *("cylinder", "across_mm", "across_conic", "focal_mm", "absorption_per_mm", "coating"),
@@ -185,7 +190,8 @@ def read_lens(path: str | Path, data: Mapping[str, Any] | None = None) -> Lens:
     table.only(LENS_KEYS)
     if data.get("schema") != SCHEMA or isinstance(data["schema"], bool):
         raise table.error("schema", data.get("schema", "(missing)"), f"{SCHEMA}, the version of the format")
-    surfaces = _surfaces(table)
+    medium = _object_medium(table)
+    surfaces = _surfaces(table, medium)
     if data.get("rims", "(missing)") not in RIMS:
         expected = 'where the diameters come from: "source", "estimated" or "derived"'
         raise table.error("rims", data.get("rims", "(missing)"), expected)
@@ -204,6 +210,8 @@ def read_lens(path: str | Path, data: Mapping[str, Any] | None = None) -> Lens:
         aperture=_aperture(table),
         stated_efl_mm=table.optional("efl_mm"),
         stated_efl_x_mm=table.optional("efl_x_mm"),
+        object_medium=medium,
+        wavelengths_nm=_wavelengths(table),
     )
     lens = _with_rims(lens, table)
     check_states(lens)
@@ -237,7 +245,26 @@ def _with_rims(lens: Lens, table: Table) -> Lens:
     return with_derived_rims(lens)
 
 
-def _surfaces(table: Table) -> tuple[Surface, ...]:
+def _object_medium(table: Table) -> Medium:
+    given = table.data.get("object_medium", {})
+    if not isinstance(given, Mapping):
+        raise table.error("object_medium", given, "a table such as { n_d = 1.333, V_d = 55.8 }")
+    row = Table(given, table.file, "object_medium, ")
+    row.only(MEDIUM_KEYS)
+    return Medium(**_glass(row))
+
+
+def _wavelengths(table: Table) -> tuple[float, ...]:
+    given, expected = table.data.get("wavelengths_nm", []), f"a list of wavelengths {said(WAVELENGTH_NM)} nm"
+    if not isinstance(given, list) or len(given) > MAX_WAVELENGTHS:
+        raise table.error("wavelengths_nm", given, expected)
+    for value in given:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not within(WAVELENGTH_NM, value):
+            raise table.error("wavelengths_nm", value, expected)
+    return tuple(float(value) for value in given)
+
+
+def _surfaces(table: Table, in_front: Medium) -> tuple[Surface, ...]:
     rows = table.data.get("surfaces", "(missing)")
     if not isinstance(rows, list) or not rows:
         raise table.error("surfaces", rows, "a list of tables, one per surface")
@@ -249,7 +276,7 @@ def _surfaces(table: Table) -> tuple[Surface, ...]:
         if not isinstance(row, Mapping):
             expected = "a table such as { radius_mm = 50.0, thickness_mm = 5.0, diameter_mm = 20.0 }"
             raise table.error(f"surface {k}", row, expected)
-        before = surfaces[-1].n_d if surfaces else 1.0
+        before = surfaces[-1].n_d if surfaces else in_front.n_d
         surfaces.append(_surface(Table(row, table.file, f"surface {k}, "), before, known))
     stops = [k for k, s in enumerate(surfaces) if s.stop]
     if len(stops) != 1:
@@ -257,8 +284,6 @@ def _surfaces(table: Table) -> tuple[Surface, ...]:
         raise table.error("surfaces", found, "exactly one row with stop = true")
     if (terms := sum(len(s.asphere) for s in surfaces)) > MAX_TERMS:
         raise table.error("surfaces", f"({terms} aspheric coefficients)", f"at most {MAX_TERMS}")
-    if surfaces[-1].n_d != 1:
-        raise table.error(f"surface {len(rows) - 1}, n_d", surfaces[-1].n_d, "air between last surface and film")
     return tuple(surfaces)
 
 

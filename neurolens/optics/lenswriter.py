@@ -9,8 +9,8 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.base.tomlfile import format_value
 from neurolens.optics.designs import is_design
-from neurolens.optics.lensfile import SCHEMA
-from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.lensfile import MEDIUM_KEYS, SCHEMA
+from neurolens.optics.prescription import Lens, Medium, Surface
 
 ROWS_COMMENT = """\
 # From the scene to the film, numbered from 0. radius_mm is positive when the centre of curvature lies towards the film;
@@ -42,11 +42,15 @@ def format_lens(lens: Lens) -> str:
         "image_radius_mm": lens.image_radius_mm,
         "half_field_deg": lens.half_field_deg,
         "rims": lens.rims,
+        "wavelengths_nm": list(lens.wavelengths_nm) or None,
     }
     lines = [f"{key} = {format_value(value)}" for key, value in head.items() if value is not None]
     notes = " ".join(text for text in (lens.notes, lens.derived) if text)
     if notes:
         lines.append(f"notes = {_wrapped(notes)}")
+    if lens.object_medium != Medium():
+        medium = ((key, getattr(lens.object_medium, key)) for key in MEDIUM_KEYS)
+        lines.append(f"object_medium = {format_value({key: value for key, value in medium if value is not None})}")
     text = "\n".join(lines) + "\n\n" + ROWS_COMMENT + "surfaces = [\n" + _rows(lens) + "]\n"
     for name, layers in _stacks(lens).items():
         text += f"\n[[coating]]\nname = {format_value(name)}\nlayers = {format_value(layers)}\n"
@@ -62,7 +66,7 @@ def format_lens(lens: Lens) -> str:
 
 def _stacks(lens: Lens) -> dict[str, tuple[tuple[float, ...], ...]]:
     """Layers by name of the coatings that are no designs: those follow from their name and the glass they are on."""
-    found, before = {}, 1.0
+    found, before = {}, float(lens.object_medium.n_d)
     for s in lens.surfaces:
         if s.coating and not is_design(s.coating, before, float(s.n_d)):
             found[s.coating.name] = s.coating.layers

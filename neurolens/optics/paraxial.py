@@ -1,4 +1,4 @@
-"""First-order (paraxial) data: focal length, principal planes, pupils, focus. Plain numbers, d line by default."""
+"""First-order (paraxial) data: focal length, principal planes, pupils, focus, by default at `Lens.reference_nm`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 from neurolens.base.errors import InputError
 from neurolens.optics import film_plane
-from neurolens.optics.glass import LINE_D_NM, index_of
+from neurolens.optics.glass import index_of
 from neurolens.optics.prescription import Lens
 
 Meridian = Literal["x", "y"]
@@ -16,16 +16,18 @@ Meridian = Literal["x", "y"]
 
 @dataclass(frozen=True)
 class FirstOrder:
-    """First-order data of a lens in air, lens frame, mm.
+    """First-order data of a lens, lens frame, mm.
 
     Attributes:
-        efl_mm: effective focal length (negative for a diverging lens).
+        efl_mm: effective focal length, of the image side (negative for a diverging lens): -y / u' of a ray that comes
+            parallel to the axis. The media are those of the lens, wherever it stands.
         back_focus_mm: last vertex to rear focal point.
         rear_focal_z_mm, front_focal_z_mm: focal points on the axis.
         rear_principal_z_mm, front_principal_z_mm: H' and H.
         entrance_pupil_z_mm, entrance_pupil_diameter_mm: paraxial image of the stop seen from the scene.
         exit_pupil_z_mm, exit_pupil_diameter_mm: seen from the film; z is infinite for an image-telecentric lens.
         f_number: efl / entrance-pupil diameter; infinite for a closed stop.
+        front_efl_mm: focal length of the object side: efl_mm times the index in front over that behind.
     """
 
     efl_mm: float
@@ -39,6 +41,11 @@ class FirstOrder:
     exit_pupil_z_mm: float
     exit_pupil_diameter_mm: float
     f_number: float
+    front_efl_mm: float
+
+    def image_z_mm(self, object_z_mm: float) -> float:
+        """Paraxial image (mm) of a point on the axis, by Newton's x x' = -f f'."""
+        return self.rear_focal_z_mm - self.efl_mm * self.front_efl_mm / (object_z_mm - self.front_focal_z_mm)
 
 
 @dataclass(frozen=True)
@@ -86,10 +93,11 @@ class PathOfRay(NamedTuple):
     after: list[Any]
 
 
-def system_of(lens: Lens, wavelength_nm: float = LINE_D_NM, meridian: Meridian = "y") -> System:
-    """The lens in one meridian at one wavelength."""
+def system_of(lens: Lens, wavelength_nm: float | None = None, meridian: Meridian = "y") -> System:
+    """The lens in one meridian at one wavelength; None takes `Lens.reference_nm`."""
+    light = lens.reference_nm if wavelength_nm is None else wavelength_nm
     curvature = [s.vertex_curvature(meridian) for s in lens.surfaces]
-    index = [1.0, *(index_of(s, wavelength_nm) for s in lens.surfaces)]
+    index = [index_of(medium, light) for medium in lens.media]
     ideal = [0.0 if s.focal_mm is None else 1 / s.focal_mm for s in lens.surfaces]
     return System(curvature, [s.thickness_mm for s in lens.surfaces[:-1]], index, ideal)
 
@@ -105,8 +113,9 @@ def _pupil(system: System, stop: int) -> tuple[Any, Any]:
     return distance, (level.y[-1] + level.after[-1] * distance if math.isfinite(distance) else math.inf)
 
 
-def first_order(lens: Lens, wavelength_nm: float = LINE_D_NM, meridian: Meridian = "y") -> FirstOrder:
-    """First-order data at one wavelength; of one meridian, where a lens has cylinders, toroids or biconics.
+def first_order(lens: Lens, wavelength_nm: float | None = None, meridian: Meridian = "y") -> FirstOrder:
+    """First-order data at one wavelength (None: `Lens.reference_nm`); of one meridian, where a lens has cylinders,
+    toroids or biconics.
 
     For a lens without power (a pinhole, filters before or behind it) the film's centre counts as the focal point, and
     the distance from the hole to the film, by which it maps angles to the film, as the focal length.
@@ -121,9 +130,10 @@ def first_order(lens: Lens, wavelength_nm: float = LINE_D_NM, meridian: Meridian
     if u == 0:
         if not is_pinhole(lens):
             raise InputError(lens.path, "surfaces", "(an afocal system)", "a lens with a finite focal length")
-        return _pinhole(lens, system.index)
+        return _pinhole(lens, system)
     back = turned.march(1.0, 0.0)
     efl, back_focus = -1.0 / u, -y / u
+    front_efl = efl * (system.index[0] / system.index[-1])
     rear_focal, front_focal = last_z + back_focus, back.y[-1] / back.after[-1]
     exit_distance, exit_magnification = _pupil(system, lens.stop_index)
     entrance_distance, entrance_magnification = _pupil(turned, len(lens.surfaces) - 1 - lens.stop_index)
@@ -135,12 +145,13 @@ def first_order(lens: Lens, wavelength_nm: float = LINE_D_NM, meridian: Meridian
         rear_focal_z_mm=rear_focal,
         front_focal_z_mm=front_focal,
         rear_principal_z_mm=rear_focal - efl,
-        front_principal_z_mm=front_focal + efl,
+        front_principal_z_mm=front_focal + front_efl,
         entrance_pupil_z_mm=-entrance_distance,
         entrance_pupil_diameter_mm=entrance_diameter,
         exit_pupil_z_mm=last_z + exit_distance,
         exit_pupil_diameter_mm=opening * abs(exit_magnification),
         f_number=abs(efl) / entrance_diameter if entrance_diameter else math.inf,
+        front_efl_mm=front_efl,
     )
 
 
@@ -150,18 +161,17 @@ def is_pinhole(lens: Lens) -> bool:
     return flat and not lens.ideal
 
 
-def _pinhole(lens: Lens, indices: list[Any]) -> FirstOrder:
+def _pinhole(lens: Lens, system: System) -> FirstOrder:
     """The data of a hole among planes: planes shorten what lies behind them, seen from the other side, by n."""
-    k, n = lens.stop_index, len(lens.surfaces)
-    depth = [s.thickness_mm / i for s, i in zip(lens.surfaces, indices[1:], strict=True)]
+    k, n, front, rear = lens.stop_index, len(lens.surfaces), system.index[0], system.index[-1]
+    depth = [s.thickness_mm / i for s, i in zip(lens.surfaces, system.index[1:], strict=True)]
     last_z = lens.vertices_mm[n - 1]
     film = lens.vertices_mm[n] if lens.film_z_mm is None else lens.film_z_mm
-    behind, opening = sum(depth[k : n - 1]), 2 * lens.stop_radius_mm
-    entrance, exit_, efl = sum(depth[:k]), last_z - behind, film - last_z + behind
-    f_number = efl / opening if opening else math.inf
-    return FirstOrder(
-        efl, film - last_z, film, entrance - efl, exit_, entrance, entrance, opening, exit_, opening, f_number
-    )
+    behind, opening = rear * sum(depth[k : n - 1]), 2 * lens.stop_radius_mm
+    entrance, exit_, efl = front * sum(depth[:k]), last_z - behind, film - last_z + behind
+    f_number, front_efl = efl / opening if opening else math.inf, efl * (front / rear)
+    planes = film, entrance - front_efl, exit_, entrance
+    return FirstOrder(efl, film - last_z, *planes, entrance, opening, exit_, opening, f_number, front_efl)
 
 
 def chief_reach_mm(lens: Lens) -> float:
@@ -169,7 +179,7 @@ def chief_reach_mm(lens: Lens) -> float:
     data = first_order(lens)
     assert lens.film_z_mm is not None
     focal_points = data.front_focal_z_mm, data.rear_focal_z_mm
-    return film_plane.reach_mm(data.efl_mm, focal_points, data.entrance_pupil_z_mm, lens.film_z_mm)
+    return film_plane.reach_mm(data.efl_mm, data.front_efl_mm, focal_points, data.entrance_pupil_z_mm, lens.film_z_mm)
 
 
 def framing_mm(lens: Lens, focus_m: float) -> tuple[float, float]:
@@ -208,12 +218,12 @@ def film_z_mm(lens: Lens, focus_m: float) -> float:
     if is_pinhole(lens):
         return float(data.rear_focal_z_mm)
     planes = data.front_principal_z_mm, data.rear_principal_z_mm
-    return film_plane.film_z_mm(data.efl_mm, *planes, focus_m, file=lens.path)
+    return film_plane.film_z_mm(data.efl_mm, *planes, focus_m, lens.path, data.front_efl_mm / data.efl_mm)
 
 
 def image_z_mm(lens: Lens, object_z_mm: float) -> float:
-    """Paraxial image of a point on the axis, lens frame, at the d line (x x' = -f^2); of a pinhole, the film."""
+    """Paraxial image of a point on the axis, lens frame, at `Lens.reference_nm`; of a pinhole, the film."""
     data = first_order(lens)
     if is_pinhole(lens):
         return float(data.rear_focal_z_mm)
-    return float(data.rear_focal_z_mm - data.efl_mm**2 / (object_z_mm - data.front_focal_z_mm))
+    return float(data.image_z_mm(object_z_mm))

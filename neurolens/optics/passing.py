@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.optics import glass
+from neurolens.optics import glass, prescription
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.shapes import intersect_shape, is_plain
@@ -40,9 +40,9 @@ def media(lens: Lens, wavelength_nm: Tensor | float) -> list[Medium]:
 
     `wavelength_nm` is a number or a tensor [N]; a dispersive medium has the shape of the wavelength.
     """
-    known: dict[Any, Medium] = {_medium_key(None): AIR}
-    found = [AIR]
-    for s in lens.surfaces:
+    known: dict[Any, Medium] = {"air": AIR}
+    found = []
+    for s in lens.media:
         key = _medium_key(s)
         if key not in known:
             known[key] = medium(glass.index_of(s, wavelength_nm))
@@ -52,11 +52,12 @@ def media(lens: Lens, wavelength_nm: Tensor | float) -> list[Medium]:
 
 def absorption_per_mm(lens: Lens, wavelength_nm: Tensor | float) -> list[Any]:
     """Napierian absorption of the media from the scene to the film, in 1/mm; None where there is none."""
+    # What the medium in front of the lens absorbs is a matter of the scene.
     return [None, *(glass.absorption_of(s, wavelength_nm) for s in lens.surfaces)]
 
 
-def _medium_key(s: Surface | None) -> Any:
-    if s is None or (s.glass is None and s.V_d is None and not isinstance(s.n_d, Tensor) and s.n_d == 1):
+def _medium_key(s: Surface | prescription.Medium) -> Any:
+    if s.glass is None and s.V_d is None and not isinstance(s.n_d, Tensor) and s.n_d == 1:
         return "air"
     return (s.glass, None if s.glass else (id(s.n_d) if isinstance(s.n_d, Tensor) else float(s.n_d), s.V_d))
 

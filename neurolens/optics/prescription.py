@@ -7,14 +7,16 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from typing import Any, Literal
 
 from neurolens.base.errors import InputError
 from neurolens.base.lensname import lens_id_of
 from neurolens.optics.apertures import Aperture
+from neurolens.optics.film_plane import LINE_D_NM
 
 Focus = Literal["best", "paraxial", "internal"]
+VISIBLE_NM = (400.0, 700.0)
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,16 @@ class Surface:
 
 
 @dataclass(frozen=True)
+class Medium:
+    """The medium in front of a lens, described by the fields of `Surface` that describe the medium after a surface."""
+
+    n_d: Any = 1.0
+    V_d: float | None = None
+    material: str | None = None
+    glass: str | None = None
+
+
+@dataclass(frozen=True)
 class Configuration:
     """A zoom or focus state of the source: thicknesses that replace those of the table, by surface index.
 
@@ -126,6 +138,9 @@ class Lens:
         aperture: shape of the stop's opening inside its rim, None where round.
         derived: description of what is not from the source (a zoom between its states).
         infinity_mm: thicknesses at infinity focus, by surface index, of the groups that `at` has moved to focus.
+        object_medium: medium in front of the first surface. The medium behind the last surface, in which the film
+            lies, is that of the last row of `surfaces`.
+        wavelengths_nm: wavelengths that the source designs the lens for, its primary one first; empty if unknown.
     """
 
     name: str
@@ -145,6 +160,28 @@ class Lens:
     aperture: Aperture | None = None
     derived: str = ""
     infinity_mm: tuple[tuple[int, Any], ...] = ()
+    object_medium: Medium = Medium()
+    wavelengths_nm: tuple[float, ...] = ()
+
+    @property
+    def media(self) -> tuple[Medium | Surface, ...]:
+        """The media from the scene to the film, one more than surfaces: media[k] lies in front of surface k."""
+        return (self.object_medium, *self.surfaces)
+
+    @property
+    def visible(self) -> bool:
+        """Whether the d line lies within the wavelengths of the source, or the source states none."""
+        return not self.wavelengths_nm or min(self.wavelengths_nm) <= LINE_D_NM <= max(self.wavelengths_nm)
+
+    @property
+    def reference_nm(self) -> float:
+        """Wavelength of first-order data and analyses: the d line, or the source's primary one for other light."""
+        return LINE_D_NM if self.visible else self.wavelengths_nm[0]
+
+    @property
+    def light_nm(self) -> tuple[float, float]:
+        """Range of wavelengths that the lens is made for: visible light, or the source's range for other light."""
+        return VISIBLE_NM if self.visible else (min(self.wavelengths_nm), max(self.wavelengths_nm))
 
     @property
     def vertices_mm(self) -> list[Any]:
@@ -182,13 +219,12 @@ class Lens:
     @property
     def dispersive(self) -> bool:
         """Whether the index of any glass is known to change with wavelength."""
-        return any(s.V_d is not None or s.glass is not None for s in self.surfaces)
+        return any(m.V_d is not None or m.glass is not None for m in self.media)
 
     @property
     def refractions(self) -> int:
-        """Surfaces at which the medium changes: the stop and other surfaces in air do not count."""
-        before = [1.0, *(float(s.n_d) for s in self.surfaces)]
-        return sum(a != b for a, b in zip(before, before[1:], strict=False))
+        """Surfaces at which the medium changes: the stop and other surfaces in one medium do not count."""
+        return sum(float(a.n_d) != float(b.n_d) for a, b in pairwise(self.media))
 
     @property
     def lens_id(self) -> str:
@@ -200,6 +236,8 @@ class Lens:
         """Hash of the figures that decide where rays go (glass only: neither film nor stop opening nor texts)."""
         rows = [_figures(s) for s in self.surfaces]
         rows[-1][1] = None
+        if self.object_medium != Medium():
+            rows.append([float(self.object_medium.n_d), self.object_medium.V_d, self.object_medium.glass])
         return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
 
     @property
@@ -217,7 +255,7 @@ class Lens:
         field_deg: float | None = None,
         zoom: str | float | None = None,
         focus: Focus = "paraxial",
-        wavelength_nm: tuple[float, float] = (400.0, 700.0),
+        wavelength_nm: tuple[float, float] | None = None,
     ) -> Lens:
         """The same lens in another state; `neurolens.optics.states` does the work.
 
@@ -235,7 +273,7 @@ class Lens:
             focus: "paraxial" moves the film as the paraxial image does; "best", which cameras and commands take, to the
                 least RMS spot of the axial point (`focusing.best_focus_z_mm`); "internal" moves the groups as
                 the file's focus states do, film fixed.
-            wavelength_nm: range of the light that "best" focuses.
+            wavelength_nm: range of the light that "best" focuses; None takes `light_nm`.
 
         Raises:
             InputError: an unknown state, a focal length beyond the zoom's range, a value that is not positive, a focus
@@ -243,7 +281,8 @@ class Lens:
         """
         from neurolens.optics import states  # states need this module's types
 
-        return states.at(self, focus_m, f_number, focal_length_mm, field_deg, zoom, focus, wavelength_nm)
+        light = wavelength_nm or self.light_nm
+        return states.at(self, focus_m, f_number, focal_length_mm, field_deg, zoom, focus, light)
 
     def scaled(self, factor: float) -> Lens:
         """All lengths times `factor`; angles, indices and f-number stay.

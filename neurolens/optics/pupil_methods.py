@@ -16,7 +16,6 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays, pupil_plane_z_mm
@@ -74,14 +73,14 @@ class RadialPupil:
 
 
 def passes_through(lens: Lens, pupil_z_mm: float) -> Passes:
-    """Whether rays from the film of a focused lens through points of a plane pass the lens, at the d line."""
+    """Whether rays from the film of a focused lens through points of a plane pass the lens, at `Lens.reference_nm`."""
     film_z = _film_z_mm(lens)
 
     def passes(radius: Array, points: Array) -> NDArray[np.bool_]:
         x, u, v = (torch.from_numpy(np.ascontiguousarray(a)) for a in (radius, *points))
         rays = camera_rays(x, torch.zeros_like(x), film_z, u, v, pupil_z_mm)
         with torch.no_grad():
-            return trace(lens, rays, LINE_D_NM).status.numpy() == 0
+            return trace(lens, rays).status.numpy() == 0
 
     return passes
 

@@ -355,7 +355,7 @@ def image_radius_mm(lens: Lens) -> tuple[float, str]:
     """
     if lens.image_radius_mm is not None:
         return lens.image_radius_mm, "the lens file"
-    f = first_order(lens).efl_mm
+    f = first_order(lens).front_efl_mm  # of angles in the medium in front
     if lens.half_field_deg is not None and lens.half_field_deg < 60:
         return f * math.tan(math.radians(lens.half_field_deg)), "f tan(half field)"
     radii = torch.linspace(0, 3 * abs(f), 481, dtype=torch.float64)

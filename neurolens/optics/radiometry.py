@@ -22,7 +22,6 @@ from torch import Tensor
 
 from neurolens.base.errors import InputError
 from neurolens.optics.aiming import without_rims
-from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays, pupil_bounds, pupil_plane_z_mm
 from neurolens.optics.sag import same_medium
@@ -68,12 +67,13 @@ class FilmLight:
 
 
 def film_light(
-    lens: Lens, film_radius_mm: Sequence[float] | Array, *, wavelength_nm: float = LINE_D_NM, directions: int = 128
+    lens: Lens, film_radius_mm: Sequence[float] | Array, *, wavelength_nm: float | None = None, directions: int = 128
 ) -> FilmLight:
     """Light on the film of a focused lens at one wavelength, for a round stop.
 
     Args:
         film_radius_mm: [F], the first 0 (the axis), the others in any order.
+        wavelength_nm: None takes `Lens.reference_nm`.
         directions: about the centre of the upper half of the pupil, in which its boundary is searched.
 
     Raises:
@@ -85,7 +85,7 @@ def film_light(
     rims = tuple(replace(b, diameter_mm=s.diameter_mm) for b, s in zip(bare.surfaces, lens.surfaces, strict=True))
     rings = _rings(lens)
     glass = tuple(bare.surfaces[k] if k in rings else s for k, s in enumerate(rims))
-    search = _Search(lens, radius, wavelength_nm, directions)
+    search = _Search(lens, radius, lens.reference_nm if wavelength_nm is None else wavelength_nm, directions)
     alone, behind_glass, all_rims = (search.boundary(replace(bare, surfaces=s)) for s in (bare.surfaces, glass, rims))
     area = [search.area(b) for b in (alone, behind_glass, all_rims)]
     if not area[2][0] > 0:
@@ -131,7 +131,7 @@ def _check(lens: Lens, radius: Array) -> None:
 
 def _rings(lens: Lens) -> set[int]:
     """Rows that bend nothing and are not the stop: hoods and other rings."""
-    return {k for k, s in enumerate(lens.surfaces) if not s.stop and same_medium(lens.surfaces, k)}
+    return {k for k, s in enumerate(lens.surfaces) if not s.stop and same_medium(lens.surfaces, k, lens.object_medium)}
 
 
 class _Search:

@@ -160,7 +160,7 @@ def half_field_deg(lens: Lens) -> float:
         return lens.half_field_deg
     if lens.image_radius_mm is None:
         raise InputError(lens.path, "half_field_deg", "(not stated)", "the edge of the field, to derive rims for it")
-    return math.degrees(math.atan(lens.image_radius_mm / abs(first_order(lens).efl_mm)))
+    return math.degrees(math.atan(lens.image_radius_mm / abs(first_order(lens).front_efl_mm)))
 
 
 def _states(lens: Lens) -> Iterator[Lens]:

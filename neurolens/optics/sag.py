@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError
 
 if TYPE_CHECKING:
-    from neurolens.optics.prescription import Surface
+    from neurolens.optics.prescription import Medium, Surface
 
 Array = NDArray[np.float64]
 
@@ -307,8 +307,9 @@ def neighbours(surfaces: Sequence[Surface]) -> Iterator[tuple[int, int, float]]:
             yield k - 1, k + 1, surfaces[k - 1].thickness_mm + surfaces[k].thickness_mm
 
 
-def same_medium(surfaces: Sequence[Surface], k: int) -> bool:
-    """Whether the medium is the same before and behind surface k; air lies before the first."""
-    air = (1.0, None, None)
-    before, after = ((s.n_d, s.V_d, s.glass) for s in (surfaces[k - 1], surfaces[k]))
-    return (before if k else air) == after and surfaces[k].focal_mm is None
+def same_medium(surfaces: Sequence[Surface], k: int, in_front: Medium | None = None) -> bool:
+    """Whether the medium is the same before and behind surface k; `in_front`, by default air, lies before the first."""
+    first = surfaces[k - 1] if k else in_front
+    before = (first.n_d, first.V_d, first.glass) if first else (1.0, None, None)
+    s = surfaces[k]
+    return before == (s.n_d, s.V_d, s.glass) and s.focal_mm is None

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.optics import coatings, glass
+from neurolens.optics import coatings
 from neurolens.optics.passing import (
     Mode,
     absorption_per_mm,
@@ -77,7 +77,7 @@ def follow(
     lens: Lens,
     rays: Rays,
     steps: Steps,
-    wavelength_nm: Tensor | float = glass.LINE_D_NM,
+    wavelength_nm: Tensor | float | None = None,
     *,
     towards: Towards = "film",
     polarised: bool = False,
@@ -88,7 +88,7 @@ def follow(
         lens: the prescription; every rim and the stop are tested at every crossing.
         rays: points and unit directions [N], lens frame, mm; float32 or float64.
         steps: surfaces in the order in which they are met, "T" refracted or "R" reflected.
-        wavelength_nm: number or [N].
+        wavelength_nm: number or [N]; None takes `Lens.reference_nm`.
         towards: "film" for light that enters at the front, "scene" for light that enters at the rear.
         polarised: whether to follow the polarisation that each surface gives to the light, or to average it there.
 
@@ -96,6 +96,7 @@ def follow(
         InputError: as `trace` for rays and wavelengths; no steps, a surface that does not exist or is not the next one
             in the direction of travel.
     """
+    wavelength_nm = lens.reference_nm if wavelength_nm is None else wavelength_nm
     check_rays(rays, wavelength_nm)
     _check(len(lens.surfaces), steps, towards)
     wavelength_nm, lit = sound_wavelength(lens, wavelength_nm, rays.x.dtype)

@@ -86,7 +86,7 @@ class _Wanted(NamedTuple):
 def trace(
     lens: Lens,
     rays: Rays,
-    wavelength_nm: Tensor | float = glass.LINE_D_NM,
+    wavelength_nm: Tensor | float | None = None,
     *,
     towards: Towards = "scene",
     transmittance: Transmittance = False,
@@ -98,7 +98,8 @@ def trace(
     Args:
         lens: the prescription; its stop's diameter is the opening that clips.
         rays: points and unit directions [N], lens frame, mm. The dtype (float32 or float64) is that of the result.
-        wavelength_nm: one number, or a tensor [N]; NaN and what is not positive pass no dispersive glass.
+        wavelength_nm: one number, or a tensor [N], of which NaN and what is not positive pass no dispersive glass; None
+            takes `Lens.reference_nm`.
         towards: "scene" for camera rays (-z), "film" for light from the scene (+z).
         transmittance: whether to follow the transmittance; "polarised" follows the polarisation that each surface
             gives to unpolarised light, where True averages it away at every surface.
@@ -113,6 +114,7 @@ def trace(
     A direction that is not a unit vector counts as a miss of the first surface.
     Differentiable with respect to rays, wavelength and prescription fields given as tensors.
     """
+    wavelength_nm = lens.reference_nm if wavelength_nm is None else wavelength_nm
     check_rays(rays, wavelength_nm)
     if not torch.compiler.is_compiling():
         _keep_memory()
@@ -304,7 +306,7 @@ class Differentials(NamedTuple):
 
 
 def trace_differentials(
-    lens: Lens, rays: Rays, derivatives: Sequence[Rays], wavelength_nm: Tensor | float = glass.LINE_D_NM
+    lens: Lens, rays: Rays, derivatives: Sequence[Rays], wavelength_nm: Tensor | float | None = None
 ) -> Differentials:
     """Trace camera rays together with their derivatives.
 

@@ -15,7 +15,7 @@ import numpy as np
 from neurolens.base import status as st
 from neurolens.graph.ir import Graph, Value
 from neurolens.optics.glass import index_of
-from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.prescription import Lens, Medium, Surface
 from neurolens.optics.sag import biconic, toroid
 from neurolens.optics.shapes import LAST_STEP, STEEPEST, is_plain, start_of
 
@@ -113,16 +113,14 @@ class _Tracing:
         self.power = self.power * (product * 2.0 * (s * s + p * p) / (both * both))
 
     def _index(self, k: int) -> Value:
-        """Of the medium before surface k, as light comes from the scene."""
-        if k == 0:
-            return self.graph.constant(1.0)
-        s = self.lens.surfaces[k - 1]
+        """Index of the medium in front of surface k, as light comes from the scene."""
+        s = self.lens.media[k]
         key = (s.glass, float(s.n_d), s.V_d)
         if key not in self.indices:
             self.indices[key] = self._polynomial(s)
         return self.indices[key]
 
-    def _polynomial(self, s: Surface) -> Value:
+    def _polynomial(self, s: Surface | Medium) -> Value:
         g = self.graph
         if s.glass is None and s.V_d is None:
             return g.constant(float(s.n_d))

@@ -15,7 +15,7 @@ from neurolens.optics.lensfile import MAX_INDEX, MAX_POWER, MAX_SURFACES
 from neurolens.optics.paraxial import FirstOrder
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.sag import check_figures
-from neurolens.readers.source import warn
+from neurolens.readers.source import assume, warn
 
 # A diameter that the file does not give, until `finish` has found it.
 UNKNOWN = math.nan
@@ -41,8 +41,8 @@ def finish(
             pupil or f-number ask for is taken, with a warning.
 
     Raises:
-        InputError: no row, too many, no stop or several, a figure out of range, a last medium that is not air, a stop
-            that nothing sizes, no image behind the lens.
+        InputError: no row, too many, no stop or several, a figure out of range, a stop that nothing sizes, no image
+            behind the lens.
     """
     _check_rows(lens.surfaces, lens.path)
     stop = lens.surfaces[lens.stop_index]
@@ -64,6 +64,9 @@ def finish(
     if math.isnan(stated):
         stated = first_order(trial).f_number
         warn(lens.path, f"no f-number is stated; f/{stated:.4g} follows from the stop's diameter")
+    if lens.surfaces[-1].n_d != 1:
+        name = lens.surfaces[-1].material or "a medium"
+        assume(lens.path, f"the film lies in {name} of index {lens.surfaces[-1].n_d:g}, as the last row says")
     rows = list(trial.surfaces)
     if not film_given:
         rows[-1] = replace(rows[-1], thickness_mm=data.back_focus_mm)
@@ -135,8 +138,6 @@ def _check_rows(rows: Sequence[Surface], file: str) -> None:
     if len(stops) != 1:
         found = f"(on surfaces {', '.join(map(str, stops))})" if stops else "(none)"
         raise InputError(file, "stop", found, "exactly one surface that is the aperture stop")
-    if rows[-1].n_d != 1:
-        raise InputError(file, f"surface {len(rows) - 1}, index", rows[-1].n_d, "air between last surface and film")
 
 
 def named_glass(

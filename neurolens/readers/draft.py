@@ -274,9 +274,7 @@ def _configuration(lens: Lens, draft: Draft, state: State) -> Configuration:
         f_number = data.f_number * 2 * there.stop_radius_mm / opening
     distance = state.object_distance if math.isfinite(state.object_distance) else None
     if not state.film_given:
-        focal_z = data.rear_focal_z_mm
-        if distance is not None:
-            focal_z += data.efl_mm**2 / (distance + data.front_focal_z_mm)  # Newton's x x' = -f^2
+        focal_z = data.rear_focal_z_mm if distance is None else data.image_z_mm(-distance)
         thickness[last] = focal_z - float(there.vertices_mm[last])
     return replace(
         found,

@@ -318,7 +318,7 @@ def _state(lens: Lens, table: Table, name: str) -> Configuration:
 
 
 def _object_distance_mm(lens: Lens) -> float:
-    """Distance from the object in focus on the tabled film to the front vertex (Newton's x x' = -f^2)."""
+    """Distance from the object in focus on the tabled film to the front vertex (Newton's x x' = -f f')."""
     data = first_order(lens)
     beyond = float(lens.vertices_mm[-1]) - data.rear_focal_z_mm
-    return data.efl_mm**2 / beyond - data.front_focal_z_mm if beyond else math.inf
+    return data.efl_mm * data.front_efl_mm / beyond - data.front_focal_z_mm if beyond else math.inf

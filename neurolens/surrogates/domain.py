@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
+from neurolens.base.bounds import WAVELENGTH_NM, said
 from neurolens.base.errors import InputError
 from neurolens.optics.focusing import film_range_mm
-from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import PupilBounds, image_radius_mm, pupil_bounds
@@ -109,7 +109,7 @@ def domain_of(
     *,
     film_radius_mm: float | None = None,
     focus_m: tuple[float, float] = (math.inf, math.inf),
-    wavelength_nm: tuple[float, float] = (400.0, 700.0),
+    wavelength_nm: tuple[float, float] | None = None,
     nearest_m: float | None = None,
     film_z_mm: tuple[float, float] | None = None,
     pupil_z_mm: float | None = None,
@@ -120,24 +120,25 @@ def domain_of(
         film_radius_mm: None takes the lit film (see `pupils.image_radius_mm`).
         focus_m: two object distances from the film; the domain holds every film plane between theirs, the paraxial
             images and those of least spot.
-        wavelength_nm: replaced by the d line where no glass of the lens has a known dispersion.
+        wavelength_nm: None takes `Lens.light_nm`. Without any known dispersion `Lens.reference_nm` replaces it.
         nearest_m: distance from the film of the nearest object in view; None takes the nearest focus.
         film_z_mm: film planes, of a lens that was focused otherwise; None follows from `focus_m`.
         pupil_z_mm: plane of the pupil points; None takes the one on which the pupil is tightest.
 
     Raises:
-        InputError: a radius or `nearest_m` that is not positive and finite, wavelengths outside 300..2500 nm or in the
-            wrong order.
+        InputError: a radius or `nearest_m` that is not positive and finite, wavelengths outside `WAVELENGTH_NM` or in
+            the wrong order.
     """
     if film_radius_mm is not None and not film_radius_mm > 0:
         raise InputError("domain", "film_radius_mm", film_radius_mm, "a positive length in mm")
     if nearest_m is not None and not 0 < nearest_m < math.inf:
         raise InputError("domain", "nearest_m", nearest_m, "a positive distance in m, or none")
-    low, high = wavelength_nm
-    if not 300 <= low <= high <= 2500:
-        raise InputError("domain", "wavelength_nm", wavelength_nm, "shortest then longest, within 300 to 2500 nm")
+    low, high = wavelength_nm or lens.light_nm
+    if not WAVELENGTH_NM[0] <= low <= high <= WAVELENGTH_NM[1]:
+        expected = f"shortest then longest, {said(WAVELENGTH_NM)} nm"
+        raise InputError("domain", "wavelength_nm", wavelength_nm, expected)
     if not lens.dispersive:
-        low = high = LINE_D_NM
+        low = high = lens.reference_nm
     planes = sorted(film_z_mm or _film_planes_mm(lens, focus_m, (low, high)))
     radius = film_radius_mm if film_radius_mm is not None else image_radius_mm(lens)[0]
     bounds = pupil_bounds(lens, radius, (planes[0], planes[-1]), (low, high), pupil_z_mm=pupil_z_mm)
@@ -195,7 +196,7 @@ def domain_from_camera(
     film_mm: tuple[float, float],
     focus_m: float,
     f_number: float | None = None,
-    wavelength_nm: tuple[float, float] = (400.0, 700.0),
+    wavelength_nm: tuple[float, float] | None = None,
     nearest_m: float | None = None,
 ) -> tuple[Lens, Domain]:
     """Only what one shot requires: its film crop, stop, focus and wavelengths. Returns the stopped lens and its domain.
@@ -215,10 +216,10 @@ def domain_from_camera(
 def focused_plane_z_mm(lens: Lens, film_z: Tensor) -> Tensor:
     """z (mm, lens frame; -inf at infinity focus) of the object plane in focus for each film plane z, first order."""
     data = first_order(lens)
-    f = data.efl_mm
-    extension = film_z - data.rear_principal_z_mm - f  # Newton: f^2 / extension is how far beyond the front focus
-    far = extension <= 1e-9 * f
-    distance = f + f * f / torch.where(far, torch.ones_like(extension), extension)
+    front, rear = data.front_efl_mm, data.efl_mm
+    extension = film_z - data.rear_principal_z_mm - rear  # Newton: f f' / extension is how far beyond the front focus
+    far = extension <= 1e-9 * rear
+    distance = front + front * rear / torch.where(far, torch.ones_like(extension), extension)
     return data.front_principal_z_mm - torch.where(far, torch.full_like(distance, math.inf), distance)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from analysis_lenses import INF, cartesian, library, scene, slower, thin
+from shipped import pinhole
 
 from neurolens.analysis.bundles import Pattern, bundle, fan, grid, hexapolar, points
 from neurolens.analysis.field_curves import distortion, illumination
@@ -16,7 +17,6 @@ from neurolens.analysis.layout import layout_profile
 from neurolens.analysis.spots import diffraction_mtf, fans, mtf, spots, working_f_number
 from neurolens.analysis.wavefront import diffraction_image, opd_mm, psf
 from neurolens.base.errors import InputError
-from neurolens.optics import accessories
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.pupils import camera_rays
@@ -144,7 +144,7 @@ def test_blades_cut_the_bundle_and_count_as_the_stop() -> None:
 
 
 D = 587.5618
-PINHOLE = Scene(replace(accessories.pinhole(50.0, 0.2, image_radius_mm=40.0), film_z_mm=50.0))
+PINHOLE = Scene(replace(pinhole(50.0, 0.2, image_radius_mm=40.0), film_z_mm=50.0))
 
 
 def moved(given: Scene, shift_mm: float) -> Scene:

@@ -99,7 +99,11 @@ BAD_ROWS = [
     ("n_d = 1.6,", "n_d = nan,", ["surface 4, n_d", "got nan"]),
     ("V_d = 50.0", "V_d = 0.0", ["surface 4, V_d", "got 0.0", "above 0"]),
     ("V_d = 50.0", "V_d = -50.0", ["surface 4, V_d", "got -50.0", "above 0"]),
-    (ROW_5, ROW_5 + ", n_d = 1.5", ["surface 5, n_d", "got 1.5", "air"]),
+    ('rims = "source"', 'rims = "source"\nobject_medium = { n = 1.3 }', ["object_medium, n", "did you mean 'n_d'?"]),
+    ('rims = "source"', 'rims = "source"\nobject_medium = { n_d = 0.5 }', ["object_medium, n_d", "got 0.5", "from 1"]),
+    ('rims = "source"', 'rims = "source"\nobject_medium = 1.3', ["object_medium", "got 1.3", "a table"]),
+    ('rims = "source"', 'rims = "source"\nwavelengths_nm = [0.55]', ["wavelengths_nm", "got 0.55", "100 to 20000 nm"]),
+    ('rims = "source"', 'rims = "source"\nwavelengths_nm = 550', ["wavelengths_nm", "got 550", "a list"]),
     # types
     ("radius_mm = 40.0", 'radius_mm = "40.0"', ["surface 4, radius_mm", "got '40.0'", "a number"]),
     ("radius_mm = 40.0", 'radius_mm = "inf"', ["surface 4, radius_mm", "got 'inf'", "a number"]),

@@ -137,7 +137,6 @@ def test_an_f_number_that_is_not_stated(tmp_path: Path) -> None:
         ({"surfaces": {}}, r"surfaces: got \{\}"),
         ({"surfaces": [3]}, r"surface 0: got 3"),
         ({"surfaces": [row(50, 5, 1.5)]}, r"stop: got \(none\)"),
-        ({"surfaces": [row(50, 5, 1.5, stop=True)]}, r"surface 0, index: got 1.5, expected air"),
         ({"surfaces": [row(50, 5, tilt=3)]}, r"surface 0, tilt: got \(unknown key\)"),
         ({"surfaces": [row(50, 5, shape="torus")]}, r"surface 0, shape: got 'torus', expected one of sphere"),
         ({"surfaces": [row(50, 5, stop=1)]}, r"surface 0, stop: got 1"),

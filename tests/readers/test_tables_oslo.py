@@ -7,7 +7,7 @@ import pytest
 from lens_formats import swapped
 from shipped import singlet_mm
 
-from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.errors import AssumedWarning, InputError, NeurolensWarning
 from neurolens.optics import catalogue
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
@@ -106,7 +106,6 @@ def test_a_plane_that_is_no_stop(tmp_path: Path) -> None:
         ("1.5   20", "9.9 20", r"index: got 9.9"),
         ("1.5   20", "0 20", r"stop: got \(rows at line 4, 5\)"),
         ("1.5   20", "nbk7 20", r"line 5, index: got 'nbk7'"),
-        ("1     20", "1.2   20", r"surface 2, index: got 1.2, expected air"),
         ("0       4.0", "7\n0       4.0", r"line 4, count: got 7, expected 3"),
         ("50      5.0", "50      -5.0", r"surface 1, thickness_mm: got -5.0"),
         ("1.5   20", "1.5 120", r"surface 1, diameter_mm: got 120"),
@@ -115,6 +114,17 @@ def test_a_plane_that_is_no_stop(tmp_path: Path) -> None:
 def test_table_refusals(old: str, new: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=message):
         read(swapped(old, new, TABLE), ".dat", tmp_path)
+
+
+def test_the_film_lies_in_the_medium_of_the_last_row(tmp_path: Path) -> None:
+    """The paraxial image of a singlet lies 1.2 times as far from R = -50 mm as n' u' = n u - y (n' - n) / R says."""
+    with pytest.warns(AssumedWarning, match="the film lies in a medium of index 1.2"):
+        lens = read(swapped("1     20", "1.2   20", TABLE), ".dat", tmp_path)
+    u = -(0.5 / 50) / 1.5  # after the first surface, of a ray at height 1
+    y = 1 + 5 * u
+    after = (1.5 * u + y * (1.2 - 1.5) / 50) / 1.2
+    assert first_order(lens).efl_mm == pytest.approx(-1 / after, rel=1e-12)
+    assert lens.surfaces[-1].thickness_mm == pytest.approx(-y / after, rel=1e-12)
 
 
 def test_oslo_by_the_lensmakers_formula(tmp_path: Path) -> None:

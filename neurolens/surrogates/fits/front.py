@@ -7,6 +7,7 @@ Networks follow that themselves, and measured worse when their error was that in
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -33,20 +34,24 @@ def grazes(pairs: RayPairs) -> bool:
 def inside_front(lens: Lens, pairs: PairSet) -> PairSet:
     """The same rays with the directions that they have inside the front glass; as they were where rays end before."""
     front, scene = lens.surfaces[0], pairs.scene
-    n, outside = np.asarray(index_of(front, pairs.inputs.wavelength_nm.numpy())), torch.stack(scene[3:]).numpy()
+    n, outside = np.asarray(_index(lens, pairs.inputs.wavelength_nm.numpy())), torch.stack(scene[3:]).numpy()
     with np.errstate(all="ignore"):
         d, _ = entered(front, scene.x.numpy(), scene.y.numpy(), outside, n)
     d = np.where(np.isfinite(d).all(0), d, outside)
     return replace(pairs, scene=scene._replace(**dict(zip(("dx", "dy", "dz"), torch.from_numpy(d), strict=True))))
 
 
+def _index(lens: Lens, wavelength_nm: Any) -> Any:
+    """The index of the front glass over that of the medium in front of it."""
+    return index_of(lens.surfaces[0], wavelength_nm) / index_of(lens.object_medium, wavelength_nm)
+
+
 def index_series(lens: Lens, encoding: Encoding) -> Array:
-    """[K] the index of the front glass as a power series in the encoding's w, to float32's last bit."""
-    front = lens.surfaces[0]
+    """[K] the relative index of the front glass as a power series in the encoding's w, to float32's last bit."""
     if not encoding.dispersive:
-        return np.array([float(front.n_d)])
+        return np.array([float(lens.surfaces[0].n_d) / float(lens.object_medium.n_d)])
     w = np.linspace(-1, 1, 200)
-    n = np.array([float(index_of(front, 1000 / v**0.5)) for v in encoding.w_middle + encoding.w_half * w])
+    n = np.array([float(_index(lens, 1000 / v**0.5)) for v in encoding.w_middle + encoding.w_half * w])
     for degree in range(_MOST_DEGREE + 1):
         series = np.polynomial.Polynomial.fit(w, n, degree, domain=[-1, 1])
         if np.abs(series(w) - n).max() < _INDEX:

@@ -137,7 +137,7 @@ def expand(lens: Lens, encoding: Encoding, wavelength_nm: float, degree: int) ->
     along = t.power(t.constant(1.0) + _square(t, slope_x, slope_y), -0.5)
     ray = RaySeries(x, y, t.times(slope_x, along), t.times(slope_y, along))
     vertices, plane, stop = lens.vertices_mm, encoding.film_plane_z_mm, ray
-    indices = [1.0, *(float(index_of(s, wavelength_nm)) for s in lens.surfaces)]
+    indices = [float(index_of(medium, wavelength_nm)) for medium in lens.media]
     for k in range(len(lens.surfaces) - 1, -1, -1):
         ray = propagate(t, ray, plane - float(vertices[k]))
         ray, height = refract(t, lens, k, ray, indices[k + 1], indices[k])
