@@ -81,7 +81,7 @@ def read_any(path: str | Path, given: Given | None = None) -> Lens:
 
 
 def format_of(path: str | Path) -> Format:
-    """The format of a file, by its content, else by its suffix.
+    """The format of a file, by its content, else by a suffix that no other format has.
 
     Raises:
         InputError: neither tells.
@@ -89,12 +89,11 @@ def format_of(path: str | Path) -> Format:
     head = read_text(path)[:_HEAD]
     suffix = Path(path).suffix.lower()
     by_content = next((f for f in FORMATS if f.looks_like(head)), None)
-    by_suffix = next((f for f in FORMATS if suffix in f.suffixes), None)
-    found = by_content or by_suffix
-    if found is None:
+    by_suffix = [f for f in FORMATS if suffix in f.suffixes]
+    if by_content is None and len(by_suffix) != 1:
         known = ", ".join(f"{f.name} ({', '.join(f.suffixes)})" for f in FORMATS)
-        raise InputError(path, "format", suffix or "(no suffix)", f"one of {known}, or a lens file (.toml)")
-    return found
+        raise InputError(path, "format", "(not known)", f"one of {known}, or a lens file (.toml)")
+    return by_content or by_suffix[0]
 
 
 def kind_of(path: str | Path) -> str:

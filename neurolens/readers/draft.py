@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import math
+import re
 from bisect import bisect_right
+from collections import Counter
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.bounds import WAVELENGTH_NM, within
 from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import MAX_SURFACES, check_states
-from neurolens.optics.prescription import Configuration, Lens, Surface
+from neurolens.optics.paraxial import system_of
+from neurolens.optics.prescription import Configuration, Lens, Medium, Surface
+from neurolens.optics.rims import narrowed_rims
 from neurolens.optics.sag import end_mm, same_medium
 from neurolens.readers.assemble import UNKNOWN, finish, first_order, smaller_stop, with_rims
 from neurolens.readers.forbes import MAX_TERMS, qbfs_terms, qcon_terms
@@ -27,6 +33,7 @@ class Given:
         f_number: nominal f-number, for a file that states none.
         units: of a file without units: "mm", "cm", "in" or "m".
         half_field_deg: edge of the field, for rims that have to be derived.
+        stop: number of the surface, as the file numbers it, that is the stop; replaces a stop that the file marks.
         gap_before: of a plain table: its second column is the distance from the surface before (Kolb's tables of 1995).
         semi_diameters: of a plain table: its last column holds radii of the rims.
     """
@@ -36,6 +43,7 @@ class Given:
     f_number: float | None = None
     units: str | None = None
     half_field_deg: float | None = None
+    stop: str | None = None
     gap_before: bool = False
     semi_diameters: bool = False
 
@@ -48,6 +56,7 @@ class Block:
     """One surface while a file is read, in the file's unit; readers add what their formats say besides."""
 
     start: Line
+    name: str = ""
     curvature: float = 0.0
     conic: float = 0.0
     thickness: float = 0.0
@@ -90,10 +99,12 @@ class Row:
     Attributes:
         surface: its diameter may be `assemble.UNKNOWN`.
         aperture: whether the file sets a clear aperture on it, so that even a plane in air cuts the beam.
+        name: number by which the file calls it; empty where that is its place in the table, from 0.
     """
 
     surface: Surface
     aperture: bool = False
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -127,9 +138,12 @@ class Draft:
         unit: "mm", "cm", "in", "m", or None if unknown.
         stated_efl: focal length as the file states it, to be checked.
         drawn: rims are somebody's measures of a drawing, some of them radii where diameters are meant: halved where
-            they are twice what they can be, and narrowed where neighbours would touch; both is told. A missing stop is
-            assumed.
+            they are twice what they can be, and narrowed by however much neighbours would overlap; both is told.
         nominal: f-number that the file states with few digits, to tell radii from diameters by.
+        stop_given: whether the file states the stop's own diameter, which then rules over its f-number.
+        skipped: what was not read since no ray depends on it, and how often it occurs; told in one line.
+        object_medium: fields of `Medium` for the medium in front of the lens.
+        wavelengths_nm: as `Lens.wavelengths_nm`.
     """
 
     file: str
@@ -149,12 +163,46 @@ class Draft:
     stated_efl: float | None = None
     drawn: bool = False
     nominal: float | None = None
+    stop_given: bool = False
+    skipped: Counter[str] = field(default_factory=Counter)
+    object_medium: dict[str, Any] = field(default_factory=dict)
+    wavelengths_nm: tuple[float, ...] = ()
+
+    def f_number_agrees(self, other: float) -> bool:
+        """Whether an f-number is the one that the file states, as far as printed digits tell, or it states none."""
+        return self.f_number is None or abs(other / self.f_number - 1) <= _AGREES
+
+    def in_file(self, text: str) -> str:
+        """A message about the rows, each called as the file calls its surface."""
+
+        def renamed(found: re.Match[str]) -> str:
+            rows = [self.rows[k].name for k in map(int, found[1].split(", ")) if k < len(self.rows)]
+            return f"surface {', '.join(rows)} of the file" if rows and all(rows) else found[0]
+
+        return _ROWS.sub(renamed, text)
+
+
+def primary_first(wavelengths_nm: Iterable[float], primary_nm: float) -> tuple[float, ...]:
+    """Wavelengths of a file as `Lens` holds them; those beyond what neurolens traces are left out."""
+    sound = [round(nm, 6) for nm in wavelengths_nm if within(WAVELENGTH_NM, nm)]  # as read in micrometres
+    return tuple(sorted(sound, key=lambda nm: nm != round(primary_nm, 6)))
 
 
 def lens_of(draft: Draft, given: Given | None = None) -> Lens:
     """The lens of a draft, in mm, checked as by `assemble.finish`; a unit other than the file's is an InputError."""
     given = given or Given()
-    draft = _without_dummies(draft)
+    if +draft.skipped:
+        listed = (word if count == 1 else f"{word} ({count})" for word, count in (+draft.skipped).items())
+        warn(draft.file, f"left out, since no ray depends on it: {', '.join(listed)}")
+    draft = _without_dummies(_with_stop(draft, given.stop))
+    try:
+        return _lens_of(draft, given)
+    except InputError as error:
+        value = draft.in_file(error.value) if isinstance(error.value, str) else error.value
+        raise InputError(error.file, draft.in_file(error.field), value, draft.in_file(error.expected)) from None
+
+
+def _lens_of(draft: Draft, given: Given) -> Lens:
     unit = given.units or draft.unit or "mm"
     if given.units and draft.unit and given.units != draft.unit:
         raise InputError(draft.file, "--units", given.units, f"{draft.unit!r}, as the file itself says (or no --units)")
@@ -175,37 +223,66 @@ def lens_of(draft: Draft, given: Given | None = None) -> Lens:
         rims=draft.rims,
         path=draft.file,
         stated_efl_mm=draft.stated_efl,
+        object_medium=Medium(**draft.object_medium),
+        wavelengths_nm=draft.wavelengths_nm,
     )
     if draft.drawn:
-        lens = _with_likely_rims(_with_stop(lens), draft.f_number or draft.nominal)
-    if draft.f_number is not None and draft.pupil is None and lens.surfaces:
+        lens = _with_likely_rims(lens, draft)
+    if draft.f_number is not None and draft.pupil is None and not draft.stop_given:
         # The file's f-number overrides a diameter of the stop, except for an aperture set on it.
         rows = (replace(s, diameter_mm=math.nan) if s.stop else s for s in lens.surfaces)
         lens = replace(lens, surfaces=tuple(rows))
     lens = finish(lens, pupil_mm=draft.pupil, film_given=draft.film_given, stop_limit_mm=_stop_aperture(draft))
+    if draft.stop_given and not draft.f_number_agrees(by_stop := first_order(lens).f_number):
+        told = f"a stop {lens.stop_radius_mm * 2:g} wide gives f/{by_stop:.3g}"
+        warn(draft.file, f"{told}, the file says f/{draft.f_number:.3g}: the diameter is kept")
     lens = replace(lens, configurations=tuple(_configuration(lens, draft, state) for state in _states(draft)))
-    lens = with_rims(lens.scaled(factor) if factor != 1 else lens)
-    lens = _narrowed(lens) if draft.drawn else lens
+    lens = with_rims(lens.scaled(factor) if factor != 1 else lens, draft.in_file)
+    with suppress(InputError):
+        check_states(lens)
+        return lens
+    lens = _narrowed(lens, draft)
     check_states(lens)
     return lens
 
 
+_AGREES = 0.03  # relative: f-numbers are printed with two digits
+_SLIGHTLY = 0.1  # of a rim's diameter
+_ROWS = re.compile(r"\bsurface ([0-9]+(?:, [0-9]+(?![0-9.]| mm))*)(?! of the file)")
 _TWICE, _SAME = (0.4, 0.7), (0.7, 1.4)  # f-number by the stop's diameter over the stated one: rims twice as wide, right
 
 
-def _with_stop(lens: Lens) -> Lens:
-    """The lens with a stop: where no row is marked, that of the narrowest rim."""
-    known = [k for k, s in enumerate(lens.surfaces) if not math.isnan(s.diameter_mm)]
-    if any(s.stop for s in lens.surfaces) or not known:
-        return lens
-    k = min(known, key=lambda k: lens.surfaces[k].diameter_mm)
-    assume(lens.path, f"no stop is marked: surface {k}, whose rim is the narrowest, is assumed to be it")
-    rows = (replace(s, stop=i == k) for i, s in enumerate(lens.surfaces))
-    return replace(lens, surfaces=tuple(rows))
+def _with_stop(draft: Draft, wanted: str | None) -> Draft:
+    """The draft with a stop: the surface wanted, that of the file, or else that whose rim limits the beam of the axis.
+
+    Raises:
+        InputError: no surface of that number.
+    """
+    names = [row.name or str(k) for k, row in enumerate(draft.rows)]
+    if wanted is not None:
+        if wanted not in names:
+            raise InputError(draft.file, "--stop", wanted, f"the number of a surface in the file: {', '.join(names)}")
+        k = names.index(wanted)
+    elif any(row.surface.stop for row in draft.rows) or not draft.rows:
+        return draft
+    else:
+        rows = tuple(row.surface for row in draft.rows)
+        heights = system_of(Lens("", "", rows, math.nan, object_medium=Medium(**draft.object_medium))).march(1.0, 0.0).y
+        k = min(range(len(rows)), key=lambda k: _share(rows[k].semi_diameter_mm, heights[k]))
+        assume(draft.file, f"no stop is marked: surface {names[k]}, whose rim limits the beam of the axis, is taken")
+    # Its rim stays, where the f-number or pupil of the file would have a wider one.
+    marked = (replace(row, surface=replace(row.surface, stop=i == k)) for i, row in enumerate(draft.rows))
+    return replace(draft, rows=tuple(replace(row, aperture=row.aperture or row.surface.stop) for row in marked))
 
 
-def _with_likely_rims(lens: Lens, f_number: float | None) -> Lens:
+def _share(rim: float, height: float) -> float:
+    """A rim over the height of the marginal ray of a beam 2 mm wide; infinite where there is no rim."""
+    return math.inf if math.isnan(rim) or height == 0 else rim / abs(height)
+
+
+def _with_likely_rims(lens: Lens, draft: Draft) -> Lens:
     """The lens with rims of half the width, where stop and spheres say that radii were meant by diameters."""
+    f_number = draft.f_number or draft.nominal
     if not any(s.stop for s in lens.surfaces):
         return lens  # `finish` says so
     beyond = [k for k, s in enumerate(lens.surfaces) if s.semi_diameter_mm > end_mm(s) * (1 + 1e-6)]
@@ -218,21 +295,25 @@ def _with_likely_rims(lens: Lens, f_number: float | None) -> Lens:
             evidence = f"the stop would give f/{by_stop:.3g}, the file says f/{f_number:.3g}"
     if not evidence:
         return lens
-    assume(lens.path, f"rims are assumed to be half as wide as the format has them: {evidence}")
+    assume(lens.path, f"rims are assumed to be half as wide as the format has them: {draft.in_file(evidence)}")
     rows = (replace(s, diameter_mm=s.diameter_mm / 2) for s in lens.surfaces)
     return replace(lens, surfaces=tuple(rows))
 
 
-def _narrowed(lens: Lens) -> Lens:
-    """The lens with rims no wider than their spheres and than where neighbours touch, in every state."""
-    from neurolens.optics.rims import narrowed_rims  # which needs torch
+def _narrowed(lens: Lens, draft: Draft) -> Lens:
+    """The lens with rims no wider than their spheres and than where neighbours touch, in every state.
 
+    Unless rims are `drawn`, they are narrowed by no more than `_SLIGHTLY`: rounded figures do not ask for more.
+    """
     found = narrowed_rims(lens)
-    pairs = enumerate(zip(lens.surfaces, found.surfaces, strict=True))
-    changed = [f"{k} ({a.diameter_mm:.4g} to {b.diameter_mm:.4g} mm)" for k, (a, b) in pairs if a != b]
+    pairs = list(zip(lens.surfaces, found.surfaces, strict=True))
+    if not draft.drawn and any(b.diameter_mm < (1 - _SLIGHTLY) * a.diameter_mm for a, b in pairs):
+        return lens
+    widths = [(k, f"{a.diameter_mm:.4g} to {b.diameter_mm:.4g} mm") for k, (a, b) in enumerate(pairs) if a != b]
+    changed = [f"{draft.in_file(f'surface {k}')} ({width})" for k, width in widths]
     if changed:  # no rim is wider than its sphere: where one is said to be, table or rims are in doubt
         say = assume if any(s.semi_diameter_mm > end_mm(s) * (1 + 1e-6) for s in lens.surfaces) else warn
-        say(lens.path, f"rims narrowed to where spheres end or neighbours touch: surface {', '.join(changed)}")
+        say(lens.path, f"rims narrowed to where spheres end or neighbours touch: {', '.join(changed)}")
     return found
 
 
@@ -313,12 +394,13 @@ def _without_dummies(draft: Draft) -> Draft:
         sums, before = merged(state.thickness)
         gaps = {place: sums[place] for place in sorted({owner[k] for k in state.thickness if owner[k] >= 0})}
         states.append(replace(state, thickness=gaps, object_distance=state.object_distance + before))
-    listed = ", ".join(map(str, dropped))
-    warn(draft.file, f"row {listed} behind the object (from 0): a plane in one medium that cuts no beam, left out")
+    listed = draft.in_file(f"surface {', '.join(map(str, dropped))}")
+    warn(draft.file, f"{listed} left out: a plane in one medium that cuts no beam")
     return replace(draft, rows=new, states=tuple(states), object_distance=draft.object_distance + front)
 
 
 def _is_dummy(draft: Draft, k: int) -> bool:
     s = draft.rows[k].surface
     flat = math.isinf(s.radius_mm) and not s.stop and not s.asphere and not draft.rows[k].aperture
-    return flat and same_medium([row.surface for row in draft.rows], k)
+    rows = [row.surface for row in draft.rows]
+    return flat and same_medium(rows, k, Medium(**draft.object_medium))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -49,7 +50,10 @@ class Line:
         except ValueError:
             value = math.nan
         if not abs(value) <= LARGEST:
-            raise self.error(keyword, word, "a finite number")
+            comma = re.fullmatch("[-+]?[0-9]+,[0-9]+(e[-+]?[0-9]+)?", word, re.IGNORECASE)
+            raise self.error(
+                keyword, word, f"a finite number{', with a point: decimal commas are not read' * bool(comma)}"
+            )
         return value
 
     def positive(self, keyword: str, words: Sequence[str]) -> float:

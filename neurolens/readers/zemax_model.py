@@ -1,11 +1,11 @@
-"""Parser state of a Zemax file: surfaces, configurations, and the keywords without effect on rays."""
+"""Parser state of a Zemax file: surfaces, configurations, and which keywords change rays."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from neurolens.base.errors import InputError
@@ -13,38 +13,16 @@ from neurolens.readers import draft
 from neurolens.readers.draft import INFINITE, State
 from neurolens.readers.source import Line, assume
 
-# Settings of the program and of its analyses.
-IGNORED_SYSTEM = frozenset(
-    """VERS PFIL LANG GFAC RAIM PUSH SDMA OMMA ROPD PICB PZUP FWGN FWGT WAVL WAVN WAVM WWGT WWGN PWAV POLS GLRS
-    GSTD NSCD COFN LUID EFFL""".split()
+# Settings of the program, and what its editor shows of a surface: written to most files, and no ray depends on them.
+HARMLESS = frozenset(
+    """VERS PFIL LANG GFAC RAIM PUSH SDMA OMMA ROPD PICB PZUP FWGN FWGT WWGT WWGN POLS GLRS GSTD NSCD COFN LUID EFFL
+    HYPR DBDT HIDE MIRR SLAB POPS FIMP MEMA OEMA VDSZ VPAR PPAR GLCZ""".split()
 )
-# Of the system, and ignored: rims and stop decide which rays pass, not the factors that a designer chose.
+# Rims and stop decide which rays pass, not the factors that a designer chose.
 VIGNETTING = frozenset("VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN".split())
-# Of a surface: what the editor shows and hides, substrates, mechanical edges, variables, pickups carried out.
-IGNORED_SURFACE = frozenset("HIDE MIRR SLAB POPS FIMP MEMA OEMA VDSZ VPAR PPAR GLCZ".split())
-# Of a surface, and worth a warning: coatings are named, not given.
-COATING = frozenset(["COAT"])
-# Operands of the merit function.
-MERIT = frozenset(
-    """AMAG ENPP EFFL EFLX EFLY EPDI EXPD EXPP ISFN ISNA LINV OBSN PIMH PMAG POWF POWP POWR SFNO TFNO WFNO GCOS GTCE
-    INDX MNAB MNIN MNPD MXAB MXIN MXPD RGLA PANA PANB PANC PARA PARB PARC PARR PARX PARY PARZ PATX PATY YNIP CEHX
-    CEHY CENX CENY CNAX CNAY CNPX CNPY DXDX DXDY DYDX DYDY HHCN IMAE MNRE MNRI MXRE MXRI OPTH PLEN RAED RAEN RAGA
-    RAGB RAGC RAGX RAGY RAGZ RAID RAIN RANG REAA REAB REAC REAR REAX REAY REAZ RENA RENB RENC RETX RETY GLCA GLCB
-    GLCC GLCR GLCX GLCY GLCZ CONF IMSF PRIM SVIG WLEN CVIG FDMO FDRE ABSO ACOS ASIN ATAN CONS COSI DIFF DIVB DIVI
-    EQUA LOGE LOGT MAXX MINN OPGT OPLT OPVA OSUM PROB PROD QSUM RECI SQRT SUMM SINE TANG ABGT ABLT MCOG MCOL MCOV
-    ZTHI GBPD GBPP GBPR GBPS GBPW GBPZ GBSD GBSP GBSR GBSS GBSW DLTN GRMN GRMX LPTD FOUC ABCD ANAC ANAR ANAX ANAY
-    ANCX ANCY ASTI AXCL BIOC BIOD BSER COMA DIMX DISA DISC DISG DIST FCGS FCGT FCUR LACL LONA OPDC OPDM OPDX OSCD
-    PETC PETZ RSCE RSCH RSRE RSRH RWCE RWCH RWRE RWRH SMIA SPCH SPHA TRAC TRAD TRAE TRAI TRAR TRAX TRAY TRCX TRCY
-    ZERN GPIM GPRT GPRX GPRY GPSX GPSY FICL FICP POPD ZPLM UDOC UDOP UDOF RELI EFNO BLNK DMFS ENDX GOTO OOFF SKIN
-    SKIS USYM FREZ NPGT NPLT NPVA NPXG NPXL NPXV NPYG NPYL NPYV NPZG NPZL NPZV NSRM NTXG NTXL NTXV NTYG NTYL NTYV
-    NTZG NTZL NTZV NSDC NSDD NSDE NSDP NSLT NSRA NSRD NSRW NSST NSTR NSTW REVR CMFV CMGT CMLT CMVA CODA CEGT CELT
-    CEVA CIGT CILT CIVA GMTA GMTN GMTS GMTT GMTX MECA MECS MECT MSWA MSWN MSWS MSWT MSWX MTFA MTFN MTFS MTFT MTFX
-    MTHA MTHN MTHS MTHT MTHX POPI BFSD TOLR TCGT TCLT TCVA STRH DENC DENF ERFP GENC GENF XENC XENF COGT COLT COVA
-    CTGT CTLT CTVA CVGT CVLT CVVA BLTH DMGT DMLT DMVA ETGT ETLT ETVA FTGT FTLT MNCA MNCG MNCT MNCV MNEA MNEG MNET
-    MXCA MXCG MXCT MXCV MXEA MXEG MXET MNSD MXSD OMMI OMMX OMSD TGTH TTGT TTHI TTLT TTVA XNEA XNET XNEG XXEA XXEG
-    XXET CVOL MNDT MXDT SAGX SAGY SSAG STHI TMAS TOTR VOLU NORX NORY NORZ NORD SCUR SDRV PMGT PMLT PMVA XDGT XDLT
-    XDVA""".split()
-)
+# Of a surface: what changes rays, and the lens model has not.
+REFUSED = dict.fromkeys(("OBSC", "SQOB", "ELOB", "USOB", "SPID"), "no obscuration: the lens model has none")
+REFUSED["SCBD"] = "no tilt and no decentre of a surface: the lens model has none"
 # Operands of the multi-configuration editor that move no ray: fields, wavelengths, vignetting factors, comments.
 CONFIGURATION = frozenset("MOFF MCOM XFIE YFIE FLWT FVDX FVDY FVCX FVCY FVAN WAVE WLWT PRWV GCRS".split())
 
@@ -109,6 +87,10 @@ def shape_of(block: Block) -> dict[str, Any]:
     match block.kind:
         case "STANDARD":
             shape = block.rotational()
+        case "XASPHERE" if any(v for v, _ in block.parameters.values()) and not any(v for v, _ in block.extra.values()):
+            told = "an XASPHERE with its terms in PARM is taken as EVENASPH"
+            assume(block.start.file, f"surface {block.name} of the file: {told}")
+            return shape_of(replace(block, kind="EVENASPH", extra={}))
         case "EVENASPH":
             shape = block.rotational([(2 * i, block.parameter(i)) for i in range(1, 9)])
         case "ODDASPHE":
@@ -193,9 +175,9 @@ class Zoom:
         word, rest = line.words[0].upper(), line.words[1:]
         if word in CONFIGURATION or word == "BLNK":
             return
+        if self.count == 1:
+            return  # what one configuration sets stands in the table
         if word not in OPERANDS:
-            if self.count == 1:
-                raise line.unknown(word, OPERANDS)
             expected = f"one of {', '.join(OPERANDS)}: other things that change with the configuration are not read"
             raise line.error(word, "(unknown operand)", expected)
         numbers = line.numbers(word, rest[:2], 2)

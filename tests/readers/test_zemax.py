@@ -138,7 +138,7 @@ def test_a_q_type_asphere_says_how_its_rows_were_taken(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("  COAT AR\n", "  COAT AR\n", "coatings named but not given"),
+        ("  COAT AR\n", "  COAT AR\n", "coatings that are named but not given"),
         ("2.0E+1 1 0", "3.0E+1 1 0", "not at 3.0E\\+1"),
         ("VDXN 0 0 0", "VDXN 0 0.1 0", "vignetting factors"),
         ('  DIAM 9 1 0 0 1 ""\n', '  DIAM 9 1 0 0 1 ""\n  SQAP 4 5\n', "SQAP"),
@@ -188,7 +188,7 @@ def test_a_paraxial_surface_is_an_ideal_lens(tmp_path: Path) -> None:
     text = swapped(front, "TYPE PARAXIAL\n  CURV 0.0\n  PARM 1 75\n  PARM 2 1").replace("GLAS N-BK7", "COMM N-BK7")
     lens = read(text.replace("CURV -2.0E-2", "CURV 0.0"), tmp_path)
     assert lens.surfaces[0].focal_mm == 75 and first_order(lens).efl_mm == pytest.approx(75, rel=1e-14)
-    with pytest.raises(InputError, match="surface 0, focal_mm: got 75.0, expected air on both sides"):
+    with pytest.raises(InputError, match="surface 1 of the file, focal_mm: got 75.0, expected air on both sides"):
         read(swapped(front, "TYPE PARAXIAL\n  CURV 0.0\n  PARM 1 75"), tmp_path)
 
 
@@ -218,11 +218,11 @@ def test_a_paraxial_surface_is_an_ideal_lens(tmp_path: Path) -> None:
         ("TYPE STANDARD\n  CURV -2", "TYPE BICONICX\n  PARM 3 1\n  CURV -2", r"PARM 3 of BICONICX"),
         ("TYPE STANDARD\n  CURV -2", "TYPE ODDASPHE\n  PARM 1 1E-3\n  CURV -2", r"PARM 1 of ODDASPHE"),
         ("TYPE STANDARD\n  CURV -2", "TYPE STANDARD\n  PARM 1 1E-3\n  CURV -2", r"PARM 1 of STANDARD"),
-        ("  DIAM 9 1", "  OBSC 0 3 0\n  DIAM 9 1", r"line 35, OBSC: got \(unknown keyword\)"),
+        ("  DIAM 9 1", "  OBSC 0 3 0\n  DIAM 9 1", r"line 35, OBSC: got .0 3 0., expected no obscuration"),
         ("  DIAM 9 1", "  CLAP 2 9 0\n  DIAM 9 1", r"CLAP: got '2 9', expected a round opening without a hole"),
         ("  DIAM 9 1", "  OBDC 0 3\n  DIAM 9 1", r"OBDC"),
         ("  DIAM 9 1", "  IGNR 1\n  DIAM 9 1", r"IGNR"),
-        ("DIAM 9 1", "DIAM 60 1", r"surface 1, diameter_mm: got 120"),
+        ("DIAM 9 1", "DIAM 60 1", r"surface 2 of the file, diameter_mm: got 120"),
         ("DISZ 45.0", "DISZ INFINITY", r"DISZ: got 'INFINITY'"),
         ("MNUM 1 1", "MNUM 1000 1", r"MNUM: got 1000"),
     ],
@@ -243,7 +243,7 @@ SURF 3
 
 def test_planes_that_cut_no_beam_are_left_out(tmp_path: Path) -> None:
     text = swapped("DISZ 45.0", "DISZ 40.0").replace(TAIL, DUMMY.format(gap=5.0) + TAIL.replace("SURF 3", "SURF 4"))
-    with pytest.warns(NeurolensWarning, match="row 2 behind the object"):
+    with pytest.warns(NeurolensWarning, match="surface 3 of the file left out"):
         lens = read(text, tmp_path)
     assert [s.thickness_mm for s in lens.surfaces] == [5.0, 45.0]
     held = text.replace('DIAM 0.1 0 0 0 1 ""', 'DIAM 6 1 0 0 1 ""\n  CLAP 0 5 0')
@@ -315,7 +315,7 @@ def test_rims_that_are_not_given_are_derived_for_the_field(tmp_path: Path) -> No
     lens = read(text, tmp_path)
     assert lens.rims == "derived" and 9 < lens.surfaces[1].diameter_mm < 12
     without = swapped("YFLN 0 2.5 4 9", "YFLN 0 0 0 0", swapped("XFLN 0 0 3 9", "XFLN 0 0 0 0", text))
-    with pytest.raises(InputError, match=r"not given for surface 1.*--half-field"):
+    with pytest.raises(InputError, match=r"not given for surface 2 of the file.*--half-field"):
         read(without, tmp_path)
     assert read(without, tmp_path, Given(half_field_deg=5.0)).surfaces == lens.surfaces
     assert math.isfinite(lens.surfaces[1].diameter_mm)
@@ -338,7 +338,7 @@ def test_the_stop_s_own_aperture_clips_what_the_pupil_asks_for(sized: str, tmp_p
     ("old", "new", "message"),
     [
         ("DIAM 9 1", "DIAM -12.7 1", r"line 35, DIAM: got -12.7, expected a semi-diameter above 0"),
-        ("DISZ 5.0", "DISZ -600", r"surface 0, thickness_mm: got -600.0, expected at least 0, except beside a stop"),
+        ("DISZ 5.0", "DISZ -600", r"surface 1 of the file, thickness_mm: got -600.0, expected at least 0"),
         ("TYPE STANDARD\n  CURV 2", "TYPE COORDBRK\n  CURV 2", r"line 24, CURV of COORDBRK"),
         ('TYPE STANDARD\n  CURV 2.0E-2 0 0 0 0 ""\n', "TYPE COORDBRK\n", r"line 28, GLAS of COORDBRK"),
     ],
