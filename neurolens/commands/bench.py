@@ -82,6 +82,8 @@ def run_surrogates(args: argparse.Namespace) -> int:
     check_ids(files, "neurolens bench surrogates", "LENS")
     check_run_folder(out, "neurolens bench surrogates", "--out")
     benches = [Bench(LensChoice(file), settings, out) for file in files]
+    for bench in benches:
+        bench.choice.read()  # a file that cannot be read ends the command, not each of its methods
     out.mkdir(parents=True, exist_ok=True)
     config = {
         "lenses": [str(file) for file in files],

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import atomic_path, atomic_write_text, library, write_json
+from neurolens.base.lensname import lens_id_of
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_json, add_lens
 from neurolens.commands.output import answer
@@ -73,7 +74,7 @@ def _record(file: Path, folder: Path) -> dict[str, Any]:
     from neurolens import __version__
     from neurolens.evaluate.describe import read_quietly
 
-    kept = folder / file.stem / "record.json"
+    kept = folder / lens_id_of(file) / "record.json"
     try:
         lens = read_quietly(file)
         try:
@@ -83,11 +84,13 @@ def _record(file: Path, folder: Path) -> dict[str, Any]:
         except (OSError, ValueError, KeyError):
             pass
         kept.parent.mkdir(parents=True, exist_ok=True)
-        record = {"lens": file.stem, "sha256": lens.sha256, "version": __version__} | _page(lens, file, kept.parent)
+        record = {"lens": lens_id_of(file), "sha256": lens.sha256, "version": __version__} | _page(
+            lens, file, kept.parent
+        )
         write_json(kept, record)
         return record
     except NeurolensError as error:
-        return {"lens": file.stem, "fault": str(error)}
+        return {"lens": lens_id_of(file), "fault": str(error)}
 
 
 def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
