@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from neurolens.base.bounds import F_NUMBER, FOCAL_MM
 from neurolens.base.errors import InputError, one_line
-from neurolens.base.lensname import is_model, lens_id_of, resolve
+from neurolens.base.lensname import lens_id_of, resolve
 
 if TYPE_CHECKING:
     from neurolens.optics.apertures import Aperture
@@ -290,27 +290,3 @@ def check_suffix(path: Path, option: str, suffixes: tuple[str, ...]) -> None:
     if path.suffix.lower() not in suffixes:
         expected = suffixes[0] if len(suffixes) == 1 else f"one of {', '.join(suffixes)}"
         raise InputError(path, option, path.suffix or "(no suffix)", expected)
-
-
-def add_bare(parser: argparse.ArgumentParser) -> None:
-    """Add --bare, for `bare_of`."""
-    parser.add_argument(
-        "--bare", action="store_true",
-        help="of a lens file: leave out coatings and what glass absorbs, and say so; else such a lens is refused",
-    )  # fmt: skip
-
-
-def bare_of(args: argparse.Namespace, file: Path) -> str:
-    """The line on what --bare leaves out of a lens file, "" of nothing.
-
-    Raises:
-        InputError: --bare of a model.
-    """
-    if not args.bare:
-        return ""
-    if is_model(file):
-        raise InputError(file, "--bare", "(a model)", "a lens file: a model has what its lens has")
-    from neurolens.cameras.exact import bare_line
-    from neurolens.readers.any_format import read_any
-
-    return bare_line(read_any(file))

@@ -12,16 +12,7 @@ from typing import Any
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import check_writable
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import (
-    Parser,
-    add_bare,
-    add_json,
-    add_lens,
-    bare_of,
-    check_folder,
-    check_suffix,
-    whole,
-)
+from neurolens.commands.arguments import Parser, add_json, add_lens, check_folder, check_suffix, whole
 from neurolens.commands.output import answer
 
 _DESCRIPTION = """\
@@ -30,7 +21,7 @@ camera's data, where a lens is put on with one click and taken off with one."""
 _BUILD = """\
 Pack the extension with a folder of models: of each lens the best polynomial, the best network and,
 where its lens file is beside the models' folder in lenses/, the exact lens, every surface traced.
-A lens whose glass absorbs or is coated has no exact form; what cannot be a shader is left out and said.
+What cannot be a shader is left out and said.
 
 Finished lenses are kept: a build that was stopped goes on where it was, and a second one is quick.
 
@@ -66,7 +57,6 @@ def add_parser(subparsers: Any) -> None:
     add = actions.add_parser("add", help="put a lens into the extension", description=_ADD)
     add_lens(add, "file", models=True)
     add.add_argument("--to", metavar="ZIP|DIR", type=Path, help="a packed extension, or a user folder of one")
-    add_bare(add)
     add.add_argument("--zoom", metavar="STATE", help="state of a zoom, by name or focal length in mm; range: a setting")
     add_json(add, quiet=True)
     add.set_defaults(run=run_add, kept="nothing was added")
@@ -127,7 +117,7 @@ def run_add(args: argparse.Namespace) -> int:
         expected = "--to, a zip or a folder: no Blender of this machine has the extension installed"
         raise InputError("neurolens blender add", "--to", "(missing)", expected)
     check_takes(to)
-    form = form_of(args.file, zoom=args.zoom, as_bare=bare_of(args, args.file), quiet=args.quiet)
+    form = form_of(args.file, zoom=args.zoom, quiet=args.quiet)
     lens = packed_of([args.file], [form], zoom=args.zoom)
     (add_to_zip if to.suffix == ".zip" else add_to_folder)(to, lens)
     data = {"lens": lens.lens_id, "to": str(to), "forms": [f.model or f.kind for f in lens.forms]}

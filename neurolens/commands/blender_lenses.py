@@ -35,17 +35,17 @@ _RADII, _NEAR = (0.0, 0.35, 0.6, 0.8, 0.97), 20.0  # of the picture's radius; fo
 Forms = dict[Path, Form]
 
 
-def form_of(file: Path, *, zoom: str | None = None, as_bare: str = "", quiet: bool = False) -> Form:
+def form_of(file: Path, *, zoom: str | None = None, quiet: bool = False) -> Form:
     """The shader of a model (.onnx) or of a lens file, with its facts; kept between runs. See `shader_of`.
 
     Raises:
         InputError: a lens that cannot be a shader. ModelError: a broken model.
     """
-    return kept_form(file, zoom, as_bare, make=lambda: _made_form(file, zoom, as_bare, quiet))
+    return kept_form(file, zoom, make=lambda: _made_form(file, zoom, quiet))
 
 
-def _made_form(file: Path, zoom: str | None, as_bare: str, quiet: bool) -> Form:
-    shader = shader_of(file, zoom=zoom, as_bare=as_bare, quiet=quiet)
+def _made_form(file: Path, zoom: str | None, quiet: bool) -> Form:
+    shader = shader_of(file, zoom=zoom, quiet=quiet)
     kind, model, error, poor = "exact", "", None, []
     if is_model(file):
         card = _card(file)
@@ -53,8 +53,7 @@ def _made_form(file: Path, zoom: str | None, as_bare: str, quiet: bool) -> Form:
         kind = "network" if _family(card).startswith(_NETWORK) else "polynomial"
         poor = list(card["errors"].get("poor") or ())
     state = None if zoom == RANGE else zoom
-    notes = [*shader.notes, *filter(None, [as_bare.removesuffix(".")])]
-    notes += [] if state is None else [f"The zoom stands at {state}"]
+    notes = [*shader.notes] if state is None else [*shader.notes, f"The zoom stands at {state}"]
     if (squeeze := _squeeze(file, state)) != 1.0:
         axis, aspect = ("Y", squeeze) if squeeze > 1 else ("X", 1 / squeeze)
         side = "across" if squeeze > 1 else "in height"
@@ -80,12 +79,12 @@ def _squeeze(file: Path, zoom: str | None) -> float:
 
 def forms_of(
     files: Sequence[Path], jobs: int, report: Callable[[float], object],
-    given: Mapping[Path, tuple[str | None, str]] = MappingProxyType({}),
+    zooms: Mapping[Path, str | None] = MappingProxyType({}),
 ) -> tuple[Forms, dict[Path, str]]:  # fmt: skip
     """Forms of many files, `jobs` at a time in processes of their own, and why others have none.
 
     Args:
-        given: zoom and as_bare of `form_of`, of files that have any.
+        zooms: `zoom` of `form_of`, of files that have one.
 
     Raises:
         NeurolensError: a process ended by itself, as where memory is short.
@@ -102,11 +101,11 @@ def forms_of(
 
     if jobs == 1:
         for file in files:
-            keep(file, _form_or_why(file, *given.get(file, ())))
+            keep(file, _form_or_why(file, zooms.get(file)))
         return found, left
     with ProcessPoolExecutor(jobs, CONTEXT, _begin_job) as pool:
         with held():  # a process just forked would raise what this one raises, and run on as a second command
-            waiting = {pool.submit(_form_or_why, file, *given.get(file, ())): file for file in files}
+            waiting = {pool.submit(_form_or_why, file, zooms.get(file)): file for file in files}
         try:
             for done in as_completed(waiting):
                 keep(waiting[done], done.result())
@@ -131,9 +130,9 @@ def _begin_job() -> None:
         torch.set_num_threads(1)
 
 
-def _form_or_why(file: Path, zoom: str | None = None, as_bare: str = "") -> Form | str:
+def _form_or_why(file: Path, zoom: str | None) -> Form | str:
     try:
-        return form_of(file, zoom=zoom, as_bare=as_bare, quiet=True)
+        return form_of(file, zoom=zoom, quiet=True)
     except NeurolensError as error:
         return str(error)
 

@@ -25,9 +25,9 @@ Read a lens file of another program and write it as a lens file of neurolens (.t
 Formats: Zemax (.zmx), CODE V (.seq), OSLO (.len, the simple ones), texts of the Optical Bench (.txt), FlareSim
 (.lens), the TOML of the Blender add-on Physical Camera, plain tables of four
 columns as in pbrt and appleseed (.dat, .txt), and JSON (our own, DeepLens, ISET). The content decides.
-Unsupported content is an error that names the line; what was left out, computed, assumed or
-doubtful is printed as a warning. Rims that a file does not give, and the check of the lens against its own
-statements, are traced: they need the extra "train" (torch)."""
+What changes rays and is not supported is an error that names the line; what was left out, computed,
+assumed or doubtful is printed as a warning and kept in the notes of the new file. Rims that a file does
+not give, and the check of the lens against its own statements, are traced: they need the extra "train" (torch)."""
 _EPILOG = """\
 examples:
   neurolens convert double_gauss.zmx -o lenses/double_gauss.toml

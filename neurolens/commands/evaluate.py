@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_glass, add_json, add_lens, whole
 from neurolens.commands.output import answer, number, table
+from neurolens.modelfile import AVERAGED, transmittance_of
 
 if TYPE_CHECKING:
     from neurolens.evaluate.check import Promise
@@ -88,6 +89,7 @@ def run(args: argparse.Namespace) -> int:
         "model": str(args.model),
         "lens": {"id": model.card["lens"]["id"], "name": lens.name, "file": lens.path},
         "method": model.card["fit"]["method"],
+        "transmittance": transmittance_of(model.card),
         **figures,
         "ns_per_ray": timing,
         "promises": [{**asdict(p), "holds": p.holds} for p in promises],
@@ -120,4 +122,6 @@ def _text(data: dict[str, Any], promises: list[Promise]) -> str:
         f"batches of {timing['batch']}",
     ]
     parts += [f"Poor, as the card says: {', '.join(data['poor'])}."] if data["poor"] else []
+    if data["transmittance"] == AVERAGED:
+        parts.append("Transmittance: its fit averaged over polarisation at every surface, the lens here does not.")
     return "\n\n".join([*parts, verdict])

@@ -54,7 +54,7 @@ _GHOSTS = 24  # of a lens at most: the brightest
 class _Entry:
     """A lens with its models, in one state; `zoom` "range" is all of a zoom.
 
-    `file` is of the lens, where it has been written; `as_bare` says what is left out where it is traced.
+    `file` is of the lens, where it has been written.
     """
 
     key: str
@@ -63,7 +63,6 @@ class _Entry:
     zoom: str | None = None
     ghosts: GhostModel | None = None
     file: Path | None = None
-    as_bare: str = ""
 
 
 def add_parser(subparsers: Any) -> None:
@@ -127,7 +126,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _with_file(entry: _Entry, folder: Path) -> _Entry:
-    from neurolens.cameras.exact import bare_line
     from neurolens.optics.lenswriter import write_lens
 
     if entry.lens is None:
@@ -135,17 +133,17 @@ def _with_file(entry: _Entry, folder: Path) -> _Entry:
     folder.mkdir()
     file = folder / f"{entry.lens.lens_id}.toml"
     write_lens(entry.lens, file)
-    return replace(entry, file=file, as_bare=bare_line(entry.lens))
+    return replace(entry, file=file)
 
 
 def _shaders(entries: Sequence[_Entry], jobs: int, progress: Progress) -> Mapping[Path, str]:
     """OSL of lens files and models; those that cannot be written so are told of and left out."""
     from neurolens.commands.blender_lenses import forms_of
 
-    given = {e.file: (e.zoom, e.as_bare) for e in entries if e.file is not None}
-    files = [*given, *(model for entry in entries for model in entry.models)]
+    zooms = {e.file: e.zoom for e in entries if e.file is not None}
+    files = [*zooms, *(model for entry in entries for model in entry.models)]
     with progress.stage("shaders") as report:
-        forms, left = forms_of(files, min(jobs, len(files)), report, given)
+        forms, left = forms_of(files, min(jobs, len(files)), report, zooms)
     for file, why in left.items():
         warnings.warn(f"no OSL: {why.replace(str(file), file.name)}", NeurolensWarning, stacklevel=2)
     return {file: form.osl for file, form in forms.items()}
@@ -249,7 +247,7 @@ def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str], shaders: Mappi
             path = _path(lens) if entry.zoom != RANGE else None
         except NeurolensError:
             if not forms:
-                raise  # a model of the lens stands in for it: coatings and the like have no code
+                raise  # a model of the lens stands in for it
         drawn = _section(lens)
     best, focal_mm = forms[0], [float(f.card["efl_mm"]) for f in forms]
     if entry.zoom != RANGE and max(focal_mm) - min(focal_mm) > _SAME * abs(focal_mm[0]):
@@ -324,14 +322,12 @@ def _facts(lens: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _exact_form(entry: _Entry, file: Path, at: Lens, kinds: Sequence[str], osl: str | None) -> Form:
-    from neurolens.cameras.exact import AS_BARE
     from neurolens.commands.export_lens import write_lens
     from neurolens.optics.paraxial import first_order
     from neurolens.optics.pupils import image_radius_mm
 
     written = {
-        to: write_lens(file, file.with_suffix(f".{to}"), to, zoom=entry.zoom, quiet=True, as_bare=entry.as_bare)
-        for to in _written(kinds)
+        to: write_lens(file, file.with_suffix(f".{to}"), to, zoom=entry.zoom, quiet=True) for to in _written(kinds)
     }
     data = first_order(at)
     told = {
@@ -341,8 +337,7 @@ def _exact_form(entry: _Entry, file: Path, at: Lens, kinds: Sequence[str], osl: 
         "f_numbers": [(float(data.efl_mm), float(data.f_number))],
         "errors": {}, "zones": {}, "poor": [],
     }  # fmt: skip
-    said = f"every surface traced, {AS_BARE}" if entry.as_bare else "every surface traced"
-    return _form("exact", said, written, told, {}, osl)
+    return _form("exact", "every surface traced", written, told, {}, osl)
 
 
 def _form(

@@ -331,7 +331,7 @@ def _exact(trial: _Trial) -> Iterator[_Judged]:
         "glsl": lambda: (glsl_operations(exact), noise(found.seen.weight, trial.share)),
     }.get(target, lambda: trial.timed(exact, found.seen))
     if target == "render" or (target != "onnx" and compiled) or target in ("osl", "glsl"):
-        with suppress(InputError):  # coatings, and glass that absorbs
+        with suppress(InputError):  # a shader that is too large
             yield trial.judged(_EXACT, f"{'fused:' if compiled and target in _OURS else ''}{path}", found.seen, cost)
 
 

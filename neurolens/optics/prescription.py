@@ -56,6 +56,8 @@ class Surface:
         absorption_per_mm: Napierian absorption of the medium after the surface at every wavelength (a grey filter),
             added to that of the glass.
         coating: the thin films on the surface, None where bare.
+        followed_mm: distance from the axis from which on an asphere continues smoothly instead of by its polynomial;
+            only `aiming.without_rims` sets it, for questions that ignore rims (`shapes.followed_mm`).
 
     `radius_mm`, `thickness_mm`, `n_d`, `conic` and the coefficients of `asphere` may be 0-d tensors where gradients
     with respect to them are wanted.
@@ -76,6 +78,7 @@ class Surface:
     glass: str | None = None
     absorption_per_mm: float = 0.0
     coating: Coating | None = None
+    followed_mm: float = math.inf
 
     @property
     def curvature(self) -> Any:
@@ -308,7 +311,7 @@ class Lens:
                 asphere=tuple((p, a * factor ** (1 - p)) for p, a in s.asphere),
                 absorption_per_mm=s.absorption_per_mm / factor,
                 across=s.across and (s.across[0] * factor, s.across[1]),
-                **lengths(s, "radius_mm", "thickness_mm", "diameter_mm", "focal_mm"),
+                **lengths(s, "radius_mm", "thickness_mm", "diameter_mm", "focal_mm", "followed_mm"),
             )
             for s in self.surfaces
         )

@@ -125,7 +125,7 @@ def with_derived_rims(lens: Lens) -> Lens:
         lens = lens.with_stop_radius(stop_radius_mm(lens, lens.f_number))
     if not any(s.asphere and math.isnan(s.diameter_mm) for s in lens.surfaces):
         return replace(_filled(lens, derive_rims(lens)[0]), rims="derived")
-    # Aspheres are traced no farther than a little beyond a rim: from those of their vertex spheres, until they stay.
+    # Figures of aspheres are followed little beyond a rim: from the rims of their vertex spheres, until they stay.
     found = _filled(lens, derive_rims(_spherical(lens))[0])
     for _ in range(_ROUNDS):
         before, found = found, _filled(lens, derive_rims(found)[0])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,8 +14,7 @@ from neurolens.optics.catalogue import LINE_C_NM, LINE_D_NM, LINE_F_NM, Glass
 from neurolens.optics.glass import by_figures
 from neurolens.optics.lensfile import MAX_INDEX, MAX_POWER, MAX_SURFACES
 from neurolens.optics.paraxial import FirstOrder
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.rims import with_derived_rims
+from neurolens.optics.prescription import Lens
 from neurolens.optics.sag import check_figures
 from neurolens.readers.source import Line, assume, warn
 
@@ -51,7 +50,7 @@ def finish(
         InputError: no row, too many, no stop or several, a figure out of range, a stop that nothing sizes, no image
             behind the lens.
     """
-    _check_rows(lens.surfaces, lens.path)
+    _check_stop(lens)
     stop = lens.surfaces[lens.stop_index]
     stated = lens.f_number
     # First-order data needs an opening, whatever it is.
@@ -91,25 +90,12 @@ def smaller_stop(file: str, asked: float, limit: float | None, state: str = "") 
     return limit
 
 
-def with_rims(lens: Lens, in_file: Callable[[str], str] = str) -> Lens:
-    """The lens with the rims that its file does not give derived by rule (`neurolens.optics.rims`), with a warning, in
-    which `in_file` calls surfaces as the file does.
-    """
-    missing = [k for k, s in enumerate(lens.surfaces) if math.isnan(s.diameter_mm)]
-    if not missing:
-        return lens
-    derived = with_derived_rims(lens)
-    surfaces = in_file(f"surface {', '.join(map(str, missing))}")
-    warn(lens.path, f"no rim is given for {surfaces}: derived from f-number and field")
-    return derived
-
-
 def first_order(lens: Lens) -> FirstOrder:
     """First-order data in the y-z plane; of a lens without power there, in the x-z plane.
 
     Raises InputError for a lens without power, or whose entrance pupil is a point or infinite; a figure out of range.
     """
-    _check_rows(lens.surfaces, lens.path)
+    _check_stop(lens)
     try:
         data = paraxial.first_order(lens, meridian="y")
     except InputError:
@@ -122,11 +108,14 @@ def first_order(lens: Lens) -> FirstOrder:
     return data
 
 
-def _check_rows(rows: Sequence[Surface], file: str) -> None:
+def check_rows(lens: Lens) -> None:
+    """Raise InputError for no surface, too many, or a figure out of range; whether there is a stop is not checked."""
+    rows, file = lens.surfaces, lens.path
     if not rows:
         raise InputError(file, "surfaces", "(none)", "at least one surface between object and image")
     if len(rows) > MAX_SURFACES:
         raise InputError(file, "surfaces", f"({len(rows)} of them)", f"at most {MAX_SURFACES}")
+    index = f"a refractive index from 1 to {MAX_INDEX}"
     mirror = " (an index of -1 describes a mirror, and the lens model has none)"
     for k, s in enumerate(rows):
         terms = (s.conic, *(a for _, a in s.asphere))
@@ -134,12 +123,7 @@ def _check_rows(rows: Sequence[Surface], file: str) -> None:
             ("radius", s.radius_mm, abs(s.radius_mm) > 0, "a number other than 0, or a plane"),
             ("thickness", s.thickness_mm, math.isfinite(s.thickness_mm), "a finite length"),
             ("diameter", s.diameter_mm, math.isnan(s.diameter_mm) or 0 < s.diameter_mm < math.inf, "a length above 0"),
-            (
-                "index",
-                s.n_d,
-                1 <= s.n_d <= MAX_INDEX,
-                f"a refractive index from 1 to {MAX_INDEX}{mirror if s.n_d == -1 else ''}",
-            ),
+            ("index", s.n_d, 1 <= s.n_d <= MAX_INDEX, index + mirror * (s.n_d == -1)),
             ("Abbe number", s.V_d, s.V_d is None or 0 < s.V_d < math.inf, "a number above 0"),
             ("asphere", (s.conic, s.asphere), all(map(math.isfinite, terms)), "finite coefficients"),
             *(("asphere, power", p, 2 <= p <= MAX_POWER, f"a power from 2 to {MAX_POWER}") for p, _ in s.asphere),
@@ -147,11 +131,17 @@ def _check_rows(rows: Sequence[Surface], file: str) -> None:
         for name, value, sound, expected in figures:
             if not sound:
                 raise InputError(file, f"surface {k}, {name}", value, expected)
+    if not 1 <= lens.object_medium.n_d <= MAX_INDEX:
+        raise InputError(file, "object, index", lens.object_medium.n_d, index)
     check_figures(rows, file)
-    stops = [k for k, s in enumerate(rows) if s.stop]
+
+
+def _check_stop(lens: Lens) -> None:
+    check_rows(lens)
+    stops = [k for k, s in enumerate(lens.surfaces) if s.stop]
     if len(stops) != 1:
-        found = f"(on surfaces {', '.join(map(str, stops))})" if stops else "(none)"
-        raise InputError(file, "stop", found, "exactly one surface that is the aperture stop")
+        found = f"(on surface {', '.join(map(str, stops))})" if stops else "(none)"
+        raise InputError(lens.path, "stop", found, "exactly one surface that is the aperture stop")
 
 
 def named_glass(
@@ -185,7 +175,7 @@ def named_glass(
         expected = f"a glass of the catalogue: it has {base.name}, whose moulded variant this may be; or give --glass"
         raise InputError(file, field, name, expected)
     if base and not same and figures and not 0 <= base.n_d - figures[0] <= _MOULDING:
-        told = f"assumed to be {base} (n_d {base.n_d:.5f}), moulded: n_d {figures[0]:g} beside it is not of such a glass"
+        told = f"assumed to be {base} (n_d {base.n_d:.5f}), moulded: n_d {figures[0]:g} beside it fits no such glass"
         assume(file, f"{field}: glass {name} is {told}")
         return {"n_d": base.n_d, "V_d": base.V_d, "glass": short_name(base), "material": name}
     known = next((g for m in makers for g in same if g.maker.upper() == m), None)

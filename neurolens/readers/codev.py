@@ -21,7 +21,7 @@ from neurolens.readers.codev_model import (
     shape_of,
 )
 from neurolens.readers.draft import INFINITE, Draft, Given, Row, lens_of, primary_first
-from neurolens.readers.source import assume, read_lines, warn
+from neurolens.readers.source import assume, by_word, read_lines, warn
 
 
 @dataclass
@@ -88,28 +88,20 @@ HARMLESS = frozenset(
     DLN DLF DLR IRR SCC KXC""".split()
 )
 # What changes rays and is not read: what is expected in its place.
-REFUSED = {
-    word: expected
-    for words, expected in (
-        ("NAO NA", "EPD or FNO to size the stop"),
-        ("MOD", "a surface that is no ideal lens (a module)"),
-        ("GRT DIF DOE HOE HOL", "a surface that is no grating, hologram or diffractive surface"),
-        ("GRN", "a medium without a gradient index"),
-        ("FRN SPL UDS NSS", "a surface that is no Fresnel surface, spline, surface of the user or non-sequential part"),
-        ("RMD", "a surface that refracts: the lens model has no mirrors"),
-        ("REX REY ELX ELY REC ELL", "a round opening (CIR)"),
-    )
-    for word in words.split()
-}
+REFUSED = by_word(
+    ("NAO NA", "EPD or FNO to size the stop"),
+    ("MOD", "a surface that is no ideal lens (a module)"),
+    ("GRT DIF DOE HOE HOL", "a surface that is no grating, hologram or diffractive surface"),
+    ("GRN", "a medium without a gradient index"),
+    ("FRN SPL UDS NSS", "a surface that is no Fresnel surface, spline, surface of the user or non-sequential part"),
+    ("RMD", "a surface that refracts: the lens model has no mirrors"),
+    ("REX REY ELX ELY REC ELL", "a round opening (CIR)"),
+)
 VIGNETTING = frozenset(["VUX", "VLX", "VUY", "VLY"])
+SHAPES = ("SPH", "CON", "ASP", "CYL", "YTO", "XTO", "AAS")
 READ = (
-    *"S SO SI RDM TIT DIM EPD FNO TEM WL REF".split(),
-    *FIELDS,
-    *"RDY CUY RDX CUX THI GLA STO SPH CON ASP CYL YTO XTO AAS SPS SCO K".split(),
-    *ALONG,
-    *LETTERS,
-    *NONE_BUT_0,
-    *("CIR", "PIM", "PRV", "ZOO"),
+    *"RDY CUY RDX CUX THI GLA STO SPS SCO K CIR PIM".split(),
+    *(*SHAPES, *ALONG, *LETTERS, *NONE_BUT_0),
 )
 
 
@@ -210,7 +202,7 @@ def _surface(file: File, command: Command) -> None:
     match name:
         case "STO":
             block.stop = True
-        case "SPH" | "CON" | "ASP" | "CYL" | "YTO" | "XTO" | "AAS":
+        case _ if name in SHAPES:
             block.kind = name
         case "SPS" | "SCO":
             block.put_special(command, words)

@@ -217,6 +217,8 @@ def _special(block: Block) -> dict[str, Any]:
         found[power] = value
     if kind == "ODD":
         return block.rotational((n, a / (radius or 1.0) ** n) for n, a in sorted(found.items()))
+    if kind == "QBF" and block.conic:
+        raise block.start.error(f"conic of SPS {kind}", block.conic, "0: Qbfs departs from a sphere")
     if not radius > 0:
         raise block.start.error(f"NRADIUS of SPS {kind}", radius, "a normalisation radius above 0")
     told = f"SPS {kind}: coefficient {SPECIAL[kind]}n is taken as that of Forbes's m = (n - 4) / 2"

@@ -15,13 +15,12 @@ from typing import Any
 from neurolens.base.bounds import WAVELENGTH_NM, within
 from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import MAX_SURFACES, check_states
-from neurolens.optics.paraxial import system_of
 from neurolens.optics.prescription import Configuration, Lens, Medium, Surface
-from neurolens.optics.rims import narrowed_rims
-from neurolens.optics.sag import end_mm, same_medium
-from neurolens.readers.assemble import UNKNOWN, finish, first_order, smaller_stop, with_rims
+from neurolens.optics.sag import same_medium
+from neurolens.readers.assemble import UNKNOWN, finish, first_order, smaller_stop
 from neurolens.readers.forbes import MAX_TERMS, qbfs_terms, qcon_terms
-from neurolens.readers.source import UNITS_MM, Line, assume, warn
+from neurolens.readers.openings import narrowed, stop_aperture, with_likely_rims, with_rims, with_stop
+from neurolens.readers.source import UNITS_MM, Line, warn
 
 
 @dataclass(frozen=True)
@@ -78,10 +77,9 @@ class Block:
         rim = radius if math.isnan(self.semi_diameter) else self.semi_diameter
         if len(values) > MAX_TERMS:
             raise self.start.error(name, f"({len(values)} terms)", f"at most {MAX_TERMS} terms")
-        if not qcon and self.conic:
-            raise self.start.error(f"conic of {name}", self.conic, "0: Qbfs departs from a sphere")
         try:
-            terms = qcon_terms(values, radius, rim) if qcon else qbfs_terms(values, radius, self.curvature, rim)
+            base = self.curvature, rim, self.conic
+            terms = qcon_terms(values, radius, rim) if qcon else qbfs_terms(values, radius, *base)
         except ValueError as error:
             found = f"(curvature {self.curvature:g}, rim {rim:g})"
             raise self.start.error(name, found, str(error)) from None
@@ -168,10 +166,6 @@ class Draft:
     object_medium: dict[str, Any] = field(default_factory=dict)
     wavelengths_nm: tuple[float, ...] = ()
 
-    def f_number_agrees(self, other: float) -> bool:
-        """Whether an f-number is the one that the file states, as far as printed digits tell, or it states none."""
-        return self.f_number is None or abs(other / self.f_number - 1) <= _AGREES
-
     def in_file(self, text: str) -> str:
         """A message about the rows, each called as the file calls its surface."""
 
@@ -194,8 +188,9 @@ def lens_of(draft: Draft, given: Given | None = None) -> Lens:
     if +draft.skipped:
         listed = (word if count == 1 else f"{word} ({count})" for word, count in (+draft.skipped).items())
         warn(draft.file, f"left out, since no ray depends on it: {', '.join(listed)}")
-    draft = _without_dummies(_with_stop(draft, given.stop))
     try:
+        draft = with_stop(draft, given.stop)
+        draft = _without_dummies(draft)
         return _lens_of(draft, given)
     except InputError as error:
         value = draft.in_file(error.value) if isinstance(error.value, str) else error.value
@@ -227,100 +222,27 @@ def _lens_of(draft: Draft, given: Given) -> Lens:
         wavelengths_nm=draft.wavelengths_nm,
     )
     if draft.drawn:
-        lens = _with_likely_rims(lens, draft)
+        lens = with_likely_rims(lens, draft)
     if draft.f_number is not None and draft.pupil is None and not draft.stop_given:
         # The file's f-number overrides a diameter of the stop, except for an aperture set on it.
         rows = (replace(s, diameter_mm=math.nan) if s.stop else s for s in lens.surfaces)
         lens = replace(lens, surfaces=tuple(rows))
-    lens = finish(lens, pupil_mm=draft.pupil, film_given=draft.film_given, stop_limit_mm=_stop_aperture(draft))
-    if draft.stop_given and not draft.f_number_agrees(by_stop := first_order(lens).f_number):
-        told = f"a stop {lens.stop_radius_mm * 2:g} wide gives f/{by_stop:.3g}"
-        warn(draft.file, f"{told}, the file says f/{draft.f_number:.3g}: the diameter is kept")
+    lens = finish(lens, pupil_mm=draft.pupil, film_given=draft.film_given, stop_limit_mm=stop_aperture(draft))
+    if draft.stop_given and abs((by_stop := first_order(lens).f_number) / lens.f_number - 1) > _AGREES:
+        told = f"a stop {lens.stop_radius_mm * 2:g} wide gives f/{by_stop:.3g}, the file says f/{lens.f_number:.3g}"
+        warn(draft.file, f"{told}: the diameter is kept")
     lens = replace(lens, configurations=tuple(_configuration(lens, draft, state) for state in _states(draft)))
     lens = with_rims(lens.scaled(factor) if factor != 1 else lens, draft.in_file)
     with suppress(InputError):
         check_states(lens)
         return lens
-    lens = _narrowed(lens, draft)
+    lens = narrowed(lens, draft)
     check_states(lens)
     return lens
 
 
 _AGREES = 0.03  # relative: f-numbers are printed with two digits
-_SLIGHTLY = 0.1  # of a rim's diameter
 _ROWS = re.compile(r"\bsurface ([0-9]+(?:, [0-9]+(?![0-9.]| mm))*)(?! of the file)")
-_TWICE, _SAME = (0.4, 0.7), (0.7, 1.4)  # f-number by the stop's diameter over the stated one: rims twice as wide, right
-
-
-def _with_stop(draft: Draft, wanted: str | None) -> Draft:
-    """The draft with a stop: the surface wanted, that of the file, or else that whose rim limits the beam of the axis.
-
-    Raises:
-        InputError: no surface of that number.
-    """
-    names = [row.name or str(k) for k, row in enumerate(draft.rows)]
-    if wanted is not None:
-        if wanted not in names:
-            raise InputError(draft.file, "--stop", wanted, f"the number of a surface in the file: {', '.join(names)}")
-        k = names.index(wanted)
-    elif any(row.surface.stop for row in draft.rows) or not draft.rows:
-        return draft
-    else:
-        rows = tuple(row.surface for row in draft.rows)
-        heights = system_of(Lens("", "", rows, math.nan, object_medium=Medium(**draft.object_medium))).march(1.0, 0.0).y
-        k = min(range(len(rows)), key=lambda k: _share(rows[k].semi_diameter_mm, heights[k]))
-        assume(draft.file, f"no stop is marked: surface {names[k]}, whose rim limits the beam of the axis, is taken")
-    # Its rim stays, where the f-number or pupil of the file would have a wider one.
-    marked = (replace(row, surface=replace(row.surface, stop=i == k)) for i, row in enumerate(draft.rows))
-    return replace(draft, rows=tuple(replace(row, aperture=row.aperture or row.surface.stop) for row in marked))
-
-
-def _share(rim: float, height: float) -> float:
-    """A rim over the height of the marginal ray of a beam 2 mm wide; infinite where there is no rim."""
-    return math.inf if math.isnan(rim) or height == 0 else rim / abs(height)
-
-
-def _with_likely_rims(lens: Lens, draft: Draft) -> Lens:
-    """The lens with rims of half the width, where stop and spheres say that radii were meant by diameters."""
-    f_number = draft.f_number or draft.nominal
-    if not any(s.stop for s in lens.surfaces):
-        return lens  # `finish` says so
-    beyond = [k for k, s in enumerate(lens.surfaces) if s.semi_diameter_mm > end_mm(s) * (1 + 1e-6)]
-    evidence = f"the rim of surface {beyond[0]} is wider than its sphere" if beyond else ""
-    if f_number is not None and not math.isnan(lens.stop_radius_mm):
-        by_stop = first_order(lens).f_number
-        if _SAME[0] <= by_stop / f_number <= _SAME[1]:
-            return lens
-        if _TWICE[0] <= by_stop / f_number < _TWICE[1]:
-            evidence = f"the stop would give f/{by_stop:.3g}, the file says f/{f_number:.3g}"
-    if not evidence:
-        return lens
-    assume(lens.path, f"rims are assumed to be half as wide as the format has them: {draft.in_file(evidence)}")
-    rows = (replace(s, diameter_mm=s.diameter_mm / 2) for s in lens.surfaces)
-    return replace(lens, surfaces=tuple(rows))
-
-
-def _narrowed(lens: Lens, draft: Draft) -> Lens:
-    """The lens with rims no wider than their spheres and than where neighbours touch, in every state.
-
-    Unless rims are `drawn`, they are narrowed by no more than `_SLIGHTLY`: rounded figures do not ask for more.
-    """
-    found = narrowed_rims(lens)
-    pairs = list(zip(lens.surfaces, found.surfaces, strict=True))
-    if not draft.drawn and any(b.diameter_mm < (1 - _SLIGHTLY) * a.diameter_mm for a, b in pairs):
-        return lens
-    widths = [(k, f"{a.diameter_mm:.4g} to {b.diameter_mm:.4g} mm") for k, (a, b) in enumerate(pairs) if a != b]
-    changed = [f"{draft.in_file(f'surface {k}')} ({width})" for k, width in widths]
-    if changed:  # no rim is wider than its sphere: where one is said to be, table or rims are in doubt
-        say = assume if any(s.semi_diameter_mm > end_mm(s) * (1 + 1e-6) for s in lens.surfaces) else warn
-        say(lens.path, f"rims narrowed to where spheres end or neighbours touch: {', '.join(changed)}")
-    return found
-
-
-def _stop_aperture(draft: Draft) -> float | None:
-    """Diameter of the aperture that the file sets on the stop itself, in its unit."""
-    stops = (row.surface.diameter_mm for row in draft.rows if row.surface.stop and row.aperture)
-    return next((d for d in stops if not math.isnan(d)), None)
 
 
 def _states(draft: Draft) -> tuple[State, ...]:
@@ -349,7 +271,7 @@ def _configuration(lens: Lens, draft: Draft, state: State) -> Configuration:
             pupil = abs(data.efl_mm) / draft.f_number
     if pupil is not None and opening is None:
         asked = 2 * there.stop_radius_mm * pupil / data.entrance_pupil_diameter_mm
-        opening = smaller_stop(draft.file, asked, _stop_aperture(draft), f'state "{state.name}": ')
+        opening = smaller_stop(draft.file, asked, stop_aperture(draft), f'state "{state.name}": ')
         f_number = f_number if opening == asked else None
     if f_number is None and opening is not None:
         f_number = data.f_number * 2 * there.stop_radius_mm / opening

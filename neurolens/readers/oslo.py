@@ -17,27 +17,23 @@ from neurolens.optics.prescription import Lens, Surface
 from neurolens.readers import draft
 from neurolens.readers.assemble import UNKNOWN, by_indices, named_glass
 from neurolens.readers.draft import INFINITE, Draft, Given, Row, lens_of, primary_first
-from neurolens.readers.source import UNITS_MM, Line, read_lines
+from neurolens.readers.source import UNITS_MM, Line, by_word, read_lines
 
 TERMS = {"AD": 4, "AE": 6, "AF": 8, "AG": 10}
 # Designer, weights, settings of the program, drawings.
 HARMLESS = frozenset("DES WW CALLBACK GPRT DRW CBK DLRS".split())
 # What changes rays and is not read, where a number other than 0 or a word follows: what is expected in its place.
-REFUSED = {
-    word: expected
-    for words, expected in (
-        ("NAO NA", "EBR or FNO to size the stop"),
-        ("TLA TLB TLC DCX DCY DCZ GC RCO", "no tilt or decentre: the lens model has none"),
-        ("RFL RFH REFL", "no mirror: the lens model has none"),
-        ("GRT GSP GOR DFR DOE HOE HOR", "no grating or hologram: the lens model has none"),
-        ("GRD GDT NZ1 NR1 NR2 NR4", "no gradient index: the lens model has none"),
-        ("PFL PFM", "no ideal lens: it is not read from OSLO's files"),
-        ("CVX RDX AAD ASP ASR ASI ASX TOR CCX", "a sphere, a conic, or AD to AG: other shapes are not read"),
-        ("PK PU PI PUC PIC PYC EAC", "a figure: solves and pickups are not carried out"),
-        ("AN AX1 AY1 APN AAC", "a round opening"),
-    )
-    for word in words.split()
-}
+REFUSED = by_word(
+    ("NAO NA", "EBR or FNO to size the stop"),
+    ("TLA TLB TLC DCX DCY DCZ GC RCO", "no tilt or decentre: the lens model has none"),
+    ("RFL RFH REFL", "no mirror: the lens model has none"),
+    ("GRT GSP GOR DFR DOE HOE HOR", "no grating or hologram: the lens model has none"),
+    ("GRD GDT NZ1 NR1 NR2 NR4", "no gradient index: the lens model has none"),
+    ("PFL PFM", "no ideal lens: it is not read from OSLO's files"),
+    ("CVX RDX AAD ASP ASR ASI ASX TOR CCX", "a sphere, a conic, or AD to AG: other shapes are not read"),
+    ("PK PU PI PUC PIC PYC EAC", "a figure: solves and pickups are not carried out"),
+    ("AN AX1 AY1 APN AAC", "a round opening"),
+)
 
 
 @dataclass
@@ -98,8 +94,10 @@ def _read(file: File, line: Line) -> None:
         file.blocks.append(Block(line))
     elif not file.blocks:
         raise line.error(word, "(here)", "LEN NEW before everything else")
-    elif file.ended:
-        _behind(file, line, word)
+    elif file.ended and word in ("CFG", "CF", "C"):
+        raise line.error(word, " ".join(rest) or "(here)", "one configuration: others are not read")
+    elif file.ended:  # variables, operands and tolerances, up to an END of their own
+        file.skipped["lines behind the surfaces"] += word != "END"
     elif word in HARMLESS:
         pass
     elif re.fullmatch("SNO[0-9]*|NOT[0-9]*", word):
@@ -110,13 +108,6 @@ def _read(file: File, line: Line) -> None:
             raise line.error(word, " ".join(rest) or "(here)", REFUSED[word])
     elif not _system(file, line, word, rest):
         _surface(file, line, word, rest)
-
-
-def _behind(file: File, line: Line, word: str) -> None:
-    """A line behind the surfaces: variables, operands and tolerances, up to an END of their own; no configurations."""
-    if word in ("CFG", "CF", "C"):
-        raise line.error(word, " ".join(line.words[1:]) or "(here)", "one configuration: others are not read")
-    file.skipped["lines behind the surfaces"] += word != "END"
 
 
 def _system(file: File, line: Line, word: str, rest: list[str]) -> bool:

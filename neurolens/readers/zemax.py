@@ -42,6 +42,7 @@ class File(Draft):
     blocks: list[Block] = field(default_factory=list)
     zoom: Zoom = field(default_factory=Zoom)
     makers: list[str] = field(default_factory=list)
+    without_film: bool = False
     working: Line | None = None  # where the f-number is said to be the working one
     field_type: int = 0
     fields: int = 0
@@ -81,7 +82,7 @@ def _complete(file: File) -> None:
     file.object_distance, file.object_medium = file.blocks[0].thickness, file.blocks[0].medium
     used = dict.fromkeys(um for n, um in sorted(file.waves_um.items()) if n <= (file.waves or n))
     file.wavelengths_nm = primary_first([1000 * um for um in used], 1000 * file.waves_um.get(file.primary, 0.0))
-    file.film_given = not (last.solve and last.solve[0] == "MAZH" and last.thickness == 0)
+    file.film_given = not (file.without_film or (last.solve and last.solve[0] == "MAZH" and last.thickness == 0))
     file.rims = "estimated" if any(b.automatic and not b.stop for b in file.blocks[1:-1]) else "source"
     _set_field(file)
 
@@ -89,23 +90,24 @@ def _complete(file: File) -> None:
 def _add_ends(file: File) -> None:
     """Add the object and the image to a file that lists the surfaces of a lens only."""
     first, last = file.blocks[0], file.blocks[-1]
-    odd = next((b for b in file.blocks if b.name and not b.name.isdecimal()), None)
-    if odd and file.zoom.count > 1:
-        raise odd.start.error("SURF", odd.name, "numbers in order, in a file with configurations")
-    if first.name and first.medium and (first.curvature or last.thickness > 0) and math.isfinite(first.thickness):
-        if file.zoom.count > 1:
-            raise first.start.error("SURF", "(glass behind the object)", "an object surface in front of the lens")
-        assume(
-            file.file, f"surface {first.name} is a surface of glass: the object is assumed in front of it, at infinity"
-        )
+    begins_in_glass = bool(first.name and first.medium and math.isfinite(first.thickness))
+    # Such a list ends with a surface of the lens; any other file that ends behind glass has been cut off.
+    ends_in_glass = begins_in_glass and bool(file.blocks[-2].medium)
+    lists_lens = begins_in_glass and (first.curvature or last.thickness > 0 or ends_in_glass)
+    if file.zoom.count > 1 and (lists_lens or not all(b.name.isdecimal() for b in file.blocks)):
+        raise first.start.error("SURF", first.name, "object, surfaces numbered in order, and image, for configurations")
+    if lists_lens:
+        assume(file.file, f"surface {first.name} is one of glass: the object is assumed in front of it, at infinity")
         file.blocks.insert(0, Block(first.start, thickness=math.inf))
     elif not first.name:
         first.thickness = math.inf
         assume(file.file, "there is no SURF 0: the object is assumed at infinity, in air")
     elif first.curvature and math.isfinite(first.thickness):
         warn(file.file, "the object surface is curved; the object is taken as plane")
-    if last.thickness > 0 and not file.blocks[0].name:
-        assume(file.file, "the last surface is no image: the film is assumed where its thickness ends")
+    file.without_film = ends_in_glass and last.thickness == 0
+    if ends_in_glass or (last.thickness > 0 and not file.blocks[0].name):
+        place = "at the paraxial focus" if file.without_film else "where its thickness ends"
+        assume(file.file, f"the last surface is no image: the film is assumed {place}")
         file.blocks.append(Block(last.start, thickness=0.0))
 
 
@@ -294,7 +296,10 @@ def _glass(line: Line, rest: list[str], makers: list[str]) -> dict[str, Any]:
     if name.upper() in ("AIR", "VACUUM"):
         return {}
     if kind == "1" or name == "___BLANK":
-        n_d, V_d = (*line.numbers("GLAS", rest[3:5]), 0.0)[:2]
+        n_d, V_d, departure = (*line.numbers("GLAS", rest[3:6]), 0.0, 0.0)[:3]
+        if departure:
+            left_out = "a model glass's departure from normal partial dispersion is left out: colours differ a little"
+            warn(line.file, f"line {line.number}, GLAS: {left_out}")
         return {"n_d": n_d, "V_d": V_d if V_d > 0 else None, "material": None if name == "___BLANK" else name}
     if kind == "4":
         raise line.error(

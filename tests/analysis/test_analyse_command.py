@@ -160,6 +160,20 @@ def test_doubtful_tables_are_named(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "Warning: surface 1, n_d = 1.5168" in capsys.readouterr().out
 
 
+def test_the_chart_of_lens_makers_has_the_frequencies_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+    data = run_json(capsys, "analyse", TESSAR, "mtf-height", "--frequencies", 80, 10, "--wavelengths", 550)[
+        "mtf-height"
+    ]
+    assert data["frequency_per_mm"] == [10, 80] and data["wavelength_nm"] == [550]
+    assert data["height_mm"][0] == 0 and data["height_mm"][-1] == pytest.approx(43.1, abs=0.1)
+    assert np.shape(data["tangential"]) == np.shape(data["sagittal"]) == np.shape(data["spread"]["sagittal"]) == (21, 2)
+    assert data["tangential"][0] == pytest.approx(data["sagittal"][0], abs=1e-3)
+    assert main(["analyse", str(TESSAR), "mtf-height", "--frequencies", "80"]) == 0
+    text = capsys.readouterr().out
+    assert "against image height" in text and "80/mm T  80/mm S" in text
+    assert "cycles per mm from 0" in failure(capsys, "analyse", TESSAR, "mtf-height", "--frequencies", "-5")
+
+
 def test_options_may_stand_before_what(capsys: pytest.CaptureFixture[str]) -> None:
     data = run_json(capsys, "analyse", GAUSS, "--f-number", 8, "seidel", "--axis", "x", "distortion")
     assert "seidel" in data and "distortion" in data and "spots" not in data

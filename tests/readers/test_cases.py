@@ -137,7 +137,13 @@ def test_glass_at_the_object_is_a_surface_of_the_lens(tmp_path: Path) -> None:
     path = tmp_path / "lens.zmx"
     path.write_text(WITHOUT_STOP.replace("SURF 1", "SURF 0").replace("SURF 2", "SURF 1"))
     lens, told = heard(path)
-    assert len(lens.surfaces) == 2 and "surface 0 is a surface of glass: the object is assumed in front" in told
+    assert len(lens.surfaces) == 2 and "surface 0 is one of glass: the object is assumed in front" in told
+    alone = first_order(lens)
+    path.write_text(path.read_text().replace("DISZ 45", "DISZ 0"))
+    lens, told = heard(path)  # a curved surface behind glass is no image: it refracts, and the film is to be assumed
+    assert first_order(lens).efl_mm == alone.efl_mm
+    assert lens.surfaces[-1].thickness_mm == pytest.approx(alone.back_focus_mm, rel=1e-12)
+    assert "the last surface is no image: the film is assumed at the paraxial focus" in told
 
 
 def test_messages_number_surfaces_as_the_file_does(tmp_path: Path) -> None:

@@ -239,6 +239,6 @@ def test_paths_of_a_worker_s_cameras(tmp_path: Path) -> None:
 def test_one_file_is_warned_of_once_in_a_command(files: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
     text = files["zmx"].read_text().replace("MODE SEQ", "MODE SEQ\nQQQQ 1")
     files["zmx"].write_text(text)
-    assert main(["export", str(files["zmx"]), "--to", "c", "--bare", "-o", str(files["toml"]) + ".h", "--json"]) == 0
+    assert main(["export", str(files["zmx"]), "--to", "c", "--camera", "-o", str(files["toml"]) + ".h", "--json"]) == 0
     lines = [line for line in capsys.readouterr().err.splitlines() if "QQQQ" in line]
     assert len(lines) == 1

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from shipped import before, disc_irradiance, pinhole, tabled
 
+from experiments.radiometry import FilmLight, film_light, white_card
 from neurolens.base.errors import InputError
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.radiometry import FilmLight, film_light, white_card
 
 
 def lens(name: str, **state: float) -> Lens:
