@@ -1,13 +1,4 @@
-"""A camera from what a command line names, as `neurolens.base.lensname` reads it.
-
-    pinhole, thin                       a point; a thin lens
-    fisheye-equidistant, -equisolid,    points with a fisheye projection
-      -stereographic, -orthographic
-    thick:LENS                          principal planes and pupils of a lens file (of any format)
-    thin:LENS, pinhole:LENS             thin lens and point that show the plane in focus at that lens's size
-    LENS                                the lens, traced exactly
-    MODEL.onnx                          an exported model of one
-    fused:LENS, fused:MODEL.onnx        the same, compiled by the system's C compiler
+"""A camera from what a command line names: `neurolens.base.lensname` lists the kinds.
 
 Only a lens file needs torch, which is imported when one is asked for.
 """
@@ -84,7 +75,7 @@ def make_camera(spec: str | Path, shot: Shot, progress: Progress | None = None) 
     """The camera that `spec` names, set for a shot.
 
     Args:
-        spec: see the module; paths, or names that ship.
+        spec: as `resolve` takes it.
         progress: shows what takes long, see `ExactCamera`.
 
     Raises:

@@ -14,7 +14,7 @@ from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import atomic_path, atomic_write_text, library, write_json
 from neurolens.base.lensname import lens_id_of
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_json, add_lens
+from neurolens.commands.arguments import add_json, add_lens, check_run_folder
 from neurolens.commands.output import answer
 
 if TYPE_CHECKING:
@@ -53,8 +53,7 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.evaluate.describe import lens_files
 
     folder = args.output
-    if folder.exists() and not folder.is_dir():
-        raise InputError("neurolens library", "-o", str(folder), "a folder")
+    check_run_folder(folder, "neurolens library", "-o")
     files = args.lenses or lens_files(library() / "lenses")
     progress, records = Progress({"lenses": 12.0 * len(files)}, quiet=args.quiet), []
     with progress.stage("lenses") as report:

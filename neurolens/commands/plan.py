@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text, library
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, add_lens
+from neurolens.commands.arguments import add_glass, add_json, add_lens, check_run_folder
 from neurolens.commands.output import answer, number, table
 from neurolens.commands.plan_frames import run_plan_frames
 from neurolens.commands.render_frames import add_frames
@@ -160,8 +160,7 @@ def run(args: argparse.Namespace) -> int:
     lens = read_any(args.lens)
     scene = load_scene(args.scene)
     folder = args.output or Path("runs") / f"plan-{scene.name}-{lens.lens_id}"
-    if folder.exists() and not folder.is_dir():
-        raise InputError("neurolens plan", "-o", str(folder), "a folder")
+    check_run_folder(folder, "neurolens plan", "-o")
     shipped = shipped_models(lens, args.zoom)
     if args.frames is not None:
         if args.zoom is not None or isinstance(args.budget, (Seconds, Flip)):

@@ -8,10 +8,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, add_lens, whole
+from neurolens.commands.arguments import add_glass, add_json, add_lens, check_run_folder, whole
 from neurolens.commands.output import answer, number, table
 from neurolens.commands.plan import TARGETS, add_look, look_of, pixels, shipped_models
 from neurolens.evaluate.records import plain
@@ -72,8 +71,7 @@ def run(args: argparse.Namespace) -> int:
 
     lens, scene = read_any(args.lens), load_scene(args.scene)
     folder = args.output or Path("runs") / f"trade-{scene.name}-{lens.lens_id}"
-    if folder.exists() and not folder.is_dir():
-        raise InputError("neurolens trade", "-o", str(folder), "a folder")
+    check_run_folder(folder, "neurolens trade", "-o")
     with Progress({"trade": 30}, quiet=args.quiet).stage("trade") as report:
         found = trade(
             scene, lens, args.budget, target=args.target, models=shipped_models(lens, args.zoom), report=report,
