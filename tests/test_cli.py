@@ -48,7 +48,6 @@ def test_every_command_has_help(command: list[str], capsys: pytest.CaptureFixtur
         ("cooke_triplet_50", "cooke_triplet_50.toml"),
         ("fused:cooke_triplet_50", "cooke_triplet_50.toml"),
         ("thin", "thin"),
-        ("no_lens", "no_lens"),
     ],
 )
 def test_a_camera_may_be_a_lens_of_the_project_by_name(given: str, name: str) -> None:
@@ -67,8 +66,8 @@ def test_export_takes_lenses_of_the_project_by_name_and_refuses_bad_names_first(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     given = ["export", "cooke_triplet_50", "--to", "c", "-o", str(tmp_path / "a.h")]
-    assert build_parser().parse_args(given).model.name == "cooke_triplet_50.toml"
-    assert "no word of C" in failure(capsys, "export", tmp_path / "missing.toml", *given[2:], "--name", "int")
+    assert build_parser().parse_args(given).model.endswith("cooke_triplet_50.toml")
+    assert "no word of C" in failure(capsys, *given, "--name", "int")
 
 
 # Bad input
@@ -121,7 +120,7 @@ def test_a_mistake_is_one_line(args: list[object], words: list[str], capsys: pyt
 @pytest.mark.parametrize(
     ("args", "words"),
     [
-        (["--camera", "fish"], ["fish", ".toml", ".onnx", "thin", "pinhole"]),
+        (["--camera", "fish"], ["fish", "any format", ".onnx", "thin", "pinhole"]),
         (["--camera", "no.onnx"], ["no.onnx", "missing"]),
         (["--camera", "no.toml"], ["no.toml", "missing"]),
         (["--camera", "thin", "--samples", "0"], ["--samples", "from 1"]),

@@ -16,11 +16,11 @@ from neurolens.base.bounds import WAVELENGTH_NM, said
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.commands.arguments import (
     add_json,
+    add_lens,
     add_lens_state,
     between,
     check_run_folder,
     focus_of,
-    lens_path,
     state_of,
 )
 from neurolens.commands.output import answer, number, table
@@ -80,7 +80,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "analyse", help="spots, MTF, distortion and more of a lens file", description=_DESCRIPTION, epilog=_EPILOG
     )
-    parser.add_argument("file", metavar="LENS", type=Path, help="lens file, or name of lenses/")
+    add_lens(parser, "file")
     parser.add_argument("what", metavar="WHAT", nargs="*", help="what to show (default: all)")
     add_lens_state(parser, efl="as tabled", f_number="the tabled stop")
     parser.add_argument(
@@ -121,7 +121,6 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.analysis.layout import state_text
 
     began = time.perf_counter()
-    args.file = lens_path(args.file, "analyse")
     scene, doubts = _scene_of(args)
     edge = scene.edge
     doubts += [edge.warning] if edge.warning else []
@@ -165,11 +164,11 @@ def _scene_of(args: argparse.Namespace) -> tuple[Scene, list[str]]:
     """The lens with its object in the state of the arguments of `add_lens_state`, and warnings."""
     from neurolens.analysis.fields import Scene
     from neurolens.evaluate.describe import file_doubts, rim_doubts
-    from neurolens.optics.lensfile import read_lens
+    from neurolens.readers.any_format import read_any
 
     with warnings.catch_warnings(record=True) as caught:  # glasses that contradict the catalogue, constant indices
         warnings.simplefilter("always", NeurolensWarning)
-        tabled = read_lens(args.file)
+        tabled = read_any(args.file)
     lens = state_of(args, tabled)
     notes = [str(w.message).removeprefix(f"{tabled.path}: ") for w in caught]
     notes += rim_doubts(lens) + file_doubts(tabled, states=bool(args.zoom))

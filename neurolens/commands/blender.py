@@ -12,7 +12,7 @@ from typing import Any
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import check_writable
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import Parser, add_json, check_folder, check_suffix, whole
+from neurolens.commands.arguments import Parser, add_json, add_lens, check_folder, check_suffix, whole
 from neurolens.commands.output import answer
 
 _DESCRIPTION = """\
@@ -27,7 +27,7 @@ Finished lenses are kept: a build that was stopped goes on where it was, and a s
 
 Install it in Blender: Edit > Preferences > Get Extensions > Install from Disk."""
 _ADD = """\
-Put a model (.onnx) or a lens file (.toml) into the extension: into the user folder of an installed
+Put a model (.onnx) or a lens file of any format into the extension: into the user folder of an installed
 one (the newest Blender of this machine that has it), or into a zip. A form of a lens replaces the one
 that was there. In Blender, "Read Lenses Again" in the panel shows it."""
 
@@ -55,7 +55,7 @@ def add_parser(subparsers: Any) -> None:
     add_json(build, quiet=True)
     build.set_defaults(run=run_build, kept="no zip was written; finished shaders are kept for the next run")
     add = actions.add_parser("add", help="put a lens into the extension", description=_ADD)
-    add.add_argument("file", metavar="FILE", type=Path, help="model (.onnx) or lens file (.toml)")
+    add_lens(add, "file", models=True)
     add.add_argument("--to", metavar="ZIP|DIR", type=Path, help="a packed extension, or a user folder of one")
     add.add_argument("--zoom", metavar="STATE", help="state of a zoom, by name or focal length in mm; range: a setting")
     add_json(add, quiet=True)
@@ -71,7 +71,7 @@ def run_build(args: argparse.Namespace) -> int:
         raise InputError("neurolens blender build", "--models", str(args.models), "a folder of models that exists")
     from neurolens.blender.pack import write_pack
     from neurolens.commands.blender_lenses import forms_of, library, packed_of, stated_lens
-    from neurolens.optics.lensfile import read_lens
+    from neurolens.readers.any_format import read_any
 
     began, packed = time.perf_counter(), []
     lens_folder = args.models.parent / "lenses"
@@ -87,7 +87,7 @@ def run_build(args: argparse.Namespace) -> int:
         for models, lens_file in places:
             own = [f for f in (*models, lens_file) if f is not None and f in forms]
             if own:
-                lens = stated_lens(own[0], lens_folder) if lens_file is None else read_lens(lens_file)
+                lens = stated_lens(own[0], lens_folder) if lens_file is None else read_any(lens_file)
                 packed.append(packed_of(own, [forms[f] for f in own], lens=lens))
             report(len(packed) / len(places))
     for why in left.values():
@@ -116,8 +116,6 @@ def run_add(args: argparse.Namespace) -> int:
     if to is None:
         expected = "--to, a zip or a folder: no Blender of this machine has the extension installed"
         raise InputError("neurolens blender add", "--to", "(missing)", expected)
-    if not args.file.is_file():
-        raise InputError(args.file, "file", "(missing)", "a model (.onnx) or a lens file (.toml)")
     check_takes(to)
     form = form_of(args.file, zoom=args.zoom, quiet=args.quiet)
     lens = packed_of([args.file], [form], zoom=args.zoom)

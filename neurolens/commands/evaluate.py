@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, whole
+from neurolens.commands.arguments import add_glass, add_json, add_lens, whole
 from neurolens.commands.output import answer, number, table
 from neurolens.modelfile import AVERAGED, transmittance_of
 
@@ -52,9 +52,7 @@ def add_parser(subparsers: Any) -> None:
         "evaluate", help="measure a model against the promises of its card", description=_DESCRIPTION, epilog=_EPILOG
     )
     parser.add_argument("model", metavar="MODEL", type=Path, help="exported model (.onnx)")
-    parser.add_argument(
-        "--lens", metavar="FILE", type=Path, help="its lens file (default: found by the card's lens id)"
-    )
+    add_lens(parser, "--lens", " (default: found by the card's lens id)")
     parser.add_argument(
         "--rays", metavar="N", type=whole(1000, 1_000_000), default=30_000,
         help="rays that the lens passes, eight times as many if a few bad ones dominate an error; "

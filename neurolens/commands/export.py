@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text, check_writable
-from neurolens.commands.arguments import add_json, named_camera, positive
+from neurolens.base.lensname import FUSED, is_model
+from neurolens.commands.arguments import add_json, add_lens, positive
 from neurolens.commands.output import answer
 from neurolens.commands.render import film_size
 
@@ -65,9 +66,9 @@ def add_parser(subparsers: Any) -> None:
         "export", help="source code (C, GLSL, OSL) of a model; fix what a scene fixes", description=_DESCRIPTION,
         epilog=_EPILOG,
     )  # fmt: skip
-    parser.add_argument(
-        "model", metavar="MODEL", type=lambda text: Path(named_camera(text).removeprefix("fused:")),
-        help="exported model (.onnx), or a run folder with one model; of C, GLSL, OSL also a lens file or name",
+    add_lens(
+        parser, "model", "; a run folder with one model, a file of neurolens plan; of --to onnx models alone",
+        models=True, cameras=True, metavar="MODEL",
     )  # fmt: skip
     parser.add_argument("--to", choices=("c", "glsl", "osl", "onnx"), required=True, help="form to write")
     parser.add_argument("-o", "--out", metavar="FILE", type=Path, required=True, help="file to write")
@@ -111,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.cameras.source import model_extras
     from neurolens.surrogates.source import checked_name
 
-    file = model_file(args.model)
+    file = model_file(Path(args.model.removeprefix(FUSED)))
     parts = _parts(args.only)
     given = _given(args.fix)
     if args.to == "onnx" and (args.name is not None or set(parts) != set(_PARTS)):
@@ -122,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
         checked_name(args.to, "", args.name)
     if args.to == "osl":
         return _write_osl(file, args, bool(given) or set(parts) != set(_PARTS))
-    exact = file.suffix == ".toml"
+    exact = not is_model(file)
     if args.camera or exact:
         if args.to == "onnx" or given or set(parts) != set(_PARTS):
             what = "a camera" if args.camera else "a lens file"

@@ -22,11 +22,11 @@ from neurolens.graph.scalars import lower
 from neurolens.modelfile.axes import Axis, weights
 from neurolens.modelfile.stategraph import mixture_of
 from neurolens.optics.focusing import best_focus_of_stops_mm, focus_states
-from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import film_z_mm, first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm, pupil_bounds, pupil_plane_z_mm
 from neurolens.optics.tracegraph import TRANSMITTANCE, exact_graph
+from neurolens.readers.any_format import read_any
 from neurolens.surrogates.source import Written, checked_name, lines_of, write_program
 from neurolens.surrogates.states import gap_axis, zoom_axis
 
@@ -44,7 +44,7 @@ def write_lens(
     Args:
         to: "c" or "glsl". name: of the function, None takes the lens's id. zoom: a state of `Lens.at`, or "range".
     """
-    lens = read_lens(file)
+    lens = read_any(file)
     name = checked_name(to, lens.lens_id, name)
     axes: tuple[Axis, ...] = ()
     lines = []

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError, NeurolensWarning, one_line
 from neurolens.base.files import library
+from neurolens.base.lensname import resolve
 from neurolens.commands.arguments import (
     add_json,
     add_lens_state,
@@ -20,7 +21,6 @@ from neurolens.commands.arguments import (
     check_suffix,
     focus_of,
     given_options,
-    lens_path,
     state_of,
 )
 from neurolens.commands.output import answer, number, table
@@ -96,6 +96,13 @@ def _check_mode(args: argparse.Namespace, several: bool) -> None:
             raise InputError("neurolens lens", option, "(given)", f"this option only {where}")
 
 
+def _file(name: Path) -> Path:
+    """The lens file that an argument names."""
+    file = resolve(name, models=False, cameras=False).file
+    assert file is not None  # only cameras without a lens have none
+    return file
+
+
 def run(args: argparse.Namespace) -> int:
     """Print and draw the data of a lens, or the table of several, or derived rims."""
     checked = str(args.files[0]) == "list"
@@ -103,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
     _check_mode(args, several)
     if several:
         return _run_list(args, args.files[1:] or [library() / "lenses"] if checked else args.files, checked)
-    args.file = lens_path(args.files[0], "lens")
+    args.file = _file(args.files[0])
     if args.derive_rims:
         return _run_rims(args)
     for option, path in (("--layout", args.layout), ("--breathing", args.breathing)):
@@ -111,13 +118,13 @@ def run(args: argparse.Namespace) -> int:
             check_suffix(path, option, _LAYOUT_SUFFIXES)
             check_folder(path, option)
     from neurolens.evaluate.describe import file_doubts, glass_table, layout_profile, lens_facts
-    from neurolens.optics.lensfile import read_lens
+    from neurolens.readers.any_format import read_any
     from neurolens.surrogates.domain import domain_of
 
     began = time.perf_counter()
     with warnings.catch_warnings(record=True) as caught:  # part of the answer
         warnings.simplefilter("always", NeurolensWarning)
-        tabled = read_lens(args.file)
+        tabled = read_any(args.file)
     lens = state_of(args, tabled)
     focus, film_z = focus_of(args, tabled, lens), float(lens.film_z_mm or 0.0)
     domain = domain_of(lens, focus_m=(focus, focus), film_z_mm=(film_z, film_z))
@@ -278,7 +285,7 @@ def _run_list(args: argparse.Namespace, paths: list[Path], checked: bool) -> int
 
     if args.layouts is not None:
         check_folder(args.layouts, "--layouts")
-    files = (lens_files(path) if path.is_dir() else [lens_path(path, "lens")] for path in paths)
+    files = (lens_files(path) if path.is_dir() else [_file(path)] for path in paths)
     rows = [library_row(file, checked) for folder in files for file in folder]
     if args.layouts is not None:
         from neurolens.evaluate.figures import sheet

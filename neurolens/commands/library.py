@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import atomic_path, atomic_write_text, library, write_json
+from neurolens.base.lensname import lens_id_of
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_json, lens_path
+from neurolens.commands.arguments import add_json, add_lens, check_run_folder
 from neurolens.commands.output import answer
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "library", help="pages of lenses: pictures, figures, models", description=_DESCRIPTION, epilog=_EPILOG
     )
-    parser.add_argument("lenses", metavar="LENS", nargs="*", help="lens files or names (default: all of lenses/)")
+    add_lens(parser, "lenses", " (default: all of lenses/)", nargs="*")
     parser.add_argument("-o", "--output", metavar="FOLDER", type=Path, required=True, help="for the pages")
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="finished pages are kept; the same command goes on")
@@ -52,9 +53,8 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.evaluate.describe import lens_files
 
     folder = args.output
-    if folder.exists() and not folder.is_dir():
-        raise InputError("neurolens library", "-o", str(folder), "a folder")
-    files = [lens_path(word, "library") for word in args.lenses] or lens_files(library() / "lenses")
+    check_run_folder(folder, "neurolens library", "-o")
+    files = args.lenses or lens_files(library() / "lenses")
     progress, records = Progress({"lenses": 12.0 * len(files)}, quiet=args.quiet), []
     with progress.stage("lenses") as report:
         for k, file in enumerate(files):
@@ -73,7 +73,7 @@ def _record(file: Path, folder: Path) -> dict[str, Any]:
     from neurolens import __version__
     from neurolens.evaluate.describe import read_quietly
 
-    kept = folder / file.stem / "record.json"
+    kept = folder / lens_id_of(file) / "record.json"
     try:
         lens = read_quietly(file)
         try:
@@ -83,11 +83,13 @@ def _record(file: Path, folder: Path) -> dict[str, Any]:
         except (OSError, ValueError, KeyError):
             pass
         kept.parent.mkdir(parents=True, exist_ok=True)
-        record = {"lens": file.stem, "sha256": lens.sha256, "version": __version__} | _page(lens, file, kept.parent)
+        record = {"lens": lens_id_of(file), "sha256": lens.sha256, "version": __version__} | _page(
+            lens, file, kept.parent
+        )
         write_json(kept, record)
         return record
     except NeurolensError as error:
-        return {"lens": file.stem, "fault": str(error)}
+        return {"lens": lens_id_of(file), "fault": str(error)}
 
 
 def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
@@ -98,6 +100,7 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
     from neurolens.evaluate import pages
     from neurolens.evaluate.describe import lens_row, rim_doubts, section
     from neurolens.optics.lenscheck import check_lens
+    from neurolens.readers.source import read_text
 
     row = lens_row(lens, check_lens(lens))
     figures, notes = [], []
@@ -119,7 +122,7 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
     body += pages.figure_grid(folder, figures)
     names = [Path(m["file"]).stem.removeprefix(f"{lens.lens_id}.") for m in models]
     body += pages.section("Models", pages.table(names, models, _model_columns()))
-    body += pages.section("File", f"<pre>{pages.text(file.read_text(encoding='utf-8', errors='replace'))}</pre>")
+    body += pages.section("File", f"<pre>{pages.text(read_text(file))}</pre>")
     atomic_write_text(folder / "index.html", pages.page(lens.name, body))
     best = min((m["rms_um"] for m in models if m["rms_um"] is not None), default=None)
     keys = ("name", "efl_mm", "f_number", "half_field_deg", "refractions", "states")

@@ -12,6 +12,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
 from neurolens.base.files import library
+from neurolens.base.lensname import lens_id_of
 from neurolens.commands.arguments import add_json
 from neurolens.commands.output import answer, number, table
 from neurolens.evaluate.records import CLOSE_UM, reaches, to_use, use_command
@@ -132,8 +133,8 @@ def _state(model: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def _is_of(model: dict[str, Any], asked: str) -> bool:
-    if asked.endswith(".toml"):
-        return bool(model["lens"] == Path(asked).stem)
+    if asked.endswith(".toml") or Path(asked).is_file():
+        return bool(model["lens"] == lens_id_of(asked))
     return any(asked.casefold() in text.casefold() for text in (model["lens"], model["name"], Path(model["file"]).stem))
 
 

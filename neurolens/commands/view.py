@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError, ModelError, NeurolensError, NeurolensWarning
 from neurolens.base.files import library as shipped
+from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, check_folder, check_suffix, lens_path, whole
+from neurolens.commands.arguments import add_glass, add_json, add_lens, check_folder, check_suffix, whole
 from neurolens.commands.output import answer
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "view", help="write a page that runs lenses and models in a browser", description=_DESCRIPTION, epilog=_EPILOG
     )
-    parser.add_argument("lenses", metavar="LENS|MODEL", nargs="*", help="lens files, names of lenses, models")
+    add_lens(parser, "lenses", models=True, metavar="LENS|MODEL", nargs="*")
     parser.add_argument(
         "-o", "--out", metavar="FILE.html", type=Path, default=Path("view.html"), help="page (default: view.html)"
     )
@@ -151,7 +152,7 @@ def _shaders(entries: Sequence[_Entry], jobs: int, progress: Progress) -> Mappin
 def _library() -> Iterator[_Entry]:
     """Every lens of lenses/ with its best models; zooms over their range where a model has it."""
     from neurolens.commands.blender_lenses import key_of, library
-    from neurolens.optics.lensfile import read_lens
+    from neurolens.readers.any_format import read_any
 
     root = shipped()
     for models, file in library(root / "models", root / "lenses", ()):
@@ -161,10 +162,10 @@ def _library() -> Iterator[_Entry]:
         zoom = RANGE if state == "range" else None
         if state and not zoom:
             continue  # a second model of a lens that is here already
-        yield _Entry(key_of(models[0]), models, read_lens(file) if file.is_file() else None, zoom)
+        yield _Entry(key_of(models[0]), models, read_any(file) if file.is_file() else None, zoom)
 
 
-def _asked(words: Sequence[str]) -> Iterator[_Entry]:
+def _asked(paths: Sequence[Path]) -> Iterator[_Entry]:
     """Lenses in the order of their first word; models join the lens of their id, in place of those of the library."""
     from neurolens.commands.blender_lenses import library
     from neurolens.readers.any_format import read_any
@@ -173,23 +174,22 @@ def _asked(words: Sequence[str]) -> Iterator[_Entry]:
     lenses: dict[str, Lens | None] = {}
     models: dict[str, list[Path]] = {}
     brought: dict[str, list[Path]] = {}
-    flares = {path: model for path in map(Path, words) if path.suffix == ".onnx" and (model := _flare(path))}
+    flares = {path: model for path in paths if is_model(path) and (model := _flare(path))}
     of: dict[str, GhostModel] = {}
     for path, model in flares.items():
         if of.setdefault(model.lens.lens_id, model) is not model:
             raise InputError("neurolens view", f"ghosts of {model.lens.lens_id}", str(path), "one file a lens")
-    for word in words:
-        path = Path(word) if word.endswith(".onnx") else lens_path(word, "view")
+    for path in paths:
         if path in flares:
             continue
-        if path.suffix == ".onnx":
+        if is_model(path):
             lens_id = str(_card(path)["lens"]["id"])
             lenses.setdefault(lens_id, None)
             models.setdefault(lens_id, []).append(path)
             continue
         lens = read_any(path)
         lenses[lens.lens_id] = lens
-        if path.parent == root / "lenses":  # one of the library brings its models
+        if path.resolve().parent == (root / "lenses").resolve():  # one of the library brings its models
             known = library(root / "models", root / "lenses", [path.stem]) if _has_models(root, path.stem) else ()
             brought[lens.lens_id] = [m for files, _ in known for m in files]
     if not of.keys() <= lenses.keys():

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens import __version__
 from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError
+from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress, Report
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ class Shader:
 
 
 def shader_of(file: Path, *, zoom: str | None = None, name: str | None = None, quiet: bool = False) -> Shader:
-    """The shader of a model (.onnx) or of a lens file (.toml).
+    """The shader of a model (.onnx) or of a lens file.
 
     Args:
         zoom: state of a zoom by name or focal length; "range" makes it an input, as None does of a model of a range.
@@ -90,7 +91,7 @@ def shader_of(file: Path, *, zoom: str | None = None, name: str | None = None, q
 
 def lens_of(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:
     """Of a model (.onnx) or a lens file: its id, itself, and lines on it. Arguments and errors as of `shader_of`."""
-    return exact_lens(file, zoom, report) if file.suffix == ".toml" else _of_model(file, zoom, report)
+    return _of_model(file, zoom, report) if is_model(file) else exact_lens(file, zoom, report)
 
 
 def _of_model(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:
@@ -137,12 +138,12 @@ def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLe
     from neurolens.cameras.osl import osl_lens, states_between
     from neurolens.modelfile.axes import product, weights
     from neurolens.optics.focusing import focus_states
-    from neurolens.optics.lensfile import read_lens
     from neurolens.optics.pupils import pupil_plane_z_mm
     from neurolens.optics.tracegraph import TRANSMITTANCE
+    from neurolens.readers.any_format import read_any
     from neurolens.surrogates.states import StateSpace, axes_of, gap_axis
 
-    lens, state = read_lens(file), None if zoom == RANGE else zoom
+    lens, state = read_any(file), None if zoom == RANGE else zoom
     ranged, internal = zoom == RANGE, bool(focus_states(lens))
     if ranged and internal:  # before minutes of work
         raise InputError(lens.path, "zoom", RANGE, "one focal length of the zoom: its groups move to focus, too")

@@ -8,10 +8,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
-from pathlib import Path
 from typing import Any, Literal
 
 from neurolens.base.errors import InputError
+from neurolens.base.lensname import lens_id_of
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.film_plane import LINE_D_NM
 
@@ -231,8 +231,8 @@ class Lens:
 
     @property
     def lens_id(self) -> str:
-        """Stem of the lens file: the name that models carry."""
-        return Path(self.path).stem
+        """The name that models carry, of the lens's file."""
+        return lens_id_of(self.path)
 
     @property
     def sha256(self) -> str:

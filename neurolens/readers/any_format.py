@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,7 +22,7 @@ from neurolens.readers.source import read_text
 from neurolens.readers.tables import looks_like_table, read_table
 from neurolens.readers.zemax import looks_like_zmx, read_zmx
 
-_OURS = "neurolens"
+OURS = "neurolens"
 _HEAD = 20_000  # characters by which a format is recognised
 
 
@@ -55,21 +56,30 @@ def read_any(path: str | Path, given: Given | None = None) -> Lens:
     The content decides; the suffix is used if the content is not recognised.
 
     Raises:
-        InputError: a file in no known format, or the mistake in it; names file and line.
+        InputError: a file in no known format, or the mistake in it; names file and line. Where an option of `neurolens
+            convert` would help, and `given` is None, the message says how.
     """
-    given = given or Given()
+    if given is None:
+        try:
+            return read_any(path, Given())
+        except InputError as error:
+            if (option := re.search(r"--[a-z-]+", error.expected)) is None:
+                raise
+            command = f"neurolens convert FILE {option[0]} ... -o LENS.toml"
+            raise InputError(error.file, error.field, error.value, f"{error.expected} ({command})") from None
     if Path(path).suffix.lower() == ".toml":
-        if kind_of(path) != _OURS:
-            return read_blender(read_toml(path), str(path), given)
-        lens = read_lens(path)
+        data = read_toml(path)
+        if is_blender(data):
+            return read_blender(data, str(path), given)
+        lens = read_lens(path, data)
         lens = replace(lens, name=given.name or lens.name, source=given.source or lens.source)
         if given != Given(name=given.name, source=given.source):
             raise InputError(path, "options", "(of a lens file)", "--name and --source only: the file has the rest")
         return lens
     found = format_of(path)
-    for option, said in (("--gap-before", given.gap_before), ("--semi-diameters", given.semi_diameters)):
+    for name, said in (("--gap-before", given.gap_before), ("--semi-diameters", given.semi_diameters)):
         if said and found.read is not read_table:
-            raise InputError(path, option, f"(a {found.name} file)", "a plain table: other formats define it")
+            raise InputError(path, name, f"(a {found.name} file)", "a plain table: other formats define it")
     return found.read(path, given)
 
 
@@ -92,7 +102,7 @@ def format_of(path: str | Path) -> Format:
 def kind_of(path: str | Path) -> str:
     """The name of a file's format, "neurolens" for our own; raises as `format_of` and `read_toml`."""
     if Path(path).suffix.lower() == ".toml":
-        return "Physical Camera" if is_blender(read_toml(path)) else _OURS
+        return "Physical Camera" if is_blender(read_toml(path)) else OURS
     return format_of(path).name
 
 

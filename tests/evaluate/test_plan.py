@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from neurolens.base.errors import InputError
+from neurolens.base.lensname import resolve
 from neurolens.base.tomlfile import format_toml
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.exact import ExactCamera
@@ -19,7 +20,6 @@ from neurolens.cameras.osl import osl_program
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.warped import Warped
 from neurolens.cli import main
-from neurolens.commands.arguments import named_camera
 from neurolens.commands.plan import TARGETS
 from neurolens.evaluate import costs
 from neurolens.evaluate import plan as planned
@@ -300,8 +300,8 @@ def test_a_plan_s_file_names_cameras_that_nothing_is_fitted_for(tmp_path: Path) 
     found = plan(scene_from_tables(wall(4.0)), read_lens(LENS).at(), 0.0)
     file = tmp_path / "plan.toml"
     file.write_text(found.to_toml(read_lens(LENS).at(), tmp_path))
-    assert Path(named_camera(str(file)).removeprefix("fused:")).resolve() == Path(LENS).resolve()
-    assert named_camera("experiments/quickstart.toml") == "experiments/quickstart.toml"
+    assert Path(str(resolve(file)).removeprefix("fused:")).resolve() == Path(LENS).resolve()
+    assert str(resolve("experiments/quickstart.toml")) == "experiments/quickstart.toml"
 
 
 def test_models_have_the_blades_of_the_lens_file() -> None:

@@ -303,5 +303,8 @@ def test_two_files_of_ghosts_of_one_lens_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(view_command, "_flare", lambda _: SimpleNamespace(lens=SimpleNamespace(lens_id=LENS)))
-    assert main(["view", LENS, "a.onnx", "b.onnx", "-o", str(tmp_path / "view.html")]) == 2
-    assert f"ghosts of {LENS}: got 'b.onnx', expected one file a lens" in capsys.readouterr().err
+    files = [tmp_path / "a.onnx", tmp_path / "b.onnx"]
+    for file in files:
+        file.touch()
+    assert main(["view", LENS, *map(str, files), "-o", str(tmp_path / "view.html")]) == 2
+    assert f"ghosts of {LENS}: got '{files[1]}', expected one file a lens" in capsys.readouterr().err
