@@ -73,8 +73,9 @@ class _Tracing:
         for k in range(last, -1, -1):
             # Gaps as the lens has them: those that are equal stay so in every state of a zoom.
             gap = float(lens.surfaces[k].thickness_mm) if k < last else -float(lens.vertices_mm[k])
-            # A gap that moves may happen to equal another number in one state alone: it stays a node of its own.
-            self.x = g.concat(self.x[0:2], self.x[2] + g.constant(gap, f"gap {k}" if k in moving else ""))
+            # A gap that moves may happen to equal another number in one state alone: its label keeps the nodes apart.
+            label = [f"gap {k}"] if k in moving else []
+            self.x = g.concat(self.x[0:2], self.x[2] + g.constant(gap, *label))
             self._surface(k, lens.surfaces[k])
             self.crossings += [self.x[2] + float(lens.vertices_mm[k]), self.x[1]]
         g.outputs["scene_ray"] = g.concat(self.x, self.d)
