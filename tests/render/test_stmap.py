@@ -245,7 +245,7 @@ def test_bad_input_is_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixtu
         ({"--key": "focus=1:1"}, "--frames beside it"),
         ({"--channels-nm": "600,500"}, "three wavelengths"),
         ({"-o": tmp_path / "none" / "a"}, "a folder that exists"),
-        ({"camera": "lens.zmx"}, "a lens file (.toml)"),
+        ({"camera": "lens.zmx"}, "a lens file of any format"),
         ({"camera": fisheye}, "degrees from the axis"),
         ({"camera": "fisheye-equidistant", "--efl": "9"}, "to be laid on a plane"),
         ({"camera": "fisheye-equidistant", "--efl": "14.2", "--size": "9600x5400"}, "another --projection"),
