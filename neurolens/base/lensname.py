@@ -74,7 +74,9 @@ def resolve(text: str | Path, *, models: bool = True, cameras: bool = True) -> N
         if cameras:
             expected += f", with {FUSED}, {', '.join(IDEAL_OF)} before it or not, or one of {', '.join(IDEAL)}"
         near = suggestion(word, [*_ships(places), *_beside(Path(word)), *(IDEAL if cameras else ())])
-        raise InputError(word, "camera" if cameras else "lens", "(a model)" if path.exists() else "(missing)", expected + near)
+        raise InputError(
+            word, "camera" if cameras else "lens", "(a model)" if path.exists() else "(missing)", expected + near
+        )
     if cameras and path.suffix.lower() == ".toml" and (planned := _planned(path)):
         own, file = split_kind(planned)
         return Named(kind or own, Path(os.path.normpath(path.parent / file)))
