@@ -3,6 +3,7 @@
 import io
 import math
 import os
+import re
 import time
 import tomllib
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 
 from neurolens.base.config import apply_overrides, from_dict, read_config, to_dict, to_toml
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path, atomic_write_text, check_writable
+from neurolens.base.files import atomic_path, atomic_write_text, check_writable, place_inside, safe_name
 from neurolens.base.progress import Progress, duration
 
 
@@ -306,3 +307,56 @@ def test_any_fraction_is_taken_and_quiet_prints_nothing() -> None:
 def test_durations_read_well() -> None:
     said = {0: "0.0 s", -1: "0.0 s", 0.44: "0.4 s", 9.96: "10 s", 59.7: "1 min 00 s", 185: "3 min 05 s"}
     assert {seconds: duration(seconds) for seconds in said} == said
+
+
+@pytest.mark.parametrize("text", ["a.zmx", "ols-64", "x+y_1"])
+def test_safe_names_stay(text: str) -> None:
+    assert safe_name(text) == text
+
+
+def test_unsafe_names_become_safe_and_stay_apart() -> None:
+    texts = [
+        "../x",
+        "/x",
+        "x/",
+        "x\\",
+        "",
+        ".",
+        "..",
+        ".hidden",
+        "ä",
+        "ö",
+        "a\nb",
+        "a" * 101,
+        "a" * 102,
+        "x\0",
+        "\udc80",
+    ]
+    names = [safe_name(text) for text in texts]
+    assert len(set(names)) == len(texts)
+    assert all(re.fullmatch(r"(?!\.)[A-Za-z0-9._+-]{1,100}", name) for name in names)
+
+
+def test_entries_of_archives_stay_inside(tmp_path: Path) -> None:
+    assert place_inside(tmp_path, "a/b.c") == tmp_path / "a/b.c"
+    for entry in ("../x", "/etc/x", "a/../../x", "", ".", "..\\x", "a\0"):
+        with pytest.raises(ValueError):
+            place_inside(tmp_path, entry)
+
+
+def test_torch_keeps_compiled_code_in_a_folder_of_this_user_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its own choice is a folder in the shared temporary one, whoever made it: planted code ran."""
+    trace = pytest.importorskip("neurolens.optics.trace")
+    places = pytest.importorskip("torch._inductor.runtime.cache_dir_utils")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "")
+    monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR")
+    trace.compile_tracing(lambda: None)
+    folder = Path(places.cache_dir())
+    assert folder == tmp_path / "neurolens" / "torch" and folder.stat().st_mode & 0o077 == 0
+    folder.chmod(0o777)  # then anybody may have put code there
+    monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR")
+    trace.compile_tracing(lambda: None)
+    assert not Path(places.cache_dir()).is_relative_to(tmp_path)

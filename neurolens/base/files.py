@@ -181,12 +181,22 @@ def cache_folder() -> Path:
     """`neurolens` in $XDG_CACHE_HOME or ~/.cache; where that is not this user's alone, a folder of this process."""
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     folder = Path(home) / "neurolens"
+    return folder if _is_own_folder(folder) else Path(_folder_of_process().name)
+
+
+def own_folder(name: str) -> Path:
+    """A folder of the cache for what another library keeps and runs; of this process where it is not the user's."""
+    folder = cache_folder() / name
+    return folder if _is_own_folder(folder) else Path(_folder_of_process().name)
+
+
+def _is_own_folder(folder: Path) -> bool:
+    """Make a folder unless it is there, and say whether it is this user's, and nobody else can write to it."""
     with suppress(OSError):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         found = folder.lstat()
-        if stat.S_ISDIR(found.st_mode) and _mine(found) and os.access(folder, os.W_OK | os.X_OK):
-            return folder
-    return Path(_folder_of_process().name)
+        return stat.S_ISDIR(found.st_mode) and _mine(found) and os.access(folder, os.W_OK | os.X_OK)
+    return False
 
 
 @cache
@@ -230,6 +240,30 @@ def keep_newest(new: Path, most: int) -> None:
         others = [(abs(now - file.stat().st_mtime), file) for file in new.parent.glob(f"*{new.suffix}") if file != new]
         for _, file in sorted(others)[most - 1 :]:
             file.unlink()
+
+
+def safe_name(text: str) -> str:
+    """The name of a file or of an archive's entry that holds `text`, wherever that text comes from.
+
+    It has letters, digits and "._+-" of ASCII, no dot at its beginning, and at most 100 characters. A text that has to
+    change for this gets digits of its SHA-256 as well, so that the names of two texts differ.
+    """
+    name = re.sub(r"[^A-Za-z0-9._+-]+", "_", text).lstrip(".")
+    if name == text and 0 < len(name) <= 100:
+        return name
+    return f"{name[:80]}-{hashlib.sha256(text.encode(errors='surrogateescape')).hexdigest()[:16]}"
+
+
+def place_inside(folder: Path, entry: str) -> Path:
+    """Where an archive's entry belongs in a folder.
+
+    Raises:
+        ValueError: a name that leads out of the folder, or none that a file can have.
+    """
+    root = folder.resolve()
+    if not (path := (root / entry).resolve()).is_relative_to(root) or path == root or "\\" in entry:
+        raise ValueError(f"{entry[:80]!r} leads out of its folder")
+    return folder / entry
 
 
 def sha256_of(path: str | Path) -> str:

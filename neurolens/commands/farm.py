@@ -17,12 +17,12 @@ from contextlib import redirect_stdout
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from neurolens.base.engine import Failed, on_dask
 from neurolens.base.errors import NeurolensError
-from neurolens.base.files import atomic_path
+from neurolens.base.files import atomic_path, place_inside
 from neurolens.commands.arguments import more_glasses
 
 DASK_HELP = (
@@ -85,9 +85,10 @@ def unpack(data: bytes, folder: Path) -> list[Path]:
     found = []
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         for name in archive.namelist():
-            if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-                raise NeurolensError(f"an answer with a file outside its folder: {name}")
-            path = folder / name
+            try:
+                path = place_inside(folder, name)
+            except ValueError as error:
+                raise NeurolensError(f"an answer with a file outside its folder: {error}") from None
             path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_path(path) as temporary:
                 temporary.write_bytes(archive.read(name))

@@ -192,9 +192,7 @@ def _first_order(data: dict[str, Any]) -> str:
     if medium["n_d"] != 1:
         rows.append(("medium in front", f"n_d {medium['n_d']:.5f}", medium["material"] or medium["glass"] or ""))
     if data["front_efl_mm"] != data["efl_mm"]:
-        rows.append(
-            ("front focal", _mm(data["front_efl_mm"]), "focal length of the object side, in its medium")
-        )
+        rows.append(("front focal", _mm(data["front_efl_mm"]), "focal length of the object side, in its medium"))
     if data["wavelength_nm"] != LINE_D_NM:
         note = "of all this: the file's primary one, as its light does not hold the d line"
         rows.append(("wavelength", f"{data['wavelength_nm']:g} nm", note))
