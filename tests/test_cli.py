@@ -520,7 +520,7 @@ def test_the_library_is_pages_of_lenses_and_an_index_that_are_kept(
     index = (tmp_path / "pages" / "index.html").read_text(encoding="utf-8")
     assert (
         "thorlabs_lb1471_biconvex_50/index.html" in index
-        and "<svg" in index
+        and "data:image/svg+xml,%3Csvg" in index
         and not re.search("(src|href)='http", index)
     )
     before = (folder / "layout.png").stat().st_mtime_ns
