@@ -228,5 +228,5 @@ def _plain_cell(value: Any) -> Any:
     """
     if not isinstance(value, str):
         return value
-    text = printable(value)
-    return f"'{text}" if text.startswith(("=", "+", "-", "@")) else text
+    text = printable(value.translate(dict.fromkeys(map(ord, "\t\r\n"), " ")))
+    return f"'{text}" if text.lstrip().startswith(("=", "+", "-", "@")) else text
