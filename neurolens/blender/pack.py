@@ -24,6 +24,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, place_inside, read_bytes, safe_name
+from neurolens.base.tomlfile import parse_json
 
 EXTENSION = Path(__file__).parent / "extension"
 FACTS, SCHEMA = "lenses.json", 1
@@ -153,12 +154,12 @@ def _of_zip(path: Path) -> tuple[dict[str, bytes], list[dict[str, Any]]]:
         with zipfile.ZipFile(data) as packed:
             # An entry gives no more bytes than it says here, so that these bound the memory that is taken.
             if sum(i.file_size for i in packed.infolist()) > _LARGEST:
-                raise InputError(path, "size", "(too large)", f"at most {_LARGEST} bytes unpacked")
+                raise ValueError(f"more than {_LARGEST} bytes unpacked")
             for info in packed.infolist():
                 place_inside(Path(), info.filename)
             files = {i.filename: packed.read(i) for i in packed.infolist() if not i.is_dir()}
         return files, _entries(files[FACTS])
-    except (InputError, MemoryError):
+    except MemoryError:
         raise
     except Exception as error:  # zipfile raises many types: for passwords, methods of compression, damaged data
         found = f"no {error}" if isinstance(error, KeyError) else f"{error}"
@@ -188,7 +189,7 @@ def _of_folder(folder: Path) -> list[dict[str, Any]]:
     data = read_bytes(file, _LARGEST, "a file of facts")
     try:
         return _entries(data)
-    except (*extension_library().DAMAGED, RecursionError) as error:
+    except (InputError, RecursionError, *extension_library().DAMAGED) as error:
         raise InputError(file, "file", f"({error})", "facts that neurolens wrote") from None
 
 
@@ -212,10 +213,9 @@ def _entries(text: bytes) -> list[dict[str, Any]]:
     """The entries of facts that the extension can read, so that it reads those to which a lens is added.
 
     Raises:
-        Those of `DAMAGED` in the extension's library, RecursionError: other facts.
+        InputError, those of `DAMAGED` in the extension's library, RecursionError: other facts.
     """
-    data = json.loads(text)
-    json.dumps(data, allow_nan=False)
+    data = parse_json(text, FACTS)
     if data["schema"] != SCHEMA:
         raise ValueError(f"schema {data['schema']}")
     for entry in data["lenses"]:
