@@ -27,7 +27,8 @@ from neurolens.commands.arguments import more_glasses
 
 DASK_HELP = (
     "run on a Dask cluster: the address of its scheduler (tcp://HOST:8786), or local (processes of this machine), or "
-    "local:N. What a task reads travels with it: workers need neurolens alone, and no folder in common"
+    "local:N, which no other user can reach. What a task reads travels with it: workers need neurolens alone, and no "
+    "folder in common. Whoever reaches a scheduler at tcp:// can run programs as you; tls:// takes keys"
 )
 _THEN = (1980, 1, 1, 0, 0, 0)  # the same files are the same bytes
 
