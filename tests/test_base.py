@@ -4,6 +4,8 @@ import io
 import math
 import os
 import re
+import subprocess
+import sys
 import time
 import tomllib
 from dataclasses import dataclass, field
@@ -342,6 +344,42 @@ def test_entries_of_archives_stay_inside(tmp_path: Path) -> None:
     for entry in ("../x", "/etc/x", "a/../../x", "", ".", "..\\x", "a\0"):
         with pytest.raises(ValueError):
             place_inside(tmp_path, entry)
+
+
+KILLED = """
+import os, signal, sys
+from neurolens.base.files import TemporaryFolder
+folder = TemporaryFolder()
+print(folder.name, flush=True)
+{end}
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no locks of files that end with a process")
+def test_temporary_folders_of_killed_processes_go_with_the_next(tmp_path: Path) -> None:
+    def process(end: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-c", KILLED.format(end=end)]
+        env = os.environ | {"TMPDIR": str(tmp_path)}
+        return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=env)
+
+    def folder_of(started: subprocess.Popen[str]) -> Path:
+        assert started.stdout is not None
+        return Path(started.stdout.readline().strip())
+
+    killed = process("os.kill(os.getpid(), signal.SIGKILL)")
+    left = folder_of(killed)
+    killed.communicate()
+    assert left.is_dir() and left.parent == tmp_path and left.stat().st_mode & 0o077 == 0
+    (tmp_path / "neurolens-of-others").mkdir()
+    (tmp_path / "neurolens-linked").symlink_to(tmp_path / "neurolens-of-others")
+    waiting = process("sys.stdin.read()")
+    alive = folder_of(waiting)
+    assert not left.exists()
+    last = process("pass")
+    last.communicate()
+    assert alive.is_dir()  # another process's, which lives
+    waiting.communicate()
+    assert {path.name for path in tmp_path.iterdir()} == {"neurolens-of-others", "neurolens-linked"}
 
 
 def test_torch_keeps_compiled_code_in_a_folder_of_this_user_alone(

@@ -9,6 +9,7 @@ import json
 import os
 import re
 import secrets
+import shutil
 import site
 import stat
 import sys
@@ -24,11 +25,17 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 
+try:
+    import fcntl
+except ModuleNotFoundError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 _LARGEST_LIST = 1 << 24
 _LEFT_OVER = re.compile(r"\.neurolens-[0-9a-f]{16}\.tmp(\.\w{1,16})?")  # a temporary file of ours
 _ABANDONED_S = 24 * 3600.0  # nothing is written for a day
 _CLEANED_S = 3600.0  # folders of thousands of files are not searched at each one
 _cleaned: dict[Path, float] = {}
+_FOLDER, _LOCK = "neurolens-", ".neurolens-lock"  # of temporary folders
 _DIGEST = 32  # bytes of SHA-256
 # Opened without waiting for a writer of a FIFO; what a system lacks it does not need.
 _READ = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
@@ -200,8 +207,41 @@ def _is_own_folder(folder: Path) -> bool:
 
 
 @cache
-def _folder_of_process() -> tempfile.TemporaryDirectory[str]:
-    return tempfile.TemporaryDirectory(prefix="neurolens-")
+def _folder_of_process() -> TemporaryFolder:
+    return TemporaryFolder()
+
+
+class TemporaryFolder(tempfile.TemporaryDirectory[str]):
+    """A folder of this process, removed with this object, or by a later process of this user if this one is killed.
+
+    The process holds a lock on a file in it, which the system takes away from a process that is killed.
+    """
+
+    def __init__(self) -> None:
+        _remove_folders_of_killed()
+        super().__init__(prefix=_FOLDER)
+        self._lock = open(os.path.join(self.name, _LOCK), "wb")  # noqa: SIM115 (held until the folder goes)
+        if fcntl is not None:
+            fcntl.flock(self._lock, fcntl.LOCK_EX)
+
+    def cleanup(self) -> None:
+        """Remove the folder."""
+        self._lock.close()
+        super().cleanup()
+
+
+@cache
+def _remove_folders_of_killed() -> None:
+    """Remove temporary folders of this user's processes that have ended without removing them, once a process."""
+    if fcntl is None:
+        return
+    with suppress(OSError):
+        for entry in os.scandir(tempfile.gettempdir()):
+            if entry.name.startswith(_FOLDER) and entry.stat(follow_symlinks=False).st_uid == os.getuid():
+                # No lock file: another program's, or one that a process is about to lock.
+                with suppress(OSError), os.fdopen(os.open(Path(entry.path, _LOCK), _READ), "rb") as lock:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    shutil.rmtree(entry.path, ignore_errors=True)
 
 
 def _mine(found: os.stat_result) -> bool:

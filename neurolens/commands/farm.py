@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import io
 import os
-import tempfile
 import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -22,7 +21,7 @@ from typing import Any
 
 from neurolens.base.engine import Failed, on_dask
 from neurolens.base.errors import NeurolensError
-from neurolens.base.files import atomic_path, place_inside
+from neurolens.base.files import TemporaryFolder, atomic_path, place_inside
 from neurolens.commands.arguments import more_glasses
 
 DASK_HELP = (
@@ -138,9 +137,9 @@ def spread(
 
 
 @lru_cache(maxsize=2)
-def _unpacked(files: bytes) -> tempfile.TemporaryDirectory[str]:
+def _unpacked(files: bytes) -> TemporaryFolder:
     """The files of a run, once in a worker."""
-    folder = tempfile.TemporaryDirectory(prefix="neurolens-")
+    folder = TemporaryFolder()
     unpack(files, Path(folder.name))
     return folder
 
