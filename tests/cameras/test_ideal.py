@@ -221,7 +221,7 @@ PLACES = {
 
 
 def sample(camera: Fisheye, film: np.ndarray):  # noqa: ANN201
-    return camera.sample(film.astype(np.float32), np.zeros((2, film.shape[1]), np.float32), np.zeros(film.shape[1]))
+    return camera.sample(film.astype(np.float32), np.zeros((2, film.shape[1]), np.float32), np.full(film.shape[1], 550.0))
 
 
 @pytest.mark.parametrize("name", PROJECTIONS)
