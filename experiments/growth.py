@@ -337,7 +337,8 @@ def lenses(count: int, place: Path) -> Iterator[None]:
 
     from neurolens.base.progress import Progress
     from neurolens.evaluate.survey import SurveySettings, Task, run_task
-    from neurolens.evaluate.survey_run import collection_of, survey
+    from neurolens.evaluate.survey_run import survey
+    from neurolens.readers.any_format import collection_of
 
     lens = lab.LENSES / "ogawa_zoom_70_200.toml"
     settings = SurveySettings(rays=2000)

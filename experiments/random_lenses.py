@@ -25,7 +25,8 @@ from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.pupils import image_radius_mm
 from neurolens.optics.rims import narrowed_rims
-from neurolens.readers.assemble import finish, with_rims
+from neurolens.readers.assemble import finish
+from neurolens.readers.openings import with_rims
 
 MOST_BLUR = 0.02
 _TRIES = 4000  # of one lens: most drawn tables are no lens

@@ -1,7 +1,7 @@
 """Light on the film: its factors for four lenses, and a white card through the 14 mm fisheye four ways.
 
 The four ways are flat, cos^4, effective aperture, and both. From the integral over the pupil that knows nothing of
-cameras (`neurolens.optics.radiometry`), and as rendered, by this, X being none, natural, optical or both:
+cameras (`experiments.radiometry`), and as rendered, by this, X being none, natural, optical or both:
 
     neurolens render experiments/scenes/white.toml --camera lenses/muller_fisheye_100.toml --efl 14 --vignetting X
 
@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 
 from experiments import lab
+from experiments.radiometry import FilmLight, film_light, white_card
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.optics.lensfile import read_lens
-from neurolens.optics.radiometry import FilmLight, film_light, white_card
 from neurolens.render.pictures import write_png
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene

@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import torch
 
 from neurolens.base.errors import NeurolensWarning
 from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens
+from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import Rays
 
 LENSES = Path(__file__).parents[1] / "lenses"
@@ -30,6 +31,18 @@ def tabled(name: str) -> Lens:
 def focused(name: str) -> Lens:
     """A lens focused at infinity."""
     return tabled(name).at()
+
+
+def pinhole(film_distance_mm: float, radius_mm: float, *, image_radius_mm: float | None = None) -> Lens:
+    """A lens without glass: a round hole in front of the film, whose focal length is its distance from the film."""
+    hole = Surface(math.inf, film_distance_mm, 2 * radius_mm, stop=True)
+    return Lens("pinhole", "", (hole,), film_distance_mm / (2 * radius_mm), image_radius_mm, path="pinhole")
+
+
+def before(lens: Lens, *rows: Surface) -> Lens:
+    """A lens with rows more in front of it, such as a plate or a hood; z = 0 moves to the first of them."""
+    film = lens.film_z_mm and lens.film_z_mm + sum(row.thickness_mm for row in rows)
+    return replace(lens, surfaces=(*rows, *lens.surfaces), film_z_mm=film)
 
 
 def rays(*rows: tuple[float, ...], dtype: torch.dtype = torch.float64) -> Rays:

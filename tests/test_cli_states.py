@@ -15,7 +15,7 @@ from neurolens.base.errors import NeurolensWarning
 from neurolens.cameras.model import load_model
 from neurolens.cameras.onnxmaps import OnnxDerivatives, load_inverse
 from neurolens.cli import main
-from neurolens.commands.arguments import Parser, lens_path
+from neurolens.commands.arguments import Parser
 from neurolens.modelfile import MODEL_KEY
 from neurolens.render.pictures import read_exr, write_exr
 
@@ -149,12 +149,6 @@ def test_warnings_are_lines_once_and_none_when_quiet(capsys: pytest.CaptureFixtu
     for quiet, lines in (([], ["neurolens: warning: a b", "neurolens: warning: c"]), (["--quiet"], [])):
         assert main(quiet, build) == 0
         assert capsys.readouterr().err.splitlines() == lines
-
-
-def test_a_lens_is_found_by_its_name(capsys: pytest.CaptureFixture[str]) -> None:
-    assert lens_path("cooke_triplet_50", "lens") == TRIPLET and lens_path(TRIPLET, "lens") == TRIPLET
-    for command in ("lens", "analyse"):
-        assert "a lens file, or a name in" in failure(capsys, command, "no_such_lens")
 
 
 def test_the_shape_of_the_picture_is_checked_before_the_camera(

@@ -68,7 +68,7 @@ EXCEPTIONS: dict[str, tuple[set[str], set[str]]] = {
     "neurolens.optics.sag": ({"optics"}, set()),  # for a type
     "neurolens.cameras.exact": ({"optics"}, {"torch"}),
     "neurolens.cameras.outline_cache": ({"optics"}, {"torch"}),
-    "neurolens.cameras.build": ({"optics"}, set()),
+    "neurolens.cameras.build": ({"optics", "readers"}, set()),
     "neurolens.cameras.field": ({"optics"}, set()),  # first-order data of lenses that are traced
 }
 # Modules that load torch or onnx; others load these when they are needed.

@@ -8,14 +8,17 @@ from typing import Any
 import pytest
 from vignetting_oracle import vignetting_errors
 
+from neurolens.base.errors import ModelError
 from neurolens.cameras.model import OnnxLens, load_model
 from neurolens.cli import main
 from neurolens.commands import models as models_command
 from neurolens.evaluate.check import check_states, promises_of, space_of_card
 from neurolens.evaluate.measure import FreshRays, fresh_rays, measure, onnx_predictor
+from neurolens.modelfile import AVERAGED, POLARISED
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.domain import Domain
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.stored import load_fitted
 
@@ -145,3 +148,25 @@ def test_models_are_listed_with_the_one_to_use(tmp_path, monkeypatch, capsys) ->
     assert "Use runs/mine/models/ols-28.onnx (" in said and "--camera fused:runs/mine/models/ols-28.onnx" in said
     assert main(["models", "--within", "1e-4um"]) == 1
     assert "closest is runs/mine/models/mlp-16x2.onnx" in capsys.readouterr().out
+
+
+def test_a_card_that_states_no_transmittance_holds_the_averaged_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As models made before it was followed: they say so wherever they are listed, read back or written as code."""
+    shipped, stated = MODELS / "petzval_portrait_100.ols-64.onnx", b'"transmittance": "polarised"'
+    data = shipped.read_bytes()
+    assert data.count(stated) == 1 and load_fitted(shipped).transmittance == POLARISED
+    file = tmp_path / "models" / "old.onnx"
+    file.parent.mkdir()
+    file.write_bytes(data.replace(stated, b'"transmittancX": "polarised"'))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(models_command, "library", lambda: tmp_path / "site")
+    assert main(["models"]) == 0 and "averaged transmittance" in capsys.readouterr().out
+    again = export_onnx(load_fitted(file), tmp_path / "again.onnx", {})
+    assert load_model(again).card["transmittance"] == AVERAGED
+    assert main(["export", str(file), "--to", "c", "-o", "old.h"]) == 0
+    assert "light is averaged at every surface" in " ".join((tmp_path / "old.h").read_text().split(" * "))
+    file.write_bytes(data.replace(stated, b'"transmittance": "circular_"'))
+    with pytest.raises(ModelError, match='transmittance.*circular_.*"polarised" or "averaged"'):
+        load_model(file)

@@ -8,6 +8,7 @@ import pytest
 from packaging.requirements import Requirement
 
 import neurolens
+from neurolens.base.errors import InputError
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -52,7 +53,7 @@ def test_examples_run(code: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest
 def test_an_installed_package_holds_the_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the wheel's data files are, laid out as an installation has them, is what names find."""
     from neurolens.base import files
-    from neurolens.commands.arguments import named_camera
+    from neurolens.base.lensname import resolve
 
     data = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["data-files"]
     for folder, patterns in data.items():
@@ -63,6 +64,7 @@ def test_an_installed_package_holds_the_library(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(files.sys, "prefix", str(tmp_path / "env"))
     assert files.library() == tmp_path / "env" / "share" / "neurolens"
     for name in ("laikin_double_gauss_50", "laikin_double_gauss_50.mlp-16x2", "isshiki_fisheye_10.mlp-16x2"):
-        assert Path(named_camera(name)).is_file()
+        assert Path(str(resolve(name))).is_file()
     assert (files.library() / "experiments" / "scenes" / "lights.toml").is_file()
-    assert named_camera("no_such_lens") == "no_such_lens"
+    with pytest.raises(InputError, match="missing"):
+        resolve("no_such_lens")

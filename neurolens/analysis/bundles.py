@@ -10,13 +10,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from neurolens.analysis.fields import DEFAULT_NM, ChiefRays, Scene, on_plane
+from neurolens.analysis.fields import ChiefRays, Scene, on_plane
+from neurolens.analysis.pupil_nodes import LitPart, lit_nodes, lit_part
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.optics.aiming import without_rims
@@ -45,42 +47,18 @@ class Pattern(NamedTuple):
 def hexapolar(rings: int) -> Pattern:
     """The centre and `rings` rings of 6, 12, 18, ... points, the last on the stop's edge; 1 + 3 n (n + 1) points.
 
-    The weights are the areas nearest to each ring, with the least change that makes the means of r^2, r^4, ...,
-    r^12 exact: spots of steep aberrations depend on the edge, where areas alone would be inaccurate.
+    The weights are the areas nearest to each ring.
     """
-    radius = [k / rings for k in range(rings + 1)]
-    weight = _ring_weights(rings)
-    t, s, w = [0.0], [0.0], [weight[0]]
+    t, s, w = [0.0], [0.0], [(0.5 / rings) ** 2]
     for k in range(1, rings + 1):
-        r = radius[k] * (1 - _EDGE)
+        r = k / rings * (1 - _EDGE)
+        area = (min(k + 0.5, rings) / rings) ** 2 - ((k - 0.5) / rings) ** 2
         for i in range(6 * k):
             angle = 2 * math.pi * i / (6 * k)
             t.append(r * math.cos(angle))
             s.append(r * math.sin(angle))
-            w.append(weight[k] / (6 * k))
+            w.append(area / (6 * k))
     return Pattern(_tensor(t), _tensor(s), _tensor(w))
-
-
-def _ring_weights(rings: int) -> list[float]:
-    k = torch.arange(rings + 1, dtype=torch.float64)
-    inner, outer = ((k - 0.5).clamp_min(0) / rings) ** 2, ((k + 0.5).clamp_max(rings) / rings) ** 2
-    area = outer - inner
-    for moments in range(min(7, rings), 0, -1):
-        m = torch.arange(moments, dtype=torch.float64)[:, None]
-        power = (k / rings) ** (2 * m)
-        lack = 1 / (m[:, 0] + 1) - power @ area
-        moved = area + area * (torch.linalg.solve((power * area) @ power.T, lack) @ power)
-        if (moved > 0).all():
-            return moved.tolist()
-    return area.tolist()
-
-
-def grid(n: int) -> Pattern:
-    """Centres of the cells of an n by n square over the stop that lie inside it, all of one weight."""
-    line = (torch.arange(n, dtype=torch.float64) + 0.5) * (2 / n) - 1
-    t, s = (v.reshape(-1) for v in torch.meshgrid(line, line, indexing="ij"))
-    inside = t * t + s * s < 1
-    return Pattern(t[inside], s[inside], torch.full_like(t[inside], 1 / int(inside.sum())))
 
 
 def fan(n: int) -> Pattern:
@@ -102,6 +80,7 @@ def _tensor(values: list[float]) -> Tensor:
 _DIRECT, _STRIDES, _PER_STRIDE = 5, 8, 3  # Newton steps; steps of the continuation from the chief ray
 _AIMED = 1e-8  # how near to its point, in stop radii, a ray must come
 _DIFFERENCE = 3e-6  # step of the derivative, in stop radii
+_MARGIN = 0.1  # of the box of the stop's edge in front of the lens, in which light is searched
 
 
 class Aim:
@@ -114,14 +93,15 @@ class Aim:
         self.step_mm = _DIFFERENCE * lens.stop_radius_mm
         self.along_x = scene.axis == "x"
         self.shape = shape
+        self.waves = waves
 
-        def spread(values: Tensor) -> Tensor:
+        def repeated(values: Tensor) -> Tensor:
             return values[:, None, None].expand(shape).reshape(-1)
 
-        self.chief = Rays(*(spread(c) for c in chief.start))
+        self.chief = Rays(*(repeated(c) for c in chief.start))
         origin = scene.object_points(chief.start)
-        self.origin = None if origin is None else tuple(spread(c) for c in origin)
-        self.exists = spread(chief.exists)
+        self.origin = None if origin is None else tuple(repeated(c) for c in origin)
+        self.exists = repeated(chief.exists)
         self.wavelength: Tensor = torch.tensor(waves, dtype=torch.float64)[None, :, None].expand(shape).reshape(-1)
 
     def rays(self, u: Tensor, v: Tensor, rows: Tensor | slice = slice(None)) -> Rays:
@@ -189,12 +169,15 @@ class Aim:
         """Distance from the goal in stop radii (inf for rays that do not exist), and beam area per stop share."""
         t, s, exists, (tu, tv, su, sv) = self._map(u, v, rows)
         error = torch.where(exists, torch.hypot(t - goal_t, s - goal_s), math.inf)
-        beam = math.pi / (tu * sv - tv * su).abs()
-        if self.origin is not None:
-            # Solid angle of an area on the plane across the chief ray: cos / r^2, with cos = distance / r.
-            distance2 = _distance2(self.chief[:3], self.origin)[rows]
-            beam = beam * torch.sqrt(distance2) / (distance2 + u * u + v * v) ** 1.5
-        return error, beam
+        return error, math.pi / (tu * sv - tv * su).abs() * self.spread(u, v, rows)
+
+    def spread(self, u: Tensor, v: Tensor, rows: Tensor | slice = slice(None)) -> Tensor | float:
+        """Energy of an area on the plane across the chief rays: 1, or of a near object the solid angle, 1/mm^2."""
+        if self.origin is None:
+            return 1.0
+        # cos / r^2, with cos = distance / r.
+        distance2 = _distance2(self.chief[:3], self.origin)[rows]
+        return torch.sqrt(distance2) / (distance2 + u * u + v * v) ** 1.5
 
     def _map(self, u: Tensor, v: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, tuple[Tensor, ...]]:
         """Stop coordinates (tangential, sagittal; in radii) of rays, whether they exist, and their derivatives."""
@@ -227,6 +210,7 @@ class Bundle:
         start: before the front surface, travelling to the film.
         film: on the film plane.
         tangential_mm, sagittal_mm: film points relative to the chief ray of the first wavelength.
+        pattern: None where the rays are nodes of `Filled`.
         status: of the trace with all rims and the stop; rays that could not be aimed count as missing surface 0.
         weight: energy of each ray: beam area in mm^2 (distant object) or solid angle in sr; 0 where it is blocked.
         open_weight: the same without the rims.
@@ -237,7 +221,7 @@ class Bundle:
     scene: Scene
     field_deg: tuple[float, ...]
     wavelength_nm: tuple[float, ...]
-    pattern: Pattern
+    pattern: Pattern | None
     start: Rays
     film: Rays
     tangential_mm: Tensor
@@ -267,7 +251,7 @@ class Bundle:
 def bundle(
     scene: Scene,
     field_deg: Sequence[float] | None,
-    wavelength_nm: Sequence[float] = DEFAULT_NM,
+    wavelength_nm: Sequence[float] | None = None,
     pattern: Pattern | None = None,
 ) -> Bundle:
     """Aim and trace rays of several fields and wavelengths through the points of a pupil pattern.
@@ -275,21 +259,104 @@ def bundle(
     Args:
         scene: lens, object and meridional plane.
         field_deg: angles of the chief ray of the first wavelength, from 0 to below 180; None: `Scene.default_fields`.
-        wavelength_nm: the first is the reference; all share the object point (or direction) of its chief ray.
+        wavelength_nm: the first is the reference; all share the object point (or direction) of its chief ray. None:
+            `Scene.waves_nm`.
         pattern: hexapolar with 8 rings where not given.
     """
     pattern = pattern or hexapolar(8)
-    fields = scene.default_fields() if field_deg is None else tuple(float(f) for f in field_deg)
-    waves = tuple(float(w) for w in wavelength_nm)
+    fields, waves, chief = _chief(scene, field_deg, wavelength_nm)
     shape = (len(fields), len(waves), len(pattern.weight))
-    chief = scene.chief_rays(fields, waves[0])
     aim = Aim(scene, chief, shape, waves)
     u, v, aimed, stretch = aim.at(pattern)
-    start = aim.rays(u, v)
-    film, status, path = _to_film(scene, start, aim.wavelength)
-    status = torch.where(aimed, status, st.blocked(0, st.MISSED))
     area = pattern.weight.expand(shape).reshape(-1) * stretch
     area = torch.where(aimed & _inside_stop(scene, pattern).expand(shape).reshape(-1), area, 0.0)
+    return _traced(scene, fields, chief, aim, (u, v), aimed, area, pattern)
+
+
+class Filled:
+    """Bundles that fill what stop and rims leave open of each field and wavelength, to any accuracy.
+
+    Their rays are nodes of a quadrature on the planes across the chief rays at the front of the lens.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        field_deg: Sequence[float] | None = None,
+        wavelength_nm: Sequence[float] | None = None,
+        to_stop: bool = False,
+    ) -> None:
+        """Find the light; arguments as of `bundle`. `to_stop`: all light that enters the stop, whatever rims take."""
+        self.scene = scene
+        self.lens = scene.to_stop if to_stop else scene.traced
+        self.fields, self.waves, self.chief = _chief(scene, field_deg, wavelength_nm)
+        self.height_mm = self.chief.height_mm.numpy()
+        outline = hexapolar(2)
+        u, v, aimed, _ = (c.reshape(-1, len(outline.weight)) for c in self._aim(len(outline.weight)).at(outline))
+        # Where no ray meets the edge of the stop, the front surface bounds the light.
+        reach = torch.where(aimed.all(1, keepdim=True), 0.0, scene.lens.surfaces[0].semi_diameter_mm)
+        low = torch.stack([torch.where(aimed, c, 0.0).amin(1) for c in (u, v)], 1) - reach
+        high = torch.stack([torch.where(aimed, c, 0.0).amax(1) for c in (u, v)], 1) + reach
+        margin = _MARGIN * (high - low).amax(1, keepdim=True)
+        self.part = lit_part(self._passes, low - margin, high + margin, torch.zeros_like(low))
+
+    def only(self, fields: list[int]) -> Filled:
+        """The same for some of the fields, by their numbers."""
+        found, waves = copy(self), len(self.waves)
+        start, exists, height, film = self.chief
+        found.chief = ChiefRays(
+            Rays(*(c[fields] for c in start)), exists[fields], height[fields], Rays(*(c[fields] for c in film))
+        )
+        found.fields = tuple(self.fields[k] for k in fields)
+        found.part = LitPart(*(c.reshape(-1, waves)[fields].reshape(-1) for c in self.part))
+        return found
+
+    def bundle(self, level: int, path: bool = False) -> Bundle:
+        """The bundle of a level of `lit_nodes`; its weights hold no light that rims take, nor does `open_weight`.
+
+        Without `path` the optical paths are NaN: they take half of the time.
+        """
+        nodes = lit_nodes(self._passes, self.part, level)
+        aim = self._aim(nodes.u.shape[1])
+        u, v, area = (c.reshape(-1) for c in nodes)
+        return _traced(
+            self.scene, self.fields, self.chief, aim, (u, v), aim.exists, area * aim.spread(u, v), None, path
+        )
+
+    def energy(self, level: int) -> Tensor:
+        """Energy [F] of all wavelengths; units as of `Bundle.weight`."""
+        nodes = lit_nodes(self._passes, self.part, level)
+        u, v = (c.reshape(-1) for c in nodes[:2])
+        weight = nodes.area * self._passes(*nodes[:2])
+        return (weight.reshape(-1) * self._aim(nodes.u.shape[1]).spread(u, v)).reshape(len(self.fields), -1).sum(1)
+
+    def _aim(self, count: int) -> Aim:
+        return Aim(self.scene, self.chief, (len(self.fields), len(self.waves), count), self.waves)
+
+    def _passes(self, u: Tensor, v: Tensor) -> Tensor:
+        aim = self._aim(u.shape[1])
+        with torch.no_grad():
+            out = trace(self.lens, aim.rays(u.reshape(-1), v.reshape(-1)), aim.wavelength, towards="film")
+        return ((out.status == 0) & aim.exists).reshape(u.shape)
+
+
+def _chief(
+    scene: Scene, field_deg: Sequence[float] | None, wavelength_nm: Sequence[float] | None
+) -> tuple[tuple[float, ...], tuple[float, ...], ChiefRays]:
+    """Fields, wavelengths and chief rays of a bundle."""
+    fields = scene.default_fields() if field_deg is None else tuple(float(f) for f in field_deg)
+    waves = tuple(float(w) for w in wavelength_nm or scene.waves_nm)
+    return fields, waves, scene.chief_rays(fields, waves[0])
+
+
+def _traced(
+    scene: Scene, fields: tuple[float, ...], chief: ChiefRays, aim: Aim, at: tuple[Tensor, Tensor], aimed: Tensor,
+    area: Tensor, pattern: Pattern | None, path: bool = True,
+) -> Bundle:  # fmt: skip
+    """Trace the rays at places (u, v) of an aim to the film."""
+    start, shape = aim.rays(*at), aim.shape
+    film, status, length = _to_film(scene, start, aim.wavelength, path)
+    status = torch.where(aimed, status, st.blocked(0, st.MISSED))
     passed = status == 0
     x, y = (c.reshape(shape) for c in (film.x, film.y))
     x, y = x - chief.film.x[:, None, None], y - chief.film.y[:, None, None]
@@ -299,36 +366,41 @@ def bundle(
         return torch.where(keep, value, other).reshape(shape)
 
     return Bundle(
-        scene, fields, waves, pattern,
+        scene, fields, aim.waves, pattern,
         Rays(*(c.reshape(shape) for c in start)),
         Rays(*(shaped(c) for c in film)),
         shaped(t.reshape(-1)), shaped(s.reshape(-1)),
         status.reshape(shape), shaped(area, other=0.0), area.reshape(shape),
-        shaped(aim.lead_mm(u, v) + path), chief.height_mm,
+        shaped(aim.lead_mm(*at) + length), chief.height_mm,
     )  # fmt: skip
 
 
-def check_light(scene: Scene, field_deg: Sequence[float] | None, wavelength_nm: float) -> None:
-    """Raise InputError for a requested field from which no ray reaches the film, or a lens that passes no ray.
+def check_light(scene: Scene, field_deg: Sequence[float] | None, wavelength_nm: float) -> list[str]:
+    """A warning of each of the default fields (None) from which no ray reaches the film.
 
-    Of the default fields (None) some may be dark.
+    Raises:
+        InputError: a requested field from which no ray reaches the film, or a lens that passes no ray.
     """
     fields = scene.default_fields() if field_deg is None else field_deg
-    seen = bundle(scene, [0.0, *fields], [wavelength_nm], hexapolar(12)).passed.any(2).any(1).tolist()
+    seen = (Filled(scene, [0.0, *fields], [wavelength_nm]).part.reach > 0).tolist()
     if not any(seen):
         raise InputError(scene.lens.path, "surfaces", "(no ray reaches the film)", "a lens that passes light")
     dark = [field for field, lit in zip(field_deg or (), seen[1:], strict=False) if not lit]
     if dark:
-        edge = f"at most {scene.edge_deg():.4g} degrees, the edge of the image"
+        edge = f"at most {scene.edge.field_deg:.4g} degrees, the edge of the image"
         raise InputError(scene.lens.path, f"field {dark[0]:g}", "(no light reaches the film)", edge)
+    lit = zip(fields, seen[1:], strict=True)
+    return [f"rims leave no light of the field of {field:.4g} degrees" for field, light in lit if not light]
 
 
-def _to_film(scene: Scene, start: Rays, wavelength_nm: Tensor) -> tuple[Rays, Tensor, Tensor]:
-    """Rays on the film, their status, and the optical path from their start to the film."""
+def _to_film(scene: Scene, start: Rays, wavelength_nm: Tensor, wanted: bool) -> tuple[Rays, Tensor, Tensor | float]:
+    """Rays on the film, their status, and the optical path from their start to the film, NaN if that is not wanted."""
     lens = scene.traced
     with torch.no_grad():
-        out = trace(lens, start, wavelength_nm, towards="film", path=True)
+        out = trace(lens, start, wavelength_nm, towards="film", path=wanted)
     film = on_plane(out.rays, scene.film_z_mm)
+    if not wanted:
+        return film, out.status, math.nan
     path = torch.zeros_like(start.x)
     indices = [m.n for m in media(lens, wavelength_nm)]
     points: list[Rays] = [start, *out.path, film]

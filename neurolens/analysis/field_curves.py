@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,13 +12,13 @@ import torch
 from torch import Tensor
 
 from neurolens.analysis.bundles import bundle, hexapolar, points
-from neurolens.analysis.fields import DEFAULT_NM, Array, Result, Scene, on_plane
+from neurolens.analysis.fields import Array, Result, Scene, on_plane
+from neurolens.analysis.pupil_nodes import LitPart, converged, lit_nodes, lit_part
 from neurolens.analysis.seidel import petzval_curvature
-from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays, pupil_plane_z_mm
 from neurolens.optics.surfaces import Rays
-from neurolens.optics.trace import trace
+from neurolens.optics.trace import passing
 
 LINE_G_NM = 435.8343  # mercury, the usual fourth line
 
@@ -32,7 +33,7 @@ class Colour(Result):
     """Colour of a lens; the film's place counts as zero focus, shifts positive away from the lens.
 
     Attributes:
-        spectrum_nm: [L], 380 to 780.
+        spectrum_nm: [L].
         zone: [3] shares of the stop's radius: paraxial, half of the area, edge.
         focus_shift_mm: [L, 3] where rays of each zone cross the axis; NaN where a rim blocks them.
         field_deg, height_mm: [F], of the chief ray of the first line.
@@ -53,19 +54,25 @@ def colour(
     scene: Scene,
     *,
     spectrum_nm: Sequence[float] | None = None,
-    line_nm: Sequence[float] = (*DEFAULT_NM, LINE_G_NM),
+    line_nm: Sequence[float] | None = None,
     fields: int = 21,
 ) -> Colour:
     """Longitudinal colour on the axis by zones, and lateral colour of chief rays up to the edge of the field.
+
+    The spectrum is 380 to 780 nm and the lines are d, F, C and g; of a lens for other light, its range and wavelengths.
 
     Raises:
         InputError: a pinhole, which has no focus.
     """
     scene.require_power()
-    spectrum = np.linspace(*_VISIBLE_NM, 41) if spectrum_nm is None else np.asarray(spectrum_nm, dtype=np.float64)
+    lens = scene.lens
+    if spectrum_nm is None:
+        spectrum_nm = np.linspace(*(_VISIBLE_NM if lens.visible else lens.light_nm), 41).tolist()
+    spectrum = np.asarray(spectrum_nm, dtype=np.float64)
+    line_nm = line_nm or (*scene.waves_nm, *((LINE_G_NM,) if lens.visible else ()))
     axial = bundle(scene.round, [0.0], spectrum.tolist(), points(list(_ZONES), [0.0] * 3))
     crossing = -(axial.tangential_mm / axial.slopes[0])[0].numpy()
-    angles = np.linspace(0, scene.edge_deg(), fields)
+    angles = np.linspace(0, scene.edge.field_deg, fields)
     chief = bundle(scene.open, angles.tolist(), line_nm, points([0.0], [0.0]))
     # Tangential points grow with image height where the field's angle is positive.
     lateral = 1000 * chief.tangential_mm[..., 0].numpy()
@@ -98,7 +105,7 @@ class Curvature(Result):
 
 
 def curvature(
-    scene: Scene, *, wavelength_nm: float = LINE_D_NM, fields: int = 31, edge_deg: float | None = None
+    scene: Scene, *, wavelength_nm: float | None = None, fields: int = 31, edge_deg: float | None = None
 ) -> Curvature:
     """Sagittal and tangential foci up to the edge of the field, rims ignored.
 
@@ -106,7 +113,8 @@ def curvature(
         InputError: a pinhole, which has no focus.
     """
     scene.require_power()
-    angles = np.linspace(0, scene.edge_deg() if edge_deg is None else edge_deg, fields)
+    wavelength_nm = scene.lens.reference_nm if wavelength_nm is None else wavelength_nm
+    angles = np.linspace(0, scene.edge.field_deg if edge_deg is None else edge_deg, fields)
     pattern = points([-_CLOSE, _CLOSE, 0.0, 0.0], [0.0, 0.0, -_CLOSE, _CLOSE])
     rays = bundle(scene.open, angles.tolist(), [wavelength_nm], pattern)
     slope_t, slope_s = rays.slopes
@@ -148,7 +156,7 @@ class Distortion(Result):
         error_percent: projection to [F], 100 (height / ideal - 1); 0 on the axis, NaN where the projection ends.
         best: the projection of least root mean square error over the whole field.
         reference: rectilinear below 60 degrees of half field, `best` from there on.
-        edge_percent: error of `reference` at the edge of the field.
+        edge_percent: error of `reference` at the edge of the field. edge: which edge that is.
     """
 
     wavelength_nm: float
@@ -159,13 +167,15 @@ class Distortion(Result):
     best: str
     reference: str
     edge_percent: float
+    edge: str
 
 
 def distortion(
-    scene: Scene, *, wavelength_nm: float = LINE_D_NM, fields: int = 41, edge_deg: float | None = None
+    scene: Scene, *, wavelength_nm: float | None = None, fields: int = 41, edge_deg: float | None = None
 ) -> Distortion:
     """Distortion against every projection. For a near object of a rectilinear lens, object heights are used."""
-    angles = np.linspace(0, scene.edge_deg() if edge_deg is None else edge_deg, fields)
+    wavelength_nm = scene.lens.reference_nm if wavelength_nm is None else wavelength_nm
+    angles = np.linspace(0, scene.edge.field_deg if edge_deg is None else edge_deg, fields)
     chief = scene.chief_rays(np.concatenate([[_SMALL_DEG], angles]), wavelength_nm)
     height = chief.height_mm.numpy()
     theta = np.radians(np.concatenate([[_SMALL_DEG], angles]))
@@ -178,7 +188,7 @@ def distortion(
     reference = best if scene.wide else RECTILINEAR
     return Distortion(
         wavelength_nm, angles, height[1:], float(height[0] / theta[0]), errors, best, reference,
-        float(errors[reference][-1]),
+        float(errors[reference][-1]), scene.edge.name if edge_deg is None else f"{edge_deg:g} degrees",
     )  # fmt: skip
 
 
@@ -206,6 +216,7 @@ class Illumination(Result):
         unvignetted: [F] the same without rims: natural falloff, pupil growth and distortion.
         passed: [F] share of the stop's light that no rim takes.
         cos4: [F] cos^4 of the field angle, 0 from 90 degrees on.
+        spread: by figure, [F, ...], by how much two samplings of the pupil differ (`pupil_nodes.converged`).
     """
 
     wavelength_nm: float
@@ -215,45 +226,71 @@ class Illumination(Result):
     unvignetted: Array
     passed: Array
     cos4: Array
+    spread: dict[str, Array]
 
 
-def illumination(scene: Scene, *, fields: int = 21, n: int = 80) -> Illumination:
-    """Relative illumination at the d line up to the edge of the field, with n by n rays from each film point.
+def illumination(scene: Scene, *, fields: int = 21) -> Illumination:
+    """Relative illumination at the reference wavelength up to the edge of the field, from where rays leave the film.
 
     Fields without a chief ray are NaN, and all are where the axis gets no light.
     """
-    angles = np.linspace(0, scene.edge_deg(), fields)
-    rays = bundle(scene.open, angles.tolist(), [LINE_D_NM], hexapolar(6))
-    film = on_plane(Rays(*(c[:, 0] for c in rays.film)), pupil_plane_z_mm(scene.lens))
-    start, area = _grid(scene, rays.chief_height_mm, film, n)
-    with torch.no_grad():
-        light = area[:, None] * start.dz.reshape(fields, -1) ** 4
-        whole, seen = (_sum(light, lens, start) for lens in (scene.open.traced, scene.lens))
+    angles, nm = np.linspace(0, scene.edge.field_deg, fields), scene.lens.reference_nm
+    rays = bundle(scene.open, angles.tolist(), [nm], hexapolar(6))
+    pupil = on_plane(Rays(*(c[:, 0] for c in rays.film)), pupil_plane_z_mm(scene.lens))
+    both = [_FilmLight(scene, lens, rays.chief_height_mm, pupil) for lens in (scene.open.traced, scene.lens)]
+
+    def shares(light: list[Array]) -> dict[str, tuple[Array, Array | float]]:
+        whole, seen = light
+        with np.errstate(divide="ignore", invalid="ignore"):  # dark fields, or an axis without light: NaN
+            found = seen / (seen[0] or np.nan), whole / (whole[0] or np.nan), seen / whole
+        return {k: (v, 1.0) for k, v in zip(("relative", "unvignetted", "passed"), found, strict=True)}
+
+    light, spread = converged(lambda level, some: [b.only(some).sums(level) for b in both], shares, fields)
     cos4 = np.where(angles < 90, np.cos(np.radians(angles)), 0.0) ** 4
-    with np.errstate(divide="ignore", invalid="ignore"):  # dark fields, or an axis without light: NaN
-        relative, unvignetted, passed = seen / (seen[0] or np.nan), whole / (whole[0] or np.nan), seen / whole
-    return Illumination(LINE_D_NM, angles, rays.chief_height_mm.numpy(), relative, unvignetted, passed, cos4)
+    relative, unvignetted, passed = (values for values, _ in shares(light).values())
+    height = rays.chief_height_mm.numpy()
+    return Illumination(nm, angles, height, relative, unvignetted, passed, cos4, spread)
 
 
-def _sum(light: Tensor, lens: Lens, start: Rays) -> Array:
-    passed = (trace(lens, start).status == 0).reshape(light.shape)
-    found: Array = (light * passed).sum(1).where(torch.isfinite(light).all(1), torch.nan).numpy()
-    return found
+class _FilmLight:
+    """Light that film points at F heights see through a lens, on the plane of the pupil."""
 
+    def __init__(self, scene: Scene, lens: Lens, height_mm: Tensor, pupil: Rays) -> None:
+        """`pupil`: rays [F, P] that fill the pupil of each film point, on its plane."""
+        self.scene, self.lens, self.height_mm = scene, lens, height_mm
+        self.plane_z_mm = pupil_plane_z_mm(scene.lens)
+        # Where no ray meets the edge of the stop, the rear surface bounds the light, as seen from the film point.
+        zero = torch.zeros_like(height_mm)
+        film = torch.stack((-height_mm, zero) if scene.axis == "x" else (zero, -height_mm), 1)
+        rear_mm, rear_z_mm = scene.lens.surfaces[-1].semi_diameter_mm, float(scene.lens.vertices_mm[-2])
+        farther = (scene.film_z_mm - self.plane_z_mm) / (scene.film_z_mm - rear_z_mm)
+        rear = [film + (edge - film) * farther for edge in (-rear_mm, rear_mm)]
+        places = torch.stack([pupil.x, pupil.y], 2)
+        sound = torch.isfinite(places)
+        low = torch.where(sound, places, torch.minimum(*rear)[:, None]).amin(1)
+        high = torch.where(sound, places, torch.maximum(*rear)[:, None]).amax(1)
+        margin = _MARGIN * (high - low)
+        near = torch.where(sound, places, 0.0).sum(1) / sound.sum(1).clamp_min(1)
+        self.part = lit_part(self._passes, low - margin, high + margin, near)
 
-def _grid(scene: Scene, height: Tensor, pupil: Rays, n: int) -> tuple[Rays, Tensor]:
-    """Rays [F * n * n] from the film to a grid over the pupil that a bundle fills, and the area of its cells [F]."""
-    share = (torch.arange(n, dtype=torch.float64) + 0.5) / n
-    columns = []
-    area = torch.ones_like(height)
-    for place in (pupil.x, pupil.y):
-        low = torch.nan_to_num(place, nan=torch.inf).amin(1)
-        high = torch.nan_to_num(place, nan=-torch.inf).amax(1)
-        low, high = low - _MARGIN * (high - low), high + _MARGIN * (high - low)
-        columns.append(low[:, None] + (high - low)[:, None] * share)
-        area = area * (high - low) / n**2
-    shape = (len(height), n, n)
-    px, py = columns[0][:, :, None].expand(shape).reshape(-1), columns[1][:, None, :].expand(shape).reshape(-1)
-    h, zero = (-height)[:, None, None].expand(shape).reshape(-1), torch.zeros_like(px)
-    x, y = (h, zero) if scene.axis == "x" else (zero, h)
-    return camera_rays(x, y, scene.film_z_mm, px, py, pupil_plane_z_mm(scene.lens)), area
+    def only(self, fields: list[int]) -> _FilmLight:
+        """The same for some of the film points."""
+        found = copy(self)
+        found.height_mm, found.part = self.height_mm[fields], LitPart(*(c[fields] for c in self.part))
+        return found
+
+    def _rays(self, u: Tensor, v: Tensor) -> Rays:
+        h, zero = (-self.height_mm)[:, None].expand(u.shape).reshape(-1), torch.zeros(u.numel(), dtype=torch.float64)
+        x, y = (h, zero) if self.scene.axis == "x" else (zero, h)
+        return camera_rays(x, y, self.scene.film_z_mm, u.reshape(-1), v.reshape(-1), self.plane_z_mm)
+
+    def _passes(self, u: Tensor, v: Tensor) -> Tensor:
+        return passing(self.lens, self._rays(u, v), self.scene.lens.reference_nm).reshape(u.shape)
+
+    def sums(self, level: int) -> Array:
+        """Integral [F] of cos^4 over what is lit, NaN for a film point without a chief ray."""
+        nodes = lit_nodes(self._passes, self.part, level)
+        cos4 = self._rays(*nodes[:2]).dz.reshape(nodes.u.shape) ** 4
+        light = (nodes.area * cos4 * self._passes(*nodes[:2])).sum(1)
+        found: Array = light.where(torch.isfinite(self.height_mm), torch.nan).numpy()
+        return found

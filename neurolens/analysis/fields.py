@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.optics.aiming import Axis, aim_at_stop, without_rims
+from neurolens.optics.aiming import Axis, aim_at_stop, between, bracket, without_rims
 from neurolens.optics.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM
 from neurolens.optics.paraxial import FirstOrder, first_order, is_pinhole
 from neurolens.optics.prescription import Lens
@@ -48,17 +48,18 @@ def _plain(value: Any) -> Any:
     return value
 
 
-DEFAULT_NM = (LINE_D_NM, LINE_F_NM, LINE_C_NM)  # the first is the reference of the others
+DEFAULT_NM = (LINE_D_NM, LINE_F_NM, LINE_C_NM)
 
 # Half field from which a lens counts as a wide one: near objects then lie on a sphere, not on a plane.
 WIDE_DEG = 60.0
 
 _FRACTIONS = (0.0, 0.5, 0.7, 0.85, 1.0)
-_SEARCH = 121  # fields tried for the edge of the film
+_WIDEST_DEG = 179.0
+_SEARCH, _ROUNDS = 181, 4  # fields tried, denser near the axis; closer looks at neighbours among them
+_MET = 1e-6  # of the film's radius or the field
 
 
-@dataclass(frozen=True)
-class ChiefRays:
+class ChiefRays(NamedTuple):
     """Chief rays of F fields, traced without rims.
 
     Attributes:
@@ -75,6 +76,34 @@ class ChiefRays:
 
 
 @dataclass(frozen=True)
+class FieldEdge(Result):
+    """The widest field that is analysed.
+
+    Attributes:
+        field_deg, height_mm: of its chief ray.
+        meant: which edge was looked for: of the film, as the lens file or an option states it; of the field, where the
+            file states only that; else of the film that gets light.
+        reached: False where no chief ray comes from there: then this is the nearest field with a chief ray.
+    """
+
+    field_deg: float
+    height_mm: float
+    meant: str
+    reached: bool
+
+    @property
+    def name(self) -> str:
+        """The edge in words."""
+        return self.meant if self.reached else f"the last chief ray, {self.height_mm:.4g} mm"
+
+    @property
+    def warning(self) -> str | None:
+        """What to say of an edge that was not reached."""
+        where = f"{self.field_deg:.4g} degrees, {self.height_mm:.4g} mm"
+        return None if self.reached else f"no chief ray comes from {self.meant}; fields end at {where}"
+
+
+@dataclass(frozen=True)
 class Scene:
     """A lens in a state, with its object.
 
@@ -83,7 +112,7 @@ class Scene:
         focus_m: distance from the film to the object, inf allowed. An object of a lens of less than 60 degrees half
             field is a plane across the axis; of a wider one a sphere about the entrance pupil.
         axis: transverse axis of the meridional plane; matters for anamorphic lenses only.
-        rims: False opens every rim but the stop's (of aspheres a little, for they end soon after it).
+        rims: False opens every rim but the stop's; aspheres continue smoothly beyond theirs.
     """
 
     lens: Lens
@@ -94,6 +123,11 @@ class Scene:
     @property
     def film_z_mm(self) -> float:
         return float(self.lens.film_z_mm if self.lens.film_z_mm is not None else self.lens.vertices_mm[-1])
+
+    @property
+    def waves_nm(self) -> tuple[float, ...]:
+        """Wavelengths of white light, the reference first: d, F and C, or those of a lens made for other light."""
+        return DEFAULT_NM if self.lens.visible else self.lens.wavelengths_nm
 
     @property
     def first_order(self) -> FirstOrder:
@@ -109,15 +143,16 @@ class Scene:
         """z of the object on the axis, mm; -inf for a distant one."""
         return self.film_z_mm - 1000 * self.focus_m
 
-    def chief_rays(self, field_deg: Sequence[float] | Tensor | Any, wavelength_nm: float = LINE_D_NM) -> ChiefRays:
-        """Chief rays of fields in degrees, 0 to below 180."""
+    def chief_rays(self, field_deg: Sequence[float] | Tensor | Any, wavelength_nm: float | None = None) -> ChiefRays:
+        """Chief rays of fields in degrees, 0 to below 180, at one wavelength, that of reference where none is given."""
+        nm = self.lens.reference_nm if wavelength_nm is None else wavelength_nm
         angles = torch.deg2rad(torch.as_tensor(field_deg, dtype=torch.float64).reshape(-1))
         found = aim_at_stop(
             self.lens, angles, torch.zeros(len(angles), 1, dtype=torch.float64), axis=self.axis,
-            wavelength_nm=wavelength_nm,
+            wavelength_nm=nm,
         )  # fmt: skip
         with torch.no_grad():
-            out = trace(without_rims(self.lens), found.rays, wavelength_nm, towards="film")
+            out = trace(without_rims(self.lens), found.rays, nm, towards="film")
         exists = found.reached[:, 0] & (out.status == 0)
         film = on_plane(out.rays, self.film_z_mm)
         height = -(film.x if self.axis == "x" else film.y)
@@ -140,37 +175,47 @@ class Scene:
 
     @property
     def wide(self) -> bool:
-        return (self.lens.half_field_deg or 0.0) >= WIDE_DEG
+        return (self.lens.half_field_deg or self.edge.field_deg) >= WIDE_DEG
 
-    def edge_deg(self) -> float:
-        """The widest field: that whose chief ray meets the edge of the image circle, at most the stated half field.
+    @property
+    def edge(self) -> FieldEdge:
+        """The widest field that is analysed.
 
         Raises:
             InputError: a lens that forms no image, or one whose chief rays do not exist off the axis.
         """
-        return _edge_deg(self)
+        return _edge(self)
 
     def default_fields(self) -> tuple[float, ...]:
         """The axis, 50%, 70%, 85% and the edge of the field, degrees."""
-        edge = self.edge_deg()
+        edge = self.edge.field_deg
         return tuple(f * edge for f in _FRACTIONS)
-
-    def heights(self, to_deg: float) -> tuple[Array, Array]:
-        """Fields in degrees from the axis to `to_deg`, or to where chief rays end or turn back, and image heights."""
-        angles = np.linspace(0, to_deg, _SEARCH)
-        height = self.chief_rays(angles).height_mm.numpy()
-        sound = np.isfinite(height) & np.concatenate([[True], np.diff(height) > 0])
-        count = _SEARCH if sound.all() else int(np.argmin(sound))
-        return angles[:count], height[:count]
 
     def fields_at(self, height_mm: Sequence[float]) -> list[float]:
         """Fields in degrees whose chief rays meet the film at these heights; NaN for one that none reaches."""
-        angles, height = self.heights((self.lens.half_field_deg or 85.0) * 1.05)
-        if len(angles) < 2:
-            return [0.0 if h == 0 else math.nan for h in height_mm]
-        found = np.interp(height_mm, height, angles)
-        # The end of the search is extended by rounding only.
-        return [float(f) if h <= height[-1] * 1.001 else math.nan for h, f in zip(height_mm, found, strict=True)]
+        field, reached = self.nearest_fields(height_mm)
+        return np.where(reached, field, math.nan).tolist()
+
+    def nearest_fields(self, wanted: Sequence[float], *, degrees: bool = False) -> tuple[Array, Array]:
+        """Fields in degrees, the first from the axis outwards, whose chief rays meet the film at given heights (mm).
+
+        Also whether there is such a chief ray; where there is none the nearest counts.
+
+        Args:
+            degrees: the values are angles of fields instead, of which the nearest that has a chief ray counts.
+        """
+        target = torch.as_tensor(wanted, dtype=torch.float64).reshape(-1)
+        angle = (_WIDEST_DEG * torch.linspace(0, 1, _SEARCH, dtype=torch.float64) ** 2).expand(len(target), -1)
+        for closer in range(_ROUNDS + 1):
+            chief = self.chief_rays(angle.reshape(-1))
+            exists, value = chief.exists.reshape(angle.shape), chief.height_mm.reshape(angle.shape)
+            value = angle if degrees else value
+            if closer < _ROUNDS:
+                ends = bracket(angle, value, exists, target, math.inf)
+                angle = ends if closer == _ROUNDS - 1 else between(ends)
+        off, best = torch.where(exists, (value - target[:, None]).abs(), math.inf).min(1, keepdim=True)
+        reached = off[:, 0] <= _MET * target.abs().clamp_min(1.0)
+        return angle.gather(1, best)[:, 0].numpy(), reached.numpy()
 
     @property
     def open(self) -> Scene:
@@ -189,6 +234,12 @@ class Scene:
             return self.lens
         rows = zip(self.lens.surfaces, without_rims(self.lens).surfaces, strict=True)
         return replace(self.lens, surfaces=tuple(old if old.stop else new for old, new in rows))
+
+    @property
+    def to_stop(self) -> Lens:
+        """The lens from the front to the stop, its opening the only rim."""
+        surfaces = self.open.traced.surfaces[: self.lens.stop_index + 1]
+        return replace(self.lens, surfaces=surfaces)
 
     def require_power(self) -> None:
         """Raise InputError for a pinhole, which has no focus."""
@@ -214,13 +265,20 @@ def _image_radius_mm(lens: Lens) -> float:
 
 
 @lru_cache(maxsize=16)
-def _edge_deg(scene: Scene) -> float:
+def _edge(scene: Scene) -> FieldEdge:
     scene.check()
     lens, stated = scene.lens, scene.lens.half_field_deg
-    angles, height = scene.heights(min(stated * 1.02 if stated else 89.0, 179.0))
-    if len(angles) < 2:
+    by_field = False
+    if lens.image_radius_mm is None and stated is not None:
+        by_field, wanted = True, stated
+        meant = f"the stated half field, {stated:.4g} degrees"
+    else:
+        wanted = scene.image_radius_mm
+        meant = f"the edge of the film, {wanted:.4g} mm"
+        if lens.image_radius_mm is None:
+            meant = f"the edge of the lit film (10% of the light), {wanted:.4g} mm"
+    (field,), (reached,) = scene.nearest_fields([wanted], degrees=by_field)
+    if not field > 0:
         raise InputError(lens.path, "half_field_deg", stated, "a lens with chief rays off the axis")
-    if stated and lens.image_radius_mm is None:
-        return float(min(stated, angles[-1]))
-    edge = float(np.interp(scene.image_radius_mm, height, angles))
-    return min(edge, stated) if stated else edge
+    height = float(scene.chief_rays([field]).height_mm[0])
+    return FieldEdge(float(field), height, meant, bool(reached))

@@ -13,9 +13,8 @@ import torch
 
 from neurolens.analysis.bundles import Pattern, bundle, fan
 from neurolens.analysis.fields import Array, Result, Scene
-from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, new_figure, save, style
+from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, heading, new_figure, save, style
 from neurolens.base.errors import InputError
-from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Surface
 from neurolens.optics.sag import sag_mm
 from neurolens.optics.surfaces import Rays
@@ -97,7 +96,7 @@ class Layout(Result):
 
 
 def layout_profile(scene: Scene, film_radius_mm: float | None = None) -> Layout:
-    """Section of a lens with meridional fans of rays to the axis, 70% and the edge of the film, d line.
+    """Section of a lens with meridional fans of rays to the axis, 70% and the edge of the film, reference wavelength.
 
     The edge of the film is that of the image circle if not given. A field of which none passes has no rays.
     """
@@ -143,7 +142,7 @@ def _fan_lines(scene: Scene, field: float) -> list[Array]:
     """Polylines (z, height) of rays that pass, evenly spread over the open part of the stop."""
     line = fan(_FAN)
     tangential = Pattern(*(v[:_FAN] for v in line))
-    rays = bundle(scene, [field], [LINE_D_NM], tangential)
+    rays = bundle(scene, [field], [scene.lens.reference_nm], tangential)
     passing = torch.nonzero(rays.passed[0, 0])[:, 0]
     if len(passing) == 0:
         return []
@@ -166,16 +165,11 @@ def lens_layout(layout: Layout, path: str | Path) -> None:
     """Draw a lens with rays, light from left to right, as PNG, PDF or SVG."""
     with style():
         z, top = _limits(layout)
-        figure = new_figure(9.4, min(9.0, max(3.4, 8.6 * 2 * top / (z[1] - z[0]) + 1.5)))
+        figure = new_figure(9.4, min(9.0, max(3.9, 8.6 * 2 * top / (z[1] - z[0]) + 2.1)))
         axes = figure.add_subplot()
         axes.set(xlabel="z (mm), light travels this way →", ylabel=f"{layout.height} (mm)")
         draw_section(axes, layout, lw=0.7, ls=(0, (12, 3, 2, 3)))
-        # The empty second line of the title keeps room for the subtitle, which has a lighter style.
-        axes.set_title(layout.title + ("\n" if layout.subtitle else ""), loc="left", fontweight="bold")
-        axes.annotate(
-            layout.subtitle, (0, 1), xycoords="axes fraction", xytext=(0, 6), textcoords="offset points",
-            fontsize=9, color="#555b63", in_layout=False,
-        )  # fmt: skip
+        heading(figure, layout.title, layout.subtitle)
         handles, labels = axes.get_legend_handles_labels()
         order = sorted(range(len(labels)), key=lambda i: labels[i] in ("stop", "film"))  # fields first
         handles, labels = [handles[i] for i in order], [labels[i] for i in order]

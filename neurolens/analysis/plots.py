@@ -105,6 +105,22 @@ def plot_mtf(data: Mtf, path: str | Path, title: str, subtitle: str) -> None:
         figure.legend(loc="outside lower center", ncols=4)
 
 
+def plot_mtf_over_height(data: Mtf, path: str | Path, title: str, subtitle: str) -> None:
+    """MTF against image height: a colour per frequency, tangential solid, sagittal dashed."""
+    waves = ", ".join(f"{nm:.0f}" for nm in data.wavelength_nm)
+    with drawing(path, 7.4, 5.4, title, f"Geometric MTF at {waves} nm, without diffraction; {subtitle}") as figure:
+        axes = figure.add_subplot()
+        for k, frequency in enumerate(data.frequency_per_mm):
+            for name, values, line in (("tangential", data.tangential, "-"), ("sagittal", data.sagittal, "--")):
+                look = {"color": FIELD_COLOURS[k % len(FIELD_COLOURS)], "ls": line, "lw": 1.6}
+                axes.plot(data.height_mm, values[:, k], label=f"{frequency:g} cycles/mm, {name}", **look)
+        axes.grid(True)
+        axes.set(xlabel="image height (mm)", ylabel="contrast", ylim=(0, 1.02))
+        axes.set_xlim(0, float(np.nanmax(data.height_mm)))
+        _degrees(axes, data.height_mm, data.field_deg, across=True)
+        figure.legend(loc="outside lower center", ncols=len(data.frequency_per_mm))
+
+
 def plot_seidel(data: Seidel, path: str | Path, title: str, subtitle: str) -> None:
     """Seidel sums as bars, surface by surface, with their total apart."""
     text = f"Seidel sums at {data.image_height_mm:.1f} mm image height, {data.wavelength_nm:.0f} nm; {subtitle}"

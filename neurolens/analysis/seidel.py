@@ -26,7 +26,8 @@ class Seidel(Result):
     """Seidel sums in mm, for the present stop and one image height.
 
     As wavefront aberrations at the edge of pupil and field: W040 = S1/8, W131 = S2/2, W222 = S3/2, W220 = (S3 + S4)/4,
-    W311 = S5/2; of colour, F against C: C1/2 and C2.
+    W311 = S5/2; of colour, F against C: C1/2 and C2
+    (of a lens for other light, its shortest wavelength against its longest).
 
     Attributes:
         surfaces: [S, 7], one row per surface; columns as in `NAMES`.
@@ -47,21 +48,23 @@ class Seidel(Result):
     odd_powers: tuple[int, ...]
 
 
-def seidel(scene: Scene, *, wavelength_nm: float = LINE_D_NM, image_height_mm: float | None = None) -> Seidel:
+def seidel(scene: Scene, *, wavelength_nm: float | None = None, image_height_mm: float | None = None) -> Seidel:
     """Seidel sums at the edge of the field, or at another paraxial image height in mm.
 
     Raises:
         InputError: a lens with cylinders: these sums are those of lenses symmetric about their axis; ideal surfaces.
     """
     lens = scene.lens
+    wavelength_nm = lens.reference_nm if wavelength_nm is None else wavelength_nm
     if lens.anamorphic:
         raise InputError(lens.path, "cylinder", "(an anamorphic lens)", "a lens that is symmetric about its axis")
     scene.require_power()
     lens.require_glass("Seidel sums")
     if image_height_mm is None:
-        image_height_mm = float(scene.chief_rays([scene.edge_deg()], wavelength_nm).height_mm[0])
+        image_height_mm = float(scene.chief_rays([scene.edge.field_deg], wavelength_nm).height_mm[0])
     system = system_of(lens, wavelength_nm)
-    n, blue, red = system.index, system_of(lens, LINE_F_NM).index, system_of(lens, LINE_C_NM).index
+    n = system.index
+    blue, red = (system_of(lens, nm).index for nm in ((LINE_F_NM, LINE_C_NM) if lens.visible else lens.light_nm))
     spread = [a - b for a, b in zip(blue, red, strict=True)]
     marginal, chief = _rays(scene, system, image_height_mm)
     rows = np.array([_row(s, k, n, spread, marginal, chief) for k, s in enumerate(lens.surfaces)])

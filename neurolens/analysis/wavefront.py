@@ -10,8 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neurolens.analysis.bundles import Bundle, bundle, grid, hexapolar, points
-from neurolens.analysis.fields import DEFAULT_NM, Array, Result, Scene
+from neurolens.analysis.bundles import Bundle, Filled, bundle, points
+from neurolens.analysis.fields import Array, Result, Scene
+from neurolens.analysis.pupil_nodes import LEVELS, converged
 from neurolens.analysis.spots import working_f_number
 
 
@@ -62,6 +63,7 @@ class Psf(Result):
         strehl: [F], greatest value of `diffraction`.
         pupil_points: [F], points across the pupil that the diffraction image needs; 0 without light.
         airy_um: radius of the first dark ring on the axis.
+        spread: by figure, [F, ...], by how much two samplings of the pupil differ (`pupil_nodes.converged`).
     """
 
     field_deg: Array
@@ -72,33 +74,53 @@ class Psf(Result):
     strehl: Array
     pupil_points: Array
     airy_um: float
+    spread: dict[str, Array]
 
 
-def psf(scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: Sequence[float] = DEFAULT_NM) -> Psf:
+def psf(scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: Sequence[float] | None = None) -> Psf:
     """Point spread of fields; the window holds the spot and six Airy radii.
 
     Raises:
         InputError: a pinhole, whose rays do not meet: it has no focus that waves could be summed about.
     """
     scene.require_power()
-    airy = 1.22e-3 * wavelength_nm[0] * working_f_number(scene, wavelength_nm[0])
-    rays = bundle(scene, field_deg, wavelength_nm, grid(64))
-    half, geometric, diffraction, needed = [], [], [], []
-    for k, field in enumerate(rays.field_deg):
+    filled = Filled(scene, field_deg, wavelength_nm)
+    airy = 1.22e-3 * filled.waves[0] * working_f_number(scene, filled.waves[0])
+    least_mm = 6e-3 * float(np.nan_to_num(airy))
+
+    def images(level: int, fields: list[int]) -> list[Array]:
+        return _images(filled.only(fields).bundle(level, path=True), least_mm)
+
+    def shown(found: list[Array]) -> dict[str, tuple[Array, Array | float]]:
+        return {"half_width_um": (found[0], 20 * found[0]), "strehl": (found[2].max((1, 2)), 1.0)}
+
+    (half, centre, diffraction, needed), spread = converged(images, shown, len(filled.fields), first=1)
+    rays = filled.bundle(LEVELS - 1)  # a picture needs rays in every square, whatever figures need
+    spots = zip(rays.tangential_mm, rays.sagittal_mm, rays.weight, centre, half, strict=True)
+    geometric = np.stack([_histogram(t - c[0], s - c[1], w, h / 1000) for t, s, w, c, h in spots])
+    return Psf(
+        np.array(filled.fields), np.array(filled.waves), half, geometric, diffraction, diffraction.max((1, 2)), needed,
+        airy, spread,
+    )  # fmt: skip
+
+
+def _images(rays: Bundle, least_mm: float) -> list[Array]:
+    """Half widths (um), centres (mm), diffraction images and points across the pupil that these need, [F, ...].
+
+    In windows of at least some half width.
+    """
+    rows = []
+    for k in range(len(rays.field_deg)):
         t, s, w = (v[k].flatten() for v in (rays.tangential_mm, rays.sagittal_mm, rays.weight))
         centre, radius = _spot(t, s, w)
-        window = max(6e-3 * np.nan_to_num(airy), 1.1 * radius)
+        window = max(least_mm, 1.1 * radius)
         if not (window > 0 and w.sum() > 0):
             window = math.nan
-        geometric.append(_histogram(t - centre[0], s - centre[1], w, window))
-        count = _needed(scene, field, wavelength_nm[0], window)
-        diffraction.append(_diffraction(scene, field, wavelength_nm[0], count, centre, window))
-        half.append(1000 * window)
-        needed.append(count)
-    return Psf(
-        np.array(rays.field_deg), np.array(wavelength_nm), np.array(half), np.stack(geometric), np.stack(diffraction),
-        np.stack(diffraction).max((1, 2)), np.array(needed, dtype=np.float64), airy,
-    )  # fmt: skip
+        needed, image = _needed(rays, k, window), np.full((_POINTS, _POINTS), np.nan)
+        if 0 < needed <= _FINEST:
+            image = diffraction_image(rays, centre, window, field=k)
+        rows.append((1000 * window, centre, image, float(needed)))
+    return [np.array(column) for column in zip(*rows, strict=True)]
 
 
 def _spot(t: Tensor, s: Tensor, w: Tensor) -> tuple[tuple[float, float], float]:
@@ -122,34 +144,26 @@ def _histogram(t: Tensor, s: Tensor, w: Tensor, half_mm: float) -> Array:
     return found / float(w.sum())
 
 
-def _needed(scene: Scene, field: float, wavelength_nm: float, half_mm: float) -> int:
+def _needed(rays: Bundle, field: int, half_mm: float) -> int:
     """Points across the pupil so that the phase anywhere in the window turns by less than half a turn between two."""
-    rays = bundle(scene, [field], [wavelength_nm], hexapolar(6))
-    t, s = cosines(rays)
-    if math.isnan(half_mm) or not rays.passed.any():
+    if math.isnan(half_mm) or not rays.passed[field].any():
         return 0
-    span = max(float(np.nanmax(v) - np.nanmin(v)) for v in (t.numpy(), s.numpy()))
-    blur = float(torch.nan_to_num(torch.hypot(rays.tangential_mm, rays.sagittal_mm)).max())
-    return max(32, math.ceil(span * 2 * (math.sqrt(2) * half_mm + blur) / (wavelength_nm * 1e-6)))
+    span = max(float(np.nanmax(v[field]) - np.nanmin(v[field])) for v in cosines(rays))
+    blur = float(torch.nan_to_num(torch.hypot(rays.tangential_mm[field], rays.sagittal_mm[field])).max())
+    return max(32, math.ceil(span * 2 * (math.sqrt(2) * half_mm + blur) / (rays.wavelength_nm[0] * 1e-6)))
 
 
-def _diffraction(
-    scene: Scene, field: float, wavelength_nm: float, count: int, centre: tuple[float, float], half_mm: float
+def diffraction_image(
+    rays: Bundle, centre_mm: tuple[float, float], half_mm: float, points: int = _POINTS, field: int = 0
 ) -> Array:
-    if not 0 < count <= _FINEST:
-        return np.full((_POINTS, _POINTS), np.nan)
-    return diffraction_image(bundle(scene, [field], [wavelength_nm], grid(count)), centre, half_mm)
-
-
-def diffraction_image(rays: Bundle, centre_mm: tuple[float, float], half_mm: float, points: int = _POINTS) -> Array:
-    """Diffraction image of a bundle of one field and one wavelength, [points, points]; see `Psf.diffraction`.
+    """Diffraction image of a field of a bundle at its first wavelength, [points, points]; see `Psf.diffraction`.
 
     Its centre is given as tangential and sagittal distance from the chief ray's film point.
     """
     wave = 2 * math.pi / (rays.wavelength_nm[0] * 1e-6)
-    keep = rays.passed[0, 0]
-    t, s = (c[0, 0][keep] for c in cosines(rays))
-    path, weight = path_to_chief_mm(rays)[0, 0][keep], rays.weight[0, 0][keep]
+    keep = rays.passed[field, 0]
+    t, s = (c[field, 0][keep] for c in cosines(rays))
+    path, weight = path_to_chief_mm(rays)[field, 0][keep], rays.weight[field, 0][keep]
     # Paths are metres of waves: only their differences may be turned into phases.
     lead = path - path.mean() + t * centre_mm[0] + s * centre_mm[1]
     amplitude = torch.polar(weight / weight.sum(), wave * lead)

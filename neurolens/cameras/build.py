@@ -1,13 +1,4 @@
-"""A camera from what a command line names.
-
-    pinhole, thin                       a point; a thin lens
-    fisheye-equidistant, -equisolid,    points with a fisheye projection
-      -stereographic, -orthographic
-    thick:LENS.toml                     principal planes and pupils of a lens file
-    thin:LENS.toml, pinhole:LENS.toml   thin lens and point that show the plane in focus at that lens's size
-    LENS.toml                           the lens, traced exactly
-    MODEL.onnx                          an exported model of one
-    fused:LENS.toml, fused:MODEL.onnx   the same, compiled by the system's C compiler
+"""A camera from what a command line names: `neurolens.base.lensname` lists the kinds.
 
 Only a lens file needs torch, which is imported when one is asked for.
 """
@@ -22,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from neurolens.base.errors import InputError
+from neurolens.base.lensname import FISHEYES, FUSED, IDEAL_OF, is_model, resolve
 from neurolens.base.progress import Progress
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.ideal import ThickLens, ThinLens
@@ -32,10 +24,6 @@ from neurolens.optics.apertures import Aperture
 if TYPE_CHECKING:
     from neurolens.optics.prescription import Lens
 
-FISHEYES = tuple(f"fisheye-{name}" for name in PROJECTIONS)
-IDEAL = ("thin", "pinhole", *FISHEYES)
-IDEAL_OF = ("thick:", "thin:", "pinhole:")  # before a lens file: ideal cameras framed as that lens is
-FUSED = "fused:"  # before a path: compiled by the system's C compiler
 _BEYOND = 1.02  # diagonal of the film over the image circle: 36x24 over 43.2 mm is as lenses are engraved
 _EFL_MM, _FISHEYE_EFL_MM, _THIN_F_NUMBER, _PINHOLE_F_NUMBER = 50.0, 14.0, 4.0, 8.0
 
@@ -87,7 +75,7 @@ def make_camera(spec: str | Path, shot: Shot, progress: Progress | None = None) 
     """The camera that `spec` names, set for a shot.
 
     Args:
-        spec: see the module.
+        spec: as `resolve` takes it.
         progress: shows what takes long, see `ExactCamera`.
 
     Raises:
@@ -100,23 +88,15 @@ def make_camera(spec: str | Path, shot: Shot, progress: Progress | None = None) 
 
 
 def _camera(spec: str, shot: Shot, progress: Progress | None) -> Camera:
-    kind = next((k for k in IDEAL_OF if spec.startswith(k)), "")
-    fused = spec.startswith(FUSED)
-    path = Path(spec.removeprefix(kind or FUSED))
-    exact = path.suffix == ".toml" and not kind
+    kind, path = resolve(spec)
+    exact = path is not None and not is_model(path) and kind not in IDEAL_OF
     only = "left out: only a lens file that is traced as it is has it"
-    _refuse(spec, "pupil", None if (exact and not fused) or shot.pupil == "outline" else shot.pupil, only)
-    if spec in IDEAL:
-        return _ideal(spec, shot)
-    if path.suffix not in (".toml", ".onnx") or (kind and path.suffix != ".toml"):
-        framed = ", ".join(f"{k}FILE.toml" for k in IDEAL_OF)
-        expected = f"a lens file (.toml), {framed}, a model (.onnx), {FUSED}FILE, {' or '.join(IDEAL)}"
-        raise InputError("camera", "--camera", spec, expected)
-    if not path.is_file():
-        raise InputError(path, "file", "(missing)", "a lens file" if path.suffix == ".toml" else "an ONNX model")
-    if kind:
+    _refuse(spec, "pupil", None if (exact and not kind) or shot.pupil == "outline" else shot.pupil, only)
+    if path is None:
+        return _ideal(kind, shot)
+    if kind in IDEAL_OF:
         return _ideal_of(kind, path, shot)
-    return _exact(path, shot, fused, progress) if exact else _model(path, shot, fused)
+    return _exact(path, shot, kind == FUSED, progress) if exact else _model(path, shot, kind == FUSED)
 
 
 def _ideal(kind: str, shot: Shot) -> Camera:
@@ -143,11 +123,11 @@ def _ideal(kind: str, shot: Shot) -> Camera:
 
 
 def _ideal_of(kind: str, path: Path, shot: Shot) -> Camera:
-    from neurolens.optics.lensfile import read_lens
+    from neurolens.readers.any_format import read_any
 
     if kind != "thin:":
         _refuse(f"{kind}{path}", "film_offset_mm", shot.film_offset_mm or None, "left out: set focus_m")
-    lens = _placed(read_lens(path), shot)
+    lens = _placed(read_any(path), shot)
     camera = ideal_as(kind, lens, shot)
     camera.settings |= {"lens": lens.identity, "zoom": shot.zoom, "focusing": shot.focus, "derived": lens.derived}
     return camera
@@ -210,10 +190,10 @@ def ideal_as(kind: str, lens: Lens, shot: Shot) -> Camera:
 def _exact(path: Path, shot: Shot, fused: bool, progress: Progress | None) -> Camera:
     from neurolens.cameras.exact import ExactCamera, FusedExactCamera
     from neurolens.optics.lenscheck import check_lens, doubts
-    from neurolens.optics.lensfile import read_lens
     from neurolens.optics.paraxial import first_order
+    from neurolens.readers.any_format import read_any
 
-    tabled = read_lens(path)
+    tabled = read_any(path)
     lens = tabled.at(focal_length_mm=shot.efl_mm, field_deg=shot.field_deg, zoom=shot.zoom)
     if shot.aperture is not None:
         lens = lens.with_aperture(shot.aperture)

@@ -32,7 +32,7 @@ from neurolens.cameras.pupil_search import COARSE, COARSE_TIGHT, FINE, Detail, o
 from neurolens.cameras.sampling import arrived, check_film, positive
 from neurolens.optics import pupil_methods as known
 from neurolens.optics.focusing import best_focused
-from neurolens.optics.glass import LINE_D_NM, absorption_of
+from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.paraxial import chief_reach_mm, first_order
 from neurolens.optics.prescription import Focus, Lens
 from neurolens.optics.pupil_methods import RadialPupil
@@ -41,7 +41,6 @@ from neurolens.optics.trace import Rays, film_derivatives, trace, trace_differen
 from neurolens.optics.tracegraph import exact_graph
 
 OUTLINE = "outline"
-AS_BARE = "coatings and absorption left out"
 _MAKERS: dict[str, Callable[[Lens, float], RadialPupil]] = {
     "rear-rim": known.rear_rim,
     "exit-pupil": known.global_exit_pupil,
@@ -97,6 +96,7 @@ class ExactCamera:
         self.name = lens.name
         self.dispersive = lens.dispersive
         self.wavelength_nm = wavelength_nm if self.dispersive else None
+        self._range_nm = wavelength_nm
         used = wavelength_nm if self.dispersive else (LINE_D_NM, LINE_D_NM)
         self.lens = lens.at(f_number=f_number, focus_m=self.focus_m, focus=focus, wavelength_nm=used)
         if focus == "internal":
@@ -171,14 +171,8 @@ class ExactCamera:
         return arrived(film, origin, point_m, weight, status, wavelength_nm)
 
     def lens_graph(self) -> LensGraph:
-        """The lens as a graph.
-
-        Raises:
-            InputError: coatings or glass that absorbs.
-        """
-        check_bare(self.lens)
-        waves = self.wavelength_nm or (LINE_D_NM, LINE_D_NM)
-        graph = exact_graph(self.lens, self._pupil_z_mm, waves)
+        """The lens as a graph."""
+        graph = exact_graph(self.lens, self._pupil_z_mm, self._range_nm)
         stopped = st.blocked(self.lens.stop_index, st.RIM)
         return LensGraph(graph, float(self.lens.stop_radius_mm), self.lens.aperture, stopped)
 
@@ -233,16 +227,15 @@ def _tensors(dtype: torch.dtype, *arrays: NDArray[Any]) -> list[torch.Tensor]:
 
 
 class FusedExactCamera(Compiled, ExactCamera):
-    """A prescription without coatings and absorption as a compiled camera: the rays of `ExactCamera` to rounding.
+    """A prescription as a compiled camera: the rays of `ExactCamera` to rounding.
 
     Args and attributes are those of `ExactCamera`, whose `dtype` is float32 here; for differentials see `FusedFilm`.
 
     Raises:
-        InputError: as `ExactCamera`; no C compiler; coatings or glass that absorbs.
+        InputError: as `ExactCamera`; no C compiler.
     """
 
     def __init__(self, lens: Lens, **kwargs: Any) -> None:
-        check_bare(lens)
         super().__init__(lens, **kwargs)
         self._fused = FusedFilm(self.film, self.lens_graph(), self.film_mm)
         self.settings |= {"runtime": "fused"}
@@ -283,25 +276,6 @@ def placed_settings(lens: Lens, film_mm: tuple[float, float], focus_m: float) ->
         "film_mm": list(film_mm),
         "lens_state": state_of(lens, (400.0, 700.0), nominal),
     }
-
-
-def check_bare(lens: Lens, instead: str = "without fused: it is traced with them") -> None:
-    """Refuse, by an InputError, coatings and glass that absorbs: their graph follows neither."""
-    for k, s in enumerate(lens.surfaces):
-        coated = s.coating is not None and bool(s.coating.layers)
-        absorbs = (s.glass is not None or s.absorption_per_mm) and absorption_of(s, LINE_D_NM) is not None
-        if coated or absorbs:
-            found = "(a coating)" if coated else "(glass that absorbs)"
-            raise InputError(lens.path, f"surface {k}", found, f"a bare, clear lens to compile ({instead})")
-
-
-def bare_line(lens: Lens) -> str:
-    """What a form that holds neither coatings nor absorption says of a lens; "" of one without them."""
-    try:
-        check_bare(lens)
-    except InputError:
-        return f"In this form: {AS_BARE}."
-    return ""
 
 
 @dataclass(frozen=True)

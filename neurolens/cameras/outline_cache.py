@@ -24,7 +24,7 @@ import torch
 from neurolens import optics
 from neurolens.base.files import atomic_path, cache_folder, fingerprint_of, keep_newest, seal, sealed_bytes, sha256_of
 from neurolens.cameras.pupil_outline import PupilOutline, wavelength_between
-from neurolens.optics.glass import LINE_D_NM, index_of
+from neurolens.optics.glass import index_of
 from neurolens.optics.prescription import Lens
 
 _KEPT = 256  # files of 5 to 40 kB
@@ -39,8 +39,8 @@ def search_key(lens: Lens, wavelength_nm: tuple[float, float], shares: tuple[flo
         lens: focused. wavelength_nm, shares: the range, and the shares of it at which rays are traced.
         settings: whatever else rules the search, as JSON takes it.
     """
-    waves = {LINE_D_NM, *wavelength_nm, *(wavelength_between(wavelength_nm, share) for share in shares)}
-    rows: list[Any] = []
+    waves = {lens.reference_nm, *wavelength_nm, *(wavelength_between(wavelength_nm, share) for share in shares)}
+    rows: list[Any] = [[float(index_of(lens.object_medium, w)) for w in sorted(waves)]]
     for s in lens.surfaces:
         numbers = (s.radius_mm, s.thickness_mm, s.diameter_mm, s.conic, *(index_of(s, w) for w in sorted(waves)))
         more = s.across, s.focal_mm, [(p, float(a)) for p, a in s.asphere]

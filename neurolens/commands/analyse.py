@@ -7,18 +7,20 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neurolens.base.bounds import WAVELENGTH_NM, said
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.commands.arguments import (
     add_json,
+    add_lens,
     add_lens_state,
     between,
     check_run_folder,
     focus_of,
-    lens_path,
     state_of,
 )
 from neurolens.commands.output import answer, number, table
@@ -28,8 +30,10 @@ if TYPE_CHECKING:
     from neurolens.optics.prescription import Lens
 
 
-WHATS = ("layout", "spots", "fans", "colour", "curvature", "distortion", "vignetting", "mtf", "seidel", "psf")
-_OF_FIELDS = ("spots", "fans", "mtf", "psf")  # take --fields and --wavelengths
+WHATS = (
+    "layout", "spots", "fans", "colour", "curvature", "distortion", "vignetting", "mtf", "mtf-height", "seidel", "psf",
+)  # fmt: skip
+_OF_FIELDS = ("spots", "fans", "mtf", "psf")  # take --fields, and as mtf-height --wavelengths
 _BULK = {  # left out of the JSON unless asked for: a number per ray or a pixel
     "layout": ("rays", "surfaces"),
     "spots": ("tangential_um", "sagittal_um", "slope_tangential", "slope_sagittal"),
@@ -47,11 +51,15 @@ Trace a lens from the scene and analyse its image. WHAT is any of:
   distortion  against f tan(theta), and for wide lenses against the projection that fits best
   vignetting  vignetting and relative illumination
   mtf         geometric MTF, tangential and sagittal, with the diffraction limit beside
+  mtf-height  the same at 10, 20 and 40 cycles/mm against image height, as lens makers print it
   seidel      Seidel sums S1 to S5 and the colour sums C1 and C2, surface by surface
   psf         point spread, geometric and by diffraction
 
 Without WHAT all are shown. Rays fill the real stop, not a paraxial pupil; fields are angles
-from the axis in degrees, of the chief ray in the scene. Needs the extra "train" (torch)."""
+from the axis in degrees, of the chief ray in the scene. The edge is that of the film, or the
+text says which; one that no chief ray reaches is a warning. Pupils are sampled finer and finer
+until two samplings agree to the digits that are printed; what does not settle has fewer.
+Needs the extra "train" (torch)."""
 _EPILOG = """\
 examples:
   neurolens analyse lenses/laikin_double_gauss_50.toml
@@ -72,7 +80,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "analyse", help="spots, MTF, distortion and more of a lens file", description=_DESCRIPTION, epilog=_EPILOG
     )
-    parser.add_argument("file", metavar="LENS", type=Path, help="lens file, or name of lenses/")
+    add_lens(parser, "file")
     parser.add_argument("what", metavar="WHAT", nargs="*", help="what to show (default: all)")
     add_lens_state(parser, efl="as tabled", f_number="the tabled stop")
     parser.add_argument(
@@ -81,7 +89,12 @@ def add_parser(subparsers: Any) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--wavelengths", metavar="NM", nargs="+", type=between(*WAVELENGTH_NM, "wavelengths in nm"),
-        help=f"of spots, fans, mtf and psf, {said(WAVELENGTH_NM)} nm, the reference first (default: the lines d, F, C)",
+        help=f"of spots, fans, the MTF and psf, {said(WAVELENGTH_NM)} nm, the reference first "
+        "(default: d, F and C, or the file's own where its range lacks the d line)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--frequencies", metavar="PER_MM", nargs="+", type=between(0, 1000, "cycles per mm"),
+        help="of mtf-height (default: 10 20 40)",
     )  # fmt: skip
     parser.add_argument(
         "--axis", choices=("x", "y"), default="y", help="plane of the field, for anamorphic lenses (default: y)"
@@ -108,13 +121,13 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.analysis.layout import state_text
 
     began = time.perf_counter()
-    args.file = lens_path(args.file, "analyse")
     scene, doubts = _scene_of(args)
-    scene.check()
+    edge = scene.edge
+    doubts += [edge.warning] if edge.warning else []
     found, pictures, notes = {}, {}, [f"derived: {scene.lens.derived}"] if scene.lens.derived else []
     for what in args.what or WHATS:
         try:
-            found[what], picture = _one(what, scene, args)
+            found[what], picture = _one(what, scene, args, doubts)
         except InputError as error:
             if args.what:
                 raise
@@ -122,13 +135,23 @@ def run(args: argparse.Namespace) -> int:
             continue
         if picture is not None:
             pictures[what] = str(picture)
-    head = {"file": str(args.file), "name": scene.lens.name, "axis": scene.axis, "focus_m": scene.focus_m}
+    head = {
+        "file": str(args.file),
+        "name": scene.lens.name,
+        "axis": scene.axis,
+        "focus_m": scene.focus_m,
+        "edge": edge.to_dict(),
+    }
     more = {"pictures": pictures, "notes": notes, "warnings": doubts, "seconds": time.perf_counter() - began}
     bulk = {} if args.full else _BULK
     shown = {w: {k: v for k, v in d.items() if k not in bulk.get(w, ())} for w, d in found.items()}
 
     def text() -> str:
-        parts = [f"{scene.lens.name}\n{state_text(scene)}", *(analysis_of(w).table(d) for w, d in found.items())]
+        widest = f"fields to {edge.field_deg:.2f}°, {edge.height_mm:.2f} mm: {edge.name}"
+        parts = [
+            f"{scene.lens.name}\n{state_text(scene)}\n{widest}",
+            *(analysis_of(w).table(d) for w, d in found.items()),
+        ]
         parts += [*(f"Note: {n}" for n in notes), *(f"Warning: {w}" for w in doubts)]
         if pictures:
             parts.append(f"{len(pictures)} pictures drawn in {args.output}")
@@ -139,38 +162,46 @@ def run(args: argparse.Namespace) -> int:
 
 def _scene_of(args: argparse.Namespace) -> tuple[Scene, list[str]]:
     """The lens with its object in the state of the arguments of `add_lens_state`, and warnings."""
-    from neurolens.analysis.fields import DEFAULT_NM, Scene
+    from neurolens.analysis.fields import Scene
     from neurolens.evaluate.describe import file_doubts, rim_doubts
-    from neurolens.optics.lensfile import read_lens
+    from neurolens.readers.any_format import read_any
 
     with warnings.catch_warnings(record=True) as caught:  # glasses that contradict the catalogue, constant indices
         warnings.simplefilter("always", NeurolensWarning)
-        tabled = read_lens(args.file)
+        tabled = read_any(args.file)
     lens = state_of(args, tabled)
     notes = [str(w.message).removeprefix(f"{tabled.path}: ") for w in caught]
     notes += rim_doubts(lens) + file_doubts(tabled, states=bool(args.zoom))
-    notes += _wavelength_warnings(lens, args.wavelengths or DEFAULT_NM)
-    return Scene(lens, focus_of(args, tabled, lens), args.axis), notes
+    scene = Scene(lens, focus_of(args, tabled, lens), args.axis)
+    notes += _wavelength_warnings(lens, args.wavelengths or scene.waves_nm)
+    return scene, notes
 
 
-def _one(what: str, scene: Scene, args: argparse.Namespace) -> tuple[dict[str, Any], Path | None]:
-    """One analysis as plain data, and its picture where a folder is given."""
+def _one(what: str, scene: Scene, args: argparse.Namespace, doubts: list[str]) -> tuple[dict[str, Any], Path | None]:
+    """One analysis as plain data, and its picture where a folder is given; new warnings are added to `doubts`."""
     from neurolens.analysis.bundles import check_light
-    from neurolens.analysis.fields import DEFAULT_NM
     from neurolens.analysis.layout import state_text
 
     analysis = analysis_of(what)
     options = {"field_deg": args.fields, "wavelength_nm": args.wavelengths}
     asked = {k: v for k, v in options.items() if v is not None} if what in _OF_FIELDS else {}
+    if what == "mtf-height":
+        options = {"frequency_per_mm": args.frequencies, "wavelength_nm": args.wavelengths}
+        asked = {k: v for k, v in options.items() if v is not None}
     if what in _OF_FIELDS:
-        check_light(scene, args.fields, (args.wavelengths or DEFAULT_NM)[0])
+        dark = check_light(scene, args.fields, (args.wavelengths or scene.waves_nm)[0])
+        doubts += [d for d in dark if d not in doubts]
     result = analysis.compute(scene, **asked)
     data = result.to_dict()
     if args.output is None:
         return data, None
     across = f"_{args.axis}" if any(s.cylinder for s in scene.lens.surfaces) else ""
     path = args.output / f"{scene.lens.lens_id}_{what}{across}.{args.format}"
-    analysis.draw(result, path, *(() if what == "layout" else (scene.lens.name, state_text(scene))))
+    warning = wrap(f"Warning: {scene.edge.warning}", _WRAP) if scene.edge.warning else []
+    if what == "layout":
+        analysis.draw(replace(result, subtitle="\n".join([result.subtitle, *warning])), path)
+    else:
+        analysis.draw(result, path, scene.lens.name, "\n".join([state_text(scene), *warning]))
     return data, path
 
 
@@ -180,7 +211,7 @@ def analysis_of(what: str) -> Analysis:
     from neurolens.analysis.field_curves import colour, curvature, distortion, illumination
     from neurolens.analysis.layout import layout_profile, lens_layout
     from neurolens.analysis.seidel import seidel
-    from neurolens.analysis.spots import fans, mtf, spots
+    from neurolens.analysis.spots import fans, mtf, mtf_over_height, spots
     from neurolens.analysis.wavefront import psf
 
     return {
@@ -192,6 +223,7 @@ def analysis_of(what: str) -> Analysis:
         "distortion": Analysis(distortion, plots.plot_distortion, _distortion_text),
         "vignetting": Analysis(illumination, plots.plot_vignetting, _vignetting_text),
         "mtf": Analysis(mtf, plots.plot_mtf, _mtf_text),
+        "mtf-height": Analysis(mtf_over_height, plots.plot_mtf_over_height, _mtf_height_text),
         "seidel": Analysis(seidel, plots.plot_seidel, _seidel_text),
         "psf": Analysis(psf, plots.plot_psf, _psf_text),
     }[what]
@@ -216,6 +248,7 @@ def _wavelength_warnings(lens: Lens, wavelength_nm: Iterable[float]) -> list[str
 
 
 _ROWS = 6  # of tables over the field
+_WRAP = 90  # characters a line that the narrowest picture has room for
 _MTF_PER_MM = (10, 20, 30, 40, 50)
 
 
@@ -231,9 +264,16 @@ def _spots_text(data: dict[str, Any]) -> str:
     header = ("RMS µm", *_nanometres(data), "largest µm", "passed", "best focus mm", "RMS there")
 
     def cells(i: int) -> list[str]:
-        best = (_three(data[key][i]) for key in ("best_shift_mm", "best_rms_um"))
-        each = (_three(v) for v in data["rms_by_wavelength_um"][i])
-        return [number(data["rms_um"][i]), *each, number(data["geometric_um"][i]), _percent(data["passed"][i]), *best]
+        off = {key: spread[i] for key, spread in data["spread"].items()}
+        each = zip(data["rms_by_wavelength_um"][i], off["rms_by_wavelength_um"], strict=True)
+        return [
+            _three(data["rms_um"][i], off["rms_um"]),
+            *(_three(*pair) for pair in each),
+            _three(data["geometric_um"][i], 20 * off["geometric_um"]),
+            _percent(data["passed"][i], off["passed"]),
+            _fixed(data["best_shift_mm"][i], _digits(off["best_shift_mm"]) + 1),
+            _three(data["best_rms_um"][i], off["best_rms_um"]),
+        ]
 
     airy = f"Airy disc radius {number(data['airy_um'], 3)} µm at the working f/{number(data['working_f_number'], 3)}"
     head = f"Spots (radius from the centroid, all wavelengths; each by itself; {airy})"
@@ -270,7 +310,7 @@ def _curvature_text(data: dict[str, Any]) -> str:
 def _distortion_text(data: dict[str, Any]) -> str:
     names = list(data["error_percent"])
     head = (
-        f"Distortion (%; {_fixed(data['edge_percent'], 2)}% at the edge against {data['reference']}; "
+        f"Distortion (%; {_fixed(data['edge_percent'], 2)}% at {data['edge']}, against {data['reference']}; "
         f"closest is {data['best']}; {number(data['scale_mm'])} mm per radian on the axis)"
     )
     header = [n.partition(",")[0] for n in names]
@@ -281,20 +321,35 @@ def _vignetting_text(data: dict[str, Any]) -> str:
     keys = ("relative", "unvignetted", "passed", "cos4")
     header = ("illumination", "without rims", "rims pass", "cos^4")
     head = "Vignetting and relative illumination"
-    return _over_field(head, data, header, lambda i: [_percent(data[key][i]) for key in keys])
+    settled = data["spread"]
+
+    def cells(i: int) -> list[str]:
+        return [_percent(data[key][i], settled[key][i] if key in settled else 0.0) for key in keys]
+
+    return _over_field(head, data, header, cells)
 
 
 def _mtf_text(data: dict[str, Any]) -> str:
     at = [data["frequency_per_mm"].index(f) for f in _MTF_PER_MM if f in data["frequency_per_mm"]]
+    return _mtf_table("Geometric MTF", data, at, range(len(data["field_deg"])))
+
+
+def _mtf_height_text(data: dict[str, Any]) -> str:
+    return _mtf_table("Geometric MTF against image height", data, range(len(data["frequency_per_mm"])), None)
+
+
+def _mtf_table(name: str, data: dict[str, Any], at: Sequence[int], fields: Iterable[int] | None) -> str:
+    """The contrast at some of the frequencies, by their numbers."""
     header = [f"{data['frequency_per_mm'][k]:g}/mm {d}" for k in at for d in "TS"]
     limit = ", ".join(_fixed(data["diffraction_limit"][k]) for k in at)
     waves = ", ".join(f"{w:.0f}" for w in data["wavelength_nm"])
-    head = f"Geometric MTF ({waves} nm; T tangential, S sagittal; without diffraction, whose limit is {limit})"
+    head = f"{name} ({waves} nm; T tangential, S sagittal; without diffraction, whose limit is {limit})"
 
     def cells(i: int) -> list[str]:
-        return [_fixed(data[key][i][k]) for k in at for key in ("tangential", "sagittal")]
+        both = ("tangential", "sagittal")
+        return [_fixed(data[key][i][k], _digits(data["spread"][key][i][k])) for k in at for key in both]
 
-    return _over_field(head, data, header, cells, range(len(data["field_deg"])))
+    return _over_field(head, data, header, cells, fields)
 
 
 def _seidel_text(data: dict[str, Any]) -> str:
@@ -308,8 +363,13 @@ def _seidel_text(data: dict[str, Any]) -> str:
 
 
 def _psf_text(data: dict[str, Any]) -> str:
+    off = data["spread"]
     rows = [
-        (_angle(data, i), number(data["half_width_um"][i]), number(data["strehl"][i], 3))
+        (
+            _angle(data, i),
+            _three(data["half_width_um"][i], 20 * off["half_width_um"][i]),
+            _fixed(data["strehl"][i], _digits(off["strehl"][i])),
+        )
         for i in range(len(data["field_deg"]))
     ]
     head = f"Point spread ({data['wavelength_nm'][0]:.0f} nm; Strehl ratio '-' where aberrations rule out diffraction)"
@@ -344,12 +404,17 @@ def _some(count: int, rows: int = _ROWS) -> list[int]:
     return [round(k * (count - 1) / steps) for k in range(steps + 1)] if steps > 0 else [0] * count
 
 
+def _digits(spread: float) -> int:
+    """Decimal places, from 1 to 3, of which two samplings that differ by `spread` differ by one of the last at most."""
+    return 3 if spread <= 1e-3 else max(1, math.floor(-math.log10(spread)))
+
+
 def _fixed(value: float, places: int = 3) -> str:
     return "-" if math.isnan(value) else f"{value + 0.0:.{places}f}"
 
 
-def _percent(value: float) -> str:
-    return "-" if math.isnan(value) else f"{100 * value:.1f}%"
+def _percent(value: float, spread: float = 0.0) -> str:
+    return "-" if math.isnan(value) else f"{100 * value:.{max(_digits(spread) - 2, 0)}f}%"
 
 
 def _largest(values: Sequence[float]) -> float:
@@ -357,6 +422,10 @@ def _largest(values: Sequence[float]) -> float:
     return max(seen) if seen else math.nan
 
 
-def _three(value: float) -> str:
-    """Three digits; rounding errors of a zero are 0."""
-    return number(0.0 if abs(value) < 1e-6 else value, 3)
+def _three(value: float, spread: float = 0.0) -> str:
+    """Three digits, or fewer: two samplings that differ by `spread` of the value differ by one of the last at most."""
+    if not 1e-6 <= abs(value) < math.inf:
+        return number(0.0 if abs(value) < 1e-6 else value)  # rounding errors of a zero are 0
+    units = math.ceil(math.log10(max(spread * abs(value), 1e-300)))
+    digits = max(min(math.floor(math.log10(abs(value))) - units + 1, 3), 1)
+    return number(float(f"{value:.{digits}g}"))

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import re
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext, suppress
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from neurolens.base.bounds import F_NUMBER, FOCAL_MM
 from neurolens.base.errors import InputError, one_line
-from neurolens.base.files import library
+from neurolens.base.lensname import lens_id_of, resolve
 
 if TYPE_CHECKING:
     from neurolens.optics.apertures import Aperture
@@ -86,13 +85,12 @@ PUPILS = ("outline", "rear-rim", "exit-pupil", "wu", "pixel-disc", "pixel-ellips
 VIGNETTINGS = ("both", "natural", "optical", "none")
 CAMERAS_HELP = """\
 cameras:
-  LENS.toml                    the lens, traced exactly, every ray through every surface
+  LENS                         the lens of a file (.toml, .zmx, ..., see neurolens convert) or of a name in lenses/,
+                               traced exactly, every ray through every surface
   MODEL.onnx                   an exported model of a lens
-  fused:LENS.toml, fused:MODEL.onnx
-                               the same, compiled by the system's C compiler: many times faster
-  thick:LENS.toml              its principal planes and pupils: ideal imaging, no rims
-  thin:LENS.toml, pinhole:LENS.toml
-                               a thin lens, a point: the plane in focus has the lens's size
+  fused:LENS, fused:MODEL.onnx the same, compiled by the system's C compiler: many times faster
+  thick:LENS                   its principal planes and pupils: ideal imaging, no rims
+  thin:LENS, pinhole:LENS      a thin lens, a point: the plane in focus has the lens's size
   thin, pinhole                the same of any focal length (--efl)
   fisheye-equidistant, fisheye-equisolid, fisheye-stereographic, fisheye-orthographic
                                points with these projections; --field sets the picture's circle"""
@@ -100,11 +98,7 @@ cameras:
 
 def add_camera(parser: argparse.ArgumentParser) -> None:
     """Add --camera, --film-offset, --pupil and --vignetting."""
-    parser.add_argument(
-        "--camera", metavar="CAMERA", required=True, type=named_camera,
-        help="lens file (.toml, or a name in lenses/: traced exactly), model (.onnx), fused: before either, "
-        "thick:LENS.toml, thin, pinhole or fisheye-PROJECTION",
-    )  # fmt: skip
+    add_lens(parser, "--camera", models=True, cameras=True, required=True)
     parser.add_argument(
         "--film-offset", metavar="MM", type=between(-1e3, 1e3, "mm"), default=0.0,
         help="move the film away from the lens after focusing (default: 0)",
@@ -231,34 +225,34 @@ def add_json(parser: argparse.ArgumentParser, quiet: bool = False) -> None:
     )
 
 
-def lens_path(name: str | Path, command: str) -> Path:
-    """The lens file of an argument: a path, or a name of lenses/ in the project; raises InputError for another word."""
-    path = Path(name)
-    if path.exists() or path.suffix:  # the reader says what is wrong with a path
-        return path
-    folder = library() / "lenses"
-    if (folder / f"{path}.toml").is_file():
-        return folder / f"{path}.toml"
-    raise InputError(f"neurolens {command}", "LENS", str(name), f"a lens file, or a name in {folder}")
+def add_lens(
+    parser: argparse._ActionsContainer, name: str, also: str = "", *, models: bool = False, cameras: bool = False,
+    **options: Any,
+) -> None:  # fmt: skip
+    """Add an argument that names a lens, as `resolve`; its value is a path, or with `cameras` the text of a `Named`.
 
-
-def named_camera(text: str) -> str:
-    """Type of a camera's argument: lenses and models that ship by name, after `fused:` and the like, too, as files.
-
-    A TOML file that names a `camera` (that of `neurolens plan`) stands for it.
+    Args:
+        also: what the help adds. models, cameras: what is taken besides lenses. options: of `add_argument`.
     """
-    kind, colon, word = text.rpartition(":")
-    for file in (library() / "lenses" / f"{word}.toml", library() / "models" / f"{word}.onnx"):
-        if not set(word) & set("/\\") and file.is_file():
-            return f"{kind}{colon}{os.path.relpath(file) if file.is_relative_to(Path.cwd()) else file}"
-    if word.endswith(".toml") and Path(word).is_file():
-        from neurolens.base.tomlfile import read_toml
 
-        with suppress(InputError):  # said where the camera is made
-            if isinstance(named := read_toml(word).get("camera"), str) and named != "none":
-                own, own_colon, path = named.rpartition(":")
-                return f"{kind or own}{colon or own_colon}{os.path.normpath(Path(word).parent / path)}"
-    return text
+    def named(text: str) -> Any:
+        try:
+            found = resolve(text, models=models, cameras=cameras)
+            return str(found) if cameras else found.file
+        except InputError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    taken = ", model (.onnx), or name of either" if models else ", or its name in lenses/"
+    taken += ", fused: before it, thick:LENS, thin, pinhole or fisheye-PROJECTION" if cameras else ""
+    options = {"metavar": "CAMERA" if cameras else "LENS", "help": f"lens file of any format{taken}{also}"} | options
+    parser.add_argument(name, type=named, **options)
+
+
+def check_ids(files: Sequence[Path], command: str, option: str) -> None:
+    """Refuse lens files of one id, whose results would have one name; raises InputError."""
+    ids = [lens_id_of(file) for file in files]
+    if twice := sorted({name for name in ids if ids.count(name) > 1}):
+        raise InputError(command, option, twice, "files whose names differ")
 
 
 def add_glass(parser: argparse._ActionsContainer) -> None:
@@ -296,27 +290,3 @@ def check_suffix(path: Path, option: str, suffixes: tuple[str, ...]) -> None:
     if path.suffix.lower() not in suffixes:
         expected = suffixes[0] if len(suffixes) == 1 else f"one of {', '.join(suffixes)}"
         raise InputError(path, option, path.suffix or "(no suffix)", expected)
-
-
-def add_bare(parser: argparse.ArgumentParser) -> None:
-    """Add --bare, for `bare_of`."""
-    parser.add_argument(
-        "--bare", action="store_true",
-        help="of a lens file: leave out coatings and what glass absorbs, and say so; else such a lens is refused",
-    )  # fmt: skip
-
-
-def bare_of(args: argparse.Namespace, file: Path) -> str:
-    """The line on what --bare leaves out of a lens file, "" of nothing.
-
-    Raises:
-        InputError: --bare of a model.
-    """
-    if not args.bare:
-        return ""
-    if file.suffix != ".toml":
-        raise InputError(file, "--bare", "(a model)", "a lens file: a model has what its lens has")
-    from neurolens.cameras.exact import bare_line
-    from neurolens.optics.lensfile import read_lens
-
-    return bare_line(read_lens(file))

@@ -9,8 +9,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurolens.base.errors import InputError, NeurolensError, printable
-from neurolens.commands.arguments import QUIET_HELP, Parser, add_glass, check_run_folder, lens_path, whole
+from neurolens.base.errors import NeurolensError, printable
+from neurolens.commands.arguments import QUIET_HELP, Parser, add_glass, add_lens, check_ids, check_run_folder, whole
 from neurolens.commands.farm import Task, add_dask, files_of, spread
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def add_parser(subparsers: Any) -> None:
 
 def add_surrogate_arguments(parser: argparse.ArgumentParser, lenses: str) -> None:
     """Add the lenses, as many as argparse's `lenses` says, and the options."""
-    parser.add_argument("lenses", metavar="LENS", nargs=lenses, help="lens files, or names of lenses/")
+    add_lens(parser, "lenses", nargs=lenses)
     parser.add_argument(
         "--methods", metavar="METHOD", nargs="+", default=[],
         help="rows by name, or groups: paraxial, published, ours, ablations (default: the first three)",
@@ -78,9 +78,12 @@ def run_surrogates(args: argparse.Namespace) -> int:
     from neurolens.evaluate.records import plain, versions
 
     rows, settings, out = chosen_rows(args.methods), _settings(args), args.out
-    files = _lens_files(args.lenses)
+    files: list[Path] = args.lenses
+    check_ids(files, "neurolens bench surrogates", "LENS")
     check_run_folder(out, "neurolens bench surrogates", "--out")
     benches = [Bench(LensChoice(file), settings, out) for file in files]
+    for bench in benches:
+        bench.choice.read()  # a file that cannot be read ends the command, not each of its methods
     out.mkdir(parents=True, exist_ok=True)
     config = {
         "lenses": [str(file) for file in files],
@@ -143,19 +146,6 @@ def _settings(args: argparse.Namespace) -> BenchSettings:
         threads=args.threads,
         compile_exact=not args.quick,
     )
-
-
-def _lens_files(names: list[str]) -> list[Path]:
-    """Files of the arguments: paths, or names in lenses/ of the working folder or the project.
-
-    Raises:
-        InputError: no such file, or two of one name, whose records would be the same file.
-    """
-    files = [lens_path(name, "bench surrogates") for name in names]
-    twice = sorted({f.stem for f in files if sum(g.stem == f.stem for g in files) > 1})
-    if twice:
-        raise InputError("neurolens bench surrogates", "LENS", twice, "files whose names differ")
-    return files
 
 
 def _conditions(args: argparse.Namespace, settings: BenchSettings) -> str:

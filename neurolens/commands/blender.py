@@ -12,7 +12,7 @@ from typing import Any
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import check_writable
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import Parser, add_bare, add_json, bare_of, check_folder, check_suffix, whole
+from neurolens.commands.arguments import Parser, add_json, add_lens, check_folder, check_suffix, whole
 from neurolens.commands.output import answer
 
 _DESCRIPTION = """\
@@ -21,13 +21,13 @@ camera's data, where a lens is put on with one click and taken off with one."""
 _BUILD = """\
 Pack the extension with a folder of models: of each lens the best polynomial, the best network and,
 where its lens file is beside the models' folder in lenses/, the exact lens, every surface traced.
-A lens whose glass absorbs or is coated has no exact form; what cannot be a shader is left out and said.
+What cannot be a shader is left out and said.
 
 Finished lenses are kept: a build that was stopped goes on where it was, and a second one is quick.
 
 Install it in Blender: Edit > Preferences > Get Extensions > Install from Disk."""
 _ADD = """\
-Put a model (.onnx) or a lens file (.toml) into the extension: into the user folder of an installed
+Put a model (.onnx) or a lens file of any format into the extension: into the user folder of an installed
 one (the newest Blender of this machine that has it), or into a zip. A form of a lens replaces the one
 that was there. In Blender, "Read Lenses Again" in the panel shows it."""
 
@@ -55,9 +55,8 @@ def add_parser(subparsers: Any) -> None:
     add_json(build, quiet=True)
     build.set_defaults(run=run_build, kept="no zip was written; finished shaders are kept for the next run")
     add = actions.add_parser("add", help="put a lens into the extension", description=_ADD)
-    add.add_argument("file", metavar="FILE", type=Path, help="model (.onnx) or lens file (.toml)")
+    add_lens(add, "file", models=True)
     add.add_argument("--to", metavar="ZIP|DIR", type=Path, help="a packed extension, or a user folder of one")
-    add_bare(add)
     add.add_argument("--zoom", metavar="STATE", help="state of a zoom, by name or focal length in mm; range: a setting")
     add_json(add, quiet=True)
     add.set_defaults(run=run_add, kept="nothing was added")
@@ -72,7 +71,7 @@ def run_build(args: argparse.Namespace) -> int:
         raise InputError("neurolens blender build", "--models", str(args.models), "a folder of models that exists")
     from neurolens.blender.pack import write_pack
     from neurolens.commands.blender_lenses import forms_of, library, packed_of, stated_lens
-    from neurolens.optics.lensfile import read_lens
+    from neurolens.readers.any_format import read_any
 
     began, packed = time.perf_counter(), []
     lens_folder = args.models.parent / "lenses"
@@ -88,7 +87,7 @@ def run_build(args: argparse.Namespace) -> int:
         for models, lens_file in places:
             own = [f for f in (*models, lens_file) if f is not None and f in forms]
             if own:
-                lens = stated_lens(own[0], lens_folder) if lens_file is None else read_lens(lens_file)
+                lens = stated_lens(own[0], lens_folder) if lens_file is None else read_any(lens_file)
                 packed.append(packed_of(own, [forms[f] for f in own], lens=lens))
             report(len(packed) / len(places))
     for why in left.values():
@@ -117,10 +116,8 @@ def run_add(args: argparse.Namespace) -> int:
     if to is None:
         expected = "--to, a zip or a folder: no Blender of this machine has the extension installed"
         raise InputError("neurolens blender add", "--to", "(missing)", expected)
-    if not args.file.is_file():
-        raise InputError(args.file, "file", "(missing)", "a model (.onnx) or a lens file (.toml)")
     check_takes(to)
-    form = form_of(args.file, zoom=args.zoom, as_bare=bare_of(args, args.file), quiet=args.quiet)
+    form = form_of(args.file, zoom=args.zoom, quiet=args.quiet)
     lens = packed_of([args.file], [form], zoom=args.zoom)
     (add_to_zip if to.suffix == ".zip" else add_to_folder)(to, lens)
     data = {"lens": lens.lens_id, "to": str(to), "forms": [f.model or f.kind for f in lens.forms]}

@@ -20,6 +20,7 @@ import numpy as np
 from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import safe_name
+from neurolens.base.lensname import is_model, lens_id_of
 from neurolens.base.signals import end_at_once, held
 from neurolens.blender.pack import Form, PackedLens
 from neurolens.commands.blender_kept import kept, kept_form
@@ -35,28 +36,25 @@ _RADII, _NEAR = (0.0, 0.35, 0.6, 0.8, 0.97), 20.0  # of the picture's radius; fo
 Forms = dict[Path, Form]
 
 
-def form_of(file: Path, *, zoom: str | None = None, as_bare: str = "", quiet: bool = False) -> Form:
-    """The shader of a model (.onnx) or of a lens file (.toml), with its facts; kept between runs. See `shader_of`.
+def form_of(file: Path, *, zoom: str | None = None, quiet: bool = False) -> Form:
+    """The shader of a model (.onnx) or of a lens file, with its facts; kept between runs. See `shader_of`.
 
     Raises:
-        InputError: neither; a lens that cannot be a shader. ModelError: a broken model.
+        InputError: a lens that cannot be a shader. ModelError: a broken model.
     """
-    if file.suffix not in (".onnx", ".toml"):
-        raise InputError(file, "file", file.suffix or "(no suffix)", "a model (.onnx) or a lens file (.toml)")
-    return kept_form(file, zoom, as_bare, make=lambda: _made_form(file, zoom, as_bare, quiet))
+    return kept_form(file, zoom, make=lambda: _made_form(file, zoom, quiet))
 
 
-def _made_form(file: Path, zoom: str | None, as_bare: str, quiet: bool) -> Form:
-    shader = shader_of(file, zoom=zoom, as_bare=as_bare, quiet=quiet)
+def _made_form(file: Path, zoom: str | None, quiet: bool) -> Form:
+    shader = shader_of(file, zoom=zoom, quiet=quiet)
     kind, model, error, poor = "exact", "", None, []
-    if file.suffix == ".onnx":
+    if is_model(file):
         card = _card(file)
         model, error = str(card["fit"]["method"]), float(card["errors"]["rms_um"])
         kind = "network" if _family(card).startswith(_NETWORK) else "polynomial"
         poor = list(card["errors"].get("poor") or ())
     state = None if zoom == RANGE else zoom
-    notes = [*shader.notes, *filter(None, [as_bare.removesuffix(".")])]
-    notes += [] if state is None else [f"The zoom stands at {state}"]
+    notes = [*shader.notes] if state is None else [*shader.notes, f"The zoom stands at {state}"]
     if (squeeze := _squeeze(file, state)) != 1.0:
         axis, aspect = ("Y", squeeze) if squeeze > 1 else ("X", 1 / squeeze)
         side = "across" if squeeze > 1 else "in height"
@@ -68,26 +66,26 @@ def _made_form(file: Path, zoom: str | None, as_bare: str, quiet: bool) -> Form:
 
 def _squeeze(file: Path, zoom: str | None) -> float:
     """See `cameras.lens_state`."""
-    if file.suffix == ".toml":
-        from neurolens.optics.lensfile import read_lens
+    if not is_model(file):
         from neurolens.optics.paraxial import first_order
+        from neurolens.readers.any_format import read_any
 
-        lens = read_lens(file).at(zoom=zoom)
+        lens = read_any(file).at(zoom=zoom)
         across = first_order(lens, meridian="x") if lens.anamorphic else first_order(lens)
         return abs(float(first_order(lens).efl_mm / across.efl_mm))
     from neurolens.cameras.build import Shot, make_camera
 
-    return float(make_camera(str(file), Shot((1.0, 1.0), math.inf, zoom=zoom)).settings["lens_state"]["squeeze"] or 1.0)
+    return float(make_camera(file, Shot((1.0, 1.0), math.inf, zoom=zoom)).settings["lens_state"]["squeeze"] or 1.0)
 
 
 def forms_of(
     files: Sequence[Path], jobs: int, report: Callable[[float], object],
-    given: Mapping[Path, tuple[str | None, str]] = MappingProxyType({}),
+    zooms: Mapping[Path, str | None] = MappingProxyType({}),
 ) -> tuple[Forms, dict[Path, str]]:  # fmt: skip
     """Forms of many files, `jobs` at a time in processes of their own, and why others have none.
 
     Args:
-        given: zoom and as_bare of `form_of`, of files that have any.
+        zooms: `zoom` of `form_of`, of files that have one.
 
     Raises:
         NeurolensError: a process ended by itself, as where memory is short.
@@ -104,11 +102,11 @@ def forms_of(
 
     if jobs == 1:
         for file in files:
-            keep(file, _form_or_why(file, *given.get(file, ())))
+            keep(file, _form_or_why(file, zooms.get(file)))
         return found, left
     with ProcessPoolExecutor(jobs, CONTEXT, _begin_job) as pool:
         with held():  # a process just forked would raise what this one raises, and run on as a second command
-            waiting = {pool.submit(_form_or_why, file, *given.get(file, ())): file for file in files}
+            waiting = {pool.submit(_form_or_why, file, zooms.get(file)): file for file in files}
         try:
             for done in as_completed(waiting):
                 keep(waiting[done], done.result())
@@ -133,9 +131,9 @@ def _begin_job() -> None:
         torch.set_num_threads(1)
 
 
-def _form_or_why(file: Path, zoom: str | None = None, as_bare: str = "") -> Form | str:
+def _form_or_why(file: Path, zoom: str | None) -> Form | str:
     try:
-        return form_of(file, zoom=zoom, as_bare=as_bare, quiet=True)
+        return form_of(file, zoom=zoom, quiet=True)
     except NeurolensError as error:
         return str(error)
 
@@ -151,16 +149,16 @@ def packed_of(
     from neurolens.optics.paraxial import first_order
 
     first, ranged = files[0], zoom == RANGE
-    if first.suffix == ".onnx":
+    if is_model(first):
         told = _card(first)
         card, ranged = told["lens"], zoom in (None, RANGE) and "zoom" in _axes(told)
         name, efl, f_number = card["name"], card["efl_mm"], card["f_number"]
         source = str(card.get("source") or "") if lens is None else lens.source  # which may be told better since
         name = f"{name}, any zoom" if ranged else name
     else:
-        from neurolens.optics.lensfile import read_lens
+        from neurolens.readers.any_format import read_any
 
-        lens = read_lens(first).at(zoom=None if zoom == RANGE else zoom)
+        lens = read_any(first).at(zoom=None if zoom == RANGE else zoom)
         data = first_order(lens)
         name, efl, f_number, source = lens.name, data.efl_mm, data.f_number, lens.source
     picture = None if lens is None else thumbnail(lens)
@@ -220,8 +218,8 @@ def field_table(lens: Lens, radius_mm: float) -> dict[str, Any] | None:
 
 
 def key_of(file: Path) -> str:
-    """Name of a lens in the menu's files: of `NAME.ols-64.onnx` and `NAME.toml`, NAME."""
-    return file.name.split(".")[0]
+    """Name of a lens in the menu's files: of `NAME.ols-64.onnx` and of a lens file NAME.toml, NAME."""
+    return file.name.split(".")[0] if is_model(file) else lens_id_of(file)
 
 
 def library(folder: Path, lenses: Path, chosen: Sequence[str]) -> Iterator[tuple[list[Path], Path | None]]:

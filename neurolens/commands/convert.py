@@ -25,9 +25,9 @@ Read a lens file of another program and write it as a lens file of neurolens (.t
 Formats: Zemax (.zmx), CODE V (.seq), OSLO (.len, the simple ones), texts of the Optical Bench (.txt), FlareSim
 (.lens), the TOML of the Blender add-on Physical Camera, plain tables of four
 columns as in pbrt and appleseed (.dat, .txt), and JSON (our own, DeepLens, ISET). The content decides.
-Unsupported content is an error that names the line; what was left out, computed, assumed or
-doubtful is printed as a warning. Rims that a file does not give, and the check of the lens against its own
-statements, are traced: they need the extra "train" (torch)."""
+What changes rays and is not supported is an error that names the line; what was left out, computed,
+assumed or doubtful is printed as a warning and kept in the notes of the new file. Rims that a file does
+not give, and the check of the lens against its own statements, are traced: they need the extra "train" (torch)."""
 _EPILOG = """\
 examples:
   neurolens convert double_gauss.zmx -o lenses/double_gauss.toml
@@ -49,6 +49,10 @@ def add_parser(subparsers: Any) -> None:
     group.add_argument(
         "--f-number", metavar="N", type=positive("an f-number"),
         help="nominal f-number of a file without one (default: as the stop's diameter gives it)",
+    )  # fmt: skip
+    group.add_argument(
+        "--stop", metavar="N",
+        help="number in the file of the surface that is the stop (default: the one marked, else the limiting rim)",
     )  # fmt: skip
     group.add_argument("--units", choices=("mm", "cm", "in", "m"), help="unit of lengths (default: the file's own, mm)")
     group.add_argument(
@@ -75,14 +79,17 @@ def run(args: argparse.Namespace) -> int:
 
     given = Given(
         name=args.name, source=args.source, f_number=args.f_number, units=args.units, half_field_deg=args.half_field,
-        gap_before=args.gap_before, semi_diameters=args.semi_diameters,
+        stop=args.stop, gap_before=args.gap_before, semi_diameters=args.semi_diameters,
     )  # fmt: skip
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", NeurolensWarning)
         lens = read_any(args.file, given)
-        write_checked(lens, args.output)
     told = [str(w.message).removeprefix(f"{args.file}: ") for w in caught if issubclass(w.category, NeurolensWarning)]
-    notes = list(dict.fromkeys([*told, *_doubts(lens)]))
+    read = list(dict.fromkeys(told))
+    if read:  # the file keeps what its source had besides, and what was assumed
+        lens = replace(lens, notes="\n".join(filter(None, (lens.notes, "As converted by neurolens:", *read))))
+    write_checked(lens, args.output)
+    notes = [*read, *_doubts(lens)]
     data = {"file": str(args.file), "output": str(args.output), **_summary(lens, notes)}
     return answer(args, data, lambda: _text(data))
 

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, whole
+from neurolens.commands.arguments import add_glass, add_json, add_lens, whole
 from neurolens.commands.output import answer, number, table
+from neurolens.modelfile import AVERAGED, transmittance_of
 
 if TYPE_CHECKING:
     from neurolens.evaluate.check import Promise
@@ -51,9 +52,7 @@ def add_parser(subparsers: Any) -> None:
         "evaluate", help="measure a model against the promises of its card", description=_DESCRIPTION, epilog=_EPILOG
     )
     parser.add_argument("model", metavar="MODEL", type=Path, help="exported model (.onnx)")
-    parser.add_argument(
-        "--lens", metavar="FILE", type=Path, help="its lens file (default: found by the card's lens id)"
-    )
+    add_lens(parser, "--lens", " (default: found by the card's lens id)")
     parser.add_argument(
         "--rays", metavar="N", type=whole(1000, 1_000_000), default=30_000,
         help="rays that the lens passes, eight times as many if a few bad ones dominate an error; "
@@ -90,6 +89,7 @@ def run(args: argparse.Namespace) -> int:
         "model": str(args.model),
         "lens": {"id": model.card["lens"]["id"], "name": lens.name, "file": lens.path},
         "method": model.card["fit"]["method"],
+        "transmittance": transmittance_of(model.card),
         **figures,
         "ns_per_ray": timing,
         "promises": [{**asdict(p), "holds": p.holds} for p in promises],
@@ -122,4 +122,6 @@ def _text(data: dict[str, Any], promises: list[Promise]) -> str:
         f"batches of {timing['batch']}",
     ]
     parts += [f"Poor, as the card says: {', '.join(data['poor'])}."] if data["poor"] else []
+    if data["transmittance"] == AVERAGED:
+        parts.append("Transmittance: its fit averaged over polarisation at every surface, the lens here does not.")
     return "\n\n".join([*parts, verdict])

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text, check_writable
-from neurolens.commands.arguments import add_bare, add_json, bare_of, named_camera, positive
+from neurolens.base.lensname import FUSED, is_model
+from neurolens.commands.arguments import add_json, add_lens, positive
 from neurolens.commands.output import answer
 from neurolens.commands.render import film_size
 
@@ -47,7 +48,7 @@ examples:
   neurolens export runs/quickstart --to c -o ray.h --only ray
   neurolens export lenses/ZOOM.toml --to c -o zoom.h --zoom range         # gaps as the focal length asks
   neurolens export models/ZOOM-range.states-64.onnx --to c -o zoom.h      # any focal length: NAME_at(zoom_mm)
-  neurolens export lenses/NAME.toml --to c -o exact.h                     # every surface; no coatings
+  neurolens export lenses/NAME.toml --to c -o exact.h                     # every surface
   neurolens export models/NAME.onnx --to c -o cam.h --camera --focus 2 --f-number 2.8 --derivatives
   neurolens export models/NAME.onnx --to osl -o lens.osl                  # for Blender; lenses/NAME.toml: exact
   neurolens export models/NAME.onnx --to onnx -o laser.onnx --fix wavelengths=633
@@ -65,9 +66,9 @@ def add_parser(subparsers: Any) -> None:
         "export", help="source code (C, GLSL, OSL) of a model; fix what a scene fixes", description=_DESCRIPTION,
         epilog=_EPILOG,
     )  # fmt: skip
-    parser.add_argument(
-        "model", metavar="MODEL", type=lambda text: Path(named_camera(text).removeprefix("fused:")),
-        help="exported model (.onnx), or a run folder with one model; of C, GLSL, OSL also a lens file or name",
+    add_lens(
+        parser, "model", "; a run folder with one model, a file of neurolens plan; of --to onnx models alone",
+        models=True, cameras=True, metavar="MODEL",
     )  # fmt: skip
     parser.add_argument("--to", choices=("c", "glsl", "osl", "onnx"), required=True, help="form to write")
     parser.add_argument("-o", "--out", metavar="FILE", type=Path, required=True, help="file to write")
@@ -87,7 +88,6 @@ def add_parser(subparsers: Any) -> None:
         "--inverse", action="store_true",
         help="of ONNX: the inverse maps too (film and stop point to ray; scene ray to film), fitted and checked",
     )  # fmt: skip
-    add_bare(parser)
     group = parser.add_argument_group("camera", "what a whole camera is set to")
     group.add_argument("--camera", action="store_true", help="the whole camera, of C and GLSL")
     group.add_argument(
@@ -112,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.cameras.source import model_extras
     from neurolens.surrogates.source import checked_name
 
-    file = model_file(args.model)
+    file = model_file(Path(args.model.removeprefix(FUSED)))
     parts = _parts(args.only)
     given = _given(args.fix)
     if args.to == "onnx" and (args.name is not None or set(parts) != set(_PARTS)):
@@ -123,20 +123,17 @@ def run(args: argparse.Namespace) -> int:
         checked_name(args.to, "", args.name)
     if args.to == "osl":
         return _write_osl(file, args, bool(given) or set(parts) != set(_PARTS))
-    exact = file.suffix == ".toml"
+    exact = not is_model(file)
     if args.camera or exact:
         if args.to == "onnx" or given or set(parts) != set(_PARTS):
             what = "a camera" if args.camera else "a lens file"
             raise InputError("neurolens export", str(file), f"({what})", "--to c or glsl, without --fix and --only")
         check_writable(args.out)
         if args.camera:
-            if args.bare:
-                raise InputError("neurolens export", "--bare", "(with --camera)", "a lens alone, or --to osl")
             return _answer(args, _about(_write_camera(file, args)))
         from neurolens.commands.export_lens import write_lens
 
-        bare, name, zoom = bare_of(args, file), args.name, args.zoom
-        written = write_lens(file, args.out, args.to, name=name, zoom=zoom, quiet=args.json, as_bare=bare)
+        written = write_lens(file, args.out, args.to, name=args.name, zoom=args.zoom, quiet=args.json)
         return _answer(args, _about(written))
     check_writable(args.out)
     from neurolens.cameras.onnxlens import load_model
@@ -183,7 +180,7 @@ def _write_osl(file: Path, args: argparse.Namespace, partly: bool) -> int:
             "neurolens export", "--fix, --only, --camera, --focus, --f-number", "(with --to osl)", expected
         )
     check_writable(args.out)
-    shader = shader_of(file, zoom=args.zoom, name=args.name, quiet=args.json, as_bare=bare_of(args, file))
+    shader = shader_of(file, zoom=args.zoom, name=args.name, quiet=args.json)
     atomic_write_text(args.out, shader.text)
     about = {
         "function": shader.name, "inputs": shader.parameters, "operations_per_ray": shader.operations,

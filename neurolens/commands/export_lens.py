@@ -14,7 +14,6 @@ from neurolens import __version__
 from neurolens.base import status as st
 from neurolens.base.bounds import RANGE
 from neurolens.base.progress import Progress
-from neurolens.cameras.exact import check_bare
 from neurolens.cameras.focus_function import Array, Focusing
 from neurolens.cameras.source import film_extras, followed, state_ranges
 from neurolens.graph.c import Extras
@@ -23,11 +22,11 @@ from neurolens.graph.scalars import lower
 from neurolens.modelfile.axes import Axis, weights
 from neurolens.modelfile.stategraph import mixture_of
 from neurolens.optics.focusing import best_focus_of_stops_mm, focus_states
-from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import film_z_mm, first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm, pupil_bounds, pupil_plane_z_mm
-from neurolens.optics.tracegraph import exact_graph
+from neurolens.optics.tracegraph import TRANSMITTANCE, exact_graph
+from neurolens.readers.any_format import read_any
 from neurolens.surrogates.source import Written, checked_name, lines_of, write_program
 from neurolens.surrogates.states import gap_axis, zoom_axis
 
@@ -38,16 +37,14 @@ _CHECKED = (0.12, 0.42, 0.83)  # of the range: where the film's position is meas
 
 
 def write_lens(
-    file: Path, out: Path, to: str, *, name: str | None = None, zoom: str | None = None, quiet: bool = False,
-    as_bare: str = "",
+    file: Path, out: Path, to: str, *, name: str | None = None, zoom: str | None = None, quiet: bool = False
 ) -> Written:  # fmt: skip
     """The lens as a function of film and pupil point, wavelength, film position, stop radius and, of a range, zoom.
 
     Args:
         to: "c" or "glsl". name: of the function, None takes the lens's id. zoom: a state of `Lens.at`, or "range".
-        as_bare: a line for the comment, of a lens whose coatings and absorption are left out; else it is refused.
     """
-    lens = read_lens(file)
+    lens = read_any(file)
     name = checked_name(to, lens.lens_id, name)
     axes: tuple[Axis, ...] = ()
     lines = []
@@ -64,9 +61,6 @@ def write_lens(
             lines.append("One zoom position: its gaps are numbers in the code (--zoom range makes it an argument).")
     if focus_states(lens):
         lines.append("Groups stand at infinity focus: the film focuses, for how groups move is no graph.")
-    lines += [as_bare] * bool(as_bare)
-    for node in nodes if not as_bare else ():
-        check_bare(node, "a model of the lens has them; --bare leaves them out")
     planes = pupil_planes_mm(nodes, axes)
     program = lens_program(nodes, axes, planes)
     constants, functions = followed(axes, numbers(nodes, planes))
@@ -83,7 +77,8 @@ def _span(axis: Axis) -> str:
 
 def _head(lens: Lens, plane: str) -> list[str]:
     return [
-        f"{lens.name}: every surface traced, written by neurolens {__version__}. Surfaces are bare.",
+        f"{lens.name}: every surface traced, written by neurolens {__version__}.",
+        TRANSMITTANCE,
         f"Lens data: {lens.source} (sha256 {str(lens.sha256)[:16]}).",
         "Lens frame: mm, front vertex at z = 0, film at z > 0. Rays go from the film point through the pupil point on "
         f"the plane {plane}; the ray that comes out is a point on the front surface and a unit direction.",

@@ -22,6 +22,7 @@ from typing import Any
 from neurolens.base.engine import Failed, on_dask
 from neurolens.base.errors import NeurolensError
 from neurolens.base.files import TemporaryFolder, atomic_path, place_inside
+from neurolens.base.lensname import IDEAL, split_kind
 from neurolens.commands.arguments import more_glasses
 
 DASK_HELP = (
@@ -150,7 +151,7 @@ def _placed(key: str, value: Any, root: Path = Path("/")) -> Any:
         return [_placed(key, each, root) for each in value]
     if isinstance(value, Path):
         return root / os.path.abspath(value).lstrip("/")
-    if key == "camera" and "." in value:
-        kind, colon, file = value.rpartition(":")
-        return f"{kind}{colon}{root / os.path.abspath(file).lstrip('/')}"
+    if key == "camera" and value not in IDEAL:
+        kind, file = split_kind(value)
+        return f"{kind}{root / os.path.abspath(file).lstrip('/')}"
     return value

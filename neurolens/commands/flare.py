@@ -15,10 +15,10 @@ from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import (
     add_json,
+    add_lens,
     add_lens_state,
     check_folder,
     check_suffix,
-    lens_path,
     state_of,
 )
 from neurolens.commands.flare_fit import add_fit, check_fit, fitted, run_fit, stopped
@@ -80,9 +80,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "flare", help="ghosts of lights: a table, and a picture with layers", description=_DESCRIPTION, epilog=_EPILOG
     )
-    parser.add_argument(
-        "file", metavar="LENS", type=Path, help="lens file, the name of one of lenses/, or fitted ghosts"
-    )
+    add_lens(parser, "file", "; a model is one of fitted ghosts", models=True)
     add_lights(parser)
     parser.add_argument(
         "--coating", metavar="NAME",
@@ -110,7 +108,7 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.commands.flare_lights import Sources
     from neurolens.flare.ghosts import ghost_pairs
     from neurolens.flare.layers import kept_beside
-    from neurolens.optics.lensfile import read_lens
+    from neurolens.readers.any_format import read_any
 
     complete(args)
     _check(args)
@@ -119,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
         progress.note(f"preview: {args.width} pixels wide, {args.wavelengths} wavelengths, cells of {args.cell_px:g}")
     states = list(_states(args))
     model = fitted(args, states)
-    tabled = read_lens(lens_path(args.file, "flare")) if model is None else model.lens
+    tabled = read_any(args.file) if model is None else model.lens
     if args.fit is not None:
         return run_fit(args, None if model else _lens(states[0], tabled), model)
     shots = _Shots(tabled, Sources(args, () if args.frames is None else states), progress, model)

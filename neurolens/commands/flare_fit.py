@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError
+from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import aperture_of, between, check_suffix, given_options
 from neurolens.commands.output import answer, number, table
@@ -56,7 +57,7 @@ def fitted(args: argparse.Namespace, states: Sequence[argparse.Namespace]) -> Gh
     Raises:
         InputError: options that would change what the model was fitted for. ModelError: as `read_ghosts`.
     """
-    if args.file.suffix.lower() != ".onnx":
+    if not is_model(args.file):
         return None
     from neurolens.flare.ghostfile import read_ghosts
 

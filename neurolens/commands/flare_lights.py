@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError
+from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import aperture_of, lens_path, positive, whole
+from neurolens.commands.arguments import aperture_of, positive, whole
 from neurolens.commands.render_files import warn
 
 if TYPE_CHECKING:
@@ -118,7 +119,7 @@ class Sources:
         from neurolens.cameras.field import field_of
 
         state = args.focus, args.f_number, args.zoom
-        if state not in self._fields and args.file.suffix.lower() == ".onnx":  # fitted ghosts, with their film
+        if state not in self._fields and is_model(args.file):  # fitted ghosts, with their film
             moved = (lens.film_z_mm or 0.0) - (lens.at(focus_m=math.inf).film_z_mm or 0.0)
             camera = ExactCamera(lens, film_mm=args.film, focus_m=math.inf, film_offset_mm=moved, progress=progress)
             self._fields[state] = field_of(camera, args.focus, "equidistant")
@@ -127,7 +128,7 @@ class Sources:
                 film_mm=args.film, focus_m=args.focus, f_number=args.f_number, efl_mm=args.efl, zoom=args.zoom,
                 field_deg=args.field, focus=args.focusing, aperture=aperture_of(args),
             )  # fmt: skip
-            exact = make_camera(str(lens_path(args.file, "flare")), shot, progress)
+            exact = make_camera(args.file, shot, progress)
             self._fields[state] = field_of(exact, args.focus, "equidistant")
         return self._fields[state]
 

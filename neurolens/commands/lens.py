@@ -1,4 +1,4 @@
-"""`neurolens lens FILE`: what a lens file holds, computed and drawn; a folder as a table; rims by a rule."""
+"""`neurolens lens FILE`: what a lens file holds, computed and drawn; many files as a table; rims by a rule."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensWarning, one_line
 from neurolens.base.files import library
+from neurolens.base.lensname import resolve
 from neurolens.commands.arguments import (
     add_json,
     add_lens_state,
@@ -20,11 +21,9 @@ from neurolens.commands.arguments import (
     check_suffix,
     focus_of,
     given_options,
-    lens_path,
     state_of,
 )
 from neurolens.commands.output import answer, number, table
-from neurolens.optics.film_plane import LINE_D_NM
 
 if TYPE_CHECKING:
     from neurolens.optics.prescription import Lens
@@ -34,8 +33,9 @@ if TYPE_CHECKING:
 _DESCRIPTION = """\
 Read a lens file strictly and print what follows from it: focal length, pupils, film plane,
 image circle, how much of the light gets through and what stops the rest, and anything
-doubtful about it. "neurolens lens list" checks a whole folder and prints a table;
---derive-rims computes the rim diameters that a patent does not print.
+doubtful about it. Several files, or folders (of all formats that "neurolens convert" reads), are
+a table with one line for each lens, in milliseconds a lens; after the word "list" each of them is
+checked, too. --derive-rims computes the rim diameters that a patent does not print.
 
 Lengths are in mm along the axis, z = 0 at the front vertex, light travelling to +z; angles
 are from the axis in degrees; first-order data is for the d line (587.56 nm). Needs the extra
@@ -45,6 +45,7 @@ examples:
   neurolens lens laikin_double_gauss_50
   neurolens lens lenses/brendel_tessar_100.toml --efl 50 --focus 1.5 --layout tessar.png
   neurolens lens lenses/ogawa_zoom_70_200.toml --zoom 135mm --json
+  neurolens lens downloads/ --json
   neurolens lens list --layouts lenses.png
   neurolens lens lenses/brendel_tessar_100.toml --derive-rims -o tessar.toml"""
 _LAYOUT_SUFFIXES = (".png", ".pdf", ".svg")
@@ -55,17 +56,19 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "lens", help="first-order data, field and layout of a lens file", description=_DESCRIPTION, epilog=_EPILOG
     )
-    parser.add_argument("file", metavar="FILE", type=Path, help='lens file, name of lenses/, or the word "list"')
     parser.add_argument(
-        "folder", metavar="FOLDER", type=Path, nargs="?", help='of lens files, after "list" (default: those that ship)'
-    )
+        "files", metavar="FILE", type=Path, nargs="+",
+        help='lens files, names of lenses/, or folders; after the word "list" they are checked (default: those that '
+        "ship)",
+    )  # fmt: skip
+    parser.intermixed = True
     add_lens_state(parser, efl="as tabled", f_number="the tabled stop")
     parser.add_argument(
         "--layout", metavar="OUT.png", type=Path,
         help="draw the lens with rays from three field points: axis, 70%% and edge of the film (.png, .pdf, .svg)",
     )  # fmt: skip
     parser.add_argument(
-        "--layouts", metavar="OUT.png", type=Path, help='after "list": draw all lenses in section on one sheet'
+        "--layouts", metavar="OUT.png", type=Path, help="of several files: draw all lenses in section on one sheet"
     )
     _add_rims(parser)
     parser.add_argument(
@@ -76,16 +79,15 @@ def add_parser(subparsers: Any) -> None:
     parser.set_defaults(run=run, kept="only a finished --layout picture is written")
 
 
-def _check_mode(args: argparse.Namespace, listing: bool) -> None:
-    alone = not listing and not args.derive_rims
+def _check_mode(args: argparse.Namespace, several: bool) -> None:
+    alone = not several and not args.derive_rims
     kinds = {
-        "--layouts": (args.layouts is not None, listing, 'with "list"'),
-        "FOLDER": (args.folder is not None, listing, 'after "list"'),
+        "--layouts": (args.layouts is not None, several, 'with "list", a folder or several files'),
         "--vignetting": (args.vignetting is not None, args.derive_rims, "with --derive-rims"),
         "--breathing": (args.breathing is not None, alone, "with one lens file alone"),
         "-o": (args.output is not None, args.derive_rims, "with --derive-rims"),
         "--half-field": (args.half_field is not None, args.derive_rims, "with --derive-rims"),
-        "--derive-rims": (args.derive_rims, not listing, "with one lens file"),
+        "--derive-rims": (args.derive_rims, not several, "with one lens file"),
         "--layout": (args.layout is not None, alone, "with one lens file alone"),
         **dict.fromkeys(given_options(args), (True, alone, "with one lens file alone")),
     }
@@ -94,13 +96,21 @@ def _check_mode(args: argparse.Namespace, listing: bool) -> None:
             raise InputError("neurolens lens", option, "(given)", f"this option only {where}")
 
 
+def _file(name: Path) -> Path:
+    """The lens file that an argument names."""
+    file = resolve(name, models=False, cameras=False).file
+    assert file is not None  # only cameras without a lens have none
+    return file
+
+
 def run(args: argparse.Namespace) -> int:
-    """Print and draw the data of a lens, or the table of a folder, or derived rims."""
-    listing = str(args.file) == "list"
-    _check_mode(args, listing)
-    if listing:
-        return _run_list(args)
-    args.file = lens_path(args.file, "lens")
+    """Print and draw the data of a lens, or the table of several, or derived rims."""
+    checked = str(args.files[0]) == "list"
+    several = checked or len(args.files) > 1 or args.files[0].is_dir()
+    _check_mode(args, several)
+    if several:
+        return _run_list(args, args.files[1:] or [library() / "lenses"] if checked else args.files, checked)
+    args.file = _file(args.files[0])
     if args.derive_rims:
         return _run_rims(args)
     for option, path in (("--layout", args.layout), ("--breathing", args.breathing)):
@@ -108,13 +118,13 @@ def run(args: argparse.Namespace) -> int:
             check_suffix(path, option, _LAYOUT_SUFFIXES)
             check_folder(path, option)
     from neurolens.evaluate.describe import file_doubts, glass_table, layout_profile, lens_facts
-    from neurolens.optics.lensfile import read_lens
+    from neurolens.readers.any_format import read_any
     from neurolens.surrogates.domain import domain_of
 
     began = time.perf_counter()
     with warnings.catch_warnings(record=True) as caught:  # part of the answer
         warnings.simplefilter("always", NeurolensWarning)
-        tabled = read_lens(args.file)
+        tabled = read_any(args.file)
     lens = state_of(args, tabled)
     focus, film_z = focus_of(args, tabled, lens), float(lens.film_z_mm or 0.0)
     domain = domain_of(lens, focus_m=(focus, focus), film_z_mm=(film_z, film_z))
@@ -172,6 +182,8 @@ def _near(configuration: dict[str, Any]) -> bool:
 
 
 def _first_order(data: dict[str, Any]) -> str:
+    from neurolens.optics.film_plane import LINE_D_NM
+
     focus = "infinity" if math.isinf(data["focus_m"]) else f"{data['focus_m']:g} m"
     across = data["efl_x_mm"] is not None
     planes = f"{_mm(data['front_principal_z_mm'])}, {_mm(data['rear_principal_z_mm'])}"
@@ -262,15 +274,19 @@ def _across_words(axis: str, radius_mm: float, conic: float | None) -> str:
     return f"{'toroid' if conic is None else f'biconic K {conic:.4g}'}, {radius_mm:.4f} mm along {other}"
 
 
-_LIST_HEADER = ("lens", "name", "EFL mm", "f/", "half field", "refr.", "asph.", "cyl.", "states", "rims", "verdict")
+_LIST_HEADER = (
+    *("lens", "name", "EFL mm", "back mm", "f/", "half field", "film mm", "refr.", "asph.", "cyl.", "states", "rims"),
+    "verdict",
+)
 
 
-def _run_list(args: argparse.Namespace) -> int:
+def _run_list(args: argparse.Namespace, paths: list[Path], checked: bool) -> int:
     from neurolens.evaluate.describe import lens_files, library_row, section
 
     if args.layouts is not None:
         check_folder(args.layouts, "--layouts")
-    rows = [library_row(file) for file in lens_files(args.folder or library() / "lenses")]
+    files = (lens_files(path) if path.is_dir() else [_file(path)] for path in paths)
+    rows = [library_row(file, checked) for folder in files for file in folder]
     if args.layouts is not None:
         from neurolens.evaluate.figures import sheet
 
@@ -283,18 +299,19 @@ def _run_list(args: argparse.Namespace) -> int:
 def _list_text(rows: list[dict[str, Any]]) -> str:
     text = table(_LIST_HEADER, [_cells(row) for row in rows], left=2)
     doubtful = [row for row in rows if row["doubts"]]
-    found = f"\n\n{len(rows)} lenses, {len(doubtful)} of them doubtful"
+    found = f"\n\n{len(rows)} lenses, {len(doubtful)} of them doubtful or unreadable"
     lines = [f"  {row['lens']}: {doubt}" for row in doubtful for doubt in row["doubts"]]
     return text + found + (":\n" + "\n".join(lines) if lines else "")
 
 
 def _cells(row: dict[str, Any]) -> list[str]:
     if "name" not in row:
-        return [row["lens"], *["-"] * 9, row["verdict"]]
+        return [row["lens"], *["-"] * (len(_LIST_HEADER) - 2), row["verdict"]]
     efl = number(row["efl_mm"]) + ("" if row["efl_x_mm"] is None else f" / {number(row['efl_x_mm'], 3)}")
     field = "-" if row["half_field_deg"] is None else f"{row['half_field_deg']:.4g}°"
     counts = [str(row[key] or "-") for key in ("refractions", "aspheres", "cylinders", "states")]
-    return [row["lens"], row["name"], efl, number(row["f_number"], 3), field, *counts, row["rims"], row["verdict"]]
+    figures = [efl, number(row["back_focus_mm"]), number(row["f_number"], 3), field, number(row["image_radius_mm"])]
+    return [row["lens"], one_line(row["name"], 40), *figures, *counts, row["rims"], row["verdict"]]
 
 
 def _add_rims(parser: argparse.ArgumentParser) -> None:

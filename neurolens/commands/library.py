@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import atomic_path, atomic_write_text, library, safe_name, write_json
+from neurolens.base.lensname import lens_id_of
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_json, lens_path
+from neurolens.commands.arguments import add_json, add_lens, check_run_folder
 from neurolens.commands.output import answer
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "library", help="pages of lenses: pictures, figures, models", description=_DESCRIPTION, epilog=_EPILOG
     )
-    parser.add_argument("lenses", metavar="LENS", nargs="*", help="lens files or names (default: all of lenses/)")
+    add_lens(parser, "lenses", " (default: all of lenses/)", nargs="*")
     parser.add_argument("-o", "--output", metavar="FOLDER", type=Path, required=True, help="for the pages")
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="finished pages are kept; the same command goes on")
@@ -53,9 +54,8 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.evaluate.describe import lens_files
 
     folder = args.output
-    if folder.exists() and not folder.is_dir():
-        raise InputError("neurolens library", "-o", str(folder), "a folder")
-    files = [lens_path(word, "library") for word in args.lenses] or lens_files(library() / "lenses")
+    check_run_folder(folder, "neurolens library", "-o")
+    files = args.lenses or lens_files(library() / "lenses")
     names = _page_names(files)
     folder.mkdir(parents=True, exist_ok=True)
     progress, records = Progress({"lenses": 12.0 * len(files)}, quiet=args.quiet), []
@@ -72,10 +72,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _page_names(files: Sequence[Path]) -> list[str]:
-    """A folder's name for each file's page: its stem, and a number where another file of the run has the same."""
+    """A folder's name for each file's page: the lens's id, and a number where another file of the run has the same."""
     names: list[str] = []
     for file in files:
-        tries = (safe_name(f"{file.stem}-{k}" if k > 1 else file.stem) for k in itertools.count(1))
+        tries = (safe_name(f"{lens_id_of(file)}-{k}" if k > 1 else lens_id_of(file)) for k in itertools.count(1))
         taken = {"index.html", *(name.lower() for name in names)}  # many disks know no capitals
         names.append(next(name for name in tries if name.lower() not in taken))
     return names
@@ -86,7 +86,7 @@ def _record(file: Path, folder: Path) -> dict[str, Any]:
     from neurolens import __version__
     from neurolens.evaluate.describe import read_quietly
 
-    kept, named = folder / "record.json", {"lens": file.stem, "page": folder.name}
+    kept, named = folder / "record.json", {"lens": lens_id_of(file), "page": folder.name}
     try:
         lens = read_quietly(file)
         try:
@@ -111,6 +111,7 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
     from neurolens.evaluate import pages
     from neurolens.evaluate.describe import lens_row, rim_doubts, section
     from neurolens.optics.lenscheck import check_lens
+    from neurolens.readers.source import read_text
 
     row = lens_row(lens, check_lens(lens))
     figures, notes = [], []
@@ -131,8 +132,7 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
     body += pages.figure_grid(folder, figures)
     names = [Path(m["file"]).stem.removeprefix(f"{lens.lens_id}.") for m in models]
     body += pages.section("Models", pages.table(names, models, _model_columns()))
-    text = file.read_text(encoding="utf-8", errors="replace")
-    body += pages.section("File", pages.html("<pre>{}</pre>", text))
+    body += pages.section("File", pages.html("<pre>{}</pre>", read_text(file)))
     atomic_write_text(folder / "index.html", pages.page(lens.name, body))
     best = min((m["rms_um"] for m in models if m["rms_um"] is not None), default=None)
     keys = ("name", "efl_mm", "f_number", "half_field_deg", "refractions", "states")

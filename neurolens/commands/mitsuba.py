@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
 from neurolens.base.progress import Progress, duration
-from neurolens.commands.arguments import add_exposure, add_json, add_lens_state, aperture_of, positive, whole
+from neurolens.commands.arguments import add_exposure, add_json, add_lens, add_lens_state, aperture_of, positive, whole
 from neurolens.commands.output import answer
 from neurolens.commands.render import film_size
 from neurolens.commands.render_files import Files, warn
@@ -36,10 +36,7 @@ def add_parser(subparsers: Any) -> None:
         description=_DESCRIPTION, epilog=_EPILOG,
     )  # fmt: skip
     parser.add_argument("scene", metavar="SCENE", help="scene file (.xml), or cornell-box")
-    parser.add_argument(
-        "--camera", metavar="CAMERA", required=True,
-        help="lens file (.toml, traced exactly), model (.onnx), thin or pinhole",
-    )  # fmt: skip
+    add_lens(parser, "--camera", models=True, cameras=True, required=True)
     parser.add_argument(
         "-o", "--out", metavar="OUT.exr", type=Path, required=True, help="picture to write; the preview is OUT.png"
     )

@@ -12,9 +12,11 @@ from typing import Any
 
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
 from neurolens.base.files import library
+from neurolens.base.lensname import lens_id_of
 from neurolens.commands.arguments import add_json
 from neurolens.commands.output import answer, number, table
 from neurolens.evaluate.records import CLOSE_UM, reaches, to_use, use_command
+from neurolens.modelfile import AVERAGED, transmittance_of
 
 _DESCRIPTION = """\
 List exported models by lens: film circle, focus, film-equivalent RMS error on rays held out, and
@@ -104,6 +106,7 @@ def models_in(folder: Path) -> Iterator[dict[str, Any]]:
                 "efl_mm": float(card["lens"]["efl_mm"]),
                 "film_radius_mm": float(domain["film_radius_mm"]),
                 "focus_m": list(domain["focus_m"]),
+                "transmittance": transmittance_of(card),
                 "states": [str(a["name"]) for a in (card.get("states") or {}).get("axes", ())],
                 **{k: errors.get(k) for k in ("rms_um", "rms_px", "direction_rms_deg", "poor")},
                 "bytes": file.stat().st_size,
@@ -130,8 +133,8 @@ def _state(model: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def _is_of(model: dict[str, Any], asked: str) -> bool:
-    if asked.endswith(".toml"):
-        return bool(model["lens"] == Path(asked).stem)
+    if asked.endswith(".toml") or Path(asked).is_file():
+        return bool(model["lens"] == lens_id_of(asked))
     return any(asked.casefold() in text.casefold() for text in (model["lens"], model["name"], Path(model["file"]).stem))
 
 
@@ -152,11 +155,7 @@ def _text(args: argparse.Namespace, listed: Sequence[dict[str, Any]], kept: Sequ
             number(m["rms_um"], 3),
             number(m["rms_px"], 2),
             *(number((m[k] or {}).get("min"), 3) for k in ("ns_per_ray", "fused_ns_per_ray")),
-            f"poor: {', '.join(m['poor'])}"
-            if m["poor"]
-            else f"in one: {', '.join(m['states'])}"
-            if m["states"]
-            else "",
+            "; ".join(_remarks(m)),
         )
         for m in kept
     ]
@@ -168,6 +167,13 @@ def _text(args: argparse.Namespace, listed: Sequence[dict[str, Any]], kept: Sequ
     if len(chosen) == 1:
         parts.append(f"Use {_said(chosen[0])}:\n  {chosen[0]['use']}")
     return "\n\n".join(parts)
+
+
+def _remarks(model: dict[str, Any]) -> list[str]:
+    """What the last column says of a model."""
+    found = [f"poor: {', '.join(model['poor'])}"] if model["poor"] else []
+    found += [f"in one: {', '.join(model['states'])}"] if model["states"] and not found else []
+    return found + ["averaged transmittance"] * (model["transmittance"] == AVERAGED)
 
 
 def _said(model: dict[str, Any]) -> str:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text, library
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, lens_path
+from neurolens.commands.arguments import add_glass, add_json, add_lens, check_run_folder
 from neurolens.commands.output import answer, number, table
 from neurolens.commands.plan_frames import run_plan_frames
 from neurolens.commands.render_frames import add_frames
@@ -20,6 +20,7 @@ from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
     from neurolens.evaluate.plan import Choice, Plan
+    from neurolens.optics.prescription import Lens
 
 # Repeated here, so that help imports no torch; a test compares with `evaluate.plan`.
 TARGETS = ("render", "c", "onnx", "osl", "glsl")
@@ -53,7 +54,7 @@ def add_parser(subparsers: Any) -> None:
         epilog=_EPILOG,
     )  # fmt: skip
     parser.add_argument("scene", metavar="SCENE", type=Path, help="scene file (.toml)")
-    parser.add_argument("--lens", metavar="LENS", required=True, help="lens file (.toml), or a name in lenses/")
+    add_lens(parser, "--lens", required=True)
     parser.add_argument(
         "--budget", metavar="BUDGET", type=_budget, default=0.25,
         help="error allowed, as 0.25px (default); or as 0.02flip: mean FLIP of strips of the picture, at its own "
@@ -100,9 +101,14 @@ def look_of(args: argparse.Namespace) -> dict[str, Any]:
     return {"afterwards": args.afterwards, "denoised": args.denoise, "zoom": args.zoom}
 
 
-def shipped_models(file: Path, zoom: str | None) -> list[Path]:
-    """Of a lens file, or of a state of its zoom."""
-    return sorted((library() / "models").glob(f"{file.stem if zoom is None else f'{file.stem}-{zoom}'}.*.onnx"))
+def shipped_models(lens: Lens, zoom: str | None) -> list[Path]:
+    """The models that ship of a lens, or of a state of its zoom, by its id and its figures."""
+    from neurolens.modelfile.onnxfile import read_checked
+
+    name = lens.lens_id if zoom is None else f"{lens.lens_id}-{zoom}"
+    files = sorted((library() / "models").glob(f"{name}.*.onnx"))
+    figures = lens.at(zoom=zoom).sha256 if files else ""
+    return [file for file in files if read_checked(file)[1]["lens"]["sha256"] == figures]
 
 
 class Seconds(float):
@@ -148,21 +154,19 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.evaluate.plan import plan
     from neurolens.evaluate.plots import plot_effects
     from neurolens.evaluate.trade import plan_seen, plan_within
-    from neurolens.optics.lensfile import read_lens
+    from neurolens.readers.any_format import read_any
     from neurolens.render.scene import load_scene
 
-    file = lens_path(args.lens, "plan")
-    lens = read_lens(file)
+    lens = read_any(args.lens)
     scene = load_scene(args.scene)
-    folder = args.output or Path("runs") / f"plan-{scene.name}-{file.stem}"
-    if folder.exists() and not folder.is_dir():
-        raise InputError("neurolens plan", "-o", str(folder), "a folder")
-    shipped = shipped_models(file, args.zoom)
+    folder = args.output or Path("runs") / f"plan-{scene.name}-{lens.lens_id}"
+    check_run_folder(folder, "neurolens plan", "-o")
+    shipped = shipped_models(lens, args.zoom)
     if args.frames is not None:
         if args.zoom is not None or isinstance(args.budget, (Seconds, Flip)):
             expected = "a budget in pixels, and the zoom as a key, with --frames"
             raise InputError("neurolens plan", "--budget, --zoom", f"{args.budget:g}, {args.zoom}", expected)
-        return run_plan_frames(args, file, shipped, folder)
+        return run_plan_frames(args, lens, shipped, folder)
     progress = Progress({"plan": 10} | ({"map of samples": 2} if args.samples else {}), quiet=args.quiet)
     with progress.stage("plan") as report:
         look: dict[str, Any] = {**look_of(args), "report": report}
@@ -174,7 +178,7 @@ def run(args: argparse.Namespace) -> int:
         else:
             found = plan(scene, lens, args.budget, explain=args.explain, **look)
     folder.mkdir(parents=True, exist_ok=True)
-    data = plain({"scene": str(args.scene), "lens": str(file), **found.to_dict()})
+    data = plain({"scene": str(args.scene), "lens": str(args.lens), **found.to_dict()})
     with atomic_path(folder / "plan.json") as part:
         part.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
     if found.best:

@@ -18,12 +18,12 @@ from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
     from neurolens.evaluate.plan_frames import FramesPlan
+    from neurolens.optics.prescription import Lens
 
 
-def run_plan_frames(args: argparse.Namespace, file: Path, models: list[Path], folder: Path) -> int:
+def run_plan_frames(args: argparse.Namespace, lens: Lens, models: list[Path], folder: Path) -> int:
     """Plan, write, print; 1 where a frame has no camera within the budget."""
     from neurolens.evaluate.plan_frames import Frame, plan_frames
-    from neurolens.optics.lensfile import read_lens
     from neurolens.render.scene import load_scene, seen_from
 
     if args.samples or args.explain:
@@ -39,11 +39,11 @@ def run_plan_frames(args: argparse.Namespace, file: Path, models: list[Path], fo
     progress = Progress({"plan": 10}, quiet=args.quiet)
     with progress.stage("plan") as report:
         found = plan_frames(
-            frames, read_lens(file), args.budget, target=args.target, models=models, report=report,
+            frames, lens, args.budget, target=args.target, models=models, report=report,
             folder=folder / "models" if args.fit else None, afterwards=args.afterwards, denoised=args.denoise,
         )  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)
-    data = plain({"scene": str(args.scene), "lens": str(file), **found.to_dict()})
+    data = plain({"scene": str(args.scene), "lens": str(args.lens), **found.to_dict()})
     with atomic_path(folder / "plan.json") as part:
         part.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
     answer(args, data, lambda: _text(args, found, folder))

@@ -15,11 +15,11 @@ from neurolens.base.progress import Progress
 from neurolens.commands.arguments import (
     CAMERAS_HELP,
     add_json,
+    add_lens,
     add_lens_state,
     aperture_of,
     between,
     check_folder,
-    named_camera,
     positive,
 )
 from neurolens.commands.output import answer, number
@@ -101,10 +101,7 @@ def add_parser(subparsers: Any) -> None:
 
 def add_picture(parser: argparse.ArgumentParser) -> None:
     """Add the camera, --size and --film."""
-    parser.add_argument(
-        "camera", metavar="CAMERA", type=named_camera,
-        help="lens file (or a name in lenses/), model or another camera, see below",
-    )  # fmt: skip
+    add_lens(parser, "camera", ", see below", models=True, cameras=True)
     parser.add_argument("--size", metavar="WxH", type=_pixels, required=True, help="of the lens's picture in pixels")
     parser.add_argument("--film", metavar="WxH", type=film_size, required=True, help="size of the film in mm")
 

@@ -67,7 +67,8 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.base.progress import Progress
     from neurolens.evaluate.survey import SurveySettings, summary_of
     from neurolens.evaluate.survey_page import summary_lines
-    from neurolens.evaluate.survey_run import collection_of, in_processes, on_cluster, survey
+    from neurolens.evaluate.survey_run import in_processes, on_cluster, survey
+    from neurolens.readers.any_format import collection_of
     from neurolens.readers.source import MAX_BYTES
 
     check_run_folder(args.out, "neurolens survey", "--out")

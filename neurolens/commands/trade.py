@@ -8,10 +8,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, lens_path, whole
+from neurolens.commands.arguments import add_glass, add_json, add_lens, check_run_folder, whole
 from neurolens.commands.output import answer, number, table
 from neurolens.commands.plan import TARGETS, add_look, look_of, pixels, shipped_models
 from neurolens.evaluate.records import plain
@@ -44,7 +43,7 @@ def add_parser(subparsers: Any) -> None:
         epilog=_EPILOG,
     )  # fmt: skip
     parser.add_argument("scene", metavar="SCENE", type=Path, help="scene file (.toml)")
-    parser.add_argument("--lens", metavar="LENS", required=True, help="lens file (.toml), or a name in lenses/")
+    add_lens(parser, "--lens", required=True)
     parser.add_argument(
         "--budget", metavar="PIXELS", type=pixels, default=0.25, help="whose choice is marked (default: 0.25px)"
     )
@@ -67,17 +66,15 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.evaluate.figures import side_by_side
     from neurolens.evaluate.plots import plot_trade
     from neurolens.evaluate.trade import trade
-    from neurolens.optics.lensfile import read_lens
+    from neurolens.readers.any_format import read_any
     from neurolens.render.scene import load_scene
 
-    file = lens_path(args.lens, "trade")
-    lens, scene = read_lens(file), load_scene(args.scene)
-    folder = args.output or Path("runs") / f"trade-{scene.name}-{file.stem}"
-    if folder.exists() and not folder.is_dir():
-        raise InputError("neurolens trade", "-o", str(folder), "a folder")
+    lens, scene = read_any(args.lens), load_scene(args.scene)
+    folder = args.output or Path("runs") / f"trade-{scene.name}-{lens.lens_id}"
+    check_run_folder(folder, "neurolens trade", "-o")
     with Progress({"trade": 30}, quiet=args.quiet).stage("trade") as report:
         found = trade(
-            scene, lens, args.budget, target=args.target, models=shipped_models(file, args.zoom), report=report,
+            scene, lens, args.budget, target=args.target, models=shipped_models(lens, args.zoom), report=report,
             samples=args.samples, folder=folder / "models" if args.fit else None, **look_of(args),
         )  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)
@@ -93,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
     atomic_write_text(folder / "trade.html", _page(found, folder, title))
     flips = {s.offer.choice.name: s.flip for s in found.shown}
     rows = [{**asdict(o.choice), "seconds": o.seconds, "flip": flips.get(o.choice.name)} for o in found.offered]
-    data = {"scene": str(args.scene), "lens": str(file), "target": args.target, "unit": found.unit}
+    data = {"scene": str(args.scene), "lens": str(args.lens), "target": args.target, "unit": found.unit}
     data |= {"base": found.base, "cameras": rows, "front": [o.choice.name for o in found.front]}
     data |= {"chosen": found.chosen and found.chosen.choice.name, "half": found.half and found.half.choice.name}
     atomic_write_text(folder / "trade.json", json.dumps(plain(data), indent=1) + "\n")

@@ -12,8 +12,9 @@ from typing import Any
 from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, one_line
 from neurolens.base.files import fingerprint_of, sha256_of
+from neurolens.base.lensname import lens_id_of
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, check_run_folder, lens_path, positive, whole
+from neurolens.commands.arguments import add_glass, add_json, add_lens, check_ids, check_run_folder, positive, whole
 from neurolens.commands.farm import Task, add_dask, files_of, spread
 from neurolens.commands.output import answer, number, table
 from neurolens.evaluate.records import CLOSE_UM, to_use, use_command
@@ -53,10 +54,8 @@ def add_parser(subparsers: Any) -> None:
         "train", help="fit, measure and render the models of an experiment", description=_DESCRIPTION, epilog=_EPILOG
     )
     parser.add_argument("experiment", metavar="EXPERIMENT.toml", nargs="?", type=Path, help="experiment file")
-    parser.add_argument(
-        "--lens", metavar="FILE", type=Path, nargs="+",
-        help="lens file or name of lenses/, instead of an experiment; of several, each has a run folder in DIR (runs)",
-    )  # fmt: skip
+    instead = ", instead of an experiment; of several, each has a run folder in DIR (runs)"
+    add_lens(parser, "--lens", instead, nargs="+")
     parser.add_argument(
         "--out", metavar="DIR", type=Path,
         help="run folder, made if needed (default: runs/NAME of the experiment or lens file)",
@@ -111,33 +110,33 @@ def _run_many(args: argparse.Namespace) -> int:
     """One run a lens, here or on a cluster; a lens that fails is a line, and the exit code is 2 then."""
     if args.lens is None:
         raise InputError("neurolens train", "--dask", args.dask, "--lens FILE ... beside it")
-    files = [lens_path(name, "train") for name in args.lens]
-    if twice := sorted({f.stem for f in files if sum(g.stem == f.stem for g in files) > 1}):
-        raise InputError("neurolens train", "--lens", twice, "files whose names differ")
+    check_ids(args.lens, "neurolens train", "--lens")
     base = args.out if args.out is not None else Path("runs")
     check_run_folder(base, "neurolens train", "--out")
     progress, failed = Progress(quiet=args.quiet), dict[str, str]()
-    each = [argparse.Namespace(**vars(args) | {"lens": f, "out": base / f.stem, "dask": None}) for f in files]
+    each = [
+        argparse.Namespace(**vars(args) | {"lens": f, "out": base / lens_id_of(f), "dask": None}) for f in args.lens
+    ]
     if args.dask is None:
         for one in each:
             try:
                 _run_one(one, progress)
             except NeurolensError as error:
-                failed[one.lens.stem] = str(error)
+                failed[one.out.name] = str(error)
     else:
         failed = _on_dask(args.dask, each, base, progress)
     for name, why in failed.items():
         print(f"neurolens: {one_line(f'{name}: {why}', 3000)}", file=sys.stderr)
-    done = [one.out for one in each if one.lens.stem not in failed]
+    done = [one.out for one in each if one.out.name not in failed]
     answer(args, {"folders": [str(folder) for folder in done], "failed": failed}, lambda: "\n".join(map(str, done)))
     return 2 if failed else 0
 
 
 def _on_dask(address: str, each: list[argparse.Namespace], base: Path, progress: Progress) -> dict[str, str]:
     """Run what is not there yet on a cluster; the reasons of what failed."""
-    marks = {one.lens.stem: _mark(one) for one in each}
-    missing = [one for one in each if _marked(one.out) != marks[one.lens.stem]]
-    tasks = [Task.of(one.lens.stem, train_alone, one, one.out) for one in missing]
+    marks = {one.out.name: _mark(one) for one in each}
+    missing = [one for one in each if _marked(one.out) != marks[one.out.name]]
+    tasks = [Task.of(one.out.name, train_alone, one, one.out) for one in missing]
     base.mkdir(parents=True, exist_ok=True)
     with progress.stage(f"train {len(tasks)} of {len(each)} lenses") as report:
         files = {path for one in missing for path in files_of(one)}
@@ -180,8 +179,7 @@ def _run_one(args: argparse.Namespace, progress: Progress) -> tuple[dict[str, An
         raise InputError("neurolens train", given, "(without --lens)", "--lens FILE")
     args.overrides = [*states, *asked, *["evaluation.rounds=0"] * args.no_race, *args.overrides]
     if args.lens is not None:
-        args.lens = lens_path(args.lens, "train")
-        experiment = default_experiment(_own_format(args.lens, folder), args.overrides)
+        experiment = default_experiment(args.lens, args.overrides)
     else:
         experiment = read_experiment(args.experiment, args.overrides)
     return run_experiment(experiment, folder, progress=progress, command=_command(args)), folder
@@ -196,22 +194,9 @@ def _run_folder(args: argparse.Namespace) -> Path:
     if (args.experiment is None) == (args.lens is None):
         found = "(neither)" if args.lens is None else "(both)"
         raise InputError("neurolens train", "EXPERIMENT.toml or --lens", found, "one of them")
-    folder: Path = args.out if args.out is not None else Path("runs") / (args.experiment or args.lens).stem
+    folder: Path = args.out if args.out is not None else Path("runs") / lens_id_of(args.experiment or args.lens)
     check_run_folder(folder, "neurolens train", "--out")
     return folder
-
-
-def _own_format(file: Path, folder: Path) -> Path:
-    """The lens file, or its conversion, kept in the run folder; raises InputError as `read_any`."""
-    if file.suffix.lower() == ".toml" or not file.is_file():
-        return file
-    from neurolens.commands.convert import write_checked
-    from neurolens.readers.any_format import read_any
-
-    lens, kept = read_any(file), folder / "lenses" / f"{file.stem}.toml"
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    write_checked(lens, kept)
-    return kept
 
 
 def _command(args: argparse.Namespace) -> str:

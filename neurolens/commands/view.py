@@ -15,8 +15,9 @@ from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError, ModelError, NeurolensError, NeurolensWarning
 from neurolens.base.files import TemporaryFolder
 from neurolens.base.files import library as shipped
+from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, check_folder, check_suffix, lens_path, whole
+from neurolens.commands.arguments import add_glass, add_json, add_lens, check_folder, check_suffix, whole
 from neurolens.commands.output import answer
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ _GHOSTS = 24  # of a lens at most: the brightest
 class _Entry:
     """A lens with its models, in one state; `zoom` "range" is all of a zoom.
 
-    `file` is of the lens, where it has been written; `as_bare` says what is left out where it is traced.
+    `file` is of the lens, where it has been written.
     """
 
     key: str
@@ -62,7 +63,6 @@ class _Entry:
     zoom: str | None = None
     ghosts: GhostModel | None = None
     file: Path | None = None
-    as_bare: str = ""
 
 
 def add_parser(subparsers: Any) -> None:
@@ -70,7 +70,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "view", help="write a page that runs lenses and models in a browser", description=_DESCRIPTION, epilog=_EPILOG
     )
-    parser.add_argument("lenses", metavar="LENS|MODEL", nargs="*", help="lens files, names of lenses, models")
+    add_lens(parser, "lenses", models=True, metavar="LENS|MODEL", nargs="*")
     parser.add_argument(
         "-o", "--out", metavar="FILE.html", type=Path, default=Path("view.html"), help="page (default: view.html)"
     )
@@ -126,7 +126,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _with_file(entry: _Entry, folder: Path) -> _Entry:
-    from neurolens.cameras.exact import bare_line
     from neurolens.optics.lenswriter import write_lens
 
     if entry.lens is None:
@@ -134,17 +133,17 @@ def _with_file(entry: _Entry, folder: Path) -> _Entry:
     folder.mkdir()
     file = folder / f"{entry.lens.lens_id}.toml"
     write_lens(entry.lens, file)
-    return replace(entry, file=file, as_bare=bare_line(entry.lens))
+    return replace(entry, file=file)
 
 
 def _shaders(entries: Sequence[_Entry], jobs: int, progress: Progress) -> Mapping[Path, str]:
     """OSL of lens files and models; those that cannot be written so are told of and left out."""
     from neurolens.commands.blender_lenses import forms_of
 
-    given = {e.file: (e.zoom, e.as_bare) for e in entries if e.file is not None}
-    files = [*given, *(model for entry in entries for model in entry.models)]
+    zooms = {e.file: e.zoom for e in entries if e.file is not None}
+    files = [*zooms, *(model for entry in entries for model in entry.models)]
     with progress.stage("shaders") as report:
-        forms, left = forms_of(files, min(jobs, len(files)), report, given)
+        forms, left = forms_of(files, min(jobs, len(files)), report, zooms)
     for file, why in left.items():
         warnings.warn(f"no OSL: {why.replace(str(file), file.name)}", NeurolensWarning, stacklevel=2)
     return {file: form.osl for file, form in forms.items()}
@@ -153,7 +152,7 @@ def _shaders(entries: Sequence[_Entry], jobs: int, progress: Progress) -> Mappin
 def _library() -> Iterator[_Entry]:
     """Every lens of lenses/ with its best models; zooms over their range where a model has it."""
     from neurolens.commands.blender_lenses import key_of, library
-    from neurolens.optics.lensfile import read_lens
+    from neurolens.readers.any_format import read_any
 
     root = shipped()
     for models, file in library(root / "models", root / "lenses", ()):
@@ -163,10 +162,10 @@ def _library() -> Iterator[_Entry]:
         zoom = RANGE if state == "range" else None
         if state and not zoom:
             continue  # a second model of a lens that is here already
-        yield _Entry(key_of(models[0]), models, read_lens(file) if file.is_file() else None, zoom)
+        yield _Entry(key_of(models[0]), models, read_any(file) if file.is_file() else None, zoom)
 
 
-def _asked(words: Sequence[str]) -> Iterator[_Entry]:
+def _asked(paths: Sequence[Path]) -> Iterator[_Entry]:
     """Lenses in the order of their first word; models join the lens of their id, in place of those of the library."""
     from neurolens.commands.blender_lenses import library
     from neurolens.readers.any_format import read_any
@@ -175,23 +174,22 @@ def _asked(words: Sequence[str]) -> Iterator[_Entry]:
     lenses: dict[str, Lens | None] = {}
     models: dict[str, list[Path]] = {}
     brought: dict[str, list[Path]] = {}
-    flares = {path: model for path in map(Path, words) if path.suffix == ".onnx" and (model := _flare(path))}
+    flares = {path: model for path in paths if is_model(path) and (model := _flare(path))}
     of: dict[str, GhostModel] = {}
     for path, model in flares.items():
         if of.setdefault(model.lens.lens_id, model) is not model:
             raise InputError("neurolens view", f"ghosts of {model.lens.lens_id}", str(path), "one file a lens")
-    for word in words:
-        path = Path(word) if word.endswith(".onnx") else lens_path(word, "view")
+    for path in paths:
         if path in flares:
             continue
-        if path.suffix == ".onnx":
+        if is_model(path):
             lens_id = str(_card(path)["lens"]["id"])
             lenses.setdefault(lens_id, None)
             models.setdefault(lens_id, []).append(path)
             continue
         lens = read_any(path)
         lenses[lens.lens_id] = lens
-        if path.parent == root / "lenses":  # one of the library brings its models
+        if path.resolve().parent == (root / "lenses").resolve():  # one of the library brings its models
             known = library(root / "models", root / "lenses", [path.stem]) if _has_models(root, path.stem) else ()
             brought[lens.lens_id] = [m for files, _ in known for m in files]
     if not of.keys() <= lenses.keys():
@@ -249,7 +247,7 @@ def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str], shaders: Mappi
             path = _path(lens) if entry.zoom != RANGE else None
         except NeurolensError:
             if not forms:
-                raise  # a model of the lens stands in for it: coatings and the like have no code
+                raise  # a model of the lens stands in for it
         drawn = _section(lens)
     best, focal_mm = forms[0], [float(f.card["efl_mm"]) for f in forms]
     if entry.zoom != RANGE and max(focal_mm) - min(focal_mm) > _SAME * abs(focal_mm[0]):
@@ -324,14 +322,12 @@ def _facts(lens: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _exact_form(entry: _Entry, file: Path, at: Lens, kinds: Sequence[str], osl: str | None) -> Form:
-    from neurolens.cameras.exact import AS_BARE
     from neurolens.commands.export_lens import write_lens
     from neurolens.optics.paraxial import first_order
     from neurolens.optics.pupils import image_radius_mm
 
     written = {
-        to: write_lens(file, file.with_suffix(f".{to}"), to, zoom=entry.zoom, quiet=True, as_bare=entry.as_bare)
-        for to in _written(kinds)
+        to: write_lens(file, file.with_suffix(f".{to}"), to, zoom=entry.zoom, quiet=True) for to in _written(kinds)
     }
     data = first_order(at)
     told = {
@@ -341,8 +337,7 @@ def _exact_form(entry: _Entry, file: Path, at: Lens, kinds: Sequence[str], osl: 
         "f_numbers": [(float(data.efl_mm), float(data.f_number))],
         "errors": {}, "zones": {}, "poor": [],
     }  # fmt: skip
-    said = f"every surface traced, {AS_BARE}" if entry.as_bare else "every surface traced"
-    return _form("exact", said, written, told, {}, osl)
+    return _form("exact", "every surface traced", written, told, {}, osl)
 
 
 def _form(

@@ -33,7 +33,6 @@ from neurolens.evaluate.measure import (
 from neurolens.evaluate.rays import EachRay, ray_errors
 from neurolens.evaluate.vignetting import ZONES, false_shares
 from neurolens.modelfile.axes import Axis
-from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.readers.any_format import read_any
@@ -317,7 +316,7 @@ def space_of_card(
     """
     path = lens_file if lens_file is not None else find_lens(str(card["lens"]["id"]), model_file)
     states = card["states"]
-    space = StateSpace(read_lens(path).with_aperture(None), tuple(axes), states["zoom"], states["f_number"])
+    space = StateSpace(read_any(path).with_aperture(None), tuple(axes), states["zoom"], states["f_number"])
     found = space.lens_at([float(v) for v in states["default"]])
     if found.sha256 != card["lens"]["sha256"]:
         expected = f"the prescription of {model_file}: {card['lens']['name']}, {str(card['lens']['sha256'])[:12]}..."

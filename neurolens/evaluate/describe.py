@@ -13,15 +13,15 @@ import torch
 from neurolens.analysis import layout
 from neurolens.analysis.fields import Scene
 from neurolens.base import status as st
-from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
+from neurolens.base.errors import NeurolensError, NeurolensWarning
 from neurolens.optics.focusing import at_infinity
 from neurolens.optics.glass import glass_of
 from neurolens.optics.lenscheck import Check, check_lens, doubts, film_edge_mm, verdict
-from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays, image_radius_mm
 from neurolens.optics.trace import trace
+from neurolens.readers.any_format import collection_of, read_any
 from neurolens.surrogates.domain import Domain, sample_domain
 
 _RAYS = 65536
@@ -198,49 +198,41 @@ _NO_FIELD = 0.2  # film radius over focal length at which a lens of unknown fiel
 
 
 def lens_files(folder: Path) -> list[Path]:
-    """The lens files of a folder, by name.
-
-    Raises:
-        InputError: no such folder, a file, or none in it.
-    """
-    if folder.is_file():
-        raise InputError(folder, "lens folder", "(a file)", 'a folder of lens files; leave out "list" for one lens')
-    if not folder.is_dir():
-        raise InputError(folder, "lens folder", "(missing)", "a folder of lens files (*.toml)")
-    files = sorted(folder.glob("*.toml"))
-    if not files:
-        raise InputError(folder, "lens folder", "(no *.toml)", "a folder of lens files")
-    return files
+    """The lens files of a folder and of its folders, by name; raises InputError as `collection_of`."""
+    return [folder / name for name in collection_of(folder).names]
 
 
 def read_quietly(path: Path) -> Lens:
     """A lens read without warnings, which its check repeats."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NeurolensWarning)
-        return read_lens(path)
+        return read_any(path)
 
 
-def library_row(path: Path) -> dict[str, Any]:
-    """A lens file in the table of its folder.
+def library_row(path: Path, checked: bool = True) -> dict[str, Any]:
+    """A lens file in a table of many.
 
-    Returns: lens, file, and `lens_row`; of a file that cannot be read the verdict "unreadable" with the error as its
-        doubt.
+    Returns: lens, file, notes (what its reader warned of), and `lens_row`, checked or not; of a file that cannot be
+        read the verdict "unreadable" with the error as its doubt.
     """
     place = {"lens": path.stem, "file": str(path)}
-    try:
-        lens = read_quietly(path)
-        return {**place, **lens_row(lens, check_lens(lens))}
-    except NeurolensError as error:
-        return {**place, "verdict": "unreadable", "doubts": [str(error)]}
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always", NeurolensWarning)
+        try:
+            lens = read_any(path)
+            row = lens_row(lens, check_lens(lens) if checked else None)
+        except NeurolensError as error:
+            row = {"verdict": "unreadable", "doubts": [str(error).removeprefix(f"{path}: ")]}
+    return {**place, **row, "notes": [str(w.message).removeprefix(f"{path}: ") for w in heard]}
 
 
-def lens_row(lens: Lens, checks: list[Check]) -> dict[str, Any]:
-    """A lens as read from its file, with its `check_lens`, in a table of many.
+def lens_row(lens: Lens, checks: list[Check] | None) -> dict[str, Any]:
+    """A lens as read from its file, in a table of many, with its `check_lens` or (None) without.
 
-    Returns: name, efl_mm and efl_x_mm computed (the latter of an anamorphic lens only), stated_efl_mm, f_number of the
-        stop, half_field_deg as stated, image_radius_mm as stated, refractions, aspheres, cylinders, states (zoom or
-        focus), rims, verdict ("ok" or "doubtful"), doubts, and checks: a list of {state, quantity, computed, stated,
-        doubt}.
+    Returns: name, efl_mm and efl_x_mm computed (the latter of an anamorphic lens only), stated_efl_mm, back_focus_mm,
+        f_number of the stop, half_field_deg as stated, image_radius_mm as stated, refractions, aspheres, cylinders,
+        states (zoom or focus), rims, verdict ("ok" or "doubtful"; without checks "read"), doubts, and checks: a list of
+        {state, quantity, computed, stated, doubt}.
     """
     data = first_order(lens)
     cylinders = sum(s.cylinder is not None for s in lens.surfaces)
@@ -249,6 +241,7 @@ def lens_row(lens: Lens, checks: list[Check]) -> dict[str, Any]:
         "efl_mm": float(data.efl_mm),
         "efl_x_mm": float(first_order(lens, meridian="x").efl_mm) if cylinders else None,
         "stated_efl_mm": lens.stated_efl_mm,
+        "back_focus_mm": float(data.back_focus_mm),
         "f_number": float(data.f_number),
         "half_field_deg": lens.half_field_deg,
         "image_radius_mm": lens.image_radius_mm,
@@ -257,9 +250,9 @@ def lens_row(lens: Lens, checks: list[Check]) -> dict[str, Any]:
         "cylinders": cylinders,
         "states": len(lens.configurations),
         "rims": lens.rims,
-        "verdict": verdict(checks),
-        "doubts": doubts(checks),
-        "checks": [asdict(c) for c in checks],
+        "verdict": "read" if checks is None else verdict(checks),
+        "doubts": doubts(checks or []),
+        "checks": [asdict(c) for c in checks or []],
     }
 
 

@@ -14,11 +14,13 @@ from typing import Any, Literal
 from neurolens.base.config import apply_overrides, from_dict, read_config, to_dict, to_toml
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
+from neurolens.base.lensname import lens_id_of
 from neurolens.evaluate.rays import PIXELS_ACROSS, frame_width_mm
 from neurolens.optics.glass import glass_of
-from neurolens.optics.lensfile import read_lens
+from neurolens.optics.lenswriter import write_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
+from neurolens.readers.any_format import OURS, kind_of, read_any
 from neurolens.surrogates.domain import Domain, domain_of
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.pairs import PairSettings
@@ -68,12 +70,12 @@ class LensChoice:
         """The lens at infinity focus with a round stop; cameras apply blades outside the models.
 
         Raises:
-            InputError: a length or f-number that is not positive, and as `read_lens` and `Lens.at`.
+            InputError: a length or f-number that is not positive, and as `read_any` and `Lens.at`.
         """
         for name, value in (("lens.efl_mm", self.efl_mm), ("lens.f_number", self.f_number)):
             if value is not None and not value > 0:
                 raise InputError("settings", name, value, "a positive number")
-        lens = read_lens(self.file).with_aperture(None)
+        lens = read_any(self.file).with_aperture(None)
         return lens.at(focal_length_mm=self.efl_mm, zoom=self.configuration, f_number=self.f_number)
 
 
@@ -253,7 +255,7 @@ class Experiment:
             raise InputError("settings", "lens.efl_mm", chosen.efl_mm, "left out: many states are of the tabled size")
         if chosen.zoom is not None and chosen.configuration is not None:
             raise InputError("settings", "lens.configuration", chosen.configuration, 'left out beside zoom = "range"')
-        lens = read_lens(chosen.file).with_aperture(None)
+        lens = read_any(chosen.file).with_aperture(None)
         internal = chosen.focusing == "internal"
         return StateSpace(
             lens,
@@ -287,7 +289,7 @@ def _with_files(experiment: Experiment, moved: Callable[[Path], Path]) -> Experi
 
 
 def keep_inputs(experiment: Experiment, folder: Path) -> dict[str, Any]:
-    """Write config.toml, and the lens file to lenses/ of a run folder, where `check.find_lens` looks for it.
+    """Write config.toml, and the lens file, in our format, to lenses/ of a run folder, where `check.find_lens` looks.
 
     Returns the resolved settings, files named relative to the folder.
     """
@@ -301,9 +303,12 @@ def keep_inputs(experiment: Experiment, folder: Path) -> dict[str, Any]:
 
     resolved = replace(_with_files(experiment, moved), camera=None)  # the run's own models are fitted from it
     atomic_write_text(folder / "config.toml", to_toml(resolved))
-    source, kept = experiment.lens.file, folder / "lenses" / experiment.lens.file.name
+    source = experiment.lens.file
+    kept = folder / "lenses" / f"{lens_id_of(source)}.toml"
     kept.parent.mkdir(parents=True, exist_ok=True)
-    if not (kept.exists() and kept.samefile(source)):
+    if kind_of(source) != OURS:
+        write_lens(read_any(source), kept)
+    elif not (kept.exists() and kept.samefile(source)):
         atomic_write_text(kept, source.read_text(encoding="utf-8-sig"))
     return to_dict(resolved)
 

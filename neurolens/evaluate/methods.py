@@ -14,6 +14,7 @@ from typing import Any, get_args
 from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import fingerprint_of, sha256_of, write_json
+from neurolens.base.lensname import lens_id_of
 from neurolens.base.progress import Progress, Report
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.candidates import EXACT, exact_candidates, exact_records, model_candidates
@@ -144,7 +145,7 @@ class Bench:
 
     @property
     def name(self) -> str:
-        return "-".join(part for part in (self.choice.file.stem, self.choice.configuration) if part)
+        return "-".join(part for part in (lens_id_of(self.choice.file), self.choice.configuration) if part)
 
     @cached_property
     def lens(self) -> Lens:

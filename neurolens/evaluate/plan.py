@@ -24,6 +24,7 @@ import numpy as np
 
 from neurolens.base.config import to_toml
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
+from neurolens.base.lensname import IDEAL_OF, split_kind
 from neurolens.base.progress import Report
 from neurolens.base.tomlfile import format_toml
 from neurolens.cameras.build import Shot, ideal_as
@@ -135,8 +136,8 @@ class Plan:
         experiment that fits it, where it is a model of the shot. Paths in it are relative to the folder."""
         best = self.best
         assert best is not None
-        kind, colon, path = best.camera.rpartition(":")
-        camera, title = f"{kind}{colon}{os.path.relpath(path, folder)}", f"{lens.name}: {best.name}"
+        kind, path = split_kind(best.camera)
+        camera, title = f"{kind}{os.path.relpath(path, folder)}", f"{lens.name}: {best.name}"
         if best.settings is None:
             return format_toml({"title": title, "camera": camera})
         file, asked = Path(os.path.relpath(lens.path, folder)), self.asked
@@ -281,11 +282,11 @@ def camera_of(found: Probed, choice: Choice) -> Camera:
     Raises:
         InputError, ModelError: as the cameras.
     """
-    kind, _, path = choice.camera.rpartition(":")
+    kind, path = split_kind(choice.camera)
     if choice.name == _EXACT:
         return found.exact
-    if kind in _IDEAL:
-        flat = ideal_as(f"{kind}:", found.exact.lens, Shot(found.asked.film_mm, found.asked.focus_m))
+    if kind in IDEAL_OF:
+        flat = ideal_as(kind, found.exact.lens, Shot(found.asked.film_mm, found.asked.focus_m))
         mapped = choice.name.endswith(_MAPPED)
         return Warped(flat, found.exact, found.asked.focus_m, tables=found.exact_field) if mapped else flat
     return (FusedCamera if kind else OnnxCamera)(load_model(path), **_real(found))
@@ -330,7 +331,7 @@ def _exact(trial: _Trial) -> Iterator[_Judged]:
         "glsl": lambda: (glsl_operations(exact), noise(found.seen.weight, trial.share)),
     }.get(target, lambda: trial.timed(exact, found.seen))
     if target == "render" or (target != "onnx" and compiled) or target in ("osl", "glsl"):
-        with suppress(InputError):  # coatings, and glass that absorbs
+        with suppress(InputError):  # a shader that is too large
             yield trial.judged(_EXACT, f"{'fused:' if compiled and target in _OURS else ''}{path}", found.seen, cost)
 
 
@@ -432,7 +433,7 @@ def shot_fits(
 
     def fit(terms: int) -> tuple[Path, ModelSettings]:
         settings = replace(model, name=f"{name}-ols-{terms}", terms=terms)
-        file = folder / f"{Path(found.lens.path).stem}.{settings.label}.onnx"
+        file = folder / f"{found.lens.lens_id}.{settings.label}.onnx"
         planes = terms >= _MOVED_TERMS[0] and not lens.anamorphic
         export_onnx(fit_model(moved() if planes else plain, settings), file, errors={})
         return file, replace(settings, planes=planes)  # as a training from scratch has it

@@ -277,7 +277,7 @@ def effects_of(found: Probed, budget_px: float, stray: bool = True) -> tuple[Eff
 
 
 def exact_camera(lens: Lens, real: dict[str, Any]) -> ExactCamera | FusedExactCamera:
-    """As C where a compiler is there and the lens has a form in C: coatings and absorbing glass have none."""
+    """As C where a compiler is there, which compiles the lens."""
     with suppress(InputError):
         if has_compiler():
             return FusedExactCamera(lens, **real)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens import __version__
 from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError
+from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress, Report
 
 if TYPE_CHECKING:
@@ -45,25 +46,21 @@ class Shader:
     notes: tuple[str, ...] = ()
 
 
-def shader_of(
-    file: Path, *, zoom: str | None = None, name: str | None = None, quiet: bool = False, as_bare: str = ""
-) -> Shader:
-    """The shader of a model (.onnx) or of a lens file (.toml).
+def shader_of(file: Path, *, zoom: str | None = None, name: str | None = None, quiet: bool = False) -> Shader:
+    """The shader of a model (.onnx) or of a lens file.
 
     Args:
         zoom: state of a zoom by name or focal length; "range" makes it an input, as None does of a model of a range.
         name: of the shader; None takes the lens's id.
-        as_bare: a line on a lens file whose coatings and absorption are left out; else it is refused.
 
     Raises:
-        InputError: coatings or glass that absorbs in a lens file, a name that is no identifier, a lens that is too
-            large for compilers.
+        InputError: a name that is no identifier, a lens that is too large for compilers.
     """
     from neurolens.cameras.osl import FOCUS_AXIS, parameters, write_camera
     from neurolens.surrogates.source import OSL, checked_name, lines_of
 
     with Progress(quiet=quiet).stage(f"fit the pupil of {file.stem}") as report:
-        lens_id, lens, told = lens_of(file, zoom, report, as_bare)
+        lens_id, lens, told = lens_of(file, zoom, report)
     own = checked_name(OSL, lens_id, name)
     passed = {f"{lens.f_number / share:.3g}": value for share, value in lens.passing().items()}
     near, least = lens.near_m
@@ -92,9 +89,9 @@ def shader_of(
     )  # fmt: skip
 
 
-def lens_of(file: Path, zoom: str | None, report: Report, as_bare: str = "") -> tuple[str, OslLens, list[str]]:
+def lens_of(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:
     """Of a model (.onnx) or a lens file: its id, itself, and lines on it. Arguments and errors as of `shader_of`."""
-    return exact_lens(file, zoom, report, as_bare) if file.suffix == ".toml" else _of_model(file, zoom, report)
+    return _of_model(file, zoom, report) if is_model(file) else exact_lens(file, zoom, report)
 
 
 def _of_model(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:
@@ -127,33 +124,31 @@ def _smallest(file: Path, has_states: bool) -> Graph | None:
     return model_graph(model, largest_angle(model), SCALARS)
 
 
-def exact_lens(file: Path, zoom: str | None, report: Report, as_bare: str = "") -> tuple[str, OslLens, list[str]]:
+def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:
     """Of a lens itself, every surface traced: its id, itself, and lines on it.
 
     Focused as its file says groups move; of a file that does not say, by moving the film, to ten focal lengths.
 
     Args:
-        zoom, as_bare: as of `shader_of`.
+        zoom: as of `shader_of`.
 
     Raises:
-        InputError: coatings or glass that absorbs; a range of no zoom, or of one whose groups move to focus.
+        InputError: a range of no zoom, or of one whose groups move to focus.
     """
-    from neurolens.cameras.exact import check_bare
     from neurolens.cameras.osl import osl_lens, states_between
     from neurolens.modelfile.axes import product, weights
     from neurolens.optics.focusing import focus_states
-    from neurolens.optics.lensfile import read_lens
     from neurolens.optics.pupils import pupil_plane_z_mm
+    from neurolens.optics.tracegraph import TRANSMITTANCE
+    from neurolens.readers.any_format import read_any
     from neurolens.surrogates.states import StateSpace, axes_of, gap_axis
 
-    lens, state = read_lens(file), None if zoom == RANGE else zoom
+    lens, state = read_any(file), None if zoom == RANGE else zoom
     ranged, internal = zoom == RANGE, bool(focus_states(lens))
     if ranged and internal:  # before minutes of work
         raise InputError(lens.path, "zoom", RANGE, "one focal length of the zoom: its groups move to focus, too")
-    if not as_bare:
-        check_bare(lens.at(zoom=state), "a model of the lens has them; --bare leaves them out")
-    told = [f"{lens.name}: every surface traced (bare), {lens.source} (sha256 {str(lens.sha256)[:16]})."]
-    told += [as_bare] * bool(as_bare)
+    told = [f"{lens.name}: every surface traced, {lens.source} (sha256 {str(lens.sha256)[:16]})."]
+    told.append(TRANSMITTANCE)
     if not (ranged or internal):
         at = lens.at(zoom=state)
         return lens.lens_id, osl_lens([_traced(at, pupil_plane_z_mm(at))], report), told

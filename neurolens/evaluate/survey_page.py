@@ -31,7 +31,7 @@ from neurolens.evaluate.records import versions
 from neurolens.evaluate.survey import GOALS, VERDICTS, SurveySettings, summary_of
 
 if TYPE_CHECKING:
-    from neurolens.evaluate.survey_run import Collection
+    from neurolens.readers.any_format import Collection
 
 COLUMNS = (
     Column("f (mm)", "efl_mm", digits=4, about="focal length of the table, first order"),

@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
@@ -23,57 +22,15 @@ from neurolens.base.progress import Progress
 from neurolens.base.signals import end_at_once, held
 from neurolens.evaluate.survey import SurveySettings, Task, known_record, run_task, unread_record
 from neurolens.evaluate.survey_page import write_pages
-from neurolens.readers.any_format import FORMATS
+from neurolens.readers.any_format import Collection
 from neurolens.readers.source import MAX_BYTES
 
-SUFFIXES = frozenset([".toml", *(suffix for f in FORMATS for suffix in f.suffixes)])
 # Tasks to their records, in any order; tasks are taken one by one as there is room for them.
 Engine = Callable[[Iterable[Task]], Iterator[tuple[Task, bytes]]]
 _KEPT_EVERY_S, _SHARE = 60.0, 20.0  # pages are written so often beside the last time, for 1/20 of the time
 _POLL_S = 0.5
 TIME_LIMIT_S = 1800.0  # of one file, far more than any lens takes
 _ANSWERED_S = 5.0  # until a worker's answer has gone
-
-
-@dataclass(frozen=True)
-class Collection:
-    """The files of a folder: those that may be lenses, by name with "/" between its parts, and how many are not.
-
-    Attributes:
-        others: how many files of other kinds lie in the folder, by suffix.
-    """
-
-    folder: Path
-    names: tuple[str, ...]
-    others: dict[str, int] = field(default_factory=dict)
-
-
-def collection_of(folder: Path) -> Collection:
-    """The files of a folder and of its folders by suffix; hidden ones and links to folders are others.
-
-    Raises:
-        InputError: no such folder, or no lens file in it.
-    """
-    if not folder.is_dir():
-        raise InputError(folder, "FOLDER", "(no folder)", "a folder of lens files")
-    names, others = list[str](), dict[str, int]()
-    for file in sorted(folder.rglob("*")):
-        parts = file.relative_to(folder).parts
-        kind = file.suffix.lower() or "(none)"
-        if file.is_dir():
-            if not file.is_symlink():
-                continue
-            kind = "(link to a folder)"
-        elif any(part.startswith(".") for part in parts):
-            kind = "(hidden)"
-        elif kind in SUFFIXES:
-            names.append("/".join(parts))
-            continue
-        others[kind] = others.get(kind, 0) + 1
-    if not names:
-        known = ", ".join(sorted(SUFFIXES))
-        raise InputError(folder, "FOLDER", f"({sum(others.values())} files of other kinds)", f"lens files: {known}")
-    return Collection(folder, tuple(names), others)
 
 
 def survey(

@@ -18,6 +18,7 @@ import torch
 from neurolens.graph.ir import Graph, Value
 from neurolens.optics import coatings
 from neurolens.optics.apertures import Aperture
+from neurolens.optics.filmgraph import transmitted
 from neurolens.optics.tracegraph import Figure, meet_plain, meet_shape
 
 Action = Literal["T", "R"]
@@ -83,10 +84,8 @@ def step_graph(kind: Kind) -> Graph:
     # On the near half of a sphere: beyond it there is no glass.
     tests = [*met.tests, (g.constant(_TINY), normal[2])]
     ratio2 = g.square(point[0:2]) * per_rim2
-    if kind.absorbs:  # exp(-2 u) as (1 - tanh u) / (1 + tanh u), which every writer has
-        way = g.dot(point - x, d) * absorbed * 0.5
-        t = way.tanh()
-        power = power * ((1.0 - t) / (1.0 + t))
+    if kind.absorbs:
+        power = power * transmitted(g.dot(point - x, d) * absorbed)
     if kind.bends:
         ratio = n1 / n2
         cos2 = ratio * ratio * (q * q + -1.0) + 1.0

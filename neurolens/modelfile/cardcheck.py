@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, ModelError
+from neurolens.modelfile import AVERAGED, POLARISED
 from neurolens.modelfile.states import check_states
 
 
@@ -91,6 +92,7 @@ _RULES: dict[str, Rule] = {
     "errors": (_errors, "a table of figures from 0 up, of tables of such, of texts and lists"),
 }
 _OPTIONAL: dict[str, Rule] = {
+    "transmittance": (lambda v: v in (POLARISED, AVERAGED), f'"{POLARISED}" or "{AVERAGED}"'),
     "lens.stop_surface": (lambda v: _integer(v, 0, 9999), "an integer"),
     "lens.index_ratio": POSITIVE,
     "domain.nearest_m": (lambda v: v is None or _positive(v), "a number above 0, or null"),

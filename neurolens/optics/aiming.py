@@ -2,7 +2,8 @@
 
 Searching the front surface for the ray that meets the stop's centre fails where the pupil moves (a fisheye's chief
 ray enters centimetres beside the paraxial pupil). From the stop every start is a ray that exists: its angle in the
-scene grows steadily with its angle at the stop, and the wanted field is bracketed from the axis outwards.
+scene usually grows with its angle at the stop, and the wanted field is bracketed from the axis outwards. Where rays are
+lost in between or turn back, the first ray of that field counts: that of the axis's own branch where there is one.
 """
 
 from __future__ import annotations
@@ -14,18 +15,21 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens
 from neurolens.optics.sag import sag_mm
+from neurolens.optics.shapes import followed_mm
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 
 Axis = Literal["x", "y"]
 
-_WIDEST_DEG = 89.0  # of the angles tried at the stop
-_GRID = 713  # odd, so that the axis is included; a step of a quarter of a degree
-_STRETCH = 1.5  # of an asphere's rim: farther out the polynomial is meaningless
-_ZOOM, _ROUNDS = 17, 9  # each round narrows the bracket 16 times: to the last digit of a double
+_WIDEST_DEG = 89.9  # of the angles tried at the stop
+_GRID = 721  # odd, so that the axis is included; a step of a quarter of a degree
+_ZOOM, _ROUNDS = 17, 4  # each round narrows the bracket 16 times, until a straight line has the last digit
+_JUMP = (
+    1.0  # rad of field between neighbours in the search: more is a jump, from one side of the axis to the other, say
+)
+_MET = 1e-7  # rad from the wanted field
 
 
 class Bundle(NamedTuple):
@@ -33,7 +37,7 @@ class Bundle(NamedTuple):
 
     Attributes:
         rays: [F * H], just before the front surface, travelling to the film; field by field.
-        reached: [F, H] bool; where False the ray is that of the widest field from which this point is reached.
+        reached: [F, H] bool; where False the ray is that of the nearest field from which this point is reached.
         field_rad: [F, H], angle of the ray to the axis in front of the lens.
     """
 
@@ -43,13 +47,14 @@ class Bundle(NamedTuple):
 
 
 def without_rims(lens: Lens) -> Lens:
-    """The lens with every surface, the stop too, open as far as it goes: an asphere a little beyond its tabled rim."""
-    rows = (replace(s, diameter_mm=_STRETCH * s.diameter_mm if s.asphere else math.inf) for s in lens.surfaces)
+    """The lens with every surface, the stop too, open as far as it goes; aspheres continue beyond their rims."""
+    ends = (followed_mm(s) if s.asphere else math.inf for s in lens.surfaces)
+    rows = (replace(s, diameter_mm=math.inf, followed_mm=end) for s, end in zip(lens.surfaces, ends, strict=True))
     return replace(lens, aperture=None, surfaces=tuple(rows))
 
 
 def aim_at_stop(
-    lens: Lens, field_rad: Tensor, height_mm: Tensor, *, axis: Axis = "x", wavelength_nm: float = LINE_D_NM
+    lens: Lens, field_rad: Tensor, height_mm: Tensor, *, axis: Axis = "x", wavelength_nm: float | None = None
 ) -> Bundle:
     """Meridional rays of collimated light that cross the stop at given heights, rims ignored.
 
@@ -58,47 +63,76 @@ def aim_at_stop(
             its image lies on the negative side.
         height_mm: [F, H] heights in the stop, along `axis`.
         axis: the meridional plane, for anamorphic lenses.
+        wavelength_nm: that of reference of the lens where none is given.
     """
     front = without_rims(replace(lens, surfaces=lens.surfaces[: lens.stop_index + 1]))
+    nm = lens.reference_nm if wavelength_nm is None else wavelength_nm
     heights = height_mm.reshape(-1)
     target = field_rad[:, None].expand_as(height_mm).reshape(-1)
 
     def outwards(angle: Tensor) -> tuple[Rays, Tensor, Tensor]:
-        return _follow(front, heights[:, None].expand_as(angle), angle, axis, wavelength_nm)
+        return _follow(front, heights[:, None].expand_as(angle), angle, axis, nm)
 
     widest = math.radians(_WIDEST_DEG)
-    grid = torch.linspace(-widest, widest, _GRID, dtype=torch.float64).expand(len(heights), _GRID)
-    low, high, reached = _bracket(grid, *outwards(grid)[1:], target)
-    share = torch.linspace(0, 1, _ZOOM, dtype=torch.float64)
+    tried = torch.linspace(-widest, widest, _GRID, dtype=torch.float64)
+    each, row = torch.unique(heights, return_inverse=True)
+    _, field, exists = _follow(front, each[:, None].expand(-1, _GRID), tried.expand(len(each), -1), axis, nm)
+    exists = exists & (torch.arange(_GRID) >= _axial(tried, field, exists)[:, None])
+    ends = bracket(tried.expand(len(heights), -1), field[row], exists[row], target)
     for _ in range(_ROUNDS):
-        fine = low[:, None] + (high - low)[:, None] * share
-        _, field, exists = outwards(fine)
-        above = (field >= target[:, None]) | ~exists
-        above[:, -1] = True
-        first = above.to(torch.int8).argmax(1).clamp_min(1)[:, None]
-        low, high = fine.gather(1, first - 1)[:, 0], fine.gather(1, first)[:, 0]
-    rays, field, _ = outwards(torch.where(reached, high, low)[:, None])
+        fine = between(ends)
+        ends = bracket(fine, *outwards(fine)[1:], target)
+    off = _off(*outwards(ends)[1:], target)
+    rays, field, _ = outwards(ends.gather(1, off.argmin(1, keepdim=True)))
+    reached = off.amin(1) < _MET
     return Bundle(rays, reached.reshape(height_mm.shape), field.reshape(height_mm.shape))
 
 
-def _bracket(grid: Tensor, field: Tensor, exists: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Angles at the stop [n] below and above the one that gives the target field, and whether there is one.
+def _axial(angle: Tensor, field: Tensor, exists: Tensor) -> Tensor:
+    """Index [n] of the last angle [G] before the ray that is parallel to the axis in the scene.
 
-    The search starts at the ray along the axis and ends where rays stop existing or turn back: there, the last two.
+    Of several such rays the one that is least inclined at the stop is meant: others graze the lens's edges.
     """
-    count = grid.shape[1]
-    places = torch.arange(count)
-    start = torch.where(exists, field.abs(), math.inf).argmin(1)[:, None]
-    rising = torch.ones_like(exists)
-    rising[:, 1:] = field[:, 1:] > field[:, :-1]
-    sound = (exists & rising) | (places <= start)
-    onwards = sound.to(torch.int8).cumprod(1).bool() & exists & (places >= start)
-    there = onwards & (field >= target[:, None])
-    reached = there.any(1)
-    first = there.to(torch.int8).argmax(1)
-    last = (onwards * places).amax(1)
-    upper = torch.where(reached, first, (last + 1).clamp_max(count - 1)).clamp_min(1)[:, None]
-    return grid.gather(1, upper - 1)[:, 0], grid.gather(1, upper)[:, 0], reached
+    rises = _joined(field, exists) & (field[:, :-1] < 0) & (field[:, 1:] >= 0)
+    inclined = torch.where(rises, (angle[:-1] + angle[1:]).abs(), math.inf)
+    nearest = _off(field, exists, torch.zeros(len(field), dtype=torch.float64)).argmin(1)
+    return torch.where(rises.any(1), inclined.argmin(1), nearest)
+
+
+def _joined(value: Tensor, exists: Tensor, jump: float = _JUMP) -> Tensor:
+    """Whether neighbours [n, G - 1] both exist and are of one branch."""
+    return exists[:, 1:] & exists[:, :-1] & ((value[:, 1:] - value[:, :-1]).abs() < jump)
+
+
+def _off(field: Tensor, exists: Tensor, target: Tensor) -> Tensor:
+    """How far fields [n, G] are from their targets [n], inf where there is no ray."""
+    return torch.where(exists, (field - target[:, None]).abs(), math.inf)
+
+
+def bracket(angle: Tensor, value: Tensor, exists: Tensor, target: Tensor, jump: float = _JUMP) -> Tensor:
+    """Of increasing angles [n, G] the first neighbours whose values lie on both sides of a target [n], [n, 3].
+
+    Else the neighbours of the ray whose value is nearest to it, between which rays may come nearer yet. In the middle
+    of the three stands the angle at which the straight line between the values of the others meets the target.
+
+    Args:
+        value: [n, G] of the ray of each angle. exists: [n, G], whether there is such a ray.
+        jump: values of neighbours that differ by more are of two branches, between which there is nothing.
+    """
+    above = value >= target[:, None]
+    crosses = _joined(value, exists, jump) & (above[:, 1:] != above[:, :-1])
+    found = crosses.any(1)
+    first, nearest = crosses.to(torch.int8).argmax(1), _off(value, exists, target).argmin(1)
+    low = torch.where(found, first, (nearest - 1).clamp_min(0))
+    high = torch.where(found, first + 1, (nearest + 1).clamp_max(angle.shape[1] - 1))
+    (a, b), (va, vb) = ([v.gather(1, k[:, None])[:, 0] for k in (low, high)] for v in (angle, value))
+    share = torch.nan_to_num((target - va) / (vb - va), 0.5).clamp(0, 1)
+    return torch.stack([a, a + (b - a) * share, b], 1)
+
+
+def between(ends: Tensor) -> Tensor:
+    """Angles [n, 17] from the first to the last of `bracket`, for the next closer look."""
+    return ends[:, :1] + (ends[:, 2:] - ends[:, :1]) * torch.linspace(0, 1, _ZOOM, dtype=torch.float64)
 
 
 def _follow(

@@ -78,11 +78,11 @@ class Glass:
             value = np.interp(wavelength_nm, *np.transpose(self.absorption))
             return float(value) if np.ndim(value) == 0 else value
         total = wavelength_nm.new_full(wavelength_nm.shape, self.absorption[-1][1])
-        for nm, bend in self._bends():
+        for nm, bend in self.bends():
             total = total + bend * (nm - wavelength_nm).clamp(min=0)
         return total
 
-    def _bends(self) -> list[tuple[float, float]]:
+    def bends(self) -> list[tuple[float, float]]:
         """The piecewise linear absorption as hinges: wavelength, and the change of the derivative there.
 
         Faster than a search, fusible, and from the red end, where absorption is least, so that float32 does not lose

@@ -164,11 +164,19 @@ def _responses(
         else:
             c, e, f, layer_fade = _propagating_or_evanescent(layer_q2, wave_number * thickness_nm)
             fade = fade * layer_fade
-        s = _times(s, (c, e, f, c))
-        p = _times(p, (c, index2 * e, f / index2, c))
+        s, p = times_film(s, p, (c, e, f), index2)
     response_s = _response(q0, q, s, passes, fade, phase_beyond)
     q0_p, q_p = q0 / (n_before * n_before), q / (n_after * n_after)
     return response_s, _response(q0_p, q_p, p, passes, fade, phase_beyond)
+
+
+def times_film(s: tuple[Any, ...], p: tuple[Any, ...], film: tuple[Any, Any, Any], index2: Any) -> Any:
+    """The matrices of s and p times those of a film: of its phase cos, sin / q and q sin; tensors or values of a graph.
+
+    q is index times cosine in the film, `index2` its index squared.
+    """
+    c, e, f = film
+    return _times(s, (c, e, f, c)), _times(p, (c, index2 * e, f / index2, c))
 
 
 def _times(m: tuple[Any, ...], k: tuple[Any, ...]) -> tuple[Any, ...]:

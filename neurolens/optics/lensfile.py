@@ -175,8 +175,8 @@ class Table:
         return angle
 
 
-def read_lens(path: str | Path) -> Lens:
-    """The lens of a file, unfocused (`Lens.at` places the film).
+def read_lens(path: str | Path, data: Mapping[str, Any] | None = None) -> Lens:
+    """The lens of a file in our own format, unfocused (`Lens.at` places the film); `data`: its tables, where known.
 
     Warns:
         NeurolensWarning: glasses whose V_d is unknown; their index is taken as constant. A coating that no surface has.
@@ -185,7 +185,7 @@ def read_lens(path: str | Path) -> Lens:
         InputError: the first mistake met: an unknown or missing key, a wrong type, a value out of range, no stop or
             two, surfaces that overlap inside their rims in any zoom state. It names file, surface and field.
     """
-    data, file = read_toml(path), str(path)
+    data, file = read_toml(path) if data is None else data, str(path)
     table = Table(data, file)
     table.only(LENS_KEYS)
     if data.get("schema") != SCHEMA or isinstance(data["schema"], bool):

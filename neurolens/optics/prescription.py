@@ -8,10 +8,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
-from pathlib import Path
 from typing import Any, Literal
 
 from neurolens.base.errors import InputError
+from neurolens.base.lensname import lens_id_of
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.film_plane import LINE_D_NM
 
@@ -56,6 +56,8 @@ class Surface:
         absorption_per_mm: Napierian absorption of the medium after the surface at every wavelength (a grey filter),
             added to that of the glass.
         coating: the thin films on the surface, None where bare.
+        followed_mm: distance from the axis from which on an asphere continues smoothly instead of by its polynomial;
+            only `aiming.without_rims` sets it, for questions that ignore rims (`shapes.followed_mm`).
 
     `radius_mm`, `thickness_mm`, `n_d`, `conic` and the coefficients of `asphere` may be 0-d tensors where gradients
     with respect to them are wanted.
@@ -76,6 +78,7 @@ class Surface:
     glass: str | None = None
     absorption_per_mm: float = 0.0
     coating: Coating | None = None
+    followed_mm: float = math.inf
 
     @property
     def curvature(self) -> Any:
@@ -228,8 +231,8 @@ class Lens:
 
     @property
     def lens_id(self) -> str:
-        """Stem of the lens file: the name that models carry."""
-        return Path(self.path).stem
+        """The name that models carry, of the lens's file."""
+        return lens_id_of(self.path)
 
     @property
     def sha256(self) -> str:
@@ -308,7 +311,7 @@ class Lens:
                 asphere=tuple((p, a * factor ** (1 - p)) for p, a in s.asphere),
                 absorption_per_mm=s.absorption_per_mm / factor,
                 across=s.across and (s.across[0] * factor, s.across[1]),
-                **lengths(s, "radius_mm", "thickness_mm", "diameter_mm", "focal_mm"),
+                **lengths(s, "radius_mm", "thickness_mm", "diameter_mm", "focal_mm", "followed_mm"),
             )
             for s in self.surfaces
         )

@@ -12,14 +12,10 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
-import torch
-
 from neurolens.base.errors import InputError
-from neurolens.optics.aiming import aim_at_stop, without_rims
 from neurolens.optics.paraxial import first_order, stop_radius_mm
 from neurolens.optics.prescription import Configuration, Lens, Surface
 from neurolens.optics.sag import end_mm, neighbours, sag_mm
-from neurolens.optics.trace import trace
 
 _FIELDS = 17  # from the axis to the edge; rims are usually widest at one of the ends
 _HEIGHTS = (-1.0, -0.75, -0.5, 0.0, 0.5, 0.75, 1.0)  # in the stop, as shares of what the rule lets through
@@ -129,7 +125,7 @@ def with_derived_rims(lens: Lens) -> Lens:
         lens = lens.with_stop_radius(stop_radius_mm(lens, lens.f_number))
     if not any(s.asphere and math.isnan(s.diameter_mm) for s in lens.surfaces):
         return replace(_filled(lens, derive_rims(lens)[0]), rims="derived")
-    # Aspheres are traced no farther than a little beyond a rim: from those of their vertex spheres, until they stay.
+    # Figures of aspheres are followed little beyond a rim: from the rims of their vertex spheres, until they stay.
     found = _filled(lens, derive_rims(_spherical(lens))[0])
     for _ in range(_ROUNDS):
         before, found = found, _filled(lens, derive_rims(found)[0])
@@ -194,6 +190,11 @@ def _stop_of(lens: Lens, c: Configuration) -> float:
 
 def _beams(lens: Lens, rule: RimRule, field_deg: float) -> tuple[list[float], list[float]]:
     """Semi-diameters that the beam of the axis and those of the field need at every surface, mm."""
+    import torch  # rays are traced; rims are narrowed without it
+
+    from neurolens.optics.aiming import aim_at_stop, without_rims
+    from neurolens.optics.trace import trace
+
     share = torch.linspace(0, 1, _FIELDS, dtype=torch.float64)
     kept = lens.stop_radius_mm * (1 - (1 - rule.vignetting) * share)
     heights = kept[:, None] * torch.tensor(_HEIGHTS, dtype=torch.float64)

@@ -28,8 +28,7 @@ from neurolens.optics.passing import (
 )
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.surfaces import Hit, Medium, Rays, fresnel_transmittance, root, times
-from neurolens.optics.transmission import normal_at, pass_surface, step_at, unpolarised, way_mm
-from neurolens.optics.transmission import power as power_of
+from neurolens.optics.transmission import Passage, normal_at, way_mm
 
 Action = Literal["T", "R"]
 Towards = Literal["scene", "film"]
@@ -106,7 +105,7 @@ def follow(
     after = glasses[0 if mode.sense > 0 else -1]
     r, tests = start(rays, after, mode, st.blocked(steps[0][0], st.MISSED), lit)
     power, vertex = torch.ones_like(r.x), 0.0
-    field = unpolarised([times(d, 1 / after.n) for d in r[3:]]) if polarised else None
+    passage = Passage(lens, wavelength_nm, r.x) if polarised else None
     points = []
     for position, (k, action) in enumerate(steps):
         r, vertex = r._replace(z=r.z + (vertex - vertices[k])), vertices[k]
@@ -114,20 +113,20 @@ def follow(
         before, after = (glasses[k], glasses[k + 1]) if ahead else (glasses[k + 1], glasses[k])
         hit = meet(lens, k, r, before, position == 0, mode, tests)
         points.append((hit.x, hit.y, hit.z + vertex))
-        absorbed = absorption[k if ahead else k + 1]
-        if absorbed is not None:
-            power = power * torch.exp(-way_mm(r, hit, before) * absorbed)
-        surface, came, sense, met = lens.surfaces[k], r, mode.sense, (before, after)
+        surface, came, sense, met, q = lens.surfaces[k], r, mode.sense, (before, after), hit.q
         if action == "R":
             r, after, mode = _reflect(surface, r, hit, sense), before, mode._replace(sense=-sense)
         else:
-            r, _, _ = bend(surface, k, r, hit, before, after, mode, tests)
-        if field is None:
-            power = power * _share(surface, hit, *met, sense, wavelength_nm, action)
-        else:
-            field = pass_surface(field, step_at(surface, hit, came, r, *met, sense, action == "R"), wavelength_nm)
+            r, q, _ = bend(surface, k, r, hit, before, after, mode, tests)
+        if passage is not None:
+            passage.pass_surface(k, came, hit, q, met, sense, action == "R")
+            continue
+        power = power * _share(surface, hit, *met, sense, wavelength_nm, action)
+        absorbed = absorption[k if ahead else k + 1]
+        if absorbed is not None:
+            power = power * torch.exp(-way_mm(came, hit, before) * absorbed)
     r = along_axis(unit(r._replace(z=r.z + vertex), after), tests, mode.sense, vertex)
-    power = power if field is None else power * power_of(field)
+    power = power if passage is None else passage.arrived()
     return Followed(r, tests.status(), tests.only(power, 0.0), tuple(points))
 
 

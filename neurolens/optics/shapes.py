@@ -4,21 +4,26 @@ A conic surface of curvature c and constant K is c (x^2 + y^2 + (1 + K) z^2) - 2
 the coordinate along which it is straight. Both are met in closed form. An asphere adds A_p h^p, h the distance from
 the axis (from the plane of symmetry, for a cylinder): an iteration of Newton's kind along the ray, started from the
 conic that fits best; started at the vertex plane it fails beyond about 55 degrees. Toroids and biconics likewise.
+
+Beyond its rim a polynomial soon means nothing: a term in r^20 is 3,000 times as large at 1.5 times the rim. Where rims
+are ignored an asphere therefore follows its figures only as far as they stay close to the slope at the rim, and then
+continues with the same slope and curvature, which dies away: it becomes a cone that every ray can meet.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from neurolens.optics.prescription import Surface
-from neurolens.optics.sag import biconic, sag_mm, toroid
+from neurolens.optics.sag import biconic, sag_and_derivatives, sag_mm, toroid
 from neurolens.optics.surfaces import (
     Hit,
     Medium,
@@ -44,6 +49,10 @@ POLISH = {torch.float32: 0, torch.float64: 2}
 LAST_STEP = 3e-4
 # cos^2 of the slope of the steepest conic that the iteration follows.
 STEEPEST = 1e-7
+# How far (rad) the slope of an asphere may turn beyond its rim before it continues smoothly, and again after that.
+TURN = 0.25
+FARTHEST = 1.5  # rim radii up to which figures are followed at most
+_UPRIGHT = 1e6  # slope and bend that stand for infinite ones
 
 
 def is_plain(surface: Surface) -> bool:
@@ -145,7 +154,7 @@ def _meet_asphere(r: Rays, m: Vector, surface: Surface, w: tuple[float, float], 
         nz, q = 1.0, torch.addcmul(torch.addcmul(p[2], nx, p[0]), ny, p[1]) * (scale * sense)
     length = times((deciding if polish else step).abs(), before.n)
     met = also(
-        at_most(length, LAST_STEP * surface.semi_diameter_mm, spend=spend),
+        at_most(length, LAST_STEP * _extent_mm(surface), spend=spend),
         positive(q.clone() if spend else q, spend=spend),
     )
     if cos2 is not None:
@@ -158,12 +167,65 @@ def _meet_asphere(r: Rays, m: Vector, surface: Surface, w: tuple[float, float], 
 def start_of(surface: Surface) -> tuple[tuple[float, float, float], int]:
     """The quadric cx x^2 + cy y^2 + cz z^2 = 2 z nearest to a surface inside its rim, and the steps it needs."""
     asphere = tuple((p, _number(a)) for p, a in surface.asphere)
-    curve = _number(surface.curvature), _number(surface.conic), asphere, surface.semi_diameter_mm
+    curve = _number(surface.curvature), _number(surface.conic), asphere, _extent_mm(surface)
     if not surface.across:
         (c, cz), steps = _fitted(*curve)
         return (c * (surface.cylinder != "y"), c * (surface.cylinder != "x"), cz), steps
     (c, other, cz), steps = _fitted_crossed(*curve, surface.across)
     return ((other, c, cz) if surface.cylinder == "y" else (c, other, cz)), steps
+
+
+def followed_mm(surface: Surface) -> float:
+    """Distance from the axis up to which an asphere's figures are followed where rims are ignored, at least its rim."""
+    height = surface.semi_diameter_mm * np.linspace(1, FARTHEST, 51)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        angle = np.arctan(_profile(surface, height)[0])
+        tame = np.abs(angle - angle[0]) <= TURN  # NaN beyond the end of the conic is not
+    return float(height[max(int(np.argmin(tame)) - 1, 0) if not tame.all() else -1])
+
+
+def _profile(surface: Surface, height: Any) -> tuple[Any, Any]:
+    """First and second derivative by the height of a surface's meridional curve (of a cylinder: across its lines)."""
+    curve = replace(surface, cylinder=None, across=None)
+    step = 1e-4 * height
+    before, slope = (sag_and_derivatives(curve, h, 0 * h)[1] for h in (height - step, height))
+    return slope, (slope - before) / step
+
+
+def _extent_mm(surface: Surface) -> float:
+    """Distance from the axis up to which a surface's own figures hold."""
+    return min(surface.semi_diameter_mm, surface.followed_mm)
+
+
+@lru_cache(maxsize=4096)
+def _end_of(surface: Surface) -> tuple[float, float, float]:
+    """Slope and second derivative of the curve where its figures end, and the length in which the latter dies away."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # a conic may end at its rim, upright
+        profile = _profile(surface, np.array(surface.followed_mm))
+    slope, bend = (float(np.nan_to_num(v, nan=0.0, posinf=_UPRIGHT, neginf=-_UPRIGHT)) for v in profile)
+    return slope, bend, min(TURN * surface.followed_mm, TURN * (1 + slope * slope) / max(abs(bend), 1e-300))
+
+
+class _Beyond(NamedTuple):
+    """How a curve continues where its figures end, each [N]; at points inside 0, 1, 0.
+
+    With d the distance beyond the end: its slope there is slope + bend * length * (1 - exp(-d / length)).
+    """
+
+    rise: Tensor  # what is added to the sag at the end
+    share: Tensor  # by which d sag / d h over h at the end is multiplied
+    turned: Tensor  # what is added to that
+    turn: Tensor  # the change of the sum by h over h
+
+
+def _beyond(surface: Surface, h2: Tensor) -> _Beyond:
+    slope, bend, length = _end_of(surface)
+    h = torch.sqrt(h2.clamp_min(1e-30)).clamp_min(surface.followed_mm)
+    d = h - surface.followed_mm
+    left = torch.exp(d / -length)
+    turned = bend * length * (1 - left)
+    rise = slope * d + bend * length * (d - length * (1 - left))
+    return _Beyond(rise, surface.followed_mm / h, turned / h, (bend * left - (slope + turned) / h) / (h * h))
 
 
 def _number(value: Any) -> float:
@@ -270,6 +332,15 @@ def _step(at: Vector, p: Vector, surface: Surface, w: tuple[float, float], sense
 def _sag(surface: Surface, w: tuple[float, float], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
     """Depth at points [N], d sag / d h over h, and the change of this by h over h of the conic alone (None without)."""
     h2 = _height2(w, x, y)
+    if surface.followed_mm == math.inf:
+        return _own_sag(surface, h2)
+    end2, more = surface.followed_mm**2, _beyond(surface, h2)
+    sag, derivative, turn = _own_sag(surface, h2.clamp_max(end2))
+    turn = torch.where(h2 > end2, more.turn, 0.0 if turn is None else turn)
+    return sag + more.rise, derivative * more.share + more.turned, turn
+
+
+def _own_sag(surface: Surface, h2: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
     sag, derivative = _polynomials(surface, h2, (0, 1))
     c = surface.curvature
     if not isinstance(c, Tensor) and c == 0:
@@ -285,6 +356,14 @@ def _sag(surface: Surface, w: tuple[float, float], x: Tensor, y: Tensor) -> tupl
 def _derivative(surface: Surface, w: tuple[float, float], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor | None]:
     """d sag / d h divided by h at points [N], and the conic's squared cosine, positive where it exists."""
     h2 = _height2(w, x, y)
+    if surface.followed_mm == math.inf:
+        return _own_derivative(surface, h2)
+    derivative, cos2 = _own_derivative(surface, h2.clamp_max(surface.followed_mm**2))
+    more = _beyond(surface, h2)
+    return derivative * more.share + more.turned, cos2
+
+
+def _own_derivative(surface: Surface, h2: Tensor) -> tuple[Tensor, Tensor | None]:
     (derivative,) = _polynomials(surface, h2, (1,))
     c = surface.curvature
     if not isinstance(c, Tensor) and c == 0:

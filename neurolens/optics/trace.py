@@ -34,10 +34,9 @@ from neurolens.optics.passing import (
 from neurolens.optics.prescription import Lens
 from neurolens.optics.shapes import start_of
 from neurolens.optics.surfaces import Counts, Rays, times
-from neurolens.optics.transmission import passage
+from neurolens.optics.transmission import Passage
 
 Towards = Literal["scene", "film"]
-Transmittance = bool | Literal["polarised"]
 
 # Rays per chunk: long enough to hide the cost of calling an operator, short enough for a core's second-level cache.
 CHUNK = 32768
@@ -80,7 +79,7 @@ class Traced(NamedTuple):
 class _Wanted(NamedTuple):
     """What to follow besides the rays; see `trace`."""
 
-    transmittance: Transmittance
+    transmittance: bool
     record: tuple[int, ...]
     path: bool
 
@@ -91,7 +90,7 @@ def trace(
     wavelength_nm: Tensor | float | None = None,
     *,
     towards: Towards = "scene",
-    transmittance: Transmittance = False,
+    transmittance: bool = False,
     record: Sequence[int] = (),
     path: bool = False,
 ) -> Traced:
@@ -103,14 +102,13 @@ def trace(
         wavelength_nm: one number, or a tensor [N], of which NaN and what is not positive pass no dispersive glass; None
             takes `Lens.reference_nm`.
         towards: "scene" for camera rays (-z), "film" for light from the scene (+z).
-        transmittance: whether to follow the transmittance; "polarised" follows the polarisation that each surface
-            gives to unpolarised light, where True averages it away at every surface.
+        transmittance: whether to follow the power of unpolarised light, with the polarisation that surfaces give to it.
         record: surfaces whose crossings are wanted.
         path: whether the points on all surfaces and the directions after them are wanted.
 
     Raises:
         InputError: components of unequal shapes or dtypes or of another dtype, a wavelength of another shape or a
-            number that is not positive, an unknown `towards` or `transmittance`, a surface to record that the lens
+            number that is not positive, an unknown `towards`, a surface to record that the lens
             does not have.
 
     A direction that is not a unit vector counts as a miss of the first surface.
@@ -124,8 +122,6 @@ def trace(
         raise InputError("trace", "towards", towards, '"scene" or "film"')
     if any(not 0 <= k < len(lens.surfaces) for k in record):
         raise InputError("trace", "record", tuple(record), f"surfaces from 0 to {len(lens.surfaces) - 1}")
-    if transmittance not in (True, False, "polarised"):
-        raise InputError("trace", "transmittance", transmittance, 'True, False or "polarised"')
     wanted = _Wanted(transmittance, tuple(record), path)
     needs_grad = any(_differentiated(v) for v in (*rays, wavelength_nm, *_parameters(lens)))
     count = rays.x.shape[0]
@@ -158,7 +154,7 @@ def passing(lens: Lens, rays: Rays, wavelength_nm: float, *, towards: Towards = 
 
 
 def compile_trace(
-    lens: Lens, *, towards: Towards = "scene", transmittance: Transmittance = False
+    lens: Lens, *, towards: Towards = "scene", transmittance: bool = False
 ) -> Callable[[Rays, Tensor], Traced]:
     """The same trace with the prescription folded in as constants, compiled by torch for chunks of one length.
 
@@ -229,7 +225,7 @@ def _trace_chunk(
     glasses = media(lens, wavelength_nm)  # glasses[k] lies before surface k as light travels to the film
     mode = Mode(sense, freeze or wanted.path or bool(wanted.record), freeze)
     r, tests = start(rays, glasses[0 if sense > 0 else -1], mode, st.blocked(order[0], st.MISSED), lit)
-    power = passage(lens, wavelength_nm, sense, wanted.transmittance, rays.x)
+    power = Passage(lens, wavelength_nm, rays.x) if wanted.transmittance else None
     crossings: dict[int, Crossing] = {}
     path: list[Rays] = []
     vertex = 0.0
@@ -241,7 +237,7 @@ def _trace_chunk(
         hit = meet(lens, k, r, before, position == 0, mode, tests)
         bent, q, q2 = bend(lens.surfaces[k], k, r, hit, before, after, mode, tests)
         if power is not None:
-            power.pass_surface(k, r, hit, bent, q, before, after)
+            power.pass_surface(k, r, hit, q, (before, after), sense)
         if k in wanted.record:
             margins = times(hit.q2, before.inverse_n2), times(q2, after.inverse_n2)
             crossings[k] = Crossing(*unfolded(lens.surfaces[k], hit), *margins)

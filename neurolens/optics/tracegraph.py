@@ -1,8 +1,8 @@
 """The exact lens as a graph, from which C is written: the best that tracing can do, with which surrogates are compared.
 
-Surfaces of every shape, stop, rims, missed surfaces, total reflection, dispersion; transmittance of bare surfaces
-(Fresnel, unpolarised, averaged at each surface) and of coated ones as if bare: coatings cost no time here. Ray
-tracing after Feder, J. Opt. Soc. Am. 41 (1951); conics, cylinders and aspheres as in `shapes`.
+Surfaces of every shape, stop, rims, missed surfaces, total reflection, dispersion; transmittance of bare and coated
+surfaces with the polarisation that each gives to the light (`transmission`), and what glass absorbs. Ray tracing after
+Feder, J. Opt. Soc. Am. 41 (1951); conics, cylinders and aspheres as in `shapes`.
 """
 
 from __future__ import annotations
@@ -14,11 +14,16 @@ import numpy as np
 
 from neurolens.base import status as st
 from neurolens.graph.ir import Graph, Value
+from neurolens.optics.filmgraph import Wave, absorption, coated_shares, transmitted
 from neurolens.optics.glass import index_of
 from neurolens.optics.prescription import Lens, Medium, Surface
 from neurolens.optics.sag import biconic, toroid
 from neurolens.optics.shapes import LAST_STEP, STEEPEST, is_plain, start_of
+from neurolens.optics.transmission import Light, crossed, crossed_spheres, fresnel, pass_surface, turned
 
+TRANSMITTANCE = (
+    "Transmittance: of unpolarised light, with the polarisation that surfaces give to it, coatings and absorption."
+)
 # The index is a polynomial in 1 / lambda^2 that holds it to float32's last bit.
 _INDEX = 3e-8
 _TINY = 1e-30  # least value under a root
@@ -35,8 +40,6 @@ def exact_graph(
         pupil_z_mm: plane of the pupil points. wavelength_nm: range in which the indices hold to float32's last bit.
         whole: with stop, rims and transmittance; else the ray alone, and whether it gets through.
         path: an output more, `path` [2 K]: z and y of the crossing with each surface, that next to the film first.
-
-    Coatings and absorption are not followed: callers that need them must refuse such lenses.
     """
     tracing = _Tracing(lens, pupil_z_mm, wavelength_nm, whole)
     if path:
@@ -49,11 +52,14 @@ class _Tracing:
         self.lens, self.wavelength_nm, self.whole = lens, wavelength_nm, whole
         self.graph = g = Graph()
         rays, film_z = g.input("rays", 5), g.input("film_z_mm", per_call=True)
-        self.inverse_square = g.square(1000.0 / rays[4]) if lens.dispersive else g.constant(0.0)
+        self.wave, self.inverse_square = Wave(rays[4], wavelength_nm), g.square(1000.0 / rays[4])
         self.stop_square = g.square(g.input("stop_radius_mm", per_call=True)) if whole else g.constant(0.0)
         self.indices: dict[object, Value] = {}
         self.tests: list[tuple[Test, int]] = []  # in the order in which rays meet them, with their codes
-        self.at_stop, self.power = rays[0:2], g.constant(1.0)
+        self.at_stop = rays[0:2]
+        self.light: Light | None = None
+        self.last: tuple[int, Value, Value] | None = None  # surface that acted on the light, its normal, cosine behind
+        self.depth: Value | None = None  # sum of path length times absorption
         self.crossings: list[Value] = []
         way = g.concat(rays[2:4] - rays[0:2], pupil_z_mm - film_z)
         self.d = way * (1.0 / g.square(way).sqrt())
@@ -71,7 +77,9 @@ class _Tracing:
             self.crossings += [self.x[2] + float(lens.vertices_mm[k]), self.x[1]]
         g.outputs["scene_ray"] = g.concat(self.x, self.d)
         if self.whole:
-            g.outputs |= {"transmittance": self.power, "stop_xy_mm": self.at_stop}
+            power = g.constant(1.0) if self.light is None else self.light.power
+            arrived = power if self.depth is None else power * transmitted(self.depth)
+            g.outputs |= {"transmittance": arrived, "stop_xy_mm": self.at_stop}
         tests, codes = zip(*self.tests, strict=True) if self.tests else ((), ())
         g.outputs["status"] = g.first_failure(tests, codes).whole()
 
@@ -79,6 +87,8 @@ class _Tracing:
         g, d = self.graph, self.d
         nearest = d * -g.dot(self.x, d) + self.x  # of the ray's points, to the vertex
         met = meet_plain(nearest, d, float(s.curvature)) if is_plain(s) else meet_shape(nearest, d, figure_of(s))
+        if self.whole:
+            self._absorb(s, met.point)
         self.x = met.point
         self.tests += [(test, st.blocked(k, st.MISSED)) for test in met.tests]
         if s.stop:
@@ -90,9 +100,10 @@ class _Tracing:
         if s.focal_mm is not None:  # slopes change by -x / f and -y / f, as light travels
             d = g.concat(self.x[0:2] * d[2] * (1 / s.focal_mm) + d[0:2], d[2])
             self.d = d * (1.0 / g.square(d).sqrt())
-        if before == after:
+        layers = s.coating.layers if s.coating and self.whole else ()
+        if before == after and not layers:
             return
-        ratio, q = before / after, met.cosine
+        arriving, ratio, q = self.d, before / after, met.cosine
         cos2 = ratio * ratio * (q * q + -1.0) + 1.0
         self.tests.append((_above(cos2), st.blocked(k, st.TOTAL_REFLECTION)))
         cos = cos2.sqrt()
@@ -103,14 +114,39 @@ class _Tracing:
             turn = bent * float(s.curvature)
             self.d = g.concat(self.x[0:2] * turn + d[0:2] * ratio, d[2] * ratio + (self.x[2] * turn + -bent))
         if self.whole:
-            self._fresnel(q, cos, before, after)
+            self._transmit(k, met, arriving, cos, (before, after))
 
-    def _fresnel(self, cos_i: Value, cos_t: Value, before: Value, after: Value) -> None:
-        """(Ts + Tp) / 2 with one division: 2 a b (1 / s^2 + 1 / p^2), s = n1 c1 + n2 c2, p = n2 c1 + n1 c2."""
-        s = before * cos_i + after * cos_t
-        p = after * cos_i + before * cos_t
-        product, both = (before * cos_i) * (after * cos_t), s * p
-        self.power = self.power * (product * 2.0 * (s * s + p * p) / (both * both))
+    def _transmit(self, k: int, met: _Meeting, d: Value, cos_t: Value, media: tuple[Value, Value]) -> None:
+        """Carry the light through a surface, for rays of direction d that leave at this cosine."""
+        g, s, (before, after) = self.graph, self.lens.surfaces[k], media
+        c, cos_i, normal = float(s.curvature), met.cosine, met.normal
+        if normal is None:
+            normal = g.concat(self.x[0:2] * -c, self.x[2] * -c + 1.0) if c else g.constant([0.0, 0.0, 1.0])
+        if s.coating and s.coating.layers:
+            sides = self.lens.media[k : k + 2]
+            sine = min(max(float(index_of(m, nm)) for nm in self.wavelength_nm) for m in sides)
+            shares = coated_shares(s.coating.layers, (cos_i, cos_t), media, sine, self.wave)
+        else:
+            shares = fresnel(before * cos_i, after * cos_t, after * cos_i + before * cos_t)
+        turn = None
+        if self.last is not None:
+            last, other, cosine = self.last
+            pair = self.lens.surfaces[last], s
+            if all(is_plain(one) for one in pair):
+                gap = float(self.lens.vertices_mm[k] - self.lens.vertices_mm[last])
+                across = crossed_spheres(self.x, d, (float(pair[0].curvature), c), gap)
+            else:
+                across = crossed(d, other, normal)
+            turn = turned(other, normal, cosine * cos_i, across)
+        self.light = pass_surface(self.light, turn, shares)
+        self.last = k, normal, cos_t
+
+    def _absorb(self, s: Surface, to: Value) -> None:
+        """What the medium behind surface s, as light comes from the scene, takes on the way from the last point."""
+        absorbed = absorption(s, self.wave)
+        if absorbed is not None:
+            depth = self.graph.dot(to - self.x, self.d) * absorbed
+            self.depth = depth if self.depth is None else self.depth + depth
 
     def _index(self, k: int) -> Value:
         """Index of the medium in front of surface k, as light comes from the scene."""

@@ -1,185 +1,197 @@
-"""Power that arrives: what surfaces reflect and glass absorbs on the way, averaged over polarisation or with it.
+"""Power of unpolarised light that arrives: what surfaces transmit or reflect, and what glass absorbs on the way.
 
-By default the transmittance of unpolarised light is the product over surfaces of (Ts + Tp) / 2: up to about 0.01
-from exact polarised transmission, since one surface polarises the light that the next one meets. For that the field
-is followed as a vector in the lens frame, which needs no angles between s and p directions: Yun, Crabtree and
-Chipman 2011, "Three-dimensional polarization ray-tracing calculus I", Applied Optics 50(18). |E|^2 is power.
+Each surface polarises the light that the next one meets, whose plane of incidence may be another. So Stokes parameters
+are followed: at each surface they are turned into its plane of incidence, and the surface acts on s and p. Angles stand
+only in the cosine and sine of twice the turn, which are products of normals and directions. Sources: Born and Wolf,
+Principles of Optics, 1.5.2 and 10.9.3; Chipman, Lam and Young, Polarized Light and Optical Systems, chapter 6.
+
+`Light`, `Shares` and the functions on them compute with tensors and with values of a graph alike.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from neurolens.optics.coatings import Layers, power_amplitudes, transmittance
+from neurolens.optics.coatings import Layers, power_amplitudes
 from neurolens.optics.passing import absorption_per_mm
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.surfaces import Hit, Medium, Rays, fresnel_transmittance, times
+from neurolens.optics.shapes import is_plain
+from neurolens.optics.surfaces import Hit, Medium, Rays, times
 
-Vector = Sequence[Tensor]  # x, y, z, each [N], lens frame
+Vector = Any  # x, y, z in the lens frame: three tensors [N], or the rows of a value
+
+# Added to the square of a turn's cosine: at exactly normal incidence, where there is no plane, nothing is turned.
+_FLOOR = 1e-30
 
 
-class Step(NamedTuple):
-    """What one surface does to N rays.
+class Light(NamedTuple):
+    """Stokes parameters of light that was unpolarised and of power 1, about the plane of incidence of a surface.
 
     Attributes:
-        normal: x, y, z of the unit normal where the rays meet the surface, of either sign, each [N].
-        before, after: unit directions, x, y, z each [N].
-        n_before, n_after: indices (number or [N]) in front of the surface and beyond it as the light meets them.
-        layers: coating, as in `prescription.Coating`; empty where bare.
-        sense: +1 for light towards the film, -1 towards the scene: the order in which it meets the layers.
-        reflected: whether the rays are reflected there (ghosts) rather than transmitted.
+        power: of both polarisations together, which is the transmittance so far.
+        excess: power of s, polarised across the plane of incidence, less that of p, polarised in it.
+        diagonal, circular: real and imaginary part of 2 E_s times the conjugate of E_p; None while they are 0.
     """
 
-    normal: Vector
-    before: Vector
-    after: Vector
-    n_before: Any
-    n_after: Any
-    layers: Layers = ()
-    sense: int = 1
-    reflected: bool = False
+    power: Any
+    excess: Any
+    diagonal: Any = None
+    circular: Any = None
 
 
-def step_at(
-    surface: Surface, hit: Hit, r: Rays, away: Rays, before: Medium, after: Medium, sense: int, reflected: bool = False
-) -> Step:
-    """The step of rays that meet a surface and go away from it; the media are those as the light meets them."""
-    pairs = (r, before), (away, before if reflected else after)
-    ahead, behind = ([times(d, 1 / m.n) for d in rays[3:]] for rays, m in pairs)
-    layers = surface.coating.layers if surface.coating else ()
-    return Step(normal_at(surface, hit), ahead, behind, before.n, after.n, layers, sense, reflected)
+class Shares(NamedTuple):
+    """What a surface does to s and p, all but the last two to be multiplied by `above / below`.
 
-
-def unpolarised(direction: Vector) -> Tensor:
-    """Two orthogonal fields of unit power across unit directions (x, y, z each [N]), for `pass_surface` and `power`.
-
-    Returns [2, 2, 3, N]: real and imaginary part of the two fields, x, y, z. Pairs of reals compile, complex numbers do
-    not.
-    """
-    k = _stacked(direction)
-    s = _across(k, k)
-    fields = torch.stack([s, _cross(k, s)])
-    return torch.stack([fields, torch.zeros_like(fields)])
-
-
-def pass_surface(field: Tensor, step: Step, wavelength_nm: Any) -> Tensor:
-    """What becomes of fields [2, 2, 3, N] (see `unpolarised`) at one surface.
-
-    They are resolved along s and p, the surface acts on each, and they are added up across the new direction.
-    """
-    if not step.layers and not step.reflected and step.n_before is step.n_after:
-        return field
-    normal, before, after = _stacked(step.normal), _stacked(step.before), _stacked(step.after)
-    cos_i = (normal * before).sum(0).abs()
-    media = step.n_before, step.n_after
-    s_part, p_part = power_amplitudes(cos_i, *media, step.layers, wavelength_nm, step.sense, step.reflected)
-    s = _across(before, normal)
-    along_s, along_p = (field * s).sum(2), (field * _cross(before, s)).sum(2)
-    return _times(along_s, *s_part) * s + _times(along_p, *p_part) * _cross(after, s)
-
-
-def power(field: Tensor) -> Tensor:
-    """Mean power [N] of the two fields of `unpolarised`, which is that of unpolarised light."""
-    return 0.5 * (field * field).sum((0, 1, 2))
-
-
-def _times(along: Tensor, real: Tensor, imaginary: Tensor) -> Tensor:
-    """Complex product of components [2, 2, N] and an amplitude, as [2, 2, 1, N]."""
-    re, im = along
-    return torch.stack([re * real - im * imaginary, re * imaginary + im * real]).unsqueeze(2)
-
-
-def _across(direction: Tensor, normal: Tensor) -> Tensor:
-    """Unit vectors [3, N] across direction and normal; where these agree, any perpendicular ones."""
-    s = _cross(direction, normal)
-    length2 = (s * s).sum(0)
-    aligned = ~(length2 > torch.finfo(s.dtype).eps)
-    x, y, z = direction
-    zero = torch.zeros_like(x)
-    other = torch.where(x.abs() < 0.6, torch.stack([zero, z, -y]), torch.stack([-z, zero, x]))
-    s = torch.where(aligned, other, s)
-    length2 = torch.where(aligned, (other * other).sum(0), length2)
-    return s / torch.sqrt(length2)
-
-
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    return torch.linalg.cross(a, b, dim=0)
-
-
-def _stacked(vector: Vector) -> Tensor:
-    return torch.stack(tuple(vector))
-
-
-def passage(
-    lens: Lens, wavelength_nm: Tensor | float, sense: int, wanted: bool | Literal["polarised"], like: Tensor
-) -> _Averaged | _Polarised | None:
-    """The tracker of the power of rays of the shape of `like`, or None where it is not wanted."""
-    if not wanted:
-        return None
-    return (_Polarised if wanted == "polarised" else _Averaged)(lens, wavelength_nm, sense, like)
-
-
-class _Absorbed:
-    """Power carried along while rays are traced: absorption by Beer and Lambert's law; surfaces are its children's:
-    `pass_surface` for surface k (rays before it, their hit, rays after it, n' cos t, media); `arrived`, unpolarised,
-    [N].
+    Attributes:
+        mean, half: mean of the shares of power of s and p that go on, and half of their difference.
+        real, imaginary: of the amplitude of s times the conjugate of that of p; None for 0.
     """
 
-    def __init__(self, lens: Lens, wavelength_nm: Tensor | float, sense: int, like: Tensor) -> None:
-        self._lens, self._wavelength_nm, self._sense = lens, wavelength_nm, sense
+    mean: Any
+    half: Any
+    real: Any
+    imaginary: Any = None
+    above: Any = 1.0
+    below: Any = 1.0
+
+
+def fresnel(before: Any, after: Any, p: Any) -> Shares:
+    """What a bare surface transmits (Born and Wolf, 1.5.2).
+
+    Args:
+        before, after: index times cosine in front of the surface and behind it, n cos i and n' cos t.
+        p: n' cos i + n cos t.
+    """
+    s = before + after
+    s2, p2 = s * s, p * p
+    return Shares(p2 + s2, p2 - s2, s * p * 2.0, None, before * after * 2.0, s2 * p2)
+
+
+def pass_surface(light: Light | None, turn: tuple[Any, Any] | None, shares: Shares) -> Light:
+    """The light behind a surface that transmits or reflects it.
+
+    Args:
+        light: from the last surface that did anything to it; None before the first, where it is unpolarised.
+        turn: from that surface's plane of incidence into this one's, as `turned`; None before the first surface.
+    """
+    mean, half, real, imaginary, above, below = shares
+    if light is None or turn is None:
+        scale = above / below
+        return Light(mean * scale, half * scale)
+    along, across = turn
+    along2, across2 = along * along + _FLOOR, across * across
+    cos, sin, size = along2 - across2, along * across * 2.0, along2 + across2
+    scale = above / (below * size)
+    power, excess, diagonal = light.power * size, light.excess * cos, -(light.excess * sin)
+    if light.diagonal is not None:
+        excess, diagonal = _plus(excess, light.diagonal, sin), _plus(diagonal, light.diagonal, cos)
+    linear, circular = diagonal * real, None if light.circular is None else light.circular * size
+    parts = [(circular, real), (diagonal, imaginary)]
+    twists = [a * b for a, b in parts if a is not None and b is not None]
+    if circular is not None and imaginary is not None:
+        linear = linear - circular * imaginary
+    return Light(
+        _plus(power * mean, excess, half) * scale,
+        _plus(power * half, excess, mean) * scale,
+        linear * scale,
+        sum(twists[1:], twists[0]) * scale if twists else None,
+    )
+
+
+def turned(last: Vector, normal: Vector, cosines: Any, across: Any) -> tuple[Any, Any]:
+    """The turn from one plane of incidence into the next: its cosine and sine, both times the same size.
+
+    The direction d lies in both planes; across them are s = d x n and s' = d x n', with s s' = n n' - (d n)(d n') and
+    s x s' = d det(d, n, n').
+
+    Args:
+        last, normal: unit normals of the two surfaces. cosines: (d n)(d n'). across: det(d, n, n'), see `crossed`.
+    """
+    return _plus(_plus(last[0] * normal[0], last[1], normal[1]), last[2], normal[2]) - cosines, across
+
+
+def crossed(d: Vector, a: Vector, b: Vector) -> Any:
+    """det(d, a, b)."""
+    return d[0] * (a[1] * b[2] - a[2] * b[1]) + d[1] * (a[2] * b[0] - a[0] * b[2]) + d[2] * (a[0] * b[1] - a[1] * b[0])
+
+
+def crossed_spheres(point: Vector, d: Vector, curvatures: tuple[Any, Any], gap_mm: Any) -> Any:
+    """`crossed` of the normals of two spheres with vertices on the axis, so far apart; the point is on the ray.
+
+    Their normals are (0, 0, 1) - c P for points P from the vertex: what is left is the ray's skewness, x dy - y dx, by
+    a number.
+    """
+    first, second = curvatures
+    return (point[0] * d[1] - point[1] * d[0]) * (first - second + first * second * gap_mm)
+
+
+def _plus(total: Any, a: Any, b: Any) -> Any:
+    """total + a b, of tensors in one pass over memory."""
+    return torch.addcmul(total, a, b) if isinstance(total, Tensor) else total + a * b
+
+
+def coated_shares(
+    cos_i: Tensor, n_before: Any, n_after: Any, layers: Layers, wavelength_nm: Any, sense: int, reflected: bool = False
+) -> Shares:
+    """What a surface transmits, or reflects with `reflected`; arguments as in `optics.coatings`."""
+    (a, b), (c, d) = power_amplitudes(cos_i, n_before, n_after, layers, wavelength_nm, sense, reflected)
+    s, p = a * a + b * b, c * c + d * d
+    return Shares((s + p) * 0.5, (s - p) * 0.5, a * c + b * d, b * c - a * d)
+
+
+class Passage:
+    """Power carried along while rays are traced; absorption is by Beer and Lambert's law."""
+
+    def __init__(self, lens: Lens, wavelength_nm: Tensor | float, like: Tensor) -> None:
+        self._lens, self._wavelength_nm, self._like = lens, wavelength_nm, like
         self._absorption = absorption_per_mm(lens, wavelength_nm)
-        self._power = torch.ones_like(like)
+        self._light: Light | None = None
         self._depth: Tensor | None = None
+        self._last: tuple[int, Vector, Tensor] | None = None  # surface, its normal, n cos behind it
 
-    def _cross_medium(self, k: int, r: Rays, hit: Hit, before: Medium) -> None:
-        absorbed = self._absorption[k if self._sense > 0 else k + 1]
+    def pass_surface(
+        self, k: int, r: Rays, hit: Hit, q: Tensor, media: tuple[Medium, Medium], sense: int, reflected: bool = False
+    ) -> None:
+        """Surface k: rays before it, their hit, n' cos t; media as the light meets them, of the sense of travel."""
+        before, after = media
+        absorbed = self._absorption[k if sense > 0 else k + 1]
         if absorbed is not None:
             depth = way_mm(r, hit, before) * absorbed
             self._depth = depth if self._depth is None else self._depth + depth
-
-    def _arrived(self, power: Tensor) -> Tensor:
-        return power if self._depth is None else power * torch.exp(-self._depth)
-
-
-class _Averaged(_Absorbed):
-    """The product over surfaces of (Ts + Tp) / 2."""
-
-    def pass_surface(self, k: int, r: Rays, hit: Hit, bent: Rays, q: Tensor, before: Medium, after: Medium) -> None:
-        self._cross_medium(k, r, hit, before)
-        coating = self._lens.surfaces[k].coating
-        if coating is not None and coating.layers:
-            cos_i = times(hit.q, 1 / before.n)
-            media = before.n, after.n
-            share = transmittance(cos_i, *media, coating.layers, self._wavelength_nm, self._sense)
-            self._power = self._power * share
-        elif before is not after:
-            self._power = self._power * fresnel_transmittance(hit.q, q, before, after)
-
-    def arrived(self) -> Tensor:
-        return self._arrived(self._power)
-
-
-class _Polarised(_Absorbed):
-    """The polarisation that each surface gives to the light, followed to the next."""
-
-    def __init__(self, lens: Lens, wavelength_nm: Tensor | float, sense: int, like: Tensor) -> None:
-        super().__init__(lens, wavelength_nm, sense, like)
-        self._field: Tensor | None = None
-
-    def pass_surface(self, k: int, r: Rays, hit: Hit, bent: Rays, q: Tensor, before: Medium, after: Medium) -> None:
-        self._cross_medium(k, r, hit, before)
-        step = step_at(self._lens.surfaces[k], hit, r, bent, before, after, self._sense)
-        if before is after and not step.layers:
+        surface = self._lens.surfaces[k]
+        layers = surface.coating.layers if surface.coating else ()
+        if before is after and not layers and not reflected:
             return
-        field = unpolarised(step.before) if self._field is None else self._field
-        self._field = pass_surface(field, step, self._wavelength_nm)
+        if layers or reflected:
+            cos_i = times(hit.q, 1 / before.n)
+            shares = coated_shares(cos_i, before.n, after.n, layers, self._wavelength_nm, sense, reflected)
+        else:
+            ratio = after.n / before.n
+            shares = fresnel(hit.q, q, hit.q * ratio + q / ratio)
+        normal = normal_at(surface, hit)
+        turn = None if self._last is None else self._turn(k, normal, r, hit, before)
+        self._light = pass_surface(self._light, turn, shares)
+        self._last = k, normal, hit.q if reflected else q
+
+    def _turn(self, k: int, normal: Vector, r: Rays, hit: Hit, before: Medium) -> tuple[Tensor, Tensor]:
+        """Of `turned`, times the square of the index."""
+        assert self._last is not None
+        last, other, q = self._last
+        pair = self._lens.surfaces[last], self._lens.surfaces[k]
+        if all(is_plain(s) for s in pair):
+            gap = self._lens.vertices_mm[k] - self._lens.vertices_mm[last]
+            across = crossed_spheres(hit, r[3:], (pair[0].curvature, pair[1].curvature), gap)
+        else:
+            across = crossed(r[3:], other, normal)
+        return turned([times(c, before.n2) for c in other], normal, q * hit.q, times(across, before.n))
 
     def arrived(self) -> Tensor:
-        return self._arrived(self._power if self._field is None else power(self._field))
+        """The power of all rays, [N]."""
+        power = torch.ones_like(self._like) if self._light is None else self._light.power
+        return power if self._depth is None else power * torch.exp(-self._depth)
 
 
 def way_mm(r: Rays, hit: Hit, before: Medium) -> Any:

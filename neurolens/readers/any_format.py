@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from neurolens.base.errors import InputError
@@ -21,7 +22,7 @@ from neurolens.readers.source import read_text
 from neurolens.readers.tables import looks_like_table, read_table
 from neurolens.readers.zemax import looks_like_zmx, read_zmx
 
-_OURS = "neurolens"
+OURS = "neurolens"
 _HEAD = 20_000  # characters by which a format is recognised
 
 
@@ -46,32 +47,44 @@ FORMATS = (
 )
 
 
+SUFFIXES = frozenset([".toml", *(suffix for f in FORMATS for suffix in f.suffixes)])
+
+
 def read_any(path: str | Path, given: Given | None = None) -> Lens:
     """The lens of a file in any format that neurolens reads, its own TOML too, with what the file lacks from `given`.
 
     The content decides; the suffix is used if the content is not recognised.
 
     Raises:
-        InputError: a file in no known format, or the mistake in it; names file and line.
+        InputError: a file in no known format, or the mistake in it; names file and line. Where an option of `neurolens
+            convert` would help, and `given` is None, the message says how.
     """
-    given = given or Given()
+    if given is None:
+        try:
+            return read_any(path, Given())
+        except InputError as error:
+            if (option := re.search(r"--[a-z-]+", error.expected)) is None:
+                raise
+            command = f"neurolens convert FILE {option[0]} ... -o LENS.toml"
+            raise InputError(error.file, error.field, error.value, f"{error.expected} ({command})") from None
     if Path(path).suffix.lower() == ".toml":
-        if kind_of(path) != _OURS:
-            return read_blender(read_toml(path), str(path), given)
-        lens = read_lens(path)
+        data = read_toml(path)
+        if is_blender(data):
+            return read_blender(data, str(path), given)
+        lens = read_lens(path, data)
         lens = replace(lens, name=given.name or lens.name, source=given.source or lens.source)
         if given != Given(name=given.name, source=given.source):
             raise InputError(path, "options", "(of a lens file)", "--name and --source only: the file has the rest")
         return lens
     found = format_of(path)
-    for option, said in (("--gap-before", given.gap_before), ("--semi-diameters", given.semi_diameters)):
+    for name, said in (("--gap-before", given.gap_before), ("--semi-diameters", given.semi_diameters)):
         if said and found.read is not read_table:
-            raise InputError(path, option, f"(a {found.name} file)", "a plain table: other formats define it")
+            raise InputError(path, name, f"(a {found.name} file)", "a plain table: other formats define it")
     return found.read(path, given)
 
 
 def format_of(path: str | Path) -> Format:
-    """The format of a file, by its content, else by its suffix.
+    """The format of a file, by its content, else by a suffix that no other format has.
 
     Raises:
         InputError: neither tells.
@@ -79,16 +92,56 @@ def format_of(path: str | Path) -> Format:
     head = read_text(path)[:_HEAD]
     suffix = Path(path).suffix.lower()
     by_content = next((f for f in FORMATS if f.looks_like(head)), None)
-    by_suffix = next((f for f in FORMATS if suffix in f.suffixes), None)
-    found = by_content or by_suffix
-    if found is None:
+    by_suffix = [f for f in FORMATS if suffix in f.suffixes]
+    if by_content is None and len(by_suffix) != 1:
         known = ", ".join(f"{f.name} ({', '.join(f.suffixes)})" for f in FORMATS)
-        raise InputError(path, "format", suffix or "(no suffix)", f"one of {known}, or a lens file (.toml)")
-    return found
+        raise InputError(path, "format", "(not known)", f"one of {known}, or a lens file (.toml)")
+    return by_content or by_suffix[0]
 
 
 def kind_of(path: str | Path) -> str:
     """The name of a file's format, "neurolens" for our own; raises as `format_of` and `read_toml`."""
     if Path(path).suffix.lower() == ".toml":
-        return "Physical Camera" if is_blender(read_toml(path)) else _OURS
+        return "Physical Camera" if is_blender(read_toml(path)) else OURS
     return format_of(path).name
+
+
+@dataclass(frozen=True)
+class Collection:
+    """The files of a folder: those that may be lenses, by name with "/" between its parts, and how many are not.
+
+    Attributes:
+        others: how many files of other kinds lie in the folder, by suffix.
+    """
+
+    folder: Path
+    names: tuple[str, ...]
+    others: dict[str, int] = field(default_factory=dict)
+
+
+def collection_of(folder: Path) -> Collection:
+    """The files of a folder and of its folders by suffix; hidden ones and links to folders are others.
+
+    Raises:
+        InputError: no such folder, or no lens file in it.
+    """
+    if not folder.is_dir():
+        raise InputError(folder, "FOLDER", "(no folder)", "a folder of lens files")
+    names, others = list[str](), dict[str, int]()
+    for file in sorted(folder.rglob("*")):
+        parts = file.relative_to(folder).parts
+        kind = file.suffix.lower() or "(none)"
+        if file.is_dir():
+            if not file.is_symlink():
+                continue
+            kind = "(link to a folder)"
+        elif any(part.startswith(".") for part in parts):
+            kind = "(hidden)"
+        elif kind in SUFFIXES:
+            names.append("/".join(parts))
+            continue
+        others[kind] = others.get(kind, 0) + 1
+    if not names:
+        known = ", ".join(sorted(SUFFIXES))
+        raise InputError(folder, "FOLDER", f"({sum(others.values())} files of other kinds)", f"lens files: {known}")
+    return Collection(folder, tuple(names), others)

@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.optics import catalogue, paraxial
-from neurolens.optics.catalogue import Glass
+from neurolens.optics.catalogue import LINE_C_NM, LINE_D_NM, LINE_F_NM, Glass
 from neurolens.optics.glass import by_figures
 from neurolens.optics.lensfile import MAX_INDEX, MAX_POWER, MAX_SURFACES
 from neurolens.optics.paraxial import FirstOrder
-from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.prescription import Lens
 from neurolens.optics.sag import check_figures
-from neurolens.readers.source import assume, warn
+from neurolens.readers.source import Line, assume, warn
 
 # A diameter that the file does not give, until `finish` has found it.
 UNKNOWN = math.nan
 NARROWER = 1e-4  # relative: smaller differences of stop diameters are rounding
 _NAMES = frozenset(m.upper() for m in catalogue.MAKERS)
+_SAME_LINE_NM = 0.1
+_MOULDED = re.compile("([ _-]?MOLD(ED)?|M)$", re.IGNORECASE)
+_MOULDING = 0.01  # by how much moulding lowers an index at the most
+# Discontinued glasses of Schott, of which no dispersion formula is at hand: n_d (Elphel's optical-design-viewer), V_d.
+_DISCONTINUED: dict[str, tuple[float, float | None]] = {"LASF14A": (1.82223, None), "SF58": (1.917613, 21.51)}
 SAME_INDEX, SAME_ABBE = 2e-5, 0.005  # tolerance of printed figures against those of a catalogue glass
 
 
@@ -44,7 +50,7 @@ def finish(
         InputError: no row, too many, no stop or several, a figure out of range, a stop that nothing sizes, no image
             behind the lens.
     """
-    _check_rows(lens.surfaces, lens.path)
+    _check_stop(lens)
     stop = lens.surfaces[lens.stop_index]
     stated = lens.f_number
     # First-order data needs an opening, whatever it is.
@@ -84,24 +90,12 @@ def smaller_stop(file: str, asked: float, limit: float | None, state: str = "") 
     return limit
 
 
-def with_rims(lens: Lens) -> Lens:
-    """The lens with the rims that its file does not give derived by rule (`neurolens.optics.rims`), with a warning."""
-    missing = [k for k, s in enumerate(lens.surfaces) if math.isnan(s.diameter_mm)]
-    if not missing:
-        return lens
-    from neurolens.optics.rims import with_derived_rims  # rays are traced, which needs torch
-
-    derived = with_derived_rims(lens)
-    warn(lens.path, f"no rim is given for surface {', '.join(map(str, missing))}: derived from f-number and field")
-    return derived
-
-
 def first_order(lens: Lens) -> FirstOrder:
     """First-order data in the y-z plane; of a lens without power there, in the x-z plane.
 
     Raises InputError for a lens without power, or whose entrance pupil is a point or infinite; a figure out of range.
     """
-    _check_rows(lens.surfaces, lens.path)
+    _check_stop(lens)
     try:
         data = paraxial.first_order(lens, meridian="y")
     except InputError:
@@ -114,18 +108,22 @@ def first_order(lens: Lens) -> FirstOrder:
     return data
 
 
-def _check_rows(rows: Sequence[Surface], file: str) -> None:
+def check_rows(lens: Lens) -> None:
+    """Raise InputError for no surface, too many, or a figure out of range; whether there is a stop is not checked."""
+    rows, file = lens.surfaces, lens.path
     if not rows:
         raise InputError(file, "surfaces", "(none)", "at least one surface between object and image")
     if len(rows) > MAX_SURFACES:
         raise InputError(file, "surfaces", f"({len(rows)} of them)", f"at most {MAX_SURFACES}")
+    index = f"a refractive index from 1 to {MAX_INDEX}"
+    mirror = " (an index of -1 describes a mirror, and the lens model has none)"
     for k, s in enumerate(rows):
         terms = (s.conic, *(a for _, a in s.asphere))
         figures = (
             ("radius", s.radius_mm, abs(s.radius_mm) > 0, "a number other than 0, or a plane"),
             ("thickness", s.thickness_mm, math.isfinite(s.thickness_mm), "a finite length"),
             ("diameter", s.diameter_mm, math.isnan(s.diameter_mm) or 0 < s.diameter_mm < math.inf, "a length above 0"),
-            ("index", s.n_d, 1 <= s.n_d <= MAX_INDEX, f"a refractive index from 1 to {MAX_INDEX}"),
+            ("index", s.n_d, 1 <= s.n_d <= MAX_INDEX, index + mirror * (s.n_d == -1)),
             ("Abbe number", s.V_d, s.V_d is None or 0 < s.V_d < math.inf, "a number above 0"),
             ("asphere", (s.conic, s.asphere), all(map(math.isfinite, terms)), "finite coefficients"),
             *(("asphere, power", p, 2 <= p <= MAX_POWER, f"a power from 2 to {MAX_POWER}") for p, _ in s.asphere),
@@ -133,11 +131,17 @@ def _check_rows(rows: Sequence[Surface], file: str) -> None:
         for name, value, sound, expected in figures:
             if not sound:
                 raise InputError(file, f"surface {k}, {name}", value, expected)
+    if not 1 <= lens.object_medium.n_d <= MAX_INDEX:
+        raise InputError(file, "object, index", lens.object_medium.n_d, index)
     check_figures(rows, file)
-    stops = [k for k, s in enumerate(rows) if s.stop]
+
+
+def _check_stop(lens: Lens) -> None:
+    check_rows(lens)
+    stops = [k for k, s in enumerate(lens.surfaces) if s.stop]
     if len(stops) != 1:
-        found = f"(on surfaces {', '.join(map(str, stops))})" if stops else "(none)"
-        raise InputError(file, "stop", found, "exactly one surface that is the aperture stop")
+        found = f"(on surface {', '.join(map(str, stops))})" if stops else "(none)"
+        raise InputError(lens.path, "stop", found, "exactly one surface that is the aperture stop")
 
 
 def named_glass(
@@ -151,7 +155,8 @@ def named_glass(
 ) -> dict[str, Any]:
     """Fields of a surface whose glass the file gives by name alone; warns where it is ambiguous.
 
-    For a discontinued glass its replacement, with the prefix "N-", is taken.
+    For a discontinued glass its replacement, with the prefix "N-", is taken. A moulded variant of a glass ("..._MOLD",
+    "...M") has an index lower by some 0.004, which no catalogue here states; its base glass is offered.
 
     Args:
         makers: the makers' catalogues that the file names; the first that has the glass is meant.
@@ -162,8 +167,21 @@ def named_glass(
         InputError: such a name without figures; the message suggests the nearest.
     """
     same = catalogue.same_name(name)
+    if not same and not figures and (left := _DISCONTINUED.get(name.upper())):
+        warn(file, f"{field}: glass {name} is discontinued: taken by n_d {left[0]:g} and V_d {left[1] or 'unknown'}")
+        return {"n_d": left[0], "V_d": left[1], "material": name}
+    base = next(iter(catalogue.same_name(_MOULDED.sub("", name))), None)
+    if base and not same and not figures:
+        expected = f"a glass of the catalogue: it has {base.name}, whose moulded variant this may be; or give --glass"
+        raise InputError(file, field, name, expected)
+    if base and not same and figures and not 0 <= base.n_d - figures[0] <= _MOULDING:
+        told = f"assumed to be {base} (n_d {base.n_d:.5f}), moulded: n_d {figures[0]:g} beside it fits no such glass"
+        assume(file, f"{field}: glass {name} is {told}")
+        return {"n_d": base.n_d, "V_d": base.V_d, "glass": short_name(base), "material": name}
     known = next((g for m in makers for g in same if g.maker.upper() == m), None)
     replacing = next((g for m in makers for g in catalogue.same_name(f"{m}:N-{name}") if m in _NAMES), None)
+    if not (same or replacing or makers):
+        replacing = next(iter(catalogue.same_name(f"N-{name}")), None)
     if figures and not (same or replacing):
         return by_figures(name, *figures, f"{file}: {field}")
     taken = known or replacing or catalogue.find(name, file, field)
@@ -177,6 +195,33 @@ def named_glass(
     if why:
         warn(file, f"glass {said or name} is taken as {taken} (n_d {taken.n_d:.5f}, V_d {taken.V_d:.2f}): {why}")
     return {"n_d": taken.n_d, "V_d": taken.V_d, "glass": short_name(taken), "material": name}
+
+
+def by_indices(line: Line, field: str, indices: Sequence[float], wavelengths_nm: Sequence[float]) -> dict[str, Any]:
+    """Fields of a surface from indices at some wavelengths, reduced to n_d and V_d with a warning; one index is n_d.
+
+    Between the wavelengths the index is a polynomial of 1 / lambda^2 through the four that are nearest.
+
+    Raises:
+        InputError: several indices, whose wavelengths do not enclose the lines d, F and C.
+    """
+    if len(indices) == 1:
+        return {"n_d": indices[0]}
+    table = {nm: n for nm, n in zip(wavelengths_nm, indices, strict=False) if nm > 0}
+    lines = (LINE_D_NM, LINE_F_NM, LINE_C_NM)
+    if not table or min(table) > min(lines) + _SAME_LINE_NM or max(table) < max(lines) - _SAME_LINE_NM:
+        expected = "indices from the F line (486.13 nm) to the C line (656.27 nm), to reduce the glass to n_d and V_d"
+        raise line.error(field, f"(wavelengths {list(wavelengths_nm)})", expected)
+    found = []
+    for line_nm in lines:
+        near = sorted(table, key=lambda nm: abs(nm - line_nm))[:4]
+        if abs(near[0] - line_nm) <= _SAME_LINE_NM:
+            near = near[:1]
+        shares = (math.prod((line_nm**-2 - b**-2) / (a**-2 - b**-2) for b in near if b != a) for a in near)
+        found.append(sum(table[nm] * share for nm, share in zip(near, shares, strict=True)))
+    n_d, n_F, n_C = found
+    warn(line.file, f"line {line.number}, {field}: the glass is reduced to n_d and V_d")
+    return {"n_d": n_d, "V_d": (n_d - 1) / (n_F - n_C) if n_F > n_C else None}
 
 
 def _letters(name: str) -> str:

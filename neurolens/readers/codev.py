@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import MAX_SURFACES
@@ -20,11 +18,10 @@ from neurolens.readers.codev_model import (
     Zoom,
     commands,
     medium,
-    private_glass,
     shape_of,
 )
-from neurolens.readers.draft import INFINITE, Draft, Given, Row, lens_of
-from neurolens.readers.source import read_lines, warn
+from neurolens.readers.draft import INFINITE, Draft, Given, Row, lens_of, primary_first
+from neurolens.readers.source import assume, by_word, read_lines, warn
 
 
 @dataclass
@@ -37,9 +34,10 @@ class File(Draft):
     zoom: Zoom = field(default_factory=Zoom)
     radii: bool | None = None
     fields: dict[str, list[float]] = field(default_factory=dict)
-    private: dict[str, dict[str, Any]] = field(default_factory=dict)
+    private: dict[str, tuple[Command, list[float]]] = field(default_factory=dict)  # a row of PRV, its wavelengths in nm
     private_nm: list[float] | None = None
-    ignored: Counter[str] = field(default_factory=Counter)
+    waves_nm: list[float] = field(default_factory=list)
+    reference: int = 1
 
 
 def _complete(file: File) -> None:
@@ -53,21 +51,20 @@ def _complete(file: File) -> None:
         raise InputError(file.file, "S", "(no surface)", "at least one surface between object and image")
     if image.curvature:
         warn(file.file, "the image surface is curved; the film is taken as plane")
-    for text, count in file.ignored.items():
-        if count:
-            warn(file.file, f"{text} ({count})")
     # The image lies off the last thickness by the thickness of SI: a defocus.
     middle[-1].thickness += image.thickness
     for k, block in enumerate(middle[:-1]):
         if block.solved:
             raise block.start.error("PIM", f"(on surface {k + 1})", "the last surface")
-    file.rows = tuple(Row(b.surface(shape_of(b)), aperture=not math.isnan(b.semi_diameter)) for b in middle)
+    file.rows = tuple(Row(b.surface(shape_of(b)), not math.isnan(b.semi_diameter), b.name) for b in middle)
     file.half_field_deg = _edge(file, ("XAN", "YAN"))
     file.image_radius = _edge(file, ("XIM", "YIM"), ("XRI", "YRI"))
     if _edge(file, ("XOB", "YOB")) and not file.half_field_deg:
         warn(file.file, "the field is given as an object height: left out")
     file.states = tuple(file.zoom.states(middle, first.thickness, image.thickness))
-    file.object_distance = first.thickness
+    file.object_distance, file.object_medium = first.thickness, first.medium
+    primary = file.waves_nm[file.reference - 1] if 0 < file.reference <= len(file.waves_nm) else 0.0
+    file.wavelengths_nm = primary_first(file.waves_nm, primary)
     file.film_given = not (middle[-1].solved and middle[-1].thickness == image.thickness)
 
 
@@ -85,26 +82,26 @@ def _edge(file: File, *pairs: tuple[str, str]) -> float | None:
 UNITS = {"M": "mm", "C": "cm", "I": "in"}
 ROOM = 20  # degrees, at which the catalogues measure
 FIELDS = ("XAN", "YAN", "XIM", "YIM", "XRI", "YRI", "XOB", "YOB")
-# Settings, weights, wavelengths, labels, control codes of variables, tolerances.
-IGNORED = frozenset(
-    """LEN WL REF WTW WTF WTA INI DOR PRE DER UID SLB GO END CCY CCX THC GLC KC AC BC CC DC EC FC GC HC JC DLT
+# Settings, weights, labels, control codes of variables, tolerances: written to most files, and no ray depends on them.
+HARMLESS = frozenset(
+    """LEN WTW WTF WTA INI DOR PRE DER UID SLB GO END CCY CCX THC GLC KC AC BC CC DC EC FC GC HC JC DLT
     DLN DLF DLR IRR SCC KXC""".split()
 )
-# Of a surface: what the lens model has not, by name.
-REFUSED = {
-    "MOD": "ideal lens (a module)",
-    "GRT": "grating",
-    "DIF": "diffractive surface",
-}
+# What changes rays and is not read: what is expected in its place.
+REFUSED = by_word(
+    ("NAO NA", "EPD or FNO to size the stop"),
+    ("MOD", "a surface that is no ideal lens (a module)"),
+    ("GRT DIF DOE HOE HOL", "a surface that is no grating, hologram or diffractive surface"),
+    ("GRN", "a medium without a gradient index"),
+    ("FRN SPL UDS NSS", "a surface that is no Fresnel surface, spline, surface of the user or non-sequential part"),
+    ("RMD", "a surface that refracts: the lens model has no mirrors"),
+    ("REX REY ELX ELY REC ELL", "a round opening (CIR)"),
+)
 VIGNETTING = frozenset(["VUX", "VLX", "VUY", "VLY"])
+SHAPES = ("SPH", "CON", "ASP", "CYL", "YTO", "XTO", "AAS")
 READ = (
-    *"S SO SI RDM TIT DIM EPD FNO TEM".split(),
-    *FIELDS,
-    *"RDY CUY RDX CUX THI GLA STO SPH CON ASP CYL YTO XTO AAS SPS SCO K".split(),
-    *ALONG,
-    *LETTERS,
-    *NONE_BUT_0,
-    *("CIR", "PIM", "PRV", "ZOO"),
+    *"RDY CUY RDX CUX THI GLA STO SPS SCO K CIR PIM".split(),
+    *(*SHAPES, *ALONG, *LETTERS, *NONE_BUT_0),
 )
 
 
@@ -120,10 +117,10 @@ def read_seq(path: str | Path, given: Given | None = None) -> Lens:
             _private(file, command)
         elif command.name == "ZOO":
             file.zoom.read(command, len(file.blocks))
-        elif command.name in IGNORED:
+        elif command.name in HARMLESS:
             pass
         elif command.name in VIGNETTING:
-            file.ignored["vignetting factors (rims decide)"] += any(command.numbers(least=0))
+            file.skipped["vignetting factors (rims decide)"] += any(command.numbers(least=0))
         elif not _system(file, command):
             _surface(file, command)
     if not file.closed:
@@ -147,8 +144,7 @@ def _private(file: File, command: Command) -> None:
     elif not file.private_nm:
         raise command.line.error("PRV", command.name, "PWL and wavelengths before the glasses")
     else:
-        file.private[command.word] = {**private_glass(command, file.private_nm), "material": command.word}
-        warn(file.file, f"private glass {command.word} is reduced to n_d and V_d")
+        file.private[command.word.strip("'\"")] = command, file.private_nm
 
 
 def _system(file: File, command: Command) -> bool:
@@ -172,6 +168,10 @@ def _system(file: File, command: Command) -> bool:
         case "TEM":
             if abs(command.numbers()[0] - ROOM) > 5:
                 warn(file.file, f"indices are those at {ROOM} degrees, not at {' '.join(words)}")
+        case "WL":
+            file.waves_nm = command.numbers()
+        case "REF":
+            file.reference = int(command.numbers()[0])
         case "PRV":
             file.private_nm = []
         case _ if name in FIELDS:
@@ -187,9 +187,10 @@ def _surface(file: File, command: Command) -> None:
         _new_surface(file, command)
         return
     if name in REFUSED:
-        raise line.error(name, " ".join(words) or "(given)", f"a surface that is no {REFUSED[name]}")
+        raise line.error(name, " ".join(words) or "(given)", REFUSED[name])
     if name not in READ:
-        raise line.unknown(name, READ)
+        file.skipped[command.word] += 1
+        return
     block = file.blocks[-1] if file.blocks else None
     if words and words[0].upper()[:1] == "S" and (words[0][1:].isdecimal() or words[0].upper() in ("SO", "SI")):
         block, words = _named(file, command), words[1:]
@@ -201,7 +202,7 @@ def _surface(file: File, command: Command) -> None:
     match name:
         case "STO":
             block.stop = True
-        case "SPH" | "CON" | "ASP" | "CYL" | "YTO" | "XTO" | "AAS":
+        case _ if name in SHAPES:
             block.kind = name
         case "SPS" | "SCO":
             block.put_special(command, words)
@@ -234,12 +235,20 @@ def _new_surface(file: File, command: Command) -> None:
         raise line.error(name, "(here)", "one object SO, then surfaces S, then one image SI")
     if len(file.blocks) > MAX_SURFACES + 1:
         raise line.error(name, f"({len(file.blocks)} surfaces)", f"at most {MAX_SURFACES} surfaces")
-    numbers = command.numbers(command.words[:2], 2)
+    far = name == "SO" and command.words[1:2] and command.words[1].lower() in ("inf", "infinity")
+    numbers = command.numbers((command.words[0], str(INFINITE)) if far else command.words[:2], 2)
     if file.radii is None and numbers[0] != 0:
-        file.radii = False
-        warn(file.file, f"line {line.number}: no RDM before it; surfaces have curvatures, CODE V's default, not radii")
+        file.radii = bool(file.pupil) and abs(numbers[0]) * (file.pupil or 0.0) > 2
+        why = (
+            "radii: a sphere of that curvature would be smaller than the pupil"
+            if file.radii
+            else "curvatures, not radii"
+        )
+        assume(file.file, f"line {line.number}: no RDM before it; the first numbers of surfaces are taken as {why}")
     first = numbers[0]
-    block = Block(line, curvature=first if not (file.radii and first) else 1 / first, thickness=numbers[1])
+    block = Block(
+        line, str(len(file.blocks)), curvature=first if not (file.radii and first) else 1 / first, thickness=numbers[1]
+    )
     if name == "SO" and block.thickness >= INFINITE:
         block.thickness = math.inf
     block.medium = medium(command, command.words[2:], file.private)

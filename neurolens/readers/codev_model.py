@@ -8,15 +8,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from neurolens.optics import catalogue
 from neurolens.readers import draft
-from neurolens.readers.assemble import named_glass
+from neurolens.readers.assemble import by_indices, named_glass
 from neurolens.readers.draft import INFINITE, State
 from neurolens.readers.source import Line, assume
 
 _MAX_COMMAND = 100_000  # characters of one command with all its continuation lines
-# Fraunhofer lines to which a private glass is reduced, nm.
-_D, _F, _C, _SAME_LINE = 587.56, 486.13, 656.27, 0.1
 
 
 @dataclass(frozen=True)
@@ -67,7 +64,9 @@ def _outside_quotes(text: str, mark: str) -> list[str]:
     return [*parts, text[begin:]]
 
 
-def medium(command: Command, words: Sequence[str], private: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+def medium(
+    command: Command, words: Sequence[str], private: Mapping[str, tuple[Command, Sequence[float]]]
+) -> dict[str, Any]:
     """Fields of a surface for the medium behind it: a name, "NAME_MAKER", a code, n:V, n V, or nothing for air.
 
     A code is the fraction of the index and the Abbe number without its point: 517.642, 517642 or 516800.641700.
@@ -78,7 +77,7 @@ def medium(command: Command, words: Sequence[str], private: Mapping[str, dict[st
     if word.upper() == "REFL":
         raise command.line.error(command.name, word, "a glass: the lens model has no mirrors")
     if word in private:
-        return dict(private[word])
+        return {**_private(*private[word]), "material": word}
     pair = word.split(":")
     if len(pair) == 2:
         n_d, V_d = command.numbers(pair, 2)
@@ -91,33 +90,18 @@ def medium(command: Command, words: Sequence[str], private: Mapping[str, dict[st
         numbers = command.numbers(words[:2])
         return {"n_d": numbers[0], "V_d": numbers[1] if len(numbers) > 1 else None}
     name, _, maker = word.rpartition("_")
-    qualified = f"{maker}:{name}" if name else word
-    if name and not catalogue.same_name(qualified):
-        # Aliases of a glass ("BK7") are listed without their maker.
-        alias = [g for g in catalogue.same_name(name) if g.maker.upper() == maker.upper()]
-        # Discontinued glasses are replaced by those with the prefix "N-".
-        replacing = catalogue.same_name(f"{maker}:N-{name}")
-        qualified = str((*alias, *replacing)[0]) if alias or replacing else qualified
-    known = named_glass(qualified, command.line.file, f"line {command.line.number}, glass", said=word if name else None)
+    makers = [maker.upper()] if name else []
+    place = f"line {command.line.number}, glass"
+    known = named_glass(name or word, command.line.file, place, makers, said=word if name else None)
     return {**known, "material": word}
 
 
-def private_glass(command: Command, wavelengths_nm: Sequence[float]) -> dict[str, Any]:
-    """Fields of a surface from a row of a PRV block: indices at the wavelengths of its PWL line.
-
-    Raises:
-        InputError: not one index a wavelength, or not the lines d, F and C among them, to which it is reduced.
-    """
-    indices = command.numbers(least=len(wavelengths_nm))
-    found = {}
-    for name, line_nm in (("d", _D), ("F", _F), ("C", _C)):
-        near = [k for k, nm in enumerate(wavelengths_nm) if abs(nm - line_nm) <= _SAME_LINE]
-        if not near:
-            expected = f"an index at the {name} line ({line_nm} nm), to reduce the glass to n_d and V_d"
-            raise command.line.error("PRV", f"(wavelengths {wavelengths_nm})", expected)
-        found[name] = indices[near[0]]
-    dispersion = found["F"] - found["C"]
-    return {"n_d": found["d"], "V_d": (found["d"] - 1) / dispersion if dispersion > 0 else None}
+def _private(command: Command, wavelengths_nm: Sequence[float]) -> dict[str, Any]:
+    """Fields of a surface from a row of a PRV block: indices at the wavelengths of its PWL line."""
+    if command.words and not re.match(r"[-+.0-9]", command.words[0]):
+        expected = "an index at each wavelength of PWL: formulas of private glasses are not read"
+        raise command.line.error(f"PRV {command.word}", command.words[0], expected)
+    return by_indices(command.line, f"PRV {command.word}", command.numbers(least=len(wavelengths_nm)), wavelengths_nm)
 
 
 # Of special surfaces: how the names of their coefficients begin, before the power of the first term.
@@ -233,6 +217,8 @@ def _special(block: Block) -> dict[str, Any]:
         found[power] = value
     if kind == "ODD":
         return block.rotational((n, a / (radius or 1.0) ** n) for n, a in sorted(found.items()))
+    if kind == "QBF" and block.conic:
+        raise block.start.error(f"conic of SPS {kind}", block.conic, "0: Qbfs departs from a sphere")
     if not radius > 0:
         raise block.start.error(f"NRADIUS of SPS {kind}", radius, "a normalisation radius above 0")
     told = f"SPS {kind}: coefficient {SPECIAL[kind]}n is taken as that of Forbes's m = (n - 4) / 2"

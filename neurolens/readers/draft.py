@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import math
+import re
 from bisect import bisect_right
+from collections import Counter
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.bounds import WAVELENGTH_NM, within
 from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import MAX_SURFACES, check_states
-from neurolens.optics.prescription import Configuration, Lens, Surface
-from neurolens.optics.sag import end_mm, same_medium
-from neurolens.readers.assemble import UNKNOWN, finish, first_order, smaller_stop, with_rims
+from neurolens.optics.prescription import Configuration, Lens, Medium, Surface
+from neurolens.optics.sag import same_medium
+from neurolens.readers.assemble import UNKNOWN, finish, first_order, smaller_stop
 from neurolens.readers.forbes import MAX_TERMS, qbfs_terms, qcon_terms
-from neurolens.readers.source import UNITS_MM, Line, assume, warn
+from neurolens.readers.openings import narrowed, stop_aperture, with_likely_rims, with_rims, with_stop
+from neurolens.readers.source import UNITS_MM, Line, warn
 
 
 @dataclass(frozen=True)
@@ -27,6 +32,7 @@ class Given:
         f_number: nominal f-number, for a file that states none.
         units: of a file without units: "mm", "cm", "in" or "m".
         half_field_deg: edge of the field, for rims that have to be derived.
+        stop: number of the surface, as the file numbers it, that is the stop; replaces a stop that the file marks.
         gap_before: of a plain table: its second column is the distance from the surface before (Kolb's tables of 1995).
         semi_diameters: of a plain table: its last column holds radii of the rims.
     """
@@ -36,6 +42,7 @@ class Given:
     f_number: float | None = None
     units: str | None = None
     half_field_deg: float | None = None
+    stop: str | None = None
     gap_before: bool = False
     semi_diameters: bool = False
 
@@ -48,6 +55,7 @@ class Block:
     """One surface while a file is read, in the file's unit; readers add what their formats say besides."""
 
     start: Line
+    name: str = ""
     curvature: float = 0.0
     conic: float = 0.0
     thickness: float = 0.0
@@ -69,10 +77,9 @@ class Block:
         rim = radius if math.isnan(self.semi_diameter) else self.semi_diameter
         if len(values) > MAX_TERMS:
             raise self.start.error(name, f"({len(values)} terms)", f"at most {MAX_TERMS} terms")
-        if not qcon and self.conic:
-            raise self.start.error(f"conic of {name}", self.conic, "0: Qbfs departs from a sphere")
         try:
-            terms = qcon_terms(values, radius, rim) if qcon else qbfs_terms(values, radius, self.curvature, rim)
+            base = self.curvature, rim, self.conic
+            terms = qcon_terms(values, radius, rim) if qcon else qbfs_terms(values, radius, *base)
         except ValueError as error:
             found = f"(curvature {self.curvature:g}, rim {rim:g})"
             raise self.start.error(name, found, str(error)) from None
@@ -90,10 +97,12 @@ class Row:
     Attributes:
         surface: its diameter may be `assemble.UNKNOWN`.
         aperture: whether the file sets a clear aperture on it, so that even a plane in air cuts the beam.
+        name: number by which the file calls it; empty where that is its place in the table, from 0.
     """
 
     surface: Surface
     aperture: bool = False
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -127,9 +136,12 @@ class Draft:
         unit: "mm", "cm", "in", "m", or None if unknown.
         stated_efl: focal length as the file states it, to be checked.
         drawn: rims are somebody's measures of a drawing, some of them radii where diameters are meant: halved where
-            they are twice what they can be, and narrowed where neighbours would touch; both is told. A missing stop is
-            assumed.
+            they are twice what they can be, and narrowed by however much neighbours would overlap; both is told.
         nominal: f-number that the file states with few digits, to tell radii from diameters by.
+        stop_given: whether the file states the stop's own diameter, which then rules over its f-number.
+        skipped: what was not read since no ray depends on it, and how often it occurs; told in one line.
+        object_medium: fields of `Medium` for the medium in front of the lens.
+        wavelengths_nm: as `Lens.wavelengths_nm`.
     """
 
     file: str
@@ -149,12 +161,43 @@ class Draft:
     stated_efl: float | None = None
     drawn: bool = False
     nominal: float | None = None
+    stop_given: bool = False
+    skipped: Counter[str] = field(default_factory=Counter)
+    object_medium: dict[str, Any] = field(default_factory=dict)
+    wavelengths_nm: tuple[float, ...] = ()
+
+    def in_file(self, text: str) -> str:
+        """A message about the rows, each called as the file calls its surface."""
+
+        def renamed(found: re.Match[str]) -> str:
+            rows = [self.rows[k].name for k in map(int, found[1].split(", ")) if k < len(self.rows)]
+            return f"surface {', '.join(rows)} of the file" if rows and all(rows) else found[0]
+
+        return _ROWS.sub(renamed, text)
+
+
+def primary_first(wavelengths_nm: Iterable[float], primary_nm: float) -> tuple[float, ...]:
+    """Wavelengths of a file as `Lens` holds them; those beyond what neurolens traces are left out."""
+    sound = [round(nm, 6) for nm in wavelengths_nm if within(WAVELENGTH_NM, nm)]  # as read in micrometres
+    return tuple(sorted(sound, key=lambda nm: nm != round(primary_nm, 6)))
 
 
 def lens_of(draft: Draft, given: Given | None = None) -> Lens:
     """The lens of a draft, in mm, checked as by `assemble.finish`; a unit other than the file's is an InputError."""
     given = given or Given()
-    draft = _without_dummies(draft)
+    if +draft.skipped:
+        listed = (word if count == 1 else f"{word} ({count})" for word, count in (+draft.skipped).items())
+        warn(draft.file, f"left out, since no ray depends on it: {', '.join(listed)}")
+    try:
+        draft = with_stop(draft, given.stop)
+        draft = _without_dummies(draft)
+        return _lens_of(draft, given)
+    except InputError as error:
+        value = draft.in_file(error.value) if isinstance(error.value, str) else error.value
+        raise InputError(error.file, draft.in_file(error.field), value, draft.in_file(error.expected)) from None
+
+
+def _lens_of(draft: Draft, given: Given) -> Lens:
     unit = given.units or draft.unit or "mm"
     if given.units and draft.unit and given.units != draft.unit:
         raise InputError(draft.file, "--units", given.units, f"{draft.unit!r}, as the file itself says (or no --units)")
@@ -175,71 +218,31 @@ def lens_of(draft: Draft, given: Given | None = None) -> Lens:
         rims=draft.rims,
         path=draft.file,
         stated_efl_mm=draft.stated_efl,
+        object_medium=Medium(**draft.object_medium),
+        wavelengths_nm=draft.wavelengths_nm,
     )
     if draft.drawn:
-        lens = _with_likely_rims(_with_stop(lens), draft.f_number or draft.nominal)
-    if draft.f_number is not None and draft.pupil is None and lens.surfaces:
+        lens = with_likely_rims(lens, draft)
+    if draft.f_number is not None and draft.pupil is None and not draft.stop_given:
         # The file's f-number overrides a diameter of the stop, except for an aperture set on it.
         rows = (replace(s, diameter_mm=math.nan) if s.stop else s for s in lens.surfaces)
         lens = replace(lens, surfaces=tuple(rows))
-    lens = finish(lens, pupil_mm=draft.pupil, film_given=draft.film_given, stop_limit_mm=_stop_aperture(draft))
+    lens = finish(lens, pupil_mm=draft.pupil, film_given=draft.film_given, stop_limit_mm=stop_aperture(draft))
+    if draft.stop_given and abs((by_stop := first_order(lens).f_number) / lens.f_number - 1) > _AGREES:
+        told = f"a stop {lens.stop_radius_mm * 2:g} wide gives f/{by_stop:.3g}, the file says f/{lens.f_number:.3g}"
+        warn(draft.file, f"{told}: the diameter is kept")
     lens = replace(lens, configurations=tuple(_configuration(lens, draft, state) for state in _states(draft)))
-    lens = with_rims(lens.scaled(factor) if factor != 1 else lens)
-    lens = _narrowed(lens) if draft.drawn else lens
+    lens = with_rims(lens.scaled(factor) if factor != 1 else lens, draft.in_file)
+    with suppress(InputError):
+        check_states(lens)
+        return lens
+    lens = narrowed(lens, draft)
     check_states(lens)
     return lens
 
 
-_TWICE, _SAME = (0.4, 0.7), (0.7, 1.4)  # f-number by the stop's diameter over the stated one: rims twice as wide, right
-
-
-def _with_stop(lens: Lens) -> Lens:
-    """The lens with a stop: where no row is marked, that of the narrowest rim."""
-    known = [k for k, s in enumerate(lens.surfaces) if not math.isnan(s.diameter_mm)]
-    if any(s.stop for s in lens.surfaces) or not known:
-        return lens
-    k = min(known, key=lambda k: lens.surfaces[k].diameter_mm)
-    assume(lens.path, f"no stop is marked: surface {k}, whose rim is the narrowest, is assumed to be it")
-    rows = (replace(s, stop=i == k) for i, s in enumerate(lens.surfaces))
-    return replace(lens, surfaces=tuple(rows))
-
-
-def _with_likely_rims(lens: Lens, f_number: float | None) -> Lens:
-    """The lens with rims of half the width, where stop and spheres say that radii were meant by diameters."""
-    if not any(s.stop for s in lens.surfaces):
-        return lens  # `finish` says so
-    beyond = [k for k, s in enumerate(lens.surfaces) if s.semi_diameter_mm > end_mm(s) * (1 + 1e-6)]
-    evidence = f"the rim of surface {beyond[0]} is wider than its sphere" if beyond else ""
-    if f_number is not None and not math.isnan(lens.stop_radius_mm):
-        by_stop = first_order(lens).f_number
-        if _SAME[0] <= by_stop / f_number <= _SAME[1]:
-            return lens
-        if _TWICE[0] <= by_stop / f_number < _TWICE[1]:
-            evidence = f"the stop would give f/{by_stop:.3g}, the file says f/{f_number:.3g}"
-    if not evidence:
-        return lens
-    assume(lens.path, f"rims are assumed to be half as wide as the format has them: {evidence}")
-    rows = (replace(s, diameter_mm=s.diameter_mm / 2) for s in lens.surfaces)
-    return replace(lens, surfaces=tuple(rows))
-
-
-def _narrowed(lens: Lens) -> Lens:
-    """The lens with rims no wider than their spheres and than where neighbours touch, in every state."""
-    from neurolens.optics.rims import narrowed_rims  # which needs torch
-
-    found = narrowed_rims(lens)
-    pairs = enumerate(zip(lens.surfaces, found.surfaces, strict=True))
-    changed = [f"{k} ({a.diameter_mm:.4g} to {b.diameter_mm:.4g} mm)" for k, (a, b) in pairs if a != b]
-    if changed:  # no rim is wider than its sphere: where one is said to be, table or rims are in doubt
-        say = assume if any(s.semi_diameter_mm > end_mm(s) * (1 + 1e-6) for s in lens.surfaces) else warn
-        say(lens.path, f"rims narrowed to where spheres end or neighbours touch: surface {', '.join(changed)}")
-    return found
-
-
-def _stop_aperture(draft: Draft) -> float | None:
-    """Diameter of the aperture that the file sets on the stop itself, in its unit."""
-    stops = (row.surface.diameter_mm for row in draft.rows if row.surface.stop and row.aperture)
-    return next((d for d in stops if not math.isnan(d)), None)
+_AGREES = 0.03  # relative: f-numbers are printed with two digits
+_ROWS = re.compile(r"\bsurface ([0-9]+(?:, [0-9]+(?![0-9.]| mm))*)(?! of the file)")
 
 
 def _states(draft: Draft) -> tuple[State, ...]:
@@ -268,7 +271,7 @@ def _configuration(lens: Lens, draft: Draft, state: State) -> Configuration:
             pupil = abs(data.efl_mm) / draft.f_number
     if pupil is not None and opening is None:
         asked = 2 * there.stop_radius_mm * pupil / data.entrance_pupil_diameter_mm
-        opening = smaller_stop(draft.file, asked, _stop_aperture(draft), f'state "{state.name}": ')
+        opening = smaller_stop(draft.file, asked, stop_aperture(draft), f'state "{state.name}": ')
         f_number = f_number if opening == asked else None
     if f_number is None and opening is not None:
         f_number = data.f_number * 2 * there.stop_radius_mm / opening
@@ -313,12 +316,13 @@ def _without_dummies(draft: Draft) -> Draft:
         sums, before = merged(state.thickness)
         gaps = {place: sums[place] for place in sorted({owner[k] for k in state.thickness if owner[k] >= 0})}
         states.append(replace(state, thickness=gaps, object_distance=state.object_distance + before))
-    listed = ", ".join(map(str, dropped))
-    warn(draft.file, f"row {listed} behind the object (from 0): a plane in one medium that cuts no beam, left out")
+    listed = draft.in_file(f"surface {', '.join(map(str, dropped))}")
+    warn(draft.file, f"{listed} left out: a plane in one medium that cuts no beam")
     return replace(draft, rows=new, states=tuple(states), object_distance=draft.object_distance + front)
 
 
 def _is_dummy(draft: Draft, k: int) -> bool:
     s = draft.rows[k].surface
     flat = math.isinf(s.radius_mm) and not s.stop and not s.asphere and not draft.rows[k].aperture
-    return flat and same_medium([row.surface for row in draft.rows], k)
+    rows = [row.surface for row in draft.rows]
+    return flat and same_medium(rows, k, Medium(**draft.object_medium))

@@ -30,7 +30,7 @@ def read_flaresim(path: str | Path, given: Given | None = None) -> Lens:
     """The lens of a .lens file.
 
     Raises:
-        InputError: a key or type that is not of the format, a row without its six figures, no rows.
+        InputError: a type that is not of the format, a row without its six figures, no rows.
     """
     file = str(path)
     draft, rows = Draft(file, "FlareSim", unit="mm", drawn=True, rims="estimated"), list[Surface]()
@@ -55,7 +55,7 @@ def read_flaresim(path: str | Path, given: Given | None = None) -> Lens:
             focal = line.numbers(key, value.split())[0]
             draft.stated_efl = focal if focal > 0 else None
         else:
-            raise line.unknown(key, ("name", "focal_length", "surfaces"))
+            draft.skipped[key] += 1
     if stated is not None and stated != len(rows):
         assume(file, f"a comment speaks of {stated} surfaces, the table has {len(rows)}")
     draft.notes = [note for note in draft.notes if any(map(str.isalpha, note)) and "ior" not in note]

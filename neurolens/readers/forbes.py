@@ -2,20 +2,21 @@
 
 With u the height over a normalisation radius and x = u^2,
     Qcon: sag = conic + u^4 sum a_m Qcon_m(x), Jacobi's P_m^(0,4)(2 x - 1): exactly even powers;
-    Qbfs: sag = sphere + u^2 (1 - u^2) / sqrt(1 - c^2 r^2) sum a_m Qbfs_m(x), whose slopes along the normal are
-    orthonormal. Its root is no polynomial: one as close as `CLOSE_MM` up to the rim stands for it. Spheres so steep
-    that the lens model's powers do not reach that are refused.
+    Qbfs: sag = conic + u^2 (1 - u^2) / cos(slope of the conic) sum a_m Qbfs_m(x), whose slopes along the normal are
+    orthonormal (Forbes has a sphere, whose cosine is sqrt(1 - c^2 r^2); with a conic, Thorlabs's ASL5040-UV is sharp).
+    The cosine is no polynomial: one as close as `CLOSE_MM` up to the rim stands for it. Conics so steep that the lens
+    model's powers do not reach that are refused.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from decimal import Context, Decimal, localcontext
 
 from neurolens.optics.lensfile import MAX_POWER
 
-CLOSE_MM = 1e-11  # of sag, in the unit of the heights
+CLOSE_MM, WORST_MM = 1e-11, 1e-9  # of sag, in the unit of the heights: what is aimed at, and what steep conics get
 MAX_TERMS = MAX_POWER // 2 - 1  # of either kind, m from 0
 _DIGITS = 80
 _SAMPLES = 101
@@ -37,21 +38,32 @@ def qcon_terms(a: Sequence[float], radius: float, rim: float) -> Terms:
         return _powers(found, radius, rim)
 
 
-def qbfs_terms(a: Sequence[float], radius: float, curvature: float, rim: float) -> Terms:
-    """As `qcon_terms`, of a Qbfs departure from a sphere; ValueError, too, where the sphere is too steep for powers."""
+def qbfs_terms(a: Sequence[float], radius: float, curvature: float, rim: float, conic: float = 0.0) -> Terms:
+    """As `qcon_terms`, of a Qbfs departure from a conic; ValueError, too, where the conic is too steep for powers."""
     with localcontext(Context(prec=_DIGITS)):
-        s2, reach = (Decimal(curvature) * Decimal(radius)) ** 2, max(Decimal(1), (Decimal(rim) / Decimal(radius)) ** 2)
-        if s2 * reach >= 1:
-            raise ValueError("a rim inside the sphere")
+        s2, k, reach = (
+            (Decimal(curvature) * Decimal(radius)) ** 2,
+            Decimal(conic),
+            (Decimal(rim) / Decimal(radius)) ** 2,
+        )
+        if (1 + k) * s2 * reach >= 1:
+            raise ValueError("a rim inside the conic")
+
+        def inverse_cosine(x: Decimal) -> Decimal:
+            return ((1 - k * s2 * x) / (1 - (1 + k) * s2 * x)).sqrt()
+
         x_1mx = [Decimal(0), Decimal(1), Decimal(-1)]
         form = _product(x_1mx, _qbfs_sum(a))
         samples = [reach * k / (_SAMPLES - 1) for k in range(_SAMPLES)]
-        exact = [_at(form, x) / (1 - s2 * x).sqrt() for x in samples]
+        exact = [_at(form, x) * inverse_cosine(x) for x in samples]
         for degree in range(0, MAX_POWER // 2 - len(form) + 2):
-            found = _product(form, _inverse_root(s2, reach, degree))
-            if max(abs(_at(found, x) - y) for x, y in zip(samples, exact, strict=True)) <= Decimal(CLOSE_MM):
-                return _powers(found, radius, rim)
-        raise ValueError(f"a sphere that powers up to {MAX_POWER} follow to {CLOSE_MM:g}")
+            found = _product(form, _interpolated(inverse_cosine, reach, degree))
+            off = max(abs(_at(found, x) - y) for x, y in zip(samples, exact, strict=True))
+            if off <= Decimal(CLOSE_MM):
+                break
+        if off > Decimal(WORST_MM):
+            raise ValueError(f"a conic that powers up to {MAX_POWER} follow to {WORST_MM:g}")
+        return _powers(found, radius, rim)
 
 
 def _qbfs_sum(a: Sequence[float]) -> list[Decimal]:
@@ -81,10 +93,10 @@ def _qbfs_sum(a: Sequence[float]) -> list[Decimal]:
     return total
 
 
-def _inverse_root(s2: Decimal, reach: Decimal, degree: int) -> list[Decimal]:
-    """(1 - s2 x)^(-1/2) by the polynomial through it in Chebyshev's points of [0, reach]."""
+def _interpolated(function: Callable[[Decimal], Decimal], reach: Decimal, degree: int) -> list[Decimal]:
+    """The polynomial through a function of x in Chebyshev's points of [0, reach]."""
     nodes = [reach / 2 * (1 - Decimal(math.cos(math.pi * (k + 0.5) / (degree + 1)))) for k in range(degree + 1)]
-    table = [1 / (1 - s2 * x).sqrt() for x in nodes]
+    table = [function(x) for x in nodes]
     for order in range(1, degree + 1):  # Newton's divided differences
         for k in range(degree, order - 1, -1):
             table[k] = (table[k] - table[k - 1]) / (nodes[k] - nodes[k - order])

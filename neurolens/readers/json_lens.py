@@ -70,6 +70,8 @@ def read_json_lens(path: str | Path, given: Given | None = None, *, catalogue: b
     other = read_others(data, file, given)
     if other is not None:
         return other
+    if given.stop is not None:
+        raise InputError(file, "--stop", given.stop, "no such option: this form of JSON marks its stop")
     table = Table(data, file)
     table.only(KEYS)
     rows = data.get("surfaces", "(missing)")
@@ -124,8 +126,11 @@ def _load(path: str | Path) -> dict[str, Any]:
             raise InputError(path, twice, "(given twice)", "each key once")
         return found
 
+    endless: list[str] = []
+
     def refuse(word: str) -> float:
-        raise InputError(path, "file", word, "finite numbers")
+        endless.append(word)
+        return math.nan
 
     try:
         data = json.loads(read_text(path), object_pairs_hook=once, parse_constant=refuse)
@@ -136,6 +141,10 @@ def _load(path: str | Path) -> dict[str, Any]:
     check_tree(data, path)
     if not isinstance(data, dict):
         raise InputError(path, "file", f"(a {type(data).__name__})", "a JSON object with the key surfaces")
+    if "surfaces" not in data:
+        raise InputError(path, "format", "(not known: JSON without the key surfaces)", "our own, DeepLens's or ISET's")
+    if endless:
+        raise InputError(path, "file", endless[0], "finite numbers")
     return data
 
 

@@ -9,6 +9,7 @@ brackets repeat others. ISET: `radius` (0 is a plane), `thickness`, `ior` (one i
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -21,10 +22,10 @@ from neurolens.readers.source import warn
 
 _DEEPLENS = (
     *("info", "foclen", "fnum", "r_sensor", "d_sensor", "sensor_size", "sensor_res", "hfov", "fov", "float_hfov"),
-    *("float_foclen", "float_rfov", "rfov", "surfaces"),
+    *("float_foclen", "float_rfov", "rfov", "surfaces", "r_last"),
 )
 _DEEPLENS_SURFACE = (
-    *("idx", "type", "r", "c", "roc", "d", "d_next", "mat1", "mat2", "k", "ai", "is_square", "diffraction"),
+    *("idx", "type", "r", "c", "roc", "d", "d_next", "mat1", "mat2", "k", "ai", "is_square", "diffraction", "use_ai2"),
 )
 _STOPS, _AIR = ("Stop", "Aperture"), ("air", "vacuum", "occluder")
 _ISET = ("name", "description", "type", "surfaces", "microlens")
@@ -63,8 +64,12 @@ def _draft(data: Mapping[str, Any], file: str) -> Draft | None:
 
 
 def _deeplens(data: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], file: str) -> Draft:
-    Table({k: v for k, v in data.items() if not _repeats(k)}, file).only(_DEEPLENS)
-    surfaces = [_deeplens_surface(Table(row, file, f"surface {k}, ")) for k, row in enumerate(rows)]
+    if "DOE" in data:
+        raise InputError(file, "DOE", "(given)", "a lens without a diffractive element: the lens model has none")
+    skipped, surfaces = Counter({key: not _repeats(key) for key in data.keys() - set(_DEEPLENS)}), list[Surface]()
+    for k, row in enumerate(rows):
+        before = surfaces[-1] if surfaces else None
+        surfaces.append(_deeplens_surface(Table(row, file, f"surface {k}, "), before, skipped))
     return Draft(
         file=file,
         kind="DeepLens",
@@ -73,16 +78,18 @@ def _deeplens(data: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], file: 
         image_radius=Table(data, file).number("r_sensor", above=0) if "r_sensor" in data else None,
         film_given=surfaces[-1].thickness_mm > 0,
         unit="mm",
+        skipped=skipped,
     )
 
 
-def _deeplens_surface(row: Table) -> Surface:
+def _deeplens_surface(row: Table, before: Surface | None, skipped: Counter[str]) -> Surface:
+    """One surface; keys that are not known go to `skipped`. A stop without `mat2` stands in the medium before it."""
     given, kind, stop = row.data, row.data.get("type"), row.data.get("type") in _STOPS
     if kind not in ("Spheric", "Aspheric", *_STOPS):
         raise row.error("type", kind, "Spheric, Aspheric, Stop or Aperture")
-    # ai2, ai4, ... repeat the list ai.
-    again = [k for k in given if _repeats(k) or (k[:2] == "ai" and k[2:].isdecimal() and "ai" in given)]
-    Table({k: v for k, v in given.items() if k not in again}, row.file, row.where).only(_DEEPLENS_SURFACE)
+    for key in given.keys() - set(_DEEPLENS_SURFACE):
+        # ai2, ai4, ... repeat the list ai.
+        skipped[key] += not (_repeats(key) or (key[:2] == "ai" and key[2:].isdecimal() and "ai" in given))
     shape: dict[str, Any] = {}
     if kind == "Aspheric":
         terms = given.get("ai") or []
@@ -98,7 +105,7 @@ def _deeplens_surface(row: Table) -> Surface:
         diameter_mm=2 * row.number("r", unit="mm", above=0),
         stop=stop,
         **shape,
-        **_medium(row),
+        **(_medium(row) if "mat2" in row or not stop else _medium_of(before)),
     )
 
 
@@ -108,6 +115,10 @@ def _radius_mm(row: Table) -> float:
         return row.number("roc", unit="mm", finite=False) or math.inf
     c = row.number("c", unit="1/mm")
     return 1 / c if c else math.inf
+
+
+def _medium_of(before: Surface | None) -> dict[str, Any]:
+    return {key: getattr(before, key) for key in ("n_d", "V_d", "material", "glass")} if before else {}
 
 
 def _medium(row: Table) -> dict[str, Any]:

@@ -43,6 +43,10 @@ class _File:
     aspheres: list[tuple[Line, list[str]]] = field(default_factory=list)
     field_stops: set[int] = field(default_factory=set)
 
+    def names(self) -> list[str]:
+        """The numbers of the surfaces; a plane that was added has none."""
+        return [*self.ids, *[""] * (len(self.surfaces) - len(self.ids))]
+
     def value(self, name: str, place: int) -> float | None:
         """A variable in a state, None where it is not told; "Infinity" is `math.inf`."""
         line, words = self.variables.get(name.lower(), (None, []))
@@ -171,8 +175,11 @@ def _complete(found: _File) -> Draft:
     opening = found.value("Aperture Diameter", 0)
     if opening is not None and opening > 0:
         rows = [replace(s, diameter_mm=opening) if s.stop else s for s in rows]
+        draft.stop_given = True
     draft.object_distance = table.object_distance
-    draft.rows = tuple(Row(s, aperture=_cuts(found, rows, k)) for k, s in enumerate(rows))
+    draft.rows = tuple(
+        Row(s, _cuts(found, rows, k), name) for k, (s, name) in enumerate(zip(rows, found.names(), strict=True))
+    )
     draft.f_number = table.f_number
     draft.film_given = table.film_given
     if math.isinf(table.object_distance):
@@ -222,7 +229,7 @@ def _state(found: _File, place: int) -> State | None:
         name=" ".join([*words, *([f"at {distance:g} mm"] if near else [])]),
         thickness=gaps,
         f_number=None if near and place else _positive(found.value("F-Number", place)),
-        stop_diameter=_positive(found.value("Aperture Diameter", place)) if place else None,
+        stop_diameter=_positive(found.value("Aperture Diameter", place)),
         object_distance=float(distance) if near and distance is not None else math.inf,
         film_given=tabled != 0,
     )

@@ -15,16 +15,24 @@ from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import MAX_SURFACES
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.readers import draft
-from neurolens.readers.assemble import UNKNOWN, named_glass
-from neurolens.readers.draft import INFINITE, Draft, Given, Row, lens_of
-from neurolens.readers.source import UNITS_MM, Line, read_lines
+from neurolens.readers.assemble import UNKNOWN, by_indices, named_glass
+from neurolens.readers.draft import INFINITE, Draft, Given, Row, lens_of, primary_first
+from neurolens.readers.source import UNITS_MM, Line, by_word, read_lines
 
 TERMS = {"AD": 4, "AE": 6, "AF": 8, "AG": 10}
-# Designer, wavelengths and weights, settings of the program.
-IGNORED = frozenset("DES WV WW CALLBACK GPRT".split())
-READ = (
-    *("LEN", "EBR", "ANG", "UNI", "NXT", "END", "AIR", "GLA", "RD", "CV", "TH", "AP", "AST", "CC", *TERMS, "PY"),
-    *("SNO1", "NOT"),
+# Designer, weights, settings of the program, drawings.
+HARMLESS = frozenset("DES WW CALLBACK GPRT DRW CBK DLRS".split())
+# What changes rays and is not read, where a number other than 0 or a word follows: what is expected in its place.
+REFUSED = by_word(
+    ("NAO NA", "EBR or FNO to size the stop"),
+    ("TLA TLB TLC DCX DCY DCZ GC RCO", "no tilt or decentre: the lens model has none"),
+    ("RFL RFH REFL", "no mirror: the lens model has none"),
+    ("GRT GSP GOR DFR DOE HOE HOR", "no grating or hologram: the lens model has none"),
+    ("GRD GDT NZ1 NR1 NR2 NR4", "no gradient index: the lens model has none"),
+    ("PFL PFM", "no ideal lens: it is not read from OSLO's files"),
+    ("CVX RDX AAD ASP ASR ASI ASX TOR CCX", "a sphere, a conic, or AD to AG: other shapes are not read"),
+    ("PK PU PI PUC PIC PYC EAC", "a figure: solves and pickups are not carried out"),
+    ("AN AX1 AY1 APN AAC", "a round opening"),
 )
 
 
@@ -34,6 +42,7 @@ class Block(draft.Block):
 
     values: dict[str, float] = field(default_factory=dict)
     checked: bool = False
+    glass: Line | None = None
     solved: bool = False
 
 
@@ -44,6 +53,7 @@ class File(Draft):
     kind: str = "OSLO"
     blocks: list[Block] = field(default_factory=list)
     ended: bool = False
+    waves_um: list[float] = field(default_factory=list)
 
 
 def read_len(path: str | Path, given: Given | None = None) -> Lens:
@@ -82,12 +92,20 @@ def _read(file: File, line: Line) -> None:
         quoted = re.search('"([^"]*)"', line.text)
         file.name = quoted[1] if quoted else ""
         file.blocks.append(Block(line))
-    elif not file.blocks or file.ended:
-        raise line.error(word, "(here)", "commands between LEN NEW and END: configurations and the rest are not read")
-    elif word in IGNORED:
+    elif not file.blocks:
+        raise line.error(word, "(here)", "LEN NEW before everything else")
+    elif file.ended and word in ("CFG", "CF", "C"):
+        raise line.error(word, " ".join(rest) or "(here)", "one configuration: others are not read")
+    elif file.ended:  # variables, operands and tolerances, up to an END of their own
+        file.skipped["lines behind the surfaces"] += word != "END"
+    elif word in HARMLESS:
         pass
     elif re.fullmatch("SNO[0-9]*|NOT[0-9]*", word):
         file.notes.append(" ".join(rest).strip('"'))
+    elif word in REFUSED:
+        numbers = [n for n in rest if re.fullmatch("[-+.0-9eE]+", n)]
+        if not numbers or any(line.numbers(word, numbers)):
+            raise line.error(word, " ".join(rest) or "(here)", REFUSED[word])
     elif not _system(file, line, word, rest):
         _surface(file, line, word, rest)
 
@@ -102,6 +120,10 @@ def _system(file: File, line: Line, word: str, rest: list[str]) -> bool:
                 file.pupil = 2 * value
             else:
                 file.half_field_deg = value if 1e-3 < value < 90 else None
+        case "FNO":
+            file.f_number = line.positive(word, rest)
+        case "WV":
+            file.waves_um = line.numbers(word, rest)
         case "UNI":
             mm = line.numbers(word, rest[:1])[0]
             file.unit = next((name for name, value in UNITS_MM.items() if value == mm), None)
@@ -110,7 +132,7 @@ def _system(file: File, line: Line, word: str, rest: list[str]) -> bool:
         case "NXT":
             if len(file.blocks) > MAX_SURFACES + 1:
                 raise line.error(word, f"({len(file.blocks)} surfaces)", f"at most {MAX_SURFACES} surfaces")
-            file.blocks.append(Block(line))
+            file.blocks.append(Block(line, str(len(file.blocks))))
         case "END":
             file.ended = True
             if rest and line.numbers(word, rest[:1])[0] != len(file.blocks) - 1:
@@ -126,7 +148,7 @@ def _surface(file: File, line: Line, word: str, rest: list[str]) -> None:
         case "AIR":
             block.medium = {}
         case "GLA":
-            block.medium = _glass(line, rest)
+            block.medium, block.glass = _glass(line, rest), line
         case "AP":
             block.checked = rest[:1] == ["CHK"]
             semi = line.numbers(word, rest[1:2] if block.checked else rest[:1])[0]
@@ -140,7 +162,7 @@ def _surface(file: File, line: Line, word: str, rest: list[str]) -> None:
         case _ if word in ("RD", "CV", "TH", "CC", *TERMS):
             block.values[word] = line.numbers(word, rest[:1])[0]
         case _:
-            raise line.unknown(word, READ)
+            file.skipped[word] += 1
 
 
 def _glass(line: Line, rest: list[str]) -> dict[str, Any]:
@@ -149,8 +171,6 @@ def _glass(line: Line, rest: list[str]) -> dict[str, Any]:
         raise line.error("GLA", "(nothing)", "the name of a glass, or an index")
     if re.fullmatch(r"[0-9.]+", rest[0]):
         indices = line.numbers("GLA", rest)
-        if len(indices) > 1:
-            raise line.error("GLA", " ".join(rest), "one index, or the name of a glass in the catalogue")
         return {"n_d": indices[0]}
     if rest[0].upper() in ("REFL", "RFL", "REFLECT"):
         raise line.error("GLA", rest[0], "a glass: the lens model has no mirrors")
@@ -159,13 +179,19 @@ def _glass(line: Line, rest: list[str]) -> dict[str, Any]:
 
 def _complete(file: File) -> None:
     """Set what follows from all surfaces."""
+    waves_nm = [1000 * um for um in file.waves_um]
+    for block in file.blocks:  # indices at the wavelengths, which follow behind the surfaces
+        if block.glass and block.medium.keys() == {"n_d"}:
+            indices = block.glass.numbers("GLA", block.glass.words[1:])
+            block.medium = by_indices(block.glass, "GLA", indices, waves_nm)
     first, *middle, _ = file.blocks
     last = middle[-1]
     for k, block in enumerate(middle, start=1):
         if block.solved and block is not last:
             raise block.start.error("PY", f"(on surface {k})", "the last surface")
     distance = first.values.get("TH", 0.0)
-    file.rows = tuple(Row(_surface_of(block), aperture=block.checked) for block in middle)
+    file.rows = tuple(Row(_surface_of(block), block.checked, block.name) for block in middle)
+    file.object_medium, file.wavelengths_nm = first.medium, primary_first(waves_nm, waves_nm[0] if waves_nm else 0.0)
     file.object_distance = math.inf if distance >= INFINITE else distance
     file.film_given = not (last.solved and "TH" not in last.values)
 

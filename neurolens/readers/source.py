@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +11,6 @@ from pathlib import Path
 
 from neurolens.base.errors import AssumedWarning, InputError, NeurolensWarning
 from neurolens.base.files import read_bytes
-from neurolens.base.tomlfile import suggestion
 
 MAX_BYTES = 4_000_000  # the longest real lens files, with tolerances and merit function, stay below 1 MB
 MAX_LINES = 100_000
@@ -37,11 +37,6 @@ class Line:
         """The error for something on this line."""
         return InputError(self.file, f"line {self.number}, {keyword}", value, expected)
 
-    def unknown(self, keyword: str, known: Sequence[str]) -> InputError:
-        """The error for a keyword that the reader does not know."""
-        expected = f"one of the keywords read: {', '.join(known)}{suggestion(keyword, known)}"
-        return self.error(keyword, "(unknown keyword)", expected)
-
     def number_of(self, keyword: str, word: str) -> float:
         """A finite number from one word of this line."""
         try:
@@ -49,7 +44,10 @@ class Line:
         except ValueError:
             value = math.nan
         if not abs(value) <= LARGEST:
-            raise self.error(keyword, word, "a finite number")
+            comma = re.fullmatch("[-+]?[0-9]+,[0-9]+(e[-+]?[0-9]+)?", word, re.IGNORECASE)
+            raise self.error(
+                keyword, word, f"a finite number{', with a point: decimal commas are not read' * bool(comma)}"
+            )
         return value
 
     def positive(self, keyword: str, words: Sequence[str]) -> float:
@@ -65,6 +63,11 @@ class Line:
             found = " ".join(words) or "(nothing)"
             raise self.error(keyword, found, f"{least} number{'s' if least > 1 else ''} after it")
         return [self.number_of(keyword, word) for word in words]
+
+
+def by_word(*groups: tuple[str, str]) -> dict[str, str]:
+    """What is expected in the place of each keyword, from groups of keywords that share it."""
+    return {word: expected for words, expected in groups for word in words.split()}
 
 
 def read_text(path: str | Path) -> str:

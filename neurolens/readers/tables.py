@@ -80,16 +80,16 @@ def looks_like_table(head: str) -> bool:
 def _surfaces(file: str, rows: Sequence[tuple[Line, list[float]]], factor: float) -> list[Surface]:
     flat = [k for k, (_, numbers) in enumerate(rows) if numbers[0] == 0]
     stops = [k for k, (_, numbers) in enumerate(rows) if numbers[2] == 0] or flat
-    if len(stops) != 1:
-        found = f"(rows at line {', '.join(str(rows[k][0].number) for k in stops)})" if stops else "(none)"
+    if len(stops) > 1:
+        found = f"(rows at line {', '.join(str(rows[k][0].number) for k in stops)})"
         raise InputError(file, "stop", found, "exactly one row of index 0, or else of radius 0: the aperture stop")
     surfaces: list[Surface] = []
     for k, (line, (radius, thickness, index, diameter)) in enumerate(rows):
         # The stop does not change the medium: pbrt and appleseed have it in air.
-        n_d = 1.0 if k == stops[0] and index == 0 else index
+        n_d = 1.0 if k in stops and index == 0 else index
         if n_d < 1:
             raise line.error("index", index, "a refractive index of at least 1 (0 marks the stop)")
         if diameter <= 0:
             raise line.error("diameter", diameter, "a length above 0")
-        surfaces.append(Surface(radius or math.inf, thickness, factor * diameter, n_d=n_d, stop=k == stops[0]))
+        surfaces.append(Surface(radius or math.inf, thickness, factor * diameter, n_d=n_d, stop=k in stops))
     return surfaces

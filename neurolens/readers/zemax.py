@@ -7,6 +7,7 @@ tolerances and configurations. Curvatures, semi-diameters, thickness to the next
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,14 +18,12 @@ from neurolens.optics import catalogue
 from neurolens.optics.lensfile import MAX_SURFACES
 from neurolens.optics.prescription import Lens
 from neurolens.readers.assemble import named_glass
-from neurolens.readers.draft import Draft, Given, Row, lens_of
-from neurolens.readers.source import Line, read_lines, warn
+from neurolens.readers.draft import Draft, Given, Row, lens_of, primary_first
+from neurolens.readers.source import Line, assume, read_lines, warn
 from neurolens.readers.zemax_model import (
-    COATING,
-    IGNORED_SURFACE,
-    IGNORED_SYSTEM,
-    MERIT,
+    HARMLESS,
     Q_TYPE,
+    REFUSED,
     TYPES,
     VIGNETTING,
     Block,
@@ -43,12 +42,15 @@ class File(Draft):
     blocks: list[Block] = field(default_factory=list)
     zoom: Zoom = field(default_factory=Zoom)
     makers: list[str] = field(default_factory=list)
+    without_film: bool = False
     working: Line | None = None  # where the f-number is said to be the working one
     field_type: int = 0
     fields: int = 0
     heights: dict[str, list[float]] = field(default_factory=dict)
-    ignored: Counter[str] = field(default_factory=Counter)
-    oddities: list[str] = field(default_factory=list)
+    waves_um: dict[int, float] = field(default_factory=dict)
+    waves: int = 0  # how many wavelengths are used, where the file says so
+    primary: int = 1
+    behind: Counter[str] = field(default_factory=Counter)  # what follows a surface without indentation
 
 
 def _complete(file: File) -> None:
@@ -58,30 +60,55 @@ def _complete(file: File) -> None:
         InputError: a file that was cut off, a shape that the lens model cannot hold, the working f-number of a near
             object.
     """
+    file.skipped["lines of the merit function"] += file.behind.total()
     *_, image = file.blocks
     for before, block in zip(file.blocks, file.blocks[1:], strict=False):
         block.semi_diameter = block.semi_diameter if block.clear is None else block.clear
         if block.kind == "COORDBRK" and block.glass is None:
             block.medium = before.medium  # it stands in the medium of the surface before it
-    file.rows = tuple(Row(b.surface(shape_of(b)), b.aperture) for b in file.blocks[1:-1])
+    file.rows = tuple(Row(b.surface(shape_of(b)), b.aperture, b.name) for b in file.blocks[1:-1])
     for block in file.blocks:
         if math.isnan(block.thickness):
             raise block.start.error("DISZ", "(missing)", "the thickness behind every surface (is the file cut off?)")
     if image.thickness or image.medium or image.stop:
         raise image.start.error("SURF", "(the last in the file)", "an image surface (is the file cut off?)")
     if image.curvature:
-        file.oddities.append("the image surface is curved; the film is taken as plane")
+        warn(file.file, "the image surface is curved; the film is taken as plane")
     if file.f_number is not None and file.working and math.isfinite(file.blocks[0].thickness):
         raise file.working.error("FNUM", "(the working f-number of a near object)", "ENPD, FLOA, or FNUM with flag 0")
-    for text in (*file.oddities, *(f"{text} ({count})" for text, count in file.ignored.items() if count)):
-        warn(file.file, text)
     last = file.blocks[-2]
     file.notes = ["\n".join(file.notes).strip()]
     file.states = tuple(draft_states(file.zoom, file.blocks, file.f_number is not None))
-    file.object_distance = file.blocks[0].thickness
-    file.film_given = not (last.solve and last.solve[0] == "MAZH" and last.thickness == 0)
+    file.object_distance, file.object_medium = file.blocks[0].thickness, file.blocks[0].medium
+    used = dict.fromkeys(um for n, um in sorted(file.waves_um.items()) if n <= (file.waves or n))
+    file.wavelengths_nm = primary_first([1000 * um for um in used], 1000 * file.waves_um.get(file.primary, 0.0))
+    file.film_given = not (file.without_film or (last.solve and last.solve[0] == "MAZH" and last.thickness == 0))
     file.rims = "estimated" if any(b.automatic and not b.stop for b in file.blocks[1:-1]) else "source"
     _set_field(file)
+
+
+def _add_ends(file: File) -> None:
+    """Add the object and the image to a file that lists the surfaces of a lens only."""
+    first, last = file.blocks[0], file.blocks[-1]
+    begins_in_glass = bool(first.name and first.medium and math.isfinite(first.thickness))
+    # Such a list ends with a surface of the lens; any other file that ends behind glass has been cut off.
+    ends_in_glass = begins_in_glass and bool(file.blocks[-2].medium)
+    lists_lens = begins_in_glass and (first.curvature or last.thickness > 0 or ends_in_glass)
+    if file.zoom.count > 1 and (lists_lens or not all(b.name.isdecimal() for b in file.blocks)):
+        raise first.start.error("SURF", first.name, "object, surfaces numbered in order, and image, for configurations")
+    if lists_lens:
+        assume(file.file, f"surface {first.name} is one of glass: the object is assumed in front of it, at infinity")
+        file.blocks.insert(0, Block(first.start, thickness=math.inf))
+    elif not first.name:
+        first.thickness = math.inf
+        assume(file.file, "there is no SURF 0: the object is assumed at infinity, in air")
+    elif first.curvature and math.isfinite(first.thickness):
+        warn(file.file, "the object surface is curved; the object is taken as plane")
+    file.without_film = ends_in_glass and last.thickness == 0
+    if ends_in_glass or (last.thickness > 0 and not file.blocks[0].name):
+        place = "at the paraxial focus" if file.without_film else "where its thickness ends"
+        assume(file.file, f"the last surface is no image: the film is assumed {place}")
+        file.blocks.append(Block(last.start, thickness=0.0))
 
 
 def _set_field(file: File) -> None:
@@ -99,11 +126,11 @@ def _set_field(file: File) -> None:
 UNITS = {"MM": "mm", "CM": "cm", "IN": "in", "INCH": "in", "METER": "m", "METERS": "m", "M": "m"}
 SYSTEM = (
     *("MODE", "NAME", "NOTE", "UNIT", "ENPD", "FNUM", "FLOA", "OBNA", "ENVD", "GCAT", "FTYP", "XFLN", "YFLN", "TOL"),
-    "MNUM",
+    *("WAVM", "WAVL", "WAVN", "PWAV", "MNUM"),
 )
 SURFACE = (
     *("SURF", "TYPE", "CURV", "CONI", "DISZ", "GLAS", "DIAM", "PARM", "XDAT", "STOP", "COMM", "MAZH", "TCOM", "TOLE"),
-    *("CLAP", "FLAP", "SQAP", "ELAP", "OBDC", "IGNR"),
+    *("CLAP", "FLAP", "SQAP", "ELAP", "USAP", "OBDC", "IGNR"),
 )
 
 
@@ -117,6 +144,8 @@ def read_zmx(path: str | Path, given: Given | None = None) -> Lens:
     file = File(str(path))
     for line in read_lines(path):
         _read(file, line)
+    if len(file.blocks) > 1:
+        _add_ends(file)
     if len(file.blocks) < 3:
         raise InputError(file.file, "SURF", f"({len(file.blocks)} surfaces)", "object, at least one surface, and image")
     _complete(file)
@@ -141,22 +170,30 @@ def _read(file: File, line: Line) -> None:
         _system(file, line, word, rest)
     elif file.blocks and word in SURFACE:
         _surface(file, file.blocks[-1], line, word, rest)
-    elif word in COATING and file.blocks:
-        file.ignored["coatings named but not given"] += 1
+    elif file.blocks and word in REFUSED:
+        if any(word not in ("0", "0.0") for word in rest) or not rest:
+            raise line.error(word, " ".join(rest) or "(here)", REFUSED[word])
+    elif word == "COAT" and file.blocks:
+        file.skipped["coatings that are named but not given"] += 1
     elif word in VIGNETTING:
-        file.ignored["vignetting factors (rims decide)"] += any(line.numbers(word, rest, 0))
-    elif word in IGNORED_SYSTEM or (file.blocks and word in IGNORED_SURFACE | MERIT):
-        pass
+        file.skipped["vignetting factors (rims decide)"] += any(line.numbers(word, rest, 0))
+    elif not file.blocks or line.text[:1].isspace():
+        file.skipped[word] += word not in HARMLESS
     else:
-        raise line.unknown(word, (*SYSTEM, *SURFACE))
+        file.behind[word] += 1
 
 
 def _begin(file: File, line: Line, rest: list[str]) -> None:
-    if not rest or rest[0] != str(len(file.blocks)):
-        raise line.error("SURF", " ".join(rest), f"surface {len(file.blocks)}, as they are numbered in order")
+    file.skipped += file.behind  # no merit function yet
+    file.behind.clear()
+    if not file.blocks and rest[:1] == ["1"]:
+        file.blocks.append(Block(line))
+    last = next((b.name for b in reversed(file.blocks) if b.name.isdecimal()), str(len(file.blocks) - 1))
+    if not rest or not re.fullmatch(f"{int(last) + 1}|{last}[A-Z]+", rest[0]):  # 5AS: a stop behind surface 5
+        raise line.error("SURF", " ".join(rest), f"surface {int(last) + 1}, as they are numbered in order")
     if len(file.blocks) > MAX_SURFACES + 1:
         raise line.error("SURF", rest[0], f"at most {MAX_SURFACES} surfaces")
-    file.blocks.append(Block(line))
+    file.blocks.append(Block(line, name=rest[0]))
 
 
 def _system(file: File, line: Line, word: str, rest: list[str]) -> None:
@@ -181,12 +218,19 @@ def _system(file: File, line: Line, word: str, rest: list[str]) -> None:
             raise line.error(word, " ".join(rest), "a pupil diameter (ENPD), an f-number (FNUM) or the stop (FLOA)")
         case "ENVD":
             if line.numbers(word, rest, 2)[:2] != [20.0, 1.0]:
-                file.oddities.append(f"indices are those at 20 degrees and 1 atmosphere, not at {' '.join(rest[:2])}")
+                warn(file.file, f"indices are those at 20 degrees and 1 atmosphere, not at {' '.join(rest[:2])}")
         case "GCAT":
             file.makers = [word.upper().split("_")[0] for word in rest]  # catalogues may end in a date
         case "FTYP":
             numbers = line.numbers(word, rest, 1)
-            file.field_type, file.fields = int(numbers[0]), int(numbers[2]) if len(numbers) > 2 else 0
+            file.field_type, file.fields, file.waves = int(numbers[0]), *map(int, (*numbers[2:4], 0, 0)[:2])
+        case "WAVM":
+            n, um = line.numbers(word, rest[:2], 2)
+            file.waves_um[int(n)] = um
+        case "WAVL" | "WAVN":
+            file.waves_um |= dict(enumerate(line.numbers(word, rest), start=1))
+        case "PWAV":
+            file.primary = int(line.numbers(word, rest[:1])[0])
         case "XFLN" | "YFLN":
             file.heights[word] = line.numbers(word, rest, 0)
         case "MNUM":
@@ -229,9 +273,9 @@ def _surface(file: File, block: Block, line: Line, word: str, rest: list[str]) -
                 raise line.error(word, f"{inner:g} {outer:g}", "a round opening without a hole")
             block.clear, block.aperture = outer, True
             block.automatic = word == "FLAP" and block.automatic
-        case "SQAP" | "ELAP":
+        case "SQAP" | "ELAP" | "USAP":
             block.aperture = True
-            file.oddities.append(f"line {line.number}: {word}, an opening that is not round, is taken as round by DIAM")
+            warn(file.file, f"line {line.number}: {word}, an opening that is not round, is taken as round by DIAM")
         case "OBDC":
             if any(line.numbers(word, rest)):
                 raise line.error(word, " ".join(rest), "an opening that is centred on the axis")
@@ -241,17 +285,26 @@ def _surface(file: File, block: Block, line: Line, word: str, rest: list[str]) -
 
 
 def _glass(line: Line, rest: list[str], makers: list[str]) -> dict[str, Any]:
-    """GLAS name, type of solve (1: a model glass, 2: a pickup already carried out, 4: an offset), surface, n_d, V_d."""
+    """GLAS name, type of solve, surface, n_d, V_d.
+
+    Solve 1 is a model glass; others leave the glass that is named (2: a pickup, carried out; 3: one that the program
+    may exchange), except 4, an offset from it.
+    """
     name, kind = rest[0] if rest else "", rest[1] if len(rest) > 1 else "0"
     if name.upper() == "MIRROR" or not name:
         raise line.error("GLAS", name, "a glass: the lens model has no mirrors")
     if name.upper() in ("AIR", "VACUUM"):
         return {}
     if kind == "1" or name == "___BLANK":
-        n_d, V_d = line.numbers("GLAS", rest[3:5], 2)
+        n_d, V_d, departure = (*line.numbers("GLAS", rest[3:6]), 0.0, 0.0)[:3]
+        if departure:
+            left_out = "a model glass's departure from normal partial dispersion is left out: colours differ a little"
+            warn(line.file, f"line {line.number}, GLAS: {left_out}")
         return {"n_d": n_d, "V_d": V_d if V_d > 0 else None, "material": None if name == "___BLANK" else name}
-    if kind not in ("0", "2"):
-        raise line.error("GLAS", f"{name} with solve {kind}", "a glass of the catalogue, or n_d and V_d")
+    if kind == "4":
+        raise line.error(
+            "GLAS", f"{name} with solve {kind}", "a glass of the catalogue, or n_d and V_d: no offset from it"
+        )
     figures = [] if catalogue.same_name(name) else [line.number_of("GLAS", word) for word in rest[3:5]]
     # 1.5 and 40 is what the program writes in the place of both.
     told = (figures[0], figures[1]) if len(figures) == 2 and min(figures) > 1 and figures != [1.5, 40.0] else None

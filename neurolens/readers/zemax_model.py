@@ -1,49 +1,30 @@
-"""Parser state of a Zemax file: surfaces, configurations, and the keywords without effect on rays."""
+"""Parser state of a Zemax file: surfaces, configurations, and which keywords change rays."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from neurolens.base.errors import InputError
+from neurolens.optics.lensfile import MAX_POWER
 from neurolens.readers import draft
 from neurolens.readers.draft import INFINITE, State
-from neurolens.readers.source import Line, assume
+from neurolens.readers.source import Line, assume, by_word
 
-# Settings of the program and of its analyses.
-IGNORED_SYSTEM = frozenset(
-    """VERS PFIL LANG GFAC RAIM PUSH SDMA OMMA ROPD PICB PZUP FWGN FWGT WAVL WAVN WAVM WWGT WWGN PWAV POLS GLRS
-    GSTD NSCD COFN LUID EFFL""".split()
+# Settings of the program, and what its editor shows of a surface: written to most files, and no ray depends on them.
+HARMLESS = frozenset(
+    """VERS PFIL LANG GFAC RAIM PUSH SDMA OMMA ROPD PICB PZUP FWGN FWGT WWGT WWGN POLS GLRS GSTD NSCD COFN LUID EFFL
+    HYPR DBDT HIDE MIRR SLAB POPS FIMP MEMA OEMA VDSZ VPAR PPAR GLCZ""".split()
 )
-# Of the system, and ignored: rims and stop decide which rays pass, not the factors that a designer chose.
+# Rims and stop decide which rays pass, not the factors that a designer chose.
 VIGNETTING = frozenset("VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN".split())
-# Of a surface: what the editor shows and hides, substrates, mechanical edges, variables, pickups carried out.
-IGNORED_SURFACE = frozenset("HIDE MIRR SLAB POPS FIMP MEMA OEMA VDSZ VPAR PPAR GLCZ".split())
-# Of a surface, and worth a warning: coatings are named, not given.
-COATING = frozenset(["COAT"])
-# Operands of the merit function.
-MERIT = frozenset(
-    """AMAG ENPP EFFL EFLX EFLY EPDI EXPD EXPP ISFN ISNA LINV OBSN PIMH PMAG POWF POWP POWR SFNO TFNO WFNO GCOS GTCE
-    INDX MNAB MNIN MNPD MXAB MXIN MXPD RGLA PANA PANB PANC PARA PARB PARC PARR PARX PARY PARZ PATX PATY YNIP CEHX
-    CEHY CENX CENY CNAX CNAY CNPX CNPY DXDX DXDY DYDX DYDY HHCN IMAE MNRE MNRI MXRE MXRI OPTH PLEN RAED RAEN RAGA
-    RAGB RAGC RAGX RAGY RAGZ RAID RAIN RANG REAA REAB REAC REAR REAX REAY REAZ RENA RENB RENC RETX RETY GLCA GLCB
-    GLCC GLCR GLCX GLCY GLCZ CONF IMSF PRIM SVIG WLEN CVIG FDMO FDRE ABSO ACOS ASIN ATAN CONS COSI DIFF DIVB DIVI
-    EQUA LOGE LOGT MAXX MINN OPGT OPLT OPVA OSUM PROB PROD QSUM RECI SQRT SUMM SINE TANG ABGT ABLT MCOG MCOL MCOV
-    ZTHI GBPD GBPP GBPR GBPS GBPW GBPZ GBSD GBSP GBSR GBSS GBSW DLTN GRMN GRMX LPTD FOUC ABCD ANAC ANAR ANAX ANAY
-    ANCX ANCY ASTI AXCL BIOC BIOD BSER COMA DIMX DISA DISC DISG DIST FCGS FCGT FCUR LACL LONA OPDC OPDM OPDX OSCD
-    PETC PETZ RSCE RSCH RSRE RSRH RWCE RWCH RWRE RWRH SMIA SPCH SPHA TRAC TRAD TRAE TRAI TRAR TRAX TRAY TRCX TRCY
-    ZERN GPIM GPRT GPRX GPRY GPSX GPSY FICL FICP POPD ZPLM UDOC UDOP UDOF RELI EFNO BLNK DMFS ENDX GOTO OOFF SKIN
-    SKIS USYM FREZ NPGT NPLT NPVA NPXG NPXL NPXV NPYG NPYL NPYV NPZG NPZL NPZV NSRM NTXG NTXL NTXV NTYG NTYL NTYV
-    NTZG NTZL NTZV NSDC NSDD NSDE NSDP NSLT NSRA NSRD NSRW NSST NSTR NSTW REVR CMFV CMGT CMLT CMVA CODA CEGT CELT
-    CEVA CIGT CILT CIVA GMTA GMTN GMTS GMTT GMTX MECA MECS MECT MSWA MSWN MSWS MSWT MSWX MTFA MTFN MTFS MTFT MTFX
-    MTHA MTHN MTHS MTHT MTHX POPI BFSD TOLR TCGT TCLT TCVA STRH DENC DENF ERFP GENC GENF XENC XENF COGT COLT COVA
-    CTGT CTLT CTVA CVGT CVLT CVVA BLTH DMGT DMLT DMVA ETGT ETLT ETVA FTGT FTLT MNCA MNCG MNCT MNCV MNEA MNEG MNET
-    MXCA MXCG MXCT MXCV MXEA MXEG MXET MNSD MXSD OMMI OMMX OMSD TGTH TTGT TTHI TTLT TTVA XNEA XNET XNEG XXEA XXEG
-    XXET CVOL MNDT MXDT SAGX SAGY SSAG STHI TMAS TOTR VOLU NORX NORY NORZ NORD SCUR SDRV PMGT PMLT PMVA XDGT XDLT
-    XDVA""".split()
+# Of a surface: what changes rays, and the lens model has not.
+REFUSED = by_word(
+    ("OBSC SQOB ELOB USOB SPID", "no obscuration: the lens model has none"),
+    ("SCBD", "no tilt and no decentre of a surface: the lens model has none"),
 )
 # Operands of the multi-configuration editor that move no ray: fields, wavelengths, vignetting factors, comments.
 CONFIGURATION = frozenset("MOFF MCOM XFIE YFIE FLWT FVDX FVDY FVCX FVCY FVAN WAVE WLWT PRWV GCRS".split())
@@ -51,6 +32,8 @@ CONFIGURATION = frozenset("MOFF MCOM XFIE YFIE FLWT FVDX FVDY FVCX FVCY FVAN WAV
 
 TYPES = tuple("STANDARD EVENASPH ODDASPHE XASPHERE XOSPHERE TOROIDAL BICONICX PARAXIAL COORDBRK".split())
 MAX_EXTRAS = 240
+_DEEPEST = 1000  # sag of an asphere over its rim
+_EVEN = 8  # terms of EVENASPH by its definition; other programs write more
 Q_TYPE = "Q"  # what the names of Q-type aspheres, and of no other type, begin with
 
 
@@ -72,18 +55,18 @@ class Block(draft.Block):
     def parameter(self, n: int) -> float:
         return self.parameters.pop(n, (0.0, self.start))[0]
 
-    def extras(self) -> tuple[float, list[float]]:
-        """Normalisation radius and coefficients of a surface whose extra data begin with their count.
+    def extras(self, first: int = 1) -> tuple[float, list[float]]:
+        """Normalisation radius and coefficients of a surface, whose count stands in the extra data at `first`.
 
         Raises:
             InputError: a count that is not whole, or beyond `MAX_EXTRAS`; a radius that is not above 0.
         """
-        (count, line), (radius, _) = (self.extra.pop(n, (given, self.start)) for n, given in ((1, 0.0), (2, 1.0)))
+        (count, line), (radius, _) = (self.extra.pop(first + k, (k, self.start)) for k in (0, 1))
         if not (0 <= count <= MAX_EXTRAS and count == int(count)):
-            raise line.error(f"XDAT 1 of {self.kind}", count, f"how many terms there are, at most {MAX_EXTRAS}")
+            raise line.error(f"XDAT {first} of {self.kind}", count, f"how many terms there are, at most {MAX_EXTRAS}")
         if not radius > 0:
-            raise line.error(f"XDAT 2 of {self.kind}", radius, "a normalisation radius above 0")
-        return radius, [self.extra.pop(n, (0.0, self.start))[0] for n in range(3, 3 + int(count))]
+            raise line.error(f"XDAT {first + 1} of {self.kind}", radius, "a normalisation radius above 0")
+        return radius, [self.extra.pop(first + 2 + k, (0.0, self.start))[0] for k in range(int(count))]
 
 
 def thickness(line: Line, word: str, rest: list[str], *, is_object: bool) -> float:
@@ -98,7 +81,7 @@ def shape_of(block: Block) -> dict[str, Any]:
     """Radius, conic, asphere and what else describes the shape of a surface, for `Surface`.
 
     Even asphere: sum of PARM i r^(2 i); odd asphere: sum of PARM i r^i; the extended ones have XDAT in the place of
-    PARM, and powers of r over a normalisation radius. Q-type: PARM 1 is 0 for Qbfs and 1 for Qcon. Toroidal: CURV,
+    PARM, and powers of r over a normalisation radius. Q-type: XDAT 1 is 0 for Qbfs and 1 for Qcon. Toroidal: CURV,
     CONI and PARM i y^(2 i - 2), i from 2, in the y-z plane, turned about an axis at PARM 1 (0 is infinity: a cylinder).
     Biconic: CURV, CONI in y, PARM 1 (a radius, 0 is infinity) and PARM 2 (a conic) in x. Paraxial, an ideal lens:
     PARM 1 is its focal length; PARM 2 counts path lengths in one way or another and moves no ray.
@@ -109,8 +92,15 @@ def shape_of(block: Block) -> dict[str, Any]:
     match block.kind:
         case "STANDARD":
             shape = block.rotational()
+        case "XASPHERE" if any(v for v, _ in block.parameters.values()) and not any(v for v, _ in block.extra.values()):
+            told = "an XASPHERE with its terms in PARM is taken as EVENASPH"
+            assume(block.start.file, f"surface {block.name} of the file: {told}")
+            return shape_of(replace(block, kind="EVENASPH", extra={}))
         case "EVENASPH":
-            shape = block.rotational([(2 * i, block.parameter(i)) for i in range(1, 9)])
+            if any(n > _EVEN and value for n, (value, _) in block.parameters.items()):
+                told = f"PARM {_EVEN + 1} and beyond of EVENASPH are taken as its next even powers"
+                assume(block.start.file, f"surface {block.name} of the file: {told}")
+            shape = block.rotational([(2 * i, block.parameter(i)) for i in range(1, MAX_POWER // 2 + 1)])
         case "ODDASPHE":
             terms = [(i, block.parameter(i)) for i in range(1, 9)]
             if terms[0][1]:
@@ -122,6 +112,10 @@ def shape_of(block: Block) -> dict[str, Any]:
             if step == 1 and values[:1] not in ([], [0.0]):
                 raise block.start.error("XDAT 3 of XOSPHERE", values[0], "0: a cone's tip has no normal")
             shape = block.rotational((step * i, a / radius ** (step * i)) for i, a in enumerate(values, start=1))
+            rim = block.semi_diameter
+            if step == 2 and (depth := sum(abs(a) * rim**p for p, a in shape["asphere"])) > _DEEPEST * rim:
+                expected = "terms of even powers: are these an XOSPHERE's, of odd powers too?"
+                raise block.start.error("XASPHERE", f"(a sag of {depth:.3g} at a rim of {rim:g})", expected)
         case kind if kind.startswith(Q_TYPE):
             shape = _q_type(block)
         case "TOROIDAL" | "BICONICX":
@@ -145,11 +139,11 @@ def shape_of(block: Block) -> dict[str, Any]:
 
 
 def _q_type(block: Block) -> dict[str, Any]:
-    form, (radius, values) = block.parameter(1), block.extras()
-    told = f"{block.kind}: PARM 1 is taken as 0 for Qbfs, 1 for Qcon, XDAT as that of XASPHERE"
-    assume(block.start.file, f"line {block.start.number}: {told}")
+    form, (radius, values) = block.extra.pop(1, (0.0, block.start))[0], block.extras(2)
     if form not in (0, 1):
-        raise block.start.error(block.kind, f"(PARM 1 {form:g})", "0 (Qbfs) or 1 (Qcon)")
+        raise block.start.error(block.kind, f"(XDAT 1 {form:g})", "0 (Qbfs) or 1 (Qcon)")
+    if form == 1:
+        assume(block.start.file, f"line {block.start.number}: {block.kind}: 1 in XDAT 1 is taken to mean Qcon")
     return block.q_type(block.kind, form == 1, values, radius)
 
 
@@ -193,9 +187,9 @@ class Zoom:
         word, rest = line.words[0].upper(), line.words[1:]
         if word in CONFIGURATION or word == "BLNK":
             return
+        if self.count == 1:
+            return  # what one configuration sets stands in the table
         if word not in OPERANDS:
-            if self.count == 1:
-                raise line.unknown(word, OPERANDS)
             expected = f"one of {', '.join(OPERANDS)}: other things that change with the configuration are not read"
             raise line.error(word, "(unknown operand)", expected)
         numbers = line.numbers(word, rest[:2], 2)

@@ -48,6 +48,7 @@ def card_of(model: LensModel, errors: dict[str, Any]) -> dict[str, Any]:
         "schema": CARD_SCHEMA,
         "lens": lens_facts(model.lens, model.domain),
         "units": UNITS,
+        "transmittance": model.transmittance,
         "frame": FRAME.format(place="the front surface" if model.direction == "angle" else "the plane z = 0"),
         "domain": model.domain.to_dict(),
         "status_codes": _status_codes(model),

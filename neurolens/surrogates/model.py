@@ -21,7 +21,7 @@ from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.program import RAY, WAVELENGTH
-from neurolens.modelfile import DOMAIN_SLACK
+from neurolens.modelfile import DOMAIN_SLACK, POLARISED
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.assemble import EXACT, model_graph
@@ -106,6 +106,8 @@ class LensModel:
         settings: JSON-able settings of the fit.
         fit_s: seconds that the fit took.
         direction: what the core's direction vector is: the angle vector, or the slope for first-order models.
+        transmittance: "polarised" as the tracer follows it, or "averaged" over s and p at every surface (of files made
+            by version 0.1.0 and earlier).
     """
 
     lens: Lens
@@ -118,6 +120,7 @@ class LensModel:
     settings: dict[str, Any] = field(default_factory=dict)
     fit_s: float = 0.0
     direction: Literal["angle", "slope"] = "angle"
+    transmittance: str = POLARISED
 
     def predict(self, rays: FilmRays, stop_radius_mm: float | None = None) -> Prediction:
         """Evaluate the model in the dtype of `rays`.

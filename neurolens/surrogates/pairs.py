@@ -44,7 +44,7 @@ class PairSet:
     Attributes:
         inputs: film point, pupil point, wavelength.
         scene: point on the front surface and unit direction (lens frame, mm).
-        transmittance: product of (Ts + Tp) / 2.
+        transmittance: power of unpolarised light that arrives.
         status: [N] int32.
         cross_x, cross_y: [S, N] crossings with every surface, mm.
         meets, refracts: [S, N] margins under the square roots of intersection and of refraction.

@@ -33,6 +33,7 @@ from neurolens.graph.program import (
     Program,
 )
 from neurolens.graph.scalars import lower
+from neurolens.modelfile import POLARISED, transmittance_of
 from neurolens.modelfile.axes import product
 from neurolens.modelfile.graph import graph_of
 from neurolens.modelfile.onnxfile import read_checked
@@ -278,7 +279,9 @@ def comment_of(
         lines.append(f"Errors on held-out rays, whole domain of the exported model: {', '.join(known)}.")
     if errors.get("poor"):
         lines.append(f"Poor: {', '.join(errors['poor'])}.")
-    lines.append("Units: mm, nm; directions are unit vectors, transmittance a share of the power.")
+    how = "followed" if transmittance_of(card) == POLARISED else "averaged at every surface"
+    lines.append("Units: mm, nm; directions are unit vectors, transmittance a share of the power of unpolarised light.")
+    lines.append(f"Transmittance: the polarisation that surfaces give to the light is {how}.")
     gone = {g["status"] for g in card["gates"]} - set(codes)
     told = {c: w for c, w in card["status_codes"].items() if int(c) not in gone}
     lines.append(f"Status: {'; '.join(f'{c} {w}' for c, w in told.items())}.")

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from neurolens.base.errors import InputError, ModelError
 from neurolens.base.tomlfile import check_tree
-from neurolens.modelfile import MODEL_KEY
+from neurolens.modelfile import MODEL_KEY, transmittance_of
 from neurolens.modelfile.cardcheck import tolerances
 from neurolens.modelfile.onnxfile import card_in, read_metadata
 from neurolens.optics.prescription import Coating, Lens, Surface
@@ -133,6 +133,7 @@ def load_fitted(path: str | Path) -> LensModel:
             settings=dict(card["fit"]["settings"]),
             fit_s=float(card["fit"]["seconds"]),
             direction="slope" if data["direction"] == "slope" else "angle",
+            transmittance=transmittance_of(card),
         )
         _check(file, model, card)
     except (ValueError, TypeError, KeyError, IndexError, RuntimeError, ArithmeticError, AttributeError) as error:

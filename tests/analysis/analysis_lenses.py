@@ -3,8 +3,10 @@
 import math
 from dataclasses import replace
 
+import torch
 from shipped import tabled
 
+from neurolens.analysis.bundles import Pattern
 from neurolens.analysis.fields import Scene
 from neurolens.optics.prescription import Lens, Surface
 
@@ -43,3 +45,11 @@ def cartesian(stop_mm: float = 10.0, n: float = 1.5, f: float = 100.0) -> Scene:
 def slower(given: Scene, share: float) -> Scene:
     """The same scene with a smaller stop."""
     return replace(given, lens=given.lens.with_stop_radius(share * given.lens.stop_radius_mm))
+
+
+def grid(n: int) -> Pattern:
+    """Centres of the cells of an n by n square over the stop that lie inside it, all of one weight."""
+    line = (torch.arange(n, dtype=torch.float64) + 0.5) * (2 / n) - 1
+    t, s = (v.reshape(-1) for v in torch.meshgrid(line, line, indexing="ij"))
+    inside = t * t + s * s < 1
+    return Pattern(t[inside], s[inside], torch.full_like(t[inside], 1 / int(inside.sum())))

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shipped
 from analysis_lenses import thin
 from command_line import failure, run_json
 from PIL import Image
@@ -22,7 +23,6 @@ from neurolens.analysis.spots import mtf, spots
 from neurolens.analysis.wavefront import psf
 from neurolens.cli import main
 from neurolens.commands.analyse import WHATS
-from neurolens.optics import accessories
 from neurolens.optics.lenswriter import write_lens
 
 GAUSS = LENSES / "laikin_double_gauss_50.toml"
@@ -86,7 +86,7 @@ def test_an_anamorphic_lens_in_both_planes(tmp_path: Path, capsys: pytest.Captur
         (["spot"], "spots, fans"),
         (["spots", "--full"], "only with --json"),
         (["mtf", "--fields", "-3"], "degrees from 0"),
-        (["mtf", "--wavelengths", "0"], "wavelengths in nm from 300"),
+        (["mtf", "--wavelengths", "0"], "wavelengths in nm from 100"),
         (["mtf", "-o", str(TESSAR)], "a folder"),
         (["mtf", "--zoom", "wide"], "zoom"),
     ],
@@ -98,7 +98,7 @@ def test_bad_input_is_one_line(args: list[str], words: str, capsys: pytest.Captu
 @pytest.fixture
 def pinhole(tmp_path: Path) -> Path:
     path = tmp_path / "pinhole.toml"
-    write_lens(replace(accessories.pinhole(50.0, 0.2, image_radius_mm=40.0), name="Pinhole", source="test"), path)
+    write_lens(replace(shipped.pinhole(50.0, 0.2, image_radius_mm=40.0), name="Pinhole", source="test"), path)
     return path
 
 
@@ -158,6 +158,20 @@ def test_doubtful_tables_are_named(tmp_path: Path, capsys: pytest.CaptureFixture
     wrong.write_text(text.replace('material = "N-BK7"', 'glass = "N-SF11"'), encoding="utf-8")
     assert main(["analyse", str(wrong), "distortion"]) == 0
     assert "Warning: surface 1, n_d = 1.5168" in capsys.readouterr().out
+
+
+def test_the_chart_of_lens_makers_has_the_frequencies_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+    data = run_json(capsys, "analyse", TESSAR, "mtf-height", "--frequencies", 80, 10, "--wavelengths", 550)[
+        "mtf-height"
+    ]
+    assert data["frequency_per_mm"] == [10, 80] and data["wavelength_nm"] == [550]
+    assert data["height_mm"][0] == 0 and data["height_mm"][-1] == pytest.approx(43.1, abs=0.1)
+    assert np.shape(data["tangential"]) == np.shape(data["sagittal"]) == np.shape(data["spread"]["sagittal"]) == (21, 2)
+    assert data["tangential"][0] == pytest.approx(data["sagittal"][0], abs=1e-3)
+    assert main(["analyse", str(TESSAR), "mtf-height", "--frequencies", "80"]) == 0
+    text = capsys.readouterr().out
+    assert "against image height" in text and "80/mm T  80/mm S" in text
+    assert "cycles per mm from 0" in failure(capsys, "analyse", TESSAR, "mtf-height", "--frequencies", "-5")
 
 
 def test_options_may_stand_before_what(capsys: pytest.CaptureFixture[str]) -> None:

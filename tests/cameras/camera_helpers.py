@@ -9,10 +9,10 @@ import lens_models
 import numpy as np
 import torch
 
+from experiments.radiometry import FilmLight, film_light
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.vignetting import Vignetted
-from neurolens.optics.radiometry import FilmLight, film_light
 
 ROOT = Path(__file__).parents[2]
 FILM = (36.0, 24.0)

@@ -9,6 +9,7 @@ import lens_models
 import numpy as np
 import pytest
 
+from experiments.radiometry import film_light
 from neurolens.base import status as st
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
@@ -18,7 +19,6 @@ from neurolens.cameras.pupil_search import outline_of
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.radiometry import film_light
 
 RADIUS, SHIFT = 4.0, 0.45  # of the discs, and how fast they part, mm per mm of film radius
 VISIBLE, ONE = (400.0, 700.0), (550.0, 550.0)

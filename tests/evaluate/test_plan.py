@@ -11,15 +11,17 @@ import numpy as np
 import pytest
 
 from neurolens.base.errors import InputError
+from neurolens.base.lensname import resolve
 from neurolens.base.tomlfile import format_toml
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.field import spectrum_of
+from neurolens.cameras.osl import osl_program
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.warped import Warped
 from neurolens.cli import main
-from neurolens.commands.arguments import named_camera
 from neurolens.commands.plan import TARGETS
+from neurolens.evaluate import costs
 from neurolens.evaluate import plan as planned
 from neurolens.evaluate.costs import noise, shader_cost
 from neurolens.evaluate.footprints import (
@@ -44,7 +46,7 @@ from neurolens.surrogates.cores import InvariantPolynomial
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.stored import load_fitted
 
-LENS = "lenses/cooke_triplet_50.toml"  # of absorbing glass: nothing is compiled
+LENS = "lenses/cooke_triplet_50.toml"  # of glass that absorbs
 GAUSS = "lenses/laikin_double_gauss_50.toml"
 NM, SHARE = np.array([450.0, 550.0, 650.0]), np.array([0.2, 0.5, 0.3])
 FILM = np.array([[0.0, 5.0, 12.0, -9.0], [0.0, 3.0, -7.0, 8.0]])
@@ -237,12 +239,14 @@ def test_what_is_cheapest_differs_by_target(tmp_path: Path, monkeypatch: pytest.
 def test_shaders_cost_what_cycles_took() -> None:
     """The exact lens against the time measured, and 1.08 times the rays: the luminance of its wavelengths' colours."""
     rows = json.loads(Path("experiments/results/osl_speed.json").read_text(encoding="utf-8"))["rows"]
-    (measured,) = (r["ns_min"] for r in rows if (r["scene"], r["camera"]) == ("sky", "exact, 12 refractions"))
+    (measured,) = (r for r in rows if (r["scene"], r["camera"]) == ("sky", "exact, 12 refractions"))
     found = garden()
     lens = lens_of(Path(GAUSS), None, lambda done, left=None: None)[1]
     asked = found.asked
     ns, times = shader_cost(lens, found.places, asked.film_mm, asked.f_number, asked.focus_m)
-    assert ns == pytest.approx(measured, rel=0.02)
+    # Measured before polarisation was followed, which takes no further divisions and roots.
+    more = sum(osl_program(lens, {"count": 0.0}).count().values()) - measured["operations"]
+    assert ns - costs._STEP_NS * more == pytest.approx(measured["ns_min"], rel=0.02) and more > 300
     place = (np.arange(1000) + 0.5) / 1000
     colour = np.stack([3 * (1 - place) ** 2, 6 * place * (1 - place), 3 * place**2])
     y = np.array([0.2126, 0.7152, 0.0722]) @ colour
@@ -296,8 +300,8 @@ def test_a_plan_s_file_names_cameras_that_nothing_is_fitted_for(tmp_path: Path) 
     found = plan(scene_from_tables(wall(4.0)), read_lens(LENS).at(), 0.0)
     file = tmp_path / "plan.toml"
     file.write_text(found.to_toml(read_lens(LENS).at(), tmp_path))
-    assert Path(named_camera(str(file))).resolve() == Path(LENS).resolve()
-    assert named_camera("experiments/quickstart.toml") == "experiments/quickstart.toml"
+    assert Path(str(resolve(file)).removeprefix("fused:")).resolve() == Path(LENS).resolve()
+    assert str(resolve("experiments/quickstart.toml")) == "experiments/quickstart.toml"
 
 
 def test_models_have_the_blades_of_the_lens_file() -> None:

@@ -352,5 +352,5 @@ def test_a_real_lens_against_itself_stopped_down() -> None:
     for result in stopped_down(lens, domain, exactly, count=32768):
         assert result["false_pass"] == result["false_block"] == 0
     light = relative_illumination(lens, domain, exactly, points=2048, rows=5)
-    assert light.max_difference == 0
+    assert light.max_difference < 1e-15  # where crossings are recorded, roots are rounded otherwise
     assert light.exact[0] == 1 and light.exact[-1] < 0.5  # a fast double Gauss darkens by over a stop in the corner

@@ -20,7 +20,8 @@ from neurolens.base.progress import Progress
 from neurolens.cli import main
 from neurolens.evaluate import survey_page, survey_run
 from neurolens.evaluate.survey import SurveySettings, Task, known_record, run_task, summary_of
-from neurolens.evaluate.survey_run import collection_of, in_processes, survey
+from neurolens.evaluate.survey_run import in_processes, survey
+from neurolens.readers.any_format import collection_of
 
 LENSES = Path(__file__).parents[2] / "lenses"
 TRIPLET = (LENSES / "cooke_triplet_50.toml").read_bytes()
@@ -82,7 +83,7 @@ def test_a_task_is_known_by_all_that_decides_its_record(fitted: bytes) -> None:
         ("x.json", b"{}", "x.json"),
         ("cut.toml", TRIPLET[:700], "cut.toml"),
         ("../../up.seq", b"RDM;LEN\n", "up.seq"),
-        ("nostop.dat", b"50 5 1.5 20\n-50 90 1 20\n", "exactly one row of index 0"),
+        ("twostops.dat", b"50 5 1.5 20\n0 1 0 9\n0 1 0 9\n-50 90 1 20\n", "exactly one row of index 0"),
     ],
 )
 def test_what_cannot_be_read_is_refused_with_its_reason(name: str, data: bytes, said: str) -> None:

@@ -18,7 +18,7 @@ from neurolens.evaluate.trade import Offer, best_within, front, offers, small, s
 from neurolens.optics.lensfile import read_lens
 from neurolens.render.scene import scene_from_tables
 
-LENS = "lenses/cooke_triplet_50.toml"  # of absorbing glass: nothing is compiled
+LENS = "lenses/cooke_triplet_50.toml"  # of glass that absorbs
 
 
 def scene(**camera: object) -> dict:

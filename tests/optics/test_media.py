@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from neurolens.cameras.outline_cache import search_key
 from neurolens.graph.interpret import evaluate
 from neurolens.optics.focusing import axial_rays, breathing
 from neurolens.optics.glass import LINE_D_NM, index_of
@@ -136,6 +137,11 @@ def test_the_file_keeps_media_and_wavelengths(tmp_path: Path) -> None:
     again = read_lens(tmp_path / "lens.toml")
     assert again.media == lens.media and again.wavelengths_nm == lens.wavelengths_nm
     assert again.sha256 == lens.sha256 != replace(lens, object_medium=Medium()).sha256
+
+
+def test_a_kept_outline_of_the_lens_in_air_is_not_taken_under_water() -> None:
+    keys = {search_key(doublet(m).at(), (400.0, 700.0), (0.5,)) for m in (WATER, Medium(), replace(WATER, V_d=None))}
+    assert len(keys) == 3
 
 
 def test_first_order_data_stand_at_the_primary_wavelength_of_other_light() -> None:

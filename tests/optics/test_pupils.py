@@ -10,6 +10,7 @@ import pytest
 import torch
 from shipped import NAMES, focused, tabled
 
+from experiments.radiometry import film_light
 from neurolens.base.errors import InputError
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
@@ -24,7 +25,6 @@ from neurolens.optics.pupil_methods import (
     wu_exit_pupil,
 )
 from neurolens.optics.pupils import camera_rays, image_radius_mm, pupil_bounds, pupil_plane_z_mm
-from neurolens.optics.radiometry import film_light
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 

@@ -148,6 +148,19 @@ def test_optical_bench_states_field_and_aspheres(tmp_path: Path) -> None:
     assert lens.surfaces[-1].thickness_mm == pytest.approx(first_order(lens).back_focus_mm)
 
 
+def test_the_stop_s_diameter_of_an_optical_bench_file_is_kept(tmp_path: Path) -> None:
+    """It rules over the f-number, of which a contradiction is told; without it the f-number sizes the stop."""
+    plain_lens, _ = read_text(ZOOM, ".txt", tmp_path)
+    for opening_mm, doubted in ((plain_lens.surfaces[2].diameter_mm, False), (9.0, True)):
+        path = tmp_path / "lens.txt"
+        path.write_text(swapped("d0\t", f"Aperture Diameter\t{opening_mm!r}\t{opening_mm!r}\nd0\t", ZOOM))
+        with warnings.catch_warnings(record=True) as heard:
+            warnings.simplefilter("always")
+            lens = read_any(path)
+        assert lens.surfaces[2].diameter_mm == opening_mm and lens.f_number == 4
+        assert any("the diameter is kept" in str(w.message) for w in heard) == doubted
+
+
 @pytest.mark.parametrize(
     ("constant", "powers"),
     [("", (4, 6, 8, 10)), ("AsphericalA2", (2, 4, 6, 8)), ("AsphericalOddCount\t1", (3, 4, 6, 8)),
@@ -169,7 +182,7 @@ def test_optical_bench_powers(constant: str, powers: tuple[int, ...], tmp_path: 
         ("1\t60\t-0.5", "9\t60\t-0.5", "the number of a surface"),
         ("2\t-80", "1\t-80", "a number of its own"),
         ("1.6\t30\t50", "0.6\t30\t50", "index"),
-        ("1.6\t30\t50", "0.0\t30\t50", "surface 0, index"),
+        ("1.6\t30\t50", "0.0\t30\t50", "surface 1 of the file, index"),
         ("1\t60\t6", "1 60 6", "between tabs"),
         ("1E-06", "1E-0x", "coefficient"),
         ("[constants]", "[constants]\nAsphericalOddCount\t-1", "how many odd powers"),
@@ -184,7 +197,7 @@ def test_optical_bench_mistakes(old: str, new: str, said: str, tmp_path: Path) -
 @pytest.mark.parametrize(
     ("suffix", "old", "new", "said"),
     [
-        (".lens", "surfaces:", "surfaces", "expected one of the keywords"),
+        (".lens", "surfaces:", "surfaces", "format: got (not known)"),
         (".lens", " 1  # row", " 1 torus # row", "one of spherical"),
         (".lens", " 1  # row", " 1 toric # row", "toric with a radius other than 0"),
         (".lens", " 1  # row", " # row", "6 figures"),

@@ -70,9 +70,9 @@ def test_qbfs_sag(curvature: float, rim: float) -> None:
 
 
 def test_what_powers_cannot_follow_is_refused() -> None:
-    with pytest.raises(ValueError, match="a sphere that powers"):
+    with pytest.raises(ValueError, match="a conic that powers"):
         qbfs_terms([0.1, 0.01], 10.0, 0.0985, 10.0)
-    with pytest.raises(ValueError, match="inside the sphere"):
+    with pytest.raises(ValueError, match="inside the conic"):
         qbfs_terms([0.1], 10.0, 0.1, 10.0)
     with pytest.raises(ValueError, match="fewer terms"):
         qcon_terms([10.0] * MAX_TERMS, 10.0, 10.0)

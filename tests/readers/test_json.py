@@ -164,7 +164,8 @@ def test_refusals(change: dict[str, Any], message: str, tmp_path: Path) -> None:
     [
         ("[1, 2]", r"file: got \(a list\)"),
         ('{"name": "a", "name": "b"}', r"name: got \(given twice\)"),
-        ('{"name": NaN}', r"got 'NaN', expected finite numbers"),
+        ('{"surfaces": NaN}', r"got 'NaN', expected finite numbers"),
+        ('{"name": -Infinity}', r"format: got \(not known: JSON without the key surfaces\)"),
         ('{"name": "a"', r"file: got \(Expecting"),
         ("[" * 100_000, r"expected valid JSON"),
         ('{"f_number": 1' + "0" * 5000 + "}", r"f_number|expected valid JSON"),
@@ -224,6 +225,17 @@ def test_terms_of_an_asphere_begin_with_the_square(tmp_path: Path) -> None:
     assert first_order(lens).efl_mm == pytest.approx(FOCAL, rel=1e-12)
 
 
+def test_a_stop_without_a_medium_and_keys_of_the_program(tmp_path: Path) -> None:
+    """DeepLens writes apertures without mat2; a key that it does not know is left out and named."""
+    bare = {key: value for key, value in STOP.items() if key != "mat2"}
+    expected = read_any(written(tmp_path, DEEPLENS))
+    with pytest.warns(NeurolensWarning, match="left out, since no ray depends on it: squeeze"):
+        lens = read_any(written(tmp_path, {**DEEPLENS, "surfaces": [{**bare, "squeeze": 1.5}, FRONT, REAR]}))
+    assert lens.surfaces == expected.surfaces
+    with pytest.raises(InputError, match="DOE: got .given., expected a lens without a diffractive element"):
+        read_any(written(tmp_path, {**DEEPLENS, "DOE": {"type": "Binary2"}}))
+
+
 def test_a_focal_length_that_is_not_that_of_the_surfaces_is_said(tmp_path: Path) -> None:
     with pytest.warns(NeurolensWarning, match="foclen says 90 mm, the first order of its surfaces 100 mm"):
         read_any(written(tmp_path, {**DEEPLENS, "foclen": 90.0}))
@@ -236,7 +248,6 @@ def test_a_focal_length_that_is_not_that_of_the_surfaces_is_said(tmp_path: Path)
         ({"mat2": "glas"}, "surface 1, mat2"),
         ({"mat2": "1.5/x"}, "surface 1, mat2"),
         ({"mat2": None}, "surface 1, mat2"),
-        ({"squeeze": 1.5}, "surface 1, squeeze"),
         ({"roc": "50"}, "surface 1, roc"),
         ({"type": "Aspheric", "ai": [None]}, r"surface 1, ai\[0\]"),
         ({"type": "Aspheric", "ai": 3}, "surface 1, ai"),

@@ -80,6 +80,12 @@ def read(text: str, tmp_path: Path, given: Given | None = None, encoding: str = 
     return read_zmx(path, given)
 
 
+def test_a_model_glass_s_partial_dispersion_is_told(tmp_path: Path) -> None:
+    with pytest.warns(NeurolensWarning, match="line 29, GLAS: a model glass's departure"):
+        lens = read(swapped("GLAS N-BK7 0 0 1.5 4.0E+1 0", "GLAS MODEL 1 0 1.6 40 0.01"), tmp_path)
+    assert (lens.surfaces[0].n_d, lens.surfaces[0].V_d) == (1.6, 40)
+
+
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "latin-1"])
 def test_singlet_by_the_lensmakers_formula(encoding: str, tmp_path: Path) -> None:
     text = swapped("Singlet", "Einzellinse \u00d8 20")
@@ -130,15 +136,15 @@ def test_units_scale_every_length(tmp_path: Path) -> None:
 
 
 def test_a_q_type_asphere_says_how_its_rows_were_taken(tmp_path: Path) -> None:
-    block = "TYPE QED_TYPE\n  CURV 0.02\n  CONI -1\n  PARM 1 1\n  XDAT 1 1\n  XDAT 2 10\n  XDAT 3 0.5"
-    with pytest.warns(AssumedWarning, match="PARM 1 is taken as 0 for Qbfs"):
+    block = "TYPE QED_TYPE\n  CURV 0.02\n  CONI -1\n  XDAT 1 1\n  XDAT 2 1\n  XDAT 3 10\n  XDAT 4 0.5"
+    with pytest.warns(AssumedWarning, match="1 in XDAT 1 is taken to mean Qcon"):
         read(swapped('TYPE STANDARD\n  CURV 2.0E-2 0 0 0 0 ""', block), tmp_path)
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("  COAT AR\n", "  COAT AR\n", "coatings named but not given"),
+        ("  COAT AR\n", "  COAT AR\n", "coatings that are named but not given"),
         ("2.0E+1 1 0", "3.0E+1 1 0", "not at 3.0E\\+1"),
         ("VDXN 0 0 0", "VDXN 0 0.1 0", "vignetting factors"),
         ('  DIAM 9 1 0 0 1 ""\n', '  DIAM 9 1 0 0 1 ""\n  SQAP 4 5\n', "SQAP"),
@@ -161,7 +167,7 @@ def test_what_is_left_out_is_told(old: str, new: str, message: str, tmp_path: Pa
         ("TYPE XASPHERE\n  CURV 0.02\n  CONI -1\n  XDAT 1 2\n  XDAT 2 10\n  XDAT 4 2E-6", (50, -1, {4: 2e-10}, None)),
         ("TYPE XOSPHERE\n  CURV 0.02\n  XDAT 1 3\n  XDAT 2 10\n  XDAT 5 2E-6", (50, 0, {3: 2e-9}, None)),
         (
-            "TYPE QED_TYPE\n  CURV 0.02\n  CONI -1\n  PARM 1 1\n  XDAT 1 1\n  XDAT 2 10\n  XDAT 3 0.5",
+            "TYPE QED_TYPE\n  CURV 0.02\n  CONI -1\n  XDAT 1 1\n  XDAT 2 1\n  XDAT 3 10\n  XDAT 4 0.5",
             (50, -1, {4: 5e-5}, None),
         ),
         ("TYPE BICONICX\n  CURV 0.02\n  CONI -2\n  PARM 1 0\n  PARM 2 3", (50, -2, {}, "y")),
@@ -183,12 +189,60 @@ def test_surface_types(block: str, shape: tuple[Any, ...], tmp_path: Path) -> No
     assert (pytest.approx(s.radius_mm), s.conic, pytest.approx(dict(s.asphere)), s.cylinder, s.across) == wanted
 
 
+QED = """\
+  TYPE QED_TYPE
+  CURV 5.7560787627824225E-02
+  CONI -0.67609120640407927
+  XDAT 1 0
+  XDAT 2 6
+  XDAT 3 27
+  XDAT 4 -8.148370167576E-01
+  XDAT 5 -3.2311E-01
+  XDAT 6 1.0591E-01
+  XDAT 7 -5.058E-02
+  XDAT 8 9.870E-03
+  XDAT 9 -2.2E-03
+  DISZ 29.85
+  GLAS FusedSilica 0 0 0 0 0
+  DIAM 22.86 1
+SURF 2
+  CURV 0
+  DISZ 19.687453064998852
+  DIAM 22.86 1
+"""
+
+
+def test_a_qbfs_asphere_on_a_conic_focuses_all_zones(tmp_path: Path) -> None:
+    """Thorlabs ASL5040-UV, f/0.87: at the wavelength of its file its zones meet within a micrometre of its film."""
+    body = "SURF 1\n  STOP\n" + QED
+    lens = read(HEAD.replace("ENPD 10", "ENPD 45.7").replace("5.875618E-1", "0.405") + body + TAIL, tmp_path)
+    assert lens.reference_nm == 405.0
+    assert first_order(lens).efl_mm == pytest.approx(40.0, rel=0.01)
+    s, n = lens.surfaces[0], catalogue.find("fused silica").index(405.0)
+    terms = {p: float(a) for p, a in s.asphere}
+    for h in (1.0, 6.0, 12.0, 18.0, 22.8):
+        root = math.sqrt(1 - (1 + s.conic) * (h / s.radius_mm) ** 2)
+        z = h * h / s.radius_mm / (1 + root) + sum(a * h**p for p, a in terms.items())
+        slope = math.atan(h / s.radius_mm / root + sum(p * a * h ** (p - 1) for p, a in terms.items()))
+        u = slope - math.asin(math.sin(slope) / n)  # a ray parallel to the axis, refracted towards it
+        at_rear = h - math.tan(u) * (s.thickness_mm - z)
+        crossing = at_rear / math.tan(math.asin(n * math.sin(u)))
+        assert crossing == pytest.approx(lens.surfaces[1].thickness_mm, abs=1e-3)
+
+
+def test_more_terms_than_an_even_asphere_has_are_its_next_powers(tmp_path: Path) -> None:
+    front = swapped("TYPE STANDARD", "TYPE EVENASPH\n  PARM 9 1E-24", BODY)
+    with pytest.warns(AssumedWarning, match="surface 1 of the file: PARM 9 and beyond"):
+        lens = read(HEAD + front + TAIL, tmp_path)
+    assert lens.surfaces[0].asphere == ((18, 1e-24),)
+
+
 def test_a_paraxial_surface_is_an_ideal_lens(tmp_path: Path) -> None:
     front = 'TYPE STANDARD\n  CURV 2.0E-2 0 0 0 0 ""'
     text = swapped(front, "TYPE PARAXIAL\n  CURV 0.0\n  PARM 1 75\n  PARM 2 1").replace("GLAS N-BK7", "COMM N-BK7")
     lens = read(text.replace("CURV -2.0E-2", "CURV 0.0"), tmp_path)
     assert lens.surfaces[0].focal_mm == 75 and first_order(lens).efl_mm == pytest.approx(75, rel=1e-14)
-    with pytest.raises(InputError, match="surface 0, focal_mm: got 75.0, expected air on both sides"):
+    with pytest.raises(InputError, match="surface 1 of the file, focal_mm: got 75.0, expected air on both sides"):
         read(swapped(front, "TYPE PARAXIAL\n  CURV 0.0\n  PARM 1 75"), tmp_path)
 
 
@@ -203,11 +257,11 @@ def test_a_paraxial_surface_is_an_ideal_lens(tmp_path: Path) -> None:
         ("GLAS N-BK7 0", "GLAS N-BK7 4", r"GLAS: got 'N-BK7 with solve 4'"),
         ("TYPE STANDARD\n  CURV -2", "TYPE PARAXIAL\n  CURV -2", r"PARAXIAL: got 0.0, expected PARM 1, a focal length"),
         ("TYPE STANDARD\n  CURV -2", "TYPE PARAXIAL\n  PARM 1 9\n  PARM 3 9\n  COMM ", r"PARM 3 of PARAXIAL: got 9.0"),
-        ("TYPE STANDARD\n  CURV -2", "TYPE QT\n  CONI 1\n  XDAT 1 1\n  XDAT 3 1\n  CURV -2", r"conic of QT: got 1.0"),
-        ("TYPE STANDARD\n  CURV -2", "TYPE QT\n  PARM 1 2\n  XDAT 1 1\n  XDAT 3 1\n  CURV -2", r"0 \(Qbfs\) or 1"),
+        ("TYPE STANDARD\n  CURV -2", "TYPE QT\n  XDAT 1 2\n  XDAT 2 1\n  XDAT 4 1\n  CURV -2", r"0 \(Qbfs\) or 1"),
         ("TYPE STANDARD\n  CURV -2", "TYPE XASPHERE\n  XDAT 1 1.5\n  CURV -2", r"XDAT 1 of XASPHERE: got 1.5"),
         ("TYPE STANDARD\n  CURV -2", "TYPE XASPHERE\n  XDAT 1 1\n  XDAT 4 1\n  CURV -2", r"XDAT 4 of XASPHERE"),
         ("TYPE STANDARD\n  CURV -2", "TYPE XOSPHERE\n  XDAT 1 1\n  XDAT 3 1\n  CURV -2", r"a cone's tip"),
+        ("TYPE STANDARD\n  CURV -2", "TYPE XASPHERE\n  XDAT 1 9\n  XDAT 11 1E-9\n  CURV -2", r"an XOSPHERE's"),
         ("GLAS N-BK7", "GLAS MIRROR", r"line 29, GLAS: got 'MIRROR'.*no mirrors"),
         ("GLAS N-BK7 0 0 1.5 4.0E+1", "GLAS ___BLANK 1 0 0.5 60", r"index: got 0.5"),
         ("SURF 2", "SURF 4", r"SURF: got '4', expected surface 2"),
@@ -218,11 +272,11 @@ def test_a_paraxial_surface_is_an_ideal_lens(tmp_path: Path) -> None:
         ("TYPE STANDARD\n  CURV -2", "TYPE BICONICX\n  PARM 3 1\n  CURV -2", r"PARM 3 of BICONICX"),
         ("TYPE STANDARD\n  CURV -2", "TYPE ODDASPHE\n  PARM 1 1E-3\n  CURV -2", r"PARM 1 of ODDASPHE"),
         ("TYPE STANDARD\n  CURV -2", "TYPE STANDARD\n  PARM 1 1E-3\n  CURV -2", r"PARM 1 of STANDARD"),
-        ("  DIAM 9 1", "  OBSC 0 3 0\n  DIAM 9 1", r"line 35, OBSC: got \(unknown keyword\)"),
+        ("  DIAM 9 1", "  OBSC 0 3 0\n  DIAM 9 1", r"line 35, OBSC: got .0 3 0., expected no obscuration"),
         ("  DIAM 9 1", "  CLAP 2 9 0\n  DIAM 9 1", r"CLAP: got '2 9', expected a round opening without a hole"),
         ("  DIAM 9 1", "  OBDC 0 3\n  DIAM 9 1", r"OBDC"),
         ("  DIAM 9 1", "  IGNR 1\n  DIAM 9 1", r"IGNR"),
-        ("DIAM 9 1", "DIAM 60 1", r"surface 1, diameter_mm: got 120"),
+        ("DIAM 9 1", "DIAM 60 1", r"surface 2 of the file, diameter_mm: got 120"),
         ("DISZ 45.0", "DISZ INFINITY", r"DISZ: got 'INFINITY'"),
         ("MNUM 1 1", "MNUM 1000 1", r"MNUM: got 1000"),
     ],
@@ -243,7 +297,7 @@ SURF 3
 
 def test_planes_that_cut_no_beam_are_left_out(tmp_path: Path) -> None:
     text = swapped("DISZ 45.0", "DISZ 40.0").replace(TAIL, DUMMY.format(gap=5.0) + TAIL.replace("SURF 3", "SURF 4"))
-    with pytest.warns(NeurolensWarning, match="row 2 behind the object"):
+    with pytest.warns(NeurolensWarning, match="surface 3 of the file left out"):
         lens = read(text, tmp_path)
     assert [s.thickness_mm for s in lens.surfaces] == [5.0, 45.0]
     held = text.replace('DIAM 0.1 0 0 0 1 ""', 'DIAM 6 1 0 0 1 ""\n  CLAP 0 5 0')
@@ -315,7 +369,7 @@ def test_rims_that_are_not_given_are_derived_for_the_field(tmp_path: Path) -> No
     lens = read(text, tmp_path)
     assert lens.rims == "derived" and 9 < lens.surfaces[1].diameter_mm < 12
     without = swapped("YFLN 0 2.5 4 9", "YFLN 0 0 0 0", swapped("XFLN 0 0 3 9", "XFLN 0 0 0 0", text))
-    with pytest.raises(InputError, match=r"not given for surface 1.*--half-field"):
+    with pytest.raises(InputError, match=r"not given for surface 2 of the file.*--half-field"):
         read(without, tmp_path)
     assert read(without, tmp_path, Given(half_field_deg=5.0)).surfaces == lens.surfaces
     assert math.isfinite(lens.surfaces[1].diameter_mm)
@@ -338,7 +392,7 @@ def test_the_stop_s_own_aperture_clips_what_the_pupil_asks_for(sized: str, tmp_p
     ("old", "new", "message"),
     [
         ("DIAM 9 1", "DIAM -12.7 1", r"line 35, DIAM: got -12.7, expected a semi-diameter above 0"),
-        ("DISZ 5.0", "DISZ -600", r"surface 0, thickness_mm: got -600.0, expected at least 0, except beside a stop"),
+        ("DISZ 5.0", "DISZ -600", r"surface 1 of the file, thickness_mm: got -600.0, expected at least 0"),
         ("TYPE STANDARD\n  CURV 2", "TYPE COORDBRK\n  CURV 2", r"line 24, CURV of COORDBRK"),
         ('TYPE STANDARD\n  CURV 2.0E-2 0 0 0 0 ""\n', "TYPE COORDBRK\n", r"line 28, GLAS of COORDBRK"),
     ],

@@ -25,7 +25,7 @@ from neurolens.graph.osl import urgent
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
-from neurolens.optics.tracegraph import exact_graph
+from neurolens.optics.tracegraph import TRANSMITTANCE, exact_graph
 from neurolens.view import packed, shaders
 from neurolens.view import page as pages
 
@@ -257,8 +257,8 @@ SURF 3
 """
 
 
-def test_a_lens_of_your_own_says_what_is_left_out(tmp_path: Path) -> None:
-    """Its glass absorbs, which traced code does not follow: in none of its forms."""
+def test_a_lens_of_your_own_whose_glass_absorbs(tmp_path: Path) -> None:
+    """All of its forms are written, and say what their transmittance is."""
     (tmp_path / "my_lens.zmx").write_text(ZMX)
     out = tmp_path / "view.html"
     assert main(["view", str(tmp_path / "my_lens.zmx"), "--jobs", "1", "-o", str(out), "--json"]) == 0
@@ -266,11 +266,11 @@ def test_a_lens_of_your_own_says_what_is_left_out(tmp_path: Path) -> None:
     (lens,) = data_of(text)["lenses"]
     (form,) = lens["forms"]
     assert lens["name"] == "My singlet"
-    assert form["method"] == "every surface traced, coatings and absorption left out"
+    assert form["method"] == "every surface traced"
     assert form["files"] == ["glsl", "c", "osl"]
     (stream,) = re.findall(r'id="lenses-0">([^<]*)<', text)
     written = unpacked(stream, lens["stream"][1])
-    assert written.count(b"In this form: coatings and absorption left out.") == 3
+    assert written.count(TRANSMITTANCE.encode()) == 3
 
 
 @pytest.mark.parametrize(
@@ -303,5 +303,8 @@ def test_two_files_of_ghosts_of_one_lens_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(view_command, "_flare", lambda _: SimpleNamespace(lens=SimpleNamespace(lens_id=LENS)))
-    assert main(["view", LENS, "a.onnx", "b.onnx", "-o", str(tmp_path / "view.html")]) == 2
-    assert f"ghosts of {LENS}: got 'b.onnx', expected one file a lens" in capsys.readouterr().err
+    files = [tmp_path / "a.onnx", tmp_path / "b.onnx"]
+    for file in files:
+        file.touch()
+    assert main(["view", LENS, *map(str, files), "-o", str(tmp_path / "view.html")]) == 2
+    assert f"ghosts of {LENS}: got '{files[1]}', expected one file a lens" in capsys.readouterr().err

@@ -5,14 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from shipped import disc_irradiance, tabled
+from shipped import before, disc_irradiance, pinhole, tabled
 
+from experiments.radiometry import FilmLight, film_light, white_card
 from neurolens.base.errors import InputError
-from neurolens.optics.accessories import pinhole, with_hood
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.radiometry import FilmLight, film_light, white_card
 
 
 def lens(name: str, **state: float) -> Lens:
@@ -93,7 +92,7 @@ def test_a_hood_is_mechanical_and_changes_nothing_else() -> None:
     plain = lens("laikin_double_gauss_50")
     radius = np.linspace(0, 21, 6)
     without = film_light(plain, radius)
-    hooded = film_light(with_hood(plain, 30.0, 60.0), radius)
+    hooded = film_light(before(plain, Surface(math.inf, 30.0, 60.0)), radius)
     for factor in ("aperture", "optical"):
         np.testing.assert_allclose(getattr(hooded, factor), getattr(without, factor), rtol=2e-3)
     assert hooded.mechanical[0] == pytest.approx(1, abs=1e-6) and hooded.mechanical[-1] < 0.9

@@ -1,0 +1,92 @@
+"""Transmittance with the polarisation that each surface gives to the light, and averaged over it at every surface.
+
+Each lens of lenses/ in its own state, wide open: rays of its whole image circle, 400 to 700 nm, that pass; bare as
+filed, and with a quarter wave of magnesium fluoride on every surface between glass and air. Writes transmittance.md and
+transmittance.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from statistics import median
+from typing import Any
+
+import torch
+
+from experiments import lab
+from neurolens.base import status as st
+from neurolens.base.progress import Progress
+from neurolens.flare.ghosts import coated
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.prescription import Lens
+from neurolens.optics.pupils import camera_rays
+from neurolens.optics.sequence import follow
+from neurolens.surrogates.domain import Domain, domain_of, sample_domain
+
+COATINGS = {"bare": None, "coated": "quarter-wave"}
+
+
+def difference(lens: Lens, domain: Domain, count: int) -> lab.Row:
+    """By how much the averaged transmittance differs over rays that pass: largest, where, and the median."""
+    rays = sample_domain(domain, count, seed=3)
+    start = camera_rays(rays.film_x, rays.film_y, rays.film_z, rays.pupil_x, rays.pupil_y, domain.pupil_z_mm)
+    steps: Any = [(k, "T") for k in reversed(range(len(lens.surfaces)))]
+    with torch.no_grad():
+        found = [follow(lens, start, steps, rays.wavelength_nm, towards="scene", polarised=p) for p in (False, True)]
+    passed = found[1].status == st.PASSED
+    averaged, true = (one.power[passed] for one in found)
+    off = averaged - true
+    relative = (off / true).abs()
+    worst = int(relative.argmax())
+    radius = torch.hypot(rays.film_x, rays.film_y)[passed] / domain.film_radius_mm
+    return {
+        "absolute": float(off.abs().max()),
+        "relative": float(relative[worst]),
+        "averaged": float(averaged[worst]),
+        "true": float(true[worst]),
+        "film_radius": float(radius[worst]),
+        "median": float(relative.median()),
+    }
+
+
+_COLUMNS = lab.columns(
+    ("lens", "lens"),
+    ("refractions", "refractions"),
+    *((f"{kind}: most", f"{kind}.absolute", ".4f") for kind in COATINGS),
+    *((f"{kind}: most, %", f"{kind}.relative", ".2f", 100) for kind in COATINGS),
+    ("there, of the film radius", "bare.film_radius", ".2f"),
+    ("averaged", "bare.averaged", ".3f"),
+    ("true", "bare.true", ".3f"),
+    *((f"{kind}: median, %", f"{kind}.median", ".3f", 100) for kind in COATINGS),
+)
+OPTIONS = (lab.count("rays", 12_000, "of each lens's domain (default 12,000)"), lab.out())
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure and write."""
+    lab.quiet_glasses()
+    rows, files = list[lab.Row](), sorted(lab.LENSES.glob("*.toml"))
+    with Progress(quiet=args.quiet).stage("lenses") as report:
+        for file in files:
+            lens = read_lens(file).at()
+            domain = domain_of(lens, focus_m=(math.inf, math.inf))
+            row: lab.Row = {"lens": file.stem, "refractions": lens.refractions}
+            for kind, design in COATINGS.items():
+                row[kind] = difference(coated(lens, design) if design else lens, domain, args.rays)
+            rows.append(row)
+            report(len(rows) / len(files))
+    about = [
+        f"{kind}: at most {100 * max(r[kind]['relative'] for r in rows):.1f}%, of the worst ray of each lens "
+        f"{100 * median(r[kind]['relative'] for r in rows):.2f}% and of the median ray "
+        f"{100 * median(r[kind]['median'] for r in rows):.3f}% (medians of {len(rows)} lenses)"
+        for kind in COATINGS
+    ]
+    text = lab.page(
+        "# Transmittance: averaged over polarisation at every surface, and true",
+        f"`python -m experiments transmittance`: {args.rays} rays of each lens's domain. How far the product of\n"
+        "(Ts + Tp) / 2 is from the power of unpolarised light whose polarisation is followed.",
+        "\n".join(f"- {line}" for line in about),
+        lab.table(_COLUMNS, rows),
+    )
+    print(lab.write_results(args.out, "transmittance", text, {"lenses": rows}))

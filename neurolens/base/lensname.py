@@ -1,0 +1,101 @@
+"""What a lens argument names: a lens or a model that ships, a file of either, or a camera made from one.
+
+laikin_double_gauss_50              a lens of lenses/, or a model of models/, by its name
+FILE.toml, FILE.zmx, ...            a lens file of any format that `neurolens.readers.any_format` reads
+MODEL.onnx                          an exported model
+plan.toml                           a file of `neurolens plan`: the camera that it names
+fused:, thick:, thin:, pinhole:     before any of these: a kind of camera
+thin, pinhole, fisheye-PROJECTION   a camera without a lens
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from neurolens.base.errors import InputError
+from neurolens.base.files import library
+from neurolens.base.tomlfile import read_toml, suggestion
+
+FUSED = "fused:"  # compiled by the system's C compiler
+IDEAL_OF = ("thick:", "thin:", "pinhole:")  # ideal cameras that are framed as a lens is
+FISHEYES = tuple(f"fisheye-{name}" for name in ("equidistant", "equisolid", "stereographic", "orthographic"))
+IDEAL = ("thin", "pinhole", *FISHEYES)
+_FORMATS = "a lens file of any format (see neurolens convert --help)"
+
+
+class Named(NamedTuple):
+    """A kind of camera, "" or as `split_kind` has it, and a file; a camera without a lens has none."""
+
+    kind: str
+    file: Path | None
+
+    def __str__(self) -> str:
+        return f"{self.kind}{self.file or ''}"
+
+
+def split_kind(text: str) -> tuple[str, str]:
+    """The kind of camera in front of a word, with its colon, and the word; file names may have colons of their own."""
+    kind = next((k for k in (FUSED, *IDEAL_OF) if text.startswith(k)), "")
+    return kind, text.removeprefix(kind)
+
+
+def is_model(file: str | Path) -> bool:
+    """Whether a file is an exported model by its name; any other file is read as a lens."""
+    return Path(file).suffix.lower() == ".onnx"
+
+
+def lens_id_of(file: str | Path) -> str:
+    """The id of a lens by the name of its file: letters, digits, "-" and "_", so that it can begin any file's name."""
+    return re.sub(r"[^\w-]+", "_", Path(file).stem).strip("_") or "lens"
+
+
+def resolve(text: str | Path, *, models: bool = True, cameras: bool = True) -> Named:
+    """What a lens argument names. A file comes first, then a name that ships, then a folder (of a run).
+
+    Args:
+        models: whether models are taken. cameras: whether kinds of cameras are, and files of `neurolens plan`.
+
+    Raises:
+        InputError: no such file or name; the message has the nearest one.
+    """
+    if cameras and text in IDEAL:
+        return Named(str(text), None)
+    kind, word = split_kind(str(text)) if cameras else ("", str(text))
+    places = (("lenses", ".toml"), ("models", ".onnx")) if models else (("lenses", ".toml"),)
+    ships = [library() / folder / f"{word}{suffix}" for folder, suffix in places if Path(word).name == word]
+    path = next((file for file in (Path(word), *ships) if file.is_file()), Path(word))
+    if (is_model(path) and (not models or kind in IDEAL_OF)) or not path.exists():
+        expected = _FORMATS + (", a model (.onnx)" if models else "") + " or a name that ships (neurolens lens list)"
+        if cameras:
+            expected += f", with {FUSED}, {', '.join(IDEAL_OF)} before it or not, or one of {', '.join(IDEAL)}"
+        near = suggestion(word, [*_ships(places), *_beside(Path(word)), *(IDEAL if cameras else ())])
+        raise InputError(word, "lens", "(a model)" if path.exists() else "(missing)", expected + near)
+    if cameras and path.suffix.lower() == ".toml" and (planned := _planned(path)):
+        own, file = split_kind(planned)
+        return Named(kind or own, Path(os.path.normpath(path.parent / file)))
+    ours = path in ships and path.is_relative_to(Path.cwd())
+    return Named(kind, Path(os.path.relpath(path)) if ours else path)
+
+
+def _planned(path: Path) -> str | None:
+    """The camera in a file of `neurolens plan`; None in other files."""
+    with suppress(InputError):  # the reader of lenses reports it
+        camera = read_toml(path).get("camera")
+        return camera if isinstance(camera, str) and camera != "none" else None
+    return None
+
+
+def _ships(places: tuple[tuple[str, str], ...]) -> Iterator[str]:
+    for folder, suffix in places:
+        yield from (file.stem for file in sorted((library() / folder).glob(f"*{suffix}")))
+
+
+def _beside(path: Path) -> Iterator[str]:
+    """The files of the folder in which a file is missing, as the argument would name them."""
+    with suppress(OSError):
+        yield from sorted(str(path.parent / entry.name) for entry in os.scandir(path.parent) if entry.is_file())
