@@ -192,10 +192,10 @@ class Graph:
         rows = table.rows * index.rows // weights.rows
         return self.add("lookup", (table, index, weights), rows, static=tuple(range(rows)), per_call=False)
 
-    def constant(self, value: ArrayLike) -> Value:
-        """Numbers, one a row."""
+    def constant(self, value: ArrayLike, *label: str) -> Value:
+        """Numbers, one a row. Equal numbers of one label, by default none, are one node."""
         array = np.atleast_1d(np.asarray(value, np.float64))
-        return self.add("constant", (), len(array), arrays=(array,), per_call=True)
+        return self.add("constant", (), len(array), arrays=(array,), static=label, per_call=True)
 
     def value(self, operand: Operand) -> Value:
         return operand if isinstance(operand, Value) else self.constant(operand)

@@ -70,7 +70,7 @@ def pruned(graph: Graph, outputs: Mapping[str, Value] | None = None) -> Graph:
         kept[number] = rows
         inputs = [rows_of(k, wanted_rows) for k, wanted_rows in _needed(graph, node, rows)]
         if node.kind == "constant":
-            place[number] = found.constant(node.arrays[0][rows])
+            place[number] = found.constant(node.arrays[0][rows], *node.static)
         elif node.kind == "take":
             place[number] = inputs[0]
         elif node.kind == "concat":

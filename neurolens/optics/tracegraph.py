@@ -69,10 +69,13 @@ class _Tracing:
     def _through(self) -> None:
         g, lens = self.graph, self.lens
         last = len(lens.surfaces) - 1
+        moving = {i for state in lens.configurations for i, _ in state.thickness_mm}
         for k in range(last, -1, -1):
             # Gaps as the lens has them: those that are equal stay so in every state of a zoom.
             gap = float(lens.surfaces[k].thickness_mm) if k < last else -float(lens.vertices_mm[k])
-            self.x = g.concat(self.x[0:2], self.x[2] + gap)
+            # A gap that moves may happen to equal another number in one state alone: its label keeps the nodes apart.
+            label = [f"gap {k}"] if k in moving else []
+            self.x = g.concat(self.x[0:2], self.x[2] + g.constant(gap, *label))
             self._surface(k, lens.surfaces[k])
             self.crossings += [self.x[2] + float(lens.vertices_mm[k]), self.x[1]]
         g.outputs["scene_ray"] = g.concat(self.x, self.d)

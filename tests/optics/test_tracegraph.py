@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.graph.interpret import evaluate
+from neurolens.graph.passes import pruned, same_structure
 from neurolens.graph.program import RAY, WAVELENGTH
 from neurolens.graph.scalars import lower
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import film_z_mm
-from neurolens.optics.prescription import Coating, Lens
+from neurolens.optics.prescription import Coating, Configuration, Lens, Surface
 from neurolens.optics.pupils import camera_rays, image_radius_mm, pupil_plane_z_mm
 from neurolens.optics.trace import trace
 from neurolens.optics.tracegraph import exact_graph
@@ -80,3 +81,19 @@ def test_transmittance_is_that_of_the_tracer(name: str, coat: bool, absorb: bool
     both = passed & (single["status"] == st.PASSED)
     off = np.abs(single["transmittance"] - power)[both]
     assert both.sum() > 0.99 * passed.sum() and np.quantile(off, 0.99) < 1e-5
+
+
+def test_states_have_one_structure_where_a_gap_equals_another_figure_in_one_of_them() -> None:
+    """The gap that moves is 2 mm in the first state, as wide as another, and so are films and glasses 2 mm thick."""
+    rows = (
+        Surface(40.0, 2.0, 10.0, n_d=1.5, V_d=60.0),
+        Surface(-60.0, 2.0, 10.0),
+        Surface(math.inf, 3.0, 6.0, stop=True),
+        Surface(50.0, 2.0, 10.0, n_d=1.6, V_d=40.0),
+        Surface(-50.0, 20.0, 10.0),
+    )
+    states = (Configuration("near", 30.0, ((1, 2.0),)), Configuration("far", 32.0, ((1, 4.5),)))
+    lens = Lens("zoom", "made up", rows, 4.0, configurations=states)
+    graphs = [exact_graph(lens.at(zoom=name), 0.0, LIGHT_NM) for name in ("near", "far")]
+    assert same_structure([pruned(g) for g in graphs])
+    assert lower(graphs).tables == 2
