@@ -46,7 +46,7 @@ _NUMBER = re.compile(rb"(?<![A-Za-z0-9_.])[-+]?[0-9]+(?:\.[0-9]+)?(?:e[-+]?[0-9]
 _WORD = re.compile(rb"[A-Za-z_][A-Za-z0-9_.-]{0,60}")
 
 _LOADED = (
-    *("onnxruntime", "torch", "trimesh.exchange.ply", "neurolens.readers.any_format", "neurolens.surrogates.export"),
+    *("onnxruntime", "torch", "neurolens.readers.any_format", "neurolens.surrogates.export"),
     *("neurolens.render.renderer", "neurolens.render.scene", "neurolens.cameras.build", "neurolens.cameras.model"),
     *("neurolens.render.pictures", "neurolens.optics.lenscheck", "neurolens.commands.render_files", "onnx"),
 )

@@ -84,32 +84,40 @@ def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] = build_
 
     `build` makes the parser; its errors and interrupts are reported like the command's.
     """
-    args = argparse.Namespace(kept="nothing was done")
+    args, received = argparse.Namespace(kept="nothing was done"), list[int]()
+
+    def interrupt(number: int) -> None:
+        received.append(number)
+        raise KeyboardInterrupt(number)
+
     try:
-        args = build().parse_args(argv)
-        with handled(_interrupt), _plain_warnings(quiet=getattr(args, "quiet", False)), more_glasses(args):
-            code: int = args.run(args)
+        with handled(interrupt):
+            args = build().parse_args(argv)
+            with _plain_warnings(quiet=getattr(args, "quiet", False)), more_glasses(args):
+                code: int = args.run(args)
         sys.stdout.flush()
         return code
-    except NeurolensError as error:
+    except (Exception, KeyboardInterrupt) as error:
+        # A signal that comes while a package is imported can end in another error, which the package makes of it.
+        if received or isinstance(error, KeyboardInterrupt):
+            print(f"\nneurolens: interrupted; {printable(args.kept)}", file=sys.stderr)
+            return 128 + (received[0] if received else signal.SIGINT)
+        return _failed(error)
+
+
+def _failed(error: Exception) -> int:
+    """Report an error in a line, and return the exit code."""
+    if isinstance(error, NeurolensError):
         return _fail(str(error))
-    except BrokenPipeError:
+    if isinstance(error, BrokenPipeError):
         # The reader (head, less) has exited; avoid a second error when the interpreter flushes stdout.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _BROKEN_PIPE
-    except OSError as error:
+    if isinstance(error, OSError):
         # The error of a full disk names no file.
         place = "" if error.filename is None else f"{error.filename}: "
         return _fail(f"{place}{error.strerror or error}")
-    except KeyboardInterrupt as error:
-        print(f"\nneurolens: interrupted; {printable(args.kept)}", file=sys.stderr)
-        return 128 + (error.args[0] if error.args else signal.SIGINT)
-    except Exception as error:
-        return _fault(error)
-
-
-def _interrupt(number: int) -> None:
-    raise KeyboardInterrupt(number)
+    return _fault(error)
 
 
 def _fault(error: Exception) -> int:

@@ -3,6 +3,9 @@
 import io
 import math
 import os
+import re
+import subprocess
+import sys
 import time
 import tomllib
 from dataclasses import dataclass, field
@@ -15,7 +18,7 @@ from hypothesis import strategies as st
 
 from neurolens.base.config import apply_overrides, from_dict, read_config, to_dict, to_toml
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path, atomic_write_text, check_writable
+from neurolens.base.files import atomic_path, atomic_write_text, check_writable, place_inside, safe_name
 from neurolens.base.progress import Progress, duration
 
 
@@ -306,3 +309,92 @@ def test_any_fraction_is_taken_and_quiet_prints_nothing() -> None:
 def test_durations_read_well() -> None:
     said = {0: "0.0 s", -1: "0.0 s", 0.44: "0.4 s", 9.96: "10 s", 59.7: "1 min 00 s", 185: "3 min 05 s"}
     assert {seconds: duration(seconds) for seconds in said} == said
+
+
+@pytest.mark.parametrize("text", ["a.zmx", "ols-64", "x+y_1"])
+def test_safe_names_stay(text: str) -> None:
+    assert safe_name(text) == text
+
+
+def test_unsafe_names_become_safe_and_stay_apart() -> None:
+    texts = [
+        "../x",
+        "/x",
+        "x/",
+        "x\\",
+        "",
+        ".",
+        "..",
+        ".hidden",
+        "ä",
+        "ö",
+        "a\nb",
+        "a" * 101,
+        "a" * 102,
+        "x\0",
+        "\udc80",
+    ]
+    names = [safe_name(text) for text in texts]
+    assert len(set(names)) == len(texts)
+    assert all(re.fullmatch(r"(?!\.)[A-Za-z0-9._+-]{1,100}", name) for name in names)
+
+
+def test_entries_of_archives_stay_inside(tmp_path: Path) -> None:
+    assert place_inside(tmp_path, "a/b.c") == tmp_path / "a/b.c"
+    for entry in ("../x", "/etc/x", "a/../../x", "", ".", "..\\x", "a\0"):
+        with pytest.raises(ValueError):
+            place_inside(tmp_path, entry)
+
+
+KILLED = """
+import os, signal, sys
+from neurolens.base.files import TemporaryFolder
+folder = TemporaryFolder()
+print(folder.name, flush=True)
+{end}
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no locks of files that end with a process")
+def test_temporary_folders_of_killed_processes_go_with_the_next(tmp_path: Path) -> None:
+    def process(end: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-c", KILLED.format(end=end)]
+        env = os.environ | {"TMPDIR": str(tmp_path)}
+        return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=env)
+
+    def folder_of(started: subprocess.Popen[str]) -> Path:
+        assert started.stdout is not None
+        return Path(started.stdout.readline().strip())
+
+    killed = process("os.kill(os.getpid(), signal.SIGKILL)")
+    left = folder_of(killed)
+    killed.communicate()
+    assert left.is_dir() and left.parent == tmp_path and left.stat().st_mode & 0o077 == 0
+    (tmp_path / "neurolens-of-others").mkdir()
+    (tmp_path / "neurolens-linked").symlink_to(tmp_path / "neurolens-of-others")
+    waiting = process("sys.stdin.read()")
+    alive = folder_of(waiting)
+    assert not left.exists()
+    last = process("pass")
+    last.communicate()
+    assert alive.is_dir()  # another process's, which lives
+    waiting.communicate()
+    assert {path.name for path in tmp_path.iterdir()} == {"neurolens-of-others", "neurolens-linked"}
+
+
+def test_torch_keeps_compiled_code_in_a_folder_of_this_user_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its own choice is a folder in the shared temporary one, whoever made it: planted code ran."""
+    trace = pytest.importorskip("neurolens.optics.trace")
+    places = pytest.importorskip("torch._inductor.runtime.cache_dir_utils")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "")
+    monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR")
+    trace.compile_tracing(lambda: None)
+    folder = Path(places.cache_dir())
+    assert folder == tmp_path / "neurolens" / "torch" and folder.stat().st_mode & 0o077 == 0
+    folder.chmod(0o777)  # then anybody may have put code there
+    monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR")
+    trace.compile_tracing(lambda: None)
+    assert not Path(places.cache_dir()).is_relative_to(tmp_path)

@@ -383,6 +383,25 @@ def test_an_interrupt_while_the_packages_are_read_is_one_line(begin: str) -> Non
     assert found.stderr.strip() == "neurolens: interrupted; nothing was done"
 
 
+@pytest.mark.parametrize("when", ["neurolens.commands.lens", "numpy"])
+@pytest.mark.parametrize("error", ["ImportError('a C extension')", "SystemError('error return')", "OSError('x')"])
+def test_a_signal_that_a_package_turns_into_its_own_error_is_an_interrupt(when: str, error: str) -> None:
+    """As C extensions do, whose start the signal ends: it was called a fault of neurolens."""
+    code = (
+        "import os, signal, sys\n"
+        "class Terminated:\n"
+        "    def find_spec(self, name, *_):\n"
+        f"        if name == '{when}':\n"
+        "            try: signal.raise_signal(signal.SIGTERM)\n"
+        f"            except KeyboardInterrupt: raise {error}\n"
+        "sys.meta_path.insert(0, Terminated())\n"
+        "from neurolens.cli import main; sys.exit(main())"
+    )
+    found = python(code, "lens", "lenses/cooke_triplet_50.toml")
+    assert (found.returncode, found.stdout) == (143, "")
+    assert found.stderr.startswith("\nneurolens: interrupted; ") and found.stderr.count("\n") == 2
+
+
 def python(code: str, *args: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-c", code, *map(str, args)]
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
@@ -542,7 +561,7 @@ def test_the_library_is_pages_of_lenses_and_an_index_that_are_kept(
     index = (tmp_path / "pages" / "index.html").read_text(encoding="utf-8")
     assert (
         "thorlabs_lb1471_biconvex_50/index.html" in index
-        and "<svg" in index
+        and "data:image/svg+xml,%3Csvg" in index
         and not re.search("(src|href)='http", index)
     )
     before = (folder / "layout.png").stat().st_mtime_ns

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import zipfile
@@ -100,6 +101,34 @@ def test_every_task_is_answered_once_and_errors_are_lines(place: str, cluster: s
         else:
             assert found[k] == b"n%d" % k
     assert collected(engine, []) == {}
+
+
+def try_in(common: bytes, task: str) -> bytes:
+    """Addresses of this worker and of its scheduler, and what an HTTP server of its answers."""
+    from distributed import get_worker
+
+    worker = get_worker()
+    return json.dumps([worker.address, worker.scheduler.address, worker.http_server.port]).encode()
+
+
+def test_workers_of_this_machine_are_of_this_process_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without keys nobody reaches them; ports for web pages are closed, or serve none."""
+    pytest.importorskip("cryptography", reason="needs cryptography (the extra dask)")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    answers = on_dask("local:1", try_in)(iter(["a", "b"]))
+    worker, scheduler, port = json.loads(next(answers)[1])
+    before = socket.create_connection(("127.0.0.1", port), 5)
+    before.sendall(b"GET /info/main/workers.html HTTP/1.0\r\n\r\n")
+    assert b" 404 " in before.recv(100)
+    before.close()
+    for address in (worker, scheduler):
+        assert address.startswith("tls://127.0.0.1:")
+        for other in (address, address.replace("tls", "tcp")):
+            stranger = Client.__new__(Client)  # at hand, so that it can be closed
+            with pytest.raises((OSError, RuntimeError, ValueError, TypeError)):
+                stranger.__init__(other, timeout="1s")
+            stranger.close()
+    assert [came for _, came in answers] != []
 
 
 def test_a_killed_worker_costs_only_its_task(cluster: str, tmp_path: Path) -> None:

@@ -56,13 +56,13 @@ PACKAGES = {
     "mitsuba": {"numpy"},
     "readers": set(),
     "cameras": {"numpy", "onnxruntime", "onnx"},  # onnx when a camera is first asked for rays: it loads slowly
-    "render": {"numpy", "OpenEXR", "PIL", "trimesh"},
+    "render": {"numpy", "OpenEXR", "PIL"},
     "blender": {"bpy", "cycles"},  # of Blender's own Python, in the extension
 }
 # Besides those: the writer of ONNX; the one camera that traces rays exactly, the maker of cameras, which imports it
 # when one is asked for; the shapes of the stop, which are parts of graphs.
 EXCEPTIONS: dict[str, tuple[set[str], set[str]]] = {
-    "neurolens.base.engine": (set(), {"distributed"}),  # where a cluster is asked for
+    "neurolens.base.engine": (set(), {"dask", "distributed"}),  # where a cluster is asked for
     "neurolens.graph.onnx": (set(), {"onnx"}),
     "neurolens.optics.apertures": ({"graph"}, set()),
     "neurolens.optics.sag": ({"optics"}, set()),  # for a type

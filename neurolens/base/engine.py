@@ -23,6 +23,7 @@ from typing import Any, TypeVar
 
 from neurolens import __version__
 from neurolens.base.errors import NeurolensError, one_line
+from neurolens.base.files import own_folder
 
 T = TypeVar("T")
 Work = Callable[[bytes, T], bytes]  # of what all tasks have in common, and of one task, to its answer
@@ -61,6 +62,8 @@ def on_dask(address: str, work: Work[T], common: bytes = b"") -> Engine[T]:
 
     Args:
         address: of the scheduler, as tcp://host:8786, or "local" (a worker a core of this machine), "local:N" (N).
+            Whoever reaches a scheduler at tcp:// can run code on its workers and here, as this user: answers and
+            errors of Dask are pickled. One at tls:// lets in those who have its keys (Dask's settings, comm.tls).
         work: a function of a module, which workers import. common: sent once to each worker that needs it.
 
     Raises (while it runs):
@@ -184,21 +187,40 @@ class _Cluster:
         kind, _, count = self._address.partition(":")
         try:
             if kind == "local":
-                self._local = self._distributed.LocalCluster(
-                    n_workers=int(count or _cores()), threads_per_worker=1, dashboard_address=None,
-                    silence_logs=logging.CRITICAL, memory_limit=0,
-                )  # fmt: skip
+                self._local = self._started(int(count or _cores()))
             # At hand before it starts, for one that fails to must be closed: found by the collector amid the start of
             # the next one, whose lock it wants, it stops both.
             self._client = self._distributed.Client.__new__(self._distributed.Client)
             self._client.__init__(self._local or self._address, timeout=_TIMEOUT)
         except BaseException as error:
             self.__exit__()
+            if isinstance(error, ImportError):
+                raise NeurolensError("--dask local needs cryptography: pip install 'neurolens[dask]'") from None
             if not isinstance(error, (OSError, ValueError)):
                 raise
             expected = "tcp://HOST:PORT of a scheduler that runs, local, or local:N"
             raise NeurolensError(f"--dask {self._address}: {_line(str(error))}; expected {expected}") from None
         return self._client
+
+    def _started(self, workers: int) -> Any:
+        """Workers of this machine, for this process alone: a scheduler runs any code that it is sent.
+
+        Keys that live as long as the cluster keep other users of the machine out; nothing is served over HTTP.
+        """
+        import dask
+        from distributed.security import Security
+
+        quiet: dict[str, list[str]] = {
+            f"distributed.{part}.http.routes": [] for part in ("scheduler", "worker", "nanny")
+        }
+        with dask.config.set(quiet):
+            cluster = self._distributed.LocalCluster(
+                n_workers=workers, threads_per_worker=1, host="127.0.0.1", security=Security.temporary(),
+                dashboard_address="127.0.0.1:0", local_directory=str(own_folder("dask")),
+                silence_logs=logging.CRITICAL, memory_limit=0,
+            )  # fmt: skip
+        cluster.scheduler.http_server.stop()
+        return cluster
 
     def __exit__(self, *_: object) -> None:
         for each, timeout_s in ((self._client, 2), (self._local, 5)):

@@ -9,6 +9,7 @@ import json
 import os
 import re
 import secrets
+import shutil
 import site
 import stat
 import sys
@@ -24,11 +25,17 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 
+try:
+    import fcntl
+except ModuleNotFoundError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 _LARGEST_LIST = 1 << 24
 _LEFT_OVER = re.compile(r"\.neurolens-[0-9a-f]{16}\.tmp(\.\w{1,16})?")  # a temporary file of ours
 _ABANDONED_S = 24 * 3600.0  # nothing is written for a day
 _CLEANED_S = 3600.0  # folders of thousands of files are not searched at each one
 _cleaned: dict[Path, float] = {}
+_FOLDER, _LOCK = "neurolens-", ".neurolens-lock"  # of temporary folders
 _DIGEST = 32  # bytes of SHA-256
 # Opened without waiting for a writer of a FIFO; what a system lacks it does not need.
 _READ = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
@@ -181,17 +188,60 @@ def cache_folder() -> Path:
     """`neurolens` in $XDG_CACHE_HOME or ~/.cache; where that is not this user's alone, a folder of this process."""
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     folder = Path(home) / "neurolens"
+    return folder if _is_own_folder(folder) else Path(_folder_of_process().name)
+
+
+def own_folder(name: str) -> Path:
+    """A folder of the cache for what another library keeps and runs; of this process where it is not the user's."""
+    folder = cache_folder() / name
+    return folder if _is_own_folder(folder) else Path(_folder_of_process().name)
+
+
+def _is_own_folder(folder: Path) -> bool:
+    """Make a folder unless it is there, and say whether it is this user's, and nobody else can write to it."""
     with suppress(OSError):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         found = folder.lstat()
-        if stat.S_ISDIR(found.st_mode) and _mine(found) and os.access(folder, os.W_OK | os.X_OK):
-            return folder
-    return Path(_folder_of_process().name)
+        return stat.S_ISDIR(found.st_mode) and _mine(found) and os.access(folder, os.W_OK | os.X_OK)
+    return False
 
 
 @cache
-def _folder_of_process() -> tempfile.TemporaryDirectory[str]:
-    return tempfile.TemporaryDirectory(prefix="neurolens-")
+def _folder_of_process() -> TemporaryFolder:
+    return TemporaryFolder()
+
+
+class TemporaryFolder(tempfile.TemporaryDirectory[str]):
+    """A folder of this process, removed with this object, or by a later process of this user if this one is killed.
+
+    The process holds a lock on a file in it, which the system takes away from a process that is killed.
+    """
+
+    def __init__(self) -> None:
+        _remove_folders_of_killed()
+        super().__init__(prefix=_FOLDER)
+        self._lock = open(os.path.join(self.name, _LOCK), "wb")  # noqa: SIM115 (held until the folder goes)
+        if fcntl is not None:
+            fcntl.flock(self._lock, fcntl.LOCK_EX)
+
+    def cleanup(self) -> None:
+        """Remove the folder."""
+        self._lock.close()
+        super().cleanup()
+
+
+@cache
+def _remove_folders_of_killed() -> None:
+    """Remove temporary folders of this user's processes that have ended without removing them, once a process."""
+    if fcntl is None:
+        return
+    with suppress(OSError):
+        for entry in os.scandir(tempfile.gettempdir()):
+            if entry.name.startswith(_FOLDER) and entry.stat(follow_symlinks=False).st_uid == os.getuid():
+                # No lock file: another program's, or one that a process is about to lock.
+                with suppress(OSError), os.fdopen(os.open(Path(entry.path, _LOCK), _READ), "rb") as lock:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    shutil.rmtree(entry.path, ignore_errors=True)
 
 
 def _mine(found: os.stat_result) -> bool:
@@ -230,6 +280,30 @@ def keep_newest(new: Path, most: int) -> None:
         others = [(abs(now - file.stat().st_mtime), file) for file in new.parent.glob(f"*{new.suffix}") if file != new]
         for _, file in sorted(others)[most - 1 :]:
             file.unlink()
+
+
+def safe_name(text: str) -> str:
+    """The name of a file or of an archive's entry that holds `text`, wherever that text comes from.
+
+    It has letters, digits and "._+-" of ASCII, no dot at its beginning, and at most 100 characters. A text that has to
+    change for this gets digits of its SHA-256 as well, so that the names of two texts differ.
+    """
+    name = re.sub(r"[^A-Za-z0-9._+-]+", "_", text).lstrip(".")
+    if name == text and 0 < len(name) <= 100:
+        return name
+    return f"{name[:80]}-{hashlib.sha256(text.encode(errors='surrogateescape')).hexdigest()[:16]}"
+
+
+def place_inside(folder: Path, entry: str) -> Path:
+    """Where an archive's entry belongs in a folder.
+
+    Raises:
+        ValueError: a name that leads out of the folder, or none that a file can have.
+    """
+    root = folder.resolve()
+    if not (path := (root / entry).resolve()).is_relative_to(root) or path == root or "\\" in entry:
+        raise ValueError(f"{entry[:80]!r} leads out of its folder")
+    return folder / entry
 
 
 def sha256_of(path: str | Path) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -45,6 +46,23 @@ def parse_toml(text: str, file: str | Path) -> dict[str, Any]:
     if any(piece.count(".") > _DEEPEST for piece in re.split(r"[=,{}\[\]\n]", text)):
         raise ValueError(f"a key of more than {_DEEPEST} parts")
     data = tomllib.loads(text)
+    check_tree(data, file)
+    return data
+
+
+def parse_json(text: str | bytes, file: str | Path) -> Any:
+    """The values of a text of strict JSON, of which every number is finite.
+
+    Raises:
+        ValueError, RecursionError: no JSON. InputError: refused by `check_tree`.
+    """
+
+    def finite(number: str) -> float:
+        if not math.isfinite(value := float(number)):  # also the words NaN and Infinity
+            raise ValueError(f"{number[:40]} is no finite number")
+        return value
+
+    data = json.loads(text, parse_float=finite, parse_constant=finite)
     check_tree(data, file)
     return data
 

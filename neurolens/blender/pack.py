@@ -16,11 +16,15 @@ import sys
 import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
+from functools import cache
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path
+from neurolens.base.files import atomic_path, place_inside, read_bytes, safe_name
+from neurolens.base.tomlfile import parse_json
 
 EXTENSION = Path(__file__).parent / "extension"
 FACTS, SCHEMA = "lenses.json", 1
@@ -65,7 +69,7 @@ class PackedLens:
         """Contents by place."""
         found = {f"shaders/{self._stem(f)}.osl": f.osl.encode() for f in self.forms}
         if self.picture is not None:
-            found[f"thumbnails/{self.lens_id}.png"] = self.picture
+            found[f"thumbnails/{safe_name(self.lens_id)}.png"] = self.picture
         return found
 
     def facts(self) -> dict[str, Any]:
@@ -81,13 +85,25 @@ class PackedLens:
             "f_number": self.f_number,
             "year": year_of(self.source),
             "source": self.source,
-            "picture": None if self.picture is None else f"thumbnails/{self.lens_id}.png",
+            "picture": None if self.picture is None else f"thumbnails/{safe_name(self.lens_id)}.png",
             "variants": variants,
             "field": self.lens_field,
         }
 
     def _stem(self, form: Form) -> str:
-        return f"{self.lens_id}.{form.model or form.kind}"
+        """A name of files: the model's is a text of its card, which anybody may have written."""
+        return safe_name(f"{self.lens_id}.{form.model or form.kind}")
+
+
+@cache
+def extension_library() -> ModuleType:
+    """The extension's own reader of its facts, by itself: its package starts with Blender."""
+    spec = spec_from_file_location("neurolens_library", EXTENSION / "library.py")
+    assert spec is not None and spec.loader is not None
+    module = module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
 
 
 def year_of(source: str) -> int | None:
@@ -132,14 +148,22 @@ def add_to_zip(path: Path, lens: PackedLens) -> None:
 
 def _of_zip(path: Path) -> tuple[dict[str, bytes], list[dict[str, Any]]]:
     """The files of a packed extension, and the entries of its facts."""
+    expected = "a zip of `neurolens blender build`"
+    data = io.BytesIO(read_bytes(path, _LARGEST, expected))
     try:
-        with zipfile.ZipFile(path) as packed:
+        with zipfile.ZipFile(data) as packed:
+            # An entry gives no more bytes than it says here, so that these bound the memory that is taken.
             if sum(i.file_size for i in packed.infolist()) > _LARGEST:
-                raise InputError(path, "size", "(too large)", f"at most {_LARGEST} bytes unpacked")
+                raise ValueError(f"more than {_LARGEST} bytes unpacked")
+            for info in packed.infolist():
+                place_inside(Path(), info.filename)
             files = {i.filename: packed.read(i) for i in packed.infolist() if not i.is_dir()}
-        return files, _entries(json.loads(files[FACTS]))
-    except (OSError, zipfile.BadZipFile, KeyError, ValueError, TypeError) as error:
-        raise InputError(path, "file", f"({error})", "a zip that `neurolens blender build` wrote") from None
+        return files, _entries(files[FACTS])
+    except MemoryError:
+        raise
+    except Exception as error:  # zipfile raises many types: for passwords, methods of compression, damaged data
+        found = f"no {error}" if isinstance(error, KeyError) else f"{error}"
+        raise InputError(path, "file", f"({found or type(error).__name__})", expected) from None
 
 
 def add_to_folder(folder: Path, lens: PackedLens) -> None:
@@ -160,9 +184,12 @@ def _of_folder(folder: Path) -> list[dict[str, Any]]:
     file = folder / FACTS
     if folder.exists() and not folder.is_dir():
         raise InputError(folder, "--to", "(a file)", "a zip that `neurolens blender build` wrote, or a folder")
+    if not file.exists():
+        return []
+    data = read_bytes(file, _LARGEST, "a file of facts")
     try:
-        return _entries(json.loads(file.read_text(encoding="utf-8"))) if file.exists() else []
-    except (ValueError, KeyError, TypeError) as error:
+        return _entries(data)
+    except (InputError, RecursionError, *extension_library().DAMAGED) as error:
         raise InputError(file, "file", f"({error})", "facts that neurolens wrote") from None
 
 
@@ -182,10 +209,18 @@ def user_folders() -> list[Path]:
     return [p.parents[2] / ".user" / p.parents[1].name / _ID for p in installed]
 
 
-def _entries(data: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _entries(text: bytes) -> list[dict[str, Any]]:
+    """The entries of facts that the extension can read, so that it reads those to which a lens is added.
+
+    Raises:
+        InputError, those of `DAMAGED` in the extension's library, RecursionError: other facts.
+    """
+    data = parse_json(text, FACTS)
     if data["schema"] != SCHEMA:
         raise ValueError(f"schema {data['schema']}")
-    return [dict(entry) for entry in data["lenses"] if entry["id"] and entry["variants"]]
+    for entry in data["lenses"]:
+        extension_library().lens_of(Path(), entry)
+    return list(data["lenses"])
 
 
 def _merged(known: Iterable[dict[str, Any]], lens: PackedLens) -> list[dict[str, Any]]:

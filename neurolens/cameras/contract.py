@@ -34,7 +34,8 @@ has the unit mm^2 / m^2. For points drawn with the density p per m^2, add
 W L cos(theta_P) / (p N a) to the pixel of area a (mm^2) that holds the film point, for each of N points.
 
 Status. Every ray has one (`base.status`); what did not pass has weight 0 and finite numbers elsewhere, and so have
-film or scene points that are not finite. Nothing in a ray raises; shapes and domains of settings do, when a camera is
+film or scene points that are not finite. A wavelength that is no finite number above 0 is outside every camera's
+domain. Nothing in a ray raises; shapes and domains of settings do, when a camera is
 made (`InputError`). A batch may be empty, and of any size that memory holds.
 """
 

@@ -168,7 +168,7 @@ class ExactCamera:
             film = np.stack([x, y]) + (film_z - z) / dz * np.stack([dx, dy])
             weight = through * aim.area / (self.film.exposure * ((point_m - origin) ** 2).sum(0))
         status = np.where(aim.status == st.PASSED, done.status.numpy(), aim.status)
-        return arrived(film, origin, point_m, weight, status)
+        return arrived(film, origin, point_m, weight, status, wavelength_nm)
 
     def lens_graph(self) -> LensGraph:
         """The lens as a graph."""

@@ -121,7 +121,7 @@ class ThickLens:
         weight = cos2 * cos2 * np.float32(self._exposure / self._part)
         status = self._stopped(entrance, np.zeros(count, np.int32))
         weight = np.where(status == st.PASSED, weight, np.float32(0))
-        return sound(CameraRays(origin, direction, weight, status), cos2, pupil)
+        return sound(CameraRays(origin, direction, weight, status), cos2, pupil, wavelength_nm)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """As `sample`, with the differentials of the rays; their origins move on the front principal plane."""
@@ -155,7 +155,7 @@ class ThickLens:
             weight *= np.sqrt(1 + (slope**2).sum(0))
         plane = np.full((1, depth.size), self.front_z_mm - self.film_z_mm)
         status = self._stopped(entrance, ahead(depth))
-        return arrived(film, 1e-3 * np.concatenate([height, plane]), point_m, weight, status)
+        return arrived(film, 1e-3 * np.concatenate([height, plane]), point_m, weight, status, wavelength_nm)
 
     def _slopes(self, film_mm: NDArray[Any], entrance_mm: NDArray[Any]) -> NDArray[Any]:
         """Slopes [2, N] of the film-side rays of film points towards the images of points of the entrance pupil."""

@@ -16,7 +16,7 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.cameragraph import D_FILM, weight_graph
 from neurolens.cameras.contract import CameraRays, FloatArray, RayDifferentials
 from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.cameras.sampling import stratified
+from neurolens.cameras.sampling import is_light, stratified
 from neurolens.graph.interpret import evaluate
 
 # Points a side of the quadrature of the exposure on the axis.
@@ -87,7 +87,7 @@ class LensFilm:
         """
         scene = scene or self.scene
         pupil, area = self.pupil.sample(film_mm, square, wavelength_nm)
-        lit = area > 0
+        lit = (area > 0) & is_light(wavelength_nm)
         if lit.all():
             return camera_rays(self._weighted(scene, film_mm, pupil, area, wavelength_nm))
         # A film point that nothing reaches is dark: no ray is traced.

@@ -167,7 +167,7 @@ class OnnxCamera:
         squared = ((point_m - origin) ** 2).sum(0)
         with np.errstate(all="ignore"):
             weight = np.maximum(out.transmittance, 0) * aim.area / (self.film.exposure * squared)
-        return arrived(out.rays[:2].astype(np.float64), origin, point_m, weight, status)
+        return arrived(out.rays[:2].astype(np.float64), origin, point_m, weight, status, wavelength_nm)
 
     def _inverse_map(self) -> tuple[OnnxInverse, FrontAim]:
         """The inverse map and where to aim at, found once."""

@@ -80,7 +80,7 @@ class Pinhole:
         origin = np.zeros((3, count), np.float32)
         origin[2] = -1e-3 * self.focal_mm
         rays = CameraRays(origin, direction, (cos2 * cos2).astype(np.float32), np.zeros(count, np.int32))
-        return sound(rays, cos2, pupil)
+        return sound(rays, cos2, pupil, wavelength_nm)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """As `sample`, with the differentials of the rays, all of which start at the hole."""
@@ -102,7 +102,7 @@ class Pinhole:
             film = self.focal_mm * way[:2] / way[2]
             # A' / E0 of a small hole is the square of its distance from the film.
             weight = self.focal_mm**2 * -way[2] / squared**1.5
-        return arrived(film, origin, point_m, weight, ahead(-way[2]))
+        return arrived(film, origin, point_m, weight, ahead(-way[2]), wavelength_nm)
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ class Fisheye:
         origin[2] = -1e-3 * self.focal_mm
         weight = (self.projection.falloff(theta) * lit).astype(np.float32)
         status = np.where(lit, st.PASSED, st.OUTSIDE_DOMAIN).astype(np.int32)
-        return sound(CameraRays(origin, direction, weight, status), np.ones_like(rho), pupil)
+        return sound(CameraRays(origin, direction, weight, status), np.ones_like(rho), pupil, wavelength_nm)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """As `sample`, with the differentials of the rays, all of which start at the hole."""
@@ -236,7 +236,8 @@ class Fisheye:
         out = np.where(theta > self.widest_rad, st.blocked(0, st.MISSED), st.OUTSIDE_DOMAIN)
         # Straight behind, the projection has no direction to lay the point in.
         lit = (theta <= self.widest_rad) & (self.projection.radius(theta) < self.projection.end) & (theta < math.pi)
-        return arrived(film, origin, point_m, weight, np.where(lit, st.PASSED, out).astype(np.int32))
+        status = np.where(lit, st.PASSED, out).astype(np.int32)
+        return arrived(film, origin, point_m, weight, status, wavelength_nm)
 
     def _place(self, film_mm: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
         """rho [N] and the unit vectors [2, N] from the axis to film points, and which lie within the projection."""

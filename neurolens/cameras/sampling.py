@@ -48,16 +48,24 @@ def stratified(side: int, wavelength_nm: tuple[float, float]) -> tuple[FloatArra
     return square, (wavelength_nm[0] + (wavelength_nm[1] - wavelength_nm[0]) * share).astype(np.float32)
 
 
-def sound(rays: CameraRays, cos2: FloatArray, square: FloatArray) -> CameraRays:
-    """The rays, those of no film point, or of one too far out for float32, or of no pupil point, dark, straight ahead.
+def is_light(wavelength_nm: FloatArray) -> NDArray[np.bool_]:
+    """Which wavelengths [N] are finite and above 0: other rays are outside the domain of every camera."""
+    return (wavelength_nm > 0) & (wavelength_nm < np.inf)
+
+
+def sound(rays: CameraRays, cos2: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+    """The rays, those of no film point, or of one too far out for float32, or of no pupil point or wavelength, dark,
+    straight ahead.
 
     Args:
         cos2: [N], a squared cosine of each ray, which is NaN or near 0 for film points that are not sound.
         square: [2, N] the pupil samples, which belong to [0, 1].
     """
-    if cos2.min(initial=1) > _LEAST_COS2 and square.min(initial=0) >= 0 and square.max(initial=0) <= 1:  # not NaN
+    lit = is_light(wavelength_nm)
+    # Written so that NaN fails.
+    if cos2.min(initial=1) > _LEAST_COS2 and square.min(initial=0) >= 0 and square.max(initial=0) <= 1 and lit.all():
         return rays
-    good = (cos2 > _LEAST_COS2) & ((square >= 0) & (square <= 1)).all(0)
+    good = (cos2 > _LEAST_COS2) & ((square >= 0) & (square <= 1)).all(0) & lit
     return CameraRays(
         np.where(good, rays.origin_m, np.float32(0)),
         np.where(good, rays.direction, _AHEAD),
@@ -72,12 +80,14 @@ def arrived(
     point_m: FloatArray,
     weight: NDArray[np.float64],
     status: NDArray[np.int32],
+    wavelength_nm: FloatArray,
 ) -> FilmPoints:
     """Film points [2, N] with what leads to them; dark, and finite, where the status or a number forbids them."""
     way = point_m - origin_m
     with np.errstate(all="ignore"):
         direction = (way / np.sqrt(np.einsum("in,in->n", way, way))).astype(np.float32)
         film, origin, weight = film_mm.astype(np.float32), origin_m.astype(np.float32), weight.astype(np.float32)
+    status = np.where(is_light(wavelength_nm), status, st.OUTSIDE_DOMAIN)
     finite = np.isfinite(np.concatenate([film, origin, direction, weight[None]])).all(0)
     good = finite & (status == st.PASSED)
     return FilmPoints(

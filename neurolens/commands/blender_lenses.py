@@ -19,6 +19,7 @@ import numpy as np
 
 from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.files import safe_name
 from neurolens.base.lensname import is_model, lens_id_of
 from neurolens.base.signals import end_at_once, held
 from neurolens.blender.pack import Form, PackedLens
@@ -175,7 +176,7 @@ def stated_lens(model: Path, lenses: Path) -> Lens | None:
     from neurolens.optics.paraxial import first_order
 
     told = _card(model)["lens"]
-    file = lenses / f"{told['id']}.toml"
+    file = lenses / f"{safe_name(told['id'])}.toml"
     if not file.is_file():
         return None
     lens, efl = read_lens(file), float(told["efl_mm"])

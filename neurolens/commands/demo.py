@@ -62,9 +62,8 @@ def run(args: argparse.Namespace) -> int:
         given.run(given)
         figures.append({"file": f"{name}.png", "title": caption, "caption": f"neurolens {shlex.join(words)}"})
     body = pages.figure_grid(folder, figures)
-    atomic_write_text(
-        folder / "index.html", pages.page("One scene, five cameras", f"<h1>One scene, five cameras</h1>{body}")
-    )
+    body = pages.html("<h1>One scene, five cameras</h1>{}", body)
+    atomic_write_text(folder / "index.html", pages.page("One scene, five cameras", body))
     more = "neurolens lens list" if traced else "with the extra 'train', which traces lenses: neurolens lens list, view"
     print(f"\nLook at {folder}/index.html\nThen: neurolens --help, neurolens models, {more}")
     return 0

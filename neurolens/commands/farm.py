@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import io
 import os
-import tempfile
 import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -17,18 +16,19 @@ from contextlib import redirect_stdout
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from neurolens.base.engine import Failed, on_dask
 from neurolens.base.errors import NeurolensError
-from neurolens.base.files import atomic_path
+from neurolens.base.files import TemporaryFolder, atomic_path, place_inside
 from neurolens.base.lensname import IDEAL, split_kind
 from neurolens.commands.arguments import more_glasses
 
 DASK_HELP = (
     "run on a Dask cluster: the address of its scheduler (tcp://HOST:8786), or local (processes of this machine), or "
-    "local:N. What a task reads travels with it: workers need neurolens alone, and no folder in common"
+    "local:N, which no other user can reach. What a task reads travels with it: workers need neurolens alone, and no "
+    "folder in common. Whoever reaches a scheduler at tcp:// can run programs as you; tls:// takes keys"
 )
 _THEN = (1980, 1, 1, 0, 0, 0)  # the same files are the same bytes
 
@@ -86,9 +86,10 @@ def unpack(data: bytes, folder: Path) -> list[Path]:
     found = []
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         for name in archive.namelist():
-            if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-                raise NeurolensError(f"an answer with a file outside its folder: {name}")
-            path = folder / name
+            try:
+                path = place_inside(folder, name)
+            except ValueError as error:
+                raise NeurolensError(f"an answer with a file outside its folder: {error}") from None
             path.parent.mkdir(parents=True, exist_ok=True)
             with atomic_path(path) as temporary:
                 temporary.write_bytes(archive.read(name))
@@ -137,9 +138,9 @@ def spread(
 
 
 @lru_cache(maxsize=2)
-def _unpacked(files: bytes) -> tempfile.TemporaryDirectory[str]:
+def _unpacked(files: bytes) -> TemporaryFolder:
     """The files of a run, once in a worker."""
-    folder = tempfile.TemporaryDirectory(prefix="neurolens-")
+    folder = TemporaryFolder()
     unpack(files, Path(folder.name))
     return folder
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError, NeurolensError
-from neurolens.base.files import atomic_path, atomic_write_text, library, write_json
+from neurolens.base.files import atomic_path, atomic_write_text, library, safe_name, write_json
 from neurolens.base.lensname import lens_id_of
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_json, add_lens, check_run_folder
@@ -55,10 +56,12 @@ def run(args: argparse.Namespace) -> int:
     folder = args.output
     check_run_folder(folder, "neurolens library", "-o")
     files = args.lenses or lens_files(library() / "lenses")
+    names = _page_names(files)
+    folder.mkdir(parents=True, exist_ok=True)
     progress, records = Progress({"lenses": 12.0 * len(files)}, quiet=args.quiet), []
     with progress.stage("lenses") as report:
         for k, file in enumerate(files):
-            records.append(_record(file, folder))
+            records.append(_record(file, folder / names[k]))
             report((k + 1) / len(files))
     atomic_write_text(folder / "index.html", _index(records))
     failed = [f"{r['lens']}: {r['fault']}" for r in records if "fault" in r]
@@ -68,28 +71,36 @@ def run(args: argparse.Namespace) -> int:
     return 1 if failed else 0
 
 
+def _page_names(files: Sequence[Path]) -> list[str]:
+    """A folder's name for each file's page: the lens's id, and a number where another file of the run has the same."""
+    names: list[str] = []
+    for file in files:
+        tries = (safe_name(f"{lens_id_of(file)}-{k}" if k > 1 else lens_id_of(file)) for k in itertools.count(1))
+        taken = {"index.html", *(name.lower() for name in names)}  # many disks know no capitals
+        names.append(next(name for name in tries if name.lower() not in taken))
+    return names
+
+
 def _record(file: Path, folder: Path) -> dict[str, Any]:
-    """A lens's row of the index, its page written unless it is there."""
+    """A lens's row of the index, its page written to a folder unless it is there."""
     from neurolens import __version__
     from neurolens.evaluate.describe import read_quietly
 
-    kept = folder / lens_id_of(file) / "record.json"
+    kept, named = folder / "record.json", {"lens": lens_id_of(file), "page": folder.name}
     try:
         lens = read_quietly(file)
         try:
             found = json.loads(kept.read_text(encoding="utf-8"))
             if (found["sha256"], found["version"]) == (lens.sha256, __version__):
-                return dict(found)
+                return found | named
         except (OSError, ValueError, KeyError):
             pass
         kept.parent.mkdir(parents=True, exist_ok=True)
-        record = {"lens": lens_id_of(file), "sha256": lens.sha256, "version": __version__} | _page(
-            lens, file, kept.parent
-        )
+        record = named | {"sha256": lens.sha256, "version": __version__} | _page(lens, file, kept.parent)
         write_json(kept, record)
         return record
     except NeurolensError as error:
-        return {"lens": lens_id_of(file), "fault": str(error)}
+        return {"lens": file.stem, "page": None, "fault": str(error)}
 
 
 def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
@@ -116,13 +127,12 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
     models = [m for m in models_in(library() / "models") if m["lens"] == lens.lens_id]
     doubts = [*row["doubts"], *rim_doubts(lens), *notes]
     source = pages.facts({"designer": lens.designer or pages.DASH, "source": lens.source, "rims": lens.rims})
-    body = f"<p><a href='../index.html'>All lenses</a></p><h1>{pages.text(lens.name)}</h1>{source}"
-    body += "".join(f"<p class='note'>{pages.text(d)}</p>" for d in doubts)
-    body += f"<p>{pages.text(lens.notes)}</p>" if lens.notes else ""
+    body = pages.html("<p><a href='../index.html'>All lenses</a></p><h1>{}</h1>{}", lens.name, source)
+    body += pages.joined("<p class='note'>{}</p>", doubts) + pages.joined("<p>{}</p>", filter(None, [lens.notes]))
     body += pages.figure_grid(folder, figures)
     names = [Path(m["file"]).stem.removeprefix(f"{lens.lens_id}.") for m in models]
     body += pages.section("Models", pages.table(names, models, _model_columns()))
-    body += pages.section("File", f"<pre>{pages.text(read_text(file))}</pre>")
+    body += pages.section("File", pages.html("<pre>{}</pre>", read_text(file)))
     atomic_write_text(folder / "index.html", pages.page(lens.name, body))
     best = min((m["rms_um"] for m in models if m["rms_um"] is not None), default=None)
     keys = ("name", "efl_mm", "f_number", "half_field_deg", "refractions", "states")
@@ -189,7 +199,7 @@ def _model_columns() -> tuple[Any, ...]:
 def _index(records: Sequence[Mapping[str, Any]]) -> str:
     """All lenses in a table with thumbnails, which searches and sorts by itself."""
     from neurolens.evaluate import pages
-    from neurolens.evaluate.survey_page import TABLE_SCRIPT, TABLE_STYLE
+    from neurolens.evaluate.survey_page import TABLE_SCRIPT, sorting_table
 
     columns = (
         pages.Column("year", "year", digits=4), pages.Column("f (mm)", "efl_mm", digits=4),
@@ -198,23 +208,15 @@ def _index(records: Sequence[Mapping[str, Any]]) -> str:
         pages.Column("fastest model (ns)", "ns", about="a ray, one core, as C where that was timed"),
         pages.Column("best model (µm)", "rms_um", about="film-equivalent RMS"),
     )  # fmt: skip
-    heads = "".join(
-        f"<th scope='col' data-kind='number' title='{pages.text(c.about)}'>{pages.text(c.heading)}</th>"
-        for c in columns
-    )
     rows = []
     for r in records:
-        cells = "".join(
-            f"<td data-v='{'' if (v := pages.number(r, c.key)) is None else v}'>{c.cell(r)}</td>" for c in columns
-        )
-        link = f"<a href='{pages.text(r['lens'])}/index.html'>{pages.text(r.get('name', r['lens']))}</a>"
-        said = r.get("fault") or "<br>".join(pages.text(d) for d in r.get("doubts", ()))
-        rows.append(
-            f"<tr data-kinds='all'><th scope='row'>{link}<small>{pages.text(r.get('designer') or '')}</small></th>"
-            f"<td class='p' data-v=''>{r.get('layout', '')}</td>{cells}<td class='t'>{said}</td></tr>"
-        )
-    head = f"<tr><th scope='col'>lens</th><th scope='col'>section</th>{heads}<th scope='col'>doubts</th></tr>"
-    tools = "<div class='tools'><input id='words' type='search' placeholder='words that a row holds'>"
-    tools += "<input class='kind' type='checkbox' value='all' checked hidden><span id='shown'></span></div>"
-    table = f"<div class='survey'><table><thead>{head}</thead><tbody>{''.join(rows)}</tbody></table></div>"
-    return pages.page("Lenses", f"{TABLE_STYLE}<h1>{len(records)} lenses</h1>{tools}{table}{TABLE_SCRIPT}")
+        link = "<a href='./{}/index.html'>{}</a>" if r["page"] else "{1}"
+        row = "<tr data-kinds='all'><th scope='row'>{}<small>{}</small></th>{}{}<td class='t'>{}</td></tr>"
+        name = pages.html(link, r["page"], r.get("name", r["lens"]))
+        said = pages.joined("{}", [r["fault"]] if "fault" in r else r.get("doubts", ()), "<br>")
+        cells = pages.sorting_cells(r, columns)
+        rows.append(pages.html(row, name, r.get("designer") or "", pages.drawing(r.get("layout", "")), cells, said))
+    heads = pages.joined("<th scope='col'>{}</th>", ("lens", "section")) + pages.sorting_heads(columns)
+    box = pages.html("<input class='kind' type='checkbox' value='all' checked hidden>")
+    table = sorting_table(heads + pages.html("<th scope='col'>doubts</th>"), pages.joined("{}", rows), box)
+    return pages.page("Lenses", pages.html("<h1>{} lenses</h1>{}{}", len(records), table, TABLE_SCRIPT))

@@ -159,7 +159,7 @@ def _page(found: Trade, folder: Path, title: str) -> str:
     front = found.front
     marks = ["● " if o == found.chosen else "○ " if o in front else "" for o in found.offered]
     names = [f"{m}{_short(o)}" for m, o in zip(marks, found.offered, strict=True)]
-    lead = "".join(f"<p class='lead'>{pages.text(line)}</p>" for line in _said(found))
+    lead = pages.joined("<p class='lead'>{}</p>", _said(found))
     told = f"{found.samples} samples a pixel each, the same random numbers. Below each its FLIP difference from the "
     told += "exact lens's picture: with noise, where a camera makes other rays of the same numbers, as thin lenses do."
     figures = [
@@ -167,7 +167,7 @@ def _page(found: Trade, folder: Path, title: str) -> str:
         {"file": "pictures.png", "title": "What is seen", "caption": told},
     ]
     shown = pages.figure_grid(folder, [{**f, "wide": True} for f in figures], inside=True)
-    body = f"<h1>{pages.text(title)}</h1>{lead}{shown}"
+    body = pages.html("<h1>{}</h1>{}{}", title, lead, shown)
     body += pages.section("Every camera", pages.table(names, records, columns))
-    body += "<p class='note'>● for the budget, ○ no other betters both.</p>" + pages.legend(columns)
+    body += pages.html("<p class='note'>● for the budget, ○ no other betters both.</p>") + pages.legend(columns)
     return pages.page(title, body)

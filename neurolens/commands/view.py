@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import os
 import re
-import tempfile
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError, ModelError, NeurolensError, NeurolensWarning
+from neurolens.base.files import TemporaryFolder
 from neurolens.base.files import library as shipped
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
@@ -108,7 +108,7 @@ def run(args: argparse.Namespace) -> int:
             raise InputError("neurolens view", entry.key, f"({' and '.join(found)})", "one model of each kind")
     kinds, progress = args.downloads, Progress(quiet=args.json)
     made: list[ViewLens] = []
-    with tempfile.TemporaryDirectory() as place, warnings.catch_warnings():
+    with TemporaryFolder() as place, warnings.catch_warnings():
         warnings.filterwarnings("ignore", re.escape(place), NeurolensWarning)  # said of the lens's own file
         entries = [_with_file(entry, Path(place) / str(number)) for number, entry in enumerate(entries)]
         shaders = _shaders(entries, args.jobs, progress) if "osl" in kinds else {}

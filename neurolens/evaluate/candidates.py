@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import math
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
@@ -16,6 +15,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base.errors import InputError, ModelError
+from neurolens.base.files import TemporaryFolder
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxLens, load_model
@@ -167,7 +167,7 @@ class CompiledSource:
 
     def __init__(self, program: Program, flags: tuple[str, ...] = FLAGS) -> None:
         self.signature = Signature.of(program, "lens")
-        self._folder = tempfile.TemporaryDirectory(prefix="neurolens-source-")
+        self._folder = TemporaryFolder()
         library = Path(self._folder.name) / "lens.so"
         blocks = bool(program.own_tables)  # lookups: loops of arrays have them apart
         text = write_blocks(program, "lens") if blocks else write_c(program, "lens", ["A timed model."])

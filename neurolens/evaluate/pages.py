@@ -1,15 +1,19 @@
-"""Tables of records, in HTML and in Markdown, and the markup of a page without scripts that needs no network."""
+"""Tables of records, in HTML and in Markdown, and the markup of a page without scripts that needs no network.
+
+All markup is made by `html`, whose template is our own text, and which escapes every value that it puts in.
+"""
 
 from __future__ import annotations
 
 import base64
-import html
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
+
+from markupsafe import Markup
 
 Record = Mapping[str, Any]
 DASH = "–"
@@ -59,41 +63,70 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[Any]], missing
     return [f"| {' | '.join(line)} |" for line in lines]
 
 
-def text(value: Any) -> str:
-    """`value` as escaped text, safe between tags and inside quoted attributes."""
-    return html.escape(str(value), quote=True)
+def html(template: str, *values: object) -> Markup:
+    """A template with values in the places of its {}: markup that this function made as it is, anything else escaped,
+    safe between tags and inside quoted attributes. A link needs more: see `local_url`."""
+    return Markup(template).format(*values)  # noqa: S704 (templates are texts of this package)
 
 
-def section(heading: str, body: str) -> str:
+def joined(template: str, values: Iterable[object], between: str = "") -> Markup:
+    """A template for each value, one after the other."""
+    return html(between).join(html(template, value) for value in values)
+
+
+def section(heading: str, body: str) -> Markup:
     """A section with a heading; empty if it has no content."""
-    return f"<section><h2>{text(heading)}</h2>{body}</section>" if body else ""
+    return html("<section><h2>{}</h2>{}</section>", heading, body) if body else Markup()
 
 
-def table(names: Sequence[str], records: Sequence[Record], columns: Iterable[Column]) -> str:
+def table(names: Sequence[str], records: Sequence[Record], columns: Iterable[Column]) -> Markup:
     """One row a record; a column that no record holds is left out, a figure that one record lacks is a dash."""
     columns = [c for c in columns if any(number(r, c.key) is not None for r in records)]
     if not records:
-        return ""
-    hover = (f" title='{text(c.about)}'" if c.about else "" for c in columns)
-    head = "".join(f"<th scope='col'{about}>{text(c.heading)}</th>" for c, about in zip(columns, hover, strict=True))
+        return Markup()
+    hover = [html(" title='{}'", c.about) if c.about else "" for c in columns]
+    heads = (html("<th scope='col'{}>{}</th>", about, c.heading) for c, about in zip(columns, hover, strict=True))
     rows = []
     for name, record in zip(names, records, strict=True):
-        cells = "".join(f"<td>{c.cell(record, ',')}</td>" for c in columns)
-        rows.append(f"<tr><th scope='row'>{text(name)}</th>{cells}</tr>")
-    body = f"<thead><tr><th></th>{head}</tr></thead><tbody>{''.join(rows)}</tbody>"
-    return f"<div class='scroll' tabindex='0'><table>{body}</table></div>"
+        cells = joined("<td>{}</td>", (c.cell(record, ",") for c in columns))
+        rows.append(html("<tr><th scope='row'>{}</th>{}</tr>", name, cells))
+    body = html("<thead><tr><th></th>{}</tr></thead><tbody>{}</tbody>", joined("{}", heads), joined("{}", rows))
+    return html("<div class='scroll' tabindex='0'><table>{}</table></div>", body)
 
 
-def legend(columns: Iterable[Column]) -> str:
+def sorting_heads(columns: Iterable[Column]) -> Markup:
+    """Headings of numbers in a table that sorts by itself."""
+    heads = (html("<th scope='col' data-kind='number' title='{}'>{}</th>", c.about, c.heading) for c in columns)
+    return joined("{}", heads)
+
+
+def sorting_cells(record: Record, columns: Iterable[Column]) -> Markup:
+    """The cells of a record below `sorting_heads`."""
+    values = ((number(record, c.key), c.cell(record)) for c in columns)
+    return joined("{}", (html("<td data-v='{}'>{}</td>", "" if v is None else v, cell) for v, cell in values))
+
+
+def drawing(svg: str) -> Markup:
+    """A cell with a drawing as a picture, in which no script runs."""
+    shown = html("<img src='data:image/svg+xml,{}' alt=''>", quote(svg, safe=" /:=(),;.")) if svg else ""
+    return html("<td class='p' data-v=''>{}</td>", shown)
+
+
+def legend(columns: Iterable[Column]) -> Markup:
     """What the headings of tables mean, folded."""
     meant = {c.heading: c.about for c in columns if c.about}
-    return f"<details><summary>What the words mean</summary>{facts(meant)}</details>" if meant else ""
+    return folded("What the words mean", facts(meant)) if meant else Markup()
 
 
-def facts(values: Mapping[str, Any]) -> str:
+def folded(summary: str, body: str) -> Markup:
+    """A body that opens when its summary is clicked on."""
+    return html("<details><summary>{}</summary>{}</details>", summary, body)
+
+
+def facts(values: Mapping[str, Any]) -> Markup:
     """A table of settings as a definition list; nested tables with dotted names."""
-    rows = "".join(f"<dt>{text(key)}</dt><dd>{text(value)}</dd>" for key, value in _flat(values))
-    return f"<dl>{rows}</dl>"
+    rows = (html("<dt>{}</dt><dd>{}</dd>", key, value) for key, value in _flat(values))
+    return html("<dl>{}</dl>", joined("{}", rows))
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
@@ -116,30 +149,32 @@ def _plain(value: Any) -> str:
     return str(value)
 
 
-def figure_grid(folder: Path, figures: Iterable[Mapping[str, Any]], small: bool = False, inside: bool = False) -> str:
+def figure_grid(
+    folder: Path, figures: Iterable[Mapping[str, Any]], small: bool = False, inside: bool = False
+) -> Markup:
     """Pictures with title, caption and links; one whose file is not in `folder` leaves a line that says so.
 
     `inside`: PNG files as part of the page, which then needs no others.
     """
-    shown = "".join(_figure(folder, figure, inside) for figure in figures)
-    return f"<div class='figures{' small' if small else ''}'>{shown}</div>" if shown else ""
+    shown = joined("{}", (_figure(folder, figure, inside) for figure in figures))
+    return html("<div class='figures{}'>{}</div>", " small" if small else "", shown) if shown else Markup()
 
 
-def _figure(folder: Path, figure: Mapping[str, Any], inside: bool) -> str:
+def _figure(folder: Path, figure: Mapping[str, Any], inside: bool) -> Markup:
     name, caption = str(figure.get("title") or ""), str(figure.get("caption") or "")
     links = {label: local_url(folder, file) for label, file in (figure.get("links") or {}).items()}
-    files = " · ".join(f"<a href='{url}'>{text(label)}</a>" for label, url in links.items() if url)
-    words = " ".join(part for part in (f"<b>{text(name)}</b>" if name else "", text(caption), files) if part)
+    files = joined("{}", (html("<a href='{}'>{}</a>", url, label) for label, url in links.items() if url), " · ")
+    words = joined("{}", filter(None, (html("<b>{}</b>", name) if name else "", caption, files)), " ")
     url = local_url(folder, figure.get("file"))
     if url is None:
-        return f"<p class='note'>Picture missing: {text(figure.get('file'))}</p>"
+        return html("<p class='note'>Picture missing: {}</p>", figure.get("file"))
     if inside:
         data = base64.b64encode((folder / str(figure["file"])).read_bytes()).decode("ascii")
-        picture = f"<img src='data:image/png;base64,{data}' alt='{text(name or caption)}'>"
+        picture = html("<img src='data:image/png;base64,{}' alt='{}'>", data, name or caption)
     else:
-        picture = f"<a href='{url}'><img src='{url}' alt='{text(name or caption)}' loading='lazy'></a>"
-    kind = " class='wide'" if figure.get("wide") else ""
-    return f"<figure{kind}>{picture}<figcaption>{words}</figcaption></figure>"
+        picture = html("<a href='{}'><img src='{}' alt='{}' loading='lazy'></a>", url, url, name or caption)
+    kind = html(" class='wide'") if figure.get("wide") else ""
+    return html("<figure{}>{}<figcaption>{}</figcaption></figure>", kind, picture, words)
 
 
 def local_url(folder: Path, file: Any) -> str | None:
@@ -153,14 +188,14 @@ def local_url(folder: Path, file: Any) -> str | None:
     return "./" + quote(path.relative_to(root).as_posix())  # "./", so that a name with a colon is not read as a scheme
 
 
-def page(title: str, body: str) -> str:
+def page(title: str, body: str) -> Markup:
     """A whole document around `body`."""
-    head = "<meta charset='utf-8'><meta name='viewport' content='width=device-width, initial-scale=1'>"
-    head += f"<title>{text(title)}</title><style>{_CSS}</style>"
-    return f"<!DOCTYPE html>\n<html lang='en'><head>{head}</head><body>{body}</body></html>\n"
+    head = html("<meta charset='utf-8'><meta name='viewport' content='width=device-width, initial-scale=1'>")
+    head += html("<title>{}</title><style>{}</style>", title, _CSS)
+    return html("<!DOCTYPE html>\n<html lang='en'><head>{}</head><body>{}</body></html>\n", head, body)
 
 
-_CSS = """
+_CSS = Markup("""
 :root { color-scheme: light dark; --ink: #1b1f24; --dim: #5d6670; --line: #dfe3e8; --back: #fff; --card: #f5f7f9;
   --accent: #0062a3; --shade: #0004; --warn: #fff6e0; --warnline: #e0a800; }
 @media (prefers-color-scheme: dark) { :root { --ink: #e4e8ec; --dim: #98a2ad; --line: #333a42; --back: #15181c;
@@ -205,4 +240,4 @@ figure img { width: 100%; height: auto; display: block; border-radius: 6px; back
 figcaption { font-size: .85rem; margin-top: .35rem; } figcaption b { color: var(--ink); }
 .small img { image-rendering: auto; border: 0; }
 @media print { body { max-width: none; } tbody th { position: static; } }
-"""
+""")

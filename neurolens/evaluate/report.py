@@ -10,6 +10,8 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
+from markupsafe import Markup
+
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.evaluate.pages import (
@@ -18,13 +20,15 @@ from neurolens.evaluate.pages import (
     Record,
     facts,
     figure_grid,
+    folded,
+    html,
+    joined,
     legend,
     number,
     page,
     section,
     show,
     table,
-    text,
 )
 from neurolens.evaluate.records import CLOSE_UM, Results, pareto_front, to_use, use_command
 
@@ -109,21 +113,21 @@ def write_report(run_dir: str | Path, results: Results) -> Path:
         section("What was run", _what_was_run(results)),
     ]
     path = folder / "report.html"
-    atomic_write_text(path, page(title, "".join(body)))
+    atomic_write_text(path, page(title, joined("{}", body)))
     return path
 
 
-def _header(results: Results, title: str) -> str:
+def _header(results: Results, title: str) -> Markup:
     wall = None if results.wall_s is None else f"{results.wall_s:.0f} s in all"
-    line = " · ".join(text(part) for part in (results.command, results.started, wall) if part)
-    return f"<header><h1>{text(title)}</h1><p class='lead'>{line}</p></header>"
+    line = " · ".join(str(part) for part in (results.command, results.started, wall) if part)
+    return html("<header><h1>{}</h1><p class='lead'>{}</p></header>", title, line)
 
 
-def _use(folder: Path, results: Results) -> str:
+def _use(folder: Path, results: Results) -> Markup:
     """The model to take and the commands that take it, why, and what was asked for."""
     best, target = to_use(results.models, (results.target or {}).get("within_um", CLOSE_UM)), results.target
     if best is None or not best.get("file"):
-        return ""
+        return Markup()
     file, fused = str(folder / best["file"]), number(best, "fused_ns_per_ray.min")
     rms, plain = number(best, "rms_um"), number(best, "ns_per_ray.min")
     within = target["within_um"] if target else CLOSE_UM
@@ -135,8 +139,8 @@ def _use(folder: Path, results: Results) -> str:
     commands = [use_command(file, fused is not None)]
     if not best.get("states"):  # one of many states is no function of a ray alone
         commands.append(f"neurolens export {shlex.quote(file)} --to c -o lens.h")
-    lines = "".join(f"<pre>{text(c)}</pre>" for c in commands)
-    return f"<section class='use'><h2>Use {text(best['name'])}</h2><p>{text(', '.join(said))}.</p>{lines}</section>"
+    use = "<section class='use'><h2>Use {}</h2><p>{}.</p>{}</section>"
+    return html(use, best["name"], ", ".join(said), joined("<pre>{}</pre>", commands))
 
 
 def _names(records: Sequence[Record], last: str, first: str = "scene") -> list[str]:
@@ -144,26 +148,25 @@ def _names(records: Sequence[Record], last: str, first: str = "scene") -> list[s
     return [" · ".join(str(r[key]) for key in (first, last) if r.get(key)) for r in records]
 
 
-def _warnings(results: Results) -> str:
+def _warnings(results: Results) -> Markup:
     notes = [str(note) for note in results.warnings]
     for record in results.exact:
         if not record.get("available", True):
             notes.append(f"{record.get('name')}: unavailable ({record.get('reason') or 'no reason given'})")
-    items = "".join(f"<li>{text(note)}</li>" for note in notes)
-    return f"<section class='warn'><h2>Notes and warnings</h2><ul>{items}</ul></section>" if items else ""
+    items = joined("<li>{}</li>", notes)
+    return html("<section class='warn'><h2>Notes and warnings</h2><ul>{}</ul></section>", items) if items else Markup()
 
 
-def _what_was_run(results: Results) -> str:
+def _what_was_run(results: Results) -> Markup:
     about = {"seed": results.seed, **results.versions}
     parts = [("Lens", results.lens), ("Domain", results.domain), ("Seed and versions", about)]
     parts.append(("Image comparison", results.image_settings or {}))
-    blocks = "".join(f"<div><h3>{text(name)}</h3>{facts(values)}</div>" for name, values in parts if values)
-    settings = facts(results.settings) if results.settings else ""
-    more = f"<details><summary>Resolved settings</summary>{settings}</details>" if settings else ""
-    return f"<div class='facts'>{blocks}</div>{more}"
+    blocks = (html("<div><h3>{}</h3>{}</div>", name, facts(values)) for name, values in parts if values)
+    more = folded("Resolved settings", facts(results.settings)) if results.settings else ""
+    return html("<div class='facts'>{}</div>{}", joined("{}", blocks), more)
 
 
-def _models(models: Sequence[Record]) -> str:
+def _models(models: Sequence[Record]) -> Markup:
     """All models, by family as recorded; a star marks those on the Pareto front of error and time."""
     key = "rms_um" if any(number(m, "rms_um") is not None for m in models) else "direction_rms_deg"
     timed = [
@@ -177,23 +180,23 @@ def _models(models: Sequence[Record]) -> str:
     notes = [f"{m['name']}: {m['note']}" for m in models if m.get("note")]
     stopped = [m for m in models if m.get("stopped_down")]
     closed = table([str(m["name"]) for m in stopped], stopped, _STOPPED_COLUMNS)
-    below = f"<h3>The same fits, stopped down</h3>{closed}" if closed else ""
+    below = html("<h3>The same fits, stopped down</h3>{}", closed) if closed else Markup()
     more = table(names, models, _MORE_COLUMNS) + _states(models)
-    words = legend((*_MODEL_COLUMNS, *_MORE_COLUMNS, *_IMAGE_COLUMNS)) if models else ""
-    folded = f"<details><summary>More figures</summary>{more}{below}</details>" if more else below
-    return table(names, models, _MODEL_COLUMNS) + _notes([note, *notes] if models else []) + words + folded
+    words = legend((*_MODEL_COLUMNS, *_MORE_COLUMNS, *_IMAGE_COLUMNS)) if models else Markup()
+    rest = folded("More figures", more + below) if more else below
+    return table(names, models, _MODEL_COLUMNS) + _notes([note, *notes] if models else []) + words + rest
 
 
-def _states(models: Sequence[Record]) -> str:
+def _states(models: Sequence[Record]) -> Markup:
     """Models of many states, state by state."""
     rows = [(str(m["name"]), row) for m in models for row in m.get("states") or ()]
     if not rows:
-        return ""
+        return Markup()
     columns = (*_AXIS_COLUMNS, *_MODEL_COLUMNS, *_MORE_COLUMNS)
-    return "<h3>State by state</h3>" + table([n for n, _ in rows], [r for _, r in rows], columns)
+    return html("<h3>State by state</h3>") + table([n for n, _ in rows], [r for _, r in rows], columns)
 
 
-def _exact(records: Sequence[Record]) -> str:
+def _exact(records: Sequence[Record]) -> Markup:
     names = [
         str(r["name"]) + ("" if r.get("available", True) else f": unavailable ({r.get('reason') or DASH})")
         for r in records
@@ -201,7 +204,7 @@ def _exact(records: Sequence[Record]) -> str:
     return table(names, records, _EXACT_COLUMNS)
 
 
-def _images(folder: Path, records: Sequence[Record]) -> str:
+def _images(folder: Path, records: Sequence[Record]) -> Markup:
     """Pictures with their captions and files, then their errors beside the noise floor."""
     named = [(n or str(r.get("name", "")), r) for n, r in zip(_names(records, "camera"), records, strict=True)]
     figures = [
@@ -215,12 +218,12 @@ def _images(folder: Path, records: Sequence[Record]) -> str:
     return figure_grid(folder, figures, small=True) + figures_table + _notes([note] if measured else [])
 
 
-def _domain_gain(gain: Record) -> str:
+def _domain_gain(gain: Record) -> Markup:
     rows: Sequence[Record] = gain.get("rows", ())
     said = ": ".join(str(gain[key]) for key in ("scene", "text") if gain.get(key))
-    words = f"<p>{text(said)}</p>" if said else ""
+    words = html("<p>{}</p>", said) if said else Markup()
     return words + table(_names(rows, "name", "domain"), rows, _GAIN_COLUMNS + _MODEL_COLUMNS)
 
 
-def _notes(notes: Sequence[str]) -> str:
-    return "".join(f"<p class='note'>{text(note)}</p>" for note in notes)
+def _notes(notes: Sequence[str]) -> Markup:
+    return joined("<p class='note'>{}</p>", notes)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import tempfile
 import traceback
 import warnings
 from collections.abc import Mapping, Sequence
@@ -21,7 +20,7 @@ from typing import Any
 from neurolens import __version__
 from neurolens.analysis.layout import thumbnail
 from neurolens.base.errors import AssumedWarning, InputError, NeurolensError, NeurolensWarning, one_line
-from neurolens.base.files import fingerprint_of
+from neurolens.base.files import TemporaryFolder, fingerprint_of
 from neurolens.cameras.model import load_model
 from neurolens.evaluate.check import check_model
 from neurolens.evaluate.describe import layout_profile, lens_row
@@ -97,7 +96,7 @@ def run_task(task: Task) -> bytes:
     card that did not hold) and reaches (whether `GOALS` are).
     """
     record: dict[str, Any] = {"file": task.name, "fingerprint": task.fingerprint, "verdict": "refused", "reason": ""}
-    with tempfile.TemporaryDirectory(prefix="neurolens-") as folder, ExitStack() as stack:
+    with TemporaryFolder() as folder, ExitStack() as stack:
         stack.enter_context(warnings.catch_warnings())
         stack.enter_context(pinned_threads())
         place = Path(folder)

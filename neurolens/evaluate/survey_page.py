@@ -9,8 +9,24 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from markupsafe import Markup
+
+from neurolens.base.errors import printable
 from neurolens.base.files import atomic_path, write_json
-from neurolens.evaluate.pages import DASH, Column, facts, legend, number, page, text
+from neurolens.evaluate.pages import (
+    DASH,
+    Column,
+    drawing,
+    facts,
+    folded,
+    html,
+    joined,
+    legend,
+    number,
+    page,
+    sorting_cells,
+    sorting_heads,
+)
 from neurolens.evaluate.records import versions
 from neurolens.evaluate.survey import GOALS, VERDICTS, SurveySettings, summary_of
 
@@ -34,11 +50,11 @@ COLUMNS = (
 )  # fmt: skip
 _TEXTS = ("file", "verdict", "format", "name", "rims", "reason")
 _LISTS = ("notes", "doubts")
-TABLE_STYLE = """<style>
+TABLE_STYLE = Markup("""<style>
 .survey td.t { text-align: left; white-space: normal; min-width: 12rem; max-width: 34rem; overflow-wrap: anywhere; }
 .survey tbody th { min-width: 11rem; max-width: 16rem; white-space: normal; overflow-wrap: anywhere; }
 .survey tbody th small { color: var(--dim); display: block; }
-.survey td.p { padding: 2px; background: #fff; color: #222; } .survey td.p svg { display: block; }
+.survey td.p { padding: 2px; background: #fff; color: #222; } .survey td.p img { display: block; }
 .survey thead th { cursor: pointer; position: sticky; top: 0; background: var(--back); z-index: 2; }
 .survey thead th[aria-sort=ascending]::after { content: " ▲"; }
 .survey thead th[aria-sort=descending]::after { content: " ▼"; }
@@ -47,9 +63,9 @@ TABLE_STYLE = """<style>
 .tools { display: flex; gap: .8rem; flex-wrap: wrap; align-items: center; margin: 1rem 0; }
 .tools input[type=search] { font: inherit; padding: .3rem .5rem; min-width: 18rem; }
 body { max-width: 1800px; }
-</style>"""
+</style>""")
 # Sorts by a heading (numbers as numbers, what is missing last), and shows rows that hold all words and a chosen kind.
-TABLE_SCRIPT = """<script>
+TABLE_SCRIPT = Markup("""<script>
 (() => {
   const table = document.querySelector('.survey table'), body = table.tBodies[0], rows = [...body.rows];
   const words = document.getElementById('words'), kinds = [...document.querySelectorAll('.kind')];
@@ -81,8 +97,8 @@ TABLE_SCRIPT = """<script>
   }));
   words.addEventListener('input', filter); kinds.forEach(k => k.addEventListener('change', filter)); filter();
 })();
-</script>"""
-_ROWS = "<!--rows-->"  # where they come: no name or text holds it, as those are escaped
+</script>""")
+_ROWS = Markup("<!--rows-->")  # where they come: no name or text holds it, as those are escaped
 _KINDS = {
     **dict.fromkeys(VERDICTS, ""),
     "unfitted": "read, but without a fit",
@@ -149,28 +165,16 @@ def survey_page(
 ) -> Iterator[str]:
     """The page in parts: what was found in words, then one row a file with its section, figures and reasons."""
     columns = [c for c in COLUMNS if any(number(r, c.key) is not None for r in records)]
-    heads = "".join(
-        f"<th scope='col' data-kind='number' title='{text(c.about)}'>{text(c.heading)}</th>" for c in columns
-    )
-    head = (
-        "<th scope='col'>file</th><th scope='col'>section</th><th scope='col'>verdict</th><th scope='col'>format</th>"
-    )
-    body = f"<thead><tr>{head}{heads}<th scope='col'>what was found</th></tr></thead><tbody>{_ROWS}</tbody>"
     counts = {kind: sum(kind in _kinds(r) for r in records) for kind in _KINDS}
-    boxes = "".join(
-        f"<label title='{text(about)}'><input type='checkbox' class='kind' value='{kind}' checked> {kind} "
-        f"({counts[kind]})</label>"
-        for kind, about in _KINDS.items()
-        if counts[kind]
-    )
-    tools = f"<div class='tools'><input id='words' type='search' placeholder='words that a row holds'>{boxes}"
-    tools += "<span id='shown'></span></div>"
-    said = "".join(f"<li>{text(line)}</li>" for line in summary_lines(records, collection.others))
-    about = f"<details><summary>What was run</summary>{facts({**asdict(settings), **versions()})}</details>"
-    table = f"<div class='survey'><table>{body}</table></div>"
+    box = "<label title='{}'><input type='checkbox' class='kind' value='{}' checked> {} ({})</label>"
+    boxes = [html(box, about, kind, kind, counts[kind]) for kind, about in _KINDS.items() if counts[kind]]
+    about = folded("What was run", facts({**asdict(settings), **versions()}))
     title = f"Survey of {collection.folder.name or collection.folder}"
-    top = f"<header><h1>{text(title)}</h1></header><ul>{said}</ul>"
-    whole = page(title, f"{TABLE_STYLE}{top}{tools}{table}{legend(columns)}{about}{TABLE_SCRIPT}")
+    top = html("<header><h1>{}</h1></header><ul>{}</ul>", title,
+               joined("<li>{}</li>", summary_lines(records, collection.others)))  # fmt: skip
+    heads = joined("<th scope='col'>{}</th>", ("file", "section", "verdict", "format")) + sorting_heads(columns)
+    table = sorting_table(heads + html("<th scope='col'>what was found</th>"), _ROWS, joined("{}", boxes))
+    whole = page(title, top + table + legend(columns) + about + TABLE_SCRIPT)
     before, _, after = whole.partition(_ROWS)
     yield before
     for r in records:
@@ -178,23 +182,31 @@ def survey_page(
     yield after
 
 
-def _row(record: Mapping[str, Any], picture: str, columns: Sequence[Column]) -> str:
-    cells = "".join(
-        f"<td data-v='{'' if (v := number(record, c.key)) is None else v}'>{c.cell(record)}</td>" for c in columns
+def sorting_table(heads: str, rows: str, boxes: str) -> Markup:
+    """A table that searches and sorts by itself where `TABLE_SCRIPT` follows it; `boxes` choose kinds of its rows."""
+    tools = html(
+        "<div class='tools'><input id='words' type='search' placeholder='words that a row holds'>{}"
+        "<span id='shown'></span></div>",
+        boxes,
     )
-    named = f"{text(record['file'])}<small>{text(record.get('name', ''))}</small>"
+    body = html("<thead><tr>{}</tr></thead><tbody>{}</tbody>", heads, rows)
+    return TABLE_STYLE + tools + html("<div class='survey'><table>{}</table></div>", body)
+
+
+def _row(record: Mapping[str, Any], picture: str, columns: Sequence[Column]) -> str:
     said = [record["reason"], *record.get("doubts", ()), *record.get("notes", ())]
     said += [f"promise not held: {b}" for b in (record.get("fit") or {}).get("broken", ())]
-    listed = "<br>".join(text(line) for line in dict.fromkeys(said) if line)
-    return (
-        f"<tr class='{text(record['verdict'])}' data-kinds='{' '.join(_kinds(record))}'><th scope='row'>{named}</th>"
-        f"<td class='p' data-v=''>{picture}</td><td class='v'>{text(record['verdict'])}</td>"
-        f"<td>{text(record.get('format', ''))}</td>{cells}<td class='t'>{listed}</td></tr>"
+    listed = joined("{}", filter(None, dict.fromkeys(said)), "<br>")
+    return html(
+        "<tr class='{}' data-kinds='{}'><th scope='row'>{}<small>{}</small></th>{}<td class='v'>{}</td><td>{}</td>{}"
+        "<td class='t'>{}</td></tr>",
+        *(record["verdict"], " ".join(_kinds(record)), record["file"], record.get("name", ""), drawing(picture)),
+        *(record["verdict"], record.get("format", ""), sorting_cells(record, columns), listed),
     )
 
 
 def _csv(records: Sequence[Mapping[str, Any]]) -> str:
-    """Texts, then the figures by their keys, then lists, their items parted by " | "."""
+    """Texts, then the figures by their keys, then lists, their items parted by " | ", a row for each record."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     fits = sorted({key for r in records for key, v in (r.get("fit") or {}).items() if not isinstance(v, list | dict)})
@@ -204,5 +216,17 @@ def _csv(records: Sequence[Mapping[str, Any]]) -> str:
         fit = r.get("fit") or {}
         lists = [*(r.get(key) or () for key in _LISTS), fit.get("broken", ())]
         figures = [*(r.get(key) for key in plain), *(fit.get(key) for key in fits)]
-        writer.writerow([*(r.get(key, "") for key in _TEXTS), *figures, *(" | ".join(items) for items in lists)])
+        row = [*(r.get(key, "") for key in _TEXTS), *figures, *(" | ".join(items) for items in lists)]
+        writer.writerow([_plain_cell(value) for value in row])
     return stream.getvalue()
+
+
+def _plain_cell(value: Any) -> Any:
+    """A cell whose text is one line and no formula of a spreadsheet: names and reasons are of strangers' files.
+
+    Source: OWASP, CSV Injection.
+    """
+    if not isinstance(value, str):
+        return value
+    text = printable(value.translate(dict.fromkeys(map(ord, "\t\r\n"), " ")))
+    return f"'{text}" if text.lstrip().startswith(("=", "+", "-", "@")) else text

@@ -5,21 +5,19 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
-import re
 import select
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from hashlib import sha256
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
 from neurolens.base.engine import Failed, on_dask
 from neurolens.base.errors import InputError, one_line
-from neurolens.base.files import atomic_path, read_bytes
+from neurolens.base.files import atomic_path, read_bytes, safe_name
 from neurolens.base.progress import Progress
 from neurolens.base.signals import end_at_once, held
 from neurolens.evaluate.survey import SurveySettings, Task, known_record, run_task, unread_record
@@ -108,8 +106,7 @@ def _task(
 
 
 def _record_file(out: Path, name: str) -> Path:
-    readable = re.sub(r"[^A-Za-z0-9._-]+", "_", name)[-60:].lstrip(".")
-    return out / "records" / f"{readable}-{sha256(name.encode(errors='surrogateescape')).hexdigest()[:16]}.json"
+    return out / "records" / f"{safe_name(name)}.json"
 
 
 def _kept(out: Path, task: Task) -> dict[str, Any] | None:

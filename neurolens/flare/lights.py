@@ -23,6 +23,7 @@ from neurolens.optics.sag import sag_mm
 
 _PLASTIC = 1.32471795724474602596  # of the R2 sequence (Roberts 2018): x^3 = x + 1
 
+MOST_LIGHTS = 10_000  # of a list, and of --most
 # Columns of a list of lights: what is left out, and least and most.
 _COLUMNS: dict[str, tuple[float, float, float]] = {
     "frame": (0.0, -1e7, 1e7),
@@ -97,14 +98,19 @@ def read_lights(path: Path) -> list[Track]:
     a light), frame (rows of one light are its keys, frames increasing), r, g, b (irradiance, 1), distance_m (inf).
 
     Raises:
-        InputError: names file, row and column, for an unknown or missing one, or a value that is none.
+        InputError: names file, row and column, for an unknown or missing one, or a value that is none; no light, or
+            more than `MOST_LIGHTS`.
     """
     rows, found = read_rows(path, "a list of lights"), dict[str, list[list[float]]]()
+    if not rows:
+        raise InputError(path, "lights", "(none)", "at least one light")
     for number, row in enumerate(rows):
         place = f"row {number + 1}, "
         reject_unknown(path, place, row, ["light", *_COLUMNS])
         frame, *values, distance = (_value(path, place, name, row.get(name)) for name in _COLUMNS)
         keys = found.setdefault(str(row.get("light") or f"light {number + 1}"), [])
+        if len(found) > MOST_LIGHTS:
+            raise InputError(path, "lights", f"(more than {MOST_LIGHTS})", f"at most {MOST_LIGHTS} lights in a list")
         if keys and not frame > keys[-1][0]:
             raise InputError(path, f"{place}frame", frame, f"a frame after {keys[-1][0]:g}, the light's key before")
         keys.append([frame, *values, 1 / distance])

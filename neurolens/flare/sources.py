@@ -31,7 +31,7 @@ _SMALL = math.radians(1.0)  # about its middle, seen from the lens: one light
 _CELL = 1 / 48  # of the picture's width: larger highlights are several lights
 WHOLE = -1
 _FADES = 1.25
-_MOST_PIXELS = 1 << 22  # above the threshold
+_MOST_PIXELS, _AT_ONCE = 1 << 22, 1 << 18  # above the threshold; of these together, each of some 500 bytes
 _DIMMEST = 0.02  # relative illumination that a highlight's radiance is told from
 
 
@@ -205,31 +205,35 @@ def highlights(
     row, column = np.nonzero(bright)
     if not row.size:
         return Kept([], 0, 0.0)
-    region = _regions(bright, max(1, round(_CELL * width)))[row, column]
-    energy, towards = _pixels(picture[row, column], row, column, field, film_mm, (height, width))
-    energy *= np.minimum(value[row, column] / threshold - 1, 1)[:, None]
+    region = _regions(bright, max(1, round(_CELL * width)))
     count = int(region.max()) + 1
-    colour = np.stack([np.bincount(region, c, count) for c in energy.T], 1)
-    total = energy.sum(1)
-    middle = np.stack([np.bincount(region, total * c, count) for c in towards]).astype(np.float64)
-    lights = [_light(middle[:, k], colour[k]) for k in range(count) if colour[k].any()]
-    return keep([light for light in lights if light], most, fade)
+    colour, middle = np.zeros((count, 3)), np.zeros((3, count))
+    for start in range(0, row.size, _AT_ONCE):
+        r, c, of = (a[start : start + _AT_ONCE] for a in (row, column, region))
+        energy, towards = _pixels(picture[r, c], r, c, field, film_mm, (height, width))
+        energy *= np.minimum(value[r, c] / threshold - 1, 1)[:, None]
+        colour += np.stack([np.bincount(of, e, count) for e in energy.T], 1)
+        middle += np.stack([np.bincount(of, energy.sum(1) * t, count) for t in towards])
+    each = colour.sum(1)
+    seen = np.flatnonzero((each > 0) & (middle[2] < -1e-6 * np.linalg.norm(middle, axis=0)))
+    first = seen[np.argsort(-each[seen], kind="stable")][: most + 1]  # one more tells how they fade
+    kept = keep([light for k in first if (light := _light(middle[:, k], colour[k]))], most, fade).lights
+    left = 1 - sum(map(_energy, kept)) / float(each[seen].sum()) if len(seen) > most else 0.0
+    return Kept(kept, len(seen), left)
 
 
 def _regions(bright: NDArray[np.bool_], cell: int) -> NDArray[np.intp]:
-    """Numbers from 0 of connected regions, [H, W]; one larger than two cells has a number for each cell of it."""
+    """Numbers from 0 of connected regions [N], of the bright pixels row by row; one larger than two cells has a number
+    for each cell of it. Time and memory grow with the pixels alone, not with the regions."""
     label, _ = ndimage.label(bright, np.ones((3, 3)))
-    part = np.zeros(label.shape, np.int64)
-    for number, box in enumerate(ndimage.find_objects(label), 1):
-        size = [s.stop - s.start for s in box]
-        if max(size) > 2 * cell:
-            row, column = (np.arange(n) // cell for n in size)
-            inside = label[box] == number
-            part[box][inside] = (row[:, None] * (column[-1] + 1) + column)[inside]
-    _, numbers = np.unique(np.stack([label[bright], part[bright]]), axis=1, return_inverse=True)
-    found = np.full(label.shape, -1, np.intp)
-    found[bright] = numbers.reshape(-1)
-    return found
+    number = label[bright] - 1
+    boxes = np.array([[(s.start, s.stop) for s in box] for box in ndimage.find_objects(label)]).reshape(-1, 2, 2)
+    large = np.ptp(boxes, axis=2).max(1) > 2 * cell
+    # The cell of each pixel, counted from its region's corner; a row has fewer cells than the picture has columns.
+    row, column = (place - boxes[number, axis, 0] for axis, place in enumerate(np.nonzero(bright)))
+    part = np.where(large[number], row // cell * label.shape[1] + column // cell, 0)
+    _, numbers = np.unique(number * np.int64(bright.size) + part, return_inverse=True)
+    return np.asarray(numbers.reshape(-1), np.intp)
 
 
 def _pixels(

@@ -7,7 +7,6 @@ project; field numbers below are its.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, ModelError
 from neurolens.base.files import read_bytes
-from neurolens.base.tomlfile import check_tree
+from neurolens.base.tomlfile import parse_json
 from neurolens.modelfile import CARD_KEY, CARD_KIND, CARD_SCHEMA, MAX_CARD
 from neurolens.modelfile.protobuf import Fields, as_text, fields_of, integers, message, one, text, walk
 from neurolens.modelfile.shapes import BROADCAST, ELEMENTWISE, RAYS, SHAPED, Node, Shape, check_shapes
@@ -81,8 +80,7 @@ def card_in(file: Any, metadata: dict[str, str], expected: str = CARD_KIND) -> d
     if len(metadata[CARD_KEY]) > MAX_CARD:
         raise ModelError(f"{file}: card: {len(metadata[CARD_KEY])} characters, expected at most {MAX_CARD}")
     try:
-        card = json.loads(metadata[CARD_KEY], parse_constant=_refuse_constant)
-        check_tree(card, "card")
+        card = parse_json(metadata[CARD_KEY], "card")
     except (ValueError, RecursionError) as error:
         raise ModelError(f"{file}: the card is not strict JSON ({error})") from error
     kind = card.get("kind") if isinstance(card, dict) else None
@@ -112,10 +110,6 @@ def constants_and_nodes(data: bytes) -> tuple[dict[str, NDArray[Any]], list[Node
     for tensor in (fields_of(t, _FLOATS["tensor"]) for t in graph.get(5, [])):
         constants[text(tensor, 8)] = _values(tensor).reshape(integers(tensor.get(1, [])))
     return constants, [_node(fields_of(node)) for node in graph.get(1, [])]
-
-
-def _refuse_constant(name: str) -> Any:
-    raise ValueError(f"{name} is no number of JSON")
 
 
 def _check_graph(graph: Fields, opsets: list[str], functions: bool) -> None:

@@ -96,7 +96,7 @@ def sound_wavelength(
     """
     if not isinstance(wavelength_nm, Tensor):
         return wavelength_nm, None
-    sound = wavelength_nm > 0
+    sound = (wavelength_nm > 0) & (wavelength_nm < math.inf)
     return torch.where(sound, wavelength_nm, LINE_D_NM).to(dtype), sound if lens.dispersive else None
 
 

@@ -6,6 +6,7 @@ status and stays finite.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any, Literal, NamedTuple
@@ -16,6 +17,7 @@ from torch.autograd import forward_ad
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
+from neurolens.base.files import own_folder
 from neurolens.optics import glass
 from neurolens.optics.passing import (
     Mode,
@@ -174,8 +176,11 @@ def compile_tracing(run: Callable[..., Any], fullgraph: bool = False) -> Callabl
     """`torch.compile` of a function that traces, for chunks of one length.
 
     What it may take for constant is marked here only: that imports the compiler, which takes longer than a camera
-    needs to start.
+    needs to start. Torch keeps the machine code that it makes, and runs what it finds: by default in a folder that
+    every user of the machine can create, so that its cache is moved into the user's own.
     """
+    if "TORCHINDUCTOR_CACHE_DIR" not in os.environ:
+        os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(own_folder("torch"))
     torch.compiler.assume_constant_result(start_of)
     return torch.compile(run, dynamic=False, fullgraph=fullgraph)
 

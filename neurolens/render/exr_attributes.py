@@ -15,7 +15,9 @@ import numpy as np
 
 from neurolens import __version__
 
+_LEAST_ASPECT = 1e-5  # of a pixel: the library refuses some less
 _SQUARE = 1e-6  # relative, of pixels
+_TEXTS = ("camera", "lensMake", "lensModel", "lensSerial", "lensFirmware")  # what the names of texts begin with
 _STATE = {
     "nominalFocalLength": "nominal_focal_length_mm",
     "effectiveFocalLength": "effective_focal_length_mm",
@@ -35,16 +37,29 @@ def standard_attributes(
         settings: of the camera, as `Camera.settings` has them.
         width, height: of the picture, in pixels; None where pixels are no part of the film, as in maps.
         frame: number of the picture in a sequence.
+
+    Raises:
+        KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError: settings of no camera.
     """
     found: dict[str, Any] = {
         "cameraMake": "neurolens",
         "cameraModel": settings.get("camera"),
         "cameraFirmwareVersion": __version__,
-        "imageCounter": frame,
+        "imageCounter": None if frame is None else int(np.int32(frame)),
         **_lens(settings),
         **({} if width is None or height is None else _film(settings, width, height)),
     }
-    return {name: value for name, value in found.items() if value is not None and not _empty(value)}
+    typed = {name: _typed(name, value) for name, value in found.items() if value is not None}
+    return {name: value for name, value in typed.items() if not _empty(value)}
+
+
+def _typed(name: str, value: Any) -> Any:
+    """A header value of the type of its attribute."""
+    if name.startswith(_TEXTS):
+        if not isinstance(value, str):
+            raise TypeError(f"{name}: {value!r} is no text")
+        return value
+    return float(value) if name in ("focus", *_STATE) else value
 
 
 def _lens(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -63,10 +78,13 @@ def _lens(settings: Mapping[str, Any]) -> dict[str, Any]:
 def _film(settings: Mapping[str, Any], width: int, height: int) -> dict[str, Any]:
     if "film_mm" not in settings:
         return {}
-    size = np.array(settings["film_mm"], np.float32)
+    with np.errstate(over="raise"):
+        size = np.array(settings["film_mm"], np.float32)
     across, down = float(size[0]) / width, float(size[1]) / height
     squeeze = (settings.get("lens_state") or {}).get("squeeze") or 1.0
     aspect = across / down
+    if not (across > 0 and down > 0 and _LEAST_ASPECT < abs(squeeze * aspect) < 1 / _LEAST_ASPECT):
+        raise ValueError(f"a film of {settings['film_mm']} mm, squeezed {squeeze}")
     return {
         "sensorOverallDimensions": size,
         "sensorCenterOffset": np.zeros(2, np.float32),

@@ -1,14 +1,13 @@
 """Reads triangle meshes: OBJ and PLY files, or tables of the scene itself; nothing is merged or repaired.
 
-Files are checked so that no vertex and no face is lost silently; PLY is then read by trimesh, which ignores what it
-does not understand. Texture coordinates and normals of an OBJ file count where every face has them. Of the MTL files
+Files are checked so that no vertex and no face is lost silently. Texture coordinates and normals of an OBJ file with
+materials count face by face, of one that has a material of the scene where every face has them. Of the MTL files
 that it names, diffuse colours and pictures are read (Kd, map_Kd) and nothing else; a material of the scene with the
 name that `usemtl` says comes before theirs.
 """
 
 from __future__ import annotations
 
-import io
 import math
 import os
 import re
@@ -17,17 +16,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import read_bytes
+from neurolens.render.plyfile import read_polygons
 from neurolens.render.scenetables import FARTHEST_M, Material, MeshSettings, Texture, Vector
 
 LARGEST_FILE = 500_000_000  # bytes
-_LARGEST_HEADER = 100_000
 _LONGEST = 60  # characters of a number or a corner
 _INDEX = r"-?[1-9][0-9]{0,9}"
 _CORNER = re.compile(rf"{_INDEX}(?:/(?:{_INDEX})?(?:/{_INDEX})?)?")
@@ -54,10 +53,11 @@ class TriangleSet:
 
 
 class Used(NamedTuple):
-    """Materials of an OBJ file: the MTL files that it names, and the material's name of each triangle."""
+    """Materials of an OBJ file: the MTL files that it names, and the material and the object of each triangle."""
 
     libraries: list[str]
     names: list[str]
+    objects: list[str]
 
 
 def read_mesh(scene: Path, field: str, settings: MeshSettings, part: TriangleSet | None = None) -> TriangleSet:
@@ -145,7 +145,13 @@ def read_file(scene: Path, field: str, path: Path) -> TriangleSet:
 
     Errors as of `read_mesh`.
     """
-    return _read(scene, field, path)[0]
+    mesh = _read(scene, field, path)[0]
+    return replace(mesh, uv=_whole(mesh.uv), normals=_whole(mesh.normals))
+
+
+def _whole(values: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+    """Values of vertices, None where some have none (NaN)."""
+    return None if values is None or np.isnan(values).any() else values
 
 
 def _read(scene: Path, field: str, path: Path) -> tuple[TriangleSet, Used]:
@@ -154,22 +160,26 @@ def _read(scene: Path, field: str, path: Path) -> tuple[TriangleSet, Used]:
         if kind not in (".obj", ".ply"):
             raise InputError(scene, field, str(path), "a mesh file that ends in .obj or .ply")
         content = read_bytes(path, LARGEST_FILE, "a mesh file", (scene, field))
-        return (_read_obj if kind == ".obj" else _read_ply)(scene, field, path, content)
-    except (InputError, MemoryError):
-        raise
-    except Exception as error:  # trimesh raises exceptions of many types
-        raise InputError(scene, field, str(path), f"a mesh file that trimesh can read ({error})") from None
+        if kind == ".obj":
+            return _read_obj(scene, field, path, content)
+        found = read_polygons(content)
+        return TriangleSet(found.vertices, found.faces, found.uv, found.normals), Used([], [], [])
+    except ValueError as error:
+        raise InputError(scene, field, str(path), f"a whole PLY file ({error})") from None
 
 
 def _read_obj(scene: Path, field: str, path: Path, content: bytes) -> tuple[TriangleSet, Used]:
-    """The triangles of an OBJ file. A vertex of the mesh is a corner as its faces write it; polygons become fans."""
+    """The triangles of an OBJ file. A vertex of the mesh is a corner as its faces write it; polygons become fans.
+
+    Texture coordinates and normals are NaN at corners that have none.
+    """
     if b"\0" in content:
         raise InputError(scene, field, str(path), "a text file, without zero bytes")
     # Only comments and names can hold more than ASCII, in any encoding. A line may go on after a backslash.
     text = content.decode("utf-8-sig", "replace").replace("\\\r\n", " ").replace("\\\n", " ")
     values: dict[str, list[list[float]]] = {"v": [], "vt": [], "vn": []}
     corners: dict[tuple[int, ...], int] = {}
-    faces, name, materials = [], "", Used([], [])
+    faces, name, thing, materials = [], "", "", Used([], [], [])
     for number, line in enumerate(text.splitlines(), 1):
         bare = line.partition("#")[0].strip()
         kind, *words = bare.split() or [""]
@@ -177,6 +187,8 @@ def _read_obj(scene: Path, field: str, path: Path, content: bytes) -> tuple[Tria
             materials.libraries.append(bare[len(kind) :].strip())  # names may hold blanks
         elif kind == "usemtl":
             name = bare[len(kind) :].strip()
+        elif kind == "o":
+            thing = bare[len(kind) :].strip()
         if kind not in ("f", *_OBJ_LINES):
             continue
         place = f"{field} {path.name}, line {number}"
@@ -186,6 +198,7 @@ def _read_obj(scene: Path, field: str, path: Path, content: bytes) -> tuple[Tria
             first, *rest = (corners.setdefault(c, len(corners)) for c in _corners(scene, place, words, values))
             faces += [(first, *edge) for edge in pairwise(rest)]
             materials.names.extend([name] * (len(rest) - 1))
+            materials.objects.extend([thing] * (len(rest) - 1))
             continue
         least, most, used, form = _OBJ_LINES[kind]
         if not least <= len(words) <= most or not all(map(_is_number, words)):
@@ -193,7 +206,9 @@ def _read_obj(scene: Path, field: str, path: Path, content: bytes) -> tuple[Tria
         values[kind].append([float(word) for word in words[:used]])
     rows = np.array(list(corners), np.intp).reshape(-1, 3).T
     vertices, uv, normals = (
-        None if (row < 0).any() else np.array(values[kind], np.float64).reshape(-1, 2 if kind == "vt" else 3)[row]
+        None
+        if row.size and (row < 0).all()
+        else np.array([*values[kind], [math.nan] * _OBJ_LINES[kind][2]], np.float64)[row]
         for kind, row in zip(values, rows, strict=True)
     )
     assert vertices is not None  # every corner has one
@@ -226,31 +241,6 @@ def _corners(scene: Path, field: str, words: list[str], values: dict[str, list[l
                     raise InputError(scene, field, word, f"{kind} from 1 to {count}, the lines before")
         corners.append(tuple(corner))
     return corners
-
-
-def _read_ply(scene: Path, field: str, path: Path, content: bytes) -> tuple[TriangleSet, Used]:
-    """The triangles of a PLY file, no fewer than the faces of its header, which are no more than the file can hold."""
-    from trimesh.exchange.ply import load_ply
-
-    head, end, _ = content[:_LARGEST_HEADER].partition(b"end_header")
-    if not head.startswith(b"ply") or not end:
-        raise InputError(scene, field, str(path), "a PLY file, which begins with ply and a header")
-    promised = {name: int(count) for name, count in re.findall(rb"^element (\w+) (\d+)\s*$", head, re.MULTILINE)}
-    for name, count in promised.items():
-        if count > len(content):
-            found = f"({count} elements {name.decode()} in {len(content)} bytes)"
-            raise InputError(scene, f"{field} {path.name}, header", found, "no more elements than bytes")
-    loaded: dict[str, Any] = load_ply(io.BytesIO(content), skip_materials=True)
-    vertices = np.asarray(loaded.get("vertices", ()), np.float64).reshape(-1, 3)
-    faces = np.asarray(loaded.get("faces", ()), np.int64)
-    if faces.ndim == 2 and faces.shape[1] > 3:
-        faces = np.stack([faces[:, [0, k, k + 1]] for k in range(1, faces.shape[1] - 1)], axis=1)
-    faces = faces.reshape(-1, 3)
-    if len(faces) < (least := promised.get(b"face", 0)):
-        raise InputError(scene, field, str(path), f"{least} triangles, as the file says, not {len(faces)}")
-    uv, normals = getattr(loaded.get("visual"), "uv", None), loaded.get("vertex_normals")
-    extra = [None if x is None or len(x) != len(vertices) else np.asarray(x, np.float64) for x in (uv, normals)]
-    return TriangleSet(vertices, faces, *extra), Used([], [])
 
 
 def encloses(mesh: TriangleSet, point: NDArray[np.float64]) -> bool:
@@ -305,35 +295,47 @@ class Parts:
         whole, used = _read(scene, f"{place}.file", scene.parent / mesh.file)
         libraries = list(dict.fromkeys(used.libraries))
         found = _library(scene, mesh.file, libraries)
+        # Faces of a material that have texture coordinates or normals are apart from those that have none.
+        has_uv, has_normals = (
+            np.zeros(len(whole.faces), np.bool_) if v is None else np.isfinite(v[whole.faces[:, 0]]).all(1)
+            for v in (whole.uv, whole.normals)
+        )
         numbers = {name: k for k, name in enumerate(dict.fromkeys(used.names))}
-        number = np.array([numbers[name] for name in used.names], np.int64)
-        for name, k in numbers.items():
-            material = name if name in known else f"{mesh.file.stem}:{name}"
+        number = np.array([4 * numbers[name] for name in used.names], np.int64) + 2 * ~has_uv + ~has_normals
+        names = list(numbers)
+        for form in np.unique(number):
+            name, chosen = names[form // 4], number == form
+            material = name
             if name not in known:
                 if name not in found:
                     expected = f"a material of the scene or of {', '.join(libraries) or 'an MTL file'}"
                     raise InputError(scene, f"{place}.file, usemtl", name or "(none before a face)", expected)
-                self._define(material, found[name], whole.uv is not None, scene.parent / mesh.file)
+                objects = dict.fromkeys(used.objects[k] for k in np.flatnonzero(chosen))
+                which = f"{scene.parent / mesh.file}, {', '.join(filter(None, objects)) or name}"
+                material = self._defined(f"{mesh.file.stem}:{name}", found[name], not form & 2, which)
             part = replace(mesh, material=material)
             self.meshes.append(part)
-            self.triangles.append(read_mesh(scene, place, part, _part(whole, number == k)))
+            self.triangles.append(read_mesh(scene, place, part, _part(whole, chosen)))
 
-    def _define(self, name: str, given: tuple[Vector, Path | None], coordinates: bool, file: Path) -> None:
+    def _defined(self, name: str, given: tuple[Vector, Path | None], coordinates: bool, which: str) -> str:
+        """The name of a material of an MTL file, for faces with texture coordinates or without, once it is defined."""
         colour, picture = given
-        if picture is not None and not coordinates:
-            told = f"{file}: it has no texture coordinates: {picture.name} is left out"
+        if picture is not None and coordinates:
+            self.textures[name] = Texture("image", file=picture)
+            self.materials[name] = Material("diffuse", texture=name)
+            return name
+        if picture is not None:
+            told = f"{which[:300]}: no texture coordinates: {picture.name} is left out there"
             warnings.warn(told, NeurolensWarning, stacklevel=2)
-        if picture is None or not coordinates:
-            self.materials[name] = Material("diffuse", reflectance=colour)
-            return
-        self.textures[name] = Texture("image", file=picture)
-        self.materials[name] = Material("diffuse", texture=name)
+            name += " without coordinates" if name in self.materials else ""
+        self.materials[name] = Material("diffuse", reflectance=colour)
+        return name
 
 
 def _part(mesh: TriangleSet, chosen: NDArray[np.bool_]) -> TriangleSet:
     """Some triangles of a mesh, with the vertices that they need."""
     rows, faces = np.unique(mesh.faces[chosen], return_inverse=True)
-    uv, normals = (None if values is None else values[rows] for values in (mesh.uv, mesh.normals))
+    uv, normals = (None if values is None else _whole(values[rows]) for values in (mesh.uv, mesh.normals))
     return TriangleSet(mesh.vertices[rows], faces.reshape(-1, 3).astype(np.int64), uv, normals)
 
 

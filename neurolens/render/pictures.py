@@ -12,7 +12,7 @@ import math
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stdout, suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from PIL import Image, UnidentifiedImageError
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, open_regular, read_bytes
+from neurolens.base.tomlfile import parse_json
 from neurolens.cameras.contract import FloatArray
 from neurolens.optics.apertures import MAX_MASK, THRESHOLD, Aperture
 from neurolens.render.colour import SRGB, ColourSpace, conversion, converted, linear_to_srgb, srgb_to_linear
@@ -187,13 +188,11 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
     return _metadata(path, text)
 
 
-def _metadata(path: str | Path, text: str) -> dict[str, Any]:
-    try:
-        told = json.loads(text)
-        if isinstance(told, dict):
+def _metadata(path: str | Path, text: Any) -> dict[str, Any]:
+    """The settings in our attribute, whose type in a stranger's file may be any that OpenEXR has."""
+    with suppress(ValueError, RecursionError, InputError):
+        if isinstance(text, str) and isinstance(told := parse_json(text, path), dict):
             return told
-    except (ValueError, RecursionError):
-        pass
     raise InputError(path, METADATA_KEY, text, "JSON text, an object")
 
 
@@ -214,7 +213,7 @@ def _read_channels(
     place: tuple[str | Path, str] | None = None,
     most: int = LARGEST_FILM,
     wanted: Sequence[str] = (),
-) -> tuple[dict[str, FloatArray], str]:
+) -> tuple[dict[str, FloatArray], Any]:
     """Channels as float32, and the text of our metadata.
 
     The values of all that are read are bounded together.

@@ -7,7 +7,6 @@ not go together.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +27,7 @@ _EXPECTED = 'a tile of "neurolens render --tile"'
 # What a merged picture's statistics add up; the rest follows from these, or is the same in all tiles.
 _COLOURS = ("R", "G", "B")
 _BYTES_A_PIXEL = 50  # seven channels, those of the tile that is read, and what the writer packs
+_MOST = 1e15  # of each of these
 _SUMMED = ("seconds", "paths", "dropped_samples", "thread_seconds", "camera_thread_seconds")
 
 
@@ -69,8 +69,8 @@ class Tile:
     @property
     def frame(self) -> int | None:
         """Number of its picture in a sequence."""
-        frame = self.told["tile"]["frame"]
-        return None if frame is None else int(frame)
+        frame: int | None = self.told["tile"]["frame"]
+        return frame
 
     def settings(self) -> dict[str, Any]:
         """What tiles of one picture have in common."""
@@ -97,17 +97,17 @@ def read_tile(path: Path) -> Tile:
     told = read_metadata(path)
     try:
         facts, render = told["tile"], told["render"]
-        number, count = (int(facts[name]) for name in ("number", "of"))
-        if not 1 <= number <= count <= int(render["height"]) or int(render["width"]) < 1:
+        numbers = number, count, width, height = facts["number"], facts["of"], render["width"], render["height"]
+        if any(type(n) is not int for n in numbers) or not 1 <= number <= count <= height or width < 1:
             raise ValueError(f"tile {number} of {count}")
-        tile = Tile(path, number, count, rows_of(int(render["height"]), (number, count)), told)
-        if tile.settings()["colour"]["space"] not in COLOUR_SPACES or not isinstance(told["camera"], dict):
+        tile = Tile(path, number, count, rows_of(height, (number, count)), told)
+        if tile.settings()["colour"]["space"] not in COLOUR_SPACES:
             raise ValueError("other metadata")
-        if not math.isfinite(sum(float(render[name]) for name in (*_SUMMED, "passed_fraction"))):
+        if not all(0 <= render[name] <= _MOST for name in (*_SUMMED, "passed_fraction")):
             raise ValueError("other statistics")
         complete, done = bool(render["complete"]), float(render["samples_done"])
-        int(facts["frame"] or 0)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        _attributes(told, tile.frame)  # can be written
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         why = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise InputError(path, "metadata", f"({why})", _EXPECTED) from None
     if not complete:
@@ -177,6 +177,9 @@ def _statistics(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def write_merged(path: Path, channels: Mapping[str, NDArray[Any]], told: Mapping[str, Any], frame: int | None) -> None:
     """Write a merged picture as one run writes it; OSError, InputError as `pictures.write_exr`."""
+    write_stored(path, channels, COLOUR_SPACES[told["colour"]["space"]], told, _attributes(told, frame))
+
+
+def _attributes(told: Mapping[str, Any], frame: int | None) -> dict[str, Any]:
     render = told["render"]
-    attributes = standard_attributes(told["camera"], render["width"], render["height"], frame)
-    write_stored(path, channels, COLOUR_SPACES[told["colour"]["space"]], told, attributes)
+    return standard_attributes(told["camera"], render["width"], render["height"], frame)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup, escape
 
 from neurolens import __version__
 from neurolens.analysis.layout import Layout, element_outline
@@ -139,7 +139,7 @@ def _page(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> str:
     data = json.dumps(shared, allow_nan=False, separators=(",", ":")).encode()
     elements.insert(0, _packed("data", packed(data), len(data)))
     parts = {
-        "TITLE": html.escape(lenses[0].name if len(lenses) == 1 else "neurolens: lenses and their models"),
+        "TITLE": escape(lenses[0].name if len(lenses) == 1 else "neurolens: lenses and their models"),
         "STYLE": _text("style.css"),
         "DATA": "\n".join(elements),
         "SCRIPT": "\n".join(_text(name) for name in SCRIPTS),
@@ -148,8 +148,12 @@ def _page(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> str:
 
 
 def _packed(key: str, text: str, size: int) -> str:
-    length = f' data-bytes="{size}"' if size else ""
-    return f'<script type="text/plain" id="{html.escape(key)}"{length}>{text}</script>'
+    length = Markup(' data-bytes="{}"').format(size) if size else ""
+    return Markup('<script type="text/plain" id="{}"{}>{}</script>').format(
+        key,
+        length,
+        Markup(text),  # noqa: S704 (of `packed.CHARACTERS`, which end nothing)
+    )
 
 
 def _entry(lens: ViewLens, kinds: Sequence[str]) -> dict[str, Any]:

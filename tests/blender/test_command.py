@@ -111,7 +111,7 @@ def test_bad_input_is_one_line(
     (place / "a.zip").write_text("no zip")
     with monkeypatch.context() as early:
         early.setattr(blender_lenses, "form_of", lambda *given, **options: pytest.fail("no shader is to be made"))
-        for to, expected in (("a.zip", "a zip that `neurolens blender build` wrote"), ("a.txt", "or a folder")):
+        for to, expected in (("a.zip", "a zip of `neurolens blender build`"), ("a.txt", "or a folder")):
             assert expected in failed(capsys, "add", models / f"{LENS}.ols-36.onnx", "--to", place / to)
     assert "format" in failed(capsys, "add", place / "a.txt", "--to", place / "user")
     assert not out.exists() and not (place / "user").exists()

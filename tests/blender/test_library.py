@@ -2,33 +2,29 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
+import os
 import sys
 import zipfile
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
 
 from neurolens.base.errors import InputError
-from neurolens.blender import pack
-from neurolens.blender.pack import Form, PackedLens, add_to_folder, add_to_zip, user_folders, write_pack, year_of
+from neurolens.blender.pack import (
+    Form,
+    PackedLens,
+    add_to_folder,
+    add_to_zip,
+    extension_library,
+    user_folders,
+    write_pack,
+    year_of,
+)
 
-
-def _library() -> ModuleType:
-    """The module by itself: its package starts with Blender."""
-    spec = importlib.util.spec_from_file_location("neurolens_library", pack.EXTENSION / "library.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
-
-
-library = _library()
+library = extension_library()
 
 
 def lens(lens_id: str = "gauss", kinds: tuple[str, ...] = ("polynomial",), efl_mm: float = 49.6) -> PackedLens:
@@ -96,16 +92,87 @@ def test_files_outside_the_folder_are_not_read(tmp_path: Path) -> None:
     assert not found and "leads out" in wrong[0]
 
 
-@pytest.mark.parametrize("content", [b"", b"PK", None])
-def test_no_extension_takes_no_lens(content: bytes | None, tmp_path: Path) -> None:
+def entry(**changed: Any) -> str:
+    """Facts of one lens, some of its values changed."""
+    facts = lens().facts() | changed
+    return json.dumps({"schema": 1, "lenses": [facts]})
+
+
+BAD_ZIPS: dict[str, Any] = {
+    "empty": b"",
+    "damaged at the start": b"PK",
+    "no facts": {"other.txt": "x"},
+    "facts nested too deeply": {"lenses.json": "[" * 100_000},
+    "kind that is no text": {"lenses.json": entry(variants=[{"kind": {}}])},
+    "variants that are no list": {"lenses.json": entry(variants=5)},
+    "variants of texts": {"lenses.json": entry(variants=["kind"])},
+    "a number that is none": {"lenses.json": entry(efl_mm=math.nan)},
+    "an infinite number": {"lenses.json": entry(efl_mm=math.inf)},
+    "a year beyond every number": {"lenses.json": entry(year="9" * 5000)},
+    "a lens's file outside": {"lenses.json": entry(picture="../secret.png")},
+    "an entry outside": {"lenses.json": entry(), "../escaped.osl": "x"},
+    "an absolute entry": {"lenses.json": entry(), "/tmp/escaped.osl": "x"},
+    "an entry outside on Windows": {"lenses.json": entry(), "..\\escaped.osl": "x"},
+}
+
+
+@pytest.mark.parametrize("content", BAD_ZIPS.values(), ids=BAD_ZIPS)
+def test_no_extension_takes_no_lens(content: bytes | dict[str, str], tmp_path: Path) -> None:
     path = tmp_path / "n.zip"
-    if content is None:
-        with zipfile.ZipFile(path, "w") as packed:
-            packed.writestr("other.txt", "x")
-    else:
+    if isinstance(content, bytes):
         path.write_bytes(content)
+    else:
+        with zipfile.ZipFile(path, "w") as packed:
+            for name, text in content.items():
+                packed.writestr(name, text)
+    before = path.read_bytes()
     with pytest.raises(InputError, match="neurolens blender build"):
         add_to_zip(path, lens())
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("at", ["flags", "method", "data", "size"])
+def test_zips_that_are_encrypted_packed_otherwise_damaged_or_lie_take_no_lens(at: str, tmp_path: Path) -> None:
+    path = tmp_path / "n.zip"
+    write_pack(path, [lens()])
+    data = bytearray(path.read_bytes())
+    local, listed = data.index(b"PK\3\4"), data.index(b"PK\1\2")  # headers of the first entry
+    if at == "flags":
+        data[local + 6] |= 1
+        data[listed + 8] |= 1
+    elif at == "method":
+        data[local + 8] = data[listed + 10] = 99
+    elif at == "data":
+        data[local + 60 : local + 80] = b"\xff" * 20
+    else:
+        data[listed + 24 : listed + 28] = (4_000_000_000).to_bytes(4, "little")
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="neurolens blender build"):
+        add_to_zip(path, lens())
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no FIFOs")
+def test_fifos_are_refused_and_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "f.zip")
+    with pytest.raises(InputError, match="not a regular file"):
+        add_to_zip(tmp_path / "f.zip", lens())
+    os.mkfifo(tmp_path / "lenses.json")
+    with pytest.raises(InputError, match="not a regular file"):
+        add_to_folder(tmp_path, lens())
+
+
+@pytest.mark.parametrize("method", ["../../../escaped/evil", "/etc/evil", "a" * 300, "..\\evil", "x\0y", "\udc80"])
+def test_no_text_of_a_card_leads_out_of_the_folder(method: str, tmp_path: Path) -> None:
+    """The card's fit.method was a part of the shader's path: it wrote outside, or no file could have its name."""
+    hostile = PackedLens("gauss", "Gauss", 50.0, 1.8, "", None, [Form("polynomial", method, "x", 1.0, 21.6, 1.8, 0.7)])
+    folder, out = tmp_path / "a" / "b" / "c", tmp_path / "n.zip"
+    add_to_folder(folder, hostile)
+    write_pack(out, [hostile])
+    found, wrong = library.read_library([folder])
+    assert not wrong and found["gauss"].variants["polynomial"].path.read_text() == "x"
+    assert {p.relative_to(tmp_path).parts[0] for p in tmp_path.rglob("*")} == {"a", "n.zip"}
+    [name] = [n for n in zipfile.ZipFile(out).namelist() if n.endswith(".osl")]
+    assert ".." not in name.split("/") and len(name) < 120 and name.isascii()
 
 
 def test_refusals_and_notes_are_sentences() -> None:

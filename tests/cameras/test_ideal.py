@@ -221,7 +221,9 @@ PLACES = {
 
 
 def sample(camera: Fisheye, film: np.ndarray):  # noqa: ANN201
-    return camera.sample(film.astype(np.float32), np.zeros((2, film.shape[1]), np.float32), np.zeros(film.shape[1]))
+    return camera.sample(
+        film.astype(np.float32), np.zeros((2, film.shape[1]), np.float32), np.full(film.shape[1], 550.0)
+    )
 
 
 @pytest.mark.parametrize("name", PROJECTIONS)
@@ -245,7 +247,7 @@ def test_weight_is_that_of_etendue(name: str) -> None:
     radius, azimuth = edge * rng.random(400), 2 * math.pi * rng.random(400)
     film = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth)]).astype(np.float32)
     rays = sample(camera, film)
-    slopes = differences(camera, film, 0 * film, film[0], 0.02)[3:]
+    slopes = differences(camera, film, 0 * film, np.full(400, 550.0), 0.02)[3:]
     solid = FOCAL**2 * np.linalg.norm(np.cross(slopes[:, 0].T, slopes[:, 1].T), axis=1)
     foreshortening = -rays.direction[2] if name == "orthographic" else 1
     assert rays.weight == pytest.approx(foreshortening * solid, abs=2e-3)

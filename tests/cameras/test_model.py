@@ -134,7 +134,7 @@ DAMAGE: dict[str, tuple[Callable[[ModelProto], object], str]] = {
             "value",
             p.metadata_props[0].value.replace('"wavelength_nm": [400.0', '"wavelength_nm": [1e400'),
         ),
-        "domain.wavelength_nm",
+        "1e400 is no finite number",
     ),
     "film planes reversed": (change_card(lambda c: c["domain"]["film_z_mm"].reverse()), "domain.film_z_mm"),
     "focus of text": (change_card(lambda c: c["domain"].update(focus_m=["far", 1.0])), "domain.focus_m"),

@@ -154,3 +154,24 @@ def test_points_from_which_no_light_arrives(kind: str, model: OnnxCamera) -> Non
 def test_a_model_without_inverse_says_so() -> None:
     with pytest.raises(InputError, match="--inverse"):
         camera("network").to_film(*(np.zeros((n, 1), np.float32) for n in (3, 2)), np.full(1, 550, np.float32))
+
+
+@pytest.mark.parametrize("kind", [*IDEAL, "exact", "model"])
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_what_is_no_wavelength_has_one_answer(kind: str, model: OnnxCamera) -> None:
+    """Outside the domain of every camera, dark and finite, both ways; thin lenses took it for light, exact ones for
+    total reflection or for light."""
+    lens = model if kind == "model" else camera(kind)
+    film, square, wavelength = film_rays(lens, 12)
+    film = 0.3 * film
+    wavelength[:6] = [np.nan, np.inf, -np.inf, 0.0, -0.0, -550.0]
+    rays = lens.sample(film, square, wavelength)
+    assert (rays.status[6:] == st.PASSED).any()
+    back = lens.to_film(points_on(lens.sample(film, square, np.full_like(wavelength, 550.0))), square, wavelength)
+    for found in (rays, back):
+        assert (found.status[:6] == st.OUTSIDE_DOMAIN).all() and (found.weight[:6] == 0).all()
+        assert np.isfinite(found.direction).all() and np.isfinite(found.origin_m).all()
+    assert np.isfinite(back.film_mm).all() and (back.status[6:] == st.PASSED).any()
+    if kind != "model":  # this one is exported without derivatives
+        moved = lens.sample_differentials(film, square, wavelength)
+        assert (moved.status == rays.status).all() and np.isfinite(moved.differentials.direction).all()

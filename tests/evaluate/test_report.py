@@ -1,9 +1,11 @@
 """Records of a run, read back as written, and the report: complete, offline, and safe against hostile names."""
 
+import ast
 import itertools
 import json
 import math
 import random
+import re
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,8 @@ import numpy as np
 import pytest
 
 from neurolens.base.errors import InputError
+from neurolens.cli import main
+from neurolens.commands import library
 from neurolens.evaluate import records
 from neurolens.evaluate.pages import local_url
 from neurolens.evaluate.records import Results, break_even_rays, pareto_front
@@ -196,3 +200,54 @@ def test_a_name_with_a_colon_is_a_file_not_a_scheme(tmp_path: Path) -> None:
     assert local_url(tmp_path, "javascript:x") == "./javascript%3Ax"
     with pytest.raises(InputError, match="run folder"):
         write_report(tmp_path / "absent", Results())
+
+
+class Index(Page):
+    """A page that sorts by itself: one script, its own."""
+
+    def handle_data(self, data: str) -> None:
+        if "script" not in self.open:
+            super().handle_data(data)
+
+
+def test_no_text_of_a_lens_runs_or_links_in_the_pages_of_a_library(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The reason of a refused file ran as a script, a name with a colon was a scheme, one page overwrote another."""
+    drawing = f"<svg xmlns='http://www.w3.org/2000/svg' onload='alert(1)'>{HOSTILE}</svg>"
+    monkeypatch.setattr(
+        library,
+        "_page",
+        lambda lens, file, folder: {
+            "name": HOSTILE, "designer": HOSTILE, "doubts": [HOSTILE], "layout": drawing, "efl_mm": HOSTILE
+        },
+    )  # fmt: skip
+    files = []
+    for name in ("a/x", "b/x", "javascript:alert(1)", "index.html", "X", "<img src=y onerror=alert(2)>"):
+        files.append(tmp_path / f"{name}.toml")
+        files[-1].parent.mkdir(exist_ok=True)
+        files[-1].write_bytes(Path("lenses/cooke_triplet_50.toml").read_bytes())
+    bad = tmp_path / "bad.toml"
+    bad.write_text('schema = 1\n"<img src=x onerror=alert(3)>" = 1\n')
+    out = tmp_path / "new" / "pages"
+    assert main(["library", "-o", str(out), *map(str, [*files, bad]), "--quiet"]) == 1
+    page = Index((out / "index.html").read_text(encoding="utf-8"))
+    assert page.tags.count("script") == 1 and HOSTILE in page.text and "onerror=alert(3)" in page.text
+    assert [link.rpartition("/")[2] for link in page.links] == ["index.html"] * 6
+    assert len(set(page.links)) == 6 and all(re.fullmatch(r"\./[\w.-]+/index\.html", link) for link in page.links)
+    assert all((out / link).parent.joinpath("record.json").is_file() for link in page.links)
+    assert all(source.startswith("data:image/svg+xml,%3Csvg") for source in page.sources)
+    assert main(["library", "-o", str(tmp_path / "refused"), str(bad), "--quiet"]) == 1
+    said = capsys.readouterr().out
+    assert said.count("bad.toml") == 2 and "onerror=alert(3)" in (tmp_path / "refused/index.html").read_text()
+
+
+def test_markup_is_made_by_templates_that_escape() -> None:
+    """Not by f-strings or sums of texts, in which one forgotten call lets a script in."""
+    tag = re.compile(r"</?(a|b|p|t[dhr]|br|h\d|li|pre|img|div|span|script|small|label|d[dlt]|ul|section)[ >]")
+    for file in Path("neurolens").rglob("*.py"):
+        text = file.read_text(encoding="utf-8")
+        for node in ast.walk(ast.parse(text)) if "Markup" in text or "pages" in text else ():
+            if isinstance(node, ast.JoinedStr):
+                parts = [v.value for v in node.values if isinstance(v, ast.Constant)]
+                assert not any(tag.search(str(part)) for part in parts), f"{file}:{node.lineno}"

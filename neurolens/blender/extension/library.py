@@ -16,6 +16,7 @@ KINDS = {"polynomial": "Polynomial", "network": "Network", "exact": "Exact"}
 OLDEST = (4, 5, 0)  # the first Blender whose Cycles runs cameras written in OSL
 BEYOND = 1.02  # a film of 36 x 24 mm over an image circle of 43.2 mm is as lenses are engraved
 NOMINAL = 1.02  # and so is f/1.8 for f/1.83
+DAMAGED = (ValueError, KeyError, TypeError, AttributeError, OverflowError)  # what reading strangers' facts raises
 _HEADROOM = 1.001  # of a near limit, for rounding
 
 
@@ -111,16 +112,17 @@ def read_library(folders: Sequence[Path]) -> tuple[dict[str, LensFacts], list[st
             if data["schema"] != SCHEMA:
                 raise ValueError(f"its schema is {data['schema']}, this extension reads {SCHEMA}")
             for entry in data["lenses"]:
-                lens = _lens(folder, entry)
+                lens = lens_of(folder, entry)
                 kept = found[lens.lens_id].variants if lens.lens_id in found else {}
                 lens.variants.update({k: v for k, v in kept.items() if k not in lens.variants})
                 found[lens.lens_id] = lens
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        except (OSError, RecursionError, *DAMAGED) as error:
             wrong.append(f"{file} cannot be read: {type(error).__name__}: {error}")
     return dict(sorted(found.items(), key=lambda item: (item[1].efl_mm, item[0]))), wrong
 
 
-def _lens(folder: Path, entry: dict[str, Any]) -> LensFacts:
+def lens_of(folder: Path, entry: dict[str, Any]) -> LensFacts:
+    """A lens from its entry in the facts of a folder; exceptions of `DAMAGED` where it is none."""
     variants = {}
     for v in entry["variants"]:
         if v["kind"] not in KINDS:
