@@ -14,16 +14,20 @@ from neurolens.analysis import plot_style
 from neurolens.analysis.field_curves import distortion, illumination
 from neurolens.analysis.fields import Scene
 from neurolens.cli import main
-from neurolens.optics.lensfile import read_lens
 from neurolens.optics.lenswriter import write_lens
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.readers.any_format import read_any
 
 FUJINON = Path(__file__).parents[1] / "data" / "fujinon_35.toml"
+CASE = Path(__file__).parents[3] / "shared" / "data" / "cases" / "04_field_cut_xf35.zmx"
 
 
-def test_a_lens_of_steep_aspheres_reaches_the_edge_of_its_film() -> None:
+@pytest.mark.parametrize("file", [FUJINON, CASE])
+def test_a_lens_of_steep_aspheres_reaches_the_edge_of_its_film(file: Path) -> None:
     """Case 04: r^20 aspheres. ray-optics 0.9.8 has 20 degrees at 12.1875 mm and 22 degrees at 13.3284 mm."""
-    given = Scene(read_lens(FUJINON))
+    if not file.exists():
+        pytest.skip(f"{file} is not here")
+    given = Scene(read_any(file))
     assert given.chief_rays([20.0, 22.0]).height_mm.tolist() == pytest.approx([12.1875, 13.3284], abs=6e-5)
     edge = given.edge
     assert edge.reached and edge.warning is None and edge.name == "the edge of the film, 14.2 mm"
