@@ -22,6 +22,7 @@ _SCOUTS = 48  # cells a side of the grid that looks for ghosts
 _FEW = 4  # of the scouts, one in so many a side, tell how far apart colours are
 _NEAR = 2.0  # r^2 / R^2 to which rays beyond rims tell it, too
 _EVEN = 0.02  # least unevenness, and spread of colours over the size, of a ghost
+_STEP = 0.25  # of a cell: how far the shadow of a rim may move on the film between two wavelengths
 _AT_ONCE = 128  # ghosts
 _ERROR, _WORST = 3.0, 0.25  # light beside its place, times the cells that half the film is wide; at most
 
@@ -79,20 +80,26 @@ def grids_of(
     """
     whole = Grid((-1.0, -1.0), (1.0, 1.0), _SCOUTS, _SCOUTS)
     start = tracer.start(rays_across(tracer.lens, light, whole.places)[0])
-    few = np.ascontiguousarray(start.reshape(len(start), _SCOUTS + 1, -1)[:, ::_FEW, ::_FEW].reshape(len(start), -1))
+    few = np.arange((_SCOUTS + 1) ** 2).reshape(_SCOUTS + 1, -1)[::_FEW, ::_FEW].ravel()
     found: list[tuple[Way, NDArray[np.bool_], _Look]] = []
     for k in range(0, len(tracer.pairs), _AT_ONCE):
         some = tracer.pairs[k : k + _AT_ONCE]
         rays = tracer.follow(start, wavelength_nm, only=some, reach=REACH)
-        ends = [tracer.follow(few, nm, only=some, reach=REACH).rows for nm in range_nm]
-        looks = zip(some, _kept(rays, half_mm), rays.rows, _spread(ends, half_mm), strict=True)
+        ends = [tracer.follow(start, nm, only=some, reach=REACH).rows for nm in range_nm]
+        apart = _spread([rows[..., few] for rows in ends], half_mm)
+        looks = zip(some, _kept(rays, half_mm), rays.rows, apart, _swept(ends, half_mm), strict=True)
         found += [
-            (pair, kept, _look(kept, of_one, spread, half_mm)) for pair, kept, of_one, spread in looks if kept.any()
+            (pair, kept, _look(kept, of_one, spread, half_mm)._replace(swept_mm=swept))
+            for pair, kept, of_one, spread, swept in looks
+            if kept.any()
         ]
     work = np.array([((look.along_u + look.along_v) * look.colours * look.size_mm) ** (1 / 3) for *_, look in found])
     most = min(_ERROR * cell_mm / half_mm[0], _WORST)
     error = work * (most / max(float(work.sum()), 1e-300)) + 1e-30
-    return {pair: _around(kept, look, each) for (pair, kept, look), each in zip(found, error.tolist(), strict=True)}
+    return {
+        pair: _around(kept, look, each, math.ceil(look.swept_mm / (_STEP * cell_mm)))
+        for (pair, kept, look), each in zip(found, error.tolist(), strict=True)
+    }
 
 
 class _Look(NamedTuple):
@@ -102,6 +109,7 @@ class _Look(NamedTuple):
         along_u, along_v: light that cells of one density put beside its place, times the cells of a side.
         colours: the same of wavelengths, times their number. size_mm: of what is on the film.
         lit: share of the rectangle that holds its light.
+        swept_mm: about how far the shadow of a rim moves on the film from one end of the spectrum to the other.
     """
 
     along_u: float
@@ -109,6 +117,7 @@ class _Look(NamedTuple):
     colours: float
     size_mm: float
     lit: float
+    swept_mm: float = 0.0
 
 
 def _look(kept: NDArray[np.bool_], rows: Floats, spread: float, half_mm: tuple[float, float]) -> _Look:
@@ -148,6 +157,20 @@ def _spread(ends: Sequence[Floats], half_mm: tuple[float, float]) -> list[float]
     return np.where(here.any(1), np.sqrt(off / np.maximum(here.sum(1), 1)), np.inf).tolist()
 
 
+def _swept(ends: Sequence[Floats], half_mm: tuple[float, float]) -> list[float]:
+    """Of ghosts at two wavelengths, [P, 4, N] each, about how far in mm the shadows of rims move on the film.
+
+    It is the share of a ghost's rays on the film that pass at only one of the wavelengths, times the ghost's width:
+    a rim may cut a ghost at another place in each colour even where the rays themselves do not move.
+    """
+    half = np.array(half_mm, np.float32)[:, None]
+    passed = [(rows[:, 3] <= 1) & (np.abs(rows[:, :2]) < half).all(1) for rows in ends]
+    share = (passed[0] ^ passed[1]).sum(1) / np.maximum((passed[0] | passed[1]).sum(1), 1)
+    inside = [np.where(lit[:, None], rows[:, :2], np.nan) for lit, rows in zip(passed, ends, strict=True)]
+    low, high = (of(np.concatenate(inside, 2), 2) for of in (np.fmin.reduce, np.fmax.reduce))
+    return (share * np.nan_to_num((high - low).max(1))).tolist()
+
+
 def _kept(rays: GhostRays, half_mm: tuple[float, float]) -> NDArray[np.bool_]:
     """[P, S, S] whether light of a cell may reach the film.
 
@@ -168,12 +191,13 @@ def _corners(a: NDArray[Any], of: Callable[[Any, Any], Any]) -> NDArray[Any]:
     return of(rows[..., :-1], rows[..., 1:])
 
 
-def _around(kept: NDArray[np.bool_], look: _Look, error: float) -> Grid:
-    """About the cells that are kept [S, S], so fine that so much light is beside its place each way."""
+def _around(kept: NDArray[np.bool_], look: _Look, error: float, least: int) -> Grid:
+    """About the cells that are kept [S, S], so fine that so much light is beside its place each way; `least` bounds the
+    number of wavelengths from below."""
     low, high, fewest = [], [], math.sqrt(FEWEST / look.lit)
     for axis in (0, 1):
         at = np.flatnonzero(kept.any(axis))
         low.append(2 * int(at[0]) / _SCOUTS - 1)
         high.append(2 * (int(at[-1]) + 1) / _SCOUTS - 1)
     columns, rows = (int(min(max(math.ceil(a / error), fewest), MOST)) for a in (look.along_u, look.along_v))
-    return Grid((low[0], low[1]), (high[0], high[1]), columns, rows, max(1, math.ceil(look.colours / error)))
+    return Grid((low[0], low[1]), (high[0], high[1]), columns, rows, max(1, least, math.ceil(look.colours / error)))
