@@ -26,7 +26,7 @@ _SAME_LINE_NM = 0.1
 _MOULDED = re.compile("([ _-]?MOLD(ED)?|M)$", re.IGNORECASE)
 _MOULDING = 0.01  # by how much moulding lowers an index at the most
 # Discontinued glasses of Schott, of which no dispersion formula is at hand: n_d (Elphel's optical-design-viewer), V_d.
-_DISCONTINUED: dict[str, tuple[float, float | None]] = {"LASF14A": (1.82223, None), "SF58": (1.917613, 21.51)}
+_DISCONTINUED: dict[str, tuple[float, float | None]] = {"LASF14A": (1.82223, None), "SF58": (1.917613, 21.5)}
 SAME_INDEX, SAME_ABBE = 2e-5, 0.005  # tolerance of printed figures against those of a catalogue glass
 
 
