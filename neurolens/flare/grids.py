@@ -19,10 +19,11 @@ from neurolens.flare.steps import LOST
 FEWEST, MOST = 320, 512  # lit cells, and cells along a side
 REACH = 16.0  # of `GhostTracer.trace`: rims are cut between rays inside and outside
 _SCOUTS = 48  # cells a side of the grid that looks for ghosts
-_FEW = 4  # of the scouts, one in so many a side, tell how far apart colours are
+_FEW = 2  # of the scouts, one in so many a side, are traced at both ends of the spectrum
 _NEAR = 2.0  # r^2 / R^2 to which rays beyond rims tell it, too
 _EVEN = 0.02  # least unevenness, and spread of colours over the size, of a ghost
 _STEP = 0.25  # of a cell: how far the shadow of a rim may move on the film between two wavelengths
+_BAND = 0.02  # of the irradiance that wide ghosts leave on the film: a step of colour that may remain in one ghost
 _AT_ONCE = 128  # ghosts
 _ERROR, _WORST = 3.0, 0.25  # light beside its place, times the cells that half the film is wide; at most
 
@@ -80,14 +81,13 @@ def grids_of(
     """
     whole = Grid((-1.0, -1.0), (1.0, 1.0), _SCOUTS, _SCOUTS)
     start = tracer.start(rays_across(tracer.lens, light, whole.places)[0])
-    few = np.arange((_SCOUTS + 1) ** 2).reshape(_SCOUTS + 1, -1)[::_FEW, ::_FEW].ravel()
+    few = np.ascontiguousarray(start.reshape(len(start), _SCOUTS + 1, -1)[:, ::_FEW, ::_FEW].reshape(len(start), -1))
     found: list[tuple[Way, NDArray[np.bool_], _Look]] = []
     for k in range(0, len(tracer.pairs), _AT_ONCE):
         some = tracer.pairs[k : k + _AT_ONCE]
         rays = tracer.follow(start, wavelength_nm, only=some, reach=REACH)
-        ends = [tracer.follow(start, nm, only=some, reach=REACH).rows for nm in range_nm]
-        apart = _spread([rows[..., few] for rows in ends], half_mm)
-        looks = zip(some, _kept(rays, half_mm), rays.rows, apart, _swept(ends, half_mm), strict=True)
+        ends = [tracer.follow(few, nm, only=some, reach=REACH).rows for nm in range_nm]
+        looks = zip(some, _kept(rays, half_mm), rays.rows, _spread(ends, half_mm), _swept(ends, half_mm), strict=True)
         found += [
             (pair, kept, _look(kept, of_one, spread, half_mm)._replace(swept_mm=swept))
             for pair, kept, of_one, spread, swept in looks
@@ -96,10 +96,15 @@ def grids_of(
     work = np.array([((look.along_u + look.along_v) * look.colours * look.size_mm) ** (1 / 3) for *_, look in found])
     most = min(_ERROR * cell_mm / half_mm[0], _WORST)
     error = work * (most / max(float(work.sum()), 1e-300)) + 1e-30
+    film = 4 * half_mm[0] * half_mm[1]
+    band = _BAND * sum(k.light / k.size_mm**2 * min(k.size_mm**2 / film, 1.0) ** 2 for *_, k in found)
     return {
-        pair: _around(kept, look, each, math.ceil(look.swept_mm / (_STEP * cell_mm)))
+        pair: _around(
+            kept, look, each,
+            math.ceil(min(look.swept_mm / (_STEP * cell_mm), look.light / max(look.size_mm**2 * band, 1e-300))),
+        )
         for (pair, kept, look), each in zip(found, error.tolist(), strict=True)
-    }
+    }  # fmt: skip
 
 
 class _Look(NamedTuple):
@@ -108,7 +113,7 @@ class _Look(NamedTuple):
     Attributes:
         along_u, along_v: light that cells of one density put beside its place, times the cells of a side.
         colours: the same of wavelengths, times their number. size_mm: of what is on the film.
-        lit: share of the rectangle that holds its light.
+        lit: share of the rectangle that holds its light. light: of it on the film.
         swept_mm: about how far the shadow of a rim moves on the film from one end of the spectrum to the other.
     """
 
@@ -117,6 +122,7 @@ class _Look(NamedTuple):
     colours: float
     size_mm: float
     lit: float
+    light: float
     swept_mm: float = 0.0
 
 
@@ -142,7 +148,7 @@ def _look(kept: NDArray[np.bool_], rows: Floats, spread: float, half_mm: tuple[f
     share = (lit.sum() + 0.5) / ((box[0] + 1) * (box[1] + 1))
     size, whole_light = max(float(np.ptp(places, 1).max()), 1e-3 * half_mm[0]), float(light.sum())
     along_u, along_v = (max(v, _EVEN * whole_light) for v in off)
-    return _Look(along_u, along_v, whole_light * min(max(spread / size, _EVEN), 1.0), size, share)
+    return _Look(along_u, along_v, whole_light * min(max(spread / size, _EVEN), 1.0), size, share, whole_light)
 
 
 def _pairs(a: NDArray[Any], axis: int, of: Callable[[Any, Any], Any]) -> NDArray[Any]:
