@@ -181,7 +181,7 @@ def judged(own: Row, theirs: Row, mended: Row | None) -> Row:
     """The differences of a file, and their cause: "" where there is none above the limit, None for an unknown one.
 
     Args:
-        mended: the answer of ray-optics with its known faults put right, None where it was not asked for that.
+        mended: the answer of ray-optics after its known faults were put right; None where that was not tried.
     """
     read = [(answer, answer.get("mended", [])) for answer in (theirs, mended) if answer and "error" not in answer]
     if not read:

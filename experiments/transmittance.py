@@ -28,7 +28,7 @@ COATINGS = {"bare": None, "coated": "quarter-wave"}
 
 
 def difference(lens: Lens, domain: Domain, count: int) -> lab.Row:
-    """By how much the averaged transmittance differs over rays that pass: largest, where, and the median."""
+    """The difference of the averaged transmittance from the true one: largest, where, and median."""
     rays = sample_domain(domain, count, seed=3)
     start = camera_rays(rays.film_x, rays.film_y, rays.film_z, rays.pupil_x, rays.pupil_y, domain.pupil_z_mm)
     steps: Any = [(k, "T") for k in reversed(range(len(lens.surfaces)))]
