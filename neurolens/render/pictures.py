@@ -11,6 +11,7 @@ import json
 import math
 import os
 import sys
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from pathlib import Path
@@ -21,12 +22,20 @@ import OpenEXR
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, UnidentifiedImageError
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import atomic_path, open_regular, read_bytes
 from neurolens.base.tomlfile import parse_json
 from neurolens.cameras.contract import FloatArray
 from neurolens.optics.apertures import MAX_MASK, THRESHOLD, Aperture
-from neurolens.render.colour import SRGB, ColourSpace, conversion, converted, linear_to_srgb, srgb_to_linear
+from neurolens.render.colour import (
+    COLOUR_SPACES,
+    SRGB,
+    ColourSpace,
+    conversion,
+    converted,
+    linear_to_srgb,
+    srgb_to_linear,
+)
 from neurolens.render.scenetables import BRIGHTEST
 
 METADATA_KEY = "neurolens"
@@ -37,6 +46,7 @@ LARGEST_PICTURE, LARGEST_ENVIRONMENT, LARGEST_FILM = 8192, 4096, 1 << 16  # pixe
 MOST_PIXELS = 1 << 26  # of all textures of a scene: 0.8 GB
 _MOST_VALUES, _LARGEST_FILE = 1 << 28, 1 << 28  # of an OpenEXR file; bytes of any other
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "TGA", "WEBP")  # of Pillow's, which would ask other programs for some
+_ROUNDED = 2e-4  # how far the chromaticities of one space may lie apart in files
 _TYPES = (np.uint32, np.float16, np.float32)  # by the numbers of pixel types in OpenEXR files
 _DEPTH = "Z"  # the name of depth in other programs
 
@@ -181,11 +191,35 @@ def read_channels(path: str | Path, wanted: Sequence[str] = ()) -> tuple[dict[st
 
 def read_metadata(path: str | Path) -> dict[str, Any]:
     """The metadata of a picture alone, {} without ours; raises InputError as `read_channels`."""
+    return _metadata(path, _header(path).get(METADATA_KEY, "{}"))
+
+
+def read_colour_space(path: str | Path) -> ColourSpace | None:
+    """The colour space whose chromaticities a picture states; None where it states none.
+
+    Warns:
+        NeurolensWarning: chromaticities of another space, in whose place sRGB is assumed.
+
+    Raises:
+        InputError: as `read_channels`.
+    """
+    stated = _header(path).get("chromaticities")
+    if not isinstance(stated, tuple) or len(stated) != len(SRGB.chromaticities):
+        return None
+    for space in COLOUR_SPACES.values():
+        if np.allclose(stated, space.chromaticities, rtol=0, atol=_ROUNDED):
+            return space
+    names = " nor ".join(COLOUR_SPACES)
+    text = f"{path}: its chromaticities are those of neither {names}; its colours are read as sRGB"
+    warnings.warn(text, NeurolensWarning, stacklevel=2)
+    return SRGB
+
+
+def _header(path: str | Path) -> dict[str, Any]:
     with _whole(path, "file", "(missing)", named=False), _silent():
         open_regular(path).close()
         with OpenEXR.File(str(path), header_only=True) as header:
-            text = header.parts[0].header.get(METADATA_KEY, "{}")
-    return _metadata(path, text)
+            return dict(header.parts[0].header)
 
 
 def _metadata(path: str | Path, text: Any) -> dict[str, Any]:
