@@ -24,7 +24,7 @@ from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_path, atomic_write_text, write_json
 from neurolens.base.progress import Progress, Report
-from neurolens.commands.arguments import QUIET_HELP, whole
+from neurolens.commands.arguments import QUIET_HELP, add_output, whole
 from neurolens.evaluate.pages import markdown_table
 
 ROOT = Path(__file__).parents[1]
@@ -50,12 +50,12 @@ def count(name: str, default: int | None, text: str, least: int = 1, most: int |
 
 
 def out(folder: Path = RESULTS, what: str = "folder for the tables") -> Option:
-    """--out, by default in runs/; --commit, for the folder that is kept in the repository; --quiet."""
+    """--output, by default in runs/; --commit, for the folder that is kept in the repository; --quiet."""
     place = ROOT / "runs" / folder.relative_to(ROOT / "experiments") if folder.is_relative_to(RESULTS) else folder
 
     def add(parser: argparse.ArgumentParser) -> None:
         shown = place.relative_to(ROOT)
-        parser.add_argument("--out", metavar="DIR", type=Path, default=place, help=f"{what} (default: {shown})")
+        add_output(parser, "DIR", f"{what} (default: {shown})", default=place)
         if place != folder:
             text = f"the folder is {folder.relative_to(ROOT)}, which the README shows"
             parser.add_argument("--commit", dest="out", action="store_const", const=folder, help=text)

@@ -109,7 +109,7 @@ def test_export_takes_lenses_of_the_project_by_name_and_refuses_bad_names_first(
         (["train", "a.toml", "--lens", GAUSS], ["both"]),
         (["train", "--lens", "no.toml"], ["no.toml"]),
         (["train", "no.toml"], ["no.toml", "missing"]),
-        (["train", "--lens", GAUSS, "--out", GAUSS], ["--out", "folder"]),
+        (["train", "--lens", GAUSS, "--out", GAUSS], ["--output", "folder"]),
     ],
 )
 def test_a_mistake_is_one_line(args: list[object], words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
@@ -137,7 +137,7 @@ def test_a_mistake_is_one_line(args: list[object], words: list[str], capsys: pyt
         (["--camera", "thin", "--focusing", "internal"], ["focus", "lens files"]),
         (["--camera", "thin", "--efl", "50", "--field", "40"], ["--field", "not allowed"]),
         (["--camera", "thin", "--width", "32", "--height", "32"], ["shape of the film"]),
-        (["--camera", "thin", "-o", "a.png"], ["--out", ".exr"]),
+        (["--camera", "thin", "-o", "a.png"], ["--output", ".exr"]),
         (["--camera", "thin", "-o", "/no/such/folder/a.exr"], ["folder"]),
         ([], ["--camera"]),
     ],

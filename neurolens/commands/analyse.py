@@ -18,6 +18,7 @@ from neurolens.commands.arguments import (
     add_json,
     add_lens,
     add_lens_state,
+    add_output,
     between,
     check_run_folder,
     focus_of,
@@ -99,7 +100,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "--axis", choices=("x", "y"), default="y", help="plane of the field, for anamorphic lenses (default: y)"
     )
-    parser.add_argument("-o", "--output", metavar="FOLDER", type=Path, help="draw a picture of each in this folder")
+    add_output(parser, "FOLDER", "draw a picture of each in this folder")
     parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png", help="of the pictures (default: png)")
     add_json(parser)
     parser.add_argument("--full", action="store_true", help="with --json: also every ray and every pixel")
@@ -114,9 +115,9 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("neurolens analyse", "WHAT", unknown[0], f"any of: {', '.join(WHATS)}")
     if args.full and not args.json:
         raise InputError("neurolens analyse", "--full", "(given)", "this option only with --json")
-    if args.output is not None:
-        check_run_folder(args.output, args.output, "--output")
-        args.output.mkdir(parents=True, exist_ok=True)
+    if args.out is not None:
+        check_run_folder(args.out, args.out, "--output")
+        args.out.mkdir(parents=True, exist_ok=True)
 
     from neurolens.analysis.layout import state_text
 
@@ -154,7 +155,7 @@ def run(args: argparse.Namespace) -> int:
         ]
         parts += [*(f"Note: {n}" for n in notes), *(f"Warning: {w}" for w in doubts)]
         if pictures:
-            parts.append(f"{len(pictures)} pictures drawn in {args.output}")
+            parts.append(f"{len(pictures)} pictures drawn in {args.out}")
         return "\n\n".join(parts)
 
     return answer(args, {**head, **shown, **more}, text)
@@ -193,10 +194,10 @@ def _one(what: str, scene: Scene, args: argparse.Namespace, doubts: list[str]) -
         doubts += [d for d in dark if d not in doubts]
     result = analysis.compute(scene, **asked)
     data = result.to_dict()
-    if args.output is None:
+    if args.out is None:
         return data, None
     across = f"_{args.axis}" if any(s.cylinder for s in scene.lens.surfaces) else ""
-    path = args.output / f"{scene.lens.lens_id}_{what}{across}.{args.format}"
+    path = args.out / f"{scene.lens.lens_id}_{what}{across}.{args.format}"
     warning = wrap(f"Warning: {scene.edge.warning}", _WRAP) if scene.edge.warning else []
     if what == "layout":
         analysis.draw(replace(result, subtitle="\n".join([result.subtitle, *warning])), path)

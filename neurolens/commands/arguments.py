@@ -78,6 +78,21 @@ def _number(kind: Callable[[str], T], good: Callable[[T], bool], expected: str) 
     return convert
 
 
+def add_option(
+    parser: argparse._ActionsContainer, *names: str, old: Sequence[str] = (), **options: Any
+) -> argparse.Action:
+    """Add an option as `add_argument` does; its `old` spellings still work, and neither help nor errors show them."""
+    action = parser.add_argument(*names, **options)
+    parser._option_string_actions.update(dict.fromkeys(old, action))
+    return action
+
+
+def add_output(parser: argparse._ActionsContainer, metavar: str, about: str, **options: Any) -> None:
+    """Add -o and --output, the file or folder that a command writes."""
+    options = {"dest": "out", "metavar": metavar, "type": Path, "help": about} | options
+    add_option(parser, "-o", "--output", old=("--out",), **options)
+
+
 QUIET_HELP = "neither progress nor warnings on stderr"
 
 # Repeated here, so that help imports no camera; a test compares with `cameras.exact` and `cameras.vignetting`.
@@ -127,8 +142,8 @@ def add_lens_state(parser: argparse.ArgumentParser, *, efl: str, f_number: str, 
         "--field", metavar="DEG", type=between(0.001, 359.0, "degrees"),
         help="scale the whole lens so that its image circle sees this full field of view, traced, in degrees",
     )  # fmt: skip
-    group.add_argument(
-        "--zoom", "--configuration", metavar="STATE", dest="zoom",
+    add_option(
+        group, "--zoom", old=("--configuration",), metavar="STATE",
         help="state of the lens file by name, or a focal length in mm between its states (derived: its table and "
         "interpolated gaps); default: the state of the table",
     )  # fmt: skip

@@ -10,7 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import NeurolensError, printable
-from neurolens.commands.arguments import QUIET_HELP, Parser, add_glass, add_lens, check_ids, check_run_folder, whole
+from neurolens.commands.arguments import (
+    QUIET_HELP,
+    Parser,
+    add_glass,
+    add_lens,
+    add_output,
+    check_ids,
+    check_run_folder,
+    whole,
+)
 from neurolens.commands.farm import Task, add_dask, files_of, spread
 
 if TYPE_CHECKING:
@@ -61,9 +70,7 @@ def add_surrogate_arguments(parser: argparse.ArgumentParser, lenses: str) -> Non
     parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=1, help="of the race (default 1)")
     parser.add_argument("--again", action="store_true", help="recompute the chosen records")
     add_dask(parser)
-    parser.add_argument(
-        "--out", metavar="DIR", type=Path, default=Path("runs/surrogates"), help="folder (default: runs/surrogates)"
-    )
+    add_output(parser, "DIR", "folder (default: runs/surrogates)", default=Path("runs/surrogates"))
     add_glass(parser)
     parser.add_argument("--quiet", action="store_true", help=QUIET_HELP)
 
@@ -80,7 +87,7 @@ def run_surrogates(args: argparse.Namespace) -> int:
     rows, settings, out = chosen_rows(args.methods), _settings(args), args.out
     files: list[Path] = args.lenses
     check_ids(files, "neurolens bench surrogates", "LENS")
-    check_run_folder(out, "neurolens bench surrogates", "--out")
+    check_run_folder(out, "neurolens bench surrogates", "--output")
     benches = [Bench(LensChoice(file), settings, out) for file in files]
     for bench in benches:
         bench.choice.read()  # a file that cannot be read ends the command, not each of its methods

@@ -12,7 +12,7 @@ from typing import Any
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import check_writable
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import Parser, add_json, add_lens, check_folder, check_suffix, whole
+from neurolens.commands.arguments import Parser, add_json, add_lens, add_output, check_folder, check_suffix, whole
 from neurolens.commands.output import answer
 
 _DESCRIPTION = """\
@@ -39,9 +39,7 @@ def add_parser(subparsers: Any) -> None:
     )
     actions = parser.add_subparsers(metavar="ACTION", required=True, parser_class=Parser)
     build = actions.add_parser("build", help="pack the extension as a zip", description=_BUILD)
-    build.add_argument(
-        "-o", "--out", metavar="OUT.zip", type=Path, default=Path("neurolens.zip"), help="default: %(default)s"
-    )
+    add_output(build, "OUT.zip", "default: neurolens.zip", default=Path("neurolens.zip"))
     build.add_argument("--models", metavar="DIR", type=Path, default=Path("models"), help="default: %(default)s")
     build.add_argument(
         "--lens", metavar="NAME", action="append", default=[],
@@ -64,8 +62,8 @@ def add_parser(subparsers: Any) -> None:
 
 def run_build(args: argparse.Namespace) -> int:
     """Pack the extension."""
-    check_suffix(args.out, "--out", (".zip",))
-    check_folder(args.out, "--out")
+    check_suffix(args.out, "--output", (".zip",))
+    check_folder(args.out, "--output")
     check_writable(args.out)
     if not args.models.is_dir():
         raise InputError("neurolens blender build", "--models", str(args.models), "a folder of models that exists")

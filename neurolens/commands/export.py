@@ -13,7 +13,7 @@ from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text, check_writable
 from neurolens.base.lensname import FUSED, is_model
-from neurolens.commands.arguments import add_json, add_lens, positive
+from neurolens.commands.arguments import add_json, add_lens, add_output, positive
 from neurolens.commands.output import answer
 from neurolens.commands.render import film_size
 
@@ -71,7 +71,7 @@ def add_parser(subparsers: Any) -> None:
         models=True, cameras=True, metavar="MODEL",
     )  # fmt: skip
     parser.add_argument("--to", choices=("c", "glsl", "osl", "onnx"), required=True, help="form to write")
-    parser.add_argument("-o", "--out", metavar="FILE", type=Path, required=True, help="file to write")
+    add_output(parser, "FILE", "file to write", required=True)
     parser.add_argument(
         "--fix", metavar="KEY=VALUE", action="append", default=[], help="a value fixed by the scene (see below)"
     )

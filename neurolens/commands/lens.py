@@ -16,6 +16,7 @@ from neurolens.base.lensname import resolve
 from neurolens.commands.arguments import (
     add_json,
     add_lens_state,
+    add_output,
     between,
     check_folder,
     check_suffix,
@@ -85,7 +86,7 @@ def _check_mode(args: argparse.Namespace, several: bool) -> None:
         "--layouts": (args.layouts is not None, several, 'with "list", a folder or several files'),
         "--vignetting": (args.vignetting is not None, args.derive_rims, "with --derive-rims"),
         "--breathing": (args.breathing is not None, alone, "with one lens file alone"),
-        "-o": (args.output is not None, args.derive_rims, "with --derive-rims"),
+        "--output": (args.out is not None, args.derive_rims, "with --derive-rims"),
         "--half-field": (args.half_field is not None, args.derive_rims, "with --derive-rims"),
         "--derive-rims": (args.derive_rims, not several, "with one lens file"),
         "--layout": (args.layout is not None, alone, "with one lens file alone"),
@@ -328,7 +329,7 @@ def _add_rims(parser: argparse.ArgumentParser) -> None:
         "--half-field", metavar="DEG", type=between(0.01, 179, "an angle in degrees"),
         help="edge of the field, in degrees from the axis (default: as the file states)",
     )  # fmt: skip
-    rims.add_argument("-o", "--output", metavar="OUT.toml", type=Path, help="write the lens with its derived rims")
+    add_output(rims, "OUT.toml", "write the lens with its derived rims")
 
 
 def _run_rims(args: argparse.Namespace) -> int:
@@ -337,14 +338,14 @@ def _run_rims(args: argparse.Namespace) -> int:
     from neurolens.optics.lenswriter import write_lens
     from neurolens.optics.rims import RimRule, derive_rims, half_field_deg
 
-    if args.output is not None:
-        check_folder(args.output, "-o")
+    if args.out is not None:
+        check_folder(args.out, "--output")
     lens = read_quietly(args.file)
     rule = RimRule(vignetting=0.5 if args.vignetting is None else args.vignetting, half_field_deg=args.half_field)
     derived, rims = derive_rims(lens, rule)
     field = args.half_field or half_field_deg(lens)
-    if args.output is not None:
-        write_lens(replace(derived, notes=_notes(derived, rule, field)), args.output)
+    if args.out is not None:
+        write_lens(replace(derived, notes=_notes(derived, rule, field)), args.out)
     data = {
         "file": str(args.file),
         "f_number": lens.f_number,
@@ -352,7 +353,7 @@ def _run_rims(args: argparse.Namespace) -> int:
         "clear_edge": rule.clear_edge,
         "half_field_deg": field,
         "rims": [vars(rim) for rim in rims],
-        "output": None if args.output is None else str(args.output),
+        "output": None if args.out is None else str(args.out),
     }
     return answer(args, data, lambda: _rims_text(lens, data, rims))
 

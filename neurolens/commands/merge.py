@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import check_writable
-from neurolens.commands.arguments import add_exposure, add_json, check_folder, check_suffix
+from neurolens.commands.arguments import add_exposure, add_json, add_output, check_folder, check_suffix
 from neurolens.commands.output import answer
 
 if TYPE_CHECKING:
@@ -34,9 +34,7 @@ def add_parser(subparsers: Any) -> None:
         "merge", help="put the tiles of a render together", description=_DESCRIPTION, epilog=_EPILOG
     )
     parser.add_argument("tiles", metavar="TILE", nargs="+", type=Path, help="tiles, in any order")
-    parser.add_argument(
-        "-o", "--out", metavar="OUT.exr", type=Path, required=True, help="picture to write; the preview is OUT.png"
-    )
+    add_output(parser, "OUT.exr", "picture to write; the preview is OUT.png", required=True)
     add_exposure(parser)
     add_json(parser)
     parser.set_defaults(run=run, kept="what was merged before is written; tiles are untouched")
@@ -44,8 +42,8 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check all tiles, then write a picture a frame."""
-    check_suffix(args.out, "--out", (".exr",))
-    check_folder(args.out, "--out")
+    check_suffix(args.out, "--output", (".exr",))
+    check_folder(args.out, "--output")
     from neurolens.render.tiles import check_together, read_tile
 
     frames: dict[int | None, list[Tile]] = {}
@@ -86,6 +84,6 @@ def write_picture(
 def _spare(out: Path, tiles: Sequence[Path]) -> None:
     """Refuse, before anything is written, to write over a tile, or where nothing can be written."""
     if out.exists() and any(out.samefile(tile) for tile in tiles):
-        raise InputError(out, "--out", out.name, "another name: it is one of the tiles")
+        raise InputError(out, "--output", out.name, "another name: it is one of the tiles")
     for path in (out, out.with_suffix(".png")):
         check_writable(path)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text, library
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, add_lens, check_run_folder
+from neurolens.commands.arguments import add_glass, add_json, add_lens, add_output, check_run_folder
 from neurolens.commands.output import answer, number, table
 from neurolens.commands.plan_frames import run_plan_frames
 from neurolens.commands.render_frames import add_frames
@@ -74,9 +74,7 @@ def add_parser(subparsers: Any) -> None:
         "and R, G and B) and its depth in m (Z), for samplers that give more samples where blur is wide",
     )  # fmt: skip
     parser.add_argument("--no-fit", dest="fit", action="store_false", help="fit nothing for the shot")
-    parser.add_argument(
-        "-o", "--output", metavar="FOLDER", type=Path, help="for the plan (default: runs/plan-SCENE-LENS)"
-    )
+    add_output(parser, "FOLDER", "for the plan (default: runs/plan-SCENE-LENS)")
     add_frames(parser, "one plan for these frames, whose models are reused: the fewest that keep the budget")
     add_glass(parser)
     add_json(parser, quiet=True)
@@ -159,8 +157,8 @@ def run(args: argparse.Namespace) -> int:
 
     lens = read_any(args.lens)
     scene = load_scene(args.scene)
-    folder = args.output or Path("runs") / f"plan-{scene.name}-{lens.lens_id}"
-    check_run_folder(folder, "neurolens plan", "-o")
+    folder = args.out or Path("runs") / f"plan-{scene.name}-{lens.lens_id}"
+    check_run_folder(folder, "neurolens plan", "--output")
     shipped = shipped_models(lens, args.zoom)
     if args.frames is not None:
         if args.zoom is not None or isinstance(args.budget, (Seconds, Flip)):

@@ -12,7 +12,7 @@ from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import CAMERAS_HELP, add_json, check_folder
+from neurolens.commands.arguments import CAMERAS_HELP, add_json, add_output, check_folder
 from neurolens.commands.output import answer, number, table
 from neurolens.commands.render_files import warn
 from neurolens.commands.stmap import LIGHT_NM, add_picture, add_state, shot_of
@@ -50,7 +50,7 @@ def add_parser(subparsers: Any) -> None:
     )  # fmt: skip
     add_picture(parser)
     parser.add_argument("--model", choices=MODELS, required=True, help="the projection")
-    parser.add_argument("-o", "--out", metavar="NAME", type=Path, help="write NAME.json and, for OpenCV's, NAME.yaml")
+    add_output(parser, "NAME", "write NAME.json and, for OpenCV's, NAME.yaml")
     add_state(parser)
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="files that were written are whole")
@@ -59,9 +59,9 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Trace, fit, write."""
     if args.out is not None:
-        check_folder(args.out, "--out")
+        check_folder(args.out, "--output")
         if not args.out.name:
-            raise InputError("neurolens projection", "--out", str(args.out), "a name")
+            raise InputError("neurolens projection", "--output", str(args.out), "a name")
         if args.out.suffix in (".json", ".yaml"):  # the name of a file that will be written
             args.out = args.out.with_suffix("")
     from neurolens.analysis.projections import fit, residual

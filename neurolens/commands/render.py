@@ -18,6 +18,7 @@ from neurolens.commands.arguments import (
     add_exposure,
     add_json,
     add_lens_state,
+    add_output,
     aperture_of,
     between,
     whole,
@@ -84,9 +85,7 @@ def add_parser(subparsers: Any) -> None:
     )  # fmt: skip
     parser.add_argument("scene", metavar="SCENE", type=Path, help="scene file (.toml)")
     add_camera(parser)
-    parser.add_argument(
-        "-o", "--out", metavar="OUT.exr", type=Path, required=True, help="picture to write; the preview is OUT.png"
-    )
+    add_output(parser, "OUT.exr", "picture to write; the preview is OUT.png", required=True)
     picture = parser.add_argument_group("picture")
     picture.add_argument("--samples", metavar="N", type=whole(1, 2**20), help="per pixel (default: the scene's)")
     picture.add_argument(

@@ -75,14 +75,14 @@ class Files:
 
     @classmethod
     def of(cls, out: Path) -> Files:
-        """The files of `--out`; refuses names that cannot be written before anything is rendered.
+        """The files of `--output`; refuses names that cannot be written before anything is rendered.
 
         Raises:
             InputError: not .exr, or no such folder.
             OSError: a folder that cannot be written, a folder of that name.
         """
-        check_suffix(out, "--out", (".exr",))
-        check_folder(out, "--out")
+        check_suffix(out, "--output", (".exr",))
+        check_folder(out, "--output")
         files = cls(out, out.with_suffix(".png"), out.with_name(f"{out.name}.part"))
         for path in (files.out, files.preview, files.checkpoint):
             check_writable(path)
@@ -93,7 +93,7 @@ class Files:
         for read in inputs:
             for written in (self.out, self.preview, self.checkpoint):
                 if written.exists() and read.exists() and written.samefile(read):
-                    raise InputError(self.out, "--out", written.name, f"another name: the scene reads {read}")
+                    raise InputError(self.out, "--output", written.name, f"another name: the scene reads {read}")
 
     def kept(self) -> str:
         """How to resume a render that ended early."""

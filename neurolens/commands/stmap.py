@@ -6,7 +6,6 @@ import argparse
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
@@ -17,6 +16,7 @@ from neurolens.commands.arguments import (
     add_json,
     add_lens,
     add_lens_state,
+    add_output,
     aperture_of,
     between,
     check_folder,
@@ -76,7 +76,7 @@ def add_parser(subparsers: Any) -> None:
         description=_DESCRIPTION, epilog=f"{CAMERAS_HELP}\n\n{_EPILOG}",
     )  # fmt: skip
     add_picture(parser)
-    parser.add_argument("-o", "--out", metavar="SHOT", type=Path, required=True, help="start of the files' names")
+    add_output(parser, "SHOT", "start of the files' names", required=True)
     parser.add_argument(
         "--projection", choices=PROJECTIONS, default=PROJECTIONS[0],
         help="of the undistorted picture (default: rectilinear, a plane: fields up to 85 degrees from the axis)",
@@ -160,9 +160,9 @@ class _Frame:
 
 def run(args: argparse.Namespace) -> int:
     """Trace the fields of all frames, then write their maps, of one size."""
-    check_folder(args.out, "--out")
+    check_folder(args.out, "--output")
     if not args.out.name:
-        raise InputError(_COMMAND, "--out", str(args.out), "the start of the files' names")
+        raise InputError(_COMMAND, "--output", str(args.out), "the start of the files' names")
     if args.frames is None and args.key:
         raise InputError(_COMMAND, "--key", args.key[0], "--frames beside it")
     from neurolens.render.stmap import plates_of

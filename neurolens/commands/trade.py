@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, add_lens, check_run_folder, whole
+from neurolens.commands.arguments import add_glass, add_json, add_lens, add_output, check_run_folder, whole
 from neurolens.commands.output import answer, number, table
 from neurolens.commands.plan import TARGETS, add_look, look_of, pixels, shipped_models
 from neurolens.evaluate.records import plain
@@ -55,7 +55,7 @@ def add_parser(subparsers: Any) -> None:
     )
     add_look(parser)
     parser.add_argument("--no-fit", dest="fit", action="store_false", help="fit nothing for the shot")
-    parser.add_argument("-o", "--output", metavar="FOLDER", type=Path, help="default: runs/trade-SCENE-LENS")
+    add_output(parser, "FOLDER", "default: runs/trade-SCENE-LENS")
     add_glass(parser)
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="models fitted so far are kept, nothing else is written")
@@ -70,8 +70,8 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.render.scene import load_scene
 
     lens, scene = read_any(args.lens), load_scene(args.scene)
-    folder = args.output or Path("runs") / f"trade-{scene.name}-{lens.lens_id}"
-    check_run_folder(folder, "neurolens trade", "-o")
+    folder = args.out or Path("runs") / f"trade-{scene.name}-{lens.lens_id}"
+    check_run_folder(folder, "neurolens trade", "--output")
     with Progress({"trade": 30}, quiet=args.quiet).stage("trade") as report:
         found = trade(
             scene, lens, args.budget, target=args.target, models=shipped_models(lens, args.zoom), report=report,

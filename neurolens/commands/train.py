@@ -14,7 +14,16 @@ from neurolens.base.errors import InputError, NeurolensError, one_line
 from neurolens.base.files import fingerprint_of, sha256_of
 from neurolens.base.lensname import lens_id_of
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, add_lens, check_ids, check_run_folder, positive, whole
+from neurolens.commands.arguments import (
+    add_glass,
+    add_json,
+    add_lens,
+    add_output,
+    check_ids,
+    check_run_folder,
+    positive,
+    whole,
+)
 from neurolens.commands.farm import Task, add_dask, files_of, spread
 from neurolens.commands.output import answer, number, table
 from neurolens.evaluate.records import CLOSE_UM, to_use, use_command
@@ -36,12 +45,12 @@ An interrupted run resumes where it stopped: existing models of the same setting
 _EPILOG = """\
 examples:
   neurolens train experiments/quickstart.toml
-  neurolens train experiments/quickstart.toml --out runs/try --set render.samples=4 --set pairs.seed=2
+  neurolens train experiments/quickstart.toml -o runs/try --set render.samples=4 --set pairs.seed=2
   neurolens train --lens lenses/cooke_triplet_50.toml
   neurolens train --lens lenses/cooke_triplet_50.toml --target-px 0.1 --no-race
-  neurolens train --lens lenses/*_50.toml --out runs/fifties --dask tcp://cluster:8786
-  neurolens train --lens lenses/nikon_zoom_70_200.toml --zoom-range --out runs/zoom
-  neurolens train --lens lenses/brendel_tessar_100.toml --out runs/tessar \\
+  neurolens train --lens lenses/*_50.toml -o runs/fifties --dask tcp://cluster:8786
+  neurolens train --lens lenses/nikon_zoom_70_200.toml --zoom-range -o runs/zoom
+  neurolens train --lens lenses/brendel_tessar_100.toml -o runs/tessar \\
       --set lens.efl_mm=50
 
 The folder holds report.html, results.json, config.toml (all settings, defaults written out),
@@ -56,10 +65,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("experiment", metavar="EXPERIMENT.toml", nargs="?", type=Path, help="experiment file")
     instead = ", instead of an experiment; of several, each has a run folder in DIR (runs)"
     add_lens(parser, "--lens", instead, nargs="+")
-    parser.add_argument(
-        "--out", metavar="DIR", type=Path,
-        help="run folder, made if needed (default: runs/NAME of the experiment or lens file)",
-    )  # fmt: skip
+    add_output(parser, "DIR", "run folder, made if needed (default: runs/NAME of the experiment or lens file)")
     parser.add_argument(
         "--set", metavar="KEY=VALUE", dest="overrides", action="append", default=[],
         help="change a setting, for example --set pairs.train=10000; values are TOML, may be repeated",
@@ -112,7 +118,7 @@ def _run_many(args: argparse.Namespace) -> int:
         raise InputError("neurolens train", "--dask", args.dask, "--lens FILE ... beside it")
     check_ids(args.lens, "neurolens train", "--lens")
     base = args.out if args.out is not None else Path("runs")
-    check_run_folder(base, "neurolens train", "--out")
+    check_run_folder(base, "neurolens train", "--output")
     progress, failed = Progress(quiet=args.quiet), dict[str, str]()
     each = [
         argparse.Namespace(**vars(args) | {"lens": f, "out": base / lens_id_of(f), "dask": None}) for f in args.lens
@@ -195,14 +201,14 @@ def _run_folder(args: argparse.Namespace) -> Path:
         found = "(neither)" if args.lens is None else "(both)"
         raise InputError("neurolens train", "EXPERIMENT.toml or --lens", found, "one of them")
     folder: Path = args.out if args.out is not None else Path("runs") / lens_id_of(args.experiment or args.lens)
-    check_run_folder(folder, "neurolens train", "--out")
+    check_run_folder(folder, "neurolens train", "--output")
     return folder
 
 
 def _command(args: argparse.Namespace) -> str:
     parts = ["neurolens", "train"]
     parts += ["--lens", str(args.lens)] if args.lens is not None else [str(args.experiment)]
-    parts += ["--out", str(args.out)] if args.out is not None else []
+    parts += ["--output", str(args.out)] if args.out is not None else []
     for override in args.overrides:
         parts += ["--set", override]
     return shlex.join(parts)
