@@ -17,6 +17,7 @@ from neurolens.commands.arguments import (
     add_json,
     add_lens,
     add_lens_state,
+    add_output,
     check_suffix,
     state_of,
 )
@@ -89,7 +90,7 @@ def add_parser(subparsers: Any) -> None:
         help="of every surface between glass and air that the lens file leaves bare: single-layer (1940s to 60s), "
         "three-layer (1970 on), multi-layer (today), quarter-wave, v-coat, broadband; of one: three-layer,s07=bare",
     )  # fmt: skip
-    parser.add_argument("-o", "--out", metavar="OUT.exr", type=Path, help="picture (default: only the table)")
+    add_output(parser, "OUT.exr", "picture to write; the preview is OUT.png (default: only the table)")
     parser.add_argument(
         "--path",
         metavar=("GHOST", "OUT"),
