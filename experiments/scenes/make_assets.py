@@ -1,5 +1,6 @@
-"""Make what the scenes in experiments/scenes load: the meshes knot.obj (a torus knot) and vase.ply (with normals and
-texture coordinates), the pictures poster.png, glaze.png (for the vase) and studio.png (lamps all around).
+"""Make what the scenes in experiments/scenes load: the meshes knot.obj (a torus knot), vase.ply (with normals and
+texture coordinates), ridge.ply (a mountain ridge) and firs.ply (a wood on a shore), the pictures poster.png, glaze.png
+(for the vase) and studio.png (lamps all around).
 
 python experiments/scenes/make_assets.py
 """
@@ -79,9 +80,50 @@ def vase(around: int = 30, up: int = 20) -> tuple[np.ndarray, np.ndarray]:
     return vertices, np.concatenate([np.stack(x, axis=-1).reshape(-1, 3) for x in ((a, b, c), (a, c, d))])
 
 
+def ridge(doublings: int = 8, slopes: int = 5) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] and faces [T, 3] of a ridge from x = -1 to 1, at most 1 high at z = 0, that falls to z = 0.6."""
+    chance = np.random.default_rng(5)
+    height = np.array([0.15, 0.45, 0.1, 0.6, 0.25])
+    for k in range(doublings - 2):  # midpoints move by less and less
+        middle = (height[1:] + height[:-1]) / 2 + 0.16 * 0.56**k * chance.standard_normal(len(height) - 1)
+        height = np.insert(height, np.arange(1, len(height)), middle)
+    height = (height - height.min() + 0.1) / (np.ptp(height) + 0.1)
+    down = np.linspace(0, 1, slopes)[:, None]
+    rough = 0.05 * np.sin(np.pi * down) * chance.standard_normal((slopes, len(height)))
+    x = np.broadcast_to(np.linspace(-1, 1, len(height)), rough.shape)
+    y = (height * (1 - down) ** 1.3 + rough).clip(0)
+    y[-1] = -0.02
+    vertices = np.stack([x, y, np.broadcast_to(0.6 * down, x.shape)], axis=-1).reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(slopes - 1), np.arange(len(height) - 1), indexing="ij")
+    a, b, c, d = (u * len(height) + v for u, v in ((i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1)))
+    return vertices, np.concatenate([np.stack(f, axis=-1).reshape(-1, 3) for f in ((a, b, c), (a, c, d))])
+
+
+def firs(count: int = 90, boughs: int = 5, around: int = 7) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] and faces [T, 3] of firs in m, each a stack of cones, thick on the left and thin to the right."""
+    chance = np.random.default_rng(2)
+    x = -46 + 62 * chance.random(count) ** 1.6
+    z = -52 + 0.3 * x - 14 * chance.random(count)
+    tall = (5 + 5 * chance.random(count)) * np.where(x < -14, 1.2, 0.8)
+    k = np.arange(boughs)[:, None]
+    angle = 2 * np.pi * np.arange(around) / around + 0.8 * k
+    points, faces = [], []
+    for tree in range(count):
+        reach = 0.19 * tall[tree] * (1 - 0.17 * k) * (1 + 0.25 * chance.standard_normal((boughs, around)))
+        low = tall[tree] * (0.1 + 0.17 * k - 0.04 * chance.random((boughs, around)))
+        ring = np.stack([x[tree] + reach * np.cos(angle), low, z[tree] + reach * np.sin(angle)], axis=-1)
+        tips = np.stack([np.full(boughs, x[tree]), tall[tree] * (0.32 + 0.17 * k[:, 0]), np.full(boughs, z[tree])], -1)
+        first = tree * boughs * (around + 1) + k * (around + 1)
+        turn = np.arange(around)
+        points.append(np.concatenate([tips[:, None], ring], axis=1).reshape(-1, 3))
+        faces += [np.stack(np.broadcast_arrays(first, first + 1 + (turn + 1) % around, first + 1 + turn), -1)]
+    return np.concatenate(points), np.concatenate(faces).reshape(-1, 3)
+
+
 def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Write a binary PLY file of vertices [V, 8] and triangles [T, 3]."""
-    names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz", "s", "t"))
+    """Write a binary PLY file of vertices, [V, 8] or [V, 3] (points alone), and triangles [T, 3]."""
+    every = ("x", "y", "z", "nx", "ny", "nz", "s", "t")
+    names = "".join(f"property float {name}\n" for name in every[: vertices.shape[1]])
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{names}"
     header += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     rows = np.empty(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
@@ -122,7 +164,8 @@ def main() -> None:
     lines += ["v " + " ".join(f"{x:.4f}" for x in vertex) for vertex in vertices]
     lines += ["f " + " ".join(str(k + 1) for k in face) for face in faces]
     (TARGET / "knot.obj").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    write_ply(TARGET / "vase.ply", *vase())
+    for name, mesh in (("vase", vase()), ("ridge", ridge()), ("firs", firs())):
+        write_ply(TARGET / f"{name}.ply", *mesh)
     for name, picture in (("poster", poster()), ("glaze", glaze()), ("studio", studio())):
         Image.fromarray(picture).save(TARGET / f"{name}.png", optimize=True)
 
