@@ -24,7 +24,7 @@ from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_path, atomic_write_text, write_json
 from neurolens.base.progress import Progress, Report
-from neurolens.commands.arguments import QUIET_HELP, add_output, whole
+from neurolens.commands.arguments import QUIET_HELP, add_option, add_output, whole
 from neurolens.evaluate.pages import markdown_table
 
 ROOT = Path(__file__).parents[1]
@@ -40,8 +40,8 @@ Option = Callable[[argparse.ArgumentParser], object]
 
 
 def option(*names: str, **settings: Any) -> Option:
-    """An option as of `ArgumentParser.add_argument`."""
-    return lambda parser: parser.add_argument(*names, **settings)
+    """An option as of `add_option`."""
+    return lambda parser: add_option(parser, *names, **settings)
 
 
 def count(name: str, default: int | None, text: str, least: int = 1, most: int | None = None) -> Option:

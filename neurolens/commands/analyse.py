@@ -18,11 +18,13 @@ from neurolens.commands.arguments import (
     add_json,
     add_lens,
     add_lens_state,
+    add_option,
     add_output,
     between,
     check_run_folder,
     focus_of,
     state_of,
+    wavelengths_nm,
 )
 from neurolens.commands.output import answer, number, table
 
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
 WHATS = (
     "layout", "spots", "fans", "colour", "curvature", "distortion", "vignetting", "mtf", "mtf-height", "seidel", "psf",
 )  # fmt: skip
-_OF_FIELDS = ("spots", "fans", "mtf", "psf")  # take --fields, and as mtf-height --wavelengths
+_OF_FIELDS = ("spots", "fans", "mtf", "psf")  # take --field-points, and as mtf-height --wavelengths
 _BULK = {  # left out of the JSON unless asked for: a number per ray or a pixel
     "layout": ("rays", "surfaces"),
     "spots": ("tangential_um", "sagittal_um", "slope_tangential", "slope_sagittal"),
@@ -84,12 +86,12 @@ def add_parser(subparsers: Any) -> None:
     add_lens(parser, "file")
     parser.add_argument("what", metavar="WHAT", nargs="*", help="what to show (default: all)")
     add_lens_state(parser, efl="as tabled", f_number="the tabled stop")
-    parser.add_argument(
-        "--fields", metavar="DEG", nargs="+", type=between(0, 179, "degrees"),
-        help="fields of spots, fans, mtf and psf (default: axis, 50%%, 70%%, 85%% and edge of the field)",
+    add_option(
+        parser, "--field-points", old=("--fields",), metavar="DEG", nargs="+", type=between(0, 179, "degrees"),
+        help="angles from the axis for spots, fans, mtf and psf (default: axis, 50%, 70%, 85% and edge of the field)",
     )  # fmt: skip
     parser.add_argument(
-        "--wavelengths", metavar="NM", nargs="+", type=between(*WAVELENGTH_NM, "wavelengths in nm"),
+        "--wavelengths", metavar="NM", nargs="+", type=wavelengths_nm,
         help=f"of spots, fans, the MTF and psf, {said(WAVELENGTH_NM)} nm, the reference first "
         "(default: d, F and C, or the file's own where its range lacks the d line)",
     )  # fmt: skip
@@ -110,6 +112,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the requested analyses, and draw them if a folder is given."""
+    args.wavelengths = [nm for some in args.wavelengths or () for nm in some] or None
     unknown = [w for w in args.what if w not in WHATS]
     if unknown:
         raise InputError("neurolens analyse", "WHAT", unknown[0], f"any of: {', '.join(WHATS)}")
@@ -184,13 +187,13 @@ def _one(what: str, scene: Scene, args: argparse.Namespace, doubts: list[str]) -
     from neurolens.analysis.layout import state_text
 
     analysis = analysis_of(what)
-    options = {"field_deg": args.fields, "wavelength_nm": args.wavelengths}
+    options = {"field_deg": args.field_points, "wavelength_nm": args.wavelengths}
     asked = {k: v for k, v in options.items() if v is not None} if what in _OF_FIELDS else {}
     if what == "mtf-height":
         options = {"frequency_per_mm": args.frequencies, "wavelength_nm": args.wavelengths}
         asked = {k: v for k, v in options.items() if v is not None}
     if what in _OF_FIELDS:
-        dark = check_light(scene, args.fields, (args.wavelengths or scene.waves_nm)[0])
+        dark = check_light(scene, args.field_points, (args.wavelengths or scene.waves_nm)[0])
         doubts += [d for d in dark if d not in doubts]
     result = analysis.compute(scene, **asked)
     data = result.to_dict()

@@ -44,7 +44,9 @@ def add_parser(subparsers: Any) -> None:
     add_output(parser, "OUT.toml", "lens file to write", required=True)
     parser.add_argument("--force", action="store_true", help="replace an existing file")
     group = parser.add_argument_group("what the file does not say")
-    group.add_argument("--name", help="name of the lens (default: the title in the file, else its file name)")
+    group.add_argument(
+        "--name", metavar="NAME", help="name of the lens (default: the title in the file, else its file name)"
+    )
     group.add_argument("--source", help="where the figures come from (default: the file's name)")
     group.add_argument(
         "--f-number", metavar="N", type=positive("an f-number"),

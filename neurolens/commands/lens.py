@@ -16,6 +16,7 @@ from neurolens.base.lensname import resolve
 from neurolens.commands.arguments import (
     add_json,
     add_lens_state,
+    add_option,
     add_output,
     between,
     check_folder,
@@ -66,7 +67,7 @@ def add_parser(subparsers: Any) -> None:
     add_lens_state(parser, efl="as tabled", f_number="the tabled stop")
     parser.add_argument(
         "--layout", metavar="OUT.png", type=Path,
-        help="draw the lens with rays from three field points: axis, 70%% and edge of the film (.png, .pdf, .svg)",
+        help="draw the lens with rays from three field points: axis, 70% and edge of the film (.png, .pdf, .svg)",
     )  # fmt: skip
     parser.add_argument(
         "--layouts", metavar="OUT.png", type=Path, help="of several files: draw all lenses in section on one sheet"
@@ -84,7 +85,7 @@ def _check_mode(args: argparse.Namespace, several: bool) -> None:
     alone = not several and not args.derive_rims
     kinds = {
         "--layouts": (args.layouts is not None, several, 'with "list", a folder or several files'),
-        "--vignetting": (args.vignetting is not None, args.derive_rims, "with --derive-rims"),
+        "--edge-pupil": (args.edge_pupil is not None, args.derive_rims, "with --derive-rims"),
         "--breathing": (args.breathing is not None, alone, "with one lens file alone"),
         "--output": (args.out is not None, args.derive_rims, "with --derive-rims"),
         "--half-field": (args.half_field is not None, args.derive_rims, "with --derive-rims"),
@@ -321,8 +322,8 @@ def _add_rims(parser: argparse.ArgumentParser) -> None:
         "--derive-rims", action="store_true",
         help="compute the diameters from the f-number and the field, and print them beside those of the file",
     )  # fmt: skip
-    rims.add_argument(
-        "--vignetting", metavar="SHARE", type=between(0.01, 1, "a share"),
+    add_option(
+        rims, "--edge-pupil", old=("--vignetting",), metavar="SHARE", type=between(0.01, 1, "a share"),
         help="share of the pupil's height that is kept at the edge of the field (default: 0.5)",
     )  # fmt: skip
     rims.add_argument(
@@ -341,7 +342,7 @@ def _run_rims(args: argparse.Namespace) -> int:
     if args.out is not None:
         check_folder(args.out, "--output")
     lens = read_quietly(args.file)
-    rule = RimRule(vignetting=0.5 if args.vignetting is None else args.vignetting, half_field_deg=args.half_field)
+    rule = RimRule(vignetting=0.5 if args.edge_pupil is None else args.edge_pupil, half_field_deg=args.half_field)
     derived, rims = derive_rims(lens, rule)
     field = args.half_field or half_field_deg(lens)
     if args.out is not None:

@@ -18,6 +18,7 @@ from neurolens.commands.arguments import (
     add_exposure,
     add_json,
     add_lens_state,
+    add_option,
     add_output,
     aperture_of,
     between,
@@ -73,6 +74,8 @@ examples:
       --zoom 100 --blades 8 --blade-curvature 0.5 -o zoom.exr
   neurolens render experiments/scenes/room.toml --camera thin --samples 64 --keep-checkpoint -o room.exr
   neurolens render experiments/scenes/room.toml --camera thin --samples 256 -o room.exr   # 192 more
+  neurolens render experiments/scenes/room.toml --camera thin --tile 1/2 -o room.exr   # and 2/2 elsewhere
+  neurolens render --merge room.tile-*.exr -o room.exr
   neurolens render experiments/scenes/room.toml --camera fused:models/NAME.onnx --frames 1:48 \\
       --key focus=1:1.2,48:3 --key position=1:0/1.6/3,48:0.5/1.6/2.5 -o pull.exr"""
 
@@ -80,10 +83,10 @@ examples:
 def add_parser(subparsers: Any) -> None:
     """Add the command to the command line."""
     parser = subparsers.add_parser(
-        "render", help="render a scene through a lens, a model, a thin lens or a pinhole",
+        "render", help="a scene through a lens, a model, a thin lens or a pinhole",
         description=_DESCRIPTION, epilog=f"{CAMERAS_HELP}\n\n{_EPILOG}",
     )  # fmt: skip
-    parser.add_argument("scene", metavar="SCENE", type=Path, help="scene file (.toml)")
+    parser.add_argument("scene", metavar="SCENE", nargs="*", type=Path, help="scene file (.toml), or tiles of --merge")
     add_camera(parser)
     add_output(parser, "OUT.exr", "picture to write; the preview is OUT.png", required=True)
     picture = parser.add_argument_group("picture")
@@ -103,8 +106,8 @@ def add_parser(subparsers: Any) -> None:
     picture.add_argument("--max-depth", metavar="N", type=whole(1, 1000), help="bounces (default: the scene's)")
     picture.add_argument("--half", action="store_true", help="16-bit floats in the EXR (default: 32-bit)")
     add_exposure(picture)
-    picture.add_argument(
-        "--layers", choices=("all", "beauty"), default="all",
+    add_option(
+        picture, "--channels", old=("--layers",), choices=("all", "beauty"), default="all",
         help="of the EXR: colour alone, or also samples, variance (of the pixel's luminance), Z (depth in m along the "
         "axis from the film) and blocked (share of camera rays that do not pass) (default: all)",
     )  # fmt: skip
@@ -142,8 +145,8 @@ def _add_colour(parser: argparse.ArgumentParser) -> None:
         "--white-balance", metavar="LIGHT",
         help="light that becomes neutral: A, D50, D65, E, '3200 K' or a measured one of the scene",
     )  # fmt: skip
-    colour.add_argument(
-        "--wavelengths", choices=WAVELENGTH_MODES,
+    add_option(
+        colour, "--wavelength-mode", old=("--wavelengths",), choices=WAVELENGTH_MODES,
         help="of a path: one; hero, four that share it; lanes, four paths that share their random numbers; "
         "auto, hero where the camera does not disperse",
     )  # fmt: skip
@@ -155,15 +158,22 @@ def _add_colour(parser: argparse.ArgumentParser) -> None:
 
 def film_of(settings: FilmSettings, args: argparse.Namespace) -> FilmSettings:
     """The scene's [film] table with the command line's options."""
-    names = ("colour_space", "white_balance", "wavelengths", "wavelength_sampling")
-    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
-    return replace(settings, **given)
+    given = {name: getattr(args, name) for name in ("colour_space", "white_balance", "wavelength_sampling")}
+    given["wavelengths"] = args.wavelength_mode
+    return replace(settings, **{name: value for name, value in given.items() if value is not None})
 
 
 def run_kept(args: argparse.Namespace) -> int:
-    """As `run`, with running out of memory as a one-line error."""
+    """As `run`, or tiles merged, with running out of memory as a one-line error."""
+    from neurolens.commands.merge import run_merge
+
+    if not args.merge:
+        if len(args.scene) != 1 or args.camera is None:
+            missing = "SCENE" if len(args.scene) != 1 else "--camera"
+            raise InputError("neurolens render", missing, " ".join(map(str, args.scene)) or "(none)", "one of it")
+        (args.scene,) = args.scene
     try:
-        return run(args)
+        return (run_merge if args.merge else run)(args)
     except MemoryError as error:
         raise NeurolensError(f"render: out of memory ({str(error) or 'no more said'})") from None
 

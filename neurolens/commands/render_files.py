@@ -35,8 +35,14 @@ def add_tile(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("farms")
     group.add_argument(
         "--tile", metavar="I/N", type=_tile,
-        help="render the I-th of N bands of rows, to OUT.tile-I-of-N.exr (goes with --frames); \"neurolens merge\" "
-        "puts together the picture that one run gives, bit for bit. A scene's [flare] is computed whole for each tile",
+        help="render the I-th of N bands of rows, to OUT.tile-I-of-N.exr (goes with --frames). A scene's [flare] is "
+        "computed whole for each tile",
+    )  # fmt: skip
+    group.add_argument(
+        "--merge", action="store_true",
+        help="put tiles together: the picture that one run gives, bit for bit, with its preview and metadata, whose "
+        "times are summed; of tiles of frames a picture a frame. Takes -o and --exposure alone, and no tile of other "
+        "settings, missing, doubled or unfinished",
     )  # fmt: skip
     add_dask(group)
 
@@ -190,7 +196,7 @@ def write_pictures(
     told = metadata | {"render": plain(result.stats)}
     told["colour"] = space.stated
     layers: dict[str, FloatArray] = {}
-    if args.layers == "all" or not result.stats["complete"]:
+    if args.channels == "all" or not result.stats["complete"]:
         layers, told["layers"] = asdict(result.layers), MEANING
     width, height = result.stats["width"], result.stats["height"]
     rows = (0, height) if args.tile is None else rows_of(height, args.tile)

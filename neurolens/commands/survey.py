@@ -9,7 +9,16 @@ from typing import Any
 
 from neurolens.base.errors import InputError, printable
 from neurolens.base.files import read_bytes
-from neurolens.commands.arguments import QUIET_HELP, add_glass, add_json, add_output, between, check_run_folder, whole
+from neurolens.commands.arguments import (
+    QUIET_HELP,
+    add_glass,
+    add_json,
+    add_option,
+    add_output,
+    between,
+    check_run_folder,
+    whole,
+)
 from neurolens.commands.farm import add_dask
 from neurolens.commands.output import answer
 
@@ -55,7 +64,7 @@ def add_parser(subparsers: Any) -> None:
         help="files at a time, about 1 GB of memory each (default: all cores)",
     )
     add_dask(parser)
-    parser.add_argument("--again", action="store_true", help="do finished files again")
+    add_option(parser, "--restart", old=("--again",), action="store_true", help="do finished files again")
     add_glass(parser)
     add_json(parser)
     parser.add_argument("--quiet", action="store_true", help=QUIET_HELP)
@@ -79,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
     glasses = [(file.name, read_bytes(file, MAX_BYTES, "a glass catalogue")) for file in args.glass_files]
     records = survey(
         collection, args.out, settings, in_processes(args.jobs) if args.dask is None else on_cluster(args.dask),
-        Progress(quiet=args.quiet), glasses=glasses, again=args.again,
+        Progress(quiet=args.quiet), glasses=glasses, again=args.restart,
     )  # fmt: skip
     summary = {**summary_of(records), "others": collection.others, "page": str(args.out / "survey.html")}
     lines = [*summary_lines(records, collection.others), f"Look at {args.out / 'survey.html'}"]

@@ -79,7 +79,7 @@ def add_parser(subparsers: Any) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--jobs", metavar="N", type=whole(1, 64), default=min(8, os.cpu_count() or 1),
-        help="processes that write OSL, each of a core and 0.5 GB (default here: %(default)s)",
+        help="processes that write OSL, each of a core and 0.5 GB (default: all cores, at most 8)",
     )  # fmt: skip
     add_glass(parser)
     add_json(parser)

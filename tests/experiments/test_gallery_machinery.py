@@ -116,7 +116,7 @@ def test_an_effect_becomes_a_figure_numbers_and_a_page_and_is_not_done_twice(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, out = written(tmp_path, '[[panel]]\nlabel = "one"\n', ""), tmp_path / "out"
-    command = ["gallery", "--effects-in", str(tmp_path), "--out", str(out), "--threads", "1"]
+    command = ["gallery", "--effects-in", str(tmp_path), "--output", str(out), "--threads", "1"]
     assert main([*command, "--json"]) == 0
     first = json.loads(capsys.readouterr().out)["effects"][0]
     assert (out / "small.png").stat().st_size <= MOST_BYTES
