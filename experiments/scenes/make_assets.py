@@ -1,6 +1,6 @@
 """Make what the scenes in experiments/scenes load: the meshes knot.obj (a torus knot), vase.ply (with normals and
-texture coordinates), ridge.ply (a mountain ridge) and firs.ply (a wood on a shore), the pictures poster.png, glaze.png
-(for the vase) and studio.png (lamps all around).
+texture coordinates), ridge.ply (a mountain ridge), firs.ply (a wood on a shore) and four pieces of chess, the pictures
+poster.png, glaze.png (for the vase) and studio.png (lamps all around).
 
 python experiments/scenes/make_assets.py
 """
@@ -75,9 +75,72 @@ def vase(around: int = 30, up: int = 20) -> tuple[np.ndarray, np.ndarray]:
     normal = np.stack([np.cos(angle), -slope, -np.sin(angle)])
     normal /= np.linalg.norm(normal, axis=0)
     vertices = np.stack([*point, *normal, 3 * angle / (2 * np.pi), t], axis=-1).reshape(-1, 8)
+    return vertices, grid_faces(up, around)
+
+
+# Outlines of turned pieces of chess: radius and height in mm, from the foot up; a repeated point is a corner.
+FOOT = [(0, 0), (1, 0), (1, 0), (1, 0.05), (1, 0.05), (0.97, 0.09), (0.86, 0.12), (0.84, 0.15), (0.75, 0.20)]
+PIECES: dict[str, tuple[float, list[tuple[float, float]]]] = {
+    "pawn": (
+        14.5,
+        [(8.0, 14), (5.6, 22), (5.0, 29), (5.2, 29), (8.2, 30.5), (8.4, 32), (5.5, 33.5), (5.6, 34), (8.4, 38)]
+        + [(9.3, 42), (8.4, 46), (5.4, 50), (0, 51.5)],
+    ),
+    "bishop": (
+        17.0,
+        [(9.5, 18), (6.4, 30), (5.6, 42), (5.8, 42), (9.6, 44), (9.8, 46), (6.2, 48), (6.4, 49), (9.0, 55)]
+        + [(9.2, 60), (6.6, 67), (3.0, 71.5), (2.3, 72.5), (3.2, 74.5), (2.4, 76.8), (0, 77.5)],
+    ),
+    "queen": (
+        19.0,
+        [(10.5, 20), (7.2, 36), (6.2, 54), (6.5, 54), (10.8, 56.5), (11.0, 58.5), (7.2, 60.5), (7.3, 62), (9.0, 70)]
+        + [(11.8, 79), (11.8, 79), (11.2, 80), (8.5, 79.6), (6.5, 82), (3.4, 84), (2.9, 85), (3.8, 87), (2.8, 89.4)]
+        + [(0, 90)],
+    ),
+    "king": (
+        20.0,
+        [(11.0, 22), (7.6, 40), (6.6, 58), (6.9, 58), (11.4, 60.5), (11.6, 63), (7.6, 65), (7.8, 66.5), (9.6, 76)]
+        + [(11.6, 84), (11.6, 84), (10.4, 86.5), (4.5, 89), (2.2, 90), (2.2, 90), (1.9, 93), (4.3, 94.5), (4.3, 94.5)]
+        + [(4.3, 97.5), (4.3, 97.5), (1.9, 99), (2.4, 102.5), (0, 103)],
+    ),
+}
+
+
+def turned(foot: float, outline: list[tuple[float, float]], around: int = 48) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 8] in metres and faces [T, 3] of a turned piece, whose foot has this radius in mm."""
+    points = np.array([(foot * r, foot * 0.95 * y) for r, y in FOOT] + outline) / 1000
+    # A spline by chords, with three points between two; where a point repeats, the outline has a corner.
+    rows = [points[:1]]
+    padded = np.concatenate([points[:1], points, points[-1:]])
+    for before, here, there, after in zip(padded, padded[1:], padded[2:], padded[3:], strict=False):
+        t = np.linspace(0, 1, 5)[1:, None]
+        left, right = (there - before) / 2, (after - here) / 2
+        reach = np.linalg.norm(there - here)
+        left, right = (v * min(1, reach / max(np.linalg.norm(v), 1e-9)) for v in (left, right))
+        rows.append(
+            (2 * t**3 - 3 * t**2 + 1) * here + (t**3 - 2 * t**2 + t) * left
+            + (3 * t**2 - 2 * t**3) * there + (t**3 - t**2) * right
+        )  # fmt: skip
+    line = np.concatenate(rows)
+    line = line[np.concatenate([[True], np.linalg.norm(np.diff(line, axis=0), axis=1) > 1e-6])]
+    line[:, 0] = np.maximum(line[:, 0], 0)
+    slope = np.gradient(line, axis=0)
+    angle = np.linspace(0, 2 * np.pi, around + 1)
+    radius, height = (np.broadcast_to(x[:, None], (len(line), around + 1)) for x in line.T)
+    dr, dy = (np.broadcast_to(x[:, None], radius.shape) for x in slope.T)
+    cos, sin = (np.broadcast_to(f(angle), radius.shape) for f in (np.cos, np.sin))
+    normal = np.stack([dy * cos, -dr, -dy * sin])
+    normal /= np.maximum(np.linalg.norm(normal, axis=0), 1e-12)
+    uv = [angle / (2 * np.pi) + 0 * radius, height / line[-1, 1]]
+    vertices = np.stack([radius * cos, height, -radius * sin, *normal, *uv], axis=-1).reshape(-1, 8)
+    return vertices, grid_faces(len(line), around)
+
+
+def grid_faces(up: int, around: int) -> np.ndarray:
+    """Triangles [T, 3] of a grid of `up` rows of `around` + 1 vertices."""
     i, j = np.meshgrid(np.arange(up - 1), np.arange(around), indexing="ij")
     a, b, c, d = (x * (around + 1) + y for x, y in ((i, j), (i, j + 1), (i + 1, j + 1), (i + 1, j)))
-    return vertices, np.concatenate([np.stack(x, axis=-1).reshape(-1, 3) for x in ((a, b, c), (a, c, d))])
+    return np.concatenate([np.stack(x, axis=-1).reshape(-1, 3) for x in ((a, b, c), (a, c, d))])
 
 
 def ridge(doublings: int = 8, slopes: int = 5) -> tuple[np.ndarray, np.ndarray]:
@@ -164,7 +227,8 @@ def main() -> None:
     lines += ["v " + " ".join(f"{x:.4f}" for x in vertex) for vertex in vertices]
     lines += ["f " + " ".join(str(k + 1) for k in face) for face in faces]
     (TARGET / "knot.obj").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    for name, mesh in (("vase", vase()), ("ridge", ridge()), ("firs", firs())):
+    pieces = {name: turned(foot, outline) for name, (foot, outline) in PIECES.items()}
+    for name, mesh in {"vase": vase(), "ridge": ridge(), "firs": firs(), **pieces}.items():
         write_ply(TARGET / f"{name}.ply", *mesh)
     for name, picture in (("poster", poster()), ("glaze", glaze()), ("studio", studio())):
         Image.fromarray(picture).save(TARGET / f"{name}.png", optimize=True)

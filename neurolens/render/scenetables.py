@@ -267,7 +267,8 @@ class Texture(Checked):
 
     kind "checker": squares of `cell_m` in two `colours`. kind "grid": lines `line_m` wide every `cell_m`, the first
     colour for the lines. kind "image": the picture `file` (beside the scene file), repeated every `size_m` (width,
-    height); without `size_m` it fills the rectangle, or lies on a mesh as the mesh's texture coordinates say.
+    height); without `size_m` it fills the rectangle, or lies on a mesh as the mesh's texture coordinates say. OpenEXR
+    and Radiance (.hdr) are read as linear sRGB, other pictures as sRGB.
     """
 
     kind: Literal["checker", "grid", "image"]
@@ -367,8 +368,9 @@ class Environment(Checked):
     """Light from infinitely far: one `colour`, a gradient by height from ground over horizon to zenith, or a picture.
 
     A picture `file` (beside the scene file) is equirectangular: its middle lies towards -z, its right half towards +x,
-    its top row at the zenith. OpenEXR is read as linear sRGB, other pictures as sRGB. It is multiplied by `scale` and
-    turned by `rotate_y_deg` about y as meshes are. `illuminant`: the light that the colours tint.
+    its top row at the zenith. OpenEXR and Radiance (.hdr) are read as linear sRGB, other pictures as sRGB. It is
+    multiplied by `scale` and turned by `rotate_y_deg` about y as meshes are. `illuminant`: the light that the colours
+    tint.
     """
 
     colour: Vector | None = None
