@@ -260,11 +260,11 @@ def given_options(args: argparse.Namespace) -> list[str]:
     return given + (["--focusing"] if args.focusing != "best" else [])
 
 
-def add_exposure(parser: argparse._ActionsContainer) -> None:
-    """Add --exposure."""
+def add_exposure(parser: argparse._ActionsContainer, default: float | None = 0.0, about: str = "0") -> None:
+    """Add --exposure; `about` describes the default."""
     parser.add_argument(
-        "--exposure", metavar="STOPS", type=between(-40, 40, "stops"), default=0.0,
-        help="stops by which the preview OUT.png is brighter; OUT.exr keeps the scene's light as it is (default: 0)",
+        "--exposure", metavar="STOPS", type=between(-40, 40, "stops"), default=default,
+        help=f"stops by which the preview OUT.png is brighter; OUT.exr keeps the light as it is (default: {about})",
     )  # fmt: skip
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import check_writable
+from neurolens.base.files import library as shipped
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import (
     Parser,
@@ -28,8 +29,8 @@ _DESCRIPTION = """\
 Real lenses as cameras of Blender's Cycles (4.5 and later): an extension with a panel at the
 camera's data, where a lens is put on with one click and taken off with one."""
 _BUILD = """\
-Pack the extension with a folder of models: of each lens the best polynomial, the best network and,
-where its lens file is beside the models' folder in lenses/, the exact lens, every surface traced.
+Pack the extension with a folder of models and with the lens files of the folder lenses/ beside it: of each
+lens the best polynomial, the best network and the exact lens, every surface traced.
 What cannot be a shader is left out and said.
 
 Finished lenses are kept: a build that was stopped goes on where it was, and a second one is quick.
@@ -49,10 +50,12 @@ def add_parser(subparsers: Any) -> None:
     actions = parser.add_subparsers(metavar="ACTION", required=True, parser_class=Parser)
     build = actions.add_parser("build", help="pack the extension as a zip", description=_BUILD)
     add_output(build, "OUT.zip", "default: neurolens.zip", default=Path("neurolens.zip"))
-    build.add_argument("--models", metavar="DIR", type=Path, default=Path("models"), help="default: models")
+    build.add_argument(
+        "--models", metavar="DIR", type=Path, default=shipped() / "models", help="default: the models that ship"
+    )
     build.add_argument(
         "--lens", metavar="LENS", action="append", default=[],
-        help="only this lens, repeatable: LENS of LENS.ols-64.onnx (default: all)",
+        help="only this lens, repeatable: LENS of LENS.ols-64.onnx or of LENS.toml (default: all)",
     )  # fmt: skip
     build.add_argument("--no-exact", action="store_true", help="leave exact lenses out")
     build.add_argument(

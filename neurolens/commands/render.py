@@ -130,12 +130,17 @@ def add_parser(subparsers: Any) -> None:
     parser.set_defaults(run=run_kept, kept="no picture was written; older files of that name are untouched")
 
 
+def add_colour_space(parser: argparse._ActionsContainer, default: str = "") -> None:
+    """Add --colour-space; `default` describes what stands for it where it is left out."""
+    parser.add_argument(
+        "--colour-space", choices=COLOUR_SPACE_NAMES,
+        help=f"of the EXR, linear: sRGB (D65) or ACEScg (AP1, the white of ACES){default}",
+    )  # fmt: skip
+
+
 def _add_colour(parser: argparse.ArgumentParser) -> None:
     colour = parser.add_argument_group("colour (left out: the scene's [film] table)")
-    colour.add_argument(
-        "--colour-space", choices=COLOUR_SPACE_NAMES,
-        help="of the EXR, linear: sRGB (D65) or ACEScg (AP1, the white of ACES)",
-    )  # fmt: skip
+    add_colour_space(colour)
     colour.add_argument(
         "--white-balance", metavar="LIGHT",
         help="light that becomes neutral: A, D50, D65, E, '3200 K' or a measured one of the scene",
@@ -269,11 +274,11 @@ def _flare(made: Prepared, args: argparse.Namespace, progress: Progress) -> dict
     from neurolens.flare.layers import scene_choice, scene_flare
     from neurolens.flare.picture import Raster
 
+    raster = Raster(camera.film_mm, *made.size)
     try:
         if args.shared is not None and args.shared.flare is None:
-            args.shared.flare = scene_choice(list(_flare_frames(scene, lens, args)))
+            args.shared.flare = scene_choice(list(_flare_frames(scene, lens, args)), raster, args.threads)
         choice = None if args.shared is None else args.shared.flare
-        raster = Raster(camera.film_mm, *made.size)
         return scene_flare(scene, lens, raster, made.film.white_balance, args.threads, progress, choice)
     except InputError as error:
         raise InputError(args.scene, f"[flare]: {error.file}, {error.field}", error.value, error.expected) from None

@@ -23,6 +23,7 @@ from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
     from neurolens.cameras.contract import FloatArray
+    from neurolens.render.colour import ColourSpace
     from neurolens.render.film_settings import FilmSettings
     from neurolens.render.renderer import RenderResult, Watch
 
@@ -185,7 +186,7 @@ def write_pictures(
     Raises:
         NeurolensError: they cannot be written; with the way to resume.
     """
-    from neurolens.render.colour import COLOUR_SPACES, SRGB, conversion, converted
+    from neurolens.render.colour import COLOUR_SPACES
     from neurolens.render.exr_attributes import standard_attributes
     from neurolens.render.job import MEANING
     from neurolens.render.pictures import write_exr, write_png
@@ -193,15 +194,13 @@ def write_pictures(
 
     space = COLOUR_SPACES[film.colour_space]
     told = metadata | {"render": plain(result.stats)}
-    told["colour"] = {"space": space.name, "white_xy": list(space.white), "adaptation": "Bradford"}
+    told["colour"] = space.stated
     layers: dict[str, FloatArray] = {}
     if args.channels == "all" or not result.stats["complete"]:
         layers, told["layers"] = asdict(result.layers), MEANING
     width, height = result.stats["width"], result.stats["height"]
     rows = (0, height) if args.tile is None else rows_of(height, args.tile)
-    for name, picture in flare.items():
-        colour = converted(picture[slice(*rows)], conversion(SRGB, space)).astype(picture.dtype)
-        layers |= {f"{name}.{c}": colour[..., k] for k, c in enumerate("RGB")}
+    layers |= flare_channels({name: picture[slice(*rows)] for name, picture in flare.items()}, space)
     attributes = standard_attributes(metadata["camera"], width, height, args.frame)
     if args.tile is not None:
         number, count = args.tile
@@ -215,6 +214,17 @@ def write_pictures(
         write_png(files.preview, result.rgb, args.exposure)
     except (OSError, NeurolensError) as error:
         raise NeurolensError(f"{_said(error)}; {_rescued(files, result)}") from None
+
+
+def flare_channels(flare: Mapping[str, FloatArray], space: ColourSpace) -> dict[str, FloatArray]:
+    """The channels of layers of flare in a colour space, of pictures [H, W, 3] linear sRGB by name."""
+    from neurolens.render.colour import SRGB, conversion, converted
+
+    channels: dict[str, FloatArray] = {}
+    for name, picture in flare.items():
+        colour = picture if space is SRGB else converted(picture, conversion(SRGB, space)).astype(picture.dtype)
+        channels |= {f"{name}.{c}": colour[..., k] for k, c in enumerate("RGB")}
+    return channels
 
 
 def _rescued(files: Files, result: RenderResult) -> str:
