@@ -11,6 +11,7 @@ import json
 import math
 import os
 import sys
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from pathlib import Path
@@ -308,7 +309,7 @@ def _opened(file: str | Path, field: str, path: Path, most: int) -> Iterator[Ima
     """A picture of at most `most` pixels per side; mistakes name file and field."""
     try:
         data = io.BytesIO(read_bytes(path, _LARGEST_FILE, "a picture", (file, field)))
-        with Image.open(data, formats=FORMATS) as picture:
+        with warnings.catch_warnings(action="ignore"), Image.open(data, formats=FORMATS) as picture:
             if max(picture.size) > most:
                 raise InputError(file, field, str(path), f"a picture of at most {most} pixels per side")
             yield picture
