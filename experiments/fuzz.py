@@ -5,8 +5,8 @@ list of lights or keys, what an earlier run has kept) or the words of a command 
 when the exit code is 0, or 2 with one line on stderr (warnings aside; 1 where a command judges, as `evaluate`), no
 temporary file stays, a refused command has written nothing, and processor time, waiting and memory stay within bounds.
 
-Cases run one after the other in a process that is forked for every two hundred of them; one that dies or hangs costs its
-own case. A case with a fault is run again in a process of its own, and the page tells whether it fails there, too.
+Cases run one after the other in a process that is forked for every two hundred of them; one that dies or hangs costs
+its own case. A case with a fault is run again in a process of its own, and the page tells whether it fails there, too.
 Case K of seed S is always the same: `--seed S --first K --cases 1 --keep DIR` shows a fault again. A run that is
 interrupted goes on, for finished batches are kept.
 """
@@ -76,7 +76,7 @@ class Verdict:
     memory: int = 0
 
 
-# ---- A batch: cases one after the other, in a process of its own. ------------------------------------------------------
+# ---- A batch: cases one after the other, in a process of its own. ----------------------------------------------------
 
 
 class Folder:
@@ -390,5 +390,5 @@ def _page(args: argparse.Namespace, total: _Total) -> str:
     versions = ", ".join(f"{name} {version(name)}" for name in ("torch", "numpy", "onnxruntime", "OpenEXR", "pillow"))
     made = f"`{command}`: {total.cases} cases, {len(total.bad)} with faults, {total.cpu_s / 60:.0f} CPU minutes."
     made += f" neurolens {__version__}, Python {platform.python_version()}, {versions}."
-    known = "Memory includes the 0.4 GB of the libraries that each process has loaded. Exit code 2 is a refusal in one line."
+    known = "Memory includes the 0.4 GB of the libraries that each process has loaded. Exit code 2 refuses in one line."
     return lab.page("# Hostile input", " ".join((__doc__ or "").split()), lab.table(header, rows), f"{made} {known}")

@@ -124,7 +124,7 @@ def damage_message(chance: Chance, data: bytes, depth: int = 0) -> bytes:
 
 
 def damage_archive(chance: Chance, data: bytes) -> bytes:
-    """A zip file with a member that is damaged and has a right checksum, an entry more or less, or a directory that lies."""
+    """A zip file with a damaged member of right checksum, an entry more or less, or a directory that lies."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     kind = chance.choice(("member", "member", "member", "member", "name", "lost", "directory"))
@@ -207,7 +207,7 @@ def damage_png(chance: Chance, data: bytes) -> bytes:
     k = chance.randrange(len(chunks))
     kind, value = chunks[k]
     more = chance.choice((b"tRNS", b"PLTE", b"iCCP", b"gAMA", b"acTL", b"fcTL", b"zTXt", b"eXIf"))
-    new = [(kind, damage_bytes(chance, value))], [], [(kind, value)] * 2, [(more, chance.randbytes(9)), (kind, value)]
-    chunks[k : k + 1] = chance.choice(new)
+    damaged, added = [(kind, damage_bytes(chance, value))], [(more, chance.randbytes(9)), (kind, value)]
+    chunks[k : k + 1] = chance.choice((damaged, [], [(kind, value)] * 2, added))
     parts = [struct.pack(">I", len(v)) + name + v + struct.pack(">I", zlib.crc32(name + v)) for name, v in chunks]
     return data[:8] + b"".join(parts)

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from experiments import lab
-from experiments.fuzz_damage import SPECIAL, WORDS, damage
+from experiments.fuzz_damage import WORDS, damage
 from neurolens import cli
 from neurolens.commands.arguments import Parser
 
@@ -28,6 +28,7 @@ SEEDS = Path(__file__).with_name("fuzz_seeds")
 Chance = random.Random
 Words = list[str]
 _SMALL_FLARE = ("--width", "24", "--wavelengths", "2", "--cell", "64", "--threads", "1", "--quiet")
+_ANALYSES = "spots", "layout", "vignetting", "mtf", "psf", "fans"  # that take longer than others
 _FILM = ("--size", "8x6", "--film", "24x18", "--quiet")
 _PLATE, _PLATE_FILM = (12, 8), "36x24"  # pixels; mm
 
@@ -65,7 +66,10 @@ def _of_lens(chance: Chance, folder: Path) -> Words:
             (2, ("lens", "lens.toml", "--json")),
             (1, ("lens", "lens.toml", "--derive-rims")),
             *((2, ("analyse", "lens.toml", what)) for what in ("seidel", "distortion", "colour", "curvature")),
-            *((0.3, ("analyse", "lens.toml", what)) for what in ("spots", "layout", "vignetting", "mtf", "psf", "fans")),
+            *(
+                (0.3, ("analyse", "lens.toml", what))
+                for what in ("spots", "layout", "vignetting", "mtf", "psf", "fans")
+            ),
             (4, _render("thick:lens.toml")),
             (4, _render("thin:lens.toml")),
             (0.5, _render("lens.toml")),
@@ -76,7 +80,7 @@ def _of_lens(chance: Chance, folder: Path) -> Words:
             (0.5, _flare("lens.toml", *light)),
             (2, _flare("lens.toml", *light)[:4]),
             (0.5, ("models", "lens.toml")),
-            (0.1, ("survey", "fold", "--no-fit", "--out", "new", "--jobs", "1", "--quiet")),
+            (0.1, ("survey", "fold", "--no-fit", "-o", "new", "--jobs", "1", "--quiet")),
         ),
     )
 
@@ -102,7 +106,11 @@ def foreign() -> list[str]:
 def _of_format(chance: Chance, folder: Path) -> Words:
     name = chance.choice(foreign())
     hurt(chance, folder, name)
-    commands = [(8, ("convert", name, "-o", "out.toml")), (1, ("lens", name, "good.toml")), (1, _render(f"thick:{name}"))]
+    commands = [
+        (8, ("convert", name, "-o", "out.toml")),
+        (1, ("lens", name, "good.toml")),
+        (1, _render(f"thick:{name}")),
+    ]
     return _pick(chance, commands)
 
 
@@ -124,13 +132,13 @@ def _of_mesh(chance: Chance, folder: Path) -> Words:
 
 
 def _of_picture(chance: Chance, folder: Path) -> Words:
-    hurt(chance, folder, chance.choice(_pictures()))
+    name = chance.choice(
+        ("tile.png", "tile.jpg", "tile.tif", "tile.webp", "mask.png", "sky.exr", "sky.hdr", "lamp.csv")
+    )
+    hurt(chance, folder, name)
+    if name == "sky.hdr":
+        (folder / "scene.toml").write_text((folder / "scene.toml").read_text().replace("sky.exr", name))
     return _render()
-
-
-def _pictures() -> list[str]:
-    """Pictures of the scene, of every format that it may name."""
-    return ["tile.png", "tile.jpg", "tile.tif", "tile.webp", "mask.png", "sky.exr", "lamp.csv"]
 
 
 def _of_model(chance: Chance, folder: Path) -> Words:
@@ -174,15 +182,9 @@ def _of_tile(chance: Chance, folder: Path) -> Words:
     return merging(*names)
 
 
-@cache
-def _one_command_renders() -> bool:
-    """Whether `render --merge` is there, which took the place of `merge`."""
-    return "merge" not in parsers()
-
-
 def merging(*names: str) -> Words:
     """The command that puts tiles together."""
-    return [*(("render", "--merge") if _one_command_renders() else ("merge",)), *names, "-o", "out.exr"]
+    return ["render", "--merge", *names, "-o", "out.exr"]
 
 
 def _of_plate(chance: Chance, folder: Path) -> Words:
@@ -216,7 +218,7 @@ def _of_kept(chance: Chance, folder: Path) -> Words:
     commands = {
         "out.exr.part": _render("thin", "--samples", "16"),
         "pages/cooke_triplet_50/record.json": ["library", "-o", "pages", "cooke_triplet_50", "--quiet"],
-        **{name: ["survey", "fold", "--no-fit", "--out", "done", "--quiet"] for name in records},
+        **{name: ["survey", "fold", "--no-fit", "-o", "done", "--quiet"] for name in records},
     }
     rare = [0.1 if "record" in name and "pages" in name else 1 for name in commands]
     (name,) = chance.choices(list(commands), rare)
@@ -233,10 +235,10 @@ def _of_words(chance: Chance, folder: Path) -> Words:
         _flare("lens.toml", "--light", "5,3"), ["stmap", "thin", *_FILM, "-o", "shot"],
         ["projection", "thin", *_FILM, "--model", "opencv"], ["evaluate", "model.onnx", "--rays", "1000", "--quiet"],
         ["blender", "add", "model.onnx", "--to", "pack.zip", "--quiet"], ["view", "model.onnx", "--downloads", "glsl"],
-        ["survey", "fold", "--no-fit", "--out", "new", "--quiet"], ["plan", "scene.toml", "--lens", "missing"],
-        ["train", "missing.toml"], ["trade", "scene.toml", "--lens", "missing"], ["mitsuba", "cornell-box"],
+        ["survey", "fold", "--no-fit", "-o", "new", "--quiet"], ["plan", "scene.toml", "--lens", "missing"],
+        ["train", "missing.toml"], ["bench", "missing"], ["mitsuba", "cornell-box"],
     )  # fmt: skip
-    words = list(chance.choice([line for line in fine if line[0] in parsers()]))
+    words = list(chance.choice(fine))
     options = [o for o in parsers()[words[0]] if o not in _LONG]
     for _ in range(chance.choice((1, 1, 2))):
         if options and chance.random() < 0.7:
@@ -289,11 +291,17 @@ def _of_long_runs(chance: Chance, folder: Path) -> Words:
             (1, ("export", "model.onnx", "--to", "osl", "-o", "out.osl", "--json")),
             (1, ("projection", "model.onnx", *_FILM, "--model", "f-theta", "-o", "shot")),
         ),
-        "scene.toml": ((1, ("plan", "scene.toml", *lens)), (1, ("trade", "scene.toml", *lens, "--samples", "1"))),
-        "lens.toml": ((1, ("library", "-o", "new", "lens.toml", "--quiet")), (1, ("view", "lens.toml", "--json")),
-                      (1, ("projection", "lens.toml", *_FILM, "--model", "opencv", "-o", "shot"))),
+        "scene.toml": (
+            (1, ("plan", "scene.toml", *lens)),
+            (1, ("plan", "scene.toml", *lens, "--trade", "--samples", "1")),
+        ),
+        "lens.toml": (
+            (1, ("library", "-o", "new", "lens.toml", "--quiet")),
+            (1, ("view", "lens.toml", "--json")),
+            (1, ("projection", "lens.toml", *_FILM, "--model", "opencv", "-o", "shot")),
+        ),
     }
-    train = (1.0, ("train", "experiment.toml", "--out", "run", "--no-race", "--quiet"))
+    train = (1.0, ("train", "experiment.toml", "-o", "run", "--no-race", "--quiet"))
     return _pick(chance, by_file.get(name, (train,)))
 
 
@@ -379,9 +387,9 @@ def shorten() -> None:
             fields[key] = field_of(sources, args, *rest)
         return fields[key]
 
-    flare_lights.Sources._field = field  # type: ignore[method-assign]
+    flare_lights.Sources._field = field  # type: ignore[assignment,method-assign]
     survey_run.in_processes = engine  # type: ignore[assignment]
-    blender_lenses.form_of = form_of  # type: ignore[assignment]
+    blender_lenses.form_of = form_of
 
 
 # ---- Good files. -----------------------------------------------------------------------------------------------------
@@ -416,11 +424,11 @@ def make_seeds(folder: Path, kinds: set[str], run: Callable[[Path, Words], tuple
     (folder / "out.exr.part").rename(folder / "kept.part")
     for k in (1, 2):
         done(_render("thin", "--tile", f"{k}/2", "-o", "tile.exr"))
-    done(["survey", "fold", "--no-fit", "--out", "done", "--quiet"])
+    done(["survey", "fold", "--no-fit", "-o", "done", "--quiet"])
     if "ghosts" in kinds:
         done(["flare", "lens.toml", "--fit", "ghosts.onnx", "--target-um", "1000", "--angle", "10", "--quiet"])
     if "long runs" in kinds:
-        done(["train", "experiment.toml", "--out", "run", "--no-race", "--quiet"])
+        done(["train", "experiment.toml", "-o", "run", "--no-race", "--quiet"])
     for made in (*folder.glob("out.*"), *folder.glob("tile*.png")):
         if made.name != "tile.png":
             made.unlink()
