@@ -45,6 +45,7 @@ export PYTHONDONTWRITEBYTECODE :=
 
 demo: $(INSTALLED)
 	$(BIN)/neurolens train experiments/quickstart.toml
+	@printf '\nThis puts neurolens on the PATH of this shell, for the commands of the README:\n  . $(BIN)/activate\n'
 
 # Two processes of one thread each: torch's threads only wait for each other in small tests.
 test: $(INSTALLED)
@@ -60,7 +61,7 @@ test-blender: $(BLENDER_INSTALLED) $(INSTALLED)
 # A browser is not for pip to bring; without one this says so. onnxruntime-web comes of npm, once, into build/web.
 test-web: $(INSTALLED)
 	@set -e; if [ -z "$(CHROMIUM)" ]; then echo "no browser: the page is not tested (Debian: apt-get install chromium)"; exit 0; fi; \
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[web]' --no-build-isolation; \
+	$(BIN)/python -m pip install -c constraints.txt -e '.[web]' --no-build-isolation; \
 	if command -v npm >/dev/null; then npm install --silent --no-audit --no-fund --prefix build/web onnxruntime-web@$(ORT_WEB); \
 	else echo "no npm: models are not run in onnxruntime-web"; fi; \
 	ort=build/web/node_modules/onnxruntime-web/dist; \
@@ -106,12 +107,12 @@ $(INSTALLED): pyproject.toml constraints.txt
 	fi; \
 	echo "Setting up $(VENV) with $$found (once; torch is large)"; \
 	"$$found" -m venv $(VENV) || { echo "'$$found -m venv' failed: is the venv module installed (Debian: python3-venv)?" >&2; exit 1; }
-	$(BIN)/python -m pip install --quiet -c constraints.txt torch
-	$(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[train,dev]'
+	$(BIN)/python -m pip install -c constraints.txt torch
+	$(BIN)/python -m pip install -c constraints.txt --no-build-isolation -e '.[train,dev]'
 	@touch $@
 
 $(VENV)/.docs: $(INSTALLED)
-	$(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[docs,web]'
+	$(BIN)/python -m pip install -c constraints.txt --no-build-isolation -e '.[docs,web]'
 	@touch $@
 
 $(BLENDER_INSTALLED): Makefile
@@ -124,5 +125,5 @@ $(BLENDER_INSTALLED): Makefile
 	fi; \
 	echo "Setting up $(BLENDER_VENV) with $$found (once; Blender is large)"; \
 	"$$found" -m venv $(BLENDER_VENV)
-	$(BLENDER_VENV)/bin/python -m pip install --quiet $(BLENDER_PACKAGES)
+	$(BLENDER_VENV)/bin/python -m pip install $(BLENDER_PACKAGES)
 	@touch $@

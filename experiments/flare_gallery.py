@@ -71,7 +71,7 @@ PICTURES = (
         "sun",
         "A low sun over hills, by a 24 mm retrofocus lens at f/8 with single-layer coatings: ghosts and starburst are "
         "layers of the render, which the scene's table [flare] asks for.",
-        (f"neurolens render {_SUN} --camera lenses/tajima_retrofocus_24.toml --layers beauty -o OUT/sun.exr",),
+        (f"neurolens render {_SUN} --camera lenses/tajima_retrofocus_24.toml --channels beauty -o OUT/sun.exr",),
         (Panel(("sun",)),),
         stops=-0.3,
     ),
@@ -80,7 +80,7 @@ PICTURES = (
         "A wet street at night by a 50 mm double Gauss at f/8, bare, its six blades in the headlights' stars. The "
         "plate is by the thin lens of the same frame: no noise of dispersion.",
         (
-            f"neurolens render {_ROAD} --camera thin:{_GAUSS} --layers beauty -o OUT/road.exr",
+            f"neurolens render {_ROAD} --camera thin:{_GAUSS} --channels beauty -o OUT/road.exr",
             f"{_FLARE} laikin_double_gauss_50 --lights {_ROAD} --most 8 --focus 14 --f-number 8 --blades 6 --starburst "
             "--width 720 -o OUT/road-flare.exr",
         ),

@@ -7,8 +7,8 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from neurolens.commands.arguments import between, whole
-from neurolens.commands.render import film_size
+from neurolens.commands.arguments import add_exposure, between, whole
+from neurolens.commands.render import add_colour_space, film_size
 
 if TYPE_CHECKING:
     from neurolens.flare.layers import FlareSettings
@@ -49,6 +49,8 @@ def _add_picture(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--wavelengths", metavar="N", type=whole(1, 256), default=15, help="from 400 to 700 nm (default: 15)"
     )
+    add_exposure(group, None, "99% of the lit pixels become no brighter than 0.8; frames share one value")
+    add_colour_space(group, "; default: that of --image, else of a scene's [film] table, else sRGB")
     group.add_argument(
         "--preview", action="store_true",
         help="at most 480 pixels wide, 5 wavelengths and 65536 photons a light and wavelength, --cell at least 24",
@@ -59,8 +61,9 @@ def _add_layers(parser: argparse.ArgumentParser) -> None:
     """Add what layers there are, and how bright they are."""
     group = parser.add_argument_group("layers")
     group.add_argument(
-        "--layers", metavar="N", type=whole(0, 64), default=0, help="brightest ghosts as layers (default: 0)"
-    )
+        "--layers", metavar="N", type=whole(0, 64), default=0,
+        help="ghosts with a layer of their own, those with the greatest values on the film (default: 0)",
+    )  # fmt: skip
     group.add_argument(
         "--without",
         metavar="LAYER",

@@ -15,7 +15,7 @@ from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import atomic_path, atomic_write_text, library, safe_name, write_json
 from neurolens.base.lensname import lens_id_of
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_json, add_lens, check_run_folder
+from neurolens.commands.arguments import add_json, add_lens, add_output, check_run_folder
 from neurolens.commands.output import answer
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def add_parser(subparsers: Any) -> None:
         "library", help="pages of lenses: pictures, figures, models", description=_DESCRIPTION, epilog=_EPILOG
     )
     add_lens(parser, "lenses", " (default: all of lenses/)", nargs="*")
-    parser.add_argument("-o", "--output", metavar="FOLDER", type=Path, required=True, help="for the pages")
+    add_output(parser, "FOLDER", "for the pages", required=True)
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="finished pages are kept; the same command goes on")
 
@@ -54,8 +54,8 @@ def run(args: argparse.Namespace) -> int:
     """Write the pages; 1 where a lens could not be shown."""
     from neurolens.evaluate.describe import lens_files
 
-    folder = args.output
-    check_run_folder(folder, "neurolens library", "-o")
+    folder = args.out
+    check_run_folder(folder, "neurolens library", "--output")
     files = args.lenses or lens_files(library() / "lenses")
     names = _page_names(files)
     folder.mkdir(parents=True, exist_ok=True)

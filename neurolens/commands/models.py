@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -13,9 +12,9 @@ from typing import Any
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
 from neurolens.base.files import library
 from neurolens.base.lensname import lens_id_of
-from neurolens.commands.arguments import add_json
+from neurolens.commands.arguments import add_json, rms_error
 from neurolens.commands.output import answer, number, table
-from neurolens.evaluate.records import CLOSE_UM, reaches, to_use, use_command
+from neurolens.evaluate.records import CLOSE_UM, program, reaches, to_use, use_command
 from neurolens.modelfile import AVERAGED, transmittance_of
 
 _DESCRIPTION = """\
@@ -40,22 +39,11 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("lens", metavar="LENS", nargs="?", help="lens file, or part of a lens's name or id")
     parser.add_argument(
-        "--within", metavar="ERROR", type=_error, default=None,
+        "--within", metavar="ERROR", type=rms_error,
         help="only models of at most this RMS error: 1um, or 0.1px of a picture 4000 pixels wide",
     )  # fmt: skip
     add_json(parser)
     parser.set_defaults(run=run, kept="nothing is written")
-
-
-def _error(text: str) -> tuple[str, float]:
-    """Key of a card's error and its bound."""
-    match = re.fullmatch(r"([0-9.]{1,20}(?:e-?[0-9]{1,3})?)(um|px)", text)
-    try:
-        if match and 0 < float(match[1]) < 1e9:
-            return f"rms_{match[2]}", float(match[1])
-    except ValueError:
-        pass
-    raise argparse.ArgumentTypeError(f"got {text!r}, expected a number above 0 and its unit, as 1um or 0.1px")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -143,7 +131,7 @@ def _text(args: argparse.Namespace, listed: Sequence[dict[str, Any]], kept: Sequ
         best = min(listed, key=lambda m: m["rms_um"] if m["rms_um"] is not None else 1e9)
         key, most = args.within
         unit = key.removeprefix("rms_")
-        more = f"neurolens train --lens {best['lens']} --target-{unit} {most:g}"
+        more = f"{program()} train --lens {best['lens']} --within {most:g}{unit}"
         return f"None of {len(listed)} models is within {most:g} {unit}; the closest is {_said(best)}.\nFit one: {more}"
     header = ("", "model", "film mm", "focus m", "RMS um", "pixels", "ns", "C ns", "")
     rows = [

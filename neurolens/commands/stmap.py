@@ -6,7 +6,6 @@ import argparse
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
@@ -17,10 +16,12 @@ from neurolens.commands.arguments import (
     add_json,
     add_lens,
     add_lens_state,
+    add_option,
+    add_output,
     aperture_of,
-    between,
     check_folder,
     positive,
+    wavelengths_nm,
 )
 from neurolens.commands.output import answer, number
 from neurolens.commands.render import film_size
@@ -72,11 +73,11 @@ examples:
 def add_parser(subparsers: Any) -> None:
     """Add the command to the command line."""
     parser = subparsers.add_parser(
-        "stmap", help="ST maps: undistort and redistort pictures of a lens in compositing",
+        "stmap", help="ST maps, which undistort and redistort pictures of a lens",
         description=_DESCRIPTION, epilog=f"{CAMERAS_HELP}\n\n{_EPILOG}",
     )  # fmt: skip
     add_picture(parser)
-    parser.add_argument("-o", "--out", metavar="SHOT", type=Path, required=True, help="start of the files' names")
+    add_output(parser, "SHOT", "start of the files' names", required=True)
     parser.add_argument(
         "--projection", choices=PROJECTIONS, default=PROJECTIONS[0],
         help="of the undistorted picture (default: rectilinear, a plane: fields up to 85 degrees from the axis)",
@@ -87,11 +88,11 @@ def add_parser(subparsers: Any) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--lateral-colour", action="store_true",
-        help="maps for each channel too, SHOT.undistort.red.exr and so on, of the wavelengths of --channels-nm",
+        help="maps for each channel too, SHOT.undistort.red.exr and so on, of the --wavelengths",
     )  # fmt: skip
-    parser.add_argument(
-        "--channels-nm", metavar="R,G,B", type=_wavelengths, default=_CHANNELS_NM,
-        help="wavelengths in nm (default: 611.4,549.1,464.2, the dominant ones of Rec. 709)",
+    add_option(
+        parser, "--wavelengths", old=("--channels-nm",), metavar="NM", type=_channels, default=_CHANNELS_NM,
+        help="those of red, green and blue (default: 611.4,549.1,464.2 nm, the dominant ones of Rec. 709)",
     )  # fmt: skip
     add_frames(parser, "maps of these frames, SHOT.undistort.0001.exr and so on, all of one overscan", names=LENS_KEYS)
     add_state(parser)
@@ -139,12 +140,13 @@ def _pixels(text: str) -> tuple[int, int]:
     raise argparse.ArgumentTypeError(f"got {text!r}, expected WIDTHxHEIGHT in pixels, each from 1 to {_LARGEST}")
 
 
-def _wavelengths(text: str) -> tuple[float, ...]:
-    """Type of --channels-nm."""
-    words = text.split(",")
-    if len(words) != 3:
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected three wavelengths in nm: red, green, blue")
-    return tuple(between(*LIGHT_NM, "a wavelength in nm")(word) for word in words)
+def _channels(text: str) -> tuple[float, ...]:
+    """Type of --wavelengths: those of red, green and blue."""
+    found = wavelengths_nm(text)
+    if len(found) == 3 and all(LIGHT_NM[0] <= nm <= LIGHT_NM[1] for nm in found):
+        return found
+    span = f"{LIGHT_NM[0]:g} to {LIGHT_NM[1]:g}"
+    raise argparse.ArgumentTypeError(f"got {text!r}, expected three wavelengths from {span} nm: red,green,blue")
 
 
 @dataclass(frozen=True)
@@ -160,9 +162,9 @@ class _Frame:
 
 def run(args: argparse.Namespace) -> int:
     """Trace the fields of all frames, then write their maps, of one size."""
-    check_folder(args.out, "--out")
+    check_folder(args.out, "--output")
     if not args.out.name:
-        raise InputError(_COMMAND, "--out", str(args.out), "the start of the files' names")
+        raise InputError(_COMMAND, "--output", str(args.out), "the start of the files' names")
     if args.frames is None and args.key:
         raise InputError(_COMMAND, "--key", args.key[0], "--frames beside it")
     from neurolens.render.stmap import plates_of
@@ -193,7 +195,7 @@ def _traced(args: argparse.Namespace, text: str, progress: Progress) -> _Frame:
     for note in camera.settings.get("notes", ()):
         warn(note)
     frame = frame_of(camera)
-    wavelengths = dict(zip(_NAMES, args.channels_nm, strict=True)) if args.lateral_colour else {}
+    wavelengths = dict(zip(_NAMES, args.wavelengths, strict=True)) if args.lateral_colour else {}
     fields = {
         name: field_of(
             camera, shot.focus_m, args.projection, frame=frame, distance_m=args.distance,

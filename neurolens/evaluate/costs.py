@@ -62,7 +62,7 @@ def ns_a_ray(camera: Camera, places: Places) -> float:
 
 
 def glsl_operations(camera: OnnxCamera | ExactCamera) -> int:
-    """Of a ray of `neurolens export --camera --to glsl`: floats, a fused multiply-add is one.
+    """Of a ray of `neurolens export --whole-camera --to glsl`: floats, a fused multiply-add is one.
 
     Raises:
         InputError: a lens or model that has no such form.

@@ -243,7 +243,7 @@ def test_bad_input_is_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixtu
         ({"--focus": "nan"}, "--focus"),
         ({"--distance": "0.05"}, "entrance pupil"),
         ({"--key": "focus=1:1"}, "--frames beside it"),
-        ({"--channels-nm": "600,500"}, "three wavelengths"),
+        ({"--wavelengths": "600,500"}, "three wavelengths"),
         ({"-o": tmp_path / "none" / "a"}, "a folder that exists"),
         ({"camera": "lens.zmx"}, "a lens file of any format"),
         ({"camera": fisheye}, "degrees from the axis"),
