@@ -115,8 +115,8 @@ def turned(foot: float, outline: list[tuple[float, float]], around: int = 48) ->
     for before, here, there, after in zip(padded, padded[1:], padded[2:], padded[3:], strict=False):
         t = np.linspace(0, 1, 5)[1:, None]
         left, right = (there - before) / 2, (after - here) / 2
-        reach = np.linalg.norm(there - here)
-        left, right = (v * min(1, reach / max(float(np.linalg.norm(v)), 1e-9)) for v in (left, right))
+        reach = float(np.linalg.norm(there - here))
+        left, right = (v * min(1.0, reach / max(float(np.linalg.norm(v)), 1e-9)) for v in (left, right))
         rows.append(
             (2 * t**3 - 3 * t**2 + 1) * here + (t**3 - 2 * t**2 + t) * left
             + (3 * t**2 - 2 * t**3) * there + (t**3 - t**2) * right
@@ -150,8 +150,7 @@ def ridge(doublings: int = 8, slopes: int = 5) -> tuple[np.ndarray, np.ndarray]:
     for k in range(doublings - 2):  # midpoints move by less and less
         middle = (height[1:] + height[:-1]) / 2 + 0.16 * 0.56**k * chance.standard_normal(len(height) - 1)
         height = np.insert(height, np.arange(1, len(height)), middle)
-    low, high = float(height.min()), float(height.max())
-    height = (height - low + 0.1) / (high - low + 0.1)
+    height = (height - height.min() + 0.1) / (np.ptp(height) + 0.1)
     down = np.linspace(0, 1, slopes)[:, None]
     rough = 0.05 * np.sin(np.pi * down) * chance.standard_normal((slopes, len(height)))
     x = np.broadcast_to(np.linspace(-1, 1, len(height)), rough.shape)
