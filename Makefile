@@ -9,8 +9,9 @@
 #   make bench    the tracer's speed, then models against it; fails when a promised ratio is lost
 #   make models   fit again every model of models/
 #   make gallery  what real lenses do: render and measure every effect
-#   make docs     the documentation in build/docs, after its links, commands and how-tos were tried (3 CPU minutes);
-#                 NEUROLENS_ORT_HEADERS=/folder/of/onnxruntime_cxx_api.h also builds the how-to in C++
+#   make docs     the documentation in build/docs; its links, commands, how-tos and, where there is a Chromium, its search
+#                 are tried (5 CPU minutes); NEUROLENS_ORT_HEADERS=/folder/of/onnxruntime_cxx_api.h also builds the how-to
+#                 in C++, NEUROLENS_MITSUBA=1 renders that in Mitsuba (extra "mitsuba", and LLVM 17 or later)
 #   make lint     lint, format and types only
 #   make format   rewrite the code in the project's format
 #   make clean    remove .venv and caches
@@ -68,8 +69,8 @@ test-web: $(INSTALLED)
 	    $(BIN)/python -m pytest -q -rs tests/view/test_view_in_browser.py
 
 docs: $(INSTALLED) $(VENV)/.docs
-	OMP_NUM_THREADS=1 NEUROLENS_DOCS=1 $(BIN)/python -m pytest -q -n 2 tests/test_docs.py
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -f docs/mkdocs.yml
+	$(BIN)/sphinx-build -q -W --keep-going -b html -c docs . build/docs
+	NEUROLENS_BROWSER="$(CHROMIUM)" OMP_NUM_THREADS=1 NEUROLENS_DOCS=1 $(BIN)/python -m pytest -q -n 2 -rs tests/test_docs.py
 	@echo "Look at build/docs/index.html"
 
 bench: $(INSTALLED)
@@ -115,7 +116,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@touch $@
 
 $(VENV)/.docs: $(INSTALLED)
-	$(BIN)/python -m pip install -c constraints.txt --no-build-isolation -e '.[docs]'
+	$(BIN)/python -m pip install -c constraints.txt --no-build-isolation -e '.[docs,web]'
 	@touch $@
 
 $(BLENDER_INSTALLED): Makefile
