@@ -66,12 +66,6 @@ REFUSED: dict[str, list[tuple[str, Callable[[], object] | None, tuple[object, ..
     ],
 }
 OTHERS = ("trav.onnx", "longmethod.onnx", "fault.toml", "library_same_stem", "rings.exr")  # each has a test below
-    "trav.onnx",
-    "longmethod.onnx",
-    "fault.toml",
-    "library_same_stem",
-    "rings.exr",
-)  # what other tests below hold
 
 
 def test_every_case_is_a_test() -> None:
