@@ -5,7 +5,7 @@ film stretches, folds or turns it (Hullin et al. 2011, section 4.2, spread light
 where the largest r / R on the way is 1, taken to be linear in between. Pixels are covered exactly: an edge adds its
 height, times the step of density across it, to the pixels that it passes, and sums along rows are the picture.
 Within whole cells the density is linear, between the means of the cells about each corner: where these change little
-from cell to cell no borders are seen, and each cell keeps its light.
+from cell to cell no borders are seen, and each cell keeps its light, but for a part in 10,000 at its border pixels.
 """
 
 from __future__ import annotations

@@ -216,17 +216,45 @@ def ghost_picture(
     threads: int = 2,
     done: Callable[[float], None] = lambda share: None,
 ) -> Floats:
-    """The ghosts of lights, [layers, H, W, 3] linear sRGB, each drawn as the areas of a grid of rays (`flare.area`).
+    """The ghosts of lights, [layers, H, W, 3] linear sRGB, as `ghost_layers` draws them.
+
+    Args:
+        layers: of each pair the layer that takes it; None puts all into one.
+    """
+    layers = [0] * len(tracer.pairs) if layers is None else layers
+    picture = np.zeros((1 + max(layers, default=0), raster.height, raster.width, 3), np.float32)
+    for number, drawn in ghost_layers(
+        tracer, lights, raster, layers, wavelength_nm=wavelength_nm, wavelengths=wavelengths, cell_px=cell_px,
+        threads=threads, done=done,
+    ):  # fmt: skip
+        picture[number] = drawn
+    return picture
+
+
+def ghost_layers(
+    tracer: GhostTracer | GhostModel,
+    lights: Sequence[Light],
+    raster: Raster,
+    layers: Sequence[int],
+    *,
+    wavelength_nm: tuple[float, float] = (400.0, 700.0),
+    wavelengths: int = 15,
+    cell_px: float = 8.0,
+    threads: int = 2,
+    done: Callable[[float], None] = lambda share: None,
+) -> Iterator[tuple[int, Floats]]:
+    """Number and picture [H, W, 3] linear sRGB of each layer that has light, one after the other.
+
+    Each ghost is drawn as the areas of a grid of rays (`flare.area`).
 
     Args:
         wavelengths: of equal shares of the range, which fewer stand for where a ghost's colours part little. cell_px:
             size of a grid's cells on the film, about: see `grids_of`.
-        layers: of each pair the layer that takes it; None puts all into one.
+        layers: of each pair the layer that takes it.
         done: told the share of the work that is done.
     """
     lens, spectral = tracer.lens, SpectralRange(*wavelength_nm, bins=wavelengths)
-    layer = dict(zip(tracer.pairs, [0] * len(tracer.pairs) if layers is None else layers, strict=True))
-    picture = np.zeros((1 + max(layer.values(), default=0), raster.height, raster.width, 3), np.float32)
+    layer = dict(zip(tracer.pairs, layers, strict=True))
     middle = 0.5 * sum(wavelength_nm)
     unit = raster.per_mm**2 / axis_irradiance(lens, middle) / wavelengths
     half, nm = (raster.film_mm[0] / 2, raster.height / raster.per_mm / 2), spectral.centres_nm
@@ -241,19 +269,21 @@ def ghost_picture(
             task = light, pair, grid, *_bands(nm, response, grid.wavelengths)
             groups.setdefault((layer[pair], smear_of(patch, moved)), []).append(task)
     work = _Work(sum(map(len, groups.values())), done)
-    for (number, smear), tasks in groups.items():
-        if smear is None:
-            _draw(tracer, tasks, picture[number], raster.per_mm, work, threads)
-            continue
-        coarse = smear.coarse
-        kernel = smear.kernel(max(raster.width, raster.height) // 2, coarse)
-        more = 3 * (coarse > 1) - 1
-        room = [n // coarse + k + more for n, k in zip(picture.shape[1:3], kernel.shape, strict=True)]
-        canvas = np.zeros((*room, 3), np.float32)
-        _draw(tracer, tasks, canvas, raster.per_mm / coarse, work, threads)
-        found = smeared(canvas, kernel) / np.float32(coarse**2)
-        picture[number] += enlarged(found, coarse, raster.height, raster.width)
-    return picture
+    for number in sorted({number for number, _ in groups}):
+        picture = np.zeros((raster.height, raster.width, 3), np.float32)
+        for (_, smear), tasks in ((key, tasks) for key, tasks in groups.items() if key[0] == number):
+            if smear is None:
+                _draw(tracer, tasks, picture, raster.per_mm, work, threads)
+                continue
+            coarse = smear.coarse
+            kernel = smear.kernel(max(raster.width, raster.height) // 2, coarse)
+            more = 3 * (coarse > 1) - 1
+            room = [n // coarse + k + more for n, k in zip(picture.shape[:2], kernel.shape, strict=True)]
+            canvas = np.zeros((*room, 3), np.float32)
+            _draw(tracer, tasks, canvas, raster.per_mm / coarse, work, threads)
+            found = smeared(canvas, kernel) / np.float32(coarse**2)
+            picture += enlarged(found, coarse, raster.height, raster.width)
+        yield number, picture
 
 
 def _draw(

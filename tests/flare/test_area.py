@@ -60,7 +60,7 @@ def test_cells_have_no_borders_where_density_changes_little() -> None:
     density = (2 / 8 * 24) ** -2 / np.sqrt(np.maximum(1 + x, 0.01))
     inside = (x > -0.55) & (x < 0.9)  # the outermost cells know one side of their border alone
     assert picture[25][inside] == pytest.approx(density[inside], rel=0.015)
-    assert picture.sum() == pytest.approx(64, rel=1e-6)
+    assert picture.sum() == pytest.approx(64, rel=2e-4)  # slopes end at the middles of border pixels
 
 
 def test_what_lies_off_the_film_changes_nothing_on_it() -> None:
