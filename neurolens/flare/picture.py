@@ -29,7 +29,7 @@ from neurolens.flare.ghosts import Four, GhostTracer, Way, four_reflections
 from neurolens.flare.grids import REACH, Grid, ghost_moves, grids_of
 from neurolens.flare.lights import Light, disc, light_rays, patches, rays_across
 from neurolens.flare.photons import LEVELS, Photons, PhotonTracer
-from neurolens.flare.smear import Smear, enlarged, smear_of, smeared
+from neurolens.flare.smear import Smear, enlarged, smear_of, smeared, spread
 from neurolens.flare.stack import Floats
 from neurolens.optics.glass import inverse_square_um
 from neurolens.optics.paraxial import first_order
@@ -485,24 +485,11 @@ def _smoothed(picture: Floats, sums: Floats, radius: float) -> Floats:
     """
     found, left, last = np.zeros_like(picture), np.ones(picture.shape[:2], np.float32), False
     while not last:
-        weight, square = np.moveaxis(_spread(np.moveaxis(sums, 0, 2), radius), 2, 0)
+        weight, square = np.moveaxis(spread(np.moveaxis(sums, 0, 2), radius), 2, 0)
         last = 8 * radius > min(picture.shape[:2])
         # n photons of equal weight have a sum of squares of n times the kernel's mean square, 4 / (3 pi r^2).
         enough = 0.75 * math.pi * radius**2 * weight**2 / np.maximum(square, 1e-30) / _ENOUGH
         share = np.ones_like(left) if last else (enough - 0.5).clip(0, 1)
-        found += _spread(picture * (left * share)[..., None], radius)
+        found += spread(picture * (left * share)[..., None], radius)
         left, radius = left * (1 - share), 2 * radius
     return in_gamut(found)
-
-
-def _spread(picture: Floats, radius: float) -> Floats:
-    """A picture [H, W, C] under one kernel."""
-    reach = min(math.ceil(radius), *picture.shape[:2])
-    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-    kernel = np.maximum(1 - (x * x + y * y) / radius**2, 0)
-    kernel[reach, reach] = 1
-    padded = np.pad(picture, ((reach, reach), (reach, reach), (0, 0)), mode="symmetric")
-    size = [n + 2 * reach for n in padded.shape[:2]]
-    whole = np.fft.rfft2(padded, size, axes=(0, 1)) * np.fft.rfft2(kernel / kernel.sum(), size)[..., None]
-    kept = np.fft.irfft2(whole, size, axes=(0, 1))[2 * reach :, 2 * reach :]
-    return kept[: picture.shape[0], : picture.shape[1]].astype(np.float32)

@@ -116,3 +116,16 @@ def enlarged(picture: Floats, factor: int, height: int, width: int) -> Floats:
         part = np.moveaxis((at - first).astype(np.float32)[:, None, None], 0, axis)
         picture = picture.take(first, axis) * (1 - part) + picture.take(first + 1, axis) * part
     return picture
+
+
+def spread(picture: Floats, radius: float) -> Floats:
+    """A picture [H, W, C] under a kernel of Epanechnikov of this radius, mirrored at the edges."""
+    reach = min(math.ceil(radius), *picture.shape[:2])
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    kernel = np.maximum(1 - (x * x + y * y) / radius**2, 0)
+    kernel[reach, reach] = 1
+    padded = np.pad(picture, ((reach, reach), (reach, reach), (0, 0)), mode="symmetric")
+    size = [n + 2 * reach for n in padded.shape[:2]]
+    whole = np.fft.rfft2(padded, size, axes=(0, 1)) * np.fft.rfft2(kernel / kernel.sum(), size)[..., None]
+    kept = np.fft.irfft2(whole, size, axes=(0, 1))[2 * reach :, 2 * reach :]
+    return kept[: picture.shape[0], : picture.shape[1]].astype(np.float32)
