@@ -63,7 +63,7 @@ class Picture:
     stops: float = 0.0
 
 
-_COATINGS = {"bare": 0.0, "single-layer": 4.0, "three-layer": 6.0, "multi-layer": 7.0}
+_COATINGS = {"bare": 0.0, "single-layer": 4.0, "three-layer": 7.0, "multi-layer": 9.0}
 _N = ("2.8", "5.6", "11", "22")
 PICTURES = (
     Picture(
@@ -78,6 +78,7 @@ PICTURES = (
             "--width 640 -o OUT/veil.exr",
         ),
         (Panel(("sun", "sun-flare", "veil")),),
+        stops=0.4,
     ),
     Picture(
         "headlights",

@@ -12,7 +12,7 @@ roulette. Noise is relative to the sum of squares of the picture; compiling is n
 
 One element (Steinert 2009, Fig. 6.5): a retrofocus lens of 25 mm at f/2.8, bare but for a single layer on both sides of
 one element: what that does to the image of a light and to the sum of its ghosts. The picture: open and stopped down to
-six blades (his Fig. 6.4), bare and coated (6.5), and light that scatters. Writes glare.md, glare.json, glare.png.
+six blades (his Fig. 6.4), bare and coated (6.5), and light that scatters. Writes glare.md, glare.json, glare.jpg.
 """
 
 from __future__ import annotations
@@ -242,7 +242,7 @@ def _draw(gauss: Lens, retrofocus: Lens, args: argparse.Namespace) -> None:
             axis.set_title(title, fontsize=8)
             axis.tick_params(labelsize=7)
     figure.supxlabel("mm on the film", fontsize=8)
-    lab.write_figure(args.out / "glare.png", figure, 100)
+    lab.write_figure(args.out / "glare.jpg", figure, 100)
 
 
 # ---- Ways. -----------------------------------------------------------------------------------------------------------

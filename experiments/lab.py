@@ -209,7 +209,7 @@ def write_results(folder: Path, name: str, text: str, data: Any) -> str:
 
 
 def write_figure(file: Path, figure: Any, dpi: int) -> None:
-    """Write a figure (of matplotlib) as PNG of 256 colours, atomically, and close it."""
+    """Write a figure (of matplotlib) as PNG of 256 colours, or as JPEG, atomically, and close it."""
     from matplotlib import pyplot as plt
     from PIL import Image
 
@@ -217,9 +217,12 @@ def write_figure(file: Path, figure: Any, dpi: int) -> None:
     drawn = io.BytesIO()
     figure.savefig(drawn, dpi=dpi, format="png")
     plt.close(figure)
-    few = Image.open(drawn).convert("RGB").quantize(256, dither=Image.Dither.NONE)
+    picture = Image.open(drawn).convert("RGB")
     with atomic_path(file) as temporary:
-        few.save(temporary, "PNG", optimize=True)
+        if file.suffix == ".jpg":
+            picture.save(temporary, "JPEG", quality=90, subsampling=0)
+        else:
+            picture.quantize(256, dither=Image.Dither.NONE).save(temporary, "PNG", optimize=True)
 
 
 def write_small_png(file: Path, pictures: Iterable[Any], most_bytes: int) -> None:

@@ -4,7 +4,7 @@ Ten million photons of 550 nm for each place of the light, with 10 reflections a
 twenty million for three places. His photons left the light in a cone tuned by hand and 30 to 32% of them reached the
 sensor, in 7867 to 9017 s, and twenty million in 12 to 15 hours (2008); ours are aimed at the sphere about the front
 surface, so that their share is another: both are told. Compiling is not counted; processor seconds are those of all
-threads. Writes photons.md, photons.json and photons.png (the flare alone, 9 wavelengths of 16 million photons each, for
+threads. Writes photons.md, photons.json and photons.jpg (the flare alone, 9 wavelengths of 16 million photons each, for
 a smooth picture; beside it all pairs of reflections without chance).
 """
 
@@ -127,7 +127,7 @@ def _draw(tracer: PhotonTracer, args: argparse.Namespace) -> None:
     raster, panels = Raster(FILM_MM, 480, 320), []
     for x, y, most, _ in CASES:
         photons = photon_picture(
-            tracer, [light_at(x, y)], raster, photons=_SHOWN, wavelengths=9, kernel_px=8.0,
+            tracer, [light_at(x, y)], raster, photons=_SHOWN, wavelengths=9, kernel_px=12.0,
             most_reflections=most, threads=args.threads,
         )  # fmt: skip
         panels.append((f"light at {x}, {y} mm, {most} reflections", photons))
@@ -141,7 +141,7 @@ def _draw(tracer: PhotonTracer, args: argparse.Namespace) -> None:
         axis.set_title(title, fontsize=8)
         axis.set_xlabel("mm", fontsize=7)
         axis.tick_params(labelsize=7)
-    lab.write_figure(args.out / "photons.png", figure, 100)
+    lab.write_figure(args.out / "photons.jpg", figure, 100)
 
 
 _COLUMNS = lab.columns(

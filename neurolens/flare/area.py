@@ -332,20 +332,21 @@ static void sloped(
     struct plane *plane)
 {
     double mean[2], off[2];
+    int even[2];
     for (int h = 0; h < 2; h++) {
         plane[h] = (struct plane){ density[h], 0.0, 0.0 };
         mean[h] = (value[h][0] + value[h][1] + value[h][2]) / 3.0;
         off[h] = density[h] - mean[h];
+        even[h] = fabs(area[h]) > EVEN;
+        for (int k = 0; k < 3; k++)
+            even[h] &= value[h][k] / density[h] > 0.5 && value[h][k] / density[h] < 2.0;
     }
-    if (density[0] == density[1])
+    if (density[0] == density[1] && even[0] && even[1]) /* else the half at a caustic would shift the other */
         off[0] = off[1] = density[0] - (mean[0] * area[0] + mean[1] * area[1]) / (area[0] + area[1]);
     for (int h = 0; h < 2; h++) {
         const struct point *const p = corner[h];
         const double *const v = value[h];
-        int even = fabs(area[h]) > EVEN;
-        for (int k = 0; k < 3; k++)
-            even &= v[k] / density[h] > 0.5 && v[k] / density[h] < 2.0;
-        if (!even) continue;
+        if (!even[h]) continue;
         const double dx = p[1].x - p[0].x, dy = p[1].y - p[0].y, ex = p[2].x - p[0].x, ey = p[2].y - p[0].y;
         const double right = ((v[1] - v[0]) * ey - (v[2] - v[0]) * dy) / (2.0 * area[h]);
         const double down = ((v[2] - v[0]) * dx - (v[1] - v[0]) * ex) / (2.0 * area[h]);

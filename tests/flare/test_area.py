@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from neurolens.flare.area import draw_edges, edges_of
-from neurolens.flare.ghosts import GhostTracer, coated
+from neurolens.flare.ghosts import GhostTracer, coated, ghost_pairs
 from neurolens.flare.grids import REACH, grids_of
 from neurolens.flare.lights import Light, light_rays, rays_across
 from neurolens.flare.picture import Raster, ghost_picture
@@ -15,6 +15,8 @@ from neurolens.flare.steps import LOST
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.optics.apertures import Aperture
+from neurolens.optics.lensfile import read_lens
+from neurolens.render.colour import SRGB
 from tests.flare.test_ghosts import lens_of
 
 
@@ -236,3 +238,13 @@ def test_faint_ghosts_that_a_rim_cuts_by_colour_cost_little() -> None:
     grids = grids_of(tracer, Light(15.0, 8.0), 550.0, (18.0, 12.0), 0.3, (410.0, 690.0)).values()
     cells = np.array([grid.columns * grid.rows for grid in grids])
     assert cells @ np.clip([grid.wavelengths for grid in grids], 4, 15) < 1.1 * 4 * cells.sum()
+
+
+def test_a_caustic_takes_no_light_from_beside_it() -> None:
+    """A cell with a caustic in one half keeps the other half's density: no pixel has a negative luminance."""
+    lens = read_lens("lenses/tajima_retrofocus_24.toml").with_aperture(Aperture(blades=6))
+    lens = lens.at(focus_m=40.0, f_number=2.8, focus="best")
+    tracer = GhostTracer(lens, [pair for pair in ghost_pairs(lens) if pair.name == "g11-06"])
+    light = Light(13.7266, 10.0068, (2.57, 1.6, 0.67))
+    luminance = ghost_picture(tracer, [light], Raster((36.0, 24.0), 640, 427))[0] @ SRGB.to_xyz[1]
+    assert luminance.min() > -0.01 * luminance.max()
