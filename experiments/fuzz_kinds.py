@@ -426,7 +426,7 @@ def make_seeds(folder: Path, kinds: set[str], run: Callable[[Path, Words], tuple
         done(_render("thin", "--tile", f"{k}/2", "-o", "tile.exr"))
     done(["survey", "fold", "--no-fit", "-o", "done", "--quiet"])
     if "ghosts" in kinds:
-        done(["flare", "lens.toml", "--fit", "ghosts.onnx", "--target-um", "1000", "--angle", "10", "--quiet"])
+        done(["flare", "lens.toml", "--fit", "ghosts.onnx", "--within", "1000um", "--angle", "10", "--quiet"])
     if "long runs" in kinds:
         done(["train", "experiment.toml", "-o", "run", "--no-race", "--quiet"])
     for made in (*folder.glob("out.*"), *folder.glob("tile*.png")):

@@ -12,7 +12,7 @@ from typing import Any
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
 from neurolens.base.files import library
 from neurolens.base.lensname import lens_id_of
-from neurolens.commands.arguments import add_json, rms_error
+from neurolens.commands.arguments import add_json, add_within
 from neurolens.commands.output import answer, number, table
 from neurolens.evaluate.records import CLOSE_UM, program, reaches, to_use, use_command
 from neurolens.modelfile import AVERAGED, transmittance_of
@@ -39,10 +39,7 @@ def add_parser(subparsers: Any) -> None:
         "models", help="list models that are here, and the one to use", description=_DESCRIPTION, epilog=_EPILOG
     )
     parser.add_argument("lens", metavar="LENS", nargs="?", help="lens file, or part of a lens's name or id")
-    parser.add_argument(
-        "--within", metavar="ERROR", type=rms_error,
-        help="only models of at most this RMS error: 1um, or 0.1px of a picture 4000 pixels wide",
-    )  # fmt: skip
+    add_within(parser, "only models of at most this RMS error: 1um, or 0.1px of a picture 4000 pixels wide")
     add_json(parser)
     parser.set_defaults(run=run, kept="nothing is written")
 

@@ -19,9 +19,9 @@ from neurolens.commands.arguments import (
     add_json,
     add_lens,
     add_output,
+    add_within,
     check_ids,
     check_run_folder,
-    rms_error,
     whole,
 )
 from neurolens.commands.farm import Task, add_dask, files_of, spread
@@ -78,16 +78,10 @@ def add_parser(subparsers: Any) -> None:
         "--internal-focus", action="store_true",
         help="of --lens: one model of internal focus, infinity to the near limit (input \"state\", in 1/m)",
     )  # fmt: skip
-    parser.add_argument(
-        "--within", metavar="ERROR", type=rms_error,
-        help="of --lens: the fastest model whose film-equivalent RMS on rays held out is at most this, 2um or 0.1px: "
-        "models from 12 coefficients to a network of 2 x 32 units are fitted until one is; exit code 1 if none is",
+    add_within(
+        parser, "of --lens: the fastest model whose film-equivalent RMS on rays held out is at most this, 2um or "
+        "0.1px: models from 12 coefficients to a network of 2 x 32 units are fitted until one is; exit code 1 if none is",
     )  # fmt: skip
-    for unit in ("um", "px"):  # how --within was spelled until version 0.9
-        parser.add_argument(
-            f"--target-{unit}", dest="within", type=lambda text, unit=unit: rms_error(text + unit),
-            help=argparse.SUPPRESS,
-        )  # fmt: skip
     parser.add_argument(
         "--pixels-across", metavar="N", type=whole(1, 10**6), default=4000,
         help="of --within in pixels: how many make the width of the 3:2 frame inscribed in the film circle (default: "
