@@ -80,7 +80,7 @@ def add_parser(subparsers: Any) -> None:
     )  # fmt: skip
     add_within(
         parser, "of --lens: the fastest model whose film-equivalent RMS on rays held out is at most this, 2um or "
-        "0.1px: models from 12 coefficients to a network of 2 x 32 units are fitted until one is; exit code 1 if none is",
+        "0.1px; models from 12 coefficients to a network of 2 x 32 units are fitted until one is (exit code 1: none)",
     )  # fmt: skip
     parser.add_argument(
         "--pixels-across", metavar="N", type=whole(1, 10**6), default=4000,
