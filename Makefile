@@ -4,8 +4,8 @@
 #   make test     tests, then lint, format and types
 #   make test-blender   the extension in Blender 5.0, in .venv-blender (Python 3.11; about 400 MB, once);
 #                       BLENDER=4.5.0 or 5.2.3 for another (from 5.1 on it needs Python 3.13)
-#   make test-web the page of `neurolens view` in headless Chromium (Debian: chromium; CHROMIUM=/path/to/another), and its
-#                 models in onnxruntime-web where npm is
+#   make test-web the pages that commands write, in headless Chromium (Debian: chromium; CHROMIUM=/path/to/another): what
+#                 `neurolens view` draws, scripts in every text; its models in onnxruntime-web where npm is
 #   make bench    the tracer's speed, then models against it; fails when a promised ratio is lost
 #   make models   fit again every model of models/
 #   make gallery  what real lenses do: render and measure every effect
@@ -60,13 +60,13 @@ test-blender: $(BLENDER_INSTALLED) $(INSTALLED)
 
 # A browser is not for pip to bring; without one this says so. onnxruntime-web comes of npm, once, into build/web.
 test-web: $(INSTALLED)
-	@set -e; if [ -z "$(CHROMIUM)" ]; then echo "no browser: the page is not tested (Debian: apt-get install chromium)"; exit 0; fi; \
+	@set -e; if [ -z "$(CHROMIUM)" ]; then echo "no browser: pages are not tested (Debian: apt-get install chromium)"; exit 0; fi; \
 	$(BIN)/python -m pip install -c constraints.txt -e '.[web]' --no-build-isolation; \
 	if command -v npm >/dev/null; then npm install --silent --no-audit --no-fund --prefix build/web onnxruntime-web@$(ORT_WEB); \
 	else echo "no npm: models are not run in onnxruntime-web"; fi; \
 	ort=build/web/node_modules/onnxruntime-web/dist; \
 	NEUROLENS_BROWSER="$(CHROMIUM)" NEUROLENS_ORT="$$(test -d $$ort && echo $$ort)" \
-	    $(BIN)/python -m pytest -q -rs tests/view/test_view_in_browser.py
+	    $(BIN)/python -m pytest -q -rs tests/view
 
 docs: $(INSTALLED) $(VENV)/.docs
 	$(BIN)/sphinx-build -q -W --keep-going -b html -c docs . build/docs

@@ -193,7 +193,7 @@ def _set(
     Raises:
         LensError: it does not compile.
     """
-    first = not applied(camera)
+    first, in_units = not applied(camera), "unit_m" in camera.cycles_custom
     opened = camera.dof.aperture_fstop if camera.dof.use_dof else None
     scene.render.engine = "CYCLES"
     if _on_other_gpu(scene):
@@ -209,7 +209,6 @@ def _set(
     if first and not _is_animated(camera, "lens"):
         camera.lens = max(1.0, lens.efl_mm)  # what the viewport shows is framed by it
     camera.dof.use_dof = True  # or Cycles does not tell shaders the focus
-    in_units = "unit_m" in camera.cycles_custom
     _compile(camera)
     custom = camera.cycles_custom
     if "unit_m" in custom and not in_units:  # one that the user has turned stays
