@@ -2,10 +2,10 @@
 
 In turn in one run of Blender, one thread: the built-in camera without and with depth of field, a thin lens written in
 OSL, a polynomial of a 50 mm double Gauss (12 refractions) as a shader, a network of its error and one of a hundredth, a
-polynomial of a 70-200 mm zoom (33 refractions), and both lenses exactly, with every surface traced. First with nothing but a white sky, where a ray costs little beside
-the camera; then meshes and lamps, in the open, where most light leaves after a bounce or two, and in a room. Blender's
-Python is a process of its own: what it takes to begin is measured by pictures of a few rays, and taken off. Writes
-osl_speed.md and osl_speed.json.
+polynomial of a 70-200 mm zoom (33 refractions), and both lenses exactly, with every surface traced. First with nothing
+but a white sky, where a ray costs little beside the camera; then meshes and lamps, in the open, where most light leaves
+after a bounce or two, and in a room. Blender's Python is a process of its own: what it takes to begin is measured by
+pictures of a few rays, and taken off. Writes osl_speed.md and osl_speed.json.
 """
 
 from __future__ import annotations

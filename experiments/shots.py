@@ -126,7 +126,7 @@ def _errors(found: Probed, camera: OnnxCamera) -> tuple[float, float]:
 def _measured(found: Probed, file: Path, terms: int) -> Model:
     camera = _onnx(found, file)
     um, light = _errors(found, camera)
-    ns = ns_a_ray(FusedCamera(load_model(file), **_real(found)), found.places)
+    ns = ns_a_ray(FusedCamera(load_model(file), **_real(found)), found.places)["min"]
     return Model(terms, um, light, glsl_operations(camera), ns)
 
 

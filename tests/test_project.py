@@ -19,7 +19,7 @@ SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 PROJECT = SETTINGS["project"]
 FOLDERS = ("neurolens", "experiments", "tests")
 IN_BLENDER = {"bpy", "bmesh", "cycles"}  # modules that Blender brings
-# Distributions that nothing here imports: programs, their plugins, and cryptography, with which distributed makes its keys.
+# Distributions that nothing here imports: programs, plugins, and cryptography, with which distributed makes keys.
 TOOLS = {"pytest-xdist", "ruff", "mypy", "mkdocs-material", "mkdocstrings", "cryptography"}
 
 

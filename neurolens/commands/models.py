@@ -15,7 +15,8 @@ from neurolens.base.files import library
 from neurolens.base.lensname import lens_id_of
 from neurolens.commands.arguments import add_json
 from neurolens.commands.output import answer, number, table
-from neurolens.evaluate.records import CLOSE_UM, reaches, to_use, use_command
+from neurolens.evaluate.advice import CLOSE_UM, to_use, use_command
+from neurolens.evaluate.records import reaches, time_of
 from neurolens.modelfile import AVERAGED, transmittance_of
 
 _DESCRIPTION = """\
@@ -178,6 +179,6 @@ def _remarks(model: dict[str, Any]) -> list[str]:
 
 def _said(model: dict[str, Any]) -> str:
     error = f"{number(model['rms_um'], 3)} um" if model["rms_um"] is not None else "error not known"
-    timing = model["fused_ns_per_ray"] or model["ns_per_ray"]
+    timing = time_of(model)
     more = f", {number(timing['min'], 3)} ns a ray" if timing else ""
     return f"{model['file']} ({error}{more})"

@@ -16,7 +16,7 @@ from neurolens.commands.arguments import add_glass, add_json, add_lens, check_ru
 from neurolens.commands.output import answer, number, table
 from neurolens.commands.plan_frames import run_plan_frames
 from neurolens.commands.render_frames import add_frames
-from neurolens.evaluate.records import plain
+from neurolens.evaluate.records import NOISY, plain
 
 if TYPE_CHECKING:
     from neurolens.evaluate.plan import Choice, Plan
@@ -230,12 +230,13 @@ def _text(args: argparse.Namespace, found: Plan, folder: Path) -> str:
         header = ("", "camera", "px", "light", found.unit, "noise", "")
         parts.append(table(header, [
             ("*" if c == found.best else "+" if c.within else "", c.name, number(c.error_px, 3),
-             number(c.light_error, 2), number(c.cost, 3), number(c.noise, 3), c.how)
+             number(c.light_error, 2), "~" * c.noisy + number(c.cost, 3), number(c.noise, 3), c.how)
             for c in found.choices
         ], left=2))  # fmt: skip
         parts.append(
             "* to use, + within the budget; px, light: errors that 95% of the picture keep; "
-            f"{found.unit} a ray times noise, the rays it takes for equal error"
+            f"{found.unit} a ray times noise, the rays it takes for equal error; ~ noisy: the median of its calls took "
+            f"more than {NOISY:g} times the least, which is shown"
         )
     best = found.best
     if best is None and found.budget_s is not None:
@@ -252,6 +253,8 @@ def _text(args: argparse.Namespace, found: Plan, folder: Path) -> str:
             allowed = f"FLIP {number(best.flip, 2)} of {found.budget_flip:g}"
         told = f"Use {best.name}: {number(best.error_px, 3)} px {allowed}, {number(best.cost, 3)} "
         told += f"{found.unit} a ray times noise"
+        if best.error_px == 0 and found.rest:
+            told += f"; a path takes {number(found.rest, 3)} besides, and no camera with an error saves enough of that"
         parts.append("\n".join([f"{told}{', ' + best.how if best.how else ''}", *_commands(args, found, best, folder)]))
     written = ["plan.json", "effects.png", *["plan.toml"] * bool(best), *["samples.exr"] * args.samples]
     return "\n\n".join([*parts, f"Written: {folder}/{', '.join(written)}"])

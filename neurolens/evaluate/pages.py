@@ -15,6 +15,8 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
+from neurolens.evaluate.records import noisy
+
 Record = Mapping[str, Any]
 DASH = "–"
 
@@ -43,11 +45,14 @@ class Column:
     about: str = ""
 
     def cell(self, record: Record, thousands: str = "") -> str:
-        """The figure as text, a dash for None; the word "never" stays."""
+        """The figure as text, a dash for None, "~" before the least of a noisy timing; the word "never" stays."""
         if record.get(self.key) == "never":
             return "never"
-        value = number(record, self.key)
-        return DASH if value is None else show(value * self.factor, self.digits, thousands)
+        value, parent = number(record, self.key), self.key.removesuffix(".min")
+        if value is None:
+            return DASH
+        mark = "~" if parent != self.key and noisy(record[parent]) else ""
+        return mark + show(value * self.factor, self.digits, thousands)
 
 
 def show(value: float, digits: int, thousands: str = "") -> str:

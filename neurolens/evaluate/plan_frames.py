@@ -25,7 +25,10 @@ from neurolens.evaluate.plan import (
     Choice,
     Target,
     candidates,
+    decided,
+    exact_suffices,
     model_choice,
+    rest_of,
     shot_domain,
     shot_fits,
     shot_terms,
@@ -113,12 +116,14 @@ def plan_frames(
         founds.append(probe(frame.scene, lens.at(zoom=frame.zoom), afterwards=afterwards, denoised=denoised))
         say(0.4 * len(founds) / len(chosen))
     best: list[Choice | None] = []
+    rest = rest_of(chosen[0].scene, founds[0], target)
     for found in founds:
-        tried = [c for c in candidates(found, (budget_px,), target, models=models) if c.meets(budget_px)]
-        best.append(min(tried, key=lambda c: c.cost, default=None))
+        best.append(
+            decided(found, candidates(found, (budget_px,), target, models=models), budget_px, target, rest).best
+        )
         say(0.4 + 0.3 * len(best) / len(founds))
     fits = 0
-    if folder is not None:
+    if folder is not None and not exact_suffices(founds[0], rest):
         # What has no camera, or one that costs more than a small model may.
         asks = [k for k, c in enumerate(best) if c is None or not c.name.startswith(("pinhole", "thin"))]
         for rows, choice in _stretches([founds[k] for k in asks], target, budget_px, folder):
