@@ -146,7 +146,8 @@ def _text(found: Trade, folder: Path) -> str:
     ]  # fmt: skip
     shown = table(("", "camera", "px", "light", found.unit, "FLIP", ""), rows, left=2)
     legend = f"* for the budget, + no other betters it; {found.unit}: added, of one thread to equal noise, ~ noisy; "
-    legend += f"FLIP at {found.samples} samples a pixel of the same random numbers, with noise where cameras use them otherwise"
+    legend += f"FLIP at {found.samples} samples a pixel of the same random numbers, with noise where cameras use them "
+    legend += "otherwise"
     written = f"Written: {folder}/trade.html, trade.png, pictures.png, trade.json"
     return "\n\n".join([shown, legend, "\n".join(_said(found)), written])
 
@@ -156,13 +157,9 @@ def _page(found: Trade, folder: Path, title: str) -> str:
 
     flips = {s.offer.choice.name: s.flip for s in found.shown}
     records = [
-        {
-            **asdict(o.choice),
-            "seconds": {"min": o.seconds, "median": o.seconds + o.more},
-            "flip": flips.get(o.choice.name),
-        }
-        for o in found.offered
-    ]
+        {**asdict(o.choice), "seconds": {"min": o.seconds, "median": o.seconds + o.more},
+         "flip": flips.get(o.choice.name)} for o in found.offered
+    ]  # fmt: skip
     columns = (
         pages.Column("error, px", "error_px", about="distance of footprints that 95% of the picture keep"),
         pages.Column("light, %", "light_error", 100, 2, "relative error of light that 95% of the picture keep"),
