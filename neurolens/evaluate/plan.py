@@ -16,7 +16,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -49,32 +49,22 @@ from neurolens.evaluate.experiment import DomainChoice, EvaluationChoice, Experi
 from neurolens.evaluate.footprints import Footprints
 from neurolens.evaluate.probe import COUNTED, LIGHT, Asked, Effect, Probed, effects_of, probe
 from neurolens.evaluate.records import Timing, noisy
-from neurolens.evaluate.shaders import IDLE, lens_of
+from neurolens.evaluate.shaders import lens_of
+from neurolens.evaluate.shot_fits import PAIRS, shot_domain, shot_fits, shot_terms
 from neurolens.graph.compiler import has_compiler
 from neurolens.graph.scalars import lower
 from neurolens.modelfile.graph import graph_of
 from neurolens.optics.prescription import Lens
 from neurolens.render.scene import Scene
-from neurolens.surrogates.domain import domain_of
-from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.fit import fit_model, prepare
-from neurolens.surrogates.fits.planes import fit_planes
-from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.settings import ModelSettings
-from neurolens.surrogates.targets import Prepared
 
 Target = Literal["render", "c", "onnx", "osl", "glsl"]
 Cost = Callable[[], tuple[Timing, float]]  # of a ray, and noise
 _OURS = ("render", "c")  # run compiled C
-_TERMS = (2, 4, 6, 8, 12, 16, 22, 28, 36, 48, 64, 90)  # of the polynomials that are fitted on the spot
 _EXACT, _IDEAL = "exact", ("pinhole", "thin", "thick")
 _MAPPED = " + ST map"  # after the name of an ideal camera
 _SHOT = "fitted for this shot"
-_FIT = ModelSettings("ols", planes=False, elimination=False, idle_gates=IDLE)
-_FIT_MIRROR = replace(_FIT, degree=5)  # of lenses with cylinders: more candidates cost ten times, for the same errors
-_MOVED_TERMS = 16, 22  # from so many on, planes are searched: once, for the second number
 _CLOSE = 1.3  # times the operations of the smallest model that holds, up to which others of its form are timed
-_PAIRS = PairSettings(train=5000, held_out=1000, rim=5000)
 _MOST_OVERSCAN = 4.0  # of a plane picture that is warped afterwards
 
 
@@ -155,7 +145,7 @@ class Plan:
         file, asked = Path(os.path.relpath(lens.path, folder)), self.asked
         choice = LensChoice(file, configuration=asked.zoom, f_number=asked.f_number)
         checks = EvaluationChoice(vignetting_rays=50_000, rounds=0, compile_exact=False)
-        return to_toml(Experiment(title, choice, (best.settings,), self.domain, _PAIRS, checks, camera=camera))
+        return to_toml(Experiment(title, choice, (best.settings,), self.domain, PAIRS, checks, camera=camera))
 
 
 def plan(
@@ -453,42 +443,6 @@ def model_choice(found: Probed, target: Target, file: Path, how: str, costed: bo
         trial = _Trial(found, target, ())
         judged = next(_model(trial, file, how), None)
         return None if judged is None else trial.costed(judged) if costed else judged.choice
-
-
-def shot_domain(found: Probed) -> DomainChoice:
-    """That of `Probed.domain`, as an experiment asks for it."""
-    return DomainChoice(found.domain.film_radius_mm, found.domain.focus_m, found.asked.wavelength_nm)
-
-
-def shot_terms(found: Probed) -> list[int]:
-    """Sizes of polynomials that are tried for a shot; those of lenses with cylinders have terms of x and of y."""
-    return [n for n in _TERMS if n >= (4 if found.lens.anamorphic else 2)]
-
-
-def shot_fits(
-    found: Probed, folder: Path, choice: DomainChoice | None = None, name: str = "shot"
-) -> Callable[[int], tuple[Path, ModelSettings]]:
-    """What fits a polynomial of so many terms to a shot alone, or to another domain of its lens: its file, in a folder,
-    and its settings."""
-    lens, domain = found.lens.with_aperture(None), found.domain
-    if choice is not None:
-        with suppress(InputError):  # a lens that goes no nearer
-            domain = domain_of(lens, **asdict(choice))
-    plain, model = prepare(make_pairs(lens, domain, _PAIRS)), _FIT_MIRROR if lens.anamorphic else _FIT
-    folder.mkdir(parents=True, exist_ok=True)
-
-    @cache
-    def moved() -> Prepared:  # the planes of one size: a search takes a second, and others of its kind agree on them
-        return replace(plain, encoding=fit_planes(plain.pairs, plain.encoding, _MOVED_TERMS[1], model.position_weight))
-
-    def fit(terms: int) -> tuple[Path, ModelSettings]:
-        settings = replace(model, name=f"{name}-ols-{terms}", terms=terms)
-        file = folder / f"{found.lens.lens_id}.{settings.label}.onnx"
-        planes = terms >= _MOVED_TERMS[0] and not lens.anamorphic
-        export_onnx(fit_model(moved() if planes else plain, settings), file, errors={})
-        return file, replace(settings, planes=planes)  # as a training from scratch has it
-
-    return fit
 
 
 def _fitted(trial: _Trial, folder: Path, tried: Sequence[_Judged], say: Report) -> list[_Judged]:

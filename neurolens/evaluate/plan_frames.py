@@ -29,11 +29,9 @@ from neurolens.evaluate.plan import (
     exact_suffices,
     model_choice,
     rest_of,
-    shot_domain,
-    shot_fits,
-    shot_terms,
 )  # fmt: skip
 from neurolens.evaluate.probe import COUNTED, Effect, Probed, effects_of, probe
+from neurolens.evaluate.shot_fits import shot_domain, shot_fits, shot_terms
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.render.scene import Scene

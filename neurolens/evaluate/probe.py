@@ -41,7 +41,7 @@ _Real = TypeVar("_Real", bound=np.floating[Any])
 Maps = dict[str, tuple[Literal["px", "relative"], Array]]
 LIGHT = 0.01  # relative error of light that a plan allows beside its budget of place
 _FOCUS_SPARE = 0.25  # of a pixel of blur: what a model may place its film beside the lens's
-_FIELDS = 9  # from the axis to the edge of the film, at which vignetting is traced
+_FIELDS = 17  # from the axis to the edge of the film, at which vignetting is traced
 _ACROSS = 16  # points of the probe along the longer side
 # Of effects, what makes them where the picture is finished: a blur by depth makes all blur.
 _MADE_BY = {"distortion": "distortion", "natural fall-off": "distortion", "vignetting": "distortion"} | dict.fromkeys(

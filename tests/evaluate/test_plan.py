@@ -22,6 +22,7 @@ from neurolens.cameras.warped import Warped
 from neurolens.cli import main
 from neurolens.commands.plan import TARGETS
 from neurolens.evaluate import plan as planned
+from neurolens.evaluate import shot_fits
 from neurolens.evaluate.costs import noise, rest_ns, shader_cost
 from neurolens.evaluate.footprints import (
     Footprints,
@@ -232,7 +233,7 @@ def garden() -> Probed:
 def test_what_is_cheapest_differs_by_target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Blender's own thin lens costs less than any shader; in our renderer a small polynomial costs less than it."""
     found = garden()
-    monkeypatch.setattr(planned, "_TERMS", (8,))
+    monkeypatch.setattr(shot_fits, "TERMS", (8,))
     targets: tuple[Target, ...] = ("render", "osl")
     best = {t: decided(found, candidates(found, (1.0,), t, folder=tmp_path), 1.0, t).best for t in targets}
     assert best["osl"] is not None and best["osl"].name == "thin + ST map" and best["osl"].error_px < 1
@@ -275,7 +276,7 @@ def test_targets_are_those_of_the_command() -> None:
 
 def test_a_plan_s_file_is_taken_by_train_render_and_export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same model again from scratch, in numbers; the pictures of the file and of the model that it names agree."""
-    monkeypatch.setattr(planned, "_TERMS", (6,))
+    monkeypatch.setattr(shot_fits, "TERMS", (6,))
     scene, folder = tmp_path / "scene.toml", tmp_path / "plan"
     film = {"film_width_mm": 18.0, "film_height_mm": 10.125, "width": 64, "height": 36, "samples": 2}
     scene.write_text(format_toml(wall(4.0, 4.0, **film)))
