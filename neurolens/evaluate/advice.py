@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from neurolens.evaluate.records import error_of, noisy, reaches, time_of
+from neurolens.base.files import library
+from neurolens.evaluate.records import error_of, noisy, program, reaches, time_of
 
 C = TypeVar("C")
 R = TypeVar("R", bound=Mapping[str, Any])
@@ -99,7 +100,7 @@ def advice(results: Mapping[str, Any], folder: Path) -> list[Advice]:
         if rest:
             command = use_command(file, fused)
         else:  # one model of many states is no function of a ray alone
-            command = "" if best.get("states") else f"neurolens export {shlex.quote(file)} --to c -o lens.h"
+            command = "" if best.get("states") else f"{program()} export {shlex.quote(file)} --to c -o lens.h"
         found.append(Advice(where, name, why, command if file else ""))
     return found
 
@@ -134,5 +135,6 @@ def said_ns(timing: Mapping[str, Any]) -> str:
 
 def use_command(file: str, fused: bool) -> str:
     """The command that renders a scene through a model or a lens, as C where that runs here."""
-    camera = f"{'fused:' if fused else ''}{file}"
-    return f"neurolens render experiments/scenes/room.toml --camera {shlex.quote(camera)} -o room.exr"
+    scene, camera = Path("experiments/scenes/room.toml"), f"{'fused:' if fused else ''}{file}"
+    words = [str(scene if scene.is_file() else library() / scene), "--camera", camera, "-o", "room.exr"]
+    return f"{program()} render {shlex.join(words)}"

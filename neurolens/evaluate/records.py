@@ -7,6 +7,9 @@ from __future__ import annotations
 
 import math
 import platform
+import shlex
+import shutil
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -163,6 +166,14 @@ def error_of(record: Mapping[str, Any]) -> tuple[float, float]:
     """Micrometres, where all rays lie beyond 60 degrees the angle."""
     found = (record.get("rms_um"), record.get("direction_rms_deg"))
     return tuple(math.inf if v is None else v for v in found)  # type: ignore[return-value]
+
+
+def program() -> str:
+    """The first words of a command line that runs here: "neurolens" if it is on the PATH, else as this one began."""
+    if shutil.which("neurolens"):
+        return "neurolens"
+    started = sys.argv[0]
+    return shlex.quote(started) if Path(started).name == "neurolens" else f"{shlex.quote(sys.executable)} -m neurolens"
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
