@@ -24,8 +24,8 @@ from neurolens.evaluate.plan import (
     UNIT,
     Choice,
     Target,
+    best_of,
     candidates,
-    decided,
     exact_suffices,
     model_choice,
     rest_of,
@@ -116,16 +116,15 @@ def plan_frames(
     best: list[Choice | None] = []
     rest = rest_of(chosen[0].scene, founds[0], target)
     for found in founds:
-        best.append(
-            decided(found, candidates(found, (budget_px,), target, models=models), budget_px, target, rest).best
-        )
+        tried = candidates(found, (budget_px,), target, models=models)
+        best.append(best_of([c for c in tried if c.meets(budget_px)], rest))
         say(0.4 + 0.3 * len(best) / len(founds))
     fits = 0
     if folder is not None and not exact_suffices(founds[0], rest):
         # What has no camera, or one that costs more than a small model may.
         asks = [k for k, c in enumerate(best) if c is None or not c.name.startswith(("pinhole", "thin"))]
         for rows, choice in _stretches([founds[k] for k in asks], target, budget_px, folder):
-            cheaper = [asks[k] for k in rows if (now := best[asks[k]]) is None or choice.cost < now.cost]
+            cheaper = [asks[k] for k in rows if best_of([choice, *filter(None, [best[asks[k]]])], rest) is choice]
             fits += bool(cheaper)
             for k in cheaper:
                 best[k] = choice

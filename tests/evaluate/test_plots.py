@@ -165,7 +165,7 @@ def test_errors_share_one_scale_in_which_small_ones_show(tmp_path: Path, figures
     shown = [a.images[0] for a in figures[0].axes if a.images and a.images[0].get_array().ndim == 2]
     assert len({(i.norm.vmin, i.norm.vmax) for i in shown}) == 1 and shown[0].norm.vmax == 1.0
     for picture in shown:  # neither all dark nor all bright
-        assert 0.05 < float(np.median(picture.norm(picture.get_array()))) < 0.95
+        assert 0.05 < float(np.ma.median(picture.norm(picture.get_array()))) < 0.95
     assert any("FLIP" in a.get_ylabel() for a in figures[0].axes)
     assert drawn.error_scale([np.zeros((2, 2))], 99.5) == (1e-3, 1.0)
     assert drawn.error_scale([np.array([math.nan, 0.3]), np.array([0.012])], 100) == pytest.approx((5e-4, 0.5))
