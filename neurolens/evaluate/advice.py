@@ -23,6 +23,7 @@ CLOSE_UM = 2.0  # a model within this RMS error counts as close: a quarter of a 
 SAVING = 1.5
 # Nanoseconds that a path takes besides its camera in the cheapest scene of experiments/results/render_times.
 PATH_NS = 190.0
+REFRACTION_NS = 2.1  # of the exact lens as C, experiments/results/fused_speed: within 7% of its four lenses
 
 
 def recommended(cameras: Iterable[C], cost: Callable[[C], float], exact: C | None, rest: float = 0.0) -> C | None:
@@ -59,6 +60,11 @@ def exact_of(records: Iterable[R]) -> R | None:
     """The fastest exact tracer that was timed."""
     timed = [r for r in records if time_of(r)]
     return min(timed, key=lambda r: time_of(r)["min"], default=None)
+
+
+def expected_exact(refractions: int) -> dict[str, Any]:
+    """A record of the exact lens as C, where it was not timed."""
+    return {"name": "exact C, expected", "ns_per_ray": {"min": REFRACTION_NS * refractions}}
 
 
 @dataclass(frozen=True)
