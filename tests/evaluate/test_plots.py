@@ -169,3 +169,19 @@ def test_errors_share_one_scale_in_which_small_ones_show(tmp_path: Path, figures
     assert any("FLIP" in a.get_ylabel() for a in figures[0].axes)
     assert drawn.error_scale([np.zeros((2, 2))], 99.5) == (1e-3, 1.0)
     assert drawn.error_scale([np.array([math.nan, 0.3]), np.array([0.012])], 100) == pytest.approx((5e-4, 0.5))
+
+
+def test_maps_of_effects_share_a_scale_in_which_light_that_is_taken_is_dark() -> None:
+    light = {"vignetting": np.array([[0.0, -0.15]]), "flare": np.array([[0.02, 0.004]])}
+    blur = {"distortion": np.array([[11.0, 0.5]]), "coma": np.array([[0.0, 0.05]])}
+    for maps, unit in ((light, "relative"), (blur, "px")):
+        figure = style.new_figure(9.0, 2.0)
+        plots._maps(figure, maps, unit, (36.0, 20.0))
+        shown = [axes.images[0] for axes in figure.axes if axes.images]
+        assert len(shown) == 2 and len({(i.norm.vmin, i.norm.vmax) for i in shown}) == 1
+        if unit == "relative":
+            none, corner = (np.array(shown[0].to_rgba(v)[:3]).mean() for v in (0.0, -15.0))
+            assert shown[0].norm.vmin == -shown[0].norm.vmax == -20.0 and none == 1 and corner < 0.5
+            red, _, blue, _ = shown[1].to_rgba(2.0)
+            assert red > blue  # added light is orange
+        assert any(plots._TITLES[unit] == axes.get_ylabel() for axes in figure.axes)
