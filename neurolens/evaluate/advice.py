@@ -117,9 +117,8 @@ def _why_exact(exact: Mapping[str, Any], model: Mapping[str, Any] | None, within
         return f"{said}; no model is within {within:.3g} um"
     times = (time_of(exact)["min"] + rest) / (time_of(model).get("min", math.inf) + rest)
     whole = "a picture of even a cheap scene" if rest else "that"
-    return (
-        f"{said}; with {model['name']} ({said_ns(time_of(model))}) {whole} is {times:.3g} times as fast, not {SAVING:g}"
-    )
+    faster = f"with {model['name']} ({said_ns(time_of(model))}) {whole} is {times:.3g} times as fast"
+    return f"{said}; {faster}, and an error is worth it from {SAVING:g} on"
 
 
 def _why_model(model: Mapping[str, Any], exact: Mapping[str, Any] | None, within: float) -> str:
