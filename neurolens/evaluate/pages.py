@@ -229,7 +229,8 @@ details { margin-top: 1rem; } summary { cursor: pointer; color: var(--accent); m
 .scroll::-webkit-scrollbar-thumb { background: var(--dim); border-radius: 6px; }
 th[title] { text-decoration: underline dotted; text-underline-offset: 3px; cursor: help; }
 .use { background: var(--card); border-left: 4px solid var(--accent); border-radius: 4px; padding: .6rem 1rem 1rem;
-  margin-top: 1.4rem; } .use h2 { border: 0; margin: 0 0 .3rem; } .use pre + h2 { margin-top: 1rem; } .use p { margin: .3rem 0; }
+  margin-top: 1.4rem; } .use h2 { border: 0; margin: 0 0 .3rem; }
+.use pre + h2 { margin-top: 1rem; } .use p { margin: .3rem 0; }
 pre { margin: .5rem 0 0; padding: .6rem .8rem; overflow-x: auto; background: var(--back); border-radius: 4px;
   border: 1px solid var(--line); font-size: .85rem; }
 table { border-collapse: collapse; font-size: .84rem; font-variant-numeric: tabular-nums; }
