@@ -11,6 +11,8 @@ import argparse
 import functools
 import json
 import os
+import re
+import statistics
 import sys
 import tempfile
 import warnings
@@ -174,12 +176,34 @@ _COLUMNS = lab.columns(
 )
 
 
+# Kinds of lens of the library besides round photographic lenses, by words in their names.
+_OTHERS = {"anamorphic lenses": "anamorphic", "single elements": "edmund|thorlabs"}
+
+
+def errors_by_kind(rows: Sequence[Row], model: str) -> dict[str, list[float]]:
+    """RMS errors (um on each lens's own film) of a model, by kind of lens; each lens once, as its file has it."""
+    found: dict[str, list[float]] = {"round photographic lenses": [], **{kind: [] for kind in _OTHERS}}
+    for row in rows:
+        if row["model"] == model and row["rms_um"] is not None and row["entry"] == Path(row["lens_file"]).stem:
+            kinds = [kind for kind, words in _OTHERS.items() if re.search(words, row["entry"])]
+            found[kinds[0] if kinds else "round photographic lenses"].append(row["rms_um"])
+    return found
+
+
+def _summary(rows: Sequence[Row], model: str) -> str:
+    """One line a kind of lens: number, median and range."""
+    kinds = ((k, v) for k, v in errors_by_kind(rows, model).items() if v)
+    parts = [f"{len(v)} {k} {statistics.median(v):.3g} ({min(v):.3g} to {max(v):.3g})" for k, v in kinds]
+    return f"RMS of {model} on each lens's own film, um, median and range: {', '.join(parts)}." if parts else ""
+
+
 def write_index(rows: Sequence[Row], left_out: Mapping[str, str], out: Path) -> None:
     """Write both; `left_out` gives the reason for each entry that has no models."""
     index = {"schema": 2, "command": "python -m experiments models", "versions": versions()}
     write_json(out / "index.json", index | {"models": list(rows), "left_out": dict(left_out)})
     reasons = "\n".join(f"- {state}: {reason}" for state, reason in left_out.items())
-    parts = ["Not made:", reasons] if left_out else []
+    parts = [line for model in ("mlp-16x2", "ols-64") if (line := _summary(rows, model))]
+    parts += ["Not made:", reasons] if left_out else []
     atomic_write_text(out / "README.md", lab.page(_HEAD, lab.table(_COLUMNS, rows, "–"), *parts))
 
 

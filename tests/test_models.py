@@ -145,7 +145,9 @@ def test_models_are_listed_with_the_one_to_use(tmp_path, monkeypatch, capsys) ->
         assert len(rows) == 3 - [None, "1um", "0.01px"].index(within) and "cut.onnx: left out" in out.err
     assert main(["models"]) == 0
     said = capsys.readouterr().out
-    assert "Use runs/mine/models/ols-28.onnx (" in said and "--camera fused:runs/mine/models/ols-28.onnx" in said
+    assert "In this renderer use the exact lens" in said and "--camera fused:runs/mine/lenses/laikin_double" in said
+    assert "In other programs use ols-28: the fastest within 2 um" in said
+    assert "export runs/mine/models/ols-28.onnx --to c" in said
     shot, stated = tmp_path / "runs" / "a_plan" / "models" / "shot.onnx", b'"focus_m": ["inf", 0.7]'
     shot.parent.mkdir(parents=True)
     shot.write_bytes((own / "mlp-16x2.onnx").read_bytes().replace(stated, b'"focus_m": [  0.7, 0.7]'))

@@ -26,7 +26,8 @@ from neurolens.commands.arguments import (
 )
 from neurolens.commands.farm import Task, add_dask, files_of, spread
 from neurolens.commands.output import answer, number, table
-from neurolens.evaluate.records import CLOSE_UM, to_use, use_command
+from neurolens.evaluate.advice import advice, said_ns
+from neurolens.evaluate.records import NOISY, noisy
 
 _MARK = "task.sha256"  # in a run folder that came from a cluster
 _DESCRIPTION = """\
@@ -220,10 +221,10 @@ def _text(results: Mapping[str, Any], folder: Path) -> str:
         reached = "reached" if target["met"] else "no model tried reaches it, the closest is"
         said = f"Asked for {target['within_um']:.3g} um RMS"
         parts.append(f"{said}: {reached} {target['model']}, {number(target['rms_um'], 3)} um.")
-    best = to_use(results.get("models", ()), target["within_um"] if target else CLOSE_UM)
-    if best and best.get("file"):
-        command = use_command(str(folder / best["file"]), fused=best.get("fused_ns_per_ray") is not None)
-        parts.append(f"Use {best['name']}:\n  {command}")
+    parts += ["\n  ".join(filter(None, (str(found), found.command))) for found in advice(results, folder)]
+    timings = [model.get(key) for model in results["models"] for key in ("ns_per_ray", "fused_ns_per_ray")]
+    if any(map(noisy, timings)):
+        parts.append(f"~ noisy: the median of the rounds is more than {NOISY:g} times the least, which is shown")
     parts += [f"Warning: {text}" for text in results.get("warnings", ())]
     places = [f"  {folder / 'report.html'}  everything on one page", f"  {folder / 'models'}  the ONNX models"]
     if (folder / "pictures").is_dir():
@@ -235,6 +236,6 @@ def _text(results: Mapping[str, Any], folder: Path) -> str:
 def _row(model: Mapping[str, Any]) -> tuple[str, ...]:
     errors = (number(model.get(key), 3) for key in ("rms_um", "p99_um", "direction_rms_deg"))
     shares = (model.get(key) for key in ("false_pass", "false_block"))
-    times = (*((model.get(key) or {}).get("min") for key in ("ns_per_ray", "fused_ns_per_ray")), model.get("fit_s"))
+    times = (said_ns(model.get(key) or {}).removesuffix(" ns") for key in ("ns_per_ray", "fused_ns_per_ray"))
     percent = ("-" if share is None else f"{100 * share:.2f}%" for share in shares)
-    return (str(model.get("name")), *errors, *percent, *(number(value, 3) for value in times))
+    return (str(model.get("name")), *errors, *percent, *times, number(model.get("fit_s"), 3))
