@@ -6,7 +6,7 @@ import argparse
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -313,7 +313,7 @@ def _draw(shot: _Shot, name: str, out: Path) -> None:
 def _told(shot: _Shot) -> dict[str, Any]:
     """Lights and their ghosts, for metadata and --json."""
     ghosts = [[_about(ghost) for ghost in of_light[:_KEPT]] for of_light in shot.ghosts]
-    return {"lights": [plain(asdict(light)) for light in shot.lights], "ghosts": ghosts}
+    return {"lights": [plain(light.about) for light in shot.lights], "ghosts": ghosts}
 
 
 def _about(ghost: Ghost) -> dict[str, Any]:

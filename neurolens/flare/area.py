@@ -1,9 +1,11 @@
-"""Light of a grid of rays as areas: each cell of the pupil spreads its light evenly over its place on the film.
+"""Light of a grid of rays as areas: each cell of the pupil spreads its light over its place on the film.
 
 So the picture of a ghost has neither holes nor noise, and its sum is the ghost's light, however the map from pupil to
 film stretches, folds or turns it (Hullin et al. 2011, section 4.2, spread light by the area of quads). Rims cut cells
 where the largest r / R on the way is 1, taken to be linear in between. Pixels are covered exactly: an edge adds its
 height, times the step of density across it, to the pixels that it passes, and sums along rows are the picture.
+Within whole cells the density is linear, between the means of the cells about each corner: where these change little
+from cell to cell no borders are seen, and each cell keeps its light, but for a part in 10,000 at its border pixels.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ def edges_of(found: Floats, columns: int, size: tuple[int, int], per_mm: float) 
     """
     rows = found.shape[1] // (columns + 1) - 1
     assert found.dtype == np.float32 and found.flags.c_contiguous and found.shape == (4, (rows + 1) * (columns + 1))
-    edges, room = np.empty((_PER_CELL * found.shape[1], 5)), np.zeros((5, found.shape[1]))
+    edges, room = np.empty((_PER_CELL * found.shape[1], 7)), np.zeros((15, found.shape[1]))
     pointers = [a.ctypes.data for a in (found, room, edges)]
     return edges[: _compiled().edges(columns, rows, *size, per_mm, *pointers)].copy()
 
@@ -46,14 +48,16 @@ def draw_edges(
     Each row is what it is with all others.
 
     Args:
-        edges: [N, 5], of several grids, so many of each. counts: [K]. light: [K, 3], of a cell whose power is 1.
+        edges: [N, 7], of several grids, so many of each: x and y of both ends in pixels, and the step of density
+            across, at the picture's corner and its slopes in x and y; of two equal ends, light that lies there.
+        counts: [K]. light: [K, 3], of a cell whose power is 1.
 
     Raises:
         InputError: as of `edges_of`.
     """
     height, width, _ = picture.shape
     assert picture.dtype == np.float32 and picture.flags.c_contiguous and rows.stop <= height
-    given, sums = np.zeros((len(light), 4)), np.zeros((len(rows), width + 3, 4))
+    given, sums = np.zeros((len(light), 4)), np.zeros((2, len(rows), width + 3, 4))
     given[:, :3] = light
     pointers = [a.ctypes.data for a in (counts, edges, given, sums, picture[rows.start :])]
     _compiled().draw(width, rows.start, len(rows), len(light), *pointers)
@@ -75,6 +79,7 @@ _TEXT = """
 
 #define SMALL 1e-6 /* square pixels, whose light goes to its corners instead */
 #define FAR 1e7 /* pixels */
+#define EVEN 2.0 /* square pixels of half a cell, below which its density is even */
 #if defined(__GNUC__)
 #define ALWAYS __attribute__((always_inline))
 #else
@@ -84,11 +89,13 @@ _TEXT = """
 struct point { double x, y; };
 /* Red, green, blue and nothing: one register. */
 typedef double rgb __attribute__((vector_size(32), aligned(8)));
+/* Density in a picture: at its corner, and how it grows to the right and down. */
+struct plane { double level, right, down; };
 /* Right of it, where y grows along it, the density is larger; of two equal points, light that lies there. */
-struct edge { struct point p, q; double density; };
+struct edge { struct point p, q; struct plane density; };
 struct canvas {
     int width, first, last;
-    rgb *sums, light; /* of a pixel, what it has more than the one before */
+    rgb *sums, *slopes, light; /* of a pixel, what it has more than the one before, of level and slope to the right */
 };
 
 static inline ALWAYS struct point between(struct point p, struct point q, double share)
@@ -118,16 +125,17 @@ static inline ALWAYS void in_row(rgb *row, double a, double b, rgb amount)
 }
 
 /* An edge between the left and the right border, p above q; rows that are not the canvas's are left out. */
-static void line(struct canvas c, struct point p, struct point q, double density)
+static void line(struct canvas c, struct point p, struct point q, struct plane density)
 {
     if (!(p.y < q.y && p.y < c.last && q.y > c.first)) return;
     const double slope = (q.x - p.x) / (q.y - p.y), wide = fabs(slope), half = 0.5 / wide;
-    const rgb light = density * c.light;
-    const int last = q.y < c.last ? (int)q.y : c.last - 1;
+    const rgb slope_light = density.right * c.light;
+    const int sloped = density.right != 0.0, last = q.y < c.last ? (int)q.y : c.last - 1;
     int k = p.y > c.first ? (int)p.y : c.first;
     double y = p.y > k ? p.y : k, x = p.y > k ? p.x : p.x + slope * (k - p.y);
-    rgb *row = c.sums + (size_t)(k - c.first) * (c.width + 3);
-    for (; k <= last; k++, row += c.width + 3) {
+    rgb *row = c.sums + (size_t)(k - c.first) * (c.width + 3), *slopes = c.slopes + (row - c.sums);
+    for (; k <= last; k++, row += c.width + 3, slopes += c.width + 3) {
+        const rgb light = (density.level + density.down * (k + 0.5)) * c.light;
         const int ends = q.y <= k + 1;
         const double next = ends ? q.y : k + 1, end = ends ? q.x : p.x + slope * (k + 1 - p.y);
         if (next - y == 1.0 && wide <= 1.0) { /* a whole row, of at most two pixels: as below, without a branch */
@@ -138,21 +146,29 @@ static void line(struct canvas c, struct point p, struct point q, double density
             row[first] += r * light;
             row[first + 1] += (rest - r) * light;
             row[first + 2] += (1.0 - rest) * light;
-        } else if (x < end) in_row(row, x, end, (next - y) * light);
-        else in_row(row, end, x, (next - y) * light);
+            if (sloped) {
+                slopes[first] += r * slope_light;
+                slopes[first + 1] += (rest - r) * slope_light;
+                slopes[first + 2] += (1.0 - rest) * slope_light;
+            }
+        } else {
+            const double a = x < end ? x : end, b = x < end ? end : x;
+            in_row(row, a, b, (next - y) * light);
+            if (sloped) in_row(slopes, a, b, (next - y) * slope_light);
+        }
         x = end;
         y = next;
     }
 }
 
 /* Any edge. Left of the film it counts at its border. */
-static void draw_edge(struct canvas c, struct point p, struct point q, double density)
+static void draw_edge(struct canvas c, struct point p, struct point q, struct plane density)
 {
     if (p.y > q.y) {
         const struct point other = p;
         p = q;
         q = other;
-        density = -density;
+        density = (struct plane){ -density.level, -density.right, -density.down };
     }
     if (!(p.y < c.last && q.y > c.first && (p.x < c.width || q.x < c.width))) return;
     const struct point from = p;
@@ -192,18 +208,20 @@ static void dot(struct canvas c, struct point p, double light)
 }
 
 /* A pixel is the sum of what is left of it; what would be 0 but for rounding is 0. */
-static void settle(int width, int height, const rgb *sums, float *picture)
+static void settle(struct canvas c, float *picture)
 {
-    for (int j = 0; j < height; j++) {
-        const rgb *const row = sums + (size_t)j * (width + 3);
-        rgb light = { 0.0 }, most = { 0.0 };
-        float *pixel = picture + (size_t)j * width * 3;
-        for (int i = 0; i < width; i++, pixel += 3) {
-            light += row[i];
+    for (int j = 0; j < c.last - c.first; j++) {
+        const rgb *const row = c.sums + (size_t)j * (c.width + 3), *const slopes = c.slopes + (row - c.sums);
+        rgb level = { 0.0 }, slope = { 0.0 }, most = { 0.0 };
+        float *pixel = picture + (size_t)j * c.width * 3;
+        for (int i = 0; i < c.width; i++, pixel += 3) {
+            level += row[i];
+            slope += slopes[i];
+            const rgb light = level + (i + 0.5) * slope;
             for (int k = 0; k < 3; k++) {
-                const double size = fabs(light[k]);
+                const double size = fabs(level[k]);
                 most[k] = size > most[k] ? size : most[k];
-                pixel[k] += size > 1e-12 * most[k] ? light[k] : 0.0;
+                pixel[k] += fabs(light[k]) > 1e-12 * most[k] ? light[k] : 0.0;
             }
         }
     }
@@ -213,13 +231,14 @@ void draw(
     int width, int first, int rows, int grids, const int64_t *counts, const struct edge *e,
     const rgb *light, rgb *sums, float *picture)
 {
+    struct canvas c = { width, first, first + rows, sums, sums + (size_t)rows * (width + 3), { 0.0 } };
     for (int k = 0; k < grids; k++) {
-        const struct canvas c = { width, first, first + rows, sums, light[k] };
+        c.light = light[k];
         for (const struct edge *const end = e + counts[k]; e < end; e++)
-            if (e->p.x == e->q.x && e->p.y == e->q.y) dot(c, e->p, e->density);
+            if (e->p.x == e->q.x && e->p.y == e->q.y) dot(c, e->p, e->density.level);
             else draw_edge(c, e->p, e->q, e->density);
     }
-    settle(width, rows, sums, picture);
+    settle(c, picture);
 }
 
 static inline ALWAYS double area_of(struct point a, struct point b, struct point c)
@@ -247,10 +266,18 @@ static int beyond(int columns, int rows, size_t o, const float *x, const float *
 }
 
 /* Edges along rows of pixels step nowhere. */
-static inline ALWAYS struct edge *step(struct edge *to, struct point p, struct point q, double density)
+static inline ALWAYS struct edge *step(struct edge *to, struct point p, struct point q, struct plane density)
 {
-    if (p.y != q.y) *to++ = (struct edge){ p, q, density };
+    if (p.y != q.y && (density.level != 0.0 || density.right != 0.0 || density.down != 0.0))
+        *to++ = (struct edge){ p, q, density };
     return to;
+}
+
+static inline ALWAYS void add(struct plane *to, struct plane more, double factor)
+{
+    to->level += factor * more.level;
+    to->right += factor * more.right;
+    to->down += factor * more.down;
 }
 
 /* A triangle of which rims cut off some: `light` would be all of it. Half the way to a corner that is lost is lit. */
@@ -282,8 +309,8 @@ static struct edge *cut(
     }
     light *= share * mean / inside;
     for (int k = 0; k < n; k++) {
-        if (fabs(area) > SMALL) to = step(to, kept[k], kept[(k + 1) % n], -light / area);
-        else *to++ = (struct edge){ kept[k], kept[k], light / n };
+        if (fabs(area) > SMALL) to = step(to, kept[k], kept[(k + 1) % n], (struct plane){ -light / area, 0.0, 0.0 });
+        else *to++ = (struct edge){ kept[k], kept[k], { light / n, 0.0, 0.0 } };
     }
     return to;
 }
@@ -298,15 +325,45 @@ static inline ALWAYS int apart(int width, int height, struct point p, struct poi
         || (p.y > below && q.y > below && r.y > below && s.y > below);
 }
 
+/* Planes of density of a cell's halves, whose mean densities are those of the corners about them: none where these are
+   too different, as at folds and caustics, or the cell is hardly a pixel. */
+static void sloped(
+    const struct point corner[2][3], const double value[2][3], const double *density, const double *area,
+    struct plane *plane)
+{
+    double mean[2], off[2];
+    for (int h = 0; h < 2; h++) {
+        plane[h] = (struct plane){ density[h], 0.0, 0.0 };
+        mean[h] = (value[h][0] + value[h][1] + value[h][2]) / 3.0;
+        off[h] = density[h] - mean[h];
+    }
+    if (density[0] == density[1])
+        off[0] = off[1] = density[0] - (mean[0] * area[0] + mean[1] * area[1]) / (area[0] + area[1]);
+    for (int h = 0; h < 2; h++) {
+        const struct point *const p = corner[h];
+        const double *const v = value[h];
+        int even = fabs(area[h]) > EVEN;
+        for (int k = 0; k < 3; k++)
+            even &= v[k] / density[h] > 0.5 && v[k] / density[h] < 2.0;
+        if (!even) continue;
+        const double dx = p[1].x - p[0].x, dy = p[1].y - p[0].y, ex = p[2].x - p[0].x, ey = p[2].y - p[0].y;
+        const double right = ((v[1] - v[0]) * ey - (v[2] - v[0]) * dy) / (2.0 * area[h]);
+        const double down = ((v[2] - v[0]) * dx - (v[1] - v[0]) * ex) / (2.0 * area[h]);
+        plane[h] = (struct plane){ v[0] + off[h] - right * p[0].x - down * p[0].y, right, down };
+    }
+}
+
 /* How many edges there are. Whole cells share theirs: steps of density across edges along rows, along columns and along
-   diagonals are summed first. Cells of which nothing is on the film are left out. `room`: [5, N] zeros. */
+   diagonals are summed first. Cells of which nothing is on the film are left out. `room`: [15, N] zeros. */
 size_t edges(
     int columns, int rows, int width, int height, double per_mm, const float *found, double *room, struct edge *to)
 {
     const size_t wide = columns + 1, all = wide * (rows + 1);
     const float *const x = found, *const y = x + all, *const power = y + all, *const worst = power + all;
     struct point *const place = (struct point *)room;
-    double *const level = room + 2 * all, *const upright = level + all, *const slanted = upright + all;
+    struct plane *const level = (struct plane *)(room + 2 * all), *const upright = level + all;
+    struct plane *const slanted = upright + all;
+    double *const densities = room + 11 * all, *const sum = densities + 2 * all, *const number = sum + all;
     const struct edge *const from = to;
 #define ON_FILM(x, y) ((struct point){ 0.5 * width - per_mm * (x), 0.5 * height + per_mm * (y) })
     for (size_t k = 0; k < all; k++)
@@ -344,24 +401,49 @@ size_t edges(
                 }
                 if (in > 0 && in < 3 && near) to = cut(to, corner, p, w, 0.5);
                 for (int k = 0; k < 3 && in == 3 && near && density[h] == 0.0; k++)
-                    *to++ = (struct edge){ corner[k], corner[k], light[h] / 3.0 };
+                    *to++ = (struct edge){ corner[k], corner[k], { light[h] / 3.0, 0.0, 0.0 } };
             }
             const double ratio = area[0] / area[1];
             if (density[0] != 0.0 && density[1] != 0.0 && ratio > 0.5 && ratio < 2.0) /* no fold: one cell */
                 density[0] = density[1] = -(light[0] + light[1]) / (area[0] + area[1]);
-            level[o] += density[0];
-            upright[o + 1] += density[0];
-            level[o + wide] -= density[1];
-            upright[o] -= density[1];
-            slanted[o] += density[1] - density[0];
+            for (int h = 0; h < 2; h++) {
+                densities[2 * o + h] = density[h];
+                for (int k = 0; k < 3 && density[h] != 0.0; k++) {
+                    sum[at[h][k]] += density[h];
+                    number[at[h][k]] += 1.0;
+                }
+            }
+        }
+    for (int j = 0; j < rows; j++)
+        for (int i = 0; i < columns; i++) {
+            const size_t o = j * wide + i, at[2][3] = { { o, o + 1, o + wide + 1 }, { o, o + wide + 1, o + wide } };
+            const double *const density = densities + 2 * o;
+            struct point corner[2][3];
+            struct plane plane[2];
+            double value[2][3], area[2];
+            if (density[0] == 0.0 && density[1] == 0.0) continue;
+            for (int h = 0; h < 2; h++) {
+                for (int k = 0; k < 3; k++) {
+                    corner[h][k] = place[at[h][k]];
+                    value[h][k] = sum[at[h][k]] / fmax(number[at[h][k]], 1.0);
+                }
+                area[h] = area_of(corner[h][0], corner[h][1], corner[h][2]);
+            }
+            sloped(corner, value, density, area, plane);
+            add(level + o, plane[0], 1.0);
+            add(upright + o + 1, plane[0], 1.0);
+            add(level + o + wide, plane[1], -1.0);
+            add(upright + o, plane[1], -1.0);
+            add(slanted + o, plane[1], 1.0);
+            add(slanted + o, plane[0], -1.0);
         }
     for (int j = 0; j <= rows; j++)
         for (int i = 0; i <= columns; i++) {
             const size_t o = j * wide + i;
             const struct point p = place[o];
-            if (level[o] != 0.0) to = step(to, p, place[o + 1], level[o]);
-            if (upright[o] != 0.0) to = step(to, p, place[o + wide], upright[o]);
-            if (slanted[o] != 0.0) to = step(to, p, place[o + wide + 1], slanted[o]);
+            if (i < columns) to = step(to, p, place[o + 1], level[o]);
+            if (j < rows) to = step(to, p, place[o + wide], upright[o]);
+            if (i < columns && j < rows) to = step(to, p, place[o + wide + 1], slanted[o]);
         }
     return (size_t)(to - from);
 }

@@ -32,12 +32,14 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.flare.exit_pupil import CELLS, Array, ExitPupil, coverage, exit_pupil, outline
-from neurolens.flare.lights import Light
+from neurolens.flare.exit_pupil import CELLS, Array, ExitPupil, coverage, exit_pupil, image_moves, outline
+from neurolens.flare.lights import Light, patches
 from neurolens.flare.picture import Raster, axis_irradiance
+from neurolens.flare.smear import smear_of, smeared
 from neurolens.flare.stack import Floats
 from neurolens.graph.compiler import load_compiled
 from neurolens.optics.prescription import Lens
+from neurolens.render.colour import in_gamut
 from neurolens.render.spectrum import SpectralRange
 
 _PER_CYCLE = 2.5  # cells a cycle of the field
@@ -45,6 +47,7 @@ _NEAR, _FAR = 2.0, 4.0  # pixels from the centre between which the sum over cell
 _SPECTRUM = 4096  # samples a side of the outline's power spectrum
 _PARTS = 5  # of the range, out of focus
 _STARTS = 1 << 15  # elements of the outline that pairs start at
+_PATCH_DEG = 8.0  # of an extended light: see `patches`
 _GROUPS, _SAMPLES = 3, 64  # of elements out of focus; of each, those whose places are kept, for each of up to 8 lines
 
 
@@ -214,9 +217,11 @@ def starburst_picture(
 ) -> Floats:
     """The stars of lights, [H, W, 3] linear sRGB: the light that diffraction takes out of their images.
 
-    It is 0 where rays make the image itself, and at the pixels next to that: there a render has the light, which keeps
-    its energy if the render's is less by what this layer would sum to on a film without edges. What is sent aside is
-    taken to pass the rear of the lens unhindered. Nothing comes of a light whose rays do not reach the film.
+    Of a point it is 0 where rays make the image itself, and at the pixels next to that: there a render has the light,
+    which keeps its energy if the render's is less by what this layer would sum to on a film without edges. An extended
+    light has the sum of its points' stars, also within its image. What is sent aside is taken to pass the rear of the
+    lens unhindered. Nothing comes of a light whose rays do not reach the film. Fringes of one wavelength lie beyond the
+    gamut of sRGB: see `in_gamut`.
 
     Args:
         wavelengths: of equal shares of the range. done: told the share of the work that is done.
@@ -224,13 +229,21 @@ def starburst_picture(
     spectral = SpectralRange(*wavelength_nm, bins=wavelengths)
     exposure = axis_irradiance(lens, 0.5 * (spectral.low_nm + spectral.high_nm)) if lights else 1.0
     picture = np.zeros((raster.height, raster.width, 3), np.float32)
-    for number, light in enumerate(lights):
-        colours = spectral.response * spectral.spectrum(light.rgb) / (wavelengths * exposure)
-        for k, film in enumerate(_stars(lens, light, spectral.centres_nm, raster, threads)):
-            picture += film[..., None] * colours[:, k].astype(np.float32)
-            done((number + (k + 1) / wavelengths) / len(lights))
-        done((number + 1) / len(lights))
-    return picture
+    parts = [patch for light in lights for patch in patches(light, _PATCH_DEG)]
+    for number, patch in enumerate(parts):
+        colours = spectral.response * spectral.spectrum(patch.light.rgb) / (wavelengths * exposure)
+        moved = raster.per_mm * image_moves(lens, patch, float(spectral.centres_nm.mean())) * (-1, 1)
+        smear = smear_of(patch, moved)
+        kernel = np.ones((1, 1), np.float32) if smear is None else smear.kernel(max(raster.width, raster.height) // 2)
+        height, width = (n + k - 1 for n, k in zip((raster.height, raster.width), kernel.shape, strict=True))
+        canvas = np.zeros((height, width, 3), np.float32)
+        around = Raster((width / raster.per_mm, height / raster.per_mm), width, height)
+        for k, film in enumerate(_stars(lens, patch.light, spectral.centres_nm, around, threads)):
+            canvas += film[..., None] * colours[:, k].astype(np.float32)
+            done((number + (k + 1) / wavelengths) / len(parts))
+        picture += canvas if smear is None else smeared(canvas, kernel)
+        done((number + 1) / len(parts))
+    return in_gamut(picture)
 
 
 def _stars(lens: Lens, light: Light, wavelengths_nm: Array, raster: Raster, threads: int) -> Iterator[Floats]:

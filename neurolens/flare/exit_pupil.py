@@ -21,7 +21,7 @@ from torch import Tensor
 
 from neurolens.analysis.fields import on_plane
 from neurolens.base.errors import InputError
-from neurolens.flare.lights import Light, disc, rays_across
+from neurolens.flare.lights import Light, Patch, disc, light_towards, rays_across
 from neurolens.optics.aiming import without_rims
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.prescription import Lens
@@ -148,6 +148,19 @@ def exit_pupil(lens: Lens, light: Light, wavelength_nm: float, like: ExitPupil |
         through &= lens.aperture.inside(at[lens.stop_index, 0], at[lens.stop_index, 1], lens.stop_radius_mm)
     hits = (hits - centre[:, None])[:, through if through.any() else inside]
     return ExitPupil(wavelength_nm, centre, middle, half, figures, tuple(limits[cut]), lens.aperture, hits, box)
+
+
+def image_moves(lens: Lens, patch: Patch, wavelength_nm: float) -> Array:
+    """How far the image of a point moves on the film (mm), [2, 2], along each of the sides of a light's patch."""
+    found = np.zeros((2, 2))
+    for along, side in zip(found, patch.sides, strict=True):
+        ends = [
+            light_towards(patch.light.towards + f * side, patch.light.rgb, patch.light.distance_m) for f in (-0.5, 0.5)
+        ]
+        pupils = [exit_pupil(lens, light, wavelength_nm) for light in ends if light is not None and side.any()]
+        if len(pupils) == 2 and pupils[0] and pupils[1]:
+            along[:] = pupils[1].centre_mm - pupils[0].centre_mm
+    return found
 
 
 def _pair(a: Tensor, b: Tensor) -> Array:

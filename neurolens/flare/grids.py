@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from neurolens.flare.ghostmodel import GhostModel
 from neurolens.flare.ghosts import GhostRays, GhostTracer, Way
-from neurolens.flare.lights import Light, rays_across
+from neurolens.flare.lights import Light, Patch, light_towards, rays_across
 from neurolens.flare.stack import Floats
 from neurolens.flare.steps import LOST
 
@@ -25,6 +25,7 @@ _EVEN = 0.02  # least unevenness, and spread of colours over the size, of a ghos
 _STEP = 0.25  # of a cell: how far the shadow of a rim may move on the film between two wavelengths
 _BAND = 0.02  # of the irradiance that wide ghosts leave on the film: a step of colour that may remain in one ghost
 _AT_ONCE = 128  # ghosts
+_MOVED, _LONG, _SOFT = 32, math.radians(0.25), 0.2  # cells a side, step, and edge in r^2 / R^2, by which ghosts move
 _ERROR, _WORST = 3.0, 0.25  # light beside its place, times the cells that half the film is wide; at most
 
 
@@ -105,6 +106,38 @@ def grids_of(
         )
         for (pair, kept, look), each in zip(found, error.tolist(), strict=True)
     }  # fmt: skip
+
+
+def ghost_moves(
+    tracer: GhostTracer | GhostModel, patch: Patch, pair: Way, grid: Grid, wavelength_nm: float
+) -> NDArray[np.float64]:
+    """How far the middle of a ghost's light moves on the film (mm), [2, 2], along each of the sides of a light's patch.
+
+    The middle moves as the edges do, which are those of the stop most often: on the film they move by another amount
+    than the light of a place of the front. Rays near rims count by how near they are, so that none comes or goes.
+    """
+    coarse = replace(grid, columns=min(grid.columns, _MOVED), rows=min(grid.rows, _MOVED))
+
+    def middle(off: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        light = light_towards(patch.light.towards + off, patch.light.rgb, patch.light.distance_m)
+        if light is None:
+            return None
+        start = tracer.start(rays_across(tracer.lens, light, coarse.places)[0])
+        x, y, power, worst = tracer.follow_each(start, [wavelength_nm], pair)[0].astype(np.float64)
+        weight = np.where(power > 0, power * np.clip((1 - worst) / _SOFT, 0, 1), 0)
+        lit = weight > 0
+        return np.stack([x, y])[:, lit] @ weight[lit] / weight.sum() if lit.any() else None
+
+    found = np.zeros((2, 2))
+    for along, side in zip(found, patch.sides, strict=True):
+        step = _LONG / max(float(np.linalg.norm(side)), 1e-300)
+        places = [(f, place) for f in (-step, step) if side.any() and (place := middle(f * side)) is not None]
+        if len(places) == 1:
+            places += [(0.0, place) for place in (middle(0 * side),) if place is not None]
+        if len(places) == 2:
+            (f, one), (g, other) = places
+            along[:] = (other - one) / (g - f)
+    return found
 
 
 class _Look(NamedTuple):

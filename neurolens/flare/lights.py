@@ -7,9 +7,10 @@ sequence that is the same every time: an animated light has no noise of its own.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,18 +34,35 @@ _COLUMNS: dict[str, tuple[float, float, float]] = {
     "r": (SUN, 0.0, 1e30),
     "g": (SUN, 0.0, 1e30),
     "b": (SUN, 0.0, 1e30),
+    "diameter_deg": (0.0, 0.0, 90.0),
     "distance_m": (math.inf, 1e-6, math.inf),
 }
+CELLS = 8  # along each side of an extended light
+
+
+class Shape(NamedTuple):
+    """The extent of a light that is not a point: `CELLS` x `CELLS` cells, and how much of its light each has.
+
+    Attributes:
+        corners: [CELLS + 1, CELLS + 1, 3] directions (lens frame) of the cells' corners.
+        weights: [CELLS, CELLS] at least 0, of any sum.
+        round: whether the light is the whole ellipse that fits into the cells.
+    """
+
+    corners: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    round: bool
 
 
 @dataclass(frozen=True)
 class Light:
-    """A light far away, or at a place.
+    """A light far away, or at a place: a point, or one that has a shape.
 
     Attributes:
         azimuth_deg: to the right of the axis, seen by the camera; elevation_deg: above it.
         rgb: linear sRGB irradiance that it makes at the front vertex across its way: radiance times solid angle in sr.
         distance_m: from the front vertex; inf allowed.
+        shape: of an extended light, whose middle the angles are; None for a point.
 
     Raises:
         InputError: angles that do not come from the front (the light lies behind the lens), a distance that is not
@@ -55,6 +73,7 @@ class Light:
     elevation_deg: float
     rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)
     distance_m: float = math.inf
+    shape: Shape | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         if not (abs(self.elevation_deg) < 90 and math.isfinite(self.azimuth_deg) and self.towards[2] < 0):
@@ -71,14 +90,107 @@ class Light:
         a, e = math.radians(self.azimuth_deg), math.radians(self.elevation_deg)
         return np.array([math.sin(a) * math.cos(e), math.sin(e), -math.cos(a) * math.cos(e)])
 
+    @property
+    def about(self) -> dict[str, Any]:
+        """Its attributes for metadata: the shape only by its size, in degrees along both sides."""
+        told = asdict(replace(self, shape=None))
+        told["shape"] = None if self.shape is None else np.degrees(_lengths(self.shape.corners)).round(4).tolist()
+        return told
+
+
+def light_towards(
+    towards: NDArray[np.floating[Any]], rgb: Sequence[float], distance_m: float = math.inf, shape: Shape | None = None
+) -> Light | None:
+    """The light in a direction [3] of any length; None where that does not lie before the lens."""
+    x, y, z = towards / np.linalg.norm(towards)
+    if not z < -1e-6:
+        return None
+    r, g, b = (max(float(v), 0.0) for v in rgb)
+    azimuth, elevation = math.degrees(math.atan2(x, -z)), math.degrees(math.asin(max(-1.0, min(1.0, y))))
+    return Light(azimuth, elevation, (r, g, b), distance_m, shape)
+
+
+def flat_shape(towards: NDArray[np.floating[Any]], sides: NDArray[np.floating[Any]], round_: bool = False) -> Shape:
+    """The parallelogram of two sides [2, 3] about a direction [3], or the ellipse in it, all of equal radiance."""
+    at = np.linspace(-0.5, 0.5, CELLS + 1)
+    corners = towards + at[:, None, None] * sides[0] + at[:, None] * sides[1]
+    middle = (np.arange(CELLS) + 0.5) / CELLS - 0.5
+    inside = middle[:, None] ** 2 + middle**2 < 0.25 if round_ else np.ones((CELLS, CELLS))
+    return Shape(corners, inside.astype(np.float64), round_)
+
+
+def with_disc(light: Light, diameter_deg: float) -> Light:
+    """A light as a round disc of this diameter about its direction."""
+    if not diameter_deg > 0:
+        return light
+    ahead, size = light.towards, 2 * math.tan(math.radians(diameter_deg) / 2)
+    return replace(light, shape=flat_shape(ahead, size * sides_across(ahead), True))
+
+
+class Patch(NamedTuple):
+    """A part of a light, small enough that what it makes is that of its middle, smeared.
+
+    Attributes:
+        light: the point in its middle that has all its light.
+        sides: [2, 3], of the parallelogram of directions about it. weights: [N, M] light of its cells.
+        round: whether it is the ellipse in the parallelogram.
+    """
+
+    light: Light
+    sides: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    round: bool
+
+
+def patches(light: Light, most_deg: float, most: int = CELLS // 2) -> list[Patch]:
+    """A light in patches of about so many degrees a side.
+
+    Each fades into those beside it: where what two of them make does not quite meet, no seam is seen.
+
+    Args:
+        most: patches along a side, at most. `CELLS` takes each cell as one.
+    """
+    if light.shape is None:
+        return [Patch(light, np.zeros((2, 3)), np.ones((1, 1)), False)]
+    corners, weights, is_round = light.shape
+    middles = 0.25 * (corners[1:, 1:] + corners[:-1, 1:] + corners[1:, :-1] + corners[:-1, :-1])
+    counts = [min(math.ceil(math.degrees(side) / most_deg + 1e-9), most) for side in _lengths(corners)]
+    found = []
+    for along in _shares(counts[0]):
+        for across in _shares(counts[1]):
+            own = weights * np.outer(along, across)
+            if not own.any():
+                continue
+            rgb = np.array(light.rgb) * (own.sum() / weights.sum())
+            part = light_towards(np.einsum("ij,ijk", own, middles), rgb.tolist(), light.distance_m)
+            if part is not None:
+                (top, below), (left, right) = ((v.nonzero()[0][0], v.nonzero()[0][-1] + 1) for v in (along, across))
+                a, b, c, d = corners[top, left], corners[top, right], corners[below, left], corners[below, right]
+                sides = np.stack([c + d - a - b, b + d - a - c]) / 2
+                found.append(Patch(part, sides, own[top:below, left:right], is_round and counts == [1, 1]))
+    return found
+
+
+def _shares(count: int) -> NDArray[np.float64]:
+    """[count, CELLS] of each cell along a side, the share that each of so many patches has: in sum 1."""
+    at = (np.arange(CELLS) + 0.5) * count / CELLS - 0.5
+    return np.maximum(1 - np.abs(at.clip(0, count - 1) - np.arange(count)[:, None]), 0)
+
+
+def _lengths(corners: NDArray[np.float64]) -> tuple[float, float]:
+    """Lengths in radians of the middles of a shape's two kinds of sides."""
+    half = CELLS // 2
+    along, across = corners[-1, half] - corners[0, half], corners[half, -1] - corners[half, 0]
+    return float(np.linalg.norm(along)), float(np.linalg.norm(across))
+
 
 @dataclass(frozen=True)
 class Track:
     """A light over frames.
 
     Attributes:
-        name: of the light. keys: [K, 7] frame, azimuth and elevation in degrees, r, g, b, 1 / distance in 1/m; linear
-            in between, before the first and after the last as there.
+        name: of the light. keys: [K, 8] frame, azimuth and elevation in degrees, r, g, b, diameter in degrees,
+            1 / distance in 1/m; linear in between, before the first and after the last as there.
     """
 
     name: str
@@ -86,17 +198,20 @@ class Track:
 
     def at(self, frame: float) -> Light | None:
         """The light at a frame; None while it stands behind the lens."""
-        azimuth, elevation, r, g, b, near = (float(np.interp(frame, self.keys[:, 0], c)) for c in self.keys.T[1:])
+        azimuth, elevation, r, g, b, diameter, near = (
+            float(np.interp(frame, self.keys[:, 0], c)) for c in self.keys.T[1:]
+        )
         if math.cos(math.radians(azimuth)) <= 1e-6 or abs(elevation) >= 90:
             return None
-        return Light(azimuth, elevation, (r, g, b), 1 / near if near else math.inf)
+        return with_disc(Light(azimuth, elevation, (r, g, b), 1 / near if near else math.inf), diameter)
 
 
 def read_lights(path: Path) -> list[Track]:
     """The lights of a list: CSV with a header, or JSON, a list of objects.
 
     Columns or keys: azimuth_deg, elevation_deg; and, where they are not left out, light (a name; without it each row is
-    a light), frame (rows of one light are its keys, frames increasing), r, g, b (irradiance, `SUN`), distance_m (inf).
+    a light), frame (rows of one light are its keys, frames increasing), r, g, b (irradiance, `SUN`), distance_m (inf),
+    diameter_deg (of a round light, 0; the sun has 0.53).
 
     Raises:
         InputError: names file, row and column, for an unknown or missing one, or a value that is none; no light, or
@@ -138,10 +253,23 @@ def light_rays(
     irradiance at the lens times area / N is the light of one of N rays. All carry the same: they are uniform across the
     way of a light far away, and in solid angle from a near one.
 
+    An extended light shares its rays out among points, one in each of its cells, by their light; `shift` moves them.
+
     Args:
         shift: of the sequence, for each wavelength another. jitter: see `disc`.
     """
-    return rays_across(lens, light, disc(first, count, shift, jitter))
+    if light.shape is None:
+        return rays_across(lens, light, disc(first, count, shift, jitter))
+    parts, rays, areas = patches(light, 1e-9, CELLS), list[Floats](), list[float]()
+    shares = np.cumsum([sum(part.light.rgb) for part in parts])
+    ends = np.rint(shares * (count / max(float(shares[-1]), 1e-300))).astype(int).tolist()
+    for part, begin, end in zip(parts, [0, *ends], ends, strict=False):
+        inside = np.array([shift % 1, shift / _PLASTIC % 1]) - 0.5
+        point = light_towards(part.light.towards + inside @ part.sides, part.light.rgb, light.distance_m)
+        some, area = rays_across(lens, point or part.light, disc(first + begin, end - begin, shift, jitter))
+        rays.append(some)
+        areas.append(area * (end - begin) / count)
+    return np.concatenate(rays, 1), sum(areas)
 
 
 def front_sphere(lens: Lens) -> tuple[NDArray[np.float64], float]:
@@ -149,6 +277,13 @@ def front_sphere(lens: Lens) -> tuple[NDArray[np.float64], float]:
     front = lens.surfaces[0]
     depth = float(sag_mm(front, front.semi_diameter_mm, 0.0))
     return np.array([0.0, 0.0, depth / 2]), math.hypot(front.semi_diameter_mm, depth / 2)
+
+
+def sides_across(ahead: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Two unit vectors [2, 3] across a direction before the lens, which turn without a jump while it moves (Duff et al.
+    2017, of one hemisphere)."""
+    x, y, z = ahead
+    return np.array([[1 - x * x / (1 - z), -x * y / (1 - z), x], [x * y / (1 - z), y * y / (1 - z) - 1, -y]])
 
 
 def rays_across(lens: Lens, light: Light, place: NDArray[np.floating[Any]]) -> tuple[Floats, float]:
@@ -159,10 +294,7 @@ def rays_across(lens: Lens, light: Light, place: NDArray[np.floating[Any]]) -> t
     """
     centre, radius = front_sphere(lens)
     ahead = light.towards
-    # Two sides that turn without a jump while the light moves (Duff et al. 2017, of one hemisphere).
-    x, y, z = ahead
-    sides = np.array([[1 - x * x / (1 - z), -x * y / (1 - z), x], [x * y / (1 - z), y * y / (1 - z) - 1, -y]])
-    across = sides.T @ place
+    across = sides_across(ahead).T @ place
     if math.isinf(light.distance_m):
         target = centre[:, None] + radius * across
         return np.concatenate([target, np.broadcast_to(-ahead[:, None], target.shape)]), math.pi * radius**2

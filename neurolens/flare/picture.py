@@ -26,15 +26,18 @@ from neurolens.base.status import PASSED
 from neurolens.flare.area import draw_edges, edges_of
 from neurolens.flare.ghostmodel import GhostModel
 from neurolens.flare.ghosts import Four, GhostTracer, Way, four_reflections
-from neurolens.flare.grids import REACH, Grid, grids_of
-from neurolens.flare.lights import Light, disc, light_rays, rays_across
+from neurolens.flare.grids import REACH, Grid, ghost_moves, grids_of
+from neurolens.flare.lights import Light, disc, light_rays, patches, rays_across
 from neurolens.flare.photons import LEVELS, Photons, PhotonTracer
+from neurolens.flare.smear import Smear, enlarged, smear_of, smeared, spread
 from neurolens.flare.stack import Floats
 from neurolens.optics.glass import inverse_square_um
+from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.sequence import follow, turning
 from neurolens.optics.trace import Rays, trace
 from neurolens.render.checkpoint import digest
+from neurolens.render.colour import in_gamut
 from neurolens.render.spectrum import SpectralRange
 
 RANKED = 4096  # rays that decide which ghosts are brightest
@@ -48,8 +51,9 @@ _AXIS = 1 << 15  # rays of the exposure
 _GOLDEN = 0.6180339887498949
 _STRIP = 1 << 22  # bytes of a canvas
 _ROOM = 1 << 26  # bytes of edges that wait to be drawn
-_EDGES = 128  # bytes, of a cell
+_EDGES = 176  # bytes, of a cell
 FEWEST = 4  # wavelengths that stand for all
+_PATCH_DEG = 2.0  # of an extended light: see `patches`
 
 Doubles = NDArray[np.float64]
 _Task = tuple[Light, Way, Grid, list[float], Doubles]  # with wavelengths [K] and their colours [K, 3]
@@ -251,36 +255,64 @@ def ghost_layers(
     """
     lens, spectral = tracer.lens, SpectralRange(*wavelength_nm, bins=wavelengths)
     layer = dict(zip(tracer.pairs, layers, strict=True))
-    middle, size = 0.5 * sum(wavelength_nm), (raster.width, raster.height)
+    middle = 0.5 * sum(wavelength_nm)
     unit = raster.per_mm**2 / axis_irradiance(lens, middle) / wavelengths
     half, nm = (raster.film_mm[0] / 2, raster.height / raster.per_mm / 2), spectral.centres_nm
-    tasks: list[_Task] = []
-    for light in lights:
-        of_light = grids_of(tracer, light, middle, half, cell_px / raster.per_mm, (float(nm[0]), float(nm[-1])))
+    groups: dict[tuple[int, Smear | None], list[_Task]] = {}
+    for patch in (part for light in lights for part in patches(light, _PATCH_DEG)):
+        light, size = patch.light, 1.5 * float(np.abs(patch.sides).sum()) * abs(float(first_order(lens).efl_mm))
+        around = half[0] + size, half[1] + size  # ghosts beside the film may reach it, smeared
+        of_light = grids_of(tracer, light, middle, around, cell_px / raster.per_mm, (float(nm[0]), float(nm[-1])))
         response = np.asarray(unit * spectral.response * spectral.spectrum(light.rgb), np.float64).T
-        tasks += [(light, pair, grid, *_bands(nm, response, grid.wavelengths)) for pair, grid in of_light.items()]
-    work, rows, high = _Work(len(tasks), done), range(raster.height), max(1, _STRIP // (32 * raster.width))
-    strips = [rows[k : k + high] for k in range(0, raster.height, high)]
+        for pair, grid in of_light.items():
+            moved = raster.per_mm * ghost_moves(tracer, patch, pair, grid, middle) * (-1, 1)
+            task = light, pair, grid, *_bands(nm, response, grid.wavelengths)
+            groups.setdefault((layer[pair], smear_of(patch, moved)), []).append(task)
+    work = _Work(sum(map(len, groups.values())), done)
+    for number in sorted({number for number, _ in groups}):
+        picture = np.zeros((raster.height, raster.width, 3), np.float32)
+        for (_, smear), tasks in ((key, tasks) for key, tasks in groups.items() if key[0] == number):
+            if smear is None:
+                _draw(tracer, tasks, picture, raster.per_mm, work, threads)
+                continue
+            coarse = smear.coarse
+            kernel = smear.kernel(max(raster.width, raster.height) // 2, coarse)
+            more = 3 * (coarse > 1) - 1
+            room = [n // coarse + k + more for n, k in zip(picture.shape[:2], kernel.shape, strict=True)]
+            canvas = np.zeros((*room, 3), np.float32)
+            _draw(tracer, tasks, canvas, raster.per_mm / coarse, work, threads)
+            found = smeared(canvas, kernel) / np.float32(coarse**2)
+            picture += enlarged(found, coarse, raster.height, raster.width)
+        yield number, picture
+
+
+def _draw(
+    tracer: GhostTracer | GhostModel, tasks: Sequence[_Task], canvas: Floats, per_mm: float, work: _Work, threads: int
+) -> None:
+    """Add ghosts to a picture of so many pixels per mm."""
+    height, width, _ = canvas.shape
+    high = max(1, _STRIP // (32 * width))
+    strips = [range(height)[k : k + high] for k in range(0, height, high)]
 
     def edges(task: _Task) -> tuple[list[Doubles], Doubles]:
         """Of each wavelength, and light of their cells."""
         light, pair, grid, wavelengths_nm, colours = task
         if not work.step():
             return [], colours[:0]
-        rays, area = rays_across(lens, light, grid.places)
+        rays, area = rays_across(tracer.lens, light, grid.places)
         found = tracer.follow_each(tracer.start(rays), wavelengths_nm, pair, REACH)
-        return [edges_of(of_one, grid.columns, size, raster.per_mm) for of_one in found], area * grid.cell * colours
+        return [edges_of(of_one, grid.columns, (width, height), per_mm) for of_one in found], area * grid.cell * colours
 
-    for number in sorted({layer[pair] for _, pair, *_ in tasks}):
-        picture = np.zeros((raster.height, raster.width, 3), np.float32)
-        for batch in _batches([task for task in tasks if layer[task[1]] == number]):
-            found = [found for _, found in work.results(edges, batch, threads)]
-            each = [edges for of_ghost, _ in found for edges in of_ghost]
-            drawn = np.concatenate(each), np.array(list(map(len, each))), np.concatenate([of for _, of in found])
-            one = partial(lambda picture, drawn, rows: draw_edges(picture, rows, *drawn), picture, drawn)
-            for _ in work.results(one, strips, threads):
-                pass
-        yield number, picture
+    for batch in _batches(tasks):
+        found = [found for _, found in work.results(edges, batch, threads)]
+        each = [edges for of_ghost, _ in found for edges in of_ghost]
+        drawn = np.concatenate(each), np.array(list(map(len, each))), np.concatenate([of for _, of in found])
+        for _ in work.results(partial(_draw_rows, canvas, drawn), strips, threads):
+            pass
+
+
+def _draw_rows(canvas: Floats, drawn: tuple[Doubles, NDArray[np.int64], Doubles], rows: range) -> None:
+    draw_edges(canvas, rows, *drawn)
 
 
 def _batches(tasks: Sequence[_Task]) -> Iterator[list[_Task]]:
@@ -453,24 +485,11 @@ def _smoothed(picture: Floats, sums: Floats, radius: float) -> Floats:
     """
     found, left, last = np.zeros_like(picture), np.ones(picture.shape[:2], np.float32), False
     while not last:
-        weight, square = np.moveaxis(_spread(np.moveaxis(sums, 0, 2), radius), 2, 0)
+        weight, square = np.moveaxis(spread(np.moveaxis(sums, 0, 2), radius), 2, 0)
         last = 8 * radius > min(picture.shape[:2])
         # n photons of equal weight have a sum of squares of n times the kernel's mean square, 4 / (3 pi r^2).
         enough = 0.75 * math.pi * radius**2 * weight**2 / np.maximum(square, 1e-30) / _ENOUGH
         share = np.ones_like(left) if last else (enough - 0.5).clip(0, 1)
-        found += _spread(picture * (left * share)[..., None], radius)
+        found += spread(picture * (left * share)[..., None], radius)
         left, radius = left * (1 - share), 2 * radius
-    return np.maximum(found, 0)  # light of one wavelength has less than none of some colours
-
-
-def _spread(picture: Floats, radius: float) -> Floats:
-    """A picture [H, W, C] under one kernel."""
-    reach = min(math.ceil(radius), *picture.shape[:2])
-    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-    kernel = np.maximum(1 - (x * x + y * y) / radius**2, 0)
-    kernel[reach, reach] = 1
-    padded = np.pad(picture, ((reach, reach), (reach, reach), (0, 0)), mode="symmetric")
-    size = [n + 2 * reach for n in padded.shape[:2]]
-    whole = np.fft.rfft2(padded, size, axes=(0, 1)) * np.fft.rfft2(kernel / kernel.sum(), size)[..., None]
-    kept = np.fft.irfft2(whole, size, axes=(0, 1))[2 * reach :, 2 * reach :]
-    return kept[: picture.shape[0], : picture.shape[1]].astype(np.float32)
+    return in_gamut(found)

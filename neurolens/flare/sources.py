@@ -18,24 +18,20 @@ from scipy import ndimage  # type: ignore[import-untyped]
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.field import Array, Field
-from neurolens.flare.lights import Light
+from neurolens.flare.lights import CELLS, Light, Shape, flat_shape, light_towards, sides_across
 from neurolens.render.colour import balance
 from neurolens.render.job import camera_axes
 from neurolens.render.scene import Scene
 from neurolens.render.spectrum import SpectralRange
 from neurolens.render.world import World
 
-_SIDE = 8  # samples along each side of a light
-_PATCHES = 4  # patches along each side of a large one
-_SMALL = math.radians(1.0)  # about its middle, seen from the lens: one light
 _CELL = 1 / 48  # of the picture's width: larger highlights are several lights
-WHOLE = -1
 _FADES = 1.25
 _MOST_PIXELS, _AT_ONCE = 1 << 22, 1 << 18  # above the threshold; of these together, each of some 500 bytes
 _DIMMEST = 0.02  # relative illumination that a highlight's radiance is told from
 
 
-Name = tuple[int, int]  # of a light of a scene: its number, and which part of it, or `WHOLE`
+Name = int  # of a light of a scene: its number
 
 
 class SceneLights:
@@ -69,51 +65,30 @@ class SceneLights:
         pose = scene.settings.camera
         axes = camera_axes(pose).astype(np.float64)
         front = np.array(pose.position_m) - axes[:, 2] * film_z_mm / 1000
-        side = (np.arange(_SIDE) + 0.5) / _SIDE
-        square = np.stack([a.ravel() for a in np.meshgrid(side, side)]).astype(np.float32)
-        point = np.repeat(front[:, None], square.shape[1], 1).astype(np.float32)
-        found: dict[Name, Light] = {}
-        lights = self._world.lights
+        middle, corner = ((2 * np.arange(CELLS + k) + 1 - k) / CELLS - 1 for k in (0, 1))
+        place = np.concatenate([np.stack(np.meshgrid(a, a, indexing="ij")).reshape(2, -1) for a in (middle, corner)], 1)
+        point = np.repeat(front[:, None], place.shape[1], 1).astype(np.float32)
+        lights, own, found = self._world.lights, CELLS * CELLS, dict[Name, Light]()
         numbers = range(lights.count) if most is None else lights.strongest(tuple(front.tolist()), most)
-        for number, (direction, distance, scale) in zip(numbers, lights.each(numbers, point, square), strict=True):
-            rgb = self._rgb[self._colour[number]]
-            seen = np.where(self._world.visible(point, direction, distance), scale, 0).astype(np.float64)
-            parts = _lights(axes.T @ direction, distance, seen, rgb)
-            found |= {(number, part): light for part, light in parts.items()}
+        for number, (is_round, aimed) in zip(numbers, lights.each(numbers, point, place), strict=True):
+            direction, distance, scale = (a[..., :own] for a in aimed)
+            inside = (place[:, :own] ** 2).sum(0) < 1 if is_round else np.ones(own, bool)
+            seen = np.where(inside & self._world.visible(point[:, :own], direction, distance), scale, 0).astype(float)
+            shape = Shape(
+                (axes.T @ aimed[0][:, own:]).T.reshape(CELLS + 1, CELLS + 1, 3), seen.reshape(CELLS, CELLS),
+                is_round and bool(seen[inside].all()),
+            )  # fmt: skip
+            rgb = self._rgb[self._colour[number]] * (seen.sum() / inside.sum())
+            if rgb.any() and (light := _light(axes.T @ (direction @ seen), rgb, distance, shape)):
+                found[number] = light
         return found
 
 
-def _lights(towards: Array, distance: FloatArray, scale: Array, rgb: Array) -> dict[int, Light]:
-    """A light sampled over its square, as one (`WHOLE`), or where it is large as several, by number.
-
-    Args:
-        towards: [3, N] camera frame. scale: [N] irradiance of emission 1.
-    """
-    if not (scale.any() and rgb.any()):
-        return {}
-    middle = towards @ scale
-    middle /= np.linalg.norm(middle)
-    apart = np.linalg.norm(towards[:, scale > 0] - middle[:, None], axis=0).max()
-    cells = 1 if apart <= _SMALL else _PATCHES
-    number = np.arange(_SIDE) * cells // _SIDE
-    cell = (number[:, None] * cells + number).ravel()
-    lights = {}
-    for k in range(cells * cells):
-        share = np.where(cell == k, scale, 0)
-        if share.any():
-            mean = float(share @ distance / share.sum()) if np.isfinite(distance).all() else math.inf
-            lights[k if cells > 1 else WHOLE] = _light(towards @ share, rgb * share.sum() / scale.size, mean)
-    return {part: light for part, light in lights.items() if light is not None}
-
-
-def _light(towards: Array, rgb: Array, distance_m: float = math.inf) -> Light | None:
-    """None behind the lens."""
-    x, y, z = towards / np.linalg.norm(towards)
-    azimuth, elevation = math.degrees(math.atan2(x, -z)), math.degrees(math.asin(max(-1.0, min(1.0, y))))
-    if not z < -1e-6:
-        return None
-    r, g, b = (max(float(v), 0.0) for v in rgb)
-    return Light(azimuth, elevation, (r, g, b), distance_m)
+def _light(towards: Array, rgb: Array, distance: FloatArray, shape: Shape) -> Light | None:
+    """A light of a scene; one without size has the same direction in all its corners."""
+    mean = float(np.average(distance, weights=shape.weights.ravel())) if np.isfinite(distance).all() else math.inf
+    extended = np.ptp(shape.corners, axis=(0, 1)).any()
+    return light_towards(towards, rgb.tolist(), mean, shape if extended else None)
 
 
 class Kept(NamedTuple):
@@ -149,25 +124,15 @@ def keep_named(lights: Mapping[Name, Light], names: frozenset[Name]) -> Kept:
 
 
 def chosen(frames: Sequence[Mapping[Name, Light]], most: int) -> frozenset[Name]:
-    """Names of the lights that are kept in all frames: so many at most, of the most energy in all frames together.
+    """Numbers of the lights that are kept in all frames: so many at most, of the most energy in all frames together.
 
-    So none comes or goes because others do. Parts of a light go with it, as far as there is room.
+    So none comes or goes because others do.
     """
-    energy: dict[int, float] = {}
-    parts: dict[int, dict[int, float]] = {}
+    energy: dict[Name, float] = {}
     for frame in frames:
-        for (number, part), light in frame.items():
+        for number, light in frame.items():
             energy[number] = energy.get(number, 0.0) + _energy(light)
-            of_parts = parts.setdefault(number, {})
-            of_parts[part] = of_parts.get(part, 0.0) + _energy(light)
-    found, room = set[Name](), most
-    for number in sorted(energy, key=lambda number: -energy[number]):
-        if room <= 0:
-            break
-        of_it = sorted(set(parts[number]) - {WHOLE}, key=lambda part: -parts[number][part])[:room]
-        found |= {(number, WHOLE), *((number, part) for part in of_it)}
-        room -= max(len(of_it), 1)
-    return frozenset(found)
+    return frozenset(sorted(energy, key=lambda number: -energy[number])[:most])
 
 
 def _energy(light: Light) -> float:
@@ -207,19 +172,33 @@ def highlights(
         return Kept([], 0, 0.0)
     region = _regions(bright, max(1, round(_CELL * width)))
     count = int(region.max()) + 1
-    colour, middle = np.zeros((count, 3)), np.zeros((3, count))
+    colour, moments = np.zeros((count, 3)), np.zeros((13, count))
     for start in range(0, row.size, _AT_ONCE):
         r, c, of = (a[start : start + _AT_ONCE] for a in (row, column, region))
-        energy, towards = _pixels(picture[r, c], r, c, field, film_mm, (height, width))
+        energy, towards, solid = _pixels(picture[r, c], r, c, field, film_mm, (height, width))
         energy *= np.minimum(value[r, c] / threshold - 1, 1)[:, None]
         colour += np.stack([np.bincount(of, e, count) for e in energy.T], 1)
-        middle += np.stack([np.bincount(of, energy.sum(1) * t, count) for t in towards])
+        squares = (towards[:, None] * towards).reshape(9, -1)
+        moments += np.stack([np.bincount(of, energy.sum(1) * t, count) for t in (*towards, *squares, solid)])
+    middle = moments[:3]
     each = colour.sum(1)
     seen = np.flatnonzero((each > 0) & (middle[2] < -1e-6 * np.linalg.norm(middle, axis=0)))
     first = seen[np.argsort(-each[seen], kind="stable")][: most + 1]  # one more tells how they fade
-    kept = keep([light for k in first if (light := _light(middle[:, k], colour[k]))], most, fade).lights
+    shapes = [_spread_of(moments[:, k] / each[k]) for k in first]
+    lights = [light_towards(middle[:, k], colour[k], shape=shape) for k, shape in zip(first, shapes, strict=True)]
+    kept = keep([light for light in lights if light], most, fade).lights
     left = 1 - sum(map(_energy, kept)) / float(each[seen].sum()) if len(seen) > most else 0.0
     return Kept(kept, len(seen), left)
+
+
+def _spread_of(means: Array) -> Shape:
+    """The parallelogram with the variances of a region, by means [13] of directions, their products, solid angles."""
+    towards = means[:3] / np.linalg.norm(means[:3])
+    across = sides_across(towards)
+    variance = across @ (means[3:12].reshape(3, 3) - np.outer(means[:3], means[:3])) @ across.T
+    pixel = means[12] / 12 * np.eye(2)  # its own variance, with that of its middles
+    half = np.linalg.cholesky(variance + pixel)
+    return flat_shape(towards, math.sqrt(12) * half.T @ across)
 
 
 def _regions(bright: NDArray[np.bool_], cell: int) -> NDArray[np.intp]:
@@ -239,8 +218,9 @@ def _regions(bright: NDArray[np.bool_], cell: int) -> NDArray[np.intp]:
 def _pixels(
     colour: FloatArray, row: NDArray[np.intp], column: NDArray[np.intp], field: Field, film_mm: tuple[float, float],
     size: tuple[int, int],
-) -> tuple[Array, Array]:  # fmt: skip
-    """Irradiance at the lens [N, 3] and direction [3, N] (lens frame) of pixels, as their corners are seen."""
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Irradiance at the lens [N, 3], unit direction [3, N] (lens frame) and solid angle [N] of pixels, as their corners
+    are seen."""
     x = (np.array([[0], [1], [1], [0]]) + column) * (film_mm[0] / size[1]) - film_mm[0] / 2
     y = film_mm[1] / 2 - (np.array([[0], [0], [1], [1]]) + row) * (film_mm[1] / size[0])
     corner = field.directions((x + 1j * y).reshape(-1)).reshape(3, 4, -1)
@@ -249,4 +229,5 @@ def _pixels(
     solid = np.linalg.norm(np.cross(across, down, axis=0), axis=0) / 2
     light = field.relative_light(x.mean(0) + 1j * y.mean(0))
     radiance = np.where(light[:, None] > _DIMMEST, np.maximum(colour, 0) / np.maximum(light, _DIMMEST)[:, None], 0)
-    return radiance * solid[:, None], corner.sum(1)
+    towards = corner.sum(1)
+    return radiance * solid[:, None], towards / np.linalg.norm(towards, axis=0), solid

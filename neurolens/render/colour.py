@@ -100,6 +100,15 @@ def balance(white_rgb: ArrayLike) -> Matrix:
     return _solve(SRGB.to_xyz, adaptation(white, xyz_of(SRGB.white)) @ SRGB.to_xyz)
 
 
+def in_gamut(colours: NDArray[np.floating]) -> FloatArray:
+    """Linear sRGB [..., 3] without negative values: colours beyond the gamut, as of one wavelength, are mixed with grey
+    of their luminance until they lie on its border; the others stay as they are."""
+    grey = (colours @ SRGB.to_xyz[1].astype(np.float32)).clip(0)[..., None]
+    least = np.minimum(colours.min(-1, keepdims=True), 0)
+    share = grey / np.maximum(grey - least, np.finfo(np.float32).tiny)
+    return np.where(least < 0, np.maximum(grey + share * (colours - grey), 0), colours).astype(np.float32)
+
+
 def srgb_to_linear(encoded: NDArray[np.floating]) -> FloatArray:
     """Linear light of sRGB-encoded values in [0, 1] (IEC 61966-2-1)."""
     encoded = np.asarray(encoded, np.float32)

@@ -233,6 +233,9 @@ class SunLight(LightGroup):
         nm, values, _ = sun_spectrum(sky)
         return palette.measured_light(("sun", sky), (nm, values), self._radiance)
 
+    def round(self, number: int) -> bool:
+        return True
+
     def importance(self, target_m: Vector) -> NDArray[np.float64]:
         return np.full(self.count, 3 * self._radiance * 2 * math.pi * float(self._one_less_cos))
 

@@ -51,6 +51,10 @@ class LightGroup:
     count: int
     sizeless = False
 
+    def round(self, number: int) -> bool:
+        """Whether samples are of a disc: their first number is the square of the radius, their second the angle."""
+        return False
+
     def importance(self, target_m: Vector) -> NDArray[np.float64]:
         """About the irradiance [count] at a point, its three colours added up."""
         raise NotImplementedError
@@ -117,11 +121,21 @@ class Lights:
         density *= self.probability.take(light)
         return density
 
-    def each(self, numbers: Iterable[int], point: FloatArray, square: FloatArray) -> Iterator[Aimed]:
-        """As `LightGroup.sample` from points [3, N] to lights, one after another."""
+    def each(
+        self, numbers: Iterable[int], point: FloatArray, place: NDArray[np.float64]
+    ) -> Iterator[tuple[bool, Aimed]]:
+        """From points [3, N] to lights, one after another: whether each is round, and as of `LightGroup.sample`.
+
+        Args:
+            place: [2, N] from -1 to 1 in the light's own square, or in the one about it.
+        """
+        square = ((place + 1) / 2).astype(np.float32)
+        disc = np.stack([(place**2).sum(0), np.arctan2(place[1], place[0]) / TWO_PI % 1]).astype(np.float32)
         for number in numbers:
             first, group = next(part for part in reversed(self._groups) if part[0] <= number)
-            yield group.sample(np.full(point.shape[1], number - first), point, square)
+            is_round = group.round(number - first)
+            some = np.full(point.shape[1], number - first)
+            yield is_round, group.sample(some, point, disc if is_round else square)
 
     def strongest(self, target_m: Vector, most: int) -> list[int]:
         """So many lights that bring a point the most light if nothing is between, by rising number."""
@@ -166,6 +180,9 @@ class FlatLights(LightGroup):
         self._middle = corner + 0.5 * (edge_u + edge_v)
         self._middle[self._quads :] = corner[self._quads :]
 
+    def round(self, number: int) -> bool:
+        return number >= self._quads
+
     def importance(self, target_m: Vector) -> NDArray[np.float64]:
         return _irradiance(self._area, self._middle, self._emission, target_m)
 
@@ -197,6 +214,9 @@ class SphereLights(LightGroup):
         self.count, self._emission = len(spheres), [s.emission for s in spheres]
         self._centre = np.array([s.centre_m for s in spheres], np.float32).reshape(-1, 3).T
         self._radius2 = np.array([s.radius_m**2 for s in spheres], np.float32)
+
+    def round(self, number: int) -> bool:
+        return True
 
     def importance(self, target_m: Vector) -> NDArray[np.float64]:
         return _irradiance(np.pi * self._radius2, self._centre.T, self._emission, target_m)

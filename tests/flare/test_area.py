@@ -51,6 +51,18 @@ def test_pixels_are_covered_by_their_area(turn: float) -> None:
     np.testing.assert_allclose(drawn(rays(place), 7, 25 / 28), whole, atol=1e-5)
 
 
+def test_cells_have_no_borders_where_density_changes_little() -> None:
+    """Places x = u + u^2 / 4 have the density 1 / sqrt(1 + x), to 1.5%; cells of one density each are off by 8%."""
+    u = lattice(8, 8, -1.0, 1.0)
+    found = np.stack([24 * (u[0] + u[0] ** 2 / 4), 24 * u[1]])
+    picture = drawn(rays(found), 8, 1.0, (60, 50))
+    x = -(np.arange(60) - 29.5) / 24  # to the left
+    density = (2 / 8 * 24) ** -2 / np.sqrt(np.maximum(1 + x, 0.01))
+    inside = (x > -0.55) & (x < 0.9)  # the outermost cells know one side of their border alone
+    assert picture[25][inside] == pytest.approx(density[inside], rel=0.015)
+    assert picture.sum() == pytest.approx(64, rel=2e-4)  # slopes end at the middles of border pixels
+
+
 def test_what_lies_off_the_film_changes_nothing_on_it() -> None:
     """A small film shows the middle of a large one: folded, stretched and cut cells at all borders."""
     rng = np.random.default_rng(4)

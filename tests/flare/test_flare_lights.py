@@ -10,8 +10,8 @@ import pytest
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.field import field_of
-from neurolens.flare.lights import SUN, Light, light_rays, read_lights
-from neurolens.flare.sources import WHOLE, SceneLights, chosen, highlights, keep, keep_named
+from neurolens.flare.lights import SUN, Light, light_rays, patches, read_lights, with_disc
+from neurolens.flare.sources import SceneLights, chosen, highlights, keep, keep_named
 from neurolens.optics.lensfile import read_lens
 from neurolens.render.scene import scene_from_tables, seen_from
 
@@ -38,6 +38,9 @@ def test_lists_hold_keys_and_both_kinds_say_the_same(tmp_path: Path) -> None:
         assert lamp.at(3) is None  # behind the lens
     one.write_text("azimuth_deg,elevation_deg\n1,2\n3,4\n")
     assert [track.at(0) for track in read_lights(one)] == [Light(*at, (SUN,) * 3) for at in ((1.0, 2.0), (3.0, 4.0))]
+    one.write_text("azimuth_deg,elevation_deg,diameter_deg\n1,2,0.533\n3,4,0\n")
+    sun, point = (track.at(0) for track in read_lights(one))
+    assert sun.about["shape"] == pytest.approx([0.533, 0.533], abs=1e-3) and point.shape is None
 
 
 @pytest.mark.parametrize(
@@ -105,6 +108,20 @@ def test_lights_of_a_scene_by_closed_forms() -> None:
     assert point.distance_m == pytest.approx(math.sqrt(8), rel=1e-5)
 
 
+def test_rays_of_an_extended_light_come_from_all_of_it() -> None:
+    """Their mean direction is that of its middle, and their variance a disc's: r^2 / 4 along each axis."""
+    lens = read_lens(Path(__file__).parents[2] / "lenses/cooke_triplet_50.toml")
+    light = Light(20.0, 10.0, (2.0, 1.0, 1.0))
+    shifts = np.arange(16) / 16  # one for each wavelength
+    found = [light_rays(lens, with_disc(light, 4.0), 0, 1024, shift) for shift in shifts]
+    point, whole = light_rays(lens, light, 0, 1024, 0.3)
+    rays = np.concatenate([rays for rays, _ in found], 1)
+    assert rays.shape[1] == 16 * 1024 and np.mean([area for _, area in found]) == pytest.approx(whole, rel=1e-3)
+    assert rays[3:].mean(1) == pytest.approx(point[3:, 0], abs=2e-3)  # a cell has 9e-3
+    spread = np.linalg.norm(rays[3:] - rays[3:].mean(1)[:, None], axis=0)
+    assert np.mean(spread**2) == pytest.approx(math.tan(math.radians(2)) ** 2 / 2, rel=0.05)
+
+
 def test_lights_are_hidden_dim_and_follow_the_camera() -> None:
     light = {"centre_m": [1.0, 2.0, -2.1], "radius_m": 0.05, "emission": [1.0, 1.0, 1.0]}
     wall = {"min_m": [1.0, 0.0, 0.0], "max_m": [3.0, 4.0, 0.1], "material": "grey"}
@@ -139,7 +156,8 @@ def test_spots_shine_where_they_look() -> None:
 
 
 def test_the_sun_and_large_lights() -> None:
-    """The sun has its direction and a disc's solid angle; a panel of 1 m at 1 m is several lights with its energy."""
+    """The sun has its direction, a disc's solid angle and size; a panel of 1 m at 1 m is one light of its energy, in
+    patches that tile it."""
     sky = {"sun_elevation_deg": 30.0, "sun_azimuth_deg": 20.0, "white_kcd_per_m2": 20.0}
     lights, made = scene(sky=sky)
     (sun,) = lights.seen(made, 100.0)
@@ -149,36 +167,43 @@ def test_the_sun_and_large_lights() -> None:
     assert 70 < luminance < 133
     quad = {"corner_m": [0.5, 1.5, 1.9], "edge_u_m": [1.0, 0.0, 0.0], "edge_v_m": [0.0, 1.0, 0.0]}
     lights, made = scene(quads=[{**quad, "emission": [1.0, 1.0, 1.0]}])
-    found = lights.seen(made, 100.0)
+    assert sun.about["shape"] == pytest.approx([0.533, 0.533], abs=1e-3) and sun.shape.round
+    (patch,) = patches(sun, 4.0)
+    assert patch.round and patch.light.towards == pytest.approx(sun.towards, abs=1e-7)
+    (panel,) = lights.seen(made, 100.0)
+    found = [patch.light for patch in patches(panel, 1e-9, 8)]
     # The solid angle of a square of side 1 from 1 m before its middle: 4 asin(0.25 / 1.25).
-    assert len(found) == 16
-    assert sum(light.rgb[1] for light in found) == pytest.approx(4 * math.asin(0.2), rel=3e-3)
+    assert len(found) == 64 and panel.about["shape"] == pytest.approx([51.2, 51.2], abs=0.1)  # 2 sin 26.6 degrees
+    for some in (found, [panel]):
+        assert sum(light.rgb[1] for light in some) == pytest.approx(4 * math.asin(0.2), rel=3e-3)
+    places = sorted(
+        {(round(math.tan(math.radians(a.azimuth_deg)), 2), round(a.towards[1] / -a.towards[2], 2)) for a in found}
+    )
+    assert places[0] == pytest.approx((-0.4375, -0.4375), abs=0.01) and len(places) == 64
 
 
 def test_lights_of_frames_neither_come_nor_go() -> None:
     """Twelve lamps that a camera passes: each frame by itself has others; of all together the same, most energy first,
-    and a near panel keeps its parts."""
+    and a near panel is one of them."""
     lamps = [{"position_m": [-3.0 + 0.5 * k, 2.0, -1.0], "intensity": [1.0 + 0.1 * k] * 3} for k in range(12)]
     quad = {"corner_m": [0.5, 1.5, -4.0], "edge_u_m": [1.0, 0.0, 0.0], "edge_v_m": [0.0, 1.0, 0.0]}
     lights, made = scene(points=lamps, quads=[{**quad, "emission": [9.0, 9.0, 9.0]}])
     places = [seen_from(made, "scene", (x, 2.0, 3.0), (x, 2.0, -3.0)) for x in np.linspace(-3.0, 3.0, 25)]
     frames = [lights.named(place, 100.0) for place in places]
-    assert all(len(frame) == 28 for frame in frames)
-    alone = [set(keep(list(f.values()), 20).lights) for f in frames]
+    assert all(len(frame) == 13 for frame in frames)
+    alone = [set(keep(list(f.values()), 5).lights) for f in frames]
     assert len({frozenset(n for n, light in f.items() if light in of) for f, of in zip(frames, alone, strict=True)}) > 3
-    names = chosen(frames, 20)
+    names = chosen(frames, 5)
     whole = {name: sum(sum(f[name].rgb) for f in frames) for name in frames[0]}
-    panel = {name for name in whole if name[1] != WHOLE}
-    others = sorted(set(whole) - panel, key=lambda name: -whole[name])
-    assert len(panel) == 16 and panel < names and set(others[:4]) == names & set(others)
+    ordered = sorted(whole, key=lambda name: -whole[name])
+    panel = next(name for name in whole if frames[0][name].shape is not None)
+    assert names == set(ordered[:5]) and panel in names
     for frame in frames:
         found = keep_named(frame, names)
-        assert found.of == 28 and set(found.lights) == {frame[name] for name in names & set(frame)}
-        left = sum(sum(frame[name].rgb) for name in others[4:]) / sum(sum(light.rgb) for light in frame.values())
+        assert found.of == 13 and set(found.lights) == {frame[name] for name in names}
+        left = sum(sum(frame[name].rgb) for name in ordered[5:]) / sum(sum(light.rgb) for light in frame.values())
         assert found.dropped == pytest.approx(left)
-    few = chosen(frames, 3)  # less than one light's parts
-    assert len({name for name in few if name in panel}) == 3 and keep_named(frames[0], few).dropped > 0.5
-    assert chosen([], 3) == frozenset() and keep_named({}, few).lights == []
+    assert chosen([], 3) == frozenset() and keep_named({}, names).lights == []
 
 
 def test_lights_fade_before_they_are_left_out() -> None:

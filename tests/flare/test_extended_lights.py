@@ -1,0 +1,158 @@
+"""Lights that are no points: what they make is the integral over their points, for ghosts, stars and photons."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.ndimage import uniform_filter
+
+from neurolens.flare.diffraction import starburst_picture
+from neurolens.flare.ghosts import GhostTracer
+from neurolens.flare.lights import CELLS, Light, light_towards, patches, sides_across, with_disc
+from neurolens.flare.photons import PhotonTracer
+from neurolens.flare.picture import Raster, ghost_picture, ghost_table, photon_picture
+from neurolens.flare.smear import Smear
+from neurolens.flare.sources import SceneLights
+from neurolens.optics.apertures import Aperture
+from neurolens.optics.lensfile import read_lens
+from neurolens.optics.prescription import Lens
+from neurolens.render.scene import load_scene
+from tests.flare.test_ghosts import LENSES, lens_of
+
+CASE = Path(__file__).parents[3] / "shared/data/cases/render/area_light_flare.toml"
+
+
+def hexagonal(name: str, **state: float) -> Lens:
+    lens = read_lens(LENSES / f"{name}.toml").at(**({"focus_m": math.inf, "f_number": 8.0} | state))
+    return replace(lens, aperture=Aperture(blades=6))
+
+
+def points_of(light: Light, sides: np.ndarray, count: int, inside: bool) -> list[Light]:
+    """A light's parallelogram of sides [2, 3], or the ellipse in it, as many points of equal light."""
+    at = (np.arange(count) + 0.5) / count - 0.5
+    places = [(a, b) for a in at for b in at if not inside or a * a + b * b < 0.25]
+    rgb = tuple(v / len(places) for v in light.rgb)
+    found = [light_towards(light.towards + np.array(p) @ sides, rgb, light.distance_m) for p in places]
+    return [point for point in found if point]
+
+
+def brightest(lens: Lens, light: Light, count: int) -> GhostTracer:
+    return GhostTracer(lens, [ghost.pair for ghost in ghost_table(GhostTracer(lens), light, 550.0)[:count]])
+
+
+@pytest.mark.parametrize(
+    ("sides", "weights", "is_round"),
+    [
+        ((7.3, 2.0, -1.5, 4.4), (), False),
+        ((7.3, 2.0, -1.5, 4.4), (), True),
+        ((16.0, 0.0, 0.0, 16.0), ((1.0, 0.0), (0.5, 0.25)), False),
+    ],
+)
+def test_kernels_have_the_moments_of_the_light(
+    sides: tuple[float, float, float, float], weights: tuple[tuple[float, ...], ...], is_round: bool
+) -> None:
+    """Sum 1, mean 0, and variances of a parallelogram (s^2 / 12), an ellipse (s^2 / 16), or cells, and of a pixel."""
+    kernel = Smear(sides, weights, is_round).kernel(100).astype(np.float64)
+    y, x = (np.arange(n) - n // 2 for n in kernel.shape)
+    assert kernel.min() >= 0 and kernel.sum() == pytest.approx(1, abs=1e-5)
+    assert (kernel @ x).sum() == pytest.approx(0, abs=1e-4) and (kernel.T @ y).sum() == pytest.approx(0, abs=1e-4)
+    a = np.array(sides).reshape(2, 2)
+    if weights:
+        w, places = np.array(weights).ravel(), np.array([(s, t) for s in (-0.25, 0.25) for t in (-0.25, 0.25)]) @ a
+        middle = w @ places / w.sum()
+        right = ((places - middle).T * w) @ (places - middle) / w.sum() + a.T @ a / 48
+    else:
+        right = a.T @ a / (16 if is_round else 12)
+    found = [(kernel @ x**2).sum(), (kernel.T @ y**2).sum(), y @ kernel @ x]
+    assert found == pytest.approx([right[0, 0] + 1 / 12, right[1, 1] + 1 / 12, right[0, 1]], rel=0.03)
+
+
+def test_ghosts_of_a_disc_are_the_integral_over_it() -> None:
+    """The 14 brightest ghosts of a disc of 3 degrees: 2.4% of their light lies elsewhere than by 37 points; of the
+    point in the middle, a seventh does."""
+    lens, light = hexagonal("tajima_retrofocus_24"), Light(13.7, 10.0)
+    tracer, raster = brightest(lens, light, 14), Raster((36.0, 24.0), 120, 80)
+
+    def light_of(lights: list[Light]) -> np.ndarray:
+        return ghost_picture(tracer, lights, raster, wavelengths=2, threads=1)[0].sum(-1)
+
+    right = light_of(points_of(light, 2 * math.tan(math.radians(1.5)) * sides_across(light.towards), 7, True))
+    disc, point = light_of([with_disc(light, 3.0)]), light_of([light])
+    assert disc.sum() == pytest.approx(right.sum(), rel=0.03)  # one ghost is cut by a rim
+    off, off_of_point = (np.abs(v - right).sum() / right.sum() for v in (disc, point))
+    assert off < 0.03 and off_of_point > 0.1
+
+
+@pytest.mark.skipif(not CASE.is_file(), reason=f"{CASE} is not there")
+def test_a_softbox_is_no_lattice_of_points() -> None:
+    """The case's softbox, 11.5 by 7.8 degrees: ghosts as by 16 x 16 points, 2.4% of their light
+    elsewhere, and 40 times as smooth as by the 4 x 4 points of before."""
+    scene, lens = load_scene(CASE), hexagonal("laikin_double_gauss_50", focus_m=3.0)
+    (light,) = SceneLights(scene).seen(scene, lens.film_z_mm)
+    assert light.about["shape"] == pytest.approx([11.5, 7.8], abs=0.1)
+    tracer, raster = brightest(lens, light, 10), Raster((36.0, 20.25), 120, 68)
+
+    def light_of(lights: list[Light]) -> np.ndarray:
+        return ghost_picture(tracer, lights, raster, wavelengths=1, threads=1)[0].sum(-1)
+
+    corners, cells = light.shape.corners, patches(light, 1e-9, CELLS)
+    right = light_of([point for cell in cells for point in points_of(cell.light, cell.sides, 2, False)])
+    sides = np.stack([corners[-1, 4] - corners[0, 4], corners[4, -1] - corners[4, 0]])
+    lattice, smooth = light_of(points_of(light, sides, 4, False)), light_of([light])
+    # One ghost is in focus: the points are seen in it, 5 pixels apart.
+    off, off_of_lattice = (np.abs(uniform_filter(v - right, 5)).sum() / right.sum() for v in (smooth, lattice))
+    assert off < 0.03 and off_of_lattice > 0.09
+    rough, rough_lattice = (np.abs(np.diff(np.diff(v, axis=0), axis=1)).sum() for v in (smooth, lattice))
+    assert rough < 0.05 * rough_lattice
+
+
+def test_streaks_of_the_sun_are_as_wide_as_its_disc() -> None:
+    """On pixels as of the case (36 mm / 960, the disc 6.0 px at 24.3 mm): a point's streaks are 2 px wide, the sun's as
+    a line smeared by a disc; its peak beside the image falls to a third, and no light is lost."""
+    lens, raster = hexagonal("tajima_retrofocus_24"), Raster((9.0, 6.0), 240, 160)
+    light = Light(0.0, 0.0)
+    point, sun = (
+        starburst_picture(lens, [of], raster, wavelengths=3, threads=1).sum(-1).astype(np.float64)
+        for of in (light, with_disc(light, 0.533))
+    )
+    widths = []
+    for star in (point, sun):
+        rows = [star[row, 90:150] for row in (5, 20, 40, 60)]  # 75 to 20 px above the core, across a vertical streak
+        widths.append([float(np.interp(0.5, *_falling(row / row.max()))) for row in rows])
+    disc = math.radians(0.533) * 24.3 / 0.0375
+    assert max(widths[0]) < 3
+    assert widths[1] == pytest.approx([disc * math.sqrt(0.75)] * 4, abs=0.8)  # of a chord's profile, and a pixel
+    assert point.max() / sun.max() > 2.5
+    assert sun[40:-40, 60:-60].sum() == pytest.approx(point[40:-40, 60:-60].sum(), rel=0.02)
+
+
+def _falling(row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Widths by height, the heights rising."""
+    heights = np.linspace(0.05, 0.95, 91)
+    fine = np.interp(np.arange(0, len(row) - 1, 0.01), np.arange(len(row)), row)
+    return heights, np.array([0.01 * (fine > height).sum() for height in heights])
+
+
+def test_stars_hold_no_negative_light() -> None:
+    """Fringes of a point's star are of nearly one wavelength, beyond the gamut of sRGB, as a violet light is."""
+    lens, raster = hexagonal("tajima_retrofocus_24"), Raster((4.5, 3.0), 60, 40)
+    lights = [Light(0.0, 0.0), Light(2.0, 1.0, (0.1, 0.0, 1.0)), with_disc(Light(-2.0, 1.0), 0.533)]
+    star = starburst_picture(lens, lights, raster, wavelengths=5, threads=1)
+    assert star.min() >= 0 and (star.sum(-1) > 0).all()
+
+
+def test_photons_of_a_disc_come_from_all_of_it() -> None:
+    """The image of a disc of 4 degrees by photons: a disc of even light, its radius 2 degrees."""
+    lens, raster = lens_of("laikin_double_gauss_50"), Raster((12.0, 8.0), 96, 64)
+    picture = photon_picture(
+        PhotonTracer(lens), [with_disc(Light(0.0, 0.0), 4.0)], raster, part="image", wavelengths=4, photons=1 << 16,
+        kernel_px=0, threads=1,
+    ).sum(-1)  # fmt: skip
+    y, x = np.mgrid[:64, :96]
+    r = np.hypot(x - 47.5, y - 31.5) / 8  # mm
+    edge = 50 * math.tan(math.radians(2))
+    total = picture.sum()
+    assert picture[r > 1.1 * edge].sum() < 0.01 * total
+    assert picture[r < edge / 2].sum() == pytest.approx(total / 4, rel=0.05)
