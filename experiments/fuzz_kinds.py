@@ -7,7 +7,6 @@ words of a command, with small settings: a valid file goes all the way in a frac
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import random
 import re
@@ -22,6 +21,7 @@ import numpy as np
 from experiments import lab
 from experiments.fuzz_damage import WORDS, damage
 from neurolens import cli
+from neurolens.base.files import write_kept
 from neurolens.commands.arguments import Parser
 
 SEEDS = Path(__file__).with_name("fuzz_seeds")
@@ -468,5 +468,5 @@ def _page(folder: Path) -> None:
     }  # fmt: skip
     place = folder / "pages" / "cooke_triplet_50"
     place.mkdir(parents=True)
-    (place / "record.json").write_text(json.dumps(record))
+    write_kept(place / "record.json", record)
     (place / "index.html").write_text("<!DOCTYPE html>")
