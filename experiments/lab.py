@@ -68,6 +68,7 @@ def out(folder: Path = RESULTS, what: str = "folder for the tables") -> Option:
 
 QUIET = option("--quiet", action="store_true", help=QUIET_HELP)
 ONLY = option("--only", metavar="TEXT", default="", help="lens files whose name holds this text")
+PICTURE = option("--picture", action="store_true", help="draw the picture alone; the tables stay as they are")
 ROUNDS = count("rounds", None, "rounds (default 20; quick 5)")
 
 

@@ -19,8 +19,8 @@ SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 PROJECT = SETTINGS["project"]
 FOLDERS = ("neurolens", "experiments", "tests")
 IN_BLENDER = {"bpy", "bmesh", "cycles"}  # modules that Blender brings
-# Distributions that nothing here imports: programs, their plugins, and cryptography, by which distributed makes keys.
-TOOLS = {"pytest-xdist", "ruff", "mypy", "mkdocs-material", "mkdocstrings", "cryptography"}
+# Distributions that nothing there imports: programs, their plugins, and cryptography, by which distributed makes keys.
+TOOLS = {"pytest-xdist", "ruff", "mypy", "sphinx", "myst-parser", "pydata-sphinx-theme", "cryptography"}
 
 
 def test_the_tested_versions_lie_in_the_ranges_that_are_declared() -> None:

@@ -30,8 +30,9 @@ examples:
   neurolens library -o pages
   neurolens library -o pages laikin_double_gauss_50 my_lens.toml"""
 _SHOWN = {
-    "layout": "Section", "spots": "Spots through focus", "mtf": "Geometric MTF", "distortion": "Distortion",
-    "vignetting": "Vignetting", "colour": "Colour",
+    "layout": "Section", "spots": "Spots through focus", "mtf": "Geometric MTF",
+    "mtf-height": "MTF against image height", "distortion": "Distortion", "vignetting": "Vignetting",
+    "colour": "Colour",
 }  # fmt: skip
 _BOKEH_FOCUS, _BOKEH_FIELDS = 30, (0.0, 0.6, 0.95)  # focal lengths; shares of the field
 _COLOURS = 96  # of the palettes of the pictures
@@ -146,7 +147,7 @@ def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
     from neurolens.commands.analyse import analysis_of
     from neurolens.evaluate.figures import draw_breathing
 
-    scene = Scene(lens.at(focus_m=math.inf))
+    scene = Scene(lens.at(focus_m=math.inf, focus="best"))
 
     def drawn(what: str) -> Any:
         def draw(path: Path) -> None:
@@ -160,7 +161,7 @@ def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
         """Lights at infinity, the lens focused near; at three points of the field."""
         near = 1e-3 * _BOKEH_FOCUS * abs(scene.first_order.efl_mm)
         edge = max(scene.default_fields())
-        blurred = Scene(lens.at(focus_m=near))
+        blurred = Scene(lens.at(focus_m=near, focus="best"))
         found = spots(blurred, [share * edge for share in _BOKEH_FIELDS], rings=20, shift_mm=[0.0])
         analysis_of("spots").draw(replace(found, airy_um=math.nan), path, lens.name, f"focused at {near:.3g} m")
 

@@ -21,7 +21,8 @@ _DESCRIPTION = """\
 List exported models by lens: film circle, focus, film-equivalent RMS error on rays held out, and
 nanoseconds a ray in onnxruntime and as C where they were timed, on the machine that made them. The
 star is the one to use of a lens: the fastest of those within 2 um (or --within) that their card does
-not call poor; where none is, the closest.
+not call poor; where none is, the closest. Models of one focus alone, such as those that "neurolens plan"
+fits for a shot, come last.
 
 Looked for in: models/ of the working folder and of the project (those that ship), and models/ of every
 run folder in runs/. Exit code 1 where there is none, or none within the error asked for."""
@@ -57,10 +58,11 @@ def run(args: argparse.Namespace) -> int:
         looked = ", ".join(map(str, places)) or "models/, runs/*/models/"
         raise InputError("neurolens models", "LENS", asked, f"one of: {known} (looked in {looked})")
     key, most = args.within or ("rms_um", CLOSE_UM)
-    listed = sorted(of_lens, key=lambda m: (m["lens"], m["film_radius_mm"], m["rms_um"] or 0.0))
+    listed = sorted(of_lens, key=lambda m: (_of_a_shot(m), m["lens"], m["film_radius_mm"], m["rms_um"] or 0.0))
     kept = [m for m in listed if args.within is None or reaches(m, most, key)]
     for state in {_state(m) for m in listed}:
-        best = to_use([m for m in kept if _state(m) == state], most, key)
+        alike = [m for m in kept if _state(m) == state]
+        best = to_use([m for m in alike if not _of_a_shot(m)] or alike, most, key)
         if best:
             best["use"] = use_command(best["file"], fused=best["fused_ns_per_ray"] is not None)
     data = {"looked_in": [str(p) for p in places], "within": args.within, "models": kept}
@@ -120,6 +122,12 @@ def _state(model: dict[str, Any]) -> tuple[Any, ...]:
     return model["lens"], round(model["efl_mm"], 3), *model["states"]
 
 
+def _of_a_shot(model: dict[str, Any]) -> bool:
+    """Whether a model has one focus alone, as those that `neurolens plan` fits for a shot."""
+    near, far = model["focus_m"]
+    return bool(near == far)
+
+
 def _is_of(model: dict[str, Any], asked: str) -> bool:
     if asked.endswith(".toml") or Path(asked).is_file():
         return bool(model["lens"] == lens_id_of(asked))
@@ -160,6 +168,7 @@ def _text(args: argparse.Namespace, listed: Sequence[dict[str, Any]], kept: Sequ
 def _remarks(model: dict[str, Any]) -> list[str]:
     """What the last column says of a model."""
     found = [f"poor: {', '.join(model['poor'])}"] if model["poor"] else []
+    found += ["one focus"] * _of_a_shot(model)
     found += [f"in one: {', '.join(model['states'])}"] if model["states"] and not found else []
     return found + ["averaged transmittance"] * (model["transmittance"] == AVERAGED)
 
