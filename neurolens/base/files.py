@@ -113,6 +113,8 @@ def _temporary(target: Path) -> Path:
     suffix = target.suffix if re.fullmatch(r"\.\w{1,16}", target.suffix) else ""
     temporary = target.with_name(f".neurolens-{secrets.token_hex(8)}.tmp{suffix}")
     try:
+        with suppress(OSError):
+            os.lstat(target)  # ValueError where no file can have that name
         os.close(os.open(temporary, _NEW, 0o666))
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(target)) from None
