@@ -96,6 +96,7 @@ clean:
 	rm -rf $(VENV) .venv-blender* .pytest_cache .mypy_cache .ruff_cache build *.egg-info
 
 # torch goes first, by itself, at the tested version: it brings setuptools, which then builds the project without fetching anything unpinned.
+# While pip unpacks torch, it prints nothing for minutes: a line every 15 s shows that it goes on.
 $(INSTALLED): pyproject.toml constraints.txt
 	@set -e; found=; \
 	for candidate in "$(PYTHON)" python3 python3.14 python3.13 python3.12 python3.11; do \
@@ -107,8 +108,11 @@ $(INSTALLED): pyproject.toml constraints.txt
 	fi; \
 	echo "Setting up $(VENV) with $$found (once; torch is large)"; \
 	"$$found" -m venv $(VENV) || { echo "'$$found -m venv' failed: is the venv module installed (Debian: python3-venv)?" >&2; exit 1; }
-	$(BIN)/python -m pip install -c constraints.txt torch
-	$(BIN)/python -m pip install -c constraints.txt --no-build-isolation -e '.[train,dev]'
+	@set -e; (while sleep 15 >/dev/null && kill -0 $$$$ 2>/dev/null; do \
+	    echo "  pip is at work: $(VENV) has $$(du -sm $(VENV) | cut -f1) MB"; done) & beat=$$!; \
+	$(BIN)/python -m pip install -c constraints.txt torch; \
+	$(BIN)/python -m pip install -c constraints.txt --no-build-isolation -e '.[train,dev]'; \
+	kill $$beat
 	@touch $@
 
 $(VENV)/.docs: $(INSTALLED)

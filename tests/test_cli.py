@@ -50,7 +50,7 @@ def options() -> Iterator[tuple[str, argparse.Action]]:
     """The options that help shows, each with its command."""
     for name, parser in COMMANDS.items():
         for action in parser._actions:
-            if action.option_strings and action.help != argparse.SUPPRESS and name != "neurolens flare":
+            if action.option_strings and action.help != argparse.SUPPRESS:
                 yield name, action
 
 
@@ -87,6 +87,7 @@ def test_old_spellings_work_and_are_hidden(capsys: pytest.CaptureFixture[str]) -
         ("survey lenses", "--again", "--restart"),
         ("render a.toml -o a.exr --camera thin", "--layers beauty --wavelengths hero --configuration 70",
          "--channels beauty --wavelength-mode hero --zoom 70"),
+        ("flare cooke_triplet_50 --light 5,3", "--out a.exr --wavelengths 9", "-o a.exr --bins 9"),
         ("stmap thin --size 9x6 --film 36x24", "--out a --channels-nm 600,500,400", "-o a --wavelengths 600,500,400"),
         ("export cooke_triplet_50 --to c -o a.h", "--camera", "--whole-camera"),
         ("lens cooke_triplet_50 --derive-rims", "--vignetting 0.4", "--edge-pupil 0.4"),

@@ -115,8 +115,8 @@ def turned(foot: float, outline: list[tuple[float, float]], around: int = 48) ->
     for before, here, there, after in zip(padded, padded[1:], padded[2:], padded[3:], strict=False):
         t = np.linspace(0, 1, 5)[1:, None]
         left, right = (there - before) / 2, (after - here) / 2
-        reach = np.linalg.norm(there - here)
-        left, right = (v * min(1, reach / max(np.linalg.norm(v), 1e-9)) for v in (left, right))
+        reach = float(np.linalg.norm(there - here))
+        left, right = (v * min(1.0, reach / max(float(np.linalg.norm(v)), 1e-9)) for v in (left, right))
         rows.append(
             (2 * t**3 - 3 * t**2 + 1) * here + (t**3 - 2 * t**2 + t) * left
             + (3 * t**2 - 2 * t**3) * there + (t**3 - t**2) * right

@@ -44,9 +44,10 @@ film, with Fresnel's or the coatings' reflectance, all rims and the stop's shape
 Prints the brightest by energy, place and size (x, y on the film itself, which pictures show turned
 by 180 degrees: a light to the right is imaged at x < 0); with -o writes their picture as OpenEXR, to be
 added to a render of the same lens, film and focus: R, G and B are the sum of the layers
-ghosts.R, .G, .B, and so on. Of the ghosts each of the brightest --layers is one more layer
-(g07-03: reflected at surface 7, then at 3, counted from 0 at the front), the others are
-"rest". Values are those of `neurolens render`: a white card of radiance 1 is 1 on the axis.
+ghosts.R, .G, .B, and so on. The --layers ghosts with the greatest values on the film are layers
+of their own (g07-03: reflected at surface 7, then at 3, counted from 0 at the front), the others
+are "rest". A PNG preview beside the EXR shows the flare, brighter by --exposure. Values are those
+of `neurolens render`: a white card of radiance 1 is 1 on the axis.
 With --reflections 4, ghosts of four reflections are traced, too: the strongest, until 0.1% of
 all ghosts' light is left. Each surface shares light out by the mean of both polarisations; with
 --polarised light keeps the one that surfaces before gave it: all ghosts' light changes by -2 to
@@ -117,7 +118,7 @@ def run(args: argparse.Namespace) -> int:
     _check(args)
     progress, began = Progress(quiet=args.quiet or args.json), time.perf_counter()
     if args.preview:
-        progress.note(f"preview: {args.width} pixels wide, {args.wavelengths} wavelengths, cells of {args.cell_px:g}")
+        progress.note(f"preview: {args.width} pixels wide, {args.bins} wavelengths, cells of {args.cell_px:g}")
     states = list(_states(args))
     model = fitted(args, states)
     tabled = read_any(args.file) if model is None else model.lens

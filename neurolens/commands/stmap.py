@@ -61,7 +61,8 @@ distances are off by what is printed as parallax, for a lens's pupil moves with 
 for another plane.
 
 The place of a thing in the picture is the centroid of its light at this stop, over pupil and wavelengths as the
-eye weighs them. Lenses with cylinders keep their squeeze: each meridian has its own focal length."""
+eye weighs them. Lenses with cylinders keep their squeeze: each meridian has its own focal length and its own
+entrance pupil. All maps have the pixel aspect ratio, which is printed, in the attribute pixelAspectRatio."""
 _EPILOG = """\
 examples:
   neurolens stmap lenses/laikin_double_gauss_50.toml --size 3840x2160 --film 36x20.25 --focus 2 -o shot
@@ -217,6 +218,7 @@ def _written(args: argparse.Namespace, frame: _Frame, plates: Plates, report: Ca
     jobs.append(("illumination", "", illumination_map))
     files = []
     header = standard_attributes(frame.settings, frame=int(frame.number) if frame.number else None)
+    header["pixelAspectRatio"] = _ideal(frame.fields[""], plates)["pixel_aspect"]
     for k, (kind, name, make) in enumerate(jobs):
         field = frame.fields[name]
         planes = make(field, plates, _part(report, 2 * k, 2 * len(jobs)))
@@ -238,15 +240,18 @@ def _about(args: argparse.Namespace, frame: _Frame, plates: Plates, kind: str, f
     said: dict[str, Any] = {"version": __version__, "map": kind, "camera": str(args.camera), "name": frame.camera}
     said |= {"picture_px": list(plates.picture), "undistorted_px": list(plates.undistorted)}
     said |= {"film_mm": list(args.film), "wavelengths_nm": field.spectrum[0].tolist()}
-    return said | _ideal(args, field) | {"focus_m": None if math.isinf(frame.focus_m) else frame.focus_m}
+    return said | _ideal(field, plates) | {"focus_m": None if math.isinf(frame.focus_m) else frame.focus_m}
 
 
-def _ideal(args: argparse.Namespace, field: Field) -> dict[str, Any]:
-    """The camera that an undistorted picture is of."""
+def _ideal(field: Field, plates: Plates) -> dict[str, Any]:
+    """The camera that an undistorted picture is of; lists are of the x and the y meridian. A pixel of both pictures is
+    `pixel_aspect` times as wide as high in what it shows, as viewers stretch it."""
+    (x, y), (width, height) = field.frame.reach_mm, plates.pixel_mm
     return {
         "projection": field.target,
-        "focal_mm": list(field.frame.reach_mm),
+        "focal_mm": [x, y],
         "before_film_mm": list(field.frame.pupil_mm),
+        "pixel_aspect": float(f"{y / x * width / height:.6g}"),
     }
 
 
@@ -260,8 +265,13 @@ def _told(args: argparse.Namespace, frames: list[_Frame], plates: Plates) -> dic
         moved, missed = worst_px(field, plates)
         pixel = min(plates.pixel_mm)
         parallax = [{"distance_m": d, "px": mm / pixel} for d, mm in field.parallax_mm.items()]
-        row = {"frame": int(frame.number) if frame.number else None, "focus_m": frame.focus_m}
-        row |= _ideal(args, field) | {"field_deg": field.field_deg, "shift_px": moved, "there_and_back_px": missed}
+        row: dict[str, Any] = {"frame": int(frame.number) if frame.number else None, "focus_m": frame.focus_m}
+        row |= _ideal(field, plates) | {"field_deg": field.field_deg, "shift_px": moved, "there_and_back_px": missed}
+        # One pinhole, at the y meridian's pupil, shows widths in this plane as the pupil of the x meridian does.
+        plane = 1e3 * (frame.focus_m if args.distance is None else args.distance)
+        x, y = field.frame.pupil_mm
+        nearer = 1.0 if math.isinf(plane) else (plane - x) / (plane - y)
+        row |= {"plane_m": plane / 1e3, "pixel_aspect_of_one_pinhole": row["pixel_aspect"] * nearer}
         rows.append(row | {"parallax": parallax})
     return {
         "camera": str(args.camera),
@@ -287,6 +297,14 @@ def _text(data: dict[str, Any]) -> str:
         f"distortion moves points by up to {worst['shift_px']:.4g} pixels; there and back within "
         f"{worst['there_and_back_px']:.2g}",
     ]
+    if " x " in focal:
+        x, y = (number(v, 6) for v in first["before_film_mm"])
+        line = f"pixel aspect ratio {first['pixel_aspect']:.5g}; entrance pupil of the x meridian {x} mm, of the y "
+        line += f"meridian {y} mm before the film"
+        if first["parallax"]:  # the plane is not at infinity
+            plane, aspect = number(first["plane_m"], 3), f"{first['pixel_aspect_of_one_pinhole']:.5g}"
+            line += f"; a pinhole at the latter shows what is {plane} m from the film with {aspect}"
+        lines.append(line)
     if first["parallax"]:
         told = [f"{p['px']:.2g} pixels at {number(p['distance_m'], 3)}" for p in first["parallax"]]
         lines.append(f"parallax of the pupil, worst of the picture, by metres from the film: {', '.join(told)}")

@@ -349,9 +349,10 @@ def _check_size(file: str | Path, field: str, name: str, size: Sequence[int], mo
 @contextmanager
 def _opened(file: str | Path, field: str, path: Path, most: int, pixels: int = MOST_PIXELS) -> Iterator[Image.Image]:
     """A picture of at most `most` pixels per side, and of at most `pixels`; mistakes name file and field."""
-    with _decoded(file, field, path) as data, Image.open(io.BytesIO(data), formats=FORMATS) as picture:
-        _check_size(file, field, str(path), picture.size, most, pixels)
-        yield picture
+    with _decoded(file, field, path) as data, warnings.catch_warnings(action="ignore"):  # Pillow's, of damaged files
+        with Image.open(io.BytesIO(data), formats=FORMATS) as picture:
+            _check_size(file, field, str(path), picture.size, most, pixels)
+            yield picture
 
 
 @contextmanager

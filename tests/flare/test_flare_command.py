@@ -28,7 +28,7 @@ def test_table_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert main(["flare", "laikin_double_gauss_50", "--light", "15,8", "--path", "g08-06", str(drawn)]) == 0
     assert drawn.read_text().startswith("<?xml")
     capsys.readouterr()
-    small = ["--width", "48", "--cell", "20", "--wavelengths", "3", "--layers", "2", "--json"]
+    small = ["--width", "48", "--cell", "20", "--bins", "3", "--layers", "2", "--json"]
     assert main(["flare", "laikin_double_gauss_50", "--light", "15,8,0.5/0.4/0.3", "-o", str(out), *small]) == 0
     told = json.loads(capsys.readouterr().out)
     rgb, metadata = read_exr(out)
@@ -49,7 +49,7 @@ def test_polarised_light_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixt
     """Table and picture alike: a little brighter or fainter, the same ghosts."""
     out, found = tmp_path / "a.exr", []
     for words in ([], ["--polarised"]):
-        few = ["--light", "15,8", "--width", "24", "--wavelengths", "2", "--json", *words]
+        few = ["--light", "15,8", "--width", "24", "--bins", "2", "--json", *words]
         assert main(["flare", "cooke_triplet_50", *few, "-o", str(out)]) == 0
         (ghosts,) = json.loads(capsys.readouterr().out)["ghosts"]
         found.append((sum(g["energy"] for g in ghosts), read_exr(out)[0].sum(), {g["name"] for g in ghosts}))
@@ -59,7 +59,7 @@ def test_polarised_light_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixt
 
 def test_photons_paint_the_ghosts(tmp_path: Path) -> None:
     """The light of photons with two reflections at most is that of the ghosts, block by block, within its noise."""
-    common = ["laikin_double_gauss_50", "--light", "12,5", "--width", "24", "--wavelengths", "2", "--quiet"]
+    common = ["laikin_double_gauss_50", "--light", "12,5", "--width", "24", "--bins", "2", "--quiet"]
     blocks = []
     for words in (["--cell", "2"], ["--photons", "400000", "--reflections", "2", "--kernel", "0"]):
         out = tmp_path / "one.exr"
@@ -72,7 +72,7 @@ def test_starburst_is_a_layer(tmp_path: Path) -> None:
     """What the module makes, added to the ghosts under its gain."""
     out = tmp_path / "star.exr"
     words = ["laikin_double_gauss_50", "--light", "4,2,3", "--f-number", "11", "--blades", "5", "--width", "48"]
-    few = ["--wavelengths", "2", "--cell", "20", "--quiet", "--starburst", "--gain", "starburst=2"]
+    few = ["--bins", "2", "--cell", "20", "--quiet", "--starburst", "--gain", "starburst=2"]
     assert main(["flare", *words, *few, "-o", str(out)]) == 0
     layers, rgb = read_layers(out), read_exr(out)[0]
     lens = read_lens("lenses/laikin_double_gauss_50.toml").with_aperture(Aperture(blades=5))
@@ -82,7 +82,7 @@ def test_starburst_is_a_layer(tmp_path: Path) -> None:
     np.testing.assert_allclose(layers["ghosts.G"] + layers["starburst.G"], rgb[..., 1], rtol=1e-5)
 
 
-SMALL = ["cooke_triplet_50", "--width", "36", "--cell", "4", "--wavelengths", "2", "--quiet"]
+SMALL = ["cooke_triplet_50", "--width", "36", "--cell", "4", "--bins", "2", "--quiet"]
 
 
 def test_frames_go_on_and_do_not_pop(tmp_path: Path) -> None:
@@ -207,7 +207,7 @@ def test_renders_of_a_scene_have_its_flare(tmp_path: Path, capsys: pytest.Captur
     assert main(["render", str(scene), "--camera", lens, "-o", str(out), "--layers", "beauty", "--quiet"]) == 0
     found = read_layers(out)
     assert len(found) == 12 and not read_exr(out)[0].any()
-    words = ["--lights", str(scene), "--coating", "single-layer", "--focus", "2", "--wavelengths", "3"]
+    words = ["--lights", str(scene), "--coating", "single-layer", "--focus", "2", "--bins", "3"]
     assert main(["flare", "cooke_triplet_50", *words, "--width", "36", "-o", str(out), "--quiet"]) == 0
     ghosts = np.stack([found[f"ghosts.{c}"] for c in "RGB"], -1) @ conversion(COLOUR_SPACES["ACEScg"], SRGB).T
     plain = read_exr(out)[0]
@@ -260,7 +260,7 @@ def test_rendered_frames_have_the_same_lights_and_layers(tmp_path: Path) -> None
 
 def test_ghosts_and_glare_are_all(tmp_path: Path) -> None:
     """Of the same seeds' photons; what scatters adds to the glare, and a share of the film is no share of the rest."""
-    common = ["laikin_double_gauss_50", "--light", "12,5", "--width", "24", "--wavelengths", "2", "--quiet"]
+    common = ["laikin_double_gauss_50", "--light", "12,5", "--width", "24", "--bins", "2", "--quiet"]
     common += ["--kernel", "0", "--photons", "300000"]
     sums, found = [], {}
     for words in ([], ["--glare", "300000"], ["--glare", "300000", "--barrel", "0.5", "--sensor", "0.5", "--preview"]):

@@ -24,7 +24,7 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.render.pictures import read_exr, write_exr
 
-COOKE = ["flare", "cooke_triplet_50", "--wavelengths", "2", "--cell", "4", "--width", "36", "--quiet"]
+COOKE = ["flare", "cooke_triplet_50", "--bins", "2", "--cell", "4", "--width", "36", "--quiet"]
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from neurolens.render.colour import ACESCG, SRGB, conversion
 from neurolens.render.pictures import read_colour_space, read_exr, read_layers, write_data_exr, write_exr
 
 GAUSS = ["flare", "laikin_double_gauss_50", "--light", "15,8", "--coating", "quarter-wave"]
-SMALL = ["flare", "cooke_triplet_50", "--width", "36", "--wavelengths", "2"]
+SMALL = ["flare", "cooke_triplet_50", "--width", "36", "--bins", "2"]
 
 
 def layers_of(file: Path) -> dict[str, np.ndarray]:
