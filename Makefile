@@ -4,13 +4,14 @@
 #   make test     tests, then lint, format and types
 #   make test-blender   the extension in Blender 5.0, in .venv-blender (Python 3.11; about 400 MB, once);
 #                       BLENDER=4.5.0 or 5.2.3 for another (from 5.1 on it needs Python 3.13)
-#   make test-web the page of `neurolens view` in headless Chromium (Debian: chromium; CHROMIUM=/path/to/another), and its
-#                 models in onnxruntime-web where npm is
+#   make test-web the pages that commands write, in headless Chromium (Debian: chromium; CHROMIUM=/path/to/another): what
+#                 `neurolens view` draws, scripts in every text; its models in onnxruntime-web where npm is
 #   make bench    the tracer's speed, then models against it; fails when a promised ratio is lost
 #   make models   fit again every model of models/
 #   make gallery  what real lenses do: render and measure every effect
-#   make docs     the documentation in build/docs, after its links, commands and how-tos were tried (3 CPU minutes);
-#                 NEUROLENS_ORT_HEADERS=/folder/of/onnxruntime_cxx_api.h also builds the how-to in C++
+#   make docs     the documentation in build/docs; its links, commands, how-tos and, where there is a Chromium, its search
+#                 are tried (5 CPU minutes); NEUROLENS_ORT_HEADERS=/folder/of/onnxruntime_cxx_api.h also builds the how-to
+#                 in C++, NEUROLENS_MITSUBA=1 renders that in Mitsuba (extra "mitsuba", and LLVM 17 or later)
 #   make lint     lint, format and types only
 #   make format   rewrite the code in the project's format
 #   make clean    remove .venv and caches
@@ -44,6 +45,7 @@ export PYTHONDONTWRITEBYTECODE :=
 
 demo: $(INSTALLED)
 	$(BIN)/neurolens train experiments/quickstart.toml
+	@printf '\nThis puts neurolens on the PATH of this shell, for the commands of the README:\n  . $(BIN)/activate\n'
 
 # Two processes of one thread each: torch's threads only wait for each other in small tests.
 test: $(INSTALLED)
@@ -58,17 +60,17 @@ test-blender: $(BLENDER_INSTALLED) $(INSTALLED)
 
 # A browser is not for pip to bring; without one this says so. onnxruntime-web comes of npm, once, into build/web.
 test-web: $(INSTALLED)
-	@set -e; if [ -z "$(CHROMIUM)" ]; then echo "no browser: the page is not tested (Debian: apt-get install chromium)"; exit 0; fi; \
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[web]' --no-build-isolation; \
+	@set -e; if [ -z "$(CHROMIUM)" ]; then echo "no browser: pages are not tested (Debian: apt-get install chromium)"; exit 0; fi; \
+	$(BIN)/python -m pip install -c constraints.txt -e '.[web]' --no-build-isolation; \
 	if command -v npm >/dev/null; then npm install --silent --no-audit --no-fund --prefix build/web onnxruntime-web@$(ORT_WEB); \
 	else echo "no npm: models are not run in onnxruntime-web"; fi; \
 	ort=build/web/node_modules/onnxruntime-web/dist; \
 	NEUROLENS_BROWSER="$(CHROMIUM)" NEUROLENS_ORT="$$(test -d $$ort && echo $$ort)" \
-	    $(BIN)/python -m pytest -q -rs tests/view/test_view_in_browser.py
+	    $(BIN)/python -m pytest -q -rs tests/view
 
 docs: $(INSTALLED) $(VENV)/.docs
-	OMP_NUM_THREADS=1 NEUROLENS_DOCS=1 $(BIN)/python -m pytest -q -n 2 tests/test_docs.py
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -f docs/mkdocs.yml
+	$(BIN)/sphinx-build -q -W --keep-going -b html -c docs . build/docs
+	NEUROLENS_BROWSER="$(CHROMIUM)" OMP_NUM_THREADS=1 NEUROLENS_DOCS=1 $(BIN)/python -m pytest -q -n 2 -rs tests/test_docs.py
 	@echo "Look at build/docs/index.html"
 
 bench: $(INSTALLED)
@@ -94,6 +96,7 @@ clean:
 	rm -rf $(VENV) .venv-blender* .pytest_cache .mypy_cache .ruff_cache build *.egg-info
 
 # torch goes first, by itself, at the tested version: it brings setuptools, which then builds the project without fetching anything unpinned.
+# While pip unpacks torch, it prints nothing for minutes: a line every 15 s shows that it goes on.
 $(INSTALLED): pyproject.toml constraints.txt
 	@set -e; found=; \
 	for candidate in "$(PYTHON)" python3 python3.14 python3.13 python3.12 python3.11; do \
@@ -105,12 +108,15 @@ $(INSTALLED): pyproject.toml constraints.txt
 	fi; \
 	echo "Setting up $(VENV) with $$found (once; torch is large)"; \
 	"$$found" -m venv $(VENV) || { echo "'$$found -m venv' failed: is the venv module installed (Debian: python3-venv)?" >&2; exit 1; }
-	$(BIN)/python -m pip install --quiet -c constraints.txt torch
-	$(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[train,dev]'
+	@set -e; (while sleep 15 >/dev/null && kill -0 $$$$ 2>/dev/null; do \
+	    echo "  pip is at work: $(VENV) has $$(du -sm $(VENV) | cut -f1) MB"; done) & beat=$$!; \
+	$(BIN)/python -m pip install -c constraints.txt torch; \
+	$(BIN)/python -m pip install -c constraints.txt --no-build-isolation -e '.[train,dev]'; \
+	kill $$beat
 	@touch $@
 
 $(VENV)/.docs: $(INSTALLED)
-	$(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[docs]'
+	$(BIN)/python -m pip install -c constraints.txt --no-build-isolation -e '.[docs,web]'
 	@touch $@
 
 $(BLENDER_INSTALLED): Makefile
@@ -123,5 +129,5 @@ $(BLENDER_INSTALLED): Makefile
 	fi; \
 	echo "Setting up $(BLENDER_VENV) with $$found (once; Blender is large)"; \
 	"$$found" -m venv $(BLENDER_VENV)
-	$(BLENDER_VENV)/bin/python -m pip install --quiet $(BLENDER_PACKAGES)
+	$(BLENDER_VENV)/bin/python -m pip install $(BLENDER_PACKAGES)
 	@touch $@

@@ -38,6 +38,7 @@ NAMES = {
     "white-cards": ("white_cards", "light on the film, by integral and rendered four ways"),
     "spectral-noise": ("spectral_noise", "noise of the ways to sample wavelengths"),
     "refine-spacing": ("refine_spacing", "a spacing refined by gradients through the tracer"),
+    "four-lenses": ("four_lenses", "the README's first picture: a night through a thin lens and three real ones"),
     "gallery": ("gallery.run", "what real lenses do: figures and numbers"),
     "random-lenses": ("random_lenses", "random valid lenses as files, for neurolens survey"),
     "fuzz": ("fuzz", "hostile files and command lines: one clear line each, in bounded time and memory"),

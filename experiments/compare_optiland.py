@@ -5,7 +5,7 @@ Optiland (MIT licence) is no dependency of this project: it lives in an environm
     python3 -m venv /tmp/optiland
     /tmp/optiland/bin/pip install optiland==0.6.3 torch==2.13.0
     export OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 PYTHONPATH=.
-    /tmp/optiland/bin/python -m experiments optiland [--quick] [--out DIR]
+    /tmp/optiland/bin/python -m experiments optiland [--quick] [-o DIR]
 
 Writes optiland.md and optiland.json. Both trace light from the scene through the double Gauss (and the same with two
 even aspheres) with every rim and the stop, one wavelength, one thread, in float32 and float64; Optiland with constant

@@ -1,15 +1,15 @@
 """Pictures of flare: what `neurolens render` and `neurolens flare` make of suns, headlights, coatings, stops, frames.
 
-Each picture is one or more commands, told beside it; OpenEXR files (in runs/flare, OUT in the commands) that are there
-are not made again. Shown is the sum of what the commands made, brighter by some stops, its highlights rolled off from
-0.6 on, colours that sRGB does not hold turned towards grey. Writes the pictures and their page.
+Each picture is one or more commands, which stand beside it; OpenEXR files (in runs/flare, OUT in the commands) that are
+there are not made again. Shown is the sum of what the commands made, renders denoised (Open Image Denoise), brighter by
+some stops, its highlights rolled off from 0.6 on, colours that sRGB does not hold turned towards grey. Writes the
+pictures and their page.
 """
 
 from __future__ import annotations
 
 import argparse
 import shlex
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,15 +26,14 @@ from neurolens.render.colour import SRGB, linear_to_srgb
 from neurolens.render.pictures import read_exr, read_layers
 
 OPTIONS = [lab.ONLY, lab.out(lab.RESULTS / "flare", "folder for pictures and page")]
-_SHOULDER, _MOST_BYTES = 0.6, 420_000
+_SHOULDER, _MOST_BYTES, _QUALITIES = 0.6, 700_000, (93, 88, 82, 75)
 _LAYERS = "ghosts", "glare", "starburst"
 _SUN, _ROAD = "experiments/scenes/sun.toml", "experiments/scenes/road.toml"
-_GAUSS = "lenses/laikin_double_gauss_50.toml"
+_GAUSS, _RETRO = "lenses/laikin_double_gauss_50.toml", "lenses/tajima_retrofocus_24.toml"
 _FLARE = "neurolens flare"
-_RETRO = f"{_FLARE} tajima_retrofocus_24 --lights {_SUN} --focus 40 --f-number 8 --blades 6"
-_STOPS = f"{_FLARE} tajima_retrofocus_24 --light 13.7,10 --blades 6 --starburst --width 360"
-_ANAMORPHIC = f"{_FLARE} cooke_anamorphic_42 --light 8,4,2 --film 24x18 --width 360"
-_ACROSS = f"{_FLARE} laikin_double_gauss_50 --lights OUT/across.csv --f-number 5.6 --blades 6 --width 240"
+_OF_SUN = f"{_FLARE} tajima_retrofocus_24 --lights {_SUN} --focus 40 --blades 6"
+_ANAMORPHIC = f"{_FLARE} cooke_anamorphic_42 --lights {_ROAD} --most 8 --focus 14 --film 24x18 --width 640"
+_ACROSS = f"{_FLARE} laikin_double_gauss_50 --lights OUT/across.csv --f-number 5.6 --blades 6 --width 432"
 _KEYS = "light,frame,azimuth_deg,elevation_deg,r,g,b\nsun,1,-24,9,3,3,3\nsun,6,24,9,3,3,3\n"
 
 
@@ -42,7 +41,7 @@ _KEYS = "light,frame,azimuth_deg,elevation_deg,r,g,b\nsun,1,-24,9,3,3,3\nsun,6,2
 class Panel:
     """A picture: what commands made, added up; its label; its width over that of its file; stops it is brighter.
 
-    `over` is the render whose plate lies under it, of twice its size.
+    `over` is the render whose plate lies under it, reduced to its size.
     """
 
     files: tuple[str, ...]
@@ -64,60 +63,76 @@ class Picture:
     stops: float = 0.0
 
 
-_COATINGS = ("bare", "single-layer", "three-layer", "multi-layer")
-_N = ("2.8", "8", "16")
+_COATINGS = {"bare": 0.0, "single-layer": 4.0, "three-layer": 6.0, "multi-layer": 7.0}
+_N = ("2.8", "5.6", "11", "22")
 PICTURES = (
     Picture(
         "sun",
-        "A low sun over hills, by a 24 mm retrofocus lens at f/8 with single-layer coatings: ghosts and starburst are "
-        "layers of the render, which the scene's table [flare] asks for.",
-        (f"neurolens render {_SUN} --camera lenses/tajima_retrofocus_24.toml --layers beauty -o OUT/sun.exr",),
-        (Panel(("sun",)),),
-        stops=-0.3,
+        "A low sun over a lake, by a 24 mm retrofocus lens at f/8 with single-layer coatings, 5% of its front dusty: "
+        "ghosts, the star of six blades, and a veil about the sun, by 63 million photons. The plate is by "
+        "the thin lens whose focal length images the sun at the same place.",
+        (
+            f"neurolens render {_SUN} --camera thin:{_RETRO} --efl 23.9 --channels beauty -o OUT/sun.exr",
+            f"{_OF_SUN} --f-number 8 --coating single-layer --starburst --width 1280 -o OUT/sun-flare.exr",
+            f"{_OF_SUN} --f-number 8 --coating single-layer --without ghosts --dust 0.05 --glare 4194304 --kernel 24 "
+            "--width 640 -o OUT/veil.exr",
+        ),
+        (Panel(("sun", "sun-flare", "veil")),),
     ),
     Picture(
         "headlights",
-        "A wet street at night by a 50 mm double Gauss at f/8, bare, its six blades in the headlights' stars. The "
-        "plate is by the thin lens of the same frame: no noise of dispersion.",
+        "A wet street at night by a 50 mm double Gauss at f/8 with single-layer coatings, its six blades in the stars "
+        "of the headlights. The plate is by the thin lens of the same frame.",
         (
-            f"neurolens render {_ROAD} --camera thin:{_GAUSS} --layers beauty -o OUT/road.exr",
+            f"neurolens render {_ROAD} --camera thin:{_GAUSS} --channels beauty -o OUT/road.exr",
             f"{_FLARE} laikin_double_gauss_50 --lights {_ROAD} --most 8 --focus 14 --f-number 8 --blades 6 --starburst "
-            "--width 720 -o OUT/road-flare.exr",
+            "--coating single-layer --width 1280 -o OUT/road-flare.exr",
         ),
         (Panel(("road", "road-flare")),),
         stops=1.0,
     ),
     Picture(
         "coatings",
-        "The sun above, its ghosts by what is on the glass.",
+        "The sun above by what is on the glass: on the left over the plate and with the same veil of dust, all exposed "
+        "alike, on the right the ghosts alone, brighter by the stops that each panel states.",
         tuple(
-            f"{_RETRO} {'' if name == 'bare' else f'--coating {name} '}--width 360 -o OUT/coating-{name}.exr"
-            for name in _COATINGS
+            f"{_OF_SUN} --f-number 8 {coating}--width 640 -o OUT/coating-{name}.exr"
+            for name, coating in ((name, "" if name == "bare" else f"--coating {name} ") for name in _COATINGS)
         ),
-        tuple(Panel((f"coating-{name}",), name, over="sun") for name in _COATINGS),
+        tuple(
+            panel
+            for name, stops in _COATINGS.items()
+            for panel in (
+                Panel((f"coating-{name}", "veil"), name, over="sun"),
+                Panel((f"coating-{name}",), f"ghosts alone, {stops:+g} stops", stops=stops),
+            )
+        ),
         columns=2,
-        stops=-0.3,
     ),
     Picture(
         "stops",
-        "A light by the same lens, bare, opened and stopped down, exposed alike: ghosts take the shape of the stop, "
-        "and light that diffraction sends aside grows.",
-        tuple(f"{_STOPS} --f-number {n} -o OUT/stop-{n}.exr" for n in _N),
+        "The same sun alone by the same lens, bare, opened and stopped down, exposed alike: ghosts take the shape of "
+        "the stop, and light that diffraction sends aside grows.",
+        tuple(f"{_OF_SUN} --starburst --f-number {n} --width 640 -o OUT/stop-{n}.exr" for n in _N),
         tuple(Panel((f"stop-{n}",), f"f/{n}") for n in _N),
-        columns=3,
+        columns=2,
     ),
     Picture(
         "anamorphic",
-        "An anamorphic lens, shown unsqueezed: its cylinders draw ghosts out to streaks in both meridians. Bare, and "
-        "with multi-layer coatings, seven stops brighter, its strongest streak six times as strong and blue.",
+        "The street by an anamorphic lens, shown unsqueezed: its cylinders draw ghosts out to streaks in both "
+        "meridians. Bare, and with multi-layer coatings, its strongest streak made blue and stronger.",
         (
+            f"neurolens render {_ROAD} --camera fused:lenses/cooke_anamorphic_42.toml --film 24x18 --width 640 "
+            "--channels beauty -o OUT/squeezed.exr",
             f"{_ANAMORPHIC} -o OUT/anamorphic.exr",
-            f"{_ANAMORPHIC} --coating multi-layer --gain g13-12=6 --tint g13-12=0.25/0.5/1 -o OUT/anamorphic-blue.exr",
+            f"{_ANAMORPHIC} --coating multi-layer --gain g13-12=1000 --tint g13-12=0.25/0.5/1 "
+            "-o OUT/anamorphic-blue.exr",
         ),
         (
-            Panel(("anamorphic",), "bare", 2.0, -3.0),
-            Panel(("anamorphic-blue",), "multi-layer, g13-12 times 1.5 / 3 / 6", 2.0, 4.0),
+            Panel(("squeezed", "anamorphic"), "bare", 2.0),
+            Panel(("squeezed", "anamorphic-blue"), "multi-layer, g13-12 times 250 / 500 / 1000", 2.0),
         ),
+        stops=1.0,
     ),
     Picture(
         "animation",
@@ -141,9 +156,11 @@ def run(args: argparse.Namespace) -> int:
         for command in picture.commands:
             _make(command, made, args.quiet)
         panels = [[_read(made / f"{file}.exr") for file in panel.files] for panel in picture.panels]
-        plates = [_half(_read(made / f"{p.over}.exr")["plate"]) if p.over else 0.0 for p in picture.panels]
-        lab.write_small_png(args.out / f"{picture.name}.png", _sizes(_drawn(picture, panels, plates)), _MOST_BYTES)
-        parts += [f"## {picture.name}", f"![{picture.name}]({picture.name}.png)", picture.text]
+        plates = [_read(made / f"{panel.over}.exr")["plate"] if panel.over else None for panel in picture.panels]
+        drawn = _drawn(picture, panels, plates)
+        forms = ((drawn, {"quality": quality, "optimize": True}) for quality in _QUALITIES)
+        lab.write_small(args.out / f"{picture.name}.jpg", forms, _MOST_BYTES)
+        parts += [f"## {picture.name}", f"![{picture.name}]({picture.name}.jpg)", picture.text]
         parts += ["```\n" + "\n".join(picture.commands) + "\n```", lab.table(_COLUMNS, _rows(picture, panels))]
     if not args.only:
         atomic_write_text(args.out / "README.md", lab.page("# Flare in pictures", __doc__ or "", *parts))
@@ -165,24 +182,19 @@ def _read(file: Path) -> dict[str, NDArray[np.float32]]:
     picture, planes = read_exr(file)[0], read_layers(file)
     found = {n: np.stack([planes[f"{n}.{c}"] for c in "RGB"], -1) for n in _LAYERS if f"{n}.R" in planes}
     if "render" in read_exr(file)[1]:
+        picture = lab.denoised(picture)
         return {"plate": picture, **found, "sum": np.sum([picture, *found.values()], 0)}
     return {**found, "sum": picture}
-
-
-def _half(picture: NDArray[np.float32]) -> NDArray[np.float32]:
-    """A picture of half the size."""
-    height, width = picture.shape[:2]
-    return picture.reshape(height // 2, 2, width // 2, 2, 3).mean((1, 3))
 
 
 def _drawn(picture: Picture, panels: list[list[dict[str, NDArray[np.float32]]]], plates: list[Any]) -> Image.Image:
     tiles = []
     for panel, found, plate in zip(picture.panels, panels, plates, strict=True):
-        tile = Image.fromarray(
-            _shown((np.sum([f["sum"] for f in found], 0) + plate) * 2.0 ** (picture.stops + panel.stops))
-        )
+        parts = [one["sum"] for one in found] + ([] if plate is None else [plate])
+        total = np.sum([_sized(part, *parts[0].shape[1::-1]) for part in parts], 0)
+        tile = Image.fromarray(_shown(total * 2.0 ** (picture.stops + panel.stops)))
         tile = tile.resize((round(tile.width * panel.stretch), tile.height), Image.Resampling.LANCZOS)
-        ImageDraw.Draw(tile).text((6, 4), panel.label, fill=(235, 235, 235))
+        ImageDraw.Draw(tile).text((8, 6), panel.label, fill=(235, 235, 235), font_size=16)
         tiles.append(tile)
     width, height = tiles[0].size
     rows = -(-len(tiles) // picture.columns)
@@ -192,9 +204,11 @@ def _drawn(picture: Picture, panels: list[list[dict[str, NDArray[np.float32]]]],
     return whole
 
 
-def _sizes(picture: Image.Image) -> Iterator[Image.Image]:
-    for share in (1, 0.75, 0.5):
-        yield picture.resize((round(share * picture.width), round(share * picture.height)), Image.Resampling.LANCZOS)
+def _sized(picture: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
+    """A linear picture of another size."""
+    way = Image.Resampling.BOX if width < picture.shape[1] else Image.Resampling.BICUBIC
+    planes = [Image.fromarray(plane).resize((width, height), way) for plane in np.moveaxis(picture, 2, 0)]
+    return np.stack([np.asarray(plane) for plane in planes], -1)
 
 
 def _shown(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -211,6 +225,8 @@ def _rows(picture: Picture, panels: list[list[dict[str, NDArray[np.float32]]]]) 
     """Mean luminance of each part of each panel."""
     rows = []
     for panel, found in zip(picture.panels, panels, strict=True):
+        if panel.label.startswith("ghosts alone"):
+            continue  # the row before has it
         row: lab.Row = {"label": panel.label or picture.name}
         for one in found:
             row |= {name: float((part @ SRGB.to_xyz[1]).mean()) for name, part in one.items() if name != "sum"}
@@ -222,5 +238,6 @@ _COLUMNS = lab.columns(
     ("mean luminance (1: a white card)", "label"),
     ("plate", "plate", ".3g"),
     ("ghosts", "ghosts", ".3g"),
+    ("glare", "glare", ".3g"),
     ("starburst", "starburst", ".3g"),
 )

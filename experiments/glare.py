@@ -50,10 +50,12 @@ CONDITIONS = {
 }
 _PATCH_MM, _WITHIN_MM, _WIDEST_DEG, _COLOURS = 6.0, 5.0, 85.0, (450.0, 550.0, 650.0)
 _AT_ONCE = 1 << 16
+_SHOWN = 1 << 23  # photons of a wavelength of a picture
 _CELLS, _RUNS = (72, 48), 16
 
 OPTIONS = [
     lab.count("photons", 4_000_000, "of each case (default: 4 million)"),
+    lab.PICTURE,
     lab.count("samples", 1 << 18, "photons of each run of the ways (default: 262144)"),
     lab.out(),
 ]
@@ -90,6 +92,12 @@ def run(args: argparse.Namespace) -> int:
     """Measure, write the tables and the picture."""
     progress = Progress(quiet=args.quiet)
     lens = read_lens(lab.LENSES / f"{LENS}.toml").at(focus_m=math.inf)
+    retrofocus = read_lens(lab.LENSES / "mori_retrofocus_100.toml")
+    retrofocus = retrofocus.at(focus_m=math.inf, focal_length_mm=25.0, f_number=2.8)
+    with progress.stage("pictures"):
+        _draw(lens, retrofocus, args)
+    if args.picture:
+        return 0
     contrasts: list[Contrast] = []
     ways: list[Way] = []
     for name in COATINGS:
@@ -98,11 +106,7 @@ def run(args: argparse.Namespace) -> int:
     for name in ("bare", "multi-layer"):
         with progress.stage(f"ways, {name}"):
             ways += ways_of(lens if name == "bare" else coated(lens, name), name, args.samples)
-    retrofocus = read_lens(lab.LENSES / "mori_retrofocus_100.toml")
-    retrofocus = retrofocus.at(focus_m=math.inf, focal_length_mm=25.0, f_number=2.8)
     elements = list(elements_of(retrofocus, "single-layer"))
-    with progress.stage("pictures"):
-        _draw(lens, retrofocus, args)
     contrast = lab.table(_CONTRAST, contrasts)
     counts = f"{args.photons:,} photons a case of the contrast, {args.samples:,} a run of the ways."
     text = lab.page("# Glare", __doc__ or "", counts, "## Contrast", contrast, "## Ways", lab.table(_WAYS, ways))
@@ -217,13 +221,13 @@ def _draw(gauss: Lens, retrofocus: Lens, args: argparse.Namespace) -> None:
         ],
         [(f"glare alone: {name}", gauss, scatter, Light(10.0, 5.0)) for name, scatter in CONDITIONS.items()],
     ]
-    raster = Raster((2 * HALF_MM[0], 2 * HALF_MM[1]), 360, 240)
-    figure, axes = plt.subplots(2, 4, figsize=(12, 4.6), layout="constrained")
+    raster = Raster((2 * HALF_MM[0], 2 * HALF_MM[1]), 480, 320)
+    figure, axes = plt.subplots(2, 4, figsize=(16, 6), layout="constrained")
     for axes_row, row in zip(axes, rows, strict=True):
         pictures = []
         for _, lens, scatter, light in row:
             settings = FlareSettings(
-                wavelengths=9, glare=max(1, args.photons // 8), scatter=scatter, kernel_px=4.0,
+                wavelengths=9, glare=_SHOWN, scatter=scatter, kernel_px=8.0,
                 without=("ghosts",) if row is rows[1] else (),
             )  # fmt: skip
             pictures.append(sum_of(flare_layers(lens, [light], raster, settings), raster))
@@ -238,7 +242,7 @@ def _draw(gauss: Lens, retrofocus: Lens, args: argparse.Namespace) -> None:
             axis.set_title(title, fontsize=8)
             axis.tick_params(labelsize=7)
     figure.supxlabel("mm on the film", fontsize=8)
-    lab.write_figure(args.out / "glare.png", figure, 110)
+    lab.write_figure(args.out / "glare.png", figure, 100)
 
 
 # ---- Ways. -----------------------------------------------------------------------------------------------------------

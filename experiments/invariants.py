@@ -91,7 +91,7 @@ def find(name: str) -> Any:
 
 
 def fit_all(folder: Path) -> None:
-    """Fit every method of `bench surrogates` on few rays, and a zoom: NAME.npz of coefficients, NAME.onnx each."""
+    """Fit every method of `bench` on few rays, and a zoom: NAME.npz of coefficients, NAME.onnx each."""
     import torch
 
     @functools.cache

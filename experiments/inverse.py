@@ -244,7 +244,7 @@ def page(records: Sequence[Row]) -> str:
 OPTIONS = (
     lab.ONLY,
     lab.count("rays", 100_000, "per lens (default: 100000)", 1000),
-    lab.option("--again", action="store_true", help="measure the chosen lenses again"),
+    lab.option("--restart", old=("--again",), action="store_true", help="measure the chosen lenses again"),
     lab.out(),
 )
 
@@ -253,7 +253,7 @@ def run(args: argparse.Namespace) -> None:
     """Measure what is missing, and write the tables after each lens."""
     files = lab.chosen(sorted(lab.LENSES.glob("*.toml")), lambda f: f.stem, args.only, "inverse")
     records = lab.kept_rows(args.out / "inverse.json", "experiments inverse", lambda r: r["lens"], "lenses")
-    missing = [f for f in files if args.again or f.stem not in records]
+    missing = [f for f in files if args.restart or f.stem not in records]
     text = page(list(records.values()))
     for file, _ in lab.stages(missing, lambda f: f.stem, args.quiet, 20.0):
         try:

@@ -20,11 +20,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
+
 from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_path, atomic_write_text, write_json
 from neurolens.base.progress import Progress, Report
-from neurolens.commands.arguments import QUIET_HELP, whole
+from neurolens.commands.arguments import QUIET_HELP, add_option, add_output, whole
 from neurolens.evaluate.pages import markdown_table
 
 ROOT = Path(__file__).parents[1]
@@ -40,8 +42,8 @@ Option = Callable[[argparse.ArgumentParser], object]
 
 
 def option(*names: str, **settings: Any) -> Option:
-    """An option as of `ArgumentParser.add_argument`."""
-    return lambda parser: parser.add_argument(*names, **settings)
+    """An option as of `add_option`."""
+    return lambda parser: add_option(parser, *names, **settings)
 
 
 def count(name: str, default: int | None, text: str, least: int = 1, most: int | None = None) -> Option:
@@ -50,12 +52,12 @@ def count(name: str, default: int | None, text: str, least: int = 1, most: int |
 
 
 def out(folder: Path = RESULTS, what: str = "folder for the tables") -> Option:
-    """--out, by default in runs/; --commit, for the folder that is kept in the repository; --quiet."""
+    """--output, by default in runs/; --commit, for the folder that is kept in the repository; --quiet."""
     place = ROOT / "runs" / folder.relative_to(ROOT / "experiments") if folder.is_relative_to(RESULTS) else folder
 
     def add(parser: argparse.ArgumentParser) -> None:
         shown = place.relative_to(ROOT)
-        parser.add_argument("--out", metavar="DIR", type=Path, default=place, help=f"{what} (default: {shown})")
+        add_output(parser, "DIR", f"{what} (default: {shown})", default=place)
         if place != folder:
             text = f"the folder is {folder.relative_to(ROOT)}, which the README shows"
             parser.add_argument("--commit", dest="out", action="store_const", const=folder, help=text)
@@ -66,6 +68,7 @@ def out(folder: Path = RESULTS, what: str = "folder for the tables") -> Option:
 
 QUIET = option("--quiet", action="store_true", help=QUIET_HELP)
 ONLY = option("--only", metavar="TEXT", default="", help="lens files whose name holds this text")
+PICTURE = option("--picture", action="store_true", help="draw the picture alone; the tables stay as they are")
 ROUNDS = count("rounds", None, "rounds (default 20; quick 5)")
 
 
@@ -206,13 +209,17 @@ def write_results(folder: Path, name: str, text: str, data: Any) -> str:
 
 
 def write_figure(file: Path, figure: Any, dpi: int) -> None:
-    """Write a figure (of matplotlib) as PNG, atomically, and close it."""
+    """Write a figure (of matplotlib) as PNG of 256 colours, atomically, and close it."""
     from matplotlib import pyplot as plt
+    from PIL import Image
 
     file.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(file) as temporary:
-        figure.savefig(temporary, dpi=dpi, format="png")
+    drawn = io.BytesIO()
+    figure.savefig(drawn, dpi=dpi, format="png")
     plt.close(figure)
+    few = Image.open(drawn).convert("RGB").quantize(256, dither=Image.Dither.NONE)
+    with atomic_path(file) as temporary:
+        few.save(temporary, "PNG", optimize=True)
 
 
 def write_small_png(file: Path, pictures: Iterable[Any], most_bytes: int) -> None:
@@ -221,15 +228,37 @@ def write_small_png(file: Path, pictures: Iterable[Any], most_bytes: int) -> Non
     Raises:
         InputError: none is.
     """
-    for picture in pictures:
+    write_small(file, ((picture, {"optimize": True}) for picture in pictures), most_bytes)
+
+
+def write_small(file: Path, forms: Iterable[tuple[Any, dict[str, Any]]], most_bytes: int) -> None:
+    """Write the first form of a picture (of Pillow, and settings of its file) that is small enough for the repository.
+
+    Raises:
+        InputError: none is.
+    """
+    for picture, settings in forms:
         packed = io.BytesIO()
-        picture.save(packed, "PNG", optimize=True)
+        picture.save(packed, {".png": "PNG", ".jpg": "JPEG"}[file.suffix], **settings)
         if packed.tell() <= most_bytes:
             with atomic_path(file) as temporary:
                 temporary.write_bytes(packed.getvalue())
             return
     size = f"({packed.tell()} bytes)"
     raise InputError(file, "size", size, f"at most {most_bytes} bytes: smaller or fewer pictures")
+
+
+def denoised(rgb: Any) -> Any:
+    """Linear RGB [H, W, 3] after Open Image Denoise, for pictures that are looked at; figures come of the render.
+
+    Raises:
+        InputError: its package is not installed.
+    """
+    try:
+        import pyoidn
+    except ImportError:
+        raise InputError("pictures", "pyoidn", "(missing)", "pip install -e '.[dev]'") from None
+    return pyoidn.denoise(np.ascontiguousarray(rgb, dtype=np.float32), hdr=True)
 
 
 def kept_rows(path: Path, maker: str, key: Callable[[Row], Hashable], listed: str = "") -> dict[Any, Row]:

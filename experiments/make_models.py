@@ -516,7 +516,7 @@ def _shipped(row: Row, file: Path, out: Path) -> Row:
 OPTIONS = (
     lab.option("lenses", metavar="LENS", nargs="*", help="entries whose name starts so (default: all)"),
     lab.option("--list", metavar="FILE", type=Path, default=_LIST, help="list (default: experiments/models.toml)"),
-    lab.option("--again", action="store_true", help="make the chosen entries again"),
+    lab.option("--restart", old=("--again",), action="store_true", help="make the chosen entries again"),
     lab.option("--clipping", action="store_true", help="only fit again what clips rays in the networks that are there"),
     lab.option("--times", action="store_true", help="only time the models that are there (on a quiet machine)"),
     lab.out(lab.MODELS, "folder"),
@@ -532,7 +532,7 @@ def run(args: argparse.Namespace) -> int:
     if args.times or args.clipping:
         failed = (time_models if args.times else refit_clipping)(library, entries, args.out, progress)
     else:
-        failed = make_models(library, entries, args.out, progress, again=args.again)
+        failed = make_models(library, entries, args.out, progress, again=args.restart)
     print((args.out / "README.md").read_text(encoding="utf-8"))
     for line in failed:
         print(f"experiments: {line}", file=sys.stderr)

@@ -384,7 +384,7 @@ def page(rows: Sequence[Mapping[str, Any]]) -> str:
 
 OPTIONS = (
     lab.option("--only", metavar="TEXT", default="", help="cases whose LENS-SCENE holds this text"),
-    lab.option("--again", action="store_true", help="measure the chosen cases again"),
+    lab.option("--restart", old=("--again",), action="store_true", help="measure the chosen cases again"),
     lab.option("--models", metavar="DIR", type=Path, default=Path("runs/plans"), help="for them (default: runs/plans)"),
     lab.out(),
 )
@@ -396,7 +396,7 @@ def run(args: argparse.Namespace) -> None:
     cases = lab.chosen(CASES, lambda c: c.name, args.only, "plans")
     maker = "experiments plans"
     kept = lab.kept_rows(args.out / "plans.json", maker, lambda r: f"{r['lens']}-{r['scene']}", "cases")
-    missing = [c for c in cases if args.again or c.name not in kept]
+    missing = [c for c in cases if args.restart or c.name not in kept]
     with pinned_threads():
         for case, report in lab.stages(missing, lambda c: c.name, args.quiet, 90.0):
             kept[case.name] = measure_case(case, args.models / case.name, report)

@@ -166,7 +166,7 @@ def page(rows: Sequence[Mapping[str, Any]]) -> str:
 
 OPTIONS = (
     lab.ONLY,
-    lab.option("--again", action="store_true", help="measure the chosen lenses again"),
+    lab.option("--restart", old=("--again",), action="store_true", help="measure the chosen lenses again"),
     lab.option("--models", metavar="DIR", type=Path, default=Path("runs/shots"), help="for them (default: runs/shots)"),
     lab.out(),
 )
@@ -179,7 +179,7 @@ def run(args: argparse.Namespace) -> None:
     kept = lab.kept_rows(args.out / "shots.json", "experiments shots", lambda r: r["lens"], "lenses")
     args.models.mkdir(parents=True, exist_ok=True)
     with pinned_threads():
-        missing = [n for n in names if args.again or n not in kept]
+        missing = [n for n in names if args.restart or n not in kept]
         for name, report in lab.stages(missing, lambda n: n, args.quiet, 60.0):
             kept[name] = measure_lens(name, args.models, report)
             rows = [kept[n] for n in LENSES if n in kept]

@@ -1,4 +1,4 @@
-"""Every method on a set of lenses, or on the whole library: `neurolens bench surrogates` with lenses chosen here.
+"""Every method on a set of lenses, or on the whole library: `neurolens bench` with lenses chosen here.
 
 Without LENS: laikin_double_gauss_50 (a standard lens), ogawa_zoom_70_200 (a long zoom), schaefter_primoplan_100 (hard
 for its aperture), horimoto_fisheye_16 and phone_lens_6 (steep aspheres).
@@ -23,7 +23,7 @@ OPTIONS = (
 
 
 def run(args: argparse.Namespace) -> int:
-    """As `neurolens bench surrogates` on the lenses chosen."""
+    """As `neurolens bench` on the lenses chosen."""
     if args.library:
         if args.lenses:
             raise InputError("experiments surrogates", "LENS", args.lenses, "none beside --library")

@@ -179,7 +179,7 @@ def draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 OPTIONS = (
     lab.option("cases", metavar="CASE", nargs="*", help="cases by name, as in the table (default: all)"),
     lab.count("states", 25, "random states (default: 25)", 2, 1000),
-    lab.option("--again", action="store_true", help="measure the chosen cases again"),
+    lab.option("--restart", old=("--again",), action="store_true", help="measure the chosen cases again"),
     lab.option("--models", metavar="DIR", type=Path, default=Path("runs/zoom"), help="for them (default: runs/zoom)"),
     lab.out(),
 )
@@ -193,7 +193,7 @@ def run(args: argparse.Namespace) -> None:
         raise InputError("experiments zoom", "CASE", unknown[0], f"one of: {', '.join(known)}")
     args.models.mkdir(parents=True, exist_ok=True)
     records = lab.kept_rows(args.out / "zoom.json", "experiments zoom", lambda r: r["case"], "cases")
-    missing = [known[n] for n in args.cases or known if args.again or n not in records]
+    missing = [known[n] for n in args.cases or known if args.restart or n not in records]
     text = page(list(records.values()))
     with pinned_threads():
         for case, report in lab.stages(missing, lambda c: c.name, args.quiet, 60.0):

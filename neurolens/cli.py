@@ -12,17 +12,20 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 from neurolens import __version__
 from neurolens.base.errors import NeurolensError, NeurolensWarning, one_line, printable
 from neurolens.base.signals import handled
-from neurolens.commands.arguments import Parser, more_glasses
+from neurolens.commands.arguments import Help, Parser, more_glasses
 
 # Packages of the extra that a base install lacks.
-_TRAIN_PACKAGES = {"torch", "sklearn", "onnx", "matplotlib", "flip_evaluator", "mpmath"}
+_TRAIN_PACKAGES = {"torch", "sklearn", "scipy", "onnx", "matplotlib", "flip_evaluator", "mpmath"}
 _BROKEN_PIPE = 141  # 128 plus the signal's number, as shells report it
 _FAULT, _TRACEBACK = 70, "NEUROLENS_TRACEBACK"  # EX_SOFTWARE of sysexits.h; the variable that asks for tracebacks
+# Names that commands had: they still work.
+_RENAMED = {("merge",): ("render", "--merge"), ("trade",): ("plan", "--trade"), ("bench", "surrogates"): ("bench",)}
 
 _DESCRIPTION = "Any lens prescription as a fast camera model with a measured error."
 _EPILOG = """\
@@ -56,7 +59,6 @@ def build_parser() -> Parser:
         glass,
         lens,
         library,
-        merge,
         mitsuba,
         models,
         plan,
@@ -64,18 +66,30 @@ def build_parser() -> Parser:
         render,
         stmap,
         survey,
-        trade,
         train,
         view,
     )
 
-    parser = Parser(prog="neurolens", description=_DESCRIPTION, epilog=_EPILOG)
+    groups = {
+        "lenses": (lens, analyse, convert, glass, library, survey, view),
+        "camera models of a lens": (train, models, evaluate, bench),
+        "pictures": (demo, plan, render, flare),
+        "compositing and other programs": (stmap, projection, export, blender, mitsuba),
+    }
+    parser = Parser(
+        prog="neurolens", usage="neurolens COMMAND ...", description=_DESCRIPTION, epilog=_EPILOG,
+        formatter_class=partial(Help, indent_increment=4),
+    )  # fmt: skip
     parser.add_argument("--version", action="version", version=f"neurolens {__version__}")
-    subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
-    read = lens, analyse, glass, convert, survey, library, stmap, projection
-    made = train, models, evaluate, export, render, merge, flare, mitsuba, blender, view
-    for command in (*read, plan, trade, *made, bench, demo):
-        command.add_parser(subparsers)
+    parser.renamed = _RENAMED
+    subparsers = parser.add_subparsers(
+        metavar="COMMAND", required=True, parser_class=Parser, prog="neurolens", help=argparse.SUPPRESS
+    )
+    for title, commands in groups.items():
+        for command in commands:
+            command.add_parser(subparsers)
+        parser.add_argument_group(title)._group_actions += subparsers._choices_actions  # so that help lists them there
+        subparsers._choices_actions = []
     return parser
 
 

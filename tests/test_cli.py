@@ -1,5 +1,6 @@
 """The command line from outside: help, one line an error, JSON with units in its keys, files that are whole."""
 
+import argparse
 import json
 import math
 import os
@@ -8,6 +9,8 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -29,17 +32,87 @@ GAUSS, SINGLET, PHONE, ZOOM, TESSAR = (
         "brendel_tessar_100",
     )
 )
-COMMANDS = (
-    *("lens", "analyse", "glass", "convert", "train", "models", "evaluate", "export", "render"),
-    *("stmap", "projection", "survey"),
-)
 
 
-@pytest.mark.parametrize("command", [[], *([c] for c in COMMANDS)])
-def test_every_command_has_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def parsers(parser: argparse.ArgumentParser, name: str = "neurolens") -> Iterator[tuple[str, argparse.ArgumentParser]]:
+    """The parser of every command and of its actions, by name."""
+    yield name, parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for word, child in action.choices.items():
+                yield from parsers(child, f"{name} {word}")
+
+
+COMMANDS = dict(parsers(build_parser()))
+
+
+def options() -> Iterator[tuple[str, argparse.Action]]:
+    """The options that help shows, each with its command."""
+    for name, parser in COMMANDS.items():
+        for action in parser._actions:
+            if action.option_strings and action.help != argparse.SUPPRESS:
+                yield name, action
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_of_every_command_is_shown_as_it_is_written(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="^0$"):
-        main([*command, "--help"])
-    assert "examples:" in capsys.readouterr().out
+        main([*name.split()[1:], "--help"])
+    out, parser = capsys.readouterr().out, COMMANDS[name]
+    assert "%%" not in out and "%(" not in out and "==SUPPRESS==" not in out
+    words = "".join(out.split())  # whatever the width of the terminal
+    for text in (parser.description, parser.epilog, *(a.help for a in parser._actions if a.help != argparse.SUPPRESS)):
+        assert text is None or "".join(text.split()) in words, text
+
+
+def test_an_option_has_one_spelling_and_one_meaning_in_all_commands() -> None:
+    spellings, kinds, commands = defaultdict(set), defaultdict(set), defaultdict(set)
+    for name, action in options():
+        (spelling,) = (s for s in action.option_strings if s.startswith("--"))
+        spellings[action.dest].add(spelling)
+        kinds[spelling].add((action.dest, action.metavar, action.nargs == 0))
+        commands[spelling].add(name)
+    assert {dest: found for dest, found in spellings.items() if len(found) > 1} == {}
+    assert {o: found for o, found in kinds.items() if len(found) > 1 and o != "--output"} == {}
+    alike = {(o, f"{o}s") for o in commands if f"{o}s" in commands}
+    assert {pair for pair in alike if commands[pair[0]] != commands[pair[1]]} == set()
+
+
+def test_old_spellings_work_and_are_hidden(capsys: pytest.CaptureFixture[str]) -> None:
+    parse = build_parser().parse_args
+    for command, old, new in (
+        ("train a.toml", "--out x", "-o x"),
+        ("train --lens cooke_triplet_50", "--target-px 0.5 --no-race", "--within 0.5px --rounds 0"),
+        ("analyse cooke_triplet_50", "--fields 0 9 --wavelengths 500 600", "--field-points 0 9 --wavelengths 500,600"),
+        ("survey lenses", "--again", "--restart"),
+        ("render a.toml -o a.exr --camera thin", "--layers beauty --wavelengths hero --configuration 70",
+         "--channels beauty --wavelength-mode hero --zoom 70"),
+        ("flare cooke_triplet_50 --light 5,3", "--out a.exr --wavelengths 9", "-o a.exr --bins 9"),
+        ("stmap thin --size 9x6 --film 36x24", "--out a --channels-nm 600,500,400", "-o a --wavelengths 600,500,400"),
+        ("export cooke_triplet_50 --to c -o a.h", "--camera", "--whole-camera"),
+        ("lens cooke_triplet_50 --derive-rims", "--vignetting 0.4", "--edge-pupil 0.4"),
+    ):  # fmt: skip
+        found, known = (vars(parse(f"{command} {words}".split())) for words in (old, new))
+        for args in (found, known):
+            if "field_points" in args:
+                args["wavelengths"] = [nm for some in args["wavelengths"] for nm in some]
+        assert found == known
+        shown = COMMANDS[f"neurolens {command.split()[0]}"].format_help()
+        for word in set(re.findall(r"--[a-z-]+", old)) - {"--wavelengths"}:
+            assert not re.search(rf"{word}(?![\w-])", shown), word
+    tiles = "a.tile-1-of-1.exr -o a.exr"
+    assert parse(f"merge {tiles}".split()) == parse(f"render --merge {tiles}".split())
+    assert parse(["bench", "surrogates", "cooke_triplet_50"]) == parse(["bench", "cooke_triplet_50"])
+    words = "a.toml --lens cooke_triplet_50".split()
+    assert parse(["trade", *words]) == parse(["plan", *words, "--trade"])
+
+
+def test_help_lists_every_command_once_in_groups(capsys: pytest.CaptureFixture[str]) -> None:
+    shown = build_parser().format_help()
+    names = [name.split()[1] for name in COMMANDS if name.count(" ") == 1]
+    listed = re.findall(r"^    ([a-z]+)\s", shown, re.MULTILINE)
+    assert sorted(listed) == sorted(names)
+    assert re.search(r"^lenses:\n.*^camera models of a lens:\n.*^pictures:\n", shown, re.MULTILINE | re.DOTALL)
 
 
 @pytest.mark.parametrize(
@@ -88,7 +161,7 @@ def test_export_takes_lenses_of_the_project_by_name_and_refuses_bad_names_first(
         (["lens", GAUSS, "--efl", "inf"], ["--efl", "mm"]),
         (["lens", GAUSS, "--f-number", "-2"], ["--f-number", "from 0.1 to 10000"]),
         (["lens", GAUSS, "--f-number", "1e100"], ["--f-number", "from 0.1 to 10000"]),
-        (["lens", GAUSS, "--configuration", "wide"], ["zoom", "wide", "none in this file"]),
+        (["lens", GAUSS, "--zoom", "wide"], ["zoom", "wide", "none in this file"]),
         (["lens", ZOOM, "--zoom", "wide"], ["zoom", "wide", "72mm"]),
         (["lens", GAUSS, "--layout", "a.exr"], ["--layout", ".png"]),
         (["lens", GAUSS, "--layout", "/no/such/folder/a.png"], ["--layout", "folder"]),
@@ -102,14 +175,14 @@ def test_export_takes_lenses_of_the_project_by_name_and_refuses_bad_names_first(
         (["lens", "list", "--focus", "2", "--blades", "5", "--efl", "20"], ["--efl"]),
         (["lens", "list", "--focusing", "paraxial"], ["--focusing"]),
         (["lens", "list", "--breathing", "a.png"], ["--breathing"]),
-        (["lens", PHONE, "--vignetting", "0.4"], ["--vignetting"]),
+        (["lens", PHONE, "--edge-pupil", "0.4"], ["--edge-pupil"]),
         (["lens", PHONE, "--derive-rims", "--f-number", "8"], ["--f-number"]),
         (["lens", PHONE, "--efl", "1e300"], ["0.001 to 1e+06"]),
         (["train"], ["EXPERIMENT.toml", "--lens"]),
         (["train", "a.toml", "--lens", GAUSS], ["both"]),
         (["train", "--lens", "no.toml"], ["no.toml"]),
         (["train", "no.toml"], ["no.toml", "missing"]),
-        (["train", "--lens", GAUSS, "--out", GAUSS], ["--out", "folder"]),
+        (["train", "--lens", GAUSS, "--output", GAUSS], ["--output", "folder"]),
     ],
 )
 def test_a_mistake_is_one_line(args: list[object], words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
@@ -137,7 +210,7 @@ def test_a_mistake_is_one_line(args: list[object], words: list[str], capsys: pyt
         (["--camera", "thin", "--focusing", "internal"], ["focus", "lens files"]),
         (["--camera", "thin", "--efl", "50", "--field", "40"], ["--field", "not allowed"]),
         (["--camera", "thin", "--width", "32", "--height", "32"], ["shape of the film"]),
-        (["--camera", "thin", "-o", "a.png"], ["--out", ".exr"]),
+        (["--camera", "thin", "-o", "a.png"], ["--output", ".exr"]),
         (["--camera", "thin", "-o", "/no/such/folder/a.exr"], ["folder"]),
         ([], ["--camera"]),
     ],
@@ -231,7 +304,7 @@ def test_lens_derives_rims_and_writes_only_where_asked(tmp_path: Path, capsys: p
     out = tmp_path / "tessar.toml"
     assert main(["lens", str(TESSAR), "--derive-rims"]) == 0
     assert "Nothing is written" in capsys.readouterr().out
-    data = run_json(capsys, "lens", TESSAR, "--derive-rims", "--vignetting", "0.8", "--half-field", "20", "-o", out)
+    data = run_json(capsys, "lens", TESSAR, "--derive-rims", "--edge-pupil", "0.8", "--half-field", "20", "-o", out)
     assert data["vignetting"] == 0.8 and len(data["rims"]) == 8
     written = out.read_text()
     assert 'rims = "derived"' in written and "80% of the pupil" in written and "20 degrees" in written
@@ -244,7 +317,7 @@ def test_lens_state_is_applied(capsys: pytest.CaptureFixture[str]) -> None:
     data = described(GAUSS)
     assert data["refractions"] == 12 and data["efl_mm"] == pytest.approx(49.64, abs=0.01)
     assert data["half_field_reached_deg"] == pytest.approx(23.5, abs=1.5)  # atan(21.6 / 49.64), and its distortion
-    data = run_json(capsys, "lens", ZOOM, "--configuration", "135mm", "--f-number", "5.6", "--focus", "5")
+    data = run_json(capsys, "lens", ZOOM, "--zoom", "135mm", "--f-number", "5.6", "--focus", "5")
     assert data["efl_mm"] == pytest.approx(135, rel=0.01)
     assert data["f_number"] == pytest.approx(5.6)
     assert data["film_z_mm"] > data["rear_focal_z_mm"]
@@ -337,7 +410,7 @@ def test_what_ends_a_training_says_what_is_kept(
     before = signal.signal(number, signal.SIG_DFL)
     monkeypatch.setattr("neurolens.evaluate.train.run_experiment", lambda *_, **__: signal.raise_signal(number))
     try:
-        code = main(["train", "--lens", str(GAUSS), "--out", str(tmp_path / "run"), "--quiet"])
+        code = main(["train", "--lens", str(GAUSS), "--output", str(tmp_path / "run"), "--quiet"])
     finally:
         signal.signal(number, before)
     assert code == 128 + number

@@ -131,7 +131,7 @@ def test_workers_end_with_a_killed_command_whatever_they_do(scene: Path, tmp_pat
 def test_layers_are_chosen_and_explained(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "a.exr"
     common = ("render", scene, "--camera", "thin", "--quiet", "-o", out)
-    run_json(capsys, *common, "--layers", "beauty")
+    run_json(capsys, *common, "--channels", "beauty")
     assert read_layers(out) == {} and "layers" not in read_exr(out)[1]
     run_json(capsys, *common, "--half")
     assert sorted(read_exr(out)[1]["layers"]) == sorted(read_layers(out))

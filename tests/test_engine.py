@@ -269,11 +269,11 @@ def test_models_of_many_lenses_are_those_of_one_machine(
     small = [word for each in SMALL for word in ("--set", each)]
     name, broken = str(lenses[0].relative_to(tmp_path)), tmp_path / "no.toml"
     broken.write_text("name = 5")
-    there = ("train", "--out", "there", "--no-race", "--quiet", "--dask", cluster, *small, "--lens", name)
+    there = ("train", "--output", "there", "--rounds", "0", "--quiet", "--dask", cluster, *small, "--lens", name)
     assert main([*there, "no.toml"]) == 2
     err = capsys.readouterr().err
     assert f"neurolens: no: {broken}: schema: got (missing)" in err and err.count("\n") == 1
-    assert main(["train", "--lens", name, "--out", "here/one", "--no-race", "--quiet", *small]) == 0
+    assert main(["train", "--lens", name, "--output", "here/one", "--rounds", "0", "--quiet", *small]) == 0
     runs = [tmp_path / place / "one" for place in ("here", "there")]
     graphs, cards = zip(*(read_model(run / "models" / "ols-12.onnx") for run in runs), strict=True)
     assert graphs[0] == graphs[1] and cards[0] == cards[1]
@@ -295,7 +295,8 @@ def test_records_of_a_survey_are_those_of_one_machine(cluster: str, lenses: list
     found = []
     for place, more in (("here", ("--jobs", "1")), ("there", ("--dask", cluster))):
         assert (
-            main(["survey", str(lenses[0].parent), "--no-fit", "--quiet", "--out", str(tmp_path / place), *more]) == 0
+            main(["survey", str(lenses[0].parent), "--no-fit", "--quiet", "--output", str(tmp_path / place), *more])
+            == 0
         )
         found.append({path.name: path.read_bytes() for path in (tmp_path / place / "records").iterdir()})
     assert found[0] == found[1] and len(found[0]) == 2
@@ -303,10 +304,10 @@ def test_records_of_a_survey_are_those_of_one_machine(cluster: str, lenses: list
 
 @pytest.mark.slow
 def test_records_of_the_bench_are_those_of_one_machine(cluster: str, lenses: list[Path], tmp_path: Path) -> None:
-    asked = ("bench", "surrogates", str(lenses[0]), "--methods", "thin", "--quick", "--rays", "1000", "--rounds", "0")
+    asked = ("bench", str(lenses[0]), "--methods", "thin", "--quick", "--rays", "1000", "--rounds", "0")
     found = []
     for place, more in (("here", ()), ("there", ("--dask", cluster))):
-        assert main([*asked, "--quiet", "--out", str(tmp_path / place), *more]) == 0
+        assert main([*asked, "--quiet", "--output", str(tmp_path / place), *more]) == 0
         (record,) = (tmp_path / place / "records" / "one").iterdir()
         found.append(UNTIMED.sub(b"", record.read_bytes()))
     assert found[0] == found[1]

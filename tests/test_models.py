@@ -190,6 +190,13 @@ def test_models_are_listed_with_the_one_to_use(tmp_path, monkeypatch, capsys) ->
     assert main(["models"]) == 0
     said = capsys.readouterr().out
     assert "Use runs/mine/models/ols-28.onnx (" in said and "--camera fused:runs/mine/models/ols-28.onnx" in said
+    shot, stated = tmp_path / "runs" / "a_plan" / "models" / "shot.onnx", b'"focus_m": ["inf", 0.7]'
+    shot.parent.mkdir(parents=True)
+    shot.write_bytes((own / "mlp-16x2.onnx").read_bytes().replace(stated, b'"focus_m": [  0.7, 0.7]'))
+    (shot.parents[1] / "results.json").write_text(json.dumps({"models": [timed[0] | {"file": "models/shot.onnx"}]}))
+    assert main(["models", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["models"]
+    assert Path(rows[-1]["file"]).stem == "shot" and [Path(r["file"]).stem for r in rows if r.get("use")] == ["ols-28"]
     assert main(["models", "--within", "1e-4um"]) == 1
     assert "closest is runs/mine/models/mlp-16x2.onnx" in capsys.readouterr().out
 

@@ -1,7 +1,11 @@
 """What the project says of itself in several files agrees; the Python examples of its pages run."""
 
+import ast
 import re
+import sys
 import tomllib
+from collections.abc import Iterator
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -11,7 +15,12 @@ import neurolens
 from neurolens.base.errors import InputError
 
 ROOT = Path(__file__).parents[1]
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+PROJECT = SETTINGS["project"]
+FOLDERS = ("neurolens", "experiments", "tests")
+IN_BLENDER = {"bpy", "bmesh", "cycles"}  # modules that Blender brings
+# Distributions that nothing there imports: programs, their plugins, and cryptography, by which distributed makes keys.
+TOOLS = {"pytest-xdist", "ruff", "mypy", "sphinx", "myst-parser", "pydata-sphinx-theme", "cryptography"}
 
 
 def test_the_tested_versions_lie_in_the_ranges_that_are_declared() -> None:
@@ -25,6 +34,65 @@ def test_the_tested_versions_lie_in_the_ranges_that_are_declared() -> None:
         assert not any(s.operator == "==" for s in wanted.specifier), (
             f"{line}: a range, constraints.txt has the version"
         )
+
+
+def _called(call: ast.Call) -> str:
+    return str(getattr(call.func, "attr", getattr(call.func, "id", "")))
+
+
+def imported(tree: ast.Module) -> Iterator[str]:
+    """Top-level names that a module imports, also by `import_module` and `importorskip` of a literal."""
+    for node in ast.walk(tree):
+        names: list[object] = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            names = [node.module]
+        elif isinstance(node, ast.Call) and _called(node) in ("import_module", "importorskip"):
+            names = [arg.value for arg in node.args[:1] if isinstance(arg, ast.Constant)]
+        yield from (str(name).partition(".")[0] for name in names)
+
+
+def own_environment(file: Path, tree: ast.Module, name: str) -> bool:
+    """Whether a script runs where another package is installed by hand: mypy leaves it out, or its head says so."""
+    excluded = any(re.search(p, file.relative_to(ROOT).as_posix()) for p in SETTINGS["tool"]["mypy"]["exclude"])
+    return excluded or f"pip install {name}==" in (ast.get_docstring(tree) or "")
+
+
+def test_what_is_imported_is_declared_and_what_is_declared_is_imported() -> None:
+    def plain(name: str) -> str:
+        return re.sub(r"[-_.]+", "-", name).lower()
+
+    def declared(*extras: str) -> set[str]:
+        lines = [line for extra in extras for line in PROJECT["optional-dependencies"][extra]]
+        return {plain(Requirement(line).name) for line in [*PROJECT["dependencies"], *lines]}
+
+    every = set(PROJECT["optional-dependencies"])
+    allowed = {
+        "neurolens": declared(*every - {"dev", "docs"}),
+        "experiments": declared(*every),
+        "tests": declared(*every),
+    }
+    distributions, used, missing = packages_distributions(), set(TOOLS), []
+    files = [file for folder in FOLDERS for file in sorted((ROOT / folder).rglob("*.py"))]
+    ours = {*FOLDERS, *(file.stem for file in files if "tests" in file.parts)} | IN_BLENDER | sys.stdlib_module_names
+    for file in files:
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        for name in set(imported(tree)) - ours:
+            wanted = {plain(one) for one in distributions.get(name, [name])}
+            used |= wanted
+            known = wanted & allowed[file.relative_to(ROOT).parts[0]] or own_environment(file, tree, name)
+            missing += [] if known else [f"{file.relative_to(ROOT)}: {name}"]
+    assert not missing
+    assert declared(*every) - used == set(), "nothing imports these: declare them no longer"
+
+
+def test_every_declared_package_says_why_it_is_needed() -> None:
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    lines = [PROJECT["dependencies"], *PROJECT["optional-dependencies"].values()]
+    for requirement in (one for each in lines for one in each):
+        for line in (line for line in text.splitlines() if f'"{requirement}"' in line):
+            assert re.search(r"[],] *# \w.{8,}", line), f"{requirement}: no reason beside it"
 
 
 def test_licence_citation_and_changes_are_there_and_name_this_version() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,9 +18,8 @@ from neurolens.base.errors import InputError
 from neurolens.evaluate.figures import rounded_up
 from neurolens.evaluate.image import Image, to_srgb
 
-DPI = 100  # a picture of 240 pixels is 2.4 inches wide: one pixel of it, one of the figure
-MOST_BYTES = 250_000
-_SCALE_COLOURS = 20
+DPI = 100  # a picture of 360 pixels is 3.6 inches wide: one pixel of it, one of the figure
+MOST_BYTES = 400_000
 _LEFT, _GAP, _HEAD, _FOOT, _BAR, _LABEL = 0.52, 0.1, 0.62, 0.34, 0.98, 0.2  # inches
 
 
@@ -56,7 +54,7 @@ def exposure_of(exact: Any, stops: float | str) -> float:
 
 
 def draw(title: str, rows: Sequence[Row], path: Path) -> None:
-    """Write the figure as a PNG of at most `MOST_BYTES`.
+    """Write the figure, its pictures denoised, as a JPEG of at most `MOST_BYTES`.
 
     Raises:
         InputError: no rows, or a figure that cannot be made so small.
@@ -80,7 +78,7 @@ def draw(title: str, rows: Sequence[Row], path: Path) -> None:
                 if column == "difference":
                     shown = axes.imshow(row.difference, cmap="magma", vmin=0, vmax=scale, **look)
                 else:
-                    axes.imshow(to_srgb(row.pictures[column], row.exposure), **look)
+                    axes.imshow(to_srgb(lab.denoised(row.pictures[column]), row.exposure), **look)
                 _axes(axes, first=k == 0)
                 if k == 0:
                     axes.set_title(row.label, loc="left", fontsize=8.6, pad=3)
@@ -129,30 +127,10 @@ def _page(rows: Sequence[Row], maps: bool) -> tuple[Any, list[list[Any]], Any]:
     return figure, boxes, box(page[0] - _BAR + 0.08, _HEAD, 0.13, min(max(heights[0], 1.4), 2.6))
 
 
-def _scale_colours() -> list[int]:
-    """R, G, B of the scale of the difference and of white, one after the other."""
-    from matplotlib import colormaps
-
-    scale = 255 * colormaps["magma"](np.linspace(0, 1, _SCALE_COLOURS - 1))[:, :3]
-    return [*(int(v) for v in scale.round().ravel()), 255, 255, 255]  # and the page's white
-
-
 def _save_small(figure: Any, path: Path) -> None:
-    """Write the figure in all its colours, or where that is too large with as many as keep it small, 256 to 32."""
+    """Write the figure as a JPEG that is small enough for the repository, its colours as sharp as its brightness."""
     drawn = io.BytesIO()
     figure.savefig(drawn, dpi=DPI, facecolor="white", format="png")
     picture = Pictures.open(drawn).convert("RGB")
-    fewer = (_reduced(picture, colours) for colours in (256, 128, 64, 48, 32))
-    lab.write_small_png(path, itertools.chain([picture], fewer), MOST_BYTES)
-
-
-def _reduced(picture: Any, colours: int) -> Any:
-    """A picture of so many colours."""
-    # The pictures would crowd out the scale of the difference, which must stay what the bar says.
-    palette = Pictures.new("P", (1, 1))
-    own = picture.quantize(colours - _SCALE_COLOURS).getpalette() or []
-    palette.putpalette([*own[: 3 * (colours - _SCALE_COLOURS)], *_scale_colours()])
-    few = picture.quantize(palette=palette, dither=Pictures.Dither.NONE)
-    page = Pictures.fromarray((np.asarray(picture) == 255).all(axis=2))
-    few.paste(colours - 1, mask=page)  # the library finds near colours only
-    return few
+    forms = ((picture, {"quality": quality, "subsampling": 0}) for quality in (90, 84, 76))
+    lab.write_small(path, forms, MOST_BYTES)

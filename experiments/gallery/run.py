@@ -48,7 +48,7 @@ _CAMERAS = 2  # counts changes of what a column's camera is: figures of earlier 
 def run_effect(
     effect: Effect, out: Path, cache: Path, *, samples: int | None = None, threads: int = 2, progress: Progress
 ) -> Record:
-    """Render and measure an effect: NAME.png and NAME.json in `out`, fitted models in `cache`.
+    """Render and measure an effect: NAME.jpg and NAME.json in `out`, fitted models in `cache`.
 
     Args:
         samples: a pixel; None takes each panel's own.
@@ -90,7 +90,7 @@ def run_effect(
         "versions": versions(),
         "fingerprint": fingerprint,
     }
-    draw(effect.title, rows, out / f"{effect.name}.png")
+    draw(effect.title, rows, out / f"{effect.name}.jpg")
     write_json(out / f"{effect.name}.json", _plain(record))
     return record
 
@@ -122,7 +122,7 @@ def finished(effect: Effect, out: Path) -> Record | None:
     """The record that an earlier run left, with its figure."""
     try:
         record = json.loads((out / f"{effect.name}.json").read_text(encoding="utf-8"))
-        return record if record["schema"] == SCHEMA and (out / f"{effect.name}.png").is_file() else None
+        return record if record["schema"] == SCHEMA and (out / f"{effect.name}.jpg").is_file() else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
@@ -215,9 +215,9 @@ _HEAD = """\
 
 Small scenes after the figures of two theses (Steinert 2009, Willi 2021), each through the exact lens, a surrogate of it
 and a thin lens with its pupil that shows the plane in focus at the same size; the last column is the difference of
-surrogate and exact in luminance, the same random numbers in both. Below each figure stands what is measured of the
-effect. Axes are millimetres of film, pictures upright. Made by `python -m experiments gallery`; one effect by the
-command beside it.
+surrogate and exact in luminance, the same random numbers in both. The difference and all numbers are those of the
+renders; the pictures are shown after Open Image Denoise. Below each figure stands what is measured of the effect. Axes
+are millimetres of film, pictures upright. Made by `python -m experiments gallery`; one effect by the command beside it.
 """
 
 
@@ -233,7 +233,7 @@ def section(record: Record) -> str:
     return lab.page(
         f"## {record['title']}",
         record["text"].strip(),
-        f"![{record['title']}]({name}.png)",
+        f"![{record['title']}]({name}.jpg)",
         effect_table(record),
         f"After {record['source'].strip()} {toml}, `{record['command']}`.",
     )

@@ -1,5 +1,6 @@
-"""Make what the scenes in experiments/scenes load: the meshes knot.obj (a torus knot) and vase.ply (with normals and
-texture coordinates), the pictures poster.png, glaze.png (for the vase) and studio.png (lamps all around).
+"""Make what the scenes in experiments/scenes load: the meshes knot.obj (a torus knot), vase.ply (with normals and
+texture coordinates), ridge.ply (a mountain ridge), firs.ply (a wood on a shore) and four pieces of chess, the pictures
+poster.png, glaze.png (for the vase) and studio.png (lamps all around).
 
 python experiments/scenes/make_assets.py
 """
@@ -74,14 +75,118 @@ def vase(around: int = 30, up: int = 20) -> tuple[np.ndarray, np.ndarray]:
     normal = np.stack([np.cos(angle), -slope, -np.sin(angle)])
     normal /= np.linalg.norm(normal, axis=0)
     vertices = np.stack([*point, *normal, 3 * angle / (2 * np.pi), t], axis=-1).reshape(-1, 8)
+    return vertices, grid_faces(up, around)
+
+
+# Outlines of turned pieces of chess: radius and height in mm, from the foot up; a repeated point is a corner.
+FOOT = [(0, 0), (1, 0), (1, 0), (1, 0.05), (1, 0.05), (0.97, 0.09), (0.86, 0.12), (0.84, 0.15), (0.75, 0.20)]
+PIECES: dict[str, tuple[float, list[tuple[float, float]]]] = {
+    "pawn": (
+        14.5,
+        [(8.0, 14), (5.6, 22), (5.0, 29), (5.2, 29), (8.2, 30.5), (8.4, 32), (5.5, 33.5), (5.6, 34), (8.4, 38)]
+        + [(9.3, 42), (8.4, 46), (5.4, 50), (0, 51.5)],
+    ),
+    "bishop": (
+        17.0,
+        [(9.5, 18), (6.4, 30), (5.6, 42), (5.8, 42), (9.6, 44), (9.8, 46), (6.2, 48), (6.4, 49), (9.0, 55)]
+        + [(9.2, 60), (6.6, 67), (3.0, 71.5), (2.3, 72.5), (3.2, 74.5), (2.4, 76.8), (0, 77.5)],
+    ),
+    "queen": (
+        19.0,
+        [(10.5, 20), (7.2, 36), (6.2, 54), (6.5, 54), (10.8, 56.5), (11.0, 58.5), (7.2, 60.5), (7.3, 62), (9.0, 70)]
+        + [(11.8, 79), (11.8, 79), (11.2, 80), (8.5, 79.6), (6.5, 82), (3.4, 84), (2.9, 85), (3.8, 87), (2.8, 89.4)]
+        + [(0, 90)],
+    ),
+    "king": (
+        20.0,
+        [(11.0, 22), (7.6, 40), (6.6, 58), (6.9, 58), (11.4, 60.5), (11.6, 63), (7.6, 65), (7.8, 66.5), (9.6, 76)]
+        + [(11.6, 84), (11.6, 84), (10.4, 86.5), (4.5, 89), (2.2, 90), (2.2, 90), (1.9, 93), (4.3, 94.5), (4.3, 94.5)]
+        + [(4.3, 97.5), (4.3, 97.5), (1.9, 99), (2.4, 102.5), (0, 103)],
+    ),
+}
+
+
+def turned(foot: float, outline: list[tuple[float, float]], around: int = 48) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 8] in metres and faces [T, 3] of a turned piece, whose foot has this radius in mm."""
+    points = np.array([(foot * r, foot * 0.95 * y) for r, y in FOOT] + outline) / 1000
+    # A spline by chords, with three points between two; where a point repeats, the outline has a corner.
+    rows = [points[:1]]
+    padded = np.concatenate([points[:1], points, points[-1:]])
+    for before, here, there, after in zip(padded, padded[1:], padded[2:], padded[3:], strict=False):
+        t = np.linspace(0, 1, 5)[1:, None]
+        left, right = (there - before) / 2, (after - here) / 2
+        reach = float(np.linalg.norm(there - here))
+        left, right = (v * min(1.0, reach / max(float(np.linalg.norm(v)), 1e-9)) for v in (left, right))
+        rows.append(
+            (2 * t**3 - 3 * t**2 + 1) * here + (t**3 - 2 * t**2 + t) * left
+            + (3 * t**2 - 2 * t**3) * there + (t**3 - t**2) * right
+        )  # fmt: skip
+    line = np.concatenate(rows)
+    line = line[np.concatenate([[True], np.linalg.norm(np.diff(line, axis=0), axis=1) > 1e-6])]
+    line[:, 0] = np.maximum(line[:, 0], 0)
+    slope = np.gradient(line, axis=0)
+    angle = np.linspace(0, 2 * np.pi, around + 1)
+    radius, height = (np.broadcast_to(x[:, None], (len(line), around + 1)) for x in line.T)
+    dr, dy = (np.broadcast_to(x[:, None], radius.shape) for x in slope.T)
+    cos, sin = (np.broadcast_to(f(angle), radius.shape) for f in (np.cos, np.sin))
+    normal = np.stack([dy * cos, -dr, -dy * sin])
+    normal /= np.maximum(np.linalg.norm(normal, axis=0), 1e-12)
+    uv = [angle / (2 * np.pi) + 0 * radius, height / line[-1, 1]]
+    vertices = np.stack([radius * cos, height, -radius * sin, *normal, *uv], axis=-1).reshape(-1, 8)
+    return vertices, grid_faces(len(line), around)
+
+
+def grid_faces(up: int, around: int) -> np.ndarray:
+    """Triangles [T, 3] of a grid of `up` rows of `around` + 1 vertices."""
     i, j = np.meshgrid(np.arange(up - 1), np.arange(around), indexing="ij")
     a, b, c, d = (x * (around + 1) + y for x, y in ((i, j), (i, j + 1), (i + 1, j + 1), (i + 1, j)))
-    return vertices, np.concatenate([np.stack(x, axis=-1).reshape(-1, 3) for x in ((a, b, c), (a, c, d))])
+    return np.concatenate([np.stack(x, axis=-1).reshape(-1, 3) for x in ((a, b, c), (a, c, d))])
+
+
+def ridge(doublings: int = 8, slopes: int = 5) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] and faces [T, 3] of a ridge from x = -1 to 1, at most 1 high at z = 0, that falls to z = 0.6."""
+    chance = np.random.default_rng(5)
+    height = np.array([0.15, 0.45, 0.1, 0.6, 0.25])
+    for k in range(doublings - 2):  # midpoints move by less and less
+        middle = (height[1:] + height[:-1]) / 2 + 0.16 * 0.56**k * chance.standard_normal(len(height) - 1)
+        height = np.insert(height, np.arange(1, len(height)), middle)
+    height = (height - height.min() + 0.1) / (np.ptp(height) + 0.1)
+    down = np.linspace(0, 1, slopes)[:, None]
+    rough = 0.05 * np.sin(np.pi * down) * chance.standard_normal((slopes, len(height)))
+    x = np.broadcast_to(np.linspace(-1, 1, len(height)), rough.shape)
+    y = (height * (1 - down) ** 1.3 + rough).clip(0)
+    y[-1] = -0.02
+    vertices = np.stack([x, y, np.broadcast_to(0.6 * down, x.shape)], axis=-1).reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(slopes - 1), np.arange(len(height) - 1), indexing="ij")
+    a, b, c, d = (u * len(height) + v for u, v in ((i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1)))
+    return vertices, np.concatenate([np.stack(f, axis=-1).reshape(-1, 3) for f in ((a, b, c), (a, c, d))])
+
+
+def firs(count: int = 90, boughs: int = 5, around: int = 7) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] and faces [T, 3] of firs in m, each a stack of cones, thick on the left and thin to the right."""
+    chance = np.random.default_rng(2)
+    x = -46 + 62 * chance.random(count) ** 1.6
+    z = -52 + 0.3 * x - 14 * chance.random(count)
+    tall = (5 + 5 * chance.random(count)) * np.where(x < -14, 1.2, 0.8)
+    k = np.arange(boughs)[:, None]
+    angle = 2 * np.pi * np.arange(around) / around + 0.8 * k
+    points, faces = [], []
+    for tree in range(count):
+        reach = 0.19 * tall[tree] * (1 - 0.17 * k) * (1 + 0.25 * chance.standard_normal((boughs, around)))
+        low = tall[tree] * (0.1 + 0.17 * k - 0.04 * chance.random((boughs, around)))
+        ring = np.stack([x[tree] + reach * np.cos(angle), low, z[tree] + reach * np.sin(angle)], axis=-1)
+        tips = np.stack([np.full(boughs, x[tree]), tall[tree] * (0.32 + 0.17 * k[:, 0]), np.full(boughs, z[tree])], -1)
+        first = tree * boughs * (around + 1) + k * (around + 1)
+        turn = np.arange(around)
+        points.append(np.concatenate([tips[:, None], ring], axis=1).reshape(-1, 3))
+        faces += [np.stack(np.broadcast_arrays(first, first + 1 + (turn + 1) % around, first + 1 + turn), -1)]
+    return np.concatenate(points), np.concatenate(faces).reshape(-1, 3)
 
 
 def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Write a binary PLY file of vertices [V, 8] and triangles [T, 3]."""
-    names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz", "s", "t"))
+    """Write a binary PLY file of vertices, [V, 8] or [V, 3] (points alone), and triangles [T, 3]."""
+    every = ("x", "y", "z", "nx", "ny", "nz", "s", "t")
+    names = "".join(f"property float {name}\n" for name in every[: vertices.shape[1]])
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{names}"
     header += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     rows = np.empty(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
@@ -122,7 +227,9 @@ def main() -> None:
     lines += ["v " + " ".join(f"{x:.4f}" for x in vertex) for vertex in vertices]
     lines += ["f " + " ".join(str(k + 1) for k in face) for face in faces]
     (TARGET / "knot.obj").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    write_ply(TARGET / "vase.ply", *vase())
+    pieces = {name: turned(foot, outline) for name, (foot, outline) in PIECES.items()}
+    for name, mesh in {"vase": vase(), "ridge": ridge(), "firs": firs(), **pieces}.items():
+        write_ply(TARGET / f"{name}.ply", *mesh)
     for name, picture in (("poster", poster()), ("glaze", glaze()), ("studio", studio())):
         Image.fromarray(picture).save(TARGET / f"{name}.png", optimize=True)
 

@@ -35,7 +35,7 @@ def duration(seconds: float) -> str:
 
 
 class Progress:
-    """Reports the stages of a run, one line each.
+    """Reports the stages of a run, one line each:
 
         progress = Progress({"trace ray pairs": 2, "fit": 60})
         with progress.stage("trace ray pairs") as report:

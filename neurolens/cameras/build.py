@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from neurolens.base.bounds import F_NUMBER, said, within
 from neurolens.base.errors import InputError
 from neurolens.base.lensname import FISHEYES, FUSED, IDEAL_OF, is_model, resolve
 from neurolens.base.progress import Progress
@@ -49,6 +50,9 @@ class Shot:
         wavelength_nm: shortest and longest wavelength of the light.
         pupil: how the pupil of an exact lens is sampled; see `exact.PUPILS`.
         vignetting: what is left of it, "both", "natural", "optical" or "none"; see `neurolens.cameras.vignetting`.
+
+    Raises:
+        InputError: an f-number that no lens has.
     """
 
     film_mm: tuple[float, float]
@@ -64,6 +68,10 @@ class Shot:
     clamp_f_number: bool = False
     pupil: str = "outline"
     vignetting: str = "both"
+
+    def __post_init__(self) -> None:
+        if self.f_number is not None and not within(F_NUMBER, self.f_number):
+            raise InputError("camera", "f_number", self.f_number, f"a number {said(F_NUMBER)}")
 
     def f_number_for(self, widest: float) -> float | None:
         """The f-number of a lens that opens to `widest`; None stands for its widest."""

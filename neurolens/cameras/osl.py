@@ -3,7 +3,8 @@
 The whole camera is a graph: from the place in the picture and two random numbers to a weighted ray, at any stop and
 focus of the lens. Inputs of the shader (`PARAMETERS`) are numbers when the renderer compiles it, and what depends on
 them alone costs nothing then. Besides them it reads, of Blender's camera, the sensor's size (with its fit and the
-picture's aspect) and, where `focus_m` is 0, the distance of depth of field; shift moves the place in the picture.
+picture's aspect) and, where `focus_m` is 0, the distance of depth of field; shift moves the place in the picture. That
+distance and the rays that it returns are in units of the scene, of `unit_m` metres each; all else is in mm and metres.
 
 Of a lens in several states (zoom, internal focus) every number of the camera follows the state, mixed from cameras at
 the nodes of its axes as a model's own numbers are: the zoom is an input, internal focus the distance in focus.
@@ -73,8 +74,10 @@ _FRAME = """\
     vector sensor = vector(36.0, 24.0, 0.0);
     getattribute("cam:sensor_size", sensor);
     float asked_m = focus_m;
-    if (focus_m <= 0.0)
+    if (focus_m <= 0.0) {
         getattribute("cam:focal_distance", asked_m);
+        asked_m *= unit_m;
+    }
     float half_turn = M_PI / max(blades, 3);
     float first_edge = radians(rotation) + half_turn;
     float raster_x = raster[0], raster_y = raster[1], first = pair[0], second = pair[1];
@@ -164,7 +167,7 @@ class OslLens:
 
 def parameters(lens: OslLens) -> list[Parameter]:
     """The inputs that a user turns, in order: f_number, focus_m, zoom_mm of a zoom's range, blades, roundness,
-    rotation, exposure, vignetting, dispersion, origin, warn."""
+    rotation, exposure, vignetting, dispersion, origin, unit_m, warn."""
     widest = float(f"{lens.f_number:.4g}")
     zoom = []
     for axis, name in zip(lens.axes, state_names(lens.axes), strict=True):
@@ -185,6 +188,8 @@ def parameters(lens: OslLens) -> list[Parameter]:
         Parameter("dispersion", "Dispersion", "Colours go their own ways", 1, widget="boolean"),
         Parameter("origin", "Origin", "What stands where Blender's camera stands, and distances are measured from",
                   1, widget="mapper", options="Film:0|Entrance pupil:1"),
+        Parameter("unit_m", "Metres per Unit", "Length of a unit of the scene, the Unit Scale of its properties",
+                  1.0, 1e-6, 1e6),
         Parameter("warn", "Warn", "Magenta where the lens is unknown (beyond its film, too near), in place of black",
                   0, widget="boolean"),
     ]  # fmt: skip
@@ -251,19 +256,20 @@ def osl_graph(camera: OslCamera) -> Graph:
 def _set_outputs(
     g: Graph, camera: OslCamera, call: _Call, film: Value, found: Mapping[str, Value], throughput: Value, warned: Value
 ) -> None:
-    """Rays in the frame of Cycles, metres and x right, y up, z ahead; warnings as of a pinhole."""
+    """Rays in the frame of Cycles, in units of the scene and x right, y up, z ahead; warnings as of a pinhole."""
     turned = [1.0, 1.0, -1.0]
+    length = call.units_per_m * [1e-3, 1e-3, -1e-3]
     ahead = g.concat(film * -1.0, g.constant(camera.efl_mm))
     ahead = ahead * (1.0 / g.square(ahead).sqrt())
     ray = found["scene_ray"]
-    start = (ray[0:3] - g.concat(g.constant([0.0, 0.0]), call.origin_mm)) * [1e-3, 1e-3, -1e-3]
+    start = (ray[0:3] - g.concat(g.constant([0.0, 0.0]), call.origin_mm)) * length
     plain = warned <= 0.5
     g.outputs["position"] = g.select(plain, start, 0.0)
     g.outputs["direction"] = g.select(plain, ray[3:] * turned, ahead)
     g.outputs["throughput"] = g.select(plain, throughput, g.constant([1.0, 0.0, 1.0]))
     for axis, name, step in zip((0, 1), D_FILM, ("x", "y"), strict=True):
         way = call.sensor[axis] * call.number(f"pixel_{step}")
-        rows = found[name] * (way * [-1e-3, -1e-3, 1e-3, -1.0, -1.0, 1.0])
+        rows = found[name] * (way * g.concat(length * -1.0, g.constant([-1.0, -1.0, 1.0])))
         g.outputs[f"dPd{step}"], g.outputs[f"dDd{step}"] = rows[0:3], rows[3:]
 
 
@@ -284,6 +290,7 @@ class _Call:
         distance = away + (self.film_z - camera.entrance_mm) * at_pupil * 1e-3
         self.focused = g.constant(camera.limit_m * _NEAR) <= distance
         self.origin_mm = g.select(at_pupil <= 0.5, self.film_z, camera.entrance_mm)
+        self.units_per_m = 1.0 / self.number("unit_m")
 
     def number(self, name: str) -> Value:
         return self.g.input(name, per_call=True)

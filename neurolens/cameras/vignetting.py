@@ -1,6 +1,6 @@
 """Vignetting of any camera switched off: natural, optical, or both.
 
-The film value of white surroundings is V(f) at a film point f, 1 on the axis. It is the product of
+The film value of white surroundings is V(f) at a film point f, 1 on the axis. It is the product of:
 
     natural N(f) = <T cos^4> / <T>    cos^4 of the film-side angle to the axis, mean over the light that passes: the
                                       chief ray's, as the stop closes; of a fisheye projection its own law

@@ -18,10 +18,13 @@ from neurolens.commands.arguments import (
     add_json,
     add_lens,
     add_lens_state,
+    add_option,
+    add_output,
     between,
     check_run_folder,
     focus_of,
     state_of,
+    wavelengths_nm,
 )
 from neurolens.commands.output import answer, number, table
 
@@ -33,7 +36,7 @@ if TYPE_CHECKING:
 WHATS = (
     "layout", "spots", "fans", "colour", "curvature", "distortion", "vignetting", "mtf", "mtf-height", "seidel", "psf",
 )  # fmt: skip
-_OF_FIELDS = ("spots", "fans", "mtf", "psf")  # take --fields, and as mtf-height --wavelengths
+_OF_FIELDS = ("spots", "fans", "mtf", "psf")  # take --field-points, and as mtf-height --wavelengths
 _BULK = {  # left out of the JSON unless asked for: a number per ray or a pixel
     "layout": ("rays", "surfaces"),
     "spots": ("tangential_um", "sagittal_um", "slope_tangential", "slope_sagittal"),
@@ -83,12 +86,12 @@ def add_parser(subparsers: Any) -> None:
     add_lens(parser, "file")
     parser.add_argument("what", metavar="WHAT", nargs="*", help="what to show (default: all)")
     add_lens_state(parser, efl="as tabled", f_number="the tabled stop")
-    parser.add_argument(
-        "--fields", metavar="DEG", nargs="+", type=between(0, 179, "degrees"),
-        help="fields of spots, fans, mtf and psf (default: axis, 50%%, 70%%, 85%% and edge of the field)",
+    add_option(
+        parser, "--field-points", old=("--fields",), metavar="DEG", nargs="+", type=between(0, 179, "degrees"),
+        help="angles from the axis for spots, fans, mtf and psf (default: axis, 50%, 70%, 85% and edge of the field)",
     )  # fmt: skip
     parser.add_argument(
-        "--wavelengths", metavar="NM", nargs="+", type=between(*WAVELENGTH_NM, "wavelengths in nm"),
+        "--wavelengths", metavar="NM", nargs="+", type=wavelengths_nm,
         help=f"of spots, fans, the MTF and psf, {said(WAVELENGTH_NM)} nm, the reference first "
         "(default: d, F and C, or the file's own where its range lacks the d line)",
     )  # fmt: skip
@@ -99,7 +102,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "--axis", choices=("x", "y"), default="y", help="plane of the field, for anamorphic lenses (default: y)"
     )
-    parser.add_argument("-o", "--output", metavar="FOLDER", type=Path, help="draw a picture of each in this folder")
+    add_output(parser, "FOLDER", "draw a picture of each in this folder")
     parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png", help="of the pictures (default: png)")
     add_json(parser)
     parser.add_argument("--full", action="store_true", help="with --json: also every ray and every pixel")
@@ -109,14 +112,15 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the requested analyses, and draw them if a folder is given."""
+    args.wavelengths = [nm for some in args.wavelengths or () for nm in some] or None
     unknown = [w for w in args.what if w not in WHATS]
     if unknown:
         raise InputError("neurolens analyse", "WHAT", unknown[0], f"any of: {', '.join(WHATS)}")
     if args.full and not args.json:
         raise InputError("neurolens analyse", "--full", "(given)", "this option only with --json")
-    if args.output is not None:
-        check_run_folder(args.output, args.output, "--output")
-        args.output.mkdir(parents=True, exist_ok=True)
+    if args.out is not None:
+        check_run_folder(args.out, args.out, "--output")
+        args.out.mkdir(parents=True, exist_ok=True)
 
     from neurolens.analysis.layout import state_text
 
@@ -154,7 +158,7 @@ def run(args: argparse.Namespace) -> int:
         ]
         parts += [*(f"Note: {n}" for n in notes), *(f"Warning: {w}" for w in doubts)]
         if pictures:
-            parts.append(f"{len(pictures)} pictures drawn in {args.output}")
+            parts.append(f"{len(pictures)} pictures drawn in {args.out}")
         return "\n\n".join(parts)
 
     return answer(args, {**head, **shown, **more}, text)
@@ -183,20 +187,20 @@ def _one(what: str, scene: Scene, args: argparse.Namespace, doubts: list[str]) -
     from neurolens.analysis.layout import state_text
 
     analysis = analysis_of(what)
-    options = {"field_deg": args.fields, "wavelength_nm": args.wavelengths}
+    options = {"field_deg": args.field_points, "wavelength_nm": args.wavelengths}
     asked = {k: v for k, v in options.items() if v is not None} if what in _OF_FIELDS else {}
     if what == "mtf-height":
         options = {"frequency_per_mm": args.frequencies, "wavelength_nm": args.wavelengths}
         asked = {k: v for k, v in options.items() if v is not None}
     if what in _OF_FIELDS:
-        dark = check_light(scene, args.fields, (args.wavelengths or scene.waves_nm)[0])
+        dark = check_light(scene, args.field_points, (args.wavelengths or scene.waves_nm)[0])
         doubts += [d for d in dark if d not in doubts]
     result = analysis.compute(scene, **asked)
     data = result.to_dict()
-    if args.output is None:
+    if args.out is None:
         return data, None
     across = f"_{args.axis}" if any(s.cylinder for s in scene.lens.surfaces) else ""
-    path = args.output / f"{scene.lens.lens_id}_{what}{across}.{args.format}"
+    path = args.out / f"{scene.lens.lens_id}_{what}{across}.{args.format}"
     warning = wrap(f"Warning: {scene.edge.warning}", _WRAP) if scene.edge.warning else []
     if what == "layout":
         analysis.draw(replace(result, subtitle="\n".join([result.subtitle, *warning])), path)

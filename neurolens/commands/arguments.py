@@ -5,14 +5,16 @@ from __future__ import annotations
 import argparse
 import math
 import re
+import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
-from neurolens.base.bounds import F_NUMBER, FOCAL_MM
+from neurolens.base.bounds import F_NUMBER, FOCAL_MM, WAVELENGTH_NM
 from neurolens.base.errors import InputError, one_line
 from neurolens.base.lensname import lens_id_of, resolve
+from neurolens.evaluate.records import program
 
 if TYPE_CHECKING:
     from neurolens.optics.apertures import Aperture
@@ -21,18 +23,35 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
+class Help(argparse.RawDescriptionHelpFormatter):
+    """Help whose texts are shown as they are written: line breaks stay, and % is a percent sign."""
+
+    def _expand_help(self, action: argparse.Action) -> str:
+        return self._get_help_string(action) or ""
+
+
 class Parser(argparse.ArgumentParser):
-    """A parser with one-line error messages, whose help keeps its line breaks."""
+    """A parser with one-line error messages, whose help keeps its line breaks.
+
+    Attributes:
+        intermixed: whether options may stand before and between the arguments of a list.
+        renamed: words at the start of a command line, and the words that replaced them.
+    """
 
     def __init__(self, **options: Any) -> None:
-        options.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
+        options.setdefault("formatter_class", Help)
         # An abbreviation can become ambiguous when an option is added.
         super().__init__(allow_abbrev=False, **options)
         self._negative_number_matcher = re.compile(r"-\.?\d")  # no option: -12,3 is a value, as -12 is
-        self.intermixed = False  # True: options may stand before and between the arguments of a list
+        self.intermixed = False
+        self.renamed: dict[tuple[str, ...], tuple[str, ...]] = {}
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As in argparse, but an intermixed command reports unknown arguments itself."""
+        """As in argparse, but old names work, and an intermixed command reports unknown arguments itself."""
+        args = sys.argv[1:] if args is None else list(args)
+        for old, new in self.renamed.items():
+            if tuple(args[: len(old)]) == old:
+                args = [*new, *args[len(old) :]]
         if self.intermixed:
             self.intermixed = False  # argparse comes back here for its two passes
             try:
@@ -45,7 +64,9 @@ class Parser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {one_line(message, 1000)} (see {self.prog} --help)\n")
+        self.exit(
+            2, f"{self.prog}: {one_line(message, 1000)} (see {self.prog.replace('neurolens', program(), 1)} --help)\n"
+        )
 
 
 def positive(unit: str, *, infinite: bool = False) -> Callable[[str], float]:
@@ -78,6 +99,37 @@ def _number(kind: Callable[[str], T], good: Callable[[T], bool], expected: str) 
     return convert
 
 
+def add_option(
+    parser: argparse._ActionsContainer, *names: str, old: Sequence[str] = (), **options: Any
+) -> argparse.Action:
+    """Add an option as `add_argument` does; its `old` spellings still work, and neither help nor errors show them."""
+    action = parser.add_argument(*names, **options)
+    parser._option_string_actions.update(dict.fromkeys(old, action))
+    return action
+
+
+def add_output(parser: argparse._ActionsContainer, metavar: str, about: str, **options: Any) -> None:
+    """Add -o and --output, the file or folder that a command writes."""
+    options = {"dest": "out", "metavar": metavar, "type": Path, "help": about} | options
+    add_option(parser, "-o", "--output", old=("--out",), **options)
+
+
+def rms_error(text: str) -> tuple[str, float]:
+    """Type of --within: the key of a model card's error, "rms_um" or "rms_px", and its bound."""
+    match = re.fullmatch(r"([0-9.]{1,20}(?:e-?[0-9]{1,3})?)(um|px)", text)
+    try:
+        if match and 0 < float(match[1]) < 1e9:
+            return f"rms_{match[2]}", float(match[1])
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"got {text!r}, expected a number above 0 and its unit, as 1um or 0.1px")
+
+
+def wavelengths_nm(text: str) -> tuple[float, ...]:
+    """Type of --wavelengths: one or more in nm, with commas between them."""
+    return tuple(between(*WAVELENGTH_NM, "wavelengths in nm")(word) for word in text.split(","))
+
+
 QUIET_HELP = "neither progress nor warnings on stderr"
 
 # Repeated here, so that help imports no camera; a test compares with `cameras.exact` and `cameras.vignetting`.
@@ -98,7 +150,7 @@ cameras:
 
 def add_camera(parser: argparse.ArgumentParser) -> None:
     """Add --camera, --film-offset, --pupil and --vignetting."""
-    add_lens(parser, "--camera", models=True, cameras=True, required=True)
+    add_lens(parser, "--camera", models=True, cameras=True)
     parser.add_argument(
         "--film-offset", metavar="MM", type=between(-1e3, 1e3, "mm"), default=0.0,
         help="move the film away from the lens after focusing (default: 0)",
@@ -127,8 +179,8 @@ def add_lens_state(parser: argparse.ArgumentParser, *, efl: str, f_number: str, 
         "--field", metavar="DEG", type=between(0.001, 359.0, "degrees"),
         help="scale the whole lens so that its image circle sees this full field of view, traced, in degrees",
     )  # fmt: skip
-    group.add_argument(
-        "--zoom", "--configuration", metavar="STATE", dest="zoom",
+    add_option(
+        group, "--zoom", old=("--configuration",), metavar="STATE",
         help="state of the lens file by name, or a focal length in mm between its states (derived: its table and "
         "interpolated gaps); default: the state of the table",
     )  # fmt: skip
@@ -208,11 +260,11 @@ def given_options(args: argparse.Namespace) -> list[str]:
     return given + (["--focusing"] if args.focusing != "best" else [])
 
 
-def add_exposure(parser: argparse._ActionsContainer) -> None:
-    """Add --exposure."""
+def add_exposure(parser: argparse._ActionsContainer, default: float | None = 0.0, about: str = "0") -> None:
+    """Add --exposure; `about` describes the default."""
     parser.add_argument(
-        "--exposure", metavar="STOPS", type=between(-40, 40, "stops"), default=0.0,
-        help="stops by which the preview OUT.png is brighter; OUT.exr keeps the scene's light as it is (default: 0)",
+        "--exposure", metavar="STOPS", type=between(-40, 40, "stops"), default=default,
+        help=f"stops by which the preview OUT.png is brighter; OUT.exr keeps the light as it is (default: {about})",
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""`neurolens bench surrogates`: every method on the same rays of every lens, as records, tables and plots."""
+"""`neurolens bench`: every method on the same rays of every lens, as records, tables and plots."""
 
 from __future__ import annotations
 
@@ -10,7 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import NeurolensError, printable
-from neurolens.commands.arguments import QUIET_HELP, Parser, add_glass, add_lens, check_ids, check_run_folder, whole
+from neurolens.commands.arguments import (
+    QUIET_HELP,
+    add_glass,
+    add_lens,
+    add_option,
+    add_output,
+    check_ids,
+    check_run_folder,
+    whole,
+)
 from neurolens.commands.farm import Task, add_dask, files_of, spread
 
 if TYPE_CHECKING:
@@ -19,14 +28,14 @@ if TYPE_CHECKING:
 SURROGATES = """\
 Fit every method for every lens on the same rays, measure errors, size and time against the exact
 tracer, and write one JSON record per lens and method, one table and plot per lens, and a summary over
-the lenses with the median and the worst.
+the lenses with the median and the worst. Needs the extra "train" (torch).
 
 Existing records of the same settings and version are kept: an interrupted run resumes where it
 stopped. A method that fails on a lens is a row with the reason."""
 _EPILOG = """\
 examples:
-  neurolens bench surrogates my_lens.toml
-  neurolens bench surrogates laikin_double_gauss_50 my_lens.toml --methods ours schrade
+  neurolens bench my_lens.toml
+  neurolens bench laikin_double_gauss_50 my_lens.toml --methods ours schrade
 
 DIR holds summary.md, LENS.md and LENS.png, records/, models/ (ONNX) and config.json."""
 
@@ -34,14 +43,9 @@ DIR holds summary.md, LENS.md and LENS.png, records/, models/ (ONNX) and config.
 def add_parser(subparsers: Any) -> None:
     """Add the command to the command line."""
     parser = subparsers.add_parser(
-        "bench",
-        help="every kind of surrogate on a lens, against its exact trace",
-        description='Compare the methods on your lenses. Needs the extra "train" (torch).',
-    )
-    kinds = parser.add_subparsers(metavar="WHAT", required=True, parser_class=Parser)
-    parser = kinds.add_parser(
-        "surrogates", help="all methods on all axes of the trade", description=SURROGATES, epilog=_EPILOG
-    )
+        "bench", help="every kind of surrogate on a lens, against its exact trace", description=SURROGATES,
+        epilog=_EPILOG,
+    )  # fmt: skip
     add_surrogate_arguments(parser, "+")
     parser.set_defaults(run=run_surrogates, kept="finished records are kept; the same command resumes")
 
@@ -59,11 +63,9 @@ def add_surrogate_arguments(parser: argparse.ArgumentParser, lenses: str) -> Non
     parser.add_argument("--seed", metavar="N", type=whole(0), default=1, help="of the rays (default 1)")
     parser.add_argument("--rounds", metavar="N", type=whole(0), help="of the race, 0 for none (default 10)")
     parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=1, help="of the race (default 1)")
-    parser.add_argument("--again", action="store_true", help="recompute the chosen records")
+    add_option(parser, "--restart", old=("--again",), action="store_true", help="recompute the chosen records")
     add_dask(parser)
-    parser.add_argument(
-        "--out", metavar="DIR", type=Path, default=Path("runs/surrogates"), help="folder (default: runs/surrogates)"
-    )
+    add_output(parser, "DIR", "folder (default: runs/surrogates)", default=Path("runs/surrogates"))
     add_glass(parser)
     parser.add_argument("--quiet", action="store_true", help=QUIET_HELP)
 
@@ -79,8 +81,8 @@ def run_surrogates(args: argparse.Namespace) -> int:
 
     rows, settings, out = chosen_rows(args.methods), _settings(args), args.out
     files: list[Path] = args.lenses
-    check_ids(files, "neurolens bench surrogates", "LENS")
-    check_run_folder(out, "neurolens bench surrogates", "--out")
+    check_ids(files, "neurolens bench", "LENS")
+    check_run_folder(out, "neurolens bench", "--output")
     benches = [Bench(LensChoice(file), settings, out) for file in files]
     for bench in benches:
         bench.choice.read()  # a file that cannot be read ends the command, not each of its methods
@@ -97,7 +99,7 @@ def run_surrogates(args: argparse.Namespace) -> int:
     facts = f"{_conditions(args, settings)} {NOTES}"
     found: dict[str, Any] = {}
     progress = Progress(quiet=args.quiet)
-    again = args.again
+    again = args.restart
     if args.dask is not None:
         asked = [bench for bench in benches if again or lacks(bench, rows)]
         with progress.stage(f"{len(asked)} of {len(benches)} lenses") as report:

@@ -11,16 +11,26 @@ from typing import Any
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import check_writable
+from neurolens.base.files import library as shipped
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import Parser, add_json, add_lens, check_folder, check_suffix, whole
+from neurolens.commands.arguments import (
+    Parser,
+    add_json,
+    add_lens,
+    add_option,
+    add_output,
+    check_folder,
+    check_suffix,
+    whole,
+)
 from neurolens.commands.output import answer
 
 _DESCRIPTION = """\
 Real lenses as cameras of Blender's Cycles (4.5 and later): an extension with a panel at the
 camera's data, where a lens is put on with one click and taken off with one."""
 _BUILD = """\
-Pack the extension with a folder of models: of each lens the best polynomial, the best network and,
-where its lens file is beside the models' folder in lenses/, the exact lens, every surface traced.
+Pack the extension with a folder of models and with the lens files of the folder lenses/ beside it: of each
+lens the best polynomial, the best network and the exact lens, every surface traced.
 What cannot be a shader is left out and said.
 
 Finished lenses are kept: a build that was stopped goes on where it was, and a second one is quick.
@@ -39,24 +49,27 @@ def add_parser(subparsers: Any) -> None:
     )
     actions = parser.add_subparsers(metavar="ACTION", required=True, parser_class=Parser)
     build = actions.add_parser("build", help="pack the extension as a zip", description=_BUILD)
+    add_output(build, "OUT.zip", "default: neurolens.zip", default=Path("neurolens.zip"))
     build.add_argument(
-        "-o", "--out", metavar="OUT.zip", type=Path, default=Path("neurolens.zip"), help="default: %(default)s"
+        "--models", metavar="DIR", type=Path, default=shipped() / "models", help="default: the models that ship"
     )
-    build.add_argument("--models", metavar="DIR", type=Path, default=Path("models"), help="default: %(default)s")
     build.add_argument(
-        "--lens", metavar="NAME", action="append", default=[],
-        help="only this lens, repeatable: NAME of NAME.ols-64.onnx (default: all)",
+        "--lens", metavar="LENS", action="append", default=[],
+        help="only this lens, repeatable: LENS of LENS.ols-64.onnx or of LENS.toml (default: all)",
     )  # fmt: skip
     build.add_argument("--no-exact", action="store_true", help="leave exact lenses out")
     build.add_argument(
         "--jobs", metavar="N", type=whole(1, 64), default=min(8, os.cpu_count() or 1),
-        help="processes that make shaders, each of a core and 0.5 GB (default here: %(default)s)",
+        help="processes that make shaders, each of a core and 0.5 GB (default: all cores, at most 8)",
     )  # fmt: skip
     add_json(build, quiet=True)
     build.set_defaults(run=run_build, kept="no zip was written; finished shaders are kept for the next run")
     add = actions.add_parser("add", help="put a lens into the extension", description=_ADD)
     add_lens(add, "file", models=True)
-    add.add_argument("--to", metavar="ZIP|DIR", type=Path, help="a packed extension, or a user folder of one")
+    add_option(
+        add, "--extension", old=("--to",), metavar="ZIP|DIR", type=Path,
+        help="a packed extension, or a user folder of one",
+    )  # fmt: skip
     add.add_argument("--zoom", metavar="STATE", help="state of a zoom, by name or focal length in mm; range: a setting")
     add_json(add, quiet=True)
     add.set_defaults(run=run_add, kept="nothing was added")
@@ -64,8 +77,8 @@ def add_parser(subparsers: Any) -> None:
 
 def run_build(args: argparse.Namespace) -> int:
     """Pack the extension."""
-    check_suffix(args.out, "--out", (".zip",))
-    check_folder(args.out, "--out")
+    check_suffix(args.out, "--output", (".zip",))
+    check_folder(args.out, "--output")
     check_writable(args.out)
     if not args.models.is_dir():
         raise InputError("neurolens blender build", "--models", str(args.models), "a folder of models that exists")
@@ -110,12 +123,12 @@ def run_add(args: argparse.Namespace) -> int:
     from neurolens.blender.pack import add_to_folder, add_to_zip, check_takes, user_folders
     from neurolens.commands.blender_lenses import form_of, packed_of
 
-    to = args.to
+    to = args.extension
     if to is None:
         to = next(iter(user_folders()), None)
     if to is None:
-        expected = "--to, a zip or a folder: no Blender of this machine has the extension installed"
-        raise InputError("neurolens blender add", "--to", "(missing)", expected)
+        expected = "a zip or a folder: no Blender of this machine has the extension installed"
+        raise InputError("neurolens blender add", "--extension", "(missing)", expected)
     check_takes(to)
     form = form_of(args.file, zoom=args.zoom, quiet=args.quiet)
     lens = packed_of([args.file], [form], zoom=args.zoom)

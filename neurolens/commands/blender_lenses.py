@@ -223,22 +223,28 @@ def key_of(file: Path) -> str:
 
 
 def library(folder: Path, lenses: Path, chosen: Sequence[str]) -> Iterator[tuple[list[Path], Path | None]]:
-    """Of every lens of a folder of models, the best polynomial, the best network, and its lens file, if it has one.
+    """Of every lens, the best polynomial and the best network among its models, and its lens file, if it has one.
+
+    A lens file of which there is no model is a lens as well.
 
     Args:
         folder: of models. lenses: of lens files. chosen: names of lenses, all where empty.
 
     Raises:
-        InputError: a name that no model has.
+        InputError: a name that no model and no lens file has.
     """
     known: dict[str, dict[str, tuple[float, Path]]] = {}
+    modelled = set()
     for file in sorted(folder.glob("*.onnx")):
         card = _card(file)
+        modelled.add(card["lens"]["id"])
         kind = "network" if _family(card).startswith(_NETWORK) else "polynomial"
         mine = known.setdefault(key_of(file), {})
         error = float(card["errors"]["rms_um"])
         if kind not in mine or error < mine[kind][0]:
             mine[kind] = error, file
+    if known:  # a folder without a model is not the folder that was meant
+        known |= {file.stem: {} for file in sorted(lenses.glob("*.toml")) if file.stem not in {*known, *modelled}}
     for name in chosen:
         if name not in known:
             raise InputError("neurolens blender build", "--lens", name, f"one of: {', '.join(known)}")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import atomic_path
-from neurolens.commands.arguments import add_glass, add_json, between, check_folder, check_suffix, positive
+from neurolens.commands.arguments import add_glass, add_json, add_output, between, check_folder, check_suffix, positive
 from neurolens.commands.output import answer, number
 
 if TYPE_CHECKING:
@@ -41,10 +41,12 @@ def add_parser(subparsers: Any) -> None:
         "convert", help="read a lens file of another program", description=_DESCRIPTION, epilog=_EPILOG
     )
     parser.add_argument("file", metavar="FILE", type=Path, help="lens file of another program")
-    parser.add_argument("-o", "--output", metavar="OUT.toml", type=Path, required=True, help="lens file to write")
+    add_output(parser, "OUT.toml", "lens file to write", required=True)
     parser.add_argument("--force", action="store_true", help="replace an existing file")
     group = parser.add_argument_group("what the file does not say")
-    group.add_argument("--name", help="name of the lens (default: the title in the file, else its file name)")
+    group.add_argument(
+        "--name", metavar="NAME", help="name of the lens (default: the title in the file, else its file name)"
+    )
     group.add_argument("--source", help="where the figures come from (default: the file's name)")
     group.add_argument(
         "--f-number", metavar="N", type=positive("an f-number"),
@@ -70,10 +72,10 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Convert one file and print what was read."""
-    check_suffix(args.output, "--output", (".toml",))
-    check_folder(args.output, "--output")
-    if args.output.exists() and not args.force:
-        raise InputError(args.output, "--output", "(an existing file)", "a new file, or --force to replace it")
+    check_suffix(args.out, "--output", (".toml",))
+    check_folder(args.out, "--output")
+    if args.out.exists() and not args.force:
+        raise InputError(args.out, "--output", "(an existing file)", "a new file, or --force to replace it")
     from neurolens.readers.any_format import read_any
     from neurolens.readers.draft import Given
 
@@ -88,9 +90,9 @@ def run(args: argparse.Namespace) -> int:
     read = list(dict.fromkeys(told))
     if read:  # the file keeps what its source had besides, and what was assumed
         lens = replace(lens, notes="\n".join(filter(None, (lens.notes, "As converted by neurolens:", *read))))
-    write_checked(lens, args.output)
+    write_checked(lens, args.out)
     notes = [*read, *_doubts(lens)]
-    data = {"file": str(args.file), "output": str(args.output), **_summary(lens, notes)}
+    data = {"file": str(args.file), "output": str(args.out), **_summary(lens, notes)}
     return answer(args, data, lambda: _text(data))
 
 

@@ -11,7 +11,8 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text, library
 from neurolens.commands import render
-from neurolens.commands.arguments import Parser, whole
+from neurolens.commands.arguments import Parser, add_output, whole
+from neurolens.evaluate.records import program
 
 _DESCRIPTION = """\
 Render lights at many depths through a model of a 50 mm f/1.8 double Gauss, the lens itself (where the extra
@@ -33,7 +34,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "demo", help="one scene through a lens, its model, a thin lens and a pinhole", description=_DESCRIPTION
     )
-    parser.add_argument("-o", "--output", metavar="FOLDER", type=Path, default=Path("neurolens-demo"))
+    add_output(parser, "FOLDER", "default: neurolens-demo", default=Path("neurolens-demo"))
     parser.add_argument("--width", metavar="PIXELS", type=whole(1, 4096), default=480, help="(default: 480)")
     parser.add_argument("--samples", metavar="N", type=whole(1, 2**16), default=32, help="a pixel (default: 32)")
     parser.set_defaults(run=run, kept="pictures so far are kept; the same command goes on")
@@ -43,9 +44,9 @@ def run(args: argparse.Namespace) -> int:
     """Render and write the page."""
     from neurolens.evaluate import pages
 
-    folder = args.output
+    folder = args.out
     if folder.exists() and not folder.is_dir():
-        raise InputError("neurolens demo", "-o", str(folder), "a folder")
+        raise InputError("neurolens demo", "--output", str(folder), "a folder")
     folder.mkdir(parents=True, exist_ok=True)
     parser = Parser()
     render.add_parser(parser.add_subparsers())
@@ -57,13 +58,15 @@ def run(args: argparse.Namespace) -> int:
         size = ["--width", str(args.width), "--samples", str(args.samples)]
         words = ["render", scene, "--camera", camera, *_MORE.get(name, "").split(), *size]
         words += ["-o", str(folder / f"{name}.exr")]
-        print(f"neurolens {shlex.join(words)}", flush=True)
+        command = f"{program()} {shlex.join(words)}"
+        print(command, flush=True)
         given = parser.parse_args(words)
         given.run(given)
-        figures.append({"file": f"{name}.png", "title": caption, "caption": f"neurolens {shlex.join(words)}"})
+        figures.append({"file": f"{name}.png", "title": caption, "caption": command})
     body = pages.figure_grid(folder, figures)
     body = pages.html("<h1>One scene, five cameras</h1>{}", body)
     atomic_write_text(folder / "index.html", pages.page("One scene, five cameras", body))
-    more = "neurolens lens list" if traced else "with the extra 'train', which traces lenses: neurolens lens list, view"
-    print(f"\nLook at {folder}/index.html\nThen: neurolens --help, neurolens models, {more}")
+    more = [f"  {program()} {words}" for words in ("--help", "models", "lens list")]
+    more[2] += "" if traced else "   # with the extra 'train', which traces lenses"
+    print("\n".join([f"\nLook at {folder}/index.html\nThen", *more]))
     return 0

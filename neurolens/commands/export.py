@@ -13,7 +13,7 @@ from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text, check_writable
 from neurolens.base.lensname import FUSED, is_model
-from neurolens.commands.arguments import add_json, add_lens, positive
+from neurolens.commands.arguments import add_json, add_lens, add_option, add_output, positive
 from neurolens.commands.output import answer
 from neurolens.commands.render import film_size
 
@@ -31,7 +31,7 @@ transmittance and status codes are those of the model; the card is a comment at 
 (or of internal focus) the state is an argument. A lens file gives the exact lens.
 OSL is a camera of Blender's Cycles (4.5 and later): stop, focus, blades and more are its inputs, and the
 zoom of a model of its range, or of a lens file with --zoom range. Lens files focus as they say groups move.
-With --camera, the whole camera for one focus and stop: film point and two random numbers in, weighted
+With --whole-camera, the whole camera for one focus and stop: film point and two random numbers in, weighted
 ray out, its pupil's outline as a table in the file (of GLSL, the data of a texture beside it).
 Needs the extra "train" (torch); without it C and GLSL are written from the graph in the file,
 whole and with nothing fixed."""
@@ -49,7 +49,7 @@ examples:
   neurolens export lenses/ZOOM.toml --to c -o zoom.h --zoom range         # gaps as the focal length asks
   neurolens export models/ZOOM-range.states-64.onnx --to c -o zoom.h      # any focal length: NAME_at(zoom_mm)
   neurolens export lenses/NAME.toml --to c -o exact.h                     # every surface
-  neurolens export models/NAME.onnx --to c -o cam.h --camera --focus 2 --f-number 2.8 --derivatives
+  neurolens export models/NAME.onnx --to c -o cam.h --whole-camera --focus 2 --f-number 2.8 --derivatives
   neurolens export models/NAME.onnx --to osl -o lens.osl                  # for Blender; lenses/NAME.toml: exact
   neurolens export models/NAME.onnx --to onnx -o laser.onnx --fix wavelengths=633
   neurolens export models/NAME.onnx --to onnx -o lens.onnx --derivatives  # for ray differentials
@@ -71,7 +71,7 @@ def add_parser(subparsers: Any) -> None:
         models=True, cameras=True, metavar="MODEL",
     )  # fmt: skip
     parser.add_argument("--to", choices=("c", "glsl", "osl", "onnx"), required=True, help="form to write")
-    parser.add_argument("-o", "--out", metavar="FILE", type=Path, required=True, help="file to write")
+    add_output(parser, "FILE", "file to write", required=True)
     parser.add_argument(
         "--fix", metavar="KEY=VALUE", action="append", default=[], help="a value fixed by the scene (see below)"
     )
@@ -79,17 +79,18 @@ def add_parser(subparsers: Any) -> None:
         "--only", metavar="PARTS", default=",".join(_PARTS),
         help=f"comma-separated: {', '.join(_PARTS)} (default: all; the domain guard is always there)",
     )  # fmt: skip
-    parser.add_argument("--name", metavar="WORD", help="of the function (default: the lens's id)")
+    parser.add_argument("--name", metavar="NAME", help="of the function (default: the lens's id)")
     parser.add_argument(
         "--derivatives", action="store_true",
-        help="of ONNX and with --camera: additional outputs for ray differentials",
+        help="of ONNX and with --whole-camera: additional outputs for ray differentials",
     )  # fmt: skip
     parser.add_argument(
         "--inverse", action="store_true",
         help="of ONNX: the inverse maps too (film and stop point to ray; scene ray to film), fitted and checked",
     )  # fmt: skip
     group = parser.add_argument_group("camera", "what a whole camera is set to")
-    group.add_argument("--camera", action="store_true", help="the whole camera, of C and GLSL")
+    about = "the whole camera, of C and GLSL"
+    add_option(group, "--whole-camera", old=("--camera",), action="store_true", help=about)
     group.add_argument(
         "--film", metavar="WxH", type=film_size, default=(36.0, 24.0), help="film in mm (default: 36x24)"
     )
@@ -117,19 +118,19 @@ def run(args: argparse.Namespace) -> int:
     given = _given(args.fix)
     if args.to == "onnx" and (args.name is not None or set(parts) != set(_PARTS)):
         raise InputError("neurolens export", "--only, --name", "(with --to onnx)", "neither: an ONNX file is whole")
-    if args.to != "onnx" and ((args.derivatives and not args.camera) or args.inverse):
+    if args.to != "onnx" and ((args.derivatives and not args.whole_camera) or args.inverse):
         raise InputError("neurolens export", "--derivatives, --inverse", f"(with --to {args.to})", "--to onnx")
     if args.name is not None:
         checked_name(args.to, "", args.name)
     if args.to == "osl":
         return _write_osl(file, args, bool(given) or set(parts) != set(_PARTS))
     exact = not is_model(file)
-    if args.camera or exact:
+    if args.whole_camera or exact:
         if args.to == "onnx" or given or set(parts) != set(_PARTS):
-            what = "a camera" if args.camera else "a lens file"
+            what = "a camera" if args.whole_camera else "a lens file"
             raise InputError("neurolens export", str(file), f"({what})", "--to c or glsl, without --fix and --only")
         check_writable(args.out)
-        if args.camera:
+        if args.whole_camera:
             return _answer(args, _about(_write_camera(file, args)))
         from neurolens.commands.export_lens import write_lens
 
@@ -174,10 +175,10 @@ def _write_osl(file: Path, args: argparse.Namespace, partly: bool) -> int:
     """A camera for Cycles."""
     from neurolens.evaluate.shaders import shader_of
 
-    if partly or args.camera or args.f_number is not None or args.focus != math.inf:
+    if partly or args.whole_camera or args.f_number is not None or args.focus != math.inf:
         expected = "none of them: stop and focus are inputs of the shader, which is a whole camera"
         raise InputError(
-            "neurolens export", "--fix, --only, --camera, --focus, --f-number", "(with --to osl)", expected
+            "neurolens export", "--fix, --only, --whole-camera, --focus, --f-number", "(with --to osl)", expected
         )
     check_writable(args.out)
     shader = shader_of(file, zoom=args.zoom, name=args.name, quiet=args.json)

@@ -17,7 +17,7 @@ from neurolens.commands.arguments import (
     add_json,
     add_lens,
     add_lens_state,
-    check_folder,
+    add_output,
     check_suffix,
     state_of,
 )
@@ -25,15 +25,17 @@ from neurolens.commands.flare_fit import add_fit, check_fit, fitted, run_fit, st
 from neurolens.commands.flare_lights import add_lights
 from neurolens.commands.flare_options import add_made, complete, settings_of
 from neurolens.commands.output import answer, number, table
+from neurolens.commands.render_files import Files, flare_channels, warn
 from neurolens.commands.render_frames import add_frames, frames_of
 from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
+    from neurolens.cameras.contract import FloatArray
     from neurolens.commands.flare_lights import Sources
     from neurolens.flare.ghostmodel import GhostModel
     from neurolens.flare.ghosts import GhostTracer
     from neurolens.flare.lights import Light
-    from neurolens.flare.picture import Ghost, Ways
+    from neurolens.flare.picture import Ghost, Raster, Ways
     from neurolens.optics.prescription import Lens
 
 _DESCRIPTION = """\
@@ -42,9 +44,10 @@ film, with Fresnel's or the coatings' reflectance, all rims and the stop's shape
 Prints the brightest by energy, place and size (x, y on the film itself, which pictures show turned
 by 180 degrees: a light to the right is imaged at x < 0); with -o writes their picture as OpenEXR, to be
 added to a render of the same lens, film and focus: R, G and B are the sum of the layers
-ghosts.R, .G, .B, and so on. Of the ghosts each of the brightest --layers is one more layer
-(g07-03: reflected at surface 7, then at 3, counted from 0 at the front), the others are
-"rest". Values are those of `neurolens render`: a white card of radiance 1 is 1 on the axis.
+ghosts.R, .G, .B, and so on. The --layers ghosts with the greatest values on the film are layers
+of their own (g07-03: reflected at surface 7, then at 3, counted from 0 at the front), the others
+are "rest". A PNG preview beside the EXR shows the flare, brighter by --exposure. Values are those
+of `neurolens render`: a white card of radiance 1 is 1 on the axis.
 With --reflections 4, ghosts of four reflections are traced, too: the strongest, until 0.1% of
 all ghosts' light is left. Each surface shares light out by the mean of both polarisations; with
 --polarised light keeps the one that surfaces before gave it: all ghosts' light changes by -2 to
@@ -59,8 +62,8 @@ light itself, which a render has. Needs the extra "train" (torch) and a C compil
 _EPILOG = """\
 examples:
   neurolens flare laikin_double_gauss_50 --light 15,8 --path g08-06 path.png
-  neurolens flare laikin_double_gauss_50 --light 15,8,0.01 --coating quarter-wave --blades 6 --f-number 8 -o flare.exr
-  neurolens flare lenses/ogawa_zoom_70_200.toml --zoom 100 --light -12,3,1/0.8/0.5 --layers 8 -o flare.exr
+  neurolens flare laikin_double_gauss_50 --light 15,8 --coating quarter-wave --blades 6 --f-number 8 -o flare.exr
+  neurolens flare lenses/ogawa_zoom_70_200.toml --zoom 100 --light -12,3,3/2.5/1.5 --layers 8 -o flare.exr
   neurolens flare laikin_double_gauss_50 --light 15,8 --coating multi-layer --barrel 0.05 --dust 0.01 -o flare.exr
   neurolens flare laikin_double_gauss_50 --light 15,8 --blades 7 --f-number 11 --starburst -o flare.exr
   neurolens flare laikin_double_gauss_50 --lights sun.csv --frames 1:48 --key camera.csv -o flare.exr
@@ -69,6 +72,7 @@ _COMMAND = "neurolens flare"
 _SHOWN, _SHOWN_LIGHTS, _KEPT = 12, 4, 64  # ghosts of a table and tables; ghosts of a light that files tell
 _FEWEST = 256  # rays of a table
 _RANKED_FRAMES = 16  # that tell which ghosts are brightest
+_QUANTILE, _SHOWN_AT = 0.99, 0.8  # the preview's exposure takes this quantile of the lit pixels to this value
 _FRAMES = (
     "flare of these frames to OUT.0001.exr and so on, of lights by their keys in lists, the lens, and the camera of a "
     "scene of --lights by --key; a frame that exists is kept. Fitted ghosts keep their focus and zoom"
@@ -87,7 +91,7 @@ def add_parser(subparsers: Any) -> None:
         help="of every surface between glass and air that the lens file leaves bare: single-layer (1940s to 60s), "
         "three-layer (1970 on), multi-layer (today), quarter-wave, v-coat, broadband; of one: three-layer,s07=bare",
     )  # fmt: skip
-    parser.add_argument("-o", "--out", metavar="OUT.exr", type=Path, help="picture (default: only the table)")
+    add_output(parser, "OUT.exr", "picture to write; the preview is OUT.png (default: only the table)")
     parser.add_argument(
         "--path",
         metavar=("GHOST", "OUT"),
@@ -114,7 +118,7 @@ def run(args: argparse.Namespace) -> int:
     _check(args)
     progress, began = Progress(quiet=args.quiet or args.json), time.perf_counter()
     if args.preview:
-        progress.note(f"preview: {args.width} pixels wide, {args.wavelengths} wavelengths, cells of {args.cell_px:g}")
+        progress.note(f"preview: {args.width} pixels wide, {args.bins} wavelengths, cells of {args.cell_px:g}")
     states = list(_states(args))
     model = fitted(args, states)
     tabled = read_any(args.file) if model is None else model.lens
@@ -129,8 +133,9 @@ def run(args: argparse.Namespace) -> int:
         found["path"] = args.path[1]
     if args.out is not None:
         found["out"] = [str(state.out) for state in states]
+        found["preview"] = [str(state.out.with_suffix(".png")) for state in states]
         try:
-            _write_all(states, shots, progress)
+            found |= _write_all(states, shots, progress)
         except KeyboardInterrupt:
             if args.frames is None and (kept := [str(path) for path in kept_beside(args.out)]):
                 args.kept = f"the same command goes on from {' and '.join(kept)}"
@@ -153,10 +158,11 @@ def _check(args: argparse.Namespace) -> None:
         raise InputError(_COMMAND, "--reflections", args.most_reflections, "2 or 4, or --photons or --glare beside it")
     if args.polarised and (args.photons or args.fit):
         raise InputError(_COMMAND, "--polarised", "(given)", "neither --photons nor --fit beside it: they average")
+    if args.photons and args.layers:
+        raise InputError(_COMMAND, "--layers", args.layers, "no --photons beside it: they tell no single ghosts apart")
     args.most_reflections = args.most_reflections or 10
     if args.out is not None:
-        check_suffix(args.out, "--out", (".exr",))
-        check_folder(args.out, "--out")
+        Files.of(args.out)
     if args.path is not None:
         check_suffix(Path(args.path[1]), "--path", (".png", ".pdf", ".svg"))
 
@@ -186,7 +192,7 @@ class _Shots:
     """What frames show; what they share is made once."""
 
     def __init__(self, tabled: Lens, sources: Sources, progress: Progress, model: GhostModel | None) -> None:
-        self._tabled, self._sources, self._progress, self._model = tabled, sources, progress, model
+        self._tabled, self.sources, self._progress, self._model = tabled, sources, progress, model
         self._lenses: dict[tuple[Any, ...], tuple[Lens, GhostModel | None]] = {}
         self._last: tuple[argparse.Namespace, _Shot] | None = None
 
@@ -206,7 +212,7 @@ class _Shots:
             model = None if self._model is None else stopped(args, self._model)
             self._lenses[state] = _lens(args, self._tabled) if model is None else model.lens, model
         lens, model = self._lenses[state]
-        lights = self._sources.at(args, lens, self._progress)
+        lights = self.sources.at(args, lens, self._progress)
         found = with_four(lens, lights) if args.fours else Ways(ghost_pairs(lens), 0, 0.0)
         tracer = model or (PolarisedTracer if args.polarised else GhostTracer)(lens, found.ways)
         rays = max(_FEWEST, RANKED // max(len(lights), 1))
@@ -221,45 +227,75 @@ def _lens(args: argparse.Namespace, tabled: Lens) -> Lens:
     return lens if args.coating is None else coated(lens, args.coating)
 
 
-def _write_all(states: list[argparse.Namespace], shots: _Shots, progress: Progress) -> None:
-    """The picture, or those of the frames that are missing."""
+def _write_all(states: list[argparse.Namespace], shots: _Shots, progress: Progress) -> dict[str, Any]:
+    """Write the picture, or those of the frames that are missing; which ghosts are layers, and the previews' stops."""
     from neurolens.flare.layers import brightest
+    from neurolens.render.pictures import read_metadata
 
-    args = states[0]
-    single: tuple[str, ...] = ()
+    args, single, exposure = states[0], tuple[str, ...](), states[0].exposure
     if args.layers:  # the same in all frames
         some = [shots.at(state) for state in states[:: -(-len(states) // _RANKED_FRAMES)]]
-        single = brightest(
-            [light for s in some for light in s.lights], [g for s in some for g in s.ghosts], args.layers
-        )
+        with progress.stage("brightest ghosts") as report:
+            ghosts = [(shot.tracer, shot.lights) for shot in some]
+            single = brightest(ghosts, _raster(args), settings_of(args), args.layers, report)
+        if len(single) < args.layers:
+            warn(f"layers of {len(single)} single ghosts, not {args.layers}: no other leaves light on the film")
     if args.frames is None:
-        _write(args, shots.at(args), single, progress)
-        return
+        exposure = _write(args, shots, single, exposure, progress)
+        return {"layers": single, "exposure": exposure or 0.0}
     with progress.stage(f"{len(states)} frames") as report:
         for number, state in enumerate(states):
             if args.restart or not state.out.is_file():
-                _write(state, shots.at(state), single, Progress(quiet=True))
+                exposure = _write(state, shots, single, exposure, Progress(quiet=True))
+            elif exposure is None:  # the frames of all runs share it
+                exposure = read_metadata(state.out).get("flare", {}).get("exposure")
             report((number + 1) / len(states))
+    return {"layers": single, "exposure": exposure or 0.0}
 
 
-def _write(args: argparse.Namespace, shot: _Shot, single: tuple[str, ...], progress: Progress) -> None:
+def _raster(args: argparse.Namespace) -> Raster:
+    from neurolens.flare.picture import Raster
+
+    return Raster(args.film, args.width, max(1, round(args.width * args.film[1] / args.film[0])))
+
+
+def _write(
+    args: argparse.Namespace, shots: _Shots, single: tuple[str, ...], exposure: float | None, progress: Progress
+) -> float | None:
+    """Write a picture and its preview; the preview's exposure in stops, None where that is free and nothing is lit."""
     from neurolens.cameras.exact import placed_settings
     from neurolens.flare.layers import flare_layers, kept_beside, sum_of
-    from neurolens.flare.picture import Raster
     from neurolens.render.exr_attributes import standard_attributes
-    from neurolens.render.pictures import write_exr
+    from neurolens.render.pictures import write_exr, write_png
 
-    raster = Raster(args.film, args.width, max(1, round(args.width * args.film[1] / args.film[0])))
+    files, shot, raster, space = Files.of(args.out), shots.at(args), _raster(args), shots.sources.colour_space(args)
+    files.spare(shots.sources.reads(args))
     settings = replace(settings_of(args), single=single, ghosts=shot.tracer, keep=args.out)
     found = flare_layers(shot.lens, shot.lights, raster, settings, progress)
-    layers = {f"{name}.{c}": picture[..., k] for name, picture in found.items() for k, c in enumerate("RGB")}
+    total = sum_of(found, raster)
+    if args.frames is None:  # frames have the same layers, dark ones too
+        found = {name: picture for name, picture in found.items() if picture.any()}
+    exposure = _exposure(total) if exposure is None else exposure
     told = {k: v for k, v in vars(args).items() if isinstance(v, str | int | float | list | tuple | None)}
-    metadata = plain({"neurolens": __version__, "flare": {**_told(shot), "settings": told}})
+    about = {**_told(shot), "exposure": exposure, "settings": told}
+    metadata = plain({"neurolens": __version__, "colour": space.stated, "flare": about})
     camera = placed_settings(shot.lens, args.film, args.focus)
     header = standard_attributes(camera, raster.width, raster.height, args.frame)
-    write_exr(args.out, sum_of(found, raster), metadata=metadata, layers=layers, attributes=header)
+    layers = flare_channels(found, space)
+    write_png(files.preview, total, exposure or 0.0)  # first: a frame whose EXR exists is kept
+    write_exr(args.out, total, metadata=metadata, space=space, layers=layers, attributes=header)
     for path in kept_beside(args.out):
         path.unlink()
+    return exposure
+
+
+def _exposure(picture: FloatArray) -> float | None:
+    """Stops that take the 99% quantile of the lit pixels of a picture [H, W, 3] to 0.8; None where none is lit."""
+    import numpy as np
+
+    bright = picture.max(-1)
+    lit = bright[bright > 0]
+    return round(math.log2(_SHOWN_AT / float(np.quantile(lit, _QUANTILE))), 2) if len(lit) else None
 
 
 def _draw(shot: _Shot, name: str, out: Path) -> None:
@@ -317,6 +353,9 @@ def _text(shot: _Shot, about: dict[str, Any]) -> str:
         parts.append(table(head, cells))
     if more := len(shot.lights[_SHOWN_LIGHTS:]):
         parts.append(f"and {more} more lights")
-    files = about.get("out", ["done"])
-    parts.append(f"{files[0]}{f' to {files[-1]}' if len(files) > 1 else ''}: {about['seconds']:.1f} s")
+    if about.get("layers"):
+        parts.append(f"layers of the ghosts with the greatest values on the film: {', '.join(about['layers'])}")
+    made = [f"{of[0]} to {of[-1]}" if len(of) > 1 else of[0] for of in (about.get(k) for k in ("out", "preview")) if of]
+    shown = f"{made[0]}, and the preview {made[1]} at {about['exposure']:+g} stops" if made else "done"
+    parts.append(f"{shown}: {about['seconds']:.1f} s")
     return "\n\n".join(parts)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from neurolens.flare.lights import Light
     from neurolens.flare.sources import Kept, Name, SceneLights
     from neurolens.optics.prescription import Lens
+    from neurolens.render.colour import ColourSpace
     from neurolens.render.scene import Scene
 
 _COMMAND = "neurolens flare"
@@ -31,8 +32,9 @@ def add_lights(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("lights, at least one; all of them together")
     group.add_argument(
         "--light", metavar="AZ,EL[,E[,M]]", action="append", default=[], dest="light",
-        help="degrees to the right of and above the axis, as the camera sees it, irradiance at the lens (radiance "
-        "times solid angle in sr; a number or R/G/B; default 1), and distance in metres (default inf); repeatable",
+        help="degrees to the right of and above the axis, as the camera sees it; irradiance at the lens, radiance "
+        "times solid angle in sr, as a number or R/G/B (default: pi, a sun that lights a white card to radiance 1); "
+        "and distance in metres (default: inf); repeatable",
     )  # fmt: skip
     group.add_argument(
         "--lights", metavar="FILE", type=Path, action="append", default=[],
@@ -96,12 +98,36 @@ class Sources:
             warn(f"no light: the flare is black{_at(args)}")
         return found
 
+    def reads(self, args: argparse.Namespace) -> Iterator[Path]:
+        """The files that tell a frame's lights and the shape of the stop, which no picture may replace."""
+        from neurolens.render.scene import files_named
+
+        yield from args.lights
+        yield from (path.parent / name for path, scene, _ in self._scenes for name in files_named(scene.settings))
+        yield from () if args.aperture_mask is None else (args.aperture_mask,)
+        yield from () if args.image is None else (picture_path(args),)
+
+    def colour_space(self, args: argparse.Namespace) -> ColourSpace:
+        """The colour space of a frame's picture: that of --colour-space, of --image or of a scene, or else sRGB."""
+        from neurolens.render.colour import COLOUR_SPACES, SRGB
+        from neurolens.render.pictures import read_colour_space
+
+        if args.colour_space is not None:
+            return COLOUR_SPACES[args.colour_space]
+        if args.image is not None:
+            return read_colour_space(picture_path(args)) or SRGB
+        return COLOUR_SPACES[self._scenes[0][1].settings.film.colour_space] if self._scenes else SRGB
+
     def _of_picture(self, args: argparse.Namespace, lens: Lens, progress: Progress) -> list[Light]:
         from neurolens.flare.sources import highlights
-        from neurolens.render.pictures import read_exr
+        from neurolens.render.colour import SRGB, conversion, converted
+        from neurolens.render.pictures import read_colour_space, read_exr
 
         path = picture_path(args)
         picture, _ = read_exr(path)
+        space = read_colour_space(path) or self.colour_space(args)
+        if space is not SRGB:
+            picture = converted(picture, conversion(space, SRGB)).astype(picture.dtype)
         shape = args.film[0] / args.film[1]
         if abs(picture.shape[1] / picture.shape[0] / shape - 1) > 1.01 / min(picture.shape[:2]):
             size = f"{picture.shape[1]} x {picture.shape[0]} pixels"
@@ -159,12 +185,12 @@ def _at(args: argparse.Namespace) -> str:
 
 
 def _light(text: str) -> Light:
-    from neurolens.flare.lights import Light
+    from neurolens.flare.lights import SUN, Light
 
     words = text.split(",")
     try:
         angles = [float(word) for word in words[:2]]
-        rgb = [float(word) for word in (words[2] if len(words) > 2 else "1").split("/")]
+        rgb = [float(word) for word in (words[2] if len(words) > 2 else str(SUN)).split("/")]
         distance = float(words[3]) if len(words) > 3 else math.inf
     except ValueError:
         angles, rgb, distance = [], [], math.inf

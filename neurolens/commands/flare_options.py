@@ -7,17 +7,17 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from neurolens.commands.arguments import between, whole
-from neurolens.commands.render import film_size
+from neurolens.commands.arguments import add_exposure, add_option, between, whole
+from neurolens.commands.render import add_colour_space, film_size
 
 if TYPE_CHECKING:
     from neurolens.flare.layers import FlareSettings
 
-_PREVIEW = {"width": 480, "wavelengths": 5, "photons": 1 << 16, "glare": 1 << 16}  # at most
+_PREVIEW = {"width": 480, "bins": 5, "photons": 1 << 16, "glare": 1 << 16}  # at most
 _PREVIEW_CELL = 24.0
 # Arguments that are numbers of `FlareSettings`, by its names.
 _NUMBERS = (
-    "wavelengths", "cell_px", "photons", "most_reflections", "kernel_px", "glare", "starburst", "seed", "threads"
+    "cell_px", "photons", "most_reflections", "kernel_px", "glare", "starburst", "seed", "threads"
 )  # fmt: skip
 _GLARE = 1 << 18  # photons where anything scatters
 # Of `Scatter`: option, attribute, highest value, unit, help.
@@ -41,14 +41,19 @@ def _add_picture(parser: argparse.ArgumentParser) -> None:
     """Add how large and how fine the picture is."""
     group = parser.add_argument_group("picture")
     group.add_argument("--film", metavar="WxH", type=film_size, default=(36.0, 24.0), help="in mm (default: 36x24)")
-    group.add_argument("--width", metavar="PX", type=whole(1, 16384), default=960, help="of the picture (default: 960)")
+    group.add_argument(
+        "--width", metavar="PIXELS", type=whole(1, 16384), default=960, help="of the picture (default: 960)"
+    )
     group.add_argument(
         "--cell", metavar="PX", type=between(1, 256, "pixels"), default=8.0, dest="cell_px",
         help="size on film of the cells that a ghost is drawn by (default: 8; a quick look: 48)",
     )  # fmt: skip
-    group.add_argument(
-        "--wavelengths", metavar="N", type=whole(1, 256), default=15, help="from 400 to 700 nm (default: 15)"
-    )
+    add_option(
+        group, "--bins", old=("--wavelengths",), metavar="N", type=whole(1, 256), default=15,
+        help="wavelengths, in equal steps from 400 to 700 nm (default: 15)",
+    )  # fmt: skip
+    add_exposure(group, None, "99% of the lit pixels become no brighter than 0.8; frames share one value")
+    add_colour_space(group, "; default: that of --image, else of a scene's [film] table, else sRGB")
     group.add_argument(
         "--preview", action="store_true",
         help="at most 480 pixels wide, 5 wavelengths and 65536 photons a light and wavelength, --cell at least 24",
@@ -59,8 +64,9 @@ def _add_layers(parser: argparse.ArgumentParser) -> None:
     """Add what layers there are, and how bright they are."""
     group = parser.add_argument_group("layers")
     group.add_argument(
-        "--layers", metavar="N", type=whole(0, 64), default=0, help="brightest ghosts as layers (default: 0)"
-    )
+        "--layers", metavar="N", type=whole(0, 64), default=0,
+        help="ghosts with a layer of their own, those with the greatest values on the film (default: 0)",
+    )  # fmt: skip
     group.add_argument(
         "--without",
         metavar="LAYER",
@@ -147,4 +153,6 @@ def settings_of(args: argparse.Namespace) -> FlareSettings:
 
     numbers = {name: getattr(args, name) for name in _NUMBERS}
     scatter = Scatter(**{name: getattr(args, name) for _, name, *_ in _SCATTER})
-    return FlareSettings(**numbers, scatter=scatter, without=tuple(args.without), gains=(*args.gain, *args.tint))
+    return FlareSettings(
+        wavelengths=args.bins, **numbers, scatter=scatter, without=tuple(args.without), gains=(*args.gain, *args.tint)
+    )

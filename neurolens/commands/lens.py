@@ -16,6 +16,8 @@ from neurolens.base.lensname import resolve
 from neurolens.commands.arguments import (
     add_json,
     add_lens_state,
+    add_option,
+    add_output,
     between,
     check_folder,
     check_suffix,
@@ -65,7 +67,7 @@ def add_parser(subparsers: Any) -> None:
     add_lens_state(parser, efl="as tabled", f_number="the tabled stop")
     parser.add_argument(
         "--layout", metavar="OUT.png", type=Path,
-        help="draw the lens with rays from three field points: axis, 70%% and edge of the film (.png, .pdf, .svg)",
+        help="draw the lens with rays from three field points: axis, 70% and edge of the film (.png, .pdf, .svg)",
     )  # fmt: skip
     parser.add_argument(
         "--layouts", metavar="OUT.png", type=Path, help="of several files: draw all lenses in section on one sheet"
@@ -83,9 +85,9 @@ def _check_mode(args: argparse.Namespace, several: bool) -> None:
     alone = not several and not args.derive_rims
     kinds = {
         "--layouts": (args.layouts is not None, several, 'with "list", a folder or several files'),
-        "--vignetting": (args.vignetting is not None, args.derive_rims, "with --derive-rims"),
+        "--edge-pupil": (args.edge_pupil is not None, args.derive_rims, "with --derive-rims"),
         "--breathing": (args.breathing is not None, alone, "with one lens file alone"),
-        "-o": (args.output is not None, args.derive_rims, "with --derive-rims"),
+        "--output": (args.out is not None, args.derive_rims, "with --derive-rims"),
         "--half-field": (args.half_field is not None, args.derive_rims, "with --derive-rims"),
         "--derive-rims": (args.derive_rims, not several, "with one lens file"),
         "--layout": (args.layout is not None, alone, "with one lens file alone"),
@@ -320,15 +322,15 @@ def _add_rims(parser: argparse.ArgumentParser) -> None:
         "--derive-rims", action="store_true",
         help="compute the diameters from the f-number and the field, and print them beside those of the file",
     )  # fmt: skip
-    rims.add_argument(
-        "--vignetting", metavar="SHARE", type=between(0.01, 1, "a share"),
+    add_option(
+        rims, "--edge-pupil", old=("--vignetting",), metavar="SHARE", type=between(0.01, 1, "a share"),
         help="share of the pupil's height that is kept at the edge of the field (default: 0.5)",
     )  # fmt: skip
     rims.add_argument(
         "--half-field", metavar="DEG", type=between(0.01, 179, "an angle in degrees"),
         help="edge of the field, in degrees from the axis (default: as the file states)",
     )  # fmt: skip
-    rims.add_argument("-o", "--output", metavar="OUT.toml", type=Path, help="write the lens with its derived rims")
+    add_output(rims, "OUT.toml", "write the lens with its derived rims")
 
 
 def _run_rims(args: argparse.Namespace) -> int:
@@ -337,14 +339,14 @@ def _run_rims(args: argparse.Namespace) -> int:
     from neurolens.optics.lenswriter import write_lens
     from neurolens.optics.rims import RimRule, derive_rims, half_field_deg
 
-    if args.output is not None:
-        check_folder(args.output, "-o")
+    if args.out is not None:
+        check_folder(args.out, "--output")
     lens = read_quietly(args.file)
-    rule = RimRule(vignetting=0.5 if args.vignetting is None else args.vignetting, half_field_deg=args.half_field)
+    rule = RimRule(vignetting=0.5 if args.edge_pupil is None else args.edge_pupil, half_field_deg=args.half_field)
     derived, rims = derive_rims(lens, rule)
     field = args.half_field or half_field_deg(lens)
-    if args.output is not None:
-        write_lens(replace(derived, notes=_notes(derived, rule, field)), args.output)
+    if args.out is not None:
+        write_lens(replace(derived, notes=_notes(derived, rule, field)), args.out)
     data = {
         "file": str(args.file),
         "f_number": lens.f_number,
@@ -352,7 +354,7 @@ def _run_rims(args: argparse.Namespace) -> int:
         "clear_edge": rule.clear_edge,
         "half_field_deg": field,
         "rims": [vars(rim) for rim in rims],
-        "output": None if args.output is None else str(args.output),
+        "output": None if args.out is None else str(args.out),
     }
     return answer(args, data, lambda: _rims_text(lens, data, rims))
 

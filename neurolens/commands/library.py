@@ -15,7 +15,7 @@ from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import atomic_path, atomic_write_text, library, safe_name, write_json
 from neurolens.base.lensname import lens_id_of
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_json, add_lens, check_run_folder
+from neurolens.commands.arguments import add_json, add_lens, add_output, check_run_folder
 from neurolens.commands.output import answer
 
 if TYPE_CHECKING:
@@ -31,8 +31,9 @@ examples:
   neurolens library -o pages
   neurolens library -o pages laikin_double_gauss_50 my_lens.toml"""
 _SHOWN = {
-    "layout": "Section", "spots": "Spots through focus", "mtf": "Geometric MTF", "distortion": "Distortion",
-    "vignetting": "Vignetting", "colour": "Colour",
+    "layout": "Section", "spots": "Spots through focus", "mtf": "Geometric MTF",
+    "mtf-height": "MTF against image height", "distortion": "Distortion", "vignetting": "Vignetting",
+    "colour": "Colour",
 }  # fmt: skip
 _BOKEH_FOCUS, _BOKEH_FIELDS = 30, (0.0, 0.6, 0.95)  # focal lengths; shares of the field
 _COLOURS = 96  # of the palettes of the pictures
@@ -44,7 +45,7 @@ def add_parser(subparsers: Any) -> None:
         "library", help="pages of lenses: pictures, figures, models", description=_DESCRIPTION, epilog=_EPILOG
     )
     add_lens(parser, "lenses", " (default: all of lenses/)", nargs="*")
-    parser.add_argument("-o", "--output", metavar="FOLDER", type=Path, required=True, help="for the pages")
+    add_output(parser, "FOLDER", "for the pages", required=True)
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="finished pages are kept; the same command goes on")
 
@@ -53,8 +54,8 @@ def run(args: argparse.Namespace) -> int:
     """Write the pages; 1 where a lens could not be shown."""
     from neurolens.evaluate.describe import lens_files
 
-    folder = args.output
-    check_run_folder(folder, "neurolens library", "-o")
+    folder = args.out
+    check_run_folder(folder, "neurolens library", "--output")
     files = args.lenses or lens_files(library() / "lenses")
     names = _page_names(files)
     folder.mkdir(parents=True, exist_ok=True)
@@ -150,7 +151,7 @@ def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
     from neurolens.commands.analyse import analysis_of
     from neurolens.evaluate.figures import draw_breathing
 
-    scene = Scene(lens.at(focus_m=math.inf))
+    scene = Scene(lens.at(focus_m=math.inf, focus="best"))
 
     def drawn(what: str) -> Any:
         def draw(path: Path) -> None:
@@ -164,7 +165,7 @@ def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
         """Lights at infinity, the lens focused near; at three points of the field."""
         near = 1e-3 * _BOKEH_FOCUS * abs(scene.first_order.efl_mm)
         edge = max(scene.default_fields())
-        blurred = Scene(lens.at(focus_m=near))
+        blurred = Scene(lens.at(focus_m=near, focus="best"))
         found = spots(blurred, [share * edge for share in _BOKEH_FIELDS], rings=20, shift_mm=[0.0])
         analysis_of("spots").draw(replace(found, airy_um=math.nan), path, lens.name, f"focused at {near:.3g} m")
 

@@ -1,4 +1,4 @@
-"""`neurolens merge TILE... -o OUT.exr`: tiles of `neurolens render --tile` put together."""
+"""`neurolens render --merge TILE... -o OUT.exr`: tiles of `neurolens render --tile` put together."""
 
 from __future__ import annotations
 
@@ -9,47 +9,22 @@ from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import check_writable
-from neurolens.commands.arguments import add_exposure, add_json, check_folder, check_suffix
+from neurolens.commands.arguments import Parser, check_folder, check_suffix
 from neurolens.commands.output import answer
 
 if TYPE_CHECKING:
     from neurolens.render.tiles import Tile
 
-_DESCRIPTION = """\
-Put the tiles of "neurolens render --tile" together: the picture that one run gives, bit for bit, with its
-metadata (times are summed), and its preview. Tiles of frames become a picture a frame, OUT.0001.exr and
-so on. Tiles of other settings, missing ones, doubled ones and unfinished ones are named and refused."""
-_EPILOG = """\
-examples:
-  neurolens render experiments/scenes/room.toml --camera thin --tile 1/2 -o room.exr
-  neurolens render experiments/scenes/room.toml --camera thin --tile 2/2 -o room.exr
-  neurolens merge room.tile-*.exr -o room.exr
 
-On farms: experiments/farm/render.openjd.yaml (OpenJD) and experiments/farm/render.sbatch (SLURM)."""
-
-
-def add_parser(subparsers: Any) -> None:
-    """Add the command to the command line."""
-    parser = subparsers.add_parser(
-        "merge", help="put the tiles of a render together", description=_DESCRIPTION, epilog=_EPILOG
-    )
-    parser.add_argument("tiles", metavar="TILE", nargs="+", type=Path, help="tiles, in any order")
-    parser.add_argument(
-        "-o", "--out", metavar="OUT.exr", type=Path, required=True, help="picture to write; the preview is OUT.png"
-    )
-    add_exposure(parser)
-    add_json(parser)
-    parser.set_defaults(run=run, kept="what was merged before is written; tiles are untouched")
-
-
-def run(args: argparse.Namespace) -> int:
+def run_merge(args: argparse.Namespace) -> int:
     """Check all tiles, then write a picture a frame."""
-    check_suffix(args.out, "--out", (".exr",))
-    check_folder(args.out, "--out")
+    _check_alone(args)
+    check_suffix(args.out, "--output", (".exr",))
+    check_folder(args.out, "--output")
     from neurolens.render.tiles import check_together, read_tile
 
     frames: dict[int | None, list[Tile]] = {}
-    for path in args.tiles:
+    for path in args.scene:
         tile = read_tile(path)
         frames.setdefault(tile.frame, []).append(tile)
     digits = max(4, *(len(str(frame)) for frame in frames))
@@ -58,9 +33,23 @@ def run(args: argparse.Namespace) -> int:
         check_together(tiles)
         number = "" if frame is None else f".{frame:0{digits}d}"
         outs[frame] = args.out.with_name(f"{args.out.stem}{number}{args.out.suffix}")
-        _spare(outs[frame], args.tiles)
+        _spare(outs[frame], args.scene)
     pictures = [write_picture(tiles, outs[frame], args.exposure) for frame, tiles in frames.items()]
     return answer(args, {"pictures": pictures}, lambda: "\n".join(str(p["file"]) for p in pictures))
+
+
+def _check_alone(args: argparse.Namespace) -> None:
+    """Refuse no tiles at all, and options that tiles have settled already; raises InputError."""
+    from neurolens.commands import render
+
+    parser, taken = Parser(), ("scene", "merge", "out", "exposure", "quiet", "json")
+    render.add_parser(parser.add_subparsers())
+    for name, unset in vars(parser.parse_args(["render", "-o", "a.exr"])).items():
+        if name not in taken and getattr(args, name) != unset:
+            option = f"--{name.replace('_', '-')}"
+            raise InputError("neurolens render", option, "(beside --merge)", "tiles, -o and --exposure alone")
+    if not args.scene:
+        raise InputError("neurolens render", "--merge", "(no tiles)", "the tiles of a render")
 
 
 def write_picture(
@@ -86,6 +75,6 @@ def write_picture(
 def _spare(out: Path, tiles: Sequence[Path]) -> None:
     """Refuse, before anything is written, to write over a tile, or where nothing can be written."""
     if out.exists() and any(out.samefile(tile) for tile in tiles):
-        raise InputError(out, "--out", out.name, "another name: it is one of the tiles")
+        raise InputError(out, "--output", out.name, "another name: it is one of the tiles")
     for path in (out, out.with_suffix(".png")):
         check_writable(path)

@@ -5,12 +5,20 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
 from neurolens.base.progress import Progress, duration
-from neurolens.commands.arguments import add_exposure, add_json, add_lens, add_lens_state, aperture_of, positive, whole
+from neurolens.commands.arguments import (
+    add_exposure,
+    add_json,
+    add_lens,
+    add_lens_state,
+    add_output,
+    aperture_of,
+    positive,
+    whole,
+)
 from neurolens.commands.output import answer
 from neurolens.commands.render import film_size
 from neurolens.commands.render_files import Files, warn
@@ -37,9 +45,7 @@ def add_parser(subparsers: Any) -> None:
     )  # fmt: skip
     parser.add_argument("scene", metavar="SCENE", help="scene file (.xml), or cornell-box")
     add_lens(parser, "--camera", models=True, cameras=True, required=True)
-    parser.add_argument(
-        "-o", "--out", metavar="OUT.exr", type=Path, required=True, help="picture to write; the preview is OUT.png"
-    )
+    add_output(parser, "OUT.exr", "picture to write; the preview is OUT.png", required=True)
     parser.add_argument(
         "--variant", metavar="NAME", help="of Mitsuba (default: llvm_ad_spectral; scalar_spectral without LLVM)"
     )

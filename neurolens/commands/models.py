@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -13,16 +12,17 @@ from typing import Any
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
 from neurolens.base.files import library
 from neurolens.base.lensname import lens_id_of
-from neurolens.commands.arguments import add_json
+from neurolens.commands.arguments import add_json, rms_error
 from neurolens.commands.output import answer, number, table
-from neurolens.evaluate.records import CLOSE_UM, reaches, to_use, use_command
+from neurolens.evaluate.records import CLOSE_UM, program, reaches, to_use, use_command
 from neurolens.modelfile import AVERAGED, transmittance_of
 
 _DESCRIPTION = """\
 List exported models by lens: film circle, focus, film-equivalent RMS error on rays held out, and
 nanoseconds a ray in onnxruntime and as C where they were timed, on the machine that made them. The
 star is the one to use of a lens: the fastest of those within 2 um (or --within) that their card does
-not call poor; where none is, the closest.
+not call poor; where none is, the closest. Models of one focus alone, such as those that "neurolens plan"
+fits for a shot, come last.
 
 Looked for in: models/ of the working folder and of the project (those that ship), and models/ of every
 run folder in runs/. Exit code 1 where there is none, or none within the error asked for."""
@@ -40,22 +40,11 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("lens", metavar="LENS", nargs="?", help="lens file, or part of a lens's name or id")
     parser.add_argument(
-        "--within", metavar="ERROR", type=_error, default=None,
+        "--within", metavar="ERROR", type=rms_error,
         help="only models of at most this RMS error: 1um, or 0.1px of a picture 4000 pixels wide",
     )  # fmt: skip
     add_json(parser)
     parser.set_defaults(run=run, kept="nothing is written")
-
-
-def _error(text: str) -> tuple[str, float]:
-    """Key of a card's error and its bound."""
-    match = re.fullmatch(r"([0-9.]{1,20}(?:e-?[0-9]{1,3})?)(um|px)", text)
-    try:
-        if match and 0 < float(match[1]) < 1e9:
-            return f"rms_{match[2]}", float(match[1])
-    except ValueError:
-        pass
-    raise argparse.ArgumentTypeError(f"got {text!r}, expected a number above 0 and its unit, as 1um or 0.1px")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -69,10 +58,11 @@ def run(args: argparse.Namespace) -> int:
         looked = ", ".join(map(str, places)) or "models/, runs/*/models/"
         raise InputError("neurolens models", "LENS", asked, f"one of: {known} (looked in {looked})")
     key, most = args.within or ("rms_um", CLOSE_UM)
-    listed = sorted(of_lens, key=lambda m: (m["lens"], m["film_radius_mm"], m["rms_um"] or 0.0))
+    listed = sorted(of_lens, key=lambda m: (_of_a_shot(m), m["lens"], m["film_radius_mm"], m["rms_um"] or 0.0))
     kept = [m for m in listed if args.within is None or reaches(m, most, key)]
     for state in {_state(m) for m in listed}:
-        best = to_use([m for m in kept if _state(m) == state], most, key)
+        alike = [m for m in kept if _state(m) == state]
+        best = to_use([m for m in alike if not _of_a_shot(m)] or alike, most, key)
         if best:
             best["use"] = use_command(best["file"], fused=best["fused_ns_per_ray"] is not None)
     data = {"looked_in": [str(p) for p in places], "within": args.within, "models": kept}
@@ -132,6 +122,12 @@ def _state(model: dict[str, Any]) -> tuple[Any, ...]:
     return model["lens"], round(model["efl_mm"], 3), *model["states"]
 
 
+def _of_a_shot(model: dict[str, Any]) -> bool:
+    """Whether a model has one focus alone, as those that `neurolens plan` fits for a shot."""
+    near, far = model["focus_m"]
+    return bool(near == far)
+
+
 def _is_of(model: dict[str, Any], asked: str) -> bool:
     if asked.endswith(".toml") or Path(asked).is_file():
         return bool(model["lens"] == lens_id_of(asked))
@@ -143,7 +139,7 @@ def _text(args: argparse.Namespace, listed: Sequence[dict[str, Any]], kept: Sequ
         best = min(listed, key=lambda m: m["rms_um"] if m["rms_um"] is not None else 1e9)
         key, most = args.within
         unit = key.removeprefix("rms_")
-        more = f"neurolens train --lens {best['lens']} --target-{unit} {most:g}"
+        more = f"{program()} train --lens {best['lens']} --within {most:g}{unit}"
         return f"None of {len(listed)} models is within {most:g} {unit}; the closest is {_said(best)}.\nFit one: {more}"
     header = ("", "model", "film mm", "focus m", "RMS um", "pixels", "ns", "C ns", "")
     rows = [
@@ -172,6 +168,7 @@ def _text(args: argparse.Namespace, listed: Sequence[dict[str, Any]], kept: Sequ
 def _remarks(model: dict[str, Any]) -> list[str]:
     """What the last column says of a model."""
     found = [f"poor: {', '.join(model['poor'])}"] if model["poor"] else []
+    found += ["one focus"] * _of_a_shot(model)
     found += [f"in one: {', '.join(model['states'])}"] if model["states"] and not found else []
     return found + ["averaged transmittance"] * (model["transmittance"] == AVERAGED)
 

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text, library
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, add_lens, check_run_folder
+from neurolens.commands.arguments import add_glass, add_json, add_lens, add_output, check_run_folder, whole
 from neurolens.commands.output import answer, number, table
 from neurolens.commands.plan_frames import run_plan_frames
 from neurolens.commands.render_frames import add_frames
-from neurolens.evaluate.records import plain
+from neurolens.evaluate.records import plain, program
 
 if TYPE_CHECKING:
     from neurolens.evaluate.plan import Choice, Plan
@@ -32,8 +32,8 @@ exact lens. Needs the extra "train" (torch).
 
 Errors are distances between footprints, the picture of a point by a camera and by the exact lens: the
 least RMS way on which light moves to turn one into the other, in pixels of the scene's picture (place,
-size and shape of the blur, each wavelength by itself), and the relative error of light, of which 1%% is
-allowed. Both are those that 95%% of the picture keep. The cost of a ray, times the noise of its weights,
+size and shape of the blur, each wavelength by itself), and the relative error of light, of which 1% is
+allowed. Both are those that 95% of the picture keep. The cost of a ray, times the noise of its weights,
 is proportional to the time to equal error: measured here, on one thread; of Cycles counted and turned
 into its nanoseconds, measured once; of GLSL in operations."""
 _EPILOG = """\
@@ -41,10 +41,19 @@ examples:
   neurolens plan experiments/scenes/garden.toml --lens laikin_double_gauss_50 --budget 0.25px
   neurolens plan scene.toml --lens my_lens.toml --budget 1px --for onnx --explain -o runs/plan
   neurolens plan scene.toml --lens my_lens.toml --frames 1:48 --key focus=1:0.8,48:3
+  neurolens plan experiments/scenes/garden.toml --lens laikin_double_gauss_50 --trade
 
 -o leaves plan.json (all of it), effects.png (effects, and where in the picture those are that a camera needs),
 models/ with what was fitted, and plan.toml: 'render' and 'export' take it for the camera, and 'train' fits a
-model of the shot from it, from scratch."""
+model of the shot from it, from scratch.
+
+--trade draws what the scene's error costs, marks the cameras that no other betters and the choice for the budget,
+and says what half of its time would buy. Seconds are of one thread, for the scene's own size and samples, and what
+a camera adds to them: its rays, and what the scene takes for the further rays that its noise asks for. What the
+scene takes by itself stands beside them; a small picture in our renderer measures it. Of other targets the camera
+alone counts, in Cycles under a white sky; of GLSL its operations. -o (default: runs/trade-SCENE-LENS) leaves
+trade.html (one page that needs no other file: small pictures side by side, their difference from the exact lens's,
+the table), trade.png, trade.json and models/ with what was fitted."""
 
 
 def add_parser(subparsers: Any) -> None:
@@ -66,24 +75,29 @@ def add_parser(subparsers: Any) -> None:
         help="what runs the camera: our renderer, compiled C, onnxruntime, Blender's Cycles (osl), or a renderer in "
         "GLSL (default: render)",
     )  # fmt: skip
-    add_look(parser)
+    _add_look(parser)
     parser.add_argument("--explain", action="store_true", help="time and list every camera tried")
     parser.add_argument(
-        "--samples", action="store_true",
+        "--trade", action="store_true",
+        help="draw every camera by its error in pixels and by its seconds to equal noise on one page, with pictures",
+    )  # fmt: skip
+    parser.add_argument(
+        "--samples", metavar="N", type=whole(1, 4096), help="per pixel, of the pictures of --trade (default: 16)"
+    )
+    parser.add_argument(
+        "--sample-map", action="store_true",
         help="write samples.exr, too, of the scene's size: the diameter of each pixel's blur in pixels (layer blur, "
         "and R, G and B) and its depth in m (Z), for samplers that give more samples where blur is wide",
     )  # fmt: skip
-    parser.add_argument("--no-fit", dest="fit", action="store_false", help="fit nothing for the shot")
-    parser.add_argument(
-        "-o", "--output", metavar="FOLDER", type=Path, help="for the plan (default: runs/plan-SCENE-LENS)"
-    )
+    parser.add_argument("--no-fit", action="store_true", help="fit nothing for the shot")
+    add_output(parser, "FOLDER", "for the plan (default: runs/plan-SCENE-LENS)")
     add_frames(parser, "one plan for these frames, whose models are reused: the fewest that keep the budget")
     add_glass(parser)
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="models fitted so far are kept, the plan is not written")
 
 
-def add_look(parser: argparse.ArgumentParser) -> None:
+def _add_look(parser: argparse.ArgumentParser) -> None:
     """Add --comp, --denoise and --zoom."""
     parser.add_argument(
         "--comp", metavar="EFFECTS", type=_afterwards, default=(), dest="afterwards",
@@ -97,7 +111,7 @@ def add_look(parser: argparse.ArgumentParser) -> None:
 
 
 def look_of(args: argparse.Namespace) -> dict[str, Any]:
-    """What `add_look` added, as arguments of `evaluate.probe.probe`."""
+    """What --comp, --denoise and --zoom say, as arguments of `evaluate.probe.probe`."""
     return {"afterwards": args.afterwards, "denoised": args.denoise, "zoom": args.zoom}
 
 
@@ -117,11 +131,6 @@ class Seconds(float):
 
 class Flip(float):
     """A budget of what is seen."""
-
-
-def pixels(text: str) -> float:
-    """Type of a budget in pixels."""
-    return _number(text, "px", "pixels, as 0.25px")
 
 
 def _budget(text: str) -> float:
@@ -151,6 +160,10 @@ def _afterwards(text: str) -> tuple[str, ...]:
 
 def run(args: argparse.Namespace) -> int:
     """Plan, write, print; 1 where no camera for this target is within the budget."""
+    if args.trade:
+        return _run_trade(args)
+    if args.samples is not None:
+        raise InputError("neurolens plan", "--samples", args.samples, "--trade beside it (a map: --sample-map)")
     from neurolens.evaluate.plan import plan
     from neurolens.evaluate.plots import plot_effects
     from neurolens.evaluate.trade import plan_seen, plan_within
@@ -159,18 +172,18 @@ def run(args: argparse.Namespace) -> int:
 
     lens = read_any(args.lens)
     scene = load_scene(args.scene)
-    folder = args.output or Path("runs") / f"plan-{scene.name}-{lens.lens_id}"
-    check_run_folder(folder, "neurolens plan", "-o")
+    folder = args.out or Path("runs") / f"plan-{scene.name}-{lens.lens_id}"
+    check_run_folder(folder, "neurolens plan", "--output")
     shipped = shipped_models(lens, args.zoom)
     if args.frames is not None:
         if args.zoom is not None or isinstance(args.budget, (Seconds, Flip)):
             expected = "a budget in pixels, and the zoom as a key, with --frames"
             raise InputError("neurolens plan", "--budget, --zoom", f"{args.budget:g}, {args.zoom}", expected)
         return run_plan_frames(args, lens, shipped, folder)
-    progress = Progress({"plan": 10} | ({"map of samples": 2} if args.samples else {}), quiet=args.quiet)
+    progress = Progress({"plan": 10} | ({"map of samples": 2} if args.sample_map else {}), quiet=args.quiet)
     with progress.stage("plan") as report:
         look: dict[str, Any] = {**look_of(args), "report": report}
-        look |= {"target": args.target, "models": shipped, "folder": folder / "models" if args.fit else None}
+        look |= {"target": args.target, "models": shipped, "folder": None if args.no_fit else folder / "models"}
         if isinstance(args.budget, Seconds):
             found = plan_within(scene, lens, args.budget, **look)
         elif isinstance(args.budget, Flip):
@@ -184,11 +197,23 @@ def run(args: argparse.Namespace) -> int:
     if found.best:
         atomic_write_text(folder / "plan.toml", found.to_toml(lens, folder))
     plot_effects(found, folder / "effects.png", f"{scene.name} through {lens.name}")
-    if args.samples:
+    if args.sample_map:
         with progress.stage("map of samples"):
             _write_samples(found, folder / "samples.exr")
     answer(args, data, lambda: _text(args, found, folder))
     return 0 if found.best else 1
+
+
+def _run_trade(args: argparse.Namespace) -> int:
+    from neurolens.commands.trade import run_trade
+
+    others = {"--explain": args.explain, "--sample-map": args.sample_map, "--frames": args.frames, "--key": args.key}
+    for option, given in others.items():
+        if given:
+            raise InputError("neurolens plan", option, "(beside --trade)", "one or the other")
+    if isinstance(args.budget, (Seconds, Flip)):
+        raise InputError("neurolens plan", "--budget", f"{args.budget:g}", "pixels, as 0.25px, beside --trade")
+    return run_trade(args)
 
 
 def _write_samples(found: Plan, path: Path) -> None:
@@ -253,7 +278,7 @@ def _text(args: argparse.Namespace, found: Plan, folder: Path) -> str:
         told = f"Use {best.name}: {number(best.error_px, 3)} px {allowed}, {number(best.cost, 3)} "
         told += f"{found.unit} a ray times noise"
         parts.append("\n".join([f"{told}{', ' + best.how if best.how else ''}", *_commands(args, found, best, folder)]))
-    written = ["plan.json", "effects.png", *["plan.toml"] * bool(best), *["samples.exr"] * args.samples]
+    written = ["plan.json", "effects.png", *["plan.toml"] * bool(best), *["samples.exr"] * args.sample_map]
     return "\n\n".join([*parts, f"Written: {folder}/{', '.join(written)}"])
 
 
@@ -263,7 +288,7 @@ def _commands(args: argparse.Namespace, found: Plan, best: Choice, folder: Path)
     lens = found.probed.lens
     model, shape = best.camera.endswith(".onnx"), lens.aperture
     state = ["--zoom", args.zoom] if args.zoom is not None and not model else []
-    words = ["neurolens", "render", str(args.scene), "--camera", f"{folder}/plan.toml", *state, "-o", "render.exr"]
+    words = ["render", str(args.scene), "--camera", f"{folder}/plan.toml", *state, "-o", "render.exr"]
     if model and shape is not None and shape.blades:  # models have none of their own
         words += ["--blades", f"{shape.blades}", "--blade-rotation", f"{shape.rotation_deg:g}"]
         words += ["--blade-curvature", f"{shape.curvature:g}"]
@@ -271,8 +296,8 @@ def _commands(args: argparse.Namespace, found: Plan, best: Choice, folder: Path)
         if ideal or found.target == "onnx":
             return []
         language, asked = found.target, found.asked
-        words = ["neurolens", "export", f"{folder}/plan.toml", "--to", language, *state, "-o", f"camera.{language}"]
+        words = ["export", f"{folder}/plan.toml", "--to", language, *state, "-o", f"camera.{language}"]
         if language != "osl":  # whose inputs they are
             film, focus = "x".join(f"{v:g}" for v in asked.film_mm), f"{asked.focus_m:g}"
-            words[3:3] = ["--camera", "--film", film, "--focus", focus, "--f-number", f"{asked.f_number:.6g}"]
-    return [f"  {shlex.join(words)}"]
+            words[2:2] = ["--whole-camera", "--film", film, "--focus", focus, "--f-number", f"{asked.f_number:.6g}"]
+    return [f"  {program()} {shlex.join(words)}"]

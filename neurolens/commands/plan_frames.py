@@ -14,7 +14,7 @@ from neurolens.base.files import atomic_path
 from neurolens.base.progress import Progress
 from neurolens.commands.output import answer, number, table
 from neurolens.commands.render_frames import frames_of
-from neurolens.evaluate.records import plain
+from neurolens.evaluate.records import plain, program
 
 if TYPE_CHECKING:
     from neurolens.evaluate.plan_frames import FramesPlan
@@ -26,8 +26,10 @@ def run_plan_frames(args: argparse.Namespace, lens: Lens, models: list[Path], fo
     from neurolens.evaluate.plan_frames import Frame, plan_frames
     from neurolens.render.scene import load_scene, seen_from
 
-    if args.samples or args.explain:
-        raise InputError("neurolens plan", "--frames", "(with --samples or --explain)", "plans of one frame for these")
+    if args.sample_map or args.explain:
+        raise InputError(
+            "neurolens plan", "--frames", "(with --sample-map or --explain)", "plans of one frame for these"
+        )
     scene, frames = load_scene(args.scene), []
     for frame, _, at in frames_of(args, "neurolens plan"):
         there = seen_from(scene, args.scene, at.get("position_m"), at.get("look_at_m"))
@@ -40,7 +42,7 @@ def run_plan_frames(args: argparse.Namespace, lens: Lens, models: list[Path], fo
     with progress.stage("plan") as report:
         found = plan_frames(
             frames, lens, args.budget, target=args.target, models=models, report=report,
-            folder=folder / "models" if args.fit else None, afterwards=args.afterwards, denoised=args.denoise,
+            folder=None if args.no_fit else folder / "models", afterwards=args.afterwards, denoised=args.denoise,
         )  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)
     data = plain({"scene": str(args.scene), "lens": str(args.lens), **found.to_dict()})
@@ -73,6 +75,8 @@ def _text(args: argparse.Namespace, found: FramesPlan, folder: Path) -> str:
         keys = [word for key in args.key for word in ("--key", key)]
         for r in found.runs:
             if r.choice is not None:
-                words = ["neurolens", "render", str(args.scene), "--camera", r.choice.camera, *keys]
-                parts.append(f"  {shlex.join([*words, '--frames', f'{r.first}:{r.last}', '-o', 'render.exr'])}")
+                words = ["render", str(args.scene), "--camera", r.choice.camera, *keys]
+                parts.append(
+                    f"  {program()} {shlex.join([*words, '--frames', f'{r.first}:{r.last}', '-o', 'render.exr'])}"
+                )
     return "\n\n".join([*parts, f"Written: {folder}/plan.json"])

@@ -1,4 +1,4 @@
-"""`neurolens projection CAMERA --model opencv`: a lens as the projections of vision and splatting programs have it."""
+"""`neurolens projection CAMERA --projection NAME`: a lens as the projections of vision and splatting programs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import CAMERAS_HELP, add_json, check_folder
+from neurolens.commands.arguments import CAMERAS_HELP, add_json, add_option, add_output, check_folder
 from neurolens.commands.output import answer, number, table
 from neurolens.commands.render_files import warn
 from neurolens.commands.stmap import LIGHT_NM, add_picture, add_state, shot_of
@@ -38,8 +38,8 @@ the first pixel, OpenCV's from its centre), NVIDIA's names for f-theta. A projec
 field is said, and an error of a planar one beyond 85 degrees. Needs the extra "train" (torch)."""
 _EPILOG = """\
 examples:
-  neurolens projection lenses/laikin_double_gauss_50.toml --size 1920x1080 --film 36x20.25 --model opencv -o gauss
-  neurolens projection models/NAME.onnx --size 1920x1280 --film 36x24 --model kannala-brandt --focus 2 -o fisheye"""
+  neurolens projection laikin_double_gauss_50 --size 1920x1080 --film 36x20.25 --projection opencv -o gauss
+  neurolens projection models/NAME.onnx --size 1920x1280 --film 36x24 --projection f-theta --focus 2 -o fisheye"""
 
 
 def add_parser(subparsers: Any) -> None:
@@ -49,8 +49,8 @@ def add_parser(subparsers: Any) -> None:
         description=_DESCRIPTION, epilog=f"{CAMERAS_HELP}\n\n{_EPILOG}",
     )  # fmt: skip
     add_picture(parser)
-    parser.add_argument("--model", choices=MODELS, required=True, help="the projection")
-    parser.add_argument("-o", "--out", metavar="NAME", type=Path, help="write NAME.json and, for OpenCV's, NAME.yaml")
+    add_option(parser, "--projection", old=("--model",), choices=MODELS, required=True, help="the projection to fit")
+    add_output(parser, "NAME", "write NAME.json and, for OpenCV's, NAME.yaml")
     add_state(parser)
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="files that were written are whole")
@@ -59,9 +59,9 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Trace, fit, write."""
     if args.out is not None:
-        check_folder(args.out, "--out")
+        check_folder(args.out, "--output")
         if not args.out.name:
-            raise InputError("neurolens projection", "--out", str(args.out), "a name")
+            raise InputError("neurolens projection", "--output", str(args.out), "a name")
         if args.out.suffix in (".json", ".yaml"):  # the name of a file that will be written
             args.out = args.out.with_suffix("")
     from neurolens.analysis.projections import fit, residual
@@ -78,13 +78,13 @@ def run(args: argparse.Namespace) -> int:
     focal = (field.frame.reach_mm[0] / step[0], field.frame.reach_mm[1] / step[1])
     if math.isclose(*field.frame.reach_mm, rel_tol=1e-9) and math.isclose(*step, rel_tol=1e-9):
         focal = focal[0], focal[0]
-    with progress.stage(f"fit {args.model}"):
-        found = fit(args.model, *shown(field, args.size, args.film), args.size, focal, source=str(args.camera))
+    with progress.stage(f"fit {args.projection}"):
+        found = fit(args.projection, *shown(field, args.size, args.film), args.size, focal, source=str(args.camera))
         left = residual(found, *shown(field, args.size, args.film, _HELD_OUT))
     data = _told(args, found, left) | {"before_film_mm": list(field.frame.pupil_mm)}
     data["files"] = _write(args.out, found, data) if args.out is not None else []
     if not left.sound:
-        warn(f"{args.model} turns back at {left.fold_deg:.4g} degrees; the picture goes to {left.field_deg:.4g}")
+        warn(f"{args.projection} turns back at {left.fold_deg:.4g} degrees; the picture goes to {left.field_deg:.4g}")
     return answer(args, data, lambda: _text(data, left))
 
 

@@ -18,6 +18,8 @@ from neurolens.commands.arguments import (
     add_exposure,
     add_json,
     add_lens_state,
+    add_option,
+    add_output,
     aperture_of,
     between,
     whole,
@@ -72,6 +74,8 @@ examples:
       --zoom 100 --blades 8 --blade-curvature 0.5 -o zoom.exr
   neurolens render experiments/scenes/room.toml --camera thin --samples 64 --keep-checkpoint -o room.exr
   neurolens render experiments/scenes/room.toml --camera thin --samples 256 -o room.exr   # 192 more
+  neurolens render experiments/scenes/room.toml --camera thin --tile 1/2 -o room.exr   # and 2/2 elsewhere
+  neurolens render --merge room.tile-*.exr -o room.exr
   neurolens render experiments/scenes/room.toml --camera fused:models/NAME.onnx --frames 1:48 \\
       --key focus=1:1.2,48:3 --key position=1:0/1.6/3,48:0.5/1.6/2.5 -o pull.exr"""
 
@@ -79,14 +83,12 @@ examples:
 def add_parser(subparsers: Any) -> None:
     """Add the command to the command line."""
     parser = subparsers.add_parser(
-        "render", help="render a scene through a lens, a model, a thin lens or a pinhole",
+        "render", help="a scene through a lens, a model, a thin lens or a pinhole",
         description=_DESCRIPTION, epilog=f"{CAMERAS_HELP}\n\n{_EPILOG}",
     )  # fmt: skip
-    parser.add_argument("scene", metavar="SCENE", type=Path, help="scene file (.toml)")
+    parser.add_argument("scene", metavar="SCENE", nargs="*", type=Path, help="scene file (.toml), or tiles of --merge")
     add_camera(parser)
-    parser.add_argument(
-        "-o", "--out", metavar="OUT.exr", type=Path, required=True, help="picture to write; the preview is OUT.png"
-    )
+    add_output(parser, "OUT.exr", "picture to write; the preview is OUT.png", required=True)
     picture = parser.add_argument_group("picture")
     picture.add_argument("--samples", metavar="N", type=whole(1, 2**20), help="per pixel (default: the scene's)")
     picture.add_argument(
@@ -104,8 +106,8 @@ def add_parser(subparsers: Any) -> None:
     picture.add_argument("--max-depth", metavar="N", type=whole(1, 1000), help="bounces (default: the scene's)")
     picture.add_argument("--half", action="store_true", help="16-bit floats in the EXR (default: 32-bit)")
     add_exposure(picture)
-    picture.add_argument(
-        "--layers", choices=("all", "beauty"), default="all",
+    add_option(
+        picture, "--channels", old=("--layers",), choices=("all", "beauty"), default="all",
         help="of the EXR: colour alone, or also samples, variance (of the pixel's luminance), Z (depth in m along the "
         "axis from the film) and blocked (share of camera rays that do not pass) (default: all)",
     )  # fmt: skip
@@ -128,18 +130,23 @@ def add_parser(subparsers: Any) -> None:
     parser.set_defaults(run=run_kept, kept="no picture was written; older files of that name are untouched")
 
 
+def add_colour_space(parser: argparse._ActionsContainer, default: str = "") -> None:
+    """Add --colour-space; `default` describes what stands for it where it is left out."""
+    parser.add_argument(
+        "--colour-space", choices=COLOUR_SPACE_NAMES,
+        help=f"of the EXR, linear: sRGB (D65) or ACEScg (AP1, the white of ACES){default}",
+    )  # fmt: skip
+
+
 def _add_colour(parser: argparse.ArgumentParser) -> None:
     colour = parser.add_argument_group("colour (left out: the scene's [film] table)")
-    colour.add_argument(
-        "--colour-space", choices=COLOUR_SPACE_NAMES,
-        help="of the EXR, linear: sRGB (D65) or ACEScg (AP1, the white of ACES)",
-    )  # fmt: skip
+    add_colour_space(colour)
     colour.add_argument(
         "--white-balance", metavar="LIGHT",
         help="light that becomes neutral: A, D50, D65, E, '3200 K' or a measured one of the scene",
     )  # fmt: skip
-    colour.add_argument(
-        "--wavelengths", choices=WAVELENGTH_MODES,
+    add_option(
+        colour, "--wavelength-mode", old=("--wavelengths",), choices=WAVELENGTH_MODES,
         help="of a path: one; hero, four that share it; lanes, four paths that share their random numbers; "
         "auto, hero where the camera does not disperse",
     )  # fmt: skip
@@ -151,15 +158,22 @@ def _add_colour(parser: argparse.ArgumentParser) -> None:
 
 def film_of(settings: FilmSettings, args: argparse.Namespace) -> FilmSettings:
     """The scene's [film] table with the command line's options."""
-    names = ("colour_space", "white_balance", "wavelengths", "wavelength_sampling")
-    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
-    return replace(settings, **given)
+    given = {name: getattr(args, name) for name in ("colour_space", "white_balance", "wavelength_sampling")}
+    given["wavelengths"] = args.wavelength_mode
+    return replace(settings, **{name: value for name, value in given.items() if value is not None})
 
 
 def run_kept(args: argparse.Namespace) -> int:
-    """As `run`, with running out of memory as a one-line error."""
+    """As `run`, or tiles merged, with running out of memory as a one-line error."""
+    from neurolens.commands.merge import run_merge
+
+    if not args.merge:
+        if len(args.scene) != 1 or args.camera is None:
+            missing = "SCENE" if len(args.scene) != 1 else "--camera"
+            raise InputError("neurolens render", missing, " ".join(map(str, args.scene)) or "(none)", "one of it")
+        (args.scene,) = args.scene
     try:
-        return run(args)
+        return (run_merge if args.merge else run)(args)
     except MemoryError as error:
         raise NeurolensError(f"render: out of memory ({str(error) or 'no more said'})") from None
 
@@ -260,11 +274,11 @@ def _flare(made: Prepared, args: argparse.Namespace, progress: Progress) -> dict
     from neurolens.flare.layers import scene_choice, scene_flare
     from neurolens.flare.picture import Raster
 
+    raster = Raster(camera.film_mm, *made.size)
     try:
         if args.shared is not None and args.shared.flare is None:
-            args.shared.flare = scene_choice(list(_flare_frames(scene, lens, args)))
+            args.shared.flare = scene_choice(list(_flare_frames(scene, lens, args)), raster, args.threads)
         choice = None if args.shared is None else args.shared.flare
-        raster = Raster(camera.film_mm, *made.size)
         return scene_flare(scene, lens, raster, made.film.white_balance, args.threads, progress, choice)
     except InputError as error:
         raise InputError(args.scene, f"[flare]: {error.file}, {error.field}", error.value, error.expected) from None

@@ -23,6 +23,7 @@ from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
     from neurolens.cameras.contract import FloatArray
+    from neurolens.render.colour import ColourSpace
     from neurolens.render.film_settings import FilmSettings
     from neurolens.render.renderer import RenderResult, Watch
 
@@ -34,8 +35,14 @@ def add_tile(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("farms")
     group.add_argument(
         "--tile", metavar="I/N", type=_tile,
-        help="render the I-th of N bands of rows, to OUT.tile-I-of-N.exr (goes with --frames); \"neurolens merge\" "
-        "puts together the picture that one run gives, bit for bit. A scene's [flare] is computed whole for each tile",
+        help="render the I-th of N bands of rows, to OUT.tile-I-of-N.exr (goes with --frames). A scene's [flare] is "
+        "computed whole for each tile",
+    )  # fmt: skip
+    group.add_argument(
+        "--merge", action="store_true",
+        help="put tiles together: the picture that one run gives, bit for bit, with its preview and metadata, whose "
+        "times are summed; of tiles of frames a picture a frame. Takes -o and --exposure alone, and no tile of other "
+        "settings, missing, doubled or unfinished",
     )  # fmt: skip
     add_dask(group)
 
@@ -74,14 +81,14 @@ class Files:
 
     @classmethod
     def of(cls, out: Path) -> Files:
-        """The files of `--out`; refuses names that cannot be written before anything is rendered.
+        """The files of `--output`; refuses names that cannot be written before anything is rendered.
 
         Raises:
             InputError: not .exr, or no such folder.
             OSError: a folder that cannot be written, a folder of that name.
         """
-        check_suffix(out, "--out", (".exr",))
-        check_folder(out, "--out")
+        check_suffix(out, "--output", (".exr",))
+        check_folder(out, "--output")
         files = cls(out, out.with_suffix(".png"), out.with_name(f"{out.name}.part"))
         for path in (files.out, files.preview, files.checkpoint):
             check_writable(path)
@@ -92,7 +99,7 @@ class Files:
         for read in inputs:
             for written in (self.out, self.preview, self.checkpoint):
                 if written.exists() and read.exists() and written.samefile(read):
-                    raise InputError(self.out, "--out", written.name, f"another name: the scene reads {read}")
+                    raise InputError(self.out, "--output", written.name, f"another name: the scene reads {read}")
 
     def kept(self) -> str:
         """How to resume a render that ended early."""
@@ -179,7 +186,7 @@ def write_pictures(
     Raises:
         NeurolensError: they cannot be written; with the way to resume.
     """
-    from neurolens.render.colour import COLOUR_SPACES, SRGB, conversion, converted
+    from neurolens.render.colour import COLOUR_SPACES
     from neurolens.render.exr_attributes import standard_attributes
     from neurolens.render.job import MEANING
     from neurolens.render.pictures import write_exr, write_png
@@ -187,15 +194,13 @@ def write_pictures(
 
     space = COLOUR_SPACES[film.colour_space]
     told = metadata | {"render": plain(result.stats)}
-    told["colour"] = {"space": space.name, "white_xy": list(space.white), "adaptation": "Bradford"}
+    told["colour"] = space.stated
     layers: dict[str, FloatArray] = {}
-    if args.layers == "all" or not result.stats["complete"]:
+    if args.channels == "all" or not result.stats["complete"]:
         layers, told["layers"] = asdict(result.layers), MEANING
     width, height = result.stats["width"], result.stats["height"]
     rows = (0, height) if args.tile is None else rows_of(height, args.tile)
-    for name, picture in flare.items():
-        colour = converted(picture[slice(*rows)], conversion(SRGB, space)).astype(picture.dtype)
-        layers |= {f"{name}.{c}": colour[..., k] for k, c in enumerate("RGB")}
+    layers |= flare_channels({name: picture[slice(*rows)] for name, picture in flare.items()}, space)
     attributes = standard_attributes(metadata["camera"], width, height, args.frame)
     if args.tile is not None:
         number, count = args.tile
@@ -209,6 +214,17 @@ def write_pictures(
         write_png(files.preview, result.rgb, args.exposure)
     except (OSError, NeurolensError) as error:
         raise NeurolensError(f"{_said(error)}; {_rescued(files, result)}") from None
+
+
+def flare_channels(flare: Mapping[str, FloatArray], space: ColourSpace) -> dict[str, FloatArray]:
+    """The channels of layers of flare in a colour space, of pictures [H, W, 3] linear sRGB by name."""
+    from neurolens.render.colour import SRGB, conversion, converted
+
+    channels: dict[str, FloatArray] = {}
+    for name, picture in flare.items():
+        colour = picture if space is SRGB else converted(picture, conversion(SRGB, space)).astype(picture.dtype)
+        channels |= {f"{name}.{c}": colour[..., k] for k, c in enumerate("RGB")}
+    return channels
 
 
 def _rescued(files: Files, result: RenderResult) -> str:

@@ -6,7 +6,6 @@ import argparse
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
@@ -17,10 +16,12 @@ from neurolens.commands.arguments import (
     add_json,
     add_lens,
     add_lens_state,
+    add_option,
+    add_output,
     aperture_of,
-    between,
     check_folder,
     positive,
+    wavelengths_nm,
 )
 from neurolens.commands.output import answer, number
 from neurolens.commands.render import film_size
@@ -60,7 +61,8 @@ distances are off by what is printed as parallax, for a lens's pupil moves with 
 for another plane.
 
 The place of a thing in the picture is the centroid of its light at this stop, over pupil and wavelengths as the
-eye weighs them. Lenses with cylinders keep their squeeze: each meridian has its own focal length."""
+eye weighs them. Lenses with cylinders keep their squeeze: each meridian has its own focal length and its own
+entrance pupil. All maps have the pixel aspect ratio, which is printed, in the attribute pixelAspectRatio."""
 _EPILOG = """\
 examples:
   neurolens stmap lenses/laikin_double_gauss_50.toml --size 3840x2160 --film 36x20.25 --focus 2 -o shot
@@ -72,11 +74,11 @@ examples:
 def add_parser(subparsers: Any) -> None:
     """Add the command to the command line."""
     parser = subparsers.add_parser(
-        "stmap", help="ST maps: undistort and redistort pictures of a lens in compositing",
+        "stmap", help="ST maps, which undistort and redistort pictures of a lens",
         description=_DESCRIPTION, epilog=f"{CAMERAS_HELP}\n\n{_EPILOG}",
     )  # fmt: skip
     add_picture(parser)
-    parser.add_argument("-o", "--out", metavar="SHOT", type=Path, required=True, help="start of the files' names")
+    add_output(parser, "SHOT", "start of the files' names", required=True)
     parser.add_argument(
         "--projection", choices=PROJECTIONS, default=PROJECTIONS[0],
         help="of the undistorted picture (default: rectilinear, a plane: fields up to 85 degrees from the axis)",
@@ -87,11 +89,11 @@ def add_parser(subparsers: Any) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--lateral-colour", action="store_true",
-        help="maps for each channel too, SHOT.undistort.red.exr and so on, of the wavelengths of --channels-nm",
+        help="maps for each channel too, SHOT.undistort.red.exr and so on, of the --wavelengths",
     )  # fmt: skip
-    parser.add_argument(
-        "--channels-nm", metavar="R,G,B", type=_wavelengths, default=_CHANNELS_NM,
-        help="wavelengths in nm (default: 611.4,549.1,464.2, the dominant ones of Rec. 709)",
+    add_option(
+        parser, "--wavelengths", old=("--channels-nm",), metavar="NM", type=_channels, default=_CHANNELS_NM,
+        help="those of red, green and blue (default: 611.4,549.1,464.2 nm, the dominant ones of Rec. 709)",
     )  # fmt: skip
     add_frames(parser, "maps of these frames, SHOT.undistort.0001.exr and so on, all of one overscan", names=LENS_KEYS)
     add_state(parser)
@@ -139,12 +141,13 @@ def _pixels(text: str) -> tuple[int, int]:
     raise argparse.ArgumentTypeError(f"got {text!r}, expected WIDTHxHEIGHT in pixels, each from 1 to {_LARGEST}")
 
 
-def _wavelengths(text: str) -> tuple[float, ...]:
-    """Type of --channels-nm."""
-    words = text.split(",")
-    if len(words) != 3:
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected three wavelengths in nm: red, green, blue")
-    return tuple(between(*LIGHT_NM, "a wavelength in nm")(word) for word in words)
+def _channels(text: str) -> tuple[float, ...]:
+    """Type of --wavelengths: those of red, green and blue."""
+    found = wavelengths_nm(text)
+    if len(found) == 3 and all(LIGHT_NM[0] <= nm <= LIGHT_NM[1] for nm in found):
+        return found
+    span = f"{LIGHT_NM[0]:g} to {LIGHT_NM[1]:g}"
+    raise argparse.ArgumentTypeError(f"got {text!r}, expected three wavelengths from {span} nm: red,green,blue")
 
 
 @dataclass(frozen=True)
@@ -160,9 +163,9 @@ class _Frame:
 
 def run(args: argparse.Namespace) -> int:
     """Trace the fields of all frames, then write their maps, of one size."""
-    check_folder(args.out, "--out")
+    check_folder(args.out, "--output")
     if not args.out.name:
-        raise InputError(_COMMAND, "--out", str(args.out), "the start of the files' names")
+        raise InputError(_COMMAND, "--output", str(args.out), "the start of the files' names")
     if args.frames is None and args.key:
         raise InputError(_COMMAND, "--key", args.key[0], "--frames beside it")
     from neurolens.render.stmap import plates_of
@@ -193,7 +196,7 @@ def _traced(args: argparse.Namespace, text: str, progress: Progress) -> _Frame:
     for note in camera.settings.get("notes", ()):
         warn(note)
     frame = frame_of(camera)
-    wavelengths = dict(zip(_NAMES, args.channels_nm, strict=True)) if args.lateral_colour else {}
+    wavelengths = dict(zip(_NAMES, args.wavelengths, strict=True)) if args.lateral_colour else {}
     fields = {
         name: field_of(
             camera, shot.focus_m, args.projection, frame=frame, distance_m=args.distance,
@@ -215,6 +218,7 @@ def _written(args: argparse.Namespace, frame: _Frame, plates: Plates, report: Ca
     jobs.append(("illumination", "", illumination_map))
     files = []
     header = standard_attributes(frame.settings, frame=int(frame.number) if frame.number else None)
+    header["pixelAspectRatio"] = _ideal(frame.fields[""], plates)["pixel_aspect"]
     for k, (kind, name, make) in enumerate(jobs):
         field = frame.fields[name]
         planes = make(field, plates, _part(report, 2 * k, 2 * len(jobs)))
@@ -236,15 +240,18 @@ def _about(args: argparse.Namespace, frame: _Frame, plates: Plates, kind: str, f
     said: dict[str, Any] = {"version": __version__, "map": kind, "camera": str(args.camera), "name": frame.camera}
     said |= {"picture_px": list(plates.picture), "undistorted_px": list(plates.undistorted)}
     said |= {"film_mm": list(args.film), "wavelengths_nm": field.spectrum[0].tolist()}
-    return said | _ideal(args, field) | {"focus_m": None if math.isinf(frame.focus_m) else frame.focus_m}
+    return said | _ideal(field, plates) | {"focus_m": None if math.isinf(frame.focus_m) else frame.focus_m}
 
 
-def _ideal(args: argparse.Namespace, field: Field) -> dict[str, Any]:
-    """The camera that an undistorted picture is of."""
+def _ideal(field: Field, plates: Plates) -> dict[str, Any]:
+    """The camera that an undistorted picture is of; lists are of the x and the y meridian. A pixel of both pictures is
+    `pixel_aspect` times as wide as high in what it shows, as viewers stretch it."""
+    (x, y), (width, height) = field.frame.reach_mm, plates.pixel_mm
     return {
         "projection": field.target,
-        "focal_mm": list(field.frame.reach_mm),
+        "focal_mm": [x, y],
         "before_film_mm": list(field.frame.pupil_mm),
+        "pixel_aspect": float(f"{y / x * width / height:.6g}"),
     }
 
 
@@ -258,8 +265,13 @@ def _told(args: argparse.Namespace, frames: list[_Frame], plates: Plates) -> dic
         moved, missed = worst_px(field, plates)
         pixel = min(plates.pixel_mm)
         parallax = [{"distance_m": d, "px": mm / pixel} for d, mm in field.parallax_mm.items()]
-        row = {"frame": int(frame.number) if frame.number else None, "focus_m": frame.focus_m}
-        row |= _ideal(args, field) | {"field_deg": field.field_deg, "shift_px": moved, "there_and_back_px": missed}
+        row: dict[str, Any] = {"frame": int(frame.number) if frame.number else None, "focus_m": frame.focus_m}
+        row |= _ideal(field, plates) | {"field_deg": field.field_deg, "shift_px": moved, "there_and_back_px": missed}
+        # One pinhole, at the y meridian's pupil, shows widths in this plane as the pupil of the x meridian does.
+        plane = 1e3 * (frame.focus_m if args.distance is None else args.distance)
+        x, y = field.frame.pupil_mm
+        nearer = 1.0 if math.isinf(plane) else (plane - x) / (plane - y)
+        row |= {"plane_m": plane / 1e3, "pixel_aspect_of_one_pinhole": row["pixel_aspect"] * nearer}
         rows.append(row | {"parallax": parallax})
     return {
         "camera": str(args.camera),
@@ -285,6 +297,14 @@ def _text(data: dict[str, Any]) -> str:
         f"distortion moves points by up to {worst['shift_px']:.4g} pixels; there and back within "
         f"{worst['there_and_back_px']:.2g}",
     ]
+    if " x " in focal:
+        x, y = (number(v, 6) for v in first["before_film_mm"])
+        line = f"pixel aspect ratio {first['pixel_aspect']:.5g}; entrance pupil of the x meridian {x} mm, of the y "
+        line += f"meridian {y} mm before the film"
+        if first["parallax"]:  # the plane is not at infinity
+            plane, aspect = number(first["plane_m"], 3), f"{first['pixel_aspect_of_one_pinhole']:.5g}"
+            line += f"; a pinhole at the latter shows what is {plane} m from the film with {aspect}"
+        lines.append(line)
     if first["parallax"]:
         told = [f"{p['px']:.2g} pixels at {number(p['distance_m'], 3)}" for p in first["parallax"]]
         lines.append(f"parallax of the pupil, worst of the picture, by metres from the film: {', '.join(told)}")

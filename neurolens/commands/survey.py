@@ -9,7 +9,16 @@ from typing import Any
 
 from neurolens.base.errors import InputError, printable
 from neurolens.base.files import read_bytes
-from neurolens.commands.arguments import QUIET_HELP, add_glass, add_json, between, check_run_folder, whole
+from neurolens.commands.arguments import (
+    QUIET_HELP,
+    add_glass,
+    add_json,
+    add_option,
+    add_output,
+    between,
+    check_run_folder,
+    whole,
+)
 from neurolens.commands.farm import add_dask
 from neurolens.commands.output import answer
 
@@ -22,7 +31,7 @@ Every file is a process of its own. A finished file is not done again: the same 
 _EPILOG = """\
 examples:
   neurolens survey lenses/
-  neurolens survey my_patents/ --out runs/patents --jobs 8
+  neurolens survey my_patents/ -o runs/patents --jobs 8
   neurolens survey my_patents/ --no-fit
 
 DIR holds survey.html (a table with sections of the lenses, to sort and filter), survey.csv, survey.json, records/."""
@@ -35,7 +44,7 @@ def add_parser(subparsers: Any) -> None:
         epilog=_EPILOG,
     )  # fmt: skip
     parser.add_argument("folder", metavar="FOLDER", type=Path, help="folder of lens files")
-    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/survey"), help="default: runs/survey")
+    add_output(parser, "DIR", "default: runs/survey", default=Path("runs/survey"))
     parser.add_argument("--no-fit", action="store_true", help="read and check only")
     parser.add_argument("--terms", metavar="N", type=whole(1, 400), default=64, help="coefficients (default 64)")
     parser.add_argument(
@@ -55,7 +64,7 @@ def add_parser(subparsers: Any) -> None:
         help="files at a time, about 1 GB of memory each (default: all cores)",
     )
     add_dask(parser)
-    parser.add_argument("--again", action="store_true", help="do finished files again")
+    add_option(parser, "--restart", old=("--again",), action="store_true", help="do finished files again")
     add_glass(parser)
     add_json(parser)
     parser.add_argument("--quiet", action="store_true", help=QUIET_HELP)
@@ -71,15 +80,15 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.readers.any_format import collection_of
     from neurolens.readers.source import MAX_BYTES
 
-    check_run_folder(args.out, "neurolens survey", "--out")
+    check_run_folder(args.out, "neurolens survey", "--output")
     if args.out.resolve() == args.folder.resolve():
-        raise InputError("neurolens survey", "--out", str(args.out), "a folder other than that of the lenses")
+        raise InputError("neurolens survey", "--output", str(args.out), "a folder other than that of the lenses")
     collection = collection_of(args.folder)
     settings = SurveySettings(not args.no_fit, args.terms, args.rays, args.seed, args.half_field)
     glasses = [(file.name, read_bytes(file, MAX_BYTES, "a glass catalogue")) for file in args.glass_files]
     records = survey(
         collection, args.out, settings, in_processes(args.jobs) if args.dask is None else on_cluster(args.dask),
-        Progress(quiet=args.quiet), glasses=glasses, again=args.again,
+        Progress(quiet=args.quiet), glasses=glasses, again=args.restart,
     )  # fmt: skip
     summary = {**summary_of(records), "others": collection.others, "page": str(args.out / "survey.html")}
     lines = [*summary_lines(records, collection.others), f"Look at {args.out / 'survey.html'}"]

@@ -1,4 +1,4 @@
-"""`neurolens trade SCENE --lens LENS`: the error of every camera for a scene against the time it takes."""
+"""`neurolens plan SCENE --lens LENS --trade`: the error of every camera for a scene against the time it takes."""
 
 from __future__ import annotations
 
@@ -6,62 +6,22 @@ import argparse
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, add_lens, check_run_folder, whole
+from neurolens.commands.arguments import check_run_folder
 from neurolens.commands.output import answer, number, table
-from neurolens.commands.plan import TARGETS, add_look, look_of, pixels, shipped_models
+from neurolens.commands.plan import look_of, shipped_models
 from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
     from neurolens.evaluate.trade import Offer, Trade
 
-_DESCRIPTION = """\
-Draw what a scene's error costs: every camera that 'neurolens plan' would try, by its error in pixels and by
-its seconds to equal noise, those that no other betters, and the choice for the budget. Says what half of the
-chosen one's time would buy. Needs the extra "train" (torch).
-
-Seconds are of one thread, for the scene's own size and samples, and what a camera adds to them: its rays, and
-what the scene takes for the further rays that its noise asks for. What the scene takes by itself is told beside;
-a small picture in our renderer measures it. Of other targets the camera alone counts, in Cycles under a white
-sky; of GLSL its operations."""
-_EPILOG = """\
-examples:
-  neurolens trade experiments/scenes/garden.toml --lens laikin_double_gauss_50
-  neurolens trade scene.toml --lens my_lens.toml --for osl --budget 0.5px -o runs/trade
-
--o leaves trade.html (one page that needs no other file: small pictures side by side, their difference from the
-exact lens's, the table), trade.png, trade.json and models/ with what was fitted."""
+_SAMPLES = 16  # a pixel of the small pictures
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add the command to the command line."""
-    parser = subparsers.add_parser(
-        "trade", help="what a scene's error costs: every camera's error against its time", description=_DESCRIPTION,
-        epilog=_EPILOG,
-    )  # fmt: skip
-    parser.add_argument("scene", metavar="SCENE", type=Path, help="scene file (.toml)")
-    add_lens(parser, "--lens", required=True)
-    parser.add_argument(
-        "--budget", metavar="PIXELS", type=pixels, default=0.25, help="whose choice is marked (default: 0.25px)"
-    )
-    parser.add_argument(
-        "--for", dest="target", choices=TARGETS, default="render", help="what runs the camera, as of 'plan'"
-    )
-    parser.add_argument(
-        "--samples", metavar="N", type=whole(1, 4096), default=16, help="a pixel of the small pictures (default: 16)"
-    )
-    add_look(parser)
-    parser.add_argument("--no-fit", dest="fit", action="store_false", help="fit nothing for the shot")
-    parser.add_argument("-o", "--output", metavar="FOLDER", type=Path, help="default: runs/trade-SCENE-LENS")
-    add_glass(parser)
-    add_json(parser, quiet=True)
-    parser.set_defaults(run=run, kept="models fitted so far are kept, nothing else is written")
-
-
-def run(args: argparse.Namespace) -> int:
+def run_trade(args: argparse.Namespace) -> int:
     """Price, draw, write, print."""
     from neurolens.evaluate.figures import side_by_side
     from neurolens.evaluate.plots import plot_trade
@@ -70,12 +30,12 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.render.scene import load_scene
 
     lens, scene = read_any(args.lens), load_scene(args.scene)
-    folder = args.output or Path("runs") / f"trade-{scene.name}-{lens.lens_id}"
-    check_run_folder(folder, "neurolens trade", "-o")
+    folder = args.out or Path("runs") / f"trade-{scene.name}-{lens.lens_id}"
+    check_run_folder(folder, "neurolens plan", "--output")
     with Progress({"trade": 30}, quiet=args.quiet).stage("trade") as report:
         found = trade(
             scene, lens, args.budget, target=args.target, models=shipped_models(lens, args.zoom), report=report,
-            samples=args.samples, folder=folder / "models" if args.fit else None, **look_of(args),
+            samples=args.samples or _SAMPLES, folder=None if args.no_fit else folder / "models", **look_of(args),
         )  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)
     title = f"{scene.name} through {lens.name}"

@@ -14,7 +14,16 @@ from neurolens.base.errors import InputError, NeurolensError, one_line
 from neurolens.base.files import fingerprint_of, sha256_of
 from neurolens.base.lensname import lens_id_of
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, add_lens, check_ids, check_run_folder, positive, whole
+from neurolens.commands.arguments import (
+    add_glass,
+    add_json,
+    add_lens,
+    add_output,
+    check_ids,
+    check_run_folder,
+    rms_error,
+    whole,
+)
 from neurolens.commands.farm import Task, add_dask, files_of, spread
 from neurolens.commands.output import answer, number, table
 from neurolens.evaluate.records import CLOSE_UM, to_use, use_command
@@ -28,7 +37,7 @@ Needs the extra "train" (torch).
 Without an experiment file, --lens fits a polynomial and a network to that lens in its default state:
 full aperture, its whole lit film, all wavelengths from 380 to 780 nm (less where its glasses are stated
 for less; one where no dispersion is known), focus from infinity to 14 focal lengths (further where the
-lens is too long for that). It takes a minute; --target-um asks for an error instead. A file of another
+lens is too long for that). It takes a minute; --within asks for an error instead. A file of another
 program (Zemax, CODE V, ...) is read as "neurolens convert" reads it; where that lacks something, convert
 first, with its options.
 
@@ -36,12 +45,12 @@ An interrupted run resumes where it stopped: existing models of the same setting
 _EPILOG = """\
 examples:
   neurolens train experiments/quickstart.toml
-  neurolens train experiments/quickstart.toml --out runs/try --set render.samples=4 --set pairs.seed=2
+  neurolens train experiments/quickstart.toml -o runs/try --set render.samples=4 --set pairs.seed=2
   neurolens train --lens lenses/cooke_triplet_50.toml
-  neurolens train --lens lenses/cooke_triplet_50.toml --target-px 0.1 --no-race
-  neurolens train --lens lenses/*_50.toml --out runs/fifties --dask tcp://cluster:8786
-  neurolens train --lens lenses/nikon_zoom_70_200.toml --zoom-range --out runs/zoom
-  neurolens train --lens lenses/brendel_tessar_100.toml --out runs/tessar \\
+  neurolens train --lens lenses/cooke_triplet_50.toml --within 0.1px --rounds 0
+  neurolens train --lens lenses/*_50.toml -o runs/fifties --dask tcp://cluster:8786
+  neurolens train --lens lenses/nikon_zoom_70_200.toml --zoom-range -o runs/zoom
+  neurolens train --lens lenses/brendel_tessar_100.toml -o runs/tessar \\
       --set lens.efl_mm=50
 
 The folder holds report.html, results.json, config.toml (all settings, defaults written out),
@@ -56,10 +65,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("experiment", metavar="EXPERIMENT.toml", nargs="?", type=Path, help="experiment file")
     instead = ", instead of an experiment; of several, each has a run folder in DIR (runs)"
     add_lens(parser, "--lens", instead, nargs="+")
-    parser.add_argument(
-        "--out", metavar="DIR", type=Path,
-        help="run folder, made if needed (default: runs/NAME of the experiment or lens file)",
-    )  # fmt: skip
+    add_output(parser, "DIR", "run folder, made if needed (default: runs/NAME of the experiment or lens file)")
     parser.add_argument(
         "--set", metavar="KEY=VALUE", dest="overrides", action="append", default=[],
         help="change a setting, for example --set pairs.train=10000; values are TOML, may be repeated",
@@ -72,22 +78,23 @@ def add_parser(subparsers: Any) -> None:
         "--internal-focus", action="store_true",
         help="of --lens: one model of internal focus, infinity to the near limit (input \"state\", in 1/m)",
     )  # fmt: skip
-    asked = parser.add_mutually_exclusive_group()
-    asked.add_argument(
-        "--target-um", metavar="X", type=positive("micrometres"),
-        help="of --lens: the fastest model whose film-equivalent RMS on rays held out is within X micrometres: from 12 "
-        "coefficients to a network of 2 x 32 units models are fitted until one is; exit code 1 if none is",
+    parser.add_argument(
+        "--within", metavar="ERROR", type=rms_error,
+        help="of --lens: the fastest model whose film-equivalent RMS on rays held out is at most this, 2um or 0.1px: "
+        "models from 12 coefficients to a network of 2 x 32 units are fitted until one is; exit code 1 if none is",
     )  # fmt: skip
-    asked.add_argument(
-        "--target-px", metavar="X", type=positive("pixels"),
-        help="the same in pixels, of which --pixels-across make the width of the 3:2 frame inscribed in the film "
-        "circle (36 mm for a radius of 21.6 mm: 1 pixel of 4000 is 9 um)",
-    )  # fmt: skip
+    for unit in ("um", "px"):  # how --within was spelled until version 0.9
+        parser.add_argument(
+            f"--target-{unit}", dest="within", type=lambda text, unit=unit: rms_error(text + unit),
+            help=argparse.SUPPRESS,
+        )  # fmt: skip
     parser.add_argument(
         "--pixels-across", metavar="N", type=whole(1, 10**6), default=4000,
-        help="width of the picture of --target-px (default: 4000)",
+        help="of --within in pixels: how many make the width of the 3:2 frame inscribed in the film circle (default: "
+        "4000: 9 um each for a radius of 21.6 mm)",
     )  # fmt: skip
-    parser.add_argument("--no-race", action="store_true", help="time no model")
+    parser.add_argument("--rounds", metavar="N", type=whole(0), help="of the race, 0 for none (default: the setting's)")
+    parser.add_argument("--no-race", dest="rounds", action="store_const", const=0, help=argparse.SUPPRESS)
     add_dask(parser)
     add_glass(parser)
     add_json(parser, quiet=True)
@@ -112,7 +119,7 @@ def _run_many(args: argparse.Namespace) -> int:
         raise InputError("neurolens train", "--dask", args.dask, "--lens FILE ... beside it")
     check_ids(args.lens, "neurolens train", "--lens")
     base = args.out if args.out is not None else Path("runs")
-    check_run_folder(base, "neurolens train", "--out")
+    check_run_folder(base, "neurolens train", "--output")
     progress, failed = Progress(quiet=args.quiet), dict[str, str]()
     each = [
         argparse.Namespace(**vars(args) | {"lens": f, "out": base / lens_id_of(f), "dask": None}) for f in args.lens
@@ -152,9 +159,9 @@ def train_alone(args: argparse.Namespace) -> None:
 
 def _mark(args: argparse.Namespace) -> str:
     """Hash of what a run's models depend on: the lens, catalogues of glass, options, the version."""
-    options = [args.overrides, args.zoom_range, args.internal_focus, args.target_um, args.target_px, args.pixels_across]
+    options = [args.overrides, args.zoom_range, args.internal_focus, args.within, args.pixels_across]
     hashes = [sha256_of(file) for file in (args.lens, *args.glass_files)]
-    return fingerprint_of([__version__, args.no_race, *options, *hashes])
+    return fingerprint_of([__version__, args.rounds, *options, *hashes])
 
 
 def _marked(folder: Path) -> str | None:
@@ -171,13 +178,15 @@ def _run_one(args: argparse.Namespace, progress: Progress) -> tuple[dict[str, An
     from neurolens.evaluate.train import run_experiment
 
     states = ['lens.zoom="range"'] * args.zoom_range + ['lens.focusing="internal"'] * args.internal_focus
-    asked = [] if args.target_um is None else [f"target.um={args.target_um!r}"]
-    if args.target_px is not None:
-        asked = [f"target.px={args.target_px!r}", f"target.pixels_across={args.pixels_across}"]
+    asked = []
+    if args.within is not None:
+        unit = args.within[0].removeprefix("rms_")
+        asked = [f"target.{unit}={args.within[1]!r}", *[f"target.pixels_across={args.pixels_across}"] * (unit == "px")]
     if (states or asked) and args.lens is None:
-        given = "--target-um, --target-px" if asked else "--zoom-range, --internal-focus"
+        given = "--within" if asked else "--zoom-range, --internal-focus"
         raise InputError("neurolens train", given, "(without --lens)", "--lens FILE")
-    args.overrides = [*states, *asked, *["evaluation.rounds=0"] * args.no_race, *args.overrides]
+    rounds = [] if args.rounds is None else [f"evaluation.rounds={args.rounds}"]
+    args.overrides = [*states, *asked, *rounds, *args.overrides]
     if args.lens is not None:
         experiment = default_experiment(args.lens, args.overrides)
     else:
@@ -195,14 +204,14 @@ def _run_folder(args: argparse.Namespace) -> Path:
         found = "(neither)" if args.lens is None else "(both)"
         raise InputError("neurolens train", "EXPERIMENT.toml or --lens", found, "one of them")
     folder: Path = args.out if args.out is not None else Path("runs") / lens_id_of(args.experiment or args.lens)
-    check_run_folder(folder, "neurolens train", "--out")
+    check_run_folder(folder, "neurolens train", "--output")
     return folder
 
 
 def _command(args: argparse.Namespace) -> str:
     parts = ["neurolens", "train"]
     parts += ["--lens", str(args.lens)] if args.lens is not None else [str(args.experiment)]
-    parts += ["--out", str(args.out)] if args.out is not None else []
+    parts += ["--output", str(args.out)] if args.out is not None else []
     for override in args.overrides:
         parts += ["--set", override]
     return shlex.join(parts)

@@ -17,7 +17,7 @@ from neurolens.base.files import TemporaryFolder
 from neurolens.base.files import library as shipped
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_json, add_lens, check_folder, check_suffix, whole
+from neurolens.commands.arguments import add_glass, add_json, add_lens, add_output, check_folder, check_suffix, whole
 from neurolens.commands.output import answer
 
 if TYPE_CHECKING:
@@ -71,9 +71,7 @@ def add_parser(subparsers: Any) -> None:
         "view", help="write a page that runs lenses and models in a browser", description=_DESCRIPTION, epilog=_EPILOG
     )
     add_lens(parser, "lenses", models=True, metavar="LENS|MODEL", nargs="*")
-    parser.add_argument(
-        "-o", "--out", metavar="FILE.html", type=Path, default=Path("view.html"), help="page (default: view.html)"
-    )
+    add_output(parser, "FILE.html", "page (default: view.html)", default=Path("view.html"))
     parser.add_argument(
         "--downloads", metavar="KINDS", type=_kinds, default=_DOWNLOADS,
         help="of glsl, onnx, c, osl what the page brings as files of each form (default: all; osl takes seconds a "
@@ -81,7 +79,7 @@ def add_parser(subparsers: Any) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--jobs", metavar="N", type=whole(1, 64), default=min(8, os.cpu_count() or 1),
-        help="processes that write OSL, each of a core and 0.5 GB (default here: %(default)s)",
+        help="processes that write OSL, each of a core and 0.5 GB (default: all cores, at most 8)",
     )  # fmt: skip
     add_glass(parser)
     add_json(parser)
@@ -99,8 +97,8 @@ def _kinds(text: str) -> list[str]:
 
 def run(args: argparse.Namespace) -> int:
     """Write the page."""
-    check_suffix(args.out, "--out", (".html", ".htm"))
-    check_folder(args.out, "--out")
+    check_suffix(args.out, "--output", (".html", ".htm"))
+    check_folder(args.out, "--output")
     entries = list(_asked(args.lenses) if args.lenses else _library())
     for entry in entries:
         found = [_kind_of(_card(file)) for file in entry.models]

@@ -62,7 +62,7 @@ def ns_a_ray(camera: Camera, places: Places) -> float:
 
 
 def glsl_operations(camera: OnnxCamera | ExactCamera) -> int:
-    """Of a ray of `neurolens export --camera --to glsl`: floats, a fused multiply-add is one.
+    """Of a ray of `neurolens export --whole-camera --to glsl`: floats, a fused multiply-add is one.
 
     Raises:
         InputError: a lens or model that has no such form.
@@ -90,9 +90,9 @@ def shader_cost(
     half = math.pi / 3
     call = {
         "f_number": f_number, "asked_m": min(focus_m, 1e9), "roundness": 0.0, "in_colour": 1.0, "shaded": 1.0,
-        "as_lens": 0.0, "at_pupil": 0.0, "warned": 0.0, "pixel_x": 1e-3, "pixel_y": 1e-3, "sensor_x_mm": film_mm[0],
-        "sensor_y_mm": film_mm[1], "half_cos": math.cos(half), "half_sin": math.sin(half), "edge_cos": math.cos(half),
-        "edge_sin": math.sin(half),
+        "as_lens": 0.0, "at_pupil": 0.0, "unit_m": 1.0, "warned": 0.0, "pixel_x": 1e-3, "pixel_y": 1e-3,
+        "sensor_x_mm": film_mm[0], "sensor_y_mm": film_mm[1], "half_cos": math.cos(half),
+        "half_sin": math.sin(half), "edge_cos": math.cos(half), "edge_sin": math.sin(half),
     }  # fmt: skip
     rows = {"raster_x": np.repeat(raster[0], rays), "raster_y": np.repeat(raster[1], rays)}
     rows |= {"first": (np.tile(first, points) + low.ravel() / 4096).ravel(), "second": np.tile(second, points)}

@@ -31,7 +31,8 @@ _NEGLIGIBLE = 1e-4  # share of the rays below which a blocking surface is not li
 def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
     """Figures of a lens placed by `Lens.at`, over a domain, as JSON has them; d line unless stated otherwise.
 
-    Returns: those of the file; `FirstOrder`, of an anamorphic lens in the y-z plane; and
+    They are those of the file, those of `FirstOrder` (of an anamorphic lens in the y-z plane), and:
+
         efl_x_mm: in the x-z plane; None of a round lens.
         working_f_number: of the real marginal ray (y-z); None where no ray passes.
         image_radius_from: what the radius follows from.

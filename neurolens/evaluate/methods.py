@@ -1,4 +1,4 @@
-"""Every method on the same rays of a lens: the rows of `bench surrogates`, their records, errors and times."""
+"""Every method on the same rays of a lens: the rows of `bench`, their records, errors and times."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def chosen_rows(names: Sequence[str]) -> tuple[Row, ...]:
         found = [r for r in rows if name in (r.name, r.group) or (name == r.settings.method and r.group != "ablations")]
         if not found and name not in GROUPS:
             known = ", ".join((*GROUPS, *(r.name for r in rows)))
-            raise InputError("neurolens bench surrogates", "--methods", name, f"one of: {known}")
+            raise InputError("neurolens bench", "--methods", name, f"one of: {known}")
         picked |= {r.name: r for r in found}
     return tuple(picked.values())
 

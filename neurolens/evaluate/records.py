@@ -8,13 +8,15 @@ from __future__ import annotations
 import math
 import platform
 import shlex
+import shutil
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypedDict, TypeVar
 
-from neurolens.base.files import write_json
+from neurolens.base.files import library, write_json
 
 SCHEMA_VERSION = 1
 _PACKAGES = ("neurolens", "torch", "numpy", "onnxruntime", "onnx", "OpenEXR")
@@ -170,10 +172,19 @@ def to_use(models: Sequence[R], most: float = CLOSE_UM, key: str = "rms_um") -> 
     return min(close, key=cost) if close else min(fits, key=_error, default=None)
 
 
+def program() -> str:
+    """The first words of a command line that runs here: "neurolens" if it is on the PATH, else as this one began."""
+    if shutil.which("neurolens"):
+        return "neurolens"
+    started = sys.argv[0]
+    return shlex.quote(started) if Path(started).name == "neurolens" else f"{shlex.quote(sys.executable)} -m neurolens"
+
+
 def use_command(file: str, fused: bool) -> str:
     """The command that renders a scene through a model, as C where that runs here."""
-    camera = f"{'fused:' if fused else ''}{file}"
-    return f"neurolens render experiments/scenes/room.toml --camera {shlex.quote(camera)} -o room.exr"
+    scene, camera = Path("experiments/scenes/room.toml"), f"{'fused:' if fused else ''}{file}"
+    words = [str(scene if scene.is_file() else library() / scene), "--camera", camera, "-o", "room.exr"]
+    return f"{program()} render {shlex.join(words)}"
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:

@@ -30,7 +30,7 @@ from neurolens.evaluate.pages import (
     show,
     table,
 )
-from neurolens.evaluate.records import CLOSE_UM, Results, pareto_front, to_use, use_command
+from neurolens.evaluate.records import CLOSE_UM, Results, pareto_front, program, to_use, use_command
 
 _MODEL_COLUMNS = (
     Column("error RMS (µm)", "rms_um", about="distance between exact and modelled ray on the plane in focus, "
@@ -138,7 +138,7 @@ def _use(folder: Path, results: Results) -> Markup:
     said += [f"{show(plain, 3)} ns in onnxruntime"] if plain is not None else []
     commands = [use_command(file, fused is not None)]
     if not best.get("states"):  # one of many states is no function of a ray alone
-        commands.append(f"neurolens export {shlex.quote(file)} --to c -o lens.h")
+        commands.append(f"{program()} export {shlex.quote(file)} --to c -o lens.h")
     use = "<section class='use'><h2>Use {}</h2><p>{}.</p>{}</section>"
     return html(use, best["name"], ", ".join(said), joined("<pre>{}</pre>", commands))
 

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from neurolens.flare.ghostmodel import GhostModel
 from neurolens.flare.ghosts import GhostTracer, Way, coated, ghost_pairs
 from neurolens.flare.lights import Light
 from neurolens.flare.photons import PhotonTracer
-from neurolens.flare.picture import PARTS, Ghost, Raster, ghost_picture, ghost_table, photon_picture
+from neurolens.flare.picture import PARTS, Raster, ghost_layers, ghost_picture, photon_picture
 from neurolens.flare.scatter import Scatter
 from neurolens.flare.sources import Name, SceneLights, chosen, keep_named
 from neurolens.flare.stack import Floats
@@ -126,8 +127,9 @@ class Choice(NamedTuple):
     single: tuple[str, ...]
 
 
-def scene_choice(frames: Sequence[tuple[Scene, Lens]]) -> Choice:
-    """The lights and ghosts of the most energy in all frames together, of a scene that has the table [flare].
+def scene_choice(frames: Sequence[tuple[Scene, Lens]], raster: Raster, threads: int) -> Choice:
+    """The lights of the most energy in all frames together, and the ghosts that `brightest` names, of a scene that has
+    the table [flare].
 
     Args:
         frames: the scene, its camera in the frame's place, and the lens in its state.
@@ -139,13 +141,20 @@ def scene_choice(frames: Sequence[tuple[Scene, Lens]]) -> Choice:
     table, sources = scene.settings.flare, SceneLights(scene)
     assert table is not None
     seen = [sources.named(at, lens.film_z_mm or 0.0) for at, lens in frames]
-    names, lights, tables = chosen(seen, table.most), list[Light](), list[list[Ghost]]()
-    for (_, lens), there in zip(frames if table.brightest else (), seen, strict=False):
-        tracer = GhostTracer(lens if table.coating is None else coated(lens, table.coating))
-        some = keep_named(there, names).lights
-        lights += some
-        tables += [ghost_table(tracer, light, 550.0) for light in some]
-    return Choice(names, brightest(lights, tables, table.brightest))
+    names = chosen(seen, table.most)
+    tracers = [GhostTracer(lens if table.coating is None else coated(lens, table.coating)) for _, lens in frames]
+    ghosts = [(tracer, keep_named(there, names).lights) for tracer, there in zip(tracers, seen, strict=True)]
+    return Choice(names, brightest(ghosts, raster, _settings_of(scene, threads), table.brightest))
+
+
+def _settings_of(scene: Scene, threads: int) -> FlareSettings:
+    """The settings of a scene's table [flare], without layers of single ghosts."""
+    table = scene.settings.flare
+    assert table is not None
+    return FlareSettings(
+        scene.settings.camera.wavelengths_nm, table.bins, table.cell_px, without=table.without, threads=threads,
+        glare=table.glare, starburst=table.starburst,
+    )  # fmt: skip
 
 
 def scene_flare(
@@ -167,13 +176,10 @@ def scene_flare(
     """
     table, sources = scene.settings.flare, SceneLights(scene)
     assert table is not None and lens.film_z_mm is not None
-    names, single = choice or scene_choice([(scene, lens)])
+    names, single = choice or scene_choice([(scene, lens)], raster, threads)
     lights = keep_named(sources.named(scene, lens.film_z_mm), names).lights
     lens = lens if table.coating is None else coated(lens, table.coating)
-    settings = FlareSettings(
-        scene.settings.camera.wavelengths_nm, table.bins, table.cell_px, without=table.without, threads=threads,
-        single=single, glare=table.glare, starburst=table.starburst,
-    )  # fmt: skip
+    settings = replace(_settings_of(scene, threads), single=single)
     found = flare_layers(lens, lights, raster, settings, progress)
     matrix = sources.balance(white_balance).T.astype(np.float32)
     return {name: picture @ matrix for name, picture in found.items()}
@@ -187,13 +193,31 @@ def sum_of(layers: Mapping[str, Floats], raster: Raster) -> Floats:
     return total
 
 
-def brightest(lights: Sequence[Light], tables: Sequence[Sequence[Ghost]], count: int) -> tuple[str, ...]:
-    """Names of so many ghosts that have the most energy of all lights, each with its `ghost_table`."""
-    energy: dict[Way, float] = {}
-    for light, ghosts in zip(lights, tables, strict=True):
-        for ghost in ghosts:
-            energy[ghost.pair] = energy.get(ghost.pair, 0.0) + ghost.energy * sum(light.rgb)
-    return tuple(pair.name for pair in sorted(energy, key=lambda pair: -energy[pair])[:count])
+def brightest(
+    frames: Sequence[tuple[GhostTracer | GhostModel, Sequence[Light]]],
+    raster: Raster,
+    settings: FlareSettings,
+    count: int,
+    done: Callable[[float], None] = lambda share: None,
+) -> tuple[str, ...]:
+    """Names of the ghosts whose own pictures, with their gains, have the greatest values on the film in any frame.
+
+    These are at most `count` names, the brightest first. A ghost without light on the film is never one of them.
+
+    Args:
+        frames: what traces the ghosts, and the lights, of each frame.
+    """
+    peaks: dict[str, float] = {}
+    most = min(count, max((len(ghosts.pairs) for ghosts, _ in frames), default=0))
+    check_memory(raster.width, raster.height, _bytes(most, most))
+    for number, (ghosts, lights) in enumerate(frames if count else ()):
+        factors = _factors(ghosts.pairs, settings, ghost_pairs(ghosts.lens))
+        each, begun = range(len(ghosts.pairs)), number / len(frames)
+        report = partial(lambda begun, share: done(begun + share / len(frames)), begun)
+        for k, picture in ghost_layers(ghosts, lights, raster, each, **_fineness(settings), done=report):
+            peak = float((picture.max(0).max(0) * factors[ghosts.pairs[k]]).max())
+            peaks[ghosts.pairs[k].name] = max(peak, peaks.get(ghosts.pairs[k].name, 0.0))
+    return tuple(sorted((name for name in peaks if peaks[name] > 0), key=lambda name: -peaks[name])[:count])
 
 
 def _ghosts(lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, done: Report) -> Layers:
@@ -205,15 +229,24 @@ def _ghosts(lens: Lens, lights: Sequence[Light], raster: Raster, settings: Flare
     # Ghosts of one layer and of equal factors share a picture.
     keys = [(p.name if p.name in settings.single else REST, factors[p]) for p in ghosts.pairs]
     kinds = list(dict.fromkeys([*keys, *((name, _ONE) for name in (*settings.single, REST))]))
-    check_memory(raster.width, raster.height, 12 * (len(kinds) + len(settings.single) + 4))
-    pictures = ghost_picture(
-        ghosts, lights, raster, wavelength_nm=settings.wavelength_nm, wavelengths=settings.wavelengths,
-        cell_px=settings.cell_px, layers=[kinds.index(key) for key in keys], threads=settings.threads, done=done,
-    )  # fmt: skip
+    check_memory(raster.width, raster.height, _bytes(len(kinds), len(settings.single)))
+    layers = [kinds.index(key) for key in keys]
+    pictures = ghost_picture(ghosts, lights, raster, layers=layers, **_fineness(settings), done=done)
     parts: Layers = {name: np.zeros(pictures.shape[1:], np.float32) for name in (*settings.single, REST)}
     for (name, factor), picture in zip(kinds, pictures, strict=False):
         parts[name] += picture * np.array(factor, np.float32)
     return {"ghosts": np.sum(list(parts.values()), 0), **(parts if settings.single else {})}
+
+
+def _bytes(pictures: int, layers: int) -> int:
+    """Of a pixel, of pictures that are drawn and layers of single ghosts that they become."""
+    return 12 * (pictures + layers + 4)
+
+
+def _fineness(settings: FlareSettings) -> dict[str, Any]:
+    """The settings that `ghost_layers` and `ghost_picture` have."""
+    names = "wavelength_nm", "wavelengths", "cell_px", "threads"
+    return {name: getattr(settings, name) for name in names}
 
 
 def _glare(lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, done: Report) -> Layers:

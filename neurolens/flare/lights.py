@@ -23,15 +23,16 @@ from neurolens.optics.sag import sag_mm
 
 _PLASTIC = 1.32471795724474602596  # of the R2 sequence (Roberts 2018): x^3 = x + 1
 
+SUN = math.pi  # irradiance by which the sun lights a white card across its way to radiance 1
 MOST_LIGHTS = 10_000  # of a list, and of --most
 # Columns of a list of lights: what is left out, and least and most.
 _COLUMNS: dict[str, tuple[float, float, float]] = {
     "frame": (0.0, -1e7, 1e7),
     "azimuth_deg": (math.nan, -360.0, 360.0),
     "elevation_deg": (math.nan, -90.0, 90.0),
-    "r": (1.0, 0.0, 1e30),
-    "g": (1.0, 0.0, 1e30),
-    "b": (1.0, 0.0, 1e30),
+    "r": (SUN, 0.0, 1e30),
+    "g": (SUN, 0.0, 1e30),
+    "b": (SUN, 0.0, 1e30),
     "distance_m": (math.inf, 1e-6, math.inf),
 }
 
@@ -95,7 +96,7 @@ def read_lights(path: Path) -> list[Track]:
     """The lights of a list: CSV with a header, or JSON, a list of objects.
 
     Columns or keys: azimuth_deg, elevation_deg; and, where they are not left out, light (a name; without it each row is
-    a light), frame (rows of one light are its keys, frames increasing), r, g, b (irradiance, 1), distance_m (inf).
+    a light), frame (rows of one light are its keys, frames increasing), r, g, b (irradiance, `SUN`), distance_m (inf).
 
     Raises:
         InputError: names file, row and column, for an unknown or missing one, or a value that is none; no light, or

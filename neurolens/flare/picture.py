@@ -212,17 +212,45 @@ def ghost_picture(
     threads: int = 2,
     done: Callable[[float], None] = lambda share: None,
 ) -> Floats:
-    """The ghosts of lights, [layers, H, W, 3] linear sRGB, each drawn as the areas of a grid of rays (`flare.area`).
+    """The ghosts of lights, [layers, H, W, 3] linear sRGB, as `ghost_layers` draws them.
+
+    Args:
+        layers: of each pair the layer that takes it; None puts all into one.
+    """
+    layers = [0] * len(tracer.pairs) if layers is None else layers
+    picture = np.zeros((1 + max(layers, default=0), raster.height, raster.width, 3), np.float32)
+    for number, drawn in ghost_layers(
+        tracer, lights, raster, layers, wavelength_nm=wavelength_nm, wavelengths=wavelengths, cell_px=cell_px,
+        threads=threads, done=done,
+    ):  # fmt: skip
+        picture[number] = drawn
+    return picture
+
+
+def ghost_layers(
+    tracer: GhostTracer | GhostModel,
+    lights: Sequence[Light],
+    raster: Raster,
+    layers: Sequence[int],
+    *,
+    wavelength_nm: tuple[float, float] = (400.0, 700.0),
+    wavelengths: int = 15,
+    cell_px: float = 8.0,
+    threads: int = 2,
+    done: Callable[[float], None] = lambda share: None,
+) -> Iterator[tuple[int, Floats]]:
+    """Number and picture [H, W, 3] linear sRGB of each layer that has light, one after the other.
+
+    Each ghost is drawn as the areas of a grid of rays (`flare.area`).
 
     Args:
         wavelengths: of equal shares of the range, which fewer stand for where a ghost's colours part little. cell_px:
             size of a grid's cells on the film, about: see `grids_of`.
-        layers: of each pair the layer that takes it; None puts all into one.
+        layers: of each pair the layer that takes it.
         done: told the share of the work that is done.
     """
     lens, spectral = tracer.lens, SpectralRange(*wavelength_nm, bins=wavelengths)
-    layer = dict(zip(tracer.pairs, [0] * len(tracer.pairs) if layers is None else layers, strict=True))
-    picture = np.zeros((1 + max(layer.values(), default=0), raster.height, raster.width, 3), np.float32)
+    layer = dict(zip(tracer.pairs, layers, strict=True))
     middle, size = 0.5 * sum(wavelength_nm), (raster.width, raster.height)
     unit = raster.per_mm**2 / axis_irradiance(lens, middle) / wavelengths
     half, nm = (raster.film_mm[0] / 2, raster.height / raster.per_mm / 2), spectral.centres_nm
@@ -243,15 +271,16 @@ def ghost_picture(
         found = tracer.follow_each(tracer.start(rays), wavelengths_nm, pair, REACH)
         return [edges_of(of_one, grid.columns, size, raster.per_mm) for of_one in found], area * grid.cell * colours
 
-    for number in range(len(picture)):
+    for number in sorted({layer[pair] for _, pair, *_ in tasks}):
+        picture = np.zeros((raster.height, raster.width, 3), np.float32)
         for batch in _batches([task for task in tasks if layer[task[1]] == number]):
             found = [found for _, found in work.results(edges, batch, threads)]
             each = [edges for of_ghost, _ in found for edges in of_ghost]
             drawn = np.concatenate(each), np.array(list(map(len, each))), np.concatenate([of for _, of in found])
-            one = partial(lambda number, drawn, rows: draw_edges(picture[number], rows, *drawn), number, drawn)
+            one = partial(lambda picture, drawn, rows: draw_edges(picture, rows, *drawn), picture, drawn)
             for _ in work.results(one, strips, threads):
                 pass
-    return picture
+        yield number, picture
 
 
 def _batches(tasks: Sequence[_Task]) -> Iterator[list[_Task]]:

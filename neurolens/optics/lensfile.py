@@ -1,57 +1,6 @@
-"""Lens files: one prescription a TOML file, read strictly. `lenswriter` writes them.
+"""Reads lens files, strictly: one prescription in a TOML file. `lenswriter` writes them.
 
-The format, complete; keys marked optional may be left out:
-
-    schema = 1
-    name = "Double Gauss 50 mm f/1.8"
-    designer = "..."            # optional
-    source = "patent or book and page"
-    f_number = 1.8              # nominal, of the source; the stop's diameter is what counts
-    efl_mm = 50.0               # optional: as the source states it, in y-z; the surfaces are what counts
-    efl_x_mm = 25.0             # optional: in x-z, of an anamorphic lens
-    image_radius_mm = 21.6      # optional
-    half_field_deg = 23.3       # optional, from the axis
-    rims = "source"             # where the diameters come from: "source", "estimated" (by somebody) or "derived"
-    notes = "..."               # optional: what was corrected or estimated, and why
-    wavelengths_nm = [587.6, 486.1, 656.3]       # optional: of the source, its primary wavelength first
-    object_medium = { n_d = 1.333, V_d = 55.8 }  # optional: in front of the lens (or glass = "..."); else air
-
-    # From the scene to the film, one row per surface, numbered from 0.
-    # radius_mm: positive when the centre of curvature lies towards the film, inf for a plane.
-    # thickness_mm: to the next surface; the last one to the film. diameter_mm: full clear diameter; with
-    # rims = "derived" it may be left out, and follows from f-number and field (see `rims`).
-    # n_d, V_d: of the medium after the surface, in the last row that in which the film lies; without n_d it is air. V_d
-    # may be left out where unknown: the index is then constant. glass: name in the catalogue, whose dispersion then
-    # rules over n_d and V_d (which may be left out; they are needed where the catalogue does not know the name).
-    # material: name of the glass in the source, for people only. stop = true: the aperture stop, one row.
-    # Optional: conic (Schwarzschild's constant K, 0 a sphere, -1 a paraboloid), asphere (power = coefficient:
-    # sag = conic + sum A_p r^p, mm), cylinder = "x" or "y" (the axis along which it is curved; across_mm: a toroid, the
-    # curve turned about a line parallel to that axis at this radius; across_conic, too: a biconic, whose sections have
-    # these radii and conics), focal_mm (an ideal thin lens: a plane in air), absorption_per_mm (Napierian, of the
-    # medium after the surface), coating (a design such as "quarter-wave 550", or the name of one of those below).
-    surfaces = [
-      { radius_mm = 33.802, thickness_mm = 5.817, diameter_mm = 41.66, n_d = 1.6645, V_d = 35.91, material = "..." },
-      { radius_mm = inf, thickness_mm = 10.211, diameter_mm = 19.05, stop = true },
-      { radius_mm = 20.0, thickness_mm = 3.0, diameter_mm = 12.0, glass = "N-BK7", asphere = { 4 = 1e-6 } },
-    ]
-
-    [[coating]]                 # optional: layers are [refractive index, thickness in nm] from the scene's side, or
-    name = "mine"               # [n_d, thickness, V_d] of films that disperse
-    layers = [[1.38, 99.6]]
-
-    [aperture]                  # optional: blades of the stop, whose diameter is then that of the circle round them
-    blades = 9
-    rotation_deg = 10.0         # optional: of the first corner, from x towards y
-    curvature = 0.6             # optional: of the edges, 0 straight to 1 round
-
-    [[configuration]]           # zoom and focus states, optional: thicknesses that replace those above, by surface
-    name = "135mm"
-    efl_mm = 135.0              # may be left out in a focus state
-    thickness_mm = { 5 = 26.15, 9 = 12.89 }
-    half_field_deg = 9.15       # optional
-    f_number = 2.9              # optional
-    stop_diameter_mm = 38.9     # optional
-    object_distance_mm = 750.0  # of a focus state: object to front vertex
+docs/pages/reference/lens-file.md describes the format: every key with its unit, default and limits, and an example.
 """
 
 from __future__ import annotations

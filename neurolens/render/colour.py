@@ -11,6 +11,7 @@ Interop Forum.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -63,6 +64,11 @@ class ColourSpace:
     def chromaticities(self) -> tuple[float, ...]:
         """Primaries and white as OpenEXR's attribute of that name has them, 8 numbers."""
         return tuple(value for xy in (*self.primaries, self.white) for value in xy)
+
+    @property
+    def stated(self) -> dict[str, Any]:
+        """What the metadata of a picture say of its colours."""
+        return {"space": self.name, "white_xy": list(self.white), "adaptation": "Bradford"}
 
 
 SRGB = ColourSpace("sRGB", "lin_rec709_scene", ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06)), (0.3127, 0.3290))

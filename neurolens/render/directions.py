@@ -102,16 +102,20 @@ class DirectionTable:
         cosine = np.cos(np.linspace(0, math.pi, self._height + 1))
         self._cosine = cosine.astype(np.float32)
         solid = (cosine[:-1] - cosine[1:]) * 2 * math.pi / self._width
-        share = weights.astype(np.float64) * solid[:, None]
+        # Each step in place: of a picture of 8192 by 4096 cells an array takes 0.27 GB.
+        share = np.multiply(weights, solid[:, None], dtype=np.float64)
         rows = share.sum(axis=1)
         self.total = float(rows.sum())
-        self._density = (weights / self.total).astype(np.float32).ravel()
+        self._density = (weights / self.total).astype(np.float32, copy=False).ravel()
         self._rows = np.concatenate([[0.0], np.cumsum(rows) / self.total])
         self._rows[-1] = 1.0
         # One sorted list for all rows: that of row r runs from r to r + 1.
-        within = np.cumsum(share, axis=1) / np.maximum(rows, 1e-300)[:, None]
-        within[:, -1] = 1.0
-        self._columns = (np.minimum(within, 1.0) + np.arange(self._height)[:, None]).ravel()
+        np.cumsum(share, axis=1, out=share)
+        share /= np.maximum(rows, 1e-300)[:, None]
+        share[:, -1] = 1.0
+        np.minimum(share, 1.0, out=share)
+        share += np.arange(self._height)[:, None]
+        self._columns = share.ravel()
 
     def sample(self, square: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Directions [3, N] and densities [N] per solid angle for numbers [2, N] in [0, 1)."""

@@ -196,13 +196,13 @@ def _picture(environment: Environment, picture: FloatArray, palette: Palette) ->
     units: tuple[Vector, ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     rows = [palette.light(unit, environment.illuminant) for unit in units]
     height, width = picture.shape[:2]
-    texels = np.ascontiguousarray(picture.reshape(-1, 3).T) * np.float32(environment.scale)
+    texels, scale = picture.reshape(-1, 3), np.float32(environment.scale)
     turn = math.radians(environment.rotate_y_deg)
 
     def coefficients(direction: FloatArray) -> FloatArray:
-        return texels.take(cell_of(direction, height, width, turn), axis=1)
+        return np.multiply(texels.take(cell_of(direction, height, width, turn), axis=0).T, scale, order="C")
 
-    bright = (palette.means(rows) @ texels).reshape(height, width)
+    bright = (texels @ (palette.means(rows) * scale)).reshape(height, width)
     return Surroundings(palette, rows, coefficients, bright, turn)
 
 

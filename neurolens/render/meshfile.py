@@ -34,6 +34,7 @@ _CORNER = re.compile(rf"{_INDEX}(?:/(?:{_INDEX})?(?:/{_INDEX})?)?")
 _OBJ_LINES = {"v": (3, 7, 3, "v X Y Z"), "vt": (2, 3, 2, "vt U V"), "vn": (3, 3, 3, "vn X Y Z")}
 _FACE = "f I J K, counted from 1, or back from -1"
 _LARGEST_MTL, _MOST = 4_000_000, 1000  # bytes of an MTL file, materials
+_LARGEST, _LARGEST_UV = 1e60, 1e6  # areas are finite; texture coordinates have pixels left in float32
 _GREY: Vector = (0.8, 0.8, 0.8)  # of a material that says nothing
 
 
@@ -120,8 +121,9 @@ def _checked(scene: Path, field: str, mesh: TriangleSet, file: Path | None) -> T
     if not len(faces):
         raise InputError(scene, f"{field}.faces", "(none)", "at least one triangle")
     for name, values in (("vertices_m", vertices), ("texture coordinates", mesh.uv), ("normals", mesh.normals)):
-        if values is not None and not np.all(np.isfinite(values)):
-            raise InputError(scene, f"{field}.{name}", "(not finite)", "finite numbers")
+        most = _LARGEST_UV if name == "texture coordinates" else _LARGEST
+        if values is not None and not np.all(np.abs(values) <= most):
+            raise InputError(scene, f"{field}.{name}", "(not finite, or too large)", f"finite numbers up to {most:g}")
     for k in np.flatnonzero(np.any((faces < 0) | (faces >= len(vertices)), axis=1))[:1]:
         raise InputError(scene, f"{field}.faces[{k}]", faces[k].tolist(), f"vertices from 0 to {len(vertices) - 1}")
     corners = vertices[faces]

@@ -11,6 +11,7 @@ import json
 import math
 import os
 import sys
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from pathlib import Path
@@ -21,22 +22,32 @@ import OpenEXR
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, UnidentifiedImageError
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import atomic_path, open_regular, read_bytes
 from neurolens.base.tomlfile import parse_json
 from neurolens.cameras.contract import FloatArray
 from neurolens.optics.apertures import MAX_MASK, THRESHOLD, Aperture
-from neurolens.render.colour import SRGB, ColourSpace, conversion, converted, linear_to_srgb, srgb_to_linear
+from neurolens.render.colour import (
+    COLOUR_SPACES,
+    SRGB,
+    ColourSpace,
+    conversion,
+    converted,
+    linear_to_srgb,
+    srgb_to_linear,
+)
+from neurolens.render.radiance import read_radiance
 from neurolens.render.scenetables import BRIGHTEST
 
 METADATA_KEY = "neurolens"
 _HALF_MAX = 65504.0
 _BAND = 1 << 17  # pixels of a preview that are encoded at a time
 _COLOURS = "RGB"
-LARGEST_PICTURE, LARGEST_ENVIRONMENT, LARGEST_FILM = 8192, 4096, 1 << 16  # pixels per side
+LARGEST_PICTURE, LARGEST_FILM = 8192, 1 << 16  # pixels per side
 MOST_PIXELS = 1 << 26  # of all textures of a scene: 0.8 GB
 _MOST_VALUES, _LARGEST_FILE = 1 << 28, 1 << 28  # of an OpenEXR file; bytes of any other
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "TGA", "WEBP")  # of Pillow's, which would ask other programs for some
+_ROUNDED = 2e-4  # how far the chromaticities of one space may lie apart in files
 _TYPES = (np.uint32, np.float16, np.float32)  # by the numbers of pixel types in OpenEXR files
 _DEPTH = "Z"  # the name of depth in other programs
 
@@ -181,11 +192,35 @@ def read_channels(path: str | Path, wanted: Sequence[str] = ()) -> tuple[dict[st
 
 def read_metadata(path: str | Path) -> dict[str, Any]:
     """The metadata of a picture alone, {} without ours; raises InputError as `read_channels`."""
+    return _metadata(path, _header(path).get(METADATA_KEY, "{}"))
+
+
+def read_colour_space(path: str | Path) -> ColourSpace | None:
+    """The colour space whose chromaticities a picture states; None where it states none.
+
+    Warns:
+        NeurolensWarning: chromaticities of another space, in whose place sRGB is assumed.
+
+    Raises:
+        InputError: as `read_channels`.
+    """
+    stated = _header(path).get("chromaticities")
+    if not isinstance(stated, tuple) or len(stated) != len(SRGB.chromaticities):
+        return None
+    for space in COLOUR_SPACES.values():
+        if np.allclose(stated, space.chromaticities, rtol=0, atol=_ROUNDED):
+            return space
+    names = " nor ".join(COLOUR_SPACES)
+    text = f"{path}: its chromaticities are those of neither {names}; its colours are read as sRGB"
+    warnings.warn(text, NeurolensWarning, stacklevel=2)
+    return SRGB
+
+
+def _header(path: str | Path) -> dict[str, Any]:
     with _whole(path, "file", "(missing)", named=False), _silent():
         open_regular(path).close()
         with OpenEXR.File(str(path), header_only=True) as header:
-            text = header.parts[0].header.get(METADATA_KEY, "{}")
-    return _metadata(path, text)
+            return dict(header.parts[0].header)
 
 
 def _metadata(path: str | Path, text: Any) -> dict[str, Any]:
@@ -213,6 +248,7 @@ def _read_channels(
     place: tuple[str | Path, str] | None = None,
     most: int = LARGEST_FILM,
     wanted: Sequence[str] = (),
+    pixels: int = _MOST_VALUES,
 ) -> tuple[dict[str, FloatArray], Any]:
     """Channels as float32, and the text of our metadata.
 
@@ -220,7 +256,7 @@ def _read_channels(
 
     Args:
         place: file and field that name the picture, if there are others than the picture itself. most: pixels per side.
-        wanted: the channels, where the file has these; else all.
+        wanted: the channels, where the file has these; else all. pixels: the most in all.
     """
     file, field = place or (path, "file")
     name = str(path) if place else "(missing)"
@@ -229,8 +265,8 @@ def _read_channels(
         with _silent(), OpenEXR.File(str(path), header_only=True) as header:
             parts = [dict(part.header) for part in header.parts]
             sizes = [[int(v) + 1 - int(u) for u, v in zip(*part["dataWindow"], strict=True)] for part in parts]
-        if max(map(max, sizes)) > most:
-            raise InputError(file, field, name, f"a picture of at most {most} pixels per side")
+        for size in sizes:
+            _check_size(file, field, name, size, most, pixels)
         kept = {c.name for c in parts[0]["channels"] if (c.xSampling, c.ySampling) == (1, 1)}.issuperset(wanted)
         some = bool(wanted) and kept and len(parts[0]["channels"]) > len(wanted)
         values = sum(w * h * len(part["channels"]) for (w, h), part in zip(sizes, parts, strict=True))
@@ -303,29 +339,44 @@ def write_png(path: str | Path, rgb: ArrayLike, exposure: float = 0.0) -> None:
         Image.fromarray(encoded).save(temporary)
 
 
+def _check_size(file: str | Path, field: str, name: str, size: Sequence[int], most: int, pixels: int) -> None:
+    if max(size) > most:
+        raise InputError(file, field, name, f"a picture of at most {most} pixels per side")
+    if math.prod(size) > pixels:
+        raise InputError(file, field, name, f"{MOST_PIXELS} pixels at most in all pictures of a scene")
+
+
 @contextmanager
-def _opened(file: str | Path, field: str, path: Path, most: int) -> Iterator[Image.Image]:
-    """A picture of at most `most` pixels per side; mistakes name file and field."""
-    try:
-        data = io.BytesIO(read_bytes(path, _LARGEST_FILE, "a picture", (file, field)))
-        with Image.open(data, formats=FORMATS) as picture:
-            if max(picture.size) > most:
-                raise InputError(file, field, str(path), f"a picture of at most {most} pixels per side")
+def _opened(file: str | Path, field: str, path: Path, most: int, pixels: int = MOST_PIXELS) -> Iterator[Image.Image]:
+    """A picture of at most `most` pixels per side, and of at most `pixels`; mistakes name file and field."""
+    with _decoded(file, field, path) as data, warnings.catch_warnings(action="ignore"):  # Pillow's, of damaged files
+        with Image.open(io.BytesIO(data), formats=FORMATS) as picture:
+            _check_size(file, field, str(path), picture.size, most, pixels)
             yield picture
+
+
+@contextmanager
+def _decoded(file: str | Path, field: str, path: Path) -> Iterator[bytes]:
+    """The content of a picture's file; errors of decoding it inside the block become InputError."""
+    try:
+        yield read_bytes(path, _LARGEST_FILE, "a picture", (file, field))
     except (InputError, MemoryError):
         raise
     except Exception as error:  # decoders of damaged files raise errors of many types
-        kinds = ", ".join(FORMATS)
+        kinds = ", ".join((*FORMATS, "Radiance (.hdr)", "OpenEXR"))
         why = "" if isinstance(error, UnidentifiedImageError) else f" ({error})"  # its words name an object
         raise InputError(file, field, str(path), f"a readable picture, one of {kinds}{why}") from None
 
 
 def read_pictures(scene: Path, files: Mapping[str, Path]) -> dict[str, FloatArray]:
-    """The pictures of a scene by their fields, as `read_picture` reads them; together of at most `MOST_PIXELS`."""
+    """The pictures of a scene by their fields, as `read_picture` reads them; together of at most `MOST_PIXELS`.
+
+    Their values are reflectances: those beyond 0 to 1 are clamped, with a warning.
+    """
     found: dict[str, FloatArray] = {}
     left = MOST_PIXELS
     for field, path in files.items():
-        found[field] = read_picture(scene, field, path, pixels=left)
+        found[field] = _clamped(scene, field, path, read_picture(scene, field, path, pixels=left), 1.0)
         left -= found[field][..., 0].size
     return found
 
@@ -333,14 +384,24 @@ def read_pictures(scene: Path, files: Mapping[str, Path]) -> dict[str, FloatArra
 def read_picture(
     scene: Path, field: str, path: Path, most: int = LARGEST_PICTURE, pixels: int = MOST_PIXELS
 ) -> FloatArray:
-    """Linear RGB [H, W, 3] of an sRGB picture: of 8 bits, or a grey one of 16 bits, which Pillow would clip to 8.
+    """Linear sRGB [H, W, 3] of a picture: of OpenEXR and Radiance as stored; else of one that is encoded as sRGB is, of
+    8 bits, or grey of 16 bits, which Pillow would clip to 8.
 
     Raises:
         InputError: names scene file, field and picture, which is missing, too large or broken.
     """
-    with _opened(scene, field, path, most) as picture:
-        if picture.width * picture.height > pixels:
-            raise InputError(scene, field, str(path), f"{MOST_PIXELS} pixels at most in all pictures of a scene")
+    kind = path.suffix.lower()
+    if kind == ".exr":
+        return _colours(_read_channels(path, (scene, field), most, _COLOURS, pixels)[0], scene, field)
+    if kind == ".hdr":
+        with _decoded(scene, field, path) as data:
+            radiance, ignored = read_radiance(
+                data, lambda *size: _check_size(scene, field, str(path), size, most, pixels)
+            )
+        if ignored:
+            _warn(scene, field, f"{path.name}: its pixels are taken as they are stored, without {', '.join(ignored)}")
+        return radiance
+    with _opened(scene, field, path, most, pixels) as picture:
         if picture.mode.startswith("I;16"):
             grey = srgb_to_linear(np.asarray(picture, np.float32) / np.float32(65535))
             return np.stack([grey] * 3, axis=-1)
@@ -350,22 +411,44 @@ def read_picture(
         return srgb_to_linear(np.arange(256, dtype=np.float32) / np.float32(255))[np.asarray(picture.convert("RGB"))]
 
 
+def _clamped(scene: Path, field: str, path: Path, picture: FloatArray, most: float | None = None) -> FloatArray:
+    """The picture with values that are no light replaced in place, and a warning that says how many and where.
+
+    Values that are negative or not a number become 0. Values above `most` become `most`; where it is None, infinite
+    values become the largest finite value, for a map of 16-bit floats holds the sun as infinite.
+    """
+    if most is None:
+        most = float(picture.max(where=np.isfinite(picture), initial=0))
+    bad = ~((picture >= 0) & (picture <= most)).all(axis=-1)  # so that NaN is bad
+    if bad.any():
+        row, column = divmod(int(bad.argmax()), bad.shape[1])
+        _warn(
+            scene, field,
+            f"{path.name}: {int(bad.sum())} of {bad.size} pixels have values that are negative, not a number or "
+            f"above {most:g}, the first in row {row + 1} from the top, column {column + 1}: they are clamped",
+        )  # fmt: skip
+        np.nan_to_num(picture, copy=False, nan=0.0, posinf=most, neginf=0.0)
+        np.clip(picture, 0, most, out=picture)
+    return picture
+
+
+def _warn(scene: Path, field: str, said: str) -> None:
+    warnings.warn(f"{scene}: {field}: {said}", NeurolensWarning, stacklevel=3)
+
+
 def read_environment(scene: Path, field: str, path: Path, scale: float = 1.0) -> FloatArray:
-    """Linear sRGB [H, W, 3] of an equirectangular picture, OpenEXR or a format of Pillow; not yet times `scale`.
+    """Linear sRGB [H, W, 3] of an equirectangular picture as of `read_picture`; not yet times `scale`.
+
+    Values that are negative, infinite or not a number are clamped, with a warning.
 
     Raises:
-        InputError: as `read_picture`; also a picture that is not twice as wide as high, values that are negative or not
-            finite or brighter than an emission may be, and black all over.
+        InputError: as `read_picture`; also a picture that is not twice as wide as high, values brighter than an
+            emission may be, and black all over.
     """
-    if path.suffix.lower() == ".exr":
-        picture = _colours(_read_channels(path, (scene, field), LARGEST_ENVIRONMENT, _COLOURS)[0], scene, field)
-    else:
-        picture = read_picture(scene, field, path, LARGEST_ENVIRONMENT)
+    picture = _clamped(scene, field, path, read_picture(scene, field, path))
     height, width = picture.shape[:2]
     if width != 2 * height:
         raise InputError(scene, field, f"({width} x {height} pixels)", "an equirectangular picture, 2 : 1")
-    if not np.all((picture >= 0) & np.isfinite(picture)):
-        raise InputError(scene, field, str(path), "a picture of finite values, 0 or more")
     if float(picture.max()) * scale > BRIGHTEST:
         expected = f"a picture whose values times scale are at most {BRIGHTEST:g}"
         raise InputError(scene, field, f"({float(picture.max()):g} times {scale:g})", expected)

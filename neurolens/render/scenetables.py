@@ -267,7 +267,8 @@ class Texture(Checked):
 
     kind "checker": squares of `cell_m` in two `colours`. kind "grid": lines `line_m` wide every `cell_m`, the first
     colour for the lines. kind "image": the picture `file` (beside the scene file), repeated every `size_m` (width,
-    height); without `size_m` it fills the rectangle, or lies on a mesh as the mesh's texture coordinates say.
+    height); without `size_m` it fills the rectangle, or lies on a mesh as the mesh's texture coordinates say. OpenEXR
+    and Radiance (.hdr) are read as linear sRGB, other pictures as sRGB.
     """
 
     kind: Literal["checker", "grid", "image"]
@@ -367,8 +368,9 @@ class Environment(Checked):
     """Light from infinitely far: one `colour`, a gradient by height from ground over horizon to zenith, or a picture.
 
     A picture `file` (beside the scene file) is equirectangular: its middle lies towards -z, its right half towards +x,
-    its top row at the zenith. OpenEXR is read as linear sRGB, other pictures as sRGB. It is multiplied by `scale` and
-    turned by `rotate_y_deg` about y as meshes are. `illuminant`: the light that the colours tint.
+    its top row at the zenith. OpenEXR and Radiance (.hdr) are read as linear sRGB, other pictures as sRGB. It is
+    multiplied by `scale` and turned by `rotate_y_deg` about y as meshes are. `illuminant`: the light that the colours
+    tint.
     """
 
     colour: Vector | None = None
@@ -401,9 +403,9 @@ class Flare(Checked):
     Attributes:
         coating: of surfaces between glass and air that the lens file leaves bare, named as `neurolens flare` does.
         bins: wavelengths. cell_px: pixels of the cells that ghosts are drawn by. brightest: ghosts that have layers of
-            their own. most: lights, those of the most energy. glare: photons a light and wavelength for the layer of
-            light that is reflected more than twice, 0 for none. starburst: whether diffraction has its layer. without:
-            names of layers that are not made.
+            their own, those with the greatest values on the film. most: lights, those of the most energy. glare:
+            photons a light and wavelength for the layer of light that is reflected more than twice, 0 for none.
+            starburst: whether diffraction has its layer. without: names of layers that are not made.
     """
 
     coating: str | None = None

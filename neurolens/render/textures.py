@@ -12,6 +12,7 @@ from neurolens.render.scenetables import Texture
 from neurolens.render.spectrum import Index, Palette, SpectralRange
 
 Frame = NDArray[np.float64]
+_STEEPEST = 1e25  # pictures or cells a metre; times the farthest point still finite in float32
 
 
 def _frame(origin: Frame, u: Frame, v: Frame, size: tuple[float, float]) -> Frame:
@@ -91,7 +92,8 @@ class TextureTable:
                 size = texture.size_m or ((cell, cell) if cell else frames[0, :, 4])
                 self._number[rows] = numbers[name]
                 # In cells, or in pictures.
-                self._frames[:, :, rows] = np.moveaxis(frames[:, :, :4] / np.array(size)[:, None], 0, -1)
+                scaled = np.clip(frames[:, :, :4] / np.array(size)[:, None], -_STEEPEST, _STEEPEST)
+                self._frames[:, :, rows] = np.moveaxis(scaled, 0, -1)
             first += count
         self._used = bool(np.any(self._number >= 0))
 

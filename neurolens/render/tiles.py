@@ -131,7 +131,7 @@ def check_together(tiles: Sequence[Tile]) -> None:
     if missing := [number for number in range(1, first.count + 1) if number not in seen]:
         of = "" if first.frame is None else f" of frame {first.frame}"
         shown = ", ".join(map(str, missing[:20])) + (", ..." if len(missing) > 20 else "")
-        raise InputError("neurolens merge", f"tiles{of}", f"({shown} missing)", f"all {first.count}")
+        raise InputError("neurolens render --merge", f"tiles{of}", f"({shown} missing)", f"all {first.count}")
 
 
 def merged(tiles: Sequence[Tile]) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:

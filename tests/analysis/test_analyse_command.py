@@ -41,7 +41,7 @@ def test_everything_at_once(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_state_fields_and_wavelengths(capsys: pytest.CaptureFixture[str]) -> None:
-    options = ("--focus", 2, "--fields", 0, 10, "--wavelengths", 587.5618, "--focusing", "best", "--full")
+    options = ("--focus", 2, "--field-points", 0, 10, "--wavelengths", 587.5618, "--focusing", "best", "--full")
     data = run_json(capsys, "analyse", TESSAR, "spots", *options)
     assert data["focus_m"] == 2 and data["spots"]["wavelength_nm"] == [587.5618]
     assert data["spots"]["field_deg"] == [0, 10] and len(data["spots"]["tangential_um"]) == 2
@@ -85,7 +85,7 @@ def test_an_anamorphic_lens_in_both_planes(tmp_path: Path, capsys: pytest.Captur
     [
         (["spot"], "spots, fans"),
         (["spots", "--full"], "only with --json"),
-        (["mtf", "--fields", "-3"], "degrees from 0"),
+        (["mtf", "--field-points", "-3"], "degrees from 0"),
         (["mtf", "--wavelengths", "0"], "wavelengths in nm from 100"),
         (["mtf", "-o", str(TESSAR)], "a folder"),
         (["mtf", "--zoom", "wide"], "zoom"),
@@ -105,7 +105,7 @@ def pinhole(tmp_path: Path) -> Path:
 def test_a_stop_wider_than_the_rims(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The outermost ray that passes counts: with the stop three times as wide, the lens is as fast as its rims."""
     lens = LENSES / "thorlabs_lb1471_biconvex_50.toml"
-    data = run_json(capsys, "analyse", lens, "spots", "psf", "--f-number", 1.0, "--fields", 0, "-o", tmp_path)
+    data = run_json(capsys, "analyse", lens, "spots", "psf", "--f-number", 1.0, "--field-points", 0, "-o", tmp_path)
     assert len(list(tmp_path.iterdir())) == 2
     assert data["spots"]["working_f_number"] == pytest.approx(49.1 / 25.4, rel=0.06)
     assert data["spots"]["airy_um"] == pytest.approx(1.22 * D / 1000 * data["spots"]["working_f_number"])
@@ -123,8 +123,8 @@ def test_no_light_is_one_error_or_a_gap(tmp_path: Path, capsys: pytest.CaptureFi
     assert np.isnan(image.half_width_um).all() and image.pupil_points[0] == 0
     plot_spots(spots(dark, fields), tmp_path / "spots.png", "", "")
     plot_psf(image, tmp_path / "psf.png", "", "")
-    assert "field 80: got (no light" in failure(capsys, "analyse", GAUSS, "spots", "--fields", 0, 80)
-    assert "expected at most 2" in failure(capsys, "analyse", GAUSS, "mtf", "--fields", 80)
+    assert "field 80: got (no light" in failure(capsys, "analyse", GAUSS, "spots", "--field-points", 0, 80)
+    assert "expected at most 2" in failure(capsys, "analyse", GAUSS, "mtf", "--field-points", 80)
 
 
 def test_a_stop_beyond_all_glass_warns_of_no_division(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

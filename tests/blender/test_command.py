@@ -16,6 +16,7 @@ import pytest
 
 pytest.importorskip("onnxruntime", reason="neurolens is not installed in Blender's environment")
 
+from neurolens.base import files  # noqa: E402
 from neurolens.base.errors import InputError  # noqa: E402
 from neurolens.cli import main  # noqa: E402
 from neurolens.commands import blender_lenses  # noqa: E402
@@ -76,6 +77,27 @@ def test_zip_holds_the_best_of_each_kind_and_takes_more(place: Path, capsys: pyt
     assert polynomial["kind"] == "polynomial" and polynomial["rms_um"] == pytest.approx(0.171, abs=1e-3)
     assert network["kind"] == "network" and exact["rms_um"] is None and exact["nearest_m"] == 0.7
     assert picture.startswith(b"\x89PNG") and picture[16:24] == bytes([0, 0, 1, 0] * 2)
+
+
+def test_an_installed_package_builds_in_any_folder(
+    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A wheel brings every lens file and a few models: a lens without a model is packed as its file is, traced."""
+    shutil.copy("lenses/brendel_tessar_100.toml", place / "lenses")
+    (place / "share").mkdir()
+    (place / "share" / "neurolens").symlink_to(place)
+    (place / "empty").mkdir()
+    monkeypatch.chdir(place / "empty")
+    monkeypatch.setattr(files, "__file__", str(place / "lib" / "site-packages" / "neurolens" / "base" / "files.py"))
+    monkeypatch.setattr(files.sys, "prefix", str(place))
+    for options, packed in (
+        ([], {LENS: ["ols-60", "mlp-10x1", "exact"], "brendel_tessar_100": ["exact"]}),
+        (["--lens", "brendel_tessar_100"], {"brendel_tessar_100": ["exact"]}),
+        (["--no-exact"], {LENS: ["ols-60", "mlp-10x1"]}),
+    ):
+        assert main(["blender", "build", "-o", "n.zip", "--jobs", "1", "--json", *options]) == 0
+        assert json.loads(capsys.readouterr().out)["lenses"] == packed
+    assert "got 'nothing', expected one of" in failed(capsys, "build", "-o", "n.zip", "--lens", "nothing")
 
 
 def test_lenses_that_cannot_be_shaders_are_left_out_and_said(place: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,6 +23,7 @@ shader camera(
   float f_number = 1.81 [[ string label = "F-Number", float min = 1.0 ]],
   int blades = 0 [[ string label = "Blades" ]],
   int vignetting = 1 [[ string widget = "checkBox" ]],
+  float unit_m = 1.0 [[ string label = "Metres per Unit", float min = 1e-6 ]],
   output point position = 0.0, output vector direction = 0.0, output color throughput = 1.0)
 {
   vector raster = camera_shader_raster_position();
@@ -91,15 +92,20 @@ def scene() -> Any:
     return scene
 
 
-def middle(scene: Any, folder: Path, frame: int = 1) -> list[float]:
-    """Colour of the middle of a render."""
+def middle(scene: Any, folder: Path, frame: int = 1, views: tuple[str, ...] = ("",)) -> list[float]:
+    """Colour of the middle of a render, of the first of its views."""
     scene.frame_set(frame)
     scene.render.filepath = str(folder / "render.exr")
     scene.render.image_settings.file_format = "OPEN_EXR"
     scene.render.image_settings.color_depth = "32"
     scene.view_settings.view_transform = "Raw"
     bpy.ops.render.render(write_still=True)
-    image = bpy.data.images.load(scene.render.filepath)
+    return middle_of(folder / f"render{views[0]}.exr")
+
+
+def middle_of(file: Path) -> list[float]:
+    """Colour of the middle of a picture."""
+    image = bpy.data.images.load(str(file))
     at = 4 * (9 * 32 + 16)
     colour = list(image.pixels[at : at + 3])
     bpy.data.images.remove(image)
@@ -146,7 +152,7 @@ def test_put_on_and_taken_back_leaves_no_trace(scene: Any) -> None:
     assert (camera.type, camera.custom_mode, scene.render.engine) == ("CUSTOM", "INTERNAL", "CYCLES")
     assert not scene.cycles.shading_system  # materials stay as they are: cameras in OSL do not ask for it
     assert camera.dof.use_dof and camera.lens == pytest.approx(49.6)
-    assert set(camera.cycles_custom.keys()) == {"f_number", "blades", "vignetting"}
+    assert set(camera.cycles_custom.keys()) == {"f_number", "blades", "vignetting", "unit_m"}
     assert bpy.ops.neurolens.apply(lens="gauss", kind="exact") == {"FINISHED"}
     assert bpy.ops.neurolens.take_back() == {"FINISHED"}
     assert everything(scene) == before
@@ -288,6 +294,62 @@ def test_a_render_that_will_be_black_says_so(scene: Any, tmp_path: Path, capfd: 
     bpy.ops.neurolens.take_back()
     middle(scene, tmp_path)
     assert "neurolens" not in capfd.readouterr().err
+
+
+def test_a_lens_takes_the_scene_s_unit_and_keeps_the_user_s(scene: Any) -> None:
+    """Centimetres: a focus distance of 50 is 0.5 m, nearer than the lens focuses."""
+    gauss, camera = {"lens": "gauss", "kind": "polynomial"}, scene.camera.data
+    scene.unit_settings.scale_length, camera.dof.focus_distance = 0.01, 50.0
+    assert "The focus distance is 0.5 m away" in said(**gauss)
+    camera.dof.focus_distance = 200.0
+    bpy.ops.neurolens.apply(**gauss)
+    assert camera.cycles_custom["unit_m"] == pytest.approx(0.01) and "unit of this scene" not in "".join(panel(scene))
+    camera.cycles_custom["unit_m"] = 0.1
+    bpy.ops.neurolens.apply(lens="zoom", kind="polynomial")
+    assert camera.cycles_custom["unit_m"] == pytest.approx(0.1)
+    assert "A unit of this scene is 0.01 m by its unit scale; the lens takes it for 0.1 m" in " ".join(panel(scene))
+    scene.unit_settings.system = "NONE"  # where Blender's unit scale does not count
+    assert "A unit of this scene is 1 m by its unit scale" in " ".join(panel(scene))
+
+
+def test_stereo_that_leaves_the_image_circle_is_told_by_what_cycles_shifts(
+    scene: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The eyes' films move by what the panel counts, which a shader shows that renders the place in the picture."""
+    camera, render, on_camera = scene.camera.data, scene.render, sys.modules[f"{MODULE}.camera"]
+    bpy.ops.neurolens.apply(lens="gauss", kind="polynomial")
+    camera.custom_shader.from_string("""shader camera(output point position = 0.0, output vector direction = 0.0,
+        output color throughput = 1.0) { direction = vector(0, 0, 1);
+        throughput = color(camera_shader_raster_position()) + 1; }""")
+    on_camera._compile(camera)
+    render.use_multiview, render.image_settings.views_format = True, "INDIVIDUAL"
+    scene.cycles.samples, scene.cycles.use_denoising = 64, False
+    camera.sensor_width, camera.shift_x, camera.stereo.convergence_distance = 30.0, 0.05, 1.0
+    for pivot, eyes in (("CENTER", (0.5, -0.5)), ("LEFT", (0.0, -1.0))):
+        camera.stereo.pivot = pivot
+        middle(scene, tmp_path, views=("_L", "_R"))
+        seen = [middle_of(tmp_path / f"render{eye}.exr")[0] - 1.5 - 0.5 / 32 for eye in ("_L", "_R")]
+        counted = on_camera.setting_of(scene, scene.camera).stereo
+        assert counted == pytest.approx([share * 0.065 * camera.lens / 30.0 for share in eyes])
+        assert seen == pytest.approx([0.05 + shift for shift in counted], abs=1e-3)
+    assert "stereo" not in " ".join(panel(scene)) + capfd.readouterr().err
+    camera.stereo.interocular_distance = 0.4
+    middle(scene, tmp_path, views=("_L", "_R"))
+    assert "Off-axis stereo takes a corner to" in " ".join(panel(scene))
+    assert "frame 1: Off-axis stereo takes a corner to" in capfd.readouterr().err
+    camera.stereo.convergence_mode = "PARALLEL"
+    assert "stereo" not in " ".join(panel(scene))
+
+
+def test_what_a_lens_does_to_passes_is_in_the_panel(scene: Any) -> None:
+    bpy.ops.neurolens.apply(lens="gauss", kind="polynomial")
+    words = ("Alpha where nothing is", "Cryptomatte's coverage", "Vector pass")
+    assert not any(word in " ".join(panel(scene)) for word in words)
+    layer = scene.view_layers[0]
+    layer.use_pass_cryptomatte_material = layer.use_pass_vector = scene.render.film_transparent = True
+    assert all(word in " ".join(panel(scene)) for word in (*words, "Vignetting off"))
+    scene.camera.data.cycles_custom["vignetting"] = False
+    assert "Vignetting off" not in " ".join(panel(scene))
 
 
 def test_what_cannot_be_is_one_sentence_and_changes_nothing(scene: Any) -> None:

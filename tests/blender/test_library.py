@@ -186,10 +186,11 @@ def test_refusals_and_notes_are_sentences() -> None:
     assert not library.refusals(variant(film_radius_mm=10.0), setting(sensor_mm=(fitted, fitted * 2 / 3)))
     said = library.notes(
         variant(rms_um=25.0, poor=("pixels",), notes=("no coatings",)),
-        setting(f_number=1.2, focus_m=None, unit_m=0.01, on_gpu=True),
+        setting(f_number=1.2, focus_m=None, unit_m=0.01, on_gpu=True, passes=("vector",)),
     )
-    assert len(said) == 7 and said[0] == "The lens opens to f/1.8: f/1.2 renders as that" and said[-1] == "no coatings"
-    assert "2.5 pixels" in said[4]
+    assert len(said) == 8 and said[0] == "The lens opens to f/1.8: f/1.2 renders as that" and said[-1] == "no coatings"
+    assert "is 0.01 m by its unit scale; the lens takes it for 1 m" in said[2]
+    assert "2.5 pixels" in said[4] and "Vector pass is wrong" in said[6]
     assert library.refusals(variant(nearest_m=None), setting(focus_m=0.01)) == []
     assert library.refusals(variant(), setting(focus_m=math.inf)) == []
 
@@ -201,8 +202,33 @@ def test_shift_is_told_where_it_counts_another_side_or_leaves_the_picture() -> N
     [line] = library.notes(variant(), setting(**small, shift=(0.1, 0.1), shift_side_mm=24.0))
     assert line == "Shift Y counts heights here: for what 0.1 does in Blender's own camera, set 0.2"
     assert library.notes(variant(), setting(shift_side_mm=36.0)) == []
-    [line] = library.notes(variant(), setting(shift=(0.1, 0.0), shift_side_mm=36.0))
-    assert "24.71 mm from the axis; the lens's picture ends at 21.6 mm" in line  # hypot(0.6 * 36, 12)
+    assert library.outside(variant(), setting(**small, shift=(0.2, 0.1))) == []
+    [line] = library.outside(variant(), setting(shift=(0.1, 0.0)))
+    assert "The shift takes a corner to 24.71 mm from the axis; the lens's picture ends at 21.6 mm" in line
+    assert math.hypot(0.6 * 36, 12) == pytest.approx(24.71, abs=0.005)
+
+
+def test_the_eye_whose_picture_leaves_the_image_circle_is_told() -> None:
+    """A film of 33 x 16 mm reaches 18.3 of 21.6 mm; an eye that is shifted by a fifth of the width, 24.5 mm."""
+    film = {"sensor_mm": (33.0, 16.0)}
+    assert library.outside(variant(), setting(**film, stereo=(0.05, -0.05))) == []
+    for shift, stereo in ((0.0, (0.1, -0.2)), (0.1, (0.1, -0.1)), (-0.1, (0.0, -0.1))):
+        [line] = library.outside(variant(), setting(**film, shift=(shift, 0.0), stereo=stereo))
+        assert line.startswith("Off-axis stereo takes a corner to 24.45 mm") and "Parallel" in line
+    assert math.hypot(0.7 * 33, 8) == pytest.approx(24.45, abs=0.005)
+    assert library.outside(variant(), setting(**film, shift=(0.2, 0.0), stereo=(-0.18, -0.2))) == []
+
+
+def test_what_a_lens_does_to_passes_is_told_where_they_are_rendered() -> None:
+    """As Cycles has it: `test_optics` measures it."""
+    assert library.notes(variant(), setting()) == []
+    alpha, matte = library.notes(variant(), setting(passes=("cryptomatte", "alpha")))
+    assert alpha.startswith("Alpha where nothing is: 1 minus the lens's light there") and "Vignetting off" in alpha
+    assert (
+        matte.startswith("Cryptomatte's coverage of what is opaque: the lens's light") and "illumination map" in matte
+    )
+    [alpha] = library.notes(variant(), setting(passes=("alpha",), darkens=False))
+    assert "nearly 1" in alpha and "Vignetting" not in alpha
 
 
 def test_error_in_pixels_of_the_render() -> None:

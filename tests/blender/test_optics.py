@@ -6,6 +6,7 @@ import json
 import math
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +90,10 @@ class Studio:
 
     def picture(self, shot: dict[str, Any], samples: int | None = None) -> Any:
         """[H, W, 3] of a shot's crop, the lowest row first."""
+        return self.pixels(shot, samples)[..., :3]
+
+    def pixels(self, shot: dict[str, Any], samples: int | None = None, matte: str = "") -> Any:
+        """[H, W, 4] of a shot's crop, or its matte of an object by Cryptomatte, the lowest row first."""
         self.set(shot)
         render = self.scene.render
         left, bottom, right, top = shot.get("crop", (0, 0, shot["width"], shot["height"]))
@@ -99,14 +104,19 @@ class Studio:
         shape = top - bottom, right - left
         self.scene.cycles.samples = samples or int(min(max(_SAMPLES / math.prod(shape), 32), 4096))
         render.filepath = str(self.folder / "shot.exr")
-        bpy.ops.render.render(write_still=True)
-        image = bpy.data.images.load(render.filepath)
-        found = np.empty(image.size[0] * image.size[1] * 4, np.float32)
-        image.pixels.foreach_get(found)
-        size = image.size[1], image.size[0]
+        render.use_compositing = bool(matte)
+        if matte:
+            with composition(self.scene) as (tree, out):
+                node = tree.nodes.new("CompositorNodeCryptomatteV2")
+                node.source, node.scene, node.matte_id = "RENDER", self.scene, matte
+                tree.links.new(node.outputs["Matte"], out)
+                bpy.ops.render.render(write_still=True)
+        else:
+            bpy.ops.render.render(write_still=True)
+        image, found = pixels_of(Path(render.filepath))
         bpy.data.images.remove(image)
-        assert size == shape
-        return found.reshape(*shape, 4)[..., :3].astype(float)
+        assert found.shape[:2] == shape
+        return found
 
     def measured(self, shot: dict[str, Any]) -> dict[str, Any]:
         return measures(self.picture(shot), shot["crop"][:2])
@@ -208,6 +218,53 @@ def test_shift_counts_widths_and_heights_where_blenders_own_camera_counts_the_lo
         data.type, data.shift_x, data.shift_y = "CUSTOM", 0.0, 0.0
 
 
+def test_a_scene_in_centimetres_is_the_scene_in_metres(studio: Studio) -> None:
+    """Lengths of the scene, and the distance of depth of field, 100 times as large; the lens out of focus as before."""
+    [shot] = [s for s in named("off axis") if s["crop"] == named("off axis")[0]["crop"]]
+    data = studio.camera.data
+    custom = shot["custom"] | {"focus_m": 0.0}
+    found = []
+    try:
+        for unit_m in (1.0, 0.01):
+            data.dof.focus_distance, data.clip_end = 3.0 / unit_m, 100.0 / unit_m
+            scaled = shot | {"point_m": [v / unit_m for v in shot["point_m"]], "radius_m": shot["radius_m"] / unit_m}
+            found.append(studio.measured(scaled | {"custom": custom | {"unit_m": unit_m}}))
+    finally:
+        data.cycles_custom["unit_m"], data.clip_end = 1.0, 100.0
+    for seen in found:
+        assert seen["centroid_px"][0] == pytest.approx(shot["found"]["centroid_px"][0], abs=0.3)
+        assert seen["area_px"] == pytest.approx(shot["found"]["area_px"], rel=0.02)
+
+
+def test_alpha_and_cryptomatte_are_what_the_panel_and_the_documentation_say(studio: Studio) -> None:
+    """Of empty sky, alpha is 1 minus the lens's light; coverage of what is opaque is that light, and without vignetting
+    nearly 1."""
+    [shot] = named("card", "rectilinear")
+    scene, layer = studio.scene, studio.scene.view_layers[0]
+    studio.world.default_value, studio.light.hide_render = (1, 1, 1, 1), True
+    wall = bpy.data.objects.new("wall", bpy.data.meshes.new("wall"))
+    wall.data.from_pydata([(-9, -9, -5), (9, -9, -5), (9, 9, -5), (-9, 9, -5)], [], [(0, 1, 2, 3)])
+    scene.collection.objects.link(wall)
+    layer.use_pass_cryptomatte_object = True
+    scene.render.image_settings.color_mode = "RGBA"
+    try:
+        for vignetting, least, most in ((True, 0.5, 0.7), (False, 0.9, 1.0)):
+            given = shot | {"custom": shot["custom"] | {"vignetting": vignetting}}
+            wall.hide_render, scene.render.film_transparent = True, False
+            light = studio.picture(given, 128).mean(2)  # of all colours, as throughput counts
+            scene.render.film_transparent = True
+            assert studio.pixels(given, 128)[..., 3] == pytest.approx(1 - light, abs=0.03)
+            wall.hide_render = False
+            assert studio.pixels(given, 128)[..., 3] == pytest.approx(1, abs=1e-4)
+            coverage = studio.pixels(given, 128, matte="wall")[..., 0]
+            assert coverage == pytest.approx(light, abs=0.03) and least < coverage.min() < most
+    finally:
+        studio.world.default_value, studio.light.hide_render = (0, 0, 0, 1), False
+        layer.use_pass_cryptomatte_object = scene.render.film_transparent = False
+        bpy.data.objects.remove(wall)
+        studio.camera.data.cycles_custom["vignetting"] = True
+
+
 def test_map_uv_reads_st_maps_as_they_are_written(studio: Studio) -> None:
     """A picture of its own pixels' places, led through both maps, holds what the maps say."""
     for kind, other in (("undistort", "redistort"), ("redistort", "undistort")):
@@ -236,33 +293,43 @@ def pixels_of(file: Path) -> tuple[Any, Any]:
     return image, found.reshape(image.size[1], image.size[0], 4).astype(float)
 
 
-def composited(studio: Studio, picture: Any, map_: Any, width: int, height: int) -> Any:
-    """A picture through Blender's Map UV, the lowest row first, and how far from a place it may read, in pixels."""
-    scene = studio.scene
+@contextmanager
+def composition(scene: Any) -> Iterator[tuple[Any, Any]]:
+    """A compositor's tree, in use inside the block, and the socket of the picture that it makes."""
     if hasattr(scene, "compositing_node_group"):  # from Blender 5.0
         tree = bpy.data.node_groups.new("maps", "CompositorNodeTree")
         tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
         scene.compositing_node_group = tree
+        out = tree.nodes.new("NodeGroupOutput")
     else:
         scene.use_nodes = True
         tree = scene.node_tree
         tree.nodes.clear()
-    image, uv = (tree.nodes.new("CompositorNodeImage") for _ in range(2))
-    image.image, uv.image = picture, map_
-    node = tree.nodes.new("CompositorNodeMapUV")
-    bilinear = "Interpolation" in node.inputs
-    if bilinear:
-        node.inputs["Interpolation"].default_value = "Bilinear"
-    else:
-        node.filter_type = "NEAREST"
-    out = tree.nodes.new("NodeGroupOutput" if hasattr(scene, "compositing_node_group") else "CompositorNodeComposite")
-    tree.links.new(image.outputs["Image"], node.inputs["Image"])
-    tree.links.new(uv.outputs["Image"], node.inputs["UV"])
-    tree.links.new(node.outputs[0], out.inputs[0])
-    render = scene.render
-    render.resolution_x, render.resolution_y, render.use_border = width, height, False
-    scene.cycles.samples, render.filepath = 1, str(studio.folder / "mapped.exr")
-    render.image_settings.color_mode = "RGBA"
-    scene.view_settings.view_transform = "Raw"
-    bpy.ops.render.render(write_still=True)
+        out = tree.nodes.new("CompositorNodeComposite")
+    scene.render.use_compositing = True
+    yield tree, out.inputs[0]
+    scene.render.use_compositing = False
+
+
+def composited(studio: Studio, picture: Any, map_: Any, width: int, height: int) -> Any:
+    """A picture through Blender's Map UV, the lowest row first, and how far from a place it may read, in pixels."""
+    scene = studio.scene
+    with composition(scene) as (tree, out):
+        image, uv = (tree.nodes.new("CompositorNodeImage") for _ in range(2))
+        image.image, uv.image = picture, map_
+        node = tree.nodes.new("CompositorNodeMapUV")
+        bilinear = "Interpolation" in node.inputs
+        if bilinear:
+            node.inputs["Interpolation"].default_value = "Bilinear"
+        else:
+            node.filter_type = "NEAREST"
+        tree.links.new(image.outputs["Image"], node.inputs["Image"])
+        tree.links.new(uv.outputs["Image"], node.inputs["UV"])
+        tree.links.new(node.outputs[0], out)
+        render = scene.render
+        render.resolution_x, render.resolution_y, render.use_border = width, height, False
+        scene.cycles.samples, render.filepath = 1, str(studio.folder / "mapped.exr")
+        render.image_settings.color_mode = "RGBA"
+        scene.view_settings.view_transform = "Raw"
+        bpy.ops.render.render(write_still=True)
     return pixels_of(Path(render.filepath))[1], 0.001 if bilinear else 0.501

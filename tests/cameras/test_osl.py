@@ -65,7 +65,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 def inputs(film: np.ndarray, square: np.ndarray, **changed: float) -> dict[str, np.ndarray]:
     """Of the graph, for film points [2, N] in mm, as the shader's frame makes them."""
     call = {"f_number": 1.8, "asked_m": 2.0, "roundness": 0.0, "rotation": 0.0, "count": 0, "in_colour": 1, "shaded": 1}
-    call |= {"as_lens": 0, "at_pupil": 0, "warned": 0, "pixel_x": 1 / 360, "pixel_y": 1 / 240}
+    call |= {"as_lens": 0, "at_pupil": 0, "unit_m": 1, "warned": 0, "pixel_x": 1 / 360, "pixel_y": 1 / 240}
     call |= {"sensor_x_mm": FILM[0], "sensor_y_mm": FILM[1]} | changed
     half = math.pi / max(call["count"], 3)
     first = math.radians(call.pop("rotation")) + half
@@ -365,6 +365,17 @@ def test_from_the_entrance_pupil_chief_rays_start_at_the_camera() -> None:
     start, way = (found[name][:, passed] for name in ("position", "direction"))
     across = start[0] - start[2] * way[0] / way[2]  # where rays cross the plane of the camera
     assert abs(across.mean()) < 5e-5
+
+
+def test_lengths_are_in_units_of_the_scene() -> None:
+    """A scene in centimetres: the same rays, their places and how these change in numbers 100 times as large."""
+    metres, centimetres = (shot((4.0, -7.0), 1000, unit_m=unit) for unit in (1.0, 0.01))
+    assert metres["throughput"].any()
+    for name in osl.OUTPUTS:
+        scale = 100 if name in ("position", "dPdx", "dPdy") else 1
+        np.testing.assert_allclose(centimetres[name], scale * metres[name], rtol=1e-9, atol=1e-15)
+    text = osl.write_camera(lens(), "gauss", [])[0]
+    assert 'getattribute("cam:focal_distance", asked_m);\n        asked_m *= unit_m;' in text
 
 
 def test_derivatives_are_those_of_neighbouring_pixels() -> None:

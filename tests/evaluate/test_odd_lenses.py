@@ -117,7 +117,7 @@ def test_a_run_folder_is_all_that_evaluate_needs(
     settings = *small, "evaluation.rounds=0", 'model=[{method="ols", terms=12}]'
     folder = tmp_path / "run"
     options = [word for setting in settings for word in ("--set", setting)]
-    assert main(["train", "--lens", str(table), "--out", str(folder), "--quiet", *options]) == 0
+    assert main(["train", "--lens", str(table), "--output", str(folder), "--quiet", *options]) == 0
     table.unlink()
     (tmp_path / "lenses").mkdir()
     written(tmp_path / "lenses", "singlet", *ODD["ball"])

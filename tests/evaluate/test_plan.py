@@ -283,7 +283,7 @@ def test_a_plan_s_file_is_taken_by_train_render_and_export(tmp_path: Path, monke
     assert main(["plan", str(scene), *asked]) == 0
     file, model = folder / "plan.toml", next((folder / "models").glob("*.onnx"))
     quick = ["--quiet", "--set", "evaluation.vignetting_rays=2000"]
-    assert main(["train", str(file), "--out", str(tmp_path / "run"), *quick]) == 0
+    assert main(["train", str(file), "--output", str(tmp_path / "run"), *quick]) == 0
     made, again = (load_fitted(f) for f in (model, tmp_path / "run" / "models" / "shot-ols-6.onnx"))
     assert isinstance(made.core, InvariantPolynomial) and isinstance(again.core, InvariantPolynomial)
     np.testing.assert_array_equal(made.core.exponents, again.core.exponents)

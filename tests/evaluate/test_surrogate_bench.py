@@ -54,14 +54,14 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
             raise InputError("fit", "degree", 9, "less | fewer")
         return real(prepared, settings, report)
 
-    command = ["bench", "surrogates", TRIPLET, "--quick", "--rays", "2000", "--rounds", "1", "--quiet"]
+    command = ["bench", TRIPLET, "--quick", "--rays", "2000", "--rounds", "1", "--quiet"]
     with patch.context() as patched:
         patched.setattr(surrogate_bench, "fit_model", fit)
         patched.setattr(surrogate_bench, "chosen_rows", lambda names: ROWS)
-        assert main([*command, "--out", str(folder)]) == 0
+        assert main([*command, "--output", str(folder)]) == 0
         files = [f for name in ("records", "models") for f in (folder / name).rglob("*") if f.is_file()]
         before = {f: f.stat().st_mtime_ns for f in files}
-        assert main([*command, "--out", str(folder)]) == 0
+        assert main([*command, "--output", str(folder)]) == 0
         # Nothing is made again, the refused one neither: its settings are the same.
         assert len(before) == 7 and {f: f.stat().st_mtime_ns for f in files} == before
     return folder
@@ -174,5 +174,5 @@ def test_a_lens_that_cannot_be_is_rows_too(tmp_path: Path) -> None:
 def test_bad_arguments_are_one_line(
     args: list[object], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    line = failure(capsys, "bench", "surrogates", *args, "--out", tmp_path / "out")
+    line = failure(capsys, "bench", *args, "--output", tmp_path / "out")
     assert all(word in line for word in words) and not (tmp_path / "out").exists()

@@ -255,7 +255,7 @@ def test_summary_counts_goals_and_takes_a_missing_figure_for_the_worst() -> None
 
 def test_the_command_says_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = _folder(tmp_path)
-    assert main(["survey", str(folder), "--no-fit", "--out", str(tmp_path / "o"), "--jobs", "1"]) == 0
+    assert main(["survey", str(folder), "--no-fit", "--output", str(tmp_path / "o"), "--jobs", "1"]) == 0
     out, err = capsys.readouterr()
     assert "2 files: 1 read (0 of them doubtful), 1 refused" in out
     assert "1 .me" in out

@@ -80,7 +80,7 @@ def test_a_trade_leaves_one_page_that_needs_nothing_else(tmp_path: Path, capsys:
     file.write_text(format_toml(scene(width=64, height=36, **film)))
     lens.write_bytes(Path(LENS).read_bytes())  # no model of it ships
     asked = ["--lens", str(lens), "--budget", "0.05px", "--no-fit", "--samples", "1", "--quiet"]
-    assert main(["trade", str(file), *asked, "-o", str(folder)]) == 0
+    assert main(["plan", str(file), "--trade", *asked, "-o", str(folder)]) == 0
     said, told = capsys.readouterr().out, json.loads((folder / "trade.json").read_text())
     page = (folder / "trade.html").read_text()
     assert all(src.startswith("data:image/png;base64,") for src in re.findall(r"(?:src|href)='([^']*)'", page))

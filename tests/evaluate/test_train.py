@@ -165,7 +165,7 @@ def test_bad_settings_name_the_field(tmp_path: Path, override: str, field: str) 
 
 
 SINGLET = str(lens_models.LENSES / "thorlabs_lb1471_biconvex_50.toml")
-QUICK = """--no-race --quiet --set pairs.train=1000 --set pairs.held_out=500 --set pairs.rim=500 --set lens.f_number=8
+QUICK = """--rounds 0 --quiet --set pairs.train=1000 --set pairs.held_out=500 --set pairs.rim=500 --set lens.f_number=8
 --set evaluation.vignetting_rays=2000 --set domain.film_radius_mm=15""".split()
 RUNGS = "model=[{terms=3,planes=false},{terms=12,planes=false},{terms=20,planes=false}]"
 
@@ -173,7 +173,9 @@ RUNGS = "model=[{terms=3,planes=false},{terms=12,planes=false},{terms=20,planes=
 @pytest.mark.parametrize(("asked", "within_um", "tried"), [("um=2", 2.0, 2), ("px=1e-6", 1e-6 * 6.24, 3)])
 def test_models_are_fitted_until_one_has_the_error_asked_for(tmp_path, capsys, asked, within_um, tried) -> None:
     kind, _, value = asked.partition("=")
-    code = main(["train", "--lens", SINGLET, "--out", str(tmp_path), f"--target-{kind}", value, *QUICK, "--set", RUNGS])
+    code = main(
+        ["train", "--lens", SINGLET, "--output", str(tmp_path), f"--target-{kind}", value, *QUICK, "--set", RUNGS]
+    )
     found, said = json.loads((tmp_path / "results.json").read_text()), capsys.readouterr().out
     errors = [m["rms_um"] for m in found["models"]]
     assert found["target"]["within_um"] == pytest.approx(within_um, rel=1e-3)  # 15 mm: a frame of 24.96 mm
@@ -189,7 +191,7 @@ def test_an_error_asked_for_is_one_positive_number_of_a_lens() -> None:
     for bad in ("target.um=-1", "target.px=inf", "target={um=1.0,px=1.0}", "target={}"):
         with pytest.raises(InputError, match="target"):
             default_experiment(SINGLET, [bad])
-    assert main(["train", "any.toml", "--target-um", "1"]) == 2
+    assert main(["train", "any.toml", "--within", "1um"]) == 2
 
 
 ZOOM = lens_models.LENSES / "nikon_zoom_70_200.toml"
@@ -268,7 +270,7 @@ def test_a_training_that_was_killed_is_taken_up_again(tmp_path: Path, monkeypatc
 
     def command(name: str) -> list[str]:
         network = 'model=[{method="mlp",units=6,layers=1,steps=20}]'
-        return ["train", "--lens", SINGLET, "--out", str(tmp_path / name), *QUICK, "--set", network]
+        return ["train", "--lens", SINGLET, "--output", str(tmp_path / name), *QUICK, "--set", network]
 
     process = subprocess.run([sys.executable, "-c", KILLED, *command("killed")], capture_output=True, text=True)
     assert process.returncode == -signal.SIGKILL, process.stderr

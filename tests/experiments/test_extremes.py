@@ -57,7 +57,7 @@ def test_a_status_that_is_wrong_is_noticed(tmp_path: Path, monkeypatch: pytest.M
         return out._replace(status=lost)
 
     monkeypatch.setattr(extremes, "all_cases", lambda count: [next(cases.near_equal_indices(count))])
-    command = ["extremes", "--rays", "100", "--out", str(tmp_path), "--quiet"]
+    command = ["extremes", "--rays", "100", "--output", str(tmp_path), "--quiet"]
     assert main(command) == 0 and "FAILED" not in (tmp_path / "extremes.md").read_text()
     monkeypatch.setattr(extremes, "trace", broken)
     assert main(command) == 1 and json.loads((tmp_path / "extremes.json").read_text())[0]["beyond"] == 5

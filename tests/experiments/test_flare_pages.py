@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from experiments import coatings, flare_gallery, flare_speed, lab
 from neurolens.base.errors import InputError
@@ -63,7 +64,16 @@ def test_another_tracer_is_asked(tmp_path: Path) -> None:
 
 
 def test_commands_of_pictures_are_commands_and_make_what_they_show() -> None:
+    before = set[str]()
     for picture in flare_gallery.PICTURES:
         made = {build_parser().parse_args(shlex.split(command)[1:]).out.stem for command in picture.commands}
-        shown = {file for panel in picture.panels for file in panel.files}
-        assert made == {file.partition(".0")[0] for file in shown}
+        shown = {file.partition(".0")[0] for panel in picture.panels for file in (*panel.files, panel.over) if file}
+        assert made <= shown <= made | before
+        before |= made
+
+
+def test_published_pictures_are_large_to_look_at_and_small_to_keep() -> None:
+    for picture in flare_gallery.PICTURES:
+        file = lab.RESULTS / "flare" / f"{picture.name}.jpg"
+        with Image.open(file) as opened:
+            assert opened.width >= 1280 and file.stat().st_size <= 700_000

@@ -116,10 +116,10 @@ def test_an_effect_becomes_a_figure_numbers_and_a_page_and_is_not_done_twice(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, out = written(tmp_path, '[[panel]]\nlabel = "one"\n', ""), tmp_path / "out"
-    command = ["gallery", "--effects-in", str(tmp_path), "--out", str(out), "--threads", "1"]
+    command = ["gallery", "--effects-in", str(tmp_path), "--output", str(out), "--threads", "1"]
     assert main([*command, "--json"]) == 0
     first = json.loads(capsys.readouterr().out)["effects"][0]
-    assert (out / "small.png").stat().st_size <= MOST_BYTES
+    assert (out / "small.jpg").stat().st_size <= MOST_BYTES
     for panel in first["panels"]:
         found = panel["measured"]["edge_um"]
         assert found["surrogate"] == pytest.approx(found["exact"], abs=1)
@@ -130,10 +130,10 @@ def test_an_effect_becomes_a_figure_numbers_and_a_page_and_is_not_done_twice(
     assert moved["edge_um"]["thin"] == pytest.approx(moved["middle_um"]["thin"], rel=0.01)
     assert (out / "README.md").is_file()
 
-    made = (out / "small.png").stat().st_mtime_ns
+    made = (out / "small.jpg").stat().st_mtime_ns
     assert main(command) == 0
     assert "done by an earlier run" in capsys.readouterr().err
-    assert (out / "small.png").stat().st_mtime_ns == made
+    assert (out / "small.jpg").stat().st_mtime_ns == made
     assert fingerprint_of(read_effect(path), 4) != first["fingerprint"] == fingerprint_of(read_effect(path), None)
     path.write_text(path.read_text(encoding="utf-8").replace('"two"', '"three"'), encoding="utf-8")
     assert fingerprint_of(read_effect(path), None) != first["fingerprint"]

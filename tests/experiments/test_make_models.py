@@ -138,7 +138,7 @@ def test_an_entry_is_fitted_checked_and_timed(tmp_path: Path) -> None:
         "models = [{ terms = 12, degree = 4, planes = false }, { terms = 20, degree = 5, planes = false }]\n"
         "best = true\n"
     )
-    command = ["models", "--list", str(tmp_path / "list.toml"), "--out", str(tmp_path / "out"), "--quiet"]
+    command = ["models", "--list", str(tmp_path / "list.toml"), "--output", str(tmp_path / "out"), "--quiet"]
     assert main(command) == 0
     (only,) = read_index(tmp_path / "out")
     assert only["model"] == "ols-20" and only["broken"] == [] and only["rms_um_at_21_6"] > only["rms_um"] > 0

@@ -68,7 +68,7 @@ def test_results_of_another_kind_are_not_written_over(
     file = tmp_path / f"{name}.json"
     for text in ("half a fi", "3", '[{"lens": "other"}]'):
         file.write_text(text)
-        assert main([name, "--quiet", "--out", str(tmp_path)]) == 2
+        assert main([name, "--quiet", "--output", str(tmp_path)]) == 2
         assert f"rows of experiments {name}" in capsys.readouterr().err and file.read_text() == text
 
 
@@ -99,7 +99,7 @@ def test_a_measurement_knows_no_other_options(capsys: pytest.CaptureFixture[str]
 def test_what_is_not_there_is_one_line_and_leaves_no_folder(
     command: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([*command, "--quiet", "--out", str(tmp_path / "out")]) == 2
+    assert main([*command, "--quiet", "--output", str(tmp_path / "out")]) == 2
     shown = capsys.readouterr().err.strip()
     assert told in shown and "\n" not in shown and not (tmp_path / "out").exists()
 
@@ -161,7 +161,7 @@ def test_a_bad_index_is_one_clear_error(tmp_path: Path, text: str | None, capsys
         (tmp_path / "index.json").write_text(text)
     with pytest.raises(InputError, match="index.json"):
         read_index(tmp_path)
-    assert main(["promises", "--models", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    assert main(["promises", "--models", str(tmp_path), "--output", str(tmp_path / "out")]) == 2
     shown = capsys.readouterr().err.strip()
     assert "index.json" in shown and "\n" not in shown
     assert not (tmp_path / "out").exists()
@@ -370,7 +370,7 @@ def test_cameras_in_blender_are_timed_without_what_it_takes_to_begin(
     times[thin]["full"] = [0.1, 1.0]
     with pytest.raises(lab.Unmeasured, match="too few"):
         osl_speed.rows_of("sky", stage, times, {})
-    assert main(["osl", "--quiet", "--blender-python", str(tmp_path / "python"), "--out", str(tmp_path)]) == 2
+    assert main(["osl", "--quiet", "--blender-python", str(tmp_path / "python"), "--output", str(tmp_path)]) == 2
     assert "make test-blender" in capsys.readouterr().err
 
 

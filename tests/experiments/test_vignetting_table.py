@@ -75,7 +75,7 @@ def test_rows_of_lenses_that_are_not_chosen_stay(
     good["illumination"] = {"max_difference": 0.0125}
     monkeypatch.setattr(vignetting, "measure", lambda file, domain, _: good | {"lens": file.stem, "domain": domain})
     (tmp_path / "vignetting.json").write_text('[{"lens": "other", "domain": "infinity", "failed": "not round"}]')
-    command = ["vignetting", "--only", "petzval", "--domain", "infinity", "--quiet", "--out", str(tmp_path)]
+    command = ["vignetting", "--only", "petzval", "--domain", "infinity", "--quiet", "--output", str(tmp_path)]
     assert main(command) == 0
     rows = json.loads((tmp_path / "vignetting.json").read_text())
     assert [r["lens"] for r in rows] == ["other", "petzval_portrait_100"]

@@ -24,7 +24,7 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.render.pictures import read_exr, write_exr
 
-COOKE = ["flare", "cooke_triplet_50", "--wavelengths", "2", "--cell", "4", "--width", "36", "--quiet"]
+COOKE = ["flare", "cooke_triplet_50", "--bins", "2", "--cell", "4", "--width", "36", "--quiet"]
 
 
 @pytest.mark.parametrize(
@@ -156,8 +156,9 @@ def test_frames_end_when_asked_and_are_whole(tmp_path: Path, capsys: pytest.Capt
     assert main([*COOKE, "--light", "5,3", "--frames", "1:1", "-o", str(out)]) == 0
     assert interrupted_after(1.5, [*COOKE, "--light", "5,3", "--frames", "1:2000", "-o", str(out)]) == 130
     assert "goes on" in capsys.readouterr().err
-    files = sorted(tmp_path.iterdir())
+    files = sorted(tmp_path.glob("*.exr"))
     assert [file.name for file in files] == [f"a.{k + 1:04d}.exr" for k in range(len(files))]
+    assert all(file.with_suffix(".png").is_file() for file in files)
     assert all(read_exr(file)[0].any() for file in files)
 
 

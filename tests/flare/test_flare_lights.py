@@ -10,7 +10,7 @@ import pytest
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.field import field_of
-from neurolens.flare.lights import Light, light_rays, read_lights
+from neurolens.flare.lights import SUN, Light, light_rays, read_lights
 from neurolens.flare.sources import WHOLE, SceneLights, chosen, highlights, keep, keep_named
 from neurolens.optics.lensfile import read_lens
 from neurolens.render.scene import scene_from_tables, seen_from
@@ -37,7 +37,7 @@ def test_lists_hold_keys_and_both_kinds_say_the_same(tmp_path: Path) -> None:
         assert lamp.at(2) == Light(60.0, 0.0, (3.0, 3.0, 3.0), 1 / 1.5)
         assert lamp.at(3) is None  # behind the lens
     one.write_text("azimuth_deg,elevation_deg\n1,2\n3,4\n")
-    assert [track.at(0) for track in read_lights(one)] == [Light(1.0, 2.0), Light(3.0, 4.0)]
+    assert [track.at(0) for track in read_lights(one)] == [Light(*at, (SUN,) * 3) for at in ((1.0, 2.0), (3.0, 4.0))]
 
 
 @pytest.mark.parametrize(

@@ -238,7 +238,7 @@ def test_lenses_with_cylinders(tmp_path: Path) -> None:
 
 def test_command(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "flare.exr"
-    small = ["--light", "9,4", "--width", "36", "--wavelengths", "2", "--blades", "6", "--f-number", "8", "--json"]
+    small = ["--light", "9,4", "--width", "36", "--bins", "2", "--blades", "6", "--f-number", "8", "--json"]
     assert main(["flare", str(file), *small, "-o", str(out)]) == 0
     assert json.loads(capsys.readouterr().out)["lens"] == tessar().name and out.is_file()
     # The table is the model's own: its ghosts, and their light as it has it.
@@ -253,7 +253,7 @@ def test_command(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     # Frames, stars and glare go with it; of each frame the stop is its own. A film beyond the fit is told.
     (keys := tmp_path / "sun.csv").write_text("light,frame,azimuth_deg,elevation_deg\na,1,-9,4\na,2,9,4\n")
     words = ["--lights", str(keys), "--frames", "1:2", "--key", "f-number=1:8,2:16", "--width", "24"]
-    more = ["--wavelengths", "2", "--starburst", "--glare", "500", "--gain", "s01=2", "--film", "45x30"]
+    more = ["--bins", "2", "--starburst", "--glare", "500", "--gain", "s01=2", "--film", "45x30"]
     assert main(["flare", str(file), *words, *more, "-o", str(out)]) == 0
     assert "fitted up to 21.64 mm" in capsys.readouterr().err
     open_stop, closed = (read_exr(tmp_path / f"flare.000{k}.exr")[0].sum() for k in (1, 2))

@@ -35,7 +35,7 @@ COMMANDS = {
     "analyse": "analyse {} spots",
     "flare": "flare {} --light 5,3",
     "plan": "plan SCENE --lens {}",
-    "trade": "trade SCENE --lens {}",
+    "trade": "plan SCENE --lens {} --trade",
     "stmap": "stmap {} --size 30x20 --film 24x16 -o NAME",
     "projection": "projection {} --size 30x20 --film 24x16 --model opencv",
     "render": "render SCENE --camera {} -o NAME.exr",
@@ -46,9 +46,9 @@ COMMANDS = {
     "export camera": "export {} --to glsl --camera -o NAME.glsl",
     "blender": "blender add {} --to NAME",
     "view": "view {} -o NAME.html",
-    "bench": "bench surrogates {} --out NAME",
-    "train": "train --lens {} --out NAME",
-    "experiment": "train EXPERIMENT --out NAME",
+    "bench": "bench {} -o NAME",
+    "train": "train --lens {} -o NAME",
+    "experiment": "train EXPERIMENT -o NAME",
     "library": "library {} -o NAME",
     "evaluate": "evaluate MODEL --lens {}",
 }
@@ -153,7 +153,7 @@ def test_a_run_keeps_the_lens_in_our_format_and_a_model_knows_its_lens(
     small = ["pairs.train=1500", "pairs.held_out=600", "pairs.rim=600", "evaluation.vignetting_rays=2000"]
     small += ["evaluation.rounds=0", 'model=[{method="ols",terms=12}]']
     options = [word for text in small for word in ("--set", text)]
-    assert main(["train", "--lens", str(files["zmx"]), "--out", str(run), "--quiet", "--json", *options]) == 0
+    assert main(["train", "--lens", str(files["zmx"]), "--output", str(run), "--quiet", "--json", *options]) == 0
     kept, model = run / "lenses" / "Tessar_100mm_1_4_5_v2_0.toml", run / "models" / "ols-12.onnx"
     assert read_lens(kept).sha256 == read_any(files["zmx"]).sha256
     capsys.readouterr()

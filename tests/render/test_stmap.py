@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenEXR
 import pytest
 
 from neurolens.analysis.field_curves import colour, distortion, illumination
@@ -16,9 +17,11 @@ from neurolens.analysis.fields import Scene
 from neurolens.cameras import field as fields
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.field import Field, field_of, frame_of, spectrum_of
+from neurolens.cameras.sampling import stratified
 from neurolens.cli import main
 from neurolens.commands import stmap as command
 from neurolens.optics.paraxial import chief_reach_mm, first_order
+from neurolens.readers.any_format import read_any
 from neurolens.render.pictures import read_exr, read_layers
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene
@@ -204,6 +207,41 @@ def test_both_meridians_of_an_anamorphic_lens_have_their_own_size(monkeypatch: p
     assert worst_px(field, plates)[1] < 0.01 and redistort_map(field, plates)["B"].min() == 1
 
 
+def test_maps_of_an_anamorphic_lens_tell_their_pixels_shape_and_both_pupils(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The lens squeezes 1.98 times: by its focal lengths of 42.475 and 21.455 mm for what is far; in a plane, by how
+    far from the axis it shows a point 30 mm from it in both meridians."""
+    monkeypatch.setattr(fields, "_OTHER", (9, 8))
+    lens, film = ROOT / "lenses" / "cooke_anamorphic_42.toml", (20.0, 16.0)
+    args = ("stmap", lens, "--size", "100x80", "--film", "20x16", "--focus", "1.5", "--f-number", "22", "--quiet")
+    [row] = run_json(capsys, *args, "-o", tmp_path / "a")["frames"]
+    assert row["pixel_aspect"] == pytest.approx(42.475 / 21.455, rel=5e-3)
+    x, y = (first_order(read_any(lens).at(), meridian=m).entrance_pupil_z_mm for m in ("x", "y"))
+    before = row["before_film_mm"]
+    assert before[0] - before[1] == pytest.approx(y - x) == pytest.approx(33.16, abs=0.01)
+    camera = make_camera(lens, Shot(film_mm=film, focus_m=1.5, f_number=22.0))
+    square, _ = stratified(64, (550.0, 550.0))
+    sizes = []
+    for k in range(2):
+        point = np.zeros((3, square.shape[1]), np.float32)
+        point[k], point[2] = 0.03, -1.5
+        seen = camera.to_film(point, square, np.full(square.shape[1], 550.0, np.float32))
+        sizes.append(abs(np.average(seen.film_mm[k], weights=seen.weight)))
+    assert row["pixel_aspect_of_one_pinhole"] == pytest.approx(sizes[1] / sizes[0], rel=1e-3)
+    assert row["pixel_aspect"] / row["pixel_aspect_of_one_pinhole"] > 1.02
+    for kind in ("undistort", "redistort", "illumination"):
+        header = OpenEXR.File(str(tmp_path / f"a.{kind}.exr"), header_only=True).parts[0].header
+        assert header["pixelAspectRatio"] == pytest.approx(row["pixel_aspect"])
+    assert main([*map(str, args), "-o", str(tmp_path / "one")]) == 0
+    said = capsys.readouterr().out
+    assert "pixel aspect ratio 1.9" in said
+    assert f"x meridian {before[0]:.6g} mm, of the y meridian {before[1]:.6g} mm before the film" in said
+    run_json(capsys, "stmap", MODEL, "--size", "96x54", "--film", "36x20.25", "--quiet", "-o", tmp_path / "round")
+    header = OpenEXR.File(str(tmp_path / "round.undistort.exr"), header_only=True).parts[0].header
+    assert header["pixelAspectRatio"] == 1
+
+
 def test_the_command_writes_maps_of_one_size_for_all_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     args = ("stmap", MODEL, "--size", "96x54", "--film", "36x20.25", "--f-number", "4", "--quiet")
     keys = ("--frames", "1:3:2", "--key", "focus=1:1,3:inf", "--lateral-colour")
@@ -243,7 +281,7 @@ def test_bad_input_is_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixtu
         ({"--focus": "nan"}, "--focus"),
         ({"--distance": "0.05"}, "entrance pupil"),
         ({"--key": "focus=1:1"}, "--frames beside it"),
-        ({"--channels-nm": "600,500"}, "three wavelengths"),
+        ({"--wavelengths": "600,500"}, "three wavelengths"),
         ({"-o": tmp_path / "none" / "a"}, "a folder that exists"),
         ({"camera": "lens.zmx"}, "a lens file of any format"),
         ({"camera": fisheye}, "degrees from the axis"),

@@ -23,8 +23,8 @@ Render = Callable[..., Path]
 KINDS = {
     "plain": (),
     "ACEScg, half": ("--half", "--colour-space", "ACEScg", "--white-balance", "A"),
-    "lanes": ("--wavelengths", "lanes", "--samples", "17"),
-    "colour alone": ("--layers", "beauty"),
+    "lanes": ("--wavelength-mode", "lanes", "--samples", "17"),
+    "colour alone": ("--channels", "beauty"),
 }
 
 
@@ -68,7 +68,7 @@ def test_merged_tiles_are_the_picture_of_one_run(
     one = render("one.exr", *options)
     tiles = tiles_of(render, count, *options)
     merged = tmp_path / "merged.exr"
-    told = run_json(capsys, "merge", *reversed(tiles), "-o", merged)
+    told = run_json(capsys, "render", "--merge", *reversed(tiles), "-o", merged)
     assert stored(merged) == stored(one) and len(stored(one)) >= 3
     assert metadata(merged) == metadata(one)
     assert told["pictures"][0]["paths"] == 32 * 18 * metadata(one)["render"]["samples"]
@@ -90,14 +90,16 @@ def test_frames_in_tiles_become_a_picture_a_frame(
         render("cut.exr", *frames, "--tile", f"{k}/2")
     tiles = sorted(tmp_path.glob("cut.*.tile-?-of-2.exr"))
     assert len(tiles) == 4
-    told = run_json(capsys, "merge", *tiles, "-o", tmp_path / "cut.exr")
+    told = run_json(capsys, "render", "--merge", *tiles, "-o", tmp_path / "cut.exr")
     assert [Path(picture["file"]).name for picture in told["pictures"]] == ["cut.0008.exr", "cut.0010.exr"]
     for number in ("0008", "0010"):
         assert stored(tmp_path / f"cut.{number}.exr") == stored(tmp_path / f"one.{number}.exr")
     before = tiles[0].stat().st_mtime_ns
     render("cut.exr", *frames, "--tile", "1/2")
     assert tiles[0].stat().st_mtime_ns == before
-    assert "tiles of frame 10: got (2 missing), expected all 2" in failure(capsys, "merge", *tiles[:3], "-o", "x.exr")
+    assert "tiles of frame 10: got (2 missing), expected all 2" in failure(
+        capsys, "render", "--merge", *tiles[:3], "-o", "x.exr"
+    )
 
 
 def test_a_tile_lies_in_its_place_for_other_programs(render: Render) -> None:
@@ -115,9 +117,9 @@ def test_a_tile_lies_in_its_place_for_other_programs(render: Render) -> None:
         (("--samples", "3"), "samples: got 3, expected 2 as in"),
         (("--half",), "half: got True, expected False as in"),
         (("--colour-space", "ACEScg"), "colour.space: got 'ACEScg', expected 'sRGB' as in"),
-        (("--layers", "beauty"), "layers: got [], expected ['blocked', 'depth', 'samples', 'variance'] as in"),
+        (("--channels", "beauty"), "layers: got [], expected ['blocked', 'depth', 'samples', 'variance'] as in"),
         (("--focus", "3"), "camera.focus_m: got 3.0, expected"),
-        (("--wavelengths", "one"), "wavelengths: got 'one', expected 'auto' as in"),
+        (("--wavelength-mode", "one"), "wavelengths: got 'one', expected 'auto' as in"),
         (("--max-depth", "1"), "max_depth: got 1, expected"),
     ],
 )
@@ -126,7 +128,7 @@ def test_tiles_of_other_settings_are_named(
 ) -> None:
     first, _ = tiles_of(render, 2)
     _, other = tiles_of(render, 2, *options, name="b.exr")
-    line = failure(capsys, "merge", first, other, "-o", tmp_path / "m.exr")
+    line = failure(capsys, "render", "--merge", first, other, "-o", tmp_path / "m.exr")
     assert f"{other}: {said}" in line and not (tmp_path / "m.exr").exists()
 
 
@@ -135,18 +137,20 @@ def test_tiles_of_another_scene_or_cut_are_refused(
 ) -> None:
     first, second = tiles_of(render, 2)
     thirds = tiles_of(render, 3, name="c.exr")
-    assert "tiles: got 3, expected 2 as in" in failure(capsys, "merge", first, thirds[1], "-o", "m.exr")
+    assert "tiles: got 3, expected 2 as in" in failure(capsys, "render", "--merge", first, thirds[1], "-o", "m.exr")
     scene.write_text(scene.read_text().replace("radius_m = 0.1", "radius_m = 0.12"))
     _, other = tiles_of(render, 2, name="d.exr")
-    assert f"{other}: scene: got " in failure(capsys, "merge", first, other, "-o", "m.exr")
-    assert "tiles: got (2 missing), expected all 2" in failure(capsys, "merge", first, "-o", "m.exr")
+    assert f"{other}: scene: got " in failure(capsys, "render", "--merge", first, other, "-o", "m.exr")
+    assert "tiles: got (2 missing), expected all 2" in failure(capsys, "render", "--merge", first, "-o", "m.exr")
     copy = Path(shutil.copy(second, tmp_path / "copy.exr"))
-    line = failure(capsys, "merge", first, second, copy, "-o", "m.exr")
+    line = failure(capsys, "render", "--merge", first, second, copy, "-o", "m.exr")
     assert f"{copy}: tile: got '2 of 2', expected each tile once: {second} is that one, too" in line
-    assert "it is one of the tiles" in failure(capsys, "merge", first, second, "-o", second)
-    assert "metadata: got (no 'tile')" in failure(capsys, "merge", render("whole.exr"), first, "-o", "m.exr")
+    assert "it is one of the tiles" in failure(capsys, "render", "--merge", first, second, "-o", second)
+    assert "metadata: got (no 'tile')" in failure(
+        capsys, "render", "--merge", render("whole.exr"), first, "-o", "m.exr"
+    )
     first.write_bytes(first.read_bytes()[:-200])
-    assert "a whole OpenEXR file" in failure(capsys, "merge", first, second, "-o", "m.exr")
+    assert "a whole OpenEXR file" in failure(capsys, "render", "--merge", first, second, "-o", "m.exr")
     assert not (tmp_path / "m.exr").exists()
 
 
@@ -214,7 +218,7 @@ def test_a_strangers_tile_is_refused_in_a_line(
     text = (told if place else value) if value is None else json.dumps(told if place else value)
     held = header | {METADATA_KEY: 5 if text is None else text}
     OpenEXR.File([OpenEXR.Part(held, channels)]).write(str(second))
-    line = failure(capsys, "merge", first, second, "-o", tmp_path / "m.exr")
+    line = failure(capsys, "render", "--merge", first, second, "-o", tmp_path / "m.exr")
     assert f"{second}: " in line and not list(tmp_path.iterdir())
 
 
@@ -227,7 +231,7 @@ def test_a_tile_that_is_not_done_says_so(render: Render, capsys: pytest.CaptureF
     header[METADATA_KEY] = json.dumps(told)
     header.pop("channels")
     OpenEXR.File([OpenEXR.Part(header, channels)]).write(str(second))
-    assert "samples: got 1.5, expected 2" in failure(capsys, "merge", first, second, "-o", "m.exr")
+    assert "samples: got 1.5, expected 2" in failure(capsys, "render", "--merge", first, second, "-o", "m.exr")
 
 
 def test_rows_cover_a_picture_once() -> None:

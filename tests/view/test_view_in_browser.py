@@ -26,15 +26,9 @@ from neurolens.render.renderer import render
 from neurolens.render.scene import scene_from_tables
 from neurolens.surrogates.source import export_file
 
-BROWSER = os.environ.get("NEUROLENS_BROWSER")
-if not BROWSER:
-    pytest.skip("no browser is named (NEUROLENS_BROWSER, see make test-web)", allow_module_level=True)
-sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright (pip install '.[web]')")
-
 ROOT = Path(__file__).parents[2]
 LENS = "petzval_portrait_100"
 ZOOM = "nikon_zoom_80_200"
-FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 WIDE, HIGH = 240, 135  # of compared pictures
 NM = 550.0
 
@@ -45,14 +39,6 @@ def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     words = [str(ROOT / "models" / f"{ZOOM}-range.states-64.onnx"), LENS, ZOOM]
     assert main(["view", *words, "--downloads", "glsl", "-o", str(out), "--json"]) == 0
     return out
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with sync_api.sync_playwright() as play:
-        found = play.chromium.launch(executable_path=BROWSER, args=FLAGS)
-        yield found
-        found.close()
 
 
 class Opened:

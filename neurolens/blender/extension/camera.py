@@ -12,7 +12,7 @@ from typing import Any
 
 import bpy
 
-from .library import LensError, LensFacts, Setting, Variant, fitting_width_mm, refusals, refused
+from .library import PASSES, LensError, LensFacts, Setting, Variant, fitting_width_mm, refusals, refused
 
 # Of the camera and of the scene, what `apply` changes; the scene's first camera of this extension writes the scene's.
 _CAMERA = (
@@ -56,21 +56,51 @@ def setting_of(scene: Any, found: Any) -> Setting:
     focus = own if own > 0 else None if off else focus_m(found)
     sensor = sensor_mm(camera, render)
     side = {"HORIZONTAL": sensor[0], "VERTICAL": sensor[1]}.get(camera.sensor_fit, max(sensor))
+    unit = scene.unit_settings.scale_length if scene.unit_settings.system != "NONE" else 1.0
+    # Until the lens is on, the scene's scale counts, which it will take; shaders of earlier versions take metres.
+    lens_unit = float(custom.get("unit_m", 1.0)) if applied(camera) else unit
     return Setting(
         sensor_mm=sensor,
         pixels=max(1, round(render.resolution_x * render.resolution_percentage / 100)),
-        focus_m=focus,
+        focus_m=focus if focus is None or own > 0 else focus * lens_unit,
         focus_object="" if own > 0 or camera.dof.focus_object is None else camera.dof.focus_object.name,
         f_number=f_number,
         shift=(camera.shift_x, camera.shift_y),
         shift_side_mm=side,
-        unit_m=scene.unit_settings.scale_length if scene.unit_settings.system != "NONE" else 1.0,
+        stereo=_stereo(camera, render),
+        unit_m=unit,
+        lens_unit_m=lens_unit,
         on_gpu=_on_other_gpu(scene),
+        darkens=bool(custom.get("vignetting", 1)) or bool(custom.get("exposure", 0)),
+        passes=_passes(scene),
     )
 
 
+def _stereo(camera: Any, render: Any) -> tuple[float, ...]:
+    """What stereo adds to shift X of the left and the right eye, as Blender computes it."""
+    stereo = camera.stereo
+    off_axis = stereo.convergence_mode == "OFFAXIS" and render.use_multiview and render.views_format == "STEREO_3D"
+    if not off_axis:
+        return ()
+    shift = stereo.interocular_distance / stereo.convergence_distance * camera.lens / camera.sensor_width
+    left, right = {"LEFT": (0.0, 1.0), "RIGHT": (1.0, 0.0)}.get(stereo.pivot, (0.5, 0.5))
+    return shift * left, -shift * right
+
+
+def _passes(scene: Any) -> tuple[str, ...]:
+    """Of `PASSES`, those that the scene renders."""
+    layers = [layer for layer in scene.view_layers if layer.use]
+    mattes = ("object", "material", "asset")
+    asked = {
+        "alpha": scene.render.film_transparent,
+        "cryptomatte": any(getattr(layer, f"use_pass_cryptomatte_{kind}") for layer in layers for kind in mattes),
+        "vector": any(layer.use_pass_vector for layer in layers),
+    }
+    return tuple(name for name in PASSES if asked[name])
+
+
 def focus_m(found: Any) -> float:
-    """Distance along the view to what is in focus, as Cycles has it."""
+    """Distance along the view to what is in focus, in units of the scene, as Cycles has it."""
     dof = found.data.dof
     if dof.focus_object is None:
         return float(dof.focus_distance)
@@ -89,7 +119,7 @@ def depths_in_view(context: Any, found: Any, setting: Setting, efl_mm: float) ->
         x, y = ((k % across + 0.5) / across - 0.5) * width, ((k // across + 0.5) / down - 0.5) * height
         way = right * (x / efl_mm) + up * (y / efl_mm) - back
         hit, point, *_ = context.scene.ray_cast(graph, frame.translation, way.normalized())
-        depths.append((frame.translation - point).dot(back) * setting.unit_m if hit else math.inf)
+        depths.append((frame.translation - point).dot(back) * setting.lens_unit_m if hit else math.inf)
     return depths
 
 
@@ -137,7 +167,7 @@ def apply(scene: Any, found: Any, lens: LensFacts, kind: str, *, fit_sensor: boo
         raise LensError(f"The shader {variant.path} cannot be read: {error}") from None
     memory = _remembered(scene, camera)
     try:
-        _set(scene, camera, lens, variant, source, width)
+        _set(scene, camera, lens, variant, source, width, setting.unit_m)
     except LensError:
         _put_back(scene, camera, memory)
         raise
@@ -155,13 +185,15 @@ def _resized(setting: Setting, width_mm: float) -> Setting:
     return replace(setting, sensor_mm=(width_mm, setting.sensor_mm[1] * share))
 
 
-def _set(scene: Any, camera: Any, lens: LensFacts, variant: Variant, source: str, width_mm: float | None) -> None:
+def _set(
+    scene: Any, camera: Any, lens: LensFacts, variant: Variant, source: str, width_mm: float | None, unit_m: float
+) -> None:
     """Change camera and scene, and compile the shader.
 
     Raises:
         LensError: it does not compile.
     """
-    first = not applied(camera)
+    first, in_units = not applied(camera), "unit_m" in camera.cycles_custom
     opened = camera.dof.aperture_fstop if camera.dof.use_dof else None
     scene.render.engine = "CYCLES"
     if _on_other_gpu(scene):
@@ -179,6 +211,8 @@ def _set(scene: Any, camera: Any, lens: LensFacts, variant: Variant, source: str
     camera.dof.use_dof = True  # or Cycles does not tell shaders the focus
     _compile(camera)
     custom = camera.cycles_custom
+    if "unit_m" in custom and not in_units:  # one that the user has turned stays
+        custom["unit_m"] = unit_m
     if first and opened is not None and "f_number" in custom:
         custom["f_number"] = max(float(opened), variant.f_number)
     _follow_zoom(camera)

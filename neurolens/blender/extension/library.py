@@ -12,6 +12,7 @@ from typing import Any
 
 FACTS = "lenses.json"  # beside shaders/ and thumbnails/, in the extension and in its user folder
 SCHEMA = 1
+PASSES = ("alpha", "cryptomatte", "vector")  # in which a lens shows otherwise than Blender's own camera
 KINDS = {"polynomial": "Polynomial", "network": "Network", "exact": "Exact"}
 OLDEST = (4, 5, 0)  # the first Blender whose Cycles runs cameras written in OSL
 BEYOND = 1.02  # a film of 36 x 24 mm over an image circle of 43.2 mm is as lenses are engraved
@@ -180,7 +181,11 @@ class Setting:
         focus_m: distance in focus; None where depth of field is off. focus_object: its name, "" for a distance.
         f_number: None where the shader's own.
         shift, shift_side_mm: Blender's, and the side that its own camera counts it in.
-        unit_m: metres a unit of the scene. on_gpu: whether a GPU that cannot run OSL cameras is chosen.
+        stereo: of each eye, what its view adds to shift X; () without stereo.
+        unit_m, lens_unit_m: metres of a unit of the scene, by its unit scale and as the lens takes it.
+        on_gpu: whether a GPU that cannot run OSL cameras is chosen.
+        darkens: whether vignetting or exposure let the lens weaken light.
+        passes: of `PASSES`, what is rendered besides the picture.
     """
 
     sensor_mm: tuple[float, float]
@@ -190,8 +195,12 @@ class Setting:
     f_number: float | None = None
     shift: tuple[float, float] = (0.0, 0.0)
     shift_side_mm: float = 0.0
+    stereo: tuple[float, ...] = ()
     unit_m: float = 1.0
+    lens_unit_m: float = 1.0
     on_gpu: bool = False
+    darkens: bool = True
+    passes: tuple[str, ...] = ()
 
 
 def refused(version: tuple[int, ...], has_osl: bool = True) -> str | None:
@@ -243,16 +252,15 @@ def notes(variant: Variant, setting: Setting) -> list[str]:
         found.append(f"The lens opens to f/{variant.f_number:.3g}: f/{setting.f_number:.3g} renders as that")
     if setting.focus_m is None:
         found.append("Depth of field is off: the lens is focused at infinity")
-    if setting.unit_m != 1.0:
-        found.append(f"A unit of this scene is {setting.unit_m:g} m; the lens takes it for 1 m")
+    if not math.isclose(setting.unit_m, setting.lens_unit_m, rel_tol=1e-5):
+        found.append(
+            f"A unit of this scene is {setting.unit_m:g} m by its unit scale; the lens takes it for "
+            f"{setting.lens_unit_m:g} m (Metres per Unit)"
+        )
     for axis, shift, side, name in zip("XY", setting.shift, setting.sensor_mm, ("widths", "heights"), strict=True):
         if shift and not math.isclose(side, setting.shift_side_mm, rel_tol=1e-3):  # so Cycles has it
             same = f"set {shift * setting.shift_side_mm / side:.4g}"
             found.append(f"Shift {axis} counts {name} here: for what {shift:.4g} does in Blender's own camera, {same}")
-    corner = math.hypot(*(side * (0.5 + abs(s)) for side, s in zip(setting.sensor_mm, setting.shift, strict=True)))
-    if any(setting.shift) and corner > BEYOND * variant.film_radius_mm:
-        reach = f"{corner:.4g} mm from the axis; the lens's picture ends at {variant.film_radius_mm:.4g} mm"
-        found.append(f"The shift takes a corner to {reach}: it is black there")
     if setting.on_gpu:
         found.append("OSL cameras run on the CPU, or on a GPU by OptiX")
     error = error_px(variant, setting)
@@ -260,7 +268,38 @@ def notes(variant: Variant, setting: Setting) -> list[str]:
         found.append(f"The model's error is {error:.2g} pixels of this picture")
     if variant.poor:
         found.append(f"The model is poor, as its card says: {', '.join(variant.poor)}")
-    return [*found, *variant.notes]
+    return [*found, *_pass_notes(setting), *variant.notes]
+
+
+def _pass_notes(setting: Setting) -> list[str]:
+    """What Cycles makes of a lens in passes: it counts the throughput of rays into alpha and coverage."""
+    light, remedy = "the share of the rays that pass there, nearly 1", ""
+    if setting.darkens:
+        light = "the lens's light there"
+        remedy = (
+            "; with Vignetting off and Exposure 0 it is nearly right: then multiply the picture by the illumination "
+            "map of neurolens stmap"
+        )
+    said = {
+        "alpha": f"Alpha where nothing is: 1 minus {light}; Blender's own camera has 0{remedy}",
+        "cryptomatte": f"Cryptomatte's coverage of what is opaque: {light}; Blender's own camera has 1{remedy}",
+        "vector": "The Vector pass is wrong with custom cameras: render Motion Blur, or take the pass of Blender's own "
+        "camera through the redistort map of neurolens stmap",
+    }
+    return [said[name] for name in PASSES if name in setting.passes]
+
+
+def outside(variant: Variant, setting: Setting) -> list[str]:
+    """Warnings of corners that shift and stereo take out of the lens's picture."""
+    (width, height), (shift_x, shift_y) = setting.sensor_mm, setting.shift
+    eyes = [abs(shift_x + more) for more in setting.stereo or (0.0,)]
+    corner = math.hypot(width * (0.5 + max(eyes)), height * (0.5 + abs(shift_y)))
+    if not any((*eyes, shift_y)) or corner <= BEYOND * variant.film_radius_mm:
+        return []
+    stereo = any(setting.stereo)
+    reach = f"{corner:.4g} mm from the axis; the lens's picture ends at {variant.film_radius_mm:.4g} mm"
+    less = ": Parallel convergence, or a longer convergence distance, takes it nearer" if stereo else ""
+    return [f"{'Off-axis stereo' if stereo else 'The shift'} takes a corner to {reach}, beyond it is black{less}"]
 
 
 def error_px(variant: Variant, setting: Setting) -> float | None:

@@ -10,7 +10,7 @@ import bpy
 import bpy.utils.previews
 
 from . import camera as on_camera
-from .library import KINDS, LensError, LensFacts, error_px, notes, read_library, refusals, refused, too_large
+from .library import KINDS, LensError, LensFacts, error_px, notes, outside, read_library, refusals, refused, too_large
 from .needs import needs
 
 _FIRST = ("f_number", "focus_m", "zoom_mm")  # of the settings, before the others
@@ -20,6 +20,7 @@ _LABELS = {  # where Blender would show the name alone
     "zoom_mm": "Zoom (mm)",
     "exposure": "Exposure: 0 Blender, 1 Lens",
     "origin": "Origin: 0 Film, 1 Pupil",
+    "unit_m": "Metres per Unit",
 }
 
 
@@ -250,6 +251,7 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
         layout, camera = self.layout, found.data
         variant, setting = lens.variants[kind], on_camera.setting_of(context.scene, found)
         wrong, message = refusals(variant, setting), camera.neurolens.message
+        black = outside(variant, setting)
         if message and message != "; ".join(wrong):
             _wrapped(layout, message, "ERROR")
         applied = on_camera.applied(camera)
@@ -267,8 +269,10 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
             _wrapped(layout, line, "INFO")
         error = error_px(variant, setting)
         layout.label(text="Every surface is traced" if error is None else f"Error: {error:.2g} pixels (RMS)")
-        for line in (*wrong, *notes(variant, setting)):
-            _wrapped(layout, line, "INFO" if line not in wrong else "ERROR")
+        for line in (*wrong, *black):
+            _wrapped(layout, line, "ERROR")
+        for line in notes(variant, setting):
+            _wrapped(layout, line, "INFO")
 
     def _draw_settings(self, camera: Any) -> None:
         """The shader's own parameters: what is keyframed is what Cycles reads."""
@@ -286,14 +290,15 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
 
 @bpy.app.handlers.persistent
 def warn_of_black(scene: Any, _graph: Any = None) -> None:
-    """Before a frame is rendered: a line to the console where the lens cannot take the picture."""
+    """Before a frame is rendered: a line to the console where the lens cannot take the picture or a corner of it."""
     found = scene.camera
     if found is None or found.type != "CAMERA" or not on_camera.applied(found.data):
         return
     lens_id, _, kind = found.data.neurolens.on.partition("/")
     lens = LIBRARY.lenses.get(lens_id)
     if lens is not None and kind in lens.variants:
-        for line in refusals(lens.variants[kind], on_camera.setting_of(scene, found)):
+        asked = lens.variants[kind], on_camera.setting_of(scene, found)
+        for line in (*refusals(*asked), *outside(*asked)):
             print(f"neurolens: camera {found.name!r}, frame {scene.frame_current}: {line}", file=sys.stderr)
 
 

@@ -1,0 +1,472 @@
+"""Kinds of hostile cases: which file of a folder is damaged, and which command then reads it.
+
+A kind is a function of random numbers and a folder of good files (`make_seeds`); it damages files there and returns the
+words of a command, with small settings: a valid file goes all the way in a fraction of a second.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import re
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments import lab
+from experiments.fuzz_damage import WORDS, damage
+from neurolens import cli
+from neurolens.commands.arguments import Parser
+
+SEEDS = Path(__file__).with_name("fuzz_seeds")
+Chance = random.Random
+Words = list[str]
+_SMALL_FLARE = ("--width", "24", "--wavelengths", "2", "--cell", "64", "--threads", "1", "--quiet")
+_ANALYSES = "spots", "layout", "vignetting", "mtf", "psf", "fans"  # that take longer than others
+_FILM = ("--size", "8x6", "--film", "24x18", "--quiet")
+_PLATE, _PLATE_FILM = (12, 8), "36x24"  # pixels; mm
+
+
+def hurt(chance: Chance, folder: Path, name: str) -> None:
+    """Damage a file of the folder; now and then something else stands in its place."""
+    file = folder / name
+    if chance.random() < 0.02:
+        file.unlink()
+        chance.choice((os.mkfifo, os.mkdir, partial(os.symlink, "/dev/zero")))(file)
+    else:
+        file.write_bytes(damage(chance, name, file.read_bytes()))
+
+
+def _pick(chance: Chance, commands: Sequence[tuple[float, Sequence[str]]]) -> Words:
+    """One of the commands by its weight: fast ones are run more often."""
+    return list(chance.choices([words for _, words in commands], [weight for weight, _ in commands])[0])
+
+
+def _render(camera: str = "thin", *more: str) -> Words:
+    return ["render", "scene.toml", "--camera", camera, "-o", "out.exr", "--threads", "1", "--quiet", *more]
+
+
+def _flare(lens: str, *more: str) -> Words:
+    return ["flare", lens, *more, *_SMALL_FLARE, "-o", "flare.exr"]
+
+
+def _of_lens(chance: Chance, folder: Path) -> Words:
+    hurt(chance, folder, "lens.toml")
+    light = ("--light", "5,3")
+    return _pick(
+        chance,
+        (
+            (8, ("lens", "lens.toml", "good.toml")),
+            (2, ("lens", "lens.toml", "--json")),
+            (1, ("lens", "lens.toml", "--derive-rims")),
+            *((2, ("analyse", "lens.toml", what)) for what in ("seidel", "distortion", "colour", "curvature")),
+            *(
+                (0.3, ("analyse", "lens.toml", what))
+                for what in ("spots", "layout", "vignetting", "mtf", "psf", "fans")
+            ),
+            (4, _render("thick:lens.toml")),
+            (4, _render("thin:lens.toml")),
+            (0.5, _render("lens.toml")),
+            (0.3, _render("fused:lens.toml")),
+            (0.1, ("stmap", "lens.toml", *_FILM, "-o", "shot")),
+            (0.3, ("export", "lens.toml", "--to", "c", "-o", "out.h", "--json")),
+            (0.2, ("export", "lens.toml", "--to", "glsl", "-o", "out.glsl", "--json")),
+            (0.5, _flare("lens.toml", *light)),
+            (2, _flare("lens.toml", *light)[:4]),
+            (0.5, ("models", "lens.toml")),
+            (0.1, ("survey", "fold", "--no-fit", "-o", "new", "--jobs", "1", "--quiet")),
+        ),
+    )
+
+
+def _of_zoom(chance: Chance, folder: Path) -> Words:
+    hurt(chance, folder, "states.toml")
+    return _pick(
+        chance,
+        (
+            (4, ("lens", "states.toml", "good.toml")),
+            (2, ("lens", "states.toml", "--zoom", "100", "--focus", "2")),
+            (1, ("lens", "states.toml", "--focusing", "internal", "--focus", "1.5")),
+            (2, _render("thick:states.toml", "--zoom", "100")),
+        ),
+    )
+
+
+def foreign() -> list[str]:
+    """Lens files of other programs."""
+    return sorted(file.name for file in SEEDS.iterdir() if file.stem in ("lens", "zoom"))
+
+
+def _of_format(chance: Chance, folder: Path) -> Words:
+    name = chance.choice(foreign())
+    hurt(chance, folder, name)
+    commands = [
+        (8, ("convert", name, "-o", "out.toml")),
+        (1, ("lens", name, "good.toml")),
+        (1, _render(f"thick:{name}")),
+    ]
+    return _pick(chance, commands)
+
+
+def _of_glass(chance: Chance, folder: Path) -> Words:
+    hurt(chance, folder, "own.agf")
+    more = ("--glass", "own.agf")
+    commands = [(3, ("glass", "OWN1", *more)), (1, ("convert", "lens.zmx", "-o", "out.toml", *more))]
+    return _pick(chance, commands)
+
+
+def _of_scene(chance: Chance, folder: Path) -> Words:
+    hurt(chance, folder, "scene.toml")
+    return _pick(chance, ((9, _render()), (1, _flare("good.toml", "--lights", "scene.toml"))))
+
+
+def _of_mesh(chance: Chance, folder: Path) -> Words:
+    hurt(chance, folder, chance.choice(("tetra.obj", "tetra.obj", "tetra.mtl", "tetra.ply", "mixed.ply")))
+    return _render()
+
+
+def _of_picture(chance: Chance, folder: Path) -> Words:
+    name = chance.choice(
+        ("tile.png", "tile.jpg", "tile.tif", "tile.webp", "mask.png", "sky.exr", "sky.hdr", "lamp.csv")
+    )
+    hurt(chance, folder, name)
+    if name == "sky.hdr":
+        (folder / "scene.toml").write_text((folder / "scene.toml").read_text().replace("sky.exr", name))
+    return _render()
+
+
+def _of_model(chance: Chance, folder: Path) -> Words:
+    name = chance.choice(("model.onnx", "model.onnx", "network.onnx"))
+    hurt(chance, folder, name)
+    return _pick(
+        chance,
+        (
+            (3, _render(name)),
+            *((1, ("export", name, "--to", to, "-o", f"out.{to}", "--json")) for to in ("glsl", "onnx")),
+            (0.3, ("export", name, "--to", "c", "-o", "out.h", "--json")),
+            (0.1, ("stmap", name, *_FILM, "-o", "shot")),
+            (0.1, ("view", name, "--downloads", "glsl", "-o", "out.html", "--json")),
+            (0.1, ("blender", "add", name, "--to", "pack.zip", "--quiet")),
+        ),
+    )
+
+
+def _of_ghosts(chance: Chance, folder: Path) -> Words:
+    hurt(chance, folder, "ghosts.onnx")
+    return _flare("ghosts.onnx", "--light", "5,3")
+
+
+def _of_listing(chance: Chance, folder: Path) -> Words:
+    """What `models` finds in the working folder."""
+    (folder / "models").mkdir()
+    name = chance.choice(("model.onnx", "network.onnx"))
+    hurt(chance, folder, name)
+    shutil.copy(folder / name, folder / "models" / name) if (folder / name).is_file() else None
+    return ["models", "cooke"]
+
+
+def _of_experiment(chance: Chance, folder: Path) -> Words:
+    hurt(chance, folder, "experiment.toml")
+    return ["read", "experiment.toml"]
+
+
+def _of_tile(chance: Chance, folder: Path) -> Words:
+    names = sorted(file.name for file in folder.glob("tile.tile-*.exr"))
+    hurt(chance, folder, chance.choice(names))
+    return merging(*names)
+
+
+def merging(*names: str) -> Words:
+    """The command that puts tiles together."""
+    return ["render", "--merge", *names, "-o", "out.exr"]
+
+
+def _of_plate(chance: Chance, folder: Path) -> Words:
+    name = chance.choice(("plate.exr", "half.exr"))
+    hurt(chance, folder, name)
+    return plate(name)
+
+
+def plate(name: str) -> Words:
+    """The flare of a plate's lights."""
+    return _flare("good.toml", "--image", name, "--film", _PLATE_FILM, "--most", "2")
+
+
+def _of_lights(chance: Chance, folder: Path) -> Words:
+    name = chance.choice(("lights.csv", "lights.json", "keys.csv", "keys.json"))
+    hurt(chance, folder, name)
+    frames = ("--frames", "1:2", "--key", name)
+    if name.startswith("keys"):
+        return _render("thin", *frames) if chance.random() < 0.8 else _flare("good.toml", "--light", "5,3", *frames)
+    return _flare("good.toml", "--lights", name)
+
+
+def _of_archive(chance: Chance, folder: Path) -> Words:
+    hurt(chance, folder, chance.choice(("pack.zip", "pack.zip", "user/lenses.json")))
+    return ["blender", "add", "model.onnx", "--to", chance.choice(("pack.zip", "user")), "--quiet"]
+
+
+def _of_kept(chance: Chance, folder: Path) -> Words:
+    """What an interrupted or an earlier run has left."""
+    records = sorted(str(file.relative_to(folder)) for file in folder.glob("done/records/*.json"))
+    commands = {
+        "out.exr.part": _render("thin", "--samples", "16"),
+        "pages/cooke_triplet_50/record.json": ["library", "-o", "pages", "cooke_triplet_50", "--quiet"],
+        **{name: ["survey", "fold", "--no-fit", "-o", "done", "--quiet"] for name in records},
+    }
+    rare = [0.1 if "record" in name and "pages" in name else 1 for name in commands]
+    (name,) = chance.choices(list(commands), rare)
+    (folder / "kept.part").rename(folder / "out.exr.part")
+    hurt(chance, folder, name)
+    return commands[name]
+
+
+def _of_words(chance: Chance, folder: Path) -> Words:
+    fine = (
+        _render(), _render("thick:lens.toml"), _render("model.onnx"), merging("tile.tile-1-of-2.exr"),
+        ["lens", "lens.toml"], ["glass", "N-BK7"], ["convert", "lens.zmx", "-o", "out.toml"], ["models", "cooke"],
+        ["export", "model.onnx", "--to", "c", "-o", "out.h", "--json"], ["analyse", "lens.toml", "seidel"],
+        _flare("lens.toml", "--light", "5,3"), ["stmap", "thin", *_FILM, "-o", "shot"],
+        ["projection", "thin", *_FILM, "--model", "opencv"], ["evaluate", "model.onnx", "--rays", "1000", "--quiet"],
+        ["blender", "add", "model.onnx", "--to", "pack.zip", "--quiet"], ["view", "model.onnx", "--downloads", "glsl"],
+        ["survey", "fold", "--no-fit", "-o", "new", "--quiet"], ["plan", "scene.toml", "--lens", "missing"],
+        ["train", "missing.toml"], ["bench", "missing"], ["mitsuba", "cornell-box"],
+    )  # fmt: skip
+    words = list(chance.choice(fine))
+    options = [o for o in parsers()[words[0]] if o not in _LONG]
+    for _ in range(chance.choice((1, 1, 2))):
+        if options and chance.random() < 0.7:
+            words += [chance.choice(options), chance.choice((*WORDS, "0.5", "2", "4", "40", "all", "x.png"))]
+        else:
+            words[chance.randrange(1, len(words))] = chance.choice((*WORDS, *options))
+    return [word.replace("\\udc00", "\udc00") for word in words]
+
+
+# Their value may be any amount of work, or of a network; help is no work at all.
+_LONG = ("--help", "-h", "--samples", "--max-depth", "--dask", "--rays", "--photons", "--glare", "--fit", "--models")
+
+
+@cache
+def parsers() -> dict[str, list[str]]:
+    """Options of each command."""
+    kinds = next(a for a in cli.build_parser()._actions if isinstance(a, argparse._SubParsersAction))
+    return {name: [o for a in p._actions for o in a.option_strings] for name, p in kinds.choices.items()}
+
+
+def _of_large(chance: Chance, folder: Path) -> Words:
+    """A text file grown to 1 MB by one thing repeated."""
+    commands = {
+        "lens.toml": _render("thick:lens.toml"),
+        **{name: _render() for name in ("scene.toml", "tetra.obj", "tetra.mtl", "lamp.csv")},
+        "experiment.toml": ["read", "experiment.toml"],
+        "lights.csv": _flare("good.toml", "--lights", "lights.csv"),
+        **{name: ["convert", name, "-o", "out.toml"] for name in foreign()},
+    }
+    name = chance.choice(list(commands))
+    data = (folder / name).read_bytes()
+    m = chance.choice(list(re.finditer(rb"[\w.+-]+|[\s\"'=,{}\[\]/:]", data)))
+    units = b" ,1,a,\n,.,a.,[,(,\",',\\,0 ,1e".split(b",")
+    unit = chance.choice((m[0], b",", *units, chance.choice(data.splitlines(keepends=True))))
+    at = chance.choice((m.start(), m.end(), data.find(b"\n", m.end()) + 1))
+    (folder / name).write_bytes(data[:at] + unit * (960_000 // len(unit)) + data[at:])
+    return commands[name]
+
+
+def _of_long_runs(chance: Chance, folder: Path) -> Words:
+    """Commands that take seconds when their files are good."""
+    made = sorted(str(file.relative_to(folder)) for file in folder.glob("run/models/*"))
+    files = ("scene.toml", "lens.toml", "model.onnx", "experiment.toml", chance.choice(made), chance.choice(made))
+    name = chance.choice(files)
+    hurt(chance, folder, name)
+    lens = ("--lens", "lens.toml", "--quiet", "--no-fit")
+    by_file: dict[str, tuple[tuple[float, Sequence[str]], ...]] = {
+        "model.onnx": (
+            (1, ("evaluate", "model.onnx", "--rays", "1000", "--quiet")),
+            (1, ("export", "model.onnx", "--to", "osl", "-o", "out.osl", "--json")),
+            (1, ("projection", "model.onnx", *_FILM, "--model", "f-theta", "-o", "shot")),
+        ),
+        "scene.toml": (
+            (1, ("plan", "scene.toml", *lens)),
+            (1, ("plan", "scene.toml", *lens, "--trade", "--samples", "1")),
+        ),
+        "lens.toml": (
+            (1, ("library", "-o", "new", "lens.toml", "--quiet")),
+            (1, ("view", "lens.toml", "--json")),
+            (1, ("projection", "lens.toml", *_FILM, "--model", "opencv", "-o", "shot")),
+        ),
+    }
+    train = (1.0, ("train", "experiment.toml", "-o", "run", "--no-race", "--quiet"))
+    return _pick(chance, by_file.get(name, (train,)))
+
+
+KINDS: dict[str, tuple[float, Callable[[Chance, Path], Words]]] = {
+    "lens": (12, _of_lens),
+    "zoom": (3, _of_zoom),
+    "format": (16, _of_format),
+    "glass": (3, _of_glass),
+    "scene": (12, _of_scene),
+    "mesh": (6, _of_mesh),
+    "picture": (6, _of_picture),
+    "model": (8, _of_model),
+    "ghosts": (1, _of_ghosts),
+    "listing": (1, _of_listing),
+    "experiment": (5, _of_experiment),
+    "tile": (5, _of_tile),
+    "plate": (3, _of_plate),
+    "lights": (3, _of_lights),
+    "archive": (3, _of_archive),
+    "kept": (4, _of_kept),
+    "words": (7, _of_words),
+    "large": (0.8, _of_large),
+    "long runs": (0.1, _of_long_runs),
+}
+
+
+def chosen(seed: int, case: int, only: str = "") -> tuple[Chance, str]:
+    """The random numbers of a case, and its kind."""
+    chance = Chance(f"{seed}/{case}")
+    names = [name for name in KINDS if only in name]
+    return chance, chance.choices(names, [KINDS[name][0] for name in names])[0]
+
+
+# ---- The commands. ---------------------------------------------------------------------------------------------------
+
+
+def build() -> Parser:
+    """The command line, and `read EXPERIMENT`: an experiment with its lens, domain and scenes; nothing runs."""
+    from neurolens.evaluate.experiment import read_experiment
+    from neurolens.render.scene import load_scene
+
+    def read(args: argparse.Namespace) -> int:
+        experiment = read_experiment(args.file)
+        experiment.domain.of(experiment.lens.read())
+        for scene in experiment.render.scenes:
+            load_scene(scene)
+        return 0
+
+    parser = cli.build_parser()
+    kinds = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
+    reader = kinds.add_parser("read")
+    reader.add_argument("file", type=Path)
+    reader.set_defaults(run=read, kept="nothing")
+    return parser
+
+
+def shorten() -> None:
+    """Replace steps that take long and read no further file: a survey's processes, a shader's pupil, the field of the
+    good lens of plates, which is made once."""
+    from neurolens.blender.pack import Form
+    from neurolens.cameras.onnxlens import load_model
+    from neurolens.commands import blender_lenses, flare_lights
+    from neurolens.evaluate import survey_run
+
+    def engine(jobs: int) -> survey_run.Engine:
+        def run(tasks: Any) -> Iterator[tuple[Any, bytes]]:
+            return ((task, survey_run.run_task(task)) for task in tasks)
+
+        return run
+
+    def form_of(file: Path, **_: Any) -> Form:
+        card = load_model(file).card
+        return Form("polynomial", card["fit"]["method"], "shader", 1.0, 21.6, 2.0, 0.7)
+
+    fields: dict[tuple[Any, ...], Any] = {}
+    field_of = flare_lights.Sources._field
+
+    def field(sources: flare_lights.Sources, args: argparse.Namespace, *rest: Any) -> Any:
+        if args.file != Path("good.toml"):
+            return field_of(sources, args, *rest)
+        key = args.film, args.focus, args.f_number, args.zoom, args.efl, args.field, args.focusing
+        if key not in fields:
+            fields[key] = field_of(sources, args, *rest)
+        return fields[key]
+
+    flare_lights.Sources._field = field  # type: ignore[assignment,method-assign]
+    survey_run.in_processes = engine  # type: ignore[assignment]
+    blender_lenses.form_of = form_of
+
+
+# ---- Good files. -----------------------------------------------------------------------------------------------------
+
+
+def make_seeds(folder: Path, kinds: set[str], run: Callable[[Path, Words], tuple[int, str]]) -> None:
+    """Fill a new folder with one good file of each kind, those of some kinds by commands.
+
+    Raises:
+        RuntimeError: a command refuses good files; then every case would be refused.
+    """
+
+    def done(words: Words) -> None:
+        code, said = run(folder, words)
+        if code:
+            raise RuntimeError(f"{' '.join(words)}: {said}")
+
+    shutil.copytree(SEEDS, folder)
+    lens, models = lab.LENSES / "cooke_triplet_50.toml", lab.MODELS / "cooke_triplet_50"
+    for place in ("lens.toml", "good.toml", "fold/lens.toml"):
+        (folder / place).parent.mkdir(exist_ok=True)
+        shutil.copy(lens, folder / place)
+    shutil.copy(lab.LENSES / "nikon_zoom_80_200.toml", folder / "states.toml")
+    shutil.copy(folder / "lens.zmx", folder / "fold" / "=lens.zmx")
+    shutil.copy(f"{models}.ols-64.onnx", folder / "model.onnx")
+    shutil.copy(f"{models}.mlp-16x2.onnx", folder / "network.onnx")
+    _plates(folder)
+    _pack(folder)
+    _page(folder)
+    done(["read", "experiment.toml"])
+    done(_render("thin", "--keep-checkpoint", "--samples", "16"))
+    (folder / "out.exr.part").rename(folder / "kept.part")
+    for k in (1, 2):
+        done(_render("thin", "--tile", f"{k}/2", "-o", "tile.exr"))
+    done(["survey", "fold", "--no-fit", "-o", "done", "--quiet"])
+    if "ghosts" in kinds:
+        done(["flare", "lens.toml", "--fit", "ghosts.onnx", "--target-um", "1000", "--angle", "10", "--quiet"])
+    if "long runs" in kinds:
+        done(["train", "experiment.toml", "-o", "run", "--no-race", "--quiet"])
+    for made in (*folder.glob("out.*"), *folder.glob("tile*.png")):
+        if made.name != "tile.png":
+            made.unlink()
+    os.mkfifo(folder / "fifo")
+
+
+def _plates(folder: Path) -> None:
+    """Plates with two lights."""
+    from neurolens.render.pictures import write_exr
+
+    plate = np.full((*_PLATE[::-1], 3), 0.1)
+    plate[2, 3] = plate[5, 8:10] = 50.0
+    write_exr(folder / "plate.exr", plate, metadata={"film_mm": [36, 24]}, layers={"depth": plate[..., 0]})
+    write_exr(folder / "half.exr", plate, half=True)
+
+
+def _pack(folder: Path) -> None:
+    """The extension with one lens, as a zip and as a user folder."""
+    from neurolens.blender.pack import Form, PackedLens, add_to_folder, write_pack
+
+    form = Form("polynomial", "ols-36", "shader", 1.0, 21.6, 1.8, 0.7)
+    lens = PackedLens("gauss", "Gauss", 50.0, 1.8, "US 2 1973", b"PNG", [form])
+    write_pack(folder / "pack.zip", [lens])
+    add_to_folder(folder / "user", lens)
+
+
+def _page(folder: Path) -> None:
+    """A page of `neurolens library` whose record is known, so that it is not drawn again."""
+    from neurolens import __version__
+    from neurolens.optics.lensfile import read_lens
+
+    record = {
+        "lens": "cooke_triplet_50", "page": "cooke_triplet_50", "sha256": read_lens(folder / "lens.toml").sha256,
+        "version": __version__, "name": "Triplet", "efl_mm": 50.0, "f_number": 2.8, "half_field_deg": 20.0,
+        "refractions": 6, "states": [], "ns": 5.0, "year": 1973, "designer": "", "rms_um": 1.0, "doubts": [],
+        "layout": "<svg></svg>",
+    }  # fmt: skip
+    place = folder / "pages" / "cooke_triplet_50"
+    place.mkdir(parents=True)
+    (place / "record.json").write_text(json.dumps(record))
+    (place / "index.html").write_text("<!DOCTYPE html>")

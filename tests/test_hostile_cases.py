@@ -1,0 +1,135 @@
+"""Files of strangers, ../shared/data/cases/hostile: one clear line each, and nothing is written outside its place."""
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_line import failure, run_json
+
+from neurolens.blender.pack import Form
+from neurolens.cameras.onnxlens import load_model
+from neurolens.cli import main
+
+HOSTILE = Path(__file__).parents[2] / "shared" / "data" / "cases" / "hostile"
+ROOT = Path(__file__).parents[1]
+GAUSS = ROOT / "models" / "laikin_double_gauss_50.ols-36.onnx"
+FLARE = ("flare", "brendel_tessar_100", "--width", "64", "--wavelengths", "2", "--quiet")
+TILES = ("148", "234", "473", "795", "869")
+ZIPS = ("damaged", "deep", "enc", "kind", "var5", "varstr")
+
+pytestmark = pytest.mark.skipif(not HOSTILE.exists(), reason="../shared/data/cases/hostile is not here")
+
+
+@pytest.fixture(autouse=True)
+def _there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A working folder with the cases, in which a failed command leaves nothing."""
+    for file in HOSTILE.iterdir():
+        shutil.copyfile(file, tmp_path / file.name)
+    monkeypatch.chdir(tmp_path)
+    yield
+    assert not [path.name for path in tmp_path.rglob("*") if ".neurolens-" in path.name]
+
+
+def lights(name: str, text: str) -> Callable[[], None]:
+    return lambda: Path(name).write_text(text) and None
+
+
+MANY = json.dumps([{"azimuth_deg": 1 + k / 50000, "elevation_deg": 0.5} for k in range(200_000)])
+MERGE = ("render", "--merge", "-o", "o.exr")
+RENDER = ("render", "mesh_pabs.toml", "--camera", "thin", "-o", "o.exr", "--samples", "1", "--width", "16", "--quiet")
+ADD = ("blender", "add", GAUSS, "--to")
+# Of each case the commands that are refused, by words of the message: what makes its file, the command.
+REFUSED: dict[str, list[tuple[str, Callable[[], object] | None, tuple[object, ...]]]] = {
+    "metaint.exr": [
+        ("metaint.exr: neurolens: got 5, expected JSON text", None, (*FLARE, "--image", "metaint.exr")),
+        ("metaint.exr: neurolens: got 5, expected JSON text", None, (*MERGE, "metaint.exr")),
+    ],
+    "pabs.ply": [("meshes[0].faces[0]: got [0, 1, 4294967295]", None, RENDER)],
+    **{
+        f"tile_{k}": [(f"tile_{k}_0.exr: metadata:", None, (*MERGE, f"tile_{k}_0.exr", f"tile_{k}_1.exr"))]
+        for k in TILES
+    },
+    **{f"z_{kind}.zip": [("`neurolens blender build`", None, (*ADD, f"z_{kind}.zip"))] for kind in ZIPS},
+    "fifo_blender": [
+        ("not a regular file", lambda: os.mkfifo("f.zip"), (*ADD, "f.zip")),
+        ("not a regular file", lambda: (os.mkdir("d"), os.mkfifo("d/lenses.json")), (*ADD, "d")),
+    ],
+    "many_lights": [
+        ("at most 10000 lights in a list", lights("many.json", MANY), (*FLARE, "--lights", "many.json")),
+        ("at least one light", lights("empty.json", "[]"), (*FLARE, "--lights", "empty.json")),
+        ("at least one light", lights("empty.csv", ""), (*FLARE, "--lights", "empty.csv")),
+        ("at least one light", lights("head.csv", "azimuth_deg,elevation_deg\n"), (*FLARE, "--lights", "head.csv")),
+    ],
+}
+OTHERS = ("trav.onnx", "longmethod.onnx", "fault.toml", "library_same_stem", "rings.exr")  # each has a test below
+
+
+def test_every_case_is_a_test() -> None:
+    cases = {file.name.removesuffix(".txt") for file in HOSTILE.glob("*.txt")}
+    assert cases == {*REFUSED, *OTHERS}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_it_is_refused_in_one_line_and_writes_nothing(case: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for words, make, command in REFUSED[case]:
+        if make is not None:
+            make()
+        before = {path: path.lstat().st_mtime_ns for path in Path().rglob("*")}
+        assert words in failure(capsys, *command)
+        assert {path: path.lstat().st_mtime_ns for path in Path().rglob("*")} == before
+
+
+@pytest.mark.parametrize("case", ["trav.onnx", "longmethod.onnx"])
+def test_a_models_method_is_part_of_a_safe_name(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The card's text stands in the pack; its shader, whose pupil takes seconds to fit, is replaced."""
+
+    def form_of(file: Path, **_: Any) -> Form:
+        return Form("polynomial", load_model(file).card["fit"]["method"], "shader", 1.0, 21.6, 1.8, 0.7)
+
+    monkeypatch.setattr("neurolens.commands.blender_lenses.form_of", form_of)
+    before = set(Path().rglob("*"))
+    assert main(["blender", "add", case, "--to", "inner/folder", "--quiet"]) == 0
+    made = set(Path().rglob("*")) - before
+    assert made and all(path.is_relative_to("inner") and len(path.name) < 120 for path in made)
+    assert len([path for path in made if path.suffix == ".osl"]) == 1
+    assert not [path for path in Path("..").glob("*/escaped")] and not Path("escaped").exists()
+
+
+def test_a_refused_lens_is_text_in_the_librarys_index(capsys: pytest.CaptureFixture[str]) -> None:
+    """All lenses are refused here: the page is there, with the reason. In a browser: tests/view."""
+    assert main(["library", "-o", "new", "fault.toml", "--quiet"]) == 1
+    text = Path("new/index.html").read_text()
+    assert "schema: got" in capsys.readouterr().out and "schema: got" in text
+    assert "<img" not in text and "<script>document.documentElement" not in text
+
+
+def test_lenses_of_one_stem_have_pages_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    from neurolens.commands import library
+
+    monkeypatch.setattr(library, "_drawings", lambda lens: ())  # pictures take ten seconds a lens
+    for folder, lens in (("a", "cooke_triplet_50"), ("b", "petzval_portrait_100")):
+        Path(folder).mkdir()
+        shutil.copyfile(ROOT / "lenses" / f"{lens}.toml", f"{folder}/x.toml")
+    assert main(["library", "-o", "pages", "a/x.toml", "b/x.toml", "--quiet"]) == 0
+    titles = [Path("pages", name, "index.html").read_text() for name in ("x", "x-2")]
+    assert "Cooke triplet" in titles[0] and "Petzval" in titles[1]
+    index = Path("pages/index.html").read_text()
+    assert "./x/index.html" in index and "./x-2/index.html" in index
+
+
+@pytest.mark.slow
+def test_nested_rings_end_within_the_memory_of_one_picture(capsys: pytest.CaptureFixture[str]) -> None:
+    """A thousand regions, each around the next, took 1.7 GB more than their picture of 48 MB."""
+    import tracemalloc
+
+    tracemalloc.start()
+    try:
+        words = (*FLARE, "--image", "rings.exr", "--film", "24x24", "--most", "2")
+        run_json(capsys, *words)
+        assert tracemalloc.get_traced_memory()[1] < 700e6
+    finally:
+        tracemalloc.stop()
