@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import math
 import os
 import sys
@@ -39,6 +40,7 @@ from neurolens.render.colour import (
 from neurolens.render.radiance import read_radiance
 from neurolens.render.scenetables import BRIGHTEST
 
+logging.getLogger("PIL").addHandler(logging.NullHandler())  # Pillow logs what our errors say of damaged files
 METADATA_KEY = "neurolens"
 _HALF_MAX = 65504.0
 _BAND = 1 << 17  # pixels of a preview that are encoded at a time
