@@ -40,7 +40,7 @@ def add_lights(parser: argparse.ArgumentParser) -> None:
         "--lights", metavar="FILE", type=Path, action="append", default=[],
         help="a scene (.toml), whose shapes that shine, points, spots and sun the camera of the scene sees; or a list, "
         "CSV or JSON, with azimuth_deg, elevation_deg, and where wanted light (a name), frame (keys), r, g, b, "
-        "distance_m; repeatable",
+        "diameter_deg (of a disc; the sun has 0.53), distance_m; repeatable",
     )  # fmt: skip
     group.add_argument(
         "--image", metavar="PLATE.exr", type=Path,
