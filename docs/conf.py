@@ -72,7 +72,8 @@ def _commands() -> str:
 
 def _write_api(folder: Path) -> None:
     """One page a package, with the docstrings of its modules, and an index of these pages."""
-    folder.mkdir(exist_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)  # modules that are gone
+    folder.mkdir()
     index = ["# API", "Modules by package. What is not listed there is private."]
     for package in PACKAGES:
         path = ROOT / "neurolens" / package
@@ -88,7 +89,11 @@ def _module(name: str) -> str:
 
 
 def _prepare(app: Any, document: str, content: list[str]) -> None:
-    """Index pages get the menu of what they link to; pages outside docs/pages are in no menu; files show their name."""
+    """Index pages get the menu of what they link to; pages outside docs/pages are in no menu; files show their name.
+
+    Links to HTML pages stay links: Sphinx would take them for downloads, without what lies beside them.
+    """
+    content[0] = re.sub(r"\[([^]]+)\]\(([\w/]+\.html)\)", r'<a href="\2">\1</a>', content[0])
     content[0] = re.sub(
         r'^```(\w+) title="([^"]+)"$', r"```{code-block} \1\n:caption: \2\n", content[0], flags=re.MULTILINE
     )

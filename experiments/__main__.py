@@ -19,6 +19,7 @@ NAMES = {
     "pupils": ("pupils", "share of rays that pass a lens, by how its pupil is sampled"),
     "surrogates": ("surrogates", "all methods on a set of lenses, or on the whole library"),
     "vignetting": ("vignetting", "false passes and blocks, illumination"),
+    "clipping": ("clipping", "rays that shipped models pass or block wrongly, networks beside polynomials"),
     "outside": ("outside", "random inputs through exported models"),
     "fused": ("fused_speed", "models as C against the exact lens as C"),
     "gpu": ("gpu", "lenses and models as GLSL compute shaders, on a GPU or by software OpenGL"),

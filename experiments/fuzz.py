@@ -194,7 +194,7 @@ def _faults(argv: Sequence[str], code: int, said: str, new: Sequence[str], memor
         yield f"exit code {code}"
     if any(".neurolens-" in name for name in new):
         yield "a temporary file stayed"
-    if code == 2 and new:
+    if code == 2 and new and "--frames" not in argv:  # frames before the one that is refused are finished
         yield f"refused, yet wrote {sorted(new)[:5]}"
     if code == 2 and (len(lines) != 1 or not lines[0].startswith("neurolens")):
         yield "not one line"

@@ -11,6 +11,8 @@ import argparse
 import functools
 import json
 import os
+import re
+import statistics
 import sys
 import tempfile
 import warnings
@@ -32,16 +34,33 @@ from neurolens.evaluate.candidates import exact_candidates, model_candidate, mod
 from neurolens.evaluate.check import check_model, check_states
 from neurolens.evaluate.describe import lens_files
 from neurolens.evaluate.experiment import DomainChoice, Experiment, LensChoice, check_names
-from neurolens.evaluate.measure import Measured, fit_and_measure, shared_rays
+from neurolens.evaluate.measure import (
+    CARD_KEYS,
+    FRESH,
+    Findings,
+    Measured,
+    fit_and_measure,
+    fresh_rays,
+    measure,
+    onnx_predictor,
+    shared_rays,
+    what_is_poor,
+)
 from neurolens.evaluate.rays import REFERENCE_RADIUS_MM
 from neurolens.evaluate.records import versions
 from neurolens.evaluate.speed import race
 from neurolens.evaluate.train_states import fit_and_measure_states, state_settings
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm
+from neurolens.surrogates.cores import Residual
 from neurolens.surrogates.domain import Domain
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, prepare
+from neurolens.surrogates.fits.network import with_boundary_terms
+from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.stored import load_fitted
+from neurolens.surrogates.targets import Prepared
 
 _LIST = lab.ROOT / "experiments" / "models.toml"
 
@@ -174,18 +193,41 @@ _COLUMNS = lab.columns(
 )
 
 
+# Kinds of lens of the library besides round photographic lenses, by words in their names.
+_OTHERS = {"anamorphic lenses": "anamorphic", "single elements": "edmund|thorlabs"}
+
+
+def errors_by_kind(rows: Sequence[Row], model: str) -> dict[str, list[float]]:
+    """RMS errors (um on each lens's own film) of a model, by kind of lens; each lens once, as its file has it."""
+    found: dict[str, list[float]] = {"round photographic lenses": [], **{kind: [] for kind in _OTHERS}}
+    for row in rows:
+        if row["model"] == model and row["rms_um"] is not None and row["entry"] == Path(row["lens_file"]).stem:
+            kinds = [kind for kind, words in _OTHERS.items() if re.search(words, row["entry"])]
+            found[kinds[0] if kinds else "round photographic lenses"].append(row["rms_um"])
+    return found
+
+
+def _summary(rows: Sequence[Row], model: str) -> str:
+    """One line a kind of lens: number, median and range."""
+    kinds = ((k, v) for k, v in errors_by_kind(rows, model).items() if v)
+    parts = [f"{len(v)} {k} {statistics.median(v):.3g} ({min(v):.3g} to {max(v):.3g})" for k, v in kinds]
+    return f"RMS of {model} on each lens's own film, um, median and range: {', '.join(parts)}." if parts else ""
+
+
 def write_index(rows: Sequence[Row], left_out: Mapping[str, str], out: Path) -> None:
     """Write both; `left_out` gives the reason for each entry that has no models."""
     index = {"schema": 2, "command": "python -m experiments models", "versions": versions()}
     write_json(out / "index.json", index | {"models": list(rows), "left_out": dict(left_out)})
     reasons = "\n".join(f"- {state}: {reason}" for state, reason in left_out.items())
-    parts = ["Not made:", reasons] if left_out else []
+    parts = [line for model in ("mlp-16x2", "ols-64") if (line := _summary(rows, model))]
+    parts += ["Not made:", reasons] if left_out else []
     atomic_write_text(out / "README.md", lab.page(_HEAD, lab.table(_COLUMNS, rows, "–"), *parts))
 
 
 # The bench fails below this share of the speed-up measured here: machines and days differ, regressions differ more.
 PROMISE = 0.8
 _VIGNETTING_RAYS = 200_000
+_SHARES = ("false_pass", "false_block")
 _KEPT = tuple(
     "rms_um p99_um direction_rms_deg position_rms_um transmittance_rms false_pass false_block "
     "coefficients_per_vector parameters bytes fit_s".split()
@@ -349,6 +391,75 @@ def time_models(library: Library, entries: Sequence[Entry], out: Path, progress:
     return missing
 
 
+def refit_clipping(library: Library, entries: Sequence[Entry], out: Path, progress: Progress) -> list[str]:
+    """Fit what clips rays again in the networks that are there, on the hidden layers that they have.
+
+    All else in their files stays as it is, their times in the index too (`--times` measures those). Networks that need
+    no terms for their boundaries are left alone.
+
+    Returns: entries whose networks cannot be fitted again, and cards that do not hold, as sentences.
+    """
+    failed = []
+    networks = {e: {m.label for m in e.models if m.method == "mlp"} for e in entries if not e.lens.many_states}
+    progress.plan({f"{e.state}: clipping": 20.0 for e, labels in networks.items() if labels})
+    for entry, labels in networks.items():
+        rows, left_out = _known(out)
+        mine = [row for row in rows if row["entry"] == entry.state and row["model"] in labels]
+        if not mine:
+            continue
+        with warnings.catch_warnings(), progress.stage(f"{entry.state}: clipping"):
+            warnings.simplefilter("ignore", NeurolensWarning)
+            models = {row["file"]: load_fitted(out / row["file"]) for row in mine}
+            domain = next(iter(models.values())).domain  # not computed again, for its last digits may differ
+            prepared = prepare(make_pairs(entry.lens.read(), domain, library.pairs))
+            for row in mine:
+                row |= _clipped_anew(prepared, models[row["file"]], out / row["file"])
+                failed += [f"{row['file']}: does not hold: {', '.join(row['broken'])}"] if row["broken"] else []
+        _keep(rows, left_out, library, out)
+    return failed
+
+
+def _clipped_anew(prepared: Prepared, model: LensModel, file: Path) -> Row:
+    """What changes in the index with the clipping of a network, which is written to its file; often nothing."""
+    lens, domain = prepared.pairs.lens, prepared.pairs.domain
+    network: Any = model.core.parts[1] if isinstance(model.core, Residual) else model.core
+    if (model.lens.sha256, model.domain, model.gates) != (lens.sha256, domain, prepared.gates):
+        raise InputError(file, "gates", "(those of other rays)", "a model of this list: make the entry again")
+    core = with_boundary_terms(replace(prepared, encoding=model.encoding), network)
+    if core is network:
+        return {}
+    model = replace(model, core=core)
+    card, seed = load_model(file).card, prepared.pairs.settings.seed + FRESH
+    with atomic_path(file) as made:
+        export_onnx(model, made, errors=card["errors"])
+        fresh = fresh_rays(lens, domain, prepared.pairs.held_out, count=_VIGNETTING_RAYS, seed=seed)
+        found = measure(fresh, onnx_predictor(load_model(made)))
+        export_onnx(model, made, errors=with_shares(card["errors"], found))
+    errors = load_model(file).card["errors"]
+    broken = [
+        p.key for p in check_model(load_model(file), lens.with_stop_radius(domain.stop_radius_mm))[1] if not p.holds
+    ]
+    return {
+        "sha256": sha256_of(file),
+        "bytes": file.stat().st_size,
+        "parameters": core.coefficients,
+        "broken": broken,
+        **{key: errors[key] for key in _SHARES},
+    }
+
+
+def with_shares(errors: Mapping[str, Any], found: Findings) -> dict[str, Any]:
+    """The errors of a card with the shares of rays that a new measurement passes or blocks wrongly."""
+    new = found.errors(CARD_KEYS)
+    zones = {
+        state: {zone: {**old, **{k: new["zones"][state][zone][k] for k in _SHARES}} for zone, old in zones.items()}
+        for state, zones in errors["zones"].items()
+    }
+    shares = {key: new[key] for key in CARD_KEYS if key.startswith(_SHARES)}
+    whole = {**errors, **shares, "stopped_down": new["stopped_down"], "zones": zones}
+    return {**whole, "poor": what_is_poor(whole)}
+
+
 def best_of_each_kind(measured: Sequence[Measured]) -> list[Measured]:
     """The polynomial and the network of the smallest error."""
     kinds: dict[bool, Measured] = {}
@@ -430,6 +541,7 @@ OPTIONS = (
     lab.option("lenses", metavar="LENS", nargs="*", help="entries whose name starts so (default: all)"),
     lab.option("--list", metavar="FILE", type=Path, default=_LIST, help="list (default: experiments/models.toml)"),
     lab.option("--restart", old=("--again",), action="store_true", help="make the chosen entries again"),
+    lab.option("--clipping", action="store_true", help="only fit again what clips rays in the networks that are there"),
     lab.option("--times", action="store_true", help="only time the models that are there (on a quiet machine)"),
     lab.out(lab.MODELS, "folder"),
 )
@@ -441,8 +553,8 @@ def run(args: argparse.Namespace) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     entries = chosen(library, args.lenses)
     progress = Progress(quiet=args.quiet)
-    if args.times:
-        failed = time_models(library, entries, args.out, progress)
+    if args.times or args.clipping:
+        failed = (time_models if args.times else refit_clipping)(library, entries, args.out, progress)
     else:
         failed = make_models(library, entries, args.out, progress, again=args.restart)
     print((args.out / "README.md").read_text(encoding="utf-8"))

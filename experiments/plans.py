@@ -27,6 +27,7 @@ from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.warped import Warped
 from neurolens.evaluate import footprints as prints
 from neurolens.evaluate import plan as plans
+from neurolens.evaluate import shot_fits
 from neurolens.evaluate.experiment import near_limit_m
 from neurolens.evaluate.probe import COUNTED, LIGHT, Probed, effects_of, probe
 from neurolens.optics.lensfile import read_lens
@@ -197,10 +198,10 @@ def _more(
 
     yield from (c for c in map(costed, shipped) if c is not None)
     fit: Any = None
-    for terms in sorted({*plans.shot_terms(found), *MORE_TERMS}):
+    for terms in sorted({*shot_fits.shot_terms(found), *MORE_TERMS}):
         file = folder / f"{Path(found.lens.path).stem}.shot-ols-{terms}.onnx"
         if file.stem not in costs and file not in made:
-            fit = fit or plans.shot_fits(found, folder)
+            fit = fit or shot_fits.shot_fits(found, folder)
             made.append(fit(terms)[0])
         choice = costed(file)
         if choice is not None:
@@ -370,7 +371,10 @@ def page(rows: Sequence[Mapping[str, Any]]) -> str:
     ]  # fmt: skip
     tried = [len(r["cameras"]) for r in rows] or [0]
     head = _HEAD.format(
-        cases=len(rows), all=len(CASES), tried=f"{min(tried)} to {max(tried)}", sizes=len({*plans._TERMS, *MORE_TERMS})
+        cases=len(rows),
+        all=len(CASES),
+        tried=f"{min(tried)} to {max(tried)}",
+        sizes=len({*shot_fits.TERMS, *MORE_TERMS}),
     )
     named = lab.columns(
         ("lens", "lens"), ("scene", "scene"), ("effect", "name"), ("probe", "probe", ".3g"), ("fresh", "fresh", ".3g"),

@@ -23,7 +23,7 @@ from neurolens.base.progress import Report
 from neurolens.cameras.fused import FusedCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.evaluate import footprints as prints
-from neurolens.evaluate import plan as plans
+from neurolens.evaluate import shot_fits
 from neurolens.evaluate.costs import glsl_operations, ns_a_ray
 from neurolens.evaluate.experiment import near_limit_m
 from neurolens.evaluate.probe import COUNTED, LIGHT, Probed, probe
@@ -90,7 +90,7 @@ def measure_lens(name: str, folder: Path, report: Report) -> dict[str, Any]:
 
 def _smallest(found: Probed, shipped: Model, folder: Path) -> Model:
     """The smallest polynomial of the shot with errors no larger than the shipped one's, by halves; else the largest."""
-    fit = plans.shot_fits(found, folder)
+    fit = shot_fits.shot_fits(found, folder)
     low, high = 0, len(TERMS) - 1
     best = -1
     while low <= high:
@@ -126,7 +126,7 @@ def _errors(found: Probed, camera: OnnxCamera) -> tuple[float, float]:
 def _measured(found: Probed, file: Path, terms: int) -> Model:
     camera = _onnx(found, file)
     um, light = _errors(found, camera)
-    ns = ns_a_ray(FusedCamera(load_model(file), **_real(found)), found.places)
+    ns = ns_a_ray(FusedCamera(load_model(file), **_real(found)), found.places)["min"]
     return Model(terms, um, light, glsl_operations(camera), ns)
 
 

@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
 
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as play:
         ghosts, files = str(Path(folder) / "ghosts.onnx"), [Path(folder) / f"{name}.html" for name in "alf"]
-        main(["flare", args.flare, "--fit", ghosts, "--target-um", "60"])
+        main(["flare", args.flare, "--fit", ghosts, "--within", "60um"])
         for words, file in zip(([args.lens], [], [args.flare, ghosts]), files, strict=True):
             main(["view", *words, *(["--downloads", "glsl"] if words else []), "-o", str(file)])
         opened = play.chromium.launch(executable_path=browser, args=list(FLAGS))

@@ -18,8 +18,30 @@ from hypothesis import strategies as st
 
 from neurolens.base.config import apply_overrides, from_dict, read_config, to_dict, to_toml
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path, atomic_write_text, check_writable, place_inside, safe_name
+from neurolens.base.files import (
+    atomic_path,
+    atomic_write_text,
+    check_writable,
+    place_inside,
+    read_kept,
+    safe_name,
+    write_kept,
+)
 from neurolens.base.progress import Progress, duration
+
+
+def test_what_a_run_keeps_counts_only_while_it_is_whole(tmp_path: Path) -> None:
+    kept, data = tmp_path / "folder" / "record.json", {"name": "a", "rms_um": 0.1, "notes": ["b", None, 1e-300]}
+    assert read_kept(kept) is None
+    write_kept(kept, data)
+    assert read_kept(kept) == data
+    text = kept.read_text()
+    for damaged in (text[:-3], text.replace("0.1", "0.2"), text.replace("name", "nome"), "[1]", "[" * 100_000, "{}"):
+        kept.write_text(damaged)
+        assert read_kept(kept) is None
+    kept.unlink()
+    kept.symlink_to("/dev/zero")
+    assert read_kept(kept) is None
 
 
 def test_files_are_whole_or_as_before(tmp_path: Path) -> None:

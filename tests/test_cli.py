@@ -12,11 +12,17 @@ import sys
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from command_line import described, failure, run_json
 
+from neurolens.analysis.fields import Scene
+from neurolens.analysis.spots import spots
 from neurolens.cli import build_parser, main
+from neurolens.commands import library
+from neurolens.optics.lensfile import read_lens
 from neurolens.render.pictures import read_exr
 
 ROOT = Path(__file__).parents[1]
@@ -90,6 +96,7 @@ def test_old_spellings_work_and_are_hidden(capsys: pytest.CaptureFixture[str]) -
         ("flare cooke_triplet_50 --light 5,3", "--out a.exr --wavelengths 9", "-o a.exr --bins 9"),
         ("stmap thin --size 9x6 --film 36x24", "--out a --channels-nm 600,500,400", "-o a --wavelengths 600,500,400"),
         ("export cooke_triplet_50 --to c -o a.h", "--camera", "--whole-camera"),
+        ("flare cooke_triplet_50 --fit a.onnx", "--target-um 60 --wavelengths 9", "--within 60um --bins 9"),
         ("lens cooke_triplet_50 --derive-rims", "--vignetting 0.4", "--edge-pupil 0.4"),
     ):  # fmt: skip
         found, known = (vars(parse(f"{command} {words}".split())) for words in (old, new))
@@ -618,6 +625,22 @@ def test_the_demo_is_a_page_of_pictures_with_their_commands(
     assert page.count("neurolens render") == 5 and "missing" not in page
 
 
+def test_pages_of_the_library_show_a_lens_where_its_spot_on_the_axis_is_smallest(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    scenes: list[Any] = []
+    seen = SimpleNamespace(compute=scenes.append, draw=lambda *_: None)
+    monkeypatch.setattr("neurolens.commands.analyse.analysis_of", lambda what: seen)
+    lens = read_lens(ROOT / "lenses" / "laikin_double_gauss_50.toml")
+    for name, _, draw in library._drawings(lens):
+        if name in library._SHOWN:
+            draw(tmp_path / name)
+    assert len(scenes) == len(library._SHOWN)
+    paraxial = spots(Scene(lens.at(focus_m=math.inf)), [0.0])
+    assert abs(paraxial.best_shift_mm[0]) > 0.1
+    assert all(abs(spots(scene, [0.0]).best_shift_mm[0]) < 0.02 for scene in scenes)
+
+
 @pytest.mark.slow
 def test_the_library_is_pages_of_lenses_and_an_index_that_are_kept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -627,9 +650,9 @@ def test_the_library_is_pages_of_lenses_and_an_index_that_are_kept(
     found = json.loads(capsys.readouterr().out)
     folder = tmp_path / "pages" / "thorlabs_lb1471_biconvex_50"
     page = (folder / "index.html").read_text(encoding="utf-8")
-    for name in re.findall(r"img src='./([a-z]+\.png)'", page):
+    for name in re.findall(r"img src='./([a-z-]+\.png)'", page):
         assert (folder / name).read_bytes()[:4] == b"\x89PNG"
-    assert page.count("<img") == 8 and "mlp-16x2" in page and "Picture missing" not in page
+    assert page.count("<img") == 9 and "mlp-16x2" in page and "Picture missing" not in page
     assert found["bytes"] < 1e6 and found["lenses"][0]["efl_mm"] == pytest.approx(50, rel=0.02)
     index = (tmp_path / "pages" / "index.html").read_text(encoding="utf-8")
     assert (

@@ -298,7 +298,8 @@ def test_frames_follow_their_keys_and_what_exists_is_kept(
     assert main([*command, "-o", str(tmp_path / "a.exr")]) == 3 and asked == ["a.0001.exr"]
     capsys.readouterr()
     for wrong, words in (
-        (("--key", "focus=1:0"), "a number above 0"),
+        (("--key", "focus=1:0"), "a number from 1e-06 to inf"),
+        (("--key", "f-number=1:1e-320"), "a number from 0.1 to 10000"),
         (("--key", "position=1:0/1"), "X/Y/Z"),
         (("--key", "focus=3:1,2:1"), "frames increasing"),
         (("--key", "iso=1:100"), "NAME of focus"),

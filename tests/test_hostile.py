@@ -1,5 +1,6 @@
 """Files and command lines of an attacker: one clear line each, in bounded time and memory (experiments/fuzz.py)."""
 
+import json
 import os
 import struct
 import subprocess
@@ -18,9 +19,10 @@ from command_line import failure
 from experiments import fuzz
 from neurolens import cli
 from neurolens.base.config import apply_overrides
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, ModelError
 from neurolens.base.files import open_regular
 from neurolens.base.tomlfile import read_toml
+from neurolens.cameras.onnxlens import load_model
 from neurolens.optics import catalogue
 from neurolens.readers.any_format import read_any
 from neurolens.readers.json_lens import image_and_field, read_json_lens
@@ -28,22 +30,23 @@ from neurolens.render import pictures
 from neurolens.render.illuminants import illuminant, read_spectrum
 from neurolens.render.meshfile import read_file
 
+ROOT = Path(__file__).parents[1]
 SECONDS = 10  # each takes less than one, and took from ten to more than a hundred
 TWICE = "{" + ",".join(f'"{k % 89_999}": 1' for k in range(90_000)) + "}"
 LENS_JSON = '{"name": "a", "source": "b", "notes": %s, "surfaces": [{}]}'
 
 
 @pytest.mark.slow
-def test_200_hostile_cases_end_as_they_should() -> None:
-    """In a new process: each case is a fork, and this one has grown large by other tests."""
+def test_200_hostile_cases_end_as_they_should(tmp_path: Path) -> None:
+    """In a new process: cases are forks of it, and this one has grown large by other tests."""
     command = [sys.executable, "-m", "experiments", "fuzz", "--cases", "200", "--seed", "13", "--quiet"]
-    found = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+    found = subprocess.run([*command, "-o", tmp_path], capture_output=True, text=True, timeout=600, check=False)
     assert found.returncode == 0, found.stdout
-    counts, last = found.stdout.splitlines()
-    ends = dict(row.rsplit(" ", 1) for row in counts.split(", "))
-    assert sum(map(int, ends.values())) == 200 and last == "200 cases of seed 13: 0 with faults"
-    assert {end.partition(":")[0] for end in ends} == set(fuzz.KINDS)
-    assert {end.rpartition(" ")[2] for end in ends} == {"0", "2"}
+    cases = json.loads((tmp_path / "fuzz" / "13-0-200.json").read_text())
+    assert len(cases) == 200 and not any(case["faults"] for case in cases)
+    assert len({case["kind"] for case in cases}) > 0.8 * len(fuzz.KINDS)
+    assert {case["code"] for case in cases} >= {0, 2}
+    assert "200 cases, 0 with faults" in (tmp_path / "fuzz.md").read_text()
 
 
 def mesh(text: bytes) -> Callable[[Path], object]:
@@ -235,3 +238,32 @@ def test_the_last_net(
     assert words in line
     monkeypatch.setenv("NEUROLENS_TRACEBACK", "1")
     assert cli.main([], build) == 70 and "Traceback" in capsys.readouterr().err
+
+
+def test_what_the_fuzzer_broke_is_one_line_or_no_fault(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    seeds = ROOT / "experiments" / "fuzz_seeds"
+    Path("f0.lens").write_text((seeds / "lens.lens").read_text(encoding="utf-8").replace("f/2.8", "f/0"))
+    assert cli.main(["convert", "f0.lens", "-o", "lens.toml"]) == 0
+    capfd.readouterr()
+
+    assert cli.main(["analyse", "lens.toml", "seidel", "--blade-curvature", "0.5", "-o", "refused"]) == 2
+    assert not Path("refused").exists()
+    assert len(capfd.readouterr().err.splitlines()) == 1
+
+    tag, other = (struct.pack("<HHIH", 277, 3, 1, samples) for samples in (3, 18761))  # samples of a pixel
+    good = picture("TIFF")
+    assert tag in good
+    Path("scan.tif").write_bytes(good.replace(tag, other))
+    with pytest.raises(InputError):
+        pictures.read_pictures(Path("scene.toml"), {"textures.scan.file": Path("scan.tif")})
+    assert capfd.readouterr().err == ""
+
+    model = (ROOT / "models" / "laikin_double_gauss_50.ols-36.onnx").read_bytes()
+    named = b"\x12\x01N"  # the dimension N of an input: a name that is no UTF-8 took its place
+    assert named in model
+    Path("model.onnx").write_bytes(model.replace(named, b"\x12\x01\xed"))
+    with pytest.raises(ModelError):
+        load_model("model.onnx")

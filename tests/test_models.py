@@ -1,11 +1,15 @@
 """The models that ship: each loads, stands for its lens and keeps on fresh rays what its index says."""
 
 import json
+import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
 from vignetting_oracle import vignetting_errors
 
 from neurolens.base.errors import ModelError
@@ -17,7 +21,7 @@ from neurolens.evaluate.measure import FreshRays, fresh_rays, measure, onnx_pred
 from neurolens.modelfile import AVERAGED, POLARISED
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
-from neurolens.surrogates.domain import Domain
+from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.stored import load_fitted
@@ -85,6 +89,46 @@ def test_model_keeps_its_card_and_index_on_fresh_rays(row: dict[str, Any]) -> No
     assert load_fitted(ROOT / "models" / row["file"]).domain == fresh.domain  # for source code of it
 
 
+@pytest.mark.parametrize("row", [r for r in ROWS if not r.get("axes")], ids=lambda r: r["file"])
+def test_no_ray_that_passes_points_backwards_or_is_not_finite(row: dict[str, Any]) -> None:
+    """In float32, over the whole domain and the ends of every coordinate; forwards is as the exact lens has it."""
+    d, fresh = Domain.from_dict(model(row["file"]).card["domain"]), rays_of(row["file"])
+    inner, ends = sample_domain(d, 60_000, seed=31), sample_domain(d, 4000, seed=32)
+    film, pupil = torch.hypot(ends.film_x, ends.film_y), torch.hypot(ends.pupil_x, ends.pupil_y)
+    to_film, to_pupil = d.film_radius_mm / film, d.pupil_radius_mm / pupil
+    far = torch.tensor([d.film_z_mm, d.wavelength_nm])[:, torch.arange(len(ends)) % 2]
+    at_ends = FilmRays(
+        ends.film_x * to_film, ends.film_y * to_film, far[0], ends.pupil_x * to_pupil, ends.pupil_y * to_pupil, far[1]
+    )
+    widest = math.acos(-float(fresh.held_out.scene.dz.max()))
+    limit = 0.0 if widest < math.pi / 2 else -math.cos(1.1 * widest)
+    predict, passed = onnx_predictor(model(row["file"])), 0
+    for rays in (
+        inner,
+        at_ends,
+        replace(ends, film_z=far[0]),
+        replace(at_ends, pupil_x=ends.pupil_x, pupil_y=ends.pupil_y),
+    ):
+        for stop in (None, 1e-3 * d.stop_radius_mm):
+            out = predict(rays, stop)
+            found = torch.stack([*out.rays, out.transmittance, out.stop_x, out.stop_y])[:, out.status == 0]
+            assert torch.isfinite(found).all() and (found[5] < limit).all()
+            assert (((found[3:6] ** 2).sum(0) - 1).abs() < 1e-5).all()
+            passed += found.shape[1]
+    assert passed > 10_000
+
+
+def test_networks_clip_rays_as_well_as_polynomials() -> None:
+    """Of every lens in its default state, in the median and in the worst case."""
+    shares = {
+        kind: np.array([[r["false_pass"], r["false_block"]] for r in ROWS if r["model"] == kind])
+        for kind in ("ols-64", "mlp-16x2")
+    }
+    for choose, slack in ((np.median, 1.3), (np.max, 1.0)):
+        worse, limit = (choose(shares[kind], 0) for kind in ("mlp-16x2", "ols-64"))
+        assert (worse <= slack * limit).all()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("row", [r for r in ROWS if r.get("axes")], ids=lambda r: r["file"])
 def test_a_model_of_many_states_keeps_its_card_at_others(row: dict[str, Any]) -> None:
@@ -145,7 +189,9 @@ def test_models_are_listed_with_the_one_to_use(tmp_path, monkeypatch, capsys) ->
         assert len(rows) == 3 - [None, "1um", "0.01px"].index(within) and "cut.onnx: left out" in out.err
     assert main(["models"]) == 0
     said = capsys.readouterr().out
-    assert "Use runs/mine/models/ols-28.onnx (" in said and "--camera fused:runs/mine/models/ols-28.onnx" in said
+    assert "In this renderer use the exact lens" in said and "--camera fused:runs/mine/lenses/laikin_double" in said
+    assert "In other programs use ols-28: the fastest within 2 um" in said
+    assert "export runs/mine/models/ols-28.onnx --to c" in said
     shot, stated = tmp_path / "runs" / "a_plan" / "models" / "shot.onnx", b'"focus_m": ["inf", 0.7]'
     shot.parent.mkdir(parents=True)
     shot.write_bytes((own / "mlp-16x2.onnx").read_bytes().replace(stated, b'"focus_m": [  0.7, 0.7]'))

@@ -132,5 +132,5 @@ def _save_small(figure: Any, path: Path) -> None:
     drawn = io.BytesIO()
     figure.savefig(drawn, dpi=DPI, facecolor="white", format="png")
     picture = Pictures.open(drawn).convert("RGB")
-    forms = ((picture, {"quality": quality, "subsampling": 0}) for quality in (90, 84, 76))
+    forms = ((picture, {"quality": quality, "subsampling": 0, "optimize": True}) for quality in (82, 76))
     lab.write_small(path, forms, MOST_BYTES)

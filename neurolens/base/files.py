@@ -30,7 +30,7 @@ try:
 except ModuleNotFoundError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-_LARGEST_LIST = 1 << 24
+_LARGEST_LIST, _CHECKSUM = 1 << 24, "checksum"
 _LEFT_OVER = re.compile(r"\.neurolens-[0-9a-f]{16}\.tmp(\.\w{1,16})?")  # a temporary file of ours
 _ABANDONED_S = 24 * 3600.0  # nothing is written for a day
 _CLEANED_S = 3600.0  # folders of thousands of files are not searched at each one
@@ -113,6 +113,8 @@ def _temporary(target: Path) -> Path:
     suffix = target.suffix if re.fullmatch(r"\.\w{1,16}", target.suffix) else ""
     temporary = target.with_name(f".neurolens-{secrets.token_hex(8)}.tmp{suffix}")
     try:
+        with suppress(OSError):
+            os.lstat(target)  # ValueError where no file can have that name
         os.close(os.open(temporary, _NEW, 0o666))
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(target)) from None
@@ -327,6 +329,20 @@ def write_json(path: str | Path, data: Any) -> None:
     """Write JSON atomically, its folder made; ValueError where a number is not finite."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     atomic_write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
+
+
+def write_kept(path: Path, data: Mapping[str, Any]) -> None:
+    """Write what a later run may take instead of making it again, as JSON with a checksum, atomically."""
+    write_json(path, {**data, _CHECKSUM: fingerprint_of([data])})
+
+
+def read_kept(path: Path) -> dict[str, Any] | None:
+    """What `write_kept` wrote; None where there is none, or it was damaged since."""
+    try:
+        data = json.loads(read_bytes(path, _LARGEST_LIST))
+        return data if data.pop(_CHECKSUM) == fingerprint_of([data]) else None
+    except (InputError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return None
 
 
 def read_rows(path: Path, what: str) -> list[Mapping[str, Any]]:

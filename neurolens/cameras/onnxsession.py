@@ -28,13 +28,18 @@ def open_session(
     options.log_severity_level = 4  # what goes wrong is raised, not printed
     try:
         session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+        inside = [_shapes(session.get_inputs()), _shapes(session.get_outputs())]
     except Exception as error:  # onnxruntime raises types of its own, without a common base
         raise ModelError(f"{path}: onnxruntime cannot load it ({_first_line(error)})") from error
-    for what, expected, found in (("input", inputs, session.get_inputs()), ("output", outputs, session.get_outputs())):
-        shapes = {v.name: (v.type, *(None if isinstance(d, str) else d for d in v.shape)) for v in found}
+    for what, expected, shapes in zip(("input", "output"), (inputs, outputs), inside, strict=True):
         if shapes != expected:
             raise ModelError(f"{path}: {what}s: got {shapes}, expected {expected} (None: the number of rays)")
     return session
+
+
+def _shapes(tensors: Any) -> dict[str, tuple[Any, ...]]:
+    """Type and dimensions by name; a dimension that has a name is None. A name that is no UTF-8 raises an error."""
+    return {v.name: (v.type, *(None if isinstance(d, str) else d for d in v.shape)) for v in tensors}
 
 
 def joined(

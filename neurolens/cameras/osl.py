@@ -3,8 +3,8 @@
 The whole camera is a graph: from the place in the picture and two random numbers to a weighted ray, at any stop and
 focus of the lens. Inputs of the shader (`PARAMETERS`) are numbers when the renderer compiles it, and what depends on
 them alone costs nothing then. Besides them it reads, of Blender's camera, the sensor's size (with its fit and the
-picture's aspect) and, where `focus_m` is 0, the distance of depth of field; shift moves the place in the picture. That
-distance and the rays that it returns are in units of the scene, of `unit_m` metres each; all else is in mm and metres.
+picture's aspect) and, where `focus_m` is 0, the distance of depth of field; shift moves the place in the picture.
+This distance and the places of the rays are in units of the scene, which are `unit_m` metres long.
 
 Of a lens in several states (zoom, internal focus) every number of the camera follows the state, mixed from cameras at
 the nodes of its axes as a model's own numbers are: the zoom is an input, internal focus the distance in focus.
@@ -74,10 +74,8 @@ _FRAME = """\
     vector sensor = vector(36.0, 24.0, 0.0);
     getattribute("cam:sensor_size", sensor);
     float asked_m = focus_m;
-    if (focus_m <= 0.0) {
-        getattribute("cam:focal_distance", asked_m);
+    if (focus_m <= 0.0 && getattribute("cam:focal_distance", asked_m))
         asked_m *= unit_m;
-    }
     float half_turn = M_PI / max(blades, 3);
     float first_edge = radians(rotation) + half_turn;
     float raster_x = raster[0], raster_y = raster[1], first = pair[0], second = pair[1];
@@ -188,8 +186,7 @@ def parameters(lens: OslLens) -> list[Parameter]:
         Parameter("dispersion", "Dispersion", "Colours go their own ways", 1, widget="boolean"),
         Parameter("origin", "Origin", "What stands where Blender's camera stands, and distances are measured from",
                   1, widget="mapper", options="Film:0|Entrance pupil:1"),
-        Parameter("unit_m", "Metres per Unit", "Length of a unit of the scene, the Unit Scale of its properties",
-                  1.0, 1e-6, 1e6),
+        Parameter("unit_m", "Metres per Unit", "Length of a unit of the scene, its Unit Scale", 1.0, 1e-6, 1e6),
         Parameter("warn", "Warn", "Magenta where the lens is unknown (beyond its film, too near), in place of black",
                   0, widget="boolean"),
     ]  # fmt: skip
@@ -257,7 +254,6 @@ def _set_outputs(
     g: Graph, camera: OslCamera, call: _Call, film: Value, found: Mapping[str, Value], throughput: Value, warned: Value
 ) -> None:
     """Rays in the frame of Cycles, in units of the scene and x right, y up, z ahead; warnings as of a pinhole."""
-    turned = [1.0, 1.0, -1.0]
     length = call.units_per_m * [1e-3, 1e-3, -1e-3]
     ahead = g.concat(film * -1.0, g.constant(camera.efl_mm))
     ahead = ahead * (1.0 / g.square(ahead).sqrt())
@@ -265,7 +261,7 @@ def _set_outputs(
     start = (ray[0:3] - g.concat(g.constant([0.0, 0.0]), call.origin_mm)) * length
     plain = warned <= 0.5
     g.outputs["position"] = g.select(plain, start, 0.0)
-    g.outputs["direction"] = g.select(plain, ray[3:] * turned, ahead)
+    g.outputs["direction"] = g.select(plain, ray[3:] * [1.0, 1.0, -1.0], ahead)
     g.outputs["throughput"] = g.select(plain, throughput, g.constant([1.0, 0.0, 1.0]))
     for axis, name, step in zip((0, 1), D_FILM, ("x", "y"), strict=True):
         way = call.sensor[axis] * call.number(f"pixel_{step}")

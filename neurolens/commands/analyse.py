@@ -120,12 +120,13 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("neurolens analyse", "--full", "(given)", "this option only with --json")
     if args.out is not None:
         check_run_folder(args.out, args.out, "--output")
-        args.out.mkdir(parents=True, exist_ok=True)
 
     from neurolens.analysis.layout import state_text
 
     began = time.perf_counter()
     scene, doubts = _scene_of(args)
+    if args.out is not None:
+        args.out.mkdir(parents=True, exist_ok=True)
     edge = scene.edge
     doubts += [edge.warning] if edge.warning else []
     found, pictures, notes = {}, {}, [f"derived: {scene.lens.derived}"] if scene.lens.derived else []

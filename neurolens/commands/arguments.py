@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
@@ -123,6 +124,14 @@ def rms_error(text: str) -> tuple[str, float]:
     except ValueError:
         pass
     raise argparse.ArgumentTypeError(f"got {text!r}, expected a number above 0 and its unit, as 1um or 0.1px")
+
+
+def add_within(parser: argparse._ActionsContainer, about: str, **options: Any) -> None:
+    """Add --within, an RMS error with its unit as `rms_error`, and its old spelling for each unit."""
+    parser.add_argument("--within", metavar="ERROR", type=rms_error, help=about, **options)
+    for unit in ("um", "px"):
+        kind = partial(lambda unit, text: rms_error(text + unit), unit)
+        parser.add_argument(f"--target-{unit}", dest="within", type=kind, help=argparse.SUPPRESS, **options)
 
 
 def wavelengths_nm(text: str) -> tuple[float, ...]:

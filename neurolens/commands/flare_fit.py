@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens.base.errors import InputError
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import aperture_of, between, check_suffix, given_options
+from neurolens.commands.arguments import add_within, aperture_of, between, check_suffix, given_options
 from neurolens.commands.output import answer, number, table
 from neurolens.commands.render_files import warn
 
@@ -37,10 +37,8 @@ def add_fit(parser: argparse.ArgumentParser) -> None:
         "--angle", metavar="DEG", type=between(0.1, 89, "degrees"), default=35.0,
         help="of --fit: largest angle between light and axis (default: 35)",
     )  # fmt: skip
-    group.add_argument(
-        "--target-um", metavar="UM", type=between(0.01, 10_000, "micrometres"), default=10.0,
-        help="of --fit: RMS on the film at which a ghost's degree is high enough (default: 10)",
-    )  # fmt: skip
+    about = "of --fit: RMS on the film in um at which a ghost's degree is high enough (default: 10um)"
+    add_within(group, about, default=("rms_um", 10.0))
 
 
 def check_fit(args: argparse.Namespace) -> None:
@@ -49,6 +47,8 @@ def check_fit(args: argparse.Namespace) -> None:
         if args.fit is not None and getattr(args, name):
             expected = f"no --{name} beside it: it writes the ghosts of one state, for any light"
             raise InputError(_COMMAND, "--fit", args.fit, expected)
+    if args.within[0] != "rms_um":
+        raise InputError(_COMMAND, "--within", f"{args.within[1]:g}px", "micrometres, as 10um: a ghost has no pixels")
 
 
 def fitted(args: argparse.Namespace, states: Sequence[argparse.Namespace]) -> GhostModel | None:
@@ -96,7 +96,7 @@ def run_fit(args: argparse.Namespace, lens: Lens | None, model: GhostModel | Non
     else:
         check_suffix(args.fit, "--fit", (".onnx",))
         assert lens is not None
-        settings = GhostSettings(args.angle, film_radius_mm=math.hypot(*args.film) / 2, target_um=args.target_um)
+        settings = GhostSettings(args.angle, film_radius_mm=math.hypot(*args.film) / 2, target_um=args.within[1])
         with progress.stage("ghosts") as report:
             model = fit_ghosts(lens, settings, report)
         write_ghosts(model, args.fit)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError, NeurolensError
-from neurolens.base.files import atomic_path, atomic_write_text, library, safe_name, write_json
+from neurolens.base.files import atomic_path, atomic_write_text, library, read_kept, safe_name, write_kept
 from neurolens.base.lensname import lens_id_of
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_json, add_lens, add_output, check_run_folder
@@ -90,15 +89,12 @@ def _record(file: Path, folder: Path) -> dict[str, Any]:
     kept, named = folder / "record.json", {"lens": lens_id_of(file), "page": folder.name}
     try:
         lens = read_quietly(file)
-        try:
-            found = json.loads(kept.read_text(encoding="utf-8"))
-            if (found["sha256"], found["version"]) == (lens.sha256, __version__):
-                return found | named
-        except (OSError, ValueError, KeyError):
-            pass
+        found = read_kept(kept)
+        if found is not None and (found.get("sha256"), found.get("version")) == (lens.sha256, __version__):
+            return found | named
         kept.parent.mkdir(parents=True, exist_ok=True)
         record = named | {"sha256": lens.sha256, "version": __version__} | _page(lens, file, kept.parent)
-        write_json(kept, record)
+        write_kept(kept, record)
         return record
     except NeurolensError as error:
         return {"lens": file.stem, "page": None, "fault": str(error)}

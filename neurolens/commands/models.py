@@ -12,17 +12,19 @@ from typing import Any
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
 from neurolens.base.files import library
 from neurolens.base.lensname import lens_id_of
-from neurolens.commands.arguments import add_json, rms_error
+from neurolens.commands.arguments import add_json, add_within
 from neurolens.commands.output import answer, number, table
-from neurolens.evaluate.records import CLOSE_UM, program, reaches, to_use, use_command
+from neurolens.evaluate.advice import CLOSE_UM, Advice, advice, expected_exact, to_use
+from neurolens.evaluate.records import program, reaches, time_of
 from neurolens.modelfile import AVERAGED, transmittance_of
 
 _DESCRIPTION = """\
 List exported models by lens: film circle, focus, film-equivalent RMS error on rays held out, and
 nanoseconds a ray in onnxruntime and as C where they were timed, on the machine that made them. The
-star is the one to use of a lens: the fastest of those within 2 um (or --within) that their card does
-not call poor; where none is, the closest. Models of one focus alone, such as those that "neurolens plan"
-fits for a shot, come last.
+star is the best model of a lens: the fastest of those within 2 um (or --within) that their card does
+not call poor; where none is, the closest. Of one lens the last lines say whether to use that model or
+the lens itself, whose time is expected from its number of refractions. Models of one focus alone, such
+as those that "neurolens plan" fits for a shot, come last.
 
 Looked for in: models/ of the working folder and of the project (those that ship), and models/ of every
 run folder in runs/. Exit code 1 where there is none, or none within the error asked for."""
@@ -39,10 +41,7 @@ def add_parser(subparsers: Any) -> None:
         "models", help="list models that are here, and the one to use", description=_DESCRIPTION, epilog=_EPILOG
     )
     parser.add_argument("lens", metavar="LENS", nargs="?", help="lens file, or part of a lens's name or id")
-    parser.add_argument(
-        "--within", metavar="ERROR", type=rms_error,
-        help="only models of at most this RMS error: 1um, or 0.1px of a picture 4000 pixels wide",
-    )  # fmt: skip
+    add_within(parser, "only models of at most this RMS error: 1um, or 0.1px of a picture 4000 pixels wide")
     add_json(parser)
     parser.set_defaults(run=run, kept="nothing is written")
 
@@ -64,10 +63,19 @@ def run(args: argparse.Namespace) -> int:
         alike = [m for m in kept if _state(m) == state]
         best = to_use([m for m in alike if not _of_a_shot(m)] or alike, most, key)
         if best:
-            best["use"] = use_command(best["file"], fused=best["fused_ns_per_ray"] is not None)
+            best["use"] = [vars(a) for a in _advice(best)]
     data = {"looked_in": [str(p) for p in places], "within": args.within, "models": kept}
     answer(args, data, lambda: _text(args, listed, kept))
     return 0 if kept else 1
+
+
+def _advice(model: dict[str, Any]) -> list[Advice]:
+    """Whether to use the best model of a lens, or the lens itself, whose time is expected from its refractions."""
+    file, lens = Path(model["file"]), model["lens"]
+    other = file.name.startswith(f"{lens}-")  # of another state or focal length than the lens's file has
+    row = {**model, "name": file.stem, "file": f"{file.parent.name}/{file.name}"}
+    results = {"models": [row], "exact": [expected_exact(model["refractions"])], "lens": {"file": f"{lens}.toml"}}
+    return advice(results | {"settings": {"lens": {"configuration": file.stem if other else None}}}, file.parent.parent)
 
 
 def _places() -> list[Path]:
@@ -93,6 +101,7 @@ def models_in(folder: Path) -> Iterator[dict[str, Any]]:
                 "name": str(card["lens"]["name"]),
                 "method": str(card["fit"]["method"]),
                 "family": str(card["fit"]["settings"].get("method", "")).replace("thick", "thin"),
+                "refractions": int(card["lens"]["refractions"]),
                 "efl_mm": float(card["lens"]["efl_mm"]),
                 "film_radius_mm": float(domain["film_radius_mm"]),
                 "focus_m": list(domain["focus_m"]),
@@ -157,11 +166,11 @@ def _text(args: argparse.Namespace, listed: Sequence[dict[str, Any]], kept: Sequ
     ]
     parts = [
         table(header, rows, left=2),
-        "* to use; film: radius; pixels of 4000 across; ns a ray on one core, C: compiled",
+        "* the best model; film: radius; pixels of 4000 across; ns a ray on one core, C: compiled",
     ]
     chosen = [m for m in kept if "use" in m]
     if len(chosen) == 1:
-        parts.append(f"Use {_said(chosen[0])}:\n  {chosen[0]['use']}")
+        parts += ["\n  ".join(filter(None, (str(Advice(**a)), a["command"]))) for a in chosen[0]["use"]]
     return "\n\n".join(parts)
 
 
@@ -175,6 +184,6 @@ def _remarks(model: dict[str, Any]) -> list[str]:
 
 def _said(model: dict[str, Any]) -> str:
     error = f"{number(model['rms_um'], 3)} um" if model["rms_um"] is not None else "error not known"
-    timing = model["fused_ns_per_ray"] or model["ns_per_ray"]
+    timing = time_of(model)
     more = f", {number(timing['min'], 3)} ns a ray" if timing else ""
     return f"{model['file']} ({error}{more})"

@@ -11,21 +11,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.bounds import F_NUMBER, FOCAL_MM, said, within
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import read_rows
 from neurolens.base.tomlfile import reject_unknown
 from neurolens.commands.render_files import Files
+from neurolens.render.scenetables import FARTHEST_M
 
 _COMMAND = "neurolens render"
 _MOST = 100_000
+_FOCUS_M, _PLACE_M = (1e-6, math.inf), (-FARTHEST_M, FARTHEST_M)
 
 
 @dataclass(frozen=True)
 class _Quantity:
-    """What keys may change: where it goes, its components, and the measure of it that is linear between keys."""
+    """What keys may change: where it goes, its components, their bounds, the measure that is linear between keys."""
 
     option: str
     size: int
+    bounds: tuple[float, float]
     linear_in: str
     to: Callable[[float], float]
     back: Callable[[float], float]
@@ -40,11 +44,11 @@ def _itself(value: float) -> float:
 
 
 _QUANTITIES = {
-    "focus": _Quantity("focus", 1, "1/m", _inverse, _inverse),
-    "f-number": _Quantity("f_number", 1, "stops", math.log, math.exp),
-    "zoom": _Quantity("zoom", 1, "the logarithm of mm", math.log, math.exp),
-    "position": _Quantity("position_m", 3, "m", _itself, _itself),
-    "look-at": _Quantity("look_at_m", 3, "m", _itself, _itself),
+    "focus": _Quantity("focus", 1, _FOCUS_M, "1/m", _inverse, _inverse),
+    "f-number": _Quantity("f_number", 1, F_NUMBER, "stops", math.log, math.exp),
+    "zoom": _Quantity("zoom", 1, FOCAL_MM, "the logarithm of mm", math.log, math.exp),
+    "position": _Quantity("position_m", 3, _PLACE_M, "m", _itself, _itself),
+    "look-at": _Quantity("look_at_m", 3, _PLACE_M, "m", _itself, _itself),
 }
 
 
@@ -185,10 +189,10 @@ def _append(
         numbers = [float(v) for v in value.split("/")] if len(value) < 100 else []
     except ValueError:
         numbers = []
-    good = [math.isfinite(v) if quantity.size > 1 else 0 < v and (v < math.inf or name == "focus") for v in numbers]
+    good = [within(quantity.bounds, v) for v in numbers]
     later = frame.isascii() and frame.isdecimal() and len(frame) <= 7 and (not keys or int(frame) > keys[-1][0])
     if not later or len(numbers) != quantity.size or not all(good):
-        form = "X/Y/Z in m" if quantity.size > 1 else "a number above 0"
+        form = f"{'X/Y/Z in m' if quantity.size > 1 else 'a number'} {said(quantity.bounds)}"
         raise InputError(*place, f"{frame}:{value}", f"FRAME:VALUE, frames increasing, VALUE {form}")
     keys.append((int(frame), [quantity.to(v) for v in numbers]))
 

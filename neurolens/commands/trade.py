@@ -40,9 +40,11 @@ def run_trade(args: argparse.Namespace) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     title = f"{scene.name} through {lens.name}"
     plot_trade(found, folder / "trade.png", title)
-    pictures = {_short(s.offer): s for s in found.shown if s.offer.choice.error_px > 0}
+    chosen = found.chosen
+    pictures = {_marked(s.offer, chosen): s for s in found.shown if s.offer.choice.error_px > 0}
+    exact = "● exact" if chosen is not None and chosen.choice.error_px == 0 else "exact"
     side_by_side(
-        {"exact": found.exact, **{k: s.rgb for k, s in pictures.items()}},
+        {exact: found.exact, **{k: s.rgb for k, s in pictures.items()}},
         {k: s.difference for k, s in pictures.items()}, folder / "pictures.png",
         {k: f"{_time(found, s.offer)}, {number(s.offer.choice.error_px, 2)} px\nFLIP {number(s.flip, 2)}"
          for k, s in pictures.items()},
@@ -62,8 +64,16 @@ def _short(offer: Offer) -> str:
     return offer.choice.name.rpartition(".")[2]
 
 
+def _marked(offer: Offer, chosen: Offer | None) -> str:
+    return "● " * (offer == chosen) + _short(offer)
+
+
+def _seconds(offer: Offer) -> str:
+    return "~" * offer.choice.noisy + number(offer.seconds, 3)
+
+
 def _time(found: Trade, offer: Offer) -> str:
-    return f"{number(offer.seconds, 3)} {found.unit}"
+    return f"{_seconds(offer)} {found.unit}"
 
 
 def _said(found: Trade) -> list[str]:
@@ -91,12 +101,13 @@ def _text(found: Trade, folder: Path) -> str:
     flips, front = {s.offer.choice.name: s.flip for s in found.shown}, found.front
     rows = [
         ("*" if o == found.chosen else "+" if o in front else "", o.choice.name, number(o.choice.error_px, 3),
-         number(o.choice.light_error, 2), number(o.seconds, 3), number(flips.get(o.choice.name), 2), o.choice.how)
+         number(o.choice.light_error, 2), _seconds(o), number(flips.get(o.choice.name), 2), o.choice.how)
         for o in found.offered
     ]  # fmt: skip
     shown = table(("", "camera", "px", "light", found.unit, "FLIP", ""), rows, left=2)
-    legend = f"* for the budget, + no other betters it; {found.unit}: added, of one thread to equal noise; FLIP at "
-    legend += f"{found.samples} samples a pixel of the same random numbers, with noise where cameras use them otherwise"
+    legend = f"* for the budget, + no other betters it; {found.unit}: added, of one thread to equal noise, ~ noisy; "
+    legend += f"FLIP at {found.samples} samples a pixel of the same random numbers, with noise where cameras use them "
+    legend += "otherwise"
     written = f"Written: {folder}/trade.html, trade.png, pictures.png, trade.json"
     return "\n\n".join([shown, legend, "\n".join(_said(found)), written])
 
@@ -105,12 +116,17 @@ def _page(found: Trade, folder: Path, title: str) -> str:
     from neurolens.evaluate import pages
 
     flips = {s.offer.choice.name: s.flip for s in found.shown}
-    records = [{**asdict(o.choice), "seconds": o.seconds, "flip": flips.get(o.choice.name)} for o in found.offered]
+    records = [
+        {**asdict(o.choice), "seconds": {"min": o.seconds, "median": o.seconds + o.more},
+         "flip": flips.get(o.choice.name)} for o in found.offered
+    ]  # fmt: skip
     columns = (
         pages.Column("error, px", "error_px", about="distance of footprints that 95% of the picture keep"),
         pages.Column("light, %", "light_error", 100, 2, "relative error of light that 95% of the picture keep"),
         pages.Column(
-            f"{found.unit} added", "seconds", about="one thread, the scene's size and samples, to equal noise"
+            f"{found.unit} added",
+            "seconds.min",
+            about="one thread, the scene's size and samples, to equal noise; ~ noisy",
         ),
         pages.Column("a ray", "cost", about=f"{found.plan.unit} times the noise"),
         pages.Column("noise", "noise", about="times the rays that equal error takes"),

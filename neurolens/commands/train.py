@@ -19,14 +19,15 @@ from neurolens.commands.arguments import (
     add_json,
     add_lens,
     add_output,
+    add_within,
     check_ids,
     check_run_folder,
-    rms_error,
     whole,
 )
 from neurolens.commands.farm import Task, add_dask, files_of, spread
 from neurolens.commands.output import answer, number, table
-from neurolens.evaluate.records import CLOSE_UM, to_use, use_command
+from neurolens.evaluate.advice import advice, said_ns
+from neurolens.evaluate.records import NOISY, noisy
 
 _MARK = "task.sha256"  # in a run folder that came from a cluster
 _DESCRIPTION = """\
@@ -78,16 +79,10 @@ def add_parser(subparsers: Any) -> None:
         "--internal-focus", action="store_true",
         help="of --lens: one model of internal focus, infinity to the near limit (input \"state\", in 1/m)",
     )  # fmt: skip
-    parser.add_argument(
-        "--within", metavar="ERROR", type=rms_error,
-        help="of --lens: the fastest model whose film-equivalent RMS on rays held out is at most this, 2um or 0.1px: "
-        "models from 12 coefficients to a network of 2 x 32 units are fitted until one is; exit code 1 if none is",
+    add_within(
+        parser, "of --lens: the fastest model whose film-equivalent RMS on rays held out is at most this, 2um or "
+        "0.1px; models from 12 coefficients to a network of 2 x 32 units are fitted until one is (exit code 1: none)",
     )  # fmt: skip
-    for unit in ("um", "px"):  # how --within was spelled until version 0.9
-        parser.add_argument(
-            f"--target-{unit}", dest="within", type=lambda text, unit=unit: rms_error(text + unit),
-            help=argparse.SUPPRESS,
-        )  # fmt: skip
     parser.add_argument(
         "--pixels-across", metavar="N", type=whole(1, 10**6), default=4000,
         help="of --within in pixels: how many make the width of the 3:2 frame inscribed in the film circle (default: "
@@ -226,10 +221,10 @@ def _text(results: Mapping[str, Any], folder: Path) -> str:
         reached = "reached" if target["met"] else "no model tried reaches it, the closest is"
         said = f"Asked for {target['within_um']:.3g} um RMS"
         parts.append(f"{said}: {reached} {target['model']}, {number(target['rms_um'], 3)} um.")
-    best = to_use(results.get("models", ()), target["within_um"] if target else CLOSE_UM)
-    if best and best.get("file"):
-        command = use_command(str(folder / best["file"]), fused=best.get("fused_ns_per_ray") is not None)
-        parts.append(f"Use {best['name']}:\n  {command}")
+    parts += ["\n  ".join(filter(None, (str(found), found.command))) for found in advice(results, folder)]
+    timings = [model.get(key) for model in results["models"] for key in ("ns_per_ray", "fused_ns_per_ray")]
+    if any(map(noisy, timings)):
+        parts.append(f"~ noisy: the median of the rounds is more than {NOISY:g} times the least, which is shown")
     parts += [f"Warning: {text}" for text in results.get("warnings", ())]
     places = [f"  {folder / 'report.html'}  everything on one page", f"  {folder / 'models'}  the ONNX models"]
     if (folder / "pictures").is_dir():
@@ -241,6 +236,6 @@ def _text(results: Mapping[str, Any], folder: Path) -> str:
 def _row(model: Mapping[str, Any]) -> tuple[str, ...]:
     errors = (number(model.get(key), 3) for key in ("rms_um", "p99_um", "direction_rms_deg"))
     shares = (model.get(key) for key in ("false_pass", "false_block"))
-    times = (*((model.get(key) or {}).get("min") for key in ("ns_per_ray", "fused_ns_per_ray")), model.get("fit_s"))
+    times = (said_ns(model.get(key) or {}).removesuffix(" ns") for key in ("ns_per_ray", "fused_ns_per_ray"))
     percent = ("-" if share is None else f"{100 * share:.2f}%" for share in shares)
-    return (str(model.get("name")), *errors, *percent, *(number(value, 3) for value in times))
+    return (str(model.get("name")), *errors, *percent, *times, number(model.get("fit_s"), 3))

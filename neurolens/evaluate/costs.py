@@ -9,6 +9,7 @@ of a camera of even weights have its error. Weights that are 1 with probability 
 from __future__ import annotations
 
 import math
+import statistics
 import time
 from collections.abc import Mapping
 
@@ -21,6 +22,9 @@ from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.osl import OslLens, osl_program
 from neurolens.cameras.source import camera_program
 from neurolens.evaluate.footprints import Array, Places
+from neurolens.evaluate.records import Timing
+from neurolens.render.renderer import render
+from neurolens.render.scene import Scene
 
 UNIT = {"render": "ns", "c": "ns", "onnx": "ns", "osl": "ns", "glsl": "operations"}
 # Of a camera ray in Cycles under a white sky, experiments/results/osl_speed.md: Blender's own cameras; any shader, each
@@ -32,6 +36,7 @@ _STEP_NS, _DEAR_NS, _DEAR = 0.1669, 4.438, ("div", "sqrt")
 # Of GLSL that anybody writes: a direction with its length, a point of a disc by concentric squares, the plane in focus.
 GLSL_OPERATIONS: Mapping[str, float] = {"pinhole": 14, "thin": 44, "thick": 47}
 _ROUNDS, _SIDE = 7, 16
+_REST_ACROSS, _REST_SAMPLES = 96, 4
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 _MOST_DARK = 0.05  # of the places
 
@@ -46,19 +51,33 @@ def noise(weight: Array, share: Array) -> float:
     return float((square[lit] / mean[lit] ** 2).mean()) if lit.mean() > 1 - _MOST_DARK else math.inf
 
 
-def ns_a_ray(camera: Camera, places: Places) -> float:
-    """Least nanoseconds of some calls on one thread, over their rays."""
+def ns_a_ray(camera: Camera, places: Places) -> Timing:
+    """Nanoseconds of a ray: least and median of some calls on one thread."""
     rays = int(getattr(camera, "rays_a_call", RAYS_A_CALL))
     rng = np.random.default_rng(1)
     rows = rng.integers(0, places.film_mm.shape[1], rays)
     film, pupil = places.film_mm[:, rows].astype(np.float32), rng.random((2, rays), np.float32)
     waves = rng.choice(places.wavelength_nm, rays, p=places.share).astype(np.float32)
-    best = math.inf
+    ns = []
     for _ in range(_ROUNDS):
         began = time.perf_counter()
         camera.sample(film, pupil, waves)
-        best = min(best, time.perf_counter() - began)
-    return 1e9 * best / rays
+        ns.append(1e9 * (time.perf_counter() - began) / rays)
+    return {"min": min(ns), "median": statistics.median(ns), "repeats": _ROUNDS}
+
+
+def small(scene: Scene, across: int) -> tuple[int, int]:
+    """Width and height of the scene's picture, no wider than `across`."""
+    shot = scene.settings.camera
+    width = min(across, shot.width)
+    return width, max(round(width * shot.film_height_mm / shot.film_width_mm), 1)
+
+
+def rest_ns(scene: Scene, camera: Camera) -> float:
+    """Nanoseconds of one thread that a path takes besides its camera, by a small picture in our renderer."""
+    width, height = small(scene, _REST_ACROSS)
+    stats = render(scene, camera, width=width, height=height, samples=_REST_SAMPLES, threads=1).stats
+    return float(1e9 * (stats["thread_seconds"] - stats["camera_thread_seconds"]) / stats["paths"])
 
 
 def glsl_operations(camera: OnnxCamera | ExactCamera) -> int:

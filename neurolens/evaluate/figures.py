@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ def side_by_side(
     Args:
         images: name to linear RGB [H, W, 3], shown through `image.to_srgb`; all of one shape.
         error_maps: name to error [H, W]; a name without one (the reference) keeps its place below for its caption.
-            The scale ends at the 99.5th percentile of all (not the maximum: fireflies), rounded up.
+            All share one logarithmic scale (`error_scale`), so that small errors show beside large ones.
         path: PNG, PDF or SVG to write.
         captions: name to one or two lines shown below its picture, for example `image_caption(...)`.
     Raises:
@@ -43,7 +43,7 @@ def side_by_side(
     pictures = {name: checked_image(image, name) for name, image in images.items()}
     maps = {name: np.asarray(error, dtype=np.float64) for name, error in error_maps.items()}
     _check_shapes(pictures, maps)
-    scale = rounded_up(np.percentile(np.concatenate([m.ravel() for m in maps.values()]), 99.5)) if maps else 1.0
+    low, high = error_scale(maps.values(), 99.5)
     height, width = next(iter(pictures.values())).shape[:2]
     rows, each = math.ceil(len(pictures) / _COLUMNS), 2 if maps else 1
     columns = math.ceil(len(pictures) / rows)
@@ -58,11 +58,14 @@ def side_by_side(
             above.imshow(to_srgb(picture), interpolation="nearest")
             above.set_title(name, fontsize=10.5, fontweight="bold", pad=4)
             if name in maps:
-                shown = below.imshow(maps[name], cmap="magma", vmin=0, vmax=scale, interpolation="nearest")
+                look = {"cmap": "magma", "norm": log_norm(low, high), "interpolation": "nearest"}
+                shown = below.imshow(np.maximum(maps[name], low), **look)
             _caption(below if name in maps else above, (captions or {}).get(name, ""))
         if maps:
-            bar = figure.colorbar(shown, ax=grid, label="FLIP (0 to 1)", aspect=40)
+            label = "FLIP difference, no unit: 0 none, 1 the most (logarithmic, one scale for all)"
+            bar = figure.colorbar(shown, ax=grid, label=label, aspect=40, extend="both")
             bar.outline.set_visible(False)
+            plain_log_ticks(bar.ax.yaxis)
     return Path(path)
 
 
@@ -86,6 +89,24 @@ def _check_shapes(pictures: Mapping[str, Any], maps: Mapping[str, Any]) -> None:
             raise InputError("side by side", "error map", name, "the name of an image: " + ", ".join(pictures))
         if error.shape != first[:2] or not np.isfinite(error).all():
             raise InputError("side by side", f"error map {name}", f"({error.shape})", f"finite values, {first[:2]}")
+
+
+_DECADES = 3  # of a scale of errors
+
+
+def error_scale(maps: Iterable[ArrayLike], counted: float) -> tuple[float, float]:
+    """Ends of the logarithmic scale that maps of errors share: three decades up to the counted percentile of the map
+    with the largest errors (not the maximum: fireflies), rounded up."""
+    known = [m[np.isfinite(m)] for m in map(np.asarray, maps)]
+    high = rounded_up(max((float(np.percentile(m, counted)) for m in known if m.size), default=0.0))
+    return high / 10**_DECADES, high
+
+
+def log_norm(low: float, high: float) -> Any:
+    """Matplotlib's logarithmic scale of colours."""
+    from matplotlib.colors import LogNorm
+
+    return LogNorm(low, high, clip=False)
 
 
 def rounded_up(value: float) -> float:

@@ -5,7 +5,6 @@ A smaller stop changes no ray, only which of them pass: the crossing with the st
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -19,7 +18,7 @@ from torch import Tensor
 
 from neurolens import __version__
 from neurolens.base import status as st
-from neurolens.base.files import atomic_path, fingerprint_of, sha256_of, write_json
+from neurolens.base.files import atomic_path, fingerprint_of, read_kept, sha256_of, write_kept
 from neurolens.base.progress import Report
 from neurolens.cameras.model import OnnxLens, load_model
 from neurolens.evaluate.rays import PIXELS_ACROSS, EachRay, Predict, RayErrors, each_ray
@@ -313,14 +312,13 @@ def seconds_to_load(file: Path) -> float:
 def note_record(file: Path, fingerprint: str, record: dict[str, Any]) -> None:
     """Write the record of a finished fit beside its model, for `known_record`."""
     made = {"fingerprint": fingerprint, "sha256": sha256_of(file), "record": record}
-    write_json(file.with_suffix(".json"), made)
+    write_kept(file.with_suffix(".json"), made)
 
 
 def known_record(file: Path, fingerprint: str) -> dict[str, Any] | None:
     """The record of an earlier finished fit of the same settings whose model file is unchanged."""
-    try:
-        data = json.loads(file.with_suffix(".json").read_text(encoding="utf-8"))
-        same = data["fingerprint"] == fingerprint and data["sha256"] == sha256_of(file)
-        return data["record"] if same else None
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+    data = read_kept(file.with_suffix(".json")) or {}
+    if data.get("fingerprint") != fingerprint or not file.is_file() or data["sha256"] != sha256_of(file):
         return None
+    record: dict[str, Any] = data["record"]
+    return record

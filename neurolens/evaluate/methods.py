@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +12,7 @@ from typing import Any, get_args
 
 from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
-from neurolens.base.files import fingerprint_of, sha256_of, write_json
+from neurolens.base.files import fingerprint_of, read_kept, sha256_of, write_kept
 from neurolens.base.lensname import lens_id_of
 from neurolens.base.progress import Progress, Report
 from neurolens.cameras.model import load_model
@@ -227,7 +226,7 @@ def _record(bench: Bench, row: Row, again: bool, report: Report) -> dict[str, An
         mark = mark if isinstance(error, NeurolensError) else ""
         made = {"failed": _reason(error)}
     record = plain({"fingerprint": mark, **head, "settings": asdict(row.settings), **made})
-    write_json(file, record)
+    write_kept(file, record)
     return record
 
 
@@ -283,17 +282,13 @@ def _add_times(bench: Bench, rows: Sequence[Row], records: list[dict[str, Any]],
     for i, (row, record) in enumerate(zip(rows, records, strict=True)):
         if row.name in files:
             records[i] = plain({**record, **_times_of(record, timed), "race": mark})
-            write_json(bench.record_file(row), records[i])
+            write_kept(bench.record_file(row), records[i])
 
 
 def _known_record(file: Path, fingerprint: str) -> dict[str, Any] | None:
-    """A record; None if missing, unreadable or of other settings."""
-    try:
-        record = json.loads(file.read_text(encoding="utf-8"))
-        good = isinstance(record, dict) and {"lens", "method", "failed"} <= record.keys()
-    except (OSError, ValueError, RecursionError):
-        return None
-    return record if good and record.get("fingerprint") == fingerprint else None
+    """A record; None if missing, damaged or of other settings."""
+    record = read_kept(file)
+    return record if record is not None and record.get("fingerprint") == fingerprint else None
 
 
 def _race(bench: Bench, files: Mapping[str, Path], report: Report) -> Race:

@@ -15,6 +15,8 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
+from neurolens.evaluate.records import noisy
+
 Record = Mapping[str, Any]
 DASH = "–"
 
@@ -43,11 +45,14 @@ class Column:
     about: str = ""
 
     def cell(self, record: Record, thousands: str = "") -> str:
-        """The figure as text, a dash for None; the word "never" stays."""
+        """The figure as text, a dash for None, "~" before the least of a noisy timing; the word "never" stays."""
         if record.get(self.key) == "never":
             return "never"
-        value = number(record, self.key)
-        return DASH if value is None else show(value * self.factor, self.digits, thousands)
+        value, parent = number(record, self.key), self.key.removesuffix(".min")
+        if value is None:
+            return DASH
+        mark = "~" if parent != self.key and noisy(record[parent]) else ""
+        return mark + show(value * self.factor, self.digits, thousands)
 
 
 def show(value: float, digits: int, thousands: str = "") -> str:
@@ -224,7 +229,8 @@ details { margin-top: 1rem; } summary { cursor: pointer; color: var(--accent); m
 .scroll::-webkit-scrollbar-thumb { background: var(--dim); border-radius: 6px; }
 th[title] { text-decoration: underline dotted; text-underline-offset: 3px; cursor: help; }
 .use { background: var(--card); border-left: 4px solid var(--accent); border-radius: 4px; padding: .6rem 1rem 1rem;
-  margin-top: 1.4rem; } .use h2 { border: 0; margin: 0 0 .3rem; } .use p { margin: .3rem 0; }
+  margin-top: 1.4rem; } .use h2 { border: 0; margin: 0 0 .3rem; }
+.use pre + h2 { margin-top: 1rem; } .use p { margin: .3rem 0; }
 pre { margin: .5rem 0 0; padding: .6rem .8rem; overflow-x: auto; background: var(--back); border-radius: 4px;
   border: 1px solid var(--line); font-size: .85rem; }
 table { border-collapse: collapse; font-size: .84rem; font-variant-numeric: tabular-nums; }

@@ -1,4 +1,4 @@
-"""The cheapest camera that shows a scene as the lens does, within a budget.
+"""The cheapest camera that shows a scene as the lens does, within a budget; the exact lens where that saves too little.
 
 A camera's error is the distance of its footprints from the exact lens's in pixels, and of its light, at the places of a
 scene that a `probe` finds; both count where they are largest but for 5% of the picture.
@@ -16,7 +16,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,6 +34,7 @@ from neurolens.cameras.fused import FusedCamera
 from neurolens.cameras.model import OnnxCamera, OnnxLens, load_model
 from neurolens.cameras.warped import Warped
 from neurolens.evaluate import footprints as prints
+from neurolens.evaluate.advice import recommended
 from neurolens.evaluate.costs import (
     CYCLES_NS,
     GLSL_OPERATIONS,
@@ -41,37 +42,29 @@ from neurolens.evaluate.costs import (
     glsl_operations,
     noise,
     ns_a_ray,
+    rest_ns,
     shader_cost,
 )
 from neurolens.evaluate.experiment import DomainChoice, EvaluationChoice, Experiment, LensChoice
 from neurolens.evaluate.footprints import Footprints
 from neurolens.evaluate.probe import COUNTED, LIGHT, Asked, Effect, Probed, effects_of, probe
-from neurolens.evaluate.shaders import IDLE, lens_of
+from neurolens.evaluate.records import Timing, noisy
+from neurolens.evaluate.shaders import lens_of
+from neurolens.evaluate.shot_fits import PAIRS, shot_domain, shot_fits, shot_terms
 from neurolens.graph.compiler import has_compiler
 from neurolens.graph.scalars import lower
 from neurolens.modelfile.graph import graph_of
 from neurolens.optics.prescription import Lens
 from neurolens.render.scene import Scene
-from neurolens.surrogates.domain import domain_of
-from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.fit import fit_model, prepare
-from neurolens.surrogates.fits.planes import fit_planes
-from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.settings import ModelSettings
-from neurolens.surrogates.targets import Prepared
 
 Target = Literal["render", "c", "onnx", "osl", "glsl"]
-Cost = Callable[[], tuple[float, float]]  # of a ray, and noise
+Cost = Callable[[], tuple[Timing, float]]  # of a ray, and noise
 _OURS = ("render", "c")  # run compiled C
-_TERMS = (2, 4, 6, 8, 12, 16, 22, 28, 36, 48, 64, 90)  # of the polynomials that are fitted on the spot
 _EXACT, _IDEAL = "exact", ("pinhole", "thin", "thick")
 _MAPPED = " + ST map"  # after the name of an ideal camera
 _SHOT = "fitted for this shot"
-_FIT = ModelSettings("ols", planes=False, elimination=False, idle_gates=IDLE)
-_FIT_MIRROR = replace(_FIT, degree=5)  # of lenses with cylinders: more candidates cost ten times, for the same errors
-_MOVED_TERMS = 16, 22  # from so many on, planes are searched: once, for the second number
 _CLOSE = 1.3  # times the operations of the smallest model that holds, up to which others of its form are timed
-_PAIRS = PairSettings(train=5000, held_out=1000, rim=5000)
 _MOST_OVERSCAN = 4.0  # of a plane picture that is warped afterwards
 
 
@@ -83,6 +76,7 @@ class Choice:
         camera: as `--camera` takes it, or what `export` takes. error_px, light_error: at the counted percentile; inf
             where it has no light that the lens has. cost: of a ray, in the plan's unit, times `noise`; inf where it was
             not asked for. noise: how many times the rays it needs for equal error, see `costs`.
+        spread: how many times as long as the least the median of its timed calls took (1 where cost is counted).
         how: what else it needs, or how it was made. within: whether it meets the budget of its plan.
         settings: of a model that was fitted for the shot. flip: of its picture, where a budget of FLIP asked for it.
     """
@@ -97,6 +91,12 @@ class Choice:
     within: bool = False
     settings: ModelSettings | None = None
     flip: float | None = None
+    spread: float = 1.0
+
+    @property
+    def noisy(self) -> bool:
+        """Whether the timing spreads too far to tell it from one that is a little shorter: see `records.noisy`."""
+        return noisy({"min": 1.0, "median": self.spread})
 
     def meets(self, budget_px: float) -> bool:
         """Whether it may be used."""
@@ -111,6 +111,7 @@ class Plan:
         budget_s, budget_flip: seconds, or FLIP difference, of a plan for those, whose `budget_px` is then the error of
             the best camera.
         unit: of costs: "ns" or, where no time is known, "operations". domain: of models that are fitted.
+        rest: what a path takes besides its camera, in the same unit; 0 where the camera alone counts.
     """
 
     asked: Asked
@@ -124,6 +125,7 @@ class Plan:
     best: Choice | None
     probed: Probed
     budget_flip: float | None = None
+    rest: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able: what is above `probed`."""
@@ -143,14 +145,15 @@ class Plan:
         file, asked = Path(os.path.relpath(lens.path, folder)), self.asked
         choice = LensChoice(file, configuration=asked.zoom, f_number=asked.f_number)
         checks = EvaluationChoice(vignetting_rays=50_000, rounds=0, compile_exact=False)
-        return to_toml(Experiment(title, choice, (best.settings,), self.domain, _PAIRS, checks, camera=camera))
+        return to_toml(Experiment(title, choice, (best.settings,), self.domain, PAIRS, checks, camera=camera))
 
 
 def plan(
     scene: Scene, lens: Lens, budget_px: float, *, target: Target = "render", models: Sequence[Path] = (),
     folder: Path | None = None, explain: bool = False, report: Report | None = None, **look: Any,
 ) -> Plan:  # fmt: skip
-    """The cheapest camera for a scene whose error stays within a budget.
+    """The cheapest camera for a scene whose error stays within a budget, or the exact lens where that one saves too
+    little (`advice.recommended`). In our renderer the rest of the picture counts, too.
 
     Args:
         lens: as its file has it. budget_px: error of place and blur in pixels of the scene's picture.
@@ -166,8 +169,21 @@ def plan(
     if not budget_px >= 0:
         raise InputError("plan", "budget_px", budget_px, "0 or more pixels")
     found = probe(scene, lens, **look)
+    rest = rest_of(scene, found, target)
+    folder = folder if explain or not exact_suffices(found, rest) else None
     tried = candidates(found, (budget_px,), target, models=models, folder=folder, explain=explain, report=report)
-    return decided(found, tried, budget_px, target)
+    return decided(found, tried, budget_px, target, rest)
+
+
+def rest_of(scene: Scene, found: Probed, target: Target) -> float:
+    """What a path takes besides its camera: in our renderer by a small picture, in other targets 0."""
+    return rest_ns(scene, found.exact) if target == "render" else 0.0
+
+
+def exact_suffices(found: Probed, rest: float) -> bool:
+    """Whether not even a camera that costs nothing would save enough, so that nothing needs to be fitted."""
+    exact = ns_a_ray(found.exact, found.places)["min"] if rest else math.inf
+    return recommended((0.0,), float, exact, rest) == exact
 
 
 def candidates(
@@ -192,12 +208,27 @@ def candidates(
         return tuple(_costed(trial, tried))
 
 
-def decided(found: Probed, tried: Sequence[Choice], budget_px: float, target: Target) -> Plan:
-    """The plan for a budget, from candidates that serve it."""
+def best_of(within: Sequence[Choice], rest: float | None) -> Choice | None:
+    """The camera to use of those within a budget; `rest` as of `decided`."""
+    exact = next((c for c in within if c.name == _EXACT and math.isfinite(c.cost)), None)
+    return recommended(within, lambda c: c.cost, None if rest is None else exact, rest or 0.0)
+
+
+def decided(
+    found: Probed, tried: Sequence[Choice], budget_px: float, target: Target, rest: float | None = None
+) -> Plan:
+    """The plan for a budget, from candidates that serve it.
+
+    Args:
+        rest: cost of a path besides its camera; None chooses the cheapest camera, whatever it saves.
+    """
     ranked = tuple(replace(c, within=c.meets(budget_px)) for c in sorted(tried, key=lambda c: c.cost))
-    best = next((c for c in ranked if c.within), None)
+    best = best_of([c for c in ranked if c.within], rest)
     effects = effects_of(found, budget_px)
-    return Plan(found.asked, budget_px, None, target, UNIT[target], shot_domain(found), effects, ranked, best, found)
+    return Plan(
+        found.asked, budget_px, None, target, UNIT[target], shot_domain(found), effects, ranked, best, found,
+        rest=rest or 0.0,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -250,30 +281,39 @@ class _Trial:
 
     def costed(self, judged: _Judged) -> Choice:
         """A camera with its cost."""
-        choice, (ray, times) = judged.choice, judged.cost()
+        choice, (timing, times) = judged.choice, judged.cost()
         # A shader that does not focus so near shows nothing.
         return replace(
             choice,
-            cost=ray * (1.0 if self.found.asked.denoised else times),
+            cost=timing["min"] * (1.0 if self.found.asked.denoised else times),
             noise=times,
+            spread=timing["median"] / timing["min"] if timing["min"] else 1.0,
             error_px=choice.error_px if math.isfinite(times) else math.inf,
         )
 
-    def timed(self, camera: Camera, seen: Footprints) -> tuple[float, float]:
+    def timed(self, camera: Camera, seen: Footprints) -> tuple[Timing, float]:
         return ns_a_ray(camera, self.found.places), noise(seen.weight, self.share)
 
-    def ideal(self, name: str, camera: Camera, seen: Footprints, area: float = 1.0) -> tuple[float, float]:
+    def ideal(self, name: str, camera: Camera, seen: Footprints, area: float = 1.0) -> tuple[Timing, float]:
         """Of a camera without a lens, whose picture is so many times as large."""
         known = {"osl": CYCLES_NS, "glsl": GLSL_OPERATIONS}.get(self.target)
-        ray, times = self.timed(camera, seen) if known is None else (known[name], noise(seen.weight, self.share))
-        return area * ray, times
+        if known is not None:
+            return _counted(area * known[name]), noise(seen.weight, self.share)
+        timing, times = self.timed(camera, seen)
+        return {"min": area * timing["min"], "median": area * timing["median"]}, times
 
-    def shader(self, file: str | Path) -> tuple[float, float]:
+    def shader(self, file: str | Path) -> tuple[Timing, float]:
         """Of the shader of a model or a lens."""
         asked = self.found.asked
         state = asked.zoom if str(file) == self.found.lens.path else None  # models are of one
         lens = lens_of(Path(file), state, lambda done, left=None: None)[1]
-        return shader_cost(lens, self.found.places, asked.film_mm, asked.f_number, asked.focus_m)
+        ns, times = shader_cost(lens, self.found.places, asked.film_mm, asked.f_number, asked.focus_m)
+        return _counted(ns), times
+
+
+def _counted(cost: float) -> Timing:
+    """A cost that is no measurement, and so has no spread."""
+    return {"min": cost, "median": cost}
 
 
 def camera_of(found: Probed, choice: Choice) -> Camera:
@@ -328,7 +368,7 @@ def _exact(trial: _Trial) -> Iterator[_Judged]:
     exact, path, compiled = found.exact, found.lens.path, isinstance(found.exact, FusedExactCamera)
     cost: Cost = {
         "osl": lambda: trial.shader(path),
-        "glsl": lambda: (glsl_operations(exact), noise(found.seen.weight, trial.share)),
+        "glsl": lambda: (_counted(glsl_operations(exact)), noise(found.seen.weight, trial.share)),
     }.get(target, lambda: trial.timed(exact, found.seen))
     if target == "render" or (target != "onnx" and compiled) or target in ("osl", "glsl"):
         with suppress(InputError):  # a shader that is too large
@@ -355,11 +395,11 @@ def _model(trial: _Trial, file: Path, how: str = "", without: Collection[str] = 
         seen = prints.footprints(camera, trial.found.places)
         beside = prints.light_beside(camera, trial.found.places) / np.maximum(trial.found.seen.light, 1e-30)
 
-        def cost() -> tuple[float, float]:
+        def cost() -> tuple[Timing, float]:
             if target == "osl":
                 return trial.shader(file)
             if target == "glsl":
-                return glsl_operations(camera), noise(seen.weight, trial.share)
+                return _counted(glsl_operations(camera)), noise(seen.weight, trial.share)
             return trial.timed(FusedCamera.of(camera) if compiled else camera, seen)
 
         spec = f"{'fused:' if compiled else ''}{file}"
@@ -403,42 +443,6 @@ def model_choice(found: Probed, target: Target, file: Path, how: str, costed: bo
         trial = _Trial(found, target, ())
         judged = next(_model(trial, file, how), None)
         return None if judged is None else trial.costed(judged) if costed else judged.choice
-
-
-def shot_domain(found: Probed) -> DomainChoice:
-    """That of `Probed.domain`, as an experiment asks for it."""
-    return DomainChoice(found.domain.film_radius_mm, found.domain.focus_m, found.asked.wavelength_nm)
-
-
-def shot_terms(found: Probed) -> list[int]:
-    """Sizes of polynomials that are tried for a shot; those of lenses with cylinders have terms of x and of y."""
-    return [n for n in _TERMS if n >= (4 if found.lens.anamorphic else 2)]
-
-
-def shot_fits(
-    found: Probed, folder: Path, choice: DomainChoice | None = None, name: str = "shot"
-) -> Callable[[int], tuple[Path, ModelSettings]]:
-    """What fits a polynomial of so many terms to a shot alone, or to another domain of its lens: its file, in a folder,
-    and its settings."""
-    lens, domain = found.lens.with_aperture(None), found.domain
-    if choice is not None:
-        with suppress(InputError):  # a lens that goes no nearer
-            domain = domain_of(lens, **asdict(choice))
-    plain, model = prepare(make_pairs(lens, domain, _PAIRS)), _FIT_MIRROR if lens.anamorphic else _FIT
-    folder.mkdir(parents=True, exist_ok=True)
-
-    @cache
-    def moved() -> Prepared:  # the planes of one size: a search takes a second, and others of its kind agree on them
-        return replace(plain, encoding=fit_planes(plain.pairs, plain.encoding, _MOVED_TERMS[1], model.position_weight))
-
-    def fit(terms: int) -> tuple[Path, ModelSettings]:
-        settings = replace(model, name=f"{name}-ols-{terms}", terms=terms)
-        file = folder / f"{found.lens.lens_id}.{settings.label}.onnx"
-        planes = terms >= _MOVED_TERMS[0] and not lens.anamorphic
-        export_onnx(fit_model(moved() if planes else plain, settings), file, errors={})
-        return file, replace(settings, planes=planes)  # as a training from scratch has it
-
-    return fit
 
 
 def _fitted(trial: _Trial, folder: Path, tried: Sequence[_Judged], say: Report) -> list[_Judged]:

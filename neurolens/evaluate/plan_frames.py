@@ -24,13 +24,14 @@ from neurolens.evaluate.plan import (
     UNIT,
     Choice,
     Target,
+    best_of,
     candidates,
+    exact_suffices,
     model_choice,
-    shot_domain,
-    shot_fits,
-    shot_terms,
+    rest_of,
 )  # fmt: skip
 from neurolens.evaluate.probe import COUNTED, Effect, Probed, effects_of, probe
+from neurolens.evaluate.shot_fits import shot_domain, shot_fits, shot_terms
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.render.scene import Scene
@@ -113,16 +114,17 @@ def plan_frames(
         founds.append(probe(frame.scene, lens.at(zoom=frame.zoom), afterwards=afterwards, denoised=denoised))
         say(0.4 * len(founds) / len(chosen))
     best: list[Choice | None] = []
+    rest = rest_of(chosen[0].scene, founds[0], target)
     for found in founds:
-        tried = [c for c in candidates(found, (budget_px,), target, models=models) if c.meets(budget_px)]
-        best.append(min(tried, key=lambda c: c.cost, default=None))
+        tried = candidates(found, (budget_px,), target, models=models)
+        best.append(best_of([c for c in tried if c.meets(budget_px)], rest))
         say(0.4 + 0.3 * len(best) / len(founds))
     fits = 0
-    if folder is not None:
+    if folder is not None and not exact_suffices(founds[0], rest):
         # What has no camera, or one that costs more than a small model may.
         asks = [k for k, c in enumerate(best) if c is None or not c.name.startswith(("pinhole", "thin"))]
         for rows, choice in _stretches([founds[k] for k in asks], target, budget_px, folder):
-            cheaper = [asks[k] for k in rows if (now := best[asks[k]]) is None or choice.cost < now.cost]
+            cheaper = [asks[k] for k in rows if best_of([choice, *filter(None, [best[asks[k]]])], rest) is choice]
             fits += bool(cheaper)
             for k in cheaper:
                 best[k] = choice

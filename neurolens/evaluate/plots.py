@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from neurolens.analysis.plot_style import INK, drawing, plain_log_ticks
+from neurolens.evaluate.advice import said_ns
+from neurolens.evaluate.figures import error_scale, log_norm
 from neurolens.evaluate.pages import Record, number
-from neurolens.evaluate.records import pareto_front
+from neurolens.evaluate.records import NOISY, noisy, pareto_front, time_of
 
 if TYPE_CHECKING:
     from neurolens.evaluate.plan import Choice, Plan
@@ -32,6 +34,8 @@ _ERRORS = {
     "rms_um": "film-equivalent error, RMS (µm)",
     "direction_rms_deg": "direction error, RMS (degrees)",
 }
+_CHOSEN = "#d55e00"
+_RING = {"ms": 13, "mfc": "none", "mec": _CHOSEN, "mew": 1.8, "ls": "none"}
 _Point = tuple[float, float, Record, bool]  # time or size, error, the model, whether as C
 
 
@@ -46,10 +50,13 @@ def trade_plot(
     path: Path,
     kinds: Kinds = FAMILIES,
     kind: str = "family",
+    use: str | None = None,
 ) -> bool:
     """Draw error against time (hollow: as C) and against size, logarithmic; returns whether there was anything to draw.
 
-    Exact tracers, which have no error, are lines at their time. The staircase is the front that nothing betters.
+    Exact tracers, which have no error, are lines at their time. The staircase is the front that nothing betters. From a
+    noisy time (`records.noisy`) a line leads to the median of its rounds. A ring marks what is advised, at the time
+    that the advice states.
 
     Args:
         records: of models by `name`, with errors, ns_per_ray, fused_ns_per_ray, coefficients_per_vector, parameters.
@@ -57,6 +64,7 @@ def trade_plot(
         exact: `records.ExactRecord`s.
         path: PNG, PDF or SVG to write.
         kinds: name, colour and marker of each value that `kind` has in the records.
+        use: name of the model, or of the exact tracer, that is advised.
     """
     error = next((k for k in _ERRORS if any((number(r, k) or 0) > 0 for r in records)), None)
     if error is None:
@@ -68,11 +76,17 @@ def trade_plot(
     with drawing(path, 13.0, 5.8) as figure:
         left, right = figure.subplots(1, 2, sharey=True)
         _panel(left, times, "time per ray (ns, best of the rounds)", kinds, kind)
+        _spread(left, shown, error)
         for one in exact:
             time = number(one, "ns_per_ray.min")
             if time:
                 look = {"color": INK, "lw": 1.0, "ls": "--" if "compiled" in one["name"] else ":"}
-                left.axvline(time, label=f"{one['name']} {time:.3g} ns", **look)
+                look |= {"color": _CHOSEN, "lw": 2.0} if one["name"] == use else {}
+                said = f"{one['name']} {said_ns(time_of(one))}" + ": use" * (one["name"] == use)
+                left.axvline(time, label=said, **look)
+        advised = [(x, number(r, error)) for r in shown if r["name"] == use and (x := number(time_of(r), "min"))]
+        if advised:
+            left.plot(*advised[0], "o", label=f"use {use}", **_RING)
         _panel(right, sizes, "coefficients of one vector output (networks: all weights)", kinds, kind)
         left.set_ylabel(_ERRORS[error])
         plain_log_ticks(left.yaxis)
@@ -86,6 +100,24 @@ def trade_plot(
             if points:
                 place_labels(axes, [p[:2] for p in points], [str(p[2]["name"]) for p in points])
     return True
+
+
+def _spread(axes: Any, records: Sequence[Record], error: str) -> None:
+    """Lines from noisy times to the medians of their rounds."""
+    lines = [
+        (number(record, error), timing["min"], timing["median"])
+        for record in records
+        for timing in (record.get("ns_per_ray"), record.get("fused_ns_per_ray"))
+        if timing is not None and noisy(timing)
+    ]
+    _noisy_lines(axes, lines)
+
+
+def _noisy_lines(axes: Any, lines: Sequence[tuple[Any, float, float]]) -> None:
+    """Lines at heights from the least of a noisy time to its median."""
+    if lines:
+        label = f"noisy: to the median, over {NOISY:g} times the least"
+        axes.hlines(*zip(*lines, strict=True), color=INK, lw=0.8, alpha=0.6, label=label)
 
 
 def _points(records: Sequence[Record], key: str, error: str) -> list[_Point]:
@@ -152,35 +184,56 @@ def _cost(box: tuple[float, float, float, float], points: Sequence[Any], taken: 
 
 
 _COLUMNS = 4  # of maps
+# Light that an effect takes is dark, light that it adds is orange; none is white.
+_SIGNED = ("#10183a", "#4d6796", "#c9d1de", "#ffffff", "#f6cfae", "#e58a45", _CHOSEN)
+_TITLES = {"px": "pixels (logarithmic)", "relative": "% of the light\n(dark: taken, orange: added)"}
 
 
 def plot_effects(plan: Plan, path: Path, title: str) -> None:
     """What a plan found: effects as bars with the budget, error against time of every camera that was timed, and where
-    in the picture the effects are that a camera needs."""
+    in the picture the effects are that a camera needs: those in pixels, then those of light, each with one scale."""
     asked = plan.asked
     shown = [e for e in plan.effects if e.needed and e.name in plan.probed.maps]
-    rows = -(-len(shown) // _COLUMNS)
+    groups = {unit: [e.name for e in shown if e.unit == unit] for unit in _TITLES}
+    groups = {unit: names for unit, names in groups.items() if names}
+    heights = [4.2, *(1.6 * -(-len(names) // _COLUMNS) + 0.15 for names in groups.values())]
     subtitle = f"f/{asked.f_number:.3g}, focus {asked.focus_m:g} m; 95% of the picture keeps these figures"
-    with drawing(path, 9.5, 4.2 + 1.75 * rows, title, subtitle) as figure:
-        if not rows:
+    with drawing(path, 9.5, sum(heights), title, subtitle) as figure:
+        if not groups:
             _bars_and_trade(plan, figure)
             return
-        above, below = figure.subfigures(2, 1, height_ratios=(4.2, 1.75 * rows))
+        above, *below = figure.subfigures(len(heights), 1, height_ratios=heights)
         _bars_and_trade(plan, above)
-        cells = below.subplots(rows, _COLUMNS, squeeze=False).ravel()
-        for axes, effect in zip(cells, shown, strict=False):
-            unit, value = plan.probed.maps[effect.name]
-            value = value if unit == "px" else 100 * value
-            # What is beyond 95% would leave the rest dark.
-            top = float(np.nanpercentile(value, 98)) or 1e-30
-            look = {"cmap": "magma", "vmin": 0, "vmax": top, "interpolation": "nearest"}
-            picture = axes.imshow(value, extent=(0, asked.film_mm[0], 0, asked.film_mm[1]), **look)
-            bar = below.colorbar(picture, ax=axes, shrink=min(1.25 * value.shape[0] / value.shape[1], 1), extend="max")
-            bar.ax.tick_params(labelsize=6)
-            axes.set_title(f"{effect.name} ({'px' if unit == 'px' else '% of the light'})", fontsize=7.5)
-            axes.set(xticks=[], yticks=[])
-        for axes in cells[len(shown) :]:
-            axes.remove()
+        for part, (unit, names) in zip(below, groups.items(), strict=True):
+            _maps(part, {name: plan.probed.maps[name][1] for name in names}, unit, asked.film_mm)
+
+
+def _maps(figure: Any, maps: Mapping[str, Any], unit: str, film_mm: tuple[float, float]) -> None:
+    """Maps of effects of one unit, upright, in one scale of colours with its bar."""
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+
+    colours: Any = "magma"
+    if unit == "px":
+        low, high = error_scale(maps.values(), 98)
+        norm = log_norm(low, high)
+        maps = {name: np.maximum(value, low) for name, value in maps.items()}
+    else:
+        maps = {name: 100 * value for name, value in maps.items()}
+        high = error_scale([np.abs(value) for value in maps.values()], 98)[1]
+        norm, colours = Normalize(-high, high), LinearSegmentedColormap.from_list("signed", _SIGNED)
+    cells = figure.subplots(-(-len(maps) // _COLUMNS), _COLUMNS, squeeze=False)
+    for axes, (name, value) in zip(cells.ravel(), maps.items(), strict=False):
+        extent = (0, film_mm[0], 0, film_mm[1])
+        picture = axes.imshow(value, extent=extent, cmap=colours, norm=norm, interpolation="nearest")
+        axes.set_title(name, fontsize=8)
+        axes.set(xticks=[], yticks=[])
+    for axes in cells.ravel()[len(maps) :]:
+        axes.set_axis_off()
+    bar = figure.colorbar(picture, ax=cells, extend="both", aspect=12 * len(cells), pad=0.015)
+    bar.ax.tick_params(labelsize=6.5)
+    bar.set_label(_TITLES[unit], fontsize=7)
+    if unit == "px":
+        plain_log_ticks(bar.ax.yaxis)
 
 
 def _bars_and_trade(plan: Plan, figure: Any) -> None:
@@ -193,22 +246,28 @@ def _bars_and_trade(plan: Plan, figure: Any) -> None:
     bars.set_xlim(left=least)
     bars.set_xlabel("worth (pixels), grey: left out")
     timed = [c for c in plan.choices if 0 < c.cost < float("inf") and c.error_px < float("inf")]
-    _cameras(trade, timed, [c.cost for c in timed], plan.best)
+    _cameras(trade, timed, [c.cost for c in timed], [c.cost * c.spread for c in timed], plan.best)
     trade.set_xlabel(f"cost ({plan.unit} a ray times noise), --for {plan.target}")
     if plan.budget_px > 0:
-        bars.axvline(plan.budget_px, color="#d55e00", lw=1.2)
-        trade.axhline(plan.budget_px, color="#d55e00", lw=1.2, label=f"budget {plan.budget_px:g} px; ring: chosen")
-        trade.legend(loc="lower right", bbox_to_anchor=(1, 1), frameon=False)
+        bars.axvline(plan.budget_px, color=_CHOSEN, lw=1.2)
+        trade.axhline(plan.budget_px, color=_CHOSEN, lw=1.2, label=f"budget {plan.budget_px:g} px; ring: chosen")
+        trade.legend(loc="lower right", bbox_to_anchor=(1, 1), frameon=False, ncols=2)
     plain_log_ticks(bars.xaxis, trade.xaxis, trade.yaxis)
 
 
-def _cameras(axes: Any, choices: Sequence[Choice], places: Sequence[float], best: Choice | None) -> None:
-    """Errors of cameras over something, those within the budget in colour, the chosen one with a ring."""
+def _cameras(
+    axes: Any, choices: Sequence[Choice], places: Sequence[float], medians: Sequence[float], best: Choice | None
+) -> None:
+    """Errors of cameras over their time, those within the budget in colour, the chosen one with a ring.
+
+    From a noisy time a line leads to the median of its repeats.
+    """
     errors = [max(c.error_px, 1e-4) for c in choices]
     axes.scatter(places, errors, c=["#0072b2" if c.within else "#b8b8b8" for c in choices], s=26)
     chosen = [k for k, c in enumerate(choices) if c == best]
-    ring = {"s": 150, "fc": "none", "ec": "#d55e00", "lw": 1.8}
+    ring = {"s": 150, "fc": "none", "ec": _CHOSEN, "lw": 1.8}
     axes.scatter([places[k] for k in chosen], [errors[k] for k in chosen], **ring)
+    _noisy_lines(axes, [(e, x, m) for c, e, x, m in zip(choices, errors, places, medians, strict=True) if c.noisy])
     axes.set(xscale="log", yscale="log", ylabel="error (pixels; none is drawn at 0.0001)")
     place_labels(axes, list(zip(places, errors, strict=True)), [_short(c.name) for c in choices])
 
@@ -220,13 +279,14 @@ def plot_trade(trade: Trade, path: Path, title: str) -> None:
     subtitle += f"; the scene itself takes {trade.base:.3g} {trade.unit}" * bool(trade.base)
     with drawing(path, 8.5, 5.0, title, subtitle) as figure:
         axes = figure.subplots()
-        _cameras(axes, [o.choice for o in offered], [o.seconds for o in offered], plan.best)
+        medians = [o.seconds + o.more for o in offered]
+        _cameras(axes, [o.choice for o in offered], [o.seconds for o in offered], medians, plan.best)
         best = trade.front
         at = [o.seconds for o in best], [max(o.choice.error_px, 1e-4) for o in best]
         axes.step(*at, where="post", color=INK, lw=1.2, alpha=0.7, label="no camera betters both")
         axes.set_xlabel(f"{trade.unit} that the camera adds, one thread, to equal noise")
         if plan.budget_px > 0:
-            axes.axhline(plan.budget_px, color="#d55e00", lw=1.2, label=f"budget {plan.budget_px:g} px; ring: chosen")
+            axes.axhline(plan.budget_px, color=_CHOSEN, lw=1.2, label=f"budget {plan.budget_px:g} px; ring: chosen")
         axes.legend(loc="lower right", bbox_to_anchor=(1, 1), frameon=False, ncols=2)
         plain_log_ticks(axes.xaxis, axes.yaxis)
 

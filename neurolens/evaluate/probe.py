@@ -18,6 +18,8 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.analysis.field_curves import illumination
+from neurolens.analysis.fields import Scene as Fields
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, ideal_as
 from neurolens.cameras.exact import ExactCamera, FusedExactCamera
@@ -39,6 +41,7 @@ _Real = TypeVar("_Real", bound=np.floating[Any])
 Maps = dict[str, tuple[Literal["px", "relative"], Array]]
 LIGHT = 0.01  # relative error of light that a plan allows beside its budget of place
 _FOCUS_SPARE = 0.25  # of a pixel of blur: what a model may place its film beside the lens's
+_FIELDS = 17  # from the axis to the edge of the film, at which vignetting is traced
 _ACROSS = 16  # points of the probe along the longer side
 # Of effects, what makes them where the picture is finished: a blur by depth makes all blur.
 _MADE_BY = {"distortion": "distortion", "natural fall-off": "distortion", "vignetting": "distortion"} | dict.fromkeys(
@@ -237,6 +240,10 @@ def upright(film: NDArray[_Real]) -> NDArray[_Real]:
 def effect_maps(found: Probed) -> Maps:
     """Unit and map [H, W] of each effect over the picture, upright; NaN where the lens is dark. See `effects_mm`.
 
+    Light has a sign: the share of it that an effect adds, below 0 where the effect makes the picture darker. Vignetting
+    is what the rims take of the light through the stop (`passed_share`). Natural fall-off is the light that would
+    remain without rims, relative to the axis: cos^4, and how the pupil grows or shrinks with the field.
+
     An Airy disc has no RMS radius: diffraction is worth the radius that holds half its light, 0.53 wavelengths times
     the f-number (Born and Wolf, 8.5.2). Transmittance is the colour that the lens gives, by its glass and coatings and
     an aperture that changes with the wavelength: RMS over wavelengths of the light there relative to its mean.
@@ -245,12 +252,13 @@ def effect_maps(found: Probed) -> Maps:
     parts = {k: v / pixel for k, v in prints.effects_mm(found.seen, found.thin_seen, share).items()}
     middle = float((found.places.wavelength_nm * share).sum())
     parts["diffraction"] = np.full(1, 0.53 * 1e-6 * middle * found.asked.f_number / pixel)
-    fall = found.seen.light / max(found.seen.light.max(), 1e-30)
-    natural = found.thin_seen.light / max(found.thin_seen.light.max(), 1e-30)
+    passed = passed_share(found)
+    open_light = found.seen.light / np.maximum(passed, 1e-30)
+    axis = int(np.argmin(np.hypot(*found.places.film_mm)))
     by_wave = found.seen.weight.mean(2) / np.maximum((found.seen.weight.mean(2) * share).sum(1), 1e-30)[:, None]
     light = {
-        "natural fall-off": np.abs(1 - natural),
-        "vignetting": np.abs(1 - fall / np.maximum(natural, 1e-30)),
+        "natural fall-off": open_light / max(open_light[axis], 1e-30) - 1,
+        "vignetting": passed - 1,
         "transmittance": np.sqrt((share * (by_wave - 1) ** 2).sum(1)),
     }
     maps: Maps = {k: ("px", found.on_film(v)) for k, v in parts.items()}
@@ -258,12 +266,32 @@ def effect_maps(found: Probed) -> Maps:
     return maps
 
 
+def passed_share(found: Probed) -> Array:
+    """[N] share of the light through the stop that no rim takes, by exact tracing (`analysis.field_curves`).
+
+    It is traced from the axis outwards; beyond the last field with a chief ray its share is kept. An anamorphic lens is
+    traced along x and along y, and the two shares are multiplied, as if its rims were slits.
+    """
+
+    def along(axis: Literal["x", "y"], height_mm: Array) -> Array:
+        try:
+            data = illumination(Fields(found.lens, found.asked.focus_m, axis), fields=_FIELDS)
+        except InputError:  # no chief rays: what the rims take is then part of the natural fall-off
+            return np.ones_like(height_mm)
+        known = np.isfinite(data.passed)
+        order = np.argsort(data.height_mm[known])
+        return np.interp(height_mm, data.height_mm[known][order], data.passed[known][order])
+
+    x, y = np.abs(found.places.film_mm)
+    return along("x", x) * along("y", y) if found.lens.anamorphic else along("y", np.hypot(x, y))
+
+
 def effects_of(found: Probed, budget_px: float, stray: bool = True) -> tuple[Effect, ...]:
     """What each effect is worth in this picture, the dearest first; `stray`: light that the lens adds among them."""
     effects = []
     for name, (unit, value) in (found.maps if stray else found.camera_maps).items():
         budget = budget_px if unit == "px" else LIGHT
-        known = value[np.isfinite(value)]
+        known = np.abs(value[np.isfinite(value)])
         worth, later = (
             float(np.percentile(known, COUNTED)),
             name in _MADE_BY and _MADE_BY[name] in found.asked.afterwards,

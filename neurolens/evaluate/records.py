@@ -14,14 +14,14 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, TypedDict, TypeVar
+from typing import Any, TypedDict
 
-from neurolens.base.files import library, write_json
+from neurolens.base.files import write_json
 
 SCHEMA_VERSION = 1
 _PACKAGES = ("neurolens", "torch", "numpy", "onnxruntime", "onnx", "OpenEXR")
-R = TypeVar("R", bound=Mapping[str, Any])
-CLOSE_UM = 2.0  # a model within this RMS error counts as close: a quarter of a pixel of 36 mm at 4000 across
+# A timing is noisy where the median of its rounds is more than so many times the least: other work ran beside it.
+NOISY = 1.1
 
 
 class Timing(TypedDict, total=False):
@@ -100,6 +100,17 @@ def versions() -> dict[str, str]:
     return found
 
 
+def noisy(timing: Mapping[str, Any] | None) -> bool:
+    """Whether the rounds of a timing spread too far (`NOISY`) to tell it from one that is a little shorter."""
+    median = (timing or {}).get("median")
+    return timing is not None and median is not None and median > NOISY * timing["min"]
+
+
+def time_of(model: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The timing that tables, plots and advice use of a model: as C where that was measured, else in onnxruntime."""
+    return model.get("fused_ns_per_ray") or model.get("ns_per_ray") or {}
+
+
 def write_results(path: str | Path, results: Results) -> None:
     """Write `results.json` whole or not at all; see `plain`."""
     write_json(path, {"schema_version": SCHEMA_VERSION, **plain(asdict(results))})
@@ -142,7 +153,7 @@ def reaches(record: Mapping[str, Any], most: float, key: str = "rms_um") -> bool
 
 def target_record(models: Sequence[Mapping[str, Any]], within_um: float) -> dict[str, Any]:
     """The error asked for, whether it was met, and the name and error of the closest model that was tried."""
-    best = min(models, key=_error)
+    best = min(models, key=error_of)
     return {
         "within_um": within_um,
         "met": reaches(best, within_um),
@@ -151,25 +162,10 @@ def target_record(models: Sequence[Mapping[str, Any]], within_um: float) -> dict
     }
 
 
-def _error(record: Mapping[str, Any]) -> tuple[float, float]:
+def error_of(record: Mapping[str, Any]) -> tuple[float, float]:
     """Micrometres, where all rays lie beyond 60 degrees the angle."""
     found = (record.get("rms_um"), record.get("direction_rms_deg"))
     return tuple(math.inf if v is None else v for v in found)  # type: ignore[return-value]
-
-
-def to_use(models: Sequence[R], most: float = CLOSE_UM, key: str = "rms_um") -> R | None:
-    """The fastest of the models within an error and not poor, as C where that was timed; if none is, the closest.
-
-    Ideal lenses (thin, thick) are left out; None where nothing else is there.
-    """
-    fits = [m for m in models if m.get("family") != "paraxial"]
-    close = [m for m in fits if reaches(m, most, key) and not m.get("poor")]
-
-    def cost(m: Mapping[str, Any]) -> tuple[float, float]:
-        timing = m.get("fused_ns_per_ray") or m.get("ns_per_ray") or {}
-        return timing.get("min", math.inf), m.get("bytes") or math.inf
-
-    return min(close, key=cost) if close else min(fits, key=_error, default=None)
 
 
 def program() -> str:
@@ -178,13 +174,6 @@ def program() -> str:
         return "neurolens"
     started = sys.argv[0]
     return shlex.quote(started) if Path(started).name == "neurolens" else f"{shlex.quote(sys.executable)} -m neurolens"
-
-
-def use_command(file: str, fused: bool) -> str:
-    """The command that renders a scene through a model, as C where that runs here."""
-    scene, camera = Path("experiments/scenes/room.toml"), f"{'fused:' if fused else ''}{file}"
-    words = [str(scene if scene.is_file() else library() / scene), "--camera", camera, "-o", "room.exr"]
-    return f"{program()} render {shlex.join(words)}"
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:

@@ -6,14 +6,15 @@ A picture or link is shown only if its file lies inside the run folder. Missing 
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 from markupsafe import Markup
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
+from neurolens.evaluate.advice import advice
 from neurolens.evaluate.pages import (
     DASH,
     Column,
@@ -27,10 +28,9 @@ from neurolens.evaluate.pages import (
     number,
     page,
     section,
-    show,
     table,
 )
-from neurolens.evaluate.records import CLOSE_UM, Results, pareto_front, program, to_use, use_command
+from neurolens.evaluate.records import NOISY, Results, pareto_front, time_of
 
 _MODEL_COLUMNS = (
     Column("error RMS (µm)", "rms_um", about="distance between exact and modelled ray on the plane in focus, "
@@ -124,23 +124,11 @@ def _header(results: Results, title: str) -> Markup:
 
 
 def _use(folder: Path, results: Results) -> Markup:
-    """The model to take and the commands that take it, why, and what was asked for."""
-    best, target = to_use(results.models, (results.target or {}).get("within_um", CLOSE_UM)), results.target
-    if best is None or not best.get("file"):
-        return Markup()
-    file, fused = str(folder / best["file"]), number(best, "fused_ns_per_ray.min")
-    rms, plain = number(best, "rms_um"), number(best, "ns_per_ray.min")
-    within = target["within_um"] if target else CLOSE_UM
-    why = "the fastest" if rms is not None and rms <= within else "the closest, as none is"
-    said = [f"{why} within {show(within, 3)} µm"]
-    said += [f"error {show(rms, 3)} µm RMS"] if rms is not None else []
-    said += [f"{show(fused, 3)} ns a ray as C"] if fused is not None else []
-    said += [f"{show(plain, 3)} ns in onnxruntime"] if plain is not None else []
-    commands = [use_command(file, fused is not None)]
-    if not best.get("states"):  # one of many states is no function of a ray alone
-        commands.append(f"{program()} export {shlex.quote(file)} --to c -o lens.h")
-    use = "<section class='use'><h2>Use {}</h2><p>{}.</p>{}</section>"
-    return html(use, best["name"], ", ".join(said), joined("<pre>{}</pre>", commands))
+    """What to use where, why, and the commands for it."""
+    found = advice(asdict(results), folder)
+    pre = [html("<pre>{}</pre>", a.command) if a.command else "" for a in found]
+    use = [html("<h2>{} use {}</h2><p>{}.</p>{}", a.where, a.name, a.why, p) for a, p in zip(found, pre, strict=True)]
+    return html("<section class='use'>{}</section>", joined("{}", use)) if use else Markup()
 
 
 def _names(records: Sequence[Record], last: str, first: str = "scene") -> list[str]:
@@ -172,11 +160,12 @@ def _models(models: Sequence[Record]) -> Markup:
     timed = [
         (i, (t, e))
         for i, m in enumerate(models)
-        if (t := number(m, "ns_per_ray.min")) is not None and (e := number(m, key)) is not None
+        if (t := number(time_of(m), "min")) is not None and (e := number(m, key)) is not None
     ]
     front = {timed[k][0] for k in pareto_front([point for _, point in timed])}
     names = [("★ " if i in front else "") + str(m["name"]) for i, m in enumerate(models)]
-    note = "★ no other model is both faster in onnxruntime and closer. Headings say what they mean when pointed at."
+    note = "★ no other model is both faster (as C where that was timed) and closer. ~ a noisy time: the median of its "
+    note += f"rounds is more than {NOISY:g} times the least, which is shown. Point at a heading to see what it means."
     notes = [f"{m['name']}: {m['note']}" for m in models if m.get("note")]
     stopped = [m for m in models if m.get("stopped_down")]
     closed = table([str(m["name"]) for m in stopped], stopped, _STOPPED_COLUMNS)

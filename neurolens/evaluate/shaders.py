@@ -116,12 +116,11 @@ def _smallest(file: Path, has_states: bool) -> Graph | None:
     if has_states or find_spec("torch") is None:
         return None
     from neurolens.surrogates.assemble import SCALARS, model_graph
-    from neurolens.surrogates.export import largest_angle
     from neurolens.surrogates.specialise import without_idle_gates
     from neurolens.surrogates.stored import load_fitted
 
     (model,) = without_idle_gates((load_fitted(file),), IDLE)
-    return model_graph(model, largest_angle(model), SCALARS)
+    return model_graph(model, model.largest_angle, SCALARS)
 
 
 def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:

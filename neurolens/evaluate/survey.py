@@ -117,14 +117,9 @@ def unread_record(name: str, verdict: str, reason: str, fingerprint: str = "") -
     return json.dumps(record, sort_keys=True).encode()
 
 
-def known_record(data: bytes, task: Task) -> dict[str, Any] | None:
-    """A record as a table; None where it is not one of this task. A fault is none: it is tried again."""
-    try:
-        record = json.loads(data)
-        same = record["fingerprint"] == task.fingerprint and record["verdict"] in VERDICTS[:3]
-        return record if same else None
-    except (ValueError, KeyError, TypeError, RecursionError):
-        return None
+def is_of(record: Mapping[str, Any], task: Task) -> bool:
+    """Whether a record is one of this task. A fault is none: it is tried again."""
+    return record.get("fingerprint") == task.fingerprint and record["verdict"] in VERDICTS[:3]
 
 
 def _put(folder: Path, name: str, data: bytes) -> Path:

@@ -17,10 +17,10 @@ from typing import Any
 
 from neurolens.base.engine import Failed, on_dask
 from neurolens.base.errors import InputError, one_line
-from neurolens.base.files import atomic_path, read_bytes, safe_name
+from neurolens.base.files import read_bytes, read_kept, safe_name, write_kept
 from neurolens.base.progress import Progress
 from neurolens.base.signals import end_at_once, held
-from neurolens.evaluate.survey import SurveySettings, Task, known_record, run_task, unread_record
+from neurolens.evaluate.survey import SurveySettings, Task, is_of, run_task, unread_record
 from neurolens.evaluate.survey_page import write_pages
 from neurolens.readers.any_format import Collection
 from neurolens.readers.source import MAX_BYTES
@@ -79,9 +79,9 @@ def survey(
     if missing:
         with progress.stage("survey") as report:
             for done, (task, data) in enumerate(engine(tasks()), start=1):
-                with atomic_path(_record_file(out, task.name)) as temporary:
-                    temporary.write_bytes(data)
-                found[task.name] = record = _without_layout(json.loads(data))
+                made = json.loads(data)
+                write_kept(_record_file(out, task.name), made)
+                found[task.name] = record = _without_layout(made)
                 if record["reason"]:
                     progress.note(one_line(f"{task.name}: {record['verdict']}: {record['reason']}", 400))
                 report(done / len(missing))
@@ -110,10 +110,8 @@ def _record_file(out: Path, name: str) -> Path:
 
 
 def _kept(out: Path, task: Task) -> dict[str, Any] | None:
-    try:
-        return known_record(_record_file(out, task.name).read_bytes(), task)
-    except OSError:
-        return None
+    record = read_kept(_record_file(out, task.name))
+    return record if record is not None and is_of(record, task) else None
 
 
 def _without_layout(record: dict[str, Any]) -> dict[str, Any]:
@@ -122,10 +120,7 @@ def _without_layout(record: dict[str, Any]) -> dict[str, Any]:
 
 def _layout(file: Path) -> str:
     """The section that a record holds; none where there is no record."""
-    try:
-        return json.loads(file.read_bytes()).get("layout") or ""
-    except (OSError, ValueError):
-        return ""
+    return (read_kept(file) or {}).get("layout") or ""
 
 
 def in_processes(jobs: int, limit_s: float = TIME_LIMIT_S) -> Engine:

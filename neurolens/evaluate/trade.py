@@ -20,16 +20,15 @@ import numpy as np
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Report
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.evaluate.costs import UNIT
+from neurolens.evaluate.costs import UNIT, small
 from neurolens.evaluate.image import Image, flip_map
-from neurolens.evaluate.plan import Choice, Plan, Target, camera_of, candidates, decided
+from neurolens.evaluate.plan import Choice, Plan, Target, camera_of, candidates, decided, rest_of
 from neurolens.evaluate.probe import LIGHT, Probed, effects_of, probe
 from neurolens.evaluate.records import pareto_front
 from neurolens.optics.prescription import Lens
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene
 
-_PROBE_ACROSS, _PROBE_SAMPLES = 96, 4
 _ACROSS, _SAMPLES = 240, 16  # of pictures
 _STRIPS, _STRIP_ROWS, _STRIP_PATHS = 3, 16, 2_000_000  # of a picture: their number, least rows, paths of all
 _SHOWN = 8  # most of them, beside the exact lens
@@ -38,10 +37,12 @@ _BUDGETS = (1.0, 0.25, 0.05)  # that polynomials are fitted for, besides the one
 
 @dataclass(frozen=True)
 class Offer:
-    """A camera for so many seconds more (10^9 operations, where no time is known) of one thread."""
+    """A camera for so many seconds more (10^9 operations, where no time is known) of one thread, by the least of its
+    timed calls; by their median it takes `more` than that."""
 
     choice: Choice
     seconds: float
+    more: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ def trade(
     found = probe(scene, lens, **look)
     plan, rest = _priced(scene, found, budget_px, target, models, folder, lambda done, left=None: say(0.5 * done))
     offered = offers(scene, plan.probed, plan.choices, rest)
-    some = spread(front(offered), plan.best)
+    some = spread(front(offered), next((o for o in offered if o.choice == plan.best), None))
     exact, pictures = _pictures(scene, plan.probed, some, samples, lambda done, left=None: say(0.5 + 0.5 * done))
     unit = "s" if plan.unit == "ns" else "10^9 operations"
     return Trade(plan, tuple(offered), 1e-9 * paths(scene) * rest, unit, samples, exact, tuple(pictures))
@@ -191,14 +192,8 @@ def _priced(
 ) -> tuple[Plan, float]:  # fmt: skip
     """A plan in which every camera has its cost, and what a path takes besides."""
     tried = candidates(found, (*_BUDGETS, budget_px), target, models=models, folder=folder, explain=True, report=report)
-    return decided(found, tried, budget_px, target), rest_ns(scene, found.exact) if target == "render" else 0.0
-
-
-def small(scene: Scene, across: int) -> tuple[int, int]:
-    """Width and height of the scene's picture, no wider than `across`."""
-    shot = scene.settings.camera
-    width = min(across, shot.width)
-    return width, max(round(width * shot.film_height_mm / shot.film_width_mm), 1)
+    rest = rest_of(scene, found, target)
+    return decided(found, tried, budget_px, target, rest), rest
 
 
 def paths(scene: Scene) -> int:
@@ -207,17 +202,12 @@ def paths(scene: Scene) -> int:
     return shot.width * shot.height * shot.samples
 
 
-def rest_ns(scene: Scene, camera: Camera) -> float:
-    """Nanoseconds of one thread that a path takes besides its camera."""
-    width, height = small(scene, _PROBE_ACROSS)
-    stats = render(scene, camera, width=width, height=height, samples=_PROBE_SAMPLES, threads=1).stats
-    return float(1e9 * (stats["thread_seconds"] - stats["camera_thread_seconds"]) / stats["paths"])
-
-
 def offers(scene: Scene, found: Probed, tried: Sequence[Choice], rest: float) -> list[Offer]:
     """Cameras of known cost by rising seconds; `rest`: nanoseconds of a path in the scene."""
     each = ((c, rest * (0.0 if found.asked.denoised else c.noise - 1) + c.cost) for c in tried)
-    return sorted((Offer(c, 1e-9 * paths(scene) * ns) for c, ns in each if math.isfinite(ns)), key=lambda o: o.seconds)
+    count = 1e-9 * paths(scene)
+    offered = (Offer(c, count * ns, count * c.cost * (c.spread - 1)) for c, ns in each if math.isfinite(ns))
+    return sorted(offered, key=lambda o: o.seconds)
 
 
 def front(offered: Sequence[Offer]) -> list[Offer]:
@@ -251,12 +241,14 @@ def _pictures(
     return exact, pictures
 
 
-def spread(offered: Sequence[Offer], chosen: Choice | None, most: int = _SHOWN) -> list[Offer]:
-    """At most so many of a front, evenly, the chosen one among them."""
+def spread(offered: Sequence[Offer], chosen: Offer | None, most: int = _SHOWN) -> list[Offer]:
+    """At most so many of a front, evenly, and the chosen one among them, even where it is not on the front."""
+    if chosen is not None and chosen not in offered:
+        offered = sorted([*offered, chosen], key=lambda o: o.seconds)
     if len(offered) <= most:
         return list(offered)
     rows = {round(k * (len(offered) - 1) / (most - 1)) for k in range(most)}
-    at = [k for k, o in enumerate(offered) if chosen is not None and o.choice.name == chosen.name]
+    at = [k for k, o in enumerate(offered) if o == chosen]
     if at and not rows & set(at):
         rows = rows - {min(rows, key=lambda k: (abs(k - at[0]), k))} | set(at)
     return [offered[k] for k in sorted(rows)]

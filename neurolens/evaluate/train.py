@@ -15,6 +15,7 @@ from neurolens.analysis.layout import lens_layout
 from neurolens.base.errors import NeurolensWarning
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
+from neurolens.evaluate.advice import CLOSE_UM, exact_of, to_use
 from neurolens.evaluate.candidates import (
     EXACT,
     exact_c_candidate,
@@ -90,8 +91,9 @@ def run_experiment(
             if within_um and reaches(measured[-1].record, within_um):
                 break
         timed = _race(experiment, prepared, measured, progress)
+        use = to_use([m.record for m in measured], within_um or CLOSE_UM, exact=exact_of(exact_records(timed)))
         with progress.stage("illumination"):
-            names = experiment.render.models or best_models(measured)
+            names = experiment.render.models or shown_models(measured, use)
             shown = {m.settings.label: m for m in measured if m.settings.label in names}
             light = _illumination(shown, lens, domain, pairs.settings.seed)
         gain = scene_gain(experiment, folder / "models", progress)
@@ -113,7 +115,7 @@ def run_experiment(
         images=drawn.images,
         image_settings=SETTINGS if drawn.images else None,
         domain_gain=gain,
-        figures=_draw(pairs, measured, timed, light, pictures) + drawn.figures,
+        figures=_draw(pairs, measured, timed, light, pictures, use) + drawn.figures,
         versions=versions(),
         seed=experiment.pairs.seed,
         started=started.isoformat(timespec="seconds"),
@@ -183,26 +185,27 @@ def _illumination(shown: Mapping[str, Measured], lens: Lens, domain: Domain, see
     return {name: of(m.file) for name, m in shown.items()}
 
 
-def best_models(measured: Sequence[Measured]) -> tuple[str, ...]:
-    """Names of the polynomial and of the network with the smallest error."""
+def shown_models(measured: Sequence[Measured], use: Mapping[str, Any] | None) -> tuple[str, ...]:
+    """Names of the polynomial and the network in pictures: the model to use, and of the other kind the closest."""
     names = []
     for networks in (False, True):
         rows = [m for m in measured if (m.settings.method in NETWORKS) == networks and m.settings.family != "paraxial"]
         if rows:
-            names.append(min(rows, key=lambda m: m.error).settings.label)
+            names.append(min(rows, key=lambda m: (m.record is not use, m.error)).settings.label)
     return tuple(names)
 
 
 def _draw(
-    pairs: RayPairs, measured: Sequence[Measured], timed: Race, light: Mapping[str, Illumination], folder: Path
-) -> list[dict[str, Any]]:
-    """Plots of errors, the lens and its illumination."""
+    pairs: RayPairs, measured: Sequence[Measured], timed: Race, light: Mapping[str, Illumination], folder: Path,
+    use: Mapping[str, Any] | None,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Plots of errors, the lens and its illumination; `use`: the record of what is advised."""
     lens, domain = pairs.lens, pairs.domain
     records = [m.record for m in measured]
     exact = [timed.record(n) for n in EXACT if n in timed.ns]
     lens_layout(layout_profile(lens, domain), folder / "layout.png")
     texts = [("layout", "The lens", "Rays of three fields, traced exactly.")]
-    if trade_plot(lens.name, records, exact, folder / "trade.png"):
+    if trade_plot(lens.name, records, exact, folder / "trade.png", use=(use or {}).get("name")):
         told = "Held-out rays, full aperture; coefficients per vector output, A and B terms both counted."
         texts.insert(0, ("trade", "Error against time and size", told))
     if light:

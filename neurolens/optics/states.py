@@ -227,6 +227,9 @@ def _states(lens: Lens) -> list[_State]:
     gaps, found = _varying_gaps(lens), []
     for c in infinity_states(lens):
         data = paraxial.first_order(lens.with_gaps(gaps_mm(lens, c)))
+        if not 0 < data.efl_mm < math.inf:
+            expected = "a positive one in every state of a zoom"
+            raise InputError(lens.path, f'focal length of "{c.name}"', f"({data.efl_mm:.6g} mm)", expected)
         thickness = gaps_mm(lens, c)
         inner = [thickness[k] for k in gaps]
         places = data.back_focus_mm + np.append(np.cumsum(inner[::-1])[::-1], 0.0)

@@ -65,7 +65,7 @@ def with_likely_rims(lens: Lens, draft: Draft) -> Lens:
         return lens  # `finish` says so
     beyond = [k for k, s in enumerate(lens.surfaces) if s.semi_diameter_mm > end_mm(s) * (1 + 1e-6)]
     evidence = f"the rim of surface {beyond[0]} is wider than its sphere" if beyond else ""
-    if f_number is not None and not math.isnan(lens.stop_radius_mm):
+    if f_number and not math.isnan(lens.stop_radius_mm):  # some files write 0 for none
         by_stop = first_order(lens).f_number
         if _SAME[0] <= by_stop / f_number <= _SAME[1]:
             return lens

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from neurolens import __version__
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path, fingerprint_of
+from neurolens.base.files import atomic_path, fingerprint_of, open_regular
 from neurolens.cameras.contract import Camera
 from neurolens.render.film import CHUNK_BYTES, RGB, Film, Tiling
 from neurolens.render.film_settings import FilmSettings
@@ -155,7 +155,7 @@ def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[st
         InputError: missing, incomplete, or of another render; it names what differs.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_regular(path) as file, zipfile.ZipFile(file) as archive:
             members = {info.filename: info for info in archive.infolist()}
             stored = all(i.compress_type == zipfile.ZIP_STORED and not i.flag_bits & 1 for i in members.values())
             if sorted(members) != sorted((_ABOUT, _SUMS, _DONE)) or not stored:

@@ -192,7 +192,7 @@ def triangle_planes(corners: FloatArray64) -> FloatArray64:
     """
     a, edge_b, edge_c = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(edge_b, edge_c)
-    area2 = np.sum(normal**2, axis=1, keepdims=True)
+    area2 = np.maximum(np.sum(normal**2, axis=1, keepdims=True), 1e-300)  # a triangle of less is never hit
     unit = normal / np.sqrt(area2)
     across_b, across_c = np.cross(edge_c, normal) / area2, np.cross(normal, edge_b) / area2
     rows = [np.column_stack([n, -np.sum(n * a, axis=1)]) for n in (unit, across_b, across_c)]

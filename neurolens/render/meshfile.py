@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import read_bytes
 from neurolens.render.plyfile import read_polygons
-from neurolens.render.scenetables import FARTHEST_M, Material, MeshSettings, Texture, Vector
+from neurolens.render.scenetables import FARTHEST_M, SMALLEST_M, Material, MeshSettings, Texture, Vector
 
 LARGEST_FILE = 500_000_000  # bytes
 _LONGEST = 60  # characters of a number or a corner
@@ -86,6 +86,8 @@ def read_mesh(scene: Path, field: str, settings: MeshSettings, part: TriangleSet
     placed = np.array(settings.scale) * mesh.vertices @ turn.T + np.array(settings.translate_m)
     if not np.all(np.abs(placed) <= FARTHEST_M):
         raise InputError(scene, f"{field}.vertices_m", "(too far)", f"points within {FARTHEST_M:g} m in the scene")
+    if np.ptp(placed, axis=0).max() < SMALLEST_M:
+        raise InputError(scene, f"{field}.scale", "(too small)", f"a mesh at least {SMALLEST_M:g} m wide in the scene")
     normals = mesh.normals
     if settings.smooth and normals is None:
         normals = vertex_normals(mesh.vertices, mesh.faces)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import math
 import os
 import sys
@@ -39,13 +40,17 @@ from neurolens.render.colour import (
 from neurolens.render.radiance import read_radiance
 from neurolens.render.scenetables import BRIGHTEST
 
+logging.getLogger("PIL").addHandler(logging.NullHandler())  # Pillow logs what our errors say of damaged files
 METADATA_KEY = "neurolens"
 _HALF_MAX = 65504.0
 _BAND = 1 << 17  # pixels of a preview that are encoded at a time
 _COLOURS = "RGB"
 LARGEST_PICTURE, LARGEST_FILM = 8192, 1 << 16  # pixels per side
 MOST_PIXELS = 1 << 26  # of all textures of a scene: 0.8 GB
-_MOST_VALUES, _LARGEST_FILE = 1 << 28, 1 << 28  # of an OpenEXR file; bytes of any other
+_MOST_VALUES, _LARGEST_FILE = (
+    1 << 27,
+    1 << 28,
+)  # of an OpenEXR file, at 8 bytes each while it is read; bytes of any other
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "TGA", "WEBP")  # of Pillow's, which would ask other programs for some
 _ROUNDED = 2e-4  # how far the chromaticities of one space may lie apart in files
 _TYPES = (np.uint32, np.float16, np.float32)  # by the numbers of pixel types in OpenEXR files

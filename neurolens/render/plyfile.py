@@ -152,7 +152,8 @@ def _columns(
     if end > len(body):
         raise IndexError
     rows = np.frombuffer(body[at:end], row)
-    return {name: rows[f"{k}"].astype(np.float64) for k, name in enumerate(names)}, end
+    with np.errstate(invalid="ignore"):  # NaN, which the mesh is refused for
+        return {name: rows[f"{k}"].astype(np.float64) for k, name in enumerate(names)}, end
 
 
 def _triangles(

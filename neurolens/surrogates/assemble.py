@@ -81,7 +81,7 @@ def model_graph(model: LensModel, angle: float, form: Form, parts: Parts = ALL) 
     """The graph of a model.
 
     Args:
-        angle: largest angle (rad) between the axis and the scene rays that its directions must hold for.
+        angle: largest angle (rad) between the axis and the scene rays, as `LensModel.largest_angle`.
     """
     g = Graph()
     rays, film_z = g.input("rays", 5), g.input("film_z_mm", per_call=True)
@@ -113,6 +113,9 @@ def add_outputs(
         radius = g.input("stop_radius_mm", per_call=True)
         inside = inside & radius.between(0.0, model.domain.stop_radius_mm * DOMAIN_SLACK)
         status = _first_failure(model, values, radius, form)
+    if series.sinc is not None and values.unit is None:
+        known = g.square(values.vectors[DIRECTION]) <= (series.kappa * series.angle) ** 2  # false for NaN
+        status = g.select(known, status, g.value(status).maximum(float(st.OUTSIDE_DOMAIN)))
     return g.select(inside, status, float(st.OUTSIDE_DOMAIN))
 
 
@@ -177,11 +180,13 @@ class DirectionSeries:
 
     Attributes:
         kappa: factor on v that makes the polynomial of sinc monic, which saves an operation a ray.
+        angle: rays that would pass with a longer v (rad) lie outside the domain: no ray of the lens has one.
         sinc, minus_cos: coefficients, lowest first; kappa v times sinc(t) is the direction's x and y. None: v is a
             slope.
     """
 
     kappa: float
+    angle: float = math.inf
     sinc: Array | None = None
     minus_cos: Array | None = None
 
@@ -190,14 +195,14 @@ class DirectionSeries:
         """That of a model: no series for slopes."""
         if model.direction == "slope":
             return DirectionSeries(1.0)
-        return DirectionSeries.exact() if form.exact else DirectionSeries.fitted(angle, form.monic)
+        return DirectionSeries.exact(angle) if form.exact else DirectionSeries.fitted(angle, form.monic)
 
     @staticmethod
-    def exact() -> DirectionSeries:
+    def exact(angle: float = math.pi) -> DirectionSeries:
         """Taylor's; 12 terms hold 1e-14 to 130 degrees."""
         k = np.arange(12)
         cos = (-1.0) ** k / np.array([math.factorial(2 * i) for i in k], np.float64)
-        return DirectionSeries(1.0, cos / (2 * k + 1), -cos)
+        return DirectionSeries(1.0, angle, cos / (2 * k + 1), -cos)
 
     @staticmethod
     def fitted(angle: float, monic: bool = True) -> DirectionSeries:
@@ -205,12 +210,12 @@ class DirectionSeries:
         sinc = fit_series(lambda t: np.sinc(np.sqrt(t) / np.pi), angle**2, _SERIES / max(angle, 0.1))
         minus_cos = fit_series(lambda t: -np.cos(np.sqrt(t)), angle**2, _SERIES)
         if not monic:
-            return DirectionSeries(1.0, sinc, minus_cos)
+            return DirectionSeries(1.0, angle, sinc, minus_cos)
         n = len(sinc) - 1
         kappa = math.copysign(abs(sinc[n]) ** (1 / (2 * n + 1)), sinc[n])
         scaled = sinc / kappa ** (2.0 * np.arange(n + 1) + 1)
         scaled[n] = 1.0
-        return DirectionSeries(kappa, scaled, minus_cos / kappa ** (2.0 * np.arange(len(minus_cos))))
+        return DirectionSeries(kappa, angle, scaled, minus_cos / kappa ** (2.0 * np.arange(len(minus_cos))))
 
     def decode(self, vector: Value) -> Value:
         """Unit direction (3 rows) of kappa v (2 rows)."""

@@ -187,7 +187,7 @@ def _best_plane_z_mm(lens: Lens, bounds: PupilBounds, film_z_mm: float) -> float
     end = max(_REACH * f if math.isfinite(f) else 0.0, here)
     count = math.ceil(math.log(max(end / start, 1.0)) / math.log(_STEP)) + 1
     best = min((start * _STEP**k for k in range(count)), key=spread)
-    return film_z_mm - best if spread(here) ** 2 > _BETTER * spread(best) ** 2 else bounds.pupil_z_mm
+    return film_z_mm - best if spread(here) > math.sqrt(_BETTER) * spread(best) else bounds.pupil_z_mm
 
 
 def domain_from_camera(

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
@@ -24,8 +22,6 @@ from neurolens.optics.focusing import at_infinity
 from neurolens.optics.paraxial import first_order
 from neurolens.surrogates.assemble import ONNX, model_graph
 from neurolens.surrogates.card import card_of, card_to_json, lens_facts, reference_rays
-from neurolens.surrogates.cores import DIRECTION
-from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.inverse import STEPS, TOLERANCE, InverseModel, front_index, scene_graph, stop_graph
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.stored import model_to_text, storable
@@ -57,7 +53,7 @@ def export_onnx(
         InputError: weights or errors that are not finite; two gates for one reason on one surface, or one on the stop.
     """
     check_gates(model)
-    graph, shapes = model_graph(model, largest_angle(model), ONNX), {}
+    graph, shapes = model_graph(model, model.largest_angle, ONNX), {}
     if derivatives:
         graph = with_derivatives(graph, ["scene_ray"], [("rays", k) for k in range(4)])
         for name, by in (("scene_ray_d_film", RAY[:2]), ("scene_ray_d_pupil", RAY[2:])):
@@ -86,18 +82,6 @@ def check_gates(model: LensModel) -> None:
     codes = [gate.status for gate in model.gates]
     if len({*codes, st.blocked(model.lens.stop_index, st.RIM)}) <= len(codes):
         raise InputError("export", "gates", codes, "one gate a surface and reason, and none on the rim of the stop")
-
-
-def largest_angle(model: LensModel, count: int = 32768) -> float:
-    """Largest direction vector (rad) of the model's passing rays, a little enlarged. Sets the length of series.
-
-    Never more than a direction has: of a lens with wild rays a network's vector may be ten times as long.
-    """
-    rays = sample_domain(model.domain, count, seed=5)
-    with torch.no_grad():
-        passed = model.predict(rays).status == st.PASSED
-        angle = model.core(model.encoding(rays))[0][DIRECTION].norm(dim=0)
-    return min(1.03 * float(angle[passed].max()), math.pi) if bool(passed.any()) else math.pi / 2
 
 
 def export_inverse(inverse: InverseModel, path: str | Path, errors: dict[str, Any] | None = None) -> tuple[Path, Path]:
@@ -134,7 +118,7 @@ def export_inverse(inverse: InverseModel, path: str | Path, errors: dict[str, An
             "front": shape,
             "fit": inverse.report,
         }
-        graph = build(inverse, ONNX, largest_angle(model))
+        graph = build(inverse, ONNX, model.largest_angle)
         proto = write_onnx(graph, {CARD_KEY: card_to_json({**card, "inverse": known})})
         written.append(write_file(base.with_name(f"{base.name}.{name}.onnx"), proto))
     return written[0], written[1]
@@ -154,7 +138,7 @@ def export_states(model: StateModel, path: str | Path, errors: dict[str, Any] | 
         InputError: what `export_onnx` refuses, and nodes whose graphs differ in more than numbers.
     """
     check_gates(model.nodes[0])
-    angle = max(largest_angle(node, 8192) for node in model.nodes)
+    angle = max(node.largest_angle for node in model.nodes)
     graphs = [model_graph(node, angle, ONNX) for node in model.nodes]
     metadata = {CARD_KEY: card_to_json(state_card(model, errors or {}))}
     return write_file(path, write_onnx(graphs, metadata, mixing_of(model.axes)))

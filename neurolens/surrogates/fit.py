@@ -30,7 +30,7 @@ from neurolens.surrogates.domain import FilmRays, draw_everywhere
 from neurolens.surrogates.fits.checkpoint import of_zone, spent_s
 from neurolens.surrogates.fits.front import grazes, index_series, inside_front
 from neurolens.surrogates.fits.mirror import fit_mirror
-from neurolens.surrogates.fits.network import fit_network
+from neurolens.surrogates.fits.network import fit_network, with_boundary_terms
 from neurolens.surrogates.fits.planes import fit_planes
 from neurolens.surrogates.fits.polynomial import fit_paraxial, fit_polynomial
 from neurolens.surrogates.gates import choose_gates, explained
@@ -151,7 +151,7 @@ def _fit_core(
         zone = next(zones)
         share = None if progress is None else lambda part: progress((zone + part) / fits)
         network = fit_network(data, settings, base=base, checkpoint=of_zone(checkpoint, zone), progress=share)
-        return network if base is None else Residual((base, network))
+        return with_boundary_terms(data, network) if base is None else Residual((base, network))
 
     return fit_partitioned(prepared, settings.partitions, fit)
 

@@ -198,7 +198,7 @@ def front_index(model: LensModel) -> list[float] | None:
 
 @lru_cache(maxsize=16)
 def _exact_graph(inverse: InverseModel, name: str, steps: int, start: bool) -> Graph:
-    known = (inverse, EXACT, math.pi, steps)
+    known = (inverse, EXACT, inverse.model.largest_angle, steps)
     return stop_graph(*known, start) if name == "stop" else scene_graph(*known)
 
 

@@ -25,12 +25,14 @@ from neurolens.modelfile import DOMAIN_SLACK, POLARISED
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.assemble import EXACT, model_graph
-from neurolens.surrogates.cores import Core
-from neurolens.surrogates.domain import Domain, FilmRays
+from neurolens.surrogates.cores import DIRECTION, Core, Refracted
+from neurolens.surrogates.domain import Domain, FilmRays, draw
 from neurolens.surrogates.lightfield import Encoding
+from neurolens.surrogates.pairs import trace_pairs
 
 OUTPUTS = ("scene_ray", "transmittance", "stop_xy_mm", "status")
 _DIFFERENTIATED = ("scene_ray", "stop_xy_mm")
+_ANGLE_RAYS, _FEWEST_RAYS = 32_768, 300
 # Positive and finite, in float32 too.
 ANY_WAVELENGTH_NM = (1e-30, 3e38)
 
@@ -162,7 +164,29 @@ class LensModel:
     @cached_property
     def graph(self) -> Graph:
         """For evaluation in float64: inputs and outputs as `assemble` says."""
-        return model_graph(self, math.pi, EXACT)
+        return model_graph(self, self.largest_angle, EXACT)
+
+    @cached_property
+    def largest_angle(self) -> float:
+        """Largest angle (rad) between the axis and the rays that the exact lens passes, enlarged by 5%.
+
+        A core's direction vector is no longer than that. Where it is, as a network's may be far from the rays of its
+        fit, the ray lies outside the domain. Where all rays point forwards the angle stays below a right one; of a
+        `Refracted` core it is that inside the glass.
+        """
+        rays, _ = draw(self.domain, _ANGLE_RAYS, seed=5)
+        with torch.no_grad():
+            exact = trace_pairs(self.lens, rays, self.domain.pupil_z_mm)
+            if isinstance(self.core, Refracted):
+                angles = self.core(self.encoding(rays))[0][DIRECTION].norm(dim=0)
+            else:
+                angles = torch.atan2(torch.hypot(exact.scene.dx, exact.scene.dy), -exact.scene.dz)
+        angles = angles[exact.status == st.PASSED]
+        if len(angles) < _FEWEST_RAYS:  # they do not tell the largest
+            return math.pi
+        angle = float(angles.max())
+        bound = next((b for b in (math.pi / 2, math.pi) if angle < b), math.pi)
+        return min(1.05 * angle, (angle + bound) / 2, bound)
 
     @cached_property
     def _derivative_graph(self) -> Graph:

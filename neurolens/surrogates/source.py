@@ -224,10 +224,8 @@ def fused_program(models: Sequence[LensModel], parts: Parts = ALL, fix: Fix = FR
         InputError: weights that float32 cannot hold, or more than `MOST_WEIGHTS`; a fixed film position or stop
             outside the domain.
     """
-    from neurolens.surrogates.export import largest_angle  # needs torch
-
     fix.check(models[0].domain)
-    angle = max(largest_angle(model) for model in models)
+    angle = max(model.largest_angle for model in models)
     fixed = {FILM_Z: fix.film_z_mm, STOP_RADIUS: fix.stop_radius_mm}
     known = {name: value for name, value in fixed.items() if value is not None}
     graphs = [model_graph(model, angle, SCALARS, parts) for model in models]

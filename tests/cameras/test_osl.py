@@ -375,7 +375,7 @@ def test_lengths_are_in_units_of_the_scene() -> None:
         scale = 100 if name in ("position", "dPdx", "dPdy") else 1
         np.testing.assert_allclose(centimetres[name], scale * metres[name], rtol=1e-9, atol=1e-15)
     text = osl.write_camera(lens(), "gauss", [])[0]
-    assert 'getattribute("cam:focal_distance", asked_m);\n        asked_m *= unit_m;' in text
+    assert 'getattribute("cam:focal_distance", asked_m))\n        asked_m *= unit_m;' in text
 
 
 def test_derivatives_are_those_of_neighbouring_pixels() -> None:

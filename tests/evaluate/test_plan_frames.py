@@ -64,10 +64,12 @@ def test_a_rack_takes_as_few_fits_as_hold(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(module, "probe", once)
     monkeypatch.setattr(module, "shot_terms", lambda found: [8, 28])
     lens, rack = read_lens(LENS).at(), frames([0.7, 0.7, 1.2])
-    moved = plan_frames(rack, lens, 0.5, folder=tmp_path)
+    moved = plan_frames(rack, lens, 0.5, folder=tmp_path, target="onnx")
     assert moved.fits == 1 and [(r.first, r.last) for r in moved.runs] == [(1, 3)] and moved.probed == (1, 3)
     assert moved.runs[0].choice is not None and moved.runs[0].choice.error_px <= 0.5
     assert {"breathing", "distortion"} <= {e.name for e in moved.effects}
+    drawn = plan_frames(rack, lens, 0.5, folder=tmp_path)  # in our renderer nothing saves enough, so nothing is fitted
+    assert drawn.fits == 0 and [r.choice and r.choice.name for r in drawn.runs] == ["exact"]
     free = plan_frames(rack, lens, 0.0)
     assert free.fits == 0 and len(free.runs) == 1 and free.cost is not None
     assert free.runs[0].choice is not None and free.runs[0].choice.name == "exact"

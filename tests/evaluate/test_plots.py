@@ -15,6 +15,7 @@ from neurolens.analysis.layout import Layout, Line, Section, lens_layout
 from neurolens.base.errors import InputError
 from neurolens.evaluate import figures as drawn
 from neurolens.evaluate import plots
+from neurolens.evaluate.advice import advice
 from neurolens.evaluate.image import ImageErrors
 from neurolens.evaluate.vignetting import Illumination
 
@@ -142,3 +143,45 @@ def test_bad_images_are_refused(tmp_path: Path) -> None:
         with pytest.raises(InputError, match="illumination"):
             drawn.illumination_plot(bad, path)
     assert not list(tmp_path.iterdir())
+
+
+def test_the_ring_of_the_plot_is_at_the_time_of_the_advice(tmp_path: Path, figures: list[Any]) -> None:
+    """One timing of the record serves both; a noisy one has a line to its median, a quiet one has none."""
+    noisy = {**MODELS[2], "fused_ns_per_ray": {"min": 4.0, "median": 6.0}}
+    plots.trade_plot("A lens", [*MODELS[:2], noisy], EXACT, tmp_path / "trade.png", use="inv")
+    left = figures[0].axes[0]
+    (ring,) = (line for line in left.lines if line.get_label() == "use inv")
+    results = {"models": [noisy | {"file": "inv.onnx"}], "exact": []}
+    assert "~4 ns a ray as C" in advice(results, tmp_path)[1].why and list(ring.get_xdata()) == [4.0]
+    (lines,) = left.collections
+    assert [tuple(path[:, 0]) for path in lines.get_segments()] == [(4.0, 6.0)]
+
+
+def test_errors_share_one_scale_in_which_small_ones_show(tmp_path: Path, figures: list[Any]) -> None:
+    draw = np.random.default_rng(0)
+    maps = {"pinhole": draw.uniform(0.2, 0.8, (18, 32)), "close": draw.uniform(0.002, 0.008, (18, 32))}
+    images = dict.fromkeys(maps, draw.uniform(0, 1, (18, 32, 3)))
+    drawn.side_by_side(images, maps, tmp_path / "a.png")
+    shown = [a.images[0] for a in figures[0].axes if a.images and a.images[0].get_array().ndim == 2]
+    assert len({(i.norm.vmin, i.norm.vmax) for i in shown}) == 1 and shown[0].norm.vmax == 1.0
+    for picture in shown:  # neither all dark nor all bright
+        assert 0.05 < float(np.ma.median(picture.norm(picture.get_array()))) < 0.95
+    assert any("FLIP" in a.get_ylabel() for a in figures[0].axes)
+    assert drawn.error_scale([np.zeros((2, 2))], 99.5) == (1e-3, 1.0)
+    assert drawn.error_scale([np.array([math.nan, 0.3]), np.array([0.012])], 100) == pytest.approx((5e-4, 0.5))
+
+
+def test_maps_of_effects_share_a_scale_in_which_light_that_is_taken_is_dark() -> None:
+    light = {"vignetting": np.array([[0.0, -0.15]]), "flare": np.array([[0.02, 0.004]])}
+    blur = {"distortion": np.array([[11.0, 0.5]]), "coma": np.array([[0.0, 0.05]])}
+    for maps, unit in ((light, "relative"), (blur, "px")):
+        figure = style.new_figure(9.0, 2.0)
+        plots._maps(figure, maps, unit, (36.0, 20.0))
+        shown = [axes.images[0] for axes in figure.axes if axes.images]
+        assert len(shown) == 2 and len({(i.norm.vmin, i.norm.vmax) for i in shown}) == 1
+        if unit == "relative":
+            none, corner = (np.array(shown[0].to_rgba(v)[:3]).mean() for v in (0.0, -15.0))
+            assert shown[0].norm.vmin == -shown[0].norm.vmax == -20.0 and none > 0.99 and corner < 0.5
+            red, _, blue, _ = shown[1].to_rgba(2.0)
+            assert red > blue  # added light is orange
+        assert any(plots._TITLES[unit] == axes.get_ylabel() for axes in figure.axes)

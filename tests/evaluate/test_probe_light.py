@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from neurolens.analysis.fields import Scene as Fields
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.evaluate.footprints import Footprints, blur_mm, distance_mm, left_to
@@ -19,6 +20,7 @@ from neurolens.flare.layers import FlareSettings, flare_layers
 from neurolens.flare.picture import Raster
 from neurolens.flare.sources import SceneLights
 from neurolens.optics.lensfile import read_lens
+from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import Rays, trace
 from neurolens.render.renderer import render
 from neurolens.render.scene import scene_from_tables
@@ -66,6 +68,30 @@ def test_transmittance_is_that_of_the_axis() -> None:
     tint = np.array(through) / np.average(through, weights=found.places.share)
     expected = math.sqrt(np.average((tint - 1) ** 2, weights=found.places.share))
     assert found.maps["transmittance"][1][0, 0] == pytest.approx(expected, rel=0.05) and expected > 5e-4
+
+
+def test_vignetting_darkens_the_corner_as_traced_rays_say() -> None:
+    """Rays of the corner's film point through a grid of the pupil, with the rims and without them; the stop in both."""
+    found = probe(wall(camera={"f_number": 2.0}), read_lens("lenses/laikin_double_gauss_50.toml").at())
+    unit, taken = found.camera_maps["vignetting"]
+    fall = found.camera_maps["natural fall-off"][1]
+    x, y = (mm * (0.5 / n - 0.5) for mm, n in zip(found.asked.film_mm, taken.shape[::-1], strict=True))
+    side = torch.linspace(-35, 35, 801, dtype=torch.float64)
+    u, v = (a.reshape(-1) for a in torch.meshgrid(side, side, indexing="ij"))
+    film = torch.full_like(u, x), torch.full_like(u, y), torch.full_like(u, found.lens.film_z_mm)
+    rays = camera_rays(*film, u, v, found.domain.pupil_z_mm)
+    whole, left = (
+        float((rays.dz**4)[trace(lens, rays, 587.56).status == 0].sum())
+        for lens in (Fields(found.lens, rims=False).traced, found.lens)
+    )
+    assert unit == "relative" and left / whole - 1 < -0.1
+    assert taken[[0, 0, -1, -1], [0, -1, 0, -1]] == pytest.approx(left / whole - 1, abs=0.003)
+    assert (taken <= 0).all() and taken[taken.shape[0] // 2, taken.shape[1] // 2] == pytest.approx(0, abs=1e-6)
+    light = found.on_film(found.seen.light)
+    axis = np.unravel_index(np.nanargmax((1 + fall) * (1 + taken)), light.shape)
+    assert (1 + fall) * (1 + taken) == pytest.approx(light / light[axis], rel=1e-6) and (fall <= 0).all()
+    worth = {e.name: e.worth for e in effects_of(found, 0.25, stray=False)}
+    assert worth["vignetting"] > 0.05  # its size: what a camera without it gets wrong
 
 
 def test_contrast_is_that_of_the_scene_and_not_noise() -> None:

@@ -3,19 +3,24 @@
 import itertools
 import math
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from neurolens.base.errors import InputError
+from neurolens.base.status import OUTSIDE_DOMAIN
+from neurolens.cameras.model import load_model
+from neurolens.evaluate.measure import onnx_predictor
 from neurolens.optics.lensfile import read_lens
-from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Network
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Network, Residual
 from neurolens.surrogates.domain import domain_of, sample_domain
+from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import fit_model
 from neurolens.surrogates.fits import checkpoint
 from neurolens.surrogates.fits import network as networks
-from neurolens.surrogates.fits.network import fit_network
+from neurolens.surrogates.fits.network import fit_network, with_boundary_terms
 from neurolens.surrogates.fits.projection import Problem, Stand, activations, minimise, normal_equations, project
 from neurolens.surrogates.gates import choose_gates
 from neurolens.surrogates.lightfield import LightField, fit_encoding
@@ -62,13 +67,50 @@ def test_held_out_rays_of_a_singlet(singlet, network, dtype):
 
 
 def test_rims_and_stop_block_what_the_exact_lens_blocks(singlet, network):
-    pairs, encoding, gates = singlet.pairs, singlet.encoding, singlet.gates
+    pairs = singlet.pairs
     rays = sample_domain(pairs.domain, 50000, seed=77)
     exact = trace_pairs(pairs.lens, rays, pairs.domain.pupil_z_mm).status == 0
-    model = LensModel(pairs.lens, pairs.domain, encoding, scales_of(pairs.lens), gates, network, "mlp")
-    passed = model.predict(rays).status == 0
+    passed = _model(singlet, network).predict(rays).status == 0
     assert (passed & ~exact).sum() < 0.003 * passed.sum()
     assert (exact & ~passed).sum() < 0.003 * exact.sum()
+
+
+def test_terms_for_the_boundaries_change_only_what_clips_rays(singlet, network):
+    """Checked against exact tracing: fewer rays are passed or blocked wrongly, and no ray goes elsewhere."""
+    core = with_boundary_terms(singlet, network)
+    assert isinstance(core, Residual)
+    rays = sample_domain(singlet.pairs.domain, 50000, seed=77)
+    field = singlet.encoding(rays)
+    for before, after, same in zip(network(field), core(field), ([POSITION, DIRECTION], [0]), strict=True):
+        torch.testing.assert_close(before[same], after[same], rtol=0, atol=1e-13)
+    exact = trace_pairs(singlet.pairs.lens, rays, singlet.pairs.domain.pupil_z_mm).status == 0
+    wrong = [int((_model(singlet, c).predict(rays).status == 0).logical_xor(exact).sum()) for c in (network, core)]
+    assert wrong[1] < 0.5 * wrong[0]
+    again = with_boundary_terms(singlet, core.parts[1])  # from the hidden layers alone, as files hold them
+    assert torch.equal(again(field)[1], core(field)[1])
+
+
+def test_directions_that_no_ray_of_the_lens_has_lie_outside_the_domain(singlet, network, tmp_path):
+    weight, bias = (a.copy() for a in network.output)
+    for rows in (weight, bias):
+        rows[2 * DIRECTION : 2 * STOP] *= 1.5
+    wild = _model(singlet, replace(network, output=(weight, bias)))
+    rays = sample_domain(singlet.pairs.domain, 20000, seed=78)
+    good, found = _model(singlet, network).predict(rays), wild.predict(rays)
+    angle = wild.core(wild.encoding(rays))[0][DIRECTION].norm(dim=0)
+    limit = math.acos(-float(singlet.pairs.train.scene.dz.max()))  # of the exact lens
+    assert (angle[found.status == 0] < 1.1 * limit).all() and (angle[good.status == 0] > 1.2 * limit).any()
+    beyond = (good.status == 0) & (angle > 1.1 * limit)
+    assert (found.status[beyond] == OUTSIDE_DOMAIN).all()
+    assert torch.equal(found.status[good.status > 0], good.status[good.status > 0])  # rims and stop say what they said
+    written = onnx_predictor(load_model(export_onnx(wild, tmp_path / "wild.onnx")))(rays)
+    assert (written.status != found.status).sum() < 10  # rounding to float32
+
+
+def _model(data, core) -> LensModel:
+    return LensModel(
+        data.pairs.lens, data.pairs.domain, data.encoding, scales_of(data.pairs.lens), data.gates, core, "mlp"
+    )
 
 
 def _weights(network: Network) -> torch.Tensor:

@@ -1,8 +1,8 @@
-"""What every polynomial fits after position and direction: stop crossing, transmittance and gates.
+"""What every model fits after position and direction: stop crossing, transmittance and gates.
 
-They use the terms that are there anyway, and more where those do not tell the boundaries or the transmittance well:
-absorption and coatings change with the wavelength faster than any ray's path does, and near grazing rays faster with
-the ray.
+Polynomials use the terms that are there anyway, networks their last hidden layer. Both get more terms where those do
+not tell the boundaries or the transmittance well: absorption and coatings change with the wavelength faster than any
+ray's path does, and near grazing rays faster with the ray.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ from neurolens.surrogates.targets import Prepared
 GATE_ERROR, STOP_ERROR = 2e-3, 5e-4
 STOP_KEPT = 0.04  # least share of that error, squared, to which growth may hold the stop crossing
 MOST_BOUNDARY_TERMS = 64
+# Networks, whose units learn where rays go rather than what blocks them, are held to this share of those errors.
+NETWORK_SHARE, MOST_NETWORK_TERMS = 1 / 6, 96
 _DEGREE = 9  # of the terms among which those for boundaries are found
 _RAYS = 12_000  # on which they are found
 TRANSMITTANCE_ERROR = 2.5e-4  # RMS at which no term is added
@@ -35,11 +37,24 @@ _TRANSMITTANCE_DEGREE, _MOST_W = 7, 8  # of the candidates
 _LEAST_GAIN = 0.03  # a term must take away this share of the squared error left
 
 
-def fit_stop(data: Prepared, exponents: Exponents) -> Tensor:
-    """[2 M]: A and B of the stop crossing (in stop radii) on the monomials given, from rays on both sides of rims."""
+Features = Callable[[LightField], Tensor]  # [M, N] of N rays
+
+
+def features_of(exponents: Exponents, hidden: Features | None = None) -> Features:
+    """Monomials of the invariants, after the features of a hidden layer where there is one."""
+
+    def features(field: LightField) -> Tensor:
+        own = [] if hidden is None else [hidden(field)]
+        return torch.cat([*own, monomials(field.invariants(), exponents)] if len(exponents) or not own else own)
+
+    return features
+
+
+def fit_stop(data: Prepared, features: Features) -> Tensor:
+    """[2 M]: A and B of the stop crossing (in stop radii) on M features, from rays on both sides of rims."""
     crossing, weight = stop_crossing(data)
     field = data.boundary_field
-    columns = vector_columns(monomials(field.invariants(), exponents), field)
+    columns = vector_columns(features(field), field)
     return solve(columns, crossing.reshape(1, -1), weight.repeat(2))[0]
 
 
@@ -61,16 +76,16 @@ def invariant_core(
     """
     ab = torch.zeros((3, 2 * len(exponents)), dtype=torch.float64)
     ab[:STOP, list(columns)] = coefficients
-    ab[STOP] = fit_stop(data, exponents)
+    ab[STOP] = fit_stop(data, features_of(exponents))
     return InvariantPolynomial(exponents, ab.reshape(3, 2, -1).numpy(), fit_scalars(data, exponents).numpy())
 
 
 def fit_scalars(data: Prepared, exponents: Exponents) -> Tensor:
     """[1 + G, M]: transmittance and gates on the monomials of the invariants given."""
-    return solve_scalars(data, lambda field: monomials(field.invariants(), exponents))
+    return solve_scalars(data, features_of(exponents))
 
 
-def solve_scalars(data: Prepared, features: Callable[[LightField], Tensor]) -> Tensor:
+def solve_scalars(data: Prepared, features: Features) -> Tensor:
     """Transmittance on the passing rays, each gate on the rays that get as far, most on those that it decides.
 
     Raises:
@@ -85,7 +100,7 @@ def solve_scalars(data: Prepared, features: Callable[[LightField], Tensor]) -> T
     return torch.cat([solve(train, pairs.train.transmittance[None]), fit.coefficients()])
 
 
-def boundary_terms(data: Prepared, exponents: Exponents, first: Exponents) -> Exponents:
+def boundary_terms(data: Prepared, exponents: Exponents, first: Exponents, hidden: Features | None = None) -> Exponents:
     """[K, 4] further exponents, where those given [M, 4] meet the stop crossing or a gate badly; often none.
 
     Forward selection by the gain of all those boundaries together, in squares of the error that each may have.
@@ -93,23 +108,28 @@ def boundary_terms(data: Prepared, exponents: Exponents, first: Exponents) -> Ex
     Args:
         first: the exponents before those were grown for position and direction alone, which takes nothing from the stop
             crossing: where those meet it better it is met as well.
+        hidden: the features of a network's last hidden layer, which are held to a share of the errors.
     """
     every = invariant_exponents(_DEGREE, dispersive=data.encoding.dispersive)
     known = {tuple(e) for e in exponents.tolist()}
     added = np.array([e for e in every.tolist() if tuple(e) not in known], dtype=np.int64).reshape(-1, 4)
     candidates = np.concatenate([exponents, added])
     field = LightField(*(c[..., :_RAYS] for c in data.boundary_field))
-    invariants, share = field.invariants(), 1.0
+    allowed, most, share = 1.0, MOST_BOUNDARY_TERMS, 1.0
+    if hidden is not None:
+        allowed, most = NETWORK_SHARE**2, MOST_NETWORK_TERMS
     if not np.array_equal(first, exponents[: len(first)]):
-        (stop,) = _boundary_fits(data, field, monomials(invariants, first), only=[0])
+        (stop,) = _boundary_fits(data, field, features_of(first)(field), only=[0])
         share = min(max(stop.error, STOP_KEPT), 1.0)
-    met = _boundary_fits(data, field, monomials(invariants, exponents), stop_share=share)
-    bad = [k for k, f in enumerate(met) if f.error > 1]
+    features = features_of(exponents, hidden)(field)
+    met = _boundary_fits(data, field, features, stop_share=share)
+    bad = [k for k, f in enumerate(met) if f.error > allowed]
     if not bad:
         return added[:0]
-    fits = _boundary_fits(data, field, monomials(invariants, candidates), len(exponents), bad, share)
+    start = len(features)
+    fits = _boundary_fits(data, field, features_of(candidates, hidden)(field), start, bad, share)
     chosen: list[int] = []
-    while fits and len(chosen) < min(MOST_BOUNDARY_TERMS, len(added)):
+    while fits and len(chosen) < min(most, len(added)):
         scores = np.sum([f.scores() for f in fits], axis=0)
         best = int(np.argmax(scores))
         if not scores[best] > 0:
@@ -117,8 +137,8 @@ def boundary_terms(data: Prepared, exponents: Exponents, first: Exponents) -> Ex
         chosen.append(best)
         for f in fits:
             f.add(best)
-        fits = [f for f in fits if f.error > 1]
-    return candidates[chosen]
+        fits = [f for f in fits if f.error > allowed]
+    return added[[k - start for k in chosen]]
 
 
 class _BoundaryFit:

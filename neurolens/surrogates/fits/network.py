@@ -10,19 +10,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.surrogates.bases import pinned_threads
-from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, InvariantPolynomial, Network
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, InvariantPolynomial, Network, Residual
+from neurolens.surrogates.fits.boundaries import (
+    MOST_NETWORK_TERMS,
+    boundary_terms,
+    features_of,
+    fit_stop,
+    solve_scalars,
+)
 from neurolens.surrogates.fits.checkpoint import Checkpoint, fingerprint
 from neurolens.surrogates.fits.projection import Problem, Projection, Stand, activations, minimise, project
 from neurolens.surrogates.gates import boundary_weights, gate_values
+from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.pairs import PairSet
 from neurolens.surrogates.settings import ModelSettings
 from neurolens.surrogates.targets import Prepared, film_equivalent_weights, targets_of
@@ -41,6 +50,8 @@ _TRIAL_STEPS = 0.1
 _BURST = 10
 # More rays, when the RMS on rays not fitted is larger than that on the fitted ones by this factor.
 _GAP = 1.15
+# Fewest rays near the boundaries for each term that may be added for them.
+_RAYS_A_TERM = 4
 # Converged, when so many bursts in a row lower the loss by less than this share each.
 _LITTLE, _IDLE = 0.01, 3
 
@@ -81,6 +92,36 @@ def fit_network(
         progress(1.0)
     *hidden, output = ((w[:, :-1].numpy().copy(), w[:, -1].numpy().copy()) for w in (*best.hidden, best.output))
     return Network(tuple(hidden), output, shift.numpy(), scale.numpy())
+
+
+def with_boundary_terms(data: Prepared, network: Network) -> Network | Residual:
+    """The network, with a sparse polynomial added to its stop crossing and gates where those need it.
+
+    The terms are chosen and the rows fitted as those of a polynomial are, with the hidden units as further features;
+    all other rows stay as they are. Lenses with cylinders need none: of those the networks are the better kind.
+    """
+    if data.encoding.mirror or len(data.boundary) < _RAYS_A_TERM * MOST_NETWORK_TERMS:
+        return network
+    shift, scale = torch.from_numpy(network.shift)[:, None], torch.from_numpy(network.scale)[:, None]
+    layers = [torch.from_numpy(np.concatenate([w, b[:, None]], 1)) for w, b in network.hidden]
+
+    def hidden(field: LightField) -> Tensor:
+        return activations(layers, ((field.invariants() - shift) * scale).T)[-1].T
+
+    none = np.zeros((0, 4), np.int64)
+    with pinned_threads():
+        exponents = boundary_terms(data, none, none, hidden)
+        if not len(exponents):
+            return network
+        features = features_of(exponents, hidden)
+        stop, gates = fit_stop(data, features).reshape(2, -1).numpy(), solve_scalars(data, features)[1:].numpy()
+    weight, bias = (a.copy() for a in network.output)
+    units, rows = weight.shape[1], [*range(2 * STOP, 2 * STOP + 2), *range(network.ab_rows + 1, len(bias))]
+    found = np.concatenate([stop, gates])  # of the units, their constant, then the terms
+    weight[rows], bias[rows] = found[:, :units], found[:, units]
+    ab, scalars = np.zeros((3, 2, len(exponents))), np.zeros((1 + len(gates), len(exponents)))
+    ab[STOP], scalars[1:] = stop[:, units + 1 :], gates[:, units + 1 :]
+    return Residual((InvariantPolynomial(exponents, ab, scalars), replace(network, output=(weight, bias))))
 
 
 def _problem(data: Prepared, base: InvariantPolynomial | None) -> tuple[Problem, Tensor, Tensor]:

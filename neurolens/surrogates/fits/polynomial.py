@@ -35,6 +35,7 @@ from neurolens.surrogates.bases import (
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Basis, InvariantPolynomial, RawPolynomial
 from neurolens.surrogates.fits.boundaries import (
     boundary_terms,
+    features_of,
     fit_scalars,
     fit_stop,
     invariant_core,
@@ -231,5 +232,5 @@ def fit_paraxial(data: Prepared, method: ParaxialMethod) -> InvariantPolynomial:
     exponents = np.array([[0, 0, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], dtype=np.int64)
     ab = torch.zeros((3, 2, len(exponents)), dtype=torch.float64)
     ab[[POSITION, DIRECTION], :, 0] = ideal_map(data.pairs.lens, data.encoding, method)
-    ab[STOP, :, 0] = fit_stop(data, exponents[:1])
+    ab[STOP, :, 0] = fit_stop(data, features_of(exponents[:1]))
     return InvariantPolynomial(exponents, ab.numpy(), fit_scalars(data, exponents).numpy())
