@@ -32,7 +32,7 @@ _SUN, _ROAD = "experiments/scenes/sun.toml", "experiments/scenes/road.toml"
 _GAUSS, _RETRO = "lenses/laikin_double_gauss_50.toml", "lenses/tajima_retrofocus_24.toml"
 _FLARE = "neurolens flare"
 _OF_SUN = f"{_FLARE} tajima_retrofocus_24 --lights {_SUN} --focus 40 --blades 6"
-_ANAMORPHIC = f"{_FLARE} cooke_anamorphic_42 --lights {_ROAD} --most 8 --focus 14 --film 24x18 --width 640"
+_ANAMORPHIC = f"{_FLARE} cooke_anamorphic_42 --lights {_ROAD} --most 4 --focus 14 --film 24x18 --width 640"
 _ACROSS = f"{_FLARE} laikin_double_gauss_50 --lights OUT/across.csv --f-number 5.6 --blades 6 --width 432"
 _KEYS = "light,frame,azimuth_deg,elevation_deg,r,g,b\nsun,1,-24,9,3,3,3\nsun,6,24,9,3,3,3\n"
 
