@@ -47,10 +47,8 @@ _BAND = 1 << 17  # pixels of a preview that are encoded at a time
 _COLOURS = "RGB"
 LARGEST_PICTURE, LARGEST_FILM = 8192, 1 << 16  # pixels per side
 MOST_PIXELS = 1 << 26  # of all textures of a scene: 0.8 GB
-_MOST_VALUES, _LARGEST_FILE = (
-    1 << 27,
-    1 << 28,
-)  # of an OpenEXR file, at 8 bytes each while it is read; bytes of any other
+_MOST_VALUES = 1 << 27  # of an OpenEXR file, at 8 bytes each while it is read
+_LARGEST_FILE = 1 << 28  # bytes of any other
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "TGA", "WEBP")  # of Pillow's, which would ask other programs for some
 _ROUNDED = 2e-4  # how far the chromaticities of one space may lie apart in files
 _TYPES = (np.uint32, np.float16, np.float32)  # by the numbers of pixel types in OpenEXR files
