@@ -130,7 +130,7 @@ PICTURES = (
             "-o OUT/anamorphic-blue.exr",
         ),
         (
-            Panel(("squeezed", "anamorphic"), "bare", 2.0),
+            Panel(("squeezed", "anamorphic"), "bare, one stop darker", 2.0, -1.0),
             Panel(("squeezed", "anamorphic-blue"), "multi-layer, g13-12 times 250 / 500 / 1000", 2.0),
         ),
         stops=1.0,
