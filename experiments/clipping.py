@@ -48,12 +48,11 @@ def measure(rows: Sequence[Row], folders: Sequence[Path], count: int) -> list[Ro
     whole, said, dz = (torch.cat(part, -1) for part in zip(*parts, strict=True))
     limit = 0.0 if widest < 0 else -math.cos(min(1.05 * math.acos(-widest), math.pi))
     found = [{**false_shares(whole, s), "backwards": int((d > limit).sum())} for s, d in zip(said, dz, strict=True)]
-    each, kinds = len(folders), {True: "network", False: "polynomial"}
+    each = len(folders)
     return [
         {
             "lens": row["entry"],
             "model": row["model"],
-            "kind": kinds["mlp" in row["model"]],
             "passing": int(whole.sum()),
         }
         | {f"folder {k}": one for k, one in enumerate(found[each * n : each * (n + 1)])}
@@ -61,7 +60,7 @@ def measure(rows: Sequence[Row], folders: Sequence[Path], count: int) -> list[Ro
     ]
 
 
-_SHARES = ("false_pass", "false_block")
+_SHARES, _KINDS = ("false_pass", "false_block"), ("ols-64", "mlp-16x2")
 
 
 def _cells(rows: Sequence[Row], keys: Sequence[str], choose: Callable[[list[float]], float] = max) -> list[str]:
@@ -72,17 +71,18 @@ def _cells(rows: Sequence[Row], keys: Sequence[str], choose: Callable[[list[floa
 
 
 def page(rows: Sequence[Row], titles: Sequence[str], count: int) -> str:
-    """The medians and the worst of each kind, then every model."""
+    """The medians and the worst of the two models that every lens has, then every model."""
     keys, lines = [f"folder {k}" for k in range(len(titles))], []
-    for kind in sorted({r["kind"] for r in rows}):
-        mine = [r for r in rows if r["kind"] == kind]
-        lines += [[f"{kind}s, {n}", *_cells(mine, keys, choose)] for n, choose in (("median", median), ("worst", max))]
+    for model in _KINDS:
+        mine = [r for r in rows if r["model"] == model]
+        for name, choose in (("median", median), ("worst", max)) if mine else ():
+            lines.append([f"{model}, {name}", *_cells(mine, keys, choose)])
     header = [*titles, *(f"backwards, {title}" for title in titles)]
     each = [[f"{r['lens']}.{r['model']}", *_cells([r], keys)] for r in rows]
     intro = f"""\
 `python -m experiments clipping`: false passes over the rays that a model passes / false blocks over those that the
-exact lens passes, in percent, of {count:,} rays a lens; passed rays that point backwards. *Polynomials* and *networks*
-are all that ship, of one state each."""
+exact lens passes, in percent, of {count:,} rays a lens; passed rays that point backwards. First the polynomials and the
+networks that every lens has, then every model."""
     parts = [lab.table(["models", *header], lines), lab.table(["model", *header], each)]
     return lab.page("# Clipping of the models that ship", intro, *parts)
 

@@ -28,7 +28,7 @@ GATE_ERROR, STOP_ERROR = 2e-3, 5e-4
 STOP_KEPT = 0.04  # least share of that error, squared, to which growth may hold the stop crossing
 MOST_BOUNDARY_TERMS = 64
 # Networks, whose units learn where rays go rather than what blocks them, are held to this share of those errors.
-NETWORK_SHARE, MOST_NETWORK_TERMS = 1 / 6, 96
+NETWORK_SHARE, MOST_NETWORK_TERMS = 1 / 3, 96
 _DEGREE = 9  # of the terms among which those for boundaries are found
 _RAYS = 12_000  # on which they are found
 TRANSMITTANCE_ERROR = 2.5e-4  # RMS at which no term is added
