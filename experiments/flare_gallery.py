@@ -22,7 +22,7 @@ from experiments import lab
 from neurolens import cli
 from neurolens.base.errors import NeurolensError
 from neurolens.base.files import atomic_write_text
-from neurolens.render.colour import SRGB, linear_to_srgb
+from neurolens.render.colour import SRGB, in_gamut, linear_to_srgb
 from neurolens.render.pictures import read_exr, read_layers
 
 OPTIONS = [lab.ONLY, lab.out(lab.RESULTS / "flare", "folder for pictures and page")]
@@ -214,9 +214,8 @@ def _sized(picture: NDArray[np.float32], width: int, height: int) -> NDArray[np.
 
 def _shown(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
     """A linear picture as sRGB bytes."""
-    grey = np.maximum(picture @ SRGB.to_xyz[1], 0)[..., None]
-    low = picture.min(-1, keepdims=True)
-    inside = grey + (picture - grey) * np.minimum(grey / np.maximum(grey - low, 1e-12), 1)
+    inside = in_gamut(picture)
+    grey = (inside @ SRGB.to_xyz[1])[..., None]
     inside += (grey - inside) * np.clip((grey - 2) / 8, 0, 1)  # what dazzles has no colour
     rolled = _SHOULDER + (1 - _SHOULDER) * -np.expm1(-np.maximum(inside - _SHOULDER, 0) / (1 - _SHOULDER))
     return np.rint(255 * linear_to_srgb(np.where(inside > _SHOULDER, rolled, inside))).astype(np.uint8)

@@ -18,6 +18,7 @@ import io
 import json
 import os
 import platform
+import re
 import resource
 import select
 import shutil
@@ -59,6 +60,9 @@ OPTIONS = (
     lab.option("--again", action="store_true", help="do finished batches again"),
     lab.out(),
 )
+
+
+_PROGRESS = re.compile(r": (done in|stopped after|\d+%)")  # of a command whose --quiet was damaged
 
 
 @dataclass(frozen=True)
@@ -198,7 +202,7 @@ def _faults(argv: Sequence[str], code: int, said: str, new: Sequence[str], memor
         yield f"refused, yet wrote {sorted(new)[:5]}"
     if code == 2 and (len(lines) != 1 or not lines[0].startswith("neurolens")):
         yield "not one line"
-    if code < 2 and lines:
+    if code < 2 and any(not _PROGRESS.search(line) for line in lines):
         yield "done, yet something on stderr"
     if "Traceback" in said:
         yield "a traceback"
@@ -245,14 +249,14 @@ def _answers(good: Path, scratch: Path, cases: Sequence[int], seed: int, only: s
             line = pipe.readline()
             if not line:
                 break
-            told = json.loads(line)
-            if isinstance(told, list):
-                begun = told
-            elif "broken" in told:
-                raise RuntimeError(told["broken"])
+            answer = json.loads(line)
+            if isinstance(answer, list):
+                begun = answer
+            elif "broken" in answer:
+                raise RuntimeError(answer["broken"])
             else:
                 begun = None
-                yield Verdict(**{**told, "argv": tuple(told["argv"]), "faults": tuple(told["faults"])})
+                yield Verdict(**{**answer, "argv": tuple(answer["argv"]), "faults": tuple(answer["faults"])})
     with suppress(ProcessLookupError):
         os.killpg(process, signal.SIGKILL)
     _, status, used = os.wait4(process, 0)

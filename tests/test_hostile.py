@@ -20,7 +20,7 @@ from experiments import fuzz
 from neurolens import cli
 from neurolens.base.config import apply_overrides
 from neurolens.base.errors import InputError, ModelError
-from neurolens.base.files import open_regular
+from neurolens.base.files import atomic_path, open_regular
 from neurolens.base.tomlfile import read_toml
 from neurolens.cameras.onnxlens import load_model
 from neurolens.optics import catalogue
@@ -238,6 +238,18 @@ def test_the_last_net(
     assert words in line
     monkeypatch.setenv("NEUROLENS_TRACEBACK", "1")
     assert cli.main([], build) == 70 and "Traceback" in capsys.readouterr().err
+
+
+def test_no_output_replaces_a_pipe_or_device(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A superuser may rename a file over both: a command that wrote to /dev/zero took the device away."""
+    pipe = tmp_path / "out.toml"
+    os.mkfifo(pipe)
+    lens = ROOT / "experiments" / "fuzz_seeds" / "lens.zmx"
+    assert "not a regular file" in failure(capsys, "convert", lens, "-o", pipe, "--force")
+    assert pipe.is_fifo()
+    with pytest.raises(OSError, match="not a regular file"), atomic_path(pipe):
+        pass
+    assert pipe.is_fifo() and list(tmp_path.iterdir()) == [pipe]
 
 
 def test_what_the_fuzzer_broke_is_one_line_or_no_fault(

@@ -71,12 +71,13 @@ def library() -> Path:
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield the path of a new empty file beside `path`; rename it to `path` on success, remove it on any failure.
 
-    Its name is random, so that processes that share a folder never share it; its content is on the disk before it has
-    the final name. It keeps the suffix, because writers such as OpenEXR and Pillow choose the format by it. What killed
-    runs have left in the folder is removed after a day.
+    The name is random, so that processes that share a folder never share it; the content is on the disk before the
+    file has its final name. It keeps the suffix, because writers such as OpenEXR and Pillow choose the format by it.
+    What killed runs have left in the folder is removed after a day.
 
     Raises:
-        OSError: it cannot be written, or nothing was; the error names `path`, not the temporary file.
+        OSError: it cannot be written, is a folder, device or pipe, or nothing was written; the error names `path`, not
+            the temporary file.
     """
     target = Path(path)
     temporary = _temporary(target)
@@ -113,8 +114,10 @@ def _temporary(target: Path) -> Path:
     suffix = target.suffix if re.fullmatch(r"\.\w{1,16}", target.suffix) else ""
     temporary = target.with_name(f".neurolens-{secrets.token_hex(8)}.tmp{suffix}")
     try:
-        with suppress(OSError):
-            os.lstat(target)  # ValueError where no file can have that name
+        with suppress(FileNotFoundError):
+            mode = os.lstat(target).st_mode  # ValueError where no file can have that name
+            if not (stat.S_ISREG(mode) or stat.S_ISLNK(mode)):  # a superuser's rename would replace a device
+                raise OSError(errno.EINVAL, "not a regular file", str(target))
         os.close(os.open(temporary, _NEW, 0o666))
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(target)) from None

@@ -48,7 +48,7 @@ class Parser(argparse.ArgumentParser):
         self.renamed: dict[tuple[str, ...], tuple[str, ...]] = {}
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As in argparse, but old names work, and an intermixed command reports unknown arguments itself."""
+        """Parse as argparse does; old names of commands work; an intermixed one reports unknown arguments itself."""
         args = sys.argv[1:] if args is None else list(args)
         for old, new in self.renamed.items():
             if tuple(args[: len(old)]) == old:

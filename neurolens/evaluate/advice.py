@@ -1,4 +1,4 @@
-"""Which camera to use: the one decision of `train`, `demo`, `models`, `plan` and the README.
+"""Which camera to use: the one decision of `train`, `models`, `plan` and the README.
 
 The exact lens has no error and needs no fit. A model is worth its error where it makes the whole work `SAVING` times as
 fast. In a picture of our renderer the camera is a small part of that work; elsewhere it may be all of it.

@@ -125,7 +125,4 @@ def spread(picture: Floats, radius: float) -> Floats:
     kernel = np.maximum(1 - (x * x + y * y) / radius**2, 0)
     kernel[reach, reach] = 1
     padded = np.pad(picture, ((reach, reach), (reach, reach), (0, 0)), mode="symmetric")
-    size = [n + 2 * reach for n in padded.shape[:2]]
-    whole = np.fft.rfft2(padded, size, axes=(0, 1)) * np.fft.rfft2(kernel / kernel.sum(), size)[..., None]
-    kept = np.fft.irfft2(whole, size, axes=(0, 1))[2 * reach :, 2 * reach :]
-    return kept[: picture.shape[0], : picture.shape[1]].astype(np.float32)
+    return smeared(padded, kernel / kernel.sum())
