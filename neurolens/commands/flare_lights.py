@@ -33,8 +33,8 @@ def add_lights(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--light", metavar="AZ,EL[,E[,M]]", action="append", default=[], dest="light",
         help="degrees to the right of and above the axis, as the camera sees it; irradiance at the lens, radiance "
-        "times solid angle in sr, as a number or R/G/B (default: pi, a sun that lights a white card to radiance 1); "
-        "and distance in metres (default: inf); repeatable",
+        "times solid angle in sr, as a number or R/G/B, of a point (default: the sun's disc with pi, which lights a "
+        "white card to radiance 1); and distance in metres (default: inf); repeatable",
     )  # fmt: skip
     group.add_argument(
         "--lights", metavar="FILE", type=Path, action="append", default=[],
@@ -185,7 +185,8 @@ def _at(args: argparse.Namespace) -> str:
 
 
 def _light(text: str) -> Light:
-    from neurolens.flare.lights import SUN, Light
+    from neurolens.flare.lights import SUN, Light, with_disc
+    from neurolens.render.environment import SUN_RADIUS_RAD
 
     words = text.split(",")
     try:
@@ -197,6 +198,7 @@ def _light(text: str) -> Light:
     if len(angles) != 2 or len(words) > 4 or len(rgb) not in (1, 3):
         raise InputError(_COMMAND, "--light", text, "AZ,EL[,E[,M]], numbers, E also as R/G/B")
     try:
-        return Light(angles[0], angles[1], (rgb[0], rgb[-2 % len(rgb)], rgb[-1]), distance)
+        light = Light(angles[0], angles[1], (rgb[0], rgb[-2 % len(rgb)], rgb[-1]), distance)
+        return with_disc(light, 0.0 if len(words) > 2 else 2 * math.degrees(SUN_RADIUS_RAD))
     except InputError as error:
         raise InputError(_COMMAND, "--light", text, error.expected) from None

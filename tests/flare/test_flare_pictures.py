@@ -11,7 +11,7 @@ from PIL import Image
 
 from neurolens.cli import main
 from neurolens.flare.ghosts import GhostTracer, coated
-from neurolens.flare.lights import Light
+from neurolens.flare.lights import Light, with_disc
 from neurolens.flare.picture import Raster, ghost_picture
 from neurolens.optics.lensfile import read_lens
 from neurolens.render.colour import ACESCG, SRGB, conversion
@@ -34,7 +34,8 @@ def test_layers_are_the_ghosts_with_the_greatest_peaks_on_the_film(tmp_path: Pat
     assert main([*GAUSS, "--layers", "8", "--width", "240", "-o", str(out)]) == 0
     lens = read_lens("lenses/laikin_double_gauss_50.toml").at(focus_m=math.inf, focus="best")
     tracer = GhostTracer(coated(lens, "quarter-wave"))
-    each = ghost_picture(tracer, [Light(15, 8, (math.pi,) * 3)], raster, layers=range(len(tracer.pairs)))
+    sun = with_disc(Light(15, 8, (math.pi,) * 3), 0.533)
+    each = ghost_picture(tracer, [sun], raster, layers=range(len(tracer.pairs)))
     order = np.argsort(-each.max((1, 2, 3)))
     found = layers_of(out)
     assert set(found) == {"ghosts", "rest", *(tracer.pairs[k].name for k in order[:8])}
@@ -59,15 +60,17 @@ def test_no_layer_is_black(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
 
 
 def test_a_light_is_a_sun_unless_its_irradiance_is_stated(tmp_path: Path) -> None:
-    """The sun of a white card of radiance 1 has the irradiance pi, on the command line and in lists."""
+    """The sun of a white card of radiance 1 has the irradiance pi; on the command line it has its disc, too."""
     lists, pictures = tmp_path / "lights.csv", []
-    lists.write_text("azimuth_deg,elevation_deg\n15,8\n")
+    lists.write_text("azimuth_deg,elevation_deg,diameter_deg\n15,8,0.533\n")
     for k, words in enumerate((["--light", "15,8"], ["--light", f"15,8,{math.pi}"], ["--lights", str(lists)])):
         assert main([*SMALL, *words, "-o", str(tmp_path / f"{k}.exr")]) == 0
         pictures.append(read_exr(tmp_path / f"{k}.exr")[0])
     assert main([*SMALL, "--light", "15,8,1", "-o", str(tmp_path / "one.exr")]) == 0
-    np.testing.assert_allclose(pictures[0], math.pi * read_exr(tmp_path / "one.exr")[0], rtol=1e-5)
-    assert np.array_equal(pictures[0], pictures[1]) and np.array_equal(pictures[0], pictures[2])
+    np.testing.assert_allclose(pictures[1], math.pi * read_exr(tmp_path / "one.exr")[0], rtol=1e-5)
+    np.testing.assert_allclose(pictures[0], pictures[2], rtol=1e-5)
+    assert pictures[0].sum() == pytest.approx(pictures[1].sum(), rel=1e-3)
+    assert not np.allclose(pictures[0], pictures[1], rtol=0.01)
 
 
 def test_the_preview_shows_the_flare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
