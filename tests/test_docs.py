@@ -7,7 +7,6 @@ import dataclasses
 import importlib.util
 import os
 import re
-import shlex
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -16,8 +15,6 @@ from typing import Any, get_args, get_type_hints
 
 import pytest
 
-from neurolens.base.lensname import Named
-from neurolens.cli import build_parser
 from neurolens.evaluate.experiment import Experiment
 from neurolens.optics import lensfile
 from neurolens.render.scene import SceneSettings
@@ -47,16 +44,6 @@ def test_links_lead_to_files(page: Path) -> None:
     for link in re.findall(r"\]\(([^)#\s:]+)[)#]", page.read_text(encoding="utf-8")):
         target = Path(os.path.normpath(page.parent / link))
         assert target.exists() or not MADE.isdisjoint({target, target.parent}), link
-
-
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_commands_are_commands(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Lenses and models of the pages need not be there.
-    monkeypatch.setattr("neurolens.commands.arguments.resolve", lambda text, **taken: Named("", Path(text)))
-    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
-    lines = re.findall(r"^(?: {4})?neurolens (?!COMMAND)(.*)$", text, re.MULTILINE)
-    for line in lines:
-        build_parser().parse_args(shlex.split(line, comments=True))  # exits where it is none
 
 
 Row = Mapping[str, str]
