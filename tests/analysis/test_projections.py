@@ -163,7 +163,7 @@ def test_the_command_fits_a_lens_and_writes_what_programs_read(
 ) -> None:
     monkeypatch.setattr("neurolens.cameras.field._ROUND", (129, 1))
     told = run_json(
-        capsys, "projection", GAUSS, *PICTURE, "--model", "opencv", "-o", tmp_path / "a.json"
+        capsys, "projection", GAUSS, *PICTURE, "--projection", "opencv", "-o", tmp_path / "a.json"
     )  # as the file will be called
     assert told["rms_px"] < 0.02 and told["worst_px"] < 0.1 and told["turns_back_at_deg"] is None
     assert -0.3 < told["coefficients"]["k1"] < -0.2 and told["focal_px"][0] == told["focal_px"][1]
@@ -174,7 +174,7 @@ def test_the_command_fits_a_lens_and_writes_what_programs_read(
     assert "camera_matrix: !!opencv-matrix" in (tmp_path / "a.yaml").read_text()
     kinds = {"kannala-brandt": 0.5, "f-theta": 0.5, "table": 0.05}  # pixels RMS of 10 mm, 220 degrees
     for kind, most in kinds.items():
-        told = run_json(capsys, "projection", FISHEYE, *PICTURE, "--model", kind, "-o", tmp_path / kind)
+        told = run_json(capsys, "projection", FISHEYE, *PICTURE, "--projection", kind, "-o", tmp_path / kind)
         assert told["rms_px"] < most and told["field_deg"] > 95
     assert json.loads((tmp_path / "kannala-brandt.json").read_text())["camera_model"] == "OPENCV_FISHEYE"
     theta = json.loads((tmp_path / "f-theta.json").read_text())
@@ -185,10 +185,10 @@ def test_the_command_fits_a_lens_and_writes_what_programs_read(
 
 def test_bad_input_is_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for camera, change, words in (
-        (FISHEYE, ("--model", "opencv"), "a field up to 85 degrees"),
-        (GAUSS, ("--model", "pinhole"), "--model"),
-        (GAUSS, ("--model", "opencv", "-o", tmp_path / "none" / "a"), "a folder that exists"),
-        (GAUSS, ("--model", "opencv", "--size", "1920x1920"), "shape of the film"),
+        (FISHEYE, ("--projection", "opencv"), "a field up to 85 degrees"),
+        (GAUSS, ("--projection", "pinhole"), "--projection"),
+        (GAUSS, ("--projection", "opencv", "-o", tmp_path / "none" / "a"), "a folder that exists"),
+        (GAUSS, ("--projection", "opencv", "--size", "1920x1920"), "shape of the film"),
     ):
         assert words in failure(capsys, "projection", camera, *PICTURE, *change)
     assert command.MODELS == tuple(NAMES) and not list(tmp_path.iterdir())
