@@ -242,7 +242,7 @@ def test_command(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert main(["flare", str(file), *small, "-o", str(out)]) == 0
     assert json.loads(capsys.readouterr().out)["lens"] == tessar().name and out.is_file()
     # The table is the model's own: its ghosts, and their light as it has it.
-    assert main(["flare", str(file), "--light", "9,4", "--json"]) == 0
+    assert main(["flare", str(file), "--light", "9,4,1", "--json"]) == 0  # a point
     (rows,) = json.loads(capsys.readouterr().out)["ghosts"]
     fitted = read_ghosts(file)
     rays, _ = light_rays(fitted.lens, Light(9.0, 4.0), 0, 4096)
