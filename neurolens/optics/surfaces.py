@@ -134,15 +134,15 @@ def _meet_sphere(o: Arithmetic, r: Rays, m: Quadric, curvature: Any, sense: int,
     c = times(curvature, sense)
     f = o.fma(m[2], -2.0 * sense, o.dot(m, m) * c)
     q2 = o.fma(f, before.n2, r.dz * r.dz, times(c, -1))
+    q = o.root(q2)
     if not entering:
-        q = o.root(q2)
         denominator = o.fma(r.dz, sense, q)
         t = f / o.positive(denominator)
         x, y, z = (o.add_to(a, t, d) for a, d in zip(m, r[3:], strict=True))
         # A root that is NaN fails the test of the denominator, too.
         return Met(x, y, z, q, q2, [(TINY, denominator), *([(TINY, q2)] if o.finite else [])])
     # Beyond 90 degrees the usual form divides two vanishing numbers; the conjugate form is exact there.
-    q, forward = o.held_root(q2), times(r.dz, sense)
+    forward = times(r.dz, sense)
     conjugate = times(forward - q, before.inverse_n2) / (c if is_number(c) else o.nonzero(c))
     t = o.select(forward, 0.0, conjugate, f / o.select(forward, 0.0, 1.0, forward + q))
     x, y, z = _along(o, m, t, r)
