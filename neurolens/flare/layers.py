@@ -103,7 +103,7 @@ def flare_layers(
     """The layers that are switched on, by name, [H, W, 3] linear sRGB each; those of `MAKERS` sum to the flare.
 
     Args:
-        lens: its film must be placed (`Lens.at`).
+        lens: its film must be placed (`set_lens`).
 
     Raises:
         InputError: as of the makers.
