@@ -149,7 +149,7 @@ def seen_by(lens: Lens, framed: Lens) -> Seen:
     xyz, moments, image = np.zeros((*shape, 3)), np.zeros((*shape, 2)), 0.0
     starts = [tracer.start(light_rays(lens, Light(min(f * half, 85.0), 0.0), 0, _RAYS)[0]) for f in (0.0, *FIELDS)]
     for k, nm in enumerate(_SPECTRAL.centres_nm):
-        image += float(observer[1, k] * tracer.sums(starts[0], float(nm), direct=True).sums[-1, 0])
+        image += float(observer[1, k] * tracer.follow(starts[0], float(nm), only=(), direct=True).sums[-1, 0])
         for n, start in enumerate(starts[1:]):
             for first in range(0, len(tracer.pairs), _AT_ONCE):
                 found = tracer.follow(start, float(nm), only=tracer.pairs[first : first + _AT_ONCE])

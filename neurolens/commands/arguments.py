@@ -10,18 +10,17 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from neurolens.base.bounds import F_NUMBER, FOCAL_MM, WAVELENGTH_NM
 from neurolens.base.errors import InputError, one_line
 from neurolens.base.lensname import lens_id_of, resolve
+from neurolens.base.options import number
 from neurolens.evaluate.records import program
 
 if TYPE_CHECKING:
     from neurolens.optics.apertures import Aperture
     from neurolens.optics.prescription import Lens
-
-T = TypeVar("T")
 
 
 class Help(argparse.RawDescriptionHelpFormatter):
@@ -73,31 +72,18 @@ class Parser(argparse.ArgumentParser):
 def positive(unit: str, *, infinite: bool = False) -> Callable[[str], float]:
     """Type of an argument that is a number above 0; "inf" only if `infinite`."""
     expected = f"{unit} above 0{', or inf' if infinite else ''}"
-    return _number(float, lambda value: value > 0 and (infinite or not math.isinf(value)), expected)
+    return number(float, lambda value: value > 0 and (infinite or not math.isinf(value)), expected)
 
 
 def between(low: float, high: float, unit: str) -> Callable[[str], float]:
     """Type of an argument that is a number from `low` to `high`."""
-    return _number(float, lambda value: low <= value <= high, f"{unit} from {low:g} to {high:g}")
+    return number(float, lambda value: low <= value <= high, f"{unit} from {low:g} to {high:g}")
 
 
 def whole(least: int, most: int | None = None) -> Callable[[str], int]:
     """Type of an argument that is an integer from `least` to `most`."""
     span = f"from {least}" + ("" if most is None else f" to {most}")
-    return _number(int, lambda value: value >= least and (most is None or value <= most), f"an integer {span}")
-
-
-def _number(kind: Callable[[str], T], good: Callable[[T], bool], expected: str) -> Callable[[str], T]:
-    def convert(text: str) -> T:
-        try:
-            value = kind(text)
-            if good(value):  # false for NaN
-                return value
-        except ValueError:
-            pass
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected {expected}")
-
-    return convert
+    return number(int, lambda value: value >= least and (most is None or value <= most), f"an integer {span}")
 
 
 def add_option(

@@ -62,8 +62,7 @@ def fitted(args: argparse.Namespace, states: Sequence[argparse.Namespace]) -> Gh
     from neurolens.flare.ghostfile import read_ghosts
 
     other = [name for name in given_options(args) if name not in _FREE]
-    other += [f"--{name}" for name in ("coating", "photons", "polarised") if getattr(args, name)]
-    other += ["--reflections"] * args.fours
+    other += [f"--{name}" for name in ("coating", "photons") if getattr(args, name)]
     other += ["--key focus"] * any(math.isfinite(s.focus) for s in states)
     other += ["--key zoom"] * any(s.zoom is not None for s in states)
     if other:

@@ -19,6 +19,7 @@ from neurolens.cameras.contract import FloatArray
 from neurolens.optics.apertures import Aperture
 from neurolens.render import scenetables as tables
 from neurolens.render.film_settings import FilmSettings
+from neurolens.render.flaresettings import FlareSettings
 from neurolens.render.illuminants import Spectrum, check_name, check_spectrum, illuminant, read_spectrum
 from neurolens.render.meshfile import Parts, TriangleSet, encloses
 from neurolens.render.pictures import make_aperture, read_environment, read_pictures
@@ -74,7 +75,7 @@ class SceneSettings:
 
     camera: CameraSettings
     film: FilmSettings = FilmSettings()
-    flare: tables.Flare | None = None
+    flare: FlareSettings | None = None
     illuminants: dict[str, MeasuredSpectrum] | None = None
     environment: tables.Environment = tables.Environment(colour=BLACK)
     sky: tables.Sky | None = None

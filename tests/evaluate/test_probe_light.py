@@ -16,13 +16,14 @@ from neurolens.evaluate.plan import plan
 from neurolens.evaluate.probe import effects_of, probe
 from neurolens.evaluate.samples import blur_map
 from neurolens.evaluate.scenes import seen_depths_m
-from neurolens.flare.layers import FlareSettings, flare_layers
+from neurolens.flare.layers import FlareJob, flare_layers
 from neurolens.flare.picture import Raster
 from neurolens.flare.sources import SceneLights
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays, trace
+from neurolens.render.flaresettings import FlareSettings
 from neurolens.render.renderer import render
 from neurolens.render.scene import scene_from_tables
 from neurolens.render.world import World
@@ -124,7 +125,8 @@ def test_flare_is_that_of_the_layers() -> None:
     for name in ("flare", "star-bursts"):
         assert twice[name].mean() == pytest.approx(2 * once[name].mean(), rel=1e-3) and once[name].mean() > 0
     lights = SceneLights(scenes[0]).seen(scenes[0], camera.lens.film_z_mm)
-    large = flare_layers(camera.lens, lights, Raster((36.0, 20.25), 192, 108), FlareSettings(wavelengths=3))["ghosts"]
+    job = FlareJob(camera.lens, lights, Raster((36.0, 20.25), 192, 108), FlareSettings(bins=3))
+    large = flare_layers(job)["ghosts"]
     expected = large.max(-1).reshape(27, 4, 48, 4).mean((1, 3)) / small.rgb.mean(-1)
     assert once["flare"].mean() == pytest.approx(expected.mean(), rel=0.03)
     assert np.corrcoef(once["flare"].ravel(), expected.ravel())[0, 1] > 0.9

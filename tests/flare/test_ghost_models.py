@@ -254,7 +254,7 @@ def test_command(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     # Frames, stars and glare go with it; of each frame the stop is its own. A film beyond the fit is told.
     (keys := tmp_path / "sun.csv").write_text("light,frame,azimuth_deg,elevation_deg\na,1,-9,4\na,2,9,4\n")
     words = ["--lights", str(keys), "--frames", "1:2", "--key", "f-number=1:8,2:16", "--width", "24"]
-    more = ["--bins", "2", "--starburst", "--glare", "500", "--gain", "s01=2", "--film", "45x30"]
+    more = ["--bins", "2", "--starburst", "--glare", "500", "--gain", "ghosts=2", "--film", "45x30"]
     assert main(["flare", str(file), *words, *more, "-o", str(out)]) == 0
     assert "fitted up to 21.64 mm" in capsys.readouterr().err
     open_stop, closed = (read_exr(tmp_path / f"flare.000{k}.exr")[0].sum() for k in (1, 2))
@@ -266,7 +266,6 @@ def test_command(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     for words, said in (
         (["--light", "40,0"], "at most 25"),
         (["--light", "1,0", "--coating", "v-coat"], "--coating"),
-        (["--light", "1,0", "--polarised"], "--polarised"),
         (["--light", "1,0", "--focus", "1"], "--focus"),
         (["--light", "1,0", "--frames", "1:2", "--key", "focus=1:1,2:2"], "--key focus"),
         (["--light", "1,0", "--frames", "1:2", "--key", "zoom=1:90,2:100"], "--key zoom"),
