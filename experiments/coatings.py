@@ -37,6 +37,7 @@ from neurolens.optics.designs import design
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
+from neurolens.optics.states import set_lens
 from neurolens.render.colour import SRGB
 from neurolens.render.spectrum import SpectralRange
 
@@ -105,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
     layer: list[Cost] = []
     dropped: list[Cost] = []
     for name, report in lab.stages(names, str, args.quiet, 10.0):
-        lens = read_lens(lab.LENSES / f"{name}.toml").at(focus_m=math.inf)
+        lens = set_lens(read_lens(lab.LENSES / f"{name}.toml"), focus_m=math.inf)
         seen = {}
         for k, coating in enumerate((*ERAS, PRACTICE)):
             seen[coating] = seen_by(lens if coating == "bare" else coated(lens, coating), lens)

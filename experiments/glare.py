@@ -39,6 +39,7 @@ from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
+from neurolens.optics.states import set_lens
 from neurolens.render.flaresettings import FlareSettings, Scatter
 
 LENS, NM, HALF_MM = "laikin_double_gauss_50", 550.0, (18.0, 12.0)
@@ -92,9 +93,9 @@ class Way:
 def run(args: argparse.Namespace) -> int:
     """Measure, write the tables and the picture."""
     progress = Progress(quiet=args.quiet)
-    lens = read_lens(lab.LENSES / f"{LENS}.toml").at(focus_m=math.inf)
+    lens = set_lens(read_lens(lab.LENSES / f"{LENS}.toml"), focus_m=math.inf)
     retrofocus = read_lens(lab.LENSES / "mori_retrofocus_100.toml")
-    retrofocus = retrofocus.at(focus_m=math.inf, focal_length_mm=25.0, f_number=2.8)
+    retrofocus = set_lens(retrofocus, focus_m=math.inf, focal_length_mm=25.0, f_number=2.8)
     with progress.stage("pictures"):
         _draw(lens, retrofocus, args)
     if args.picture:
@@ -210,8 +211,8 @@ def elements_of(lens: Lens, name: str) -> Iterator[Element]:
 def _draw(gauss: Lens, retrofocus: Lens, args: argparse.Namespace) -> None:
     import matplotlib.pyplot as plt
 
-    wide = read_lens(lab.LENSES / "canon_gauss_35.toml").at(focus_m=math.inf, focal_length_mm=36.0, f_number=2.0)
-    stopped = wide.at(f_number=5.6).with_aperture(Aperture(blades=6))
+    wide = set_lens(read_lens(lab.LENSES / "canon_gauss_35.toml"), focus_m=math.inf, focal_length_mm=36.0, f_number=2.0)
+    stopped = set_lens(wide, f_number=5.6).with_aperture(Aperture(blades=6))
     one = coated(retrofocus, "bare,s02=single-layer,s03=single-layer")
     rows: list[list[tuple[str, Lens, Scatter, Light]]] = [
         [

@@ -23,6 +23,7 @@ import numpy as np
 
 from experiments import lab
 from experiments.lab import Row
+from neurolens.optics.states import set_lens
 
 _STEEP = 1.1  # a slope above it grows faster than the count
 _FLAT = 0.15
@@ -170,7 +171,7 @@ def traced(count: int, _: Path) -> Iterator[None]:
     from experiments.trace_speed import film_rays, launched
     from neurolens.optics.trace import trace
 
-    lens = _lens(count).at()
+    lens = set_lens(_lens(count))
     rays, nm = launched(lens, film_rays(lens, 100_000), torch.float64)
     yield
     trace(lens, rays, nm)

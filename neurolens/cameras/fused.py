@@ -92,12 +92,10 @@ class FusedFilm:
             not asked for yet.
 
     Raises:
-        InputError: no C compiler, or one that fails; a pupil that is not sampled by its outline.
+        InputError: no C compiler, or one that fails.
     """
 
     def __init__(self, film: LensFilm, lens: LensGraph, film_mm: tuple[float, float]) -> None:
-        if film.pupil is not film.outline:
-            raise InputError("camera", "pupil", "(another)", "outline: the only one that fused cameras sample")
         self._film, self._lens, self._film_mm = film, lens, film_mm
         # A mask is tested on rays that come back.
         self._mask = lens.aperture if lens.blades is None else None

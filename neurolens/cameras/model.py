@@ -56,7 +56,7 @@ class OnnxCamera:
             stop means that (an engraved f/1.8 may be 1.83). Focusing moves the groups of a model that knows them.
         zoom: of a model of a zoom's whole range, as of `Shot`; None leaves it at `model.state`.
         wavelength_nm: range of the light, which sets the exposure and the best focus; None takes the model's own.
-        focus: "best" places the film where the model's rays from the axis make the least spot, as `Lens.at` does for
+        focus: "best" places the film where the model's rays from the axis make the least spot, as `set_lens` does for
             the lens; "paraxial" in the paraxial image. "internal" is as "best": groups move where a model knows them.
         outline: of the pupil of the lens itself, to hold the model against it; None searches the model's own.
 
@@ -202,7 +202,7 @@ class OnnxFilm:
         from neurolens.graph.onnx import write_onnx  # the package onnx takes a quarter of a second
 
         scene, outline = film.scene, film.outline
-        assert isinstance(scene, ModelScene) and film.pupil is outline
+        assert isinstance(scene, ModelScene)
         self._path, aperture = model.path, scene.aperture
         before = Graph()
         found = before.inline(outline.graph, {})

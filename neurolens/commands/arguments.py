@@ -127,8 +127,7 @@ def wavelengths_nm(text: str) -> tuple[float, ...]:
 
 QUIET_HELP = "neither progress nor warnings on stderr"
 
-# Repeated here, so that help imports no camera; a test compares with `cameras.exact` and `cameras.vignetting`.
-PUPILS = ("outline", "rear-rim", "exit-pupil", "wu", "pixel-disc", "pixel-ellipse", "boxes", "ellipses")
+# Repeated here, so that help imports no camera; a test compares it with `cameras.vignetting`.
 VIGNETTINGS = ("both", "natural", "optical", "none")
 CAMERAS_HELP = """\
 cameras:
@@ -144,16 +143,11 @@ cameras:
 
 
 def add_camera(parser: argparse.ArgumentParser) -> None:
-    """Add --camera, --film-offset, --pupil and --vignetting."""
+    """Add --camera, --film-offset and --vignetting."""
     add_lens(parser, "--camera", models=True, cameras=True)
     parser.add_argument(
         "--film-offset", metavar="MM", type=between(-1e3, 1e3, "mm"), default=0.0,
         help="move the film away from the lens after focusing (default: 0)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--pupil", choices=PUPILS, default="outline",
-        help="how the pupil of an exact lens is sampled: its outline, or a shape of the literature that holds it; the "
-        "same picture, with fewer rays that pass (default: outline)",
     )  # fmt: skip
     parser.add_argument(
         "--vignetting", choices=VIGNETTINGS, default="both",
@@ -223,10 +217,11 @@ def aperture_of(args: argparse.Namespace) -> Aperture | None:
 
 
 def state_of(args: argparse.Namespace, tabled: Lens) -> Lens:
-    """The lens of a file in the state of the arguments of `add_lens_state`; raises InputError as `Lens.at`."""
+    """The lens of a file in the state of the arguments of `add_lens_state`; raises InputError as `set_lens`."""
     from neurolens.optics.focusing import best_focused
+    from neurolens.optics.states import set_lens
 
-    lens = tabled.with_aperture(aperture_of(args) or tabled.aperture).at(
+    lens = set_lens(tabled.with_aperture(aperture_of(args) or tabled.aperture),
         zoom=args.zoom, focal_length_mm=args.efl, field_deg=args.field, f_number=args.f_number,
         focus_m=args.focus, focus=args.focusing,
     )  # fmt: skip

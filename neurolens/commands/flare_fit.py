@@ -79,8 +79,10 @@ def stopped(args: argparse.Namespace, model: GhostModel) -> GhostModel:
     Raises:
         InputError: a stop wider than that of the fit.
     """
+    from neurolens.optics.states import set_lens
+
     lens = model.lens.with_aperture(aperture_of(args))
-    return replace(model, lens=lens if args.f_number is None else lens.at(f_number=args.f_number))
+    return replace(model, lens=lens if args.f_number is None else set_lens(lens, f_number=args.f_number))
 
 
 def run_fit(args: argparse.Namespace, lens: Lens | None, model: GhostModel | None) -> int:

@@ -141,10 +141,11 @@ class Sources:
         from neurolens.cameras.build import Shot, make_camera
         from neurolens.cameras.exact import ExactCamera
         from neurolens.cameras.field import field_of
+        from neurolens.optics.states import set_lens
 
         state = args.focus, args.f_number, args.zoom
         if state not in self._fields and is_model(args.file):  # fitted ghosts, with their film
-            moved = (lens.film_z_mm or 0.0) - (lens.at(focus_m=math.inf).film_z_mm or 0.0)
+            moved = (lens.film_z_mm or 0.0) - (set_lens(lens, focus_m=math.inf).film_z_mm or 0.0)
             camera = ExactCamera(lens, film_mm=args.film, focus_m=math.inf, film_offset_mm=moved, progress=progress)
             self._fields[state] = field_of(camera, args.focus, "equidistant")
         elif state not in self._fields:

@@ -151,8 +151,9 @@ def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
     from neurolens.analysis.spots import spots
     from neurolens.commands.analyse import analysis_of
     from neurolens.evaluate.figures import draw_breathing
+    from neurolens.optics.states import set_lens
 
-    scene = Scene(lens.at(focus_m=math.inf, focus="best"))
+    scene = Scene(set_lens(lens, focus_m=math.inf, focus="best"))
 
     def drawn(what: str) -> Any:
         def draw(path: Path) -> None:
@@ -166,7 +167,7 @@ def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
         """Lights at infinity, the lens focused near; at three points of the field."""
         near = 1e-3 * _BOKEH_FOCUS * abs(scene.first_order.efl_mm)
         edge = max(scene.default_fields())
-        blurred = Scene(lens.at(focus_m=near, focus="best"))
+        blurred = Scene(set_lens(lens, focus_m=near, focus="best"))
         found = spots(blurred, [share * edge for share in _BOKEH_FIELDS], rings=20, shift_mm=[0.0])
         analysis_of("spots").draw(replace(found, airy_um=math.nan), path, lens.name, f"focused at {near:.3g} m")
 

@@ -349,7 +349,6 @@ def shot_of(settings: CameraSettings, args: argparse.Namespace, aperture: Apertu
         # A scene's f-number is clamped to the lens; one of the command line must be possible.
         clamp_f_number=args.f_number is None,
         film_offset_mm=args.film_offset,
-        pupil=args.pupil,
         vignetting=args.vignetting,
     )
 

@@ -34,6 +34,7 @@ from neurolens.evaluate.probe import COUNTED, Effect, Probed, effects_of, probe
 from neurolens.evaluate.shot_fits import shot_domain, shot_fits, shot_terms
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
+from neurolens.optics.states import set_lens
 from neurolens.render.scene import Scene
 from neurolens.surrogates.settings import ModelSettings
 
@@ -111,7 +112,7 @@ def plan_frames(
     chosen = representatives(frames)
     founds: list[Probed] = []
     for frame in chosen:
-        founds.append(probe(frame.scene, lens.at(zoom=frame.zoom), afterwards=afterwards, denoised=denoised))
+        founds.append(probe(frame.scene, set_lens(lens, zoom=frame.zoom), afterwards=afterwards, denoised=denoised))
         say(0.4 * len(founds) / len(chosen))
     best: list[Choice | None] = []
     rest = rest_of(chosen[0].scene, founds[0], target)

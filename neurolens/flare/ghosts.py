@@ -112,7 +112,7 @@ class GhostTracer:
     """Ghosts of a lens at its focus, zoom and stop, and the direct light, as compiled code in float32.
 
     Args:
-        lens: its film must be placed (`Lens.at`).
+        lens: its film must be placed (`set_lens`).
         pairs: the ghosts to follow; None takes all of two reflections.
 
     Attributes:

@@ -38,7 +38,7 @@ class FlareJob:
     """A flare to make.
 
     Attributes:
-        lens: its film must be placed (`Lens.at`); `settings.coating` is not applied to it any more.
+        lens: its film must be placed (`set_lens`); `settings.coating` is not applied to it any more.
         wavelength_nm: range of light. threads: of the work.
         ghosts: what traces ghosts, or stands for that, of the same lens and stop; None traces all of two reflections.
         single: names of the ghosts that become layers; the others are the layer "rest".

@@ -47,7 +47,7 @@ class Stack:
     """A lens at its focus, zoom and stop.
 
     Args:
-        lens: its film must be placed (`Lens.at`).
+        lens: its film must be placed (`set_lens`).
         places: the surfaces and actions that are needed; each kind of surface takes a moment to compile.
 
     Attributes:
@@ -60,7 +60,7 @@ class Stack:
 
     def __init__(self, lens: Lens, places: Iterable[Place]) -> None:
         if lens.film_z_mm is None:
-            raise InputError(lens.path, "film_z_mm", None, "a focused lens (Lens.at)")
+            raise InputError(lens.path, "film_z_mm", None, "a focused lens (set_lens)")
         lens.require_glass("reflections, of which flare is made")
         self.lens, self.fit_error = lens, 0.0
         # An asphere's polynomial goes as high as the highest of its sort: they share functions.

@@ -40,11 +40,6 @@ from neurolens.surrogates.cores import (
 from neurolens.surrogates.domain import Domain, FilmRays
 from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.model import Gate, LensModel, Scales
-from neurolens.surrogates.published.adaptive import Cells
-from neurolens.surrogates.published.data import OuterPupil
-from neurolens.surrogates.published.neural import Averaged
-from neurolens.surrogates.published.raylut import RayTable
-from neurolens.surrogates.published.rtf import Meridian
 
 SCHEMA = 1
 # Cores by the name that files carry. Their fields are tensors, integer arrays, numbers, tuples and other cores.
@@ -56,13 +51,7 @@ CORES: dict[str, type] = {
     "partitioned": Partitioned,
     "residual": Residual,
     "refracted": Refracted,
-    "outer-pupil": OuterPupil,
-    "cells": Cells,
-    "averaged": Averaged,
-    "meridian": Meridian,
-    "ray-table": RayTable,
 }
-_NAMES = {kind: name for name, kind in CORES.items()}
 _MAX_TEXT = 16 * 2**20  # of the JSON; the largest models known take 100 kB
 _MAX_DEPTH = 16  # two a cut of cells
 _MAX_ROWS = 20_000  # of any array: terms, or units of a layer
@@ -74,7 +63,7 @@ _LENS = ("name", "source", "f_number", "image_radius_mm", "half_field_deg", "des
 def storable(core: Core) -> bool:
     """Whether a core, and every core in it, has a name in `CORES`."""
     parts = [*getattr(core, "parts", ()), *(v for v in vars(core).values() if isinstance(v, Core))]
-    return type(core) in _NAMES and all(storable(part) for part in parts)
+    return type(core) in CORES.values() and all(storable(part) for part in parts)
 
 
 def model_to_text(model: LensModel) -> str:
@@ -166,8 +155,9 @@ def pack(value: Any) -> Any:
         return {"u1": base64.b64encode(value.astype("u1").tobytes()).decode(), "shape": list(value.shape)}
     if isinstance(value, tuple):
         return [pack(v) for v in value]
-    if type(value) in _NAMES:
-        return {"kind": _NAMES[type(value)], **{f.name: pack(getattr(value, f.name)) for f in fields(value)}}
+    names = {kind: name for name, kind in CORES.items()}
+    if type(value) in names:
+        return {"kind": names[type(value)], **{f.name: pack(getattr(value, f.name)) for f in fields(value)}}
     return value
 
 

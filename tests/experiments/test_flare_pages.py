@@ -15,11 +15,12 @@ from neurolens.cli import build_parser
 from neurolens.flare.ghosts import coated
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
+from neurolens.optics.states import set_lens
 from neurolens.render.spectrum import SpectralRange
 
 
 def triplet() -> Lens:
-    return read_lens(lab.LENSES / "cooke_triplet_50.toml").at(focus_m=math.inf)
+    return set_lens(read_lens(lab.LENSES / "cooke_triplet_50.toml"), focus_m=math.inf)
 
 
 def test_no_habit_costs_nothing_and_a_filter_only_light(monkeypatch: pytest.MonkeyPatch) -> None:

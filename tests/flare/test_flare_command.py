@@ -15,6 +15,7 @@ from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.picture import Raster
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
+from neurolens.optics.states import set_lens
 from neurolens.render.colour import COLOUR_SPACES, SRGB, conversion
 from neurolens.render.pictures import read_exr, read_layers, write_data_exr, write_exr
 
@@ -64,7 +65,7 @@ def test_starburst_is_a_layer(tmp_path: Path) -> None:
     assert main(["flare", *words, *few, "-o", str(out)]) == 0
     layers, rgb = read_layers(out), read_exr(out)[0]
     lens = read_lens("lenses/laikin_double_gauss_50.toml").with_aperture(Aperture(blades=5))
-    lens = lens.at(f_number=11.0, focus_m=math.inf, focus="best")
+    lens = set_lens(lens, f_number=11.0, focus_m=math.inf, focus="best")
     alone = starburst_picture(lens, [Light(4.0, 2.0, (3.0, 3.0, 3.0))], Raster((36, 24), 48, 32), wavelengths=2)
     np.testing.assert_allclose(layers["starburst.G"], 2 * alone[..., 1], rtol=1e-4, atol=1e-6 * alone.max())
     np.testing.assert_allclose(layers["ghosts.G"] + layers["starburst.G"], rgb[..., 1], rtol=1e-5)
@@ -130,7 +131,7 @@ def test_gains_and_tints(tmp_path: Path) -> None:
 
 def test_highlights_are_where_the_lens_images_lights(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The direction of a highlight is that of the light whose image, traced exactly, lies in its pixel."""
-    lens = read_lens("lenses/cooke_triplet_50.toml").at(focus_m=math.inf, f_number=8.0)
+    lens = set_lens(read_lens("lenses/cooke_triplet_50.toml"), focus_m=math.inf, f_number=8.0)
     light = Light(12.0, -6.0)
     rays, _ = light_rays(lens, light, 0, 4096)
     arrived = GhostTracer(lens, []).trace(rays, 550.0, direct=True)

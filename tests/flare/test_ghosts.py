@@ -20,6 +20,7 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Coating, Lens, Surface
 from neurolens.optics.sequence import follow, turning
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays, trace
 
 LENSES = Path(__file__).parents[2] / "lenses"
@@ -27,7 +28,7 @@ LENSES = Path(__file__).parents[2] / "lenses"
 
 def lens_of(name: str, **state: float) -> Lens:
     """A lens of the library, focused at infinity; for other tests of flare, too."""
-    return read_lens(LENSES / f"{name}.toml").at(focus_m=math.inf, **state)
+    return set_lens(read_lens(LENSES / f"{name}.toml"), focus_m=math.inf, **state)
 
 
 def double_gauss() -> Lens:
@@ -65,8 +66,8 @@ LETTER[5:45, 10:20] = LETTER[5:15, 10:40] = LETTER[22:30, 10:32] = True
 
 CASES = {
     "spheres": lambda: double_gauss(),
-    "blades": lambda: replace(double_gauss().at(f_number=5.6), aperture=Aperture(blades=6)),
-    "mask": lambda: replace(double_gauss().at(f_number=4.0), aperture=Aperture(mask=LETTER, rotation_deg=30.0)),
+    "blades": lambda: replace(set_lens(double_gauss(), f_number=5.6), aperture=Aperture(blades=6)),
+    "mask": lambda: replace(set_lens(double_gauss(), f_number=4.0), aperture=Aperture(mask=LETTER, rotation_deg=30.0)),
     "coated": lambda: coated(double_gauss(), "broadband"),
     "aspheres": lambda: lens_of("phone_lens_6"),
     "cylinders": lambda: lens_of("schneider_anamorphic_31"),
@@ -124,7 +125,7 @@ def test_a_plate_by_hand() -> None:
 def test_masks_are_those_of_their_lens() -> None:
     """Of two lenses with masks of one size, compiled alike, each keeps its own, whichever is traced."""
     masks = LETTER, LETTER[::-1, ::-1]
-    lenses = [replace(double_gauss().at(f_number=4.0), aperture=Aperture(mask=mask)) for mask in masks]
+    lenses = [replace(set_lens(double_gauss(), f_number=4.0), aperture=Aperture(mask=mask)) for mask in masks]
     tracers = [GhostTracer(lens, [Pair(11, 12)]) for lens in lenses]
     rays, _ = light_rays(lenses[0], Light(3.0, 2.0), 0, 20_000)
     for lens, tracer in zip(lenses, tracers, strict=True):
@@ -148,7 +149,7 @@ def test_direct_light_is_the_plain_trace() -> None:
 
 def test_energy_of_a_point_is_irradiance_times_pupil() -> None:
     """Light that gets through is that of the entrance pupil, pi (f / 2 N)^2."""
-    lens = double_gauss().at(f_number=4.0)
+    lens = set_lens(double_gauss(), f_number=4.0)
     rays, area = light_rays(lens, Light(0.0, 0.0), 0, 100_000)
     found = GhostTracer(lens, []).trace(rays, 587.6, direct=True)
     lit = found.power[0] > 0

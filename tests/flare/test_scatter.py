@@ -15,6 +15,7 @@ from neurolens.flare.picture import Raster, _smoothed, axis_irradiance, photon_p
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.sequence import follow, turning
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays
 from neurolens.render.flaresettings import Scatter
 from tests.flare.test_ghosts import LENSES, lens_of
@@ -193,7 +194,7 @@ def test_direct_highlights_have_the_light_that_passes() -> None:
 
 def test_everything_at_once_loses_no_light() -> None:
     """A zoom with all of it, boosted: every photon ends in one book, and weights are finite."""
-    lens = read_lens(LENSES / "nikon_zoom_80_200.toml").at(zoom="80", focus_m=math.inf)
+    lens = set_lens(read_lens(LENSES / "nikon_zoom_80_200.toml"), zoom="80", focus_m=math.inf)
     rays, _ = light_rays(lens, Light(12.0, -5.0), 0, 1 << 15)
     everything = Scatter(barrel=0.3, sensor=0.2, dust=0.1, haze_per_mm=0.01)
     found = PhotonTracer(lens, everything).trace(rays, 550.0, most_reflections=1000, boost=3.0)

@@ -18,6 +18,7 @@ from neurolens.modelfile.graph import graph_of
 from neurolens.modelfile.onnxfile import read_checked
 from neurolens.modelfile.protobuf import message, walk
 from neurolens.optics.lensfile import read_lens
+from neurolens.optics.states import set_lens
 from neurolens.surrogates.precision import store_weights
 
 ROOT = Path(__file__).parents[2]
@@ -57,7 +58,7 @@ def evaluated_as_onnxruntime(
 
 def _cosine_at_front(ray: NDArray[np.float32]) -> NDArray[np.float32]:
     """Of rays [6, N] of the fisheye, with the normal of its front sphere."""
-    c = float(read_lens(lens_models.LENSES / f"{lens_models.FISHEYE}.toml").at().surfaces[0].curvature)
+    c = float(set_lens(read_lens(lens_models.LENSES / f"{lens_models.FISHEYE}.toml")).surfaces[0].curvature)
     x, y = c * ray[:2]
     return np.abs(ray[3] * x + ray[4] * y - ray[5] * np.sqrt(1 - x * x - y * y))
 

@@ -24,6 +24,7 @@ from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.osl import urgent
 from neurolens.optics.lensfile import read_lens
+from neurolens.optics.states import set_lens
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 from neurolens.optics.tracegraph import TRANSMITTANCE, exact_graph
@@ -207,7 +208,7 @@ def test_a_thin_lens_sends_rays_to_the_conjugate_point() -> None:
 
 
 def test_crossings_are_those_of_the_tracer() -> None:
-    lens = read_lens(ROOT / "lenses" / "cooke_triplet_50.toml").at()
+    lens = set_lens(read_lens(ROOT / "lenses" / "cooke_triplet_50.toml"))
     plane, film_z = 20.0, float(lens.film_z_mm if lens.film_z_mm is not None else lens.vertices_mm[-1])
     y, v = np.linspace(-9, 9, 7), np.linspace(2, -2, 7)
     zero = np.zeros_like(y)

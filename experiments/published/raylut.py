@@ -22,13 +22,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from experiments.published.data import RawData
+from experiments.published.rtf import meridian_of, turn, turned_back
 from neurolens.graph.interpret import monomials
 from neurolens.graph.ir import Graph
 from neurolens.surrogates.cores import Core, CoreValues, Field, Units
 from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.pairs import trace_pairs
-from neurolens.surrogates.published.data import RawData
-from neurolens.surrogates.published.rtf import meridian_of, turn, turned_back
 from neurolens.surrogates.targets import scales_of
 
 Array = NDArray[np.float64]

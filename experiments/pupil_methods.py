@@ -87,7 +87,7 @@ def passes_through(lens: Lens, pupil_z_mm: float) -> Passes:
 
 def _film_z_mm(lens: Lens) -> float:
     if lens.film_z_mm is None:
-        raise InputError(lens.path, "film_z_mm", None, "a focused lens: lens.at(focus_m=...)")
+        raise InputError(lens.path, "film_z_mm", None, "a focused lens: set_lens(lens, focus_m=...)")
     return float(lens.film_z_mm)
 
 

@@ -11,13 +11,13 @@ import pytest
 from command_line import failure
 from lens_models import LENSES
 
+from experiments import methods as surrogate_bench
+from experiments.__main__ import main
+from experiments.methods import Bench, BenchSettings, Row, all_rows, chosen_rows, run_bench
+from experiments.methods_page import lens_page, write_lens
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
-from neurolens.cli import main
-from neurolens.evaluate import methods as surrogate_bench
 from neurolens.evaluate.experiment import DomainChoice, LensChoice
-from neurolens.evaluate.methods import Bench, BenchSettings, Row, all_rows, chosen_rows, run_bench
-from neurolens.evaluate.methods_page import lens_page, write_lens
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.pairs import PairSettings
 
@@ -47,16 +47,16 @@ def run(bench: Bench, *rows: Row, **options: Any) -> list[dict[str, Any]]:
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a command that ran twice."""
-    folder, real, patch = tmp_path_factory.mktemp("bench"), surrogate_bench.fit_model, pytest.MonkeyPatch()
+    folder, real, patch = tmp_path_factory.mktemp("bench"), surrogate_bench.fit_any, pytest.MonkeyPatch()
 
     def fit(prepared: Any, settings: ModelSettings, report: Any) -> Any:
         if settings.method == "dense":
             raise InputError("fit", "degree", 9, "less | fewer")
         return real(prepared, settings, report)
 
-    command = ["bench", TRIPLET, "--quick", "--rays", "2000", "--rounds", "1", "--quiet"]
+    command = ["surrogates", TRIPLET, "--quick", "--rays", "2000", "--rounds", "1", "--quiet"]
     with patch.context() as patched:
-        patched.setattr(surrogate_bench, "fit_model", fit)
+        patched.setattr(surrogate_bench, "fit_any", fit)
         patched.setattr(surrogate_bench, "chosen_rows", lambda names: ROWS)
         assert main([*command, "--output", str(folder)]) == 0
         files = [f for name in ("records", "models") for f in (folder / name).rglob("*") if f.is_file()]
@@ -130,7 +130,7 @@ def test_a_lens_of_another_stop_is_another_lens(tmp_path: Path) -> None:
 
 def test_other_settings_and_lost_files_are_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fitted: list[str] = []
-    real = surrogate_bench.fit_model
+    real = surrogate_bench.fit_any
 
     def fit(prepared: Any, settings: ModelSettings, report: Any) -> Any:
         fitted.append(settings.label)
@@ -138,7 +138,7 @@ def test_other_settings_and_lost_files_are_made_again(tmp_path: Path, monkeypatc
             raise ZeroDivisionError("by accident")
         return real(prepared, settings, report)
 
-    monkeypatch.setattr(surrogate_bench, "fit_model", fit)
+    monkeypatch.setattr(surrogate_bench, "fit_any", fit)
     one = replace(ROWS[1], settings=replace(ROWS[1].settings, planes=False))
     bench = bench_of(tmp_path)  # one, so that rays are traced once
     run(bench, one)
@@ -174,5 +174,5 @@ def test_a_lens_that_cannot_be_is_rows_too(tmp_path: Path) -> None:
 def test_bad_arguments_are_one_line(
     args: list[object], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    line = failure(capsys, "bench", *args, "--output", tmp_path / "out")
+    line = failure(capsys, "surrogates", *args, "--output", tmp_path / "out", run=main)
     assert all(word in line for word in words) and not (tmp_path / "out").exists()

@@ -17,9 +17,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from experiments.published.data import PARITY, Outputs, RawData, parity_exponents, solve_outputs
 from neurolens.surrogates.bases import monomials
 from neurolens.surrogates.cores import RawPolynomial
-from neurolens.surrogates.published.data import PARITY, Outputs, RawData, parity_exponents, solve_outputs
 
 # Rays that decide the choice of terms; the coefficients are fitted on all of them afterwards.
 SELECTION_RAYS = 6000

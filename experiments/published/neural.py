@@ -25,6 +25,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from experiments.published.data import RawData
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
@@ -32,7 +33,6 @@ from neurolens.surrogates.cores import ROUND, Core, CoreValues, Field, Units
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import PairSet, trace_pairs
-from neurolens.surrogates.published.data import RawData
 from neurolens.surrogates.settings import ModelSettings
 from neurolens.surrogates.targets import scales_of
 

@@ -1,4 +1,4 @@
-"""Every method on the same rays of a lens: the rows of `bench`, their records, errors and times."""
+"""The rows of `python -m experiments surrogates`: every method on the same rays of a lens, its errors and times."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, get_args
 
+from experiments.published import PUBLISHED, fit_any
 from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import fingerprint_of, read_kept, sha256_of, write_kept
@@ -26,11 +27,9 @@ from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm
 from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, fit_model, prepare
+from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.precision import Precision, store_weights
-from neurolens.surrogates.published import PUBLISHED
-from neurolens.surrogates.settings import NETWORK_ABLATIONS, POLYNOMIAL_ABLATIONS, ablated
 
 GROUPS = {
     "paraxial": "what renderers use today",
@@ -39,6 +38,34 @@ GROUPS = {
     "ablations": "ours with one thing changed",
 }
 DEFAULT_GROUPS = ("paraxial", "published", "ours")
+
+
+# Of method "ols" in the invariants.
+POLYNOMIAL_ABLATIONS: Mapping[str, Mapping[str, Any]] = {
+    "planes not searched": {"planes": False},
+    "candidates do not grow": {"growth": 0},
+    "no elimination": {"elimination": False},
+    "no replacement": {"replacement": False},
+    "position at its first-order weight": {"position_weight": 1.0},
+    "no terms for transmittance": {"transmittance_terms": 0},
+    "forward selection alone": {"planes": False, "growth": 0, "elimination": False, "replacement": False},
+    "matching pursuit": {"method": "omp"},
+    "raw monomials": {"basis": "raw", "degree": 5},
+}
+# Of networks.
+NETWORK_ABLATIONS: Mapping[str, Mapping[str, Any]] = {"20 steps of training": {"steps": 20}, "one layer": {"layers": 1}}
+
+
+def ablated(settings: ModelSettings, name: str) -> ModelSettings:
+    """The settings with one part left out, named for the table; the benchmark gives the ratio of the two errors.
+
+    Raises:
+        InputError: an ablation of neither table, or of the other kind of model.
+    """
+    known = NETWORK_ABLATIONS if settings.method == "mlp" else POLYNOMIAL_ABLATIONS
+    if name not in known:
+        raise InputError("ablation", "name", name, f"one of {', '.join(known)}")
+    return replace(settings, **known[name], name=f"{settings.label}, {name}")
 
 
 @dataclass(frozen=True)
@@ -102,7 +129,7 @@ def chosen_rows(names: Sequence[str]) -> tuple[Row, ...]:
         found = [r for r in rows if name in (r.name, r.group) or (name == r.settings.method and r.group != "ablations")]
         if not found and name not in GROUPS:
             known = ", ".join((*GROUPS, *(r.name for r in rows)))
-            raise InputError("neurolens bench", "--methods", name, f"one of: {known}")
+            raise InputError("experiments surrogates", "--methods", name, f"one of: {known}")
         picked |= {r.name: r for r in found}
     return tuple(picked.values())
 
@@ -178,18 +205,6 @@ class Bench:
         return fingerprint_of(asked)
 
 
-def lacks(bench: Bench, rows: Sequence[Row]) -> bool:
-    """Whether `run_bench` would have to make a record or a race."""
-    known = [_known_record(bench.record_file(row), bench.fingerprint(row)) for row in rows]
-    return any(
-        record is None
-        or not (
-            record["failed"] or (bench.model_file(row).is_file() and ("race" in record or not bench.settings.rounds))
-        )
-        for row, record in zip(rows, known, strict=True)
-    )
-
-
 def run_bench(
     benches: Sequence[Bench], rows: Sequence[Row], progress: Progress, *, again: bool = False
 ) -> Iterator[tuple[Bench, list[dict[str, Any]]]]:
@@ -238,7 +253,7 @@ def _reason(error: Exception) -> str:
 def _fit_and_measure(bench: Bench, row: Row, report: Report) -> dict[str, Any]:
     """Errors of the exported graph in onnxruntime."""
     prepared, file = bench.prepared, bench.model_file(row)
-    model = fit_model(prepared, row.settings, report)
+    model = fit_any(prepared, row.settings, report)
     file.parent.mkdir(parents=True, exist_ok=True)
     export_onnx(model, file, {})
     if row.weights:

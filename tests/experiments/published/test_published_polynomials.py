@@ -11,6 +11,17 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as some
 
+from experiments.published import PublishedSettings, fit_any
+from experiments.published.data import (
+    PARITY,
+    RawData,
+    from_tangents,
+    parity_exponents,
+    slope_encoding,
+    to_tangents,
+)
+from experiments.published.polynomials import Pursuit
+from experiments.published.taylor import expand, truncated
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.evaluate.rays import ray_errors
@@ -20,25 +31,15 @@ from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.trace import Rays, trace
 from neurolens.surrogates.domain import sample_domain
-from neurolens.surrogates.fit import ModelSettings, fit_model
+from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.fits.polynomial import ideal_map
 from neurolens.surrogates.lightfield import Encoding, fit_encoding
 from neurolens.surrogates.pairs import trace_pairs
-from neurolens.surrogates.published.data import (
-    PARITY,
-    RawData,
-    from_tangents,
-    parity_exponents,
-    slope_encoding,
-    to_tangents,
-)
-from neurolens.surrogates.published.polynomials import Pursuit
-from neurolens.surrogates.published.taylor import expand, truncated
 from neurolens.surrogates.targets import scales_of
 
 FAST = {
-    "dense": ModelSettings("hanika", basis="raw", degree=3),
-    "sparse": ModelSettings("schrade", basis="raw", degree=5, terms=12),
+    "dense": PublishedSettings("hanika", basis="raw", degree=3),
+    "sparse": PublishedSettings("schrade", basis="raw", degree=5, terms=12),
 }
 
 
@@ -121,11 +122,11 @@ def test_more_terms_and_degrees_leave_less() -> None:
     pairs = prepared.pairs
 
     def rms_deg(settings: ModelSettings) -> float:
-        model = fit_model(prepared, settings)
+        model = fit_any(prepared, settings)
         return ray_errors(pairs.lens, pairs.domain, pairs.held_out, model.predict).direction_rms_deg
 
-    dense = [rms_deg(ModelSettings("hanika", basis="raw", degree=degree)) for degree in (1, 3, 5)]
-    sparse = [rms_deg(ModelSettings("schrade", basis="raw", degree=5, terms=terms)) for terms in (4, 12, 32)]
+    dense = [rms_deg(PublishedSettings("hanika", basis="raw", degree=degree)) for degree in (1, 3, 5)]
+    sparse = [rms_deg(PublishedSettings("schrade", basis="raw", degree=5, terms=terms)) for terms in (4, 12, 32)]
     assert dense[0] > 2 * dense[1] > 4 * dense[2]
     assert sparse[0] > 2 * sparse[1] > 4 * sparse[2]
 
@@ -135,7 +136,7 @@ def test_pupil_tests_are_those_of_the_exact_rims(label: str) -> None:
     """The tests of the outer and the inner pupil stop a ray where it crosses those rims outside, bar their fit."""
     prepared = lens_models.prepared()
     pairs, lens = prepared.pairs, prepared.pairs.lens
-    model = fit_model(prepared, FAST[label])
+    model = fit_any(prepared, FAST[label])
     last = len(lens.surfaces) - 1
     assert [g.surface for g in model.gates] == [last, 0]
     rays = trace_pairs(lens, sample_domain(pairs.domain, 4000, 3), pairs.domain.pupil_z_mm)

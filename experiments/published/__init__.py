@@ -8,22 +8,43 @@ are their own.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+from experiments.published.adaptive import Cells, fit_adaptive
+from experiments.published.data import OuterPupil, RawData, outer_pupil
+from experiments.published.neural import Averaged, fit_averaged
+from experiments.published.polynomials import fit_dense, fit_sparse
+from experiments.published.raylut import RayTable, fit_table
+from experiments.published.rtf import Meridian, fit_rtf
+from experiments.published.taylor import fit_taylor
 from neurolens.base.errors import InputError
+from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.cores import Core
+from neurolens.surrogates.fit import as_model, fit_model
 from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.model import Gate
-from neurolens.surrogates.published.adaptive import fit_adaptive
-from neurolens.surrogates.published.data import RawData, outer_pupil
-from neurolens.surrogates.published.neural import fit_averaged
-from neurolens.surrogates.published.polynomials import fit_dense, fit_sparse
-from neurolens.surrogates.published.raylut import fit_table
-from neurolens.surrogates.published.rtf import fit_rtf
-from neurolens.surrogates.published.taylor import fit_taylor
+from neurolens.surrogates.model import Gate, LensModel
 from neurolens.surrogates.settings import ModelSettings
+from neurolens.surrogates.stored import CORES
 from neurolens.surrogates.targets import Prepared
+
+# Files of these models can be read back by a program that has imported this module.
+CORES |= {
+    "outer-pupil": OuterPupil,
+    "cells": Cells,
+    "averaged": Averaged,
+    "meridian": Meridian,
+    "ray-table": RayTable,
+}
+
+
+@dataclass(frozen=True)
+class PublishedSettings(ModelSettings):
+    """The settings of a published method, whose names are those of `PUBLISHED`."""
+
+    method: str = ""  # type: ignore[assignment]
 
 
 class PublishedMethod(NamedTuple):
@@ -37,23 +58,25 @@ PUBLISHED: dict[str, PublishedMethod] = {
     "taylor": PublishedMethod(
         'Hullin, Hanika, Heidrich 2012, "Polynomial Optics: A Construction Kit for Efficient Ray-Tracing of Lens '
         'Systems", Computer Graphics Forum 31(4)',
-        tuple(ModelSettings("taylor", f"taylor-d{degree}", "raw", degree=degree) for degree in (5, 3, 7)),
+        tuple(PublishedSettings("taylor", f"taylor-d{degree}", "raw", degree=degree) for degree in (5, 3, 7)),
     ),
     "hanika": PublishedMethod(
         'Hanika and Dachsbacher 2014, "Efficient Monte Carlo Rendering with Realistic Lenses", Computer Graphics '
         "Forum 33(2)",
-        tuple(ModelSettings("hanika", f"hanika-d{degree}", "raw", degree=degree) for degree in (5, 4, 3)),
+        tuple(PublishedSettings("hanika", f"hanika-d{degree}", "raw", degree=degree) for degree in (5, 4, 3)),
     ),
     "schrade": PublishedMethod(
         'Schrade, Hanika, Dachsbacher 2016, "Sparse high-degree polynomials for wide-angle lenses", Computer Graphics '
         "Forum 35(4)",
-        tuple(ModelSettings("schrade", f"schrade-{terms}", "raw", terms=terms, degree=11) for terms in (28, 16, 40)),
+        tuple(
+            PublishedSettings("schrade", f"schrade-{terms}", "raw", terms=terms, degree=11) for terms in (28, 16, 40)
+        ),
     ),
     "zheng-adaptive": PublishedMethod(
         'Zheng and Zheng 2017, "Adaptive sparse polynomial regression for camera lens simulation", The Visual '
         "Computer 33(6-8)",
         tuple(
-            ModelSettings("zheng-adaptive", f"zheng-adaptive-{terms}x{zones}", "raw", terms=terms, partitions=zones)
+            PublishedSettings("zheng-adaptive", f"zheng-adaptive-{terms}x{zones}", "raw", terms=terms, partitions=zones)
             for terms, zones in ((36, 4), (36, 1))
         ),
     ),
@@ -61,7 +84,7 @@ PUBLISHED: dict[str, PublishedMethod] = {
         'Zheng and Zheng 2017, "NeuroLens: Data-Driven Camera Lens Simulation Using Neural Networks", Computer '
         "Graphics Forum 36(8); here 24,000 steps of 128 rays a network",
         (
-            ModelSettings(
+            PublishedSettings(
                 "neurolens2017", "neurolens2017-128x3", "raw", partitions=2, units=128, layers=3, steps=24_000
             ),
         ),
@@ -69,18 +92,33 @@ PUBLISHED: dict[str, PublishedMethod] = {
     "rtf": PublishedMethod(
         'Goossens et al. 2022, "Ray-transfer functions for camera simulation of 3D scenes with hidden lens design", '
         "Optics Express 30(13)",
-        tuple(ModelSettings("rtf", f"rtf-d{degree}", "raw", degree=degree) for degree in (6, 4, 8)),
+        tuple(PublishedSettings("rtf", f"rtf-d{degree}", "raw", degree=degree) for degree in (6, 4, 8)),
     ),
     "ray-lut": PublishedMethod(
         'Honsbrok, Mostafawy, Herder, Huldtgren 2025, "Ray-LUT: A Lookup-Based Method for Camera Lens Simulation in '
         'Real-Time Using Ray Tracing", GRAPP',
-        tuple(ModelSettings("ray-lut", f"ray-lut-{nodes}", "raw", units=nodes) for nodes in (8, 16, 32)),
+        tuple(PublishedSettings("ray-lut", f"ray-lut-{nodes}", "raw", units=nodes) for nodes in (8, 16, 32)),
     ),
 }
 
 
+def fit_any(prepared: Prepared, settings: ModelSettings, progress: Callable[[float], None] | None = None) -> LensModel:
+    """Fit a published method, or one of ours, and return the complete model.
+
+    Raises:
+        InputError: the method is unknown, or it cannot take the lens or the settings.
+    """
+    if not isinstance(settings, PublishedSettings):
+        return fit_model(prepared, settings, progress)
+    start = time.perf_counter()
+    with pinned_threads():
+        core, encoding, gates = fit_published(prepared, settings, progress)
+    fitted = replace(prepared, encoding=encoding, gates=gates)
+    return as_model(fitted, core, settings, time.perf_counter() - start)
+
+
 def fit_published(
-    prepared: Prepared, settings: ModelSettings, progress: Callable[[float], None] | None = None
+    prepared: Prepared, settings: PublishedSettings, progress: Callable[[float], None] | None = None
 ) -> tuple[Core, Encoding, tuple[Gate, ...]]:
     """Fit one published method.
 
@@ -89,7 +127,7 @@ def fit_published(
     Raises:
         InputError: an unknown method, or a lens or settings that it cannot take.
     """
-    s, method = settings, settings.method
+    s, method = settings, str(settings.method)
     if method not in PUBLISHED:
         raise InputError("fit", "method", method, f"one of {', '.join(PUBLISHED)}")
     data = RawData.of(prepared, centred=method in ("taylor", "hanika", "ray-lut"))

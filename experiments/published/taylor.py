@@ -25,6 +25,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from experiments.published.data import raw_polynomial
 from neurolens.base.errors import InputError
 from neurolens.optics.glass import index_of
 from neurolens.optics.prescription import Lens, Surface
@@ -33,7 +34,6 @@ from neurolens.optics.trace import trace
 from neurolens.surrogates.bases import ordered
 from neurolens.surrogates.cores import RawPolynomial
 from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.published.data import raw_polynomial
 from neurolens.surrogates.targets import scales_of
 
 # Coefficients [M] of `Truncated.exponents`: a power series in several variables, cut beyond a total degree.

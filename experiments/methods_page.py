@@ -6,8 +6,8 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from experiments.methods import GROUPS
 from neurolens.base.files import atomic_write_text
-from neurolens.evaluate.methods import GROUPS
 from neurolens.evaluate.pages import DASH, Column, Record, markdown_table, number, show
 from neurolens.evaluate.plots import Kinds, trade_plot
 from neurolens.surrogates.source import MOST_WEIGHTS

@@ -19,14 +19,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from experiments.published.data import Outputs, RawData, outer_pupil, solve_outputs
+from experiments.published.polynomials import fit_dense
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph
 from neurolens.surrogates.bases import Exponents
 from neurolens.surrogates.cores import ROUND, Composite, CoreValues, Field, RawPolynomial, Units
 from neurolens.surrogates.fits.selection import grow
 from neurolens.surrogates.pairs import PairSet
-from neurolens.surrogates.published.data import Outputs, RawData, outer_pupil, solve_outputs
-from neurolens.surrogates.published.polynomials import fit_dense
 from neurolens.surrogates.targets import squared_error
 
 # A cell's fit sees this share of its rays' range beyond a cut, so that neighbours meet.

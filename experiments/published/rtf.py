@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError  # type: ignore[import-untyped]
 from torch import Tensor
 
+from experiments.published.data import RawData, stable_solve
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
@@ -33,7 +34,6 @@ from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import trace_pairs
-from neurolens.surrogates.published.data import RawData, stable_solve
 from neurolens.surrogates.targets import scales_of
 
 Array = NDArray[np.float64]

@@ -12,24 +12,24 @@ from hypothesis import given
 from hypothesis import strategies as some
 from torch import Tensor
 
+from experiments.published import PublishedSettings, fit_any
+from experiments.published.adaptive import Cells, fit_adaptive
+from experiments.published.data import RawData
+from experiments.published.neural import Averaged, Layers
+from experiments.published.rtf import least_ellipse, meridian_exponents, meridian_variables, turn
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.evaluate.rays import ray_errors
 from neurolens.surrogates.cores import RawPolynomial
 from neurolens.surrogates.domain import FilmRays, sample_domain
-from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import trace_pairs
-from neurolens.surrogates.published.adaptive import Cells, fit_adaptive
-from neurolens.surrogates.published.data import RawData
-from neurolens.surrogates.published.neural import Averaged, Layers
-from neurolens.surrogates.published.rtf import least_ellipse, meridian_exponents, meridian_variables, turn
 
 
 @cache
 def fitted(degree: int = 4, name: str = "laikin_double_gauss_50") -> LensModel:
-    return fit_model(lens_models.prepared(name), ModelSettings("rtf", basis="raw", degree=degree))
+    return fit_any(lens_models.prepared(name), PublishedSettings("rtf", basis="raw", degree=degree))
 
 
 def test_degree_six_has_84_terms_as_published() -> None:
@@ -98,7 +98,7 @@ def test_pass_function_holds_every_passing_ray_and_blocks_most_others() -> None:
 
 @pytest.mark.parametrize("turned", (0.0, 2.0))
 def test_rays_of_nodes_are_exact(turned: float) -> None:
-    model = fit_model(lens_models.prepared(), ModelSettings("ray-lut", units=5))
+    model = fit_any(lens_models.prepared(), PublishedSettings("ray-lut", units=5))
     e, pairs = model.encoding, lens_models.prepared().pairs
     radius, across, along = (
         torch.tensor(v, dtype=torch.float64) for v in ((0.25, 0.5, 1.0), (0.5, -0.5, 0), (0.5, 0, 0))
@@ -121,14 +121,14 @@ def test_half_the_step_leaves_a_quarter_of_the_error() -> None:
             pairs.lens,
             pairs.domain,
             pairs.held_out,
-            fit_model(lens_models.prepared(), ModelSettings("ray-lut", units=n)).predict,
+            fit_any(lens_models.prepared(), PublishedSettings("ray-lut", units=n)).predict,
         ).rms_um
         for n in (9, 17)
     ]
     assert 3 < errors[0] / errors[1] < 5
 
 
-NETWORKS = ModelSettings("neurolens2017", basis="raw", units=16, layers=2, steps=60, partitions=2)
+NETWORKS = PublishedSettings("neurolens2017", basis="raw", units=16, layers=2, steps=60, partitions=2)
 
 
 def rms_um(model: LensModel) -> float:
@@ -167,7 +167,7 @@ def test_cells_give_each_ray_the_polynomial_of_its_cell() -> None:
 
 def test_cells_and_terms_leave_less() -> None:
     few, more, cells = (
-        fit_model(lens_models.prepared(), ModelSettings("zheng-adaptive", basis="raw", terms=terms, partitions=zones))
+        fit_any(lens_models.prepared(), PublishedSettings("zheng-adaptive", basis="raw", terms=terms, partitions=zones))
         for terms, zones in ((6, 1), (16, 1), (16, 2))
     )
     assert rms_um(few) > 2 * rms_um(more)
@@ -184,9 +184,9 @@ def test_growth_reaches_degrees_that_no_list_of_candidates_was_cut_at() -> None:
 
 @pytest.mark.parametrize("method", ("zheng-adaptive", "neurolens2017"))
 def test_more_cells_than_rays_allow_are_refused(method: str) -> None:
-    settings = ModelSettings(method, basis="raw", terms=4, partitions=64)  # type: ignore[arg-type]
+    settings = PublishedSettings(method, basis="raw", terms=4, partitions=64)
     with pytest.raises(InputError, match="partitions"):
-        fit_model(lens_models.prepared(), settings)
+        fit_any(lens_models.prepared(), settings)
 
 
 def by_hand(layers: Layers, h: np.ndarray) -> np.ndarray:
@@ -198,7 +198,7 @@ def by_hand(layers: Layers, h: np.ndarray) -> np.ndarray:
 
 
 def test_networks_are_averaged_and_chosen_by_film_radius() -> None:
-    model = fit_model(lens_models.prepared(), NETWORKS)
+    model = fit_any(lens_models.prepared(), NETWORKS)
     core = model.core
     assert isinstance(core, Averaged)
     assert [len(ring) for ring in core.networks] == [3, 3]
@@ -213,7 +213,7 @@ def test_networks_are_averaged_and_chosen_by_film_radius() -> None:
     np.testing.assert_allclose(vectors[0], wanted[:2], atol=1e-12)
     np.testing.assert_allclose(scalars, [wanted[2], 0.5 - wanted[6]], atol=1e-12)
     # The seed makes the weights, and another seed others.
-    again, other = (fit_model(lens_models.prepared(), replace(NETWORKS, seed=s)).core for s in (0, 1))
+    again, other = (fit_any(lens_models.prepared(), replace(NETWORKS, seed=s)).core for s in (0, 1))
     assert isinstance(again, Averaged)
     assert isinstance(other, Averaged)
     assert np.array_equal(again.networks[1][2][0][0], core.networks[1][2][0][0])
@@ -222,9 +222,7 @@ def test_networks_are_averaged_and_chosen_by_film_radius() -> None:
 
 def test_networks_learn_rays_and_who_passes() -> None:
     prepared = lens_models.prepared()
-    short, longer = (
-        fit_model(prepared, replace(NETWORKS, units=32, partitions=1, steps=steps)) for steps in (30, 1500)
-    )
+    short, longer = (fit_any(prepared, replace(NETWORKS, units=32, partitions=1, steps=steps)) for steps in (30, 1500))
     assert rms_um(short) > 2 * rms_um(longer)
     pairs = prepared.pairs
     rays = trace_pairs(pairs.lens, sample_domain(pairs.domain, 8000, 9), pairs.domain.pupil_z_mm)
