@@ -47,7 +47,7 @@ PARTS = {
 }
 # Packages from elsewhere that each part may import; what is not listed here is not restricted.
 PACKAGES = {
-    "base": {"numpy"},
+    "base": {"numpy", "jinja2"},
     "graph": {"numpy"},  # and torch where it is handed tensors
     "modelfile": {"numpy"},
     "optics": {"numpy", "torch"},

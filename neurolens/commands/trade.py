@@ -129,6 +129,7 @@ def _text(found: Trade, folder: Path) -> str:
 
 
 def _page(found: Trade, folder: Path, title: str) -> str:
+    from neurolens.base.html import html
     from neurolens.evaluate import pages
 
     flips = {s.offer.choice.name: s.flip for s in found.shown}
@@ -151,15 +152,12 @@ def _page(found: Trade, folder: Path, title: str) -> str:
     front = found.front
     marks = ["● " if o == found.chosen else "○ " if o in front else "" for o in found.offered]
     names = [f"{m}{_short(o)}" for m, o in zip(marks, found.offered, strict=True)]
-    lead = pages.joined("<p class='lead'>{}</p>", _said(found))
     told = f"{found.samples} samples a pixel each, the same random numbers. Below each its FLIP difference from the "
     told += "exact lens's picture: with noise, where a camera makes other rays of the same numbers, as thin lenses do."
     figures = [
         {"file": "trade.png", "title": "Error against time", "caption": "Ring: the choice for the budget."},
         {"file": "pictures.png", "title": "What is seen", "caption": told},
     ]
-    shown = pages.figure_grid(folder, [{**f, "wide": True} for f in figures], inside=True)
-    body = pages.html("<h1>{}</h1>{}{}", title, lead, shown)
-    body += pages.section("Every camera", pages.table(names, records, columns))
-    body += pages.html("<p class='note'>● for the budget, ○ no other betters both.</p>") + pages.legend(columns)
-    return pages.page(title, body)
+    shown = pages.figures_of(folder, [{**f, "wide": True} for f in figures], inside=True)
+    cameras = pages.table(names, records, columns)
+    return html("trade.html", title=title, lead=_said(found), shown=shown, cameras=cameras)
