@@ -29,7 +29,8 @@ from neurolens.evaluate.candidates import exact_candidates, ideal_cameras, model
 from neurolens.evaluate.speed import Race, race
 from neurolens.optics.lensfile import read_lens
 from neurolens.render.scene import load_scene
-from neurolens.surrogates.domain import Domain, domain_of
+from neurolens.surrogates.domain import domain_of
+from neurolens.surrogates.model import Domain
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 from neurolens.base.errors import InputError
 from neurolens.surrogates.cores import Core
-from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.model import Gate
+from neurolens.surrogates.model import Encoding, Gate
 from neurolens.surrogates.published.adaptive import fit_adaptive
 from neurolens.surrogates.published.data import RawData, outer_pupil
 from neurolens.surrogates.published.neural import fit_averaged

@@ -32,7 +32,7 @@ from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 from neurolens.surrogates.bases import ordered
 from neurolens.surrogates.cores import RawPolynomial
-from neurolens.surrogates.lightfield import Encoding
+from neurolens.surrogates.model import Encoding
 from neurolens.surrogates.published.data import raw_polynomial
 from neurolens.surrogates.targets import scales_of
 
