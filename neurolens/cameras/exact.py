@@ -18,19 +18,20 @@ from neurolens.base import status as st
 from neurolens.base.progress import Progress
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
-from neurolens.cameras.fused import Compiled, FusedFilm, LensGraph
-from neurolens.cameras.lens_film import LensFilm, SceneRays
+from neurolens.cameras.fused import Compiled, FusedFilm
+from neurolens.cameras.lens_film import LensFilm, LensGraph, SceneRays
 from neurolens.cameras.lens_state import axial_transmittance, lens_state
 from neurolens.cameras.outline_cache import kept_outline, search_key
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.pupil_search import COARSE, COARSE_TIGHT, FINE, Detail, outline_of
 from neurolens.cameras.sampling import arrived, check_film, positive
+from neurolens.optics.film_plane import PupilBounds
 from neurolens.optics.focusing import best_focused
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.paraxial import chief_reach_mm, first_order
 from neurolens.optics.prescription import Focus, Lens
-from neurolens.optics.pupils import PupilBounds, camera_rays, passes_at_any_azimuth, pupil_bounds, pupil_plane_z_mm
+from neurolens.optics.pupils import camera_rays, passes_at_any_azimuth, pupil_bounds, pupil_plane_z_mm
 from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays, film_derivatives, trace, trace_differentials
 from neurolens.optics.tracegraph import exact_graph

@@ -53,7 +53,6 @@ from neurolens.evaluate.shaders import lens_of
 from neurolens.evaluate.shot_fits import PAIRS, shot_domain, shot_fits, shot_terms
 from neurolens.graph.compiler import has_compiler
 from neurolens.graph.scalars import lower
-from neurolens.modelfile.graph import graph_of
 from neurolens.optics.prescription import Lens
 from neurolens.render.scene import Scene
 from neurolens.surrogates.settings import ModelSettings
@@ -407,9 +406,9 @@ def _model(trial: _Trial, file: Path, how: str = "", without: Collection[str] = 
 
 
 def _operations(model: OnnxLens) -> int:
-    """Of a ray of a model; 0 where its operators have no such form."""
+    """The number of float operations that a ray of a model costs; 0 of networks that only onnxruntime runs."""
     with suppress(InputError):
-        return sum(lower(graph_of(model.path, model.data, model.state if model.axes else ())).count().values())
+        return sum(lower(model.graph()).count().values())
     return 0
 
 

@@ -35,7 +35,8 @@ from neurolens.optics.pupils import image_radius_mm
 from neurolens.optics.states import set_lens
 from neurolens.render.scene import Scene
 from neurolens.render.world import shared_worlds
-from neurolens.surrogates.domain import Domain, domain_from_camera, domain_of
+from neurolens.surrogates.domain import domain_from_camera, domain_of
+from neurolens.surrogates.model import Domain
 
 COUNTED = 95.0  # percentile over the picture that a budget is held against
 _Real = TypeVar("_Real", bound=np.floating[Any])

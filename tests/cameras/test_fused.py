@@ -11,6 +11,7 @@ from typing import Any
 import lens_models
 import numpy as np
 import pytest
+from neurolens.modelfile.graph import graph_of
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
@@ -24,7 +25,6 @@ from neurolens.flare.ghosts import coated
 from neurolens.graph import compiler
 from neurolens.graph.ir import Graph
 from neurolens.graph.loworder import WORST, with_low_order_derivatives
-from neurolens.modelfile.graph import graph_of
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.render.renderer import render

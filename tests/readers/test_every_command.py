@@ -156,8 +156,9 @@ def test_a_run_keeps_the_lens_in_our_format_and_a_model_knows_its_lens(
     kept, model = run / "lenses" / "Tessar_100mm_1_4_5_v2_0.toml", run / "models" / "ols-12.onnx"
     assert read_lens(kept).sha256 == read_any(files["zmx"]).sha256
     capsys.readouterr()
-    from neurolens.evaluate.check import lens_of_card
     from neurolens.modelfile.onnxfile import read_checked
+
+    from neurolens.evaluate.check import lens_of_card
 
     card = read_checked(model)[1]
     assert card["lens"]["id"] == "Tessar_100mm_1_4_5_v2_0"

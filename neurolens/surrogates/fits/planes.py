@@ -17,7 +17,7 @@ import torch
 
 from neurolens.surrogates.bases import invariant_exponents, monomials
 from neurolens.surrogates.fits.selection import Sweep, backward, forward
-from neurolens.surrogates.lightfield import Encoding
+from neurolens.surrogates.model import Encoding
 from neurolens.surrogates.pairs import PairSet, RayPairs
 from neurolens.surrogates.targets import targets_of, weighed_apart
 
