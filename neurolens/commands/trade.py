@@ -6,19 +6,35 @@ import argparse
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from neurolens.base.files import atomic_write_text
+from neurolens.base.files import atomic_write_text, library
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import check_run_folder
 from neurolens.commands.output import answer, number, table
-from neurolens.commands.plan import look_of, shipped_models
 from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
     from neurolens.evaluate.trade import Offer, Trade
+    from neurolens.optics.prescription import Lens
 
 _SAMPLES = 16  # a pixel of the small pictures
+
+
+def look_of(args: argparse.Namespace) -> dict[str, Any]:
+    """What --comp, --denoise and --zoom say, as arguments of `evaluate.probe.probe`."""
+    return {"afterwards": args.afterwards, "denoised": args.denoise, "zoom": args.zoom}
+
+
+def shipped_models(lens: Lens, zoom: str | None) -> list[Path]:
+    """The models that ship of a lens, or of a state of its zoom, by its id and its figures."""
+    from neurolens.modelfile.onnxfile import read_checked
+    from neurolens.optics.states import set_lens
+
+    name = lens.lens_id if zoom is None else f"{lens.lens_id}-{zoom}"
+    files = sorted((library() / "models").glob(f"{name}.*.onnx"))
+    figures = set_lens(lens, zoom=zoom).sha256 if files else ""
+    return [file for file in files if read_checked(file)[1]["lens"]["sha256"] == figures]
 
 
 def run_trade(args: argparse.Namespace) -> int:
