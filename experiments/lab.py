@@ -27,7 +27,6 @@ from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_path, atomic_write_text, write_json
 from neurolens.base.progress import Progress, Report
 from neurolens.commands.arguments import QUIET_HELP, add_option, add_output, whole
-from neurolens.evaluate.pages import markdown_table
 
 ROOT = Path(__file__).parents[1]
 LENSES, SCENES, MODELS = ROOT / "lenses", ROOT / "experiments" / "scenes", ROOT / "models"
@@ -135,6 +134,12 @@ def look_up(row: Any, path: str) -> Any:
 def columns(*described: tuple[Any, ...]) -> tuple[Column, ...]:
     """Columns from tuples of title, value, form, scale."""
     return tuple(Column(*one) for one in described)
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[Any]], missing: str = "") -> list[str]:
+    """Lines of a table in Markdown; `missing` stands for cells that are None."""
+    lines = [header, ["---"] * len(header), *([missing if c is None else str(c) for c in row] for row in rows)]
+    return [f"| {' | '.join(line)} |" for line in lines]
 
 
 def table(header: Sequence[Column] | Sequence[str] | str, rows: Iterable[Any], missing: str = "") -> str:

@@ -6,9 +6,10 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from experiments.lab import markdown_table
 from experiments.methods import GROUPS
 from neurolens.base.files import atomic_write_text
-from neurolens.evaluate.pages import DASH, Column, Record, markdown_table, number, show
+from neurolens.evaluate.pages import DASH, Column, Record, number, show
 from neurolens.evaluate.plots import Kinds, trade_plot
 from neurolens.graph.scalars import MOST_WEIGHTS
 

@@ -82,12 +82,6 @@ def show(value: float, digits: int, thousands: str = "") -> str:
     return f"{value:{thousands}.0f}" if 1 <= abs(value) < 1e7 else f"{value:.{digits - 1}e}"
 
 
-def markdown_table(header: Sequence[str], rows: Iterable[Sequence[Any]], missing: str = "") -> list[str]:
-    """Lines of a table in Markdown; `missing` stands for cells that are None."""
-    lines = [header, ["---"] * len(header), *([missing if c is None else str(c) for c in row] for row in rows)]
-    return [f"| {' | '.join(line)} |" for line in lines]
-
-
 def table(names: Sequence[str], records: Sequence[Record], columns: Iterable[Column]) -> Table:
     """The table of records; a column that no record holds is left out."""
     return Table(names, records, [c for c in columns if any(c.value(r) is not None for r in records)])
