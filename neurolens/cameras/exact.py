@@ -118,7 +118,7 @@ class ExactCamera:
         return self.film.sample(film_mm, pupil, wavelength_nm)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `sample`, with the differentials of the rays, carried through every surface."""
+        """Sample rays as `sample` does, and carry their differentials through every surface."""
         return self.film.sample(film_mm, pupil, wavelength_nm, self._with_differentials)
 
     def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
@@ -131,7 +131,7 @@ class ExactCamera:
             self._front = front_aim(self.film, self.film_mm, self._light_nm, self.lens.surfaces[0])
         film_z = self.film.film_z_mm
         aim = self._front.aim(1e3 * point_m.astype(np.float64) + [[0], [0], [film_z]], pupil)
-        # Light starts a millimetre before the surface, so that this is still ahead; nonsense misses it.
+        # Light starts a millimetre before the surface, so that it lies ahead; rays that are not finite miss it.
         rays = np.nan_to_num(np.concatenate([aim.position + aim.direction, -aim.direction]), posinf=0, neginf=0)
         with torch.no_grad():
             *light, wavelength = _tensors(self._dtype, *rays, wavelength_nm)

@@ -60,7 +60,7 @@ class FusedFilm:
     def sample(
         self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray, differentials: bool = False
     ) -> CameraRays:
-        """As `LensFilm.sample`, with the differentials of the rays where asked for."""
+        """Sample rays as `LensFilm.sample` does, with their differentials where the caller wants them."""
         film, square, wavelength = (np.ascontiguousarray(a, np.float32) for a in (film_mm, square, wavelength_nm))
         count = film.shape[1]
         if film.shape != (2, count) or square.shape != (2, count) or wavelength.shape != (count,):
@@ -111,7 +111,7 @@ class Compiled:
         return self._fused.sample(film_mm, pupil, wavelength_nm)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `sample`, with the differentials of the rays, which come from the same pass."""
+        """Sample rays as `sample` does; the same pass gives their differentials."""
         return self._fused.sample(film_mm, pupil, wavelength_nm, True)
 
     @property

@@ -136,7 +136,7 @@ class OnnxCamera:
         return self._whole.sample(film_mm, pupil, wavelength_nm)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `sample`, with the differentials of the rays."""
+        """Sample rays as `sample` does, and give their differentials, too."""
         if self._with_moves is None:
             lens = self.lens_graph(ONNX)
             lens = lens._replace(graph=with_film_derivatives(lens.graph))
@@ -217,7 +217,7 @@ class OnnxFilm:
         self._session = open_session(model.path, write_onnx(g, {}), model.threads, _INPUTS, shapes)
 
     def sample(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `LensFilm.sample`, with the rays' differentials where the lens's graph has derivatives."""
+        """Sample rays as `LensFilm.sample` does, with their differentials where the lens's graph has derivatives."""
         rays = {"film_mm": film_mm, "square": square, "wavelength_nm": wavelength_nm[None]}
         done = run_batches(self._path, self._session, self._names, rays, {}, RAYS_A_CALL)
         found = {name: np.atleast_2d(values) for name, values in zip(self._names, done, strict=True)}
@@ -259,7 +259,7 @@ class ModelScene:
         return self.model.status(film, pupil, waves, self.film_z_mm, self.stop_radius_mm) == st.PASSED
 
     def passes_at_any_azimuth(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
-        """As `passes`, of a lens with cylinders: whether rays pass when film and pupil points turn about the axis."""
+        """Whether rays of a lens with cylinders pass at any azimuth of their film and pupil points; bool [N]."""
         passed = np.zeros(film.shape[1], bool)
         for azimuth in _AZIMUTHS:
             left = np.flatnonzero(~passed)

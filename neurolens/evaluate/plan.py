@@ -256,7 +256,7 @@ class _Trial:
 
     @property
     def share(self) -> prints.Array:
-        """Of the wavelengths."""
+        """The share of the scene's light that each wavelength stands for."""
         return self.found.places.share
 
     @property
@@ -294,7 +294,7 @@ class _Trial:
         return ns_a_ray(camera, self.found.places), noise(seen.weight, self.share)
 
     def ideal(self, name: str, camera: Camera, seen: Footprints, area: float = 1.0) -> tuple[Timing, float]:
-        """Of a camera without a lens, whose picture is so many times as large."""
+        """The cost of a camera without a lens, whose picture is so many times as large."""
         known = {"osl": CYCLES_NS, "glsl": GLSL_OPERATIONS}.get(self.target)
         if known is not None:
             return _counted(area * known[name]), noise(seen.weight, self.share)
@@ -302,7 +302,7 @@ class _Trial:
         return {"min": area * timing["min"], "median": area * timing["median"]}, times
 
     def shader(self, file: str | Path) -> tuple[Timing, float]:
-        """Of the shader of a model or a lens."""
+        """The cost of the shader of a model or a lens."""
         asked = self.found.asked
         state = asked.zoom if str(file) == self.found.lens.path else None  # models are of one
         lens = lens_of(Path(file), state, lambda done, left=None: None)[1]

@@ -126,7 +126,7 @@ class Probed:
 
     @cached_property
     def exact_field(self) -> Field:
-        """Of the exact camera, for maps of its picture; it takes seconds.
+        """The field of the exact camera, for maps of its picture; it takes seconds.
 
         Raises:
             InputError: as `field_of`.
@@ -307,7 +307,7 @@ def effects_of(found: Probed, budget_px: float, stray: bool = True) -> tuple[Eff
 
 
 def exact_camera(lens: Lens, real: dict[str, Any]) -> ExactCamera | FusedExactCamera:
-    """As C where a compiler is there, which compiles the lens."""
+    """The exact camera, compiled as C where the machine has a compiler."""
     with suppress(InputError):
         if has_compiler():
             return FusedExactCamera(lens, **real)

@@ -142,7 +142,7 @@ class Stack:
         return found, float(lens.film_z_mm) - z[len(lens.surfaces) - 1]
 
     def reflectance(self, wavelength_nm: float) -> NDArray[np.float64]:
-        """Of every surface at normal incidence, towards the film, [surfaces]."""
+        """The reflectance of every surface at normal incidence, towards the film, [surfaces]."""
         numbers = self.numbers(wavelength_nm)[0][:, 0].astype(np.float64)
         n1, n2 = numbers[:, CALL.index("n_before")], numbers[:, CALL.index("n_after")]
         coated = [bool(s.coating and s.coating.layers) for s in self.lens.surfaces]
