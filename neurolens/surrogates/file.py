@@ -97,8 +97,8 @@ def read_model(path: str | Path) -> ModelFile:
     check_card(file, card)
     if MODEL_KEY not in metadata:
         raise ModelError(
-            f"{file}: it holds no coefficients, as files of version 0.1.0 and earlier may: make it again with "
-            "`neurolens train`, or export it with the version that made it"
+            f"{file}: it holds no coefficients, from which its graph would be built: export it again "
+            "(`neurolens train` fits the model and writes its file with them)"
         )
     try:
         with np.errstate(all="ignore"):
