@@ -14,13 +14,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.onnxsession import open_session, run_batches
 from neurolens.graph.ir import Graph
-from neurolens.modelfile.states import STATE, card_at, default_state, state_numbers
-from neurolens.surrogates.assemble import SCALARS, Form, model_graph
-from neurolens.surrogates.file import ModelFile, onnx_of, read_model
+from neurolens.graph.onnx import write_onnx
+from neurolens.graph.passes import pruned
+from neurolens.modelfile.states import card_at, default_state, state_numbers
+from neurolens.surrogates.assemble import ONNX, SCALARS, Form, model_graph
+from neurolens.surrogates.file import ModelFile, read_model
 from neurolens.surrogates.model import LensModel
 
 INPUTS = {"rays": ("tensor(float)", 5, None), "film_z_mm": ("tensor(float)", 1), "stop_radius_mm": ("tensor(float)", 1)}
@@ -63,17 +66,18 @@ class OnnxLens:
         self.file, self.path, self.card, self.threads = file, file.path, file.card, threads
         self.axes, self.state = file.axes, default_state(file.card)
         self._sessions: dict[tuple[str, ...], Any] = {}  # by the outputs that they compute; opened when they are needed
+        self._graphs: dict[Form, Graph] = {}
 
     def at(self, *state: float) -> OnnxLens:
-        """The same model in another state, its card with the lens and the domain there; one session serves all.
+        """The same model in another state, its card with the lens and the domain there.
 
         Raises:
             InputError: another number of values than axes, or one out of range.
         """
-        other = copy(self)
-        if self.axes or state:
-            other.card, other.state = card_at(self.file.card, self.axes, state), tuple(float(v) for v in state)
-            other.__dict__.pop("fitted", None)
+        if not self.axes and not state:
+            return self
+        other = OnnxLens(self.file, self.threads)
+        other.card, other.state = card_at(self.file.card, self.axes, state), tuple(float(v) for v in state)
         return other
 
     def reopened(self) -> OnnxLens:
@@ -89,7 +93,9 @@ class OnnxLens:
 
     def graph(self, form: Form = SCALARS) -> Graph:
         """The graph of the model in its state; inputs and outputs as `surrogates.assemble` says."""
-        return model_graph(self.fitted, form)
+        if form not in self._graphs:
+            self._graphs[form] = model_graph(self.fitted, form)
+        return self._graphs[form]
 
     @np.errstate(over="ignore")  # numbers that float32 does not hold are outside the domain
     def rays(
@@ -117,7 +123,9 @@ class OnnxLens:
                 error: their status says so.
         """
         if state is not None:
-            return self._in_state(state).rays(film_xy_mm, pupil_xy_mm, wavelength_nm, film_z_mm, stop_radius_mm)
+            values = state_numbers(self.axes, state)
+            if all(a.limits[0] <= v <= a.limits[1] for a, v in zip(self.axes, values, strict=True)):
+                return self.at(*values).rays(film_xy_mm, pupil_xy_mm, wavelength_nm, film_z_mm, stop_radius_mm)
         points = {"film_xy_mm": film_xy_mm, "pupil_xy_mm": pupil_xy_mm}
         columns = ray_columns("OnnxLens.rays", 2, points, wavelength_nm)
         stop = self.card["domain"]["stop_radius_mm"] if stop_radius_mm is None else stop_radius_mm
@@ -125,6 +133,9 @@ class OnnxLens:
         plane, count = np.atleast_1d(np.asarray(film_z_mm, np.float32)), columns.shape[1]
         if plane.shape not in ((1,), (count,)):
             raise InputError("OnnxLens.rays", "film_z_mm", plane.shape, f"a number or an array ({count},)")
+        if state is not None:  # out of range
+            status = np.full(count, st.OUTSIDE_DOMAIN, np.int32)
+            return LensRays(*(np.zeros(shape, np.float32) for shape in ((6, count), count, (2, count))), status)
         if len(plane) == 1:
             return self._run(columns, plane, stop)
         planes, at = np.unique(plane, return_inverse=True)
@@ -133,7 +144,7 @@ class OnnxLens:
         return LensRays(*(np.concatenate(of_one, -1)[..., place] for of_one in zip(*parts, strict=True)))
 
     def _run(self, rays: FloatArray, plane: FloatArray, stop_radius_mm: float) -> LensRays:
-        session, call = self._session(tuple(OUTPUTS)), self._call(plane, stop_radius_mm)
+        session, call = self._session(tuple(OUTPUTS)), {"film_z_mm": plane, "stop_radius_mm": stop_radius_mm}
         return LensRays(*run_batches(self.path, session, tuple(OUTPUTS), {"rays": rays}, call, BATCH))
 
     def status(
@@ -142,28 +153,17 @@ class OnnxLens:
         """`rays(...).status` alone, in less time: nothing else is computed. Arguments as there."""
         points = {"film_xy_mm": film_xy_mm, "pupil_xy_mm": pupil_xy_mm}
         rays = {"rays": ray_columns("OnnxLens.status", 2, points, wavelength_nm)}
-        session, call = self._session(("status",)), self._call(np.array([film_z_mm], np.float32), stop)
+        session, call = self._session(("status",)), {"film_z_mm": film_z_mm, "stop_radius_mm": stop}
         found: NDArray[np.int32] = run_batches(self.path, session, ("status",), rays, call, BATCH)[0]
         return found
 
     def _session(self, outputs: tuple[str, ...]) -> Any:
         if outputs not in self._sessions:
-            inputs = {**INPUTS, STATE: ("tensor(float)", len(self.axes))} if self.axes else INPUTS
-            data = onnx_of(self.file.nodes, self.axes, outputs=outputs)
+            graph = self.graph(ONNX)
+            wanted = pruned(graph, {name: graph.outputs[name] for name in outputs})
             shapes = {name: OUTPUTS[name] for name in outputs}
-            self._sessions[outputs] = open_session(self.path, data, self.threads, inputs, shapes)
+            self._sessions[outputs] = open_session(self.path, write_onnx(wanted, {}), self.threads, INPUTS, shapes)
         return self._sessions[outputs]
-
-    def _call(self, plane: FloatArray, stop_radius_mm: float) -> dict[str, Any]:
-        return {"film_z_mm": plane, "stop_radius_mm": stop_radius_mm} | ({STATE: self.state} if self.axes else {})
-
-    def _in_state(self, state: float | Sequence[float]) -> OnnxLens:
-        """`at`, for any numbers: out of range, where there is no domain, rays are sent with that of this state."""
-        other, values = copy(self), state_numbers(self.axes, state)
-        if all(a.limits[0] <= v <= a.limits[1] for a, v in zip(self.axes, values, strict=True)):
-            other.card = card_at(self.file.card, self.axes, values)
-        other.state = values
-        return other
 
 
 def load_model(path: str | Path, lens: str | None = None, threads: int = 1) -> OnnxLens:

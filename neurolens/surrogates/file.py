@@ -97,8 +97,8 @@ def read_model(path: str | Path) -> ModelFile:
     check_card(file, card)
     if MODEL_KEY not in metadata:
         raise ModelError(
-            f"{file}: it holds no coefficients, as files of version 0.1.0 and earlier may: make it again with "
-            "`neurolens train`, or export it with the version that made it"
+            f"{file}: it holds no coefficients, from which its graph would be built: export it again "
+            "(`neurolens train` fits the model and writes its file with them)"
         )
     try:
         with np.errstate(all="ignore"):
@@ -247,7 +247,6 @@ def onnx_of(
     metadata: Mapping[str, str] | None = None,
     *,
     derivatives: bool = False,
-    outputs: Sequence[str] = (),
 ) -> bytes:
     """The ONNX file of a model, whose inputs and outputs `export.export_onnx` describes.
 
@@ -255,7 +254,6 @@ def onnx_of(
         nodes: one model, or one for every node of the axes. Numbers that are equal at all nodes are constants; the
             others follow the features of the state (`Axis.features`), which costs a few operations a call.
         derivatives: whether the scene ray's derivatives by film and pupil point are outputs, too.
-        outputs: the only outputs wanted; empty: all.
 
     Raises:
         InputError: weights that float32 does not hold, and nodes whose graphs differ in more than numbers.
@@ -265,8 +263,6 @@ def onnx_of(
     if derivatives:
         graphs = [_with_ray_derivatives(graph) for graph in graphs]
         shapes = dict.fromkeys(DERIVATIVES, (2, 6))
-    for graph in graphs:
-        graph.outputs = {name: value for name, value in graph.outputs.items() if not outputs or name in outputs}
     return write_onnx(graphs, metadata or {}, mixing_of(axes) if axes else None, shapes)
 
 
