@@ -117,8 +117,8 @@ def run(args: argparse.Namespace) -> int:
     complete(args)
     _check(args)
     progress, began = Progress(quiet=args.quiet or args.json), time.perf_counter()
-    if args.preview:
-        progress.note(f"preview: {args.width} pixels wide, {args.bins} wavelengths, cells of {args.cell_px:g}")
+    if args.quick:
+        progress.note(f"quick: {args.width} pixels wide, {args.bins} wavelengths, cells of {args.cell_px:g}")
     states = list(_states(args))
     model = fitted(args, states)
     tabled = read_any(args.file) if model is None else model.lens

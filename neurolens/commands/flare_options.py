@@ -50,12 +50,13 @@ def _add_picture(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add_option(
         group, "--bins", old=("--wavelengths",), metavar="N", type=whole(1, 256), default=15,
-        help="wavelengths, in equal steps from 400 to 700 nm (default: 15)",
+        help="wavelengths of stars and photons, in equal steps from 400 to 700 nm; ghosts take what their colours "
+        "need, at most four times as many (default: 15)",
     )  # fmt: skip
     add_exposure(group, None, "99% of the lit pixels become no brighter than 0.8; frames share one value")
     add_colour_space(group, "; default: that of --image, else of a scene's [film] table, else sRGB")
-    group.add_argument(
-        "--preview", action="store_true",
+    add_option(
+        group, "--quick", old=("--preview",), action="store_true",
         help="at most 480 pixels wide, 5 wavelengths and 65536 photons a light and wavelength, --cell at least 24",
     )  # fmt: skip
 
@@ -137,7 +138,7 @@ def _factor(size: int) -> Callable[[str], tuple[str, tuple[float, ...]]]:
 def complete(args: argparse.Namespace) -> None:
     """Photons of what scatters where none were asked for, and the bounds of a preview."""
     args.glare = args.glare or _GLARE * any(getattr(args, name) > 0 for _, name, *_ in _SCATTER)
-    if args.preview:
+    if args.quick:
         vars(args).update({name: min(getattr(args, name), most) for name, most in _PREVIEW.items()})
         args.cell_px = max(args.cell_px, _PREVIEW_CELL)
 

@@ -32,6 +32,7 @@ from neurolens.render.scene import Scene
 Layers = dict[str, Floats]
 REST = "rest"
 _ONE = (1.0, 1.0, 1.0)
+_FINER = 4  # wavelengths of a ghost at most, for one of a star
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,8 @@ class FlareSettings:
     """What flare is made of, and how finely.
 
     Attributes:
-        wavelength_nm: range of light. wavelengths: of equal shares of it.
+        wavelength_nm: range of light. wavelengths: of equal shares of it, in stars and photons. A ghost has as many as
+            its colours need, at most four times as many.
         cell_px: size on film, about, of the cells that ghosts are drawn by.
         photons: if above 0, ghosts by photons with up to `most_reflections`, so many a light and wavelength, smoothed
             by kernels from radius `kernel_px` on, instead of by all pairs of reflections; 0 leaves them.
@@ -91,6 +93,10 @@ class FlareSettings:
             if not all(0 <= v < math.inf for v in factor):
                 raise InputError("flare", f"gain {name}", factor, "finite numbers of at least 0")
 
+    def makes(self, name: str) -> bool:
+        """Whether the layer of this name is switched on."""
+        return name not in self.without and bool({"glare": self.glare, "starburst": self.starburst}.get(name, True))
+
     def gain(self, *names: str) -> tuple[float, float, float]:
         """Factors of red, green and blue of what has these names."""
         r, g, b = np.prod([_ONE, *(factor for name, factor in self.gains if name in names)], 0)
@@ -111,7 +117,7 @@ def flare_layers(
     found: Layers = {}
     progress = progress or Progress(quiet=True)
     for name, make in MAKERS.items():
-        if name not in settings.without:
+        if settings.makes(name):
             with progress.stage(name) as report:
                 made = make(lens, lights, raster, settings, report)
             for picture in made.values():
@@ -245,19 +251,15 @@ def _bytes(pictures: int, layers: int) -> int:
 
 def _fineness(settings: FlareSettings) -> dict[str, Any]:
     """The settings that `ghost_layers` and `ghost_picture` have."""
-    names = "wavelength_nm", "wavelengths", "cell_px", "threads"
-    return {name: getattr(settings, name) for name in names}
+    names = "wavelength_nm", "cell_px", "threads"
+    return {name: getattr(settings, name) for name in names} | {"wavelengths": _FINER * settings.wavelengths}
 
 
 def _glare(lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, done: Report) -> Layers:
-    if not settings.glare:
-        return {}
     return {"glare": _photons(lens, lights, raster, settings, done, "glare", settings.glare)}
 
 
 def _starburst(lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, done: Report) -> Layers:
-    if not settings.starburst:
-        return {}
     return {
         "starburst": starburst_picture(
             lens, lights, raster, wavelength_nm=settings.wavelength_nm, wavelengths=settings.wavelengths,
