@@ -14,7 +14,7 @@ import math
 import os
 import resource
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -336,6 +336,7 @@ def lenses(count: int, place: Path) -> Iterator[None]:
     import shutil
 
     from neurolens.base.progress import Progress
+    from neurolens.base.tasks import Here
     from neurolens.evaluate.survey import SurveySettings, Task, run_task
     from neurolens.evaluate.survey_run import survey
     from neurolens.readers.any_format import collection_of
@@ -347,13 +348,16 @@ def lenses(count: int, place: Path) -> Iterator[None]:
     for k in range(count):
         shutil.copyfile(lens, place / "lenses" / f"{k:05d}.toml")
 
-    def engine(tasks: Iterable[Task]) -> Iterator[tuple[Task, bytes]]:
-        for task in tasks:
-            yield task, json.dumps(record | {"file": task.name, "fingerprint": task.fingerprint}).encode()
+    def renamed(task: Task) -> bytes:
+        return json.dumps(record | {"file": task.name, "fingerprint": task.fingerprint}).encode()
+
+    class Renamed(Here):
+        def submit(self, _: Any, /, *args: Any, **named: Any) -> Any:
+            return super().submit(renamed, *args, **named)
 
     yield
     for _ in range(2):  # the second time all of them are known
-        survey(collection_of(place / "lenses"), place / "out", settings, engine, Progress(quiet=True))
+        survey(collection_of(place / "lenses"), place / "out", settings, Renamed(), Progress(quiet=True))
 
 
 PROBES: dict[str, Callable[[int, Path], Iterator[None]]] = {

@@ -3,7 +3,7 @@
 base <- graph <- modelfile <- optics <- surrogates <- evaluate <- commands <- cli
                               optics <- analysis   <- evaluate
                  modelfile <- cameras <- render    <- evaluate
-                  surrogates, analysis, render <- flare <- evaluate
+                  surrogates, analysis, render <- flare <- evaluate <- frames <- commands
                                          render    <- mitsuba  <- evaluate
 """
 
@@ -38,10 +38,12 @@ PARTS = {
     },
     "view": {"graph", "optics", "analysis", "cameras", "flare"},
     "blender": set(),
+    "frames": {"optics", "readers", "cameras", "render", "flare", "evaluate"},
     "commands": {
         *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba", "flare"),
         "blender",
         "evaluate",
+        "frames",
         "view",
     },
     "cli": {"commands"},
@@ -62,7 +64,7 @@ PACKAGES = {
 # Besides those: the writer of ONNX; the one camera that traces rays exactly, the maker of cameras, which imports it
 # when one is asked for; the shapes of the stop, which are parts of graphs.
 EXCEPTIONS: dict[str, tuple[set[str], set[str]]] = {
-    "neurolens.base.engine": (set(), {"dask", "distributed"}),  # where a cluster is asked for
+    "neurolens.base.cluster": (set(), {"dask", "distributed"}),  # where a cluster is asked for
     "neurolens.graph.onnx": (set(), {"onnx"}),
     "neurolens.optics.apertures": ({"graph"}, set()),
     "neurolens.optics.sag": ({"optics"}, set()),  # for a type
@@ -75,7 +77,7 @@ EXCEPTIONS: dict[str, tuple[set[str], set[str]]] = {
 SLOW = {"neurolens.cameras.exact", "neurolens.cameras.outline_cache", "neurolens.commands.export_lens"}
 SLOW |= {"neurolens.graph.onnx"}
 # What loads in a base install: these parts, and what converts lens files, looks up glass and writes C.
-LEAN = ("graph", "modelfile", "cameras", "render", "mitsuba", "commands", "cli", "base", "readers")
+LEAN = ("graph", "modelfile", "cameras", "render", "mitsuba", "frames", "commands", "cli", "base", "readers")
 LEAN_MODULES = {
     *(f"neurolens.optics.{name}" for name in ("catalogue", "designs", "glass", "lensfile", "lenswriter", "paraxial")),
     "neurolens.surrogates.source",

@@ -5,25 +5,28 @@ from __future__ import annotations
 import argparse
 import math
 import platform
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neurolens.base.cluster import Dask
 from neurolens.base.errors import NeurolensError, printable
+from neurolens.base.travel import run_remotely
 from neurolens.commands.arguments import (
     QUIET_HELP,
+    add_dask,
     add_glass,
     add_lens,
     add_option,
     add_output,
     check_ids,
     check_run_folder,
+    more_glasses,
     whole,
 )
-from neurolens.commands.farm import Task, add_dask, files_of, spread
 
 if TYPE_CHECKING:
-    from neurolens.evaluate.methods import Bench, BenchSettings
+    from neurolens.evaluate.methods import BenchSettings
 
 SURROGATES = """\
 Fit every method for every lens on the same rays, measure errors, size and time against the exact
@@ -102,9 +105,13 @@ def run_surrogates(args: argparse.Namespace) -> int:
     again = args.restart
     if args.dask is not None:
         asked = [bench for bench in benches if again or lacks(bench, rows)]
-        with progress.stage(f"{len(asked)} of {len(benches)} lenses") as report:
-            tasks = [_task(args, bench) for bench in asked]
-            failed = spread(args.dask, tasks, {*files, *files_of(args)}, out, report) if tasks else {}
+        glasses = tuple(args.glass_files)
+        tasks = {
+            bench.name: _Task(bench.choice.file, settings, out / bench.name, tuple(args.methods), glasses)
+            for bench in asked
+        }
+        with progress.stage(f"{len(asked)} of {len(benches)} lenses") as report, Dask(args.dask) as executor:
+            failed = run_remotely(executor, bench_alone, tasks, {*files, *args.glass_files}, out, report)
         for name, why in failed.items():
             raise NeurolensError(f"{name}: {why}; finished records are kept: the same command resumes")
         again = False
@@ -117,19 +124,26 @@ def run_surrogates(args: argparse.Namespace) -> int:
     return 0
 
 
-def _task(args: argparse.Namespace, bench: Bench) -> Task:
-    alone = argparse.Namespace(**vars(args) | {"lenses": [bench.choice.file]})
-    return Task.of(bench.name, bench_alone, alone, args.out)
+@dataclass(frozen=True)
+class _Task:
+    """The records of one lens, in the folder of `out`, with the catalogues of glass that it needs."""
+
+    lens: Path
+    settings: BenchSettings
+    out: Path
+    methods: tuple[str, ...]
+    glass_files: tuple[Path, ...] = ()
 
 
-def bench_alone(args: argparse.Namespace) -> None:
-    """Make the records of the lenses, without pages, as a task of a cluster does."""
+def bench_alone(task: _Task) -> None:
+    """Make the records of a lens, without pages, as a task of a cluster does."""
     from neurolens.base.progress import Progress
     from neurolens.evaluate.experiment import LensChoice
     from neurolens.evaluate.methods import Bench, chosen_rows, run_bench
 
-    benches = [Bench(LensChoice(file), _settings(args), args.out) for file in args.lenses]
-    list(run_bench(benches, chosen_rows(args.methods), Progress(quiet=True)))
+    with more_glasses(task):
+        bench = Bench(LensChoice(task.lens), task.settings, task.out.parent)
+        list(run_bench([bench], chosen_rows(task.methods), Progress(quiet=True)))
 
 
 def _settings(args: argparse.Namespace) -> BenchSettings:

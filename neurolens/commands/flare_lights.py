@@ -9,11 +9,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, warn
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import aperture_of, positive, whole
-from neurolens.commands.render_files import warn
 
 if TYPE_CHECKING:
     from neurolens.cameras.field import Field
