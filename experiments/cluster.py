@@ -27,8 +27,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 from experiments import lab
-from experiments.growth import cpu_s, resident_kb
-from experiments.lab import Row
+from experiments.lab import Row, cpu_s, resident_kb
 from neurolens.base.cluster import Dask
 from neurolens.base.tasks import Shared, run_each
 

@@ -34,6 +34,7 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm
+from neurolens.optics.states import set_lens
 from neurolens.render.scene import Scene, load_scene
 from neurolens.surrogates.bases import pinned_threads
 
@@ -78,7 +79,7 @@ class Case:
 
     def load(self) -> tuple[Lens, Scene]:
         """The lens in its state, and the scene on a film that suits it."""
-        lens = read_lens(self.file).at(zoom=self.state)
+        lens = set_lens(read_lens(self.file), zoom=self.state)
         return lens, suited(load_scene(lab.SCENES / f"{self.scene}.toml"), lens)
 
     def shipped(self) -> list[Path]:

@@ -28,6 +28,7 @@ from neurolens.evaluate.costs import glsl_operations, ns_a_ray
 from neurolens.evaluate.experiment import near_limit_m
 from neurolens.evaluate.probe import COUNTED, LIGHT, Probed, probe
 from neurolens.optics.lensfile import read_lens
+from neurolens.optics.states import set_lens
 from neurolens.render.scene import load_scene
 from neurolens.surrogates.bases import pinned_threads
 
@@ -73,7 +74,7 @@ class Model:
 
 def measure_lens(name: str, folder: Path, report: Report) -> dict[str, Any]:
     """All shots of a lens."""
-    lens = read_lens(lab.LENSES / f"{name}.toml").at()
+    lens = set_lens(read_lens(lab.LENSES / f"{name}.toml"))
     shots = []
     terms = max(n for n in range(SHIPPED_TERMS + 1) if (lab.MODELS / f"{name}.ols-{n}.onnx").is_file())
     for number, sitting in enumerate(SITTINGS):

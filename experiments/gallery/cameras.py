@@ -35,10 +35,12 @@ from neurolens.evaluate.measure import fit_and_measure, known_record
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import film_z_mm, first_order
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.states import set_lens
 from neurolens.render.pictures import make_aperture
 from neurolens.render.scene import Scene
-from neurolens.surrogates.domain import Domain, domain_of
+from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.fit import ModelSettings, prepare
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
 _CLEAR = 0.95  # rims over the radius of curvature, at most
@@ -80,18 +82,18 @@ def shot_of(panel: Panel, scene: Scene) -> Shot:
     """The lens and the settings of a panel.
 
     Raises:
-        InputError: as `read_lens` and `Lens.at`.
+        InputError: as `read_lens` and `set_lens`.
     """
     camera = scene.settings.camera
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NeurolensWarning)  # a lens of one wavelength is what the file asks for
-        lens = read_lens(panel.lens).at(focal_length_mm=panel.efl_mm, field_deg=panel.field_deg, zoom=panel.zoom)
+        lens = set_lens(read_lens(panel.lens), focal_length_mm=panel.efl_mm, field_deg=panel.field_deg, zoom=panel.zoom)
     lens = widened(lens, panel.widen)
     shape = make_aperture(panel.blades, panel.blade_rotation_deg, panel.blade_curvature, panel.aperture_mask)
     lens = lens.with_aperture(shape or scene.aperture or lens.aperture)
     focus_m = camera.focus_m if panel.focus_m is None else panel.focus_m
     f_number = panel.f_number or camera.f_number or float(first_order(lens).f_number)
-    lens = lens.at(f_number=f_number, focus_m=focus_m, focus=panel.focusing)
+    lens = set_lens(lens, f_number=f_number, focus_m=focus_m, focus=panel.focusing)
     assert lens.film_z_mm is not None  # `at` places the film
     film_z = float(lens.film_z_mm) + panel.film_offset_mm
     lens = replace(lens, infinity_mm=())  # groups that have moved to focus stay there

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from neurolens.base.files import atomic_path, seal, sealed_bytes
 from neurolens.base.status import PASSED
 from neurolens.flare.area import draw_edges, edges_of
 from neurolens.flare.ghostmodel import GhostModel
-from neurolens.flare.ghosts import Four, GhostTracer, Way, four_reflections
+from neurolens.flare.ghosts import GhostTracer, Pair
 from neurolens.flare.grids import REACH, Grid, ghost_moves, grids_of
 from neurolens.flare.lights import Light, disc, light_rays, patches, rays_across
 from neurolens.flare.photons import LEVELS, Photons, PhotonTracer
@@ -41,8 +41,6 @@ from neurolens.render.colour import in_gamut
 from neurolens.render.spectrum import SpectralRange
 
 RANKED = 4096  # rays that decide which ghosts are brightest
-LEFT, SOME, MANY = 1e-3, 64, 2000  # of `with_four`
-_PROBES = 512  # rays
 _AT_ONCE = 1 << 16  # rays of a call
 _ENOUGH = 200  # photons of a kernel: a noise of 8%
 _WAIT_S = 0.5  # between two reports
@@ -56,7 +54,7 @@ FEWEST = 4  # wavelengths that stand for all
 _PATCH_DEG = 2.0  # of an extended light: see `patches`
 
 Doubles = NDArray[np.float64]
-_Task = tuple[Light, Way, Grid, list[float], Doubles]  # with wavelengths [K] and their colours [K, 3]
+_Task = tuple[Light, Pair, Grid, list[float], Doubles]  # with wavelengths [K] and their colours [K, 3]
 _T = TypeVar("_T")
 _R = TypeVar("_R")
 
@@ -93,7 +91,7 @@ class Ghost:
         passed: share of the rays at the front disc that arrive.
     """
 
-    pair: Way
+    pair: Pair
     energy: float
     centre_mm: tuple[float, float]
     size_mm: float
@@ -113,7 +111,7 @@ def ghost_table(
         image = GhostTracer(tracer.lens, []).trace(rays, wavelength_nm, direct=True)
         sums = np.concatenate([tracer.trace(rays, wavelength_nm).sums, image.sums])
     else:
-        sums = tracer.sums(tracer.start(rays), wavelength_nm, direct=True).sums
+        sums = tracer.sums(rays, wavelength_nm, direct=True)
     of_image, rows = sums[-1, 0], []
     for way, (power, *moments, lit) in zip(tracer.pairs, sums.tolist(), strict=False):
         if power > 0:
@@ -123,44 +121,7 @@ def ghost_table(
     return sorted(rows, key=lambda ghost: -ghost.energy)
 
 
-class Ways(NamedTuple):
-    """Ghosts of two reflections, and the strongest of four.
-
-    Attributes:
-        ways: the ghosts. fours: how many of four reflections the lens has. left: share of all ghosts' light on the
-            film's plane that those of four reflections have which are not among the ways.
-    """
-
-    ways: tuple[Way, ...]
-    fours: int
-    left: float
-
-
-def with_four(lens: Lens, lights: Sequence[Light], wavelength_nm: float = 550.0) -> Ways:
-    """All ghosts of two reflections, and of four reflections so many of the strongest that little light is left.
-
-    That is `LEFT` of all ghosts' light; but at least `SOME` ghosts, and at most `MANY`.
-
-    Raises:
-        InputError: more ghosts than `ghosts.MOST_WAYS`.
-    """
-    tracer, fours = GhostTracer(lens), four_reflections(lens)
-    energy, twice = np.zeros(len(fours)), 0.0
-    for light in lights:
-        rays, area = light_rays(lens, light, 0, _PROBES)
-        start = tracer.start(rays)
-        twice += area * sum(light.rgb) * float(tracer.sums(start, wavelength_nm).sums[:, 0].sum())
-        energy += area * sum(light.rgb) * tracer.sums(start, wavelength_nm, fours).sums[:, 0]
-    order = np.argsort(-energy, kind="stable")
-    left = energy.sum() - np.cumsum(energy[order])
-    whole = twice + energy.sum()
-    kept = int(np.clip(np.count_nonzero(left > LEFT * whole) + 1, SOME, MANY))
-    kept = min(kept, int(np.count_nonzero(energy)))
-    chosen = tuple(Four(*row) for row in fours[order[:kept]].tolist())
-    return Ways(tracer.pairs + chosen, len(fours), float(left[kept - 1] / whole) if kept else 0.0)
-
-
-def ghost_layout(lens: Lens, pair: Way, light: Light, lines: int = 9) -> Layout:
+def ghost_layout(lens: Lens, pair: Pair, light: Light, lines: int = 9) -> Layout:
     """The lens with rays of one ghost in the plane through the axis, of light as far off the axis as `light`.
 
     At most so many rays, evenly chosen of those that arrive.
@@ -295,7 +256,7 @@ def _draw(
     strips = [range(height)[k : k + high] for k in range(0, height, high)]
 
     def edges(task: _Task) -> tuple[list[Doubles], Doubles]:
-        """Of each wavelength, and light of their cells."""
+        """The edges of each wavelength's cells, and the light of the cells."""
         light, pair, grid, wavelengths_nm, colours = task
         if not work.step():
             return [], colours[:0]

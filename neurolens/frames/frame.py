@@ -40,7 +40,7 @@ class Frame:
 
     Attributes:
         scene: the scene file. camera: what `base.lensname.resolve` makes of a camera's name.
-        focus_m, f_number, efl_mm, zoom, field_deg, focusing, aperture, film_offset_mm, pupil, vignetting: as in
+        focus_m, f_number, efl_mm, zoom, field_deg, focusing, aperture, film_offset_mm, vignetting: as in
             `cameras.build.Shot`, where `focusing` is called `focus`.
         glass_files: catalogues of Zemax, whose glasses come before those that ship.
         position_m, look_at_m: where the camera stands, and a point on its optical axis.
@@ -62,7 +62,6 @@ class Frame:
     focusing: Literal["best", "paraxial", "internal"] = "best"
     aperture: Aperture | None = None
     film_offset_mm: float = 0.0
-    pupil: str = "outline"
     vignetting: str = "both"
     glass_files: tuple[Path, ...] = ()
     position_m: Vector | None = None
@@ -111,7 +110,6 @@ class Frame:
             # A scene's f-number is clamped to the lens; one of the frame must be possible.
             clamp_f_number=self.f_number is None,
             film_offset_mm=self.film_offset_mm,
-            pupil=self.pupil,
             vignetting=self.vignetting,
         )
 
