@@ -158,7 +158,7 @@ def trace_all(folder: Path, item: str, count: int) -> None:
     for number, file in enumerate(progress(files, item)):
         if (folder / f"{file.stem}.npz").exists():
             continue
-        lens, found = find("read_lens")(file).at(), {}
+        lens, found = set_lens(find("read_lens")(file)), {}
         every = range(len(lens.surfaces))
         pairs = list(itertools.combinations([k for k in every if lens.surfaces[k].n_d != lens.media[k].n_d], 2))
         share = len(range(number, 1000, len(files)))
