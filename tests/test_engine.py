@@ -301,14 +301,3 @@ def test_records_of_a_survey_are_those_of_one_machine(cluster: str, lenses: list
         )
         found.append({path.name: path.read_bytes() for path in (tmp_path / place / "records").iterdir()})
     assert found[0] == found[1] and len(found[0]) == 2
-
-
-@pytest.mark.slow
-def test_records_of_the_bench_are_those_of_one_machine(cluster: str, lenses: list[Path], tmp_path: Path) -> None:
-    asked = ("bench", str(lenses[0]), "--methods", "thin", "--quick", "--rays", "1000", "--rounds", "0")
-    found = []
-    for place, more in (("here", ()), ("there", ("--dask", cluster))):
-        assert main([*asked, "--quiet", "--output", str(tmp_path / place), *more]) == 0
-        (record,) = (tmp_path / place / "records" / "one").iterdir()
-        found.append(UNTIMED.sub(b"", record.read_bytes()))
-    assert found[0] == found[1]

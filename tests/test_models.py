@@ -21,6 +21,7 @@ from neurolens.evaluate.measure import FreshRays, fresh_rays, measure, onnx_pred
 from neurolens.modelfile import AVERAGED, POLARISED
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
+from neurolens.optics.states import set_lens
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.file import read_model
@@ -57,7 +58,7 @@ def model(file: str) -> OnnxLens:
 
 @cache
 def exact(lens_file: str, configuration: str | None, efl_mm: float | None) -> Lens:
-    return read_lens(ROOT / lens_file).at(zoom=configuration, focal_length_mm=efl_mm)
+    return set_lens(read_lens(ROOT / lens_file), zoom=configuration, focal_length_mm=efl_mm)
 
 
 def rays_of(file: str) -> FreshRays:

@@ -6,7 +6,7 @@ One code for both, so that they send the same rays for the same random numbers.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,16 +43,6 @@ class SceneRays(NamedTuple):
 SceneFunction = Callable[[FloatArray, FloatArray, FloatArray], SceneRays]
 
 
-class Pupil(Protocol):
-    """Where rays are sent through; a `PupilOutline`, or another shape that holds it."""
-
-    def sample(
-        self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Pupil points [2, N] in mm and the inverse of their densities [N] in mm^2; see `PupilOutline.sample`."""
-        ...
-
-
 class LensFilm:
     """Film and pupil of a lens at one focus and stop: from film points and random numbers to weighted rays.
 
@@ -61,9 +51,6 @@ class LensFilm:
         film_z_mm: film plane, lens frame.
         wavelength_nm: range of the wavelengths used.
         scene: the lens.
-
-    Attributes:
-        pupil: the shape that is sampled: the outline, or one put in its place that holds it.
 
     Raises:
         InputError: no ray passes from the film's centre.
@@ -77,7 +64,6 @@ class LensFilm:
         self.film_z_mm, self.scene = film_z_mm, scene
         self.distance_mm = film_z_mm - outline.pupil_z_mm
         self.outline = outline
-        self.pupil: Pupil = outline
         self.exposure = 1.0
         self.exposure = self._exposure_on_axis(wavelength_nm)
 
@@ -89,7 +75,7 @@ class LensFilm:
         `scene` stands in for the lens's own function, for one that gives more (`SceneRays.d_film`).
         """
         scene = scene or self.scene
-        pupil, area = self.pupil.sample(film_mm, square, wavelength_nm)
+        pupil, area = self.outline.sample(film_mm, square, wavelength_nm)
         lit = (area > 0) & is_light(wavelength_nm)
         if lit.all():
             return camera_rays(self._weighted(scene, film_mm, pupil, area, wavelength_nm))
@@ -123,7 +109,7 @@ class LensFilm:
 
     def natural(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
         """cos^4 of the angles between the axis and the rays of `sample` on the film's side."""
-        slope = (self.pupil.sample(film_mm, square, wavelength_nm)[0] - film_mm) * np.float32(1 / self.distance_mm)
+        slope = (self.outline.sample(film_mm, square, wavelength_nm)[0] - film_mm) * np.float32(1 / self.distance_mm)
         cos4: FloatArray = np.square(1 / (1 + np.einsum("in,in->n", slope, slope)))
         return cos4
 

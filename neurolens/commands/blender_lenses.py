@@ -66,11 +66,13 @@ def _made_form(file: Path, zoom: str | None, quiet: bool) -> Form:
 
 def _squeeze(file: Path, zoom: str | None) -> float:
     """See `cameras.lens_state`."""
+    from neurolens.optics.states import set_lens
+
     if not is_model(file):
         from neurolens.optics.paraxial import first_order
         from neurolens.readers.any_format import read_any
 
-        lens = read_any(file).at(zoom=zoom)
+        lens = set_lens(read_any(file), zoom=zoom)
         across = first_order(lens, meridian="x") if lens.anamorphic else first_order(lens)
         return abs(float(first_order(lens).efl_mm / across.efl_mm))
     from neurolens.cameras.build import Shot, make_camera
@@ -147,6 +149,7 @@ def packed_of(
         lens: its prescription, for the thumbnail, where it is at hand.
     """
     from neurolens.optics.paraxial import first_order
+    from neurolens.optics.states import set_lens
 
     first, ranged = files[0], zoom == RANGE
     if is_model(first):
@@ -158,7 +161,7 @@ def packed_of(
     else:
         from neurolens.readers.any_format import read_any
 
-        lens = read_any(first).at(zoom=None if zoom == RANGE else zoom)
+        lens = set_lens(read_any(first), zoom=None if zoom == RANGE else zoom)
         data = first_order(lens)
         name, efl, f_number, source = lens.name, data.efl_mm, data.f_number, lens.source
     picture = None if lens is None else thumbnail(lens)
@@ -174,6 +177,7 @@ def stated_lens(model: Path, lenses: Path) -> Lens | None:
     """The prescription of a model of one state of a lens file, scaled or zoomed, or of its range; None without it."""
     from neurolens.optics.lensfile import read_lens
     from neurolens.optics.paraxial import first_order
+    from neurolens.optics.states import set_lens
 
     told = _card(model)["lens"]
     file = lenses / f"{safe_name(told['id'])}.toml"
@@ -182,7 +186,7 @@ def stated_lens(model: Path, lenses: Path) -> Lens | None:
     lens, efl = read_lens(file), float(told["efl_mm"])
     if math.isclose(first_order(lens).efl_mm, efl, rel_tol=1e-3):
         return lens
-    return lens.at(zoom=str(efl)) if lens.configurations else lens.at(focal_length_mm=efl)
+    return set_lens(lens, zoom=str(efl)) if lens.configurations else set_lens(lens, focal_length_mm=efl)
 
 
 def field_table(lens: Lens, radius_mm: float) -> dict[str, Any] | None:
@@ -257,6 +261,8 @@ def library(folder: Path, lenses: Path, chosen: Sequence[str]) -> Iterator[tuple
 
 def thumbnail(lens: Lens) -> bytes | None:
     """The section of a lens as a PNG of 256 by 256 pixels; None where torch or matplotlib is missing."""
+    from neurolens.optics.states import set_lens
+
     if find_spec("torch") is None or find_spec("matplotlib") is None:
         return None
     from neurolens.analysis.fields import Scene
@@ -267,7 +273,7 @@ def thumbnail(lens: Lens) -> bytes | None:
         figure = new_figure(_SIDE_IN, _SIDE_IN)
         figure.set_layout_engine("none")
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-        layout = layout_profile(Scene(lens.at(), axis="y"))
+        layout = layout_profile(Scene(set_lens(lens), axis="y"))
         layout = replace(layout, rays=tuple(ray for ray in layout.rays if ray.field != 1))  # of the axis and the edge
         draw_section(axes, layout, lw=0.5)
         arcs = np.concatenate([s.arc() for s in layout.surfaces])  # the glass fills the picture: menus show it small

@@ -284,12 +284,13 @@ def _given(texts: list[str]) -> dict[str, list[float]]:
 def _fix(given: dict[str, list[float]], model: LensModel) -> Fix:
     from neurolens.optics.focusing import best_focus_z_mm
     from neurolens.optics.paraxial import film_z_mm
+    from neurolens.optics.states import set_lens
     from neurolens.surrogates.specialise import Fix
 
     film_z = given.get("film_z", [None])[0]
     stop = given.get("stop", [None])[0]
     if "f_number" in given:
-        stop = model.lens.at(f_number=given["f_number"][0]).stop_radius_mm
+        stop = set_lens(model.lens, f_number=given["f_number"][0]).stop_radius_mm
     if "focus" in given:
         focus_m, lens = given["focus"][0], model.lens if stop is None else model.lens.with_stop_radius(stop)
         Fix(film_z_mm=film_z_mm(lens, focus_m)).check(model.domain)

@@ -62,8 +62,7 @@ def fitted(args: argparse.Namespace, states: Sequence[argparse.Namespace]) -> Gh
     from neurolens.flare.ghostfile import read_ghosts
 
     other = [name for name in given_options(args) if name not in _FREE]
-    other += [f"--{name}" for name in ("coating", "photons", "polarised") if getattr(args, name)]
-    other += ["--reflections"] * args.fours
+    other += [f"--{name}" for name in ("coating", "photons") if getattr(args, name)]
     other += ["--key focus"] * any(math.isfinite(s.focus) for s in states)
     other += ["--key zoom"] * any(s.zoom is not None for s in states)
     if other:
@@ -80,8 +79,10 @@ def stopped(args: argparse.Namespace, model: GhostModel) -> GhostModel:
     Raises:
         InputError: a stop wider than that of the fit.
     """
+    from neurolens.optics.states import set_lens
+
     lens = model.lens.with_aperture(aperture_of(args))
-    return replace(model, lens=lens if args.f_number is None else lens.at(f_number=args.f_number))
+    return replace(model, lens=lens if args.f_number is None else set_lens(lens, f_number=args.f_number))
 
 
 def run_fit(args: argparse.Namespace, lens: Lens | None, model: GhostModel | None) -> int:

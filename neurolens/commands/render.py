@@ -349,16 +349,19 @@ def shot_of(settings: CameraSettings, args: argparse.Namespace, aperture: Apertu
         # A scene's f-number is clamped to the lens; one of the command line must be possible.
         clamp_f_number=args.f_number is None,
         film_offset_mm=args.film_offset,
-        pupil=args.pupil,
         vignetting=args.vignetting,
     )
 
 
 def picture_size(settings: CameraSettings, width: int | None, height: int | None) -> tuple[int, int]:
     """Width and height; a missing one follows from the other and the film's shape."""
-    shape = settings.film_width_mm / settings.film_height_mm
     if width is None and height is None:
         return settings.width, settings.height
+    return size_by_shape(settings.film_width_mm / settings.film_height_mm, width, height)
+
+
+def size_by_shape(shape: float, width: int | None, height: int | None) -> tuple[int, int]:
+    """Width and height of a film of this width over height, of which one may be missing."""
     found_width = max(1, round((height or 0) * shape)) if width is None else width
     return found_width, max(1, round(found_width / shape)) if height is None else height
 

@@ -232,6 +232,7 @@ def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str], shaders: Mappi
     Raises:
         InputError: models of another state; a lens that the exact tracer's code cannot hold, without any model.
     """
+    from neurolens.optics.states import set_lens
     from neurolens.view.page import ViewLens
     from neurolens.view.shaders import ghosts_glsl
 
@@ -239,7 +240,7 @@ def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str], shaders: Mappi
     drawn: dict[str, Any] = {}
     path = None
     if entry.lens is not None and entry.file is not None:
-        lens = entry.lens.at() if entry.zoom == RANGE else entry.lens.at(zoom=entry.zoom)
+        lens = set_lens(entry.lens) if entry.zoom == RANGE else set_lens(entry.lens, zoom=entry.zoom)
         try:
             forms.append(_exact_form(entry, entry.file, lens, kinds, shaders.get(entry.file)))
             path = _path(lens) if entry.zoom != RANGE else None
@@ -260,10 +261,11 @@ def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str], shaders: Mappi
 
 def _squeeze(entry: _Entry) -> float:
     from neurolens.optics.paraxial import first_order
+    from neurolens.optics.states import set_lens
 
     if entry.lens is None or not entry.lens.anamorphic:
         return 1.0
-    lens = entry.lens.at()
+    lens = set_lens(entry.lens)
     return abs(float(first_order(lens).efl_mm / first_order(lens, meridian="x").efl_mm))
 
 

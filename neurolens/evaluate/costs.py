@@ -80,7 +80,7 @@ def rest_ns(scene: Scene, camera: Camera) -> float:
 
 
 def glsl_operations(camera: OnnxCamera | ExactCamera) -> int:
-    """Of a ray of `neurolens export --whole-camera --to glsl`: floats, a fused multiply-add is one.
+    """Count the operations of a ray of `neurolens export --whole-camera --to glsl`; a fused multiply-add counts as one.
 
     Raises:
         InputError: a lens or model that has no such form.

@@ -68,7 +68,7 @@ class FreshRays:
     near: Tensor
 
     def stop_radius_mm(self, state: str) -> float:
-        """Of one of `STOPS`."""
+        """The radius of one of `STOPS`, in mm."""
         return self.domain.stop_radius_mm / math.sqrt(2) ** STOPS[state]
 
 

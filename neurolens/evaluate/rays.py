@@ -86,7 +86,7 @@ class RayErrors:
 
     @classmethod
     def over(cls, lens: Lens, domain: Domain, each: EachRay) -> RayErrors:
-        """Of errors ray by ray."""
+        """Summarise errors that are known ray by ray."""
         pitch, focus = pixel_um(domain), _spread(each.focus_um)
         position, transmittance = _spread(each.position_um), _spread(each.transmittance)
         return cls(

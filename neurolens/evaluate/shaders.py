@@ -138,6 +138,7 @@ def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLe
     from neurolens.modelfile.axes import product, weights
     from neurolens.optics.focusing import focus_states
     from neurolens.optics.pupils import pupil_plane_z_mm
+    from neurolens.optics.states import set_lens
     from neurolens.optics.tracegraph import TRANSMITTANCE
     from neurolens.readers.any_format import read_any
     from neurolens.surrogates.states import StateSpace, axes_of, gap_axis
@@ -149,7 +150,7 @@ def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLe
     told = [f"{lens.name}: every surface traced, {lens.source} (sha256 {str(lens.sha256)[:16]})."]
     told.append(TRANSMITTANCE)
     if not (ranged or internal):
-        at = lens.at(zoom=state)
+        at = set_lens(lens, zoom=state)
         return lens.lens_id, osl_lens([_traced(at, pupil_plane_z_mm(at))], report), told
     space = StateSpace(lens, axes_of(lens, zoom=ranged, internal=internal, state=state), state)
     if len(space.axes) == 1:

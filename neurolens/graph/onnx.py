@@ -68,7 +68,7 @@ def write_onnx(
 
 
 def _shape(node: Node) -> list[int | str]:
-    """Of an input or a table."""
+    """The shape of an input or a table."""
     if node.kind == "table":
         return ["cells", node.rows]
     return [node.rows] if node.per_call else [node.rows, "N"]

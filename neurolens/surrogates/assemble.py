@@ -89,7 +89,7 @@ def model_graph(model: LensModel, form: Form, parts: Parts = ALL) -> Graph:
 
 
 def units_of(model: LensModel, series: DirectionSeries, form: Form) -> Units:
-    """Of a core whose outputs `add_outputs` takes: mm, and kappa rad."""
+    """The units of a core whose outputs `add_outputs` takes: mm, and kappa rad."""
     return Units((model.scales.position_mm, series.kappa, model.scales.stop_mm), form.gate_scale)
 
 

@@ -276,7 +276,7 @@ class InvariantPolynomial(_Symmetric):
 @stored_as("mirror")
 @dataclass(frozen=True, eq=False)
 class MirrorPolynomial(_Symmetric):
-    """Of a lens with two planes of symmetry: out_x = A_x p_x + B_x u_x, and y likewise.
+    """The polynomial of a lens with two planes of symmetry: out_x = A_x p_x + B_x u_x, and y likewise.
 
     Attributes:
         exponents: [M, 7] int64 of p_x^2, p_x u_x, u_x^2, the same of y, w; rows are unique.
@@ -292,7 +292,7 @@ class MirrorPolynomial(_Symmetric):
 
     @cached_property
     def coefficients_per_vector(self) -> int:
-        """Of one vector's two components together, the larger of position and direction."""
+        """The coefficients of a vector's two components together, the larger of position and direction."""
         return int((self.ab[:2] != 0).sum((1, 2, 3)).max())
 
 
@@ -401,7 +401,7 @@ class Composite(Core):
 
     @property
     def coefficients_per_vector(self) -> int:
-        """Of all parts together."""
+        """The coefficients of all parts together."""
         return sum(part.coefficients_per_vector for part in self.parts)
 
     @property

@@ -16,6 +16,7 @@ from neurolens.optics.focusing import film_range_mm
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm, pupil_bounds
+from neurolens.optics.states import set_lens
 from neurolens.surrogates.model import Domain
 
 # The disc on the pupil plane is that of all passing rays, enlarged by this much (design: "enlarged by 5%").
@@ -162,7 +163,9 @@ def domain_from_camera(
     The lit film may be smaller than the crop (fisheyes); the smaller radius rules. `nearest_m` is the distance from the
     film of the nearest object in view: objects before the plane in focus keep their place then.
     """
-    stopped = lens.at(f_number=f_number, focus_m=focus_m) if f_number is not None else lens.at(focus_m=focus_m)
+    stopped = (
+        set_lens(lens, f_number=f_number, focus_m=focus_m) if f_number is not None else set_lens(lens, focus_m=focus_m)
+    )
     corner = math.hypot(*film_mm) / 2
     radius = min(corner, image_radius_mm(lens)[0])
     focus = (focus_m, focus_m)

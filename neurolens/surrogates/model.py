@@ -128,7 +128,7 @@ class Encoding:
 
     @property
     def pupil_scales_mm(self) -> tuple[float, float]:
-        """Of x and of y."""
+        """The pupil scales of x and of y, in mm."""
         return self.pupil_scale_mm, self.pupil_scale_mm if self.pupil_scale_y_mm is None else self.pupil_scale_y_mm
 
     def planes(self, rays: FilmRays) -> tuple[Tensor, Tensor]:

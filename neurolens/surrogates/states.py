@@ -21,6 +21,7 @@ from neurolens.optics.focusing import film_range_mm, infinity_states, nearest_fo
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm
+from neurolens.optics.states import set_lens
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.model import Domain, LensModel, mixed
 
@@ -85,9 +86,9 @@ class StateSpace:
 
     def _lens(self, zoom: str | float | None, focus_m: float | None) -> Lens:
         if focus_m is None:
-            return self.lens.at(zoom=zoom, f_number=self.f_number)
+            return set_lens(self.lens, zoom=zoom, f_number=self.f_number)
         distance = None if math.isinf(focus_m) else focus_m
-        return self.lens.at(zoom=zoom, f_number=self.f_number, focus="internal", focus_m=distance)
+        return set_lens(self.lens, zoom=zoom, f_number=self.f_number, focus="internal", focus_m=distance)
 
     def domain_at(self, state: Sequence[float]) -> Domain:
         """The domain of a state: the full lit film, and the film positions that focusing by the film needs.
@@ -126,7 +127,7 @@ def zoom_axis(lens: Lens, degree: int | None = None) -> Axis:
     Raises:
         InputError: a file with fewer than two zoom states.
     """
-    found = sorted((float(first_order(lens.at(zoom=s.name)).efl_mm), s.name) for s in infinity_states(lens))
+    found = sorted((float(first_order(set_lens(lens, zoom=s.name)).efl_mm), s.name) for s in infinity_states(lens))
     knots: list[float] = []
     for efl, _ in found:
         if not knots or efl > knots[-1] * (1 + _SAME):
@@ -147,7 +148,7 @@ def focus_axis(lens: Lens, zoom: Sequence[str | float | None] = (None,), degree:
     Raises:
         InputError: a file without focus states.
     """
-    nearest = max(nearest_focus_m(lens.at(zoom=z)) for z in zoom)
+    nearest = max(nearest_focus_m(set_lens(lens, zoom=z)) for z in zoom)
     return Axis("focus", "1/m", (0.0, (1 - 1e-9) / nearest), degree)
 
 

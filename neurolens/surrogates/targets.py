@@ -77,7 +77,7 @@ class Prepared:
 
     @cached_property
     def boundary_weights(self) -> tuple[Tensor, Tensor]:
-        """Of the gates [G, N] and of the stop crossing [N]."""
+        """The weights of the gates [G, N] and of the stop crossing [N]."""
         return boundary_weights(self.pairs.lens, self.gates, self.boundary)
 
 

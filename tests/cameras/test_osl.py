@@ -31,6 +31,7 @@ from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.pupils import pupil_plane_z_mm
+from neurolens.optics.states import set_lens
 from neurolens.optics.tracegraph import exact_graph
 
 MODEL = ROOT / "models" / f"{GAUSS.stem}.ols-36.onnx"
@@ -196,7 +197,7 @@ def test_groups_of_a_lens_file_move_where_the_camera_is_focused(coarse: None) ->
     assert passed.mean() > 0.5
     start, way = (np.array([found[f"{name}_{k}"][passed] for k in range(3)]) for name in ("position", "direction"))
     # All rays of a film point meet where the lens, its groups moved, has the point's image.
-    lens = read_lens(file).at(focus="internal", focus_m=focus_m)
+    lens = set_lens(read_lens(file), focus="internal", focus_m=focus_m)
     data = first_order(lens)
     away = (focus_m * 1e3 + data.front_principal_z_mm - lens.film_z_mm) / 1e3  # from the front principal plane
     plane = start + (focus_m - start[2]) / way[2] * way

@@ -46,7 +46,6 @@ COMMANDS = {
     "export camera": "export {} --to glsl --camera -o NAME.glsl",
     "blender": "blender add {} --to NAME",
     "view": "view {} -o NAME.html",
-    "bench": "bench {} -o NAME",
     "train": "train --lens {} -o NAME",
     "experiment": "train EXPERIMENT -o NAME",
     "library": "library {} -o NAME",

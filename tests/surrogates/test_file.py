@@ -23,6 +23,7 @@ from neurolens.graph.scalars import lower
 from neurolens.modelfile import MODEL_KEY
 from neurolens.modelfile.metadata import read_metadata
 from neurolens.optics.lensfile import read_lens
+from neurolens.optics.states import set_lens
 from neurolens.surrogates.file import onnx_of, read_model
 
 ROOT = Path(__file__).parents[2]
@@ -71,7 +72,7 @@ def agrees_with_its_nodes(
 
 def _cosine_at_front(ray: NDArray[np.float32]) -> NDArray[np.float32]:
     """The cosine between rays [6, N] of the fisheye and the normal of its front sphere."""
-    c = float(read_lens(lens_models.LENSES / f"{lens_models.FISHEYE}.toml").at().surfaces[0].curvature)
+    c = float(set_lens(read_lens(lens_models.LENSES / f"{lens_models.FISHEYE}.toml")).surfaces[0].curvature)
     x, y = c * ray[:2]
     return np.abs(ray[3] * x + ray[4] * y - ray[5] * np.sqrt(1 - x * x - y * y))
 

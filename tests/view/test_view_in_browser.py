@@ -22,6 +22,7 @@ from neurolens.flare.ghostfit import GhostSettings, fit_ghosts
 from neurolens.flare.lights import Light
 from neurolens.flare.picture import Raster, ghost_picture
 from neurolens.optics.lensfile import read_lens
+from neurolens.optics.states import set_lens
 from neurolens.render.renderer import render
 from neurolens.render.scene import scene_from_tables
 from neurolens.surrogates.source import export_source
@@ -216,7 +217,7 @@ def test_other_lenses_too(others: Opened, key: str) -> None:
 
 
 def test_a_lamp_is_dragged_and_its_ghosts_are_those_of_neurolens_flare(browser: Any, tmp_path: Path) -> None:
-    lens = read_lens(ROOT / "lenses" / "brendel_tessar_100.toml").at(focus_m=np.inf)
+    lens = set_lens(read_lens(ROOT / "lenses" / "brendel_tessar_100.toml"), focus_m=np.inf)
     model = fit_ghosts(lens, GhostSettings(angle_deg=25.0, keep=0.8, rays=2000, target_um=60.0))
     words = ["brendel_tessar_100", str(write_ghosts(model, tmp_path / "ghosts.onnx")), "--downloads", "glsl"]
     assert main(["view", *words, "-o", str(tmp_path / "view.html"), "--json"]) == 0
