@@ -47,8 +47,6 @@ from typing import Any
 import numpy as np
 import onnxruntime
 
-from neurolens.optics.states import set_lens
-
 Out = dict[str, Any]  # arrays by the name of the output
 Model = Callable[[Out], Out]
 BATCH = 16384
@@ -98,13 +96,18 @@ def find(name: str) -> Any:
     return getattr(importlib.import_module(".".join(files[0].relative_to(root).with_suffix("").parts)), name)
 
 
+def placed(lens: Any) -> Any:
+    """The lens with its film placed; in trees before `set_lens` that was a method."""
+    return lens.at() if hasattr(lens, "at") else find("set_lens")(lens)
+
+
 def fit_all(folder: Path) -> None:
     """Fit every row of `experiments surrogates` on few rays, and a zoom: NAME.npz of coefficients, NAME.onnx each."""
     import torch
 
     @functools.cache
     def prepared(name: str) -> Any:
-        lens = set_lens(find("read_lens")(f"lenses/{name}.toml"))
+        lens = placed(find("read_lens")(f"lenses/{name}.toml"))
         domain = find("DomainChoice")(focus_m=(math.inf, math.inf)).of(lens)
         return find("prepare")(find("make_pairs")(lens, domain, find("PairSettings")(3000, 300, 3000)))
 
@@ -158,8 +161,7 @@ def trace_all(folder: Path, item: str, count: int) -> None:
     for number, file in enumerate(progress(files, item)):
         if (folder / f"{file.stem}.npz").exists():
             continue
-        lens = find("read_lens")(file).at()
-        found: Out = {}
+        lens, found = placed(find("read_lens")(file)), dict[str, Any]()
         every = range(len(lens.surfaces))
         pairs = list(itertools.combinations([k for k in every if lens.surfaces[k].n_d != lens.media[k].n_d], 2))
         share = len(range(number, 1000, len(files)))

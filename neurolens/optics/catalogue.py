@@ -137,17 +137,27 @@ _REFUSED: dict[str, str] = {}
 
 
 def add(glasses: Iterable[Glass], refused: Mapping[str, str]) -> None:
-    """Put glasses before those of the table until `remove_added`; `refused`: why others are not there, by name."""
+    """Put glasses before those of the table until `restore`; `refused`: why others are not there, by name."""
     for glass in glasses:
         for key in (_key(glass.name), _key(str(glass))):
             _ADDED.setdefault(key, []).insert(0, glass)
     _REFUSED.update({_key(name): reason for name, reason in refused.items()})
 
 
-def remove_added() -> None:
-    """Forget what `add` has put in."""
+Added = tuple[dict[str, list[Glass]], dict[str, str]]
+
+
+def added() -> Added:
+    """What `add` has put in so far."""
+    return {key: [*glasses] for key, glasses in _ADDED.items()}, dict(_REFUSED)
+
+
+def restore(before: Added) -> None:
+    """Keep what `added` returned alone."""
     _ADDED.clear()
     _REFUSED.clear()
+    _ADDED.update(before[0])
+    _REFUSED.update(before[1])
 
 
 def find(name: str, file: str | Path = "glass catalogue", where: str = "glass") -> Glass:
