@@ -27,7 +27,8 @@ from neurolens.evaluate.measure import onnx_predictor
 from neurolens.evaluate.vignetting import SEED, false_shares
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.states import set_lens
-from neurolens.surrogates.domain import Domain, sample_domain
+from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import trace_pairs
 
 _BATCH = 65536

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from experiments.published import PUBLISHED, fit_any
 from neurolens import __version__
@@ -25,11 +25,10 @@ from neurolens.evaluate.records import plain
 from neurolens.evaluate.speed import Race, race
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm
-from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, prepare
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.precision import Precision, store_weights
 
 GROUPS = {
     "paraxial": "what renderers use today",
@@ -77,14 +76,12 @@ class Row:
         group: of `GROUPS`.
         settings: of the fit.
         source: the paper, or what an ablation changes.
-        weights: how a network's weights are stored in the file, where not in float32.
     """
 
     name: str
     group: str
     settings: ModelSettings
     source: str = ""
-    weights: Precision | None = None
 
 
 def _ours() -> tuple[ModelSettings, ...]:
@@ -112,8 +109,6 @@ def all_rows() -> tuple[Row, ...]:
     for method in PUBLISHED.values():
         rows += [Row(s.label, "published", s, method.citation) for s in method.presets]
     rows += [Row(s.label, "ours", s) for s in _ours()]
-    network = ModelSettings("mlp")
-    rows += [Row(f"{network.label}-{p}", "ours", network, weights=p) for p in get_args(Precision)]
     return tuple([*rows, *_ablations()])
 
 
@@ -200,7 +195,7 @@ class Bench:
         asked = [
             __version__, self.lens.sha256, self.lens.stop_radius_mm, self.lens.image_radius_mm,
             asdict(self.settings.domain), asdict(self.settings.pairs), self.settings.vignetting_rays,
-            asdict(row.settings), *([row.weights] if row.weights else []),
+            asdict(row.settings),
         ]  # fmt: skip
         return fingerprint_of(asked)
 
@@ -256,8 +251,6 @@ def _fit_and_measure(bench: Bench, row: Row, report: Report) -> dict[str, Any]:
     model = fit_any(prepared, row.settings, report)
     file.parent.mkdir(parents=True, exist_ok=True)
     export_onnx(model, file, {})
-    if row.weights:
-        store_weights(file, file, row.weights, {})
     found = measure(bench.rays, onnx_predictor(load_model(file)))
     figures = {key: found.figures[key] for key in _FIGURES}
     # Micrometres at the common scale of lenses of different size.

@@ -11,7 +11,7 @@ from experiments.methods import GROUPS
 from neurolens.base.files import atomic_write_text
 from neurolens.evaluate.pages import DASH, Column, Record, number, show
 from neurolens.evaluate.plots import Kinds, trade_plot
-from neurolens.surrogates.source import MOST_WEIGHTS
+from neurolens.graph.scalars import MOST_WEIGHTS
 
 COLUMNS = (
     Column("RMS um", "rms_um_at_21_6"),

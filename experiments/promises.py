@@ -30,7 +30,8 @@ from neurolens.evaluate.speed import Race, race
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.states import set_lens
 from neurolens.render.scene import load_scene
-from neurolens.surrogates.domain import Domain, domain_of
+from neurolens.surrogates.domain import domain_of
+from neurolens.surrogates.model import Domain
 
 
 @dataclass(frozen=True)

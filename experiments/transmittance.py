@@ -23,7 +23,8 @@ from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.sequence import follow
 from neurolens.optics.states import set_lens
-from neurolens.surrogates.domain import Domain, domain_of, sample_domain
+from neurolens.surrogates.domain import domain_of, sample_domain
+from neurolens.surrogates.model import Domain
 
 COATINGS = {"bare": None, "coated": "quarter-wave"}
 

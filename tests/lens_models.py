@@ -24,11 +24,11 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.states import set_lens
 from neurolens.surrogates.cores import Network
-from neurolens.surrogates.domain import Domain, domain_of
+from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.gates import gate_values
-from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.model import Domain, LensModel
 from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs
 from neurolens.surrogates.specialise import at_wavelength
 from neurolens.surrogates.targets import scales_of, targets_of

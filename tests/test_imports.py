@@ -1,8 +1,8 @@
 """The folders are layers: imports go one way and in no circle, a render needs no torch, and the package stays small.
 
-base <- graph <- modelfile <- optics <- surrogates <- evaluate <- commands <- cli
+base <- graph <- modelfile <- optics <- models <- surrogates <- evaluate <- commands <- cli
                               optics <- analysis   <- evaluate
-                 modelfile <- cameras <- render    <- evaluate
+                    models <- cameras <- render    <- evaluate
                   surrogates, analysis, render <- flare <- evaluate
                                          render    <- mitsuba  <- evaluate
 """
@@ -20,6 +20,8 @@ MAX_LINES = 500
 BASE = {"base"}
 # What cameras need of optics: modules without torch, open to all parts.
 TORCH_FREE_OPTICS = {f"neurolens.optics.{name}" for name in ("apertures", "film_plane", "sag")}
+# Models from their files, without torch, which cameras need. Whoever may import surrogates may import these, too.
+MODELS = {f"neurolens.surrogates.{name}" for name in ("assemble", "cores", "file", "inverse", "model")}
 # Parts of the package that each part may import, besides itself and the base.
 PARTS = {
     "graph": set(),
@@ -28,7 +30,8 @@ PARTS = {
     "readers": {"optics"},
     "analysis": {"optics"},
     "surrogates": {"graph", "modelfile", "optics"},
-    "cameras": {"graph", "modelfile"},
+    "models": {"graph", "modelfile", "optics"},
+    "cameras": {"graph", "modelfile", "models"},
     "render": {"cameras"},
     "mitsuba": {"cameras", "render"},
     "flare": {"graph", "modelfile", "optics", "analysis", "surrogates", "cameras", "render"},
@@ -54,15 +57,18 @@ PACKAGES = {
     "analysis": {"numpy", "torch", "matplotlib"},
     "mitsuba": {"numpy"},
     "readers": set(),
-    "cameras": {"numpy", "onnxruntime", "onnx"},  # onnx when a camera is first asked for rays: it loads slowly
+    "cameras": {"numpy", "onnxruntime"},
     "render": {"numpy", "OpenEXR", "PIL"},
     "blender": {"bpy", "cycles"},  # of Blender's own Python, in the extension
 }
-# Besides those: the writer of ONNX; the one camera that traces rays exactly, the maker of cameras, which imports it
+# Besides those: the one camera that traces rays exactly, the maker of cameras, which imports it
 # when one is asked for; the shapes of the stop, which are parts of graphs.
 EXCEPTIONS: dict[str, tuple[set[str], set[str]]] = {
     "neurolens.base.engine": (set(), {"dask", "distributed"}),  # where a cluster is asked for
-    "neurolens.graph.onnx": (set(), {"onnx"}),
+    # Methods that take tensors: torch is loaded where one is called.
+    "neurolens.surrogates.cores": ({"surrogates"}, {"torch"}),
+    "neurolens.surrogates.model": ({"surrogates"}, {"torch"}),
+    "neurolens.surrogates.inverse": ({"surrogates"}, {"torch"}),
     "neurolens.optics.apertures": ({"graph"}, set()),
     "neurolens.optics.sag": ({"optics"}, set()),  # for a type
     "neurolens.cameras.exact": ({"optics"}, {"torch"}),
@@ -70,13 +76,13 @@ EXCEPTIONS: dict[str, tuple[set[str], set[str]]] = {
     "neurolens.cameras.build": ({"optics", "readers"}, set()),
     "neurolens.cameras.field": ({"optics"}, set()),  # first-order data of lenses that are traced
 }
-# Modules that load torch or onnx; others load these when they are needed.
+# Modules that load torch; others load these when they are needed.
 SLOW = {"neurolens.cameras.exact", "neurolens.cameras.outline_cache", "neurolens.commands.export_lens"}
-SLOW |= {"neurolens.graph.onnx"}
 # What loads in a base install: these parts, and what converts lens files, looks up glass and writes C.
 LEAN = ("graph", "modelfile", "cameras", "render", "mitsuba", "commands", "cli", "base", "readers")
 LEAN_MODULES = {
     *(f"neurolens.optics.{name}" for name in ("catalogue", "designs", "glass", "lensfile", "lenswriter", "paraxial")),
+    *MODELS,
     "neurolens.surrogates.source",
 }
 
@@ -112,6 +118,8 @@ IMPORTED = {module_name(path): imported(path) for path in MODULES}
 
 def part_of(module: str) -> str:
     """First folder or module below the package; "base" for the modules that everybody may import."""
+    if ".".join(module.split(".")[:3]) in MODELS:
+        return "models"
     name = module.split(".")[1] if "." in module else "__init__"
     shared = ".".join(module.split(".")[:3]) in TORCH_FREE_OPTICS
     return "base" if shared or name in BASE else name
@@ -130,6 +138,7 @@ def test_imports_go_one_way() -> None:
             # `from neurolens import __version__` is open to all.
             parts = {part_of(name) for name in names if name.startswith("neurolens.")} - {"__version__"}
             allowed = {part, "base"} | PARTS.get(part, set()) | own_parts
+            allowed |= {"models"} if "surrogates" in allowed else set()
             wrong += [f"{module} imports {p}" for p in sorted(parts - allowed)]
     assert not wrong
 

@@ -38,8 +38,9 @@ from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.states import set_lens
 from neurolens.render.pictures import make_aperture
 from neurolens.render.scene import Scene
-from neurolens.surrogates.domain import Domain, domain_of
+from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.fit import ModelSettings, prepare
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
 _CLEAR = 0.95  # rims over the radius of curvature, at most

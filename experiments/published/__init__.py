@@ -13,31 +13,20 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from experiments.published.adaptive import Cells, fit_adaptive
-from experiments.published.data import OuterPupil, RawData, outer_pupil
-from experiments.published.neural import Averaged, fit_averaged
+from experiments.published.adaptive import fit_adaptive
+from experiments.published.data import RawData, outer_pupil
+from experiments.published.neural import fit_averaged
 from experiments.published.polynomials import fit_dense, fit_sparse
-from experiments.published.raylut import RayTable, fit_table
-from experiments.published.rtf import Meridian, fit_rtf
+from experiments.published.raylut import fit_table
+from experiments.published.rtf import fit_rtf
 from experiments.published.taylor import fit_taylor
 from neurolens.base.errors import InputError
 from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.cores import Core
 from neurolens.surrogates.fit import as_model, fit_model
-from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.model import Gate, LensModel
+from neurolens.surrogates.model import Encoding, Gate, LensModel
 from neurolens.surrogates.settings import ModelSettings
-from neurolens.surrogates.stored import CORES
 from neurolens.surrogates.targets import Prepared
-
-# Files of these models can be read back by a program that has imported this module.
-CORES |= {
-    "outer-pupil": OuterPupil,
-    "cells": Cells,
-    "averaged": Averaged,
-    "meridian": Meridian,
-    "ray-table": RayTable,
-}
 
 
 @dataclass(frozen=True)

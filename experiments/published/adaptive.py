@@ -24,7 +24,7 @@ from experiments.published.polynomials import fit_dense
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph
 from neurolens.surrogates.bases import Exponents
-from neurolens.surrogates.cores import ROUND, Composite, CoreValues, Field, RawPolynomial, Units
+from neurolens.surrogates.cores import ROUND, Composite, CoreValues, Field, RawPolynomial, Units, stored_as
 from neurolens.surrogates.fits.selection import grow
 from neurolens.surrogates.pairs import PairSet
 from neurolens.surrogates.targets import squared_error
@@ -35,6 +35,7 @@ _FEWEST_RAYS = 400
 _COORDINATES = (0, 2, 1)  # rho, tau, sigma: of equal errors the first is cut
 
 
+@stored_as("cells")
 @dataclass(frozen=True, eq=False)
 class Cells(Composite):
     """A partition of the light field into two halves, each with a polynomial of its own or divided again.

@@ -14,10 +14,9 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
 from neurolens.surrogates.bases import Exponents, monomials, raw_exponents, raw_variables, united
-from neurolens.surrogates.cores import DIRECTION, POSITION, Core, CoreValues, Field, RawPolynomial, Units
+from neurolens.surrogates.cores import DIRECTION, POSITION, Core, CoreValues, Field, RawPolynomial, Units, stored_as
 from neurolens.surrogates.gates import gate_reach
-from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.model import Gate
+from neurolens.surrogates.model import Encoding, Gate
 from neurolens.surrogates.pairs import PairSet, RayPairs
 from neurolens.surrogates.targets import Prepared, scales_of
 
@@ -26,6 +25,7 @@ OUTPUTS = ("position x", "position y", "tangent x", "tangent y", "stop x", "stop
 PARITY = ((1, 0), (0, 1), (1, 0), (0, 1), (1, 0), (0, 1), (0, 0))
 
 
+@stored_as("outer-pupil")
 @dataclass(frozen=True, eq=False)
 class OuterPupil(Core):
     """A polynomial that gives the ray on the outer pupil: the position on a sphere, the direction in its tangent frame.

@@ -29,7 +29,7 @@ from experiments.published.data import RawData
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
-from neurolens.surrogates.cores import ROUND, Core, CoreValues, Field, Units
+from neurolens.surrogates.cores import ROUND, Core, CoreValues, Field, Units, stored_as
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import PairSet, trace_pairs
@@ -47,6 +47,7 @@ Array = NDArray[np.float64]
 Layers = tuple[tuple[Array, Array], ...]
 
 
+@stored_as("averaged")
 @dataclass(frozen=True, eq=False)
 class Averaged(Core):
     """The core: for each ring of the film the mean of some networks.

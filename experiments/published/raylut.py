@@ -26,7 +26,7 @@ from experiments.published.data import RawData
 from experiments.published.rtf import meridian_of, turn, turned_back
 from neurolens.graph.interpret import monomials
 from neurolens.graph.ir import Graph
-from neurolens.surrogates.cores import Core, CoreValues, Field, Units
+from neurolens.surrogates.cores import Core, CoreValues, Field, Units, stored_as
 from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.pairs import trace_pairs
 from neurolens.surrogates.targets import scales_of
@@ -38,6 +38,7 @@ _BATCH = 16384
 _FILL_DEGREE = 5
 
 
+@stored_as("ray-table")
 @dataclass(frozen=True, eq=False)
 class RayTable(Core):
     """The core, without its tests of the pupils (`OuterPupil` has them).

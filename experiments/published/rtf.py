@@ -29,7 +29,7 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
 from neurolens.surrogates.bases import Exponents, monomials
-from neurolens.surrogates.cores import Core, CoreValues, Field, Units
+from neurolens.surrogates.cores import Core, CoreValues, Field, Units, stored_as
 from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import Gate
@@ -42,6 +42,7 @@ POSITIONS = 33
 _RAYS = 6000
 
 
+@stored_as("meridian")
 @dataclass(frozen=True, eq=False)
 class Meridian(Core):
     """The core: polynomials in the meridian of the ray, and the elliptic pass function.

@@ -33,7 +33,7 @@ from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 from neurolens.surrogates.bases import ordered
 from neurolens.surrogates.cores import RawPolynomial
-from neurolens.surrogates.lightfield import Encoding
+from neurolens.surrogates.model import Encoding
 from neurolens.surrogates.targets import scales_of
 
 # Coefficients [M] of `Truncated.exponents`: a power series in several variables, cut beyond a total degree.

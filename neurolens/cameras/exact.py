@@ -18,19 +18,20 @@ from neurolens.base import status as st
 from neurolens.base.progress import Progress
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
-from neurolens.cameras.fused import Compiled, FusedFilm, LensGraph
-from neurolens.cameras.lens_film import LensFilm, SceneRays
+from neurolens.cameras.fused import Compiled, FusedFilm
+from neurolens.cameras.lens_film import LensFilm, LensGraph, SceneRays
 from neurolens.cameras.lens_state import axial_transmittance, lens_state
 from neurolens.cameras.outline_cache import kept_outline, search_key
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.pupil_search import COARSE, COARSE_TIGHT, FINE, Detail, outline_of
 from neurolens.cameras.sampling import arrived, check_film, positive
+from neurolens.optics.film_plane import PupilBounds
 from neurolens.optics.focusing import best_focused
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.paraxial import chief_reach_mm, first_order
 from neurolens.optics.prescription import Focus, Lens
-from neurolens.optics.pupils import PupilBounds, camera_rays, passes_at_any_azimuth, pupil_bounds, pupil_plane_z_mm
+from neurolens.optics.pupils import camera_rays, passes_at_any_azimuth, pupil_bounds, pupil_plane_z_mm
 from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays, film_derivatives, trace, trace_differentials
 from neurolens.optics.tracegraph import exact_graph
@@ -117,7 +118,7 @@ class ExactCamera:
         return self.film.sample(film_mm, pupil, wavelength_nm)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `sample`, with the differentials of the rays, carried through every surface."""
+        """Sample rays as `sample` does, and carry their differentials through every surface."""
         return self.film.sample(film_mm, pupil, wavelength_nm, self._with_differentials)
 
     def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
@@ -130,7 +131,7 @@ class ExactCamera:
             self._front = front_aim(self.film, self.film_mm, self._light_nm, self.lens.surfaces[0])
         film_z = self.film.film_z_mm
         aim = self._front.aim(1e3 * point_m.astype(np.float64) + [[0], [0], [film_z]], pupil)
-        # Light starts a millimetre before the surface, so that this is still ahead; nonsense misses it.
+        # Light starts a millimetre before the surface, so that it lies ahead; rays that are not finite miss it.
         rays = np.nan_to_num(np.concatenate([aim.position + aim.direction, -aim.direction]), posinf=0, neginf=0)
         with torch.no_grad():
             *light, wavelength = _tensors(self._dtype, *rays, wavelength_nm)

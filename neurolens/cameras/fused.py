@@ -7,73 +7,27 @@ The system's C compiler makes the code when the camera is made (1 to 10 s, kept 
 from __future__ import annotations
 
 import ctypes
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.cameragraph import D_FILM, weight_graph
+from neurolens.cameras.cameragraph import D_FILM
 from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FloatArray
-from neurolens.cameras.lens_film import LensFilm, camera_rays
-from neurolens.cameras.model import ModelScene, OnnxCamera
+from neurolens.cameras.lens_film import LensFilm, LensGraph, camera_rays, whole_camera
+from neurolens.cameras.model import OnnxCamera
 from neurolens.graph.c import Signature, padded_columns, write_blocks
 from neurolens.graph.compiler import load_compiled
 from neurolens.graph.ir import Graph
 from neurolens.graph.loworder import with_film_derivatives, with_low_order_derivatives
-from neurolens.graph.passes import pruned
 from neurolens.graph.program import row_names
 from neurolens.graph.scalars import lower
-from neurolens.modelfile.graph import graph_of
-from neurolens.optics.apertures import Aperture
 
 # Of a camera with its lens: 2900 in the largest that ships. gcc 12 takes 48 s for 7100, and ever longer.
 MAX_STEPS = 12_000
 _SAMPLES = 4096  # rays that low-order derivatives are fitted to
-
-
-class LensGraph(NamedTuple):
-    """The graph of a lens with what its camera's graph takes from it.
-
-    Attributes:
-        graph: inputs `rays` [5] (film and pupil point, wavelength), `film_z_mm` and `stop_radius_mm`; outputs
-            `scene_ray` [6], `transmittance`, `status`, `stop_xy_mm` [2], and any derivatives of `scene_ray`.
-        stop_radius_mm: of its round stop.
-        aperture: the shape of the opening, tested on the rays' crossings with the stop; None is round.
-        stopped: status of rays that the shape blocks.
-    """
-
-    graph: Graph
-    stop_radius_mm: float
-    aperture: Aperture | None = None
-    stopped: int = 0
-
-    @property
-    def blades(self) -> Aperture | None:
-        """The opening where it is no mask: a mask's table is too large for compiled loops."""
-        return None if self.aperture is None or self.aperture.mask is not None else self.aperture
-
-
-def whole_camera(film: LensFilm, lens: LensGraph, pupil_too: bool = False) -> tuple[Graph, dict[str, float]]:
-    """The graph of a camera with the graph of its lens inside, and its numbers of the call.
-
-    Inputs: those of `pupil_graph` and `weight_graph`. Outputs: those of `weight_graph`, derivatives of the ray that the
-    lens's graph has, of a mask `stop_xy_mm`, and with `pupil_too` the outputs of `pupil_graph`.
-    """
-    wanted = {k: v for k, v in lens.graph.outputs.items() if k != "stop_xy_mm" or lens.aperture is not None}
-    g = Graph()
-    pupil = g.inline(film.outline.graph, {})
-    film_mm, wavelength = g.input("film_mm", 2), g.input("wavelength_nm")
-    found = g.inline(pruned(lens.graph, wanted), {"rays": g.concat(film_mm, pupil["pupil_mm"], wavelength)})
-    derivatives = tuple(name for name in found if "_by_" in name)
-    given = {"film_mm": film_mm, **pupil, **found, "lens_status": found["status"]}
-    g.outputs = g.inline(weight_graph(derivatives, lens.blades, lens.stopped), given)
-    if lens.blades is None and "stop_xy_mm" in found:
-        g.outputs["stop_xy_mm"] = found["stop_xy_mm"]
-    if pupil_too:
-        g.outputs |= pupil
-    return g, film.outline.numbers | film.numbers | {"stop_radius_mm": lens.stop_radius_mm}
 
 
 class FusedFilm:
@@ -106,7 +60,7 @@ class FusedFilm:
     def sample(
         self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray, differentials: bool = False
     ) -> CameraRays:
-        """As `LensFilm.sample`, with the differentials of the rays where asked for."""
+        """Sample rays as `LensFilm.sample` does, with their differentials where the caller wants them."""
         film, square, wavelength = (np.ascontiguousarray(a, np.float32) for a in (film_mm, square, wavelength_nm))
         count = film.shape[1]
         if film.shape != (2, count) or square.shape != (2, count) or wavelength.shape != (count,):
@@ -157,25 +111,13 @@ class Compiled:
         return self._fused.sample(film_mm, pupil, wavelength_nm)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `sample`, with the differentials of the rays, which come from the same pass."""
+        """Sample rays as `sample` does; the same pass gives their differentials."""
         return self._fused.sample(film_mm, pupil, wavelength_nm, True)
 
     @property
     def differentials_error(self) -> float | None:
         """See `FusedFilm.moves_error`."""
         return self._fused.moves_error
-
-
-def lens_graph(camera: OnnxCamera) -> LensGraph:
-    """The graph of a model, in the state and with the stop of its camera.
-
-    Raises:
-        InputError: a model of operators that have no such form.
-    """
-    model, scene = camera.model, camera.film.scene
-    assert isinstance(scene, ModelScene)
-    graph = graph_of(model.path, model.data, model.state if model.axes else ())
-    return LensGraph(graph, scene.stop_radius_mm, scene.aperture, scene.stop_status)
 
 
 class FusedCamera(Compiled, OnnxCamera):
@@ -201,7 +143,7 @@ class FusedCamera(Compiled, OnnxCamera):
         return made
 
     def _compile(self) -> None:
-        self._fused = FusedFilm(self.film, lens_graph(self), self.film_mm)
+        self._fused = FusedFilm(self.film, self.lens_graph(), self.film_mm)
         self.settings = self.settings | {"runtime": "fused"}
 
     def for_worker(self) -> FusedCamera:

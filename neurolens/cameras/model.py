@@ -6,7 +6,6 @@ import math
 import warnings
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -14,24 +13,27 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
-from neurolens.cameras.cameragraph import status_graph, weight_graph
+from neurolens.cameras.cameragraph import D_FILM, status_graph
 from neurolens.cameras.contract import RAYS_A_CALL, CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
-from neurolens.cameras.lens_film import LensFilm, SceneRays, camera_rays
+from neurolens.cameras.lens_film import LensFilm, LensGraph, SceneRays, camera_rays, whole_camera
 from neurolens.cameras.lens_state import axial_transmittance, lens_state, squeeze_of
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
-from neurolens.cameras.onnxmaps import InverseRays, OnnxDerivatives, OnnxInverse, load_inverse
-from neurolens.cameras.onnxsession import joined, open_session, run_batches
+from neurolens.cameras.onnxmaps import InverseRays, OnnxInverse, load_inverse
+from neurolens.cameras.onnxsession import open_session, run_batches
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.pupil_search import COARSE_TIGHT, outline_of
 from neurolens.cameras.sampling import arrived, check_film, common_light, positive
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
+from neurolens.graph.loworder import with_film_derivatives
+from neurolens.graph.onnx import write_onnx
 from neurolens.modelfile import DOMAIN_SLACK
-from neurolens.modelfile.states import STATE, state_for
+from neurolens.modelfile.states import state_for
 from neurolens.optics import film_plane
 from neurolens.optics.apertures import Aperture
+from neurolens.surrogates.assemble import ONNX, SCALARS, Form
 
 __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
 
@@ -88,7 +90,7 @@ class OnnxCamera:
         lens, domain = card["lens"], card["domain"]
         self.model = model
         self._whole: OnnxFilm | None = None
-        self._derivatives: OnnxDerivatives | None = None
+        self._with_moves: OnnxFilm | None = None
         self._inverse: tuple[OnnxInverse, FrontAim] | None = None
         self.name = str(lens.get("name", model.path.stem))
         self.film_mm = check_film(film_mm)
@@ -130,20 +132,22 @@ class OnnxCamera:
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """Rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
         if self._whole is None:
-            self._whole = OnnxFilm(self.film, self.model)
+            self._whole = OnnxFilm(self.film, self.lens_graph(ONNX), self.model)
         return self._whole.sample(film_mm, pupil, wavelength_nm)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `sample`, with the differentials of the rays.
+        """Sample rays as `sample` does, and give their differentials, too."""
+        if self._with_moves is None:
+            lens = self.lens_graph(ONNX)
+            lens = lens._replace(graph=with_film_derivatives(lens.graph))
+            self._with_moves = OnnxFilm(self.film, lens, self.model)
+        return self._with_moves.sample(film_mm, pupil, wavelength_nm)
 
-        Raises:
-            InputError: a model exported without derivatives.
-        """
-        assert isinstance(self.film.scene, ModelScene)
-        if self._derivatives is None:
-            self._derivatives = OnnxDerivatives(self.model)
-        whole = partial(self.film.scene.with_differentials, self._derivatives)
-        return self.film.sample(film_mm, pupil, wavelength_nm, whole)
+    def lens_graph(self, form: Form = SCALARS) -> LensGraph:
+        """The graph of the model in the camera's state, with its stop."""
+        scene = self.film.scene
+        assert isinstance(scene, ModelScene)
+        return LensGraph(self.model.graph(form), scene.stop_radius_mm, scene.aperture, scene.stop_status)
 
     def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
         """cos^4 of the angles between the axis and the rays of `sample` on the film's side."""
@@ -185,47 +189,40 @@ class OnnxCamera:
         """The same camera with a session of its own, for another process or thread."""
         other = copy(self)
         other.model, other.film = self.model.reopened(), copy(self.film)
-        other._whole = other._derivatives = other._inverse = None
+        other._whole = other._with_moves = other._inverse = None
         assert isinstance(self.film.scene, ModelScene)
         other.film.scene = replace(self.film.scene, model=other.model)
         return other
 
 
 class OnnxFilm:
-    """Film, pupil and model of a camera as one graph of onnxruntime: the model's own, and around it the camera's.
+    """Film, pupil and lens of a camera as one graph that onnxruntime runs.
 
     Args:
-        film: of the model at one focus and stop, whose numbers are constants of the graph.
+        film: of a lens at one focus and stop, whose numbers are constants of the graph.
+        lens: the graph of that lens, with its derivatives by the film point where differentials are wanted.
+        model: the model whose lens it is.
     """
 
-    def __init__(self, film: LensFilm, model: OnnxLens) -> None:
-        from neurolens.graph.onnx import write_onnx  # the package onnx takes a quarter of a second
-
-        scene, outline = film.scene, film.outline
-        assert isinstance(scene, ModelScene)
-        self._path, aperture = model.path, scene.aperture
-        before = Graph()
-        found = before.inline(outline.graph, {})
-        rays = before.concat(before.input("film_mm", 2), found["pupil_mm"], before.input("wavelength_nm"))
-        before.outputs = {"rays": rays, **found}
-        numbers: dict[str, Any] = outline.numbers | film.numbers | {"stop_radius_mm": scene.stop_radius_mm}
-        tables = {"outline": outline.table} | (
-            {} if aperture is None or aperture.mask is None else {"mask": aperture.table}
-        )
-        constants = {STATE: model.state, **tables} | {name: [value] for name, value in numbers.items()}
-        after = weight_graph((), aperture, scene.stop_status)
-        parts = [write_onnx(before, {}), model.data, write_onnx(after, {})]
-        try:
-            whole = joined(parts, constants, tuple(_OUTPUTS), {"status": "lens_status"})
-        except ModelError as error:
-            raise ModelError(f"{model.path}: {error}") from error
-        self._session = open_session(model.path, whole, model.threads, _INPUTS, _OUTPUTS)
+    def __init__(self, film: LensFilm, lens: LensGraph, model: OnnxLens) -> None:
+        whole, numbers = whole_camera(film, lens, mask_too=True)
+        g, mask = Graph(), lens.aperture and lens.aperture.mask
+        constants = {name: g.constant(value) for name, value in numbers.items()}
+        constants["outline"] = g.own_table(film.outline.table)
+        if lens.aperture is not None and mask is not None:
+            constants["mask"] = g.own_table(lens.aperture.table)
+        g.outputs = g.inline(whole, constants)
+        shapes = _OUTPUTS | {name: ("tensor(float)", 6, None) for name in D_FILM if name in g.outputs}
+        self._path, self._names = model.path, tuple(shapes)
+        self._session = open_session(model.path, write_onnx(g, {}), model.threads, _INPUTS, shapes)
 
     def sample(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `LensFilm.sample`."""
+        """Sample rays as `LensFilm.sample` does, with their differentials where the lens's graph has derivatives."""
         rays = {"film_mm": film_mm, "square": square, "wavelength_nm": wavelength_nm[None]}
-        done = run_batches(self._path, self._session, tuple(_OUTPUTS), rays, {}, RAYS_A_CALL)
-        return camera_rays({name: np.atleast_2d(values) for name, values in zip(_OUTPUTS, done, strict=True)})
+        done = run_batches(self._path, self._session, self._names, rays, {}, RAYS_A_CALL)
+        found = {name: np.atleast_2d(values) for name, values in zip(self._names, done, strict=True)}
+        moves = [found.pop(name) for name in D_FILM if name in found]
+        return camera_rays(found | ({"d_film": np.stack(moves, 1)} if moves else {}))
 
 
 @dataclass(frozen=True)
@@ -254,13 +251,6 @@ class ModelScene:
         """Status of rays that the stop's shape blocks."""
         return st.blocked(int(self.model.card["lens"].get("stop_surface", 0)), st.RIM)
 
-    def with_differentials(
-        self, derivatives: OnnxDerivatives, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray
-    ) -> SceneRays:
-        """As a call, with `SceneRays.d_film`."""
-        out = derivatives(film, pupil, wavelength_nm, self.film_z_mm, self.stop_radius_mm)
-        return SceneRays(out.rays.scene_ray, out.rays.transmittance, self.status_of(out.rays), out.d_film)
-
     def passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
         """Whether rays pass at one wavelength; bool [N]. Of a round stop directions are not looked at: it is faster."""
         waves = np.full(film.shape[1], wavelength_nm, np.float32)
@@ -269,7 +259,7 @@ class ModelScene:
         return self.model.status(film, pupil, waves, self.film_z_mm, self.stop_radius_mm) == st.PASSED
 
     def passes_at_any_azimuth(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
-        """As `passes`, of a lens with cylinders: whether rays pass when film and pupil points turn about the axis."""
+        """Whether rays of a lens with cylinders pass at any azimuth of their film and pupil points; bool [N]."""
         passed = np.zeros(film.shape[1], bool)
         for azimuth in _AZIMUTHS:
             left = np.flatnonzero(~passed)

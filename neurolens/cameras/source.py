@@ -13,8 +13,7 @@ import numpy as np
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.focus_function import FOCUS, SMALLEST, Array, Focus, Focusing, film_function, number_of
-from neurolens.cameras.fused import LensGraph, whole_camera
-from neurolens.cameras.lens_film import LensFilm
+from neurolens.cameras.lens_film import LensFilm, LensGraph, whole_camera
 from neurolens.cameras.model import ModelScene, best_focus_of_stops_mm
 from neurolens.cameras.onnxlens import OnnxLens
 from neurolens.graph.c import Extras

@@ -287,9 +287,9 @@ def thumbnail(lens: Lens) -> bytes | None:
 
 
 def _card(file: Path) -> dict[str, Any]:
-    from neurolens.modelfile.onnxfile import read_checked
+    from neurolens.modelfile.metadata import read_card
 
-    return read_checked(file)[1]
+    return read_card(file)
 
 
 def _axes(card: dict[str, Any]) -> list[str]:

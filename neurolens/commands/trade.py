@@ -28,13 +28,13 @@ def look_of(args: argparse.Namespace) -> dict[str, Any]:
 
 def shipped_models(lens: Lens, zoom: str | None) -> list[Path]:
     """The models that ship of a lens, or of a state of its zoom, by its id and its figures."""
-    from neurolens.modelfile.onnxfile import read_checked
+    from neurolens.modelfile.metadata import read_card
     from neurolens.optics.states import set_lens
 
     name = lens.lens_id if zoom is None else f"{lens.lens_id}-{zoom}"
     files = sorted((library() / "models").glob(f"{name}.*.onnx"))
     figures = set_lens(lens, zoom=zoom).sha256 if files else ""
-    return [file for file in files if read_checked(file)[1]["lens"]["sha256"] == figures]
+    return [file for file in files if read_card(file)["lens"]["sha256"] == figures]
 
 
 def run_trade(args: argparse.Namespace) -> int:

@@ -37,7 +37,7 @@ from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.states import set_lens
 from neurolens.readers.any_format import read_any
-from neurolens.surrogates.domain import Domain
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.states import State, StateSpace
 

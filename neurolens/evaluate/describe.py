@@ -23,7 +23,8 @@ from neurolens.optics.pupils import camera_rays, image_radius_mm
 from neurolens.optics.states import set_lens
 from neurolens.optics.trace import trace
 from neurolens.readers.any_format import collection_of, read_any
-from neurolens.surrogates.domain import Domain, sample_domain
+from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.model import Domain
 
 _RAYS = 65536
 _NEGLIGIBLE = 1e-4  # share of the rays below which a blocking surface is not listed

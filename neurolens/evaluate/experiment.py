@@ -22,8 +22,9 @@ from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.states import set_lens
 from neurolens.readers.any_format import OURS, kind_of, read_any
-from neurolens.surrogates.domain import Domain, domain_of
+from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.fit import ModelSettings
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import PairSettings
 from neurolens.surrogates.states import StateSpace, axes_of
 

@@ -53,7 +53,6 @@ from neurolens.evaluate.shaders import lens_of
 from neurolens.evaluate.shot_fits import PAIRS, shot_domain, shot_fits, shot_terms
 from neurolens.graph.compiler import has_compiler
 from neurolens.graph.scalars import lower
-from neurolens.modelfile.graph import graph_of
 from neurolens.optics.prescription import Lens
 from neurolens.render.scene import Scene
 from neurolens.surrogates.settings import ModelSettings
@@ -257,7 +256,7 @@ class _Trial:
 
     @property
     def share(self) -> prints.Array:
-        """Of the wavelengths."""
+        """The share of the scene's light that each wavelength stands for."""
         return self.found.places.share
 
     @property
@@ -295,7 +294,7 @@ class _Trial:
         return ns_a_ray(camera, self.found.places), noise(seen.weight, self.share)
 
     def ideal(self, name: str, camera: Camera, seen: Footprints, area: float = 1.0) -> tuple[Timing, float]:
-        """Of a camera without a lens, whose picture is so many times as large."""
+        """The cost of a camera without a lens, whose picture is so many times as large."""
         known = {"osl": CYCLES_NS, "glsl": GLSL_OPERATIONS}.get(self.target)
         if known is not None:
             return _counted(area * known[name]), noise(seen.weight, self.share)
@@ -303,7 +302,7 @@ class _Trial:
         return {"min": area * timing["min"], "median": area * timing["median"]}, times
 
     def shader(self, file: str | Path) -> tuple[Timing, float]:
-        """Of the shader of a model or a lens."""
+        """The cost of the shader of a model or a lens."""
         asked = self.found.asked
         state = asked.zoom if str(file) == self.found.lens.path else None  # models are of one
         lens = lens_of(Path(file), state, lambda done, left=None: None)[1]
@@ -407,9 +406,9 @@ def _model(trial: _Trial, file: Path, how: str = "", without: Collection[str] = 
 
 
 def _operations(model: OnnxLens) -> int:
-    """Of a ray of a model; 0 where its operators have no such form."""
+    """The number of float operations that a ray of a model costs; 0 of networks that only onnxruntime runs."""
     with suppress(InputError):
-        return sum(lower(graph_of(model.path, model.data, model.state if model.axes else ())).count().values())
+        return sum(lower(model.graph()).count().values())
     return 0
 
 

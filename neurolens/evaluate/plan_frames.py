@@ -154,7 +154,7 @@ def representatives(frames: Sequence[Frame]) -> list[Frame]:
 
 
 def _nearest(frame: Frame, chosen: Sequence[Frame]) -> int:
-    """Of the probed frames, the one of the state most like a frame's, then of the number nearest to it."""
+    """The probed frame whose state is most like that of a frame; of several the one with the nearest number."""
     return min(
         range(len(chosen)),
         key=lambda k: (math.dist(chosen[k].state, frame.state), abs(chosen[k].number - frame.number)),
@@ -220,7 +220,7 @@ class _Stretch:
 
     @cached_property
     def fit(self) -> Callable[[int], tuple[Path, ModelSettings]]:
-        """Of the domain that holds those of all frames."""
+        """Fit a model over the domain that holds the domains of all frames."""
         ends = [focus for p in self.founds for focus in shot_domain(p).focus_m or ()]
         widest = min(self.founds, key=lambda p: p.asked.f_number)
         radius = max(p.domain.film_radius_mm for p in self.founds)
@@ -244,7 +244,7 @@ class _Stretch:
 
 
 def _effects(founds: Sequence[Probed], budget_px: float) -> tuple[Effect, ...]:
-    """Of each effect the dearest frame's; light that the lens adds is that of the first frame. And breathing."""
+    """Collect the largest of each effect over the frames, and breathing; stray light is that of the first frame."""
     every: dict[str, Effect] = {}
     for k, found in enumerate(founds):
         for effect in effects_of(found, budget_px, stray=k == 0):

@@ -35,7 +35,8 @@ from neurolens.optics.pupils import image_radius_mm
 from neurolens.optics.states import set_lens
 from neurolens.render.scene import Scene
 from neurolens.render.world import shared_worlds
-from neurolens.surrogates.domain import Domain, domain_from_camera, domain_of
+from neurolens.surrogates.domain import domain_from_camera, domain_of
+from neurolens.surrogates.model import Domain
 
 COUNTED = 95.0  # percentile over the picture that a budget is held against
 _Real = TypeVar("_Real", bound=np.floating[Any])
@@ -125,7 +126,7 @@ class Probed:
 
     @cached_property
     def exact_field(self) -> Field:
-        """Of the exact camera, for maps of its picture; it takes seconds.
+        """The field of the exact camera, for maps of its picture; it takes seconds.
 
         Raises:
             InputError: as `field_of`.
@@ -306,7 +307,7 @@ def effects_of(found: Probed, budget_px: float, stray: bool = True) -> tuple[Eff
 
 
 def exact_camera(lens: Lens, real: dict[str, Any]) -> ExactCamera | FusedExactCamera:
-    """As C where a compiler is there, which compiles the lens."""
+    """The exact camera, compiled as C where the machine has a compiler."""
     with suppress(InputError):
         if has_compiler():
             return FusedExactCamera(lens, **real)

@@ -36,8 +36,9 @@ from neurolens.render.renderer import render
 from neurolens.render.scene import CameraSettings, Scene, load_scene
 from neurolens.render.spectrum import SpectralRange
 from neurolens.render.world import world_of
-from neurolens.surrogates.domain import Domain, domain_from_camera
+from neurolens.surrogates.domain import domain_from_camera
 from neurolens.surrogates.fit import prepare
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import make_pairs
 
 EXACT = "exact"

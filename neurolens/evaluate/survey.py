@@ -34,8 +34,8 @@ from neurolens.readers.agf import more_glasses
 from neurolens.readers.any_format import kind_of, read_any
 from neurolens.readers.draft import Given
 from neurolens.surrogates.bases import pinned_threads
-from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.fit import ModelSettings, prepare
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
 SCHEMA = 1

@@ -85,7 +85,7 @@ def summary_lines(records: Sequence[Mapping[str, Any]], others: Mapping[str, int
 
 
 def _kinds(record: Mapping[str, Any]) -> list[str]:
-    """Of `_KINDS`, those of a record."""
+    """The names of `_KINDS` that hold for a record."""
     fit, kinds = record.get("fit"), [str(record["verdict"])]
     if fit:
         kinds += ["missed"] * (not fit["reaches"]) + ["broken"] * bool(fit["broken"])

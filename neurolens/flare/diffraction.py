@@ -247,7 +247,7 @@ def starburst_picture(
 
 
 def _stars(lens: Lens, light: Light, wavelengths_nm: Array, raster: Raster, threads: int) -> Iterator[Floats]:
-    """Of a light at each wavelength, irradiance [H, W] for 1 at the lens; nothing where none of it arrives."""
+    """Yield the star of a light at each wavelength: irradiance [H, W] for 1 at the lens; nothing where it is dark."""
     middle = exit_pupil(lens, light, float(wavelengths_nm.mean()))
     lines = [] if middle is None else outline(middle)
     if middle is None or not lines:

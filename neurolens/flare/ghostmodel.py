@@ -146,13 +146,13 @@ class GhostModel:
         return start
 
     def trace(self, rays: Floats, wavelength_nm: float) -> GhostRays:
-        """As `GhostTracer.trace`."""
+        """Trace ghosts as `GhostTracer.trace` does."""
         return self.follow(self.start(rays), wavelength_nm)
 
     def follow(
         self, start: Floats, wavelength_nm: float, *, only: Sequence[Pair] | None = None, reach: float = 1.0
     ) -> GhostRays:
-        """As `GhostTracer.follow`; all rays are followed.
+        """Follow ghosts as `GhostTracer.follow` does; all rays are followed.
 
         Raises:
             InputError: a wavelength out of range.
@@ -161,7 +161,7 @@ class GhostModel:
         return GhostRays(np.concatenate([self.follow_each(start, [wavelength_nm], pair) for pair in some]))
 
     def follow_each(self, start: Floats, wavelengths_nm: Sequence[float], pair: Pair, reach: float = 1.0) -> Floats:
-        """As `GhostTracer.follow_each`; errors as of `follow`."""
+        """Follow ghosts as `GhostTracer.follow_each` does; it raises what `follow` raises."""
         low, high = self.wavelength_nm
         for nm in wavelengths_nm:
             if not low <= nm <= high:

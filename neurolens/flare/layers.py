@@ -191,7 +191,7 @@ def _ghosts(job: FlareJob, done: Report) -> Layers:
 
 
 def _bytes(pictures: int, layers: int) -> int:
-    """Of a pixel, of pictures that are drawn and layers of single ghosts that they become."""
+    """The bytes of a pixel of all pictures that are drawn, and of the layers of single ghosts that they become."""
     return 12 * (pictures + layers + 4)
 
 

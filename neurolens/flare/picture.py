@@ -256,7 +256,7 @@ def _draw(
     strips = [range(height)[k : k + high] for k in range(0, height, high)]
 
     def edges(task: _Task) -> tuple[list[Doubles], Doubles]:
-        """Of each wavelength, and light of their cells."""
+        """The edges of each wavelength's cells, and the light of the cells."""
         light, pair, grid, wavelengths_nm, colours = task
         if not work.step():
             return [], colours[:0]

@@ -136,7 +136,7 @@ def load_compiled(source: str) -> ctypes.CDLL:
 
 
 def _key(source: str) -> str:
-    """Of a source, its flags, the compiler and the processor: a library for another processor may crash on this one."""
+    """Hash a source, its flags, the compiler and the processor: a library for another one may crash on this one."""
     made_by = _compiler_and_processor(find_compiler())
     return hashlib.sha256("\0".join((source, *FLAGS, made_by)).encode()).hexdigest()[:32]
 

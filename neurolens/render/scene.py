@@ -131,7 +131,7 @@ def load_scene(path: str | Path) -> Scene:
 
 
 def scene_from_tables(tables: Mapping[str, Any], path: str | Path = "scene") -> Scene:
-    """As `load_scene`, for tables already in memory; `path` is for messages and for finding files."""
+    """Make a scene from tables in memory, as `load_scene` does; `path` is for messages and for finding files."""
     path = Path(path)
     settings, triangles = _with_meshes(path, from_dict(SceneSettings, tables, path))
     _check_references(path, settings, triangles)

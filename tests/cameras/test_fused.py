@@ -19,12 +19,11 @@ from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.exact import ExactCamera, FusedExactCamera
 from neurolens.cameras.fused import FusedCamera
-from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.cameras.model import OnnxCamera, OnnxLens, load_model
 from neurolens.flare.ghosts import coated
 from neurolens.graph import compiler
 from neurolens.graph.ir import Graph
 from neurolens.graph.loworder import WORST, with_low_order_derivatives
-from neurolens.modelfile.graph import graph_of
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.render.renderer import render
@@ -217,8 +216,10 @@ def test_rays_that_are_lost_on_their_way_stay_finite() -> None:
 def test_directions_of_another_length_pass_nothing(length: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a poor network makes of a few rays, here of those of half the film."""
 
-    def spoilt(*args: Any) -> Graph:
-        g = graph_of(*args)
+    whole_graph = OnnxLens.graph
+
+    def spoilt(model: OnnxLens, *form: Any) -> Graph:
+        g = whole_graph(model, *form)
         zero = g.select(g.input("rays", 5)[0] <= 0.0, 0.0, 1.0)
         strange = zero / zero if math.isnan(length) else 1.0 / zero
         factor = strange if not math.isfinite(length) else g.select(zero <= 0.0, length, 1.0)
@@ -227,8 +228,9 @@ def test_directions_of_another_length_pass_nothing(length: float, monkeypatch: p
         return g
 
     _, whole = pair()
-    monkeypatch.setattr(fused_module, "graph_of", spoilt)
     half = FusedCamera(load_model(model_file()), film_mm=FILM, focus_m=2.0)
+    monkeypatch.setattr(OnnxLens, "graph", spoilt)
+    half._compile()
     given = numbers(4000, seed=2)
     wanted, found = whole.sample(*given), half.sample(*given)
     left, passed = given[0][0] <= 0, wanted.status == st.PASSED

@@ -17,7 +17,6 @@ from neurolens.base import status as st
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.focus_function import Focusing, number_of
-from neurolens.cameras.fused import lens_graph
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.source import camera_program, film_extras, model_extras
 from neurolens.cli import main
@@ -45,7 +44,7 @@ def camera(kind: str) -> ExactCamera | OnnxCamera:
 @pytest.mark.parametrize("kind", ["exact", "invariants"])
 def test_a_camera_as_source_gives_its_own_rays(kind: str) -> None:
     made = camera(kind)
-    graph = made.lens_graph() if isinstance(made, ExactCamera) else lens_graph(made)
+    graph = made.lens_graph()
     program = camera_program(made.film, graph, derivatives=True)
     film, square, wavelength = film_rays(made, 4000)
     given = dict(zip(("film_x_mm", "film_y_mm", "u", "v", "wavelength_nm"), (*film, *square, wavelength), strict=True))

@@ -45,7 +45,7 @@ from neurolens.render.pictures import read_exr
 from neurolens.render.scene import load_scene, scene_from_tables
 from neurolens.surrogates.cores import InvariantPolynomial
 from neurolens.surrogates.domain import domain_of
-from neurolens.surrogates.stored import load_fitted
+from neurolens.surrogates.file import read_model
 
 LENS = "lenses/cooke_triplet_50.toml"  # of glass that absorbs
 GAUSS = "lenses/laikin_double_gauss_50.toml"
@@ -289,7 +289,7 @@ def test_a_plan_s_file_is_taken_by_train_render_and_export(tmp_path: Path, monke
     file, model = folder / "plan.toml", next((folder / "models").glob("*.onnx"))
     quick = ["--quiet", "--set", "evaluation.vignetting_rays=2000"]
     assert main(["train", str(file), "--output", str(tmp_path / "run"), *quick]) == 0
-    made, again = (load_fitted(f) for f in (model, tmp_path / "run" / "models" / "shot-ols-6.onnx"))
+    made, again = (read_model(f).at() for f in (model, tmp_path / "run" / "models" / "shot-ols-6.onnx"))
     assert isinstance(made.core, InvariantPolynomial) and isinstance(again.core, InvariantPolynomial)
     np.testing.assert_array_equal(made.core.exponents, again.core.exponents)
     np.testing.assert_allclose(made.core.ab, again.core.ab, rtol=1e-9, atol=1e-12)

@@ -23,14 +23,16 @@ from neurolens.evaluate.rays import (
     ray_errors,
 )
 from neurolens.evaluate.vignetting import deciding_rim_ratio, relative_illumination
+from neurolens.optics.film_plane import PupilBounds
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.pupils import PupilBounds, camera_rays, image_radius_mm
+from neurolens.optics.pupils import camera_rays, image_radius_mm
 from neurolens.optics.states import set_lens
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
-from neurolens.surrogates.domain import Domain, FilmRays, domain_of, sample_domain
+from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, trace_pairs
 
 LENSES = Path(__file__).parents[2] / "lenses"

@@ -16,7 +16,8 @@ from neurolens.evaluate.speed import Call, Candidate, Race, Unavailable, race
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.states import set_lens
 from neurolens.surrogates.bases import pinned_threads
-from neurolens.surrogates.domain import Domain, FilmRays, domain_of
+from neurolens.surrogates.domain import FilmRays, domain_of
+from neurolens.surrogates.model import Domain
 
 LENSES = Path(__file__).parents[2] / "lenses"
 

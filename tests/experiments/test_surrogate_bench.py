@@ -87,15 +87,6 @@ def test_rows_by_name_group_and_method() -> None:
     assert all(re.search(r" 20\d\d, ", r.source) for r in rows if r.group == "published")
 
 
-def test_stored_weights_are_rows_of_their_own(tmp_path: Path) -> None:
-    network = ModelSettings("mlp", units=6, layers=1, steps=20)
-    settings = replace(SETTINGS, pairs=PairSettings(2000, 1000, 2000), vignetting_rays=20_000)
-    rows = Row("net", "ours", network), Row("net-int8", "ours", network, weights="int8")
-    whole, small = run(bench_of(tmp_path, settings=settings), *rows)
-    assert small["rms_um"] > 2 * whole["rms_um"] and small["bytes"] != whole["bytes"]
-    assert small["fingerprint"] != whole["fingerprint"]
-
-
 def test_one_record_a_method_with_every_figure(made: Path) -> None:
     found = records_of(made)
     assert found["thick"]["rms_um"] > 2 * found["ols-12"]["rms_um"] > 4 * found["ols-24"]["rms_um"] > 0

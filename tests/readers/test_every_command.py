@@ -157,9 +157,9 @@ def test_a_run_keeps_the_lens_in_our_format_and_a_model_knows_its_lens(
     assert read_lens(kept).sha256 == read_any(files["zmx"]).sha256
     capsys.readouterr()
     from neurolens.evaluate.check import lens_of_card
-    from neurolens.modelfile.onnxfile import read_checked
+    from neurolens.modelfile.metadata import read_card
 
-    card = read_checked(model)[1]
+    card = read_card(model)
     assert card["lens"]["id"] == "Tessar_100mm_1_4_5_v2_0"
     for lens in (None, files["zmx"], files["toml"]):
         assert lens_of_card(card, lens, model).sha256 == card["lens"]["sha256"]

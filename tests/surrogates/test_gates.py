@@ -17,13 +17,13 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.states import set_lens
 from neurolens.surrogates.cores import InvariantPolynomial
-from neurolens.surrogates.domain import SPARSE, Domain, FilmRays, domain_of, lit_share, sample_domain, sample_lit
+from neurolens.surrogates.domain import SPARSE, FilmRays, domain_of, lit_share, sample_domain, sample_lit
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.fits.polynomial import fit_polynomial
 from neurolens.surrogates.gates import GateFit, boundary_rays, choose_gates, gate_reach, gate_values
 from neurolens.surrogates.lightfield import LightField
-from neurolens.surrogates.model import Gate, LensModel
+from neurolens.surrogates.model import Domain, Gate, LensModel
 from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, reached, trace_pairs
 from neurolens.surrogates.targets import targets_of
 

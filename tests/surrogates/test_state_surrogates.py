@@ -31,9 +31,9 @@ from neurolens.optics.states import set_lens
 from neurolens.optics.trace import trace
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_states
-from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.model import LensModel, mix
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.states import StateModel, StateSpace, focus_axis, mix, zoom_axis
+from neurolens.surrogates.states import StateModel, StateSpace, focus_axis, zoom_axis
 from neurolens.surrogates.states_fit import StateSettings, fit_states
 
 ZOOM = Axis("zoom", "mm", (70.0, 135.0, 200.0), 3, reciprocal=True, stated=(("70mm", 70.0),))

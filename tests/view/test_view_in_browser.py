@@ -25,7 +25,7 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.states import set_lens
 from neurolens.render.renderer import render
 from neurolens.render.scene import scene_from_tables
-from neurolens.surrogates.source import export_file
+from neurolens.surrogates.source import export_source
 
 ROOT = Path(__file__).parents[2]
 LENS = "petzval_portrait_100"
@@ -301,9 +301,11 @@ def test_downloads_are_the_files(browser: Any, tmp_path: Path) -> None:
     models = {kind: ROOT / "models" / f"{LENS}.{kind}.onnx" for kind in ("ols-64", "mlp-16x2")}
     wanted = {("exact", to): exported(ROOT / "lenses" / f"{LENS}.toml", to, tmp_path) for to in ("glsl", "c", "osl")}
     for form, file in zip(("polynomial", "network"), models.values(), strict=True):
-        extras, notes = model_extras(load_model(file))
+        model = load_model(file)
+        extras, notes = model_extras(model)
         for to in ("glsl", "c"):
-            path = export_file(file, tmp_path / f"{form}.{to}", to, None, extras, notes).path
+            nodes, out = model.file.nodes, tmp_path / f"{form}.{to}"
+            path = export_source(nodes, out, to, model.card, extras=extras, notes=notes).path
             wanted[form, to] = path.read_bytes()
         wanted |= {(form, "onnx"): file.read_bytes(), (form, "osl"): exported(file, "osl", tmp_path)}
     found = {}

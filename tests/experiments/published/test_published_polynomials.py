@@ -33,7 +33,8 @@ from neurolens.optics.trace import Rays, trace
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.fits.polynomial import ideal_map
-from neurolens.surrogates.lightfield import Encoding, fit_encoding
+from neurolens.surrogates.lightfield import fit_encoding
+from neurolens.surrogates.model import Encoding
 from neurolens.surrogates.pairs import trace_pairs
 from neurolens.surrogates.targets import scales_of
 
