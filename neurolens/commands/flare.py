@@ -27,10 +27,11 @@ from neurolens.commands.arguments import (
 from neurolens.commands.flare_fit import add_fit, check_fit, fitted, run_fit, stopped
 from neurolens.commands.flare_lights import add_lights
 from neurolens.commands.output import answer, number, table
-from neurolens.commands.render import add_colour_space, film_size
+from neurolens.commands.render import film_size
 from neurolens.commands.render_files import Files, flare_channels, warn
 from neurolens.commands.render_frames import add_frames, frames_of
 from neurolens.evaluate.records import plain
+from neurolens.render.film_settings import FilmSettings
 from neurolens.render.flaresettings import FlareSettings
 
 if TYPE_CHECKING:
@@ -119,7 +120,8 @@ def _add_picture(parser: argparse.ArgumentParser) -> None:
     )
     add_options(group, FlareSettings, ["cell_px", "bins"])
     add_exposure(group, None, "99% of the lit pixels become no brighter than 0.8; frames share one value")
-    add_colour_space(group, "; default: that of --image, else of a scene's [film] table, else sRGB")
+    (space,) = add_options(group, FilmSettings, ["colour_space"], unset=True)
+    space.help = f"{space.help}; default: that of --image, else of a scene's [film] table, else sRGB"
     group.add_argument(
         "--preview", action="store_true",
         help="at most 480 pixels wide, 5 wavelengths and 65536 photons a light and wavelength, --cell at least 24",
@@ -156,7 +158,7 @@ def _settings(args: argparse.Namespace) -> FlareSettings:
     for name, factors in args.gains:
         r, g, b = (a * b for a, b in zip(gains.get(name, (1.0, 1.0, 1.0)), factors, strict=True))
         gains[name] = (r, g, b)
-    settings = replace(from_options(FlareSettings, args), gains=gains)
+    settings = replace(from_options(FlareSettings(), args), gains=gains)
     return settings.preview() if args.preview else settings
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens import __version__
 from neurolens.base.bounds import FILM_MM
 from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.options import add_options, from_options
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import (
     CAMERAS_HELP,
@@ -40,7 +41,7 @@ from neurolens.commands.render_files import (
 )
 from neurolens.commands.render_frames import add_frames, run_frames
 from neurolens.evaluate.records import plain
-from neurolens.render.film_settings import COLOUR_SPACE_NAMES, WAVELENGTH_MODES, WAVELENGTH_SAMPLINGS, FilmSettings
+from neurolens.render.film_settings import FilmSettings
 
 if TYPE_CHECKING:
     from neurolens.cameras.build import Shot
@@ -111,7 +112,7 @@ def add_parser(subparsers: Any) -> None:
         help="of the EXR: colour alone, or also samples, variance (of the pixel's luminance), Z (depth in m along the "
         "axis from the film) and blocked (share of camera rays that do not pass) (default: all)",
     )  # fmt: skip
-    _add_colour(parser)
+    add_options(parser.add_argument_group("colour (left out: the scene's [film] table)"), FilmSettings, unset=True)
     add_frames(parser)
     add_tile(parser)
     add_safety(parser)
@@ -128,39 +129,6 @@ def add_parser(subparsers: Any) -> None:
     add_json(parser, quiet=True)
     parser.set_defaults(position_m=None, look_at_m=None, frame=None, shared=None)
     parser.set_defaults(run=run_kept, kept="no picture was written; older files of that name are untouched")
-
-
-def add_colour_space(parser: argparse._ActionsContainer, default: str = "") -> None:
-    """Add --colour-space; `default` describes what stands for it where it is left out."""
-    parser.add_argument(
-        "--colour-space", choices=COLOUR_SPACE_NAMES,
-        help=f"of the EXR, linear: sRGB (D65) or ACEScg (AP1, the white of ACES){default}",
-    )  # fmt: skip
-
-
-def _add_colour(parser: argparse.ArgumentParser) -> None:
-    colour = parser.add_argument_group("colour (left out: the scene's [film] table)")
-    add_colour_space(colour)
-    colour.add_argument(
-        "--white-balance", metavar="LIGHT",
-        help="light that becomes neutral: A, D50, D65, E, '3200 K' or a measured one of the scene",
-    )  # fmt: skip
-    add_option(
-        colour, "--wavelength-mode", old=("--wavelengths",), choices=WAVELENGTH_MODES,
-        help="of a path: one; hero, four that share it; lanes, four paths that share their random numbers; "
-        "auto, hero where the camera does not disperse",
-    )  # fmt: skip
-    colour.add_argument(
-        "--wavelength-sampling", choices=WAVELENGTH_SAMPLINGS,
-        help="by importance (film response times light) or uniform",
-    )  # fmt: skip
-
-
-def film_of(settings: FilmSettings, args: argparse.Namespace) -> FilmSettings:
-    """The scene's [film] table with the command line's options."""
-    given = {name: getattr(args, name) for name in ("colour_space", "white_balance", "wavelength_sampling")}
-    given["wavelengths"] = args.wavelength_mode
-    return replace(settings, **{name: value for name, value in given.items() if value is not None})
 
 
 def run_kept(args: argparse.Namespace) -> int:
@@ -215,7 +183,7 @@ def prepared(args: argparse.Namespace, progress: Progress) -> Prepared:
     files = Files.of(tile_path(args.out, args.tile))
     scene = seen_from(load_scene(args.scene), args.scene, args.position_m, args.look_at_m)
     files.spare(args.scene.parent / name for name in files_named(scene.settings))
-    settings, film = scene.settings.camera, film_of(scene.settings.film, args)
+    settings, film = scene.settings.camera, from_options(scene.settings.film, args)
     if args.white_balance is not None:
         check_name(args.scene, "--white-balance", args.white_balance, scene.illuminants)
     if args.film is not None:
