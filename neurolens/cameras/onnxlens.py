@@ -135,7 +135,8 @@ class OnnxLens:
             raise InputError("OnnxLens.rays", "film_z_mm", plane.shape, f"a number or an array ({count},)")
         if state is not None:  # out of range
             status = np.full(count, st.OUTSIDE_DOMAIN, np.int32)
-            return LensRays(*(np.zeros(shape, np.float32) for shape in ((6, count), count, (2, count))), status)
+            ray, through, crossing = (np.zeros(shape, np.float32) for shape in ((6, count), (count,), (2, count)))
+            return LensRays(ray, through, crossing, status)
         if len(plane) == 1:
             return self._run(columns, plane, stop)
         planes, at = np.unique(plane, return_inverse=True)
