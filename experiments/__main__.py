@@ -46,9 +46,7 @@ NAMES = {
     "flare-gallery": ("flare_gallery", "pictures of flare: suns, headlights, coatings, stops, an animation"),
     "ghosts": ("ghosts", "ghosts drawn in several ways: error and time a picture"),
     "dask": ("cluster", "a Dask cluster: speed-up, overhead a task, 100,000 tasks by simulation"),
-    "growth": ("growth", "how time and memory grow with surfaces, pixels, samples, lights, triangles, lenses"),
     "transmittance": ("transmittance", "what averaging over polarisation at every surface would cost"),
-    "coatings": ("coatings", "what flare loses by one-layer coatings and dropped aspheres"),
     "collection": ("collection", "a public collection of lens files: read, refused, agreement with ray-optics"),
     "optiland": ("compare_optiland", "speed of the exact tracer beside Optiland"),
 }

@@ -27,8 +27,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 from experiments import lab
-from experiments.growth import cpu_s, resident_kb
-from experiments.lab import Row
+from experiments.lab import Row, cpu_s, resident_kb
 from neurolens.base.engine import on_dask
 
 _LENS, _TILE = (20_000, 12_000), (3_000, 6_000_000)  # bytes of a task, and of its answer
