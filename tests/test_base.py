@@ -470,7 +470,7 @@ def test_settings_are_options(capsys: pytest.CaptureFixture[str]) -> None:
         _Options(count=0)
     group = argparse.ArgumentParser()
     add_options(group, _Options, ["count", "share"])
-    assert vars(group.parse_args(["--rays", "9"])) == {"count": 9, "share": 0.0}
+    assert vars(group.parse_args(["--rays", "9"])) == {"rays": 9, "share": 0.0}
     over = argparse.ArgumentParser()
     add_options(over, _Options, unset=True)
     table = _Options(2.0, 4, "x", ("p",), True, "b", _Inner(0.5, 1.0))

@@ -48,8 +48,8 @@ def setting(
     Args:
         about: the help; `add_options` adds the default where the help does not mention one.
         within: the smallest and the largest value of a number. unit: what the number is, for messages.
-        option: name of the option ("reflections") where it is not the field's. old: earlier names, which still work
-            and which help does not show. metavar: placeholder of the value in the help.
+        option: name of the option ("reflections") where it is not the field's; the parsed arguments have that name, too.
+        old: earlier names, which still work and which help does not show. metavar: placeholder of the value in the help.
     """
     about_it = {"about": about, "within": within, "unit": unit, "option": option, "old": old, "metavar": metavar}
     return field(default=default, metadata=about_it)
@@ -110,7 +110,7 @@ def from_options(settings: T, args: argparse.Namespace) -> T:
     for f in (f for f in fields(settings) if f.metadata.get("about") is not None):  # type: ignore[arg-type]
         if is_dataclass(inner := hints[f.name]) and isinstance(inner, type):
             values[f.name] = from_options(getattr(settings, f.name), args)
-        elif (value := getattr(args, f.name, None)) is not None:
+        elif (value := getattr(args, _dest(f.name, f.metadata["option"]), None)) is not None:
             values[f.name] = tuple(value) if isinstance(value, list) else value
     return replace(settings, **values)  # type: ignore[type-var]
 
@@ -123,11 +123,8 @@ def _add(
     match = _UNIT.fullmatch(name)
     if "(default" not in about and not (default is None or default is False or default == ()):
         about += f" (default: {f'{default:g}' if isinstance(default, float) else default})"
-    more: dict[str, Any] = {
-        "dest": name,
-        "default": list(default) if many and default is not None else default,
-        "help": about,
-    }
+    more: dict[str, Any] = {"dest": _dest(name, option), "help": about}
+    more["default"] = list(default) if isinstance(default, tuple) else default
     if kind is bool:
         more["action"] = "store_true"
     elif get_origin(kind) is Literal:
@@ -143,6 +140,11 @@ def _add(
     action = parser.add_argument(f"--{option or (match[1] if match else name).replace('_', '-')}", **more)
     parser._option_string_actions.update({f"--{word}": action for word in old})
     return action
+
+
+def _dest(name: str, option: str) -> str:
+    """The attribute of the parsed arguments."""
+    return (option or name).replace("-", "_")
 
 
 def _kind(hint: Any) -> tuple[Any, bool]:

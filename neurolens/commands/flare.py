@@ -210,12 +210,12 @@ def _check(args: argparse.Namespace) -> None:
             raise InputError(_COMMAND, "--frames", f"({len(args.frames)})", "-o beside it")
         args.kept = "the frames that are there are kept: the same command goes on"
     by_chance = args.photons or args.glare or args.barrel or args.sensor or args.dust or args.haze_per_mm
-    if not by_chance and args.most_reflections not in (None, 2):
+    if not by_chance and args.reflections not in (None, 2):
         expected = "2, or --photons or --glare beside it, whose light is reflected more often"
-        raise InputError(_COMMAND, "--reflections", args.most_reflections, expected)
-    if args.photons and args.brightest:
+        raise InputError(_COMMAND, "--reflections", args.reflections, expected)
+    if args.photons and args.layers:
         expected = "no --photons beside it: they tell no single ghosts apart"
-        raise InputError(_COMMAND, "--layers", args.brightest, expected)
+        raise InputError(_COMMAND, "--layers", args.layers, expected)
     if args.out is not None:
         Files.of(args.out)
     if args.path is not None:
@@ -299,12 +299,12 @@ def _write_all(states: list[argparse.Namespace], shots: _Shots, progress: Progre
     from neurolens.render.pictures import read_metadata
 
     args, single, exposure = states[0], tuple[str, ...](), states[0].exposure
-    if args.brightest:  # the same in all frames
+    if args.layers:  # the same in all frames
         jobs = [shots.at(state).job for state in states[:: -(-len(states) // _RANKED_FRAMES)]]
         with progress.stage("brightest ghosts") as report:
             single = brightest(jobs, report)
-        if len(single) < args.brightest:
-            warn(f"layers of {len(single)} single ghosts, not {args.brightest}: no other leaves light on the film")
+        if len(single) < args.layers:
+            warn(f"layers of {len(single)} single ghosts, not {args.layers}: no other leaves light on the film")
     if args.frames is None:
         exposure = _write(args, shots, single, exposure, progress)
         return {"layers": single, "exposure": exposure or 0.0}
