@@ -48,8 +48,9 @@ def setting(
     Args:
         about: the help; `add_options` adds the default where the help does not mention one.
         within: the smallest and the largest value of a number. unit: what the number is, for messages.
-        option: name of the option ("reflections") where it is not the field's; the parsed arguments have that name, too.
-        old: earlier names, which still work and which help does not show. metavar: placeholder of the value in the help.
+        option: name of the option ("reflections") and of the parsed argument, where it is not the field's.
+        old: earlier names, which still work and which help does not show.
+        metavar: placeholder of the value in the help.
     """
     about_it = {"about": about, "within": within, "unit": unit, "option": option, "old": old, "metavar": metavar}
     return field(default=default, metadata=about_it)
