@@ -105,21 +105,22 @@ def run_fit(args: argparse.Namespace, lens: Lens | None, model: GhostModel | Non
         with progress.stage("ghosts") as report:
             model = fit_ghosts(lens, settings, report)
         write_ghosts(model, args.fit)
-    found = {"lens": model.lens.name, "out": str(args.fit), **model.report}
-    return answer(args, found, lambda: _text(found))
+    results = {"lens": model.lens.name, "out": str(args.fit), **model.report}
+    return answer(args, results, lambda: _text(results))
 
 
-def _text(found: dict[str, Any]) -> str:
+def _text(results: dict[str, Any]) -> str:
     rows = [
         [
             r["ghost"], number(100 * r["energy"]), number(r["film_rms_um"]), number(100 * r["false_light"]),
             number(100 * r["lost_light"]), str(r["degree"]), str(r["rims"]),
         ]
-        for r in found["ghosts"][:_SHOWN]
+        for r in results["ghosts"][:_SHOWN]
     ]  # fmt: skip
     head = ("ghost", "energy %", "RMS um", "light too much %", "too little %", "degree", "rims")
+    energy, error = number(100 * results["kept_energy"]), number(results["film_rms_um"])
     return (
-        f"{found['lens']}: {found['kept']} of {found['pairs']} ghosts, with {number(100 * found['kept_energy'])}% of "
-        f"their light; {number(found['film_rms_um'])} um RMS on the film, by light; the brightest:\n\n"
-        f"{table(head, rows)}\n\n{found['out']}: fitted in {found['seconds']:.1f} s"
+        f"{results['lens']}: {results['kept']} of {results['pairs']} ghosts, with {energy}% of their light; {error} um "
+        f"RMS on the film, by light; the brightest:\n\n{table(head, rows)}\n\n{results['out']}: fitted in "
+        f"{results['seconds']:.1f} s"
     )
