@@ -323,9 +323,13 @@ def shot_of(settings: CameraSettings, args: argparse.Namespace, aperture: Apertu
 
 def picture_size(settings: CameraSettings, width: int | None, height: int | None) -> tuple[int, int]:
     """Width and height; a missing one follows from the other and the film's shape."""
-    shape = settings.film_width_mm / settings.film_height_mm
     if width is None and height is None:
         return settings.width, settings.height
+    return size_by_shape(settings.film_width_mm / settings.film_height_mm, width, height)
+
+
+def size_by_shape(shape: float, width: int | None, height: int | None) -> tuple[int, int]:
+    """Width and height of a film of this width over height, of which one may be missing."""
     found_width = max(1, round((height or 0) * shape)) if width is None else width
     return found_width, max(1, round(found_width / shape)) if height is None else height
 

@@ -10,10 +10,12 @@ lower index, fitted to its transfer matrices at one wavelength.
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from neurolens.graph.ir import Graph, Value
 from neurolens.optics import coatings
@@ -160,7 +162,15 @@ def reflectance_fit(
     exact = coatings.reflectance(cos_i, n_before, n_after, layers, wavelength_nm, sense).numpy()
     fit = np.polynomial.Chebyshev.fit(1 - c, exact, DEGREE, domain=(0, 1), w=1 / (exact + _FAINT))
     worst = np.abs(fit(1 - c) - exact) / (exact + _FAINT)
-    return fit.convert(kind=np.polynomial.Polynomial).coef.tolist(), float(worst.max())
+    return (fit.coef @ _powers()).tolist(), float(worst.max())
+
+
+@cache
+def _powers() -> NDArray[np.float64]:
+    """Coefficients of the powers of u in Chebyshev's polynomials of 2 u - 1, [DEGREE + 1, DEGREE + 1]."""
+    basis = [np.polynomial.Chebyshev.basis(k, domain=(0, 1)) for k in range(DEGREE + 1)]
+    powers = [each.convert(kind=np.polynomial.Polynomial).coef for each in basis]
+    return np.stack([np.pad(each, (0, DEGREE + 1 - len(each))) for each in powers])
 
 
 def _figure(shape: Shape, call: Value) -> Figure:
