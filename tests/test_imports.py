@@ -3,7 +3,7 @@
 base <- graph <- modelfile <- optics <- models <- surrogates <- evaluate <- commands <- cli
                               optics <- analysis   <- evaluate
                     models <- cameras <- render    <- evaluate
-                  surrogates, analysis, render <- flare <- evaluate
+                  surrogates, analysis, render <- flare <- evaluate <- frames
                                          render    <- mitsuba  <- evaluate
 """
 
@@ -40,10 +40,12 @@ PARTS = {
     },
     "view": {"graph", "optics", "analysis", "cameras", "flare"},
     "blender": set(),
+    "frames": {"optics", "readers", "cameras", "render", "flare", "evaluate"},
     "commands": {
         *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba", "flare"),
         "blender",
         "evaluate",
+        "frames",
         "view",
     },
     "cli": {"commands"},
@@ -64,7 +66,7 @@ PACKAGES = {
 # Besides those: the one camera that traces rays exactly, the maker of cameras, which imports it
 # when one is asked for; the shapes of the stop, which are parts of graphs.
 EXCEPTIONS: dict[str, tuple[set[str], set[str]]] = {
-    "neurolens.base.engine": (set(), {"dask", "distributed"}),  # where a cluster is asked for
+    "neurolens.base.cluster": (set(), {"dask", "distributed"}),  # where a cluster is asked for
     # Methods that take tensors: torch is loaded where one is called.
     "neurolens.surrogates.cores": ({"surrogates"}, {"torch"}),
     "neurolens.surrogates.model": ({"surrogates"}, {"torch"}),
@@ -79,7 +81,7 @@ EXCEPTIONS: dict[str, tuple[set[str], set[str]]] = {
 # Modules that load torch; others load these when they are needed.
 SLOW = {"neurolens.cameras.exact", "neurolens.cameras.outline_cache", "neurolens.commands.export_lens"}
 # What loads in a base install: these parts, and what converts lens files, looks up glass and writes C.
-LEAN = ("graph", "modelfile", "cameras", "render", "mitsuba", "commands", "cli", "base", "readers")
+LEAN = ("graph", "modelfile", "cameras", "render", "mitsuba", "frames", "commands", "cli", "base", "readers")
 LEAN_MODULES = {
     *(f"neurolens.optics.{name}" for name in ("catalogue", "designs", "glass", "lensfile", "lenswriter", "paraxial")),
     *MODELS,

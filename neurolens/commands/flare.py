@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neurolens import __version__
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, warn
 from neurolens.base.options import add_options, from_options
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import (
@@ -29,7 +29,6 @@ from neurolens.commands.flare_fit import add_fit, check_fit, fitted, run_fit, st
 from neurolens.commands.flare_lights import add_lights
 from neurolens.commands.output import answer, number, table
 from neurolens.commands.render import film_size
-from neurolens.commands.render_files import Files, flare_channels, warn
 from neurolens.commands.render_frames import add_frames, frames_of
 from neurolens.evaluate.records import plain
 from neurolens.render.film_settings import FilmSettings
@@ -218,6 +217,8 @@ def _check(args: argparse.Namespace) -> None:
         expected = "no --photons beside it: they tell no single ghosts apart"
         raise InputError(_COMMAND, "--layers", args.layers, expected)
     if args.out is not None:
+        from neurolens.frames.frame import Files
+
         Files.of(args.out)
     if args.path is not None:
         check_suffix(Path(args.path[1]), "--path", (".png", ".pdf", ".svg"))
@@ -325,6 +326,8 @@ def _write(
     """Write a picture and its preview; returns the exposure in stops, or None where it is free and all is dark."""
     from neurolens.cameras.exact import placed_settings
     from neurolens.flare.layers import flare_layers, kept_beside, sum_of
+    from neurolens.frames.frame import Files
+    from neurolens.frames.picture import flare_channels
     from neurolens.render.exr_attributes import standard_attributes
     from neurolens.render.pictures import write_exr, write_png
 

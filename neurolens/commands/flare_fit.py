@@ -9,12 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, warn
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_within, aperture_of, between, check_suffix, given_options
 from neurolens.commands.output import answer, number, table
-from neurolens.commands.render_files import warn
 
 if TYPE_CHECKING:
     from neurolens.flare.ghostmodel import GhostModel

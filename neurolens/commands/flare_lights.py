@@ -9,12 +9,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, warn
 from neurolens.base.lensname import is_model
 from neurolens.base.options import add_options
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import aperture_of, positive
-from neurolens.commands.render_files import warn
 from neurolens.render.flaresettings import FlareSettings
 
 if TYPE_CHECKING:
