@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.layout import Layout, Line, layout_profile
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path, seal, sealed_bytes
+from neurolens.base.kept import read_arrays, write_arrays
 from neurolens.base.status import PASSED
 from neurolens.flare.area import draw_edges, edges_of
 from neurolens.flare.ghostmodel import GhostModel
@@ -385,28 +386,25 @@ def _arrivals(
 
 
 class _Kept:
-    """Sums of work, and how many of its tasks they hold, in a file that is as old as half a minute at most."""
+    """Sums of work, and how many of its tasks they hold, in a file (`base.kept`) that is half a minute old at most."""
 
     def __init__(self, path: Path | None, same: str, sums: Sequence[Floats]) -> None:
-        self.done, self._path, self._head, self._sums, self._at = 0, path, same.encode(), sums, time.monotonic()
-        size = len(self._head) + 8 + sum(a.nbytes for a in sums)
-        if path is None or not path.is_file() or path.stat().st_size > 2 * size:
-            return
-        data, at = sealed_bytes(path), len(self._head) + 8
-        if data is not None and len(data) == size and data.startswith(self._head):
-            self.done = int.from_bytes(data[at - 8 : at], "little")
-            for a in sums:
-                a[:] = np.frombuffer(data, a.dtype, a.size, at).reshape(a.shape)
-                at += a.nbytes
+        self.done, self._path, self._same, self._at = 0, path, same, time.monotonic()
+        self._sums = {f"a{k}": array for k, array in enumerate(sums)}
+        with suppress(OSError, ValueError):  # there is none, or it is damaged: all is done again
+            if path is not None:
+                with read_arrays(path, self._sums) as (about, read):
+                    if about["same"] == same:
+                        whole = [(array, read(name, np.empty_like(array))) for name, array in self._sums.items()]
+                        self.done = int(about["done"])
+                        for array, kept in whole:
+                            array[:] = kept
 
     def add(self) -> None:
         """One more task is done."""
         self.done += 1
         if self._path is not None and time.monotonic() - self._at > _KEEP_S:
-            with atomic_path(self._path) as temporary:
-                parts = self._head, self.done.to_bytes(8, "little"), *(a.tobytes() for a in self._sums)
-                temporary.write_bytes(b"".join(parts))
-                seal(temporary)
+            write_arrays(self._path, {"same": self._same, "done": self.done}, self._sums)
             self._at = time.monotonic()
 
 
