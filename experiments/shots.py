@@ -20,7 +20,6 @@ import numpy as np
 from experiments import lab
 from experiments.plans import suited
 from neurolens.base.progress import Report
-from neurolens.cameras.fused import FusedCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.evaluate import footprints as prints
 from neurolens.evaluate import shot_fits
@@ -127,7 +126,7 @@ def _errors(found: Probed, camera: OnnxCamera) -> tuple[float, float]:
 def _measured(found: Probed, file: Path, terms: int) -> Model:
     camera = _onnx(found, file)
     um, light = _errors(found, camera)
-    ns = ns_a_ray(FusedCamera(load_model(file), **_real(found)), found.places)["min"]
+    ns = ns_a_ray(OnnxCamera(load_model(file), **_real(found), runtime="c"), found.places)["min"]
     return Model(terms, um, light, glsl_operations(camera), ns)
 
 

@@ -94,8 +94,8 @@ def test_old_spellings_work_and_are_hidden(capsys: pytest.CaptureFixture[str]) -
         ("survey lenses", "--again", "--restart"),
         ("render a.toml -o a.exr --camera thin", "--layers beauty --wavelengths hero --configuration 70",
          "--channels beauty --wavelength-mode hero --zoom 70"),
-        ("flare cooke_triplet_50 --light 5,3", "--out a.exr --wavelengths 9", "-o a.exr --bins 9"),
-        ("stmap thin --size 9x6 --film 36x24", "--out a --channels-nm 600,500,400", "-o a --wavelengths 600,500,400"),
+        ("flare cooke_triplet_50 --light 5,3", "--out a.exr --preview --wavelengths 9", "-o a.exr --quick --bins 9"),
+        ("stmap thin --width 9 --film 36x24", "--out a --channels-nm 600,500,400", "-o a --wavelengths 600,500,400"),
         ("export cooke_triplet_50 --to c -o a.h", "--camera", "--whole-camera"),
         ("flare cooke_triplet_50 --fit a.onnx", "--target-um 60 --wavelengths 9", "--within 60um --bins 9"),
         ("lens cooke_triplet_50 --derive-rims", "--vignetting 0.4", "--edge-pupil 0.4"),
@@ -110,6 +110,7 @@ def test_old_spellings_work_and_are_hidden(capsys: pytest.CaptureFixture[str]) -
             assert not re.search(rf"{word}(?![\w-])", shown), word
     tiles = "a.tile-1-of-1.exr -o a.exr"
     assert parse(f"merge {tiles}".split()) == parse(f"render --merge {tiles}".split())
+    assert parse("stmap thin --size 9x6 --film 36x24 -o a".split()).size == (9, 6)
     words = "a.toml --lens cooke_triplet_50".split()
     assert parse(["trade", *words]) == parse(["plan", *words, "--trade"])
 

@@ -26,8 +26,8 @@ from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.progress import Report
 from neurolens.cameras import build
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FloatArray
-from neurolens.cameras.exact import ExactCamera, FusedExactCamera
-from neurolens.cameras.fused import FusedCamera
+from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.graphcamera import Runtime
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.vignetting import Vignetted
 from neurolens.evaluate.image import Image
@@ -270,9 +270,9 @@ class Window:
         return other
 
 
-def exact_camera(shot: Shot, surrogate: Surrogate | None, kind: type[ExactCamera] = ExactCamera) -> Camera:
+def exact_camera(shot: Shot, surrogate: Surrogate | None, runtime: Runtime = "trace") -> Camera:
     """The prescription itself, sampled over the surrogate's pupil: the same rays for the same random numbers."""
-    return kind(
+    return ExactCamera(
         replace(shot.lens, film_z_mm=None),
         film_mm=shot.film_mm,
         focus_m=shot.focus_m,
@@ -280,13 +280,14 @@ def exact_camera(shot: Shot, surrogate: Surrogate | None, kind: type[ExactCamera
         bounds=None if surrogate is None else surrogate.domain.bounds,
         focus="paraxial",
         film_offset_mm=shot.offset_mm,
+        runtime=runtime,
     )
 
 
-def surrogate_camera(shot: Shot, surrogate: Surrogate | None, kind: type[OnnxCamera] = OnnxCamera) -> Camera:
+def surrogate_camera(shot: Shot, surrogate: Surrogate | None, runtime: Runtime = "onnxruntime") -> Camera:
     """The exported model."""
     assert surrogate is not None
-    return kind(
+    return OnnxCamera(
         load_model(surrogate.file),
         film_mm=shot.film_mm,
         focus_m=shot.focus_m,
@@ -295,6 +296,7 @@ def surrogate_camera(shot: Shot, surrogate: Surrogate | None, kind: type[OnnxCam
         wavelength_nm=shot.wavelength_nm,
         focus="paraxial",
         film_offset_mm=shot.offset_mm,
+        runtime=runtime,
     )
 
 
@@ -321,8 +323,8 @@ CAMERAS: dict[str, Callable[[Shot, Surrogate | None], Camera]] = {
 }
 # The same as compiled code: many times as fast, but not for every lens, nor on every machine.
 _COMPILED: dict[str, Callable[[Shot, Surrogate | None], Camera]] = {
-    "exact": partial(exact_camera, kind=FusedExactCamera),
-    "surrogate": partial(surrogate_camera, kind=FusedCamera),
+    "exact": partial(exact_camera, runtime="c"),
+    "surrogate": partial(surrogate_camera, runtime="c"),
 }
 TITLES = {
     "exact": "exact lens",

@@ -194,7 +194,7 @@ def ideal_as(kind: str, lens: Lens, shot: Shot) -> Camera:
 
 
 def _exact(path: Path, shot: Shot, fused: bool, progress: Progress | None) -> Camera:
-    from neurolens.cameras.exact import ExactCamera, FusedExactCamera
+    from neurolens.cameras.exact import ExactCamera
     from neurolens.optics.lenscheck import check_lens, doubts
     from neurolens.optics.paraxial import first_order
     from neurolens.optics.states import set_lens
@@ -205,7 +205,7 @@ def _exact(path: Path, shot: Shot, fused: bool, progress: Progress | None) -> Ca
     if shot.aperture is not None:
         lens = lens.with_aperture(shot.aperture)
     f_number = shot.f_number_for(first_order(lens).f_number)
-    camera = (FusedExactCamera if fused else ExactCamera)(
+    camera = ExactCamera(
         lens,
         film_mm=shot.film_mm,
         focus_m=shot.focus_m,
@@ -214,6 +214,7 @@ def _exact(path: Path, shot: Shot, fused: bool, progress: Progress | None) -> Ca
         focus=shot.focus,
         film_offset_mm=shot.film_offset_mm,
         progress=progress,
+        runtime="c" if fused else "trace",
     )
     camera.settings |= {"zoom": shot.zoom, "notes": [*doubts(check_lens(tabled)), *_film_notes(lens, shot.film_mm)]}
     return camera
@@ -237,7 +238,6 @@ def _beyond_circle(film_mm: tuple[float, float], radius_mm: float, what: str, th
 
 
 def _model(path: Path, shot: Shot, fused: bool) -> Camera:
-    from neurolens.cameras.fused import FusedCamera
     from neurolens.cameras.model import OnnxCamera, load_model
     from neurolens.modelfile.states import state_for
 
@@ -253,7 +253,7 @@ def _model(path: Path, shot: Shot, fused: bool) -> Camera:
         model = model.at(*state_for(path, model.axes, model.state, shot.zoom, shot.focus_m))
     lens, domain = model.card["lens"], model.card["domain"]
     widest = float(lens["f_number"] * lens["stop_radius_mm"] / domain["stop_radius_mm"])
-    camera = (FusedCamera if fused else OnnxCamera)(
+    camera = OnnxCamera(
         model,
         film_mm=shot.film_mm,
         focus_m=shot.focus_m,
@@ -262,6 +262,7 @@ def _model(path: Path, shot: Shot, fused: bool) -> Camera:
         wavelength_nm=shot.wavelength_nm,
         focus=shot.focus,
         film_offset_mm=shot.film_offset_mm,
+        runtime="c" if fused else "onnxruntime",
     )
     notes = _beyond_circle(shot.film_mm, domain["film_radius_mm"], "the model's picture", "stay dark")
     poor = ", ".join(model.card["errors"].get("poor") or ())

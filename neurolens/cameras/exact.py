@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -18,7 +19,7 @@ from neurolens.base import status as st
 from neurolens.base.progress import Progress
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
-from neurolens.cameras.fused import Compiled, FusedFilm
+from neurolens.cameras.graphcamera import LensCamera, Runtime
 from neurolens.cameras.lens_film import LensFilm, LensGraph, SceneRays
 from neurolens.cameras.lens_state import axial_transmittance, lens_state
 from neurolens.cameras.outline_cache import kept_outline, search_key
@@ -35,9 +36,10 @@ from neurolens.optics.pupils import camera_rays, passes_at_any_azimuth, pupil_bo
 from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays, film_derivatives, trace, trace_differentials
 from neurolens.optics.tracegraph import exact_graph
+from neurolens.surrogates.assemble import SCALARS, Form
 
 
-class ExactCamera:
+class ExactCamera(LensCamera):
     """A camera whose lens is the prescription itself.
 
     Args:
@@ -49,6 +51,7 @@ class ExactCamera:
         bounds: pupil bounds of a domain that holds this focus and stop; rays are then those of the domain's models for
             the same random numbers. None searches for them, over the whole film.
         progress: shows the search for the outline, where it was not found before (`outline_cache`).
+        runtime: what runs the camera; all but "trace" are float32.
 
     Raises:
         InputError: a focus nearer than four focal lengths, or a lens that no ray passes.
@@ -67,9 +70,10 @@ class ExactCamera:
         focus: Focus = "best",
         film_offset_mm: float = 0.0,
         progress: Progress | None = None,
+        runtime: Runtime = "trace",
     ) -> None:
         self._pid = os.getpid()
-        self.film_mm = check_film(film_mm)
+        self.film_mm, self.path = check_film(film_mm), Path(lens.path)
         self.focus_m = positive("focus_m", focus_m, infinite=True)
         self.name = lens.name
         self.dispersive = lens.dispersive
@@ -112,18 +116,12 @@ class ExactCamera:
             "dtype": dtype,
             "lens_state": state_of(self.lens, self._light_nm, float(first_order(lens).efl_mm)),
         }
+        self.start(runtime)
 
-    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
-        return self.film.sample(film_mm, pupil, wavelength_nm)
-
-    def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Sample rays as `sample` does, and carry their differentials through every surface."""
-        return self.film.sample(film_mm, pupil, wavelength_nm, self._with_differentials)
-
-    def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
-        """cos^4 of the angles between the axis and the rays of `sample` on the film's side."""
-        return self.film.natural(film_mm, pupil, wavelength_nm)
+    def _sampled(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray, moves: bool) -> CameraRays:
+        if self.runtime != "trace":
+            return super()._sampled(film_mm, square, wavelength_nm, moves)
+        return self.film.sample(film_mm, square, wavelength_nm, self._with_differentials if moves else None)
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """Film points of scene points [3, N] in m, traced through points of the front surface chosen by `pupil`."""
@@ -145,8 +143,8 @@ class ExactCamera:
         status = np.where(aim.status == st.PASSED, done.status.numpy(), aim.status)
         return arrived(film, origin, point_m, weight, status, wavelength_nm)
 
-    def lens_graph(self) -> LensGraph:
-        """The lens as a graph."""
+    def lens_graph(self, form: Form = SCALARS) -> LensGraph:
+        """The graph of the lens with its stop; it has one form."""
         graph = exact_graph(self.lens, self._pupil_z_mm, self._range_nm)
         stopped = st.blocked(self.lens.stop_index, st.RIM)
         return LensGraph(graph, float(self.lens.stop_radius_mm), self.lens.aperture, stopped)
@@ -199,21 +197,6 @@ class ExactCamera:
 
 def _tensors(dtype: torch.dtype, *arrays: NDArray[Any]) -> list[torch.Tensor]:
     return [torch.from_numpy(np.ascontiguousarray(a)).to(dtype) for a in arrays]
-
-
-class FusedExactCamera(Compiled, ExactCamera):
-    """A prescription as a compiled camera: the rays of `ExactCamera` to rounding.
-
-    Args and attributes are those of `ExactCamera`, whose `dtype` is float32 here; for differentials see `FusedFilm`.
-
-    Raises:
-        InputError: as `ExactCamera`; no C compiler.
-    """
-
-    def __init__(self, lens: Lens, **kwargs: Any) -> None:
-        super().__init__(lens, **kwargs)
-        self._fused = FusedFilm(self.film, self.lens_graph(), self.film_mm)
-        self.settings |= {"runtime": "fused"}
 
 
 def state_of(lens: Lens, wavelength_nm: tuple[float, float], nominal_mm: float | None = None) -> dict[str, Any]:

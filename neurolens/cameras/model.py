@@ -13,27 +13,24 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
-from neurolens.cameras.cameragraph import D_FILM, status_graph
-from neurolens.cameras.contract import RAYS_A_CALL, CameraRays, FilmPoints, FloatArray
+from neurolens.cameras.cameragraph import status_graph
+from neurolens.cameras.contract import FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
-from neurolens.cameras.lens_film import LensFilm, LensGraph, SceneRays, camera_rays, whole_camera
+from neurolens.cameras.graphcamera import LensCamera, Runtime
+from neurolens.cameras.lens_film import LensFilm, LensGraph, SceneRays
 from neurolens.cameras.lens_state import axial_transmittance, lens_state, squeeze_of
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.onnxmaps import InverseRays, OnnxInverse, load_inverse
-from neurolens.cameras.onnxsession import open_session, run_batches
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.pupil_search import COARSE_TIGHT, outline_of
 from neurolens.cameras.sampling import arrived, check_film, common_light, positive
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph
-from neurolens.graph.loworder import with_film_derivatives
-from neurolens.graph.onnx import write_onnx
 from neurolens.modelfile import DOMAIN_SLACK
 from neurolens.modelfile.states import state_for
 from neurolens.optics import film_plane
 from neurolens.optics.apertures import Aperture
-from neurolens.surrogates.assemble import ONNX, SCALARS, Form
+from neurolens.surrogates.assemble import SCALARS, Form
 
 __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
 
@@ -41,14 +38,10 @@ Focus = Literal["best", "paraxial", "internal"]
 
 # Parts of the card that the metadata of pictures leave out.
 _NOT_KEPT = ("reference", "units", "frame", "status_codes", "states")
-# Of the graph of a whole camera.
-_INPUTS = {"film_mm": ("tensor(float)", 2, None), "square": ("tensor(float)", 2, None)}
-_INPUTS |= {"wavelength_nm": ("tensor(float)", 1, None)}
-_OUTPUTS = {"ray": ("tensor(float)", 6, None), "weight": ("tensor(float)", None), "status": ("tensor(int32)", None)}
 _NOMINAL = 1.02  # f-numbers are engraved rounded: up to this much wider than the widest stop means the widest stop
 
 
-class OnnxCamera:
+class OnnxCamera(LensCamera):
     """A camera whose lens is an exported model.
 
     Args:
@@ -61,9 +54,10 @@ class OnnxCamera:
         focus: "best" places the film where the model's rays from the axis make the least spot, as `set_lens` does for
             the lens; "paraxial" in the paraxial image. "internal" is as "best": groups move where a model knows them.
         outline: of the pupil of the lens itself, to hold the model against it; None searches the model's own.
+        runtime: what runs the camera, "onnxruntime" or "c".
 
     Raises:
-        InputError: a focus, stop or zoom position outside the model's domain.
+        InputError: a focus, stop or zoom position outside the model's domain; no C compiler where one is needed.
 
     Warns:
         NeurolensWarning: best focus lies beyond the film positions of a model, which has its film at their end then.
@@ -82,15 +76,14 @@ class OnnxCamera:
         focus: Focus = "best",
         film_offset_mm: float = 0.0,
         outline: PupilOutline | None = None,
+        runtime: Runtime = "onnxruntime",
     ) -> None:
         self.focus_m = positive("focus_m", focus_m, infinite=True)
         if model.axes or zoom is not None:
             model = model.at(*state_for(model.path, model.axes, model.state, zoom, self.focus_m))
         card = model.card
         lens, domain = card["lens"], card["domain"]
-        self.model = model
-        self._whole: OnnxFilm | None = None
-        self._with_moves: OnnxFilm | None = None
+        self.model, self.path, self.threads = model, model.path, model.threads
         self._inverse: tuple[OnnxInverse, FrontAim] | None = None
         self.name = str(lens.get("name", model.path.stem))
         self.film_mm = check_film(film_mm)
@@ -128,30 +121,13 @@ class OnnxCamera:
             "card": {k: v for k, v in card.items() if k not in _NOT_KEPT},
         }
         self.settings["lens_state"] = _state_of(scene, used, self.settings["f_number"])
-
-    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
-        if self._whole is None:
-            self._whole = OnnxFilm(self.film, self.lens_graph(ONNX), self.model)
-        return self._whole.sample(film_mm, pupil, wavelength_nm)
-
-    def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Sample rays as `sample` does, and give their differentials, too."""
-        if self._with_moves is None:
-            lens = self.lens_graph(ONNX)
-            lens = lens._replace(graph=with_film_derivatives(lens.graph))
-            self._with_moves = OnnxFilm(self.film, lens, self.model)
-        return self._with_moves.sample(film_mm, pupil, wavelength_nm)
+        self.start(runtime)
 
     def lens_graph(self, form: Form = SCALARS) -> LensGraph:
         """The graph of the model in the camera's state, with its stop."""
         scene = self.film.scene
         assert isinstance(scene, ModelScene)
         return LensGraph(self.model.graph(form), scene.stop_radius_mm, scene.aperture, scene.stop_status)
-
-    def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
-        """cos^4 of the angles between the axis and the rays of `sample` on the film's side."""
-        return self.film.natural(film_mm, pupil, wavelength_nm)
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """Film points of scene points [3, N] in m through points of the front surface chosen by `pupil`.
@@ -186,43 +162,16 @@ class OnnxCamera:
         return self._inverse
 
     def for_worker(self) -> OnnxCamera:
-        """The same camera with a session of its own, for another process or thread."""
+        """The same camera with sessions of its own, for another process or thread; compiled code needs none."""
+        if self.runtime == "c":
+            return self
         other = copy(self)
         other.model, other.film = self.model.reopened(), copy(self.film)
-        other._whole = other._with_moves = other._inverse = None
+        other._inverse = None
+        other.start(self.runtime)
         assert isinstance(self.film.scene, ModelScene)
         other.film.scene = replace(self.film.scene, model=other.model)
         return other
-
-
-class OnnxFilm:
-    """Film, pupil and lens of a camera as one graph that onnxruntime runs.
-
-    Args:
-        film: of a lens at one focus and stop, whose numbers are constants of the graph.
-        lens: the graph of that lens, with its derivatives by the film point where differentials are wanted.
-        model: the model whose lens it is.
-    """
-
-    def __init__(self, film: LensFilm, lens: LensGraph, model: OnnxLens) -> None:
-        whole, numbers = whole_camera(film, lens, mask_too=True)
-        g, mask = Graph(), lens.aperture and lens.aperture.mask
-        constants = {name: g.constant(value) for name, value in numbers.items()}
-        constants["outline"] = g.own_table(film.outline.table)
-        if lens.aperture is not None and mask is not None:
-            constants["mask"] = g.own_table(lens.aperture.table)
-        g.outputs = g.inline(whole, constants)
-        shapes = _OUTPUTS | {name: ("tensor(float)", 6, None) for name in D_FILM if name in g.outputs}
-        self._path, self._names = model.path, tuple(shapes)
-        self._session = open_session(model.path, write_onnx(g, {}), model.threads, _INPUTS, shapes)
-
-    def sample(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Sample rays as `LensFilm.sample` does, with their differentials where the lens's graph has derivatives."""
-        rays = {"film_mm": film_mm, "square": square, "wavelength_nm": wavelength_nm[None]}
-        done = run_batches(self._path, self._session, self._names, rays, {}, RAYS_A_CALL)
-        found = {name: np.atleast_2d(values) for name, values in zip(self._names, done, strict=True)}
-        moves = [found.pop(name) for name in D_FILM if name in found]
-        return camera_rays(found | ({"d_film": np.stack(moves, 1)} if moves else {}))
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from neurolens.commands.arguments import (
     add_json,
     add_lens,
     add_lens_state,
+    add_option,
     add_output,
     check_suffix,
     state_of,
@@ -73,7 +74,7 @@ examples:
 _COMMAND = "neurolens flare"
 _SHOWN, _SHOWN_LIGHTS, _KEPT = 12, 4, 64  # ghosts of a table and tables; ghosts of a light that files tell
 _FEWEST = 256  # rays of a table
-_PREVIEW_WIDTH = 480  # at most
+_QUICK_WIDTH = 480  # at most
 _RANKED_FRAMES = 16  # that tell which ghosts are brightest
 _QUANTILE, _SHOWN_AT = 0.99, 0.8  # the preview's exposure takes this quantile of the lit pixels to this value
 _FRAMES = (
@@ -116,8 +117,8 @@ def _add_picture(parser: argparse.ArgumentParser) -> None:
     add_options(group, FlareSettings, ["cell_px", "bins"])
     add_exposure(group, None, "99% of the lit pixels become no brighter than 0.8; frames share one value")
     add_colour_space(group, "; default: that of --image, else of a scene's [film] table, else sRGB")
-    group.add_argument(
-        "--preview", action="store_true",
+    add_option(
+        group, "--quick", old=("--preview",), action="store_true",
         help="at most 480 pixels wide, 5 wavelengths and 65536 photons a light and wavelength, --cell at least 24",
     )  # fmt: skip
     group = parser.add_argument_group("layers")
@@ -147,13 +148,13 @@ def _gain(text: str) -> tuple[str, list[float]]:
 
 
 def _settings(args: argparse.Namespace) -> FlareSettings:
-    """The settings of the arguments, those of a preview where it is one."""
+    """The settings of the arguments, those of a quick look where it is one."""
     gains: dict[str, tuple[float, float, float]] = {}
     for name, factors in args.gains:
         r, g, b = (a * b for a, b in zip(gains.get(name, (1.0, 1.0, 1.0)), factors, strict=True))
         gains[name] = (r, g, b)
     settings = replace(from_options(FlareSettings, args), gains=gains)
-    return settings.preview() if args.preview else settings
+    return settings.quick() if args.quick else settings
 
 
 def run(args: argparse.Namespace) -> int:
@@ -166,9 +167,9 @@ def run(args: argparse.Namespace) -> int:
     _check(args)
     settings = args.settings = _settings(args)
     progress, began = Progress(quiet=args.quiet or args.json), time.perf_counter()
-    if args.preview:
-        args.width = min(args.width, _PREVIEW_WIDTH)
-        progress.note(f"preview: {args.width} pixels wide, {settings.bins} wavelengths, cells of {settings.cell_px:g}")
+    if args.quick:
+        args.width = min(args.width, _QUICK_WIDTH)
+        progress.note(f"quick: {args.width} pixels wide, {settings.bins} wavelengths, cells of {settings.cell_px:g}")
     states = list(_states(args))
     model = fitted(args, states)
     tabled = read_any(args.file) if model is None else model.lens

@@ -29,8 +29,6 @@ from neurolens.base.progress import Report
 from neurolens.base.tomlfile import format_toml
 from neurolens.cameras.build import Shot, ideal_as
 from neurolens.cameras.contract import Camera
-from neurolens.cameras.exact import FusedExactCamera
-from neurolens.cameras.fused import FusedCamera
 from neurolens.cameras.model import OnnxCamera, OnnxLens, load_model
 from neurolens.cameras.warped import Warped
 from neurolens.evaluate import footprints as prints
@@ -328,7 +326,7 @@ def camera_of(found: Probed, choice: Choice) -> Camera:
         flat = ideal_as(kind, found.exact.lens, Shot(found.asked.film_mm, found.asked.focus_m))
         mapped = choice.name.endswith(_MAPPED)
         return Warped(flat, found.exact, found.asked.focus_m, tables=found.exact_field) if mapped else flat
-    return (FusedCamera if kind else OnnxCamera)(load_model(path), **_real(found))
+    return OnnxCamera(load_model(path), **_real(found), runtime="c" if kind else "onnxruntime")
 
 
 def _real(found: Probed) -> dict[str, Any]:
@@ -364,7 +362,7 @@ def _ideal(trial: _Trial) -> Iterator[_Judged]:
 def _exact(trial: _Trial) -> Iterator[_Judged]:
     """The exact lens, which has no error: as C where that runs, and as code where its surfaces have a form in it."""
     found, target = trial.found, trial.target
-    exact, path, compiled = found.exact, found.lens.path, isinstance(found.exact, FusedExactCamera)
+    exact, path, compiled = found.exact, found.lens.path, found.exact.runtime == "c"
     cost: Cost = {
         "osl": lambda: trial.shader(path),
         "glsl": lambda: (_counted(glsl_operations(exact)), noise(found.seen.weight, trial.share)),
@@ -399,7 +397,7 @@ def _model(trial: _Trial, file: Path, how: str = "", without: Collection[str] = 
                 return trial.shader(file)
             if target == "glsl":
                 return _counted(glsl_operations(camera)), noise(seen.weight, trial.share)
-            return trial.timed(FusedCamera.of(camera) if compiled else camera, seen)
+            return trial.timed(camera.compiled() if compiled else camera, seen)
 
         spec = f"{'fused:' if compiled else ''}{file}"
         yield trial.judged(file.stem, spec, seen, cost, how, form, _operations(model), beside)

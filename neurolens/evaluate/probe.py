@@ -22,7 +22,7 @@ from neurolens.analysis.field_curves import illumination
 from neurolens.analysis.fields import Scene as Fields
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, ideal_as
-from neurolens.cameras.exact import ExactCamera, FusedExactCamera
+from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.field import Field, field_of
 from neurolens.evaluate import footprints as prints
 from neurolens.evaluate.footprints import AFTERWARDS, Array, Footprints, Places
@@ -116,7 +116,7 @@ class Probed:
     asked: Asked
     lens: Lens
     domain: Domain
-    exact: ExactCamera | FusedExactCamera
+    exact: ExactCamera
     places: Places
     shape: tuple[int, int]
     seen: Footprints
@@ -306,11 +306,11 @@ def effects_of(found: Probed, budget_px: float, stray: bool = True) -> tuple[Eff
     return tuple(sorted(effects, key=lambda e: (e.unit, -e.worth)))
 
 
-def exact_camera(lens: Lens, real: dict[str, Any]) -> ExactCamera | FusedExactCamera:
+def exact_camera(lens: Lens, real: dict[str, Any]) -> ExactCamera:
     """The exact camera, compiled as C where the machine has a compiler."""
     with suppress(InputError):
         if has_compiler():
-            return FusedExactCamera(lens, **real)
+            return ExactCamera(lens, **real, runtime="c")
     return ExactCamera(lens, **real)
 
 

@@ -31,6 +31,7 @@ from neurolens.render.scene import Scene
 Layers = dict[str, Floats]
 REST = "rest"
 _ONE = (1.0, 1.0, 1.0)
+_FINER = 4  # wavelengths of a ghost at most, for one of a star
 
 
 @dataclass(frozen=True)
@@ -57,8 +58,8 @@ class FlareJob:
 
     @property
     def fineness(self) -> dict[str, Any]:
-        """The arguments that `ghost_layers` and `ghost_picture` share."""
-        bins, cell = self.settings.bins, self.settings.cell_px
+        """The arguments of `ghost_layers` and `ghost_picture`; a ghost takes as many wavelengths as it needs."""
+        bins, cell = _FINER * self.settings.bins, self.settings.cell_px
         return {"wavelength_nm": self.wavelength_nm, "wavelengths": bins, "cell_px": cell, "threads": self.threads}
 
 
@@ -71,7 +72,7 @@ def flare_layers(job: FlareJob, progress: Progress | None = None) -> Layers:
     found: Layers = {}
     progress = progress or Progress(quiet=True)
     for name, make in MAKERS.items():
-        if name not in job.settings.without:
+        if job.settings.makes(name):
             with progress.stage(name) as report:
                 made = make(job, report)
             for picture in made.values():
@@ -196,12 +197,10 @@ def _bytes(pictures: int, layers: int) -> int:
 
 
 def _glare(job: FlareJob, done: Report) -> Layers:
-    return {"glare": _photons(job, done, "glare", job.settings.glare)} if job.settings.glare else {}
+    return {"glare": _photons(job, done, "glare", job.settings.glare)}
 
 
 def _starburst(job: FlareJob, done: Report) -> Layers:
-    if not job.settings.starburst:
-        return {}
     return {
         "starburst": starburst_picture(
             job.lens, job.lights, job.raster, wavelength_nm=job.wavelength_nm, wavelengths=job.settings.bins,

@@ -38,12 +38,13 @@ from neurolens.optics.prescription import Lens
 from neurolens.optics.sequence import follow, turning
 from neurolens.optics.trace import Rays, trace
 from neurolens.render.checkpoint import digest
-from neurolens.render.colour import in_gamut
+from neurolens.render.colour import SRGB, in_gamut
 from neurolens.render.spectrum import SpectralRange
 
 RANKED = 4096  # rays that decide which ghosts are brightest
 _AT_ONCE = 1 << 16  # rays of a call
 _ENOUGH = 200  # photons of a kernel: a noise of 8%
+_COLOURED = 3200  # photons of a kernel of colour: eyes see its noise in wider areas
 _WAIT_S = 0.5  # between two reports
 _KEEP_S = 30.0  # between two states of long work
 _AXIS = 1 << 15  # rays of the exposure
@@ -172,7 +173,7 @@ def ghost_picture(
     raster: Raster,
     *,
     wavelength_nm: tuple[float, float] = (400.0, 700.0),
-    wavelengths: int = 15,
+    wavelengths: int = 60,
     cell_px: float = 8.0,
     layers: Sequence[int] | None = None,
     threads: int = 2,
@@ -200,7 +201,7 @@ def ghost_layers(
     layers: Sequence[int],
     *,
     wavelength_nm: tuple[float, float] = (400.0, 700.0),
-    wavelengths: int = 15,
+    wavelengths: int = 60,
     cell_px: float = 8.0,
     threads: int = 2,
     done: Callable[[float], None] = lambda share: None,
@@ -224,11 +225,11 @@ def ghost_layers(
     for patch in (part for light in lights for part in patches(light, _PATCH_DEG)):
         light, size = patch.light, 1.5 * float(np.abs(patch.sides).sum()) * abs(float(first_order(lens).efl_mm))
         around = half[0] + size, half[1] + size  # ghosts beside the film may reach it, smeared
-        of_light = grids_of(tracer, light, middle, around, cell_px / raster.per_mm, (float(nm[0]), float(nm[-1])))
+        of_light = grids_of(tracer, light, middle, around, cell_px / raster.per_mm, nm.tolist())
         response = np.asarray(unit * spectral.response * spectral.spectrum(light.rgb), np.float64).T
         for pair, grid in of_light.items():
             moved = raster.per_mm * ghost_moves(tracer, patch, pair, grid, middle) * (-1, 1)
-            task = light, pair, grid, *_bands(nm, response, grid.wavelengths)
+            task = light, pair, grid, *_bands(nm, response, grid)
             groups.setdefault((layer[pair], smear_of(patch, moved)), []).append(task)
     work = _Work(sum(map(len, groups.values())), done)
     for number in sorted({number for number, _ in groups}):
@@ -291,14 +292,27 @@ def _batches(tasks: Sequence[_Task]) -> Iterator[list[_Task]]:
         yield some
 
 
-def _bands(nm: Doubles, response: Doubles, count: int) -> tuple[list[float], Doubles]:
-    """About so many wavelengths that stand for all of `nm` [W], and their colours [K, 3] for responses [W, 3]."""
-    count = min(max(count, FEWEST), len(nm))
+def _bands(nm: Doubles, response: Doubles, grid: Grid) -> tuple[list[float], Doubles]:
+    """The wavelengths that stand for all of `nm` [W] in a ghost, and their colours [K, 3] for responses [W, 3].
+
+    One wavelength is traced for each band. The others of the band have its places and their own power: a coating may
+    reflect ten times as much at one end of a band as at the other. Ghosts with equally many bands share the wavelengths
+    that are traced, unless a ghost is too dark at one of them to stand for its band.
+    """
+    count = min(max(grid.wavelengths, FEWEST), len(nm))
     w = inverse_square_um(nm)  # glass moves light about evenly with it
     at = np.arange(count) if count == len(nm) else (count * (w[0] - w) / (1.000001 * (w[0] - w[-1]))).astype(int)
-    of_band = (at == np.unique(at)[:, None]).astype(np.float64)
-    share = of_band * (np.abs(response).sum(1) + 1e-30)
-    return (share @ nm / share.sum(1)).tolist(), of_band @ response
+    nodes, level = zip(*(grid.spectrum or ((nm[0], 1.0),)), strict=True)
+    power = np.interp(nm, nodes, np.maximum(level, 1e-3 * max(level) + 1e-30))
+    traced, colours = list[float](), list[Doubles]()
+    for band in (np.flatnonzero(at == k) for k in np.unique(at)):
+        chosen = float(np.average(nm[band], weights=np.abs(response[band]).sum(1) + 1e-30))
+        if 2 * np.interp(chosen, nm, power) < power[band].mean():
+            bright = nm[band[2 * power[band] >= power[band].mean()]]
+            chosen = float(bright[np.abs(bright - chosen).argmin()])
+        traced.append(chosen)
+        colours.append(power[band] @ response[band] / np.interp(chosen, nm, power))
+    return traced, np.array(colours)
 
 
 # Photons by what became of them; those of "ghosts" and "glare" are the flare.
@@ -436,9 +450,16 @@ class _Work:
 
 
 def _smoothed(picture: Floats, sums: Floats, radius: float) -> Floats:
+    """Smooth a picture [H, W, 3] of photons: its luminance by kernels from `radius` on, its colour by wider kernels."""
+    bright, coloured = (in_gamut(_spread_wide(picture, sums, radius, most)) for most in (_ENOUGH, _COLOURED))
+    luminance = [np.maximum(part @ SRGB.to_xyz[1].astype(np.float32), 1e-30)[..., None] for part in (bright, coloured)]
+    return coloured * (luminance[0] / luminance[1])
+
+
+def _spread_wide(picture: Floats, sums: Floats, radius: float, enough: int) -> Floats:
     """A picture [H, W, 3] whose pixels' light is spread by kernels that keep its sum, mirrored at the edges.
 
-    Each by the narrowest kernel of radius r, 2 r, ... that holds `_ENOUGH` photons of equal weight, or is as little
+    Each by the narrowest kernel of radius r, 2 r, ... that holds `enough` photons of equal weight, or is as little
     noisy by their `sums` of weights and of squares, [2, H, W], with a soft step to the next; by none much wider than an
     eighth of the picture's shorter side. Epanechnikov's, 2 / pi (1 - r^2) in units of its radius.
     """
@@ -447,8 +468,8 @@ def _smoothed(picture: Floats, sums: Floats, radius: float) -> Floats:
         weight, square = np.moveaxis(spread(np.moveaxis(sums, 0, 2), radius), 2, 0)
         last = 8 * radius > min(picture.shape[:2])
         # n photons of equal weight have a sum of squares of n times the kernel's mean square, 4 / (3 pi r^2).
-        enough = 0.75 * math.pi * radius**2 * weight**2 / np.maximum(square, 1e-30) / _ENOUGH
-        share = np.ones_like(left) if last else (enough - 0.5).clip(0, 1)
+        held = 0.75 * math.pi * radius**2 * weight**2 / np.maximum(square, 1e-30) / enough
+        share = np.ones_like(left) if last else (held - 0.5).clip(0, 1)
         found += spread(picture * (left * share)[..., None], radius)
         left, radius = left * (1 - share), 2 * radius
-    return in_gamut(found)
+    return found

@@ -32,8 +32,7 @@ from neurolens.graph.scalars import lower
 from neurolens.optics import glass
 from neurolens.optics.prescription import Lens
 from neurolens.optics.sag import same_medium
-from neurolens.optics.shapes import is_plain
-from neurolens.optics.tracegraph import figure_of
+from neurolens.optics.shapes import figure_of, is_plain
 
 Floats = NDArray[np.float32]
 # What a step may do, by its place: refract light that goes to the film (0) or back (1), reflect it (2, 3).
@@ -64,7 +63,7 @@ class Stack:
         lens.require_glass("reflections, of which flare is made")
         self.lens, self.fit_error = lens, 0.0
         # An asphere's polynomial goes as high as the highest of its sort: they share functions.
-        self._figures = {k: figure_of(s) for k, s in enumerate(lens.surfaces) if not is_plain(s)}
+        self._figures = {k: figure_of(s, float) for k, s in enumerate(lens.surfaces) if not is_plain(s)}
         figures = self._figures.values()
         most = {even: max([0, *(len(f.terms) for f in figures if f.even == even)]) for even in (True, False)}
         self._terms = {k: most[f.even] if f.terms else 0 for k, f in self._figures.items()}

@@ -22,7 +22,13 @@ from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.evaluate.records import plain
 from neurolens.render.film import PixelGrid
-from neurolens.render.film_settings import ColourSpaceName, FilmSettings, WavelengthMode, WavelengthSampling
+from neurolens.render.film_settings import (
+    ColourSpaceName,
+    FilmSettings,
+    WavelengthMode,
+    WavelengthSampling,
+    size_by_shape,
+)
 from neurolens.render.illuminants import check_name
 from neurolens.render.renderer import RenderResult, Watch, render
 from neurolens.render.scene import CameraSettings, Scene, files_named, load_scene, seen_from
@@ -127,9 +133,7 @@ class Frame:
             if self.film_mm is None:
                 return settings.width, settings.height
             width = settings.width
-        shape = film[0] / film[1]
-        across = max(1, round((height or 0) * shape)) if width is None else width
-        return across, max(1, round(across / shape)) if height is None else height
+        return size_by_shape(film[0] / film[1], width, height)
 
 
 @dataclass(frozen=True)

@@ -49,12 +49,12 @@ class Glass:
         return f"{self.maker}:{self.name}"
 
     def index(self, wavelength_nm: Any) -> Any:
-        """Refractive index relative to air at a wavelength in nm (number, or tensor of any shape, of its dtype).
+        """Refractive index relative to air at a wavelength in nm (number, value of a graph, or tensor of its dtype).
 
         Outside `range_um` the formula is extrapolated; it is finite for 380-780 nm in every glass of the catalogue,
         and meaningless or NaN beyond the poles in the ultraviolet (below 300 nm).
         """
-        square = (wavelength_nm * 1e-3) ** 2
+        square = (wavelength_nm * 1e-3) * (wavelength_nm * 1e-3)
         c = self.coefficients
         if self.form == "sellmeier":
             terms = [c[k] * square / (square - c[k + 1]) for k in range(0, len(c), 2)]
@@ -111,6 +111,8 @@ class Glass:
 
 def _root(square: Any) -> Any:
     """Square root; a negative number gives NaN as a tensor's does, where Python's own power gives a complex one."""
+    if hasattr(square, "sqrt"):
+        return square.sqrt()
     return math.nan if isinstance(square, float) and square < 0 else square**0.5
 
 

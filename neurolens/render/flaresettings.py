@@ -77,7 +77,11 @@ class FlareSettings:
         "three-layer (1970 on), multi-layer (today), quarter-wave, v-coat, broadband; of one: three-layer,s07=bare",
     )
     bins: int = setting(
-        15, "wavelengths, in equal steps over the range of light, 400 to 700 nm", within=(1, 256), old=("wavelengths",)
+        15,
+        "wavelengths of stars and photons, in equal steps over the range of light, 400 to 700 nm; ghosts take what "
+        "their colours need, at most four times as many (default: 15)",
+        within=(1, 256),
+        old=("wavelengths",),
     )
     cell_px: float = setting(
         8.0, "size on film of the cells that a ghost is drawn by (default: 8; a quick look: 48)",
@@ -127,11 +131,15 @@ class FlareSettings:
         if self.scatter.on and not self.glare:
             object.__setattr__(self, "glare", GLARE)
 
-    def preview(self) -> FlareSettings:
+    def quick(self) -> FlareSettings:
         """The same, coarse enough for a quick look."""
         photons, glare = (min(n, _PREVIEW_PHOTONS) for n in (self.photons, self.glare))
         cell = max(self.cell_px, _PREVIEW_CELL_PX)
         return replace(self, bins=min(self.bins, _PREVIEW_BINS), cell_px=cell, photons=photons, glare=glare)
+
+    def makes(self, name: str) -> bool:
+        """Whether the layer of this name is switched on."""
+        return name not in self.without and bool({"glare": self.glare, "starburst": self.starburst}.get(name, True))
 
     def gain(self, name: str) -> tuple[float, float, float]:
         """Factors of red, green and blue of a layer or ghost."""

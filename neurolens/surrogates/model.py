@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -71,8 +71,11 @@ class Domain:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able, with infinity written as the string "inf"."""
-        data = asdict(self)
+        data = {
+            f.name: getattr(self, f.name) for f in fields(self)
+        }  # a zoom mixes many: asdict takes ten times as long
         data["focus_m"] = ["inf" if math.isinf(f) else f for f in self.focus_m]
+        data["bounds"] = {f.name: getattr(self.bounds, f.name) for f in fields(self.bounds)}
         return data
 
     @staticmethod

@@ -251,7 +251,7 @@ def test_ghosts_and_glare_are_all(tmp_path: Path) -> None:
     common = ["laikin_double_gauss_50", "--light", "12,5", "--width", "24", "--bins", "2", "--quiet"]
     common += ["--kernel", "0", "--photons", "300000"]
     sums, found = [], {}
-    for words in ([], ["--glare", "300000"], ["--glare", "300000", "--barrel", "0.5", "--sensor", "0.5", "--preview"]):
+    for words in ([], ["--glare", "300000"], ["--glare", "300000", "--barrel", "0.5", "--sensor", "0.5", "--quick"]):
         out = tmp_path / "one.exr"
         assert main(["flare", *common, *words, "-o", str(out)]) == 0
         found = read_layers(out)
