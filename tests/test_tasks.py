@@ -393,7 +393,7 @@ def test_the_documented_script_renders_one_picture_in_three_ways(tmp_path: Path)
         r'```python title="farm.py"\n(.*?)```', (ROOT / "docs/pages/how-to/farm.md").read_text(), re.S
     )
     scene = (ROOT / "experiments" / "scenes" / "lights.toml").read_text()
-    (tmp_path / "lights.toml").write_text(f"{scene}\n[flare]\nbins = 3\nbrightest = 1\nmost = 1\ncell_px = 64.0\n")
+    (tmp_path / "lights.toml").write_text(f"{scene}\n[flare]\nbins = 3\nbrightest = 1\ncell_px = 64.0\n")
     (tmp_path / "farm.py").write_text(script.replace("experiments/scenes/", ""))
     subprocess.run([sys.executable, "farm.py"], cwd=tmp_path, check=True, timeout=600)
     one, *others = (read_channels(tmp_path / f"{name}.exr")[0] for name in ("one", "tiled", "farm"))

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import io
 import json
+import time
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -75,6 +76,39 @@ def read_arrays(path: Path, names: Iterable[str] = ()) -> Iterator[tuple[Any, Re
         raise ValueError(f"damaged: {error.strerror}") from None
     except _UNREADABLE as error:
         raise ValueError(str(error) or type(error).__name__) from None
+
+
+class Kept:
+    """Keeps the state of long work in a file every few seconds, for a later run of the very same work.
+
+    Args:
+        path: the file; None keeps nothing. key: hash of everything that decides the work. every_s: seconds between two
+            states.
+    """
+
+    def __init__(self, path: Path | None, key: str, every_s: float) -> None:
+        self._path, self._key, self._every_s = path, key, every_s
+        self._spent_s, self._began = 0.0, time.monotonic()
+        self._written = self._began
+
+    def load(self) -> tuple[dict[str, Any], list[NDArray[Any]]] | None:
+        """State and arrays as saved, or None where there is no file, or a damaged one, or one of other work."""
+        with suppress(OSError, ValueError):
+            if self._path is not None:
+                with read_arrays(self._path) as (about, read):
+                    if about["key"] == self._key:
+                        arrays = [read(f"a{k}") for k in range(about["arrays"])]
+                        state, self._spent_s = dict(about["state"]), float(about["spent_s"])
+                        return state, arrays
+        return None
+
+    def save(self, state: Mapping[str, Any], arrays: Sequence[NDArray[Any]], *, now: bool = False) -> None:
+        """Write a state (JSON-able) and arrays, if the last write is some seconds ago or `now` asks for it."""
+        if self._path is not None and (now or time.monotonic() - self._written >= self._every_s):
+            spent_s = self._spent_s + time.monotonic() - self._began  # by earlier runs, too
+            about = {"key": self._key, "state": state, "spent_s": spent_s, "arrays": len(arrays)}
+            write_arrays(self._path, about, {f"a{k}": array for k, array in enumerate(arrays)})
+            self._written = time.monotonic()
 
 
 def _check_length(path: Path, length: int) -> None:

@@ -6,10 +6,8 @@ Values are those of a render: film irradiance over the irradiance that a white c
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -22,7 +20,7 @@ from numpy.typing import NDArray
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.layout import Layout, Line, layout_profile
 from neurolens.base.errors import InputError
-from neurolens.base.kept import read_arrays, write_arrays
+from neurolens.base.kept import Kept
 from neurolens.base.status import PASSED
 from neurolens.flare.area import draw_edges, edges_of
 from neurolens.flare.ghostmodel import GhostModel
@@ -356,8 +354,10 @@ def photon_picture(
     picture = np.zeros((raster.height, raster.width, 3), np.float32)
     sums = np.zeros((2, raster.height, raster.width), np.float32)
     same = lens, tracer.scatter, list(lights), raster, part, spectral.centres_nm, photons, most_reflections, seed
-    kept = _Kept(keep, digest(same), (picture, sums))
-    work = _Work((len(tasks) - kept.done) * len(firsts), done)
+    kept, first_task = Kept(keep, digest(same), _KEEP_S), 0
+    if (known := kept.load()) is not None:
+        first_task, (picture, sums) = known[0]["done"], known[1]
+    work = _Work((len(tasks) - first_task) * len(firsts), done)
 
     def one(task: tuple[int, Light, int]) -> tuple[Floats, NDArray[np.float64]]:
         """Sums of weights and of their squares, [2, H, W], and the colour [3] of a weight of 1."""
@@ -377,10 +377,11 @@ def photon_picture(
         colour = spectral.response[:, k] * spectral.spectrum(light.rgb)[k] / wavelengths
         return film, colour * (area * raster.per_mm**2 / photons / exposure)
 
-    for _, (film, colour) in work.results(one, tasks[kept.done :], threads):
+    for _, (film, colour) in work.results(one, tasks[first_task:], threads):
         picture += film[0, ..., None] * colour.astype(np.float32)
         sums += film * (np.abs(colour).max() ** np.array([1, 2], np.float32))[:, None, None]
-        kept.add()
+        first_task += 1
+        kept.save({"done": first_task}, (picture, sums))
     return _smoothed(picture, sums, kernel_px) if kernel_px > 0 else picture
 
 
@@ -397,29 +398,6 @@ def _arrivals(
             which &= (found.scattered > 0) == scatters
         # A film that sends light back is exposed by what it keeps.
         yield found.film_xy_mm[:, which], found.weight[which] / (1 - tracer.scatter.sensor)
-
-
-class _Kept:
-    """Sums of work, and how many of its tasks they hold, in a file (`base.kept`) that is half a minute old at most."""
-
-    def __init__(self, path: Path | None, same: str, sums: Sequence[Floats]) -> None:
-        self.done, self._path, self._same, self._at = 0, path, same, time.monotonic()
-        self._sums = {f"a{k}": array for k, array in enumerate(sums)}
-        with suppress(OSError, ValueError):  # there is none, or it is damaged: all is done again
-            if path is not None:
-                with read_arrays(path, self._sums) as (about, read):
-                    if about["same"] == same:
-                        whole = [(array, read(name, np.empty_like(array))) for name, array in self._sums.items()]
-                        self.done = int(about["done"])
-                        for array, kept in whole:
-                            array[:] = kept
-
-    def add(self) -> None:
-        """One more task is done."""
-        self.done += 1
-        if self._path is not None and time.monotonic() - self._at > _KEEP_S:
-            write_arrays(self._path, {"same": self._same, "done": self.done}, self._sums)
-            self._at = time.monotonic()
 
 
 class _Work:

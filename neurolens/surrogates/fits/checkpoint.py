@@ -1,22 +1,17 @@
-"""Checkpoints of a training (see `base.kept`), so that a killed run ends with the very same weights.
-
-One is written every few seconds. Only the very same fit goes on from it: it holds a fingerprint of data and settings.
-"""
+"""The files of a training's states (`base.kept`), so that a killed run ends with the very same weights."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import time
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from neurolens.base.kept import read_arrays, write_arrays
+from neurolens.base.kept import read_arrays
 
 SCHEMA = 1
 EVERY_S = 3.0
@@ -29,48 +24,6 @@ def fingerprint(tensors: list[Tensor], settings: dict[str, Any]) -> str:
         digest.update(str(tuple(tensor.shape)).encode())
         digest.update(tensor.contiguous().numpy().tobytes())
     return digest.hexdigest()
-
-
-@dataclass
-class Checkpoint:
-    """One file of one training. Without a path nothing is kept.
-
-    Attributes:
-        path: of the file.
-        key: `fingerprint` of the training.
-        spent_s: seconds of training up to the last save, those of earlier runs included.
-    """
-
-    path: Path | None
-    key: str
-    spent_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        self._begin = self._written = time.monotonic()
-
-    @property
-    def elapsed_s(self) -> float:
-        """Seconds of training so far, those of earlier runs included."""
-        return self.spent_s + time.monotonic() - self._begin
-
-    def load(self) -> tuple[dict[str, Any], list[Tensor]] | None:
-        """State and arrays as saved, or None where there is no file, or a damaged one, or one of another training."""
-        with suppress(OSError, ValueError):
-            if self.path is not None:
-                with read_arrays(self.path) as (about, read):
-                    if about["key"] == self.key:
-                        arrays = [torch.from_numpy(read(f"a{i}")) for i in range(about["arrays"])]
-                        state, self.spent_s = dict(about["state"]), float(about["spent_s"])
-                        return state, arrays
-        return None
-
-    def save(self, state: dict[str, Any], arrays: list[Tensor], *, now: bool = False) -> None:
-        """Write the state (JSON-able) and arrays, if the last write is some seconds ago or `now` asks for it."""
-        if self.path is None or not (now or time.monotonic() - self._written >= EVERY_S):
-            return
-        about = {"key": self.key, "state": state, "spent_s": self.elapsed_s, "arrays": len(arrays)}
-        write_arrays(self.path, about, {f"a{i}": array.numpy() for i, array in enumerate(arrays)})
-        self._written = time.monotonic()
 
 
 def of_zone(path: Path | None, zone: int) -> Path | None:
