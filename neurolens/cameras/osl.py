@@ -144,7 +144,8 @@ class OslLens:
 
     def passing(self) -> dict[float, float]:
         """The share of the samples that pass, in the worst state, by shares of the widest stop."""
-        first, *others = (c.pupil for c in self.nodes)
+        pupils: list[Any] = [c.pupil for c in self.nodes]  # of one kind
+        first, *others = pupils
         states = [*zip(np.eye(len(self.nodes)), (c.lens for c in self.nodes), strict=True), *self.between]
         shares = [passing_share(lens, first.mixed(others, weights)) for weights, lens in states]
         return {stop: min(s[stop] for s in shares) for stop in shares[0]}
@@ -446,7 +447,7 @@ def osl_lens(
     Raises:
         InputError: no ray passes.
     """
-    pupils = fit_pupil(nodes, report, between)
+    pupils: list[PupilCircles | PupilDisc] = [*fit_pupil(nodes, report, between)]
     samples = [_samples(*pair) for pair in zip(nodes, pupils, strict=True)]
     graphs = [lens.graph for lens in nodes]
     graphs = (tested := low_tests(graphs, samples)) or graphs

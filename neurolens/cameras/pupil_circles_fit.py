@@ -44,7 +44,7 @@ _WEIGHTS, _HEAVIER = (2.0, 5.0, 3e4), 1.6  # of rays that pass: least, first and
 _GOAL = 2e-4  # the share of a zone's rays that a circle may lose while it is fitted
 _RIDGE, _LEAST, _FLATTEST = 1e-9, 1e-4, 0.02  # of Newton's matrix; of a circle's curvature by its greatest number
 _CALM = 1e-3  # rays, by whose force numbers stay at those that all states share
-_HELD = (3e-4, 3e-4, 2e-4, 1e-4)  # shares of a zone's new rays that a circle may lose, in turn until at most
+_HELD = (6e-4, 6e-4, 4e-4, 2e-4)  # shares of a zone's new rays that all circles may lose, in turn until at most
 LOST = 1e-3  # of a zone's rays are lost in all
 _NEIGHBOUR = 0.3  # of the greatest weight, which nodes beside a state have
 _INNER = 0.1  # zones of a smaller part of what `PupilCircles.wide` grows by count as the axis
@@ -101,7 +101,7 @@ def _fit_circles(
     first = _fit_first(rays, pupils, exponents, rims)
     for k, (pupil, drawn) in enumerate(zip(pupils, rays, strict=True)):
         numbers = _fit_rims(drawn, pupil, exponents, rims, first)
-        pupils[k] = _with_circles(replace(pupil, wide=_disc(pupil, drawn)), exponents, numbers)
+        pupils[k] = _with_circles(replace(pupil, wide=_disc(pupil, drawn, len(rims))), exponents, numbers)
         report((k + 1) / (len(pupils) + 1))
     pupils, lost = _widened(pupils, lenses, between)
     if lenses[0].anamorphic and len(rims):
@@ -124,7 +124,7 @@ def _widened(
             within = evaluate(mixed.checked, rays.inputs)["within"]
             lost_of.append(_lost(rays, within))
             if held and (seed == 0 or lost_of[-1] > LOST):
-                needs = [[need for _, need in _needs(rays, margin, held)] for margin in within[1:]]
+                needs = [[n for _, n in _needs(rays, margin, held / len(within))] for margin in within[1:]]
                 more = np.array([max([0.0, *need]) for need in needs])
                 near = weights > _NEIGHBOUR * weights.max()  # the nodes on both sides of a state between them
                 more /= weights[near].sum()
@@ -232,12 +232,12 @@ def _drawn(lens: ShaderLens, pupil: PupilCircles, seed: int) -> _Rays:
     return _Rays(inputs, codes, np.ravel_multi_index(zones, _ZONES))
 
 
-def _disc(pupil: PupilCircles, rays: _Rays) -> tuple[float, float]:
+def _disc(pupil: PupilCircles, rays: _Rays, rims: int) -> tuple[float, float]:
     """`PupilCircles.wide`: images err most where the film ends."""
     size = rays.inputs["stop_radius_mm"][0] / pupil.image.stop_mm
     beyond = np.hypot(*rays.inputs["point_mm"]) / pupil.image.stop_mm / size - 1
     growth = (np.square(rays.inputs["film_mm"]).sum(0) / pupil.image.film_mm**2 * size) ** 2
-    needs = [(float(growth[zone].mean()), need) for zone, need in _needs(rays, -beyond, _HELD[0])]
+    needs = [(float(growth[zone].mean()), need) for zone, need in _needs(rays, -beyond, _HELD[0] / (rims + 1))]
     inner = max(0.0, *(need for at, need in needs if at < _INNER))
     return 1 + inner, max(0.0, *((need - inner) / at for at, need in needs if at >= _INNER))
 
@@ -254,7 +254,11 @@ def _needs(rays: _Rays, within: Array, share: float) -> list[tuple[Truths, float
 
 
 def _separated(
-    features: Array, inside: Truths, first: Array, zone: NDArray[np.intp] | None = None, lit: Array | None = None
+    features: Array,
+    inside: Truths,
+    first: Array,
+    zone: NDArray[np.intp] | None = None,
+    lit: NDArray[np.intp] | None = None,
 ) -> Array:
     """Numbers [M + 1] of a circle which separate rays inside from the others: logistic regression on features
     [M + 1, N], from the numbers `first`; these stay where no ray tells otherwise.

@@ -112,7 +112,7 @@ def _fitted(lens: ShaderLens, disc: PupilDisc) -> Array:
                 extents.append((centre, wide * corners, tall * corners))
                 at.append(np.prod(np.array(scaled) ** disc.exponents, axis=1))
     rows, wanted = np.array(at), np.array(extents).T
-    numbers = []
+    numbers = list[Array]()
     for k, values in enumerate(wanted):
         # A centre may lie on either side: half widths are measured about the fitted one.
         if k == 1:
@@ -134,8 +134,8 @@ def _rays(lens: ShaderLens, radius: Array, stop: Array, rng: np.random.Generator
     turn = np.exp(1j * angle)
     film, turned = radius * turn, (pupil[0] + 1j * pupil[1]) * turn
     z, nm = (rng.uniform(*span, count) for span in (lens.film_z_mm, lens.wavelength_nm))
-    points = (np.stack([v.real, v.imag]) for v in (film, turned))
-    return pupil, np.asarray(lens.status(*points, nm, z, stop) == st.PASSED)
+    film_mm, pupil_mm = (np.stack([v.real, v.imag]) for v in (film, turned))
+    return pupil, np.asarray(lens.status(film_mm, pupil_mm, nm, z, stop) == st.PASSED)
 
 
 def _lost(disc: PupilDisc, lens: ShaderLens) -> float:

@@ -160,12 +160,12 @@ def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLe
     knots = tuple(replace(a, degree=1) for a in space.axes)
     planes = [pupil_plane_z_mm(space.lens_at(s)) for s in product(knots)]
 
-    def at(s: tuple[float, ...]) -> ShaderLens:
+    def lens_in(s: tuple[float, ...]) -> ShaderLens:
         plane, far = float(weights(knots, s) @ planes), space.lens_at((*s[:-1], 0.0)) if internal else None
         return _traced(space.lens_at(s), plane, far, 1 / s[-1] if internal and s[-1] else math.inf)
 
-    nodes = [at(s) for s in product(space.axes)]
-    between = [(weights(space.axes, s), at(s)) for s in states_between(space.axes)]
+    nodes = [lens_in(s) for s in product(space.axes)]
+    between = [(weights(space.axes, s), lens_in(s)) for s in states_between(space.axes)]
     return lens.lens_id, osl_lens(nodes, report, space.axes, between), told
 
 
