@@ -142,12 +142,16 @@ class OslLens:
         """Radius of the picture that all states fill."""
         return min(c.pupil.film_radius_mm for c in self.nodes)
 
+    def states(self) -> list[tuple[ShaderLens, PupilCircles | PupilDisc]]:
+        """The lens and its pupil at each node, and in states between them."""
+        pupils: list[Any] = [c.pupil for c in self.nodes]  # all are of one kind
+        first, *others = pupils
+        nodes = zip(np.eye(len(self.nodes)), (c.lens for c in self.nodes), strict=True)
+        return [(lens, first.mixed(others, weights)) for weights, lens in [*nodes, *self.between]]
+
     def passing(self) -> dict[float, float]:
         """The share of the samples that pass, in the worst state, by shares of the widest stop."""
-        pupils: list[Any] = [c.pupil for c in self.nodes]  # of one kind
-        first, *others = pupils
-        states = [*zip(np.eye(len(self.nodes)), (c.lens for c in self.nodes), strict=True), *self.between]
-        shares = [passing_share(lens, first.mixed(others, weights)) for weights, lens in states]
+        shares = [passing_share(*state) for state in self.states()]
         return {stop: min(s[stop] for s in shares) for stop in shares[0]}
 
 

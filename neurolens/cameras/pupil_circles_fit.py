@@ -18,7 +18,7 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Report
 from neurolens.cameras.pupil_circles import PupilCircles
-from neurolens.cameras.pupil_disc import PupilDisc, fit_discs
+from neurolens.cameras.pupil_disc import PupilDisc, disc_lost, fit_discs
 from neurolens.cameras.pupil_passing import passing_share
 from neurolens.cameras.shader_lens import ShaderLens
 from neurolens.cameras.stop_image import StopImage, draw_rays, fit_stop_images
@@ -319,9 +319,25 @@ def _features(rays: _Rays, pupil: PupilCircles, exponents: Exponents, rows: NDAr
 
 def _lost(rays: _Rays, within: Array) -> float:
     """The share of the rays that pass which lie outside, in the worst zone."""
+    passed, missed = _missed(rays, within)
+    return float((missed / np.maximum(passed, _FEW)).max())
+
+
+def _missed(rays: _Rays, within: Array) -> Array:
+    """How many rays pass [2, zones], and how many of them lie outside."""
     out = rays.passed & (within < 0).any(0)
-    counts, missed = (np.bincount(rays.zone[rows], minlength=_ALL) for rows in (rays.passed, out))
-    return float((missed / np.maximum(counts, _FEW)).max())
+    return np.stack([np.bincount(rays.zone[rows], minlength=_ALL) for rows in (rays.passed, out)])
+
+
+def light_lost(lens: ShaderLens, pupil: PupilCircles | PupilDisc, draws: int = 4) -> float:
+    """The share of the rays that pass which no sample is, in the worst zone of film and stop, by new random rays."""
+    if isinstance(pupil, PupilDisc):
+        return disc_lost(pupil, lens)
+    counts = np.zeros((2, _ALL))
+    for seed in range(draws):
+        rays = _drawn(lens, pupil, 100 + seed)
+        counts += _missed(rays, evaluate(pupil.checked, rays.inputs)["within"])
+    return float((counts[1] / np.maximum(counts[0], _FEW)).max())
 
 
 def _beside(lens: ShaderLens, image: StopImage) -> float:

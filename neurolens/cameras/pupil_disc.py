@@ -93,7 +93,7 @@ def fit_discs(
         discs.append(replace(disc, numbers=_fitted(lens, disc)))
         report(len(discs) / (len(lenses) + 1))
     states = [*zip(np.eye(len(discs)), lenses, strict=True), *between]
-    while max(_lost(discs[0].mixed(discs[1:], weights), lens) for weights, lens in states) > _LOST:
+    while max(disc_lost(discs[0].mixed(discs[1:], weights), lens) for weights, lens in states) > _LOST:
         discs = [replace(d, numbers=d.numbers * [[1.0], [_STEP], [_STEP]]) for d in discs]
     return discs
 
@@ -138,7 +138,7 @@ def _rays(lens: ShaderLens, radius: Array, stop: Array, rng: np.random.Generator
     return pupil, np.asarray(lens.status(film_mm, pupil_mm, nm, z, stop) == st.PASSED)
 
 
-def _lost(disc: PupilDisc, lens: ShaderLens) -> float:
+def disc_lost(disc: PupilDisc, lens: ShaderLens) -> float:
     """The share of random rays that pass beyond the disc, in the worst zone of film and stop."""
     rng = np.random.default_rng(7)
     place, share = rng.random(_CHECKED), rng.choice(_STOPS, _CHECKED)
