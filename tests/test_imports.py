@@ -23,7 +23,7 @@ MAX_LINES = 500
 
 BASE = {"base"}
 # What cameras need of optics: modules without torch, open to all parts.
-TORCH_FREE_OPTICS = {f"neurolens.optics.{name}" for name in ("apertures", "film_plane", "sag")}
+TORCH_FREE_OPTICS = {f"neurolens.optics.{name}" for name in ("apertures", "film_plane", "sag", "shapes")}
 # Models from their files, without torch, which cameras need. Whoever may import surrogates may import these, too.
 MODELS = {f"neurolens.surrogates.{name}" for name in ("assemble", "cores", "file", "inverse", "lightfield", "model")}
 # Parts of the package that each part may import, besides itself and the base.
@@ -76,7 +76,8 @@ EXCEPTIONS: dict[str, tuple[set[str], set[str]]] = {
     "neurolens.surrogates.model": ({"surrogates"}, {"torch"}),
     "neurolens.surrogates.inverse": ({"surrogates"}, {"torch"}),
     "neurolens.optics.apertures": ({"graph"}, set()),
-    "neurolens.optics.sag": ({"optics"}, set()),  # for a type
+    "neurolens.optics.sag": ({"optics"}, set()),
+    "neurolens.optics.shapes": ({"optics"}, set()),
     "neurolens.cameras.exact": ({"optics"}, {"torch"}),
     "neurolens.cameras.outline_cache": ({"optics"}, {"torch"}),
     "neurolens.cameras.build": ({"optics", "readers"}, set()),

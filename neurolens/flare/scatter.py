@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from neurolens.flare.steps import LOST, STATE
 from neurolens.graph.ir import Graph, Value
 from neurolens.optics.prescription import Lens
-from neurolens.optics.sag import sag_mm
+from neurolens.optics.shapes import sag_mm
 from neurolens.render.flaresettings import Scatter
 
 CHANCES = 5  # rows: an exponential variate; two uniform ones; cosine and sine of a uniform angle
