@@ -162,7 +162,7 @@ def reflectance_fit(
     exact = coatings.reflectance(cos_i, n_before, n_after, layers, wavelength_nm, sense).numpy()
     fit = np.polynomial.Chebyshev.fit(1 - c, exact, DEGREE, domain=(0, 1), w=1 / (exact + _FAINT))
     worst = np.abs(fit(1 - c) - exact) / (exact + _FAINT)
-    return (fit.coef @ _powers()).tolist(), float(worst.max())
+    return (np.asarray(fit.coef, np.float64) @ _powers()).tolist(), float(worst.max())
 
 
 @cache
