@@ -402,10 +402,10 @@ class Flare(Checked):
 
     Attributes:
         coating: of surfaces between glass and air that the lens file leaves bare, named as `neurolens flare` does.
-        bins: wavelengths. cell_px: pixels of the cells that ghosts are drawn by. brightest: ghosts that have layers of
-            their own, those with the greatest values on the film. most: lights, those of the most energy. glare:
-            photons a light and wavelength for the layer of light that is reflected more than twice, 0 for none.
-            starburst: whether diffraction has its layer. without: names of layers that are not made.
+        bins: as `FlareSettings.wavelengths`. cell_px: pixels of the cells that ghosts are drawn by. brightest: ghosts
+            that have layers of their own, those with the greatest values on the film. most: lights, those of the most
+            energy. glare: photons a light and wavelength for the layer of light that is reflected more than twice, 0
+            for none. starburst: whether diffraction has its layer. without: names of layers that are not made.
     """
 
     coating: str | None = None
