@@ -35,6 +35,7 @@ from neurolens.flare.lights import Light, light_rays, rays_across
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.optics.sequence import follow, ghost
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays
 
 LENS, LIGHT = "laikin_double_gauss_50", Light(15.0, 8.0)
@@ -66,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure, draw, write."""
     lab.quiet_glasses()
     torch.set_num_threads(1)
-    lens = read_lens(lab.LENSES / f"{LENS}.toml").at(focus_m=math.inf)
+    lens = set_lens(read_lens(lab.LENSES / f"{LENS}.toml"), focus_m=math.inf)
     tracer, progress = GhostTracer(lens), Progress(quiet=args.quiet)
     with progress.stage("fit") as report:
         fitted = fit_ghosts(lens, GhostSettings(), report)

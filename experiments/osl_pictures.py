@@ -24,6 +24,7 @@ from neurolens.commands.blender_kept import kept_form
 from neurolens.commands.blender_lenses import form_of
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
+from neurolens.optics.states import set_lens
 
 _MOST_BYTES = 240_000  # of a picture
 _QUALITIES = (90, 85, 80, 70)
@@ -130,7 +131,7 @@ def _form(shot: Shot, folder: Path, quiet: bool) -> Form:
 
 def focal_mm(shot: Shot) -> float:
     """Focal length (vertical, of an anamorphic lens)."""
-    return float(first_order(read_lens(lab.LENSES / f"{shot.name}.toml").at(zoom=shot.state)).efl_mm)
+    return float(first_order(set_lens(read_lens(lab.LENSES / f"{shot.name}.toml"), zoom=shot.state)).efl_mm)
 
 
 def _write_pair(file: Path, folder: Path, shot: Shot) -> None:

@@ -20,15 +20,19 @@ import numpy as np
 from torch.quasirandom import SobolEngine
 
 from experiments import lab
+from experiments import pupil_methods as known
 from neurolens.base.progress import Progress
 from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.osl import osl_program
 from neurolens.cameras.pupil_boxes import PupilTable
+from neurolens.cameras.pupil_circles_fit import light_lost
 from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.evaluate.shaders import shader_of
-from neurolens.optics import pupil_methods as known
+from neurolens.evaluate.costs import cycles_ns
+from neurolens.evaluate.shaders import lens_of
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import pupil_bounds
+from neurolens.optics.states import set_lens
 
 
 @dataclass(frozen=True)
@@ -80,7 +84,9 @@ SampleFunction = Callable[[Any, Any, Any], tuple[Any, Any]]
 
 def camera_of(case: Case) -> ExactCamera:
     """The lens of a case on `FILM_MM`, focused at infinity."""
-    lens = read_lens(lab.LENSES / f"{case.lens}.toml").at(focal_length_mm=case.focal_length_mm, f_number=case.f_number)
+    lens = set_lens(
+        read_lens(lab.LENSES / f"{case.lens}.toml"), focal_length_mm=case.focal_length_mm, f_number=case.f_number
+    )
     return ExactCamera(lens, film_mm=FILM_MM, focus_m=math.inf)
 
 
@@ -227,7 +233,7 @@ def pixel_rates(samples: int = SAMPLES) -> Iterator[tuple[float, float, float]]:
     r, angle = SobolEngine(2, scramble=True, seed=1).draw(samples).double().numpy().T
     r, angle = np.sqrt(r), 2 * math.pi * angle
     for f_number, theirs in TABLE_5_3.items():
-        lens = read_lens(lab.LENSES / "brendel_tessar_100.toml").at(focal_length_mm=50.0, f_number=f_number)
+        lens = set_lens(read_lens(lab.LENSES / "brendel_tessar_100.toml"), focal_length_mm=50.0, f_number=f_number)
         rim = known.rear_rim(lens, radius)
         points = rim.along[0] * np.stack([r * np.cos(angle), r * np.sin(angle)])
         passed = known.passes_through(lens, rim.pupil_z_mm)(np.full(samples, radius), points)
@@ -327,12 +333,17 @@ SHADERS = lab.columns(
     ("Open", "open", ".3f"),
     ("2 stops down", "stopped_2", ".3f"),
     ("4 stops down", "stopped_4", ".3f"),
+    ("Lost (per mille)", "lost_per_mille", ".2f"),
     ("Operations", "operations"),
+    ("ns a ray that passes", "ns", ".0f"),
     ("CPU (s)", "cpu_s", ".1f"),
 )
 _SHADERS_TEXT = """\
 By `python -m experiments pupils --shaders`: share of the samples that pass the lens, from film points that have light
-at that stop, all over film, focus and wavelength; operations of a ray through a round stop; CPU to make the shader."""
+at that stop, all over film, focus and wavelength; light that no sample has, in the worst zone of film and stop;
+operations of a ray through a round stop; what they make a ray cost in Cycles under a white sky (`evaluate/costs.py`)
+for each that passes, the stop open; CPU to make the shader. The pupil of the biconvex lens folds far off the axis: one
+wide disc holds it."""
 
 
 def shaders(args: argparse.Namespace) -> None:
@@ -353,9 +364,12 @@ def shaders(args: argparse.Namespace) -> None:
 
 
 def shader_row(file: Path) -> lab.Row:
-    """Of a model."""
+    """The row of a model's shader, in its worst state."""
     begun = time.process_time()
-    made = shader_of(file, quiet=True)
-    shares = dict(zip(("open", "stopped_2", "stopped_4"), made.passing.values(), strict=True))
-    cpu = time.process_time() - begun
-    return {"model": file.stem, **shares, "operations": made.operations, "cpu_s": cpu}
+    with Progress(quiet=True).stage(file.stem) as report:
+        _, lens, _ = lens_of(file, None, report)
+    shares = dict(zip(("open", "stopped_2", "stopped_4"), lens.passing().values(), strict=True))
+    cpu, program = time.process_time() - begun, osl_program(lens, {"count": 0.0})
+    lost = max(light_lost(state, pupil) for state, pupil in lens.states())
+    measured = {"operations": sum(program.count().values()), "ns": cycles_ns(program) / shares["open"], "cpu_s": cpu}
+    return {"model": file.stem, **shares, "lost_per_mille": 1e3 * lost, **measured}

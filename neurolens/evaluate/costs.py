@@ -17,12 +17,12 @@ import numpy as np
 
 from neurolens.cameras.contract import RAYS_A_CALL, Camera
 from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.fused import lens_graph
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.osl import OslLens, osl_program
 from neurolens.cameras.source import camera_program
 from neurolens.evaluate.footprints import Array, Places
 from neurolens.evaluate.records import Timing
+from neurolens.graph.program import Program
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene
 
@@ -81,13 +81,19 @@ def rest_ns(scene: Scene, camera: Camera) -> float:
 
 
 def glsl_operations(camera: OnnxCamera | ExactCamera) -> int:
-    """Of a ray of `neurolens export --whole-camera --to glsl`: floats, a fused multiply-add is one.
+    """Count the operations of a ray of `neurolens export --whole-camera --to glsl`; a fused multiply-add counts as one.
 
     Raises:
         InputError: a lens or model that has no such form.
     """
-    graph = lens_graph(camera) if isinstance(camera, OnnxCamera) else camera.lens_graph()
+    graph = camera.lens_graph()
     return sum(camera_program(camera.film, graph, own_table=False).count().values())
+
+
+def cycles_ns(program: Program) -> float:
+    """Nanoseconds of a ray of a shader in Cycles, by its operations."""
+    kinds = program.count()
+    return SHADER_NS + _STEP_NS * sum(kinds.values()) + _DEAR_NS * sum(kinds.get(k, 0) for k in _DEAR)
 
 
 def shader_cost(
@@ -98,8 +104,7 @@ def shader_cost(
     The noise is that of the shader's own throughput at the places: of its pupil, and of wavelengths drawn evenly.
     """
     program = osl_program(lens, {"count": 0.0})
-    kinds = program.count()
-    ns = SHADER_NS + _STEP_NS * sum(kinds.values()) + _DEAR_NS * sum(kinds.get(k, 0) for k in _DEAR)
+    ns = cycles_ns(program)
     points, rays = places.film_mm.shape[1], _SIDE * _SIDE
     steps, rng = (np.arange(_SIDE) + 0.5) / _SIDE, np.random.default_rng(1)
     first, second = np.stack(np.meshgrid(steps, steps)).reshape(2, -1)

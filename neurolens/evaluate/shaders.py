@@ -14,7 +14,9 @@ from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress, Report
 
 if TYPE_CHECKING:
-    from neurolens.cameras.osl import OslLens, Seen
+    from neurolens.cameras.onnxlens import OnnxLens
+    from neurolens.cameras.osl import OslLens
+    from neurolens.cameras.shader_lens import ShaderLens
     from neurolens.graph.ir import Graph
     from neurolens.optics.prescription import Lens
 
@@ -105,22 +107,21 @@ def _of_model(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLen
     lens, fit = model.card["lens"], model.card["fit"]
     state = ", ".join(f"{a.name} {v:.5g}" for a, v in zip(model.axes, model.state, strict=True))
     told = [f"{lens['name']}: {fit['method']}, {lens['source']} (sha256 {lens['sha256'][:16]})."]
-    made = model_lens(model, _smallest(file, bool(model.axes)), report, fixed=fixed)
+    made = model_lens(model, _smallest(model), report, fixed=fixed)
     return str(lens["id"]), made, told + [f"State: {state}."] * bool(state and fixed)
 
 
-def _smallest(file: Path, has_states: bool) -> Graph | None:
-    """The graph of a model from its coefficients, a third smaller than that in its file; None without torch."""
+def _smallest(model: OnnxLens) -> Graph | None:
+    """The graph of a model without the rims that block next to nothing, which need torch to be known; None without."""
     from importlib.util import find_spec
 
-    if has_states or find_spec("torch") is None:
+    if model.axes or find_spec("torch") is None:
         return None
     from neurolens.surrogates.assemble import SCALARS, model_graph
     from neurolens.surrogates.specialise import without_idle_gates
-    from neurolens.surrogates.stored import load_fitted
 
-    (model,) = without_idle_gates((load_fitted(file),), IDLE)
-    return model_graph(model, model.largest_angle, SCALARS)
+    (smallest,) = without_idle_gates((model.fitted,), IDLE)
+    return model_graph(smallest, SCALARS)
 
 
 def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:
@@ -138,6 +139,7 @@ def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLe
     from neurolens.modelfile.axes import product, weights
     from neurolens.optics.focusing import focus_states
     from neurolens.optics.pupils import pupil_plane_z_mm
+    from neurolens.optics.states import set_lens
     from neurolens.optics.tracegraph import TRANSMITTANCE
     from neurolens.readers.any_format import read_any
     from neurolens.surrogates.states import StateSpace, axes_of, gap_axis
@@ -149,7 +151,7 @@ def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLe
     told = [f"{lens.name}: every surface traced, {lens.source} (sha256 {str(lens.sha256)[:16]})."]
     told.append(TRANSMITTANCE)
     if not (ranged or internal):
-        at = lens.at(zoom=state)
+        at = set_lens(lens, zoom=state)
         return lens.lens_id, osl_lens([_traced(at, pupil_plane_z_mm(at))], report), told
     space = StateSpace(lens, axes_of(lens, zoom=ranged, internal=internal, state=state), state)
     if len(space.axes) == 1:
@@ -159,16 +161,16 @@ def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLe
     knots = tuple(replace(a, degree=1) for a in space.axes)
     planes = [pupil_plane_z_mm(space.lens_at(s)) for s in product(knots)]
 
-    def seen(s: tuple[float, ...]) -> Seen:
+    def lens_in(s: tuple[float, ...]) -> ShaderLens:
         plane, far = float(weights(knots, s) @ planes), space.lens_at((*s[:-1], 0.0)) if internal else None
         return _traced(space.lens_at(s), plane, far, 1 / s[-1] if internal and s[-1] else math.inf)
 
-    nodes = [seen(s) for s in product(space.axes)]
-    between = [(weights(space.axes, s), seen(s).sight) for s in states_between(space.axes)]
+    nodes = [lens_in(s) for s in product(space.axes)]
+    between = [(weights(space.axes, s), lens_in(s)) for s in states_between(space.axes)]
     return lens.lens_id, osl_lens(nodes, report, space.axes, between), told
 
 
-def _traced(lens: Lens, plane_mm: float, far: Lens | None = None, inside_m: float = math.inf) -> Seen:
+def _traced(lens: Lens, plane_mm: float, far: Lens | None = None, inside_m: float = math.inf) -> ShaderLens:
     """A lens in one state.
 
     Args:
@@ -176,9 +178,8 @@ def _traced(lens: Lens, plane_mm: float, far: Lens | None = None, inside_m: floa
             picture's size holds, and the distance in focus.
     """
     from neurolens.cameras.focus_function import Focusing
-    from neurolens.cameras.osl import Seen
     from neurolens.cameras.pupil_boxes import PupilTable
-    from neurolens.cameras.pupil_sight import Sight
+    from neurolens.cameras.shader_lens import ShaderLens
     from neurolens.optics.focusing import best_focus_of_stops_mm, film_range_mm
     from neurolens.optics.paraxial import film_z_mm, first_order
     from neurolens.optics.pupils import image_radius_mm, pupil_bounds
@@ -202,8 +203,15 @@ def _traced(lens: Lens, plane_mm: float, far: Lens | None = None, inside_m: floa
     def best(focus_m: float, stops_mm: Any) -> Any:
         return best_focus_of_stops_mm(lens, inside_m if far else focus_m, stops_mm, LIGHT_NM)
 
-    graph = exact_graph(lens, plane_mm, LIGHT_NM)
-    sight = Sight(
-        graph, PupilTable.of(asdict(bounds)), places, LIGHT_NM, stop, lens.stop_index, lens.anamorphic
-    )  # fmt: skip
-    return Seen(sight, Focusing(near, stop, paraxial, best, places), float(data.f_number), efl)
+    return ShaderLens(
+        graph=exact_graph(lens, plane_mm, LIGHT_NM),
+        table=PupilTable.of(asdict(bounds)),
+        film_z_mm=places,
+        wavelength_nm=LIGHT_NM,
+        stop_radius_mm=stop,
+        stop_surface=lens.stop_index,
+        anamorphic=lens.anamorphic,
+        focusing=Focusing(near, stop, paraxial, best, places),
+        f_number=float(data.f_number),
+        efl_mm=efl,
+    )

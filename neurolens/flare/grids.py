@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.flare.ghostmodel import GhostModel
-from neurolens.flare.ghosts import GhostRays, GhostTracer, Way
+from neurolens.flare.ghosts import GhostRays, GhostTracer, Pair
 from neurolens.flare.lights import Light, Patch, light_towards, rays_across
 from neurolens.flare.stack import Floats
 from neurolens.flare.steps import LOST
@@ -71,7 +71,7 @@ def grids_of(
     half_mm: tuple[float, float],
     cell_mm: float,
     wavelengths_nm: Sequence[float] = (400.0, 700.0),
-) -> dict[Way, Grid]:
+) -> dict[Pair, Grid]:
     """The grids of all ghosts that reach the film.
 
     A cell has one density, and a wavelength stands for those beside it: both put light beside its place, by a / n with
@@ -89,7 +89,7 @@ def grids_of(
     start = tracer.start(rays_across(tracer.lens, light, whole.places)[0])
     few = np.ascontiguousarray(start.reshape(len(start), _SCOUTS + 1, -1)[:, ::_FEW, ::_FEW].reshape(len(start), -1))
     nodes = sorted({wavelengths_nm[round(at)] for at in np.linspace(0, len(wavelengths_nm) - 1, _NODES)})
-    found: list[tuple[Way, NDArray[np.bool_], _Look]] = []
+    found: list[tuple[Pair, NDArray[np.bool_], _Look]] = []
     for k in range(0, len(tracer.pairs), _AT_ONCE):
         some = tracer.pairs[k : k + _AT_ONCE]
         rays = tracer.follow(start, wavelength_nm, only=some, reach=REACH)
@@ -118,7 +118,7 @@ def grids_of(
 
 
 def ghost_moves(
-    tracer: GhostTracer | GhostModel, patch: Patch, pair: Way, grid: Grid, wavelength_nm: float
+    tracer: GhostTracer | GhostModel, patch: Patch, pair: Pair, grid: Grid, wavelength_nm: float
 ) -> NDArray[np.float64]:
     """How far the middle of a ghost's light moves on the film (mm), [2, 2], along each of the sides of a light's patch.
 

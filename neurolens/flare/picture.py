@@ -6,13 +6,12 @@ Values are those of a render: film irradiance over the irradiance that a white c
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -21,11 +20,11 @@ from numpy.typing import NDArray
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.layout import Layout, Line, layout_profile
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path, seal, sealed_bytes
+from neurolens.base.kept import Kept
 from neurolens.base.status import PASSED
 from neurolens.flare.area import draw_edges, edges_of
 from neurolens.flare.ghostmodel import GhostModel
-from neurolens.flare.ghosts import Four, GhostTracer, Way, four_reflections
+from neurolens.flare.ghosts import GhostTracer, Pair
 from neurolens.flare.grids import REACH, Grid, ghost_moves, grids_of
 from neurolens.flare.lights import Light, disc, light_rays, patches, rays_across
 from neurolens.flare.photons import LEVELS, Photons, PhotonTracer
@@ -41,8 +40,6 @@ from neurolens.render.colour import SRGB, in_gamut
 from neurolens.render.spectrum import SpectralRange
 
 RANKED = 4096  # rays that decide which ghosts are brightest
-LEFT, SOME, MANY = 1e-3, 64, 2000  # of `with_four`
-_PROBES = 512  # rays
 _AT_ONCE = 1 << 16  # rays of a call
 _ENOUGH = 200  # photons of a kernel: a noise of 8%
 _COLOURED = 3200  # photons of a kernel of colour: eyes see its noise in wider areas
@@ -57,7 +54,7 @@ FEWEST = 4  # wavelengths that stand for all
 _PATCH_DEG = 2.0  # of an extended light: see `patches`
 
 Doubles = NDArray[np.float64]
-_Task = tuple[Light, Way, Grid, list[float], Doubles]  # with wavelengths [K] and their colours [K, 3]
+_Task = tuple[Light, Pair, Grid, list[float], Doubles]  # with wavelengths [K] and their colours [K, 3]
 _T = TypeVar("_T")
 _R = TypeVar("_R")
 
@@ -94,7 +91,7 @@ class Ghost:
         passed: share of the rays at the front disc that arrive.
     """
 
-    pair: Way
+    pair: Pair
     energy: float
     centre_mm: tuple[float, float]
     size_mm: float
@@ -114,7 +111,7 @@ def ghost_table(
         image = GhostTracer(tracer.lens, []).trace(rays, wavelength_nm, direct=True)
         sums = np.concatenate([tracer.trace(rays, wavelength_nm).sums, image.sums])
     else:
-        sums = tracer.sums(tracer.start(rays), wavelength_nm, direct=True).sums
+        sums = tracer.sums(rays, wavelength_nm, direct=True)
     of_image, rows = sums[-1, 0], []
     for way, (power, *moments, lit) in zip(tracer.pairs, sums.tolist(), strict=False):
         if power > 0:
@@ -124,44 +121,7 @@ def ghost_table(
     return sorted(rows, key=lambda ghost: -ghost.energy)
 
 
-class Ways(NamedTuple):
-    """Ghosts of two reflections, and the strongest of four.
-
-    Attributes:
-        ways: the ghosts. fours: how many of four reflections the lens has. left: share of all ghosts' light on the
-            film's plane that those of four reflections have which are not among the ways.
-    """
-
-    ways: tuple[Way, ...]
-    fours: int
-    left: float
-
-
-def with_four(lens: Lens, lights: Sequence[Light], wavelength_nm: float = 550.0) -> Ways:
-    """All ghosts of two reflections, and of four reflections so many of the strongest that little light is left.
-
-    That is `LEFT` of all ghosts' light; but at least `SOME` ghosts, and at most `MANY`.
-
-    Raises:
-        InputError: more ghosts than `ghosts.MOST_WAYS`.
-    """
-    tracer, fours = GhostTracer(lens), four_reflections(lens)
-    energy, twice = np.zeros(len(fours)), 0.0
-    for light in lights:
-        rays, area = light_rays(lens, light, 0, _PROBES)
-        start = tracer.start(rays)
-        twice += area * sum(light.rgb) * float(tracer.sums(start, wavelength_nm).sums[:, 0].sum())
-        energy += area * sum(light.rgb) * tracer.sums(start, wavelength_nm, fours).sums[:, 0]
-    order = np.argsort(-energy, kind="stable")
-    left = energy.sum() - np.cumsum(energy[order])
-    whole = twice + energy.sum()
-    kept = int(np.clip(np.count_nonzero(left > LEFT * whole) + 1, SOME, MANY))
-    kept = min(kept, int(np.count_nonzero(energy)))
-    chosen = tuple(Four(*row) for row in fours[order[:kept]].tolist())
-    return Ways(tracer.pairs + chosen, len(fours), float(left[kept - 1] / whole) if kept else 0.0)
-
-
-def ghost_layout(lens: Lens, pair: Way, light: Light, lines: int = 9) -> Layout:
+def ghost_layout(lens: Lens, pair: Pair, light: Light, lines: int = 9) -> Layout:
     """The lens with rays of one ghost in the plane through the axis, of light as far off the axis as `light`.
 
     At most so many rays, evenly chosen of those that arrive.
@@ -296,7 +256,7 @@ def _draw(
     strips = [range(height)[k : k + high] for k in range(0, height, high)]
 
     def edges(task: _Task) -> tuple[list[Doubles], Doubles]:
-        """Of each wavelength, and light of their cells."""
+        """The edges of each wavelength's cells, and the light of the cells."""
         light, pair, grid, wavelengths_nm, colours = task
         if not work.step():
             return [], colours[:0]
@@ -394,8 +354,10 @@ def photon_picture(
     picture = np.zeros((raster.height, raster.width, 3), np.float32)
     sums = np.zeros((2, raster.height, raster.width), np.float32)
     same = lens, tracer.scatter, list(lights), raster, part, spectral.centres_nm, photons, most_reflections, seed
-    kept = _Kept(keep, digest(same), (picture, sums))
-    work = _Work((len(tasks) - kept.done) * len(firsts), done)
+    kept, first_task = Kept(keep, digest(same), _KEEP_S), 0
+    if (known := kept.load()) is not None:
+        first_task, (picture, sums) = known[0]["done"], known[1]
+    work = _Work((len(tasks) - first_task) * len(firsts), done)
 
     def one(task: tuple[int, Light, int]) -> tuple[Floats, NDArray[np.float64]]:
         """Sums of weights and of their squares, [2, H, W], and the colour [3] of a weight of 1."""
@@ -415,10 +377,11 @@ def photon_picture(
         colour = spectral.response[:, k] * spectral.spectrum(light.rgb)[k] / wavelengths
         return film, colour * (area * raster.per_mm**2 / photons / exposure)
 
-    for _, (film, colour) in work.results(one, tasks[kept.done :], threads):
+    for _, (film, colour) in work.results(one, tasks[first_task:], threads):
         picture += film[0, ..., None] * colour.astype(np.float32)
         sums += film * (np.abs(colour).max() ** np.array([1, 2], np.float32))[:, None, None]
-        kept.add()
+        first_task += 1
+        kept.save({"done": first_task}, (picture, sums))
     return _smoothed(picture, sums, kernel_px) if kernel_px > 0 else picture
 
 
@@ -435,32 +398,6 @@ def _arrivals(
             which &= (found.scattered > 0) == scatters
         # A film that sends light back is exposed by what it keeps.
         yield found.film_xy_mm[:, which], found.weight[which] / (1 - tracer.scatter.sensor)
-
-
-class _Kept:
-    """Sums of work, and how many of its tasks they hold, in a file that is as old as half a minute at most."""
-
-    def __init__(self, path: Path | None, same: str, sums: Sequence[Floats]) -> None:
-        self.done, self._path, self._head, self._sums, self._at = 0, path, same.encode(), sums, time.monotonic()
-        size = len(self._head) + 8 + sum(a.nbytes for a in sums)
-        if path is None or not path.is_file() or path.stat().st_size > 2 * size:
-            return
-        data, at = sealed_bytes(path), len(self._head) + 8
-        if data is not None and len(data) == size and data.startswith(self._head):
-            self.done = int.from_bytes(data[at - 8 : at], "little")
-            for a in sums:
-                a[:] = np.frombuffer(data, a.dtype, a.size, at).reshape(a.shape)
-                at += a.nbytes
-
-    def add(self) -> None:
-        """One more task is done."""
-        self.done += 1
-        if self._path is not None and time.monotonic() - self._at > _KEEP_S:
-            with atomic_path(self._path) as temporary:
-                parts = self._head, self.done.to_bytes(8, "little"), *(a.tobytes() for a in self._sums)
-                temporary.write_bytes(b"".join(parts))
-                seal(temporary)
-            self._at = time.monotonic()
 
 
 class _Work:

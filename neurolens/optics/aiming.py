@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from neurolens.optics.prescription import Lens
-from neurolens.optics.sag import sag_mm
-from neurolens.optics.shapes import followed_mm
+from neurolens.optics.shapes import followed_mm, sag_mm
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 
@@ -110,7 +109,7 @@ def _off(field: Tensor, exists: Tensor, target: Tensor) -> Tensor:
 
 
 def bracket(angle: Tensor, value: Tensor, exists: Tensor, target: Tensor, jump: float = _JUMP) -> Tensor:
-    """Of increasing angles [n, G] the first neighbours whose values lie on both sides of a target [n], [n, 3].
+    """Find the first neighbours among increasing angles [n, G] whose values lie on both sides of a target [n]: [n, 3].
 
     Else the neighbours of the ray whose value is nearest to it, between which rays may come nearer yet. In the middle
     of the three stands the angle at which the straight line between the values of the others meets the target.

@@ -14,6 +14,7 @@ from neurolens.flare.ghosts import GhostTracer, coated
 from neurolens.flare.lights import Light, with_disc
 from neurolens.flare.picture import Raster, ghost_picture
 from neurolens.optics.lensfile import read_lens
+from neurolens.optics.states import set_lens
 from neurolens.render.colour import ACESCG, SRGB, conversion
 from neurolens.render.pictures import read_colour_space, read_exr, read_layers, write_data_exr, write_exr
 
@@ -32,7 +33,7 @@ def test_layers_are_the_ghosts_with_the_greatest_peaks_on_the_film(tmp_path: Pat
     """Of the README's case: each ghost's own picture beside the layers, with the light of the sun that is meant."""
     out, raster = tmp_path / "flare.exr", Raster((36.0, 24.0), 240, 160)
     assert main([*GAUSS, "--layers", "8", "--width", "240", "-o", str(out)]) == 0
-    lens = read_lens("lenses/laikin_double_gauss_50.toml").at(focus_m=math.inf, focus="best")
+    lens = set_lens(read_lens("lenses/laikin_double_gauss_50.toml"), focus_m=math.inf, focus="best")
     tracer = GhostTracer(coated(lens, "quarter-wave"))
     sun = with_disc(Light(15, 8, (math.pi,) * 3), 0.533)
     each = ghost_picture(tracer, [sun], raster, layers=range(len(tracer.pairs)))

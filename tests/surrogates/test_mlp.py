@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from experiments.published import PublishedSettings, fit_any
 from neurolens.base.errors import InputError
 from neurolens.base.status import OUTSIDE_DOMAIN
 from neurolens.cameras.model import load_model
@@ -17,17 +18,16 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Network, Residual
 from neurolens.surrogates.domain import domain_of, sample_domain
 from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.fit import fit_model
 from neurolens.surrogates.fits import checkpoint
 from neurolens.surrogates.fits import network as networks
 from neurolens.surrogates.fits.network import fit_network, with_boundary_terms
 from neurolens.surrogates.fits.projection import Problem, Stand, activations, minimise, normal_equations, project
 from neurolens.surrogates.gates import choose_gates
-from neurolens.surrogates.lightfield import LightField, fit_encoding
+from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.pairs import PairSettings, make_pairs, trace_pairs
+from neurolens.surrogates.pairs import PairSettings, make_pairs, trace_pairs, with_angle
 from neurolens.surrogates.settings import ModelSettings
-from neurolens.surrogates.targets import Prepared, film_equivalent_weights, scales_of, targets_of
+from neurolens.surrogates.targets import Prepared, film_equivalent_weights, fit_encoding, scales_of, targets_of
 
 LENSES = Path(__file__).parents[2] / "lenses"
 F64 = torch.float64
@@ -108,9 +108,8 @@ def test_directions_that_no_ray_of_the_lens_has_lie_outside_the_domain(singlet, 
 
 
 def _model(data, core) -> LensModel:
-    return LensModel(
-        data.pairs.lens, data.pairs.domain, data.encoding, scales_of(data.pairs.lens), data.gates, core, "mlp"
-    )
+    pairs, scales = data.pairs, scales_of(data.pairs.lens)
+    return with_angle(LensModel(pairs.lens, pairs.domain, data.encoding, scales, data.gates, core, "mlp"))
 
 
 def _weights(network: Network) -> torch.Tensor:
@@ -145,7 +144,7 @@ def test_no_clock_decides_a_fit_and_its_progress_grows_to_one(singlet, monkeypat
     settings = {
         "network": ModelSettings("mlp", units=4, layers=1, steps=25),
         "zones": ModelSettings("mlp", units=3, layers=1, steps=4, partitions=2),
-        "published": ModelSettings("neurolens2017", basis="raw", units=8, layers=2, steps=40, partitions=2),
+        "published": PublishedSettings("neurolens2017", basis="raw", units=8, layers=2, steps=40, partitions=2),
     }[kind]
     found = []
     for each_look in (1e-3, 1e9):  # seconds that go by, as the fit sees it
@@ -153,7 +152,7 @@ def test_no_clock_decides_a_fit_and_its_progress_grows_to_one(singlet, monkeypat
         for clock in ("monotonic", "process_time", "perf_counter", "thread_time"):
             monkeypatch.setattr(time, clock, lambda now=now: next(now))
         shares: list[float] = []
-        model = fit_model(singlet, settings, shares.append)
+        model = fit_any(singlet, settings, shares.append)
         assert shares == sorted(shares) and shares[-1] == 1.0 and 0 < shares[0] < 0.5
         found.append(model.core(singlet.encoding(singlet.pairs.held_out.inputs)))
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
