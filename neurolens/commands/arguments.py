@@ -305,7 +305,18 @@ def add_glass(parser: argparse._ActionsContainer) -> None:
     )  # fmt: skip
 
 
-def more_glasses(args: argparse.Namespace) -> AbstractContextManager[None]:
+def add_dask(parser: argparse._ActionsContainer) -> None:
+    """Add --dask."""
+    parser.add_argument(
+        "--dask", metavar="ADDRESS",
+        help="run on a Dask cluster: the address of its scheduler (tcp://HOST:8786), or local (processes of this "
+        "machine), or local:N, which no other user can reach. What a task reads travels with it: workers need "
+        "neurolens alone, and no folder in common. Whoever reaches a scheduler at tcp:// can run programs as you; "
+        "tls:// takes keys",
+    )  # fmt: skip
+
+
+def more_glasses(args: object) -> AbstractContextManager[None]:
     """A block in which the catalogues of --glass are known; without any, nothing is imported."""
     files = getattr(args, "glass_files", ())
     if not files:

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import io
 import math
-import multiprocessing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,11 +18,10 @@ from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import safe_name
 from neurolens.base.lensname import is_model, lens_id_of
-from neurolens.base.signals import end_at_once, held
+from neurolens.base.tasks import Failed, Here, Processes, run_each
 from neurolens.blender.pack import Form, PackedLens
 from neurolens.commands.blender_kept import kept, kept_form
 from neurolens.evaluate.shaders import shader_of
-from neurolens.render.film import CONTEXT
 
 if TYPE_CHECKING:
     from neurolens.optics.prescription import Lens
@@ -84,60 +80,41 @@ def forms_of(
     files: Sequence[Path], jobs: int, report: Callable[[float], object],
     zooms: Mapping[Path, str | None] = MappingProxyType({}),
 ) -> tuple[Forms, dict[Path, str]]:  # fmt: skip
-    """Forms of many files, `jobs` at a time in processes of their own, and why others have none.
+    """The forms of many files, `jobs` at a time in processes of their own, and why others have none.
 
     Args:
-        zooms: `zoom` of `form_of`, of files that have one.
+        zooms: `zoom` of `form_of`, for files that have one.
 
     Raises:
-        NeurolensError: a process ended by itself, as where memory is short.
+        NeurolensError: a process ended early, as where memory is short.
     """
     found: Forms = {}
     left: dict[Path, str] = {}
-
-    def keep(file: Path, made: Form | str) -> None:
-        if isinstance(made, Form):
-            found[file] = made
-        else:
-            left[file] = made
-        report((len(found) + len(left)) / len(files))
-
-    if jobs == 1:
-        for file in files:
-            keep(file, _form_or_why(file, zooms.get(file)))
-        return found, left
-    with ProcessPoolExecutor(jobs, CONTEXT, _begin_job) as pool:
-        with held():  # a process just forked would raise what this one raises, and run on as a second command
-            waiting = {pool.submit(_form_or_why, file, zooms.get(file)): file for file in files}
-        try:
-            for done in as_completed(waiting):
-                keep(waiting[done], done.result())
-        except BaseException as error:
-            for job in multiprocessing.active_children():
-                job.terminate()
-            pool.shutdown(cancel_futures=True)
-            if isinstance(error, BrokenProcessPool):
-                raise NeurolensError(
-                    f"one of {jobs} processes ended early: memory may be short, try --jobs 1"
-                ) from None
-            raise
+    tasks = [(file, zooms.get(file)) for file in files]
+    with Here() if jobs == 1 else Processes(jobs) as executor:
+        for done, ((file, _), made) in enumerate(run_each(executor, _form_or_why, tasks), start=1):
+            if isinstance(made, Failed):
+                raise NeurolensError(f"{file}: {made.reason} ({jobs} jobs: where memory is short, try --jobs 1)")
+            if isinstance(made, Form):
+                found[file] = made
+            else:
+                left[file] = made
+            report(done / len(files))
     return found, left
 
 
-def _begin_job() -> None:
-    """In a process: signals end it at once, as the main process ends it; one core is its own."""
-    end_at_once()
-    if find_spec("torch") is not None:
-        import torch
+def _form_or_why(task: tuple[Path, str | None]) -> Form | str:
+    """The form of a file and a zoom, or why the lens cannot be a shader."""
+    file, zoom = task
+    with ExitStack() as stack:
+        if find_spec("torch") is not None:
+            from neurolens.surrogates.bases import pinned_threads
 
-        torch.set_num_threads(1)
-
-
-def _form_or_why(file: Path, zoom: str | None) -> Form | str:
-    try:
-        return form_of(file, zoom=zoom, quiet=True)
-    except NeurolensError as error:
-        return str(error)
+            stack.enter_context(pinned_threads())
+        try:
+            return form_of(file, zoom=zoom, quiet=True)
+        except NeurolensError as error:
+            return str(error)
 
 
 def packed_of(

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, warn
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import CAMERAS_HELP, add_json, add_option, add_output, check_folder
 from neurolens.commands.output import answer, number, table
-from neurolens.commands.render_files import warn
 from neurolens.commands.stmap import LIGHT_NM, add_picture, add_state, shot_of
 from neurolens.evaluate.records import plain
 

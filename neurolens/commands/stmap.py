@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, warn
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import (
     CAMERAS_HELP,
@@ -25,9 +25,9 @@ from neurolens.commands.arguments import (
     whole,
 )
 from neurolens.commands.output import answer, number
-from neurolens.commands.render import film_size, size_by_shape
-from neurolens.commands.render_files import warn
+from neurolens.commands.render import film_size
 from neurolens.commands.render_frames import LENS_KEYS, add_frames, frames_of
+from neurolens.render.film_settings import size_by_shape
 
 if TYPE_CHECKING:
     from neurolens.cameras.build import Shot

@@ -39,7 +39,6 @@ from neurolens.surrogates.cores import CORES, Core
 from neurolens.surrogates.model import Domain, Encoding, Gate, LensModel, Scales, mixed, with_one_angle
 
 SCHEMA = 2
-_ONE_NODE = 1  # schema of version 0.1.0: one state, and no angle
 _MAX_TEXT = 16 * 2**20  # of the JSON; the largest models known take 100 kB
 _MAX_DEPTH = 16  # of cores in cores
 _MAX_CORES = 1000  # of one file
@@ -48,7 +47,7 @@ _MAX_DEGREE = 64  # of any term; settings allow half, and growth without limit s
 _MAX_RAYS = 1000  # of the card's reference; `card.reference_rays` gives 4 a status
 _MAX_NODES = 256  # states of one model
 # Of a model: terms and units, each of which is a row for every ray; numbers; and ways in which its terms are products of
-# two others, all of which a writer compares. The largest that settings allow have 5,000, 1.9 million and one million.
+# two others, all of which a writer compares. The largest that settings allow have 5,000, 1.9 and one million.
 _MAX_WORK, _MAX_WEIGHTS, _MAX_PRODUCTS = 10_000, 2_000_000, 3_000_000
 _MAX_SURFACES, _MAX_TERMS, _MAX_POWER = 500, 1000, 40  # of a prescription, as `optics.lensfile` has them
 _LENS = ("name", "source", "f_number", "image_radius_mm", "half_field_deg", "designer", "rims", "film_z_mm", "path")
@@ -95,14 +94,15 @@ def read_model(path: str | Path) -> ModelFile:
     metadata = read_metadata(file)
     card = card_in(file, metadata)
     check_card(file, card)
+    again = "export it again (`neurolens train` fits the model and writes its file with them)"
     if MODEL_KEY not in metadata:
-        raise ModelError(
-            f"{file}: it holds no coefficients, from which its graph would be built: export it again "
-            "(`neurolens train` fits the model and writes its file with them)"
-        )
+        raise ModelError(f"{file}: it holds no coefficients, from which its graph would be built: {again}")
     try:
         with np.errstate(all="ignore"):
-            data = coefficients_in(metadata[MODEL_KEY])
+            data = json.loads(inflated(metadata[MODEL_KEY]))
+            check_tree(data, "coefficients")
+            if data["schema"] != SCHEMA:
+                raise ModelError(f"{file}: coefficients: schema: got {data['schema']!r}, expected {SCHEMA}: {again}")
             model = ModelFile(file, card, _nodes(file, card, data), data)
             _check_reference(model)
     except _DAMAGE as error:
@@ -112,25 +112,15 @@ def read_model(path: str | Path) -> ModelFile:
     return model
 
 
-def coefficients_in(text: str) -> dict[str, Any]:
-    """The JSON of a metadata entry of coefficients. Raises ValueError: damaged, or of another schema."""
-    data = json.loads(inflated(text))
-    check_tree(data, "coefficients")
-    if data["schema"] not in (_ONE_NODE, SCHEMA):
-        raise ValueError(f"schema: got {data['schema']!r}, expected {SCHEMA}")
-    return dict(data)
-
-
 def _nodes(file: Path, card: Mapping[str, Any], data: Mapping[str, Any]) -> tuple[LensModel, ...]:
     states = card.get("states")
     domains = [node["domain"] for node in states["nodes"]] if states else [card["domain"]]
-    parts = [data] if data["schema"] == _ONE_NODE else data["nodes"]
+    parts = data["nodes"]
     if len(parts) != len(domains) or len(parts) > _MAX_NODES:
         raise ValueError(f"{len(parts)} nodes, expected {len(domains)}, at most {_MAX_NODES}")
     lens, gates = unpacked_lens(data["lens"]), tuple(Gate(int(k), int(r)) for k, r in data["gates"])
     if not states and lens.sha256 != card["lens"]["sha256"]:
         raise ModelError(f"{file}: its prescription is not that of its card")
-    angle = data.get("angle")
     common = LensModel(
         lens=lens,
         domain=Domain.from_dict(card["domain"]),
@@ -143,12 +133,10 @@ def _nodes(file: Path, card: Mapping[str, Any], data: Mapping[str, Any]) -> tupl
         fit_s=float(card["fit"]["seconds"]),
         direction="slope" if data["direction"] == "slope" else "angle",
         transmittance=transmittance_of(card),
-        angle=None if angle is None else float(angle),
+        angle=float(data["angle"]),
     )
-    if angle is None:
-        common = replace(common, angle=_traced_angle(file, common))
-    if not 0 < common.largest_angle <= math.pi:
-        raise ValueError(f"angle: got {angle!r}, expected above 0, up to pi")
+    if not 0 < common.angle <= math.pi:
+        raise ValueError(f"angle: got {common.angle!r}, expected above 0, up to pi")
     nodes = tuple(
         replace(
             common,
@@ -160,17 +148,6 @@ def _nodes(file: Path, card: Mapping[str, Any], data: Mapping[str, Any]) -> tupl
     )
     check_size(nodes[0].core)
     return nodes
-
-
-def _traced_angle(file: Path, model: LensModel) -> float:
-    """The largest angle of the scene rays, which coefficients of version 0.1.0 do not tell."""
-    try:
-        return model.largest_angle
-    except ModuleNotFoundError as error:
-        raise ModelError(
-            f"{file}: its coefficients are those of version 0.1.0, which only a machine with torch reads: there "
-            "`neurolens export MODEL.onnx --to onnx --out NEW.onnx` writes it as others read it"
-        ) from error
 
 
 def check_size(core: Any) -> None:

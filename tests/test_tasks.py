@@ -1,4 +1,4 @@
-"""Tasks on a cluster of Dask: the answers of one machine, bit for bit, whatever happens to workers and scheduler."""
+"""Executors: the answers of one machine, bit for bit, whatever happens to processes, workers and scheduler."""
 
 import gc
 import io
@@ -9,9 +9,14 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
+import time
 import zipfile
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, as_completed
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,11 +24,17 @@ import onnx
 import pytest
 from command_line import failure
 
-from neurolens.base.engine import Engine, Failed, here, on_dask
+from neurolens import __version__
+from neurolens.base import cluster as cluster_module
+from neurolens.base import tasks as tasks_module
+from neurolens.base.cluster import Dask
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import noted_files, read_bytes
+from neurolens.base.lensname import Named
+from neurolens.base.tasks import Failed, Here, Processes, Shared, run_each
+from neurolens.base.travel import packed, unpack, with_paths
 from neurolens.cli import main
-from neurolens.commands.farm import packed, unpack
+from neurolens.frames.frame import Frame
 from neurolens.render.pictures import read_channels
 
 Client = pytest.importorskip("distributed", reason="needs the extra dask").Client
@@ -65,45 +76,105 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     made.kill()
 
 
-def count(common: bytes, task: tuple[int, str]) -> bytes:
+def count(common: Shared, task: tuple[int, str]) -> bytes:
     """The number, unless the task says what to do the first time."""
     number, deed = task
     if deed == "refuse":
         raise InputError("lens.toml", "radius_mm", number, "a radius")
     if deed == "break":
         raise ZeroDivisionError("oh")
+    if deed == "exit":
+        os._exit(3)
+    if deed == "sleep":
+        time.sleep(600)
     if deed == "die":
         os.kill(os.getpid(), signal.SIGKILL)
     if deed and not Path(deed).exists():
         Path(deed).touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    return common + str(number).encode()
+    return common.data + str(number).encode()
 
 
-def collected(engine: Engine[tuple[int, str]], tasks: list[tuple[int, str]]) -> dict[int, bytes | Failed]:
+def collected(executor: Executor, tasks: list[tuple[int, str]], common: bytes = b"") -> dict[int, bytes | Failed]:
     found = {}
-    for (number, _), came in engine(iter(tasks)):
-        assert number not in found
-        found[number] = came
+    with executor:
+        for (number, _), came in run_each(executor, count, iter(tasks), Shared(common)):
+            assert number not in found
+            found[number] = came
     return found
 
 
-@pytest.mark.parametrize("place", ["here", "dask"])
+@pytest.mark.parametrize("place", ["here", "processes", "dask"])
 def test_every_task_is_answered_once_and_errors_are_lines(place: str, cluster: str) -> None:
-    engine = here(count, b"n") if place == "here" else on_dask(cluster, count, b"n")
-    tasks = [(k, {3: "refuse", 5: "break"}.get(k, "")) for k in range(20)]
-    found = collected(engine, tasks)
-    for k in range(20):
+    make = {"here": Here, "processes": lambda: Processes(2), "dask": lambda: Dask(cluster)}[place]
+    tasks = [(k, {3: "refuse", 5: "break"}.get(k, "")) for k in range(8)]
+    found = collected(make(), tasks, b"n")
+    for k in range(8):
         if k == 3:
             assert found[k] == Failed("lens.toml: radius_mm: got 3, expected a radius")
         elif k == 5:
             assert found[k] == Failed("a fault of neurolens: ZeroDivisionError: oh")
         else:
             assert found[k] == b"n%d" % k
-    assert collected(engine, []) == {}
+    assert collected(make(), []) == {}
+    with make() as executor:  # as executors of the standard library are used
+        futures = [executor.submit(count, Shared(b""), (k, "")) for k in range(3)]
+        assert sorted(future.result() for future in as_completed(futures)) == [b"0", b"1", b"2"]
 
 
-def try_in(common: bytes, task: str) -> bytes:
+def test_a_process_that_ends_early_or_takes_too_long_costs_its_own_task() -> None:
+    deeds = {1: "die", 2: "exit", 4: "sleep"}
+    began = time.monotonic()
+    found = collected(Processes(2, limit_s=6.0), [(k, deeds.get(k, "")) for k in range(6)])
+    assert time.monotonic() - began < 300
+    assert found.pop(1) == Failed("its process was killed by signal 9: did the memory run out?")
+    assert found.pop(2) == Failed("its process ended with code 3")
+    assert found.pop(4) == Failed("took longer than 6 s")
+    assert found == {k: b"%d" % k for k in (0, 3, 5)}
+
+
+def test_processes_end_with_an_iteration_that_is_left() -> None:
+    executor = Processes(2)
+    tasks = [(0, ""), (1, "sleep"), (2, "sleep"), (3, "")]
+    for _, answer in run_each(executor, count, tasks, Shared(b"")):
+        assert answer == b"0"
+        break
+    deadline = time.monotonic() + 60
+    while executor._running:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    with pytest.raises(RuntimeError, match="shutdown"):
+        executor.submit(count, Shared(b""), (1, ""))
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_process_ends_once_nobody_waits_for_it() -> None:
+    read, write = os.pipe()
+    child = os.fork()
+    if not child:
+        os.close(read)
+        tasks_module._end_unread(write)
+        os._exit(0)
+    time.sleep(0.05)
+    assert os.waitpid(child, os.WNOHANG) == (0, 0)
+    os.close(read)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1
+    os.close(write)
+
+
+def test_a_worker_of_a_cluster_ends_after_a_task_that_never_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It answers first; a task in time leaves it alone."""
+    ended: list[float] = []
+    stuck, timer = threading.Event(), SimpleNamespace(start=lambda: None)
+    monkeypatch.setattr(cluster_module.threading, "Timer", lambda after, *_: (ended.append(after), timer)[1])
+    assert cluster_module._answer(bytes, __version__, 9.0, [b"a"], {}) == b"a" and not ended
+    answer = cluster_module._answer(stuck.wait, __version__, 0.01, [], {})
+    stuck.set()
+    assert answer == Failed("took longer than 0.01 s") and len(ended) == 1
+    assert "not 0" in cluster_module._answer(bytes, "0", 9.0, [], {}).reason
+
+
+def try_in(task: str) -> bytes:
     """Addresses of this worker and of its scheduler, and what an HTTP server of its answers."""
     from distributed import get_worker
 
@@ -115,8 +186,10 @@ def test_workers_of_this_machine_are_of_this_process_alone(tmp_path: Path, monke
     """Without keys nobody reaches them; ports for web pages are closed, or serve none."""
     pytest.importorskip("cryptography", reason="needs cryptography (the extra dask)")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    answers = on_dask("local:1", try_in)(iter(["a", "b"]))
-    worker, scheduler, port = json.loads(next(answers)[1])
+    answers = run_each(Dask("local:1"), try_in, ["a", "b"])
+    answer = next(answers)[1]
+    assert isinstance(answer, bytes)
+    worker, scheduler, port = json.loads(answer)
     before = socket.create_connection(("127.0.0.1", port), 5)
     before.sendall(b"GET /info/main/workers.html HTTP/1.0\r\n\r\n")
     assert b" 404 " in before.recv(100)
@@ -128,17 +201,17 @@ def test_workers_of_this_machine_are_of_this_process_alone(tmp_path: Path, monke
             with pytest.raises((OSError, RuntimeError, ValueError, TypeError)):
                 stranger.__init__(other, timeout="1s")
             stranger.close()
-    assert [came for _, came in answers] != []
+    assert [came for _, came in answers] == [answer]
 
 
 def test_a_killed_worker_costs_only_its_task(cluster: str, tmp_path: Path) -> None:
     tasks = [(k, str(tmp_path / "killed") if k == 4 else "") for k in range(12)]
-    assert collected(on_dask(cluster, count), tasks) == {k: b"%d" % k for k in range(12)}
+    assert collected(Dask(cluster), tasks) == {k: b"%d" % k for k in range(12)}
     assert (tmp_path / "killed").exists()
 
 
 def test_a_task_that_kills_its_workers_fails_alone(cluster: str) -> None:
-    found = collected(on_dask(cluster, count), [(k, "die" if k == 1 else "") for k in range(4)])
+    found = collected(Dask(cluster), [(k, "die" if k == 1 else "") for k in range(4)])
     assert found.pop(1) == Failed("its worker was killed, again and again: did the memory run out?")
     assert found == {k: b"%d" % k for k in (0, 2, 3)}
 
@@ -153,13 +226,14 @@ def test_tasks_are_taken_as_there_is_room(cluster: str) -> None:
             taken += 1
             yield k, ""
 
-    for done, (_, came) in enumerate(on_dask(cluster, count)(tasks()), start=1):
-        assert isinstance(came, bytes) and taken <= done + 4
+    with Dask(cluster) as executor:
+        for done, (_, came) in enumerate(run_each(executor, count, tasks(), Shared(b"")), start=1):
+            assert isinstance(came, bytes) and taken <= done + 4
     assert taken == 60
 
 
 def test_no_such_scheduler(capsys: pytest.CaptureFixture[str], scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.base.engine._TIMEOUT", "0.5s")
+    monkeypatch.setattr("neurolens.base.cluster._TIMEOUT", "0.5s")
     line = failure(
         capsys, "render", scene, "--camera", "thin", "-o", scene.with_name("a.exr"), "--quiet", "--dask", "x"
     )
@@ -188,11 +262,20 @@ def test_files_travel_as_they_are_and_stay_in_their_folder(tmp_path: Path) -> No
         unpack(evil.getvalue(), tmp_path / "there")
 
 
+def test_paths_of_a_frame_move_with_it() -> None:
+    frame = Frame(scene=Path("/a/s.toml"), camera=Named("fused:", Path("/a/1:2 lens")), glass_files=(Path("/g.agf"),))
+    moved = with_paths(frame, lambda path: Path("/w") / str(path).lstrip("/"))
+    assert (moved.scene, str(moved.camera)) == (Path("/w/a/s.toml"), "fused:/w/a/1:2 lens")
+    assert moved.glass_files == (Path("/w/g.agf"),) and replace(moved, scene=frame.scene) != frame
+    thin = Frame(scene=Path("/a/s.toml"), camera=Named("thin", None))
+    assert str(with_paths(thin, Path.absolute).camera) == "thin"
+
+
 @pytest.fixture
 def framed(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, bytes]]:
     """Renders two frames of several tiles each; the channels by file."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("neurolens.commands.render_dask._PATHS_OF_FEW", 300)
+    monkeypatch.setattr("neurolens.frames.farm._PATHS_OF_FEW", 300)
     frames = ("--frames", "1:2", "--key", "focus=1:1.5,2:3", "--samples", "2", "--quiet", "--camera", "thin")
 
     def run(name: str, *options: str) -> dict[str, bytes]:
@@ -218,7 +301,7 @@ def test_a_lost_scheduler_leaves_what_is_done(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     doomed = Cluster(1, tmp_path)
-    monkeypatch.setattr("neurolens.base.engine._TIMEOUT", "4s")
+    monkeypatch.setattr("neurolens.base.cluster._TIMEOUT", "4s")
     seen: list[Path] = []
 
     def kept(data: bytes, folder: Path) -> list[Path]:
@@ -227,7 +310,7 @@ def test_a_lost_scheduler_leaves_what_is_done(
             doomed.kill()
         return seen
 
-    monkeypatch.setattr("neurolens.commands.render_dask.unpack", kept)
+    monkeypatch.setattr("neurolens.frames.farm.unpack", kept)
     with pytest.raises(AssertionError):
         framed("a.exr", "--dask", doomed.address)
     err = capsys.readouterr().err
@@ -301,3 +384,21 @@ def test_records_of_a_survey_are_those_of_one_machine(cluster: str, lenses: list
         )
         found.append({path.name: path.read_bytes() for path in (tmp_path / place / "records").iterdir()})
     assert found[0] == found[1] and len(found[0]) == 2
+
+
+@pytest.mark.slow
+def test_the_documented_script_renders_one_picture_in_three_ways(tmp_path: Path) -> None:
+    """A frame rendered at once, in tiles that are merged, and on Dask has the same channels, its flare's among them."""
+    (script,) = re.findall(
+        r'```python title="farm.py"\n(.*?)```', (ROOT / "docs/pages/how-to/farm.md").read_text(), re.S
+    )
+    scene = (ROOT / "experiments" / "scenes" / "lights.toml").read_text()
+    (tmp_path / "lights.toml").write_text(f"{scene}\n[flare]\nbins = 3\nbrightest = 1\ncell_px = 64.0\n")
+    (tmp_path / "farm.py").write_text(script.replace("experiments/scenes/", ""))
+    subprocess.run([sys.executable, "farm.py"], cwd=tmp_path, check=True, timeout=600)
+    one, *others = (read_channels(tmp_path / f"{name}.exr")[0] for name in ("one", "tiled", "farm"))
+    assert one["ghosts.G"].any() and {"R", "Z", "rest.B"} <= one.keys()
+    for other in others:
+        assert other.keys() == one.keys()
+        assert all(np.array_equal(other[name], one[name]) for name in one)
+    assert len(list(tmp_path.glob("pull.*.exr"))) == 2 and not list(tmp_path.glob("*.tiles"))
