@@ -46,7 +46,7 @@ _MAX_ROWS = 20_000  # of any array: terms, or units of a layer
 _MAX_DEGREE = 64  # of any term; settings allow half, and growth without limit stays far below
 _MAX_RAYS = 1000  # of the card's reference; `card.reference_rays` gives 4 a status
 _MAX_NODES = 256  # states of one model
-# Of a model: terms and units, each of which is a row for every ray; numbers; and ways in which its terms are products of
+# Of a model: terms and units, each of which is a row for every ray; numbers; and ways in which terms are products of
 # two others, all of which a writer compares. The largest that settings allow have 5,000, 1.9 and one million.
 _MAX_WORK, _MAX_WEIGHTS, _MAX_PRODUCTS = 10_000, 2_000_000, 3_000_000
 _MAX_SURFACES, _MAX_TERMS, _MAX_POWER = 500, 1000, 40  # of a prescription, as `optics.lensfile` has them
