@@ -26,7 +26,9 @@ from neurolens.cameras.model import load_model
 from neurolens.evaluate.measure import onnx_predictor
 from neurolens.evaluate.vignetting import SEED, false_shares
 from neurolens.optics.lensfile import read_lens
-from neurolens.surrogates.domain import Domain, sample_domain
+from neurolens.optics.states import set_lens
+from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import trace_pairs
 
 _BATCH = 65536
@@ -36,7 +38,9 @@ def measure(rows: Sequence[Row], folders: Sequence[Path], count: int) -> list[Ro
     """A row for each model of one lens: `folder 0` and so on hold its figures as the file of each folder has it."""
     models = [load_model(folder / row["file"]) for row in rows for folder in folders]
     state, domain = rows[0], Domain.from_dict(models[0].card["domain"])
-    lens = read_lens(lab.ROOT / state["lens_file"]).at(zoom=state["configuration"], focal_length_mm=state["efl_mm"])
+    lens = set_lens(
+        read_lens(lab.ROOT / state["lens_file"]), zoom=state["configuration"], focal_length_mm=state["efl_mm"]
+    )
     lens, parts, widest = lens.with_stop_radius(domain.stop_radius_mm), list[tuple[torch.Tensor, ...]](), -1.0
     for start in range(0, count, _BATCH):
         rays = sample_domain(domain, min(_BATCH, count - start), SEED, start)

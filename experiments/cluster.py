@@ -27,9 +27,9 @@ from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 from experiments import lab
-from experiments.growth import cpu_s, resident_kb
-from experiments.lab import Row
-from neurolens.base.engine import on_dask
+from experiments.lab import Row, cpu_s, resident_kb
+from neurolens.base.cluster import Dask
+from neurolens.base.tasks import Shared, run_each
 
 _LENS, _TILE = (20_000, 12_000), (3_000, 6_000_000)  # bytes of a task, and of its answer
 _COUNTS = {"lens": (100, 1000, 10_000), "tile": (100, 1000)}
@@ -110,9 +110,9 @@ def _result(out: Path) -> str:
     return "".join(key + planes[key].tobytes().hex() for key in sorted(planes))
 
 
-def nothing(size: bytes, _: bytes) -> bytes:
+def nothing(size: Shared, _: bytes) -> bytes:
     """The answer to a task that does nothing: so many bytes."""
-    return bytes(int(size))
+    return bytes(int(size.data))
 
 
 def overhead(kind: str, count: int) -> Row:
@@ -127,9 +127,10 @@ def overhead(kind: str, count: int) -> Row:
                 began, cpu, before = time.perf_counter(), time.process_time(), resident_kb("VmRSS")
             yield random.Random(k).randbytes(task)
 
-    for _, came in on_dask("local:2", nothing, str(answer).encode())(tasks()):
-        assert isinstance(came, bytes) and len(came) == answer
-        done += 1
+    with Dask("local:2") as executor:
+        for _, came in run_each(executor, nothing, tasks(), Shared(str(answer).encode())):
+            assert isinstance(came, bytes) and len(came) == answer
+            done += 1
     wall, spent = time.perf_counter() - began, time.process_time() - cpu
     assert done == count + 20
     grown = max(0, resident_kb("VmHWM") - before) / 1024

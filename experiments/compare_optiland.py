@@ -32,6 +32,7 @@ from neurolens.evaluate.speed import POOL, Call, Candidate, Race, race
 from neurolens.optics import glass
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays, compile_trace, trace
 from neurolens.surrogates.domain import FilmRays
 
@@ -250,7 +251,7 @@ def run(args: argparse.Namespace) -> None:
     be.set_backend("torch")
     be.grad_mode.disable()
     rounds = 5 if args.quick else 20
-    lens = read_lens(LENS).at()
+    lens = set_lens(read_lens(LENS))
     tables = {table.name + end: (table, bool(end)) for end in ("", PASSING) for table in (lens, with_aspheres(lens))}
     contests = [(name, dtype) for name in tables for dtype in DTYPES]
     rows: list[Row] = []

@@ -38,7 +38,7 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.render.film_settings import FilmSettings
 from neurolens.render.renderer import render
 from neurolens.render.scene import CameraSettings, Scene, files_named, load_scene
-from neurolens.surrogates.domain import Domain
+from neurolens.surrogates.model import Domain
 
 EXACT, THIN = "exact", "thin lens"
 LENS = "laikin_double_gauss_50"

@@ -226,7 +226,7 @@ def on_pupil_of(exact: DifferentialCamera, camera: Camera) -> DifferentialCamera
         return exact
     turned: Any = copy(exact)
     turned.film = copy(own)
-    turned.film.outline, turned.film.pupil = other.outline, other.pupil
+    turned.film.outline = other.outline
     found: DifferentialCamera = turned
     return found
 

@@ -15,6 +15,7 @@ from neurolens.optics import glass
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays, Towards, trace
 
 INF = math.inf
@@ -61,14 +62,14 @@ def apertures(count: int) -> Iterator[Case]:
         yield _case("f-number", f"{lens.name} f/{f_number:.2g}", lens, from_scene(lens, count, g, slope=0.05), "film")
     whole = read_lens(lab.LENSES / f"{DOUBLE_GAUSS}.toml")
     for number in (1.8, 5.6, 16, 45):
-        lens = whole.at(f_number=number)
+        lens = set_lens(whole, f_number=number)
         rays = from_film(lens, count, g, share=1.1 * lens.stop_radius_mm / whole.stop_radius_mm)
         yield _case("f-number", f"double Gauss f/{number:g}", lens, rays, "scene")
 
 
 def wide_fields(count: int) -> Iterator[Case]:
     """A fisheye of 220 degrees, from the film to beyond its edge, and back from the scene."""
-    lens = read_lens(lab.LENSES / f"{FISHEYE}.toml").at()
+    lens = set_lens(read_lens(lab.LENSES / f"{FISHEYE}.toml"))
     rays = from_film(lens, 4 * count, generator(), film=1.3)
     yield _case("field", "fisheye of 220 degrees, to the scene", lens, rays, "scene")
     yield _case("field", "fisheye of 220 degrees, to the film", lens, returning(lens, rays, count), "film")
@@ -132,7 +133,7 @@ def near_equal_indices(count: int) -> Iterator[Case]:
 
 def wavelengths(count: int) -> Iterator[Case]:
     """The ends of the visible."""
-    lens = read_lens(lab.LENSES / f"{DOUBLE_GAUSS}.toml").at()
+    lens = set_lens(read_lens(lab.LENSES / f"{DOUBLE_GAUSS}.toml"))
     for wavelength in (380.0, 780.0):
         rays = from_film(lens, count, generator())
         case = _case("wavelength", f"double Gauss, {wavelength:g} nm", lens, rays, "scene")
@@ -141,7 +142,7 @@ def wavelengths(count: int) -> Iterator[Case]:
 
 def object_distances(count: int) -> Iterator[Case]:
     """Light from points 1e-6 mm to 1e6 m away, along the ray, from where it enters the front surface."""
-    lens = read_lens(lab.LENSES / f"{DOUBLE_GAUSS}.toml").at()
+    lens = set_lens(read_lens(lab.LENSES / f"{DOUBLE_GAUSS}.toml"))
     for distance_mm in (1e-6, 1e-3, 1.0, 1e3, 1e6, 1e9):
         g = generator()
         x, y = disc(g, count, lens.surfaces[0].semi_diameter_mm)
@@ -174,7 +175,7 @@ def library(count: int) -> Iterator[Case]:
     for path in sorted(lab.LENSES.glob("*.toml")):
         table = read_lens(path)
         for name in (None, *(c.name for c in table.configurations)):
-            lens = table.at(zoom=name)
+            lens = set_lens(table, zoom=name)
             title = path.stem + ("" if name is None else f" {name}")
             rays = from_film(lens, count, generator())
             yield _case("library", f"{title}, to the scene", lens, rays, "scene")

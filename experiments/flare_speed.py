@@ -36,6 +36,7 @@ from neurolens.flare.lights import Light, light_rays
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.optics.sequence import follow, ghost
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays
 from neurolens.render.pictures import write_exr
 
@@ -109,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _row(name: str, rounds: int, report: Callable[[float], None]) -> Row:
-    lens = read_lens(lab.LENSES / f"{name}.toml").at(focus_m=math.inf)
+    lens = set_lens(read_lens(lab.LENSES / f"{name}.toml"), focus_m=math.inf)
     tracer = GhostTracer(lens)
     rays, _ = light_rays(lens, Light(_ANGLE_DEG, 0.0), 0, _RAYS)
     given = Rays(*torch.from_numpy(rays).float())
@@ -155,7 +156,7 @@ def _beside(binary: Path, rounds: int, progress: Progress) -> list[Public]:
     Raises:
         InputError: no such program, or one that ends otherwise than flaresim does.
     """
-    lens = read_lens(lab.LENSES / f"{LENSES[0]}.toml").at(focus_m=math.inf)
+    lens = set_lens(read_lens(lab.LENSES / f"{LENSES[0]}.toml"), focus_m=math.inf)
     tracer = GhostTracer(lens)
     rays, _ = light_rays(lens, Light(_ANGLE_DEG, 0.0), 0, 1 << 15)
     arriving = float((tracer.trace(rays, _NM).worst <= 1).mean())

@@ -100,7 +100,7 @@ def _number(chance: Chance) -> bytes:
 
 def damage_message(chance: Chance, data: bytes, depth: int = 0) -> bytes:
     """A message of Protocol Buffers with one field, at any depth, left out, repeated, emptied or changed."""
-    from neurolens.modelfile.protobuf import message, walk
+    from neurolens.graph.protobuf import message, walk
 
     try:
         fields = [(n, w, v if isinstance(v, int) else bytes(v)) for n, w, v in walk(memoryview(data))]

@@ -35,6 +35,7 @@ from neurolens.flare.lights import Light, light_rays, rays_across
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.optics.sequence import follow, ghost
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays
 
 LENS, LIGHT = "laikin_double_gauss_50", Light(15.0, 8.0)
@@ -44,7 +45,7 @@ _CELLS = (8.0, 32.0, 40.0)
 _CELL = 40.0  # the coarsest whose FLIP and light keep the goals: the one that they are held against
 GOAL_UM, GOAL_ENERGY, GOAL_FLIP, GOAL_TORCH, GOAL_C, GOAL_MS = 20.0, 0.01, 0.03, 15.0, 4.0, 100.0
 
-OPTIONS = [lab.count("rounds", 5, "of which the best counts (default: 5)"), lab.out()]
+OPTIONS = [lab.count("rounds", 5, "of which the best counts (default: 5)"), lab.PICTURE, lab.out()]
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure, draw, write."""
     lab.quiet_glasses()
     torch.set_num_threads(1)
-    lens = read_lens(lab.LENSES / f"{LENS}.toml").at(focus_m=math.inf)
+    lens = set_lens(read_lens(lab.LENSES / f"{LENS}.toml"), focus_m=math.inf)
     tracer, progress = GhostTracer(lens), Progress(quiet=args.quiet)
     with progress.stage("fit") as report:
         fitted = fit_ghosts(lens, GhostSettings(), report)
@@ -84,11 +85,16 @@ def run(args: argparse.Namespace) -> int:
     for name, model, cell, count in ways:
         with progress.stage(f"{name}, {cell:g} px, {count} wavelengths"), _grid(cell):
             found = _drawn(model, cell or 8.0, 1, count)
+            shown[f"{name}, {f'cells of {cell:g} px, ' if cell else ''}{count} wavelengths"] = found
+            if args.picture:
+                continue
             times = [_timed(model, cell or 8.0, threads, count, args.rounds) for threads in (1, 2)]
         rms = None if model is tracer else _rms(tracer, model)
         energy = float(found.sum(dtype=np.float64) / reference.sum(dtype=np.float64) - 1)
         rows.append(Row(name, cell, count, rms, energy, flip(*_shown(found, reference)), times[0][0], times[1][1]))
-        shown[f"{name}, {f'cells of {cell:g} px, ' if cell else ''}{count} wavelengths"] = found
+    _draw(args.out, shown, reference)
+    if args.picture:
+        return 0
     exact = next(r for r in rows if r.cell_px == _CELL)
     more = _torch_ms(lens, tracer, _CELL)
     slow = exact.cpu_ms[0] + more, exact.cpu_ms[1] + more
@@ -103,7 +109,6 @@ def run(args: argparse.Namespace) -> int:
     )
     told = {"machine": lab.machine(), "rounds": args.rounds, "ray_ns": ns}
     told |= {"rows": [asdict(r) for r in rows], "fit": fitted.report}
-    _draw(args.out, shown, reference)
     print(lab.write_results(args.out, "ghosts", text, told))
     return 0
 

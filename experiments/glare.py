@@ -8,7 +8,8 @@ is measured within 5 mm of the middle by photons of 450, 550 and 650 nm, in thre
 
 Ways (Steinert 2009, 5.3.2): a light 15 and 8 degrees off the axis, its flare on 72 x 48 cells; for light of two and of
 four reflections, variance times processor time of every way, and how many times less that is than of the photons'
-roulette. Noise is relative to the sum of squares of the picture; compiling is not counted.
+roulette. All paths are followed for two reflections alone. Noise is relative to the sum of squares of the picture;
+compiling is not counted.
 
 One element (Steinert 2009, Fig. 6.5): a retrofocus lens of 25 mm at f/2.8, bare but for a single layer on both sides of
 one element: what that does to the image of a light and to the sum of its ghosts. The picture: open and stopped down to
@@ -28,17 +29,18 @@ from numpy.typing import NDArray
 
 from experiments import lab
 from neurolens.base.progress import Progress
-from neurolens.flare.ghosts import Four, GhostTracer, coated, four_reflections, ghost_pairs
-from neurolens.flare.layers import FlareSettings, flare_layers, sum_of
+from neurolens.flare.ghosts import GhostTracer, coated, ghost_pairs
+from neurolens.flare.layers import FlareJob, flare_layers, sum_of
 from neurolens.flare.lights import Light, front_sphere, light_rays
 from neurolens.flare.photons import LEVELS, Photons, PhotonTracer
 from neurolens.flare.picture import Raster, axis_irradiance, ghost_table
-from neurolens.flare.scatter import Scatter
 from neurolens.flare.stack import Floats
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
+from neurolens.optics.states import set_lens
+from neurolens.render.flaresettings import FlareSettings, Scatter
 
 LENS, NM, HALF_MM = "laikin_double_gauss_50", 550.0, (18.0, 12.0)
 COATINGS = ("bare", "single-layer", "multi-layer")
@@ -91,9 +93,9 @@ class Way:
 def run(args: argparse.Namespace) -> int:
     """Measure, write the tables and the picture."""
     progress = Progress(quiet=args.quiet)
-    lens = read_lens(lab.LENSES / f"{LENS}.toml").at(focus_m=math.inf)
+    lens = set_lens(read_lens(lab.LENSES / f"{LENS}.toml"), focus_m=math.inf)
     retrofocus = read_lens(lab.LENSES / "mori_retrofocus_100.toml")
-    retrofocus = retrofocus.at(focus_m=math.inf, focal_length_mm=25.0, f_number=2.8)
+    retrofocus = set_lens(retrofocus, focus_m=math.inf, focal_length_mm=25.0, f_number=2.8)
     with progress.stage("pictures"):
         _draw(lens, retrofocus, args)
     if args.picture:
@@ -209,8 +211,8 @@ def elements_of(lens: Lens, name: str) -> Iterator[Element]:
 def _draw(gauss: Lens, retrofocus: Lens, args: argparse.Namespace) -> None:
     import matplotlib.pyplot as plt
 
-    wide = read_lens(lab.LENSES / "canon_gauss_35.toml").at(focus_m=math.inf, focal_length_mm=36.0, f_number=2.0)
-    stopped = wide.at(f_number=5.6).with_aperture(Aperture(blades=6))
+    wide = set_lens(read_lens(lab.LENSES / "canon_gauss_35.toml"), focus_m=math.inf, focal_length_mm=36.0, f_number=2.0)
+    stopped = set_lens(wide, f_number=5.6).with_aperture(Aperture(blades=6))
     one = coated(retrofocus, "bare,s02=single-layer,s03=single-layer")
     rows: list[list[tuple[str, Lens, Scatter, Light]]] = [
         [
@@ -227,10 +229,10 @@ def _draw(gauss: Lens, retrofocus: Lens, args: argparse.Namespace) -> None:
         pictures = []
         for _, lens, scatter, light in row:
             settings = FlareSettings(
-                wavelengths=9, glare=_SHOWN, scatter=scatter, kernel_px=8.0,
+                bins=9, glare=_SHOWN, scatter=scatter, kernel_px=8.0,
                 without=("ghosts",) if row is rows[1] else (),
             )  # fmt: skip
-            pictures.append(sum_of(flare_layers(lens, [light], raster, settings), raster))
+            pictures.append(sum_of(flare_layers(FlareJob(lens, [light], raster, settings)), raster))
         # Pairs of the first row at one exposure; light in the second by its logarithm, over four decades.
         for number, (axis, (title, *_), picture) in enumerate(zip(axes_row, row, pictures, strict=True)):
             if row is rows[0]:
@@ -274,19 +276,19 @@ def ways_of(lens: Lens, coating: str, count: int) -> Iterator[Way]:
         return sample
 
     pairs = GhostTracer(lens)
-    fours = GhostTracer(lens, [Four(*path) for path in four_reflections(lens).tolist()])
-    for times, ghosts, rays in ((2, pairs, count // 32), (4, fours, count // 256)):
+    for times in (2, 4):
         turning = tracer.turning(NM, times)
         turning[:, :, times:] = 1e-3
         ways = {
             "photons, roulette": (by_photons(1.0, times), count),
             "photons, squared transmission": (by_photons(2.0, times), count),
             "photons, a surface ahead by its reflectance": (by_photons(turning, times), count),
-            "all paths": (by_paths(ghosts), max(1, rays)),
         }
+        best = ways["photons, a surface ahead by its reflectance"]
         if times == 2:
+            best = ways["all paths"] = by_paths(pairs), max(1, count // 32)
             ways["photons, a surface ahead by its ghosts"] = (by_photons(_by_ghosts(pairs, tracer, light), 2), count)
-        truth = np.mean([by_paths(ghosts)(2 * max(1, rays), 1000 + k) for k in range(2 * _RUNS)], 0)
+        truth = np.mean([best[0](2 * best[1], 1000 + k) for k in range(2 * _RUNS)], 0)
         rows = [Way(f"{coating}, {times} reflections", name, *_race(*way, truth), None) for name, way in ways.items()]
         first = rows[0].variance_time
         for row in rows:

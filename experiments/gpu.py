@@ -35,10 +35,10 @@ from neurolens.graph.scalars import lower
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.tracegraph import exact_graph
 from neurolens.surrogates.domain import FilmRays, sample_domain
+from neurolens.surrogates.file import read_model
 from neurolens.surrogates.model import LensModel, Prediction
 from neurolens.surrogates.pairs import PairSet, trace_pairs
 from neurolens.surrogates.source import fused_program
-from neurolens.surrogates.stored import load_fitted
 
 LENSES = {
     "thorlabs_lb1471_biconvex_50": ("ols-64", "mlp-16x2"),
@@ -132,7 +132,7 @@ class Subject(NamedTuple):
 
 def subject_of(name: str) -> Subject:
     """A lens of `LENSES`: exact, and its models that ship."""
-    models = {kind: load_fitted(lab.MODELS / f"{name}.{kind}.onnx") for kind in LENSES[name]}
+    models = {kind: read_model(lab.MODELS / f"{name}.{kind}.onnx").at() for kind in LENSES[name]}
     first = next(iter(models.values()))
     exact = lower(exact_graph(first.lens, first.domain.pupil_z_mm, first.domain.wavelength_nm))
     return Subject(name, first, {EXACT: exact, **{kind: fused_program([model]) for kind, model in models.items()}})

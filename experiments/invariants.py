@@ -3,9 +3,14 @@
     python experiments/invariants.py record FOLDER [--tree OLD]     goldens of a tree (default: the one of this file)
     python experiments/invariants.py check FOLDER [--tree NEW] [--only ITEM ...] [--rays N] [--models GLOB]
 
-Items: onnx, onnx-speed, source, derivatives, wild, fits, fits-onnx, render, start. Only the command line of the package
-and onnxruntime are used, but for `fit_all`. Both commands go on where they stopped: goldens and results are files, the
-results of a check by a hash of the tree's source and of the number of rays. `check` exits with 1 on a failure.
+Items: onnx, onnx-speed, source, derivatives, wild, fits, fits-onnx, render, start, rays, ghosts. Only the command line
+of the package and onnxruntime are used, but for `fit_all` and `trace_all`. Both commands go on where they stopped:
+goldens and results are files, the results of a check by a hash of the tree's source and of the number of rays. `check`
+exits with 1 on a failure.
+
+`rays` are exact rays of every lens in both directions, --traced of them each way (10^6 for a full run; a check must
+name the number that was recorded); `ghosts` are 1,000 paths with two reflections. Positions, directions and powers are
+compared in float64; the float32 run by its errors against the float64 run of the recorded tree.
 
 Differences are in units in the last place (ulp) of float32, over rays that both pass (status 0): |a - b| over the ulp
 of the largest component of the vector (position, direction, crossing with the stop, a column of derivatives), or of the
@@ -72,7 +77,7 @@ CAMERAS = {
     "fused-model": f"--camera fused:models/{GAUSS}.ols-60.onnx",
     "fused-exact": f"--camera fused:lenses/{GAUSS}.toml",
     "onnx-blades": f"--camera models/{GAUSS}.ols-60.onnx --blades 6 --f-number 2.8 --vignetting optical",
-    "exact-blades": f"--camera lenses/{GAUSS}.toml --blades 6 --f-number 2.8 --pupil rear-rim",
+    "exact-blades": f"--camera lenses/{GAUSS}.toml --blades 6 --f-number 2.8",
     "anamorphic": f"--camera models/{CYLINDERS}.ols-64.onnx --focus 6",
     "zoom": f"--camera {ZOOM} --zoom 100 --focus 6",
     "fused-zoom": f"--camera fused:{ZOOM} --zoom 100 --focus 6",
@@ -84,26 +89,36 @@ def find(name: str) -> Any:
     """A function or class of the package under test, in whatever module it is."""
     root = Path.cwd()
     pattern = re.compile(rf"^(?:def|class) {name}\b", re.MULTILINE)
-    files = [f for f in sorted((root / "neurolens").rglob("*.py")) if pattern.search(f.read_text(encoding="utf-8"))]
+    modules = sorted([*(root / "neurolens").rglob("*.py"), *(root / "experiments").rglob("*.py")])
+    files = [f for f in modules if f.name != "invariants.py" and pattern.search(f.read_text(encoding="utf-8"))]
     if len(files) != 1:
         raise LookupError(f"{name}: defined in {len(files)} modules, expected 1")
     return getattr(importlib.import_module(".".join(files[0].relative_to(root).with_suffix("").parts)), name)
 
 
+def placed(lens: Any) -> Any:
+    """The lens with its film placed; in trees before `set_lens` that was a method."""
+    return lens.at() if hasattr(lens, "at") else find("set_lens")(lens)
+
+
 def fit_all(folder: Path) -> None:
-    """Fit every method of `bench` on few rays, and a zoom: NAME.npz of coefficients, NAME.onnx each."""
+    """Fit every row of `experiments surrogates` on few rays, and a zoom: NAME.npz of coefficients, NAME.onnx each."""
     import torch
 
     @functools.cache
     def prepared(name: str) -> Any:
-        lens = find("read_lens")(f"lenses/{name}.toml").at()
+        lens = placed(find("read_lens")(f"lenses/{name}.toml"))
         domain = find("DomainChoice")(focus_m=(math.inf, math.inf)).of(lens)
         return find("prepare")(find("make_pairs")(lens, domain, find("PairSettings")(3000, 300, 3000)))
 
     def fit(lens: str, row: Any) -> Any:
         quick = {"steps": min(row.settings.steps, 20), "degree": min(row.settings.degree, 8)}
         quick |= {"seconds": 1e9} if hasattr(row.settings, "seconds") else {}  # of versions whose fits a time ended
-        return find("fit_model")(prepared(lens), dataclasses.replace(row.settings, **quick))
+        try:
+            fit_row = find("fit_any")
+        except LookupError:  # a tree in which published methods were part of the package
+            fit_row = find("fit_model")
+        return fit_row(prepared(lens), dataclasses.replace(row.settings, **quick))
 
     def fit_zoom() -> Any:
         lens = find("read_lens")("lenses/nikon_zoom_80_200.toml")
@@ -135,6 +150,62 @@ def fit_all(folder: Path) -> None:
             found["refused"] = np.array(f"{type(error).__name__}: {error}")
         np.savez(folder / f"{name}.part.npz", **found)
         (folder / f"{name}.part.npz").replace(folder / f"{name}.npz")
+
+
+def trace_all(folder: Path, item: str, count: int) -> None:
+    """Trace every lens both ways, or 1,000 ghost paths, in float64 and float32: LENS.npz, arrays by precision."""
+    import torch
+
+    tracer = sys.modules[find("compile_trace").__module__]
+    files = sorted(Path("lenses").glob("*.toml"))
+    for number, file in enumerate(progress(files, item)):
+        if (folder / f"{file.stem}.npz").exists():
+            continue
+        lens, found = placed(find("read_lens")(file)), dict[str, Any]()
+        every = range(len(lens.surfaces))
+        pairs = list(itertools.combinations([k for k in every if lens.surfaces[k].n_d != lens.media[k].n_d], 2))
+        share = len(range(number, 1000, len(files)))
+        rng = np.random.default_rng(zlib.crc32(file.stem.encode()))
+        chosen = rng.choice(len(pairs), share, replace=share > len(pairs)) if item == "ghosts" else ()
+        paths = [find("ghost")(len(every), *pairs[k]) for k in chosen]
+        for name, steps in [*enumerate(paths)] if paths else [("scene", ()), ("film", ())]:
+            rays, waves = launched(rng, lens, str(name), 200 if paths else count)
+            for precision in ("float64", "float32"):
+                one = tracer.Rays(*(torch.from_numpy(r.astype(precision)) for r in rays))
+                nm = torch.from_numpy(waves.astype(precision))
+                if paths:
+                    out = find("follow")(lens, one, steps, nm)
+                else:
+                    out = tracer.trace(lens, one, nm, towards=name, transmittance=True)
+                power = out.power if paths else out.transmittance
+                found |= {f"{name}.{precision}.ray": torch.stack([*out.rays]).numpy()}
+                found |= {f"{name}.{precision}.power": power.numpy()}
+                found |= {f"{name}.{precision}.status": out.status.numpy().astype(np.int16)}
+        np.savez(folder / f"{file.stem}.part.npz", **found)
+        (folder / f"{file.stem}.part.npz").replace(folder / f"{file.stem}.npz")
+
+
+def launched(rng: np.random.Generator, lens: Any, name: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rays [6, N] from the film through the rear rim, or from the scene through the front rim, and wavelengths.
+
+    One ray in eight passes the rim by up to a tenth of its radius, and film points lie up to a tenth beyond the image.
+    """
+    u, scene = rng.random((6, count)), name == "scene"
+    rim = lens.surfaces[-1 if scene else 0].semi_diameter_mm * np.where(u[5] < 0.125, 1.1, 1.0) * np.sqrt(u[0])
+    to = np.stack([rim * np.cos(2 * np.pi * u[1]), rim * np.sin(2 * np.pi * u[1]), np.zeros(count)])
+    if scene:
+        to[2] = float(lens.vertices_mm[len(lens.surfaces) - 1])
+        radius = 1.1 * (lens.image_radius_mm or 0.8 * lens.surfaces[-1].semi_diameter_mm) * np.sqrt(u[2])
+        start = np.stack([radius * np.cos(2 * np.pi * u[3]), radius * np.sin(2 * np.pi * u[3]), 0 * u[0]])
+        start[2] = float(lens.film_z_mm if lens.film_z_mm is not None else lens.vertices_mm[-1])
+        d = to - start
+    else:
+        angle = np.radians(1.1 * min(lens.half_field_deg or 30.0, 90.0)) * np.sqrt(u[2])
+        d = np.stack(
+            [np.sin(angle) * np.cos(2 * np.pi * u[3]), np.sin(angle) * np.sin(2 * np.pi * u[3]), np.cos(angle)]
+        )
+        start = to - 20 * d
+    return np.concatenate([start, d / np.sqrt((d * d).sum(0))]), 400 + 300 * u[4]
 
 
 def arrays_of(value: Any, path: str) -> Iterator[tuple[str, np.ndarray]]:
@@ -181,7 +252,7 @@ def in_tree(tree: Path, arguments: Sequence[str], **options: Any) -> subprocess.
     return subprocess.run([sys.executable, *arguments], cwd=tree, env=env, **options)
 
 
-def make(tree: Path, folder: Path, golden: Path, item: str, pattern: str) -> None:
+def make(tree: Path, folder: Path, golden: Path, item: str, pattern: str, traced: int = 10_000) -> None:
     """Everything of an item that the tree makes, into the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     jobs: dict[str, list[str]] = {}
@@ -212,8 +283,8 @@ def make(tree: Path, folder: Path, golden: Path, item: str, pattern: str) -> Non
                 jobs[f"{base}.fixed.ray.h"] = [*export, "c", "--only", "ray", *waves, *film]
                 bands = ["--fix", "wavelengths=450,550,650"] if waves else []
                 jobs |= {f"{base}.bands.{k}": [*export, t, *bands] for k, t in (("h", "c"), ("glsl", "glsl"))}
-    if item == "fits":
-        in_tree(tree, [__file__, "_fits", str(folder), item], check=True)
+    if item in ("fits", "rays", "ghosts"):
+        in_tree(tree, [__file__, f"_{item}", str(folder), item, str(traced)], check=True)
     elif jobs:
         (folder / f"{item}.jobs.json").write_text(json.dumps(jobs))
         in_tree(tree, [__file__, "_jobs", str(folder), item], check=True)
@@ -474,6 +545,28 @@ def check_picture(old: Path, new: Path, cache: Path, **_: Any) -> Out:
     return {"differs": 1, "relative": float(max(off, default=math.inf))}
 
 
+def check_rays(old: Path, new: Path, **_: Any) -> Out:
+    """Rays that both trees pass: largest differences in float64, and how float32 errors (RMS) compare."""
+    (a, b), parts = (dict(np.load(f)) for f in (old, new)), []
+    for name in sorted({key.rsplit(".", 2)[0] for key in a}):
+        status, other = (x[f"{name}.float64.status"] for x in (a, b))
+        part: Out = {"rays": len(status), "status": int((status != other).sum())}
+        passed = (status == 0) & (other == 0)
+        gap = np.abs(a[f"{name}.float64.ray"] - b[f"{name}.float64.ray"])[:, passed]
+        part |= {"beyond 1e-12 mm": int((gap.max(0) > 1e-12).sum()), "mm": gap.max(initial=0.0)}
+        off = np.abs(a[f"{name}.float64.power"] - b[f"{name}.float64.power"])[passed]
+        part["power off"] = off.max(initial=0.0)
+        for x, key in ((a, "old single"), (b, "new single")):  # sums of squares: of tens of rays, ratios would be noise
+            both = passed & (x[f"{name}.float32.status"] == 0)
+            off = (a[f"{name}.float64.ray"] - x[f"{name}.float32.ray"])[:2, both]
+            part[key] = float(np.minimum(off * off, 1e-4).sum())
+            part[f"{key} status"] = int((x[f"{name}.float32.status"] != status).sum())
+        parts.append(part)
+    found = total(parts)
+    found["float32 error"] = (found.pop("new single") / max(found.pop("old single"), 1e-30)) ** 0.5
+    return found
+
+
 def check_start(golden: Path, new: Path, **_: Any) -> Out:
     """Processor time of fresh processes in pairs. What must run without torch is for tests/test_imports.py."""
     found: Out = {}
@@ -495,8 +588,20 @@ def check_start(golden: Path, new: Path, **_: Any) -> Out:
 # What may not be more, summed over the files or, of `SIZES`, the largest; all else is told only.
 LIMITS: dict[str, float] = {"ulp": 2.0, "derivative ulp": 4.0, "slower": 1.03, "import": 1.05, "help": 1.05}
 LIMITS |= dict.fromkeys(("status", "cards", "differs", "signature", "message", "operations"), 0.0)
-LIMITS |= dict.fromkeys(("broken", "convergence"), 0.0)
-SIZES = ("ulp", "derivative ulp", "slower", "import", "help", "relative", "import s", "help s")
+LIMITS |= dict.fromkeys(("broken", "convergence"), 0.0) | {"mm": 1e-12, "power off": 1e-12, "float32 error": 1.1}
+SIZES: tuple[str, ...] = (
+    "ulp",
+    "derivative ulp",
+    "slower",
+    "import",
+    "help",
+    "relative",
+    "import s",
+    "help s",
+    "mm",
+    "power off",
+)
+SIZES += ("float32 error",)  # largest of all files
 # The folder and endings of an item's goldens, the comparison of two files, and its share of --rays.
 ITEMS: dict[str, tuple[str, tuple[str, ...], Callable[..., Out], float]] = {
     "onnx": ("onnx", (".onnx",), check_onnx, 1),
@@ -508,6 +613,8 @@ ITEMS: dict[str, tuple[str, tuple[str, ...], Callable[..., Out], float]] = {
     "fits-onnx": ("fits", (".onnx",), check_onnx, 0.1),
     "render": ("render", (".exr",), check_picture, 0),
     "start": ("", (), check_start, 0),
+    "rays": ("rays", (".npz",), check_rays, 0),
+    "ghosts": ("ghosts", (".npz",), check_rays, 0),
 }
 
 
@@ -535,7 +642,7 @@ def check(args: argparse.Namespace) -> int:
     for item in args.only or ITEMS:
         folder, _, compare_files, share = ITEMS[item]
         if folder:
-            make(tree, new, golden, folder, args.models)
+            make(tree, new, golden, folder, args.models, args.traced)
         results: list[Out] = []
         for name in progress(files_of(item, golden, args.models), item):
             file = new / "results" / f"{item}-{args.rays}" / f"{name.replace('/', '_')}.json"
@@ -561,11 +668,14 @@ def check(args: argparse.Namespace) -> int:
 
 
 def main() -> int:
-    if sys.argv[1] in ("_jobs", "_fits"):  # in a subprocess, see `make`
+    if sys.argv[1].startswith("_"):  # in a subprocess, see `make`
         sys.path[0] = str(Path.cwd())
         folder, item = Path(sys.argv[2]), sys.argv[3]
         (folder / item).mkdir(parents=True, exist_ok=True)
-        run_jobs(folder, item) if sys.argv[1] == "_jobs" else fit_all(folder / item)
+        if sys.argv[1] in ("_rays", "_ghosts"):
+            trace_all(folder / item, item, int(sys.argv[4]))
+        else:
+            run_jobs(folder, item) if sys.argv[1] == "_jobs" else fit_all(folder / item)
         return 0
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("command", choices=("record", "check"))
@@ -573,6 +683,7 @@ def main() -> int:
     parser.add_argument("--tree", type=Path, default=Path(__file__).resolve().parents[1])
     parser.add_argument("--only", nargs="+", choices=ITEMS, default=[])
     parser.add_argument("--rays", type=int, default=1_000_000, help="inside, and as many outside (default 10^6)")
+    parser.add_argument("--traced", type=int, default=10_000, help="exact rays of a lens each way (default 10^4)")
     parser.add_argument("--models", default="*", help="pattern of file names in models/, without .onnx")
     args = parser.parse_args()
     if args.command == "check":
@@ -580,9 +691,9 @@ def main() -> int:
     golden, tree = args.folder.resolve(), args.tree.resolve()
     golden.mkdir(parents=True, exist_ok=True)
     (golden / "tree.json").write_text(json.dumps({"tree": str(tree)}))
-    for item in ("fits", "onnx", "derivatives", "source", "render"):
+    for item in ("fits", "onnx", "derivatives", "source", "render", "rays", "ghosts"):
         if not args.only or item in args.only:
-            make(tree, golden, golden, item, "*")
+            make(tree, golden, golden, item, "*", args.traced)
     return 0
 
 

@@ -29,11 +29,11 @@ from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.sag import front_rays
 from neurolens.surrogates.bases import pinned_threads
-from neurolens.surrogates.domain import Domain, FilmRays, domain_of, sample_domain
+from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.inverse import STEPS, TOLERANCE, InverseModel, front_index, scene_system, stop_system
 from neurolens.surrogates.inverse_fit import convergence, fit_inverse
-from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.model import Domain, LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
 PUBLISHED_STEPS = (3, 5, 10, 20)

@@ -12,6 +12,7 @@ import io
 import json
 import os
 import platform
+import resource
 import subprocess
 import sys
 import warnings
@@ -27,7 +28,6 @@ from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_path, atomic_write_text, write_json
 from neurolens.base.progress import Progress, Report
 from neurolens.commands.arguments import QUIET_HELP, add_option, add_output, whole
-from neurolens.evaluate.pages import markdown_table
 
 ROOT = Path(__file__).parents[1]
 LENSES, SCENES, MODELS = ROOT / "lenses", ROOT / "experiments" / "scenes", ROOT / "models"
@@ -135,6 +135,12 @@ def look_up(row: Any, path: str) -> Any:
 def columns(*described: tuple[Any, ...]) -> tuple[Column, ...]:
     """Columns from tuples of title, value, form, scale."""
     return tuple(Column(*one) for one in described)
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[Any]], missing: str = "") -> list[str]:
+    """Lines of a table in Markdown; `missing` stands for cells that are None."""
+    lines = [header, ["---"] * len(header), *([missing if c is None else str(c) for c in row] for row in rows)]
+    return [f"| {' | '.join(line)} |" for line in lines]
 
 
 def table(header: Sequence[Column] | Sequence[str] | str, rows: Iterable[Any], missing: str = "") -> str:
@@ -341,6 +347,18 @@ def in_child(function: Callable[..., Row], *args: str | float) -> Row:
     return found
 
 
+def cpu_s() -> float:
+    """Processor time of this process and of those that it has waited for, in seconds."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(each.ru_utime + each.ru_stime for each in used)
+
+
+def resident_kb(field: str) -> int:
+    """Resident memory in kilobytes: "VmRSS" now, "VmHWM" at its highest. Raises OSError: no /proc."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith(field)).split()[1])
+
+
 def memory_growth(work: Callable[[], T]) -> tuple[T, float]:
     """Result of `work`, and by how many bytes the highest resident memory meanwhile exceeds that before.
 
@@ -348,11 +366,7 @@ def memory_growth(work: Callable[[], T]) -> tuple[T, float]:
         OSError: no /proc (other than Linux).
     """
 
-    def kilobytes(field: str) -> int:
-        lines = Path("/proc/self/status").read_text().splitlines()
-        return int(next(line for line in lines if line.startswith(field)).split()[1])
-
     Path("/proc/self/clear_refs").write_text("5")  # the highest mark starts from here
-    before = kilobytes("VmRSS")
+    before = resident_kb("VmRSS")
     made = work()
-    return made, (kilobytes("VmHWM") - before) * 1024.0
+    return made, (resident_kb("VmHWM") - before) * 1024.0

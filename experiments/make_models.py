@@ -53,13 +53,12 @@ from neurolens.evaluate.train_states import fit_and_measure_states, state_settin
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm
 from neurolens.surrogates.cores import Residual
-from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.export import export_onnx
+from neurolens.surrogates.file import read_model
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, prepare
 from neurolens.surrogates.fits.network import with_boundary_terms
-from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.model import Domain, LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.stored import load_fitted
 from neurolens.surrogates.targets import Prepared
 
 _LIST = lab.ROOT / "experiments" / "models.toml"
@@ -408,7 +407,7 @@ def refit_clipping(library: Library, entries: Sequence[Entry], out: Path, progre
         mine = [row for row in rows if row["entry"] == entry.state and row["model"] in labels]
         if not mine:
             continue
-        models = {row["file"]: load_fitted(out / row["file"]) for row in mine}
+        models = {row["file"]: read_model(out / row["file"]).at() for row in mine}
         domain = next(iter(models.values())).domain  # not computed again, for its last digits may differ
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NeurolensWarning)

@@ -123,6 +123,7 @@ def _evening(bpy: Any) -> Any:
     """A head between balls on a chequered floor, the subject at the origin; strings of coloured lights behind it."""
     scene = _scene(bpy, "sky")
     scene.cycles.max_bounces = 3
+    scene.cycles.use_denoising, scene.cycles.denoiser = True, "OPENIMAGEDENOISE"
     scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (0.012, 0.018, 0.04, 1.0)
     bpy.ops.mesh.primitive_plane_add(size=60, location=(0, -0.12, -20), rotation=(-math.pi / 2, 0, 0))
     paint = _paint(bpy, (0.3, 0.3, 0.3), 0.4)

@@ -2,7 +2,8 @@
 
 Each lens stands where its subject is as large as in the other pictures, at its widest stop; Cycles's own camera stands
 there too, with the same focal length, f-number and sensor (of the anamorphic lens: its squeeze as the ratio of the
-aperture; of the fisheye: the equisolid panorama). Nothing is denoised. Writes README.md and a PNG a lens.
+aperture; of the fisheye: the equisolid panorama). Every picture is denoised by Cycles's OpenImageDenoise. Writes
+README.md and a JPEG a lens.
 """
 
 from __future__ import annotations
@@ -19,11 +20,14 @@ from experiments import lab
 from experiments.osl_speed import BLENDER, checked_python, in_blender
 from neurolens.base.progress import Progress
 from neurolens.blender.pack import Form
+from neurolens.commands.blender_kept import kept_form
 from neurolens.commands.blender_lenses import form_of
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
+from neurolens.optics.states import set_lens
 
-_MOST_BYTES = 400_000  # of a PNG
+_MOST_BYTES = 240_000  # of a picture
+_QUALITIES = (90, 85, 80, 70)
 _GAP = 4  # pixels between the two pictures
 
 
@@ -42,7 +46,7 @@ class Shot:
     title: str
     shows: str
     focus_m: float
-    size: tuple[int, int] = (360, 240)
+    size: tuple[int, int] = (640, 426)
     sensor_mm: float = 36.0
     squeeze: float = 1.0
     fisheye: bool = False
@@ -62,7 +66,7 @@ SHOTS = (
          "its film moves far for a subject this near, which makes the picture larger; corners darken", 1.42),
     Shot("cooke_anamorphic_42", "Anamorphic 42 mm f/2.4, its squeeze of two undone",
          "upright ovals; every surface traced, focused by its groups (glass by n_d and V_d, without absorption)",
-         0.9, (432, 180), 20.6, 2.0, state="0.74m"),
+         0.9, (640, 266), 20.6, 2.0, state="0.74m"),
     Shot("horimoto_fisheye_16.ols-64", "Fisheye 16 mm f/2.8, 180 degrees",
          "nearly the panorama, with its own corners", 0.25, fisheye=True),
     Shot("nikon_zoom_70_200.ols-64", "Zoom 70-200 mm f/2.8 at 71.5 mm",
@@ -71,7 +75,7 @@ SHOTS = (
 
 OPTIONS = [
     BLENDER,
-    lab.count("samples", 256, "of a pixel (default: 256)"),
+    lab.count("samples", 64, "of a pixel (default: 64)"),
     lab.ONLY,
     lab.out(lab.RESULTS / "blender", "folder for the page"),
 ]
@@ -92,7 +96,7 @@ def run(args: argparse.Namespace) -> None:
             told = in_blender(python, {"cameras": [], "scenes": {}, "shots": plan}, report)
         args.out.mkdir(parents=True, exist_ok=True)
         for shot in shots:
-            _write_pair(args.out / f"{shot.name}.png", Path(folder), shot)
+            _write_pair(args.out / f"{shot.name}.jpg", Path(folder), shot)
     rows, load = [_row(shot, told["shots"]) for shot in shots], os.getloadavg()[0]
     data = {"machine": lab.machine(), "load": load, "blender": told["blender"], "samples": args.samples, "rows": rows}
     print(lab.write_results(args.out, "README", _page(data, shots), data))
@@ -117,16 +121,17 @@ def planned(shot: Shot, f_number: float, shader: str | None, samples: int, folde
 def _form(shot: Shot, folder: Path, quiet: bool) -> Form:
     """The shader of a model, or of a lens file without what names its glass: shaders of exact lenses absorb nothing."""
     if shot.state is None:
-        return form_of(lab.MODELS / f"{shot.model}.onnx", quiet=quiet)
+        model = lab.MODELS / f"{shot.model}.onnx"
+        return kept_form(model, make=lambda: form_of(model, quiet=quiet))
     clear = folder / f"{shot.name}.toml"
     named = (lab.LENSES / clear.name).read_text(encoding="utf-8")
     clear.write_text(re.sub(r', (material|glass) = "[^"]*"', "", named), encoding="utf-8")
-    return form_of(clear, quiet=quiet)
+    return kept_form(clear, make=lambda: form_of(clear, quiet=quiet))
 
 
 def focal_mm(shot: Shot) -> float:
     """Focal length (vertical, of an anamorphic lens)."""
-    return float(first_order(read_lens(lab.LENSES / f"{shot.name}.toml").at(zoom=shot.state)).efl_mm)
+    return float(first_order(set_lens(read_lens(lab.LENSES / f"{shot.name}.toml"), zoom=shot.state)).efl_mm)
 
 
 def _write_pair(file: Path, folder: Path, shot: Shot) -> None:
@@ -135,11 +140,11 @@ def _write_pair(file: Path, folder: Path, shot: Shot) -> None:
 
     left, right = (Image.open(folder / f"{shot.name}.{kind}.png").convert("RGB") for kind in ("cycles", "lens"))
     for picture, label in ((left, "Cycles's own"), (right, shot.title.split(",")[0])):
-        ImageDraw.Draw(picture).text((6, 4), label, "white", font_size=13, stroke_width=2, stroke_fill="black")
+        ImageDraw.Draw(picture).text((8, 6), label, "white", font_size=20, stroke_width=2, stroke_fill="black")
     both = Image.new("RGB", (left.width + _GAP + right.width, left.height), "white")
     both.paste(left, (0, 0))
     both.paste(right, (left.width + _GAP, 0))
-    lab.write_small_png(file, (both, both.quantize(256)), _MOST_BYTES)
+    lab.write_small(file, [(both, {"quality": quality, "optimize": True}) for quality in _QUALITIES], _MOST_BYTES)
 
 
 def _row(shot: Shot, seconds: dict[str, float]) -> lab.Row:
@@ -161,8 +166,8 @@ def _page(data: lab.Row, shots: Sequence[Shot]) -> str:
     head = (
         f"`python -m experiments osl-pictures --samples {samples}`: Blender {data['blender']}, one thread, {samples} "
     )
-    head += f"samples a pixel; load average {data['load']:.0f}; {lab.machine_line()}"
+    head += f"samples a pixel, denoised; load average {data['load']:.0f}; {lab.machine_line()}"
     parts = ["Left Cycles's own depth of field, right the lens."]
     for shot in shots:
-        parts += [f"## {shot.title}", f"Right: {shot.shows}.", f"![{shot.title}: Cycles, the lens]({shot.name}.png)"]
+        parts += [f"## {shot.title}", f"Right: {shot.shows}.", f"![{shot.title}: Cycles, the lens]({shot.name}.jpg)"]
     return lab.page("# Lenses in Cycles", __doc__ or "", head, *parts, "## Seconds", lab.table(_COLUMNS, data["rows"]))

@@ -25,6 +25,7 @@ from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.photons import PhotonTracer
 from neurolens.flare.picture import Raster, ghost_picture, photon_picture
 from neurolens.optics.lensfile import read_lens
+from neurolens.optics.states import set_lens
 
 LENS, ZOOM, DISTANCE_MM = "nikon_zoom_80_200", "80", 3600.0
 # x, y of the light in mm, most reflections, and his time where he states it.
@@ -74,7 +75,7 @@ class Row:
 
 def run(args: argparse.Namespace) -> int:
     """Trace the cases, write the tables; 1 where the goal is missed."""
-    lens = read_lens(lab.LENSES / f"{LENS}.toml").at(zoom=ZOOM, focus_m=DISTANCE_MM / 1000, focus="best")
+    lens = set_lens(read_lens(lab.LENSES / f"{LENS}.toml"), zoom=ZOOM, focus_m=DISTANCE_MM / 1000, focus="best")
     tracer, rows, progress = PhotonTracer(lens), [], Progress(quiet=args.quiet)
     if args.picture:
         _draw(tracer, args)

@@ -22,7 +22,6 @@ from experiments import lab, plan_errors
 from neurolens.base.progress import Report
 from neurolens.cameras.build import Shot, ideal_as, make_camera
 from neurolens.cameras.contract import Camera
-from neurolens.cameras.exact import FusedExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.warped import Warped
 from neurolens.evaluate import footprints as prints
@@ -34,6 +33,7 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm
+from neurolens.optics.states import set_lens
 from neurolens.render.scene import Scene, load_scene
 from neurolens.surrogates.bases import pinned_threads
 
@@ -78,7 +78,7 @@ class Case:
 
     def load(self) -> tuple[Lens, Scene]:
         """The lens in its state, and the scene on a film that suits it."""
-        lens = read_lens(self.file).at(zoom=self.state)
+        lens = set_lens(read_lens(self.file), zoom=self.state)
         return lens, suited(load_scene(lab.SCENES / f"{self.scene}.toml"), lens)
 
     def shipped(self) -> list[Path]:
@@ -122,7 +122,7 @@ def measure_case(case: Case, folder: Path, report: Report) -> dict[str, Any]:
     probe_s = time.process_time() - began
     asked = found.asked
     shot = Shot(asked.film_mm, asked.focus_m, asked.f_number, zoom=case.state, wavelength_nm=asked.wavelength_nm)
-    compiled = "fused:" if isinstance(found.exact, FusedExactCamera) else ""
+    compiled = "fused:" if found.exact.runtime == "c" else ""
     exact = make_camera(
         f"{compiled}{lens.path}", shot
     )  # as a render has it: a plan's own has another outline of pupils

@@ -28,8 +28,10 @@ from neurolens.cameras.model import load_model
 from neurolens.evaluate.candidates import exact_candidates, ideal_cameras, model_candidate
 from neurolens.evaluate.speed import Race, race
 from neurolens.optics.lensfile import read_lens
+from neurolens.optics.states import set_lens
 from neurolens.render.scene import load_scene
-from neurolens.surrogates.domain import Domain, domain_of
+from neurolens.surrogates.domain import domain_of
+from neurolens.surrogates.model import Domain
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,7 @@ def bench_models(args: argparse.Namespace, save: Callable[[Outcome], str]) -> Ou
     outcome = Outcome()
     for (lens_file, configuration, efl_mm), report in lab.stages(groups, _state, args.quiet, 60.0):
         rows = groups[lens_file, configuration, efl_mm]
-        lens = read_lens(lab.ROOT / lens_file).at(zoom=configuration, focal_length_mm=efl_mm)
+        lens = set_lens(read_lens(lab.ROOT / lens_file), zoom=configuration, focal_length_mm=efl_mm)
         models = {row["file"]: load_model(folder / row["file"], lens.sha256) for row in rows}
         domain = Domain.from_dict(next(iter(models.values())).card["domain"])
         lens = lens.with_stop_radius(domain.stop_radius_mm)
@@ -166,7 +168,7 @@ RENDER_MPATH_S = 1.0  # the room, depth 3, two cores
 
 def check_floors(rounds: int) -> list[Floor]:
     """Measure all of them; the best of the rounds counts, as a busy machine only ever slows."""
-    lens = read_lens(LENS).at()
+    lens = set_lens(read_lens(LENS))
     domain = domain_of(lens)
     candidates = exact_candidates(lens, domain, transmittance=False, build_rays=False, label="trace")
     timed = race(candidates, domain, rounds=rounds)

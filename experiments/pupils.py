@@ -20,6 +20,7 @@ import numpy as np
 from torch.quasirandom import SobolEngine
 
 from experiments import lab
+from experiments import pupil_methods as known
 from neurolens.base.progress import Progress
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.osl import osl_program
@@ -28,10 +29,10 @@ from neurolens.cameras.pupil_circles_fit import light_lost
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.evaluate.costs import cycles_ns
 from neurolens.evaluate.shaders import lens_of
-from neurolens.optics import pupil_methods as known
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import pupil_bounds
+from neurolens.optics.states import set_lens
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,9 @@ SampleFunction = Callable[[Any, Any, Any], tuple[Any, Any]]
 
 def camera_of(case: Case) -> ExactCamera:
     """The lens of a case on `FILM_MM`, focused at infinity."""
-    lens = read_lens(lab.LENSES / f"{case.lens}.toml").at(focal_length_mm=case.focal_length_mm, f_number=case.f_number)
+    lens = set_lens(
+        read_lens(lab.LENSES / f"{case.lens}.toml"), focal_length_mm=case.focal_length_mm, f_number=case.f_number
+    )
     return ExactCamera(lens, film_mm=FILM_MM, focus_m=math.inf)
 
 
@@ -230,7 +233,7 @@ def pixel_rates(samples: int = SAMPLES) -> Iterator[tuple[float, float, float]]:
     r, angle = SobolEngine(2, scramble=True, seed=1).draw(samples).double().numpy().T
     r, angle = np.sqrt(r), 2 * math.pi * angle
     for f_number, theirs in TABLE_5_3.items():
-        lens = read_lens(lab.LENSES / "brendel_tessar_100.toml").at(focal_length_mm=50.0, f_number=f_number)
+        lens = set_lens(read_lens(lab.LENSES / "brendel_tessar_100.toml"), focal_length_mm=50.0, f_number=f_number)
         rim = known.rear_rim(lens, radius)
         points = rim.along[0] * np.stack([r * np.cos(angle), r * np.sin(angle)])
         passed = known.passes_through(lens, rim.pupil_z_mm)(np.full(samples, radius), points)

@@ -122,7 +122,7 @@ def white_card(light: FilmLight) -> dict[str, Array]:
 
 def _check(lens: Lens, radius: Array) -> None:
     if lens.film_z_mm is None:
-        raise InputError(lens.path, "film_z_mm", None, "a focused lens: lens.at(focus_m=...)")
+        raise InputError(lens.path, "film_z_mm", None, "a focused lens: set_lens(lens, focus_m=...)")
     if lens.anamorphic or lens.aperture is not None:
         raise InputError(lens.path, "surfaces", "(cylinders or blades)", "a lens that is round about its axis")
     if radius.ndim != 1 or not radius.size or radius[0] != 0 or not ((radius >= 0) & np.isfinite(radius)).all():

@@ -69,7 +69,7 @@ class Subject:
         refractions: of the lens, None for an ideal camera. kind: one of `KINDS`, or an ideal camera.
         camera: None where it cannot be made, `reason` says why. made_s: to make it, compiling included.
         ns, ns_moves: of a ray without and with differentials, camera alone, best of the rounds.
-        moves_error: of differentials that are fitted, see `FusedFilm`.
+        moves_error: of differentials that are fitted, see `LensCamera`.
     """
 
     lens: str

@@ -20,7 +20,6 @@ import numpy as np
 from experiments import lab
 from experiments.plans import suited
 from neurolens.base.progress import Report
-from neurolens.cameras.fused import FusedCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.evaluate import footprints as prints
 from neurolens.evaluate import shot_fits
@@ -28,6 +27,7 @@ from neurolens.evaluate.costs import glsl_operations, ns_a_ray
 from neurolens.evaluate.experiment import near_limit_m
 from neurolens.evaluate.probe import COUNTED, LIGHT, Probed, probe
 from neurolens.optics.lensfile import read_lens
+from neurolens.optics.states import set_lens
 from neurolens.render.scene import load_scene
 from neurolens.surrogates.bases import pinned_threads
 
@@ -73,7 +73,7 @@ class Model:
 
 def measure_lens(name: str, folder: Path, report: Report) -> dict[str, Any]:
     """All shots of a lens."""
-    lens = read_lens(lab.LENSES / f"{name}.toml").at()
+    lens = set_lens(read_lens(lab.LENSES / f"{name}.toml"))
     shots = []
     terms = max(n for n in range(SHIPPED_TERMS + 1) if (lab.MODELS / f"{name}.ols-{n}.onnx").is_file())
     for number, sitting in enumerate(SITTINGS):
@@ -126,7 +126,7 @@ def _errors(found: Probed, camera: OnnxCamera) -> tuple[float, float]:
 def _measured(found: Probed, file: Path, terms: int) -> Model:
     camera = _onnx(found, file)
     um, light = _errors(found, camera)
-    ns = ns_a_ray(FusedCamera(load_model(file), **_real(found)), found.places)["min"]
+    ns = ns_a_ray(OnnxCamera(load_model(file), **_real(found), runtime="c"), found.places)["min"]
     return Model(terms, um, light, glsl_operations(camera), ns)
 
 

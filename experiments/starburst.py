@@ -26,6 +26,7 @@ from neurolens.flare.picture import Raster
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
+from neurolens.optics.states import set_lens
 
 LENS, NM, FILM_MM = "laikin_double_gauss_50", 550.0, (36.0, 24.0)
 STOPS, BLADES, CURVATURES, FIELDS = (4.0, 8.0, 16.0), (6, 7, 9), (0.0, 0.7), (0.0, 15.0)
@@ -87,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
 def lens_at(f_number: float, aperture: Aperture | None = None) -> Lens:
     """The lens, focused at infinity."""
     lens = read_lens(lab.LENSES / f"{LENS}.toml").with_aperture(aperture)
-    return lens.at(f_number=f_number, focus_m=math.inf, focus="best")
+    return set_lens(lens, f_number=f_number, focus_m=math.inf, focus="best")
 
 
 def _pupil(f_number: float, aperture: Aperture | None = None) -> tuple[ExitPupil, list[Array]]:

@@ -29,7 +29,6 @@ from experiments import lab
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.cli import main
-from neurolens.evaluate.pages import markdown_table
 from neurolens.render.pictures import read_channels
 
 OPTIONS = [
@@ -111,7 +110,7 @@ def run(args: argparse.Namespace) -> None:
     ]
     header = ["command", "kills", "starts until done, median", "same bytes", "half-written", "full disk"]
     header += ["two runs at once", "clock back a year", "no place to write"]
-    table = "\n".join(markdown_table(header, rows))
+    table = "\n".join(lab.markdown_table(header, rows))
     page = f"# Runs that are disturbed\n\n{' '.join((__doc__ or '').split())}\n\n{table}\n"
     args.out.mkdir(parents=True, exist_ok=True)
     atomic_write_text(args.out / "survive.md", page)

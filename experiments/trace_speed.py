@@ -24,6 +24,7 @@ from neurolens.evaluate.speed import POOL, Call, Candidate, Race, Unavailable, r
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays, compile_trace, trace
 from neurolens.surrogates.domain import FilmRays
 
@@ -45,7 +46,7 @@ DTYPES = (torch.float32, torch.float64)
 
 def lens_of(count: int) -> Lens:
     """The lens of so many refractions."""
-    return read_lens(lab.LENSES / f"{LENSES[count]}.toml").at()
+    return set_lens(read_lens(lab.LENSES / f"{LENSES[count]}.toml"))
 
 
 def with_aspheres(lens: Lens) -> Lens:
@@ -175,7 +176,7 @@ def memory_of(lens_file: str, count: int) -> Row:
         before), working_mb (growth less results: what tracing itself needs).
     """
     torch.set_num_threads(1)
-    lens = read_lens(lens_file).at()
+    lens = set_lens(read_lens(lens_file))
     rays, wavelength = _rays(lens, count)
     with torch.no_grad():
         trace(lens, Rays(*(c[:_PART] for c in rays)), wavelength[:_PART])  # what torch sets up once

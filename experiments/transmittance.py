@@ -22,7 +22,9 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.sequence import follow
-from neurolens.surrogates.domain import Domain, domain_of, sample_domain
+from neurolens.optics.states import set_lens
+from neurolens.surrogates.domain import domain_of, sample_domain
+from neurolens.surrogates.model import Domain
 
 COATINGS = {"bare": None, "coated": "quarter-wave"}
 
@@ -69,7 +71,7 @@ def run(args: argparse.Namespace) -> None:
     rows, files = list[lab.Row](), sorted(lab.LENSES.glob("*.toml"))
     with Progress(quiet=args.quiet).stage("lenses") as report:
         for file in files:
-            lens = read_lens(file).at()
+            lens = set_lens(read_lens(file))
             domain = domain_of(lens, focus_m=(math.inf, math.inf))
             row: lab.Row = {"lens": file.stem, "refractions": lens.refractions}
             for kind, design in COATINGS.items():

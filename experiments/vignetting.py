@@ -33,9 +33,9 @@ from neurolens.evaluate.experiment import DomainChoice, LensChoice
 from neurolens.evaluate.vignetting import SEED, false_shares, relative_illumination
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.prescription import Lens
-from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
+from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
-from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.model import Domain, LensModel
 from neurolens.surrogates.pairs import make_pairs, trace_pairs
 
 # Stops closed, and the blades if any.

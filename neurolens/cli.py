@@ -25,7 +25,7 @@ _TRAIN_PACKAGES = {"torch", "sklearn", "scipy", "onnx", "matplotlib", "flip_eval
 _BROKEN_PIPE = 141  # 128 plus the signal's number, as shells report it
 _FAULT, _TRACEBACK = 70, "NEUROLENS_TRACEBACK"  # EX_SOFTWARE of sysexits.h; the variable that asks for tracebacks
 # Names that commands had: they still work.
-_RENAMED = {("merge",): ("render", "--merge"), ("trade",): ("plan", "--trade"), ("bench", "surrogates"): ("bench",)}
+_RENAMED: dict[tuple[str, ...], tuple[str, ...]] = {("merge",): ("render", "--merge"), ("trade",): ("plan", "--trade")}
 
 _DESCRIPTION = "Any lens prescription as a fast camera model with a measured error."
 _EPILOG = """\
@@ -49,7 +49,6 @@ def build_parser() -> Parser:
     """
     from neurolens.commands import (
         analyse,
-        bench,
         blender,
         convert,
         demo,
@@ -72,7 +71,7 @@ def build_parser() -> Parser:
 
     groups = {
         "lenses": (lens, analyse, convert, glass, library, survey, view),
-        "camera models of a lens": (train, models, evaluate, bench),
+        "camera models of a lens": (train, models, evaluate),
         "pictures": (demo, plan, render, flare),
         "compositing and other programs": (stmap, projection, export, blender, mitsuba),
     }

@@ -1,6 +1,7 @@
 """Running commands as from a shell: what they print as JSON, and the one line of those that fail."""
 
 import json
+from collections.abc import Callable
 from contextlib import redirect_stdout
 from functools import cache
 from io import StringIO
@@ -28,10 +29,10 @@ def described(path: Path) -> dict[str, Any]:
     return data
 
 
-def failure(capsys: pytest.CaptureFixture[str], *args: object) -> str:
+def failure(capsys: pytest.CaptureFixture[str], *args: object, run: Callable[[list[str]], int] = main) -> str:
     """Run a command that must fail with exit code 2, nothing on stdout, and one line on stderr; returns the line."""
     try:
-        code = main([*map(str, args)])
+        code = run([*map(str, args)])
     except SystemExit as stopped:
         code = int(stopped.code or 0)
     captured = capsys.readouterr()

@@ -15,18 +15,20 @@ import onnx
 import torch
 from torch import Tensor
 
+from experiments.published import PublishedSettings, fit_any
 from neurolens.base.errors import NeurolensWarning
 from neurolens.cameras.exact import ExactCamera
 from neurolens.modelfile import CARD_KEY, MODEL_KEY
 from neurolens.optics import paraxial
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.states import set_lens
 from neurolens.surrogates.cores import Network
-from neurolens.surrogates.domain import Domain, domain_of
+from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.gates import gate_values
-from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.model import Domain, LensModel
 from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs
 from neurolens.surrogates.specialise import at_wavelength
 from neurolens.surrogates.targets import scales_of, targets_of
@@ -42,19 +44,19 @@ _FITS = {
     "thick": ModelSettings("thick"),
     "zones": ModelSettings("ols", terms=16, partitions=2, planes=False),
     "residual": ModelSettings("ols+mlp", terms=12, degree=5, planes=False, units=8, layers=1, steps=60),
-    "hanika": ModelSettings("hanika", basis="raw", degree=3),
-    "schrade": ModelSettings("schrade", basis="raw", degree=5, terms=12),
-    "rtf": ModelSettings("rtf", basis="raw", degree=4),
-    "taylor": ModelSettings("taylor", basis="raw", degree=3),
-    "ray-lut": ModelSettings("ray-lut", basis="raw", units=6),
-    "cells": ModelSettings("zheng-adaptive", basis="raw", terms=6, partitions=2),
-    "neurolens2017": ModelSettings("neurolens2017", basis="raw", units=16, layers=2, steps=60, partitions=2),
+    "hanika": PublishedSettings("hanika", basis="raw", degree=3),
+    "schrade": PublishedSettings("schrade", basis="raw", degree=5, terms=12),
+    "rtf": PublishedSettings("rtf", basis="raw", degree=4),
+    "taylor": PublishedSettings("taylor", basis="raw", degree=3),
+    "ray-lut": PublishedSettings("ray-lut", basis="raw", units=6),
+    "cells": PublishedSettings("zheng-adaptive", basis="raw", terms=6, partitions=2),
+    "neurolens2017": PublishedSettings("neurolens2017", basis="raw", units=16, layers=2, steps=60, partitions=2),
 }
 
 
 @cache
 def lens(name: str = GAUSS) -> Lens:
-    return read_lens(LENSES / f"{name}.toml").at(focal_length_mm=14.0 if "muller" in name else None)
+    return set_lens(read_lens(LENSES / f"{name}.toml"), focal_length_mm=14.0 if "muller" in name else None)
 
 
 @cache
@@ -78,7 +80,7 @@ def prepared(name: str = GAUSS) -> Prepared:
 @cache
 def anamorphic() -> Prepared:
     """Pairs of a lens with cylinders, focused at infinity: the search for its pupil takes seconds."""
-    lens = read_lens(LENSES / "cooke_anamorphic_42.toml").at()
+    lens = set_lens(read_lens(LENSES / "cooke_anamorphic_42.toml"))
     domain = domain_of(lens, film_radius_mm=10.0, focus_m=(math.inf, math.inf))
     return prepare(make_pairs(lens, domain, PairSettings(5000, 3000, 5000)))
 
@@ -104,7 +106,7 @@ def hemisphere() -> Lens:
         Surface(math.inf, 9.9, 19.8, 1.6, 40.0),
         Surface(-10.0, 12.0, 19.8),
     )
-    return Lens("half ball", "", surfaces, 2.0, path="half_ball.toml").at(focus_m=2.0)
+    return set_lens(Lens("half ball", "", surfaces, 2.0, path="half_ball.toml"), focus_m=2.0)
 
 
 @cache
@@ -129,7 +131,7 @@ def model(kind: str) -> LensModel:
     if kind in GATED:
         return fit_model(gated(kind), ModelSettings("ols", terms=40, planes=False))
     method, _, other = kind.partition(" ")
-    return fit_model(prepared(FISHEYE if other else GAUSS), _FITS[method])
+    return fit_any(prepared(FISHEYE if other else GAUSS), _FITS[method])
 
 
 @cache

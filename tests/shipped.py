@@ -12,6 +12,7 @@ import torch
 from neurolens.base.errors import NeurolensWarning
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays
 
 LENSES = Path(__file__).parents[1] / "lenses"
@@ -30,7 +31,7 @@ def tabled(name: str) -> Lens:
 @cache
 def focused(name: str) -> Lens:
     """A lens focused at infinity."""
-    return tabled(name).at()
+    return set_lens(tabled(name))
 
 
 def pinhole(film_distance_mm: float, radius_mm: float, *, image_radius_mm: float | None = None) -> Lens:

@@ -1,5 +1,6 @@
 """The base: files that are whole or not there, settings, what progress says of the time left."""
 
+import argparse
 import io
 import math
 import os
@@ -27,6 +28,7 @@ from neurolens.base.files import (
     safe_name,
     write_kept,
 )
+from neurolens.base.options import add_options, check_bounds, from_options, setting
 from neurolens.base.progress import Progress, duration
 
 
@@ -420,3 +422,52 @@ def test_torch_keeps_compiled_code_in_a_folder_of_this_user_alone(
     monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR")
     trace.compile_tracing(lambda: None)
     assert not Path(places.cache_dir()).is_relative_to(tmp_path)
+
+
+@dataclass(frozen=True)
+class _Inner:
+    share: float = setting(0.0, "of the light", within=(0, 1), metavar="SHARE")
+    hidden: float = 0.25
+
+
+@dataclass(frozen=True)
+class _Options:
+    cell_px: float = setting(8.0, "size of a cell", within=(1, 256), unit="pixels", old=("pixel-size",))
+    count: int = setting(3, "rays", within=(1, 9), option="rays")
+    name: str | None = setting(None, "of the lens")
+    only: tuple[str, ...] = setting((), "a layer", metavar="LAYER")
+    fast: bool = setting(False, "no check")
+    kind: Literal["a", "b"] = setting("a", "of the fit")
+    inner: _Inner = setting(_Inner(), "what is inside")
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "blur")
+
+
+def test_settings_are_options(capsys: pytest.CaptureFixture[str]) -> None:
+    """One declaration gives options, help, and the bounds of values from the command line, TOML and Python."""
+    parser = argparse.ArgumentParser()
+    add_options(parser, _Options, kind="b")
+    assert from_options(_Options, parser.parse_args([])) == _Options(kind="b")
+    words = "--pixel-size 4 --rays 2 --name x --only p --only q --fast --kind a --share 0.5".split()
+    found = from_options(_Options, parser.parse_args(words))
+    assert found == _Options(4.0, 2, "x", ("p", "q"), True, "a", _Inner(0.5))
+    assert from_dict(_Options, {"cell_px": 4, "inner": {"share": 0.5}}, "s.toml") == _Options(4.0, inner=_Inner(0.5))
+    text = parser.format_help()
+    assert "--cell PX" in text and "(default: 8)" in text and "(default: 0)" in text and "--hidden" not in text
+    assert "pixel-size" not in text and "(default: b)" in text and "no check (" not in text
+    refused = {
+        "--cell nan": "--cell", "--cell 0.5": "pixels from 1 to 256", "--rays 2.5": "an integer from 1 to 9",
+        "--share 2": "a number from 0 to 1", "--kind c": "choose from", "--hidden 1": "unrecognized",
+    }  # fmt: skip
+    for wrong, said in refused.items():
+        with pytest.raises(SystemExit):
+            parser.parse_args(wrong.split())
+        assert said in capsys.readouterr().err
+    with pytest.raises(InputError, match=r"s\.toml: cell_px: got 300.*pixels from 1 to 256"):
+        from_dict(_Options, {"cell_px": 300}, "s.toml")
+    with pytest.raises(InputError, match="an integer from 1 to 9"):
+        _Options(count=0)
+    group = argparse.ArgumentParser()
+    add_options(group, _Options, ["count", "share"])
+    assert vars(group.parse_args(["--rays", "9"])) == {"count": 9, "share": 0.0}

@@ -294,7 +294,9 @@ def test_frames_follow_their_keys_and_what_exists_is_kept(
     # A frame that was interrupted goes on; one that fails ends the run.
     (tmp_path / "a.0001.exr.part").write_bytes(b"")
     asked: list[str] = []
-    monkeypatch.setattr("neurolens.commands.render._run_one", lambda args: asked.append(args.out.name) or 3)
+    monkeypatch.setattr(
+        "neurolens.commands.render._render", lambda _, made, *__: asked.append(made.files.out.name) or 3
+    )
     assert main([*command, "-o", str(tmp_path / "a.exr")]) == 3 and asked == ["a.0001.exr"]
     capsys.readouterr()
     for wrong, words in (

@@ -21,10 +21,12 @@ from neurolens.evaluate.measure import FreshRays, fresh_rays, measure, onnx_pred
 from neurolens.modelfile import AVERAGED, POLARISED
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
-from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
+from neurolens.optics.states import set_lens
+from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_onnx
+from neurolens.surrogates.file import read_model
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.stored import load_fitted
 
 ROOT = Path(__file__).parents[1]
 MODELS = ROOT / "models"
@@ -56,7 +58,7 @@ def model(file: str) -> OnnxLens:
 
 @cache
 def exact(lens_file: str, configuration: str | None, efl_mm: float | None) -> Lens:
-    return read_lens(ROOT / lens_file).at(zoom=configuration, focal_length_mm=efl_mm)
+    return set_lens(read_lens(ROOT / lens_file), zoom=configuration, focal_length_mm=efl_mm)
 
 
 def rays_of(file: str) -> FreshRays:
@@ -86,7 +88,7 @@ def test_model_keeps_its_card_and_index_on_fresh_rays(row: dict[str, Any]) -> No
     assert all(row[figure] == card["errors"][figure] for figure in ("rms_um", "direction_rms_deg", "false_pass"))
     promises = promises_of(card["errors"], fresh, measure(fresh, onnx_predictor(model(row["file"]))))
     assert len(promises) > 10 and not [p for p in promises if not p.holds]
-    assert load_fitted(ROOT / "models" / row["file"]).domain == fresh.domain  # for source code of it
+    assert read_model(ROOT / "models" / row["file"]).at().domain == fresh.domain  # for source code of it
 
 
 @pytest.mark.parametrize("row", [r for r in ROWS if not r.get("axes")], ids=lambda r: r["file"])
@@ -209,14 +211,14 @@ def test_a_card_that_states_no_transmittance_holds_the_averaged_one(
     """As models made before it was followed: they say so wherever they are listed, read back or written as code."""
     shipped, stated = MODELS / "petzval_portrait_100.ols-64.onnx", b'"transmittance": "polarised"'
     data = shipped.read_bytes()
-    assert data.count(stated) == 1 and load_fitted(shipped).transmittance == POLARISED
+    assert data.count(stated) == 1 and read_model(shipped).at().transmittance == POLARISED
     file = tmp_path / "models" / "old.onnx"
     file.parent.mkdir()
     file.write_bytes(data.replace(stated, b'"transmittancX": "polarised"'))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(models_command, "library", lambda: tmp_path / "site")
     assert main(["models"]) == 0 and "averaged transmittance" in capsys.readouterr().out
-    again = export_onnx(load_fitted(file), tmp_path / "again.onnx", {})
+    again = export_onnx(read_model(file).at(), tmp_path / "again.onnx", {})
     assert load_model(again).card["transmittance"] == AVERAGED
     assert main(["export", str(file), "--to", "c", "-o", "old.h"]) == 0
     assert "light is averaged at every surface" in " ".join((tmp_path / "old.h").read_text().split(" * "))

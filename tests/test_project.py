@@ -2,6 +2,7 @@
 
 import ast
 import re
+import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -136,3 +137,15 @@ def test_an_installed_package_holds_the_library(tmp_path: Path, monkeypatch: pyt
     assert (files.library() / "experiments" / "scenes" / "lights.toml").is_file()
     with pytest.raises(InputError, match="missing"):
         resolve("no_such_lens")
+
+
+def test_files_beside_the_modules_are_in_the_wheel() -> None:
+    """C, templates, scripts, styles and tables: every file of the package that git knows is package data."""
+    data = SETTINGS["tool"]["setuptools"]["package-data"]
+    folders = {ROOT / name.replace(".", "/"): patterns for name, patterns in data.items()}
+    packed = {file for folder, patterns in folders.items() for pattern in patterns for file in folder.glob(pattern)}
+    listed = subprocess.run(["git", "ls-files", "neurolens"], cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("no git, or no checkout")
+    beside = {ROOT / line for line in listed.stdout.splitlines() if not line.endswith(".py")}
+    assert len(beside) > 20 and {file for file in beside if file.is_file()} - packed == {ROOT / "neurolens/README.md"}

@@ -8,7 +8,8 @@ import torch
 from neurolens.base import status as st
 from neurolens.evaluate.vignetting import NEAR_RIM, SEED, ZONES, deciding_rim_ratio, false_shares
 from neurolens.optics.prescription import Lens
-from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
+from neurolens.surrogates.domain import FilmRays, sample_domain
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import trace_pairs
 
 _BATCH = 65536

@@ -26,8 +26,8 @@ from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.progress import Report
 from neurolens.cameras import build
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FloatArray
-from neurolens.cameras.exact import ExactCamera, FusedExactCamera
-from neurolens.cameras.fused import FusedCamera
+from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.graphcamera import Runtime
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.vignetting import Vignetted
 from neurolens.evaluate.image import Image
@@ -35,10 +35,12 @@ from neurolens.evaluate.measure import fit_and_measure, known_record
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import film_z_mm, first_order
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.states import set_lens
 from neurolens.render.pictures import make_aperture
 from neurolens.render.scene import Scene
-from neurolens.surrogates.domain import Domain, domain_of
+from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.fit import ModelSettings, prepare
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
 _CLEAR = 0.95  # rims over the radius of curvature, at most
@@ -80,18 +82,18 @@ def shot_of(panel: Panel, scene: Scene) -> Shot:
     """The lens and the settings of a panel.
 
     Raises:
-        InputError: as `read_lens` and `Lens.at`.
+        InputError: as `read_lens` and `set_lens`.
     """
     camera = scene.settings.camera
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NeurolensWarning)  # a lens of one wavelength is what the file asks for
-        lens = read_lens(panel.lens).at(focal_length_mm=panel.efl_mm, field_deg=panel.field_deg, zoom=panel.zoom)
+        lens = set_lens(read_lens(panel.lens), focal_length_mm=panel.efl_mm, field_deg=panel.field_deg, zoom=panel.zoom)
     lens = widened(lens, panel.widen)
     shape = make_aperture(panel.blades, panel.blade_rotation_deg, panel.blade_curvature, panel.aperture_mask)
     lens = lens.with_aperture(shape or scene.aperture or lens.aperture)
     focus_m = camera.focus_m if panel.focus_m is None else panel.focus_m
     f_number = panel.f_number or camera.f_number or float(first_order(lens).f_number)
-    lens = lens.at(f_number=f_number, focus_m=focus_m, focus=panel.focusing)
+    lens = set_lens(lens, f_number=f_number, focus_m=focus_m, focus=panel.focusing)
     assert lens.film_z_mm is not None  # `at` places the film
     film_z = float(lens.film_z_mm) + panel.film_offset_mm
     lens = replace(lens, infinity_mm=())  # groups that have moved to focus stay there
@@ -268,9 +270,9 @@ class Window:
         return other
 
 
-def exact_camera(shot: Shot, surrogate: Surrogate | None, kind: type[ExactCamera] = ExactCamera) -> Camera:
+def exact_camera(shot: Shot, surrogate: Surrogate | None, runtime: Runtime = "trace") -> Camera:
     """The prescription itself, sampled over the surrogate's pupil: the same rays for the same random numbers."""
-    return kind(
+    return ExactCamera(
         replace(shot.lens, film_z_mm=None),
         film_mm=shot.film_mm,
         focus_m=shot.focus_m,
@@ -278,13 +280,14 @@ def exact_camera(shot: Shot, surrogate: Surrogate | None, kind: type[ExactCamera
         bounds=None if surrogate is None else surrogate.domain.bounds,
         focus="paraxial",
         film_offset_mm=shot.offset_mm,
+        runtime=runtime,
     )
 
 
-def surrogate_camera(shot: Shot, surrogate: Surrogate | None, kind: type[OnnxCamera] = OnnxCamera) -> Camera:
+def surrogate_camera(shot: Shot, surrogate: Surrogate | None, runtime: Runtime = "onnxruntime") -> Camera:
     """The exported model."""
     assert surrogate is not None
-    return kind(
+    return OnnxCamera(
         load_model(surrogate.file),
         film_mm=shot.film_mm,
         focus_m=shot.focus_m,
@@ -293,6 +296,7 @@ def surrogate_camera(shot: Shot, surrogate: Surrogate | None, kind: type[OnnxCam
         wavelength_nm=shot.wavelength_nm,
         focus="paraxial",
         film_offset_mm=shot.offset_mm,
+        runtime=runtime,
     )
 
 
@@ -319,8 +323,8 @@ CAMERAS: dict[str, Callable[[Shot, Surrogate | None], Camera]] = {
 }
 # The same as compiled code: many times as fast, but not for every lens, nor on every machine.
 _COMPILED: dict[str, Callable[[Shot, Surrogate | None], Camera]] = {
-    "exact": partial(exact_camera, kind=FusedExactCamera),
-    "surrogate": partial(surrogate_camera, kind=FusedCamera),
+    "exact": partial(exact_camera, runtime="c"),
+    "surrogate": partial(surrogate_camera, runtime="c"),
 }
 TITLES = {
     "exact": "exact lens",

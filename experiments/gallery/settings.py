@@ -23,7 +23,7 @@ class Panel:
     Attributes:
         label: what differs from the other rows.
         lens, scene, model, aperture_mask: files beside the effect's. model: a shipped one; None fits one.
-        efl_mm, field_deg, zoom: see `Lens.at`. focusing: how the lens is focused, there called `focus`.
+        efl_mm, field_deg, zoom: see `set_lens`. focusing: how the lens is focused, there called `focus`.
         widen: factor on all rims but the stop's, where an effect asks for more than the lens lets through; no rim
             comes nearer than 5% to its surface's radius of curvature.
         f_number: None takes the scene's, else the lens's own.

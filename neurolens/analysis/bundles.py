@@ -22,8 +22,7 @@ from neurolens.analysis.pupil_nodes import LitPart, lit_nodes, lit_part
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.optics.aiming import without_rims
-from neurolens.optics.passing import media
-from neurolens.optics.surfaces import Rays
+from neurolens.optics.surfaces import Rays, media
 from neurolens.optics.trace import trace
 
 # The outermost ring lies this share inside the stop's edge, so that rounding never clips it.

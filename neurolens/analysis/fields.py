@@ -108,7 +108,7 @@ class Scene:
     """A lens in a state, with its object.
 
     Attributes:
-        lens: placed by `Lens.at`; where it is not, the table's last thickness places the film.
+        lens: placed by `set_lens`; where it is not, the table's last thickness places the film.
         focus_m: distance from the film to the object, inf allowed. An object of a lens of less than 60 degrees half
             field is a plane across the axis; of a wider one a sphere about the entrance pupil.
         axis: transverse axis of the meridional plane; matters for anamorphic lenses only.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from pathlib import Path
 
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -57,3 +58,8 @@ class NeurolensWarning(UserWarning):
 
 class AssumedWarning(NeurolensWarning):
     """Something that a file does not say, or says wrongly, was assumed: what is read from it is doubtful."""
+
+
+def warn(text: str) -> None:
+    """Warn with a NeurolensWarning, which the command line prints to stderr."""
+    warnings.warn(text, NeurolensWarning, stacklevel=2)

@@ -276,7 +276,7 @@ def sealed_bytes(path: Path) -> bytes | None:
 
 
 def keep_newest(new: Path, most: int) -> None:
-    """Of the files of a cache with the suffix of `new`, which was written last, keep `new` and the nearest in time.
+    """Keep `new` and the files written nearest before it, and remove the other files of its suffix from a cache.
 
     A clock that went back leaves files of the future: they go as the oldest do.
     """

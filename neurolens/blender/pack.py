@@ -162,7 +162,8 @@ def _of_zip(path: Path) -> tuple[dict[str, bytes], list[dict[str, Any]]]:
     except MemoryError:
         raise
     except Exception as error:  # zipfile raises many types: for passwords, methods of compression, damaged data
-        found = f"no {error}" if isinstance(error, KeyError) else f"{error}"
+        said = isinstance(error, (zipfile.BadZipFile, ValueError))  # the others speak of the code, not of the file
+        found = f"no {error}" if isinstance(error, KeyError) else str(error) if said else "damaged or encrypted"
         raise InputError(path, "file", f"({found or type(error).__name__})", expected) from None
 
 

@@ -48,7 +48,6 @@ class Shot:
         clamp_f_number: an f-number wider than the lens opens becomes its widest; else it is an error of a model, and
             opens the stop of a lens file as far as the rims let light through.
         wavelength_nm: shortest and longest wavelength of the light.
-        pupil: how the pupil of an exact lens is sampled; see `exact.PUPILS`.
         vignetting: what is left of it, "both", "natural", "optical" or "none"; see `neurolens.cameras.vignetting`.
 
     Raises:
@@ -66,7 +65,6 @@ class Shot:
     wavelength_nm: tuple[float, float] = (400.0, 700.0)
     film_offset_mm: float = 0.0
     clamp_f_number: bool = False
-    pupil: str = "outline"
     vignetting: str = "both"
 
     def __post_init__(self) -> None:
@@ -97,14 +95,13 @@ def make_camera(spec: str | Path, shot: Shot, progress: Progress | None = None) 
 
 def _camera(spec: str, shot: Shot, progress: Progress | None) -> Camera:
     kind, path = resolve(spec)
-    exact = path is not None and not is_model(path) and kind not in IDEAL_OF
-    only = "left out: only a lens file that is traced as it is has it"
-    _refuse(spec, "pupil", None if (exact and not kind) or shot.pupil == "outline" else shot.pupil, only)
     if path is None:
         return _ideal(kind, shot)
     if kind in IDEAL_OF:
         return _ideal_of(kind, path, shot)
-    return _exact(path, shot, kind == FUSED, progress) if exact else _model(path, shot, kind == FUSED)
+    if is_model(path):
+        return _model(path, shot, kind == FUSED)
+    return _exact(path, shot, kind == FUSED, progress)
 
 
 def _ideal(kind: str, shot: Shot) -> Camera:
@@ -145,11 +142,12 @@ def _placed(lens: Lens, shot: Shot) -> Lens:
     """The lens as a shot asks for it."""
     from neurolens.optics.focusing import best_focused
     from neurolens.optics.paraxial import first_order
+    from neurolens.optics.states import set_lens
 
-    lens = lens.at(focal_length_mm=shot.efl_mm, field_deg=shot.field_deg, zoom=shot.zoom)
+    lens = set_lens(lens, focal_length_mm=shot.efl_mm, field_deg=shot.field_deg, zoom=shot.zoom)
     f_number = shot.f_number_for(first_order(lens).f_number)
     light = shot.wavelength_nm
-    lens = lens.at(f_number=f_number, focus_m=shot.focus_m, focus=shot.focus, wavelength_nm=light)
+    lens = set_lens(lens, f_number=f_number, focus_m=shot.focus_m, focus=shot.focus, wavelength_nm=light)
     return best_focused(lens, shot.focus_m, light) if shot.focus == "internal" else lens
 
 
@@ -196,26 +194,27 @@ def ideal_as(kind: str, lens: Lens, shot: Shot) -> Camera:
 
 
 def _exact(path: Path, shot: Shot, fused: bool, progress: Progress | None) -> Camera:
-    from neurolens.cameras.exact import ExactCamera, FusedExactCamera
+    from neurolens.cameras.exact import ExactCamera
     from neurolens.optics.lenscheck import check_lens, doubts
     from neurolens.optics.paraxial import first_order
+    from neurolens.optics.states import set_lens
     from neurolens.readers.any_format import read_any
 
     tabled = read_any(path)
-    lens = tabled.at(focal_length_mm=shot.efl_mm, field_deg=shot.field_deg, zoom=shot.zoom)
+    lens = set_lens(tabled, focal_length_mm=shot.efl_mm, field_deg=shot.field_deg, zoom=shot.zoom)
     if shot.aperture is not None:
         lens = lens.with_aperture(shot.aperture)
     f_number = shot.f_number_for(first_order(lens).f_number)
-    camera = (FusedExactCamera if fused else ExactCamera)(
+    camera = ExactCamera(
         lens,
         film_mm=shot.film_mm,
         focus_m=shot.focus_m,
         f_number=f_number,
         wavelength_nm=shot.wavelength_nm,
         focus=shot.focus,
-        pupil=shot.pupil,
         film_offset_mm=shot.film_offset_mm,
         progress=progress,
+        runtime="c" if fused else "trace",
     )
     camera.settings |= {"zoom": shot.zoom, "notes": [*doubts(check_lens(tabled)), *_film_notes(lens, shot.film_mm)]}
     return camera
@@ -239,7 +238,6 @@ def _beyond_circle(film_mm: tuple[float, float], radius_mm: float, what: str, th
 
 
 def _model(path: Path, shot: Shot, fused: bool) -> Camera:
-    from neurolens.cameras.fused import FusedCamera
     from neurolens.cameras.model import OnnxCamera, load_model
     from neurolens.modelfile.states import state_for
 
@@ -255,7 +253,7 @@ def _model(path: Path, shot: Shot, fused: bool) -> Camera:
         model = model.at(*state_for(path, model.axes, model.state, shot.zoom, shot.focus_m))
     lens, domain = model.card["lens"], model.card["domain"]
     widest = float(lens["f_number"] * lens["stop_radius_mm"] / domain["stop_radius_mm"])
-    camera = (FusedCamera if fused else OnnxCamera)(
+    camera = OnnxCamera(
         model,
         film_mm=shot.film_mm,
         focus_m=shot.focus_m,
@@ -264,6 +262,7 @@ def _model(path: Path, shot: Shot, fused: bool) -> Camera:
         wavelength_nm=shot.wavelength_nm,
         focus=shot.focus,
         film_offset_mm=shot.film_offset_mm,
+        runtime="c" if fused else "onnxruntime",
     )
     notes = _beyond_circle(shot.film_mm, domain["film_radius_mm"], "the model's picture", "stay dark")
     poor = ", ".join(model.card["errors"].get("poor") or ())

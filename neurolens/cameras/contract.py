@@ -133,7 +133,7 @@ class DifferentialCamera(Camera, Protocol):
     """What all cameras of this package know besides; `Vignetted` but for `natural`."""
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `sample`, with the differentials of the rays.
+        """Sample rays as `sample` does, and give their differentials, too.
 
         Raises:
             InputError: an exported model without derivatives.

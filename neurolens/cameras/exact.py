@@ -1,16 +1,14 @@
-"""The exact lens as a camera, traced or compiled: every ray through every surface. The cameras that need torch.
+"""The exact lens as a camera, traced by torch or compiled to C: every ray passes through every surface.
 
-Its pupil is the outline of what passes, or one of the literature's, widened until it holds that outline. Found at one
-wavelength, some of them lose light (a paraxial exit pupil up to 12% of it; `python -m experiments pupils`): then
-pictures would differ in brightness. Widened, they differ in the share of rays that pass, and in noise.
+These are the only cameras that need torch. They sample the outline of the light that passes the lens.
 """
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -18,45 +16,30 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
-from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
-from neurolens.cameras.fused import Compiled, FusedFilm, LensGraph
-from neurolens.cameras.lens_film import LensFilm, SceneRays
+from neurolens.cameras.graphcamera import LensCamera, Runtime
+from neurolens.cameras.lens_film import LensFilm, LensGraph, SceneRays
 from neurolens.cameras.lens_state import axial_transmittance, lens_state
 from neurolens.cameras.outline_cache import kept_outline, search_key
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.pupil_search import COARSE, COARSE_TIGHT, FINE, Detail, outline_of
 from neurolens.cameras.sampling import arrived, check_film, positive
-from neurolens.optics import pupil_methods as known
+from neurolens.optics.film_plane import PupilBounds
 from neurolens.optics.focusing import best_focused
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.paraxial import chief_reach_mm, first_order
 from neurolens.optics.prescription import Focus, Lens
-from neurolens.optics.pupil_methods import RadialPupil
-from neurolens.optics.pupils import PupilBounds, camera_rays, passes_at_any_azimuth, pupil_bounds, pupil_plane_z_mm
+from neurolens.optics.pupils import camera_rays, passes_at_any_azimuth, pupil_bounds, pupil_plane_z_mm
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays, film_derivatives, trace, trace_differentials
 from neurolens.optics.tracegraph import exact_graph
-
-OUTLINE = "outline"
-_MAKERS: dict[str, Callable[[Lens, float], RadialPupil]] = {
-    "rear-rim": known.rear_rim,
-    "exit-pupil": known.global_exit_pupil,
-    "wu": known.wu_exit_pupil,
-    "pixel-disc": lambda lens, end: known.pixel_pupils(lens, end, "disc"),
-    "pixel-ellipse": lambda lens, end: known.pixel_pupils(lens, end, "ellipse"),
-    "boxes": lambda lens, end: known.radial_bounds(lens, end, "box"),
-    "ellipses": lambda lens, end: known.radial_bounds(lens, end, "ellipse"),
-}
-PUPILS = (OUTLINE, *_MAKERS)
-
-_HAIR = 1.001  # between the film radii at which a pupil is held against the outline
-_BETWEEN = 4  # film radii of the outline between two of its rows
+from neurolens.surrogates.assemble import SCALARS, Form
 
 
-class ExactCamera:
+class ExactCamera(LensCamera):
     """A camera whose lens is the prescription itself.
 
     Args:
@@ -64,15 +47,14 @@ class ExactCamera:
         film_mm, focus_m, film_offset_mm: as of `build.Shot`. f_number: None keeps the lens's stop.
         wavelength_nm: range of the wavelengths; the d line stands in for a lens without known dispersion.
         dtype: precision of the trace.
-        focus: how the lens is focused; see `Lens.at`. After "internal" the film, too, moves to the least spot.
+        focus: how the lens is focused; see `set_lens`. After "internal" the film, too, moves to the least spot.
         bounds: pupil bounds of a domain that holds this focus and stop; rays are then those of the domain's models for
             the same random numbers. None searches for them, over the whole film.
-        pupil: how the pupil is sampled, one of `PUPILS`. All give the same picture in expectation; fewer
-            rays pass through any but the outline, by which the others are widened where they would lose light.
         progress: shows the search for the outline, where it was not found before (`outline_cache`).
+        runtime: what runs the camera; all but "trace" are float32.
 
     Raises:
-        InputError: a focus nearer than four focal lengths, a lens that no ray passes, an unknown pupil.
+        InputError: a focus nearer than four focal lengths, or a lens that no ray passes.
     """
 
     def __init__(
@@ -86,19 +68,19 @@ class ExactCamera:
         dtype: Literal["float32", "float64"] = "float32",
         bounds: PupilBounds | None = None,
         focus: Focus = "best",
-        pupil: str = OUTLINE,
         film_offset_mm: float = 0.0,
         progress: Progress | None = None,
+        runtime: Runtime = "trace",
     ) -> None:
         self._pid = os.getpid()
-        self.film_mm = check_film(film_mm)
+        self.film_mm, self.path = check_film(film_mm), Path(lens.path)
         self.focus_m = positive("focus_m", focus_m, infinite=True)
         self.name = lens.name
         self.dispersive = lens.dispersive
         self.wavelength_nm = wavelength_nm if self.dispersive else None
         self._range_nm = wavelength_nm
         used = wavelength_nm if self.dispersive else (LINE_D_NM, LINE_D_NM)
-        self.lens = lens.at(f_number=f_number, focus_m=self.focus_m, focus=focus, wavelength_nm=used)
+        self.lens = set_lens(lens, f_number=f_number, focus_m=self.focus_m, focus=focus, wavelength_nm=used)
         if focus == "internal":
             self.lens = best_focused(self.lens, self.focus_m, used)
         film_z = self.lens.film_z_mm
@@ -114,8 +96,6 @@ class ExactCamera:
         key = search_key(self.lens, used, detail.wavelengths, *read)
         outline = kept_outline(key, lambda: self._outline(bounds, used, detail, progress))
         self.film = LensFilm(outline, float(film_z), used, self._scene)
-        if pupil != OUTLINE:
-            self.film.pupil = pupil_named(pupil, self.lens, self.film.outline, float(film_z))
         self._light_nm = used
         self._front: FrontAim | None = None
         data = first_order(self.lens)
@@ -134,21 +114,14 @@ class ExactCamera:
             "rims": lens.rims,
             "aperture": self.lens.aperture and self.lens.aperture.settings(),
             "dtype": dtype,
-            "pupil": pupil,
             "lens_state": state_of(self.lens, self._light_nm, float(first_order(lens).efl_mm)),
         }
+        self.start(runtime)
 
-    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
-        return self.film.sample(film_mm, pupil, wavelength_nm)
-
-    def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `sample`, with the differentials of the rays, carried through every surface."""
-        return self.film.sample(film_mm, pupil, wavelength_nm, self._with_differentials)
-
-    def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
-        """cos^4 of the angles between the axis and the rays of `sample` on the film's side."""
-        return self.film.natural(film_mm, pupil, wavelength_nm)
+    def _sampled(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray, moves: bool) -> CameraRays:
+        if self.runtime != "trace":
+            return super()._sampled(film_mm, square, wavelength_nm, moves)
+        return self.film.sample(film_mm, square, wavelength_nm, self._with_differentials if moves else None)
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """Film points of scene points [3, N] in m, traced through points of the front surface chosen by `pupil`."""
@@ -156,7 +129,7 @@ class ExactCamera:
             self._front = front_aim(self.film, self.film_mm, self._light_nm, self.lens.surfaces[0])
         film_z = self.film.film_z_mm
         aim = self._front.aim(1e3 * point_m.astype(np.float64) + [[0], [0], [film_z]], pupil)
-        # Light starts a millimetre before the surface, so that this is still ahead; nonsense misses it.
+        # Light starts a millimetre before the surface, so that it lies ahead; rays that are not finite miss it.
         rays = np.nan_to_num(np.concatenate([aim.position + aim.direction, -aim.direction]), posinf=0, neginf=0)
         with torch.no_grad():
             *light, wavelength = _tensors(self._dtype, *rays, wavelength_nm)
@@ -170,8 +143,8 @@ class ExactCamera:
         status = np.where(aim.status == st.PASSED, done.status.numpy(), aim.status)
         return arrived(film, origin, point_m, weight, status, wavelength_nm)
 
-    def lens_graph(self) -> LensGraph:
-        """The lens as a graph."""
+    def lens_graph(self, form: Form = SCALARS) -> LensGraph:
+        """The graph of the lens with its stop; it has one form."""
         graph = exact_graph(self.lens, self._pupil_z_mm, self._range_nm)
         stopped = st.blocked(self.lens.stop_index, st.RIM)
         return LensGraph(graph, float(self.lens.stop_radius_mm), self.lens.aperture, stopped)
@@ -226,21 +199,6 @@ def _tensors(dtype: torch.dtype, *arrays: NDArray[Any]) -> list[torch.Tensor]:
     return [torch.from_numpy(np.ascontiguousarray(a)).to(dtype) for a in arrays]
 
 
-class FusedExactCamera(Compiled, ExactCamera):
-    """A prescription as a compiled camera: the rays of `ExactCamera` to rounding.
-
-    Args and attributes are those of `ExactCamera`, whose `dtype` is float32 here; for differentials see `FusedFilm`.
-
-    Raises:
-        InputError: as `ExactCamera`; no C compiler.
-    """
-
-    def __init__(self, lens: Lens, **kwargs: Any) -> None:
-        super().__init__(lens, **kwargs)
-        self._fused = FusedFilm(self.film, self.lens_graph(), self.film_mm)
-        self.settings |= {"runtime": "fused"}
-
-
 def state_of(lens: Lens, wavelength_nm: tuple[float, float], nominal_mm: float | None = None) -> dict[str, Any]:
     """The table `lens_state` of a lens that `at` has placed; `nominal_mm` is its focal length at infinity."""
     data, film_z = first_order(lens), lens.film_z_mm
@@ -276,74 +234,3 @@ def placed_settings(lens: Lens, film_mm: tuple[float, float], focus_m: float) ->
         "film_mm": list(film_mm),
         "lens_state": state_of(lens, (400.0, 700.0), nominal),
     }
-
-
-@dataclass(frozen=True)
-class HeldPupil:
-    """A pupil on a plane of its own, sampled as the outline is, on the outline's plane.
-
-    Attributes:
-        pupil: what is sampled. film_z_mm, plane_z_mm: of the film, and of the plane that points are wanted on.
-    """
-
-    pupil: RadialPupil
-    film_z_mm: float
-    plane_z_mm: float
-
-    def sample(
-        self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """As `PupilOutline.sample`; every wavelength has the same pupil."""
-        finite = np.isfinite(film_mm).all(0)
-        film = np.where(finite, film_mm, np.float32(0)).astype(np.float64)
-        points, area = self.pupil.sample(film, square.astype(np.float64))
-        stretch = (self.film_z_mm - self.plane_z_mm) / (self.film_z_mm - self.pupil.pupil_z_mm)
-        held = (film + stretch * (points - film)).astype(np.float32)
-        return held, (area * stretch**2 * finite).astype(np.float32)
-
-
-def pupil_named(name: str, lens: Lens, outline: PupilOutline, film_z_mm: float) -> HeldPupil:
-    """One of `PUPILS` other than the outline, for a focused lens.
-
-    Raises:
-        InputError: an unknown name, or a paraxial exit pupil at infinity.
-    """
-    if name not in _MAKERS:
-        raise InputError("camera", "pupil", name, f"one of: {', '.join(PUPILS)}")
-    found = _MAKERS[name](lens, outline.film_radius_mm)
-    return HeldPupil(_holding(found, outline, film_z_mm), film_z_mm, outline.pupil_z_mm)
-
-
-def _holding(pupil: RadialPupil, outline: PupilOutline, film_z_mm: float) -> RadialPupil:
-    """The pupil with each of its shapes enlarged about its centre until it holds the outline at its film radii."""
-    radius, x, y = _corners(outline)
-    stretch = (film_z_mm - pupil.pupil_z_mm) / (film_z_mm - outline.pupil_z_mm)
-    x, y = radius[:, None] + stretch * (x - radius[:, None]), stretch * y
-    count = pupil.centre.size
-    place = radius / pupil.film_radius_mm * count
-    centre, along, across = pupil.centre.copy(), pupil.along.copy(), pupil.across.copy()
-    for row in range(count):
-        # The ends of the interval belong to it, and their nearest radii of the outline on either side.
-        inside = np.flatnonzero((place >= row) & (place <= row + 1))
-        first, last = np.searchsorted(place, [row, row + 1])
-        rows = np.unique(np.clip(np.concatenate([inside, [first - 1, last]]), 0, radius.size - 1))
-        u, v = x[rows], np.abs(y[rows])
-        if along[row] <= 0 or across[row] <= 0:  # no ray was found, where the outline holds some
-            centre[row] = (u.max() + u.min()) / 2
-            along[row], across[row] = max((u.max() - u.min()) / 2, 1e-9), max(float(v.max()), 1e-9)
-        u, v = np.abs(u - centre[row]) / along[row], v / across[row]
-        reach = np.maximum(u, v) if pupil.shape == "box" else np.hypot(u, v)
-        scale = max(_HAIR * float(reach.max()), 1.0)
-        along[row], across[row] = along[row] * scale, across[row] * scale
-    return replace(pupil, centre=centre, along=along, across=across)
-
-
-def _corners(outline: PupilOutline) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Film radii [R'] and corners x, y [R', V] of the outline there, all its wavelengths together."""
-    last = outline.centre.size - 1
-    place = np.linspace(0, last, last * _BETWEEN + 1)
-    row = np.minimum(place.astype(int), last - 1)
-    step = (place - row)[:, None, None]
-    x, y = (c.transpose(1, 0, 2).astype(np.float64) for c in (outline.centre[None, :, None] + outline.x, outline.y))
-    x, y = ((1 - step) * c[row] + step * c[row + 1] for c in (x, y))
-    return outline.radii(place), x.reshape(place.size, -1), y.reshape(place.size, -1)

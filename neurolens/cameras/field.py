@@ -233,7 +233,7 @@ class Polar:
 
     @classmethod
     def of(cls, end: float, place: Complex) -> Polar:
-        """Of where the points of the rings go, [R, A]; the first ring is the centre."""
+        """Make it from where the points of the rings go, [R, A]; the first ring is the centre."""
         rings, turn = place.shape[0], turns(place.shape[1])
         shift = complex(place[0].mean()) if len(turn) > 1 else 0j  # of a round camera it is rounding
         radius = np.linspace(0, end, rings)[:, None]

@@ -132,7 +132,7 @@ def followed_rows(axes: Sequence[Axis], nodes: ArrayLike) -> tuple[Graph, Value]
 
 
 def _roots(count: int) -> Array:
-    """Of the Chebyshev polynomial of that degree, from 0 to 1."""
+    """The roots of the Chebyshev polynomial of that degree, scaled to 0 to 1."""
     return np.asarray((1 - np.cos(np.pi * (np.arange(count) + 0.5) / count)) / 2)
 
 

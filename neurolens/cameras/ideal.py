@@ -124,7 +124,7 @@ class ThickLens:
         return sound(CameraRays(origin, direction, weight, status), cos2, pupil, wavelength_nm)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `sample`, with the differentials of the rays; their origins move on the front principal plane."""
+        """Sample rays as `sample` does, with their differentials; the origins move on the front principal plane."""
         rays = self.sample(film_mm, pupil, wavelength_nm)
         rise = 1 - self._x * self.image_distance_mm / self._seen  # of the height by the film point
         slope = np.zeros((3, 2, film_mm.shape[1]), np.float32)

@@ -6,7 +6,7 @@ One code for both, so that they send the same rays for the same random numbers.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,9 @@ from neurolens.cameras.contract import CameraRays, FloatArray, RayDifferentials
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.sampling import is_light, stratified
 from neurolens.graph.interpret import evaluate
+from neurolens.graph.ir import Graph
+from neurolens.graph.passes import pruned
+from neurolens.optics.apertures import Aperture
 
 # Points a side of the quadrature of the exposure on the axis.
 _QUADRATURE = 256
@@ -40,16 +43,6 @@ class SceneRays(NamedTuple):
 SceneFunction = Callable[[FloatArray, FloatArray, FloatArray], SceneRays]
 
 
-class Pupil(Protocol):
-    """Where rays are sent through; a `PupilOutline`, or another shape that holds it."""
-
-    def sample(
-        self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Pupil points [2, N] in mm and the inverse of their densities [N] in mm^2; see `PupilOutline.sample`."""
-        ...
-
-
 class LensFilm:
     """Film and pupil of a lens at one focus and stop: from film points and random numbers to weighted rays.
 
@@ -58,9 +51,6 @@ class LensFilm:
         film_z_mm: film plane, lens frame.
         wavelength_nm: range of the wavelengths used.
         scene: the lens.
-
-    Attributes:
-        pupil: the shape that is sampled: the outline, or one put in its place that holds it.
 
     Raises:
         InputError: no ray passes from the film's centre.
@@ -74,7 +64,6 @@ class LensFilm:
         self.film_z_mm, self.scene = film_z_mm, scene
         self.distance_mm = film_z_mm - outline.pupil_z_mm
         self.outline = outline
-        self.pupil: Pupil = outline
         self.exposure = 1.0
         self.exposure = self._exposure_on_axis(wavelength_nm)
 
@@ -86,7 +75,7 @@ class LensFilm:
         `scene` stands in for the lens's own function, for one that gives more (`SceneRays.d_film`).
         """
         scene = scene or self.scene
-        pupil, area = self.pupil.sample(film_mm, square, wavelength_nm)
+        pupil, area = self.outline.sample(film_mm, square, wavelength_nm)
         lit = (area > 0) & is_light(wavelength_nm)
         if lit.all():
             return camera_rays(self._weighted(scene, film_mm, pupil, area, wavelength_nm))
@@ -120,7 +109,7 @@ class LensFilm:
 
     def natural(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
         """cos^4 of the angles between the axis and the rays of `sample` on the film's side."""
-        slope = (self.pupil.sample(film_mm, square, wavelength_nm)[0] - film_mm) * np.float32(1 / self.distance_mm)
+        slope = (self.outline.sample(film_mm, square, wavelength_nm)[0] - film_mm) * np.float32(1 / self.distance_mm)
         cos4: FloatArray = np.square(1 / (1 + np.einsum("in,in->n", slope, slope)))
         return cos4
 
@@ -147,3 +136,53 @@ def camera_rays(found: Mapping[str, NDArray[Any]]) -> CameraRays:
             moves[..., lost] = 0
     differentials = None if moves is None else RayDifferentials(moves[:3], moves[3:])
     return CameraRays(ray[:3], ray[3:], found["weight"][0], found["status"][0], differentials)
+
+
+class LensGraph(NamedTuple):
+    """The graph of a lens with what its camera's graph takes from it.
+
+    Attributes:
+        graph: inputs `rays` [5] (film and pupil point, wavelength), `film_z_mm` and `stop_radius_mm`; outputs
+            `scene_ray` [6], `transmittance`, `status`, `stop_xy_mm` [2], and any derivatives of `scene_ray`.
+        stop_radius_mm: of its round stop.
+        aperture: the shape of the opening, tested on the rays' crossings with the stop; None is round.
+        stopped: status of rays that the shape blocks.
+    """
+
+    graph: Graph
+    stop_radius_mm: float
+    aperture: Aperture | None = None
+    stopped: int = 0
+
+    @property
+    def blades(self) -> Aperture | None:
+        """The opening where it is no mask: a mask's table is too large for compiled loops."""
+        return None if self.aperture is None or self.aperture.mask is not None else self.aperture
+
+
+def whole_camera(
+    film: LensFilm, lens: LensGraph, pupil_too: bool = False, mask_too: bool = False
+) -> tuple[Graph, dict[str, float]]:
+    """The graph of a camera with the graph of its lens inside, and its numbers of the call.
+
+    Inputs: those of `pupil_graph` and `weight_graph`. Outputs: those of `weight_graph`, derivatives of the ray that the
+    lens's graph has, and with `pupil_too` the outputs of `pupil_graph`. A mask in the stop is tested in the graph with
+    `mask_too`; else `stop_xy_mm` is an output, for the caller to test it.
+    """
+    aperture = lens.aperture if mask_too else lens.blades
+    wanted = {k: v for k, v in lens.graph.outputs.items() if k != "stop_xy_mm" or lens.aperture is not None}
+    g = Graph()
+    pupil = g.inline(film.outline.graph, {})
+    film_mm, wavelength = g.input("film_mm", 2), g.input("wavelength_nm")
+    found = g.inline(pruned(lens.graph, wanted), {"rays": g.concat(film_mm, pupil["pupil_mm"], wavelength)})
+    derivatives = tuple(name for name in found if "_by_" in name)
+    status = found["status"]
+    if status.node.kind == "whole":  # the camera's tests take the number before it is made an integer
+        (status,) = g.inputs_of(status.number)
+    given = {"film_mm": film_mm, **pupil, **found, "lens_status": status}
+    g.outputs = g.inline(weight_graph(derivatives, aperture, lens.stopped), given)
+    if aperture is None and "stop_xy_mm" in found:
+        g.outputs["stop_xy_mm"] = found["stop_xy_mm"]
+    if pupil_too:
+        g.outputs |= pupil
+    return g, film.outline.numbers | film.numbers | {"stop_radius_mm": lens.stop_radius_mm}

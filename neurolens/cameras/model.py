@@ -6,7 +6,6 @@ import math
 import warnings
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -14,24 +13,24 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
-from neurolens.cameras.cameragraph import status_graph, weight_graph
-from neurolens.cameras.contract import RAYS_A_CALL, CameraRays, FilmPoints, FloatArray
+from neurolens.cameras.cameragraph import status_graph
+from neurolens.cameras.contract import FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
-from neurolens.cameras.lens_film import LensFilm, SceneRays, camera_rays
+from neurolens.cameras.graphcamera import LensCamera, Runtime
+from neurolens.cameras.lens_film import LensFilm, LensGraph, SceneRays
 from neurolens.cameras.lens_state import axial_transmittance, lens_state, squeeze_of
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
-from neurolens.cameras.onnxmaps import InverseRays, OnnxDerivatives, OnnxInverse, load_inverse
-from neurolens.cameras.onnxsession import joined, open_session, run_batches
+from neurolens.cameras.onnxmaps import InverseRays, OnnxInverse, load_inverse
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.pupil_search import COARSE_TIGHT, outline_of
 from neurolens.cameras.sampling import arrived, check_film, common_light, positive
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph
 from neurolens.modelfile import DOMAIN_SLACK
-from neurolens.modelfile.states import STATE, state_for
+from neurolens.modelfile.states import state_for
 from neurolens.optics import film_plane
 from neurolens.optics.apertures import Aperture
+from neurolens.surrogates.assemble import SCALARS, Form
 
 __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
 
@@ -39,14 +38,10 @@ Focus = Literal["best", "paraxial", "internal"]
 
 # Parts of the card that the metadata of pictures leave out.
 _NOT_KEPT = ("reference", "units", "frame", "status_codes", "states")
-# Of the graph of a whole camera.
-_INPUTS = {"film_mm": ("tensor(float)", 2, None), "square": ("tensor(float)", 2, None)}
-_INPUTS |= {"wavelength_nm": ("tensor(float)", 1, None)}
-_OUTPUTS = {"ray": ("tensor(float)", 6, None), "weight": ("tensor(float)", None), "status": ("tensor(int32)", None)}
 _NOMINAL = 1.02  # f-numbers are engraved rounded: up to this much wider than the widest stop means the widest stop
 
 
-class OnnxCamera:
+class OnnxCamera(LensCamera):
     """A camera whose lens is an exported model.
 
     Args:
@@ -56,12 +51,13 @@ class OnnxCamera:
             stop means that (an engraved f/1.8 may be 1.83). Focusing moves the groups of a model that knows them.
         zoom: of a model of a zoom's whole range, as of `Shot`; None leaves it at `model.state`.
         wavelength_nm: range of the light, which sets the exposure and the best focus; None takes the model's own.
-        focus: "best" places the film where the model's rays from the axis make the least spot, as `Lens.at` does for
+        focus: "best" places the film where the model's rays from the axis make the least spot, as `set_lens` does for
             the lens; "paraxial" in the paraxial image. "internal" is as "best": groups move where a model knows them.
         outline: of the pupil of the lens itself, to hold the model against it; None searches the model's own.
+        runtime: what runs the camera, "onnxruntime" or "c".
 
     Raises:
-        InputError: a focus, stop or zoom position outside the model's domain.
+        InputError: a focus, stop or zoom position outside the model's domain; no C compiler where one is needed.
 
     Warns:
         NeurolensWarning: best focus lies beyond the film positions of a model, which has its film at their end then.
@@ -80,15 +76,14 @@ class OnnxCamera:
         focus: Focus = "best",
         film_offset_mm: float = 0.0,
         outline: PupilOutline | None = None,
+        runtime: Runtime = "onnxruntime",
     ) -> None:
         self.focus_m = positive("focus_m", focus_m, infinite=True)
         if model.axes or zoom is not None:
             model = model.at(*state_for(model.path, model.axes, model.state, zoom, self.focus_m))
         card = model.card
         lens, domain = card["lens"], card["domain"]
-        self.model = model
-        self._whole: OnnxFilm | None = None
-        self._derivatives: OnnxDerivatives | None = None
+        self.model, self.path, self.threads = model, model.path, model.threads
         self._inverse: tuple[OnnxInverse, FrontAim] | None = None
         self.name = str(lens.get("name", model.path.stem))
         self.film_mm = check_film(film_mm)
@@ -126,28 +121,13 @@ class OnnxCamera:
             "card": {k: v for k, v in card.items() if k not in _NOT_KEPT},
         }
         self.settings["lens_state"] = _state_of(scene, used, self.settings["f_number"])
+        self.start(runtime)
 
-    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Rays for film points [2, N] in mm, pupil samples [2, N] in [0, 1) and wavelengths [N] in nm."""
-        if self._whole is None:
-            self._whole = OnnxFilm(self.film, self.model)
-        return self._whole.sample(film_mm, pupil, wavelength_nm)
-
-    def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `sample`, with the differentials of the rays.
-
-        Raises:
-            InputError: a model exported without derivatives.
-        """
-        assert isinstance(self.film.scene, ModelScene)
-        if self._derivatives is None:
-            self._derivatives = OnnxDerivatives(self.model)
-        whole = partial(self.film.scene.with_differentials, self._derivatives)
-        return self.film.sample(film_mm, pupil, wavelength_nm, whole)
-
-    def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
-        """cos^4 of the angles between the axis and the rays of `sample` on the film's side."""
-        return self.film.natural(film_mm, pupil, wavelength_nm)
+    def lens_graph(self, form: Form = SCALARS) -> LensGraph:
+        """The graph of the model in the camera's state, with its stop."""
+        scene = self.film.scene
+        assert isinstance(scene, ModelScene)
+        return LensGraph(self.model.graph(form), scene.stop_radius_mm, scene.aperture, scene.stop_status)
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """Film points of scene points [3, N] in m through points of the front surface chosen by `pupil`.
@@ -182,50 +162,16 @@ class OnnxCamera:
         return self._inverse
 
     def for_worker(self) -> OnnxCamera:
-        """The same camera with a session of its own, for another process or thread."""
+        """The same camera with sessions of its own, for another process or thread; compiled code needs none."""
+        if self.runtime == "c":
+            return self
         other = copy(self)
         other.model, other.film = self.model.reopened(), copy(self.film)
-        other._whole = other._derivatives = other._inverse = None
+        other._inverse = None
+        other.start(self.runtime)
         assert isinstance(self.film.scene, ModelScene)
         other.film.scene = replace(self.film.scene, model=other.model)
         return other
-
-
-class OnnxFilm:
-    """Film, pupil and model of a camera as one graph of onnxruntime: the model's own, and around it the camera's.
-
-    Args:
-        film: of the model at one focus and stop, whose numbers are constants of the graph.
-    """
-
-    def __init__(self, film: LensFilm, model: OnnxLens) -> None:
-        from neurolens.graph.onnx import write_onnx  # the package onnx takes a quarter of a second
-
-        scene, outline = film.scene, film.outline
-        assert isinstance(scene, ModelScene) and film.pupil is outline
-        self._path, aperture = model.path, scene.aperture
-        before = Graph()
-        found = before.inline(outline.graph, {})
-        rays = before.concat(before.input("film_mm", 2), found["pupil_mm"], before.input("wavelength_nm"))
-        before.outputs = {"rays": rays, **found}
-        numbers: dict[str, Any] = outline.numbers | film.numbers | {"stop_radius_mm": scene.stop_radius_mm}
-        tables = {"outline": outline.table} | (
-            {} if aperture is None or aperture.mask is None else {"mask": aperture.table}
-        )
-        constants = {STATE: model.state, **tables} | {name: [value] for name, value in numbers.items()}
-        after = weight_graph((), aperture, scene.stop_status)
-        parts = [write_onnx(before, {}), model.data, write_onnx(after, {})]
-        try:
-            whole = joined(parts, constants, tuple(_OUTPUTS), {"status": "lens_status"})
-        except ModelError as error:
-            raise ModelError(f"{model.path}: {error}") from error
-        self._session = open_session(model.path, whole, model.threads, _INPUTS, _OUTPUTS)
-
-    def sample(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `LensFilm.sample`."""
-        rays = {"film_mm": film_mm, "square": square, "wavelength_nm": wavelength_nm[None]}
-        done = run_batches(self._path, self._session, tuple(_OUTPUTS), rays, {}, RAYS_A_CALL)
-        return camera_rays({name: np.atleast_2d(values) for name, values in zip(_OUTPUTS, done, strict=True)})
 
 
 @dataclass(frozen=True)
@@ -254,13 +200,6 @@ class ModelScene:
         """Status of rays that the stop's shape blocks."""
         return st.blocked(int(self.model.card["lens"].get("stop_surface", 0)), st.RIM)
 
-    def with_differentials(
-        self, derivatives: OnnxDerivatives, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray
-    ) -> SceneRays:
-        """As a call, with `SceneRays.d_film`."""
-        out = derivatives(film, pupil, wavelength_nm, self.film_z_mm, self.stop_radius_mm)
-        return SceneRays(out.rays.scene_ray, out.rays.transmittance, self.status_of(out.rays), out.d_film)
-
     def passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
         """Whether rays pass at one wavelength; bool [N]. Of a round stop directions are not looked at: it is faster."""
         waves = np.full(film.shape[1], wavelength_nm, np.float32)
@@ -269,7 +208,7 @@ class ModelScene:
         return self.model.status(film, pupil, waves, self.film_z_mm, self.stop_radius_mm) == st.PASSED
 
     def passes_at_any_azimuth(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
-        """As `passes`, of a lens with cylinders: whether rays pass when film and pupil points turn about the axis."""
+        """Whether rays of a lens with cylinders pass at any azimuth of their film and pupil points; bool [N]."""
         passed = np.zeros(film.shape[1], bool)
         for azimuth in _AZIMUTHS:
             left = np.flatnonzero(~passed)

@@ -1,9 +1,13 @@
-"""Exported lens models, loaded with suspicion and run with onnxruntime: rays in, rays out, numpy arrays."""
+"""Exported lens models, run by onnxruntime: rays in, rays out, numpy arrays.
+
+What runs is the graph that is built from the coefficients in a file, never the nodes in it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,9 +18,13 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.onnxsession import open_session, run_batches
-from neurolens.modelfile.cardcheck import check_card, tolerances
-from neurolens.modelfile.onnxfile import read_checked, without_outputs
-from neurolens.modelfile.states import STATE, axes_of, card_at, default_state, state_numbers
+from neurolens.graph.ir import Graph
+from neurolens.graph.onnx import write_onnx
+from neurolens.graph.passes import pruned
+from neurolens.modelfile.states import card_at, default_state, state_numbers
+from neurolens.surrogates.assemble import ONNX, SCALARS, Form, model_graph
+from neurolens.surrogates.file import ModelFile, read_model
+from neurolens.surrogates.model import LensModel
 
 INPUTS = {"rays": ("tensor(float)", 5, None), "film_z_mm": ("tensor(float)", 1), "stop_radius_mm": ("tensor(float)", 1)}
 OUTPUTS = {
@@ -25,8 +33,6 @@ OUTPUTS = {
     "stop_xy_mm": ("tensor(float)", 2, None),
     "status": ("tensor(int32)", None),
 }
-# Outputs that a file may have besides; see `onnxmaps`.
-DERIVATIVES = {name: ("tensor(float)", 2, 6, None) for name in ("scene_ray_d_film", "scene_ray_d_pupil")}
 # Rays a call of onnxruntime: enough to hide the cost of its operators, few enough for the caches.
 BATCH = 16384
 MAX_RAYS = 2**27
@@ -49,37 +55,47 @@ class OnnxLens:
     """An exported model, loaded and checked. Make it with `load_model`.
 
     Attributes:
+        file: what the file says.
         card: see `neurolens.surrogates.card`; its lens and domain are those of `state`.
-        path, data: of the file.
+        path: of the file.
         axes: what the model's state is made of (zoom in mm, focus in 1/m); none for a model of one state.
         state: a number for every axis.
     """
 
-    def __init__(self, path: Path, data: bytes, card: dict[str, Any], threads: int) -> None:
-        self.path, self.card, self.threads = path, card, threads
-        self.axes, self.state = axes_of(card), default_state(card)
-        self.data = data
-        self._session = open_session(
-            path, without_outputs(data, frozenset(DERIVATIVES)), threads, self._inputs, OUTPUTS
-        )
-        self._status: Any = None  # session, opened when asked for
+    def __init__(self, file: ModelFile, threads: int) -> None:
+        self.file, self.path, self.card, self.threads = file, file.path, file.card, threads
+        self.axes, self.state = file.axes, default_state(file.card)
+        self._sessions: dict[tuple[str, ...], Any] = {}  # by the outputs that they compute; opened when they are needed
+        self._graphs: dict[Form, Graph] = {}
 
     def at(self, *state: float) -> OnnxLens:
-        """The same model in another state, its card with the lens and the domain there; one session serves all.
+        """The same model in another state, its card with the lens and the domain there.
 
         Raises:
             InputError: another number of values than axes, or one out of range.
         """
-        other = copy(self)
-        if self.axes or state:
-            other.card, other.state = card_at(self.card, self.axes, state), tuple(float(v) for v in state)
+        if not self.axes and not state:
+            return self
+        other = OnnxLens(self.file, self.threads)
+        other.card, other.state = card_at(self.file.card, self.axes, state), tuple(float(v) for v in state)
         return other
 
     def reopened(self) -> OnnxLens:
-        """The same model with a session of its own, for another process or thread."""
-        other = OnnxLens(self.path, self.data, self.card, self.threads)
-        other.state = self.state
+        """The same model with sessions of its own, for another process or thread."""
+        other = copy(self)
+        other._sessions = {}
         return other
+
+    @cached_property
+    def fitted(self) -> LensModel:
+        """The model of this state: its coefficients, its encoding and its domain."""
+        return self.file.at(self.state)
+
+    def graph(self, form: Form = SCALARS) -> Graph:
+        """The graph of the model in its state; inputs and outputs as `surrogates.assemble` says."""
+        if form not in self._graphs:
+            self._graphs[form] = model_graph(self.fitted, form)
+        return self._graphs[form]
 
     @np.errstate(over="ignore")  # numbers that float32 does not hold are outside the domain
     def rays(
@@ -107,7 +123,9 @@ class OnnxLens:
                 error: their status says so.
         """
         if state is not None:
-            return self._in_state(state).rays(film_xy_mm, pupil_xy_mm, wavelength_nm, film_z_mm, stop_radius_mm)
+            values = state_numbers(self.axes, state)
+            if all(a.limits[0] <= v <= a.limits[1] for a, v in zip(self.axes, values, strict=True)):
+                return self.at(*values).rays(film_xy_mm, pupil_xy_mm, wavelength_nm, film_z_mm, stop_radius_mm)
         points = {"film_xy_mm": film_xy_mm, "pupil_xy_mm": pupil_xy_mm}
         columns = ray_columns("OnnxLens.rays", 2, points, wavelength_nm)
         stop = self.card["domain"]["stop_radius_mm"] if stop_radius_mm is None else stop_radius_mm
@@ -115,6 +133,10 @@ class OnnxLens:
         plane, count = np.atleast_1d(np.asarray(film_z_mm, np.float32)), columns.shape[1]
         if plane.shape not in ((1,), (count,)):
             raise InputError("OnnxLens.rays", "film_z_mm", plane.shape, f"a number or an array ({count},)")
+        if state is not None:  # out of range
+            status = np.full(count, st.OUTSIDE_DOMAIN, np.int32)
+            ray, through, crossing = (np.zeros(shape, np.float32) for shape in ((6, count), (count,), (2, count)))
+            return LensRays(ray, through, crossing, status)
         if len(plane) == 1:
             return self._run(columns, plane, stop)
         planes, at = np.unique(plane, return_inverse=True)
@@ -123,38 +145,26 @@ class OnnxLens:
         return LensRays(*(np.concatenate(of_one, -1)[..., place] for of_one in zip(*parts, strict=True)))
 
     def _run(self, rays: FloatArray, plane: FloatArray, stop_radius_mm: float) -> LensRays:
-        call = self._call(plane, stop_radius_mm)
-        return LensRays(*run_batches(self.path, self._session, tuple(OUTPUTS), {"rays": rays}, call, BATCH))
+        session, call = self._session(tuple(OUTPUTS)), {"film_z_mm": plane, "stop_radius_mm": stop_radius_mm}
+        return LensRays(*run_batches(self.path, session, tuple(OUTPUTS), {"rays": rays}, call, BATCH))
 
     def status(
         self, film_xy_mm: FloatArray, pupil_xy_mm: FloatArray, wavelength_nm: FloatArray, film_z_mm: float, stop: float
     ) -> NDArray[np.int32]:
         """`rays(...).status` alone, in less time: nothing else is computed. Arguments as there."""
-        if self._status is None:
-            rest = frozenset({*DERIVATIVES, *OUTPUTS} - {"status"})
-            asked = {"status": OUTPUTS["status"]}
-            self._status = open_session(self.path, without_outputs(self.data, rest), self.threads, self._inputs, asked)
         points = {"film_xy_mm": film_xy_mm, "pupil_xy_mm": pupil_xy_mm}
         rays = {"rays": ray_columns("OnnxLens.status", 2, points, wavelength_nm)}
-        found: NDArray[np.int32] = run_batches(
-            self.path, self._status, ("status",), rays, self._call(np.array([film_z_mm], np.float32), stop), BATCH
-        )[0]
+        session, call = self._session(("status",)), {"film_z_mm": film_z_mm, "stop_radius_mm": stop}
+        found: NDArray[np.int32] = run_batches(self.path, session, ("status",), rays, call, BATCH)[0]
         return found
 
-    @property
-    def _inputs(self) -> dict[str, tuple[Any, ...]]:
-        return {**INPUTS, STATE: ("tensor(float)", len(self.axes))} if self.axes else INPUTS
-
-    def _call(self, plane: FloatArray, stop_radius_mm: float) -> dict[str, Any]:
-        return {"film_z_mm": plane, "stop_radius_mm": stop_radius_mm} | ({STATE: self.state} if self.axes else {})
-
-    def _in_state(self, state: float | Sequence[float]) -> OnnxLens:
-        """`at`, for any numbers: out of range, where there is no domain, rays are sent with that of this state."""
-        other, values = copy(self), state_numbers(self.axes, state)
-        if all(a.limits[0] <= v <= a.limits[1] for a, v in zip(self.axes, values, strict=True)):
-            other.card = card_at(self.card, self.axes, values)
-        other.state = values
-        return other
+    def _session(self, outputs: tuple[str, ...]) -> Any:
+        if outputs not in self._sessions:
+            graph = self.graph(ONNX)
+            wanted = pruned(graph, {name: graph.outputs[name] for name in outputs})
+            shapes = {name: OUTPUTS[name] for name in outputs}
+            self._sessions[outputs] = open_session(self.path, write_onnx(wanted, {}), self.threads, INPUTS, shapes)
+        return self._sessions[outputs]
 
 
 def load_model(path: str | Path, lens: str | None = None, threads: int = 1) -> OnnxLens:
@@ -165,25 +175,26 @@ def load_model(path: str | Path, lens: str | None = None, threads: int = 1) -> O
         threads: of onnxruntime, within one operator. Batches that fit a core's cache gain nothing from more than one.
 
     Raises:
-        ModelError: a file that is missing, truncated, too large, no ONNX model, without a card or with one of another
-            schema, with other inputs and outputs, with operators or weights that no lens model has, of another lens, or
-            whose reference rays come out wrong.
+        ModelError: as `read_model`; a file of another lens, or of an inverse map.
         InputError: fewer than one thread.
     """
     if threads < 1:
         raise InputError("load_model", "threads", threads, "at least 1")
-    file = Path(path)
-    data, card = read_checked(file)
-    check_card(file, card)
-    if lens is not None and card["lens"].get("sha256") != lens:
-        found = str(card["lens"].get("sha256"))
+    file = read_model(path)
+    if "inverse" in file.card:
+        raise ModelError(f"{file.path}: card: inverse: it is an inverse map, expected a model")
+    check_lens(file, lens)
+    return OnnxLens(file, threads)
+
+
+def check_lens(file: ModelFile, lens: str | None) -> None:
+    """Refuse a file of another lens than the one with this SHA-256; None takes any. Raises ModelError: as it says."""
+    known = str(file.card["lens"]["sha256"])
+    if lens is not None and known != lens:
         raise ModelError(
-            f"{file}: card: lens.sha256: got {found[:16]}... ({card['lens'].get('name')}), expected {lens[:16]}...: "
-            "the model stands for another lens"
+            f"{file.path}: card: lens.sha256: got {known[:16]}... ({file.card['lens']['name']}), expected "
+            f"{lens[:16]}...: the model stands for another lens"
         )
-    model = OnnxLens(file, data, card, threads)
-    _check_reference(model)
-    return model
 
 
 def ray_columns(
@@ -207,38 +218,3 @@ def ray_columns(
     if wavelength.shape not in ((), (count,)):
         raise InputError(where, "wavelength_nm", f"({wavelength.shape})", f"a number or an array ({count},)")
     return np.concatenate([*arrays, np.broadcast_to(wavelength, (1, count))])
-
-
-def _check_reference(model: OnnxLens) -> None:
-    """Recompute the card's reference rays, at every state that has some: what is loaded here is what was exported."""
-    _check_rays(model, model.card.get("reference"))
-    for reference in model.card["states"]["reference"] if model.axes else ():
-        _check_rays(model.at(*reference["state"]), reference)
-
-
-@np.errstate(over="ignore", invalid="ignore")  # what is not finite is refused
-def _check_rays(model: OnnxLens, reference: Any) -> None:
-    try:
-        rays = np.asarray(reference["rays"], np.float32)
-        wanted = [np.asarray(reference[k], np.float64) for k in ("scene_ray", "transmittance", "stop_xy_mm", "status")]
-        found = model.rays(rays[:2], rays[2:4], rays[4], float(reference["film_z_mm"][0]), reference["stop_radius_mm"])
-        if any(a.shape != b.shape for a, b in zip(found, wanted, strict=True)):
-            raise ValueError("columns of unequal length")
-    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
-        raise ModelError(f"{model.path}: card: reference: {type(error).__name__}: {error}") from error
-    passed = wanted[3] == st.PASSED
-    if not np.array_equal(found.status, wanted[3]) or not passed.any():
-        raise ModelError(
-            f"{model.path}: reference rays: got status {found.status.tolist()}, expected {wanted[3].tolist()}"
-        )
-    try:
-        position, direction, power, stop = tolerances(model.card, reference).values()
-    except (AttributeError, TypeError, ValueError) as error:
-        raise ModelError(f"{model.path}: card: reference.rounding: {type(error).__name__}: {error}") from error
-    allowed = [[position]] * 3 + [[direction]] * 3, power, stop, 0
-    for name, a, b, tolerance in zip(LensRays._fields, found, wanted, allowed, strict=True):
-        off = np.abs(a[..., passed] - b[..., passed])
-        if not (off <= np.asarray(tolerance)).all():  # NaN fails
-            raise ModelError(
-                f"{model.path}: reference rays: {name} is wrong by {off.max():.3g}: the weights are damaged"
-            )

@@ -1,13 +1,9 @@
-"""Derivatives and inverse maps of exported models that were written with them: numpy and onnxruntime alone.
-
-Inverse maps lead from stop points, and from scene rays, back to camera rays.
-"""
+"""Inverse maps of exported models, from stop points and from scene rays back to camera rays, run by onnxruntime."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,56 +12,19 @@ from numpy.typing import ArrayLike, NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.onnxlens import DERIVATIVES, INPUTS, OUTPUTS, LensRays, OnnxLens, ray_columns
+from neurolens.cameras.onnxlens import OUTPUTS, check_lens, ray_columns
 from neurolens.cameras.onnxsession import open_session, run_batches
-from neurolens.modelfile.cardcheck import check_card, is_number
-from neurolens.modelfile.onnxfile import read_checked
-from neurolens.optics.sag import front_rays
+from neurolens.graph.onnx import write_onnx
+from neurolens.optics.sag import Shape, front_rays
+from neurolens.surrogates.assemble import ONNX
+from neurolens.surrogates.file import ModelFile, read_model
+from neurolens.surrogates.inverse import Guess, front_index, scene_graph, stop_graph
 
 # Rays a call: these graphs have more rows than those of models alone.
-_DERIVATIVES_BATCH, _INVERSE_BATCH = 8192, 4096
+_BATCH = 4096
 _CALL = {"film_z_mm": ("tensor(float)", 1), "stop_radius_mm": ("tensor(float)", 1)}
 _OUTPUTS = {"rays": ("tensor(float)", 5, None), **OUTPUTS, "density": ("tensor(float)", None)}
-_NEWER: dict[str, Any] = {"across": None, "index": None}  # of fronts, which older files lack
 _GIVEN = {"stop": "stop_rays", "scene": "front_rays"}
-
-
-class LensDerivatives(NamedTuple):
-    """A model's rays, and their derivatives [6, 2, N]: x, y, z (mm) and direction by x and y of a point, per mm.
-
-    `d_film`: the pupil point held; `d_pupil`: the film point held.
-    """
-
-    rays: LensRays
-    d_film: FloatArray
-    d_pupil: FloatArray
-
-
-class OnnxDerivatives:
-    """The derivatives of a loaded model; its session is one of its own, so that others do not pay for it.
-
-    Raises:
-        InputError: a model that was exported without derivatives, or one of many states.
-    """
-
-    def __init__(self, model: OnnxLens) -> None:
-        self.model = model
-        try:
-            if model.axes:
-                raise ModelError(f"{model.path}: a model of many states")
-            self._session = open_session(model.path, model.data, model.threads, INPUTS, {**OUTPUTS, **DERIVATIVES})
-        except ModelError as error:
-            raise InputError(model.path, "derivatives", f"({error})", "a model exported with derivatives") from error
-
-    def __call__(
-        self, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray, film_z_mm: float, stop_radius_mm: float
-    ) -> LensDerivatives:
-        """Rays and derivatives for film and pupil points [2, N] mm and wavelengths [N] nm, as `OnnxLens.rays`."""
-        rays = {"rays": np.concatenate([film, pupil, wavelength_nm[None]]).astype(np.float32)}
-        call = {"film_z_mm": film_z_mm, "stop_radius_mm": stop_radius_mm}
-        names = (*OUTPUTS, *DERIVATIVES)
-        out = run_batches(self.model.path, self._session, names, rays, call, _DERIVATIVES_BATCH)
-        return LensDerivatives(LensRays(*out[:4]), *(np.moveaxis(d, 0, 1) for d in out[4:]))
 
 
 class InverseRays(NamedTuple):
@@ -92,9 +51,9 @@ class OnnxInverse:
         card: of the model; its entry "inverse" says how the map was fitted and how often it converges, by map.
     """
 
-    def __init__(self, maps: Mapping[str, tuple[Any, dict[str, Any]]], path: Path) -> None:
+    def __init__(self, maps: Mapping[str, tuple[Any, ModelFile]], path: Path) -> None:
         self.path, self._maps = path, maps
-        self.card = next(iter(maps.values()))[1]
+        self.card = next(iter(maps.values()))[1].card
 
     def through_stop(
         self,
@@ -132,23 +91,22 @@ class OnnxInverse:
         """
         lines = {"origin_mm": origin_mm, "direction": direction}
         *rays, wavelength = ray_columns("OnnxInverse", 3, lines, wavelength_nm, np.float64)
-        index = None if self.front is None else self.front.index
+        index = front_index(self._map("scene")[1].nodes[0])
         known, solid = front_rays(self.front, *rays, index=index, wavelength_nm=wavelength)
         out = self._run("scene", np.concatenate([known, [wavelength]]), film_z_mm, stop_radius_mm)
         with np.errstate(all="ignore"):  # area of direction vectors to solid angle
             return out._replace(density=(out.density / solid).astype(np.float32))
 
     @property
-    def front(self) -> Any:
-        """Shape of the surface on which scene rays are taken (`optics.sag.Shape`); None for the plane z = 0.
+    def front(self) -> Shape | None:
+        """The surface on which scene rays are taken; None for the plane z = 0.
 
         Raises:
             InputError: no file of the map of scene rays.
         """
-        shape = self._map("scene")[1]["inverse"]["front"]
-        return None if shape is None else SimpleNamespace(**_NEWER | shape)
+        return self._map("scene")[1].nodes[0].front
 
-    def _map(self, name: str) -> tuple[Any, dict[str, Any]]:
+    def _map(self, name: str) -> tuple[Any, ModelFile]:
         if name not in self._maps:
             raise InputError(self.path, "map", name, f"one of those found: {', '.join(self._maps)}")
         return self._maps[name]
@@ -156,22 +114,22 @@ class OnnxInverse:
     def _run(
         self, name: str, given: NDArray[Any], film_z_mm: float | None, stop_radius_mm: float | None
     ) -> InverseRays:
-        session, card = self._map(name)
-        domain = card["domain"]
+        session, file = self._map(name)
+        card, domain = file.card, file.card["domain"]
         call = {
             "film_z_mm": card["lens"]["film_z_mm"] if film_z_mm is None else film_z_mm,
             "stop_radius_mm": domain["stop_radius_mm"] if stop_radius_mm is None else stop_radius_mm,
         }
         with np.errstate(over="ignore"):
             rays = {_GIVEN[name]: given.astype(np.float32)}
-        return InverseRays(*run_batches(self.path, session, InverseRays._fields, rays, call, _INVERSE_BATCH))
+        return InverseRays(*run_batches(self.path, session, InverseRays._fields, rays, call, _BATCH))
 
 
 def load_inverse(path: str | Path, lens: str | None = None, threads: int = 1) -> OnnxInverse:
     """Load the inverse maps that lie beside a model: NAME.stop.onnx and NAME.scene.onnx for NAME.onnx.
 
     Args:
-        path: of the model. lens, threads: as of `load_model`.
+        path: of the model. lens, threads: see `load_model`.
 
     Raises:
         ModelError: neither file is there, or one is damaged, of another lens, or does not lead the card's reference
@@ -186,45 +144,25 @@ def load_inverse(path: str | Path, lens: str | None = None, threads: int = 1) ->
     if not maps:
         raise ModelError(f"{base}.stop.onnx, {base}.scene.onnx: no such files, expected exported inverse maps")
     inverse = OnnxInverse(maps, Path(path))
-    for name, (_, card) in maps.items():
-        _check(inverse, name, card)
+    for name, (_, model) in maps.items():
+        _check(inverse, name, model.card)
     return inverse
 
 
-def _load(file: Path, name: str, lens: str | None, threads: int) -> tuple[Any, dict[str, Any]]:
-    data, card = read_checked(file)
-    check_card(file, card)
-    facts = card.get("inverse")
-    if not isinstance(facts, dict) or facts.get("map") != name or not _is_front(facts.get("front", "")):
-        raise ModelError(f"{file}: card: inverse: got {str(facts)[:80]}, expected the facts of the {name} map")
-    if lens is not None and card["lens"].get("sha256") != lens:
-        raise ModelError(f"{file}: card: lens.sha256: the map stands for another lens, {card['lens'].get('name')}")
+def _load(path: Path, name: str, lens: str | None, threads: int) -> tuple[Any, ModelFile]:
+    file = read_model(path)
+    facts = file.card.get("inverse")
+    if not isinstance(facts, dict) or facts.get("map") != name or file.axes:
+        raise ModelError(f"{path}: card: inverse: got {str(facts)[:80]}, expected the facts of the {name} map")
+    check_lens(file, lens)
+    build = stop_graph if name == "stop" else scene_graph
+    try:
+        with np.errstate(all="ignore"):
+            data = write_onnx(build(file.nodes[0], Guess.unpacked(file.more["guess"]), ONNX), {})
+    except (ValueError, TypeError, KeyError, IndexError, ArithmeticError, AttributeError) as error:
+        raise ModelError(f"{path}: its first guess is damaged ({type(error).__name__}: {error})") from error
     inputs = {_GIVEN[name]: ("tensor(float)", 5, None), **_CALL}
-    return open_session(file, data, threads, inputs, _OUTPUTS), card
-
-
-def _is_front(value: Any) -> bool:
-    """Whether this is a front surface as `meet_front` takes it: none, or a table of its shape."""
-    if value is None:
-        return True
-    keys = {"curvature", "conic", "asphere", "cylinder", *_NEWER}
-    if not isinstance(value, dict) or set(value) | set(_NEWER) != keys:
-        return False
-    terms, across, index = value["asphere"], value.get("across"), value.get("index")
-    if index is not None and not (isinstance(index, list) and index and all(map(is_number, index))):
-        return False
-    if across is not None:
-        if not isinstance(across, list) or len(across) != 2 or not is_number(across[0]) or across[0] == 0:
-            return False
-        if value["cylinder"] is None or not (across[1] is None or is_number(across[1])):
-            return False
-    return (
-        is_number(value["curvature"])
-        and is_number(value["conic"])
-        and value["cylinder"] in (None, "x", "y")
-        and isinstance(terms, list)
-        and all(isinstance(t, list) and len(t) == 2 and all(map(is_number, t)) for t in terms)
-    )
+    return open_session(path, data, threads, inputs, _OUTPUTS), file
 
 
 def _check(inverse: OnnxInverse, name: str, card: dict[str, Any]) -> None:

@@ -42,60 +42,6 @@ def _shapes(tensors: Any) -> dict[str, tuple[Any, ...]]:
     return {v.name: (v.type, *(None if isinstance(d, str) else d for d in v.shape)) for v in tensors}
 
 
-def joined(
-    models: Sequence[Any], constants: Mapping[str, Any], outputs: Sequence[str], renamed: Mapping[str, str]
-) -> bytes:
-    """Models after one another as one: an input takes what an earlier one gives, or is given, under its name.
-
-    Args:
-        models: of the package onnx, or their bytes.
-        constants: inputs that become numbers. outputs: wanted of all that the models give.
-        renamed: what models give, where a later one takes it under another name.
-
-    Raises:
-        ModelError: models of several operator sets.
-    """
-    import onnx  # takes a quarter of a second
-    from onnx import helper, numpy_helper
-
-    parts = [onnx.load_from_string(m) if isinstance(m, bytes) else m for m in models]
-    if len(versions := {tuple((o.domain, o.version) for o in part.opset_import) for part in parts}) > 1:
-        raise ModelError(f"operator sets {sorted(versions)}: a camera needs a model of the one that neurolens writes")
-    graph, known = onnx.GraphProto(name="camera"), dict[str, Any]()  # what is given: a name here, and its description
-    for k, part in enumerate(parts):
-        names = {"": ""}  # of the part: names here
-        for value in part.graph.input:
-            name, kind = value.name, value.type.tensor_type.elem_type
-            if name not in known:
-                known[name] = name, value
-                if name in constants:
-                    graph.initializer.append(numpy_helper.from_array(np.array(constants[name], np.float32), name))
-                else:
-                    graph.input.append(value)
-            names[name], given = known[name]
-            if given.type.tensor_type.elem_type != kind:
-                graph.node.append(helper.make_node("Cast", [names[name]], [f"{k}_{name}_cast"], to=kind))
-                names[name] = f"{k}_{name}_cast"
-        for tensor in part.graph.initializer:
-            names[tensor.name] = tensor.name = f"{k}_{tensor.name}"
-            graph.initializer.append(tensor)
-        for node in part.graph.node:
-            names |= {name: f"{k}_{name}" for name in node.output}
-            node.name, node.input[:], node.output[:] = (
-                f"{k}_{node.name}",
-                [names[i] for i in node.input],
-                [names[o] for o in node.output],
-            )
-            graph.node.append(node)
-        last = part is parts[-1]
-        known |= {v.name if last else renamed.get(v.name, v.name): (names[v.name], v) for v in part.graph.output}
-    for name in outputs:
-        graph.node.append(helper.make_node("Identity", [known[name][0]], [name]))
-        graph.output.append(known[name][1])
-    whole = helper.make_model(graph, opset_imports=parts[0].opset_import, ir_version=parts[0].ir_version)
-    return bytes(whole.SerializeToString())
-
-
 def run_batches(
     path: Path,
     session: Any,

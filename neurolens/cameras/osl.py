@@ -48,7 +48,6 @@ from neurolens.graph.osl import Parameter, write_osl
 from neurolens.graph.program import STOP_RADIUS, Mixture, Program
 from neurolens.graph.scalars import lower
 from neurolens.modelfile.axes import Axis, product, weights
-from neurolens.modelfile.graph import graph_of
 from neurolens.modelfile.stategraph import state_graph, state_names
 from neurolens.modelfile.states import STATE
 from neurolens.optics.film_plane import LINE_D_NM
@@ -397,7 +396,7 @@ def model_lens(model: OnnxLens, graph: Graph | None, report: Report, *, fixed: b
     """An exported model.
 
     Args:
-        graph: of a model of one state; None reads it from its file. fixed: in its state alone.
+        graph: of a model of one state; None takes its own. fixed: in its state alone.
     """
     if not model.axes or fixed:
         return osl_lens([shader_lens(model, graph)], report)
@@ -419,7 +418,7 @@ def shader_lens(model: OnnxLens, graph: Graph | None = None) -> ShaderLens:
     short, long = _light_of(*map(float, d["wavelength_nm"]))
     stop = float(d["stop_radius_mm"])
     if graph is None:
-        graph = graph_of(model.path, model.data, model.state if model.axes else ())
+        graph = model.graph()
     height = _BESIDE * float(d["film_radius_mm"])
     squeeze = squeeze_of(ModelScene(model, float(low), stop), height, (short, long))
     return ShaderLens(

@@ -50,7 +50,7 @@ def search_key(lens: Lens, wavelength_nm: tuple[float, float], shares: tuple[flo
 
 @cache
 def _code() -> list[str]:
-    """Of the modules that trace and search, and of torch's arithmetic on this machine."""
+    """Hash the modules that trace and search, and torch's arithmetic on this machine."""
     folders = Path(optics.__file__).parent.glob("*.py"), Path(__file__).parent.glob("pupil_*.py")
     files = [f"{file.name} {sha256_of(file)}" for folder in folders for file in sorted(folder)]
     return [*files, torch.__version__, torch.backends.cpu.get_cpu_capability()]

@@ -83,7 +83,7 @@ class Pinhole:
         return sound(rays, cos2, pupil, wavelength_nm)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `sample`, with the differentials of the rays, all of which start at the hole."""
+        """Sample rays as `sample` does, with their differentials; all rays start at the hole."""
         rays = self.sample(film_mm, pupil, wavelength_nm)
         slope = np.zeros((3, 2, film_mm.shape[1]), np.float32)
         slope[0, 0] = slope[1, 1] = -1 / self.focal_mm
@@ -204,7 +204,7 @@ class Fisheye:
         return sound(CameraRays(origin, direction, weight, status), np.ones_like(rho), pupil, wavelength_nm)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `sample`, with the differentials of the rays, all of which start at the hole."""
+        """Sample rays as `sample` does, with their differentials; all rays start at the hole."""
         rays = self.sample(film_mm, pupil, wavelength_nm)
         rho, towards, _ = self._place(film_mm)
         theta = self.projection.angle(rho)

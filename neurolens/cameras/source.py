@@ -13,8 +13,7 @@ import numpy as np
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.focus_function import FOCUS, SMALLEST, Array, Focus, Focusing, film_function, number_of
-from neurolens.cameras.fused import LensGraph, whole_camera
-from neurolens.cameras.lens_film import LensFilm
+from neurolens.cameras.lens_film import LensFilm, LensGraph, whole_camera
 from neurolens.cameras.model import ModelScene, best_focus_of_stops_mm
 from neurolens.cameras.onnxlens import OnnxLens
 from neurolens.graph.c import Extras
@@ -43,12 +42,10 @@ def camera_program(film: LensFilm, lens: LensGraph, derivatives: bool = False, o
     Inputs: film_x_mm, film_y_mm, u, v, wavelength_nm. Outputs: see `CAMERA_FRAME`.
 
     Raises:
-        InputError: a stop whose shape is a picture; a pupil other than the outline.
+        InputError: a stop whose shape is a picture.
     """
     if lens.aperture is not None and lens.blades is None:
         raise InputError("export", "aperture", "(a picture)", "a round stop or one with blades")
-    if film.pupil is not film.outline:
-        raise InputError("export", "pupil", "(another)", "outline: the only one that is written")
     if derivatives:
         lens = lens._replace(graph=with_film_derivatives(lens.graph))
     graph, numbers = whole_camera(film, lens, pupil_too=True)

@@ -70,7 +70,7 @@ class Vignetted:
         return self._weighed(self.camera.sample(film_mm, pupil, wavelength_nm), film_mm)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `sample`, with the differentials of the rays."""
+        """Sample rays as `sample` does, and give their differentials, too."""
         return self._weighed(self.camera.sample_differentials(film_mm, pupil, wavelength_nm), film_mm)
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:

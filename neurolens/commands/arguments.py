@@ -10,18 +10,17 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from neurolens.base.bounds import F_NUMBER, FOCAL_MM, WAVELENGTH_NM
 from neurolens.base.errors import InputError, one_line
 from neurolens.base.lensname import lens_id_of, resolve
+from neurolens.base.options import number
 from neurolens.evaluate.records import program
 
 if TYPE_CHECKING:
     from neurolens.optics.apertures import Aperture
     from neurolens.optics.prescription import Lens
-
-T = TypeVar("T")
 
 
 class Help(argparse.RawDescriptionHelpFormatter):
@@ -73,31 +72,18 @@ class Parser(argparse.ArgumentParser):
 def positive(unit: str, *, infinite: bool = False) -> Callable[[str], float]:
     """Type of an argument that is a number above 0; "inf" only if `infinite`."""
     expected = f"{unit} above 0{', or inf' if infinite else ''}"
-    return _number(float, lambda value: value > 0 and (infinite or not math.isinf(value)), expected)
+    return number(float, lambda value: value > 0 and (infinite or not math.isinf(value)), expected)
 
 
 def between(low: float, high: float, unit: str) -> Callable[[str], float]:
     """Type of an argument that is a number from `low` to `high`."""
-    return _number(float, lambda value: low <= value <= high, f"{unit} from {low:g} to {high:g}")
+    return number(float, lambda value: low <= value <= high, f"{unit} from {low:g} to {high:g}")
 
 
 def whole(least: int, most: int | None = None) -> Callable[[str], int]:
     """Type of an argument that is an integer from `least` to `most`."""
     span = f"from {least}" + ("" if most is None else f" to {most}")
-    return _number(int, lambda value: value >= least and (most is None or value <= most), f"an integer {span}")
-
-
-def _number(kind: Callable[[str], T], good: Callable[[T], bool], expected: str) -> Callable[[str], T]:
-    def convert(text: str) -> T:
-        try:
-            value = kind(text)
-            if good(value):  # false for NaN
-                return value
-        except ValueError:
-            pass
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected {expected}")
-
-    return convert
+    return number(int, lambda value: value >= least and (most is None or value <= most), f"an integer {span}")
 
 
 def add_option(
@@ -141,8 +127,7 @@ def wavelengths_nm(text: str) -> tuple[float, ...]:
 
 QUIET_HELP = "neither progress nor warnings on stderr"
 
-# Repeated here, so that help imports no camera; a test compares with `cameras.exact` and `cameras.vignetting`.
-PUPILS = ("outline", "rear-rim", "exit-pupil", "wu", "pixel-disc", "pixel-ellipse", "boxes", "ellipses")
+# Repeated here, so that help imports no camera; a test compares it with `cameras.vignetting`.
 VIGNETTINGS = ("both", "natural", "optical", "none")
 CAMERAS_HELP = """\
 cameras:
@@ -158,16 +143,11 @@ cameras:
 
 
 def add_camera(parser: argparse.ArgumentParser) -> None:
-    """Add --camera, --film-offset, --pupil and --vignetting."""
+    """Add --camera, --film-offset and --vignetting."""
     add_lens(parser, "--camera", models=True, cameras=True)
     parser.add_argument(
         "--film-offset", metavar="MM", type=between(-1e3, 1e3, "mm"), default=0.0,
         help="move the film away from the lens after focusing (default: 0)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--pupil", choices=PUPILS, default="outline",
-        help="how the pupil of an exact lens is sampled: its outline, or a shape of the literature that holds it; the "
-        "same picture, with fewer rays that pass (default: outline)",
     )  # fmt: skip
     parser.add_argument(
         "--vignetting", choices=VIGNETTINGS, default="both",
@@ -237,10 +217,11 @@ def aperture_of(args: argparse.Namespace) -> Aperture | None:
 
 
 def state_of(args: argparse.Namespace, tabled: Lens) -> Lens:
-    """The lens of a file in the state of the arguments of `add_lens_state`; raises InputError as `Lens.at`."""
+    """The lens of a file in the state of the arguments of `add_lens_state`; raises InputError as `set_lens`."""
     from neurolens.optics.focusing import best_focused
+    from neurolens.optics.states import set_lens
 
-    lens = tabled.with_aperture(aperture_of(args) or tabled.aperture).at(
+    lens = set_lens(tabled.with_aperture(aperture_of(args) or tabled.aperture),
         zoom=args.zoom, focal_length_mm=args.efl, field_deg=args.field, f_number=args.f_number,
         focus_m=args.focus, focus=args.focusing,
     )  # fmt: skip
@@ -324,7 +305,18 @@ def add_glass(parser: argparse._ActionsContainer) -> None:
     )  # fmt: skip
 
 
-def more_glasses(args: argparse.Namespace) -> AbstractContextManager[None]:
+def add_dask(parser: argparse._ActionsContainer) -> None:
+    """Add --dask."""
+    parser.add_argument(
+        "--dask", metavar="ADDRESS",
+        help="run on a Dask cluster: the address of its scheduler (tcp://HOST:8786), or local (processes of this "
+        "machine), or local:N, which no other user can reach. What a task reads travels with it: workers need "
+        "neurolens alone, and no folder in common. Whoever reaches a scheduler at tcp:// can run programs as you; "
+        "tls:// takes keys",
+    )  # fmt: skip
+
+
+def more_glasses(args: object) -> AbstractContextManager[None]:
     """A block in which the catalogues of --glass are known; without any, nothing is imported."""
     files = getattr(args, "glass_files", ())
     if not files:

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import io
 import math
-import multiprocessing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,11 +18,10 @@ from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import safe_name
 from neurolens.base.lensname import is_model, lens_id_of
-from neurolens.base.signals import end_at_once, held
+from neurolens.base.tasks import Failed, Here, Processes, run_each
 from neurolens.blender.pack import Form, PackedLens
 from neurolens.commands.blender_kept import kept, kept_form
 from neurolens.evaluate.shaders import shader_of
-from neurolens.render.film import CONTEXT
 
 if TYPE_CHECKING:
     from neurolens.optics.prescription import Lens
@@ -66,11 +62,13 @@ def _made_form(file: Path, zoom: str | None, quiet: bool) -> Form:
 
 def _squeeze(file: Path, zoom: str | None) -> float:
     """See `cameras.lens_state`."""
+    from neurolens.optics.states import set_lens
+
     if not is_model(file):
         from neurolens.optics.paraxial import first_order
         from neurolens.readers.any_format import read_any
 
-        lens = read_any(file).at(zoom=zoom)
+        lens = set_lens(read_any(file), zoom=zoom)
         across = first_order(lens, meridian="x") if lens.anamorphic else first_order(lens)
         return abs(float(first_order(lens).efl_mm / across.efl_mm))
     from neurolens.cameras.build import Shot, make_camera
@@ -82,60 +80,41 @@ def forms_of(
     files: Sequence[Path], jobs: int, report: Callable[[float], object],
     zooms: Mapping[Path, str | None] = MappingProxyType({}),
 ) -> tuple[Forms, dict[Path, str]]:  # fmt: skip
-    """Forms of many files, `jobs` at a time in processes of their own, and why others have none.
+    """The forms of many files, `jobs` at a time in processes of their own, and why others have none.
 
     Args:
-        zooms: `zoom` of `form_of`, of files that have one.
+        zooms: `zoom` of `form_of`, for files that have one.
 
     Raises:
-        NeurolensError: a process ended by itself, as where memory is short.
+        NeurolensError: a process ended early, as where memory is short.
     """
     found: Forms = {}
     left: dict[Path, str] = {}
-
-    def keep(file: Path, made: Form | str) -> None:
-        if isinstance(made, Form):
-            found[file] = made
-        else:
-            left[file] = made
-        report((len(found) + len(left)) / len(files))
-
-    if jobs == 1:
-        for file in files:
-            keep(file, _form_or_why(file, zooms.get(file)))
-        return found, left
-    with ProcessPoolExecutor(jobs, CONTEXT, _begin_job) as pool:
-        with held():  # a process just forked would raise what this one raises, and run on as a second command
-            waiting = {pool.submit(_form_or_why, file, zooms.get(file)): file for file in files}
-        try:
-            for done in as_completed(waiting):
-                keep(waiting[done], done.result())
-        except BaseException as error:
-            for job in multiprocessing.active_children():
-                job.terminate()
-            pool.shutdown(cancel_futures=True)
-            if isinstance(error, BrokenProcessPool):
-                raise NeurolensError(
-                    f"one of {jobs} processes ended early: memory may be short, try --jobs 1"
-                ) from None
-            raise
+    tasks = [(file, zooms.get(file)) for file in files]
+    with Here() if jobs == 1 else Processes(jobs) as executor:
+        for done, ((file, _), made) in enumerate(run_each(executor, _form_or_why, tasks), start=1):
+            if isinstance(made, Failed):
+                raise NeurolensError(f"{file}: {made.reason} ({jobs} jobs: where memory is short, try --jobs 1)")
+            if isinstance(made, Form):
+                found[file] = made
+            else:
+                left[file] = made
+            report(done / len(files))
     return found, left
 
 
-def _begin_job() -> None:
-    """In a process: signals end it at once, as the main process ends it; one core is its own."""
-    end_at_once()
-    if find_spec("torch") is not None:
-        import torch
+def _form_or_why(task: tuple[Path, str | None]) -> Form | str:
+    """The form of a file and a zoom, or why the lens cannot be a shader."""
+    file, zoom = task
+    with ExitStack() as stack:
+        if find_spec("torch") is not None:
+            from neurolens.surrogates.bases import pinned_threads
 
-        torch.set_num_threads(1)
-
-
-def _form_or_why(file: Path, zoom: str | None) -> Form | str:
-    try:
-        return form_of(file, zoom=zoom, quiet=True)
-    except NeurolensError as error:
-        return str(error)
+            stack.enter_context(pinned_threads())
+        try:
+            return form_of(file, zoom=zoom, quiet=True)
+        except NeurolensError as error:
+            return str(error)
 
 
 def packed_of(
@@ -147,6 +126,7 @@ def packed_of(
         lens: its prescription, for the thumbnail, where it is at hand.
     """
     from neurolens.optics.paraxial import first_order
+    from neurolens.optics.states import set_lens
 
     first, ranged = files[0], zoom == RANGE
     if is_model(first):
@@ -158,7 +138,7 @@ def packed_of(
     else:
         from neurolens.readers.any_format import read_any
 
-        lens = read_any(first).at(zoom=None if zoom == RANGE else zoom)
+        lens = set_lens(read_any(first), zoom=None if zoom == RANGE else zoom)
         data = first_order(lens)
         name, efl, f_number, source = lens.name, data.efl_mm, data.f_number, lens.source
     picture = None if lens is None else thumbnail(lens)
@@ -174,6 +154,7 @@ def stated_lens(model: Path, lenses: Path) -> Lens | None:
     """The prescription of a model of one state of a lens file, scaled or zoomed, or of its range; None without it."""
     from neurolens.optics.lensfile import read_lens
     from neurolens.optics.paraxial import first_order
+    from neurolens.optics.states import set_lens
 
     told = _card(model)["lens"]
     file = lenses / f"{safe_name(told['id'])}.toml"
@@ -182,7 +163,7 @@ def stated_lens(model: Path, lenses: Path) -> Lens | None:
     lens, efl = read_lens(file), float(told["efl_mm"])
     if math.isclose(first_order(lens).efl_mm, efl, rel_tol=1e-3):
         return lens
-    return lens.at(zoom=str(efl)) if lens.configurations else lens.at(focal_length_mm=efl)
+    return set_lens(lens, zoom=str(efl)) if lens.configurations else set_lens(lens, focal_length_mm=efl)
 
 
 def field_table(lens: Lens, radius_mm: float) -> dict[str, Any] | None:
@@ -257,6 +238,8 @@ def library(folder: Path, lenses: Path, chosen: Sequence[str]) -> Iterator[tuple
 
 def thumbnail(lens: Lens) -> bytes | None:
     """The section of a lens as a PNG of 256 by 256 pixels; None where torch or matplotlib is missing."""
+    from neurolens.optics.states import set_lens
+
     if find_spec("torch") is None or find_spec("matplotlib") is None:
         return None
     from neurolens.analysis.fields import Scene
@@ -267,7 +250,7 @@ def thumbnail(lens: Lens) -> bytes | None:
         figure = new_figure(_SIDE_IN, _SIDE_IN)
         figure.set_layout_engine("none")
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-        layout = layout_profile(Scene(lens.at(), axis="y"))
+        layout = layout_profile(Scene(set_lens(lens), axis="y"))
         layout = replace(layout, rays=tuple(ray for ray in layout.rays if ray.field != 1))  # of the axis and the edge
         draw_section(axes, layout, lw=0.5)
         arcs = np.concatenate([s.arc() for s in layout.surfaces])  # the glass fills the picture: menus show it small
@@ -281,9 +264,9 @@ def thumbnail(lens: Lens) -> bytes | None:
 
 
 def _card(file: Path) -> dict[str, Any]:
-    from neurolens.modelfile.onnxfile import read_checked
+    from neurolens.modelfile.metadata import read_card
 
-    return read_checked(file)[1]
+    return read_card(file)
 
 
 def _axes(card: dict[str, Any]) -> list[str]:

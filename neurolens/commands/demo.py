@@ -42,7 +42,8 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Render and write the page."""
-    from neurolens.evaluate import pages
+    from neurolens.base.html import html
+    from neurolens.evaluate.pages import figures_of
 
     folder = args.out
     if folder.exists() and not folder.is_dir():
@@ -63,9 +64,8 @@ def run(args: argparse.Namespace) -> int:
         given = parser.parse_args(words)
         given.run(given)
         figures.append({"file": f"{name}.png", "title": caption, "caption": command})
-    body = pages.figure_grid(folder, figures)
-    body = pages.html("<h1>One scene, five cameras</h1>{}", body)
-    atomic_write_text(folder / "index.html", pages.page("One scene, five cameras", body))
+    page = html("demo.html", title="One scene, five cameras", shown=figures_of(folder, figures))
+    atomic_write_text(folder / "index.html", page)
     more = [f"  {program()} {words}" for words in ("--help", "models", "lens list")]
     more[2] += "" if traced else "   # with the extra 'train', which traces lenses"
     print("\n".join([f"\nLook at {folder}/index.html\nThen", *more]))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -138,6 +137,8 @@ def run(args: argparse.Namespace) -> int:
         return _answer(args, _about(written))
     check_writable(args.out)
     from neurolens.cameras.onnxlens import load_model
+    from neurolens.surrogates.source import Parts, export_source
+    from neurolens.surrogates.specialise import Fix, fixed_models
 
     loaded = load_model(file)
     card, whole = loaded.card, set(parts) == set(_PARTS) and not given
@@ -145,24 +146,15 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(
             "neurolens export", str(file), "(a model of many states)", "--to c or glsl without --fix, --only"
         )
-    if loaded.axes or (args.to != "onnx" and whole and find_spec("torch") is None):
-        from neurolens.surrogates.source import export_file
-
-        extras, notes = model_extras(loaded)
-        return _answer(args, _about(export_file(file, args.out, args.to, args.name, extras, notes)))
-    from neurolens.surrogates.source import Parts, export_source
-    from neurolens.surrogates.specialise import fixed_models
-    from neurolens.surrogates.stored import load_fitted
-
-    model = load_fitted(file)
-    fix = _fix(given, model)
-    models = fixed_models(model, fix)
+    fix, models = _fix(given, loaded.fitted) if given else Fix(), loaded.file.nodes
+    if given:
+        models = fixed_models(loaded.fitted, fix)
     if args.to == "onnx":
         _write_onnx(models, args.out, card if not given else None, args.derivatives)
         about: dict[str, Any] = _write_inverse(models[0], args.out) if args.inverse else {}
     else:
         asked = Parts(*(name in parts for name in _PARTS[1:]))
-        stop = fix.stop_radius_mm if asked.vignetting else model.domain.stop_radius_mm
+        stop = fix.stop_radius_mm if asked.vignetting else models[0].domain.stop_radius_mm
         extras, notes = model_extras(loaded, film=fix.film_z_mm is None, stop_mm=stop)
         written = export_source(
             models, args.out, args.to, card, parts=asked, fix=fix, name=args.name, extras=extras, notes=notes
@@ -194,8 +186,6 @@ def _write_camera(file: Path, args: argparse.Namespace) -> Written:
     """A whole camera, of a model or a lens file."""
     from neurolens.base.progress import Progress
     from neurolens.cameras.build import Shot, make_camera
-    from neurolens.cameras.fused import lens_graph
-    from neurolens.cameras.model import OnnxCamera
     from neurolens.cameras.source import CAMERA_FRAME, camera_program
     from neurolens.graph.c import Extras
     from neurolens.surrogates.source import checked_name, lines_of, write_program
@@ -205,7 +195,7 @@ def _write_camera(file: Path, args: argparse.Namespace) -> Written:
     facts = camera.settings
     lens = facts["lens"] if "lens" in facts else facts["card"]["lens"]
     name = checked_name(args.to, f"{lens['id']}_camera", args.name)
-    graph = lens_graph(camera) if isinstance(camera, OnnxCamera) else camera.lens_graph()
+    graph = camera.lens_graph()
     # Compilers of GLSL take minutes for an array of 43,000 constants: there the table is a texture of the caller.
     program = camera_program(camera.film, graph, args.derivatives, own_table=args.to == "c")
     numbers = {key: facts[key] for key in ("efl_mm", "f_number", "film_z_mm", "stop_radius_mm")}
@@ -294,12 +284,13 @@ def _given(texts: list[str]) -> dict[str, list[float]]:
 def _fix(given: dict[str, list[float]], model: LensModel) -> Fix:
     from neurolens.optics.focusing import best_focus_z_mm
     from neurolens.optics.paraxial import film_z_mm
+    from neurolens.optics.states import set_lens
     from neurolens.surrogates.specialise import Fix
 
     film_z = given.get("film_z", [None])[0]
     stop = given.get("stop", [None])[0]
     if "f_number" in given:
-        stop = model.lens.at(f_number=given["f_number"][0]).stop_radius_mm
+        stop = set_lens(model.lens, f_number=given["f_number"][0]).stop_radius_mm
     if "focus" in given:
         focus_m, lens = given["focus"][0], model.lens if stop is None else model.lens.with_stop_radius(stop)
         Fix(film_z_mm=film_z_mm(lens, focus_m)).check(model.domain)

@@ -25,6 +25,7 @@ from neurolens.optics.focusing import best_focus_of_stops_mm, focus_states
 from neurolens.optics.paraxial import film_z_mm, first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm, pupil_bounds, pupil_plane_z_mm
+from neurolens.optics.states import set_lens
 from neurolens.optics.tracegraph import TRANSMITTANCE, exact_graph
 from neurolens.readers.any_format import read_any
 from neurolens.surrogates.source import Written, checked_name, lines_of, write_program
@@ -42,21 +43,21 @@ def write_lens(
     """The lens as a function of film and pupil point, wavelength, film position, stop radius and, of a range, zoom.
 
     Args:
-        to: "c" or "glsl". name: of the function, None takes the lens's id. zoom: a state of `Lens.at`, or "range".
+        to: "c" or "glsl". name: of the function, None takes the lens's id. zoom: a state of `set_lens`, or "range".
     """
     lens = read_any(file)
     name = checked_name(to, lens.lens_id, name)
     axes: tuple[Axis, ...] = ()
     lines = []
     if zoom == RANGE:
-        axis, error_mm = gap_axis(zoom_axis(lens), lambda zoom_mm: lens.at(zoom=zoom_mm))
-        axes, nodes = (axis,), [lens.at(zoom=v) for v in axis.nodes]
+        axis, error_mm = gap_axis(zoom_axis(lens), lambda zoom_mm: set_lens(lens, zoom=zoom_mm))
+        axes, nodes = (axis,), [set_lens(lens, zoom=v) for v in axis.nodes]
         lines.append(
             f"Argument state: NAME_at(zoom_mm) makes it, once for all rays, of the focal length at infinity focus, "
             f"{_span(axis)} mm. Gaps between the source's own positions are within {1e3 * error_mm:.2g} um (measured)."
         )
     else:
-        nodes = [lens.at(zoom=zoom)]
+        nodes = [set_lens(lens, zoom=zoom)]
         if lens.configurations:
             lines.append("One zoom position: its gaps are numbers in the code (--zoom range makes it an argument).")
     if focus_states(lens):
@@ -93,7 +94,7 @@ def _film(
 ) -> tuple[dict[str, Program], list[str]]:
     """The film's position, as `film_extras`."""
     between = [a.range[0] + (a.range[1] - a.range[0]) * share for a in axes for share in _CHECKED]
-    lenses = [*nodes, *(lens.at(zoom=v) for v in between)]
+    lenses = [*nodes, *(set_lens(lens, zoom=v) for v in between)]
     data = [first_order(at) for at in lenses]
     # The separation of the principal planes may change its sign in a zoom: one for all.
     apart = max(abs(float(d.rear_principal_z_mm - d.front_principal_z_mm)) for d in data)

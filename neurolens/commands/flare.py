@@ -6,36 +6,41 @@ import argparse
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neurolens import __version__
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, warn
+from neurolens.base.options import add_options, from_options
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import (
+    add_exposure,
     add_json,
     add_lens,
     add_lens_state,
+    add_option,
     add_output,
     check_suffix,
     state_of,
+    whole,
 )
 from neurolens.commands.flare_fit import add_fit, check_fit, fitted, run_fit, stopped
 from neurolens.commands.flare_lights import add_lights
-from neurolens.commands.flare_options import add_made, complete, settings_of
 from neurolens.commands.output import answer, number, table
-from neurolens.commands.render_files import Files, flare_channels, warn
+from neurolens.commands.render import add_colour_space, film_size
 from neurolens.commands.render_frames import add_frames, frames_of
 from neurolens.evaluate.records import plain
+from neurolens.render.flaresettings import FlareSettings
 
 if TYPE_CHECKING:
     from neurolens.cameras.contract import FloatArray
     from neurolens.commands.flare_lights import Sources
     from neurolens.flare.ghostmodel import GhostModel
     from neurolens.flare.ghosts import GhostTracer
+    from neurolens.flare.layers import FlareJob
     from neurolens.flare.lights import Light
-    from neurolens.flare.picture import Ghost, Raster, Ways
+    from neurolens.flare.picture import Ghost
     from neurolens.optics.prescription import Lens
 
 _DESCRIPTION = """\
@@ -48,16 +53,14 @@ ghosts.R, .G, .B, and so on. The --layers ghosts with the greatest values on the
 of their own (g07-03: reflected at surface 7, then at 3, counted from 0 at the front), the others
 are "rest". A PNG preview beside the EXR shows the flare, brighter by --exposure. Values are those
 of `neurolens render`: a white card of radiance 1 is 1 on the axis.
-With --reflections 4, ghosts of four reflections are traced, too: the strongest, until 0.1% of
-all ghosts' light is left. Each surface shares light out by the mean of both polarisations; with
---polarised light keeps the one that surfaces before gave it: all ghosts' light changes by -2 to
-+12% in three lenses tried, single bright ghosts' by -22 to +48%, most in coated lenses, in twenty
-times the time (ghosts alone, not glare). Edges of ghosts are as rays draw them, without the rings
-of diffraction, which no option adds. With --photons light goes on by chance instead, with any number of
-reflections, smoothed by a kernel. With --glare, or anything that scatters, the layer glare has
-by such photons the light that is reflected more than twice or scatters, so that ghosts and
-glare are all. With --starburst the layer starburst has what diffraction sends aside, by the
-shape of the opening as each light sees it: streaks of blades. It is 0 at the image of the
+Each surface shares light out by the mean of both polarisations. If polarisation were followed from
+surface to surface, the light of all ghosts would change by -2 to +12% in three lenses tried, and
+that of single bright ghosts by -22 to +48%, most in coated lenses. Edges of ghosts are as rays draw
+them, without the rings of diffraction, which no option adds. With --photons light goes on by chance
+instead, with any number of reflections, smoothed by a kernel. With --glare, or anything that
+scatters, the layer glare has by such photons the light that is reflected more than twice or
+scatters, so that ghosts and glare are all. With --starburst the layer starburst has what diffraction
+sends aside, by the shape of the opening as each light sees it: streaks of blades. It is 0 at the image of the
 light itself, which a render has. Needs the extra "train" (torch) and a C compiler."""
 _EPILOG = """\
 examples:
@@ -71,6 +74,7 @@ examples:
 _COMMAND = "neurolens flare"
 _SHOWN, _SHOWN_LIGHTS, _KEPT = 12, 4, 64  # ghosts of a table and tables; ghosts of a light that files tell
 _FEWEST = 256  # rays of a table
+_QUICK_WIDTH = 480  # at most
 _RANKED_FRAMES = 16  # that tell which ghosts are brightest
 _QUANTILE, _SHOWN_AT = 0.99, 0.8  # the preview's exposure takes this quantile of the lit pixels to this value
 _FRAMES = (
@@ -86,11 +90,7 @@ def add_parser(subparsers: Any) -> None:
     )
     add_lens(parser, "file", "; a model is one of fitted ghosts", models=True)
     add_lights(parser)
-    parser.add_argument(
-        "--coating", metavar="NAME",
-        help="of every surface between glass and air that the lens file leaves bare: single-layer (1940s to 60s), "
-        "three-layer (1970 on), multi-layer (today), quarter-wave, v-coat, broadband; of one: three-layer,s07=bare",
-    )  # fmt: skip
+    add_options(parser, FlareSettings, ["coating"])
     add_output(parser, "OUT.exr", "picture to write; the preview is OUT.png (default: only the table)")
     parser.add_argument(
         "--path",
@@ -98,13 +98,63 @@ def add_parser(subparsers: Any) -> None:
         nargs=2,
         help="draw the rays of one ghost of the first light (PNG, PDF, SVG)",
     )
-    add_made(parser)
+    _add_picture(parser)
     add_fit(parser)
     add_frames(parser, _FRAMES)
     parser.add_argument("--restart", action="store_true", help="of --frames: make those that exist again")
     add_lens_state(parser, efl="as tabled", f_number="the widest")
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="nothing is written", position_m=None, look_at_m=None, frame=None)
+
+
+def _add_picture(parser: argparse.ArgumentParser) -> None:
+    """Add what the picture is, and the settings of its flare."""
+    group = parser.add_argument_group("picture")
+    group.add_argument("--film", metavar="WxH", type=film_size, default=(36.0, 24.0), help="in mm (default: 36x24)")
+    group.add_argument(
+        "--width", metavar="PIXELS", type=whole(1, 16384), default=960, help="of the picture (default: 960)"
+    )
+    add_options(group, FlareSettings, ["cell_px", "bins"])
+    add_exposure(group, None, "99% of the lit pixels become no brighter than 0.8; frames share one value")
+    add_colour_space(group, "; default: that of --image, else of a scene's [film] table, else sRGB")
+    add_option(
+        group, "--quick", old=("--preview",), action="store_true",
+        help="at most 480 pixels wide, 5 wavelengths and 65536 photons a light and wavelength, --cell at least 24",
+    )  # fmt: skip
+    group = parser.add_argument_group("layers")
+    add_options(group, FlareSettings, ["brightest", "without", "starburst"])
+    gain = group.add_argument(
+        "--gain", metavar="NAME=X", action="append", default=[], dest="gains", type=_gain,
+        help="factor of a layer (ghosts) or a ghost (g07-03), or one for each colour, NAME=R/G/B; repeatable, gains "
+        "multiply",
+    )  # fmt: skip
+    parser._option_string_actions["--tint"] = gain
+    group = parser.add_argument_group("photons, and what scatters them")
+    names = ("photons", "most_reflections", "kernel_px", "glare", "barrel", "sensor", "dust", "haze_per_mm", "seed")
+    add_options(group, FlareSettings, names, most_reflections=None)
+    parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=2, help="default: 2")
+
+
+def _gain(text: str) -> tuple[str, list[float]]:
+    """Type of --gain: a name, and factors of red, green and blue."""
+    name, _, rest = text.partition("=")
+    try:
+        found = [float(word) for word in rest.split("/")]
+    except ValueError:
+        found = []
+    if len(found) not in (1, 3) or not all(0 <= v < math.inf for v in found):
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected NAME=X or NAME=R/G/B, of at least 0")
+    return name, found * (3 // len(found))
+
+
+def _settings(args: argparse.Namespace) -> FlareSettings:
+    """The settings of the arguments, those of a quick look where it is one."""
+    gains: dict[str, tuple[float, float, float]] = {}
+    for name, factors in args.gains:
+        r, g, b = (a * b for a, b in zip(gains.get(name, (1.0, 1.0, 1.0)), factors, strict=True))
+        gains[name] = (r, g, b)
+    settings = replace(from_options(FlareSettings, args), gains=gains)
+    return settings.quick() if args.quick else settings
 
 
 def run(args: argparse.Namespace) -> int:
@@ -114,11 +164,12 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.flare.layers import kept_beside
     from neurolens.readers.any_format import read_any
 
-    complete(args)
     _check(args)
+    settings = args.settings = _settings(args)
     progress, began = Progress(quiet=args.quiet or args.json), time.perf_counter()
-    if args.preview:
-        progress.note(f"preview: {args.width} pixels wide, {args.bins} wavelengths, cells of {args.cell_px:g}")
+    if args.quick:
+        args.width = min(args.width, _QUICK_WIDTH)
+        progress.note(f"quick: {args.width} pixels wide, {settings.bins} wavelengths, cells of {settings.cell_px:g}")
     states = list(_states(args))
     model = fitted(args, states)
     tabled = read_any(args.file) if model is None else model.lens
@@ -152,16 +203,16 @@ def _check(args: argparse.Namespace) -> None:
         if args.out is None:
             raise InputError(_COMMAND, "--frames", f"({len(args.frames)})", "-o beside it")
         args.kept = "the frames that are there are kept: the same command goes on"
-    by_chance = args.photons or args.glare
-    args.fours = not by_chance and args.most_reflections == 4
-    if not by_chance and args.most_reflections not in (None, 2, 4):
-        raise InputError(_COMMAND, "--reflections", args.most_reflections, "2 or 4, or --photons or --glare beside it")
-    if args.polarised and (args.photons or args.fit):
-        raise InputError(_COMMAND, "--polarised", "(given)", "neither --photons nor --fit beside it: they average")
-    if args.photons and args.layers:
-        raise InputError(_COMMAND, "--layers", args.layers, "no --photons beside it: they tell no single ghosts apart")
-    args.most_reflections = args.most_reflections or 10
+    by_chance = args.photons or args.glare or args.barrel or args.sensor or args.dust or args.haze_per_mm
+    if not by_chance and args.most_reflections not in (None, 2):
+        expected = "2, or --photons or --glare beside it, whose light is reflected more often"
+        raise InputError(_COMMAND, "--reflections", args.most_reflections, expected)
+    if args.photons and args.brightest:
+        expected = "no --photons beside it: they tell no single ghosts apart"
+        raise InputError(_COMMAND, "--layers", args.brightest, expected)
     if args.out is not None:
+        from neurolens.frames.frame import Files
+
         Files.of(args.out)
     if args.path is not None:
         check_suffix(Path(args.path[1]), "--path", (".png", ".pdf", ".svg"))
@@ -179,12 +230,11 @@ def _states(args: argparse.Namespace) -> Iterator[argparse.Namespace]:
 
 
 class _Shot(NamedTuple):
-    """Lens, lights, the ghosts of each light, brightest first, which were looked for, and what draws them."""
+    """Lens, lights, the ghosts of each light, brightest first, and what draws them."""
 
     lens: Lens
     lights: list[Light]
     ghosts: list[list[Ghost]]
-    found: Ways
     tracer: GhostTracer | GhostModel
 
 
@@ -203,9 +253,8 @@ class _Shots:
         return self._last[1]
 
     def _made(self, args: argparse.Namespace) -> _Shot:
-        from neurolens.flare.ghosts import GhostTracer, ghost_pairs
-        from neurolens.flare.picture import RANKED, Ways, ghost_table, with_four
-        from neurolens.flare.polarised import PolarisedTracer
+        from neurolens.flare.ghosts import GhostTracer
+        from neurolens.flare.picture import RANKED, ghost_table
 
         state = args.focus, args.f_number, args.zoom
         if state not in self._lenses:
@@ -213,18 +262,16 @@ class _Shots:
             self._lenses[state] = _lens(args, self._tabled) if model is None else model.lens, model
         lens, model = self._lenses[state]
         lights = self.sources.at(args, lens, self._progress)
-        found = with_four(lens, lights) if args.fours else Ways(ghost_pairs(lens), 0, 0.0)
-        tracer = model or (PolarisedTracer if args.polarised else GhostTracer)(lens, found.ways)
+        tracer = model or GhostTracer(lens)
         rays = max(_FEWEST, RANKED // max(len(lights), 1))
-        return _Shot(lens, lights, [ghost_table(tracer, light, 550.0, rays) for light in lights], found, tracer)
+        return _Shot(lens, lights, [ghost_table(tracer, light, 550.0, rays) for light in lights], tracer)
 
 
 def _lens(args: argparse.Namespace, tabled: Lens) -> Lens:
     """The lens of a file in its state, coated."""
-    from neurolens.flare.ghosts import coated
+    from neurolens.flare.layers import with_coating
 
-    lens = state_of(args, tabled)
-    return lens if args.coating is None else coated(lens, args.coating)
+    return with_coating(state_of(args, tabled), args.settings)
 
 
 def _write_all(states: list[argparse.Namespace], shots: _Shots, progress: Progress) -> dict[str, Any]:
@@ -233,13 +280,12 @@ def _write_all(states: list[argparse.Namespace], shots: _Shots, progress: Progre
     from neurolens.render.pictures import read_metadata
 
     args, single, exposure = states[0], tuple[str, ...](), states[0].exposure
-    if args.layers:  # the same in all frames
-        some = [shots.at(state) for state in states[:: -(-len(states) // _RANKED_FRAMES)]]
+    if args.brightest:  # the same in all frames
+        some = [_job(state, shots.at(state)) for state in states[:: -(-len(states) // _RANKED_FRAMES)]]
         with progress.stage("brightest ghosts") as report:
-            ghosts = [(shot.tracer, shot.lights) for shot in some]
-            single = brightest(ghosts, _raster(args), settings_of(args), args.layers, report)
-        if len(single) < args.layers:
-            warn(f"layers of {len(single)} single ghosts, not {args.layers}: no other leaves light on the film")
+            single = brightest(some, report)
+        if len(single) < args.brightest:
+            warn(f"layers of {len(single)} single ghosts, not {args.brightest}: no other leaves light on the film")
     if args.frames is None:
         exposure = _write(args, shots, single, exposure, progress)
         return {"layers": single, "exposure": exposure or 0.0}
@@ -253,10 +299,12 @@ def _write_all(states: list[argparse.Namespace], shots: _Shots, progress: Progre
     return {"layers": single, "exposure": exposure or 0.0}
 
 
-def _raster(args: argparse.Namespace) -> Raster:
+def _job(args: argparse.Namespace, shot: _Shot) -> FlareJob:
+    from neurolens.flare.layers import FlareJob
     from neurolens.flare.picture import Raster
 
-    return Raster(args.film, args.width, max(1, round(args.width * args.film[1] / args.film[0])))
+    raster = Raster(args.film, args.width, max(1, round(args.width * args.film[1] / args.film[0])))
+    return FlareJob(shot.lens, shot.lights, raster, args.settings, threads=args.threads, ghosts=shot.tracer)
 
 
 def _write(
@@ -265,18 +313,21 @@ def _write(
     """Write a picture and its preview; the preview's exposure in stops, None where that is free and nothing is lit."""
     from neurolens.cameras.exact import placed_settings
     from neurolens.flare.layers import flare_layers, kept_beside, sum_of
+    from neurolens.frames.frame import Files
+    from neurolens.frames.picture import flare_channels
     from neurolens.render.exr_attributes import standard_attributes
     from neurolens.render.pictures import write_exr, write_png
 
-    files, shot, raster, space = Files.of(args.out), shots.at(args), _raster(args), shots.sources.colour_space(args)
+    files, shot, space = Files.of(args.out), shots.at(args), shots.sources.colour_space(args)
     files.spare(shots.sources.reads(args))
-    settings = replace(settings_of(args), single=single, ghosts=shot.tracer, keep=args.out)
-    found = flare_layers(shot.lens, shot.lights, raster, settings, progress)
+    job = replace(_job(args, shot), single=single, keep=args.out)
+    raster, found = job.raster, flare_layers(job, progress)
     total = sum_of(found, raster)
     if args.frames is None:  # frames have the same layers, dark ones too
         found = {name: picture for name, picture in found.items() if picture.any()}
     exposure = _exposure(total) if exposure is None else exposure
     told = {k: v for k, v in vars(args).items() if isinstance(v, str | int | float | list | tuple | None)}
+    told |= asdict(args.settings)
     about = {**_told(shot), "exposure": exposure, "settings": told}
     metadata = plain({"neurolens": __version__, "colour": space.stated, "flare": about})
     camera = placed_settings(shot.lens, args.film, args.focus)
@@ -300,9 +351,10 @@ def _exposure(picture: FloatArray) -> float | None:
 
 def _draw(shot: _Shot, name: str, out: Path) -> None:
     from neurolens.analysis.layout import lens_layout
+    from neurolens.flare.ghosts import ghost_pairs
     from neurolens.flare.picture import ghost_layout
 
-    pairs = shot.found.ways
+    pairs = ghost_pairs(shot.lens)
     pair = next((p for p in pairs if p.name == name), None)
     if pair is None or not shot.lights:
         expected = f"a ghost of this lens, as {pairs[0].name}, and a light" if pairs else "a lens with ghosts"
@@ -328,23 +380,15 @@ def _about(ghost: Ghost) -> dict[str, Any]:
 
 
 def _text(shot: _Shot, about: dict[str, Any]) -> str:
-    parts, fours = [f"{shot.lens.name}: {about['pairs']} pairs of surfaces"], len(shot.found.ways) - about["pairs"]
-    if shot.found.fours:
-        parts[0] += (
-            f", and {fours} of its {shot.found.fours} ghosts of four reflections: the others have "
-            f"{number(100 * shot.found.left)}% of all ghosts' light"
-        )
+    parts = [f"{shot.lens.name}: {about['pairs']} pairs of surfaces"]
     if about["fitted"]:
         parts[0] += f", {about['fitted']} ghosts of them fitted: the table is of the fit"
     head = ("ghost", "energy of the image's", "x mm", "y mm", "RMS radius mm", "rays that arrive %")
     for light, of_light in zip(shot.lights[:_SHOWN_LIGHTS], shot.ghosts, strict=False):
         all_of = sum(ghost.energy for ghost in of_light)
-        often = sum(ghost.energy for ghost in of_light if len(ghost.pair.reflections) > 2)
         parts.append(
             f"light at {light.azimuth_deg:g}, {light.elevation_deg:g} deg: {len(of_light)} ghosts reach the film's "
-            f"plane, with {number(100 * all_of)}% of the image's light"
-            + (f", {number(100 * often)}% by four reflections" if fours else "")
-            + "; the brightest at 550 nm:"
+            f"plane, with {number(100 * all_of)}% of the image's light; the brightest at 550 nm:"
         )
         cells = [
             [g.pair.name, number(g.energy), *map(number, g.centre_mm), number(g.size_mm), number(100 * g.passed)]

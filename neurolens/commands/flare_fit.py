@@ -9,12 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, warn
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_within, aperture_of, between, check_suffix, given_options
 from neurolens.commands.output import answer, number, table
-from neurolens.commands.render_files import warn
 
 if TYPE_CHECKING:
     from neurolens.flare.ghostmodel import GhostModel
@@ -62,8 +61,7 @@ def fitted(args: argparse.Namespace, states: Sequence[argparse.Namespace]) -> Gh
     from neurolens.flare.ghostfile import read_ghosts
 
     other = [name for name in given_options(args) if name not in _FREE]
-    other += [f"--{name}" for name in ("coating", "photons", "polarised") if getattr(args, name)]
-    other += ["--reflections"] * args.fours
+    other += [f"--{name}" for name in ("coating", "photons") if getattr(args, name)]
     other += ["--key focus"] * any(math.isfinite(s.focus) for s in states)
     other += ["--key zoom"] * any(s.zoom is not None for s in states)
     if other:
@@ -80,8 +78,10 @@ def stopped(args: argparse.Namespace, model: GhostModel) -> GhostModel:
     Raises:
         InputError: a stop wider than that of the fit.
     """
+    from neurolens.optics.states import set_lens
+
     lens = model.lens.with_aperture(aperture_of(args))
-    return replace(model, lens=lens if args.f_number is None else lens.at(f_number=args.f_number))
+    return replace(model, lens=lens if args.f_number is None else set_lens(lens, f_number=args.f_number))
 
 
 def run_fit(args: argparse.Namespace, lens: Lens | None, model: GhostModel | None) -> int:

@@ -9,11 +9,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, warn
 from neurolens.base.lensname import is_model
+from neurolens.base.options import add_options
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import aperture_of, positive, whole
-from neurolens.commands.render_files import warn
+from neurolens.commands.arguments import aperture_of, positive
+from neurolens.render.flaresettings import FlareSettings
 
 if TYPE_CHECKING:
     from neurolens.cameras.field import Field
@@ -52,11 +53,7 @@ def add_lights(parser: argparse.ArgumentParser) -> None:
         help="of --image: value of a colour, where a white card of radiance 1 is 1; pixels count in full from 2 T on, "
         "so that none switches on at once (default: 2)",
     )  # fmt: skip
-    group.add_argument(
-        "--most", metavar="N", type=whole(1, 10_000), default=32,
-        help="of --image and of a scene: the lights of the most energy; what is left out is said. With --frames a "
-        "scene has the same ones in all frames, and those of pictures fade before they are left out (default: 32)",
-    )  # fmt: skip
+    add_options(group, FlareSettings, ["most"])
 
 
 class Sources:
@@ -143,10 +140,11 @@ class Sources:
         from neurolens.cameras.build import Shot, make_camera
         from neurolens.cameras.exact import ExactCamera
         from neurolens.cameras.field import field_of
+        from neurolens.optics.states import set_lens
 
         state = args.focus, args.f_number, args.zoom
         if state not in self._fields and is_model(args.file):  # fitted ghosts, with their film
-            moved = (lens.film_z_mm or 0.0) - (lens.at(focus_m=math.inf).film_z_mm or 0.0)
+            moved = (lens.film_z_mm or 0.0) - (set_lens(lens, focus_m=math.inf).film_z_mm or 0.0)
             camera = ExactCamera(lens, film_mm=args.film, focus_m=math.inf, film_offset_mm=moved, progress=progress)
             self._fields[state] = field_of(camera, args.focus, "equidistant")
         elif state not in self._fields:

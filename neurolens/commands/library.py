@@ -103,6 +103,7 @@ def _record(file: Path, folder: Path) -> dict[str, Any]:
 def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
     """Draw a lens, write its page, and say what the index shows of it."""
     from neurolens.analysis.layout import thumbnail
+    from neurolens.base.html import html
     from neurolens.blender.pack import year_of
     from neurolens.commands.models import models_in
     from neurolens.evaluate import pages
@@ -123,14 +124,18 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
         figures.append({"file": picture.name, "title": title})
     models = [m for m in models_in(library() / "models") if m["lens"] == lens.lens_id]
     doubts = [*row["doubts"], *rim_doubts(lens), *notes]
-    source = pages.facts({"designer": lens.designer or pages.DASH, "source": lens.source, "rims": lens.rims})
-    body = pages.html("<p><a href='../index.html'>All lenses</a></p><h1>{}</h1>{}", lens.name, source)
-    body += pages.joined("<p class='note'>{}</p>", doubts) + pages.joined("<p>{}</p>", filter(None, [lens.notes]))
-    body += pages.figure_grid(folder, figures)
     names = [Path(m["file"]).stem.removeprefix(f"{lens.lens_id}.") for m in models]
-    body += pages.section("Models", pages.table(names, models, _model_columns()))
-    body += pages.section("File", pages.html("<pre>{}</pre>", read_text(file)))
-    atomic_write_text(folder / "index.html", pages.page(lens.name, body))
+    page = html(
+        "lens.html",
+        title=lens.name,
+        source=pages.flat({"designer": lens.designer or pages.DASH, "source": lens.source, "rims": lens.rims}),
+        doubts=doubts,
+        about=lens.notes,
+        shown=pages.figures_of(folder, figures),
+        models=pages.table(names, models, _model_columns()),
+        file=read_text(file),
+    )
+    atomic_write_text(folder / "index.html", page)
     best = min((m["rms_um"] for m in models if m["rms_um"] is not None), default=None)
     keys = ("name", "efl_mm", "f_number", "half_field_deg", "refractions", "states")
     times = [pages.number(m, "fused_ns_per_ray.min") or pages.number(m, "ns_per_ray.min") for m in models]
@@ -146,8 +151,9 @@ def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
     from neurolens.analysis.spots import spots
     from neurolens.commands.analyse import analysis_of
     from neurolens.evaluate.figures import draw_breathing
+    from neurolens.optics.states import set_lens
 
-    scene = Scene(lens.at(focus_m=math.inf, focus="best"))
+    scene = Scene(set_lens(lens, focus_m=math.inf, focus="best"))
 
     def drawn(what: str) -> Any:
         def draw(path: Path) -> None:
@@ -161,7 +167,7 @@ def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
         """Lights at infinity, the lens focused near; at three points of the field."""
         near = 1e-3 * _BOKEH_FOCUS * abs(scene.first_order.efl_mm)
         edge = max(scene.default_fields())
-        blurred = Scene(lens.at(focus_m=near, focus="best"))
+        blurred = Scene(set_lens(lens, focus_m=near, focus="best"))
         found = spots(blurred, [share * edge for share in _BOKEH_FIELDS], rings=20, shift_mm=[0.0])
         analysis_of("spots").draw(replace(found, airy_um=math.nan), path, lens.name, f"focused at {near:.3g} m")
 
@@ -195,25 +201,15 @@ def _model_columns() -> tuple[Any, ...]:
 
 def _index(records: Sequence[Mapping[str, Any]]) -> str:
     """All lenses in a table with thumbnails, which searches and sorts by itself."""
-    from neurolens.evaluate import pages
-    from neurolens.evaluate.survey_page import TABLE_SCRIPT, sorting_table
+    from neurolens.base.html import html
+    from neurolens.evaluate.pages import Column
 
     columns = (
-        pages.Column("year", "year", digits=4), pages.Column("f (mm)", "efl_mm", digits=4),
-        pages.Column("f-number", "f_number"), pages.Column("half field (°)", "half_field_deg"),
-        pages.Column("refractions", "refractions"), pages.Column("states", "states"),
-        pages.Column("fastest model (ns)", "ns", about="a ray, one core, as C where that was timed"),
-        pages.Column("best model (µm)", "rms_um", about="film-equivalent RMS"),
+        Column("year", "year", digits=4), Column("f (mm)", "efl_mm", digits=4), Column("f-number", "f_number"),
+        Column("half field (°)", "half_field_deg"), Column("refractions", "refractions"), Column("states", "states"),
+        Column("fastest model (ns)", "ns", about="a ray, one core, as C where that was timed"),
+        Column("best model (µm)", "rms_um", about="film-equivalent RMS"),
     )  # fmt: skip
-    rows = []
-    for r in records:
-        link = "<a href='./{}/index.html'>{}</a>" if r["page"] else "{1}"
-        row = "<tr data-kinds='all'><th scope='row'>{}<small>{}</small></th>{}{}<td class='t'>{}</td></tr>"
-        name = pages.html(link, r["page"], r.get("name", r["lens"]))
-        said = pages.joined("{}", [r["fault"]] if "fault" in r else r.get("doubts", ()), "<br>")
-        cells = pages.sorting_cells(r, columns)
-        rows.append(pages.html(row, name, r.get("designer") or "", pages.drawing(r.get("layout", "")), cells, said))
-    heads = pages.joined("<th scope='col'>{}</th>", ("lens", "section")) + pages.sorting_heads(columns)
-    box = pages.html("<input class='kind' type='checkbox' value='all' checked hidden>")
-    table = sorting_table(heads + pages.html("<th scope='col'>doubts</th>"), pages.joined("{}", rows), box)
-    return pages.page("Lenses", pages.html("<h1>{} lenses</h1>{}{}", len(records), table, TABLE_SCRIPT))
+    missing = {"fault": "", "designer": "", "layout": "", "doubts": ()}
+    rows = [{"name": r["lens"], **missing, **r} for r in records]
+    return html("library.html", title="Lenses", records=rows, columns=columns)

@@ -8,6 +8,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
+from neurolens.base.errors import warn
 from neurolens.base.progress import Progress, duration
 from neurolens.commands.arguments import (
     add_exposure,
@@ -21,7 +22,6 @@ from neurolens.commands.arguments import (
 )
 from neurolens.commands.output import answer
 from neurolens.commands.render import film_size
-from neurolens.commands.render_files import Files, warn
 from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
@@ -68,13 +68,14 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Render, write both pictures, print a summary."""
-    preview = Files.of(args.out).preview
     from neurolens.cameras.build import make_camera
+    from neurolens.frames.frame import Files
     from neurolens.mitsuba import load_scene, render
     from neurolens.mitsuba.library import libraries
     from neurolens.render.exr_attributes import standard_attributes
     from neurolens.render.pictures import write_exr, write_png
 
+    preview = Files.of(args.out).preview
     scene = load_scene(args.scene, args.variant)
     width, height = (int(v) for v in scene.sensors()[0].film().size())
     progress = Progress(quiet=args.quiet)

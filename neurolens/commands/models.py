@@ -88,12 +88,12 @@ def _places() -> list[Path]:
 
 def models_in(folder: Path) -> Iterator[dict[str, Any]]:
     """What the cards of a folder say, with the times beside them; a file that is no model is left out."""
-    from neurolens.modelfile.onnxfile import card_in, read_metadata
+    from neurolens.modelfile.metadata import read_card
 
     times = _times(folder / "index.json") | _times(folder.parent / "results.json")
     for file in sorted(folder.glob("*.onnx")):
         try:
-            card = card_in(file, read_metadata(file)[2])
+            card = read_card(file)
             domain, errors = card["domain"], card["errors"]
             row = {
                 "file": str(file),

@@ -10,17 +10,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path, atomic_write_text, library
+from neurolens.base.files import atomic_path, atomic_write_text
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import add_glass, add_json, add_lens, add_output, check_run_folder, whole
 from neurolens.commands.output import answer, number, table
 from neurolens.commands.plan_frames import run_plan_frames
 from neurolens.commands.render_frames import add_frames
+from neurolens.commands.trade import look_of, run_trade, shipped_models
 from neurolens.evaluate.records import NOISY, plain, program
 
 if TYPE_CHECKING:
     from neurolens.evaluate.plan import Choice, Plan
-    from neurolens.optics.prescription import Lens
 
 # Repeated here, so that help imports no torch; a test compares with `evaluate.plan`.
 TARGETS = ("render", "c", "onnx", "osl", "glsl")
@@ -112,21 +112,6 @@ def _add_look(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def look_of(args: argparse.Namespace) -> dict[str, Any]:
-    """What --comp, --denoise and --zoom say, as arguments of `evaluate.probe.probe`."""
-    return {"afterwards": args.afterwards, "denoised": args.denoise, "zoom": args.zoom}
-
-
-def shipped_models(lens: Lens, zoom: str | None) -> list[Path]:
-    """The models that ship of a lens, or of a state of its zoom, by its id and its figures."""
-    from neurolens.modelfile.onnxfile import read_checked
-
-    name = lens.lens_id if zoom is None else f"{lens.lens_id}-{zoom}"
-    files = sorted((library() / "models").glob(f"{name}.*.onnx"))
-    figures = lens.at(zoom=zoom).sha256 if files else ""
-    return [file for file in files if read_checked(file)[1]["lens"]["sha256"] == figures]
-
-
 class Seconds(float):
     """A budget of time."""
 
@@ -207,8 +192,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_trade(args: argparse.Namespace) -> int:
-    from neurolens.commands.trade import run_trade
-
     others = {"--explain": args.explain, "--sample-map": args.sample_map, "--frames": args.frames, "--key": args.key}
     for option, given in others.items():
         if given:

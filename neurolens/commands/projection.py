@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, warn
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import CAMERAS_HELP, add_json, add_option, add_output, check_folder
 from neurolens.commands.output import answer, number, table
-from neurolens.commands.render_files import warn
 from neurolens.commands.stmap import LIGHT_NM, add_picture, add_state, shot_of
 from neurolens.evaluate.records import plain
 
@@ -38,8 +37,8 @@ the first pixel, OpenCV's from its centre), NVIDIA's names for f-theta. A projec
 field is said, and an error of a planar one beyond 85 degrees. Needs the extra "train" (torch)."""
 _EPILOG = """\
 examples:
-  neurolens projection laikin_double_gauss_50 --size 1920x1080 --film 36x20.25 --projection opencv -o gauss
-  neurolens projection models/NAME.onnx --size 1920x1280 --film 36x24 --projection f-theta --focus 2 -o fisheye"""
+  neurolens projection laikin_double_gauss_50 --width 1920 --film 36x20.25 --projection opencv -o gauss
+  neurolens projection models/NAME.onnx --width 1920 --film 36x24 --projection f-theta --focus 2 -o fisheye"""
 
 
 def add_parser(subparsers: Any) -> None:

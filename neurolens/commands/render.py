@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurolens import __version__
 from neurolens.base.bounds import FILM_MM
-from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.cluster import Dask
+from neurolens.base.errors import InputError, NeurolensError, warn
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import (
     CAMERAS_HELP,
+    Parser,
     add_camera,
     add_exposure,
     add_json,
@@ -22,36 +22,27 @@ from neurolens.commands.arguments import (
     add_output,
     aperture_of,
     between,
+    check_folder,
+    check_suffix,
     whole,
 )
 from neurolens.commands.output import answer
-from neurolens.commands.render_dask import run_on_dask
 from neurolens.commands.render_files import (
-    Files,
     Stopping,
     Unfinished,
     add_safety,
     add_tile,
     so_far,
     summary,
-    warn,
     watch_of,
-    write_pictures,
 )
-from neurolens.commands.render_frames import add_frames, run_frames
+from neurolens.commands.render_frames import add_frames, frames_by_file, missing_frames
 from neurolens.evaluate.records import plain
-from neurolens.render.film_settings import COLOUR_SPACE_NAMES, WAVELENGTH_MODES, WAVELENGTH_SAMPLINGS, FilmSettings
+from neurolens.render.film_settings import COLOUR_SPACE_NAMES, WAVELENGTH_MODES, WAVELENGTH_SAMPLINGS
 
 if TYPE_CHECKING:
-    from neurolens.cameras.build import Shot
-    from neurolens.cameras.contract import Camera, FloatArray
-    from neurolens.optics.apertures import Aperture
-    from neurolens.optics.prescription import Lens
-    from neurolens.render.renderer import RenderResult
-    from neurolens.render.scene import CameraSettings, Scene
-
-_LENS_STATE = "focus", "f_number", "zoom"
-_FLARE_FRAMES = 16  # that tell which lights and ghosts are brightest
+    from neurolens.cameras.contract import FloatArray
+    from neurolens.frames.frame import Frame, Prepared
 
 _DESCRIPTION = """\
 Path-trace a scene (experiments/scenes/*.toml) and write OpenEXR, linear sRGB or ACEScg, with
@@ -126,7 +117,6 @@ def add_parser(subparsers: Any) -> None:
         help="workers, each pinned to a core if there are as many as cores (default: 2)",
     )  # fmt: skip
     add_json(parser, quiet=True)
-    parser.set_defaults(position_m=None, look_at_m=None, frame=None, shared=None)
     parser.set_defaults(run=run_kept, kept="no picture was written; older files of that name are untouched")
 
 
@@ -156,171 +146,70 @@ def _add_colour(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def film_of(settings: FilmSettings, args: argparse.Namespace) -> FilmSettings:
-    """The scene's [film] table with the command line's options."""
-    given = {name: getattr(args, name) for name in ("colour_space", "white_balance", "wavelength_sampling")}
-    given["wavelengths"] = args.wavelength_mode
-    return replace(settings, **{name: value for name, value in given.items() if value is not None})
-
-
 def run_kept(args: argparse.Namespace) -> int:
     """As `run`, or tiles merged, with running out of memory as a one-line error."""
-    from neurolens.commands.merge import run_merge
-
     if not args.merge:
         if len(args.scene) != 1 or args.camera is None:
             missing = "SCENE" if len(args.scene) != 1 else "--camera"
             raise InputError("neurolens render", missing, " ".join(map(str, args.scene)) or "(none)", "one of it")
         (args.scene,) = args.scene
     try:
-        return (run_merge if args.merge else run)(args)
+        return (_run_merge if args.merge else run)(args)
     except MemoryError as error:
         raise NeurolensError(f"render: out of memory ({str(error) or 'no more said'})") from None
 
 
 def run(args: argparse.Namespace) -> int:
-    """Render one picture, or one a frame."""
-    if args.dask is not None:
-        return run_on_dask(args, prepared, render_alone)
-    if args.frames is not None:
-        return run_frames(args, _run_one)
-    if args.key:
+    """Render one picture, or one for each frame; the exit code of the first that fails."""
+    if args.frames is None and args.key:
         raise InputError("neurolens render", "--key", args.key[0], "--frames beside it")
-    return _run_one(args)
+    frames = {args.out: frame_of(args)} if args.frames is None else frames_by_file(args, frame_of(args))
+    missing = frames if args.frames is None else missing_frames(args, frames)
+    if args.dask is not None:
+        return _run_on_dask(args, frames, missing)
+    from neurolens.frames.frame import prepare
+    from neurolens.frames.picture import flare_choice, flare_of
+
+    choice = None
+    for number, (out, frame) in enumerate(missing.items()):
+        progress = Progress(quiet=args.quiet)
+        made = prepare(frame, out, progress)
+        choice = choice if number else flare_choice(list(frames.values()), made, args.threads)
+        code = _render(args, made, flare_of(made, choice, args.threads, progress), progress)
+        if code:
+            return code
+    return 0
 
 
-@dataclass(frozen=True)
-class Prepared:
-    """What the arguments of a picture name, read and checked; `rows`: of its tile, None: all of them."""
+def frame_of(args: argparse.Namespace) -> Frame:
+    """The frame that the options describe."""
+    from neurolens.frames.frame import Frame
 
-    files: Files
-    scene: Scene
-    film: FilmSettings
-    camera: Camera
-    size: tuple[int, int]
-    rows: tuple[int, int] | None
-
-    def metadata(self, args: argparse.Namespace) -> dict[str, Any]:
-        return {"version": __version__, "scene": str(args.scene), "camera": plain(self.camera.settings)}
-
-
-def prepared(args: argparse.Namespace, progress: Progress) -> Prepared:
-    """Read and check all that a picture needs, before it is rendered."""
-    from neurolens.cameras.build import make_camera
-    from neurolens.render.film import PixelGrid
-    from neurolens.render.illuminants import check_name
-    from neurolens.render.scene import files_named, load_scene, seen_from
-    from neurolens.render.tiles import rows_of, tile_path
-
-    files = Files.of(tile_path(args.out, args.tile))
-    scene = seen_from(load_scene(args.scene), args.scene, args.position_m, args.look_at_m)
-    files.spare(args.scene.parent / name for name in files_named(scene.settings))
-    settings, film = scene.settings.camera, film_of(scene.settings.film, args)
-    if args.white_balance is not None:
-        check_name(args.scene, "--white-balance", args.white_balance, scene.illuminants)
-    if args.film is not None:
-        settings = replace(settings, film_width_mm=args.film[0], film_height_mm=args.film[1])
-        if args.width is None and args.height is None:
-            args.width = settings.width
-    width, height = picture_size(settings, args.width, args.height)
-    PixelGrid(width, height, (settings.film_width_mm, settings.film_height_mm))  # before the slow make_camera
-    rows = None if args.tile is None else rows_of(height, args.tile)
-    camera = make_camera(args.camera, shot_of(settings, args, scene.aperture), progress)
-    for note in (*camera.settings.get("notes", ()), *_pixel_notes(camera, width)):
-        warn(note)
-    return Prepared(files, scene, film, camera, (width, height), rows)
-
-
-def _run_one(args: argparse.Namespace) -> int:
-    """Render, write both pictures, print a summary."""
-    progress = Progress(quiet=args.quiet)
-    made = prepared(args, progress)
-    flare = _flare(made, args, progress)
-    with Stopping() as stopping, progress.stage(f"render {made.scene.name}, {made.camera.name}") as report:
-        result = _rendered(made, args, args.threads, progress=report, watch=watch_of(args, made.files, stopping))
-        if not result.stats["complete"]:
-            raise Unfinished
-    return _deliver(args, made, result, stopping, flare)
-
-
-def render_alone(args: argparse.Namespace) -> None:
-    """Render in this process and write the EXR alone, as a task of a farm does."""
-    quiet = Progress(quiet=True)
-    made = prepared(args, quiet)
-    result = _rendered(made, args, 1)
-    write_pictures(made.files, result, made.metadata(args), made.film, args, _flare(made, args, quiet))
-    made.files.preview.unlink()
-
-
-def _rendered(made: Prepared, args: argparse.Namespace, threads: int, **more: Any) -> RenderResult:
-    from neurolens.render.renderer import render
-
-    width, height = made.size
-    return render(
-        made.scene, made.camera, width=width, height=height, samples=args.samples, seed=args.seed,
-        threads=threads, max_depth=args.max_depth, film=made.film, rows=made.rows, **more,
+    return Frame.of(
+        args.scene, args.camera, focus_m=args.focus, f_number=args.f_number, efl_mm=args.efl, zoom=args.zoom,
+        field_deg=args.field, focusing=args.focusing, aperture=aperture_of(args), film_offset_mm=args.film_offset,
+        vignetting=args.vignetting, glass_files=tuple(args.glass_files), film_mm=args.film,
+        width=args.width, height=args.height, samples=args.samples, seed=args.seed, max_depth=args.max_depth,
+        colour_space=args.colour_space, white_balance=args.white_balance, wavelengths=args.wavelength_mode,
+        wavelength_sampling=args.wavelength_sampling, half=args.half, channels=args.channels, exposure=args.exposure,
+        tile=args.tile,
     )  # fmt: skip
 
 
-def _flare(made: Prepared, args: argparse.Namespace, progress: Progress) -> dict[str, FloatArray]:
-    """The layers of flare that a scene asks for."""
-    scene, camera = made.scene, made.camera
-    if scene.settings.flare is None:
-        return {}
-    lens = getattr(camera, "lens", None)
-    if lens is None:
-        warn(f"no flare of {camera.name}: that takes a lens file that is traced as it is")
-        return {}
-    from neurolens.flare.layers import scene_choice, scene_flare
-    from neurolens.flare.picture import Raster
+def _render(args: argparse.Namespace, made: Prepared, flare: Mapping[str, FloatArray], progress: Progress) -> int:
+    """Render a frame until it is done or a signal asks to stop, write its pictures, and print a summary."""
+    from neurolens.frames.picture import write_pictures
 
-    raster = Raster(camera.film_mm, *made.size)
-    try:
-        if args.shared is not None and args.shared.flare is None:
-            args.shared.flare = scene_choice(list(_flare_frames(scene, lens, args)), raster, args.threads)
-        choice = None if args.shared is None else args.shared.flare
-        return scene_flare(scene, lens, raster, made.film.white_balance, args.threads, progress, choice)
-    except InputError as error:
-        raise InputError(args.scene, f"[flare]: {error.file}, {error.field}", error.value, error.expected) from None
-
-
-def _flare_frames(scene: Scene, lens: Lens, args: argparse.Namespace) -> Iterator[tuple[Scene, Lens]]:
-    """The scene and the lens in some of the frames that a command makes."""
-    from neurolens.cameras.build import make_camera
-    from neurolens.render.scene import seen_from
-
-    lenses = {tuple(getattr(args, name) for name in _LENS_STATE): lens}
-    states = args.shared.states
-    for values in states[:: -(-len(states) // _FLARE_FRAMES)]:
-        there = argparse.Namespace(**vars(args) | values)
-        state = tuple(getattr(there, name) for name in _LENS_STATE)
-        if state not in lenses:
-            shot = shot_of(scene.settings.camera, there, scene.aperture)
-            lenses[state] = make_camera(args.camera, shot, Progress(quiet=True)).lens  # type: ignore[attr-defined]
-        yield seen_from(scene, args.scene, there.position_m, there.look_at_m), lenses[state]
-
-
-def _pixel_notes(camera: Camera, width: int) -> list[str]:
-    """A sentence on a model whose error is larger than the pixels of a picture so many wide."""
-    error = (camera.settings.get("card") or {}).get("errors", {}).get("rms_um") or 0.0
-    pixel = 1e3 * camera.film_mm[0] / width
-    return [f"the model's RMS error of {error:.3g} um is more than a pixel, {pixel:.3g} um"] if error > pixel else []
-
-
-def _deliver(
-    args: argparse.Namespace,
-    made: Prepared,
-    result: RenderResult,
-    stopping: Stopping,
-    flare: Mapping[str, FloatArray],
-) -> int:
-    """Write the pictures, complete or not, and print a summary; the exit code."""
     files = made.files
+    with Stopping() as stopping, progress.stage(f"render {made.name}") as report:
+        result = made.render(args.threads, report, watch_of(args, files, stopping))
+        if not result.stats["complete"]:
+            raise Unfinished
     if stopping():
         args.kept = files.kept()
     if not result.stats["paths"]:
         return stopping.say(args.kept)
-    write_pictures(files, result, made.metadata(args), made.film, args, flare)
+    write_pictures(made, result, flare)
     if dropped := result.stats["dropped_samples"]:
         warn(f"{dropped} of {result.stats['paths']} samples were not finite and count as black")
     if not result.stats["complete"]:
@@ -332,35 +221,48 @@ def _deliver(
     return answer(args, data, lambda: summary(stats, files))
 
 
-def shot_of(settings: CameraSettings, args: argparse.Namespace, aperture: Aperture | None = None) -> Shot:
-    """The scene's camera settings (and shape of the stop) with the command line's options."""
-    from neurolens.cameras.build import Shot
+def _run_on_dask(args: argparse.Namespace, frames: Mapping[Path, Frame], missing: Mapping[Path, Frame]) -> int:
+    """Render frames by tiles on a cluster."""
+    from neurolens.frames.farm import kept, render_frames
 
-    return Shot(
-        film_mm=(settings.film_width_mm, settings.film_height_mm),
-        focus_m=settings.focus_m if args.focus is None else args.focus,
-        f_number=settings.f_number if args.f_number is None else args.f_number,
-        efl_mm=args.efl,
-        zoom=args.zoom,
-        field_deg=args.field,
-        focus=args.focusing,
-        aperture=aperture_of(args) or aperture,
-        wavelength_nm=settings.wavelengths_nm,
-        # A scene's f-number is clamped to the lens; one of the command line must be possible.
-        clamp_f_number=args.f_number is None,
-        film_offset_mm=args.film_offset,
-        pupil=args.pupil,
-        vignetting=args.vignetting,
-    )
+    for option, value in (("--tile", args.tile), ("--keep-checkpoint", args.keep_checkpoint or None)):
+        if value is not None:
+            raise InputError("neurolens render", option, value, "left out beside --dask")
+    if not missing:
+        return 0
+    folder, progress = args.out.with_name(f"{args.out.name}.tiles"), Progress(quiet=args.quiet)
+    args.kept = kept(folder)
+    with Dask(args.dask) as executor:
+        pictures = render_frames(
+            missing, executor, folder, shown=list(frames.values()), restart=args.restart, progress=progress
+        )
+    return _say_pictures(args, pictures)
 
 
-def picture_size(settings: CameraSettings, width: int | None, height: int | None) -> tuple[int, int]:
-    """Width and height; a missing one follows from the other and the film's shape."""
-    shape = settings.film_width_mm / settings.film_height_mm
-    if width is None and height is None:
-        return settings.width, settings.height
-    found_width = max(1, round((height or 0) * shape)) if width is None else width
-    return found_width, max(1, round(found_width / shape)) if height is None else height
+def _run_merge(args: argparse.Namespace) -> int:
+    """Put tiles together."""
+    _check_alone(args)
+    check_suffix(args.out, "--output", (".exr",))
+    check_folder(args.out, "--output")
+    from neurolens.render.tiles import merge_tiles
+
+    return _say_pictures(args, merge_tiles(args.scene, args.out, args.exposure))
+
+
+def _check_alone(args: argparse.Namespace) -> None:
+    """Refuse no tiles at all, and options that tiles have settled already; raises InputError."""
+    parser, taken = Parser(), ("scene", "merge", "out", "exposure", "quiet", "json")
+    add_parser(parser.add_subparsers())
+    for name, unset in vars(parser.parse_args(["render", "-o", "a.exr"])).items():
+        if name not in taken and getattr(args, name) != unset:
+            option = f"--{name.replace('_', '-')}"
+            raise InputError("neurolens render", option, "(beside --merge)", "tiles, -o and --exposure alone")
+    if not args.scene:
+        raise InputError("neurolens render", "--merge", "(no tiles)", "the tiles of a render")
+
+
+def _say_pictures(args: argparse.Namespace, pictures: Sequence[Mapping[str, Any]]) -> int:
+    return answer(args, {"pictures": pictures}, lambda: "\n".join(str(p["file"]) for p in pictures))
 
 
 def film_size(text: str) -> tuple[float, float]:

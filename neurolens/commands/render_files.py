@@ -1,4 +1,4 @@
-"""Files of `neurolens render` (picture, preview, checkpoint) and its reaction to signals."""
+"""Options of `neurolens render` for farms and long renders, its reaction to signals, and its summary."""
 
 from __future__ import annotations
 
@@ -6,25 +6,17 @@ import argparse
 import signal
 import sys
 import time
-import warnings
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning, printable
-from neurolens.base.files import check_writable
+from neurolens.base.errors import printable, warn
 from neurolens.base.progress import duration
 from neurolens.base.signals import handled
-from neurolens.commands.arguments import check_folder, check_suffix, positive
-from neurolens.commands.farm import add_dask
-from neurolens.evaluate.records import plain
+from neurolens.commands.arguments import add_dask, positive
 
 if TYPE_CHECKING:
-    from neurolens.cameras.contract import FloatArray
-    from neurolens.render.colour import ColourSpace
-    from neurolens.render.film_settings import FilmSettings
+    from neurolens.frames.frame import Files
     from neurolens.render.renderer import RenderResult, Watch
 
 _AT_ONCE_S = 1.0
@@ -71,43 +63,6 @@ def add_safety(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Files:
-    """Files of a render: the EXR, the PNG beside it, and the temporary checkpoint."""
-
-    out: Path
-    preview: Path
-    checkpoint: Path
-
-    @classmethod
-    def of(cls, out: Path) -> Files:
-        """The files of `--output`; refuses names that cannot be written before anything is rendered.
-
-        Raises:
-            InputError: not .exr, or no such folder.
-            OSError: a folder that cannot be written, a folder of that name.
-        """
-        check_suffix(out, "--output", (".exr",))
-        check_folder(out, "--output")
-        files = cls(out, out.with_suffix(".png"), out.with_name(f"{out.name}.part"))
-        for path in (files.out, files.preview, files.checkpoint):
-            check_writable(path)
-        return files
-
-    def spare(self, inputs: Iterable[Path]) -> None:
-        """Raise InputError if an output is one of `inputs`, such as a texture with the preview's name."""
-        for read in inputs:
-            for written in (self.out, self.preview, self.checkpoint):
-                if written.exists() and read.exists() and written.samefile(read):
-                    raise InputError(self.out, "--output", written.name, f"another name: the scene reads {read}")
-
-    def kept(self) -> str:
-        """How to resume a render that ended early."""
-        if self.checkpoint.exists():
-            return f"the same command resumes from {self.checkpoint}"
-        return "there is no checkpoint to resume from"
-
-
 class Stopping:
     """Inside the block, Ctrl-C, SIGTERM and SIGHUP first request a stop; a second signal takes its usual effect.
 
@@ -149,11 +104,6 @@ class Unfinished(Exception):
     """Leaves the block of a `Stopping`, and a stage of the progress without its final line."""
 
 
-def warn(text: str) -> None:
-    """A warning, which the command line prints to stderr."""
-    warnings.warn(text, NeurolensWarning, stacklevel=2)
-
-
 def watch_of(args: argparse.Namespace, files: Files, stop: Callable[[], bool]) -> Watch:
     """Preview, checkpoint and stop of the command line."""
     from neurolens.render.pictures import write_png
@@ -168,86 +118,6 @@ def watch_of(args: argparse.Namespace, files: Files, stop: Callable[[], bool]) -
         stop=stop,
         note=warn,
     )
-
-
-def write_pictures(
-    files: Files,
-    result: RenderResult,
-    metadata: dict[str, Any],
-    film: FilmSettings,
-    args: argparse.Namespace,
-    flare: Mapping[str, FloatArray],
-) -> None:
-    """Write EXR and PNG; if they cannot be written, the checkpoint.
-
-    Args:
-        flare: layers by name, [H, W, 3] linear sRGB, which are to be added.
-
-    Raises:
-        NeurolensError: they cannot be written; with the way to resume.
-    """
-    from neurolens.render.colour import COLOUR_SPACES
-    from neurolens.render.exr_attributes import standard_attributes
-    from neurolens.render.job import MEANING
-    from neurolens.render.pictures import write_exr, write_png
-    from neurolens.render.tiles import rows_of, windows
-
-    space = COLOUR_SPACES[film.colour_space]
-    told = metadata | {"render": plain(result.stats)}
-    told["colour"] = space.stated
-    layers: dict[str, FloatArray] = {}
-    if args.channels == "all" or not result.stats["complete"]:
-        layers, told["layers"] = asdict(result.layers), MEANING
-    width, height = result.stats["width"], result.stats["height"]
-    rows = (0, height) if args.tile is None else rows_of(height, args.tile)
-    layers |= flare_channels({name: picture[slice(*rows)] for name, picture in flare.items()}, space)
-    attributes = standard_attributes(metadata["camera"], width, height, args.frame)
-    if args.tile is not None:
-        number, count = args.tile
-        told["tile"] = {"number": number, "of": count, "frame": args.frame, "half": args.half}
-        told["tile"]["identity"] = plain(result.identity)
-        attributes |= windows(width, height, rows)
-    try:
-        write_exr(
-            files.out, result.rgb, half=args.half, metadata=told, space=space, layers=layers, attributes=attributes
-        )
-        write_png(files.preview, result.rgb, args.exposure)
-    except (OSError, NeurolensError) as error:
-        raise NeurolensError(f"{_said(error)}; {_rescued(files, result)}") from None
-
-
-def flare_channels(flare: Mapping[str, FloatArray], space: ColourSpace) -> dict[str, FloatArray]:
-    """The channels of layers of flare in a colour space, of pictures [H, W, 3] linear sRGB by name."""
-    from neurolens.render.colour import SRGB, conversion, converted
-
-    channels: dict[str, FloatArray] = {}
-    for name, picture in flare.items():
-        colour = picture if space is SRGB else converted(picture, conversion(SRGB, space)).astype(picture.dtype)
-        channels |= {f"{name}.{c}": colour[..., k] for k, c in enumerate("RGB")}
-    return channels
-
-
-def _rescued(files: Files, result: RenderResult) -> str:
-    """Save a render whose picture cannot be written; returns how to resume.
-
-    A checkpoint is larger than the picture (64 bytes per pixel), but the disk may be full only for a moment, or the
-    picture itself may be refused.
-    """
-    try:
-        assert result.save is not None
-        result.save()
-    except (OSError, NeurolensError, MemoryError) as error:
-        if files.checkpoint.exists():
-            return f"only a part of the render is kept ({_said(error)}): {files.kept()}"
-        return f"the render is lost, for the checkpoint cannot be written either ({_said(error)})"
-    return f"the render is kept: {files.kept()}"
-
-
-def _said(error: BaseException) -> str:
-    if not isinstance(error, OSError):
-        return str(error) or type(error).__name__
-    place = "" if error.filename is None else f"{error.filename}: "
-    return f"{place}{error.strerror or error}"
 
 
 def so_far(result: RenderResult, files: Files) -> str:

@@ -5,18 +5,19 @@ from __future__ import annotations
 import argparse
 import math
 import re
-import warnings
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from neurolens.base.bounds import F_NUMBER, FOCAL_MM, said, within
-from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.errors import InputError, warn
 from neurolens.base.files import read_rows
 from neurolens.base.tomlfile import reject_unknown
-from neurolens.commands.render_files import Files
 from neurolens.render.scenetables import FARTHEST_M
+
+if TYPE_CHECKING:
+    from neurolens.frames.frame import Frame
 
 _COMMAND = "neurolens render"
 _MOST = 100_000
@@ -73,47 +74,38 @@ def add_frames(parser: argparse.ArgumentParser, does: str = _RENDERED, names: Se
     )  # fmt: skip
 
 
-@dataclass
-class Shared:
-    """What the frames of a command share: options that keys set in each, and the `Choice` of flare once it is made."""
-
-    states: list[dict[str, Any]]
-    flare: Any = None
-
-
-def run_frames(args: argparse.Namespace, render: Callable[[argparse.Namespace], int]) -> int:
-    """Render the frames that are missing, by `render`, as the keys say; the exit code of the first that fails.
-
-    Warns:
-        NeurolensWarning: frames that exist are kept, by whatever keys they were rendered.
+def frames_by_file(args: argparse.Namespace, frame: Frame) -> dict[Path, Frame]:
+    """The frames of --frames by the files of their pictures; `frame` has the settings that no key sets.
 
     Raises:
         InputError: a key that is none, or of a quantity that the command line sets too.
     """
-    for each in shots_of(args):
-        code = render(each)
-        if code:
-            return code
-    return 0
+    frames = {}
+    for number, digits, values in frames_of(args):
+        changes = {"focus_m" if name == "focus" else name: value for name, value in values.items()}
+        out = args.out.with_name(f"{args.out.stem}.{digits}{args.out.suffix}")
+        frames[out] = replace(frame, **changes, number=number, seed=frame.seed + number)
+    return frames
 
 
-def shots_of(args: argparse.Namespace) -> Iterator[argparse.Namespace]:
-    """The arguments of every frame that is missing; warns and raises as `run_frames`."""
+def missing_frames(args: argparse.Namespace, frames: Mapping[Path, Frame]) -> dict[Path, Frame]:
+    """The frames that are to be rendered: without --restart those that do not exist, or that have a checkpoint.
+
+    Warns:
+        NeurolensWarning: frames that exist are kept, whatever keys they were rendered by.
+    """
+    from neurolens.frames.frame import Files
     from neurolens.render.tiles import tile_path
 
-    kept, every = 0, list(frames_of(args))
-    shared = Shared([values for _, _, values in every])
-    for frame, number, values in every:
-        out = args.out.with_name(f"{args.out.stem}.{number}{args.out.suffix}")
-        written = tile_path(out, args.tile)
-        if written.is_file() and not Files.of(written).checkpoint.exists() and not args.restart:
-            kept += 1
-            continue
-        values = {**values, "out": out, "seed": args.seed + frame, "frame": frame, "shared": shared}
-        yield argparse.Namespace(**vars(args) | values)
-    if kept:
-        told = f"{kept} of {len(args.frames)} frames exist and are kept, whatever their settings"
-        warnings.warn(f"{told}; --restart renders them again", NeurolensWarning, stacklevel=2)
+    missing = {}
+    for out, frame in frames.items():
+        written = tile_path(out, frame.tile)
+        if args.restart or not written.is_file() or Files.of(written).checkpoint.exists():
+            missing[out] = frame
+    if kept := len(frames) - len(missing):
+        told = f"{kept} of {len(frames)} frames exist and are kept, whatever their settings"
+        warn(f"{told}; --restart renders them again")
+    return missing
 
 
 def frames_of(

@@ -1,4 +1,4 @@
-"""`neurolens stmap CAMERA --size WxH -o SHOT`: maps that undistort the picture of a lens, and distort it again."""
+"""`neurolens stmap CAMERA --width PIXELS -o SHOT`: maps that undistort the picture of a lens, and distort it again."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, warn
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import (
     CAMERAS_HELP,
@@ -22,11 +22,12 @@ from neurolens.commands.arguments import (
     check_folder,
     positive,
     wavelengths_nm,
+    whole,
 )
 from neurolens.commands.output import answer, number
 from neurolens.commands.render import film_size
-from neurolens.commands.render_files import warn
 from neurolens.commands.render_frames import LENS_KEYS, add_frames, frames_of
+from neurolens.render.film_settings import size_by_shape
 
 if TYPE_CHECKING:
     from neurolens.cameras.build import Shot
@@ -65,10 +66,10 @@ eye weighs them. Lenses with cylinders keep their squeeze: each meridian has its
 entrance pupil. All maps have the pixel aspect ratio, which is printed, in the attribute pixelAspectRatio."""
 _EPILOG = """\
 examples:
-  neurolens stmap lenses/laikin_double_gauss_50.toml --size 3840x2160 --film 36x20.25 --focus 2 -o shot
-  neurolens stmap models/NAME.onnx --size 1920x1080 --film 24x13.5 --frames 1:48 --key focus=1:1.2,48:3 -o pull
-  neurolens stmap lenses/NAME.toml --size 1920x1080 --film 36x20.25 --lateral-colour -o shot   # and per channel
-  neurolens stmap lenses/isshiki_fisheye_10.toml --size 2000x2000 --film 18x18 --projection equidistant -o fisheye"""
+  neurolens stmap lenses/laikin_double_gauss_50.toml --width 3840 --film 36x20.25 --focus 2 -o shot
+  neurolens stmap models/NAME.onnx --width 1920 --film 24x13.5 --frames 1:48 --key focus=1:1.2,48:3 -o pull
+  neurolens stmap lenses/NAME.toml --width 1920 --film 36x20.25 --lateral-colour -o shot   # and per channel
+  neurolens stmap lenses/isshiki_fisheye_10.toml --width 2000 --film 18x18 --projection equidistant -o fisheye"""
 
 
 def add_parser(subparsers: Any) -> None:
@@ -102,9 +103,12 @@ def add_parser(subparsers: Any) -> None:
 
 
 def add_picture(parser: argparse.ArgumentParser) -> None:
-    """Add the camera, --size and --film."""
+    """Add the camera, the size of the picture and --film."""
     add_lens(parser, "camera", ", see below", models=True, cameras=True)
-    parser.add_argument("--size", metavar="WxH", type=_pixels, required=True, help="of the lens's picture in pixels")
+    for side, other in (("width", "height"), ("height", "width")):
+        about = f"{side} of the lens's picture (default: from --{other} and the film's shape)"
+        parser.add_argument(f"--{side}", metavar="PIXELS", type=whole(1, _LARGEST), help=about)
+    parser.add_argument("--size", type=_pixels, help=argparse.SUPPRESS)  # the old spelling
     parser.add_argument("--film", metavar="WxH", type=film_size, required=True, help="size of the film in mm")
 
 
@@ -120,11 +124,14 @@ def shot_of(args: argparse.Namespace) -> Shot:
     """What the command line sets.
 
     Raises:
-        InputError: a film whose shape is not that of the picture.
+        InputError: neither a width nor a height; a film whose shape is not that of the picture.
     """
     from neurolens.cameras.build import Shot
     from neurolens.render.film import PixelGrid
 
+    if not (args.size or args.width or args.height):
+        raise InputError(_COMMAND, "--width", "(missing)", "--width or --height of the lens's picture")
+    args.size = args.size or size_by_shape(args.film[0] / args.film[1], args.width, args.height)
     PixelGrid(args.size[0], args.size[1], args.film)
     return Shot(
         film_mm=args.film, focus_m=math.inf if args.focus is None else args.focus, f_number=args.f_number,

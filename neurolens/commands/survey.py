@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 from typing import Any
 
+from neurolens.base.cluster import Dask
 from neurolens.base.errors import InputError, printable
 from neurolens.base.files import read_bytes
+from neurolens.base.tasks import Processes, cores
 from neurolens.commands.arguments import (
     QUIET_HELP,
+    add_dask,
     add_glass,
     add_json,
     add_option,
@@ -19,7 +21,6 @@ from neurolens.commands.arguments import (
     check_run_folder,
     whole,
 )
-from neurolens.commands.farm import add_dask
 from neurolens.commands.output import answer
 
 _DESCRIPTION = """\
@@ -55,12 +56,11 @@ def add_parser(subparsers: Any) -> None:
         "--half-field", metavar="DEG", type=between(1e-3, 179.0, "degrees"), default=15.0,
         help="assumed where a file gives neither rims nor a field (default 15)",
     )  # fmt: skip
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     parser.add_argument(
         "--jobs",
         metavar="N",
         type=whole(1, 256),
-        default=cores,
+        default=cores(),
         help="files at a time, about 1 GB of memory each (default: all cores)",
     )
     add_dask(parser)
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.base.progress import Progress
     from neurolens.evaluate.survey import SurveySettings, summary_of
     from neurolens.evaluate.survey_page import summary_lines
-    from neurolens.evaluate.survey_run import in_processes, on_cluster, survey
+    from neurolens.evaluate.survey_run import TIME_LIMIT_S, survey
     from neurolens.readers.any_format import collection_of
     from neurolens.readers.source import MAX_BYTES
 
@@ -86,10 +86,10 @@ def run(args: argparse.Namespace) -> int:
     collection = collection_of(args.folder)
     settings = SurveySettings(not args.no_fit, args.terms, args.rays, args.seed, args.half_field)
     glasses = [(file.name, read_bytes(file, MAX_BYTES, "a glass catalogue")) for file in args.glass_files]
-    records = survey(
-        collection, args.out, settings, in_processes(args.jobs) if args.dask is None else on_cluster(args.dask),
-        Progress(quiet=args.quiet), glasses=glasses, again=args.restart,
-    )  # fmt: skip
+    progress = Progress(quiet=args.quiet)
+    limit_s = TIME_LIMIT_S
+    with Processes(args.jobs, limit_s) if args.dask is None else Dask(args.dask, limit_s) as executor:
+        records = survey(collection, args.out, settings, executor, progress, glasses=glasses, again=args.restart)
     summary = {**summary_of(records), "others": collection.others, "page": str(args.out / "survey.html")}
     lines = [*summary_lines(records, collection.others), f"Look at {args.out / 'survey.html'}"]
     answer(args, summary, lambda: printable("\n".join(lines)))

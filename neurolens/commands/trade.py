@@ -6,19 +6,35 @@ import argparse
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from neurolens.base.files import atomic_write_text
+from neurolens.base.files import atomic_write_text, library
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import check_run_folder
 from neurolens.commands.output import answer, number, table
-from neurolens.commands.plan import look_of, shipped_models
 from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
     from neurolens.evaluate.trade import Offer, Trade
+    from neurolens.optics.prescription import Lens
 
 _SAMPLES = 16  # a pixel of the small pictures
+
+
+def look_of(args: argparse.Namespace) -> dict[str, Any]:
+    """What --comp, --denoise and --zoom say, as arguments of `evaluate.probe.probe`."""
+    return {"afterwards": args.afterwards, "denoised": args.denoise, "zoom": args.zoom}
+
+
+def shipped_models(lens: Lens, zoom: str | None) -> list[Path]:
+    """The models that ship of a lens, or of a state of its zoom, by its id and its figures."""
+    from neurolens.modelfile.metadata import read_card
+    from neurolens.optics.states import set_lens
+
+    name = lens.lens_id if zoom is None else f"{lens.lens_id}-{zoom}"
+    files = sorted((library() / "models").glob(f"{name}.*.onnx"))
+    figures = set_lens(lens, zoom=zoom).sha256 if files else ""
+    return [file for file in files if read_card(file)["lens"]["sha256"] == figures]
 
 
 def run_trade(args: argparse.Namespace) -> int:
@@ -113,6 +129,7 @@ def _text(found: Trade, folder: Path) -> str:
 
 
 def _page(found: Trade, folder: Path, title: str) -> str:
+    from neurolens.base.html import html
     from neurolens.evaluate import pages
 
     flips = {s.offer.choice.name: s.flip for s in found.shown}
@@ -135,15 +152,12 @@ def _page(found: Trade, folder: Path, title: str) -> str:
     front = found.front
     marks = ["● " if o == found.chosen else "○ " if o in front else "" for o in found.offered]
     names = [f"{m}{_short(o)}" for m, o in zip(marks, found.offered, strict=True)]
-    lead = pages.joined("<p class='lead'>{}</p>", _said(found))
     told = f"{found.samples} samples a pixel each, the same random numbers. Below each its FLIP difference from the "
     told += "exact lens's picture: with noise, where a camera makes other rays of the same numbers, as thin lenses do."
     figures = [
         {"file": "trade.png", "title": "Error against time", "caption": "Ring: the choice for the budget."},
         {"file": "pictures.png", "title": "What is seen", "caption": told},
     ]
-    shown = pages.figure_grid(folder, [{**f, "wide": True} for f in figures], inside=True)
-    body = pages.html("<h1>{}</h1>{}{}", title, lead, shown)
-    body += pages.section("Every camera", pages.table(names, records, columns))
-    body += pages.html("<p class='note'>● for the budget, ○ no other betters both.</p>") + pages.legend(columns)
-    return pages.page(title, body)
+    shown = pages.figures_of(folder, [{**f, "wide": True} for f in figures], inside=True)
+    cameras = pages.table(names, records, columns)
+    return html("trade.html", title=title, lead=_said(found), shown=shown, cameras=cameras)

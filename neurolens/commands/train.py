@@ -6,15 +6,19 @@ import argparse
 import shlex
 import sys
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from neurolens import __version__
+from neurolens.base.cluster import Dask
 from neurolens.base.errors import InputError, NeurolensError, one_line
 from neurolens.base.files import fingerprint_of, sha256_of
 from neurolens.base.lensname import lens_id_of
 from neurolens.base.progress import Progress
+from neurolens.base.travel import run_remotely
 from neurolens.commands.arguments import (
+    add_dask,
     add_glass,
     add_json,
     add_lens,
@@ -22,9 +26,9 @@ from neurolens.commands.arguments import (
     add_within,
     check_ids,
     check_run_folder,
+    more_glasses,
     whole,
 )
-from neurolens.commands.farm import Task, add_dask, files_of, spread
 from neurolens.commands.output import answer, number, table
 from neurolens.evaluate.advice import advice, said_ns
 from neurolens.evaluate.records import NOISY, noisy
@@ -96,13 +100,90 @@ def add_parser(subparsers: Any) -> None:
     parser.set_defaults(run=run, kept="fitted models are kept in the run folder; the same command resumes")
 
 
+@dataclass(frozen=True)
+class Training:
+    """One run of an experiment file, or of a lens file without one; attributes are those of the options.
+
+    Raises:
+        InputError: both or neither of experiment and lens, options that take a lens, a run folder that is a file.
+    """
+
+    experiment: Path | None
+    lens: Path | None
+    out: Path
+    named: bool  # whether the command line names `out`
+    overrides: tuple[str, ...] = ()
+    zoom_range: bool = False
+    internal_focus: bool = False
+    within: tuple[str, float] | None = None
+    pixels_across: int = 4000
+    rounds: int | None = None
+    glass_files: tuple[Path, ...] = ()
+
+    @classmethod
+    def of(cls, args: argparse.Namespace, lens: Path | None, out: Path | None) -> Training:
+        """The training of a lens, or of the experiment where there is none."""
+        file = args.experiment or lens
+        if file is None or None not in (args.experiment, lens):
+            found = "(neither)" if file is None else "(both)"
+            raise InputError("neurolens train", "EXPERIMENT.toml or --lens", found, "one of them")
+        folder = out if out is not None else Path("runs") / lens_id_of(file)
+        check_run_folder(folder, "neurolens train", "--output")
+        made = cls(
+            args.experiment, lens, folder, out is not None, tuple(args.overrides), args.zoom_range,
+            args.internal_focus, args.within, args.pixels_across, args.rounds, tuple(args.glass_files),
+        )  # fmt: skip
+        if lens is None and (made.within or made.zoom_range or made.internal_focus):
+            option = "--within" if made.within else "--zoom-range, --internal-focus"
+            raise InputError("neurolens train", option, "(without --lens)", "--lens FILE")
+        return made
+
+    @property
+    def settings(self) -> list[str]:
+        """The options as changes of the experiment's settings, KEY=VALUE; --set comes last."""
+        states = ['lens.zoom="range"'] * self.zoom_range + ['lens.focusing="internal"'] * self.internal_focus
+        if self.within is not None:
+            unit = self.within[0].removeprefix("rms_")
+            states.append(f"target.{unit}={self.within[1]!r}")
+            states += [f"target.pixels_across={self.pixels_across}"] * (unit == "px")
+        rounds = [] if self.rounds is None else [f"evaluation.rounds={self.rounds}"]
+        return [*states, *rounds, *self.overrides]
+
+    @property
+    def command(self) -> str:
+        """The command line that makes this run."""
+        parts = ["neurolens", "train"]
+        parts += ["--lens", str(self.lens)] if self.lens is not None else [str(self.experiment)]
+        parts += ["--output", str(self.out)] if self.named else []
+        for setting in self.settings:
+            parts += ["--set", setting]
+        return shlex.join(parts)
+
+    @property
+    def mark(self) -> str:
+        """Hash of everything that the models depend on: the lens, catalogues of glass, options, the version."""
+        files = [each for each in (self.experiment, self.lens, *self.glass_files) if each is not None]
+        return fingerprint_of([__version__, self.settings, *map(sha256_of, files)])
+
+    def run(self, progress: Progress) -> dict[str, Any]:
+        """Run the experiment; its results."""
+        from neurolens.evaluate.experiment import default_experiment, read_experiment
+        from neurolens.evaluate.train import run_experiment
+
+        if self.lens is not None:
+            experiment = default_experiment(self.lens, self.settings)
+        else:
+            assert self.experiment is not None
+            experiment = read_experiment(self.experiment, self.settings)
+        return run_experiment(experiment, self.out, progress=progress, command=self.command)
+
+
 def run(args: argparse.Namespace) -> int:
     """Run the experiment, or one a lens, and print a summary."""
     if args.dask is not None or (args.lens is not None and len(args.lens) > 1):
         return _run_many(args)
-    if args.lens is not None:
-        (args.lens,) = args.lens
-    results, folder = _run_one(args, Progress(quiet=args.quiet))
+    training = Training.of(args, None if args.lens is None else args.lens[0], args.out)
+    results, folder = training.run(Progress(quiet=args.quiet)), training.out
     data = {"folder": str(folder), "report": str(folder / "report.html"), **results}
     answer(args, data, lambda: _text(results, folder))
     return 0 if (results.get("target") or {"met": True})["met"] else 1
@@ -116,47 +197,39 @@ def _run_many(args: argparse.Namespace) -> int:
     base = args.out if args.out is not None else Path("runs")
     check_run_folder(base, "neurolens train", "--output")
     progress, failed = Progress(quiet=args.quiet), dict[str, str]()
-    each = [
-        argparse.Namespace(**vars(args) | {"lens": f, "out": base / lens_id_of(f), "dask": None}) for f in args.lens
-    ]
+    each = [Training.of(args, file, base / lens_id_of(file)) for file in args.lens]
     if args.dask is None:
-        for one in each:
+        for training in each:
             try:
-                _run_one(one, progress)
+                training.run(progress)
             except NeurolensError as error:
-                failed[one.out.name] = str(error)
+                failed[training.out.name] = str(error)
     else:
         failed = _on_dask(args.dask, each, base, progress)
     for name, why in failed.items():
         print(f"neurolens: {one_line(f'{name}: {why}', 3000)}", file=sys.stderr)
-    done = [one.out for one in each if one.out.name not in failed]
-    answer(args, {"folders": [str(folder) for folder in done], "failed": failed}, lambda: "\n".join(map(str, done)))
+    done = [str(training.out) for training in each if training.out.name not in failed]
+    answer(args, {"folders": done, "failed": failed}, lambda: "\n".join(done))
     return 2 if failed else 0
 
 
-def _on_dask(address: str, each: list[argparse.Namespace], base: Path, progress: Progress) -> dict[str, str]:
-    """Run what is not there yet on a cluster; the reasons of what failed."""
-    marks = {one.out.name: _mark(one) for one in each}
-    missing = [one for one in each if _marked(one.out) != marks[one.out.name]]
-    tasks = [Task.of(one.out.name, train_alone, one, one.out) for one in missing]
+def _on_dask(address: str, each: list[Training], base: Path, progress: Progress) -> dict[str, str]:
+    """Run on a cluster what is not there yet; the reasons of what failed."""
+    missing = {training.out.name: training for training in each if _marked(training.out) != training.mark}
     base.mkdir(parents=True, exist_ok=True)
-    with progress.stage(f"train {len(tasks)} of {len(each)} lenses") as report:
-        files = {path for one in missing for path in files_of(one)}
-        return spread(address, tasks, files, base, report) if tasks else {}
+    with progress.stage(f"train {len(missing)} of {len(each)} lenses") as report:
+        if not missing:
+            return {}
+        files = {file for training in missing.values() for file in (training.lens, *training.glass_files) if file}
+        with Dask(address) as executor:
+            return run_remotely(executor, train_alone, missing, files, base, report)
 
 
-def train_alone(args: argparse.Namespace) -> None:
+def train_alone(training: Training) -> None:
     """One lens, as a task of a cluster; the folder's mark, written last, says that it is whole, and of what."""
-    mark = _mark(args)
-    _run_one(args, Progress(quiet=True))
-    (args.out / _MARK).write_text(mark)
-
-
-def _mark(args: argparse.Namespace) -> str:
-    """Hash of what a run's models depend on: the lens, catalogues of glass, options, the version."""
-    options = [args.overrides, args.zoom_range, args.internal_focus, args.within, args.pixels_across]
-    hashes = [sha256_of(file) for file in (args.lens, *args.glass_files)]
-    return fingerprint_of([__version__, args.rounds, *options, *hashes])
+    with more_glasses(training):
+        training.run(Progress(quiet=True))
+    (training.out / _MARK).write_text(training.mark)
 
 
 def _marked(folder: Path) -> str | None:
@@ -164,52 +237,6 @@ def _marked(folder: Path) -> str | None:
         return (folder / _MARK).read_text()
     except OSError:
         return None
-
-
-def _run_one(args: argparse.Namespace, progress: Progress) -> tuple[dict[str, Any], Path]:
-    """Run the experiment; its results and folder."""
-    folder = _run_folder(args)
-    from neurolens.evaluate.experiment import default_experiment, read_experiment
-    from neurolens.evaluate.train import run_experiment
-
-    states = ['lens.zoom="range"'] * args.zoom_range + ['lens.focusing="internal"'] * args.internal_focus
-    asked = []
-    if args.within is not None:
-        unit = args.within[0].removeprefix("rms_")
-        asked = [f"target.{unit}={args.within[1]!r}", *[f"target.pixels_across={args.pixels_across}"] * (unit == "px")]
-    if (states or asked) and args.lens is None:
-        given = "--within" if asked else "--zoom-range, --internal-focus"
-        raise InputError("neurolens train", given, "(without --lens)", "--lens FILE")
-    rounds = [] if args.rounds is None else [f"evaluation.rounds={args.rounds}"]
-    args.overrides = [*states, *asked, *rounds, *args.overrides]
-    if args.lens is not None:
-        experiment = default_experiment(args.lens, args.overrides)
-    else:
-        experiment = read_experiment(args.experiment, args.overrides)
-    return run_experiment(experiment, folder, progress=progress, command=_command(args)), folder
-
-
-def _run_folder(args: argparse.Namespace) -> Path:
-    """The run folder of the arguments.
-
-    Raises:
-        InputError: both or neither of experiment and --lens, a folder that is a file.
-    """
-    if (args.experiment is None) == (args.lens is None):
-        found = "(neither)" if args.lens is None else "(both)"
-        raise InputError("neurolens train", "EXPERIMENT.toml or --lens", found, "one of them")
-    folder: Path = args.out if args.out is not None else Path("runs") / lens_id_of(args.experiment or args.lens)
-    check_run_folder(folder, "neurolens train", "--output")
-    return folder
-
-
-def _command(args: argparse.Namespace) -> str:
-    parts = ["neurolens", "train"]
-    parts += ["--lens", str(args.lens)] if args.lens is not None else [str(args.experiment)]
-    parts += ["--output", str(args.out)] if args.out is not None else []
-    for override in args.overrides:
-        parts += ["--set", override]
-    return shlex.join(parts)
 
 
 def _text(results: Mapping[str, Any], folder: Path) -> str:

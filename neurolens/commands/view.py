@@ -206,19 +206,19 @@ def _has_models(root: Path, key: str) -> bool:
 def _flare(file: Path) -> GhostModel | None:
     """The ghosts of a file that holds such; others are refused or read elsewhere."""
     from neurolens.flare.ghostfile import KIND, read_ghosts
-    from neurolens.modelfile.onnxfile import card_in, read_metadata
+    from neurolens.modelfile.metadata import card_in, read_metadata
 
     try:
-        card_in(file, read_metadata(file)[2], KIND)
+        card_in(file, read_metadata(file), KIND)
     except ModelError:
         return None
     return read_ghosts(file)
 
 
 def _card(file: Path) -> dict[str, Any]:
-    from neurolens.modelfile.onnxfile import read_checked
+    from neurolens.modelfile.metadata import read_card
 
-    return read_checked(file)[1]
+    return read_card(file)
 
 
 def _kind_of(card: Mapping[str, Any]) -> str:
@@ -232,6 +232,7 @@ def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str], shaders: Mappi
     Raises:
         InputError: models of another state; a lens that the exact tracer's code cannot hold, without any model.
     """
+    from neurolens.optics.states import set_lens
     from neurolens.view.page import ViewLens
     from neurolens.view.shaders import ghosts_glsl
 
@@ -239,7 +240,7 @@ def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str], shaders: Mappi
     drawn: dict[str, Any] = {}
     path = None
     if entry.lens is not None and entry.file is not None:
-        lens = entry.lens.at() if entry.zoom == RANGE else entry.lens.at(zoom=entry.zoom)
+        lens = set_lens(entry.lens) if entry.zoom == RANGE else set_lens(entry.lens, zoom=entry.zoom)
         try:
             forms.append(_exact_form(entry, entry.file, lens, kinds, shaders.get(entry.file)))
             path = _path(lens) if entry.zoom != RANGE else None
@@ -260,10 +261,11 @@ def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str], shaders: Mappi
 
 def _squeeze(entry: _Entry) -> float:
     from neurolens.optics.paraxial import first_order
+    from neurolens.optics.states import set_lens
 
     if entry.lens is None or not entry.lens.anamorphic:
         return 1.0
-    lens = entry.lens.at()
+    lens = set_lens(entry.lens)
     return abs(float(first_order(lens).efl_mm / first_order(lens, meridian="x").efl_mm))
 
 
@@ -285,14 +287,17 @@ def _path(lens: Lens) -> tuple[str, Sequence[str]]:
 def _model_form(file: Path, folder: Path, kinds: Sequence[str], osl: str | None) -> Form:
     from neurolens.cameras.onnxlens import load_model
     from neurolens.cameras.source import model_extras
-    from neurolens.surrogates.source import export_file
+    from neurolens.surrogates.source import export_source
 
     loaded = load_model(file)
     card, domain, errors = loaded.card, loaded.card["domain"], loaded.card["errors"]
     if any(axis.name != "zoom" for axis in loaded.axes):
         raise InputError(file, "states", [axis.name for axis in loaded.axes], "a zoom, or a model of one state")
     extras, notes = model_extras(loaded)
-    written = {to: export_file(file, folder / f"model.{to}", to, None, extras, notes) for to in _written(kinds)}
+    written = {
+        to: export_source(loaded.file.nodes, folder / f"model.{to}", to, card, extras=extras, notes=notes)
+        for to in _written(kinds)
+    }
     told = {
         **_facts(card["lens"]),
         "film_radius_mm": domain["film_radius_mm"],

@@ -33,11 +33,11 @@ from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import Traced, compile_tracing, trace
 from neurolens.optics.tracegraph import exact_graph
 from neurolens.surrogates.assemble import ALL, Parts
-from neurolens.surrogates.domain import Domain, FilmRays
-from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.domain import FilmRays
+from neurolens.surrogates.file import read_model
+from neurolens.surrogates.model import Domain, LensModel
 from neurolens.surrogates.source import FREE, fused_program
 from neurolens.surrogates.specialise import Fix
-from neurolens.surrogates.stored import load_fitted
 
 # Names of `exact_candidates` of a whole camera, and of `exact_c_candidate`.
 EXACT = ("exact eager", "exact compiled", "exact C")
@@ -270,7 +270,7 @@ def fused_candidate(
     if not has_compiler():
         return None
     try:
-        found = load_fitted(model) if isinstance(model, Path) else model
+        found = read_model(model).at() if isinstance(model, Path) else model
         models = [found] if isinstance(found, LensModel) else found
         program = fused_program(models, parts, fix)
     except (ModelError, InputError):

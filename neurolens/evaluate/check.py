@@ -35,8 +35,9 @@ from neurolens.evaluate.vignetting import ZONES, false_shares
 from neurolens.modelfile.axes import Axis
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
+from neurolens.optics.states import set_lens
 from neurolens.readers.any_format import read_any
-from neurolens.surrogates.domain import Domain
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.states import State, StateSpace
 
@@ -237,13 +238,13 @@ def find_lens(lens_id: str, model_file: Path) -> Path:
 def _states(tabled: Lens, efl_mm: float) -> Iterator[Lens]:
     """The lens in every zoom state, as tabled and at the focal length of the card."""
     for configuration in (None, *(c.name for c in tabled.configurations)):
-        lens = tabled.at(zoom=configuration)
+        lens = set_lens(tabled, zoom=configuration)
         yield lens
         # The card has the computed focal length; the requested one, needed bit by bit, had fewer digits.
         for digits in (9, 12, 15):
             asked = float(f"{efl_mm:.{digits}g}")
             if abs(first_order(lens).efl_mm / asked - 1) > 1e-12:
-                yield tabled.at(zoom=configuration, focal_length_mm=asked)
+                yield set_lens(tabled, zoom=configuration, focal_length_mm=asked)
 
 
 RAY_KEYS = (

@@ -17,7 +17,6 @@ import numpy as np
 
 from neurolens.cameras.contract import RAYS_A_CALL, Camera
 from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.fused import lens_graph
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.osl import OslLens, osl_program
 from neurolens.cameras.source import camera_program
@@ -82,12 +81,12 @@ def rest_ns(scene: Scene, camera: Camera) -> float:
 
 
 def glsl_operations(camera: OnnxCamera | ExactCamera) -> int:
-    """Of a ray of `neurolens export --whole-camera --to glsl`: floats, a fused multiply-add is one.
+    """Count the operations of a ray of `neurolens export --whole-camera --to glsl`; a fused multiply-add counts as one.
 
     Raises:
         InputError: a lens or model that has no such form.
     """
-    graph = lens_graph(camera) if isinstance(camera, OnnxCamera) else camera.lens_graph()
+    graph = camera.lens_graph()
     return sum(camera_program(camera.film, graph, own_table=False).count().values())
 
 

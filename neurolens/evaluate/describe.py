@@ -20,16 +20,18 @@ from neurolens.optics.lenscheck import Check, check_lens, doubts, film_edge_mm, 
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays, image_radius_mm
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import trace
 from neurolens.readers.any_format import collection_of, read_any
-from neurolens.surrogates.domain import Domain, sample_domain
+from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.model import Domain
 
 _RAYS = 65536
 _NEGLIGIBLE = 1e-4  # share of the rays below which a blocking surface is not listed
 
 
 def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
-    """Figures of a lens placed by `Lens.at`, over a domain, as JSON has them; d line unless stated otherwise.
+    """Figures of a lens placed by `set_lens`, over a domain, as JSON has them; d line unless stated otherwise.
 
     They are those of the file, those of `FirstOrder` (of an anamorphic lens in the y-z plane), and:
 
@@ -188,7 +190,7 @@ def layout_profile(lens: Lens, domain: Domain) -> layout.Layout:
     """Section of a lens with meridional fans of rays to the axis, 70% and the edge of the domain's film, d line.
 
     Args:
-        lens: placed by `Lens.at`; where it is not, the film is that of the domain's farthest focus.
+        lens: placed by `set_lens`; where it is not, the film is that of the domain's farthest focus.
     """
     if lens.film_z_mm is None:
         lens = replace(lens, film_z_mm=float(domain.film_z_mm[0]))
@@ -259,7 +261,7 @@ def lens_row(lens: Lens, checks: list[Check] | None) -> dict[str, Any]:
 
 def section(path: Path) -> layout.Layout:
     """A lens in section with rays, focused at infinity, as `figures.sheet` draws it; an anamorphic one in y-z."""
-    lens = read_quietly(path).at()
+    lens = set_lens(read_quietly(path))
     data, edge = first_order(lens), film_edge_mm(lens)
     if edge is None:
         edge = _NO_FIELD * abs(data.efl_mm) if lens.half_field_deg is None else image_radius_mm(lens)[0]

@@ -20,9 +20,11 @@ from neurolens.optics.glass import glass_of
 from neurolens.optics.lenswriter import write_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
+from neurolens.optics.states import set_lens
 from neurolens.readers.any_format import OURS, kind_of, read_any
-from neurolens.surrogates.domain import Domain, domain_of
+from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.fit import ModelSettings
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import PairSettings
 from neurolens.surrogates.states import StateSpace, axes_of
 
@@ -70,13 +72,13 @@ class LensChoice:
         """The lens at infinity focus with a round stop; cameras apply blades outside the models.
 
         Raises:
-            InputError: a length or f-number that is not positive, and as `read_any` and `Lens.at`.
+            InputError: a length or f-number that is not positive, and as `read_any` and `set_lens`.
         """
         for name, value in (("lens.efl_mm", self.efl_mm), ("lens.f_number", self.f_number)):
             if value is not None and not value > 0:
                 raise InputError("settings", name, value, "a positive number")
         lens = read_any(self.file).with_aperture(None)
-        return lens.at(focal_length_mm=self.efl_mm, zoom=self.configuration, f_number=self.f_number)
+        return set_lens(lens, focal_length_mm=self.efl_mm, zoom=self.configuration, f_number=self.f_number)
 
 
 @dataclass(frozen=True)

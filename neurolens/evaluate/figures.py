@@ -10,14 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from neurolens.analysis.breathing import Breath, breathing, field_change
 from neurolens.analysis.layout import Layout, draw_section
 from neurolens.analysis.plot_style import FIELD_COLOURS, INK, drawing, plain_log_ticks
 from neurolens.base.errors import InputError
 from neurolens.evaluate.image import ImageErrors, checked_image, to_srgb
 from neurolens.evaluate.vignetting import Illumination
-from neurolens.optics.focusing import Breath, breathing, field_change, focus_states, nearest_focus_m
+from neurolens.optics.focusing import focus_states, nearest_focus_m
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Focus, Lens
+from neurolens.optics.states import set_lens
 
 _COLUMNS = 4  # with more, each picture would be too small
 
@@ -168,7 +170,7 @@ def draw_breathing(lens: Lens, path: str | Path, count: int = 48) -> dict[str, l
     Three panels over one logarithmic axis of distance, which has no place for infinity; a line for each way of
     focusing, both where the lens file has focus states. Returns what is drawn, infinity first.
     """
-    data = first_order(lens.at())
+    data = first_order(set_lens(lens))
     nearest = 1.05 * (4 * abs(data.efl_mm) + data.rear_principal_z_mm - data.front_principal_z_mm) / 1000
     ways: dict[str, Focus] = {"film moves": "paraxial"}
     if focus_states(lens):

@@ -144,7 +144,7 @@ def compare(renders: Sequence[ArrayLike], exact_renders: Sequence[ArrayLike]) ->
         raise InputError("image", "surrogate renders", len(renders), f"1 to {len(ring)}, one for each exact render")
 
     def errors(tests: Sequence[ArrayLike], measure: Callable[..., float]) -> list[float]:
-        """Of each pair (i, j): test i against exact render j."""
+        """Compare each pair (i, j): test render i against exact render j."""
         return [measure(tests[i], exact_renders[j]) for i, j in ring[: len(tests)]]
 
     floor = float(np.mean(errors(exact_renders, flip)))

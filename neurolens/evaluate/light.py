@@ -7,7 +7,7 @@ no noise. The lens's ghosts, glare and stars of the scene's own lights, drawn on
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import field_of
-from neurolens.flare.layers import FlareSettings, flare_layers
+from neurolens.flare.layers import FlareJob, flare_layers
 from neurolens.flare.lights import Light
 from neurolens.flare.picture import Raster
 from neurolens.flare.sources import SceneLights, highlights, keep
 from neurolens.graph.compiler import has_compiler
 from neurolens.optics.film_plane import colours
 from neurolens.optics.prescription import Lens
+from neurolens.render.flaresettings import FlareSettings
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene
 from neurolens.render.spectrum import SpectralRange
@@ -143,12 +144,13 @@ def stray_light(scene: Scene, camera: Any, seen: Glance, white_balance: str | No
     none = np.zeros((height, width))
     if not lights:
         return dict.fromkeys(STRAY.values(), none)
-    raster, given = Raster(camera.film_mm, width, height), (scene.settings.camera.wavelengths_nm, _WAVES, _CELL_PX)
-    layers = flare_layers(lens, lights, raster, FlareSettings(*given, glare=_PHOTONS // len(lights), threads=1))
+    raster, light_nm = Raster(camera.film_mm, width, height), scene.settings.camera.wavelengths_nm
+    settings = FlareSettings(bins=_WAVES, cell_px=_CELL_PX, glare=_PHOTONS // len(lights))
+    layers = flare_layers(FlareJob(lens, lights, raster, settings, light_nm, threads=1))
     half = np.array(camera.film_mm) / 2 / camera.settings["lens_state"]["pinhole_focal_length_mm"]
     stars = [a for a in lights if (np.abs(a.towards[:2]) < -1.1 * half * a.towards[2]).all()][:_STARS]
-    only = FlareSettings(*given, starburst=True, without=("ghosts",), threads=1)
-    layers |= flare_layers(lens, stars, raster, only) if stars else {}
+    only = replace(settings, glare=0, starburst=True, without=("ghosts",))
+    layers |= flare_layers(FlareJob(lens, stars, raster, only, light_nm, threads=1)) if stars else {}
     base = np.maximum(seen.rgb.mean(-1), seen.floor)
     return {told: layers[name].max(-1) / base if name in layers else none for name, told in STRAY.items()}
 

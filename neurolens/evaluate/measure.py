@@ -25,11 +25,11 @@ from neurolens.evaluate.rays import PIXELS_ACROSS, EachRay, Predict, RayErrors, 
 from neurolens.evaluate.vignetting import NEAR_RIM, ZONES, deciding_rim_ratio, false_shares
 from neurolens.optics.prescription import Lens
 from neurolens.optics.surfaces import Rays
-from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
+from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, fit_model
 from neurolens.surrogates.fits import checkpoint
-from neurolens.surrogates.model import Prediction
+from neurolens.surrogates.model import Domain, Prediction
 from neurolens.surrogates.pairs import PairSet, PairSettings, join_pairs, make_pairs, trace_pairs
 
 # Whole stops closed, by the name of the state.
@@ -68,7 +68,7 @@ class FreshRays:
     near: Tensor
 
     def stop_radius_mm(self, state: str) -> float:
-        """Of one of `STOPS`."""
+        """The radius of one of `STOPS`, in mm."""
         return self.domain.stop_radius_mm / math.sqrt(2) ** STOPS[state]
 
 

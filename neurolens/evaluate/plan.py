@@ -29,8 +29,6 @@ from neurolens.base.progress import Report
 from neurolens.base.tomlfile import format_toml
 from neurolens.cameras.build import Shot, ideal_as
 from neurolens.cameras.contract import Camera
-from neurolens.cameras.exact import FusedExactCamera
-from neurolens.cameras.fused import FusedCamera
 from neurolens.cameras.model import OnnxCamera, OnnxLens, load_model
 from neurolens.cameras.warped import Warped
 from neurolens.evaluate import footprints as prints
@@ -53,7 +51,6 @@ from neurolens.evaluate.shaders import lens_of
 from neurolens.evaluate.shot_fits import PAIRS, shot_domain, shot_fits, shot_terms
 from neurolens.graph.compiler import has_compiler
 from neurolens.graph.scalars import lower
-from neurolens.modelfile.graph import graph_of
 from neurolens.optics.prescription import Lens
 from neurolens.render.scene import Scene
 from neurolens.surrogates.settings import ModelSettings
@@ -257,7 +254,7 @@ class _Trial:
 
     @property
     def share(self) -> prints.Array:
-        """Of the wavelengths."""
+        """The share of the scene's light that each wavelength stands for."""
         return self.found.places.share
 
     @property
@@ -295,7 +292,7 @@ class _Trial:
         return ns_a_ray(camera, self.found.places), noise(seen.weight, self.share)
 
     def ideal(self, name: str, camera: Camera, seen: Footprints, area: float = 1.0) -> tuple[Timing, float]:
-        """Of a camera without a lens, whose picture is so many times as large."""
+        """The cost of a camera without a lens, whose picture is so many times as large."""
         known = {"osl": CYCLES_NS, "glsl": GLSL_OPERATIONS}.get(self.target)
         if known is not None:
             return _counted(area * known[name]), noise(seen.weight, self.share)
@@ -303,7 +300,7 @@ class _Trial:
         return {"min": area * timing["min"], "median": area * timing["median"]}, times
 
     def shader(self, file: str | Path) -> tuple[Timing, float]:
-        """Of the shader of a model or a lens."""
+        """The cost of the shader of a model or a lens."""
         asked = self.found.asked
         state = asked.zoom if str(file) == self.found.lens.path else None  # models are of one
         lens = lens_of(Path(file), state, lambda done, left=None: None)[1]
@@ -329,7 +326,7 @@ def camera_of(found: Probed, choice: Choice) -> Camera:
         flat = ideal_as(kind, found.exact.lens, Shot(found.asked.film_mm, found.asked.focus_m))
         mapped = choice.name.endswith(_MAPPED)
         return Warped(flat, found.exact, found.asked.focus_m, tables=found.exact_field) if mapped else flat
-    return (FusedCamera if kind else OnnxCamera)(load_model(path), **_real(found))
+    return OnnxCamera(load_model(path), **_real(found), runtime="c" if kind else "onnxruntime")
 
 
 def _real(found: Probed) -> dict[str, Any]:
@@ -365,7 +362,7 @@ def _ideal(trial: _Trial) -> Iterator[_Judged]:
 def _exact(trial: _Trial) -> Iterator[_Judged]:
     """The exact lens, which has no error: as C where that runs, and as code where its surfaces have a form in it."""
     found, target = trial.found, trial.target
-    exact, path, compiled = found.exact, found.lens.path, isinstance(found.exact, FusedExactCamera)
+    exact, path, compiled = found.exact, found.lens.path, found.exact.runtime == "c"
     cost: Cost = {
         "osl": lambda: trial.shader(path),
         "glsl": lambda: (_counted(glsl_operations(exact)), noise(found.seen.weight, trial.share)),
@@ -400,16 +397,16 @@ def _model(trial: _Trial, file: Path, how: str = "", without: Collection[str] = 
                 return trial.shader(file)
             if target == "glsl":
                 return _counted(glsl_operations(camera)), noise(seen.weight, trial.share)
-            return trial.timed(FusedCamera.of(camera) if compiled else camera, seen)
+            return trial.timed(camera.compiled() if compiled else camera, seen)
 
         spec = f"{'fused:' if compiled else ''}{file}"
         yield trial.judged(file.stem, spec, seen, cost, how, form, _operations(model), beside)
 
 
 def _operations(model: OnnxLens) -> int:
-    """Of a ray of a model; 0 where its operators have no such form."""
+    """The number of float operations that a ray of a model costs; 0 of networks that only onnxruntime runs."""
     with suppress(InputError):
-        return sum(lower(graph_of(model.path, model.data, model.state if model.axes else ())).count().values())
+        return sum(lower(model.graph()).count().values())
     return 0
 
 

@@ -34,6 +34,7 @@ from neurolens.evaluate.probe import COUNTED, Effect, Probed, effects_of, probe
 from neurolens.evaluate.shot_fits import shot_domain, shot_fits, shot_terms
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
+from neurolens.optics.states import set_lens
 from neurolens.render.scene import Scene
 from neurolens.surrogates.settings import ModelSettings
 
@@ -111,7 +112,7 @@ def plan_frames(
     chosen = representatives(frames)
     founds: list[Probed] = []
     for frame in chosen:
-        founds.append(probe(frame.scene, lens.at(zoom=frame.zoom), afterwards=afterwards, denoised=denoised))
+        founds.append(probe(frame.scene, set_lens(lens, zoom=frame.zoom), afterwards=afterwards, denoised=denoised))
         say(0.4 * len(founds) / len(chosen))
     best: list[Choice | None] = []
     rest = rest_of(chosen[0].scene, founds[0], target)
@@ -153,7 +154,7 @@ def representatives(frames: Sequence[Frame]) -> list[Frame]:
 
 
 def _nearest(frame: Frame, chosen: Sequence[Frame]) -> int:
-    """Of the probed frames, the one of the state most like a frame's, then of the number nearest to it."""
+    """The probed frame whose state is most like that of a frame; of several the one with the nearest number."""
     return min(
         range(len(chosen)),
         key=lambda k: (math.dist(chosen[k].state, frame.state), abs(chosen[k].number - frame.number)),
@@ -219,7 +220,7 @@ class _Stretch:
 
     @cached_property
     def fit(self) -> Callable[[int], tuple[Path, ModelSettings]]:
-        """Of the domain that holds those of all frames."""
+        """Fit a model over the domain that holds the domains of all frames."""
         ends = [focus for p in self.founds for focus in shot_domain(p).focus_m or ()]
         widest = min(self.founds, key=lambda p: p.asked.f_number)
         radius = max(p.domain.film_radius_mm for p in self.founds)
@@ -243,7 +244,7 @@ class _Stretch:
 
 
 def _effects(founds: Sequence[Probed], budget_px: float) -> tuple[Effect, ...]:
-    """Of each effect the dearest frame's; light that the lens adds is that of the first frame. And breathing."""
+    """Collect the largest of each effect over the frames, and breathing; stray light is that of the first frame."""
     every: dict[str, Effect] = {}
     for k, found in enumerate(founds):
         for effect in effects_of(found, budget_px, stray=k == 0):

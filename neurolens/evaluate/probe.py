@@ -22,7 +22,7 @@ from neurolens.analysis.field_curves import illumination
 from neurolens.analysis.fields import Scene as Fields
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, ideal_as
-from neurolens.cameras.exact import ExactCamera, FusedExactCamera
+from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.field import Field, field_of
 from neurolens.evaluate import footprints as prints
 from neurolens.evaluate.footprints import AFTERWARDS, Array, Footprints, Places
@@ -32,9 +32,11 @@ from neurolens.graph.compiler import has_compiler
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm
+from neurolens.optics.states import set_lens
 from neurolens.render.scene import Scene
 from neurolens.render.world import shared_worlds
-from neurolens.surrogates.domain import Domain, domain_from_camera, domain_of
+from neurolens.surrogates.domain import domain_from_camera, domain_of
+from neurolens.surrogates.model import Domain
 
 COUNTED = 95.0  # percentile over the picture that a budget is held against
 _Real = TypeVar("_Real", bound=np.floating[Any])
@@ -114,7 +116,7 @@ class Probed:
     asked: Asked
     lens: Lens
     domain: Domain
-    exact: ExactCamera | FusedExactCamera
+    exact: ExactCamera
     places: Places
     shape: tuple[int, int]
     seen: Footprints
@@ -124,7 +126,7 @@ class Probed:
 
     @cached_property
     def exact_field(self) -> Field:
-        """Of the exact camera, for maps of its picture; it takes seconds.
+        """The field of the exact camera, for maps of its picture; it takes seconds.
 
         Raises:
             InputError: as `field_of`.
@@ -170,10 +172,10 @@ def probe(
     """
     if not set(afterwards) <= set(AFTERWARDS):
         raise InputError("plan", "afterwards", sorted(afterwards), f"of {', '.join(AFTERWARDS)}")
-    lens, shot = lens if zoom is None else lens.at(zoom=zoom), scene.settings.camera
+    lens, shot = lens if zoom is None else set_lens(lens, zoom=zoom), scene.settings.camera
     film, widest = (shot.film_width_mm, shot.film_height_mm), first_order(lens).f_number
     f_number = max(shot.f_number or widest, widest)
-    stopped, domain = lens.at(f_number=f_number, focus_m=shot.focus_m), _domain(lens, scene, f_number)
+    stopped, domain = set_lens(lens, f_number=f_number, focus_m=shot.focus_m), _domain(lens, scene, f_number)
     real: dict[str, Any] = {"film_mm": film, "focus_m": shot.focus_m, "f_number": f_number}
     exact = exact_camera(lens, {**real, "bounds": domain.bounds, "wavelength_nm": shot.wavelengths_nm})
     shape = _shape(film, across)
@@ -205,7 +207,7 @@ def _domain(lens: Lens, scene: Scene, f_number: float) -> Domain:
     quarter of a pixel, for models have their own focus; none more of a lens that goes no nearer."""
     shot, plain = scene.settings.camera, lens.with_aperture(None)
     film = shot.film_width_mm, shot.film_height_mm
-    stopped = plain.at(f_number=f_number, focus_m=shot.focus_m)
+    stopped = set_lens(plain, f_number=f_number, focus_m=shot.focus_m)
     radius = min(math.hypot(*film) / 2, image_radius_mm(lens)[0])
     move = _FOCUS_SPARE * f_number * film[0] / shot.width / first_order(stopped).efl_mm ** 2  # of the vergence, 1/mm
     vergence = 1e-3 / shot.focus_m
@@ -304,11 +306,11 @@ def effects_of(found: Probed, budget_px: float, stray: bool = True) -> tuple[Eff
     return tuple(sorted(effects, key=lambda e: (e.unit, -e.worth)))
 
 
-def exact_camera(lens: Lens, real: dict[str, Any]) -> ExactCamera | FusedExactCamera:
-    """As C where a compiler is there, which compiles the lens."""
+def exact_camera(lens: Lens, real: dict[str, Any]) -> ExactCamera:
+    """The exact camera, compiled as C where the machine has a compiler."""
     with suppress(InputError):
         if has_compiler():
-            return FusedExactCamera(lens, **real)
+            return ExactCamera(lens, **real, runtime="c")
     return ExactCamera(lens, **real)
 
 

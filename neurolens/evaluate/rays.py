@@ -23,7 +23,8 @@ from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays, image_radius_mm
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
-from neurolens.surrogates.domain import Domain, FilmRays, focused_plane_z_mm, sample_domain
+from neurolens.surrogates.domain import FilmRays, focused_plane_z_mm, sample_domain
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import PairSet
 
 FIELD_LIMIT_DEG = 60.0
@@ -85,7 +86,7 @@ class RayErrors:
 
     @classmethod
     def over(cls, lens: Lens, domain: Domain, each: EachRay) -> RayErrors:
-        """Of errors ray by ray."""
+        """Summarise errors that are known ray by ray."""
         pitch, focus = pixel_um(domain), _spread(each.focus_um)
         position, transmittance = _spread(each.position_um), _spread(each.transmittance)
         return cls(

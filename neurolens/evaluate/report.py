@@ -9,27 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-
-from markupsafe import Markup
+from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
+from neurolens.base.html import html
 from neurolens.evaluate.advice import advice
-from neurolens.evaluate.pages import (
-    DASH,
-    Column,
-    Record,
-    facts,
-    figure_grid,
-    folded,
-    html,
-    joined,
-    legend,
-    number,
-    page,
-    section,
-    table,
-)
+from neurolens.evaluate.pages import Column, Record, figures_of, flat, number, table
 from neurolens.evaluate.records import NOISY, Results, pareto_front, time_of
 
 _MODEL_COLUMNS = (
@@ -99,62 +85,52 @@ def write_report(run_dir: str | Path, results: Results) -> Path:
     folder = Path(run_dir)
     if not folder.is_dir():
         raise InputError(folder, "run folder", "(missing)", "a folder that exists")
-    title = str(results.title or results.lens.get("name") or "neurolens run")
-    body = [
-        _header(results, title),
-        _use(folder, results),
-        _warnings(results),
-        section("Models, on rays held out from the fit", _models(results.models)),
-        section("Exact tracers", _exact(results.exact)),
-        section("The trade", figure_grid(folder, results.figures)),
-        section("Cameras in renders", table(_names(results.cameras, "name"), results.cameras, _CAMERA_COLUMNS)),
-        section("Pictures", _images(folder, results.images)),
-        section("What a domain taken from the scene gains", _domain_gain(results.domain_gain or {})),
-        section("What was run", _what_was_run(results)),
-    ]
-    path = folder / "report.html"
-    atomic_write_text(path, page(title, joined("{}", body)))
-    return path
-
-
-def _header(results: Results, title: str) -> Markup:
     wall = None if results.wall_s is None else f"{results.wall_s:.0f} s in all"
-    line = " · ".join(str(part) for part in (results.command, results.started, wall) if part)
-    return html("<header><h1>{}</h1><p class='lead'>{}</p></header>", title, line)
-
-
-def _use(folder: Path, results: Results) -> Markup:
-    """What to use where, why, and the commands for it."""
-    found = advice(asdict(results), folder)
-    pre = [html("<pre>{}</pre>", a.command) if a.command else "" for a in found]
-    use = [html("<h2>{} use {}</h2><p>{}.</p>{}", a.where, a.name, a.why, p) for a, p in zip(found, pre, strict=True)]
-    return html("<section class='use'>{}</section>", joined("{}", use)) if use else Markup()
+    gain = results.domain_gain or {}
+    rows: Sequence[Record] = gain.get("rows", ())
+    page = html(
+        "report.html",
+        title=str(results.title or results.lens.get("name") or "neurolens run"),
+        lead=[part for part in (results.command, results.started, wall) if part],
+        advice=advice(asdict(results), folder),
+        warnings=_warnings(results),
+        exact=table([_exact_name(r) for r in results.exact], results.exact, _EXACT_COLUMNS),
+        trade=figures_of(folder, results.figures),
+        cameras=table(_names(results.cameras, "name"), results.cameras, _CAMERA_COLUMNS),
+        gain_text=": ".join(str(gain[key]) for key in ("scene", "text") if gain.get(key)),
+        gains=table(_names(rows, "name", "domain"), rows, _GAIN_COLUMNS + _MODEL_COLUMNS),
+        about=_about(results),
+        settings=flat(results.settings or {}),
+        **_models(results.models),
+        **_pictures(folder, results.images),
+    )
+    atomic_write_text(folder / "report.html", page)
+    return folder / "report.html"
 
 
 def _names(records: Sequence[Record], last: str, first: str = "scene") -> list[str]:
-    """What records are of: the scene or the domain, then the camera or the model."""
+    """The scene or the domain of each record, then its camera or model."""
     return [" · ".join(str(r[key]) for key in (first, last) if r.get(key)) for r in records]
 
 
-def _warnings(results: Results) -> Markup:
-    notes = [str(note) for note in results.warnings]
-    for record in results.exact:
-        if not record.get("available", True):
-            notes.append(f"{record.get('name')}: unavailable ({record.get('reason') or 'no reason given'})")
-    items = joined("<li>{}</li>", notes)
-    return html("<section class='warn'><h2>Notes and warnings</h2><ul>{}</ul></section>", items) if items else Markup()
+def _exact_name(record: Record) -> str:
+    lacks = "" if record.get("available", True) else f": unavailable ({record.get('reason') or 'no reason given'})"
+    return f"{record.get('name')}{lacks}"
 
 
-def _what_was_run(results: Results) -> Markup:
-    about = {"seed": results.seed, **results.versions}
-    parts = [("Lens", results.lens), ("Domain", results.domain), ("Seed and versions", about)]
-    parts.append(("Image comparison", results.image_settings or {}))
-    blocks = (html("<div><h3>{}</h3>{}</div>", name, facts(values)) for name, values in parts if values)
-    more = folded("Resolved settings", facts(results.settings)) if results.settings else ""
-    return html("<div class='facts'>{}</div>{}", joined("{}", blocks), more)
+def _warnings(results: Results) -> list[str]:
+    missing = [_exact_name(record) for record in results.exact if not record.get("available", True)]
+    return [*map(str, results.warnings), *missing]
 
 
-def _models(models: Sequence[Record]) -> Markup:
+def _about(results: Results) -> list[tuple[str, list[tuple[str, str]]]]:
+    parts = {"Lens": results.lens, "Domain": results.domain}
+    parts["Seed and versions"] = {"seed": results.seed, **results.versions}
+    parts["Image comparison"] = results.image_settings or {}
+    return [(name, flat(values)) for name, values in parts.items()]
+
+
+def _models(models: Sequence[Record]) -> dict[str, Any]:
     """All models, by family as recorded; a star marks those on the Pareto front of error and time."""
     key = "rms_um" if any(number(m, "rms_um") is not None for m in models) else "direction_rms_deg"
     timed = [
@@ -166,35 +142,22 @@ def _models(models: Sequence[Record]) -> Markup:
     names = [("★ " if i in front else "") + str(m["name"]) for i, m in enumerate(models)]
     note = "★ no other model is both faster (as C where that was timed) and closer. ~ a noisy time: the median of its "
     note += f"rounds is more than {NOISY:g} times the least, which is shown. Point at a heading to see what it means."
-    notes = [f"{m['name']}: {m['note']}" for m in models if m.get("note")]
     stopped = [m for m in models if m.get("stopped_down")]
-    closed = table([str(m["name"]) for m in stopped], stopped, _STOPPED_COLUMNS)
-    below = html("<h3>The same fits, stopped down</h3>{}", closed) if closed else Markup()
-    more = table(names, models, _MORE_COLUMNS) + _states(models)
-    words = legend((*_MODEL_COLUMNS, *_MORE_COLUMNS, *_IMAGE_COLUMNS)) if models else Markup()
-    rest = folded("More figures", more + below) if more else below
-    return table(names, models, _MODEL_COLUMNS) + _notes([note, *notes] if models else []) + words + rest
+    states = [(str(m["name"]), row) for m in models for row in m.get("states") or ()]
+    return {
+        "models": table(names, models, _MODEL_COLUMNS),
+        "model_notes": [note, *(f"{m['name']}: {m['note']}" for m in models if m.get("note"))] if models else [],
+        "legend_columns": (*_MODEL_COLUMNS, *_MORE_COLUMNS, *_IMAGE_COLUMNS) if models else (),
+        "more": table(names, models, _MORE_COLUMNS),
+        "states": table(
+            [n for n, _ in states], [r for _, r in states], (*_AXIS_COLUMNS, *_MODEL_COLUMNS, *_MORE_COLUMNS)
+        ),
+        "stopped": table([str(m["name"]) for m in stopped], stopped, _STOPPED_COLUMNS),
+    }
 
 
-def _states(models: Sequence[Record]) -> Markup:
-    """Models of many states, state by state."""
-    rows = [(str(m["name"]), row) for m in models for row in m.get("states") or ()]
-    if not rows:
-        return Markup()
-    columns = (*_AXIS_COLUMNS, *_MODEL_COLUMNS, *_MORE_COLUMNS)
-    return html("<h3>State by state</h3>") + table([n for n, _ in rows], [r for _, r in rows], columns)
-
-
-def _exact(records: Sequence[Record]) -> Markup:
-    names = [
-        str(r["name"]) + ("" if r.get("available", True) else f": unavailable ({r.get('reason') or DASH})")
-        for r in records
-    ]
-    return table(names, records, _EXACT_COLUMNS)
-
-
-def _images(folder: Path, records: Sequence[Record]) -> Markup:
-    """Pictures with their captions and files, then their errors beside the noise floor."""
+def _pictures(folder: Path, records: Sequence[Record]) -> dict[str, Any]:
+    """Pictures with their captions and files, and their errors beside the noise floor."""
     named = [(n or str(r.get("name", "")), r) for n, r in zip(_names(records, "camera"), records, strict=True)]
     figures = [
         {"file": png, "title": name, "caption": r.get("caption"), "links": {"EXR": r.get("file_exr"), "PNG": png}}
@@ -202,17 +165,5 @@ def _images(folder: Path, records: Sequence[Record]) -> Markup:
         if (png := r.get("file_png"))
     ]
     measured = [(n, r) for n, r in named if number(r, "flip") is not None or number(r, "rel_mse")]
-    note = "Against the exact render of another seed; the floor is what exact renders of different seeds differ by."
-    figures_table = table([n for n, _ in measured], [r for _, r in measured], _IMAGE_COLUMNS)
-    return figure_grid(folder, figures, small=True) + figures_table + _notes([note] if measured else [])
-
-
-def _domain_gain(gain: Record) -> Markup:
-    rows: Sequence[Record] = gain.get("rows", ())
-    said = ": ".join(str(gain[key]) for key in ("scene", "text") if gain.get(key))
-    words = html("<p>{}</p>", said) if said else Markup()
-    return words + table(_names(rows, "name", "domain"), rows, _GAIN_COLUMNS + _MODEL_COLUMNS)
-
-
-def _notes(notes: Sequence[str]) -> Markup:
-    return joined("<p class='note'>{}</p>", notes)
+    errors = table([n for n, _ in measured], [r for _, r in measured], _IMAGE_COLUMNS)
+    return {"pictures": figures_of(folder, figures), "measured": errors}

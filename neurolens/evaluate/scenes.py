@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from neurolens.base.progress import Progress, Report
 from neurolens.cameras.build import Shot, ideal_as
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.cameras.exact import ExactCamera, FusedExactCamera
-from neurolens.cameras.fused import FusedCamera
+from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.evaluate.candidates import model_candidate
@@ -36,8 +35,9 @@ from neurolens.render.renderer import render
 from neurolens.render.scene import CameraSettings, Scene, load_scene
 from neurolens.render.spectrum import SpectralRange
 from neurolens.render.world import world_of
-from neurolens.surrogates.domain import Domain, domain_from_camera
+from neurolens.surrogates.domain import domain_from_camera
 from neurolens.surrogates.fit import prepare
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import make_pairs
 
 EXACT = "exact"
@@ -65,11 +65,10 @@ def scene_cameras(
     # The same light for all cameras.
     real: dict[str, Any] = {"film_mm": film, "focus_m": shot.focus_m, "f_number": f_number}
     real["wavelength_nm"] = shot.wavelengths_nm
-    exact_kind, model = (FusedExactCamera, FusedCamera) if fused else (ExactCamera, OnnxCamera)
-    exact = exact_kind(lens, bounds=domain.bounds, **real)
+    exact = ExactCamera(lens, bounds=domain.bounds, **real, runtime="c" if fused else "trace")
     cameras: dict[str, Camera] = {EXACT: exact}
     for name, file in models.items():
-        cameras[name] = model(load_model(file), **real)
+        cameras[name] = OnnxCamera(load_model(file), **real, runtime="c" if fused else "onnxruntime")
     cameras["thin lens"], cameras["pinhole"] = (
         ideal_as(kind, exact.lens, Shot(film, shot.focus_m)) for kind in ("thin:", "pinhole:")
     )

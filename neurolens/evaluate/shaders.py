@@ -14,6 +14,7 @@ from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress, Report
 
 if TYPE_CHECKING:
+    from neurolens.cameras.onnxlens import OnnxLens
     from neurolens.cameras.osl import OslLens
     from neurolens.cameras.shader_lens import ShaderLens
     from neurolens.graph.ir import Graph
@@ -106,22 +107,21 @@ def _of_model(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLen
     lens, fit = model.card["lens"], model.card["fit"]
     state = ", ".join(f"{a.name} {v:.5g}" for a, v in zip(model.axes, model.state, strict=True))
     told = [f"{lens['name']}: {fit['method']}, {lens['source']} (sha256 {lens['sha256'][:16]})."]
-    made = model_lens(model, _smallest(file, bool(model.axes)), report, fixed=fixed)
+    made = model_lens(model, _smallest(model), report, fixed=fixed)
     return str(lens["id"]), made, told + [f"State: {state}."] * bool(state and fixed)
 
 
-def _smallest(file: Path, has_states: bool) -> Graph | None:
-    """The graph of a model from its coefficients, a third smaller than that in its file; None without torch."""
+def _smallest(model: OnnxLens) -> Graph | None:
+    """The graph of a model without the rims that block next to nothing, which need torch to be known; None without."""
     from importlib.util import find_spec
 
-    if has_states or find_spec("torch") is None:
+    if model.axes or find_spec("torch") is None:
         return None
     from neurolens.surrogates.assemble import SCALARS, model_graph
     from neurolens.surrogates.specialise import without_idle_gates
-    from neurolens.surrogates.stored import load_fitted
 
-    (model,) = without_idle_gates((load_fitted(file),), IDLE)
-    return model_graph(model, model.largest_angle, SCALARS)
+    (smallest,) = without_idle_gates((model.fitted,), IDLE)
+    return model_graph(smallest, SCALARS)
 
 
 def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:
@@ -139,6 +139,7 @@ def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLe
     from neurolens.modelfile.axes import product, weights
     from neurolens.optics.focusing import focus_states
     from neurolens.optics.pupils import pupil_plane_z_mm
+    from neurolens.optics.states import set_lens
     from neurolens.optics.tracegraph import TRANSMITTANCE
     from neurolens.readers.any_format import read_any
     from neurolens.surrogates.states import StateSpace, axes_of, gap_axis
@@ -150,7 +151,7 @@ def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLe
     told = [f"{lens.name}: every surface traced, {lens.source} (sha256 {str(lens.sha256)[:16]})."]
     told.append(TRANSMITTANCE)
     if not (ranged or internal):
-        at = lens.at(zoom=state)
+        at = set_lens(lens, zoom=state)
         return lens.lens_id, osl_lens([_traced(at, pupil_plane_z_mm(at))], report), told
     space = StateSpace(lens, axes_of(lens, zoom=ranged, internal=internal, state=state), state)
     if len(space.axes) == 1:

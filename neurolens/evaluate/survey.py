@@ -29,12 +29,13 @@ from neurolens.evaluate.measure import CARD_KEYS, fit_and_measure, fresh_rays
 from neurolens.evaluate.records import plain
 from neurolens.optics.lenscheck import check_lens
 from neurolens.optics.prescription import Lens
+from neurolens.optics.states import set_lens
 from neurolens.readers.agf import more_glasses
 from neurolens.readers.any_format import kind_of, read_any
 from neurolens.readers.draft import Given
 from neurolens.surrogates.bases import pinned_threads
-from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.fit import ModelSettings, prepare
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
 SCHEMA = 1
@@ -153,7 +154,7 @@ def _survey(task: Task, file: Path, record: dict[str, Any]) -> None:
     if assumed:
         record["verdict"], record["doubts"] = "doubtful", [*assumed, *record["doubts"]]
     record |= {"sha256": lens.sha256, "layout": None, "fit": None}
-    lens = lens.with_aperture(None).at()
+    lens = set_lens(lens.with_aperture(None))
     domain = DomainChoice(focus_m=(math.inf, math.inf), wavelength_nm=_WAVELENGTHS_NM).of(lens)
     if lens.half_field_deg is None and lens.image_radius_mm is None:
         found = f"a film radius of {domain.film_radius_mm:.4g} mm, where its light falls to 10%"

@@ -9,24 +9,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from markupsafe import Markup
-
 from neurolens.base.errors import printable
 from neurolens.base.files import atomic_path, write_json
-from neurolens.evaluate.pages import (
-    DASH,
-    Column,
-    drawing,
-    facts,
-    folded,
-    html,
-    joined,
-    legend,
-    number,
-    page,
-    sorting_cells,
-    sorting_heads,
-)
+from neurolens.base.html import html_parts
+from neurolens.evaluate.pages import DASH, Column, flat, table
 from neurolens.evaluate.records import versions
 from neurolens.evaluate.survey import GOALS, VERDICTS, SurveySettings, summary_of
 
@@ -50,55 +36,6 @@ COLUMNS = (
 )  # fmt: skip
 _TEXTS = ("file", "verdict", "format", "name", "rims", "reason")
 _LISTS = ("notes", "doubts")
-TABLE_STYLE = Markup("""<style>
-.survey td.t { text-align: left; white-space: normal; min-width: 12rem; max-width: 34rem; overflow-wrap: anywhere; }
-.survey tbody th { min-width: 11rem; max-width: 16rem; white-space: normal; overflow-wrap: anywhere; }
-.survey tbody th small { color: var(--dim); display: block; }
-.survey td.p { padding: 2px; background: #fff; color: #222; } .survey td.p img { display: block; }
-.survey thead th { cursor: pointer; position: sticky; top: 0; background: var(--back); z-index: 2; }
-.survey thead th[aria-sort=ascending]::after { content: " ▲"; }
-.survey thead th[aria-sort=descending]::after { content: " ▼"; }
-.survey thead th:not([data-kind]), .survey td.v, .survey td.v + td { text-align: left; }
-.survey tr.refused, .survey tr.fault { color: var(--dim); } .survey .v { font-weight: 600; }
-.tools { display: flex; gap: .8rem; flex-wrap: wrap; align-items: center; margin: 1rem 0; }
-.tools input[type=search] { font: inherit; padding: .3rem .5rem; min-width: 18rem; }
-body { max-width: 1800px; }
-</style>""")
-# Sorts by a heading (numbers as numbers, what is missing last), and shows rows that hold all words and a chosen kind.
-TABLE_SCRIPT = Markup("""<script>
-(() => {
-  const table = document.querySelector('.survey table'), body = table.tBodies[0], rows = [...body.rows];
-  const words = document.getElementById('words'), kinds = [...document.querySelectorAll('.kind')];
-  const shown = document.getElementById('shown');
-  const texts = new Map(rows.map(r => [r, r.textContent.toLowerCase()]));
-  const filter = () => {
-    const all = words.value.toLowerCase().split(/\\s+/).filter(Boolean);
-    const on = new Set(kinds.filter(k => k.checked).map(k => k.value));
-    let count = 0;
-    for (const r of rows) {
-      const seen = r.dataset.kinds.split(' ').some(k => on.has(k)) && all.every(w => texts.get(r).includes(w));
-      r.hidden = !seen; count += seen;
-    }
-    shown.textContent = count + ' of ' + rows.length;
-  };
-  const key = (r, i) => r.cells[i].dataset.v ?? r.cells[i].textContent;
-  [...table.tHead.rows[0].cells].forEach((head, i) => head.addEventListener('click', () => {
-    const down = head.getAttribute('aria-sort') === 'ascending', sign = down ? -1 : 1;
-    for (const h of table.tHead.rows[0].cells) h.removeAttribute('aria-sort');
-    head.setAttribute('aria-sort', down ? 'descending' : 'ascending');
-    const numeric = head.dataset.kind === 'number';
-    const of = new Map(rows.map(r => [r, key(r, i)]));
-    rows.sort((a, b) => {
-      const x = of.get(a), y = of.get(b);
-      if (x === '' || y === '') return (x === '') - (y === '');
-      return sign * (numeric ? x - y : x.localeCompare(y));
-    });
-    body.append(...rows);
-  }));
-  words.addEventListener('input', filter); kinds.forEach(k => k.addEventListener('change', filter)); filter();
-})();
-</script>""")
-_ROWS = Markup("<!--rows-->")  # where they come: no name or text holds it, as those are escaped
 _KINDS = {
     **dict.fromkeys(VERDICTS, ""),
     "unfitted": "read, but without a fit",
@@ -148,7 +85,7 @@ def summary_lines(records: Sequence[Mapping[str, Any]], others: Mapping[str, int
 
 
 def _kinds(record: Mapping[str, Any]) -> list[str]:
-    """Of `_KINDS`, those of a record."""
+    """The names of `_KINDS` that hold for a record."""
     fit, kinds = record.get("fit"), [str(record["verdict"])]
     if fit:
         kinds += ["missed"] * (not fit["reaches"]) + ["broken"] * bool(fit["broken"])
@@ -163,46 +100,29 @@ def survey_page(
     collection: Collection,
     settings: SurveySettings,
 ) -> Iterator[str]:
-    """The page in parts: what was found in words, then one row a file with its section, figures and reasons."""
-    columns = [c for c in COLUMNS if any(number(r, c.key) is not None for r in records)]
-    counts = {kind: sum(kind in _kinds(r) for r in records) for kind in _KINDS}
-    box = "<label title='{}'><input type='checkbox' class='kind' value='{}' checked> {} ({})</label>"
-    boxes = [html(box, about, kind, kind, counts[kind]) for kind, about in _KINDS.items() if counts[kind]]
-    about = folded("What was run", facts({**asdict(settings), **versions()}))
-    title = f"Survey of {collection.folder.name or collection.folder}"
-    top = html("<header><h1>{}</h1></header><ul>{}</ul>", title,
-               joined("<li>{}</li>", summary_lines(records, collection.others)))  # fmt: skip
-    heads = joined("<th scope='col'>{}</th>", ("file", "section", "verdict", "format")) + sorting_heads(columns)
-    table = sorting_table(heads + html("<th scope='col'>what was found</th>"), _ROWS, joined("{}", boxes))
-    whole = page(title, top + table + legend(columns) + about + TABLE_SCRIPT)
-    before, _, after = whole.partition(_ROWS)
-    yield before
-    for r in records:
-        yield _row(r, layout_of(r["file"]), columns)
-    yield after
-
-
-def sorting_table(heads: str, rows: str, boxes: str) -> Markup:
-    """A table that searches and sorts by itself where `TABLE_SCRIPT` follows it; `boxes` choose kinds of its rows."""
-    tools = html(
-        "<div class='tools'><input id='words' type='search' placeholder='words that a row holds'>{}"
-        "<span id='shown'></span></div>",
-        boxes,
+    """The page in parts: a summary, then one row a file with its section, figures and reasons."""
+    of_records = [_kinds(r) for r in records]
+    counts = {kind: sum(kind in kinds for kinds in of_records) for kind in _KINDS}
+    rows = (
+        {"record": r, "kinds": kinds, "picture": layout_of(r["file"]), "found": _found(r)}
+        for r, kinds in zip(records, of_records, strict=True)
     )
-    body = html("<thead><tr>{}</tr></thead><tbody>{}</tbody>", heads, rows)
-    return TABLE_STYLE + tools + html("<div class='survey'><table>{}</table></div>", body)
-
-
-def _row(record: Mapping[str, Any], picture: str, columns: Sequence[Column]) -> str:
-    said = [record["reason"], *record.get("doubts", ()), *record.get("notes", ())]
-    said += [f"promise not held: {b}" for b in (record.get("fit") or {}).get("broken", ())]
-    listed = joined("{}", filter(None, dict.fromkeys(said)), "<br>")
-    return html(
-        "<tr class='{}' data-kinds='{}'><th scope='row'>{}<small>{}</small></th>{}<td class='v'>{}</td><td>{}</td>{}"
-        "<td class='t'>{}</td></tr>",
-        *(record["verdict"], " ".join(_kinds(record)), record["file"], record.get("name", ""), drawing(picture)),
-        *(record["verdict"], record.get("format", ""), sorting_cells(record, columns), listed),
+    return html_parts(
+        "survey.html",
+        title=f"Survey of {collection.folder.name or collection.folder}",
+        summary=summary_lines(records, collection.others),
+        kinds=[{"name": kind, "about": about, "count": counts[kind]} for kind, about in _KINDS.items()],
+        columns=table((), records, COLUMNS).columns,
+        rows=rows,
+        about=flat({**asdict(settings), **versions()}),
     )
+
+
+def _found(record: Mapping[str, Any]) -> list[str]:
+    """Why a file was refused, doubts, notes, and promises of the card that were not held; each once."""
+    lines = [record["reason"], *record.get("doubts", ()), *record.get("notes", ())]
+    lines += [f"promise not held: {b}" for b in (record.get("fit") or {}).get("broken", ())]
+    return list(filter(None, dict.fromkeys(lines)))
 
 
 def _csv(records: Sequence[Mapping[str, Any]]) -> str:

@@ -197,7 +197,7 @@ def _priced(
 
 
 def paths(scene: Scene) -> int:
-    """Of the scene's own size and samples."""
+    """The paths of a picture of the scene's own size and samples."""
     shot = scene.settings.camera
     return shot.width * shot.height * shot.samples
 

@@ -40,8 +40,8 @@ from neurolens.evaluate.vignetting import Illumination, relative_illumination
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.bases import pinned_threads
-from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.fit import NETWORKS, Prepared, prepare
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import RayPairs, make_pairs, save_pairs
 
 _IDEAL = ("thin lens", "pinhole")

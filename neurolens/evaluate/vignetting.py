@@ -13,7 +13,8 @@ from neurolens.evaluate.rays import Predict
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import trace
-from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
+from neurolens.surrogates.domain import FilmRays, sample_domain
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import PairSet
 
 NEAR_RIM = 0.02  # relative distance to a rim's radius that counts as near

@@ -102,14 +102,14 @@ def exit_pupil(lens: Lens, light: Light, wavelength_nm: float, like: ExitPupil |
     """The exit pupil of a light; None where none of its light arrives, or its rays meet nowhere (a pinhole, a plate).
 
     Args:
-        lens: its film must be placed (`Lens.at`).
+        lens: its film must be placed (`set_lens`).
         like: that of another wavelength; its boxes are taken.
 
     Raises:
         InputError: a lens without film, a light inside the lens.
     """
     if lens.film_z_mm is None:
-        raise InputError(lens.path, "film", None, "a focused lens (Lens.at)")
+        raise InputError(lens.path, "film", None, "a focused lens (set_lens)")
     box = _box(lens, light, wavelength_nm) if like is None else like.box
     if box is None:
         return None

@@ -27,10 +27,10 @@ from neurolens.graph.ir import Graph
 from neurolens.graph.program import ARRIVING, ENTERING
 from neurolens.graph.scalars import lower
 from neurolens.modelfile import CARD_KEY, MODEL_KEY
-from neurolens.modelfile.onnxfile import card_in, read_metadata
+from neurolens.modelfile.metadata import card_in, read_metadata
 from neurolens.surrogates.card import card_to_json
+from neurolens.surrogates.file import deflated, inflated, pack, packed_lens, unpack, unpacked_lens
 from neurolens.surrogates.source import WRITERS, identifier
-from neurolens.surrogates.stored import deflated, inflated, pack, packed_lens, unpack, unpacked_lens
 
 KIND, SCHEMA = "neurolens.ghost_model", 1
 _FRAME = "Lens frame: z along the optical axis towards the film, front vertex at z = 0, x right and y up from behind."
@@ -115,7 +115,7 @@ def read_ghosts(path: str | Path) -> GhostModel:
     Raises:
         ModelError: a file that is missing, too large, no model of ghosts, or damaged.
     """
-    _, _, metadata = read_metadata(path)
+    metadata = read_metadata(path)
     card = card_in(path, metadata, KIND)
     try:
         data = json.loads(inflated(metadata[MODEL_KEY]))

@@ -66,7 +66,7 @@ class GhostSettings:
 
     @property
     def sine(self) -> float:
-        """Of the largest angle."""
+        """The sine of the largest angle."""
         return math.sin(math.radians(self.angle_deg))
 
 
@@ -163,7 +163,7 @@ def _drawn(lens: Lens, count: int, rng: np.random.Generator) -> tuple[Array, Arr
 def _search(
     tracer: GhostTracer, every: Sequence[Pair], settings: GhostSettings, rng: np.random.Generator
 ) -> dict[Pair, tuple[float, Array, Array]]:
-    """Of every ghost its light on the film, all directions alike, and chief and scale of u where it enters (mm)."""
+    """Find the light of every ghost on the film over all directions, and where it enters: chief and scale of u (mm)."""
     sine, front = settings.sine, tracer.lens.surfaces[0].semi_diameter_mm
     p, u = _drawn(tracer.lens, _SEARCH, rng)
     place = 1.3 * front * u
@@ -297,7 +297,7 @@ def mirror_exponents(degree: int) -> Any:
 
 
 def _measured(fit: GhostPolynomial, test: Sample, film_radius: float) -> dict[str, float]:
-    """Of light on the film: RMS distance in um, shares that are wrongly there or missing, and the error of all."""
+    """Measure light on the film: RMS distance in um, shares that are wrong or missing, and the error of the sum."""
     field = LightField(*(torch.from_numpy(v) for v in (test.p, test.u, test.w)))
     if fit.exponents.shape[1] == 4:
         features = monomials(field.invariants(), fit.exponents).numpy()

@@ -15,17 +15,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from string import Template
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.flare.ghosts import GhostRays, Pair, Way
+from neurolens.flare.ghosts import GhostRays, Pair
 from neurolens.flare.stack import Floats, function_text
 from neurolens.flare.steps import LOST
-from neurolens.graph.compiler import load_compiled
+from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Exponents, Graph, Value
 from neurolens.optics.glass import inverse_square_um
@@ -123,7 +122,7 @@ class GhostModel:
             raise InputError("flare", "stop_radius_mm", self.lens.stop_radius_mm, expected)
 
     @cached_property
-    def _of(self) -> dict[Way, GhostPolynomial]:
+    def _of(self) -> dict[Pair, GhostPolynomial]:
         return dict(zip(self.pairs, self.ghosts, strict=True))
 
     @cached_property
@@ -147,22 +146,22 @@ class GhostModel:
         return start
 
     def trace(self, rays: Floats, wavelength_nm: float) -> GhostRays:
-        """As `GhostTracer.trace`."""
+        """Trace ghosts as `GhostTracer.trace` does."""
         return self.follow(self.start(rays), wavelength_nm)
 
     def follow(
-        self, start: Floats, wavelength_nm: float, *, only: Sequence[Way] | None = None, reach: float = 1.0
+        self, start: Floats, wavelength_nm: float, *, only: Sequence[Pair] | None = None, reach: float = 1.0
     ) -> GhostRays:
-        """As `GhostTracer.follow`; all rays are followed.
+        """Follow ghosts as `GhostTracer.follow` does; all rays are followed.
 
         Raises:
             InputError: a wavelength out of range.
         """
-        some: Sequence[Way] = self.pairs if only is None else only
+        some: Sequence[Pair] = self.pairs if only is None else only
         return GhostRays(np.concatenate([self.follow_each(start, [wavelength_nm], pair) for pair in some]))
 
-    def follow_each(self, start: Floats, wavelengths_nm: Sequence[float], pair: Way, reach: float = 1.0) -> Floats:
-        """As `GhostTracer.follow_each`; errors as of `follow`."""
+    def follow_each(self, start: Floats, wavelengths_nm: Sequence[float], pair: Pair, reach: float = 1.0) -> Floats:
+        """Follow ghosts as `GhostTracer.follow_each` does; it raises what `follow` raises."""
         low, high = self.wavelength_nm
         for nm in wavelengths_nm:
             if not low <= nm <= high:
@@ -209,7 +208,8 @@ class GhostModel:
             text += function_text(self._monomial_graph(key), f"terms_{n}", f"run_terms_{n}", "place", "term", "call")
         for stops, n in lights.items():
             text += function_text(self._light_graph(stops), f"lit_{n}", f"run_lit_{n}", "row", "light", "call")
-        driver = Template(_DRIVER).substitute(
+        driver = c_source(
+            "flare/ghostmodel.c",
             TERMS=", ".join(f"run_terms_{n}" for n in monomials.values()),
             LIGHTS=", ".join(f"run_lit_{n}" for n in lights.values()),
             MOST=max(4, *map(len, monomials)),  # a ray's four results have their places there, too
@@ -271,57 +271,3 @@ def ghost_graph(model: GhostModel, ghost: GhostPolynomial, g: Graph | None = Non
     rows = g.polynomial(ghost.exponents, ghost.table, variables)
     g.outputs[output] = model._light(stops, p, u, rows, radius)
     return g
-
-
-# Monomials serve all wavelengths; a table's products with them are what the graphs of light take.
-_DRIVER = """
-enum { BLOCK = 256, LANES = 16, MOST = $MOST, ROWS = $ROWS };
-typedef float lanes __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
-typedef void step(size_t, const float *const *, const float *, float *const *);
-static step *const terms_of[] = { $TERMS }, *const light_of[] = { $LIGHTS };
-
-/* Four rows of so few rays at a time that their sums stay in registers. */
-static void product(int rows, int terms, const float *table, float term[][BLOCK], float row[][BLOCK])
-{
-    for (int i = 0; i < BLOCK; i += LANES)
-        for (int r = 0; r < rows; r += 4) {
-            const float *const a = table + r * terms, *const b = a + (r + 1 < rows) * terms;
-            const float *const c = b + (r + 2 < rows) * terms, *const d = c + (r + 3 < rows) * terms;
-            lanes s = { 0.0f }, t = s, u = s, v = s;
-            for (int k = 0; k < terms; k++) {
-                const lanes x = *(const lanes *)&term[k][i];
-                s += a[k] * x;
-                t += b[k] * x;
-                u += c[k] * x;
-                v += d[k] * x;
-            }
-            *(lanes *)&row[r][i] = s;
-            *(lanes *)&row[r + 1][i] = t;
-            *(lanes *)&row[r + 2][i] = u;
-            *(lanes *)&row[r + 3][i] = v;
-        }
-}
-
-void ghosts(
-    size_t count, int wavelengths, int rows, int terms, int monomials, int lights, const float *places,
-    const float *call, const float *tables, float *out)
-{
-    static __thread float term[MOST][BLOCK], row[ROWS + 3][BLOCK];
-    for (size_t at = 0; at < count; at += BLOCK) {
-        const size_t n = count - at < BLOCK ? count - at : BLOCK;
-        const float *in[ROWS] = { places + at, places + count + at };
-        float *to[MOST];
-        for (int k = 0; k < terms; k++)
-            to[k] = term[k];
-        terms_of[monomials](n, in, call, to);
-        for (int r = 0; r < rows; r++)
-            in[2 + r] = row[r];
-        for (int w = 0; w < wavelengths; w++) {
-            product(rows, terms, tables + (size_t)w * rows * terms, term, row);
-            for (int k = 0; k < 4; k++)
-                to[k] = out + (4 * (size_t)w + k) * count + at;
-            light_of[lights](n, in, call, to);
-        }
-    }
-}
-"""

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.flare.ghostmodel import GhostModel
-from neurolens.flare.ghosts import GhostRays, GhostTracer, Way
+from neurolens.flare.ghosts import GhostRays, GhostTracer, Pair
 from neurolens.flare.lights import Light, Patch, light_towards, rays_across
 from neurolens.flare.stack import Floats
 from neurolens.flare.steps import LOST
@@ -24,6 +25,8 @@ _NEAR = 2.0  # r^2 / R^2 to which rays beyond rims tell it, too
 _EVEN = 0.02  # least unevenness, and spread of colours over the size, of a ghost
 _STEP = 0.25  # of a cell: how far the shadow of a rim may move on the film between two wavelengths
 _BAND = 0.02  # of the irradiance that wide ghosts leave on the film: a step of colour that may remain in one ghost
+_NODES = 31  # wavelengths at which scouts look
+_FOLD = 2.0  # of the logarithm of a ray's power: by so much it may change, up and down together, from band to band
 _AT_ONCE = 128  # ghosts
 _MOVED, _LONG, _SOFT = 32, math.radians(0.25), 0.2  # cells a side, step, and edge in r^2 / R^2, by which ghosts move
 _ERROR, _WORST = 3.0, 0.25  # light beside its place, times the cells that half the film is wide; at most
@@ -36,6 +39,7 @@ class Grid:
     Attributes:
         low, high: corners of the rectangle, in disc radii. columns, rows: cells.
         wavelengths: about so many stand for all of the range.
+        spectrum: wavelengths in nm, and the power of a ray at each of them over that at the first; empty where unknown.
     """
 
     low: tuple[float, float]
@@ -43,6 +47,7 @@ class Grid:
     columns: int
     rows: int
     wavelengths: int = 1
+    spectrum: tuple[tuple[float, float], ...] = ()
 
     @property
     def places(self) -> NDArray[np.float64]:
@@ -65,8 +70,8 @@ def grids_of(
     wavelength_nm: float,
     half_mm: tuple[float, float],
     cell_mm: float,
-    range_nm: tuple[float, float] = (400.0, 700.0),
-) -> dict[Way, Grid]:
+    wavelengths_nm: Sequence[float] = (400.0, 700.0),
+) -> dict[Pair, Grid]:
     """The grids of all ghosts that reach the film.
 
     A cell has one density, and a wavelength stands for those beside it: both put light beside its place, by a / n with
@@ -78,20 +83,24 @@ def grids_of(
         wavelength_nm: of the rays that look for them; others differ little.
         half_mm: half the film's width and height.
         cell_mm: size of cells on the film, about, which the share of light beside its place follows.
-        range_nm: of light.
+        wavelengths_nm: of light, increasing.
     """
     whole = Grid((-1.0, -1.0), (1.0, 1.0), _SCOUTS, _SCOUTS)
     start = tracer.start(rays_across(tracer.lens, light, whole.places)[0])
     few = np.ascontiguousarray(start.reshape(len(start), _SCOUTS + 1, -1)[:, ::_FEW, ::_FEW].reshape(len(start), -1))
-    found: list[tuple[Way, NDArray[np.bool_], _Look]] = []
+    nodes = sorted({wavelengths_nm[round(at)] for at in np.linspace(0, len(wavelengths_nm) - 1, _NODES)})
+    found: list[tuple[Pair, NDArray[np.bool_], _Look]] = []
     for k in range(0, len(tracer.pairs), _AT_ONCE):
         some = tracer.pairs[k : k + _AT_ONCE]
         rays = tracer.follow(start, wavelength_nm, only=some, reach=REACH)
-        ends = [tracer.follow(few, nm, only=some, reach=REACH).rows for nm in range_nm]
-        looks = zip(some, _kept(rays, half_mm), rays.rows, _spread(ends, half_mm), _swept(ends, half_mm), strict=True)
+        each = [tracer.follow(few, nm, only=some, reach=REACH).rows for nm in nodes]
+        looks = zip(
+            some, _kept(rays, half_mm), rays.rows, _spread(each, half_mm), _swept(each, half_mm), _spectra(each, nodes),
+            strict=True,
+        )  # fmt: skip
         found += [
-            (pair, kept, _look(kept, of_one, spread, half_mm)._replace(swept_mm=swept))
-            for pair, kept, of_one, spread, swept in looks
+            (pair, kept, _look(kept, of_one, spread, half_mm)._replace(swept_mm=swept, spectrum=spectrum))
+            for pair, kept, of_one, spread, swept, spectrum in looks
             if kept.any()
         ]
     work = np.array([((look.along_u + look.along_v) * look.colours * look.size_mm) ** (1 / 3) for *_, look in found])
@@ -109,7 +118,7 @@ def grids_of(
 
 
 def ghost_moves(
-    tracer: GhostTracer | GhostModel, patch: Patch, pair: Way, grid: Grid, wavelength_nm: float
+    tracer: GhostTracer | GhostModel, patch: Patch, pair: Pair, grid: Grid, wavelength_nm: float
 ) -> NDArray[np.float64]:
     """How far the middle of a ghost's light moves on the film (mm), [2, 2], along each of the sides of a light's patch.
 
@@ -148,6 +157,7 @@ class _Look(NamedTuple):
         colours: the same of wavelengths, times their number. size_mm: of what is on the film.
         lit: share of the rectangle that holds its light. light: of it on the film.
         swept_mm: about how far the shadow of a rim moves on the film from one end of the spectrum to the other.
+        spectrum: as of `Grid`.
     """
 
     along_u: float
@@ -157,6 +167,7 @@ class _Look(NamedTuple):
     lit: float
     light: float
     swept_mm: float = 0.0
+    spectrum: tuple[tuple[float, float], ...] = ()
 
 
 def _look(kept: NDArray[np.bool_], rows: Floats, spread: float, half_mm: tuple[float, float]) -> _Look:
@@ -188,26 +199,47 @@ def _pairs(a: NDArray[Any], axis: int, of: Callable[[Any, Any], Any]) -> NDArray
     return of(a[1:], a[:-1]) if axis == 0 else of(a[:, 1:], a[:, :-1])
 
 
-def _spread(ends: Sequence[Floats], half_mm: tuple[float, float]) -> list[float]:
-    """Of ghosts at two wavelengths, [P, 4, N] each, how far apart they are in mm; inf of those that have no light."""
-    one, other = ends
+def _spread(each: Sequence[Floats], half_mm: tuple[float, float]) -> list[float]:
+    """How far apart ghosts at the first and the last of some wavelengths are in mm; inf for those without light.
+
+    Args:
+        each: rows [P, 4, N] of the ghosts' rays at each wavelength.
+    """
+    one, other = each[0], each[-1]
     here = (one[:, 3] <= _NEAR) & (other[:, 3] <= _NEAR) & (np.abs(one[:, :2]).max(1) < 2 * max(half_mm))
     off = np.where(here, ((other[:, :2] - one[:, :2]).astype(np.float64) ** 2).sum(1), 0).sum(1)
     return np.where(here.any(1), np.sqrt(off / np.maximum(here.sum(1), 1)), np.inf).tolist()
 
 
-def _swept(ends: Sequence[Floats], half_mm: tuple[float, float]) -> list[float]:
-    """Of ghosts at two wavelengths, [P, 4, N] each, about how far in mm the shadows of rims move on the film.
+def _swept(each: Sequence[Floats], half_mm: tuple[float, float]) -> list[float]:
+    """About how far in mm the shadows of rims move on the film, from wavelength to wavelength, summed.
 
-    It is the share of a ghost's rays on the film that pass at only one of the wavelengths, times the ghost's width:
-    a rim may cut a ghost at another place in each colour even where the rays themselves do not move.
+    A rim may cut a ghost at another place in each colour even where the rays themselves do not move. Between two
+    wavelengths a shadow moves by the share of the rays on the film that pass at only one of them, times the ghost's
+    width.
+
+    Args:
+        each: rows [P, 4, N] of the ghosts' rays at each wavelength.
     """
     half = np.array(half_mm, np.float32)[:, None]
-    passed = [(rows[:, 3] <= 1) & (np.abs(rows[:, :2]) < half).all(1) for rows in ends]
-    share = (passed[0] ^ passed[1]).sum(1) / np.maximum((passed[0] | passed[1]).sum(1), 1)
-    inside = [np.where(lit[:, None], rows[:, :2], np.nan) for lit, rows in zip(passed, ends, strict=True)]
+    passed = [(rows[:, 3] <= 1) & (np.abs(rows[:, :2]) < half).all(1) for rows in each]
+    share = sum(((a ^ b).sum(1) / np.maximum((a | b).sum(1), 1) for a, b in pairwise(passed)), np.zeros(len(each[0])))
+    inside = [np.where(lit[:, None], rows[:, :2], np.nan) for lit, rows in zip(passed, each, strict=True)]
     low, high = (of(np.concatenate(inside, 2), 2) for of in (np.fmin.reduce, np.fmax.reduce))
     return (share * np.nan_to_num((high - low).max(1))).tolist()
+
+
+def _spectra(each: Sequence[Floats], nm: Sequence[float]) -> list[tuple[tuple[float, float], ...]]:
+    """Each ghost's power at some wavelengths over that at the first, by the rays that pass at two neighbours alike.
+
+    Args:
+        each: rows [P, 4, N] of the ghosts' rays at each wavelength.
+    """
+    ratios = [np.ones(len(each[0]))]
+    for one, other in pairwise(rows[:, 2].astype(np.float64) for rows in each):
+        sums = [np.where((one > 0) & (other > 0), power, 0).sum(1) for power in (one, other)]
+        ratios.append(np.divide(sums[1], sums[0], out=np.ones_like(sums[0]), where=sums[0] > 0))
+    return [tuple(zip(nm, of_one, strict=True)) for of_one in np.cumprod(ratios, 0).T.tolist()]
 
 
 def _kept(rays: GhostRays, half_mm: tuple[float, float]) -> NDArray[np.bool_]:
@@ -239,4 +271,7 @@ def _around(kept: NDArray[np.bool_], look: _Look, error: float, least: int) -> G
         low.append(2 * int(at[0]) / _SCOUTS - 1)
         high.append(2 * (int(at[-1]) + 1) / _SCOUTS - 1)
     columns, rows = (int(min(max(math.ceil(a / error), fewest), MOST)) for a in (look.along_u, look.along_v))
-    return Grid((low[0], low[1]), (high[0], high[1]), columns, rows, max(1, least, math.ceil(look.colours / error)))
+    power = np.log([max(power, 1e-30) for _, power in look.spectrum])
+    folds = math.ceil(np.abs(np.diff(power)).sum() / _FOLD)
+    wavelengths = max(1, least, folds, math.ceil(look.colours / error))
+    return Grid((low[0], low[1]), (high[0], high[1]), columns, rows, wavelengths, look.spectrum)

@@ -5,9 +5,8 @@ Each maker gives a picture of its own, and more by name that are parts of it. A 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,92 +17,54 @@ from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress, Report
 from neurolens.flare.diffraction import starburst_picture
 from neurolens.flare.ghostmodel import GhostModel
-from neurolens.flare.ghosts import GhostTracer, Way, coated, ghost_pairs
+from neurolens.flare.ghosts import GhostTracer, Pair, coated, ghost_pairs
 from neurolens.flare.lights import Light
 from neurolens.flare.photons import PhotonTracer
 from neurolens.flare.picture import PARTS, Raster, ghost_layers, ghost_picture, photon_picture
-from neurolens.flare.scatter import Scatter
 from neurolens.flare.sources import Name, SceneLights, chosen, keep_named
 from neurolens.flare.stack import Floats
 from neurolens.optics.prescription import Lens
 from neurolens.render.film import check_memory
+from neurolens.render.flaresettings import LAYERS, FlareSettings
 from neurolens.render.scene import Scene
 
 Layers = dict[str, Floats]
 REST = "rest"
 _ONE = (1.0, 1.0, 1.0)
+_FINER = 4  # wavelengths of a ghost at most, for one of a star
 
 
 @dataclass(frozen=True)
-class FlareSettings:
-    """What flare is made of, and how finely.
+class FlareJob:
+    """A flare to make.
 
     Attributes:
-        wavelength_nm: range of light. wavelengths: of equal shares of it.
-        cell_px: size on film, about, of the cells that ghosts are drawn by.
-        photons: if above 0, ghosts by photons with up to `most_reflections`, so many a light and wavelength, smoothed
-            by kernels from radius `kernel_px` on, instead of by all pairs of reflections; 0 leaves them.
-        glare: if above 0, so many photons of the layer "glare": light that was reflected more than twice, or scattered.
-        scatter: what scatters it. The ghosts keep what scatters of theirs, which is little.
-        starburst: whether to make the layer "starburst": what diffraction at the stop and the rims takes out of images.
+        lens: its film must be placed (`set_lens`); `settings.coating` is not applied to it any more.
+        wavelength_nm: range of light. threads: of the work.
         ghosts: what traces ghosts, or stands for that, of the same lens and stop; None traces all of two reflections.
-            Those of four (see `picture.with_four`) go without photons and glare, which have that light by chance.
-        single: ghosts that become layers, by name; the other ghosts are the layer "rest".
-        without: layers that are not made.
-        gains: factors of red, green and blue by the name of a layer, of a ghost (g07-03), or of a surface (s07: of all
-            ghosts that it reflects); several for one ghost are multiplied.
-        seed: of the places and chances of photons, the same for all frames. threads: of the work.
+        single: names of the ghosts that become layers; the others are the layer "rest".
         keep: picture beside which photons of long work are kept until they are whole (see `kept_beside`).
     """
 
+    lens: Lens
+    lights: Sequence[Light]
+    raster: Raster
+    settings: FlareSettings = FlareSettings()
     wavelength_nm: tuple[float, float] = (400.0, 700.0)
-    wavelengths: int = 15
-    cell_px: float = 8.0
-    photons: int = 0
-    most_reflections: int = 10
-    kernel_px: float = 3.0
-    glare: int = 0
-    scatter: Scatter = Scatter()
-    starburst: bool = False
+    threads: int = 2
     ghosts: GhostTracer | GhostModel | None = None
     single: tuple[str, ...] = ()
-    without: tuple[str, ...] = ()
-    gains: tuple[tuple[str, tuple[float, float, float]], ...] = ()
-    seed: int = 0
-    threads: int = 2
     keep: Path | None = None
 
-    def __post_init__(self) -> None:
-        for name in self.without:
-            if name not in MAKERS:
-                raise InputError("flare", "without", name, f"layers of flare: {', '.join(MAKERS)}")
-        if self.scatter.on and not self.glare:
-            raise InputError("flare", "glare", self.glare, "photons, for light that scatters")
-        often = [way.name for way in (self.ghosts.pairs if self.ghosts else ()) if len(way.reflections) > 2]
-        if often and (self.photons or self.glare):
-            raise InputError(
-                "flare", "ghosts", often[0], "none of four reflections with photons or glare: they have it"
-            )
-        of_ghosts = [name for name, _ in self.gains if name not in MAKERS]
-        if self.photons and (self.single or of_ghosts):
-            raise InputError("flare", "photons", self.photons, "0 with layers or gains of single ghosts")
-        for name, factor in self.gains:
-            if not all(0 <= v < math.inf for v in factor):
-                raise InputError("flare", f"gain {name}", factor, "finite numbers of at least 0")
-
-    def gain(self, *names: str) -> tuple[float, float, float]:
-        """Factors of red, green and blue of what has these names."""
-        r, g, b = np.prod([_ONE, *(factor for name, factor in self.gains if name in names)], 0)
-        return float(r), float(g), float(b)
+    @property
+    def fineness(self) -> dict[str, Any]:
+        """The arguments of `ghost_layers` and `ghost_picture`; a ghost takes as many wavelengths as it needs."""
+        bins, cell = _FINER * self.settings.bins, self.settings.cell_px
+        return {"wavelength_nm": self.wavelength_nm, "wavelengths": bins, "cell_px": cell, "threads": self.threads}
 
 
-def flare_layers(
-    lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, progress: Progress | None = None
-) -> Layers:
+def flare_layers(job: FlareJob, progress: Progress | None = None) -> Layers:
     """The layers that are switched on, by name, [H, W, 3] linear sRGB each; those of `MAKERS` sum to the flare.
-
-    Args:
-        lens: its film must be placed (`Lens.at`).
 
     Raises:
         InputError: as of the makers.
@@ -111,11 +72,11 @@ def flare_layers(
     found: Layers = {}
     progress = progress or Progress(quiet=True)
     for name, make in MAKERS.items():
-        if name not in settings.without:
+        if job.settings.makes(name):
             with progress.stage(name) as report:
-                made = make(lens, lights, raster, settings, report)
+                made = make(job, report)
             for picture in made.values():
-                picture *= np.array(settings.gain(name), np.float32)
+                picture *= np.array(job.settings.gain(name), np.float32)
             found |= made
     return found
 
@@ -138,23 +99,20 @@ def scene_choice(frames: Sequence[tuple[Scene, Lens]], raster: Raster, threads: 
         InputError: as of `coated`.
     """
     scene = frames[0][0]
-    table, sources = scene.settings.flare, SceneLights(scene)
-    assert table is not None
+    settings, sources = scene.settings.flare, SceneLights(scene)
+    assert settings is not None
     seen = [sources.named(at, lens.film_z_mm or 0.0) for at, lens in frames]
-    names = chosen(seen, table.most)
-    tracers = [GhostTracer(lens if table.coating is None else coated(lens, table.coating)) for _, lens in frames]
-    ghosts = [(tracer, keep_named(there, names).lights) for tracer, there in zip(tracers, seen, strict=True)]
-    return Choice(names, brightest(ghosts, raster, _settings_of(scene, threads), table.brightest))
+    names = chosen(seen, settings.most)
+    jobs = []
+    for (_, lens), there in zip(frames, seen, strict=True):
+        lens, lights = with_coating(lens, settings), keep_named(there, names).lights
+        jobs.append(FlareJob(lens, lights, raster, settings, scene.settings.camera.wavelengths_nm, threads))
+    return Choice(names, brightest(jobs))
 
 
-def _settings_of(scene: Scene, threads: int) -> FlareSettings:
-    """The settings of a scene's table [flare], without layers of single ghosts."""
-    table = scene.settings.flare
-    assert table is not None
-    return FlareSettings(
-        scene.settings.camera.wavelengths_nm, table.bins, table.cell_px, without=table.without, threads=threads,
-        glare=table.glare, starburst=table.starburst,
-    )  # fmt: skip
+def with_coating(lens: Lens, settings: FlareSettings) -> Lens:
+    """The lens with the coating of the settings; raises InputError as `coated`."""
+    return lens if settings.coating is None else coated(lens, settings.coating)
 
 
 def scene_flare(
@@ -174,15 +132,14 @@ def scene_flare(
     Raises:
         InputError: as of `flare_layers` and `coated`.
     """
-    table, sources = scene.settings.flare, SceneLights(scene)
-    assert table is not None and lens.film_z_mm is not None
+    settings, sources = scene.settings.flare, SceneLights(scene)
+    assert settings is not None and lens.film_z_mm is not None
     names, single = choice or scene_choice([(scene, lens)], raster, threads)
     lights = keep_named(sources.named(scene, lens.film_z_mm), names).lights
-    lens = lens if table.coating is None else coated(lens, table.coating)
-    settings = replace(_settings_of(scene, threads), single=single)
-    found = flare_layers(lens, lights, raster, settings, progress)
+    light_nm = scene.settings.camera.wavelengths_nm
+    job = FlareJob(with_coating(lens, settings), lights, raster, settings, light_nm, threads, single=single)
     matrix = sources.balance(white_balance).T.astype(np.float32)
-    return {name: picture @ matrix for name, picture in found.items()}
+    return {name: picture @ matrix for name, picture in flare_layers(job, progress).items()}
 
 
 def sum_of(layers: Mapping[str, Floats], raster: Raster) -> Floats:
@@ -193,87 +150,72 @@ def sum_of(layers: Mapping[str, Floats], raster: Raster) -> Floats:
     return total
 
 
-def brightest(
-    frames: Sequence[tuple[GhostTracer | GhostModel, Sequence[Light]]],
-    raster: Raster,
-    settings: FlareSettings,
-    count: int,
-    done: Callable[[float], None] = lambda share: None,
-) -> tuple[str, ...]:
+def brightest(frames: Sequence[FlareJob], done: Callable[[float], None] = lambda share: None) -> tuple[str, ...]:
     """Names of the ghosts whose own pictures, with their gains, have the greatest values on the film in any frame.
 
-    These are at most `count` names, the brightest first. A ghost without light on the film is never one of them.
-
-    Args:
-        frames: what traces the ghosts, and the lights, of each frame.
+    These are at most `settings.brightest` names, the brightest first. A ghost without light on the film is never one.
     """
     peaks: dict[str, float] = {}
-    most = min(count, max((len(ghosts.pairs) for ghosts, _ in frames), default=0))
+    raster, count = frames[0].raster, frames[0].settings.brightest
+    if not count:
+        return ()
+    tracers = [job.ghosts or GhostTracer(job.lens) for job in frames]
+    most = min(count, max(len(ghosts.pairs) for ghosts in tracers))
     check_memory(raster.width, raster.height, _bytes(most, most))
-    for number, (ghosts, lights) in enumerate(frames if count else ()):
-        factors = _factors(ghosts.pairs, settings, ghost_pairs(ghosts.lens))
+    for number, (job, ghosts) in enumerate(zip(frames, tracers, strict=True)):
+        factors = _factors(ghosts.pairs, job.settings, ghost_pairs(ghosts.lens))
         each, begun = range(len(ghosts.pairs)), number / len(frames)
         report = partial(lambda begun, share: done(begun + share / len(frames)), begun)
-        for k, picture in ghost_layers(ghosts, lights, raster, each, **_fineness(settings), done=report):
+        for k, picture in ghost_layers(ghosts, job.lights, raster, each, **job.fineness, done=report):
             peak = float((picture.max(0).max(0) * factors[ghosts.pairs[k]]).max())
             peaks[ghosts.pairs[k].name] = max(peak, peaks.get(ghosts.pairs[k].name, 0.0))
     return tuple(sorted((name for name in peaks if peaks[name] > 0), key=lambda name: -peaks[name])[:count])
 
 
-def _ghosts(lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, done: Report) -> Layers:
-    if settings.photons:
-        part = "ghosts" if settings.glare else "flare"
-        return {"ghosts": _photons(lens, lights, raster, settings, done, part, settings.photons)}
-    ghosts = settings.ghosts or GhostTracer(lens)
-    factors = _factors(ghosts.pairs, settings, ghost_pairs(lens))
+def _ghosts(job: FlareJob, done: Report) -> Layers:
+    if job.settings.photons:
+        part = "ghosts" if job.settings.glare else "flare"
+        return {"ghosts": _photons(job, done, part, job.settings.photons)}
+    ghosts = job.ghosts or GhostTracer(job.lens)
+    factors = _factors(ghosts.pairs, job.settings, ghost_pairs(job.lens))
     # Ghosts of one layer and of equal factors share a picture.
-    keys = [(p.name if p.name in settings.single else REST, factors[p]) for p in ghosts.pairs]
-    kinds = list(dict.fromkeys([*keys, *((name, _ONE) for name in (*settings.single, REST))]))
-    check_memory(raster.width, raster.height, _bytes(len(kinds), len(settings.single)))
+    keys = [(p.name if p.name in job.single else REST, factors[p]) for p in ghosts.pairs]
+    kinds = list(dict.fromkeys([*keys, *((name, _ONE) for name in (*job.single, REST))]))
+    raster = job.raster
+    check_memory(raster.width, raster.height, _bytes(len(kinds), len(job.single)))
     layers = [kinds.index(key) for key in keys]
-    pictures = ghost_picture(ghosts, lights, raster, layers=layers, **_fineness(settings), done=done)
-    parts: Layers = {name: np.zeros(pictures.shape[1:], np.float32) for name in (*settings.single, REST)}
+    pictures = ghost_picture(ghosts, job.lights, raster, layers=layers, **job.fineness, done=done)
+    parts: Layers = {name: np.zeros(pictures.shape[1:], np.float32) for name in (*job.single, REST)}
     for (name, factor), picture in zip(kinds, pictures, strict=False):
         parts[name] += picture * np.array(factor, np.float32)
-    return {"ghosts": np.sum(list(parts.values()), 0), **(parts if settings.single else {})}
+    return {"ghosts": np.sum(list(parts.values()), 0), **(parts if job.single else {})}
 
 
 def _bytes(pictures: int, layers: int) -> int:
-    """Of a pixel, of pictures that are drawn and layers of single ghosts that they become."""
+    """The bytes of a pixel of all pictures that are drawn, and of the layers of single ghosts that they become."""
     return 12 * (pictures + layers + 4)
 
 
-def _fineness(settings: FlareSettings) -> dict[str, Any]:
-    """The settings that `ghost_layers` and `ghost_picture` have."""
-    names = "wavelength_nm", "wavelengths", "cell_px", "threads"
-    return {name: getattr(settings, name) for name in names}
+def _glare(job: FlareJob, done: Report) -> Layers:
+    return {"glare": _photons(job, done, "glare", job.settings.glare)}
 
 
-def _glare(lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, done: Report) -> Layers:
-    if not settings.glare:
-        return {}
-    return {"glare": _photons(lens, lights, raster, settings, done, "glare", settings.glare)}
-
-
-def _starburst(lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, done: Report) -> Layers:
-    if not settings.starburst:
-        return {}
+def _starburst(job: FlareJob, done: Report) -> Layers:
     return {
         "starburst": starburst_picture(
-            lens, lights, raster, wavelength_nm=settings.wavelength_nm, wavelengths=settings.wavelengths,
-            threads=settings.threads, done=done,
+            job.lens, job.lights, job.raster, wavelength_nm=job.wavelength_nm, wavelengths=job.settings.bins,
+            threads=job.threads, done=done,
         )
     }  # fmt: skip
 
 
-def _photons(
-    lens: Lens, lights: Sequence[Light], raster: Raster, settings: FlareSettings, done: Report, part: str, count: int
-) -> Floats:
+def _photons(job: FlareJob, done: Report, part: str, count: int) -> Floats:
+    settings = job.settings
     return photon_picture(
-        PhotonTracer(lens, settings.scatter), lights, raster, part=part, wavelength_nm=settings.wavelength_nm,
-        wavelengths=settings.wavelengths, photons=count, most_reflections=settings.most_reflections,
-        kernel_px=settings.kernel_px, seed=settings.seed, threads=settings.threads, done=done,
-        keep=None if settings.keep is None else _kept_file(settings.keep, part),
+        PhotonTracer(job.lens, settings.scatter), job.lights, job.raster, part=part, wavelength_nm=job.wavelength_nm,
+        wavelengths=settings.bins, photons=count, most_reflections=settings.most_reflections,
+        kernel_px=settings.kernel_px, seed=settings.seed, threads=job.threads, done=done,
+        keep=None if job.keep is None else _kept_file(job.keep, part),
     )  # fmt: skip
 
 
@@ -287,23 +229,16 @@ def _kept_file(picture: Path, part: str) -> Path:
 
 
 def _factors(
-    pairs: Sequence[Way], settings: FlareSettings, every: Sequence[Way]
-) -> dict[Way, tuple[float, float, float]]:
-    """Of each of the pairs; names may be those of `every` ghost of the lens, of which a fit leaves some out."""
-    surfaces = {k for pair in every for k in pair.reflections}
-    known = {*MAKERS, *(pair.name for pair in (*pairs, *every)), *(f"s{k:02d}" for k in surfaces)}
-    for name, _ in settings.gains:
+    pairs: Sequence[Pair], settings: FlareSettings, every: Sequence[Pair]
+) -> dict[Pair, tuple[float, float, float]]:
+    """The gain of each of the pairs; a gain may name a ghost of `every` that is not among the pairs, as fits leave some
+    out."""
+    known = {*MAKERS, *(pair.name for pair in (*pairs, *every))}
+    for name in settings.gains:
         if name not in known:
-            named = every[0].name if every else "g01-00"
-            expected = (
-                f"a layer ({', '.join(MAKERS)}), a ghost ({named}) or a surface (s{min(surfaces, default=0):02d})"
-            )
-            raise InputError("flare", "gain", name, f"{expected} of this lens")
-    return {pair: settings.gain(pair.name, *(f"s{k:02d}" for k in pair.reflections)) for pair in pairs}
+            expected = f"a layer ({', '.join(MAKERS)}) or a ghost ({every[0].name if every else 'g01-00'}) of this lens"
+            raise InputError("flare", "gain", name, expected)
+    return {pair: settings.gain(pair.name) for pair in pairs}
 
 
-MAKERS: dict[str, Callable[[Lens, Sequence[Light], Raster, FlareSettings, Report], Layers]] = {
-    "ghosts": _ghosts,
-    "glare": _glare,
-    "starburst": _starburst,
-}
+MAKERS: dict[str, Callable[[FlareJob, Report], Layers]] = dict(zip(LAYERS, (_ghosts, _glare, _starburst), strict=True))

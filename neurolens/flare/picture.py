@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from neurolens.base.files import atomic_path, seal, sealed_bytes
 from neurolens.base.status import PASSED
 from neurolens.flare.area import draw_edges, edges_of
 from neurolens.flare.ghostmodel import GhostModel
-from neurolens.flare.ghosts import Four, GhostTracer, Way, four_reflections
+from neurolens.flare.ghosts import GhostTracer, Pair
 from neurolens.flare.grids import REACH, Grid, ghost_moves, grids_of
 from neurolens.flare.lights import Light, disc, light_rays, patches, rays_across
 from neurolens.flare.photons import LEVELS, Photons, PhotonTracer
@@ -37,14 +37,13 @@ from neurolens.optics.prescription import Lens
 from neurolens.optics.sequence import follow, turning
 from neurolens.optics.trace import Rays, trace
 from neurolens.render.checkpoint import digest
-from neurolens.render.colour import in_gamut
+from neurolens.render.colour import SRGB, in_gamut
 from neurolens.render.spectrum import SpectralRange
 
 RANKED = 4096  # rays that decide which ghosts are brightest
-LEFT, SOME, MANY = 1e-3, 64, 2000  # of `with_four`
-_PROBES = 512  # rays
 _AT_ONCE = 1 << 16  # rays of a call
 _ENOUGH = 200  # photons of a kernel: a noise of 8%
+_COLOURED = 3200  # photons of a kernel of colour: eyes see its noise in wider areas
 _WAIT_S = 0.5  # between two reports
 _KEEP_S = 30.0  # between two states of long work
 _AXIS = 1 << 15  # rays of the exposure
@@ -56,7 +55,7 @@ FEWEST = 4  # wavelengths that stand for all
 _PATCH_DEG = 2.0  # of an extended light: see `patches`
 
 Doubles = NDArray[np.float64]
-_Task = tuple[Light, Way, Grid, list[float], Doubles]  # with wavelengths [K] and their colours [K, 3]
+_Task = tuple[Light, Pair, Grid, list[float], Doubles]  # with wavelengths [K] and their colours [K, 3]
 _T = TypeVar("_T")
 _R = TypeVar("_R")
 
@@ -93,7 +92,7 @@ class Ghost:
         passed: share of the rays at the front disc that arrive.
     """
 
-    pair: Way
+    pair: Pair
     energy: float
     centre_mm: tuple[float, float]
     size_mm: float
@@ -113,7 +112,7 @@ def ghost_table(
         image = GhostTracer(tracer.lens, []).trace(rays, wavelength_nm, direct=True)
         sums = np.concatenate([tracer.trace(rays, wavelength_nm).sums, image.sums])
     else:
-        sums = tracer.sums(tracer.start(rays), wavelength_nm, direct=True).sums
+        sums = tracer.sums(rays, wavelength_nm, direct=True)
     of_image, rows = sums[-1, 0], []
     for way, (power, *moments, lit) in zip(tracer.pairs, sums.tolist(), strict=False):
         if power > 0:
@@ -123,44 +122,7 @@ def ghost_table(
     return sorted(rows, key=lambda ghost: -ghost.energy)
 
 
-class Ways(NamedTuple):
-    """Ghosts of two reflections, and the strongest of four.
-
-    Attributes:
-        ways: the ghosts. fours: how many of four reflections the lens has. left: share of all ghosts' light on the
-            film's plane that those of four reflections have which are not among the ways.
-    """
-
-    ways: tuple[Way, ...]
-    fours: int
-    left: float
-
-
-def with_four(lens: Lens, lights: Sequence[Light], wavelength_nm: float = 550.0) -> Ways:
-    """All ghosts of two reflections, and of four reflections so many of the strongest that little light is left.
-
-    That is `LEFT` of all ghosts' light; but at least `SOME` ghosts, and at most `MANY`.
-
-    Raises:
-        InputError: more ghosts than `ghosts.MOST_WAYS`.
-    """
-    tracer, fours = GhostTracer(lens), four_reflections(lens)
-    energy, twice = np.zeros(len(fours)), 0.0
-    for light in lights:
-        rays, area = light_rays(lens, light, 0, _PROBES)
-        start = tracer.start(rays)
-        twice += area * sum(light.rgb) * float(tracer.sums(start, wavelength_nm).sums[:, 0].sum())
-        energy += area * sum(light.rgb) * tracer.sums(start, wavelength_nm, fours).sums[:, 0]
-    order = np.argsort(-energy, kind="stable")
-    left = energy.sum() - np.cumsum(energy[order])
-    whole = twice + energy.sum()
-    kept = int(np.clip(np.count_nonzero(left > LEFT * whole) + 1, SOME, MANY))
-    kept = min(kept, int(np.count_nonzero(energy)))
-    chosen = tuple(Four(*row) for row in fours[order[:kept]].tolist())
-    return Ways(tracer.pairs + chosen, len(fours), float(left[kept - 1] / whole) if kept else 0.0)
-
-
-def ghost_layout(lens: Lens, pair: Way, light: Light, lines: int = 9) -> Layout:
+def ghost_layout(lens: Lens, pair: Pair, light: Light, lines: int = 9) -> Layout:
     """The lens with rays of one ghost in the plane through the axis, of light as far off the axis as `light`.
 
     At most so many rays, evenly chosen of those that arrive.
@@ -210,7 +172,7 @@ def ghost_picture(
     raster: Raster,
     *,
     wavelength_nm: tuple[float, float] = (400.0, 700.0),
-    wavelengths: int = 15,
+    wavelengths: int = 60,
     cell_px: float = 8.0,
     layers: Sequence[int] | None = None,
     threads: int = 2,
@@ -238,7 +200,7 @@ def ghost_layers(
     layers: Sequence[int],
     *,
     wavelength_nm: tuple[float, float] = (400.0, 700.0),
-    wavelengths: int = 15,
+    wavelengths: int = 60,
     cell_px: float = 8.0,
     threads: int = 2,
     done: Callable[[float], None] = lambda share: None,
@@ -262,11 +224,11 @@ def ghost_layers(
     for patch in (part for light in lights for part in patches(light, _PATCH_DEG)):
         light, size = patch.light, 1.5 * float(np.abs(patch.sides).sum()) * abs(float(first_order(lens).efl_mm))
         around = half[0] + size, half[1] + size  # ghosts beside the film may reach it, smeared
-        of_light = grids_of(tracer, light, middle, around, cell_px / raster.per_mm, (float(nm[0]), float(nm[-1])))
+        of_light = grids_of(tracer, light, middle, around, cell_px / raster.per_mm, nm.tolist())
         response = np.asarray(unit * spectral.response * spectral.spectrum(light.rgb), np.float64).T
         for pair, grid in of_light.items():
             moved = raster.per_mm * ghost_moves(tracer, patch, pair, grid, middle) * (-1, 1)
-            task = light, pair, grid, *_bands(nm, response, grid.wavelengths)
+            task = light, pair, grid, *_bands(nm, response, grid)
             groups.setdefault((layer[pair], smear_of(patch, moved)), []).append(task)
     work = _Work(sum(map(len, groups.values())), done)
     for number in sorted({number for number, _ in groups}):
@@ -295,7 +257,7 @@ def _draw(
     strips = [range(height)[k : k + high] for k in range(0, height, high)]
 
     def edges(task: _Task) -> tuple[list[Doubles], Doubles]:
-        """Of each wavelength, and light of their cells."""
+        """The edges of each wavelength's cells, and the light of the cells."""
         light, pair, grid, wavelengths_nm, colours = task
         if not work.step():
             return [], colours[:0]
@@ -329,14 +291,27 @@ def _batches(tasks: Sequence[_Task]) -> Iterator[list[_Task]]:
         yield some
 
 
-def _bands(nm: Doubles, response: Doubles, count: int) -> tuple[list[float], Doubles]:
-    """About so many wavelengths that stand for all of `nm` [W], and their colours [K, 3] for responses [W, 3]."""
-    count = min(max(count, FEWEST), len(nm))
+def _bands(nm: Doubles, response: Doubles, grid: Grid) -> tuple[list[float], Doubles]:
+    """The wavelengths that stand for all of `nm` [W] in a ghost, and their colours [K, 3] for responses [W, 3].
+
+    One wavelength is traced for each band. The others of the band have its places and their own power: a coating may
+    reflect ten times as much at one end of a band as at the other. Ghosts with equally many bands share the wavelengths
+    that are traced, unless a ghost is too dark at one of them to stand for its band.
+    """
+    count = min(max(grid.wavelengths, FEWEST), len(nm))
     w = inverse_square_um(nm)  # glass moves light about evenly with it
     at = np.arange(count) if count == len(nm) else (count * (w[0] - w) / (1.000001 * (w[0] - w[-1]))).astype(int)
-    of_band = (at == np.unique(at)[:, None]).astype(np.float64)
-    share = of_band * (np.abs(response).sum(1) + 1e-30)
-    return (share @ nm / share.sum(1)).tolist(), of_band @ response
+    nodes, level = zip(*(grid.spectrum or ((nm[0], 1.0),)), strict=True)
+    power = np.interp(nm, nodes, np.maximum(level, 1e-3 * max(level) + 1e-30))
+    traced, colours = list[float](), list[Doubles]()
+    for band in (np.flatnonzero(at == k) for k in np.unique(at)):
+        chosen = float(np.average(nm[band], weights=np.abs(response[band]).sum(1) + 1e-30))
+        if 2 * np.interp(chosen, nm, power) < power[band].mean():
+            bright = nm[band[2 * power[band] >= power[band].mean()]]
+            chosen = float(bright[np.abs(bright - chosen).argmin()])
+        traced.append(chosen)
+        colours.append(power[band] @ response[band] / np.interp(chosen, nm, power))
+    return traced, np.array(colours)
 
 
 # Photons by what became of them; those of "ghosts" and "glare" are the flare.
@@ -477,9 +452,16 @@ class _Work:
 
 
 def _smoothed(picture: Floats, sums: Floats, radius: float) -> Floats:
+    """Smooth a picture [H, W, 3] of photons: its luminance by kernels from `radius` on, its colour by wider kernels."""
+    bright, coloured = (in_gamut(_spread_wide(picture, sums, radius, most)) for most in (_ENOUGH, _COLOURED))
+    luminance = [np.maximum(part @ SRGB.to_xyz[1].astype(np.float32), 1e-30)[..., None] for part in (bright, coloured)]
+    return coloured * (luminance[0] / luminance[1])
+
+
+def _spread_wide(picture: Floats, sums: Floats, radius: float, enough: int) -> Floats:
     """A picture [H, W, 3] whose pixels' light is spread by kernels that keep its sum, mirrored at the edges.
 
-    Each by the narrowest kernel of radius r, 2 r, ... that holds `_ENOUGH` photons of equal weight, or is as little
+    Each by the narrowest kernel of radius r, 2 r, ... that holds `enough` photons of equal weight, or is as little
     noisy by their `sums` of weights and of squares, [2, H, W], with a soft step to the next; by none much wider than an
     eighth of the picture's shorter side. Epanechnikov's, 2 / pi (1 - r^2) in units of its radius.
     """
@@ -488,8 +470,8 @@ def _smoothed(picture: Floats, sums: Floats, radius: float) -> Floats:
         weight, square = np.moveaxis(spread(np.moveaxis(sums, 0, 2), radius), 2, 0)
         last = 8 * radius > min(picture.shape[:2])
         # n photons of equal weight have a sum of squares of n times the kernel's mean square, 4 / (3 pi r^2).
-        enough = 0.75 * math.pi * radius**2 * weight**2 / np.maximum(square, 1e-30) / _ENOUGH
-        share = np.ones_like(left) if last else (enough - 0.5).clip(0, 1)
+        held = 0.75 * math.pi * radius**2 * weight**2 / np.maximum(square, 1e-30) / enough
+        share = np.ones_like(left) if last else (held - 0.5).clip(0, 1)
         found += spread(picture * (left * share)[..., None], radius)
         left, radius = left * (1 - share), 2 * radius
-    return in_gamut(found)
+    return found

@@ -9,16 +9,15 @@ Lambert's law or about the mirror's direction; haze and dust turn light by the p
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.base.errors import InputError
 from neurolens.flare.steps import LOST, STATE
 from neurolens.graph.ir import Graph, Value
 from neurolens.optics.prescription import Lens
 from neurolens.optics.sag import sag_mm
+from neurolens.render.flaresettings import Scatter
 
 CHANCES = 5  # rows: an exponential variate; two uniform ones; cosine and sine of a uniform angle
 PASSED, VOLUME, WALL, NOWHERE = range(4)  # what `scatter_graph` finds
@@ -28,72 +27,34 @@ NUMBERS = (
 _LOBE = 0.9  # mean cosine of the glossy lobe about the mirror's direction, 26 degrees
 _TINY, _NEAR = 1e-20, 1e-3
 _FLAT = 1e-6  # the least cosine with the axis: light does not stay between two surfaces for ever
-# Attributes of a share of light, and the largest that is allowed.
-_LIMITS = {"barrel": 1.0, "gloss": 1.0, "sensor": 0.9, "mirror": 1.0, "dust": 1.0, "haze_per_mm": 10.0}
 
 
-@dataclass(frozen=True)
-class Scatter:
-    """What scatters light in a lens, and how much; nothing by default.
-
-    Attributes:
-        barrel: share of light that the tube, its rings and the stop's plate reflect; gloss: share of it that goes about
-            the mirror's direction, the rest by Lambert's law.
-        sensor: share of light that the film reflects, at most 0.9; mirror: share of it as a mirror, the rest by
-            Lambert's law.
-        dust: share of the light that enters at the front that dust there scatters; dust_forward: mean cosine.
-        haze_per_mm: scattering of glass, the inverse of the mean free path; haze_forward: mean cosine.
-
-    Raises:
-        InputError: a value out of bounds: shares from 0 to 1, mean cosines from 0 to 0.9999, haze at most 10 per mm.
-    """
-
-    barrel: float = 0.0
-    gloss: float = 0.2
-    sensor: float = 0.0
-    mirror: float = 0.5
-    dust: float = 0.0
-    dust_forward: float = 0.98
-    haze_per_mm: float = 0.0
-    haze_forward: float = 0.9
-
-    def __post_init__(self) -> None:
-        for f in fields(self):
-            value, most = getattr(self, f.name), _LIMITS.get(f.name, 0.9999)
-            if not 0 <= value <= most:
-                raise InputError("scatter", f.name, value, f"a number from 0 to {most:g}")
-
-    @property
-    def on(self) -> bool:
-        """Whether anything scatters."""
-        return bool(self.barrel or self.sensor or self.dust or self.haze_per_mm)
-
-    def numbers(self, lens: Lens) -> NDArray[np.float32]:
-        """`NUMBERS` of the way to every surface, towards the film and back, [surfaces, 2, NUMBERS]."""
-        z, rows = [float(v) for v in lens.vertices_mm], lens.surfaces
-        found = np.zeros((len(rows), 2, len(NUMBERS)), np.float32)
-        for k, s in enumerate(rows):
-            r = s.semi_diameter_mm
-            for way, sense in enumerate((1, -1)):
-                last = k - sense
-                inside = 0 <= last < len(rows)
-                tube = max(r, rows[last].semi_diameter_mm) if inside else 0.0
-                medium = rows[min(k, last)].n_d if inside else 1.0
-                bends = s.n_d != lens.media[k].n_d
-                dusty = -math.log1p(-min(self.dust, 1 - 1e-7)) if last < 0 else 0.0
-                found[k, way] = (
-                    sense * (z[k] - z[last]) if inside else 0.0,
-                    tube,
-                    0.0 if s.stop else (r * (1 - 1e-4)) ** 2,
-                    -sense * float(sag_mm(s, r, 0.0)),
-                    1 / r**2 if bends else LOST,
-                    -_NEAR if inside else -LOST,
-                    self.haze_per_mm * (medium > 1),
-                    dusty,
-                    max(self.dust_forward if last < 0 else self.haze_forward, _NEAR),
-                    self.gloss,
-                )
-        return found
+def scatter_numbers(scatter: Scatter, lens: Lens) -> NDArray[np.float32]:
+    """`NUMBERS` of the way to every surface, towards the film and back, [surfaces, 2, NUMBERS]."""
+    z, rows = [float(v) for v in lens.vertices_mm], lens.surfaces
+    found = np.zeros((len(rows), 2, len(NUMBERS)), np.float32)
+    for k, s in enumerate(rows):
+        r = s.semi_diameter_mm
+        for way, sense in enumerate((1, -1)):
+            last = k - sense
+            inside = 0 <= last < len(rows)
+            tube = max(r, rows[last].semi_diameter_mm) if inside else 0.0
+            medium = rows[min(k, last)].n_d if inside else 1.0
+            bends = s.n_d != lens.media[k].n_d
+            dusty = -math.log1p(-min(scatter.dust, 1 - 1e-7)) if last < 0 else 0.0
+            found[k, way] = (
+                sense * (z[k] - z[last]) if inside else 0.0,
+                tube,
+                0.0 if s.stop else (r * (1 - 1e-4)) ** 2,
+                -sense * float(sag_mm(s, r, 0.0)),
+                1 / r**2 if bends else LOST,
+                -_NEAR if inside else -LOST,
+                scatter.haze_per_mm * (medium > 1),
+                dusty,
+                max(scatter.dust_forward if last < 0 else scatter.haze_forward, _NEAR),
+                scatter.gloss,
+            )
+    return found
 
 
 def scatter_graph() -> Graph:

@@ -26,14 +26,13 @@ from neurolens.flare.steps import (
     step_graph,
 )
 from neurolens.graph.c import Signature, write_c
-from neurolens.graph.compiler import load_compiled
+from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.graph.ir import Graph
 from neurolens.graph.scalars import lower
 from neurolens.optics import glass
 from neurolens.optics.prescription import Lens
 from neurolens.optics.sag import same_medium
-from neurolens.optics.shapes import is_plain
-from neurolens.optics.tracegraph import figure_of
+from neurolens.optics.shapes import figure_of, is_plain
 
 Floats = NDArray[np.float32]
 # What a step may do, by its place: refract light that goes to the film (0) or back (1), reflect it (2, 3).
@@ -47,7 +46,7 @@ class Stack:
     """A lens at its focus, zoom and stop.
 
     Args:
-        lens: its film must be placed (`Lens.at`).
+        lens: its film must be placed (`set_lens`).
         places: the surfaces and actions that are needed; each kind of surface takes a moment to compile.
 
     Attributes:
@@ -60,11 +59,11 @@ class Stack:
 
     def __init__(self, lens: Lens, places: Iterable[Place]) -> None:
         if lens.film_z_mm is None:
-            raise InputError(lens.path, "film_z_mm", None, "a focused lens (Lens.at)")
+            raise InputError(lens.path, "film_z_mm", None, "a focused lens (set_lens)")
         lens.require_glass("reflections, of which flare is made")
         self.lens, self.fit_error = lens, 0.0
         # An asphere's polynomial goes as high as the highest of its sort: they share functions.
-        self._figures = {k: figure_of(s) for k, s in enumerate(lens.surfaces) if not is_plain(s)}
+        self._figures = {k: figure_of(s, float) for k, s in enumerate(lens.surfaces) if not is_plain(s)}
         figures = self._figures.values()
         most = {even: max([0, *(len(f.terms) for f in figures if f.even == even)]) for even in (True, False)}
         self._terms = {k: most[f.even] if f.terms else 0 for k, f in self._figures.items()}
@@ -76,7 +75,7 @@ class Stack:
             self.functions[place] = self._kinds.index(kind)
 
     def compiled(self, driver: str, name: str, more: Mapping[str, Graph] = NONE) -> ctypes._NamedFuncPointer:
-        """A C function `name` of a text that goes through the steps: see `_HEAD` for what it finds.
+        """A C function `name` of a text that goes through the steps: `stack.c` has what it finds.
 
         Args:
             more: graphs that it finds as run_NAME, with the input `row`, numbers `call` and the output `event`.
@@ -86,14 +85,14 @@ class Stack:
         """
         mask = self.lens.aperture.table if self.lens.aperture and self.lens.aperture.mask is not None else None
         key = "" if mask is None else hashlib.sha256(mask.tobytes()).hexdigest()
-        text = "" if mask is None else _MASK.format(key=key)
+        text = "" if mask is None else c_source("flare/mask.c", MASK=key)
         for number, kind in enumerate(self._kinds):
             text += function_text(step_graph(kind), f"step_{number}", f"run_{number}", "state", "after", "call")
         text += function_text(film_graph(), "film", "run_film", "state", "film", "shift_mm")
         for called, graph in more.items():
             text += function_text(graph, called, f"run_{called}", "row", "event", "call")
         runs = ", ".join(f"run_{number}" for number in range(len(self._kinds)))
-        head = _HEAD.format(runs=runs, state=STATE, width=self.width, actions=len(ACTIONS))
+        head = c_source("flare/stack.c", STEPS=runs, STATE=STATE, WIDTH=self.width, ACTIONS=len(ACTIONS))
         library = load_compiled(text + head + driver)
         if mask is not None:
             kept = _MASKS.setdefault(key, mask)
@@ -142,7 +141,7 @@ class Stack:
         return found, float(lens.film_z_mm) - z[len(lens.surfaces) - 1]
 
     def reflectance(self, wavelength_nm: float) -> NDArray[np.float64]:
-        """Of every surface at normal incidence, towards the film, [surfaces]."""
+        """The reflectance of every surface at normal incidence, towards the film, [surfaces]."""
         numbers = self.numbers(wavelength_nm)[0][:, 0].astype(np.float64)
         n1, n2 = numbers[:, CALL.index("n_before")], numbers[:, CALL.index("n_after")]
         coated = [bool(s.coating and s.coating.layers) for s in self.lens.surfaces]
@@ -184,53 +183,3 @@ def function_text(graph: Graph, name: str, run: str, taken: str, given: str, num
     head = f"static void {run}(size_t n, const float *const *in, const float *call, float *const *out)"
     text = write_c(program, name, ["A step of flare."])
     return f"{text}\n{head}\n{{\n    (void)call;\n    {name}_rays(n, {', '.join(arguments)});\n}}\n"
-
-
-# Each mask has a library of its own, so that what it points at never changes.
-_MASK = """
-/* {key} */
-static const float *mask;
-static int mask_cells;
-void take_mask(const float *cell, int cells)
-{{
-    mask = cell;
-    mask_cells = cells;
-}}
-"""
-
-# A driver calls `go`: the step of surface k on rows `stride` apart.
-_HEAD = """
-typedef void step(size_t, const float *const *, const float *, float *const *);
-static step *const steps[] = {{ {runs} }};
-enum {{ STATE = {state}, WIDTH = {width}, ACTIONS = {actions} }};
-
-struct lens {{
-    int surfaces;
-    const int *functions;
-    const float *numbers;
-}};
-
-static void go(struct lens lens, int k, int action, size_t n, const float *from, float *to, size_t stride)
-{{
-    const float *in[STATE];
-    float *out[STATE];
-    for (int r = 0; r < STATE; r++) {{
-        in[r] = from + r * stride;
-        out[r] = to + r * stride;
-    }}
-    const int at = ACTIONS * k + action;
-    steps[lens.functions[at]](n, in, lens.numbers + at * WIDTH, out);
-}}
-
-/* x, y, power and worst of light that meets the film. */
-static void meet_film(size_t n, const float *from, size_t stride, float shift, float *to, size_t apart)
-{{
-    const float *in[STATE];
-    float *out[4];
-    for (int r = 0; r < STATE; r++)
-        in[r] = from + r * stride;
-    for (int r = 0; r < 4; r++)
-        out[r] = to + r * apart;
-    run_film(n, in, &shift, out);
-}}
-"""

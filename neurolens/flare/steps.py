@@ -1,40 +1,45 @@
 """One surface as a graph, refracting or reflecting: the step that ghosts are traced by, on compiled code.
 
 Light always travels towards -z here: in a frame that is mirrored (z reversed) while it goes to the film. So one step
-serves both ways, and `tracegraph` has its intersections. The figure of a surface is numbers of the call, as its media
-are: surfaces of one kind share a function. Fresnel's reflectance is written without the difference of nearly equal
-roots, which float32 would lose where glasses are cemented; a coating's is a polynomial in the cosine on the side of the
-lower index, fitted to its transfer matrices at one wavelength.
+serves both directions; it is that of the tracer (`optics.surfaces`). The figure of a surface is numbers of the call, as
+its media are: surfaces of one kind share a function. Fresnel's reflectance is written without the difference of nearly
+equal roots, which float32 would lose where glasses are cemented; a coating's is a polynomial in the cosine on the side
+of the lower index, fitted to its transfer matrices at one wavelength.
 """
 
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from neurolens.graph.ir import Graph, Value
 from neurolens.optics import coatings
 from neurolens.optics.apertures import Aperture
+from neurolens.optics.arithmetic import TINY, Graphs
 from neurolens.optics.filmgraph import transmitted
-from neurolens.optics.tracegraph import Figure, meet_plain, meet_shape
+from neurolens.optics.shapes import Figure
+from neurolens.optics.surfaces import Medium, Rays, height2, meet, normal_at, reflect, refract
+from neurolens.optics.transmission import path_mm
 
 Action = Literal["T", "R"]
 STATE = 8  # rows: x, y, z (mm, this step's frame), direction, power, largest r^2 over the rim's so far
 LOST = 1e30  # of that ratio: the ray meets no surface, or is totally reflected where it should go on
 CALL = ("shift_mm", "curvature", "per_rim2", "n_before", "n_after", "n_step", "absorbed_per_mm")
 DEGREE = 10  # of a coating's reflectance
-FIGURE = ("stretch", "start_c", "start_cz", "last_step_mm")  # as `tracegraph.Figure`; then `across`, then the terms
+FIGURE = ("stretch", "start_c", "start_cz", "last_step_mm")  # as `shapes.Figure`; then `across`, then the terms
 ACROSS = 3
 PLAIN = len(CALL) + DEGREE + 1  # numbers of the call of a sphere
-_TINY = 1e-30
+_UNIT = Medium(1.0, 1.0, 1.0)  # no air: light may be totally reflected behind it
 _FAINT = 2e-4  # reflectance that no ghost is seen by
 
 
 class Shape(NamedTuple):
-    """What a function knows of a `tracegraph.Figure`; its numbers are those of the call."""
+    """What a function knows of a `shapes.Figure`; its numbers are those of the call."""
 
     terms: int = 0
     even: bool = True
@@ -70,41 +75,41 @@ def step_graph(kind: Kind) -> Graph:
     terms of the polynomial, as many as the shape has.
     """
     g, shape = Graph(), kind.shape
+    o = Graphs(g, finite=True)  # films average over rays, also over those that are lost and have no power
     count = PLAIN + (0 if shape is None else len(FIGURE) + ACROSS * shape.crossed + shape.terms)
     state, call = g.input("state", STATE), g.input("call", count, per_call=True)
     shift, curvature, per_rim2, n1, n2, n_step, absorbed = (call[k] for k in range(len(CALL)))
-    d, power, worst = state[3:6], state[6], state[7]
-    x = g.concat(state[0:2], state[2] + shift)
-    nearest = d * -g.dot(x, d) + x
-    met = meet_plain(nearest, d, curvature) if shape is None else meet_shape(nearest, d, _figure(shape, call))
-    point, q = met.point, met.cosine
-    normal = met.normal
-    if normal is None:
-        normal = g.concat(point[0:2] * -curvature, 1.0 - point[2] * curvature)
+    power, worst = state[6], state[7]
+    rays = Rays(state[0], state[1], state[2] + shift, state[3], state[4], state[5])
+    figure = Figure(curvature, plain=True) if shape is None else _figure(shape, call)
+    # Indices are those relative to the medium before the surface, so that directions there are unit vectors.
+    met = meet(o, rays, figure, -1, _UNIT)
+    normal = normal_at(o, met, curvature)
     # On the near half of a sphere: beyond it there is no glass.
-    tests = [*met.tests, (g.constant(_TINY), normal[2])]
-    ratio2 = g.square(point[0:2]) * per_rim2
+    tests = [*met.tests, (TINY, normal[2])]
+    ratio2 = height2(o, met) * per_rim2
+    point, d = g.concat(met.x, met.y, met.z), state[3:6]
     if kind.absorbs:
-        power = power * transmitted(g.dot(point - x, d) * absorbed)
+        power = power * transmitted(path_mm(o, rays, met, _UNIT) * absorbed)
     if kind.bends:
         ratio = n1 / n2
-        cos2 = ratio * ratio * (q * q + -1.0) + 1.0
-        cos = cos2.maximum(0.0).sqrt()
+        bent = refract(o, rays, met, curvature, -1, _UNIT, _UNIT, n_step / (n1 * n1))
+        q, cos = met.q, bent.q * ratio
         reflected = _coated(g, call, q, cos, n_step) if kind.coated else _fresnel(n1, n2, n_step, q, cos)
         if kind.action == "R":
-            power = power * g.select(g.constant(_TINY) <= cos2, reflected, 1.0)
+            power = power * o.select(TINY, bent.q2, reflected, 1.0)
         else:
-            tests.append((g.constant(_TINY), cos2))
+            tests += bent.tests
             power = power * (1.0 - reflected)
-            d = d * ratio + normal * (ratio * q - cos)
+            d = g.concat(*bent.rays[3:]) * ratio
     if kind.action == "R":
-        d = d + normal * (q * 2.0)
-        point, d = point * [1.0, 1.0, -1.0], d * [1.0, 1.0, -1.0]
+        d = g.concat(*reflect(o, rays, met, curvature, -1)[3:]) * [1.0, 1.0, -1.0]
+        point = point * [1.0, 1.0, -1.0]
     if kind.aperture is not None:
         ratio2 = kind.aperture.rim(g, point[0:2], 1.0 / per_rim2.sqrt(), LOST)
     on = ratio2 <= LOST  # false for NaN
     for low, high in tests:
-        on = on & (low <= high)
+        on = on & (g.value(low) <= high)
     g.outputs["after"] = g.concat(point, d, power, g.select(on, worst.maximum(ratio2), LOST))
     return g
 
@@ -118,7 +123,7 @@ def film_graph() -> Graph:
     state, shift = g.input("state", STATE), g.input("shift_mm", per_call=True)
     z, dz, worst = state[2] + shift, state[5], state[7]
     place = state[0:2] - state[3:5] * (z / dz)
-    arrives = (worst <= 1.0) & (dz <= -_TINY)
+    arrives = (worst <= 1.0) & (dz <= -TINY)
     g.outputs["film"] = g.concat(place, g.select(arrives, state[6], 0.0), worst)
     return g
 
@@ -160,18 +165,34 @@ def reflectance_fit(
     exact = coatings.reflectance(cos_i, n_before, n_after, layers, wavelength_nm, sense).numpy()
     fit = np.polynomial.Chebyshev.fit(1 - c, exact, DEGREE, domain=(0, 1), w=1 / (exact + _FAINT))
     worst = np.abs(fit(1 - c) - exact) / (exact + _FAINT)
-    return fit.convert(kind=np.polynomial.Polynomial).coef.tolist(), float(worst.max())
+    return (np.asarray(fit.coef, np.float64) @ _powers()).tolist(), float(worst.max())
+
+
+@cache
+def _powers() -> NDArray[np.float64]:
+    """Coefficients of the powers of u in Chebyshev's polynomials of 2 u - 1, [DEGREE + 1, DEGREE + 1]."""
+    basis = [np.polynomial.Chebyshev.basis(k, domain=(0, 1)) for k in range(DEGREE + 1)]
+    powers = [each.convert(kind=np.polynomial.Polynomial).coef for each in basis]
+    return np.stack([np.pad(each, (0, DEGREE + 1 - len(each))) for each in powers])
 
 
 def _figure(shape: Shape, call: Value) -> Figure:
     more = ACROSS * shape.crossed
     stretch, c, cz, last_step, *rest = (call[PLAIN + k] for k in range(len(FIGURE) + more + shape.terms))
-    figure = Figure(call[CALL.index("curvature")], stretch, rest[more:], (c, cz), last_step, *shape[1:4])
-    return figure._replace(across=tuple(rest[:more]), turned=shape.turned)
+    figure = Figure(call[CALL.index("curvature")], stretch, bent=shape.bent)
+    if not shape.terms and not shape.crossed:
+        return figure
+    other: Any = rest[1] if shape.crossed else 0.0
+    start = c if shape.bent[0] else other, c if shape.bent[1] else other, cz
+    return figure._replace(
+        terms=rest[more:], even=shape.even, start=start, steps=shape.steps, last_step=last_step,
+        across=(rest[0], rest[2]) if shape.crossed else (), turned=shape.turned,
+    )  # fmt: skip
 
 
 def figure_numbers(figure: Figure, turn: float) -> list[Any]:
     """`FIGURE` and the terms as numbers, turned by -1.0 for light that travels towards +z in the lens frame."""
-    across = [turn * figure.across[0], turn * figure.across[1], figure.across[2]] if figure.across else []
-    start = [figure.stretch, *(turn * v for v in figure.start), figure.last_step]
-    return [*start, *across, *(turn * v for v in figure.terms)]
+    cx, cy, cz = figure.start or (0.0, 0.0, 0.0)
+    c, other = (cx, cy) if figure.bent[0] else (cy, cx)
+    across = [turn * figure.across[0], turn * other, figure.across[1]] if figure.across else []
+    return [figure.stretch, turn * c, turn * cz, figure.last_step, *across, *(turn * v for v in figure.terms)]

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from string import Template
 from typing import Any
 
 import numpy as np
@@ -11,94 +15,17 @@ from numpy.typing import NDArray
 
 from neurolens.graph.program import Argument, Mixture, Program, Step
 
-_HEAD = """\
-/*
-{comment}
- *
- * {name}(...) takes one ray; {name}_rays(...) takes arrays, one value a ray, that must not overlap. It has no
- * branches: gcc -O3 -march=native (clang alike) makes vectors of it. Results mean something where status is 0. The
- * guard of the domain needs NaN: never compile this with -ffast-math or -ffinite-math-only.
- */
-#ifndef {guard}
-#define {guard}
 
-#include <stddef.h>
+@cache
+def _parts(file: str) -> dict[str, Template]:
+    text = (Path(__file__).parent / file).read_text(encoding="utf-8")
+    words = re.split(r"^//// (\w+).*\n", text, flags=re.MULTILINE)
+    return {name: Template(body) for name, body in zip(words[1::2], words[2::2], strict=True)}
 
-#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)
-#error "{name}: rays outside the domain are told by NaN; compile without -ffast-math and -ffinite-math-only"
-#endif
-#ifdef __cplusplus
-#define {macro}_RESTRICT __restrict
-#else
-#define {macro}_RESTRICT restrict
-#endif
-#if defined(__GNUC__)
-#define {macro}_INLINE static inline __attribute__((always_inline, unused))
-#define {macro}_UNUSED __attribute__((unused))
-#else
-#define {macro}_INLINE static inline
-#define {macro}_UNUSED
-#endif
-/* a b + c, rounded once where the machine can. */
-#if defined(__GNUC__) && (defined(__FMA__) || defined(__FP_FAST_FMAF) || defined(__ARM_FEATURE_FMA))
-#define {macro}_FMA(a, b, c) __builtin_fmaf((a), (b), (c))
-#else
-#define {macro}_FMA(a, b, c) ((a) * (b) + (c))
-#endif
-"""
-# sqrtf of the library sets errno, which keeps compilers from making vectors of it unless they are told not to care.
-_SQRT = """
-/* Square root: the machine's with -fno-math-errno, else by Newton's steps from the halved exponent, within an ulp. */
-{macro}_INLINE float {name}_sqrt(float x)
-{{
-#ifdef __NO_MATH_ERRNO__
-    return __builtin_sqrtf(x);
-#else
-    union {{ float f; unsigned u; }} y;
-    y.f = x;
-    y.u = 0x5f375a86u - (y.u >> 1);
-    float r = y.f;
-    r = r * (1.5f - 0.5f * x * r * r);
-    r = r * (1.5f - 0.5f * x * r * r);
-    r = r * (1.5f - 0.5f * x * r * r);
-    const float s = x * r;
-    return s + 0.5f * r * (x - s * s);
-#endif
-}}
-"""
-# As whole numbers, which order as the sizes of floats do: compilers make branches of two comparisons of floats.
-_CLAMP = """
-{macro}_INLINE float {name}_clamp(float x, float limit)
-{{
-    union {{ float f; unsigned u; }} a, b;
-    a.f = x;
-    b.f = limit;
-    const unsigned sign = a.u & 0x80000000u, size = a.u & 0x7fffffffu;
-    a.u = (size < b.u ? size : b.u) | sign;
-    return a.f;
-}}
-"""
-# By masks, of which compilers make vectors where the choice is the same for all rays.
-_PICK = """
-{macro}_INLINE float {name}_pick(float truth, float x, float y)
-{{
-    union {{ float f; unsigned u; }} a, b;
-    const unsigned mask = 0u - (unsigned)(int)truth;
-    a.f = x;
-    b.f = y;
-    a.u = (a.u & mask) | (b.u & ~mask);
-    return a.f;
-}}
-"""
-# A cell of a table, whatever the index is: NaN is above nothing.
-_CELL = """
-{macro}_INLINE int {name}_cell(float index, int cells)
-{{
-    const float last = (float)(cells - 1);
-    const float inside = index < last ? index : last;
-    return (int)(inside > 0.0f ? inside : 0.0f);
-}}
-"""
+
+def part(file: str, key: str, /, **values: object) -> str:
+    """A text of `parts.h` or `parts.glsl`, which the line "//// KEY" precedes, with its ${places} filled."""
+    return _parts(file)[key].substitute(values)
 
 
 @dataclass(frozen=True)
@@ -169,12 +96,11 @@ def write_c(program: Program, name: str, comment: Sequence[str], extras: Extras 
     signature = Signature.of(program, name)
     macro = name.upper()
     lines = "\n".join(f" * {line}".rstrip() for line in comment).replace("*/", "* /")
-    text = _HEAD.format(comment=lines, name=name, guard=f"{macro}_H", macro=macro)
+    text = part("parts.h", "head", comment=lines, name=name, guard=f"{macro}_H", macro=macro)
     live = program.live()
     kinds = [p.steps[k].kind for p in (program, *extras.functions.values()) for k in p.live()]
-    helpers = {"sqrt": _SQRT, "clamp": _CLAMP, "pick": _PICK, "floor": "#include <math.h>\n", "lookup": _CELL}
-    for kind, helper in helpers.items():
-        text += helper.format(name=name, macro=macro) if kind in kinds else ""
+    for kind in ("sqrt", "clamp", "pick", "floor", "lookup"):
+        text += part("parts.h", kind, name=name, macro=macro) if kind in kinds else ""
     for table in dict.fromkeys(program.steps[k].name for k in live if program.steps[k].kind == "lookup"):
         if table in program.own_tables:
             text += _numbers(f"{name}_{table}", program.own_tables[table])
@@ -194,7 +120,7 @@ def write_c(program: Program, name: str, comment: Sequence[str], extras: Extras 
     if program.mixture is not None:
         own = Writer(program.mixture.program, "sqrtf", f"{macro}_FMA")
         parts = state_parts(program.mixture, writer.table, own)
-        text += _STATE.format(name=name, macro=macro, **parts)
+        text += part("parts.h", "state", name=name, macro=macro, **parts)
         body.insert(0, "    const float *const c = state->c;")
     elif writer.table:
         rows = ",\n".join("    {" + ", ".join(literal(v) for v in row) + "}" for row in np.array(writer.table).T)
@@ -222,32 +148,6 @@ def steps_of(writer: Writer) -> list[str]:
     """The steps of a program as lines."""
     steps = [(k, writer.program.steps[k]) for k in writer.program.live() if not _input(writer.program, k)]
     return [f"    float t{k} = {writer.step(step)};" for k, step in steps]
-
-
-_STATE = """
-/* One state: made once by {name}_at, handed to every call. Out of its range every ray is outside the domain. */
-typedef struct {{
-    int inside;
-    float c[{count}];
-}} {name}_state;
-
-static const float {name}_nodes[{size}] = {{
-    {rows}}};
-
-{macro}_UNUSED static inline {name}_state {name}_at({arguments})
-{{
-{steps}
-    const float feature[{features}] = {{{made}}};
-    {name}_state state;
-    state.inside = {inside} > 0.5f;
-    for (int i = 0; i < {count}; i++) {{
-        float sum = 0.0f;
-        for (int k = 0; k < {features}; k++) sum += {name}_nodes[{features} * i + k] * feature[k];
-        state.c[i] = sum;
-    }}
-    return state;
-}}
-"""
 
 
 def state_parts(mixture: Mixture, table: Sequence[Sequence[float]], writer: Writer) -> dict[str, Any]:
@@ -342,7 +242,9 @@ def write_blocks(program: Program, name: str) -> str:
     terms = (
         f"made[{made.index(f'weight_{g}')}][i] * cell_{g // groups}[{width * (g % groups)} + c]" for g in range(weights)
     )
-    loops = _BLOCKS.format(
+    loops = part(
+        "parts.h",
+        "blocks",
         name=name,
         known=f"const {same.name}_ray once = {same.name}({', '.join(places[n] for n in same.inputs)});"
         * bool(same.outputs),
@@ -363,32 +265,10 @@ def write_blocks(program: Program, name: str) -> str:
         padded = np.pad(own.reshape(len(own), groups, columns), ((0, 0), (0, 0), (0, width - columns)))
         text += f"enum {{ {name}_table_cells = {len(own)} }};\n"
         text += _numbers(f"{name}_table", padded.reshape(len(own), -1))
-    return text + _CELL.format(name=name, macro=last.name.upper()) + loops
+    return text + part("parts.h", "lookup", name=name, macro=last.name.upper()) + loops
 
 
 BLOCK = 256  # rays
-_BLOCKS = """
-void {name}(
-    size_t count, const float *const *in, const float *call, const float *table, int cells, float *const *out,
-    int *status)
-{{
-    float made[{made}][{block}], sums[{block}][{width}];
-    {known}
-    for (size_t at = 0; at < count; at += {block}) {{
-        const size_t n = count - at < {block} ? count - at : {block};
-        {name}_before_rays(n, {first});
-        for (size_t i = 0; i < n; i++) {{
-            {cells}
-            for (int c = 0; c < {width}; c++)
-                sums[i][c] = {total};
-        }}
-        for (int c = 0; c < {columns}; c++)
-            for (size_t i = 0; i < n; i++)
-                made[{looked} + c][i] = sums[i][c];
-        {name}_after_rays(n, {last}{out}, status + at);
-    }}
-}}
-"""
 
 
 class Writer:

@@ -106,6 +106,12 @@ def _end(child: subprocess.Popen[str]) -> None:
         os.killpg(child.pid, signal.SIGKILL) if hasattr(os, "killpg") else child.kill()
 
 
+def c_source(file: str, **constants: object) -> str:
+    """The text of a .c file of this package ("flare/area.c"), after a #define for each constant that Python knows."""
+    defines = "".join(f"#define {name} {value}\n" for name, value in constants.items())
+    return defines + (Path(__file__).parents[1] / file).read_text(encoding="utf-8")
+
+
 def load_compiled(source: str) -> ctypes.CDLL:
     """The library of a source: compiled once for this machine, then taken from the folder.
 
@@ -130,7 +136,7 @@ def load_compiled(source: str) -> ctypes.CDLL:
 
 
 def _key(source: str) -> str:
-    """Of a source, its flags, the compiler and the processor: a library for another processor may crash on this one."""
+    """Hash a source, its flags, the compiler and the processor: a library for another one may crash on this one."""
     made_by = _compiler_and_processor(find_compiler())
     return hashlib.sha256("\0".join((source, *FLAGS, made_by)).encode()).hexdigest()[:32]
 

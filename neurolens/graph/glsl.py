@@ -6,48 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from neurolens.graph.c import NOTHING, Extras, Signature, Writer, literal, one_number, state_parts, steps_of
+from neurolens.graph.c import NOTHING, Extras, Signature, Writer, literal, one_number, part, state_parts, steps_of
 from neurolens.graph.program import Program
 
-_HEAD = """\
-/*
-{comment}
- *
- * For GLSL 3.30, GLSL ES 3.00 (with highp floats) and later. Results mean something where status is 0. A language that
- * may ignore NaN cannot promise the status of one: rays handed in must be numbers.
- */
-#define {fma}(a, b, c) ((a) * (b) + (c))
-"""
 # Tables of the caller are textures of one float a texel, a cell a line; NaN is less than nothing in no language.
 _LOOKUP = "texelFetch({table}, ivec2({place}, clamp(int({index}), 0, textureSize({table}, 0).y - 1)), 0).r"
 _OWN_LOOKUP = "{table}[{width} * clamp(int({index}), 0, {cells} - 1) + {place}]"
-
-
-_STATE = """
-// One state: made once by {name}_at, handed to every call. Out of its range every ray is outside the domain.
-struct {name}_state {{
-    bool inside;
-    float c[{count}];
-}};
-
-const float {name}_nodes[{size}] = float[{size}](
-    {rows}
-);
-
-{name}_state {name}_at({arguments})
-{{
-{steps}
-    float feature[{features}] = float[{features}]({made});
-    {name}_state state;
-    state.inside = {inside} > 0.5;
-    for (int i = 0; i < {count}; i++) {{
-        float sum = 0.0;
-        for (int k = 0; k < {features}; k++) sum += {name}_nodes[{features} * i + k] * feature[k];
-        state.c[i] = sum;
-    }}
-    return state;
-}}
-"""
 
 
 def write_glsl(program: Program, name: str, comment: Sequence[str], extras: Extras = NOTHING) -> str:
@@ -61,14 +25,14 @@ def write_glsl(program: Program, name: str, comment: Sequence[str], extras: Extr
     results = [f"    {o} = {writer.value(program.outputs[o].argument)};" for o in signature.outputs]
     status = program.outputs.get("status")
     results += [] if status is None else [f"    status = int({writer.value(status.argument)});"]
-    text = _HEAD.format(comment=lines, fma=fma) + "\n" * bool(extras.constants)
+    text = part("parts.glsl", "head", comment=lines, fma=fma) + "\n" * bool(extras.constants)
     text += "".join(f"const float {name.upper()}_{k.upper()} = {literal(v)};\n" for k, v in extras.constants.items())
     for key, function in extras.functions.items():
         text += f"\n{one_number(Writer(function, 'sqrt', fma), f'{name}_{key}')}"
     constants = {table: numbers.reshape(-1) for table, numbers in program.own_tables.items()}
     if program.mixture is not None:
         parts = state_parts(program.mixture, writer.table, Writer(program.mixture.program, "sqrt", fma))
-        text += _STATE.format(name=name, **parts)
+        text += part("parts.glsl", "state", name=name, **parts)
     elif writer.table:
         constants["table"] = np.array(writer.table).T.reshape(-1)
     for table, values in constants.items():

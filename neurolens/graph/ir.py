@@ -311,7 +311,7 @@ class Graph:
         """Append all of another graph, these values as its inputs (others stay inputs); returns its outputs."""
         values: list[Value] = []
         for node in other.nodes:
-            if node.kind == "input" and node.name in given:
+            if node.kind in ("input", "table") and node.name in given:
                 values.append(given[node.name])
                 continue
             values.append(self.like(node, [values[k] for k in node.inputs]))

@@ -98,7 +98,7 @@ def solve(columns: Sequence[Value], b: Value) -> Value:
 
 
 def determinant(columns: Sequence[Value]) -> Value:
-    """Of the matrix whose columns, 2 or 4 rows each, are given."""
+    """The determinant of the matrix with these columns, of 2 or 4 rows each."""
     if len(columns) == 2:
         return _determinant(_block(columns, 0, 0))
     return _determinant(_schur(columns)[0]) * _determinant(_block(columns, 2, 2))

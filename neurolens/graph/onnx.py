@@ -13,17 +13,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from onnx import ModelProto, NodeProto, TensorProto, checker, helper, numpy_helper
 
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Node
 from neurolens.graph.monomials import Block, Exponent, Pair, blocks_alone, by_block, plan_products
 from neurolens.graph.passes import pruned, same_structure
+from neurolens.graph.protobuf import FLOAT, INT32, model_proto, node_proto, tensor_proto, value_proto
 
 Array = NDArray[np.float64]
 # Opset 17 and IR 8 are read by every onnxruntime since 1.12.
 OPSET, IR_VERSION = 17, 8
-FLOAT, INT32 = TensorProto.FLOAT, TensorProto.INT32
 
 
 @dataclass(frozen=True)
@@ -45,8 +44,8 @@ def write_onnx(
     metadata: Mapping[str, str],
     mixing: Mixing | None = None,
     shapes: Mapping[str, Sequence[int]] | None = None,
-) -> ModelProto:
-    """The checked model of a graph, or of the graphs of a state's nodes.
+) -> bytes:
+    """The ONNX file of a graph, or of the graphs of a state's nodes.
 
     Args:
         metadata: its entries.
@@ -63,23 +62,13 @@ def write_onnx(
     body = writer.body(shapes or {})
     inputs = {n.name: n for g in ([mixing.graph] if mixing else []) + [kept[0]] for n in g.nodes if n.name}
     ordered = sorted(inputs.values(), key=lambda n: (n.per_call, n.name == "state"))
-    graph = helper.make_graph(
-        body,
-        "neurolens",
-        [helper.make_tensor_value_info(n.name, FLOAT, _shape(n)) for n in ordered],
-        [helper.make_tensor_value_info(*info) for info in writer.results],
-        writer.tensors,
-    )
-    model = helper.make_model(
-        graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, producer_name="neurolens"
-    )
-    helper.set_model_props(model, dict(metadata))
-    checker.check_model(model, full_check=True)
-    return model
+    given = [value_proto(n.name, FLOAT, _shape(n)) for n in ordered]
+    results = [value_proto(*result) for result in writer.results]
+    return model_proto(body, given, results, writer.tensors, metadata, (IR_VERSION, OPSET))
 
 
 def _shape(node: Node) -> list[int | str]:
-    """Of an input or a table."""
+    """The shape of an input or a table."""
     if node.kind == "table":
         return ["cells", node.rows]
     return [node.rows] if node.per_call else [node.rows, "N"]
@@ -111,8 +100,8 @@ class _Writer:
 
     def __init__(self, graphs: Sequence[Graph], mixing: Mixing | None = None, prefix: str = "") -> None:
         self.graphs, self.mixing, self.prefix = graphs, mixing, prefix
-        self.nodes: list[NodeProto] = []
-        self.tensors: list[TensorProto] = []
+        self.nodes: list[bytes] = []
+        self.tensors: list[bytes] = []
         self.results: list[tuple[str, int, list[int | str]]] = []
         self.known: dict[int, str | _Linear | _Longer] = {}
         self.inputs: dict[str, str] = {}
@@ -121,7 +110,7 @@ class _Writer:
         self._cuts: dict[int, dict[tuple[int, ...], str]] = {}
         self._squares: dict[int, tuple[str, dict[tuple[int, int], int]]] = {}  # rows of squares, of x_i and x_i + x_j
 
-    def body(self, shapes: Mapping[str, Sequence[int]]) -> list[NodeProto]:
+    def body(self, shapes: Mapping[str, Sequence[int]]) -> list[bytes]:
         """All nodes, and with them the constants and results."""
         if self.mixing is not None:
             names = {n.name for n in self.mixing.graph.nodes if n.kind == "input"}
@@ -157,11 +146,11 @@ class _Writer:
             _take_rows(self, number, range(self.graphs[0].nodes[number].rows)) if isinstance(value, _Longer) else value
         )
 
-    def op(self, kind: str, *inputs: str, out: str | None = None, **attributes: Any) -> str:
+    def op(self, kind: str, *inputs: str, out: str | None = None, **attributes: int) -> str:
         """Append a node with one output and return its name."""
         name = out or f"{self.prefix}{kind}_{len(self.nodes)}"
         number = f"{self.prefix}n{len(self.nodes)}"
-        self.nodes.append(helper.make_node(kind, list(inputs), [name], name=number, **attributes))
+        self.nodes.append(node_proto(kind, inputs, [name], number, **attributes))
         return name
 
     def const(self, value: ArrayLike, dtype: type = np.float32) -> str:
@@ -173,7 +162,7 @@ class _Writer:
         key = (array.tobytes(), array.dtype.str, array.shape)
         if key not in self._constants:
             self._constants[key] = f"c{len(self._constants)}"
-            self.tensors.append(numpy_helper.from_array(array, self._constants[key]))
+            self.tensors.append(tensor_proto(array, self._constants[key]))
         return self._constants[key]
 
     def numbers(self, stack: Array) -> str:
@@ -199,13 +188,13 @@ class _Writer:
         number = len(self.nodes)
         names = [f"{self.prefix}Split_{number}_{i}" for i in range(len(sizes))]
         inputs = [value, self.const(list(sizes), np.int64)]
-        self.nodes.append(helper.make_node("Split", inputs, names, name=f"{self.prefix}n{number}", axis=0))
+        self.nodes.append(node_proto("Split", inputs, names, f"{self.prefix}n{number}", axis=0))
         return names
 
     def concat(self, names: Sequence[str]) -> str:
         return names[0] if len(names) == 1 else self.op("Concat", *names, axis=0)
 
-    def _state(self) -> list[NodeProto]:
+    def _state(self) -> list[bytes]:
         """Nodes that make what follows the state: all of it in one product, cut and shaped."""
         if self.mixing is None:
             return []

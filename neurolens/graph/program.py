@@ -79,7 +79,7 @@ class Step:
     indices: int = 1
 
     def at_indices(self, arguments: Sequence[T]) -> list[tuple[T, Sequence[T]]]:
-        """Of a lookup: each index with its weights, from its arguments or what stands for them."""
+        """Each index of a lookup with its weights, from its arguments or what stands for them."""
         count = (len(arguments) - self.indices) // self.indices
         starts = range(self.indices, len(arguments), count)
         return [(index, arguments[k : k + count]) for index, k in zip(arguments, starts, strict=False)]

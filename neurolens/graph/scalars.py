@@ -21,6 +21,8 @@ from neurolens.graph.program import Expr, Program, row_names
 Array = NDArray[np.float64]
 # Pairs (a, b) of a truth: it holds where a <= b in all of them.
 Tests = list[tuple[Expr, Expr]]
+# Weights of matrices: each is a step, and compilers take minutes; onnxruntime multiplies larger matrices by blocks.
+MOST_WEIGHTS = 20_000
 _ROWS = 8  # of a matrix product at a time, of 16 registers; fewer would wait for one another
 
 
@@ -33,11 +35,15 @@ def lower(graphs: Graph | Sequence[Graph], fixed: Mapping[str, ArrayLike] | None
     Inputs and outputs are named row by row, see `program.row_names`. Inputs that nothing needs are none.
 
     Raises:
-        InputError: graphs that differ in more than numbers; numbers that float32 cannot hold.
+        InputError: graphs that differ in more than numbers, or with more than `MOST_WEIGHTS`; numbers that float32
+            cannot hold.
     """
     kept = [pruned(g) for g in ([graphs] if isinstance(graphs, Graph) else graphs)]
     if not same_structure(kept):
         raise InputError("export", "models", "(graphs that differ)", "models of one structure")
+    weights = sum(node.arrays[0].size for node in kept[0].nodes if node.kind == "affine")
+    if weights > MOST_WEIGHTS:
+        raise InputError("export", "weights", weights, f"at most {MOST_WEIGHTS}: larger networks are for onnxruntime")
     return _Lowering(kept, fixed or {}).program
 
 

@@ -110,7 +110,7 @@ def _off(field: Tensor, exists: Tensor, target: Tensor) -> Tensor:
 
 
 def bracket(angle: Tensor, value: Tensor, exists: Tensor, target: Tensor, jump: float = _JUMP) -> Tensor:
-    """Of increasing angles [n, G] the first neighbours whose values lie on both sides of a target [n], [n, 3].
+    """Find the first neighbours among increasing angles [n, G] whose values lie on both sides of a target [n]: [n, 3].
 
     Else the neighbours of the ray whose value is nearest to it, between which rays may come nearer yet. In the middle
     of the three stands the angle at which the straight line between the values of the others meets the target.

@@ -49,12 +49,12 @@ class Glass:
         return f"{self.maker}:{self.name}"
 
     def index(self, wavelength_nm: Any) -> Any:
-        """Refractive index relative to air at a wavelength in nm (number, or tensor of any shape, of its dtype).
+        """Refractive index relative to air at a wavelength in nm (number, value of a graph, or tensor of its dtype).
 
         Outside `range_um` the formula is extrapolated; it is finite for 380-780 nm in every glass of the catalogue,
         and meaningless or NaN beyond the poles in the ultraviolet (below 300 nm).
         """
-        square = (wavelength_nm * 1e-3) ** 2
+        square = (wavelength_nm * 1e-3) * (wavelength_nm * 1e-3)
         c = self.coefficients
         if self.form == "sellmeier":
             terms = [c[k] * square / (square - c[k + 1]) for k in range(0, len(c), 2)]
@@ -111,6 +111,8 @@ class Glass:
 
 def _root(square: Any) -> Any:
     """Square root; a negative number gives NaN as a tensor's does, where Python's own power gives a complex one."""
+    if hasattr(square, "sqrt"):
+        return square.sqrt()
     return math.nan if isinstance(square, float) and square < 0 else square**0.5
 
 
@@ -135,17 +137,27 @@ _REFUSED: dict[str, str] = {}
 
 
 def add(glasses: Iterable[Glass], refused: Mapping[str, str]) -> None:
-    """Put glasses before those of the table until `remove_added`; `refused`: why others are not there, by name."""
+    """Put glasses before those of the table until `restore`; `refused`: why others are not there, by name."""
     for glass in glasses:
         for key in (_key(glass.name), _key(str(glass))):
             _ADDED.setdefault(key, []).insert(0, glass)
     _REFUSED.update({_key(name): reason for name, reason in refused.items()})
 
 
-def remove_added() -> None:
-    """Forget what `add` has put in."""
+Added = tuple[dict[str, list[Glass]], dict[str, str]]
+
+
+def added() -> Added:
+    """What `add` has put in so far."""
+    return {key: [*glasses] for key, glasses in _ADDED.items()}, dict(_REFUSED)
+
+
+def restore(before: Added) -> None:
+    """Keep what `added` returned alone."""
     _ADDED.clear()
     _REFUSED.clear()
+    _ADDED.update(before[0])
+    _REFUSED.update(before[1])
 
 
 def find(name: str, file: str | Path = "glass catalogue", where: str = "glass") -> Glass:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -91,3 +92,32 @@ def colours(range_nm: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray
     count = COLOURS if low < high else 1
     nm = low + (high - low) * (np.arange(count) + 0.5) / count
     return nm, np.exp(-285.4e-6 * (nm - 559.0) ** 2) + _LEAST
+
+
+@dataclass(frozen=True)
+class PupilBounds:
+    """Bounds of the passing rays on the pupil plane at equally spaced film radii (as pbrt: Pharr et al. 2016, 6.4.5).
+
+    For a film point at radius r along +x, passing rays lie within `low` <= u <= `high` along +x and |v| <= `half`
+    across.
+
+    Attributes:
+        pupil_z_mm: the plane.
+        film_radius_mm: radius of the last row; the first row is the axis.
+        low_mm, high_mm, half_mm: one value per film radius; an empty row (low > high) where no ray passes.
+        disc_mm: radius of the axial disc that holds all passing rays.
+    """
+
+    pupil_z_mm: float
+    film_radius_mm: float
+    low_mm: tuple[float, ...]
+    high_mm: tuple[float, ...]
+    half_mm: tuple[float, ...]
+    disc_mm: float
+
+    @property
+    def lit_radius_mm(self) -> float:
+        """The first film radius from which on every row is empty; that of the film where its edge is lit."""
+        rows = enumerate(zip(self.low_mm, self.high_mm, strict=True))
+        last = max((k for k, (low, high) in rows if low <= high), default=0)
+        return self.film_radius_mm * min(last + 1, len(self.low_mm) - 1) / (len(self.low_mm) - 1)

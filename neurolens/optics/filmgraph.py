@@ -4,79 +4,83 @@ from __future__ import annotations
 
 import math
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 
 from neurolens.graph.ir import Value
-from neurolens.optics.coatings import Layers, times_film
-from neurolens.optics.glass import absorption_of, glass_of, index_at
-from neurolens.optics.prescription import Surface
+from neurolens.optics.coatings import times_film
+from neurolens.optics.glass import absorption_of, glass_of, index_at, index_of
+from neurolens.optics.prescription import Lens
+from neurolens.optics.surfaces import Medium, Met
 from neurolens.optics.transmission import Shares
 
 _DEGREE, _FIT = 8, 1e-9  # of the series of sine and cosine, and how close they are
 _HALVINGS = 12  # of a phase, at most: films of 500 waves
 
 
-class Wave(NamedTuple):
-    """The wavelength of rays, nm, and the range that it lies in."""
+class GraphLosses:
+    """What glass and coatings do to light in a graph, as `transmission.Losses` does it with tensors.
 
-    nanometres: Value
-    range_nm: tuple[float, float]
+    Args:
+        wavelength_nm: of the rays. range_nm: wavelengths from and to which it may lie.
+    """
+
+    def __init__(self, lens: Lens, wavelength_nm: Value, range_nm: tuple[float, float]) -> None:
+        self.lens, self.wavelength_nm, self.range_nm = lens, wavelength_nm, range_nm
+
+    def absorption(self, k: int) -> Value | None:
+        """Napierian absorption (1/mm) of the medium before surface k, in the range; None where there is none."""
+        (low, high), surface = self.range_nm, self.lens.surfaces[k - 1]
+        end = absorption_of(surface, high) if k else None
+        if end is None:
+            return None
+        total = self.wavelength_nm.graph.constant(float(end))
+        bends = glass_of(surface.glass).bends() if surface.glass else []
+        slope = sum(bend for nm, bend in bends if nm >= high)
+        for nm, bend in [(high, slope), *((nm, bend) for nm, bend in bends if low < nm < high)]:
+            if bend:
+                total = total + (nm - self.wavelength_nm).maximum(0.0) * bend
+        return total
+
+    def transmitted(self, depth: Value) -> Value:
+        """exp(-depth)."""
+        return transmitted(depth)
+
+    def coated(self, k: int, met: Met, q: Value, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares:
+        """What the coating of surface k transmits of light on its way to the scene; see `coatings`."""
+        (one, two), coating, g = media, self.lens.surfaces[k].coating, self.wavelength_nm.graph
+        assert sense < 0 and not reflected and coating is not None
+        sides = self.lens.media[k : k + 2]
+        # The largest index times sine of light that passes.
+        sine = min(max(float(index_of(m, nm)) for nm in self.range_nm) for m in sides)
+        before, after, n1, n2 = met.q, q, g.value(one.n), g.value(two.n)
+        inverse_um = 1000.0 / self.wavelength_nm
+        s: tuple[Value | float, ...] = (1.0, 0.0, 0.0, 1.0)
+        p = s
+        for n_d, thickness_nm, *V_d in reversed(coating.layers):
+            at_1000, at_500 = (float(index_at(n_d, V_d[0] if V_d else None, nm)) for nm in (1000.0, 500.0))
+            rise = (at_500 - at_1000) / 3  # of Cauchy's index by 1 / lambda^2 in um
+            index = g.series(inverse_um * inverse_um, [at_1000 - rise, rise])
+            phase_per_q = inverse_um * (2e-3 * math.pi * float(thickness_nm))
+            q2 = before * before + (index - n1) * (index + n1)
+            numbers = [float(index_at(n_d, V_d[0] if V_d else None, nm)) for nm in self.range_nm]
+            most = [2 * math.pi * float(thickness_nm) / nm for nm in self.range_nm]
+            ends = [(n * n - part) * k * k for n, k in zip(numbers, most, strict=True) for part in (0.0, sine * sine)]
+            cos, sinc = _cos_and_sinc(q2 * (phase_per_q * phase_per_q), min(0.0, *ends), max(0.0, *ends))
+            s, p = times_film(s, p, (cos, sinc * phase_per_q, q2 * sinc * phase_per_q), index * index)
+        cos_i, cos_t = before / n1, after / n2
+        real_s, other_s = before * s[0] + after * s[3], before * after * s[1] + s[2]
+        real_p, other_p = n2 * cos_i * p[0] + n1 * cos_t * p[3], cos_i * cos_t * p[1] + n1 * n2 * p[2]
+        size_s, size_p = real_s * real_s + other_s * other_s, real_p * real_p + other_p * other_p
+        real, imaginary = real_s * real_p + other_s * other_p, other_s * real_p - real_s * other_p
+        both = size_s * size_p
+        return Shares(size_p + size_s, size_p - size_s, real * 2.0, imaginary * 2.0, before * after * 2.0, both)
 
 
 def transmitted(depth: Value) -> Value:
     """exp(-depth) as (1 - t) / (1 + t) with t = tanh(depth / 2), which every writer has."""
     t = (depth * 0.5).tanh()
     return (1.0 - t) / (1.0 + t)
-
-
-def absorption(surface: Surface, wave: Wave) -> Value | None:
-    """As `glass.absorption_of`, to rounding within the wavelengths' range; None where there is none."""
-    low, high = wave.range_nm
-    end = absorption_of(surface, high)
-    if end is None:
-        return None
-    total = wave.nanometres.graph.constant(float(end))
-    bends = glass_of(surface.glass).bends() if surface.glass else []
-    slope = sum(bend for nm, bend in bends if nm >= high)
-    for nm, bend in [(high, slope), *((nm, bend) for nm, bend in bends if low < nm < high)]:
-        if bend:
-            total = total + (nm - wave.nanometres).maximum(0.0) * bend
-    return total
-
-
-def coated_shares(
-    layers: Layers, cosines: tuple[Value, Value], media: tuple[Value, Value], sine: float, wave: Wave
-) -> Shares:
-    """What a coated surface transmits of light on its way to the scene; see `coatings`.
-
-    Args:
-        cosines: of incidence and of refraction. media: indices as the light meets them.
-        sine: the largest index times sine of light that passes.
-    """
-    (cos_i, cos_t), (n1, n2) = cosines, media
-    before, after = n1 * cos_i, n2 * cos_t
-    inverse_um = 1000.0 / wave.nanometres
-    s: tuple[Value | float, ...] = (1.0, 0.0, 0.0, 1.0)
-    p = s
-    for n_d, thickness_nm, *V_d in reversed(layers):
-        at_1000, at_500 = (float(index_at(n_d, V_d[0] if V_d else None, nm)) for nm in (1000.0, 500.0))
-        rise = (at_500 - at_1000) / 3  # of Cauchy's index by 1 / lambda^2 in um
-        index = wave.nanometres.graph.series(inverse_um * inverse_um, [at_1000 - rise, rise])
-        phase_per_q = inverse_um * (2e-3 * math.pi * float(thickness_nm))
-        q2 = before * before + (index - n1) * (index + n1)
-        numbers = [float(index_at(n_d, V_d[0] if V_d else None, nm)) for nm in wave.range_nm]
-        most = [2 * math.pi * float(thickness_nm) / nm for nm in wave.range_nm]
-        ends = [(n * n - part) * k * k for n, k in zip(numbers, most, strict=True) for part in (0.0, sine * sine)]
-        cos, sinc = _cos_and_sinc(q2 * (phase_per_q * phase_per_q), min(0.0, *ends), max(0.0, *ends))
-        s, p = times_film(s, p, (cos, sinc * phase_per_q, q2 * sinc * phase_per_q), index * index)
-    real_s, other_s = before * s[0] + after * s[3], before * after * s[1] + s[2]
-    real_p, other_p = n2 * cos_i * p[0] + n1 * cos_t * p[3], cos_i * cos_t * p[1] + n1 * n2 * p[2]
-    size_s, size_p = real_s * real_s + other_s * other_s, real_p * real_p + other_p * other_p
-    real, imaginary = real_s * real_p + other_s * other_p, other_s * real_p - real_s * other_p
-    both = size_s * size_p
-    return Shares(size_p + size_s, size_p - size_s, real * 2.0, imaginary * 2.0, before * after * 2.0, both)
 
 
 def _cos_and_sinc(phase2: Value, low: float, high: float) -> tuple[Value, Value]:

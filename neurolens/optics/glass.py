@@ -24,7 +24,8 @@ _FOUND: dict[str, Glass] = {}
 
 def inverse_square_um(wavelength_nm: Any) -> Any:
     """1 / lambda^2 in 1/um^2 for a wavelength in nm (number or tensor)."""
-    return (1000.0 / wavelength_nm) ** 2
+    inverse = 1000.0 / wavelength_nm
+    return inverse * inverse
 
 
 def index_at(n_d: Any, V_d: float | None, wavelength_nm: Any) -> Any:

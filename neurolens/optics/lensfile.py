@@ -125,7 +125,7 @@ class Table:
 
 
 def read_lens(path: str | Path, data: Mapping[str, Any] | None = None) -> Lens:
-    """The lens of a file in our own format, unfocused (`Lens.at` places the film); `data`: its tables, where known.
+    """The lens of a file in our own format, unfocused (`set_lens` places the film); `data`: its tables, where known.
 
     Warns:
         NeurolensWarning: glasses whose V_d is unknown; their index is taken as constant. A coating that no surface has.

@@ -186,7 +186,7 @@ def framing_mm(lens: Lens, focus_m: float) -> tuple[float, float]:
     """Image distances (mm) of two ideal lenses that show the plane `focus_m` metres from the film at the lens's size.
 
     Chief rays of a film point then meet that plane in one point, also where the film is not in the paraxial image.
-    `Lens.at` has placed the lens.
+    `set_lens` has placed the lens.
 
     Returns:
         That of a thin lens or a hole so far before the film, and of a lens in this one's front principal plane.

@@ -249,44 +249,6 @@ class Lens:
         texts = {"id": self.lens_id, "name": self.name, "designer": self.designer, "source": self.source}
         return texts | {"sha256": self.sha256}
 
-    def at(
-        self,
-        *,
-        focus_m: float | None = None,
-        f_number: float | None = None,
-        focal_length_mm: float | None = None,
-        field_deg: float | None = None,
-        zoom: str | float | None = None,
-        focus: Focus = "paraxial",
-        wavelength_nm: tuple[float, float] | None = None,
-    ) -> Lens:
-        """The same lens in another state; `neurolens.optics.states` does the work.
-
-        Args:
-            focus_m: distance from object to film in metres, `inf` allowed; None focuses at infinity (a focus state
-                chosen by its name: at the object of the source), and leaves the focus where `f_number` alone is given.
-            f_number: EFL / paraxial entrance-pupil diameter at infinity focus, of a bladed stop by the circle round it.
-                None keeps the stop, except for a zoom state with its own stop. A stop wider than the rims let light
-                through is allowed: they then vignette.
-            focal_length_mm: rescale the whole lens so that its focal length at infinity focus is this.
-            field_deg: full field of view of the image circle at infinity focus: the lens is rescaled, the
-                image circle stays (by the traced chief ray, along x; distortion included).
-            zoom: name of a state of the file, or a focal length in mm between those of its states, as a number or its
-                text (`neurolens.optics.states`; marked in `derived`).
-            focus: "paraxial" moves the film as the paraxial image does; "best", which cameras and commands take, to the
-                least RMS spot of the axial point (`focusing.best_focus_z_mm`); "internal" moves the groups as
-                the file's focus states do, film fixed.
-            wavelength_nm: range of the light that "best" focuses; None takes `light_nm`.
-
-        Raises:
-            InputError: an unknown state, a focal length beyond the zoom's range, a value that is not positive, a focus
-                nearer than the lens allows, a field that it does not see, or a size asked of a lens that diverges.
-        """
-        from neurolens.optics import states  # states need this module's types
-
-        light = wavelength_nm or self.light_nm
-        return states.at(self, focus_m, f_number, focal_length_mm, field_deg, zoom, focus, light)
-
     def scaled(self, factor: float) -> Lens:
         """All lengths times `factor`; angles, indices and f-number stay.
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError
+from neurolens.optics.film_plane import PupilBounds
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.sag import end_mm, sag_mm
@@ -215,35 +216,6 @@ _AT_MANY_AZIMUTHS = 64  # points of a grid, at most, where each is traced at man
 
 # Boxes about what passes from film points, looked for over boxes.
 _Look = Callable[[Lens, list[Place], list[Box]], list[Box | None]]
-
-
-@dataclass(frozen=True)
-class PupilBounds:
-    """Bounds of the passing rays on the pupil plane at equally spaced film radii (as pbrt: Pharr et al. 2016, 6.4.5).
-
-    For a film point at radius r along +x, passing rays lie within `low` <= u <= `high` along +x and |v| <= `half`
-    across.
-
-    Attributes:
-        pupil_z_mm: the plane.
-        film_radius_mm: radius of the last row; the first row is the axis.
-        low_mm, high_mm, half_mm: one value per film radius; an empty row (low > high) where no ray passes.
-        disc_mm: radius of the axial disc that holds all passing rays.
-    """
-
-    pupil_z_mm: float
-    film_radius_mm: float
-    low_mm: tuple[float, ...]
-    high_mm: tuple[float, ...]
-    half_mm: tuple[float, ...]
-    disc_mm: float
-
-    @property
-    def lit_radius_mm(self) -> float:
-        """The first film radius from which on every row is empty; that of the film where its edge is lit."""
-        rows = enumerate(zip(self.low_mm, self.high_mm, strict=True))
-        last = max((k for k, (low, high) in rows if low <= high), default=0)
-        return self.film_radius_mm * min(last + 1, len(self.low_mm) - 1) / (len(self.low_mm) - 1)
 
 
 def pupil_bounds(

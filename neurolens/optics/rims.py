@@ -235,7 +235,7 @@ def _clear_of_neighbours(states: Sequence[Lens], diameters: Sequence[float]) -> 
 
 
 def _which_to_trim(before: Surface, after: Surface, k: int, k_after: int, h: float) -> tuple[int, ...]:
-    """Of two surfaces that meet at height h, the one whose flat, ground from there outwards, clears the other."""
+    """Choose of two surfaces that meet at height h the one whose flat, ground from there outwards, clears the other."""
 
     def slope(s: Surface) -> float:
         return sag_mm(s, h, 0.0) - sag_mm(s, 0.99 * h, 0.0)

@@ -1,6 +1,6 @@
 """Light along any sequence of surfaces, reflected or refracted at each: the paths of ghosts.
 
-The same surfaces, tests and refraction as in `trace`; in addition, light may be reflected.
+The surfaces and their tests are those of `trace`; in addition, light may be reflected.
 """
 
 from __future__ import annotations
@@ -11,24 +11,13 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.optics import coatings
-from neurolens.optics.passing import (
-    Mode,
-    absorption_per_mm,
-    along_axis,
-    bend,
-    check_rays,
-    media,
-    meet,
-    sound_wavelength,
-    start,
-    unit,
-)
+from neurolens.optics.arithmetic import times
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.surfaces import Hit, Medium, Rays, fresnel_transmittance, root, times
-from neurolens.optics.transmission import Passage, normal_at, way_mm
+from neurolens.optics.surfaces import Medium, Met, Rays
+from neurolens.optics.trace import Tracing, check_rays
+from neurolens.optics.transmission import Passage, TensorLosses, path_mm
 
 Action = Literal["T", "R"]
 Towards = Literal["scene", "film"]
@@ -98,36 +87,23 @@ def follow(
     wavelength_nm = lens.reference_nm if wavelength_nm is None else wavelength_nm
     check_rays(rays, wavelength_nm)
     _check(len(lens.surfaces), steps, towards)
-    wavelength_nm, lit = sound_wavelength(lens, wavelength_nm, rays.x.dtype)
-    glasses, vertices = media(lens, wavelength_nm), lens.vertices_mm
-    absorption = absorption_per_mm(lens, wavelength_nm)
-    mode = Mode(sense=1 if towards == "film" else -1, guard=True, freeze=False)
-    after = glasses[0 if mode.sense > 0 else -1]
-    r, tests = start(rays, after, mode, st.blocked(steps[0][0], st.MISSED), lit)
-    power, vertex = torch.ones_like(r.x), 0.0
-    passage = Passage(lens, wavelength_nm, r.x) if polarised else None
+    tracing = Tracing(lens, rays, wavelength_nm, 1 if towards == "film" else -1, steps[0][0], guard=True)
+    losses = TensorLosses(lens, tracing.wavelength_nm)
+    power, passage = torch.ones_like(rays.x), Passage(tracing.o, lens, losses) if polarised else None
     points = []
-    for position, (k, action) in enumerate(steps):
-        r, vertex = r._replace(z=r.z + (vertex - vertices[k])), vertices[k]
-        ahead = mode.sense > 0
-        before, after = (glasses[k], glasses[k + 1]) if ahead else (glasses[k + 1], glasses[k])
-        hit = meet(lens, k, r, before, position == 0, mode, tests)
-        points.append((hit.x, hit.y, hit.z + vertex))
-        surface, came, sense, met, q = lens.surfaces[k], r, mode.sense, (before, after), hit.q
-        if action == "R":
-            r, after, mode = _reflect(surface, r, hit, sense), before, mode._replace(sense=-sense)
-        else:
-            r, q, _ = bend(surface, k, r, hit, before, after, mode, tests)
+    for k, action in steps:
+        sense, reflected = tracing.sense, action == "R"
+        r, (met, bent, _), (before, after) = tracing.cross(k, reflected)
+        points.append((met.x, met.y, met.z + tracing.vertex))
         if passage is not None:
-            passage.pass_surface(k, came, hit, q, met, sense, action == "R")
+            passage.pass_surface(k, r, met, bent.q, (before, after), sense, reflected)
             continue
-        power = power * _share(surface, hit, *met, sense, wavelength_nm, action)
-        absorbed = absorption[k if ahead else k + 1]
+        power = power * _share(lens.surfaces[k], met, before, after, sense, tracing.wavelength_nm, action)
+        absorbed = losses.absorption(k if sense > 0 else k + 1)
         if absorbed is not None:
-            power = power * torch.exp(-way_mm(came, hit, before) * absorbed)
-    r = along_axis(unit(r._replace(z=r.z + vertex), after), tests, mode.sense, vertex)
-    power = power if passage is None else passage.arrived()
-    return Followed(r, tests.status(), tests.only(power, 0.0), tuple(points))
+            power = power * torch.exp(-path_mm(tracing.o, r, met, before) * absorbed)
+    power = power if passage is None else passage.arrived(rays.x)
+    return Followed(tracing.leave(), tracing.tests.status(), tracing.tests.only(power, 0.0), tuple(points))
 
 
 def backwards(steps: Steps) -> list[tuple[int, Action]]:
@@ -135,25 +111,16 @@ def backwards(steps: Steps) -> list[tuple[int, Action]]:
     return list(reversed(steps))
 
 
-def _reflect(surface: Surface, r: Rays, hit: Hit, sense: int) -> Rays:
-    """The normal part of the direction turned round."""
-    turn = -2 * sense * hit.q
-    normal = normal_at(surface, hit)
-    return Rays(hit.x, hit.y, hit.z, *(torch.addcmul(p, turn, n) for p, n in zip(r[3:], normal, strict=True)))
-
-
 def _share(
-    surface: Surface, hit: Hit, before: Medium, after: Medium, sense: int, wavelength_nm: Any, action: Action
+    surface: Surface, met: Met, before: Medium, after: Medium, sense: int, wavelength_nm: Any, action: Action
 ) -> Tensor | float:
     """Unpolarised power that goes on, [N]: transmitted or reflected at one surface."""
-    if surface.coating is not None and surface.coating.layers:
-        share = coatings.reflectance if action == "R" else coatings.transmittance
-        return share(times(hit.q, 1 / before.n), before.n, after.n, surface.coating.layers, wavelength_nm, sense)
-    if before is after:
+    coated = surface.coating is not None and surface.coating.layers
+    if before is after and not coated:
         return 0.0 if action == "R" else 1.0
-    q2 = hit.q2 + (after.n - before.n) * (after.n + before.n)
-    transmitted = fresnel_transmittance(hit.q, root(q2, True), before, after)
-    return transmitted if action == "T" else torch.where(q2 > 0, 1 - transmitted, 1.0)
+    layers = surface.coating.layers if surface.coating else ()
+    share = coatings.reflectance if action == "R" else coatings.transmittance
+    return share(times(met.q, 1 / before.n), before.n, after.n, layers, wavelength_nm, sense)
 
 
 def _check(count: int, steps: Steps, towards: Towards) -> None:

@@ -1,9 +1,8 @@
-"""Where a ray meets a conic, a cylinder, an asphere, a toroid or a biconic. Conventions as in `surfaces`.
+"""The shape of a surface for rays: its figure as numbers, its depth, and where an iteration along a ray starts.
 
 A conic surface of curvature c and constant K is c (x^2 + y^2 + (1 + K) z^2) - 2 z = 0; a cylinder lacks the square of
-the coordinate along which it is straight. Both are met in closed form. An asphere adds A_p h^p, h the distance from
-the axis (from the plane of symmetry, for a cylinder): an iteration of Newton's kind along the ray, started from the
-conic that fits best; started at the vertex plane it fails beyond about 55 degrees. Toroids and biconics likewise.
+the coordinate along which it is straight. An asphere adds A_p h^p, h the distance from the axis (from the plane of
+symmetry, for a cylinder). All arithmetic is that of `arithmetic`: the same text serves tensors, arrays and graphs.
 
 Beyond its rim a polynomial soon means nothing: a term in r^20 is 3,000 times as large at 1.5 times the rim. Where rims
 are ignored an asphere therefore follows its figures only as far as they stay close to the slope at the rim, and then
@@ -13,38 +12,20 @@ continues with the same slope and curvature, which dies away: it becomes a cone 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
+from neurolens.optics.arithmetic import Arithmetic, is_number, times
 from neurolens.optics.prescription import Surface
 from neurolens.optics.sag import biconic, sag_and_derivatives, sag_mm, toroid
-from neurolens.optics.surfaces import (
-    Hit,
-    Medium,
-    Mode,
-    Rays,
-    also,
-    at_most,
-    choose,
-    nearest_approach,
-    positive,
-    root,
-    times,
-)
-
-Vector = tuple[Tensor, Tensor, Tensor]
 
 # Steps of the iteration by how far the asphere departs from the conic that it starts from, in rim radii. A fixed
 # count: a test of convergence would make an accelerator wait for its host at every surface.
 STEPS = ((3e-4, 2), (3e-3, 3), (3e-2, 4), (math.inf, 7))
-# Extra steps of float64 after the one that decides convergence, so that both precisions decide equally.
-POLISH = {torch.float32: 0, torch.float64: 2}
 # Length of the deciding step, in rim radii, that counts as converged: the error left is of the order of its square.
 LAST_STEP = 3e-4
 # cos^2 of the slope of the steepest conic that the iteration follows.
@@ -54,114 +35,85 @@ TURN = 0.25
 FARTHEST = 1.5  # rim radii up to which figures are followed at most
 _UPRIGHT = 1e6  # slope and bend that stand for infinite ones
 
+Quadric = tuple[Any, Any, Any]
+
+
+class Figure(NamedTuple):
+    """A surface's shape; lengths in mm, as numbers, 0-d tensors or values of a graph.
+
+    Attributes:
+        curvature, stretch: c and 1 + K of the conic.
+        plain: whether it is a sphere or a plane, of which only the curvature counts.
+        bent: whether along x and y.
+        terms: A_p of h^(p - 2), lowest first, in every second power where they are `even`; () without a polynomial.
+        start: cx, cy, cz of the quadric cx x^2 + cy y^2 + cz z^2 = 2 z that the iteration starts from; None without an
+            iteration. steps: of it. last_step: how long its last step may be.
+        across: of a toroid or biconic, along the other axis: curvature and 1 + K; () of other surfaces.
+        turned: whether it is a toroid.
+        beyond: where and how an asphere continues smoothly; None for one that follows its polynomial everywhere.
+    """
+
+    curvature: Any
+    stretch: Any = 1.0
+    plain: bool = False
+    bent: tuple[bool, bool] = (True, True)
+    terms: Sequence[Any] = ()
+    even: bool = True
+    start: Quadric | None = None
+    steps: int = 0
+    last_step: Any = 0.0
+    across: tuple[Any, ...] = ()
+    turned: bool = False
+    beyond: Beyond | None = None
+
+    @property
+    def flat(self) -> bool:
+        """Whether it is a plane, known as such: a curvature that is no plain number may become another."""
+        return self.plain and is_number(self.curvature) and self.curvature == 0
+
+
+class Beyond(NamedTuple):
+    """How a curve continues where its figures end.
+
+    With d the distance beyond the end: its slope there is slope + bend * length * (1 - exp(-d / length)).
+    """
+
+    height: float  # where the figures end
+    slope: float
+    bend: float  # second derivative there
+    length: float  # in which the second derivative dies away
+
 
 def is_plain(surface: Surface) -> bool:
-    """Whether a surface is a sphere or a plane, which `surfaces` meets."""
-    conic = isinstance(surface.conic, Tensor) or surface.conic != 0
+    """Whether a surface is a sphere or a plane."""
+    conic = not is_number(surface.conic) or surface.conic != 0
     return not (conic or surface.asphere or surface.cylinder)
 
 
-def intersect_shape(r: Rays, surface: Surface, mode: Mode, before: Medium) -> Hit:
-    """Meet a conic, cylinder or asphere at the root next to the vertex. Arguments as for a sphere."""
-    w = (float(surface.cylinder != "y"), float(surface.cylinder != "x"))
-    nearest = nearest_approach(r, before.inverse_n2)
-    if surface.asphere or surface.across:
-        return _meet_asphere(r, nearest, surface, w, mode, before)
-    c = surface.curvature
-    kind = (c * w[0], c * w[1], c * (1 + surface.conic))
-    guard, spend = mode.guard, mode.spend
-    met, q2, q, t = _meet_quadric(r, nearest, kind, mode.sense, before, guard, spend)
-    x, y, z = _along(nearest, t, (r.dx, r.dy, r.dz))
-    nx, ny, nz = times(x, -kind[0]), times(y, -kind[1]), 1 - times(z, kind[2])
-    length2 = torch.addcmul(torch.addcmul(nx * nx, ny, ny), nz, nz)
-    scale = torch.rsqrt(torch.where(length2 > 0, length2, 1.0) if guard else length2)
-    met = also(met, positive(nz.clone() if spend else nz, spend=spend))
-    return Hit(x, y, z, q * scale, q2 * scale * scale, met, (nx * scale, ny * scale, nz * scale))
-
-
-def _weighted(a: Vector, b: Vector, w: tuple[Any, ...]) -> Tensor:
-    """Sum of the products of two vectors' components, each times its weight; terms of weight 0 are left out."""
-    terms = [times(p * q, k) for p, q, k in zip(a, b, w, strict=False) if isinstance(k, Tensor) or k != 0]
-    total = terms[0] if terms else torch.zeros_like(a[0])
-    for term in terms[1:]:
-        total = total + term
-    return total
-
-
-def _along(m: Vector, t: Tensor, p: Vector) -> Vector:
-    x, y, z = (torch.addcmul(o, t, d) for o, d in zip(m, p, strict=True))
-    return x, y, z
-
-
-def _meet_quadric(
-    r: Rays, m: Vector, c: tuple[Any, Any, Any], sense: int, before: Medium, guard: bool, spend: bool
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Meet cx x^2 + cy y^2 + cz z^2 = 2 z at the root next to the vertex.
-
-    Returns whether there is one, the square of the left side's derivative along the ray and its root, and the
-    parameter from the nearest approach `m` of the ray: near it where there is none.
-    """
-    p, (cx, cy, cz) = (r.dx, r.dy, r.dz), c
-    if cx is cy or (not isinstance(cx, Tensor) and cx == cy):
-        # Rotationally symmetric: p.p = n^2 and m.p = 0 simplify the terms.
-        a = p[2] * p[2] * (cz - cx) + before.n2 * cx
-        b = p[2] * (times(m[2], cz - cx) - 1)
-        f = torch.addcmul(m[0] * m[0], m[1], m[1]) * cx + m[2] * (times(m[2], cz) - 2)
-    else:
-        a, b, f = _weighted(p, p, c), _weighted(m, p, c) - r.dz, _weighted(m, m, c) - 2 * m[2]
-    q2 = torch.addcmul(b * b, a, f, value=-1)
-    q = root(q2, True) if guard else torch.sqrt(q2.clamp_min(0))
-    # The two forms of the same root: each divides by what is not small.
-    backwards = at_most(b * -sense, 0.0, spend=spend)
-    denominator = choose(backwards, a, torch.add(-b, q, alpha=sense))
-    numerator = choose(backwards, torch.add(-b, q, alpha=-sense), f)
-    sound = positive(denominator * denominator, spend=spend)
-    t = numerator / (torch.where(sound, denominator, 1.0) if guard else denominator)
-    return also(positive(q2.clone() if spend else q2, spend=spend), sound), q2, q, t
-
-
-def _meet_asphere(r: Rays, m: Vector, surface: Surface, w: tuple[float, float], mode: Mode, before: Medium) -> Hit:
-    """Iterate along the rays, from the conic that fits the asphere best.
-
-    All steps but the last are outside the graph: it alone carries the derivative (implicit function theorem), so
-    that gradients cost no memory for iterations.
-    """
-    p, sense, guard, spend = (r.dx, r.dy, r.dz), mode.sense, mode.guard, mode.spend
+def figure_of(surface: Surface, number: Callable[[Any], Any] = lambda value: value) -> Figure:
+    """The figure of a surface; `number` turns fields that may be tensors into numbers."""
+    c = number(surface.curvature)
+    if is_plain(surface):
+        return Figure(c, plain=True)
+    bent = surface.cylinder != "y", surface.cylinder != "x"
+    conic = Figure(c, 1 + number(surface.conic), bent=bent)
+    if not surface.asphere and not surface.across:
+        return conic
+    powers = {n: number(a) for n, a in surface.asphere}
+    even = all(n % 2 == 0 for n in powers)
+    terms = [powers.get(n, 0.0) for n in range(2, max(powers, default=0) + 1, 2 if even else 1)]
     start, steps = start_of(surface)
-    with torch.no_grad():
-        held = Rays(*(v.detach() for v in r))
-        held_m, held_p = (m[0].detach(), m[1].detach(), m[2].detach()), (held.dx, held.dy, held.dz)
-        medium = Medium(*(v.detach() if isinstance(v, Tensor) else v for v in before))
-        _, missed, _, t = _meet_quadric(held, held_m, start, sense, medium, False, spend)
-        t = torch.nan_to_num(t, 0.0, 0.0, 0.0) if guard else t
-        polish = POLISH[t.dtype]
-        for n in range(steps + polish - 1):
-            step = _step(_along(held_m, t, held_p), held_p, surface, w, sense)
-            if n == steps - 1:
-                deciding = step
-            t = t + step
-    at = _along(m, t.detach(), p)
-    step = _step(at, p, surface, w, sense, last=True)
-    x, y, z = _along(at, step, p)
-    if surface.across:
-        _, (nx, ny, nz), _, cos2 = _crossed(surface, w, (x, y, z), p)
-        scale = -torch.rsqrt(nx * nx + ny * ny + nz * nz)
-        q = _weighted((nx, ny, nz), p, (1, 1, 1)) * (scale * sense)
-    else:
-        derivative, cos2 = _derivative(surface, w, x, y)
-        nx, ny = (times(v * -derivative, k) for v, k in zip((x, y), w, strict=True))
-        scale = torch.rsqrt(torch.addcmul(nx * nx, ny, ny) + 1)
-        nz, q = 1.0, torch.addcmul(torch.addcmul(p[2], nx, p[0]), ny, p[1]) * (scale * sense)
-    length = times((deciding if polish else step).abs(), before.n)
-    met = also(
-        at_most(length, LAST_STEP * _extent_mm(surface), spend=spend),
-        positive(q.clone() if spend else q, spend=spend),
+    across = (1 / surface.across[0], 1 + (surface.across[1] or 0.0)) if surface.across else ()
+    return conic._replace(
+        terms=terms,
+        even=even,
+        start=start,
+        steps=steps,
+        last_step=LAST_STEP * _extent_mm(surface),
+        across=across,
+        turned=bool(surface.across and surface.across[1] is None),
+        beyond=None if surface.followed_mm == math.inf else _end_of(surface),
     )
-    if cos2 is not None:
-        met = also(met, positive(cos2 - STEEPEST, spend=spend))
-    # How far a ray misses is of use only where crossings are learnt from.
-    q2 = torch.where(met, q * q, torch.minimum(missed, -q * q)) if guard else q * q
-    return Hit(x, y, z, q, q2, met, (nx * scale, ny * scale, times(scale, nz)))
 
 
 def start_of(surface: Surface) -> tuple[tuple[float, float, float], int]:
@@ -198,38 +150,16 @@ def _extent_mm(surface: Surface) -> float:
 
 
 @lru_cache(maxsize=4096)
-def _end_of(surface: Surface) -> tuple[float, float, float]:
-    """Slope and second derivative of the curve where its figures end, and the length in which the latter dies away."""
+def _end_of(surface: Surface) -> Beyond:
     with np.errstate(divide="ignore", invalid="ignore"):  # a conic may end at its rim, upright
         profile = _profile(surface, np.array(surface.followed_mm))
     slope, bend = (float(np.nan_to_num(v, nan=0.0, posinf=_UPRIGHT, neginf=-_UPRIGHT)) for v in profile)
-    return slope, bend, min(TURN * surface.followed_mm, TURN * (1 + slope * slope) / max(abs(bend), 1e-300))
-
-
-class _Beyond(NamedTuple):
-    """How a curve continues where its figures end, each [N]; at points inside 0, 1, 0.
-
-    With d the distance beyond the end: its slope there is slope + bend * length * (1 - exp(-d / length)).
-    """
-
-    rise: Tensor  # what is added to the sag at the end
-    share: Tensor  # by which d sag / d h over h at the end is multiplied
-    turned: Tensor  # what is added to that
-    turn: Tensor  # the change of the sum by h over h
-
-
-def _beyond(surface: Surface, h2: Tensor) -> _Beyond:
-    slope, bend, length = _end_of(surface)
-    h = torch.sqrt(h2.clamp_min(1e-30)).clamp_min(surface.followed_mm)
-    d = h - surface.followed_mm
-    left = torch.exp(d / -length)
-    turned = bend * length * (1 - left)
-    rise = slope * d + bend * length * (d - length * (1 - left))
-    return _Beyond(rise, surface.followed_mm / h, turned / h, (bend * left - (slope + turned) / h) / (h * h))
+    length = min(TURN * surface.followed_mm, TURN * (1 + slope * slope) / max(abs(bend), 1e-300))
+    return Beyond(surface.followed_mm, slope, bend, length)
 
 
 def _number(value: Any) -> float:
-    return float(value.detach() if isinstance(value, Tensor) else value)
+    return float(value.detach() if hasattr(value, "detach") else value)
 
 
 @lru_cache(maxsize=4096)
@@ -262,7 +192,7 @@ def _fitted_crossed(
     rim_mm: float,
     across: tuple[float, float | None],
 ) -> tuple[tuple[float, float, float], int]:
-    """As `_fitted`, of a toroid or biconic: along the curve, across it, along z."""
+    """The fit of a toroid or biconic: along the curve, across it, along z."""
     if not math.isfinite(rim_mm):
         return (curvature, 1 / across[0], 0.0), STEPS[-1][1]
     radius_mm = 1 / curvature if curvature else math.inf
@@ -271,126 +201,104 @@ def _fitted_crossed(
     a, h = h.ravel() * np.sin(turn.ravel()), h.ravel() * np.cos(turn.ravel())
     z = sag_mm(same, a, h)
     a, h, z = (v[np.isfinite(z)] for v in (a, h, z))
-    found, *_ = np.linalg.lstsq(np.stack([h * h, a * a, z * z], 1), 2 * z, rcond=1e-9)
-    worst = np.abs(found @ np.stack([h * h, a * a, z * z]) - 2 * z).max(initial=0.0) / 2
-    c, other, cz = found.tolist()
+    fit, *_ = np.linalg.lstsq(np.stack([h * h, a * a, z * z], 1), 2 * z, rcond=1e-9)
+    worst = np.abs(fit @ np.stack([h * h, a * a, z * z]) - 2 * z).max(initial=0.0) / 2
+    c, other, cz = fit.tolist()
     return (c, other, cz), next(steps for departure, steps in STEPS if worst <= departure * rim_mm)
 
 
-def _crossed(surface: Surface, w: tuple[float, float], at: Vector, p: Vector) -> tuple[Any, ...]:
-    """A function that is 0 on a toroid or biconic and grows with -z, its gradient [3], its second derivative along p,
-    and a number that is positive where the surface exists; each [N]."""
-    assert surface.across is not None
-    (radius, conic), swapped = surface.across, surface.cylinder == "x"
-    (a, h, z), (pa, ph, pz) = ((v[swapped], v[not swapped], v[2]) for v in (at, p))
-    if conic is None:
-        g, slope, turn = _sag(surface, w, *at[:2])
-        curve = g, slope, 0.0 if turn is None else turn
-        value, gradient, bend = toroid(1 / radius, curve, (a, h, z), (pa, ph, pz))
-        own = _derivative(surface, w, *at[:2])[1]
-        cos2 = -gradient[2] if own is None else torch.minimum(own, -gradient[2])
-    else:
-        along = surface.curvature, 1 + surface.conic
-        value, gradient, bend, cos2 = biconic(along, (1 / radius, 1 + conic), (a, h, z), (pa, ph, pz), _held_root)
-        gradient = gradient[0], gradient[1], torch.full_like(z, -1.0)
-    return value, (gradient[swapped], gradient[not swapped], gradient[2]), bend, cos2
+class Depth(NamedTuple):
+    """The curve of a figure at a distance h from its axis or plane of symmetry.
 
-
-def _held_root(square: Tensor) -> Tensor:
-    return torch.sqrt(square.clamp_min(STEEPEST))
-
-
-def _step(at: Vector, p: Vector, surface: Surface, w: tuple[float, float], sense: int, last: bool = False) -> Tensor:
-    """Euler's step along the rays towards sag(x, y) = z: Newton's with the bend of the surface taken into account.
-
-    Newton's own is lost where a ray all but touches the surface, for there two meetings lie close together; the
-    parabola has both. The `last` step is Newton's: by then both are the same.
+    Attributes:
+        sag: depth towards +z. slope: d sag / d h over h. turn: the change of that over h by h, of the conic alone. One
+            that is not needed for the `order` of `depth` is 0.
+        cos2: squared cosine of the conic's slope, positive where it exists; None without a conic.
     """
-    x, y, z = at
-    if surface.across:
-        value, gradient, bend, _ = _crossed(surface, w, at, p)
-        rate = _weighted(gradient, p, (1, 1, 1))
-        if last:
-            return -value / rate
-        lack = 2 * value
+
+    sag: Any
+    slope: Any
+    turn: Any
+    cos2: Any
+
+
+def depth(o: Arithmetic, figure: Figure, h2: Any, order: int = 2) -> Depth:
+    """The depth of a figure's curve at squared distances h2 (mm^2); held finite where its conic ends.
+
+    `order`: 0 for depth and slope, 1 for the slope alone, 2 for everything.
+    """
+    if figure.beyond is None:
+        return _followed(o, figure, h2, order)
+    end, slope, bend, length = figure.beyond
+    inside = _followed(o, figure, o.least(h2, o.like(h2, end * end)), order)
+    h = o.held_root(h2, end * end)
+    d = h - end
+    left = (d / -length).exp()
+    turned = bend * length * (1 - left)
+    rise = slope * d + bend * length * (d - length * (1 - left))
+    turn = o.select(h2, end * end, inside.turn, (bend * left - (slope + turned) / h) / (h * h))
+    return Depth(inside.sag + rise, inside.slope * (end / h) + turned / h, turn, inside.cos2)
+
+
+def _followed(o: Arithmetic, figure: Figure, h2: Any, order: int) -> Depth:
+    """The depth by a figure's own numbers: c h^2 / (1 + cos) + sum A_p h^p."""
+    sag, slope = _polynomials(o, figure, h2, order)
+    c = figure.curvature
+    if is_number(c) and c == 0:
+        return Depth(times(h2, sag), slope + o.like(h2, 0.0), 0.0, None)
+    cos2 = o.fma(h2, -(figure.stretch * c * c), 1.0)
+    cos = o.held_root(cos2, STEEPEST)
+    if order == 1:
+        return Depth(0.0, c / cos + slope, 0.0, cos2)
+    both = c / o.fma(cos, cos, cos)  # one division for both c h^2 / (1 + cos) and c / cos
+    inverse = o.fma(both, cos, both)
+    turn = times(inverse * inverse * inverse, figure.stretch) if order else 0.0
+    return Depth(o.fma(both, cos, sag) * h2, inverse + slope, turn, cos2)
+
+
+def _polynomials(o: Arithmetic, figure: Figure, h2: Any, order: int) -> tuple[Any, Any]:
+    """sum A_p h^(p - 2) and sum p A_p h^(p - 2), in h^2 or, where odd powers occur, in h."""
+    if not figure.terms:
+        return 0.0, 0.0
+    # The root is kept from 0, where its derivative is infinite.
+    h, down = (h2, 2) if figure.even else (o.held_root(h2), 1)
+    slopes = [a * float(2 + down * k) for k, a in enumerate(figure.terms)]
+    return 0.0 if order == 1 else o.horner(h, figure.terms), o.horner(h, slopes)
+
+
+def crossed(o: Arithmetic, figure: Figure, at: Quadric, p: Quadric) -> tuple[Any, Quadric, Any, Any]:
+    """A function that is 0 on a toroid or biconic and grows with -z.
+
+    Returns its value at points, its gradient, its second derivative along p, and what is positive where the surface
+    exists.
+    """
+    (c, stretch), swapped = figure.across, not figure.bent[1]
+    (a, h, z), (pa, ph, pz) = ((v[swapped], v[not swapped], v[2]) for v in (at, p))
+    if figure.turned:
+        curve = depth(o, figure, h * h)
+        value, gradient, bend = toroid(c, curve[:3], (a, h, z), (pa, ph, pz))
+        exists = -gradient[2] if curve.cos2 is None else o.least(curve.cos2, -gradient[2])
     else:
-        sag, derivative, turn = _sag(surface, w, x, y)
-        along = _weighted((x, y, z), p, w)
-        rate = derivative * along - p[2]
-        if last:
-            return (z - sag) / rate
-        # Second derivative of the sag along the ray, but for what the polynomial adds to the change of its derivative.
-        bend = derivative * _weighted(p, p, w)
-        if turn is not None:
-            bend = torch.addcmul(bend, along * along, turn)
-        lack = 2 * (sag - z)
-    square = torch.addcmul(rate * rate, bend, lack, value=-1)
-    denominator = torch.sub(torch.sqrt(square.clamp_min(1e-30)), rate, alpha=sense) * sense
-    return lack / denominator
+        along = figure.curvature, figure.stretch
+        place, way = (a, h, z), (pa, ph, pz)
+        value, gradient, bend, exists = biconic(
+            along, (c, stretch), place, way, lambda square: o.held_root(square, STEEPEST)
+        )
+        gradient = gradient[0], gradient[1], o.like(z, -1.0)
+    return value, (gradient[swapped], gradient[not swapped], gradient[2]), bend, exists
 
 
-def _sag(surface: Surface, w: tuple[float, float], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Depth at points [N], d sag / d h over h, and the change of this by h over h of the conic alone (None without)."""
-    h2 = _height2(w, x, y)
-    if surface.followed_mm == math.inf:
-        return _own_sag(surface, h2)
-    end2, more = surface.followed_mm**2, _beyond(surface, h2)
-    sag, derivative, turn = _own_sag(surface, h2.clamp_max(end2))
-    turn = torch.where(h2 > end2, more.turn, 0.0 if turn is None else turn)
-    return sag + more.rise, derivative * more.share + more.turned, turn
+def is_deep(surface: Surface) -> bool:
+    """Whether a sphere's depth at its rim tells heights as exactly as their squares do."""
+    if not is_number(surface.radius_mm) or not is_plain(surface):
+        return False
+    return DEEP < rim_sine(surface) <= 1
 
 
-def _own_sag(surface: Surface, h2: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-    sag, derivative = _polynomials(surface, h2, (0, 1))
-    c = surface.curvature
-    if not isinstance(c, Tensor) and c == 0:
-        return sag * h2, derivative, None
-    cos = _held_root(1 - h2 * ((1 + surface.conic) * c * c))
-    # One division for both c h^2 / (1 + cos) and c / cos.
-    both = c / torch.addcmul(cos, cos, cos)
-    inverse = torch.addcmul(both, both, cos)
-    turn = inverse * inverse * inverse * (1 + surface.conic)
-    return torch.addcmul(sag, both, cos) * h2, inverse + derivative, turn
+def rim_sine(surface: Surface) -> float:
+    """Rim radius over radius of curvature."""
+    return abs(surface.semi_diameter_mm * surface.curvature)
 
 
-def _derivative(surface: Surface, w: tuple[float, float], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor | None]:
-    """d sag / d h divided by h at points [N], and the conic's squared cosine, positive where it exists."""
-    h2 = _height2(w, x, y)
-    if surface.followed_mm == math.inf:
-        return _own_derivative(surface, h2)
-    derivative, cos2 = _own_derivative(surface, h2.clamp_max(surface.followed_mm**2))
-    more = _beyond(surface, h2)
-    return derivative * more.share + more.turned, cos2
-
-
-def _own_derivative(surface: Surface, h2: Tensor) -> tuple[Tensor, Tensor | None]:
-    (derivative,) = _polynomials(surface, h2, (1,))
-    c = surface.curvature
-    if not isinstance(c, Tensor) and c == 0:
-        return derivative, None
-    cos2 = 1 - h2 * ((1 + surface.conic) * c * c)
-    return derivative + c * torch.rsqrt(cos2.clamp_min(STEEPEST)), cos2
-
-
-def _height2(w: tuple[float, float], x: Tensor, y: Tensor) -> Tensor:
-    return torch.addcmul(x * x, y, y) if w == (1.0, 1.0) else (x * x if w[0] else y * y)
-
-
-def _polynomials(surface: Surface, h2: Tensor, orders: Sequence[int]) -> list[Tensor]:
-    """sum A_p h^(p - 2) (order 0) and sum p A_p h^(p - 2) (order 1) by Horner's rule, each [N]."""
-    powers = dict(surface.asphere)
-    if not powers:
-        return [torch.zeros_like(h2) for _ in orders]
-    even = all(p % 2 == 0 for p in powers)
-    # In h^2, or in h where odd powers occur; the root is kept from 0, where its derivative is infinite.
-    h = h2 if even else torch.sqrt(h2.clamp_min(1e-30))
-    highest, down = max(powers), 2 if even else 1
-    found = []
-    for order in orders:
-        total: Any = powers[highest] * highest**order
-        for k in range(highest - down, 1, -down):
-            total = total * h
-            if k in powers:
-                total = total + powers[k] * k**order
-        found.append(total if isinstance(total, Tensor) and total.shape == h2.shape else torch.zeros_like(h2) + total)
-    return found
+# Rim radius over radius of curvature from which on a sphere's rim is tested by its depth.
+DEEP = 0.25

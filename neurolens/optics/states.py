@@ -1,4 +1,4 @@
-"""What a photographer changes, in this order: zoom, size, f-number, focus. Called by `Lens.at`.
+"""What a photographer sets on a lens, in this order: zoom, size, f-number, focus.
 
 Between the zoom states of the source, the places of all groups, measured from the film, are interpolated against log
 focal length; then focal length and image are made exact by moving the groups behind the first varying gap (which
@@ -34,17 +34,42 @@ from neurolens.optics.sag import check_clearance
 from neurolens.optics.trace import trace
 
 
-def at(
+def set_lens(
     lens: Lens,
-    focus_m: float | None,
-    f_number: float | None,
-    focal_length_mm: float | None,
-    field_deg: float | None,
-    zoom: str | float | None,
-    focus: Focus,
-    wavelength_nm: tuple[float, float],
+    *,
+    focus_m: float | None = None,
+    f_number: float | None = None,
+    focal_length_mm: float | None = None,
+    field_deg: float | None = None,
+    zoom: str | float | None = None,
+    focus: Focus = "paraxial",
+    wavelength_nm: tuple[float, float] | None = None,
 ) -> Lens:
-    """The lens in another state; arguments and errors are those of `Lens.at`."""
+    """Return the lens zoomed, scaled, stopped down and focused.
+
+        lens = set_lens(read_lens("lenses/laikin_double_gauss_50.toml"), focus_m=2.0, f_number=4.0)
+
+    Args:
+        focus_m: distance from object to film in metres, `inf` allowed; None focuses at infinity (a focus state that is
+            named: at the object of the source), and leaves the focus where `f_number` alone is given.
+        f_number: focal length over the diameter of the paraxial entrance pupil at infinity focus, of a bladed stop by
+            the circle round it. None keeps the stop, except for a zoom state with a stop of its own. A stop wider than
+            the rims let light through is allowed: they then vignette.
+        focal_length_mm: the whole lens is scaled until its focal length at infinity focus is this.
+        field_deg: full field of view of the image circle at infinity focus: the lens is scaled, the image circle stays
+            (by the traced chief ray, along x; distortion included).
+        zoom: name of a state of the file, or a focal length in mm between those of its states, as a number or its text.
+            A lens between states is marked in `derived`.
+        focus: "paraxial" moves the film as the paraxial image does; "best", which cameras and commands take, to the
+            least RMS spot of the axial point (`focusing.best_focus_z_mm`); "internal" moves the groups as the file's
+            focus states do, and the film stays.
+        wavelength_nm: range of the light that "best" focuses; None takes `Lens.light_nm`.
+
+    Raises:
+        InputError: the state is unknown, the focal length lies beyond the zoom's range, a value is not positive, the
+            focus is nearer than the lens allows, the lens does not see the field, or a size is asked of a lens that
+            diverges.
+    """
     _check(lens, focus_m, f_number, focal_length_mm, field_deg, focus)
     others = (focus_m, focal_length_mm, field_deg, zoom)
     if f_number is not None and lens.film_z_mm is not None and others == (None,) * 4:
@@ -80,7 +105,7 @@ def at(
         focus_m = math.inf if focus_m is None else focus_m
         film_z = paraxial.film_z_mm(lens, focus_m)
     lens = replace(lens, film_z_mm=film_z)
-    return best_focused(lens, focus_m, wavelength_nm) if focus == "best" else lens
+    return best_focused(lens, focus_m, wavelength_nm or lens.light_nm) if focus == "best" else lens
 
 
 def state_named(lens: Lens, name: str) -> Configuration:

@@ -6,6 +6,7 @@ status and stays finite.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -19,27 +20,30 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.files import own_folder
 from neurolens.optics import glass
-from neurolens.optics.passing import (
-    Mode,
-    along_axis,
-    bend,
-    check_rays,
+from neurolens.optics.arithmetic import is_number, times
+from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.shapes import figure_of, is_deep, start_of
+from neurolens.optics.surfaces import (
+    Crossed,
+    Medium,
+    Met,
+    Rays,
+    Test,
+    cross,
+    height2,
     media,
-    meet,
-    sound_wavelength,
-    start,
-    unfolded,
-    unit,
+    nearest_approach,
+    rim_tests,
 )
-from neurolens.optics.prescription import Lens
-from neurolens.optics.shapes import start_of
-from neurolens.optics.surfaces import Counts, Rays, times
-from neurolens.optics.transmission import Passage
+from neurolens.optics.tensors import Survival, Tensors, at_most
+from neurolens.optics.transmission import Passage, TensorLosses
 
 Towards = Literal["scene", "film"]
 
 # Rays per chunk: long enough to hide the cost of calling an operator, short enough for a core's second-level cache.
 CHUNK = 32768
+# How far the squared length of a direction may be from 1; float32 rounding is a thousandth of this.
+UNIT_SLACK = 1e-3
 # Of the rays that `passing` follows, the share below which those that are left are put together.
 _FEWER = 0.8
 
@@ -48,7 +52,7 @@ class Crossing(NamedTuple):
     """Where rays cross one surface, each [N]; mm, and the margins of Snell's and the sphere's square roots.
 
     `meets` is positive where the ray meets the surface, `refracts` where it is not totally reflected there. Points on
-    the far half of a sphere, beyond any rim, lie mirrored outwards (see `passing.unfolded`).
+    the far half of a sphere, beyond any rim, lie mirrored outwards (see `unfolded`).
     """
 
     x: Tensor
@@ -127,17 +131,25 @@ def trace(
     count = rays.x.shape[0]
     if needs_grad or count <= CHUNK:
         return _trace_chunk(lens, rays, wavelength_nm, towards, wanted, needs_grad)
-    whole = None
+    parts = []
     for i in range(0, count, CHUNK):
         part = slice(i, i + CHUNK)
         lam = wavelength_nm[part] if isinstance(wavelength_nm, Tensor) and wavelength_nm.ndim else wavelength_nm
-        chunk = Rays(*(c[part] for c in rays))
-        traced = _trace_chunk(lens, chunk, lam, towards, wanted, False)
-        # Written in place: keeping the chunks until the end would double the memory.
-        whole = _room(traced, count) if whole is None else whole
-        _fill(whole, traced, part)
-    assert isinstance(whole, Traced)
-    return whole
+        parts.append(_trace_chunk(lens, Rays(*(c[part] for c in rays)), lam, towards, wanted, False))
+    return _joined(parts)
+
+
+def _joined(parts: Sequence[Any]) -> Any:
+    """Chunks of results as one."""
+    first = parts[0]
+    if isinstance(first, Tensor):
+        return torch.cat(list(parts))
+    if isinstance(first, dict):
+        return {k: _joined([part[k] for part in parts]) for k in first}
+    if isinstance(first, tuple):
+        columns = [_joined(column) for column in zip(*parts, strict=True)]
+        return type(first)(*columns) if hasattr(first, "_fields") else tuple(columns)
+    return first
 
 
 def passing(lens: Lens, rays: Rays, wavelength_nm: float, *, towards: Towards = "scene") -> Tensor:
@@ -151,6 +163,20 @@ def passing(lens: Lens, rays: Rays, wavelength_nm: float, *, towards: Towards = 
     chunks = zip(*(c.split(CHUNK) for c in rays), strict=True)
     with torch.no_grad():
         return torch.cat([_passing_chunk(lens, Rays(*chunk), wavelength_nm, towards) for chunk in chunks])
+
+
+def _passing_chunk(lens: Lens, rays: Rays, wavelength_nm: float, towards: Towards) -> Tensor:
+    sense, order = _path(lens, towards)
+    tracing, left = Tracing(lens, rays, wavelength_nm, sense, order[0], False), torch.arange(len(rays.x))
+    for k in order:
+        tracing.cross(k)
+        if float(tracing.tests.passed.sum()) < _FEWER * len(left):
+            alive = torch.nonzero(tracing.tests.passed)[:, 0]
+            tracing.rays, left = Rays(*(c.index_select(0, alive) for c in tracing.rays)), left.index_select(0, alive)
+            tracing.tests = Survival(torch.ones_like(tracing.rays.x), st.PASSED)
+    passed = torch.zeros(len(rays.x), dtype=torch.bool)
+    passed[left] = tracing.tests.passed > 0
+    return passed
 
 
 def compile_trace(
@@ -210,87 +236,158 @@ def _parameters(lens: Lens) -> list[Any]:
     return found
 
 
-def _way(lens: Lens, towards: Towards) -> tuple[int, range]:
+def _path(lens: Lens, towards: Towards) -> tuple[int, range]:
     """The sense of travel along z, and the surfaces in the order in which light meets them."""
     last = len(lens.surfaces) - 1
     return (1, range(last + 1)) if towards == "film" else (-1, range(last, -1, -1))
 
 
+class Tracing:
+    """Rays on their way through a lens, surface by surface.
+
+    Args:
+        sense: the direction of travel in which they start, +1 to the film.
+        entering: the surface that they meet first. guard: whether lost rays stay finite on the way.
+        freeze: whether lost rays are put on the axis at once, for gradients.
+    """
+
+    def __init__(
+        self, lens: Lens, rays: Rays, wavelength_nm: Any, sense: int, entering: int, guard: bool, freeze: bool = False
+    ) -> None:
+        self.lens, self.sense, self.freeze = lens, sense, freeze
+        self.o = Tensors(guard or freeze, rays.x.dtype)
+        self.wavelength_nm, lit = sound_wavelength(lens, wavelength_nm, rays.x.dtype)
+        self.media = media(lens, self.wavelength_nm)  # media[k] lies before surface k as light travels to the film
+        self.figures = [figure_of(s) for s in lens.surfaces]
+        self.medium = self.media[0 if sense > 0 else -1]
+        self.vertex: Any = 0.0
+        self._entering: int | None = entering
+        self.tests, self.rays = self._start(rays, lit, st.blocked(entering, st.MISSED))
+
+    def _start(self, rays: Rays, lit: Tensor | None, otherwise: int) -> tuple[Survival, Rays]:
+        """Rays with optical direction cosines, and the test that their directions are unit vectors."""
+        o = self.o
+        length2 = o.dot(rays[3:], rays[3:])
+        sound = at_most((length2 - 1).abs(), UNIT_SLACK)
+        if lit is not None:
+            sound = sound * lit
+        if self.freeze:
+            # A NaN input must not reach the gradients of the other rays.
+            sound = sound * torch.isfinite(rays.x * rays.x + rays.y * rays.y + rays.z * rays.z)
+        tests = Survival(sound, otherwise)
+        if self.freeze:
+            rays = tests.along_axis(rays, self.sense, 0.0)
+        if self.sense > 0:
+            # Light may start far away; near the lens float32 keeps points and directions consistent.
+            rays = Rays(*nearest_approach(o, rays, 1.0), *rays[3:])
+        return tests, Rays(*rays[:3], *(times(d, self.medium.n) for d in rays[3:]))
+
+    def cross(self, k: int, reflected: bool = False) -> tuple[Rays, Crossed, tuple[Medium, Medium]]:
+        """Go on to surface k and through it, or back from it where `reflected`.
+
+        Returns the rays before it, in its vertex frame, what it does to them, and the media as they meet them.
+        """
+        lens, surface = self.lens, self.lens.surfaces[k]
+        vertex = lens.vertices_mm[k]
+        # In this surface's frame float32 keeps its precision.
+        r, self.vertex = self.rays._replace(z=self.rays.z + (self.vertex - vertex)), vertex
+        met_media = (self.media[k], self.media[k + 1]) if self.sense > 0 else (self.media[k + 1], self.media[k])
+        crossed = cross(
+            self.o, surface, self.figures[k], r, self.sense, *met_media,
+            entering=k == self._entering, reflected=reflected, rim=self._rim(surface),
+        )  # fmt: skip
+        for tests, reason in crossed.tests:
+            self.tests.require(tests, k, reason)
+        if self.figures[k].flat:
+            # A sphere's square root turns NaN and overflow into a miss; a plane would pass them.
+            self.tests.end(height2(self.o, crossed.met))
+        self.rays, self._entering = crossed.bent.rays, None
+        self.medium = met_media[0 if reflected else 1]
+        self.sense = -self.sense if reflected else self.sense
+        # A lost ray goes on along the axis: no overflow there can reach the gradients of the others.
+        if self.freeze:
+            self.rays = self.tests.along_axis(self.rays, self.sense, 0.0)
+        return r, crossed, met_media
+
+    def _rim(self, surface: Surface) -> Callable[[Met], list[Test]] | None:
+        aperture, radius_mm = self.lens.aperture, surface.semi_diameter_mm
+        if aperture is None or not surface.stop:
+            return None
+        outer = rim_tests(self.o, surface)
+        return lambda met: [*outer(met), (0.5, aperture.inside(met.x, met.y, radius_mm).to(met.x.dtype))]
+
+    def in_lens_frame(self) -> Rays:
+        """The rays behind the last surface with unit directions."""
+        r, n = self.rays._replace(z=self.rays.z + self.vertex), self.medium.n
+        return r if is_number(n) and n == 1 else Rays(*r[:3], *(d / n for d in r[3:]))
+
+    def leave(self) -> Rays:
+        """The rays in the lens frame; those that did not go on are along the axis."""
+        return self.tests.along_axis(self.in_lens_frame(), self.sense, self.vertex)
+
+
 def _trace_chunk(
     lens: Lens, rays: Rays, wavelength_nm: Tensor | float, towards: Towards, wanted: _Wanted, freeze: bool
 ) -> Traced:
-    sense, order = _way(lens, towards)
-    vertices = lens.vertices_mm
-    wavelength_nm, lit = sound_wavelength(lens, wavelength_nm, rays.x.dtype)
-    glasses = media(lens, wavelength_nm)  # glasses[k] lies before surface k as light travels to the film
-    mode = Mode(sense, freeze or wanted.path or bool(wanted.record), freeze)
-    r, tests = start(rays, glasses[0 if sense > 0 else -1], mode, st.blocked(order[0], st.MISSED), lit)
-    power = Passage(lens, wavelength_nm, rays.x) if wanted.transmittance else None
+    sense, order = _path(lens, towards)
+    tracing = Tracing(lens, rays, wavelength_nm, sense, order[0], wanted.path or bool(wanted.record), freeze)
+    power = Passage(tracing.o, lens, TensorLosses(lens, tracing.wavelength_nm)) if wanted.transmittance else None
     crossings: dict[int, Crossing] = {}
     path: list[Rays] = []
-    vertex = 0.0
-    for position, k in enumerate(order):
-        # Move to this surface's frame, where float32 keeps its precision.
-        r = r._replace(z=r.z + (vertex - vertices[k]))
-        vertex = vertices[k]
-        before, after = (glasses[k], glasses[k + 1]) if sense > 0 else (glasses[k + 1], glasses[k])
-        hit = meet(lens, k, r, before, position == 0, mode, tests)
-        bent, q, q2 = bend(lens.surfaces[k], k, r, hit, before, after, mode, tests)
+    for k in order:
+        r, (met, bent, _), (before, after) = tracing.cross(k)
         if power is not None:
-            power.pass_surface(k, r, hit, q, (before, after), sense)
+            power.pass_surface(k, r, met, bent.q, (before, after), sense)
         if k in wanted.record:
-            margins = times(hit.q2, before.inverse_n2), times(q2, after.inverse_n2)
-            crossings[k] = Crossing(*unfolded(lens.surfaces[k], hit), *margins)
-        # A lost ray goes on along the axis: no overflow there can reach the gradients of the others.
-        r = along_axis(bent, tests, sense, 0.0) if freeze else bent
+            margins = times(met.q2, before.inverse_n2), times(bent.q2, after.inverse_n2)
+            crossings[k] = Crossing(*unfolded(lens.surfaces[k], met), *margins)
         if wanted.path:
-            path.append(unit(r._replace(z=r.z + vertex), after))
-    r = along_axis(unit(r._replace(z=r.z + vertex), after), tests, sense, vertex)
-    arrived = None if power is None else tests.only(power.arrived(), 0.0)
-    return Traced(r, tests.status(), arrived, crossings, tuple(path))
+            path.append(tracing.in_lens_frame())
+    arrived = None if power is None else tracing.tests.only(power.arrived(rays.x), 0.0)
+    return Traced(tracing.leave(), tracing.tests.status(), arrived, crossings, tuple(path))
 
 
-def _passing_chunk(lens: Lens, rays: Rays, wavelength_nm: float, towards: Towards) -> Tensor:
-    sense, order = _way(lens, towards)
-    vertices, glasses, mode = lens.vertices_mm, media(lens, wavelength_nm), Mode(sense, False, False)
-    r, tests = start(rays, glasses[0 if sense > 0 else -1], mode, st.blocked(order[0], st.MISSED))
-    left, vertex = torch.arange(len(rays.x)), 0.0
-    for position, k in enumerate(order):
-        r = r._replace(z=r.z + (vertex - vertices[k]))
-        vertex = vertices[k]
-        before, after = (glasses[k], glasses[k + 1]) if sense > 0 else (glasses[k + 1], glasses[k])
-        hit = meet(lens, k, r, before, position == 0, mode, tests)
-        r = bend(lens.surfaces[k], k, r, hit, before, after, mode, tests)[0]
-        if float(tests.passed().sum()) < _FEWER * len(left):
-            alive = torch.nonzero(tests.passed())[:, 0]
-            r, left = Rays(*(c.index_select(0, alive) for c in r)), left.index_select(0, alive)
-            tests = Counts(torch.ones_like(r.x), st.PASSED)
-    passed = torch.zeros(len(rays.x), dtype=torch.bool)
-    passed[left] = tests.passed() > 0
-    return passed
+def unfolded(surface: Surface, met: Met) -> tuple[Tensor, Tensor]:
+    """x and y of a meeting, [N] each, mm; on the far half of a deep sphere mirrored outwards at its equator.
+
+    So the distance from the axis grows on beyond a deep rim, where it would fall again, and tells the half.
+    """
+    if not is_deep(surface):
+        return met.x, met.y
+    height = torch.hypot(met.x, met.y).clamp_min(1e-300)
+    outwards = torch.where(met.z * surface.curvature > 1, 2 * abs(surface.radius_mm) / height - 1, 1.0)
+    return met.x * outwards, met.y * outwards
 
 
-def _room(part: Any, count: int) -> Any:
-    """The same structure with room for `count` rays."""
-    if isinstance(part, Tensor):
-        return part.new_empty(count)
-    if isinstance(part, dict):
-        return {k: _room(v, count) for k, v in part.items()}
-    if isinstance(part, tuple):
-        rooms = [_room(v, count) for v in part]
-        return type(part)(*rooms) if hasattr(part, "_fields") else tuple(rooms)
-    return part
+def check_rays(rays: Rays, wavelength_nm: Tensor | float) -> None:
+    """Raise InputError for components of unequal or wrong shape or dtype, and such wavelengths, or one not positive."""
+    shape, dtype = rays.x.shape, rays.x.dtype
+    if dtype not in (torch.float32, torch.float64):
+        raise InputError("trace", "rays.x", f"({dtype})", "torch.float32 or torch.float64")
+    for name, c in zip(Rays._fields, rays, strict=True):
+        if c.shape != shape or c.dtype != dtype or c.ndim != 1:
+            found = f"({tuple(c.shape)}, {c.dtype})"
+            raise InputError("trace", f"rays.{name}", found, f"[N] like x: {tuple(shape)}, {dtype}")
+    if isinstance(wavelength_nm, Tensor):
+        if wavelength_nm.ndim and wavelength_nm.shape != shape:
+            found = f"({tuple(wavelength_nm.shape)})"
+            raise InputError("trace", "wavelength_nm", found, f"a number or a tensor {tuple(shape)}")
+    elif not 0 < wavelength_nm < math.inf:
+        raise InputError("trace", "wavelength_nm", wavelength_nm, "a positive number")
 
 
-def _fill(whole: Any, part: Any, at: slice) -> None:
-    if isinstance(part, Tensor):
-        whole[at] = part
-    elif isinstance(part, dict):
-        for k, v in part.items():
-            _fill(whole[k], v, at)
-    elif isinstance(part, tuple):
-        for a, b in zip(whole, part, strict=True):
-            _fill(a, b, at)
+def sound_wavelength(
+    lens: Lens, wavelength_nm: Tensor | float, dtype: torch.dtype
+) -> tuple[Tensor | float, Tensor | None]:
+    """Wavelengths in the precision of the rays, invalid ones replaced by the d line, and which are valid [N].
+
+    A NaN in an index would reach the gradients of the prescription, and float64 would spread to float32 rays halfway.
+    None where all are valid or, without dispersion, irrelevant.
+    """
+    if not isinstance(wavelength_nm, Tensor):
+        return wavelength_nm, None
+    sound = (wavelength_nm > 0) & (wavelength_nm < math.inf)
+    return torch.where(sound, wavelength_nm, glass.LINE_D_NM).to(dtype), sound if lens.dispersive else None
 
 
 class Differentials(NamedTuple):

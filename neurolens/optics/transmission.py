@@ -10,16 +10,17 @@ Principles of Optics, 1.5.2 and 10.9.3; Chipman, Lam and Young, Polarized Light 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
+from neurolens.optics.arithmetic import Arithmetic, times
 from neurolens.optics.coatings import Layers, power_amplitudes
-from neurolens.optics.passing import absorption_per_mm
-from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.glass import absorption_of
+from neurolens.optics.prescription import Lens
 from neurolens.optics.shapes import is_plain
-from neurolens.optics.surfaces import Hit, Medium, Rays, times
+from neurolens.optics.surfaces import Medium, Met, Rays, normal_at
 
 Vector = Any  # x, y, z in the lens frame: three tensors [N], or the rows of a value
 
@@ -142,67 +143,90 @@ def coated_shares(
     return Shares((s + p) * 0.5, (s - p) * 0.5, a * c + b * d, b * c - a * d)
 
 
+class Losses(Protocol):
+    """What glass and coatings do to light: `TensorLosses` with tensors, `filmgraph.GraphLosses` in a graph."""
+
+    def absorption(self, k: int) -> Any: ...
+    def coated(self, k: int, met: Met, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares: ...
+    def transmitted(self, depth: Any) -> Any: ...
+
+
+class TensorLosses:
+    """What glass and coatings do to light, with tensors."""
+
+    def __init__(self, lens: Lens, wavelength_nm: Any) -> None:
+        self.lens, self.wavelength_nm = lens, wavelength_nm
+
+    def absorption(self, k: int) -> Any:
+        """Napierian absorption (1/mm) of the medium before surface k; None where there is none."""
+        # What the medium in front of the lens absorbs is a matter of the scene.
+        return absorption_of(self.lens.surfaces[k - 1], self.wavelength_nm) if k else None
+
+    def coated(self, k: int, met: Met, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares:
+        """What the coating of surface k transmits or reflects; arguments as of `Passage.pass_surface`."""
+        before, after = media
+        coating = self.lens.surfaces[k].coating
+        cos_i = times(met.q, 1 / before.n)
+        layers = coating.layers if coating else ()
+        return coated_shares(cos_i, before.n, after.n, layers, self.wavelength_nm, sense, reflected)
+
+    def transmitted(self, depth: Any) -> Any:
+        """exp(-depth)."""
+        return torch.exp(-depth)
+
+
 class Passage:
     """Power carried along while rays are traced; absorption is by Beer and Lambert's law."""
 
-    def __init__(self, lens: Lens, wavelength_nm: Tensor | float, like: Tensor) -> None:
-        self._lens, self._wavelength_nm, self._like = lens, wavelength_nm, like
-        self._absorption = absorption_per_mm(lens, wavelength_nm)
+    def __init__(self, o: Arithmetic, lens: Lens, losses: Losses) -> None:
+        self._o, self._lens, self._losses = o, lens, losses
         self._light: Light | None = None
-        self._depth: Tensor | None = None
-        self._last: tuple[int, Vector, Tensor] | None = None  # surface, its normal, n cos behind it
+        self._depth: Any = None
+        self._last: tuple[int, Vector, Any] | None = None  # surface, its normal, n cos behind it
 
     def pass_surface(
-        self, k: int, r: Rays, hit: Hit, q: Tensor, media: tuple[Medium, Medium], sense: int, reflected: bool = False
+        self, k: int, r: Rays, met: Met, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool = False
     ) -> None:
-        """Surface k: rays before it, their hit, n' cos t; media as the light meets them, of the sense of travel."""
+        """Surface k: rays before it, their meeting, n' cos t; media as the light meets them, of the sense of travel."""
         before, after = media
-        absorbed = self._absorption[k if sense > 0 else k + 1]
+        absorbed = self._losses.absorption(k if sense > 0 else k + 1)
         if absorbed is not None:
-            depth = way_mm(r, hit, before) * absorbed
+            depth = path_mm(self._o, r, met, before) * absorbed
             self._depth = depth if self._depth is None else self._depth + depth
         surface = self._lens.surfaces[k]
-        layers = surface.coating.layers if surface.coating else ()
-        if before is after and not layers and not reflected:
+        coated = bool(surface.coating and surface.coating.layers)
+        if before is after and not coated and not reflected:
             return
-        if layers or reflected:
-            cos_i = times(hit.q, 1 / before.n)
-            shares = coated_shares(cos_i, before.n, after.n, layers, self._wavelength_nm, sense, reflected)
+        if coated or reflected:
+            shares = self._losses.coated(k, met, q, media, sense, reflected)
         else:
-            ratio = after.n / before.n
-            shares = fresnel(hit.q, q, hit.q * ratio + q / ratio)
-        normal = normal_at(surface, hit)
-        turn = None if self._last is None else self._turn(k, normal, r, hit, before)
+            both = before.n * after.n
+            p = self._o.fma(met.q, times(both, before.inverse_n2), q * times(both, after.inverse_n2))
+            shares = fresnel(met.q, q, p)
+        normal = normal_at(self._o, met, surface.curvature)
+        turn = None if self._last is None else self._turn(k, normal, r, met, before)
         self._light = pass_surface(self._light, turn, shares)
-        self._last = k, normal, hit.q if reflected else q
+        self._last = k, normal, met.q if reflected else q
 
-    def _turn(self, k: int, normal: Vector, r: Rays, hit: Hit, before: Medium) -> tuple[Tensor, Tensor]:
-        """Of `turned`, times the square of the index."""
+    def _turn(self, k: int, normal: Vector, r: Rays, met: Met, before: Medium) -> tuple[Any, Any]:
+        """The turn between the planes of incidence (`turned`), times the square of the index."""
         assert self._last is not None
         last, other, q = self._last
         pair = self._lens.surfaces[last], self._lens.surfaces[k]
         if all(is_plain(s) for s in pair):
             gap = self._lens.vertices_mm[k] - self._lens.vertices_mm[last]
-            across = crossed_spheres(hit, r[3:], (pair[0].curvature, pair[1].curvature), gap)
+            across = crossed_spheres(met, r[3:], (pair[0].curvature, pair[1].curvature), gap)
         else:
             across = crossed(r[3:], other, normal)
-        return turned([times(c, before.n2) for c in other], normal, q * hit.q, times(across, before.n))
+        return turned([times(c, before.n2) for c in other], normal, q * met.q, times(across, before.n))
 
-    def arrived(self) -> Tensor:
-        """The power of all rays, [N]."""
-        power = torch.ones_like(self._like) if self._light is None else self._light.power
-        return power if self._depth is None else power * torch.exp(-self._depth)
-
-
-def way_mm(r: Rays, hit: Hit, before: Medium) -> Any:
-    """Length of the way from a ray's point to its hit, [N] mm; negative where the hit lies behind it."""
-    way = (hit.x - r.x) * r.dx + (hit.y - r.y) * r.dy + (hit.z - r.z) * r.dz
-    return times(way, 1 / before.n)
+    def arrived(self, like: Any) -> Any:
+        """The power of all rays, in the form of a value."""
+        power = self._o.like(like, 1.0) if self._light is None else self._light.power
+        return power if self._depth is None else power * self._losses.transmitted(self._depth)
 
 
-def normal_at(surface: Surface, hit: Hit) -> Vector:
-    """Unit normal towards +z at a meeting point, x, y, z each [N]."""
-    if hit.normal is not None:
-        return hit.normal
-    c = surface.curvature
-    return -c * hit.x, -c * hit.y, 1 - c * hit.z
+def path_mm(o: Arithmetic, r: Rays, met: Met, before: Medium) -> Any:
+    """Length of the path from a ray's point to its meeting, mm; negative where the meeting lies behind it."""
+    along = o.fma(met.z - r.z, r.dz, o.fma(met.y - r.y, r.dy, (met.x - r.x) * r.dx))
+    return times(along, times(before.n, before.inverse_n2))

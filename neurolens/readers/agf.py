@@ -66,7 +66,7 @@ def read_agf(path: str | Path) -> tuple[list[Glass], dict[str, str]]:
 @contextmanager
 def more_glasses(files: Iterable[str | Path]) -> Iterator[None]:
     """The glasses of these catalogues within the block, before those of the same names that ship."""
-    read = [read_agf(file) for file in files]
+    read, before = [read_agf(file) for file in files], catalogue.added()
     try:
         for found, refused in reversed(read):
             catalogue.add(found, refused)
@@ -74,7 +74,7 @@ def more_glasses(files: Iterable[str | Path]) -> Iterator[None]:
         yield
     finally:
         if read:
-            catalogue.remove_added()
+            catalogue.restore(before)
             glass.forget()
 
 

@@ -73,7 +73,7 @@ class Block:
         return {"radius_mm": self.radius, "conic": conic, "asphere": tuple((p, a) for p, a in asphere if a)}
 
     def q_type(self, name: str, qcon: bool, values: list[float], radius: float) -> dict[str, Any]:
-        """As `rotational`, of Forbes's aspheres: coefficients from m = 0 over a normalisation radius."""
+        """A surface of Forbes's kind, made as by `rotational`: coefficients from m = 0, a normalisation radius."""
         rim = radius if math.isnan(self.semi_diameter) else self.semi_diameter
         if len(values) > MAX_TERMS:
             raise self.start.error(name, f"({len(values)} terms)", f"at most {MAX_TERMS} terms")

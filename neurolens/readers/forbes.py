@@ -39,7 +39,7 @@ def qcon_terms(a: Sequence[float], radius: float, rim: float) -> Terms:
 
 
 def qbfs_terms(a: Sequence[float], radius: float, curvature: float, rim: float, conic: float = 0.0) -> Terms:
-    """As `qcon_terms`, of a Qbfs departure from a conic; ValueError, too, where the conic is too steep for powers."""
+    """The terms of a Qbfs departure from a conic, as of `qcon_terms`; ValueError where the conic is too steep."""
     with localcontext(Context(prec=_DIGITS)):
         s2, k, reach = (
             (Decimal(curvature) * Decimal(radius)) ** 2,

@@ -30,3 +30,9 @@ class FilmSettings:
     white_balance: str | None = None
     wavelengths: WavelengthMode = "auto"
     wavelength_sampling: WavelengthSampling = "importance"
+
+
+def size_by_shape(shape: float, width: int | None, height: int | None) -> tuple[int, int]:
+    """Width and height in pixels for a film of this width over height; one of them may be missing."""
+    across = max(1, round((height or 0) * shape)) if width is None else width
+    return across, max(1, round(across / shape)) if height is None else height

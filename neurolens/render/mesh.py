@@ -128,7 +128,7 @@ class Tree:
 
 
 class SphereTree(Tree):
-    """As `Spheres`, for many of them: their exact test of the pairs that a tree leaves over."""
+    """Many spheres: a tree of boxes, and the exact test of `Spheres` for the pairs that it leaves over."""
 
     def __init__(self, first: int, centres: FloatArray64, radii: FloatArray64) -> None:
         super().__init__(first, centres, centres - radii[:, None], centres + radii[:, None])

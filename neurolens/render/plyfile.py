@@ -198,7 +198,7 @@ def _skipped(element: Element, body: memoryview, at: int, order: str, numbers: N
 def _walk(
     element: Element, body: memoryview, at: int, order: str, numbers: Numbers
 ) -> Iterator[tuple[str, int, int, int]]:
-    """Of each list of each element: its name, where its values begin, how many there are, and where they end.
+    """Yield, for each list of each element, its name, where its values begin, how many there are, and where they end.
 
     Places are bytes, or numbers of an ASCII file. Plain values after the last list of an element count to the next.
     """

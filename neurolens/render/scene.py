@@ -19,6 +19,7 @@ from neurolens.cameras.contract import FloatArray
 from neurolens.optics.apertures import Aperture
 from neurolens.render import scenetables as tables
 from neurolens.render.film_settings import FilmSettings
+from neurolens.render.flaresettings import FlareSettings
 from neurolens.render.illuminants import Spectrum, check_name, check_spectrum, illuminant, read_spectrum
 from neurolens.render.meshfile import Parts, TriangleSet, encloses
 from neurolens.render.pictures import make_aperture, read_environment, read_pictures
@@ -74,7 +75,7 @@ class SceneSettings:
 
     camera: CameraSettings
     film: FilmSettings = FilmSettings()
-    flare: tables.Flare | None = None
+    flare: FlareSettings | None = None
     illuminants: dict[str, MeasuredSpectrum] | None = None
     environment: tables.Environment = tables.Environment(colour=BLACK)
     sky: tables.Sky | None = None
@@ -130,7 +131,7 @@ def load_scene(path: str | Path) -> Scene:
 
 
 def scene_from_tables(tables: Mapping[str, Any], path: str | Path = "scene") -> Scene:
-    """As `load_scene`, for tables already in memory; `path` is for messages and for finding files."""
+    """Make a scene from tables in memory, as `load_scene` does; `path` is for messages and for finding files."""
     path = Path(path)
     settings, triangles = _with_meshes(path, from_dict(SceneSettings, tables, path))
     _check_references(path, settings, triangles)

@@ -78,11 +78,6 @@ _RULES: dict[str, Rule] = {
     "matrix": (lambda v: _is_regular(v), f"three rows of four numbers within {FARTHEST_M:g}, which flatten nothing"),
     **dict.fromkeys(("width", "height"), _count(16384)),
     "samples": _count(1 << 20),
-    "bins": _count(256),
-    "most": _count(10_000),
-    "cell_px": (lambda v: 1 <= v <= 256, "pixels from 1 to 256"),
-    "glare": (lambda v: 0 <= v <= 1 << 30, "an integer from 0 to 1073741824"),
-    "brightest": (lambda v: 0 <= v <= 64, "an integer from 0 to 64"),
     "max_depth": _count(1000),
     "focus_m": (lambda v: v > 0, "a number above 0"),
     "wavelengths_nm": (lambda v: 380 <= v[0] <= v[1] <= 780, "low and high within 380 to 780"),
@@ -394,28 +389,6 @@ class Environment(Checked):
             require(self.scale == 1, "scale", self.scale, "left out: it multiplies a picture")
             require(self.rotate_y_deg == 0, "rotate_y_deg", self.rotate_y_deg, "left out: it turns a picture")
         require(self.scale <= BRIGHTEST, "scale", self.scale, f"a number above 0, at most {BRIGHTEST:g}")
-
-
-@dataclass(frozen=True)
-class Flare(Checked):
-    """Flare of the scene's own lights (without sky and environment) as layers of pictures by a lens that is traced.
-
-    Attributes:
-        coating: of surfaces between glass and air that the lens file leaves bare, named as `neurolens flare` does.
-        bins: wavelengths. cell_px: pixels of the cells that ghosts are drawn by. brightest: ghosts that have layers of
-            their own, those with the greatest values on the film. most: lights, those of the most energy. glare:
-            photons a light and wavelength for the layer of light that is reflected more than twice, 0 for none.
-            starburst: whether diffraction has its layer. without: names of layers that are not made.
-    """
-
-    coating: str | None = None
-    bins: int = 15
-    cell_px: float = 12.0
-    brightest: int = 0
-    most: int = 32
-    glare: int = 0
-    starburst: bool = False
-    without: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -70,8 +70,8 @@ def plates_of(fields: Sequence[Field], picture: tuple[int, int], film_mm: tuple[
         # By whole pixels on both sides, so that pixels of both pictures lie on one grid; rounding is no pixel.
         size.append(side + 2 * max(0, math.ceil(reach / step - side / 2 - 1e-4)))
     if size[0] * size[1] > LARGEST_MAP:
-        expected = f"at most {LARGEST_MAP} pixels undistorted: a smaller --size or --film, or another --projection"
-        raise InputError("stmap", "--size", f"({size[0]} x {size[1]} pixels undistorted)", expected)
+        expected = f"at most {LARGEST_MAP} pixels undistorted: a smaller --width or --film, or another --projection"
+        raise InputError("stmap", "--width", f"({size[0]} x {size[1]} pixels undistorted)", expected)
     return Plates(picture, (size[0], size[1]), pixel)
 
 

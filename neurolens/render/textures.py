@@ -36,7 +36,7 @@ def plane_frame(point: Frame, normal: Frame) -> Frame:
 
 
 def disc_frame(centre: Frame, normal: Frame, radius: float) -> Frame:
-    """As for a plane, from the lower left corner of the square around a disc."""
+    """The frame of a disc's texture, from the lower left corner of the square around the disc."""
     frame = plane_frame(centre, normal)
     frame[:, 3] += radius
     frame[:, 4] = 2 * radius

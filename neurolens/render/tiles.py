@@ -7,7 +7,7 @@ not go together.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
+from neurolens.base.files import check_writable
 from neurolens.cameras.contract import FloatArray
 from neurolens.render.checkpoint import difference
-from neurolens.render.colour import COLOUR_SPACES
+from neurolens.render.colour import COLOUR_SPACES, SRGB, conversion, converted
 from neurolens.render.exr_attributes import standard_attributes
 from neurolens.render.film import check_memory
-from neurolens.render.pictures import read_channels, read_metadata, write_stored
+from neurolens.render.pictures import read_channels, read_metadata, write_png, write_stored
 
 _EXPECTED = 'a tile of "neurolens render --tile"'
 # What a merged picture's statistics add up; the rest follows from these, or is the same in all tiles.
@@ -175,9 +176,46 @@ def _statistics(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def write_merged(path: Path, channels: Mapping[str, NDArray[Any]], told: Mapping[str, Any], frame: int | None) -> None:
-    """Write a merged picture as one run writes it; OSError, InputError as `pictures.write_exr`."""
-    write_stored(path, channels, COLOUR_SPACES[told["colour"]["space"]], told, _attributes(told, frame))
+def merge_tiles(paths: Iterable[Path], out: Path, exposure: float = 0.0) -> list[dict[str, Any]]:
+    """Check all tiles, then write their picture, or one for each frame: OUT.0001.exr and so on.
+
+    Returns:
+        For each picture its file, preview, number of tiles and statistics.
+
+    Raises:
+        InputError: as `check_together`; an output that is one of the tiles. OSError: an output that cannot be written.
+    """
+    frames: dict[int | None, list[Tile]] = {}
+    for path in paths:
+        tile = read_tile(path)
+        frames.setdefault(tile.frame, []).append(tile)
+    digits = max(4, *(len(str(frame)) for frame in frames))
+    outs = {}
+    for frame, tiles in frames.items():
+        check_together(tiles)
+        number = "" if frame is None else f".{frame:0{digits}d}"
+        outs[frame] = out.with_name(f"{out.stem}{number}{out.suffix}")
+        for file in (outs[frame], outs[frame].with_suffix(".png")):
+            if any(file.exists() and file.samefile(tile.path) for each in frames.values() for tile in each):
+                raise InputError(file, "--output", file.name, "another name: it is one of the tiles")
+            check_writable(file)
+    return [write_picture(tiles, outs[frame], exposure) for frame, tiles in frames.items()]
+
+
+def write_picture(tiles: Sequence[Tile], out: Path, exposure: float) -> dict[str, Any]:
+    """Write the picture of all its tiles as one run writes it, and its preview; returns its file and statistics.
+
+    Raises:
+        InputError: as `merged`. OSError: it cannot be written.
+    """
+    channels, told = merged(tiles)
+    space, render = COLOUR_SPACES[told["colour"]["space"]], told["render"]
+    rgb = np.stack([channels[name].astype(np.float32) for name in _COLOURS], axis=-1)
+    if space is not SRGB:
+        rgb = converted(rgb, conversion(space, SRGB)).astype(np.float32)
+    write_stored(out, channels, space, told, _attributes(told, tiles[0].frame))
+    write_png(preview := out.with_suffix(".png"), rgb, exposure)
+    return {"file": str(out), "preview": str(preview), "tiles": len(tiles), **render}
 
 
 def _attributes(told: Mapping[str, Any], frame: int | None) -> dict[str, Any]:

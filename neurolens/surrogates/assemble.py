@@ -22,8 +22,7 @@ from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, CoreValues, Fi
 
 if TYPE_CHECKING:
     from neurolens.optics.prescription import Surface
-    from neurolens.surrogates.lightfield import Encoding
-    from neurolens.surrogates.model import LensModel
+    from neurolens.surrogates.model import Encoding, LensModel
 
 Array = NDArray[np.float64]
 
@@ -77,24 +76,20 @@ class Parts:
 ALL, RAY_ONLY = Parts(), Parts(False, False, False)
 
 
-def model_graph(model: LensModel, angle: float, form: Form, parts: Parts = ALL) -> Graph:
-    """The graph of a model.
-
-    Args:
-        angle: largest angle (rad) between the axis and the scene rays, as `LensModel.largest_angle`.
-    """
+def model_graph(model: LensModel, form: Form, parts: Parts = ALL) -> Graph:
+    """The graph of a model."""
     g = Graph()
     rays, film_z = g.input("rays", 5), g.input("film_z_mm", per_call=True)
     inside = within_domain(model, rays, film_z, form)
     field = light_field(g, model.encoding, rays, film_z)
-    series = DirectionSeries.of(model, angle, form)
+    series = DirectionSeries.of(model, form)
     values = model.core.build(g, field, units_of(model, series, form))
     g.outputs["status"] = add_outputs(model, values, inside, series, form, parts).whole()
     return g
 
 
 def units_of(model: LensModel, series: DirectionSeries, form: Form) -> Units:
-    """Of a core whose outputs `add_outputs` takes: mm, and kappa rad."""
+    """The units of a core whose outputs `add_outputs` takes: mm, and kappa rad."""
     return Units((model.scales.position_mm, series.kappa, model.scales.stop_mm), form.gate_scale)
 
 
@@ -191,10 +186,11 @@ class DirectionSeries:
     minus_cos: Array | None = None
 
     @staticmethod
-    def of(model: LensModel, angle: float, form: Form) -> DirectionSeries:
-        """That of a model: no series for slopes."""
+    def of(model: LensModel, form: Form) -> DirectionSeries:
+        """The series of a model up to its largest angle; no series for slopes."""
         if model.direction == "slope":
             return DirectionSeries(1.0)
+        angle = model.largest_angle
         return DirectionSeries.exact(angle) if form.exact else DirectionSeries.fitted(angle, form.monic)
 
     @staticmethod

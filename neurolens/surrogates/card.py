@@ -18,8 +18,8 @@ from neurolens.base.errors import InputError
 from neurolens.modelfile import CARD_KIND, CARD_SCHEMA, MAX_CARD
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
-from neurolens.surrogates.domain import Domain, FilmRays, sample_domain
-from neurolens.surrogates.model import LensModel, Prediction
+from neurolens.surrogates.domain import FilmRays, sample_domain
+from neurolens.surrogates.model import Domain, LensModel, Prediction
 
 UNITS = {
     "rays": ["film_x mm", "film_y mm", "pupil_x mm", "pupil_y mm", "wavelength nm"],

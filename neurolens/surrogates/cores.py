@@ -2,15 +2,15 @@
 
 A core maps a light field to vectors (position, direction, stop crossing) and scalars (transmittance, gates). It is
 plain data with one method that writes it into a graph (`neurolens.graph`); every evaluator and writer reads that. A new
-kind of core is one class here; `stored.CORES` names it in files.
+kind of core is one class here with its name in files (`stored_as`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,6 +109,21 @@ class CoreValues:
         vectors = tuple(g.select(truth, x, y) for x, y in zip(a, b, strict=True))
         gates = None if self.gates is None or other.gates is None else g.select(truth, self.gates, other.gates)
         return CoreValues(vectors, g.select(truth, self.transmittance, other.transmittance), gates)  # type: ignore[arg-type]
+
+
+_CoreType = TypeVar("_CoreType", bound=type)
+# Cores by the name that files carry. Their fields are float and integer arrays, numbers, tuples and other cores.
+CORES: dict[str, type[Core]] = {}
+
+
+def stored_as(name: str) -> Callable[[_CoreType], _CoreType]:
+    """A decorator of a core's class: the name that model files carry for it."""
+
+    def register(kind: _CoreType) -> _CoreType:
+        CORES[name] = kind
+        return kind
+
+    return register
 
 
 class Core:
@@ -224,6 +239,7 @@ class _Symmetric(_Polynomial):
         return symmetric(self.rows(g, field, units), field, len(self.scalars))
 
 
+@stored_as("invariants")
 @dataclass(frozen=True, eq=False)
 class InvariantPolynomial(_Symmetric):
     """out = A p + B u, with A, B and the scalars polynomials in rho, sigma, tau, w.
@@ -257,9 +273,10 @@ class InvariantPolynomial(_Symmetric):
         return int((self.ab[:2] != 0).any(0).sum())
 
 
+@stored_as("mirror")
 @dataclass(frozen=True, eq=False)
 class MirrorPolynomial(_Symmetric):
-    """Of a lens with two planes of symmetry: out_x = A_x p_x + B_x u_x, and y likewise.
+    """The polynomial of a lens with two planes of symmetry: out_x = A_x p_x + B_x u_x, and y likewise.
 
     Attributes:
         exponents: [M, 7] int64 of p_x^2, p_x u_x, u_x^2, the same of y, w; rows are unique.
@@ -275,10 +292,11 @@ class MirrorPolynomial(_Symmetric):
 
     @cached_property
     def coefficients_per_vector(self) -> int:
-        """Of one vector's two components together, the larger of position and direction."""
+        """The coefficients of a vector's two components together, the larger of position and direction."""
         return int((self.ab[:2] != 0).sum((1, 2, 3)).max())
 
 
+@stored_as("raw")
 @dataclass(frozen=True, eq=False)
 class RawPolynomial(_Polynomial):
     """Every component of every vector, and every scalar, is a polynomial in p_x, p_y, u_x, u_y, w: the published form.
@@ -307,6 +325,7 @@ class RawPolynomial(_Polynomial):
         return int((self.components[:2] != 0).sum((1, 2)).max())
 
 
+@stored_as("network")
 @dataclass(frozen=True, eq=False)
 class Network(Core):
     """A multilayer perceptron from the invariants to the coefficients A and B of each vector and to the scalars.
@@ -382,7 +401,7 @@ class Composite(Core):
 
     @property
     def coefficients_per_vector(self) -> int:
-        """Of all parts together."""
+        """The coefficients of all parts together."""
         return sum(part.coefficients_per_vector for part in self.parts)
 
     @property
@@ -390,6 +409,7 @@ class Composite(Core):
         return sum(part.coefficients for part in self.parts)
 
 
+@stored_as("residual")
 @dataclass(frozen=True, eq=False)
 class Residual(Composite):
     """The sum of a polynomial and a network on what the polynomial leaves, both on the same invariants.
@@ -408,6 +428,7 @@ class Residual(Composite):
         return symmetric(network.rows(g, field, units, whole.rows(g, field, units)), field, len(bias) - 6)
 
 
+@stored_as("partitioned")
 @dataclass(frozen=True, eq=False)
 class Partitioned(Composite):
     """Cores of zones of the light field, split by rho (the squared film radius): the published light-field partition.
@@ -430,6 +451,7 @@ class Partitioned(Composite):
         return chosen
 
 
+@stored_as("refracted")
 @dataclass(frozen=True, eq=False)
 class Refracted(Composite):
     """A core whose rays end inside the front glass: the refraction there follows exactly, by `assemble.refracted`.

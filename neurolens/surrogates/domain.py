@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -12,10 +11,13 @@ from torch.quasirandom import SobolEngine
 
 from neurolens.base.bounds import WAVELENGTH_NM, said
 from neurolens.base.errors import InputError
+from neurolens.optics.film_plane import PupilBounds
 from neurolens.optics.focusing import film_range_mm
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
-from neurolens.optics.pupils import PupilBounds, image_radius_mm, pupil_bounds
+from neurolens.optics.pupils import image_radius_mm, pupil_bounds
+from neurolens.optics.states import set_lens
+from neurolens.surrogates.model import Domain
 
 # The disc on the pupil plane is that of all passing rays, enlarged by this much (design: "enlarged by 5%").
 PUPIL_MARGIN = 1.05
@@ -33,49 +35,6 @@ _EDGE = 0.03  # of the film radius
 # Another pupil plane is taken where so many times more of the disc passes there; the planes tried are so much further
 # from the film each than the one before, out to so many focal lengths.
 _BETTER, _STEP, _REACH = 1.25, 1.02, 20
-
-
-@dataclass(frozen=True)
-class Domain:
-    """A set of camera rays. Lengths in mm, lens frame.
-
-    Attributes:
-        film_radius_mm: film points lie within this distance of the axis.
-        film_z_mm: film planes, nearest to the lens first (best focus at infinity) to farthest (near limit).
-        focus_m: the object distances that those planes focus (far, near), from film to object, at every aperture.
-        pupil_z_mm: plane of the pupil points.
-        pupil_radius_mm: pupil points lie within this distance of the axis; 1.05 times the disc of passing rays.
-        wavelength_nm: shortest and longest wavelength; equal for a lens whose dispersion is unknown.
-        stop_radius_mm: the widest stop for which the surrogate is fitted.
-        bounds: where passing rays lie on the pupil plane, by film radius (for sampling in a render).
-        nearest_m: distance from the film of the nearest object in view, where one lies before the plane in focus; None:
-            the nearest focus. It changes no ray, only what an error of position counts in a fit.
-    """
-
-    film_radius_mm: float
-    film_z_mm: tuple[float, float]
-    focus_m: tuple[float, float]
-    pupil_z_mm: float
-    pupil_radius_mm: float
-    wavelength_nm: tuple[float, float]
-    stop_radius_mm: float
-    bounds: PupilBounds
-    nearest_m: float | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able, with infinity written as the string "inf"."""
-        data = asdict(self)
-        data["focus_m"] = ["inf" if math.isinf(f) else f for f in self.focus_m]
-        return data
-
-    @staticmethod
-    def from_dict(data: dict[str, Any]) -> Domain:
-        """The inverse of `to_dict`; what was written before `nearest_m` existed has none."""
-        table = {f.name: data["bounds"][f.name] for f in fields(PupilBounds)}
-        bounds: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
-        pairs = {k: tuple(float(v) for v in data[k]) for k in ("film_z_mm", "focus_m", "wavelength_nm")}
-        known = {f.name: data[f.name] for f in fields(Domain) if f.name in data}
-        return Domain(**{**known, **pairs, "bounds": PupilBounds(**bounds)})
 
 
 @dataclass(frozen=True)
@@ -204,7 +163,9 @@ def domain_from_camera(
     The lit film may be smaller than the crop (fisheyes); the smaller radius rules. `nearest_m` is the distance from the
     film of the nearest object in view: objects before the plane in focus keep their place then.
     """
-    stopped = lens.at(f_number=f_number, focus_m=focus_m) if f_number is not None else lens.at(focus_m=focus_m)
+    stopped = (
+        set_lens(lens, f_number=f_number, focus_m=focus_m) if f_number is not None else set_lens(lens, focus_m=focus_m)
+    )
     corner = math.hypot(*film_mm) / 2
     radius = min(corner, image_radius_mm(lens)[0])
     focus = (focus_m, focus_m)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,26 +10,19 @@ import numpy as np
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path
-from neurolens.graph.derive import derivative, with_derivatives
-from neurolens.graph.onnx import Mixing, write_onnx
-from neurolens.graph.program import RAY
+from neurolens.graph.onnx import write_onnx
 from neurolens.modelfile import CARD_KEY, MODEL_KEY
-from neurolens.modelfile.axes import Axis
-from neurolens.modelfile.stategraph import state_graph
 from neurolens.modelfile.states import STATE
 from neurolens.optics.focusing import at_infinity
 from neurolens.optics.paraxial import first_order
-from neurolens.surrogates.assemble import ONNX, model_graph
+from neurolens.surrogates.assemble import ONNX
 from neurolens.surrogates.card import card_of, card_to_json, lens_facts, reference_rays
-from neurolens.surrogates.inverse import STEPS, TOLERANCE, InverseModel, front_index, scene_graph, stop_graph
+from neurolens.surrogates.file import as_stored, coefficients_text, onnx_of
+from neurolens.surrogates.inverse import STEPS, TOLERANCE, Guess, InverseModel, front_index, scene_graph, stop_graph
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.stored import model_to_text, storable
 
 if TYPE_CHECKING:
     from neurolens.surrogates.states import StateModel
-
-# A film position that lies in no domain: where the state is out of range, this takes the place of the one asked for.
-_NOWHERE = -1.0
 
 
 def export_onnx(
@@ -53,23 +45,15 @@ def export_onnx(
         InputError: weights or errors that are not finite; two gates for one reason on one surface, or one on the stop.
     """
     check_gates(model)
-    graph, shapes = model_graph(model, model.largest_angle, ONNX), {}
-    if derivatives:
-        graph = with_derivatives(graph, ["scene_ray"], [("rays", k) for k in range(4)])
-        for name, by in (("scene_ray_d_film", RAY[:2]), ("scene_ray_d_pupil", RAY[2:])):
-            graph.outputs[name] = graph.concat(*(graph.outputs.pop(derivative("scene_ray", row)) for row in by))
-            shapes[name] = (2, 6)
-    metadata = {CARD_KEY: card_to_json(card_of(model, errors or {}))}
-    if storable(model.core):
-        metadata[MODEL_KEY] = model_to_text(model)
-    return write_file(path, write_onnx(graph, metadata, shapes=shapes))
+    metadata = {CARD_KEY: card_to_json(card_of(model, errors or {})), MODEL_KEY: coefficients_text([model])}
+    return write_file(path, onnx_of(as_stored([model]), metadata=metadata, derivatives=derivatives))
 
 
-def write_file(path: str | Path, proto: Any) -> Path:
+def write_file(path: str | Path, data: bytes) -> Path:
     """Write an ONNX model, whole or not at all."""
     target = Path(path)
     with atomic_path(target) as temporary:
-        temporary.write_bytes(proto.SerializeToString())
+        temporary.write_bytes(data)
     return target
 
 
@@ -109,7 +93,8 @@ def export_inverse(inverse: InverseModel, path: str | Path, errors: dict[str, An
         "index": front_index(model),
     }
     written = []
-    for name, build in (("stop", stop_graph), ("scene", scene_graph)):
+    (stored,) = as_stored([model])
+    for name, guess, build in (("stop", inverse.stop, stop_graph), ("scene", inverse.scene, scene_graph)):
         known = {
             "map": name,
             "steps": STEPS,
@@ -118,9 +103,12 @@ def export_inverse(inverse: InverseModel, path: str | Path, errors: dict[str, An
             "front": shape,
             "fit": inverse.report,
         }
-        graph = build(inverse, ONNX, model.largest_angle)
-        proto = write_onnx(graph, {CARD_KEY: card_to_json({**card, "inverse": known})})
-        written.append(write_file(base.with_name(f"{base.name}.{name}.onnx"), proto))
+        metadata = {
+            CARD_KEY: card_to_json({**card, "inverse": known}),
+            MODEL_KEY: coefficients_text([model], guess=guess.packed()),
+        }
+        data = write_onnx(build(stored, Guess.unpacked(guess.packed()), ONNX), metadata)
+        written.append(write_file(base.with_name(f"{base.name}.{name}.onnx"), data))
     return written[0], written[1]
 
 
@@ -128,8 +116,7 @@ def export_states(model: StateModel, path: str | Path, errors: dict[str, Any] | 
     """Write a model of many states with its card.
 
     As `export_onnx`, with one more input: state [A], a number for every axis, in its unit. A state out of range puts
-    every ray outside the domain. Constants that are equal at all nodes stay constants; the others follow the features
-    of the state (`axes.Axis.features`), which costs a few operations a call and nothing a ray.
+    every ray outside the domain.
 
     Args:
         errors: held-out errors for the card, JSON-able.
@@ -138,18 +125,9 @@ def export_states(model: StateModel, path: str | Path, errors: dict[str, Any] | 
         InputError: what `export_onnx` refuses, and nodes whose graphs differ in more than numbers.
     """
     check_gates(model.nodes[0])
-    angle = max(node.largest_angle for node in model.nodes)
-    graphs = [model_graph(node, angle, ONNX) for node in model.nodes]
-    metadata = {CARD_KEY: card_to_json(state_card(model, errors or {}))}
-    return write_file(path, write_onnx(graphs, metadata, mixing_of(model.axes)))
-
-
-def mixing_of(axes: Sequence[Axis]) -> Mixing:
-    """How constants follow the state; one out of range puts the film where no domain is."""
-    g, transform = state_graph(axes)
-    film_z = g.input("film_z_mm", per_call=True)
-    g.outputs["film_z_mm"] = g.select(g.outputs.pop("inside"), film_z, _NOWHERE)
-    return Mixing(g, transform)
+    card = card_to_json(state_card(model, errors or {}))
+    metadata = {CARD_KEY: card, MODEL_KEY: coefficients_text(model.nodes)}
+    return write_file(path, onnx_of(as_stored(model.nodes), model.axes, metadata))
 
 
 def state_card(model: StateModel, errors: dict[str, Any]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -37,8 +37,7 @@ from neurolens.surrogates.gates import choose_gates, explained
 from neurolens.surrogates.lightfield import fit_encoding
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import RayPairs, join_pairs, trace_pairs
-from neurolens.surrogates.published import fit_published
-from neurolens.surrogates.settings import NETWORKS, PLANES_SEARCHED, POLYNOMIALS, ModelSettings, PublishedName
+from neurolens.surrogates.settings import NETWORKS, PLANES_SEARCHED, POLYNOMIALS, ModelSettings
 from neurolens.surrogates.specialise import without_idle_gates
 from neurolens.surrogates.targets import Prepared, scales_of, squared_error
 
@@ -98,32 +97,36 @@ def fit_model(
         InputError: an unknown method, or settings that the method refuses.
     """
     start = time.perf_counter()
-    pairs, encoding, gates = prepared.pairs, prepared.encoding, prepared.gates
+    pairs, encoding = prepared.pairs, prepared.encoding
     with pinned_threads():
-        if settings.method in get_args(PublishedName):
-            core, encoding, gates = fit_published(prepared, settings, progress)
-        else:
-            shown, refracts = pairs, settings.method in POLYNOMIALS and settings.basis == "invariants" and grazes(pairs)
-            if refracts:
-                shown = replace(pairs, train=inside_front(pairs.lens, pairs.train))
-            if settings.planes and settings.basis == "invariants" and settings.method in PLANES_SEARCHED:
-                encoding = fit_planes(shown, encoding, settings.terms, settings.position_weight)
-            core = _fit_core(replace(prepared, pairs=shown, encoding=encoding), settings, progress, checkpoint)
-            if refracts:
-                core = Refracted((core,), index_series(pairs.lens, encoding))
-    model = LensModel(
+        shown, refracts = pairs, settings.method in POLYNOMIALS and settings.basis == "invariants" and grazes(pairs)
+        if refracts:
+            shown = replace(pairs, train=inside_front(pairs.lens, pairs.train))
+        if settings.planes and settings.basis == "invariants" and settings.method in PLANES_SEARCHED:
+            encoding = fit_planes(shown, encoding, settings.terms, settings.position_weight)
+        core = _fit_core(replace(prepared, pairs=shown, encoding=encoding), settings, progress, checkpoint)
+        if refracts:
+            core = Refracted((core,), index_series(pairs.lens, encoding))
+    fit_s = max(time.perf_counter() - start, spent_s(checkpoint))
+    model = as_model(replace(prepared, encoding=encoding), core, settings, fit_s)
+    return without_idle_gates((model,), settings.idle_gates)[0] if settings.idle_gates else model
+
+
+def as_model(prepared: Prepared, core: Core, settings: ModelSettings, fit_s: float) -> LensModel:
+    """A complete model of a core that was fitted in `fit_s` seconds to the prepared pairs."""
+    pairs = prepared.pairs
+    return LensModel(
         lens=pairs.lens,
         domain=pairs.domain,
-        encoding=encoding,
+        encoding=prepared.encoding,
         scales=scales_of(pairs.lens),
-        gates=gates,
+        gates=prepared.gates,
         core=core,
         method=settings.label,
         settings={**asdict(settings), "rays": len(pairs.train), "rays_seed": pairs.settings.seed},
         direction="slope" if settings.family == "paraxial" else "angle",
-        fit_s=max(time.perf_counter() - start, spent_s(checkpoint)),
+        fit_s=fit_s,
     )
-    return without_idle_gates((model,), settings.idle_gates)[0] if settings.idle_gates else model
 
 
 def _fit_core(
@@ -133,7 +136,7 @@ def _fit_core(
     if settings.method in ("thin", "thick") and not mirror:
         return fit_paraxial(prepared, settings.method)
     if settings.method not in (*POLYNOMIALS, *NETWORKS):
-        known = ("thin", "thick", *POLYNOMIALS, *NETWORKS, *get_args(PublishedName))
+        known = ("thin", "thick", *POLYNOMIALS, *NETWORKS)
         raise InputError("fit", "method", settings.method, f"one of {', '.join(known)}")
     if mirror and settings.method != "mlp":
         return fit_mirror(prepared, settings.method, settings.terms, settings.degree)

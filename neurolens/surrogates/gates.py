@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from neurolens.base import status as st
-from neurolens.optics.passing import is_deep, rim_sine
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.shapes import is_deep, rim_sine
 from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import RIM_REACH, PairSet, RayPairs, join_pairs, reached
 

@@ -11,14 +11,13 @@ tensors, or exported: in onnxruntime one call takes 5 to 8 (stop) and 7 to 14 (s
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
@@ -29,7 +28,6 @@ from neurolens.graph.newton import determinant, limited_newton
 from neurolens.graph.passes import pruned
 from neurolens.graph.program import RAY
 from neurolens.optics.sag import front_rays
-from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.assemble import (
     EXACT,
     DirectionSeries,
@@ -42,9 +40,14 @@ from neurolens.surrogates.assemble import (
     within_domain,
 )  # fmt: skip
 from neurolens.surrogates.cores import DIRECTION, MIRROR, POSITION, ROUND, STOP, CoreValues, Field, Refracted, Units
-from neurolens.surrogates.domain import FilmRays
-from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.model import LensModel, Prediction, prediction_of
+from neurolens.surrogates.file import pack, unpack
+from neurolens.surrogates.model import Encoding, LensModel, Prediction, prediction_of
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from neurolens.optics.surfaces import Rays
+    from neurolens.surrogates.domain import FilmRays
 
 Array = NDArray[np.float64]
 
@@ -73,6 +76,15 @@ class Guess:
     @property
     def coefficients(self) -> int:
         return int((self.ab != 0).sum())
+
+    def packed(self) -> dict[str, Any]:
+        """The guess as its file holds it, in float32."""
+        return {"exponents": pack(self.exponents), "ab": pack(self.ab)}
+
+    @staticmethod
+    def unpacked(packed: Mapping[str, Any]) -> Guess:
+        """The inverse of `packed`. Raises ValueError, KeyError, TypeError: a damaged one."""
+        return Guess(unpack(packed["exponents"]), unpack(packed["ab"]))
 
     def build(self, g: Graph, light: Field, z: Value | None) -> list[Value]:
         """The vectors, 2 rows each, of a and b, the p and u of `light`; z None: it is 0."""
@@ -143,6 +155,8 @@ class InverseModel:
         Raises:
             InputError: as `LensModel.predict`.
         """
+        import torch
+
         given = {"stop_rays": torch.stack([film_x, film_y, stop_x, stop_y, wavelength_nm])}
         if start is not None:
             given["start"] = start
@@ -167,6 +181,8 @@ class InverseModel:
         Raises:
             InputError: as `LensModel.predict`.
         """
+        import torch
+
         *lines, wavelength = (c.detach().double().numpy() for c in (*scene, wavelength_nm))
         found = front_rays(self.model.front, *lines, index=front_index(self.model), wavelength_nm=wavelength)
         known, solid = (torch.from_numpy(a).to(film_z.dtype) for a in found)
@@ -177,6 +193,10 @@ class InverseModel:
     def _solved(
         self, name: str, given: dict[str, Tensor], film_z: Tensor, stop_radius_mm: float | None, steps: int
     ) -> InverseRays:
+        import torch
+
+        from neurolens.surrogates.domain import FilmRays
+
         radius = film_z.new_full((1, 1), self.model.checked_radius_mm(stop_radius_mm))
         graph = _exact_graph(self, name, steps, "start" in given)
         out = evaluate(graph, {**given, "film_z_mm": film_z[None], "stop_radius_mm": radius})
@@ -198,8 +218,9 @@ def front_index(model: LensModel) -> list[float] | None:
 
 @lru_cache(maxsize=16)
 def _exact_graph(inverse: InverseModel, name: str, steps: int, start: bool) -> Graph:
-    known = (inverse, EXACT, inverse.model.largest_angle, steps)
-    return stop_graph(*known, start) if name == "stop" else scene_graph(*known)
+    if name == "stop":
+        return stop_graph(inverse.model, inverse.stop, EXACT, steps, start)
+    return scene_graph(inverse.model, inverse.scene, EXACT, steps)
 
 
 def stop_system(model: LensModel) -> Graph:
@@ -250,7 +271,7 @@ def _light(e: Encoding, vectors: list[Value], wavelength: Value) -> Field:
     return Field(g.concat(*vectors, wavelength_row(e, wavelength)), -e.w_middle / e.w_half)
 
 
-def stop_graph(inverse: InverseModel, form: Form, angle: float, steps: int = STEPS, start: bool = False) -> Graph:
+def stop_graph(model: LensModel, guess: Guess, form: Form, steps: int = STEPS, start: bool = False) -> Graph:
     """The map from stop points to camera rays.
 
     Inputs stop_rays (film x, y, stop x, y in mm, wavelength in nm), film_z_mm, stop_radius_mm; `start`: another one of
@@ -258,7 +279,7 @@ def stop_graph(inverse: InverseModel, form: Form, angle: float, steps: int = STE
     where the form is exact `residual`. An exact graph gives the best point that was seen, any other that of the last
     step, which saves one evaluation.
     """
-    model, e, g = inverse.model, inverse.model.encoding, Graph()
+    e, g = model.encoding, Graph()
     film, stop, wavelength = g.split(g.input("stop_rays", 5), [2, 2, 1])
     wanted = stop * (1 / model.scales.stop_mm)
     known = {"film": film, "wanted": wanted, "wavelength_nm": wavelength}
@@ -266,11 +287,11 @@ def stop_graph(inverse: InverseModel, form: Form, angle: float, steps: int = STE
         first = g.input("start", 2)
     else:
         z = scaled_film_z(model, g.input("film_z_mm", per_call=True))
-        (first,) = inverse.stop.build(g, _light(e, [film * (1 / e.film_scale_mm), wanted], wavelength), z)
+        (first,) = guess.build(g, _light(e, [film * (1 / e.film_scale_mm), wanted], wavelength), z)
     system = stop_system(model)
     u, size = _solve(system, known, first, steps, form)
     rays = _pupil_rays(e, film, u, wavelength)
-    judge = with_derivatives(model_graph(model, angle, form), ["stop_xy_mm"], [("rays", 2), ("rays", 3)])
+    judge = with_derivatives(model_graph(model, form), ["stop_xy_mm"], [("rays", 2), ("rays", 3)])
     out = g.inline(judge, {"rays": rays})
     area = determinant([out.pop(derivative("stop_xy_mm", row)) for row in RAY[2:]]).abs()
     off = out["stop_xy_mm"] * (1 / model.scales.stop_mm) - wanted
@@ -278,18 +299,18 @@ def stop_graph(inverse: InverseModel, form: Form, angle: float, steps: int = STE
     return _finished(g, rays, out, area, status, size or g.square(off), form)
 
 
-def scene_graph(inverse: InverseModel, form: Form, angle: float, steps: int = STEPS) -> Graph:
+def scene_graph(model: LensModel, guess: Guess, form: Form, steps: int = STEPS) -> Graph:
     """The map from scene rays to camera rays: as `stop_graph`, but for its input and what density is of.
 
     Input front_rays: x and y on the front surface (mm), direction vector of the model (angle vector in rad, or slope;
     inside the front glass where `front_index` says so), wavelength. Density is mm^2 of film times mm^2 of the pupil
     plane per mm^2 of (x, y) and area of direction vectors.
     """
-    model, e, g = inverse.model, inverse.model.encoding, Graph()
+    e, g = model.encoding, Graph()
     position, direction, wavelength = g.split(g.input("front_rays", 5), [2, 2, 1])
     position = position * (1 / model.scales.position_mm)
     wanted = g.concat(position, direction)
-    first = g.concat(*inverse.scene.build(g, _light(e, [position, direction], wavelength), None))
+    first = g.concat(*guess.build(g, _light(e, [position, direction], wavelength), None))
     known = {"wanted": wanted, "wavelength_nm": wavelength}
     unknown, size = _solve(scene_system(model), known, first, steps, form)
     # Free space from the two planes to the film: F = U + (P - U) / along.
@@ -301,7 +322,7 @@ def scene_graph(inverse: InverseModel, form: Form, angle: float, steps: int = ST
     rays = g.concat(pupil + (p - pupil) * back, pupil, wavelength)
 
     inside, light = within_domain(model, rays, film_z, form), light_field(g, e, rays, film_z)
-    series = DirectionSeries.of(model, angle, form)
+    series = DirectionSeries.of(model, form)
     core, planes = _core_graph(model, light, units_of(model, series, form)), (2, 3, 0, 1)
     found = g.inline(with_derivatives(core, _SCENE, [("planes", k) for k in planes]), {"planes": light.planes})
     vectors = (found["position"], found["direction"], found["stop"])

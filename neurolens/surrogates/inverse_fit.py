@@ -114,7 +114,7 @@ def _fit(model: LensModel, rays: FilmRays, weight: Tensor, terms: int, degree: i
 def _teaching(model: LensModel, pairs: RayPairs) -> tuple[FilmRays, Tensor]:
     """Rays of the fits and their weights [N]: those that pass, and those a little beyond the rims that the model knows.
 
-    What is inverted is the model, not the lens: rays where it has run away from the lens would teach nonsense.
+    What is inverted is the model, not the lens: rays where it has run away from the lens would mislead the fit.
     """
     size = min(len(pairs.train), len(pairs.rim))
     sets = join_pairs([pairs.train.select(slice(0, 2 * size)), pairs.rim.select(slice(0, size))])

@@ -13,7 +13,6 @@ keeps its two planes of symmetry only: then x (and y likewise) of every vector i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import reduce
 from operator import add
 from typing import NamedTuple
@@ -23,7 +22,7 @@ from torch import Tensor
 
 from neurolens.optics.glass import inverse_square_um
 from neurolens.surrogates.cores import MIRROR, ROUND
-from neurolens.surrogates.domain import Domain, FilmRays
+from neurolens.surrogates.model import Domain, Encoding
 from neurolens.surrogates.pairs import PairSet
 
 
@@ -43,65 +42,6 @@ class LightField(NamedTuple):
         rows = (*self.p, *self.u)
         sums = (reduce(add, (rows[i] * rows[j] for i, j in form)) for form in (MIRROR if mirror else ROUND))
         return torch.stack([*sums, self.w])
-
-
-@dataclass(frozen=True)
-class Encoding:
-    """From raw millimetres and nanometres to the light field.
-
-    Attributes:
-        film_plane_z_mm, pupil_plane_z_mm: the two planes (lens frame).
-        chief: k of the chief ray's u = k p, subtracted so that u is centred on the passing rays.
-        film_scale_mm, pupil_scale_mm: largest |p| and |u - k p| of the domain's passing rays.
-        w_middle, w_half: w = (1 / lambda^2 - middle) / half in 1/um^2; the index is linear in 1 / lambda^2 (Cauchy).
-            half is 0 for a lens without known dispersion, and then w = 0.
-        chief_y, pupil_scale_y_mm: of y where the lens has cylinders, and then the two above are of x; None: of both.
-    """
-
-    film_plane_z_mm: float
-    pupil_plane_z_mm: float
-    chief: float
-    film_scale_mm: float
-    pupil_scale_mm: float
-    w_middle: float
-    w_half: float
-    chief_y: float | None = None
-    pupil_scale_y_mm: float | None = None
-
-    @property
-    def mirror(self) -> bool:
-        """Whether the lens has two planes of symmetry instead of an axis."""
-        return self.chief_y is not None
-
-    @property
-    def dispersive(self) -> bool:
-        """Whether rays depend on the wavelength."""
-        return self.w_half != 0
-
-    @property
-    def chiefs(self) -> tuple[float, float]:
-        """k of x and of y."""
-        return self.chief, self.chief if self.chief_y is None else self.chief_y
-
-    @property
-    def pupil_scales_mm(self) -> tuple[float, float]:
-        """Of x and of y."""
-        return self.pupil_scale_mm, self.pupil_scale_mm if self.pupil_scale_y_mm is None else self.pupil_scale_y_mm
-
-    def planes(self, rays: FilmRays) -> tuple[Tensor, Tensor]:
-        """Crossings with the two planes in mm, [2, N] each."""
-        u = torch.stack([rays.pupil_x, rays.pupil_y])
-        film = torch.stack([rays.film_x, rays.film_y])
-        along = (self.film_plane_z_mm - self.pupil_plane_z_mm) / (rays.film_z - self.pupil_plane_z_mm)
-        return u + (film - u) * along, u
-
-    def __call__(self, rays: FilmRays) -> LightField:
-        p, u = self.planes(rays)
-        u = torch.stack([(u[i] - self.chiefs[i] * p[i]) / self.pupil_scales_mm[i] for i in (0, 1)])
-        w = torch.zeros_like(rays.wavelength_nm)
-        if self.dispersive:
-            w = (inverse_square_um(rays.wavelength_nm) - self.w_middle) / self.w_half
-        return LightField(p / self.film_scale_mm, u, w)
 
 
 def fit_encoding(domain: Domain, passing: PairSet, *, mirror: bool = False) -> Encoding:

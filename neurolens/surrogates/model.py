@@ -1,19 +1,18 @@
 """A complete surrogate: raw millimetres and nanometres in; scene ray, transmittance, stop crossing and status out.
 
-Polynomials and networks differ only in their core, which maps the light field to a few vectors and scalars. Everything
-round it is written once, in `assemble`; here it is evaluated on torch tensors.
+A `LensModel` is plain data: the domain, the encoding, the core's coefficients. `assemble` writes its graph, which
+onnxruntime, compiled C and numpy run without torch. Methods that take or give tensors import torch when they run.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
@@ -22,19 +21,136 @@ from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.program import RAY, WAVELENGTH
 from neurolens.modelfile import DOMAIN_SLACK, POLARISED
+from neurolens.modelfile.states import mix_domain
+from neurolens.optics.film_plane import PupilBounds
+from neurolens.optics.glass import inverse_square_um
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.assemble import EXACT, model_graph
-from neurolens.surrogates.cores import DIRECTION, Core, Refracted
-from neurolens.surrogates.domain import Domain, FilmRays, draw
-from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.pairs import trace_pairs
+from neurolens.surrogates.cores import DIRECTION, Array, Core, Refracted
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from neurolens.optics.surfaces import Rays
+    from neurolens.surrogates.domain import FilmRays
+    from neurolens.surrogates.lightfield import LightField
 
 OUTPUTS = ("scene_ray", "transmittance", "stop_xy_mm", "status")
 _DIFFERENTIATED = ("scene_ray", "stop_xy_mm")
 _ANGLE_RAYS, _FEWEST_RAYS = 32_768, 300
 # Positive and finite, in float32 too.
 ANY_WAVELENGTH_NM = (1e-30, 3e38)
+
+
+@dataclass(frozen=True)
+class Domain:
+    """A set of camera rays. Lengths in mm, lens frame.
+
+    Attributes:
+        film_radius_mm: film points lie within this distance of the axis.
+        film_z_mm: film planes, nearest to the lens first (best focus at infinity) to farthest (near limit).
+        focus_m: the object distances that those planes focus (far, near), from film to object, at every aperture.
+        pupil_z_mm: plane of the pupil points.
+        pupil_radius_mm: pupil points lie within this distance of the axis; 1.05 times the disc of passing rays.
+        wavelength_nm: shortest and longest wavelength; equal for a lens whose dispersion is unknown.
+        stop_radius_mm: the widest stop for which the surrogate is fitted.
+        bounds: where passing rays lie on the pupil plane, by film radius (for sampling in a render).
+        nearest_m: distance from the film of the nearest object in view, where one lies before the plane in focus; None:
+            the nearest focus. It changes no ray, only what an error of position counts in a fit.
+    """
+
+    film_radius_mm: float
+    film_z_mm: tuple[float, float]
+    focus_m: tuple[float, float]
+    pupil_z_mm: float
+    pupil_radius_mm: float
+    wavelength_nm: tuple[float, float]
+    stop_radius_mm: float
+    bounds: PupilBounds
+    nearest_m: float | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able, with infinity written as the string "inf"."""
+        data = {
+            f.name: getattr(self, f.name) for f in fields(self)
+        }  # a zoom mixes many: asdict takes ten times as long
+        data["focus_m"] = ["inf" if math.isinf(f) else f for f in self.focus_m]
+        data["bounds"] = {f.name: getattr(self.bounds, f.name) for f in fields(self.bounds)}
+        return data
+
+    @staticmethod
+    def from_dict(data: dict[str, Any]) -> Domain:
+        """The inverse of `to_dict`; what was written before `nearest_m` existed has none."""
+        table = {f.name: data["bounds"][f.name] for f in fields(PupilBounds)}
+        bounds: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
+        pairs = {k: tuple(float(v) for v in data[k]) for k in ("film_z_mm", "focus_m", "wavelength_nm")}
+        known = {f.name: data[f.name] for f in fields(Domain) if f.name in data}
+        return Domain(**{**known, **pairs, "bounds": PupilBounds(**bounds)})
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """From raw millimetres and nanometres to the light field.
+
+    Attributes:
+        film_plane_z_mm, pupil_plane_z_mm: the two planes (lens frame).
+        chief: k of the chief ray's u = k p, subtracted so that u is centred on the passing rays.
+        film_scale_mm, pupil_scale_mm: largest |p| and |u - k p| of the domain's passing rays.
+        w_middle, w_half: w = (1 / lambda^2 - middle) / half in 1/um^2; the index is linear in 1 / lambda^2 (Cauchy).
+            half is 0 for a lens without known dispersion, and then w = 0.
+        chief_y, pupil_scale_y_mm: of y where the lens has cylinders, and then the two above are of x; None: of both.
+    """
+
+    film_plane_z_mm: float
+    pupil_plane_z_mm: float
+    chief: float
+    film_scale_mm: float
+    pupil_scale_mm: float
+    w_middle: float
+    w_half: float
+    chief_y: float | None = None
+    pupil_scale_y_mm: float | None = None
+
+    @property
+    def mirror(self) -> bool:
+        """Whether the lens has two planes of symmetry instead of an axis."""
+        return self.chief_y is not None
+
+    @property
+    def dispersive(self) -> bool:
+        """Whether rays depend on the wavelength."""
+        return self.w_half != 0
+
+    @property
+    def chiefs(self) -> tuple[float, float]:
+        """k of x and of y."""
+        return self.chief, self.chief if self.chief_y is None else self.chief_y
+
+    @property
+    def pupil_scales_mm(self) -> tuple[float, float]:
+        """The pupil scales of x and of y, in mm."""
+        return self.pupil_scale_mm, self.pupil_scale_mm if self.pupil_scale_y_mm is None else self.pupil_scale_y_mm
+
+    def planes(self, rays: FilmRays) -> tuple[Tensor, Tensor]:
+        """Crossings with the two planes in mm, [2, N] each."""
+        import torch
+
+        u = torch.stack([rays.pupil_x, rays.pupil_y])
+        film = torch.stack([rays.film_x, rays.film_y])
+        along = (self.film_plane_z_mm - self.pupil_plane_z_mm) / (rays.film_z - self.pupil_plane_z_mm)
+        return u + (film - u) * along, u
+
+    def __call__(self, rays: FilmRays) -> LightField:
+        import torch
+
+        from neurolens.surrogates.lightfield import LightField
+
+        p, u = self.planes(rays)
+        u = torch.stack([(u[i] - self.chiefs[i] * p[i]) / self.pupil_scales_mm[i] for i in (0, 1)])
+        w = torch.zeros_like(rays.wavelength_nm)
+        if self.dispersive:
+            w = (inverse_square_um(rays.wavelength_nm) - self.w_middle) / self.w_half
+        return LightField(p / self.film_scale_mm, u, w)
 
 
 @dataclass(frozen=True)
@@ -92,6 +208,8 @@ class Derivatives(NamedTuple):
 
 def prediction_of(out: Mapping[str, Tensor], count: int) -> Prediction:
     """The outputs of a model's graph for `count` rays."""
+    from neurolens.optics.surfaces import Rays
+
     scene, power, stop, status = (out[n].expand(-1, count) for n in OUTPUTS)
     return Prediction(Rays(*scene), power[0], stop[0], stop[1], status[0])
 
@@ -110,6 +228,7 @@ class LensModel:
         direction: what the core's direction vector is: the angle vector, or the slope for first-order models.
         transmittance: "polarised" as the tracer follows it, or "averaged" over s and p at every surface (of files made
             by version 0.1.0 and earlier).
+        angle: see `largest_angle`, which is computed where this is None.
     """
 
     lens: Lens
@@ -123,6 +242,7 @@ class LensModel:
     fit_s: float = 0.0
     direction: Literal["angle", "slope"] = "angle"
     transmittance: str = POLARISED
+    angle: float | None = None
 
     def predict(self, rays: FilmRays, stop_radius_mm: float | None = None) -> Prediction:
         """Evaluate the model in the dtype of `rays`.
@@ -142,6 +262,8 @@ class LensModel:
         The wavelength's derivative is at fixed film and pupil point. Where the status is not 0 the figures mean
         nothing.
         """
+        import torch
+
         out = evaluate(self._derivative_graph, self._inputs(rays, stop_radius_mm))
         scene, stop = (
             torch.stack([out[derivative(name, row)].expand(-1, len(rays)) for row in (*RAY, WAVELENGTH)], 1)
@@ -164,7 +286,7 @@ class LensModel:
     @cached_property
     def graph(self) -> Graph:
         """For evaluation in float64: inputs and outputs as `assemble` says."""
-        return model_graph(self, self.largest_angle, EXACT)
+        return model_graph(self, EXACT)
 
     @cached_property
     def largest_angle(self) -> float:
@@ -172,8 +294,15 @@ class LensModel:
 
         A core's direction vector is no longer than that. Where it is, as a network's may be far from the rays of its
         fit, the ray lies outside the domain. Where all rays point forwards the angle stays below a right one; of a
-        `Refracted` core it is that inside the glass.
+        `Refracted` core it is that inside the glass. Tracing needs torch; a model from a file knows its angle.
         """
+        if self.angle is not None:
+            return self.angle
+        import torch
+
+        from neurolens.surrogates.domain import draw
+        from neurolens.surrogates.pairs import trace_pairs
+
         rays, _ = draw(self.domain, _ANGLE_RAYS, seed=5)
         with torch.no_grad():
             exact = trace_pairs(self.lens, rays, self.domain.pupil_z_mm)
@@ -204,3 +333,63 @@ class LensModel:
             return ANY_WAVELENGTH_NM
         low, high = self.domain.wavelength_nm
         return low / DOMAIN_SLACK, high * DOMAIN_SLACK
+
+
+def with_one_angle(models: Sequence[LensModel]) -> list[LensModel]:
+    """Models of one structure with the largest angle of them all, so that their graphs are of one structure, too."""
+    angle = max(model.largest_angle for model in models)
+    return [replace(model, angle=angle) for model in models]
+
+
+def mixed(nodes: Sequence[LensModel], weights: Array) -> LensModel:
+    """The model of a state between nodes [K] of one structure whose weights are [K]; its lens is that of the first.
+
+    Raises:
+        InputError: nodes that differ in more than numbers.
+    """
+    return replace(
+        nodes[0],
+        domain=Domain.from_dict(mix_domain([n.domain.to_dict() for n in nodes], weights)),
+        encoding=mix_encodings([n.encoding for n in nodes], weights),
+        core=mix([n.core for n in nodes], weights),
+    )
+
+
+def mix_encodings(encodings: Sequence[Encoding], weights: Array) -> Encoding:
+    """The encoding of a state: planes as they are, scales by their reciprocals, as the graph's matrices hold them."""
+
+    def of(value: Callable[[Encoding], float]) -> float:
+        return float(weights @ np.array([value(e) for e in encodings]))
+
+    pupil_scale = 1 / of(lambda e: 1 / e.pupil_scale_mm)
+    return replace(
+        encodings[0],
+        film_plane_z_mm=of(lambda e: e.film_plane_z_mm),
+        pupil_plane_z_mm=of(lambda e: e.pupil_plane_z_mm),
+        chief=pupil_scale * of(lambda e: e.chief / e.pupil_scale_mm),
+        film_scale_mm=1 / of(lambda e: 1 / e.film_scale_mm),
+        pupil_scale_mm=pupil_scale,
+    )
+
+
+def mix(values: Sequence[Any], weights: Array) -> Any:
+    """Weighted sum of float arrays wherever they stand in equal structures of dataclasses and tuples.
+
+    Raises:
+        InputError: structures that differ in anything but those numbers.
+    """
+    first = values[0]
+    if isinstance(first, np.ndarray) and first.dtype.kind == "f":
+        if any(v.shape != first.shape for v in values):
+            raise InputError("state model", "nodes", [v.shape for v in values], "arrays of one shape")
+        return np.einsum("k,k...->...", weights, np.stack(values))
+    if is_dataclass(first) and not isinstance(first, type):
+        names = [f.name for f in fields(first)]
+        return replace(first, **{n: mix([getattr(v, n) for v in values], weights) for n in names})
+    if isinstance(first, tuple):
+        if any(len(v) != len(first) for v in values):
+            raise InputError("state model", "nodes", [len(v) for v in values], "tuples of one length")
+        return tuple(mix([v[i] for v in values], weights) for i in range(len(first)))
+    if not all(np.array_equal(v, first) for v in values):
+        raise InputError("state model", "nodes", f"({type(first).__name__})", "the same at every node")
+    return first

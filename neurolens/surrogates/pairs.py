@@ -18,7 +18,8 @@ from neurolens.base.files import atomic_path
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import CHUNK, Rays, trace
-from neurolens.surrogates.domain import SPARSE, Domain, FilmRays, draw, lit_share, sample_domain
+from neurolens.surrogates.domain import SPARSE, FilmRays, draw, lit_share, sample_domain
+from neurolens.surrogates.model import Domain
 
 SCHEMA = 3
 SPLITS = ("train", "held_out", "rim", "edge", "far")

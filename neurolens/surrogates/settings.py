@@ -1,17 +1,15 @@
-"""Settings of a surrogate, and ablations: the changes that leave one part of a fit out, by table row."""
+"""The settings of a surrogate."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
 from neurolens.base.errors import InputError
 from neurolens.surrogates.cores import Basis
 
-PublishedName = Literal["taylor", "hanika", "schrade", "zheng-adaptive", "neurolens2017", "rtf", "ray-lut"]
-Method = Literal["thin", "thick", "dense", "omp", "ols", "adaptive", "mlp", "ols+mlp", PublishedName]
+Method = Literal["thin", "thick", "dense", "omp", "ols", "adaptive", "mlp", "ols+mlp"]
 POLYNOMIALS = ("dense", "omp", "ols", "adaptive")
 NETWORKS = ("mlp", "ols+mlp")
 PLANES_SEARCHED = ("ols", "adaptive", "ols+mlp")
@@ -27,8 +25,7 @@ class ModelSettings:
         name: of the file and of the table's row; made from the other settings where empty.
         method: "thin", "thick" (first order); polynomials: "dense" (all terms up to `degree`), "omp" (matching
             pursuit), "ols" (orthogonal least squares with replacement), "adaptive" (terms of any degree grown from
-            chosen terms); "mlp"; "ols+mlp" (a polynomial and a network on what it leaves); the published methods of
-            `neurolens.surrogates.published`.
+            chosen terms); "mlp"; "ols+mlp" (a polynomial and a network on what it leaves).
         basis: of polynomials: "invariants" (rotational symmetry held exactly) or "raw" (p_x, p_y, u_x, u_y, w).
         terms: coefficients per vector output; ignored by "dense".
         degree: largest total degree of the candidates that a fit starts from; ignored by "adaptive".
@@ -106,31 +103,3 @@ class ModelSettings:
     @property
     def family(self) -> str:
         return "paraxial" if self.method in ("thin", "thick") else self.method
-
-
-# Of method "ols" in the invariants.
-POLYNOMIAL_ABLATIONS: Mapping[str, Mapping[str, Any]] = {
-    "planes not searched": {"planes": False},
-    "candidates do not grow": {"growth": 0},
-    "no elimination": {"elimination": False},
-    "no replacement": {"replacement": False},
-    "position at its first-order weight": {"position_weight": 1.0},
-    "no terms for transmittance": {"transmittance_terms": 0},
-    "forward selection alone": {"planes": False, "growth": 0, "elimination": False, "replacement": False},
-    "matching pursuit": {"method": "omp"},
-    "raw monomials": {"basis": "raw", "degree": 5},
-}
-# Of networks.
-NETWORK_ABLATIONS: Mapping[str, Mapping[str, Any]] = {"20 steps of training": {"steps": 20}, "one layer": {"layers": 1}}
-
-
-def ablated(settings: ModelSettings, name: str) -> ModelSettings:
-    """The settings with one part left out, named for the table; the benchmark gives the ratio of the two errors.
-
-    Raises:
-        InputError: an ablation of neither table, or of the other kind of model.
-    """
-    known = NETWORK_ABLATIONS if settings.method == "mlp" else POLYNOMIAL_ABLATIONS
-    if name not in known:
-        raise InputError("ablation", "name", name, f"one of {', '.join(known)}")
-    return replace(settings, **known[name], name=f"{settings.label}, {name}")

@@ -1,7 +1,4 @@
-"""Source code of exported models: a C99 header or a GLSL function, the card as a comment on top.
-
-From a model's coefficients, or, without torch, from the graph in its file, which fixes nothing.
-"""
+"""Source code of models: a C99 header or a GLSL function, the card as a comment on top. It needs no torch."""
 
 from __future__ import annotations
 
@@ -11,13 +8,10 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import Any
 
 import neurolens
-from neurolens.base import status as st
-from neurolens.base.errors import InputError, ModelError
+from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.graph.c import NOTHING, Extras, Signature, write_c
 from neurolens.graph.glsl import write_glsl
@@ -34,24 +28,16 @@ from neurolens.graph.program import (
 )
 from neurolens.graph.scalars import lower
 from neurolens.modelfile import POLARISED, transmittance_of
-from neurolens.modelfile.axes import product
-from neurolens.modelfile.graph import graph_of
-from neurolens.modelfile.onnxfile import read_checked
 from neurolens.modelfile.stategraph import mixture_of, state_names
 from neurolens.modelfile.states import axes_of
 from neurolens.surrogates.assemble import ALL, SCALARS, Parts, model_graph
+from neurolens.surrogates.model import LensModel, with_one_angle
 from neurolens.surrogates.specialise import Fix
-
-if TYPE_CHECKING:
-    from neurolens.surrogates.model import LensModel
 
 # Nothing fixed. Wavelengths are fixed in the models themselves, one model a table; film plane and stop here too.
 FREE = Fix()
 WRITERS = {"c": write_c, "glsl": write_glsl}
 OSL = "osl"  # of whole cameras: `cameras.osl`
-MOST_NODES = 256  # of a model of many states
-_SAME_MM = 1e-5  # a mm of focal length: what rounding may do between two forms of one model
-MOST_WEIGHTS = 20_000  # each is a step, and compilers take minutes; larger products of matrices go by blocks
 _WIDTH = 110
 # Keywords of C11, C++20 and GLSL 4.60 and words reserved there, types and functions of GLSL and OSL,
 # names of the code that is written.
@@ -99,11 +85,14 @@ def export_source(
     extras: Extras = NOTHING,
     notes: Sequence[str] = (),
 ) -> Written:
-    """Write a model, or one for each of several fixed wavelengths, as one function.
+    """Write a model, one for each of several fixed wavelengths, or one of many states, as one function.
 
     Args:
+        models: one; one for each wavelength; or one for every node of a card with states (zoom, internal focus): then
+            the state is an argument, which NAME_at makes of numbers.
         language: "c" or "glsl".
         card: of the model, for the comment.
+        parts, fix: see `fused_program`.
         name: of the function; None takes the lens's id.
         extras, notes: what else the file holds, and lines of the comment on it.
 
@@ -111,60 +100,19 @@ def export_source(
         InputError: another language, a name that is no identifier, numbers that float32 cannot hold, a card that lacks
             what the comment says.
     """
-    model = models[0]
+    model, axes = models[0], axes_of(card)
     own = checked_name(language, model.lens.lens_id, name)
-    waves = [m.domain.wavelength_nm for m in models]
-    about = card, model.domain.to_dict(), waves, fix, [g.status for g in model.gates]
-    return _write(fused_program(models, parts, fix), Path(path), language, own, about, extras, notes)
-
-
-def export_file(
-    file: str | Path,
-    path: str | Path,
-    language: str,
-    name: str | None = None,
-    extras: Extras = NOTHING,
-    notes: Sequence[str] = (),
-) -> Written:
-    """Write the graph of a model's file, with everything it gives: the same rays to rounding, without torch.
-
-    Of a model of many states (zoom, internal focus) the state is an argument: NAME_at makes it of numbers.
-
-    Arguments as of `export_source`; errors too, and a ModelError for a file that cannot be trusted.
-    """
-    data, card = read_checked(file)
+    program = fused_program(models, parts, fix)
+    if axes:
+        program.mixture = mixture_of(axes)
+    waves = [m.domain.wavelength_nm for m in ([model] if axes else models)]
     try:
-        domain, codes = card["domain"], [gate["status"] for gate in card["gates"]]
-        own = checked_name(language, str(card["lens"]["id"]), name)
-        about = card, domain, [domain["wavelength_nm"]], FREE, codes
-    except (KeyError, TypeError) as error:
-        raise _no_card(error) from error
-    program = program_of_states(file, data, card) if card.get("states") else lower(graph_of(file, data))
-    return _write(program, Path(path), language, own, about, extras, notes)
-
-
-def program_of_states(file: str | Path, data: bytes, card: Mapping[str, Any]) -> Program:
-    """The program of a model of many states: a table of numbers for each of its nodes, mixed by the state.
-
-    Raises:
-        InputError: more than `MOST_NODES`. ModelError: a graph whose numbers follow the state in another way.
-    """
-    axes = axes_of(card)
-    nodes = product(axes)
-    if len(nodes) > MOST_NODES:
-        raise InputError(file, "states.nodes", f"({len(nodes)})", f"at most {MOST_NODES}, or onnxruntime for it")
-    program = lower([graph_of(file, data, node) for node in nodes])
-    program.mixture = mixture_of(axes)
-    for known in card["states"]["reference"]:
-        rows = (*known["rays"], known["film_z_mm"][0], known["stop_radius_mm"])
-        given = dict(zip((*RAY, WAVELENGTH, FILM_Z, STOP_RADIUS), rows, strict=True))
-        wanted = lower(graph_of(file, data, known["state"])).evaluate(given)
-        found = program.evaluate(given | dict(zip(state_names(axes), known["state"], strict=True)))
-        passed = np.broadcast_to(wanted[STATUS] == st.PASSED, np.shape(known["rays"][0]))
-        off = [np.abs(found[name] - wanted[name])[passed].max(initial=0) for name in SCENE_RAY]
-        if (found[STATUS] != wanted[STATUS]).any() or not max(off) <= _SAME_MM * max(1.0, abs(card["lens"]["efl_mm"])):
-            raise ModelError(f"{file}: graph: its numbers do not follow the state as sums of the nodes'")
-    return program
+        codes = [gate.status for gate in model.gates]
+        comment = [*comment_of(card, model.domain.to_dict(), waves, fix, codes), *lines_of(notes)]
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        expected = "a card of neurolens, whole"
+        raise InputError("export", "card", f"({type(error).__name__}: {error})", expected) from error
+    return write_program(program, Path(path), language, own, comment, extras)
 
 
 def checked_name(language: str, lens_id: str, name: str | None) -> str:
@@ -185,26 +133,6 @@ def _taken(word: str) -> bool:
     return word in known or word.removesuffix("f") in dir(math) or _PATTERNS.fullmatch(word) is not None
 
 
-def _no_card(error: Exception) -> InputError:
-    return InputError("export", "card", f"({type(error).__name__}: {error})", "a card of neurolens, whole")
-
-
-def _write(
-    program: Program,
-    target: Path,
-    language: str,
-    own: str,
-    about: tuple[Any, ...],
-    extras: Extras,
-    notes: Sequence[str],
-) -> Written:
-    try:
-        comment = [*comment_of(*about), *lines_of(notes)]
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise _no_card(error) from error
-    return write_program(program, target, language, own, comment, extras)
-
-
 def write_program(
     program: Program, target: Path, language: str, name: str, comment: Sequence[str], extras: Extras
 ) -> Written:
@@ -221,17 +149,12 @@ def fused_program(models: Sequence[LensModel], parts: Parts = ALL, fix: Fix = FR
     status, a float.
 
     Raises:
-        InputError: weights that float32 cannot hold, or more than `MOST_WEIGHTS`; a fixed film position or stop
-            outside the domain.
+        InputError: as `lower`; a fixed film position or stop outside the domain.
     """
     fix.check(models[0].domain)
-    angle = max(model.largest_angle for model in models)
     fixed = {FILM_Z: fix.film_z_mm, STOP_RADIUS: fix.stop_radius_mm}
     known = {name: value for name, value in fixed.items() if value is not None}
-    graphs = [model_graph(model, angle, SCALARS, parts) for model in models]
-    weights = sum(node.arrays[0].size for node in graphs[0].nodes if node.kind == "affine")
-    if weights > MOST_WEIGHTS:
-        raise InputError("export", "weights", weights, f"at most {MOST_WEIGHTS}: larger networks are for onnxruntime")
+    graphs = [model_graph(model, SCALARS, parts) for model in with_one_angle(models)]
     return lower(graphs, known)
 
 

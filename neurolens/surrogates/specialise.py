@@ -18,8 +18,7 @@ from neurolens.surrogates.cores import STOP
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from neurolens.surrogates.domain import Domain
-    from neurolens.surrogates.model import LensModel
+    from neurolens.surrogates.model import Domain, LensModel
 
 # A gate goes where at most this share of the domain's rays is blocked by it and by nothing else.
 IDLE_SHARE = 1e-5
@@ -69,7 +68,7 @@ def _narrowed(model: LensModel, fix: Fix) -> LensModel:
         domain = replace(domain, stop_radius_mm=fix.stop_radius_mm)
         lens = lens.with_stop_radius(fix.stop_radius_mm)
         settings["stop_radius_mm"] = fix.stop_radius_mm
-    return replace(model, domain=domain, lens=lens, settings=settings)
+    return replace(model, domain=domain, lens=lens, settings=settings, angle=None)
 
 
 def without_idle_gates(models: tuple[LensModel, ...], share: float = IDLE_SHARE) -> tuple[LensModel, ...]:
@@ -126,4 +125,5 @@ def at_wavelength(model: LensModel, wavelength_nm: float) -> LensModel:
         encoding=replace(model.encoding, w_half=0.0),
         core=model.core.fixed(w),
         settings={**model.settings, "wavelength_nm": wavelength_nm},
+        angle=None,
     )

@@ -10,22 +10,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from neurolens.base.errors import InputError
 from neurolens.modelfile.axes import Array, Axis, product, weights
-from neurolens.modelfile.states import mix_domain
 from neurolens.optics.focusing import film_range_mm, infinity_states, nearest_focus_m
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import image_radius_mm
-from neurolens.surrogates.domain import Domain, domain_of
-from neurolens.surrogates.lightfield import Encoding
-from neurolens.surrogates.model import LensModel
+from neurolens.optics.states import set_lens
+from neurolens.surrogates.domain import domain_of
+from neurolens.surrogates.model import Domain, LensModel, mixed
 
 State = tuple[float, ...]
 
@@ -88,9 +86,9 @@ class StateSpace:
 
     def _lens(self, zoom: str | float | None, focus_m: float | None) -> Lens:
         if focus_m is None:
-            return self.lens.at(zoom=zoom, f_number=self.f_number)
+            return set_lens(self.lens, zoom=zoom, f_number=self.f_number)
         distance = None if math.isinf(focus_m) else focus_m
-        return self.lens.at(zoom=zoom, f_number=self.f_number, focus="internal", focus_m=distance)
+        return set_lens(self.lens, zoom=zoom, f_number=self.f_number, focus="internal", focus_m=distance)
 
     def domain_at(self, state: Sequence[float]) -> Domain:
         """The domain of a state: the full lit film, and the film positions that focusing by the film needs.
@@ -129,7 +127,7 @@ def zoom_axis(lens: Lens, degree: int | None = None) -> Axis:
     Raises:
         InputError: a file with fewer than two zoom states.
     """
-    found = sorted((float(first_order(lens.at(zoom=s.name)).efl_mm), s.name) for s in infinity_states(lens))
+    found = sorted((float(first_order(set_lens(lens, zoom=s.name)).efl_mm), s.name) for s in infinity_states(lens))
     knots: list[float] = []
     for efl, _ in found:
         if not knots or efl > knots[-1] * (1 + _SAME):
@@ -150,7 +148,7 @@ def focus_axis(lens: Lens, zoom: Sequence[str | float | None] = (None,), degree:
     Raises:
         InputError: a file without focus states.
     """
-    nearest = max(nearest_focus_m(lens.at(zoom=z)) for z in zoom)
+    nearest = max(nearest_focus_m(set_lens(lens, zoom=z)) for z in zoom)
     return Axis("focus", "1/m", (0.0, (1 - 1e-9) / nearest), degree)
 
 
@@ -208,57 +206,13 @@ class StateModel:
 
     def at(self, *state: float) -> LensModel:
         """The model of one state; InputError as `modelfile.axes.weights`."""
-        w = weights(self.axes, state)
         first = self.nodes[0]
         return replace(
-            first,
+            mixed(self.nodes, weights(self.axes, state)),
             lens=self.space.lens_at(state),
-            domain=Domain.from_dict(mix_domain([n.domain.to_dict() for n in self.nodes], w)),
-            encoding=mix_encodings([n.encoding for n in self.nodes], w),
-            core=mix([n.core for n in self.nodes], w),
             settings={**first.settings, "state": dict(zip((a.name for a in self.axes), state, strict=True))},
             fit_s=self.fit_s,
         )
-
-
-def mix_encodings(encodings: Sequence[Encoding], weights: Array) -> Encoding:
-    """The encoding of a state: planes as they are, scales by their reciprocals, as the graph's matrices hold them."""
-
-    def of(value: Callable[[Encoding], float]) -> float:
-        return float(weights @ np.array([value(e) for e in encodings]))
-
-    pupil_scale = 1 / of(lambda e: 1 / e.pupil_scale_mm)
-    return replace(
-        encodings[0],
-        film_plane_z_mm=of(lambda e: e.film_plane_z_mm),
-        pupil_plane_z_mm=of(lambda e: e.pupil_plane_z_mm),
-        chief=pupil_scale * of(lambda e: e.chief / e.pupil_scale_mm),
-        film_scale_mm=1 / of(lambda e: 1 / e.film_scale_mm),
-        pupil_scale_mm=pupil_scale,
-    )
-
-
-def mix(values: Sequence[Any], weights: Array) -> Any:
-    """Weighted sum of float arrays wherever they stand in equal structures of dataclasses and tuples.
-
-    Raises:
-        InputError: structures that differ in anything but those numbers.
-    """
-    first = values[0]
-    if isinstance(first, np.ndarray) and first.dtype.kind == "f":
-        if any(v.shape != first.shape for v in values):
-            raise InputError("state model", "nodes", [v.shape for v in values], "arrays of one shape")
-        return np.einsum("k,k...->...", weights, np.stack(values))
-    if is_dataclass(first) and not isinstance(first, type):
-        names = [f.name for f in fields(first)]
-        return replace(first, **{n: mix([getattr(v, n) for v in values], weights) for n in names})
-    if isinstance(first, tuple):
-        if any(len(v) != len(first) for v in values):
-            raise InputError("state model", "nodes", [len(v) for v in values], "tuples of one length")
-        return tuple(mix([v[i] for v in values], weights) for i in range(len(first)))
-    if not all(np.array_equal(v, first) for v in values):
-        raise InputError("state model", "nodes", f"({type(first).__name__})", "the same at every node")
-    return first
 
 
 def gap_axis(first: Axis, lens_at: Callable[[float], Lens]) -> tuple[Axis, float]:

@@ -27,8 +27,8 @@ from neurolens.surrogates.cores import STOP
 from neurolens.surrogates.fit import prepare
 from neurolens.surrogates.fits.boundaries import invariant_core
 from neurolens.surrogates.fits.selection import JointSweep, Sweep, forward, replace_terms
-from neurolens.surrogates.lightfield import Encoding, fit_encoding
-from neurolens.surrogates.model import LensModel, Scales
+from neurolens.surrogates.lightfield import fit_encoding
+from neurolens.surrogates.model import Encoding, LensModel, Scales
 from neurolens.surrogates.pairs import PairSettings, RayPairs, make_pairs
 from neurolens.surrogates.states import State, StateModel, StateSpace
 from neurolens.surrogates.targets import Prepared, film_equivalent, scales_of

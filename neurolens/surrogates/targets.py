@@ -12,10 +12,9 @@ from torch import Tensor
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Core
-from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.gates import boundary_rays, boundary_weights
-from neurolens.surrogates.lightfield import Encoding, LightField, angle_vector
-from neurolens.surrogates.model import Gate, Scales
+from neurolens.surrogates.lightfield import LightField, angle_vector
+from neurolens.surrogates.model import Domain, Encoding, Gate, Scales
 from neurolens.surrogates.pairs import PairSet, RayPairs
 
 
@@ -78,7 +77,7 @@ class Prepared:
 
     @cached_property
     def boundary_weights(self) -> tuple[Tensor, Tensor]:
-        """Of the gates [G, N] and of the stop crossing [N]."""
+        """The weights of the gates [G, N] and of the stop crossing [N]."""
         return boundary_weights(self.pairs.lens, self.gates, self.boundary)
 
 

@@ -11,17 +11,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup, escape
 
 from neurolens import __version__
 from neurolens.analysis.layout import Layout, element_outline
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
+from neurolens.base.html import html, text_of
 from neurolens.graph.c import Signature
 from neurolens.view.packed import packed, packed_parts
 from neurolens.view.shaders import Ghosts, call_of, shared_glsl
 
-FOLDER = Path(__file__).parent / "page"
 SCRIPTS = ("packed.js", "gl.js", "scene.js", "engine.js", "ghosts.js", "layout.js", "main.js")
 SHADERS = ("random.glsl", "scene.glsl", "rays.glsl")
 # A form's download that would carry the page beyond this is left out.
@@ -120,11 +119,11 @@ def _without_exact(lenses: Sequence[ViewLens], kind: str) -> list[ViewLens]:
 
 
 def _page(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> str:
-    elements, entries = [], []
+    elements, entries = list[dict[str, Any]](), []
     for first in range(0, len(lenses), _TOGETHER):
         group, key = lenses[first : first + _TOGETHER], f"lenses-{first}"
         text, index = packed_parts(_parts(group, kinds))
-        elements.append(_packed(key, text, 0))
+        elements.append({"key": key, "text": text, "bytes": 0})
         stream = key, index[-1][1] + index[-1][2]
         for lens in group:
             own = f"{lens.key}/"
@@ -133,27 +132,14 @@ def _page(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> str:
     shared = {
         "version": __version__,
         "functions": {name: {"text": text, "call": call} for name, (text, call) in shared_glsl().items()},
-        "shaders": {name.removesuffix(".glsl"): _text(name) for name in SHADERS},
+        "shaders": {name.removesuffix(".glsl"): text_of(name) for name in SHADERS},
         "lenses": entries,
     }
     data = json.dumps(shared, allow_nan=False, separators=(",", ":")).encode()
-    elements.insert(0, _packed("data", packed(data), len(data)))
-    parts = {
-        "TITLE": escape(lenses[0].name if len(lenses) == 1 else "neurolens: lenses and their models"),
-        "STYLE": _text("style.css"),
-        "DATA": "\n".join(elements),
-        "SCRIPT": "\n".join(_text(name) for name in SCRIPTS),
-    }
-    return re.sub(r"@([A-Z]+)@", lambda m: parts[m[1]], _text("page.html"))
-
-
-def _packed(key: str, text: str, size: int) -> str:
-    length = Markup(' data-bytes="{}"').format(size) if size else ""
-    return Markup('<script type="text/plain" id="{}"{}>{}</script>').format(
-        key,
-        length,
-        Markup(text),  # noqa: S704 (of `packed.CHARACTERS`, which end nothing)
-    )
+    # Packed texts are of `packed.CHARACTERS`, which end no element.
+    elements.insert(0, {"key": "data", "text": packed(data), "bytes": len(data)})
+    title = lenses[0].name if len(lenses) == 1 else "neurolens: lenses and their models"
+    return html("view.html", title=title, streams=elements, scripts=SCRIPTS)
 
 
 def _entry(lens: ViewLens, kinds: Sequence[str]) -> dict[str, Any]:
@@ -186,10 +172,6 @@ def _parts(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> Iterator[tuple[s
             if kind in form.files:
                 data = form.files[kind]
                 yield f"{lens.key}/{form.kind}/{kind}", data if kind == "onnx" else data.decode()
-
-
-def _text(name: str) -> str:
-    return (FOLDER / name).read_text(encoding="utf-8")
 
 
 def section_svg(layout: Layout) -> dict[str, Any]:

@@ -9,18 +9,19 @@ from shipped import tabled
 from neurolens.analysis.bundles import Pattern
 from neurolens.analysis.fields import Scene
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.states import set_lens
 
 INF = math.inf
 
 
 def library(name: str, **state: float) -> Scene:
     """A lens of the library in a state, looking at what it is focused on."""
-    return Scene(tabled(name).at(**state), state.get("focus_m", INF))
+    return Scene(set_lens(tabled(name), **state), state.get("focus_m", INF))
 
 
 def scene(rows: list[Surface], half_field_deg: float = 10.0, focus_m: float = INF) -> Scene:
     """Surfaces as a scene in focus."""
-    return Scene(Lens("test", "", tuple(rows), 4.0, half_field_deg=half_field_deg).at(focus_m=focus_m), focus_m)
+    return Scene(set_lens(Lens("test", "", tuple(rows), 4.0, half_field_deg=half_field_deg), focus_m=focus_m), focus_m)
 
 
 def thin(bending: float, stop_mm: float = 5.0, n: float = 1.5, gap_mm: float = 0.0, v: float | None = 60.0) -> Scene:

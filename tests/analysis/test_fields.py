@@ -16,6 +16,7 @@ from neurolens.analysis.fields import Scene
 from neurolens.cli import main
 from neurolens.optics.lenswriter import write_lens
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.states import set_lens
 from neurolens.readers.any_format import read_any
 
 FUJINON = Path(__file__).parents[1] / "data" / "fujinon_35.toml"
@@ -85,7 +86,7 @@ def test_a_field_that_was_not_reached_is_a_warning_everywhere(
 def test_other_light_is_analysed_at_its_own_wavelengths() -> None:
     """A lens for 1.55 um; its glass disperses, so that the d line would be another focal length."""
     rows = (Surface(INF, 0.0, 4.0, stop=True), Surface(20.0, 3.0, 10.0, 1.5168, 64.17), Surface(-20.0, 18.0, 10.0))
-    lens = Lens("ir", "", rows, 5.0, half_field_deg=3.0, wavelengths_nm=(1550.0, 1500.0, 1600.0)).at()
+    lens = set_lens(Lens("ir", "", rows, 5.0, half_field_deg=3.0, wavelengths_nm=(1550.0, 1500.0, 1600.0)))
     given = Scene(lens)
     assert given.waves_nm == (1550.0, 1500.0, 1600.0)
     here, visible = (float(given.chief_rays([2.0], nm).height_mm[0]) for nm in (None, 587.5618))

@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 GAUSS = ROOT / "models" / "laikin_double_gauss_50.ols-60.onnx"
 FISHEYE = ROOT / "models" / "isshiki_fisheye_10.ols-64.onnx"
 SIZE, FILM = (1920, 1080), (36.0, 20.25)
-PICTURE = ("--size", "1920x1080", "--film", "36x20.25", "--quiet")
+PICTURE = ("--width", "1920", "--film", "36x20.25", "--quiet")
 # One of each kind, as strong as lenses are, and its widest angle in rad.
 EXAMPLES = {
     "opencv": ((1400.0, 1380.0), (-0.21, 0.06, 1e-3, -5e-4, -0.008), 0.7),
@@ -188,7 +188,7 @@ def test_bad_input_is_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixtu
         (FISHEYE, ("--projection", "opencv"), "a field up to 85 degrees"),
         (GAUSS, ("--projection", "pinhole"), "--projection"),
         (GAUSS, ("--projection", "opencv", "-o", tmp_path / "none" / "a"), "a folder that exists"),
-        (GAUSS, ("--projection", "opencv", "--size", "1920x1920"), "shape of the film"),
+        (GAUSS, ("--projection", "opencv", "--height", "1920"), "shape of the film"),
     ):
         assert words in failure(capsys, "projection", camera, *PICTURE, *change)
     assert command.MODELS == tuple(NAMES) and not list(tmp_path.iterdir())

@@ -211,7 +211,7 @@ def main(folder: Path) -> None:
         shots += grid(LENSES["inside"])
         shots += [white_card(LENSES["rectilinear"], 1.83), white_card(LENSES["anamorphic"], 2.8)]
         shots += [white_card(LENSES["fisheye"], 2.8)]
-    command_line(["stmap", _GAUSS, "--size", "120x68", "--film", "36x20.4", "-o", str(folder / "maps"), "--quiet"])
+    command_line(["stmap", _GAUSS, "--width", "120", "--film", "36x20.4", "-o", str(folder / "maps"), "--quiet"])
     (folder / "shots.json").write_text(json.dumps(shots, indent=1), encoding="utf-8")
 
 

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
 import shutil
-import signal
-import time
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +14,13 @@ import pytest
 pytest.importorskip("onnxruntime", reason="neurolens is not installed in Blender's environment")
 
 from neurolens.base import files  # noqa: E402
-from neurolens.base.errors import InputError  # noqa: E402
+from neurolens.base.errors import InputError, NeurolensError  # noqa: E402
 from neurolens.cli import main  # noqa: E402
 from neurolens.commands import blender_lenses  # noqa: E402
 from neurolens.commands.blender_lenses import thumbnail  # noqa: E402
 from neurolens.evaluate.shaders import Shader  # noqa: E402
 from neurolens.optics.lensfile import read_lens  # noqa: E402
 from neurolens.optics.paraxial import first_order  # noqa: E402
-from neurolens.render.film import FORKS  # noqa: E402
 
 LENS = "laikin_double_gauss_50"
 HUGE = "operations: got 20000"
@@ -166,40 +162,22 @@ def test_a_second_build_makes_no_shader_again(place: Path, monkeypatch: pytest.M
     assert main([*given, str(place / "d.zip")]) == 0 and asked[5:] == [".toml", ".onnx", ".onnx"]
 
 
-@pytest.mark.skipif(not FORKS, reason="stand-ins reach forked processes alone")
-def test_processes_make_the_same_zip_and_end_together(
+def test_two_jobs_make_the_zip_of_one_and_a_killed_job_fails_the_command(
     place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Stand-ins reach threads, not processes, which tests/test_tasks.py tests."""
+    monkeypatch.setattr(blender_lenses, "Processes", ThreadPoolExecutor)
     given = ["blender", "build", "--models", str(place / "models"), "--quiet", "-o"]
-    stand_in = blender_lenses.shader_of
-
-    def dies() -> None:
-        os._exit(9)
-
-    def interrupts() -> None:
-        os.kill(os.getppid(), signal.SIGINT)
-        time.sleep(300)
-
-    def made(file: Path, **options: Any) -> Shader:
-        if file.suffix == ".toml" and deeds:
-            deeds[0]()
-        return stand_in(file, **options)
-
-    monkeypatch.setattr(blender_lenses, "shader_of", made)
-    deeds = [dies]
-    assert main([*given, str(place / "a.zip"), "--jobs", "2"]) == 2
-    assert "one of 2 processes ended early" in capsys.readouterr().err
-    deeds = [interrupts]
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background of a shell ignore it
-    try:
-        assert main([*given, str(place / "a.zip"), "--jobs", "2"]) == 130
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert not multiprocessing.active_children() and not (place / "a.zip").exists()
-    deeds = []
     for name, jobs in (("a.zip", "2"), ("b.zip", "1")):
         assert main([*given, str(place / name), "--jobs", jobs]) == 0
     assert (place / "a.zip").read_bytes() == (place / "b.zip").read_bytes()
+
+    def killed(task: tuple[Path, str | None]) -> None:
+        raise NeurolensError("its process was killed by signal 9: did the memory run out?")
+
+    monkeypatch.setattr(blender_lenses, "_form_or_why", killed)
+    assert main([*given, str(place / "c.zip"), "--jobs", "2"]) == 2 and not (place / "c.zip").exists()
+    assert "killed by signal 9" in (said := capsys.readouterr().err) and "try --jobs 1" in said
 
 
 def test_a_squeezed_picture_is_said_of_its_lens(place: Path) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from neurolens.blender import pack
+from neurolens.optics.states import set_lens
 
 
 def _extension() -> tuple[ModuleType, ModuleType]:
@@ -81,7 +82,9 @@ def test_field_is_that_of_the_lens_and_goes_through_the_zip(tmp_path: Path) -> N
     from neurolens.optics.lensfile import read_lens
 
     path = "lenses/cooke_triplet_50.toml"
-    once, twice = (field_table(read_lens(path).at(focal_length_mm=f), r) for f, r in ((50.0, 18.0), (100.0, 36.0)))
+    once, twice = (
+        field_table(set_lens(read_lens(path), focal_length_mm=f), r) for f, r in ((50.0, 18.0), (100.0, 36.0))
+    )
     assert once is not None and twice is not None
     for name in ("distortion_um", "blur_um"):
         for a, b in zip(once[name], twice[name], strict=True):

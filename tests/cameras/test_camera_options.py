@@ -54,12 +54,6 @@ def test_the_film_moves_away_from_the_lens(tmp_path: Path, capsys: pytest.Captur
     assert "film_offset_mm" in capsys.readouterr().err and not (tmp_path / "b.exr").exists()
 
 
-def test_options_of_other_cameras_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = ("-o", str(tmp_path / "a.exr"), "--quiet")
-    assert main(["render", str(SCENE), "--camera", "thin", "--pupil", "boxes", *out]) != 0
-    assert "pupil" in capsys.readouterr().err and not list(tmp_path.iterdir())
-
-
 def test_directions_of_another_length_pass_nothing() -> None:
     """What a poor network makes of a few rays in a thousand million, here of every third."""
     lens = copy(camera("network"))

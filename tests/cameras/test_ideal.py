@@ -21,6 +21,7 @@ from neurolens.optics.film_plane import film_z_mm
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order, system_of
 from neurolens.optics.prescription import Lens
+from neurolens.optics.states import set_lens
 
 
 def square_grid(side: int) -> np.ndarray:
@@ -99,7 +100,7 @@ def test_rays_of_a_film_point_meet_at_the_focus_distance_and_fill_the_entrance_p
     rays = camera.sample(at((height, 0.0), 576), square, wavelength)
     t = (-focus_m - rays.origin_m[2]) / rays.direction[2]
     met = rays.origin_m[:2] + t * rays.direction[:2]
-    lens = read_lens(path).at(focus_m=focus_m, focus="best")
+    lens = set_lens(read_lens(path), focus_m=focus_m, focus="best")
     data = first_order(lens)
     assert lens.film_z_mm is not None
     magnification = paraxial_chief_slope(lens, height) * (data.entrance_pupil_z_mm - lens.film_z_mm + 1e3 * focus_m)
@@ -126,7 +127,7 @@ def paraxial_chief_slope(lens: Lens, height_mm: float) -> float:
 @pytest.mark.parametrize("path", [GAUSS, RETROFOCUS, TELEPHOTO, ZOOM])
 def test_ideal_cameras_frame_the_plane_in_focus_as_the_lens_does(path: Path, focus_m: float, focus: str) -> None:
     """Chief rays of a film point of the lens and of its thin lens, thick lens and pinhole meet there (item 16)."""
-    lens = read_lens(path).at(focus_m=focus_m, focus=focus)  # type: ignore[arg-type]
+    lens = set_lens(read_lens(path), focus_m=focus_m, focus=focus)  # type: ignore[arg-type]
     height, depth = 8.0, 1e7 if math.isinf(focus_m) else 1e3 * focus_m  # from the film, mm
     pupil = first_order(lens).entrance_pupil_z_mm - float(lens.film_z_mm or 0.0)
     wanted = -paraxial_chief_slope(lens, height) * (depth + pupil)
@@ -141,7 +142,7 @@ def test_ideal_cameras_frame_the_plane_in_focus_as_the_lens_does(path: Path, foc
 def test_light_falls_off_as_that_of_the_exit_pupil(path: Path) -> None:
     """The irradiance of a uniform disc, at any height (Foote 1915), is that of the paraxial exit pupil."""
     camera = made(path, math.inf, focus="paraxial")
-    data = first_order(read_lens(path).at(focus_m=math.inf))
+    data = first_order(set_lens(read_lens(path), focus_m=math.inf))
     distance = data.rear_focal_z_mm - data.exit_pupil_z_mm
     heights = np.array([0.0, 10.0, 20.0])
     light = disc_irradiance(data.exit_pupil_diameter_mm / 2, distance, heights)
@@ -181,7 +182,7 @@ def test_settings_are_those_of_the_lens_in_its_state() -> None:
     camera = made(GAUSS, f_number=4.0, efl_mm=35.0)
     assert camera.settings["efl_mm"] == pytest.approx(35, rel=2e-3)  # of the film in best focus
     assert camera.settings["f_number"] == pytest.approx(4, rel=2e-3)
-    assert camera.settings["lens"]["sha256"] == lens_models.lens().at(focal_length_mm=35.0).sha256
+    assert camera.settings["lens"]["sha256"] == set_lens(lens_models.lens(), focal_length_mm=35.0).sha256
 
 
 @pytest.mark.parametrize(

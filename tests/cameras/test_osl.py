@@ -32,6 +32,7 @@ from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.pupils import pupil_plane_z_mm
+from neurolens.optics.states import set_lens
 from neurolens.optics.tracegraph import exact_graph
 
 MODEL = ROOT / "models" / f"{GAUSS.stem}.ols-36.onnx"
@@ -40,7 +41,7 @@ FAR = 1e9
 
 @cache
 def lens() -> osl.OslLens:
-    return osl.model_lens(load_model(MODEL), _smallest(MODEL, False), lambda share: None)
+    return osl.model_lens(load_model(MODEL), _smallest(load_model(MODEL)), lambda share: None)
 
 
 def written() -> osl.OslCamera:
@@ -197,7 +198,7 @@ def test_groups_of_a_lens_file_move_where_the_camera_is_focused() -> None:
     assert passed.mean() > 0.5
     start, way = (np.array([found[f"{name}_{k}"][passed] for k in range(3)]) for name in ("position", "direction"))
     # All rays of a film point meet where the lens, its groups moved, has the point's image.
-    lens = read_lens(file).at(focus="internal", focus_m=focus_m)
+    lens = set_lens(read_lens(file), focus="internal", focus_m=focus_m)
     data = first_order(lens)
     away = (focus_m * 1e3 + data.front_principal_z_mm - lens.film_z_mm) / 1e3  # from the front principal plane
     plane = start + (focus_m - start[2]) / way[2] * way
@@ -221,7 +222,8 @@ def test_range_of_a_zoom_whose_groups_focus_is_refused_in_one_line(tmp_path, cap
 @cache
 def fitted(name: str) -> tuple[ShaderLens, PupilCircles | PupilDisc]:
     path = ROOT / "models" / f"{name}.onnx"
-    lens = osl.shader_lens(load_model(path), _smallest(path, False))
+    model = load_model(path)
+    lens = osl.shader_lens(model, _smallest(model))
     return lens, fit_pupil([lens], lambda share: None)[0]
 
 

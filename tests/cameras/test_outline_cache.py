@@ -16,6 +16,7 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.outline_cache import kept_outline, search_key
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.optics.prescription import Lens
+from neurolens.optics.states import set_lens
 
 KEY = "0123456789abcdef" * 4
 
@@ -55,7 +56,7 @@ def test_a_camera_starts_from_the_outline_of_the_run_before(monkeypatch: pytest.
 
 
 def test_whatever_the_search_reads_is_in_the_key() -> None:
-    lens = lens_models.lens().at(focus_m=2.0)
+    lens = set_lens(lens_models.lens(), focus_m=2.0)
 
     def key(lens: Lens, waves: tuple[float, float] = (400.0, 700.0), *settings: object) -> str:
         return search_key(lens, waves, (0.0, 0.5, 1.0), *settings)
@@ -68,7 +69,7 @@ def test_whatever_the_search_reads_is_in_the_key() -> None:
         changed(0, radius_mm=float(lens.surfaces[0].radius_mm) * (1 + 1e-15)),
         changed(3, thickness_mm=1.0), changed(2, diameter_mm=9.0), changed(0, conic=0.1), changed(1, cylinder="x"),
         changed(0, asphere=((4, 1e-9),)), changed(0, n_d=1.7, glass=None), changed(0, V_d=30.0, glass=None),
-        changed(0, glass="N-BK7"), lens.at(f_number=4.0), replace(lens, film_z_mm=90.0),
+        changed(0, glass="N-BK7"), set_lens(lens, f_number=4.0), replace(lens, film_z_mm=90.0),
     ]  # fmt: skip
     keys = [key(lens), *map(key, others), key(lens, (400.0, 650.0)), key(lens, (400.0, 700.0), "float64")]
     assert len(set(keys)) == len(keys) and key(lens) == keys[0]

@@ -17,7 +17,6 @@ from neurolens.base import status as st
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.focus_function import Focusing, number_of
-from neurolens.cameras.fused import lens_graph
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.source import camera_program, film_extras, model_extras
 from neurolens.cli import main
@@ -25,6 +24,7 @@ from neurolens.commands.export_lens import lens_program, pupil_planes_mm
 from neurolens.optics.focusing import best_focus_of_stops_mm, best_focus_z_mm
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import film_z_mm, first_order
+from neurolens.optics.states import set_lens
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 from neurolens.surrogates.domain import sample_domain
@@ -44,7 +44,7 @@ def camera(kind: str) -> ExactCamera | OnnxCamera:
 @pytest.mark.parametrize("kind", ["exact", "invariants"])
 def test_a_camera_as_source_gives_its_own_rays(kind: str) -> None:
     made = camera(kind)
-    graph = made.lens_graph() if isinstance(made, ExactCamera) else lens_graph(made)
+    graph = made.lens_graph()
     program = camera_program(made.film, graph, derivatives=True)
     film, square, wavelength = film_rays(made, 4000)
     given = dict(zip(("film_x_mm", "film_y_mm", "u", "v", "wavelength_nm"), (*film, *square, wavelength), strict=True))
@@ -69,7 +69,7 @@ def test_a_camera_as_source_gives_its_own_rays(kind: str) -> None:
 @pytest.mark.parametrize("name", ["laikin_double_gauss_50", "phone_lens_6"])
 def test_the_film_of_a_focus_and_stop_is_that_of_best_focus(name: str) -> None:
     """Of an exact lens, within the error that is told; it rises as objects come nearer, and stays beyond the ends."""
-    lens = read_lens(LENS.with_name(f"{name}.toml")).at()
+    lens = set_lens(read_lens(LENS.with_name(f"{name}.toml")))
     near_m, widest = 12e-3 * float(first_order(lens).efl_mm), float(lens.stop_radius_mm)
 
     def best(focus_m: float, stops_mm: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -146,11 +146,11 @@ def test_the_exact_lens_as_a_function(tmp_path: Path) -> None:
 def test_the_zoom_of_an_exact_lens_is_an_argument(zoom_mm: float) -> None:
     """Between the source's positions: rays of the tracer through the lens zoomed there."""
     lens = read_lens(LENS.with_name("nikon_zoom_70_200.toml"))
-    axis, error_mm = gap_axis(zoom_axis(lens), lambda zoom_mm: lens.at(zoom=zoom_mm))
+    axis, error_mm = gap_axis(zoom_axis(lens), lambda zoom_mm: set_lens(lens, zoom=zoom_mm))
     assert error_mm < 1e-4
-    nodes = [lens.at(zoom=v) for v in axis.nodes]
+    nodes = [set_lens(lens, zoom=v) for v in axis.nodes]
     planes = pupil_planes_mm(nodes, (axis,))
-    program, at = lens_program(nodes, (axis,), planes), lens.at(zoom=zoom_mm)
+    program, at = lens_program(nodes, (axis,), planes), set_lens(lens, zoom=zoom_mm)
     film_z, random = best_focus_z_mm(at, 5.0), np.random.default_rng(3)
     plane = number_of((axis,), planes)
     pupil_z = plane if isinstance(plane, float) else float(plane.evaluate({"zoom_mm": zoom_mm})["value"])

@@ -22,6 +22,7 @@ from neurolens.cameras.onnxlens import load_model
 from neurolens.cameras.pinhole import PROJECTIONS, Pinhole
 from neurolens.cameras.vignetting import VIGNETTINGS, Vignetted
 from neurolens.optics.paraxial import first_order
+from neurolens.optics.states import set_lens
 
 MODELS = Path(__file__).parents[2] / "models"
 
@@ -36,7 +37,7 @@ def expected(kind: str) -> np.ndarray:
     if kind == "pinhole":
         return (1 + (RADII / 50.0) ** 2) ** -2.0
     if kind in ("thin", "thick"):
-        lens = lens_models.lens().at(focus_m=2.0, f_number=4.0)
+        lens = set_lens(lens_models.lens(), focus_m=2.0, f_number=4.0)
         data = first_order(lens)
         assert lens.film_z_mm is not None
         image = camera("thin").image_distance_mm

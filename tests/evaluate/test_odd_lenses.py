@@ -17,6 +17,7 @@ from neurolens.evaluate.measure import measure_on, shared_rays
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
+from neurolens.optics.states import set_lens
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
@@ -85,7 +86,7 @@ def test_promises_of_the_default_domain_hold(name: str, tmp_path: Path) -> None:
 def test_defaults_of_the_whole_library() -> None:
     """Every lens: visible light, or the d line; an object in focus that lies before the front surface."""
     for file in sorted(LENSES.glob("*.toml")):
-        lens = read_lens(file).at()
+        lens = set_lens(read_lens(file))
         low, high = wavelengths_nm(lens)
         assert 380 <= low <= 400 and 700 <= high <= 780, file.name
         near_mm, data = 1000 * near_limit_m(lens), first_order(lens)

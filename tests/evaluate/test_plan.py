@@ -40,11 +40,12 @@ from neurolens.evaluate.scenes import seen_depths_m
 from neurolens.evaluate.shaders import lens_of
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
+from neurolens.optics.states import set_lens
 from neurolens.render.pictures import read_exr
 from neurolens.render.scene import load_scene, scene_from_tables
 from neurolens.surrogates.cores import InvariantPolynomial
 from neurolens.surrogates.domain import domain_of
-from neurolens.surrogates.stored import load_fitted
+from neurolens.surrogates.file import read_model
 
 LENS = "lenses/cooke_triplet_50.toml"  # of glass that absorbs
 GAUSS = "lenses/laikin_double_gauss_50.toml"
@@ -123,7 +124,7 @@ def test_exact_footprints_are_the_spots_of_the_lens() -> None:
 
     camera = make_camera(LENS, Shot((36.0, 24.0), math.inf, focus="paraxial"))
     places = places_of(camera, np.array([[0.0], [0.0]]), np.array([math.inf]), np.array([587.56]), np.ones(1))
-    lens = read_lens(LENS).at()
+    lens = set_lens(read_lens(LENS))
     found = blur_mm(footprints(camera, places, samples=48), np.ones(1))[0] / 2
     assert 1000 * found == pytest.approx(spots(Scene(lens), [0.0], [587.56]).rms_um[0], rel=0.03)
 
@@ -132,7 +133,7 @@ def test_a_pupil_s_outline_serves_any_plane_and_tells_what_passes_beside_it() ->
     lens, film, real = read_lens(LENS), (24.0, 16.0), {"film_mm": (24.0, 16.0), "focus_m": 2.0, "f_number": 8.0}
     camera, waves = ExactCamera(lens, **real), np.full(FILM.shape[1], 550.0, np.float32)
     outline, film_z = camera.film.outline, camera.film.film_z_mm
-    stopped, other = lens.at(f_number=8.0, focus_m=2.0), outline.pupil_z_mm - 15.0
+    stopped, other = set_lens(lens, f_number=8.0, focus_m=2.0), outline.pupil_z_mm - 15.0
     bounds = domain_of(stopped, film_radius_mm=math.hypot(*film) / 2, focus_m=(2.0, 2.0), pupil_z_mm=other).bounds
     searched, moved = ExactCamera(lens, **real, bounds=bounds).film.outline, outline.on_plane(other, film_z)
     for square in (np.full(FILM.shape, 0.5), np.full(FILM.shape, 0.9)):
@@ -141,7 +142,7 @@ def test_a_pupil_s_outline_serves_any_plane_and_tells_what_passes_beside_it() ->
     places = places_of(camera, FILM, np.full(4, 4.0), NM, SHARE)
     light = footprints(camera, places).light
     assert (light_beside(camera, places) < 1e-3 * light).all()  # the outline holds all that passes
-    camera.film.outline = camera.film.pupil = replace(outline, x=0.98 * outline.x, y=0.98 * outline.y)
+    camera.film.outline = replace(outline, x=0.98 * outline.x, y=0.98 * outline.y)
     narrow = footprints(camera, places).light
     assert light_beside(camera, places) == pytest.approx(0.01 * narrow, rel=0.02)  # 0.5% of the radius, all of it lit
 
@@ -153,7 +154,7 @@ def test_depths_are_along_the_axis() -> None:
 
 
 def test_what_a_shot_needs_falls_with_its_stop() -> None:
-    lens = read_lens(LENS).at()
+    lens = set_lens(read_lens(LENS))
     wide, small = (
         {e.name: e.worth for e in effects_of(probe(scene_from_tables(wall(4.0, n)), lens, across=6), 0.25)}
         for n in (None, 16.0)
@@ -186,7 +187,7 @@ def test_budgets_at_the_extremes(budget: float, distance_m: float, f_number: flo
     renderer the exact lens stays, as even the cheapest scene takes many times what a camera does."""
     film = {"film_width_mm": 28.0, "film_height_mm": 15.75}  # less than its circle of light, for the maps
     scene = scene_from_tables(wall(distance_m, f_number, **film))
-    found = plan(scene, read_lens(LENS).at(), budget, target="c")
+    found = plan(scene, set_lens(read_lens(LENS)), budget, target="c")
     assert found.best is not None and found.best.light_error <= 0.01
     assert found.best.name == ("exact" if budget == 0 else "pinhole + ST map")
     assert all(c.cost >= found.best.cost for c in found.choices if c.within)
@@ -197,13 +198,13 @@ def test_budgets_at_the_extremes(budget: float, distance_m: float, f_number: flo
 def test_a_scene_with_nothing_in_view_is_distant() -> None:
     tables = wall(4.0)
     tables["planes"][0]["point_m"] = [0.0, 0.0, 4.0]  # behind the camera
-    asked = probe(scene_from_tables(tables), read_lens(LENS).at(), across=4).asked
+    asked = probe(scene_from_tables(tables), set_lens(read_lens(LENS)), across=4).asked
     assert asked.nearest_m is None and asked.distant == 1.0
 
 
 def test_bad_budgets_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(InputError, match="budget_px"):
-        plan(scene_from_tables(wall(4.0)), read_lens(LENS).at(), math.nan)
+        plan(scene_from_tables(wall(4.0)), set_lens(read_lens(LENS)), math.nan)
     for word in ("-1px", "nan", "1um", "1e99"):
         with pytest.raises(SystemExit) as ended:
             main(["plan", "experiments/scenes/room.toml", "--lens", LENS, "--budget", word, "-o", str(tmp_path)])
@@ -227,7 +228,7 @@ def test_noise_of_weights_is_how_many_times_the_rays_it_takes() -> None:
 
 @cache
 def garden() -> Probed:
-    return probe(load_scene(Path("experiments/scenes/garden.toml")), read_lens(GAUSS).at(), across=6)
+    return probe(load_scene(Path("experiments/scenes/garden.toml")), set_lens(read_lens(GAUSS)), across=6)
 
 
 def test_what_is_cheapest_differs_by_target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -262,7 +263,7 @@ def test_shaders_cost_what_cycles_took() -> None:
 
 def test_a_warped_pinhole_lacks_the_blur_alone() -> None:
     """Of a wall in focus: places and light are right, so that its error is the RMS radius of the lens's footprints."""
-    scene, lens = scene_from_tables(wall(3.0)), read_lens(GAUSS).at()
+    scene, lens = scene_from_tables(wall(3.0)), set_lens(read_lens(GAUSS))
     choices, found = {c.name: c for c in plan(scene, lens, 1e9, explain=True).choices}, probe(scene, lens)
     blur = np.percentile(blur_mm(found.seen, found.places.share) / 2, 95) / found.asked.pixel_mm
     assert choices["pinhole + ST map"].error_px == pytest.approx(blur, rel=0.02)
@@ -288,7 +289,7 @@ def test_a_plan_s_file_is_taken_by_train_render_and_export(tmp_path: Path, monke
     file, model = folder / "plan.toml", next((folder / "models").glob("*.onnx"))
     quick = ["--quiet", "--set", "evaluation.vignetting_rays=2000"]
     assert main(["train", str(file), "--output", str(tmp_path / "run"), *quick]) == 0
-    made, again = (load_fitted(f) for f in (model, tmp_path / "run" / "models" / "shot-ols-6.onnx"))
+    made, again = (read_model(f).at() for f in (model, tmp_path / "run" / "models" / "shot-ols-6.onnx"))
     assert isinstance(made.core, InvariantPolynomial) and isinstance(again.core, InvariantPolynomial)
     np.testing.assert_array_equal(made.core.exponents, again.core.exponents)
     np.testing.assert_allclose(made.core.ab, again.core.ab, rtol=1e-9, atol=1e-12)
@@ -301,9 +302,9 @@ def test_a_plan_s_file_is_taken_by_train_render_and_export(tmp_path: Path, monke
 
 
 def test_a_plan_s_file_names_cameras_that_nothing_is_fitted_for(tmp_path: Path) -> None:
-    found = plan(scene_from_tables(wall(4.0)), read_lens(LENS).at(), 0.0)
+    found = plan(scene_from_tables(wall(4.0)), set_lens(read_lens(LENS)), 0.0)
     file = tmp_path / "plan.toml"
-    file.write_text(found.to_toml(read_lens(LENS).at(), tmp_path))
+    file.write_text(found.to_toml(set_lens(read_lens(LENS)), tmp_path))
     assert Path(str(resolve(file)).removeprefix("fused:")).resolve() == Path(LENS).resolve()
     assert str(resolve("experiments/quickstart.toml")) == "experiments/quickstart.toml"
 
@@ -322,7 +323,7 @@ def test_models_have_the_blades_of_the_lens_file() -> None:
 def test_a_zoom_is_planned_in_its_state() -> None:
     lens, seen = read_lens("lenses/ogawa_zoom_70_200.toml"), []
     scene = scene_from_tables(wall(10.0, 5.6, focus_m=8.0))
-    for found in (probe(scene, lens, zoom="135mm"), probe(scene, lens.at(zoom="135mm")), probe(scene, lens)):
+    for found in (probe(scene, lens, zoom="135mm"), probe(scene, set_lens(lens, zoom="135mm")), probe(scene, lens)):
         seen.append(found.exact.settings["efl_mm"])
     assert seen[0] == seen[1] != seen[2] and seen[0] == pytest.approx(135, rel=0.02)
     with pytest.raises(InputError, match="zoom"):

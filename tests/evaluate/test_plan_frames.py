@@ -13,6 +13,7 @@ from neurolens.evaluate import plan_frames as module
 from neurolens.evaluate.plan_frames import Frame, breathing_px, plan_frames, representatives
 from neurolens.evaluate.probe import probe
 from neurolens.optics.lensfile import read_lens
+from neurolens.optics.states import set_lens
 from neurolens.render.scene import Scene, scene_from_tables
 
 LENS = "lenses/laikin_double_gauss_50.toml"
@@ -44,7 +45,7 @@ def test_frames_at_the_extremes_are_probed() -> None:
 
 def test_breathing_is_that_of_the_picture() -> None:
     """A lens focused by its film shows less as that moves away: near the axis, sizes go as the chief ray's reach."""
-    lens = read_lens(LENS).at()
+    lens = set_lens(read_lens(LENS))
     far, near = (probe(f.scene, lens, across=5) for f in frames([1e4, 0.8], 11.0, 8.0))
     found = breathing_px([near, far])
     assert found is not None
@@ -63,7 +64,7 @@ def test_a_rack_takes_as_few_fits_as_hold(tmp_path: Path, monkeypatch: pytest.Mo
 
     monkeypatch.setattr(module, "probe", once)
     monkeypatch.setattr(module, "shot_terms", lambda found: [8, 28])
-    lens, rack = read_lens(LENS).at(), frames([0.7, 0.7, 1.2])
+    lens, rack = set_lens(read_lens(LENS)), frames([0.7, 0.7, 1.2])
     moved = plan_frames(rack, lens, 0.5, folder=tmp_path, target="onnx")
     assert moved.fits == 1 and [(r.first, r.last) for r in moved.runs] == [(1, 3)] and moved.probed == (1, 3)
     assert moved.runs[0].choice is not None and moved.runs[0].choice.error_px <= 0.5
@@ -78,7 +79,7 @@ def test_a_rack_takes_as_few_fits_as_hold(tmp_path: Path, monkeypatch: pytest.Mo
 def test_stretches_are_the_fewest(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Where a model holds a range of 1 / focus of at most 0.5, greedy stretches are as few as can be."""
     near = [0.2, 0.3, 0.65, 0.7, 0.75, 1.3, 1.85]  # 1 / m
-    lens = read_lens(LENS).at()
+    lens = set_lens(read_lens(LENS))
     founds: Any = [SimpleNamespace(lens=lens, asked=SimpleNamespace(focus_m=1 / v)) for v in near]
 
     class Short:
@@ -98,4 +99,4 @@ def test_stretches_are_the_fewest(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
 
 def test_no_frames_are_refused() -> None:
     with pytest.raises(InputError, match="frames"):
-        plan_frames([], read_lens(LENS).at(), 1.0)
+        plan_frames([], set_lens(read_lens(LENS)), 1.0)

@@ -16,12 +16,14 @@ from neurolens.evaluate.plan import plan
 from neurolens.evaluate.probe import effects_of, probe
 from neurolens.evaluate.samples import blur_map
 from neurolens.evaluate.scenes import seen_depths_m
-from neurolens.flare.layers import FlareSettings, flare_layers
+from neurolens.flare.layers import FlareJob, flare_layers
 from neurolens.flare.picture import Raster
 from neurolens.flare.sources import SceneLights
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.pupils import camera_rays
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays, trace
+from neurolens.render.flaresettings import FlareSettings
 from neurolens.render.renderer import render
 from neurolens.render.scene import scene_from_tables
 from neurolens.render.world import World
@@ -45,7 +47,7 @@ def card(size_m: float, depth_m: float, corner_m: tuple[float, float], material:
 def test_narrow_light_has_no_colour_errors() -> None:
     line = {"spectrum": [[300.0, 0.0], [584.0, 0.0], [589.0, 1.0], [594.0, 0.0], [900.0, 0.0]]}
     sodium = wall(illuminants={"sodium": line}, environment={"colour": [1.0, 1.0, 1.0], "illuminant": "sodium"})
-    found, white = (probe(s, read_lens(LENS).at(), across=4) for s in (sodium, wall()))
+    found, white = (probe(s, set_lens(read_lens(LENS)), across=4) for s in (sodium, wall()))
     assert 583 <= found.asked.light_nm[0] < found.asked.light_nm[1] <= 595
     assert white.asked.light_nm[0] < 430 and white.asked.light_nm[1] > 660
     # Of one light the shares are those of the eye: its mean lies where V times the light is balanced.
@@ -56,7 +58,7 @@ def test_narrow_light_has_no_colour_errors() -> None:
 
 
 def test_transmittance_is_that_of_the_axis() -> None:
-    found = probe(wall(), read_lens(LENS).at(), across=1)  # one place, on the axis
+    found = probe(wall(), set_lens(read_lens(LENS)), across=1)  # one place, on the axis
     slope = torch.linspace(0, 0.12, 200_001, dtype=torch.float64)
     zero, through = torch.zeros_like(slope), []
     for nm in found.places.wavelength_nm:
@@ -72,7 +74,7 @@ def test_transmittance_is_that_of_the_axis() -> None:
 
 def test_vignetting_darkens_the_corner_as_traced_rays_say() -> None:
     """Rays of the corner's film point through a grid of the pupil, with the rims and without them; the stop in both."""
-    found = probe(wall(camera={"f_number": 2.0}), read_lens("lenses/laikin_double_gauss_50.toml").at())
+    found = probe(wall(camera={"f_number": 2.0}), set_lens(read_lens("lenses/laikin_double_gauss_50.toml")))
     unit, taken = found.camera_maps["vignetting"]
     fall = found.camera_maps["natural fall-off"][1]
     x, y = (mm * (0.5 / n - 0.5) for mm, n in zip(found.asked.film_mm, taken.shape[::-1], strict=True))
@@ -106,7 +108,7 @@ def test_contrast_is_that_of_the_scene_and_not_noise() -> None:
 
 def test_edges_are_where_blur_differs() -> None:
     near = [card(0.3, 1.0, (0.05, 0.1), "light")]
-    lens = read_lens(LENS).at()
+    lens = set_lens(read_lens(LENS))
     scenes = wall(), wall(4.0, {"f_number": 45.0}, quads=near), wall(quads=near)
     bare, sharp, open_stop = (probe(s, lens, across=2).asked for s in scenes)
     assert bare.edges == 0 and bare.edge_contrast is None and open_stop.edges > 0.005 > sharp.edges
@@ -123,7 +125,8 @@ def test_flare_is_that_of_the_layers() -> None:
     for name in ("flare", "star-bursts"):
         assert twice[name].mean() == pytest.approx(2 * once[name].mean(), rel=1e-3) and once[name].mean() > 0
     lights = SceneLights(scenes[0]).seen(scenes[0], camera.lens.film_z_mm)
-    large = flare_layers(camera.lens, lights, Raster((36.0, 20.25), 192, 108), FlareSettings(wavelengths=3))["ghosts"]
+    job = FlareJob(camera.lens, lights, Raster((36.0, 20.25), 192, 108), FlareSettings(bins=3))
+    large = flare_layers(job)["ghosts"]
     expected = large.max(-1).reshape(27, 4, 48, 4).mean((1, 3)) / small.rgb.mean(-1)
     assert once["flare"].mean() == pytest.approx(expected.mean(), rel=0.03)
     assert np.corrcoef(once["flare"].ravel(), expected.ravel())[0, 1] > 0.9
@@ -131,7 +134,7 @@ def test_flare_is_that_of_the_layers() -> None:
 
 
 def test_what_is_made_afterwards_is_not_asked() -> None:
-    lens = read_lens(LENS).at()
+    lens = set_lens(read_lens(LENS))
     far = wall(500.0, {"f_number": 45.0, "focus_m": 500.0, "width": 1920, "height": 1080})
     without = plan(far, lens, 0.2, afterwards=["distortion"])
     assert without.best is not None and without.best.name == "pinhole"
@@ -157,7 +160,7 @@ def test_footprints_without_distortion_lie_where_a_thin_lens_has_them() -> None:
 def test_blur_of_each_pixel_is_the_circle_of_confusion_at_its_depth(f_number: float) -> None:
     """A small card before a wall, through a thin lens: two diameters, and nothing between."""
     scene = wall(5.0, {"f_number": f_number}, quads=[card(0.3, 2.0, (0.05, 0.1))])
-    found = probe(scene, read_lens(LENS).at(), across=4)
+    found = probe(scene, set_lens(read_lens(LENS)), across=4)
     thin = make_camera("thin", Shot((36.0, 20.25), 3.0, f_number=f_number))
     object.__setattr__(found, "exact", thin)
     blur, depth = blur_map(found)
@@ -182,7 +185,7 @@ EXTREMES: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("name", EXTREMES)
 def test_extremes_have_an_answer(name: str) -> None:
-    found = probe(wall(**EXTREMES[name]), read_lens(LENS).at(), across=3)
+    found = probe(wall(**EXTREMES[name]), set_lens(read_lens(LENS)), across=3)
     effects = effects_of(found, 0.25)
     assert all(e.worth >= 0 for e in effects) and {"defocus", "flare"} <= {e.name for e in effects}
     assert (found.asked.nearest_m is None) == (name == "distant")
@@ -208,7 +211,7 @@ def test_a_probe_makes_its_scene_ready_once(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(World, "__init__", lambda self, *args: (made.append(1), whole(self, *args))[1])
     bulb = {"centre_m": [0.0, 0.0, -2.5], "radius_m": 0.5, "emission": [5.0, 4.0, 3.0]}
     scene = wall(spheres=[bulb])
-    found = probe(scene, read_lens(LENS).at(), across=4)
+    found = probe(scene, set_lens(read_lens(LENS)), across=4)
     assert len(made) == 1 and 2.0 < found.asked.nearest_m < 2.3
     seen_depths_m(scene, found.exact, found.places.film_mm)  # outside nothing is kept
     assert len(made) == 2

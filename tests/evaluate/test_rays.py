@@ -23,13 +23,16 @@ from neurolens.evaluate.rays import (
     ray_errors,
 )
 from neurolens.evaluate.vignetting import deciding_rim_ratio, relative_illumination
+from neurolens.optics.film_plane import PupilBounds
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.pupils import PupilBounds, camera_rays, image_radius_mm
+from neurolens.optics.pupils import camera_rays, image_radius_mm
+from neurolens.optics.states import set_lens
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
-from neurolens.surrogates.domain import Domain, FilmRays, domain_of, sample_domain
+from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, trace_pairs
 
 LENSES = Path(__file__).parents[2] / "lenses"
@@ -38,7 +41,7 @@ LENSES = Path(__file__).parents[2] / "lenses"
 def lens_and_domain(
     name: str, efl_mm: float | None, focus_m: float, film_radius_mm: float | None = None
 ) -> tuple[Lens, Domain]:
-    lens = read_lens(LENSES / f"{name}.toml").at(focal_length_mm=efl_mm, focus_m=focus_m)
+    lens = set_lens(read_lens(LENSES / f"{name}.toml"), focal_length_mm=efl_mm, focus_m=focus_m)
     return lens, domain_of(lens, focus_m=(focus_m, focus_m), film_radius_mm=film_radius_mm)
 
 
@@ -242,7 +245,7 @@ def test_where_the_image_folds_an_error_counts_for_ten_times_first_order_at_most
     lens = Lens(
         name="loupe", source="made up", f_number=10.0, surfaces=(front, flat, Surface(math.inf, 40.0, 6.0, stop=True))
     )
-    lens = lens.at()
+    lens = set_lens(lens)
     domain, f = domain_of(lens, film_radius_mm=80.0), first_order(lens).efl_mm
     rms = []
     for seed in (1, 2):
@@ -330,7 +333,7 @@ def test_illumination_of_a_small_hole_is_cos4() -> None:
 
 
 def test_the_deciding_rim_agrees_with_the_tracer() -> None:
-    lens = read_lens(LENSES / "laikin_double_gauss_50.toml").at()
+    lens = set_lens(read_lens(LENSES / "laikin_double_gauss_50.toml"))
     domain = domain_of(lens)
     rays = trace_pairs(lens, sample_domain(domain, 20000, 1), domain.pupil_z_mm)
     ratio = deciding_rim_ratio(lens, rays)
@@ -341,7 +344,7 @@ def test_the_deciding_rim_agrees_with_the_tracer() -> None:
 
 
 def test_a_real_lens_against_itself_stopped_down() -> None:
-    lens = read_lens(LENSES / "laikin_double_gauss_50.toml").at()
+    lens = set_lens(read_lens(LENSES / "laikin_double_gauss_50.toml"))
     domain = domain_of(lens)
 
     def exactly(rays: FilmRays, stop_radius_mm: float | None) -> SimpleNamespace:

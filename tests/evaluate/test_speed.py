@@ -14,19 +14,21 @@ from neurolens.cameras.pinhole import Pinhole
 from neurolens.evaluate.candidates import camera_candidate, exact_candidates
 from neurolens.evaluate.speed import Call, Candidate, Race, Unavailable, race
 from neurolens.optics.lensfile import read_lens
+from neurolens.optics.states import set_lens
 from neurolens.surrogates.bases import pinned_threads
-from neurolens.surrogates.domain import Domain, FilmRays, domain_of
+from neurolens.surrogates.domain import FilmRays, domain_of
+from neurolens.surrogates.model import Domain
 
 LENSES = Path(__file__).parents[2] / "lenses"
 
 
 @pytest.fixture(scope="module")
 def domain() -> Domain:
-    return domain_of(read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml").at(), film_radius_mm=10.0)
+    return domain_of(set_lens(read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml")), film_radius_mm=10.0)
 
 
 def test_a_race_of_cameras_and_the_eager_tracer(domain: Domain) -> None:
-    lens = read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml").at()
+    lens = set_lens(read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml"))
     eager = exact_candidates(lens, domain, compiled=False)
     cameras = [camera_candidate(c, domain) for c in (Pinhole(50.0), ThinLens(50.0, 2.0, math.inf))]
     result = race([*eager, *cameras], domain, rounds=3)
@@ -79,7 +81,7 @@ def test_what_cannot_run_is_reported_with_its_reason(domain: Domain) -> None:
 def test_without_a_compiler_the_compiled_tracer_is_unavailable(domain: Domain) -> None:
     import torch._inductor.config as inductor
 
-    lens = read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml").at()
+    lens = set_lens(read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml"))
     # torch's own patch: monkeypatch leaves its settings unusable. A kernel compiled before would need no compiler.
     with inductor.patch({"cpp.cxx": ("/nowhere/c++",), "fx_graph_cache": False}):
         result = race(exact_candidates(lens, domain), domain, rounds=1)
@@ -98,7 +100,7 @@ def test_bad_settings_are_refused(domain: Domain) -> None:
 
 def test_candidates_of_several_domains_run_in_one_race() -> None:
     """Each does rays of its own domain; all are timed round by round together."""
-    wide = domain_of(read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml").at(f_number=8), film_radius_mm=20.0)
+    wide = domain_of(set_lens(read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml"), f_number=8), film_radius_mm=20.0)
     small = replace(wide, film_radius_mm=5.0)
     reached: dict[str, float] = {}
 

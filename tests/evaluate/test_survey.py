@@ -5,22 +5,19 @@ import io
 import json
 import os
 import re
-import signal
-import threading
-import time
-from collections.abc import Iterable, Iterator
 from html.parser import HTMLParser
 from pathlib import Path
-from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
+from neurolens.base.tasks import Here, Processes
 from neurolens.cli import main
-from neurolens.evaluate import survey_page, survey_run
+from neurolens.evaluate import survey_page
 from neurolens.evaluate.survey import SurveySettings, Task, is_of, run_task, summary_of
-from neurolens.evaluate.survey_run import in_processes, survey
+from neurolens.evaluate.survey_run import survey
 from neurolens.readers.any_format import collection_of
 
 LENSES = Path(__file__).parents[2] / "lenses"
@@ -28,11 +25,6 @@ TRIPLET = (LENSES / "cooke_triplet_50.toml").read_bytes()
 SMALL = SurveySettings(terms=12, rays=2000)
 READ = SurveySettings(fit=False)
 QUIET = Progress(quiet=True)
-
-
-def here(tasks: Iterable[Task]) -> Iterator[tuple[Task, bytes]]:
-    """An engine without processes."""
-    return ((task, run_task(task)) for task in tasks)
 
 
 @pytest.fixture(scope="module")
@@ -135,19 +127,21 @@ class Rows(HTMLParser):
 def test_a_survey_leaves_nothing_out_and_goes_on(tmp_path: Path) -> None:
     collection, out, asked = collection_of(_folder(tmp_path)), tmp_path / "out", list[str]()
 
-    def engine(tasks: Iterable[Task]) -> Iterator[tuple[Task, bytes]]:
-        for task, data in here(tasks):
-            asked.append(task.name)
-            yield task, data
-            if len(asked) == 1:
+    class Once(Here):
+        """Is interrupted when it is to take its second task."""
+
+        def submit(self, work: Any, /, *args: Any, **named: Any) -> Any:
+            asked.append(args[0].name)
+            if len(asked) == 2:
                 raise KeyboardInterrupt
+            return super().submit(work, *args, **named)
 
     assert collection.names == ("in/=triplet <b>.toml", "no.zmx")
     assert collection.others == {".me": 1, "(hidden)": 1}
     with pytest.raises(KeyboardInterrupt):
-        survey(collection, out, READ, engine, QUIET)
-    records = survey(collection, out, READ, engine, QUIET)
-    assert asked == list(collection.names)  # each once
+        survey(collection, out, READ, Once(), QUIET)
+    records = survey(collection, out, READ, Once(), QUIET)
+    assert asked == [*collection.names, collection.names[1]]  # the first is kept
     assert [r["verdict"] for r in records] == ["ok", "refused"]
     page = (out / "survey.html").read_text(encoding="utf-8")
     found = Rows()
@@ -182,64 +176,18 @@ def test_names_that_are_no_text(tmp_path: Path) -> None:
         Path(os.fsdecode(os.fsencode(folder) + b"/\xff\xfe.zmx")).write_text("VERS")
     except OSError:
         pytest.skip("this system takes names that are text alone")
-    (record,) = survey(collection_of(folder), tmp_path / "out", READ, here, QUIET)
+    (record,) = survey(collection_of(folder), tmp_path / "out", READ, Here(), QUIET)
     assert record["verdict"] == "refused"
     for kind in ("html", "csv"):
         assert "\\udcff\\udcfe.zmx" in (tmp_path / "out" / f"survey.{kind}").read_text(encoding="utf-8")
 
 
-def test_a_killed_process_costs_its_own_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(survey_run, "_POLL_S", 0.0)
+def test_a_file_that_takes_too_long_is_a_fault(tmp_path: Path) -> None:
     collection = collection_of(_folder(tmp_path))
-    records = survey(collection, tmp_path / "out", READ, in_processes(2, limit_s=0.0), QUIET)
+    with Processes(2, limit_s=0.0) as executor:
+        records = survey(collection, tmp_path / "out", READ, executor, QUIET)
     assert {r["verdict"] for r in records} == {"fault"}
-    assert "took longer than 0 s" in records[0]["reason"]
-
-
-def test_a_worker_of_a_cluster_ends_after_a_file_that_never_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It answers first; a file in time leaves it alone."""
-    ended: list[float] = []
-    stuck, timer = threading.Event(), SimpleNamespace(start=lambda: None)
-    monkeypatch.setattr(survey_run.threading, "Timer", lambda after, *_: (ended.append(after), timer)[1])
-    task = Task("a.zmx", b"", READ)
-    assert json.loads(survey_run._on_worker(b"", task))["verdict"] == "refused" and not ended
-    monkeypatch.setattr(survey_run, "run_task", lambda _: stuck.wait())
-    monkeypatch.setattr(survey_run, "TIME_LIMIT_S", 0.01)
-    record = json.loads(survey_run._on_worker(b"", task))
-    stuck.set()
-    assert (record["verdict"], record["reason"]) == ("fault", "took longer than 0.01 s") and len(ended) == 1
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_a_process_ends_once_its_survey_is_gone() -> None:
-    read, write = os.pipe()
-    child = os.fork()
-    if not child:
-        os.close(read)
-        survey_run._end_unread(write)
-        os._exit(0)
-    time.sleep(0.05)
-    assert os.waitpid(child, os.WNOHANG) == (0, 0)
-    os.close(read)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1
-    os.close(write)
-
-
-def test_the_end_of_a_process_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    task = Task("a.toml", b"")
-
-    class Process:
-        exitcode = -signal.SIGKILL
-
-        def join(self) -> None: ...
-
-    read, write = os.pipe()
-    os.close(write)
-    from multiprocessing.connection import Connection
-
-    record = json.loads(survey_run._answer(Connection(read), Process(), task))
-    assert record["verdict"] == "fault"
-    assert "killed by signal 9" in record["reason"]
+    assert records[0]["reason"] == "took longer than 0 s"
 
 
 def test_summary_counts_goals_and_takes_a_missing_figure_for_the_worst() -> None:

@@ -23,11 +23,11 @@ from neurolens.evaluate.experiment import default_experiment, read_experiment
 from neurolens.evaluate.measure import fit_and_measure
 from neurolens.evaluate.train import run_experiment
 from neurolens.evaluate.train_states import fit_and_measure_states, state_settings
+from neurolens.surrogates.file import pack, read_model
 from neurolens.surrogates.fit import ModelSettings, prepare
 from neurolens.surrogates.fits import checkpoint
 from neurolens.surrogates.pairs import make_pairs
 from neurolens.surrogates.states_fit import StateSettings
-from neurolens.surrogates.stored import load_fitted, pack
 
 pytestmark = pytest.mark.slow
 
@@ -283,7 +283,7 @@ def test_a_training_that_was_killed_is_taken_up_again(tmp_path: Path, monkeypatc
 
     def made(name: str) -> tuple[dict, str]:
         (file,) = (tmp_path / name).rglob("*.onnx")
-        card, core = load_model(file).card, load_fitted(file).core
+        card, core = load_model(file).card, read_model(file).at().core
         assert card["fit"].pop("seconds") > 0
         return card, json.dumps(pack(core))
 

@@ -28,6 +28,7 @@ from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays, trace
 from neurolens.render.pictures import make_aperture
 from neurolens.render.scene import load_scene
@@ -137,8 +138,11 @@ def paraxial_blur_mm(lens: Lens, distance_m: float, wavelength_nm: float = 550.0
 
 def test_blur_of_near_and_far_signs_is_first_order_when_stopped_down() -> None:
     efl_mm = 75.0
-    lens = read_lens(ROOT / "lenses" / "tronnier_double_gauss_100.toml").at(
-        focal_length_mm=efl_mm, f_number=11.0, focus_m=1.4
+    lens = set_lens(
+        read_lens(ROOT / "lenses" / "tronnier_double_gauss_100.toml"),
+        focal_length_mm=efl_mm,
+        f_number=11.0,
+        focus_m=1.4,
     )
     exact = camera("tronnier_double_gauss_100.toml", 11.0, (24.0, 16.0), 1.4, efl_mm)
     thin = camera("thin", 11.0, (24.0, 16.0), 1.4, efl_mm)
@@ -354,7 +358,7 @@ def test_an_anamorphic_lens_draws_upright_ovals() -> None:
 
 def _forward_spread(name: str, distance_m: float) -> NDArray[np.float64]:
     """Four standard deviations in x and y of the light of a point on the axis, traced through the exact lens."""
-    lens = read_lens(ROOT / "lenses" / f"{name}.toml").at(focus_m=math.inf)
+    lens = set_lens(read_lens(ROOT / "lenses" / f"{name}.toml"), focus_m=math.inf)
     assert lens.film_z_mm is not None
     start = lens.film_z_mm - 1e3 * distance_m
     places = torch.linspace(-1, 1, 151, dtype=torch.float64) * 20

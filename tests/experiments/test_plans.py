@@ -15,6 +15,7 @@ from neurolens.evaluate.footprints import distance_mm, places_of
 from neurolens.evaluate.plan import Choice
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.pupils import image_radius_mm
+from neurolens.optics.states import set_lens
 from neurolens.render.scene import load_scene
 
 SIDE, SEEDS = 56, 4
@@ -128,7 +129,7 @@ def test_two_outlines_of_one_pupil_are_one_camera() -> None:
 
 def test_scenes_suit_lenses() -> None:
     for name in ("phone_lens_6", "ogawa_zoom_70_200"):
-        lens = read_lens(f"lenses/{name}.toml").at()
+        lens = set_lens(read_lens(f"lenses/{name}.toml"))
         own = load_scene(lab.SCENES / "lights.toml").settings.camera
         shot = plans.suited(load_scene(lab.SCENES / "lights.toml"), lens).settings.camera
         assert shot.focus_m >= near_limit_m(lens) and shot.width == 1920

@@ -12,10 +12,11 @@ from neurolens.base.errors import InputError
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.states import set_lens
 
 
 def lens(name: str, **state: float) -> Lens:
-    return tabled(name).at(**state)
+    return set_lens(tabled(name), **state)
 
 
 def product(light: FilmLight) -> np.ndarray:
@@ -26,7 +27,7 @@ def product(light: FilmLight) -> np.ndarray:
 @pytest.mark.parametrize("radius_mm", [0.01, 3.0, 25.0])
 def test_a_hole_of_any_size_is_the_exact_double_integral(radius_mm: float) -> None:
     height = np.array([0.0, 4.0, 11.0, 30.0, 80.0])
-    light = film_light(pinhole(36.0, radius_mm).at(), height)
+    light = film_light(set_lens(pinhole(36.0, radius_mm)), height)
     np.testing.assert_allclose(light.irradiance, disc_irradiance(radius_mm, 36.0, height), rtol=1e-7)
     np.testing.assert_allclose(light.aperture, 1, rtol=1e-8)
     np.testing.assert_allclose(light.area_mm2, math.pi * radius_mm**2, rtol=1e-8)
@@ -63,7 +64,7 @@ def test_on_the_axis_it_is_pi_sin2_of_the_last_ray() -> None:
 
 def test_a_thin_singlet_with_a_small_stop_and_far_rims_falls_as_cos4() -> None:
     rows = (Surface(math.inf, 0.01, 1.0, stop=True), Surface(50.0, 0.2, 60.0, 1.5), Surface(-50.0, 50.0, 60.0))
-    singlet = Lens("thin", "", rows, 50.0).at()
+    singlet = set_lens(Lens("thin", "", rows, 50.0))
     height = np.array([0.0, 5.0, 12.0, 20.0])
     light = film_light(singlet, height)
     cos4 = np.cos(np.arctan(height / singlet.film_z_mm)) ** 4
@@ -117,7 +118,7 @@ def test_white_card_four_ways() -> None:
 @pytest.mark.parametrize("radius", [[], [1.0, 2.0], [0.0, -1.0], [0.0, math.nan], [[0.0]]])
 def test_radii_that_make_no_sense(radius: list[float]) -> None:
     with pytest.raises(InputError, match="film_radius_mm"):
-        film_light(pinhole(36.0, 1.0).at(), radius)
+        film_light(set_lens(pinhole(36.0, 1.0)), radius)
 
 
 def test_lenses_that_are_not_round_or_not_focused() -> None:
@@ -125,9 +126,9 @@ def test_lenses_that_are_not_round_or_not_focused() -> None:
     with pytest.raises(InputError, match="film_z_mm"):
         film_light(hole, [0.0])
     with pytest.raises(InputError, match="cylinders or blades"):
-        film_light(hole.at().with_aperture(Aperture(blades=5)), [0.0])
+        film_light(set_lens(hole).with_aperture(Aperture(blades=5)), [0.0])
     with pytest.raises(InputError, match="cylinders or blades"):
         film_light(lens("schneider_anamorphic_31"), [0.0])
-    shut = replace(hole.at(), surfaces=(replace(hole.surfaces[0], diameter_mm=0.0),))
+    shut = replace(set_lens(hole), surfaces=(replace(hole.surfaces[0], diameter_mm=0.0),))
     with pytest.raises(InputError, match="no ray passes"):
         film_light(shut, [0.0])

@@ -18,6 +18,7 @@ from neurolens.flare.sources import SceneLights
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
+from neurolens.optics.states import set_lens
 from neurolens.render.scene import load_scene
 from tests.flare.test_ghosts import LENSES, lens_of
 
@@ -25,7 +26,7 @@ CASE = Path(__file__).parents[3] / "shared/data/cases/render/area_light_flare.to
 
 
 def hexagonal(name: str, **state: float) -> Lens:
-    lens = read_lens(LENSES / f"{name}.toml").at(**({"focus_m": math.inf, "f_number": 8.0} | state))
+    lens = set_lens(read_lens(LENSES / f"{name}.toml"), **({"focus_m": math.inf, "f_number": 8.0} | state))
     return replace(lens, aperture=Aperture(blades=6))
 
 

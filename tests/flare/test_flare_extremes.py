@@ -22,6 +22,7 @@ from neurolens.flare.picture import Raster, ghost_picture, photon_picture
 from neurolens.flare.sources import highlights
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.states import set_lens
 from neurolens.render.pictures import read_exr, write_exr
 
 COOKE = ["flare", "cooke_triplet_50", "--bins", "2", "--cell", "4", "--width", "36", "--quiet"]
@@ -97,7 +98,7 @@ def test_nested_rings_take_memory_and_time_by_their_pixels(monkeypatch: pytest.M
 
 
 def cooke() -> Lens:
-    return read_lens(Path(__file__).parents[2] / "lenses" / "cooke_triplet_50.toml").at(focus_m=math.inf)
+    return set_lens(read_lens(Path(__file__).parents[2] / "lenses" / "cooke_triplet_50.toml"), focus_m=math.inf)
 
 
 def interrupted_after(seconds: float, words: list[str]) -> int:
@@ -164,7 +165,7 @@ def test_frames_end_when_asked_and_are_whole(tmp_path: Path, capsys: pytest.Capt
 
 def test_memory_does_not_grow_with_lights() -> None:
     """Twelve lights take what two take: films under way are bounded."""
-    lens = read_lens("lenses/cooke_triplet_50.toml").at(focus_m=math.inf)
+    lens = set_lens(read_lens("lenses/cooke_triplet_50.toml"), focus_m=math.inf)
     tracer, raster = GhostTracer(lens), Raster((36.0, 24.0), 360, 240)
     peaks = []
     for count in (2, 2, 12):  # the first compiles

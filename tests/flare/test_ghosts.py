@@ -11,16 +11,16 @@ import torch
 from experiments.radiometry import film_light
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.flare.ghosts import GhostTracer, Pair, Way, coated, ghost_pairs
+from neurolens.flare.ghosts import GhostTracer, Pair, coated, ghost_pairs
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.photons import PhotonTracer
 from neurolens.flare.picture import Raster, axis_irradiance, ghost_layout, ghost_picture, ghost_table
-from neurolens.flare.polarised import PolarisedTracer
 from neurolens.optics.apertures import Aperture
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Coating, Lens, Surface
 from neurolens.optics.sequence import follow, turning
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays, trace
 
 LENSES = Path(__file__).parents[2] / "lenses"
@@ -28,7 +28,7 @@ LENSES = Path(__file__).parents[2] / "lenses"
 
 def lens_of(name: str, **state: float) -> Lens:
     """A lens of the library, focused at infinity; for other tests of flare, too."""
-    return read_lens(LENSES / f"{name}.toml").at(focus_m=math.inf, **state)
+    return set_lens(read_lens(LENSES / f"{name}.toml"), focus_m=math.inf, **state)
 
 
 def double_gauss() -> Lens:
@@ -41,9 +41,9 @@ def plate(wide: float = 20.0) -> Lens:
     return Lens("plate", "", rows, 2.0, film_z_mm=20.0)
 
 
-def exact(lens: Lens, rays: np.ndarray, way: Way, wavelength_nm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def exact(lens: Lens, rays: np.ndarray, pair: Pair, wavelength_nm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Film points [2, N], power [N] and whether they arrive [N], in float64."""
-    steps = turning(len(lens.surfaces), way.reflections)
+    steps = turning(len(lens.surfaces), pair.reflections)
     found = follow(lens, Rays(*torch.from_numpy(rays.copy())), steps, wavelength_nm)
     assert lens.film_z_mm is not None
     way = (lens.film_z_mm - found.rays.z) / found.rays.dz
@@ -66,8 +66,8 @@ LETTER[5:45, 10:20] = LETTER[5:15, 10:40] = LETTER[22:30, 10:32] = True
 
 CASES = {
     "spheres": lambda: double_gauss(),
-    "blades": lambda: replace(double_gauss().at(f_number=5.6), aperture=Aperture(blades=6)),
-    "mask": lambda: replace(double_gauss().at(f_number=4.0), aperture=Aperture(mask=LETTER, rotation_deg=30.0)),
+    "blades": lambda: replace(set_lens(double_gauss(), f_number=5.6), aperture=Aperture(blades=6)),
+    "mask": lambda: replace(set_lens(double_gauss(), f_number=4.0), aperture=Aperture(mask=LETTER, rotation_deg=30.0)),
     "coated": lambda: coated(double_gauss(), "broadband"),
     "aspheres": lambda: lens_of("phone_lens_6"),
     "cylinders": lambda: lens_of("schneider_anamorphic_31"),
@@ -125,7 +125,7 @@ def test_a_plate_by_hand() -> None:
 def test_masks_are_those_of_their_lens() -> None:
     """Of two lenses with masks of one size, compiled alike, each keeps its own, whichever is traced."""
     masks = LETTER, LETTER[::-1, ::-1]
-    lenses = [replace(double_gauss().at(f_number=4.0), aperture=Aperture(mask=mask)) for mask in masks]
+    lenses = [replace(set_lens(double_gauss(), f_number=4.0), aperture=Aperture(mask=mask)) for mask in masks]
     tracers = [GhostTracer(lens, [Pair(11, 12)]) for lens in lenses]
     rays, _ = light_rays(lenses[0], Light(3.0, 2.0), 0, 20_000)
     for lens, tracer in zip(lenses, tracers, strict=True):
@@ -134,44 +134,6 @@ def test_masks_are_those_of_their_lens() -> None:
         assert 200 < found[1].sum() and np.mean(found[1] != (plain.status == 0).numpy()) < 1e-3
     through = PhotonTracer(lenses[0]).trace(rays, 550.0, most_reflections=0, seed=1).reflections.size
     assert 0.3 * found[1].sum() < through < found[1].sum()  # twelve bare surfaces
-
-
-@pytest.mark.parametrize("angle", [20.0, 50.0, 70.0])
-def test_a_polarised_ghost_by_hand(angle: float) -> None:
-    """Two Fresnel reflections at an angle inside a plate: the mean over s and p of T R R T, and what is absorbed."""
-    lens = plate()
-    grey = replace(lens, surfaces=(replace(lens.surfaces[0], absorption_per_mm=0.1), *lens.surfaces[1:]))
-    turn = math.radians(angle)
-    ray = np.array([[0.0, 0, -1, math.sin(turn) * 0.6, math.sin(turn) * 0.8, math.cos(turn)]]).T
-    cos_i, cos_t = math.cos(turn), math.sqrt(1 - (math.sin(turn) / 1.5) ** 2)
-    r_s = ((cos_i - 1.5 * cos_t) / (cos_i + 1.5 * cos_t)) ** 2
-    r_p = ((1.5 * cos_i - cos_t) / (1.5 * cos_i + cos_t)) ** 2
-    wide = [replace(s, diameter_mm=400.0) for s in grey.surfaces]
-    tracer = PolarisedTracer(replace(grey, surfaces=tuple(wide)))
-    start = tracer.start(ray)
-    found, plain = tracer.follow(start, 550.0, direct=True), super(PolarisedTracer, tracer).follow(start, 550.0)
-    ghost_power = sum((r * (1 - r)) ** 2 for r in (r_s, r_p)) / 2
-    assert found.power[0, 0] == pytest.approx(ghost_power * math.exp(-0.1 * 12 / cos_t), rel=2e-6)
-    through = sum((1 - r) ** 2 for r in (r_s, r_p)) / 2
-    assert found.power[1, 0] == pytest.approx(through * math.exp(-0.4 / cos_t), rel=2e-6)
-    np.testing.assert_array_equal(found.film_xy_mm[:1], plain.film_xy_mm)
-    mean = (r_s + r_p) / 2  # the average at each surface is another
-    assert plain.power[0, 0] / found.power[0, 0] == pytest.approx((mean * (1 - mean)) ** 2 / ghost_power, rel=2e-6)
-
-
-def test_polarised_tables_and_pictures() -> None:
-    """A picture's sum and a table's energy are those of the polarised rays; on the axis all is the same."""
-    lens = plate()
-    tracer, plain, raster = PolarisedTracer(lens), GhostTracer(lens), Raster((60.0, 40.0), 60, 40)
-    for light, least in ((Light(0.0, 0.0), 0.0), (Light(45.0, 0.0), 0.05)):
-        rays, _ = light_rays(lens, light, 0, 4096)
-        (mine,), (other,) = (ghost_table(t, light, 550.0) for t in (tracer, plain))
-        polarised, averaged = (t.trace(rays, 550.0, direct=True).power.astype(float).sum(1) for t in (tracer, plain))
-        assert mine.energy == pytest.approx(polarised[0] / polarised[1], rel=1e-6)
-        assert mine.centre_mm == pytest.approx(other.centre_mm, abs=1e-3) and mine.passed == other.passed
-        drawn = [ghost_picture(t, [light], raster, wavelengths=1, threads=1).sum() for t in (tracer, plain)]
-        assert drawn[0] / drawn[1] == pytest.approx(polarised[0] / averaged[0], rel=2e-3)
-        assert abs(drawn[0] / drawn[1] - 1) > least if least else drawn[0] == pytest.approx(drawn[1], rel=1e-5)
 
 
 def test_direct_light_is_the_plain_trace() -> None:
@@ -187,7 +149,7 @@ def test_direct_light_is_the_plain_trace() -> None:
 
 def test_energy_of_a_point_is_irradiance_times_pupil() -> None:
     """Light that gets through is that of the entrance pupil, pi (f / 2 N)^2."""
-    lens = double_gauss().at(f_number=4.0)
+    lens = set_lens(double_gauss(), f_number=4.0)
     rays, area = light_rays(lens, Light(0.0, 0.0), 0, 100_000)
     found = GhostTracer(lens, []).trace(rays, 587.6, direct=True)
     lit = found.power[0] > 0

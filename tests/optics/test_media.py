@@ -10,14 +10,16 @@ import numpy as np
 import pytest
 import torch
 
+from neurolens.analysis.breathing import breathing
 from neurolens.cameras.outline_cache import search_key
 from neurolens.graph.interpret import evaluate
-from neurolens.optics.focusing import axial_rays, breathing
+from neurolens.optics.focusing import axial_rays
 from neurolens.optics.glass import LINE_D_NM, index_of
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.lenswriter import write_lens
 from neurolens.optics.paraxial import chief_reach_mm, film_z_mm, first_order, image_z_mm
 from neurolens.optics.prescription import Lens, Medium, Surface
+from neurolens.optics.states import set_lens
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 from neurolens.optics.tracegraph import exact_graph
@@ -64,7 +66,7 @@ def test_one_surface_between_two_media_images_as_in_closed_form(front: float, be
     image = behind / (power - front / 1000.0)
     assert image_z_mm(lens, -1000.0) == pytest.approx(image, rel=1e-13)
     assert film_z_mm(lens, (1000.0 + image) / 1000) == pytest.approx(image, rel=1e-12)
-    focused = lens.at(focus_m=1.0)
+    focused = set_lens(lens, focus_m=1.0)
     assert focused.film_z_mm is not None
     traced = trace(focused, axial_rays(focused.with_stop_radius(1e-3), focused.film_z_mm - 1000.0), towards="film")
     r = traced.rays
@@ -111,7 +113,7 @@ def test_the_graph_of_a_lens_under_water_is_the_tracer() -> None:
     """Film in glass and object in water, dispersive both, at the film's edge and both ends of the spectrum."""
     lens = doublet()
     rows = (*lens.surfaces[:2], replace(lens.surfaces[2], n_d=1.5, V_d=60.0))
-    lens = replace(lens, surfaces=rows).at()
+    lens = set_lens(replace(lens, surfaces=rows))
     film_z = float(lens.film_z_mm or 0.0)
     rng = np.random.default_rng(1)
     film, pupil = rng.uniform(-8, 8, (2, 500)), rng.uniform(-7, 7, (2, 500))
@@ -140,7 +142,9 @@ def test_the_file_keeps_media_and_wavelengths(tmp_path: Path) -> None:
 
 
 def test_a_kept_outline_of_the_lens_in_air_is_not_taken_under_water() -> None:
-    keys = {search_key(doublet(m).at(), (400.0, 700.0), (0.5,)) for m in (WATER, Medium(), replace(WATER, V_d=None))}
+    keys = {
+        search_key(set_lens(doublet(m)), (400.0, 700.0), (0.5,)) for m in (WATER, Medium(), replace(WATER, V_d=None))
+    }
     assert len(keys) == 3
 
 
@@ -151,8 +155,8 @@ def test_first_order_data_stand_at_the_primary_wavelength_of_other_light() -> No
     assert (visible.reference_nm, visible.light_nm) == (LINE_D_NM, (400.0, 700.0))
     assert (infrared.reference_nm, infrared.light_nm) == (1550.0, (1500.0, 1600.0))
     assert first_order(infrared) == first_order(visible, 1550.0) != first_order(visible)
-    film = infrared.at(focus="best").film_z_mm
+    film = set_lens(infrared, focus="best").film_z_mm
     assert film is not None
     assert film == pytest.approx(
-        float(visible.at(focus="best", wavelength_nm=(1500.0, 1600.0)).film_z_mm or 0), rel=1e-5
+        float(set_lens(visible, focus="best", wavelength_nm=(1500.0, 1600.0)).film_z_mm or 0), rel=1e-5
     )

@@ -19,6 +19,7 @@ from neurolens.base import status as st
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays, Traced, trace
 
 ROOT = Path(__file__).parents[2]
@@ -210,7 +211,7 @@ def test_first_order_of_the_whole_set(name: str) -> None:
 @pytest.mark.parametrize("towards", ["film", "scene"])
 def test_float32_of_a_fast_lens_holds_a_twentieth_of_a_micrometre(towards: str) -> None:
     """35 mm f/1.2, two aspheres, 21 surfaces. The difference of two rounded roots at each surface gave 0.070 um."""
-    lens, g = tabled("canon_aspheric_50").scaled(0.7).at(f_number=1.2), generator()
+    lens, g = set_lens(tabled("canon_aspheric_50").scaled(0.7), f_number=1.2), generator()
     start = from_scene(lens, 40_000, g, slope=0.2) if towards == "film" else from_film(lens, 40_000, g)
     small, large = (trace(lens, r, 550.0, towards=towards) for r in both_precisions(start))  # type: ignore[arg-type]
     passed = (small.status == st.PASSED) & (large.status == st.PASSED)

@@ -10,6 +10,7 @@ from shipped import NAMES, tabled
 from neurolens.base.errors import InputError
 from neurolens.optics.paraxial import film_z_mm, first_order, stop_radius_mm
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays, trace
 
 INF = math.inf
@@ -80,7 +81,7 @@ def near_axis(lens: Lens, z: float, towards: str, height: float = 1e-4) -> tuple
 @pytest.mark.parametrize("focus_m", [INF, 30.0, 3.0])
 def test_exact_rays_near_the_axis_meet_in_focus(name: str, focus_m: float) -> None:
     """The object lies `focus_m` from the film, and the magnification is that of Newton's equation."""
-    lens = tabled(name).at(focus_m=focus_m)
+    lens = set_lens(tabled(name), focus_m=focus_m)
     f = first_order(lens).efl_mm
     # The angle at the film is small enough that spherical aberration leaves no trace: that of an r^3 only falls with
     # the height, not with its square.
@@ -113,19 +114,19 @@ def test_pupils_are_conjugates_of_the_stop(name: str) -> None:
 def test_f_number_sets_the_entrance_pupil(name: str) -> None:
     lens = tabled(name)
     for n in (2.0, 8.0, 22.0):
-        stopped = lens.at(f_number=n, focus_m=5.0)
+        stopped = set_lens(lens, f_number=n, focus_m=5.0)
         data = first_order(stopped)
         assert data.f_number == pytest.approx(n, rel=1e-12)
         assert data.entrance_pupil_diameter_mm == pytest.approx(abs(data.efl_mm) / n, rel=1e-12)
         assert stopped.stop_radius_mm == pytest.approx(stop_radius_mm(lens, n), rel=1e-12)
         # Focusing leaves the stop as it is, and the hash of the glass too.
-        assert stopped.at(focus_m=3.0).stop_radius_mm == stopped.stop_radius_mm
+        assert set_lens(stopped, focus_m=3.0).stop_radius_mm == stopped.stop_radius_mm
         assert stopped.sha256 == lens.sha256
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_scaling_scales_every_length(name: str) -> None:
-    lens = tabled(name).at(focus_m=8.0)
+    lens = set_lens(tabled(name), focus_m=8.0)
     small, data = lens.scaled(0.37), first_order(lens)
     for name, value in vars(first_order(small)).items():
         expected = getattr(data, name) * (1.0 if name == "f_number" else 0.37)
@@ -139,10 +140,10 @@ def test_nearer_than_four_focal_lengths_is_an_error_that_names_the_limit() -> No
     lens = thick(50, -50, 5, 1.5)
     data = first_order(lens)
     nearest = (4 * data.efl_mm + data.rear_principal_z_mm - data.front_principal_z_mm) / 1000
-    symmetric = lens.at(focus_m=nearest * (1 + 1e-12))
+    symmetric = set_lens(lens, focus_m=nearest * (1 + 1e-12))
     assert symmetric.film_z_mm == pytest.approx(data.rear_principal_z_mm + 2 * data.efl_mm, rel=1e-4)  # 1:1
     with pytest.raises(InputError, match=r"focus_m.*at least 0\.205 m"):
-        lens.at(focus_m=nearest * 0.999)
+        set_lens(lens, focus_m=nearest * 0.999)
 
 
 def test_far_objects_move_the_film_by_the_square_of_the_focal_length_over_their_distance() -> None:
@@ -156,12 +157,12 @@ def test_far_objects_move_the_film_by_the_square_of_the_focal_length_over_their_
 
 def test_a_diverging_lens_has_no_film_for_an_object_between_its_principal_planes() -> None:
     with pytest.raises(InputError, match="focus_m"):
-        thick(-50, 50, 60, 1.5).at(focus_m=1e-3)
+        set_lens(thick(-50, 50, 60, 1.5), focus_m=1e-3)
 
 
 def test_a_diverging_lens_cannot_be_scaled_to_a_positive_focal_length() -> None:
     with pytest.raises(InputError, match="focal_length_mm"):
-        thick(-50, 50, 5, 1.5).at(focal_length_mm=50.0)
+        set_lens(thick(-50, 50, 5, 1.5), focal_length_mm=50.0)
 
 
 def test_wavelength_shifts_the_focus() -> None:

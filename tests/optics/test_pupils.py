@@ -10,11 +10,7 @@ import pytest
 import torch
 from shipped import NAMES, focused, tabled
 
-from experiments.radiometry import film_light
-from neurolens.base.errors import InputError
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.pupil_methods import (
+from experiments.pupil_methods import (
     RadialPupil,
     global_exit_pupil,
     hull_disc,
@@ -24,7 +20,12 @@ from neurolens.optics.pupil_methods import (
     rear_rim,
     wu_exit_pupil,
 )
+from experiments.radiometry import film_light
+from neurolens.base.errors import InputError
+from neurolens.optics.paraxial import first_order
+from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.pupils import camera_rays, image_radius_mm, pupil_bounds, pupil_plane_z_mm
+from neurolens.optics.states import set_lens
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 
@@ -133,7 +134,7 @@ def test_a_cover_glass_on_the_film_changes_little(gap: float) -> None:
     back = tessar.film_z_mm - tessar.vertices_mm[-2]
     plate = Surface(math.inf, 3.0, 150.0, 1.5), Surface(math.inf, gap, 150.0)
     rows = [*rows, replace(last, thickness_mm=back - 3.0 / 1.5 - gap), *plate]
-    covered = replace(tessar, surfaces=tuple(rows), film_z_mm=None).at()
+    covered = set_lens(replace(tessar, surfaces=tuple(rows), film_z_mm=None))
     assert image_radius_mm(covered)[0] == pytest.approx(dark, rel=0.05)
     assert covered.film_z_mm - pupil_plane_z_mm(covered) > 10
 
@@ -150,7 +151,7 @@ METHODS: dict[str, Callable[[Lens, float], RadialPupil]] = {
 
 @cache
 def lens(name: str, efl_mm: float, f_number: float) -> Lens:
-    return tabled(name).at(focal_length_mm=efl_mm, f_number=f_number)
+    return set_lens(tabled(name), focal_length_mm=efl_mm, f_number=f_number)
 
 
 def rate_and_light(some: Lens, pupil: RadialPupil, count: int = 20_000) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.graph.program import FILM_Z, RAY, SCENE_RAY, STATUS, STOP_RADIUS, TRANSMITTANCE, WAVELENGTH
 from neurolens.graph.scalars import lower
-from neurolens.optics import shapes
+from neurolens.optics import tensors
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Coating, Lens, Surface
 from neurolens.optics.sag import sag_mm
@@ -247,7 +247,7 @@ def test_gradients_of_an_asphere_equal_finite_differences() -> None:
 
 
 def saved_bytes(polish: int, monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setattr(shapes, "POLISH", {torch.float64: polish, torch.float32: polish})
+    monkeypatch.setattr(tensors, "POLISH", {torch.float64: polish, torch.float32: polish})
     total = 0
 
     def pack(t: Tensor) -> Tensor:

@@ -9,12 +9,11 @@ import pytest
 import torch
 from shipped import NAMES, tabled
 
+from neurolens.analysis.breathing import breathing, field_change
 from neurolens.base.errors import InputError
 from neurolens.optics.focusing import (
     axial_rays,
     best_focus_z_mm,
-    breathing,
-    field_change,
     film_range_mm,
     focus_states,
     infinity_states,
@@ -28,6 +27,7 @@ from neurolens.optics.lenswriter import write_lens
 from neurolens.optics.paraxial import film_z_mm, first_order
 from neurolens.optics.prescription import Coating, Lens, Surface
 from neurolens.optics.sag import check_clearance
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays, trace
 
 ZOOMS = ("ogawa_zoom_70_200", "nikon_zoom_70_200", "nikon_zoom_14_24", "nikon_zoom_80_200", "itoh_zoom_100_146")
@@ -71,9 +71,9 @@ def magnification(lens: Lens, object_z_mm: float) -> float:
 def test_at_the_stated_focal_lengths_a_zoom_is_in_the_stated_states(name: str) -> None:
     lens = tabled(name)
     for state in infinity_states(lens):
-        named = lens.at(zoom=state.name)
+        named = set_lens(lens, zoom=state.name)
         for asked in (state.efl_mm, first_order(named).efl_mm, f"{state.efl_mm}"):
-            zoomed = lens.at(zoom=asked)
+            zoomed = set_lens(lens, zoom=asked)
             assert gaps(zoomed) == gaps(named)
             assert zoomed.film_z_mm == named.film_z_mm
             assert zoomed.stop_radius_mm == named.stop_radius_mm
@@ -87,7 +87,7 @@ def test_between_the_states_a_zoom_has_the_focal_length_asked_for_and_no_collisi
     low, high = known[0] * 1.002, known[-1] * 0.998
     for share in (0.0, 0.15, 0.4, 0.7, 1.0):
         asked = low * (high / low) ** share
-        zoomed = lens.at(zoom=asked)
+        zoomed = set_lens(lens, zoom=asked)
         assert first_order(zoomed).efl_mm == pytest.approx(asked, rel=1e-10)
         assert zoomed.film_z_mm == pytest.approx(first_order(zoomed).rear_focal_z_mm, abs=1e-9)
         check_clearance(zoomed.surfaces, name)
@@ -97,9 +97,9 @@ def test_between_the_states_a_zoom_has_the_focal_length_asked_for_and_no_collisi
 def test_the_film_of_a_zoom_stays_where_the_states_have_it() -> None:
     """The rear group of Ogawa's zoom stands still, and so does the front one: total length and back focus hold."""
     lens = tabled("ogawa_zoom_70_200")
-    states = [lens.at(zoom=c.name) for c in lens.configurations]
+    states = [set_lens(lens, zoom=c.name) for c in lens.configurations]
     for asked in (80, 100, 120, 150, 180):
-        zoomed = lens.at(zoom=asked)
+        zoomed = set_lens(lens, zoom=asked)
         assert min(map(back_mm, states)) - 1e-6 <= back_mm(zoomed) <= max(map(back_mm, states)) + 1e-6
         assert min(s.film_z_mm or 0 for s in states) - 1e-6 <= (zoomed.film_z_mm or 0) + 0.0
         assert (zoomed.film_z_mm or 0) <= max(s.film_z_mm or 0 for s in states) + 1e-6
@@ -117,10 +117,10 @@ def test_interpolated_values_stay_between_their_neighbours_and_keep_what_is_stat
 
 def test_gaps_move_smoothly_through_a_state() -> None:
     lens = tabled("nikon_zoom_14_24")
-    middle = lens.at(zoom="18mm")
+    middle = set_lens(lens, zoom="18mm")
     efl = first_order(middle).efl_mm
     for sign in (-1, 1):
-        beside = lens.at(zoom=efl * (1 + sign * 1e-5))
+        beside = set_lens(lens, zoom=efl * (1 + sign * 1e-5))
         assert gaps(beside) == pytest.approx(gaps(middle), abs=1e-3)
         assert beside.stop_radius_mm == pytest.approx(middle.stop_radius_mm, abs=1e-3)
 
@@ -133,9 +133,9 @@ def test_a_state_is_predicted_from_the_others(name: str, left_out: str, within_m
     """Ogawa's three moving groups leave a freedom that two states say little of: millimetres, but focal length and
     image hold all the same."""
     lens = tabled(name)
-    truth = lens.at(zoom=left_out)
+    truth = set_lens(lens, zoom=left_out)
     fewer = replace(lens, configurations=tuple(c for c in lens.configurations if c.name != left_out))
-    predicted = fewer.at(zoom=first_order(truth).efl_mm)
+    predicted = set_lens(fewer, zoom=first_order(truth).efl_mm)
     assert gaps(predicted) == pytest.approx(gaps(truth), abs=within_mm)
 
 
@@ -152,11 +152,11 @@ def test_a_state_is_predicted_from_the_others(name: str, left_out: str, within_m
 )
 def test_zoom_positions_that_are_none(name: str, zoom: str | float, expected: str) -> None:
     with pytest.raises(InputError, match=expected):
-        tabled(name).at(zoom=zoom)
+        set_lens(tabled(name), zoom=zoom)
 
 
 def test_a_derived_position_says_so_in_its_file(tmp_path: Path) -> None:
-    zoomed = tabled("ogawa_zoom_70_200").at(zoom=100)
+    zoomed = set_lens(tabled("ogawa_zoom_70_200"), zoom=100)
     write_lens(zoomed, tmp_path / "zoomed.toml")
     assert zoomed.derived in read_lens(tmp_path / "zoomed.toml").notes
 
@@ -166,7 +166,7 @@ def test_a_derived_position_says_so_in_its_file(tmp_path: Path) -> None:
     [("72mm", 72.1, 17.0), ("135mm", 135.0, 9.15), ("194mm", 194.01, 6.0)],
 )
 def test_zoom_states(configuration: str, efl_mm: float, half_field_deg: float) -> None:
-    zoomed = tabled("ogawa_zoom_70_200").at(zoom=configuration)
+    zoomed = set_lens(tabled("ogawa_zoom_70_200"), zoom=configuration)
     assert first_order(zoomed).efl_mm == pytest.approx(efl_mm, rel=0.001)
     assert first_order(zoomed).f_number == pytest.approx(2.8, rel=0.001)
     assert zoomed.half_field_deg == half_field_deg
@@ -177,8 +177,8 @@ def test_zoom_states(configuration: str, efl_mm: float, half_field_deg: float) -
 
 def test_size_by_focal_length_and_by_field() -> None:
     lens = tabled("laikin_double_gauss_50")
-    assert first_order(lens.at(focal_length_mm=35)).efl_mm == pytest.approx(35, rel=1e-12)
-    small = lens.at(field_deg=40)
+    assert first_order(set_lens(lens, focal_length_mm=35)).efl_mm == pytest.approx(35, rel=1e-12)
+    small = set_lens(lens, field_deg=40)
     assert small.image_radius_mm == lens.image_radius_mm == 21.6
     # 21.6 = f tan(20 degrees) but for 3% of distortion, and twice the field is about half the focal length.
     assert first_order(small).efl_mm == pytest.approx(21.6 / math.tan(math.radians(20)), rel=0.05)
@@ -186,8 +186,8 @@ def test_size_by_focal_length_and_by_field() -> None:
 
 def test_the_edge_of_the_image_circle_sees_the_field_asked_for() -> None:
     """A ray traced from the scene at half the field, through the stop's centre, lands on the image circle's edge."""
-    fisheye = tabled("muller_fisheye_100").at()
-    lens = replace(fisheye, image_radius_mm=21.6).at(field_deg=140)
+    fisheye = set_lens(tabled("muller_fisheye_100"))
+    lens = set_lens(replace(fisheye, image_radius_mm=21.6), field_deg=140)
     x = torch.linspace(-20, 60, 80001, dtype=torch.float64)
     angle = torch.tensor(math.radians(70), dtype=torch.float64)
     zero = torch.zeros_like(x)
@@ -220,7 +220,7 @@ def test_the_edge_of_the_image_circle_sees_the_field_asked_for() -> None:
 )
 def test_states_that_a_double_gauss_has_not(state: dict, expected: str) -> None:
     with pytest.raises(InputError, match=expected):
-        tabled("laikin_double_gauss_50").at(**state)
+        set_lens(tabled("laikin_double_gauss_50"), **state)
 
 
 # --- Stop
@@ -229,14 +229,14 @@ def test_states_that_a_double_gauss_has_not(state: dict, expected: str) -> None:
 def test_the_stop_of_a_state_is_the_source_s_and_f_numbers_hold_at_every_zoom() -> None:
     lens = tabled("nikon_zoom_14_24")
     for state in infinity_states(lens):
-        assert lens.at(zoom=state.name).stop_radius_mm == state.stop_diameter_mm / 2
-        assert first_order(lens.at(zoom=state.name)).f_number == pytest.approx(2.91, rel=0.03)
-        assert first_order(lens.at(zoom=state.name, f_number=8)).f_number == pytest.approx(8, rel=1e-12)
+        assert set_lens(lens, zoom=state.name).stop_radius_mm == state.stop_diameter_mm / 2
+        assert first_order(set_lens(lens, zoom=state.name)).f_number == pytest.approx(2.91, rel=0.03)
+        assert first_order(set_lens(lens, zoom=state.name, f_number=8)).f_number == pytest.approx(8, rel=1e-12)
 
 
 def test_a_stop_wider_than_the_rims_is_allowed_and_they_vignette() -> None:
     lens = tabled("laikin_double_gauss_50")
-    wide = lens.at(f_number=0.9)
+    wide = set_lens(lens, f_number=0.9)
     assert first_order(wide).f_number == pytest.approx(0.9, rel=1e-12)
     rays = axial_rays(wide, -math.inf)
     passed = trace(wide, rays, towards="film").status == 0
@@ -252,11 +252,11 @@ def test_pure_third_order_aberration_focuses_best_two_thirds_of_the_way() -> Non
     At f/10 fifth order is 1% of a singlet's aberration.
     """
     lens = singlet()
-    paraxial = lens.at().film_z_mm
+    paraxial = set_lens(lens).film_z_mm
     ray = Rays(*(torch.tensor([v], dtype=torch.float64) for v in (5.0, 0.0, -1.0, 0.0, 0.0, 1.0)))
     out = trace(lens, ray, towards="film").rays
     marginal = float(out.z - out.x * out.dz / out.dx)
-    best = lens.at(focus="best").film_z_mm
+    best = set_lens(lens, focus="best").film_z_mm
     assert marginal < best < paraxial
     assert (best - paraxial) / (marginal - paraxial) == pytest.approx(2 / 3, abs=0.01)
 
@@ -307,7 +307,7 @@ def test_best_focus_is_the_least_spot_of_two_hundred_films(name: str, focus_m: f
 
 
 def test_best_focus_weighs_colours_as_the_eye_does() -> None:
-    lens = tabled("thorlabs_lb1471_biconvex_50").at(f_number=16)
+    lens = set_lens(tabled("thorlabs_lb1471_biconvex_50"), f_number=16)
     blue, green, red = (best_focus_z_mm(lens, wavelength_nm=(nm, nm)) for nm in (450.0, 555.0, 650.0))
     assert blue < green < red
     assert best_focus_z_mm(lens) == pytest.approx(green, abs=0.05 * (red - blue))
@@ -332,7 +332,7 @@ def test_best_focus_weighs_colours_as_the_eye_does() -> None:
 def test_a_film_range_holds_best_focus_at_every_aperture_and_colour(name: str, focus_m: float) -> None:
     lens = tabled(name)
     internal = "nikon" in name
-    lens = lens.at(zoom=100.0, focus_m=focus_m, focus="internal") if internal else lens
+    lens = set_lens(lens, zoom=100.0, focus_m=focus_m, focus="internal") if internal else lens
     low, high = film_range_mm(lens, focus_m, (400.0, 700.0))
     assert low < (lens.film_z_mm if internal else film_z_mm(lens, focus_m)) < high
     found = [
@@ -346,7 +346,7 @@ def test_a_film_range_holds_best_focus_at_every_aperture_and_colour(name: str, f
 
 def test_a_shut_stop_has_no_best_focus() -> None:
     with pytest.raises(InputError, match="best"):
-        tabled("brendel_tessar_100").with_stop_radius(0.0).at(focus="best")
+        set_lens(tabled("brendel_tessar_100").with_stop_radius(0.0), focus="best")
 
 
 # --- Focus by moving groups
@@ -355,9 +355,9 @@ def test_a_shut_stop_has_no_best_focus() -> None:
 @pytest.mark.parametrize("name", INTERNAL)
 def test_focused_inside_near_rays_from_the_object_meet_on_a_film_that_stands_still(name: str) -> None:
     for zoom in [c.name for c in infinity_states(tabled(name))]:
-        infinity = tabled(name).at(zoom=zoom)
+        infinity = set_lens(tabled(name), zoom=zoom)
         for focus_m in (20.0, 3.0, 1.001 * nearest_focus_m(infinity)):
-            lens = infinity.at(focus_m=focus_m, focus="internal").with_stop_radius(1e-3)
+            lens = set_lens(infinity, focus_m=focus_m, focus="internal").with_stop_radius(1e-3)
             out = trace(lens, axial_rays(lens, lens.film_z_mm - 1000 * focus_m), towards="film")
             r = out.rays
             miss = torch.hypot(r.x + (lens.film_z_mm - r.z) * r.dx / r.dz, r.y + (lens.film_z_mm - r.z) * r.dy / r.dz)
@@ -383,7 +383,7 @@ def test_focused_inside_near_rays_from_the_object_meet_on_a_film_that_stands_sti
     ],
 )
 def test_magnifications_of_focus_states_are_those_the_source_states(name: str, state: str, stated: float) -> None:
-    lens = tabled(name).at(zoom=state)
+    lens = set_lens(tabled(name), zoom=state)
     near = next(c for c in lens.configurations if c.name == state)
     assert magnification(lens, -near.object_distance_mm) == pytest.approx(stated, rel=0.006)
     data = first_order(in_state(tabled(name), near))
@@ -391,15 +391,15 @@ def test_magnifications_of_focus_states_are_those_the_source_states(name: str, s
     assert paraxial == pytest.approx(stated, rel=0.02)
     # The path from infinity passes through the state.
     focus_m = max((lens.film_z_mm + near.object_distance_mm) / 1000, nearest_focus_m(lens))
-    again = lens.at(focus_m=focus_m, focus="internal")
+    again = set_lens(lens, focus_m=focus_m, focus="internal")
     assert gaps(again) == pytest.approx(gaps(lens), abs=0.01)
 
 
 def test_between_zoom_states_focusing_is_interpolated_too() -> None:
     lens = tabled("nikon_zoom_70_200")
     for asked in (90.0, 160.0):
-        zoomed = lens.at(zoom=asked)
-        near = lens.at(zoom=asked, focus_m=1.2, focus="internal")
+        zoomed = set_lens(lens, zoom=asked)
+        near = set_lens(lens, zoom=asked, focus_m=1.2, focus="internal")
         assert near.film_z_mm == pytest.approx(zoomed.film_z_mm, abs=0.02)
         assert near.derived
         check_clearance(near.surfaces, "near")
@@ -408,38 +408,38 @@ def test_between_zoom_states_focusing_is_interpolated_too() -> None:
 
 
 def test_focusing_again_starts_from_infinity() -> None:
-    lens = tabled("sony_sonnar_55").at()
-    near = lens.at(focus_m=1.8, focus="internal")
-    assert gaps(near.at()) == gaps(lens)
-    again, once = (given.at(focus_m=4.0, focus="internal") for given in (near, lens))
+    lens = set_lens(tabled("sony_sonnar_55"))
+    near = set_lens(lens, focus_m=1.8, focus="internal")
+    assert gaps(set_lens(near)) == gaps(lens)
+    again, once = (set_lens(given, focus_m=4.0, focus="internal") for given in (near, lens))
     assert gaps(again) == pytest.approx(gaps(once), abs=1e-12)
-    assert gaps(lens.at(focus="internal")) == gaps(lens)
-    by_name = lens.at(zoom="1.7m")
-    assert gaps(by_name.at()) == gaps(lens)
+    assert gaps(set_lens(lens, focus="internal")) == gaps(lens)
+    by_name = set_lens(lens, zoom="1.7m")
+    assert gaps(set_lens(by_name)) == gaps(lens)
     # f-numbers are those of infinity, wherever the groups stand.
-    for closed in (by_name.at(f_number=4), near.at(f_number=4, focus_m=2, focus="internal")):
-        assert closed.stop_radius_mm == pytest.approx(lens.at(f_number=4).stop_radius_mm, rel=1e-12)
+    for closed in (set_lens(by_name, f_number=4), set_lens(near, f_number=4, focus_m=2, focus="internal")):
+        assert closed.stop_radius_mm == pytest.approx(set_lens(lens, f_number=4).stop_radius_mm, rel=1e-12)
 
 
 def test_size_and_internal_focus_go_together() -> None:
     lens = tabled("sony_sonnar_55")
-    twice = lens.at(focal_length_mm=2 * first_order(lens).efl_mm, focus_m=4.0, focus="internal")
-    once = lens.at(focus_m=2.0, focus="internal")
+    twice = set_lens(lens, focal_length_mm=2 * first_order(lens).efl_mm, focus_m=4.0, focus="internal")
+    once = set_lens(lens, focus_m=2.0, focus="internal")
     assert gaps(twice) == pytest.approx([2 * g for g in gaps(once)], rel=1e-9)
 
 
 def test_nearer_than_the_nearest_is_an_error_that_names_it() -> None:
-    lens = tabled("sony_sonnar_55").at()
+    lens = set_lens(tabled("sony_sonnar_55"))
     nearest = nearest_focus_m(lens)
     assert nearest == pytest.approx(1.71, abs=0.02)
-    lens.at(focus_m=nearest, focus="internal")
+    set_lens(lens, focus_m=nearest, focus="internal")
     with pytest.raises(InputError, match=r"1\.71"):
-        lens.at(focus_m=0.99 * nearest, focus="internal")
+        set_lens(lens, focus_m=0.99 * nearest, focus="internal")
     with pytest.raises(InputError) as caught:
-        lens.at(focus_m=nearest * (1 - 1e-6), focus="internal")
+        set_lens(lens, focus_m=nearest * (1 - 1e-6), focus="internal")
     limit = float(caught.value.expected.split()[2])
     assert nearest <= limit < 1.001 * nearest  # rounded up: what is printed is allowed
-    lens.at(focus_m=limit, focus="internal")
+    set_lens(lens, focus_m=limit, focus="internal")
 
 
 # --- Breathing
@@ -460,9 +460,9 @@ def test_a_thin_lens_breathes_by_its_extension() -> None:
 
 
 def test_breathing_of_groups_that_move_inside_is_traced_magnification() -> None:
-    lens = tabled("nikon_zoom_70_200").at(zoom="196mm")
+    lens = set_lens(tabled("nikon_zoom_70_200"), zoom="196mm")
     near = breathing(lens, [1.2], "internal")[0]
-    state = lens.at(focus_m=1.2, focus="internal")
+    state = set_lens(lens, focus_m=1.2, focus="internal")
     assert near.magnification == pytest.approx(magnification(state, state.film_z_mm - 1200), rel=1e-6)
     film = breathing(lens, [math.inf, 1.2])
     inside = breathing(lens, [math.inf, 1.2], "internal")
@@ -475,9 +475,9 @@ def test_breathing_of_groups_that_move_inside_is_traced_magnification() -> None:
 def test_every_shipped_lens_with_states_reaches_all_of_them() -> None:
     for lens in map(tabled, NAMES):
         for state in lens.configurations:
-            assert lens.at(zoom=state.name).film_z_mm is not None
+            assert set_lens(lens, zoom=state.name).film_z_mm is not None
         for state in focus_states(lens):
-            assert nearest_focus_m(lens.at(zoom=state.name)) > 0
+            assert nearest_focus_m(set_lens(lens, zoom=state.name)) > 0
 
 
 def test_a_named_state_does_not_depend_on_the_way_to_it() -> None:
@@ -485,24 +485,27 @@ def test_a_named_state_does_not_depend_on_the_way_to_it() -> None:
         table = tabled(name)
         for state in table.configurations:
             for other in table.configurations:
-                direct, round_about = table.at(zoom=state.name), table.at(zoom=other.name).at(zoom=state.name)
+                direct, round_about = (
+                    set_lens(table, zoom=state.name),
+                    set_lens(set_lens(table, zoom=other.name), zoom=state.name),
+                )
                 assert direct.half_field_deg == round_about.half_field_deg, (name, other.name, state.name)
                 assert direct.f_number == round_about.f_number, (name, other.name, state.name)
                 assert direct.vertices_mm == pytest.approx(round_about.vertices_mm, abs=1e-12)
 
 
 def test_closing_the_stop_leaves_the_focus() -> None:
-    lens = tabled("laikin_double_gauss_50").at(focus_m=1.0)
-    closed = lens.at(f_number=8)
+    lens = set_lens(tabled("laikin_double_gauss_50"), focus_m=1.0)
+    closed = set_lens(lens, f_number=8)
     assert closed.film_z_mm == lens.film_z_mm and first_order(closed).f_number == pytest.approx(8)
-    assert closed == tabled("laikin_double_gauss_50").at(focus_m=1.0, f_number=8)
-    zoom = tabled("nikon_zoom_70_200").at(zoom="135mm", focus_m=2.0, focus="internal")
-    assert zoom.at(f_number=8).vertices_mm == zoom.vertices_mm
+    assert closed == set_lens(tabled("laikin_double_gauss_50"), focus_m=1.0, f_number=8)
+    zoom = set_lens(tabled("nikon_zoom_70_200"), zoom="135mm", focus_m=2.0, focus="internal")
+    assert set_lens(zoom, f_number=8).vertices_mm == zoom.vertices_mm
 
 
 def test_a_shut_stop_opens_again() -> None:
     shut = tabled("laikin_double_gauss_50").with_stop_radius(0.0)
-    assert first_order(shut.at(f_number=4)).f_number == pytest.approx(4)
+    assert first_order(set_lens(shut, f_number=4)).f_number == pytest.approx(4)
 
 
 @pytest.mark.parametrize("factor", [0.0, -1.0, math.nan, math.inf])

@@ -18,6 +18,7 @@ from neurolens.optics.lenswriter import write_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Surface
 from neurolens.optics.pupils import camera_rays, pupil_plane_z_mm
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays, trace
 from neurolens.render.pictures import make_aperture, read_mask
 
@@ -60,13 +61,13 @@ def test_a_pinhole_maps_tangents_and_knows_no_focus(tmp_path: Path) -> None:
     assert (data.efl_mm, data.f_number, data.exit_pupil_z_mm, data.entrance_pupil_z_mm) == (50.0, 100.0, 0.0, 0.0)
     for focus_m in (math.inf, 1.0, 0.01):
         for focus in ("paraxial", "best"):
-            state = hole.at(focus_m=focus_m, focus=focus)  # type: ignore[arg-type]
+            state = set_lens(hole, focus_m=focus_m, focus=focus)  # type: ignore[arg-type]
             assert state.film_z_mm == 50.0
-    assert hole.at(f_number=200).stop_radius_mm == 0.125
-    assert first_order(hole.at(focal_length_mm=25)).efl_mm == pytest.approx(25, rel=1e-12)
-    assert first_order(hole.at(field_deg=60)).efl_mm == pytest.approx(20 / math.tan(math.radians(30)), rel=1e-9)
+    assert set_lens(hole, f_number=200).stop_radius_mm == 0.125
+    assert first_order(set_lens(hole, focal_length_mm=25)).efl_mm == pytest.approx(25, rel=1e-12)
+    assert first_order(set_lens(hole, field_deg=60)).efl_mm == pytest.approx(20 / math.tan(math.radians(30)), rel=1e-9)
     with pytest.raises(InputError, match="no focus states"):
-        hole.at(focus="internal", focus_m=2.0)
+        set_lens(hole, focus="internal", focus_m=2.0)
     write_lens(replace(hole, source="a tin"), tmp_path / "hole.toml")
     assert first_order(read_lens(tmp_path / "hole.toml")).efl_mm == 50.0
 
@@ -79,11 +80,11 @@ def test_plates_before_and_behind_a_pinhole_shorten_its_distances() -> None:
     rows = replace(hole.surfaces[0], thickness_mm=1.0), glass, replace(air, thickness_mm=film_z - 1.0 - PLATE_MM)
     rear = replace(hole, surfaces=rows)
     assert first_order(rear).efl_mm == pytest.approx(50.0, rel=1e-12)
-    assert rear.at().film_z_mm == pytest.approx(film_z, rel=1e-12)
+    assert set_lens(rear).film_z_mm == pytest.approx(film_z, rel=1e-12)
     slope = 1e-4
     ray = Rays(*(torch.tensor([v], dtype=torch.float64) for v in (-slope, 0.0, -1.0, slope, 0.0, 1.0)))
     out = trace(rear, ray, towards="film").rays
-    height = float(out.x + (rear.at().film_z_mm - out.z) * out.dx / out.dz)  # type: ignore[operator]
+    height = float(out.x + (set_lens(rear).film_z_mm - out.z) * out.dx / out.dz)  # type: ignore[operator]
     assert height == pytest.approx(50.0 * slope, rel=1e-6)
 
 
@@ -185,7 +186,7 @@ def test_torch_and_numpy_agree_and_nan_is_outside(shape: Aperture, dtype: torch.
 @pytest.mark.parametrize("towards", ["scene", "film"])
 def test_the_tracer_passes_the_share_of_the_round_stop(shape: Aperture, towards: str) -> None:
     """Near the axis the stop's image is sharp, so that even points of the pupil are even points of the stop."""
-    lens = tabled("laikin_double_gauss_50").at(f_number=11)
+    lens = set_lens(tabled("laikin_double_gauss_50"), f_number=11)
     x, y = (torch.tensor(v) for v in square_of_points(400))
     plane, film_z, reach = pupil_plane_z_mm(lens), lens.film_z_mm, 0.55 * first_order(lens).exit_pupil_diameter_mm
     rays = camera_rays(torch.zeros_like(x), torch.zeros_like(x), film_z, reach * x, reach * y, plane)
@@ -208,7 +209,7 @@ def test_round_stops_and_scale_know_nothing_of_blades() -> None:
     lens = tabled("brendel_tessar_100")
     bladed = lens.with_aperture(Aperture(5))
     assert bladed.sha256 == lens.sha256
-    assert bladed.at(focal_length_mm=50).aperture == Aperture(5)
+    assert set_lens(bladed, focal_length_mm=50).aperture == Aperture(5)
     assert bladed.with_aperture(None) == lens
 
 

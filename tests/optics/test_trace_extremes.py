@@ -17,12 +17,13 @@ from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.pupils import camera_rays
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays, film_derivatives, trace, trace_differentials
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", NeurolensWarning)  # glasses of unknown dispersion
-    DOUBLE_GAUSS = tabled("laikin_double_gauss_50").at()
-    FISHEYE = tabled("muller_fisheye_100").at()
+    DOUBLE_GAUSS = set_lens(tabled("laikin_double_gauss_50"))
+    FISHEYE = set_lens(tabled("muller_fisheye_100"))
 STOP = Surface(math.inf, 1, 10, stop=True)
 PLATE = Lens("plate", "", (Surface(math.inf, 5, 20, 1.5), Surface(math.inf, 5, 20), STOP), 2.0)
 BALL = Lens("ball", "", (Surface(10.0, 20, 19.9, 1.5), Surface(-10.0, 5, 19.9), STOP), 2.0)
@@ -256,7 +257,7 @@ def lenses() -> dict[str, Lens]:
 
 def film_rays(lens: Lens, fx: Tensor, fy: Tensor, px: Tensor, py: Tensor) -> tuple[Rays, Tensor]:
     """Camera rays towards points in the rear vertex plane, and their distances to these."""
-    film_z, pupil_z = lens.at().film_z_mm, float(lens.vertices_mm[len(lens.surfaces) - 1])
+    film_z, pupil_z = set_lens(lens).film_z_mm, float(lens.vertices_mm[len(lens.surfaces) - 1])
     rays = camera_rays(fx, fy, film_z, px, py, pupil_z)
     return rays, torch.sqrt((px - fx) ** 2 + (py - fy) ** 2 + (film_z - pupil_z) ** 2)
 
@@ -282,7 +283,7 @@ def test_equal_to_central_differences(name: str) -> None:
 
 
 def test_near_the_axis_of_a_focused_lens_the_direction_turns_by_one_over_the_focal_length() -> None:
-    lens = tabled("laikin_double_gauss_50").at()
+    lens = set_lens(tabled("laikin_double_gauss_50"))
     zero = torch.zeros(1, dtype=torch.float64)
     rays, distance = film_rays(lens, zero, zero, zero, zero)
     dx, dy = trace_differentials(lens, rays, film_derivatives(rays, distance)).derivatives
@@ -308,7 +309,7 @@ def test_directions_stay_unit_vectors_and_lost_rays_have_no_derivative() -> None
 
 
 def test_float32_gives_the_same_to_rounding() -> None:
-    lens = tabled("laikin_double_gauss_50").at()
+    lens = set_lens(tabled("laikin_double_gauss_50"))
     points = [torch.linspace(-9, 9, 50, dtype=torch.float64) * k for k in (1.0, 0.5, 0.3, -0.4)]
     found = []
     for dtype in (torch.float64, torch.float32):

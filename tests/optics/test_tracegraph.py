@@ -20,6 +20,7 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import film_z_mm
 from neurolens.optics.prescription import Coating, Configuration, Lens, Surface
 from neurolens.optics.pupils import camera_rays, image_radius_mm, pupil_plane_z_mm
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import trace
 from neurolens.optics.tracegraph import exact_graph
 
@@ -59,7 +60,7 @@ def corner_rays(lens: Lens, wavelength_nm: float, count: int = 3000) -> tuple[di
 @pytest.mark.parametrize("coat, absorb", [(False, False), (True, False), (False, True), (True, True)])
 @pytest.mark.parametrize("name", ["laikin_double_gauss_50", "canon_aspheric_50", "shimizu_fisheye_220"])
 def test_transmittance_is_that_of_the_tracer(name: str, coat: bool, absorb: bool, wavelength_nm: float) -> None:
-    lens = with_losses(read_lens(LENSES / f"{name}.toml").at(), coat, absorb)
+    lens = with_losses(set_lens(read_lens(LENSES / f"{name}.toml")), coat, absorb)
     inputs, plane = corner_rays(lens, wavelength_nm)
     fx, fy, px, py, nm = (torch.from_numpy(row) for row in inputs["rays"])
     film_z, graph = float(inputs["film_z_mm"][0, 0]), exact_graph(lens, plane, LIGHT_NM)
@@ -94,6 +95,6 @@ def test_states_have_one_structure_where_a_gap_equals_another_figure_in_one_of_t
     )
     states = (Configuration("near", 30.0, ((1, 2.0),)), Configuration("far", 32.0, ((1, 4.5),)))
     lens = Lens("zoom", "made up", rows, 4.0, configurations=states)
-    graphs = [exact_graph(lens.at(zoom=name), 0.0, LIGHT_NM) for name in ("near", "far")]
+    graphs = [exact_graph(set_lens(lens, zoom=name), 0.0, LIGHT_NM) for name in ("near", "far")]
     assert same_structure([pruned(g) for g in graphs])
     assert lower(graphs).tables == 2

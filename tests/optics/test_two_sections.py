@@ -23,6 +23,7 @@ from neurolens.optics.lenswriter import write_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.sag import meet_front, sag_and_derivatives, sag_mm
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays, trace
 from neurolens.surrogates.assemble import Form, sag
 
@@ -203,13 +204,13 @@ def test_ideal_lenses_add_up_to_first_order() -> None:
     data = first_order(pair)
     assert 1 / data.efl_mm == pytest.approx(1 / 80 - 1 / 120 + 20 / (80 * 120), rel=1e-14)
     assert data.back_focus_mm == pytest.approx(data.efl_mm * (1 - 20 / 80), rel=1e-14)
-    far = pair.at(focus_m=math.inf)
+    far = set_lens(pair, focus_m=math.inf)
     assert far.film_z_mm == pytest.approx(20 + data.back_focus_mm)
     assert trace(far, random_rays(50), towards="film", transmittance=True).transmittance.max() == 1  # type: ignore[union-attr]
 
 
 def test_what_an_ideal_lens_has_not_is_refused_by_name() -> None:
-    lens = replace(ideal(), half_field_deg=10.0).at(focus_m=math.inf)
+    lens = set_lens(replace(ideal(), half_field_deg=10.0), focus_m=math.inf)
     with pytest.raises(InputError, match=r"surface 0, focal_mm: got 50.0, expected surfaces of glass.*reflections"):
         GhostTracer(lens)
     with pytest.raises(InputError, match="no optical path"):

@@ -3,7 +3,6 @@
 A lens of the project, written in the formats of other programs, gives what its own file gives.
 """
 
-import argparse
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,6 @@ from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.lensname import lens_id_of, resolve, split_kind
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cli import main
-from neurolens.commands.farm import _placed
 from neurolens.commands.plan import shipped_models
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.lenswriter import write_lens
@@ -46,7 +44,6 @@ COMMANDS = {
     "export camera": "export {} --to glsl --camera -o NAME.glsl",
     "blender": "blender add {} --to NAME",
     "view": "view {} -o NAME.html",
-    "bench": "bench {} -o NAME",
     "train": "train --lens {} -o NAME",
     "experiment": "train EXPERIMENT -o NAME",
     "library": "library {} -o NAME",
@@ -158,9 +155,9 @@ def test_a_run_keeps_the_lens_in_our_format_and_a_model_knows_its_lens(
     assert read_lens(kept).sha256 == read_any(files["zmx"]).sha256
     capsys.readouterr()
     from neurolens.evaluate.check import lens_of_card
-    from neurolens.modelfile.onnxfile import read_checked
+    from neurolens.modelfile.metadata import read_card
 
-    card = read_checked(model)[1]
+    card = read_card(model)
     assert card["lens"]["id"] == "Tessar_100mm_1_4_5_v2_0"
     for lens in (None, files["zmx"], files["toml"]):
         assert lens_of_card(card, lens, model).sha256 == card["lens"]["sha256"]
@@ -227,13 +224,6 @@ def test_what_a_file_lacks_is_asked_of_convert(tessar: Lens, tmp_path: Path) -> 
         read_any(file, any_format.Given())
     assert "convert" not in str(plain.value)
     assert read_any(file, any_format.Given(f_number=8.0)).f_number == 8
-
-
-def test_paths_of_a_worker_s_cameras(tmp_path: Path) -> None:
-    assert _placed("camera", "thin") == "thin" and _placed("camera", "fisheye-equisolid") == "fisheye-equisolid"
-    assert _placed("camera", "fused:/a/1:2 lens", Path("/w")) == "fused:/w/a/1:2 lens"
-    args = argparse.Namespace(camera="/a/lens.zmx")
-    assert {k: _placed(k, v, Path("/w")) for k, v in vars(args).items()} == {"camera": "/w/a/lens.zmx"}
 
 
 def test_one_file_is_warned_of_once_in_a_command(files: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:

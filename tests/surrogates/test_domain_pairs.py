@@ -10,12 +10,14 @@ import pytest
 import torch
 
 from neurolens.base.errors import InputError
+from neurolens.optics.film_plane import PupilBounds
 from neurolens.optics.glass import LINE_D_NM
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import film_z_mm, first_order
 from neurolens.optics.prescription import Lens
-from neurolens.optics.pupils import PupilBounds
-from neurolens.surrogates.domain import Domain, domain_from_camera, domain_of, focused_plane_z_mm, sample_domain
+from neurolens.optics.states import set_lens
+from neurolens.surrogates.domain import domain_from_camera, domain_of, focused_plane_z_mm, sample_domain
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import SPLITS, PairSettings, RayPairs, load_pairs, make_pairs, save_pairs, trace_pairs
 from neurolens.surrogates.targets import film_equivalent_weights
 
@@ -25,7 +27,7 @@ DOMAIN = Domain(20.0, (50.0, 55.0), (math.inf, 0.5), 10.0, 7.35, (400.0, 700.0),
 
 
 def singlet() -> Lens:
-    return read_lens(ROOT / "thorlabs_lb1471_biconvex_50.toml").at(f_number=4.0)
+    return set_lens(read_lens(ROOT / "thorlabs_lb1471_biconvex_50.toml"), f_number=4.0)
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +100,7 @@ def test_near_objects_before_the_plane_in_focus_keep_their_place() -> None:
 
 
 def test_one_shot_needs_less_than_the_whole_lens() -> None:
-    lens = read_lens(ROOT / "brendel_tessar_100.toml").at(focal_length_mm=50)
+    lens = set_lens(read_lens(ROOT / "brendel_tessar_100.toml"), focal_length_mm=50)
     full = domain_of(lens, focus_m=(math.inf, 0.7))
     stopped, shot = domain_from_camera(lens, film_mm=(24.0, 16.0), focus_m=2.0, f_number=8.0, wavelength_nm=(500, 600))
     assert first_order(stopped).f_number == pytest.approx(8.0)
@@ -108,7 +110,7 @@ def test_one_shot_needs_less_than_the_whole_lens() -> None:
     near, far = shot.film_z_mm
     assert near < film_z_mm(lens, 2.0) < far and far - near < 0.2 * (full.film_z_mm[1] - full.film_z_mm[0])
     assert full.film_z_mm[0] < near and far < full.film_z_mm[1]
-    assert near < stopped.at(f_number=8.0, focus_m=2.0, focus="best").film_z_mm < far
+    assert near < set_lens(stopped, f_number=8.0, focus_m=2.0, focus="best").film_z_mm < far
     assert shot.wavelength_nm == (500, 600)
     # A film larger than the image: the image rules.
     _, wide = domain_from_camera(lens, film_mm=(60.0, 60.0), focus_m=2.0)
@@ -130,7 +132,7 @@ def test_infinity_focus_has_no_plane() -> None:
 
 
 def test_without_dispersion_there_is_one_wavelength() -> None:
-    fisheye = read_lens(ROOT / "muller_fisheye_100.toml").at(focal_length_mm=14, f_number=16)
+    fisheye = set_lens(read_lens(ROOT / "muller_fisheye_100.toml"), focal_length_mm=14, f_number=16)
     plain = replace(fisheye, surfaces=tuple(replace(s, V_d=None) for s in fisheye.surfaces))
     domain = domain_of(plain, film_radius_mm=5.0)
     assert domain.wavelength_nm == (LINE_D_NM, LINE_D_NM)
@@ -212,7 +214,7 @@ def test_pairs_of_another_lens_are_refused(pairs: RayPairs, tmp_path: Path) -> N
     save_pairs(pairs, path)
     with pytest.raises(InputError, match="lens_sha256"):
         load_pairs(path, pairs.lens.scaled(1.001))
-    load_pairs(path, pairs.lens.at(f_number=8.0, focus_m=2.0))  # stop and focus are no part of the glass
+    load_pairs(path, set_lens(pairs.lens, f_number=8.0, focus_m=2.0))  # stop and focus are no part of the glass
 
 
 @pytest.mark.parametrize("kind", ["missing", "empty", "text", "truncated", "flipped", "pickled", "no header", "schema"])

@@ -10,6 +10,7 @@ import pytest
 import torch
 from lens_models import LENSES, prepared
 
+from experiments.methods import NETWORK_ABLATIONS, POLYNOMIAL_ABLATIONS, ablated
 from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import read_lens
 from neurolens.surrogates.bases import invariant_exponents, raw_exponents
@@ -19,7 +20,6 @@ from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.fits import checkpoint
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.settings import NETWORK_ABLATIONS, POLYNOMIAL_ABLATIONS, ablated
 from neurolens.surrogates.targets import film_equivalent, targets_of
 
 

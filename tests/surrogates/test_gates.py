@@ -15,14 +15,15 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens, Surface
+from neurolens.optics.states import set_lens
 from neurolens.surrogates.cores import InvariantPolynomial
-from neurolens.surrogates.domain import SPARSE, Domain, FilmRays, domain_of, lit_share, sample_domain, sample_lit
+from neurolens.surrogates.domain import SPARSE, FilmRays, domain_of, lit_share, sample_domain, sample_lit
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.fits.polynomial import fit_polynomial
 from neurolens.surrogates.gates import GateFit, boundary_rays, choose_gates, gate_reach, gate_values
 from neurolens.surrogates.lightfield import LightField
-from neurolens.surrogates.model import Gate, LensModel
+from neurolens.surrogates.model import Domain, Gate, LensModel
 from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, reached, trace_pairs
 from neurolens.surrogates.targets import targets_of
 
@@ -154,7 +155,7 @@ RAYS = PairSettings(train=4000, held_out=100, rim=4000)
 
 @cache
 def lens(name: str = "laikin_double_gauss_50") -> Lens:
-    return read_lens(LENSES / f"{name}.toml").at()
+    return set_lens(read_lens(LENSES / f"{name}.toml"))
 
 
 @cache

@@ -18,8 +18,8 @@ from neurolens.surrogates.bases import invariant_exponents, monomials, solve, ve
 from neurolens.surrogates.domain import FilmRays, domain_of
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.fits.planes import fit_planes, shifted
-from neurolens.surrogates.lightfield import Encoding, angle_vector
-from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.lightfield import angle_vector
+from neurolens.surrogates.model import Encoding, LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.targets import targets_of
 

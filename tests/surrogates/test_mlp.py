@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from experiments.published import PublishedSettings, fit_any
 from neurolens.base.errors import InputError
 from neurolens.base.status import OUTSIDE_DOMAIN
 from neurolens.cameras.model import load_model
@@ -17,7 +18,6 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Network, Residual
 from neurolens.surrogates.domain import domain_of, sample_domain
 from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.fit import fit_model
 from neurolens.surrogates.fits import checkpoint
 from neurolens.surrogates.fits import network as networks
 from neurolens.surrogates.fits.network import fit_network, with_boundary_terms
@@ -145,7 +145,7 @@ def test_no_clock_decides_a_fit_and_its_progress_grows_to_one(singlet, monkeypat
     settings = {
         "network": ModelSettings("mlp", units=4, layers=1, steps=25),
         "zones": ModelSettings("mlp", units=3, layers=1, steps=4, partitions=2),
-        "published": ModelSettings("neurolens2017", basis="raw", units=8, layers=2, steps=40, partitions=2),
+        "published": PublishedSettings("neurolens2017", basis="raw", units=8, layers=2, steps=40, partitions=2),
     }[kind]
     found = []
     for each_look in (1e-3, 1e9):  # seconds that go by, as the fit sees it
@@ -153,7 +153,7 @@ def test_no_clock_decides_a_fit_and_its_progress_grows_to_one(singlet, monkeypat
         for clock in ("monotonic", "process_time", "perf_counter", "thread_time"):
             monkeypatch.setattr(time, clock, lambda now=now: next(now))
         shares: list[float] = []
-        model = fit_model(singlet, settings, shares.append)
+        model = fit_any(singlet, settings, shares.append)
         assert shares == sorted(shares) and shares[-1] == 1.0 and 0 < shares[0] < 0.5
         found.append(model.core(singlet.encoding(singlet.pairs.held_out.inputs)))
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import lens_models
 import numpy as np
+import onnxruntime
 import pytest
 import torch
 from lens_models import edited, prepared
@@ -13,7 +14,8 @@ from lens_models import edited, prepared
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.cameras.onnxmaps import OnnxDerivatives, load_inverse
+from neurolens.cameras.onnxmaps import load_inverse
+from neurolens.modelfile import MODEL_KEY
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_inverse, export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
@@ -46,10 +48,13 @@ def test_derivatives_of_the_file_are_those_of_the_model(kind: str, tmp_path: Pat
     rays = _rays(kind)
     film, pupil = (torch.stack(p).float().numpy() for p in ((rays.film_x, rays.film_y), (rays.pupil_x, rays.pupil_y)))
     w, plane, stop = rays.wavelength_nm.float().numpy(), float(rays.film_z[0]), m.domain.stop_radius_mm
-    found = OnnxDerivatives(loaded)(film, pupil, w, plane, stop)
+    session = onnxruntime.InferenceSession(loaded.path.read_bytes(), providers=["CPUExecutionProvider"])
+    feeds = {"rays": np.concatenate([film, pupil, w[None]]), "film_z_mm": np.float32([plane])}
+    names = ["scene_ray_d_film", "scene_ray_d_pupil"]
+    found = [np.moveaxis(a, 0, 1) for a in session.run(names, feeds | {"stop_radius_mm": np.float32([stop])})]
     wanted = m.differentiate(rays)
     ok = (wanted.prediction.status == st.PASSED).numpy()
-    for a, b in ((found.d_film, wanted.d_film.numpy()), (found.d_pupil, wanted.d_pupil.numpy())):
+    for a, b in zip(found, (wanted.d_film.numpy(), wanted.d_pupil.numpy()), strict=True):
         for rows in (slice(0, 3), slice(3, 6)):
             assert np.abs(a - b)[rows][..., ok].max() < 1e-5 * np.abs(b[rows][..., ok]).max()
     # Those who do not ask get what the plain file gives.
@@ -57,16 +62,11 @@ def test_derivatives_of_the_file_are_those_of_the_model(kind: str, tmp_path: Pat
         np.testing.assert_allclose(a[..., ok], b[..., ok], atol=2e-5, rtol=1e-5)
 
 
-def test_a_file_without_derivatives_says_so() -> None:
-    with pytest.raises(InputError, match="derivatives"):
-        OnnxDerivatives(load_model(lens_models.exported("invariants")))
-
-
 @pytest.mark.slow
 def test_cameras_agree_on_ray_differentials(tmp_path: Path) -> None:
     known = prepared()
     m = fit_model(known, ModelSettings("ols", terms=64, planes=False))
-    model = load_model(export_onnx(m, tmp_path / "m.onnx", derivatives=True))
+    model = load_model(export_onnx(m, tmp_path / "m.onnx"))
     shot = {"film_mm": (36.0, 24.0), "focus_m": 2.0}
     camera = OnnxCamera(model, **shot)  # type: ignore[arg-type]
     exact = lens_models.exact_camera(2.0, None)
@@ -141,9 +141,16 @@ def test_files_that_are_no_inverse_maps_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="another lens"):
         load_inverse(tmp_path / "m.onnx", lens="0" * 64)
     scene = shutil.copy(tmp_path / "m.scene.onnx", tmp_path / "whole.onnx")
-    for front in ({"curvature": 0.01}, {"curvature": 0.01, "conic": 0, "asphere": [4], "cylinder": None}, "flat"):
-        edited(scene, tmp_path / "m.scene.onnx", lambda card, front=front: card["inverse"].update(front=front))
-        with pytest.raises(ModelError, match="card: inverse"):
+    edited(scene, tmp_path / "m.scene.onnx", lambda card: card["inverse"].update(map="stop"))
+    with pytest.raises(ModelError, match="card: inverse"):
+        load_inverse(tmp_path / "m.onnx")
+    for change in (
+        lambda d: d.pop("guess"),
+        lambda d: d["guess"]["ab"].update(shape=[1, 1]),
+        lambda d: d["guess"].pop("ab"),
+    ):
+        edited(scene, tmp_path / "m.scene.onnx", change, MODEL_KEY)
+        with pytest.raises(ModelError, match="first guess"):
             load_inverse(tmp_path / "m.onnx")
     shutil.copy(scene, tmp_path / "m.scene.onnx")
     (tmp_path / "m.stop.onnx").unlink()

@@ -15,6 +15,7 @@ from neurolens.base.errors import InputError
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import stop_radius_mm
 from neurolens.optics.pupils import camera_rays
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import trace
 from neurolens.surrogates.cores import DIRECTION, STOP, InvariantPolynomial, RawPolynomial
 from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain
@@ -34,7 +35,7 @@ ROOT = Path(__file__).parents[2] / "lenses"
 @cache
 def prepared() -> Prepared:
     """A Tessar at 50 mm over its whole aperture and field, focused from infinity to 1 m."""
-    lens = read_lens(ROOT / "brendel_tessar_100.toml").at(focal_length_mm=50)
+    lens = set_lens(read_lens(ROOT / "brendel_tessar_100.toml"), focal_length_mm=50)
     domain = domain_of(lens, focus_m=(math.inf, 1.0))
     pairs = make_pairs(lens, domain, PairSettings(train=4000, held_out=4000, rim=6000))
     gates = choose_gates(lens, pairs.rim.select(pairs.rim.status != 0))

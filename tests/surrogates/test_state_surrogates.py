@@ -27,12 +27,13 @@ from neurolens.optics.focusing import axial_rays, best_focus_z_mm
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
+from neurolens.optics.states import set_lens
 from neurolens.optics.trace import trace
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_states
-from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.model import LensModel, mix
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.states import StateModel, StateSpace, focus_axis, mix, zoom_axis
+from neurolens.surrogates.states import StateModel, StateSpace, focus_axis, zoom_axis
 from neurolens.surrogates.states_fit import StateSettings, fit_states
 
 ZOOM = Axis("zoom", "mm", (70.0, 135.0, 200.0), 3, reciprocal=True, stated=(("70mm", 70.0),))
@@ -121,9 +122,9 @@ def test_axes_of_lens_files() -> None:
     zoom = read_lens(lens_models.LENSES / "nikon_zoom_70_200.toml")
     axis = zoom_axis(zoom)
     for (name, value), knot in zip(axis.stated, axis.knots, strict=True):
-        assert value == knot == first_order(zoom.at(zoom=name)).efl_mm
+        assert value == knot == first_order(set_lens(zoom, zoom=name)).efl_mm
     focus = focus_axis(zoom, ("71mm",))
-    near = zoom.at(zoom="71mm near")
+    near = set_lens(zoom, zoom="71mm near")
     assert near.film_z_mm is not None
     # The source gives the distance, and gaps to a thousandth of a millimetre.
     assert 1 / focus.range[1] == pytest.approx((753.2 + near.film_z_mm) / 1000, rel=2e-3)
@@ -149,7 +150,7 @@ def test_a_model_of_internal_focus_is_focused_as_its_lens_is(tmp_path: Path) -> 
     loaded = load_model(export_states(fitted, tmp_path / "focus.onnx", {"rms_um": 1.0}))
     for focus_m in (math.inf, 1.0001 / axis.range[1]):
         camera = OnnxCamera(loaded, film_mm=(36.0, 24.0), focus_m=focus_m)
-        placed = lens.at(focus="internal", focus_m=None if math.isinf(focus_m) else focus_m)
+        placed = set_lens(lens, focus="internal", focus_m=None if math.isinf(focus_m) else focus_m)
         best, found = best_focus_z_mm(placed, focus_m), camera.film.film_z_mm
         assert placed.film_z_mm is not None and placed.film_z_mm - best > 0.1  # groups stand in paraxial focus
         assert found == pytest.approx(best, abs=0.02)
@@ -194,7 +195,7 @@ def test_a_node_is_its_own_model() -> None:
 def test_errors_between_nodes(state: float) -> None:
     """No worse than twice the nodes and a micrometre, on the exact lens at states that no node has."""
     part = model().at(state)
-    (near, far), exact = part.domain.film_z_mm, part.lens.at(zoom=state)
+    (near, far), exact = part.domain.film_z_mm, set_lens(part.lens, zoom=state)
     assert near < exact.film_z_mm < far and near < best_focus_z_mm(exact) < far
     pairs = make_pairs(part.lens, part.domain, PairSettings(train=1, held_out=4000, rim=1, seed=9))
     errors = ray_errors(part.lens, part.domain, pairs.held_out, part.predict)
@@ -245,7 +246,7 @@ def test_wrong_numbers_of_states_are_refused() -> None:
     plain = load_model(lens_models.exported("invariants"))
     with pytest.raises(InputError, match="one state"):
         run(plain, rays, z, state=1.0)
-    assert plain.at().card == plain.card
+    assert set_lens(plain).card == plain.card
 
 
 DAMAGE: dict[str, Callable[[dict[str, Any]], object]] = {

@@ -26,18 +26,16 @@ from neurolens.evaluate.candidates import CompiledSource
 from neurolens.graph.c import literal
 from neurolens.graph.compiler import FLAGS, find_compiler
 from neurolens.graph.program import SCENE_RAY
-from neurolens.graph.scalars import lower
 from neurolens.modelfile import MODEL_KEY
-from neurolens.modelfile.graph import graph_of
-from neurolens.modelfile.onnxfile import read_checked
+from neurolens.modelfile.stategraph import mixture_of
 from neurolens.optics.paraxial import first_order
 from neurolens.surrogates.assemble import ALL, RAY_ONLY, Parts
 from neurolens.surrogates.card import card_of, card_to_json
-from neurolens.surrogates.domain import Domain
 from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.source import export_file, export_source, fused_program, identifier, program_of_states
+from neurolens.surrogates.file import read_model
+from neurolens.surrogates.model import Domain
+from neurolens.surrogates.source import export_source, fused_program, identifier
 from neurolens.surrogates.specialise import Fix, fixed_models
-from neurolens.surrogates.stored import load_fitted
 
 MODELS = Path(__file__).parents[2] / "models"
 
@@ -64,8 +62,9 @@ def test_card_is_strict_json_and_says_what_the_model_is(tmp_path: Path) -> None:
 
 def test_a_state_mixes_the_numbers_of_its_nodes_in_glsl_too() -> None:
     file = MODELS / "nikon_zoom_80_200-range.states-64.onnx"
-    data, card = read_checked(file)
-    program = program_of_states(file, data, card)
+    model = read_model(file)
+    card, program = model.card, fused_program(model.nodes)
+    program.mixture = mixture_of(model.axes)
     for known in card["states"]["reference"][1:2]:  # between nodes
         columns = (*COLUMNS, "film_z_mm", "stop_radius_mm")
         numbers = [*known["rays"], known["film_z_mm"][0], known["stop_radius_mm"]]
@@ -78,10 +77,6 @@ def test_a_state_mixes_the_numbers_of_its_nodes_in_glsl_too() -> None:
             np.testing.assert_array_equal(found["status"], known["status"])
             for name, wanted in zip(SCENE_RAY, np.array(known["scene_ray"]), strict=True):
                 np.testing.assert_allclose(found[name][passed], wanted[passed], atol=1e-3 if "mm" in name else 1e-5)
-    (axis,) = card["states"]["axes"]
-    fewer = card | {"states": card["states"] | {"axes": [axis | {"degree": 2}]}}
-    with pytest.raises(ModelError, match="do not follow the state"):
-        program_of_states(file, data, fewer)
 
 
 def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
@@ -111,36 +106,40 @@ def put(array: dict[str, Any], form: str, at: slice, raw: bytes) -> None:
 
 
 def nest(data: dict[str, Any]) -> None:
+    node = data["nodes"][0]
     for _ in range(20):
-        data["core"] = {"kind": "partitioned", "edges": [], "parts": [data["core"]]}
+        node["core"] = {"kind": "partitioned", "edges": [], "parts": [node["core"]]}
 
 
 # Terms that evaluation takes memory for before their coefficients, too few, are looked at.
 MANY = {"u1": base64.b64encode(bytes(800_000)).decode(), "shape": [200_000, 4]}
 DAMAGE: dict[str, Callable[[dict[str, Any]], object]] = {
-    "NaN": lambda d: put(d["core"]["ab"], "f4", slice(4), b"\x00\x00\xc0\x7f"),
+    "NaN": lambda d: put(d["nodes"][0]["core"]["ab"], "f4", slice(4), b"\x00\x00\xc0\x7f"),
     "another scale": lambda d: d["scales"].update(position_mm=1.001 * d["scales"]["position_mm"]),
     "another lens": lambda d: d["lens"]["surfaces"][0].update(radius_mm=1.001 * d["lens"]["surfaces"][0]["radius_mm"]),
-    "a shape too large": lambda d: d["core"]["ab"].update(shape=[3, 2, 10**9]),
-    "many terms": lambda d: d["core"].update(exponents=MANY),
-    "a high degree": lambda d: put(d["core"]["exponents"], "u1", slice(-4, None), b"\xff" * 4),
-    "no such kind": lambda d: d["core"].update(kind="eval"),
+    "a shape too large": lambda d: d["nodes"][0]["core"]["ab"].update(shape=[3, 2, 10**9]),
+    "many terms": lambda d: d["nodes"][0]["core"].update(exponents=MANY),
+    "a high degree": lambda d: put(d["nodes"][0]["core"]["exponents"], "u1", slice(-4, None), b"\xff" * 4),
+    "a high power": lambda d: d["lens"]["surfaces"][0].update(asphere=[[10**9, 1e-9]]),
+    "no angle": lambda d: d.update(angle=0.0),
+    "more nodes than states": lambda d: d["nodes"].append(d["nodes"][0]),
+    "no such kind": lambda d: d["nodes"][0]["core"].update(kind="eval"),
     "nested": nest,
 }
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
 def test_damaged_coefficients_are_refused(kind: str, tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match="damaged|prescription"):
-        load_fitted(edited(lens_models.exported("invariants"), tmp_path / "bad.onnx", DAMAGE[kind], MODEL_KEY))
+    with pytest.raises(ModelError, match="damaged|prescription|reference rays"):
+        read_model(edited(lens_models.exported("invariants"), tmp_path / "bad.onnx", DAMAGE[kind], MODEL_KEY))
 
 
 def test_more_reference_rays_than_any_card_has_are_refused(tmp_path: Path) -> None:
     def repeat(card: dict[str, Any]) -> None:
         card["reference"]["rays"] = [row * 100 for row in card["reference"]["rays"]]
 
-    with pytest.raises(ModelError, match="reference rays"):
-        load_fitted(edited(lens_models.exported("invariants"), tmp_path / "many.onnx", repeat))
+    with pytest.raises(ModelError, match="reference"):
+        read_model(edited(lens_models.exported("invariants"), tmp_path / "many.onnx", repeat))
 
 
 def test_files_that_hold_none(tmp_path: Path) -> None:
@@ -154,14 +153,14 @@ def test_files_that_hold_none(tmp_path: Path) -> None:
         if data is not None:
             path.write_bytes(data)
         with pytest.raises(ModelError, match=words):
-            load_fitted(path)
+            read_model(path)
     proto = onnx.load_model_from_string(good)
     kept = [e for e in proto.metadata_props if e.key != MODEL_KEY]
     del proto.metadata_props[:]
     proto.metadata_props.extend(kept)
     (tmp_path / "old.onnx").write_bytes(proto.SerializeToString())
     with pytest.raises(ModelError, match="holds no coefficients"):
-        load_fitted(tmp_path / "old.onnx")
+        read_model(tmp_path / "old.onnx")
 
 
 def test_a_text_that_inflates_without_end_is_refused(tmp_path: Path) -> None:
@@ -170,7 +169,7 @@ def test_a_text_that_inflates_without_end_is_refused(tmp_path: Path) -> None:
     entry.value = base64.b64encode(zlib.compress(b" " * (64 * 2**20), 9)).decode()
     (tmp_path / "bomb.onnx").write_bytes(proto.SerializeToString())
     with pytest.raises(ModelError, match="more than"):
-        load_fitted(tmp_path / "bomb.onnx")
+        read_model(tmp_path / "bomb.onnx")
 
 
 def test_the_compiler_makes_vectors_and_loses_nothing() -> None:
@@ -215,7 +214,7 @@ def test_fixed_values_outside_the_domain_are_refused() -> None:
 
 
 def test_networks_that_a_compiler_would_not_end_with_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.surrogates.source.MOST_WEIGHTS", 100)
+    monkeypatch.setattr("neurolens.graph.scalars.MOST_WEIGHTS", 100)
     with pytest.raises(InputError, match="onnxruntime"):
         fused_program([lens_models.model("network")])
 
@@ -227,22 +226,6 @@ def test_literals_keep_every_bit() -> None:
     assert np.array_equal(read.view(np.uint32), numbers.view(np.uint32))
 
 
-def test_a_file_without_its_coefficients_is_written_as_the_same_function(tmp_path: Path) -> None:
-    """What is written without torch: rays of the file's graph, under the same comment and signature."""
-    file, model = lens_models.exported("invariants"), lens_models.model("invariants")
-    written = export_file(file, tmp_path / "file.h", "c")
-    whole = export_source([model], tmp_path / "model.h", "c", load_model(file).card)
-    assert written.signature == whole.signature
-    head, other = (f.read_text(encoding="utf-8").partition("#ifndef")[0] for f in (written.path, whole.path))
-    assert head == other
-    rays = {**rays_of(model, 2000, seed=3), "film_z_mm": model.domain.film_z_mm[0], "stop_radius_mm": 5.0}
-    found = compiled(lower(graph_of(file, file.read_bytes()))).rays(rays)
-    wanted = written_rays("onnx", "invariants", rays)
-    assert np.mean(found["status"] != wanted["status"]) < 1e-3
-    for name in SCENE_RAY:
-        np.testing.assert_allclose(found[name], wanted[name], rtol=0, atol=2e-5)
-
-
 @pytest.mark.parametrize(
     "word",
     ["int", "class", "status", "ray", "t12", "vec3", "sampler2D", "sqrtf", "clamp", "size_t", "film_x_mm", "gl_a"],
@@ -251,7 +234,7 @@ def test_words_of_the_languages_and_of_the_code_are_no_names(word: str, tmp_path
     """With most of these a file would not compile."""
     for language in ("c", "glsl"):
         with pytest.raises(InputError, match=f"name: got '{word}'"):
-            export_file(lens_models.exported("invariants"), tmp_path / "a", language, word)
+            export_source([lens_models.model("invariants")], tmp_path / "a", language, {}, name=word)
     assert identifier(f"{word}!") == f"lens_{word}" and identifier("half-lens 2") == "half_lens_2"
 
 

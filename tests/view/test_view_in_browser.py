@@ -22,9 +22,10 @@ from neurolens.flare.ghostfit import GhostSettings, fit_ghosts
 from neurolens.flare.lights import Light
 from neurolens.flare.picture import Raster, ghost_picture
 from neurolens.optics.lensfile import read_lens
+from neurolens.optics.states import set_lens
 from neurolens.render.renderer import render
 from neurolens.render.scene import scene_from_tables
-from neurolens.surrogates.source import export_file
+from neurolens.surrogates.source import export_source
 
 ROOT = Path(__file__).parents[2]
 LENS = "petzval_portrait_100"
@@ -216,7 +217,7 @@ def test_other_lenses_too(others: Opened, key: str) -> None:
 
 
 def test_a_lamp_is_dragged_and_its_ghosts_are_those_of_neurolens_flare(browser: Any, tmp_path: Path) -> None:
-    lens = read_lens(ROOT / "lenses" / "brendel_tessar_100.toml").at(focus_m=np.inf)
+    lens = set_lens(read_lens(ROOT / "lenses" / "brendel_tessar_100.toml"), focus_m=np.inf)
     model = fit_ghosts(lens, GhostSettings(angle_deg=25.0, keep=0.8, rays=2000, target_um=60.0))
     words = ["brendel_tessar_100", str(write_ghosts(model, tmp_path / "ghosts.onnx")), "--downloads", "glsl"]
     assert main(["view", *words, "-o", str(tmp_path / "view.html"), "--json"]) == 0
@@ -300,9 +301,11 @@ def test_downloads_are_the_files(browser: Any, tmp_path: Path) -> None:
     models = {kind: ROOT / "models" / f"{LENS}.{kind}.onnx" for kind in ("ols-64", "mlp-16x2")}
     wanted = {("exact", to): exported(ROOT / "lenses" / f"{LENS}.toml", to, tmp_path) for to in ("glsl", "c", "osl")}
     for form, file in zip(("polynomial", "network"), models.values(), strict=True):
-        extras, notes = model_extras(load_model(file))
+        model = load_model(file)
+        extras, notes = model_extras(model)
         for to in ("glsl", "c"):
-            path = export_file(file, tmp_path / f"{form}.{to}", to, None, extras, notes).path
+            nodes, out = model.file.nodes, tmp_path / f"{form}.{to}"
+            path = export_source(nodes, out, to, model.card, extras=extras, notes=notes).path
             wanted[form, to] = path.read_bytes()
         wanted |= {(form, "onnx"): file.read_bytes(), (form, "osl"): exported(file, "osl", tmp_path)}
     found = {}

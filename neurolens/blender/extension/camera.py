@@ -88,7 +88,7 @@ def _stereo(camera: Any, render: Any) -> tuple[float, ...]:
 
 
 def _passes(scene: Any) -> tuple[str, ...]:
-    """Of `PASSES`, those that the scene renders."""
+    """The passes of `PASSES` that the scene renders."""
     layers = [layer for layer in scene.view_layers if layer.use]
     mattes = ("object", "material", "asset")
     asked = {

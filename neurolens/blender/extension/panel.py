@@ -239,6 +239,7 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
             return
         layout.label(text=lens.line)
         row = layout.row(align=True)
+        row.use_property_split = False  # else the first form's name stands beside its button
         for name in lens.variants:
             row.prop_enum(props, "kind", name)
         found = context.object if context.object is not None and context.object.type == "CAMERA" else None

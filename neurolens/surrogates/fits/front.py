@@ -17,7 +17,7 @@ from neurolens.optics.prescription import Lens
 from neurolens.optics.sag import entered
 from neurolens.surrogates.assemble import tilt_series
 from neurolens.surrogates.cores import Array
-from neurolens.surrogates.lightfield import Encoding
+from neurolens.surrogates.model import Encoding
 from neurolens.surrogates.pairs import PairSet, RayPairs
 
 # Cosine of the flattest ray that leaves the front surface, below which a fit refracts there.

@@ -17,7 +17,7 @@ import torch
 
 from neurolens.surrogates.bases import invariant_exponents, monomials
 from neurolens.surrogates.fits.selection import Sweep, backward, forward
-from neurolens.surrogates.lightfield import Encoding
+from neurolens.surrogates.model import Encoding
 from neurolens.surrogates.pairs import PairSet, RayPairs
 from neurolens.surrogates.targets import targets_of, weighed_apart
 
@@ -53,7 +53,7 @@ def shifted(encoding: Encoding, passing: PairSet, shift: Shift) -> Encoding:
 
 
 def _weights(encoding: Encoding, m: float) -> tuple[float, float]:
-    """Of p0 and u0, the crossings in mm, in p - m u: with p = p0 / P and u = (u0 - c p0) / U."""
+    """The weights of p0 and u0, the crossings in mm, in p - m u, with p = p0 / P and u = (u0 - c p0) / U."""
     from_u = m / encoding.pupil_scale_mm
     return 1 / encoding.film_scale_mm + encoding.chief * from_u, -from_u
 

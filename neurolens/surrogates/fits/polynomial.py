@@ -45,7 +45,8 @@ from neurolens.surrogates.fits.boundaries import (
 )
 from neurolens.surrogates.fits.selection import Sweep, backward, forward, grow, matching_pursuit, replace_terms
 from neurolens.surrogates.gates import gate_values
-from neurolens.surrogates.lightfield import Encoding, LightField
+from neurolens.surrogates.lightfield import LightField
+from neurolens.surrogates.model import Encoding
 from neurolens.surrogates.settings import POLYNOMIALS, ModelSettings
 from neurolens.surrogates.targets import Prepared, film_equivalent_weights, scales_of, weighed_apart
 

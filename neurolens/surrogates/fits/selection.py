@@ -53,13 +53,13 @@ class Sweep:
 
     @staticmethod
     def of_columns(columns: Tensor, outputs: Tensor) -> Sweep:
-        """Of columns [M, N] and outputs [R, N]."""
+        """Make the problem from columns [M, N] and outputs [R, N]."""
         own = columns.numpy()
         return Sweep(own @ own.T, (columns @ outputs.T).numpy(), (outputs**2).sum(1).numpy())  # numpy sums half of it
 
     @staticmethod
     def of_vectors(features: Tensor, field: LightField, outputs: Tensor) -> Sweep:
-        """Of `vector_columns` of features [M, N], and vector outputs [R, 2, N]."""
+        """Make the problem from the `vector_columns` of features [M, N] and vector outputs [R, 2, N]."""
         gram, moments = vector_gram(features, field, outputs)
         return Sweep(gram, moments, (outputs.flatten(1) ** 2).sum(1).numpy())
 

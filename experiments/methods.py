@@ -1,0 +1,326 @@
+"""The rows of `python -m experiments surrogates`: every method on the same rays of a lens, its errors and times."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+
+from experiments.published import PUBLISHED, fit_any
+from neurolens import __version__
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
+from neurolens.base.files import fingerprint_of, read_kept, sha256_of, write_kept
+from neurolens.base.lensname import lens_id_of
+from neurolens.base.progress import Progress, Report
+from neurolens.cameras.model import load_model
+from neurolens.evaluate.candidates import EXACT, exact_candidates, exact_records, model_candidates
+from neurolens.evaluate.experiment import DomainChoice, LensChoice
+from neurolens.evaluate.measure import FreshRays, measure, onnx_predictor, seconds_to_load, shared_rays
+from neurolens.evaluate.rays import REFERENCE_RADIUS_MM
+from neurolens.evaluate.records import plain
+from neurolens.evaluate.speed import Race, race
+from neurolens.optics.prescription import Lens
+from neurolens.optics.pupils import image_radius_mm
+from neurolens.surrogates.export import export_onnx
+from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, prepare
+from neurolens.surrogates.model import Domain
+from neurolens.surrogates.pairs import PairSettings, make_pairs
+
+GROUPS = {
+    "paraxial": "what renderers use today",
+    "published": "published methods, our implementations of their papers",
+    "ours": "this project's",
+    "ablations": "ours with one thing changed",
+}
+DEFAULT_GROUPS = ("paraxial", "published", "ours")
+
+
+# Of method "ols" in the invariants.
+POLYNOMIAL_ABLATIONS: Mapping[str, Mapping[str, Any]] = {
+    "planes not searched": {"planes": False},
+    "candidates do not grow": {"growth": 0},
+    "no elimination": {"elimination": False},
+    "no replacement": {"replacement": False},
+    "position at its first-order weight": {"position_weight": 1.0},
+    "no terms for transmittance": {"transmittance_terms": 0},
+    "forward selection alone": {"planes": False, "growth": 0, "elimination": False, "replacement": False},
+    "matching pursuit": {"method": "omp"},
+    "raw monomials": {"basis": "raw", "degree": 5},
+}
+# Of networks.
+NETWORK_ABLATIONS: Mapping[str, Mapping[str, Any]] = {"20 steps of training": {"steps": 20}, "one layer": {"layers": 1}}
+
+
+def ablated(settings: ModelSettings, name: str) -> ModelSettings:
+    """The settings with one part left out, named for the table; the benchmark gives the ratio of the two errors.
+
+    Raises:
+        InputError: an ablation of neither table, or of the other kind of model.
+    """
+    known = NETWORK_ABLATIONS if settings.method == "mlp" else POLYNOMIAL_ABLATIONS
+    if name not in known:
+        raise InputError("ablation", "name", name, f"one of {', '.join(known)}")
+    return replace(settings, **known[name], name=f"{settings.label}, {name}")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method with its settings.
+
+    Attributes:
+        name: of the table's row and of files.
+        group: of `GROUPS`.
+        settings: of the fit.
+        source: the paper, or what an ablation changes.
+    """
+
+    name: str
+    group: str
+    settings: ModelSettings
+    source: str = ""
+
+
+def _ours() -> tuple[ModelSettings, ...]:
+    polynomials = tuple(ModelSettings("ols", terms=terms) for terms in (20, 40, 64, 100))
+    networks = tuple(ModelSettings("mlp", units=n, layers=k) for n, k in ((8, 1), (10, 1), (8, 2), (16, 2)))
+    networks += (ModelSettings("mlp", units=32, steps=150),)  # a minute
+    return *polynomials, *networks, *(ModelSettings("ols+mlp", terms=n, units=u) for n, u in ((40, 8), (64, 16)))
+
+
+def _ablations() -> Iterator[Row]:
+    """Our polynomial of 64 terms and our network, each without one part."""
+    for whole, parts in (
+        (ModelSettings("ols", terms=64), POLYNOMIAL_ABLATIONS),
+        (ModelSettings("mlp"), NETWORK_ABLATIONS),
+    ):
+        for text in parts:
+            name = f"{whole.label}-{text.replace(' ', '-')}"
+            yield Row(name, "ablations", replace(ablated(whole, text), name=name), text)
+
+
+@cache
+def all_rows() -> tuple[Row, ...]:
+    """Every row that this version can fit, group by group."""
+    rows = [Row(name, "paraxial", ModelSettings(name)) for name in ("thin", "thick")]
+    for method in PUBLISHED.values():
+        rows += [Row(s.label, "published", s, method.citation) for s in method.presets]
+    rows += [Row(s.label, "ours", s) for s in _ours()]
+    return tuple([*rows, *_ablations()])
+
+
+def chosen_rows(names: Sequence[str]) -> tuple[Row, ...]:
+    """Rows by name, by group, or by method ("ols", "schrade"; without ablations); none named: all but the ablations.
+
+    Raises:
+        InputError: an unknown name.
+    """
+    rows, wanted = all_rows(), names or DEFAULT_GROUPS
+    picked: dict[str, Row] = {}
+    for name in wanted:
+        found = [r for r in rows if name in (r.name, r.group) or (name == r.settings.method and r.group != "ablations")]
+        if not found and name not in GROUPS:
+            known = ", ".join((*GROUPS, *(r.name for r in rows)))
+            raise InputError("experiments surrogates", "--methods", name, f"one of: {known}")
+        picked |= {r.name: r for r in found}
+    return tuple(picked.values())
+
+
+_FIGURES = (
+    "rms_um p99_um max_um rms_infinity_um rms_px p99_px max_px rms_um_at_21_6 direction_rms_deg direction_p99_deg "
+    "direction_max_deg position_rms_um position_p99_um transmittance_rms transmittance_max false_pass false_block "
+    "false_pass_near_rim false_block_near_rim rays share_beyond_60_deg"
+).split()
+
+
+@dataclass(frozen=True)
+class BenchSettings:
+    """Settings common to all rows.
+
+    Attributes:
+        domain: of the models; None for focus_m: infinity only.
+        pairs: rays of the fits and of the errors.
+        vignetting_rays: that test what passes.
+        rounds, threads: of the race; none without rounds.
+        compile_exact: whether the compiled exact tracer races.
+    """
+
+    domain: DomainChoice = field(default_factory=lambda: DomainChoice(focus_m=(math.inf, math.inf)))
+    pairs: PairSettings = field(default_factory=PairSettings)
+    vignetting_rays: int = 200_000
+    rounds: int = 10
+    threads: int = 1
+    compile_exact: bool = True
+
+
+@dataclass(frozen=True)
+class Bench:
+    """One lens of the benchmark and the folder of its records; expensive parts are computed on first use."""
+
+    choice: LensChoice
+    settings: BenchSettings
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        return "-".join(part for part in (lens_id_of(self.choice.file), self.choice.configuration) if part)
+
+    @cached_property
+    def lens(self) -> Lens:
+        return self.choice.read()
+
+    @cached_property
+    def domain(self) -> Domain:
+        return self.settings.domain.of(self.lens)
+
+    @cached_property
+    def prepared(self) -> Prepared:
+        return prepare(make_pairs(self.lens, self.domain, self.settings.pairs))
+
+    @cached_property
+    def rays(self) -> FreshRays:
+        return shared_rays(self.prepared, self.settings.vignetting_rays)
+
+    def record_file(self, row: Row) -> Path:
+        return self.folder / "records" / self.name / f"{row.name}.json"
+
+    def model_file(self, row: Row) -> Path:
+        return self.folder / "models" / self.name / f"{row.name}.onnx"
+
+    def fingerprint(self, row: Row) -> str:
+        """Hash of everything that decides a record except its times."""
+        asked = [
+            __version__, self.lens.sha256, self.lens.stop_radius_mm, self.lens.image_radius_mm,
+            asdict(self.settings.domain), asdict(self.settings.pairs), self.settings.vignetting_rays,
+            asdict(row.settings),
+        ]  # fmt: skip
+        return fingerprint_of(asked)
+
+
+def run_bench(
+    benches: Sequence[Bench], rows: Sequence[Row], progress: Progress, *, again: bool = False
+) -> Iterator[tuple[Bench, list[dict[str, Any]]]]:
+    """Lens by lens, the records of its rows; existing ones are recomputed only `again`."""
+    slow = (*NETWORKS, "neurolens2017")
+    for bench in benches:
+        progress.plan({f"{bench.name}: {r.name}": 40.0 if r.settings.method in slow else 4.0 for r in rows})
+        progress.plan({f"{bench.name}: race": 60.0 if bench.settings.compile_exact else 15.0})
+    for bench in benches:
+        records = []
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NeurolensWarning)
+            for row in rows:
+                with progress.stage(f"{bench.name}: {row.name}") as report:
+                    records.append(_record(bench, row, again, report))
+            with progress.stage(f"{bench.name}: race") as report:
+                _add_times(bench, rows, records, report)
+        yield bench, records
+
+
+def _record(bench: Bench, row: Row, again: bool, report: Report) -> dict[str, Any]:
+    """An existing record of the same settings, or a new one, with its failure if it fails."""
+    file, mark = bench.record_file(row), ""
+    head = {"lens": bench.name, "method": row.name, "group": row.group, "source": row.source}
+    try:
+        mark = bench.fingerprint(row)
+        known = None if again else _known_record(file, mark)
+        if known is not None and (known["failed"] or bench.model_file(row).is_file()):
+            return known
+        file.unlink(missing_ok=True)  # an interruption must not leave a record of removed files
+        made = {"failed": None, **_fit_and_measure(bench, row, report)}
+    except Exception as error:  # a row with the reason; other methods and lenses continue
+        # Expected errors are permanent; unexpected ones are retried by the next run.
+        mark = mark if isinstance(error, NeurolensError) else ""
+        made = {"failed": _reason(error)}
+    record = plain({"fingerprint": mark, **head, "settings": asdict(row.settings), **made})
+    write_kept(file, record)
+    return record
+
+
+def _reason(error: Exception) -> str:
+    text = " ".join(str(error).split()).replace(f"{Path.cwd()}/", "")[:300]
+    return text if isinstance(error, NeurolensError) else f"{type(error).__name__}: {text}"
+
+
+def _fit_and_measure(bench: Bench, row: Row, report: Report) -> dict[str, Any]:
+    """Errors of the exported graph in onnxruntime."""
+    prepared, file = bench.prepared, bench.model_file(row)
+    model = fit_any(prepared, row.settings, report)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    export_onnx(model, file, {})
+    found = measure(bench.rays, onnx_predictor(load_model(file)))
+    figures = {key: found.figures[key] for key in _FIGURES}
+    # Micrometres at the common scale of lenses of different size.
+    scale = REFERENCE_RADIUS_MM / image_radius_mm(bench.lens)[0]
+    scaled = {
+        f"{key}_at_21_6": None if (value := figures[key]) is None else scale * value
+        for key in ("p99_um", "max_um", "position_rms_um")
+    }
+    network = row.settings.method in NETWORKS
+    return {
+        **figures,
+        **scaled,
+        "stopped_down": found.stopped_down,
+        "zones": found.zones,
+        "coefficients_per_vector": None if network else model.core.coefficients_per_vector,
+        "parameters": model.core.coefficients,
+        "rims": len(model.gates),
+        "bytes": file.stat().st_size,
+        "fit_s": model.fit_s,
+        "load_s": seconds_to_load(file),
+        "film_radius_mm": bench.domain.film_radius_mm,
+        "passing_share": float(bench.rays.passes.double().mean()),
+    }
+
+
+def _add_times(bench: Bench, rows: Sequence[Row], records: list[dict[str, Any]], report: Report) -> None:
+    """Race all models of one lens and the exact tracer, and add the times to the records, unless that was done."""
+    s = bench.settings
+    files = {row.name: bench.model_file(row) for row, r in zip(rows, records, strict=True) if not r["failed"]}
+    if not s.rounds or not files:
+        return
+    hashes = {name: sha256_of(file) for name, file in sorted(files.items())}
+    mark = fingerprint_of([hashes, s.rounds, s.threads, s.compile_exact])
+    if all(record.get("race") == mark for record in records if record["method"] in files):
+        return
+    timed = _race(bench, files, report)
+    for i, (row, record) in enumerate(zip(rows, records, strict=True)):
+        if row.name in files:
+            records[i] = plain({**record, **_times_of(record, timed), "race": mark})
+            write_kept(bench.record_file(row), records[i])
+
+
+def _known_record(file: Path, fingerprint: str) -> dict[str, Any] | None:
+    """A record; None if missing, damaged or of other settings."""
+    record = read_kept(file)
+    return record if record is not None and record.get("fingerprint") == fingerprint else None
+
+
+def _race(bench: Bench, files: Mapping[str, Path], report: Report) -> Race:
+    """Race exported models, by name, and the exact tracer; "NAME fused" where a C compiler makes one."""
+    s, domain = bench.settings, bench.domain
+    candidates = exact_candidates(bench.lens.with_stop_radius(domain.stop_radius_mm), domain, compiled=s.compile_exact)
+    candidates += model_candidates(files, domain, s.threads)
+    return race(candidates, domain, rounds=s.rounds, threads=s.threads, report=report)
+
+
+def _times_of(record: Mapping[str, Any], timed: Race) -> dict[str, Any]:
+    """Times of one model for its record, held against the fastest exact tracer of the same race.
+
+    Returns: ns_per_ray, speedup (by the minima), break_even_rays (after which fitting and loading pay off; "never"
+        where the exact tracer is as fast), the same with "fused_" before, and exact: the tracers' times.
+    """
+    best = EXACT[1] if EXACT[1] in timed.ns else EXACT[0]
+    found = dict[str, Any]()
+    for prefix, name in (("", record["method"]), ("fused_", f"{record['method']} fused")):
+        gain = timed.gain(name, best, record["fit_s"], record["load_s"])
+        never = "never" if gain.speedup is not None else None
+        found |= {
+            f"{prefix}ns_per_ray": gain.ns_per_ray,
+            f"{prefix}speedup": gain.speedup,
+            f"{prefix}break_even_rays": gain.break_even_rays or never,
+        }
+    return {**found, "exact": exact_records(timed)}

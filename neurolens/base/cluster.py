@@ -1,0 +1,229 @@
+"""The executor of a Dask cluster; see `base.tasks`."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import math
+import os
+import threading
+import time
+import warnings
+from collections.abc import Callable
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from contextlib import suppress
+from functools import cache
+from typing import Any, TypeVar
+
+from neurolens import __version__
+from neurolens.base.errors import NeurolensError, one_line
+from neurolens.base.files import own_folder
+from neurolens.base.tasks import Failed, Lost, Shared, answer_of, cores, failure
+
+R = TypeVar("R")
+_MOST = 4096  # tasks in flight: each has a thread here that waits for it
+_ASK_EVERY_S = 1.0  # how many workers there are
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
+_TIMEOUT, _POLL_S = "10s", 5.0
+_ANSWERED_S = 5.0  # until a worker's answer has gone
+_LOST = "the Dask scheduler is lost: what is done is kept, the same command goes on"
+_KILLED = "its worker was killed, again and again: did the memory run out?"
+_ALONE = threading.Lock()  # in a worker: tasks set options of the whole process, such as torch's threads
+
+
+class Dask(ThreadPoolExecutor):
+    """Runs tasks on a cluster, to which it connects when the first task is submitted.
+
+    A worker that is killed costs only its task, which another one takes; a task that has cost two rounds of workers has
+    failed. A lost scheduler fails all tasks with `Lost`.
+
+    Args:
+        address: the scheduler's, as tcp://host:8786, or "local" (a worker for each core of this machine), "local:N" (N
+            workers), which needs a script with `if __name__ == "__main__":`. Whoever reaches a scheduler at tcp:// can
+            run code on its workers and here, as this user: answers and errors of Dask are pickled. One at tls:// lets
+            in those who have its keys (Dask's settings, comm.tls).
+        limit_s: seconds after which a task has failed; its worker ends.
+
+    Raises (when tasks are submitted):
+        NeurolensError: Dask is not installed, there is no such scheduler. Lost: the scheduler is lost.
+    """
+
+    def __init__(self, address: str, limit_s: float = math.inf) -> None:
+        super().__init__(_MOST)
+        self._address, self._limit_s = address, limit_s
+        self._cluster: _Cluster | None = None
+        self._lock = threading.Lock()
+        self._room, self._asked = 0, -math.inf
+        self._sent: dict[Shared, Any] = {}
+        self._ended = False
+
+    @property
+    def room(self) -> int:
+        """How many tasks the cluster takes: one for each thread of its workers.
+
+        None is sent ahead, because Dask blames all tasks that a worker has when it is killed.
+        """
+        if time.monotonic() > self._asked + _ASK_EVERY_S:
+            client = self._client()
+            workers = client.scheduler_info(n_workers=-1).get("workers") if client.status == "running" else None
+            if workers is None:
+                raise Lost(_LOST)
+            self._room, self._asked = max(sum(w["nthreads"] for w in workers.values()), 1), time.monotonic()
+        return min(self._room, _MOST)
+
+    def submit(self, work: Callable[..., R], /, *args: Any, **named: Any) -> Future[R]:
+        """Send a task. `work` must be a function of a module, which workers import."""
+        self._client()
+        return super().submit(self._on_worker, work, args, named)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Wait for the tasks, or with `cancel_futures` drop them, and leave the cluster; local workers end."""
+        self._ended = self._ended or cancel_futures
+        super().shutdown(wait and not cancel_futures, cancel_futures=cancel_futures)
+        with self._lock:
+            if self._cluster is not None and (wait or cancel_futures):
+                self._cluster.close()
+                self._cluster = None
+
+    def _client(self) -> Any:
+        with self._lock:
+            if self._cluster is None:
+                self._cluster = _Cluster(_distributed(), self._address)
+            return self._cluster.client
+
+    def _on_worker(self, work: Callable[..., R], args: Any, named: Any) -> R:
+        """Wait for the answer of a task, which is sent again where its worker was killed, perhaps by another task."""
+        client = self._client()
+        for _ in range(2):
+            try:
+                outcome = self._sent_and_awaited(client, work, args, named)
+            except (Exception, CancelledError) as error:
+                if not self._ended and client.status != "running":
+                    raise Lost(_LOST) from None
+                if getattr(error, "reason", "") == "scheduler-connection-lost":
+                    raise Lost(_LOST) from None
+                if self._ended or not (isinstance(error, CancelledError) or type(error).__name__ == "KilledWorker"):
+                    raise NeurolensError(one_line(f"{type(error).__name__}: {error}", 600)) from None
+            else:
+                return answer_of(outcome)
+        raise NeurolensError(_KILLED)
+
+    def _sent_and_awaited(self, client: Any, work: Callable[..., Any], args: Any, named: Any) -> Any:
+        """The outcome of a task; it would be awaited for ever where the client was closed meanwhile."""
+        sent = [self._shared(client, each) if isinstance(each, Shared) else each for each in args]
+        future = client.submit(_answer, work, __version__, self._limit_s, sent, named, pure=False)
+        try:
+            while True:
+                try:
+                    return future.result(timeout=_POLL_S)
+                except TimeoutError:
+                    if self._ended or client.status != "running":
+                        raise
+        finally:
+            future.release()
+
+    def _shared(self, client: Any, value: Shared) -> Any:
+        """The place of shared bytes on the cluster, to which they are sent again where all workers lost them."""
+        with self._lock:
+            place = self._sent.get(value)
+            if place is None or place.status not in ("finished", "pending"):
+                place = self._sent[value] = client.submit(Shared, value.data, pure=False)
+            return place
+
+
+def _answer(work: Callable[..., Any], version: str, limit_s: float, args: Any, named: Any) -> Any:
+    """Run a task on a worker; errors travel as text."""
+    if version != __version__:
+        return Failed(f"a worker has neurolens {__version__}, not {version}")
+    if "MALLOC_TRIM_THRESHOLD_" in os.environ:
+        _keep_memory()
+    try:
+        with _ALONE:
+            return work(*args, **named) if math.isinf(limit_s) else _in_time(work, limit_s, args, named)
+    except Exception as error:
+        return failure(error)
+
+
+def _in_time(work: Callable[..., Any], limit_s: float, args: Any, named: Any) -> Any:
+    """The answer, or Failed after a time: then the worker ends once it has answered, as no thread can be stopped."""
+    pool = ThreadPoolExecutor(1)
+    try:
+        return pool.submit(work, *args, **named).result(limit_s)
+    except TimeoutError:
+        threading.Timer(_ANSWERED_S, os._exit, (1,)).start()
+        return Failed(f"took longer than {limit_s:g} s")
+    finally:
+        pool.shutdown(wait=False)
+
+
+@cache
+def _keep_memory() -> None:
+    """Let the C library (glibc) keep freed memory, once a worker, up to the sizes that it comes to by itself.
+
+    Dask's nannies have it given back at once (MALLOC_TRIM_THRESHOLD_), which also ends those sizes' growth: getting the
+    pages of every larger array anew takes two fifths of a fit's time.
+    """
+    with suppress(AttributeError, OSError):  # another C library
+        library = ctypes.CDLL(None)
+        library.mallopt(_M_MMAP_THRESHOLD, 32 << 20)
+        library.mallopt(_M_TRIM_THRESHOLD, 64 << 20)
+
+
+def _distributed() -> Any:
+    try:
+        import distributed
+    except ModuleNotFoundError:
+        raise NeurolensError("--dask needs Dask, which is not installed: pip install 'neurolens[dask]'") from None
+    return distributed
+
+
+class _Cluster:
+    """A client, and the workers of this machine that it was asked to start."""
+
+    def __init__(self, distributed: Any, address: str) -> None:
+        self._distributed, self._local = distributed, None
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # our own line reports errors
+        warnings.filterwarnings("ignore", "Sending large graph")
+        # The client is created before it starts, because one that fails to start must be closed: otherwise the garbage
+        # collector closes it while the next one starts, whose lock it takes, and both stop.
+        self.client: Any = distributed.Client.__new__(distributed.Client)
+        kind, _, count = address.partition(":")
+        try:
+            if kind == "local":
+                self._local = self._started(int(count or cores()))
+            self.client.__init__(self._local or address, timeout=_TIMEOUT)
+        except BaseException as error:
+            self.close()
+            if isinstance(error, ImportError):
+                raise NeurolensError("--dask local needs cryptography: pip install 'neurolens[dask]'") from None
+            if not isinstance(error, (OSError, ValueError)):
+                raise
+            expected = "tcp://HOST:PORT of a scheduler that runs, local, or local:N"
+            raise NeurolensError(f"--dask {address}: {one_line(str(error), 600)}; expected {expected}") from None
+
+    def _started(self, workers: int) -> Any:
+        """Workers of this machine, for this process alone: a scheduler runs any code that it is sent.
+
+        Keys that live as long as the cluster keep other users of the machine out; nothing is served over HTTP.
+        """
+        import dask
+        from distributed.security import Security
+
+        quiet: dict[str, list[str]] = {
+            f"distributed.{part}.http.routes": [] for part in ("scheduler", "worker", "nanny")
+        }
+        with dask.config.set(quiet):
+            cluster = self._distributed.LocalCluster(
+                n_workers=workers, threads_per_worker=1, host="127.0.0.1", security=Security.temporary(),
+                dashboard_address="127.0.0.1:0", local_directory=str(own_folder("dask")),
+                silence_logs=logging.CRITICAL, memory_limit=0,
+            )  # fmt: skip
+        cluster.scheduler.http_server.stop()
+        return cluster
+
+    def close(self) -> None:
+        """Leave the cluster; a scheduler that is slow to answer spoils nothing."""
+        for each, timeout_s in ((self.client, 2), (self._local, 5)):
+            if each is not None:
+                with suppress(Exception):
+                    each.close(timeout=timeout_s)

@@ -1,0 +1,231 @@
+"""Executors that run tasks: at once in this process, in a process for each task, or on a cluster (`base.cluster`).
+
+They have the interface of `concurrent.futures`: `submit` returns a `Future`, and `wait` and `as_completed` of the
+standard library take it. `run_each` hands out the answers of any number of tasks while only a few of them wait in
+memory. An answer must depend on its task alone, because a cluster starts a task again when its worker was lost.
+
+    with Processes(jobs=4) as executor:
+        for task, answer in run_each(executor, work, tasks):
+            print(task, answer.reason if isinstance(answer, Failed) else answer)
+
+The workers of a render (`render.workers`) are not tasks: they are forked because they add to one film in shared memory.
+"""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import os
+import select
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import wait
+from queue import SimpleQueue
+from typing import Any, TypeVar
+
+from neurolens.base.errors import NeurolensError, one_line
+from neurolens.base.signals import end_at_once, held
+
+T = TypeVar("T")
+R = TypeVar("R")
+_LONGEST = 600  # characters of a reason
+# Another thread that starts a process asks all processes for their exit codes, which can be read only once.
+_STARTING = threading.Lock()
+
+
+@dataclass(frozen=True)
+class Failed:
+    """Stands for the answer of a task that failed: the reason in one line."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Shared:
+    """Bytes that many tasks take as an argument: a cluster sends them to each worker once."""
+
+    data: bytes
+
+
+class Lost(NeurolensError):
+    """The executor itself has failed, so that its remaining tasks have no answers."""
+
+
+class Here(Executor):
+    """Runs each task in this process, before `submit` returns."""
+
+    room = 1
+
+    def submit(self, work: Callable[..., R], /, *args: Any, **named: Any) -> Future[R]:
+        """Run the task; its future is done."""
+        future: Future[R] = Future()
+        try:
+            future.set_result(work(*args, **named))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+class Processes(ThreadPoolExecutor):
+    """Runs each task in a process of its own, whose memory ends with it.
+
+    A process that is killed or takes too long costs its own task only. A script that uses these must guard its main
+    part by `if __name__ == "__main__":`, since each process imports the script.
+
+    Args:
+        jobs: how many processes run at a time. limit_s: seconds after which a process is killed.
+    """
+
+    def __init__(self, jobs: int, limit_s: float = math.inf) -> None:
+        super().__init__(jobs)
+        self.room = jobs
+        self._limit_s, self._running, self._ended = limit_s, set[Any](), False
+
+    def submit(self, work: Callable[..., R], /, *args: Any, **named: Any) -> Future[R]:
+        """Start the task once a process has room. `work` must be a function of a module; its arguments are pickled."""
+        return super().submit(self._in_process, work, args, named)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Wait for the tasks, or with `cancel_futures` kill the processes that run."""
+        if cancel_futures:
+            with _STARTING:
+                self._ended = True
+                for process in self._running:
+                    process.kill()
+        super().shutdown(wait, cancel_futures=cancel_futures)
+
+    def _in_process(self, work: Callable[..., R], args: Any, named: Any) -> R:
+        """Start a process and wait for its answer, in a thread of the pool."""
+        pipe, process = self._started(work, args, named)
+        try:
+            if not pipe.poll(None if math.isinf(self._limit_s) else self._limit_s):
+                process.kill()
+                raise NeurolensError(f"took longer than {self._limit_s:g} s")
+            return answer_of(pipe.recv())
+        except EOFError:
+            raise NeurolensError(_ending(_exit_code(process))) from None
+        finally:
+            pipe.close()
+            _exit_code(process)
+            self._running.discard(process)
+
+    def _started(self, work: Callable[..., R], args: Any, named: Any) -> tuple[Any, Any]:
+        context = _context(sorted({each.__module__ for each in (work, *args) if callable(each)}))
+        here, there = context.Pipe(duplex=False)
+        process = context.Process(target=_work, args=(there, work, args, named), daemon=True)
+        with _STARTING, held():  # this process handles Ctrl-C
+            if self._ended:
+                raise NeurolensError("the executor was shut down")
+            process.start()
+            self._running.add(process)
+        there.close()
+        return here, process
+
+
+def run_each(
+    executor: Executor, work: Callable[..., R], tasks: Iterable[T], *common: Any
+) -> Iterator[tuple[T, R | Failed]]:
+    """Run `work(*common, task)` for each task, and yield tasks with their answers in the order of completion.
+
+    Tasks are taken one by one, when the executor has room, so that hundreds of thousands need little memory. Where the
+    iteration ends early, the executor is shut down and its processes are killed.
+
+    Args:
+        executor: any executor of `concurrent.futures`; its attribute `room`, where it has one, bounds the tasks in
+            flight (the number of cores elsewhere).
+
+    Raises:
+        Lost: the executor has failed; the answers so far were yielded.
+    """
+    waiting, running, done = iter(tasks), dict[Future[R], T](), SimpleQueue[Future[R]]()
+    more = True
+    try:
+        while more or running:
+            while more and len(running) < getattr(executor, "room", cores()):
+                try:
+                    task = next(waiting)
+                except StopIteration:
+                    more = False
+                    break
+                future = executor.submit(work, *common, task)
+                running[future] = task
+                future.add_done_callback(done.put)
+            if running:
+                future = done.get()
+                yield running.pop(future), _result(future)
+    finally:
+        if more or running:
+            executor.shutdown(wait=False, cancel_futures=True)
+
+
+def _result(future: Future[Any]) -> Any:
+    try:
+        return future.result()
+    except Lost:
+        raise
+    except Exception as error:
+        return failure(error)
+
+
+def failure(error: Exception) -> Failed:
+    """The reason that an error gives, in one line: errors travel between processes as text."""
+    known = isinstance(error, NeurolensError)
+    return Failed(one_line(str(error) if known else f"a fault of neurolens: {type(error).__name__}: {error}", _LONGEST))
+
+
+def answer_of(outcome: Any) -> Any:
+    """What another process has sent: its answer, or NeurolensError with the reason of its failure."""
+    if isinstance(outcome, Failed):
+        raise NeurolensError(outcome.reason)
+    return outcome
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _context(modules: list[str]) -> Any:
+    """Processes are forked from a small server, which has imported the modules of the first task and has no threads."""
+    kind = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+    context: Any = multiprocessing.get_context(kind)
+    if kind == "forkserver":
+        context.set_forkserver_preload(modules)
+    return context
+
+
+def _exit_code(process: Any) -> int:
+    wait([process.sentinel])
+    with _STARTING:
+        process.join()
+        return int(process.exitcode)
+
+
+def _ending(code: int) -> str:
+    if code < 0:
+        return f"its process was killed by signal {-code}: did the memory run out?"
+    return f"its process ended with code {code}"
+
+
+def _work(pipe: Any, work: Callable[..., Any], args: Any, named: Any) -> None:
+    """The main function of a process."""
+    end_at_once()
+    threading.Thread(target=_end_unread, args=(pipe.fileno(),), daemon=True).start()
+    with suppress(BrokenPipeError):  # the process that asked was killed
+        try:
+            outcome = work(*args, **named)
+        except Exception as error:
+            outcome = failure(error)
+        pipe.send(outcome)
+
+
+def _end_unread(pipe: int) -> None:
+    """End this process once no process is left that reads from the pipe: one that was killed cannot ask it to end."""
+    if hasattr(select, "poll"):
+        waiting = select.poll()
+        waiting.register(pipe, 0)  # errors alone, such as a closed end
+        waiting.poll()
+        os._exit(1)

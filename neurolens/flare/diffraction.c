@@ -1,0 +1,92 @@
+/* The field of edge elements: see `diffraction.py`. `pairs`: of each start and every element after it (sorted by x, in
+   units of the greatest distance), the product under Parzen's window, whose transform is the fourth power of a sinc,
+   laid down on the nearest nine lags by quadratic B-splines. One of each two opposite pairs, for the real part has
+   both; and half of what meets itself. `squares` has |u|^2 of the element whose n is closest to u, less what an element
+   between it and the one beside it would have less. */
+#include <math.h>
+#include <stdint.h>
+#if defined(__GNUC__)
+#define ALWAYS __attribute__((always_inline))
+#else
+#define ALWAYS
+#endif
+
+static inline ALWAYS float window(float t)
+{
+    return t < 0.5f ? 1.0f - 6.0f * t * t * (1.0f - t) : 2.0f * (1.0f - t) * (1.0f - t) * (1.0f - t);
+}
+
+static inline ALWAYS int64_t laid(float at, float *share)
+{
+    const float middle = floorf(at + 0.5f), t = at - middle;
+    share[0] = 0.5f * (0.5f - t) * (0.5f - t);
+    share[1] = 0.75f - t * t;
+    share[2] = 0.5f * (0.5f + t) * (0.5f + t);
+    return (int64_t)middle;
+}
+
+enum { LANES = 16 };
+typedef float lanes __attribute__((vector_size(4 * LANES)));
+typedef int32_t truth __attribute__((vector_size(4 * LANES)));
+
+static inline ALWAYS lanes chosen(truth first, lanes a, lanes b)
+{
+    return (lanes)((first & (truth)a) | (~first & (truth)b));
+}
+
+void squares(
+    int64_t width, int64_t height, int64_t count, const float *x, const float *y, const float *edge, float *found)
+{
+    for (int64_t first = 0; first < width * height; first += LANES) {
+        const int64_t some = width * height - first < LANES ? width * height - first : LANES;
+        lanes q = { 0.0f }, r = q, none = q;
+        for (int64_t i = 0; i < some; i++) {
+            q[i] = x[(first + i) % width];
+            r[i] = y[(first + i) / width];
+        }
+        lanes least = none + 1.0f, of = least; /* the least is least / of */
+        lanes result = q * q + r * r;
+        for (const float *e = edge; e < edge + 5 * count; e += 5) {
+            const lanes a = q - e[0], b = r - e[1], whole = a * a + b * b, aside = a * e[3] - b * e[2];
+            const lanes square = aside * aside, most = 0.9f * whole, gap = none + e[4];
+            const truth closer = square * of < least * whole;
+            lanes less = chosen(most < gap, most, gap);
+            less = chosen(square < less, square, less);
+            least = chosen(closer, square, least);
+            of = chosen(closer, whole, of);
+            result = chosen(closer, whole - less, result);
+        }
+        for (int64_t i = 0; i < some; i++)
+            found[first + i] = result[i];
+    }
+}
+
+void pairs(
+    int64_t count, int64_t starts, int64_t side, const int64_t *start, const double *place, const float *vector,
+    float *total)
+{
+    const double *const x = place, *const y = place + count;
+    const float *const u = vector, *const v = vector + 2 * count;
+    for (int64_t k = 0; k < starts; k++) {
+        const int64_t i = start[k];
+        const float a = u[2 * i], b = u[2 * i + 1], c = v[2 * i], d = v[2 * i + 1];
+        for (int64_t j = i; j < count && x[j] - x[i] < 1.0; j++) {
+            const float dx = (float)(x[j] - x[i]), dy = (float)(y[j] - y[i]);
+            if (fabsf(dy) >= 1.0f || dx >= 1.0f)
+                continue;
+            const float weight = window(dx) * window(fabsf(dy)) * (i == j ? 0.5f : 1.0f);
+            const float re = weight * (a * u[2 * j] + b * u[2 * j + 1] + c * v[2 * j] + d * v[2 * j + 1]);
+            const float im = weight * (a * u[2 * j + 1] - b * u[2 * j] + c * v[2 * j + 1] - d * v[2 * j]);
+            float across[3], along[3];
+            const int64_t column = laid(0.5f * dx * side, across), row = laid(0.5f * dy * side, along) - 1;
+            for (int q = 0; q < 3; q++) {
+                const int64_t y = row + q < 0 ? row + q + side : row + q < side ? row + q : row + q - side;
+                float *const at = total + 2 * (column * side + y);
+                for (int p = 0; p < 3; p++) {
+                    at[2 * p * side] += across[p] * along[q] * re;
+                    at[2 * p * side + 1] += across[p] * along[q] * im;
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,34 @@
+/* The steps of a lens: see `stack.py`. Compiled steps stand before this text; Python defines STATE, WIDTH, ACTIONS and
+   STEPS. `go` is the step of surface k on rows `stride` apart. */
+typedef void step(size_t, const float *const *, const float *, float *const *);
+static step *const steps[] = { STEPS };
+
+struct lens {
+    int surfaces;
+    const int *functions;
+    const float *numbers;
+};
+
+static void go(struct lens lens, int k, int action, size_t n, const float *from, float *to, size_t stride)
+{
+    const float *in[STATE];
+    float *out[STATE];
+    for (int r = 0; r < STATE; r++) {
+        in[r] = from + r * stride;
+        out[r] = to + r * stride;
+    }
+    const int at = ACTIONS * k + action;
+    steps[lens.functions[at]](n, in, lens.numbers + at * WIDTH, out);
+}
+
+/* x, y, power and worst of light that meets the film. */
+static void meet_film(size_t n, const float *from, size_t stride, float shift, float *to, size_t apart)
+{
+    const float *in[STATE];
+    float *out[4];
+    for (int r = 0; r < STATE; r++)
+        in[r] = from + r * stride;
+    for (int r = 0; r < 4; r++)
+        out[r] = to + r * apart;
+    run_film(n, in, &shift, out);
+}

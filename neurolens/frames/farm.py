@@ -1,0 +1,165 @@
+"""Frames cut into tiles that any executor of `base.tasks` renders, and put together when their tiles are there.
+
+Tiles are kept in a folder until their picture is written, under names that their frame and its files decide, so that
+the next run takes those that are there.
+
+    with Dask("local:2") as executor:
+        render_frames({Path("room.exr"): Frame.of("experiments/scenes/room.toml", "thin")}, executor)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neurolens import __version__
+from neurolens.base.errors import NeurolensError
+from neurolens.base.files import noted_files
+from neurolens.base.progress import Progress
+from neurolens.base.tasks import Failed, Shared, run_each
+from neurolens.base.travel import absolute, packed, run_with_files, unpack
+from neurolens.frames.frame import Frame, Prepared, prepare
+from neurolens.frames.picture import flare_choice, render_frame
+from neurolens.render.checkpoint import digest
+from neurolens.render.tiles import read_tile, tile_path, write_picture
+
+if TYPE_CHECKING:
+    from neurolens.flare.layers import Choice
+
+_PATHS_A_TILE, _MOST_TILES = 1 << 24, 1024  # some 20 s of a core
+_FEW, _PATHS_OF_FEW = 4, 1 << 19  # tiles of small pictures, if each has so many paths
+
+
+@dataclass(frozen=True)
+class TileTask:
+    """A tile to render: its name in messages, the frame, the file of its whole picture, and the lights of its flare."""
+
+    name: str
+    frame: Frame
+    out: Path
+    choice: Choice | None
+
+    @property
+    def number(self) -> int:
+        """The tile's, from 1."""
+        return self.frame.tile[0] if self.frame.tile else 1
+
+
+@dataclass
+class _Picture:
+    """A picture in the making: its frame, where it is written, the files of its tiles, and which are missing yet."""
+
+    frame: Frame
+    out: Path
+    tiles: list[Path]
+    missing: set[int]
+
+
+def render_tile(task: TileTask) -> None:
+    """Render a tile in one thread and write its EXR alone."""
+    render_frame(task.frame, task.out, threads=1, choice=task.choice, preview=False)
+
+
+def render_frames(
+    frames: Mapping[Path, Frame],
+    executor: Executor,
+    folder: Path | None = None,
+    *,
+    shown: Sequence[Frame] | None = None,
+    restart: bool = False,
+    progress: Progress | None = None,
+) -> list[dict[str, Any]]:
+    """Render frames by tiles, wherever the executor runs them; pictures are those of one machine, bit for bit.
+
+    Args:
+        frames: of one scene and one camera, by the files of their pictures (.exr); without tiles of their own.
+        folder: where tiles are kept (default: OUT.exr.tiles for the first picture OUT.exr).
+        shown: the frames that decide which lights and ghosts the flare has, see `flare_choice`; None: these frames.
+        restart: render tiles that are there again.
+
+    Returns:
+        For each picture its file, preview, number of tiles and statistics.
+
+    Raises:
+        InputError: a mistake in a scene or a camera, before anything is sent. NeurolensError: a tile has failed; the
+            others are kept. Lost: the executor has failed.
+    """
+    out, frame = next(iter(frames.items()))
+    progress = progress or Progress(quiet=True)
+    folder = folder or out.with_name(f"{out.name}.tiles")
+    with noted_files() as files, frame.glasses():
+        made = prepare(frame, out, progress)
+        choice = flare_choice(shown or list(frames.values()), made)
+    common = packed(files | {path for path in (frame.scene, frame.camera.file, *frame.glass_files) if path is not None})
+    shared = sha256(common).hexdigest(), None if choice is None else (sorted(map(repr, choice.lights)), choice.single)
+    todo = [_picture(each, out, folder, shared, made, restart) for out, each in frames.items()]
+    folder.mkdir(exist_ok=True)
+    pictures, done, count = [], 0, sum(len(picture.tiles) for picture in todo)
+    with progress.stage(f"render {made.name}: {count} tiles") as report:
+        waiting: dict[Path, _Picture] = {}
+        tasks = _tasks(todo, waiting, choice)
+        for task, answer in run_each(executor, run_with_files, tasks, render_tile, Shared(common)):
+            if isinstance(answer, Failed):
+                raise NeurolensError(f"{task.name}: {answer.reason}; {kept(folder)}")
+            unpack(answer, folder)
+            picture = waiting[task.out]
+            picture.missing.discard(task.number)
+            if not picture.missing:
+                pictures.append(_finish(waiting.pop(task.out), made))
+            done += 1
+            report(done / count)
+        pictures += [_finish(picture, made) for picture in todo if picture.tiles]  # whose tiles were all there
+    with suppress(OSError):
+        for stale in folder.glob("*.tile-*.exr"):
+            stale.unlink()
+        folder.rmdir()
+    return pictures
+
+
+def kept(folder: Path) -> str:
+    """How to resume frames whose tiles are in a folder."""
+    return f"tiles that are done are kept in {folder}: the same command goes on"
+
+
+def _picture(frame: Frame, out: Path, folder: Path, shared: Any, made: Prepared, restart: bool) -> _Picture:
+    """A picture cut into tiles; the cut depends on the picture alone, so that the next command has the same."""
+    width, height = made.size
+    paths = width * height * (frame.samples or made.scene.settings.camera.samples)
+    few = min(_FEW, math.ceil(paths / _PATHS_OF_FEW))
+    count = min(max(math.ceil(paths / _PATHS_A_TILE), few), _MOST_TILES, height)
+    mark = digest((__version__, out.name, replace(frame, exposure=0.0), shared))
+    tiles = [tile_path(folder / f"{mark}.exr", (k, count)) for k in range(1, count + 1)]
+    return _Picture(frame, out, tiles, {k for k, tile in enumerate(tiles, 1) if restart or not tile.is_file()})
+
+
+def _tasks(todo: list[_Picture], waiting: dict[Path, _Picture], choice: Choice | None) -> Iterator[TileTask]:
+    """The tiles that are missing; `waiting` gets their pictures by the names that the tasks have of these."""
+    for picture in todo:
+        count = len(picture.tiles)
+        for k in sorted(picture.missing):
+            mark = picture.tiles[0].name.partition(".")[0]
+            name = f"{picture.out.name}, tile {k} of {count}"
+            out = picture.tiles[0].with_name(f"{mark}.exr")
+            task = absolute(TileTask(name, replace(picture.frame, tile=(k, count)), out, choice))
+            waiting[task.out] = picture
+            yield task
+
+
+def _finish(picture: _Picture, made: Prepared) -> dict[str, Any]:
+    """Put a picture together, with the paths as they are here, and remove its tiles."""
+    tiles = [read_tile(tile) for tile in picture.tiles]
+    for tile in tiles:
+        tile.told["scene"] = str(picture.frame.scene)
+        if "model" in tile.told["camera"]:
+            tile.told["camera"]["model"] = made.camera.settings["model"]
+    written = write_picture(tiles, picture.out, picture.frame.exposure)
+    for file in picture.tiles:
+        file.unlink()
+    picture.tiles = []
+    return written

@@ -1,0 +1,162 @@
+"""The operations in which a surface step is written, so that one text serves tensors, numpy arrays and graphs.
+
+Operators (+ - * / and comparisons) mean the same in all three. `Arithmetic` names the rest. Torch's fused and guarded
+forms are in `tensors`; the methods here serve numpy arrays and, overridden in `Graphs`, the values of a graph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+import numpy as np
+
+from neurolens.graph.ir import Graph, Value
+
+# The least number under a square root. What must be positive is tested to be at least this.
+TINY = 1e-30
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value is a plain number, which is folded into the operations around it."""
+    return isinstance(value, int | float)
+
+
+def times(a: Any, k: Any) -> Any:
+    """a k, without an operation where k is the number 1 or -1."""
+    if is_number(k) and k in (1, -1):
+        return a if k == 1 else -a
+    return a * k
+
+
+class Arithmetic:
+    """Numpy's arithmetic: NaN is what a root of a negative number gives, and tests fail for it.
+
+    Attributes:
+        guard: whether rays that are lost stay finite, which derivatives and recorded crossings need.
+        finite: whether roots of negative numbers are numbers; they are where lost rays are guarded.
+        polish: steps of an iteration after the one that decides whether it has converged.
+    """
+
+    guard = finite = False
+    polish = 2
+
+    def fma(self, a: Any, b: Any, c: Any, k: Any = 1) -> Any:
+        """a b k + c, where b and k may be numbers."""
+        if is_number(b):
+            b, k = k, b
+        if is_number(k) and k == 0:
+            return c
+        return times(times(a, k), b) + c
+
+    def add_to(self, c: Any, a: Any, b: Any, k: Any = 1) -> Any:
+        """a b k + c, which may overwrite c."""
+        return self.fma(a, b, c, k)
+
+    def dot(self, a: Sequence[Any], b: Sequence[Any]) -> Any:
+        """The scalar product of two vectors."""
+        total = a[0] * b[0]
+        for p, q in zip(a[1:], b[1:], strict=True):
+            total = self.fma(p, q, total)
+        return total
+
+    def root(self, square: Any) -> Any:
+        """Square root; NaN for negative numbers unless lost rays are guarded."""
+        return np.sqrt(square)
+
+    def held_root(self, square: Any, least: float = TINY) -> Any:
+        """Square root of a number, or of the least one where it is less."""
+        return np.sqrt(np.maximum(square, least))
+
+    def inverse_root(self, square: Any) -> Any:
+        """1 / square root."""
+        return 1.0 / np.sqrt(square)
+
+    def positive(self, value: Any) -> Any:
+        """A divisor. With guards it is 1 where it is not positive."""
+        return value
+
+    def nonzero(self, value: Any) -> Any:
+        """A divisor of either sign. With guards it is 1 where its square is 0."""
+        return value
+
+    def least(self, a: Any, b: Any) -> Any:
+        """The smaller of two values."""
+        return np.minimum(a, b)
+
+    def abs(self, value: Any) -> Any:
+        """The size of a value."""
+        return np.abs(value)
+
+    def select(self, low: Any, high: Any, then: Any, otherwise: Any) -> Any:
+        """`then` where low <= high, else `otherwise`, also for NaN."""
+        return np.where(low <= high, then, otherwise)
+
+    def fixed(self, value: Any) -> Any:
+        """The value as a constant: derivatives are not taken through it."""
+        return value
+
+    def constant(self) -> AbstractContextManager[Any]:
+        """A context in which derivatives are not followed."""
+        return nullcontext()
+
+    def like(self, value: Any, number: Any) -> Any:
+        """A number in the form of a value."""
+        return np.full_like(value, number)
+
+    def horner(self, x: Any, coefficients: Sequence[Any]) -> Any:
+        """The polynomial of these coefficients, lowest power first."""
+        total: Any = coefficients[-1]
+        for c in coefficients[-2::-1]:
+            total = total * x + c
+        return total + x * 0.0 if is_number(total) else total
+
+
+class Graphs(Arithmetic):
+    """The arithmetic of a graph's values.
+
+    Args:
+        double: whether the graph will run in double precision, for which iterations are polished.
+        guard, finite: as in `Arithmetic`.
+    """
+
+    def __init__(self, graph: Graph, *, double: bool = False, guard: bool = False, finite: bool = False) -> None:
+        self.graph, self.polish, self.guard, self.finite = graph, 2 if double else 0, guard, guard or finite
+
+    def root(self, square: Value) -> Value:
+        if self.guard:
+            return self.select(TINY, square, square, 1.0).sqrt()
+        return self.held_root(square) if self.finite else square.sqrt()
+
+    def held_root(self, square: Value, least: float = TINY) -> Value:
+        return square.maximum(least).sqrt()
+
+    def inverse_root(self, square: Value) -> Value:
+        return 1.0 / square.sqrt()
+
+    def positive(self, value: Value) -> Value:
+        return self.select(TINY, value, value, 1.0) if self.guard else value
+
+    def nonzero(self, value: Value) -> Value:
+        return self.select(TINY, value * value, value, 1.0) if self.guard else value
+
+    def least(self, a: Value, b: Value) -> Value:
+        return a.minimum(b)
+
+    def abs(self, value: Value) -> Value:
+        return value.abs()
+
+    def select(self, low: Any, high: Any, then: Any, otherwise: Any) -> Value:
+        return self.graph.select(self.graph.value(low) <= high, then, otherwise)
+
+    def like(self, value: Value, number: Any) -> Value:
+        return self.graph.value(number)
+
+    def horner(self, x: Value, coefficients: Sequence[Any]) -> Value:
+        if all(is_number(c) for c in coefficients):
+            return self.graph.series(x, coefficients)
+        return self.graph.value(super().horner(x, coefficients))
+
+
+NUMPY = Arithmetic()

@@ -1,0 +1,146 @@
+"""What flare is made of and how finely: the table [flare] of a scene, options of `neurolens flare`, and Python."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+from neurolens.base.errors import InputError
+from neurolens.base.options import check_bounds, setting
+
+LAYERS = ("ghosts", "glare", "starburst")
+GLARE = 1 << 18  # photons where anything scatters
+_MOST_PHOTONS = 1 << 30
+_PREVIEW_BINS, _PREVIEW_CELL_PX, _PREVIEW_PHOTONS = 5, 24.0, 1 << 16
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """What scatters light in a lens, and how much; nothing by default.
+
+    Attributes:
+        barrel: share of light that the tube, its rings and the stop's plate reflect; gloss: share of it that goes about
+            the mirror's direction, the rest by Lambert's law.
+        sensor: share of light that the film reflects; mirror: share of it as a mirror, the rest by Lambert's law.
+        dust: share of the light that enters at the front that dust there scatters; dust_forward: mean cosine.
+        haze_per_mm: scattering of glass, the inverse of the mean free path; haze_forward: mean cosine.
+
+    Raises:
+        InputError: a value out of bounds.
+    """
+
+    barrel: float = setting(
+        0.0, "of light that the barrel reflects, its rings and the stop, a fifth glossily", within=(0, 1),
+        metavar="SHARE",
+    )  # fmt: skip
+    gloss: float = 0.2
+    sensor: float = setting(
+        0.0, "of light that the film reflects, half of it as a mirror", within=(0, 0.9), metavar="SHARE"
+    )
+    mirror: float = 0.5
+    dust: float = setting(
+        0.0, "of the front that is dusty: light scatters there, mean cosine 0.98", within=(0, 1), metavar="SHARE"
+    )
+    dust_forward: float = 0.98
+    haze_per_mm: float = setting(
+        0.0, "scattering in glass, inverse of the mean free path, mean cosine 0.9", within=(0, 10)
+    )
+    haze_forward: float = 0.9
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "scatter")
+        for name, most in (("gloss", 1.0), ("mirror", 1.0), ("dust_forward", 0.9999), ("haze_forward", 0.9999)):
+            if not 0 <= (value := getattr(self, name)) <= most:
+                raise InputError("scatter", name, value, f"a number from 0 to {most:g}")
+
+    @property
+    def on(self) -> bool:
+        """Whether anything scatters."""
+        return bool(self.barrel or self.sensor or self.dust or self.haze_per_mm)
+
+
+@dataclass(frozen=True)
+class FlareSettings:
+    """What flare is made of, and how finely.
+
+    Attributes:
+        gains: factors of red, green and blue by the name of a layer or of a ghost (g07-03).
+        scatter: what scatters light. Ghosts keep the light that scatters out of them, which is little.
+
+    Raises:
+        InputError: a value out of bounds, an unknown layer, or photons together with single ghosts.
+    """
+
+    coating: str | None = setting(
+        None,
+        "of every surface between glass and air that the lens file leaves bare: single-layer (1940s to 60s), "
+        "three-layer (1970 on), multi-layer (today), quarter-wave, v-coat, broadband; of one: three-layer,s07=bare",
+    )
+    bins: int = setting(
+        15,
+        "wavelengths of stars and photons, in equal steps over the range of light, 400 to 700 nm; ghosts take what "
+        "their colours need, at most four times as many (default: 15)",
+        within=(1, 256),
+        old=("wavelengths",),
+    )
+    cell_px: float = setting(
+        8.0, "size on film of the cells that a ghost is drawn by (default: 8; a quick look: 48)",
+        within=(1, 256), unit="pixels",
+    )  # fmt: skip
+    brightest: int = setting(
+        0, "ghosts with a layer of their own, those with the greatest values on the film",
+        within=(0, 64), option="layers",
+    )  # fmt: skip
+    most: int = setting(
+        32,
+        "of --image and of a scene: the lights of the most energy; what is left out is said. With --frames a scene has "
+        "the same ones in all frames, and those of pictures fade before they are left out",
+        within=(1, 10_000),
+    )
+    without: tuple[str, ...] = setting((), f"layer that is not made: {', '.join(LAYERS)}; repeatable", metavar="LAYER")
+    gains: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    starburst: bool = setting(False, "the layer starburst; some seconds a light")
+    photons: int = setting(
+        0, "instead of all pairs, photons with up to --reflections by chance, N a light and wavelength",
+        within=(0, _MOST_PHOTONS),
+    )  # fmt: skip
+    most_reflections: int = setting(
+        10, "of photons and glare at most (default: 10)", within=(1, 1000), option="reflections"
+    )
+    kernel_px: float = setting(
+        3.0, "radius of the kernel that smooths photons, where they are dense (default: 3); 0 leaves them",
+        within=(0, 100), unit="pixels",
+    )  # fmt: skip
+    glare: int = setting(
+        0, f"photons a light and wavelength of the layer glare (default: {GLARE} if anything scatters, else none)",
+        within=(0, _MOST_PHOTONS),
+    )  # fmt: skip
+    scatter: Scatter = setting(Scatter(), "what scatters photons")
+    seed: int = setting(0, "of the chances of photons, the same in all frames; ghosts have none", within=(0, 1 << 20))
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "flare")
+        for name in self.without:
+            if name not in LAYERS:
+                raise InputError("flare", "without", name, f"layers of flare: {', '.join(LAYERS)}")
+        if self.photons and (self.brightest or set(self.gains) - set(LAYERS)):
+            raise InputError("flare", "photons", self.photons, "0 with layers or gains of single ghosts")
+        for name, factor in self.gains.items():
+            if not all(0 <= v < math.inf for v in factor):
+                raise InputError("flare", f"gain {name}", factor, "finite numbers of at least 0")
+        if self.scatter.on and not self.glare:
+            object.__setattr__(self, "glare", GLARE)
+
+    def quick(self) -> FlareSettings:
+        """The same, coarse enough for a quick look."""
+        photons, glare = (min(n, _PREVIEW_PHOTONS) for n in (self.photons, self.glare))
+        cell = max(self.cell_px, _PREVIEW_CELL_PX)
+        return replace(self, bins=min(self.bins, _PREVIEW_BINS), cell_px=cell, photons=photons, glare=glare)
+
+    def makes(self, name: str) -> bool:
+        """Whether the layer of this name is switched on."""
+        return name not in self.without and bool({"glare": self.glare, "starburst": self.starburst}.get(name, True))
+
+    def gain(self, name: str) -> tuple[float, float, float]:
+        """Factors of red, green and blue of a layer or ghost."""
+        return self.gains.get(name, (1.0, 1.0, 1.0))

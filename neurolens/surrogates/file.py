@@ -1,0 +1,438 @@
+"""A model file is its coefficients: what a model is made of, as compact JSON in an ONNX file's metadata.
+
+An exported file is a complete ONNX model that any program runs. This package reads the card and the coefficients alone,
+checks them, and builds the graph again, which onnxruntime, C, GLSL and numpy then run; it does so without torch.
+Coefficients are kept in float32; floats of the prescription and of the encoding in float64, exactly.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import math
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neurolens.base import status as st
+from neurolens.base.errors import InputError, ModelError
+from neurolens.base.tomlfile import check_tree
+from neurolens.graph.derive import derivative, with_derivatives
+from neurolens.graph.interpret import evaluate
+from neurolens.graph.ir import Graph
+from neurolens.graph.onnx import Mixing, write_onnx
+from neurolens.graph.program import RAY
+from neurolens.modelfile import MODEL_KEY, transmittance_of
+from neurolens.modelfile.axes import Axis, weights
+from neurolens.modelfile.cardcheck import check_card, tolerances
+from neurolens.modelfile.metadata import card_in, read_metadata
+from neurolens.modelfile.stategraph import state_graph
+from neurolens.modelfile.states import axes_of, default_state
+from neurolens.optics.prescription import Coating, Lens, Surface
+from neurolens.surrogates.assemble import ONNX, model_graph
+from neurolens.surrogates.cores import CORES, Core
+from neurolens.surrogates.model import Domain, Encoding, Gate, LensModel, Scales, mixed, with_one_angle
+
+SCHEMA = 2
+_ONE_NODE = 1  # schema of version 0.1.0: one state, and no angle
+_MAX_TEXT = 16 * 2**20  # of the JSON; the largest models known take 100 kB
+_MAX_DEPTH = 16  # of cores in cores
+_MAX_CORES = 1000  # of one file
+_MAX_ROWS = 20_000  # of any array: terms, or units of a layer
+_MAX_DEGREE = 64  # of any term; settings allow half, and growth without limit stays far below
+_MAX_RAYS = 1000  # of the card's reference; `card.reference_rays` gives 4 a status
+_MAX_NODES = 256  # states of one model
+# Of a graph: rows that a ray has at a time, monomials included, and numbers. The largest that settings allow have 5,000
+# and 1.9 million.
+_MAX_WORK, _MAX_WEIGHTS = 10_000, 2_000_000
+_MAX_SURFACES, _MAX_TERMS, _MAX_POWER = 500, 1000, 40  # of a prescription, as `optics.lensfile` has them
+_LENS = ("name", "source", "f_number", "image_radius_mm", "half_field_deg", "designer", "rims", "film_z_mm", "path")
+_NOWHERE = -1.0  # A film position in no domain: it takes the place of the film where the state is out of range.
+DERIVATIVES = {"scene_ray_d_film": RAY[:2], "scene_ray_d_pupil": RAY[2:]}
+_DAMAGE = (ValueError, TypeError, KeyError, IndexError, ArithmeticError, AttributeError, AssertionError)
+
+
+@dataclass(frozen=True)
+class ModelFile:
+    """A model that was read from its file.
+
+    Attributes:
+        path: the file.
+        card: what `surrogates.card` wrote.
+        more: further entries of the coefficients, of inverse maps.
+        nodes: a model for every node of the axes, in the order of `modelfile.axes.product`; one without axes. Their
+            coefficients are rounded to float32, and their lens is that of the first node.
+    """
+
+    path: Path
+    card: dict[str, Any]
+    nodes: tuple[LensModel, ...]
+    more: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        """State variables of a model of many states."""
+        return axes_of(self.card)
+
+    def at(self, state: Sequence[float] = ()) -> LensModel:
+        """The model of one state. Raises InputError: another number of values than axes, or one out of range."""
+        return mixed(self.nodes, weights(self.axes, state)) if self.axes else self.nodes[0]
+
+
+def read_model(path: str | Path) -> ModelFile:
+    """The model of an exported file.
+
+    Raises:
+        ModelError: a file that is missing, too large, no exported model, or damaged; one without coefficients; one
+            whose coefficients do not give the card's reference rays.
+    """
+    file = Path(path)
+    metadata = read_metadata(file)
+    card = card_in(file, metadata)
+    check_card(file, card)
+    if MODEL_KEY not in metadata:
+        raise ModelError(
+            f"{file}: it holds no coefficients, from which its graph would be built: export it again "
+            "(`neurolens train` fits the model and writes its file with them)"
+        )
+    try:
+        with np.errstate(all="ignore"):
+            data = coefficients_in(metadata[MODEL_KEY])
+            model = ModelFile(file, card, _nodes(file, card, data), data)
+            _check_reference(model)
+    except _DAMAGE as error:
+        if isinstance(error, ModelError):
+            raise
+        raise ModelError(f"{file}: its coefficients are damaged ({type(error).__name__}: {error})") from error
+    return model
+
+
+def coefficients_in(text: str) -> dict[str, Any]:
+    """The JSON of a metadata entry of coefficients. Raises ValueError: damaged, or of another schema."""
+    data = json.loads(inflated(text))
+    check_tree(data, "coefficients")
+    if data["schema"] not in (_ONE_NODE, SCHEMA):
+        raise ValueError(f"schema: got {data['schema']!r}, expected {SCHEMA}")
+    return dict(data)
+
+
+def _nodes(file: Path, card: Mapping[str, Any], data: Mapping[str, Any]) -> tuple[LensModel, ...]:
+    states = card.get("states")
+    domains = [node["domain"] for node in states["nodes"]] if states else [card["domain"]]
+    parts = [data] if data["schema"] == _ONE_NODE else data["nodes"]
+    if len(parts) != len(domains) or len(parts) > _MAX_NODES:
+        raise ValueError(f"{len(parts)} nodes, expected {len(domains)}, at most {_MAX_NODES}")
+    lens, gates = unpacked_lens(data["lens"]), tuple(Gate(int(k), int(r)) for k, r in data["gates"])
+    if not states and lens.sha256 != card["lens"]["sha256"]:
+        raise ModelError(f"{file}: its prescription is not that of its card")
+    angle = data.get("angle")
+    common = LensModel(
+        lens=lens,
+        domain=Domain.from_dict(card["domain"]),
+        encoding=_numbers(Encoding, parts[0]["encoding"]),
+        scales=_numbers(Scales, data["scales"]),
+        gates=gates,
+        core=unpack(parts[0]["core"]),
+        method=str(card["fit"]["method"]),
+        settings=dict(card["fit"]["settings"]),
+        fit_s=float(card["fit"]["seconds"]),
+        direction="slope" if data["direction"] == "slope" else "angle",
+        transmittance=transmittance_of(card),
+        angle=None if angle is None else float(angle),
+    )
+    if angle is None:
+        common = replace(common, angle=_traced_angle(file, common))
+    if not 0 < common.largest_angle <= math.pi:
+        raise ValueError(f"angle: got {angle!r}, expected above 0, up to pi")
+    nodes = tuple(
+        replace(
+            common,
+            domain=Domain.from_dict(domain),
+            encoding=_numbers(Encoding, part["encoding"]),
+            core=unpack(part["core"]),
+        )
+        for part, domain in zip(parts, domains, strict=True)
+    )
+    _check_size(nodes[0].core)
+    return nodes
+
+
+def _traced_angle(file: Path, model: LensModel) -> float:
+    """The largest angle of the scene rays, which coefficients of version 0.1.0 do not tell."""
+    try:
+        return model.largest_angle
+    except ModuleNotFoundError as error:
+        raise ModelError(
+            f"{file}: its coefficients are those of version 0.1.0, which only a machine with torch reads: there "
+            "`neurolens export MODEL.onnx --to onnx --out NEW.onnx` writes it as others read it"
+        ) from error
+
+
+def _check_size(core: Core) -> None:
+    """Refuse work beyond reason before a graph is made of a core.
+
+    Raises:
+        ValueError: more than `_MAX_WORK` rows of a ray, monomials included, or more than `_MAX_WEIGHTS` numbers.
+    """
+    rows = weights = 0
+    left: list[Any] = [core]
+    while left:
+        value = left.pop()
+        if isinstance(value, np.ndarray):
+            rows, weights = rows + (value.shape[0] if value.dtype.kind == "i" else 0), weights + value.size
+            rows += value.shape[0] if value.dtype.kind == "f" and value.ndim == 1 else 0  # units of a layer
+        elif isinstance(value, tuple):
+            left += value
+        elif isinstance(value, Core):
+            left += [getattr(value, f.name) for f in fields(value)]  # type: ignore[arg-type]
+    if rows > _MAX_WORK or weights > _MAX_WEIGHTS:
+        raise ValueError(
+            f"{rows} terms and units and {weights} numbers, expected at most {_MAX_WORK} and {_MAX_WEIGHTS}"
+        )
+
+
+def _check_reference(model: ModelFile) -> None:
+    """Compute the card's reference rays, at every state that has some: a changed coefficient shows."""
+    states = model.card.get("states") or {}
+    known = [(default_state(model.card), model.card.get("reference"))]
+    known += [(tuple(r["state"]), r) for r in states.get("reference", ())]
+    for state, reference in known:
+        try:
+            _check_rays(model, state, reference)
+        except ModelError:
+            raise
+        except _DAMAGE as error:
+            raise ModelError(f"{model.path}: card: reference: {type(error).__name__}: {error}") from error
+
+
+def _check_rays(model: ModelFile, state: Sequence[float], reference: Any) -> None:
+    rays = np.array(reference["rays"], np.float64)
+    status = np.array(reference["status"])
+    wanted = {
+        k: np.atleast_2d(np.array(reference[k], np.float64)) for k in ("scene_ray", "transmittance", "stop_xy_mm")
+    }
+    if rays.shape != (5, len(status)) or len(status) > _MAX_RAYS:
+        raise ValueError(f"rays of shape {rays.shape}, expected 5 rows, and at most {_MAX_RAYS} columns as of status")
+    given = {
+        "rays": rays,
+        "film_z_mm": np.array(reference["film_z_mm"], np.float64).reshape(1, -1)[:, :1],
+        "stop_radius_mm": np.full((1, 1), float(reference["stop_radius_mm"])),
+    }
+    found = evaluate(model.at(state).graph, given)
+    same = np.broadcast_to(found["status"], (1, len(status)))[0] == status
+    passed = status == st.PASSED
+    if not same.all() or not passed.any():
+        raise ModelError(f"{model.path}: reference rays: the status of {int((~same).sum())} is not that of its card")
+    try:
+        position, direction, power, stop = tolerances(model.card, reference).values()
+    except (AttributeError, TypeError, ValueError) as error:
+        raise ValueError(f"rounding: {error}") from error
+    allowed = {"scene_ray": [[position]] * 3 + [[direction]] * 3, "transmittance": [[power]], "stop_xy_mm": [[stop]]}
+    for name, limit in allowed.items():
+        off = np.abs(np.broadcast_to(found[name], wanted[name].shape) - wanted[name])[:, passed]
+        if not (off <= limit).all():  # NaN fails
+            raise ModelError(
+                f"{model.path}: reference rays: {name} is off by {off.max():.3g}: its coefficients are damaged"
+            )
+
+
+def onnx_of(
+    nodes: Sequence[LensModel],
+    axes: Sequence[Axis] = (),
+    metadata: Mapping[str, str] | None = None,
+    *,
+    derivatives: bool = False,
+) -> bytes:
+    """The ONNX file of a model, whose inputs and outputs `export.export_onnx` describes.
+
+    Args:
+        nodes: one model, or one for every node of the axes. Numbers that are equal at all nodes are constants; the
+            others follow the features of the state (`Axis.features`), which costs a few operations a call.
+        derivatives: whether the scene ray's derivatives by film and pupil point are outputs, too.
+
+    Raises:
+        InputError: weights that float32 does not hold, and nodes whose graphs differ in more than numbers.
+    """
+    graphs = [model_graph(node, ONNX) for node in with_one_angle(nodes)]
+    shapes = {}
+    if derivatives:
+        graphs = [_with_ray_derivatives(graph) for graph in graphs]
+        shapes = dict.fromkeys(DERIVATIVES, (2, 6))
+    return write_onnx(graphs, metadata or {}, mixing_of(axes) if axes else None, shapes)
+
+
+def _with_ray_derivatives(graph: Graph) -> Graph:
+    graph = with_derivatives(graph, ["scene_ray"], [("rays", k) for k in range(4)])
+    for name, by in DERIVATIVES.items():
+        graph.outputs[name] = graph.concat(*(graph.outputs.pop(derivative("scene_ray", row)) for row in by))
+    return graph
+
+
+def mixing_of(axes: Sequence[Axis]) -> Mixing:
+    """How constants follow the state; one out of range puts the film where no domain is."""
+    g, transform = state_graph(axes)
+    film_z = g.input("film_z_mm", per_call=True)
+    g.outputs["film_z_mm"] = g.select(g.outputs.pop("inside"), film_z, _NOWHERE)
+    return Mixing(g, transform)
+
+
+def coefficients_text(nodes: Sequence[LensModel], **more: Any) -> str:
+    """The metadata entry of a model, or of the nodes of one of many states: deflated JSON in base64.
+
+    Args:
+        more: further entries, of inverse maps.
+
+    Raises:
+        InputError: a core that no file can hold.
+    """
+    nodes = with_one_angle(nodes)
+    first = nodes[0]
+    data = {
+        "schema": SCHEMA,
+        "lens": packed_lens(first.lens),
+        "scales": asdict(first.scales),
+        "gates": [[g.surface, g.reason] for g in first.gates],
+        "direction": first.direction,
+        "angle": first.angle,
+        "nodes": [{"encoding": asdict(node.encoding), "core": pack(node.core)} for node in nodes],
+        **more,
+    }
+    return deflated(data)
+
+
+def as_stored(nodes: Sequence[LensModel]) -> tuple[LensModel, ...]:
+    """The models as their file will give them: with coefficients rounded to float32, and one angle for all."""
+    return tuple(replace(node, core=unpack(pack(node.core))) for node in with_one_angle(nodes))
+
+
+def deflated(data: dict[str, Any]) -> str:
+    """JSON as an entry of metadata."""
+    text = json.dumps(data, separators=(",", ":")).encode()
+    return base64.b64encode(zlib.compress(text, 9)).decode()
+
+
+def inflated(text: str) -> bytes:
+    """The JSON of `deflated`. Raises ValueError: damaged, or too long."""
+    unpacker = zlib.decompressobj()
+    try:
+        found = unpacker.decompress(base64.b64decode(text, validate=True), _MAX_TEXT)
+    except (binascii.Error, zlib.error) as error:
+        raise ValueError(str(error)) from error
+    if unpacker.unconsumed_tail or not unpacker.eof:
+        raise ValueError(f"more than {_MAX_TEXT} bytes, or cut short")
+    return found
+
+
+def pack(value: Any) -> Any:
+    """Arrays, tuples and cores as JSON has them: floats in float32, integers in bytes.
+
+    Raises:
+        InputError: a core that no file can hold, or a term of a degree beyond it.
+    """
+    if isinstance(value, np.ndarray) and value.dtype.kind == "f":
+        with np.errstate(over="ignore"):
+            rounded = value.astype("<f4")
+        if not np.isfinite(rounded).all():
+            raise InputError("export", "weights", "(NaN or infinity)", "finite numbers, in float32 too")
+        return {"f4": base64.b64encode(rounded.tobytes()).decode(), "shape": list(value.shape)}
+    if isinstance(value, np.ndarray):
+        if value.size and not (0 <= value.min() and value.sum(-1).max() <= _MAX_DEGREE):
+            raise InputError("export", "exponents", "(a negative or larger one)", f"terms of degree 0 to {_MAX_DEGREE}")
+        return {"u1": base64.b64encode(value.astype("u1").tobytes()).decode(), "shape": list(value.shape)}
+    if isinstance(value, tuple):
+        return [pack(v) for v in value]
+    if isinstance(value, Core):
+        names = {kind: name for name, kind in CORES.items()}
+        if type(value) not in names:
+            raise InputError("export", "core", type(value).__name__, f"one of {', '.join(CORES)}")
+        parts = {f.name: pack(getattr(value, f.name)) for f in fields(value)}  # type: ignore[arg-type]
+        return {"kind": names[type(value)], **parts}
+    return value
+
+
+def unpack(packed: Any) -> Any:
+    """What `pack` packed. Raises ValueError, KeyError, TypeError: it is damaged, or larger than files may be."""
+    return _unpacked(packed, 0, [_MAX_CORES])
+
+
+def _unpacked(packed: Any, depth: int, left: list[int]) -> Any:
+    if depth > _MAX_DEPTH:
+        raise ValueError("cores nested too deep")
+    if isinstance(packed, list):
+        return tuple(_unpacked(v, depth + 1, left) for v in packed)
+    if not isinstance(packed, dict):
+        return packed
+    if "kind" in packed:
+        left[0] -= 1
+        if left[0] < 0 or packed["kind"] not in CORES:
+            raise ValueError(
+                f"core {str(packed['kind'])[:40]!r}, expected one of {', '.join(CORES)}, at most {_MAX_CORES}"
+            )
+        kind = CORES[packed["kind"]]
+        return kind(**{f.name: _unpacked(packed[f.name], depth + 1, left) for f in fields(kind) if f.name in packed})  # type: ignore[arg-type]
+    if max(packed["shape"], default=0) > _MAX_ROWS:
+        raise ValueError(f"an array of shape {packed['shape']}, expected at most {_MAX_ROWS} rows")
+    form = "f4" if "f4" in packed else "u1"
+    array = np.frombuffer(base64.b64decode(packed[form], validate=True), f"<{form}").reshape(packed["shape"])
+    if form == "u1":
+        if array.size and int(array.sum(-1).max()) > _MAX_DEGREE:  # whoever writes terms as products would not end
+            raise ValueError(f"a term of degree {int(array.sum(-1).max())}, expected at most {_MAX_DEGREE}")
+        return array.astype(np.int64)
+    if not np.isfinite(array).all():
+        raise ValueError("coefficients that are NaN or infinite")
+    return array.astype(np.float64)
+
+
+def _numbers(kind: Any, packed: dict[str, Any]) -> Any:
+    """A dataclass of numbers, some of them None."""
+    return kind(**{key: None if value is None else float(value) for key, value in packed.items()})
+
+
+def packed_lens(lens: Lens) -> dict[str, Any]:
+    """What stands in a prescription but for its other states and notes; numbers as they are, infinity as a word."""
+    rows = []
+    for surface in lens.surfaces:
+        row = {}
+        for f in fields(surface):
+            value = getattr(surface, f.name)
+            if f.default is MISSING or value != f.default:
+                row[f.name] = _plain(value)
+        rows.append(row)
+    return {**{k: _plain(getattr(lens, k)) for k in _LENS}, "path": Path(lens.path).name, "surfaces": rows}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Coating):
+        return [value.name, [list(layer) for layer in value.layers]]
+    if isinstance(value, tuple):
+        return [_plain(v) for v in value]
+    if not isinstance(value, (str, bool, int, float, list, dict, type(None))):
+        value = float(value)  # of torch
+    if isinstance(value, float) and math.isinf(value):
+        return "inf" if value > 0 else "-inf"
+    return value
+
+
+def unpacked_lens(packed: dict[str, Any]) -> Lens:
+    """What `packed_lens` packed. Raises ValueError, KeyError, TypeError: it is damaged, or larger than lenses are."""
+    surfaces: list[Surface] = []
+    if len(packed["surfaces"]) > _MAX_SURFACES:
+        raise ValueError(f"{len(packed['surfaces'])} surfaces, expected at most {_MAX_SURFACES}")
+    for row in packed["surfaces"]:
+        known = {f.name: row[f.name] for f in fields(Surface) if f.name in row}
+        for key in ("radius_mm", "thickness_mm", "diameter_mm"):
+            known[key] = float(known[key])  # "inf" too
+        if "asphere" in known:
+            known["asphere"] = tuple((int(p), float(a)) for p, a in known["asphere"])
+            if len(known["asphere"]) > _MAX_TERMS or any(not 0 <= p <= _MAX_POWER for p, _ in known["asphere"]):
+                raise ValueError(f"an asphere of more than {_MAX_TERMS} terms, or of powers beyond {_MAX_POWER}")
+        if known.get("coating"):
+            name, layers = known["coating"]
+            known["coating"] = Coating(str(name), tuple(tuple(float(v) for v in layer) for layer in layers))
+        surfaces.append(Surface(**known))
+    return Lens(surfaces=tuple(surfaces), **{k: packed[k] for k in _LENS})

@@ -1,0 +1,386 @@
+"""Executors: the answers of one machine, bit for bit, whatever happens to processes, workers and scheduler."""
+
+import gc
+import io
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, as_completed
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+from command_line import failure
+
+from neurolens import __version__
+from neurolens.base import cluster as cluster_module
+from neurolens.base import tasks as tasks_module
+from neurolens.base.cluster import Dask
+from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.files import noted_files, read_bytes
+from neurolens.base.lensname import Named
+from neurolens.base.tasks import Failed, Here, Processes, Shared, run_each
+from neurolens.base.travel import packed, unpack, with_paths
+from neurolens.cli import main
+from neurolens.frames.frame import Frame
+from neurolens.render.pictures import read_channels
+
+Client = pytest.importorskip("distributed", reason="needs the extra dask").Client
+
+ROOT = Path(__file__).parents[1]
+CLUSTER = """
+import logging, sys
+from distributed import LocalCluster
+if __name__ == "__main__":
+    cluster = LocalCluster(n_workers=int(sys.argv[1]), threads_per_worker=1, dashboard_address=None, memory_limit=0,
+                           silence_logs=logging.CRITICAL)
+    print(cluster.scheduler_address, flush=True)
+    sys.stdin.read()
+"""
+
+
+class Cluster:
+    """A scheduler and its workers, apart from this process."""
+
+    def __init__(self, workers: int, folder: Path) -> None:
+        (folder / "cluster.py").write_text(CLUSTER)
+        more = {"PYTHONPATH": os.pathsep.join(sys.path), "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
+        self.process = subprocess.Popen(
+            [sys.executable, "cluster.py", str(workers)], cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL, text=True, env=os.environ | more,
+        )  # fmt: skip
+        assert self.process.stdout is not None
+        self.address = self.process.stdout.readline().strip()
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    made = Cluster(2, tmp_path_factory.mktemp("cluster"))
+    yield made.address
+    made.kill()
+
+
+def count(common: Shared, task: tuple[int, str]) -> bytes:
+    """The number, unless the task says what to do the first time."""
+    number, deed = task
+    if deed == "refuse":
+        raise InputError("lens.toml", "radius_mm", number, "a radius")
+    if deed == "break":
+        raise ZeroDivisionError("oh")
+    if deed == "exit":
+        os._exit(3)
+    if deed == "sleep":
+        time.sleep(600)
+    if deed == "die":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if deed and not Path(deed).exists():
+        Path(deed).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return common.data + str(number).encode()
+
+
+def collected(executor: Executor, tasks: list[tuple[int, str]], common: bytes = b"") -> dict[int, bytes | Failed]:
+    found = {}
+    with executor:
+        for (number, _), came in run_each(executor, count, iter(tasks), Shared(common)):
+            assert number not in found
+            found[number] = came
+    return found
+
+
+@pytest.mark.parametrize("place", ["here", "processes", "dask"])
+def test_every_task_is_answered_once_and_errors_are_lines(place: str, cluster: str) -> None:
+    make = {"here": Here, "processes": lambda: Processes(2), "dask": lambda: Dask(cluster)}[place]
+    tasks = [(k, {3: "refuse", 5: "break"}.get(k, "")) for k in range(8)]
+    found = collected(make(), tasks, b"n")
+    for k in range(8):
+        if k == 3:
+            assert found[k] == Failed("lens.toml: radius_mm: got 3, expected a radius")
+        elif k == 5:
+            assert found[k] == Failed("a fault of neurolens: ZeroDivisionError: oh")
+        else:
+            assert found[k] == b"n%d" % k
+    assert collected(make(), []) == {}
+    with make() as executor:  # as executors of the standard library are used
+        futures = [executor.submit(count, Shared(b""), (k, "")) for k in range(3)]
+        assert sorted(future.result() for future in as_completed(futures)) == [b"0", b"1", b"2"]
+
+
+def test_a_process_that_ends_early_or_takes_too_long_costs_its_own_task() -> None:
+    deeds = {1: "die", 2: "exit", 4: "sleep"}
+    began = time.monotonic()
+    found = collected(Processes(2, limit_s=6.0), [(k, deeds.get(k, "")) for k in range(6)])
+    assert time.monotonic() - began < 300
+    assert found.pop(1) == Failed("its process was killed by signal 9: did the memory run out?")
+    assert found.pop(2) == Failed("its process ended with code 3")
+    assert found.pop(4) == Failed("took longer than 6 s")
+    assert found == {k: b"%d" % k for k in (0, 3, 5)}
+
+
+def test_processes_end_with_an_iteration_that_is_left() -> None:
+    executor = Processes(2)
+    tasks = [(0, ""), (1, "sleep"), (2, "sleep"), (3, "")]
+    for _, answer in run_each(executor, count, tasks, Shared(b"")):
+        assert answer == b"0"
+        break
+    deadline = time.monotonic() + 60
+    while executor._running:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    with pytest.raises(RuntimeError, match="shutdown"):
+        executor.submit(count, Shared(b""), (1, ""))
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_process_ends_once_nobody_waits_for_it() -> None:
+    read, write = os.pipe()
+    child = os.fork()
+    if not child:
+        os.close(read)
+        tasks_module._end_unread(write)
+        os._exit(0)
+    time.sleep(0.05)
+    assert os.waitpid(child, os.WNOHANG) == (0, 0)
+    os.close(read)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1
+    os.close(write)
+
+
+def test_a_worker_of_a_cluster_ends_after_a_task_that_never_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It answers first; a task in time leaves it alone."""
+    ended: list[float] = []
+    stuck, timer = threading.Event(), SimpleNamespace(start=lambda: None)
+    monkeypatch.setattr(cluster_module.threading, "Timer", lambda after, *_: (ended.append(after), timer)[1])
+    assert cluster_module._answer(bytes, __version__, 9.0, [b"a"], {}) == b"a" and not ended
+    answer = cluster_module._answer(stuck.wait, __version__, 0.01, [], {})
+    stuck.set()
+    assert answer == Failed("took longer than 0.01 s") and len(ended) == 1
+    assert "not 0" in cluster_module._answer(bytes, "0", 9.0, [], {}).reason
+
+
+def try_in(task: str) -> bytes:
+    """Addresses of this worker and of its scheduler, and what an HTTP server of its answers."""
+    from distributed import get_worker
+
+    worker = get_worker()
+    return json.dumps([worker.address, worker.scheduler.address, worker.http_server.port]).encode()
+
+
+def test_workers_of_this_machine_are_of_this_process_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without keys nobody reaches them; ports for web pages are closed, or serve none."""
+    pytest.importorskip("cryptography", reason="needs cryptography (the extra dask)")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    answers = run_each(Dask("local:1"), try_in, ["a", "b"])
+    answer = next(answers)[1]
+    assert isinstance(answer, bytes)
+    worker, scheduler, port = json.loads(answer)
+    before = socket.create_connection(("127.0.0.1", port), 5)
+    before.sendall(b"GET /info/main/workers.html HTTP/1.0\r\n\r\n")
+    assert b" 404 " in before.recv(100)
+    before.close()
+    for address in (worker, scheduler):
+        assert address.startswith("tls://127.0.0.1:")
+        for other in (address, address.replace("tls", "tcp")):
+            stranger = Client.__new__(Client)  # at hand, so that it can be closed
+            with pytest.raises((OSError, RuntimeError, ValueError, TypeError)):
+                stranger.__init__(other, timeout="1s")
+            stranger.close()
+    assert [came for _, came in answers] == [answer]
+
+
+def test_a_killed_worker_costs_only_its_task(cluster: str, tmp_path: Path) -> None:
+    tasks = [(k, str(tmp_path / "killed") if k == 4 else "") for k in range(12)]
+    assert collected(Dask(cluster), tasks) == {k: b"%d" % k for k in range(12)}
+    assert (tmp_path / "killed").exists()
+
+
+def test_a_task_that_kills_its_workers_fails_alone(cluster: str) -> None:
+    found = collected(Dask(cluster), [(k, "die" if k == 1 else "") for k in range(4)])
+    assert found.pop(1) == Failed("its worker was killed, again and again: did the memory run out?")
+    assert found == {k: b"%d" % k for k in (0, 2, 3)}
+
+
+def test_tasks_are_taken_as_there_is_room(cluster: str) -> None:
+    """Of thousands, a scheduler holds a few."""
+    taken = 0
+
+    def tasks() -> Iterator[tuple[int, str]]:
+        nonlocal taken
+        for k in range(60):
+            taken += 1
+            yield k, ""
+
+    with Dask(cluster) as executor:
+        for done, (_, came) in enumerate(run_each(executor, count, tasks(), Shared(b"")), start=1):
+            assert isinstance(came, bytes) and taken <= done + 4
+    assert taken == 60
+
+
+def test_no_such_scheduler(capsys: pytest.CaptureFixture[str], scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neurolens.base.cluster._TIMEOUT", "0.5s")
+    line = failure(
+        capsys, "render", scene, "--camera", "thin", "-o", scene.with_name("a.exr"), "--quiet", "--dask", "x"
+    )
+    assert line.startswith("neurolens: --dask x: ") and "expected tcp://HOST:PORT" in line
+    assert all(c.status == "closed" for c in gc.get_objects() if type(c) is Client)  # none is left to the collector
+    options = ("--dask", "local", "--tile", "1/2")
+    assert "--tile: got (1, 2), expected left out beside --dask" in failure(
+        capsys, "render", scene, "--camera", "thin", "-o", scene.with_name("a.exr"), *options
+    )
+
+
+def test_files_travel_as_they_are_and_stay_in_their_folder(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "one.bin").write_bytes(bytes(range(256)))
+    with noted_files() as noted:
+        read_bytes(tmp_path / "a" / ".." / "a" / "one.bin", 999)
+    assert noted == {tmp_path / "a" / "one.bin"}
+    data = packed(noted)
+    (there,) = unpack(data, tmp_path / "there")
+    assert there.read_bytes() == bytes(range(256)) and there == tmp_path / "there" / str(noted.pop()).lstrip("/")
+    assert data == packed({tmp_path / "a" / "one.bin"})
+    evil = io.BytesIO()
+    with zipfile.ZipFile(evil, "w") as archive:
+        archive.writestr("../x", "y")
+    with pytest.raises(NeurolensError, match="outside its folder"):
+        unpack(evil.getvalue(), tmp_path / "there")
+
+
+def test_paths_of_a_frame_move_with_it() -> None:
+    frame = Frame(scene=Path("/a/s.toml"), camera=Named("fused:", Path("/a/1:2 lens")), glass_files=(Path("/g.agf"),))
+    moved = with_paths(frame, lambda path: Path("/w") / str(path).lstrip("/"))
+    assert (moved.scene, str(moved.camera)) == (Path("/w/a/s.toml"), "fused:/w/a/1:2 lens")
+    assert moved.glass_files == (Path("/w/g.agf"),) and replace(moved, scene=frame.scene) != frame
+    thin = Frame(scene=Path("/a/s.toml"), camera=Named("thin", None))
+    assert str(with_paths(thin, Path.absolute).camera) == "thin"
+
+
+@pytest.fixture
+def framed(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, bytes]]:
+    """Renders two frames of several tiles each; the channels by file."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("neurolens.frames.farm._PATHS_OF_FEW", 300)
+    frames = ("--frames", "1:2", "--key", "focus=1:1.5,2:3", "--samples", "2", "--quiet", "--camera", "thin")
+
+    def run(name: str, *options: str) -> dict[str, bytes]:
+        assert main(["render", scene.name, *frames, "-o", name, *options]) == 0
+        stem = Path(name).stem
+        found = {}
+        for number in ("0001", "0002"):
+            planes, told = read_channels(tmp_path / f"{stem}.{number}.exr")
+            assert told["scene"] == scene.name and np.isfinite(planes["R"]).all()
+            found[number] = b"".join(planes[key].tobytes() for key in sorted(planes))
+        return found
+
+    return run
+
+
+def test_frames_of_a_cluster_are_those_of_one_machine(framed: Callable[..., dict[str, bytes]], cluster: str) -> None:
+    assert framed("there.exr", "--dask", cluster) == framed("here.exr")
+    assert not Path("there.exr.tiles").exists()
+
+
+def test_a_lost_scheduler_leaves_what_is_done(
+    framed: Callable[..., dict[str, bytes]], cluster: str, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    doomed = Cluster(1, tmp_path)
+    monkeypatch.setattr("neurolens.base.cluster._TIMEOUT", "4s")
+    seen: list[Path] = []
+
+    def kept(data: bytes, folder: Path) -> list[Path]:
+        seen.extend(unpack(data, folder))
+        if len(seen) == 3:
+            doomed.kill()
+        return seen
+
+    monkeypatch.setattr("neurolens.frames.farm.unpack", kept)
+    with pytest.raises(AssertionError):
+        framed("a.exr", "--dask", doomed.address)
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and "is lost: what is done is kept, the same command goes on" in err
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "a.exr.tiles").iterdir()}
+    assert len(before) + 2 * (tmp_path / "a.0001.exr").exists() >= 2
+    seen.clear()
+    assert framed("a.exr", "--dask", cluster) == framed("here.exr")
+    assert 1 <= len(seen) < 8 and not (tmp_path / "a.exr.tiles").exists()
+
+
+# A file's bytes count the digits of the time in its card, and the checksum covers all of them.
+UNTIMED = re.compile(rb'"(fit_s|load_s|bytes)": [^,]*,|"checksum": "[0-9a-f]{64}"')
+
+
+@pytest.fixture
+def lenses(tmp_path: Path) -> list[Path]:
+    """Two lenses that are soon fitted, one beside the other."""
+    text = (ROOT / "lenses" / "cooke_triplet_50.toml").read_text()
+    found = [tmp_path / "lenses" / name for name in ("one.toml", "two.toml")]
+    found[0].parent.mkdir()
+    for path in found:
+        path.write_text(text)
+    return found
+
+
+SMALL = ("pairs.train=1500", "pairs.held_out=1000", "evaluation.vignetting_rays=1000",
+         "render.scenes=[]", 'model=[{method="ols", terms=12}]')  # fmt: skip
+
+
+@pytest.mark.slow
+def test_models_of_many_lenses_are_those_of_one_machine(
+    cluster: str,
+    lenses: list[Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    small = [word for each in SMALL for word in ("--set", each)]
+    name, broken = str(lenses[0].relative_to(tmp_path)), tmp_path / "no.toml"
+    broken.write_text("name = 5")
+    there = ("train", "--output", "there", "--rounds", "0", "--quiet", "--dask", cluster, *small, "--lens", name)
+    assert main([*there, "no.toml"]) == 2
+    err = capsys.readouterr().err
+    assert f"neurolens: no: {broken}: schema: got (missing)" in err and err.count("\n") == 1
+    assert main(["train", "--lens", name, "--output", "here/one", "--rounds", "0", "--quiet", *small]) == 0
+    runs = [tmp_path / place / "one" for place in ("here", "there")]
+    graphs, cards = zip(*(read_model(run / "models" / "ols-12.onnx") for run in runs), strict=True)
+    assert graphs[0] == graphs[1] and cards[0] == cards[1]
+    assert (runs[0] / "config.toml").read_text() == (runs[1] / "config.toml").read_text()
+    before = (runs[1] / "results.json").stat().st_mtime_ns
+    assert main([*there]) == 0
+    assert (runs[1] / "results.json").stat().st_mtime_ns == before
+
+
+def read_model(file: Path) -> tuple[bytes, dict[str, Any]]:
+    """Graph and card, without how long the fit took."""
+    model = onnx.load(file)
+    (card,) = (json.loads(each.value) for each in model.metadata_props if each.key == "neurolens")
+    assert card["fit"].pop("seconds") > 0
+    return model.graph.SerializeToString(deterministic=True), card
+
+
+def test_records_of_a_survey_are_those_of_one_machine(cluster: str, lenses: list[Path], tmp_path: Path) -> None:
+    found = []
+    for place, more in (("here", ("--jobs", "1")), ("there", ("--dask", cluster))):
+        assert (
+            main(["survey", str(lenses[0].parent), "--no-fit", "--quiet", "--output", str(tmp_path / place), *more])
+            == 0
+        )
+        found.append({path.name: path.read_bytes() for path in (tmp_path / place / "records").iterdir()})
+    assert found[0] == found[1] and len(found[0]) == 2
