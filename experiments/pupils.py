@@ -366,7 +366,8 @@ def shaders(args: argparse.Namespace) -> None:
 def shader_row(file: Path) -> lab.Row:
     """The row of a model's shader, in its worst state."""
     begun = time.process_time()
-    _, lens, _ = lens_of(file, None, lambda share: None)
+    with Progress(quiet=True).stage(file.stem) as report:
+        _, lens, _ = lens_of(file, None, report)
     shares = dict(zip(("open", "stopped_2", "stopped_4"), lens.passing().values(), strict=True))
     cpu, program = time.process_time() - begun, osl_program(lens, {"count": 0.0})
     lost = max(light_lost(state, pupil) for state, pupil in lens.states())
