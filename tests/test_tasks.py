@@ -384,3 +384,21 @@ def test_records_of_a_survey_are_those_of_one_machine(cluster: str, lenses: list
         )
         found.append({path.name: path.read_bytes() for path in (tmp_path / place / "records").iterdir()})
     assert found[0] == found[1] and len(found[0]) == 2
+
+
+@pytest.mark.slow
+def test_the_documented_script_renders_one_picture_in_three_ways(tmp_path: Path) -> None:
+    """A frame rendered at once, in tiles that are merged, and on Dask has the same channels, its flare's among them."""
+    (script,) = re.findall(
+        r'```python title="farm.py"\n(.*?)```', (ROOT / "docs/pages/how-to/farm.md").read_text(), re.S
+    )
+    scene = (ROOT / "experiments" / "scenes" / "lights.toml").read_text()
+    (tmp_path / "lights.toml").write_text(f"{scene}\n[flare]\nbins = 3\nbrightest = 1\ncell_px = 64.0\n")
+    (tmp_path / "farm.py").write_text(script.replace("experiments/scenes/", ""))
+    subprocess.run([sys.executable, "farm.py"], cwd=tmp_path, check=True, timeout=600)
+    one, *others = (read_channels(tmp_path / f"{name}.exr")[0] for name in ("one", "tiled", "farm"))
+    assert one["ghosts.G"].any() and {"R", "Z", "rest.B"} <= one.keys()
+    for other in others:
+        assert other.keys() == one.keys()
+        assert all(np.array_equal(other[name], one[name]) for name in one)
+    assert len(list(tmp_path.glob("pull.*.exr"))) == 2 and not list(tmp_path.glob("*.tiles"))

@@ -6,7 +6,6 @@ Values are those of a render: film irradiance over the irradiance that a white c
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.layout import Layout, Line, layout_profile
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path, seal, sealed_bytes
+from neurolens.base.kept import Kept
 from neurolens.base.status import PASSED
 from neurolens.flare.area import draw_edges, edges_of
 from neurolens.flare.ghostmodel import GhostModel
@@ -355,8 +354,10 @@ def photon_picture(
     picture = np.zeros((raster.height, raster.width, 3), np.float32)
     sums = np.zeros((2, raster.height, raster.width), np.float32)
     same = lens, tracer.scatter, list(lights), raster, part, spectral.centres_nm, photons, most_reflections, seed
-    kept = _Kept(keep, digest(same), (picture, sums))
-    work = _Work((len(tasks) - kept.done) * len(firsts), done)
+    kept, first_task = Kept(keep, digest(same), _KEEP_S), 0
+    if (known := kept.load()) is not None:
+        first_task, (picture, sums) = known[0]["done"], known[1]
+    work = _Work((len(tasks) - first_task) * len(firsts), done)
 
     def one(task: tuple[int, Light, int]) -> tuple[Floats, NDArray[np.float64]]:
         """Sums of weights and of their squares, [2, H, W], and the colour [3] of a weight of 1."""
@@ -376,10 +377,11 @@ def photon_picture(
         colour = spectral.response[:, k] * spectral.spectrum(light.rgb)[k] / wavelengths
         return film, colour * (area * raster.per_mm**2 / photons / exposure)
 
-    for _, (film, colour) in work.results(one, tasks[kept.done :], threads):
+    for _, (film, colour) in work.results(one, tasks[first_task:], threads):
         picture += film[0, ..., None] * colour.astype(np.float32)
         sums += film * (np.abs(colour).max() ** np.array([1, 2], np.float32))[:, None, None]
-        kept.add()
+        first_task += 1
+        kept.save({"done": first_task}, (picture, sums))
     return _smoothed(picture, sums, kernel_px) if kernel_px > 0 else picture
 
 
@@ -396,32 +398,6 @@ def _arrivals(
             which &= (found.scattered > 0) == scatters
         # A film that sends light back is exposed by what it keeps.
         yield found.film_xy_mm[:, which], found.weight[which] / (1 - tracer.scatter.sensor)
-
-
-class _Kept:
-    """Sums of work, and how many of its tasks they hold, in a file that is as old as half a minute at most."""
-
-    def __init__(self, path: Path | None, same: str, sums: Sequence[Floats]) -> None:
-        self.done, self._path, self._head, self._sums, self._at = 0, path, same.encode(), sums, time.monotonic()
-        size = len(self._head) + 8 + sum(a.nbytes for a in sums)
-        if path is None or not path.is_file() or path.stat().st_size > 2 * size:
-            return
-        data, at = sealed_bytes(path), len(self._head) + 8
-        if data is not None and len(data) == size and data.startswith(self._head):
-            self.done = int.from_bytes(data[at - 8 : at], "little")
-            for a in sums:
-                a[:] = np.frombuffer(data, a.dtype, a.size, at).reshape(a.shape)
-                at += a.nbytes
-
-    def add(self) -> None:
-        """One more task is done."""
-        self.done += 1
-        if self._path is not None and time.monotonic() - self._at > _KEEP_S:
-            with atomic_path(self._path) as temporary:
-                parts = self._head, self.done.to_bytes(8, "little"), *(a.tobytes() for a in self._sums)
-                temporary.write_bytes(b"".join(parts))
-                seal(temporary)
-            self._at = time.monotonic()
 
 
 class _Work:

@@ -100,7 +100,7 @@ def render_frames(
     shared = sha256(common).hexdigest(), None if choice is None else (sorted(map(repr, choice.lights)), choice.single)
     todo = [_picture(each, out, folder, shared, made, restart) for out, each in frames.items()]
     folder.mkdir(exist_ok=True)
-    pictures, done, count = [], 0, sum(len(picture.tiles) for picture in todo)
+    pictures, done, count = dict[Path, dict[str, Any]](), 0, sum(len(picture.tiles) for picture in todo)
     with progress.stage(f"render {made.name}: {count} tiles") as report:
         waiting: dict[Path, _Picture] = {}
         tasks = _tasks(todo, waiting, choice)
@@ -111,15 +111,15 @@ def render_frames(
             picture = waiting[task.out]
             picture.missing.discard(task.number)
             if not picture.missing:
-                pictures.append(_finish(waiting.pop(task.out), made))
+                pictures[picture.out] = _finish(picture, made)
             done += 1
             report(done / count)
-        pictures += [_finish(picture, made) for picture in todo if picture.tiles]  # whose tiles were all there
+        pictures |= {picture.out: _finish(picture, made) for picture in todo if picture.tiles}  # whose tiles were there
     with suppress(OSError):
         for stale in folder.glob("*.tile-*.exr"):
             stale.unlink()
         folder.rmdir()
-    return pictures
+    return [pictures[out] for out in frames]
 
 
 def kept(folder: Path) -> str:

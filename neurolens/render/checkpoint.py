@@ -1,20 +1,14 @@
-"""Checkpoint of a render: its sums and everything they depend on, in one file written atomically.
+"""Checkpoint of a render (see `base.kept`): the film's sums, and the identity of the render.
 
-The file is a zip of numpy arrays (an .npz), stored as they are: `sums.npy`, `done.npy` and `about.json`. Names, sizes
-and headers must be those that this render would write, before a byte reaches memory; zip's checksums find damaged
-data. `about.json` holds the identity of the render: what its picture depends on, as JSON that two renders can
-compare.
+The identity is everything that the picture depends on, as JSON that two renders can compare.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import math
-import os
-import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,9 +18,10 @@ from numpy.typing import NDArray
 
 from neurolens import __version__
 from neurolens.base.errors import InputError
-from neurolens.base.files import atomic_path, fingerprint_of, open_regular
+from neurolens.base.files import fingerprint_of
+from neurolens.base.kept import read_arrays, write_arrays
 from neurolens.cameras.contract import Camera
-from neurolens.render.film import CHUNK_BYTES, RGB, Film, Tiling
+from neurolens.render.film import RGB, Film, Tiling
 from neurolens.render.film_settings import FilmSettings
 from neurolens.render.job import Job
 from neurolens.render.mesh import tracer
@@ -36,9 +31,7 @@ _NO_MATTER = ("model", "notes")
 _NOTHING = "(nothing)"  # a place that one of two identities lacks
 _PROBES, _DIGITS = 1024, 16
 _FORMAT = 3
-_ABOUT, _SUMS, _DONE = "about.json", "sums.npy", "done.npy"
 SPENT = ("seconds", "camera_thread_seconds", "thread_seconds")
-_LARGEST_ABOUT = 8 << 20
 _BRIGHTEST = 1e37  # sum of a pixel, which float32 shall hold after the white balance, too
 _LONGEST = 80  # characters of a value in a message
 _AGAIN = "or --restart to begin again"
@@ -125,24 +118,17 @@ def write_checkpoint(path: Path, film: Film, identity: dict[str, Any], spent: di
         InputError: an identity that no reader would take.
         NeurolensError: a worker was killed while it wrote to the film.
     """
-    tiling = film.tiling
+    tiling, done = film.tiling, list[NDArray[np.int64]]()
+
+    def sums() -> Iterator[NDArray[np.float64]]:
+        for first, stop in tiling.chunks():
+            part, passes = film.copy(first, stop)
+            done.append(passes)
+            yield part
+
     about = {"format": _FORMAT, "samples": tiling.samples, "tile": tiling.tile, "step": tiling.step}
-    settings = json.dumps(about | {"render": identity, "spent": spent})
-    _check_length(path, len(settings))
-    done: list[NDArray[np.int64]] = []
-    with atomic_path(path) as temporary:
-        with open(temporary, "wb") as file:
-            with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-                with archive.open(_SUMS, "w", force_zip64=True) as member:
-                    member.write(_header(film.sums))
-                    for first, stop in tiling.chunks():
-                        sums, passes = film.copy(first, stop)
-                        member.write(np.ascontiguousarray(sums).data)
-                        done.append(passes)
-                archive.writestr(_DONE, _header(film.done) + np.concatenate(done).tobytes())
-                archive.writestr(_ABOUT, settings)
-            file.flush()
-            os.fsync(file.fileno())
+    arrays = {"sums": (film.sums, sums()), "done": (film.done, done)}  # in this order: the passes of the same moment
+    write_arrays(path, about | {"render": identity, "spent": spent}, arrays)
 
 
 def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[str, float]:
@@ -155,40 +141,22 @@ def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[st
         InputError: missing, incomplete, or of another render; it names what differs.
     """
     try:
-        with open_regular(path) as file, zipfile.ZipFile(file) as archive:
-            members = {info.filename: info for info in archive.infolist()}
-            stored = all(i.compress_type == zipfile.ZIP_STORED and not i.flag_bits & 1 for i in members.values())
-            if sorted(members) != sorted((_ABOUT, _SUMS, _DONE)) or not stored:
-                raise ValueError("other contents")
-            _check_length(path, members[_ABOUT].file_size)
-            about = json.loads(archive.read(_ABOUT))
+        with read_arrays(path, ("sums", "done")) as (about, read):
             _check_render(path, about, identity)
             _check_tiling(path, about, film.tiling)
-            done = np.empty_like(film.done)
-            _fill(archive, members[_DONE], done)
+            done = read("done", np.empty_like(film.done))
             _check_samples(path, about["samples"], film.tiling, done)
-            _fill(archive, members[_SUMS], film.sums)
-            _check_sums(film.sums)
+            _check_sums(read("sums", film.sums))
             film.done[:] = done
             return {name: float(value) for name, value in about["spent"].items()}
-    except InputError:
-        raise
+    except InputError as error:
+        if "--restart" in error.expected:
+            raise
+        raise InputError(path, error.field, error.value, f"{error.expected}, {_AGAIN}") from None
     except FileNotFoundError:
         raise InputError(path, "file", "(missing)", "a checkpoint of this render") from None
-    except OSError as error:
-        if error.filename is not None:  # it cannot be opened
-            raise
-        why = f"damaged: {error.strerror}"  # a place before its beginning, as a damaged directory asks for
-        raise InputError(path, "file", f"({why})", f"a whole checkpoint of a render, {_AGAIN}") from None
-    # RuntimeError: deep JSON, and features of zip that are never written here.
-    except (zipfile.BadZipFile, ValueError, KeyError, TypeError, AttributeError, EOFError, RuntimeError) as error:
-        why = str(error) or type(error).__name__
-        raise InputError(path, "file", f"({why})", f"a whole checkpoint of a render, {_AGAIN}") from None
-
-
-def _check_length(path: Path, length: int) -> None:
-    if length > _LARGEST_ABOUT:
-        raise InputError(path, "settings", f"({length} characters)", f"at most {_LARGEST_ABOUT}, {_AGAIN}")
+    except ValueError as error:
+        raise InputError(path, "file", f"({error})", f"a whole checkpoint of a render, {_AGAIN}") from None
 
 
 def _check_render(path: Path, about: dict[str, Any], identity: dict[str, Any]) -> None:
@@ -236,26 +204,3 @@ def _check_sums(sums: NDArray[np.float64]) -> None:
         if columns.min() >= -most and columns.max() <= most:
             continue
         raise ValueError("impossible sums")
-
-
-def _header(array: NDArray[Any]) -> bytes:
-    out = io.BytesIO()
-    np.lib.format.write_array_header_1_0(out, np.lib.format.header_data_from_array_1_0(array))
-    return out.getvalue()
-
-
-def _fill(archive: zipfile.ZipFile, info: zipfile.ZipInfo, array: NDArray[Any]) -> None:
-    """Read a member into an array of exactly its size and type; anything else is refused before memory is used."""
-    header = _header(array)
-    if info.file_size != len(header) + array.nbytes:
-        raise ValueError(f"{info.filename} of {info.file_size} bytes")
-    with archive.open(info) as member:
-        if member.read(len(header)) != header:
-            raise ValueError(f"{info.filename} of another shape or type")
-        memory = array.reshape(-1).data.cast("B")
-        for start in range(0, len(memory), CHUNK_BYTES):
-            part = memory[start : start + CHUNK_BYTES]
-            if member.readinto(part) != len(part):  # type: ignore[attr-defined]
-                raise EOFError("it ends too early")
-        if member.read(1):
-            raise ValueError(f"{info.filename} too long")

@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.kept import CHUNK_BYTES
 from neurolens.cameras.contract import FloatArray
 
 FORKS = sys.platform.startswith("linux")
 CONTEXT: Any = multiprocessing.get_context("fork" if FORKS else None)
 BATCH = 32768  # paths; fewer, and calling numpy costs more than computing; many more, and their state leaves the cache
 SAMPLES_A_PASS = 16
-CHUNK_BYTES = 16 << 20  # of the sums that are copied at a time
 
 # Columns of the sums: linear sRGB; squared luminance of independent samples; depth in m over the samples that hit
 # something, and how many those are; samples whose camera ray passed; samples that were not finite and add no light.

@@ -15,6 +15,7 @@ import pytest
 
 from experiments.zoom import CASES, page
 from neurolens.base.errors import InputError
+from neurolens.base.kept import Kept
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
 from neurolens.cli import main
@@ -25,7 +26,6 @@ from neurolens.evaluate.train import run_experiment
 from neurolens.evaluate.train_states import fit_and_measure_states, state_settings
 from neurolens.surrogates.file import pack, read_model
 from neurolens.surrogates.fit import ModelSettings, prepare
-from neurolens.surrogates.fits import checkpoint
 from neurolens.surrogates.pairs import make_pairs
 from neurolens.surrogates.states_fit import StateSettings
 
@@ -251,14 +251,14 @@ def test_a_second_run_takes_the_model_that_is_there(tmp_path: Path) -> None:
 KILLED = """
 import os, signal, sys
 from neurolens.cli import main
-from neurolens.surrogates.fits.checkpoint import Checkpoint
-saved, save = [], Checkpoint.save
+from neurolens.base.kept import Kept
+saved, save = [], Kept.save
 def save_and_die(self, state, arrays, *, now=False):
     save(self, state, arrays, now=True)
     saved.append(state)
     if len(saved) == 3:
         os.kill(os.getpid(), signal.SIGKILL)
-Checkpoint.save = save_and_die
+Kept.save = save_and_die
 main(sys.argv[1:])
 """
 
@@ -275,9 +275,9 @@ def test_a_training_that_was_killed_is_taken_up_again(tmp_path: Path, monkeypatc
     assert process.returncode == -signal.SIGKILL, process.stderr
     (left,) = (tmp_path / "killed").rglob("*.training.npz")
     with np.load(left) as held:
-        assert b'"ended": false' in held["header"].tobytes()
-    taken_up, load = [], checkpoint.Checkpoint.load
-    monkeypatch.setattr(checkpoint.Checkpoint, "load", lambda self: taken_up.append(load(self)) or taken_up[-1])
+        assert b'"ended": false' in held["about.json"]
+    taken_up, load = [], Kept.load
+    monkeypatch.setattr(Kept, "load", lambda self: taken_up.append(load(self)) or taken_up[-1])
     assert main(command("killed")) == main(command("whole")) == 0
     assert taken_up[0] is not None and taken_up[-1] is None and not left.exists()
 

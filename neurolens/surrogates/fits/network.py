@@ -19,6 +19,7 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
+from neurolens.base.kept import Kept
 from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, InvariantPolynomial, Network, Residual
 from neurolens.surrogates.fits.boundaries import (
@@ -28,7 +29,7 @@ from neurolens.surrogates.fits.boundaries import (
     fit_stop,
     solve_scalars,
 )
-from neurolens.surrogates.fits.checkpoint import Checkpoint, fingerprint
+from neurolens.surrogates.fits.checkpoint import EVERY_S, fingerprint
 from neurolens.surrogates.fits.projection import Problem, Projection, Stand, activations, minimise, project
 from neurolens.surrogates.gates import boundary_weights, gate_values
 from neurolens.surrogates.lightfield import LightField
@@ -87,7 +88,7 @@ def fit_network(
         decisive = {name: getattr(settings, name) for name in ("units", "layers", "steps", "seed")}
         key = fingerprint(problem.tensors, {**decisive, "starts": STARTS, "rays": RAYS})
         enough = (_ENOUGH * 1000 * data.pairs.domain.film_radius_mm) ** 2
-        best = Training(problem, settings, enough, Checkpoint(checkpoint, key), progress).run()
+        best = Training(problem, settings, enough, Kept(checkpoint, key, EVERY_S), progress).run()
     if progress:
         progress(1.0)
     *hidden, output = ((w[:, :-1].numpy().copy(), w[:, -1].numpy().copy()) for w in (*best.hidden, best.output))
@@ -204,7 +205,7 @@ class Training:
     problem: Problem
     settings: ModelSettings
     enough: float
-    checkpoint: Checkpoint
+    checkpoint: Kept
     progress: Callable[[float], None] | None = None
     _place: _Place = field(default_factory=_Place)
     _champion: list[Tensor] = field(default_factory=list)
@@ -284,13 +285,14 @@ class Training:
 
     def _save(self, *, now: bool = False) -> None:
         self._place.damping, self._place.growth = self._stand.damping, self._stand.growth
-        self.checkpoint.save(asdict(self._place), [*self._stand.hidden, *self._champion], now=now)
+        arrays = [array.numpy() for array in (*self._stand.hidden, *self._champion)]
+        self.checkpoint.save(asdict(self._place), arrays, now=now)
 
     def _resume(self) -> None:
         known = self.checkpoint.load()
         if known is None:
             return
-        state, arrays = known
+        state, arrays = known[0], [torch.from_numpy(array) for array in known[1]]
         self._place = _Place(**state)
         self._stand = Stand(arrays[: self.settings.layers], self._place.damping, self._place.growth)
         self._champion = arrays[self.settings.layers :]
