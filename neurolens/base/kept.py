@@ -125,7 +125,7 @@ def _header(array: NDArray[Any]) -> bytes:
 def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo, into: NDArray[Any] | None) -> NDArray[Any]:
     if into is None:
         with archive.open(info) as member:
-            return np.lib.format.read_array(member, allow_pickle=False)  # type: ignore[no-untyped-call, no-any-return]
+            return np.lib.format.read_array(member, allow_pickle=False)
     header = _header(into)
     if info.file_size != len(header) + into.nbytes:
         raise ValueError(f"{info.filename} of {info.file_size} bytes")

@@ -187,7 +187,7 @@ def frame_of(args: argparse.Namespace) -> Frame:
 
     return Frame.of(
         args.scene, args.camera, focus_m=args.focus, f_number=args.f_number, efl_mm=args.efl, zoom=args.zoom,
-        field_deg=args.field, focusing=args.focusing, aperture=aperture_of(args), film_offset_mm=args.film_offset,
+        field_deg=args.field, focus=args.focusing, aperture=aperture_of(args), film_offset_mm=args.film_offset,
         vignetting=args.vignetting, glass_files=tuple(args.glass_files), film_mm=args.film,
         width=args.width, height=args.height, samples=args.samples, seed=args.seed, max_depth=args.max_depth,
         colour_space=args.colour_space, white_balance=args.white_balance, wavelengths=args.wavelength_mode,
