@@ -23,9 +23,12 @@ from experiments import lab
 from experiments import pupil_methods as known
 from neurolens.base.progress import Progress
 from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.osl import osl_program
 from neurolens.cameras.pupil_boxes import PupilTable
+from neurolens.cameras.pupil_circles_fit import light_lost
 from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.evaluate.shaders import shader_of
+from neurolens.evaluate.costs import cycles_ns
+from neurolens.evaluate.shaders import lens_of
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import pupil_bounds
@@ -330,12 +333,17 @@ SHADERS = lab.columns(
     ("Open", "open", ".3f"),
     ("2 stops down", "stopped_2", ".3f"),
     ("4 stops down", "stopped_4", ".3f"),
+    ("Lost (per mille)", "lost_per_mille", ".2f"),
     ("Operations", "operations"),
+    ("ns a ray that passes", "ns", ".0f"),
     ("CPU (s)", "cpu_s", ".1f"),
 )
 _SHADERS_TEXT = """\
 By `python -m experiments pupils --shaders`: share of the samples that pass the lens, from film points that have light
-at that stop, all over film, focus and wavelength; operations of a ray through a round stop; CPU to make the shader."""
+at that stop, all over film, focus and wavelength; light that no sample has, in the worst zone of film and stop;
+operations of a ray through a round stop; what they make a ray cost in Cycles under a white sky (`evaluate/costs.py`)
+for each that passes, the stop open; CPU to make the shader. The pupil of the biconvex lens folds far off the axis: one
+wide disc holds it."""
 
 
 def shaders(args: argparse.Namespace) -> None:
@@ -356,9 +364,12 @@ def shaders(args: argparse.Namespace) -> None:
 
 
 def shader_row(file: Path) -> lab.Row:
-    """Of a model."""
+    """The row of a model's shader, in its worst state."""
     begun = time.process_time()
-    made = shader_of(file, quiet=True)
-    shares = dict(zip(("open", "stopped_2", "stopped_4"), made.passing.values(), strict=True))
-    cpu = time.process_time() - begun
-    return {"model": file.stem, **shares, "operations": made.operations, "cpu_s": cpu}
+    with Progress(quiet=True).stage(file.stem) as report:
+        _, lens, _ = lens_of(file, None, report)
+    shares = dict(zip(("open", "stopped_2", "stopped_4"), lens.passing().values(), strict=True))
+    cpu, program = time.process_time() - begun, osl_program(lens, {"count": 0.0})
+    lost = max(light_lost(state, pupil) for state, pupil in lens.states())
+    measured = {"operations": sum(program.count().values()), "ns": cycles_ns(program) / shares["open"], "cpu_s": cpu}
+    return {"model": file.stem, **shares, "lost_per_mille": 1e3 * lost, **measured}

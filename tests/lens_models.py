@@ -29,7 +29,7 @@ from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.gates import gate_values
 from neurolens.surrogates.model import Domain, LensModel
-from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs
+from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, with_angle
 from neurolens.surrogates.specialise import at_wavelength
 from neurolens.surrogates.targets import scales_of, targets_of
 
@@ -189,4 +189,6 @@ def _network(known: Prepared, units: int) -> LensModel:
     out = torch.cat([ab, ridge(m, targets.transmittance[None]), gates])
     layers = tuple((w.numpy(), b.numpy()) for w, b in hidden)
     core = Network(layers, (out[:, :-1].numpy(), out[:, -1].numpy()), shift.numpy(), scale.numpy())
-    return LensModel(pairs.lens, pairs.domain, encoding, scales_of(pairs.lens), known.gates, core, "random network")
+    return with_angle(
+        LensModel(pairs.lens, pairs.domain, encoding, scales_of(pairs.lens), known.gates, core, "random network")
+    )

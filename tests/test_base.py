@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 import tomllib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -448,9 +448,9 @@ def test_settings_are_options(capsys: pytest.CaptureFixture[str]) -> None:
     """One declaration gives options, help, and the bounds of values from the command line, TOML and Python."""
     parser = argparse.ArgumentParser()
     add_options(parser, _Options, kind="b")
-    assert from_options(_Options, parser.parse_args([])) == _Options(kind="b")
+    assert from_options(_Options(), parser.parse_args([])) == _Options(kind="b")
     words = "--pixel-size 4 --rays 2 --name x --only p --only q --fast --kind a --share 0.5".split()
-    found = from_options(_Options, parser.parse_args(words))
+    found = from_options(_Options(), parser.parse_args(words))
     assert found == _Options(4.0, 2, "x", ("p", "q"), True, "a", _Inner(0.5))
     assert from_dict(_Options, {"cell_px": 4, "inner": {"share": 0.5}}, "s.toml") == _Options(4.0, inner=_Inner(0.5))
     text = parser.format_help()
@@ -470,4 +470,11 @@ def test_settings_are_options(capsys: pytest.CaptureFixture[str]) -> None:
         _Options(count=0)
     group = argparse.ArgumentParser()
     add_options(group, _Options, ["count", "share"])
-    assert vars(group.parse_args(["--rays", "9"])) == {"count": 9, "share": 0.0}
+    assert vars(group.parse_args(["--rays", "9"])) == {"rays": 9, "share": 0.0}
+    over = argparse.ArgumentParser()
+    add_options(over, _Options, unset=True)
+    table = _Options(2.0, 4, "x", ("p",), True, "b", _Inner(0.5, 1.0))
+    assert from_options(table, over.parse_args([])) == table
+    changed = from_options(table, over.parse_args(["--share", "1", "--kind", "a", "--only", "q"]))
+    assert changed == replace(table, inner=_Inner(1.0, 1.0), kind="a", only=("q",))
+    assert "(default" not in over.format_help()

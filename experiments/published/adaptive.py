@@ -24,8 +24,9 @@ from experiments.published.polynomials import fit_dense
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph
 from neurolens.surrogates.bases import Exponents
-from neurolens.surrogates.cores import ROUND, Composite, CoreValues, Field, RawPolynomial, Units, stored_as
+from neurolens.surrogates.cores import Composite, CoreValues, Field, RawPolynomial, Units, stored_as
 from neurolens.surrogates.fits.selection import grow
+from neurolens.surrogates.lightfield import ROUND
 from neurolens.surrogates.pairs import PairSet
 from neurolens.surrogates.targets import squared_error
 

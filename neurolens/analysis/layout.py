@@ -16,7 +16,7 @@ from neurolens.analysis.fields import Array, Result, Scene
 from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, heading, new_figure, save, style
 from neurolens.base.errors import InputError
 from neurolens.optics.prescription import Surface
-from neurolens.optics.sag import sag_mm
+from neurolens.optics.shapes import sag_mm
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 

@@ -29,13 +29,13 @@ def html_parts(template: str, **values: Any) -> Iterator[str]:
 
 @cache
 def _templates() -> Environment:
-    made = Environment(
+    environment = Environment(
         loader=FileSystemLoader(_FOLDERS), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True, keep_trailing_newline=True,
     )  # fmt: skip
-    made.filters["quoted"] = lambda svg: quote(svg, safe=" /:=(),;.")
-    made.globals["text"] = text_of
-    return made
+    environment.filters["quoted"] = lambda svg: quote(svg, safe=" /:=(),;.")
+    environment.globals["text"] = text_of
+    return environment
 
 
 def text_of(name: str) -> str:

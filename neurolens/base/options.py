@@ -9,10 +9,10 @@
             check_bounds(self, "blur")
 
     add_options(parser, Blur)  # --radius PX, --only NAME
-    blur = from_options(Blur, parser.parse_args())
+    blur = from_options(Blur(), parser.parse_args())
 
 The option of a field is its name without its unit, which becomes the placeholder of the value. `base.config` reads the
-same fields from TOML.
+same fields from TOML; options that overrule a file's table are added `unset`, and `from_options` takes that table.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import field, fields, is_dataclass
+from dataclasses import field, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import NoneType
@@ -48,8 +48,9 @@ def setting(
     Args:
         about: the help; `add_options` adds the default where the help does not mention one.
         within: the smallest and the largest value of a number. unit: what the number is, for messages.
-        option: name of the option ("reflections") where it is not the field's. old: earlier names, which still work
-            and which help does not show. metavar: placeholder of the value in the help.
+        option: name of the option ("reflections") and of the parsed argument, where it is not the field's.
+        old: earlier names, which still work and which help does not show.
+        metavar: placeholder of the value in the help.
     """
     about_it = {"about": about, "within": within, "unit": unit, "option": option, "old": old, "metavar": metavar}
     return field(default=default, metadata=about_it)
@@ -79,47 +80,52 @@ def number(kind: Callable[[str], T], good: Callable[[T], bool], expected: str) -
     return convert
 
 
-def add_options(parser: argparse._ActionsContainer, cls: type, names: Collection[str] = (), **defaults: Any) -> None:
+def add_options(
+    parser: argparse._ActionsContainer, cls: type, names: Collection[str] = (), *, unset: bool = False, **defaults: Any
+) -> list[argparse.Action]:
     """Add the fields of `cls` that are declared by `setting` as options, also those of dataclasses inside it.
 
     Args:
         parser: a parser, or a group of its arguments.
         names: these fields alone. defaults: of this command, where they differ from those of the fields.
+        unset: whether all options have the default None, which leaves a setting as it is (see `from_options`).
     """
-    hints = get_type_hints(cls)
+    hints, actions = get_type_hints(cls), list[argparse.Action]()
     for f in (f for f in fields(cls) if f.metadata.get("about") is not None):
         if is_dataclass(inner := hints[f.name]) and isinstance(inner, type):
-            add_options(parser, inner, names, **defaults)
+            actions += add_options(parser, inner, names, unset=unset, **defaults)
         elif not names or f.name in names:
-            default = defaults.get(f.name, f.default)
-            _add(parser, f.name, hints[f.name], default, **f.metadata)
+            default = defaults.get(f.name, None if unset else f.default)
+            actions.append(_add(parser, f.name, hints[f.name], default, **f.metadata))
+    return actions
 
 
-def from_options(cls: type[T], args: argparse.Namespace) -> T:
-    """The settings that the arguments of `add_options` say; a field without option or value has its default.
+def from_options(settings: T, args: argparse.Namespace) -> T:
+    """Settings with the values of the options of `add_options`; a field without option or value stays as it is.
 
     Raises:
         InputError: what the class refuses.
     """
     values: dict[str, Any] = {}
-    hints = get_type_hints(cls)
-    for f in (f for f in fields(cls) if f.metadata.get("about") is not None):  # type: ignore[arg-type]
+    hints = get_type_hints(type(settings))
+    for f in (f for f in fields(settings) if f.metadata.get("about") is not None):  # type: ignore[arg-type]
         if is_dataclass(inner := hints[f.name]) and isinstance(inner, type):
-            values[f.name] = from_options(inner, args)
-        elif (value := getattr(args, f.name, None)) is not None:
+            values[f.name] = from_options(getattr(settings, f.name), args)
+        elif (value := getattr(args, _dest(f.name, f.metadata["option"]), None)) is not None:
             values[f.name] = tuple(value) if isinstance(value, list) else value
-    return cls(**values)
+    return replace(settings, **values)  # type: ignore[type-var]
 
 
 def _add(
     parser: argparse._ActionsContainer, name: str, hint: Any, default: Any, *, about: str,
     within: tuple[float, float] | None, unit: str, option: str, old: Sequence[str], metavar: str,
-) -> None:  # fmt: skip
+) -> argparse.Action:  # fmt: skip
     kind, many = _kind(hint)
     match = _UNIT.fullmatch(name)
     if "(default" not in about and not (default is None or default is False or default == ()):
         about += f" (default: {f'{default:g}' if isinstance(default, float) else default})"
-    more: dict[str, Any] = {"dest": name, "default": list(default) if many else default, "help": about}
+    more: dict[str, Any] = {"dest": _dest(name, option), "help": about}
+    more["default"] = list(default) if isinstance(default, tuple) else default
     if kind is bool:
         more["action"] = "store_true"
     elif get_origin(kind) is Literal:
@@ -134,6 +140,12 @@ def _add(
         more["action"] = "append"
     action = parser.add_argument(f"--{option or (match[1] if match else name).replace('_', '-')}", **more)
     parser._option_string_actions.update({f"--{word}": action for word in old})
+    return action
+
+
+def _dest(name: str, option: str) -> str:
+    """The attribute of the parsed arguments."""
+    return (option or name).replace("-", "_")
 
 
 def _kind(hint: Any) -> tuple[Any, bool]:

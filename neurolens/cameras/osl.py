@@ -19,26 +19,26 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.progress import Report
-from neurolens.cameras.arcs_passing import passing
 from neurolens.cameras.blades import MAX_BLADES, Blades
 from neurolens.cameras.cameragraph import D_FILM, weight_graph
 from neurolens.cameras.focus_function import FOCUS, SMALLEST, Focusing, film_function, followed_rows
 from neurolens.cameras.lens_state import squeeze_of
 from neurolens.cameras.model import ModelScene
 from neurolens.cameras.onnxlens import OnnxLens
-from neurolens.cameras.pupil_arcs import PupilArcs
-from neurolens.cameras.pupil_arcs_fit import fit_arcs
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_circles import PupilCircles
-from neurolens.cameras.pupil_sight import Sight
+from neurolens.cameras.pupil_circles_fit import fit_pupil
+from neurolens.cameras.pupil_disc import PupilDisc
+from neurolens.cameras.pupil_passing import passing_share
 from neurolens.cameras.sampling import stratified
+from neurolens.cameras.shader_lens import ShaderLens
 from neurolens.cameras.source import model_focusing
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value
@@ -85,42 +85,31 @@ _FRAME = """\
 """
 
 
-class Seen(NamedTuple):
-    """A lens in one state: its rays, how it is focused, f-number of its widest stop and focal length (mm)."""
-
-    sight: Sight
-    focusing: Focusing
-    f_number: float
-    efl_mm: float
-
-
 @dataclass(frozen=True)
 class OslCamera:
-    """What a shader of a lens in one state is made of.
+    """What the shader of a lens in one state is made of.
 
     Attributes:
-        sight: the lens. lens: its graph with derivatives by the film point. arcs: its pupil. film, nearest_m: see
-            `_film`. limit_m: nearer than that nothing is in focus; 0 where nothing moves.
-        f_number: of the widest stop. efl_mm: focal length. entrance_mm: z of the entrance pupil, lens frame.
-            stop_image: see `_stop_image`. unit: whether directions are sure to be of unit length.
+        lens: the lens. graph: its graph with derivatives by the film point. pupil: where rays are sampled.
+        film, nearest_m: see `_film`. limit_m: nothing nearer is in focus; 0 where the film does not move.
+        entrance_mm: z of the entrance pupil, lens frame. margin: by which the stop's blades are widened for samples,
+            in units of the stop's radius. unit: whether directions are sure to be of unit length.
     """
 
-    sight: Sight
-    lens: Graph
-    arcs: PupilArcs | PupilCircles
+    lens: ShaderLens
+    graph: Graph
+    pupil: PupilCircles | PupilDisc
     film: Array
     nearest_m: tuple[float, float]
     limit_m: float
-    f_number: float
-    efl_mm: float
     entrance_mm: float
-    stop_image: tuple[float, float]
+    margin: float
     unit: bool
 
     @property
     def pupil_z_mm(self) -> float:
-        """Of the plane of pupil points."""
-        return self.sight.table.pupil_z_mm
+        """z of the plane of pupil points."""
+        return self.lens.table.pupil_z_mm
 
 
 @dataclass(frozen=True)
@@ -128,38 +117,41 @@ class OslLens:
     """A lens as its shader has it.
 
     Attributes:
-        nodes: in each state of `product(axes)`; the one of a lens without axes.
+        nodes: the lens in each state of `product(axes)`; a lens without axes has one.
         between: weights of the nodes, and the lens in states between them.
     """
 
     nodes: list[OslCamera]
     axes: tuple[Axis, ...] = ()
-    between: Sequence[tuple[Array, Sight]] = ()
+    between: Sequence[tuple[Array, ShaderLens]] = ()
 
     @property
     def near_m(self) -> tuple[float, float]:
-        """The nearest distance in focus, of the state that focuses nearest and of that which does least; 0: fixed."""
-        own = [c.limit_m for c in self.nodes]
-        return min(own), max(own)
+        """The nearest distance in focus in the state that focuses nearest and in the one that does least; 0: fixed."""
+        limits = [c.limit_m for c in self.nodes]
+        return min(limits), max(limits)
 
     @property
     def f_number(self) -> float:
         """The widest of all states."""
-        return min(c.f_number for c in self.nodes)
+        return min(c.lens.f_number for c in self.nodes)
 
     @property
     def film_radius_mm(self) -> float:
-        """Of the picture that all states fill."""
-        return min(c.arcs.film_radius_mm for c in self.nodes)
+        """Radius of the picture that all states fill."""
+        return min(c.pupil.film_radius_mm for c in self.nodes)
+
+    def states(self) -> list[tuple[ShaderLens, PupilCircles | PupilDisc]]:
+        """The lens and its pupil at each node, and in states between them."""
+        pupils: list[Any] = [c.pupil for c in self.nodes]  # all are of one kind
+        first, *others = pupils
+        nodes = zip(np.eye(len(self.nodes)), (c.lens for c in self.nodes), strict=True)
+        return [(lens, first.mixed(others, weights)) for weights, lens in [*nodes, *self.between]]
 
     def passing(self) -> dict[float, float]:
-        """Share of the samples that pass, in the worst state, by shares of the widest stop."""
-        if not self.axes:
-            return passing(self.nodes[0].sight, self.nodes[0].arcs)
-        first, *others = (c.arcs for c in self.nodes if isinstance(c.arcs, PupilArcs))  # as all of several states are
-        seen = [(np.eye(len(self.nodes))[k], c.sight) for k, c in enumerate(self.nodes)]
-        found = [passing(sight, first.mixed(others, weights)) for weights, sight in [*seen, *self.between]]
-        return {share: min(f[share] for f in found) for share in found[0]}
+        """The share of the samples that pass, in the worst state, by shares of the widest stop."""
+        shares = [passing_share(*state) for state in self.states()]
+        return {stop: min(s[stop] for s in shares) for stop in shares[0]}
 
 
 def parameters(lens: OslLens) -> list[Parameter]:
@@ -210,7 +202,7 @@ def _mixture(lens: OslLens) -> Mixture:
     focus = [a for a in lens.axes if a.name == FOCUS_AXIS]
     others = tuple(a for a in lens.axes if a.name != FOCUS_AXIS)
     far = lens.nodes[:: len(focus[0].nodes)] if focus else lens.nodes  # the last axis goes fastest
-    g, rows = followed_rows(others, [[c.sight.film_z_mm[0] - c.entrance_mm] for c in far])
+    g, rows = followed_rows(others, [[c.lens.film_z_mm[0] - c.entrance_mm] for c in far])
     state = [g.input(name, per_call=True).clip(*a.range) for a, name in zip(others, state_names(others), strict=True)]
     if focus:
         away, at_pupil = (g.input(name, per_call=True) for name in ("asked_m", "at_pupil"))
@@ -233,38 +225,38 @@ def osl_graph(camera: OslCamera) -> Graph:
     film = (0.5 - g.concat(g.input("raster_x"), g.input("raster_y"))) * call.sensor
     nanometres, colour = _light(camera, square[0], call.number("in_colour"))
     per_call = {"film_z_mm": call.film_z, "stop_radius_mm": call.stop}
-    sampler = camera.arcs.sampler(Blades, *camera.stop_image)
+    sampler = camera.pupil.sampler(Blades, camera.margin)
     pupil = g.inline(sampler, {"film_mm": film, "square": square, "wavelength_nm": nanometres, **per_call})
     rays = g.concat(film, pupil["pupil_mm"], nanometres)
-    found = g.inline(camera.lens, {"rays": rays, **per_call})
-    given = {"film_mm": film, **pupil, **found, "lens_status": found["status"], **per_call, **call.weighting()}
-    done = g.inline(weight_graph(unit=camera.unit), given)
-    even = g.select(done["status"] <= float(st.PASSED), pupil["area_mm2"] / pupil["mean_area_mm2"], 0.0)
-    weight = g.select(call.number("shaded") <= 0.5, even, done["weight"])
-    weight = g.select(Blades(g).opened(found["stop_xy_mm"] * (1.0 / call.stop)), weight, 0.0)
-    known = (g.square(film) <= camera.arcs.film_radius_mm**2) & call.focused
+    ray = g.inline(camera.graph, {"rays": rays, **per_call})
+    inputs = {"film_mm": film, **pupil, **ray, "lens_status": ray["status"], **per_call, **call.weighting()}
+    weighted = g.inline(weight_graph(unit=camera.unit), inputs)
+    even = g.select(weighted["status"] <= float(st.PASSED), pupil["area_mm2"] / pupil["mean_area_mm2"], 0.0)
+    weight = g.select(call.number("shaded") <= 0.5, even, weighted["weight"])
+    weight = g.select(Blades(g).opened(ray["stop_xy_mm"] * (1.0 / call.stop)), weight, 0.0)
+    known = (g.square(film) <= camera.pupil.film_radius_mm**2) & call.focused
     warned = g.select(known, 0.0, call.number("warned"))
     # Beyond the film nothing has an area.
-    _set_outputs(g, camera, call, film, found, colour * g.select(call.focused, weight, 0.0), warned)
+    _set_outputs(g, camera, call, film, ray, colour * g.select(call.focused, weight, 0.0), warned)
     return g
 
 
 def _set_outputs(
-    g: Graph, camera: OslCamera, call: _Call, film: Value, found: Mapping[str, Value], throughput: Value, warned: Value
+    g: Graph, camera: OslCamera, call: _Call, film: Value, lens: Mapping[str, Value], throughput: Value, warned: Value
 ) -> None:
     """Rays in the frame of Cycles, in units of the scene and x right, y up, z ahead; warnings as of a pinhole."""
     length = call.units_per_m * [1e-3, 1e-3, -1e-3]
-    ahead = g.concat(film * -1.0, g.constant(camera.efl_mm))
+    ahead = g.concat(film * -1.0, g.constant(camera.lens.efl_mm))
     ahead = ahead * (1.0 / g.square(ahead).sqrt())
-    ray = found["scene_ray"]
+    ray = lens["scene_ray"]
     start = (ray[0:3] - g.concat(g.constant([0.0, 0.0]), call.origin_mm)) * length
     plain = warned <= 0.5
     g.outputs["position"] = g.select(plain, start, 0.0)
     g.outputs["direction"] = g.select(plain, ray[3:] * [1.0, 1.0, -1.0], ahead)
     g.outputs["throughput"] = g.select(plain, throughput, g.constant([1.0, 0.0, 1.0]))
     for axis, name, step in zip((0, 1), D_FILM, ("x", "y"), strict=True):
-        way = call.sensor[axis] * call.number(f"pixel_{step}")
-        rows = found[name] * (way * g.concat(length * -1.0, g.constant([-1.0, -1.0, 1.0])))
+        pixel = call.sensor[axis] * call.number(f"pixel_{step}")
+        rows = lens[name] * (pixel * g.concat(length * -1.0, g.constant([-1.0, -1.0, 1.0])))
         g.outputs[f"dPd{step}"], g.outputs[f"dDd{step}"] = rows[0:3], rows[3:]
 
 
@@ -274,9 +266,9 @@ class _Call:
     def __init__(self, g: Graph, camera: OslCamera) -> None:
         self.g, self.camera = g, camera
         self.sensor = g.concat(self.number("sensor_x_mm"), self.number("sensor_y_mm"))
-        # Before the radius: the share of it in the pupil's numbers, of all states, would be this one's own in some.
-        self.share = (camera.f_number / self.number("f_number")).minimum(1.0)
-        self.stop = self.share * camera.sight.stop_radius_mm
+        self.share = (camera.lens.f_number / self.number("f_number")).minimum(1.0)
+        # Named, for it equals the unit of the pupil's numbers in some states of a lens only.
+        self.stop = self.share * g.constant(camera.lens.stop_radius_mm, "stop radius")
         at_pupil, asked = self.number("at_pupil"), self.number("asked_m")
         away = _away(asked)
         ways = zip(camera.film, camera.nearest_m, strict=True)
@@ -294,9 +286,10 @@ class _Call:
         """The numbers of `weight_graph`."""
         g, camera = self.g, self.camera
         per_distance = 1.0 / (self.film_z - camera.pupil_z_mm)
-        own = _in_turn(g, _per_exposure(camera), self.share, _place(camera, self.film_z))
-        own, nominal = own * (1.0 / (self.share * self.share)), 4 * camera.f_number**2 / math.pi
-        per_exposure = g.select(self.number("as_lens") <= 0.5, own, nominal)
+        middle, half = _film_position(camera)
+        per_share = _in_turn(g, _per_exposure(camera), self.share, (self.film_z - middle) * (1 / half))
+        per_lens, nominal = per_share * (1.0 / (self.share * self.share)), 4 * camera.lens.f_number**2 / math.pi
+        per_exposure = g.select(self.number("as_lens") <= 0.5, per_lens, nominal)
         return {"per_distance": per_distance, "scale": per_distance * per_distance * per_exposure}
 
 
@@ -313,14 +306,15 @@ def _in_turn(g: Graph, weights: Array, first: Value, then: Value) -> Value:
     return total
 
 
-def _place(camera: OslCamera, film_z: Value) -> Value:
-    middle, half = camera.arcs.film_z_mm
-    return (film_z - middle) * (1 / half)
+def _film_position(camera: OslCamera) -> tuple[float, float]:
+    """Middle and half range of film positions."""
+    low, high = camera.lens.film_z_mm
+    return (low + high) / 2, max((high - low) / 2, 1e-6)
 
 
 def _light(camera: OslCamera, random: Value, in_colour: Value) -> tuple[Value, Value]:
     """Wavelength and colour weights [3] of a ray, red to blue."""
-    g, (short, long) = random.graph, camera.sight.wavelength_nm
+    g, (short, long) = random.graph, camera.lens.wavelength_nm
     fine = random * _LOW_BITS
     place = fine - fine.floor()
     rest = 1.0 - place
@@ -331,43 +325,41 @@ def _light(camera: OslCamera, random: Value, in_colour: Value) -> tuple[Value, V
     return nanometres, g.select(grey, 1.0, colour)
 
 
-def _samples(sight: Sight, arcs: PupilArcs | PupilCircles, count: int = 32768) -> dict[str, NDArray[np.float32]]:
-    """Rays through the arcs, nearly half at the widest stop, as inputs of the lens's graph; `at_stop` of the arcs."""
+def _samples(lens: ShaderLens, pupil: PupilCircles | PupilDisc, count: int = 32768) -> dict[str, NDArray[np.float32]]:
+    """Rays through the pupil, nearly half at the widest stop, as inputs of the lens's graph; `at_stop` of samples."""
     rng = np.random.default_rng(0)
-    angle, radius = 2 * np.pi * rng.random(count), 0.99 * arcs.film_radius_mm * np.sqrt(rng.random(count))
+    angle, radius = 2 * np.pi * rng.random(count), 0.99 * pupil.film_radius_mm * np.sqrt(rng.random(count))
     film = radius * np.stack([np.cos(angle), np.sin(angle)])
-    stop = sight.stop_radius_mm * rng.uniform(0.2, 1.6, (1, count)).clip(max=1)
-    given = {"film_mm": film, "square": rng.random((2, count)), "stop_radius_mm": stop}
-    given["film_z_mm"] = rng.uniform(*sight.film_z_mm, (1, count))
-    given["wavelength_nm"] = rng.uniform(*sight.wavelength_nm, (1, count))
-    pupil = evaluate(arcs.graph, given)
-    given |= {"rays": np.concatenate([film, pupil["pupil_mm"], given["wavelength_nm"]]), "at_stop": pupil["at_stop"]}
-    return {k: given[k].astype(np.float32) for k in ("rays", "film_z_mm", "stop_radius_mm", "at_stop")}
+    stop = lens.stop_radius_mm * rng.uniform(0.2, 1.6, (1, count)).clip(max=1)
+    inputs = {"film_mm": film, "square": rng.random((2, count)), "stop_radius_mm": stop}
+    inputs["film_z_mm"] = rng.uniform(*lens.film_z_mm, (1, count))
+    inputs["wavelength_nm"] = rng.uniform(*lens.wavelength_nm, (1, count))
+    sample = evaluate(pupil.graph, inputs)
+    inputs["rays"] = np.concatenate([film, sample["pupil_mm"], inputs["wavelength_nm"]])
+    inputs |= {name: sample[name] for name in ("at_stop",) if name in sample}
+    return {k: v.astype(np.float32) for k, v in inputs.items() if k not in ("film_mm", "square", "wavelength_nm")}
 
 
 def _per_exposure(camera: OslCamera) -> Array:
-    """The square of the stop's share over the exposure on the axis, by powers [N, M] of that share and the place."""
-    sight = camera.sight
-    square, nanometres = stratified(_QUADRATURE, sight.wavelength_nm)
-    low, high = sight.film_z_mm
-    places = np.linspace(low, high, 3) if high > low else np.array([low])
+    """The square of the stop's share over the exposure on the axis, by powers [N, M] of that share and of the film
+    position, scaled to 1."""
+    square, nanometres = stratified(_QUADRATURE, camera.lens.wavelength_nm)
+    (low, high), (middle, half) = camera.lens.film_z_mm, _film_position(camera)
+    positions = np.linspace(low, high, 3) if high > low else np.array([low])
     rows, values = [], []
-    for z in places:
-        for share in (0.1, 0.3, 0.5, 0.7, 0.85, 1.0):
-            per_distance = 1 / (z - camera.pupil_z_mm)
-            call = {"film_z_mm": z, "stop_radius_mm": share * sight.stop_radius_mm}
-            call |= {"per_distance": per_distance, "scale": per_distance**2}
-            given: dict[str, Any] = {k: np.array([[v]]) for k, v in call.items()}
-            given |= {"film_mm": np.zeros_like(square), "square": square, "wavelength_nm": nanometres[None]}
-            given |= evaluate(camera.arcs.graph, given)
-            lens = evaluate(
-                sight.graph,
-                given | {"rays": np.concatenate([given["film_mm"], given["pupil_mm"], given["wavelength_nm"]])},
-            )
-            weight = evaluate(weight_graph(), given | lens | {"lens_status": lens["status"]})["weight"]
-            rows.append((share, (z - camera.arcs.film_z_mm[0]) / camera.arcs.film_z_mm[1]))
-            values.append(share**2 / float(np.mean(weight, dtype=np.float64)))
-    return _powers(np.array(rows), np.array(values), (4, len(places)))
+    for z, share in itertools.product(positions, (0.1, 0.3, 0.5, 0.7, 0.85, 1.0)):
+        per_distance = 1 / (z - camera.pupil_z_mm)
+        call = {"film_z_mm": z, "stop_radius_mm": share * camera.lens.stop_radius_mm}
+        call |= {"per_distance": per_distance, "scale": per_distance**2}
+        inputs: dict[str, Any] = {k: np.array([[v]]) for k, v in call.items()}
+        inputs |= {"film_mm": np.zeros_like(square), "square": square, "wavelength_nm": nanometres[None]}
+        inputs |= evaluate(camera.pupil.graph, inputs)
+        inputs["rays"] = np.concatenate([inputs["film_mm"], inputs["pupil_mm"], inputs["wavelength_nm"]])
+        ray = evaluate(camera.lens.graph, inputs)
+        weight = evaluate(weight_graph(), inputs | ray | {"lens_status": ray["status"]})["weight"]
+        rows.append((share, (z - middle) / half))
+        values.append(share**2 / float(np.mean(weight, dtype=np.float64)))
+    return _powers(np.array(rows), np.array(values), (4, len(positions)))
 
 
 def _powers(at: Array, values: Array, shape: tuple[int, int]) -> Array:
@@ -401,26 +393,26 @@ def _film(focusing: Focusing, entrance_mm: float) -> tuple[Array, tuple[float, f
 
 
 def model_lens(model: OnnxLens, graph: Graph | None, report: Report, *, fixed: bool = False) -> OslLens:
-    """Of an exported model.
+    """An exported model.
 
     Args:
         graph: of a model of one state; None takes its own. fixed: in its state alone.
     """
     if not model.axes or fixed:
-        return osl_lens([_seen(model, graph)], report)
+        return osl_lens([shader_lens(model, graph)], report)
     axes = model.axes
-    between = [(weights(axes, state), _seen(model.at(*state), None).sight) for state in states_between(axes)]
-    return osl_lens([_seen(model.at(*state), None) for state in product(axes)], report, axes, between)
+    between = [(weights(axes, state), shader_lens(model.at(*state))) for state in states_between(axes)]
+    return osl_lens([shader_lens(model.at(*state)) for state in product(axes)], report, axes, between)
 
 
 def states_between(axes: Sequence[Axis]) -> list[tuple[float, ...]]:
     """The middles between neighbouring nodes."""
-    places = [[(a + b) / 2 for a, b in zip(axis.nodes, axis.nodes[1:], strict=False)] for axis in axes]
-    return list(itertools.product(*places))
+    middles = [[(a + b) / 2 for a, b in zip(axis.nodes, axis.nodes[1:], strict=False)] for axis in axes]
+    return list(itertools.product(*middles))
 
 
-def _seen(model: OnnxLens, graph: Graph | None) -> Seen:
-    """A model in its state."""
+def shader_lens(model: OnnxLens, graph: Graph | None = None) -> ShaderLens:
+    """A model in its state; its graph, where that is not the one in its file."""
     lens, d = model.card["lens"], model.card["domain"]
     low, high = d["film_z_mm"]
     short, long = _light_of(*map(float, d["wavelength_nm"]))
@@ -429,71 +421,80 @@ def _seen(model: OnnxLens, graph: Graph | None) -> Seen:
         graph = model.graph()
     height = _BESIDE * float(d["film_radius_mm"])
     squeeze = squeeze_of(ModelScene(model, float(low), stop), height, (short, long))
-    sight = Sight(
-        graph, PupilTable.of(d["bounds"]), (float(low), float(high)), (short, long), stop,
-        int(lens.get("stop_surface", 0)), squeeze != 1.0,
-    )  # fmt: skip
-    focusing = model_focusing(model, model.state if model.axes else ())
-    return Seen(sight, focusing, lens["f_number"] * lens["stop_radius_mm"] / stop, lens["efl_mm"])
+    return ShaderLens(
+        graph=graph,
+        table=PupilTable.of(d["bounds"]),
+        film_z_mm=(float(low), float(high)),
+        wavelength_nm=(short, long),
+        stop_radius_mm=stop,
+        stop_surface=int(lens.get("stop_surface", 0)),
+        anamorphic=squeeze != 1.0,
+        focusing=model_focusing(model, model.state if model.axes else ()),
+        f_number=lens["f_number"] * lens["stop_radius_mm"] / stop,
+        efl_mm=lens["efl_mm"],
+    )
 
 
 def _light_of(short_nm: float, long_nm: float) -> tuple[float, float]:
-    """Of the wavelengths of a model those that pictures are made of; all where it is of others."""
+    """Those wavelengths of a model that pictures are made of; all where it has none of these."""
     short, long = max(short_nm, _LIGHT_NM[0]), min(long_nm, _LIGHT_NM[1])
     return (short, long) if short < long else (short_nm, long_nm)
 
 
 def osl_lens(
-    nodes: Sequence[Seen], report: Report, axes: tuple[Axis, ...] = (), between: Sequence[tuple[Array, Sight]] = ()
-) -> OslLens:
-    """Of any lens: what it is at each node of its axes, see `OslLens`.
+    nodes: Sequence[ShaderLens], report: Report, axes: tuple[Axis, ...] = (),
+    between: Sequence[tuple[Array, ShaderLens]] = (),
+) -> OslLens:  # fmt: skip
+    """Any lens: what it is at each node of its axes, see `OslLens`.
 
     Raises:
         InputError: no ray passes.
     """
-    sights = [node.sight for node in nodes]
-    arcs = fit_arcs(sights, report, between)
-    samples = [_samples(*of_one) for of_one in zip(sights, arcs, strict=True)]
-    graphs = [s.graph for s in sights]
+    pupils: list[PupilCircles | PupilDisc] = [*fit_pupil(nodes, report, between)]
+    samples = [_samples(*pair) for pair in zip(nodes, pupils, strict=True)]
+    graphs = [lens.graph for lens in nodes]
     graphs = (tested := low_tests(graphs, samples)) or graphs
-    reach = _SEEN * min(1.0, *(node.focusing.nearest_m for node in nodes)) * 1e3
+    reach = _SEEN * min(1.0, *(lens.focusing.nearest_m for lens in nodes)) * 1e3
     fitted = low_orders(graphs, samples, _DERIVATIVES, _WORST, reach)
     graphs = [with_film_derivatives(g) for g in graphs] if fitted is None else [f.graph for f in fitted]
     inside = next((1 / a.range[1] for a in axes if a.name == FOCUS_AXIS), 0.0)
     cameras = []
-    for seen, graph, own in zip(nodes, graphs, arcs, strict=True):
-        near, entrance = seen.focusing.nearest_m, _entrance_mm(seen.sight)
-        numbers = near if math.isfinite(near) else inside, seen.f_number, seen.efl_mm, entrance
-        film, image = _film(seen.focusing, entrance), _stop_image(seen.sight, own)
-        cameras.append(OslCamera(seen.sight, graph, own, *film, *numbers, image, tested is not None))
+    for lens, graph, pupil in zip(nodes, graphs, pupils, strict=True):
+        near, entrance = lens.focusing.nearest_m, _entrance_mm(lens)
+        film, nearest = _film(lens.focusing, entrance)
+        limit, margin = near if math.isfinite(near) else inside, _blade_margin(lens, pupil)
+        cameras.append(OslCamera(lens, graph, pupil, film, nearest, limit, entrance, margin, tested is not None))
     return OslLens(cameras, axes, between)
 
 
-def _stop_image(sight: Sight, arcs: PupilArcs | PupilCircles) -> tuple[float, float]:
-    """The stop in its image in the pupil, as the arcs have it: -1 where it is upside down, and by how much, in the
-    stop's radius, nearly no ray within an edge of blades seems to lie beyond it."""
-    given = _samples(sight, arcs)
-    seen = evaluate(sight.graph, given)
-    passed = np.broadcast_to(seen["status"][0] == st.PASSED, given["at_stop"].shape[1:])
-    place, true = ((v[0] + 1j * v[1])[passed] for v in (given["at_stop"], seen["stop_xy_mm"] / given["stop_radius_mm"]))
-    side = 1.0 if np.mean((place * true.conj()).real) > 0 else -1.0
-    place, true = (v[np.abs(true) > _EDGES] for v in (place, true))
-    # Edges near a place face its own direction, to within half a blade's angle.
+def _blade_margin(lens: ShaderLens, pupil: PupilCircles | PupilDisc) -> float:
+    """By how much, in the stop's radius, blades are widened for samples: nearly no ray that passes within an edge lies
+    beyond it where the pupil's image of the stop has it."""
+    if isinstance(pupil, PupilDisc):
+        return 0.0
+    inputs = _samples(lens, pupil)
+    ray = evaluate(lens.graph, inputs)
+    passed = np.broadcast_to(ray["status"][0] == st.PASSED, inputs["at_stop"].shape[1:])
+    image, true = (
+        (v[0] + 1j * v[1])[passed] for v in (inputs["at_stop"], ray["stop_xy_mm"] / inputs["stop_radius_mm"])
+    )
+    image, true = (v[np.abs(true) > _EDGES] for v in (image, true))
+    # Edges near a point face its direction, to within half a blade's angle.
     facing = true / np.abs(true) * np.exp(1j * np.linspace(-1, 1, 5)[:, None] * np.pi / 5)
-    beyond = ((side * place - true) * facing.conj()).real.max(0)
-    return side, max(float(np.quantile(beyond, _NEARLY)), _LEAST)
+    beyond = ((image - true) * facing.conj()).real.max(0)
+    return max(float(np.quantile(beyond, _NEARLY)), _LEAST)
 
 
-def _entrance_mm(sight: Sight) -> float:
+def _entrance_mm(lens: ShaderLens) -> float:
     """z of the entrance pupil: where the ray through the stop's middle, from beside the film's, crosses the axis."""
-    height, nudge = _BESIDE * sight.table.film_radius_mm, 1e-3 * sight.table.film_radius_mm
-    nm = min(max(LINE_D_NM, sight.wavelength_nm[0]), sight.wavelength_nm[1])
+    height, nudge = _BESIDE * lens.table.film_radius_mm, 1e-3 * lens.table.film_radius_mm
+    nm = min(max(LINE_D_NM, lens.wavelength_nm[0]), lens.wavelength_nm[1])
     pupil = 0.0
     for _ in range(4):  # Newton's steps
         ends = np.array([[height, height], [0, 0], [pupil, pupil + nudge], [0, 0], [nm, nm]])
-        call = {"film_z_mm": sight.film_z_mm[0], "stop_radius_mm": sight.stop_radius_mm}
-        found = evaluate(sight.graph, {"rays": ends} | {k: np.array([[v]]) for k, v in call.items()})
-        at_stop = found["stop_xy_mm"][0]
+        call = {"film_z_mm": lens.film_z_mm[0], "stop_radius_mm": lens.stop_radius_mm}
+        rays = evaluate(lens.graph, {"rays": ends} | {k: np.array([[v]]) for k, v in call.items()})
+        at_stop = rays["stop_xy_mm"][0]
         pupil -= float(at_stop[0] * nudge / (at_stop[1] - at_stop[0]))
-    x, _, z, dx, _, dz = found["scene_ray"][:, 0]
+    x, _, z, dx, _, dz = rays["scene_ray"][:, 0]
     return float(z - x * dz / dx)

@@ -1,203 +1,278 @@
 """The image of a lens's stop in its pupil, by film point: pupil points as sparse polynomials of points of the stop.
 
-In points of this image all but nothing is left of a pupil's shape but the circle of the stop, and rims that cut it:
-where a lens is anamorphic, or its pupil changes much over the film, short polynomials do not describe its ends.
+Seen from a film point, the pupil of a lens has many shapes, but in points of the stop it is nearly a disc that rims cut
+by other discs. That is easy to sample, and this map takes the samples to the pupil.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
+from neurolens.cameras.shader_lens import ShaderLens
 from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph, Value
+from neurolens.graph.ir import Exponents, Graph, Value
 from neurolens.graph.loworder import pursue
 
-if TYPE_CHECKING:
-    from neurolens.cameras.pupil_sight import Sight
-
 Array = NDArray[np.float64]
-_RAYS, _FEWEST = 12_000, 1_000  # that tell of an image, at least
-# Terms of a coordinate by rounds: rays of each are drawn by the last one's. Error (RMS) of the stop that is enough.
-_TERMS, _GOOD = ((12, 24, 44), (12, 30, 72)), 0.0012
-_SIZES, _REACH = (0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.0), 1.06  # of stops, whose edge counts most; rays beyond it
-# Most of the powers of film and stop point together, of the stop point, of terms that move with focus or wavelength: of
-# anamorphic lenses, of round ones.
-_DEGREE, _STOP_DEGREE, _MOVING = (7, 13), (5, 7), (4, 7)
-_FIELD = 21  # powers of the film point beside up to one of the stop point, of round lenses
-_MOVES = ((1, 0), (0, 1), (0, 2), (1, 1), (2, 0))  # wavelength, film position
-HAIR = 1e-18  # mm
+HAIR = 1e-18  # mm; keeps the direction of a film point on the axis finite
+_RAYS, _FEWEST = 8_000, 1_000  # rays of a fit, and how many have to pass
+_TERMS = ((12, 24, 48), (16, 32, 72))  # most terms of each fit; rays of the next are drawn through the last
+_ENOUGH = 0.0012  # RMS error, in units of the stop's radius, at which a fit needs no more terms
+_SIZES, _REACH = (0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.0), 1.06  # stops whose edges count most; how far beyond rays lie
+# Highest powers of film and stop point together, of the stop point, and of film and stop point in terms that move with
+# the wavelength or the film: of round lenses, of anamorphic ones.
+_DEGREE, _STOP_DEGREE, _MOVING = (13, 7), (7, 5), (7, 4)
+_FIELD = 21  # powers of the film radius in a round lens's terms that are linear in the stop point: fisheyes need them
+_MOVES = ((0, 0), (1, 0), (0, 1), (0, 2), (1, 1), (2, 0))  # powers of the wavelength's variable and the film position
 
 
 @dataclass(frozen=True)
 class StopImage:
-    """Pupil points of points of the stop, in the frame of the film point where the lens is round.
+    """Pupil points of points (x, y) of the stop, by two polynomials P and Q.
+
+    A round lens is described in the frame of the film point, whose x axis points to it: the pupil point is
+    (x P + Q, y P) with P and Q of the film radius, x and x^2 + y^2. This is the general form of a map that rotations
+    and mirrors leave alone. The pupil point of an anamorphic lens is (P, Q), of film point and stop point.
 
     Attributes:
-        unit_mm, stop_mm: that film points and those of the stop are scaled by. film_z_mm, wave: middle and half range
-            of film positions and of (1000 / wavelength)^2.
-        exponents: [M, 6]: of film x and y, stop x and y, wavelength and film position. numbers: [2, M], mm.
+        film_mm, stop_mm: units of film points and of stop points. They are the same in all states of a lens.
+        film_z_mm, wave: middle and half range of film positions, and of (1000 / wavelength)^2.
+        anamorphic: which of the two forms it is.
+        exponents: [M, 7]: 0 for terms of P and 1 for Q, then powers of two film variables, of two stop variables, of
+            the wavelength's variable and of the film position. numbers: [M], mm.
     """
 
-    unit_mm: float
+    film_mm: float
     stop_mm: float
     film_z_mm: tuple[float, float]
     wave: tuple[float, float]
-    exponents: NDArray[np.int64]
+    anamorphic: bool
+    exponents: Exponents
     numbers: Array
 
     @cached_property
     def graph(self) -> Graph:
-        """Of points `point_mm` [2] with derivatives; numbers of the focus are of the call."""
+        """Inputs `film_mm`, `point_mm` [2], `wavelength_nm`, and of the call `film_z_mm`; output `pupil_mm` [2] with
+        its derivatives by the point. A film point of a round lens is (radius, 0)."""
         g = Graph()
         (middle, half), (mean, reach) = self.film_z_mm, self.wave
-        place = (g.input("film_z_mm", per_call=True) - middle) * (1 / half)
+        position = (g.input("film_z_mm", per_call=True) - middle) * (1 / half)
         inverse = (1000.0 * reach**-0.5) / g.input("wavelength_nm")
-        wave = inverse * inverse - mean / reach
-        film, point = g.input("film_mm", 2) * (1 / self.unit_mm), g.input("point_mm", 2) * (1 / self.stop_mm)
-        rays, own = np.unique(self.exponents[:, :5], axis=0, return_inverse=True)
-        monomials = g.polynomial(rays, np.eye(len(rays)), g.concat(film, point, wave))
-        powers = self.exponents[:, 5].max() + 1
-        rows = []
-        for numbers in self.numbers:
-            weights = np.zeros((len(rays), powers))
-            np.add.at(weights, (own.ravel(), self.exponents[:, 5]), numbers)
-            used = np.flatnonzero(weights.any(1))
-            rows.append(g.dot(g.polynomial(np.arange(powers)[:, None], weights[used], place), monomials[used.tolist()]))
-        g.outputs["pupil_mm"] = g.concat(*rows)
+        field = g.concat(g.input("film_mm", 2) * (1 / self.film_mm), inverse * inverse - mean / reach)
+        point = g.input("point_mm", 2) * (1 / self.stop_mm)
+        stop = point if self.anamorphic else g.concat(point[0], g.square(point))
+        p, q = (self._polynomial(part, field, stop, position) for part in (0, 1))
+        g.outputs["pupil_mm"] = g.concat(p, q) if self.anamorphic else g.concat(point[0] * p + q, point[1] * p)
         return with_derivatives(g, ["pupil_mm"], [("point_mm", 0), ("point_mm", 1)])
 
-    def placed(self, film: Value, film_z: Value, nanometres: Value, point: Value) -> tuple[Value, Value]:
-        """The pupil point [2] of a point of the stop (mm), and the area of a unit of area there."""
-        given = {"film_mm": film, "film_z_mm": film_z, "wavelength_nm": nanometres, "point_mm": point}
-        found = film.graph.inline(self.graph, given)
-        by_x, by_y = (found[derivative("pupil_mm", f"point_mm_{row}")] for row in (0, 1))
-        return found["pupil_mm"], (by_x[0] * by_y[1] - by_x[1] * by_y[0]).abs()
+    def _polynomial(self, part: int, field: Value, stop: Value, position: Value) -> Value:
+        """P or Q, as a polynomial of the stop variables: their derivatives share its coefficients."""
+        g, mine = field.graph, self.exponents[:, 0] == part
+        exponents, numbers = self.exponents[mine, 1:], self.numbers[mine]
+        powers, index = np.unique(exponents[:, 2:4], axis=0, return_inverse=True)
+        if not len(powers):
+            return g.constant(0.0)
+        rows = []
+        for k in range(len(powers)):
+            terms = index.ravel() == k
+            rows.append(moving_polynomial(exponents[terms][:, [0, 1, 4, 5]], numbers[terms], field, position))
+        return g.dot(g.concat(*rows), g.polynomial(powers, np.eye(len(powers)), stop))
 
-    def before(self, lens: Graph, anamorphic: bool) -> Graph:
-        """The graph of the lens, of rays through points of the stop in place of pupil points."""
+    def placed(self, film: Value, film_z: Value, nanometres: Value, point: Value) -> tuple[Value, Value]:
+        """The pupil point [2] of a point of the stop (mm), and the area in the pupil of a unit of area there."""
+        inputs = {"film_mm": film, "film_z_mm": film_z, "wavelength_nm": nanometres, "point_mm": point}
+        rows = film.graph.inline(self.graph, inputs)
+        by_x, by_y = (rows[derivative("pupil_mm", f"point_mm_{axis}")] for axis in (0, 1))
+        return rows["pupil_mm"], (by_x[0] * by_y[1] - by_x[1] * by_y[0]).abs()
+
+    def through_stop(self, lens: Graph) -> Graph:
+        """The graph of the lens with points of the stop in place of pupil points."""
         g = Graph()
         rays, film_z = g.input("rays", 5), g.input("film_z_mm", per_call=True)
-        film, point = rays[0:2], rays[2:4]
-        if anamorphic:
-            pupil, _ = self.placed(film, film_z, rays[4], point)
+        film, point, nanometres = rays[0:2], rays[2:4], rays[4]
+        if self.anamorphic:
+            pupil, _ = self.placed(film, film_z, nanometres, point)
         else:
             radius = g.square(film).sqrt()
             x, y = g.split((film + [HAIR, 0.0]) * (1.0 / (radius + HAIR)), (1, 1))
             turned = g.concat(x * point[0] + y * point[1], x * point[1] - y * point[0])
-            own, _ = self.placed(g.concat(radius, radius * 0.0), film_z, rays[4], turned)
-            pupil = g.concat(x * own[0] - y * own[1], y * own[0] + x * own[1])
-        g.outputs = g.inline(lens, {"rays": g.concat(film, pupil, rays[4]), "film_z_mm": film_z})
+            image, _ = self.placed(g.concat(radius, radius * 0.0), film_z, nanometres, turned)
+            pupil = g.concat(x * image[0] - y * image[1], y * image[0] + x * image[1])
+        g.outputs = g.inline(lens, {"rays": g.concat(film, pupil, nanometres), "film_z_mm": film_z})
         return g
 
 
-def stop_image(sight: Sight) -> StopImage | None:
-    """Of a lens, fitted to its rays; None where too few pass."""
-    low, high = sight.film_z_mm
-    long, short = ((1000 / w) ** 2 for w in reversed(sight.wavelength_nm))
-    places = (low + high) / 2, max((high - low) / 2, 1e-6)
-    waves = (long + short) / 2, max((short - long) / 2, 1e-9)
-    exponents = [_exponents(k, sight.anamorphic) for k in range(2)]
-    image: StopImage | None = None
-    for seed, most in enumerate(_TERMS[not sight.anamorphic]):
-        film, z, nm, pupil, point = draw_rays(sight, image, np.random.default_rng(seed))
-        if z.size < _FEWEST:
+def moving_polynomial(exponents: Exponents, numbers: Array, variables: Value, position: Value) -> Value:
+    """A polynomial of variables of a ray, the last of its exponents [M, K + 1] that of the film position of the call:
+    coefficients follow the position once a call."""
+    g = variables.graph
+    monomials, index = np.unique(exponents[:, :-1], axis=0, return_inverse=True)
+    powers, moved = np.unique(exponents[:, -1], return_inverse=True)
+    weights = np.zeros((len(monomials), len(powers)))
+    np.add.at(weights, (index.ravel(), moved.ravel()), numbers)
+    coefficients = g.polynomial(powers[:, None], weights, position)
+    return g.dot(coefficients, g.polynomial(monomials, np.eye(len(monomials)), variables))
+
+
+class StopRays(NamedTuple):
+    """Rays [N] that pass the widest stop, with pupil points and points of the stop [2, N]."""
+
+    film_mm: Array
+    film_z_mm: Array
+    wavelength_nm: Array
+    pupil_mm: Array
+    point_mm: Array
+
+
+def fit_stop_images(lenses: Sequence[ShaderLens]) -> list[StopImage] | None:
+    """The image of the stop in every state of a lens, with the same terms; None where too few rays pass."""
+    candidates = _candidates(lenses[0].anamorphic)
+    images: list[StopImage] | None = None
+    for seed, most in enumerate(_TERMS[lenses[0].anamorphic]):
+        previous: Sequence[StopImage | None] = images or [None] * len(lenses)
+        rays = [draw_rays(lens, image, seed) for lens, image in zip(lenses, previous, strict=True)]
+        if min(r.film_z_mm.size for r in rays) < _FEWEST:
             return None
-        scaled = film / sight.film_radius_mm, point / sight.stop_radius_mm
-        variables = np.stack(
-            [*scaled[0], *scaled[1], ((1000 / nm) ** 2 - waves[0]) / waves[1], (z - places[0]) / places[1]]
-        )
-        weight = 1 / np.maximum(np.hypot(*scaled[1]), _SIZES[0])
-        fits = []
-        for k, powers in enumerate(exponents):
-            columns = _products(variables, powers, not sight.anamorphic) * weight
-            linear = np.stack([scaled[1][k], scaled[0][k]])[: 2 if scaled[0][k].any() else 1] * weight
-            size = abs(float(np.linalg.lstsq(linear.T, pupil[k] * weight, rcond=None)[0][0]))  # mm of a stop's radius
-            (chosen, values) = pursue([columns], [pupil[k] * weight], [_GOOD * size], most)
-            fits.append(_monomials(powers[chosen], values[0], not sight.anamorphic))
-        every = np.concatenate([powers for powers, _ in fits])
-        numbers = np.zeros((2, len(every)))
-        numbers[0, : len(fits[0][1])], numbers[1, len(fits[0][1]) :] = fits[0][1], fits[1][1]
-        image = StopImage(sight.film_radius_mm, sight.stop_radius_mm, places, waves, every, numbers)
-    return image
+        empty = [_without_terms(lens, lenses) for lens in lenses]
+        fits = [_equations(*pair, candidates) for pair in zip(empty, rays, strict=True)]
+        columns, wanted = zip(*fits, strict=True)
+        terms, numbers = pursue(columns, wanted, [_ENOUGH] * len(lenses), most)
+        images = [_with_terms(*pair, candidates[terms]) for pair in zip(empty, numbers, strict=True)]
+    return images
 
 
-def _products(variables: Array, exponents: NDArray[np.int64], chebyshev: bool) -> Array:
-    """[M, N] of powers of variables [6, N], or of Chebyshev's polynomials of the first, which differ more."""
-    found = np.ones((len(exponents), variables.shape[1]))
-    for k, value in enumerate(variables):
-        degrees = range(exponents[:, k].max() + 1)
-        if chebyshev and k == 0:
-            rows = np.stack([np.cos(n * np.arccos(value.clip(-1, 1))) for n in degrees])
-        else:
-            rows = np.stack([value**n for n in degrees])
-        found *= rows[exponents[:, k]]
-    return found
+def _without_terms(lens: ShaderLens, states: Sequence[ShaderLens]) -> StopImage:
+    low, high = lens.film_z_mm
+    long, short = ((1000 / w) ** 2 for w in reversed(lens.wavelength_nm))
+    return StopImage(
+        film_mm=max(s.film_radius_mm for s in states),
+        stop_mm=max(s.stop_radius_mm for s in states),
+        film_z_mm=((low + high) / 2, max((high - low) / 2, 1e-6)),
+        wave=((long + short) / 2, max((short - long) / 2, 1e-9)),
+        anamorphic=lens.anamorphic,
+        exponents=np.zeros((0, 7), np.int64),
+        numbers=np.zeros(0),
+    )
 
 
-def _monomials(exponents: NDArray[np.int64], numbers: Array, chebyshev: bool) -> tuple[NDArray[np.int64], Array]:
-    """Powers of the variables and their numbers, of products of `_products`."""
-    if not chebyshev:
-        return exponents, numbers
+def _equations(image: StopImage, rays: StopRays, exponents: Exponents) -> tuple[Array, Array]:
+    """Columns [M, 2 N] of terms and pupil points [2 N] that they should sum to, in stop radii; small stops count as
+    much as the widest."""
+    (middle, half), (mean, reach) = image.film_z_mm, image.wave
+    film, (x, y) = rays.film_mm / image.film_mm, rays.point_mm / image.stop_mm
+    weight = 1 / np.maximum(np.hypot(x, y), _SIZES[0])
+    wave, position = ((1000 / rays.wavelength_nm) ** 2 - mean) / reach, (rays.film_z_mm - middle) / half
+    stop = (x, y) if image.anamorphic else (x, x**2 + y**2)
+    along_x = _powers(film[0], exponents[:, 1]) if image.anamorphic else _radial(film[0], exponents)
+    products = along_x * _powers(film[1], exponents[:, 2])
+    for values, powers in zip((*stop, wave, position), exponents.T[3:], strict=True):
+        products *= _powers(values, powers)
+    one, none = np.ones_like(x), np.zeros_like(x)
+    directions = ((one, none), (none, one)) if image.anamorphic else ((x, y), (one, none))
+    rows = []
+    for k, pupil in enumerate(rays.pupil_mm):
+        linear = np.stack([(x, y)[k], film[k]]) * weight
+        size = abs(float(np.linalg.lstsq(linear.T, pupil * weight, rcond=None)[0][0]))  # mm of a stop radius
+        scale = weight / size
+        along = np.stack([direction[k] for direction in directions])
+        rows.append((products * along[exponents[:, 0]] * scale, pupil * scale))
+    return np.concatenate([c for c, _ in rows], 1), np.concatenate([w for _, w in rows])
+
+
+def _powers(values: Array, powers: NDArray[np.int64]) -> Array:
+    return np.stack([values**n for n in range(powers.max() + 1)])[powers]
+
+
+def _lowest(exponents: NDArray[np.int64]) -> int:
+    """The lowest power of the film radius that a round lens's term can have."""
+    return int(exponents[3] + exponents[0])
+
+
+def _radial(radius: Array, exponents: Exponents) -> Array:
+    """Factors of the film radius while terms are chosen: Chebyshev's polynomials differ more than powers do."""
+    pairs = [(_lowest(e), (int(e[1]) - _lowest(e)) // 2) for e in exponents]
+    factors = {(least, degree): radius**least * _chebyshev(degree)(radius**2) for least, degree in set(pairs)}
+    return np.stack([factors[pair] for pair in pairs])
+
+
+def _chebyshev(degree: int) -> np.polynomial.Chebyshev:
+    return np.polynomial.Chebyshev.basis(degree, domain=[0, 1])
+
+
+def _with_terms(image: StopImage, numbers: Array, exponents: Exponents) -> StopImage:
+    """The image with terms of `_equations`, as powers."""
+    if image.anamorphic:
+        return replace(image, exponents=exponents, numbers=numbers)
     total: dict[tuple[int, ...], float] = {}
-    for (degree, *others), number in zip(exponents.tolist(), numbers, strict=True):
-        for power, factor in enumerate(np.polynomial.chebyshev.cheb2poly([0.0] * degree + [1.0])):
-            if factor:
-                key = (power, *others)
-                total[key] = total.get(key, 0.0) + factor * number
-    return np.array(list(total), np.int64), np.array(list(total.values()))
+    for powers, number in zip(exponents, numbers, strict=True):
+        least = _lowest(powers)
+        series = _chebyshev((int(powers[1]) - least) // 2).convert(kind=np.polynomial.Polynomial).coef
+        for n, factor in enumerate(series):
+            key = (int(powers[0]), least + 2 * n, *powers[2:].tolist())
+            total[key] = total.get(key, 0.0) + factor * number
+    return replace(image, exponents=np.array(list(total)), numbers=np.array([*total.values()]))
 
 
-def draw_rays(
-    sight: Sight, image: StopImage | None, rng: np.random.Generator
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Random rays that pass the widest stop: film points [2, N], film positions, wavelengths,
-    pupil points and points of the stop [2, N]; through an image, such that edges of all stops are met."""
-    count, stop = _RAYS * (4 if image is None else 1), sight.stop_radius_mm
-    radius = sight.film_radius_mm * np.sqrt(rng.random(count)) * 0.9999
-    z, nm = (rng.uniform(*span, count) for span in (sight.film_z_mm, sight.wavelength_nm))
-    angle = 2 * np.pi * rng.random(count) if sight.anamorphic else np.zeros(count)
+def _candidates(anamorphic: bool) -> Exponents:
+    """Exponents of all terms among which a fit chooses."""
+    terms = _of_anamorphic() if anamorphic else _of_round()
+    return np.array(list(terms), np.int64)
+
+
+def _of_round() -> Iterator[tuple[int, ...]]:
+    degree, of_stop, moving = _DEGREE[0], _STOP_DEGREE[0], _MOVING[0]
+    for part, x, square, pairs in product((0, 1), range(of_stop + 1), range(of_stop // 2 + 1), range(_FIELD // 2 + 1)):
+        field, stop = x + part + 2 * pairs, x + 2 * square + 1 - part
+        if stop > of_stop or field + stop > (degree if stop > 1 else _FIELD):
+            continue
+        for wave, position in _MOVES:
+            if wave + position == 0 or field + stop <= moving or (wave == 0 and stop <= 1):
+                yield part, field, 0, x, square, wave, position
+
+
+def _of_anamorphic() -> Iterator[tuple[int, ...]]:
+    degree, of_stop, moving = _DEGREE[1], _STOP_DEGREE[1], _MOVING[1]
+    for part, *powers in product((0, 1), *[range(degree + 1)] * 2, *[range(of_stop + 1)] * 2):
+        if sum(powers) > degree or sum(powers[2:]) > of_stop:
+            continue
+        # Odd in what lies along the coordinate's axis, and even in the other: mirrors leave the lens alone.
+        if (powers[part] + powers[2 + part]) % 2 == 1 and (powers[1 - part] + powers[3 - part]) % 2 == 0:
+            for wave, position in _MOVES:
+                if wave + position == 0 or sum(powers) <= moving:
+                    yield part, *powers, wave, position
+
+
+def draw_rays(lens: ShaderLens, image: StopImage | None, seed: int) -> StopRays:
+    """Random rays that pass the widest stop, from film points on +x of round lenses: through the lens's boxes, or
+    through an image of the stop, such that the edges of all stops are met."""
+    rng = np.random.default_rng(seed)
+    count, stop = _RAYS * (4 if image is None else 1), lens.stop_radius_mm
+    radius = lens.film_radius_mm * np.sqrt(rng.random(count)) * 0.9999
+    z, nm = (rng.uniform(*span, count) for span in (lens.film_z_mm, lens.wavelength_nm))
+    angle = 2 * np.pi * rng.random(count) if lens.anamorphic else np.zeros(count)
     film = radius * np.stack([np.cos(angle), np.sin(angle)])
     if image is None:
-        radii = np.linspace(0, sight.table.film_radius_mm, sight.table.rows.shape[1])
-        low, high, half = (np.interp(radius, radii, row) for row in sight.table.rows)
+        radii = np.linspace(0, lens.film_radius_mm, lens.table.rows.shape[1])
+        low, high, half = (np.interp(radius, radii, row) for row in lens.table.rows)
         x, y = low + (high - low) * rng.random(count), half * rng.uniform(-1, 1, count)
         pupil = np.stack([np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y])
     else:
-        size, turn = (
-            _REACH * stop * rng.choice(_SIZES, count) * rng.random(count) ** 0.15,
-            2 * np.pi * rng.random(count),
-        )
-        given = {"film_mm": film, "point_mm": size * np.stack([np.cos(turn), np.sin(turn)])}
-        pupil = evaluate(image.graph, given | {"film_z_mm": z[None], "wavelength_nm": nm[None]})["pupil_mm"]
+        turn = 2 * np.pi * rng.random(count)
+        size = _REACH * stop * rng.choice(_SIZES, count) * rng.random(count) ** 0.15
+        inputs = {"film_mm": film, "point_mm": size * np.stack([np.cos(turn), np.sin(turn)])}
+        pupil = evaluate(image.graph, inputs | {"film_z_mm": z[None], "wavelength_nm": nm[None]})["pupil_mm"]
     rays = np.concatenate([film, pupil, nm[None]])
     with np.errstate(all="ignore"):
-        found = evaluate(sight.graph, {"rays": rays, "film_z_mm": z[None], "stop_radius_mm": np.array([[stop]])})
-    code, point = found["status"][0], found["stop_xy_mm"].astype(np.float64)
-    good = np.broadcast_to(code == st.PASSED, radius.shape)
-    return film[:, good], z[good], nm[good], pupil[:, good].astype(np.float64), point[:, good]
-
-
-def _exponents(axis: int, anamorphic: bool) -> NDArray[np.int64]:
-    """Of the terms that mirrored lenses share: odd in what lies along the axis, even in the other."""
-    degree, of_stop, moving = (row[not anamorphic] for row in (_DEGREE, _STOP_DEGREE, _MOVING))
-    found = [
-        (*e, 0, 0)
-        for e in product(range(_FIELD), range(degree + 1 if anamorphic else 1), *[range(of_stop + 1)] * 2)
-        if (sum(e) <= degree or (sum(e[2:]) <= 1 and not anamorphic)) and sum(e[2:]) <= of_stop
-        and (e[axis] + e[2 + axis]) % 2 == 1 and (e[1 - axis] + e[3 - axis]) % 2 == 0
-    ]  # fmt: skip
-    moves = [
-        (*e[:4], *m)
-        for e in found
-        for m in _MOVES
-        if sum(e) <= moving or (m[0] == 0 and sum(e[2:]) <= 1 and not anamorphic)
-    ]
-    return np.array(found + moves, np.int64)
+        out = evaluate(lens.graph, {"rays": rays, "film_z_mm": z[None], "stop_radius_mm": np.array([[stop]])})
+    passed = np.broadcast_to(out["status"][0] == st.PASSED, radius.shape)
+    point = out["stop_xy_mm"].astype(np.float64)
+    return StopRays(film[:, passed], z[passed], nm[passed], pupil[:, passed].astype(np.float64), point[:, passed])

@@ -28,40 +28,44 @@ from neurolens.commands.arguments import (
 from neurolens.commands.flare_fit import add_fit, check_fit, fitted, run_fit, stopped
 from neurolens.commands.flare_lights import add_lights
 from neurolens.commands.output import answer, number, table
-from neurolens.commands.render import add_colour_space, film_size
+from neurolens.commands.render import film_size
 from neurolens.commands.render_frames import add_frames, frames_of
 from neurolens.evaluate.records import plain
+from neurolens.render.film_settings import FilmSettings
 from neurolens.render.flaresettings import FlareSettings
 
 if TYPE_CHECKING:
     from neurolens.cameras.contract import FloatArray
     from neurolens.commands.flare_lights import Sources
     from neurolens.flare.ghostmodel import GhostModel
-    from neurolens.flare.ghosts import GhostTracer
     from neurolens.flare.layers import FlareJob
-    from neurolens.flare.lights import Light
     from neurolens.flare.picture import Ghost
     from neurolens.optics.prescription import Lens
 
 _DESCRIPTION = """\
-Trace all ghosts of a lens exactly: light that two of its surfaces reflect on its way to the
-film, with Fresnel's or the coatings' reflectance, all rims and the stop's shape, spectrally.
-Prints the brightest by energy, place and size (x, y on the film itself, which pictures show turned
-by 180 degrees: a light to the right is imaged at x < 0); with -o writes their picture as OpenEXR, to be
-added to a render of the same lens, film and focus: R, G and B are the sum of the layers
-ghosts.R, .G, .B, and so on. The --layers ghosts with the greatest values on the film are layers
-of their own (g07-03: reflected at surface 7, then at 3, counted from 0 at the front), the others
-are "rest". A PNG preview beside the EXR shows the flare, brighter by --exposure. Values are those
-of `neurolens render`: a white card of radiance 1 is 1 on the axis.
-Each surface shares light out by the mean of both polarisations. If polarisation were followed from
-surface to surface, the light of all ghosts would change by -2 to +12% in three lenses tried, and
-that of single bright ghosts by -22 to +48%, most in coated lenses. Edges of ghosts are as rays draw
-them, without the rings of diffraction, which no option adds. With --photons light goes on by chance
-instead, with any number of reflections, smoothed by a kernel. With --glare, or anything that
-scatters, the layer glare has by such photons the light that is reflected more than twice or
-scatters, so that ghosts and glare are all. With --starburst the layer starburst has what diffraction
-sends aside, by the shape of the opening as each light sees it: streaks of blades. It is 0 at the image of the
-light itself, which a render has. Needs the extra "train" (torch) and a C compiler."""
+Trace all ghosts of a lens exactly: light that two of its surfaces reflect on its way to the film, with
+the reflectance of Fresnel's equations or of the coatings, all rims, the shape of the stop, and the
+spectrum. The command prints the brightest ghosts with their energy, position and size. Positions are
+on the film itself, which pictures show turned by 180 degrees: a light to the right is imaged at x < 0.
+
+With -o the ghosts are written as an OpenEXR picture that can be added to a render of the same lens,
+film and focus: R, G and B are the sum of the layers (ghosts.R, .G, .B, and so on). The --layers ghosts
+with the greatest values on the film become layers of their own (g07-03 is reflected at surface 7, then
+at surface 3, counted from 0 at the front), and the layer "rest" has the others. A PNG preview beside
+the EXR shows the flare, brighter by --exposure. Values are those of `neurolens render`: a white card of
+radiance 1 is 1 on the axis.
+
+Each surface divides light by the mean of both polarisations. If polarisation were followed from surface
+to surface, the light of all ghosts would change by -2 to +12% in three lenses tried, and that of single
+bright ghosts by -22 to +48%, most in coated lenses. Edges of ghosts are as rays draw them, without the
+rings of diffraction, which no option adds.
+
+With --photons light goes on by chance instead, with any number of reflections, smoothed by a kernel.
+With --glare, or if anything scatters, photons of the same kind make the layer "glare": light that is
+reflected more than twice or scatters, so that ghosts and glare together are all the light. With
+--starburst the layer "starburst" has the light that diffraction sends aside, by the shape of the
+opening as each light sees it: the streaks of blades. It is 0 at the image of the light itself, which a
+render has. Needs the extra "train" (torch) and a C compiler."""
 _EPILOG = """\
 examples:
   neurolens flare laikin_double_gauss_50 --light 15,8 --path g08-06 path.png
@@ -72,10 +76,10 @@ examples:
   neurolens flare laikin_double_gauss_50 --lights sun.csv --frames 1:48 --key camera.csv -o flare.exr
   neurolens flare laikin_double_gauss_50 --fit ghosts.onnx; neurolens flare ghosts.onnx --light 15,8 -o flare.exr"""
 _COMMAND = "neurolens flare"
-_SHOWN, _SHOWN_LIGHTS, _KEPT = 12, 4, 64  # ghosts of a table and tables; ghosts of a light that files tell
-_FEWEST = 256  # rays of a table
+_SHOWN, _SHOWN_LIGHTS, _KEPT = 12, 4, 64  # ghosts of a table; tables; ghosts of a light in metadata
+_FEWEST = 256  # rays behind a table
 _QUICK_WIDTH = 480  # at most
-_RANKED_FRAMES = 16  # that tell which ghosts are brightest
+_RANKED_FRAMES = 16  # at most; they decide which ghosts are the brightest
 _QUANTILE, _SHOWN_AT = 0.99, 0.8  # the preview's exposure takes this quantile of the lit pixels to this value
 _FRAMES = (
     "flare of these frames to OUT.0001.exr and so on, of lights by their keys in lists, the lens, and the camera of a "
@@ -116,7 +120,8 @@ def _add_picture(parser: argparse.ArgumentParser) -> None:
     )
     add_options(group, FlareSettings, ["cell_px", "bins"])
     add_exposure(group, None, "99% of the lit pixels become no brighter than 0.8; frames share one value")
-    add_colour_space(group, "; default: that of --image, else of a scene's [film] table, else sRGB")
+    (space,) = add_options(group, FilmSettings, ["colour_space"], unset=True)
+    space.help = f"{space.help}; default: that of --image, else of a scene's [film] table, else sRGB"
     add_option(
         group, "--quick", old=("--preview",), action="store_true",
         help="at most 480 pixels wide, 5 wavelengths and 65536 photons a light and wavelength, --cell at least 24",
@@ -153,12 +158,12 @@ def _settings(args: argparse.Namespace) -> FlareSettings:
     for name, factors in args.gains:
         r, g, b = (a * b for a, b in zip(gains.get(name, (1.0, 1.0, 1.0)), factors, strict=True))
         gains[name] = (r, g, b)
-    settings = replace(from_options(FlareSettings, args), gains=gains)
+    settings = replace(from_options(FlareSettings(), args), gains=gains)
     return settings.quick() if args.quick else settings
 
 
 def run(args: argparse.Namespace) -> int:
-    """Trace, print, write."""
+    """Trace the ghosts, print their table, and write the picture."""
     from neurolens.commands.flare_lights import Sources
     from neurolens.flare.ghosts import ghost_pairs
     from neurolens.flare.layers import kept_beside
@@ -177,25 +182,26 @@ def run(args: argparse.Namespace) -> int:
         return run_fit(args, None if model else _lens(states[0], tabled), model)
     shots = _Shots(tabled, Sources(args, () if args.frames is None else states), progress, model)
     first = shots.at(states[0])
-    found = {"lens": first.lens.name, "pairs": len(ghost_pairs(first.lens)), **_told(first)}
-    found["fitted"] = 0 if model is None else len(model.pairs)
+    results = {"lens": first.job.lens.name, "pairs": len(ghost_pairs(first.job.lens)), **first.metadata()}
+    results["fitted"] = 0 if model is None else len(model.pairs)
     if args.path is not None:
-        _draw(first, args.path[0], Path(args.path[1]))
-        found["path"] = args.path[1]
+        _draw(first.job, args.path[0], Path(args.path[1]))
+        results["path"] = args.path[1]
     if args.out is not None:
-        found["out"] = [str(state.out) for state in states]
-        found["preview"] = [str(state.out.with_suffix(".png")) for state in states]
+        results["out"] = [str(state.out) for state in states]
+        results["preview"] = [str(state.out.with_suffix(".png")) for state in states]
         try:
-            found |= _write_all(states, shots, progress)
+            results |= _write_all(states, shots, progress)
         except KeyboardInterrupt:
             if args.frames is None and (kept := [str(path) for path in kept_beside(args.out)]):
                 args.kept = f"the same command goes on from {' and '.join(kept)}"
             raise
-    found["seconds"] = time.perf_counter() - began
-    return answer(args, found, lambda: _text(first, found))
+    results["seconds"] = time.perf_counter() - began
+    return answer(args, results, lambda: _text(first, results))
 
 
 def _check(args: argparse.Namespace) -> None:
+    """Refuse options that exclude each other and files that cannot be written; raises InputError."""
     check_fit(args)
     if args.frames is None and args.key:
         raise InputError(_COMMAND, "--key", args.key[0], "--frames beside it")
@@ -204,12 +210,12 @@ def _check(args: argparse.Namespace) -> None:
             raise InputError(_COMMAND, "--frames", f"({len(args.frames)})", "-o beside it")
         args.kept = "the frames that are there are kept: the same command goes on"
     by_chance = args.photons or args.glare or args.barrel or args.sensor or args.dust or args.haze_per_mm
-    if not by_chance and args.most_reflections not in (None, 2):
+    if not by_chance and args.reflections not in (None, 2):
         expected = "2, or --photons or --glare beside it, whose light is reflected more often"
-        raise InputError(_COMMAND, "--reflections", args.most_reflections, expected)
-    if args.photons and args.brightest:
+        raise InputError(_COMMAND, "--reflections", args.reflections, expected)
+    if args.photons and args.layers:
         expected = "no --photons beside it: they tell no single ghosts apart"
-        raise InputError(_COMMAND, "--layers", args.brightest, expected)
+        raise InputError(_COMMAND, "--layers", args.layers, expected)
     if args.out is not None:
         from neurolens.frames.frame import Files
 
@@ -230,16 +236,26 @@ def _states(args: argparse.Namespace) -> Iterator[argparse.Namespace]:
 
 
 class _Shot(NamedTuple):
-    """Lens, lights, the ghosts of each light, brightest first, and what draws them."""
+    """The flare of one frame, and the ghosts of each of its lights, brightest first."""
 
-    lens: Lens
-    lights: list[Light]
+    job: FlareJob
     ghosts: list[list[Ghost]]
-    tracer: GhostTracer | GhostModel
+
+    def metadata(self) -> dict[str, Any]:
+        """The lights and their ghosts, for files and --json."""
+        ghosts = [
+            [
+                {"name": g.pair.name, "energy": g.energy, "x_mm": g.centre_mm[0], "y_mm": g.centre_mm[1],
+                 "size_mm": g.size_mm, "passed": g.passed}
+                for g in of_light[:_KEPT]
+            ]
+            for of_light in self.ghosts
+        ]  # fmt: skip
+        return {"lights": [plain(light.about) for light in self.job.lights], "ghosts": ghosts}
 
 
 class _Shots:
-    """What frames show; what they share is made once."""
+    """The flare of each frame. Frames with the same focus, stop and zoom share the lens."""
 
     def __init__(self, tabled: Lens, sources: Sources, progress: Progress, model: GhostModel | None) -> None:
         self._tabled, self.sources, self._progress, self._model = tabled, sources, progress, model
@@ -247,24 +263,26 @@ class _Shots:
         self._last: tuple[argparse.Namespace, _Shot] | None = None
 
     def at(self, args: argparse.Namespace) -> _Shot:
-        """Of a frame."""
+        """The flare of the frame with these arguments."""
         if self._last is None or self._last[0] is not args:
-            self._last = args, self._made(args)
+            self._last = args, self._make(args)
         return self._last[1]
 
-    def _made(self, args: argparse.Namespace) -> _Shot:
+    def _make(self, args: argparse.Namespace) -> _Shot:
         from neurolens.flare.ghosts import GhostTracer
-        from neurolens.flare.picture import RANKED, ghost_table
+        from neurolens.flare.layers import FlareJob
+        from neurolens.flare.picture import RANKED, Raster, ghost_table
 
         state = args.focus, args.f_number, args.zoom
         if state not in self._lenses:
             model = None if self._model is None else stopped(args, self._model)
             self._lenses[state] = _lens(args, self._tabled) if model is None else model.lens, model
         lens, model = self._lenses[state]
-        lights = self.sources.at(args, lens, self._progress)
-        tracer = model or GhostTracer(lens)
+        lights, tracer = self.sources.at(args, lens, self._progress), model or GhostTracer(lens)
+        raster = Raster(args.film, args.width, max(1, round(args.width * args.film[1] / args.film[0])))
+        job = FlareJob(lens, lights, raster, args.settings, threads=args.threads, ghosts=tracer)
         rays = max(_FEWEST, RANKED // max(len(lights), 1))
-        return _Shot(lens, lights, [ghost_table(tracer, light, 550.0, rays) for light in lights], tracer)
+        return _Shot(job, [ghost_table(tracer, light, 550.0, rays) for light in lights])
 
 
 def _lens(args: argparse.Namespace, tabled: Lens) -> Lens:
@@ -275,17 +293,20 @@ def _lens(args: argparse.Namespace, tabled: Lens) -> Lens:
 
 
 def _write_all(states: list[argparse.Namespace], shots: _Shots, progress: Progress) -> dict[str, Any]:
-    """Write the picture, or those of the frames that are missing; which ghosts are layers, and the previews' stops."""
+    """Write the picture, or those of the frames that are missing.
+
+    Returns the names of the ghosts that are layers, and the exposure of the previews in stops.
+    """
     from neurolens.flare.layers import brightest
     from neurolens.render.pictures import read_metadata
 
     args, single, exposure = states[0], tuple[str, ...](), states[0].exposure
-    if args.brightest:  # the same in all frames
-        some = [_job(state, shots.at(state)) for state in states[:: -(-len(states) // _RANKED_FRAMES)]]
+    if args.layers:  # the same in all frames
+        jobs = [shots.at(state).job for state in states[:: -(-len(states) // _RANKED_FRAMES)]]
         with progress.stage("brightest ghosts") as report:
-            single = brightest(some, report)
-        if len(single) < args.brightest:
-            warn(f"layers of {len(single)} single ghosts, not {args.brightest}: no other leaves light on the film")
+            single = brightest(jobs, report)
+        if len(single) < args.layers:
+            warn(f"layers of {len(single)} single ghosts, not {args.layers}: no other leaves light on the film")
     if args.frames is None:
         exposure = _write(args, shots, single, exposure, progress)
         return {"layers": single, "exposure": exposure or 0.0}
@@ -299,18 +320,10 @@ def _write_all(states: list[argparse.Namespace], shots: _Shots, progress: Progre
     return {"layers": single, "exposure": exposure or 0.0}
 
 
-def _job(args: argparse.Namespace, shot: _Shot) -> FlareJob:
-    from neurolens.flare.layers import FlareJob
-    from neurolens.flare.picture import Raster
-
-    raster = Raster(args.film, args.width, max(1, round(args.width * args.film[1] / args.film[0])))
-    return FlareJob(shot.lens, shot.lights, raster, args.settings, threads=args.threads, ghosts=shot.tracer)
-
-
 def _write(
     args: argparse.Namespace, shots: _Shots, single: tuple[str, ...], exposure: float | None, progress: Progress
 ) -> float | None:
-    """Write a picture and its preview; the preview's exposure in stops, None where that is free and nothing is lit."""
+    """Write a picture and its preview; returns the exposure in stops, or None where it is free and all is dark."""
     from neurolens.cameras.exact import placed_settings
     from neurolens.flare.layers import flare_layers, kept_beside, sum_of
     from neurolens.frames.frame import Files
@@ -320,21 +333,20 @@ def _write(
 
     files, shot, space = Files.of(args.out), shots.at(args), shots.sources.colour_space(args)
     files.spare(shots.sources.reads(args))
-    job = replace(_job(args, shot), single=single, keep=args.out)
-    raster, found = job.raster, flare_layers(job, progress)
-    total = sum_of(found, raster)
+    job = replace(shot.job, single=single, keep=args.out)
+    layers = flare_layers(job, progress)
+    total = sum_of(layers, job.raster)
     if args.frames is None:  # frames have the same layers, dark ones too
-        found = {name: picture for name, picture in found.items() if picture.any()}
+        layers = {name: picture for name, picture in layers.items() if picture.any()}
     exposure = _exposure(total) if exposure is None else exposure
-    told = {k: v for k, v in vars(args).items() if isinstance(v, str | int | float | list | tuple | None)}
-    told |= asdict(args.settings)
-    about = {**_told(shot), "exposure": exposure, "settings": told}
+    options = {k: v for k, v in vars(args).items() if isinstance(v, str | int | float | list | tuple | None)}
+    about = {**shot.metadata(), "exposure": exposure, "settings": options | asdict(args.settings)}
     metadata = plain({"neurolens": __version__, "colour": space.stated, "flare": about})
-    camera = placed_settings(shot.lens, args.film, args.focus)
-    header = standard_attributes(camera, raster.width, raster.height, args.frame)
-    layers = flare_channels(found, space)
+    camera = placed_settings(job.lens, args.film, args.focus)
+    header = standard_attributes(camera, job.raster.width, job.raster.height, args.frame)
+    channels = flare_channels(layers, space)
     write_png(files.preview, total, exposure or 0.0)  # first: a frame whose EXR exists is kept
-    write_exr(args.out, total, metadata=metadata, space=space, layers=layers, attributes=header)
+    write_exr(args.out, total, metadata=metadata, space=space, layers=channels, attributes=header)
     for path in kept_beside(args.out):
         path.unlink()
     return exposure
@@ -349,57 +361,42 @@ def _exposure(picture: FloatArray) -> float | None:
     return round(math.log2(_SHOWN_AT / float(np.quantile(lit, _QUANTILE))), 2) if len(lit) else None
 
 
-def _draw(shot: _Shot, name: str, out: Path) -> None:
+def _draw(job: FlareJob, name: str, out: Path) -> None:
+    """Draw the rays of one ghost of the first light."""
     from neurolens.analysis.layout import lens_layout
     from neurolens.flare.ghosts import ghost_pairs
     from neurolens.flare.picture import ghost_layout
 
-    pairs = ghost_pairs(shot.lens)
+    pairs = ghost_pairs(job.lens)
     pair = next((p for p in pairs if p.name == name), None)
-    if pair is None or not shot.lights:
+    if pair is None or not job.lights:
         expected = f"a ghost of this lens, as {pairs[0].name}, and a light" if pairs else "a lens with ghosts"
         raise InputError(_COMMAND, "--path", name, expected)
-    lens_layout(ghost_layout(shot.lens, pair, shot.lights[0]), out)
+    lens_layout(ghost_layout(job.lens, pair, job.lights[0]), out)
 
 
-def _told(shot: _Shot) -> dict[str, Any]:
-    """Lights and their ghosts, for metadata and --json."""
-    ghosts = [[_about(ghost) for ghost in of_light[:_KEPT]] for of_light in shot.ghosts]
-    return {"lights": [plain(light.about) for light in shot.lights], "ghosts": ghosts}
-
-
-def _about(ghost: Ghost) -> dict[str, Any]:
-    return {
-        "name": ghost.pair.name,
-        "energy": ghost.energy,
-        "x_mm": ghost.centre_mm[0],
-        "y_mm": ghost.centre_mm[1],
-        "size_mm": ghost.size_mm,
-        "passed": ghost.passed,
-    }
-
-
-def _text(shot: _Shot, about: dict[str, Any]) -> str:
-    parts = [f"{shot.lens.name}: {about['pairs']} pairs of surfaces"]
-    if about["fitted"]:
-        parts[0] += f", {about['fitted']} ghosts of them fitted: the table is of the fit"
+def _text(shot: _Shot, results: dict[str, Any]) -> str:
+    lines = [f"{results['lens']}: {results['pairs']} pairs of surfaces"]
+    if results["fitted"]:
+        lines[0] += f", {results['fitted']} ghosts of them fitted: the table is of the fit"
     head = ("ghost", "energy of the image's", "x mm", "y mm", "RMS radius mm", "rays that arrive %")
-    for light, of_light in zip(shot.lights[:_SHOWN_LIGHTS], shot.ghosts, strict=False):
-        all_of = sum(ghost.energy for ghost in of_light)
-        parts.append(
-            f"light at {light.azimuth_deg:g}, {light.elevation_deg:g} deg: {len(of_light)} ghosts reach the film's "
-            f"plane, with {number(100 * all_of)}% of the image's light; the brightest at 550 nm:"
+    lights = shot.job.lights
+    for light, ghosts in zip(lights[:_SHOWN_LIGHTS], shot.ghosts, strict=False):
+        energy = sum(ghost.energy for ghost in ghosts)
+        lines.append(
+            f"light at {light.azimuth_deg:g}, {light.elevation_deg:g} deg: {len(ghosts)} ghosts reach the film's "
+            f"plane, with {number(100 * energy)}% of the image's light; the brightest at 550 nm:"
         )
         cells = [
             [g.pair.name, number(g.energy), *map(number, g.centre_mm), number(g.size_mm), number(100 * g.passed)]
-            for g in of_light[:_SHOWN]
+            for g in ghosts[:_SHOWN]
         ]
-        parts.append(table(head, cells))
-    if more := len(shot.lights[_SHOWN_LIGHTS:]):
-        parts.append(f"and {more} more lights")
-    if about.get("layers"):
-        parts.append(f"layers of the ghosts with the greatest values on the film: {', '.join(about['layers'])}")
-    made = [f"{of[0]} to {of[-1]}" if len(of) > 1 else of[0] for of in (about.get(k) for k in ("out", "preview")) if of]
-    shown = f"{made[0]}, and the preview {made[1]} at {about['exposure']:+g} stops" if made else "done"
-    parts.append(f"{shown}: {about['seconds']:.1f} s")
-    return "\n\n".join(parts)
+        lines.append(table(head, cells))
+    if more := len(lights[_SHOWN_LIGHTS:]):
+        lines.append(f"and {more} more lights")
+    if results.get("layers"):
+        lines.append(f"layers of the ghosts with the greatest values on the film: {', '.join(results['layers'])}")
+    files = [results[key] for key in ("out", "preview") if key in results]
+    spans = [f"{names[0]} to {names[-1]}" if len(names) > 1 else names[0] for names in files]
+    end = f"{spans[0]}, and the preview {spans[1]} at {results['exposure']:+g} stops" if spans else "done"
+    return "\n\n".join([*lines, f"{end}: {results['seconds']:.1f} s"])

@@ -1,4 +1,4 @@
-"""Fitted ghosts of `neurolens flare`: --fit writes them, a file of them takes the place of a lens."""
+"""Fitted ghosts of `neurolens flare`: --fit writes them to a file, which then takes the place of a lens."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SHOWN = 12
 
 
 def add_fit(parser: argparse.ArgumentParser) -> None:
-    """Add --fit and what goes with it."""
+    """Add --fit and its settings."""
     group = parser.add_argument_group("fitted ghosts")
     group.add_argument(
         "--fit", metavar="OUT", type=Path,
@@ -41,7 +41,7 @@ def add_fit(parser: argparse.ArgumentParser) -> None:
 
 
 def check_fit(args: argparse.Namespace) -> None:
-    """Raise InputError where --fit has beside it what asks for a picture."""
+    """Refuse --fit together with options that ask for a picture; raises InputError."""
     for name in ("light", "lights", "image", "out", "path", "frames", "photons", "glare", "starburst"):
         if args.fit is not None and getattr(args, name):
             expected = f"no --{name} beside it: it writes the ghosts of one state, for any light"
@@ -51,21 +51,25 @@ def check_fit(args: argparse.Namespace) -> None:
 
 
 def fitted(args: argparse.Namespace, states: Sequence[argparse.Namespace]) -> GhostModel | None:
-    """The model where the file is one; None for a lens. `states`: the arguments of each frame.
+    """The fitted ghosts, if the file holds some instead of a lens.
+
+    Args:
+        states: the arguments of each frame.
 
     Raises:
-        InputError: options that would change what the model was fitted for. ModelError: as `read_ghosts`.
+        InputError: options that need the lens itself, since the ghosts were fitted for one state.
+        ModelError: see `read_ghosts`.
     """
     if not is_model(args.file):
         return None
     from neurolens.flare.ghostfile import read_ghosts
 
-    other = [name for name in given_options(args) if name not in _FREE]
-    other += [f"--{name}" for name in ("coating", "photons") if getattr(args, name)]
-    other += ["--key focus"] * any(math.isfinite(s.focus) for s in states)
-    other += ["--key zoom"] * any(s.zoom is not None for s in states)
-    if other:
-        raise InputError(_COMMAND, other[0], args.file, "a lens: fitted ghosts have one state and two reflections")
+    wrong = [name for name in given_options(args) if name not in _FREE]
+    wrong += [f"--{name}" for name in ("coating", "photons") if getattr(args, name)]
+    wrong += ["--key focus"] * any(math.isfinite(s.focus) for s in states)
+    wrong += ["--key zoom"] * any(s.zoom is not None for s in states)
+    if wrong:
+        raise InputError(_COMMAND, wrong[0], args.file, "a lens: fitted ghosts have one state and two reflections")
     model, half = read_ghosts(args.file), math.hypot(*args.film) / 2
     if half > 1.001 * (known := float(model.report.get("film_radius_mm", math.inf))):
         warn(f"{args.file}: fitted up to {known:.4g} mm from the axis, and the film's corners are at {half:.4g} mm")
@@ -73,7 +77,7 @@ def fitted(args: argparse.Namespace, states: Sequence[argparse.Namespace]) -> Gh
 
 
 def stopped(args: argparse.Namespace, model: GhostModel) -> GhostModel:
-    """The model at the f-number and with the blades asked for.
+    """The model at the f-number and with the blades of the options.
 
     Raises:
         InputError: a stop wider than that of the fit.
@@ -100,21 +104,22 @@ def run_fit(args: argparse.Namespace, lens: Lens | None, model: GhostModel | Non
         with progress.stage("ghosts") as report:
             model = fit_ghosts(lens, settings, report)
         write_ghosts(model, args.fit)
-    found = {"lens": model.lens.name, "out": str(args.fit), **model.report}
-    return answer(args, found, lambda: _text(found))
+    results = {"lens": model.lens.name, "out": str(args.fit), **model.report}
+    return answer(args, results, lambda: _text(results))
 
 
-def _text(found: dict[str, Any]) -> str:
+def _text(results: dict[str, Any]) -> str:
     rows = [
         [
             r["ghost"], number(100 * r["energy"]), number(r["film_rms_um"]), number(100 * r["false_light"]),
             number(100 * r["lost_light"]), str(r["degree"]), str(r["rims"]),
         ]
-        for r in found["ghosts"][:_SHOWN]
+        for r in results["ghosts"][:_SHOWN]
     ]  # fmt: skip
     head = ("ghost", "energy %", "RMS um", "light too much %", "too little %", "degree", "rims")
+    energy, error = number(100 * results["kept_energy"]), number(results["film_rms_um"])
     return (
-        f"{found['lens']}: {found['kept']} of {found['pairs']} ghosts, with {number(100 * found['kept_energy'])}% of "
-        f"their light; {number(found['film_rms_um'])} um RMS on the film, by light; the brightest:\n\n"
-        f"{table(head, rows)}\n\n{found['out']}: fitted in {found['seconds']:.1f} s"
+        f"{results['lens']}: {results['kept']} of {results['pairs']} ghosts, with {energy}% of their light; {error} um "
+        f"RMS on the film, by light; the brightest:\n\n{table(head, rows)}\n\n{results['out']}: fitted in "
+        f"{results['seconds']:.1f} s"
     )

@@ -1,4 +1,4 @@
-"""Lights of `neurolens flare`: from the command line, from lists over frames, of a scene, and of a picture."""
+"""The lights of `neurolens flare`: options, lists over frames, the lights of a scene, and highlights of a picture."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from neurolens.render.scene import Scene
 
 _COMMAND = "neurolens flare"
-_RANKED_FRAMES = 64  # that tell which lights of a scene have the most energy
+_RANKED_FRAMES = 64  # at most; they decide which lights of a scene have the most energy
 
 
 def add_lights(parser: argparse.ArgumentParser) -> None:
@@ -57,7 +57,11 @@ def add_lights(parser: argparse.ArgumentParser) -> None:
 
 
 class Sources:
-    """The lights of the command line; files are read once. `states`: the arguments of all frames, where there are."""
+    """The lights that a command line names, whose files are read once.
+
+    Args:
+        states: the arguments of all frames; empty for a single picture.
+    """
 
     def __init__(self, args: argparse.Namespace, states: Sequence[argparse.Namespace] = ()) -> None:
         from neurolens.flare.lights import read_lights
@@ -75,28 +79,28 @@ class Sources:
         self._chosen: dict[Path, frozenset[Name]] = {}
 
     def at(self, args: argparse.Namespace, lens: Lens, progress: Progress) -> list[Light]:
-        """The lights at a frame, the lens and the scene's camera as `args` has them there."""
+        """The lights at the frame of `args`, where the lens and the camera of a scene are as `args` says."""
         from neurolens.flare.sources import chosen, keep_named
 
-        there = [track.at(args.frame or 0) for track in self._tracks]
-        found = [*self._fixed, *(light for light in there if light is not None)]
-        if behind := len(self._fixed) + len(there) - len(found):
+        of_lists = [track.at(args.frame or 0) for track in self._tracks]
+        lights = [*self._fixed, *(light for light in of_lists if light is not None)]
+        if behind := len(self._fixed) + len(of_lists) - len(lights):
             warn(f"{behind} lights of lists stand behind the lens{_at(args)}")
         assert lens.film_z_mm is not None
-        for path, scene, lights in self._scenes:
-            seen = _seen(scene, path, lights, args, lens.film_z_mm)
+        for path, scene, sources in self._scenes:
+            visible = _visible(scene, path, sources, args, lens.film_z_mm)
             if path not in self._chosen:
-                of_all = [_seen(scene, path, lights, state, lens.film_z_mm) for state in self._states]
-                self._chosen[path] = chosen(of_all or [seen], args.most)
-            found += _kept(keep_named(seen, self._chosen[path]), path)
+                in_frames = [_visible(scene, path, sources, state, lens.film_z_mm) for state in self._states]
+                self._chosen[path] = chosen(in_frames or [visible], args.most)
+            lights += _with_warning(keep_named(visible, self._chosen[path]), path)
         if args.image is not None:
-            found += self._of_picture(args, lens, progress)
-        if not found:
+            lights += self._of_picture(args, lens, progress)
+        if not lights:
             warn(f"no light: the flare is black{_at(args)}")
-        return found
+        return lights
 
     def reads(self, args: argparse.Namespace) -> Iterator[Path]:
-        """The files that tell a frame's lights and the shape of the stop, which no picture may replace."""
+        """The files that a frame's lights and the shape of the stop come from, which no picture may overwrite."""
         from neurolens.render.scene import files_named
 
         yield from args.lights
@@ -131,10 +135,10 @@ class Sources:
             raise InputError(path, "shape", f"({size})", "the film's, {:g}x{:g}".format(*args.film))
         try:
             fade = args.frame is not None and path != args.image
-            found = highlights(picture, self._field(args, lens, progress), args.film, args.threshold, args.most, fade)
+            regions = highlights(picture, self._field(args, lens, progress), args.film, args.threshold, args.most, fade)
         except InputError as error:
             raise InputError(path, error.field, error.value, error.expected) from None
-        return _kept(found, path)
+        return _with_warning(regions, path)
 
     def _field(self, args: argparse.Namespace, lens: Lens, progress: Progress) -> Field:
         from neurolens.cameras.build import Shot, make_camera
@@ -157,32 +161,35 @@ class Sources:
         return self._fields[state]
 
 
-def _seen(
-    scene: Scene, path: Path, lights: SceneLights, args: argparse.Namespace, film_z_mm: float
+def _visible(
+    scene: Scene, path: Path, sources: SceneLights, args: argparse.Namespace, film_z_mm: float
 ) -> dict[Name, Light]:
-    """The lights of a scene whose camera stands where `args` have it."""
+    """The lights of a scene that its camera sees from the position that `args` gives it."""
     from neurolens.render.scene import seen_from
 
-    return lights.named(seen_from(scene, path, args.position_m, args.look_at_m), film_z_mm)
+    return sources.named(seen_from(scene, path, args.position_m, args.look_at_m), film_z_mm)
 
 
-def _kept(found: Kept, path: Path) -> list[Light]:
-    if found.dropped > 0:
-        warn(f"{path}: {len(found.lights)} of {found.of} lights; the others have {found.dropped:.2%} of the energy")
-    return found.lights
+def _with_warning(kept: Kept, path: Path) -> list[Light]:
+    """The lights that are kept, after a warning about the energy of those that are not."""
+    if kept.dropped > 0:
+        warn(f"{path}: {len(kept.lights)} of {kept.of} lights; the others have {kept.dropped:.2%} of the energy")
+    return kept.lights
 
 
 def picture_path(args: argparse.Namespace) -> Path:
     """The file of --image at a frame."""
     frame = args.frame or 0
-    return Path(re.sub("#+", lambda found: f"{frame:0{len(found[0])}d}", str(args.image)))
+    return Path(re.sub("#+", lambda digits: f"{frame:0{len(digits[0])}d}", str(args.image)))
 
 
 def _at(args: argparse.Namespace) -> str:
+    """Where a warning belongs to, if there are frames."""
     return "" if args.frame is None else f" at frame {args.frame}"
 
 
 def _light(text: str) -> Light:
+    """The light of a --light option."""
     from neurolens.flare.lights import SUN, Light, with_disc
     from neurolens.render.environment import SUN_RADIUS_RAD
 

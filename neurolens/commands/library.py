@@ -35,7 +35,7 @@ _SHOWN = {
     "colour": "Colour",
 }  # fmt: skip
 _BOKEH_FOCUS, _BOKEH_FIELDS = 30, (0.0, 0.6, 0.95)  # focal lengths; shares of the field
-_COLOURS = 96  # of the palettes of the pictures
+_COLOURS = 96  # in the palette of a picture
 
 
 def add_parser(subparsers: Any) -> None:
@@ -66,13 +66,13 @@ def run(args: argparse.Namespace) -> int:
     atomic_write_text(folder / "index.html", _index(records))
     failed = [f"{r['lens']}: {r['fault']}" for r in records if "fault" in r]
     size = sum(f.stat().st_size for f in folder.rglob("*") if f.is_file())
-    told = [f"{len(records) - len(failed)} lenses, {size / 1e6:.1f} MB: {folder}/index.html", *failed]
-    answer(args, {"folder": str(folder), "bytes": size, "lenses": records}, lambda: "\n".join(told))
+    lines = [f"{len(records) - len(failed)} lenses, {size / 1e6:.1f} MB: {folder}/index.html", *failed]
+    answer(args, {"folder": str(folder), "bytes": size, "lenses": records}, lambda: "\n".join(lines))
     return 1 if failed else 0
 
 
 def _page_names(files: Sequence[Path]) -> list[str]:
-    """A folder's name for each file's page: the lens's id, and a number where another file of the run has the same."""
+    """The folder of each file's page: the id of the lens, with a number if another file of the run has the same id."""
     names: list[str] = []
     for file in files:
         tries = (safe_name(f"{lens_id_of(file)}-{k}" if k > 1 else lens_id_of(file)) for k in itertools.count(1))
@@ -82,16 +82,16 @@ def _page_names(files: Sequence[Path]) -> list[str]:
 
 
 def _record(file: Path, folder: Path) -> dict[str, Any]:
-    """A lens's row of the index, its page written to a folder unless it is there."""
+    """The row of a lens in the index. Its page is written to a folder, unless it is there already."""
     from neurolens import __version__
     from neurolens.evaluate.describe import read_quietly
 
     kept, named = folder / "record.json", {"lens": lens_id_of(file), "page": folder.name}
     try:
         lens = read_quietly(file)
-        found = read_kept(kept)
-        if found is not None and (found.get("sha256"), found.get("version")) == (lens.sha256, __version__):
-            return found | named
+        last = read_kept(kept)
+        if last is not None and (last.get("sha256"), last.get("version")) == (lens.sha256, __version__):
+            return last | named
         kept.parent.mkdir(parents=True, exist_ok=True)
         record = named | {"sha256": lens.sha256, "version": __version__} | _page(lens, file, kept.parent)
         write_kept(kept, record)
@@ -101,7 +101,7 @@ def _record(file: Path, folder: Path) -> dict[str, Any]:
 
 
 def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
-    """Draw a lens, write its page, and say what the index shows of it."""
+    """Draw a lens and write its page; returns what the index shows."""
     from neurolens.analysis.layout import thumbnail
     from neurolens.base.html import html
     from neurolens.blender.pack import year_of
@@ -145,7 +145,7 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
 
 
 def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
-    """Name, title and what draws it to a path."""
+    """Name and title of each drawing, and the function that draws it to a path."""
     from neurolens.analysis.fields import Scene
     from neurolens.analysis.layout import state_text
     from neurolens.analysis.spots import spots
@@ -177,7 +177,7 @@ def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
 
 
 def _lessen(picture: Path) -> None:
-    """A picture with a palette: a third of the bytes."""
+    """Reduce a picture to a palette, which takes a third of the bytes."""
     from PIL import Image
 
     with Image.open(picture) as image:

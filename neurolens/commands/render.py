@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from neurolens.base.bounds import FILM_MM
 from neurolens.base.cluster import Dask
 from neurolens.base.errors import InputError, NeurolensError, warn
+from neurolens.base.options import add_options
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import (
     CAMERAS_HELP,
@@ -38,7 +39,7 @@ from neurolens.commands.render_files import (
 )
 from neurolens.commands.render_frames import add_frames, frames_by_file, missing_frames
 from neurolens.evaluate.records import plain
-from neurolens.render.film_settings import COLOUR_SPACE_NAMES, WAVELENGTH_MODES, WAVELENGTH_SAMPLINGS
+from neurolens.render.film_settings import FilmSettings
 
 if TYPE_CHECKING:
     from neurolens.cameras.contract import FloatArray
@@ -102,7 +103,7 @@ def add_parser(subparsers: Any) -> None:
         help="of the EXR: colour alone, or also samples, variance (of the pixel's luminance), Z (depth in m along the "
         "axis from the film) and blocked (share of camera rays that do not pass) (default: all)",
     )  # fmt: skip
-    _add_colour(parser)
+    add_options(parser.add_argument_group("colour (left out: the scene's [film] table)"), FilmSettings, unset=True)
     add_frames(parser)
     add_tile(parser)
     add_safety(parser)
@@ -118,32 +119,6 @@ def add_parser(subparsers: Any) -> None:
     )  # fmt: skip
     add_json(parser, quiet=True)
     parser.set_defaults(run=run_kept, kept="no picture was written; older files of that name are untouched")
-
-
-def add_colour_space(parser: argparse._ActionsContainer, default: str = "") -> None:
-    """Add --colour-space; `default` describes what stands for it where it is left out."""
-    parser.add_argument(
-        "--colour-space", choices=COLOUR_SPACE_NAMES,
-        help=f"of the EXR, linear: sRGB (D65) or ACEScg (AP1, the white of ACES){default}",
-    )  # fmt: skip
-
-
-def _add_colour(parser: argparse.ArgumentParser) -> None:
-    colour = parser.add_argument_group("colour (left out: the scene's [film] table)")
-    add_colour_space(colour)
-    colour.add_argument(
-        "--white-balance", metavar="LIGHT",
-        help="light that becomes neutral: A, D50, D65, E, '3200 K' or a measured one of the scene",
-    )  # fmt: skip
-    add_option(
-        colour, "--wavelength-mode", old=("--wavelengths",), choices=WAVELENGTH_MODES,
-        help="of a path: one; hero, four that share it; lanes, four paths that share their random numbers; "
-        "auto, hero where the camera does not disperse",
-    )  # fmt: skip
-    colour.add_argument(
-        "--wavelength-sampling", choices=WAVELENGTH_SAMPLINGS,
-        help="by importance (film response times light) or uniform",
-    )  # fmt: skip
 
 
 def run_kept(args: argparse.Namespace) -> int:

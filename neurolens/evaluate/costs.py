@@ -22,6 +22,7 @@ from neurolens.cameras.osl import OslLens, osl_program
 from neurolens.cameras.source import camera_program
 from neurolens.evaluate.footprints import Array, Places
 from neurolens.evaluate.records import Timing
+from neurolens.graph.program import Program
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene
 
@@ -89,6 +90,12 @@ def glsl_operations(camera: OnnxCamera | ExactCamera) -> int:
     return sum(camera_program(camera.film, graph, own_table=False).count().values())
 
 
+def cycles_ns(program: Program) -> float:
+    """Nanoseconds of a ray of a shader in Cycles, by its operations."""
+    kinds = program.count()
+    return SHADER_NS + _STEP_NS * sum(kinds.values()) + _DEAR_NS * sum(kinds.get(k, 0) for k in _DEAR)
+
+
 def shader_cost(
     lens: OslLens, places: Places, film_mm: tuple[float, float], f_number: float, focus_m: float
 ) -> tuple[float, float]:
@@ -97,8 +104,7 @@ def shader_cost(
     The noise is that of the shader's own throughput at the places: of its pupil, and of wavelengths drawn evenly.
     """
     program = osl_program(lens, {"count": 0.0})
-    kinds = program.count()
-    ns = SHADER_NS + _STEP_NS * sum(kinds.values()) + _DEAR_NS * sum(kinds.get(k, 0) for k in _DEAR)
+    ns = cycles_ns(program)
     points, rays = places.film_mm.shape[1], _SIDE * _SIDE
     steps, rng = (np.arange(_SIDE) + 0.5) / _SIDE, np.random.default_rng(1)
     first, second = np.stack(np.meshgrid(steps, steps)).reshape(2, -1)

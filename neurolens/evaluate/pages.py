@@ -1,4 +1,4 @@
-"""What pages show: tables of records, settings as texts, pictures. Templates make HTML of them (`base.html`)."""
+"""The contents of pages: tables of records, settings as texts, pictures. Templates make HTML of them (`base.html`)."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ def number(record: Mapping[str, Any], key: str) -> float | None:
 
 @dataclass(frozen=True)
 class Column:
-    """A figure of a record: its heading, its key (dots go into nested tables), a factor and significant digits.
+    """A column of a table: its heading, the key of its figure in a record, a factor and the significant digits.
 
-    `about` says what it means, on hover and in the legend.
+    Dots in a key go into nested tables. `about` explains the figure on hover and in the legend.
     """
 
     heading: str
@@ -65,7 +65,7 @@ class Column:
         return number(record, self.key)
 
     def cell(self, record: Record, thousands: str = "") -> str:
-        """The figure as text, a dash for None, "~" before the least of a noisy timing; the word "never" stays."""
+        """The figure as text: a dash if it is missing, "~" before the minimum of a noisy timing; "never" stays."""
         if record.get(self.key) == "never":
             return "never"
         value, parent = number(record, self.key), self.key.removesuffix(".min")
@@ -76,14 +76,14 @@ class Column:
 
 
 def show(value: float, digits: int, thousands: str = "") -> str:
-    """A number with significant digits, without an exponent if it is short; `thousands` separates a long one's."""
+    """A number with significant digits. Short ones have no exponent; `thousands` separates the digits of long ones."""
     if value == 0 or 1e-4 <= abs(value) < 10.0**digits:
         return f"{value:.{digits}g}"
     return f"{value:{thousands}.0f}" if 1 <= abs(value) < 1e7 else f"{value:.{digits - 1}e}"
 
 
 def table(names: Sequence[str], records: Sequence[Record], columns: Iterable[Column]) -> Table:
-    """The table of records; a column that no record holds is left out."""
+    """The table of records, without the columns for which no record has a figure."""
     return Table(names, records, [c for c in columns if any(c.value(r) is not None for r in records)])
 
 
@@ -116,14 +116,14 @@ def figures_of(folder: Path, figures: Iterable[Mapping[str, Any]], inside: bool 
     Args:
         inside: whether PNG files become part of the page, which then needs no others.
     """
-    found = []
+    shown = []
     for figure in figures:
         url = local_url(folder, figure.get("file"))
         if url is not None and inside:
             data = base64.b64encode((folder / str(figure["file"])).read_bytes()).decode("ascii")
             url = f"data:image/png;base64,{data}"
         links = {label: local_url(folder, file) for label, file in (figure.get("links") or {}).items()}
-        there = {label: link for label, link in links.items() if link}
+        existing = {label: link for label, link in links.items() if link}
         file, title, caption = (str(figure.get(key) or "") for key in ("file", "title", "caption"))
-        found.append(Figure(url, file, title, caption, there, bool(figure.get("wide")), inside))
-    return found
+        shown.append(Figure(url, file, title, caption, existing, bool(figure.get("wide")), inside))
+    return shown

@@ -15,7 +15,8 @@ from neurolens.base.progress import Progress, Report
 
 if TYPE_CHECKING:
     from neurolens.cameras.onnxlens import OnnxLens
-    from neurolens.cameras.osl import OslLens, Seen
+    from neurolens.cameras.osl import OslLens
+    from neurolens.cameras.shader_lens import ShaderLens
     from neurolens.graph.ir import Graph
     from neurolens.optics.prescription import Lens
 
@@ -160,16 +161,16 @@ def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLe
     knots = tuple(replace(a, degree=1) for a in space.axes)
     planes = [pupil_plane_z_mm(space.lens_at(s)) for s in product(knots)]
 
-    def seen(s: tuple[float, ...]) -> Seen:
+    def lens_in(s: tuple[float, ...]) -> ShaderLens:
         plane, far = float(weights(knots, s) @ planes), space.lens_at((*s[:-1], 0.0)) if internal else None
         return _traced(space.lens_at(s), plane, far, 1 / s[-1] if internal and s[-1] else math.inf)
 
-    nodes = [seen(s) for s in product(space.axes)]
-    between = [(weights(space.axes, s), seen(s).sight) for s in states_between(space.axes)]
+    nodes = [lens_in(s) for s in product(space.axes)]
+    between = [(weights(space.axes, s), lens_in(s)) for s in states_between(space.axes)]
     return lens.lens_id, osl_lens(nodes, report, space.axes, between), told
 
 
-def _traced(lens: Lens, plane_mm: float, far: Lens | None = None, inside_m: float = math.inf) -> Seen:
+def _traced(lens: Lens, plane_mm: float, far: Lens | None = None, inside_m: float = math.inf) -> ShaderLens:
     """A lens in one state.
 
     Args:
@@ -177,9 +178,8 @@ def _traced(lens: Lens, plane_mm: float, far: Lens | None = None, inside_m: floa
             picture's size holds, and the distance in focus.
     """
     from neurolens.cameras.focus_function import Focusing
-    from neurolens.cameras.osl import Seen
     from neurolens.cameras.pupil_boxes import PupilTable
-    from neurolens.cameras.pupil_sight import Sight
+    from neurolens.cameras.shader_lens import ShaderLens
     from neurolens.optics.focusing import best_focus_of_stops_mm, film_range_mm
     from neurolens.optics.paraxial import film_z_mm, first_order
     from neurolens.optics.pupils import image_radius_mm, pupil_bounds
@@ -203,8 +203,15 @@ def _traced(lens: Lens, plane_mm: float, far: Lens | None = None, inside_m: floa
     def best(focus_m: float, stops_mm: Any) -> Any:
         return best_focus_of_stops_mm(lens, inside_m if far else focus_m, stops_mm, LIGHT_NM)
 
-    graph = exact_graph(lens, plane_mm, LIGHT_NM)
-    sight = Sight(
-        graph, PupilTable.of(asdict(bounds)), places, LIGHT_NM, stop, lens.stop_index, lens.anamorphic
-    )  # fmt: skip
-    return Seen(sight, Focusing(near, stop, paraxial, best, places), float(data.f_number), efl)
+    return ShaderLens(
+        graph=exact_graph(lens, plane_mm, LIGHT_NM),
+        table=PupilTable.of(asdict(bounds)),
+        film_z_mm=places,
+        wavelength_nm=LIGHT_NM,
+        stop_radius_mm=stop,
+        stop_surface=lens.stop_index,
+        anamorphic=lens.anamorphic,
+        focusing=Focusing(near, stop, paraxial, best, places),
+        f_number=float(data.f_number),
+        efl_mm=efl,
+    )

@@ -104,7 +104,7 @@ def survey_page(
     of_records = [_kinds(r) for r in records]
     counts = {kind: sum(kind in kinds for kinds in of_records) for kind in _KINDS}
     rows = (
-        {"record": r, "kinds": kinds, "picture": layout_of(r["file"]), "found": _found(r)}
+        {"record": r, "kinds": kinds, "picture": layout_of(r["file"]), "remarks": _remarks(r)}
         for r, kinds in zip(records, of_records, strict=True)
     )
     return html_parts(
@@ -118,7 +118,7 @@ def survey_page(
     )
 
 
-def _found(record: Mapping[str, Any]) -> list[str]:
+def _remarks(record: Mapping[str, Any]) -> list[str]:
     """Why a file was refused, doubts, notes, and promises of the card that were not held; each once."""
     lines = [record["reason"], *record.get("doubts", ()), *record.get("notes", ())]
     lines += [f"promise not held: {b}" for b in (record.get("fit") or {}).get("broken", ())]

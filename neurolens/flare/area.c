@@ -1,11 +1,12 @@
-/* The light of cells of a grid as edges, and edges as a picture: see `area.py`. Python defines LOST. */
+/* Turns the cells of a grid into edges (`edges`), and edges into a picture (`draw`): see `area.py`. Python defines
+   LOST. */
 #include <math.h>
 #include <stddef.h>
 #include <stdint.h>
 
-#define SMALL 1e-6 /* square pixels, whose light goes to its corners instead */
-#define FAR 1e7 /* pixels */
-#define EVEN 2.0 /* square pixels of half a cell, below which its density is even */
+#define SMALL 1e-6 /* square pixels: the light of a smaller triangle goes to its corners */
+#define FAR 1e7 /* pixels: a triangle that reaches farther is not drawn */
+#define EVEN 2.0 /* square pixels: a smaller half of a cell has one density */
 #if defined(__GNUC__)
 #define ALWAYS __attribute__((always_inline))
 #else
@@ -13,15 +14,16 @@
 #endif
 
 struct point { double x, y; };
-/* Red, green, blue and nothing: one register. */
+/* Red, green, blue and an unused number, in one register. */
 typedef double rgb __attribute__((vector_size(32), aligned(8)));
-/* Density in a picture: at its corner, and how it grows to the right and down. */
+/* A linear density: its value at the picture's corner, and its growth per pixel to the right and down. */
 struct plane { double level, right, down; };
-/* Right of it, where y grows along it, the density is larger; of two equal points, light that lies there. */
+/* To the right of an edge along which y grows the density is larger by `density`. An edge of two equal points is light
+   at that point. */
 struct edge { struct point p, q; struct plane density; };
 struct canvas {
     int width, first, last;
-    rgb *sums, *slopes, light; /* of a pixel, what it has more than the one before, of level and slope to the right */
+    rgb *sums, *slopes, light; /* differences of each pixel from the one to its left, of the level and of the slope */
 };
 
 static inline ALWAYS struct point between(struct point p, struct point q, double share)
@@ -29,8 +31,8 @@ static inline ALWAYS struct point between(struct point p, struct point q, double
     return (struct point){ p.x + share * (q.x - p.x), p.y + share * (q.y - p.y) };
 }
 
-/* One row's part of an edge, from x = a to b > a, `amount` high. With r(t) the mean of max(t - x, 0) along it, what it
-   covers of pixel k is r(k + 1) - r(k). */
+/* Add the part of an edge in one row, from x = a to b > a and `amount` high. If r(t) is the mean of max(t - x, 0) along
+   the edge, it covers r(k + 1) - r(k) of pixel k. */
 static inline ALWAYS void in_row(rgb *row, double a, double b, rgb amount)
 {
     const int first = (int)a, last = (int)b;
@@ -50,7 +52,7 @@ static inline ALWAYS void in_row(rgb *row, double a, double b, rgb amount)
     }
 }
 
-/* An edge between the left and the right border, p above q; rows that are not the canvas's are left out. */
+/* Draw an edge between the left and the right border, with p above q, in the rows of the canvas. */
 static void line(struct canvas c, struct point p, struct point q, struct plane density)
 {
     if (!(p.y < q.y && p.y < c.last && q.y > c.first)) return;
@@ -64,7 +66,7 @@ static void line(struct canvas c, struct point p, struct point q, struct plane d
         const rgb light = (density.level + density.down * (k + 0.5)) * c.light;
         const int ends = q.y <= k + 1;
         const double next = ends ? q.y : k + 1, end = ends ? q.x : p.x + slope * (k + 1 - p.y);
-        if (next - y == 1.0 && wide <= 1.0) { /* a whole row, of at most two pixels: as below, without a branch */
+        if (next - y == 1.0 && wide <= 1.0) { /* a whole row and at most two pixels: the same without a branch */
             const double a = x < end ? x : end;
             const int first = (int)a;
             const double t = first + 1 - a, all = t - 0.5 * wide, r = t < wide ? half * t * t : all;
@@ -87,7 +89,7 @@ static void line(struct canvas c, struct point p, struct point q, struct plane d
     }
 }
 
-/* Any edge. Left of the film it counts at its border. */
+/* Draw any edge. The part of it to the left of the film is moved to the left border. */
 static void draw_edge(struct canvas c, struct point p, struct point q, struct plane density)
 {
     if (p.y > q.y) {
@@ -117,7 +119,7 @@ static void draw_edge(struct canvas c, struct point p, struct point q, struct pl
     line(c, p, q, density);
 }
 
-/* Light at a point, shared among the four pixels round it. */
+/* Share the light at a point among the four pixels around it. */
 static void dot(struct canvas c, struct point p, double light)
 {
     const double u = p.x - 0.5, v = p.y - 0.5;
@@ -133,7 +135,7 @@ static void dot(struct canvas c, struct point p, double light)
     }
 }
 
-/* A pixel is the sum of what is left of it; what would be 0 but for rounding is 0. */
+/* Sum the differences along each row and add them to the picture; values that are 0 but for rounding become 0. */
 static void settle(struct canvas c, float *picture)
 {
     for (int j = 0; j < c.last - c.first; j++) {
@@ -152,7 +154,7 @@ static void settle(struct canvas c, float *picture)
         }
     }
 }
-/* `sums`: of the canvas, 0. */
+/* Draw edges of several grids, `counts` of each, to rows of a picture; `sums` has zeros for these rows. */
 void draw(
     int width, int first, int rows, int grids, const int64_t *counts, const struct edge *e,
     const rgb *light, rgb *sums, float *picture)
@@ -172,11 +174,12 @@ static inline ALWAYS double area_of(struct point a, struct point b, struct point
     return 0.5 * ((b.x - a.x) * (c.y - a.y) - (c.x - a.x) * (b.y - a.y));
 }
 
-/* Where ray o of the grid, which is lost, would have gone: as those beside it go on. Whether any tell. */
+/* Where ray o of the grid, which is lost, would have met the film, extrapolated from its neighbours; returns whether
+   there are any. */
 static int beyond(int columns, int rows, size_t o, const float *x, const float *y, const float *worst, double *to)
 {
     const int wide = columns + 1, i = (int)(o % wide), j = (int)(o / wide);
-    int told = 0;
+    int neighbours = 0;
     to[0] = to[1] = 0.0;
     for (int d = 0; d < 9; d++) {
         const int u = d % 3 - 1, v = d / 3 - 1, step = v * wide + u;
@@ -185,13 +188,13 @@ static int beyond(int columns, int rows, size_t o, const float *x, const float *
         if (!(worst[near] < LOST && worst[far] < LOST)) continue;
         to[0] += 2.0 * x[near] - x[far];
         to[1] += 2.0 * y[near] - y[far];
-        told++;
+        neighbours++;
     }
-    for (int k = 0; k < 2 && told; k++) to[k] /= told;
-    return told > 0;
+    for (int k = 0; k < 2 && neighbours; k++) to[k] /= neighbours;
+    return neighbours > 0;
 }
 
-/* Edges along rows of pixels step nowhere. */
+/* Append an edge, unless it lies along a row of pixels or its density is 0. */
 static inline ALWAYS struct edge *step(struct edge *to, struct point p, struct point q, struct plane density)
 {
     if (p.y != q.y && (density.level != 0.0 || density.right != 0.0 || density.down != 0.0))
@@ -206,7 +209,8 @@ static inline ALWAYS void add(struct plane *to, struct plane more, double factor
     to->down += factor * more.down;
 }
 
-/* A triangle of which rims cut off some: `light` would be all of it. Half the way to a corner that is lost is lit. */
+/* Append the edges of a triangle that rims cut; `light` is the light of the whole triangle per power. Half of the side
+   to a lost corner is lit. */
 static struct edge *cut(
     struct edge *to, const struct point *corner, const double *power, const double *worst, double light)
 {
@@ -241,7 +245,7 @@ static struct edge *cut(
     return to;
 }
 
-/* Whether four points lie on one side of the film, a pixel away. */
+/* Whether four points all lie more than a pixel beyond the same side of the film. */
 static inline ALWAYS int apart(int width, int height, struct point p, struct point q, struct point r, struct point s)
 {
     const double right = width + 1.0, below = height + 1.0;
@@ -251,8 +255,8 @@ static inline ALWAYS int apart(int width, int height, struct point p, struct poi
         || (p.y > below && q.y > below && r.y > below && s.y > below);
 }
 
-/* Planes of density of a cell's halves, whose mean densities are those of the corners about them: none where these are
-   too different, as at folds and caustics, or the cell is hardly a pixel. */
+/* Fit linear densities to the corners of both halves of a cell, with the mean density of each half. The density is
+   constant where corners differ too much, as at folds and caustics, or where the cell is hardly a pixel. */
 static void sloped(
     const struct point corner[2][3], const double value[2][3], const double *density, const double *area,
     struct plane *plane)
@@ -267,7 +271,7 @@ static void sloped(
         for (int k = 0; k < 3; k++)
             even[h] &= value[h][k] / density[h] > 0.5 && value[h][k] / density[h] < 2.0;
     }
-    if (density[0] == density[1] && even[0] && even[1]) /* else the half at a caustic would shift the other */
+    if (density[0] == density[1] && even[0] && even[1]) /* otherwise the half at a caustic would shift the other */
         off[0] = off[1] = density[0] - (mean[0] * area[0] + mean[1] * area[1]) / (area[0] + area[1]);
     for (int h = 0; h < 2; h++) {
         const struct point *const p = corner[h];
@@ -280,8 +284,9 @@ static void sloped(
     }
 }
 
-/* How many edges there are. Whole cells share theirs: steps of density across edges along rows, along columns and along
-   diagonals are summed first. Cells of which nothing is on the film are left out. `room`: [15, N] zeros. */
+/* Write the edges of a grid's cells and return their number. Whole cells share edges, so the steps of density across
+   edges along rows, columns and diagonals are summed first. Cells beside the film are left out. `room` has [15, N]
+   zeros. */
 size_t edges(
     int columns, int rows, int width, int height, double per_mm, const float *found, double *room, struct edge *to)
 {
@@ -322,16 +327,16 @@ size_t edges(
                     const int next = (k + 1) % 3, kept = w[next] <= 1.0 ? next : (k + 2) % 3;
                     double ahead[2];
                     if (w[k] < LOST) continue;
-                    const int told = beyond(columns, rows, at[h][k], x, y, worst, ahead);
+                    const int known = beyond(columns, rows, at[h][k], x, y, worst, ahead);
                     const struct point there = ON_FILM(ahead[0], ahead[1]);
-                    corner[k] = told && fabs(there.x) < FAR && fabs(there.y) < FAR ? there : corner[kept];
+                    corner[k] = known && fabs(there.x) < FAR && fabs(there.y) < FAR ? there : corner[kept];
                 }
                 if (in > 0 && in < 3 && near) to = cut(to, corner, p, w, 0.5);
                 for (int k = 0; k < 3 && in == 3 && near && density[h] == 0.0; k++)
                     *to++ = (struct edge){ corner[k], corner[k], { light[h] / 3.0, 0.0, 0.0 } };
             }
             const double ratio = area[0] / area[1];
-            if (density[0] != 0.0 && density[1] != 0.0 && ratio > 0.5 && ratio < 2.0) /* no fold: one cell */
+            if (density[0] != 0.0 && density[1] != 0.0 && ratio > 0.5 && ratio < 2.0) /* no fold: halves are alike */
                 density[0] = density[1] = -(light[0] + light[1]) / (area[0] + area[1]);
             for (int h = 0; h < 2; h++) {
                 densities[2 * o + h] = density[h];

@@ -1,11 +1,12 @@
-"""Light of a grid of rays as areas: each cell of the pupil spreads its light over its place on the film.
+"""Ghosts drawn as areas: each cell of a grid of rays spreads its light over the area that it covers on the film.
 
-So the picture of a ghost has neither holes nor noise, and its sum is the ghost's light, however the map from pupil to
-film stretches, folds or turns it (Hullin et al. 2011, section 4.2, spread light by the area of quads). Rims cut cells
-where the largest r / R on the way is 1, taken to be linear in between. Pixels are covered exactly: an edge adds its
-height, times the step of density across it, to the pixels that it passes, and sums along rows are the picture.
-Within whole cells the density is linear, between the means of the cells about each corner: where these change little
-from cell to cell no borders are seen, and each cell keeps its light, but for a part in 10,000 at its border pixels.
+So the picture of a ghost has neither holes nor noise, and its sum is the light of the ghost, however the map from pupil
+to film stretches, folds or turns (Hullin et al. 2011, section 4.2, spread light over quads in this way). Rims cut cells
+where the largest r / R on the way is 1, by linear interpolation between rays. Pixels are covered exactly (`area.c`): an
+edge adds its height, times the step of density across it, to the pixels that it crosses, and sums along rows make the
+picture. Within whole cells the density is linear between the corners, where it is the mean of the cells that meet
+there. So no borders show where the density changes little from cell to cell, and each cell keeps its light, except for
+a part in 10,000 at its border pixels.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ _PER_CELL = 8  # edges at most: of two triangles that rims cut
 
 
 def edges_of(found: Floats, columns: int, size: tuple[int, int], per_mm: float) -> NDArray[np.float64]:
-    """The light of a grid of rays of one wavelength as edges, which `draw_edges` draws: none where it misses the film.
+    """The light of a grid of rays of one wavelength as edges for `draw_edges`; none if it misses the film.
 
     Args:
-        found: [4, N] film x, y (mm), power, worst of the rays, row after row, each one ray longer than `columns`.
-        size: of the whole film in pixels. per_mm: pixels.
+        found: [4, N] film x, y (mm), power and worst of the rays, row after row, with one ray more than `columns` each.
+        size: width and height of the film in pixels. per_mm: pixels per mm.
 
     Raises:
         InputError: no C compiler, or one that fails.
@@ -45,12 +46,12 @@ def draw_edges(
 ) -> None:
     """Add light to some rows of a picture [H, W, 3], centred and upright (the film turned by 180 degrees).
 
-    Each row is what it is with all others.
+    A row is the same whether it is drawn by itself or with others.
 
     Args:
-        edges: [N, 7], of several grids, so many of each: x and y of both ends in pixels, and the step of density
-            across, at the picture's corner and its slopes in x and y; of two equal ends, light that lies there.
-        counts: [K]. light: [K, 3], of a cell whose power is 1.
+        edges: [N, 7], edges of several grids: x and y of both ends in pixels, then the step of density across the edge
+            (at the corner of the picture, and its slopes in x and y). An edge of two equal ends is light at a point.
+        counts: [K] number of edges of each grid. light: [K, 3] colour of a cell whose power is 1.
 
     Raises:
         InputError: as of `edges_of`.

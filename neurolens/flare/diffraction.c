@@ -1,8 +1,12 @@
-/* The field of edge elements: see `diffraction.py`. `pairs`: of each start and every element after it (sorted by x, in
-   units of the greatest distance), the product under Parzen's window, whose transform is the fourth power of a sinc,
-   laid down on the nearest nine lags by quadratic B-splines. One of each two opposite pairs, for the real part has
-   both; and half of what meets itself. `squares` has |u|^2 of the element whose n is closest to u, less what an element
-   between it and the one beside it would have less. */
+/* Light that the elements of an edge diffract: see `diffraction.py`.
+
+   `pairs` adds up the products of each start element and every element after it, under Parzen's window, whose transform
+   is the fourth power of a sinc. Elements are sorted by x, in units of the largest distance. Quadratic B-splines spread
+   each product over the nearest nine lags. Of two opposite pairs only one is added, since the real part has both,
+   and half of the product of an element with itself.
+
+   `squares` computes |u|^2 for the element whose n is closest to u, less the largest difference that an element between
+   it and its neighbour could make. */
 #include <math.h>
 #include <stdint.h>
 #if defined(__GNUC__)
@@ -44,7 +48,7 @@ void squares(
             q[i] = x[(first + i) % width];
             r[i] = y[(first + i) / width];
         }
-        lanes least = none + 1.0f, of = least; /* the least is least / of */
+        lanes least = none + 1.0f, of = least; /* the smallest ratio is least / of */
         lanes result = q * q + r * r;
         for (const float *e = edge; e < edge + 5 * count; e += 5) {
             const lanes a = q - e[0], b = r - e[1], whole = a * a + b * b, aside = a * e[3] - b * e[2];

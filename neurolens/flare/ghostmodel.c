@@ -1,11 +1,12 @@
-/* Evaluates fitted ghosts: monomials serve all wavelengths, and a table's products with them are what the graphs of light
-   take. The graphs stand before this text; Python defines MOST, ROWS, TERMS and LIGHTS. */
+/* Evaluates fitted ghosts for rays of one direction. The monomials of a ray serve all wavelengths; the products of the
+   coefficients of a wavelength with them are the inputs of the graphs of light. The graphs stand before this text;
+   Python defines MOST, ROWS, TERMS and LIGHTS. */
 enum { BLOCK = 256, LANES = 16 };
 typedef float lanes __attribute__((vector_size(4 * LANES), aligned(4), may_alias));
 typedef void step(size_t, const float *const *, const float *, float *const *);
 static step *const terms_of[] = { TERMS }, *const light_of[] = { LIGHTS };
 
-/* Four rows of so few rays at a time that their sums stay in registers. */
+/* Multiply coefficients by monomials, four rows of so few rays at a time that their sums stay in registers. */
 static void product(int rows, int terms, const float *table, float term[][BLOCK], float row[][BLOCK])
 {
     for (int i = 0; i < BLOCK; i += LANES)

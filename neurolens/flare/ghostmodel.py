@@ -29,7 +29,7 @@ from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Exponents, Graph, Value
 from neurolens.optics.glass import inverse_square_um
 from neurolens.optics.prescription import Lens
-from neurolens.surrogates.cores import ROUND
+from neurolens.surrogates.lightfield import ROUND
 
 Array = NDArray[np.float64]
 _CALL = 7  # numbers of the call: p, what chief is of it (mm), 1 / scale, the stop's radius

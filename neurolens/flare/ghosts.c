@@ -1,9 +1,9 @@
-/* Follows rays along the ghosts of two reflections, a block of rays at a time. `stack.c` stands before this text; Python
-   defines BLOCK and LOST. */
+/* Follows rays along all ghosts of two reflections, a block of rays at a time. `stack.c` stands before this text.
+   Python defines BLOCK and LOST. */
 enum { ROOM = BLOCK * STATE };
 
 struct ghost {
-    int second, first, index; /* light is reflected at `second`, then at `first`; `index` is its place in the output */
+    int second, first, index; /* surfaces that reflect, in the order of light; number in the output */
 };
 
 struct job {
@@ -28,7 +28,7 @@ static void arrive(const struct job *job, const float *from, int index)
     meet_film(job->n, from, BLOCK, job->shift, job->out + 4 * index * job->count + job->at, job->count);
 }
 
-/* From before surface k to the film; `here` and `next` are overwritten. */
+/* Follow rays from before surface k to the film; `here` and `next` are overwritten. */
 static void to_film(const struct job *job, int k, float *here, float *next, int index)
 {
     for (; k < job->lens.surfaces; k++) {
@@ -40,15 +40,15 @@ static void to_film(const struct job *job, int k, float *here, float *next, int 
     arrive(job, here, index);
 }
 
-/* Follows a block, whose rays stand at the begin of `room`, along all ghosts, sorted by rising `second` and then by
-   falling `first`. A `second` behind the last surface is the light that is not reflected. */
+/* Follow a block, whose rays are at the start of `room`, along all ghosts. These are sorted by rising `second`, then by
+   falling `first`. A `second` behind the last surface stands for the light that is not reflected. */
 static void sweep(const struct job *job, const struct ghost *ghost, int count, float *room)
 {
     const int surfaces = job->lens.surfaces;
     const struct ghost *const end = ghost + count;
-    float *const ahead = room, *back = ahead + (surfaces + 1) * ROOM, *spare = back + ROOM; /* `ahead`: before each surface */
+    float *const ahead = room, *back = ahead + (surfaces + 1) * ROOM, *spare = back + ROOM;
     float *const here = spare + ROOM, *const next = here + ROOM;
-    int reached = 0;
+    int reached = 0; /* `ahead` has the rays before each surface up to this one */
     while (reached < end[-1].second && go_on(job, reached, 0, ahead + reached * ROOM, ahead + (reached + 1) * ROOM))
         reached++;
     while (ghost < end && ghost->second <= reached) {

@@ -29,7 +29,7 @@ _BLOCK = 512  # rays whose states, 32 bytes each before every surface, fit the s
 
 
 class Pair(NamedTuple):
-    """A ghost: reflected at surface `second`, then at `first` < `second`; counted from 0 at the front."""
+    """A ghost: light that is reflected at surface `second`, then at `first` < `second`, counted from 0 at the front."""
 
     first: int
     second: int
@@ -41,7 +41,7 @@ class Pair(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Stable, for layers and tables."""
+        """Its name in layers and tables."""
         return f"g{self.second:02d}-{self.first:02d}"
 
 
@@ -76,7 +76,7 @@ def coated(lens: Lens, names: str) -> Lens:
 
 
 class GhostRays(NamedTuple):
-    """Where light of one wavelength arrives, by ghost.
+    """The rays of one wavelength that follow each ghost to the film.
 
     Attributes:
         rows: [P, 4, N] film x and y (mm, lens frame), power and worst.
@@ -119,7 +119,7 @@ class GhostTracer:
         pairs: the ghosts, in the order of the results. stack: the lens's compiled steps.
 
     Raises:
-        InputError: no C compiler, or one that fails; a lens without film position; ghosts that it has not.
+        InputError: no C compiler, or one that fails; a lens without film position; pairs that are no ghosts.
     """
 
     def __init__(self, lens: Lens, pairs: Sequence[Pair] | None = None) -> None:
@@ -143,7 +143,7 @@ class GhostTracer:
         return self.follow(self.start(rays), wavelength_nm, direct=direct)
 
     def start(self, rays: Floats) -> Floats:
-        """What `follow` takes of rays [6, N], at any wavelength."""
+        """The form in which `follow` takes rays [6, N], at any wavelength."""
         return entering(rays)
 
     def follow(
@@ -155,11 +155,12 @@ class GhostTracer:
         direct: bool = False,
         reach: float = 1.0,
     ) -> GhostRays:
-        """Follow rays of `start`.
+        """Follow rays in the form of `start`.
 
         Args:
-            only: these of the tracer's ghosts. direct: see `trace`.
-            reach: rays are followed while some of their block have a worst of at most this; else theirs is `LOST`.
+            only: some of the tracer's ghosts; None follows all. direct: see `trace`.
+            reach: a block of rays is followed while the `worst` of some of its rays is at most this; after that, theirs
+                is `LOST`.
         """
         pairs, surfaces = self.pairs if only is None else tuple(only), len(self.lens.surfaces)
         # `ghosts.c` meets the second surfaces from the front, and the first ones on the way back.
@@ -174,11 +175,11 @@ class GhostTracer:
         return GhostRays(out)
 
     def follow_each(self, start: Floats, wavelengths_nm: Sequence[float], pair: Pair, reach: float = 1.0) -> Floats:
-        """Rays of `start` along one ghost at several wavelengths, [W, 4, N], rows as of `GhostRays`."""
+        """Rays in the form of `start` along one ghost at several wavelengths, [W, 4, N]: rows of `GhostRays`."""
         return np.concatenate([self.follow(start, nm, only=[pair], reach=reach).rows for nm in wavelengths_nm])
 
     def sums(self, rays: Floats, wavelength_nm: float, *, direct: bool = False) -> NDArray[np.float64]:
-        """The light of every ghost summed over rays [6, N], [P, 5] as `GhostRays.sums`, without keeping single rays."""
+        """The light of every ghost summed over rays [6, N]: `GhostRays.sums`, [P, 5], of a block of rays at a time."""
         start = self.start(rays)
         blocks = (np.ascontiguousarray(start[:, k : k + _BLOCK]) for k in range(0, start.shape[1], _BLOCK))
         zero = np.zeros((len(self.pairs) + direct, 5))

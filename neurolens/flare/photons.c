@@ -1,7 +1,7 @@
-/* Follows photons through a lens in sweeps. `stack.c` and the graphs of `flare.scatter` stand before this text; Python
-   defines BLOCK, CHANCES, NUMBERS, LEVELS and MOST_SCATTERS. Lists of photons are rows BLOCK long: the state, with the
-   photon's weight as power, then how often it was reflected, and how often scattered. `wait` holds a list for each
-   surface that the next sweep meets them at, and one for the film. */
+/* Follows photons through a lens in sweeps: see `photons.py`. `stack.c` and the graphs of `flare.scatter` stand before
+   this text; Python defines BLOCK, CHANCES, NUMBERS, LEVELS and MOST_SCATTERS. A list of photons is rows of BLOCK
+   numbers: the state, with the photon's weight as its power, then how often the photon was reflected and how often it
+   scattered. `wait` has a list of photons for each surface, where the next sweep picks them up, and for the film. */
 #include <math.h>
 #include <stdint.h>
 
@@ -22,7 +22,7 @@ static inline ALWAYS float chance(uint64_t *state)
     return (float)((z ^ z >> 31) >> 40) * 0x1p-24f;
 }
 
-/* Append photon `i` of a list: where it is, and what else is to be known of it. */
+/* Append photon `i` of a list, with its position and direction there and with the other numbers given here. */
 static inline ALWAYS void append(
     const float *from, int i, float weight, float times, float scatters, float *list, int *count)
 {
@@ -35,7 +35,7 @@ static inline ALWAYS void append(
 }
 
 struct light {
-    int most, scatters, plain; /* plain: no weights, no scattering */
+    int most, scatters, plain; /* `plain`: all weights are 1 and nothing scatters */
     const float *boost, *number, *film;
     float barrel, sensor;
     uint64_t state;
@@ -60,10 +60,11 @@ static void draw(int n, float *chances, uint64_t *state)
     }
 }
 
-/* What the `count` first rows of two lists and chances become; `event` has `given` rows. */
+/* Run a graph of `flare.scatter` on the state in `first`, on `count` rows of `second` and on random numbers; it writes
+   `outputs` rows of `room->event`. */
 static void happen(
     void (*run)(size_t, const float *const *, const float *, float *const *), int n, const float *first,
-    const float *second, int count, struct room *room, const float *numbers, int given)
+    const float *second, int count, struct room *room, const float *numbers, int outputs)
 {
     const float *in[2 * STATE + CHANCES];
     float *out[EVENT];
@@ -73,17 +74,17 @@ static void happen(
         in[STATE + r] = second + r * BLOCK;
     for (int r = 0; r < CHANCES; r++)
         in[STATE + count + r] = room->chances + r * BLOCK;
-    for (int r = 0; r < given; r++)
+    for (int r = 0; r < outputs; r++)
         out[r] = room->event + r * BLOCK;
     run(n, in, numbers, out);
 }
 
-/* Photons that scatter on their way to surface k wait there or, where they turn round, at `next`. */
+/* Photons that scatter on their way to surface k wait at k for the next sweep or, if they turn round, at `next`. */
 static void scatter_on_way(struct room *room, struct light *light, int k, int back, int n, int next)
 {
     const float *const list = room->now, *const kind = room->event + (EVENT - 2) * BLOCK, *const turns = kind + BLOCK;
     draw(n, room->chances, &light->state);
-    for (int i = 0; k == 0 && !back && i < n; i++) /* dust lies in one layer */
+    for (int i = 0; k == 0 && !back && i < n; i++) /* dust lies on the front surface alone: it scatters a photon once */
         if (list[SCATTERS * BLOCK + i] > 0.0f) room->chances[i] = INFINITY;
     const float *const numbers = light->number + (2 * k + back) * NUMBERS;
     happen(run_scatter, n, list, room->after, STATE, room, numbers, EVENT);
@@ -103,7 +104,8 @@ static void scatter_on_way(struct room *room, struct light *light, int k, int ba
     }
 }
 
-/* Photons of `room->now` at surface k: those that go through become the list, those that turn round wait at `next`. */
+/* Let the photons of `room->now` meet surface k. Those that pass become the new list, whose length is returned; those
+   that turn round wait at surface `next`. */
 static inline ALWAYS int meet_as(
     struct lens lens, struct room *room, struct light *light, int k, int back, int n, int next, const int plain)
 {
@@ -120,7 +122,7 @@ static inline ALWAYS int meet_as(
         const float scatters = plain ? 0.0f : list[SCATTERS * BLOCK + i];
         const float through = worst[i] <= 1.0f ? power[i] / weight : 0.0f;
         const float boost = plain || !reflects ? 1.0f : boosts[times < LEVELS ? (int)times : LEVELS - 1];
-        /* Instead of 1 - T, in all with T, light turns with boost (1 - T): the sum is `all`. */
+        /* A photon passes with T / all and turns round with boost (1 - T) / all; its weight makes up for that. */
         const float all = 1.0f + (boost - 1.0f) * (1.0f - through), drawn = chance(&light->state) * all;
         if (drawn < through) {
             append(room->after, i, weight * all, times, scatters, room->after, &on);
@@ -165,7 +167,7 @@ static inline ALWAYS void copy(const float *list, int i, float *to, int *count)
     append(list, i, list[POWER * BLOCK + i], list[TIMES * BLOCK + i], list[SCATTERS * BLOCK + i], to, count);
 }
 
-/* The list and those that wait at a surface. */
+/* Append the photons that wait at surface k to the list of n photons; returns the new length. */
 static int joined(struct room *room, int back, int k, int n)
 {
     for (int i = 0; i < room->waiting[back][k]; i++)
@@ -180,7 +182,7 @@ struct arrivals {
     int *reflections, *scatters;
 };
 
-/* Photons at the film: kept, or sent back to the last surface. */
+/* Photons that meet the film arrive, or it sends them back to the last surface. */
 static void at_film(struct room *room, struct light *light, int last, int n, struct arrivals *to)
 {
     float *const film = room->after, *const list = room->now;

@@ -1,16 +1,16 @@
-"""Photon-traced flare: light that is refracted or reflected by chance at every surface, with any number of reflections.
+"""Flare by photons: light that each surface refracts or reflects by chance, with any number of reflections.
 
-Keshmirian 2008: photons leave the lights, and each surface reflects one with the probability of its Fresnel or coating
-reflectance; those that reach the film after reflections are its flare, smoothed by a kernel. Here they are aimed at the
-front surface alone and weighted by the solid angle, and go through the compiled steps of `flare.stack` in sweeps: to
-the film through all surfaces, back through all, with those that turn round kept at their surface for the next sweep. On
-their way they may scatter (`flare.scatter`). No photon is lost to the books: what is cast arrives, leaves at the front,
-ends at a rim, is absorbed, or is cut off.
+Photons leave the lights, and each surface reflects a photon with the probability of its Fresnel or coating reflectance.
+The photons that reach the film after reflections are the flare, smoothed by a kernel (Keshmirian 2008). Here photons
+are aimed at the front surface alone and weighted by the solid angle. They go through the compiled steps of
+`flare.stack` in sweeps (`photons.c`): a sweep goes through all surfaces to the film, then back through all, and photons
+that turn round wait at their surface for the next sweep. On their way they may scatter (`flare.scatter`). All photons
+are accounted for: each one arrives, leaves at the front, ends at a rim, is absorbed, or is cut off.
 
-Reflection may be chosen more often than it happens, by a boost b: with T the share that goes through, light turns round
-with probability b (1 - T) / (T + b (1 - T)), and weights make up for it. b = 2 is Steinert's choice (2009, 5.3.2), who
-lets light through with probability T^2, but for terms in (1 - T)^2. `PhotonTracer.turning` is less noisy: of the
-surfaces ahead one is chosen, by its reflectance.
+A boost b makes reflection more frequent than it is: if T is the transmitted share, a photon turns round with the
+probability b (1 - T) / (T + b (1 - T)), and its weight makes up for that. Steinert (2009, 5.3.2) transmits photons with
+the probability T^2, which is b = 2 but for terms in (1 - T)^2. `PhotonTracer.turning` is less noisy: it chooses one of
+the surfaces ahead by its reflectance.
 """
 
 from __future__ import annotations
@@ -29,21 +29,22 @@ from neurolens.graph.compiler import c_source
 from neurolens.optics.prescription import Lens
 from neurolens.render.flaresettings import Scatter
 
-BLOCK = 4096  # photons under way: their states, 40 bytes at every surface, stay in the caches
-MOST_REFLECTIONS = 1000  # and scatterings
+BLOCK = 4096  # photons at a time: their states, 40 bytes at every surface, stay in the caches
+MOST_REFLECTIONS = 1000  # and as many scattering events
 LEVELS = 5  # boosts of light that was reflected never, once, ..., at least four times
-_TURNS = 0.95  # share of light that turns round in a sweep where it is to
+_TURNS = 0.95  # share of the photons that turn round in one sweep under the boosts of `turning`
 _BOOSTS = 1e-6, 1e6
 
 
 class Photons(NamedTuple):
-    """Photons that arrived at the film's plane, and the books of all that were cast.
+    """Photons that arrived at the film's plane, and what became of the others.
 
     Attributes:
-        film_xy_mm: [2, M] lens frame. weight: [M], 1 each where no boost is asked for.
-        reflections, scattered: [M], how often each was reflected by surfaces, and scattered.
-        cast, left, stopped, absorbed, cut: numbers of photons: all; out at the front; ended at rims, the barrel or the
-            film's plane; by glass or by a total reflection that meets no surface; with more reflections than allowed.
+        film_xy_mm: [2, M] in the lens frame. weight: [M], 1 each without a boost.
+        reflections, scattered: [M], how often surfaces reflected each photon, and how often it scattered.
+        cast: number of all photons. left: of those that left the lens at the front. stopped: of those that ended at
+            rims, at the barrel or beside the film. absorbed: of those that glass absorbed, or that total reflection
+            sent where no surface is. cut: of those that would have had more reflections than allowed.
     """
 
     film_xy_mm: Floats
@@ -58,7 +59,7 @@ class Photons(NamedTuple):
 
     @property
     def glare(self) -> NDArray[np.bool_]:
-        """[M]: those that scattered, or were reflected more than twice: neither image nor ghosts of two reflections."""
+        """[M] whether a photon is neither image nor ghost: it scattered, or was reflected more than twice."""
         return (self.scattered > 0) | (self.reflections > 2)
 
 
@@ -66,7 +67,7 @@ class PhotonTracer:
     """Photons through a lens at its focus, zoom and stop.
 
     Args:
-        scatter: what scatters them; None lets nothing.
+        scatter: what scatters photons; None scatters nothing.
 
     Attributes:
         stack: the lens's compiled steps.
@@ -92,19 +93,19 @@ class PhotonTracer:
         self._call.restype = ctypes.c_size_t
 
     def turning(self, wavelength_nm: float, times: int) -> NDArray[np.float64]:
-        """Boosts by which light turns round so many `times` (up to `LEVELS` - 1), then as it does.
+        """Boosts, [surfaces, 2, LEVELS], by which photons turn round `times` times (up to `LEVELS` - 1).
 
-        Of the surfaces ahead each has a chance as its reflectance at normal incidence: paths of as many reflections
-        have much the same weight.
+        The chance of each surface ahead is proportional to its reflectance at normal incidence, so that all paths with
+        that number of reflections have about the same weight. After that, reflection is as frequent as it is.
         """
         share = self.stack.reflectance(wavelength_nm)
-        found = np.ones((len(share), 2, LEVELS))
+        boosts = np.ones((len(share), 2, LEVELS))
         for way, ahead in enumerate((share[::-1].cumsum()[::-1], share.cumsum())):
             turns = _TURNS * share / np.maximum(ahead, 1e-30)
-            found[:, way, :times] = np.where(
+            boosts[:, way, :times] = np.where(
                 share > 0, turns / (1 - turns) * (1 - share) / np.maximum(share, 1e-30), 1
             )[:, None]
-        return found.clip(*_BOOSTS)
+        return boosts.clip(*_BOOSTS)
 
     def trace(
         self,
@@ -118,9 +119,9 @@ class PhotonTracer:
         """Cast a photon along each ray [6, N] (point in mm and unit direction towards the film, lens frame).
 
         Args:
-            most_reflections: a photon that would be reflected once more is cut off. seed: of the chances.
-            boost: how much more often light turns round than it is reflected, for all or [surfaces, 2, LEVELS]: on the
-                way to the film and back, after no, one, ... reflections.
+            most_reflections: a photon that would be reflected once more is cut off. seed: of the random numbers.
+            boost: how much more often photons turn round than reflectances say: one number, or [surfaces, 2, LEVELS]
+                for the way to the film and back, after no, one, ... reflections.
 
         Raises:
             InputError: as of `stack.entering`; reflections or boosts out of bounds.
@@ -143,5 +144,5 @@ class PhotonTracer:
         pointers = [a.ctypes.data for a in (*arrays, scattered, books)]
         plain = not scatter.on and bool((boosts == 1).all())
         arrived = self._call(count, surfaces, most_reflections, on_way, plain, shares.ctypes.data, seed, *pointers)
-        told = (place[:, :arrived], weight[:arrived], reflections[:arrived], scattered[:arrived])
-        return Photons(*told, count, *(int(v) for v in books))
+        arrivals = (place[:, :arrived], weight[:arrived], reflections[:arrived], scattered[:arrived])
+        return Photons(*arrivals, count, *(int(v) for v in books))

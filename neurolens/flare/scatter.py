@@ -1,9 +1,9 @@
-"""Light that scatters in a lens: at its tube and rings, on the film, by dust on the front, by haze in the glass.
+"""How light scatters in a lens: at its tube and rings, on the film, at dust on the front surface, in hazy glass.
 
-Simple models that keep energy, for photons (`flare.photons`), as graphs of one event. Between two surfaces a tube, as
-wide as the wider rim, holds the lens; flat rings close it towards the rims, and a stop is a plate. Walls reflect by
-Lambert's law or about the mirror's direction; haze and dust turn light by the phase function of Henyey and Greenstein
-(1941). Frames are those of `flare.steps`: light travels towards -z.
+These are simple models that conserve energy, written as graphs of one event for photons (`flare.photons`). Between two
+surfaces the lens sits in a tube as wide as the wider rim; flat rings close the tube towards the rims, and the stop is a
+plate. Walls reflect by Lambert's law or about the direction of a mirror. Haze and dust deflect light by the phase
+function of Henyey and Greenstein (1941). Frames are those of `flare.steps`: light travels towards -z.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from numpy.typing import NDArray
 from neurolens.flare.steps import LOST, STATE
 from neurolens.graph.ir import Graph, Value
 from neurolens.optics.prescription import Lens
-from neurolens.optics.sag import sag_mm
+from neurolens.optics.shapes import sag_mm
 from neurolens.render.flaresettings import Scatter
 
 CHANCES = 5  # rows: an exponential variate; two uniform ones; cosine and sine of a uniform angle
-PASSED, VOLUME, WALL, NOWHERE = range(4)  # what `scatter_graph` finds
+PASSED, VOLUME, WALL, NOWHERE = range(4)  # what happens to light: see `scatter_graph`
 NUMBERS = (
     "shift_mm", "tube_mm", "ring_r2_mm2", "ring_z_mm", "per_rim2", "least_mm", "per_mm", "layer", "forward", "gloss",
 )  # fmt: skip
 _LOBE = 0.9  # mean cosine of the glossy lobe about the mirror's direction, 26 degrees
 _TINY, _NEAR = 1e-20, 1e-3
-_FLAT = 1e-6  # the least cosine with the axis: light does not stay between two surfaces for ever
+_FLAT = 1e-6  # the smallest cosine with the axis, so that no light stays between two surfaces for ever
 
 
 def scatter_numbers(scatter: Scatter, lens: Lens) -> NDArray[np.float32]:
-    """`NUMBERS` of the way to every surface, towards the film and back, [surfaces, 2, NUMBERS]."""
+    """`NUMBERS` for the way to every surface, towards the film and back, [surfaces, 2, NUMBERS]."""
     z, rows = [float(v) for v in lens.vertices_mm], lens.surfaces
     found = np.zeros((len(rows), 2, len(NUMBERS)), np.float32)
     for k, s in enumerate(rows):
@@ -58,11 +58,12 @@ def scatter_numbers(scatter: Scatter, lens: Lens) -> NDArray[np.float32]:
 
 
 def scatter_graph() -> Graph:
-    """What happens to light on its way to a surface; input `row`: state before [8], after refraction there [8], chances
-    [CHANCES]; `call`: `NUMBERS`.
+    """The graph of what happens to light on its way to a surface.
 
-    Output `event`: x, y, z, direction, in the frame of the next step; what happened, and whether it then goes the other
-    way. Light that the surface refracts or totally reflects has met it; other light meets ring or tube, or nothing.
+    Its inputs are `row`, the state before [8], the state after refraction there [8] and random numbers [CHANCES]; and
+    `call`, the `NUMBERS`. Its output `event` has x, y, z and the direction in the frame of the next step, then what
+    happens (`PASSED`, ...), and whether light then travels the other way. Light that the surface refracts or totally
+    reflects has met it; other light meets the ring, the tube, or nothing.
     """
     g = Graph()
     row, call = g.input("row", 2 * STATE + CHANCES), g.input("call", len(NUMBERS), per_call=True)
@@ -103,9 +104,11 @@ def scatter_graph() -> Graph:
 
 
 def film_scatter_graph() -> Graph:
-    """Light that the film sends back; input `row`: state [8] behind the last surface, place on the film [2], chances
-    [CHANCES]; `call`: the film's distance from that surface and the share of a mirror. Output `event` [6]: place and
-    direction in the last surface's frame.
+    """The graph of light that the film sends back.
+
+    Its inputs are `row`, the state behind the last surface [8], the point on the film [2] and random numbers
+    [CHANCES]; and `call`, the film's distance from that surface and the share that the film reflects as a mirror. Its
+    output `event` [6] is the position and direction in the frame of the last surface.
     """
     g = Graph()
     row, call = g.input("row", STATE + 2 + CHANCES), g.input("call", 2, per_call=True)
@@ -117,14 +120,14 @@ def film_scatter_graph() -> Graph:
 
 
 def _greenstein(forward: Value, u: Value) -> Value:
-    """Cosine by a uniform variate, for a mean cosine above 0 (Henyey and Greenstein 1941, inverted)."""
+    """A random cosine by a uniform variate u, for a mean cosine above 0 (the inverse of Henyey and Greenstein 1941)."""
     square = forward * forward
     q = (1.0 - square) / (1.0 - forward + forward * u * 2.0)
     return ((square + 1.0 - q * q) / (forward * 2.0)).maximum(-1.0).minimum(1.0)
 
 
 def _about(g: Graph, axis: Value, cosine: Value, turn: Value) -> Value:
-    """The unit vector at an angle from an axis, turned about it: its frame after Duff et al. (JCGT 6, 2017)."""
+    """The unit vector at an angle from an axis and turned about it, in the frame of Duff et al. (JCGT 6, 2017)."""
     x, y, z = axis[0], axis[1], axis[2]
     sign = g.select(g.constant(0.0) <= z, 1.0, -1.0)
     a = -1.0 / (sign + z)

@@ -1,5 +1,4 @@
-/* The steps of a lens: see `stack.py`. Compiled steps stand before this text; Python defines STATE, WIDTH, ACTIONS and
-   STEPS. `go` is the step of surface k on rows `stride` apart. */
+/* Calls the compiled steps of a lens, which stand before this text. Python defines STATE, WIDTH, ACTIONS and STEPS. */
 typedef void step(size_t, const float *const *, const float *, float *const *);
 static step *const steps[] = { STEPS };
 
@@ -9,6 +8,7 @@ struct lens {
     const float *numbers;
 };
 
+/* Take n rays through an action of surface k, from one list of rows to another; rows are `stride` numbers apart. */
 static void go(struct lens lens, int k, int action, size_t n, const float *from, float *to, size_t stride)
 {
     const float *in[STATE];
@@ -21,7 +21,7 @@ static void go(struct lens lens, int k, int action, size_t n, const float *from,
     steps[lens.functions[at]](n, in, lens.numbers + at * WIDTH, out);
 }
 
-/* x, y, power and worst of light that meets the film. */
+/* Write x, y, power and worst of n rays where they meet the film, `shift` mm behind the last surface. */
 static void meet_film(size_t n, const float *from, size_t stride, float shift, float *to, size_t apart)
 {
     const float *in[STATE];

@@ -1,4 +1,4 @@
-"""The surfaces of a lens as compiled steps: which function each needs, and its numbers at a wavelength."""
+"""The surfaces of a lens as compiled steps: the function that each surface needs, and its numbers at a wavelength."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ from neurolens.optics.sag import same_medium
 from neurolens.optics.shapes import figure_of, is_plain
 
 Floats = NDArray[np.float32]
-# What a step may do, by its place: refract light that goes to the film (0) or back (1), reflect it (2, 3).
+# Actions of a step: refract light that travels to the film (0) or back (1), reflect such light (2, 3).
 ACTIONS: tuple[tuple[Action, int], ...] = (("T", 1), ("T", -1), ("R", 1), ("R", -1))
 Place = tuple[int, int]  # surface and action
 NONE: Mapping[str, Graph] = {}
-_MASKS: dict[str, Floats] = {}  # of stops, which compiled code points at as long as it is loaded
+_MASKS: dict[str, Floats] = {}  # masks of stops, which compiled code points at as long as it is loaded
 
 
 class Stack:
@@ -62,7 +62,7 @@ class Stack:
             raise InputError(lens.path, "film_z_mm", None, "a focused lens (set_lens)")
         lens.require_glass("reflections, of which flare is made")
         self.lens, self.fit_error = lens, 0.0
-        # An asphere's polynomial goes as high as the highest of its sort: they share functions.
+        # All aspheres of a sort get the degree of the highest one, so that they share functions.
         self._figures = {k: figure_of(s, float) for k, s in enumerate(lens.surfaces) if not is_plain(s)}
         figures = self._figures.values()
         most = {even: max([0, *(len(f.terms) for f in figures if f.even == even)]) for even in (True, False)}
@@ -75,10 +75,11 @@ class Stack:
             self.functions[place] = self._kinds.index(kind)
 
     def compiled(self, driver: str, name: str, more: Mapping[str, Graph] = NONE) -> ctypes._NamedFuncPointer:
-        """A C function `name` of a text that goes through the steps: `stack.c` has what it finds.
+        """The function `name` of a C text that calls the steps by `go` of `stack.c`.
 
         Args:
-            more: graphs that it finds as run_NAME, with the input `row`, numbers `call` and the output `event`.
+            driver: the text. more: graphs that it can call as run_NAME, with the input `row`, numbers `call` and the
+                output `event`.
 
         Raises:
             InputError: no C compiler, or one that fails.
@@ -114,7 +115,7 @@ class Stack:
 
     @lru_cache(maxsize=64)  # noqa: B019  it keeps a few stacks, which are small
     def numbers(self, wavelength_nm: float) -> tuple[Floats, float]:
-        """Numbers of the call [surfaces, actions, width] at a wavelength, and the last step's shift to the film."""
+        """Numbers of all steps at a wavelength, [surfaces, actions, width]; mm from the last surface to the film."""
         lens, z = self.lens, [float(v) for v in self.lens.vertices_mm]
         n = [float(glass.index_of(medium, wavelength_nm)) for medium in lens.media]
         a = [0.0, *(float(glass.absorption_of(s, wavelength_nm) or 0.0) for s in lens.surfaces)]
@@ -122,7 +123,7 @@ class Stack:
         for k, s in enumerate(lens.surfaces):
             for which, (_, sense) in enumerate(ACTIONS):
                 before, after = (k, k + 1) if sense > 0 else (k + 1, k)
-                # The ray comes in the frame of the surface before; at the front and the rear in its own.
+                # A ray arrives in the frame of the surface before; at the front and the rear in that of the surface.
                 gap = sense * (z[k] - z[k - sense]) if 0 <= k - sense < len(lens.surfaces) else 0.0
                 curvature = -sense * float(s.curvature)
                 step = (n[after] - n[before]) * (n[after] + n[before])
@@ -141,7 +142,7 @@ class Stack:
         return found, float(lens.film_z_mm) - z[len(lens.surfaces) - 1]
 
     def reflectance(self, wavelength_nm: float) -> NDArray[np.float64]:
-        """The reflectance of every surface at normal incidence, towards the film, [surfaces]."""
+        """The reflectance of every surface at normal incidence, for light towards the film, [surfaces]."""
         numbers = self.numbers(wavelength_nm)[0][:, 0].astype(np.float64)
         n1, n2 = numbers[:, CALL.index("n_before")], numbers[:, CALL.index("n_after")]
         coated = [bool(s.coating and s.coating.layers) for s in self.lens.surfaces]
@@ -149,7 +150,7 @@ class Stack:
 
 
 def entering(rays: Floats) -> Floats:
-    """States before the first surface: moved near the front vertex, mirrored."""
+    """The states of rays [6, N] before the first surface: moved near the front vertex and mirrored, [STATE, N]."""
     given = np.asarray(rays, np.float64)
     if given.ndim != 2 or given.shape[0] != 6:
         raise InputError("flare", "rays", f"({given.shape})", "an array [6, N]")
@@ -166,8 +167,12 @@ def reflects(lens: Lens, k: int) -> bool:
     return bool(coating and coating.layers) or not same_medium(lens.surfaces, k, lens.object_medium)
 
 
-def function_text(graph: Graph, name: str, run: str, taken: str, given: str, numbers: str) -> str:
-    """A graph in C, and `run`: the same on pointers to rows, in the order of `flare.steps`."""
+def function_text(graph: Graph, name: str, run: str, inputs: str, outputs: str, numbers: str) -> str:
+    """The C text of a graph as a function `name`, and a function `run` that takes pointers to its rows.
+
+    Args:
+        inputs, outputs, numbers: the names of the graph's input rows, output rows and numbers of the call.
+    """
     program = lower(graph).in_order_of_need()
     s = Signature.of(program, name)
 
@@ -175,10 +180,10 @@ def function_text(graph: Graph, name: str, run: str, taken: str, given: str, num
         return f"{array}[{row.removeprefix(of + '_') if row != of else 0}]"
 
     arguments = [
-        *(place(row, "in", taken) for row in s.per_ray),
+        *(place(row, "in", inputs) for row in s.per_ray),
         *(place(row, "call", numbers) for row in s.per_call),
         *(f"{table}, {table}_cells" for table in s.tables),
-        *(place(row, "out", given) for row in s.outputs),
+        *(place(row, "out", outputs) for row in s.outputs),
     ]
     head = f"static void {run}(size_t n, const float *const *in, const float *call, float *const *out)"
     text = write_c(program, name, ["A step of flare."])

@@ -23,7 +23,7 @@ from neurolens.optics.apertures import Aperture
 from neurolens.optics.arithmetic import TINY, Graphs
 from neurolens.optics.filmgraph import transmitted
 from neurolens.optics.shapes import Figure
-from neurolens.optics.surfaces import Medium, Rays, height2, meet, normal_at, reflect, refract
+from neurolens.optics.surfaces import Medium, Rays, meet, normal_at, radius2, reflect, refract
 from neurolens.optics.transmission import path_mm
 
 Action = Literal["T", "R"]
@@ -87,7 +87,7 @@ def step_graph(kind: Kind) -> Graph:
     normal = normal_at(o, met, curvature)
     # On the near half of a sphere: beyond it there is no glass.
     tests = [*met.tests, (TINY, normal[2])]
-    ratio2 = height2(o, met) * per_rim2
+    ratio2 = radius2(o, met) * per_rim2
     point, d = g.concat(met.x, met.y, met.z), state[3:6]
     if kind.absorbs:
         power = power * transmitted(path_mm(o, rays, met, _UNIT) * absorbed)

@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from neurolens.optics.prescription import Lens
-from neurolens.optics.sag import sag_mm
-from neurolens.optics.shapes import followed_mm
+from neurolens.optics.shapes import followed_mm, sag_mm
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 

@@ -19,7 +19,8 @@ from neurolens.optics.aiming import aim_at_stop
 from neurolens.optics.paraxial import FirstOrder, first_order
 from neurolens.optics.prescription import Configuration, Lens
 from neurolens.optics.pupils import camera_rays, pupil_plane_z_mm
-from neurolens.optics.sag import end_mm, sag_mm
+from neurolens.optics.sag import end_mm
+from neurolens.optics.shapes import sag_mm
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import trace
 

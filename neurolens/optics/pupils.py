@@ -14,7 +14,8 @@ from neurolens.base.errors import InputError
 from neurolens.optics.film_plane import PupilBounds
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
-from neurolens.optics.sag import end_mm, sag_mm
+from neurolens.optics.sag import end_mm
+from neurolens.optics.shapes import sag_mm
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import passing, trace
 

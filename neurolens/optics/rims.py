@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 from neurolens.base.errors import InputError
 from neurolens.optics.paraxial import first_order, stop_radius_mm
 from neurolens.optics.prescription import Configuration, Lens, Surface
-from neurolens.optics.sag import end_mm, neighbours, sag_mm
+from neurolens.optics.sag import end_mm, neighbours
+from neurolens.optics.shapes import sag_mm
 
 _FIELDS = 17  # from the axis to the edge; rims are usually widest at one of the ends
 _HEIGHTS = (-1.0, -0.75, -0.5, 0.0, 0.5, 0.75, 1.0)  # in the stop, as shares of what the rule lets through

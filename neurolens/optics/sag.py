@@ -1,19 +1,21 @@
-"""The shape of surfaces: depth and its derivatives, where rays from the scene meet it, where it ends, what touches.
+"""Where rays from the scene meet the front surface, where surfaces end, and which of them touch.
 
-For numbers, numpy arrays and torch tensors; torch is not imported, as cameras without it use this module.
-The tracer has its own form (`shapes`): by Horner's rule, held finite beyond the end of a conic.
+Torch is not imported, as cameras without it use this module.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
+from neurolens.optics.arithmetic import NUMPY
+from neurolens.optics.shapes import Figure, Shape, curve_of, sag_and_derivatives, sag_mm, without_rim
+from neurolens.optics.surfaces import AIR, Rays, meet
 
 if TYPE_CHECKING:
     from neurolens.optics.prescription import Medium, Surface
@@ -21,129 +23,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 TOUCH_MM = 1e-6  # edge contact is common in patents; only rounding is forgiven
-
-# Newton's steps along the ray from the sphere of the vertex to a conic, asphere, cylinder, toroid or biconic.
-_STEPS = 8
-
-
-class Shape(Protocol):
-    """A surface of revolution, or a cylinder bent in x or y only: c h^2 / (1 + sqrt(1 - (1 + k) c^2 h^2)) + sum a h^p.
-
-    Attributes:
-        curvature: 1/mm. conic: k. asphere: pairs (p, a). cylinder: the axis that is bent, or None.
-        across: what bends it along the other axis, or None; see `Surface`.
-    """
-
-    @property
-    def curvature(self) -> Any: ...
-    @property
-    def conic(self) -> Any: ...
-    @property
-    def asphere(self) -> Any: ...
-    @property
-    def cylinder(self) -> str | None: ...
-    @property
-    def across(self) -> Any: ...
-
-
-def sag_mm(shape: Shape, x: Any, y: Any, *, held: bool = False) -> Any:
-    """Depth z (mm) of a surface at points x, y (mm) relative to its vertex, towards +z.
-
-    Args:
-        x, y: floats, numpy arrays or torch tensors.
-        held: whether a conic goes on as a plane beyond its end, where the depth is else NaN; arrays and tensors only.
-    """
-    h2, c = _height2(shape, x, y), float(shape.curvature)
-    under_root, bent = 1 - (1 + float(shape.conic)) * c * c * h2, c * h2
-    if shape.across is not None:
-        a2, c_across = x * x + y * y - h2, 1 / shape.across[0]
-        if shape.across[1] is not None:
-            under_root, bent = under_root - (1 + shape.across[1]) * c_across**2 * a2, bent + c_across * a2
-    sag = bent / (1 + _root(under_root.clip(0.0) if held else under_root))
-    h = _root(h2) if len(shape.asphere) else 0.0
-    sag = sag + sum(float(a) * h**p for p, a in shape.asphere)
-    if shape.across is None or shape.across[1] is not None:
-        return sag
-    way = 1 - c_across * sag  # to the line that the curve is turned about, over the radius there
-    under_root = way * way - c_across**2 * a2
-    return (sag * (1 + way) + c_across * a2) / (1 + _root(under_root.clip(0.0) if held else under_root))
-
-
-def toroid(c: Any, curve: tuple[Any, Any, Any], at: tuple[Any, Any, Any], p: tuple[Any, Any, Any]) -> tuple[Any, ...]:
-    """(c (a^2 + z^2) - c g^2) / 2 - z + g, which is 0 on a toroid; its gradient; its second derivative along p.
-
-    In any arithmetic that has operators.
-
-    Args:
-        c: 1 / radius of rotation. curve: the sag g(h), its slope over h, and the change of that over h by h.
-        at, p: point and direction: across the curve, along it, along z.
-    """
-    (g, slope, turn), (a, h, z), (pa, ph, pz) = curve, at, p
-    way = 1 - g * c
-    value = (a * a + z * z) * c * 0.5 - z + g * (way + 1) * 0.5
-    bend = (pa * pa + pz * pz) * c + ph * ph * ((slope + turn * h * h) * way - slope * slope * h * h * c)
-    return value, (a * c, slope * h * way, z * c - 1), bend
-
-
-def biconic(
-    along: tuple[Any, Any], across: tuple[Any, Any], at: tuple[Any, Any, Any], p: tuple[Any, Any, Any], root: Any
-) -> tuple[Any, ...]:
-    """Sag less z of a biconic, its gradient, its second derivative along p, and what stands under the root.
-
-    Args:
-        along, across: curvature and 1 + conic. at, p: as of `toroid`. root: a square root that is held above 0.
-    """
-    (c, k), (ca, ka), (a, h, z), (pa, ph, _) = along, across, at, p
-    kc, kca = k * c * c, ka * ca * ca
-    square = 1 - (h * h * kc + a * a * kca)
-    r = root(square)
-    over = 1 / (r + 1)
-    sag = (h * h * c + a * a * ca) * over
-    rh, ra = h * kc / r, a * kca / r  # derivatives of the root, negative
-    sh, sa = (h * c * 2 + sag * rh) * over, (a * ca * 2 + sag * ra) * over
-    change, rise = ph * rh + pa * ra, ph * sh + pa * sa
-    bend = (ph * ph * c + pa * pa * ca + rise * change) * 2 + sag * (ph * ph * kc + pa * pa * kca + change * change) / r
-    return sag - z, (sa, sh, -1.0), bend * over, square
-
-
-def sag_and_derivatives(shape: Shape, x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Depth (mm) at points x, y and its derivatives by x and y; NaN beyond the end of a conic."""
-    c, k = float(shape.curvature), float(shape.conic)
-    if shape.across is not None and shape.across[1] is not None:
-        swapped = shape.cylinder == "x"
-        at, c_across = ((y, x) if swapped else (x, y)), 1 / shape.across[0]
-        z, slope, *_ = biconic((c, 1 + k), (c_across, 1 + shape.across[1]), (*at, 0.0), (0.0, 0.0, 0.0), np.sqrt)
-        return z, slope[swapped], slope[not swapped]
-    h2 = _height2(shape, x, y)
-    root = np.sqrt(1 - (1 + k) * c * c * h2)
-    z, by_h2 = c * h2 / (1 + root), c / (2 * root)
-    for power, a in shape.asphere:
-        z = z + float(a) * h2 ** (power / 2)
-        by_h2 = by_h2 + float(a) * (power / 2) * h2 ** (power / 2 - 1)
-    gx, gy = _bent(shape)
-    zx, zy = 2 * gx * x * by_h2, 2 * gy * y * by_h2
-    if shape.across is None:
-        return z, zx, zy
-    c, way = 1 / shape.across[0], 1 - z / shape.across[0]
-    z = sag_mm(shape, x, y)
-    return z, ((1 - gx) * c * x + way * zx) / (1 - c * z), ((1 - gy) * c * y + way * zy) / (1 - c * z)
-
-
-def _bent(shape: Shape) -> tuple[float, float]:
-    """1.0 for the axes, x and y, along which a surface is bent, 0.0 for the one along which a cylinder is straight."""
-    return float(shape.cylinder != "y"), float(shape.cylinder != "x")
-
-
-def _height2(shape: Shape, x: Any, y: Any) -> Any:
-    gx, gy = _bent(shape)
-    return gx * x * x + gy * y * y
-
-
-def _root(square: Any) -> Any:
-    if isinstance(square, float):
-        return math.sqrt(square) if square >= 0 else math.nan
-    with np.errstate(invalid="ignore"):
-        return square**0.5
 
 
 def meet_front(
@@ -154,24 +33,12 @@ def meet_front(
     Rays are points (mm) and directions of either sense, float64 [N].
     """
     # Before the lens light travels towards +z, or from the side and beyond: the sense is that of the camera ray's end.
-    dx, dy, dz = -dx, -dy, -dz
-    c = 0.0 if shape is None else float(shape.curvature)
+    rays = Rays(x, y, z, -dx, -dy, -dz)
+    figure = Figure(0.0, plain=True) if shape is None else without_rim(curve_of(shape))
     with np.errstate(all="ignore"):
-        # The point nearest to the vertex, then c |m + t d|^2 = 2 (m_z + t d_z), its root next to the vertex.
-        along = x * dx + y * dy + z * dz
-        mx, my, mz = x - along * dx, y - along * dy, z - along * dz
-        f = c * (mx * mx + my * my + mz * mz) - 2 * mz
-        root = np.sqrt(dz * dz - c * f)
-        t = np.where(dz > 0, f / (dz + root), (dz - root) / c if c else np.nan)
-        px, py, pz = mx + t * dx, my + t * dy, mz + t * dz
-        if shape is not None and (float(shape.conic) or len(shape.asphere) or shape.cylinder):
-            lost = ~np.isfinite(t)
-            px, py, pz = (np.where(lost, m, p) for m, p in ((mx, px), (my, py), (mz, pz)))
-            for _ in range(_STEPS):
-                sag, sx, sy = sag_and_derivatives(shape, px, py)
-                t = (sag - pz) / (dz - sx * dx - sy * dy)
-                px, py, pz = px + t * dx, py + t * dy, pz + t * dz
-    return px, py
+        met = meet(NUMPY, rays, figure, 1, AIR, entering=True)
+        passed = np.logical_and.reduce([low <= high for low, high in met.tests])
+        return np.where(passed, met.x, math.nan), np.where(passed, met.y, math.nan)
 
 
 def front_rays(

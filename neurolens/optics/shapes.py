@@ -15,13 +15,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, NamedTuple
+from importlib import import_module
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from neurolens.optics.arithmetic import Arithmetic, is_number, times
+from neurolens.optics.arithmetic import NUMPY, TINY, Arithmetic, is_number, times
 from neurolens.optics.prescription import Surface
-from neurolens.optics.sag import biconic, sag_and_derivatives, sag_mm, toroid
 
 # Steps of the iteration by how far the asphere departs from the conic that it starts from, in rim radii. A fixed
 # count: a test of convergence would make an accelerator wait for its host at every surface.
@@ -36,6 +36,26 @@ FARTHEST = 1.5  # rim radii up to which figures are followed at most
 _UPRIGHT = 1e6  # slope and bend that stand for infinite ones
 
 Quadric = tuple[Any, Any, Any]
+
+
+class Shape(Protocol):
+    """A surface of revolution, or a cylinder bent in x or y only: c h^2 / (1 + sqrt(1 - (1 + k) c^2 h^2)) + sum a h^p.
+
+    Attributes:
+        curvature: 1/mm. conic: k. asphere: pairs (p, a). cylinder: the axis that is bent, or None.
+        across: what bends it along the other axis, or None; see `Surface`.
+    """
+
+    @property
+    def curvature(self) -> Any: ...
+    @property
+    def conic(self) -> Any: ...
+    @property
+    def asphere(self) -> Any: ...
+    @property
+    def cylinder(self) -> str | None: ...
+    @property
+    def across(self) -> Any: ...
 
 
 class Figure(NamedTuple):
@@ -90,30 +110,41 @@ def is_plain(surface: Surface) -> bool:
     return not (conic or surface.asphere or surface.cylinder)
 
 
-def figure_of(surface: Surface, number: Callable[[Any], Any] = lambda value: value) -> Figure:
-    """The figure of a surface; `number` turns fields that may be tensors into numbers."""
-    c = number(surface.curvature)
-    if is_plain(surface):
+def curve_of(shape: Shape, number: Callable[[Any], Any] = float) -> Figure:
+    """The figure of a shape by its own numbers; `number` turns fields that are tensors into numbers."""
+    c, k = number(shape.curvature), number(shape.conic)
+    powers = {int(n): number(a) for n, a in shape.asphere}
+    if is_number(k) and k == 0 and not powers and not shape.cylinder:
         return Figure(c, plain=True)
-    bent = surface.cylinder != "y", surface.cylinder != "x"
-    conic = Figure(c, 1 + number(surface.conic), bent=bent)
-    if not surface.asphere and not surface.across:
-        return conic
-    powers = {n: number(a) for n, a in surface.asphere}
     even = all(n % 2 == 0 for n in powers)
-    terms = [powers.get(n, 0.0) for n in range(2, max(powers, default=0) + 1, 2 if even else 1)]
-    start, steps = start_of(surface)
-    across = (1 / surface.across[0], 1 + (surface.across[1] or 0.0)) if surface.across else ()
-    return conic._replace(
-        terms=terms,
+    return Figure(
+        c,
+        1 + k,
+        bent=(shape.cylinder != "y", shape.cylinder != "x"),
+        terms=[powers.get(n, 0.0) for n in range(2, max(powers, default=0) + 1, 2 if even else 1)],
         even=even,
-        start=start,
-        steps=steps,
-        last_step=LAST_STEP * _extent_mm(surface),
-        across=across,
-        turned=bool(surface.across and surface.across[1] is None),
-        beyond=None if surface.followed_mm == math.inf else _end_of(surface),
+        across=(1 / shape.across[0], 1 + (shape.across[1] or 0.0)) if shape.across else (),
+        turned=bool(shape.across and shape.across[1] is None),
     )
+
+
+def figure_of(surface: Surface, number: Callable[[Any], Any] = lambda value: value) -> Figure:
+    """The figure of a surface with the start of its iteration; arguments as of `curve_of`."""
+    figure = curve_of(surface, number)
+    if not figure.terms and not figure.across:
+        return figure
+    start, steps = start_of(surface)
+    beyond = None if surface.followed_mm == math.inf else _end_of(surface)
+    return figure._replace(start=start, steps=steps, last_step=LAST_STEP * _extent_mm(surface), beyond=beyond)
+
+
+def without_rim(figure: Figure) -> Figure:
+    """A figure whose iteration starts from the quadric of its vertex."""
+    if not figure.terms and not figure.across:
+        return figure
+    c, (other, _) = figure.curvature, figure.across or (0.0, 1.0)
+    start = (c if figure.bent[0] else other), (c if figure.bent[1] else other), c * figure.stretch
+    return figure._replace(start=start, steps=STEPS[-1][1], last_step=math.inf)
 
 
 def start_of(surface: Surface) -> tuple[tuple[float, float, float], int]:
@@ -222,15 +253,16 @@ class Depth(NamedTuple):
     cos2: Any
 
 
-def depth(o: Arithmetic, figure: Figure, h2: Any, order: int = 2) -> Depth:
+def depth(o: Arithmetic, figure: Figure, h2: Any, order: int = 2, steepest: float = STEEPEST) -> Depth:
     """The depth of a figure's curve at squared distances h2 (mm^2); held finite where its conic ends.
 
-    `order`: 0 for depth and slope, 1 for the slope alone, 2 for everything.
+    `order`: 0 for depth and slope, 1 for the slope alone, 2 for everything. `steepest`: least squared cosine of the
+    conic's slope.
     """
     if figure.beyond is None:
-        return _followed(o, figure, h2, order)
+        return _followed(o, figure, h2, order, steepest)
     end, slope, bend, length = figure.beyond
-    inside = _followed(o, figure, o.least(h2, o.like(h2, end * end)), order)
+    inside = _followed(o, figure, o.least(h2, o.like(h2, end * end)), order, steepest)
     h = o.held_root(h2, end * end)
     d = h - end
     left = (d / -length).exp()
@@ -240,14 +272,14 @@ def depth(o: Arithmetic, figure: Figure, h2: Any, order: int = 2) -> Depth:
     return Depth(inside.sag + rise, inside.slope * (end / h) + turned / h, turn, inside.cos2)
 
 
-def _followed(o: Arithmetic, figure: Figure, h2: Any, order: int) -> Depth:
+def _followed(o: Arithmetic, figure: Figure, h2: Any, order: int, steepest: float) -> Depth:
     """The depth by a figure's own numbers: c h^2 / (1 + cos) + sum A_p h^p."""
     sag, slope = _polynomials(o, figure, h2, order)
     c = figure.curvature
     if is_number(c) and c == 0:
         return Depth(times(h2, sag), slope + o.like(h2, 0.0), 0.0, None)
     cos2 = o.fma(h2, -(figure.stretch * c * c), 1.0)
-    cos = o.held_root(cos2, STEEPEST)
+    cos = o.held_root(cos2, steepest)
     if order == 1:
         return Depth(0.0, c / cos + slope, 0.0, cos2)
     both = c / o.fma(cos, cos, cos)  # one division for both c h^2 / (1 + cos) and c / cos
@@ -264,6 +296,92 @@ def _polynomials(o: Arithmetic, figure: Figure, h2: Any, order: int) -> tuple[An
     h, down = (h2, 2) if figure.even else (o.held_root(h2), 1)
     slopes = [a * float(2 + down * k) for k, a in enumerate(figure.terms)]
     return 0.0 if order == 1 else o.horner(h, figure.terms), o.horner(h, slopes)
+
+
+def toroid(c: Any, curve: tuple[Any, Any, Any], at: tuple[Any, Any, Any], p: tuple[Any, Any, Any]) -> tuple[Any, ...]:
+    """(c (a^2 + z^2) - c g^2) / 2 - z + g, which is 0 on a toroid; its gradient; its second derivative along p.
+
+    In any arithmetic that has operators.
+
+    Args:
+        c: 1 / radius of rotation. curve: the sag g(h), its slope over h, and the change of that over h by h.
+        at, p: point and direction: across the curve, along it, along z.
+    """
+    (g, slope, turn), (a, h, z), (pa, ph, pz) = curve, at, p
+    way = 1 - g * c
+    value = (a * a + z * z) * c * 0.5 - z + g * (way + 1) * 0.5
+    bend = (pa * pa + pz * pz) * c + ph * ph * ((slope + turn * h * h) * way - slope * slope * h * h * c)
+    return value, (a * c, slope * h * way, z * c - 1), bend
+
+
+def biconic(
+    along: tuple[Any, Any], across: tuple[Any, Any], at: tuple[Any, Any, Any], p: tuple[Any, Any, Any], root: Any
+) -> tuple[Any, ...]:
+    """Sag less z of a biconic, its gradient, its second derivative along p, and what stands under the root.
+
+    Args:
+        along, across: curvature and 1 + conic. at, p: as of `toroid`. root: a square root that is held above 0.
+    """
+    (c, k), (ca, ka), (a, h, z), (pa, ph, _) = along, across, at, p
+    kc, kca = k * c * c, ka * ca * ca
+    square = 1 - (h * h * kc + a * a * kca)
+    r = root(square)
+    over = 1 / (r + 1)
+    sag = (h * h * c + a * a * ca) * over
+    rh, ra = h * kc / r, a * kca / r  # derivatives of the root, negative
+    sh, sa = (h * c * 2 + sag * rh) * over, (a * ca * 2 + sag * ra) * over
+    change, rise = ph * rh + pa * ra, ph * sh + pa * sa
+    bend = (ph * ph * c + pa * pa * ca + rise * change) * 2 + sag * (ph * ph * kc + pa * pa * kca + change * change) / r
+    return sag - z, (sa, sh, -1.0), bend * over, square
+
+
+def height2(o: Arithmetic, figure: Figure, x: Any, y: Any) -> Any:
+    """Squared distance from the axis, or from a cylinder's plane of symmetry."""
+    if all(figure.bent):
+        return o.dot((x, y), (x, y))
+    return x * x if figure.bent[0] else y * y
+
+
+def sag(o: Arithmetic, figure: Figure, x: Any, y: Any) -> tuple[Any, Any]:
+    """Depth at points, and what is at least 0 where the surface exists; None where that is everywhere."""
+    h2 = height2(o, figure, x, y)
+    if not figure.across:
+        curve = depth(o, figure, h2, order=0, steepest=TINY)
+        return curve.sag, curve.cos2
+    (c, stretch), a = figure.across, y if figure.bent[0] else x
+    a2 = a * a
+    if not figure.turned:
+        square = 1 - (h2 * (figure.stretch * figure.curvature**2) + a2 * (stretch * c * c))
+        return (h2 * figure.curvature + a2 * c) / (1 + o.held_root(square)), square
+    curve = depth(o, figure, h2, order=0, steepest=TINY)
+    way = 1 - c * curve.sag  # to the line that the curve is turned about, over the radius there
+    square = way * way - a2 * (c * c)
+    z = (curve.sag * (1 + way) + a2 * c) / (1 + o.held_root(square))
+    return z, square if curve.cos2 is None else o.least(curve.cos2, square)
+
+
+def sag_mm(shape: Shape, x: Any, y: Any, *, held: bool = False) -> Any:
+    """Depth z (mm) of a surface at points x, y (mm) relative to its vertex, towards +z.
+
+    Args:
+        x, y: floats, numpy arrays or torch tensors.
+        held: whether a conic goes on as a plane beyond its end, where the depth is else NaN; arrays and tensors only.
+    """
+    tensor = next((v for v in (x, y) if hasattr(v, "new_full")), None)
+    o = NUMPY if tensor is None else import_module("neurolens.optics.tensors").Tensors(False, tensor.dtype)
+    z, exists = sag(o, curve_of(shape), x, y)
+    z = z if held or exists is None else o.select(0.0, exists, z, math.nan)
+    return float(z) if is_number(x) and is_number(y) else z
+
+
+def sag_and_derivatives(shape: Shape, x: Any, y: Any) -> tuple[Any, Any, Any]:
+    """Depth (mm) at points x, y (numpy arrays) and its derivatives by x and y; NaN beyond the end of a conic."""
+    figure, z = curve_of(shape), sag_mm(shape, x, y)
+    if figure.across:
+        _, (gx, gy, gz), *_ = crossed(NUMPY, figure, (x, y, z), (0.0, 0.0, 1.0))
+        return z, -gx / gz, -gy / gz
+    slope = depth(NUMPY, figure, height2(NUMPY, figure, x, y), order=1, steepest=TINY).slope + 0 * z
+    return z, figure.bent[0] * x * slope, figure.bent[1] * y * slope
 
 
 def crossed(o: Arithmetic, figure: Figure, at: Quadric, p: Quadric) -> tuple[Any, Quadric, Any, Any]:

@@ -21,7 +21,7 @@ from neurolens.base import status as st
 from neurolens.optics import glass, prescription
 from neurolens.optics.arithmetic import TINY, Arithmetic, is_number, times
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.shapes import STEEPEST, Figure, Quadric, crossed, depth, is_deep, rim_sine
+from neurolens.optics.shapes import STEEPEST, Figure, Quadric, crossed, depth, height2, is_deep, rim_sine
 
 # A test that a ray passes where the first value is at most the second; NaN does not pass.
 Test = tuple[Any, Any]
@@ -221,7 +221,7 @@ def _meet_asphere(o: Arithmetic, r: Rays, m: Quadric, figure: Figure, sense: int
         scale = times(o.inverse_root(o.dot((nx, ny, nz), (nx, ny, nz))), -1)
         q = o.dot((nx, ny, nz), p) * times(scale, sense)
     else:
-        _, slope, _, exists = depth(o, figure, _height2(o, figure, x, y), order=1)
+        _, slope, _, exists = depth(o, figure, height2(o, figure, x, y), order=1)
         nx, ny = (v * -slope if bent else o.like(v, 0.0) for v, bent in zip((x, y), figure.bent, strict=True))
         scale = o.inverse_root(o.fma(ny, ny, o.fma(nx, nx, 1.0)))
         nz, q = 1.0, o.fma(ny, r.dy, o.fma(nx, r.dx, r.dz)) * times(scale, sense)
@@ -237,13 +237,6 @@ def _meet_asphere(o: Arithmetic, r: Rays, m: Quadric, figure: Figure, sense: int
     return Met(x, y, z, q, q2, tests, (nx * scale, ny * scale, times(scale, nz)))
 
 
-def _height2(o: Arithmetic, figure: Figure, x: Any, y: Any) -> Any:
-    """Squared distance from the axis, or from a cylinder's plane of symmetry."""
-    if all(figure.bent):
-        return o.dot((x, y), (x, y))
-    return x * x if figure.bent[0] else y * y
-
-
 def _toward(o: Arithmetic, at: Quadric, r: Rays, figure: Figure, sense: int) -> Any:
     """Euler's step along the rays towards sag(x, y) = z: Newton's with the bend of the surface taken into account.
 
@@ -255,7 +248,7 @@ def _toward(o: Arithmetic, at: Quadric, r: Rays, figure: Figure, sense: int) -> 
         value, gradient, bend, _ = crossed(o, figure, at, p)
         rate, lack = o.dot(gradient, p), 2.0 * value
     else:
-        sag, slope, turn, _ = depth(o, figure, _height2(o, figure, x, y), order=2)
+        sag, slope, turn, _ = depth(o, figure, height2(o, figure, x, y), order=2)
         bent = (*map(float, figure.bent), 0.0)
         along = _weighted(o, at, p, bent)
         rate = o.fma(slope, along, -r.dz)
@@ -271,7 +264,7 @@ def _last_step(o: Arithmetic, at: Quadric, r: Rays, figure: Figure) -> Any:
     if figure.across:
         value, gradient, *_ = crossed(o, figure, at, (r.dx, r.dy, r.dz))
         return -value / o.dot(gradient, r[3:])
-    sag, slope, *_ = depth(o, figure, _height2(o, figure, at[0], at[1]), order=0)
+    sag, slope, *_ = depth(o, figure, height2(o, figure, at[0], at[1]), order=0)
     along = _weighted(o, at, r[3:], (*map(float, figure.bent), 0.0))
     return (at[2] - sag) / o.fma(slope, along, -r.dz)
 
@@ -364,9 +357,9 @@ def rim_tests(o: Arithmetic, surface: Surface) -> Callable[[Met], list[Test]]:
         # By its depth: a point on the far half of the sphere may be near the axis, but there is no glass.
         most = 1 - math.sqrt(1 - rim_sine(surface) ** 2)
         return lambda met: [(times(met.z, surface.curvature), most)]
-    return lambda met: [(height2(o, met), surface.semi_diameter_mm**2)]
+    return lambda met: [(radius2(o, met), surface.semi_diameter_mm**2)]
 
 
-def height2(o: Arithmetic, met: Met) -> Any:
+def radius2(o: Arithmetic, met: Met) -> Any:
     """Squared distance of a meeting from the axis, mm^2."""
     return o.dot(met[:2], met[:2])

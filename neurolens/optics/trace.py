@@ -30,9 +30,9 @@ from neurolens.optics.surfaces import (
     Rays,
     Test,
     cross,
-    height2,
     media,
     nearest_approach,
+    radius2,
     rim_tests,
 )
 from neurolens.optics.tensors import Survival, Tensors, at_most
@@ -300,7 +300,7 @@ class Tracing:
             self.tests.require(tests, k, reason)
         if self.figures[k].flat:
             # A sphere's square root turns NaN and overflow into a miss; a plane would pass them.
-            self.tests.end(height2(self.o, crossed.met))
+            self.tests.end(radius2(self.o, crossed.met))
         self.rays, self._entering = crossed.bent.rays, None
         self.medium = met_media[0 if reflected else 1]
         self.sense = -self.sense if reflected else self.sense

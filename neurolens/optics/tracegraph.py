@@ -11,7 +11,7 @@ from neurolens.optics.arithmetic import Graphs, is_number, times
 from neurolens.optics.filmgraph import GraphLosses
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.shapes import figure_of
-from neurolens.optics.surfaces import Met, Rays, Test, cross, height2, media
+from neurolens.optics.surfaces import Met, Rays, Test, cross, media, radius2
 from neurolens.optics.transmission import Passage
 
 TRANSMITTANCE = (
@@ -92,4 +92,4 @@ class _Tracing:
 
     def _opening(self, met: Met) -> list[Test]:
         """The test of the stop, whose radius is a number of the call; none where only the ray is wanted."""
-        return [] if self.stop_square is None else [(height2(self.o, met), self.stop_square)]
+        return [] if self.stop_square is None else [(radius2(self.o, met), self.stop_square)]

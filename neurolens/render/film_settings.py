@@ -1,16 +1,15 @@
-"""The [film] table of a scene, without numpy: the command line names its choices before anything else is loaded."""
+"""The [film] table of a scene, without numpy: the command line has its options before anything else is loaded."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
+
+from neurolens.base.options import setting
 
 ColourSpaceName = Literal["sRGB", "ACEScg"]
 WavelengthMode = Literal["auto", "one", "hero", "lanes"]
 WavelengthSampling = Literal["importance", "uniform"]
-COLOUR_SPACE_NAMES: tuple[str, ...] = get_args(ColourSpaceName)
-WAVELENGTH_MODES: tuple[str, ...] = get_args(WavelengthMode)
-WAVELENGTH_SAMPLINGS: tuple[str, ...] = get_args(WavelengthSampling)
 
 
 @dataclass(frozen=True)
@@ -26,10 +25,20 @@ class FilmSettings:
         wavelength_sampling: "importance", by the film's response times the light of the scene, or "uniform".
     """
 
-    colour_space: ColourSpaceName = "sRGB"
-    white_balance: str | None = None
-    wavelengths: WavelengthMode = "auto"
-    wavelength_sampling: WavelengthSampling = "importance"
+    colour_space: ColourSpaceName = setting("sRGB", "of the EXR, linear: sRGB (D65) or ACEScg (AP1, the white of ACES)")
+    white_balance: str | None = setting(
+        None, "light that becomes neutral: A, D50, D65, E, '3200 K' or a measured one of the scene", metavar="LIGHT"
+    )
+    wavelengths: WavelengthMode = setting(
+        "auto",
+        "of a path: one; hero, four that share it; lanes, four paths that share their random numbers; auto, hero where "
+        "the camera does not disperse",
+        option="wavelength-mode",
+        old=("wavelengths",),
+    )
+    wavelength_sampling: WavelengthSampling = setting(
+        "importance", "by importance (film response times light) or uniform"
+    )
 
 
 def size_by_shape(shape: float, width: int | None, height: int | None) -> tuple[int, int]:

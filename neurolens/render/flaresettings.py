@@ -11,7 +11,7 @@ from neurolens.base.options import check_bounds, setting
 LAYERS = ("ghosts", "glare", "starburst")
 GLARE = 1 << 18  # photons where anything scatters
 _MOST_PHOTONS = 1 << 30
-_PREVIEW_BINS, _PREVIEW_CELL_PX, _PREVIEW_PHOTONS = 5, 24.0, 1 << 16
+_QUICK_BINS, _QUICK_CELL_PX, _QUICK_PHOTONS = 5, 24.0, 1 << 16
 
 
 @dataclass(frozen=True)
@@ -133,9 +133,9 @@ class FlareSettings:
 
     def quick(self) -> FlareSettings:
         """The same, coarse enough for a quick look."""
-        photons, glare = (min(n, _PREVIEW_PHOTONS) for n in (self.photons, self.glare))
-        cell = max(self.cell_px, _PREVIEW_CELL_PX)
-        return replace(self, bins=min(self.bins, _PREVIEW_BINS), cell_px=cell, photons=photons, glare=glare)
+        photons, glare = (min(n, _QUICK_PHOTONS) for n in (self.photons, self.glare))
+        cell = max(self.cell_px, _QUICK_CELL_PX)
+        return replace(self, bins=min(self.bins, _QUICK_BINS), cell_px=cell, photons=photons, glare=glare)
 
     def makes(self, name: str) -> bool:
         """Whether the layer of this name is switched on."""

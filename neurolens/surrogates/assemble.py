@@ -190,7 +190,7 @@ class DirectionSeries:
         """The series of a model up to its largest angle; no series for slopes."""
         if model.direction == "slope":
             return DirectionSeries(1.0)
-        angle = model.largest_angle
+        angle = model.angle
         return DirectionSeries.exact(angle) if form.exact else DirectionSeries.fitted(angle, form.monic)
 
     @staticmethod

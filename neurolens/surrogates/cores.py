@@ -18,19 +18,16 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Exponents, Form, Graph, Value
+from neurolens.surrogates.lightfield import MIRROR, ROUND, LightField, angle_vector
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from neurolens.surrogates.lightfield import LightField
 
 Array = NDArray[np.float64]
 Basis = Literal["invariants", "raw"]
 # Order of the vectors of every core.
 POSITION, DIRECTION, STOP = 0, 1, 2
-# Invariants as pairs of the rows p_x, p_y, u_x, u_y: rho, sigma, tau; of two mirrors those of x, then those of y.
-ROUND: tuple[Form, ...] = (((0, 0), (1, 1)), ((0, 2), (1, 3)), ((2, 2), (3, 3)))
-MIRROR: tuple[Form, ...] = tuple(((a, b),) for i in (0, 1) for a, b in ((i, i), (i, 2 + i), (2 + i, 2 + i)))
 
 
 @dataclass(frozen=True)
@@ -156,8 +153,6 @@ class Core:
     def __call__(self, field: LightField) -> tuple[Tensor, Tensor]:
         """Vectors [3, 2, N] and scalars [1 + G, N] of a light field of tensors, in its precision."""
         import torch
-
-        from neurolens.surrogates.lightfield import angle_vector
 
         out = evaluate(self._graph, {"p": field.p, "u": field.u, "w": field.w[None]})
         direction = angle_vector(*out["unit"]) if "unit" in out else out["direction"]

@@ -39,7 +39,6 @@ from neurolens.surrogates.cores import CORES, Core
 from neurolens.surrogates.model import Domain, Encoding, Gate, LensModel, Scales, mixed, with_one_angle
 
 SCHEMA = 2
-_ONE_NODE = 1  # schema of version 0.1.0: one state, and no angle
 _MAX_TEXT = 16 * 2**20  # of the JSON; the largest models known take 100 kB
 _MAX_DEPTH = 16  # of cores in cores
 _MAX_CORES = 1000  # of one file
@@ -116,21 +115,20 @@ def coefficients_in(text: str) -> dict[str, Any]:
     """The JSON of a metadata entry of coefficients. Raises ValueError: damaged, or of another schema."""
     data = json.loads(inflated(text))
     check_tree(data, "coefficients")
-    if data["schema"] not in (_ONE_NODE, SCHEMA):
-        raise ValueError(f"schema: got {data['schema']!r}, expected {SCHEMA}")
+    if data["schema"] != SCHEMA:
+        raise ValueError(f"schema: got {data['schema']!r}, expected {SCHEMA}: `neurolens train` writes the file anew")
     return dict(data)
 
 
 def _nodes(file: Path, card: Mapping[str, Any], data: Mapping[str, Any]) -> tuple[LensModel, ...]:
     states = card.get("states")
     domains = [node["domain"] for node in states["nodes"]] if states else [card["domain"]]
-    parts = [data] if data["schema"] == _ONE_NODE else data["nodes"]
+    parts = data["nodes"]
     if len(parts) != len(domains) or len(parts) > _MAX_NODES:
         raise ValueError(f"{len(parts)} nodes, expected {len(domains)}, at most {_MAX_NODES}")
     lens, gates = unpacked_lens(data["lens"]), tuple(Gate(int(k), int(r)) for k, r in data["gates"])
     if not states and lens.sha256 != card["lens"]["sha256"]:
         raise ModelError(f"{file}: its prescription is not that of its card")
-    angle = data.get("angle")
     common = LensModel(
         lens=lens,
         domain=Domain.from_dict(card["domain"]),
@@ -143,12 +141,10 @@ def _nodes(file: Path, card: Mapping[str, Any], data: Mapping[str, Any]) -> tupl
         fit_s=float(card["fit"]["seconds"]),
         direction="slope" if data["direction"] == "slope" else "angle",
         transmittance=transmittance_of(card),
-        angle=None if angle is None else float(angle),
+        angle=float(data["angle"]),
     )
-    if angle is None:
-        common = replace(common, angle=_traced_angle(file, common))
-    if not 0 < common.largest_angle <= math.pi:
-        raise ValueError(f"angle: got {angle!r}, expected above 0, up to pi")
+    if not 0 < common.angle <= math.pi:
+        raise ValueError(f"angle: got {common.angle!r}, expected above 0, up to pi")
     nodes = tuple(
         replace(
             common,
@@ -160,17 +156,6 @@ def _nodes(file: Path, card: Mapping[str, Any], data: Mapping[str, Any]) -> tupl
     )
     _check_size(nodes[0].core)
     return nodes
-
-
-def _traced_angle(file: Path, model: LensModel) -> float:
-    """The largest angle of the scene rays, which coefficients of version 0.1.0 do not tell."""
-    try:
-        return model.largest_angle
-    except ModuleNotFoundError as error:
-        raise ModelError(
-            f"{file}: its coefficients are those of version 0.1.0, which only a machine with torch reads: there "
-            "`neurolens export MODEL.onnx --to onnx --out NEW.onnx` writes it as others read it"
-        ) from error
 
 
 def _check_size(core: Core) -> None:

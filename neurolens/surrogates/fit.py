@@ -34,12 +34,11 @@ from neurolens.surrogates.fits.network import fit_network, with_boundary_terms
 from neurolens.surrogates.fits.planes import fit_planes
 from neurolens.surrogates.fits.polynomial import fit_paraxial, fit_polynomial
 from neurolens.surrogates.gates import choose_gates, explained
-from neurolens.surrogates.lightfield import fit_encoding
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.pairs import RayPairs, join_pairs, trace_pairs
+from neurolens.surrogates.pairs import RayPairs, join_pairs, trace_pairs, with_angle
 from neurolens.surrogates.settings import NETWORKS, PLANES_SEARCHED, POLYNOMIALS, ModelSettings
 from neurolens.surrogates.specialise import without_idle_gates
-from neurolens.surrogates.targets import Prepared, scales_of, squared_error
+from neurolens.surrogates.targets import Prepared, fit_encoding, scales_of, squared_error
 
 # Rays drawn over the domain to find what blocks anything: a share of 1e-4 is 20 of them.
 _GATE_RAYS = 200_000
@@ -115,7 +114,7 @@ def fit_model(
 def as_model(prepared: Prepared, core: Core, settings: ModelSettings, fit_s: float) -> LensModel:
     """A complete model of a core that was fitted in `fit_s` seconds to the prepared pairs."""
     pairs = prepared.pairs
-    return LensModel(
+    model = LensModel(
         lens=pairs.lens,
         domain=pairs.domain,
         encoding=prepared.encoding,
@@ -127,6 +126,7 @@ def as_model(prepared: Prepared, core: Core, settings: ModelSettings, fit_s: flo
         direction="slope" if settings.family == "paraxial" else "angle",
         fit_s=fit_s,
     )
+    return with_angle(model)
 
 
 def _fit_core(

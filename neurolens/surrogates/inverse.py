@@ -39,8 +39,9 @@ from neurolens.surrogates.assemble import (
     wavelength_row,
     within_domain,
 )  # fmt: skip
-from neurolens.surrogates.cores import DIRECTION, MIRROR, POSITION, ROUND, STOP, CoreValues, Field, Refracted, Units
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, CoreValues, Field, Refracted, Units
 from neurolens.surrogates.file import pack, unpack
+from neurolens.surrogates.lightfield import MIRROR, ROUND
 from neurolens.surrogates.model import Encoding, LensModel, Prediction, prediction_of
 
 if TYPE_CHECKING:

@@ -15,15 +15,16 @@ from __future__ import annotations
 
 from functools import reduce
 from operator import add
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import torch
-from torch import Tensor
+from neurolens.graph.ir import Form
 
-from neurolens.optics.glass import inverse_square_um
-from neurolens.surrogates.cores import MIRROR, ROUND
-from neurolens.surrogates.model import Domain, Encoding
-from neurolens.surrogates.pairs import PairSet
+if TYPE_CHECKING:
+    from torch import Tensor
+
+# Invariants as pairs of the rows p_x, p_y, u_x, u_y: rho, sigma, tau; of two mirrors those of x, then those of y.
+ROUND: tuple[Form, ...] = (((0, 0), (1, 1)), ((0, 2), (1, 3)), ((2, 2), (3, 3)))
+MIRROR: tuple[Form, ...] = tuple(((a, b),) for i in (0, 1) for a, b in ((i, i), (i, 2 + i), (2 + i, 2 + i)))
 
 
 class LightField(NamedTuple):
@@ -39,34 +40,17 @@ class LightField(NamedTuple):
 
     def invariants(self, mirror: bool = False) -> Tensor:
         """[4, N]: rho, sigma, tau, w; of two mirrors [7, N]: p_x^2, p_x u_x, u_x^2, the same of y, w."""
+        import torch
+
         rows = (*self.p, *self.u)
         sums = (reduce(add, (rows[i] * rows[j] for i, j in form)) for form in (MIRROR if mirror else ROUND))
         return torch.stack([*sums, self.w])
 
 
-def fit_encoding(domain: Domain, passing: PairSet, *, mirror: bool = False) -> Encoding:
-    """Centre and scale by the passing rays of a domain; `mirror`: x and y by themselves, for lenses with cylinders."""
-    plain = Encoding(domain.film_z_mm[0], domain.pupil_z_mm, 0.0, 1.0, 1.0, 0.0, 0.0)
-    p, u = plain.planes(passing.inputs)
-    axes = [slice(0, 1), slice(1, 2)] if mirror else [slice(0, 2)]
-    chiefs = [float((p[a] * u[a]).sum() / (p[a] * p[a]).sum()) for a in axes]
-    scales = [float((u[a] - k * p[a]).norm(dim=0).max()) for a, k in zip(axes, chiefs, strict=True)]
-    shortest, longest = (float(inverse_square_um(v)) for v in domain.wavelength_nm)
-    return Encoding(
-        film_plane_z_mm=plain.film_plane_z_mm,
-        pupil_plane_z_mm=plain.pupil_plane_z_mm,
-        chief=chiefs[0],
-        film_scale_mm=float(p.norm(dim=0).max()),
-        pupil_scale_mm=scales[0],
-        w_middle=(shortest + longest) / 2,
-        w_half=(shortest - longest) / 2,
-        chief_y=chiefs[1] if mirror else None,
-        pupil_scale_y_mm=scales[1] if mirror else None,
-    )
-
-
 def angle_vector(dx: Tensor, dy: Tensor, dz: Tensor) -> Tensor:
     """[2, N] v = theta (dx, dy) / |(dx, dy)| with theta from -z: smooth through 90 degrees, equivariant."""
+    import torch
+
     sine = torch.hypot(dx, dy)
     theta = torch.atan2(sine, -dz)
     # theta / sine tends to 1 on the axis; the guard also keeps the exact axis finite.

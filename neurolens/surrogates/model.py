@@ -26,18 +26,17 @@ from neurolens.optics.film_plane import PupilBounds
 from neurolens.optics.glass import inverse_square_um
 from neurolens.optics.prescription import Lens, Surface
 from neurolens.surrogates.assemble import EXACT, model_graph
-from neurolens.surrogates.cores import DIRECTION, Array, Core, Refracted
+from neurolens.surrogates.cores import Array, Core
+from neurolens.surrogates.lightfield import LightField
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from neurolens.optics.surfaces import Rays
     from neurolens.surrogates.domain import FilmRays
-    from neurolens.surrogates.lightfield import LightField
 
 OUTPUTS = ("scene_ray", "transmittance", "stop_xy_mm", "status")
 _DIFFERENTIATED = ("scene_ray", "stop_xy_mm")
-_ANGLE_RAYS, _FEWEST_RAYS = 32_768, 300
 # Positive and finite, in float32 too.
 ANY_WAVELENGTH_NM = (1e-30, 3e38)
 
@@ -143,8 +142,6 @@ class Encoding:
     def __call__(self, rays: FilmRays) -> LightField:
         import torch
 
-        from neurolens.surrogates.lightfield import LightField
-
         p, u = self.planes(rays)
         u = torch.stack([(u[i] - self.chiefs[i] * p[i]) / self.pupil_scales_mm[i] for i in (0, 1)])
         w = torch.zeros_like(rays.wavelength_nm)
@@ -228,7 +225,10 @@ class LensModel:
         direction: what the core's direction vector is: the angle vector, or the slope for first-order models.
         transmittance: "polarised" as the tracer follows it, or "averaged" over s and p at every surface (of files made
             by version 0.1.0 and earlier).
-        angle: see `largest_angle`, which is computed where this is None.
+        angle: largest angle (rad) between the axis and the rays that the exact lens passes, enlarged by 5%; see
+            `pairs.with_angle`. A core's direction vector is no longer than that. Where it is, as a network's may be far
+            from the rays of its fit, the ray lies outside the domain. Where all rays point forwards the angle stays
+            below a right one; of a `Refracted` core it is that inside the glass. pi refuses nothing.
     """
 
     lens: Lens
@@ -242,7 +242,7 @@ class LensModel:
     fit_s: float = 0.0
     direction: Literal["angle", "slope"] = "angle"
     transmittance: str = POLARISED
-    angle: float | None = None
+    angle: float = math.pi
 
     def predict(self, rays: FilmRays, stop_radius_mm: float | None = None) -> Prediction:
         """Evaluate the model in the dtype of `rays`.
@@ -289,35 +289,6 @@ class LensModel:
         return model_graph(self, EXACT)
 
     @cached_property
-    def largest_angle(self) -> float:
-        """Largest angle (rad) between the axis and the rays that the exact lens passes, enlarged by 5%.
-
-        A core's direction vector is no longer than that. Where it is, as a network's may be far from the rays of its
-        fit, the ray lies outside the domain. Where all rays point forwards the angle stays below a right one; of a
-        `Refracted` core it is that inside the glass. Tracing needs torch; a model from a file knows its angle.
-        """
-        if self.angle is not None:
-            return self.angle
-        import torch
-
-        from neurolens.surrogates.domain import draw
-        from neurolens.surrogates.pairs import trace_pairs
-
-        rays, _ = draw(self.domain, _ANGLE_RAYS, seed=5)
-        with torch.no_grad():
-            exact = trace_pairs(self.lens, rays, self.domain.pupil_z_mm)
-            if isinstance(self.core, Refracted):
-                angles = self.core(self.encoding(rays))[0][DIRECTION].norm(dim=0)
-            else:
-                angles = torch.atan2(torch.hypot(exact.scene.dx, exact.scene.dy), -exact.scene.dz)
-        angles = angles[exact.status == st.PASSED]
-        if len(angles) < _FEWEST_RAYS:  # they do not tell the largest
-            return math.pi
-        angle = float(angles.max())
-        bound = next((b for b in (math.pi / 2, math.pi) if angle < b), math.pi)
-        return min(1.05 * angle, (angle + bound) / 2, bound)
-
-    @cached_property
     def _derivative_graph(self) -> Graph:
         return with_derivatives(self.graph, _DIFFERENTIATED, [("rays", k) for k in range(5)])
 
@@ -337,7 +308,7 @@ class LensModel:
 
 def with_one_angle(models: Sequence[LensModel]) -> list[LensModel]:
     """Models of one structure with the largest angle of them all, so that their graphs are of one structure, too."""
-    angle = max(model.largest_angle for model in models)
+    angle = max(model.angle for model in models)
     return [replace(model, angle=angle) for model in models]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -18,14 +19,16 @@ from neurolens.base.files import atomic_path
 from neurolens.optics.prescription import Lens
 from neurolens.optics.pupils import camera_rays
 from neurolens.optics.trace import CHUNK, Rays, trace
+from neurolens.surrogates.cores import DIRECTION, Refracted
 from neurolens.surrogates.domain import SPARSE, FilmRays, draw, lit_share, sample_domain
-from neurolens.surrogates.model import Domain
+from neurolens.surrogates.model import Domain, LensModel
 
 SCHEMA = 3
 SPLITS = ("train", "held_out", "rim", "edge", "far")
 # Rays beyond this many rim radii are too far from any boundary to teach a model where it lies.
 RIM_REACH = 1.25
 _BATCH = 65536
+_ANGLE_RAYS, _FEWEST_RAYS = 32_768, 300  # that tell the largest angle of a lens
 
 
 @dataclass(frozen=True)
@@ -275,3 +278,20 @@ def load_pairs(path: str | Path, lens: Lens) -> RayPairs:
 def _unpack(arrays: dict[str, Any], name: str) -> PairSet:
     vectors, status, surfaces = (torch.from_numpy(arrays[f"{name}_{k}"]) for k in ("vectors", "status", "surfaces"))
     return PairSet.of_columns([*vectors, status, *surfaces])
+
+
+def with_angle(model: LensModel) -> LensModel:
+    """The model with the largest angle of its lens's rays, by a sample of the domain; see `LensModel.angle`."""
+    rays, _ = draw(model.domain, _ANGLE_RAYS, seed=5)
+    with torch.no_grad():
+        exact = trace_pairs(model.lens, rays, model.domain.pupil_z_mm)
+        if isinstance(model.core, Refracted):
+            angles = model.core(model.encoding(rays))[0][DIRECTION].norm(dim=0)
+        else:
+            angles = torch.atan2(torch.hypot(exact.scene.dx, exact.scene.dy), -exact.scene.dz)
+    angles = angles[exact.status == st.PASSED]
+    if len(angles) < _FEWEST_RAYS:  # they do not tell the largest
+        return replace(model, angle=math.pi)
+    angle = float(angles.max())
+    bound = next((b for b in (math.pi / 2, math.pi) if angle < b), math.pi)
+    return replace(model, angle=min(1.05 * angle, (angle + bound) / 2, bound))

@@ -68,7 +68,7 @@ def _narrowed(model: LensModel, fix: Fix) -> LensModel:
         domain = replace(domain, stop_radius_mm=fix.stop_radius_mm)
         lens = lens.with_stop_radius(fix.stop_radius_mm)
         settings["stop_radius_mm"] = fix.stop_radius_mm
-    return replace(model, domain=domain, lens=lens, settings=settings, angle=None)
+    return _with_angle(replace(model, domain=domain, lens=lens, settings=settings))
 
 
 def without_idle_gates(models: tuple[LensModel, ...], share: float = IDLE_SHARE) -> tuple[LensModel, ...]:
@@ -119,11 +119,17 @@ def at_wavelength(model: LensModel, wavelength_nm: float) -> LensModel:
     if not low <= wavelength_nm <= high:
         raise InputError("at_wavelength", "wavelength_nm", wavelength_nm, f"{low:g} to {high:g} nm")
     w = (inverse_square_um(wavelength_nm) - model.encoding.w_middle) / model.encoding.w_half
-    return replace(
+    fixed = replace(
         model,
         domain=replace(model.domain, wavelength_nm=(wavelength_nm, wavelength_nm)),
         encoding=replace(model.encoding, w_half=0.0),
         core=model.core.fixed(w),
         settings={**model.settings, "wavelength_nm": wavelength_nm},
-        angle=None,
     )
+    return _with_angle(fixed)
+
+
+def _with_angle(model: LensModel) -> LensModel:
+    from neurolens.surrogates.pairs import with_angle  # rays are traced, which needs torch
+
+    return with_angle(model)

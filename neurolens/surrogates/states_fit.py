@@ -27,11 +27,10 @@ from neurolens.surrogates.cores import STOP
 from neurolens.surrogates.fit import prepare
 from neurolens.surrogates.fits.boundaries import invariant_core
 from neurolens.surrogates.fits.selection import JointSweep, Sweep, forward, replace_terms
-from neurolens.surrogates.lightfield import fit_encoding
 from neurolens.surrogates.model import Encoding, LensModel, Scales
-from neurolens.surrogates.pairs import PairSettings, RayPairs, make_pairs
+from neurolens.surrogates.pairs import PairSettings, RayPairs, make_pairs, with_angle
 from neurolens.surrogates.states import State, StateModel, StateSpace
-from neurolens.surrogates.targets import Prepared, film_equivalent, scales_of
+from neurolens.surrogates.targets import Prepared, film_equivalent, fit_encoding, scales_of
 
 # Nodes that choose the support and the gates; the others only fit coefficients.
 _CHOOSERS = 7
@@ -146,7 +145,7 @@ def _fit_node(
     vectors = vector_columns(monomials(train.field.invariants(), exponents), train.field)[columns]
     core = invariant_core(data, exponents, columns, solve(vectors, train.vectors[:STOP].flatten(1)))
     core.ab[STOP] *= scales.stop_mm / stop_mm
-    return LensModel(
+    model = LensModel(
         lens=pairs.lens,
         domain=pairs.domain,
         encoding=data.encoding,
@@ -156,3 +155,4 @@ def _fit_node(
         method=settings.label,
         settings={"method": "ols", **asdict(settings), "rays_seed": settings.seed},
     )
+    return with_angle(model)

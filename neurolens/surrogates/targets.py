@@ -9,6 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from neurolens.optics.glass import inverse_square_um
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Core
@@ -118,3 +119,24 @@ def weighed_apart(lens: Lens, domain: Domain, vectors: Tensor, position_weight: 
     """
     position, direction = film_equivalent_weights(lens, domain)
     return torch.stack([direction * vectors[DIRECTION], position_weight * position * vectors[POSITION]])
+
+
+def fit_encoding(domain: Domain, passing: PairSet, *, mirror: bool = False) -> Encoding:
+    """Centre and scale by the passing rays of a domain; `mirror`: x and y by themselves, for lenses with cylinders."""
+    plain = Encoding(domain.film_z_mm[0], domain.pupil_z_mm, 0.0, 1.0, 1.0, 0.0, 0.0)
+    p, u = plain.planes(passing.inputs)
+    axes = [slice(0, 1), slice(1, 2)] if mirror else [slice(0, 2)]
+    chiefs = [float((p[a] * u[a]).sum() / (p[a] * p[a]).sum()) for a in axes]
+    scales = [float((u[a] - k * p[a]).norm(dim=0).max()) for a, k in zip(axes, chiefs, strict=True)]
+    shortest, longest = (float(inverse_square_um(v)) for v in domain.wavelength_nm)
+    return Encoding(
+        film_plane_z_mm=plain.film_plane_z_mm,
+        pupil_plane_z_mm=plain.pupil_plane_z_mm,
+        chief=chiefs[0],
+        film_scale_mm=float(p.norm(dim=0).max()),
+        pupil_scale_mm=scales[0],
+        w_middle=(shortest + longest) / 2,
+        w_half=(shortest - longest) / 2,
+        chief_y=chiefs[1] if mirror else None,
+        pupil_scale_y_mm=scales[1] if mirror else None,
+    )

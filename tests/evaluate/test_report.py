@@ -123,26 +123,6 @@ def test_every_picture_and_link_exists_and_nothing_needs_the_network(run_dir: Pa
     assert "http" not in path.read_text(encoding="utf-8")
 
 
-def test_it_says_what_to_use(run_dir: Path) -> None:
-    results = full_results("ols-40")
-    slow = {**results["models"][0], "name": "close", "rms_um": 0.01, "fused_ns_per_ray": {"min": 9.0}}
-    thin = {"name": "thin", "family": "paraxial", "rms_um": 1.0, "fused_ns_per_ray": {"min": 0.9}}
-    poor = {**results["models"][0], "name": "fast", "fused_ns_per_ray": {"min": 1.0}, "poor": ["false pass 3%"]}
-    models = [slow, thin, poor, *results["models"]]
-    exact = [{"name": "exact C", "available": True, "ns_per_ray": {"min": 26.0, "median": 27.0}}]
-    given = {**results, "models": models, "exact": exact, "lens": {**results["lens"], "file": "tessar.toml"}}
-    head = Page(write_report(run_dir, Results(**given)).read_text()).text.partition("Notes and warnings")[0]
-    assert "In this renderer use the exact lens" in head and f"--camera fused:{run_dir}/lenses/tessar.toml" in head
-    assert "In other programs use ols-40" in head and "3.25 ns a ray as C, 8 times as fast" in head
-    assert f"neurolens export {run_dir}/models/ols-40.onnx --to c" in head
-    target = {"within_um": 0.001, "met": False, "model": "close", "rms_um": 0.01}
-    given = {**given, "models": [slow], "target": target}
-    text = Page(write_report(run_dir, Results(**given)).read_text()).text
-    assert "In other programs use the exact lens" in text and "no model is within 0.001 um" in text
-    text = Page(write_report(run_dir, Results(**{**given, "exact": []})).read_text()).text
-    assert "use close" in text and "the closest, as none is within 0.001 um" in text
-
-
 def test_a_noisy_time_is_marked(run_dir: Path) -> None:
     """Where the median of the rounds is more than 1.1 times the least."""
     results = full_results("ols-40")

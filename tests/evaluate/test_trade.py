@@ -85,7 +85,8 @@ def test_a_trade_leaves_one_page_that_needs_nothing_else(tmp_path: Path, capsys:
     assert main(["plan", str(file), "--trade", *asked, "-o", str(folder)]) == 0
     said, told = capsys.readouterr().out, json.loads((folder / "trade.json").read_text())
     page = (folder / "trade.html").read_text()
-    assert all(src.startswith("data:image/png;base64,") for src in re.findall(r"(?:src|href)='([^']*)'", page))
+    sources = re.findall(r"(?:src|href)=[\"']([^\"']*)", page)
+    assert sources and all(source.startswith("data:image/png;base64,") for source in sources)
     assert page.count("<img") == 2 and "http" not in page and "<script" not in page
     cameras = {c["name"]: c for c in told["cameras"]}
     assert told["chosen"] in told["front"] and cameras["exact"]["error_px"] == 0 and cameras["exact"]["flip"] == 0

@@ -15,7 +15,7 @@ from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.optics.lensfile import read_lens
 from neurolens.optics.lenswriter import format_lens, write_lens
 from neurolens.optics.prescription import Coating, Configuration, Lens, Surface
-from neurolens.optics.sag import sag_mm
+from neurolens.optics.shapes import sag_mm
 
 # A cemented doublet, the stop, a meniscus; surfaces 0 to 5.
 GOOD = """

@@ -13,7 +13,7 @@ from experiments.extreme_cases import Case, disc, unit
 from experiments.extremes import measure
 from neurolens.base import status as st
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.sag import sag_mm
+from neurolens.optics.shapes import sag_mm
 from neurolens.optics.trace import Rays, trace
 
 RIM_MM = 10.0

@@ -16,7 +16,7 @@ from neurolens.graph.scalars import lower
 from neurolens.optics import tensors
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Coating, Lens, Surface
-from neurolens.optics.sag import sag_mm
+from neurolens.optics.shapes import sag_mm
 from neurolens.optics.trace import Rays, Traced, trace
 from neurolens.optics.tracegraph import exact_graph
 

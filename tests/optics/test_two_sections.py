@@ -22,7 +22,8 @@ from neurolens.optics.lensfile import read_lens
 from neurolens.optics.lenswriter import write_lens
 from neurolens.optics.paraxial import first_order
 from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.sag import meet_front, sag_and_derivatives, sag_mm
+from neurolens.optics.sag import meet_front
+from neurolens.optics.shapes import sag_and_derivatives, sag_mm
 from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays, trace
 from neurolens.surrogates.assemble import Form, sag

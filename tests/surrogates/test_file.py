@@ -1,8 +1,5 @@
 """Model files: the graph built from a file's coefficients against the file's own nodes, run by onnxruntime."""
 
-import re
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -125,24 +122,6 @@ def test_nodes_of_a_strangers_file_are_never_run(change: Callable[[ModelProto], 
     film, pupil = np.zeros((2, 50)), np.random.default_rng(0).uniform(-4, 4, (2, 50))
     for a, b in zip(whole.rays(film, pupil, 550.0), load_model(file).rays(film, pupil, 550.0), strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-def test_an_angle_that_version_0_1_0_did_not_store_is_traced(tmp_path: Path) -> None:
-    """Its coefficients have one node and no largest angle; without torch the message says how to export them again."""
-    whole = read_model(lens_models.exported("invariants"))
-
-    def as_before(data: dict) -> None:
-        data.update(data.pop("nodes")[0], schema=1)
-        del data["angle"]
-
-    old = lens_models.edited(whole.path, tmp_path / "old.onnx", as_before, MODEL_KEY)
-    assert read_model(old).nodes[0].angle == pytest.approx(whole.nodes[0].angle, rel=1e-12)
-    code = (
-        "import sys; sys.modules['torch'] = None\n"
-        f"from neurolens.surrogates.file import read_model; read_model({str(old)!r})"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
-    assert re.search(r"ModelError: .*neurolens export .* --to onnx", done.stderr)
 
 
 def test_hostile_terms_end_soon(tmp_path: Path) -> None:

@@ -12,7 +12,8 @@ from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.optics.glass import index_of
 from neurolens.optics.prescription import Surface
-from neurolens.optics.sag import entered, sag_and_derivatives
+from neurolens.optics.sag import entered
+from neurolens.optics.shapes import sag_and_derivatives
 from neurolens.surrogates.assemble import refracted, tilt_series
 from neurolens.surrogates.cores import Refracted
 from neurolens.surrogates.fit import ModelSettings, fit_model

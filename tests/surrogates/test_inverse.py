@@ -15,7 +15,7 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.optics.pupils import camera_rays
-from neurolens.optics.sag import sag_and_derivatives
+from neurolens.optics.shapes import sag_and_derivatives
 from neurolens.optics.surfaces import Rays
 from neurolens.optics.trace import film_derivatives, trace_differentials
 from neurolens.surrogates.domain import FilmRays, sample_domain

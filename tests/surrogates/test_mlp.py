@@ -23,11 +23,11 @@ from neurolens.surrogates.fits import network as networks
 from neurolens.surrogates.fits.network import fit_network, with_boundary_terms
 from neurolens.surrogates.fits.projection import Problem, Stand, activations, minimise, normal_equations, project
 from neurolens.surrogates.gates import choose_gates
-from neurolens.surrogates.lightfield import LightField, fit_encoding
+from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.pairs import PairSettings, make_pairs, trace_pairs
+from neurolens.surrogates.pairs import PairSettings, make_pairs, trace_pairs, with_angle
 from neurolens.surrogates.settings import ModelSettings
-from neurolens.surrogates.targets import Prepared, film_equivalent_weights, scales_of, targets_of
+from neurolens.surrogates.targets import Prepared, film_equivalent_weights, fit_encoding, scales_of, targets_of
 
 LENSES = Path(__file__).parents[2] / "lenses"
 F64 = torch.float64
@@ -108,9 +108,8 @@ def test_directions_that_no_ray_of_the_lens_has_lie_outside_the_domain(singlet, 
 
 
 def _model(data, core) -> LensModel:
-    return LensModel(
-        data.pairs.lens, data.pairs.domain, data.encoding, scales_of(data.pairs.lens), data.gates, core, "mlp"
-    )
+    pairs, scales = data.pairs, scales_of(data.pairs.lens)
+    return with_angle(LensModel(pairs.lens, pairs.domain, data.encoding, scales, data.gates, core, "mlp"))
 
 
 def _weights(network: Network) -> torch.Tensor:

@@ -23,11 +23,10 @@ from neurolens.surrogates.fits import polynomial
 from neurolens.surrogates.fits.boundaries import stop_crossing
 from neurolens.surrogates.fits.polynomial import ParaxialMethod, fit_paraxial, fit_polynomial
 from neurolens.surrogates.gates import choose_gates
-from neurolens.surrogates.lightfield import fit_encoding
 from neurolens.surrogates.model import LensModel, Prediction
 from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, trace_pairs
 from neurolens.surrogates.settings import ModelSettings
-from neurolens.surrogates.targets import Prepared, film_equivalent_weights, scales_of
+from neurolens.surrogates.targets import Prepared, film_equivalent_weights, fit_encoding, scales_of
 
 ROOT = Path(__file__).parents[2] / "lenses"
 

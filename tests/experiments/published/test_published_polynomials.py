@@ -33,10 +33,9 @@ from neurolens.optics.trace import Rays, trace
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.fits.polynomial import ideal_map
-from neurolens.surrogates.lightfield import fit_encoding
 from neurolens.surrogates.model import Encoding
 from neurolens.surrogates.pairs import trace_pairs
-from neurolens.surrogates.targets import scales_of
+from neurolens.surrogates.targets import fit_encoding, scales_of
 
 FAST = {
     "dense": PublishedSettings("hanika", basis="raw", degree=3),
