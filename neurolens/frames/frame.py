@@ -1,8 +1,8 @@
 """A `Frame` holds everything that decides one picture; `prepare` reads the files that it names and checks it.
 
 frame = Frame.of("experiments/scenes/room.toml", "lenses/cooke_triplet_50.toml", f_number=4.0, samples=16)
-made = prepare(frame, Path("room.exr"))
-picture = made.render(threads=2).rgb
+prepared = prepare(frame, Path("room.exr"))
+picture = prepared.render(threads=2).rgb
 """
 
 from __future__ import annotations
