@@ -176,10 +176,10 @@ def test_zoom_is_an_input() -> None:
 def test_a_zoom_whose_stop_changes_and_whose_rims_cut_on_both_sides() -> None:
     """One set of operations serves its states, and hardly any ray that passes is lost, between nodes either."""
     made = zoom("nikon_zoom_70_200-range.states-64", knots=(90.0, 130.0))
-    first, *others = (c.pupil for c in made.nodes)
-    assert len({c.lens.stop_radius_mm for c in made.nodes}) == 3 and len(first.numbers) >= 2
-    for state, lens in [(np.array([0.0, 1.0, 0.0]), made.nodes[1].lens), *made.between]:
-        counts, missed = missed_by_zone(lens, first.mixed(others, state), 0.8 * reach_of(lens))
+    assert len({c.lens.stop_radius_mm for c in made.nodes}) == 3
+    for shown, pupil in made.states()[1:]:
+        assert isinstance(pupil, PupilCircles) and len(pupil.numbers) >= 2
+        counts, missed = missed_by_zone(shown, pupil, 0.8 * reach_of(shown))
         assert missed.sum() <= 1e-3 * counts.sum()
 
 
@@ -244,7 +244,7 @@ BICONVEX = "thorlabs_lb1471_biconvex_50.ols-64"  # far off its axis two parts of
 @pytest.mark.parametrize(
     "name, least",
     [
-        pytest.param("phone_lens_6.ols-64", 0.94, marks=pytest.mark.slow),
+        pytest.param("phone_lens_6.ols-64", 0.95, marks=pytest.mark.slow),
         ("muller_fisheye_100.ols-64", 0.95),
         pytest.param("panavision_anamorphic_zoom_21.ols-64", 0.95, marks=pytest.mark.slow),
         pytest.param("sony_sonnar_55.ols-64", 0.95, marks=pytest.mark.slow),
