@@ -6,6 +6,7 @@ lengths or checksums are taken apart and put together again, so that the damage 
 
 from __future__ import annotations
 
+import base64
 import io
 import random
 import re
@@ -99,8 +100,15 @@ def _number(chance: Chance) -> bytes:
 
 
 def damage_message(chance: Chance, data: bytes, depth: int = 0) -> bytes:
-    """A message of Protocol Buffers with one field, at any depth, left out, repeated, emptied or changed."""
+    """A message of Protocol Buffers with one field, at any depth, left out, repeated, emptied or changed.
+
+    Coefficients, which are deflated JSON in base64, are damaged as JSON: checksums would refuse any other change.
+    """
     from neurolens.graph.protobuf import message, walk
+
+    with suppress(ValueError, zlib.error):
+        text = zlib.decompress(base64.b64decode(data, validate=True))
+        return base64.b64encode(zlib.compress(damage_text(chance, text)))
 
     try:
         fields = [(n, w, v if isinstance(v, int) else bytes(v)) for n, w, v in walk(memoryview(data))]
@@ -109,8 +117,10 @@ def damage_message(chance: Chance, data: bytes, depth: int = 0) -> bytes:
     if not fields:
         return (damage_text if data.isascii() else damage_bytes)(chance, data)
     k = chance.randrange(len(fields))
-    if depth == 0 and chance.random() < 0.9:  # the graph or the metadata, not the version
-        k = chance.choice([k for k, field in enumerate(fields) if not isinstance(field[2], int) and len(field[2]) > 99])
+    long = [k for k, field in enumerate(fields) if not isinstance(field[2], int) and len(field[2]) > 99]
+    if depth == 0 and long and chance.random() < 0.9:  # the card or the coefficients, not the version
+        metadata = [k for k in long if fields[k][0] == 14]
+        k = chance.choice(metadata if metadata and chance.random() < 0.9 else long)
     number, wire, value = fields[k]
     if isinstance(value, bytes) and wire == 2 and chance.random() < 0.85:
         new: list[tuple[int, int, Any]] = [(number, wire, damage_message(chance, value, depth + 1))]

@@ -129,7 +129,9 @@ def fit_all(folder: Path) -> None:
         f"{lens}.{row.name}": (lens, row)
         for lens, groups in FIT_LENSES.items()
         for row in find("all_rows")()
-        if row.group in groups and (lens == GAUSS or not row.weights) and f"{lens}.{row.name}" not in SLOW_FITS
+        if row.group in groups
+        and (lens == GAUSS or not getattr(row, "weights", None))
+        and f"{lens}.{row.name}" not in SLOW_FITS
     }
     for name in progress([n for n in (*rows, "zoom.states") if not (folder / f"{n}.npz").exists()], "fits"):
         found: dict[str, Any] = {}
@@ -144,7 +146,7 @@ def fit_all(folder: Path) -> None:
                     found |= dict(arrays_of(getattr(part, what), f"{what}.{k}"))
             file = folder / f"{name}.onnx"
             find("export_onnx" if row else "export_states")(model, file, {})
-            if row and row.weights:
+            if row and getattr(row, "weights", None):  # of older trees
                 find("store_weights")(file, file, row.weights, {})
         except Exception as error:  # a method that refuses a lens, or has no graph
             found["refused"] = np.array(f"{type(error).__name__}: {error}")

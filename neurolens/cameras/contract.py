@@ -133,11 +133,7 @@ class DifferentialCamera(Camera, Protocol):
     """What all cameras of this package know besides; `Vignetted` but for `natural`."""
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Sample rays as `sample` does, and give their differentials, too.
-
-        Raises:
-            InputError: an exported model without derivatives.
-        """
+        """Sample rays as `sample` does, and give their differentials, too."""
         ...
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:

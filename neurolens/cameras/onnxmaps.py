@@ -18,7 +18,7 @@ from neurolens.graph.onnx import write_onnx
 from neurolens.optics.sag import front_rays
 from neurolens.optics.shapes import Shape
 from neurolens.surrogates.assemble import ONNX
-from neurolens.surrogates.file import ModelFile, read_model
+from neurolens.surrogates.file import ModelFile, check_size, read_model
 from neurolens.surrogates.inverse import Guess, front_index, scene_graph, stop_graph
 
 # Rays a call: these graphs have more rows than those of models alone.
@@ -159,7 +159,9 @@ def _load(path: Path, name: str, lens: str | None, threads: int) -> tuple[Any, M
     build = stop_graph if name == "stop" else scene_graph
     try:
         with np.errstate(all="ignore"):
-            data = write_onnx(build(file.nodes[0], Guess.unpacked(file.more["guess"]), ONNX), {})
+            guess = Guess.unpacked(file.more["guess"])
+            check_size((guess.exponents, guess.ab))
+            data = write_onnx(build(file.nodes[0], guess, ONNX), {})
     except (ValueError, TypeError, KeyError, IndexError, ArithmeticError, AttributeError) as error:
         raise ModelError(f"{path}: its first guess is damaged ({type(error).__name__}: {error})") from error
     inputs = {_GIVEN[name]: ("tensor(float)", 5, None), **_CALL}

@@ -51,7 +51,7 @@ examples:
   neurolens export models/NAME.onnx --to c -o cam.h --whole-camera --focus 2 --f-number 2.8 --derivatives
   neurolens export models/NAME.onnx --to osl -o lens.osl                  # for Blender; lenses/NAME.toml: exact
   neurolens export models/NAME.onnx --to onnx -o laser.onnx --fix wavelengths=633
-  neurolens export models/NAME.onnx --to onnx -o lens.onnx --derivatives  # for ray differentials
+  neurolens export models/NAME.onnx --to onnx -o lens.onnx --derivatives  # for ray differentials elsewhere
   neurolens export models/NAME.onnx --to onnx -o a.onnx --inverse         # and a.stop.onnx, a.scene.onnx"""
 _PARTS = ("ray", "transmittance", "stop", "vignetting")
 _FIXED = ("wavelengths", "film_z", "focus", "stop", "f_number")

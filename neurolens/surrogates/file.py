@@ -46,9 +46,9 @@ _MAX_ROWS = 20_000  # of any array: terms, or units of a layer
 _MAX_DEGREE = 64  # of any term; settings allow half, and growth without limit stays far below
 _MAX_RAYS = 1000  # of the card's reference; `card.reference_rays` gives 4 a status
 _MAX_NODES = 256  # states of one model
-# Of a graph: rows that a ray has at a time, monomials included, and numbers. The largest that settings allow have 5,000
-# and 1.9 million.
-_MAX_WORK, _MAX_WEIGHTS = 10_000, 2_000_000
+# Of a model: terms and units, each of which is a row for every ray; numbers; and ways in which terms are products of
+# two others, all of which a writer compares. The largest that settings allow have 5,000, 1.9 and one million.
+_MAX_WORK, _MAX_WEIGHTS, _MAX_PRODUCTS = 10_000, 2_000_000, 3_000_000
 _MAX_SURFACES, _MAX_TERMS, _MAX_POWER = 500, 1000, 40  # of a prescription, as `optics.lensfile` has them
 _LENS = ("name", "source", "f_number", "image_radius_mm", "half_field_deg", "designer", "rims", "film_z_mm", "path")
 _NOWHERE = -1.0  # A film position in no domain: it takes the place of the film where the state is out of range.
@@ -94,14 +94,15 @@ def read_model(path: str | Path) -> ModelFile:
     metadata = read_metadata(file)
     card = card_in(file, metadata)
     check_card(file, card)
+    again = "export it again (`neurolens train` fits the model and writes its file with them)"
     if MODEL_KEY not in metadata:
-        raise ModelError(
-            f"{file}: it holds no coefficients, from which its graph would be built: export it again "
-            "(`neurolens train` fits the model and writes its file with them)"
-        )
+        raise ModelError(f"{file}: it holds no coefficients, from which its graph would be built: {again}")
     try:
         with np.errstate(all="ignore"):
-            data = coefficients_in(metadata[MODEL_KEY])
+            data = json.loads(inflated(metadata[MODEL_KEY]))
+            check_tree(data, "coefficients")
+            if data["schema"] != SCHEMA:
+                raise ModelError(f"{file}: coefficients: schema: got {data['schema']!r}, expected {SCHEMA}: {again}")
             model = ModelFile(file, card, _nodes(file, card, data), data)
             _check_reference(model)
     except _DAMAGE as error:
@@ -109,15 +110,6 @@ def read_model(path: str | Path) -> ModelFile:
             raise
         raise ModelError(f"{file}: its coefficients are damaged ({type(error).__name__}: {error})") from error
     return model
-
-
-def coefficients_in(text: str) -> dict[str, Any]:
-    """The JSON of a metadata entry of coefficients. Raises ValueError: damaged, or of another schema."""
-    data = json.loads(inflated(text))
-    check_tree(data, "coefficients")
-    if data["schema"] != SCHEMA:
-        raise ValueError(f"schema: got {data['schema']!r}, expected {SCHEMA}: `neurolens train` writes the file anew")
-    return dict(data)
 
 
 def _nodes(file: Path, card: Mapping[str, Any], data: Mapping[str, Any]) -> tuple[LensModel, ...]:
@@ -154,30 +146,33 @@ def _nodes(file: Path, card: Mapping[str, Any], data: Mapping[str, Any]) -> tupl
         )
         for part, domain in zip(parts, domains, strict=True)
     )
-    _check_size(nodes[0].core)
+    check_size(nodes[0].core)
     return nodes
 
 
-def _check_size(core: Core) -> None:
-    """Refuse work beyond reason before a graph is made of a core.
+def check_size(core: Any) -> None:
+    """Refuse work beyond reason before a graph is made of a core, or of a tuple of arrays.
 
     Raises:
-        ValueError: more than `_MAX_WORK` rows of a ray, monomials included, or more than `_MAX_WEIGHTS` numbers.
+        ValueError: more terms and units, numbers or products than the limits above.
     """
-    rows = weights = 0
+    rows = weights = products = 0
     left: list[Any] = [core]
     while left:
         value = left.pop()
         if isinstance(value, np.ndarray):
-            rows, weights = rows + (value.shape[0] if value.dtype.kind == "i" else 0), weights + value.size
-            rows += value.shape[0] if value.dtype.kind == "f" and value.ndim == 1 else 0  # units of a layer
+            exponents = value.dtype.kind == "i"
+            rows += len(value) if exponents or value.ndim == 1 else 0  # terms, or units of a layer
+            products += int(np.prod(value + 1, axis=-1).sum()) if exponents else 0
+            weights += value.size
         elif isinstance(value, tuple):
             left += value
         elif isinstance(value, Core):
             left += [getattr(value, f.name) for f in fields(value)]  # type: ignore[arg-type]
-    if rows > _MAX_WORK or weights > _MAX_WEIGHTS:
+    if rows > _MAX_WORK or weights > _MAX_WEIGHTS or products > _MAX_PRODUCTS:
         raise ValueError(
-            f"{rows} terms and units and {weights} numbers, expected at most {_MAX_WORK} and {_MAX_WEIGHTS}"
+            f"{rows} terms and units, {weights} numbers and {products} products of terms, expected at most "
+            f"{_MAX_WORK}, {_MAX_WEIGHTS} and {_MAX_PRODUCTS}"
         )
 
 
