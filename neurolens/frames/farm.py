@@ -114,9 +114,8 @@ def render_frames(
                 pictures[picture.out] = _finish(picture, prepared)
             done += 1
             report(done / count)
-        pictures |= {
-            picture.out: _finish(picture, prepared) for picture in todo if picture.tiles
-        }  # whose tiles were there
+        # Pictures whose tiles were all there.
+        pictures |= {picture.out: _finish(picture, prepared) for picture in todo if picture.tiles}
     with suppress(OSError):
         for stale in folder.glob("*.tile-*.exr"):
             stale.unlink()
