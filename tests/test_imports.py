@@ -72,6 +72,7 @@ PACKAGES = {
 EXCEPTIONS: dict[str, tuple[set[str], set[str]]] = {
     "neurolens.base.cluster": (set(), {"dask", "distributed"}),  # where a cluster is asked for
     # Methods that take tensors: torch is loaded where one is called.
+    "neurolens.surrogates.file": ({"surrogates"}, {"torch"}),
     "neurolens.surrogates.cores": ({"surrogates"}, {"torch"}),
     "neurolens.surrogates.model": ({"surrogates"}, {"torch"}),
     "neurolens.surrogates.inverse": ({"surrogates"}, {"torch"}),

@@ -39,6 +39,7 @@ from neurolens.surrogates.cores import CORES, Core
 from neurolens.surrogates.model import Domain, Encoding, Gate, LensModel, Scales, mixed, with_one_angle
 
 SCHEMA = 2
+_ONE_NODE = 1  # an earlier schema: one state, and no angle
 _MAX_TEXT = 16 * 2**20  # of the JSON; the largest models known take 100 kB
 _MAX_DEPTH = 16  # of cores in cores
 _MAX_CORES = 1000  # of one file
@@ -101,7 +102,7 @@ def read_model(path: str | Path) -> ModelFile:
         with np.errstate(all="ignore"):
             data = json.loads(inflated(metadata[MODEL_KEY]))
             check_tree(data, "coefficients")
-            if data["schema"] != SCHEMA:
+            if data["schema"] not in (_ONE_NODE, SCHEMA):
                 raise ModelError(f"{file}: coefficients: schema: got {data['schema']!r}, expected {SCHEMA}: {again}")
             model = ModelFile(file, card, _nodes(file, card, data), data)
             _check_reference(model)
@@ -115,7 +116,7 @@ def read_model(path: str | Path) -> ModelFile:
 def _nodes(file: Path, card: Mapping[str, Any], data: Mapping[str, Any]) -> tuple[LensModel, ...]:
     states = card.get("states")
     domains = [node["domain"] for node in states["nodes"]] if states else [card["domain"]]
-    parts = data["nodes"]
+    parts = [data] if data["schema"] == _ONE_NODE else data["nodes"]
     if len(parts) != len(domains) or len(parts) > _MAX_NODES:
         raise ValueError(f"{len(parts)} nodes, expected {len(domains)}, at most {_MAX_NODES}")
     lens, gates = unpacked_lens(data["lens"]), tuple(Gate(int(k), int(r)) for k, r in data["gates"])
@@ -133,8 +134,10 @@ def _nodes(file: Path, card: Mapping[str, Any], data: Mapping[str, Any]) -> tupl
         fit_s=float(card["fit"]["seconds"]),
         direction="slope" if data["direction"] == "slope" else "angle",
         transmittance=transmittance_of(card),
-        angle=float(data["angle"]),
+        angle=float(data.get("angle", math.pi)),
     )
+    if "angle" not in data:
+        common = _traced(file, common)
     if not 0 < common.angle <= math.pi:
         raise ValueError(f"angle: got {common.angle!r}, expected above 0, up to pi")
     nodes = tuple(
@@ -174,6 +177,18 @@ def check_size(core: Any) -> None:
             f"{rows} terms and units, {weights} numbers and {products} products of terms, expected at most "
             f"{_MAX_WORK}, {_MAX_WEIGHTS} and {_MAX_PRODUCTS}"
         )
+
+
+def _traced(file: Path, model: LensModel) -> LensModel:
+    """The model with the largest angle of its rays, which files of the first schema do not hold."""
+    try:
+        from neurolens.surrogates.pairs import with_angle
+    except ModuleNotFoundError as error:
+        raise ModelError(
+            f"{file}: an old file, which only a machine with torch reads: there `neurolens export MODEL.onnx --to onnx "
+            "-o NEW.onnx` writes it as others read it"
+        ) from error
+    return with_angle(model)
 
 
 def _check_reference(model: ModelFile) -> None:

@@ -56,7 +56,7 @@ def test_a_camera_as_source_gives_its_own_rays(kind: str) -> None:
     assert np.abs(np.stack(rows) - [*wanted.origin_m, *wanted.direction])[:, both].max() < 5e-6
     np.testing.assert_allclose(found["weight"][both], wanted.weight[both], rtol=2e-4)
     assert not found["weight"][found["status"] != st.PASSED].any()
-    pupil, area = made.film.pupil.sample(film, square, wavelength)
+    pupil, area = made.film.outline.sample(film, square, wavelength)
     np.testing.assert_allclose([found["pupil_x_mm"], found["pupil_y_mm"]], pupil, atol=2e-4)
     np.testing.assert_allclose(found["area_mm2"], area, rtol=1e-3)
     if isinstance(made, ExactCamera):

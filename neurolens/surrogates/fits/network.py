@@ -22,6 +22,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.kept import Kept
 from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, InvariantPolynomial, Network, Residual
+from neurolens.surrogates.fits import checkpoint as kept_training
 from neurolens.surrogates.fits.boundaries import (
     MOST_NETWORK_TERMS,
     boundary_terms,
@@ -29,7 +30,7 @@ from neurolens.surrogates.fits.boundaries import (
     fit_stop,
     solve_scalars,
 )
-from neurolens.surrogates.fits.checkpoint import EVERY_S, fingerprint
+from neurolens.surrogates.fits.checkpoint import fingerprint
 from neurolens.surrogates.fits.projection import Problem, Projection, Stand, activations, minimise, project
 from neurolens.surrogates.gates import boundary_weights, gate_values
 from neurolens.surrogates.lightfield import LightField
@@ -88,7 +89,7 @@ def fit_network(
         decisive = {name: getattr(settings, name) for name in ("units", "layers", "steps", "seed")}
         key = fingerprint(problem.tensors, {**decisive, "starts": STARTS, "rays": RAYS})
         enough = (_ENOUGH * 1000 * data.pairs.domain.film_radius_mm) ** 2
-        best = Training(problem, settings, enough, Kept(checkpoint, key, EVERY_S), progress).run()
+        best = Training(problem, settings, enough, Kept(checkpoint, key, kept_training.EVERY_S), progress).run()
     if progress:
         progress(1.0)
     *hidden, output = ((w[:, :-1].numpy().copy(), w[:, -1].numpy().copy()) for w in (*best.hidden, best.output))
