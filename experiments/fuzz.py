@@ -44,7 +44,7 @@ __all__ = ["KINDS", "SEEDS", "run_cases"]
 
 CPU_S, LONG_CPU_S, WALL_S, MEMORY = 10.0, 60.0, 300.0, 2 << 30
 _BATCH = 200
-_JUDGES = ("evaluate", "models", "library", "survey", "train", "bench")  # their exit code 1 is an answer
+_JUDGES = ("evaluate", "models", "library", "survey", "train")  # their exit code 1 is an answer
 _LOADED = (
     *("onnxruntime", "torch", "onnx", "matplotlib.pyplot", "sklearn.linear_model", "neurolens.readers.any_format"),
     *("neurolens.surrogates.export", "neurolens.render.renderer", "neurolens.render.scene", "neurolens.cameras.build"),

@@ -236,7 +236,7 @@ def _of_words(chance: Chance, folder: Path) -> Words:
         ["projection", "thin", *_FILM, "--model", "opencv"], ["evaluate", "model.onnx", "--rays", "1000", "--quiet"],
         ["blender", "add", "model.onnx", "--to", "pack.zip", "--quiet"], ["view", "model.onnx", "--downloads", "glsl"],
         ["survey", "fold", "--no-fit", "-o", "new", "--quiet"], ["plan", "scene.toml", "--lens", "missing"],
-        ["train", "missing.toml"], ["bench", "missing"], ["mitsuba", "cornell-box"],
+        ["train", "missing.toml"], ["mitsuba", "cornell-box"],
     )  # fmt: skip
     words = list(chance.choice(fine))
     options = [o for o in parsers()[words[0]] if o not in _LONG]

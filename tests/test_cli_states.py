@@ -82,7 +82,7 @@ def test_the_surface_table_hides_nothing(tmp_path: Path, capsys: pytest.CaptureF
 def test_a_place_that_cannot_be_written_is_found_before_the_render(
     scene: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("neurolens.render.renderer.render", lambda *_, **__: pytest.fail("rendered for nothing"))
+    monkeypatch.setattr("neurolens.frames.frame.render", lambda *_, **__: pytest.fail("rendered for nothing"))
     line = failure(capsys, "render", scene, "--camera", "thin", "-o", _NOWHERE, "--quiet")
     assert str(_NOWHERE) in line and ".tmp" not in line
     with pytest.raises(OSError, match=str(_NOWHERE)) as refused:

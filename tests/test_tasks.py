@@ -386,14 +386,27 @@ def test_records_of_a_survey_are_those_of_one_machine(cluster: str, lenses: list
     assert found[0] == found[1] and len(found[0]) == 2
 
 
+LAMP = """
+points = [{ position_m = [-0.3, 1.3, 0.0], intensity = [2.0, 1.0, 0.5] }]
+[camera]
+position_m = [0.0, 1.0, 2.0]
+look_at_m = [0.0, 1.0, 0.0]
+focus_m = 2.0
+film_height_mm = 24.0
+[flare]
+bins = 3
+brightest = 1
+cell_px = 64.0
+"""
+
+
 @pytest.mark.slow
 def test_the_documented_script_renders_one_picture_in_three_ways(tmp_path: Path) -> None:
     """A frame rendered at once, in tiles that are merged, and on Dask has the same channels, its flare's among them."""
     (script,) = re.findall(
         r'```python title="farm.py"\n(.*?)```', (ROOT / "docs/pages/how-to/farm.md").read_text(), re.S
     )
-    scene = (ROOT / "experiments" / "scenes" / "lights.toml").read_text()
-    (tmp_path / "lights.toml").write_text(f"{scene}\n[flare]\nbins = 3\nbrightest = 1\ncell_px = 64.0\n")
+    (tmp_path / "lights.toml").write_text(LAMP)
     (tmp_path / "farm.py").write_text(script.replace("experiments/scenes/", ""))
     subprocess.run([sys.executable, "farm.py"], cwd=tmp_path, check=True, timeout=600)
     one, *others = (read_channels(tmp_path / f"{name}.exr")[0] for name in ("one", "tiled", "farm"))

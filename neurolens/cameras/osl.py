@@ -1,13 +1,13 @@
 """Cameras as shaders of Blender's Cycles (4.5 and later), in Open Shading Language.
 
-The whole camera is a graph: from the place in the picture and two random numbers to a weighted ray, at any stop and
+The whole camera is a graph: from a point of the picture and two random numbers to a weighted ray, at any stop and
 focus of the lens. Inputs of the shader (`PARAMETERS`) are numbers when the renderer compiles it, and what depends on
 them alone costs nothing then. Besides them it reads, of Blender's camera, the sensor's size (with its fit and the
-picture's aspect) and, where `focus_m` is 0, the distance of depth of field; shift moves the place in the picture.
+picture's aspect) and, where `focus_m` is 0, the distance of depth of field; shift moves the point in the picture.
 This distance and the places of the rays are in units of the scene, which are `unit_m` metres long.
 
 Of a lens in several states (zoom, internal focus) every number of the camera follows the state, mixed from cameras at
-the nodes of its axes as a model's own numbers are: the zoom is an input, internal focus the distance in focus.
+the nodes of its axes as a model's numbers are: the zoom is an input, internal focus the distance in focus.
 
 One of the two random numbers tells the wavelength by its low bits, which leaves both as even as they were. Its colour
 weights are Bernstein's polynomials of second order: never negative, of mean 1 each.
@@ -59,7 +59,7 @@ _LOW_BITS = 4096.0  # of a random number: what lies below 1 / 4096 of it
 _NEARLY, _EDGES = 0.99, 0.75  # of rays beyond this share of the stop's radius: their places at the stop are known
 _LEAST = 1.7e-3  # of the stop's radius, by which blades are widened; no other number of a graph, which would share it
 _QUADRATURE = 64  # points a side of the exposure on the axis
-_NEAR, _ROUNDS = 0.999, 4  # of the near limit: rounding; that place a film
+_NEAR, _ROUNDS = 0.999, 4  # of the near limit, for rounding; of finding the film's position
 # Errors of derivatives, whose mean size Cycles takes, by output and in all; nothing is nearer than this share of focus.
 _DERIVATIVES, _WORST, _SEEN = 0.05, 0.05, 0.25
 _ACROSS, _FILM_POWERS = 16, (7, 5)  # distances and stops at which the film is placed; powers of stop and distance
@@ -269,8 +269,7 @@ class _Call:
         self.share = (camera.lens.f_number / self.number("f_number")).minimum(1.0)
         # Named, for it equals the unit of the pupil's numbers in some states of a lens only.
         self.stop = self.share * g.constant(camera.lens.stop_radius_mm, "stop radius")
-        at_pupil, asked = self.number("at_pupil"), self.number("asked_m")
-        away = _away(asked)
+        at_pupil, away = self.number("at_pupil"), _away(self.number("asked_m"))
         ways = zip(camera.film, camera.nearest_m, strict=True)
         places = (_in_turn(g, f, self.share, (near / away).clip(0.0, 1.0)) for f, near in ways)
         self.film_z = g.select(at_pupil <= 0.5, *places)
@@ -316,12 +315,12 @@ def _light(camera: OslCamera, random: Value, in_colour: Value) -> tuple[Value, V
     """Wavelength and colour weights [3] of a ray, red to blue."""
     g, (short, long) = random.graph, camera.lens.wavelength_nm
     fine = random * _LOW_BITS
-    place = fine - fine.floor()
-    rest = 1.0 - place
+    part = fine - fine.floor()
+    rest = 1.0 - part
     grey = in_colour <= 0.5
     reference = min(max(LINE_D_NM, short), long)
-    nanometres = g.select(grey, reference, place * (short - long) + long)
-    colour = g.concat(rest * rest * 3.0, place * rest * 6.0, place * place * 3.0)
+    nanometres = g.select(grey, reference, part * (short - long) + long)
+    colour = g.concat(rest * rest * 3.0, part * rest * 6.0, part * part * 3.0)
     return nanometres, g.select(grey, 1.0, colour)
 
 
@@ -375,21 +374,21 @@ def _film(focusing: Focusing, entrance_mm: float) -> tuple[Array, tuple[float, f
     side = (1 - np.cos(np.pi * (np.arange(_ACROSS) + 0.5) / _ACROSS)) / 2
     share, vergence = (a.ravel() for a in np.meshgrid(SMALLEST + (1 - SMALLEST) * side, side if moves else [0.0]))
 
-    def place(share: Array, away_m: Array, at_pupil: bool) -> Array:
+    def position(share: Array, away_m: Array, at_pupil: bool) -> Array:
         z = np.full(share.shape, entrance_mm)
         for _ in range(_ROUNDS):  # distances are from the film there
             away = away_m + (z - entrance_mm) * (at_pupil * 1e-3)
             call = {FOCUS: away, STOP_RADIUS: share * focusing.stop_radius_mm}
-            found = evaluate(function.graph, {name: value[None] for name, value in call.items()})["film_z_mm"][0]
-            z = np.broadcast_to(found.astype(np.float64), share.shape)
+            film = evaluate(function.graph, {name: value[None] for name, value in call.items()})["film_z_mm"][0]
+            z = np.broadcast_to(film.astype(np.float64), share.shape)
         return z
 
     nearest = ahead = focusing.nearest_m if moves else 1.0
     if moves:
-        ahead -= float(place(np.ones(1), np.full(1, nearest), False)[0] - entrance_mm) * 1e-3
+        ahead -= float(position(np.ones(1), np.full(1, nearest), False)[0] - entrance_mm) * 1e-3
     powers, at = (_FILM_POWERS[0], _FILM_POWERS[1] if moves else 1), np.stack([share, vergence], 1)
-    places = [place(share, near / np.maximum(vergence, 1e-9), near != nearest) for near in (nearest, ahead)]
-    return np.stack([_powers(at, z, powers) for z in places]), (nearest, ahead)
+    positions = [position(share, near / np.maximum(vergence, 1e-9), near != nearest) for near in (nearest, ahead)]
+    return np.stack([_powers(at, z, powers) for z in positions]), (nearest, ahead)
 
 
 def model_lens(model: OnnxLens, graph: Graph | None, report: Report, *, fixed: bool = False) -> OslLens:

@@ -227,7 +227,7 @@ class _Shape:
 def _within_blades(
     disc: Value, shape: _Shape, at_stop: Callable[[Value, Value], Value], blades: Blades, margin: float
 ) -> Value:
-    """The share of the way from the middle of the disc to a point which keeps it within the blades."""
+    """By which factor a point of the disc is moved towards the middle, to lie within the blades."""
     g = disc.graph
     centre, _ = shape.chord(g.constant(0.0))
     start = at_stop(shape.middle, g.constant(0.0) if centre is None else centre)
@@ -259,7 +259,7 @@ def unit_disc(square: Value) -> Value:
 
 
 def _series(function: Callable[[Array], Array]) -> Array:
-    """Of squares of angles of up to pi / 4, in units of that: to float32's last bit."""
+    """The polynomial of a function of squares of angles up to pi / 4, in units of that, to float32's last bit."""
     fit = np.polynomial.Chebyshev.interpolate(function, 3, [0, 1])
     return np.asarray(fit.convert(kind=np.polynomial.Polynomial).coef, np.float64)
 

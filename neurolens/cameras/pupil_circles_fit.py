@@ -44,7 +44,7 @@ _WEIGHTS, _HEAVIER = (2.0, 5.0, 3e4), 1.6  # of rays that pass: least, first and
 _GOAL = 2e-4  # the share of a zone's rays that a circle may lose while it is fitted
 _RIDGE, _LEAST, _FLATTEST = 1e-9, 1e-4, 0.02  # of Newton's matrix; of a circle's curvature by its greatest number
 _CALM = 1e-3  # rays, by whose force numbers stay at those that all states share
-_HELD = (6e-4, 6e-4, 4e-4, 2e-4)  # shares of a zone's new rays that all circles may lose, in turn until at most
+_ALLOWED = (6e-4, 6e-4, 4e-4, 2e-4)  # shares of a zone's new rays that all circles may lose, in turn until at most
 LOST = 1e-3  # of a zone's rays are lost in all
 _NEIGHBOUR = 0.3  # of the greatest weight, which nodes beside a state have
 _INNER = 0.1  # zones of a smaller part of what `PupilCircles.wide` grows by count as the axis
@@ -116,15 +116,15 @@ def _widened(
     """Circles as much wider as new random rays need, and the share that they lose of others."""
     states = [*zip(np.eye(len(pupils)), lenses, strict=True), *between]
     lost = 1.0
-    for seed, held in enumerate((*_HELD, 0.0)):
+    for seed, allowed in enumerate((*_ALLOWED, 0.0)):
         lost_of = []
         for weights, lens in states:
             mixed = pupils[0].mixed(pupils[1:], weights)
             rays = _drawn(lens, mixed, 1 + seed)
             within = evaluate(mixed.checked, rays.inputs)["within"]
             lost_of.append(_lost(rays, within))
-            if held and (seed == 0 or lost_of[-1] > LOST):
-                needs = [[n for _, n in _needs(rays, margin, held / len(within))] for margin in within[1:]]
+            if allowed and (seed == 0 or lost_of[-1] > LOST):
+                needs = [[n for _, n in _needs(rays, margin, allowed / len(within))] for margin in within[1:]]
                 more = np.array([max([0.0, *need]) for need in needs])
                 near = weights > _NEIGHBOUR * weights.max()  # the nodes on both sides of a state between them
                 more /= weights[near].sum()
@@ -156,8 +156,8 @@ def _fit_first(
     few = [r.first(_FIRST // len(rays)) for r in rays]
     for k, code in enumerate(rims):
         rows = [np.flatnonzero(r.passed | (r.codes == code)) for r in few]
-        features = [_features(r, p, exponents, own) for r, p, own in zip(few, pupils, rows, strict=True)]
-        inside = np.concatenate([r.passed[own] for r, own in zip(few, rows, strict=True)])
+        features = [_features(r, p, exponents, chosen) for r, p, chosen in zip(few, pupils, rows, strict=True)]
+        inside = np.concatenate([r.passed[chosen] for r, chosen in zip(few, rows, strict=True)])
         numbers[k] = _separated(np.concatenate(features, 1), inside, numbers[k])
     return numbers
 
@@ -227,7 +227,7 @@ def _drawn(lens: ShaderLens, pupil: PupilCircles, seed: int) -> _Rays:
     inputs = {"film_mm": film, "point_mm": point, "film_z_mm": z[None]}
     inputs["stop_radius_mm"] = share[None] * lens.stop_radius_mm
     aside = np.abs(np.arctan2(np.abs(film[1]), np.abs(film[0]))) / (np.pi / 2)
-    shares = (radius / pupil.film_radius_mm) ** 2, aside, share * 0.7501  # the widest stop is a zone of its own
+    shares = (radius / pupil.film_radius_mm) ** 2, aside, share * 0.7501  # the widest stop is a separate zone
     zones = [np.minimum(s * n, n - 1).astype(np.intp) for s, n in zip(shares, _ZONES, strict=True)]
     return _Rays(inputs, codes, np.ravel_multi_index(zones, _ZONES))
 
@@ -237,7 +237,7 @@ def _disc(pupil: PupilCircles, rays: _Rays, rims: int) -> tuple[float, float]:
     size = rays.inputs["stop_radius_mm"][0] / pupil.image.stop_mm
     beyond = np.hypot(*rays.inputs["point_mm"]) / pupil.image.stop_mm / size - 1
     growth = (np.square(rays.inputs["film_mm"]).sum(0) / pupil.image.film_mm**2 * size) ** 2
-    needs = [(float(growth[zone].mean()), need) for zone, need in _needs(rays, -beyond, _HELD[0] / (rims + 1))]
+    needs = [(float(growth[zone].mean()), need) for zone, need in _needs(rays, -beyond, _ALLOWED[0] / (rims + 1))]
     inner = max(0.0, *(need for at, need in needs if at < _INNER))
     return 1 + inner, max(0.0, *((need - inner) / at for at, need in needs if at >= _INNER))
 

@@ -141,14 +141,14 @@ def _rays(lens: ShaderLens, radius: Array, stop: Array, rng: np.random.Generator
 def disc_lost(disc: PupilDisc, lens: ShaderLens) -> float:
     """The share of random rays that pass beyond the disc, in the worst zone of film and stop."""
     rng = np.random.default_rng(7)
-    place, share = rng.random(_CHECKED), rng.choice(_STOPS, _CHECKED)
-    radius, stop = disc.film_radius_mm * np.sqrt(place), share * lens.stop_radius_mm
+    area, share = rng.random(_CHECKED), rng.choice(_STOPS, _CHECKED)
+    radius, stop = disc.film_radius_mm * np.sqrt(area), share * lens.stop_radius_mm
     pupil, passed = _rays(lens, radius, stop, rng)
     g = Graph()
     g.outputs["rows"] = g.concat(*disc._rows(g.input("radius"), g.input("stop")))
     inputs = {"radius": radius[None] / disc.unit_mm, "stop": stop[None] / disc.stop_mm}
     centre, wide, tall = evaluate(g, inputs)["rows"]
     out = passed & (np.hypot((pupil[0] - centre) / wide, pupil[1] / tall) > 1)
-    zone = (8 * place).astype(np.intp) * 3 + np.digitize(share, (0.3, 0.6))
+    zone = (8 * area).astype(np.intp) * 3 + np.digitize(share, (0.3, 0.6))
     counts, missed = (np.bincount(zone[rows], minlength=24) for rows in (passed, out))
     return float((missed / np.maximum(counts, _FEW)).max())

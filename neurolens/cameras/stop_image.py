@@ -25,7 +25,7 @@ from neurolens.graph.loworder import pursue
 Array = NDArray[np.float64]
 HAIR = 1e-18  # mm; keeps the direction of a film point on the axis finite
 _RAYS, _FEWEST = 8_000, 1_000  # rays of a fit, and how many have to pass
-_TERMS = ((12, 24, 48), (16, 32, 72))  # most terms of each fit; rays of the next are drawn through the last
+_TERMS = ((12, 24, 72), (16, 32, 72))  # most terms of each fit; rays of the next are drawn through the last
 _ENOUGH = 0.0012  # RMS error, in units of the stop's radius, at which a fit needs no more terms
 _SIZES, _REACH = (0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.0), 1.06  # stops whose edges count most; how far beyond rays lie
 # Highest powers of film and stop point together, of the stop point, and of film and stop point in terms that move with

@@ -14,7 +14,7 @@ from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
 from neurolens.commands.arguments import CAMERAS_HELP, add_json, add_option, add_output, check_folder
 from neurolens.commands.output import answer, number, table
-from neurolens.commands.stmap import LIGHT_NM, add_picture, add_state, shot_of
+from neurolens.commands.stmap import LIGHT_NM, add_picture, add_state, shot_of, size_of
 from neurolens.evaluate.records import plain
 
 if TYPE_CHECKING:
@@ -73,13 +73,14 @@ def run(args: argparse.Namespace) -> int:
         warn(note)
     with progress.stage(f"trace the field of {args.camera}"):
         field = field_of(camera, shot.focus_m, "equidistant", spectrum=spectrum_of(camera, LIGHT_NM))
-    step = [side / count for side, count in zip(args.film, args.size, strict=True)]
+    size = size_of(args)
+    step = [side / count for side, count in zip(args.film, size, strict=True)]
     focal = (field.frame.reach_mm[0] / step[0], field.frame.reach_mm[1] / step[1])
     if math.isclose(*field.frame.reach_mm, rel_tol=1e-9) and math.isclose(*step, rel_tol=1e-9):
         focal = focal[0], focal[0]
     with progress.stage(f"fit {args.projection}"):
-        found = fit(args.projection, *shown(field, args.size, args.film), args.size, focal, source=str(args.camera))
-        left = residual(found, *shown(field, args.size, args.film, _HELD_OUT))
+        found = fit(args.projection, *shown(field, size, args.film), size, focal, source=str(args.camera))
+        left = residual(found, *shown(field, size, args.film, _HELD_OUT))
     data = _told(args, found, left) | {"before_film_mm": list(field.frame.pupil_mm)}
     data["files"] = _write(args.out, found, data) if args.out is not None else []
     if not left.sound:

@@ -148,9 +148,9 @@ def run(args: argparse.Namespace) -> int:
     choice = None
     for number, (out, frame) in enumerate(missing.items()):
         progress = Progress(quiet=args.quiet)
-        made = prepare(frame, out, progress)
-        choice = choice if number else flare_choice(list(frames.values()), made, args.threads)
-        code = _render(args, made, flare_of(made, choice, args.threads, progress), progress)
+        prepared = prepare(frame, out, progress)
+        choice = choice if number else flare_choice(list(frames.values()), prepared, args.threads)
+        code = _render(args, prepared, flare_of(prepared, choice, args.threads, progress), progress)
         if code:
             return code
     return 0
@@ -162,7 +162,7 @@ def frame_of(args: argparse.Namespace) -> Frame:
 
     return Frame.of(
         args.scene, args.camera, focus_m=args.focus, f_number=args.f_number, efl_mm=args.efl, zoom=args.zoom,
-        field_deg=args.field, focusing=args.focusing, aperture=aperture_of(args), film_offset_mm=args.film_offset,
+        field_deg=args.field, focus=args.focusing, aperture=aperture_of(args), film_offset_mm=args.film_offset,
         vignetting=args.vignetting, glass_files=tuple(args.glass_files), film_mm=args.film,
         width=args.width, height=args.height, samples=args.samples, seed=args.seed, max_depth=args.max_depth,
         colour_space=args.colour_space, white_balance=args.white_balance, wavelengths=args.wavelength_mode,
@@ -171,20 +171,20 @@ def frame_of(args: argparse.Namespace) -> Frame:
     )  # fmt: skip
 
 
-def _render(args: argparse.Namespace, made: Prepared, flare: Mapping[str, FloatArray], progress: Progress) -> int:
+def _render(args: argparse.Namespace, prepared: Prepared, flare: Mapping[str, FloatArray], progress: Progress) -> int:
     """Render a frame until it is done or a signal asks to stop, write its pictures, and print a summary."""
     from neurolens.frames.picture import write_pictures
 
-    files = made.files
-    with Stopping() as stopping, progress.stage(f"render {made.name}") as report:
-        result = made.render(args.threads, report, watch_of(args, files, stopping))
+    files = prepared.files
+    with Stopping() as stopping, progress.stage(f"render {prepared.name}") as report:
+        result = prepared.render(args.threads, report, watch_of(args, files, stopping))
         if not result.stats["complete"]:
             raise Unfinished
     if stopping():
         args.kept = files.kept()
     if not result.stats["paths"]:
         return stopping.say(args.kept)
-    write_pictures(made, result, flare)
+    write_pictures(prepared, result, flare)
     if dropped := result.stats["dropped_samples"]:
         warn(f"{dropped} of {result.stats['paths']} samples were not finite and count as black")
     if not result.stats["complete"]:
@@ -192,13 +192,13 @@ def _render(args: argparse.Namespace, made: Prepared, flare: Mapping[str, FloatA
     if not args.keep_checkpoint:
         files.checkpoint.unlink(missing_ok=True)
     stats = plain(result.stats)
-    data = {"file": str(files.out), "preview": str(files.preview), **stats, "camera": made.camera.settings}
+    data = {"file": str(files.out), "preview": str(files.preview), **stats, "camera": prepared.camera.settings}
     return answer(args, data, lambda: summary(stats, files))
 
 
 def _run_on_dask(args: argparse.Namespace, frames: Mapping[Path, Frame], missing: Mapping[Path, Frame]) -> int:
     """Render frames by tiles on a cluster."""
-    from neurolens.frames.farm import kept, render_frames
+    from neurolens.frames.farm import how_to_resume, render_frames
 
     for option, value in (("--tile", args.tile), ("--keep-checkpoint", args.keep_checkpoint or None)):
         if value is not None:
@@ -206,7 +206,7 @@ def _run_on_dask(args: argparse.Namespace, frames: Mapping[Path, Frame], missing
     if not missing:
         return 0
     folder, progress = args.out.with_name(f"{args.out.name}.tiles"), Progress(quiet=args.quiet)
-    args.kept = kept(folder)
+    args.kept = how_to_resume(folder)
     with Dask(args.dask) as executor:
         pictures = render_frames(
             missing, executor, folder, shown=list(frames.values()), restart=args.restart, progress=progress

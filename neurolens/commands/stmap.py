@@ -120,19 +120,27 @@ def add_state(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def size_of(args: argparse.Namespace) -> tuple[int, int]:
+    """Width and height of the lens's picture in pixels.
+
+    Raises:
+        InputError: the command line states neither.
+    """
+    if not (args.size or args.width or args.height):
+        raise InputError(_COMMAND, "--width", "(missing)", "--width or --height of the lens's picture")
+    return args.size or size_by_shape(args.film[0] / args.film[1], args.width, args.height)
+
+
 def shot_of(args: argparse.Namespace) -> Shot:
     """What the command line sets.
 
     Raises:
-        InputError: neither a width nor a height; a film whose shape is not that of the picture.
+        InputError: as of `size_of`; a film whose shape is not that of the picture.
     """
     from neurolens.cameras.build import Shot
     from neurolens.render.film import PixelGrid
 
-    if not (args.size or args.width or args.height):
-        raise InputError(_COMMAND, "--width", "(missing)", "--width or --height of the lens's picture")
-    args.size = args.size or size_by_shape(args.film[0] / args.film[1], args.width, args.height)
-    PixelGrid(args.size[0], args.size[1], args.film)
+    PixelGrid(*size_of(args), args.film)
     return Shot(
         film_mm=args.film, focus_m=math.inf if args.focus is None else args.focus, f_number=args.f_number,
         efl_mm=args.efl, zoom=args.zoom, field_deg=args.field, focus=args.focusing, aperture=aperture_of(args),
@@ -184,7 +192,7 @@ def run(args: argparse.Namespace) -> int:
         for k, (text, values) in enumerate(states):
             frames.append(_traced(argparse.Namespace(**vars(args) | values), text, progress))
             report((k + 1) / len(states))
-    plates = plates_of([f for frame in frames for f in frame.fields.values()], args.size, args.film)
+    plates = plates_of([f for frame in frames for f in frame.fields.values()], size_of(args), args.film)
     files = []
     with progress.stage("write the maps") as report:
         for k, frame in enumerate(frames):

@@ -62,14 +62,14 @@ def shader_of(file: Path, *, zoom: str | None = None, name: str | None = None, q
     from neurolens.surrogates.source import OSL, checked_name, lines_of
 
     with Progress(quiet=quiet).stage(f"fit the pupil of {file.stem}") as report:
-        lens_id, lens, told = lens_of(file, zoom, report)
-    own = checked_name(OSL, lens_id, name)
+        lens_id, lens, lines = lens_of(file, zoom, report)
+    function = checked_name(OSL, lens_id, name)
     passed = {f"{lens.f_number / share:.3g}": value for share, value in lens.passing().items()}
     near, least = lens.near_m
     focus = f"from {near:.4g} m" if near else "fixed"
     comment = [
         f"A camera for Blender's Cycles (4.5 and later), written by neurolens {__version__} from {file.name}.",
-        *told,
+        *lines,
         f"Film radius {lens.film_radius_mm:.4g} mm, f/{lens.f_number:.3g}, focus {focus}; rays that pass: "
         + ", ".join(f"f/{n} {share:.1%}" for n, share in passed.items()) + ".",
         "Sensor size and shift are Blender's; shift X counts widths of the picture, shift Y heights.",
@@ -82,17 +82,18 @@ def shader_of(file: Path, *, zoom: str | None = None, name: str | None = None, q
             notes.append("Groups move to focus: the picture breathes as the lens's does")
         elif least > near:
             notes.append(f"Nearest focus from {near:.3g} to {least:.3g} m over the zoom, {low:.4g} to {high:.4g} mm")
-    text, operations = write_camera(lens, own, lines_of([*comment, *(f"{n}." for n in notes)]))
+    text, operations = write_camera(lens, function, lines_of([*comment, *(f"{n}." for n in notes)]))
     if operations > MAX_STEPS:
         raise InputError(file, "operations", operations, f"up to {MAX_STEPS}: a model of the lens is smaller")
     return Shader(
-        own, text, operations, tuple(p.name for p in parameters(lens)), passed, lens.film_radius_mm, lens.f_number,
+        function, text, operations, tuple(p.name for p in parameters(lens)), passed, lens.film_radius_mm, lens.f_number,
         near or None, tuple(notes),
     )  # fmt: skip
 
 
 def lens_of(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:
-    """Of a model (.onnx) or a lens file: its id, itself, and lines on it. Arguments and errors as of `shader_of`."""
+    """The id of a model (.onnx) or lens file, the lens as a shader has it, and lines that describe it. Arguments and
+    errors are those of `shader_of`."""
     return _of_model(file, zoom, report) if is_model(file) else exact_lens(file, zoom, report)
 
 
@@ -106,9 +107,9 @@ def _of_model(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLen
         model = model.at(*state_for(model.path, model.axes, model.state, zoom, math.inf))
     lens, fit = model.card["lens"], model.card["fit"]
     state = ", ".join(f"{a.name} {v:.5g}" for a, v in zip(model.axes, model.state, strict=True))
-    told = [f"{lens['name']}: {fit['method']}, {lens['source']} (sha256 {lens['sha256'][:16]})."]
+    lines = [f"{lens['name']}: {fit['method']}, {lens['source']} (sha256 {lens['sha256'][:16]})."]
     made = model_lens(model, _smallest(model), report, fixed=fixed)
-    return str(lens["id"]), made, told + [f"State: {state}."] * bool(state and fixed)
+    return str(lens["id"]), made, lines + [f"State: {state}."] * bool(state and fixed)
 
 
 def _smallest(model: OnnxLens) -> Graph | None:
@@ -125,7 +126,7 @@ def _smallest(model: OnnxLens) -> Graph | None:
 
 
 def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:
-    """Of a lens itself, every surface traced: its id, itself, and lines on it.
+    """A lens with every surface traced: its id, the lens as a shader has it, and lines that describe it.
 
     Focused as its file says groups move; of a file that does not say, by moving the film, to ten focal lengths.
 
@@ -148,16 +149,16 @@ def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLe
     ranged, internal = zoom == RANGE, bool(focus_states(lens))
     if ranged and internal:  # before minutes of work
         raise InputError(lens.path, "zoom", RANGE, "one focal length of the zoom: its groups move to focus, too")
-    told = [f"{lens.name}: every surface traced, {lens.source} (sha256 {str(lens.sha256)[:16]})."]
-    told.append(TRANSMITTANCE)
+    lines = [f"{lens.name}: every surface traced, {lens.source} (sha256 {str(lens.sha256)[:16]})."]
+    lines.append(TRANSMITTANCE)
     if not (ranged or internal):
         at = set_lens(lens, zoom=state)
-        return lens.lens_id, osl_lens([_traced(at, pupil_plane_z_mm(at))], report), told
+        return lens.lens_id, osl_lens([_traced(at, pupil_plane_z_mm(at))], report), lines
     space = StateSpace(lens, axes_of(lens, zoom=ranged, internal=internal, state=state), state)
     if len(space.axes) == 1:
         axis, error_mm = gap_axis(space.axes[0], lambda value: space.lens_at((value,)))
         space = replace(space, axes=(axis,))
-        told.append(f"Between {len(axis.nodes)} states its gaps are within {1e3 * error_mm:.2g} um (measured).")
+        lines.append(f"Between {len(axis.nodes)} states its gaps are within {1e3 * error_mm:.2g} um (measured).")
     knots = tuple(replace(a, degree=1) for a in space.axes)
     planes = [pupil_plane_z_mm(space.lens_at(s)) for s in product(knots)]
 
@@ -167,7 +168,7 @@ def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLe
 
     nodes = [lens_in(s) for s in product(space.axes)]
     between = [(weights(space.axes, s), lens_in(s)) for s in states_between(space.axes)]
-    return lens.lens_id, osl_lens(nodes, report, space.axes, between), told
+    return lens.lens_id, osl_lens(nodes, report, space.axes, between), lines
 
 
 def _traced(lens: Lens, plane_mm: float, far: Lens | None = None, inside_m: float = math.inf) -> ShaderLens:

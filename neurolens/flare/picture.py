@@ -429,22 +429,24 @@ class _Work:
 
 def _smoothed(picture: Floats, sums: Floats, radius: float) -> Floats:
     """Smooth a picture [H, W, 3] of photons: its luminance by kernels from `radius` on, its colour by wider kernels."""
-    bright, coloured = (in_gamut(_spread_wide(picture, sums, radius, most)) for most in (_ENOUGH, _COLOURED))
+    wide = min(picture.shape[:2])
+    bright = in_gamut(_spread_wide(picture, sums, radius, _ENOUGH, wide / 8))
+    coloured = in_gamut(_spread_wide(picture, sums, radius, _COLOURED, wide / 2))
     luminance = [np.maximum(part @ SRGB.to_xyz[1].astype(np.float32), 1e-30)[..., None] for part in (bright, coloured)]
     return coloured * (luminance[0] / luminance[1])
 
 
-def _spread_wide(picture: Floats, sums: Floats, radius: float, enough: int) -> Floats:
+def _spread_wide(picture: Floats, sums: Floats, radius: float, enough: int, widest: float) -> Floats:
     """A picture [H, W, 3] whose pixels' light is spread by kernels that keep its sum, mirrored at the edges.
 
     Each by the narrowest kernel of radius r, 2 r, ... that holds `enough` photons of equal weight, or is as little
-    noisy by their `sums` of weights and of squares, [2, H, W], with a soft step to the next; by none much wider than an
-    eighth of the picture's shorter side. Epanechnikov's, 2 / pi (1 - r^2) in units of its radius.
+    noisy by their `sums` of weights and of squares, [2, H, W], with a soft step to the next; by none much wider than
+    `widest`, in pixels. Epanechnikov's, 2 / pi (1 - r^2) in units of its radius.
     """
     found, left, last = np.zeros_like(picture), np.ones(picture.shape[:2], np.float32), False
     while not last:
         weight, square = np.moveaxis(spread(np.moveaxis(sums, 0, 2), radius), 2, 0)
-        last = 8 * radius > min(picture.shape[:2])
+        last = radius > widest
         # n photons of equal weight have a sum of squares of n times the kernel's mean square, 4 / (3 pi r^2).
         held = 0.75 * math.pi * radius**2 * weight**2 / np.maximum(square, 1e-30) / enough
         share = np.ones_like(left) if last else (held - 0.5).clip(0, 1)

@@ -94,27 +94,28 @@ def render_frames(
     progress = progress or Progress(quiet=True)
     folder = folder or out.with_name(f"{out.name}.tiles")
     with noted_files() as files, frame.glasses():
-        made = prepare(frame, out, progress)
-        choice = flare_choice(shown or list(frames.values()), made)
+        prepared = prepare(frame, out, progress)
+        choice = flare_choice(shown or list(frames.values()), prepared)
     common = packed(files | {path for path in (frame.scene, frame.camera.file, *frame.glass_files) if path is not None})
     shared = sha256(common).hexdigest(), None if choice is None else (sorted(map(repr, choice.lights)), choice.single)
-    todo = [_picture(each, out, folder, shared, made, restart) for out, each in frames.items()]
+    todo = [_picture(each, out, folder, shared, prepared, restart) for out, each in frames.items()]
     folder.mkdir(exist_ok=True)
     pictures, done, count = dict[Path, dict[str, Any]](), 0, sum(len(picture.tiles) for picture in todo)
-    with progress.stage(f"render {made.name}: {count} tiles") as report:
+    with progress.stage(f"render {prepared.name}: {count} tiles") as report:
         waiting: dict[Path, _Picture] = {}
         tasks = _tasks(todo, waiting, choice)
         for task, answer in run_each(executor, run_with_files, tasks, render_tile, Shared(common)):
             if isinstance(answer, Failed):
-                raise NeurolensError(f"{task.name}: {answer.reason}; {kept(folder)}")
+                raise NeurolensError(f"{task.name}: {answer.reason}; {how_to_resume(folder)}")
             unpack(answer, folder)
             picture = waiting[task.out]
             picture.missing.discard(task.number)
             if not picture.missing:
-                pictures[picture.out] = _finish(picture, made)
+                pictures[picture.out] = _finish(picture, prepared)
             done += 1
             report(done / count)
-        pictures |= {picture.out: _finish(picture, made) for picture in todo if picture.tiles}  # whose tiles were there
+        # Pictures whose tiles were all there.
+        pictures |= {picture.out: _finish(picture, prepared) for picture in todo if picture.tiles}
     with suppress(OSError):
         for stale in folder.glob("*.tile-*.exr"):
             stale.unlink()
@@ -122,15 +123,15 @@ def render_frames(
     return [pictures[out] for out in frames]
 
 
-def kept(folder: Path) -> str:
+def how_to_resume(folder: Path) -> str:
     """How to resume frames whose tiles are in a folder."""
     return f"tiles that are done are kept in {folder}: the same command goes on"
 
 
-def _picture(frame: Frame, out: Path, folder: Path, shared: Any, made: Prepared, restart: bool) -> _Picture:
+def _picture(frame: Frame, out: Path, folder: Path, shared: Any, prepared: Prepared, restart: bool) -> _Picture:
     """A picture cut into tiles; the cut depends on the picture alone, so that the next command has the same."""
-    width, height = made.size
-    paths = width * height * (frame.samples or made.scene.settings.camera.samples)
+    width, height = prepared.size
+    paths = width * height * (frame.samples or prepared.scene.settings.camera.samples)
     few = min(_FEW, math.ceil(paths / _PATHS_OF_FEW))
     count = min(max(math.ceil(paths / _PATHS_A_TILE), few), _MOST_TILES, height)
     mark = digest((__version__, out.name, replace(frame, exposure=0.0), shared))
@@ -151,13 +152,13 @@ def _tasks(todo: list[_Picture], waiting: dict[Path, _Picture], choice: Choice |
             yield task
 
 
-def _finish(picture: _Picture, made: Prepared) -> dict[str, Any]:
+def _finish(picture: _Picture, prepared: Prepared) -> dict[str, Any]:
     """Put a picture together, with the paths as they are here, and remove its tiles."""
     tiles = [read_tile(tile) for tile in picture.tiles]
     for tile in tiles:
         tile.told["scene"] = str(picture.frame.scene)
         if "model" in tile.told["camera"]:
-            tile.told["camera"]["model"] = made.camera.settings["model"]
+            tile.told["camera"]["model"] = prepared.camera.settings["model"]
     written = write_picture(tiles, picture.out, picture.frame.exposure)
     for file in picture.tiles:
         file.unlink()

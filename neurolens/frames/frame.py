@@ -1,15 +1,15 @@
 """A `Frame` holds everything that decides one picture; `prepare` reads the files that it names and checks it.
 
 frame = Frame.of("experiments/scenes/room.toml", "lenses/cooke_triplet_50.toml", f_number=4.0, samples=16)
-made = prepare(frame, Path("room.exr"))
-picture = made.render(threads=2).rgb
+prepared = prepare(frame, Path("room.exr"))
+picture = prepared.render(threads=2).rgb
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -46,12 +46,12 @@ class Frame:
 
     Attributes:
         scene: the scene file. camera: what `base.lensname.resolve` makes of a camera's name.
-        focus_m, f_number, efl_mm, zoom, field_deg, focusing, aperture, film_offset_mm, vignetting: as in
-            `cameras.build.Shot`, where `focusing` is called `focus`.
+        film_mm, focus_m, f_number, efl_mm, zoom, field_deg, focus, aperture, film_offset_mm, vignetting: as in
+            `cameras.build.Shot`.
         glass_files: catalogues of Zemax, whose glasses come before those that ship.
         position_m, look_at_m: where the camera stands, and a point on its optical axis.
-        film_mm: width and height of the film. width, height: in pixels; one of them follows from the other and the
-            film's shape. samples: in each pixel. seed: of the random numbers. max_depth: bounces of a path.
+        width, height: in pixels; one of them follows from the other and the film's shape. samples: in each pixel.
+        seed: of the random numbers. max_depth: bounces of a path.
         colour_space, white_balance, wavelengths, wavelength_sampling: as in `FilmSettings`.
         half: whether the EXR has 16-bit floats. channels: "all", or "beauty" for colour alone.
         exposure: stops by which the preview is brighter.
@@ -65,7 +65,7 @@ class Frame:
     efl_mm: float | None = None
     zoom: str | float | None = None
     field_deg: float | None = None
-    focusing: Literal["best", "paraxial", "internal"] = "best"
+    focus: Literal["best", "paraxial", "internal"] = "best"
     aperture: Aperture | None = None
     film_offset_mm: float = 0.0
     vignetting: str = "both"
@@ -103,21 +103,14 @@ class Frame:
 
     def shot(self, settings: CameraSettings, aperture: Aperture | None) -> Shot:
         """The scene's settings of the camera, and its stop's shape, with the changes of the frame."""
-        return Shot(
-            film_mm=self.film_mm or (settings.film_width_mm, settings.film_height_mm),
-            focus_m=settings.focus_m if self.focus_m is None else self.focus_m,
-            f_number=settings.f_number if self.f_number is None else self.f_number,
-            efl_mm=self.efl_mm,
-            zoom=self.zoom,
-            field_deg=self.field_deg,
-            focus=self.focusing,
-            aperture=self.aperture or aperture,
-            wavelength_nm=settings.wavelengths_nm,
-            # A scene's f-number is clamped to the lens; one of the frame must be possible.
-            clamp_f_number=self.f_number is None,
-            film_offset_mm=self.film_offset_mm,
-            vignetting=self.vignetting,
-        )
+        film_mm, light_nm = (settings.film_width_mm, settings.film_height_mm), settings.wavelengths_nm
+        clamped = self.f_number is None  # a scene's f-number is clamped to the lens; one of the frame must be possible
+        scene = Shot(
+            film_mm, settings.focus_m, settings.f_number, aperture=aperture, wavelength_nm=light_nm,
+            clamp_f_number=clamped,
+        )  # fmt: skip
+        changes = {field.name: getattr(self, field.name, None) for field in fields(Shot)}
+        return replace(scene, **{name: value for name, value in changes.items() if value is not None})
 
     def film(self, settings: FilmSettings) -> FilmSettings:
         """The scene's [film] table with the changes of the frame."""

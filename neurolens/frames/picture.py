@@ -58,65 +58,67 @@ def render_frame(
     """
     progress = progress or Progress(quiet=True)
     with frame.glasses():
-        made = prepare(frame, out, progress)
-        flare = flare_of(made, choice, threads, progress)
-        with progress.stage(f"render {made.name}") as report:
-            result = made.render(threads, report, watch)
-        write_pictures(made, result, flare, preview)
+        prepared = prepare(frame, out, progress)
+        flare = flare_of(prepared, choice, threads, progress)
+        with progress.stage(f"render {prepared.name}") as report:
+            result = prepared.render(threads, report, watch)
+        write_pictures(prepared, result, flare, preview)
     return result
 
 
-def flare_of(made: Prepared, choice: Choice | None, threads: int, progress: Progress) -> Layers:
+def flare_of(prepared: Prepared, choice: Choice | None, threads: int, progress: Progress) -> Layers:
     """The layers of flare that the scene of a frame asks for, by name, [H, W, 3] linear sRGB each.
 
     Warns:
         NeurolensWarning: a camera that has no flare.
     """
-    if made.scene.settings.flare is None:
+    if prepared.scene.settings.flare is None:
         return {}
-    lens = getattr(made.camera, "lens", None)
+    lens = getattr(prepared.camera, "lens", None)
     if lens is None:
-        warn(f"no flare of {made.camera.name}: that takes a lens file that is traced as it is")
+        warn(f"no flare of {prepared.camera.name}: that takes a lens file that is traced as it is")
         return {}
     from neurolens.flare.layers import scene_flare
 
-    with _errors_of_table(made.frame.scene):
-        return scene_flare(made.scene, lens, _raster(made), made.film.white_balance, threads, progress, choice)
+    with _errors_of_table(prepared.frame.scene):
+        return scene_flare(
+            prepared.scene, lens, _raster(prepared), prepared.film.white_balance, threads, progress, choice
+        )
 
 
-def flare_choice(frames: Sequence[Frame], made: Prepared, threads: int = 2) -> Choice | None:
+def flare_choice(frames: Sequence[Frame], prepared: Prepared, threads: int = 2) -> Choice | None:
     """Which lights and ghosts the layers of flare show in all frames of an animation.
 
-    At most 16 of the frames, evenly spread, decide which are brightest. `made` is one of the frames, or of the same
+    At most 16 of the frames, evenly spread, decide which are brightest. `prepared` is one of the frames, or of the same
     camera and scene. The choice is None where there is no flare.
     """
-    if made.scene.settings.flare is None or getattr(made.camera, "lens", None) is None:
+    if prepared.scene.settings.flare is None or getattr(prepared.camera, "lens", None) is None:
         return None
     from neurolens.flare.layers import scene_choice
 
     some = frames[:: -(-len(frames) // _CHOICE_FRAMES)]
-    with _errors_of_table(made.frame.scene):
-        return scene_choice(list(_scenes(some, made)), _raster(made), threads)
+    with _errors_of_table(prepared.frame.scene):
+        return scene_choice(list(_scenes(some, prepared)), _raster(prepared), threads)
 
 
-def _scenes(frames: Sequence[Frame], made: Prepared) -> Iterator[tuple[Scene, Lens]]:
+def _scenes(frames: Sequence[Frame], prepared: Prepared) -> Iterator[tuple[Scene, Lens]]:
     """The scene and the lens in each of the frames."""
 
     def state(frame: Frame) -> tuple[Any, ...]:
         return frame.focus_m, frame.f_number, frame.zoom
 
-    lenses: dict[tuple[Any, ...], Lens] = {state(made.frame): made.camera.lens}  # type: ignore[attr-defined]
+    lenses: dict[tuple[Any, ...], Lens] = {state(prepared.frame): prepared.camera.lens}  # type: ignore[attr-defined]
     for frame in frames:
         if state(frame) not in lenses:
-            shot = frame.shot(made.scene.settings.camera, made.scene.aperture)
+            shot = frame.shot(prepared.scene.settings.camera, prepared.scene.aperture)
             lenses[state(frame)] = make_camera(str(frame.camera), shot).lens  # type: ignore[attr-defined]
-        yield seen_from(made.scene, frame.scene, frame.position_m, frame.look_at_m), lenses[state(frame)]
+        yield seen_from(prepared.scene, frame.scene, frame.position_m, frame.look_at_m), lenses[state(frame)]
 
 
-def _raster(made: Prepared) -> Raster:
+def _raster(prepared: Prepared) -> Raster:
     from neurolens.flare.picture import Raster
 
-    return Raster(made.camera.film_mm, *made.size)
+    return Raster(prepared.camera.film_mm, *prepared.size)
 
 
 @contextmanager
@@ -128,7 +130,9 @@ def _errors_of_table(scene: Path) -> Iterator[None]:
         raise InputError(scene, f"[flare]: {error.file}, {error.field}", error.value, error.expected) from None
 
 
-def write_pictures(made: Prepared, result: RenderResult, flare: Mapping[str, FloatArray], preview: bool = True) -> None:
+def write_pictures(
+    prepared: Prepared, result: RenderResult, flare: Mapping[str, FloatArray], preview: bool = True
+) -> None:
     """Write EXR and PNG; if they cannot be written, the checkpoint.
 
     Args:
@@ -139,23 +143,23 @@ def write_pictures(made: Prepared, result: RenderResult, flare: Mapping[str, Flo
     """
     from neurolens.render.pictures import write_exr, write_png
 
-    frame, files, (width, height) = made.frame, made.files, made.size
-    space, metadata = COLOUR_SPACES[made.film.colour_space], made.metadata()
-    told = metadata | {"render": plain(result.stats), "colour": space.stated}
+    frame, files, (width, height) = prepared.frame, prepared.files, prepared.size
+    space, settings = COLOUR_SPACES[prepared.film.colour_space], prepared.metadata()
+    metadata = settings | {"render": plain(result.stats), "colour": space.stated}
     layers: Layers = {}
     if frame.channels == "all" or not result.stats["complete"]:
-        layers, told["layers"] = asdict(result.layers), MEANING
-    rows = made.rows or (0, height)
+        layers, metadata["layers"] = asdict(result.layers), MEANING
+    rows = prepared.rows or (0, height)
     layers |= flare_channels({name: picture[slice(*rows)] for name, picture in flare.items()}, space)
-    attributes = standard_attributes(metadata["camera"], width, height, frame.number)
+    attributes = standard_attributes(settings["camera"], width, height, frame.number)
     if frame.tile is not None:
         number, count = frame.tile
-        told["tile"] = {"number": number, "of": count, "frame": frame.number, "half": frame.half}
-        told["tile"]["identity"] = plain(result.identity)
+        metadata["tile"] = {"number": number, "of": count, "frame": frame.number, "half": frame.half}
+        metadata["tile"]["identity"] = plain(result.identity)
         attributes |= windows(width, height, rows)
     try:
         write_exr(
-            files.out, result.rgb, half=frame.half, metadata=told, space=space, layers=layers, attributes=attributes
+            files.out, result.rgb, half=frame.half, metadata=metadata, space=space, layers=layers, attributes=attributes
         )
         if preview:
             write_png(files.preview, result.rgb, frame.exposure)

@@ -35,7 +35,7 @@ class Arithmetic:
 
     Attributes:
         guard: whether rays that are lost stay finite, which derivatives and recorded crossings need.
-        finite: whether roots of negative numbers are numbers; they are where lost rays are guarded.
+        finite: whether rays that are totally reflected stay finite; they do where lost rays are guarded.
         polish: steps of an iteration after the one that decides whether it has converged.
     """
 
@@ -48,6 +48,8 @@ class Arithmetic:
             b, k = k, b
         if is_number(k) and k == 0:
             return c
+        if is_number(b):
+            return c - a if b * k == -1 else times(a, b * k) + c
         return times(times(a, k), b) + c
 
     def add_to(self, c: Any, a: Any, b: Any, k: Any = 1) -> Any:
@@ -61,8 +63,8 @@ class Arithmetic:
             total = self.fma(p, q, total)
         return total
 
-    def root(self, square: Any) -> Any:
-        """Square root; NaN for negative numbers unless lost rays are guarded."""
+    def root(self, square: Any, finite: bool = False) -> Any:
+        """Square root; NaN for negative numbers, unless it is to be `finite` or lost rays are guarded."""
         return np.sqrt(square)
 
     def held_root(self, square: Any, least: float = TINY) -> Any:
@@ -124,10 +126,10 @@ class Graphs(Arithmetic):
     def __init__(self, graph: Graph, *, double: bool = False, guard: bool = False, finite: bool = False) -> None:
         self.graph, self.polish, self.guard, self.finite = graph, 2 if double else 0, guard, guard or finite
 
-    def root(self, square: Value) -> Value:
+    def root(self, square: Value, finite: bool = False) -> Value:
         if self.guard:
             return self.select(TINY, square, square, 1.0).sqrt()
-        return self.held_root(square) if self.finite else square.sqrt()
+        return self.held_root(square) if finite else square.sqrt()
 
     def held_root(self, square: Value, least: float = TINY) -> Value:
         return square.maximum(least).sqrt()

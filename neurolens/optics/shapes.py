@@ -33,6 +33,8 @@ STEEPEST = 1e-7
 # How far (rad) the slope of an asphere may turn beyond its rim before it continues smoothly, and again after that.
 TURN = 0.25
 FARTHEST = 1.5  # rim radii up to which figures are followed at most
+# Rim radius over radius of curvature from which on a sphere's rim is tested by its depth.
+DEEP = 0.25
 _UPRIGHT = 1e6  # slope and bend that stand for infinite ones
 
 Quadric = tuple[Any, Any, Any]
@@ -416,7 +418,3 @@ def is_deep(surface: Surface) -> bool:
 def rim_sine(surface: Surface) -> float:
     """Rim radius over radius of curvature."""
     return abs(surface.semi_diameter_mm * surface.curvature)
-
-
-# Rim radius over radius of curvature from which on a sphere's rim is tested by its depth.
-DEEP = 0.25

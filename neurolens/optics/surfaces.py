@@ -140,7 +140,7 @@ def _meet_sphere(o: Arithmetic, r: Rays, m: Quadric, curvature: Any, sense: int,
         t = f / o.positive(denominator)
         x, y, z = (o.add_to(a, t, d) for a, d in zip(m, r[3:], strict=True))
         # A root that is NaN fails the test of the denominator, too.
-        return Met(x, y, z, q, q2, [(TINY, denominator), *([(TINY, q2)] if o.finite else [])])
+        return Met(x, y, z, q, q2, [(TINY, denominator), *([(TINY, q2)] if o.guard else [])])
     # Beyond 90 degrees the usual form divides two vanishing numbers; the conjugate form is exact there.
     forward = times(r.dz, sense)
     conjugate = times(forward - q, before.inverse_n2) / (c if is_number(c) else o.nonzero(c))
@@ -285,7 +285,7 @@ def refract(
     """
     step = after.n2 - before.n2 if step is None else step
     q2 = met.q2 + step
-    q = o.root(q2)
+    q = o.root(q2, o.finite)
     # q - met.q without the rounding of both roots, which was a third of all error in float32.
     bend = step / o.positive(q + met.q)
     # From air nothing is totally reflected.

@@ -55,7 +55,7 @@ class Tensors(Arithmetic):
             total.addcmul_(p, q)  # in place: a third less memory to move
         return total
 
-    def root(self, square: Tensor) -> Tensor:
+    def root(self, square: Tensor, finite: bool = False) -> Tensor:
         if self.guard:
             return torch.sqrt(torch.where(square > 0, square, 1.0))
         if torch.compiler.is_compiling():

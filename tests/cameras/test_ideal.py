@@ -197,7 +197,6 @@ def test_settings_are_those_of_the_lens_in_its_state() -> None:
         (lambda: made(ROOT / "lenses" / "cooke_anamorphic_42.toml"), "cylinders"),
         (lambda: make_camera("thick:absent.toml", Shot(FILM, 2.0)), "absent.toml"),
         (lambda: make_camera("thick:model.onnx", Shot(FILM, 2.0)), "camera"),
-        (lambda: make_camera(f"thick:{GAUSS}", Shot(FILM, 2.0, pupil="boxes")), "pupil"),
         (lambda: ThickLens(50.0, 2.0, 0.1), "focus_m"),
         (lambda: ThickLens(50.0, 2.0, 2.0, entrance_pupil_z_mm=math.nan), "entrance_pupil_z_mm"),
         (lambda: ThickLens(50.0, 2.0, 2.0, principal_z_mm=(0.0, math.inf)), "principal_z_mm"),
@@ -333,7 +332,6 @@ def test_field_sets_the_circle_within_the_film() -> None:
         ("fisheye-orthographic", {"field_deg": 181.0}, "field_deg"),
         ("fisheye-equisolid", {"field_deg": 90.0, "efl_mm": 8.0}, "efl_mm"),
         ("fisheye-equisolid", {"efl_mm": math.inf}, "focal_mm"),
-        ("fisheye-equisolid", {"pupil": "boxes"}, "pupil"),
     ],
 )
 def test_bad_settings_are_named(spec: str, change: dict[str, object], field: str) -> None:

@@ -41,7 +41,7 @@ FAR = 1e9
 
 @cache
 def lens() -> osl.OslLens:
-    return osl.model_lens(load_model(MODEL), _smallest(MODEL, False), lambda share: None)
+    return osl.model_lens(load_model(MODEL), _smallest(load_model(MODEL)), lambda share: None)
 
 
 def written() -> osl.OslCamera:
@@ -176,10 +176,10 @@ def test_zoom_is_an_input() -> None:
 def test_a_zoom_whose_stop_changes_and_whose_rims_cut_on_both_sides() -> None:
     """One set of operations serves its states, and hardly any ray that passes is lost, between nodes either."""
     made = zoom("nikon_zoom_70_200-range.states-64", knots=(90.0, 130.0))
-    first, *others = (c.pupil for c in made.nodes)
-    assert len({c.lens.stop_radius_mm for c in made.nodes}) == 3 and len(first.numbers) >= 2
-    for state, lens in [(np.array([0.0, 1.0, 0.0]), made.nodes[1].lens), *made.between]:
-        counts, missed = missed_by_zone(lens, first.mixed(others, state), 0.8 * reach_of(lens))
+    assert len({c.lens.stop_radius_mm for c in made.nodes}) == 3
+    for shown, pupil in made.states()[1:]:
+        assert isinstance(pupil, PupilCircles) and len(pupil.numbers) >= 2
+        counts, missed = missed_by_zone(shown, pupil, 0.8 * reach_of(shown))
         assert missed.sum() <= 1e-3 * counts.sum()
 
 
@@ -221,9 +221,11 @@ def test_range_of_a_zoom_whose_groups_focus_is_refused_in_one_line(tmp_path, cap
 
 @cache
 def fitted(name: str) -> tuple[ShaderLens, PupilCircles | PupilDisc]:
-    path = ROOT / "models" / f"{name}.onnx"
-    lens = osl.shader_lens(load_model(path), _smallest(path, False))
-    return lens, fit_pupil([lens], lambda share: None)[0]
+    if name == MODEL.stem:
+        return written().lens, written().pupil
+    model = load_model(ROOT / "models" / f"{name}.onnx")
+    shown = osl.shader_lens(model, _smallest(model))
+    return shown, fit_pupil([shown], lambda share: None)[0]
 
 
 def reach_of(lens: ShaderLens) -> float:
@@ -242,7 +244,7 @@ BICONVEX = "thorlabs_lb1471_biconvex_50.ols-64"  # far off its axis two parts of
 @pytest.mark.parametrize(
     "name, least",
     [
-        pytest.param("phone_lens_6.ols-64", 0.94, marks=pytest.mark.slow),
+        pytest.param("phone_lens_6.ols-64", 0.95, marks=pytest.mark.slow),
         ("muller_fisheye_100.ols-64", 0.95),
         pytest.param("panavision_anamorphic_zoom_21.ols-64", 0.95, marks=pytest.mark.slow),
         pytest.param("sony_sonnar_55.ols-64", 0.95, marks=pytest.mark.slow),
@@ -274,7 +276,7 @@ def test_pupils_of_high_order_pass_and_keep_the_light(name: str, least: float) -
 @pytest.mark.parametrize(
     "name",
     [
-        "laikin_double_gauss_50.ols-36",
+        MODEL.stem,
         pytest.param("muller_fisheye_100.ols-64", marks=pytest.mark.slow),
         pytest.param("cooke_anamorphic_42.ols-64", marks=pytest.mark.slow),
         pytest.param(BICONVEX, marks=pytest.mark.slow),
@@ -299,7 +301,8 @@ def missed_by_zone(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Of random rays through a box, those that pass and those of them that no sample is: of five parts of the film's
     radius and of four of its half turn."""
-    rng, count, stop = np.random.default_rng(21), 400_000, share * lens.stop_radius_mm
+    rng, count = np.random.default_rng(21), 400_000 if lens.anamorphic else 200_000
+    stop = share * lens.stop_radius_mm
     radius, angle = np.sqrt(rng.random(count)), 2 * np.pi * rng.random(count)
     film = pupil.film_radius_mm * radius * np.stack([np.cos(angle), np.sin(angle)])
     point, z, nm = rng.uniform(-reach, reach, (2, count)), *(rng.uniform(*span, count) for span in (

@@ -17,6 +17,7 @@ from neurolens.optics.prescription import Lens, Surface
 from neurolens.optics.sequence import follow, turning
 from neurolens.optics.states import set_lens
 from neurolens.optics.trace import Rays
+from neurolens.render.colour import SRGB
 from neurolens.render.flaresettings import Scatter
 from tests.flare.test_ghosts import LENSES, lens_of
 
@@ -205,6 +206,16 @@ def test_everything_at_once_loses_no_light() -> None:
     assert np.array_equal(found.film_xy_mm, same.film_xy_mm)
     none = PhotonTracer(lens, Scatter()).trace(rays, 550.0, seed=1)
     assert not none.scattered.any()
+
+
+def test_kernels_take_more_noise_of_colour_than_of_luminance() -> None:
+    """Photons of three colours on an even ground: blotches of colour are seen before those of grey."""
+    number = np.random.default_rng(5).poisson(0.2, (96, 144, 3)).astype(np.float32)
+    sums = np.stack([number.sum(2), number.sum(2)])
+    found = _smoothed(number, sums, 3.0)
+    luminance = found @ SRGB.to_xyz[1]
+    assert (found / luminance[..., None]).std((0, 1)).max() < 0.5 * luminance.std() / luminance.mean()
+    assert luminance.sum() == pytest.approx((number @ SRGB.to_xyz[1]).sum(), rel=1e-4)
 
 
 def test_kernels_keep_light_and_edges_and_take_noise() -> None:

@@ -191,6 +191,9 @@ def test_the_symmetry_of_the_lens_is_exact(kind: str, angle: float, mirror: int)
     model, (c, s) = lens_models.model(kind), (math.cos(angle), math.sin(angle))
     turn = torch.tensor([[c * mirror, -s], [s * mirror, c]], dtype=torch.float64)
     rays = lens_models.prepared().pairs.train.inputs.select(slice(0, 2000))
+    rho = model.encoding(rays).invariants()[0]
+    for cut in getattr(model.core, "edges", ()):  # on a cut rounding decides the zone
+        rays, rho = rays.select((rho - cut).abs() > 1e-12), rho[(rho - cut).abs() > 1e-12]
     film, pupil = turn @ torch.stack([rays.film_x, rays.film_y]), turn @ torch.stack([rays.pupil_x, rays.pupil_y])
     a, b = model.predict(rays), model.predict(FilmRays(*film, rays.film_z, *pupil, rays.wavelength_nm))
     for k, (x, y) in enumerate(((a.rays[:2], b.rays[:2]), (a.rays[3:5], b.rays[3:5]), (a[2:4], b[2:4]))):
