@@ -67,7 +67,8 @@ def damage_text(chance: Chance, data: bytes) -> bytes:
         elif kind == "line":
             lines = data.splitlines(keepends=True) or [b""]
             k = chance.randrange(len(lines))
-            lines[k : k + 1] = chance.choice(([], [lines[k]] * 2, [chance.choice(lines)], [lines[k]] * 1000))
+            many = max(2, min(1000, 10**7 // (1 + len(lines[k]))))  # JSON may be one long line
+            lines[k : k + 1] = chance.choice(([], [lines[k]] * 2, [chance.choice(lines)], [lines[k]] * many))
             data = b"".join(lines)
         else:
             data = damage_bytes(chance, data)
