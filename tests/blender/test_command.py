@@ -36,6 +36,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         return Shader("camera", f"shader of {file.name}, {zoom}", 1, (), {}, 21.6, 1.8, 0.7)
 
     monkeypatch.setattr(blender_lenses, "shader_of", written)
+    monkeypatch.setattr(blender_lenses, "Processes", ThreadPoolExecutor)  # which know the stand-in
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # what stands in must not stay
     for folder in ("models", "lenses"):
         (tmp_path / folder).mkdir()
