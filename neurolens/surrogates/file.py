@@ -54,7 +54,8 @@ _MAX_SURFACES, _MAX_TERMS, _MAX_POWER = 500, 1000, 40  # of a prescription, as `
 _LENS = ("name", "source", "f_number", "image_radius_mm", "half_field_deg", "designer", "rims", "film_z_mm", "path")
 _NOWHERE = -1.0  # A film position in no domain: it takes the place of the film where the state is out of range.
 DERIVATIVES = {"scene_ray_d_film": RAY[:2], "scene_ray_d_pupil": RAY[2:]}
-_DAMAGE = (ValueError, TypeError, KeyError, IndexError, ArithmeticError, AttributeError, AssertionError)
+# RecursionError: of lists in lists.
+_DAMAGE = (ValueError, TypeError, KeyError, IndexError, ArithmeticError, AttributeError, AssertionError, RecursionError)
 
 
 @dataclass(frozen=True)

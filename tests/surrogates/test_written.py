@@ -163,12 +163,16 @@ def test_files_that_hold_none(tmp_path: Path) -> None:
         read_model(tmp_path / "old.onnx")
 
 
-def test_a_text_that_inflates_without_end_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("text", "words"), [(b" " * (64 * 2**20), "more than"), (b"[" * 10**5 + b"]" * 10**5, "damaged"), (b"{}", "schema")]
+)
+def test_coefficients_without_end_are_refused(text: bytes, words: str, tmp_path: Path) -> None:
+    """What inflates to any size, lists in lists, and a table of nothing."""
     proto = onnx.load(str(lens_models.exported("invariants")))
     entry = next(e for e in proto.metadata_props if e.key == MODEL_KEY)
-    entry.value = base64.b64encode(zlib.compress(b" " * (64 * 2**20), 9)).decode()
+    entry.value = base64.b64encode(zlib.compress(text, 9)).decode()
     (tmp_path / "bomb.onnx").write_bytes(proto.SerializeToString())
-    with pytest.raises(ModelError, match="more than"):
+    with pytest.raises(ModelError, match=words):
         read_model(tmp_path / "bomb.onnx")
 
 
