@@ -96,7 +96,7 @@ LEAN_MODULES = {
 
 
 # Lines of Python that the package may have; a feature that needs more pays by what it replaces.
-MOST_LINES, MOST_MODULES = 61_100, 300
+MOST_LINES, MOST_MODULES = 59550, 296
 
 
 def module_name(path: Path) -> str:

@@ -28,11 +28,11 @@ from neurolens.render.scene import Scene
 
 UNIT = {"render": "ns", "c": "ns", "onnx": "ns", "osl": "ns", "glsl": "operations"}
 # Of a camera ray in Cycles under a white sky, experiments/results/osl_speed.md: Blender's own cameras; any shader, each
-# of its operations, and what each division and root takes besides. Fitted to the least times of the five cameras of
-# lenses there: within 1.7%, and within 4.4% of each that is left out (of the medians 1.2%, and 2.8%), on quiet cores.
-CYCLES_NS: Mapping[str, float] = {"pinhole": 110.0, "thin": 141.7}
-SHADER_NS = 99.6
-_STEP_NS, _DEAR_NS, _DEAR = 0.1669, 4.438, ("div", "sqrt")
+# of its operations, and what each division and root takes besides. Fitted to the least times of the six cameras of
+# lenses there, on quiet cores: within 2.8%.
+CYCLES_NS: Mapping[str, float] = {"pinhole": 111.9, "thin": 139.5}
+SHADER_NS = 70.42
+_STEP_NS, _DEAR_NS, _DEAR = 0.2761, 2.324, ("div", "sqrt")
 # Of GLSL that anybody writes: a direction with its length, a point of a disc by concentric squares, the plane in focus.
 GLSL_OPERATIONS: Mapping[str, float] = {"pinhole": 14, "thin": 44, "thick": 47}
 _ROUNDS, _SIDE = 7, 16
