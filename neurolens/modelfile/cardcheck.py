@@ -26,7 +26,8 @@ def is_number(value: Any) -> bool:
 
 
 def _positive(value: Any) -> bool:
-    return is_number(value) and value > 0
+    """Whether a number and its reciprocal are above 0 in float32, too."""
+    return is_number(value) and 1e-30 <= value <= 1e30
 
 
 def _integer(value: Any, least: int, most: int) -> bool:

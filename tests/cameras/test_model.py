@@ -82,6 +82,10 @@ DAMAGE: dict[str, tuple[Callable[[ModelProto], object], str]] = {
     "a section of text": (change_card(lambda c: c.update(lens="lens")), "lens: got 'lens'"),
     "no name of the lens": (change_card(lambda c: c["lens"].pop("id")), "lens.id"),
     "negative radius": (change_card(lambda c: c["domain"].update(film_radius_mm=-20)), "domain.film_radius_mm"),
+    "a radius of nothing": (
+        change_card(lambda c: c["domain"]["bounds"].update(film_radius_mm=1e-308)),
+        "domain.bounds.film_radius_mm",
+    ),
     "no stop": (change_card(lambda c: c["lens"].update(stop_radius_mm=0)), "lens.stop_radius_mm"),
     "integer beyond floats": (change_card(lambda c: c["lens"].update(efl_mm=10**400)), "lens.efl_mm"),
     "infinite by its digits": (
