@@ -1,4 +1,4 @@
-"""Fields of a settings dataclass as options of a command line: one declaration for Python, TOML and argparse.
+"""Fields of a settings dataclass as options of a command line: one declaration for Python, TOML and argparse::
 
     @dataclass(frozen=True)
     class Blur:

@@ -2,7 +2,7 @@
 
 They have the interface of `concurrent.futures`: `submit` returns a `Future`, and `wait` and `as_completed` of the
 standard library take it. `run_each` hands out the answers of any number of tasks while only a few of them wait in
-memory. An answer must depend on its task alone, because a cluster starts a task again when its worker was lost.
+memory. An answer must depend on its task alone, because a cluster starts a task again when its worker was lost::
 
     with Processes(jobs=4) as executor:
         for task, answer in run_each(executor, work, tasks):

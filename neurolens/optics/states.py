@@ -45,7 +45,7 @@ def set_lens(
     focus: Focus = "paraxial",
     wavelength_nm: tuple[float, float] | None = None,
 ) -> Lens:
-    """Return the lens zoomed, scaled, stopped down and focused.
+    """Return the lens zoomed, scaled, stopped down and focused::
 
         lens = set_lens(read_lens("lenses/laikin_double_gauss_50.toml"), focus_m=2.0, f_number=4.0)
 

@@ -57,7 +57,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     command = ["surrogates", TRIPLET, "--quick", "--rays", "2000", "--rounds", "1", "--quiet"]
     with patch.context() as patched:
         patched.setattr(surrogate_bench, "fit_any", fit)
-        patched.setattr(surrogate_bench, "chosen_rows", lambda names: ROWS)
+        patched.setattr("experiments.surrogates.chosen_rows", lambda names: ROWS)
         assert main([*command, "--output", str(folder)]) == 0
         files = [f for name in ("records", "models") for f in (folder / name).rglob("*") if f.is_file()]
         before = {f: f.stat().st_mtime_ns for f in files}
