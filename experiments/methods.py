@@ -39,7 +39,7 @@ GROUPS = {
 DEFAULT_GROUPS = ("paraxial", "published", "ours")
 
 
-# Of method "ols" in the invariants.
+# What each ablation changes in a polynomial that "ols" fits in the invariants.
 POLYNOMIAL_ABLATIONS: Mapping[str, Mapping[str, Any]] = {
     "planes not searched": {"planes": False},
     "candidates do not grow": {"growth": 0},
@@ -51,7 +51,7 @@ POLYNOMIAL_ABLATIONS: Mapping[str, Mapping[str, Any]] = {
     "matching pursuit": {"method": "omp"},
     "raw monomials": {"basis": "raw", "degree": 5},
 }
-# Of networks.
+# What each ablation changes in a network.
 NETWORK_ABLATIONS: Mapping[str, Mapping[str, Any]] = {"20 steps of training": {"steps": 20}, "one layer": {"layers": 1}}
 
 

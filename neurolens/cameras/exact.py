@@ -51,7 +51,7 @@ class ExactCamera(LensCamera):
         bounds: pupil bounds of a domain that holds this focus and stop; rays are then those of the domain's models for
             the same random numbers. None searches for them, over the whole film.
         progress: shows the search for the outline, where it was not found before (`outline_cache`).
-        runtime: what runs the camera; all but "trace" are float32.
+        runtime: what runs the camera. Only "trace" can compute in float64.
 
     Raises:
         InputError: a focus nearer than four focal lengths, or a lens that no ray passes.

@@ -39,7 +39,8 @@ Runtime = Literal["onnxruntime", "c", "trace"]
 # Film points, pupil squares [2, N] and wavelengths [1, N] by name to what `camera_rays` takes.
 GraphRun = Callable[[dict[str, FloatArray]], dict[str, NDArray[Any]]]
 
-# Of a camera with its lens: 2900 in the largest that ships. gcc 12 takes 48 s for 7100, and ever longer.
+# The most steps of a camera that are compiled. The largest camera of a model that ships has 2900; gcc 12 takes 48 s for
+# 7100, and its time grows faster than their number.
 MAX_STEPS = 12_000
 _SAMPLES = 4096  # rays that low-order derivatives are fitted to
 _INPUTS = {"film_mm": ("tensor(float)", 2, None), "square": ("tensor(float)", 2, None)}

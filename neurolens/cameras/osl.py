@@ -467,8 +467,10 @@ def osl_lens(
 
 
 def _blade_margin(lens: ShaderLens, pupil: PupilCircles | PupilDisc) -> float:
-    """By how much, in the stop's radius, blades are widened for samples: nearly no ray that passes within an edge lies
-    beyond it where the pupil's image of the stop has it."""
+    """The margin, in stop radii, by which the sampler widens the blades.
+
+    The image of the stop in the pupil is a fit, so that a ray just inside a blade may be sampled just outside it.
+    """
     if isinstance(pupil, PupilDisc):
         return 0.0
     inputs = _samples(lens, pupil)

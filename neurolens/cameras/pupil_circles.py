@@ -227,7 +227,7 @@ class _Shape:
 def _within_blades(
     disc: Value, shape: _Shape, at_stop: Callable[[Value, Value], Value], blades: Blades, margin: float
 ) -> Value:
-    """By which factor a point of the disc is moved towards the middle, to lie within the blades."""
+    """The factor that moves a point of the disc towards the middle until it lies within the blades."""
     g = disc.graph
     centre, _ = shape.chord(g.constant(0.0))
     start = at_stop(shape.middle, g.constant(0.0) if centre is None else centre)

@@ -33,7 +33,7 @@ def passing_share(
         blocked = np.flatnonzero(~passed)
         lit, tries = np.zeros(blocked.size, bool), 0
         while tries < _TRIES and not lit.all():
-            # As many again of each at once, for few rays cost nearly as much as many.
+            # Each round doubles the rays of a dark point: a call with few rays takes nearly as long as one with many.
             more = min(max(1, min(tries, _SAMPLES // int(np.count_nonzero(~lit)))), _TRIES - tries)
             dark, tries = np.repeat(blocked[~lit], more), tries + more
             again = _sampled(lens, pupil, rng.random((2, dark.size)), film[:, dark], call[:, dark], stop)

@@ -103,8 +103,10 @@ def missing_frames(args: argparse.Namespace, frames: Mapping[Path, Frame]) -> di
         if args.restart or not written.is_file() or Files.of(written).checkpoint.exists():
             missing[out] = frame
     if kept := len(frames) - len(missing):
-        told = f"{kept} of {len(frames)} frames exist and are kept, whatever their settings"
-        warn(f"{told}; --restart renders them again")
+        warn(
+            f"{kept} of {len(frames)} frames exist and are kept, even if their settings differ; "
+            "--restart renders them again"
+        )
     return missing
 
 

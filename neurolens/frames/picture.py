@@ -1,4 +1,4 @@
-"""A frame rendered with its flare, and its files: OpenEXR and a PNG preview.
+"""A frame rendered with its flare, and its files: OpenEXR and a PNG preview::
 
 frame = Frame.of("experiments/scenes/lights.toml", "lenses/cooke_triplet_50.toml", samples=16)
 render_frame(frame, Path("lights.exr"))
