@@ -467,10 +467,7 @@ def osl_lens(
 
 
 def _blade_margin(lens: ShaderLens, pupil: PupilCircles | PupilDisc) -> float:
-    """The margin, in stop radii, by which the sampler widens the blades.
-
-    The image of the stop in the pupil is a fit, so that a ray just inside a blade may be sampled just outside it.
-    """
+    """The margin, in stop radii, by which the sampler widens blades: a fitted image may put a passing ray beyond one."""
     if isinstance(pupil, PupilDisc):
         return 0.0
     inputs = _samples(lens, pupil)
