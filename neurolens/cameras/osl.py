@@ -467,7 +467,7 @@ def osl_lens(
 
 
 def _blade_margin(lens: ShaderLens, pupil: PupilCircles | PupilDisc) -> float:
-    """The margin, in stop radii, by which the sampler widens blades: a fitted image may put a passing ray beyond one."""
+    """The margin, in stop radii, by which the sampler widens blades: a fit may put a passing ray beyond one."""
     if isinstance(pupil, PupilDisc):
         return 0.0
     inputs = _samples(lens, pupil)
