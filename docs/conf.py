@@ -17,8 +17,8 @@ from pygments.lexers.special import TextLexer
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ROOT / "docs" / "pages"
-PACKAGES = ("base", "graph", "modelfile", "optics", "readers", "analysis", "surrogates", "cameras", "render", "flare",
-            "evaluate")  # fmt: skip
+PACKAGES = ("base", "graph", "lens", "trace", "setting", "readers", "analysis", "surrogates", "cameras", "shaders",
+            "render", "flare", "study", "plan")  # fmt: skip
 sys.path.insert(0, str(ROOT))
 
 project = html_title = "neurolens"

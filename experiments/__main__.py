@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from neurolens import cli
-from neurolens.commands.arguments import Parser
+from neurolens.cli.arguments import Parser
 
 NAMES = {
     "trace": ("trace_speed", "rays per second and memory of the exact tracer"),

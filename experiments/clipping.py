@@ -23,10 +23,10 @@ from experiments.lab import Row
 from experiments.promises import read_index
 from neurolens.base import status as st
 from neurolens.cameras.model import load_model
-from neurolens.evaluate.measure import onnx_predictor
-from neurolens.evaluate.vignetting import SEED, false_shares
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.states import set_lens
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
+from neurolens.study.measure import onnx_predictor
+from neurolens.study.vignetting import SEED, false_shares
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import trace_pairs

@@ -36,9 +36,9 @@ from neurolens.analysis.fields import Scene
 from neurolens.base.errors import AssumedWarning, InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress, Report
-from neurolens.optics.glass import index_of
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens
+from neurolens.lens.glass import index_of
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any
 
 SCRIPT = Path(__file__).with_name("ray_optics.py")

@@ -21,10 +21,10 @@ from experiments.collection import PARAXIAL, SHARES, TENTHS, RayOptics, own_row,
 from experiments.lab import Row
 from neurolens.base.files import atomic_path
 from neurolens.base.progress import Report
-from neurolens.evaluate.describe import read_quietly
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
 from neurolens.readers.source import read_text
+from neurolens.study.describe import read_quietly
 
 COUNT = 200
 MOST_EFL_MM = 3000.0  # longer ones are nearly afocal: an attachment

@@ -28,13 +28,13 @@ from experiments import lab
 from experiments.lab import Row
 from experiments.trace_speed import film_rays, with_aspheres
 from neurolens.base.errors import NeurolensError
-from neurolens.evaluate.speed import POOL, Call, Candidate, Race, race
-from neurolens.optics import glass
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens
-from neurolens.optics.states import set_lens
-from neurolens.optics.trace import Rays, compile_trace, trace
+from neurolens.lens import glass
+from neurolens.lens.prescription import Lens
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
+from neurolens.study.speed import POOL, Call, Candidate, Race, race
 from neurolens.surrogates.domain import FilmRays
+from neurolens.trace.rays import Rays, compile_trace, trace
 
 try:
     import optiland

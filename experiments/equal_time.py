@@ -28,16 +28,16 @@ from experiments.equal_time_errors import (
     weights,
 )
 from neurolens.base.files import atomic_path, fingerprint_of, sha256_of
+from neurolens.base.records import plain
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.onnxlens import load_model
-from neurolens.evaluate import scenes
-from neurolens.evaluate.image import EPS, flip, flip_map
-from neurolens.evaluate.records import plain
-from neurolens.optics.lensfile import read_lens
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.film_settings import FilmSettings
 from neurolens.render.renderer import render
 from neurolens.render.scene import CameraSettings, Scene, files_named, load_scene
+from neurolens.study import scenes
+from neurolens.study.image import EPS, flip, flip_map
 from neurolens.surrogates.model import Domain
 
 EXACT, THIN = "exact", "thin lens"

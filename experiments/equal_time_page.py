@@ -37,9 +37,9 @@ from experiments.equal_time import (
 from experiments.equal_time_errors import Estimate, crossover_s, log_interpolate
 from neurolens.analysis.plot_style import FAINT, INK, drawing, plain_log_ticks
 from neurolens.base.files import atomic_write_text, write_json
-from neurolens.evaluate.figures import side_by_side
-from neurolens.evaluate.plots import family_colour
-from neurolens.evaluate.records import plain
+from neurolens.base.records import plain
+from neurolens.study.figures import side_by_side
+from neurolens.study.plots import family_colour
 
 _INTRO = """\
 # Equal time and equal samples

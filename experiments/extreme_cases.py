@@ -11,12 +11,12 @@ from torch import Tensor
 
 from experiments import lab
 from neurolens.base import status as st
-from neurolens.optics import glass
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.states import set_lens
-from neurolens.optics.trace import Rays, Towards, trace
+from neurolens.lens import glass
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens, Surface
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
+from neurolens.trace.rays import Rays, Towards, trace
 
 INF = math.inf
 DOUBLE_GAUSS, FISHEYE = "laikin_double_gauss_50", "shimizu_fisheye_220"

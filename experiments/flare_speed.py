@@ -33,12 +33,12 @@ from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
 from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.lights import Light, light_rays
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens
-from neurolens.optics.sequence import follow, ghost
-from neurolens.optics.states import set_lens
-from neurolens.optics.trace import Rays
+from neurolens.lens.prescription import Lens
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.pictures import write_exr
+from neurolens.setting.states import set_lens
+from neurolens.trace.rays import Rays
+from neurolens.trace.sequence import follow, ghost
 
 LENSES = ("laikin_double_gauss_50", "brendel_tessar_100", "ikemori_retrofocus_14", "ogawa_zoom_70_200", "phone_lens_6")
 GOAL_NS = 57.0  # a tenth of what the public CPU tracer was said to take on one quiet core (10 surfaces, all pairs)

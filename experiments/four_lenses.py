@@ -17,9 +17,9 @@ import numpy as np
 from experiments import lab
 from neurolens.base.progress import Progress
 from neurolens.cameras.build import FUSED, Shot, make_camera
-from neurolens.evaluate.image import Image, to_srgb
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene
+from neurolens.study.image import Image, to_srgb
 
 SCENE = lab.SCENES / "chess.toml"
 _GAP = 6  # pixels between the pictures

@@ -24,20 +24,19 @@ from experiments import lab
 from experiments.lab import Report
 from neurolens.cameras.model import load_model
 from neurolens.cameras.onnxsession import open_session
-from neurolens.evaluate.candidates import (
+from neurolens.graph.compiler import FLAGS, find_compiler
+from neurolens.graph.program import Program
+from neurolens.graph.scalars import lower
+from neurolens.lens.prescription import Lens
+from neurolens.study.candidates import (
     exact_candidates,
     fused_candidate,
     model_candidate,
     program_candidate,
 )
-from neurolens.evaluate.experiment import LensChoice
-from neurolens.evaluate.rays import ray_errors
-from neurolens.evaluate.speed import Call, Candidate, race
-from neurolens.graph.compiler import FLAGS, find_compiler
-from neurolens.graph.program import Program
-from neurolens.graph.scalars import lower
-from neurolens.optics.prescription import Lens
-from neurolens.optics.tracegraph import exact_graph
+from neurolens.study.experiment import LensChoice
+from neurolens.study.rays import ray_errors
+from neurolens.study.speed import Call, Candidate, race
 from neurolens.surrogates.assemble import ALL, RAY_ONLY
 from neurolens.surrogates.domain import FilmRays, domain_of
 from neurolens.surrogates.export import export_onnx
@@ -46,6 +45,7 @@ from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.source import fused_program
 from neurolens.surrogates.specialise import Fix, fixed_models
+from neurolens.trace.tracegraph import exact_graph
 
 WITHIN_UM = 1.0
 # Other ways to compile, of what is not fixed: one ray at a time, as an integrator calls it; without AVX-512.

@@ -48,8 +48,8 @@ _JUDGES = ("evaluate", "models", "library", "survey", "train")  # their exit cod
 _LOADED = (
     *("onnxruntime", "torch", "onnx", "matplotlib.pyplot", "sklearn.linear_model", "neurolens.readers.any_format"),
     *("neurolens.surrogates.export", "neurolens.render.renderer", "neurolens.render.scene", "neurolens.cameras.build"),
-    *("neurolens.cameras.model", "neurolens.render.pictures", "neurolens.optics.lenscheck", "neurolens.flare.layers"),
-    *("neurolens.commands.render_files", "neurolens.evaluate.survey_run", "neurolens.analysis.spots"),
+    *("neurolens.cameras.model", "neurolens.render.pictures", "neurolens.setting.check", "neurolens.flare.layers"),
+    *("neurolens.cli.render_files", "neurolens.study.survey_run", "neurolens.analysis.spots"),
 )
 OPTIONS = (
     lab.count("cases", 1000, "cases (default 1000)"),

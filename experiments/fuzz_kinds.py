@@ -22,7 +22,7 @@ from experiments import lab
 from experiments.fuzz_damage import WORDS, damage
 from neurolens import cli
 from neurolens.base.files import write_kept
-from neurolens.commands.arguments import Parser
+from neurolens.cli.arguments import Parser
 
 SEEDS = Path(__file__).with_name("fuzz_seeds")
 Chance = random.Random
@@ -340,8 +340,8 @@ def chosen(seed: int, case: int, only: str = "") -> tuple[Chance, str]:
 
 def build() -> Parser:
     """The command line, and `read EXPERIMENT`: an experiment with its lens, domain and scenes; nothing runs."""
-    from neurolens.evaluate.experiment import read_experiment
     from neurolens.render.scene import load_scene
+    from neurolens.study.experiment import read_experiment
 
     def read(args: argparse.Namespace) -> int:
         experiment = read_experiment(args.file)
@@ -364,7 +364,7 @@ def shorten() -> None:
     from neurolens.base.tasks import Here
     from neurolens.blender.pack import Form
     from neurolens.cameras.onnxlens import load_model
-    from neurolens.commands import blender_lenses, flare_lights, survey
+    from neurolens.cli import blender_lenses, flare_lights, survey
 
     def form_of(file: Path, **_: Any) -> Form:
         card = load_model(file).card
@@ -456,7 +456,7 @@ def _pack(folder: Path) -> None:
 def _page(folder: Path) -> None:
     """A page of `neurolens library` whose record is known, so that it is not drawn again."""
     from neurolens import __version__
-    from neurolens.optics.lensfile import read_lens
+    from neurolens.readers.lensfile import read_lens
 
     record = {
         "lens": "cooke_triplet_50", "page": "cooke_triplet_50", "sha256": read_lens(folder / "lens.toml").sha256,

@@ -26,17 +26,17 @@ import torch
 
 from experiments import lab
 from neurolens.base.progress import Progress
-from neurolens.evaluate.image import flip, flip_map
 from neurolens.flare import grids, picture
 from neurolens.flare.ghostfit import GhostSettings, fit_ghosts, sample, solved
 from neurolens.flare.ghostmodel import GhostModel
 from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.lights import Light, light_rays, rays_across
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens
-from neurolens.optics.sequence import follow, ghost
-from neurolens.optics.states import set_lens
-from neurolens.optics.trace import Rays
+from neurolens.lens.prescription import Lens
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
+from neurolens.study.image import flip, flip_map
+from neurolens.trace.rays import Rays
+from neurolens.trace.sequence import follow, ghost
 
 LENS, LIGHT = "laikin_double_gauss_50", Light(15.0, 8.0)
 RASTER = picture.Raster((36.0, 20.25), 960, 540)

@@ -35,12 +35,12 @@ from neurolens.flare.lights import Light, front_sphere, light_rays
 from neurolens.flare.photons import LEVELS, Photons, PhotonTracer
 from neurolens.flare.picture import Raster, axis_irradiance, ghost_table
 from neurolens.flare.stack import Floats
-from neurolens.optics.apertures import Aperture
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens
-from neurolens.optics.states import set_lens
+from neurolens.lens.apertures import Aperture
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.flaresettings import FlareSettings, Scatter
+from neurolens.setting.states import set_lens
 
 LENS, NM, HALF_MM = "laikin_double_gauss_50", 550.0, (18.0, 12.0)
 COATINGS = ("bare", "single-layer", "multi-layer")

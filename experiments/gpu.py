@@ -27,18 +27,18 @@ from numpy.typing import NDArray
 
 from experiments import gl_compute, lab
 from neurolens.base import status as st
-from neurolens.evaluate.rays import ray_errors
 from neurolens.graph.c import Signature
 from neurolens.graph.glsl import write_glsl
 from neurolens.graph.program import FILM_Z, RAY, STOP_RADIUS, WAVELENGTH, Program
 from neurolens.graph.scalars import lower
-from neurolens.optics.surfaces import Rays
-from neurolens.optics.tracegraph import exact_graph
+from neurolens.study.rays import ray_errors
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.file import read_model
 from neurolens.surrogates.model import LensModel, Prediction
 from neurolens.surrogates.pairs import PairSet, trace_pairs
 from neurolens.surrogates.source import fused_program
+from neurolens.trace.surfaces import Rays
+from neurolens.trace.tracegraph import exact_graph
 
 LENSES = {
     "thorlabs_lb1471_biconvex_50": ("ols-64", "mlp-16x2"),

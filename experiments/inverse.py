@@ -21,13 +21,12 @@ from experiments import lab
 from experiments.lab import Row
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.evaluate.experiment import LensChoice
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.newton import solve, with_jacobian
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens
-from neurolens.optics.sag import front_rays
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
+from neurolens.study.experiment import LensChoice
 from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
@@ -35,6 +34,7 @@ from neurolens.surrogates.inverse import STEPS, TOLERANCE, InverseModel, front_i
 from neurolens.surrogates.inverse_fit import convergence, fit_inverse
 from neurolens.surrogates.model import Domain, LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.trace.sag import front_rays
 
 PUBLISHED_STEPS = (3, 5, 10, 20)
 # A residual beyond this (in stop radii; of the front's radius, in radians) counts as diverged, not just missed.

@@ -27,7 +27,7 @@ from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_path, atomic_write_text, write_json
 from neurolens.base.progress import Progress, Report
-from neurolens.commands.arguments import QUIET_HELP, add_option, add_output, whole
+from neurolens.cli.arguments import QUIET_HELP, add_option, add_output, whole
 
 ROOT = Path(__file__).parents[1]
 LENSES, SCENES, MODELS = ROOT / "lenses", ROOT / "experiments" / "scenes", ROOT / "models"

@@ -29,12 +29,15 @@ from neurolens.base.config import read_config
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_path, atomic_write_text, fingerprint_of, sha256_of, write_json
 from neurolens.base.progress import Progress
+from neurolens.base.records import versions
 from neurolens.cameras.model import load_model
-from neurolens.evaluate.candidates import exact_candidates, model_candidate, model_candidates
-from neurolens.evaluate.check import check_model, check_states
-from neurolens.evaluate.describe import lens_files
-from neurolens.evaluate.experiment import DomainChoice, Experiment, LensChoice, check_names
-from neurolens.evaluate.measure import (
+from neurolens.lens.prescription import Lens
+from neurolens.setting.pupils import image_radius_mm
+from neurolens.study.candidates import exact_candidates, model_candidate, model_candidates
+from neurolens.study.check import check_model, check_states
+from neurolens.study.describe import lens_files
+from neurolens.study.experiment import DomainChoice, Experiment, LensChoice, check_names
+from neurolens.study.measure import (
     CARD_KEYS,
     FRESH,
     Findings,
@@ -46,12 +49,9 @@ from neurolens.evaluate.measure import (
     shared_rays,
     what_is_poor,
 )
-from neurolens.evaluate.rays import REFERENCE_RADIUS_MM
-from neurolens.evaluate.records import versions
-from neurolens.evaluate.speed import race
-from neurolens.evaluate.train_states import fit_and_measure_states, state_settings
-from neurolens.optics.prescription import Lens
-from neurolens.optics.pupils import image_radius_mm
+from neurolens.study.rays import REFERENCE_RADIUS_MM
+from neurolens.study.speed import race
+from neurolens.study.train_states import fit_and_measure_states, state_settings
 from neurolens.surrogates.cores import Residual
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.file import read_model
@@ -160,7 +160,7 @@ _HEAD = """# Models that ship
 Made by `python -m experiments models` from experiments/models.toml: of every lens of lenses/ the best polynomial of at most
 64 coefficients per vector output and the best network of two layers of 16 units after 600 iterations,
 over the whole lit film, full aperture, focus from infinity to near and all wavelengths for which the glasses are known;
-of a few lenses also faster ones. Errors on held-out rays (`neurolens.evaluate.rays`), micrometres at an image radius of
+of a few lenses also faster ones. Errors on held-out rays (`neurolens.study.rays`), micrometres at an image radius of
 21.6 mm; every card was checked on fresh rays. Times on one core in onnxruntime and as C compiled here, with stop, rims and transmittance;
 speed-up of onnxruntime over the compiled exact tracer doing the same work in the same run. Check a model with
 `neurolens evaluate models/FILE`; `make bench` holds those of the first lenses to the speed-ups that the index promises."""  # noqa: E501

@@ -16,15 +16,15 @@ from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import fingerprint_of, read_kept, sha256_of, write_kept
 from neurolens.base.lensname import lens_id_of
 from neurolens.base.progress import Progress, Report
+from neurolens.base.records import plain
 from neurolens.cameras.model import load_model
-from neurolens.evaluate.candidates import EXACT, exact_candidates, exact_records, model_candidates
-from neurolens.evaluate.experiment import DomainChoice, LensChoice
-from neurolens.evaluate.measure import FreshRays, measure, onnx_predictor, seconds_to_load, shared_rays
-from neurolens.evaluate.rays import REFERENCE_RADIUS_MM
-from neurolens.evaluate.records import plain
-from neurolens.evaluate.speed import Race, race
-from neurolens.optics.prescription import Lens
-from neurolens.optics.pupils import image_radius_mm
+from neurolens.lens.prescription import Lens
+from neurolens.setting.pupils import image_radius_mm
+from neurolens.study.candidates import EXACT, exact_candidates, exact_records, model_candidates
+from neurolens.study.experiment import DomainChoice, LensChoice
+from neurolens.study.measure import FreshRays, measure, onnx_predictor, seconds_to_load, shared_rays
+from neurolens.study.rays import REFERENCE_RADIUS_MM
+from neurolens.study.speed import Race, race
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, prepare
 from neurolens.surrogates.model import Domain

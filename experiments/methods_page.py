@@ -9,9 +9,9 @@ from pathlib import Path
 from experiments.lab import markdown_table
 from experiments.methods import GROUPS
 from neurolens.base.files import atomic_write_text
-from neurolens.evaluate.pages import DASH, Column, Record, number, show
-from neurolens.evaluate.plots import Kinds, trade_plot
 from neurolens.graph.scalars import MOST_WEIGHTS
+from neurolens.study.pages import DASH, Column, Record, number, show
+from neurolens.study.plots import Kinds, trade_plot
 
 COLUMNS = (
     Column("RMS um", "rms_um_at_21_6"),
@@ -60,7 +60,7 @@ _LOOK: Kinds = {
 }
 
 NOTES = (
-    "Errors on held-out rays at full aperture, as `neurolens.evaluate.rays` defines them, of the exported float32 "
+    "Errors on held-out rays at full aperture, as `neurolens.study.rays` defines them, of the exported float32 "
     "graph. Micrometres are film-equivalent and at an image radius of 21.6 "
     "mm, the position's at the front surface likewise; pixels are the frame's width over 4000. False pass: blocked "
     "rays over rays that the model passes; false block: lost rays over rays that the lens passes. Coefficients: of "

@@ -32,10 +32,10 @@ from experiments.mitsuba_scenes import our_scene, with_our_spectra
 from neurolens import mitsuba
 from neurolens.base.errors import NeurolensError
 from neurolens.base.progress import Progress
+from neurolens.base.records import plain
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.evaluate.records import plain
 from neurolens.mitsuba import require_mitsuba
 from neurolens.mitsuba.library import libraries
 from neurolens.render.film_settings import FilmSettings

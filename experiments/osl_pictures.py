@@ -20,11 +20,11 @@ from experiments import lab
 from experiments.osl_speed import BLENDER, checked_python, in_blender
 from neurolens.base.progress import Progress
 from neurolens.blender.pack import Form
-from neurolens.commands.blender_kept import kept_form
-from neurolens.commands.blender_lenses import form_of
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.states import set_lens
+from neurolens.cli.blender_kept import kept_form
+from neurolens.cli.blender_lenses import form_of
+from neurolens.lens.paraxial import first_order
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
 
 _MOST_BYTES = 240_000  # of a picture
 _QUALITIES = (90, 85, 80, 70)

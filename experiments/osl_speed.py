@@ -151,7 +151,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _shaders(quiet: bool) -> tuple[dict[str, str | None], dict[str, int]]:
     """Texts by camera, None for Blender's own, and the operations of ours."""
-    from neurolens.evaluate.shaders import shader_of
+    from neurolens.shaders.blender_shader import shader_of
 
     made = {name: shader_of(file, quiet=quiet) for name, file in SHADERS.items()}
     own: dict[str, str | None] = {BUILT_IN: None, DEPTH: None, THIN: THIN_LENS}

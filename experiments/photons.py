@@ -24,8 +24,8 @@ from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.photons import PhotonTracer
 from neurolens.flare.picture import Raster, ghost_picture, photon_picture
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.states import set_lens
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
 
 LENS, ZOOM, DISTANCE_MM = "nikon_zoom_80_200", "80", 3600.0
 # x, y of the light in mm, most reflections, and his time where he states it.

@@ -26,14 +26,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import Camera, CameraRays, FloatArray
-from neurolens.evaluate import footprints as prints
-from neurolens.evaluate.footprints import Footprints, Places
-from neurolens.evaluate.light import parts_of, spectrum_seen
-from neurolens.evaluate.probe import COUNTED
-from neurolens.evaluate.scenes import seen_depths_m
+from neurolens.plan import footprints as prints
+from neurolens.plan.footprints import Footprints, Places
+from neurolens.plan.light import parts_of, spectrum_seen
+from neurolens.plan.probe import COUNTED
 from neurolens.render.film_settings import FilmSettings
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene
+from neurolens.study.scenes import seen_depths_m
 
 Array = NDArray[np.float64]
 _PUPILS = 18, 64, 160  # squared: pupil samples of a fresh footprint, and where those leave its error unsure

@@ -24,17 +24,17 @@ from neurolens.cameras.build import Shot, ideal_as, make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.warped import Warped
-from neurolens.evaluate import footprints as prints
-from neurolens.evaluate import plan as plans
-from neurolens.evaluate import shot_fits
-from neurolens.evaluate.experiment import near_limit_m
-from neurolens.evaluate.probe import COUNTED, LIGHT, Probed, effects_of, probe
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens
-from neurolens.optics.pupils import image_radius_mm
-from neurolens.optics.states import set_lens
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
+from neurolens.plan import footprints as prints
+from neurolens.plan import plan as plans
+from neurolens.plan import shot_fits
+from neurolens.plan.probe import COUNTED, LIGHT, Probed, effects_of, probe
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import Scene, load_scene
+from neurolens.setting.pupils import image_radius_mm
+from neurolens.setting.states import set_lens
+from neurolens.study.experiment import near_limit_m
 from neurolens.surrogates.bases import pinned_threads
 
 LENSES = (

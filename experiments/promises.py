@@ -25,11 +25,11 @@ from experiments.lab import Row
 from experiments.mitsuba_speed import mpaths_per_s
 from neurolens.base.errors import InputError
 from neurolens.cameras.model import load_model
-from neurolens.evaluate.candidates import exact_candidates, ideal_cameras, model_candidate
-from neurolens.evaluate.speed import Race, race
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.states import set_lens
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import load_scene
+from neurolens.setting.states import set_lens
+from neurolens.study.candidates import exact_candidates, ideal_cameras, model_candidate
+from neurolens.study.speed import Race, race
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.model import Domain
 

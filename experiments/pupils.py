@@ -23,16 +23,16 @@ from experiments import lab
 from experiments import pupil_methods as known
 from neurolens.base.progress import Progress
 from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.osl import osl_program
 from neurolens.cameras.pupil_boxes import PupilTable
-from neurolens.cameras.pupil_circles_fit import light_lost
 from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.evaluate.costs import cycles_ns
-from neurolens.evaluate.shaders import lens_of
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens
-from neurolens.optics.pupils import pupil_bounds
-from neurolens.optics.states import set_lens
+from neurolens.lens.prescription import Lens
+from neurolens.plan.costs import cycles_ns
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.pupils import pupil_bounds
+from neurolens.setting.states import set_lens
+from neurolens.shaders.blender_shader import lens_of
+from neurolens.shaders.osl import osl_program
+from neurolens.shaders.pupil_circles_fit import light_lost
 
 
 @dataclass(frozen=True)
@@ -341,7 +341,7 @@ SHADERS = lab.columns(
 _SHADERS_TEXT = """\
 By `python -m experiments pupils --shaders`: share of the samples that pass the lens, from film points that have light
 at that stop, all over film, focus and wavelength; light that no sample has, in the worst zone of film and stop;
-operations of a ray through a round stop; what they make a ray cost in Cycles under a white sky (`evaluate/costs.py`)
+operations of a ray through a round stop; what they make a ray cost in Cycles under a white sky (`plan/costs.py`)
 for each that passes, the stop open; CPU to make the shader. The pupil of the biconvex lens folds far off the axis: one
 wide disc holds it."""
 

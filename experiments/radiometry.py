@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.optics.aiming import without_rims
-from neurolens.optics.prescription import Lens
-from neurolens.optics.pupils import camera_rays, pupil_bounds, pupil_plane_z_mm
-from neurolens.optics.sag import same_medium
-from neurolens.optics.surfaces import Rays
-from neurolens.optics.trace import trace
+from neurolens.lens.prescription import Lens
+from neurolens.setting.pupils import camera_rays, pupil_bounds, pupil_plane_z_mm
+from neurolens.trace.aiming import without_rims
+from neurolens.trace.rays import trace
+from neurolens.trace.sag import same_medium
+from neurolens.trace.surfaces import Rays
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from experiments.lab import Report
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import FUSED, Shot, make_camera
 from neurolens.cameras.contract import RAYS_A_CALL, Camera
-from neurolens.optics.apertures import Aperture
+from neurolens.lens.apertures import Aperture
 from neurolens.render.film_settings import FilmSettings
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene, load_scene

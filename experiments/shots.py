@@ -21,14 +21,14 @@ from experiments import lab
 from experiments.plans import suited
 from neurolens.base.progress import Report
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.evaluate import footprints as prints
-from neurolens.evaluate import shot_fits
-from neurolens.evaluate.costs import glsl_operations, ns_a_ray
-from neurolens.evaluate.experiment import near_limit_m
-from neurolens.evaluate.probe import COUNTED, LIGHT, Probed, probe
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.states import set_lens
+from neurolens.plan import footprints as prints
+from neurolens.plan import shot_fits
+from neurolens.plan.costs import glsl_operations, ns_a_ray
+from neurolens.plan.probe import COUNTED, LIGHT, Probed, probe
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import load_scene
+from neurolens.setting.states import set_lens
+from neurolens.study.experiment import near_limit_m
 from neurolens.surrogates.bases import pinned_threads
 
 # All kinds: wide to long, f/1 to f/5.4, simple and not, from plastic, a zoom's default state.

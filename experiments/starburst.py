@@ -23,10 +23,10 @@ from neurolens.flare.diffraction import far_field, outline_spectrum, star, starb
 from neurolens.flare.exit_pupil import Array, ExitPupil, coverage, exit_pupil, outline
 from neurolens.flare.lights import Light
 from neurolens.flare.picture import Raster
-from neurolens.optics.apertures import Aperture
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens
-from neurolens.optics.states import set_lens
+from neurolens.lens.apertures import Aperture
+from neurolens.lens.prescription import Lens
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
 
 LENS, NM, FILM_MM = "laikin_double_gauss_50", 550.0, (36.0, 24.0)
 STOPS, BLADES, CURVATURES, FIELDS = (4.0, 8.0, 16.0), (6, 7, 9), (0.0, 0.7), (0.0, 15.0)

@@ -22,10 +22,10 @@ from experiments.methods_page import NOTES, summary_page, write_lens
 from neurolens.base.errors import InputError, printable
 from neurolens.base.files import atomic_write_text, write_json
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import add_glass, add_lens, check_ids, check_run_folder, whole
-from neurolens.evaluate.describe import lens_files
-from neurolens.evaluate.experiment import DomainChoice, LensChoice
-from neurolens.evaluate.records import plain, versions
+from neurolens.base.records import plain, versions
+from neurolens.cli.arguments import add_glass, add_lens, check_ids, check_run_folder, whole
+from neurolens.study.describe import lens_files
+from neurolens.study.experiment import DomainChoice, LensChoice
 from neurolens.surrogates.pairs import PairSettings
 
 DEFAULT_LENSES = (

@@ -18,15 +18,15 @@ from experiments import lab
 from experiments.lab import Report, Row
 from neurolens.base import status as st
 from neurolens.base.progress import Progress
-from neurolens.commands.arguments import whole
-from neurolens.evaluate.candidates import COMPILED_BATCHES, EAGER_BATCHES
-from neurolens.evaluate.speed import POOL, Call, Candidate, Race, Unavailable, race
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens
-from neurolens.optics.pupils import camera_rays
-from neurolens.optics.states import set_lens
-from neurolens.optics.trace import Rays, compile_trace, trace
+from neurolens.cli.arguments import whole
+from neurolens.lens.prescription import Lens
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.pupils import camera_rays
+from neurolens.setting.states import set_lens
+from neurolens.study.candidates import COMPILED_BATCHES, EAGER_BATCHES
+from neurolens.study.speed import POOL, Call, Candidate, Race, Unavailable, race
 from neurolens.surrogates.domain import FilmRays
+from neurolens.trace.rays import Rays, compile_trace, trace
 
 # Lens files by number of refractions.
 LENSES = {

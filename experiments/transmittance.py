@@ -18,13 +18,13 @@ from experiments import lab
 from neurolens.base import status as st
 from neurolens.base.progress import Progress
 from neurolens.flare.ghosts import coated
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens
-from neurolens.optics.pupils import camera_rays
-from neurolens.optics.sequence import follow
-from neurolens.optics.states import set_lens
+from neurolens.lens.prescription import Lens
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.pupils import camera_rays
+from neurolens.setting.states import set_lens
 from neurolens.surrogates.domain import domain_of, sample_domain
 from neurolens.surrogates.model import Domain
+from neurolens.trace.sequence import follow
 
 COATINGS = {"bare": None, "coated": "quarter-wave"}
 

@@ -28,11 +28,11 @@ from experiments.lab import Row
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.progress import Progress
-from neurolens.evaluate.describe import lens_files, read_quietly
-from neurolens.evaluate.experiment import DomainChoice, LensChoice
-from neurolens.evaluate.vignetting import SEED, false_shares, relative_illumination
-from neurolens.optics.apertures import Aperture
-from neurolens.optics.prescription import Lens
+from neurolens.lens.apertures import Aperture
+from neurolens.lens.prescription import Lens
+from neurolens.study.describe import lens_files, read_quietly
+from neurolens.study.experiment import DomainChoice, LensChoice
+from neurolens.study.vignetting import SEED, false_shares, relative_illumination
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.model import Domain, LensModel

@@ -52,8 +52,8 @@ def pytest_collection_finish() -> None:
 def quick_races() -> Iterator[None]:
     """Races of few rays and samples: no test judges a clock."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("neurolens.evaluate.speed.POOL", 16384)
-        patch.setattr("neurolens.evaluate.speed._SAMPLES", 1)
+        patch.setattr("neurolens.study.speed.POOL", 16384)
+        patch.setattr("neurolens.study.speed._SAMPLES", 1)
         yield
 
 

@@ -18,11 +18,11 @@ from torch import Tensor
 from experiments.published import PublishedSettings, fit_any
 from neurolens.base.errors import NeurolensWarning
 from neurolens.cameras.exact import ExactCamera
-from neurolens.modelfile import CARD_KEY, MODEL_KEY
-from neurolens.optics import paraxial
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.states import set_lens
+from neurolens.lens import paraxial
+from neurolens.lens.prescription import Lens, Surface
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
+from neurolens.surrogates.cardkeys import CARD_KEY, MODEL_KEY
 from neurolens.surrogates.cores import Network
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.export import export_onnx

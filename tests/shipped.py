@@ -10,10 +10,10 @@ import numpy as np
 import torch
 
 from neurolens.base.errors import NeurolensWarning
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.states import set_lens
-from neurolens.optics.trace import Rays
+from neurolens.lens.prescription import Lens, Surface
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
+from neurolens.trace.rays import Rays
 
 LENSES = Path(__file__).parents[1] / "lenses"
 PATHS = sorted(LENSES.glob("*.toml"))

@@ -20,14 +20,13 @@ from command_line import described, failure, run_json
 
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.spots import spots
-from neurolens.cli import build_parser, main
-from neurolens.commands import library
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.states import set_lens
+from neurolens.cli import build_parser, library, main
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.pictures import read_exr
+from neurolens.setting.states import set_lens
 
 ROOT = Path(__file__).parents[1]
-# A singlet, a fisheye, an asphere that is the stop, cylinders, a nearly telecentric lens; tests/optics has them all.
+# A singlet, a fisheye, an asphere that is the stop, cylinders, a nearly telecentric lens; tests/trace has them all.
 DESCRIBED = (
     *("thorlabs_lb1471_biconvex_50", "brendel_tessar_100", "muller_fisheye_100", "edmund_asphere_30"),
     *("cooke_anamorphic_42", "isshiki_fisheye_10", "nikon_zoom_80_200"),
@@ -416,7 +415,7 @@ def test_what_ends_a_training_says_what_is_kept(
 ) -> None:
     """Without a handler SIGTERM and SIGHUP would end this process."""
     before = signal.signal(number, signal.SIG_DFL)
-    monkeypatch.setattr("neurolens.evaluate.train.run_experiment", lambda *_, **__: signal.raise_signal(number))
+    monkeypatch.setattr("neurolens.study.train.run_experiment", lambda *_, **__: signal.raise_signal(number))
     try:
         code = main(["train", "--lens", str(GAUSS), "--output", str(tmp_path / "run"), "--quiet"])
     finally:
@@ -455,7 +454,7 @@ def test_an_interrupt_while_the_packages_are_read_is_one_line(begin: str) -> Non
         "import sys\n"
         "class Interrupt:\n"
         "    def find_spec(self, name, *_):\n"
-        "        if name == 'neurolens.commands.lens': raise KeyboardInterrupt\n"
+        "        if name == 'neurolens.cli.lens': raise KeyboardInterrupt\n"
         "sys.meta_path.insert(0, Interrupt())\n"
         f"{begin.replace('main()', 'sys.exit(main())')}"
     )
@@ -464,7 +463,7 @@ def test_an_interrupt_while_the_packages_are_read_is_one_line(begin: str) -> Non
     assert found.stderr.strip() == "neurolens: interrupted; nothing was done"
 
 
-@pytest.mark.parametrize("when", ["neurolens.commands.lens", "numpy"])
+@pytest.mark.parametrize("when", ["neurolens.cli.lens", "numpy"])
 @pytest.mark.parametrize("error", ["ImportError('a C extension')", "SystemError('error return')", "OSError('x')"])
 def test_a_signal_that_a_package_turns_into_its_own_error_is_an_interrupt(when: str, error: str) -> None:
     """As C extensions do, whose start the signal ends: it was called a fault of neurolens."""
@@ -532,8 +531,8 @@ def test_a_reader_that_leaves_is_no_error(scene: Path, tmp_path: Path) -> None:
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A polynomial of the singlet, exported with the errors that it has."""
     from neurolens.cameras.model import load_model
-    from neurolens.evaluate.measure import fresh_rays, measure_on
-    from neurolens.optics.lensfile import read_lens
+    from neurolens.readers.lensfile import read_lens
+    from neurolens.study.measure import fresh_rays, measure_on
     from neurolens.surrogates.domain import domain_of
     from neurolens.surrogates.export import export_onnx
     from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
@@ -631,7 +630,7 @@ def test_pages_of_the_library_show_a_lens_where_its_spot_on_the_axis_is_smallest
 ) -> None:
     scenes: list[Any] = []
     seen = SimpleNamespace(compute=scenes.append, draw=lambda *_: None)
-    monkeypatch.setattr("neurolens.commands.analyse.analysis_of", lambda what: seen)
+    monkeypatch.setattr("neurolens.cli.analyse.analysis_of", lambda what: seen)
     lens = read_lens(ROOT / "lenses" / "laikin_double_gauss_50.toml")
     for name, _, draw in library._drawings(lens):
         if name in library._SHOWN:

@@ -20,7 +20,7 @@ from PIL import Image
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cli import main
-from neurolens.commands.render_frames import frames_of
+from neurolens.cli.render_frames import frames_of
 from neurolens.render.pictures import read_exr, read_layers, write_exr
 
 
@@ -294,9 +294,7 @@ def test_frames_follow_their_keys_and_what_exists_is_kept(
     # A frame that was interrupted goes on; one that fails ends the run.
     (tmp_path / "a.0001.exr.part").write_bytes(b"")
     asked: list[str] = []
-    monkeypatch.setattr(
-        "neurolens.commands.render._render", lambda _, made, *__: asked.append(made.files.out.name) or 3
-    )
+    monkeypatch.setattr("neurolens.cli.render._render", lambda _, made, *__: asked.append(made.files.out.name) or 3)
     assert main([*command, "-o", str(tmp_path / "a.exr")]) == 3 and asked == ["a.0001.exr"]
     capsys.readouterr()
     for wrong, words in (

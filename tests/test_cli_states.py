@@ -16,9 +16,9 @@ from neurolens.base.errors import NeurolensWarning
 from neurolens.cameras.model import load_model
 from neurolens.cameras.onnxmaps import load_inverse
 from neurolens.cli import main
-from neurolens.commands.arguments import Parser
-from neurolens.modelfile import MODEL_KEY
+from neurolens.cli.arguments import Parser
 from neurolens.render.pictures import read_exr, write_exr
+from neurolens.surrogates.cardkeys import MODEL_KEY
 from neurolens.surrogates.domain import FilmRays
 
 LENSES = Path(__file__).parents[1] / "lenses"

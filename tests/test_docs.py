@@ -15,9 +15,9 @@ from typing import Any, get_args, get_type_hints
 
 import pytest
 
-from neurolens.evaluate.experiment import Experiment
-from neurolens.optics import lensfile
+from neurolens.readers import lensfile
 from neurolens.render.scene import SceneSettings
+from neurolens.study.experiment import Experiment
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs" / "pages"

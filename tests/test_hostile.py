@@ -22,7 +22,7 @@ from neurolens.base.config import apply_overrides
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, open_regular
 from neurolens.base.tomlfile import read_toml
-from neurolens.optics import catalogue
+from neurolens.lens import catalogue
 from neurolens.readers.any_format import read_any
 from neurolens.readers.json_lens import image_and_field, read_json_lens
 from neurolens.render import pictures

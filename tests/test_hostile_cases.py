@@ -90,7 +90,7 @@ def test_a_models_method_is_part_of_a_safe_name(case: str, monkeypatch: pytest.M
     def form_of(file: Path, **_: Any) -> Form:
         return Form("polynomial", load_model(file).card["fit"]["method"], "shader", 1.0, 21.6, 1.8, 0.7)
 
-    monkeypatch.setattr("neurolens.commands.blender_lenses.form_of", form_of)
+    monkeypatch.setattr("neurolens.cli.blender_lenses.form_of", form_of)
     before = set(Path().rglob("*"))
     assert main(["blender", "add", case, "--to", "inner/folder", "--quiet"]) == 0
     made = set(Path().rglob("*")) - before
@@ -108,7 +108,7 @@ def test_a_refused_lens_is_text_in_the_librarys_index(capsys: pytest.CaptureFixt
 
 
 def test_lenses_of_one_stem_have_pages_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    from neurolens.commands import library
+    from neurolens.cli import library
 
     monkeypatch.setattr(library, "_drawings", lambda lens: ())  # pictures take ten seconds a lens
     for folder, lens in (("a", "cooke_triplet_50"), ("b", "petzval_portrait_100")):

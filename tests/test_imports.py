@@ -1,11 +1,4 @@
-"""The folders are layers: imports go one way and in no circle, a render needs no torch, and the package stays small.
-
-base <- graph <- modelfile <- optics <- models <- surrogates <- evaluate <- commands <- cli
-                              optics <- analysis   <- evaluate
-                    models <- cameras <- render    <- evaluate
-                  surrogates, analysis, render <- flare <- evaluate <- frames
-                                         render    <- mitsuba  <- evaluate
-"""
+"""The folders are layers: imports go one way and in no circle, a render needs no torch, and the package stays small."""
 
 import ast
 import re
@@ -21,82 +14,61 @@ ROOT = Path(__file__).parents[1]
 MODULES = sorted((ROOT / "neurolens").rglob("*.py"))
 MAX_LINES = 500
 
-BASE = {"base"}
-# What cameras need of optics: modules without torch, open to all parts.
-TORCH_FREE_OPTICS = {f"neurolens.optics.{name}" for name in ("apertures", "film_plane", "sag", "shapes")}
-# Models from their files, without torch, which cameras need. Whoever may import surrogates may import these, too.
-MODELS = {f"neurolens.surrogates.{name}" for name in ("assemble", "cores", "file", "inverse", "lightfield", "model")}
-# Parts of the package that each part may import, besides itself and the base.
+# Folders that each folder may import, besides itself and base.
 PARTS = {
-    "graph": set(),
-    "modelfile": {"graph"},
-    "optics": {"graph", "modelfile"},
-    "readers": {"optics"},
-    "analysis": {"optics"},
-    "surrogates": {"graph", "modelfile", "optics"},
-    "models": {"graph", "modelfile", "optics"},
-    "cameras": {"graph", "modelfile", "models"},
-    "render": {"cameras"},
-    "mitsuba": {"cameras", "render"},
-    "flare": {"graph", "modelfile", "optics", "analysis", "surrogates", "cameras", "render"},
-    "evaluate": {
-        *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba", "flare")
-    },
-    "view": {"graph", "optics", "analysis", "cameras", "flare"},
-    "blender": set(),
-    "frames": {"optics", "readers", "cameras", "render", "flare", "evaluate"},
-    "commands": {
-        *("graph", "modelfile", "optics", "analysis", "readers", "surrogates", "cameras", "render", "mitsuba", "flare"),
-        "blender",
-        "evaluate",
-        "frames",
-        "view",
-    },
-    "cli": {"commands"},
+    "graph": "",
+    "lens": "graph",
+    "trace": "graph lens",
+    "setting": "lens trace",
+    "readers": "lens trace setting",
+    "surrogates": "graph lens trace setting",
+    "analysis": "lens trace setting",
+    "cameras": "graph lens trace setting readers surrogates",
+    "shaders": "graph lens trace setting readers surrogates cameras",
+    "render": "lens cameras",
+    "mitsuba": "cameras render",
+    "flare": "graph lens trace analysis surrogates cameras render",
+    "study": "graph lens trace setting readers analysis surrogates cameras render",
+    "plan": "graph lens setting analysis surrogates cameras shaders render flare study",
+    "view": "graph lens trace analysis cameras shaders flare",
+    "blender": "",
+    "frames": "lens readers cameras render flare",
+    "cli": "graph lens trace setting readers analysis surrogates cameras shaders render mitsuba flare study plan view"
+    " blender frames",
 }
 # Packages from elsewhere that each part may import; what is not listed here is not restricted.
 PACKAGES = {
     "base": {"numpy", "jinja2"},
     "graph": {"numpy"},  # and torch where it is handed tensors
-    "modelfile": {"numpy"},
-    "optics": {"numpy", "torch"},
+    "lens": {"numpy"},
+    "trace": {"numpy", "torch"},
+    "setting": {"numpy", "torch"},
     "analysis": {"numpy", "torch", "matplotlib"},
     "mitsuba": {"numpy"},
     "readers": set(),
     "cameras": {"numpy", "onnxruntime"},
+    "shaders": {"numpy"},
     "render": {"numpy", "OpenEXR", "PIL"},
     "blender": {"bpy", "cycles"},  # of Blender's own Python, in the extension
 }
-# Besides those: the one camera that traces rays exactly, the maker of cameras, which imports it
-# when one is asked for; the shapes of the stop, which are parts of graphs.
-EXCEPTIONS: dict[str, tuple[set[str], set[str]]] = {
-    "neurolens.base.cluster": (set(), {"dask", "distributed"}),  # where a cluster is asked for
-    # Methods that take tensors: torch is loaded where one is called.
-    "neurolens.surrogates.file": ({"surrogates"}, {"torch"}),
-    "neurolens.surrogates.cores": ({"surrogates"}, {"torch"}),
-    "neurolens.surrogates.model": ({"surrogates"}, {"torch"}),
-    "neurolens.surrogates.inverse": ({"surrogates"}, {"torch"}),
-    "neurolens.optics.apertures": ({"graph"}, set()),
-    "neurolens.optics.sag": ({"optics"}, set()),
-    "neurolens.optics.shapes": ({"optics"}, set()),
-    "neurolens.cameras.exact": ({"optics"}, {"torch"}),
-    "neurolens.cameras.outline_cache": ({"optics"}, {"torch"}),
-    "neurolens.cameras.build": ({"optics", "readers"}, set()),
-    "neurolens.cameras.field": ({"optics"}, set()),  # first-order data of lenses that are traced
+EXCEPTIONS: dict[str, set[str]] = {
+    "neurolens.base.cluster": {"dask", "distributed"},  # where a cluster is asked for
+    "neurolens.cameras.exact": {"torch"},  # the one camera that traces rays
+    "neurolens.cameras.outline_cache": {"torch"},
 }
 # Modules that load torch; others load these when they are needed.
-SLOW = {"neurolens.cameras.exact", "neurolens.cameras.outline_cache", "neurolens.commands.export_lens"}
-# What loads in a base install: these parts, and what converts lens files, looks up glass and writes C.
-LEAN = ("graph", "modelfile", "cameras", "render", "mitsuba", "frames", "commands", "cli", "base", "readers")
+SLOW = {"neurolens.cameras.exact", "neurolens.cameras.outline_cache", "neurolens.cli.export_lens"}
+# What loads in a base install: these folders, models from their files, and what converts lens files.
+LEAN = ("base", "graph", "lens", "readers", "cameras", "shaders", "render", "mitsuba", "frames", "cli")
 LEAN_MODULES = {
-    *(f"neurolens.optics.{name}" for name in ("catalogue", "designs", "glass", "lensfile", "lenswriter", "paraxial")),
-    *MODELS,
-    "neurolens.surrogates.source",
+    *(f"neurolens.trace.{name}" for name in ("arithmetic", "sag", "shapes", "surfaces")),
+    *(f"neurolens.surrogates.{name}" for name in ("assemble", "cardstates", "cores", "file", "inverse", "lightfield")),
+    *(f"neurolens.surrogates.{name}" for name in ("metadata", "model", "source", "stategraph")),
 }
 
 
 # Lines of Python that the package may have; a feature that needs more pays by what it replaces.
-MOST_LINES, MOST_MODULES = 59550, 296
+MOST_LINES, MOST_MODULES = 59520, 301
 
 
 def module_name(path: Path) -> str:
@@ -126,29 +98,24 @@ IMPORTED = {module_name(path): imported(path) for path in MODULES}
 
 
 def part_of(module: str) -> str:
-    """First folder or module below the package; "base" for the modules that everybody may import."""
-    if ".".join(module.split(".")[:3]) in MODELS:
-        return "models"
-    name = module.split(".")[1] if "." in module else "__init__"
-    shared = ".".join(module.split(".")[:3]) in TORCH_FREE_OPTICS
-    return "base" if shared or name in BASE else name
+    """The folder of a module below the package."""
+    return module.split(".")[1] if "." in module else "__init__"
 
 
 def test_imports_go_one_way() -> None:
     wrong = []
     for module, names in IMPORTED.items():
         part = part_of(module)
-        assert part in {*PARTS, "base", "__init__", "__main__"}, f"{module}: give this part its place in {__name__}"
-        own_parts, own_packages = EXCEPTIONS.get(module, (set(), set()))
+        assert part in {*PARTS, "base", "__init__", "__main__"}, f"{module}: give this folder its place in {__name__}"
         packages = {name.split(".")[0] for name in names} - set(sys.stdlib_module_names) - {"neurolens"}
         if part in PACKAGES:
-            wrong += [f"{module} imports {p}" for p in sorted(packages - PACKAGES[part] - own_packages)]
+            wrong += [
+                f"{module} imports {p}" for p in sorted(packages - PACKAGES[part] - EXCEPTIONS.get(module, set()))
+            ]
         if part != "__main__":
             # `from neurolens import __version__` is open to all.
             parts = {part_of(name) for name in names if name.startswith("neurolens.")} - {"__version__"}
-            allowed = {part, "base"} | PARTS.get(part, set()) | own_parts
-            allowed |= {"models"} if "surrogates" in allowed else set()
-            wrong += [f"{module} imports {p}" for p in sorted(parts - allowed)]
+            wrong += [f"{module} imports {p}" for p in sorted(parts - {part, "base", *PARTS.get(part, "").split()})]
     assert not wrong
 
 
@@ -160,7 +127,8 @@ def test_no_imports_go_in_a_circle() -> None:
         found = set()
         for node in ast.walk(ast.parse(text)):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("neurolens"):
-                found |= {f"{node.module}.{alias.name}" for alias in node.names} | {str(node.module)}
+                names = {f"{node.module}.{alias.name}" for alias in node.names}
+                found |= names & IMPORTED.keys() or {str(node.module)}
         graph[module_name(path)] = (found & IMPORTED.keys()) - {module_name(path), "neurolens"}
     assert sum(map(len, graph.values())) > len(graph)
     try:
@@ -181,7 +149,7 @@ def test_the_package_keeps_within_its_budget_of_lines() -> None:
 
 
 def test_cameras_renderer_and_command_line_load_without_the_training_packages() -> None:
-    wanted = [m for m in map(module_name, MODULES) if part_of(m) in LEAN or m in LEAN_MODULES]
+    wanted = [m for m in IMPORTED if part_of(m) in LEAN or m in LEAN_MODULES]
     wanted = [m for m in wanted if m not in SLOW]
     forbidden = ["torch", "sklearn", "onnx", "matplotlib", "scipy", "flip_evaluator", "mitsuba", "drjit"]
     code = (

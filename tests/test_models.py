@@ -15,13 +15,13 @@ from vignetting_oracle import vignetting_errors
 from neurolens.base.errors import ModelError
 from neurolens.cameras.model import OnnxLens, load_model
 from neurolens.cli import main
-from neurolens.commands import models as models_command
-from neurolens.evaluate.check import check_states, promises_of, space_of_card
-from neurolens.evaluate.measure import FreshRays, fresh_rays, measure, onnx_predictor
-from neurolens.modelfile import AVERAGED, POLARISED
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens
-from neurolens.optics.states import set_lens
+from neurolens.cli import models as models_command
+from neurolens.lens.prescription import Lens
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
+from neurolens.study.check import check_states, promises_of, space_of_card
+from neurolens.study.measure import FreshRays, fresh_rays, measure, onnx_predictor
+from neurolens.surrogates.cardkeys import AVERAGED, POLARISED
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.file import read_model

@@ -72,7 +72,7 @@ def test_commands_run_as_printed(page: Path, tmp_path: Path, monkeypatch: pytest
         early = not Path(file).exists() and exists(Path(file), made)
         return Named(kind, Path(file)) if early else resolve(text, **taken)
 
-    monkeypatch.setattr("neurolens.commands.arguments.resolve", resolved)
+    monkeypatch.setattr("neurolens.cli.arguments.resolve", resolved)
     for line, quoted in lines_of(page):
         for name, value in variables.items():
             line = line.replace(f"${name}", value)

@@ -1,4 +1,4 @@
-"""False passes and blocks at one stop, traced at that stop: `evaluate.measure` is held to it."""
+"""False passes and blocks at one stop, traced at that stop: `study.measure` is held to it."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,8 +6,8 @@ from typing import Any
 import torch
 
 from neurolens.base import status as st
-from neurolens.evaluate.vignetting import NEAR_RIM, SEED, ZONES, deciding_rim_ratio, false_shares
-from neurolens.optics.prescription import Lens
+from neurolens.lens.prescription import Lens
+from neurolens.study.vignetting import NEAR_RIM, SEED, ZONES, deciding_rim_ratio, false_shares
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import trace_pairs

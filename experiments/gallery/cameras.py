@@ -30,14 +30,14 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.graphcamera import Runtime
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.vignetting import Vignetted
-from neurolens.evaluate.image import Image
-from neurolens.evaluate.measure import fit_and_measure, known_record
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import film_z_mm, first_order
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.states import set_lens
+from neurolens.lens.paraxial import film_z_mm, first_order
+from neurolens.lens.prescription import Lens, Surface
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.pictures import make_aperture
 from neurolens.render.scene import Scene
+from neurolens.setting.states import set_lens
+from neurolens.study.image import Image
+from neurolens.study.measure import fit_and_measure, known_record
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.fit import ModelSettings, prepare
 from neurolens.surrogates.model import Domain

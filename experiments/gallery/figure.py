@@ -15,8 +15,8 @@ from experiments import lab
 from experiments.gallery.cameras import TITLES, luminance
 from neurolens.analysis.plot_style import new_figure, style
 from neurolens.base.errors import InputError
-from neurolens.evaluate.figures import rounded_up
-from neurolens.evaluate.image import Image, to_srgb
+from neurolens.study.figures import rounded_up
+from neurolens.study.image import Image, to_srgb
 
 DPI = 100  # a picture of 360 pixels is 3.6 inches wide: one pixel of it, one of the figure
 MOST_BYTES = 400_000

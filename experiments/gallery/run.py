@@ -35,9 +35,9 @@ from experiments.lab import Row as Record
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text, write_json
 from neurolens.base.progress import Progress, Report
-from neurolens.commands.arguments import add_json
-from neurolens.commands.output import number, print_json, table
-from neurolens.evaluate.records import versions
+from neurolens.base.records import versions
+from neurolens.cli.arguments import add_json
+from neurolens.cli.output import number, print_json, table
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene
 

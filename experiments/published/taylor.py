@@ -27,14 +27,14 @@ from numpy.typing import NDArray
 
 from experiments.published.data import raw_polynomial
 from neurolens.base.errors import InputError
-from neurolens.optics.glass import index_of
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.surfaces import Rays
-from neurolens.optics.trace import trace
+from neurolens.lens.glass import index_of
+from neurolens.lens.prescription import Lens, Surface
 from neurolens.surrogates.bases import ordered
 from neurolens.surrogates.cores import RawPolynomial
 from neurolens.surrogates.model import Encoding
 from neurolens.surrogates.targets import scales_of
+from neurolens.trace.rays import trace
+from neurolens.trace.surfaces import Rays
 
 # Coefficients [M] of `Truncated.exponents`: a power series in several variables, cut beyond a total degree.
 Series = NDArray[np.float64]

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from neurolens.base.errors import InputError
-from neurolens.optics import paraxial
-from neurolens.optics.prescription import Focus, Lens
-from neurolens.optics.pupils import image_radius_mm
-from neurolens.optics.states import set_lens
+from neurolens.lens import paraxial
+from neurolens.lens.prescription import Focus, Lens
+from neurolens.setting.pupils import image_radius_mm
+from neurolens.setting.states import set_lens
 
 
 @dataclass(frozen=True)

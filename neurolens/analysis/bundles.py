@@ -1,6 +1,6 @@
 """Bundles of rays from the scene that fill the real stop, traced to the film, for every lens whose chief rays exist.
 
-The chief ray is found from the stop outwards (`optics.aiming`), as pupils may move with the field (fisheyes). Its
+The chief ray is found from the stop outwards (`trace.aiming`), as pupils may move with the field (fisheyes). Its
 neighbours start on the plane across it at the front of the lens, and Newton's method on that plane takes each to its
 point of the stop; rays for which this fails at once walk there from the chief ray in small steps. The derivative of
 the mapping also turns stop area into the energy that a ray carries.
@@ -21,9 +21,9 @@ from neurolens.analysis.fields import ChiefRays, Scene, on_plane
 from neurolens.analysis.pupil_nodes import LitPart, lit_nodes, lit_part
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.optics.aiming import without_rims
-from neurolens.optics.surfaces import Rays, media
-from neurolens.optics.trace import trace
+from neurolens.trace.aiming import without_rims
+from neurolens.trace.rays import trace
+from neurolens.trace.surfaces import Rays, media
 
 # The outermost ring lies this share inside the stop's edge, so that rounding never clips it.
 _EDGE = 1e-7

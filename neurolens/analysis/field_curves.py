@@ -15,10 +15,10 @@ from neurolens.analysis.bundles import bundle, hexapolar, points
 from neurolens.analysis.fields import Array, Result, Scene, on_plane
 from neurolens.analysis.pupil_nodes import LitPart, converged, lit_nodes, lit_part
 from neurolens.analysis.seidel import petzval_curvature
-from neurolens.optics.prescription import Lens
-from neurolens.optics.pupils import camera_rays, pupil_plane_z_mm
-from neurolens.optics.surfaces import Rays
-from neurolens.optics.trace import passing
+from neurolens.lens.prescription import Lens
+from neurolens.setting.pupils import camera_rays, pupil_plane_z_mm
+from neurolens.trace.rays import passing
+from neurolens.trace.surfaces import Rays
 
 LINE_G_NM = 435.8343  # mercury, the usual fourth line
 

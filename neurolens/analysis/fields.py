@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.optics.aiming import Axis, aim_at_stop, between, bracket, without_rims
-from neurolens.optics.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM
-from neurolens.optics.paraxial import FirstOrder, first_order, is_pinhole
-from neurolens.optics.prescription import Lens
-from neurolens.optics.pupils import image_radius_mm
-from neurolens.optics.surfaces import Rays
-from neurolens.optics.trace import trace
+from neurolens.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM
+from neurolens.lens.paraxial import FirstOrder, first_order, is_pinhole
+from neurolens.lens.prescription import Lens
+from neurolens.setting.pupils import image_radius_mm
+from neurolens.trace.aiming import Axis, aim_at_stop, between, bracket, without_rims
+from neurolens.trace.rays import trace
+from neurolens.trace.surfaces import Rays
 
 Array = NDArray[np.float64]
 

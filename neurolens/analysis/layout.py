@@ -15,10 +15,10 @@ from neurolens.analysis.bundles import Pattern, bundle, fan
 from neurolens.analysis.fields import Array, Result, Scene
 from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, heading, new_figure, save, style
 from neurolens.base.errors import InputError
-from neurolens.optics.prescription import Surface
-from neurolens.optics.shapes import sag_mm
-from neurolens.optics.surfaces import Rays
-from neurolens.optics.trace import trace
+from neurolens.lens.prescription import Surface
+from neurolens.trace.rays import trace
+from neurolens.trace.shapes import sag_mm
+from neurolens.trace.surfaces import Rays
 
 FIELDS = (0.0, 0.7, 1.0)  # shares of the film radius: axis, the zone of equal areas inside and outside, edge
 RAYS_A_FIELD = 7

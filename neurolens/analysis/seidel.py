@@ -14,9 +14,9 @@ import numpy as np
 
 from neurolens.analysis.fields import Array, Result, Scene
 from neurolens.base.errors import InputError
-from neurolens.optics.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM
-from neurolens.optics.paraxial import PathOfRay, System, system_of
-from neurolens.optics.prescription import Lens, Surface
+from neurolens.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM
+from neurolens.lens.paraxial import PathOfRay, System, system_of
+from neurolens.lens.prescription import Lens, Surface
 
 NAMES = ("S1 spherical", "S2 coma", "S3 astigmatism", "S4 Petzval", "S5 distortion", "C1 axial colour", "C2 lateral")
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from neurolens.analysis.bundles import Bundle, Filled, bundle, fan, hexapolar
 from neurolens.analysis.fields import Array, Result, Scene
 from neurolens.analysis.pupil_nodes import converged
-from neurolens.optics.paraxial import is_pinhole
+from neurolens.lens.paraxial import is_pinhole
 
 _RINGS = 16
 _SHIFTS = 21

@@ -20,10 +20,10 @@ from neurolens.cameras.contract import Camera
 from neurolens.cameras.ideal import ThickLens, ThinLens
 from neurolens.cameras.pinhole import PROJECTIONS, Fisheye, Pinhole, check_field
 from neurolens.cameras.vignetting import Vignetted
-from neurolens.optics.apertures import Aperture
+from neurolens.lens.apertures import Aperture
 
 if TYPE_CHECKING:
-    from neurolens.optics.prescription import Lens
+    from neurolens.lens.prescription import Lens
 
 _BEYOND = 1.02  # diagonal of the film over the image circle: 36x24 over 43.2 mm is as lenses are engraved
 _EFL_MM, _FISHEYE_EFL_MM, _THIN_F_NUMBER, _PINHOLE_F_NUMBER = 50.0, 14.0, 4.0, 8.0
@@ -140,9 +140,9 @@ def _ideal_of(kind: str, path: Path, shot: Shot) -> Camera:
 
 def _placed(lens: Lens, shot: Shot) -> Lens:
     """The lens as a shot asks for it."""
-    from neurolens.optics.focusing import best_focused
-    from neurolens.optics.paraxial import first_order
-    from neurolens.optics.states import set_lens
+    from neurolens.lens.paraxial import first_order
+    from neurolens.setting.focusing import best_focused
+    from neurolens.setting.states import set_lens
 
     lens = set_lens(lens, focal_length_mm=shot.efl_mm, field_deg=shot.field_deg, zoom=shot.zoom)
     f_number = shot.f_number_for(first_order(lens).f_number)
@@ -161,7 +161,7 @@ def ideal_as(kind: str, lens: Lens, shot: Shot) -> Camera:
     Raises:
         InputError: a thick lens of one with cylinders, which has two focal lengths; as the cameras.
     """
-    from neurolens.optics.paraxial import first_order, framing_mm
+    from neurolens.lens.paraxial import first_order, framing_mm
 
     if lens.anamorphic and kind == "thick:":
         raise InputError(
@@ -195,10 +195,10 @@ def ideal_as(kind: str, lens: Lens, shot: Shot) -> Camera:
 
 def _exact(path: Path, shot: Shot, fused: bool, progress: Progress | None) -> Camera:
     from neurolens.cameras.exact import ExactCamera
-    from neurolens.optics.lenscheck import check_lens, doubts
-    from neurolens.optics.paraxial import first_order
-    from neurolens.optics.states import set_lens
+    from neurolens.lens.paraxial import first_order
     from neurolens.readers.any_format import read_any
+    from neurolens.setting.check import check_lens, doubts
+    from neurolens.setting.states import set_lens
 
     tabled = read_any(path)
     lens = set_lens(tabled, focal_length_mm=shot.efl_mm, field_deg=shot.field_deg, zoom=shot.zoom)
@@ -222,7 +222,7 @@ def _exact(path: Path, shot: Shot, fused: bool, progress: Progress | None) -> Ca
 
 def _film_notes(lens: Lens, film_mm: tuple[float, float]) -> list[str]:
     """A sentence on a film that is larger than the picture of the lens, where the size of that is known."""
-    from neurolens.optics.pupils import image_radius_mm
+    from neurolens.setting.pupils import image_radius_mm
 
     if lens.image_radius_mm is None and (lens.half_field_deg is None or lens.half_field_deg >= 60):
         return []  # only a long search would tell
@@ -239,7 +239,7 @@ def _beyond_circle(film_mm: tuple[float, float], radius_mm: float, what: str, th
 
 def _model(path: Path, shot: Shot, fused: bool) -> Camera:
     from neurolens.cameras.model import OnnxCamera, load_model
-    from neurolens.modelfile.states import state_for
+    from neurolens.surrogates.cardstates import state_for
 
     for field, value in {"efl_mm": shot.efl_mm, "field_deg": shot.field_deg}.items():
         _refuse(str(path), field, value, "left out: a model is of one size of its lens")

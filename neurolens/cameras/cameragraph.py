@@ -12,7 +12,7 @@ from neurolens.base import status as st
 from neurolens.graph.derive import derivative
 from neurolens.graph.ir import Graph
 from neurolens.graph.program import FILM_X_Y
-from neurolens.optics.apertures import Aperture
+from neurolens.lens.apertures import Aperture
 
 # How far the squared length of a direction may be from 1: where a poor network decodes none, the ray is no ray.
 UNIT_SLACK = 1e-3

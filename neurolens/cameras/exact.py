@@ -27,16 +27,16 @@ from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.pupil_search import COARSE, COARSE_TIGHT, FINE, Detail, outline_of
 from neurolens.cameras.sampling import arrived, check_film, positive
-from neurolens.optics.film_plane import PupilBounds
-from neurolens.optics.focusing import best_focused
-from neurolens.optics.glass import LINE_D_NM
-from neurolens.optics.paraxial import chief_reach_mm, first_order
-from neurolens.optics.prescription import Focus, Lens
-from neurolens.optics.pupils import camera_rays, passes_at_any_azimuth, pupil_bounds, pupil_plane_z_mm
-from neurolens.optics.states import set_lens
-from neurolens.optics.trace import Rays, film_derivatives, trace, trace_differentials
-from neurolens.optics.tracegraph import exact_graph
+from neurolens.lens.film_plane import PupilBounds
+from neurolens.lens.glass import LINE_D_NM
+from neurolens.lens.paraxial import chief_reach_mm, first_order
+from neurolens.lens.prescription import Focus, Lens
+from neurolens.setting.focusing import best_focused
+from neurolens.setting.pupils import camera_rays, passes_at_any_azimuth, pupil_bounds, pupil_plane_z_mm
+from neurolens.setting.states import set_lens
 from neurolens.surrogates.assemble import SCALARS, Form
+from neurolens.trace.rays import Rays, film_derivatives, trace, trace_differentials
+from neurolens.trace.tracegraph import exact_graph
 
 
 class ExactCamera(LensCamera):

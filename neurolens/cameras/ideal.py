@@ -21,8 +21,8 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints, FloatArray, RayDifferentials, towards
 from neurolens.cameras.lens_state import ideal_state
 from neurolens.cameras.sampling import ahead, arrived, check_film, concentric_disk, positive, sound, stratified
-from neurolens.optics.apertures import Aperture
-from neurolens.optics.film_plane import film_z_mm
+from neurolens.lens.apertures import Aperture
+from neurolens.lens.film_plane import film_z_mm
 
 _QUADRATURE = 256  # points a side
 

@@ -20,7 +20,7 @@ from neurolens.cameras.sampling import is_light, stratified
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.passes import pruned
-from neurolens.optics.apertures import Aperture
+from neurolens.lens.apertures import Aperture
 
 # Points a side of the quadrature of the exposure on the axis.
 _QUADRATURE = 256

@@ -18,7 +18,7 @@ import numpy as np
 
 from neurolens.base import status as st
 from neurolens.cameras.lens_film import SceneFunction
-from neurolens.optics.film_plane import LINE_D_NM
+from neurolens.lens.film_plane import LINE_D_NM
 
 _ROUND = 0.02  # of the squeeze: less than this from 1 is the error of a model, not a cylinder
 

@@ -26,11 +26,11 @@ from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.pupil_search import COARSE_TIGHT, outline_of
 from neurolens.cameras.sampling import arrived, check_film, common_light, positive
 from neurolens.graph.interpret import evaluate
-from neurolens.modelfile import DOMAIN_SLACK
-from neurolens.modelfile.states import state_for
-from neurolens.optics import film_plane
-from neurolens.optics.apertures import Aperture
+from neurolens.lens import film_plane
+from neurolens.lens.apertures import Aperture
 from neurolens.surrogates.assemble import SCALARS, Form
+from neurolens.surrogates.cardkeys import DOMAIN_SLACK
+from neurolens.surrogates.cardstates import state_for
 
 __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
 
@@ -219,7 +219,7 @@ class ModelScene:
         return passed
 
 
-# Of lenses with cylinders, as `optics.pupils.AZIMUTHS`; those that differ most come first.
+# Of lenses with cylinders, as `setting.pupils.AZIMUTHS`; those that differ most come first.
 _AZIMUTHS = [math.radians(5 * k) for k in sorted(range(-18, 19), key=lambda k: k % 9)]
 _RINGS, _SPOKES = 192, 24  # rays of the best focus; many rings, since the stop's edge falls between two
 _WIDER = 1.3  # their disc over the axial pupil at the stop in use

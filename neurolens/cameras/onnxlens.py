@@ -21,8 +21,8 @@ from neurolens.cameras.onnxsession import open_session, run_batches
 from neurolens.graph.ir import Graph
 from neurolens.graph.onnx import write_onnx
 from neurolens.graph.passes import pruned
-from neurolens.modelfile.states import card_at, default_state, state_numbers
 from neurolens.surrogates.assemble import ONNX, SCALARS, Form, model_graph
+from neurolens.surrogates.cardstates import card_at, default_state, state_numbers
 from neurolens.surrogates.file import ModelFile, read_model
 from neurolens.surrogates.model import LensModel
 

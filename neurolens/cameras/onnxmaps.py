@@ -15,11 +15,11 @@ from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.onnxlens import OUTPUTS, check_lens, ray_columns
 from neurolens.cameras.onnxsession import open_session, run_batches
 from neurolens.graph.onnx import write_onnx
-from neurolens.optics.sag import front_rays
-from neurolens.optics.shapes import Shape
 from neurolens.surrogates.assemble import ONNX
 from neurolens.surrogates.file import ModelFile, check_size, read_model
 from neurolens.surrogates.inverse import Guess, front_index, scene_graph, stop_graph
+from neurolens.trace.sag import front_rays
+from neurolens.trace.shapes import Shape
 
 # Rays a call: these graphs have more rows than those of models alone.
 _BATCH = 4096

@@ -21,11 +21,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from neurolens import optics
 from neurolens.base.files import atomic_path, cache_folder, fingerprint_of, keep_newest, seal, sealed_bytes, sha256_of
 from neurolens.cameras.pupil_outline import PupilOutline, wavelength_between
-from neurolens.optics.glass import index_of
-from neurolens.optics.prescription import Lens
+from neurolens.lens.glass import index_of
+from neurolens.lens.prescription import Lens
 
 _KEPT = 256  # files of 5 to 40 kB
 _LARGEST = 1 << 20  # bytes
@@ -51,8 +50,9 @@ def search_key(lens: Lens, wavelength_nm: tuple[float, float], shares: tuple[flo
 @cache
 def _code() -> list[str]:
     """Hash the modules that trace and search, and torch's arithmetic on this machine."""
-    folders = Path(optics.__file__).parent.glob("*.py"), Path(__file__).parent.glob("pupil_*.py")
-    files = [f"{file.name} {sha256_of(file)}" for folder in folders for file in sorted(folder)]
+    package = Path(__file__).parents[1]
+    found = (package.glob(pattern) for pattern in ("lens/*.py", "trace/*.py", "setting/*.py", "cameras/pupil_*.py"))
+    files = [f"{file.name} {sha256_of(file)}" for folder in found for file in sorted(folder)]
     return [*files, torch.__version__, torch.backends.cpu.get_cpu_capability()]
 
 

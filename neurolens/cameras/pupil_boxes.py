@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
-from neurolens.modelfile.cardcheck import pupil_rows
+from neurolens.surrogates.cardcheck import pupil_rows
 
 # Halvings that place the end of the light; lattice on a box that looks for light.
 _END_HALVINGS = 10
@@ -44,7 +44,7 @@ class PupilTable:
 
     @staticmethod
     def of(bounds: Mapping[str, Any]) -> PupilTable:
-        """From the fields of `optics.pupils.PupilBounds`, as a model's card holds them."""
+        """From the fields of `setting.pupils.PupilBounds`, as a model's card holds them."""
         return PupilTable(float(bounds["pupil_z_mm"]), float(bounds["film_radius_mm"]), pupil_rows(bounds))
 
 

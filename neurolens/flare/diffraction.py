@@ -38,7 +38,7 @@ from neurolens.flare.picture import Raster, axis_irradiance
 from neurolens.flare.smear import smear_of, smeared
 from neurolens.flare.stack import Floats
 from neurolens.graph.compiler import c_source, load_compiled
-from neurolens.optics.prescription import Lens
+from neurolens.lens.prescription import Lens
 from neurolens.render.colour import in_gamut
 from neurolens.render.spectrum import SpectralRange
 

@@ -22,10 +22,10 @@ from torch import Tensor
 from neurolens.analysis.fields import on_plane
 from neurolens.base.errors import InputError
 from neurolens.flare.lights import Light, Patch, disc, light_towards, rays_across
-from neurolens.optics.aiming import without_rims
-from neurolens.optics.apertures import Aperture
-from neurolens.optics.prescription import Lens
-from neurolens.optics.trace import Rays, passing, trace
+from neurolens.lens.apertures import Aperture
+from neurolens.lens.prescription import Lens
+from neurolens.trace.aiming import without_rims
+from neurolens.trace.rays import Rays, passing, trace
 
 Array = NDArray[np.floating[Any]]
 

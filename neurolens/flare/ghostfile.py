@@ -26,10 +26,10 @@ from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.program import ARRIVING, ENTERING
 from neurolens.graph.scalars import lower
-from neurolens.modelfile import CARD_KEY, MODEL_KEY
-from neurolens.modelfile.metadata import card_in, read_metadata
 from neurolens.surrogates.card import card_to_json
+from neurolens.surrogates.cardkeys import CARD_KEY, MODEL_KEY
 from neurolens.surrogates.file import deflated, inflated, pack, packed_lens, unpack, unpacked_lens
+from neurolens.surrogates.metadata import card_in, read_metadata
 from neurolens.surrogates.source import WRITERS, identifier
 
 KIND, SCHEMA = "neurolens.ghost_model", 1

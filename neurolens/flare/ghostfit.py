@@ -16,10 +16,8 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.flare.ghostmodel import GhostModel, GhostPolynomial
 from neurolens.flare.ghosts import GhostTracer, Pair, ghost_pairs
-from neurolens.optics.glass import inverse_square_um
-from neurolens.optics.prescription import Lens
-from neurolens.optics.sequence import follow, ghost
-from neurolens.optics.trace import Rays
+from neurolens.lens.glass import inverse_square_um
+from neurolens.lens.prescription import Lens
 from neurolens.surrogates.bases import (
     invariant_exponents,
     monomials,
@@ -30,6 +28,8 @@ from neurolens.surrogates.bases import (
     vector_columns,
 )
 from neurolens.surrogates.lightfield import LightField
+from neurolens.trace.rays import Rays
+from neurolens.trace.sequence import follow, ghost
 
 Array = NDArray[np.float64]
 DEGREES = (3, 4, 5, 6, 7, 9)  # in the invariants; the first that is good enough

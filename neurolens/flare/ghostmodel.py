@@ -27,8 +27,8 @@ from neurolens.flare.steps import LOST
 from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Exponents, Graph, Value
-from neurolens.optics.glass import inverse_square_um
-from neurolens.optics.prescription import Lens
+from neurolens.lens.glass import inverse_square_um
+from neurolens.lens.prescription import Lens
 from neurolens.surrogates.lightfield import ROUND
 
 Array = NDArray[np.float64]

@@ -4,7 +4,7 @@ Ghosts share their paths: light that comes to surface j is reflected there once 
 back to surface i is traced once for all ghosts that are reflected there or further to the front. Only the path from i
 to the film belongs to a single ghost. So a lens of n surfaces takes n^3 / 3 steps for n^2 / 2 ghosts. The steps are
 graphs (`flare.steps`), compiled once for a lens's kinds of surfaces, and `ghosts.c` loops over them; focus, zoom, stop
-and wavelength are numbers of the call and need no compiling. `optics.sequence.follow` is the truth in float64 for one
+and wavelength are numbers of the call and need no compiling. `trace.sequence.follow` is the truth in float64 for one
 path.
 """
 
@@ -22,8 +22,8 @@ from neurolens.base.errors import InputError
 from neurolens.flare.stack import Floats, Stack, entering, reflects
 from neurolens.flare.steps import LOST, STATE
 from neurolens.graph.compiler import c_source
-from neurolens.optics.designs import design
-from neurolens.optics.prescription import Lens
+from neurolens.lens.designs import design
+from neurolens.lens.prescription import Lens
 
 _BLOCK = 512  # rays whose states, 32 bytes each before every surface, fit the second cache
 
@@ -52,7 +52,7 @@ def ghost_pairs(lens: Lens) -> tuple[Pair, ...]:
 
 
 def coated(lens: Lens, names: str) -> Lens:
-    """The lens with a coating of `optics.designs` on each bare surface between glass and air.
+    """The lens with a coating of `lens.designs` on each bare surface between glass and air.
 
     Args:
         names: a design, and for single surfaces others, which replace what they have: "three-layer,s07=bare".

@@ -23,7 +23,7 @@ from neurolens.flare.photons import PhotonTracer
 from neurolens.flare.picture import PARTS, Raster, ghost_layers, ghost_picture, photon_picture
 from neurolens.flare.sources import Name, SceneLights, chosen, keep_named
 from neurolens.flare.stack import Floats
-from neurolens.optics.prescription import Lens
+from neurolens.lens.prescription import Lens
 from neurolens.render.film import check_memory
 from neurolens.render.flaresettings import LAYERS, FlareSettings
 from neurolens.render.scene import Scene

@@ -19,8 +19,8 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import read_rows
 from neurolens.base.tomlfile import reject_unknown
 from neurolens.flare.stack import Floats
-from neurolens.optics.prescription import Lens
-from neurolens.optics.shapes import sag_mm
+from neurolens.lens.prescription import Lens
+from neurolens.trace.shapes import sag_mm
 
 _PLASTIC = 1.32471795724474602596  # of the R2 sequence (Roberts 2018): x^3 = x + 1
 

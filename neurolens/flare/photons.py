@@ -26,7 +26,7 @@ from neurolens.flare.scatter import CHANCES, NUMBERS, film_scatter_graph, scatte
 from neurolens.flare.stack import Floats, Place, Stack, entering, reflects
 from neurolens.flare.steps import STATE
 from neurolens.graph.compiler import c_source
-from neurolens.optics.prescription import Lens
+from neurolens.lens.prescription import Lens
 from neurolens.render.flaresettings import Scatter
 
 BLOCK = 4096  # photons at a time: their states, 40 bytes at every surface, stay in the caches

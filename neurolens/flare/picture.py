@@ -30,14 +30,14 @@ from neurolens.flare.lights import Light, disc, light_rays, patches, rays_across
 from neurolens.flare.photons import LEVELS, Photons, PhotonTracer
 from neurolens.flare.smear import Smear, enlarged, smear_of, smeared, spread
 from neurolens.flare.stack import Floats
-from neurolens.optics.glass import inverse_square_um
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens
-from neurolens.optics.sequence import follow, turning
-from neurolens.optics.trace import Rays, trace
+from neurolens.lens.glass import inverse_square_um
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
 from neurolens.render.checkpoint import digest
 from neurolens.render.colour import SRGB, in_gamut
 from neurolens.render.spectrum import SpectralRange
+from neurolens.trace.rays import Rays, trace
+from neurolens.trace.sequence import follow, turning
 
 RANKED = 4096  # rays that decide which ghosts are brightest
 _AT_ONCE = 1 << 16  # rays of a call

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from neurolens.flare.steps import LOST, STATE
 from neurolens.graph.ir import Graph, Value
-from neurolens.optics.prescription import Lens
-from neurolens.optics.shapes import sag_mm
+from neurolens.lens.prescription import Lens
 from neurolens.render.flaresettings import Scatter
+from neurolens.trace.shapes import sag_mm
 
 CHANCES = 5  # rows: an exponential variate; two uniform ones; cosine and sine of a uniform angle
 PASSED, VOLUME, WALL, NOWHERE = range(4)  # what happens to light: see `scatter_graph`

@@ -29,10 +29,10 @@ from neurolens.graph.c import Signature, write_c
 from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.graph.ir import Graph
 from neurolens.graph.scalars import lower
-from neurolens.optics import glass
-from neurolens.optics.prescription import Lens
-from neurolens.optics.sag import same_medium
-from neurolens.optics.shapes import figure_of, is_plain
+from neurolens.lens import glass
+from neurolens.lens.prescription import Lens
+from neurolens.trace.sag import same_medium
+from neurolens.trace.shapes import figure_of, is_plain
 
 Floats = NDArray[np.float32]
 # Actions of a step: refract light that travels to the film (0) or back (1), reflect such light (2, 3).

@@ -1,7 +1,7 @@
 """One surface as a graph, refracting or reflecting: the step that ghosts are traced by, on compiled code.
 
 Light always travels towards -z here: in a frame that is mirrored (z reversed) while it goes to the film. So one step
-serves both directions; it is that of the tracer (`optics.surfaces`). The figure of a surface is numbers of the call, as
+serves both directions; it is that of the tracer (`trace.surfaces`). The figure of a surface is numbers of the call, as
 its media are: surfaces of one kind share a function. Fresnel's reflectance is written without the difference of nearly
 equal roots, which float32 would lose where glasses are cemented; a coating's is a polynomial in the cosine on the side
 of the lower index, fitted to its transfer matrices at one wavelength.
@@ -18,13 +18,13 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.graph.ir import Graph, Value
-from neurolens.optics import coatings
-from neurolens.optics.apertures import Aperture
-from neurolens.optics.arithmetic import TINY, Graphs
-from neurolens.optics.filmgraph import transmitted
-from neurolens.optics.shapes import Figure
-from neurolens.optics.surfaces import Medium, Rays, meet, normal_at, radius2, reflect, refract
-from neurolens.optics.transmission import path_mm
+from neurolens.lens.apertures import Aperture
+from neurolens.trace import coatings
+from neurolens.trace.arithmetic import TINY, Graphs
+from neurolens.trace.coatinggraph import transmitted
+from neurolens.trace.shapes import Figure
+from neurolens.trace.surfaces import Medium, Rays, meet, normal_at, radius2, reflect, refract
+from neurolens.trace.transmission import path_mm
 
 Action = Literal["T", "R"]
 STATE = 8  # rows: x, y, z (mm, this step's frame), direction, power, largest r^2 over the rim's so far

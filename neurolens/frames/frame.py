@@ -18,9 +18,9 @@ from neurolens.base.errors import InputError, warn
 from neurolens.base.files import check_writable
 from neurolens.base.lensname import Named, resolve
 from neurolens.base.progress import Progress
+from neurolens.base.records import plain
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import Camera
-from neurolens.evaluate.records import plain
 from neurolens.render.film import PixelGrid
 from neurolens.render.film_settings import (
     ColourSpaceName,
@@ -35,7 +35,7 @@ from neurolens.render.scene import CameraSettings, Scene, files_named, load_scen
 from neurolens.render.tiles import rows_of, tile_path
 
 if TYPE_CHECKING:
-    from neurolens.optics.apertures import Aperture
+    from neurolens.lens.apertures import Aperture
 
 Vector = tuple[float, float, float]
 

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 from neurolens.base.errors import InputError, NeurolensError, warn
 from neurolens.base.progress import Progress
+from neurolens.base.records import plain
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import FloatArray
-from neurolens.evaluate.records import plain
 from neurolens.frames.frame import Files, Frame, Prepared, prepare
 from neurolens.render.colour import COLOUR_SPACES, SRGB, ColourSpace, conversion, converted
 from neurolens.render.exr_attributes import standard_attributes
@@ -28,7 +28,7 @@ from neurolens.render.tiles import windows
 if TYPE_CHECKING:
     from neurolens.flare.layers import Choice
     from neurolens.flare.picture import Raster
-    from neurolens.optics.prescription import Lens
+    from neurolens.lens.prescription import Lens
 
 _CHOICE_FRAMES = 16  # of an animation, which decide the brightest lights and ghosts
 Layers = dict[str, FloatArray]

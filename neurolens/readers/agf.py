@@ -13,8 +13,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from neurolens.optics import catalogue, glass
-from neurolens.optics.catalogue import LINE_D_NM, Glass
+from neurolens.lens import catalogue, glass
+from neurolens.lens.catalogue import LINE_D_NM, Glass
 from neurolens.readers.source import Line, read_lines
 
 MAX_GLASSES, MAX_NAME, MAX_SAMPLES = 5000, 64, 200

@@ -9,14 +9,14 @@ from dataclasses import replace
 from typing import Any
 
 from neurolens.base.errors import InputError
-from neurolens.optics import catalogue, paraxial
-from neurolens.optics.catalogue import LINE_C_NM, LINE_D_NM, LINE_F_NM, Glass
-from neurolens.optics.glass import by_figures
-from neurolens.optics.lensfile import MAX_INDEX, MAX_POWER, MAX_SURFACES
-from neurolens.optics.paraxial import FirstOrder
-from neurolens.optics.prescription import Lens
-from neurolens.optics.sag import check_figures
+from neurolens.lens import catalogue, paraxial
+from neurolens.lens.catalogue import LINE_C_NM, LINE_D_NM, LINE_F_NM, Glass
+from neurolens.lens.glass import by_figures
+from neurolens.lens.paraxial import FirstOrder
+from neurolens.lens.prescription import Lens
+from neurolens.readers.lensfile import MAX_INDEX, MAX_POWER, MAX_SURFACES
 from neurolens.readers.source import Line, assume, warn
+from neurolens.trace.sag import check_figures
 
 # A diameter that the file does not give, until `finish` has found it.
 UNKNOWN = math.nan

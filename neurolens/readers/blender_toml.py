@@ -12,9 +12,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from neurolens.base.errors import InputError
-from neurolens.optics.lensfile import MAX_SURFACES, Table
-from neurolens.optics.prescription import Lens, Surface
+from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.draft import Draft, Given, Row, State, lens_of
+from neurolens.readers.lensfile import MAX_SURFACES, Table
 
 _LENS = ("name", "patent", "focal_length", "max_fstop", "coating", "squeeze", "image_circle", "sensor_width")
 _SURFACE = ("type", "radius", "thickness", "ior", "aperture", "abbe_v", "conic", "aspheric_coeffs")

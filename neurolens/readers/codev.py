@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from neurolens.base.errors import InputError
-from neurolens.optics.lensfile import MAX_SURFACES
-from neurolens.optics.prescription import Lens
+from neurolens.lens.prescription import Lens
 from neurolens.readers.codev_model import (
     ALONG,
     LETTERS,
@@ -21,6 +20,7 @@ from neurolens.readers.codev_model import (
     shape_of,
 )
 from neurolens.readers.draft import INFINITE, Draft, Given, Row, lens_of, primary_first
+from neurolens.readers.lensfile import MAX_SURFACES
 from neurolens.readers.source import assume, by_word, read_lines, warn
 
 

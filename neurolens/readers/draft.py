@@ -14,13 +14,13 @@ from typing import Any
 
 from neurolens.base.bounds import WAVELENGTH_NM, within
 from neurolens.base.errors import InputError
-from neurolens.optics.lensfile import MAX_SURFACES, check_states
-from neurolens.optics.prescription import Configuration, Lens, Medium, Surface
-from neurolens.optics.sag import same_medium
+from neurolens.lens.prescription import Configuration, Lens, Medium, Surface
 from neurolens.readers.assemble import UNKNOWN, finish, first_order, smaller_stop
 from neurolens.readers.forbes import MAX_TERMS, qbfs_terms, qcon_terms
+from neurolens.readers.lensfile import MAX_SURFACES, check_states
 from neurolens.readers.openings import narrowed, stop_aperture, with_likely_rims, with_rims, with_stop
 from neurolens.readers.source import UNITS_MM, Line, warn
+from neurolens.trace.sag import same_medium
 
 
 @dataclass(frozen=True)

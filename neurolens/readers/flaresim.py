@@ -15,9 +15,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-from neurolens.optics.lensfile import MAX_SURFACES
-from neurolens.optics.prescription import Lens, Surface
+from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.draft import Draft, Given, Row, lens_of
+from neurolens.readers.lensfile import MAX_SURFACES
 from neurolens.readers.source import Line, assume, read_lines
 
 _COLUMNS = ("radius", "thickness", "ior", "abbe", "semi_ap", "coating")

@@ -19,12 +19,12 @@ from typing import Any, Literal
 
 from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import check_tree
-from neurolens.optics import paraxial
-from neurolens.optics.lensfile import MAX_SURFACES, Table, check_states
-from neurolens.optics.prescription import Configuration, Lens, Surface
+from neurolens.lens import paraxial
+from neurolens.lens.prescription import Configuration, Lens, Surface
 from neurolens.readers.assemble import UNKNOWN, finish, first_order, same_glass
 from neurolens.readers.draft import Given
 from neurolens.readers.json_others import read_others
+from neurolens.readers.lensfile import MAX_SURFACES, Table, check_states
 from neurolens.readers.source import read_text, warn
 
 KEYS = (

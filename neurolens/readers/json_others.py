@@ -14,10 +14,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from neurolens.base.errors import InputError
-from neurolens.optics.lensfile import Table
-from neurolens.optics.prescription import Lens, Surface
+from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.assemble import first_order, named_glass
 from neurolens.readers.draft import Draft, Given, Row, lens_of
+from neurolens.readers.lensfile import Table
 from neurolens.readers.source import warn
 
 _DEEPLENS = (

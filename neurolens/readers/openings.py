@@ -8,12 +8,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from neurolens.base.errors import InputError
-from neurolens.optics.paraxial import system_of
-from neurolens.optics.prescription import Lens, Medium
-from neurolens.optics.rims import narrowed_rims, with_derived_rims
-from neurolens.optics.sag import end_mm
+from neurolens.lens.paraxial import system_of
+from neurolens.lens.prescription import Lens, Medium
 from neurolens.readers.assemble import check_rows, first_order
 from neurolens.readers.source import assume, warn
+from neurolens.setting.rims import narrowed_rims, with_derived_rims
+from neurolens.trace.sag import end_mm
 
 if TYPE_CHECKING:
     from neurolens.readers.draft import Draft
@@ -79,7 +79,7 @@ def with_likely_rims(lens: Lens, draft: Draft) -> Lens:
 
 
 def with_rims(lens: Lens, in_file: Callable[[str], str] = str) -> Lens:
-    """The lens with the rims that its file does not give derived by rule (`neurolens.optics.rims`), with a warning, in
+    """The lens with the rims that its file does not give derived by rule (`neurolens.setting.rims`), with a warning, in
     which `in_file` calls surfaces as the file does.
     """
     missing = [k for k, s in enumerate(lens.surfaces) if math.isnan(s.diameter_mm)]

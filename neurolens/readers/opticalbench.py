@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.base.errors import InputError
-from neurolens.optics.lensfile import MAX_SURFACES
-from neurolens.optics.prescription import Lens, Surface
+from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.assemble import same_glass
 from neurolens.readers.draft import INFINITE, Draft, Given, Row, State, lens_of
+from neurolens.readers.lensfile import MAX_SURFACES
 from neurolens.readers.source import Line, assume, read_lines, warn
 
 SECTIONS = ("descriptive data", "constants", "variable distances", "lens data", "aspherical data")

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.base.errors import InputError
-from neurolens.optics.lensfile import MAX_SURFACES
-from neurolens.optics.prescription import Lens, Surface
+from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers import draft
 from neurolens.readers.assemble import UNKNOWN, by_indices, named_glass
 from neurolens.readers.draft import INFINITE, Draft, Given, Row, lens_of, primary_first
+from neurolens.readers.lensfile import MAX_SURFACES
 from neurolens.readers.source import UNITS_MM, Line, by_word, read_lines
 
 TERMS = {"AD": 4, "AE": 6, "AF": 8, "AG": 10}

@@ -15,9 +15,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from neurolens.base.errors import InputError
-from neurolens.optics.lensfile import MAX_SURFACES
-from neurolens.optics.prescription import Lens, Surface
+from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.draft import Draft, Given, Row, lens_of
+from neurolens.readers.lensfile import MAX_SURFACES
 from neurolens.readers.source import Line, read_lines
 
 COLUMNS = ("radius", "thickness", "index", "diameter")

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from neurolens.base.errors import InputError
-from neurolens.optics import catalogue
-from neurolens.optics.lensfile import MAX_SURFACES
-from neurolens.optics.prescription import Lens
+from neurolens.lens import catalogue
+from neurolens.lens.prescription import Lens
 from neurolens.readers.assemble import named_glass
 from neurolens.readers.draft import Draft, Given, Row, lens_of, primary_first
+from neurolens.readers.lensfile import MAX_SURFACES
 from neurolens.readers.source import Line, assume, read_lines, warn
 from neurolens.readers.zemax_model import (
     HARMLESS,

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from neurolens.base.errors import InputError
-from neurolens.optics.lensfile import MAX_POWER
 from neurolens.readers import draft
 from neurolens.readers.draft import INFINITE, State
+from neurolens.readers.lensfile import MAX_POWER
 from neurolens.readers.source import Line, assume, by_word
 
 # Settings of the program, and what its editor shows of a surface: written to most files, and no ray depends on them.

@@ -27,7 +27,7 @@ from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import atomic_path, open_regular, read_bytes
 from neurolens.base.tomlfile import parse_json
 from neurolens.cameras.contract import FloatArray
-from neurolens.optics.apertures import MAX_MASK, THRESHOLD, Aperture
+from neurolens.lens.apertures import MAX_MASK, THRESHOLD, Aperture
 from neurolens.render.colour import (
     COLOUR_SPACES,
     SRGB,

@@ -16,7 +16,7 @@ from neurolens.base.config import from_dict
 from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import read_toml, suggestion
 from neurolens.cameras.contract import FloatArray
-from neurolens.optics.apertures import Aperture
+from neurolens.lens.apertures import Aperture
 from neurolens.render import scenetables as tables
 from neurolens.render.film_settings import FilmSettings
 from neurolens.render.flaresettings import FlareSettings
@@ -37,7 +37,7 @@ class CameraSettings(Checked):
         position_m: film-plane centre. look_at_m: a point on the optical axis. up: points to the picture's top.
         focus_m: distance from film to the object in focus. f_number: None leaves it to the lens.
         blades, blade_rotation_deg, blade_curvature, aperture_mask: shape of the stop's opening, see
-            `optics.apertures`; the mask is a picture beside the scene. Without them the lens's own, else round.
+            `lens.apertures`; the mask is a picture beside the scene. Without them the lens's own, else round.
         film_width_mm, film_height_mm: the part of the film that is used.
         wavelengths_nm: range of light. width, height: picture in pixels. samples: a pixel.
         max_depth: number of surfaces along a path at which light is scattered.

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.graph.ir import Graph, Value
-from neurolens.modelfile import DOMAIN_SLACK
+from neurolens.surrogates.cardkeys import DOMAIN_SLACK
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, CoreValues, Field, Units
 
 if TYPE_CHECKING:
-    from neurolens.optics.prescription import Surface
+    from neurolens.lens.prescription import Surface
     from neurolens.surrogates.model import Encoding, LensModel
 
 Array = NDArray[np.float64]

@@ -15,9 +15,9 @@ from torch import Tensor
 import neurolens
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.modelfile import CARD_KIND, CARD_SCHEMA, MAX_CARD
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
+from neurolens.surrogates.cardkeys import CARD_KIND, CARD_SCHEMA, MAX_CARD
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.model import Domain, LensModel, Prediction
 

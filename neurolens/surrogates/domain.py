@@ -11,12 +11,12 @@ from torch.quasirandom import SobolEngine
 
 from neurolens.base.bounds import WAVELENGTH_NM, said
 from neurolens.base.errors import InputError
-from neurolens.optics.film_plane import PupilBounds
-from neurolens.optics.focusing import film_range_mm
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens
-from neurolens.optics.pupils import image_radius_mm, pupil_bounds
-from neurolens.optics.states import set_lens
+from neurolens.lens.film_plane import PupilBounds
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
+from neurolens.setting.focusing import film_range_mm
+from neurolens.setting.pupils import image_radius_mm, pupil_bounds
+from neurolens.setting.states import set_lens
 from neurolens.surrogates.model import Domain
 
 # The disc on the pupil plane is that of all passing rays, enlarged by this much (design: "enlarged by 5%").

@@ -11,12 +11,12 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path
 from neurolens.graph.onnx import write_onnx
-from neurolens.modelfile import CARD_KEY, MODEL_KEY
-from neurolens.modelfile.states import STATE
-from neurolens.optics.focusing import at_infinity
-from neurolens.optics.paraxial import first_order
+from neurolens.lens.paraxial import first_order
+from neurolens.setting.focusing import at_infinity
 from neurolens.surrogates.assemble import ONNX
 from neurolens.surrogates.card import card_of, card_to_json, lens_facts, reference_rays
+from neurolens.surrogates.cardkeys import CARD_KEY, MODEL_KEY
+from neurolens.surrogates.cardstates import STATE
 from neurolens.surrogates.file import as_stored, coefficients_text, onnx_of
 from neurolens.surrogates.inverse import STEPS, TOLERANCE, Guess, InverseModel, front_index, scene_graph, stop_graph
 from neurolens.surrogates.model import LensModel

@@ -27,16 +27,16 @@ from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.onnx import Mixing, write_onnx
 from neurolens.graph.program import RAY
-from neurolens.modelfile import MODEL_KEY, transmittance_of
-from neurolens.modelfile.axes import Axis, weights
-from neurolens.modelfile.cardcheck import check_card, tolerances
-from neurolens.modelfile.metadata import card_in, read_metadata
-from neurolens.modelfile.stategraph import state_graph
-from neurolens.modelfile.states import axes_of, default_state
-from neurolens.optics.prescription import Coating, Lens, Surface
+from neurolens.lens.prescription import Coating, Lens, Surface
 from neurolens.surrogates.assemble import ONNX, model_graph
+from neurolens.surrogates.axes import Axis, weights
+from neurolens.surrogates.cardcheck import check_card, tolerances
+from neurolens.surrogates.cardkeys import MODEL_KEY, transmittance_of
+from neurolens.surrogates.cardstates import axes_of, default_state
 from neurolens.surrogates.cores import CORES, Core
+from neurolens.surrogates.metadata import card_in, read_metadata
 from neurolens.surrogates.model import Domain, Encoding, Gate, LensModel, Scales, mixed, with_one_angle
+from neurolens.surrogates.stategraph import state_graph
 
 SCHEMA = 2
 _ONE_NODE = 1  # an earlier schema: one state, and no angle
@@ -50,7 +50,7 @@ _MAX_NODES = 256  # states of one model
 # Of a model: terms and units, each of which is a row for every ray; numbers; and ways in which terms are products of
 # two others, all of which a writer compares. The largest that settings allow have 5,000, 1.9 and one million.
 _MAX_WORK, _MAX_WEIGHTS, _MAX_PRODUCTS = 10_000, 2_000_000, 3_000_000
-_MAX_SURFACES, _MAX_TERMS, _MAX_POWER = 500, 1000, 40  # of a prescription, as `optics.lensfile` has them
+_MAX_SURFACES, _MAX_TERMS, _MAX_POWER = 500, 1000, 40  # of a prescription, as `readers.lensfile` has them
 _LENS = ("name", "source", "f_number", "image_radius_mm", "half_field_deg", "designer", "rims", "film_z_mm", "path")
 _NOWHERE = -1.0  # A film position in no domain: it takes the place of the film where the state is out of range.
 DERIVATIVES = {"scene_ray_d_film": RAY[:2], "scene_ray_d_pupil": RAY[2:]}
@@ -66,7 +66,7 @@ class ModelFile:
         path: the file.
         card: what `surrogates.card` wrote.
         more: further entries of the coefficients, of inverse maps.
-        nodes: a model for every node of the axes, in the order of `modelfile.axes.product`; one without axes. Their
+        nodes: a model for every node of the axes, in the order of `surrogates.axes.product`; one without axes. Their
             coefficients are rounded to float32, and their lens is that of the first node.
     """
 

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.optics.trace import CHUNK
 from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.cores import (
     Core,
@@ -39,6 +38,7 @@ from neurolens.surrogates.pairs import RayPairs, join_pairs, trace_pairs, with_a
 from neurolens.surrogates.settings import NETWORKS, PLANES_SEARCHED, POLYNOMIALS, ModelSettings
 from neurolens.surrogates.specialise import without_idle_gates
 from neurolens.surrogates.targets import Prepared, fit_encoding, scales_of, squared_error
+from neurolens.trace.rays import CHUNK
 
 # Rays drawn over the domain to find what blocks anything: a share of 1e-4 is 20 of them.
 _GATE_RAYS = 200_000

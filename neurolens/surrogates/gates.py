@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from neurolens.base import status as st
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.shapes import is_deep, rim_sine
+from neurolens.lens.prescription import Lens, Surface
 from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import RIM_REACH, PairSet, RayPairs, join_pairs, reached
+from neurolens.trace.shapes import is_deep, rim_sine
 
 # Rays of the boundary fits are mixed by this seed: networks use the first of them.
 _MIXING_SEED = 1

@@ -27,7 +27,6 @@ from neurolens.graph.ir import Exponents, Graph, Value
 from neurolens.graph.newton import determinant, limited_newton
 from neurolens.graph.passes import pruned
 from neurolens.graph.program import RAY
-from neurolens.optics.sag import front_rays
 from neurolens.surrogates.assemble import (
     EXACT,
     DirectionSeries,
@@ -43,12 +42,13 @@ from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, CoreValues, Fi
 from neurolens.surrogates.file import pack, unpack
 from neurolens.surrogates.lightfield import MIRROR, ROUND
 from neurolens.surrogates.model import Encoding, LensModel, Prediction, prediction_of
+from neurolens.trace.sag import front_rays
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from neurolens.optics.surfaces import Rays
     from neurolens.surrogates.domain import FilmRays
+    from neurolens.trace.surfaces import Rays
 
 Array = NDArray[np.float64]
 

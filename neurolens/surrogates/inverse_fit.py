@@ -13,7 +13,6 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.interpret import monomials
-from neurolens.optics.surfaces import Rays
 from neurolens.surrogates.bases import Exponents, kept, ordered, pinned_threads, solve
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Refracted
 from neurolens.surrogates.domain import FilmRays
@@ -24,6 +23,7 @@ from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import RayPairs, join_pairs
 from neurolens.surrogates.targets import targets_of
+from neurolens.trace.surfaces import Rays
 
 # Rays beyond the rims teach the guess how the map goes on; those that pass count more.
 _BEYOND_WEIGHT = 0.3

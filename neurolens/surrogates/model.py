@@ -20,20 +20,20 @@ from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.program import RAY, WAVELENGTH
-from neurolens.modelfile import DOMAIN_SLACK, POLARISED
-from neurolens.modelfile.states import mix_domain
-from neurolens.optics.film_plane import PupilBounds
-from neurolens.optics.glass import inverse_square_um
-from neurolens.optics.prescription import Lens, Surface
+from neurolens.lens.film_plane import PupilBounds
+from neurolens.lens.glass import inverse_square_um
+from neurolens.lens.prescription import Lens, Surface
 from neurolens.surrogates.assemble import EXACT, model_graph
+from neurolens.surrogates.cardkeys import DOMAIN_SLACK, POLARISED
+from neurolens.surrogates.cardstates import mix_domain
 from neurolens.surrogates.cores import Array, Core
 from neurolens.surrogates.lightfield import LightField
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from neurolens.optics.surfaces import Rays
     from neurolens.surrogates.domain import FilmRays
+    from neurolens.trace.surfaces import Rays
 
 OUTPUTS = ("scene_ray", "transmittance", "stop_xy_mm", "status")
 _DIFFERENTIATED = ("scene_ray", "stop_xy_mm")
@@ -205,7 +205,7 @@ class Derivatives(NamedTuple):
 
 def prediction_of(out: Mapping[str, Tensor], count: int) -> Prediction:
     """The outputs of a model's graph for `count` rays."""
-    from neurolens.optics.surfaces import Rays
+    from neurolens.trace.surfaces import Rays
 
     scene, power, stop, status = (out[n].expand(-1, count) for n in OUTPUTS)
     return Prediction(Rays(*scene), power[0], stop[0], stop[1], status[0])

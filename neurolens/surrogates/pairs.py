@@ -16,12 +16,12 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path
-from neurolens.optics.prescription import Lens
-from neurolens.optics.pupils import camera_rays
-from neurolens.optics.trace import CHUNK, Rays, trace
+from neurolens.lens.prescription import Lens
+from neurolens.setting.pupils import camera_rays
 from neurolens.surrogates.cores import DIRECTION, Refracted
 from neurolens.surrogates.domain import SPARSE, FilmRays, draw, lit_share, sample_domain
 from neurolens.surrogates.model import Domain, LensModel
+from neurolens.trace.rays import CHUNK, Rays, trace
 
 SCHEMA = 3
 SPLITS = ("train", "held_out", "rim", "edge", "far")

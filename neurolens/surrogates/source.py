@@ -27,12 +27,12 @@ from neurolens.graph.program import (
     Program,
 )
 from neurolens.graph.scalars import lower
-from neurolens.modelfile import POLARISED, transmittance_of
-from neurolens.modelfile.stategraph import mixture_of, state_names
-from neurolens.modelfile.states import axes_of
 from neurolens.surrogates.assemble import ALL, SCALARS, Parts, model_graph
+from neurolens.surrogates.cardkeys import POLARISED, transmittance_of
+from neurolens.surrogates.cardstates import axes_of
 from neurolens.surrogates.model import LensModel, with_one_angle
 from neurolens.surrogates.specialise import Fix
+from neurolens.surrogates.stategraph import mixture_of, state_names
 
 # Nothing fixed. Wavelengths are fixed in the models themselves, one model a table; film plane and stop here too.
 FREE = Fix()

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from neurolens.base.errors import InputError
-from neurolens.modelfile import DOMAIN_SLACK
-from neurolens.optics.glass import inverse_square_um
+from neurolens.lens.glass import inverse_square_um
+from neurolens.surrogates.cardkeys import DOMAIN_SLACK
 from neurolens.surrogates.cores import STOP
 
 if TYPE_CHECKING:

@@ -1,7 +1,7 @@
 """Surrogates of a lens in many states (zoom, internal focus): models of one structure at nodes, mixed between.
 
 A `StateSpace` says which states: the axes of a lens file, and its lens and domain at every state. Every number of the
-model at a state is interpolated from the nodes (see `modelfile.axes`), so that the model at a state is a plain
+model at a state is interpolated from the nodes (see `surrogates.axes`), so that the model at a state is a plain
 `LensModel`, and everything that knows those knows this one. A core is linear in its numbers: its error at a state is at
 most a small multiple (the Lebesgue constant) of the nodes' errors, plus that of interpolating the exact lens itself.
 """
@@ -16,12 +16,12 @@ from functools import cached_property
 import numpy as np
 
 from neurolens.base.errors import InputError
-from neurolens.modelfile.axes import Array, Axis, product, weights
-from neurolens.optics.focusing import film_range_mm, infinity_states, nearest_focus_m
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens
-from neurolens.optics.pupils import image_radius_mm
-from neurolens.optics.states import set_lens
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
+from neurolens.setting.focusing import film_range_mm, infinity_states, nearest_focus_m
+from neurolens.setting.pupils import image_radius_mm
+from neurolens.setting.states import set_lens
+from neurolens.surrogates.axes import Array, Axis, product, weights
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.model import Domain, LensModel, mixed
 
@@ -181,7 +181,7 @@ class StateModel:
 
     Attributes:
         space: the states, and the exact lens at each.
-        nodes: one model a node, in the order of `modelfile.axes.product`; of one structure: they differ in numbers.
+        nodes: one model a node, in the order of `surrogates.axes.product`; of one structure: they differ in numbers.
         fit_s: seconds that the whole fit took.
     """
 
@@ -205,7 +205,7 @@ class StateModel:
         return tuple(a.range[0] for a in self.axes)
 
     def at(self, *state: float) -> LensModel:
-        """The model of one state; InputError as `modelfile.axes.weights`."""
+        """The model of one state; InputError as `surrogates.axes.weights`."""
         first = self.nodes[0]
         return replace(
             mixed(self.nodes, weights(self.axes, state)),

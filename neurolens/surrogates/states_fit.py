@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from neurolens.base.errors import InputError
-from neurolens.modelfile import axes as ax
+from neurolens.surrogates import axes as ax
 from neurolens.surrogates.bases import (
     Exponents,
     invariant_exponents,

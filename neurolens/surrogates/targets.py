@@ -9,9 +9,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from neurolens.optics.glass import inverse_square_um
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens
+from neurolens.lens.glass import inverse_square_um
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Core
 from neurolens.surrogates.gates import boundary_rays, boundary_weights
 from neurolens.surrogates.lightfield import LightField, angle_vector

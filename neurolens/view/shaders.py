@@ -8,7 +8,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from neurolens.cameras.blades import Blades
 from neurolens.cameras.cameragraph import weight_graph
 from neurolens.flare.ghostmodel import GhostModel, ghost_graph
 from neurolens.graph.c import Signature
@@ -16,8 +15,9 @@ from neurolens.graph.glsl import write_glsl
 from neurolens.graph.ir import Graph
 from neurolens.graph.program import FILM_Z, STOP_RADIUS, WAVELENGTH, Program
 from neurolens.graph.scalars import lower
-from neurolens.optics.prescription import Lens
-from neurolens.optics.tracegraph import exact_graph
+from neurolens.lens.prescription import Lens
+from neurolens.shaders.blades import Blades
+from neurolens.trace.tracegraph import exact_graph
 
 # What stands in the page's shaders for inputs and outputs of functions.
 _PLACES = {

@@ -8,8 +8,8 @@ from shipped import tabled
 
 from neurolens.analysis.bundles import Pattern
 from neurolens.analysis.fields import Scene
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.states import set_lens
+from neurolens.lens.prescription import Lens, Surface
+from neurolens.setting.states import set_lens
 
 INF = math.inf
 

@@ -22,8 +22,8 @@ from neurolens.analysis.plots import plot_psf, plot_spots
 from neurolens.analysis.spots import mtf, spots
 from neurolens.analysis.wavefront import psf
 from neurolens.cli import main
-from neurolens.commands.analyse import WHATS
-from neurolens.optics.lenswriter import write_lens
+from neurolens.cli.analyse import WHATS
+from neurolens.readers.lenswriter import write_lens
 
 GAUSS = LENSES / "laikin_double_gauss_50.toml"
 D = 587.5618

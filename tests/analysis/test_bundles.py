@@ -17,11 +17,11 @@ from neurolens.analysis.layout import layout_profile
 from neurolens.analysis.spots import diffraction_mtf, fans, mtf, spots, working_f_number
 from neurolens.analysis.wavefront import diffraction_image, opd_mm, psf
 from neurolens.base.errors import InputError
-from neurolens.optics.apertures import Aperture
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.pupils import camera_rays
-from neurolens.optics.surfaces import Rays
-from neurolens.optics.trace import trace
+from neurolens.lens.apertures import Aperture
+from neurolens.lens.prescription import Lens, Surface
+from neurolens.setting.pupils import camera_rays
+from neurolens.trace.rays import trace
+from neurolens.trace.surfaces import Rays
 
 LENSES = ["laikin_double_gauss_50", "shimizu_fisheye_220", "ogawa_zoom_70_200", "phone_lens_6", "cooke_anamorphic_42"]
 

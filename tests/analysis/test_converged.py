@@ -14,8 +14,8 @@ from neurolens.analysis.fields import Scene
 from neurolens.analysis.pupil_nodes import LEVELS, converged, lit_nodes, lit_part
 from neurolens.analysis.spots import diffraction_mtf, mtf, mtf_over_height, spots, working_f_number
 from neurolens.analysis.wavefront import diffraction_image
-from neurolens.commands.analyse import _digits, _three
-from neurolens.optics.lensfile import read_lens
+from neurolens.cli.analyse import _digits, _three
+from neurolens.readers.lensfile import read_lens
 
 FUJINON = Path(__file__).parents[1] / "data" / "fujinon_35.toml"
 Tensor = torch.Tensor

@@ -14,10 +14,10 @@ from neurolens.analysis import plot_style
 from neurolens.analysis.field_curves import distortion, illumination
 from neurolens.analysis.fields import Scene
 from neurolens.cli import main
-from neurolens.optics.lenswriter import write_lens
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.states import set_lens
+from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.any_format import read_any
+from neurolens.readers.lenswriter import write_lens
+from neurolens.setting.states import set_lens
 
 FUJINON = Path(__file__).parents[1] / "data" / "fujinon_35.toml"
 CASE = Path(__file__).parents[3] / "shared" / "data" / "cases" / "04_field_cut_xf35.zmx"

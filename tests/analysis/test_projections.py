@@ -13,7 +13,7 @@ import torch
 from neurolens.analysis.projections import NAMES, Projection, fit, inverse_polynomial, residual
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.field import Field, field_of
-from neurolens.commands import projection as command
+from neurolens.cli import projection as command
 from tests.command_line import failure, run_json
 
 ROOT = Path(__file__).parents[2]

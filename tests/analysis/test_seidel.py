@@ -16,10 +16,10 @@ from neurolens.analysis.fields import Scene
 from neurolens.analysis.seidel import seidel
 from neurolens.analysis.wavefront import opd_mm
 from neurolens.base.errors import InputError
-from neurolens.optics.aiming import without_rims
-from neurolens.optics.glass import index_of
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.trace import trace
+from neurolens.lens.glass import index_of
+from neurolens.lens.prescription import Lens, Surface
+from neurolens.trace.aiming import without_rims
+from neurolens.trace.rays import trace
 
 D = 587.5618
 ASPHERE = scene(

@@ -22,7 +22,7 @@ from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.sampling import stratified
 from neurolens.cli import main as command_line
-from neurolens.commands.blender_lenses import form_of
+from neurolens.cli.blender_lenses import form_of
 
 _SIDE = 512  # rays of a point: this squared
 _LIGHT_NM = (400.0, 700.0)

@@ -15,12 +15,14 @@ pytest.importorskip("onnxruntime", reason="neurolens is not installed in Blender
 
 from neurolens.base import files  # noqa: E402
 from neurolens.base.errors import InputError, NeurolensError  # noqa: E402
-from neurolens.cli import main  # noqa: E402
-from neurolens.commands import blender_lenses  # noqa: E402
-from neurolens.commands.blender_lenses import thumbnail  # noqa: E402
-from neurolens.evaluate.shaders import Shader  # noqa: E402
-from neurolens.optics.lensfile import read_lens  # noqa: E402
-from neurolens.optics.paraxial import first_order  # noqa: E402
+from neurolens.cli import (
+    blender_lenses,  # noqa: E402
+    main,  # noqa: E402
+)
+from neurolens.cli.blender_lenses import thumbnail  # noqa: E402
+from neurolens.lens.paraxial import first_order  # noqa: E402
+from neurolens.readers.lensfile import read_lens  # noqa: E402
+from neurolens.shaders.blender_shader import Shader  # noqa: E402
 
 LENS = "laikin_double_gauss_50"
 HUGE = "operations: got 20000"

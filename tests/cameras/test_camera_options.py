@@ -17,7 +17,7 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cli import main
-from neurolens.optics.apertures import Aperture
+from neurolens.lens.apertures import Aperture
 from neurolens.render.pictures import read_exr
 
 SCENE = ROOT / "experiments" / "scenes" / "white.toml"

@@ -16,8 +16,8 @@ from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.vignetting import VIGNETTINGS
-from neurolens.commands import arguments
-from neurolens.optics.paraxial import film_z_mm, first_order
+from neurolens.cli import arguments
+from neurolens.lens.paraxial import film_z_mm, first_order
 
 FILM = (36.0, 24.0)
 

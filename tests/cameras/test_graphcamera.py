@@ -24,8 +24,8 @@ from neurolens.flare.ghosts import coated
 from neurolens.graph import compiler
 from neurolens.graph.ir import Graph
 from neurolens.graph.loworder import WORST, with_low_order_derivatives
-from neurolens.optics.apertures import Aperture
-from neurolens.optics.lensfile import read_lens
+from neurolens.lens.apertures import Aperture
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene
 from neurolens.surrogates.export import export_onnx

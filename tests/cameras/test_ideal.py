@@ -16,12 +16,12 @@ from neurolens.cameras.contract import Camera
 from neurolens.cameras.ideal import ThickLens, ThinLens
 from neurolens.cameras.pinhole import PROJECTIONS, Fisheye, Pinhole
 from neurolens.cameras.sampling import concentric_disk
-from neurolens.optics.apertures import Aperture
-from neurolens.optics.film_plane import film_z_mm
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import first_order, system_of
-from neurolens.optics.prescription import Lens
-from neurolens.optics.states import set_lens
+from neurolens.lens.apertures import Aperture
+from neurolens.lens.film_plane import film_z_mm
+from neurolens.lens.paraxial import first_order, system_of
+from neurolens.lens.prescription import Lens
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
 
 
 def square_grid(side: int) -> np.ndarray:

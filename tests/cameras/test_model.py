@@ -20,10 +20,10 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
 from neurolens.cameras.model import ModelScene, OnnxCamera, OnnxLens, best_focus_z_mm, load_model
 from neurolens.cameras.pupil_boxes import PupilTable, tightened
-from neurolens.modelfile import metadata
-from neurolens.optics import focusing
-from neurolens.optics.apertures import Aperture
-from neurolens.optics.paraxial import film_z_mm, first_order
+from neurolens.lens.apertures import Aperture
+from neurolens.lens.paraxial import film_z_mm, first_order
+from neurolens.setting import focusing
+from neurolens.surrogates import metadata
 
 ROOT = Path(__file__).parents[2]
 

@@ -9,31 +9,30 @@ import numpy as np
 import pytest
 from camera_helpers import FILM, GAUSS, ROOT
 
-from neurolens.cameras import osl
-from neurolens.cameras.blades import Blades
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.onnxlens import load_model
-from neurolens.cameras.pupil_circles import PupilCircles, unit_disc
-from neurolens.cameras.pupil_circles_fit import fit_pupil
-from neurolens.cameras.pupil_disc import PupilDisc
-from neurolens.cameras.pupil_passing import passing_share
-from neurolens.cameras.shader_lens import ShaderLens
 from neurolens.cli import main
-from neurolens.evaluate import shaders
-from neurolens.evaluate.shaders import _smallest, exact_lens
-from neurolens.graph import lowtests
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.osl import write_osl
 from neurolens.graph.passes import pruned
 from neurolens.graph.scalars import lower
-from neurolens.modelfile.axes import Axis, product, weights
-from neurolens.optics.apertures import Aperture
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.pupils import pupil_plane_z_mm
-from neurolens.optics.states import set_lens
-from neurolens.optics.tracegraph import exact_graph
+from neurolens.lens.apertures import Aperture
+from neurolens.lens.paraxial import first_order
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.pupils import pupil_plane_z_mm
+from neurolens.setting.states import set_lens
+from neurolens.shaders import blender_shader as shaders
+from neurolens.shaders import lowtests, osl
+from neurolens.shaders.blades import Blades
+from neurolens.shaders.blender_shader import _smallest, exact_lens
+from neurolens.shaders.pupil_circles import PupilCircles, unit_disc
+from neurolens.shaders.pupil_circles_fit import fit_pupil
+from neurolens.shaders.pupil_disc import PupilDisc
+from neurolens.shaders.pupil_passing import passing_share
+from neurolens.shaders.shader_lens import ShaderLens
+from neurolens.surrogates.axes import Axis, product, weights
+from neurolens.trace.tracegraph import exact_graph
 
 MODEL = ROOT / "models" / f"{GAUSS.stem}.ols-36.onnx"
 FAR = 1e9

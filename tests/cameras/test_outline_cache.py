@@ -15,8 +15,8 @@ from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.outline_cache import kept_outline, search_key
 from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.optics.prescription import Lens
-from neurolens.optics.states import set_lens
+from neurolens.lens.prescription import Lens
+from neurolens.setting.states import set_lens
 
 KEY = "0123456789abcdef" * 4
 

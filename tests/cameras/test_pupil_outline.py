@@ -16,10 +16,10 @@ from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pupil_boxes import Passes, PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.pupil_search import outline_of
-from neurolens.optics.apertures import Aperture
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.states import set_lens
+from neurolens.lens.apertures import Aperture
+from neurolens.lens.prescription import Lens, Surface
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
 
 RADIUS, SHIFT = 4.0, 0.45  # of the discs, and how fast they part, mm per mm of film radius
 VISIBLE, ONE = (400.0, 700.0), (550.0, 550.0)

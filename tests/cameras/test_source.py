@@ -16,19 +16,19 @@ from numpy.typing import ArrayLike, NDArray
 from neurolens.base import status as st
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.focus_function import Focusing, number_of
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.cameras.source import camera_program, film_extras, model_extras
 from neurolens.cli import main
-from neurolens.commands.export_lens import lens_program, pupil_planes_mm
-from neurolens.optics.focusing import best_focus_of_stops_mm, best_focus_z_mm
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import film_z_mm, first_order
-from neurolens.optics.states import set_lens
-from neurolens.optics.surfaces import Rays
-from neurolens.optics.trace import trace
+from neurolens.cli.export_lens import lens_program, pupil_planes_mm
+from neurolens.lens.paraxial import film_z_mm, first_order
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.focusing import best_focus_of_stops_mm, best_focus_z_mm
+from neurolens.setting.states import set_lens
+from neurolens.shaders.focus_function import Focusing, number_of
+from neurolens.shaders.source import camera_program, film_extras, model_extras
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.states import gap_axis, zoom_axis
+from neurolens.trace.rays import trace
+from neurolens.trace.surfaces import Rays
 
 ROOT = Path(__file__).parents[2]
 LENS = ROOT / "lenses" / "laikin_double_gauss_50.toml"

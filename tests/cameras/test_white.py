@@ -21,8 +21,8 @@ from neurolens.cameras.ideal import ThickLens, ThinLens
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cameras.pinhole import PROJECTIONS, Pinhole
 from neurolens.cameras.vignetting import VIGNETTINGS, Vignetted
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.states import set_lens
+from neurolens.lens.paraxial import first_order
+from neurolens.setting.states import set_lens
 
 MODELS = Path(__file__).parents[2] / "models"
 

@@ -32,7 +32,7 @@ from neurolens.cameras.contract import Camera, CameraRays, FloatArray
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.optics.lensfile import read_lens
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.film_settings import FilmSettings
 from neurolens.render.scene import CameraSettings, load_scene
 

@@ -15,8 +15,8 @@ from experiments import extremes
 from experiments.__main__ import main
 from experiments.extremes import failures, measure, trace_reference
 from neurolens.base import status as st
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.trace import trace
+from neurolens.lens.prescription import Lens, Surface
+from neurolens.trace.rays import trace
 
 LENSES = Path(__file__).parents[2] / "lenses"
 COUNT = 300

@@ -10,9 +10,9 @@ from PIL import Image
 from experiments import flare_gallery, flare_speed, lab
 from neurolens.base.errors import InputError
 from neurolens.cli import build_parser
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens
-from neurolens.optics.states import set_lens
+from neurolens.lens.prescription import Lens
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
 
 
 def triplet() -> Lens:

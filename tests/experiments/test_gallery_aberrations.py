@@ -16,8 +16,8 @@ from neurolens.analysis.field_curves import RECTILINEAR, curvature, distortion
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.seidel import seidel
 from neurolens.cameras.ideal import ThinLens
-from neurolens.optics.glass import LINE_D_NM, index_of
-from neurolens.optics.paraxial import first_order
+from neurolens.lens.glass import LINE_D_NM, index_of
+from neurolens.lens.paraxial import first_order
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene
 

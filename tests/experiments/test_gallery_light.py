@@ -24,14 +24,14 @@ from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.cameras.vignetting import Vignetted
-from neurolens.optics.apertures import Aperture
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens
-from neurolens.optics.states import set_lens
-from neurolens.optics.trace import Rays, trace
+from neurolens.lens.apertures import Aperture
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.pictures import make_aperture
 from neurolens.render.scene import load_scene
+from neurolens.setting.states import set_lens
+from neurolens.trace.rays import Rays, trace
 
 ROOT = Path(__file__).parents[2]
 GALLERY = ROOT / "experiments" / "gallery"

@@ -16,7 +16,7 @@ from experiments.gallery.settings import find_effects, read_effect
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.ideal import ThinLens
-from neurolens.optics.lensfile import read_lens
+from neurolens.readers.lensfile import read_lens
 
 EFFECT = """\
 title = "Small"

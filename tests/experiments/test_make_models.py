@@ -15,7 +15,7 @@ from neurolens.base.config import from_dict
 from neurolens.base.errors import InputError
 from neurolens.base.files import sha256_of
 from neurolens.base.progress import Progress
-from neurolens.evaluate.measure import Measured
+from neurolens.study.measure import Measured
 from neurolens.surrogates.fit import ModelSettings
 
 QUIET = Progress(quiet=True)

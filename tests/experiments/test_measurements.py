@@ -35,15 +35,15 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.model import load_model
-from neurolens.evaluate.candidates import CompiledSource, fused_candidate
-from neurolens.evaluate.speed import Race, Unavailable, race
 from neurolens.graph.compiler import find_compiler
 from neurolens.graph.program import SCENE_RAY
 from neurolens.graph.scalars import lower
-from neurolens.optics.trace import trace
-from neurolens.optics.tracegraph import exact_graph
+from neurolens.study.candidates import CompiledSource, fused_candidate
+from neurolens.study.speed import Race, Unavailable, race
 from neurolens.surrogates.assemble import RAY_ONLY
 from neurolens.surrogates.domain import sample_domain
+from neurolens.trace.rays import trace
+from neurolens.trace.tracegraph import exact_graph
 
 MODEL = MODELS[0]
 
@@ -303,7 +303,7 @@ def test_two_aspheres_change_the_rays_and_little_else() -> None:
 
 
 def test_the_exact_graph_of_rays_alone_gives_the_rays_of_the_whole() -> None:
-    """The whole against the tracer: tests/optics/test_tracegraph.py."""
+    """The whole against the tracer: tests/trace/test_tracegraph.py."""
     lens, domain = lens_models.lens(), lens_models.domain()
     s = sample_domain(domain, 20_000, 3)
     inputs = {f"{k}_mm": getattr(s, k).numpy() for k in ("film_x", "film_y", "pupil_x", "pupil_y")}

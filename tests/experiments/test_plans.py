@@ -10,13 +10,13 @@ from experiments.plan_errors import by_rays, fresh_places, fresh_prints, moved, 
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.evaluate.experiment import near_limit_m
-from neurolens.evaluate.footprints import distance_mm, places_of
-from neurolens.evaluate.plan import Choice
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.pupils import image_radius_mm
-from neurolens.optics.states import set_lens
+from neurolens.plan.footprints import distance_mm, places_of
+from neurolens.plan.plan import Choice
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import load_scene
+from neurolens.setting.pupils import image_radius_mm
+from neurolens.setting.states import set_lens
+from neurolens.study.experiment import near_limit_m
 
 SIDE, SEEDS = 56, 4
 

@@ -9,10 +9,10 @@ from shipped import before, disc_irradiance, pinhole, tabled
 
 from experiments.radiometry import FilmLight, film_light, white_card
 from neurolens.base.errors import InputError
-from neurolens.optics.apertures import Aperture
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.states import set_lens
+from neurolens.lens.apertures import Aperture
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens, Surface
+from neurolens.setting.states import set_lens
 
 
 def lens(name: str, **state: float) -> Lens:

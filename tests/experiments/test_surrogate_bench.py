@@ -17,7 +17,7 @@ from experiments.methods import Bench, BenchSettings, Row, all_rows, chosen_rows
 from experiments.methods_page import lens_page, write_lens
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
-from neurolens.evaluate.experiment import DomainChoice, LensChoice
+from neurolens.study.experiment import DomainChoice, LensChoice
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.pairs import PairSettings
 

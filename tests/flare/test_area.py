@@ -14,10 +14,10 @@ from neurolens.flare.picture import Raster, ghost_picture
 from neurolens.flare.steps import LOST
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
-from neurolens.optics.apertures import Aperture
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.states import set_lens
+from neurolens.lens.apertures import Aperture
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.colour import SRGB
+from neurolens.setting.states import set_lens
 from tests.flare.test_ghosts import lens_of
 
 

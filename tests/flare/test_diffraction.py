@@ -19,9 +19,9 @@ from neurolens.flare import diffraction as d
 from neurolens.flare import exit_pupil as p
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.picture import Raster, axis_irradiance
-from neurolens.optics.apertures import Aperture
-from neurolens.optics.prescription import Lens
-from neurolens.optics.trace import Rays, trace
+from neurolens.lens.apertures import Aperture
+from neurolens.lens.prescription import Lens
+from neurolens.trace.rays import Rays, trace
 from tests.flare.test_ghosts import lens_of, plate
 
 AXIS, NM = Light(0.0, 0.0), 550.0

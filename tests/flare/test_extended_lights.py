@@ -15,11 +15,11 @@ from neurolens.flare.photons import PhotonTracer
 from neurolens.flare.picture import Raster, ghost_picture, ghost_table, photon_picture
 from neurolens.flare.smear import Smear
 from neurolens.flare.sources import SceneLights
-from neurolens.optics.apertures import Aperture
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens
-from neurolens.optics.states import set_lens
+from neurolens.lens.apertures import Aperture
+from neurolens.lens.prescription import Lens
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import load_scene
+from neurolens.setting.states import set_lens
 from tests.flare.test_ghosts import LENSES, lens_of
 
 CASE = Path(__file__).parents[3] / "shared/data/cases/render/area_light_flare.toml"

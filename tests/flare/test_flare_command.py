@@ -13,11 +13,11 @@ from neurolens.flare.diffraction import starburst_picture
 from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.picture import Raster
-from neurolens.optics.apertures import Aperture
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.states import set_lens
+from neurolens.lens.apertures import Aperture
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.colour import COLOUR_SPACES, SRGB, conversion
 from neurolens.render.pictures import read_exr, read_layers, write_data_exr, write_exr
+from neurolens.setting.states import set_lens
 
 
 def test_table_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,10 +20,10 @@ from neurolens.flare.lights import Light
 from neurolens.flare.photons import PhotonTracer
 from neurolens.flare.picture import Raster, ghost_picture, photon_picture
 from neurolens.flare.sources import highlights
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.states import set_lens
+from neurolens.lens.prescription import Lens, Surface
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.pictures import read_exr, write_exr
+from neurolens.setting.states import set_lens
 
 COOKE = ["flare", "cooke_triplet_50", "--bins", "2", "--cell", "4", "--width", "36", "--quiet"]
 

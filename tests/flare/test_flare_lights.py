@@ -12,7 +12,7 @@ from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.field import field_of
 from neurolens.flare.lights import SUN, Light, light_rays, patches, read_lights, with_disc
 from neurolens.flare.sources import SceneLights, chosen, highlights, keep, keep_named
-from neurolens.optics.lensfile import read_lens
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import scene_from_tables, seen_from
 
 CSV = """light,frame,azimuth_deg,elevation_deg,r,g,b,distance_m

@@ -13,10 +13,10 @@ from neurolens.cli import main
 from neurolens.flare.ghosts import GhostTracer, coated
 from neurolens.flare.lights import Light, with_disc
 from neurolens.flare.picture import Raster, ghost_picture
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.states import set_lens
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.colour import ACESCG, SRGB, conversion
 from neurolens.render.pictures import read_colour_space, read_exr, read_layers, write_data_exr, write_exr
+from neurolens.setting.states import set_lens
 
 GAUSS = ["flare", "laikin_double_gauss_50", "--light", "15,8", "--coating", "quarter-wave"]
 SMALL = ["flare", "cooke_triplet_50", "--width", "36", "--bins", "2"]

@@ -23,12 +23,12 @@ from neurolens.flare.ghosts import GhostTracer, Pair
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.picture import Raster, ghost_picture
 from neurolens.graph.compiler import compile_c
-from neurolens.modelfile import CARD_KEY, MODEL_KEY
-from neurolens.optics.apertures import Aperture
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens
-from neurolens.optics.states import set_lens
+from neurolens.lens.apertures import Aperture
+from neurolens.lens.prescription import Lens
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.pictures import read_exr
+from neurolens.setting.states import set_lens
+from neurolens.surrogates.cardkeys import CARD_KEY, MODEL_KEY
 from neurolens.surrogates.source import identifier
 
 LENS = Path(__file__).parents[2] / "lenses" / "brendel_tessar_100.toml"

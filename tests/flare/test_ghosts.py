@@ -15,13 +15,13 @@ from neurolens.flare.ghosts import GhostTracer, Pair, coated, ghost_pairs
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.photons import PhotonTracer
 from neurolens.flare.picture import Raster, axis_irradiance, ghost_layout, ghost_picture, ghost_table
-from neurolens.optics.apertures import Aperture
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Coating, Lens, Surface
-from neurolens.optics.sequence import follow, turning
-from neurolens.optics.states import set_lens
-from neurolens.optics.trace import Rays, trace
+from neurolens.lens.apertures import Aperture
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Coating, Lens, Surface
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
+from neurolens.trace.rays import Rays, trace
+from neurolens.trace.sequence import follow, turning
 
 LENSES = Path(__file__).parents[2] / "lenses"
 

@@ -12,13 +12,13 @@ from neurolens.flare.ghosts import GhostTracer, ghost_pairs
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.photons import LEVELS, Photons, PhotonTracer
 from neurolens.flare.picture import Raster, _smoothed, axis_irradiance, photon_picture
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.sequence import follow, turning
-from neurolens.optics.states import set_lens
-from neurolens.optics.trace import Rays
+from neurolens.lens.prescription import Lens, Surface
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.colour import SRGB
 from neurolens.render.flaresettings import Scatter
+from neurolens.setting.states import set_lens
+from neurolens.trace.rays import Rays
+from neurolens.trace.sequence import follow, turning
 from tests.flare.test_ghosts import LENSES, lens_of
 
 COUNT = 1 << 17

@@ -10,9 +10,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.trace import Rays, trace
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens, Surface
+from neurolens.trace.rays import Rays, trace
 
 
 class CannotSay(Exception):

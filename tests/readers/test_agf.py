@@ -8,10 +8,10 @@ import pytest
 from command_line import failure, run_json
 
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.optics import catalogue
-from neurolens.optics.glass import index_at, index_of
-from neurolens.optics.lensfile import read_lens
+from neurolens.lens import catalogue
+from neurolens.lens.glass import index_at, index_of
 from neurolens.readers.agf import more_glasses, read_agf
+from neurolens.readers.lensfile import read_lens
 
 TRIPLET = Path(__file__).parents[2] / "lenses" / "cooke_triplet_50.toml"
 BK7 = catalogue.find("Schott:N-BK7")

@@ -11,9 +11,9 @@ from test_tables_oslo import OSLO
 from test_zemax import BODY, DUMMY, HEAD, TAIL, read, swapped
 
 from neurolens.base.errors import InputError
-from neurolens.optics import catalogue
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens
+from neurolens.lens import catalogue
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any
 from neurolens.readers.draft import Given
 

@@ -10,9 +10,9 @@ from lens_formats import swapped as swapped_in
 from shipped import singlet_mm
 
 from neurolens.base.errors import AssumedWarning, InputError, NeurolensWarning
-from neurolens.optics import catalogue
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens
+from neurolens.lens import catalogue
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
 from neurolens.readers.codev import read_seq
 from neurolens.readers.draft import Given
 from neurolens.readers.forbes import qbfs_terms, qcon_terms

@@ -13,11 +13,11 @@ from lens_formats import DRAWN, CannotSay, assert_same_optics, optical_bench, pl
 from shipped import PATHS
 
 from neurolens.base.errors import AssumedWarning, InputError
-from neurolens.evaluate.survey import SurveySettings, Task, run_task
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import kind_of, read_any
+from neurolens.readers.lensfile import read_lens
+from neurolens.study.survey import SurveySettings, Task, run_task
 
 GAUSS = plain(read_lens(Path(__file__).parents[2] / "lenses" / "laikin_double_gauss_50.toml"))
 

@@ -16,12 +16,12 @@ from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.lensname import lens_id_of, resolve, split_kind
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cli import main
-from neurolens.commands.plan import shipped_models
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.lenswriter import write_lens
-from neurolens.optics.prescription import Lens
+from neurolens.cli.plan import shipped_models
+from neurolens.lens.prescription import Lens
 from neurolens.readers import any_format
 from neurolens.readers.any_format import read_any
+from neurolens.readers.lensfile import read_lens
+from neurolens.readers.lenswriter import write_lens
 from neurolens.render.pictures import read_exr
 
 LENSES = Path(__file__).parents[2] / "lenses"
@@ -88,7 +88,7 @@ def test_every_command_gives_a_foreign_file_to_its_reader(
     (tmp_path / "out").mkdir(exist_ok=command == "blender")
     if command == "blender":
         monkeypatch.setattr("neurolens.blender.pack.check_takes", lambda to: None)
-    monkeypatch.setattr("neurolens.commands.library._index", lambda records: pytest.fail(str(records)))
+    monkeypatch.setattr("neurolens.cli.library._index", lambda records: pytest.fail(str(records)))
     code, said = 0, ""
     try:
         code = main([*words(command, files["zmx"], tmp_path, scene)])
@@ -154,8 +154,8 @@ def test_a_run_keeps_the_lens_in_our_format_and_a_model_knows_its_lens(
     kept, model = run / "lenses" / "Tessar_100mm_1_4_5_v2_0.toml", run / "models" / "ols-12.onnx"
     assert read_lens(kept).sha256 == read_any(files["zmx"]).sha256
     capsys.readouterr()
-    from neurolens.evaluate.check import lens_of_card
-    from neurolens.modelfile.metadata import read_card
+    from neurolens.study.check import lens_of_card
+    from neurolens.surrogates.metadata import read_card
 
     card = read_card(model)
     assert card["lens"]["id"] == "Tessar_100mm_1_4_5_v2_0"

@@ -14,11 +14,11 @@ from shipped import PATHS
 
 from neurolens.base.errors import AssumedWarning, InputError
 from neurolens.cli import main
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import system_of
-from neurolens.optics.prescription import Lens
+from neurolens.lens.paraxial import system_of
+from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any
 from neurolens.readers.draft import Given
+from neurolens.readers.lensfile import read_lens
 from neurolens.readers.source import MAX_BYTES
 
 NO_DISPERSION = (".len", ".dat", ".txt")

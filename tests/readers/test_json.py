@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any
 from neurolens.readers.draft import Given
 from neurolens.readers.json_lens import read_json_lens

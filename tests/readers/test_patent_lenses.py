@@ -20,8 +20,8 @@ from command_line import run_json
 
 from neurolens.analysis.fields import Scene
 from neurolens.base.errors import NeurolensWarning
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any
 
 ARCHIVE = Path(__file__).parents[1] / "data" / "patent_lenses.tar.xz"

@@ -8,9 +8,9 @@ from lens_formats import swapped
 from shipped import singlet_mm
 
 from neurolens.base.errors import AssumedWarning, InputError, NeurolensWarning
-from neurolens.optics import catalogue
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens
+from neurolens.lens import catalogue
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
 from neurolens.readers.draft import Given
 from neurolens.readers.oslo import read_len
 from neurolens.readers.tables import read_table

@@ -12,8 +12,8 @@ from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.sampling import stratified
 from neurolens.cli import main
-from neurolens.optics.glass import LINE_D_NM, index_of
-from neurolens.optics.lensfile import read_lens
+from neurolens.lens.glass import LINE_D_NM, index_of
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.exr_attributes import standard_attributes
 from neurolens.render.pictures import read_exr, write_exr
 

@@ -12,7 +12,7 @@ from render_helpers import CAMERA, WHITE, diffuse, radiance, scene, world
 from neurolens.base.errors import InputError
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.optics.apertures import Aperture
+from neurolens.lens.apertures import Aperture
 from neurolens.render import pictures
 from neurolens.render.meshfile import encloses
 from neurolens.render.renderer import render

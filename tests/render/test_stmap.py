@@ -19,14 +19,14 @@ from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.field import Field, field_of, frame_of, spectrum_of
 from neurolens.cameras.sampling import stratified
 from neurolens.cli import main
-from neurolens.commands import stmap as command
-from neurolens.optics.paraxial import chief_reach_mm, first_order
-from neurolens.optics.states import set_lens
+from neurolens.cli import stmap as command
+from neurolens.lens.paraxial import chief_reach_mm, first_order
 from neurolens.readers.any_format import read_any
 from neurolens.render.pictures import read_exr, read_layers
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene
 from neurolens.render.stmap import illumination_map, plates_of, redistort_map, undistort_map, worst_px
+from neurolens.setting.states import set_lens
 from tests.command_line import failure, run_json
 
 ROOT = Path(__file__).parents[2]

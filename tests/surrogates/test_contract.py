@@ -18,7 +18,7 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.graph.c import Signature
 from neurolens.graph.program import SCENE_RAY, Program
-from neurolens.optics.paraxial import first_order
+from neurolens.lens.paraxial import first_order
 from neurolens.surrogates.assemble import ALL
 from neurolens.surrogates.cores import Core
 from neurolens.surrogates.domain import FilmRays, sample_domain

@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from neurolens.base.errors import InputError
-from neurolens.optics.film_plane import PupilBounds
-from neurolens.optics.glass import LINE_D_NM
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import film_z_mm, first_order
-from neurolens.optics.prescription import Lens
-from neurolens.optics.states import set_lens
+from neurolens.lens.film_plane import PupilBounds
+from neurolens.lens.glass import LINE_D_NM
+from neurolens.lens.paraxial import film_z_mm, first_order
+from neurolens.lens.prescription import Lens
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
 from neurolens.surrogates.domain import domain_from_camera, domain_of, focused_plane_z_mm, sample_domain
 from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import SPLITS, PairSettings, RayPairs, load_pairs, make_pairs, save_pairs, trace_pairs

@@ -18,11 +18,11 @@ from neurolens.cameras.model import load_model
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.program import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH
 from neurolens.graph.scalars import lower
-from neurolens.modelfile import MODEL_KEY
-from neurolens.modelfile.metadata import read_metadata
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.states import set_lens
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
+from neurolens.surrogates.cardkeys import MODEL_KEY
 from neurolens.surrogates.file import onnx_of, read_model
+from neurolens.surrogates.metadata import read_metadata
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = sorted((ROOT / "models").glob("*.onnx"))

@@ -12,7 +12,7 @@ from lens_models import LENSES, prepared
 
 from experiments.methods import NETWORK_ABLATIONS, POLYNOMIAL_ABLATIONS, ablated
 from neurolens.base.errors import InputError
-from neurolens.optics.lensfile import read_lens
+from neurolens.readers.lensfile import read_lens
 from neurolens.surrogates.bases import invariant_exponents, raw_exponents
 from neurolens.surrogates.cores import Partitioned, Residual
 from neurolens.surrogates.domain import domain_of

@@ -10,14 +10,14 @@ import torch
 
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
-from neurolens.optics.glass import index_of
-from neurolens.optics.prescription import Surface
-from neurolens.optics.sag import entered
-from neurolens.optics.shapes import sag_and_derivatives
+from neurolens.lens.glass import index_of
+from neurolens.lens.prescription import Surface
 from neurolens.surrogates.assemble import refracted, tilt_series
 from neurolens.surrogates.cores import Refracted
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.fits import front
+from neurolens.trace.sag import entered
+from neurolens.trace.shapes import sag_and_derivatives
 
 FRONTS = {
     "sphere": Surface(60.0, 2.0, 70.0, 1.6, 50.0),

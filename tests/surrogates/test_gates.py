@@ -13,9 +13,9 @@ from vignetting_oracle import vignetting_errors
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.states import set_lens
+from neurolens.lens.prescription import Lens, Surface
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
 from neurolens.surrogates.cores import InvariantPolynomial
 from neurolens.surrogates.domain import SPARSE, FilmRays, domain_of, lit_share, sample_domain, sample_lit
 from neurolens.surrogates.export import export_onnx

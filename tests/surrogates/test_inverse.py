@@ -14,16 +14,16 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.optics.pupils import camera_rays
-from neurolens.optics.shapes import sag_and_derivatives
-from neurolens.optics.surfaces import Rays
-from neurolens.optics.trace import film_derivatives, trace_differentials
+from neurolens.setting.pupils import camera_rays
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.inverse import InverseModel, InverseRays
 from neurolens.surrogates.inverse_fit import convergence, fit_inverse
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSet
+from neurolens.trace.rays import film_derivatives, trace_differentials
+from neurolens.trace.shapes import sag_and_derivatives
+from neurolens.trace.surfaces import Rays
 
 GAUSS, FISHEYE, ASPHERE = "laikin_double_gauss_50", "horimoto_fisheye_16", "canon_aspheric_50"
 

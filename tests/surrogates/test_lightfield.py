@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
-from neurolens.optics.lensfile import read_lens
+from neurolens.readers.lensfile import read_lens
 from neurolens.surrogates.assemble import DirectionSeries
 from neurolens.surrogates.bases import invariant_exponents, monomials, solve, vector_columns
 from neurolens.surrogates.domain import FilmRays, domain_of

@@ -10,8 +10,8 @@ from lens_models import anamorphic
 from vignetting_oracle import vignetting_errors
 
 from neurolens.base.errors import InputError
-from neurolens.evaluate.rays import ray_errors
-from neurolens.optics.prescription import Lens
+from neurolens.lens.prescription import Lens
+from neurolens.study.rays import ray_errors
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model
 from neurolens.surrogates.fits.mirror import mirror_exponents

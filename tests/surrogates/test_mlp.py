@@ -13,8 +13,8 @@ from experiments.published import PublishedSettings, fit_any
 from neurolens.base.errors import InputError
 from neurolens.base.status import OUTSIDE_DOMAIN
 from neurolens.cameras.model import load_model
-from neurolens.evaluate.measure import onnx_predictor
-from neurolens.optics.lensfile import read_lens
+from neurolens.readers.lensfile import read_lens
+from neurolens.study.measure import onnx_predictor
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Network, Residual
 from neurolens.surrogates.domain import domain_of, sample_domain
 from neurolens.surrogates.export import export_onnx

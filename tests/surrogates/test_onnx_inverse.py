@@ -15,7 +15,7 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.onnxmaps import load_inverse
-from neurolens.modelfile import MODEL_KEY
+from neurolens.surrogates.cardkeys import MODEL_KEY
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_inverse, export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model

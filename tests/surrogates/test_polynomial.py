@@ -12,11 +12,10 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import stop_radius_mm
-from neurolens.optics.pupils import camera_rays
-from neurolens.optics.states import set_lens
-from neurolens.optics.trace import trace
+from neurolens.lens.paraxial import stop_radius_mm
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.pupils import camera_rays
+from neurolens.setting.states import set_lens
 from neurolens.surrogates.cores import DIRECTION, STOP, InvariantPolynomial, RawPolynomial
 from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain
 from neurolens.surrogates.fits import polynomial
@@ -27,6 +26,7 @@ from neurolens.surrogates.model import LensModel, Prediction
 from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, trace_pairs
 from neurolens.surrogates.settings import ModelSettings
 from neurolens.surrogates.targets import Prepared, film_equivalent_weights, fit_encoding, scales_of
+from neurolens.trace.rays import trace
 
 ROOT = Path(__file__).parents[2] / "lenses"
 

@@ -19,22 +19,22 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
-from neurolens.evaluate.check import check_states, random_states, space_of_card
-from neurolens.evaluate.rays import ray_errors
-from neurolens.modelfile.axes import Axis, product, weights
-from neurolens.optics.film_plane import colours
-from neurolens.optics.focusing import axial_rays, best_focus_z_mm
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens
-from neurolens.optics.states import set_lens
-from neurolens.optics.trace import trace
+from neurolens.lens.film_plane import colours
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.focusing import axial_rays, best_focus_z_mm
+from neurolens.setting.states import set_lens
+from neurolens.study.check import check_states, random_states, space_of_card
+from neurolens.study.rays import ray_errors
+from neurolens.surrogates.axes import Axis, product, weights
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_states
 from neurolens.surrogates.model import LensModel, mix
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.states import StateModel, StateSpace, focus_axis, zoom_axis
 from neurolens.surrogates.states_fit import StateSettings, fit_states
+from neurolens.trace.rays import trace
 
 ZOOM = Axis("zoom", "mm", (70.0, 135.0, 200.0), 3, reciprocal=True, stated=(("70mm", 70.0),))
 FOCUS = Axis("focus", "1/m", (0.0, 1.0), 4)

@@ -22,20 +22,20 @@ from writers import COLUMNS, compiled, glsl_rays, rays_of, written_rays
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.model import load_model
-from neurolens.evaluate.candidates import CompiledSource
 from neurolens.graph.c import literal
 from neurolens.graph.compiler import FLAGS, find_compiler
 from neurolens.graph.program import SCENE_RAY
-from neurolens.modelfile import MODEL_KEY
-from neurolens.modelfile.stategraph import mixture_of
-from neurolens.optics.paraxial import first_order
+from neurolens.lens.paraxial import first_order
+from neurolens.study.candidates import CompiledSource
 from neurolens.surrogates.assemble import ALL, RAY_ONLY, Parts
 from neurolens.surrogates.card import card_of, card_to_json
+from neurolens.surrogates.cardkeys import MODEL_KEY
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.file import read_model
 from neurolens.surrogates.model import Domain
 from neurolens.surrogates.source import export_source, fused_program, identifier
 from neurolens.surrogates.specialise import Fix, fixed_models
+from neurolens.surrogates.stategraph import mixture_of
 
 MODELS = Path(__file__).parents[2] / "models"
 

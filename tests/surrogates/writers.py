@@ -15,11 +15,11 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.evaluate.candidates import CompiledSource
 from neurolens.graph.c import Signature, literal
 from neurolens.graph.compiler import find_compiler
 from neurolens.graph.glsl import write_glsl
 from neurolens.graph.program import SCENE_RAY, Program
+from neurolens.study.candidates import CompiledSource
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.source import fused_program

@@ -15,11 +15,11 @@ import onnx
 import pytest
 from report_results import full_results
 
+from neurolens.base.records import Results
 from neurolens.cli import main
-from neurolens.evaluate.records import Results
-from neurolens.evaluate.report import write_report
-from neurolens.modelfile import CARD_KEY
 from neurolens.render.pictures import write_exr, write_png
+from neurolens.study.report import write_report
+from neurolens.surrogates.cardkeys import CARD_KEY
 
 ROOT = Path(__file__).parents[2]
 RUN = "window.__pwned = 1"
@@ -127,7 +127,7 @@ def test_a_page_that_escapes_nothing_is_noticed(browser: Any, attack: str, tmp_p
 def test_library_and_the_pages_of_its_lenses(
     browser: Any, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from neurolens.commands import library
+    from neurolens.cli import library
 
     def draw(path: Path) -> None:
         write_png(path, np.full((20, 30, 3), 0.5))

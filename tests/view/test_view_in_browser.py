@@ -15,16 +15,16 @@ import pytest
 
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.onnxlens import load_model
-from neurolens.cameras.source import model_extras
 from neurolens.cli import main
 from neurolens.flare.ghostfile import write_ghosts
 from neurolens.flare.ghostfit import GhostSettings, fit_ghosts
 from neurolens.flare.lights import Light
 from neurolens.flare.picture import Raster, ghost_picture
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.states import set_lens
+from neurolens.readers.lensfile import read_lens
 from neurolens.render.renderer import render
 from neurolens.render.scene import scene_from_tables
+from neurolens.setting.states import set_lens
+from neurolens.shaders.source import model_extras
 from neurolens.surrogates.source import export_source
 
 ROOT = Path(__file__).parents[2]

@@ -19,15 +19,15 @@ import torch
 from neurolens.base.errors import InputError
 from neurolens.base.html import text_of
 from neurolens.cli import main
-from neurolens.commands import view as view_command
+from neurolens.cli import view as view_command
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.osl import urgent
-from neurolens.optics.lensfile import read_lens
-from neurolens.optics.states import set_lens
-from neurolens.optics.surfaces import Rays
-from neurolens.optics.trace import trace
-from neurolens.optics.tracegraph import TRANSMITTANCE, exact_graph
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
+from neurolens.trace.rays import trace
+from neurolens.trace.surfaces import Rays
+from neurolens.trace.tracegraph import TRANSMITTANCE, exact_graph
 from neurolens.view import packed, shaders
 from neurolens.view import page as pages
 

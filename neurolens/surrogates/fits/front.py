@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from neurolens.optics.glass import index_of
-from neurolens.optics.prescription import Lens
-from neurolens.optics.sag import entered
+from neurolens.lens.glass import index_of
+from neurolens.lens.prescription import Lens
 from neurolens.surrogates.assemble import tilt_series
 from neurolens.surrogates.cores import Array
 from neurolens.surrogates.model import Encoding
 from neurolens.surrogates.pairs import PairSet, RayPairs
+from neurolens.trace.sag import entered
 
 # Cosine of the flattest ray that leaves the front surface, below which a fit refracts there.
 GRAZING = 0.3

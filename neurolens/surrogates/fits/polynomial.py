@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.optics.paraxial import first_order
-from neurolens.optics.prescription import Lens
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
 from neurolens.surrogates.bases import (
     Exponents,
     invariant_exponents,

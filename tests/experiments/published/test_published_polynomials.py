@@ -24,18 +24,18 @@ from experiments.published.polynomials import Pursuit
 from experiments.published.taylor import expand, truncated
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.evaluate.rays import ray_errors
 from neurolens.graph.interpret import evaluate, monomials
 from neurolens.graph.ir import Graph
-from neurolens.optics.glass import LINE_D_NM
-from neurolens.optics.prescription import Lens, Surface
-from neurolens.optics.trace import Rays, trace
+from neurolens.lens.glass import LINE_D_NM
+from neurolens.lens.prescription import Lens, Surface
+from neurolens.study.rays import ray_errors
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.fits.polynomial import ideal_map
 from neurolens.surrogates.model import Encoding
 from neurolens.surrogates.pairs import trace_pairs
 from neurolens.surrogates.targets import fit_encoding, scales_of
+from neurolens.trace.rays import Rays, trace
 
 FAST = {
     "dense": PublishedSettings("hanika", basis="raw", degree=3),

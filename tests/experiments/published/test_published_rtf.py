@@ -19,7 +19,7 @@ from experiments.published.neural import Averaged, Layers
 from experiments.published.rtf import least_ellipse, meridian_exponents, meridian_variables, turn
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.evaluate.rays import ray_errors
+from neurolens.study.rays import ray_errors
 from neurolens.surrogates.cores import RawPolynomial
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.lightfield import LightField

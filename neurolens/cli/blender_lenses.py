@@ -1,0 +1,277 @@
+"""Lenses for Blender's extension, of models and lens files: their shaders, facts and thumbnails."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from neurolens.base.bounds import RANGE
+from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.files import safe_name
+from neurolens.base.lensname import is_model, lens_id_of
+from neurolens.base.tasks import Failed, Here, Processes, run_each
+from neurolens.blender.pack import Form, PackedLens
+from neurolens.cli.blender_kept import kept, kept_form
+from neurolens.shaders.blender_shader import shader_of
+
+if TYPE_CHECKING:
+    from neurolens.lens.prescription import Lens
+
+_SIDE_IN, _DOTS, _MARGIN = 2.56, 100, 1.08  # of a thumbnail: 256 pixels; its side over the glass's
+_NETWORK = "mlp"
+_RADII, _NEAR = (0.0, 0.35, 0.6, 0.8, 0.97), 20.0  # of the picture's radius; focal lengths
+Forms = dict[Path, Form]
+
+
+def form_of(file: Path, *, zoom: str | None = None, quiet: bool = False) -> Form:
+    """The shader of a model (.onnx) or of a lens file, with its facts; kept between runs. See `shader_of`.
+
+    Raises:
+        InputError: a lens that cannot be a shader. ModelError: a broken model.
+    """
+    return kept_form(file, zoom, make=lambda: _made_form(file, zoom, quiet))
+
+
+def _made_form(file: Path, zoom: str | None, quiet: bool) -> Form:
+    shader = shader_of(file, zoom=zoom, quiet=quiet)
+    kind, model, error, poor = "exact", "", None, []
+    if is_model(file):
+        card = _card(file)
+        model, error = str(card["fit"]["method"]), float(card["errors"]["rms_um"])
+        kind = "network" if _family(card).startswith(_NETWORK) else "polynomial"
+        poor = list(card["errors"].get("poor") or ())
+    state = None if zoom == RANGE else zoom
+    notes = [*shader.notes] if state is None else [*shader.notes, f"The zoom stands at {state}"]
+    if (squeeze := _squeeze(file, state)) != 1.0:
+        axis, aspect = ("Y", squeeze) if squeeze > 1 else ("X", 1 / squeeze)
+        side = "across" if squeeze > 1 else "in height"
+        notes.append(f"The picture is squeezed {aspect:.3g} times {side}: an Aspect {axis} of {aspect:.3g} undoes it")
+    return Form(
+        kind, model, shader.text, error, shader.film_radius_mm, shader.f_number, shader.nearest_m, poor, notes
+    )  # fmt: skip
+
+
+def _squeeze(file: Path, zoom: str | None) -> float:
+    """See `cameras.lens_state`."""
+    from neurolens.setting.states import set_lens
+
+    if not is_model(file):
+        from neurolens.lens.paraxial import first_order
+        from neurolens.readers.any_format import read_any
+
+        lens = set_lens(read_any(file), zoom=zoom)
+        across = first_order(lens, meridian="x") if lens.anamorphic else first_order(lens)
+        return abs(float(first_order(lens).efl_mm / across.efl_mm))
+    from neurolens.cameras.build import Shot, make_camera
+
+    return float(make_camera(file, Shot((1.0, 1.0), math.inf, zoom=zoom)).settings["lens_state"]["squeeze"] or 1.0)
+
+
+def forms_of(
+    files: Sequence[Path], jobs: int, report: Callable[[float], object],
+    zooms: Mapping[Path, str | None] = MappingProxyType({}),
+) -> tuple[Forms, dict[Path, str]]:  # fmt: skip
+    """The forms of many files, `jobs` at a time in processes of their own, and why others have none.
+
+    Args:
+        zooms: `zoom` of `form_of`, for files that have one.
+
+    Raises:
+        NeurolensError: a process ended early, as where memory is short.
+    """
+    found: Forms = {}
+    left: dict[Path, str] = {}
+    tasks = [(file, zooms.get(file)) for file in files]
+    with Here() if jobs == 1 else Processes(jobs) as executor:
+        for done, ((file, _), made) in enumerate(run_each(executor, _form_or_why, tasks), start=1):
+            if isinstance(made, Failed):
+                raise NeurolensError(f"{file}: {made.reason} ({jobs} jobs: where memory is short, try --jobs 1)")
+            if isinstance(made, Form):
+                found[file] = made
+            else:
+                left[file] = made
+            report(done / len(files))
+    return found, left
+
+
+def _form_or_why(task: tuple[Path, str | None]) -> Form | str:
+    """The form of a file and a zoom, or why the lens cannot be a shader."""
+    file, zoom = task
+    with ExitStack() as stack:
+        if find_spec("torch") is not None:
+            from neurolens.surrogates.bases import pinned_threads
+
+            stack.enter_context(pinned_threads())
+        try:
+            return form_of(file, zoom=zoom, quiet=True)
+        except NeurolensError as error:
+            return str(error)
+
+
+def packed_of(
+    files: Sequence[Path], forms: Sequence[Form], *, lens: Lens | None = None, zoom: str | None = None
+) -> PackedLens:
+    """A lens of the menu from files of one lens and their forms.
+
+    Args:
+        lens: its prescription, for the thumbnail, where it is at hand.
+    """
+    from neurolens.lens.paraxial import first_order
+    from neurolens.setting.states import set_lens
+
+    first, ranged = files[0], zoom == RANGE
+    if is_model(first):
+        told = _card(first)
+        card, ranged = told["lens"], zoom in (None, RANGE) and "zoom" in _axes(told)
+        name, efl, f_number = card["name"], card["efl_mm"], card["f_number"]
+        source = str(card.get("source") or "") if lens is None else lens.source  # which may be told better since
+        name = f"{name}, any zoom" if ranged else name
+    else:
+        from neurolens.readers.any_format import read_any
+
+        lens = set_lens(read_any(first), zoom=None if zoom == RANGE else zoom)
+        data = first_order(lens)
+        name, efl, f_number, source = lens.name, data.efl_mm, data.f_number, lens.source
+    picture = None if lens is None else thumbnail(lens)
+    table = None
+    if lens is not None and forms and not ranged:
+        radius = min(form.film_radius_mm for form in forms)
+        given = str(first_order(lens).efl_mm), str(radius)
+        table = kept(Path(lens.path), "field", *given, make=lambda: {"table": field_table(lens, radius)})["table"]
+    return PackedLens(key_of(first), str(name), float(efl), float(f_number), source, picture, list(forms), table)
+
+
+def stated_lens(model: Path, lenses: Path) -> Lens | None:
+    """The prescription of a model of one state of a lens file, scaled or zoomed, or of its range; None without it."""
+    from neurolens.lens.paraxial import first_order
+    from neurolens.readers.lensfile import read_lens
+    from neurolens.setting.states import set_lens
+
+    told = _card(model)["lens"]
+    file = lenses / f"{safe_name(told['id'])}.toml"
+    if not file.is_file():
+        return None
+    lens, efl = read_lens(file), float(told["efl_mm"])
+    if math.isclose(first_order(lens).efl_mm, efl, rel_tol=1e-3):
+        return lens
+    return set_lens(lens, zoom=str(efl)) if lens.configurations else set_lens(lens, focal_length_mm=efl)
+
+
+def field_table(lens: Lens, radius_mm: float) -> dict[str, Any] | None:
+    """What a lens does to its picture wide open, as `extension.library.Field`; None where it cannot be traced."""
+    if find_spec("torch") is None:
+        return None
+    from neurolens.cameras.build import Shot, ideal_as
+    from neurolens.cameras.exact import ExactCamera
+    from neurolens.cameras.field import spectrum_of
+    from neurolens.lens.paraxial import first_order
+    from neurolens.plan import footprints as prints
+
+    film, radii = (2 * radius_mm, 2 * radius_mm), radius_mm * np.array(_RADII)
+    points = np.stack([radii, np.zeros_like(radii)])
+    near = round(_NEAR * float(first_order(lens).efl_mm) / 1000, 6)
+    rows: dict[str, list[Any]] = {"distortion_um": [], "blur_um": [], "light": []}
+    with suppress(InputError):
+        for focus in (math.inf, near):
+            camera = ExactCamera(lens, film_mm=film, focus_m=focus)
+            nm, share = spectrum_of(camera)
+            share = share / share.sum()
+            places = prints.places_of(camera, points, np.full(radii.size, focus), nm, share)
+            if places.film_mm.shape[1] < radii.size:
+                return None  # dark at the edge
+            thin = ideal_as("thin:", camera.lens, Shot(film, focus))
+            seen, ideal = (prints.footprints(c, places) for c in (camera, thin))
+            rows["distortion_um"].append(1e3 * prints.effects_mm(seen, ideal, share)["distortion"])
+            rows["blur_um"].append(1e3 * math.sqrt(2) * prints.blur_mm(seen, share))
+            rows["light"].append(seen.light / seen.light[0])
+        table = {name: [[float(f"{v:.4g}") for v in row] for row in both] for name, both in rows.items()}
+        return {"radius_mm": [round(float(r), 4) for r in radii], "near_m": near, **table}
+    return None
+
+
+def key_of(file: Path) -> str:
+    """Name of a lens in the menu's files: of `NAME.ols-64.onnx` and of a lens file NAME.toml, NAME."""
+    return file.name.split(".")[0] if is_model(file) else lens_id_of(file)
+
+
+def library(folder: Path, lenses: Path, chosen: Sequence[str]) -> Iterator[tuple[list[Path], Path | None]]:
+    """Of every lens, the best polynomial and the best network among its models, and its lens file, if it has one.
+
+    A lens file of which there is no model is a lens as well.
+
+    Args:
+        folder: of models. lenses: of lens files. chosen: names of lenses, all where empty.
+
+    Raises:
+        InputError: a name that no model and no lens file has.
+    """
+    known: dict[str, dict[str, tuple[float, Path]]] = {}
+    modelled = set()
+    for file in sorted(folder.glob("*.onnx")):
+        card = _card(file)
+        modelled.add(card["lens"]["id"])
+        kind = "network" if _family(card).startswith(_NETWORK) else "polynomial"
+        mine = known.setdefault(key_of(file), {})
+        error = float(card["errors"]["rms_um"])
+        if kind not in mine or error < mine[kind][0]:
+            mine[kind] = error, file
+    if known:  # a folder without a model is not the folder that was meant
+        known |= {file.stem: {} for file in sorted(lenses.glob("*.toml")) if file.stem not in {*known, *modelled}}
+    for name in chosen:
+        if name not in known:
+            raise InputError("neurolens blender build", "--lens", name, f"one of: {', '.join(known)}")
+    for key, kinds in known.items():
+        if not chosen or key in chosen:
+            lens_file = lenses / f"{key}.toml"
+            files = [kinds[kind][1] for kind in ("polynomial", "network") if kind in kinds]
+            yield files, lens_file if lens_file.is_file() else None
+
+
+def thumbnail(lens: Lens) -> bytes | None:
+    """The section of a lens as a PNG of 256 by 256 pixels; None where torch or matplotlib is missing."""
+    from neurolens.setting.states import set_lens
+
+    if find_spec("torch") is None or find_spec("matplotlib") is None:
+        return None
+    from neurolens.analysis.fields import Scene
+    from neurolens.analysis.layout import draw_section, layout_profile
+    from neurolens.analysis.plot_style import new_figure, style
+
+    with style():
+        figure = new_figure(_SIDE_IN, _SIDE_IN)
+        figure.set_layout_engine("none")
+        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+        layout = layout_profile(Scene(set_lens(lens), axis="y"))
+        layout = replace(layout, rays=tuple(ray for ray in layout.rays if ray.field != 1))  # of the axis and the edge
+        draw_section(axes, layout, lw=0.5)
+        arcs = np.concatenate([s.arc() for s in layout.surfaces])  # the glass fills the picture: menus show it small
+        z, height = (arcs.min(0) + arcs.max(0)) / 2, np.ptp(arcs, 0)
+        half = _MARGIN * max(height) / 2
+        axes.set(xlim=(z[0] - half, z[0] + half), ylim=(-half, half))
+        axes.set_axis_off()
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=_DOTS, facecolor="white", metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def _card(file: Path) -> dict[str, Any]:
+    from neurolens.surrogates.metadata import read_card
+
+    return read_card(file)
+
+
+def _axes(card: dict[str, Any]) -> list[str]:
+    return [axis["name"] for axis in (card.get("states") or {}).get("axes", ())]
+
+
+def _family(card: dict[str, Any]) -> str:
+    return str(card["fit"]["settings"].get("method", card["fit"]["method"]))

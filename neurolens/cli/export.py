@@ -1,0 +1,346 @@
+"""`neurolens export`: source code of a model, a lens or a whole camera, or a model for what a scene fixes."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neurolens import __version__
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_path, atomic_write_text, check_writable
+from neurolens.base.lensname import FUSED, is_model
+from neurolens.cli.arguments import add_json, add_lens, add_option, add_output, positive
+from neurolens.cli.output import answer
+from neurolens.cli.render import film_size
+
+if TYPE_CHECKING:
+    from neurolens.surrogates.model import LensModel
+    from neurolens.surrogates.pairs import RayPairs
+    from neurolens.surrogates.source import Written
+    from neurolens.surrogates.specialise import Fix
+
+_DESCRIPTION = """\
+Write an exported model in another form: a self-contained C99 header (one function for a ray, one for
+arrays that compilers vectorise), a GLSL function, or an ONNX file. Domain guard, stop, rims,
+transmittance and status codes are those of the model; the card is a comment at the top. Constants
+(planes, ranges) and the film's position for a focus stand beside it. Of a model of a zoom's whole range
+(or of internal focus) the state is an argument. A lens file gives the exact lens.
+OSL is a camera of Blender's Cycles (4.5 and later): stop, focus, blades and more are its inputs, and the
+zoom of a model of its range, or of a lens file with --zoom range. Lens files focus as they say groups move.
+With --whole-camera, the whole camera for one focus and stop: film point and two random numbers in, weighted
+ray out, its pupil's outline as a table in the file (of GLSL, the data of a texture beside it).
+Needs the extra "train" (torch); without it C and GLSL are written from the graph in the file,
+whole and with nothing fixed."""
+_EPILOG = """\
+values fixed by a scene are folded into fewer operations (--fix, repeatable):
+  wavelengths=450,550,650   one coefficient table per wavelength, chosen by the argument band (a single one:
+                            no argument; an ONNX file takes one)
+  film_z=59.2 | focus=2.0   film plane z in mm, or the object distance from the film in m that it focuses
+  stop=4.5 | f_number=5.6   stop radius in mm, or the f-number it gives
+
+examples:
+  neurolens export models/laikin_double_gauss_50.ols-60.onnx --to c -o gauss.h
+  neurolens export models/NAME.onnx --to glsl -o lens.glsl --fix wavelengths=450,550,650 --fix focus=2
+  neurolens export runs/quickstart --to c -o ray.h --only ray
+  neurolens export lenses/ZOOM.toml --to c -o zoom.h --zoom range         # gaps as the focal length asks
+  neurolens export models/ZOOM-range.states-64.onnx --to c -o zoom.h      # any focal length: NAME_at(zoom_mm)
+  neurolens export lenses/NAME.toml --to c -o exact.h                     # every surface
+  neurolens export models/NAME.onnx --to c -o cam.h --whole-camera --focus 2 --f-number 2.8 --derivatives
+  neurolens export models/NAME.onnx --to osl -o lens.osl                  # for Blender; lenses/NAME.toml: exact
+  neurolens export models/NAME.onnx --to onnx -o laser.onnx --fix wavelengths=633
+  neurolens export models/NAME.onnx --to onnx -o lens.onnx --derivatives  # for ray differentials elsewhere
+  neurolens export models/NAME.onnx --to onnx -o a.onnx --inverse         # and a.stop.onnx, a.scene.onnx"""
+_PARTS = ("ray", "transmittance", "stop", "vignetting")
+_FIXED = ("wavelengths", "film_z", "focus", "stop", "f_number")
+# Rays for the errors of an ONNX file with fixed inputs; rays to fit inverse maps.
+_HELD_OUT, _VIGNETTING, _TRAIN = 20_000, 100_000, 15_000
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command to the command line."""
+    parser = subparsers.add_parser(
+        "export", help="source code (C, GLSL, OSL) of a model; fix what a scene fixes", description=_DESCRIPTION,
+        epilog=_EPILOG,
+    )  # fmt: skip
+    add_lens(
+        parser, "model", "; a run folder with one model, a file of neurolens plan; of --to onnx models alone",
+        models=True, cameras=True, metavar="MODEL",
+    )  # fmt: skip
+    parser.add_argument("--to", choices=("c", "glsl", "osl", "onnx"), required=True, help="form to write")
+    add_output(parser, "FILE", "file to write", required=True)
+    parser.add_argument(
+        "--fix", metavar="KEY=VALUE", action="append", default=[], help="a value fixed by the scene (see below)"
+    )
+    parser.add_argument(
+        "--only", metavar="PARTS", default=",".join(_PARTS),
+        help=f"comma-separated: {', '.join(_PARTS)} (default: all; the domain guard is always there)",
+    )  # fmt: skip
+    parser.add_argument("--name", metavar="NAME", help="of the function (default: the lens's id)")
+    parser.add_argument(
+        "--derivatives", action="store_true",
+        help="of ONNX and with --whole-camera: additional outputs for ray differentials",
+    )  # fmt: skip
+    parser.add_argument(
+        "--inverse", action="store_true",
+        help="of ONNX: the inverse maps too (film and stop point to ray; scene ray to film), fitted and checked",
+    )  # fmt: skip
+    group = parser.add_argument_group("camera", "what a whole camera is set to")
+    about = "the whole camera, of C and GLSL"
+    add_option(group, "--whole-camera", old=("--camera",), action="store_true", help=about)
+    group.add_argument(
+        "--film", metavar="WxH", type=film_size, default=(36.0, 24.0), help="film in mm (default: 36x24)"
+    )
+    group.add_argument(
+        "--focus", metavar="M", type=positive("a distance in metres", infinite=True), default=math.inf,
+        help="distance from the film to the object in focus in metres (default: inf)",
+    )  # fmt: skip
+    group.add_argument("--f-number", metavar="N", type=positive("an f-number"), help="default: the widest")
+    group.add_argument(
+        "--zoom",
+        metavar="STATE",
+        help="state of a zoom by name or focal length; of a lens file also range: an argument, of OSL an input",
+    )
+    add_json(parser)
+    parser.set_defaults(run=run, kept="nothing is written")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Load, fix, write."""
+    from neurolens.shaders.source import model_extras
+    from neurolens.surrogates.source import checked_name
+
+    file = model_file(Path(args.model.removeprefix(FUSED)))
+    parts = _parts(args.only)
+    given = _given(args.fix)
+    if args.to == "onnx" and (args.name is not None or set(parts) != set(_PARTS)):
+        raise InputError("neurolens export", "--only, --name", "(with --to onnx)", "neither: an ONNX file is whole")
+    if args.to != "onnx" and ((args.derivatives and not args.whole_camera) or args.inverse):
+        raise InputError("neurolens export", "--derivatives, --inverse", f"(with --to {args.to})", "--to onnx")
+    if args.name is not None:
+        checked_name(args.to, "", args.name)
+    if args.to == "osl":
+        return _write_osl(file, args, bool(given) or set(parts) != set(_PARTS))
+    exact = not is_model(file)
+    if args.whole_camera or exact:
+        if args.to == "onnx" or given or set(parts) != set(_PARTS):
+            what = "a camera" if args.whole_camera else "a lens file"
+            raise InputError("neurolens export", str(file), f"({what})", "--to c or glsl, without --fix and --only")
+        check_writable(args.out)
+        if args.whole_camera:
+            return _answer(args, _about(_write_camera(file, args)))
+        from neurolens.cli.export_lens import write_lens
+
+        written = write_lens(file, args.out, args.to, name=args.name, zoom=args.zoom, quiet=args.json)
+        return _answer(args, _about(written))
+    check_writable(args.out)
+    from neurolens.cameras.onnxlens import load_model
+    from neurolens.surrogates.source import Parts, export_source
+    from neurolens.surrogates.specialise import Fix, fixed_models
+
+    loaded = load_model(file)
+    card, whole = loaded.card, set(parts) == set(_PARTS) and not given
+    if loaded.axes and (args.to == "onnx" or not whole):
+        raise InputError(
+            "neurolens export", str(file), "(a model of many states)", "--to c or glsl without --fix, --only"
+        )
+    fix, models = _fix(given, loaded.fitted) if given else Fix(), loaded.file.nodes
+    if given:
+        models = fixed_models(loaded.fitted, fix)
+    if args.to == "onnx":
+        _write_onnx(models, args.out, card if not given else None, args.derivatives)
+        about: dict[str, Any] = _write_inverse(models[0], args.out) if args.inverse else {}
+    else:
+        asked = Parts(*(name in parts for name in _PARTS[1:]))
+        stop = fix.stop_radius_mm if asked.vignetting else models[0].domain.stop_radius_mm
+        extras, notes = model_extras(loaded, film=fix.film_z_mm is None, stop_mm=stop)
+        written = export_source(
+            models, args.out, args.to, card, parts=asked, fix=fix, name=args.name, extras=extras, notes=notes
+        )
+        about = _about(written, [m.domain.wavelength_nm[0] for m in models])
+    return _answer(args, about)
+
+
+def _write_osl(file: Path, args: argparse.Namespace, partly: bool) -> int:
+    """A camera for Cycles."""
+    from neurolens.shaders.blender_shader import shader_of
+
+    if partly or args.whole_camera or args.f_number is not None or args.focus != math.inf:
+        expected = "none of them: stop and focus are inputs of the shader, which is a whole camera"
+        raise InputError(
+            "neurolens export", "--fix, --only, --whole-camera, --focus, --f-number", "(with --to osl)", expected
+        )
+    check_writable(args.out)
+    shader = shader_of(file, zoom=args.zoom, name=args.name, quiet=args.json)
+    atomic_write_text(args.out, shader.text)
+    about = {
+        "function": shader.name, "inputs": shader.parameters, "operations_per_ray": shader.operations,
+        "passing": shader.passing,
+    }  # fmt: skip
+    return _answer(args, about)
+
+
+def _write_camera(file: Path, args: argparse.Namespace) -> Written:
+    """A whole camera, of a model or a lens file."""
+    from neurolens.base.progress import Progress
+    from neurolens.cameras.build import Shot, make_camera
+    from neurolens.graph.c import Extras
+    from neurolens.shaders.source import CAMERA_FRAME, camera_program
+    from neurolens.surrogates.source import checked_name, lines_of, write_program
+
+    shot = Shot(args.film, args.focus, args.f_number, zoom=args.zoom)
+    camera: Any = make_camera(file, shot, Progress(quiet=args.json))
+    facts = camera.settings
+    lens = facts["lens"] if "lens" in facts else facts["card"]["lens"]
+    name = checked_name(args.to, f"{lens['id']}_camera", args.name)
+    graph = camera.lens_graph()
+    # Compilers of GLSL take minutes for an array of 43,000 constants: there the table is a texture of the caller.
+    program = camera_program(camera.film, graph, args.derivatives, own_table=args.to == "c")
+    numbers = {key: facts[key] for key in ("efl_mm", "f_number", "film_z_mm", "stop_radius_mm")}
+    constants = {"film_width_mm": args.film[0], "film_height_mm": args.film[1], **numbers}
+    constants |= {"pupil_z_mm": camera.film.outline.pupil_z_mm, "exposure": camera.film.exposure}
+    told = ", ".join(f"{key} {value:.6g}" for key, value in constants.items())
+    comment = [
+        f"{lens['name']}: a whole camera, written by neurolens {__version__} from {file.name}.",
+        f"Lens data: sha256 {str(lens.get('sha256'))[:16]}. Focus {args.focus:g} m; {told}.",
+        CAMERA_FRAME,
+    ]
+    if args.to == "glsl":
+        table, beside = camera.film.outline.table, args.out.with_name(f"{args.out.name}.outline.f32")
+        with atomic_path(beside) as temporary:
+            temporary.write_bytes(table.astype("<f4").tobytes())
+        size = f"{table.shape[1]} wide, {len(table)} high"
+        comment.append(f"outline: texture of one float a texel, {size}: {beside.name}, little-endian, line by line.")
+    return write_program(program, args.out, args.to, name, lines_of(comment), Extras(constants))
+
+
+def _about(written: Written, bands_nm: Sequence[float] = ()) -> dict[str, Any]:
+    """What --json tells of source code."""
+    s = written.signature
+    return {
+        "function": s.name,
+        "inputs": s.inputs,
+        "state": s.state,
+        "outputs": [*s.outputs, "status"],
+        "bands_nm": bands_nm if s.bands > 1 else [],
+        "operations_per_ray": written.operations,
+    }
+
+
+def _answer(args: argparse.Namespace, about: dict[str, Any]) -> int:
+    data = {"file": str(args.out), "to": args.to, "bytes": args.out.stat().st_size, **about}
+    maps = about.get("inverse", {}).values()
+    said = [f"{m['file']}: finds {m['converged']:.3%} of the model's rays in three steps" for m in maps]
+    return answer(args, data, lambda: "\n".join([str(args.out), *said]))
+
+
+def model_file(path: Path) -> Path:
+    """The model that a path names: a file, or the one model of a run folder.
+
+    Raises:
+        InputError: a folder that holds none, or several.
+    """
+    if not path.is_dir():
+        return path
+    files = sorted(p for folder in (path, path / "models") for p in folder.glob("*.onnx"))
+    # Inverse maps and unfinished files of an interrupted run lie beside models.
+    found = [p for p in files if not p.name.startswith(".") and not p.name.endswith((".stop.onnx", ".scene.onnx"))]
+    if len(found) != 1:
+        names = ", ".join(str(p) for p in found) or "(none)"
+        raise InputError("neurolens export", str(path), f"({names})", "one exported model: name its file")
+    return found[0]
+
+
+def _parts(text: str) -> list[str]:
+    parts = [word.strip() for word in text.split(",")]
+    unknown = [p for p in parts if p not in _PARTS]
+    if unknown or "ray" not in parts:
+        raise InputError("neurolens export", "--only", text, f"ray, and of {', '.join(_PARTS[1:])} what is wanted")
+    return parts
+
+
+def _given(texts: list[str]) -> dict[str, list[float]]:
+    found: dict[str, list[float]] = {}
+    for text in texts:
+        key, _, value = text.partition("=")
+        try:
+            numbers = [float(v) for v in value.split(",")]
+        except ValueError:
+            numbers = []
+        infinite = key == "focus"
+        good = bool(numbers) and all(v > 0 and (infinite or math.isfinite(v)) for v in numbers)
+        if key not in _FIXED or key in found or not good or (key != "wavelengths" and len(numbers) > 1):
+            expected = f"KEY=NUMBER with KEY of {', '.join(_FIXED)} (wavelengths: a list), each once, above 0"
+            raise InputError("neurolens export", "--fix", text, expected)
+        found[key] = numbers
+    for pair in (("film_z", "focus"), ("stop", "f_number")):
+        if all(key in found for key in pair):
+            raise InputError("neurolens export", "--fix", f"(both {' and '.join(pair)})", "one of them")
+    return found
+
+
+def _fix(given: dict[str, list[float]], model: LensModel) -> Fix:
+    from neurolens.lens.paraxial import film_z_mm
+    from neurolens.setting.focusing import best_focus_z_mm
+    from neurolens.setting.states import set_lens
+    from neurolens.surrogates.specialise import Fix
+
+    film_z = given.get("film_z", [None])[0]
+    stop = given.get("stop", [None])[0]
+    if "f_number" in given:
+        stop = set_lens(model.lens, f_number=given["f_number"][0]).stop_radius_mm
+    if "focus" in given:
+        focus_m, lens = given["focus"][0], model.lens if stop is None else model.lens.with_stop_radius(stop)
+        Fix(film_z_mm=film_z_mm(lens, focus_m)).check(model.domain)
+        near, far = model.domain.film_z_mm
+        film_z = min(max(best_focus_z_mm(lens, focus_m), near), far)
+    return Fix(tuple(given.get("wavelengths", ())), film_z, stop)
+
+
+def _write_onnx(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] | None, derivatives: bool) -> None:
+    """The graph with its card: the errors of the card given, or measured anew for what was fixed."""
+    from neurolens.cameras.model import load_model
+    from neurolens.study.measure import fresh_rays, measure_on
+    from neurolens.surrogates.export import export_onnx
+
+    if len(models) > 1:
+        wavelengths = [m.domain.wavelength_nm[0] for m in models]
+        raise InputError("neurolens export", "--fix wavelengths", wavelengths, "one wavelength for an ONNX file")
+    model = models[0]
+    if card is not None:
+        export_onnx(model, out, card["errors"], derivatives=derivatives)
+        return
+    seed, held_out = _seed(model), _pairs(model, train=1).held_out
+    with atomic_path(out) as measured:  # a file without its errors never has the final name
+        export_onnx(model, measured, {})
+        rays = fresh_rays(model.lens, model.domain, held_out, count=_VIGNETTING, seed=seed + 1)
+        errors = measure_on(rays, load_model(measured))
+        export_onnx(model, measured, errors, derivatives=derivatives)
+
+
+def _write_inverse(model: LensModel, out: Path) -> dict[str, Any]:
+    """Both inverse maps beside the model's file: their files, and the share of fresh rays that each finds."""
+    from neurolens.cameras.model import load_model
+    from neurolens.surrogates.export import export_inverse
+    from neurolens.surrogates.inverse_fit import convergence, fit_inverse
+
+    pairs = _pairs(model, train=_TRAIN)
+    inverse = fit_inverse(model, pairs)
+    found = convergence(inverse, pairs.held_out.inputs)
+    files = export_inverse(inverse, out, load_model(out).card["errors"])
+    return {"inverse": {n: {"file": str(f), **found[n]} for n, f in zip(("stop", "scene"), files, strict=True)}}
+
+
+def _seed(model: LensModel) -> int:
+    from neurolens.study.measure import FRESH
+
+    return int(model.settings.get("rays_seed") or 0) + FRESH
+
+
+def _pairs(model: LensModel, train: int) -> RayPairs:
+    from neurolens.surrogates.pairs import PairSettings, make_pairs
+
+    settings = PairSettings(train=train, held_out=_HELD_OUT, rim=train, seed=_seed(model))
+    return make_pairs(model.lens, model.domain, settings)

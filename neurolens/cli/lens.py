@@ -1,0 +1,385 @@
+"""`neurolens lens FILE`: what a lens file holds, computed and drawn; many files as a table; rims by a rule."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+import warnings
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neurolens.base.errors import InputError, NeurolensWarning, one_line
+from neurolens.base.files import library
+from neurolens.base.lensname import resolve
+from neurolens.cli.arguments import (
+    add_json,
+    add_lens_state,
+    add_option,
+    add_output,
+    between,
+    check_folder,
+    check_suffix,
+    focus_of,
+    given_options,
+    state_of,
+)
+from neurolens.cli.output import answer, number, table
+
+if TYPE_CHECKING:
+    from neurolens.lens.prescription import Lens
+    from neurolens.setting.rims import Rim, RimRule
+
+
+_DESCRIPTION = """\
+Read a lens file strictly and print what follows from it: focal length, pupils, film plane,
+image circle, how much of the light gets through and what stops the rest, and anything
+doubtful about it. Several files, or folders (of all formats that "neurolens convert" reads), are
+a table with one line for each lens, in milliseconds a lens; after the word "list" each of them is
+checked, too. --derive-rims computes the rim diameters that a patent does not print.
+
+Lengths are in mm along the axis, z = 0 at the front vertex, light travelling to +z; angles
+are from the axis in degrees; first-order data is for the d line (587.56 nm). Needs the extra
+"train" (torch)."""
+_EPILOG = """\
+examples:
+  neurolens lens laikin_double_gauss_50
+  neurolens lens lenses/brendel_tessar_100.toml --efl 50 --focus 1.5 --layout tessar.png
+  neurolens lens lenses/ogawa_zoom_70_200.toml --zoom 135mm --json
+  neurolens lens downloads/ --json
+  neurolens lens list --layouts lenses.png
+  neurolens lens lenses/brendel_tessar_100.toml --derive-rims -o tessar.toml"""
+_LAYOUT_SUFFIXES = (".png", ".pdf", ".svg")
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command to the command line."""
+    parser = subparsers.add_parser(
+        "lens", help="first-order data, field and layout of a lens file", description=_DESCRIPTION, epilog=_EPILOG
+    )
+    parser.add_argument(
+        "files", metavar="FILE", type=Path, nargs="+",
+        help='lens files, names of lenses/, or folders; after the word "list" they are checked (default: those that '
+        "ship)",
+    )  # fmt: skip
+    parser.intermixed = True
+    add_lens_state(parser, efl="as tabled", f_number="the tabled stop")
+    parser.add_argument(
+        "--layout", metavar="OUT.png", type=Path,
+        help="draw the lens with rays from three field points: axis, 70% and edge of the film (.png, .pdf, .svg)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--layouts", metavar="OUT.png", type=Path, help="of several files: draw all lenses in section on one sheet"
+    )
+    _add_rims(parser)
+    parser.add_argument(
+        "--breathing", metavar="OUT.png", type=Path,
+        help="draw field of view, focal length and magnification against the focus distance (.png, .pdf, .svg)",
+    )  # fmt: skip
+    add_json(parser)
+    parser.set_defaults(run=run, kept="only a finished --layout picture is written")
+
+
+def _check_mode(args: argparse.Namespace, several: bool) -> None:
+    alone = not several and not args.derive_rims
+    kinds = {
+        "--layouts": (args.layouts is not None, several, 'with "list", a folder or several files'),
+        "--edge-pupil": (args.edge_pupil is not None, args.derive_rims, "with --derive-rims"),
+        "--breathing": (args.breathing is not None, alone, "with one lens file alone"),
+        "--output": (args.out is not None, args.derive_rims, "with --derive-rims"),
+        "--half-field": (args.half_field is not None, args.derive_rims, "with --derive-rims"),
+        "--derive-rims": (args.derive_rims, not several, "with one lens file"),
+        "--layout": (args.layout is not None, alone, "with one lens file alone"),
+        **dict.fromkeys(given_options(args), (True, alone, "with one lens file alone")),
+    }
+    for option, (given, allowed, where) in kinds.items():
+        if given and not allowed:
+            raise InputError("neurolens lens", option, "(given)", f"this option only {where}")
+
+
+def _file(name: Path) -> Path:
+    """The lens file that an argument names."""
+    file = resolve(name, models=False, cameras=False).file
+    assert file is not None  # only cameras without a lens have none
+    return file
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print and draw the data of a lens, or the table of several, or derived rims."""
+    checked = str(args.files[0]) == "list"
+    several = checked or len(args.files) > 1 or args.files[0].is_dir()
+    _check_mode(args, several)
+    if several:
+        return _run_list(args, args.files[1:] or [library() / "lenses"] if checked else args.files, checked)
+    args.file = _file(args.files[0])
+    if args.derive_rims:
+        return _run_rims(args)
+    for option, path in (("--layout", args.layout), ("--breathing", args.breathing)):
+        if path is not None:
+            check_suffix(path, option, _LAYOUT_SUFFIXES)
+            check_folder(path, option)
+    from neurolens.readers.any_format import read_any
+    from neurolens.study.describe import file_doubts, glass_table, layout_profile, lens_facts
+    from neurolens.surrogates.domain import domain_of
+
+    began = time.perf_counter()
+    with warnings.catch_warnings(record=True) as caught:  # part of the answer
+        warnings.simplefilter("always", NeurolensWarning)
+        tabled = read_any(args.file)
+    lens = state_of(args, tabled)
+    focus, film_z = focus_of(args, tabled, lens), float(lens.film_z_mm or 0.0)
+    domain = domain_of(lens, focus_m=(focus, focus), film_z_mm=(film_z, film_z))
+    configurations = [
+        {"name": c.name, "efl_mm": c.efl_mm, "object_distance_mm": c.object_distance_mm} for c in tabled.configurations
+    ]
+    facts = lens_facts(lens, domain)
+    facts["warnings"] += [str(w.message).removeprefix(f"{tabled.path}: ") for w in caught] + file_doubts(tabled)
+    data = {
+        "file": str(args.file),
+        **facts,
+        "zoom": args.zoom,
+        "focusing": args.focusing,
+        "derived": lens.derived,
+        "aperture": lens.aperture and lens.aperture.settings(),
+        "configurations": configurations,
+        "surfaces": glass_table(lens),
+        "layout": None if args.layout is None else str(args.layout),
+        "breathing_plot": None if args.breathing is None else str(args.breathing),
+    }
+    if args.layout is not None:
+        from neurolens.analysis.layout import lens_layout
+
+        lens_layout(layout_profile(lens, domain), args.layout)
+    if args.breathing is not None:
+        from neurolens.study.figures import draw_breathing
+
+        found = draw_breathing(lens, args.breathing)
+        data["breathing"] = {name: [asdict(b) for b in breaths] for name, breaths in found.items()}
+    data["seconds"] = time.perf_counter() - began
+    return answer(args, data, lambda: _lens_text(data))
+
+
+def _lens_text(data: dict[str, Any]) -> str:
+    """What is printed as JSON, as a page of text."""
+    by = f", {data['designer']}" if data["designer"] else ""
+    parts = [f"{data['name']}{by}\n{data['source']}", _first_order(data), _light(data), _surfaces(data["surfaces"])]
+    if data["configurations"]:
+        zoom = [f"{c['name']} ({number(c['efl_mm'])} mm)" for c in data["configurations"] if not _near(c)]
+        near = [f"{c['name']} ({number(c['object_distance_mm'])} mm)" for c in data["configurations"] if _near(c)]
+        parts += [f"Zoom states (--zoom, also mm between them): {', '.join(zoom)}"] if zoom else []
+        parts += [f"Focus states (--zoom, or --focusing internal): {', '.join(near)} to the object"] if near else []
+    if data["derived"]:
+        parts.append(f"Derived: {data['derived']}")
+    parts += [f"Warning: {text}" for text in data["warnings"]]
+    if data["layout"]:
+        parts.append(f"Layout drawn in {data['layout']}")
+    if data["breathing_plot"]:
+        parts.append(f"Focus breathing drawn in {data['breathing_plot']}")
+    return "\n\n".join(parts)
+
+
+def _near(configuration: dict[str, Any]) -> bool:
+    return configuration["object_distance_mm"] is not None
+
+
+def _first_order(data: dict[str, Any]) -> str:
+    from neurolens.lens.film_plane import LINE_D_NM
+
+    focus = "infinity" if math.isinf(data["focus_m"]) else f"{data['focus_m']:g} m"
+    across = data["efl_x_mm"] is not None
+    planes = f"{_mm(data['front_principal_z_mm'])}, {_mm(data['rear_principal_z_mm'])}"
+    rows = [
+        ("focal length", _mm(data["efl_mm"]), "in the y-z plane, as all that follows" if across else ""),
+        *((("", _mm(data["efl_x_mm"]), "in the x-z plane"),) if across else ()),
+        ("back focus", _mm(data["back_focus_mm"]), "last vertex to rear focal point"),
+        ("f-number", f"f/{number(data['f_number'])}", "focal length over entrance pupil"),
+        ("working f-number", f"f/{number(data['working_f_number'])}", "of the real marginal ray at this focus"),
+        ("principal planes", planes, "front H, rear H'"),
+        ("entrance pupil", _mm(data["entrance_pupil_z_mm"]), f"diameter {_mm(data['entrance_pupil_diameter_mm'])}"),
+        ("exit pupil", _mm(data["exit_pupil_z_mm"]), f"diameter {_mm(data['exit_pupil_diameter_mm'])}"),
+        ("film plane", _mm(data["film_z_mm"]), f"focus at {focus}"),
+        ("stop", f"surface {data['stop_surface']}", f"diameter {_mm(data['stop_diameter_mm'])}"),
+        ("refractions", str(data["refractions"]), ""),
+    ]
+    medium = data["object_medium"]
+    if medium["n_d"] != 1:
+        rows.append(("medium in front", f"n_d {medium['n_d']:.5f}", medium["material"] or medium["glass"] or ""))
+    if data["front_efl_mm"] != data["efl_mm"]:
+        rows.append(("front focal", _mm(data["front_efl_mm"]), "focal length of the object side, in its medium"))
+    if data["wavelength_nm"] != LINE_D_NM:
+        note = "of all this: the file's primary one, as its light does not hold the d line"
+        rows.append(("wavelength", f"{data['wavelength_nm']:g} nm", note))
+    return _columns(rows)
+
+
+def _mm(value: float | None) -> str:
+    return f"{number(value, 6)} mm"
+
+
+def _light(data: dict[str, Any]) -> str:
+    stated, anamorphic = data["half_field_deg"], data["efl_x_mm"] is not None
+    along, states = " along y" if anamorphic else "", "" if stated is None else f"; the file states {stated:g}"
+    share_of = "of rays uniform over the film and over the disc of all passing rays, 5% wider"
+    reached = f"reached at the edge of the film{along}{states}"
+    rows = [
+        ("image radius", f"{number(data['image_radius_mm'])} mm", f"from {data['image_radius_from']}"),
+        ("half field", _degrees(data["half_field_reached_deg"]), reached),
+        *((("", _degrees(data["half_field_reached_x_deg"]), "along x"),) if anamorphic else ()),
+        ("rays that pass", f"{100 * data['passing_share']:.1f}%", share_of),
+        *(("", f"{100 * e['share']:.1f}%", e["text"]) for e in data["ended"]),
+    ]
+    return _columns(rows)
+
+
+def _degrees(angle: float | None) -> str:
+    return "-" if angle is None else f"{angle:.2f} degrees"
+
+
+def _columns(rows: list[tuple[str, str, str]]) -> str:
+    wide = max(len(value) for _, value, _ in rows)
+    return "\n".join(f"{name:18}{value:{wide}}  {note}".rstrip() for name, value, note in rows)
+
+
+def _surfaces(surfaces: list[dict[str, Any]]) -> str:
+    header = ["surface", "radius mm", "thickness mm", "diameter mm", "n_d", "V_d", "", ""]
+    rows = []
+    for s in surfaces:
+        radius = "plane" if math.isinf(s["radius_mm"]) else f"{s['radius_mm']:.4f}"
+        glass = ("", "") if s["n_d"] == 1 else (f"{s['n_d']:.4f}", "-" if s["V_d"] is None else f"{s['V_d']:.2f}")
+        name = "stop" if s["stop"] else s["glass"] or s["material"] or ""
+        size = f"{s['thickness_mm']:.4f}", f"{s['diameter_mm']:.4f}"
+        rows.append([str(s["surface"]), radius, *size, *glass, name, _surface_words(s)])
+    if not any(row[-1] for row in rows):
+        header, rows = header[:-1], [row[:-1] for row in rows]
+    return table(header, rows)
+
+
+def _surface_words(row: dict[str, Any]) -> str:
+    """Properties of a row of `study.describe.glass_table` besides radius and glass; empty for a sphere."""
+    powers = sorted(map(int, row["asphere"]))
+    span = "" if not powers else f"asphere {powers[0]}" + (f"-{powers[-1]}" if len(powers) > 1 else "")
+    words = [
+        span,
+        f"K {row['conic']:.4g}" if row["conic"] else "",
+        f"cylinder {row['cylinder']}" if row["cylinder"] and not row["across"] else "",
+        _across_words(row["cylinder"], *row["across"]) if row["across"] else "",
+        f"ideal lens, f {row['focal_mm']:.4g} mm" if row["focal_mm"] else "",
+        f"coating {row['coating']['name']}" if row["coating"] else "",
+        f"absorbs {row['absorption_per_mm']:.3g}/mm" if row["absorption_per_mm"] else "",
+    ]
+    return ", ".join(word for word in words if word)
+
+
+def _across_words(axis: str, radius_mm: float, conic: float | None) -> str:
+    other = "x" if axis == "y" else "y"
+    return f"{'toroid' if conic is None else f'biconic K {conic:.4g}'}, {radius_mm:.4f} mm along {other}"
+
+
+_LIST_HEADER = (
+    *("lens", "name", "EFL mm", "back mm", "f/", "half field", "film mm", "refr.", "asph.", "cyl.", "states", "rims"),
+    "verdict",
+)
+
+
+def _run_list(args: argparse.Namespace, paths: list[Path], checked: bool) -> int:
+    from neurolens.study.describe import lens_files, library_row, section
+
+    if args.layouts is not None:
+        check_folder(args.layouts, "--layouts")
+    files = (lens_files(path) if path.is_dir() else [_file(path)] for path in paths)
+    rows = [library_row(file, checked) for folder in files for file in folder]
+    if args.layouts is not None:
+        from neurolens.study.figures import sheet
+
+        sheet([section(Path(r["file"])) for r in rows if "name" in r], args.layouts)
+    drawn = None if args.layouts is None else str(args.layouts)
+    note = f"\n\nSections drawn in {drawn}" if drawn else ""
+    return answer(args, {"lenses": rows, "layouts": drawn}, lambda: _list_text(rows) + note)
+
+
+def _list_text(rows: list[dict[str, Any]]) -> str:
+    text = table(_LIST_HEADER, [_cells(row) for row in rows], left=2)
+    doubtful = [row for row in rows if row["doubts"]]
+    found = f"\n\n{len(rows)} lenses, {len(doubtful)} of them doubtful or unreadable"
+    lines = [f"  {row['lens']}: {doubt}" for row in doubtful for doubt in row["doubts"]]
+    return text + found + (":\n" + "\n".join(lines) if lines else "")
+
+
+def _cells(row: dict[str, Any]) -> list[str]:
+    if "name" not in row:
+        return [row["lens"], *["-"] * (len(_LIST_HEADER) - 2), row["verdict"]]
+    efl = number(row["efl_mm"]) + ("" if row["efl_x_mm"] is None else f" / {number(row['efl_x_mm'], 3)}")
+    field = "-" if row["half_field_deg"] is None else f"{row['half_field_deg']:.4g}°"
+    counts = [str(row[key] or "-") for key in ("refractions", "aspheres", "cylinders", "states")]
+    figures = [efl, number(row["back_focus_mm"]), number(row["f_number"], 3), field, number(row["image_radius_mm"])]
+    return [row["lens"], one_line(row["name"], 40), *figures, *counts, row["rims"], row["verdict"]]
+
+
+def _add_rims(parser: argparse.ArgumentParser) -> None:
+    rims = parser.add_argument_group("rims")
+    rims.add_argument(
+        "--derive-rims", action="store_true",
+        help="compute the diameters from the f-number and the field, and print them beside those of the file",
+    )  # fmt: skip
+    add_option(
+        rims, "--edge-pupil", old=("--vignetting",), metavar="SHARE", type=between(0.01, 1, "a share"),
+        help="share of the pupil's height that is kept at the edge of the field (default: 0.5)",
+    )  # fmt: skip
+    rims.add_argument(
+        "--half-field", metavar="DEG", type=between(0.01, 179, "an angle in degrees"),
+        help="edge of the field, in degrees from the axis (default: as the file states)",
+    )  # fmt: skip
+    add_output(rims, "OUT.toml", "write the lens with its derived rims")
+
+
+def _run_rims(args: argparse.Namespace) -> int:
+    """Print the table of rims; write the lens with derived rims only where -o asks for it."""
+    from neurolens.readers.lenswriter import write_lens
+    from neurolens.setting.rims import RimRule, derive_rims, half_field_deg
+    from neurolens.study.describe import read_quietly
+
+    if args.out is not None:
+        check_folder(args.out, "--output")
+    lens = read_quietly(args.file)
+    rule = RimRule(vignetting=0.5 if args.edge_pupil is None else args.edge_pupil, half_field_deg=args.half_field)
+    derived, rims = derive_rims(lens, rule)
+    field = args.half_field or half_field_deg(lens)
+    if args.out is not None:
+        write_lens(replace(derived, notes=_notes(derived, rule, field)), args.out)
+    data = {
+        "file": str(args.file),
+        "f_number": lens.f_number,
+        "vignetting": rule.vignetting,
+        "clear_edge": rule.clear_edge,
+        "half_field_deg": field,
+        "rims": [vars(rim) for rim in rims],
+        "output": None if args.out is None else str(args.out),
+    }
+    return answer(args, data, lambda: _rims_text(lens, data, rims))
+
+
+def _notes(lens: Lens, rule: RimRule, field: float) -> str:
+    said = (
+        f"Rims are derived by neurolens lens --derive-rims: the stop from the f-number, the whole axial beam, "
+        f"{100 * rule.vignetting:g}% of the pupil's height kept at {field:.4g} degrees, "
+        f"a clear edge of {100 * rule.clear_edge:g}%."
+    )
+    return f"{lens.notes} {said}".strip()
+
+
+def _rims_text(lens: Lens, data: dict[str, Any], rims: list[Rim]) -> str:
+    rows = []
+    for rim in rims:
+        note = "stop" if lens.surfaces[rim.surface].stop else "trimmed: limited by a neighbour" if rim.trimmed else ""
+        share = f"{100 * (rim.derived_mm / rim.tabled_mm - 1):+.1f}%"
+        cells = (f"{v:.3f}" for v in (rim.tabled_mm, rim.axis_mm, rim.field_mm, rim.derived_mm))
+        rows.append((str(rim.surface), *cells, share, note))
+    head = (
+        f"{lens.name}\nRims for f/{lens.f_number:g} and {data['half_field_deg']:.4g} degrees half field, where "
+        f"{100 * data['vignetting']:g}% of the pupil's height is kept; diameters in mm; "
+        f"those of the file are marked as {lens.rims}."
+    )
+    header = ("surface", "in the file", "axial beam", "field", "derived", "change", "")
+    tail = f"\n\nWritten to {data['output']}" if data["output"] else "\n\nNothing is written without -o OUT.toml"
+    return head + "\n\n" + table(header, rows) + tail

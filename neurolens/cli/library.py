@@ -1,0 +1,215 @@
+"""`neurolens library`: a page for each lens of a folder, and an index that searches and sorts."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.files import atomic_path, atomic_write_text, library, read_kept, safe_name, write_kept
+from neurolens.base.lensname import lens_id_of
+from neurolens.base.progress import Progress
+from neurolens.cli.arguments import add_json, add_lens, add_output, check_run_folder
+from neurolens.cli.output import answer
+
+if TYPE_CHECKING:
+    from neurolens.lens.prescription import Lens
+
+_DESCRIPTION = """\
+Write a folder of pages: of each lens its section, spots, MTF, distortion, vignetting, colour, breathing and bokeh at
+three points of the field, its models with error and cost, its source and what is doubtful about it; and an
+index with search, sorted by year, focal length, speed, error. A lens whose page is there, from the same file
+by the same version, is kept. Needs the extra "train" (torch)."""
+_EPILOG = """\
+examples:
+  neurolens library -o pages
+  neurolens library -o pages laikin_double_gauss_50 my_lens.toml"""
+_SHOWN = {
+    "layout": "Section", "spots": "Spots through focus", "mtf": "Geometric MTF",
+    "mtf-height": "MTF against image height", "distortion": "Distortion", "vignetting": "Vignetting",
+    "colour": "Colour",
+}  # fmt: skip
+_BOKEH_FOCUS, _BOKEH_FIELDS = 30, (0.0, 0.6, 0.95)  # focal lengths; shares of the field
+_COLOURS = 96  # in the palette of a picture
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command to the command line."""
+    parser = subparsers.add_parser(
+        "library", help="pages of lenses: pictures, figures, models", description=_DESCRIPTION, epilog=_EPILOG
+    )
+    add_lens(parser, "lenses", " (default: all of lenses/)", nargs="*")
+    add_output(parser, "FOLDER", "for the pages", required=True)
+    add_json(parser, quiet=True)
+    parser.set_defaults(run=run, kept="finished pages are kept; the same command goes on")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the pages; 1 where a lens could not be shown."""
+    from neurolens.study.describe import lens_files
+
+    folder = args.out
+    check_run_folder(folder, "neurolens library", "--output")
+    files = args.lenses or lens_files(library() / "lenses")
+    names = _page_names(files)
+    folder.mkdir(parents=True, exist_ok=True)
+    progress, records = Progress({"lenses": 12.0 * len(files)}, quiet=args.quiet), []
+    with progress.stage("lenses") as report:
+        for k, file in enumerate(files):
+            records.append(_record(file, folder / names[k]))
+            report((k + 1) / len(files))
+    atomic_write_text(folder / "index.html", _index(records))
+    failed = [f"{r['lens']}: {r['fault']}" for r in records if "fault" in r]
+    size = sum(f.stat().st_size for f in folder.rglob("*") if f.is_file())
+    lines = [f"{len(records) - len(failed)} lenses, {size / 1e6:.1f} MB: {folder}/index.html", *failed]
+    answer(args, {"folder": str(folder), "bytes": size, "lenses": records}, lambda: "\n".join(lines))
+    return 1 if failed else 0
+
+
+def _page_names(files: Sequence[Path]) -> list[str]:
+    """The folder of each file's page: the id of the lens, with a number if another file of the run has the same id."""
+    names: list[str] = []
+    for file in files:
+        tries = (safe_name(f"{lens_id_of(file)}-{k}" if k > 1 else lens_id_of(file)) for k in itertools.count(1))
+        taken = {"index.html", *(name.lower() for name in names)}  # many disks know no capitals
+        names.append(next(name for name in tries if name.lower() not in taken))
+    return names
+
+
+def _record(file: Path, folder: Path) -> dict[str, Any]:
+    """The row of a lens in the index. Its page is written to a folder, unless it is there already."""
+    from neurolens import __version__
+    from neurolens.study.describe import read_quietly
+
+    kept, named = folder / "record.json", {"lens": lens_id_of(file), "page": folder.name}
+    try:
+        lens = read_quietly(file)
+        last = read_kept(kept)
+        if last is not None and (last.get("sha256"), last.get("version")) == (lens.sha256, __version__):
+            return last | named
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        record = named | {"sha256": lens.sha256, "version": __version__} | _page(lens, file, kept.parent)
+        write_kept(kept, record)
+        return record
+    except NeurolensError as error:
+        return {"lens": file.stem, "page": None, "fault": str(error)}
+
+
+def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
+    """Draw a lens and write its page; returns what the index shows."""
+    from neurolens.analysis.layout import thumbnail
+    from neurolens.base.html import html
+    from neurolens.blender.pack import year_of
+    from neurolens.cli.models import models_in
+    from neurolens.readers.source import read_text
+    from neurolens.setting.check import check_lens
+    from neurolens.study import pages
+    from neurolens.study.describe import lens_row, rim_doubts, section
+
+    row = lens_row(lens, check_lens(lens))
+    figures, notes = [], []
+    for name, title, draw in _drawings(lens):
+        picture = folder / f"{name}.png"
+        try:
+            draw(picture)
+        except InputError as error:
+            notes.append(f"{title} is left out: {error}")
+            continue
+        _lessen(picture)
+        figures.append({"file": picture.name, "title": title})
+    models = [m for m in models_in(library() / "models") if m["lens"] == lens.lens_id]
+    doubts = [*row["doubts"], *rim_doubts(lens), *notes]
+    names = [Path(m["file"]).stem.removeprefix(f"{lens.lens_id}.") for m in models]
+    page = html(
+        "lens.html",
+        title=lens.name,
+        source=pages.flat({"designer": lens.designer or pages.DASH, "source": lens.source, "rims": lens.rims}),
+        doubts=doubts,
+        about=lens.notes,
+        shown=pages.figures_of(folder, figures),
+        models=pages.table(names, models, _model_columns()),
+        file=read_text(file),
+    )
+    atomic_write_text(folder / "index.html", page)
+    best = min((m["rms_um"] for m in models if m["rms_um"] is not None), default=None)
+    keys = ("name", "efl_mm", "f_number", "half_field_deg", "refractions", "states")
+    times = [pages.number(m, "fused_ns_per_ray.min") or pages.number(m, "ns_per_ray.min") for m in models]
+    fastest = min((t for t in times if t), default=None)
+    more = {"ns": fastest, "year": year_of(lens.source), "designer": lens.designer, "rms_um": best, "doubts": doubts}
+    return {**{k: row[k] for k in keys}, **more, "layout": thumbnail(section(file))}
+
+
+def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
+    """Name and title of each drawing, and the function that draws it to a path."""
+    from neurolens.analysis.fields import Scene
+    from neurolens.analysis.layout import state_text
+    from neurolens.analysis.spots import spots
+    from neurolens.cli.analyse import analysis_of
+    from neurolens.setting.states import set_lens
+    from neurolens.study.figures import draw_breathing
+
+    scene = Scene(set_lens(lens, focus_m=math.inf, focus="best"))
+
+    def drawn(what: str) -> Any:
+        def draw(path: Path) -> None:
+            analysis = analysis_of(what)
+            titles = () if what == "layout" else (lens.name, state_text(scene))
+            analysis.draw(analysis.compute(scene), path, *titles)
+
+        return draw
+
+    def bokeh(path: Path) -> None:
+        """Lights at infinity, the lens focused near; at three points of the field."""
+        near = 1e-3 * _BOKEH_FOCUS * abs(scene.first_order.efl_mm)
+        edge = max(scene.default_fields())
+        blurred = Scene(set_lens(lens, focus_m=near, focus="best"))
+        found = spots(blurred, [share * edge for share in _BOKEH_FIELDS], rings=20, shift_mm=[0.0])
+        analysis_of("spots").draw(replace(found, airy_um=math.nan), path, lens.name, f"focused at {near:.3g} m")
+
+    yield from ((what, title, drawn(what)) for what, title in _SHOWN.items())
+    yield "bokeh", "Bokeh: lights at infinity, the lens focused near", bokeh
+    yield "breathing", "Breathing", lambda path: draw_breathing(lens, path)
+
+
+def _lessen(picture: Path) -> None:
+    """Reduce a picture to a palette, which takes a third of the bytes."""
+    from PIL import Image
+
+    with Image.open(picture) as image:
+        small = image.convert("RGB").quantize(_COLOURS, dither=Image.Dither.NONE)
+    with atomic_path(picture) as part:
+        small.save(part, optimize=True)
+
+
+def _model_columns() -> tuple[Any, ...]:
+    from neurolens.study.pages import Column
+
+    return (
+        Column("RMS (µm)", "rms_um", about="film-equivalent, rays held out, whole domain"),
+        Column("RMS (px)", "rms_px", about="of a picture 4000 pixels wide"),
+        Column("direction (°)", "direction_rms_deg", about="root mean square"),
+        Column("onnxruntime (ns)", "ns_per_ray.min", about="a ray, one core"),
+        Column("as C (ns)", "fused_ns_per_ray.min", about="a ray, one core, compiled"),
+        Column("kB", "bytes", 1e-3),
+    )
+
+
+def _index(records: Sequence[Mapping[str, Any]]) -> str:
+    """All lenses in a table with thumbnails, which searches and sorts by itself."""
+    from neurolens.base.html import html
+    from neurolens.study.pages import Column
+
+    columns = (
+        Column("year", "year", digits=4), Column("f (mm)", "efl_mm", digits=4), Column("f-number", "f_number"),
+        Column("half field (°)", "half_field_deg"), Column("refractions", "refractions"), Column("states", "states"),
+        Column("fastest model (ns)", "ns", about="a ray, one core, as C where that was timed"),
+        Column("best model (µm)", "rms_um", about="film-equivalent RMS"),
+    )  # fmt: skip
+    missing = {"fault": "", "designer": "", "layout": "", "doubts": ()}
+    rows = [{"name": r["lens"], **missing, **r} for r in records]
+    return html("library.html", title="Lenses", records=rows, columns=columns)

@@ -1,1 +1,0 @@
-"""Error and speed: rays, vignetting, images, time, and the report that shows the trade."""

@@ -1,0 +1,1 @@
+"""A lens as data: its prescription, glasses, stop, and first-order properties. No ray is traced here."""

@@ -1,0 +1,229 @@
+"""First-order (paraxial) data: focal length, principal planes, pupils, focus, by default at `Lens.reference_nm`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+from neurolens.base.errors import InputError
+from neurolens.lens import film_plane
+from neurolens.lens.glass import index_of
+from neurolens.lens.prescription import Lens
+
+Meridian = Literal["x", "y"]
+
+
+@dataclass(frozen=True)
+class FirstOrder:
+    """First-order data of a lens, lens frame, mm.
+
+    Attributes:
+        efl_mm: effective focal length, of the image side (negative for a diverging lens): -y / u' of a ray that comes
+            parallel to the axis. The media are those of the lens, wherever it stands.
+        back_focus_mm: last vertex to rear focal point.
+        rear_focal_z_mm, front_focal_z_mm: focal points on the axis.
+        rear_principal_z_mm, front_principal_z_mm: H' and H.
+        entrance_pupil_z_mm, entrance_pupil_diameter_mm: paraxial image of the stop seen from the scene.
+        exit_pupil_z_mm, exit_pupil_diameter_mm: seen from the film; z is infinite for an image-telecentric lens.
+        f_number: efl / entrance-pupil diameter; infinite for a closed stop.
+        front_efl_mm: focal length of the object side: efl_mm times the index in front over that behind.
+    """
+
+    efl_mm: float
+    back_focus_mm: float
+    rear_focal_z_mm: float
+    front_focal_z_mm: float
+    rear_principal_z_mm: float
+    front_principal_z_mm: float
+    entrance_pupil_z_mm: float
+    entrance_pupil_diameter_mm: float
+    exit_pupil_z_mm: float
+    exit_pupil_diameter_mm: float
+    f_number: float
+    front_efl_mm: float
+
+    def image_z_mm(self, object_z_mm: float) -> float:
+        """Paraxial image (mm) of a point on the axis, by Newton's x x' = -f f'."""
+        return self.rear_focal_z_mm - self.efl_mm * self.front_efl_mm / (object_z_mm - self.front_focal_z_mm)
+
+
+@dataclass(frozen=True)
+class System:
+    """A lens to first order: curvatures [S] in 1/mm, gaps [S - 1] between surfaces, indices [S + 1] of the media.
+
+    `ideal` [S]: powers in 1/mm of ideal thin lenses, 0 of other surfaces.
+    """
+
+    curvature: list[Any]
+    gap_mm: list[Any]
+    index: list[Any]
+    ideal: list[float]
+
+    def turned(self) -> System:
+        """The system as light meets it that comes from the other side."""
+        return System([-c for c in reversed(self.curvature)], self.gap_mm[::-1], self.index[::-1], self.ideal[::-1])
+
+    def behind(self, surface: int) -> System:
+        """The surfaces behind one."""
+        rest = slice(surface + 1, None)
+        return System(self.curvature[rest], self.gap_mm[rest], self.index[rest], self.ideal[rest])
+
+    def march(self, y: Any, u: Any) -> PathOfRay:
+        """The paraxial ray of height y (mm) at the first surface and slope u before it.
+
+        Smith, Modern Optical Engineering, ch. 2.
+        """
+        path = PathOfRay([], [], [])
+        n = self.index
+        for k, c in enumerate(self.curvature):
+            y = y + u * self.gap_mm[k - 1] if k else y
+            after = (n[k] * u - y * c * (n[k + 1] - n[k]) - y * self.ideal[k]) / n[k + 1]
+            for values, value in zip(path, (y, u, after), strict=True):
+                values.append(value)
+            u = after
+        return path
+
+
+class PathOfRay(NamedTuple):
+    """A paraxial ray: height at every surface (mm), slope before and after it."""
+
+    y: list[Any]
+    before: list[Any]
+    after: list[Any]
+
+
+def system_of(lens: Lens, wavelength_nm: float | None = None, meridian: Meridian = "y") -> System:
+    """The lens in one meridian at one wavelength; None takes `Lens.reference_nm`."""
+    light = lens.reference_nm if wavelength_nm is None else wavelength_nm
+    curvature = [s.vertex_curvature(meridian) for s in lens.surfaces]
+    index = [index_of(medium, light) for medium in lens.media]
+    ideal = [0.0 if s.focal_mm is None else 1 / s.focal_mm for s in lens.surfaces]
+    return System(curvature, [s.thickness_mm for s in lens.surfaces[:-1]], index, ideal)
+
+
+def _pupil(system: System, stop: int) -> tuple[Any, Any]:
+    """Distance of the stop's image behind the last vertex, and its magnification, by the surfaces after the stop."""
+    behind = system.behind(stop)
+    if not behind.curvature:
+        return 0.0, 1.0
+    slanted = behind.march(system.gap_mm[stop] * 1.0, 1.0)  # from the axial point of the stop
+    level = behind.march(1.0, 0.0)  # parallel, at height 1 in the stop
+    distance = -slanted.y[-1] / slanted.after[-1] if slanted.after[-1] != 0 else math.inf
+    return distance, (level.y[-1] + level.after[-1] * distance if math.isfinite(distance) else math.inf)
+
+
+def first_order(lens: Lens, wavelength_nm: float | None = None, meridian: Meridian = "y") -> FirstOrder:
+    """First-order data at one wavelength (None: `Lens.reference_nm`); of one meridian, where a lens has cylinders,
+    toroids or biconics.
+
+    For a lens without power (a pinhole, filters before or behind it) the film's centre counts as the focal point, and
+    the distance from the hole to the film, by which it maps angles to the film, as the focal length.
+
+    Raises:
+        InputError: an afocal lens (no finite focal length).
+    """
+    system, last_z = system_of(lens, wavelength_nm, meridian), lens.vertices_mm[-2]
+    turned = system.turned()
+    ahead = system.march(1.0, 0.0)
+    y, u = ahead.y[-1], ahead.after[-1]
+    if u == 0:
+        if not is_pinhole(lens):
+            raise InputError(lens.path, "surfaces", "(an afocal system)", "a lens with a finite focal length")
+        return _pinhole(lens, system)
+    back = turned.march(1.0, 0.0)
+    efl, back_focus = -1.0 / u, -y / u
+    front_efl = efl * (system.index[0] / system.index[-1])
+    rear_focal, front_focal = last_z + back_focus, back.y[-1] / back.after[-1]
+    exit_distance, exit_magnification = _pupil(system, lens.stop_index)
+    entrance_distance, entrance_magnification = _pupil(turned, len(lens.surfaces) - 1 - lens.stop_index)
+    opening = 2 * lens.stop_radius_mm
+    entrance_diameter = opening * abs(entrance_magnification)
+    return FirstOrder(
+        efl_mm=efl,
+        back_focus_mm=back_focus,
+        rear_focal_z_mm=rear_focal,
+        front_focal_z_mm=front_focal,
+        rear_principal_z_mm=rear_focal - efl,
+        front_principal_z_mm=front_focal + front_efl,
+        entrance_pupil_z_mm=-entrance_distance,
+        entrance_pupil_diameter_mm=entrance_diameter,
+        exit_pupil_z_mm=last_z + exit_distance,
+        exit_pupil_diameter_mm=opening * abs(exit_magnification),
+        f_number=abs(efl) / entrance_diameter if entrance_diameter else math.inf,
+        front_efl_mm=front_efl,
+    )
+
+
+def is_pinhole(lens: Lens) -> bool:
+    """Whether no surface bends light: a hole, perhaps behind plane filters."""
+    flat = all(s.radius_mm in (math.inf, -math.inf) and not (s.asphere or s.across) for s in lens.surfaces)
+    return flat and not lens.ideal
+
+
+def _pinhole(lens: Lens, system: System) -> FirstOrder:
+    """The data of a hole among planes: planes shorten what lies behind them, seen from the other side, by n."""
+    k, n, front, rear = lens.stop_index, len(lens.surfaces), system.index[0], system.index[-1]
+    depth = [s.thickness_mm / i for s, i in zip(lens.surfaces, system.index[1:], strict=True)]
+    last_z = lens.vertices_mm[n - 1]
+    film = lens.vertices_mm[n] if lens.film_z_mm is None else lens.film_z_mm
+    behind, opening = rear * sum(depth[k : n - 1]), 2 * lens.stop_radius_mm
+    entrance, exit_, efl = front * sum(depth[:k]), last_z - behind, film - last_z + behind
+    f_number, front_efl = efl / opening if opening else math.inf, efl * (front / rear)
+    planes = film, entrance - front_efl, exit_, entrance
+    return FirstOrder(efl, film - last_z, *planes, entrance, opening, exit_, opening, f_number, front_efl)
+
+
+def chief_reach_mm(lens: Lens) -> float:
+    """Film height (mm) over the slope of the paraxial chief ray in the scene, which passes the entrance pupil."""
+    data = first_order(lens)
+    assert lens.film_z_mm is not None
+    focal_points = data.front_focal_z_mm, data.rear_focal_z_mm
+    return film_plane.reach_mm(data.efl_mm, data.front_efl_mm, focal_points, data.entrance_pupil_z_mm, lens.film_z_mm)
+
+
+def framing_mm(lens: Lens, focus_m: float) -> tuple[float, float]:
+    """Image distances (mm) of two ideal lenses that show the plane `focus_m` metres from the film at the lens's size.
+
+    Chief rays of a film point then meet that plane in one point, also where the film is not in the paraxial image.
+    `set_lens` has placed the lens.
+
+    Returns:
+        That of a thin lens or a hole so far before the film, and of a lens in this one's front principal plane.
+    """
+    data, reach = first_order(lens), chief_reach_mm(lens)
+    if math.isinf(focus_m):
+        return reach, reach
+    assert lens.film_z_mm is not None
+    plane = lens.film_z_mm - 1000 * focus_m
+    size = (data.entrance_pupil_z_mm - plane) / reach  # of the plane in focus over that on the film
+    return 1000 * focus_m / (1 + size), (data.front_principal_z_mm - plane) / size
+
+
+def stop_radius_mm(lens: Lens, f_number: float) -> float:
+    """Radius of the stop for f-number N = EFL / paraxial entrance-pupil diameter at infinity focus."""
+    # From an opening of 1 mm: a closed stop has no f-number to scale.
+    return first_order(lens.with_stop_radius(1.0)).f_number / f_number
+
+
+def film_z_mm(lens: Lens, focus_m: float) -> float:
+    """Film plane that focuses an object `focus_m` metres from the film (unit focusing; see `film_plane`).
+
+    A pinhole's film stays in place: it is equally sharp at every distance.
+
+    Raises:
+        InputError: an object nearer than four focal lengths, for which no film plane exists.
+    """
+    data = first_order(lens)
+    if is_pinhole(lens):
+        return float(data.rear_focal_z_mm)
+    planes = data.front_principal_z_mm, data.rear_principal_z_mm
+    return film_plane.film_z_mm(data.efl_mm, *planes, focus_m, lens.path, data.front_efl_mm / data.efl_mm)
+
+
+def image_z_mm(lens: Lens, object_z_mm: float) -> float:
+    """Paraxial image of a point on the axis, lens frame, at `Lens.reference_nm`; of a pinhole, the film."""
+    data = first_order(lens)
+    if is_pinhole(lens):
+        return float(data.rear_focal_z_mm)
+    return float(data.image_z_mm(object_z_mm))

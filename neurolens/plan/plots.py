@@ -1,0 +1,127 @@
+"""What a plan found, in pictures: effects beside their budget, maps of them, each camera's error over its time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neurolens.analysis.plot_style import INK, drawing, plain_log_ticks
+from neurolens.plan.plan import Choice, Plan
+from neurolens.plan.trade import Trade
+from neurolens.study.figures import error_scale, log_norm
+from neurolens.study.plots import CHOSEN, family_colour, noisy_lines, place_labels
+
+_COLUMNS = 4  # of maps
+# Light that an effect takes is dark, light that it adds is orange; none is white.
+_SIGNED = ("#10183a", "#4d6796", "#c9d1de", "#ffffff", "#f6cfae", "#e58a45", CHOSEN)
+_TITLES = {"px": "pixels (logarithmic)", "relative": "% of the light\n(dark: taken, orange: added)"}
+
+
+def plot_effects(plan: Plan, path: Path, title: str) -> None:
+    """What a plan found: effects as bars with the budget, error against time of every camera that was timed, and where
+    in the picture the effects are that a camera needs: those in pixels, then those of light, each with one scale."""
+    asked = plan.asked
+    shown = [e for e in plan.effects if e.needed and e.name in plan.probed.maps]
+    groups = {unit: [e.name for e in shown if e.unit == unit] for unit in _TITLES}
+    groups = {unit: names for unit, names in groups.items() if names}
+    heights = [4.2, *(1.6 * -(-len(names) // _COLUMNS) + 0.15 for names in groups.values())]
+    subtitle = f"f/{asked.f_number:.3g}, focus {asked.focus_m:g} m; 95% of the picture keeps these figures"
+    with drawing(path, 9.5, sum(heights), title, subtitle) as figure:
+        if not groups:
+            _bars_and_trade(plan, figure)
+            return
+        above, *below = figure.subfigures(len(heights), 1, height_ratios=heights)
+        _bars_and_trade(plan, above)
+        for part, (unit, names) in zip(below, groups.items(), strict=True):
+            _maps(part, {name: plan.probed.maps[name][1] for name in names}, unit, asked.film_mm)
+
+
+def _maps(figure: Any, maps: Mapping[str, Any], unit: str, film_mm: tuple[float, float]) -> None:
+    """Maps of effects of one unit, upright, in one scale of colours with its bar."""
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+
+    colours: Any = "magma"
+    if unit == "px":
+        low, high = error_scale(maps.values(), 98)
+        norm = log_norm(low, high)
+        maps = {name: np.maximum(value, low) for name, value in maps.items()}
+    else:
+        maps = {name: 100 * value for name, value in maps.items()}
+        high = error_scale([np.abs(value) for value in maps.values()], 98)[1]
+        norm, colours = Normalize(-high, high), LinearSegmentedColormap.from_list("signed", _SIGNED)
+    cells = figure.subplots(-(-len(maps) // _COLUMNS), _COLUMNS, squeeze=False)
+    for axes, (name, value) in zip(cells.ravel(), maps.items(), strict=False):
+        extent = (0, film_mm[0], 0, film_mm[1])
+        picture = axes.imshow(value, extent=extent, cmap=colours, norm=norm, interpolation="nearest")
+        axes.set_title(name, fontsize=8)
+        axes.set(xticks=[], yticks=[])
+    for axes in cells.ravel()[len(maps) :]:
+        axes.set_axis_off()
+    bar = figure.colorbar(picture, ax=cells, extend="both", aspect=12 * len(cells), pad=0.015)
+    bar.ax.tick_params(labelsize=6.5)
+    bar.set_label(_TITLES[unit], fontsize=7)
+    if unit == "px":
+        plain_log_ticks(bar.ax.yaxis)
+
+
+def _bars_and_trade(plan: Plan, figure: Any) -> None:
+    wide = [e for e in plan.effects if e.unit == "px"][::-1]
+    bars, trade = figure.subplots(1, 2, width_ratios=(1.0, 1.1))
+    least = max(min((e.worth for e in wide if e.worth > 0), default=1e-3) / 3, 1e-4)
+    colours = [family_colour("ols") if e.needed else "#b8b8b8" for e in wide]
+    bars.barh([e.name for e in wide], [max(e.worth, least) for e in wide], color=colours, left=0)
+    bars.set_xscale("log")
+    bars.set_xlim(left=least)
+    bars.set_xlabel("worth (pixels), grey: left out")
+    timed = [c for c in plan.choices if 0 < c.cost < float("inf") and c.error_px < float("inf")]
+    _cameras(trade, timed, [c.cost for c in timed], [c.cost * c.spread for c in timed], plan.best)
+    trade.set_xlabel(f"cost ({plan.unit} a ray times noise), --for {plan.target}")
+    if plan.budget_px > 0:
+        bars.axvline(plan.budget_px, color=CHOSEN, lw=1.2)
+        trade.axhline(plan.budget_px, color=CHOSEN, lw=1.2, label=f"budget {plan.budget_px:g} px; ring: chosen")
+        trade.legend(loc="lower right", bbox_to_anchor=(1, 1), frameon=False, ncols=2)
+    plain_log_ticks(bars.xaxis, trade.xaxis, trade.yaxis)
+
+
+def _cameras(
+    axes: Any, choices: Sequence[Choice], places: Sequence[float], medians: Sequence[float], best: Choice | None
+) -> None:
+    """Errors of cameras over their time, those within the budget in colour, the chosen one with a ring.
+
+    From a noisy time a line leads to the median of its repeats.
+    """
+    errors = [max(c.error_px, 1e-4) for c in choices]
+    axes.scatter(places, errors, c=["#0072b2" if c.within else "#b8b8b8" for c in choices], s=26)
+    chosen = [k for k, c in enumerate(choices) if c == best]
+    ring = {"s": 150, "fc": "none", "ec": CHOSEN, "lw": 1.8}
+    axes.scatter([places[k] for k in chosen], [errors[k] for k in chosen], **ring)
+    noisy_lines(axes, [(e, x, m) for c, e, x, m in zip(choices, errors, places, medians, strict=True) if c.noisy])
+    axes.set(xscale="log", yscale="log", ylabel="error (pixels; none is drawn at 0.0001)")
+    place_labels(axes, list(zip(places, errors, strict=True)), [_short(c.name) for c in choices])
+
+
+def plot_trade(trade: Trade, path: Path, title: str) -> None:
+    """Error of every camera against its seconds, with the front of those that no other betters."""
+    plan, offered = trade.plan, [o for o in trade.offered if o.choice.error_px < float("inf")]
+    subtitle = f"--for {plan.target}; 95% of the picture keeps these errors"
+    subtitle += f"; the scene itself takes {trade.base:.3g} {trade.unit}" * bool(trade.base)
+    with drawing(path, 8.5, 5.0, title, subtitle) as figure:
+        axes = figure.subplots()
+        medians = [o.seconds + o.more for o in offered]
+        _cameras(axes, [o.choice for o in offered], [o.seconds for o in offered], medians, plan.best)
+        best = trade.front
+        at = [o.seconds for o in best], [max(o.choice.error_px, 1e-4) for o in best]
+        axes.step(*at, where="post", color=INK, lw=1.2, alpha=0.7, label="no camera betters both")
+        axes.set_xlabel(f"{trade.unit} that the camera adds, one thread, to equal noise")
+        if plan.budget_px > 0:
+            axes.axhline(plan.budget_px, color=CHOSEN, lw=1.2, label=f"budget {plan.budget_px:g} px; ring: chosen")
+        axes.legend(loc="lower right", bbox_to_anchor=(1, 1), frameon=False, ncols=2)
+        plain_log_ticks(axes.xaxis, axes.yaxis)
+
+
+def _short(name: str) -> str:
+    """A model's name without its lens."""
+    return name.rpartition(".")[2] or name

@@ -1,0 +1,326 @@
+"""A scene as a lens sees it: the places in view, the lens's footprints there, and what each of its effects is worth.
+
+A probe sends the chief rays of a grid of film points into the scene: what they meet, and how far off, are the places at
+which cameras are held against the exact lens (`footprints`), in the scene's own light (`light`). An effect's worth is
+its part of the exact footprints in pixels, or the light that it adds or takes relative to the picture, where it is
+largest but for 5% of the picture.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.analysis.field_curves import illumination
+from neurolens.analysis.fields import Scene as Fields
+from neurolens.base.errors import InputError
+from neurolens.cameras.build import Shot, ideal_as
+from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.field import Field, field_of
+from neurolens.graph.compiler import has_compiler
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
+from neurolens.plan import footprints as prints
+from neurolens.plan.footprints import AFTERWARDS, Array, Footprints, Places
+from neurolens.plan.light import STRAY, Glance, glance, small_raster, stray_light
+from neurolens.render.scene import Scene
+from neurolens.render.world import shared_worlds
+from neurolens.setting.pupils import image_radius_mm
+from neurolens.setting.states import set_lens
+from neurolens.study.scenes import seen_depths_m
+from neurolens.surrogates.domain import domain_from_camera, domain_of
+from neurolens.surrogates.model import Domain
+
+COUNTED = 95.0  # percentile over the picture that a budget is held against
+_Real = TypeVar("_Real", bound=np.floating[Any])
+Maps = dict[str, tuple[Literal["px", "relative"], Array]]
+LIGHT = 0.01  # relative error of light that a plan allows beside its budget of place
+_FOCUS_SPARE = 0.25  # of a pixel of blur: what a model may place its film beside the lens's
+_FIELDS = 17  # from the axis to the edge of the film, at which vignetting is traced
+_ACROSS = 16  # points of the probe along the longer side
+# Of effects, what makes them where the picture is finished: a blur by depth makes all blur.
+_MADE_BY = {"distortion": "distortion", "natural fall-off": "distortion", "vignetting": "distortion"} | dict.fromkeys(
+    ("defocus", "spherical aberration", "coma", "astigmatism", "field curvature", "higher orders",
+     "longitudinal colour", "diffraction"), "defocus",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a scene asks of its camera.
+
+    Attributes:
+        film_mm: width and height in use. pixel_mm: pitch. focus_m, f_number, wavelength_nm: of the shot; no wider
+            than the lens opens. nearest_m, farthest_m: along the axis from the film; None where nothing is in view.
+        distant: share of the picture that shows what has no distance. dark: share that the lens leaves dark.
+        light_nm: between which all but 0.2% of the scene's light lies, as the eye weighs it.
+        contrast: RMS relative difference of neighbours on 48 pixels across, the median. edges: share of neighbours
+            there whose blur differs by more than a pixel. edge_contrast: median contrast at those, None without any: if
+            it is little, how well blur is made there matters little.
+        filter_px: side of the pixel filter, a box. afterwards: what compositing makes, of `footprints.AFTERWARDS`.
+            denoised: whether noise is taken out, so that cameras are not charged for it. zoom: state of the lens.
+    """
+
+    film_mm: tuple[float, float]
+    pixel_mm: float
+    focus_m: float
+    f_number: float
+    wavelength_nm: tuple[float, float]
+    nearest_m: float | None
+    farthest_m: float | None
+    distant: float
+    dark: float
+    light_nm: tuple[float, float]
+    contrast: float
+    edges: float
+    edge_contrast: float | None
+    filter_px: float = 1.0
+    afterwards: tuple[str, ...] = ()
+    denoised: bool = False
+    zoom: str | None = None
+
+
+@dataclass(frozen=True)
+class Effect:
+    """An effect's worth: pixels (RMS of what it moves light by; `relative`: share of the light) at the counted
+    percentile, its median over the picture, the share of the picture where it is beyond the budget, and whether a
+    camera needs it; `why` not, or why that is not known (worth inf)."""
+
+    name: str
+    worth: float
+    median: float
+    over: float
+    unit: Literal["px", "relative"]
+    needed: bool
+    why: str = ""
+
+
+@dataclass(frozen=True)
+class Probed:
+    """A scene's places as the exact lens sees them: its camera, its footprints there, and those of a thin lens.
+
+    Attributes:
+        scene, lens, domain: the lens stopped and focused, and what models of this shot must know. places: those with
+            light, of `shape` rows and columns over the film. wanted: what a camera is asked for, `seen` without what is
+            done afterwards.
+    """
+
+    scene: Scene
+    asked: Asked
+    lens: Lens
+    domain: Domain
+    exact: ExactCamera
+    places: Places
+    shape: tuple[int, int]
+    seen: Footprints
+    thin_seen: Footprints
+    wanted: Footprints
+    glance: Glance
+
+    @cached_property
+    def exact_field(self) -> Field:
+        """The field of the exact camera, for maps of its picture; it takes seconds.
+
+        Raises:
+            InputError: as `field_of`.
+        """
+        return field_of(self.exact, self.asked.focus_m)
+
+    @cached_property
+    def camera_maps(self) -> Maps:
+        """`effect_maps`, made once."""
+        return effect_maps(self)
+
+    @cached_property
+    def maps(self) -> Maps:
+        """The same, and those of the light that the lens adds, on more pixels; without that where it is not known."""
+        with suppress(InputError):
+            added = stray_light(self.scene, self.exact, self.glance)
+            return self.camera_maps | {k: ("relative", v) for k, v in added.items()}
+        return self.camera_maps
+
+    def on_film(self, value: Array) -> Array:
+        """Values [N] of places as a picture [rows, columns], as prints show it: upright; NaN where none is."""
+        found = np.full(self.shape, np.nan)
+        at = self.places.film_mm / np.array(self.asked.film_mm)[:, None] + 0.5
+        column, row = (np.minimum((at[k] * n).astype(int), n - 1) for k, n in enumerate(self.shape[::-1]))
+        found[row, column] = np.broadcast_to(value, row.shape)
+        return upright(found)
+
+
+def probe(
+    scene: Scene, lens: Lens, *, across: int = _ACROSS, afterwards: Collection[str] = (), denoised: bool = False,
+    zoom: str | None = None,
+) -> Probed:  # fmt: skip
+    """Look through the exact lens at a scene.
+
+    Args:
+        across: places along the longer side. afterwards: effects that compositing makes, of `footprints.AFTERWARDS`:
+            distortion, where the ST map corrects the picture's light, too, and defocus. denoised: see `Asked`.
+        zoom: state of the lens by name or focal length; None leaves it as it is.
+
+    Raises:
+        InputError: a scene's camera that the lens cannot be; a picture that the lens leaves dark; other names; an
+            unknown state.
+    """
+    if not set(afterwards) <= set(AFTERWARDS):
+        raise InputError("plan", "afterwards", sorted(afterwards), f"of {', '.join(AFTERWARDS)}")
+    lens, shot = lens if zoom is None else set_lens(lens, zoom=zoom), scene.settings.camera
+    film, widest = (shot.film_width_mm, shot.film_height_mm), first_order(lens).f_number
+    f_number = max(shot.f_number or widest, widest)
+    stopped, domain = set_lens(lens, f_number=f_number, focus_m=shot.focus_m), _domain(lens, scene, f_number)
+    real: dict[str, Any] = {"film_mm": film, "focus_m": shot.focus_m, "f_number": f_number}
+    exact = exact_camera(lens, {**real, "bounds": domain.bounds, "wavelength_nm": shot.wavelengths_nm})
+    shape = _shape(film, across)
+    points = _grid(film, shape)
+    with shared_worlds():
+        small, depth = glance(scene, exact), seen_depths_m(scene, exact, points)
+        edges = _edges(scene, exact, small, film[0] / shot.width)
+    far = np.where(np.isnan(depth), np.inf, depth)
+    places = prints.places_of(exact, points, far, small.wavelength_nm, small.share)
+    if not places.film_mm.shape[1]:
+        raise InputError(scene.name, "camera", lens.name, "a lens that lights some of this film")
+    thin = ideal_as("thin:", exact.lens, Shot(film, shot.focus_m))
+    met = depth[np.isfinite(depth)]
+    asked = Asked(
+        film, film[0] / shot.width, shot.focus_m, f_number, shot.wavelengths_nm,
+        float(met.min()) if met.size else None, float(met.max()) if met.size else None,
+        float(np.isinf(depth).mean()), 1 - places.film_mm.shape[1] / points.shape[1],
+        small.range_nm, float(np.median(small.contrast)),
+        *edges, afterwards=tuple(sorted(afterwards)), denoised=denoised,
+        zoom=zoom,
+    )  # fmt: skip
+    seen, ideal = (prints.footprints(c, places) for c in (exact, thin))
+    wanted = prints.left_to(seen, ideal, places.share, afterwards)
+    return Probed(scene, asked, stopped, domain, exact, places, shape, seen, ideal, wanted, small)
+
+
+def _domain(lens: Lens, scene: Scene, f_number: float) -> Domain:
+    """What a model of the shot must know: its film, stop and wavelengths, and as much more of the film's way as blurs a
+    quarter of a pixel, for models have their own focus; none more of a lens that goes no nearer."""
+    shot, plain = scene.settings.camera, lens.with_aperture(None)
+    film = shot.film_width_mm, shot.film_height_mm
+    stopped = set_lens(plain, f_number=f_number, focus_m=shot.focus_m)
+    radius = min(math.hypot(*film) / 2, image_radius_mm(lens)[0])
+    move = _FOCUS_SPARE * f_number * film[0] / shot.width / first_order(stopped).efl_mm ** 2  # of the vergence, 1/mm
+    vergence = 1e-3 / shot.focus_m
+    ends = 1e-3 / (vergence - move) if vergence > move else math.inf, 1e-3 / (vergence + move)
+    with suppress(InputError):
+        return domain_of(stopped, film_radius_mm=radius, focus_m=ends, wavelength_nm=shot.wavelengths_nm)
+    return domain_from_camera(
+        plain, film_mm=film, focus_m=shot.focus_m, f_number=f_number, wavelength_nm=shot.wavelengths_nm
+    )[1]
+
+
+def _edges(scene: Scene, exact: Any, small: Glance, pixel_mm: float) -> tuple[float, float | None]:
+    """`Asked.edges` and `edge_contrast`, with the blur of a thin lens: its difference at two depths of one point."""
+    first, (width, height) = first_order(exact.lens), small_raster(exact.film_mm)
+    depth = seen_depths_m(scene, exact, _grid(exact.film_mm, (height, width)))
+    near = upright((1 / np.where(np.isnan(depth), np.inf, depth)).reshape(height, width))
+    reach = exact.settings["lens_state"]["pinhole_focal_length_mm"]
+    blur = 1e-3 * near * first.entrance_pupil_diameter_mm * reach / pixel_mm
+    step = np.zeros_like(blur)
+    step[:, :-1] = np.abs(np.diff(blur, axis=1))
+    step[:-1] = np.maximum(step[:-1], np.abs(np.diff(blur, axis=0)))
+    there = step > 1
+    return float(there.mean()), float(np.median(small.contrast[there])) if there.any() else None
+
+
+def upright(film: NDArray[_Real]) -> NDArray[_Real]:
+    """Rows by rising y and columns by rising x of the film (lens frame) as a picture shows them, turned by 180 degrees:
+    its top left is at +x, -y."""
+    return film[:, ::-1]
+
+
+def effect_maps(found: Probed) -> Maps:
+    """Unit and map [H, W] of each effect over the picture, upright; NaN where the lens is dark. See `effects_mm`.
+
+    Light has a sign: the share of it that an effect adds, below 0 where the effect makes the picture darker. Vignetting
+    is what the rims take of the light through the stop (`passed_share`). Natural fall-off is the light that would
+    remain without rims, relative to the axis: cos^4, and how the pupil grows or shrinks with the field.
+
+    An Airy disc has no RMS radius: diffraction is worth the radius that holds half its light, 0.53 wavelengths times
+    the f-number (Born and Wolf, 8.5.2). Transmittance is the colour that the lens gives, by its glass and coatings and
+    an aperture that changes with the wavelength: RMS over wavelengths of the light there relative to its mean.
+    """
+    pixel, share = found.asked.pixel_mm, found.places.share
+    parts = {k: v / pixel for k, v in prints.effects_mm(found.seen, found.thin_seen, share).items()}
+    middle = float((found.places.wavelength_nm * share).sum())
+    parts["diffraction"] = np.full(1, 0.53 * 1e-6 * middle * found.asked.f_number / pixel)
+    passed = passed_share(found)
+    open_light = found.seen.light / np.maximum(passed, 1e-30)
+    axis = int(np.argmin(np.hypot(*found.places.film_mm)))
+    by_wave = found.seen.weight.mean(2) / np.maximum((found.seen.weight.mean(2) * share).sum(1), 1e-30)[:, None]
+    light = {
+        "natural fall-off": open_light / max(open_light[axis], 1e-30) - 1,
+        "vignetting": passed - 1,
+        "transmittance": np.sqrt((share * (by_wave - 1) ** 2).sum(1)),
+    }
+    maps: Maps = {k: ("px", found.on_film(v)) for k, v in parts.items()}
+    maps |= {k: ("relative", found.on_film(v)) for k, v in light.items()}
+    return maps
+
+
+def passed_share(found: Probed) -> Array:
+    """[N] share of the light through the stop that no rim takes, by exact tracing (`analysis.field_curves`).
+
+    It is traced from the axis outwards; beyond the last field with a chief ray its share is kept. An anamorphic lens is
+    traced along x and along y, and the two shares are multiplied, as if its rims were slits.
+    """
+
+    def along(axis: Literal["x", "y"], height_mm: Array) -> Array:
+        try:
+            data = illumination(Fields(found.lens, found.asked.focus_m, axis), fields=_FIELDS)
+        except InputError:  # no chief rays: what the rims take is then part of the natural fall-off
+            return np.ones_like(height_mm)
+        known = np.isfinite(data.passed)
+        order = np.argsort(data.height_mm[known])
+        return np.interp(height_mm, data.height_mm[known][order], data.passed[known][order])
+
+    x, y = np.abs(found.places.film_mm)
+    return along("x", x) * along("y", y) if found.lens.anamorphic else along("y", np.hypot(x, y))
+
+
+def effects_of(found: Probed, budget_px: float, stray: bool = True) -> tuple[Effect, ...]:
+    """What each effect is worth in this picture, the dearest first; `stray`: light that the lens adds among them."""
+    effects = []
+    for name, (unit, value) in (found.maps if stray else found.camera_maps).items():
+        budget = budget_px if unit == "px" else LIGHT
+        known = np.abs(value[np.isfinite(value)])
+        worth, later = (
+            float(np.percentile(known, COUNTED)),
+            name in _MADE_BY and _MADE_BY[name] in found.asked.afterwards,
+        )
+        why = "made afterwards" if later else "left out" if worth <= budget else ""
+        over = float((known > budget).mean())
+        effects.append(Effect(name, worth, float(np.median(known)), over, unit, not why, why))
+    if stray and not {*STRAY.values()} & {e.name for e in effects}:
+        effects.append(Effect("flare", math.inf, math.inf, 1.0, "relative", True, "not known"))
+    return tuple(sorted(effects, key=lambda e: (e.unit, -e.worth)))
+
+
+def exact_camera(lens: Lens, real: dict[str, Any]) -> ExactCamera:
+    """The exact camera, compiled as C where the machine has a compiler."""
+    with suppress(InputError):
+        if has_compiler():
+            return ExactCamera(lens, **real, runtime="c")
+    return ExactCamera(lens, **real)
+
+
+def _shape(film_mm: tuple[float, float], across: int) -> tuple[int, int]:
+    """Rows and columns of about square cells."""
+    width, height = (max(round(across * side / max(film_mm)), 1) for side in film_mm)
+    return height, width
+
+
+def _grid(film_mm: tuple[float, float], shape: tuple[int, int]) -> Array:
+    """Centres of equal cells of the film, [2, N] mm, row after row."""
+    x, y = (((np.arange(n) + 0.5) / n - 0.5) * side for n, side in zip(shape[::-1], film_mm, strict=True))
+    return np.stack(np.meshgrid(x, y)).reshape(2, -1)

@@ -1,0 +1,395 @@
+"""Focusing: groups that move inside a lens, the film plane of best focus, and breathing.
+
+Internal focusing: the source lists a few states of the groups, between infinity and the nearest, for every zoom
+position. One parameter moves all gaps from state to state linearly (as a focus ring on straight cams would), and is
+solved for so that the paraxial image of the object lies on the film, which is fixed.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from neurolens.base.errors import InputError
+from neurolens.lens import film_plane, paraxial
+from neurolens.lens.prescription import Configuration, Lens
+from neurolens.trace.rays import trace
+from neurolens.trace.surfaces import Rays
+
+
+def monotone(x: Sequence[float], rows: Sequence[Sequence[float]], place: float) -> list[float]:
+    """Values [M] at a place between rows of values [R, M] at ascending places x [R]: a row's own at its place.
+
+    Of two rows linear, else piecewise cubic with the derivatives of Fritsch and Butland (1984), "A method for
+    constructing local monotone piecewise cubic interpolants": a value stays between those of its two rows, so that no
+    gap can turn negative.
+    """
+    if len(x) == 1:
+        return list(rows[0])
+    i = min(max(bisect_right(x, place) - 1, 0), len(x) - 2)
+    step = x[i + 1] - x[i]
+    t = (place - x[i]) / step
+    if t in (0, 1):
+        return list(rows[i + int(t)])
+    found = []
+    for values in zip(*rows, strict=True):
+        d = _derivatives(x, values)
+        low, high = values[i], values[i + 1]
+        bump = t * (1 - t) * ((1 - t) * (d[i] * step - (high - low)) - t * (d[i + 1] * step - (high - low)))
+        found.append(low + t * (high - low) + bump)
+    return found
+
+
+def _derivatives(x: Sequence[float], values: Sequence[float]) -> list[float]:
+    """Derivative at every place: a weighted harmonic mean of those beside it, 0 at a turning point."""
+    steps = [b - a for a, b in zip(x, x[1:], strict=False)]
+    secants = [(b - a) / h for a, b, h in zip(values, values[1:], steps, strict=False)]
+    if len(secants) == 1:
+        return secants * 2
+    inner = []
+    for h0, h1, d0, d1 in zip(steps, steps[1:], secants, secants[1:], strict=False):
+        w0, w1 = 2 * h1 + h0, h1 + 2 * h0
+        inner.append((w0 + w1) / (w0 / d0 + w1 / d1) if d0 * d1 > 0 else 0.0)
+    return [_end(steps, secants), *inner, _end(steps[::-1], secants[::-1])]
+
+
+def _end(steps: Sequence[float], secants: Sequence[float]) -> float:
+    """Derivative at an end: of the parabola through three values, kept within what stays monotone."""
+    (h0, h1), (d0, d1) = steps[:2], secants[:2]
+    derivative = ((2 * h0 + h1) * d0 - h0 * d1) / (h0 + h1)
+    if derivative * d0 <= 0:
+        return 0.0
+    return 3 * d0 if d0 * d1 <= 0 and abs(derivative) > 3 * abs(d0) else derivative
+
+
+SAME_MM = 0.005  # gaps of two states that differ by less are the same: sources give two decimals
+
+
+def at_infinity(lens: Lens) -> Lens:
+    """The lens with its groups at their places for infinity focus."""
+    if not lens.infinity_mm:
+        return lens
+    return replace(lens.with_gaps(dict(lens.infinity_mm)), infinity_mm=())
+
+
+def infinity_states(lens: Lens) -> list[Configuration]:
+    """The zoom states of the source: those with the object at infinity."""
+    return [c for c in lens.configurations if c.object_distance_mm is None]
+
+
+def focus_states(lens: Lens) -> list[Configuration]:
+    """The focus states of the source: those with an object at a distance."""
+    return [c for c in lens.configurations if c.object_distance_mm is not None]
+
+
+def zoom_state_of(lens: Lens, near: Configuration) -> Configuration | None:
+    """The infinity state of the zoom position of a focus state; None where the file has none: its table then.
+
+    It is the one with the fewest different gaps, then with the smallest differences.
+    """
+
+    def unlikeness(base: Configuration) -> tuple[int, float]:
+        gaps = gaps_mm(lens, base)
+        differences = [abs(gaps[k] - t) for k, t in near.thickness_mm]
+        return sum(d > SAME_MM for d in differences), sum(differences)
+
+    return min(infinity_states(lens), key=unlikeness, default=None)
+
+
+def gaps_mm(lens: Lens, *states: Configuration | None) -> dict[int, float]:
+    """All thicknesses, by surface index, with those of the states on top of the lens's own, in that order."""
+    gaps = {k: s.thickness_mm for k, s in enumerate(lens.surfaces)}
+    for state in states:
+        gaps.update(() if state is None else state.thickness_mm)
+    return gaps
+
+
+@dataclass(frozen=True)
+class FocusPath:
+    """How the gaps move while focusing: `steps[j]` holds what is added to each gap at the state j, 0 at infinity.
+
+    `film` is the surface whose thickness is the distance to the film.
+    """
+
+    steps: tuple[Mapping[int, float], ...]
+    film: int
+
+    def moved(self, s: float) -> dict[int, float]:
+        """What is added to the gaps at the parameter s, from 0 (infinity) to the number of states beyond."""
+        j = min(int(s), len(self.steps) - 2)
+        share = s - j
+        low, high = self.steps[j], self.steps[j + 1]
+        return {k: low[k] * (1 - share) + high[k] * share for k in low}
+
+
+def focus_path(lens: Lens) -> FocusPath:
+    """The path of a lens at infinity focus, at a state of its zoom or between (then interpolated in log EFL).
+
+    Raises:
+        InputError: a file without focus states.
+    """
+    if not focus_states(lens):
+        raise InputError(lens.path, "focus", "internal", '"best" or "paraxial": the file has no focus states')
+    film = len(lens.surfaces) - 1
+    moved = sorted({film, *(k for c in focus_states(lens) for k, _ in c.thickness_mm)})
+    by_zoom: dict[Configuration | None, list[Configuration]] = {}
+    for c in focus_states(lens):
+        by_zoom.setdefault(zoom_state_of(lens, c), []).append(c)
+    stages = min(len(found) for found in by_zoom.values())
+    rows = []
+    for base, found in by_zoom.items():
+        start = gaps_mm(lens, base)
+        near = sorted(found, key=lambda c: -(c.object_distance_mm or math.inf))[-stages:]
+        ends = [gaps_mm(lens, base, c) for c in near]
+        efl = paraxial.first_order(lens.with_gaps(start)).efl_mm
+        rows.append((math.log(efl), [end[k] - start[k] for end in ends for k in moved]))
+    rows.sort()
+    place = math.log(paraxial.first_order(lens).efl_mm)
+    place = min(max(place, rows[0][0]), rows[-1][0])
+    flat = monotone([r[0] for r in rows], [r[1] for r in rows], place)
+    steps = [dict.fromkeys(moved, 0.0)]
+    for j in range(stages):
+        steps.append(dict(zip(moved, flat[j * len(moved) :], strict=False)))
+    return FocusPath(tuple(steps), film)
+
+
+def focused_inside(lens: Lens, focus_m: float | None, object_mm: float | None = None) -> Lens:
+    """The lens focused by moving its groups.
+
+    Args:
+        lens: at infinity focus; or in a focus state of its file, which is kept where `focus_m` is None.
+        focus_m: distance from object to film; None is infinity.
+        object_mm: from object to front vertex, of a focus state that was chosen by its name.
+
+    Raises:
+        InputError: a file without focus states, or a distance below the nearest, which it names.
+    """
+    if focus_m is None and object_mm is not None:
+        return replace(lens, film_z_mm=paraxial.image_z_mm(lens, -object_mm))
+    lens = at_infinity(lens)
+    path, place = _mover(lens)
+    wanted = 0.0 if focus_m is None else 1 / (1000 * focus_m)
+    furthest = len(path.steps) - 1
+    nearest = _vergence(place(furthest))
+    if not nearest > 0:
+        raise InputError(lens.path, "focus", "internal", "focus states that focus nearer than infinity")
+    if wanted > nearest * (1 + 1e-9):
+        limit = f"at least {_rounded_up(1 / nearest / 1000):g} m, the nearest focus of the source's states"
+        raise InputError(lens.path, "focus_m", focus_m, limit)
+    s = _solve(lambda s: _vergence(place(s)) - wanted, furthest) if wanted else 0.0
+    return replace(place(s), infinity_mm=tuple((k, lens.surfaces[k].thickness_mm) for k in path.steps[0]))
+
+
+def _rounded_up(value: float) -> float:
+    """A positive number rounded up to four digits: a distance printed as the limit must be accepted."""
+    step = 10.0 ** (math.floor(math.log10(value)) - 3)
+    return math.ceil(value / step - 1e-9) * step
+
+
+def nearest_focus_m(lens: Lens) -> float:
+    """Nearest distance from object to film that internal focusing reaches."""
+    path, place = _mover(at_infinity(lens))
+    return 1 / _vergence(place(len(path.steps) - 1)) / 1000
+
+
+def _mover(lens: Lens) -> tuple[FocusPath, Callable[[float], Lens]]:
+    """The path of a lens at infinity focus, and the lens with its groups moved along it, film fixed."""
+    path, back_mm = focus_path(lens), paraxial.first_order(lens).back_focus_mm
+
+    def place(s: float) -> Lens:
+        added = path.moved(s)
+        moved = lens.with_gaps({k: lens.surfaces[k].thickness_mm + v for k, v in added.items() if k != path.film})
+        return replace(moved, film_z_mm=moved.vertices_mm[path.film] + back_mm + added[path.film])
+
+    return path, place
+
+
+def _vergence(lens: Lens) -> float:
+    """1 / distance (1/mm) from the film to the object that is in focus on it; 0 for infinity (Newton: x x' = -f f')."""
+    data = paraxial.first_order(lens)
+    assert lens.film_z_mm is not None
+    extension = lens.film_z_mm - data.rear_focal_z_mm
+    return float(extension / (data.efl_mm * data.front_efl_mm + extension * (lens.film_z_mm - data.front_focal_z_mm)))
+
+
+def _solve(excess: Callable[[float], float], furthest: float) -> float:
+    """Root between 0 (below) and `furthest` (above): regula falsi with halving (Illinois), to rounding."""
+    low, high, f_low, f_high = 0.0, float(furthest), excess(0.0), excess(float(furthest))
+    for _ in range(100):
+        s = high - f_high * (high - low) / (f_high - f_low) if f_high != f_low else high
+        f = excess(s)
+        if f == 0 or abs(high - low) < 1e-14:
+            return s
+        if f > 0:
+            high, f_high, f_low = s, f, f_low / 2
+        else:
+            low, f_low, f_high = s, f, f_high / 2
+    return s
+
+
+_RINGS, _SPOKES = 512, 24
+_RINGS_OF_SPOKES = 64  # where the opening is not round
+_WIDER = 1.1  # the disc of rays over the paraxial entrance pupil: aberrations of the pupil move its edge
+_ROUNDS = 2  # the object's distance counts from the film: each round reduces the step by a factor of 100
+_SPARE = 0.05  # of a film range, added at both ends
+_NEAREST = 0.5  # of the way from the last surface to the paraxial image: no film of a range lies nearer
+
+
+def best_focus_z_mm(lens: Lens, focus_m: float = math.inf, wavelength_nm: tuple[float, float] | None = None) -> float:
+    """Film plane (lens frame, mm) of least RMS spot for the axial point `focus_m` metres from it, for a range of light,
+    by default `Lens.light_nm`.
+
+    Rays of the colours of `film_plane.colours` are spread evenly over the entrance pupil, and those that stop and rims
+    let through count: the focus of a lens with spherical aberration shifts as it is stopped down. The plane follows in
+    closed form: the spot's second moment is a parabola in z. With pure third-order spherical aberration it lies two
+    thirds of the way from the paraxial to the marginal focus; of a lens with cylinders it is that of the whole spot. A
+    pinhole's film stays in place.
+
+    Raises:
+        InputError: no ray passes, or focus nearer than four focal lengths.
+    """
+    film_z = _paraxial_film_z_mm(lens, focus_m)
+    if paraxial.is_pinhole(lens):
+        return film_z
+    wavelengths, weights = _colours(lens, wavelength_nm)
+    for _ in range(1 if math.isinf(focus_m) else _ROUNDS):
+        along, across = _moments(lens, film_z - 1000 * focus_m, wavelengths)
+        w = torch.from_numpy(weights)[:, None, None]
+        if not float(across.sum()) > 0:
+            raise InputError(lens.path, "focus", "best", "a lens that axial light passes and bends")
+        film_z = -float((w * along).sum() / (w * across).sum())
+    return film_z
+
+
+def _colours(lens: Lens, wavelength_nm: tuple[float, float] | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Wavelengths of best focus and their weights in a range, by default `Lens.light_nm`; one without dispersion."""
+    one = (lens.reference_nm, lens.reference_nm)
+    return film_plane.colours(wavelength_nm or lens.light_nm if lens.dispersive else one)
+
+
+_COARSER = 4.0  # stops below the widest by more are left to rays of their own: few rings lie within them
+
+
+def best_focus_of_stops_mm(
+    lens: Lens, focus_m: float, stops_mm: Sequence[float], wavelength_nm: tuple[float, float] | None = None
+) -> NDArray[np.float64]:
+    """`best_focus_z_mm` at some stop radii up to the lens's own, of those of its rays that each lets through.
+
+    Raises:
+        InputError: as `best_focus_z_mm`.
+    """
+    stops = np.asarray(stops_mm, np.float64)
+    if lens.anamorphic or lens.aperture is not None:  # too few rays for their parts
+        each = (lens.with_stop_radius(float(r)) for r in stops)
+        return np.array([best_focus_z_mm(one, focus_m, wavelength_nm) for one in each])
+    widest, whole = float(lens.stop_radius_mm), best_focus_z_mm(lens, focus_m, wavelength_nm)
+    if paraxial.is_pinhole(lens):
+        return np.full(stops.shape, whole)
+    small = stops < widest / _COARSER
+    found = np.empty(stops.shape)
+    if small.any():
+        narrow = lens.with_stop_radius(widest / _COARSER)
+        found[small] = best_focus_of_stops_mm(narrow, focus_m, stops[small].tolist(), wavelength_nm)
+    wavelengths, weights = _colours(lens, wavelength_nm)
+    moments = _moments(lens, whole - 1000 * focus_m, wavelengths, at_stop=True)
+    along, across, squared = (m.numpy() for m in moments)
+    # Rings are of equal areas: those at the edge count in part.
+    ring = (_WIDER * widest) ** 2 / along.shape[1]
+    share = ((stops[~small, None, None, None] ** 2 - squared) / ring + 0.5).clip(0, 1) * weights[:, None, None]
+    z = -(share * along).sum((1, 2, 3)) / (share * across).sum((1, 2, 3))
+    # The object keeps its distance from the film: where that moves, its image moves by the square of its scale, times
+    # the index behind the lens over that in front.
+    data = paraxial.first_order(lens)
+    scale = 0.0 if math.isinf(focus_m) else float((whole - data.rear_focal_z_mm) / data.efl_mm)
+    found[~small] = z + (z - whole) * scale**2 * (data.efl_mm / data.front_efl_mm)
+    return found
+
+
+def best_focused(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float] | None = None) -> Lens:
+    """A lens that `set_lens` has placed, by film or groups, with its film where `best_focus_z_mm` says."""
+    return replace(lens, film_z_mm=best_focus_z_mm(lens, focus_m, wavelength_nm))
+
+
+def _paraxial_film_z_mm(lens: Lens, focus_m: float) -> float:
+    """Film in the paraxial image; where it stands, of a lens whose groups have moved to focus."""
+    if lens.infinity_mm and lens.film_z_mm is not None:
+        return float(lens.film_z_mm)
+    return paraxial.film_z_mm(lens, focus_m)
+
+
+def film_range_mm(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float]) -> tuple[float, float]:
+    """Film planes that hold the paraxial image of an axial point, and its least spot at every aperture and colour.
+
+    What is least for all rays lies between what is least for each colour and meridian by itself. Arguments are those
+    of `best_focus_z_mm`.
+    """
+    image = _paraxial_film_z_mm(lens, focus_m)
+    if paraxial.is_pinhole(lens):
+        return image, image
+    colours = np.linspace(*wavelength_nm, film_plane.COLOURS if lens.dispersive else 1)
+    low = high = image
+    for _ in range(1 if math.isinf(focus_m) else _ROUNDS):
+        # The rays within each ring are those that a smaller stop lets through.
+        along, across = (m.cumsum(1) for m in _moments(lens, (low + high) / 2 - 1000 * focus_m, colours))
+        found = [image, *(-along / across)[across > 0].tolist()]
+        low, high = min(found), max(found)
+    spare, last = _SPARE * (high - low), float(lens.vertices_mm[len(lens.surfaces) - 1])
+    return max(low - spare, last + _NEAREST * (image - last)), high + spare
+
+
+def axial_rays(lens: Lens, object_z_mm: float) -> Rays:
+    """Rays [rings * spokes] to the film from a point of the axis (-inf allowed), of equal areas of the entrance pupil.
+
+    One spoke stands for all where lens and opening are round.
+    """
+    data = paraxial.first_order(lens)
+    round_ = not lens.anamorphic and lens.aperture is None
+    rings, spokes = (_RINGS, 1) if round_ else (_RINGS_OF_SPOKES, _SPOKES)
+    ring = torch.sqrt((torch.arange(rings, dtype=torch.float64) + 0.5) / rings)
+    spoke = 2 * math.pi * (torch.arange(spokes, dtype=torch.float64) + 0.5) / spokes
+    widest = max(data.entrance_pupil_diameter_mm, paraxial.first_order(lens, meridian="x").entrance_pupil_diameter_mm)
+    radius = _WIDER / 2 * widest * ring[:, None]
+    x, y = (radius * torch.cos(spoke)).reshape(-1), (radius * torch.sin(spoke)).reshape(-1)
+    # Started well in front of every lens, so that a front surface bulging towards the scene is still ahead.
+    front_mm = lens.surfaces[0].diameter_mm
+    start = -max(10.0, front_mm if math.isfinite(front_mm) else 10.0)
+    if math.isinf(object_z_mm):
+        zero = torch.zeros_like(x)
+        return Rays(x, y, zero + start, zero, zero, zero + 1)
+    depth = data.entrance_pupil_z_mm - object_z_mm
+    length = torch.sqrt(x * x + y * y + depth * depth) * math.copysign(1.0, depth)
+    dx, dy, dz = x / length, y / length, depth / length
+    t = (start - object_z_mm) / dz
+    if object_z_mm > start:
+        t = torch.zeros_like(t)
+    return Rays(dx * t, dy * t, object_z_mm + dz * t, dx, dy, dz)
+
+
+def _moments(
+    lens: Lens, object_z_mm: float, wavelength_nm: NDArray[np.float64], at_stop: bool = False
+) -> tuple[Tensor, ...]:
+    """Of each ray [colours, rings, spokes] x0 tx + y0 ty and tx^2 + ty^2, with (x0, y0) where it meets the plane z = 0
+    and (tx, ty) its slopes; 0 of one that is blocked. The sum of (x0 + z tx)^2 is least where the first make up for z
+    times the second. `at_stop`: the square of its radius there, too.
+    """
+    rays = axial_rays(lens, object_z_mm)
+    count, colours = len(rays.x), len(wavelength_nm)
+    record = (lens.stop_index,) if at_stop else ()
+    with torch.no_grad():
+        many = Rays(*(c.repeat(colours) for c in rays))
+        nm = torch.from_numpy(wavelength_nm).repeat_interleave(count)
+        out = trace(lens, many, nm, towards="film", record=record)
+    r, passed = out.rays, out.status == 0
+    tx, ty = r.dx / r.dz, r.dy / r.dz
+    along, across = (r.x - r.z * tx) * tx + (r.y - r.z * ty) * ty, tx * tx + ty * ty
+    shape = (colours, _RINGS, 1) if count == _RINGS else (colours, _RINGS_OF_SPOKES, _SPOKES)
+    found = [along.where(passed, 0.0), across.where(passed, 0.0)]
+    found += [c.x * c.x + c.y * c.y for c in out.crossings.values()]
+    return tuple(m.reshape(shape) for m in found)

@@ -1,0 +1,264 @@
+"""Rim diameters that follow from a stated rule, for tables that print none: patents rarely do.
+
+The rule: the stop is as wide as the f-number asks; every other rim lets through the whole beam of the axis, and of a
+field the rays whose height in the stop is within a share of the stop's radius that falls linearly from 1 on the axis to
+`vignetting` at the edge of the field. To that comes a clear edge. Where neighbours would touch inside their rims, they
+are shrunk to the height where they meet. Rays are real ones, d line, object at infinity; a zoom counts all its states.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+from neurolens.base.errors import InputError
+from neurolens.lens.paraxial import first_order, stop_radius_mm
+from neurolens.lens.prescription import Configuration, Lens, Surface
+from neurolens.trace.sag import end_mm, neighbours
+from neurolens.trace.shapes import sag_mm
+
+_FIELDS = 17  # from the axis to the edge; rims are usually widest at one of the ends
+_HEIGHTS = (-1.0, -0.75, -0.5, 0.0, 0.5, 0.75, 1.0)  # in the stop, as shares of what the rule lets through
+_STEP_MM = 1e-3  # diameters are given to a micrometre
+_STEPS = 64
+_ROUNDS = 12  # rims of aspheres settle in 2 to 4
+
+
+@dataclass(frozen=True)
+class RimRule:
+    """How rims are derived.
+
+    Attributes:
+        vignetting: share of the stop's height that is kept at the edge of the field, above 0, at most 1.
+        clear_edge: what a rim is wider than the rays need, relative to its diameter.
+        half_field_deg: edge of the field; None: that of the lens or of its image circle.
+    """
+
+    vignetting: float = 0.5
+    clear_edge: float = 0.01
+    half_field_deg: float | None = None
+
+
+@dataclass(frozen=True)
+class Rim:
+    """One row of the result; full diameters in mm.
+
+    Attributes:
+        tabled_mm: of the lens as it was given.
+        axis_mm, field_mm: what the beam of the axis and those of the field need, before the clear edge.
+        derived_mm: the diameter taken.
+        trimmed: whether a neighbour left less room than the rays need.
+    """
+
+    surface: int
+    tabled_mm: float
+    axis_mm: float
+    field_mm: float
+    derived_mm: float
+    trimmed: bool = False
+
+
+def derive_rims(lens: Lens, rule: RimRule | None = None) -> tuple[Lens, list[Rim]]:
+    """The lens with derived rims (marked `rims = "derived"`) and stops, and how they compare with those it had.
+
+    Raises:
+        InputError: a rule out of range, a lens without a stated field, a lens with cylinders, a field that no ray
+            through the middle of the stop reaches.
+    """
+    rule = rule or RimRule()
+    if not 0 < rule.vignetting <= 1:
+        raise InputError(lens.path, "vignetting", rule.vignetting, "a share of the pupil above 0 and at most 1")
+    if not 0 <= rule.clear_edge < 1:
+        raise InputError(lens.path, "clear edge", rule.clear_edge, "a share of the diameter from 0 to below 1")
+    if lens.anamorphic:
+        raise InputError(lens.path, "cylinder", "(an anamorphic lens)", "a lens that is symmetric about its axis")
+    states = list(_states(lens))
+    axis, field = [0.0] * len(lens.surfaces), [0.0] * len(lens.surfaces)
+    for state in states:
+        on_axis, off_axis = _beams(state, rule, rule.half_field_deg or half_field_deg(state))
+        axis, field = list(map(max, axis, on_axis)), list(map(max, field, off_axis))
+    needed = [2 * max(pair) for pair in zip(axis, field, strict=True)]
+    wide = [
+        min(math.ceil(d * (1 + rule.clear_edge) / _STEP_MM) * _STEP_MM, _end_mm(s))
+        for d, s in zip(needed, lens.surfaces, strict=True)
+    ]
+    wide[lens.stop_index] = 2 * states[0].stop_radius_mm
+    fitted = _clear_of_neighbours(states, wide)
+    rims = [
+        Rim(k, s.diameter_mm, 2 * axis[k], 2 * field[k], fitted[k], trimmed=fitted[k] < needed[k] and not s.stop)
+        for k, s in enumerate(lens.surfaces)
+    ]
+    surfaces = tuple(replace(s, diameter_mm=d) for s, d in zip(lens.surfaces, fitted, strict=True))
+    configurations = tuple(
+        replace(c, stop_diameter_mm=round(_stop_of(lens, c), 4)) if c.stop_diameter_mm or c.f_number else c
+        for c in lens.configurations
+    )
+    return replace(lens, surfaces=surfaces, configurations=configurations, rims="derived"), rims
+
+
+def narrowed_rims(lens: Lens) -> Lens:
+    """The lens with rims, but never the stop's, narrowed to where spheres end and neighbours touch in any state.
+
+    Rims of surfaces whose vertices lie in the wrong order stay: no width helps, and the check of clearance says so.
+    """
+    states = [lens, *(lens.with_gaps(dict(c.thickness_mm)) for c in lens.configurations)]
+    ends = [s.diameter_mm if s.stop else min(s.diameter_mm, _end_mm(s)) for s in lens.surfaces]
+    fitted = _clear_of_neighbours(states, ends)
+    rows = (
+        s if s.stop or d <= 0 or s.diameter_mm <= min(d + _STEP_MM, _end_mm(s)) else replace(s, diameter_mm=d)
+        for s, d in zip(lens.surfaces, fitted, strict=True)
+    )
+    return replace(lens, surfaces=tuple(rows))
+
+
+def with_derived_rims(lens: Lens) -> Lens:
+    """The lens with a diameter wherever it has none (NaN), by the rule as it is; given ones stay.
+
+    Raises:
+        InputError: as `derive_rims`, and where no field is stated.
+    """
+    missing = ", ".join(str(k) for k, s in enumerate(lens.surfaces) if math.isnan(s.diameter_mm))
+    if lens.half_field_deg is None and lens.image_radius_mm is None:
+        expected = "the clear diameter of every surface, or a field to derive rims for (half_field_deg, --half-field)"
+        raise InputError(lens.path, "diameter", f"(not given for surface {missing})", expected)
+    if math.isnan(lens.stop_radius_mm):
+        lens = lens.with_stop_radius(stop_radius_mm(lens, lens.f_number))
+    if not any(s.asphere and math.isnan(s.diameter_mm) for s in lens.surfaces):
+        return replace(_filled(lens, derive_rims(lens)[0]), rims="derived")
+    # Figures of aspheres are followed little beyond a rim: from the rims of their vertex spheres, until they stay.
+    found = _filled(lens, derive_rims(_spherical(lens))[0])
+    for _ in range(_ROUNDS):
+        before, found = found, _filled(lens, derive_rims(found)[0])
+        if found == before:
+            break
+    return replace(found, rims="derived")
+
+
+def _filled(lens: Lens, other: Lens) -> Lens:
+    pairs = zip(lens.surfaces, other.surfaces, strict=True)
+    rows = (replace(s, diameter_mm=o.diameter_mm) if math.isnan(s.diameter_mm) else s for s, o in pairs)
+    return replace(lens, surfaces=tuple(rows))
+
+
+def _spherical(lens: Lens) -> Lens:
+    radii = (1 / c if (c := s.vertex_curvature("y")) else math.inf for s in lens.surfaces)
+    rows = (replace(s, radius_mm=r, conic=0.0, asphere=()) for s, r in zip(lens.surfaces, radii, strict=True))
+    return replace(lens, surfaces=tuple(rows))
+
+
+def half_field_deg(lens: Lens) -> float:
+    """Half field of a lens: its own, or that of its image circle by r = f tan(field).
+
+    Raises:
+        InputError: neither is stated.
+    """
+    if lens.half_field_deg is not None:
+        return lens.half_field_deg
+    if lens.image_radius_mm is None:
+        raise InputError(lens.path, "half_field_deg", "(not stated)", "the edge of the field, to derive rims for it")
+    return math.degrees(math.atan(lens.image_radius_mm / abs(first_order(lens).front_efl_mm)))
+
+
+def _states(lens: Lens) -> Iterator[Lens]:
+    """The table and every zoom state of the lens with the stop of its f-number."""
+    yield lens.with_stop_radius(round(stop_radius_mm(lens, lens.f_number), 5))
+    for c in lens.configurations:
+        if c.object_distance_mm is None:
+            yield _moved(lens, c).with_stop_radius(_stop_of(lens, c) / 2)
+
+
+def _moved(lens: Lens, c: Configuration) -> Lens:
+    """The table with the thicknesses, field and f-number of a state."""
+    moved = lens.with_gaps(dict(c.thickness_mm))
+    return replace(moved, half_field_deg=lens.half_field_in(c), f_number=c.f_number or lens.f_number)
+
+
+def _stop_of(lens: Lens, c: Configuration) -> float:
+    """Diameter of the stop in a state; a focus state has that of the zoom state with the same tabled stop.
+
+    A state without f-number and stop has that of the table.
+    """
+    if c.object_distance_mm is not None:
+        same = [z for z in lens.configurations if z.object_distance_mm is None]
+        twin = next((z for z in same if z.stop_diameter_mm == c.stop_diameter_mm), None)
+        return _stop_of(lens, twin) if twin else 2 * stop_radius_mm(lens, lens.f_number)
+    if c.f_number is None and c.stop_diameter_mm is None:
+        return 2 * stop_radius_mm(lens, lens.f_number)  # one stop for all states
+    state = _moved(lens, c)
+    return 2 * stop_radius_mm(state, state.f_number)
+
+
+def _beams(lens: Lens, rule: RimRule, field_deg: float) -> tuple[list[float], list[float]]:
+    """Semi-diameters that the beam of the axis and those of the field need at every surface, mm."""
+    import torch  # rays are traced; rims are narrowed without it
+
+    from neurolens.trace.aiming import aim_at_stop, without_rims
+    from neurolens.trace.rays import trace
+
+    share = torch.linspace(0, 1, _FIELDS, dtype=torch.float64)
+    kept = lens.stop_radius_mm * (1 - (1 - rule.vignetting) * share)
+    heights = kept[:, None] * torch.tensor(_HEIGHTS, dtype=torch.float64)
+    bundle = aim_at_stop(lens, share * math.radians(field_deg), heights)
+    if not bundle.reached[:, len(_HEIGHTS) // 2].all():
+        widest = math.degrees(float(bundle.field_rad[-1, len(_HEIGHTS) // 2]))
+        expected = f"at most {widest:.3g}, where the chief ray ends"
+        if not 0 < widest < field_deg:  # a chief ray that turns back gives no limit
+            expected = "a field whose chief ray meets the middle of the stop: none does (a wrong radius or thickness?)"
+        raise InputError(lens.path, "half_field_deg", field_deg, expected)
+    every = range(len(lens.surfaces))
+    with torch.no_grad():
+        traced = trace(without_rims(lens), bundle.rays, towards="film", record=every)
+    usable = bundle.reached & (traced.status == 0).reshape(heights.shape)
+    at = torch.stack([traced.crossings[k].x.abs().reshape(heights.shape).where(usable, 0.0) for k in every])
+    return at[:, 0].amax(1).tolist(), at[:, 1:].amax((1, 2)).tolist()
+
+
+def _end_mm(surface: Surface) -> float:
+    """The widest diameter, just inside where the surface's conic ends."""
+    return 2 * end_mm(surface) * (1 - 1e-9)
+
+
+def _clear_of_neighbours(states: Sequence[Lens], diameters: Sequence[float]) -> list[float]:
+    """Diameters shrunk so that in no state two neighbours overlap inside the smaller of their rims; never the stop."""
+    found = list(diameters)
+    for state in states:
+        for k, after, gap in neighbours(state.surfaces):
+            smaller = min(found[k], found[after])
+            room = _meeting_height(state.surfaces[k], state.surfaces[after], gap, smaller / 2)
+            if 2 * room < smaller:
+                trimmed = _which_to_trim(state.surfaces[k], state.surfaces[after], k, after, room)
+                if state.stop_index in (k, after):  # a stop on glass keeps its size
+                    trimmed = (after if k == state.stop_index else k,)
+                for which in trimmed:
+                    found[which] = min(found[which], math.floor(2 * room / _STEP_MM) * _STEP_MM)
+    return [min(round(d, 4), _end_mm(s)) for d, s in zip(found, states[0].surfaces, strict=True)]
+
+
+def _which_to_trim(before: Surface, after: Surface, k: int, k_after: int, h: float) -> tuple[int, ...]:
+    """Choose of two surfaces that meet at height h the one whose flat, ground from there outwards, clears the other."""
+
+    def slope(s: Surface) -> float:
+        return sag_mm(s, h, 0.0) - sag_mm(s, 0.99 * h, 0.0)
+
+    if slope(after) >= 0:
+        return (k,)
+    return (k_after,) if slope(before) <= 0 else (k, k_after)
+
+
+def _meeting_height(before: Surface, after: Surface, gap: float, limit: float) -> float:
+    """Distance from the axis, up to `limit`, at which two surfaces first meet, mm."""
+
+    def clear(h: float) -> bool:
+        return gap + sag_mm(after, h, 0.0) - sag_mm(before, h, 0.0) >= 0
+
+    low = 0.0
+    for i in range(1, _STEPS + 1):
+        high = limit * i / _STEPS
+        if not clear(high):
+            for _ in range(60):
+                middle = (low + high) / 2
+                low, high = (middle, high) if clear(middle) else (low, middle)
+            return low
+        low = high
+    return limit

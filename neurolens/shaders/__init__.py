@@ -1,0 +1,1 @@
+"""Cameras as shaders of Open Shading Language and as source code for other integrators."""

@@ -1,0 +1,268 @@
+"""The pupil of every film point at any stop and film position, for shaders: the stop's disc, cut by circles.
+
+The rays that pass a lens cross its stop within the opening, and within what the rims before and behind the stop leave
+of it. Seen in points of the stop, rims are circles whose centres and radii are short polynomials of the film point.
+Samples fill what the circles have in common, and `stop_image` maps them to the pupil.
+
+Nothing here is a table: in a renderer's shader a table costs more than all of this. `pupil_outline` fits the pupil more
+closely, at one stop and focus.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, reduce
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.graph.ir import Exponents, Graph, Value
+from neurolens.shaders.blades import Blades
+from neurolens.shaders.stop_image import HAIR, StopImage, moving_polynomial
+
+Array = NDArray[np.float64]
+_NODES = ((-(0.5**0.5), 0.25), (0.0, 0.5), (0.5**0.5, 0.25))  # Gauss's nodes and weights over a disc, on a diameter
+_TIP = 1e-7  # of 1 - x^2 near the ends of a diameter
+_ROUNDS = 2  # of finding the blades from the pupil's middle: the pupil's width there depends on where they are
+
+
+@dataclass(frozen=True)
+class PupilCircles:
+    """Circles that hold the passing rays of film points, in points of the stop in units of `image.stop_mm`.
+
+    Attributes:
+        film_radius_mm: beyond it no light passes. image: from points of the stop to the pupil.
+        wide: how wide the stop's disc is, in units of the stop's radius: on the axis, and what is added by the square
+            of the film radius squared times the stop.
+        exponents: [M, 3] of film x and y, scaled as the image does, and of the film position.
+        numbers: [K, 3, M] of each rim's circle: u^2 + v^2 <= c + 2 a u + 2 b v with c, a, b of these monomials.
+        squeeze: film points' y is scaled by it for the direction in which the pupil of an anamorphic lens is filled.
+    """
+
+    film_radius_mm: float
+    image: StopImage
+    wide: tuple[float, float]
+    exponents: Exponents
+    numbers: Array
+    squeeze: float = 1.0
+
+    @cached_property
+    def graph(self) -> Graph:
+        """`sampler` of a round stop."""
+        return self.sampler()
+
+    def sampler(self, blades: type[Blades] | None = None, margin: float = 0.0) -> Graph:
+        """The pupil point of a film point and a point of the unit square.
+
+        Args:
+            blades: moves points of the disc towards its middle, to where the stop's blades end.
+            margin: by which blades are widened, in units of the stop's radius, as the image is not exact.
+
+        Inputs: `film_mm`, `square` [2], `wavelength_nm`; of the call `film_z_mm`, `stop_radius_mm`.
+        Outputs: `pupil_mm` [2]; `area_mm2`, the inverse of its density, 0 where nothing passes; `mean_area_mm2`, its
+        mean over the square of a round stop, as if the pupil were everywhere stretched as at the point; `at_stop` [2],
+        about where the ray crosses the stop, in units of its radius.
+        """
+        g = Graph()
+        film, square = g.input("film_mm", 2), g.input("square", 2)
+        film_z, nanometres = g.input("film_z_mm", per_call=True), g.input("wavelength_nm")
+        size = g.input("stop_radius_mm", per_call=True) * (1 / self.image.stop_mm)
+        anamorphic, (radius, turn, aside) = self.image.anamorphic, frame_of_film_point(film)
+        if self.squeeze != 1:
+            _, turn, aside = frame_of_film_point(film * [1.0, self.squeeze])
+        field = film if anamorphic else g.concat(radius, g.constant(0.0))
+        disc_radius = self._disc(field, size)
+        opening = _Circle(g.constant(0.0), None, disc_radius * disc_radius, disc_radius)
+        shape = _Shape([opening, *self._rims(field, film_z, turn)])
+
+        def at_stop(x: Value, y: Value) -> Value:
+            return (turn * x + aside * y) * (1.0 / size)
+
+        disc, share = unit_disc(square), g.constant(1.0)
+        if blades is not None:
+            share = _within_blades(disc, shape, at_stop, blades(g), margin)
+            disc = disc * share
+        x, y, tall = shape.point(disc, disc[0])
+        point = turn * x + aside * y if anamorphic else g.concat(x, y)
+        pupil, stretched = self.image.placed(field, film_z, nanometres, point * self.image.stop_mm)
+        if not anamorphic:
+            pupil = turn * pupil[0] + aside * pupil[1]
+        unit = stretched * (shape.half * (math.pi * self.image.stop_mm**2))
+        lit = (radius <= self.film_radius_mm) & (shape.low <= shape.high)
+        g.outputs = {"pupil_mm": pupil, "at_stop": at_stop(x, y)}
+        g.outputs["area_mm2"] = g.select(lit, tall * (share * share) * unit, 0.0)
+        g.outputs["mean_area_mm2"] = shape.mean_height() * unit
+        return g
+
+    def _disc(self, film: Value, size: Value) -> Value:
+        """The radius of the stop's disc."""
+        g = film.graph
+        grown = g.square(film * (1 / self.image.film_mm)) * size
+        # Named: states whose numbers equal others of the graph have the same structure as the rest.
+        first, second = (g.constant(value, f"wide {k}") for k, value in enumerate(self.wide))
+        return size * (grown * grown * second + first)
+
+    def _rims(self, field: Value, film_z: Value, turn: Value) -> list[_Circle]:
+        """The rims' circles in the frame in which the disc is filled."""
+        circles = []
+        for c, a, b in self._rows(field, film_z):
+            if self.image.anamorphic:
+                a, b = turn[0] * a + turn[1] * b, turn[0] * b - turn[1] * a
+                level = c + b * b
+                circles.append(_Circle(a, b, level, (level + a * a).maximum(0.0).sqrt()))
+            else:
+                circles.append(_Circle(a, None, c, (c + a * a).maximum(0.0).sqrt()))
+        return circles
+
+    def _rows(self, film: Value, film_z: Value) -> list[tuple[Value, Value, Value]]:
+        """c, a and b of every circle. Those that are 0 by symmetry have no terms."""
+        g, (middle, half) = film.graph, self.image.film_z_mm
+        position, variables = (film_z - middle) * (1 / half), film * (1 / self.image.film_mm)
+        circles = []
+        for numbers in self.numbers:
+            rows = []
+            for k, row in enumerate(numbers):
+                terms = self._terms(k)
+                some = (
+                    moving_polynomial(self.exponents[terms], row[terms], variables, position) if terms.any() else None
+                )
+                rows.append(g.constant(0.0) if some is None else some)
+            circles.append((rows[0], rows[1], rows[2]))
+        return circles
+
+    def _terms(self, row: int) -> NDArray[np.bool_]:
+        """Which monomials c, a or b has, by symmetry."""
+        x, y = self.exponents[:, 0] + (row == 1), self.exponents[:, 1] + (row == 2)
+        return np.asarray((x % 2 == 0) & (y % 2 == 0) & (self.image.anamorphic | (row < 2)))
+
+    @cached_property
+    def checked(self) -> Graph:
+        """How far points of the stop lie inside: inputs `film_mm`, `point_mm` [2], `film_z_mm`, `stop_radius_mm`; for a
+        round lens in the film point's frame. Output `within`: of the disc, then of the circles."""
+        g = Graph()
+        film, point = g.input("film_mm", 2), g.input("point_mm", 2) * (1 / self.image.stop_mm)
+        size = g.input("stop_radius_mm") * (1 / self.image.stop_mm)
+        square, disc = g.square(point), self._disc(film, size)
+        rows = [disc * disc - square]
+        for c, a, b in self._rows(film, g.input("film_z_mm")):
+            rows.append(c + (a * point[0] + b * point[1]) * 2.0 - square)
+        g.outputs["within"] = g.concat(*rows)
+        return g
+
+    def mixed(self, others: Sequence[PupilCircles], weights: Array) -> PupilCircles:
+        """The pupil of a state between states, with these weights of itself and of others of the same lens."""
+        states = [self, *others]
+
+        def mean(values: Sequence[Array | float]) -> Array:
+            return np.tensordot(weights, np.asarray(values, np.float64), 1)
+
+        middle, half = zip(*(s.image.film_z_mm for s in states), strict=True)
+        image = replace(
+            self.image,
+            film_z_mm=(float(mean(middle)), 1 / float(mean([1 / h for h in half]))),
+            numbers=mean([s.image.numbers for s in states]),
+        )
+        first, second = mean([np.array(s.wide) for s in states])
+        radius, numbers = float(mean([s.film_radius_mm for s in states])), mean([s.numbers for s in states])
+        return replace(self, film_radius_mm=radius, image=image, wide=(first, second), numbers=numbers)
+
+
+@dataclass(frozen=True)
+class _Circle:
+    """A circle (x' - x)^2 + (y' - y)^2 <= radius^2 in the frame in which the disc is filled, where y is None if all
+    centres lie on the x axis. Its half height at x' is the root of level + 2 x x' - x'^2."""
+
+    x: Value
+    y: Value | None
+    level: Value
+    radius: Value
+
+    @property
+    def low(self) -> Value:
+        return self.x - self.radius
+
+    @property
+    def high(self) -> Value:
+        return self.x + self.radius
+
+
+class _Shape:
+    """What circles have in common, the first of them that of the stop; the unit disc maps to it chord by chord, so that
+    densities stay nearly even."""
+
+    def __init__(self, circles: Sequence[_Circle]) -> None:
+        self.circles = circles
+        self.low = reduce(Value.maximum, (c.low for c in circles))
+        self.high = reduce(Value.minimum, (c.high for c in circles))
+        self.half, self.middle = (self.high - self.low) * 0.5, (self.low + self.high) * 0.5
+
+    def chord(self, x: Value) -> tuple[Value | None, Value]:
+        """The middle along y (None: 0) of the chord at x of the unit disc, and its half height over the disc's."""
+        square, at = ((x + 1.0) * (1.0 - x)).maximum(_TIP), self.middle + self.half * x
+        twice, below = at * 2.0, at * at
+        levels = [c.level + c.x * twice for c in self.circles]
+        if all(c.y is None for c in self.circles):
+            return None, ((reduce(Value.minimum, levels) - below) / square).maximum(0.0).sqrt()
+        first, *others = ((level - below).maximum(0.0).sqrt() for level in levels)
+        top, bottom = first, -first
+        for circle, tall in zip(self.circles[1:], others, strict=True):
+            assert circle.y is not None
+            top, bottom = top.minimum(circle.y + tall), bottom.maximum(circle.y - tall)
+        return (top + bottom) * 0.5, ((top - bottom) * 0.5).maximum(0.0) / square.sqrt()
+
+    def point(self, disc: Value, x: Value) -> tuple[Value, Value, Value]:
+        """x, y and the half height over that of the disc, for a point of the unit disc on the chord at x."""
+        centre, tall = self.chord(x)
+        y = disc[1] * tall
+        return self.middle + self.half * disc[0], y if centre is None else centre + y, tall
+
+    def mean_height(self) -> Value:
+        one = self.half.graph.constant(1.0)
+        heights = [self.chord(one * x)[1] * weight for x, weight in _NODES]
+        return heights[0] + heights[1] + heights[2]
+
+
+def _within_blades(
+    disc: Value, shape: _Shape, at_stop: Callable[[Value, Value], Value], blades: Blades, margin: float
+) -> Value:
+    """The factor that moves a point of the disc towards the middle until it lies within the blades."""
+    g = disc.graph
+    centre, _ = shape.chord(g.constant(0.0))
+    start = at_stop(shape.middle, g.constant(0.0) if centre is None else centre)
+    direction, share = disc * (1.0 / (g.square(disc).sqrt() + HAIR)), g.constant(1.0)
+    for _ in range(_ROUNDS):
+        x, y, _ = shape.point(direction, direction[0] * share)
+        share = blades.drawn(start, at_stop(x, y) - start, margin)
+    return share
+
+
+def frame_of_film_point(film: Value) -> tuple[Value, Value, Value]:
+    """Its distance from the axis, and unit vectors towards it and across."""
+    radius = film.graph.square(film).sqrt()
+    turn = (film + [HAIR, 0.0]) * (1.0 / (radius + HAIR))
+    return radius, turn, film.graph.affine([[0.0, -1.0], [1.0, 0.0]], turn)
+
+
+def unit_disc(square: Value) -> Value:
+    """The point [2] of the unit disc of a point of the unit square, evenly (Shirley and Chiu 1997)."""
+    g = square.graph
+    a, b = g.split(square * 2.0 - 1.0, (1, 1))
+    flat = b * b <= a * a
+    size = g.select(flat, a, b)
+    angle = g.select(flat, b, a) / g.select(size * size <= HAIR, 1.0, size)
+    squared = angle * angle
+    cos = size * g.series(squared, _COS)
+    sin = size * angle * g.series(squared, _SIN)
+    return g.concat(g.select(flat, cos, sin), g.select(flat, sin, cos))
+
+
+def _series(function: Callable[[Array], Array]) -> Array:
+    """The polynomial of a function of squares of angles up to pi / 4, in units of that, to float32's last bit."""
+    fit = np.polynomial.Chebyshev.interpolate(function, 3, [0, 1])
+    return np.asarray(fit.convert(kind=np.polynomial.Polynomial).coef, np.float64)
+
+
+_COS = _series(lambda s: np.cos(np.pi / 4 * np.sqrt(np.maximum(s, 0))))
+_SIN = _series(lambda s: np.pi / 4 * np.sinc(np.sqrt(np.maximum(s, 0)) / 4))

@@ -1,0 +1,351 @@
+"""Fits the circles of `pupil_circles` to the rays that pass a lens.
+
+In points of the stop, whether a ray lies within a rim's circle is linear in the circle's numbers: logistic regression
+separates the rays that pass from those that this rim blocks. Rays that pass weigh more, zone by zone of the film and
+the stop, until few enough of them are lost. Where the stop's image folds, or circles lose too much, `pupil_disc` holds
+them all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
+from neurolens.base.progress import Report
+from neurolens.graph.interpret import evaluate
+from neurolens.graph.ir import Exponents
+from neurolens.shaders.pupil_circles import PupilCircles
+from neurolens.shaders.pupil_disc import PupilDisc, disc_lost, fit_discs
+from neurolens.shaders.pupil_passing import passing_share
+from neurolens.shaders.shader_lens import ShaderLens
+from neurolens.shaders.stop_image import StopImage, draw_rays, fit_stop_images
+
+Array = NDArray[np.float64]
+Truths = NDArray[np.bool_]
+_RAYS, _FIRST = 12_000, 60_000  # random rays of a zone; those of all to which circles are fitted first
+_STOPS = (0.08, 0.16, 0.25, 0.35, 0.5, 0.7, 0.85, 1.0, 1.0, 1.0)  # of the widest stop
+_AROUND = 1.1  # stop radii, within which rays are drawn
+_BESIDE, _FOLDED = 0.25, 0.01  # of the pupil's size, and the share of rays that may lie so far from the image
+# Highest powers of the film point of round lenses and anamorphic ones; of terms with the film position and its square.
+_DEGREE, _MOVING = (8, 4), (3, 1)
+_RARE = 0.006  # of rays, which a rim has to block to have a circle
+_ZONES, _FEW = (8, 3, 3), 2500  # of film radius squared, azimuth and stop; rays that tell about a zone
+_ALL = int(np.prod(_ZONES))
+_SQUEEZES = (1.0, 0.7, 0.5, 0.35, 1.4, 2.0)  # those that are tried
+_WITHIN = 0.97  # stop radii: what is blocked further out may be blocked by the stop
+_PARTS, _NEAR = 16, 12.0  # of many rays; margins of rays near a circle
+_ROUNDS, _STRIDE, _HALVINGS = 25, 30.0, 6  # of Newton's rule; the longest change of a margin in a step
+_WEIGHTS, _HEAVIER = (2.0, 5.0, 3e4), 1.6  # of rays that pass: least, first and greatest; its greatest step
+_GOAL = 2e-4  # the share of a zone's rays that a circle may lose while it is fitted
+_RIDGE, _LEAST, _FLATTEST = 1e-9, 1e-4, 0.02  # of Newton's matrix; of a circle's curvature by its greatest number
+_CALM = 1e-3  # rays, by whose force numbers stay at those that all states share
+_ALLOWED = (6e-4, 6e-4, 4e-4, 2e-4)  # shares of a zone's new rays that all circles may lose, in turn until at most
+LOST = 1e-3  # of a zone's rays are lost in all
+_NEIGHBOUR = 0.3  # of the greatest weight, which nodes beside a state have
+_INNER = 0.1  # zones of a smaller part of what `PupilCircles.wide` grows by count as the axis
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """Random rays [N] through points of the stop: inputs of `PupilCircles.checked`, status and zone."""
+
+    inputs: dict[str, Array]
+    codes: NDArray[np.int32]
+    zone: NDArray[np.intp]
+
+    @property
+    def passed(self) -> Truths:
+        return np.asarray(self.codes == st.PASSED)
+
+    def first(self, count: int) -> _Rays:
+        return _Rays({name: row[:, :count] for name, row in self.inputs.items()}, self.codes[:count], self.zone[:count])
+
+
+def fit_pupil(
+    lenses: Sequence[ShaderLens], report: Report, between: Sequence[tuple[Array, ShaderLens]] = ()
+) -> Sequence[PupilCircles] | Sequence[PupilDisc]:
+    """The pupil of a lens in each of its states. All but 1 in 1000 of the rays that pass, in any zone, lie inside.
+
+    Args:
+        lenses: the lens at each node of its states.
+        between: weights of the nodes and the lens in states between them: mixtures of the pupils hold its rays, too.
+
+    Raises:
+        InputError: no ray passes.
+    """
+    images = fit_stop_images(lenses)
+    if images is None:
+        raise InputError("export", "pupil", "(no ray passes)", "a lens that light can pass")
+    if max(_beside(*pair) for pair in zip(lenses, images, strict=True)) <= _FOLDED:
+        pupils, lost = _fit_circles(lenses, images, report, between)
+        if lost <= LOST:
+            return pupils
+    return fit_discs(lenses, report, between)
+
+
+def _fit_circles(
+    lenses: Sequence[ShaderLens], images: Sequence[StopImage], report: Report,
+    between: Sequence[tuple[Array, ShaderLens]],
+) -> tuple[list[PupilCircles], float]:  # fmt: skip
+    """Circles, and the share of the rays of the worst zone that they lose."""
+    exponents, pairs = _exponents(lenses[0].anamorphic), list(zip(lenses, images, strict=True))
+    pupils = [PupilCircles(lens.end_of_light_mm(), image, (1.0, 0.0), exponents[:0, :3], np.zeros((0, 3, 0)))
+              for lens, image in pairs]  # fmt: skip
+    rays = [_drawn(lens, pupil, 0) for lens, pupil in zip(lenses, pupils, strict=True)]
+    rims = _rims(lenses[0], rays)
+    first = _fit_first(rays, pupils, exponents, rims)
+    for k, (pupil, drawn) in enumerate(zip(pupils, rays, strict=True)):
+        numbers = _fit_rims(drawn, pupil, exponents, rims, first)
+        pupils[k] = _with_circles(replace(pupil, wide=_disc(pupil, drawn, len(rims))), exponents, numbers)
+        report((k + 1) / (len(pupils) + 1))
+    pupils, lost = _widened(pupils, lenses, between)
+    if lenses[0].anamorphic and len(rims):
+        squeezed = [[replace(p, squeeze=s) for p in pupils] for s in _SQUEEZES]
+        pupils = max(squeezed, key=lambda states: passing_share(lenses[0], states[0], (1.0,))[1.0])
+    return pupils, lost
+
+
+def _widened(
+    pupils: list[PupilCircles], lenses: Sequence[ShaderLens], between: Sequence[tuple[Array, ShaderLens]]
+) -> tuple[list[PupilCircles], float]:
+    """Circles as much wider as new random rays need, and the share that they lose of others."""
+    states = [*zip(np.eye(len(pupils)), lenses, strict=True), *between]
+    lost = 1.0
+    for seed, allowed in enumerate((*_ALLOWED, 0.0)):
+        lost_of = []
+        for weights, lens in states:
+            mixed = pupils[0].mixed(pupils[1:], weights)
+            rays = _drawn(lens, mixed, 1 + seed)
+            within = evaluate(mixed.checked, rays.inputs)["within"]
+            lost_of.append(_lost(rays, within))
+            if allowed and (seed == 0 or lost_of[-1] > LOST):
+                needs = [[n for _, n in _needs(rays, margin, allowed / len(within))] for margin in within[1:]]
+                more = np.array([max([0.0, *need]) for need in needs])
+                near = weights > _NEIGHBOUR * weights.max()  # the nodes on both sides of a state between them
+                more /= weights[near].sum()
+                pupils = [_wider(p, more) if w else p for p, w in zip(pupils, near, strict=True)]
+        lost = max(lost_of)
+        if seed and lost <= LOST:
+            break
+    return pupils, lost
+
+
+def _wider(pupil: PupilCircles, more: Array) -> PupilCircles:
+    numbers = pupil.numbers.copy()
+    numbers[:, 0, (pupil.exponents == 0).all(1)] += more[:, None]
+    return replace(pupil, numbers=numbers)
+
+
+def _rims(lens: ShaderLens, rays: Sequence[_Rays]) -> list[int]:
+    """Status codes of the rims that block more than a few rays in some state."""
+    codes = np.unique(np.concatenate([r.codes for r in rays]))
+    others = [int(c) for c in codes if c > st.NO_SOLUTION and c != st.blocked(lens.stop_surface, st.RIM)]
+    return [c for c in others if max(np.mean(r.codes == c) for r in rays) > _RARE]
+
+
+def _fit_first(
+    rays: Sequence[_Rays], pupils: Sequence[PupilCircles], exponents: Exponents, rims: Sequence[int]
+) -> Array:
+    """Numbers [K, M + 1] of the rims' circles, the same in all states, fitted to a few rays of each."""
+    numbers = np.zeros((len(rims), len(exponents) + 1))
+    few = [r.first(_FIRST // len(rays)) for r in rays]
+    for k, code in enumerate(rims):
+        rows = [np.flatnonzero(r.passed | (r.codes == code)) for r in few]
+        features = [_features(r, p, exponents, chosen) for r, p, chosen in zip(few, pupils, rows, strict=True)]
+        inside = np.concatenate([r.passed[chosen] for r, chosen in zip(few, rows, strict=True)])
+        numbers[k] = _separated(np.concatenate(features, 1), inside, numbers[k])
+    return numbers
+
+
+def _fit_rims(rays: _Rays, pupil: PupilCircles, exponents: Exponents, rims: Sequence[int], first: Array) -> Array:
+    """Numbers of the rims' circles in a state, from those that all states share: fitted to all rays that lie near them
+    or on their wrong side."""
+    numbers, blame = first.copy(), _blame(rays, pupil, exponents, rims, first)
+    lit = np.bincount(rays.zone[rays.passed], minlength=_ALL)
+    for k in range(len(rims)):
+        rows = np.flatnonzero(rays.passed | (blame == k))
+        parts = [numbers[k] @ _features(rays, pupil, exponents, part) for part in np.array_split(rows, _PARTS)]
+        margin = np.concatenate(parts)
+        rows = rows[np.where(rays.passed[rows], margin, -margin) < _NEAR]
+        features = _features(rays, pupil, exponents, rows)
+        numbers[k] = _separated(features, rays.passed[rows], numbers[k], rays.zone[rows], lit)
+    return numbers
+
+
+def _blame(
+    rays: _Rays, pupil: PupilCircles, exponents: Exponents, rims: Sequence[int], numbers: Array
+) -> NDArray[np.intp]:
+    """[N] the circle that should stop a blocked ray: that of its rim, or else the nearest; -1 where none should."""
+    blame = np.full(rays.codes.size, -1)
+    for k, code in enumerate(rims):
+        blame[rays.codes == code] = k
+    size = rays.inputs["stop_radius_mm"][0]
+    others = ~rays.passed & (blame < 0) & (np.hypot(*rays.inputs["point_mm"]) < _WITHIN * size)
+    for part in np.array_split(np.flatnonzero(others), _PARTS) if rims else ():
+        blame[part] = (numbers @ _features(rays, pupil, exponents, part)).argmin(0)
+    return blame
+
+
+def _with_circles(pupil: PupilCircles, exponents: Exponents, numbers: Array) -> PupilCircles:
+    """The pupil with circles of these numbers [K, M + 1]."""
+    monomials = np.unique(exponents[:, :3], axis=0)
+    rows = np.zeros((len(numbers), 3, len(monomials)))
+    for powers, values in zip(exponents, (numbers[:, :-1] / numbers[:, -1:]).T, strict=True):
+        kind = int(powers[3] + 2 * powers[4])
+        rows[:, kind, (monomials == powers[:3]).all(1)] = values[:, None] / (2 if kind else 1)
+    return replace(pupil, exponents=monomials, numbers=rows)
+
+
+def _exponents(anamorphic: bool) -> Exponents:
+    """[M, 5] of film x, y, film position, stop x, y: terms that mirrors leave alone, linear in the stop point."""
+    terms, degree = [], _DEGREE[anamorphic]
+    for i in range(degree + 1):
+        for j in range(degree + 1 if anamorphic else 1):
+            for u, v in ((0, 0), (1, 0), (0, 1)):
+                if i + j <= degree and (i + u) % 2 == 0 and (j + v) % 2 == 0:
+                    terms += [(i, j, k, u, v) for k in range(3) if k == 0 or i + j + u + v <= _MOVING[k - 1]]
+    return np.array(terms, np.int64)
+
+
+def _drawn(lens: ShaderLens, pupil: PupilCircles, seed: int) -> _Rays:
+    """Random rays through points of all stops and a little beyond."""
+    rng, count = np.random.default_rng(seed), _RAYS * (_ALL if lens.anamorphic else _ALL // _ZONES[1])
+    radius = pupil.film_radius_mm * 0.9999 * rng.random(count) ** 0.5
+    angle = 2 * np.pi * rng.random(count) if lens.anamorphic else np.zeros(count)
+    film = radius * np.stack([np.cos(angle), np.sin(angle)])
+    z, nm = (rng.uniform(*span, count) for span in (lens.film_z_mm, lens.wavelength_nm))
+    share = rng.choice(_STOPS, count)
+    size, turn = _AROUND * share * np.sqrt(rng.random(count)), 2 * np.pi * rng.random(count)
+    point = size * lens.stop_radius_mm * np.stack([np.cos(turn), np.sin(turn)])
+    through = replace(lens, graph=pupil.image.through_stop(lens.graph))
+    codes = through.status(film, point, nm, z, share * lens.stop_radius_mm)
+    inputs = {"film_mm": film, "point_mm": point, "film_z_mm": z[None]}
+    inputs["stop_radius_mm"] = share[None] * lens.stop_radius_mm
+    aside = np.abs(np.arctan2(np.abs(film[1]), np.abs(film[0]))) / (np.pi / 2)
+    shares = (radius / pupil.film_radius_mm) ** 2, aside, share * 0.7501  # the widest stop is a separate zone
+    zones = [np.minimum(s * n, n - 1).astype(np.intp) for s, n in zip(shares, _ZONES, strict=True)]
+    return _Rays(inputs, codes, np.ravel_multi_index(zones, _ZONES))
+
+
+def _disc(pupil: PupilCircles, rays: _Rays, rims: int) -> tuple[float, float]:
+    """`PupilCircles.wide`: images err most where the film ends."""
+    size = rays.inputs["stop_radius_mm"][0] / pupil.image.stop_mm
+    beyond = np.hypot(*rays.inputs["point_mm"]) / pupil.image.stop_mm / size - 1
+    growth = (np.square(rays.inputs["film_mm"]).sum(0) / pupil.image.film_mm**2 * size) ** 2
+    needs = [(float(growth[zone].mean()), need) for zone, need in _needs(rays, -beyond, _ALLOWED[0] / (rims + 1))]
+    inner = max(0.0, *(need for at, need in needs if at < _INNER))
+    return 1 + inner, max(0.0, *((need - inner) / at for at, need in needs if at >= _INNER))
+
+
+def _needs(rays: _Rays, within: Array, share: float) -> list[tuple[Truths, float]]:
+    """The rays that pass in each zone, and by how much their margins lack, so that this share at most is lost."""
+    needs = []
+    for zone in np.unique(rays.zone):
+        rows = rays.passed & (rays.zone == zone)
+        margin, spare = within[rows], round(share * max(rows.sum(), _FEW))
+        if margin.size > spare:
+            needs.append((rows, -float(np.partition(margin, spare)[spare])))
+    return needs
+
+
+def _separated(
+    features: Array,
+    inside: Truths,
+    first: Array,
+    zone: NDArray[np.intp] | None = None,
+    lit: NDArray[np.intp] | None = None,
+) -> Array:
+    """Numbers [M + 1] of a circle which separate rays inside from the others: logistic regression on features
+    [M + 1, N], from the numbers `first`; these stay where no ray tells otherwise.
+
+    Args:
+        zone, lit: of each ray, and how many pass in each zone. Rays of zones that lose many weigh more.
+    """
+    numbers, weight = first, np.full(_ALL, _WEIGHTS[1])
+    calm = _CALM * np.square(features).mean(1)
+    for _ in range(_ROUNDS):
+        chance = 1 / (1 + np.exp(-np.clip(numbers @ features, -40, 40)))
+        force = np.where(inside, _WEIGHTS[1] if zone is None else weight[zone], 1.0)
+        matrix = (features * (force * np.maximum(chance * (1 - chance), _LEAST))) @ features.T
+        matrix += np.diag(_RIDGE * np.diag(matrix) + calm)
+        step = -np.linalg.solve(matrix, features @ (force * (chance - inside)) + calm * (numbers - first))
+        numbers = _stepped(numbers, step, first, features, inside, force, calm)
+        if zone is None or lit is None:
+            continue
+        lost = np.bincount(zone[inside & (numbers @ features < 0)], minlength=_ALL) / np.maximum(lit, _FEW / 3)
+        change = ((lost + _GOAL / 5) / (_GOAL * 1.2)).clip(1 / _HEAVIER, _HEAVIER)
+        weight = (weight * change).clip(_WEIGHTS[0], _WEIGHTS[2])
+    return numbers
+
+
+def _stepped(
+    numbers: Array, step: Array, first: Array, features: Array, inside: Truths, force: Array, calm: Array
+) -> Array:
+    """Numbers after a step of Newton's rule, or a part of it that makes the fit better."""
+
+    def error(numbers: Array) -> float:
+        margin = np.where(inside, 1.0, -1.0) * (numbers @ features)
+        return float(force @ np.logaddexp(0, -margin) + calm @ (numbers - first) ** 2 / 2)
+
+    step, before = step * min(1.0, _STRIDE / float(np.abs(step @ features).max())), error(numbers)
+    for _ in range(_HALVINGS):
+        after = numbers + step
+        after[-1] = max(after[-1], _FLATTEST * float(np.abs(after[:-1]).max()))
+        if error(after) < before:
+            return after
+        step = step / 2
+    return numbers
+
+
+def _features(rays: _Rays, pupil: PupilCircles, exponents: Exponents, rows: NDArray[np.intp]) -> Array:
+    """[M + 1, N] what a circle's margin is linear in, for some of the rays."""
+    inputs, image = rays.inputs, pupil.image
+    point = inputs["point_mm"][:, rows] / image.stop_mm
+    position = (inputs["film_z_mm"][:, rows] - image.film_z_mm[0]) / image.film_z_mm[1]
+    variables = np.concatenate([inputs["film_mm"][:, rows] / image.film_mm, position, point])
+    features = np.ones((len(exponents) + 1, rows.size))
+    for feature, powers in zip(features, exponents, strict=False):
+        for value, power in zip(variables, powers, strict=True):
+            if power:
+                feature *= value**power
+    features[-1] = -np.sum(point**2, axis=0)
+    return features
+
+
+def _lost(rays: _Rays, within: Array) -> float:
+    """The share of the rays that pass which lie outside, in the worst zone."""
+    passed, missed = _missed(rays, within)
+    return float((missed / np.maximum(passed, _FEW)).max())
+
+
+def _missed(rays: _Rays, within: Array) -> Array:
+    """How many rays pass [2, zones], and how many of them lie outside."""
+    out = rays.passed & (within < 0).any(0)
+    return np.stack([np.bincount(rays.zone[rows], minlength=_ALL) for rows in (rays.passed, out)])
+
+
+def light_lost(lens: ShaderLens, pupil: PupilCircles | PupilDisc, draws: int = 4) -> float:
+    """The share of the rays that pass which no sample is, in the worst zone of film and stop, by new random rays."""
+    if isinstance(pupil, PupilDisc):
+        return disc_lost(pupil, lens)
+    counts = np.zeros((2, _ALL))
+    for seed in range(draws):
+        rays = _drawn(lens, pupil, 100 + seed)
+        counts += _missed(rays, evaluate(pupil.checked, rays.inputs)["within"])
+    return float((counts[1] / np.maximum(counts[0], _FEW)).max())
+
+
+def _beside(lens: ShaderLens, image: StopImage) -> float:
+    """The share of random rays that pass far beside the image of their point of the stop, in the worst part of the
+    film: where an image folds, two pupil points show one point of the stop."""
+    rays = draw_rays(lens, None, 5)
+    inputs = {"film_mm": rays.film_mm, "point_mm": rays.point_mm}
+    inputs |= {"film_z_mm": rays.film_z_mm[None], "wavelength_nm": rays.wavelength_nm[None]}
+    away = np.hypot(*(evaluate(image.graph, inputs)["pupil_mm"] - rays.pupil_mm)) > _BESIDE * rays.pupil_mm.std()
+    part = (np.square(rays.film_mm).sum(0) / lens.film_radius_mm**2 * _ZONES[0]).astype(np.intp)
+    return float((np.bincount(part, away) / np.maximum(np.bincount(part), _FEW)).max())

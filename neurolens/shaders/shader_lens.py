@@ -1,0 +1,94 @@
+"""A lens in one state as a shader uses it: its graph over ranges of film position, wavelength and stop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from neurolens.base import status as st
+from neurolens.cameras.contract import FloatArray
+from neurolens.cameras.pupil_boxes import PupilTable, asking, end_of_light
+from neurolens.graph.interpret import evaluate
+from neurolens.graph.ir import Graph
+from neurolens.shaders.focus_function import Focusing
+
+_PART = 1 << 15  # rays that are evaluated together
+
+
+@dataclass(frozen=True)
+class ShaderLens:
+    """A lens in one state.
+
+    Attributes:
+        graph: the lens; see `fused.LensGraph`.
+        table: boxes on the pupil plane that hold the rays which pass.
+        film_z_mm, wavelength_nm: the ranges. stop_radius_mm: the widest stop.
+        stop_surface: its number, for the status of the rays that it blocks.
+        anamorphic: whether the lens is symmetric about the x and y axes only.
+        focusing: where the film stands. f_number: of the widest stop. efl_mm: the focal length.
+    """
+
+    graph: Graph
+    table: PupilTable
+    film_z_mm: tuple[float, float]
+    wavelength_nm: tuple[float, float]
+    stop_radius_mm: float
+    stop_surface: int
+    anamorphic: bool
+    focusing: Focusing
+    f_number: float
+    efl_mm: float
+
+    @property
+    def film_radius_mm(self) -> float:
+        """The model knows no ray from beyond it."""
+        return self.table.film_radius_mm
+
+    def end_of_light_mm(self) -> float:
+        """The film radius at which light ends."""
+        low, high = self.film_z_mm
+        radii = [0.0]
+        for z in {low, (low + high) / 2, high}:
+            for azimuth in np.linspace(0, np.pi / 2, 4) if self.anamorphic else [0.0]:
+                passes = partial(self._passes, film_z=z, azimuth=azimuth)
+                radii.append(end_of_light(self.table, asking(passes, self.wavelength_nm)) or 0.0)
+        return min(max(radii), self.film_radius_mm)
+
+    def _passes(
+        self, film: FloatArray, pupil: FloatArray, nanometres: float, film_z: float, azimuth: float
+    ) -> NDArray[np.bool_]:
+        """Whether rays pass through points [2, N] of the boxes, turned about the axis by an azimuth, or mirrored."""
+        cos, sin = np.cos(azimuth), np.sin(azimuth)
+        turn, sides = np.array([[cos, -sin], [sin, cos]]), (1.0, -1.0) if self.anamorphic else (1.0,)
+        points = [(turn @ film, turn @ (pupil * [[1.0], [side]])) for side in sides]
+        codes = np.stack([self.status(*pair, nanometres, film_z, self.stop_radius_mm) for pair in points])
+        return np.asarray((np.hypot(*film) <= self.film_radius_mm) & (codes == st.PASSED).any(0))
+
+    def status(
+        self, film: ArrayLike, pupil: ArrayLike, nanometres: ArrayLike, film_z: ArrayLike, stop: ArrayLike
+    ) -> NDArray[Any]:
+        """Status [N] of rays from film points [2, N] through pupil points [2, N] (mm). The other arguments are [N] or
+        one number."""
+        film = np.asarray(film)
+        rays = np.concatenate([film, pupil, np.broadcast_to(nanometres, (1, film.shape[1]))]).astype(np.float32)
+        call = {"film_z_mm": _row(film_z), "stop_radius_mm": _row(stop)}
+        codes = []
+        for start in range(0, rays.shape[1], _PART):
+            part = np.s_[:, start : start + _PART]
+            inputs = {"rays": rays[part]} | {name: v[part] if v.size > 1 else v for name, v in call.items()}
+            status = evaluate(self._status, inputs)["status"][0]
+            codes.append(np.broadcast_to(status, inputs["rays"].shape[1]))
+        return np.concatenate(codes) if codes else np.zeros(0)
+
+    @cached_property
+    def _status(self) -> Graph:
+        """The graph of the status alone."""
+        return replace(self.graph, outputs={"status": self.graph.outputs["status"]})
+
+
+def _row(value: ArrayLike) -> NDArray[np.float32]:
+    return np.asarray(value, np.float32).reshape(1, -1)

@@ -1,0 +1,145 @@
+"""Which camera to use: the one decision of `train`, `models`, `plan` and the README.
+
+The exact lens has no error and needs no fit. A model is worth its error where it makes the whole work `SAVING` times as
+fast. In a picture of our renderer the camera is a small part of that work; elsewhere it may be all of it.
+"""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from neurolens.base.files import library
+from neurolens.base.records import error_of, noisy, program, reaches, time_of
+
+C = TypeVar("C")
+R = TypeVar("R", bound=Mapping[str, Any])
+
+CLOSE_UM = 2.0  # a model within this RMS error counts as close: a quarter of a pixel of 36 mm at 4000 across
+SAVING = 1.5
+# Nanoseconds that a path takes besides its camera in the cheapest scene of experiments/results/render_times.
+PATH_NS = 190.0
+REFRACTION_NS = 2.1  # of the exact lens as C, experiments/results/fused_speed: within 7% of its four lenses
+
+
+def recommended(cameras: Iterable[C], cost: Callable[[C], float], exact: C | None, rest: float = 0.0) -> C | None:
+    """The cheapest of the cameras that keep a budget, or the exact lens where that one does not save enough.
+
+    Args:
+        cost: of a ray. exact: None where the exact lens cannot run. rest: cost of the rest of the work a ray.
+    """
+    best = min(cameras, key=cost, default=None)
+    if exact is None or best is None:
+        return exact if best is None else best
+    return best if SAVING * (cost(best) + rest) <= cost(exact) + rest else exact
+
+
+def to_use(
+    models: Sequence[R], most: float = CLOSE_UM, key: str = "rms_um", exact: R | None = None, rest: float = 0.0
+) -> R | None:
+    """The model to use, or the exact lens: see `recommended`.
+
+    Models count that are within an error and not poor; ideal lenses (thin, thick) do not. If no model counts and the
+    exact lens was not timed, the closest model is taken. None where nothing is there.
+
+    Args:
+        exact: record of the exact lens (`records.ExactRecord`). rest: nanoseconds, as of `recommended`.
+    """
+    fits = [m for m in models if m.get("family") != "paraxial"]
+    close = [m for m in fits if reaches(m, most, key) and not m.get("poor")]
+    if exact is None and not any(time_of(m) for m in close):
+        return min(close or fits, key=(lambda m: m.get("bytes") or math.inf) if close else error_of, default=None)
+    return recommended(close, lambda m: time_of(m).get("min", math.inf), exact, rest)
+
+
+def exact_of(records: Iterable[R]) -> R | None:
+    """The fastest exact tracer that was timed."""
+    timed = [r for r in records if time_of(r)]
+    return min(timed, key=lambda r: time_of(r)["min"], default=None)
+
+
+def expected_exact(refractions: int) -> dict[str, Any]:
+    """A record of the exact lens as C, where it was not timed."""
+    return {"name": "exact C, expected", "ns_per_ray": {"min": REFRACTION_NS * refractions}}
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What to use in one place: its name, the reason, and the command that uses it (empty: none is known)."""
+
+    where: str
+    name: str
+    why: str
+    command: str
+
+    def __str__(self) -> str:
+        return f"{self.where} use {self.name}: {self.why}."
+
+
+def advice(results: Mapping[str, Any], folder: Path) -> list[Advice]:
+    """What to use of a run in our renderer, and what in other programs; none of a run without models.
+
+    Args:
+        results: as `records.Results` has them, as a table. folder: of the run, which commands name.
+    """
+    models: Sequence[Mapping[str, Any]] = results["models"]
+    exact, target = exact_of(results.get("exact") or ()), results.get("target")
+    within = target["within_um"] if target else CLOSE_UM
+    lens = folder / "lenses" / f"{Path(str(results.get('lens', {}).get('file') or 'lens')).stem}.toml"
+    state = (results.get("settings") or {}).get("lens") or {}
+    whole = all(state.get(k) in (None, "none") for k in ("efl_mm", "configuration", "f_number"))  # as its file has it
+    found = []
+    for where, rest in (("In this renderer", PATH_NS), ("In other programs", 0.0)):
+        best = to_use(models, within, exact=exact, rest=rest)
+        if best is None or not (best is exact or best.get("file")):
+            continue
+        if exact is not None and best is exact:
+            name, file, fused = "the exact lens", str(lens) if whole else "", " C" in exact["name"]
+            why = _why_exact(exact, to_use(models, within), within, rest)
+        else:
+            name, file, fused = str(best["name"]), str(folder / best["file"]), bool(best.get("fused_ns_per_ray"))
+            why = _why_model(best, exact, within)
+        if rest:
+            command = use_command(file, fused)
+        else:  # one model of many states is no function of a ray alone
+            command = "" if best.get("states") else f"{program()} export {shlex.quote(file)} --to c -o lens.h"
+        found.append(Advice(where, name, why, command if file else ""))
+    return found
+
+
+def _why_exact(exact: Mapping[str, Any], model: Mapping[str, Any] | None, within: float, rest: float) -> str:
+    said = f"{said_ns(time_of(exact))} a ray ({exact['name']}), without error"
+    if model is None or not reaches(model, within) or model.get("poor"):
+        return f"{said}; no model is within {within:.3g} um"
+    times = (time_of(exact)["min"] + rest) / (time_of(model).get("min", math.inf) + rest)
+    whole = "a picture of even a cheap scene" if rest else "that"
+    faster = f"with {model['name']} ({said_ns(time_of(model))}) {whole} is {times:.3g} times as fast"
+    return f"{said}; {faster}, and an error is worth it from {SAVING:g} on"
+
+
+def _why_model(model: Mapping[str, Any], exact: Mapping[str, Any] | None, within: float) -> str:
+    close, timing, as_c = reaches(model, within), time_of(model), bool(model.get("fused_ns_per_ray"))
+    said = [f"{'the fastest' if close else 'the closest, as none is'} within {within:.3g} um"]
+    if model.get("rms_um") is not None:
+        said.append(f"error {model['rms_um']:.3g} um RMS")
+    if timing:
+        said.append(f"{said_ns(timing)} a ray {'as C' if as_c else 'in onnxruntime'}")
+    if exact is not None and timing:
+        said.append(f"{time_of(exact)['min'] / timing['min']:.2g} times as fast as the exact lens")
+    return ", ".join(said)
+
+
+def said_ns(timing: Mapping[str, Any]) -> str:
+    """A time in words; "~" before one that is noisy."""
+    return f"{'~' * noisy(timing)}{timing['min']:.3g} ns" if timing else "-"
+
+
+def use_command(file: str, fused: bool) -> str:
+    """The command that renders a scene through a model or a lens, as C where that runs here."""
+    scene, camera = Path("experiments/scenes/room.toml"), f"{'fused:' if fused else ''}{file}"
+    words = [str(scene if scene.is_file() else library() / scene), "--camera", camera, "-o", "room.exr"]
+    return f"{program()} render {shlex.join(words)}"

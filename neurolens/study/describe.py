@@ -1,0 +1,276 @@
+"""A lens in figures, a folder of lenses as a table, and their sections, with units in the keys."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from neurolens.analysis import layout
+from neurolens.analysis.fields import Scene
+from neurolens.base import status as st
+from neurolens.base.errors import NeurolensError, NeurolensWarning
+from neurolens.lens.glass import glass_of
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
+from neurolens.readers.any_format import collection_of, read_any
+from neurolens.setting.check import Check, check_lens, doubts, film_edge_mm, verdict
+from neurolens.setting.focusing import at_infinity
+from neurolens.setting.pupils import camera_rays, image_radius_mm
+from neurolens.setting.states import set_lens
+from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.model import Domain
+from neurolens.trace.rays import trace
+
+_RAYS = 65536
+_NEGLIGIBLE = 1e-4  # share of the rays below which a blocking surface is not listed
+
+
+def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
+    """Figures of a lens placed by `set_lens`, over a domain, as JSON has them; d line unless stated otherwise.
+
+    They are those of the file, those of `FirstOrder` (of an anamorphic lens in the y-z plane), and:
+
+        efl_x_mm: in the x-z plane; None of a round lens.
+        working_f_number: of the real marginal ray (y-z); None where no ray passes.
+        image_radius_from: what the radius follows from.
+        half_field_deg: as the file states it.
+        half_field_reached_deg: mean angle of the rays that reach the edge of the domain's film, along y of an
+            anamorphic lens; None where none does. half_field_reached_x_deg is None of a round lens, too.
+        passing_share: of rays uniform over the film and pupil discs of the domain.
+        ended: what stops the others, a list of {status, text, share}, largest share first.
+        warnings: sentences.
+    """
+    radius, radius_from = image_radius_mm(lens)
+    film_z = float(lens.film_z_mm if lens.film_z_mm is not None else domain.film_z_mm[0])
+    passing, ended = passing_share(lens, domain)
+    # A round lens has the same field along y; the mean over rays along x is used.
+    reached = field_reached_deg(lens, domain, film_z, "y" if lens.anamorphic else "x")
+    reached_x = field_reached_deg(lens, domain, film_z, "x") if lens.anamorphic else reached
+    notes = warnings_of(lens, first_order(at_infinity(lens)).f_number, reached, math.isinf(domain.focus_m[0]))
+    if reached is None or reached_x is None:
+        where = " and ".join(axis for axis, deg in (("y", reached), ("x", reached_x)) if deg is None)
+        along = f", along {where}" if lens.anamorphic else ""
+        notes.append(f"no ray reaches the edge of the film ({domain.film_radius_mm:.4g} mm from the axis{along})")
+    return {
+        **{key: getattr(lens, key) for key in ("name", "designer", "source", "rims", "sha256", "refractions")},
+        **{key: float(value) for key, value in asdict(first_order(lens)).items()},
+        "efl_x_mm": float(first_order(lens, meridian="x").efl_mm) if lens.anamorphic else None,
+        "wavelength_nm": lens.reference_nm,
+        "object_medium": {**asdict(lens.object_medium), "n_d": float(lens.object_medium.n_d)},
+        "working_f_number": working_f_number(lens, domain, film_z),
+        "film_z_mm": film_z,
+        "focus_m": domain.focus_m[0],
+        "stop_surface": lens.stop_index,
+        "stop_diameter_mm": 2 * lens.stop_radius_mm,
+        "image_radius_mm": radius,
+        "image_radius_from": radius_from,
+        "half_field_deg": lens.half_field_deg,
+        "half_field_reached_deg": reached,
+        "half_field_reached_x_deg": reached_x if lens.anamorphic else None,
+        "passing_share": passing,
+        "ended": ended,
+        "warnings": notes,
+    }
+
+
+def glass_table(lens: Lens) -> list[dict[str, Any]]:
+    """The prescription row by row, every figure of it: n_d and V_d are the catalogue's where a glass rules; asphere is
+    {power: coefficient}; coating None or {name, layers: [[index, thickness in nm, V_d if known], ...]}.
+    """
+    return [
+        {
+            "surface": k,
+            "z_mm": float(z),
+            "radius_mm": float(s.radius_mm),
+            "thickness_mm": float(s.thickness_mm),
+            "diameter_mm": s.diameter_mm,
+            "n_d": float(s.n_d) if s.glass is None else float(glass_of(s.glass).n_d),
+            "V_d": s.V_d if s.glass is None else float(glass_of(s.glass).V_d),
+            "material": s.material,
+            "stop": s.stop,
+            "conic": float(s.conic),
+            "asphere": {str(power): float(a) for power, a in s.asphere},
+            "cylinder": s.cylinder,
+            "across": s.across,
+            "focal_mm": s.focal_mm,
+            "glass": s.glass,
+            "absorption_per_mm": s.absorption_per_mm,
+            "coating": s.coating and {"name": s.coating.name, "layers": [list(layer) for layer in s.coating.layers]},
+        }
+        for k, (s, z) in enumerate(zip(lens.surfaces, lens.vertices_mm[:-1], strict=True))
+    ]
+
+
+def working_f_number(lens: Lens, domain: Domain, film_z: float) -> float | None:
+    """1 / (2 sin theta') of the outermost ray of the y-z plane to reach the middle of the film; None without one."""
+    u = torch.linspace(0, domain.pupil_radius_mm, 4001, dtype=torch.float64)
+    zero = torch.zeros_like(u)
+    rays = camera_rays(zero, zero, film_z, zero, u, domain.pupil_z_mm)
+    with torch.no_grad():
+        passed = trace(lens, rays).status == st.PASSED
+    sine = float(rays.dy[passed].abs().max()) if passed.any() else 0.0
+    return 1 / (2 * sine) if sine > 0 else None
+
+
+def field_reached_deg(
+    lens: Lens, domain: Domain, film_z: float, axis: Literal["x", "y"] = "x", points: int = 200
+) -> float | None:
+    """Mean angle to the axis (degrees) of the rays from the edge of the film to the scene; None where none passes.
+
+    The edge is that on the x or the y axis of the film.
+    """
+    grid = torch.linspace(-domain.pupil_radius_mm, domain.pupil_radius_mm, points, dtype=torch.float64)
+    u, v = (t.reshape(-1) for t in torch.meshgrid(grid, grid[points // 2 :], indexing="ij"))  # symmetric across
+    edge, zero = torch.full_like(u, domain.film_radius_mm), torch.zeros_like(u)
+    film, pupil = ((edge, zero), (u, v)) if axis == "x" else ((zero, edge), (v, u))
+    with torch.no_grad():
+        out = trace(lens, camera_rays(*film, film_z, *pupil, domain.pupil_z_mm))
+    passed = out.status == st.PASSED
+    if not passed.any():
+        return None
+    angle = torch.atan2(torch.hypot(out.rays.dx, out.rays.dy), -out.rays.dz)[passed].mean()
+    return math.degrees(float(angle))
+
+
+def passing_share(lens: Lens, domain: Domain, seed: int = 5) -> tuple[float, list[dict[str, Any]]]:
+    """Share of a domain's rays that pass, and what ends the others: {status, text, share}, largest share first."""
+    rays = sample_domain(domain, _RAYS, seed)
+    with torch.no_grad():
+        start = camera_rays(rays.film_x, rays.film_y, rays.film_z, rays.pupil_x, rays.pupil_y, domain.pupil_z_mm)
+        status = trace(lens, start, rays.wavelength_nm).status
+    codes, counts = (t.tolist() for t in torch.unique(status, return_counts=True))
+    share = {int(code): count / _RAYS for code, count in zip(codes, counts, strict=True)}
+    passed = share.pop(st.PASSED, 0.0)
+    stop = st.blocked(lens.stop_index, st.RIM)
+    ended = [
+        {"status": code, "text": "blocked by the stop" if code == stop else st.describe(code), "share": part}
+        for code, part in sorted(share.items(), key=lambda item: -item[1])
+        if part >= _NEGLIGIBLE
+    ]
+    return passed, ended
+
+
+def file_doubts(tabled: Lens, states: bool = True) -> list[str]:
+    """Doubts about a lens file as sentences; without its states where not asked for. See also `warnings_of`."""
+    # A smaller stop than stated is a choice, not a doubt.
+    checks = [c for c in check_lens(tabled) if c.quantity != "f-number" or (c.computed or 0.0) > (c.stated or 0.0)]
+    return doubts([c for c in checks if states or not c.state])
+
+
+def rim_doubts(lens: Lens) -> list[str]:
+    """That rims are not the source's, as a sentence."""
+    return {
+        "estimated": ["rim diameters are estimated, not the source's: vignetting is a guess"],
+        "derived": ["rim diameters are derived by a rule, the source has none: vignetting follows that rule"],
+    }.get(lens.rims, [])
+
+
+def warnings_of(lens: Lens, f_number: float, reached_deg: float | None, far: bool) -> list[str]:
+    """Warnings about a lens in its state, as sentences; see `file_doubts` for its file, and the reader's own warnings.
+
+    Args:
+        f_number: of the lens focused at infinity, as the source states it.
+        reached_deg: half field that reaches the edge of the film.
+        far: whether the lens is focused at infinity, where its source states the field.
+    """
+    found = rim_doubts(lens)
+    if abs(f_number / lens.f_number - 1) > 0.05 and f_number < lens.f_number:
+        found.append(f"the stop gives f/{f_number:.3g}, wider than the f/{lens.f_number:.3g} of the source")
+    if far and lens.half_field_deg is not None and reached_deg is not None and reached_deg < lens.half_field_deg - 2:
+        found.append(f"the edge of the film sees {reached_deg:.1f} degrees, the source says {lens.half_field_deg:.1f}")
+    return found
+
+
+def layout_profile(lens: Lens, domain: Domain) -> layout.Layout:
+    """Section of a lens with meridional fans of rays to the axis, 70% and the edge of the domain's film, d line.
+
+    Args:
+        lens: placed by `set_lens`; where it is not, the film is that of the domain's farthest focus.
+    """
+    if lens.film_z_mm is None:
+        lens = replace(lens, film_z_mm=float(domain.film_z_mm[0]))
+    return layout.layout_profile(Scene(lens, domain.focus_m[0]), domain.film_radius_mm)
+
+
+_NO_FIELD = 0.2  # film radius over focal length at which a lens of unknown field is drawn
+
+
+def lens_files(folder: Path) -> list[Path]:
+    """The lens files of a folder and of its folders, by name; raises InputError as `collection_of`."""
+    return [folder / name for name in collection_of(folder).names]
+
+
+def read_quietly(path: Path) -> Lens:
+    """A lens read without warnings, which its check repeats."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NeurolensWarning)
+        return read_any(path)
+
+
+def library_row(path: Path, checked: bool = True) -> dict[str, Any]:
+    """A lens file in a table of many.
+
+    Returns: lens, file, notes (what its reader warned of), and `lens_row`, checked or not; of a file that cannot be
+        read the verdict "unreadable" with the error as its doubt.
+    """
+    place = {"lens": path.stem, "file": str(path)}
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always", NeurolensWarning)
+        try:
+            lens = read_any(path)
+            row = lens_row(lens, check_lens(lens) if checked else None)
+        except NeurolensError as error:
+            row = {"verdict": "unreadable", "doubts": [str(error).removeprefix(f"{path}: ")]}
+    return {**place, **row, "notes": [str(w.message).removeprefix(f"{path}: ") for w in heard]}
+
+
+def lens_row(lens: Lens, checks: list[Check] | None) -> dict[str, Any]:
+    """A lens as read from its file, in a table of many, with its `check_lens` or (None) without.
+
+    Returns: name, efl_mm and efl_x_mm computed (the latter of an anamorphic lens only), stated_efl_mm, back_focus_mm,
+        f_number of the stop, half_field_deg as stated, image_radius_mm as stated, refractions, aspheres, cylinders,
+        states (zoom or focus), rims, verdict ("ok" or "doubtful"; without checks "read"), doubts, and checks: a list of
+        {state, quantity, computed, stated, doubt}.
+    """
+    data = first_order(lens)
+    cylinders = sum(s.cylinder is not None for s in lens.surfaces)
+    return {
+        "name": lens.name,
+        "efl_mm": float(data.efl_mm),
+        "efl_x_mm": float(first_order(lens, meridian="x").efl_mm) if cylinders else None,
+        "stated_efl_mm": lens.stated_efl_mm,
+        "back_focus_mm": float(data.back_focus_mm),
+        "f_number": float(data.f_number),
+        "half_field_deg": lens.half_field_deg,
+        "image_radius_mm": lens.image_radius_mm,
+        "refractions": lens.refractions,
+        "aspheres": sum(s.conic != 0 or bool(s.asphere) for s in lens.surfaces),
+        "cylinders": cylinders,
+        "states": len(lens.configurations),
+        "rims": lens.rims,
+        "verdict": "read" if checks is None else verdict(checks),
+        "doubts": doubts(checks or []),
+        "checks": [asdict(c) for c in checks or []],
+    }
+
+
+def section(path: Path) -> layout.Layout:
+    """A lens in section with rays, focused at infinity, as `figures.sheet` draws it; an anamorphic one in y-z."""
+    lens = set_lens(read_quietly(path))
+    data, edge = first_order(lens), film_edge_mm(lens)
+    if edge is None:
+        edge = _NO_FIELD * abs(data.efl_mm) if lens.half_field_deg is None else image_radius_mm(lens)[0]
+    profile = layout.layout_profile(Scene(lens, math.inf, "y"), edge)
+    return replace(profile, title=path.stem, subtitle=_caption(lens, data.efl_mm, data.f_number))
+
+
+def _caption(lens: Lens, efl_mm: float, f_number: float) -> str:
+    text = f"{efl_mm:.4g} mm f/{f_number:.2g}"
+    if lens.anamorphic:
+        text = f"{efl_mm:.3g} / {first_order(lens, meridian='x').efl_mm:.3g} mm f/{f_number:.2g}"
+    return text + ("" if lens.half_field_deg is None else f", {lens.half_field_deg:.3g}°") + f", rims {lens.rims}"

@@ -1,0 +1,324 @@
+"""Errors of models by zone, on rays not used in any fit, traced once through the exact lens.
+
+A smaller stop changes no ray, only which of them pass: the crossing with the stop, kept from the one trace, tells.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neurolens import __version__
+from neurolens.base import status as st
+from neurolens.base.files import atomic_path, fingerprint_of, read_kept, sha256_of, write_kept
+from neurolens.base.progress import Report
+from neurolens.cameras.model import OnnxLens, load_model
+from neurolens.lens.prescription import Lens
+from neurolens.study.rays import PIXELS_ACROSS, EachRay, Predict, RayErrors, each_ray
+from neurolens.study.vignetting import NEAR_RIM, ZONES, deciding_rim_ratio, false_shares
+from neurolens.surrogates.domain import FilmRays, sample_domain
+from neurolens.surrogates.export import export_onnx
+from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, fit_model
+from neurolens.surrogates.fits import checkpoint
+from neurolens.surrogates.model import Domain, Prediction
+from neurolens.surrogates.pairs import PairSet, PairSettings, join_pairs, make_pairs, trace_pairs
+from neurolens.trace.surfaces import Rays
+
+# Whole stops closed, by the name of the state.
+STOPS = {"full": 0, "2_stops": 2, "4_stops": 4}
+# States whose zones a card contains.
+ZONED = ("full", "2_stops")
+# Fewest rays of a zone for a figure.
+LEAST_RAYS = 100
+# A root mean square dominated by a few bad rays is measured on MORE times as many rays, if its relative standard
+# deviation is above KNOWN.
+MORE, MOST, KNOWN = 8, 1_000_000, 0.08
+_BATCH = 65536
+
+
+@dataclass(frozen=True)
+class FreshRays:
+    """Test rays of the models of one lens and domain.
+
+    Attributes:
+        lens, domain: the exact lens at its widest stop, and the domain of the models.
+        held_out: [M] rays that the lens passes.
+        held_square: [M] their squared distance from the axis (mm^2) at the stop.
+        drawn: [N] rays uniform over the film and pupil discs, blocked ones included.
+        passes: [N] bool, at full aperture.
+        stop_square: [N] squared distance from the axis (mm^2) at the stop.
+        near: [N] bool, full aperture: within 2% of the radius of the rim that decides.
+    """
+
+    lens: Lens
+    domain: Domain
+    held_out: PairSet
+    held_square: Tensor
+    drawn: FilmRays
+    passes: Tensor
+    stop_square: Tensor
+    near: Tensor
+
+    def stop_radius_mm(self, state: str) -> float:
+        """The radius of one of `STOPS`, in mm."""
+        return self.domain.stop_radius_mm / math.sqrt(2) ** STOPS[state]
+
+
+def fresh_rays(lens: Lens, domain: Domain, held_out: PairSet, *, count: int, seed: int) -> FreshRays:
+    """Draw and trace `count` rays for the vignetting; `seed` must not be that of a fit's pairs."""
+    parts = []
+    for start in range(0, count, _BATCH):
+        rays = sample_domain(domain, min(_BATCH, count - start), seed, start)
+        exact = trace_pairs(lens, rays, domain.pupil_z_mm)
+        near = (deciding_rim_ratio(lens, exact) - 1).abs() <= NEAR_RIM
+        parts.append((*rays.columns(), exact.status == st.PASSED, _stop_square(lens, exact), near))
+    *drawn, passes, square, near = (torch.cat(c) for c in zip(*parts, strict=True))
+    return FreshRays(lens, domain, held_out, _stop_square(lens, held_out), FilmRays(*drawn), passes, square, near)
+
+
+def with_more(fresh: FreshRays, seed: int) -> FreshRays:
+    """`MORE` times as many passing rays, those there among them; at most `MOST` are added."""
+    lens, domain, count = fresh.lens, fresh.domain, len(fresh.held_out)
+    sets, squares, wanted = [_without_crossings(fresh.held_out)], [fresh.held_square], min((MORE - 1) * count, MOST)
+    while wanted > 0:
+        part = PairSettings(train=1, held_out=min(count, wanted), rim=1, seed=seed + len(sets))
+        pairs = make_pairs(lens, domain, part).held_out
+        sets.append(_without_crossings(pairs))
+        squares.append(_stop_square(lens, pairs))
+        wanted -= len(pairs)
+    return replace(fresh, held_out=join_pairs(sets), held_square=torch.cat(squares))
+
+
+def _stop_square(lens: Lens, pairs: PairSet) -> Tensor:
+    return pairs.cross_x[lens.stop_index] ** 2 + pairs.cross_y[lens.stop_index] ** 2
+
+
+def _without_crossings(pairs: PairSet) -> PairSet:
+    """The same rays without the data per surface, which is most of their memory."""
+    return replace(
+        pairs, **{name: getattr(pairs, name)[:0].clone() for name in ("cross_x", "cross_y", "meets", "refracts")}
+    )
+
+
+@dataclass(frozen=True)
+class Findings:
+    """Errors of one model on `FreshRays`.
+
+    Attributes:
+        figures: those of `rays.RayErrors`, false_pass, false_block and both near rims at full aperture.
+        stopped_down: false_pass and false_block of the states of `STOPS` but the first.
+        zones: by state of `ZONED` and zone: rms_um, direction_rms_deg of `rays` rays, and false_pass, false_block of
+            `passing` rays that the exact lens passes. None with fewer than `LEAST_RAYS`, or where an RMS is not
+            known to `KNOWN`.
+        each: errors ray by ray, of the rays of `held_out`.
+    """
+
+    figures: dict[str, float | None]
+    stopped_down: dict[str, dict[str, float | None]]
+    zones: dict[str, dict[str, dict[str, Any]]]
+    each: EachRay
+
+    def errors(self, keys: tuple[str, ...]) -> dict[str, Any]:
+        """Data for card and record: figures of `keys`, None if not finite, then `zones`."""
+        plain = {key: _finite(self.figures[key]) for key in keys}
+        return {**plain, "stopped_down": self.stopped_down, "zones": self.zones}
+
+
+def measure(fresh: FreshRays, predict: Predict) -> Findings:
+    """Errors of one model; `predict` as `onnx_predictor` gives it."""
+    each = each_ray(fresh.lens, fresh.domain, fresh.held_out, predict)
+    said = {s: predict(fresh.drawn, fresh.stop_radius_mm(s)).status == st.PASSED for s in STOPS}
+    exact = {s: fresh.passes & (fresh.stop_square <= fresh.stop_radius_mm(s) ** 2) for s in STOPS}
+    shares = {s: false_shares(exact[s], said[s]) for s in STOPS}
+    near = false_shares(exact["full"][fresh.near], said["full"][fresh.near])
+    full = {**shares.pop("full"), **{f"{key}_near_rim": value for key, value in near.items()}}
+    zones = {s: {z: _zone(fresh, each, s, z, exact[s], said[s]) for z in ZONES} for s in ZONED}
+    return Findings({**asdict(RayErrors.over(fresh.lens, fresh.domain, each)), **full}, shares, zones, each)
+
+
+def well_known(fresh: FreshRays, each: EachRay) -> bool:
+    """Whether the rays determine the errors over the film and of its zones to `KNOWN`."""
+    whole = (each.focus_um, each.infinity_um, each.direction_deg, each.position_um, each.transmittance)
+    parts = [zone_of(fresh, each, s, z) for s in ZONED for z in ZONES]
+    zones = [v for part in parts for v in (part.focus_um, part.direction_deg) if len(v) >= LEAST_RAYS]
+    return all(rms_deviation(v) <= KNOWN for v in (*whole, *zones))
+
+
+def rms_deviation(values: Tensor) -> float:
+    """Relative standard deviation of the root mean square of values."""
+    square = values * values
+    mean = float(square.mean()) if len(values) > 1 else 0.0
+    return float(square.std()) / (2 * mean * math.sqrt(len(values))) if mean > 0 else 0.0
+
+
+def zone_of(fresh: FreshRays, each: EachRay, state: str, zone: str) -> EachRay:
+    """Errors of the rays of one zone that pass in one state."""
+    open_ = fresh.held_square <= fresh.stop_radius_mm(state) ** 2
+    return each.select(_within(fresh.domain, fresh.held_out.inputs, zone) & open_)
+
+
+def _within(domain: Domain, rays: FilmRays, zone: str) -> Tensor:
+    low, high = ZONES[zone]
+    place = torch.hypot(rays.film_x, rays.film_y) / domain.film_radius_mm
+    return (place >= low) & ((place < high) | (high == 1.0))
+
+
+def _zone(fresh: FreshRays, each: EachRay, state: str, zone: str, exact: Tensor, said: Tensor) -> dict[str, Any]:
+    part = zone_of(fresh, each, state, zone)
+    within = _within(fresh.domain, fresh.drawn, zone)
+    passing, shares = int(exact[within].sum()), false_shares(exact[within], said[within])
+    return {
+        "rms_um": _rms(part.focus_um),
+        "direction_rms_deg": _rms(part.direction_deg),
+        "rays": len(part.inside),
+        **(shares if passing >= LEAST_RAYS else dict.fromkeys(shares)),
+        "passing": passing,
+    }
+
+
+def _rms(values: Tensor) -> float | None:
+    """RMS with four digits; None with too few rays, or if a few of them dominate."""
+    if len(values) < LEAST_RAYS or rms_deviation(values) > KNOWN:
+        return None
+    return _finite(float(f"{float(torch.sqrt((values * values).mean())):.4g}"))
+
+
+def _finite(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else value
+
+
+# Keys of the ray and vignetting errors that a model's card promises and its record shows.
+CARD_KEYS = tuple(
+    "rms_um p99_um max_um rms_infinity_um rms_px direction_rms_deg position_rms_um transmittance_rms transmittance_max "
+    "false_pass false_block false_pass_near_rim false_block_near_rim".split()
+)
+# Reported as poor: false passes or blocks beyond this share, an RMS error beyond so many pixels of 4000 across.
+POOR_SHARE, POOR_PX = 0.01, 1.0
+# Added to the seed of the fit's rays: the same seed would give the rays that the rims were fitted to.
+FRESH = 104729
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One model: its settings, the exported file, its record for `results.json`."""
+
+    settings: ModelSettings
+    file: Path
+    record: dict[str, Any]
+
+    @property
+    def error(self) -> float:
+        """Film-equivalent RMS, or that of the angle where no ray is within 60 degrees."""
+        found = self.record.get("rms_um")
+        return float(found if found is not None else self.record.get("direction_rms_deg") or 1e9)
+
+
+def onnx_predictor(model: OnnxLens) -> Predict:
+    """An exported model as `rays` and `vignetting` want it."""
+
+    def predict(rays: FilmRays, stop_radius_mm: float | None = None) -> Prediction:
+        columns = [np.ascontiguousarray(c.numpy(), dtype=np.float32) for c in rays.columns()]
+        film, pupil = np.stack(columns[0:2]), np.stack(columns[3:5])
+        out = model.rays(film, pupil, columns[5], columns[2], stop_radius_mm)
+        x, y, z, dx, dy, dz = torch.from_numpy(out.scene_ray)
+        stop_x, stop_y = torch.from_numpy(out.stop_xy_mm)
+        power, status = torch.from_numpy(out.transmittance), torch.from_numpy(out.status)
+        return Prediction(Rays(x, y, z, dx, dy, dz), power, stop_x, stop_y, status)
+
+    return predict
+
+
+def shared_rays(prepared: Prepared, vignetting_rays: int) -> FreshRays:
+    """The test rays of all models of one lens and domain; many, as a few bad ones, one in 10,000, may dominate."""
+    pairs = prepared.pairs
+    seed = pairs.settings.seed + FRESH
+    rays = fresh_rays(pairs.lens, pairs.domain, pairs.held_out, count=vignetting_rays, seed=seed)
+    return with_more(rays, seed)
+
+
+def measure_on(rays: FreshRays, model: OnnxLens) -> dict[str, Any]:
+    """Errors of an exported model for its card; keys with units, None if not finite."""
+    errors = measure(rays, onnx_predictor(model)).errors(CARD_KEYS)
+    return {**errors, "poor": what_is_poor(errors), "rays": len(rays.held_out), "passing": int(rays.passes.sum())}
+
+
+def what_is_poor(errors: Mapping[str, Any]) -> list[str]:
+    """Errors of a model that are visible in a picture, as sentences for its card."""
+    said = [
+        f"{key.replace('_', ' ')} {100 * errors[key]:.2g}%"
+        for key in ("false_pass", "false_block")
+        if (errors.get(key) or 0.0) > POOR_SHARE
+    ]
+    pixels = errors.get("rms_px") or 0.0
+    return [*said, f"RMS error {pixels:.2g} pixels of a picture {PIXELS_ACROSS} wide"] if pixels > POOR_PX else said
+
+
+def fit_and_measure(
+    prepared: Prepared,
+    settings: ModelSettings,
+    folder: Path,
+    vignetting_rays: int,
+    report: Report,
+    rays: Callable[[], FreshRays] | None = None,
+) -> Measured:
+    """Fit, export and measure one model, or take an existing one of the same settings and version from the folder.
+
+    Errors are of the exported float32 graph in onnxruntime. `rays`: `shared_rays`, where several models share them.
+    """
+    file, pairs = folder / f"{settings.label}.onnx", prepared.pairs
+    made_of = (pairs.domain.to_dict(), asdict(pairs.settings), asdict(settings), vignetting_rays)
+    fingerprint = fingerprint_of([__version__, pairs.lens.sha256, *made_of])
+    known = known_record(file, fingerprint)
+    if known is not None:
+        return Measured(settings, file, known)
+    training = folder / f"{settings.label}.training.npz"  # left by a killed run
+    model = fit_model(prepared, settings, report, checkpoint=training)
+    on = rays() if rays else shared_rays(prepared, vignetting_rays)
+    with atomic_path(file) as measured:  # a file without its errors never has the final name
+        export_onnx(model, measured, errors={})
+        errors = measure_on(on, load_model(measured))
+        export_onnx(model, measured, errors=errors)
+    record: dict[str, Any] = {
+        "name": settings.label,
+        "family": settings.family,
+        "variables": settings.basis,
+        "file": f"models/{file.name}",
+        **errors,
+        "coefficients_per_vector": None if settings.method in NETWORKS else model.core.coefficients_per_vector,
+        "parameters": model.core.coefficients,
+        "bytes": file.stat().st_size,
+        "fit_s": model.fit_s,
+        "load_s": seconds_to_load(file),
+    }
+    note_record(file, fingerprint, record)
+    checkpoint.clear(training)
+    return Measured(settings, file, record)
+
+
+def seconds_to_load(file: Path) -> float:
+    start = time.perf_counter()
+    load_model(file)
+    return time.perf_counter() - start
+
+
+def note_record(file: Path, fingerprint: str, record: dict[str, Any]) -> None:
+    """Write the record of a finished fit beside its model, for `known_record`."""
+    made = {"fingerprint": fingerprint, "sha256": sha256_of(file), "record": record}
+    write_kept(file.with_suffix(".json"), made)
+
+
+def known_record(file: Path, fingerprint: str) -> dict[str, Any] | None:
+    """The record of an earlier finished fit of the same settings whose model file is unchanged."""
+    data = read_kept(file.with_suffix(".json")) or {}
+    if data.get("fingerprint") != fingerprint or not file.is_file() or data["sha256"] != sha256_of(file):
+        return None
+    record: dict[str, Any] = data["record"]
+    return record

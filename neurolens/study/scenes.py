@@ -1,0 +1,248 @@
+"""Scenes of an experiment: renders through every camera, compared with the exact lens's, and the gain of a domain
+restricted to one shot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.base.progress import Progress, Report
+from neurolens.cameras.build import Shot, ideal_as
+from neurolens.cameras.contract import Camera, FloatArray
+from neurolens.cameras.exact import ExactCamera
+from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.cameras.pinhole import Pinhole
+from neurolens.graph.compiler import has_compiler
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
+from neurolens.render.exr_attributes import standard_attributes
+from neurolens.render.job import camera_axes
+from neurolens.render.pictures import write_exr, write_png
+from neurolens.render.primitives import Rays
+from neurolens.render.renderer import render
+from neurolens.render.scene import CameraSettings, Scene, load_scene
+from neurolens.render.spectrum import SpectralRange
+from neurolens.render.world import world_of
+from neurolens.study.candidates import model_candidate
+from neurolens.study.experiment import Experiment, RenderChoice
+from neurolens.study.figures import image_caption, side_by_side
+from neurolens.study.image import compare, flip_map
+from neurolens.study.measure import fit_and_measure
+from neurolens.study.speed import Candidate, race
+from neurolens.surrogates.domain import domain_from_camera
+from neurolens.surrogates.fit import prepare
+from neurolens.surrogates.model import Domain
+from neurolens.surrogates.pairs import make_pairs
+
+EXACT = "exact"
+
+
+@dataclass
+class Pictures:
+    """Records for `results.json`: pictures, cameras, figures."""
+
+    images: list[dict[str, Any]] = field(default_factory=list)
+    cameras: list[dict[str, Any]] = field(default_factory=list)
+    figures: list[dict[str, Any]] = field(default_factory=list)
+
+
+def scene_cameras(
+    lens: Lens, domain: Domain, models: Mapping[str, Path], shot: CameraSettings, fused: bool = False
+) -> dict[str, Camera]:
+    """Exact lens, each model, thin lens and pinhole, set as a scene's [camera] asks; no wider than the lens opens.
+
+    All are in best focus, and show the plane in focus at one size. Lens and models as C if `fused`.
+    """
+    film = (shot.film_width_mm, shot.film_height_mm)
+    data = first_order(lens)
+    f_number = max(shot.f_number or data.f_number, data.f_number)
+    # The same light for all cameras.
+    real: dict[str, Any] = {"film_mm": film, "focus_m": shot.focus_m, "f_number": f_number}
+    real["wavelength_nm"] = shot.wavelengths_nm
+    exact = ExactCamera(lens, bounds=domain.bounds, **real, runtime="c" if fused else "trace")
+    cameras: dict[str, Camera] = {EXACT: exact}
+    for name, file in models.items():
+        cameras[name] = OnnxCamera(load_model(file), **real, runtime="c" if fused else "onnxruntime")
+    cameras["thin lens"], cameras["pinhole"] = (
+        ideal_as(kind, exact.lens, Shot(film, shot.focus_m)) for kind in ("thin:", "pinhole:")
+    )
+    return cameras
+
+
+def render_all(
+    choice: RenderChoice, lens: Lens, domain: Domain, models: Mapping[str, Path], folder: Path, report: Report
+) -> Pictures:
+    """Every scene through every camera with several seeds: for the noise floor, and their mean as the picture."""
+    found, fused = Pictures(), choice.fused and has_compiler()
+    scenes = [load_scene(path) for path in choice.scenes]
+    done, total = 0, len(scenes) * (3 + len(models)) * choice.seeds
+    for scene in scenes:
+        film = replace(scene.settings.film, wavelengths="one")  # for every camera: they share their random numbers
+        renders: dict[str, list[FloatArray]] = {}
+        for name, camera in scene_cameras(lens, domain, models, scene.settings.camera, fused).items():
+            for seed in range(choice.seeds):
+                result = render(
+                    scene, camera, width=choice.width, height=choice.height, samples=choice.samples, seed=seed,
+                    threads=choice.threads, film=film,
+                )  # fmt: skip
+                renders.setdefault(name, []).append(result.rgb)
+                done += 1
+                report(done / total)
+            found.cameras.append(_camera_record(scene, name, result.stats))
+            metadata = {"render": result.stats, "camera": camera.settings, "mean_of_renders": choice.seeds}
+            file, mean = folder / f"{_stem(scene, name)}.exr", np.mean(renders[name], axis=0, dtype=np.float32)
+            attributes = standard_attributes(camera.settings, choice.width, choice.height)
+            write_exr(file, mean, half=True, metadata=metadata, attributes=attributes)
+            write_png(file.with_suffix(".png"), mean)
+        _compare_scene(found, scene, choice, renders, folder)
+    return found
+
+
+def _camera_record(scene: Scene, name: str, stats: Mapping[str, Any]) -> dict[str, Any]:
+    share, seconds = stats["camera_fraction"], stats["seconds"]
+    known = {"name": name, "scene": scene.name, "render_s": seconds, "camera_s": share * seconds, "camera_share": share}
+    return known | {key: stats[key] for key in ("samples", "width", "height", "threads")}
+
+
+def _stem(scene: Scene, name: str) -> str:
+    return f"{scene.name}-{name.replace(' ', '-')}"
+
+
+def _compare_scene(
+    found: Pictures, scene: Scene, choice: RenderChoice, renders: Mapping[str, list[FloatArray]], folder: Path
+) -> None:
+    exact = renders[EXACT]
+    captions, maps = {}, {}
+    for name, pictures in renders.items():
+        record: dict[str, Any] = {
+            "name": f"{scene.name}, {name}",
+            "scene": scene.name,
+            "camera": name,
+            "file_png": f"{folder.name}/{_stem(scene, name)}.png",
+            "file_exr": f"{folder.name}/{_stem(scene, name)}.exr",
+            "samples": choice.samples * choice.seeds,
+        }
+        if name != EXACT:
+            errors = compare(pictures, exact)
+            record |= asdict(errors)
+            captions[name] = image_caption(errors)
+            maps[name] = flip_map(np.mean(pictures, axis=0), np.mean(exact[: len(pictures)], axis=0))
+        found.images.append(record)
+    maps[EXACT] = flip_map(exact[0], exact[1])
+    captions[EXACT] = "two seeds: the noise floor"
+    file = folder / f"{scene.name}-side-by-side.png"
+    shown = {name: np.mean(pictures, axis=0) for name, pictures in renders.items()}
+    side_by_side(shown, maps, file, captions, title=f"{scene.name}, error against exact")
+    found.figures.append(
+        {
+            "file": f"{folder.name}/{file.name}",
+            "title": f"{scene.name}: every camera",
+            "caption": f"The mean of {choice.seeds} renders of {choice.samples} samples a pixel. Below each its FLIP "
+            "difference from the exact lens's with the same random numbers; below the exact lens that of two seeds.",
+            "wide": True,
+        }
+    )
+
+
+def scene_gain(experiment: Experiment, folder: Path, progress: Progress) -> dict[str, Any] | None:
+    """One model for the whole lens, the same for one shot, and for the shot half of it: error, size and time.
+
+    Returns `records.Results.domain_gain`, None where the experiment names no scene.
+    """
+    choice = experiment.scene_domain
+    if choice is None:
+        return None
+    scene = load_scene(choice.scene)
+    shot = scene.settings.camera
+    lens = experiment.lens.read()
+    data = first_order(lens)
+    widest = data.f_number
+    shot_lens, shot_domain = domain_from_camera(
+        lens,
+        film_mm=(shot.film_width_mm, shot.film_height_mm),
+        focus_m=shot.focus_m,
+        f_number=max(shot.f_number or widest, widest),
+        wavelength_nm=shot.wavelengths_nm,
+        nearest_m=nearest_depth_m(scene, abs(data.efl_mm)),
+    )
+    half = replace(choice.model, name="", terms=max(choice.model.terms // 2, 2), units=max(choice.model.units // 2, 2))
+    states = (
+        ("whole lens", lens, experiment.domain.of(lens), (choice.model,)),
+        (scene.name, shot_lens, shot_domain, (choice.model, half)),
+    )
+    rows: list[dict[str, Any]] = []
+    candidates: list[Candidate] = []
+    with progress.stage("fit the scene's domain") as report:
+        for name, state, domain, models in states:
+            prepared = prepare(make_pairs(state, domain, experiment.pairs))
+            place = folder / f"for-{name.replace(' ', '-')}"
+            place.mkdir(parents=True, exist_ok=True)
+            for settings in models:
+                m = fit_and_measure(prepared, settings, place, experiment.evaluation.vignetting_rays, report)
+                rows.append({**m.record, "domain": name, **domain_facts(state, domain)})
+                rows[-1]["file"] = f"models/{place.name}/{m.file.name}"
+                candidate = model_candidate(f"{name}: {settings.label}", load_model(m.file), domain.stop_radius_mm)
+                candidates.append(replace(candidate, domain=domain))
+        # One race, so that the times can be set against each other.
+        chosen = experiment.evaluation
+        timed = race(candidates, shot_domain, threads=chosen.threads, rounds=chosen.rounds)
+        for row, candidate in zip(rows, candidates, strict=True):
+            row["ns_per_ray"] = timed.timing(candidate.name)
+    return {"scene": scene.name, "text": _words(rows), "rows": rows}
+
+
+def nearest_depth_m(scene: Scene, efl_mm: float, across: int = 96) -> float | None:
+    """Depth of the nearest visible surface, in m from the film plane along the axis; None if nothing is visible.
+
+    Rays of a pinhole of the lens's focal length through a grid of `across` x `across` points of the film; surfaces
+    smaller than a step of the grid may be missed.
+    """
+    film = (scene.settings.camera.film_width_mm, scene.settings.camera.film_height_mm)
+    steps = np.linspace(-0.5, 0.5, across)
+    points = np.stack(np.meshgrid(steps * film[0], steps * film[1])).reshape(2, -1)
+    nearest = float(seen_depths_m(scene, Pinhole(efl_mm, film), points).min())
+    return nearest if np.isfinite(nearest) else None
+
+
+def seen_depths_m(scene: Scene, camera: Camera, film_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Depths [N] of what a camera's chief rays of film points [2, N] meet, in m from the film plane along the axis.
+
+    inf where they meet nothing, NaN where no light passes.
+    """
+    shot, count = scene.settings.camera, film_mm.shape[1]
+    nanometres = np.full(count, np.mean(shot.wavelengths_nm), np.float32)
+    rays = camera.sample(film_mm.astype(np.float32), np.full((2, count), 0.5, np.float32), nanometres)
+    axes, position = camera_axes(shot), np.array(shot.position_m, np.float32)[:, None]
+    world = world_of(scene, SpectralRange(*shot.wavelengths_nm), geometry=True)
+    distance, _ = world.nearest(Rays.of(axes @ rays.origin_m + position, axes @ rays.direction))
+    with np.errstate(invalid="ignore"):
+        depth = -(rays.origin_m[2] + distance * rays.direction[2])  # the camera looks along -z
+    return np.where(rays.weight > 0, np.where(np.isfinite(distance), depth, np.inf), np.nan)
+
+
+def domain_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
+    """A domain as a flat table, units in the keys."""
+    return {
+        "film_radius_mm": domain.film_radius_mm,
+        "f_number": first_order(lens).f_number,
+        "wavelength_nm": list(domain.wavelength_nm),
+        "focus_m": ["infinity" if f == float("inf") else f for f in domain.focus_m],
+        "nearest_m": domain.nearest_m,
+    }
+
+
+def _words(rows: Sequence[Mapping[str, Any]]) -> str:
+    whole, same, half = rows
+    if not all(row.get("rms_um") for row in rows):
+        return ""
+    return (
+        f"{whole['name']} has {whole['rms_um']:.3g} um RMS over the whole lens, "
+        f"{same['rms_um']:.3g} um over this shot; "
+        f"{half['name']} has {half['rms_um']:.3g} um over the shot."
+    )

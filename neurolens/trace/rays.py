@@ -1,0 +1,454 @@
+"""The exact tracer, in either direction, and ray differentials: the reference for surrogates.
+
+Rays are separate tensors of shape [N]; float64 for truth, float32 for speed. A ray that cannot go on carries a
+status and stays finite.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
+from neurolens.base.files import own_folder
+from neurolens.lens import glass
+from neurolens.lens.prescription import Lens, Surface
+from neurolens.trace.arithmetic import is_number, times
+from neurolens.trace.shapes import figure_of, is_deep, start_of
+from neurolens.trace.surfaces import (
+    Crossed,
+    Medium,
+    Met,
+    Rays,
+    Test,
+    cross,
+    media,
+    nearest_approach,
+    radius2,
+    rim_tests,
+)
+from neurolens.trace.tensors import Survival, Tensors, at_most
+from neurolens.trace.transmission import Passage, TensorLosses
+
+Towards = Literal["scene", "film"]
+
+# Rays per chunk: long enough to hide the cost of calling an operator, short enough for a core's second-level cache.
+CHUNK = 32768
+# How far the squared length of a direction may be from 1; float32 rounding is a thousandth of this.
+UNIT_SLACK = 1e-3
+# Of the rays that `passing` follows, the share below which those that are left are put together.
+_FEWER = 0.8
+
+
+class Crossing(NamedTuple):
+    """Where rays cross one surface, each [N]; mm, and the margins of Snell's and the sphere's square roots.
+
+    `meets` is positive where the ray meets the surface, `refracts` where it is not totally reflected there. Points on
+    the far half of a sphere, beyond any rim, lie mirrored outwards (see `unfolded`).
+    """
+
+    x: Tensor
+    y: Tensor
+    meets: Tensor
+    refracts: Tensor
+
+
+class Traced(NamedTuple):
+    """What tracing gives.
+
+    Attributes:
+        rays: point on the last surface met (lens frame, mm) and unit direction after it. Rays that missed a surface or
+            were totally reflected are replaced by a finite ray along the axis; those that only a rim stops go on.
+        status: [N] int32, see `neurolens.base.status`.
+        transmittance: [N], power of unpolarised light that arrives: of surfaces and absorption; None unless requested.
+        crossings: surface index to `Crossing`, for the recorded surfaces.
+        path: the rays on and after every surface, in the order of travel, or empty if not requested.
+    """
+
+    rays: Rays
+    status: Tensor
+    transmittance: Tensor | None
+    crossings: dict[int, Crossing]
+    path: tuple[Rays, ...] = ()
+
+
+class _Wanted(NamedTuple):
+    """What to follow besides the rays; see `trace`."""
+
+    transmittance: bool
+    record: tuple[int, ...]
+    path: bool
+
+
+def trace(
+    lens: Lens,
+    rays: Rays,
+    wavelength_nm: Tensor | float | None = None,
+    *,
+    towards: Towards = "scene",
+    transmittance: bool = False,
+    record: Sequence[int] = (),
+    path: bool = False,
+) -> Traced:
+    """Trace rays through the whole lens.
+
+    Args:
+        lens: the prescription; its stop's diameter is the opening that clips.
+        rays: points and unit directions [N], lens frame, mm. The dtype (float32 or float64) is that of the result.
+        wavelength_nm: one number, or a tensor [N], of which NaN and what is not positive pass no dispersive glass; None
+            takes `Lens.reference_nm`.
+        towards: "scene" for camera rays (-z), "film" for light from the scene (+z).
+        transmittance: whether to follow the power of unpolarised light, with the polarisation that surfaces give to it.
+        record: surfaces whose crossings are wanted.
+        path: whether the points on all surfaces and the directions after them are wanted.
+
+    Raises:
+        InputError: components of unequal shapes or dtypes or of another dtype, a wavelength of another shape or a
+            number that is not positive, an unknown `towards`, a surface to record that the lens
+            does not have.
+
+    A direction that is not a unit vector counts as a miss of the first surface.
+    Differentiable with respect to rays, wavelength and prescription fields given as tensors.
+    """
+    wavelength_nm = lens.reference_nm if wavelength_nm is None else wavelength_nm
+    check_rays(rays, wavelength_nm)
+    if not torch.compiler.is_compiling():
+        _keep_memory()
+    if towards not in ("scene", "film"):
+        raise InputError("trace", "towards", towards, '"scene" or "film"')
+    if any(not 0 <= k < len(lens.surfaces) for k in record):
+        raise InputError("trace", "record", tuple(record), f"surfaces from 0 to {len(lens.surfaces) - 1}")
+    wanted = _Wanted(transmittance, tuple(record), path)
+    needs_grad = any(_differentiated(v) for v in (*rays, wavelength_nm, *_parameters(lens)))
+    count = rays.x.shape[0]
+    if needs_grad or count <= CHUNK:
+        return _trace_chunk(lens, rays, wavelength_nm, towards, wanted, needs_grad)
+    parts = []
+    for i in range(0, count, CHUNK):
+        part = slice(i, i + CHUNK)
+        lam = wavelength_nm[part] if isinstance(wavelength_nm, Tensor) and wavelength_nm.ndim else wavelength_nm
+        parts.append(_trace_chunk(lens, Rays(*(c[part] for c in rays)), lam, towards, wanted, False))
+    return _joined(parts)
+
+
+def _joined(parts: Sequence[Any]) -> Any:
+    """Chunks of results as one."""
+    first = parts[0]
+    if isinstance(first, Tensor):
+        return torch.cat(list(parts))
+    if isinstance(first, dict):
+        return {k: _joined([part[k] for part in parts]) for k in first}
+    if isinstance(first, tuple):
+        columns = [_joined(column) for column in zip(*parts, strict=True)]
+        return type(first)(*columns) if hasattr(first, "_fields") else tuple(columns)
+    return first
+
+
+def passing(lens: Lens, rays: Rays, wavelength_nm: float, *, towards: Towards = "scene") -> Tensor:
+    """Whether rays pass the whole lens, bool [N]: where the status of `trace` is 0, bit for bit.
+
+    Rays that are lost are left out of the work on later surfaces. For questions of which most are answered by no.
+    Arguments and errors are those of `trace`, with one wavelength.
+    """
+    check_rays(rays, wavelength_nm)
+    _keep_memory()
+    chunks = zip(*(c.split(CHUNK) for c in rays), strict=True)
+    with torch.no_grad():
+        return torch.cat([_passing_chunk(lens, Rays(*chunk), wavelength_nm, towards) for chunk in chunks])
+
+
+def _passing_chunk(lens: Lens, rays: Rays, wavelength_nm: float, towards: Towards) -> Tensor:
+    sense, order = _path(lens, towards)
+    tracing, left = Tracing(lens, rays, wavelength_nm, sense, order[0], False), torch.arange(len(rays.x))
+    for k in order:
+        tracing.cross(k)
+        if float(tracing.tests.passed.sum()) < _FEWER * len(left):
+            alive = torch.nonzero(tracing.tests.passed)[:, 0]
+            tracing.rays, left = Rays(*(c.index_select(0, alive) for c in tracing.rays)), left.index_select(0, alive)
+            tracing.tests = Survival(torch.ones_like(tracing.rays.x), st.PASSED)
+    passed = torch.zeros(len(rays.x), dtype=torch.bool)
+    passed[left] = tracing.tests.passed > 0
+    return passed
+
+
+def compile_trace(
+    lens: Lens, *, towards: Towards = "scene", transmittance: bool = False
+) -> Callable[[Rays, Tensor], Traced]:
+    """The same trace with the prescription folded in as constants, compiled by torch for chunks of one length.
+
+    The result takes rays and wavelengths [N]; every new N compiles anew, so call it with chunks of one length.
+    Without a C++ compiler the first call raises torch's own error; the eager `trace` needs none.
+    """
+
+    def run(rays: Rays, wavelength_nm: Tensor) -> Traced:
+        return _trace_chunk(lens, rays, wavelength_nm, towards, _Wanted(transmittance, (), False), False)
+
+    for surface in lens.surfaces:
+        # Read the catalogue now: compiled code cannot read files.
+        glass.index_of(surface, glass.LINE_D_NM)
+        glass.absorption_of(surface, glass.LINE_D_NM)
+    return compile_tracing(run)
+
+
+def compile_tracing(run: Callable[..., Any], fullgraph: bool = False) -> Callable[..., Any]:
+    """`torch.compile` of a function that traces, for chunks of one length.
+
+    What it may take for constant is marked here only: that imports the compiler, which takes longer than a camera
+    needs to start. Torch keeps the machine code that it makes, and runs what it finds: by default in a folder that
+    every user of the machine can create, so that its cache is moved into the user's own.
+    """
+    if "TORCHINDUCTOR_CACHE_DIR" not in os.environ:
+        os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(own_folder("torch"))
+    torch.compiler.assume_constant_result(start_of)
+    return torch.compile(run, dynamic=False, fullgraph=fullgraph)
+
+
+@cache
+def _keep_memory() -> None:
+    """Make glibc keep the memory of chunks between operators, once a process: half the time of a trace otherwise.
+
+    Freeing one block above 128 KiB raises the limit for return to the system to its size (mallopt(3),
+    M_MMAP_THRESHOLD).
+    """
+    torch.empty(30 << 20, dtype=torch.uint8)
+
+
+def _differentiated(value: Any) -> bool:
+    """Whether derivatives with respect to a value are followed, backwards or forwards."""
+    if not isinstance(value, Tensor):
+        return False
+    return (value.requires_grad and torch.is_grad_enabled()) or forward_ad.unpack_dual(value).tangent is not None
+
+
+def _parameters(lens: Lens) -> list[Any]:
+    found: list[Any] = []
+    for s in lens.surfaces:
+        found += (s.radius_mm, s.thickness_mm, s.n_d, s.V_d, s.conic, s.absorption_per_mm, *(a for _, a in s.asphere))
+        found += (figure for layer in (s.coating.layers if s.coating else ()) for figure in layer)
+    return found
+
+
+def _path(lens: Lens, towards: Towards) -> tuple[int, range]:
+    """The sense of travel along z, and the surfaces in the order in which light meets them."""
+    last = len(lens.surfaces) - 1
+    return (1, range(last + 1)) if towards == "film" else (-1, range(last, -1, -1))
+
+
+class Tracing:
+    """Rays on their way through a lens, surface by surface.
+
+    Args:
+        sense: the direction of travel in which they start, +1 to the film.
+        entering: the surface that they meet first. guard: whether lost rays stay finite on the way.
+        freeze: whether lost rays are put on the axis at once, for gradients.
+    """
+
+    def __init__(
+        self, lens: Lens, rays: Rays, wavelength_nm: Any, sense: int, entering: int, guard: bool, freeze: bool = False
+    ) -> None:
+        self.lens, self.sense, self.freeze = lens, sense, freeze
+        self.o = Tensors(guard or freeze, rays.x.dtype)
+        self.wavelength_nm, lit = sound_wavelength(lens, wavelength_nm, rays.x.dtype)
+        self.media = media(lens, self.wavelength_nm)  # media[k] lies before surface k as light travels to the film
+        self.figures = [figure_of(s) for s in lens.surfaces]
+        self.medium = self.media[0 if sense > 0 else -1]
+        self.vertex: Any = 0.0
+        self._entering: int | None = entering
+        self.tests, self.rays = self._start(rays, lit, st.blocked(entering, st.MISSED))
+
+    def _start(self, rays: Rays, lit: Tensor | None, otherwise: int) -> tuple[Survival, Rays]:
+        """Rays with optical direction cosines, and the test that their directions are unit vectors."""
+        o = self.o
+        length2 = o.dot(rays[3:], rays[3:])
+        sound = at_most((length2 - 1).abs(), UNIT_SLACK)
+        if lit is not None:
+            sound = sound * lit
+        if self.freeze:
+            # A NaN input must not reach the gradients of the other rays.
+            sound = sound * torch.isfinite(rays.x * rays.x + rays.y * rays.y + rays.z * rays.z)
+        tests = Survival(sound, otherwise)
+        if self.freeze:
+            rays = tests.along_axis(rays, self.sense, 0.0)
+        if self.sense > 0:
+            # Light may start far away; near the lens float32 keeps points and directions consistent.
+            rays = Rays(*nearest_approach(o, rays, 1.0), *rays[3:])
+        return tests, Rays(*rays[:3], *(times(d, self.medium.n) for d in rays[3:]))
+
+    def cross(self, k: int, reflected: bool = False) -> tuple[Rays, Crossed, tuple[Medium, Medium]]:
+        """Go on to surface k and through it, or back from it where `reflected`.
+
+        Returns the rays before it, in its vertex frame, what it does to them, and the media as they meet them.
+        """
+        lens, surface = self.lens, self.lens.surfaces[k]
+        vertex = lens.vertices_mm[k]
+        # In this surface's frame float32 keeps its precision.
+        r, self.vertex = self.rays._replace(z=self.rays.z + (self.vertex - vertex)), vertex
+        met_media = (self.media[k], self.media[k + 1]) if self.sense > 0 else (self.media[k + 1], self.media[k])
+        crossed = cross(
+            self.o, surface, self.figures[k], r, self.sense, *met_media,
+            entering=k == self._entering, reflected=reflected, rim=self._rim(surface),
+        )  # fmt: skip
+        for tests, reason in crossed.tests:
+            self.tests.require(tests, k, reason)
+        if self.figures[k].flat:
+            # A sphere's square root turns NaN and overflow into a miss; a plane would pass them.
+            self.tests.end(radius2(self.o, crossed.met))
+        self.rays, self._entering = crossed.bent.rays, None
+        self.medium = met_media[0 if reflected else 1]
+        self.sense = -self.sense if reflected else self.sense
+        # A lost ray goes on along the axis: no overflow there can reach the gradients of the others.
+        if self.freeze:
+            self.rays = self.tests.along_axis(self.rays, self.sense, 0.0)
+        return r, crossed, met_media
+
+    def _rim(self, surface: Surface) -> Callable[[Met], list[Test]] | None:
+        aperture, radius_mm = self.lens.aperture, surface.semi_diameter_mm
+        if aperture is None or not surface.stop:
+            return None
+        outer = rim_tests(self.o, surface)
+        return lambda met: [*outer(met), (0.5, aperture.inside(met.x, met.y, radius_mm).to(met.x.dtype))]
+
+    def in_lens_frame(self) -> Rays:
+        """The rays behind the last surface with unit directions."""
+        r, n = self.rays._replace(z=self.rays.z + self.vertex), self.medium.n
+        return r if is_number(n) and n == 1 else Rays(*r[:3], *(d / n for d in r[3:]))
+
+    def leave(self) -> Rays:
+        """The rays in the lens frame; those that did not go on are along the axis."""
+        return self.tests.along_axis(self.in_lens_frame(), self.sense, self.vertex)
+
+
+def _trace_chunk(
+    lens: Lens, rays: Rays, wavelength_nm: Tensor | float, towards: Towards, wanted: _Wanted, freeze: bool
+) -> Traced:
+    sense, order = _path(lens, towards)
+    tracing = Tracing(lens, rays, wavelength_nm, sense, order[0], wanted.path or bool(wanted.record), freeze)
+    power = Passage(tracing.o, lens, TensorLosses(lens, tracing.wavelength_nm)) if wanted.transmittance else None
+    crossings: dict[int, Crossing] = {}
+    path: list[Rays] = []
+    for k in order:
+        r, (met, bent, _), (before, after) = tracing.cross(k)
+        if power is not None:
+            power.pass_surface(k, r, met, bent.q, (before, after), sense)
+        if k in wanted.record:
+            margins = times(met.q2, before.inverse_n2), times(bent.q2, after.inverse_n2)
+            crossings[k] = Crossing(*unfolded(lens.surfaces[k], met), *margins)
+        if wanted.path:
+            path.append(tracing.in_lens_frame())
+    arrived = None if power is None else tracing.tests.only(power.arrived(rays.x), 0.0)
+    return Traced(tracing.leave(), tracing.tests.status(), arrived, crossings, tuple(path))
+
+
+def unfolded(surface: Surface, met: Met) -> tuple[Tensor, Tensor]:
+    """x and y of a meeting, [N] each, mm; on the far half of a deep sphere mirrored outwards at its equator.
+
+    So the distance from the axis grows on beyond a deep rim, where it would fall again, and tells the half.
+    """
+    if not is_deep(surface):
+        return met.x, met.y
+    height = torch.hypot(met.x, met.y).clamp_min(1e-300)
+    outwards = torch.where(met.z * surface.curvature > 1, 2 * abs(surface.radius_mm) / height - 1, 1.0)
+    return met.x * outwards, met.y * outwards
+
+
+def check_rays(rays: Rays, wavelength_nm: Tensor | float) -> None:
+    """Raise InputError for components of unequal or wrong shape or dtype, and such wavelengths, or one not positive."""
+    shape, dtype = rays.x.shape, rays.x.dtype
+    if dtype not in (torch.float32, torch.float64):
+        raise InputError("trace", "rays.x", f"({dtype})", "torch.float32 or torch.float64")
+    for name, c in zip(Rays._fields, rays, strict=True):
+        if c.shape != shape or c.dtype != dtype or c.ndim != 1:
+            found = f"({tuple(c.shape)}, {c.dtype})"
+            raise InputError("trace", f"rays.{name}", found, f"[N] like x: {tuple(shape)}, {dtype}")
+    if isinstance(wavelength_nm, Tensor):
+        if wavelength_nm.ndim and wavelength_nm.shape != shape:
+            found = f"({tuple(wavelength_nm.shape)})"
+            raise InputError("trace", "wavelength_nm", found, f"a number or a tensor {tuple(shape)}")
+    elif not 0 < wavelength_nm < math.inf:
+        raise InputError("trace", "wavelength_nm", wavelength_nm, "a positive number")
+
+
+def sound_wavelength(
+    lens: Lens, wavelength_nm: Tensor | float, dtype: torch.dtype
+) -> tuple[Tensor | float, Tensor | None]:
+    """Wavelengths in the precision of the rays, invalid ones replaced by the d line, and which are valid [N].
+
+    A NaN in an index would reach the gradients of the prescription, and float64 would spread to float32 rays halfway.
+    None where all are valid or, without dispersion, irrelevant.
+    """
+    if not isinstance(wavelength_nm, Tensor):
+        return wavelength_nm, None
+    sound = (wavelength_nm > 0) & (wavelength_nm < math.inf)
+    return torch.where(sound, wavelength_nm, glass.LINE_D_NM).to(dtype), sound if lens.dispersive else None
+
+
+class Differentials(NamedTuple):
+    """A traced ray and its derivatives.
+
+    Attributes:
+        traced: as `trace` gives it.
+        derivatives: for every parameter, the derivatives of the resulting ray: x, y, z (mm per unit of it) and
+            direction, each [N]; 0 for rays that do not go on. Points move on the last surface.
+    """
+
+    traced: Traced
+    derivatives: tuple[Rays, ...]
+
+
+def trace_differentials(
+    lens: Lens, rays: Rays, derivatives: Sequence[Rays], wavelength_nm: Tensor | float | None = None
+) -> Differentials:
+    """Trace camera rays together with their derivatives.
+
+    Args:
+        derivatives: of the rays with respect to some parameters, one `Rays` each (components [N]), such as those of
+            `film_derivatives`; the rest as for `trace`.
+
+    Raises:
+        InputError: as `trace`, and a derivative whose components have not the shape and dtype of the rays.
+    """
+    for n, derivative in enumerate(derivatives):
+        for name, c, r in zip(Rays._fields, derivative, rays, strict=True):
+            if c.shape != r.shape or c.dtype != r.dtype:
+                found, expected = (f"{tuple(t.shape)}, {t.dtype}" for t in (c, r))
+                raise InputError("trace", f"derivatives[{n}].{name}", f"({found})", f"like the rays: {expected}")
+    traced, carried = None, []
+    for derivative in derivatives:
+        with forward_ad.dual_level():
+            pairs = zip(rays, derivative, strict=True)
+            dual = Rays(*(forward_ad.make_dual(r.contiguous(), t.contiguous()) for r, t in pairs))
+            out = trace(lens, dual, wavelength_nm)
+            parts = [forward_ad.unpack_dual(c) for c in out.rays]
+            moved = (torch.zeros_like(p.primal) if p.tangent is None else p.tangent for p in parts)
+            # A lost ray was replaced by one along the axis, whose derivative is 0 already; others may carry NaN.
+            carried.append(Rays(*(torch.nan_to_num(s, 0.0, 0.0, 0.0) for s in moved)))
+            traced = out._replace(rays=Rays(*(p.primal for p in parts)))
+    traced = trace(lens, rays, wavelength_nm) if traced is None else traced
+    return Differentials(traced, tuple(carried))
+
+
+def film_derivatives(rays: Rays, distance_mm: Tensor | float) -> tuple[Rays, Rays]:
+    """Derivatives of camera rays with respect to the film point's x and y (mm), the pupil point held.
+
+    Args:
+        rays: from the film point towards the pupil point, unit directions, each [N].
+        distance_mm: from film point to pupil point along the ray, positive, number or [N].
+
+    With d = (P - F) / |P - F|, dd/dF_x = (d d_x - e_x) / |P - F|.
+    """
+    zero, one = torch.zeros_like(rays.x), torch.ones_like(rays.x)
+    found = []
+    for axis, along in enumerate((rays.dx, rays.dy)):
+        e = [0.0, 0.0, 0.0]
+        e[axis] = 1.0
+        dx, dy, dz = ((c * along - k) / distance_mm for c, k in zip(rays[3:], e, strict=True))
+        found.append(Rays(one * e[0], one * e[1], zero, dx, dy, dz))
+    return found[0], found[1]

@@ -1,0 +1,420 @@
+"""The shape of a surface for rays: its figure as numbers, its depth, and where an iteration along a ray starts.
+
+A conic surface of curvature c and constant K is c (x^2 + y^2 + (1 + K) z^2) - 2 z = 0; a cylinder lacks the square of
+the coordinate along which it is straight. An asphere adds A_p h^p, h the distance from the axis (from the plane of
+symmetry, for a cylinder). All arithmetic is that of `arithmetic`: the same text serves tensors, arrays and graphs.
+
+Beyond its rim a polynomial soon means nothing: a term in r^20 is 3,000 times as large at 1.5 times the rim. Where rims
+are ignored an asphere therefore follows its figures only as far as they stay close to the slope at the rim, and then
+continues with the same slope and curvature, which dies away: it becomes a cone that every ray can meet.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from importlib import import_module
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from neurolens.lens.prescription import Surface
+from neurolens.trace.arithmetic import NUMPY, TINY, Arithmetic, is_number, times
+
+# Steps of the iteration by how far the asphere departs from the conic that it starts from, in rim radii. A fixed
+# count: a test of convergence would make an accelerator wait for its host at every surface.
+STEPS = ((3e-4, 2), (3e-3, 3), (3e-2, 4), (math.inf, 7))
+# Length of the deciding step, in rim radii, that counts as converged: the error left is of the order of its square.
+LAST_STEP = 3e-4
+# cos^2 of the slope of the steepest conic that the iteration follows.
+STEEPEST = 1e-7
+# How far (rad) the slope of an asphere may turn beyond its rim before it continues smoothly, and again after that.
+TURN = 0.25
+FARTHEST = 1.5  # rim radii up to which figures are followed at most
+# Rim radius over radius of curvature from which on a sphere's rim is tested by its depth.
+DEEP = 0.25
+_UPRIGHT = 1e6  # slope and bend that stand for infinite ones
+
+Quadric = tuple[Any, Any, Any]
+
+
+class Shape(Protocol):
+    """A surface of revolution, or a cylinder bent in x or y only: c h^2 / (1 + sqrt(1 - (1 + k) c^2 h^2)) + sum a h^p.
+
+    Attributes:
+        curvature: 1/mm. conic: k. asphere: pairs (p, a). cylinder: the axis that is bent, or None.
+        across: what bends it along the other axis, or None; see `Surface`.
+    """
+
+    @property
+    def curvature(self) -> Any: ...
+    @property
+    def conic(self) -> Any: ...
+    @property
+    def asphere(self) -> Any: ...
+    @property
+    def cylinder(self) -> str | None: ...
+    @property
+    def across(self) -> Any: ...
+
+
+class Figure(NamedTuple):
+    """A surface's shape; lengths in mm, as numbers, 0-d tensors or values of a graph.
+
+    Attributes:
+        curvature, stretch: c and 1 + K of the conic.
+        plain: whether it is a sphere or a plane, of which only the curvature counts.
+        bent: whether along x and y.
+        terms: A_p of h^(p - 2), lowest first, in every second power where they are `even`; () without a polynomial.
+        start: cx, cy, cz of the quadric cx x^2 + cy y^2 + cz z^2 = 2 z that the iteration starts from; None without an
+            iteration. steps: of it. last_step: how long its last step may be.
+        across: of a toroid or biconic, along the other axis: curvature and 1 + K; () of other surfaces.
+        turned: whether it is a toroid.
+        beyond: where and how an asphere continues smoothly; None for one that follows its polynomial everywhere.
+    """
+
+    curvature: Any
+    stretch: Any = 1.0
+    plain: bool = False
+    bent: tuple[bool, bool] = (True, True)
+    terms: Sequence[Any] = ()
+    even: bool = True
+    start: Quadric | None = None
+    steps: int = 0
+    last_step: Any = 0.0
+    across: tuple[Any, ...] = ()
+    turned: bool = False
+    beyond: Beyond | None = None
+
+    @property
+    def flat(self) -> bool:
+        """Whether it is a plane, known as such: a curvature that is no plain number may become another."""
+        return self.plain and is_number(self.curvature) and self.curvature == 0
+
+
+class Beyond(NamedTuple):
+    """How a curve continues where its figures end.
+
+    With d the distance beyond the end: its slope there is slope + bend * length * (1 - exp(-d / length)).
+    """
+
+    height: float  # where the figures end
+    slope: float
+    bend: float  # second derivative there
+    length: float  # in which the second derivative dies away
+
+
+def is_plain(surface: Surface) -> bool:
+    """Whether a surface is a sphere or a plane."""
+    conic = not is_number(surface.conic) or surface.conic != 0
+    return not (conic or surface.asphere or surface.cylinder)
+
+
+def curve_of(shape: Shape, number: Callable[[Any], Any] = float) -> Figure:
+    """The figure of a shape by its own numbers; `number` turns fields that are tensors into numbers."""
+    c, k = number(shape.curvature), number(shape.conic)
+    powers = {int(n): number(a) for n, a in shape.asphere}
+    if is_number(k) and k == 0 and not powers and not shape.cylinder:
+        return Figure(c, plain=True)
+    even = all(n % 2 == 0 for n in powers)
+    return Figure(
+        c,
+        1 + k,
+        bent=(shape.cylinder != "y", shape.cylinder != "x"),
+        terms=[powers.get(n, 0.0) for n in range(2, max(powers, default=0) + 1, 2 if even else 1)],
+        even=even,
+        across=(1 / shape.across[0], 1 + (shape.across[1] or 0.0)) if shape.across else (),
+        turned=bool(shape.across and shape.across[1] is None),
+    )
+
+
+def figure_of(surface: Surface, number: Callable[[Any], Any] = lambda value: value) -> Figure:
+    """The figure of a surface with the start of its iteration; arguments as of `curve_of`."""
+    figure = curve_of(surface, number)
+    if not figure.terms and not figure.across:
+        return figure
+    start, steps = start_of(surface)
+    beyond = None if surface.followed_mm == math.inf else _end_of(surface)
+    return figure._replace(start=start, steps=steps, last_step=LAST_STEP * _extent_mm(surface), beyond=beyond)
+
+
+def without_rim(figure: Figure) -> Figure:
+    """A figure whose iteration starts from the quadric of its vertex."""
+    if not figure.terms and not figure.across:
+        return figure
+    c, (other, _) = figure.curvature, figure.across or (0.0, 1.0)
+    start = (c if figure.bent[0] else other), (c if figure.bent[1] else other), c * figure.stretch
+    return figure._replace(start=start, steps=STEPS[-1][1], last_step=math.inf)
+
+
+def start_of(surface: Surface) -> tuple[tuple[float, float, float], int]:
+    """The quadric cx x^2 + cy y^2 + cz z^2 = 2 z nearest to a surface inside its rim, and the steps it needs."""
+    asphere = tuple((p, _number(a)) for p, a in surface.asphere)
+    curve = _number(surface.curvature), _number(surface.conic), asphere, _extent_mm(surface)
+    if not surface.across:
+        (c, cz), steps = _fitted(*curve)
+        return (c * (surface.cylinder != "y"), c * (surface.cylinder != "x"), cz), steps
+    (c, other, cz), steps = _fitted_crossed(*curve, surface.across)
+    return ((other, c, cz) if surface.cylinder == "y" else (c, other, cz)), steps
+
+
+def followed_mm(surface: Surface) -> float:
+    """Distance from the axis up to which an asphere's figures are followed where rims are ignored, at least its rim."""
+    height = surface.semi_diameter_mm * np.linspace(1, FARTHEST, 51)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        angle = np.arctan(_profile(surface, height)[0])
+        tame = np.abs(angle - angle[0]) <= TURN  # NaN beyond the end of the conic is not
+    return float(height[max(int(np.argmin(tame)) - 1, 0) if not tame.all() else -1])
+
+
+def _profile(surface: Surface, height: Any) -> tuple[Any, Any]:
+    """First and second derivative by the height of a surface's meridional curve (of a cylinder: across its lines)."""
+    curve = replace(surface, cylinder=None, across=None)
+    step = 1e-4 * height
+    before, slope = (sag_and_derivatives(curve, h, 0 * h)[1] for h in (height - step, height))
+    return slope, (slope - before) / step
+
+
+def _extent_mm(surface: Surface) -> float:
+    """Distance from the axis up to which a surface's own figures hold."""
+    return min(surface.semi_diameter_mm, surface.followed_mm)
+
+
+@lru_cache(maxsize=4096)
+def _end_of(surface: Surface) -> Beyond:
+    with np.errstate(divide="ignore", invalid="ignore"):  # a conic may end at its rim, upright
+        profile = _profile(surface, np.array(surface.followed_mm))
+    slope, bend = (float(np.nan_to_num(v, nan=0.0, posinf=_UPRIGHT, neginf=-_UPRIGHT)) for v in profile)
+    length = min(TURN * surface.followed_mm, TURN * (1 + slope * slope) / max(abs(bend), 1e-300))
+    return Beyond(surface.followed_mm, slope, bend, length)
+
+
+def _number(value: Any) -> float:
+    return float(value.detach() if hasattr(value, "detach") else value)
+
+
+@lru_cache(maxsize=4096)
+def _fitted(
+    curvature: float, conic: float, asphere: tuple[tuple[int, float], ...], rim_mm: float
+) -> tuple[tuple[float, float], int]:
+    if not math.isfinite(rim_mm):
+        return (curvature, curvature * (1 + conic)), STEPS[-1][1]
+    radius_mm = 1 / curvature if curvature else math.inf
+    same = Surface(radius_mm, 0.0, 2 * rim_mm, conic=conic, asphere=asphere)
+    points = [(h, sag_mm(same, h, 0.0)) for h in (rim_mm * i / 24 for i in range(1, 25))]
+    points = [(h, z) for h, z in points if math.isfinite(z)]
+    # Linear least squares for c and cz: each point's error is that of its height along the axis, times 2.
+    hh, hz, zz = (sum(h ** (4 - 2 * k) * z ** (2 * k) for h, z in points) for k in range(3))
+    hb, zb = sum(2 * h * h * z for h, z in points), sum(2 * z**3 for _, z in points)
+    determinant = hh * zz - hz * hz
+    if determinant > 1e-9 * hh * zz:
+        c, cz = (hb * zz - zb * hz) / determinant, (zb * hh - hb * hz) / determinant
+    else:
+        c, cz = (hb / hh if hh else curvature), 0.0
+    worst = max((abs(c * h * h + cz * z * z - 2 * z) / 2 for h, z in points), default=math.inf)
+    return (c, cz), next(steps for departure, steps in STEPS if worst <= departure * rim_mm)
+
+
+@lru_cache(maxsize=4096)
+def _fitted_crossed(
+    curvature: float,
+    conic: float,
+    asphere: tuple[tuple[int, float], ...],
+    rim_mm: float,
+    across: tuple[float, float | None],
+) -> tuple[tuple[float, float, float], int]:
+    """The fit of a toroid or biconic: along the curve, across it, along z."""
+    if not math.isfinite(rim_mm):
+        return (curvature, 1 / across[0], 0.0), STEPS[-1][1]
+    radius_mm = 1 / curvature if curvature else math.inf
+    same = Surface(radius_mm, 0.0, 2 * rim_mm, conic=conic, asphere=asphere, cylinder="y", across=across)
+    h, turn = np.meshgrid(rim_mm * np.arange(1, 25) / 24, np.linspace(0, math.pi / 2, 9))
+    a, h = h.ravel() * np.sin(turn.ravel()), h.ravel() * np.cos(turn.ravel())
+    z = sag_mm(same, a, h)
+    a, h, z = (v[np.isfinite(z)] for v in (a, h, z))
+    fit, *_ = np.linalg.lstsq(np.stack([h * h, a * a, z * z], 1), 2 * z, rcond=1e-9)
+    worst = np.abs(fit @ np.stack([h * h, a * a, z * z]) - 2 * z).max(initial=0.0) / 2
+    c, other, cz = fit.tolist()
+    return (c, other, cz), next(steps for departure, steps in STEPS if worst <= departure * rim_mm)
+
+
+class Depth(NamedTuple):
+    """The curve of a figure at a distance h from its axis or plane of symmetry.
+
+    Attributes:
+        sag: depth towards +z. slope: d sag / d h over h. turn: the change of that over h by h, of the conic alone. One
+            that is not needed for the `order` of `depth` is 0.
+        cos2: squared cosine of the conic's slope, positive where it exists; None without a conic.
+    """
+
+    sag: Any
+    slope: Any
+    turn: Any
+    cos2: Any
+
+
+def depth(o: Arithmetic, figure: Figure, h2: Any, order: int = 2, steepest: float = STEEPEST) -> Depth:
+    """The depth of a figure's curve at squared distances h2 (mm^2); held finite where its conic ends.
+
+    `order`: 0 for depth and slope, 1 for the slope alone, 2 for everything. `steepest`: least squared cosine of the
+    conic's slope.
+    """
+    if figure.beyond is None:
+        return _followed(o, figure, h2, order, steepest)
+    end, slope, bend, length = figure.beyond
+    inside = _followed(o, figure, o.least(h2, o.like(h2, end * end)), order, steepest)
+    h = o.held_root(h2, end * end)
+    d = h - end
+    left = (d / -length).exp()
+    turned = bend * length * (1 - left)
+    rise = slope * d + bend * length * (d - length * (1 - left))
+    turn = o.select(h2, end * end, inside.turn, (bend * left - (slope + turned) / h) / (h * h))
+    return Depth(inside.sag + rise, inside.slope * (end / h) + turned / h, turn, inside.cos2)
+
+
+def _followed(o: Arithmetic, figure: Figure, h2: Any, order: int, steepest: float) -> Depth:
+    """The depth by a figure's own numbers: c h^2 / (1 + cos) + sum A_p h^p."""
+    sag, slope = _polynomials(o, figure, h2, order)
+    c = figure.curvature
+    if is_number(c) and c == 0:
+        return Depth(times(h2, sag), slope + o.like(h2, 0.0), 0.0, None)
+    cos2 = o.fma(h2, -(figure.stretch * c * c), 1.0)
+    cos = o.held_root(cos2, steepest)
+    if order == 1:
+        return Depth(0.0, c / cos + slope, 0.0, cos2)
+    both = c / o.fma(cos, cos, cos)  # one division for both c h^2 / (1 + cos) and c / cos
+    inverse = o.fma(both, cos, both)
+    turn = times(inverse * inverse * inverse, figure.stretch) if order else 0.0
+    return Depth(o.fma(both, cos, sag) * h2, inverse + slope, turn, cos2)
+
+
+def _polynomials(o: Arithmetic, figure: Figure, h2: Any, order: int) -> tuple[Any, Any]:
+    """sum A_p h^(p - 2) and sum p A_p h^(p - 2), in h^2 or, where odd powers occur, in h."""
+    if not figure.terms:
+        return 0.0, 0.0
+    # The root is kept from 0, where its derivative is infinite.
+    h, down = (h2, 2) if figure.even else (o.held_root(h2), 1)
+    slopes = [a * float(2 + down * k) for k, a in enumerate(figure.terms)]
+    return 0.0 if order == 1 else o.horner(h, figure.terms), o.horner(h, slopes)
+
+
+def toroid(c: Any, curve: tuple[Any, Any, Any], at: tuple[Any, Any, Any], p: tuple[Any, Any, Any]) -> tuple[Any, ...]:
+    """(c (a^2 + z^2) - c g^2) / 2 - z + g, which is 0 on a toroid; its gradient; its second derivative along p.
+
+    In any arithmetic that has operators.
+
+    Args:
+        c: 1 / radius of rotation. curve: the sag g(h), its slope over h, and the change of that over h by h.
+        at, p: point and direction: across the curve, along it, along z.
+    """
+    (g, slope, turn), (a, h, z), (pa, ph, pz) = curve, at, p
+    way = 1 - g * c
+    value = (a * a + z * z) * c * 0.5 - z + g * (way + 1) * 0.5
+    bend = (pa * pa + pz * pz) * c + ph * ph * ((slope + turn * h * h) * way - slope * slope * h * h * c)
+    return value, (a * c, slope * h * way, z * c - 1), bend
+
+
+def biconic(
+    along: tuple[Any, Any], across: tuple[Any, Any], at: tuple[Any, Any, Any], p: tuple[Any, Any, Any], root: Any
+) -> tuple[Any, ...]:
+    """Sag less z of a biconic, its gradient, its second derivative along p, and what stands under the root.
+
+    Args:
+        along, across: curvature and 1 + conic. at, p: as of `toroid`. root: a square root that is held above 0.
+    """
+    (c, k), (ca, ka), (a, h, z), (pa, ph, _) = along, across, at, p
+    kc, kca = k * c * c, ka * ca * ca
+    square = 1 - (h * h * kc + a * a * kca)
+    r = root(square)
+    over = 1 / (r + 1)
+    sag = (h * h * c + a * a * ca) * over
+    rh, ra = h * kc / r, a * kca / r  # derivatives of the root, negative
+    sh, sa = (h * c * 2 + sag * rh) * over, (a * ca * 2 + sag * ra) * over
+    change, rise = ph * rh + pa * ra, ph * sh + pa * sa
+    bend = (ph * ph * c + pa * pa * ca + rise * change) * 2 + sag * (ph * ph * kc + pa * pa * kca + change * change) / r
+    return sag - z, (sa, sh, -1.0), bend * over, square
+
+
+def height2(o: Arithmetic, figure: Figure, x: Any, y: Any) -> Any:
+    """Squared distance from the axis, or from a cylinder's plane of symmetry."""
+    if all(figure.bent):
+        return o.dot((x, y), (x, y))
+    return x * x if figure.bent[0] else y * y
+
+
+def sag(o: Arithmetic, figure: Figure, x: Any, y: Any) -> tuple[Any, Any]:
+    """Depth at points, and what is at least 0 where the surface exists; None where that is everywhere."""
+    h2 = height2(o, figure, x, y)
+    if not figure.across:
+        curve = depth(o, figure, h2, order=0, steepest=TINY)
+        return curve.sag, curve.cos2
+    (c, stretch), a = figure.across, y if figure.bent[0] else x
+    a2 = a * a
+    if not figure.turned:
+        square = 1 - (h2 * (figure.stretch * figure.curvature**2) + a2 * (stretch * c * c))
+        return (h2 * figure.curvature + a2 * c) / (1 + o.held_root(square)), square
+    curve = depth(o, figure, h2, order=0, steepest=TINY)
+    way = 1 - c * curve.sag  # to the line that the curve is turned about, over the radius there
+    square = way * way - a2 * (c * c)
+    z = (curve.sag * (1 + way) + a2 * c) / (1 + o.held_root(square))
+    return z, square if curve.cos2 is None else o.least(curve.cos2, square)
+
+
+def sag_mm(shape: Shape, x: Any, y: Any, *, held: bool = False) -> Any:
+    """Depth z (mm) of a surface at points x, y (mm) relative to its vertex, towards +z.
+
+    Args:
+        x, y: floats, numpy arrays or torch tensors.
+        held: whether a conic goes on as a plane beyond its end, where the depth is else NaN; arrays and tensors only.
+    """
+    tensor = next((v for v in (x, y) if hasattr(v, "new_full")), None)
+    o = NUMPY if tensor is None else import_module("neurolens.trace.tensors").Tensors(False, tensor.dtype)
+    z, exists = sag(o, curve_of(shape), x, y)
+    z = z if held or exists is None else o.select(0.0, exists, z, math.nan)
+    return float(z) if is_number(x) and is_number(y) else z
+
+
+def sag_and_derivatives(shape: Shape, x: Any, y: Any) -> tuple[Any, Any, Any]:
+    """Depth (mm) at points x, y (numpy arrays) and its derivatives by x and y; NaN beyond the end of a conic."""
+    figure, z = curve_of(shape), sag_mm(shape, x, y)
+    if figure.across:
+        _, (gx, gy, gz), *_ = crossed(NUMPY, figure, (x, y, z), (0.0, 0.0, 1.0))
+        return z, -gx / gz, -gy / gz
+    slope = depth(NUMPY, figure, height2(NUMPY, figure, x, y), order=1, steepest=TINY).slope + 0 * z
+    return z, figure.bent[0] * x * slope, figure.bent[1] * y * slope
+
+
+def crossed(o: Arithmetic, figure: Figure, at: Quadric, p: Quadric) -> tuple[Any, Quadric, Any, Any]:
+    """A function that is 0 on a toroid or biconic and grows with -z.
+
+    Returns its value at points, its gradient, its second derivative along p, and what is positive where the surface
+    exists.
+    """
+    (c, stretch), swapped = figure.across, not figure.bent[1]
+    (a, h, z), (pa, ph, pz) = ((v[swapped], v[not swapped], v[2]) for v in (at, p))
+    if figure.turned:
+        curve = depth(o, figure, h * h)
+        value, gradient, bend = toroid(c, curve[:3], (a, h, z), (pa, ph, pz))
+        exists = -gradient[2] if curve.cos2 is None else o.least(curve.cos2, -gradient[2])
+    else:
+        along = figure.curvature, figure.stretch
+        place, way = (a, h, z), (pa, ph, pz)
+        value, gradient, bend, exists = biconic(
+            along, (c, stretch), place, way, lambda square: o.held_root(square, STEEPEST)
+        )
+        gradient = gradient[0], gradient[1], o.like(z, -1.0)
+    return value, (gradient[swapped], gradient[not swapped], gradient[2]), bend, exists
+
+
+def is_deep(surface: Surface) -> bool:
+    """Whether a sphere's depth at its rim tells heights as exactly as their squares do."""
+    if not is_number(surface.radius_mm) or not is_plain(surface):
+        return False
+    return DEEP < rim_sine(surface) <= 1
+
+
+def rim_sine(surface: Surface) -> float:
+    """Rim radius over radius of curvature."""
+    return abs(surface.semi_diameter_mm * surface.curvature)

@@ -1,0 +1,365 @@
+"""One surface: where a ray meets it, the tests that it passes there, and how it is bent or reflected.
+
+Written once, for tensors, numpy arrays and graphs (`arithmetic`), and used for the lens in both directions and for
+ghosts. Directions in here are optical direction cosines: unit vectors times the refractive index of the medium,
+p = n d, for which Snell's law needs no division (p after = p before + a multiple of the normal). `sense` is +1 for rays
+that travel from the scene to the film (+z) and -1 for camera rays. Coordinates are relative to the surface's vertex.
+
+Formulas: Spencer and Murty 1962, "General Ray-Tracing Procedure", in the form that needs no division by dz and gives
+the cosine of incidence for free; optical direction cosines as in Welford 1986, "Aberrations of Optical Systems", ch. 4.
+Spheres, conics and cylinders are met in closed form. An asphere is met by an iteration of Newton's kind along the ray,
+started from the quadric that fits best; started at the vertex plane it fails beyond about 55 degrees.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from neurolens.base import status as st
+from neurolens.lens import glass, prescription
+from neurolens.lens.prescription import Lens, Surface
+from neurolens.trace.arithmetic import TINY, Arithmetic, is_number, times
+from neurolens.trace.shapes import STEEPEST, Figure, Quadric, crossed, depth, height2, is_deep, rim_sine
+
+# A test that a ray passes where the first value is at most the second; NaN does not pass.
+Test = tuple[Any, Any]
+
+
+class Rays(NamedTuple):
+    """Rays as a structure of arrays, each [N]: a point (mm) and a direction (unit, or times the index in here)."""
+
+    x: Any
+    y: Any
+    z: Any
+    dx: Any
+    dy: Any
+    dz: Any
+
+
+class Medium(NamedTuple):
+    """A refractive index with its square and the inverse of that: numbers, or [N] where dispersive."""
+
+    n: Any
+    n2: Any
+    inverse_n2: Any
+
+
+AIR = Medium(1.0, 1.0, 1.0)
+
+
+class Met(NamedTuple):
+    """A meeting with a surface, each [N].
+
+    `q` is n times the cosine of incidence and `q2` its square: positive where the ray meets the surface, and with
+    guards a smooth measure of how far it misses elsewhere. The ray meets the surface where it passes the `tests`.
+    `normal` is the unit normal towards +z; None for a sphere or plane, whose curvature gives it (`normal_at`).
+    """
+
+    x: Any
+    y: Any
+    z: Any
+    q: Any
+    q2: Any
+    tests: list[Test]
+    normal: Quadric | None = None
+
+
+class Bent(NamedTuple):
+    """Rays behind a surface (vertex frame), n' times their cosine there, its square, and the test for total reflection.
+
+    The square `q2` is not positive where rays are totally reflected.
+    """
+
+    rays: Rays
+    q: Any
+    q2: Any
+    tests: list[Test]
+
+
+def medium(n: Any) -> Medium:
+    """A medium of index `n`, a number or a value."""
+    n2 = n * n
+    return Medium(n, n2, 1 / n2)
+
+
+def media(lens: Lens, wavelength_nm: Any) -> list[Medium]:
+    """Media from the scene to the film; media(...)[k] lies before surface k. The same object where it does not change.
+
+    `wavelength_nm` is a number or [N]; a dispersive medium has the shape of the wavelength.
+    """
+    known: dict[Any, Medium] = {"air": AIR}
+    for s in lens.media:
+        if _medium_key(s) not in known:
+            known[_medium_key(s)] = medium(glass.index_of(s, wavelength_nm))
+    return [known[_medium_key(s)] for s in lens.media]
+
+
+def _medium_key(s: Surface | prescription.Medium) -> Any:
+    if s.glass is None and s.V_d is None and is_number(s.n_d) and s.n_d == 1:
+        return "air"
+    return (s.glass, None if s.glass else (float(s.n_d) if is_number(s.n_d) else id(s.n_d)), s.V_d)
+
+
+def nearest_approach(o: Arithmetic, r: Rays, inverse_n2: Any) -> Quadric:
+    """The point of a ray nearest to the vertex: its coordinates are small, which keeps float32 to micrometres."""
+    e = times(o.dot(r[:3], r[3:]), inverse_n2)
+    return o.fma(e, r.dx, r.x, -1), o.fma(e, r.dy, r.y, -1), o.fma(e, r.dz, r.z, -1)
+
+
+def meet(o: Arithmetic, r: Rays, figure: Figure, sense: int, before: Medium, entering: bool = False) -> Met:
+    """Meet a surface at the point next to its vertex.
+
+    `entering` marks the first surface met, where rays may arrive at more than 90 degrees.
+    """
+    if figure.flat:
+        return _meet_plane(o, r, sense)
+    nearest = nearest_approach(o, r, before.inverse_n2)
+    if figure.plain:
+        return _meet_sphere(o, r, nearest, figure.curvature, sense, before, entering)
+    if figure.start is not None:
+        return _meet_asphere(o, r, nearest, figure, sense, before)
+    return _meet_conic(o, r, nearest, figure, sense, before)
+
+
+def _meet_plane(o: Arithmetic, r: Rays, sense: int) -> Met:
+    q = times(r.dz, sense)
+    t = r.z / o.positive(q)
+    x, y = (o.fma(t, d, a, -sense) for d, a in ((r.dx, r.x), (r.dy, r.y)))
+    return Met(x, y, o.like(r.z, 0.0), q, r.dz * r.dz, [(TINY, q)])
+
+
+def _meet_sphere(o: Arithmetic, r: Rays, m: Quadric, curvature: Any, sense: int, before: Medium, entering: bool) -> Met:
+    c = times(curvature, sense)
+    f = o.fma(m[2], -2.0 * sense, o.dot(m, m) * c)
+    q2 = o.fma(f, before.n2, r.dz * r.dz, times(c, -1))
+    q = o.root(q2)
+    if not entering:
+        denominator = o.fma(r.dz, sense, q)
+        t = f / o.positive(denominator)
+        x, y, z = (o.add_to(a, t, d) for a, d in zip(m, r[3:], strict=True))
+        # A root that is NaN fails the test of the denominator, too.
+        return Met(x, y, z, q, q2, [(TINY, denominator), *([(TINY, q2)] if o.guard else [])])
+    # Beyond 90 degrees the usual form divides two vanishing numbers; the conjugate form is exact there.
+    forward = times(r.dz, sense)
+    conjugate = times(forward - q, before.inverse_n2) / (c if is_number(c) else o.nonzero(c))
+    t = o.select(forward, 0.0, conjugate, f / o.select(forward, 0.0, 1.0, forward + q))
+    x, y, z = _along(o, m, t, r)
+    # A general ray may meet the far half of the sphere, where there is no glass.
+    return Met(x, y, z, q, q2, [(TINY, q2), (times(z, curvature), 1.0)])
+
+
+def _meet_conic(o: Arithmetic, r: Rays, m: Quadric, figure: Figure, sense: int, before: Medium) -> Met:
+    c = figure.curvature
+    kind = (c * figure.bent[0], c * figure.bent[1], c * figure.stretch)
+    q2, denominator, t = _meet_quadric(o, r, m, kind, sense, before)
+    x, y, z = _along(o, m, t, r)
+    nx, ny, nz = times(x, -kind[0]), times(y, -kind[1]), o.fma(z, -kind[2], 1.0)
+    scale = o.inverse_root(o.dot((nx, ny, nz), (nx, ny, nz)))
+    tests = [(TINY, q2), (TINY, denominator * denominator), (TINY, nz)]
+    return Met(x, y, z, o.root(q2) * scale, q2 * scale * scale, tests, (nx * scale, ny * scale, nz * scale))
+
+
+def _meet_quadric(o: Arithmetic, r: Rays, m: Quadric, c: Quadric, sense: int, before: Medium) -> tuple[Any, Any, Any]:
+    """Meet cx x^2 + cy y^2 + cz z^2 = 2 z at the root next to the vertex.
+
+    Returns the square of the left side's derivative along the ray, which is positive where there is a root, what the
+    parameter of the ray is divided by, and this parameter, from the ray's nearest approach `m`.
+    """
+    p, (cx, cy, cz) = (r.dx, r.dy, r.dz), c
+    if cx is cy or (is_number(cx) and is_number(cy) and cx == cy):
+        # Rotationally symmetric: p.p = n^2 and m.p = 0 simplify the terms.
+        a = o.fma(p[2] * p[2], cz - cx, times(before.n2, cx))
+        b = p[2] * o.fma(m[2], cz - cx, -1.0)
+        f = o.fma(o.dot(m[:2], m[:2]), cx, m[2] * o.fma(m[2], cz, -2.0))
+    else:
+        a, b, f = _weighted(o, p, p, c), _weighted(o, m, p, c) - r.dz, o.fma(m[2], -2.0, _weighted(o, m, m, c))
+    q2 = o.fma(a, f, b * b, -1)
+    q, back = o.held_root(q2), times(b, -sense)
+    # The two forms of the same root: each divides by what is not small.
+    denominator = o.select(back, 0.0, a, o.fma(q, sense, -b))
+    numerator = o.select(back, 0.0, o.fma(q, -sense, -b), f)
+    return q2, denominator, numerator / o.nonzero(denominator)
+
+
+def _weighted(o: Arithmetic, a: Sequence[Any], b: Sequence[Any], w: Sequence[Any]) -> Any:
+    """Sum of the products of two vectors' components, each times its weight; terms of weight 0 are left out."""
+    total: Any = None
+    for p, q, k in zip(a, b, w, strict=True):
+        if not (is_number(k) and k == 0):
+            total = times(p * q, k) if total is None else o.fma(p, q, total, k)
+    return o.like(a[0], 0.0) if total is None else total
+
+
+def _along(o: Arithmetic, m: Quadric, t: Any, r: Rays) -> Quadric:
+    return o.fma(t, r.dx, m[0]), o.fma(t, r.dy, m[1]), o.fma(t, r.dz, m[2])
+
+
+def _meet_asphere(o: Arithmetic, r: Rays, m: Quadric, figure: Figure, sense: int, before: Medium) -> Met:
+    """Iterate along the rays, from the quadric that fits the asphere best.
+
+    Only the last step carries the derivative (implicit function theorem), so that gradients cost no memory for
+    iterations.
+    """
+    assert figure.start is not None
+    still = Rays(*(o.fixed(v) for v in r))
+    nearest = (o.fixed(m[0]), o.fixed(m[1]), o.fixed(m[2]))
+    with o.constant():
+        glass_before = Medium(*(o.fixed(v) for v in before))
+        missed, _, t = _meet_quadric(o, still, nearest, figure.start, sense, glass_before)
+        for n in range(figure.steps + o.polish - 1):
+            step = _toward(o, _along(o, nearest, t, still), still, figure, sense)
+            if n == figure.steps - 1:
+                deciding = step
+            t = t + step
+    at = _along(o, m, o.fixed(t), r)
+    step, p = _last_step(o, at, r, figure), (r.dx, r.dy, r.dz)
+    x, y, z = _along(o, at, step, r)
+    if figure.across:
+        _, (nx, ny, nz), _, exists = crossed(o, figure, (x, y, z), p)
+        scale = times(o.inverse_root(o.dot((nx, ny, nz), (nx, ny, nz))), -1)
+        q = o.dot((nx, ny, nz), p) * times(scale, sense)
+    else:
+        _, slope, _, exists = depth(o, figure, height2(o, figure, x, y), order=1)
+        nx, ny = (v * -slope if bent else o.like(v, 0.0) for v, bent in zip((x, y), figure.bent, strict=True))
+        scale = o.inverse_root(o.fma(ny, ny, o.fma(nx, nx, 1.0)))
+        nz, q = 1.0, o.fma(ny, r.dy, o.fma(nx, r.dx, r.dz)) * times(scale, sense)
+    length = times(o.abs(deciding if o.polish else step), before.n)
+    tests = [(length, figure.last_step), (TINY, q)]
+    if exists is not None:
+        tests.append((STEEPEST, exists))
+    # How far a ray misses is of use only where crossings are learnt from.
+    q2 = q * q
+    if o.guard:
+        for low, high in tests:
+            q2 = o.select(low, high, q2, o.least(missed, -q * q))
+    return Met(x, y, z, q, q2, tests, (nx * scale, ny * scale, times(scale, nz)))
+
+
+def _toward(o: Arithmetic, at: Quadric, r: Rays, figure: Figure, sense: int) -> Any:
+    """Euler's step along the rays towards sag(x, y) = z: Newton's with the bend of the surface taken into account.
+
+    Newton's own is lost where a ray all but touches the surface, for there two meetings lie close together; the
+    parabola has both.
+    """
+    p, (x, y, z) = (r.dx, r.dy, r.dz), at
+    if figure.across:
+        value, gradient, bend, _ = crossed(o, figure, at, p)
+        rate, lack = o.dot(gradient, p), 2.0 * value
+    else:
+        sag, slope, turn, _ = depth(o, figure, height2(o, figure, x, y), order=2)
+        bent = (*map(float, figure.bent), 0.0)
+        along = _weighted(o, at, p, bent)
+        rate = o.fma(slope, along, -r.dz)
+        # Second derivative of the sag along the ray, but for what the polynomial adds to the change of its slope.
+        bend = o.fma(along * along, turn, slope * _weighted(o, p, p, bent))
+        lack = 2.0 * (sag - z)
+    root = o.held_root(o.fma(bend, lack, rate * rate, -1))
+    return lack / times(o.fma(rate, -sense, root), sense)
+
+
+def _last_step(o: Arithmetic, at: Quadric, r: Rays, figure: Figure) -> Any:
+    """Newton's step, which by then is Euler's."""
+    if figure.across:
+        value, gradient, *_ = crossed(o, figure, at, (r.dx, r.dy, r.dz))
+        return -value / o.dot(gradient, r[3:])
+    sag, slope, *_ = depth(o, figure, height2(o, figure, at[0], at[1]), order=0)
+    along = _weighted(o, at, r[3:], (*map(float, figure.bent), 0.0))
+    return (at[2] - sag) / o.fma(slope, along, -r.dz)
+
+
+def normal_at(o: Arithmetic, met: Met, curvature: Any) -> Quadric:
+    """Unit normal towards +z at a meeting point; spheres and planes have it by their curvature."""
+    if met.normal is not None:
+        return met.normal
+    return met.x * -curvature, met.y * -curvature, 1.0 - met.z * curvature
+
+
+def refract(
+    o: Arithmetic, r: Rays, met: Met, curvature: Any, sense: int, before: Medium, after: Medium, step: Any = None
+) -> Bent:
+    """Snell's law: the tangential part of the optical direction cosines stays, the normal part follows their length.
+
+    `step` is n'^2 - n^2, where it is known better than from the media.
+    """
+    step = after.n2 - before.n2 if step is None else step
+    q2 = met.q2 + step
+    q = o.root(q2, o.finite)
+    # q - met.q without the rounding of both roots, which was a third of all error in float32.
+    bend = step / o.positive(q + met.q)
+    # From air nothing is totally reflected.
+    tests = [] if before is AIR else [(TINY, q2)]
+    if met.normal is not None:
+        direction = [o.fma(bend, n, p, sense) for p, n in zip(r[3:], met.normal, strict=True)]
+    else:
+        pull = times(curvature, -sense)
+        ahead = o.fma(bend, sense, r.dz)
+        direction = [o.fma(bend, met.x, r.dx, pull), o.fma(bend, met.y, r.dy, pull), o.add_to(ahead, bend, met.z, pull)]
+    return Bent(Rays(*met[:3], *direction), q, q2, tests)
+
+
+def reflect(o: Arithmetic, r: Rays, met: Met, curvature: Any, sense: int) -> Rays:
+    """Rays with the normal part of their direction turned round."""
+    normal = normal_at(o, met, curvature)
+    return Rays(*met[:3], *(o.fma(met.q, n, p, -2 * sense) for p, n in zip(r[3:], normal, strict=True)))
+
+
+def through_ideal(o: Arithmetic, r: Rays, met: Met, focal_mm: float) -> Rays:
+    """Rays in air behind an ideal thin lens: slopes change by -x / f and -y / f, so that points become points."""
+    towards = o.abs(r.dz) * (1 / focal_mm)
+    dx, dy = o.fma(towards, met.x, r.dx, -1), o.fma(towards, met.y, r.dy, -1)
+    scale = o.inverse_root(o.dot((dx, dy, r.dz), (dx, dy, r.dz)))
+    return Rays(*met[:3], dx * scale, dy * scale, r.dz * scale)
+
+
+class Crossed(NamedTuple):
+    """What a surface does to rays: those before it are given, those behind it are in its vertex frame.
+
+    `bent` has the rays behind; `tests` are all tests at the surface in order, each with its reason (`base.status`).
+    """
+
+    met: Met
+    bent: Bent
+    tests: list[tuple[list[Test], int]]
+
+
+def cross(
+    o: Arithmetic,
+    surface: Surface,
+    figure: Figure,
+    r: Rays,
+    sense: int,
+    before: Medium,
+    after: Medium,
+    *,
+    entering: bool = False,
+    reflected: bool = False,
+    rim: Callable[[Met], list[Test]] | None = None,
+) -> Crossed:
+    """Take rays through a surface, or back from it where they are `reflected`; `rim` replaces the tests of the rim."""
+    met = meet(o, r, figure, sense, before, entering)
+    tests = [(met.tests, st.MISSED), ((rim or rim_tests(o, surface))(met), st.RIM)]
+    if reflected:
+        return Crossed(met, Bent(reflect(o, r, met, figure.curvature, sense), met.q, met.q2, []), tests)
+    if surface.focal_mm is not None:
+        bent = Bent(through_ideal(o, r, met, surface.focal_mm), met.q, met.q2, [])
+    elif before is after:
+        bent = Bent(Rays(*met[:3], *r[3:]), met.q, met.q2, [])
+    else:
+        bent = refract(o, r, met, figure.curvature, sense, before, after)
+    return Crossed(met, bent, [*tests, (bent.tests, st.TOTAL_REFLECTION)])
+
+
+def rim_tests(o: Arithmetic, surface: Surface) -> Callable[[Met], list[Test]]:
+    """Tests whether a meeting lies inside a surface's rim."""
+    if is_deep(surface):
+        # By its depth: a point on the far half of the sphere may be near the axis, but there is no glass.
+        most = 1 - math.sqrt(1 - rim_sine(surface) ** 2)
+        return lambda met: [(times(met.z, surface.curvature), most)]
+    return lambda met: [(radius2(o, met), surface.semi_diameter_mm**2)]
+
+
+def radius2(o: Arithmetic, met: Met) -> Any:
+    """Squared distance of a meeting from the axis, mm^2."""
+    return o.dot(met[:2], met[:2])

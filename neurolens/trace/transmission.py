@@ -1,0 +1,232 @@
+"""Power of unpolarised light that arrives: what surfaces transmit or reflect, and what glass absorbs on the way.
+
+Each surface polarises the light that the next one meets, whose plane of incidence may be another. So Stokes parameters
+are followed: at each surface they are turned into its plane of incidence, and the surface acts on s and p. Angles stand
+only in the cosine and sine of twice the turn, which are products of normals and directions. Sources: Born and Wolf,
+Principles of Optics, 1.5.2 and 10.9.3; Chipman, Lam and Young, Polarized Light and Optical Systems, chapter 6.
+
+`Light`, `Shares` and the functions on them compute with tensors and with values of a graph alike.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from neurolens.lens.glass import absorption_of
+from neurolens.lens.prescription import Lens
+from neurolens.trace.arithmetic import Arithmetic, times
+from neurolens.trace.coatings import Layers, power_amplitudes
+from neurolens.trace.shapes import is_plain
+from neurolens.trace.surfaces import Medium, Met, Rays, normal_at
+
+Vector = Any  # x, y, z in the lens frame: three tensors [N], or the rows of a value
+
+# Added to the square of a turn's cosine: at exactly normal incidence, where there is no plane, nothing is turned.
+_FLOOR = 1e-30
+
+
+class Light(NamedTuple):
+    """Stokes parameters of light that was unpolarised and of power 1, about the plane of incidence of a surface.
+
+    Attributes:
+        power: of both polarisations together, which is the transmittance so far.
+        excess: power of s, polarised across the plane of incidence, less that of p, polarised in it.
+        diagonal, circular: real and imaginary part of 2 E_s times the conjugate of E_p; None while they are 0.
+    """
+
+    power: Any
+    excess: Any
+    diagonal: Any = None
+    circular: Any = None
+
+
+class Shares(NamedTuple):
+    """What a surface does to s and p, all but the last two to be multiplied by `above / below`.
+
+    Attributes:
+        mean, half: mean of the shares of power of s and p that go on, and half of their difference.
+        real, imaginary: of the amplitude of s times the conjugate of that of p; None for 0.
+    """
+
+    mean: Any
+    half: Any
+    real: Any
+    imaginary: Any = None
+    above: Any = 1.0
+    below: Any = 1.0
+
+
+def fresnel(before: Any, after: Any, p: Any) -> Shares:
+    """What a bare surface transmits (Born and Wolf, 1.5.2).
+
+    Args:
+        before, after: index times cosine in front of the surface and behind it, n cos i and n' cos t.
+        p: n' cos i + n cos t.
+    """
+    s = before + after
+    s2, p2 = s * s, p * p
+    return Shares(p2 + s2, p2 - s2, s * p * 2.0, None, before * after * 2.0, s2 * p2)
+
+
+def pass_surface(light: Light | None, turn: tuple[Any, Any] | None, shares: Shares) -> Light:
+    """The light behind a surface that transmits or reflects it.
+
+    Args:
+        light: from the last surface that did anything to it; None before the first, where it is unpolarised.
+        turn: from that surface's plane of incidence into this one's, as `turned`; None before the first surface.
+    """
+    mean, half, real, imaginary, above, below = shares
+    if light is None or turn is None:
+        scale = above / below
+        return Light(mean * scale, half * scale)
+    along, across = turn
+    along2, across2 = along * along + _FLOOR, across * across
+    cos, sin, size = along2 - across2, along * across * 2.0, along2 + across2
+    scale = above / (below * size)
+    power, excess, diagonal = light.power * size, light.excess * cos, -(light.excess * sin)
+    if light.diagonal is not None:
+        excess, diagonal = _plus(excess, light.diagonal, sin), _plus(diagonal, light.diagonal, cos)
+    linear, circular = diagonal * real, None if light.circular is None else light.circular * size
+    parts = [(circular, real), (diagonal, imaginary)]
+    twists = [a * b for a, b in parts if a is not None and b is not None]
+    if circular is not None and imaginary is not None:
+        linear = linear - circular * imaginary
+    return Light(
+        _plus(power * mean, excess, half) * scale,
+        _plus(power * half, excess, mean) * scale,
+        linear * scale,
+        sum(twists[1:], twists[0]) * scale if twists else None,
+    )
+
+
+def turned(last: Vector, normal: Vector, cosines: Any, across: Any) -> tuple[Any, Any]:
+    """The turn from one plane of incidence into the next: its cosine and sine, both times the same size.
+
+    The direction d lies in both planes; across them are s = d x n and s' = d x n', with s s' = n n' - (d n)(d n') and
+    s x s' = d det(d, n, n').
+
+    Args:
+        last, normal: unit normals of the two surfaces. cosines: (d n)(d n'). across: det(d, n, n'), see `crossed`.
+    """
+    return _plus(_plus(last[0] * normal[0], last[1], normal[1]), last[2], normal[2]) - cosines, across
+
+
+def crossed(d: Vector, a: Vector, b: Vector) -> Any:
+    """det(d, a, b)."""
+    return d[0] * (a[1] * b[2] - a[2] * b[1]) + d[1] * (a[2] * b[0] - a[0] * b[2]) + d[2] * (a[0] * b[1] - a[1] * b[0])
+
+
+def crossed_spheres(point: Vector, d: Vector, curvatures: tuple[Any, Any], gap_mm: Any) -> Any:
+    """`crossed` of the normals of two spheres with vertices on the axis, so far apart; the point is on the ray.
+
+    Their normals are (0, 0, 1) - c P for points P from the vertex: what is left is the ray's skewness, x dy - y dx, by
+    a number.
+    """
+    first, second = curvatures
+    return (point[0] * d[1] - point[1] * d[0]) * (first - second + first * second * gap_mm)
+
+
+def _plus(total: Any, a: Any, b: Any) -> Any:
+    """total + a b, of tensors in one pass over memory."""
+    return torch.addcmul(total, a, b) if isinstance(total, Tensor) else total + a * b
+
+
+def coated_shares(
+    cos_i: Tensor, n_before: Any, n_after: Any, layers: Layers, wavelength_nm: Any, sense: int, reflected: bool = False
+) -> Shares:
+    """What a surface transmits, or reflects with `reflected`; arguments as in `trace.coatings`."""
+    (a, b), (c, d) = power_amplitudes(cos_i, n_before, n_after, layers, wavelength_nm, sense, reflected)
+    s, p = a * a + b * b, c * c + d * d
+    return Shares((s + p) * 0.5, (s - p) * 0.5, a * c + b * d, b * c - a * d)
+
+
+class Losses(Protocol):
+    """What glass and coatings do to light: `TensorLosses` with tensors, `filmgraph.GraphLosses` in a graph."""
+
+    def absorption(self, k: int) -> Any: ...
+    def coated(self, k: int, met: Met, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares: ...
+    def transmitted(self, depth: Any) -> Any: ...
+
+
+class TensorLosses:
+    """What glass and coatings do to light, with tensors."""
+
+    def __init__(self, lens: Lens, wavelength_nm: Any) -> None:
+        self.lens, self.wavelength_nm = lens, wavelength_nm
+
+    def absorption(self, k: int) -> Any:
+        """Napierian absorption (1/mm) of the medium before surface k; None where there is none."""
+        # What the medium in front of the lens absorbs is a matter of the scene.
+        return absorption_of(self.lens.surfaces[k - 1], self.wavelength_nm) if k else None
+
+    def coated(self, k: int, met: Met, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares:
+        """What the coating of surface k transmits or reflects; arguments as of `Passage.pass_surface`."""
+        before, after = media
+        coating = self.lens.surfaces[k].coating
+        cos_i = times(met.q, 1 / before.n)
+        layers = coating.layers if coating else ()
+        return coated_shares(cos_i, before.n, after.n, layers, self.wavelength_nm, sense, reflected)
+
+    def transmitted(self, depth: Any) -> Any:
+        """exp(-depth)."""
+        return torch.exp(-depth)
+
+
+class Passage:
+    """Power carried along while rays are traced; absorption is by Beer and Lambert's law."""
+
+    def __init__(self, o: Arithmetic, lens: Lens, losses: Losses) -> None:
+        self._o, self._lens, self._losses = o, lens, losses
+        self._light: Light | None = None
+        self._depth: Any = None
+        self._last: tuple[int, Vector, Any] | None = None  # surface, its normal, n cos behind it
+
+    def pass_surface(
+        self, k: int, r: Rays, met: Met, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool = False
+    ) -> None:
+        """Surface k: rays before it, their meeting, n' cos t; media as the light meets them, of the sense of travel."""
+        before, after = media
+        absorbed = self._losses.absorption(k if sense > 0 else k + 1)
+        if absorbed is not None:
+            depth = path_mm(self._o, r, met, before) * absorbed
+            self._depth = depth if self._depth is None else self._depth + depth
+        surface = self._lens.surfaces[k]
+        coated = bool(surface.coating and surface.coating.layers)
+        if before is after and not coated and not reflected:
+            return
+        if coated or reflected:
+            shares = self._losses.coated(k, met, q, media, sense, reflected)
+        else:
+            both = before.n * after.n
+            p = self._o.fma(met.q, times(both, before.inverse_n2), q * times(both, after.inverse_n2))
+            shares = fresnel(met.q, q, p)
+        normal = normal_at(self._o, met, surface.curvature)
+        turn = None if self._last is None else self._turn(k, normal, r, met, before)
+        self._light = pass_surface(self._light, turn, shares)
+        self._last = k, normal, met.q if reflected else q
+
+    def _turn(self, k: int, normal: Vector, r: Rays, met: Met, before: Medium) -> tuple[Any, Any]:
+        """The turn between the planes of incidence (`turned`), times the square of the index."""
+        assert self._last is not None
+        last, other, q = self._last
+        pair = self._lens.surfaces[last], self._lens.surfaces[k]
+        if all(is_plain(s) for s in pair):
+            gap = self._lens.vertices_mm[k] - self._lens.vertices_mm[last]
+            across = crossed_spheres(met, r[3:], (pair[0].curvature, pair[1].curvature), gap)
+        else:
+            across = crossed(r[3:], other, normal)
+        return turned([times(c, before.n2) for c in other], normal, q * met.q, times(across, before.n))
+
+    def arrived(self, like: Any) -> Any:
+        """The power of all rays, in the form of a value."""
+        power = self._o.like(like, 1.0) if self._light is None else self._light.power
+        return power if self._depth is None else power * self._losses.transmitted(self._depth)
+
+
+def path_mm(o: Arithmetic, r: Rays, met: Met, before: Medium) -> Any:
+    """Length of the path from a ray's point to its meeting, mm; negative where the meeting lies behind it."""
+    along = o.fma(met.z - r.z, r.dz, o.fma(met.y - r.y, r.dy, (met.x - r.x) * r.dx))
+    return times(along, times(before.n, before.inverse_n2))

@@ -1,0 +1,217 @@
+"""What a probe finds besides footprints: light, contrast, flare, what is made afterwards, blur of each pixel."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from neurolens.analysis.fields import Scene as Fields
+from neurolens.base.errors import InputError
+from neurolens.cameras.build import Shot, make_camera
+from neurolens.flare.layers import FlareJob, flare_layers
+from neurolens.flare.picture import Raster
+from neurolens.flare.sources import SceneLights
+from neurolens.plan.footprints import Footprints, blur_mm, distance_mm, left_to
+from neurolens.plan.light import glance, stray_light
+from neurolens.plan.plan import plan
+from neurolens.plan.probe import effects_of, probe
+from neurolens.plan.samples import blur_map
+from neurolens.readers.lensfile import read_lens
+from neurolens.render.flaresettings import FlareSettings
+from neurolens.render.renderer import render
+from neurolens.render.scene import scene_from_tables
+from neurolens.render.world import World
+from neurolens.setting.pupils import camera_rays
+from neurolens.setting.states import set_lens
+from neurolens.study.scenes import seen_depths_m
+from neurolens.trace.rays import Rays, trace
+
+LENS = "lenses/cooke_triplet_50.toml"  # of glass that absorbs
+GREYS = {name: {"kind": "diffuse", "reflectance": [value] * 3} for name, value in (("grey", 0.2), ("light", 0.8))}
+
+
+def wall(distance_m: float = 4.0, camera: dict[str, Any] | None = None, **more: Any) -> Any:
+    shot = {"position_m": [0.0, 0.0, 0.0], "look_at_m": [0.0, 0.0, -1.0], "focus_m": 3.0, "width": 96, "height": 54}
+    plane = {"point_m": [0.0, 0.0, -distance_m], "normal": [0.0, 0.0, 1.0], "material": "grey"}
+    tables = {"environment": {"colour": [1.0, 1.0, 1.0]}, "materials": GREYS, "planes": [plane]}
+    return scene_from_tables({"camera": shot | (camera or {})} | tables | more)
+
+
+def card(size_m: float, depth_m: float, corner_m: tuple[float, float], material: str = "grey") -> dict[str, Any]:
+    sides = {"edge_u_m": [size_m, 0.0, 0.0], "edge_v_m": [0.0, size_m, 0.0]}
+    return {"corner_m": [*corner_m, -depth_m], **sides, "material": material}
+
+
+def test_narrow_light_has_no_colour_errors() -> None:
+    line = {"spectrum": [[300.0, 0.0], [584.0, 0.0], [589.0, 1.0], [594.0, 0.0], [900.0, 0.0]]}
+    sodium = wall(illuminants={"sodium": line}, environment={"colour": [1.0, 1.0, 1.0], "illuminant": "sodium"})
+    found, white = (probe(s, set_lens(read_lens(LENS)), across=4) for s in (sodium, wall()))
+    assert 583 <= found.asked.light_nm[0] < found.asked.light_nm[1] <= 595
+    assert white.asked.light_nm[0] < 430 and white.asked.light_nm[1] > 660
+    # Of one light the shares are those of the eye: its mean lies where V times the light is balanced.
+    assert (found.places.wavelength_nm * found.places.share).sum() == pytest.approx(589, abs=0.3)
+    for name in ("lateral colour", "longitudinal colour", "transmittance"):
+        narrow, wide = (np.nanmax(f.maps[name][1]) for f in (found, white))
+        assert narrow < 0.1 * wide, name
+
+
+def test_transmittance_is_that_of_the_axis() -> None:
+    found = probe(wall(), set_lens(read_lens(LENS)), across=1)  # one place, on the axis
+    slope = torch.linspace(0, 0.12, 200_001, dtype=torch.float64)
+    zero, through = torch.zeros_like(slope), []
+    for nm in found.places.wavelength_nm:
+        cone = Rays(zero, zero, zero + found.lens.film_z_mm, torch.sin(slope), zero, -torch.cos(slope))
+        along = trace(found.lens, cone, float(nm), transmittance=True)
+        # What one wavelength has of light goes with the square of its aperture, too: an integral over the cone.
+        assert along.transmittance is not None
+        through.append(float((along.transmittance * torch.sin(2 * slope))[along.status == 0].sum()))
+    tint = np.array(through) / np.average(through, weights=found.places.share)
+    expected = math.sqrt(np.average((tint - 1) ** 2, weights=found.places.share))
+    assert found.maps["transmittance"][1][0, 0] == pytest.approx(expected, rel=0.05) and expected > 5e-4
+
+
+def test_vignetting_darkens_the_corner_as_traced_rays_say() -> None:
+    """Rays of the corner's film point through a grid of the pupil, with the rims and without them; the stop in both."""
+    found = probe(wall(camera={"f_number": 2.0}), set_lens(read_lens("lenses/laikin_double_gauss_50.toml")))
+    unit, taken = found.camera_maps["vignetting"]
+    fall = found.camera_maps["natural fall-off"][1]
+    x, y = (mm * (0.5 / n - 0.5) for mm, n in zip(found.asked.film_mm, taken.shape[::-1], strict=True))
+    side = torch.linspace(-35, 35, 801, dtype=torch.float64)
+    u, v = (a.reshape(-1) for a in torch.meshgrid(side, side, indexing="ij"))
+    film = torch.full_like(u, x), torch.full_like(u, y), torch.full_like(u, found.lens.film_z_mm)
+    rays = camera_rays(*film, u, v, found.domain.pupil_z_mm)
+    whole, left = (
+        float((rays.dz**4)[trace(lens, rays, 587.56).status == 0].sum())
+        for lens in (Fields(found.lens, rims=False).traced, found.lens)
+    )
+    assert unit == "relative" and left / whole - 1 < -0.1
+    assert taken[[0, 0, -1, -1], [0, -1, 0, -1]] == pytest.approx(left / whole - 1, abs=0.003)
+    assert (taken <= 0).all() and taken[taken.shape[0] // 2, taken.shape[1] // 2] == pytest.approx(0, abs=1e-6)
+    light = found.on_film(found.seen.light)
+    axis = np.unravel_index(np.nanargmax((1 + fall) * (1 + taken)), light.shape)
+    assert (1 + fall) * (1 + taken) == pytest.approx(light / light[axis], rel=1e-6) and (fall <= 0).all()
+    worth = {e.name: e.worth for e in effects_of(found, 0.25, stray=False)}
+    assert worth["vignetting"] > 0.05  # its size: what a camera without it gets wrong
+
+
+def test_contrast_is_that_of_the_scene_and_not_noise() -> None:
+    camera = make_camera("pinhole", Shot((36.0, 20.25), 3.0))
+    bare = glance(wall(), camera)
+    assert np.median(bare.contrast) < 0.02
+    # The right half is four times as bright: on its left a step of 3 to one of two neighbours.
+    half = glance(wall(quads=[card(9.0, 3.99, (0.0, -4.5), "light")]), camera)
+    assert np.median(half.contrast[:, 23]) == pytest.approx(3 / math.sqrt(2), rel=0.1)
+    assert np.median(half.contrast[:, [10, 40]]) < 0.02
+
+
+def test_edges_are_where_blur_differs() -> None:
+    near = [card(0.3, 1.0, (0.05, 0.1), "light")]
+    lens = set_lens(read_lens(LENS))
+    scenes = wall(), wall(4.0, {"f_number": 45.0}, quads=near), wall(quads=near)
+    bare, sharp, open_stop = (probe(s, lens, across=2).asked for s in scenes)
+    assert bare.edges == 0 and bare.edge_contrast is None and open_stop.edges > 0.005 > sharp.edges
+    assert open_stop.edge_contrast is not None and open_stop.edge_contrast > 5 * max(open_stop.contrast, 0.01)
+
+
+def test_flare_is_that_of_the_layers() -> None:
+    """As its layers at four times the pixels, in proportion to the light, and none without a light."""
+    bright = {"centre_m": [0.5, 0.3, -3.0], "radius_m": 0.03}
+    scenes = [wall(spheres=[bright | {"emission": [e, e, e]}]) for e in (300.0, 600.0)]
+    camera = make_camera(LENS, Shot((36.0, 20.25), 3.0))
+    small = glance(wall(), camera)
+    once, twice = (stray_light(s, camera, small) for s in scenes)
+    for name in ("flare", "star-bursts"):
+        assert twice[name].mean() == pytest.approx(2 * once[name].mean(), rel=1e-3) and once[name].mean() > 0
+    lights = SceneLights(scenes[0]).seen(scenes[0], camera.lens.film_z_mm)
+    job = FlareJob(camera.lens, lights, Raster((36.0, 20.25), 192, 108), FlareSettings(bins=3))
+    large = flare_layers(job)["ghosts"]
+    expected = large.max(-1).reshape(27, 4, 48, 4).mean((1, 3)) / small.rgb.mean(-1)
+    assert once["flare"].mean() == pytest.approx(expected.mean(), rel=0.03)
+    assert np.corrcoef(once["flare"].ravel(), expected.ravel())[0, 1] > 0.9
+    assert not any(v.any() for v in stray_light(wall(), camera, small).values())
+
+
+def test_what_is_made_afterwards_is_not_asked() -> None:
+    lens = set_lens(read_lens(LENS))
+    far = wall(500.0, {"f_number": 45.0, "focus_m": 500.0, "width": 1920, "height": 1080})
+    without = plan(far, lens, 0.2, afterwards=["distortion"])
+    assert without.best is not None and without.best.name == "pinhole"
+    told = next(e for e in without.effects if e.name == "distortion")
+    assert told.worth > 0.2 and told.why == "made afterwards" and not told.needed
+    assert next(c for c in without.choices if c.name == "exact").error_px > 0.2  # it has what comes twice
+    blurred = plan(wall(1.0), lens, 0.2, afterwards=["distortion", "defocus"])
+    assert blurred.best is not None and blurred.best.name == "pinhole" and blurred.best.error_px < 0.02
+    with pytest.raises(InputError, match="afterwards"):
+        probe(far, lens, afterwards=["coma"])
+
+
+def test_footprints_without_distortion_lie_where_a_thin_lens_has_them() -> None:
+    place, share = np.random.default_rng(0).normal(size=(2, 1, 1, 500)), np.ones(1)
+    thin = Footprints(place, place, np.ones((1, 1, 500)))
+    moved = Footprints(place + 0.3, place, thin.weight)
+    assert distance_mm(left_to(moved, thin, share, ["distortion"]), thin, share)[0] < 1e-12
+    assert distance_mm(left_to(moved, thin, share, []), thin, share)[0] == pytest.approx(0.3 * math.sqrt(2))
+    assert blur_mm(left_to(moved, thin, share, ["defocus"]), share)[0] < 1e-12
+
+
+@pytest.mark.parametrize("f_number", [4.0, 8.0])
+def test_blur_of_each_pixel_is_the_circle_of_confusion_at_its_depth(f_number: float) -> None:
+    """A small card before a wall, through a thin lens: two diameters, and nothing between."""
+    scene = wall(5.0, {"f_number": f_number}, quads=[card(0.3, 2.0, (0.05, 0.1))])
+    found = probe(scene, set_lens(read_lens(LENS)), across=4)
+    thin = make_camera("thin", Shot((36.0, 20.25), 3.0, f_number=f_number))
+    object.__setattr__(found, "exact", thin)
+    blur, depth = blur_map(found)
+    image = 50 / (1 - 50 / (3000 - thin.settings["lens_state"]["pinhole_focal_length_mm"]))
+    for there in (2.0, 5.0):
+        at = np.abs(depth - there) < 1e-3
+        confusion = 50 / f_number * image * abs(1 / (1000 * there - image) - 1 / (3000 - image))
+        assert blur[at] * found.asked.pixel_mm == pytest.approx(confusion, rel=0.01)
+    assert (np.abs(depth - 2) < 1e-3).any() and set(np.round(np.unique(depth), 2)) == {2.0, 5.0}
+    rendered = render(scene, thin, samples=1).layers.depth
+    assert np.median(np.abs(rendered - depth)) < 0.01  # and the card is where a render shows it
+    assert (np.abs(rendered - depth) < 0.01).mean() > 0.95
+
+
+EXTREMES: dict[str, dict[str, Any]] = {
+    "distant": {"planes": []},
+    "at the front glass": {"quads": [card(0.2, 0.0635, (-0.1, -0.1))]},  # 2 mm before it, 61.5 mm from the film
+    "one pixel": {"camera": {"width": 1, "height": 1, "film_width_mm": 0.01, "film_height_mm": 0.01}},
+    "dark": {"environment": {"colour": [0.0, 0.0, 0.0]}},
+}
+
+
+@pytest.mark.parametrize("name", EXTREMES)
+def test_extremes_have_an_answer(name: str) -> None:
+    found = probe(wall(**EXTREMES[name]), set_lens(read_lens(LENS)), across=3)
+    effects = effects_of(found, 0.25)
+    assert all(e.worth >= 0 for e in effects) and {"defocus", "flare"} <= {e.name for e in effects}
+    assert (found.asked.nearest_m is None) == (name == "distant")
+    blur, _ = blur_map(found)
+    assert np.isfinite(blur).all() and blur.shape == (found.scene.settings.camera.height, blur.shape[1])
+    if name == "at the front glass":
+        assert np.median(blur) > 20  # pixels
+
+
+def test_lights_beyond_number_are_bounded() -> None:
+    """Of many lights those that are strongest at the lens are looked at: a near one among weak ones is found."""
+    place = np.random.default_rng(0).uniform([-9, -9, -60], [9, 9, -40], (20_000, 3))
+    points = [{"position_m": [float(v) for v in p], "intensity": [1e-6] * 3} for p in place]
+    points[12_345] = {"position_m": [0.2, 0.1, -2.0], "intensity": [5.0] * 3}
+    scene = wall(100.0, points=points)
+    seen = SceneLights(scene).seen(scene, 60.0, most=8)
+    assert len(seen) <= 8 and max(a.rgb[0] for a in seen) == pytest.approx(5 / 2.01**2, rel=0.1)
+
+
+def test_a_probe_makes_its_scene_ready_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a million lights that takes half a minute."""
+    made, whole = [], World.__init__
+    monkeypatch.setattr(World, "__init__", lambda self, *args: (made.append(1), whole(self, *args))[1])
+    bulb = {"centre_m": [0.0, 0.0, -2.5], "radius_m": 0.5, "emission": [5.0, 4.0, 3.0]}
+    scene = wall(spheres=[bulb])
+    found = probe(scene, set_lens(read_lens(LENS)), across=4)
+    assert len(made) == 1 and 2.0 < found.asked.nearest_m < 2.3
+    seen_depths_m(scene, found.exact, found.places.film_mm)  # outside nothing is kept
+    assert len(made) == 2

@@ -1,0 +1,116 @@
+"""The timing harness: what it reports, never how fast. Thresholds belong to `make bench`."""
+
+import math
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from neurolens.base.errors import InputError
+from neurolens.cameras.ideal import ThinLens
+from neurolens.cameras.pinhole import Pinhole
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
+from neurolens.study.candidates import camera_candidate, exact_candidates
+from neurolens.study.speed import Call, Candidate, Race, Unavailable, race
+from neurolens.surrogates.bases import pinned_threads
+from neurolens.surrogates.domain import FilmRays, domain_of
+from neurolens.surrogates.model import Domain
+
+LENSES = Path(__file__).parents[2] / "lenses"
+
+
+@pytest.fixture(scope="module")
+def domain() -> Domain:
+    return domain_of(set_lens(read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml")), film_radius_mm=10.0)
+
+
+def test_a_race_of_cameras_and_the_eager_tracer(domain: Domain) -> None:
+    lens = set_lens(read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml"))
+    eager = exact_candidates(lens, domain, compiled=False)
+    cameras = [camera_candidate(c, domain) for c in (Pinhole(50.0), ThinLens(50.0, 2.0, math.inf))]
+    result = race([*eager, *cameras], domain, rounds=3)
+    assert list(result.ns) == ["exact eager", "pinhole", "thin"]
+    for name in result.ns:
+        timing = result.timing(name)
+        assert timing is not None and 0 < timing["min"] <= timing["median"] and timing["repeats"] == 3
+    there, back = result.speedup("thin", "exact eager"), result.speedup("exact eager", "thin")
+    assert there is not None and back is not None
+    assert there["min"] * back["min"] == pytest.approx(1)
+    assert result.speedup("thin", "thin") == {"min": 1.0, "median": 1.0}
+
+
+def test_every_batch_covers_the_same_rays_and_threads_come_back_after_an_error(domain: Domain) -> None:
+    done, before = Counter[int](), torch.get_num_threads()
+
+    def prepare(rays: FilmRays) -> Call:
+        done[len(rays)] += len(rays)
+        return lambda: None
+
+    race([Candidate("idle", prepare, (4096, 16384))], domain, rounds=1)
+    assert done[4096] == done[16384] > 0
+    with pytest.raises(RuntimeError), pinned_threads():
+        assert torch.get_num_threads() == 1
+        raise RuntimeError
+    assert torch.get_num_threads() == before
+
+
+def test_ratios_are_taken_within_rounds() -> None:
+    """A machine that slows down tenfold half way changes both times and no ratio."""
+    drifting = Race({"model": [1.0, 10.0, 10.0], "exact": [4.0, 40.0, 40.0]}, {"model": 1, "exact": 1}, 1, 3)
+    assert drifting.speedup("model", "exact") == {"min": 4.0, "median": 4.0}
+    assert drifting.speedup("model", "absent") is None
+
+
+def test_what_cannot_run_is_reported_with_its_reason(domain: Domain) -> None:
+    def refuse(_: FilmRays) -> Call:
+        raise Unavailable("no such thing here")
+
+    result = race([Candidate("absent", refuse), camera_candidate(Pinhole(50.0), domain)], domain, rounds=1)
+    assert result.unavailable == {"absent": "no such thing here"}
+    known = {"name": "absent", "available": False, "reason": "no such thing here", "ns_per_ray": None}
+    assert result.record("absent") == known
+    assert result.record("pinhole")["available"]
+    assert result.timing("absent") is None
+    assert result.speedup("pinhole", "absent") is None
+
+
+@pytest.mark.slow
+def test_without_a_compiler_the_compiled_tracer_is_unavailable(domain: Domain) -> None:
+    import torch._inductor.config as inductor
+
+    lens = set_lens(read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml"))
+    # torch's own patch: monkeypatch leaves its settings unusable. A kernel compiled before would need no compiler.
+    with inductor.patch({"cpp.cxx": ("/nowhere/c++",), "fx_graph_cache": False}):
+        result = race(exact_candidates(lens, domain), domain, rounds=1)
+    assert "exact eager" in result.ns
+    assert "compiler" in result.unavailable["exact compiled"].lower()
+
+
+def test_bad_settings_are_refused(domain: Domain) -> None:
+    pinhole = camera_candidate(Pinhole(50.0), domain)
+    for words, candidates, options in (
+        ("threads", [pinhole], {"threads": 0}), ("differ", [pinhole] * 2, {}), ("round", [pinhole], {"rounds": 0}),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=words):
+            race(candidates, domain, **options)
+
+
+def test_candidates_of_several_domains_run_in_one_race() -> None:
+    """Each does rays of its own domain; all are timed round by round together."""
+    wide = domain_of(set_lens(read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml"), f_number=8), film_radius_mm=20.0)
+    small = replace(wide, film_radius_mm=5.0)
+    reached: dict[str, float] = {}
+
+    def watching(name: str) -> Candidate:
+        def prepare(rays: FilmRays) -> Call:
+            reached[name] = max(reached.get(name, 0.0), float(torch.hypot(rays.film_x, rays.film_y).max()))
+            return lambda: None
+
+        return Candidate(name, prepare)
+
+    timed = race([watching("wide"), replace(watching("small"), domain=small)], wide, rounds=2)
+    assert reached == pytest.approx({"wide": 20.0, "small": 5.0}, rel=1e-2)
+    assert len(timed.ns["wide"]) == len(timed.ns["small"]) == 2

@@ -1,0 +1,125 @@
+"""Offers, fronts and choices by time against what is known of them, and the page that a trade leaves."""
+
+import json
+import math
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from neurolens.base.errors import InputError
+from neurolens.base.tomlfile import format_toml
+from neurolens.cli import main
+from neurolens.plan import trade as traded
+from neurolens.plan.plan import Choice
+from neurolens.plan.probe import probe
+from neurolens.plan.trade import Offer, best_within, front, offers, small, spread
+from neurolens.readers.lensfile import read_lens
+from neurolens.render.scene import scene_from_tables
+
+LENS = "lenses/cooke_triplet_50.toml"  # of glass that absorbs
+
+
+def scene(**camera: object) -> dict:
+    shot = {"position_m": [0.0, 0.0, 0.0], "look_at_m": [0.0, 0.0, -1.0], "focus_m": 3.0, "width": 320, "height": 180}
+    return {
+        "camera": {**shot, **camera},
+        "environment": {"colour": [1.0, 1.0, 1.0]},
+        "materials": {"grey": {"kind": "diffuse", "reflectance": [0.5, 0.5, 0.5]}},
+        "planes": [{"point_m": [0.0, 0.0, -4.0], "normal": [0.0, 0.0, 1.0], "material": "grey"}],
+    }
+
+
+def choice(name: str, error: float, cost: float, noise: float = 1.0, light: float = 0.0) -> Choice:
+    return Choice(name, "", error, light, cost, noise)
+
+
+def test_seconds_are_those_of_the_camera_and_of_the_rays_that_its_noise_asks_for() -> None:
+    tried = [choice("even", 0.1, 50.0), choice("noisy", 0.0, 20.0, 1.5), choice("untimed", 0.0, math.inf)]
+    made, rays = scene_from_tables(scene(samples=100)), 320 * 180 * 100
+    for denoised in (False, True):
+        found = SimpleNamespace(asked=SimpleNamespace(denoised=denoised))
+        seconds = {o.choice.name: o.seconds for o in offers(made, found, tried, 1000.0)}  # type: ignore[arg-type]
+        extra = 0.0 if denoised else 0.5 * 1000.0
+        assert seconds == pytest.approx({"even": 50e-9 * rays, "noisy": (20.0 + extra) * 1e-9 * rays})
+
+
+def test_the_front_holds_what_nothing_betters_and_time_buys_the_most_faithful() -> None:
+    rows = [
+        ("a", 2.0, 1.0, 0.0),
+        ("b", 1.0, 2.0, 0.0),
+        ("dull", 1.5, 3.0, 0.0),
+        ("dark", 0.1, 1.5, 0.5),
+        ("c", 0, 9, 0),
+    ]
+    offered = [Offer(choice(n, e, 0.0, light=dim), s) for n, e, s, dim in rows]
+    assert [o.choice.name for o in front(offered)] == ["a", "b", "c"]
+    bought = {s: best_within(offered, s) for s in (0.5, 1.0, 5.0, 9.0)}
+    assert [o and o.choice.name for o in bought.values()] == [None, "a", "b", "c"]
+
+
+def test_what_is_shown_holds_the_ends_and_the_chosen_one() -> None:
+    many = [Offer(choice(str(k), 1 / (k + 1), 0.0), float(k)) for k in range(30)]
+    for chosen in (0, 7, 13, 29):
+        names = [o.choice.name for o in spread(many, many[chosen], 6)]
+        assert len(names) == 6 and {"0", "29", str(chosen)} <= set(names) and names == sorted(names, key=int)
+    assert spread(many[:3], None, 6) == many[:3]
+    beside = Offer(choice("beside", 0.5, 0.0), 2.5)  # a choice that another camera betters is shown, too
+    assert beside in spread(many, beside, 6) and spread(many[:2], beside) == [*many[:2], beside]
+
+
+def test_small_pictures_keep_the_shape_of_the_film() -> None:
+    for width, height in ((640, 360), (1, 1), (997, 561), (64, 36)):
+        film = {"film_width_mm": 36.0, "film_height_mm": 36.0 * height / width}
+        across, down = small(scene_from_tables(scene(width=width, height=height, **film)), 240)
+        assert across == min(width, 240) and abs(down - across * height / width) <= 0.5
+
+
+def test_a_trade_leaves_one_page_that_needs_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, lens, folder = tmp_path / "scene.toml", tmp_path / "own.toml", tmp_path / "trade"
+    film = {"film_width_mm": 18.0, "film_height_mm": 10.125, "samples": 4, "f_number": 5.6}
+    file.write_text(format_toml(scene(width=64, height=36, **film)))
+    lens.write_bytes(Path(LENS).read_bytes())  # no model of it ships
+    asked = ["--lens", str(lens), "--budget", "0.05px", "--no-fit", "--samples", "1", "--quiet"]
+    assert main(["plan", str(file), "--trade", *asked, "-o", str(folder)]) == 0
+    said, told = capsys.readouterr().out, json.loads((folder / "trade.json").read_text())
+    page = (folder / "trade.html").read_text()
+    sources = re.findall(r"(?:src|href)=[\"']([^\"']*)", page)
+    assert sources and all(source.startswith("data:image/png;base64,") for source in sources)
+    assert page.count("<img") == 2 and "http" not in page and "<script" not in page
+    cameras = {c["name"]: c for c in told["cameras"]}
+    assert told["chosen"] in told["front"] and cameras["exact"]["error_px"] == 0 and cameras["exact"]["flip"] == 0
+    seconds, errors = ([cameras[n][k] for n in told["front"]] for k in ("seconds", "error_px"))
+    assert seconds == sorted(seconds) and errors == sorted(errors, reverse=True) and cameras["exact"]["seconds"] > 0
+    chosen = cameras[told["chosen"]]
+    assert re.search(rf"which adds ~?{chosen['seconds']:.3g} s", said) and "Half of that buys" in said
+    (row,) = (line for line in said.splitlines() if line.startswith("*  "))
+    assert f"{chosen['seconds']:.3g}" in row.replace("~", " ").split()  # advice, table and plot use one measurement
+    assert told["chosen"] == "exact"  # a picture of our renderer takes many times what its camera does
+
+
+def test_a_plan_for_a_time_takes_the_most_faithful_camera_that_fits(tmp_path: Path) -> None:
+    file = tmp_path / "scene.toml"
+    file.write_text(format_toml(scene(width=64, height=36, film_width_mm=18.0, film_height_mm=10.125, samples=4)))
+    asked = ["plan", str(file), "--lens", LENS, "--no-fit", "--quiet", "-o", str(tmp_path / "plan"), "--budget"]
+    assert main([*asked, "1e6s"]) == 0
+    told = json.loads((tmp_path / "plan" / "plan.json").read_text())
+    assert told["best"]["name"] == "exact" and told["budget_s"] == 1e6 and told["budget_px"] == 0
+    assert main([*asked, "20s", "--for", "glsl"]) == 2  # no time is known
+
+
+def test_a_plan_for_flip_takes_the_cheapest_camera_that_looks_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = scene_from_tables(scene(width=64, height=36, film_width_mm=18.0, film_height_mm=10.125, samples=4))
+    found, seen = probe(shown, read_lens(LENS)), {}
+    priced = traded._priced(shown, found, 0.0, "render", [], None, None)
+    monkeypatch.setattr(traded, "probe", lambda *args: found)  # once for all budgets
+    monkeypatch.setattr(traded, "_priced", lambda *args: priced)
+    for budget in (0.0, 0.05, 1.0):
+        seen[budget] = traded.plan_seen(shown, read_lens(LENS), budget).best
+        assert seen[budget] is not None and seen[budget].flip <= budget
+    right = [c.cost for c in priced[0].choices if c.light_error <= 0.01]
+    assert seen[0.0].name == "exact" and seen[1.0].cost == min(right) <= seen[0.05].cost <= seen[0.0].cost
+    for wrong in ({"flip_budget": 1.5}, {"flip_budget": 0.1, "afterwards": ("distortion",)}):
+        with pytest.raises(InputError):
+            traded.plan_seen(shown, read_lens(LENS), **wrong)

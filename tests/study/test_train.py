@@ -1,0 +1,290 @@
+"""The whole line on small experiments: lens file to report, many states, and on again after an interruption."""
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import lens_models
+import numpy as np
+import pytest
+
+from experiments.zoom import CASES, page
+from neurolens.base.errors import InputError
+from neurolens.base.kept import Kept
+from neurolens.base.progress import Progress
+from neurolens.cameras.model import load_model
+from neurolens.cli import main
+from neurolens.study import measure
+from neurolens.study.experiment import default_experiment, read_experiment
+from neurolens.study.measure import fit_and_measure
+from neurolens.study.train import run_experiment
+from neurolens.study.train_states import fit_and_measure_states, state_settings
+from neurolens.surrogates.file import pack, read_model
+from neurolens.surrogates.fit import ModelSettings, prepare
+from neurolens.surrogates.pairs import make_pairs
+from neurolens.surrogates.states_fit import StateSettings
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).parents[2]
+SMALL = """
+title = "small"
+[lens]
+file = "ROOT/lenses/brendel_tessar_100.toml"
+efl_mm = 50
+[domain]
+wavelength_nm = [400, 700]
+[pairs]
+train = 3000
+held_out = 2000
+rim = 3000
+[[model]]
+method = "thick"
+[[model]]
+method = "ols"
+terms = 24
+[[model]]
+method = "mlp"
+units = 8
+steps = 20
+[evaluation]
+vignetting_rays = 20000
+rounds = 1
+compile_exact = false
+[render]
+scenes = ["ROOT/experiments/scenes/grid.toml"]
+width = 32
+height = 18
+samples = 4
+[scene_domain]
+scene = "ROOT/experiments/scenes/grid.toml"
+model = { method = "ols", terms = 24, planes = false }
+"""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    folder = tmp_path_factory.mktemp("run")
+    # Relative paths all along: as files name others, as a person names files, and from another folder than the file's.
+    (folder / "small.toml").write_text(SMALL.replace("ROOT", os.path.relpath(ROOT, folder)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder.parent)
+        experiment = read_experiment(Path(folder.name) / "small.toml")
+        return folder, run_experiment(experiment, Path(folder.name) / "out", progress=Progress(quiet=True))
+
+
+def test_leaves_everything_in_one_folder(run: tuple[Path, dict]) -> None:
+    out = run[0] / "out"
+    written = json.loads((out / "results.json").read_text())
+    assert (out / "report.html").read_text().startswith("<!")
+    for record in written["models"]:
+        assert (out / record["file"]).stat().st_size == record["bytes"]
+    for record in [*written["images"], *written["figures"]]:
+        picture = out / (record.get("file_png") or record["file"])
+        assert picture.stat().st_size > 1000, picture
+    assert (out / "config.toml").exists()
+    assert "illumination" in " ".join(f["file"] for f in written["figures"])
+    assert written["image_settings"]["pixels_per_degree"] == 67
+    assert "67" in (out / "report.html").read_text().partition("Image comparison")[2][:400]
+
+
+def test_errors_are_in_the_order_that_physics_gives_and_hold_when_stopped_down(run: tuple[Path, dict]) -> None:
+    thick, fitted, network = run[1]["models"]
+    assert thick["rms_um"] > 20 * fitted["rms_um"] > 0
+    assert network["rms_um"] < thick["rms_um"] / 5
+    assert fitted["false_pass"] < 0.005 and fitted["false_block"] < 0.005
+    stopped = {m["name"]: m["stopped_down"] for m in run[1]["models"]}
+    for shares in stopped["ols-24"].values():
+        assert shares["false_pass"] < 0.02 and shares["false_block"] < 0.02
+    assert set(stopped["mlp-8x2"]) == {"2_stops", "4_stops"}
+
+
+def test_less_to_model_is_modelled_better(run: tuple[Path, dict]) -> None:
+    whole, shot, half = run[1]["domain_gain"]["rows"]
+    assert all(row["ns_per_ray"]["min"] > 0 for row in (whole, shot, half))
+    assert whole["nearest_m"] is None and 0.5 < shot["nearest_m"] < 10
+    assert shot["film_radius_mm"] < whole["film_radius_mm"]
+    assert shot["rms_um"] < whole["rms_um"]
+    assert half["coefficients_per_vector"] == shot["coefficients_per_vector"] / 2
+
+
+def test_models_are_whole_and_fitted_again_where_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The final name comes when the errors are in the card."""
+    there: list[list[Path]] = []
+    usual = measure.measure_on
+    monkeypatch.setattr(
+        measure, "measure_on", lambda *a: (there.append(list(tmp_path.glob("[!.]*.onnx"))), usual(*a))[1]
+    )
+    lens = f'lens.file="{ROOT}/lenses/thorlabs_lb1471_biconvex_50.toml"'
+    small = ("pairs.train=1000", "pairs.held_out=500", "pairs.rim=500", "evaluation.vignetting_rays=2000")
+    (tmp_path / "a.toml").write_text('title = "a"\n[lens]\nfile = "a"\n[[model]]\nterms = 6\nplanes = false\n')
+    settings = read_experiment(tmp_path / "a.toml", [lens, *small, "lens.f_number=8", "domain.film_radius_mm=21"])
+    lens_ = settings.lens.read()
+    prepared = prepare(make_pairs(lens_, settings.domain.of(lens_), settings.pairs))
+    first = fit_and_measure(prepared, settings.model[0], tmp_path, 2000, lambda _: None)
+    whole = first.file.read_bytes()
+    assert fit_and_measure(prepared, settings.model[0], tmp_path, 2000, lambda _: None).record == first.record
+    first.file.write_bytes(whole[:-1000])
+    again = fit_and_measure(prepared, settings.model[0], tmp_path, 2000, lambda _: None)
+    assert again.record["rms_um"] == first.record["rms_um"] and there == [[], [first.file]]
+    assert load_model(again.file).card["errors"]["rms_um"] == pytest.approx(first.record["rms_um"])
+
+
+def test_resolved_configuration_runs_again_without_fitting(run: tuple[Path, dict]) -> None:
+    out = run[0] / "out"
+    before = {f: f.stat().st_mtime_ns for f in (out / "models").glob("*.onnx")}
+    quick = ["render.scenes=[]", "scene_domain=none"]
+    again = run_experiment(read_experiment(out / "config.toml", quick), out)
+    assert {f: f.stat().st_mtime_ns for f in (out / "models").glob("*.onnx")} == before
+    assert [m["rms_um"] for m in again["models"]] == [m["rms_um"] for m in run[1]["models"]]
+
+
+@pytest.mark.parametrize(
+    ("override", "field"),
+    [
+        ("render.seeds=2", "seeds"),
+        ("model=[]", "model"),
+        ("lens.efl_mm=-3", "efl_mm"),
+        ("domain.wavelength_nm=[700, 400]", "wavelength_nm"),
+        ("nonsense=1", "nonsense"),
+        ('model=[{name="../../evil"}]', "model"),
+        ('model=[{name=".hidden"}]', "model"),
+        ('scene_domain.model.name="a/b"', "scene_domain"),
+    ],
+)
+def test_bad_settings_name_the_field(tmp_path: Path, override: str, field: str) -> None:
+    (tmp_path / "small.toml").write_text(SMALL.replace("ROOT", str(ROOT)))
+    with pytest.raises(InputError, match=field):
+        run_experiment(read_experiment(tmp_path / "small.toml", [override]), tmp_path / "out")
+
+
+SINGLET = str(lens_models.LENSES / "thorlabs_lb1471_biconvex_50.toml")
+QUICK = """--rounds 0 --quiet --set pairs.train=1000 --set pairs.held_out=500 --set pairs.rim=500 --set lens.f_number=8
+--set evaluation.vignetting_rays=2000 --set domain.film_radius_mm=15""".split()
+RUNGS = "model=[{terms=3,planes=false},{terms=12,planes=false},{terms=20,planes=false}]"
+
+
+@pytest.mark.parametrize(("asked", "within_um", "tried"), [("um=2", 2.0, 2), ("px=1e-6", 1e-6 * 6.24, 3)])
+def test_models_are_fitted_until_one_has_the_error_asked_for(tmp_path, capsys, asked, within_um, tried) -> None:
+    kind, _, value = asked.partition("=")
+    code = main(
+        ["train", "--lens", SINGLET, "--output", str(tmp_path), f"--target-{kind}", value, *QUICK, "--set", RUNGS]
+    )
+    found, said = json.loads((tmp_path / "results.json").read_text()), capsys.readouterr().out
+    errors = [m["rms_um"] for m in found["models"]]
+    assert found["target"]["within_um"] == pytest.approx(within_um, rel=1e-3)  # 15 mm: a frame of 24.96 mm
+    assert len(errors) == tried and (errors[-1] <= within_um) == (code == 0) == found["target"]["met"]
+    assert all(e > within_um for e in errors[:-1])
+    assert ("no model tried reaches it" in said) == (code == 1)
+    assert not found["exact"] and "ns_per_ray" not in found["models"][0] and (tmp_path / "report.html").exists()
+
+
+def test_an_error_asked_for_is_one_positive_number_of_a_lens() -> None:
+    asked = default_experiment(SINGLET, ["target.um=1.5"])
+    assert asked.target and asked.target.within_um(20.0) == 1.5 and len(asked.model) > 5
+    for bad in ("target.um=-1", "target.px=inf", "target={um=1.0,px=1.0}", "target={}"):
+        with pytest.raises(InputError, match="target"):
+            default_experiment(SINGLET, [bad])
+    assert main(["train", "any.toml", "--within", "1um"]) == 2
+
+
+ZOOM = lens_models.LENSES / "nikon_zoom_70_200.toml"
+
+
+def test_experiments_ask_for_states() -> None:
+    both = default_experiment(ZOOM, ['lens.zoom="range"', 'lens.focusing="internal"'])
+    assert both.lens.many_states and [a.name for a in both.states().axes] == ["zoom", "focus"]
+    zoom = default_experiment(ZOOM, ['lens.zoom="range"']).states()
+    assert [a.name for a in zoom.axes] == ["zoom"]
+    wide = zoom.domain_at((zoom.axes[0].range[0],))
+    assert math.isinf(wide.focus_m[0]) and wide.film_z_mm[0] < wide.film_z_mm[1] and wide.film_radius_mm == 21.6
+    inside = default_experiment(ZOOM, ['lens.focusing="internal"', 'lens.configuration="135mm"']).states()
+    near = inside.axes[0].range[1]
+    # The groups focus: the film moves from where it stands to best focus at the widest aperture, no farther.
+    (low, high), stands = inside.domain_at((near,)).film_z_mm, inside.lens_at((near,)).film_z_mm
+    assert low <= stands <= high and high - low < 1.0
+    assert not default_experiment(ZOOM).lens.many_states
+
+
+@pytest.mark.parametrize(
+    ("file", "overrides", "field"),
+    [
+        (ZOOM, ['lens.zoom="range"', "lens.efl_mm=50"], "lens.efl_mm"),
+        (ZOOM, ['lens.zoom="range"', 'lens.configuration="135mm"'], "lens.configuration"),
+        (lens_models.LENSES / "laikin_double_gauss_50.toml", ['lens.zoom="range"'], "zoom"),
+        (lens_models.LENSES / "laikin_double_gauss_50.toml", ['lens.focusing="internal"'], "focus"),
+    ],
+)
+def test_states_that_cannot_be_asked_for(file: Path, overrides: list[str], field: str) -> None:
+    with pytest.raises(InputError, match=field):
+        default_experiment(file, overrides).states()
+
+
+@pytest.mark.parametrize(
+    "settings", [ModelSettings("mlp"), ModelSettings("ols", basis="raw"), ModelSettings("ols", partitions=2)]
+)
+def test_models_that_know_no_states(settings: ModelSettings) -> None:
+    with pytest.raises(InputError, match="many states"):
+        state_settings(settings, 1000, 1)
+
+
+def test_a_second_run_takes_the_model_that_is_there(tmp_path: Path) -> None:
+    space = default_experiment(lens_models.LENSES / "nikon_zoom_80_200.toml", ['lens.zoom="range"']).states()
+    space = replace(space, axes=(replace(space.axes[0], degree=1),), focus_m=(math.inf, math.inf))
+    settings = StateSettings(terms=8, degree=2, rays=800, name="tiny")
+    first = fit_and_measure_states(space, settings, tmp_path, states=2)
+    card = load_model(tmp_path / "tiny.onnx").card
+    assert card["errors"]["rms_um"] == first["rms_um"] == max(r["rms_um"] for r in first["states"])
+    assert len(card["states"]["nodes"]) == first["nodes"] == 2
+    written = (tmp_path / "tiny.onnx").stat().st_mtime_ns
+    assert fit_and_measure_states(space, settings, tmp_path, states=2) == first
+    assert (tmp_path / "tiny.onnx").stat().st_mtime_ns == written
+    text = page([{"case": CASES[0].name, "axes": [a.to_dict() for a in space.axes], "fixed": [], **first}])
+    assert CASES[0].name in text and "80.09" in text
+
+
+KILLED = """
+import os, signal, sys
+from neurolens.cli import main
+from neurolens.base.kept import Kept
+saved, save = [], Kept.save
+def save_and_die(self, state, arrays, *, now=False):
+    save(self, state, arrays, now=True)
+    saved.append(state)
+    if len(saved) == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+Kept.save = save_and_die
+main(sys.argv[1:])
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL on this system")
+def test_a_training_that_was_killed_is_taken_up_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same command once more ends with the very bytes of a run that nothing stopped, but for the time it took."""
+
+    def command(name: str) -> list[str]:
+        network = 'model=[{method="mlp",units=6,layers=1,steps=20}]'
+        return ["train", "--lens", SINGLET, "--output", str(tmp_path / name), *QUICK, "--set", network]
+
+    process = subprocess.run([sys.executable, "-c", KILLED, *command("killed")], capture_output=True, text=True)
+    assert process.returncode == -signal.SIGKILL, process.stderr
+    (left,) = (tmp_path / "killed").rglob("*.training.npz")
+    with np.load(left) as held:
+        assert b'"ended": false' in held["about.json"]
+    taken_up, load = [], Kept.load
+    monkeypatch.setattr(Kept, "load", lambda self: taken_up.append(load(self)) or taken_up[-1])
+    assert main(command("killed")) == main(command("whole")) == 0
+    assert taken_up[0] is not None and taken_up[-1] is None and not left.exists()
+
+    def made(name: str) -> tuple[dict, str]:
+        (file,) = (tmp_path / name).rglob("*.onnx")
+        card, core = load_model(file).card, read_model(file).at().core
+        assert card["fit"].pop("seconds") > 0
+        return card, json.dumps(pack(core))
+
+    assert made("killed") == made("whole")

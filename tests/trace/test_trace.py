@@ -1,0 +1,415 @@
+"""The exact tracer against closed forms and symmetries, here and on an accelerator; no number is of another tracer."""
+
+import math
+import shutil
+import sysconfig
+from pathlib import Path
+
+import mpmath
+import pytest
+import torch
+from shipped import NAMES, backwards, focused, rays, turned
+from torch import Tensor
+
+from experiments.extreme_cases import from_film, generator
+from neurolens.base import status as st
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens, Surface
+from neurolens.setting.pupils import camera_rays, pupil_plane_z_mm
+from neurolens.trace.rays import CHUNK, Rays, Towards, Traced, compile_trace, passing, trace
+
+INF = math.inf
+WIDE = 1000.0
+
+
+def lens(*surfaces: Surface) -> Lens:
+    return Lens("test", "", surfaces, 2.0)
+
+
+def bundle(table: Lens, count: int = 400, film: float = 0.6) -> Rays:
+    """Camera rays from a square on the film (`film` rear radii to each side) to a square round the exit pupil."""
+    g = torch.Generator().manual_seed(0)
+    rear, pupil_z = table.surfaces[-1].semi_diameter_mm, pupil_plane_z_mm(table)
+    data = first_order(table)
+    at_pupil = pupil_z == data.exit_pupil_z_mm
+    reach = min(0.6 * data.exit_pupil_diameter_mm, 2 * rear) if at_pupil else rear
+    u = 2 * torch.rand((4, count), generator=g, dtype=torch.float64) - 1
+    return camera_rays(u[2] * film * rear, u[3] * film * rear, table.film_z_mm, u[0] * reach, u[1] * reach, pupil_z)
+
+
+def distance_from_line(point: tuple[float, float, float], r: Rays) -> Tensor:
+    """[N] perpendicular distance of a point from each ray's line."""
+    offset = torch.stack([p - c for p, c in zip(point, r[:3], strict=True)])
+    return torch.linalg.cross(offset.T, torch.stack(r[3:]).T).norm(dim=1)
+
+
+# ---- one surface ----
+
+
+@pytest.mark.parametrize("index", [1.3, 1.5168, 1.9])
+@pytest.mark.parametrize("degrees", [0.0, 1e-6, 20.0, 60.0, 89.0])
+def test_snell_at_a_plane(index: float, degrees: float) -> None:
+    i = math.radians(degrees)
+    start = rays((1, 2, -1, math.sin(i), 0, math.cos(i)))
+    out = trace(lens(Surface(INF, 1, WIDE, index, stop=True)), start, towards="film")
+    assert float(out.rays.dx[0]) == pytest.approx(math.sin(i) / index, abs=1e-15)
+    assert float(out.rays.x[0]) == pytest.approx(1 + math.tan(i), rel=1e-14)
+    assert (float(out.rays.y[0]), float(out.rays.z[0])) == (2.0, 0.0)
+
+
+def test_aplanatic_points_of_a_sphere_image_perfectly() -> None:
+    """Rays towards the point n R from the centre of a glass sphere all meet at R / n from it (Born and Wolf, 4.2.3)."""
+    n, radius = 1.5168, 10.0
+    ball = lens(Surface(radius, 5, 2 * radius, n, stop=True))
+    heights = torch.linspace(-0.8, 0.8, 33, dtype=torch.float64) * radius
+    target = radius + n * radius  # the centre lies at z = R
+    d = torch.stack([-heights, 0.5 * heights, torch.full_like(heights, target + 20.0)])
+    d = d / d.norm(dim=0)
+    start = Rays(heights, -0.5 * heights, torch.full_like(heights, -20.0), *d)
+    out = trace(ball, start, towards="film")
+    assert (out.status == 0).all()
+    assert distance_from_line((0.0, 0.0, radius + radius / n), out.rays).max() < 1e-13 * radius * 10
+
+
+@pytest.mark.parametrize("radius", [10.0, -10.0, 0.5, 1e4])
+def test_one_sphere_with_50_digits(radius: float) -> None:
+    """Angles at a sphere, computed in the plane of incidence with mpmath."""
+    mpmath.mp.dps = 50
+    n, height = 1.7, 0.9 * min(abs(radius), 50)
+    out = trace(lens(Surface(radius, 1, WIDE, n, stop=True)), rays((0, height, -3, 0, 0, 1)), towards="film")
+    h, r = mpmath.mpf(height), mpmath.mpf(radius)
+    incidence = mpmath.asin(h / r)
+    slope = mpmath.asin(h / r / n) - incidence  # the ray turns towards the normal
+    sag = r - mpmath.sign(r) * mpmath.sqrt(r * r - h * h)
+    assert abs(float(out.rays.dy[0] - float(mpmath.sin(slope)))) < 1e-14
+    assert abs(float(out.rays.dz[0] - float(mpmath.cos(slope)))) < 1e-14
+    assert abs(float(out.rays.z[0]) - float(sag)) < 1e-13 * abs(radius)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_huge_radius_is_a_plane(sign: int, dtype: torch.dtype) -> None:
+    start = rays((1, 2, -5, 0.3, -0.2, 1), (-8, 3, -5, -0.5, 0.1, 1), dtype=dtype)
+    flat = trace(lens(Surface(INF, 3, 40, 1.6), Surface(INF, 1, 40, stop=True)), start, towards="film")
+    bent = trace(lens(Surface(sign * 1e9, 3, 40, 1.6), Surface(sign * 1e9, 1, 40, stop=True)), start, towards="film")
+    assert torch.equal(flat.status, bent.status)
+    for a, b in zip(flat.rays, bent.rays, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=2e-6 if dtype == torch.float32 else 1e-7)
+
+
+def test_a_nearly_hemispherical_surface() -> None:
+    """Rays at 99.99% of the radius meet it where they should; just beyond the radius they miss."""
+    radius = 10.0
+    dome = lens(Surface(radius, 30, 2 * radius, 1.5, stop=True))
+    out = trace(dome, rays((9.999, 0, -1, 0, 0, 1), (0, -9.999, -1, 0, 0, 1), (10.001, 0, -1, 0, 0, 1)), towards="film")
+    assert out.status.tolist() == [0, 0, st.blocked(0, st.MISSED)]
+    sag = radius - math.sqrt(radius**2 - 9.999**2)
+    torch.testing.assert_close(out.rays.z[:2], torch.full((2,), sag, dtype=torch.float64), rtol=0, atol=1e-12)
+    # Steeply from the side onto the far half of the sphere, where there is no glass.
+    far = trace(dome, rays((-30, 0, 13, 1, 0, 0.1)), towards="film")
+    assert far.status.tolist() == [st.blocked(0, st.MISSED)]
+
+
+# ---- total reflection and rims ----
+
+
+@pytest.mark.parametrize("towards", ["film", "scene"])
+@pytest.mark.parametrize("step", [1e-9, 1e-5, 0.1])
+def test_total_reflection_begins_at_the_critical_angle(towards: str, step: float) -> None:
+    """A plane from glass to air, either way; the ray enters the glass along the normal of a concentric sphere."""
+    n, angles = 1.6, [math.asin(1 / 1.6) + s for s in (-step, step)]
+    if towards == "film":
+        block = lens(Surface(-50.0, 50, WIDE, n), Surface(INF, 1, WIDE, stop=True))
+        out = trace(block, rays(*((0, 0, -50, math.sin(a), 0, math.cos(a)) for a in angles)), towards="film")
+    else:
+        block = lens(Surface(INF, 50, WIDE, n, stop=True), Surface(50.0, 1, WIDE))
+        out = trace(block, rays(*((0, 0, 100, 0, math.sin(a), -math.cos(a)) for a in angles)), towards="scene")
+    assert out.status.tolist() == [0, st.blocked(1 if towards == "film" else 0, st.TOTAL_REFLECTION)]
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7, 2.5, 4.0])
+@pytest.mark.parametrize("k", [0, 1, 2])
+def test_rims_and_stop_are_circles(k: int, angle: float) -> None:
+    """Just inside passes, just outside does not, whatever the azimuth."""
+    openings = [40.0, 40.0, 40.0]
+    openings[k] = 10.0
+    plates = lens(*(Surface(INF, 2, d, stop=i == 1) for i, d in enumerate(openings)))
+    rows = [
+        (r * math.cos(angle), r * math.sin(angle), z, 0, 0, d)
+        for z, d in ((-5, 1), (50, -1))
+        for r in (5 - 1e-9, 5 + 1e-9)
+    ]
+    for towards, some in (("film", rows[:2]), ("scene", rows[2:])):
+        assert trace(plates, rays(*some), towards=towards).status.tolist() == [0, st.blocked(k, st.RIM)]  # type: ignore[arg-type]
+
+
+def test_the_first_failure_along_the_travel_rules() -> None:
+    """One ray outside every rim: each direction names its own first surface; a miss goes before the rim."""
+    plates = lens(*(Surface(INF, 2, 10, stop=k == 1) for k in range(3)))
+    assert trace(plates, rays((6, 0, -1, 0, 0, 1)), towards="film").status.tolist() == [st.blocked(0, st.RIM)]
+    assert trace(plates, rays((6, 0, 9, 0, 0, -1)), towards="scene").status.tolist() == [st.blocked(2, st.RIM)]
+    dome = lens(Surface(INF, 2, 100, stop=True), Surface(5.0, 2, 8), Surface(INF, 2, 6))
+    out = trace(dome, rays((4.5, 0, -1, 0, 0, 1), (5.5, 0, -1, 0, 0, 1), (3.5, 0, -1, 0, 0, 1)), towards="film")
+    assert out.status.tolist() == [st.blocked(1, st.RIM), st.blocked(1, st.MISSED), st.blocked(2, st.RIM)]
+
+
+# ---- whole lenses ----
+
+
+def test_ball_lens() -> None:
+    """EFL = n D / (4 (n - 1)), and every ray bent twice by the same angle: 2 (i - t) about the centre."""
+    n, diameter = 1.5168, 20.0
+    ball = lens(
+        Surface(diameter / 2, diameter / 2, diameter, n),
+        Surface(INF, diameter / 2, diameter, n, stop=True),
+        Surface(-diameter / 2, 1, diameter),
+    )
+    assert first_order(ball).efl_mm == pytest.approx(n * diameter / (4 * (n - 1)), rel=1e-14)
+    heights = [-9.5, -3.0, 1e-3, 0.5, 5.0, 9.0]
+    out = trace(ball, rays(*((0, h, -1, 0, 0, 1) for h in heights)), towards="film")
+    assert (out.status == 0).all()
+    for i, h in enumerate(heights):
+        incidence = math.asin(2 * h / diameter)
+        bend = 2 * (incidence - math.asin(2 * h / diameter / n))
+        assert math.atan2(float(out.rays.dy[i]), float(out.rays.dz[i])) == pytest.approx(-bend, abs=1e-14)
+        # The distance from the centre is kept, so is the plane of incidence.
+        along = torch.linalg.cross(
+            torch.tensor([0.0, float(out.rays.y[i]), float(out.rays.z[i]) - diameter / 2], dtype=torch.float64),
+            torch.stack([c[i] for c in out.rays[3:]]),
+        )
+        assert abs(float(along[0])) == pytest.approx(abs(h), rel=1e-12)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1e-4, 30.0, 80.0])
+def test_a_plate_shifts_rays(degrees: float) -> None:
+    """t sin i (1 - cos i / (n cos t)), direction unchanged."""
+    n, thickness, i = 1.6, 7.0, math.radians(degrees)
+    plate = lens(Surface(INF, thickness, WIDE, n), Surface(INF, 1, WIDE, stop=True))
+    start = rays((3, 0, -2, math.sin(i), 0, math.cos(i)))
+    out = trace(plate, start, towards="film")
+    shift = thickness * math.sin(i) * (1 - math.cos(i) / (n * math.cos(math.asin(math.sin(i) / n))))
+    assert float(distance_from_line((3.0, 0.0, -2.0), out.rays)[0]) == pytest.approx(abs(shift), abs=1e-13)
+    torch.testing.assert_close(torch.stack(out.rays[3:]), torch.stack(start[3:]), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_symmetry_and_reversibility(name: str) -> None:
+    """Turned or mirrored rays give turned or mirrored results; the way back is the way there, from either end."""
+    table = focused(name)
+    start = bundle(table, 3000, 0.4)
+    g = torch.Generator().manual_seed(1)
+    wavelength = 380 + 400 * torch.rand(3000, generator=g, dtype=torch.float64)
+    out = trace(table, start, wavelength, transmittance=True)
+    passed = out.status == 0
+    assert passed.sum() > 20
+    # An anamorphic lens has two planes of symmetry, any other all through its axis.
+    for angle, mirror in ((math.pi, False), (0.0, True)) if table.anamorphic else ((1.0, False), (4.0, True)):
+        other = trace(table, turned(start, angle, mirror), wavelength)
+        assert torch.equal(other.status, out.status)
+        for a, b in zip(other.rays, turned(out.rays, angle, mirror), strict=True):
+            torch.testing.assert_close(a[passed], b[passed], rtol=0, atol=1e-11)
+    scene = Rays(*(c[passed] for c in out.rays))
+    there = trace(table, backwards(scene, travel=25.0), wavelength[passed], towards="film", transmittance=True)
+    assert (there.status == 0).all()
+    film = backwards(there.rays)
+    for k, c in enumerate((start.x, start.y)):
+        reach = (start.z[passed] - film.z) / film.dz
+        torch.testing.assert_close(film[k] + reach * film[3 + k], c[passed], rtol=0, atol=1e-10)
+    for a, c in zip(film[3:], start[3:], strict=True):
+        torch.testing.assert_close(a, c[passed], rtol=0, atol=1e-12)
+    torch.testing.assert_close(there.transmittance, out.transmittance[passed], rtol=0, atol=1e-12)  # type: ignore[index]
+    # And round again from the scene: scene -> film -> scene.
+    again = trace(table, backwards(there.rays, travel=5.0), wavelength[passed])
+    for a, c in zip(again.rays[:3], scene[:3], strict=True):
+        torch.testing.assert_close(a, c, rtol=0, atol=1e-10)
+
+
+def test_fisheye_rays_from_behind_the_camera_are_reversible() -> None:
+    """The 220-degree fisheye sees more than 90 degrees off its axis; such rays enter its front the same way."""
+    fisheye = focused("shimizu_fisheye_220")
+    start = bundle(fisheye, 60000, film=1.3)
+    out = trace(fisheye, start)
+    behind = (out.status == 0) & (out.rays.dz > 0.17)  # more than 100 degrees from -z
+    assert behind.sum() > 20
+    scene = Rays(*(c[behind] for c in out.rays))
+    assert float(torch.rad2deg(torch.acos(-scene.dz)).max()) > 104
+    for travel in (0.01, 10.0, 1000.0):
+        there = trace(fisheye, backwards(scene, travel), towards="film")
+        assert (there.status == 0).all()
+        reach = (start.z[behind] - there.rays.z) / there.rays.dz
+        for k in (0, 1):
+            atol = 1e-10 * max(1.0, travel / 10)
+            torch.testing.assert_close(there.rays[k] + reach * there.rays[3 + k], start[k][behind], rtol=0, atol=atol)
+
+
+def test_shorter_wavelengths_bend_more() -> None:
+    singlet = focused("thorlabs_lb1471_biconvex_50")
+    wavelength = torch.tensor([380.0, 587.5618, 780.0], dtype=torch.float64)
+    out = trace(singlet, rays(*[(0, 5, -10, 0, 0, 1)] * 3), wavelength, towards="film")
+    bend = -out.rays.dy
+    assert bend[0] > bend[1] > bend[2] > 0
+    one = trace(singlet, rays((0, 5, -10, 0, 0, 1)), 587.5618, towards="film")
+    torch.testing.assert_close(bend[1:2], -one.rays.dy, rtol=0, atol=1e-15)
+
+
+# ---- arrays ----
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_chunks_change_no_bit(dtype: torch.dtype) -> None:
+    """A batch over the chunk boundary equals the same rays traced in any other division."""
+    singlet = focused("thorlabs_lb1471_biconvex_50")
+    start = Rays(*(c.to(dtype) for c in bundle(singlet, CHUNK + 777)))
+    wavelength = torch.linspace(400, 700, CHUNK + 777, dtype=dtype)
+    whole = trace(singlet, start, wavelength, transmittance=True, record=[0, 2])
+    cut = 4097
+    for part in (slice(0, cut), slice(cut, 2 * cut), slice(CHUNK - 5, CHUNK + 5)):
+        one = trace(singlet, Rays(*(c[part] for c in start)), wavelength[part], transmittance=True, record=[0, 2])
+        for a, b in zip(one.rays, whole.rays, strict=True):
+            assert torch.equal(a, b[part])
+        assert torch.equal(one.status, whole.status[part])
+        assert torch.equal(one.transmittance, whole.transmittance[part])
+        for k in (0, 2):
+            assert all(torch.equal(a, b[part]) for a, b in zip(one.crossings[k], whole.crossings[k], strict=True))
+
+
+def test_an_empty_batch() -> None:
+    singlet, none = focused("thorlabs_lb1471_biconvex_50"), Rays(*torch.empty((6, 0)))
+    out = trace(singlet, none, torch.empty(0), transmittance=True, record=[1])
+    assert out.status.shape == out.rays.x.shape == out.crossings[1].x.shape == (0,)
+    assert out.status.dtype == torch.int32
+
+
+@pytest.mark.parametrize("name", ["laikin_double_gauss_50", "shimizu_fisheye_220", "ogawa_zoom_70_200"])
+def test_float32_agrees_with_float64(name: str) -> None:
+    """Where the statuses differ, the ray passes an edge closely."""
+    table = focused(name)
+    start = bundle(table, 20000)
+    fine = trace(table, start, 500.0, record=range(len(table.surfaces)))
+    coarse = trace(table, Rays(*(c.float() for c in start)), 500.0)
+    differ = fine.status != coarse.status
+    assert differ.sum() < 20
+    for i in torch.nonzero(differ)[:, 0]:
+        edges = [
+            abs(float(torch.hypot(fine.crossings[k].x[i], fine.crossings[k].y[i])) - s.semi_diameter_mm)
+            for k, s in enumerate(table.surfaces)
+        ]
+        margins = [min(abs(float(c.meets[i])), abs(float(c.refracts[i]))) for c in fine.crossings.values()]
+        assert min(edges) < 1e-3 or min(margins) < 1e-4
+    passed = (fine.status == 0) & (coarse.status == 0)
+    for a, b in zip(fine.rays, coarse.rays, strict=True):
+        assert (a - b)[passed].abs().max() < 3e-4
+
+
+def test_recording_changes_no_status() -> None:
+    """Rays that are learnt from are traced with guards; the guards decide nothing."""
+    table = focused("muller_fisheye_100")
+    start = bundle(table, 5000)
+    plain, watched = trace(table, start), trace(table, start, record=range(12), transmittance=True)
+    assert torch.equal(plain.status, watched.status)
+    passed = plain.status == 0
+    for a, b in zip(plain.rays, watched.rays, strict=True):
+        torch.testing.assert_close(a[passed], b[passed], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("towards", ["scene", "film"])
+@pytest.mark.parametrize("name", ["muller_fisheye_100", "canon_aspheric_50", "schneider_anamorphic_31"])
+def test_passing_is_status_0_without_the_lost_rays(name: str, towards: Towards) -> None:
+    """Bit for bit, over several chunks, of which most rays are lost; NaN and no ray at all, too."""
+    table = focused(name)
+    start = bundle(table, 2 * CHUNK + 5, film=1.5)
+    if towards == "film":
+        out = trace(table, start)
+        start = Rays(*(torch.where(torch.rand(c.shape) < 0.5, c, c.flip(0)) for c in out.rays))
+        start = Rays(*start[:3], *(-c for c in start[3:]))
+    start.x[7] = math.nan
+    for dtype in (torch.float32, torch.float64):
+        rays = Rays(*(c.to(dtype) for c in start))
+        found = passing(table, rays, 500.0, towards=towards)
+        assert torch.equal(found, trace(table, rays, 500.0, towards=towards).status == 0)
+        assert 0 < found.sum() < 0.8 * len(found)
+    assert passing(table, Rays(*(c[:0] for c in start)), 500.0).shape == (0,)
+
+
+@pytest.mark.slow
+def test_compiled_equals_eager() -> None:
+    """Skipped without what torch compiles with, which the project does not need."""
+    if not any(map(shutil.which, ("c++", "g++", "clang++"))):
+        pytest.skip("no C++ compiler")
+    if not Path(sysconfig.get_paths()["include"], "Python.h").is_file():
+        pytest.skip("no Python.h (Debian: python3-dev)")
+    from torch._inductor import config as inductor_config  # the compiler: nothing else here needs it
+
+    singlet = focused("thorlabs_lb1471_biconvex_50")
+    start = Rays(*(c.float() for c in bundle(singlet, 1024)))
+    wavelength = torch.linspace(400, 700, 1024)
+    with torch.no_grad():
+        eager = trace(singlet, start, wavelength, transmittance=True)
+        with inductor_config.patch({"cpp.vec_isa_ok": True}):  # else trial programs are compiled first, for 6 s
+            compiled = compile_trace(singlet, transmittance=True)(start, wavelength)
+    assert int((eager.status != compiled.status).sum()) <= 1  # a ray may pass an edge closely
+    both = (eager.status == 0) & (compiled.status == 0)
+    for a, b in zip(eager.rays, compiled.rays, strict=True):
+        torch.testing.assert_close(a[both], b[both], rtol=0, atol=2e-5)
+    torch.testing.assert_close(eager.transmittance, compiled.transmittance, rtol=0, atol=2e-6)
+
+
+ON_DEVICE = ["laikin_double_gauss_50", "canon_aspheric_50", "schneider_anamorphic_31", "shimizu_fisheye_220"]
+needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here: nothing was run on one")
+
+
+def device_rays(lens: Lens, count: int, dtype: torch.dtype) -> tuple[Rays, torch.Tensor]:
+    rays = from_film(lens, count, generator())
+    return Rays(*(c.to(dtype) for c in rays)), torch.linspace(400, 700, count, dtype=dtype)
+
+
+def on(device: str, rays: Rays, wavelength_nm: torch.Tensor) -> tuple[Rays, torch.Tensor]:
+    return Rays(*(c.to(device) for c in rays)), wavelength_nm.to(device)
+
+
+def tensors(out: Traced) -> list[torch.Tensor]:
+    crossings = [c for crossing in out.crossings.values() for c in crossing]
+    return [*out.rays, out.status, *([] if out.transmittance is None else [out.transmittance]), *crossings]
+
+
+@pytest.mark.parametrize("name", ON_DEVICE)
+@pytest.mark.parametrize("options", [{}, {"transmittance": True}, {"record": [0, 3]}])
+def test_the_host_decides_nothing(name: str, options: dict[str, object]) -> None:
+    """Rays without values go through the whole lens, in one chunk and in several."""
+    lens = focused(name)
+    for count in (100, CHUNK + 100):
+        start = on("meta", *device_rays(lens, count, torch.float32))
+        out = trace(lens, *start, **options)  # type: ignore[arg-type]
+        assert {t.device.type for t in tensors(out)} == {"meta"}
+        assert all(t.shape == (count,) for t in tensors(out))
+
+
+@needs_cuda
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", ON_DEVICE)
+def test_the_same_results_on_cuda(name: str, dtype: torch.dtype) -> None:
+    lens = focused(name)
+    start = device_rays(lens, 20000, dtype)
+    here = trace(lens, *start, transmittance=True)
+    there = trace(lens, *on("cuda", *start), transmittance=True)
+    status = there.status.cpu()
+    assert int((status != here.status).sum()) <= (20 if dtype == torch.float32 else 0)
+    passed = (status == 0) & (here.status == 0)
+    assert passed.sum() > 1000
+    for a, b in zip(there.rays, here.rays, strict=True):
+        assert (a.cpu() - b)[passed].abs().max() < (1e-3 if dtype == torch.float32 else 1e-11)
+    assert (there.transmittance.cpu() - here.transmittance)[passed].abs().max() < 1e-4
+
+
+@needs_cuda
+@pytest.mark.parametrize("name", ON_DEVICE)
+def test_no_synchronisation_on_cuda(name: str) -> None:
+    lens = focused(name)
+    start = on("cuda", *device_rays(lens, 3 * CHUNK + 5, torch.float32))
+    trace(lens, *start, transmittance=True)  # what is set up once
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        trace(lens, *start, transmittance=True)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")

@@ -1,0 +1,331 @@
+"""The tracer under what should not happen; gradients and ray differentials against finite differences."""
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as hs
+from shipped import tabled
+from torch import Tensor
+
+from neurolens.base import status as st
+from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens, Surface
+from neurolens.setting.pupils import camera_rays
+from neurolens.setting.states import set_lens
+from neurolens.trace.rays import Rays, film_derivatives, trace, trace_differentials
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", NeurolensWarning)  # glasses of unknown dispersion
+    DOUBLE_GAUSS = set_lens(tabled("laikin_double_gauss_50"))
+    FISHEYE = set_lens(tabled("muller_fisheye_100"))
+STOP = Surface(math.inf, 1, 10, stop=True)
+PLATE = Lens("plate", "", (Surface(math.inf, 5, 20, 1.5), Surface(math.inf, 5, 20), STOP), 2.0)
+BALL = Lens("ball", "", (Surface(10.0, 20, 19.9, 1.5), Surface(-10.0, 5, 19.9), STOP), 2.0)
+TABLES = {"double gauss": DOUBLE_GAUSS, "fisheye": FISHEYE, "plate": PLATE, "ball": BALL}
+WILD = (math.nan, math.inf, -math.inf, 1e-310, 1e-42, 1e20, 1e39, 1e300, -1e300, 0.0)
+
+
+def rays(rows: list[list[float]], dtype: torch.dtype = torch.float64) -> Rays:
+    return Rays(*torch.tensor(rows, dtype=torch.float64).to(dtype).T.contiguous())
+
+
+def start_z(table: Lens, towards: str) -> float:
+    return -30.0 if towards == "film" else float(table.vertices_mm[-1])
+
+
+def good(table: Lens, towards: str) -> list[float]:
+    return [0.1, 0.2, start_z(table, towards), 0.0, 0.0, 1.0 if towards == "film" else -1.0]
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("towards", ["film", "scene"])
+@pytest.mark.parametrize("name", TABLES)
+@pytest.mark.parametrize("record", [(), (0, 1, 2)])
+def test_wild_numbers_end_a_ray_and_never_leave_as_one(
+    name: str, towards: str, dtype: torch.dtype, record: tuple[int, ...]
+) -> None:
+    table = TABLES[name]
+    rows = [good(table, towards) for _ in range(6 * len(WILD))]
+    for i, row in enumerate(rows):
+        row[i % 6] = WILD[i // 6]
+    rows += [[0.0] * 6, [1.0, 1.0, 1.0, 1e-320, 0, -1e-320], [0.1, 0.2, 0.3, 0, 0, 2.0], good(table, towards)]
+    start = rays(rows, dtype)
+    out = trace(table, start, 500.0, towards=towards, transmittance=True, record=record)  # type: ignore[arg-type]
+    for c in (*out.rays, out.transmittance):
+        assert torch.isfinite(c).all()
+    sound = torch.stack([torch.isfinite(c) for c in start]).all(0)
+    unit = (start.dx**2 + start.dy**2 + start.dz**2 - 1).abs() < 1e-3
+    assert (out.status[~(sound & unit)] != 0).all()
+    assert out.status[-1] == 0
+
+
+@given(
+    hs.lists(hs.lists(hs.floats(width=32) | hs.floats(-50, 50), min_size=6, max_size=6), min_size=1, max_size=8),
+    hs.sampled_from(sorted(TABLES)),
+    hs.sampled_from(["film", "scene"]),
+    hs.booleans(),
+)
+def test_any_floats_give_a_status_and_finite_rays(rows: list[list[float]], name: str, towards: str, unit: bool) -> None:
+    start = rays(rows)
+    if unit:
+        length = torch.stack(start[3:]).norm(dim=0)
+        start = Rays(*start[:3], *(c / length for c in start[3:]))
+    out = trace(TABLES[name], start, towards=towards)  # type: ignore[arg-type]
+    assert all(torch.isfinite(c).all() for c in out.rays)
+    passed = out.status == 0
+    square = out.rays.dx**2 + out.rays.dy**2 + out.rays.dz**2
+    assert ((square[passed] - 1).abs() < 2e-3).all()
+
+
+@pytest.mark.parametrize("wavelength", [math.nan, -500.0, 0.0, math.inf])
+def test_a_wavelength_that_is_none(wavelength: float) -> None:
+    start = rays([good(DOUBLE_GAUSS, "scene")] * 2)
+    with pytest.raises(InputError, match="wavelength_nm"):
+        trace(DOUBLE_GAUSS, start, wavelength)
+    if wavelength == math.inf:
+        return  # Cauchy's limit is finite
+    out = trace(DOUBLE_GAUSS, start, torch.tensor([500.0, wavelength], dtype=torch.float64))
+    assert (out.status != 0).tolist() == [False, True]
+    assert all(torch.isfinite(c).all() for c in out.rays)
+
+
+def test_the_rays_decide_the_precision() -> None:
+    """A float64 wavelength beside float32 rays leaves float32."""
+    start = rays([good(DOUBLE_GAUSS, "scene")] * 2, torch.float32)
+    for wavelength in (torch.tensor([500.0, 600.0], dtype=torch.float64), torch.tensor([500, 600])):
+        out = trace(DOUBLE_GAUSS, start, wavelength, transmittance=True, record=[3])
+        assert {c.dtype for c in (*out.rays, out.transmittance, *out.crossings[3])} == {torch.float32}  # type: ignore[union-attr]
+
+
+def fields(**changes: Tensor) -> Rays:
+    return rays([good(PLATE, "film")] * 3)._replace(**changes)
+
+
+@pytest.mark.parametrize(
+    ("call", "named"),
+    [
+        (lambda: trace(PLATE, fields(y=torch.zeros(2).double())), "rays.y"),
+        (lambda: trace(PLATE, fields(dz=torch.ones(3))), "rays.dz"),
+        (lambda: trace(PLATE, Rays(*torch.zeros((6, 3, 1)))), "rays.x"),
+        (lambda: trace(PLATE, Rays(*torch.zeros(6))), "rays.x"),
+        (lambda: trace(PLATE, Rays(*torch.zeros((6, 3), dtype=torch.int64))), "int64"),
+        (lambda: trace(PLATE, Rays(*torch.zeros((6, 3), dtype=torch.float16))), "float16"),
+        (lambda: trace(PLATE, fields(), torch.full((2,), 500.0)), "wavelength_nm"),
+        (lambda: trace(PLATE, fields(), torch.full((3, 1), 500.0)), "wavelength_nm"),
+        (lambda: trace(PLATE, fields(), towards="sky"), "towards"),  # type: ignore[arg-type]
+        (lambda: trace(PLATE, fields(), record=[3]), "record"),
+        (lambda: trace(PLATE, fields(), record=[-1]), "record"),
+    ],
+)
+def test_bad_arguments_name_themselves(call: Callable[[], object], named: str) -> None:
+    with pytest.raises(InputError, match=named):
+        call()
+
+
+def test_camera_rays_that_start_away_from_the_lens_are_lost() -> None:
+    for table in TABLES.values():
+        row = good(table, "scene")
+        row[5] = 1.0
+        last = len(table.surfaces) - 1
+        assert trace(table, rays([row])).status.tolist() == [st.blocked(last, st.MISSED)]
+
+
+# ---- gradients ----
+
+
+def with_parameters(values: Tensor) -> Lens:
+    """A doublet with radius, thickness and index of its first element, from a tensor [3]."""
+    first = Surface(values[0], values[1], 22, values[2], V_d=60.0), Surface(-45.0, 2.0, 22, 1.65, V_d=35.0)
+    return Lens("doublet", "", (*first, Surface(-200.0, 3.0, 22), Surface(math.inf, 50.0, 14, stop=True)), 4.0)
+
+
+VALUES = torch.tensor([40.0, 5.0, 1.55], dtype=torch.float64)
+# The last five are lost: outside the rim, beyond the sphere, past every surface, backwards, NaN.
+BUNDLE = [[x, y, -20.0, 0.02, 0.05, math.sqrt(1 - 0.0029)] for x in (-4.0, 0.0, 3.0) for y in (-5.0, 0.0, 2.0)] + [
+    [10.0, 0.0, -20.0, 0.0, 0.0, 1.0],
+    [100.0, 0.0, -20.0, 0.0, 0.0, 1.0],
+    [0.0, 0.0, -20.0, 0.0, 0.8, 0.6],
+    [0.0, 0.0, -20.0, 0.0, 0.0, -1.0],
+    [math.nan, 0.0, -20.0, 0.0, 0.0, 1.0],
+]
+
+
+def moments(values: Tensor, start: Rays, wavelength: Tensor) -> Tensor:
+    """A number that every output of the passing rays enters."""
+    out = trace(with_parameters(values), start, wavelength, towards="film", transmittance=True)
+    passed = out.status == 0
+    assert 5 <= passed.sum() < len(start.x)
+    terms = [
+        (torch.cos(0.3 * (k + 1) * c) * (k + 1))[passed].sum() for k, c in enumerate((*out.rays, out.transmittance))
+    ]
+    return torch.stack(terms).sum()
+
+
+def test_gradients_of_the_prescription_and_of_rays() -> None:
+    """Against central differences; lost rays beside the others leave no NaN."""
+    values, start = VALUES.clone().requires_grad_(), Rays(*(c.requires_grad_() for c in rays(BUNDLE)))
+    wavelength = torch.linspace(420, 680, len(BUNDLE), dtype=torch.float64).requires_grad_()
+    inputs = [values, *start, wavelength]
+    grads = torch.autograd.grad(moments(values, start, wavelength), inputs)
+    assert all(torch.isfinite(g[:9]).all() for g in grads)
+    assert torch.isfinite(grads[0]).all()
+    for which, (tensor, grad) in enumerate(zip(inputs, grads, strict=True)):
+        for i in range(len(tensor) if which == 0 else 9):
+            step = 1e-5 * max(1.0, abs(float(tensor.detach()[i])))
+            ends = []
+            for sign in (1, -1):
+                moved = [t.detach().clone() for t in inputs]
+                moved[which][i] += sign * step
+                ends.append(float(moments(moved[0], Rays(*moved[1:7]), moved[7])))
+            slope = (ends[0] - ends[1]) / (2 * step)
+            assert float(grad.detach()[i]) == pytest.approx(slope, rel=2e-6, abs=2e-7), (which, i)
+
+
+@pytest.mark.parametrize("towards", ["film", "scene"])
+def test_no_nan_gradient_where_most_rays_are_lost(towards: str) -> None:
+    """Misses, rims and total reflection in one batch, as the fisheye has them all."""
+    g = torch.Generator().manual_seed(3)
+    d = torch.randn((3, 2000), generator=g, dtype=torch.float64)
+    d[2] = d[2].abs() * (1 if towards == "film" else -1)
+    p = torch.randn((3, 2000), generator=g, dtype=torch.float64) * 60
+    p[2] = start_z(FISHEYE, towards) + 0.1 * p[2]
+    start = Rays(*(c.clone().requires_grad_() for c in (*p, *(d / d.norm(dim=0)))))
+    first = replace(FISHEYE.surfaces[0], radius_mm=torch.tensor(float(FISHEYE.surfaces[0].radius_mm)).double())
+    first.radius_mm.requires_grad_()
+    table = replace(FISHEYE, surfaces=(first, *FISHEYE.surfaces[1:]))
+    out = trace(table, start, 550.0, towards=towards, transmittance=True)  # type: ignore[arg-type]
+    assert {st.MISSED, st.RIM} <= {st.reason_of(int(s)) for s in out.status}
+    total = sum(c.sum() for c in out.rays) + out.transmittance.sum()
+    assert isinstance(total, Tensor)
+    for grad in torch.autograd.grad(total, [first.radius_mm, *start]):
+        assert torch.isfinite(grad).all()
+
+
+@pytest.mark.parametrize("bad", [math.nan, 0.0, -500.0])
+def test_a_bad_wavelength_spoils_no_gradient(bad: float) -> None:
+    radius = torch.tensor(40.0, dtype=torch.float64, requires_grad=True)
+    singlet = Lens("s", "", (Surface(radius, 5.0, 20.0, 1.6, 40.0), Surface(math.inf, 30.0, 20.0, stop=True)), 2.0)
+    y = torch.linspace(-8, 8, 9, dtype=torch.float64)
+    zero = torch.zeros_like(y)
+    wavelength = torch.full_like(y, 550.0)
+    gradients = []
+    for spoilt in (False, True):
+        lam = wavelength.clone()
+        if spoilt:
+            lam[4] = bad
+        out = trace(singlet, Rays(zero, y, zero - 5, zero, zero, zero + 1), lam, towards="film")
+        keep = torch.arange(9) != 4
+        assert (out.status[keep] == 0).all() and (not spoilt or int(out.status[4]) == st.blocked(0, st.MISSED))
+        gradients.append(torch.autograd.grad((out.rays.dy[keep] ** 2).sum(), radius)[0])
+    assert torch.equal(*gradients) and torch.isfinite(gradients[0])
+
+
+def test_a_plane_given_as_a_tensor_has_a_gradient() -> None:
+    radius = torch.tensor(math.inf, dtype=torch.float64, requires_grad=True)
+    plate = Lens("p", "", (Surface(radius, 5.0, 20.0, 1.6), Surface(-30.0, 30.0, 20.0, stop=True)), 2.0)
+    y = torch.linspace(-8, 8, 9, dtype=torch.float64)
+    zero = torch.zeros_like(y)
+    out = trace(plate, Rays(zero, y, zero - 5, zero, zero, zero + 1), towards="film")
+    (slope,) = torch.autograd.grad(out.rays.dy.square().sum(), radius)
+    assert (out.status == 0).all() and torch.isfinite(slope)
+
+
+def test_coordinates_that_overflow_spoil_no_gradient() -> None:
+    radius = torch.tensor(40.0, dtype=torch.float64, requires_grad=True)
+    singlet = Lens("s", "", (Surface(radius, 5.0, 20.0, 1.6), Surface(math.inf, 30.0, 20.0, stop=True)), 2.0)
+    y = torch.tensor([1.0, 2.0, 1e200], dtype=torch.float64)
+    zero = torch.zeros_like(y)
+    out = trace(singlet, Rays(zero, y, zero - 5, zero, zero, zero + 1), towards="film")
+    assert torch.isfinite(torch.autograd.grad(out.rays.dy[:2].sum(), radius)[0])
+
+
+def asphere() -> Lens:
+    front = Surface(30.0, 6.0, 24.0, 1.6, conic=-0.6, asphere=((4, -1e-5), (6, 2e-8)))
+    return Lens("asphere", "", (front, Surface(-80.0, 2.0, 24.0), Surface(math.inf, 40.0, 16.0, stop=True)), 2.0)
+
+
+def lenses() -> dict[str, Lens]:
+    names = ("laikin_double_gauss_50", "muller_fisheye_100")
+    return {name: tabled(name) for name in names} | {"asphere": asphere()}
+
+
+def film_rays(lens: Lens, fx: Tensor, fy: Tensor, px: Tensor, py: Tensor) -> tuple[Rays, Tensor]:
+    """Camera rays towards points in the rear vertex plane, and their distances to these."""
+    film_z, pupil_z = set_lens(lens).film_z_mm, float(lens.vertices_mm[len(lens.surfaces) - 1])
+    rays = camera_rays(fx, fy, film_z, px, py, pupil_z)
+    return rays, torch.sqrt((px - fx) ** 2 + (py - fy) ** 2 + (film_z - pupil_z) ** 2)
+
+
+@pytest.mark.parametrize("name", ["laikin_double_gauss_50", "muller_fisheye_100", "asphere"])
+def test_equal_to_central_differences(name: str) -> None:
+    lens = lenses()[name]
+    g = torch.Generator().manual_seed(1)
+    rear, f = lens.surfaces[-1].semi_diameter_mm, abs(first_order(lens).efl_mm)
+    fx, fy, px, py = (torch.rand(400, generator=g, dtype=torch.float64) * 2 - 1 for _ in range(4))
+    fx, fy, px, py = 0.3 * f * fx, 0.3 * f * fy, 0.5 * rear * px, 0.5 * rear * py
+    rays, distance = film_rays(lens, fx, fy, px, py)
+    out = trace_differentials(lens, rays, film_derivatives(rays, distance))
+    passed = out.traced.status == 0
+    assert passed.sum() > 100
+    h = 1e-4
+    for k, (ex, ey) in enumerate([(h, 0.0), (0.0, h)]):
+        ahead, behind = (trace(lens, film_rays(lens, fx + s * ex, fy + s * ey, px, py)[0]) for s in (1, -1))
+        ok = passed & (ahead.status == 0) & (behind.status == 0)
+        for found, a, b in zip(out.derivatives[k], ahead.rays, behind.rays, strict=True):
+            wanted = (a - b) / (2 * h)
+            assert (found - wanted)[ok].abs().max() < 1e-7 * (1 + wanted[ok].abs().max())
+
+
+def test_near_the_axis_of_a_focused_lens_the_direction_turns_by_one_over_the_focal_length() -> None:
+    lens = set_lens(tabled("laikin_double_gauss_50"))
+    zero = torch.zeros(1, dtype=torch.float64)
+    rays, distance = film_rays(lens, zero, zero, zero, zero)
+    dx, dy = trace_differentials(lens, rays, film_derivatives(rays, distance)).derivatives
+    f = first_order(lens).efl_mm
+    assert float(dx.dx) == pytest.approx(-1 / f, rel=1e-12) and float(dy.dy) == pytest.approx(-1 / f, rel=1e-12)
+    assert abs(float(dx.dy)) < 1e-15 and abs(float(dx.dz)) < 1e-15
+
+
+def test_directions_stay_unit_vectors_and_lost_rays_have_no_derivative() -> None:
+    lens = asphere()
+    g = torch.Generator().manual_seed(4)
+    fx, fy, px, py = ((torch.rand(2000, generator=g, dtype=torch.float64) * 2 - 1) * 30 for _ in range(4))
+    rays, distance = film_rays(lens, fx, fy, px, py)
+    out = trace_differentials(lens, rays, film_derivatives(rays, distance))
+    d = out.traced.rays
+    lost = (d.x == 0) & (d.y == 0) & (out.traced.status != 0)  # replaced by a ray along the axis
+    assert lost.any()
+    for slope in out.derivatives:
+        assert all(torch.isfinite(c).all() for c in slope)
+        along = d.dx * slope.dx + d.dy * slope.dy + d.dz * slope.dz
+        assert along[~lost].abs().max() < 1e-12
+        assert all((c[lost] == 0).all() for c in slope)
+
+
+def test_float32_gives_the_same_to_rounding() -> None:
+    lens = set_lens(tabled("laikin_double_gauss_50"))
+    points = [torch.linspace(-9, 9, 50, dtype=torch.float64) * k for k in (1.0, 0.5, 0.3, -0.4)]
+    found = []
+    for dtype in (torch.float64, torch.float32):
+        rays, distance = film_rays(lens, *(p.to(dtype) for p in points))
+        found.append(trace_differentials(lens, rays, film_derivatives(rays, distance)))
+    ok = (found[0].traced.status == 0) & (found[1].traced.status == 0)
+    for k in range(2):
+        for a, b in zip(found[0].derivatives[k], found[1].derivatives[k], strict=True):
+            assert (a - b.double())[ok].abs().max() < 2e-5 * (1 + a[ok].abs().max())
+
+
+def test_no_derivatives_and_wrong_ones() -> None:
+    lens = asphere()
+    rays, _ = film_rays(lens, *(torch.zeros(3, dtype=torch.float64) for _ in range(4)))
+    assert trace_differentials(lens, rays, ()).derivatives == ()
+    with pytest.raises(InputError, match=r"derivatives\[0\].x"):
+        trace_differentials(lens, rays, (Rays(*(c[:2] for c in rays)),))
+    with pytest.raises(InputError, match="float32"):
+        trace_differentials(lens, rays, (Rays(*(c.float() for c in rays)),))
