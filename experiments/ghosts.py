@@ -27,6 +27,7 @@ import torch
 from experiments import lab
 from neurolens.base.progress import Progress
 from neurolens.flare import grids, picture
+from neurolens.flare.canvas import Raster
 from neurolens.flare.ghostfit import GhostSettings, fit_ghosts, sample, solved
 from neurolens.flare.ghostmodel import GhostModel
 from neurolens.flare.ghosts import GhostTracer
@@ -39,7 +40,7 @@ from neurolens.trace.rays import Rays
 from neurolens.trace.sequence import follow, ghost
 
 LENS, LIGHT = "laikin_double_gauss_50", Light(15.0, 8.0)
-RASTER = picture.Raster((36.0, 20.25), 960, 540)
+RASTER = Raster((36.0, 20.25), 960, 540)
 WAVELENGTHS, _SPARSE, _NM = 15, 32, 550.0
 _CELLS = (8.0, 32.0, 40.0)
 _CELL = 40.0  # the coarsest whose FLIP and light keep the goals: the one that they are held against

@@ -29,12 +29,12 @@ from numpy.typing import NDArray
 
 from experiments import lab
 from neurolens.base.progress import Progress
-from neurolens.flare.ghosts import GhostTracer, coated, ghost_pairs
+from neurolens.flare.canvas import Raster, axis_irradiance
+from neurolens.flare.ghosts import GhostTracer, coated, ghost_pairs, ghost_table
 from neurolens.flare.layers import FlareJob, flare_layers, sum_of
 from neurolens.flare.lights import Light, front_sphere, light_rays
 from neurolens.flare.photons import LEVELS, Photons, PhotonTracer
-from neurolens.flare.picture import Raster, axis_irradiance, ghost_table
-from neurolens.flare.stack import Floats
+from neurolens.flare.steps import Floats
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens

@@ -20,10 +20,11 @@ import numpy as np
 
 from experiments import lab
 from neurolens.base.progress import Progress
+from neurolens.flare.canvas import Raster
 from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.photons import PhotonTracer
-from neurolens.flare.picture import Raster, ghost_picture, photon_picture
+from neurolens.flare.picture import ghost_picture, photon_picture
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
 

@@ -19,10 +19,10 @@ import numpy as np
 
 from experiments import lab
 from neurolens.base.progress import Progress
+from neurolens.flare.canvas import Raster
 from neurolens.flare.diffraction import far_field, outline_spectrum, star, starburst_picture
 from neurolens.flare.exit_pupil import Array, ExitPupil, coverage, exit_pupil, outline
 from neurolens.flare.lights import Light
-from neurolens.flare.picture import Raster
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens
 from neurolens.readers.lensfile import read_lens

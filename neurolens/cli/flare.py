@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from neurolens.cameras.contract import FloatArray
     from neurolens.cli.flare_lights import Sources
     from neurolens.flare.ghostmodel import GhostModel
+    from neurolens.flare.ghosts import Ghost
     from neurolens.flare.layers import FlareJob
-    from neurolens.flare.picture import Ghost
     from neurolens.lens.prescription import Lens
 
 _DESCRIPTION = """\
@@ -269,9 +269,9 @@ class _Shots:
         return self._last[1]
 
     def _make(self, args: argparse.Namespace) -> _Shot:
-        from neurolens.flare.ghosts import GhostTracer
+        from neurolens.flare.canvas import Raster
+        from neurolens.flare.ghosts import RANKED, GhostTracer, ghost_table
         from neurolens.flare.layers import FlareJob
-        from neurolens.flare.picture import RANKED, Raster, ghost_table
 
         state = args.focus, args.f_number, args.zoom
         if state not in self._lenses:
@@ -364,8 +364,7 @@ def _exposure(picture: FloatArray) -> float | None:
 def _draw(job: FlareJob, name: str, out: Path) -> None:
     """Draw the rays of one ghost of the first light."""
     from neurolens.analysis.layout import lens_layout
-    from neurolens.flare.ghosts import ghost_pairs
-    from neurolens.flare.picture import ghost_layout
+    from neurolens.flare.ghosts import ghost_layout, ghost_pairs
 
     pairs = ghost_pairs(job.lens)
     pair = next((p for p in pairs if p.name == name), None)

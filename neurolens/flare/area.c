@@ -1,4 +1,4 @@
-/* Turns the cells of a grid into edges (`edges`), and edges into a picture (`draw`): see `area.py`. Python defines
+/* Turns the cells of a grid into edges (`edges`), and edges into a picture (`draw`): see `canvas.py`. Python defines
    LOST. */
 #include <math.h>
 #include <stddef.h>

@@ -32,11 +32,10 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
+from neurolens.flare.canvas import Raster, axis_irradiance, smear_of, smeared
 from neurolens.flare.exit_pupil import CELLS, Array, ExitPupil, coverage, exit_pupil, image_moves, outline
 from neurolens.flare.lights import Light, patches
-from neurolens.flare.picture import Raster, axis_irradiance
-from neurolens.flare.smear import smear_of, smeared
-from neurolens.flare.stack import Floats
+from neurolens.flare.steps import Floats
 from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.lens.prescription import Lens
 from neurolens.render.colour import in_gamut

@@ -21,9 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.flare.ghosts import GhostRays, Pair
-from neurolens.flare.stack import Floats, function_text
-from neurolens.flare.steps import LOST
+from neurolens.flare.ghosts import GhostRays, GhostTracer, Pair
+from neurolens.flare.steps import LOST, Floats, function_text
 from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Exponents, Graph, Value
@@ -148,6 +147,11 @@ class GhostModel:
     def trace(self, rays: Floats, wavelength_nm: float) -> GhostRays:
         """Trace ghosts as `GhostTracer.trace` does."""
         return self.follow(self.start(rays), wavelength_nm)
+
+    def sums(self, rays: Floats, wavelength_nm: float) -> NDArray[np.float64]:
+        """Sum the light of fitted ghosts as `GhostTracer.sums` does; the image is traced exactly."""
+        image = GhostTracer(self.lens, []).sums(rays, wavelength_nm)
+        return np.concatenate([self.trace(rays, wavelength_nm).sums, image])
 
     def follow(
         self, start: Floats, wavelength_nm: float, *, only: Sequence[Pair] | None = None, reach: float = 1.0

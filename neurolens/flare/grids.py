@@ -11,11 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.flare.ghostmodel import GhostModel
-from neurolens.flare.ghosts import GhostRays, GhostTracer, Pair
+from neurolens.flare.ghosts import GhostRays, GhostSource, Pair
 from neurolens.flare.lights import Light, Patch, light_towards, rays_across
-from neurolens.flare.stack import Floats
-from neurolens.flare.steps import LOST
+from neurolens.flare.steps import LOST, Floats
 
 FEWEST, MOST = 320, 512  # lit cells, and cells along a side
 REACH = 16.0  # of `GhostTracer.trace`: rims are cut between rays inside and outside
@@ -65,7 +63,7 @@ class Grid:
 
 
 def grids_of(
-    tracer: GhostTracer | GhostModel,
+    tracer: GhostSource,
     light: Light,
     wavelength_nm: float,
     half_mm: tuple[float, float],
@@ -117,9 +115,7 @@ def grids_of(
     }  # fmt: skip
 
 
-def ghost_moves(
-    tracer: GhostTracer | GhostModel, patch: Patch, pair: Pair, grid: Grid, wavelength_nm: float
-) -> NDArray[np.float64]:
+def ghost_moves(tracer: GhostSource, patch: Patch, pair: Pair, grid: Grid, wavelength_nm: float) -> NDArray[np.float64]:
     """How far the middle of a ghost's light moves on the film (mm), [2, 2], along each of the sides of a light's patch.
 
     The middle moves as the edges do, which are those of the stop most often: on the film they move by another amount

@@ -15,14 +15,14 @@ import numpy as np
 
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress, Report
+from neurolens.flare.canvas import Raster
 from neurolens.flare.diffraction import starburst_picture
-from neurolens.flare.ghostmodel import GhostModel
-from neurolens.flare.ghosts import GhostTracer, Pair, coated, ghost_pairs
+from neurolens.flare.ghosts import GhostSource, GhostTracer, Pair, coated, ghost_pairs
 from neurolens.flare.lights import Light
 from neurolens.flare.photons import PhotonTracer
-from neurolens.flare.picture import PARTS, Raster, ghost_layers, ghost_picture, photon_picture
+from neurolens.flare.picture import PARTS, ghost_layers, ghost_picture, photon_picture
 from neurolens.flare.sources import Name, SceneLights, chosen, keep_named
-from neurolens.flare.stack import Floats
+from neurolens.flare.steps import Floats
 from neurolens.lens.prescription import Lens
 from neurolens.render.film import check_memory
 from neurolens.render.flaresettings import LAYERS, FlareSettings
@@ -52,7 +52,7 @@ class FlareJob:
     settings: FlareSettings = FlareSettings()
     wavelength_nm: tuple[float, float] = (400.0, 700.0)
     threads: int = 2
-    ghosts: GhostTracer | GhostModel | None = None
+    ghosts: GhostSource | None = None
     single: tuple[str, ...] = ()
     keep: Path | None = None
 

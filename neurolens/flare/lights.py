@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError
 from neurolens.base.files import read_rows
 from neurolens.base.tomlfile import reject_unknown
-from neurolens.flare.stack import Floats
+from neurolens.flare.steps import Floats
 from neurolens.lens.prescription import Lens
 from neurolens.trace.shapes import sag_mm
 

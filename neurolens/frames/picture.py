@@ -26,8 +26,8 @@ from neurolens.render.scene import Scene, seen_from
 from neurolens.render.tiles import windows
 
 if TYPE_CHECKING:
+    from neurolens.flare.canvas import Raster
     from neurolens.flare.layers import Choice
-    from neurolens.flare.picture import Raster
     from neurolens.lens.prescription import Lens
 
 _CHOICE_FRAMES = 16  # of an animation, which decide the brightest lights and ghosts
@@ -116,7 +116,7 @@ def _scenes(frames: Sequence[Frame], prepared: Prepared) -> Iterator[tuple[Scene
 
 
 def _raster(prepared: Prepared) -> Raster:
-    from neurolens.flare.picture import Raster
+    from neurolens.flare.canvas import Raster
 
     return Raster(prepared.camera.film_mm, *prepared.size)
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neurolens.flare.area import draw_edges, edges_of
+from neurolens.flare.canvas import Raster, draw_edges, edges_of
 from neurolens.flare.ghosts import GhostTracer, coated, ghost_pairs
 from neurolens.flare.grids import REACH, grids_of
 from neurolens.flare.lights import Light, light_rays, rays_across
-from neurolens.flare.picture import Raster, ghost_picture
+from neurolens.flare.picture import ghost_picture
 from neurolens.flare.steps import LOST
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph

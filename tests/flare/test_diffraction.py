@@ -17,8 +17,8 @@ from neurolens.analysis.wavefront import opd_mm
 from neurolens.base.errors import InputError
 from neurolens.flare import diffraction as d
 from neurolens.flare import exit_pupil as p
+from neurolens.flare.canvas import Raster, axis_irradiance
 from neurolens.flare.lights import Light, light_rays
-from neurolens.flare.picture import Raster, axis_irradiance
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens
 from neurolens.trace.rays import Rays, trace

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import uniform_filter
 
+from neurolens.flare.canvas import Raster, Smear
 from neurolens.flare.diffraction import starburst_picture
-from neurolens.flare.ghosts import GhostTracer
+from neurolens.flare.ghosts import GhostTracer, ghost_table
 from neurolens.flare.lights import CELLS, Light, light_towards, patches, sides_across, with_disc
 from neurolens.flare.photons import PhotonTracer
-from neurolens.flare.picture import Raster, ghost_picture, ghost_table, photon_picture
-from neurolens.flare.smear import Smear
+from neurolens.flare.picture import ghost_picture, photon_picture
 from neurolens.flare.sources import SceneLights
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens

@@ -9,10 +9,10 @@ import OpenEXR
 import pytest
 
 from neurolens.cli import main
+from neurolens.flare.canvas import Raster
 from neurolens.flare.diffraction import starburst_picture
 from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.lights import Light, light_rays
-from neurolens.flare.picture import Raster
 from neurolens.lens.apertures import Aperture
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.colour import COLOUR_SPACES, SRGB, conversion

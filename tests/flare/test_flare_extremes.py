@@ -15,10 +15,11 @@ from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.field import field_of
 from neurolens.cli import main
 from neurolens.flare import picture, sources
+from neurolens.flare.canvas import Raster
 from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.lights import Light
 from neurolens.flare.photons import PhotonTracer
-from neurolens.flare.picture import Raster, ghost_picture, photon_picture
+from neurolens.flare.picture import ghost_picture, photon_picture
 from neurolens.flare.sources import highlights
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.lensfile import read_lens

@@ -10,9 +10,10 @@ import pytest
 from PIL import Image
 
 from neurolens.cli import main
+from neurolens.flare.canvas import Raster
 from neurolens.flare.ghosts import GhostTracer, coated
 from neurolens.flare.lights import Light, with_disc
-from neurolens.flare.picture import Raster, ghost_picture
+from neurolens.flare.picture import ghost_picture
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.colour import ACESCG, SRGB, conversion
 from neurolens.render.pictures import read_colour_space, read_exr, read_layers, write_data_exr, write_exr

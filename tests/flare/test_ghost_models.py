@@ -16,12 +16,13 @@ import pytest
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cli import main
 from neurolens.flare import ghostfit
+from neurolens.flare.canvas import Raster
 from neurolens.flare.ghostfile import output_of, read_ghosts, write_ghost_source, write_ghosts
 from neurolens.flare.ghostfit import GhostSettings, fit_ghosts
 from neurolens.flare.ghostmodel import GhostModel
 from neurolens.flare.ghosts import GhostTracer, Pair
 from neurolens.flare.lights import Light, light_rays
-from neurolens.flare.picture import Raster, ghost_picture
+from neurolens.flare.picture import ghost_picture
 from neurolens.graph.compiler import compile_c
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens

@@ -11,10 +11,11 @@ import torch
 from experiments.radiometry import film_light
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.flare.ghosts import GhostTracer, Pair, coated, ghost_pairs
+from neurolens.flare.canvas import Raster, axis_irradiance
+from neurolens.flare.ghosts import GhostTracer, Pair, coated, ghost_layout, ghost_pairs, ghost_table
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.photons import PhotonTracer
-from neurolens.flare.picture import Raster, axis_irradiance, ghost_layout, ghost_picture, ghost_table
+from neurolens.flare.picture import ghost_picture
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Coating, Lens, Surface

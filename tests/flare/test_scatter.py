@@ -8,10 +8,11 @@ import torch
 
 from neurolens.base.errors import InputError
 from neurolens.base.status import PASSED
+from neurolens.flare.canvas import Raster, axis_irradiance
 from neurolens.flare.ghosts import GhostTracer, ghost_pairs
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.photons import LEVELS, Photons, PhotonTracer
-from neurolens.flare.picture import Raster, _smoothed, axis_irradiance, photon_picture
+from neurolens.flare.picture import _smoothed, photon_picture
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.colour import SRGB

@@ -10,8 +10,8 @@ import torch
 from neurolens.analysis.fields import Scene as Fields
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
+from neurolens.flare.canvas import Raster
 from neurolens.flare.layers import FlareJob, flare_layers
-from neurolens.flare.picture import Raster
 from neurolens.flare.sources import SceneLights
 from neurolens.plan.footprints import Footprints, blur_mm, distance_mm, left_to
 from neurolens.plan.light import glance, stray_light

@@ -16,10 +16,11 @@ import pytest
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import main
+from neurolens.flare.canvas import Raster
 from neurolens.flare.ghostfile import write_ghosts
 from neurolens.flare.ghostfit import GhostSettings, fit_ghosts
 from neurolens.flare.lights import Light
-from neurolens.flare.picture import Raster, ghost_picture
+from neurolens.flare.picture import ghost_picture
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.renderer import render
 from neurolens.render.scene import scene_from_tables
