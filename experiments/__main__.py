@@ -29,7 +29,7 @@ NAMES = {
     "shots": ("shots", "models fitted to one shot beside those that ship: error, operations, time"),
     "zoom": ("zoom", "models of whole zooms, of internal focus"),
     "equal-time": ("equal_time_page", "error over render time of every camera"),
-    "render": ("render_times_page", "render time by camera and scene"),
+    "render": ("render_times", "render time by camera and scene"),
     "mitsuba": ("mitsuba_speed", "speed of the renderer beside Mitsuba 3"),
     "osl": ("osl_speed", "cameras in Blender's Cycles: shaders of models beside its own"),
     "osl-pictures": ("osl_pictures", "lenses in Cycles beside its own depth of field"),

@@ -186,24 +186,20 @@ def _page(rows: Sequence[Row], simulated: Sequence[Row]) -> str:
         ("CPU s of all processes", "cpu_s", ".1f"), ("load average", "load", ".1f"),
         ("same result", lambda r: "yes" if r["same"] else "NO"),
     )  # fmt: skip
-    small = [
-        [r["what"], f"{r['count']:,}", f"{r['wall_ms']:.2f}", f"{r['cpu_ms']:.2f}", f"{r['mb']:.0f}"]
-        for r in rows
-        if r["part"] == "overhead"
-    ]
-    large = [
-        [r["what"], f"{r['tasks']:,}", f"{r['task_s']:.1f}", f"{r['workers']:,}", f"{r['seconds'] / 3600:.2f}",
-         f"{r['speed_up']:.1f}", f"{r['driver_s']:.0f}"]
-        for r in simulated
-    ]  # fmt: skip
+    small = lab.columns(
+        ("payload of a", "what"), ("tasks", "count", ","), ("wall ms a task", "wall_ms", ".2f"),
+        ("CPU ms of driver and scheduler a task", "cpu_ms", ".2f"), ("MB above the start", "mb", ".0f"),
+    )  # fmt: skip
+    large = lab.columns(
+        ("what", "what"), ("tasks", "tasks", ","), ("s a task", "task_s", ".1f"), ("workers", "workers", ","),
+        ("hours", "seconds", ".2f", 1 / 3600), ("speed-up", "speed_up", ".1f"),
+        ("CPU s of the driver", "driver_s", ".0f"),
+    )  # fmt: skip
     return lab.page(
         "# Dask: speed-up and overhead", " ".join((__doc__ or "").split()), lab.machine_line(), "![dask](dask.png)",
-        "## Speed-up (measured)",
-        lab.table(columns, fast, missing="not taken"),
-        "## Tasks that do nothing (measured)",
-        lab.table("payload of a|tasks|wall ms a task|CPU ms of driver and scheduler a task|MB above the start", small),
-        "## Many tasks and workers (simulated)",
-        lab.table("what|tasks|s a task|workers|hours|speed-up|CPU s of the driver", large), _words(rows, simulated),
+        "## Speed-up (measured)", lab.table(columns, fast, missing="not taken"),
+        "## Tasks that do nothing (measured)", lab.table(small, [r for r in rows if r["part"] == "overhead"]),
+        "## Many tasks and workers (simulated)", lab.table(large, simulated), _words(rows, simulated),
     )  # fmt: skip
 
 

@@ -27,14 +27,16 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from hashlib import sha256
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from experiments import lab
 from experiments.lab import Row
 from neurolens.analysis.fields import Scene
 from neurolens.base.errors import AssumedWarning, InputError, NeurolensError, NeurolensWarning
-from neurolens.base.files import atomic_write_text
+from neurolens.base.files import atomic_write_text, fingerprint_of, sha256_of
 from neurolens.base.progress import Progress, Report
 from neurolens.lens.glass import index_of
 from neurolens.lens.paraxial import first_order
@@ -58,7 +60,7 @@ AT_ONCE = 50  # files for one process of ray-optics, after which the answers are
 
 def own_row(path: Path, name: str) -> Row:
     """The verdict on a file, its reason, the notes of the reader, and the figures that are compared."""
-    row: Row = {"file": name, "sha256": sha256(path.read_bytes()).hexdigest(), "reason": ""}
+    row: Row = {"file": name, "sha256": sha256_of(path), "reason": ""}
     began = time.perf_counter()
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always", NeurolensWarning)
@@ -125,9 +127,8 @@ class RayOptics:
         """
         keys = ("wavelength_nm", "fields_deg", "stop_z_mm", *(["index"] if mend else ()))
         tasks = {r["file"]: {key: r[key] for key in keys} | {"mend": mend} for r in rows}
-        version = sha256(SCRIPT.read_bytes()).hexdigest()
-        decisive = {r["file"]: json.dumps([version, r["sha256"], tasks[r["file"]]]) for r in rows}
-        key = {name: sha256(text.encode()).hexdigest() for name, text in decisive.items()}
+        script = sha256_of(SCRIPT)
+        key = {r["file"]: fingerprint_of([script, r["sha256"], tasks[r["file"]]]) for r in rows}
         new = [name for name in tasks if key[name] not in self.kept]
         for begin in range(0, len(new), AT_ONCE):
             names = new[begin : begin + AT_ONCE]
@@ -138,14 +139,12 @@ class RayOptics:
         return {name: self.kept[key[name]] for name in tasks}
 
     def _answers(self, tasks: Sequence[Row]) -> list[Row]:
-        text = "".join(
-            json.dumps(task | {"file": str((self.folder / task["file"]).resolve())}) + "\n" for task in tasks
-        )
+        named = [task | {"file": str((self.folder / task["file"]).resolve())} for task in tasks]
+        text = "".join(json.dumps(task) + "\n" for task in named)
         KEPT.parent.mkdir(parents=True, exist_ok=True)  # where ray-optics writes its own log, too
+        options: Any = {"capture_output": True, "text": True, "check": False, "cwd": KEPT.parent}
         try:
-            done = subprocess.run(
-                [self.python, SCRIPT], input=text, capture_output=True, text=True, check=False, cwd=KEPT.parent
-            )
+            done = subprocess.run([self.python, SCRIPT], input=text, **options)
         except OSError as error:
             raise InputError("experiments collection", "--ray-optics", str(self.python), "a Python program") from error
         lines = done.stdout.splitlines()
@@ -167,10 +166,8 @@ def differences(own: Row, theirs: Row) -> Row:
     if len(own["states"]) != len(theirs["states"]):
         found["states"] = math.inf
     elif own["states"]:
-        both = zip(own["states"], theirs["states"], strict=True)
-        found["states"] = max(
-            abs(a - b) / abs(other[0]) for one, other in both for a, b in zip(one, other, strict=True)
-        )
+        both = np.array(own["states"]), np.array(theirs["states"])
+        found["states"] = float((np.abs(both[0] - both[1]) / np.abs(both[1][:, :1])).max())
     for share in SHARES if reached else ():
         a, b = pairs[max(1, round(share * reached)) - 1]
         found[f"height {share:g}"] = abs(a / b - 1) if b else abs(a)
@@ -358,7 +355,6 @@ def run_all(folder: Path, only: str, python: Path | None, quiet: bool) -> list[R
 OPTIONS = (
     lab.option("folder", metavar="FOLDER", type=Path, help="clone of github.com/amegahed/OpticsDatabase"),
     lab.option("--ray-optics", metavar="PYTHON", type=Path, help="Python with ray-optics 0.9.8 (default: only read)"),
-    lab.option("--tables", metavar="OUT.tar.xz", type=Path, help="write two hundred tables for the tests, too"),
     lab.ONLY,
     lab.out(),
 )
@@ -370,9 +366,3 @@ def run(args: argparse.Namespace) -> None:
     summary = {"files": len(rows), "verdicts": Counter(r["verdict"] for r in rows), "machine": lab.machine()}
     print(lab.write_results(args.out, "collection", page(rows), summary))
     atomic_write_text(args.out / "collection.csv", lab.csv_text(COLUMNS, rows))
-    if args.tables is not None:
-        from experiments.collection_tables import write_tables  # which needs this module
-
-        if args.ray_optics is None:
-            raise InputError("experiments collection", "--tables", str(args.tables), "--ray-optics with it")
-        write_tables(args.tables, rows, RayOptics(args.ray_optics, args.folder), lambda *_: None)

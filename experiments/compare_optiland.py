@@ -30,8 +30,6 @@ from experiments.trace_speed import film_rays, with_aspheres
 from neurolens.base.errors import NeurolensError
 from neurolens.lens import glass
 from neurolens.lens.prescription import Lens
-from neurolens.readers.lensfile import read_lens
-from neurolens.setting.states import set_lens
 from neurolens.study.speed import POOL, Call, Candidate, Race, race
 from neurolens.surrogates.domain import FilmRays
 from neurolens.trace.rays import Rays, compile_trace, trace
@@ -45,7 +43,7 @@ try:
 except ImportError as error:
     raise NeurolensError(f"this needs Optiland 0.6.3 in an environment of its own: see {__file__}") from error
 
-LENS = lab.LENSES / "laikin_double_gauss_50.toml"
+LENS = "laikin_double_gauss_50"
 FOCAL_MM = 50.0
 BATCHES = (4096, 16384, 65536)
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -171,9 +169,7 @@ def rows_of(timed: Race, dtype: str, lens: str, agreement: dict[str, Any]) -> li
     """Plain tables, units in the keys."""
     rows = []
     for name in timed.ns:
-        t = timed.timing(name)
-        assert t is not None
-        row: dict[str, Any] = {"lens": lens, "dtype": dtype, "name": name, **t, **agreement}
+        row: Row = {"lens": lens, "dtype": dtype, "name": name, **(timed.timing(name) or {}), **agreement}
         row["load"] = [timed.load_before, timed.load_after]
         if name.startswith("neurolens"):
             row["faster_than"] = {other: timed.speedup(name, other) for other in timed.ns if other.startswith("Opti")}
@@ -229,17 +225,11 @@ def page(rows: list[Row], rounds: int) -> str:
         least = min(v["min"] for r in eager for v in r["faster_than"].values())
         goals.append(f"{dtype}: {'reached' if least >= GOAL else 'missed'}, at least {least:.1f} times.")
     goals.append(f"\n{WHY}")
-    return lab.page(
-        "# Beside Optiland",
-        "`python -m experiments optiland`",
-        _SAME.format(rounds=rounds),
-        f"{m['processor']}, {m['vectors']}; Python {m['python']}, torch {m['torch']}, numpy {m['numpy']}, "
-        f"Optiland {version}. Load average meanwhile up to {lab.most_load(rows) or 0.0:.1f}.",
-        lab.table(_COLUMNS, rows),
-        "Where rays land on the last surface, and rays that only one of the two passes:",
-        lab.table(_AGREEMENT, landed),
-        "\n".join(goals),
-    )
+    machine = f"{m['processor']}, {m['vectors']}; Python {m['python']}, torch {m['torch']}, numpy {m['numpy']}, "
+    machine += f"Optiland {version}. Load average meanwhile up to {lab.most_load(rows) or 0.0:.1f}."
+    landing = "Where rays land on the last surface, and rays that only one of the two passes:"
+    parts = ["`python -m experiments optiland`", _SAME.format(rounds=rounds), machine, lab.table(_COLUMNS, rows)]
+    return lab.page("# Beside Optiland", *parts, landing, lab.table(_AGREEMENT, landed), "\n".join(goals))
 
 
 OPTIONS = (lab.option("--quick", action="store_true", help="few rounds"), lab.out())
@@ -251,7 +241,7 @@ def run(args: argparse.Namespace) -> None:
     be.set_backend("torch")
     be.grad_mode.disable()
     rounds = 5 if args.quick else 20
-    lens = set_lens(read_lens(LENS))
+    lens = lab.lens_of(LENS)
     tables = {table.name + end: (table, bool(end)) for end in ("", PASSING) for table in (lens, with_aspheres(lens))}
     contests = [(name, dtype) for name in tables for dtype in DTYPES]
     rows: list[Row] = []

@@ -51,7 +51,7 @@ EXACTS = (EXACT, FUSED_EXACT)
 def scene_cameras(shot: CameraSettings) -> tuple[dict[str, Camera], ExactCamera]:
     """The cameras of a scene by name, the exact one first, and the exact one in float64 for film-space errors.
 
-    All of the lens share the pupil bounds of the models' domain, so that the same random numbers are the same rays.
+    All cameras of the lens have the pupil bounds of the models' domain: the same random numbers are the same rays.
     """
     lens = read_lens(lab.LENSES / f"{LENS}.toml")
     files = {name: lab.MODELS / file for name, file in MODELS.items()}
@@ -66,7 +66,8 @@ def scene_cameras(shot: CameraSettings) -> tuple[dict[str, Camera], ExactCamera]
     return cameras, truth
 
 
-_SOURCES = ("base", "cameras", "graph", "modelfile", "optics", "render")  # folders that a picture depends on
+# Folders that a picture depends on.
+_SOURCES = ("base", "graph", "lens", "trace", "setting", "readers", "surrogates", "cameras", "render")
 
 
 class Shelf:
@@ -93,14 +94,14 @@ class Shelf:
         A file that is broken is made again. Raises what `render` does.
         """
         file = self.file(samples, seed, threads)
-        known = _read(file, (*self.size[::-1], 3))
-        if known is not None:
-            return known
-        found = self.render(samples=samples, seed=seed, threads=threads)
+        kept = _read(file, (*self.size[::-1], 3))
+        if kept is not None:
+            return kept
+        made = self.render(samples=samples, seed=seed, threads=threads)
         self.folder.mkdir(parents=True, exist_ok=True)
         with atomic_path(file) as temporary:
-            np.savez(temporary, rgb=found.rgb, seconds=np.float64(found.stats["seconds"]))
-        return found.rgb, float(found.stats["seconds"])
+            np.savez(temporary, rgb=made.rgb, seconds=np.float64(made.stats["seconds"]))
+        return made.rgb, float(made.stats["seconds"])
 
     def warm_up(self) -> None:
         """An untimed sample per pixel: the first render of a camera loads code and fills caches."""

@@ -1,4 +1,4 @@
-"""Bias and variance of a Monte Carlo render, told apart, and what follows for the time that an error takes.
+"""Bias and variance of a Monte Carlo render, and what follows for the time that an error takes; errors on the film.
 
 A progressive render adds passes of n samples, each with a seed of its own. Its squared error against the truth, mean
 over the pixels, is then exactly bias^2 + V / K after K passes, with V the variance of one pass (within a pass, the
@@ -96,7 +96,7 @@ def reference_variance(halves: Sequence[ArrayLike], weight: ArrayLike) -> float:
 
 
 def bias_and_variance(passes: ArrayLike, halves: Sequence[ArrayLike], weight: ArrayLike) -> tuple[Estimate, Estimate]:
-    """bias^2, and the variance of one pass, of passes [K, ...] with seeds of their own; see the module.
+    """bias^2 and the variance of one pass, from passes [K, ...] with seeds of their own; see the module.
 
     Raises:
         InputError: fewer than three passes, which leave no deviation.
@@ -161,12 +161,9 @@ _SAME = 1e-6  # of the distance from film to pupil plane
 
 @dataclass(frozen=True)
 class FilmMap:
-    """Film-space error of one camera over the film.
+    """Film-space error of one camera, over the rays that pass it and the exact lens.
 
-    Attributes:
-        median_um: [rows, columns] median over pupil and wavelengths, as the picture shows the film; NaN where no ray
-            passes both cameras.
-        p50_um, p99_um: over all rays that pass both.
+    `median_um`: [rows, columns] median over pupil and wavelengths, as the picture shows the film; NaN without a ray.
     """
 
     median_um: Floats
@@ -222,13 +219,11 @@ def on_pupil_of(exact: DifferentialCamera, camera: Camera) -> DifferentialCamera
     own, other = getattr(exact, "film", None), getattr(camera, "film", None)
     if not (isinstance(own, LensFilm) and isinstance(other, LensFilm)):
         return exact
-    if abs(own.distance_mm / other.distance_mm - 1) > _SAME:
-        return exact
-    turned: Any = copy(exact)
-    turned.film = copy(own)
-    turned.film.outline = other.outline
-    found: DifferentialCamera = turned
-    return found
+    same: Any = copy(exact)
+    if abs(own.distance_mm / other.distance_mm - 1) <= _SAME:
+        same.film = copy(own)
+        same.film.outline = other.outline
+    return same
 
 
 def film_error_um(
@@ -244,15 +239,14 @@ def film_error_um(
     `focus_m`: distance from the film to the plane in focus; None is infinity.
     """
     vergence = 0.0 if focus_m is None else 1 / focus_m
-    film_mm, pupil, wavelength_nm = (np.ascontiguousarray(a) for a in (film_mm, pupil, wavelength_nm))
-    true = exact.sample_differentials(film_mm, pupil, wavelength_nm)
-    found = camera.sample(film_mm, pupil, wavelength_nm)
-    step = _on_plane(found, vergence) - _on_plane(true, vergence)
+    arrays = [np.ascontiguousarray(a) for a in (film_mm, pupil, wavelength_nm)]
+    true, rays = exact.sample_differentials(*arrays), camera.sample(*arrays)
+    step = _on_plane(rays, vergence) - _on_plane(true, vergence)
     (a, b), (c, d) = _differential(true, vergence)
     with np.errstate(divide="ignore", invalid="ignore"):
         area = a * d - b * c
         moved = np.hypot((d * step[0] - b * step[1]) / area, (a * step[1] - c * step[0]) / area)
-    return np.where((true.status == 0) & (found.status == 0), 1000 * moved, np.nan)
+    return np.where((true.status == 0) & (rays.status == 0), 1000 * moved, np.nan)
 
 
 def _on_plane(rays: CameraRays, vergence: float) -> Floats:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +24,6 @@ from experiments.equal_time import (
     EXACT,
     EXACTS,
     LENS,
-    MEASURES,
     QUICK,
     SCENES,
     CameraResult,
@@ -36,8 +34,6 @@ from experiments.equal_time import (
 )
 from experiments.equal_time_errors import Estimate, crossover_s, log_interpolate
 from neurolens.analysis.plot_style import FAINT, INK, drawing, plain_log_ticks
-from neurolens.base.files import atomic_write_text, write_json
-from neurolens.base.records import plain
 from neurolens.study.figures import side_by_side
 from neurolens.study.plots import family_colour
 
@@ -63,17 +59,6 @@ scene's tables are not in them.
 - *Film*: where the camera's ray meets the plane in focus, taken back to the film by the exact lens's differential, from
   the exact ray in float64 of the same film and pupil point and wavelength: median and 99th percentile of all rays, um.
 """
-
-
-def write(results: Sequence[SceneResult], folder: Path) -> str:
-    """Write tables of all scenes and the pictures of each; returns the page."""
-    data = {"machine": lab.machine(), "scenes": [_scene_data(r) for r in results]}
-    write_json(folder / "equal_time.json", plain(data))
-    for result in results:
-        draw(result, folder)
-    text = page(results)
-    atomic_write_text(folder / "README.md", text)
-    return text
 
 
 def _threads(result: SceneResult) -> str:
@@ -191,29 +176,16 @@ def _time(seconds: float) -> str:
 
 def _scene_data(result: SceneResult) -> lab.Row:
     def camera_data(c: CameraResult) -> lab.Row:
-        return {
-            "name": c.name,
-            "levels": [asdict(level) for level in c.levels],
-            "pass_s_min": c.pass_s[0],
-            "pass_s_median": c.pass_s[1],
-            **{k: {m: asdict(getattr(c, k)[m]) for m in MEASURES} for k in ("bias2", "extrapolated2", "variance")},
-            "flip_same_seeds": c.flip_same,
-            "film_p50_um": c.film.p50_um,
-            "film_p99_um": c.film.p99_um,
-            "ahead_after_s": {} if c.name in EXACTS else {n: crossovers_s(result, c, n) for n in _exacts(result)},
-        }
+        estimates = {"bias2": c.bias2, "extrapolated2": c.extrapolated2, "variance": c.variance}
+        times = {"pass_s_min": c.pass_s[0], "pass_s_median": c.pass_s[1], "flip_same_seeds": c.flip_same}
+        film = {"film_p50_um": c.film.p50_um, "film_p99_um": c.film.p99_um}
+        ahead = {} if c.name in EXACTS else {n: crossovers_s(result, c, n) for n in _exacts(result)}
+        return {"name": c.name, "levels": c.levels, **times, **estimates, **film, "ahead_after_s": ahead}
 
-    return {
-        "scene": result.name,
-        "f_number": result.f_number,
-        "focus_m": result.settings.focus_m,
-        "counts": asdict(result.counts),
-        "threads": result.threads,
-        "equal_time_s": equal_time_s(result),
-        "reference_variance": result.noise2,
-        "reference_flip_halves": result.flip_halves,
-        "cameras": [camera_data(c) for c in result.cameras.values()],
-    }
+    about = {"scene": result.name, "f_number": result.f_number, "focus_m": result.settings.focus_m}
+    about |= {"counts": result.counts, "threads": result.threads, "equal_time_s": equal_time_s(result)}
+    about |= {"reference_variance": result.noise2, "reference_flip_halves": result.flip_halves}
+    return about | {"cameras": [camera_data(c) for c in result.cameras.values()]}
 
 
 _MOST_BYTES = 150_000  # of a picture
@@ -245,6 +217,7 @@ def _panels(result: SceneResult) -> list[Panel]:
 
 def draw(result: SceneResult, folder: Path) -> None:
     """Three pictures: error over time, FLIP maps at equal samples, film-space maps."""
+    folder.mkdir(parents=True, exist_ok=True)
     shot, counts = result.settings, result.counts
     over_time, flips, films = (folder / f"{result.name}-{kind}.png" for kind in ("error", "flip", "film"))
     where = f"{result.name}, f/{result.f_number:.3g}, focused at {shot.focus_m:g} m"
@@ -282,7 +255,7 @@ def _fewer_colours(picture: Path) -> None:
     def reduced(colours: int) -> Image.Image:
         return pixels.quantize(colours, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
 
-    lab.write_small_png(picture, (reduced(n) for n in (256, 128, 64, 32)), _MOST_BYTES)
+    lab.write_small(picture, ((reduced(n), {"optimize": True}) for n in (256, 128, 64, 32)), _MOST_BYTES)
 
 
 _MARKERS = "osD^vP"
@@ -362,5 +335,7 @@ def run(args: argparse.Namespace) -> None:
     done: list[SceneResult] = []
     for file, report in lab.stages(files, lambda f: f.stem, args.quiet):
         done.append(measure_scene(file, folder, counts, args.threads, report))
-        text = write(done, args.out)
+        draw(done[-1], args.out)
+        data = {"machine": lab.machine(), "scenes": [_scene_data(result) for result in done]}
+        text = lab.write_results(args.out, "README", page(done), data, "equal_time")
     print(f"{text}\nWritten to {args.out}")

@@ -69,7 +69,7 @@ def apertures(count: int) -> Iterator[Case]:
 
 def wide_fields(count: int) -> Iterator[Case]:
     """A fisheye of 220 degrees, from the film to beyond its edge, and back from the scene."""
-    lens = set_lens(read_lens(lab.LENSES / f"{FISHEYE}.toml"))
+    lens = lab.lens_of(FISHEYE)
     rays = from_film(lens, 4 * count, generator(), film=1.3)
     yield _case("field", "fisheye of 220 degrees, to the scene", lens, rays, "scene")
     yield _case("field", "fisheye of 220 degrees, to the film", lens, returning(lens, rays, count), "film")
@@ -133,7 +133,7 @@ def near_equal_indices(count: int) -> Iterator[Case]:
 
 def wavelengths(count: int) -> Iterator[Case]:
     """The ends of the visible."""
-    lens = set_lens(read_lens(lab.LENSES / f"{DOUBLE_GAUSS}.toml"))
+    lens = lab.lens_of(DOUBLE_GAUSS)
     for wavelength in (380.0, 780.0):
         rays = from_film(lens, count, generator())
         case = _case("wavelength", f"double Gauss, {wavelength:g} nm", lens, rays, "scene")
@@ -142,7 +142,7 @@ def wavelengths(count: int) -> Iterator[Case]:
 
 def object_distances(count: int) -> Iterator[Case]:
     """Light from points 1e-6 mm to 1e6 m away, along the ray, from where it enters the front surface."""
-    lens = set_lens(read_lens(lab.LENSES / f"{DOUBLE_GAUSS}.toml"))
+    lens = lab.lens_of(DOUBLE_GAUSS)
     for distance_mm in (1e-6, 1e-3, 1.0, 1e3, 1e6, 1e9):
         g = generator()
         x, y = disc(g, count, lens.surfaces[0].semi_diameter_mm)

@@ -17,7 +17,7 @@ import argparse
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -27,7 +27,6 @@ from torch import Tensor
 from experiments import lab
 from experiments.extreme_cases import Case, all_cases
 from neurolens.base import status as st
-from neurolens.base.progress import Progress
 from neurolens.lens import glass
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.trace.rays import Rays, Traced, trace
@@ -355,14 +354,9 @@ OPTIONS = (lab.count("rays", 20000, "rays per case (default 20000)", 100), lab.o
 def run(args: argparse.Namespace) -> int:
     """Measure every case; 1 where there are violations."""
     lab.quiet_glasses()
-    done = []
-    with Progress(quiet=args.quiet).stage("extremes") as report:
-        cases = list(all_cases(args.rays))
-        for case in cases:
-            done.append(measure(case))
-            report(len(done) / len(cases))
+    done = [measure(case) for case in lab.counted(all_cases(args.rays), "extremes", args.quiet)]
     bad = failures(done)
-    print(lab.write_results(args.out, "extremes", page(done, bad), [asdict(row) for row in done]))
+    print(lab.write_results(args.out, "extremes", page(done, bad), done))
     for line in bad:
         print(f"experiments: {line}", file=sys.stderr)
     return 1 if bad else 0

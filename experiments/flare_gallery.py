@@ -39,7 +39,7 @@ _KEYS = "light,frame,azimuth_deg,elevation_deg,r,g,b\nsun,1,-24,9,3,3,3\nsun,6,2
 
 @dataclass(frozen=True)
 class Panel:
-    """A picture: what commands made, added up; its label; its width over that of its file; stops it is brighter.
+    """A picture, the sum of what commands made: its label, its width over that of its file, stops it is brighter.
 
     `over` is the render whose plate lies under it, reduced to its size.
     """
@@ -53,7 +53,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Picture:
-    """Panels in rows of `columns`; what is said of them; their commands, OUT being the folder; exposure in stops."""
+    """Panels in rows of `columns`, their text, their commands (OUT is the folder), the exposure in stops."""
 
     name: str
     text: str
@@ -197,11 +197,7 @@ def _drawn(picture: Picture, panels: list[list[dict[str, NDArray[np.float32]]]],
         tile = tile.resize((round(tile.width * panel.stretch), tile.height), Image.Resampling.LANCZOS)
         ImageDraw.Draw(tile).text((8, 6), panel.label, fill=(235, 235, 235), font_size=16)
         tiles.append(tile)
-    width, height = tiles[0].size
-    rows = -(-len(tiles) // picture.columns)
-    whole = Image.new("RGB", (picture.columns * (width + 2) - 2, rows * (height + 2) - 2))
-    for k, tile in enumerate(tiles):
-        whole.paste(tile, (k % picture.columns * (width + 2), k // picture.columns * (height + 2)))
+    whole: Image.Image = lab.sheet(tiles, picture.columns, 2, "black")
     return whole
 
 

@@ -20,9 +20,7 @@ import re
 import statistics
 import subprocess
 import tempfile
-import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -34,9 +32,7 @@ from neurolens.base.progress import Progress
 from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.lights import Light, light_rays
 from neurolens.lens.prescription import Lens
-from neurolens.readers.lensfile import read_lens
 from neurolens.render.pictures import write_exr
-from neurolens.setting.states import set_lens
 from neurolens.trace.rays import Rays
 from neurolens.trace.sequence import follow, ghost
 
@@ -55,8 +51,11 @@ OPTIONS = [
 
 @dataclass(frozen=True)
 class Row:
-    """Times are ns a ghost ray, minimum and median; `arriving` is the share of ghost rays that reach the film's plane,
-    `steps` how many surfaces a ghost passes, and `own_steps` those that it does not share with others."""
+    """Times are ns a ghost ray, minimum and median.
+
+    `arriving` is the share of ghost rays that reach the film's plane, `steps` the number of surfaces that a ghost
+    passes, `own_steps` of those that it does not share with other ghosts.
+    """
 
     lens: str
     surfaces: int
@@ -103,51 +102,30 @@ def run(args: argparse.Namespace) -> int:
         goal_now = lab.Goal(f"times as fast as {beside[0].tracer}", 10.0, beside[0].ns_min / beside[1].ns_min, True)
         other = lab.page(lab.table(_PUBLIC, beside), lab.goal_table("Goal", [goal_now]))
     text = lab.page("# Ghosts", __doc__ or "", lab.table(_COLUMNS, rows), lab.goal_table("Goal", [goal]), other)
-    told = {"machine": lab.machine(), "rounds": args.rounds, "rows": [asdict(r) for r in rows]}
-    told["beside"] = [asdict(r) for r in beside]
-    print(lab.write_results(args.out, "flare_speed", text, told))
+    data = {"machine": lab.machine(), "rounds": args.rounds, "rows": rows, "beside": beside}
+    print(lab.write_results(args.out, "flare_speed", text, data))
     return int(bool(main) and main[0] > GOAL_NS)
 
 
-def _row(name: str, rounds: int, report: Callable[[float], None]) -> Row:
-    lens = set_lens(read_lens(lab.LENSES / f"{name}.toml"), focus_m=math.inf)
+def _row(name: str, rounds: int, report: lab.Report) -> Row:
+    lens = lab.lens_of(name, focus_m=math.inf)
     tracer = GhostTracer(lens)
     rays, _ = light_rays(lens, Light(_ANGLE_DEG, 0.0), 0, _RAYS)
-    given = Rays(*torch.from_numpy(rays).float())
+    start = Rays(*torch.from_numpy(rays).float())
     paths = [ghost(len(lens.surfaces), *pair) for pair in tracer.pairs]
     some = paths[:: max(1, len(paths) // _PATHS)]
 
-    def compiled() -> int:
-        found = tracer.trace(rays, _NM)
-        return int(found.worst.size)
-
     def by_path() -> int:
         for path in some:
-            follow(lens, given, path, _NM)
+            follow(lens, start, path, _NM)
         return len(some) * _RAYS
 
-    times: dict[Callable[[], int], list[float]] = {compiled: [], by_path: []}
-    for n in range(rounds + 1):
-        for call, found in times.items():
-            began = time.process_time()
-            rays_done = call()
-            if n:  # the first compiles, and warms caches
-                found.append(1e9 * (time.process_time() - began) / rays_done)
-        report(n / rounds)
-    arriving = tracer.trace(rays, _NM).worst <= 1
-    own = [len(lens.surfaces) - 1 - pair.first for pair in tracer.pairs]
-    return Row(
-        name,
-        len(lens.surfaces),
-        len(paths),
-        float(arriving.mean()),
-        statistics.mean(map(len, paths)),
-        statistics.mean(own),
-        min(times[compiled]),
-        statistics.median(times[compiled]),
-        min(times[by_path]),
-        statistics.median(times[by_path]),
-    )
+    times = lab.cpu_ns({"compiled": lambda: tracer.trace(rays, _NM).worst.size, "torch": by_path}, rounds, report)
+    steps = statistics.mean(map(len, paths))
+    own_steps = statistics.mean(len(lens.surfaces) - 1 - pair.first for pair in tracer.pairs)
+    arriving = float((tracer.trace(rays, _NM).worst <= 1).mean())
+    ends = [end(times[which]) for which in ("compiled", "torch") for end in (min, statistics.median)]
+    return Row(name, len(lens.surfaces), len(paths), arriving, steps, own_steps, *ends)
 
 
 def _beside(binary: Path, rounds: int, progress: Progress) -> list[Public]:
@@ -156,29 +134,25 @@ def _beside(binary: Path, rounds: int, progress: Progress) -> list[Public]:
     Raises:
         InputError: no such program, or one that ends otherwise than flaresim does.
     """
-    lens = set_lens(read_lens(lab.LENSES / f"{LENSES[0]}.toml"), focus_m=math.inf)
+    lens = lab.lens_of(LENSES[0], focus_m=math.inf)
     tracer = GhostTracer(lens)
     rays, _ = light_rays(lens, Light(_ANGLE_DEG, 0.0), 0, 1 << 15)
     arriving = float((tracer.trace(rays, _NM).worst <= 1).mean())
-    theirs: list[tuple[float, ...]] = []
-    ours: list[float] = []
+    theirs, ours = list[float](), list[float]()
     with progress.stage("flaresim") as report, tempfile.TemporaryDirectory() as folder:
         _write_inputs(lens, Path(folder))
         for n in range(rounds):
             few, many = (_flaresim(binary, Path(folder), grid) for grid in (_FEW, _GRID))
-            theirs.append(tuple(a - b for a, b in zip(many, few, strict=True)))
-            for _ in range(20):
-                began = time.process_time()
-                found = tracer.trace(rays[:, :_RAYS], _NM)
-                ours.append(1e9 * (time.process_time() - began) / found.worst.size)
+            seconds, count, hits = (a - b for a, b in zip(many, few, strict=True))
+            theirs.append(1e9 * seconds / count)
+            ours += lab.cpu_ns({"": lambda: tracer.trace(rays[:, :_RAYS], _NM).worst.size}, 20)[""]
             report((n + 1) / rounds)
-    ns = [1e9 * seconds / count for seconds, count, _ in theirs]
-    _, count, hits = theirs[0]
     git = ["git", "-C", str(binary.resolve().parent), "log", "-1", "--format=%h of %cs"]
     version = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip() or "unknown"
+    pairs = len(tracer.pairs)
     return [
-        Public(f"flaresim ({version})", len(tracer.pairs), int(count), hits / count, min(ns), statistics.median(ns)),
-        Public("ours", len(tracer.pairs), found.worst.size, arriving, min(ours), statistics.median(ours)),
+        Public(f"flaresim ({version})", pairs, int(count), hits / count, min(theirs), statistics.median(theirs)),
+        Public("ours", pairs, pairs * _RAYS, arriving, min(ours), statistics.median(ours)),
     ]
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass, replace
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +28,7 @@ _MOST_BYTES = 500_000
 
 @dataclass(frozen=True)
 class Lens:
-    """A picture.
+    """A picture of the sheet.
 
     Attributes:
         camera: as `make_camera` takes it. f_number: the widest.
@@ -59,59 +59,42 @@ OPTIONS = [
 
 
 def run(args: argparse.Namespace) -> None:
-    """Render all four and write the picture."""
+    """Render all four and write the sheet: two rows of two pictures with their titles.
+
+    It is a JPEG, because a photograph's noise would fill a PNG.
+    """
+    from PIL import Image as Pictures
+
     lab.quiet_glasses()
     size = (args.width, round(args.width * 9 / 16))
     with Progress(quiet=args.quiet).stage("pictures") as report:
-        pictures = []
-        for k, lens in enumerate(LENSES):
-
-            def part(fraction: float, seconds_left: float | None = None, before: int = k) -> None:
-                report((before + fraction) / len(LENSES))
-
-            pictures.append(picture_of(lens, size, args.samples, part))
-    write_sheet(args.out, pictures)
+        parts = [lab.part_of(report, k, len(LENSES)) for k in range(len(LENSES))]
+        pictures = [picture_of(lens, size, args.samples, part) for lens, part in zip(LENSES, parts, strict=True)]
+    middle = np.s_[size[1] // 3 : -size[1] // 8, size[0] // 4 : -size[0] // 4]
+    shown = []
+    for lens, picture in zip(LENSES, pictures, strict=True):
+        exposure = float(np.median(pictures[0][middle]) / np.median(picture[middle]))
+        shown.append(lab.labelled(Pictures.fromarray(np.uint8(np.round(255 * to_srgb(picture, exposure)))), lens.title))
+    args.out.mkdir(parents=True, exist_ok=True)
+    forms = [(lab.sheet(shown, 2, _GAP), {"quality": quality}) for quality in (90, 80, 70)]
+    lab.write_small(args.out / "night.jpg", forms, _MOST_BYTES)
     print(args.out / "night.jpg")
 
 
 def picture_of(lens: Lens, size: tuple[int, int], samples: int, report: lab.Report) -> Image:
     """The scene through a lens, denoised: linear RGB [height, width, 3]."""
     scene = load_scene(SCENE)
-    settings = scene.settings.camera
-    position, there = np.array(settings.position_m), np.array(settings.look_at_m)
+    settings, internal = scene.settings.camera, lens.focus_m is not None
+    position, target = np.array(settings.position_m), np.array(settings.look_at_m)
     focus_m = lens.focus_m or settings.focus_m
-    back = (position - there) / np.linalg.norm(position - there) * (focus_m - settings.focus_m)
-    own = lens.focus_m is not None
-    shot = Shot(
-        film_mm=(lens.film_height_mm * 16 / 9 / lens.squeeze, lens.film_height_mm),
-        focus_m=focus_m,
-        f_number=lens.f_number,
-        efl_mm=None if own else 50.0,
-        focus="internal" if own else "best",
-    )
+    back = (position - target) / np.linalg.norm(position - target) * (focus_m - settings.focus_m)
+    film_mm = (lens.film_height_mm * 16 / 9 / lens.squeeze, lens.film_height_mm)
+    focus: Any = "internal" if internal else "best"
+    shot = Shot(film_mm, focus_m, lens.f_number, efl_mm=None if internal else 50.0, focus=focus)
     camera = make_camera(lens.camera if lens.camera == "thin" else f"{FUSED}{lens.camera}", shot)
-    scene = replace(
-        scene, settings=replace(scene.settings, camera=replace(settings, position_m=tuple(position + back)))
-    )
+    moved = replace(settings, position_m=tuple(position + back))
+    scene = replace(scene, settings=replace(scene.settings, camera=moved))
     width, height = size[0], round(size[1] * lens.squeeze)  # pixels of a squeezed picture stay square
     samples = max(1, round(samples / lens.squeeze))
     done = render(scene, camera, width=width, height=height, samples=samples, progress=report)
     return lab.denoised(done.rgb).reshape(size[1], -1, width, 3).mean(axis=1)
-
-
-def write_sheet(folder: Path, pictures: list[Image]) -> None:
-    """Two rows of two pictures, each with its title, as JPEG: a photograph's noise would fill a PNG."""
-    from PIL import Image as Pictures
-    from PIL import ImageDraw
-
-    height, width, _ = pictures[0].shape
-    middle = np.s_[height // 3 : -height // 8, width // 4 : -width // 4]
-    sheet = Pictures.new("RGB", (2 * width + _GAP, 2 * height + _GAP), "white")
-    for k, (lens, picture) in enumerate(zip(LENSES, pictures, strict=True)):
-        exposure = float(np.median(pictures[0][middle]) / np.median(picture[middle]))
-        part = Pictures.fromarray(np.uint8(np.round(255 * to_srgb(picture, exposure))))
-        place = ImageDraw.Draw(part)
-        place.text((12, 8), lens.title, "white", font_size=20, stroke_width=2, stroke_fill="black")
-        sheet.paste(part, ((k % 2) * (width + _GAP), (k // 2) * (height + _GAP)))
-    folder.mkdir(parents=True, exist_ok=True)
-    lab.write_small(folder / "night.jpg", [(sheet, {"quality": quality}) for quality in (90, 80, 70)], _MOST_BYTES)

@@ -14,7 +14,7 @@ import math
 import os
 import tempfile
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +28,7 @@ from neurolens.graph.compiler import FLAGS, find_compiler
 from neurolens.graph.program import Program
 from neurolens.graph.scalars import lower
 from neurolens.lens.prescription import Lens
-from neurolens.study.candidates import (
-    exact_candidates,
-    fused_candidate,
-    model_candidate,
-    program_candidate,
-)
+from neurolens.study.candidates import exact_candidates, fused_candidate, model_candidate, program_candidate
 from neurolens.study.experiment import LensChoice
 from neurolens.study.rays import ray_errors
 from neurolens.study.speed import Call, Candidate, race
@@ -53,15 +48,9 @@ OTHERWISE = {
     "one ray at a time, -O2": ("-std=c99", "-O2", "-march=native", "-fno-math-errno", "-fno-tree-vectorize"),
     "AVX2": (*FLAGS, "-mno-avx512f"),
 }
-
-
 POLYNOMIALS = tuple(ModelSettings("ols", terms=n) for n in (8, 12, 16, 20, 24, 28, 32, 36, 40, 48, 56, 64, 80, 100))
-
-
 NETWORKS = tuple(ModelSettings("mlp", units=n, layers=1) for n in (4, 5, 6, 7, 8, 9, 10, 12, 16))
 WAVELENGTH_NM = 550.0
-
-
 _STOPPED = math.sqrt(0.5)  # one stop down, where a stop is fixed
 
 
@@ -89,14 +78,14 @@ CASES = (
 
 @dataclass
 class Row:
-    """One candidate: what it is, the work it does, its floor, its time.
+    """One candidate.
 
     Attributes:
         work: "ray" (position and direction) or "whole" (with stop, rims and transmittance).
-        operations: float operations of one ray (a fused multiply-add is one), bytes: that a ray reads and writes.
-        roots: square roots and divisions among them.
-        speedup: over the exact tracer in C and over the one compiled by torch at the same work, of the same race.
-        load: load average of the machine meanwhile, the larger of before and after.
+        operations: float operations of one ray (a fused multiply-add is one); roots: square roots and divisions of
+            them; bytes: that a ray reads and writes.
+        speedup: over the exact tracer in C and over the one compiled by torch, in the same race at the same work.
+        load: load average of the machine, the larger of before and after.
     """
 
     lens: str
@@ -231,8 +220,6 @@ roots.
 
 The exact tracer has no error and needs no fit: with few surfaces it is nearly as fast, and a fit takes seconds, in
 which it traces hundreds of millions of rays."""
-
-
 EXACTS = ("exact C", "exact torch")
 _FUSED, _FOLDED, _GRAPH = ", C", ", one wavelength", ", onnxruntime"
 _NS_GOALS = (
@@ -250,27 +237,27 @@ _RATIO_GOALS = (  # by work, at 12 and 33 refractions
 
 def goals(rows: Sequence[Row]) -> list[lab.Goal]:
     """Goals of the fastest model within 1 um."""
-    found = []
+    made = []
     for words, ending, most in _NS_GOALS:
         for work, limit in most.items():
             row = _fastest(rows, 12, work, ending)
             ns = float(row.ns["min"]) if row is not None and row.ns else None
-            found.append(lab.Goal(f"ns per ray, 12 refractions, {words}, {work}", limit, ns))
+            made.append(lab.Goal(f"ns per ray, 12 refractions, {words}, {work}", limit, ns))
     for exact in EXACTS:
         for kind, ending, work, wanted in _RATIO_GOALS:
             for count, least in wanted.items():
                 row = _fastest(rows, count, work, ending)
                 ratio = None if row is None else row.speedup.get(exact)
                 text = f"times as fast as {exact}, {count} refractions, {kind}, {work}"
-                found.append(lab.Goal(text, least, ratio, at_least=True))
-    return found
+                made.append(lab.Goal(text, least, ratio, at_least=True))
+    return made
 
 
 def _fastest(rows: Sequence[Row], refractions: int, work: str, ending: str) -> Row | None:
     """The fastest model of one form within 1 um."""
-    some = [r for r in rows if r.refractions == refractions and r.work == work and r.name.endswith(ending) and r.ns]
-    some = [r for r in some if r.rms_um is not None and r.rms_um <= WITHIN_UM]
-    return min(some, key=lambda r: r.ns["min"] if r.ns else 0.0, default=None)
+    form = [r for r in rows if r.refractions == refractions and r.work == work and r.name.endswith(ending) and r.ns]
+    good = [r for r in form if r.rms_um is not None and r.rms_um <= WITHIN_UM]
+    return min(good, key=lambda r: r.ns["min"] if r.ns else 0.0, default=None)
 
 
 _COLUMNS = lab.columns(
@@ -294,27 +281,15 @@ ratios over it too high."""
 
 def page(rows: Sequence[Row], rounds: int) -> str:
     """The whole page."""
-    most = max((r.load for r in rows if r.load is not None), default=0.0)
+    most, scalar = max((r.load or 0.0 for r in rows), default=0.0), OTHERWISE["one ray at a time, -O2"]
     return lab.page(
         "# Fused models against the exact lens",
         "`python -m experiments fused`",
-        _NOTES.format(
-            rounds=rounds,
-            flags=" ".join(FLAGS),
-            wavelength=WAVELENGTH_NM,
-            scalar=" ".join(OTHERWISE["one ray at a time, -O2"]),
-        ),
+        _NOTES.format(rounds=rounds, flags=" ".join(FLAGS), wavelength=WAVELENGTH_NM, scalar=" ".join(scalar)),
         lab.machine_line() + (_BUSY.format(most) if most > (os.cpu_count() or 1) else ""),
         lab.goal_table("goal", goals(rows)),
         lab.table(_COLUMNS, rows),
     )
-
-
-def write(rows: Sequence[Row], folder: Path, rounds: int) -> str:
-    """Write fused_speed.md and fused_speed.json; returns the page."""
-    data = {"machine": lab.machine(), "rounds": rounds, "flags": FLAGS}
-    data |= {"goals": [g.to_dict() for g in goals(rows)], "rows": [asdict(r) for r in rows]}
-    return lab.write_results(folder, "fused_speed", page(rows, rounds), data)
 
 
 def earlier(folder: Path, names: Collection[str]) -> list[Row]:
@@ -344,5 +319,6 @@ def run(args: argparse.Namespace) -> None:
     rows, text = earlier(args.out, [Path(c.file).stem for c in cases]), ""
     for case, report in lab.stages(cases, lambda c: c.file, args.quiet):
         rows += measure(case, rounds=rounds, torch_compiled=not args.quick, report=report)
-        text = write(rows, args.out, rounds)
+        data = {"machine": lab.machine(), "rounds": rounds, "flags": FLAGS, "goals": goals(rows), "rows": rows}
+        text = lab.write_results(args.out, "fused_speed", page(rows, rounds), data)
     print(text)

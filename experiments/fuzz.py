@@ -25,7 +25,6 @@ import shutil
 import signal
 import sys
 import tempfile
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import chdir, redirect_stdout, suppress
@@ -37,6 +36,7 @@ from typing import Any
 
 from experiments import lab
 from experiments.fuzz_kinds import KINDS, SEEDS, build, chosen, make_seeds, plate, shorten
+from experiments.lab import cpu_s, resident_kb
 from neurolens import __version__, cli
 from neurolens.base.files import atomic_write_text, write_json
 
@@ -138,7 +138,7 @@ def _batch(good: Path, scratch: Path, cases: Sequence[int], seed: int, only: str
         for number, name in ((0, os.devnull), (1, os.devnull), (2, str(scratch / "stderr"))):
             os.dup2(os.open(name, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND), number)
         sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w", errors="backslashreplace")
-        resource.setrlimit(resource.RLIMIT_DATA, (2 * MEMORY + _memory("VmData"),) * 2)
+        resource.setrlimit(resource.RLIMIT_DATA, (2 * MEMORY + 1024 * resident_kb("VmData"),) * 2)
         resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 28,) * 2)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         parser = build()
@@ -167,7 +167,7 @@ def _case(case: int, kind: str, argv: list[str], folder: Folder, parser: Callabl
     os.chdir(folder.place)
     os.ftruncate(2, 0)
     Path("/proc/self/clear_refs").write_text("5")  # the largest memory counts from here
-    spent, children = _spent(), resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    spent, children = cpu_s(), resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
     signal.setitimer(signal.ITIMER_PROF, CPU_S if kind != "long runs" else LONG_CPU_S)
     try:
         code = cli.main(argv, parser)
@@ -183,12 +183,12 @@ def _case(case: int, kind: str, argv: list[str], folder: Folder, parser: Callabl
         sys.stdout.flush()
         sys.stderr.flush()
     largest = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-    memory = max(_memory("VmHWM"), largest << 10 if largest > children else 0)
+    memory = max(resident_kb("VmHWM"), largest if largest > children else 0) << 10
     after = folder.state()
     new = [path for path in after if after[path] != before.get(path)]
     said = (folder.place.parent / "stderr").read_bytes().decode(errors="backslashreplace")
     faults = tuple(_faults(argv, code, said, [p.name for p in new], memory))
-    return Verdict(case, kind, tuple(argv), code, said[-2000:], faults, _spent() - spent, memory)
+    return Verdict(case, kind, tuple(argv), code, said[-2000:], faults, cpu_s() - spent, memory)
 
 
 def _faults(argv: Sequence[str], code: int, said: str, new: Sequence[str], memory: int) -> Iterator[str]:
@@ -212,18 +212,6 @@ def _faults(argv: Sequence[str], code: int, said: str, new: Sequence[str], memor
         yield f"{len(said)} characters on stderr"
     if memory > MEMORY or "memory" in said:
         yield f"memory: {memory >> 20} MB"
-
-
-def _spent() -> float:
-    """Seconds of processor time of this process and of those that it has waited for."""
-    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(u.ru_utime + u.ru_stime for u in used)
-
-
-def _memory(key: str) -> int:
-    """Bytes of this process: VmHWM, its largest resident memory, or VmData."""
-    line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(key))
-    return int(line.split()[1]) << 10
 
 
 # ---- Batches. --------------------------------------------------------------------------------------------------------
@@ -326,7 +314,7 @@ def run(args: argparse.Namespace) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     wanted = range(args.first, args.first + args.cases)
     kinds = {chosen(args.seed, case, args.only)[1] for case in wanted}
-    total = _Total()
+    verdicts = list[Verdict]()
     for module in _LOADED:  # once, not in every process
         import_module(module)
     shorten()
@@ -340,16 +328,17 @@ def run(args: argparse.Namespace) -> int:
             if args.again or not kept.exists():
                 made = run_cases(good, Path(scratch), cases, args.seed, args.only, args.keep)
                 write_json(kept, [asdict(v) for v in made])
-            total.add([Verdict(**row) for row in json.loads(kept.read_text())])
+            verdicts += [Verdict(**row) for row in json.loads(kept.read_text())]
+            bad = [v for v in verdicts if v.faults]
             if not args.quiet:
-                print(f"{total.cases} cases, {len(total.bad)} with faults", file=sys.stderr, flush=True)
-    for v in total.bad:
+                print(f"{len(verdicts)} cases, {len(bad)} with faults", file=sys.stderr, flush=True)
+    for v in bad:
         words = " ".join(word if len(word) < 60 else f"{word[:40]}...({len(word)})" for word in v.argv)
         print(f"case {v.case}, {v.kind}: {'; '.join(v.faults)}\n  {words!r}\n  {v.said.strip()[-300:]!r}")
-    text = _page(args, total)
+    text = _page(args, verdicts)
     atomic_write_text(args.out / "fuzz.md", text)
     print(text)
-    return int(bool(total.bad))
+    return int(bool(bad))
 
 
 def _disk() -> str | None:
@@ -360,39 +349,21 @@ def _disk() -> str | None:
 # ---- The page. -------------------------------------------------------------------------------------------------------
 
 
-class _Total:
-    """What is shown of many verdicts."""
-
-    def __init__(self) -> None:
-        self.cases, self.cpu_s, self.began = 0, 0.0, time.time()
-        self.codes: dict[str, Counter[int]] = {}
-        self.most: dict[str, tuple[float, int]] = {}
-        self.bad: list[Verdict] = []
-
-    def add(self, verdicts: Sequence[Verdict]) -> None:
-        for v in verdicts:
-            self.cases += 1
-            self.cpu_s += v.cpu_s
-            self.codes.setdefault(v.kind, Counter())[v.code] += 1
-            seconds, memory = self.most.get(v.kind, (0.0, 0))
-            self.most[v.kind] = max(seconds, v.cpu_s), max(memory, v.memory)
-            self.bad += [v] if v.faults else []
-
-
-def _page(args: argparse.Namespace, total: _Total) -> str:
+def _page(args: argparse.Namespace, verdicts: Sequence[Verdict]) -> str:
     """The table of exit codes, times and memory by kind, and the command that shows it again."""
-    codes = sorted({code for counter in total.codes.values() for code in counter})
+    codes = sorted({v.code for v in verdicts})
     header = ["damaged", "cases", *(f"exit {code}" for code in codes), "faults", "slowest, CPU s", "largest memory, MB"]
-    faults = Counter(v.kind for v in total.bad)
-    rows = [
-        [name, str(counter.total()), *(str(counter[code]) for code in codes), str(faults[name])]
-        + [f"{total.most[name][0]:.1f}", f"{total.most[name][1] / 2**20:.0f}"]
-        for name, counter in ((name, total.codes[name]) for name in KINDS if name in total.codes)
-    ]
+    rows = []
+    for name in KINDS:
+        if mine := [v for v in verdicts if v.kind == name]:
+            counter, slowest = Counter(v.code for v in mine), max(v.cpu_s for v in mine)
+            counts = [len(mine), *(counter[code] for code in codes), sum(bool(v.faults) for v in mine)]
+            rows.append([name, *counts, f"{slowest:.1f}", f"{max(v.memory for v in mine) / 2**20:.0f}"])
     command = f"python -m experiments fuzz --cases {args.cases} --seed {args.seed}"
     command += (f" --first {args.first}" if args.first else "") + (f" --only {args.only}" if args.only else "")
     versions = ", ".join(f"{name} {version(name)}" for name in ("torch", "numpy", "onnxruntime", "OpenEXR", "pillow"))
-    made = f"`{command}`: {total.cases} cases, {len(total.bad)} with faults, {total.cpu_s / 60:.0f} CPU minutes."
+    bad, minutes = sum(bool(v.faults) for v in verdicts), sum(v.cpu_s for v in verdicts) / 60
+    made = f"`{command}`: {len(verdicts)} cases, {bad} with faults, {minutes:.0f} CPU minutes."
     made += f" neurolens {__version__}, Python {platform.python_version()}, {versions}."
     known = "Memory includes the 0.4 GB of the libraries that each process has loaded. Exit code 2 refuses in one line."
     return lab.page("# Hostile input", " ".join((__doc__ or "").split()), lab.table(header, rows), f"{made} {known}")

@@ -27,12 +27,7 @@ _NUMBERS = (
     *('""', "[]", "{}", "true", "null", "[" * 3000 + "]" * 3000),
 )
 _SCRIPTS = ("<script>alert(1)</script>", "'\"><img src=x onerror=alert(1)>", "javascript:alert(1)", "=1+1", "@SUM(1)")
-WORDS = (
-    *_NUMBERS,
-    *SPECIAL,
-    *_SCRIPTS,
-    *("\x1b[31m", "\u00e9", " " * 20000, "-" * 20000, "(" * 5000, "a/" * 5000),
-)
+WORDS = (*_NUMBERS, *SPECIAL, *_SCRIPTS, *("\x1b[31m", "\u00e9", " " * 20000, "-" * 20000, "(" * 5000, "a/" * 5000))
 _NUMBER = re.compile(rb"(?<![A-Za-z0-9_.])[-+]?[0-9]+(?:\.[0-9]+)?(?:e[-+]?[0-9]+)?")
 _WORD = re.compile(rb"[A-Za-z_][A-Za-z0-9_.-]{0,60}")
 _INTEGERS = (0, 1, -1, 2, 255, 65535, 2**31 - 1, -(2**31), 2**32 - 1, 2**40, 2**63 - 1, -(2**63), 2**64 - 1)
@@ -41,11 +36,7 @@ _REALS = (0.0, -1.0, 1e30, 1e-40, float("inf"), float("-inf"), float("nan"))
 
 def damage(chance: Chance, name: str, data: bytes) -> bytes:
     """The content of a file, damaged as suits the format that its name and its first bytes show."""
-    by_format = {
-        b"\x76\x2f\x31\x01": damage_exr,
-        b"\x89PNG": damage_png,
-        b"PK\x03\x04": damage_archive,
-    }
+    by_format = {b"\x76\x2f\x31\x01": damage_exr, b"\x89PNG": damage_png, b"PK\x03\x04": damage_archive}
     if chance.random() < 0.8:
         if data[:4] in by_format:
             return by_format[data[:4]](chance, data)

@@ -18,7 +18,8 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -33,8 +34,6 @@ from neurolens.flare.ghostmodel import GhostModel
 from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.lights import Light, light_rays, rays_across
 from neurolens.lens.prescription import Lens
-from neurolens.readers.lensfile import read_lens
-from neurolens.setting.states import set_lens
 from neurolens.study.image import flip, flip_map
 from neurolens.trace.rays import Rays
 from neurolens.trace.sequence import follow, ghost
@@ -46,13 +45,16 @@ _CELLS = (8.0, 32.0, 40.0)
 _CELL = 40.0  # the coarsest whose FLIP and light keep the goals: the one that they are held against
 GOAL_UM, GOAL_ENERGY, GOAL_FLIP, GOAL_TORCH, GOAL_C, GOAL_MS = 20.0, 0.01, 0.03, 15.0, 4.0, 100.0
 
-OPTIONS = [lab.count("rounds", 5, "of which the best counts (default: 5)"), lab.PICTURE, lab.out()]
+OPTIONS = [lab.count("rounds", 5, "of which the best counts (default: 5)"), lab.out()]
 
 
 @dataclass(frozen=True)
 class Row:
-    """`rms_um`: None for exact rays. `energy`: of the picture over the converged one, less 1. `cpu_ms`: one thread;
-    `wall_ms`: two threads, least and median; None where it was not drawn so."""
+    """A way to draw the picture.
+
+    `rms_um` is None for exact rays; `energy` is the picture's over that of the converged one, less 1. The times are the
+    least and the median: `cpu_ms` of one thread, `wall_ms` of two (None where it was not drawn so).
+    """
 
     way: str
     cell_px: float
@@ -68,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure, draw, write."""
     lab.quiet_glasses()
     torch.set_num_threads(1)
-    lens = set_lens(read_lens(lab.LENSES / f"{LENS}.toml"), focus_m=math.inf)
+    lens = lab.lens_of(LENS, focus_m=math.inf)
     tracer, progress = GhostTracer(lens), Progress(quiet=args.quiet)
     with progress.stage("fit") as report:
         fitted = fit_ghosts(lens, GhostSettings(), report)
@@ -87,15 +89,11 @@ def run(args: argparse.Namespace) -> int:
         with progress.stage(f"{name}, {cell:g} px, {count} wavelengths"), _grid(cell):
             found = _drawn(model, cell or 8.0, 1, count)
             shown[f"{name}, {f'cells of {cell:g} px, ' if cell else ''}{count} wavelengths"] = found
-            if args.picture:
-                continue
             times = [_timed(model, cell or 8.0, threads, count, args.rounds) for threads in (1, 2)]
         rms = None if model is tracer else _rms(tracer, model)
         energy = float(found.sum(dtype=np.float64) / reference.sum(dtype=np.float64) - 1)
         rows.append(Row(name, cell, count, rms, energy, flip(*_shown(found, reference)), times[0][0], times[1][1]))
     _draw(args.out, shown, reference)
-    if args.picture:
-        return 0
     exact = next(r for r in rows if r.cell_px == _CELL)
     more = _torch_ms(lens, tracer, _CELL)
     slow = exact.cpu_ms[0] + more, exact.cpu_ms[1] + more
@@ -108,9 +106,8 @@ def run(args: argparse.Namespace) -> int:
     text = lab.page(
         "# Ghosts, drawn", __doc__ or "", about, lab.table(_COLUMNS, rows, "-"), lab.goal_table("Goal", goals)
     )
-    told = {"machine": lab.machine(), "rounds": args.rounds, "ray_ns": ns}
-    told |= {"rows": [asdict(r) for r in rows], "fit": fitted.report}
-    print(lab.write_results(args.out, "ghosts", text, told))
+    data = {"machine": lab.machine(), "rounds": args.rounds, "ray_ns": ns, "rows": rows, "fit": fitted.report}
+    print(lab.write_results(args.out, "ghosts", text, data))
     return 0
 
 
@@ -192,19 +189,18 @@ def _timed(
 
 def _ray_ns(tracer: GhostTracer, model: GhostModel, rounds: int) -> tuple[float, float]:
     """CPU ns of a ray of the fitted ghosts' grids, exact and fitted."""
-    half, best = (RASTER.film_mm[0] / 2, RASTER.film_mm[1] / 2), [math.inf, math.inf]
-    found = grids.grids_of(model, LIGHT, _NM, half, _CELL / RASTER.per_mm)
-    rays = {pair: rays_across(model.lens, LIGHT, grid.places)[0] for pair, grid in found.items()}
-    count = WAVELENGTHS * sum(of_ghost.shape[1] for of_ghost in rays.values())
+    half = RASTER.film_mm[0] / 2, RASTER.film_mm[1] / 2
+    every = grids.grids_of(model, LIGHT, _NM, half, _CELL / RASTER.per_mm)
+    rays = {pair: rays_across(model.lens, LIGHT, grid.places)[0] for pair, grid in every.items()}
     nm = np.linspace(405.0, 695.0, WAVELENGTHS).tolist()
-    tried: tuple[GhostTracer | GhostModel, ...] = (tracer, model)
-    for _ in range(rounds):
-        for k, of in enumerate(tried):
-            began = time.process_time()
-            for pair, of_ghost in rays.items():
-                of.follow_each(of.start(of_ghost), nm, pair, grids.REACH)
-            best[k] = min(best[k], 1e9 * (time.process_time() - began) / count)
-    return best[0], best[1]
+
+    def followed(of: Any) -> int:
+        for pair, of_ghost in rays.items():
+            of.follow_each(of.start(of_ghost), nm, pair, grids.REACH)
+        return WAVELENGTHS * sum(of_ghost.shape[1] for of_ghost in rays.values())
+
+    times = lab.cpu_ns({"exact": partial(followed, tracer), "fitted": partial(followed, model)}, rounds)
+    return min(times["exact"]), min(times["fitted"])
 
 
 def _torch_ms(lens: Lens, tracer: GhostTracer, cell: float) -> float:

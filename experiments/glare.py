@@ -57,7 +57,6 @@ _CELLS, _RUNS = (72, 48), 16
 
 OPTIONS = [
     lab.count("photons", 4_000_000, "of each case (default: 4 million)"),
-    lab.PICTURE,
     lab.count("samples", 1 << 18, "photons of each run of the ways (default: 262144)"),
     lab.out(),
 ]
@@ -93,13 +92,11 @@ class Way:
 def run(args: argparse.Namespace) -> int:
     """Measure, write the tables and the picture."""
     progress = Progress(quiet=args.quiet)
-    lens = set_lens(read_lens(lab.LENSES / f"{LENS}.toml"), focus_m=math.inf)
+    lens = lab.lens_of(LENS, focus_m=math.inf)
     retrofocus = read_lens(lab.LENSES / "mori_retrofocus_100.toml")
     retrofocus = set_lens(retrofocus, focus_m=math.inf, focal_length_mm=25.0, f_number=2.8)
     with progress.stage("pictures"):
         _draw(lens, retrofocus, args)
-    if args.picture:
-        return 0
     contrasts: list[Contrast] = []
     ways: list[Way] = []
     for name in COATINGS:
@@ -113,14 +110,9 @@ def run(args: argparse.Namespace) -> int:
     counts = f"{args.photons:,} photons a case of the contrast, {args.samples:,} a run of the ways."
     text = lab.page("# Glare", __doc__ or "", counts, "## Contrast", contrast, "## Ways", lab.table(_WAYS, ways))
     text = lab.page(text, "## One element", lab.table(_ELEMENTS, elements))
-    told = {
-        "machine": lab.machine(),
-        "photons": args.photons,
-        "contrast": [vars(row) | {"kept": row.kept} for row in contrasts],
-        "ways": [vars(row) for row in ways],
-        "elements": [vars(row) for row in elements],
-    }
-    print(lab.write_results(args.out, "glare", text, told))
+    data = {"machine": lab.machine(), "photons": args.photons, "ways": ways, "elements": elements}
+    data["contrast"] = [vars(row) | {"kept": row.kept} for row in contrasts]
+    print(lab.write_results(args.out, "glare", text, data))
     return 0
 
 
@@ -211,7 +203,7 @@ def elements_of(lens: Lens, name: str) -> Iterator[Element]:
 def _draw(gauss: Lens, retrofocus: Lens, args: argparse.Namespace) -> None:
     import matplotlib.pyplot as plt
 
-    wide = set_lens(read_lens(lab.LENSES / "canon_gauss_35.toml"), focus_m=math.inf, focal_length_mm=36.0, f_number=2.0)
+    wide = lab.lens_of("canon_gauss_35", focus_m=math.inf, focal_length_mm=36.0, f_number=2.0)
     stopped = set_lens(wide, f_number=5.6).with_aperture(Aperture(blades=6))
     one = coated(retrofocus, "bare,s02=single-layer,s03=single-layer")
     rows: list[list[tuple[str, Lens, Scatter, Light]]] = [

@@ -17,7 +17,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -106,9 +106,8 @@ class Row:
 
     Attributes:
         operations: float operations of a ray (a fused multiply-add is one). roots: square roots and divisions of them.
-        rms_um: film-equivalent error against float64. wrong: share of rays that pass here and are blocked in float64,
-            or the reverse.
-        ns: nanoseconds a ray by work, [least, median]. gain: the exact lens's least time over this one's.
+        rms_um: film-equivalent error against float64. wrong: share of rays passed or blocked otherwise than there.
+        ns: nanoseconds a ray by work, (least, median). gain: the exact lens's least time over this one's.
     """
 
     lens: str
@@ -175,11 +174,8 @@ class ShaderRace:
         film, pupil = (r * np.sqrt(2.0) for r in (domain.film_radius_mm, domain.pupil_radius_mm))
         low, high = domain.wavelength_nm
         call = [float(checked.film_z[0]), domain.stop_radius_mm, film, pupil, low, high - low]
-        for what, array in (
-            ("call", np.array(call, np.float32)),
-            ("checked", _columns(checked)),
-            ("timed", _columns(timed)),
-        ):
+        arrays = {"call": np.array(call, np.float32), "checked": _columns(checked), "timed": _columns(timed)}
+        for what, array in arrays.items():
             np.save(self.folder / f"{name}.{what}.npy", array)
         for k, (form, program) in enumerate({NOTHING: None, **subject.programs}.items()):
             for work, each, size in ((WORKS[0], 1, _RESULTS * self.count), (WORKS[1], _EACH, self.count)):
@@ -251,14 +247,10 @@ _COLUMNS = lab.columns(
     ("operations (roots)", lambda r: f"{r.operations} ({r.roots})" if r.operations else None),
     ("RMS um", "rms_um", ".2g"),
     ("wrong %", "wrong", ".2g", 100),
-    *(
-        column
-        for work in WORKS
-        for column in (
-            (f"{work}: ns a ray", lambda r, w=work: lab.best_median(r.ns[w][0], r.ns[w][1], ".3g")),
-            ("exact over it", lambda r, w=work: None if r.form == NOTHING else f"{r.gain[w]:.2f}"),
-        )
-    ),
+    ("stored: ns a ray", lambda r: lab.best_median(*r.ns["stored"], form=".3g")),
+    ("exact over it", lambda r: None if r.form == NOTHING else f"{r.gain['stored']:.2f}"),
+    ("in place: ns a ray", lambda r: lab.best_median(*r.ns["in place"], form=".3g")),
+    ("exact over it", lambda r: None if r.form == NOTHING else f"{r.gain['in place']:.2f}"),
 )
 
 
@@ -271,19 +263,12 @@ def run(args: argparse.Namespace) -> None:
         subjects = [subject_of(name) for name in lab.chosen(list(LENSES), str, args.only, "gpu")]
         for subject in subjects:
             raced.add(subject)
-        found = raced.run(args.rounds)
-        rows = [row for subject in subjects for row in rows_of(subject, raced, found)]
-    about = {name: found[name] for name in ("renderer", "version")}
-    about |= {"rays": args.rays, "rounds": args.rounds, "load": max(before, os.getloadavg()[0])}
-    busy = f" Load average up to {about['load']:.1f} meanwhile." if about["load"] > 1 else ""
+        result = raced.run(args.rounds)
+        rows = [row for subject in subjects for row in rows_of(subject, raced, result)]
+    about = {name: result[name] for name in ("renderer", "version")} | {"rays": args.rays, "rounds": args.rounds}
+    about["load"] = load = max(before, os.getloadavg()[0])
+    busy = f" Load average up to {load:.1f} meanwhile." if load > 1 else ""
     notes = _NOTES.format(**about | {"load": busy}, each=_EACH, checked=_CHECKED)
-    table = lab.table(_COLUMNS, rows)
-    text = lab.page(
-        "# Lenses as compute shaders",
-        f"`python -m experiments gpu --rays {args.rays}`",
-        notes,
-        lab.machine_line(),
-        table,
-    )
-    data = {"machine": lab.machine(), **about, "rows": [asdict(r) for r in rows]}
-    print(lab.write_results(args.out, "gpu", text, data))
+    parts = [f"`python -m experiments gpu --rays {args.rays}`", notes, lab.machine_line(), lab.table(_COLUMNS, rows)]
+    text = lab.page("# Lenses as compute shaders", *parts)
+    print(lab.write_results(args.out, "gpu", text, {"machine": lab.machine(), **about, "rows": rows}))

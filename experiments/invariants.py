@@ -3,10 +3,10 @@
     python experiments/invariants.py record FOLDER [--tree OLD]     goldens of a tree (default: the one of this file)
     python experiments/invariants.py check FOLDER [--tree NEW] [--only ITEM ...] [--rays N] [--models GLOB]
 
-Items: onnx, onnx-speed, source, derivatives, wild, fits, fits-onnx, render, start, rays, ghosts. Only the command line
-of the package and onnxruntime are used, but for `fit_all` and `trace_all`. Both commands go on where they stopped:
-goldens and results are files, the results of a check by a hash of the tree's source and of the number of rays. `check`
-exits with 1 on a failure.
+Items: onnx, source, derivatives, wild, fits, fits-onnx, render, rays, ghosts. Only the command line of the package and
+onnxruntime are used, but for `fit_all` and `trace_all`. Both commands go on where they stopped: goldens and results are
+files, the results of a check by a hash of the tree's source and of the number of rays. `check` exits with 1 on a
+failure. Record a tree by the copy of this file in it: functions of the package have other names in older trees.
 
 `rays` are exact rays of every lens in both directions, --traced of them each way (10^6 for a full run; a check must
 name the number that was recorded); `ghosts` are 1,000 paths with two reflections. Positions, directions and powers are
@@ -33,11 +33,9 @@ import json
 import math
 import os
 import re
-import resource
 import runpy
 import subprocess
 import sys
-import time
 import traceback
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -96,29 +94,19 @@ def find(name: str) -> Any:
     return getattr(importlib.import_module(".".join(files[0].relative_to(root).with_suffix("").parts)), name)
 
 
-def placed(lens: Any) -> Any:
-    """The lens with its film placed; in trees before `set_lens` that was a method."""
-    return lens.at() if hasattr(lens, "at") else find("set_lens")(lens)
-
-
 def fit_all(folder: Path) -> None:
     """Fit every row of `experiments surrogates` on few rays, and a zoom: NAME.npz of coefficients, NAME.onnx each."""
     import torch
 
     @functools.cache
     def prepared(name: str) -> Any:
-        lens = placed(find("read_lens")(f"lenses/{name}.toml"))
+        lens = find("set_lens")(find("read_lens")(f"lenses/{name}.toml"))
         domain = find("DomainChoice")(focus_m=(math.inf, math.inf)).of(lens)
         return find("prepare")(find("make_pairs")(lens, domain, find("PairSettings")(3000, 300, 3000)))
 
     def fit(lens: str, row: Any) -> Any:
         quick = {"steps": min(row.settings.steps, 20), "degree": min(row.settings.degree, 8)}
-        quick |= {"seconds": 1e9} if hasattr(row.settings, "seconds") else {}  # of versions whose fits a time ended
-        try:
-            fit_row = find("fit_any")
-        except LookupError:  # a tree in which published methods were part of the package
-            fit_row = find("fit_model")
-        return fit_row(prepared(lens), dataclasses.replace(row.settings, **quick))
+        return find("fit_any")(prepared(lens), dataclasses.replace(row.settings, **quick))
 
     def fit_zoom() -> Any:
         lens = find("read_lens")("lenses/nikon_zoom_80_200.toml")
@@ -129,9 +117,7 @@ def fit_all(folder: Path) -> None:
         f"{lens}.{row.name}": (lens, row)
         for lens, groups in FIT_LENSES.items()
         for row in find("all_rows")()
-        if row.group in groups
-        and (lens == GAUSS or not getattr(row, "weights", None))
-        and f"{lens}.{row.name}" not in SLOW_FITS
+        if row.group in groups and f"{lens}.{row.name}" not in SLOW_FITS
     }
     for name in progress([n for n in (*rows, "zoom.states") if not (folder / f"{n}.npz").exists()], "fits"):
         found: dict[str, Any] = {}
@@ -146,8 +132,6 @@ def fit_all(folder: Path) -> None:
                     found |= dict(arrays_of(getattr(part, what), f"{what}.{k}"))
             file = folder / f"{name}.onnx"
             find("export_onnx" if row else "export_states")(model, file, {})
-            if row and getattr(row, "weights", None):  # of older trees
-                find("store_weights")(file, file, row.weights, {})
         except Exception as error:  # a method that refuses a lens, or has no graph
             found["refused"] = np.array(f"{type(error).__name__}: {error}")
         np.savez(folder / f"{name}.part.npz", **found)
@@ -163,7 +147,7 @@ def trace_all(folder: Path, item: str, count: int) -> None:
     for number, file in enumerate(progress(files, item)):
         if (folder / f"{file.stem}.npz").exists():
             continue
-        lens, found = placed(find("read_lens")(file)), dict[str, Any]()
+        lens, found = find("set_lens")(find("read_lens")(file)), dict[str, Any]()
         every = range(len(lens.surfaces))
         pairs = list(itertools.combinations([k for k in every if lens.surfaces[k].n_d != lens.media[k].n_d], 2))
         share = len(range(number, 1000, len(files)))
@@ -449,25 +433,6 @@ def check_onnx(old: Path, new: Path, count: int, **_: Any) -> Out:
     return total(parts) | {"cards": int(json.dumps(cards[0]) != json.dumps(cards[1]))}
 
 
-def check_speed(old: Path, new: Path, rounds: int = 40, **_: Any) -> Out:
-    """Time of the thread in pairs of calls, the first by turns: minimum over minimum, or the median of the ratios."""
-    import onnx
-
-    if onnx.load(old).graph == onnx.load(new).graph:
-        return {"slower": 1.0, "same graph": 1}
-    sessions, feeds = [open_model(old), open_model(new)], next(batches(card_of(old), BATCH, "inside", old.name))
-    times: list[list[float]] = [[], []]
-    for k in range(4 * rounds):
-        for which in (0, 1) if k % 2 else (1, 0):
-            start = time.thread_time_ns()
-            sessions[which].run(None, feeds)
-            times[which].append(time.thread_time_ns() - start)
-        a, b = np.array(times[0][3:]), np.array(times[1][3:])
-        if k >= rounds and min(b.min() / a.min(), np.median(b / a)) <= LIMITS["slower"]:
-            break  # what looks slower is measured for longer
-    return {"slower": float(min(b.min() / a.min(), np.median(b / a)))}
-
-
 def refused(old: Path, new: Path, cache: Path) -> Out | None:
     """Where a command of either tree failed: whether both said the same."""
     facts = [json.loads(Path(f"{f}.json").read_text()) for f in (old, new)]
@@ -569,52 +534,20 @@ def check_rays(old: Path, new: Path, **_: Any) -> Out:
     return found
 
 
-def check_start(golden: Path, new: Path, **_: Any) -> Out:
-    """Processor time of fresh processes in pairs. What must run without torch is for tests/test_imports.py."""
-    found: Out = {}
-    old = Path(json.loads((golden / "tree.json").read_text())["tree"])
-    jobs = {"import": ["-c", "import neurolens.cameras.model"], "help": ["-m", "neurolens", "--help"]}
-    for name, arguments in jobs.items():
-        times: dict[Path, list[float]] = {old: [], new: []}
-        for k in range(15):
-            for tree in (old, new) if k % 2 else (new, old):
-                before = resource.getrusage(resource.RUSAGE_CHILDREN)
-                in_tree(tree, arguments, check=True, capture_output=True)
-                after = resource.getrusage(resource.RUSAGE_CHILDREN)
-                times[tree].append(after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime)
-        found[f"{name} s"] = min(times[new][1:])
-        found[name] = min(times[new][1:]) / min(times[old][1:])
-    return found
-
-
 # What may not be more, summed over the files or, of `SIZES`, the largest; all else is told only.
-LIMITS: dict[str, float] = {"ulp": 2.0, "derivative ulp": 4.0, "slower": 1.03, "import": 1.05, "help": 1.05}
+LIMITS: dict[str, float] = {"ulp": 2.0, "derivative ulp": 4.0}
 LIMITS |= dict.fromkeys(("status", "cards", "differs", "signature", "message", "operations"), 0.0)
 LIMITS |= dict.fromkeys(("broken", "convergence"), 0.0) | {"mm": 1e-12, "power off": 1e-12, "float32 error": 1.1}
-SIZES: tuple[str, ...] = (
-    "ulp",
-    "derivative ulp",
-    "slower",
-    "import",
-    "help",
-    "relative",
-    "import s",
-    "help s",
-    "mm",
-    "power off",
-)
-SIZES += ("float32 error",)  # largest of all files
+SIZES = ("ulp", "derivative ulp", "relative", "mm", "power off", "float32 error")
 # The folder and endings of an item's goldens, the comparison of two files, and its share of --rays.
 ITEMS: dict[str, tuple[str, tuple[str, ...], Callable[..., Out], float]] = {
     "onnx": ("onnx", (".onnx",), check_onnx, 1),
-    "onnx-speed": ("onnx", (".onnx",), check_speed, 0),
     "source": ("source", (".h", ".glsl"), check_source, 0.2),
     "derivatives": ("derivatives", (".onnx",), check_derivatives, 0.25),
     "wild": ("onnx", (".onnx",), check_wild, 0.1),
     "fits": ("fits", (".npz",), check_fit, 0),
     "fits-onnx": ("fits", (".onnx",), check_onnx, 0.1),
     "render": ("render", (".exr",), check_picture, 0),
-    "start": ("", (), check_start, 0),
     "rays": ("rays", (".npz",), check_rays, 0),
     "ghosts": ("ghosts", (".npz",), check_rays, 0),
 }
@@ -624,8 +557,6 @@ def files_of(item: str, golden: Path, models: str) -> list[str]:
     """Names of what is compared, below the golden folder."""
     folder, endings, *_ = ITEMS[item]
     # What a command refuses leaves a message alone: NAME.json beside where NAME would be.
-    if not folder:
-        return [item]
     told = {f.with_suffix("") if f.suffix == ".json" else f for f in (golden / folder).rglob("*")}
     files = sorted(f for f in told if f.name.endswith(endings) and ".part." not in f.name)
     files = [f for f in files if not f.name.endswith((".stop.onnx", ".scene.onnx"))]
@@ -643,13 +574,12 @@ def check(args: argparse.Namespace) -> int:
     table = []
     for item in args.only or ITEMS:
         folder, _, compare_files, share = ITEMS[item]
-        if folder:
-            make(tree, new, golden, folder, args.models, args.traced)
+        make(tree, new, golden, folder, args.models, args.traced)
         results: list[Out] = []
         for name in progress(files_of(item, golden, args.models), item):
             file = new / "results" / f"{item}-{args.rays}" / f"{name.replace('/', '_')}.json"
             if not file.exists():
-                both = (golden / name, new / name) if folder else (golden, tree)
+                both = golden / name, new / name
                 try:
                     result = compare_files(*both, count=round(share * args.rays), cache=golden / "compiled")
                 except Exception as error:

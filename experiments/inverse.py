@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from experiments import lab
-from experiments.lab import Row
+from experiments.lab import Report, Row
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.graph.interpret import evaluate
@@ -241,25 +241,18 @@ def page(records: Sequence[Row]) -> str:
     return lab.page(*parts, *(["Not measured:", "\n".join(refused)] if refused else []))
 
 
-OPTIONS = (
-    lab.ONLY,
-    lab.count("rays", 100_000, "per lens (default: 100000)", 1000),
-    lab.option("--restart", old=("--again",), action="store_true", help="measure the chosen lenses again"),
-    lab.out(),
-)
+OPTIONS = (lab.ONLY, lab.count("rays", 100_000, "per lens (default: 100000)", 1000), lab.AGAIN, lab.out())
 
 
 def run(args: argparse.Namespace) -> None:
     """Measure what is missing, and write the tables after each lens."""
-    files = lab.chosen(sorted(lab.LENSES.glob("*.toml")), lambda f: f.stem, args.only, "inverse")
-    records = lab.kept_rows(args.out / "inverse.json", "experiments inverse", lambda r: r["lens"], "lenses")
-    missing = [f for f in files if args.restart or f.stem not in records]
-    text = page(list(records.values()))
-    for file, _ in lab.stages(missing, lambda f: f.stem, args.quiet, 20.0):
+
+    def measured(file: Path, report: Report) -> Row:
         try:
-            records[file.stem] = measure_lens(file, args.rays)
+            return measure_lens(file, args.rays)
         except InputError as error:
-            records[file.stem] = {"lens": file.stem, "refused": str(error).removeprefix(f"{lab.ROOT}/")}
-        rows = sorted(records.values(), key=lambda r: str(r["lens"]))
-        text = lab.write_results(args.out, "inverse", page(rows), {"lenses": rows})
-    print(text)
+            return {"lens": file.stem, "refused": str(error).removeprefix(f"{lab.ROOT}/")}
+
+    files = lab.chosen(sorted(lab.LENSES.glob("*.toml")), lambda f: f.stem, args.only, "inverse")
+    chosen = {file.stem: file for file in files}
+    lab.resume(args, "inverse", chosen, measured, lambda r: r["lens"], page, listed="lenses", again=args.restart)

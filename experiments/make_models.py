@@ -37,29 +37,13 @@ from neurolens.study.candidates import exact_candidates, model_candidate, model_
 from neurolens.study.check import check_model, check_states
 from neurolens.study.describe import lens_files
 from neurolens.study.experiment import DomainChoice, Experiment, LensChoice, check_names
-from neurolens.study.measure import (
-    CARD_KEYS,
-    FRESH,
-    Findings,
-    Measured,
-    fit_and_measure,
-    fresh_rays,
-    measure,
-    onnx_predictor,
-    shared_rays,
-    what_is_poor,
-)
+from neurolens.study.measure import Measured, fit_and_measure, shared_rays
 from neurolens.study.rays import REFERENCE_RADIUS_MM
 from neurolens.study.speed import race
 from neurolens.study.train_states import fit_and_measure_states, state_settings
-from neurolens.surrogates.cores import Residual
-from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.file import read_model
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, prepare
-from neurolens.surrogates.fits.network import with_boundary_terms
-from neurolens.surrogates.model import Domain, LensModel
+from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.targets import Prepared
 
 _LIST = lab.ROOT / "experiments" / "models.toml"
 
@@ -70,10 +54,9 @@ def _default_models() -> tuple[ModelSettings, ...]:
 
 @dataclass(frozen=True)
 class Entry:
-    """One lens in one state and the models made of it.
+    """One lens in one state and the settings of its models.
 
     Attributes:
-        models: what is fitted.
         best: keep the best polynomial and the best network only; else all.
         promise: whether the index promises a speed-up, to which `make bench` holds the models.
     """
@@ -214,7 +197,7 @@ def _summary(rows: Sequence[Row], model: str) -> str:
 
 
 def write_index(rows: Sequence[Row], left_out: Mapping[str, str], out: Path) -> None:
-    """Write both; `left_out` gives the reason for each entry that has no models."""
+    """Write index.json and README.md; `left_out` gives the reason for each entry that has no models."""
     index = {"schema": 2, "command": "python -m experiments models", "versions": versions()}
     write_json(out / "index.json", index | {"models": list(rows), "left_out": dict(left_out)})
     reasons = "\n".join(f"- {state}: {reason}" for state, reason in left_out.items())
@@ -226,7 +209,6 @@ def write_index(rows: Sequence[Row], left_out: Mapping[str, str], out: Path) -> 
 # The bench fails below this share of the speed-up measured here: machines and days differ, regressions differ more.
 PROMISE = 0.8
 _VIGNETTING_RAYS = 200_000
-_SHARES = ("false_pass", "false_block")
 _KEPT = tuple(
     "rms_um p99_um direction_rms_deg position_rms_um transmittance_rms false_pass false_block "
     "coefficients_per_vector parameters bytes fit_s".split()
@@ -288,18 +270,16 @@ def _known(out: Path) -> tuple[list[Row], dict[str, str]]:
 
 
 def fingerprint(entry: Entry, pairs: PairSettings) -> str:
-    """Of all that decides the models of an entry.
+    """Hash of everything that decides the models of an entry.
 
     Raises:
         InputError: a lens that cannot be read.
     """
-    c = entry.lens
-    lens = c.read()
+    c, lens = entry.lens, entry.lens.read()
     glass = [lens.sha256, lens.stop_radius_mm, lens.image_radius_mm]
     state = [*glass, c.efl_mm, c.configuration, c.f_number, c.zoom, c.focusing]
-    settings = [asdict(m) for m in entry.models]
-    asked = [__version__, state, asdict(entry.domain), settings, entry.best, asdict(pairs)]
-    return fingerprint_of(asked)
+    models = [asdict(m) for m in entry.models]
+    return fingerprint_of([__version__, state, asdict(entry.domain), models, entry.best, asdict(pairs)])
 
 
 def _stands(entry: Entry, pairs: PairSettings, known: Sequence[Row], out: Path) -> bool:
@@ -317,11 +297,9 @@ def _stands(entry: Entry, pairs: PairSettings, known: Sequence[Row], out: Path) 
 def make_entry(entry: Entry, library: Library, out: Path, progress: Progress) -> list[Row]:
     """Fit, check and time the models of one lens; writes their files and returns their rows of the index."""
     make = _make_of_many_states if entry.lens.many_states else _make_of_one_state
-    common = {
-        "entry": entry.state,
-        "fingerprint": fingerprint(entry, library.pairs),
-        "lens_file": Path(os.path.relpath(entry.lens.file.resolve(), lab.ROOT.resolve())).as_posix(),
-    }
+    lens_file = Path(os.path.relpath(entry.lens.file.resolve(), lab.ROOT.resolve())).as_posix()
+    mark = fingerprint(entry, library.pairs)
+    common = {"entry": entry.state, "fingerprint": mark, "lens_file": lens_file}
     return [{**row, **common} for row in make(entry, library, out, progress)]
 
 
@@ -388,83 +366,6 @@ def time_models(library: Library, entries: Sequence[Entry], out: Path, progress:
             row |= times[row["model"]]
         _keep(rows, left_out, library, out)
     return missing
-
-
-def refit_clipping(library: Library, entries: Sequence[Entry], out: Path, progress: Progress) -> list[str]:
-    """Fit what clips rays again in the networks that are there, on the hidden layers that they have.
-
-    All else in their files stays as it is. Networks that need no terms for their boundaries are left alone; those that
-    change are timed, without the exact tracer.
-
-    Returns: entries whose networks cannot be fitted again, and cards that do not hold, as sentences.
-    """
-    failed = []
-    networks = {e: {m.label for m in e.models if m.method == "mlp"} for e in entries if not e.lens.many_states}
-    for e in (e for e, labels in networks.items() if labels):
-        progress.plan({f"{e.state}: clipping": 5.0, f"{e.state}: race": 10.0})
-    for entry, labels in networks.items():
-        rows, left_out = _known(out)
-        mine = [row for row in rows if row["entry"] == entry.state and row["model"] in labels]
-        if not mine:
-            continue
-        models = {row["file"]: read_model(out / row["file"]).at() for row in mine}
-        domain = next(iter(models.values())).domain  # not computed again, for its last digits may differ
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NeurolensWarning)
-            with progress.stage(f"{entry.state}: clipping"):
-                prepared = prepare(make_pairs(entry.lens.read(), domain, library.pairs))
-                changes = {row["file"]: _clipped_anew(prepared, models[row["file"]], row, out) for row in mine}
-            files = {row["model"]: out / row["file"] for row in mine if changes[row["file"]]}
-            alone = replace(entry, promise=False)
-            times = _times(alone, library, prepared.pairs.lens, domain, files, progress) if files else {}
-        for row in mine:
-            row |= changes[row["file"]] | times.get(row["model"], {}) | {"promised_speedup": row["promised_speedup"]}
-            failed += [f"{row['file']}: does not hold: {', '.join(row['broken'])}"] if row["broken"] else []
-        _keep(rows, left_out, library, out)
-    return failed
-
-
-def _clipped_anew(prepared: Prepared, model: LensModel, row: Row, out: Path) -> Row:
-    """What changes in the row of a network with its clipping, which is written to its file; often nothing."""
-    file, lens, domain = out / row["file"], prepared.pairs.lens, prepared.pairs.domain
-    network: Any = model.core.parts[1] if isinstance(model.core, Residual) else model.core
-    if (model.lens.sha256, model.domain, model.gates) != (lens.sha256, domain, prepared.gates):
-        raise InputError(file, "gates", "(those of other rays)", "a model of this list: make the entry again")
-    core = with_boundary_terms(replace(prepared, encoding=model.encoding), network)
-    if core is network:
-        return {}
-    model = replace(model, core=core)
-    card, seed = load_model(file).card, prepared.pairs.settings.seed + FRESH
-    with atomic_path(file) as made:
-        export_onnx(model, made, errors=card["errors"])
-        fresh = fresh_rays(lens, domain, prepared.pairs.held_out, count=_VIGNETTING_RAYS, seed=seed)
-        found = measure(fresh, onnx_predictor(load_model(made)))
-        export_onnx(model, made, errors=with_shares(card["errors"], found))
-    if sha256_of(file) == row["sha256"]:
-        return {}
-    errors = load_model(file).card["errors"]
-    broken = [
-        p.key for p in check_model(load_model(file), lens.with_stop_radius(domain.stop_radius_mm))[1] if not p.holds
-    ]
-    return {
-        "sha256": sha256_of(file),
-        "bytes": file.stat().st_size,
-        "parameters": core.coefficients,
-        "broken": broken,
-        **{key: errors[key] for key in _SHARES},
-    }
-
-
-def with_shares(errors: Mapping[str, Any], found: Findings) -> dict[str, Any]:
-    """The errors of a card with the shares of rays that a new measurement passes or blocks wrongly."""
-    new = found.errors(CARD_KEYS)
-    zones = {
-        state: {zone: {**old, **{k: new["zones"][state][zone][k] for k in _SHARES}} for zone, old in zones.items()}
-        for state, zones in errors["zones"].items()
-    }
-    shares = {key: new[key] for key in CARD_KEYS if key.startswith(_SHARES)}
-    whole = {**errors, **shares, "stopped_down": new["stopped_down"], "zones": zones}
-    return {**whole, "poor": what_is_poor(whole)}
 
 
 def best_of_each_kind(measured: Sequence[Measured]) -> list[Measured]:
@@ -548,7 +449,6 @@ OPTIONS = (
     lab.option("lenses", metavar="LENS", nargs="*", help="entries whose name starts so (default: all)"),
     lab.option("--list", metavar="FILE", type=Path, default=_LIST, help="list (default: experiments/models.toml)"),
     lab.option("--restart", old=("--again",), action="store_true", help="make the chosen entries again"),
-    lab.option("--clipping", action="store_true", help="only fit again what clips rays in the networks that are there"),
     lab.option("--times", action="store_true", help="only time the models that are there (on a quiet machine)"),
     lab.out(lab.MODELS, "folder"),
 )
@@ -560,8 +460,8 @@ def run(args: argparse.Namespace) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     entries = chosen(library, args.lenses)
     progress = Progress(quiet=args.quiet)
-    if args.times or args.clipping:
-        failed = (time_models if args.times else refit_clipping)(library, entries, args.out, progress)
+    if args.times:
+        failed = time_models(library, entries, args.out, progress)
     else:
         failed = make_models(library, entries, args.out, progress, again=args.restart)
     print((args.out / "README.md").read_text(encoding="utf-8"))

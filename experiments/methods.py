@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from neurolens.cameras.model import load_model
 from neurolens.lens.prescription import Lens
 from neurolens.setting.pupils import image_radius_mm
 from neurolens.study.candidates import EXACT, exact_candidates, exact_records, model_candidates
-from neurolens.study.experiment import DomainChoice, LensChoice
+from neurolens.study.experiment import DomainChoice, EvaluationChoice, LensChoice
 from neurolens.study.measure import FreshRays, measure, onnx_predictor, seconds_to_load, shared_rays
 from neurolens.study.rays import REFERENCE_RADIUS_MM
 from neurolens.study.speed import Race, race
@@ -112,8 +111,11 @@ def all_rows() -> tuple[Row, ...]:
     return tuple([*rows, *_ablations()])
 
 
-def chosen_rows(names: Sequence[str]) -> tuple[Row, ...]:
+def chosen_rows(names: Sequence[str], quick: bool = False) -> tuple[Row, ...]:
     """Rows by name, by group, or by method ("ols", "schrade"; without ablations); none named: all but the ablations.
+
+    Args:
+        quick: train NeuroLens, whose networks take minutes, for `QUICK_STEPS` only; its source says so.
 
     Raises:
         InputError: an unknown name.
@@ -126,7 +128,17 @@ def chosen_rows(names: Sequence[str]) -> tuple[Row, ...]:
             known = ", ".join((*GROUPS, *(r.name for r in rows)))
             raise InputError("experiments surrogates", "--methods", name, f"one of: {known}")
         picked |= {r.name: r for r in found}
-    return tuple(picked.values())
+    return tuple(_quick(row) if quick else row for row in picked.values())
+
+
+QUICK_STEPS = 2000
+
+
+def _quick(row: Row) -> Row:
+    if row.settings.method != "neurolens2017":
+        return row
+    source = f"{row.source}, cut by --quick to {QUICK_STEPS:,}: its errors are too large"
+    return replace(row, settings=replace(row.settings, steps=QUICK_STEPS), source=source)
 
 
 _FIGURES = (
@@ -138,22 +150,11 @@ _FIGURES = (
 
 @dataclass(frozen=True)
 class BenchSettings:
-    """Settings common to all rows.
+    """The settings that all rows share: domain of the models, rays of the fits and errors, measurement and race."""
 
-    Attributes:
-        domain: of the models; None for focus_m: infinity only.
-        pairs: rays of the fits and of the errors.
-        vignetting_rays: that test what passes.
-        rounds, threads: of the race; none without rounds.
-        compile_exact: whether the compiled exact tracer races.
-    """
-
-    domain: DomainChoice = field(default_factory=lambda: DomainChoice(focus_m=(math.inf, math.inf)))
-    pairs: PairSettings = field(default_factory=PairSettings)
-    vignetting_rays: int = 200_000
-    rounds: int = 10
-    threads: int = 1
-    compile_exact: bool = True
+    domain: DomainChoice
+    pairs: PairSettings
+    evaluation: EvaluationChoice
 
 
 @dataclass(frozen=True)
@@ -182,7 +183,7 @@ class Bench:
 
     @cached_property
     def rays(self) -> FreshRays:
-        return shared_rays(self.prepared, self.settings.vignetting_rays)
+        return shared_rays(self.prepared, self.settings.evaluation.vignetting_rays)
 
     def record_file(self, row: Row) -> Path:
         return self.folder / "records" / self.name / f"{row.name}.json"
@@ -192,12 +193,10 @@ class Bench:
 
     def fingerprint(self, row: Row) -> str:
         """Hash of everything that decides a record except its times."""
-        asked = [
-            __version__, self.lens.sha256, self.lens.stop_radius_mm, self.lens.image_radius_mm,
-            asdict(self.settings.domain), asdict(self.settings.pairs), self.settings.vignetting_rays,
-            asdict(row.settings),
-        ]  # fmt: skip
-        return fingerprint_of(asked)
+        lens, s = self.lens, self.settings
+        state = [__version__, lens.sha256, lens.stop_radius_mm, lens.image_radius_mm]
+        rays = [asdict(s.domain), asdict(s.pairs), s.evaluation.vignetting_rays]
+        return fingerprint_of([*state, *rays, asdict(row.settings)])
 
 
 def run_bench(
@@ -207,7 +206,7 @@ def run_bench(
     slow = (*NETWORKS, "neurolens2017")
     for bench in benches:
         progress.plan({f"{bench.name}: {r.name}": 40.0 if r.settings.method in slow else 4.0 for r in rows})
-        progress.plan({f"{bench.name}: race": 60.0 if bench.settings.compile_exact else 15.0})
+        progress.plan({f"{bench.name}: race": 60.0 if bench.settings.evaluation.compile_exact else 15.0})
     for bench in benches:
         records = []
         with warnings.catch_warnings():
@@ -278,7 +277,7 @@ def _fit_and_measure(bench: Bench, row: Row, report: Report) -> dict[str, Any]:
 
 def _add_times(bench: Bench, rows: Sequence[Row], records: list[dict[str, Any]], report: Report) -> None:
     """Race all models of one lens and the exact tracer, and add the times to the records, unless that was done."""
-    s = bench.settings
+    s = bench.settings.evaluation
     files = {row.name: bench.model_file(row) for row, r in zip(rows, records, strict=True) if not r["failed"]}
     if not s.rounds or not files:
         return
@@ -286,7 +285,10 @@ def _add_times(bench: Bench, rows: Sequence[Row], records: list[dict[str, Any]],
     mark = fingerprint_of([hashes, s.rounds, s.threads, s.compile_exact])
     if all(record.get("race") == mark for record in records if record["method"] in files):
         return
-    timed = _race(bench, files, report)
+    domain = bench.domain
+    candidates = exact_candidates(bench.lens.with_stop_radius(domain.stop_radius_mm), domain, compiled=s.compile_exact)
+    candidates += model_candidates(files, domain, s.threads)  # "NAME fused" too, where a C compiler makes one
+    timed = race(candidates, domain, rounds=s.rounds, threads=s.threads, report=report)
     for i, (row, record) in enumerate(zip(rows, records, strict=True)):
         if row.name in files:
             records[i] = plain({**record, **_times_of(record, timed), "race": mark})
@@ -294,17 +296,9 @@ def _add_times(bench: Bench, rows: Sequence[Row], records: list[dict[str, Any]],
 
 
 def _known_record(file: Path, fingerprint: str) -> dict[str, Any] | None:
-    """A record; None if missing, damaged or of other settings."""
+    """A record; None if it is missing, damaged or of other settings."""
     record = read_kept(file)
     return record if record is not None and record.get("fingerprint") == fingerprint else None
-
-
-def _race(bench: Bench, files: Mapping[str, Path], report: Report) -> Race:
-    """Race exported models, by name, and the exact tracer; "NAME fused" where a C compiler makes one."""
-    s, domain = bench.settings, bench.domain
-    candidates = exact_candidates(bench.lens.with_stop_radius(domain.stop_radius_mm), domain, compiled=s.compile_exact)
-    candidates += model_candidates(files, domain, s.threads)
-    return race(candidates, domain, rounds=s.rounds, threads=s.threads, report=report)
 
 
 def _times_of(record: Mapping[str, Any], timed: Race) -> dict[str, Any]:

@@ -32,7 +32,6 @@ from experiments.mitsuba_scenes import our_scene, with_our_spectra
 from neurolens import mitsuba
 from neurolens.base.errors import NeurolensError
 from neurolens.base.progress import Progress
-from neurolens.base.records import plain
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
@@ -66,9 +65,9 @@ class Settings:
 
 @dataclass
 class Row:
-    """One renderer: name, what a path carries, camera; seconds of each repeat, first_s of the first (with compiling).
+    """One renderer: seconds of each repeat, `first_s` of the first, with compiling.
 
-    `pictures`: of the repeats, [H, W, 3] each, free of what cameras do to a white card.
+    `pictures` [H, W, 3] of the repeats are divided by `white`, the camera's picture of a white card.
     """
 
     name: str
@@ -189,22 +188,13 @@ def record(row: Row, settings: Settings, base: Row) -> dict[str, Any]:
     means over the picture, at the settings' samples. `equal_noise`: time to the noise that `base` has, over its time.
     """
     low, middle = min(row.seconds), statistics.median(row.seconds)
-    pictures = np.stack(row.pictures)
-    noise, base_noise = (_noise(r) for r in (row, base))
-    time_over_ours = middle / statistics.median(base.seconds)
+    (noise, base_noise), over = (_noise(r) for r in (row, base)), middle / statistics.median(base.seconds)
     return {
-        "name": row.name,
-        "carries": row.carries,
-        "camera": row.camera,
-        "mpaths_per_s": settings.paths / low * 1e-6,
-        "mpaths_per_s_median": settings.paths / middle * 1e-6,
-        "seconds_min": low,
-        "seconds_median": middle,
-        "first_s": row.first_s,
-        "time_over_ours": time_over_ours,
-        "mean_rgb": [float(v) for v in pictures.mean(axis=(0, 1, 2))],
-        "noise": noise,
-        "equal_noise": time_over_ours * noise / base_noise if noise and base_noise else None,
+        **{key: getattr(row, key) for key in ("name", "carries", "camera", "first_s")},
+        **{"mpaths_per_s": settings.paths / low * 1e-6, "mpaths_per_s_median": settings.paths / middle * 1e-6},
+        **{"seconds_min": low, "seconds_median": middle, "time_over_ours": over, "noise": noise},
+        "mean_rgb": np.mean(row.pictures, axis=(0, 1, 2)).tolist(),
+        "equal_noise": over * noise / base_noise if noise and base_noise else None,
     }
 
 
@@ -215,18 +205,12 @@ def _noise(row: Row) -> float | None:
 
 STAGES = ("camera", "intersection", "lights", "shading", "random numbers", "integrator", "film, set-up")
 _ROOT = str(Path(neurolens.__file__).parent)
-# Module of the renderer to stage; some functions are told apart by name.
+# Stages of the renderer's modules; some functions have a stage of their own.
 _STAGE = {
-    "primitives": "intersection",
-    "mesh": "intersection",
-    "lights": "lights",
-    "environment": "lights",
-    "materials": "shading",
-    "directions": "shading",
-    "textures": "shading",
-    "world": "shading",
-    "sampler": "random numbers",
-    "integrator": "integrator",
+    **dict.fromkeys(("primitives", "mesh"), "intersection"),
+    **dict.fromkeys(("lights", "environment"), "lights"),
+    **dict.fromkeys(("materials", "directions", "textures", "world"), "shading"),
+    **{"sampler": "random numbers", "integrator": "integrator"},
 }
 _FUNCTIONS = {
     "world": dict.fromkeys(("nearest", "visible", "surfaces"), "intersection"),
@@ -242,11 +226,11 @@ _HELPERS = {"dot", "take", "cut"}  # which count as part of those who call them
 Function = tuple[str, int, str]
 
 
-def profile(scene: Scene, camera: Camera, width: int, height: int, samples: int) -> dict[str, float]:
+def profile(scene: Scene, camera: Camera, **size: int) -> dict[str, float]:
     """Share of the time of each of `STAGES` in a render by one worker, adding up to 1."""
     profiler = cProfile.Profile()
     profiler.enable()
-    render(scene, camera, width=width, height=height, samples=samples, threads=1)
+    render(scene, camera, **size, threads=1)  # type: ignore[arg-type]
     profiler.disable()
     return shares(pstats.Stats(profiler))
 
@@ -305,22 +289,19 @@ def mpaths_per_s(scene: Scene, repeats: int = 5, **options: Any) -> list[float]:
 
 
 def memory_of(scene_file: str, width: int, samples: int) -> lab.Row:
-    """Render a scene, in a fresh process.
-
-    Returns: width, height, samples, growth_mb (highest resident memory while rendering, less that before).
-    """
+    """Render a scene in a fresh process: its size, and the MB by which the highest resident memory grows."""
     scene = load_scene(scene_file)
     camera = thin_camera(scene)
     height = round(width * camera.film_mm[1] / camera.film_mm[0])
     render(scene, camera, width=64, height=36, samples=1, threads=1)  # what numpy sets up once
-    size: dict[str, int] = {"width": width, "height": height, "samples": samples}
-    grown = lab.memory_growth(lambda: render(scene, camera, **size, threads=1))[1]  # type: ignore[arg-type]
+    size: dict[str, Any] = {"width": width, "height": height, "samples": samples}
+    grown = lab.memory_growth(lambda: render(scene, camera, **size, threads=1))[1]
     return {**size, "growth_mb": grown / 1e6}
 
 
 @dataclass
 class Found:
-    """What was measured: rows of `record`, of scenes and of memory; `missing`: what was not, and why."""
+    """The results: rows of `record`, of scenes and of memory; `missing` says what was not measured, and why."""
 
     settings: Settings
     versions: dict[str, str]
@@ -384,10 +365,9 @@ def _memory_text(rows: list[lab.Row]) -> str:
     (small, small_mb), (large, large_mb) = sizes[-2:]
     each = (large_mb - small_mb) * 1e6 / (large - small)
     rest = large_mb - each * large * 1e-6
+    text = f"It grows by {each:.0f} bytes per pixel, the film; the paths under way take {rest:.0f} MB whatever the"
     return (
-        "Highest resident memory of one worker while it renders, less that before. It grows by "
-        f"{each:.0f} bytes per pixel, the film; the paths under way take {rest:.0f} MB whatever the picture's size and "
-        "samples."
+        f"Highest resident memory of one worker while it renders, less that before. {text} picture's size and samples."
     )
 
 
@@ -416,19 +396,15 @@ def run(args: argparse.Namespace) -> None:
                 part(found, report)
             except NeurolensError as error:
                 found.missing.append(f"{name} ({error})")
-        data = {k: getattr(found, k) for k in ("versions", "rows", "scenes", "memory", "missing")}
-        data["settings"] = vars(found.settings)
-        text = lab.write_results(args.out, "render_speed", page(found), plain(data))
+        text = lab.write_results(args.out, "render_speed", page(found), vars(found))
     print(text)
 
 
 def _versions() -> dict[str, str]:
     known = {}
     for package in ("numpy", "mitsuba", "drjit", "embreex"):
-        try:
+        with suppress(PackageNotFoundError):
             known[package] = version(package)
-        except PackageNotFoundError:
-            continue
     with suppress(NeurolensError, AttributeError):  # no LLVM, or a Dr.Jit that does not tell
         require_mitsuba("llvm_ad_rgb")
         known["LLVM"] = ".".join(map(str, libraries()[1].detail.llvm_version()))
@@ -454,15 +430,9 @@ def _scenes(found: Found, report: Report) -> None:
         height = round(SCENE_WIDTH * camera.film_mm[1] / camera.film_mm[0])
         size: dict[str, Any] = {"width": SCENE_WIDTH, "height": height, "samples": SCENE_SAMPLES}
         speeds = mpaths_per_s(scene, repeats=repeats, threads=threads, **size)
-        found.scenes.append(
-            {
-                "scene": name,
-                "max_depth": scene.settings.camera.max_depth,
-                "mpaths_per_s": max(speeds),
-                "mpaths_per_s_median": sorted(speeds)[len(speeds) // 2],
-                "shares": profile(scene, camera, SCENE_WIDTH, height, SCENE_SAMPLES),
-            }
-        )
+        row = {"scene": name, "max_depth": scene.settings.camera.max_depth, "mpaths_per_s": max(speeds)}
+        row |= {"mpaths_per_s_median": sorted(speeds)[len(speeds) // 2], "shares": profile(scene, camera, **size)}
+        found.scenes.append(row)
         report((k + 1) / len(SCENES))
 
 

@@ -23,8 +23,6 @@ from neurolens.blender.pack import Form
 from neurolens.cli.blender_kept import kept_form
 from neurolens.cli.blender_lenses import form_of
 from neurolens.lens.paraxial import first_order
-from neurolens.readers.lensfile import read_lens
-from neurolens.setting.states import set_lens
 
 _MOST_BYTES = 240_000  # of a picture
 _QUALITIES = (90, 85, 80, 70)
@@ -131,19 +129,16 @@ def _form(shot: Shot, folder: Path, quiet: bool) -> Form:
 
 def focal_mm(shot: Shot) -> float:
     """Focal length (vertical, of an anamorphic lens)."""
-    return float(first_order(set_lens(read_lens(lab.LENSES / f"{shot.name}.toml"), zoom=shot.state)).efl_mm)
+    return float(first_order(lab.lens_of(shot.name, zoom=shot.state)).efl_mm)
 
 
 def _write_pair(file: Path, folder: Path, shot: Shot) -> None:
     """Both pictures side by side, Cycles's own on the left, each with its name."""
-    from PIL import Image, ImageDraw
+    from PIL import Image
 
-    left, right = (Image.open(folder / f"{shot.name}.{kind}.png").convert("RGB") for kind in ("cycles", "lens"))
-    for picture, label in ((left, "Cycles's own"), (right, shot.title.split(",")[0])):
-        ImageDraw.Draw(picture).text((8, 6), label, "white", font_size=20, stroke_width=2, stroke_fill="black")
-    both = Image.new("RGB", (left.width + _GAP + right.width, left.height), "white")
-    both.paste(left, (0, 0))
-    both.paste(right, (left.width + _GAP, 0))
+    labels = {"cycles": "Cycles's own", "lens": shot.title.split(",")[0]}
+    files = {kind: Image.open(folder / f"{shot.name}.{kind}.png").convert("RGB") for kind in labels}
+    both = lab.sheet([lab.labelled(picture, labels[kind]) for kind, picture in files.items()], 2, _GAP)
     lab.write_small(file, [(both, {"quality": quality, "optimize": True}) for quality in _QUALITIES], _MOST_BYTES)
 
 
@@ -163,10 +158,9 @@ _COLUMNS = lab.columns(
 
 def _page(data: lab.Row, shots: Sequence[Shot]) -> str:
     samples = data["samples"]
-    head = (
-        f"`python -m experiments osl-pictures --samples {samples}`: Blender {data['blender']}, one thread, {samples} "
-    )
-    head += f"samples a pixel, denoised; load average {data['load']:.0f}; {lab.machine_line()}"
+    command = f"`python -m experiments osl-pictures --samples {samples}`"
+    head = f"{command}: Blender {data['blender']}, one thread, {samples} samples a pixel, denoised; "
+    head += f"load average {data['load']:.0f}; {lab.machine_line()}"
     parts = ["Left Cycles's own depth of field, right the lens."]
     for shot in shots:
         parts += [f"## {shot.title}", f"Right: {shot.shows}.", f"![{shot.title}: Cycles, the lens]({shot.name}.jpg)"]

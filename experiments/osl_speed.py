@@ -97,9 +97,13 @@ OPTIONS = [
 
 @dataclass(frozen=True)
 class Row:
-    """A camera in a scene: operations of a ray and RMS error (um), None where that is not ours to tell; ns of CPU a
-    ray, least and median; what a picture takes before its first ray; the least over the least of the scene's base, and
-    the median of that ratio in the turns."""
+    """A camera in a scene.
+
+    Attributes:
+        operations, error_um: of a ray, and the RMS error; None for cameras that are not ours.
+        begin_ms: what a picture takes before its first ray. ns_min, ns_median: ns of CPU a ray.
+        over, over_median: the least over the least of the scene's base, and the median of that ratio in the turns.
+    """
 
     scene: str
     camera: str
@@ -143,8 +147,7 @@ def run(args: argparse.Namespace) -> int:
         told = race(python, texts | others, stages, report)
     rows = [row for name, stage in stages.items() for row in rows_of(name, stage, told["scenes"][name], operations)]
     met = goals(rows)
-    data = {"machine": lab.machine(), "blender": told["blender"], "rows": [asdict(r) for r in rows]}
-    data |= {"goals": [g.to_dict() for g in met]}
+    data = {"machine": lab.machine(), "blender": told["blender"], "rows": rows, "goals": met}
     print(lab.write_results(args.out, "osl_speed", _page(told["blender"], stages, rows, met), data))
     return int(any(g.verdict == "missed" for g in met))
 

@@ -68,7 +68,7 @@ def _one_batch(model: OnnxLens, rng: np.random.Generator, n: int, found: Outcome
     rays, film_z, stop = _rays(rng, n, d), _film_z(rng, d), _stop(rng, d)
     with np.errstate(all="ignore"):
         out = model.rays(rays[:2], rays[2:4], rays[4], float(film_z), float(stop), state or None)
-        surely_out, surely_in = _place(d, rays.astype(np.float64), float(film_z), float(stop), _wavelengths(model))
+        surely_out, surely_in = _sides(d, rays.astype(np.float64), float(film_z), float(stop), _wavelengths(model))
         if place is not _Place.INSIDE:
             surely_out, surely_in = np.full(n, place is _Place.OUTSIDE), np.zeros(n, bool)
         passed = out.status == st.PASSED
@@ -151,7 +151,7 @@ def _stop(rng: np.random.Generator, d: dict[str, Any]) -> np.float32:
     return np.float32(rng.choice(np.array([-radius, 1.01 * radius, *_SPECIAL], np.float32)))
 
 
-def _place(
+def _sides(
     d: dict[str, Any], rays: NDArray[np.float64], film_z: float, stop: float, wavelengths_nm: tuple[float, float]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Rays surely outside the domain, and surely inside: between lie those that rounding decides."""

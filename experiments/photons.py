@@ -25,8 +25,6 @@ from neurolens.flare.ghosts import GhostTracer
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.photons import PhotonTracer
 from neurolens.flare.picture import ghost_picture, photon_picture
-from neurolens.readers.lensfile import read_lens
-from neurolens.setting.states import set_lens
 
 LENS, ZOOM, DISTANCE_MM = "nikon_zoom_80_200", "80", 3600.0
 # x, y of the light in mm, most reflections, and his time where he states it.
@@ -47,15 +45,13 @@ GOAL_S = 10.0
 OPTIONS = [
     lab.count("photons", 10_000_000, "of each case (default: 10 million)"),
     lab.count("threads", 2, "default: 2"),
-    lab.PICTURE,
     lab.out(),
 ]
 
 
 @dataclass(frozen=True)
 class Row:
-    """Shares are of the photons cast; `film` those that arrive on the film, `flare` of these after reflections, in all
-    and by their number."""
+    """Shares of the photons cast: `film` arrive on the film, `flare` of these after reflections, also by number."""
 
     x_mm: int
     y_mm: int
@@ -76,11 +72,8 @@ class Row:
 
 def run(args: argparse.Namespace) -> int:
     """Trace the cases, write the tables; 1 where the goal is missed."""
-    lens = set_lens(read_lens(lab.LENSES / f"{LENS}.toml"), zoom=ZOOM, focus_m=DISTANCE_MM / 1000, focus="best")
+    lens = lab.lens_of(LENS, zoom=ZOOM, focus_m=DISTANCE_MM / 1000, focus="best")
     tracer, rows, progress = PhotonTracer(lens), [], Progress(quiet=args.quiet)
-    if args.picture:
-        _draw(tracer, args)
-        return 0
     cases = [(*case, args.photons) for case in CASES] + [(*at, 10, "12 to 15 h", 2 * args.photons) for at in TWICE]
     for x, y, most, his, count in cases:
         with progress.stage(f"{x}, {y}, {most} reflections"):
@@ -89,8 +82,8 @@ def run(args: argparse.Namespace) -> int:
     slowest = max(r.seconds for r in rows if r.photons == args.photons)
     goal = lab.Goal(f"seconds for {args.photons:,} photons, {args.threads} threads", GOAL_S, slowest)
     text = lab.page("# Photons", __doc__ or "", lab.table(_COLUMNS, rows), lab.goal_table("Goal", [goal]))
-    told = {"machine": lab.machine(), "photons": args.photons, "threads": args.threads, "rows": [vars(r) for r in rows]}
-    print(lab.write_results(args.out, "photons", text, told))
+    data = {"machine": lab.machine(), "photons": args.photons, "threads": args.threads, "rows": rows}
+    print(lab.write_results(args.out, "photons", text, data))
     return int(goal.measured is not None and goal.measured > GOAL_S)
 
 

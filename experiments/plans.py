@@ -388,7 +388,7 @@ def page(rows: Sequence[Mapping[str, Any]]) -> str:
 
 OPTIONS = (
     lab.option("--only", metavar="TEXT", default="", help="cases whose LENS-SCENE holds this text"),
-    lab.option("--restart", old=("--again",), action="store_true", help="measure the chosen cases again"),
+    lab.AGAIN,
     lab.option("--models", metavar="DIR", type=Path, default=Path("runs/plans"), help="for them (default: runs/plans)"),
     lab.out(),
 )
@@ -397,13 +397,10 @@ OPTIONS = (
 def run(args: argparse.Namespace) -> None:
     """Measure what is missing, and write the tables after each case."""
     lab.quiet_glasses()
-    cases = lab.chosen(CASES, lambda c: c.name, args.only, "plans")
-    maker = "experiments plans"
-    kept = lab.kept_rows(args.out / "plans.json", maker, lambda r: f"{r['lens']}-{r['scene']}", "cases")
-    missing = [c for c in cases if args.restart or c.name not in kept]
+    cases = {case.name: case for case in lab.chosen(CASES, lambda c: c.name, args.only, "plans")}
     with pinned_threads():
-        for case, report in lab.stages(missing, lambda c: c.name, args.quiet, 90.0):
-            kept[case.name] = measure_case(case, args.models / case.name, report)
-            rows = [kept[c.name] for c in CASES if c.name in kept]
-            lab.write_results(args.out, "plans", page(rows), {"cases": rows})
-    print(page([kept[c.name] for c in CASES if c.name in kept]))
+        lab.resume(
+            args, "plans", cases, lambda case, report: measure_case(case, args.models / case.name, report),
+            lambda r: f"{r['lens']}-{r['scene']}", page, listed="cases", again=args.restart, seconds=90.0,
+            order=[case.name for case in CASES],
+        )  # fmt: skip

@@ -14,7 +14,7 @@ import platform
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,48 +25,33 @@ from experiments.lab import Row
 from experiments.mitsuba_speed import mpaths_per_s
 from neurolens.base.errors import InputError
 from neurolens.cameras.model import load_model
-from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import load_scene
-from neurolens.setting.states import set_lens
 from neurolens.study.candidates import exact_candidates, ideal_cameras, model_candidate
 from neurolens.study.speed import Race, race
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.model import Domain
 
-
-@dataclass(frozen=True)
-class Floor:
-    """One speed against its floor; `measured` is None, with a `reason`, where it could not be taken."""
-
-    name: str
-    floor: float
-    measured: float | None
-    unit: str
-    reason: str = ""
-
-    @property
-    def verdict(self) -> str:
-        if self.measured is None:
-            return "UNCHECKED"
-        return "pass" if self.measured >= self.floor else "FAIL"
+COMPILED, EAGER = "exact compiled", "exact eager"
+LENS, SCENE = "laikin_double_gauss_50", lab.SCENES / "room.toml"
+TRACER_MRAY_S = {"eager": 6.0, "compiled": 20.0}  # one core, float32, 12 refractions, stop, rims and dispersion
+RENDER_MPATH_S = 1.0  # the room, depth 3, two cores
 
 
 @dataclass
 class Outcome:
-    """Rows of the table, and what failed.
+    """Rows of the table, one per candidate, and what failed.
 
     Attributes:
-        rows: one per candidate, with units in the keys.
         missed: promises that were not kept, as sentences.
         checked, unchecked: promises held against a measurement, and those that could not be.
-        floors: of the tracer and the renderer.
+        floors: least speeds of the tracer and the renderer.
     """
 
     rows: list[Row] = field(default_factory=list)
     missed: list[str] = field(default_factory=list)
     checked: int = 0
     unchecked: list[str] = field(default_factory=list)
-    floors: list[Floor] = field(default_factory=list)
+    floors: list[lab.Goal] = field(default_factory=list)
 
 
 def read_index(folder: Path) -> list[dict[str, Any]]:
@@ -79,9 +64,8 @@ def read_index(folder: Path) -> list[dict[str, Any]]:
     try:
         rows = json.loads(path.read_text(encoding="utf-8"))["models"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            path, "file", f"({type(error).__name__}: {error})", "the index that `python -m experiments models` writes"
-        ) from error
+        expected = "the index that `python -m experiments models` writes"
+        raise InputError(path, "file", f"({type(error).__name__}: {error})", expected) from error
     if not isinstance(rows, list):
         raise InputError(path, "models", type(rows).__name__, "a list")
     for i, row in enumerate(rows):
@@ -94,7 +78,7 @@ def read_index(folder: Path) -> list[dict[str, Any]]:
 
 
 def bench_models(args: argparse.Namespace, save: Callable[[Outcome], str]) -> Outcome:
-    """Race the models of the index in `args.models`, lens by lens; `save` what there is after each.
+    """Race the models of the index in `args.models`, lens by lens; `save` the outcome so far after each.
 
     Without --only, those of which the index promises a speed-up.
     """
@@ -105,19 +89,24 @@ def bench_models(args: argparse.Namespace, save: Callable[[Outcome], str]) -> Ou
     if not groups:
         raise InputError(folder / "index.json", "models", "(none)", f"models with {only!r} in the file's name")
     outcome = Outcome()
-    for (lens_file, configuration, efl_mm), report in lab.stages(groups, _state, args.quiet, 60.0):
-        rows = groups[lens_file, configuration, efl_mm]
-        lens = set_lens(read_lens(lab.ROOT / lens_file), zoom=configuration, focal_length_mm=efl_mm)
+    for group, report in lab.stages(groups, _state, args.quiet, 60.0):
+        rows, (lens_file, configuration, efl_mm) = groups[group], group
+        lens = lab.lens_of(lab.ROOT / lens_file, zoom=configuration, focal_length_mm=efl_mm)
         models = {row["file"]: load_model(folder / row["file"], lens.sha256) for row in rows}
         domain = Domain.from_dict(next(iter(models.values())).card["domain"])
         lens = lens.with_stop_radius(domain.stop_radius_mm)
         made = [model_candidate(name, model, domain.stop_radius_mm) for name, model in models.items()]
         candidates = [*exact_candidates(lens, domain), *made, *ideal_cameras(lens, domain)]
         timed = race(candidates, domain, threads=args.threads, rounds=args.rounds, report=report)
-        outcome.rows += table_rows(_state((lens_file, configuration)), timed)
+        outcome.rows += table_rows(_state(group), timed)
         hold_to_promises(rows, timed, outcome)
         save(outcome)
     return outcome
+
+
+def _state(group: tuple[Any, ...]) -> str:
+    """Words for the lens and the state of a group of models."""
+    return " ".join([Path(group[0]).stem, *([str(group[1])] if group[1] else [])])
 
 
 def hold_to_promises(rows: Sequence[dict[str, Any]], timed: Race, outcome: Outcome) -> None:
@@ -129,20 +118,30 @@ def hold_to_promises(rows: Sequence[dict[str, Any]], timed: Race, outcome: Outco
         promised = row.get("promised_speedup")
         if promised is None:
             continue
-        found = timed.speedup(row["file"], COMPILED)
-        if found is None:
+        ratios = timed.speedup(row["file"], COMPILED)
+        if ratios is None:
             reason = timed.unavailable.get(COMPILED) or timed.unavailable.get(row["file"]) or "not timed"
             outcome.unchecked.append(f"{row['file']}: {reason}")
             continue
         outcome.checked += 1
-        best = max(found.values())
+        best = max(ratios.values())
         if not best >= promised:
             outcome.missed.append(f"{row['file']}: {best:.3g} times the compiled exact tracer, promised {promised:g}")
 
 
-def _state(group: tuple[Any, ...]) -> str:
-    """Words for the lens and the state of a group of models."""
-    return " ".join([Path(group[0]).stem, *([str(group[1])] if group[1] else [])])
+def check_floors(rounds: int) -> list[lab.Goal]:
+    """Measure the floors; the best of the rounds counts, as a busy machine only ever slows."""
+    lens = lab.lens_of(LENS)
+    domain = domain_of(lens)
+    candidates = exact_candidates(lens, domain, transmittance=False, build_rays=False, label="trace")
+    timed, floors = race(candidates, domain, rounds=rounds), []
+    for kind, floor in TRACER_MRAY_S.items():
+        timing = timed.timing(f"trace {kind}")
+        speed, reason = (1000 / timing["min"], "") if timing else (None, timed.unavailable.get(f"trace {kind}", ""))
+        text = f"exact tracer, {kind}, one core, float32, Mray/s"
+        floors.append(lab.Goal(text, floor, speed, at_least=True, worst=reason))
+    speed = max(mpaths_per_s(load_scene(SCENE), threads=2, max_depth=3, samples=16))
+    return [*floors, lab.Goal("render of the room, two cores, depth 3, Mpath/s", RENDER_MPATH_S, speed, at_least=True)]
 
 
 def report_outcome(outcome: Outcome) -> int:
@@ -151,9 +150,9 @@ def report_outcome(outcome: Outcome) -> int:
         print(f"not checked: {line}")
     for line in outcome.missed:
         print(f"SLOWER THAN PROMISED: {line}", file=sys.stderr)
-    below = [f for f in outcome.floors if f.verdict == "FAIL"]
+    below = [f for f in outcome.floors if f.verdict == "missed"]
     for f in below:
-        print(f"BELOW ITS FLOOR: {f.name}: {f.measured:.3g} {f.unit}, at least {f.floor:g}", file=sys.stderr)
+        print(f"BELOW ITS FLOOR: {f.text}: {f.measured:.3g}, at least {f.wanted:g}", file=sys.stderr)
     print(f"{outcome.checked - len(outcome.missed)} of {outcome.checked + len(outcome.unchecked)} promises kept")
     if outcome.unchecked and not outcome.checked:
         reason = outcome.unchecked[0].partition(": ")[2]
@@ -161,78 +160,38 @@ def report_outcome(outcome: Outcome) -> int:
     return 1 if outcome.missed or below else 0
 
 
-LENS, SCENE = lab.LENSES / "laikin_double_gauss_50.toml", lab.SCENES / "room.toml"
-TRACER_MRAY_S = {"eager": 6.0, "compiled": 20.0}  # one core, float32, 12 refractions, stop, rims and dispersion
-RENDER_MPATH_S = 1.0  # the room, depth 3, two cores
-
-
-def check_floors(rounds: int) -> list[Floor]:
-    """Measure all of them; the best of the rounds counts, as a busy machine only ever slows."""
-    lens = set_lens(read_lens(LENS))
-    domain = domain_of(lens)
-    candidates = exact_candidates(lens, domain, transmittance=False, build_rays=False, label="trace")
-    timed = race(candidates, domain, rounds=rounds)
-    found = []
-    for kind, floor in TRACER_MRAY_S.items():
-        timing, reason = timed.timing(f"trace {kind}"), timed.unavailable.get(f"trace {kind}", "")
-        speed = None if timing is None else 1000 / timing["min"]
-        found.append(Floor(f"exact tracer, {kind}, one core, float32", floor, speed, "Mray/s", reason))
-    speed = max(mpaths_per_s(load_scene(SCENE), threads=2, max_depth=3, samples=16))
-    return [*found, Floor("render of the room, two cores, depth 3", RENDER_MPATH_S, speed, "Mpath/s")]
-
-
-COMPILED, EAGER = "exact compiled", "exact eager"
-
-
 def table_rows(state: str, timed: Race) -> list[Row]:
     """One row per candidate of a race.
 
-    Returns: tables of lens (`state`), name, ns_per_ray, speedup_over_compiled and speedup_over_eager ({"min", "median"}
-        as of `Race.speedup`; None where that tracer did not run), reason where unavailable, load of the machine.
-        Where several exact tracers raced, each is held against those of its own kind.
+    Its ratios to the exact tracers are {"min", "median"} as of `Race.speedup`; None where that tracer did not run.
+    Where several exact tracers raced, each is held against those of its own kind.
     """
     rows: list[Row] = []
     for name in (*timed.ns, *timed.unavailable):
         own = name.rsplit(" ", 1)[0]
         compiled, eager = (n if n in timed.ns else f"{own} {n.split()[-1]}" for n in (COMPILED, EAGER))
-        rows.append(
-            {
-                "lens": state,
-                "name": name,
-                "ns_per_ray": timed.timing(name),
-                "speedup_over_compiled": timed.speedup(name, compiled),
-                "speedup_over_eager": timed.speedup(name, eager),
-                "reason": timed.unavailable.get(name),
-                "load": [timed.load_before, timed.load_after],
-            }
-        )
+        ratios = {"speedup_over_compiled": timed.speedup(name, compiled)}
+        ratios |= {"speedup_over_eager": timed.speedup(name, eager)}
+        load = [timed.load_before, timed.load_after]
+        about = {"lens": state, "name": name, "ns_per_ray": timed.timing(name)}
+        rows.append(about | ratios | {"reason": timed.unavailable.get(name), "load": load})
     return rows
 
 
-def _ratio(found: dict[str, float] | None) -> str | None:
-    return None if found is None else lab.best_median(found["min"], found["median"])
+def _ratio(key: str) -> Callable[[Row], str | None]:
+    return lambda row: lab.best_median(row[key]["min"], row[key]["median"]) if row[key] else None
 
 
 _COLUMNS = lab.columns(
     ("lens", "lens"),
     ("candidate", "name"),
-    (
-        "ns per ray, best",
-        lambda r: f"{t['min']:.1f}" if (t := r["ns_per_ray"]) else f"unavailable: {r['reason']}",
-    ),
+    ("ns per ray, best", lambda r: f"{t['min']:.1f}" if (t := r["ns_per_ray"]) else f"unavailable: {r['reason']}"),
     ("median", "ns_per_ray.median", ".1f"),
     ("Mray/s", lambda r: 1000 / t["min"] if (t := r["ns_per_ray"]) else None, ".1f"),
     ("batch", "ns_per_ray.batch"),
     ("threads", "ns_per_ray.threads"),
-    ("over compiled", lambda r: _ratio(r["speedup_over_compiled"])),
-    ("over eager", lambda r: _ratio(r["speedup_over_eager"])),
-)
-_FLOORS = lab.columns(
-    ("what", "name"),
-    ("measured", lambda f: f"({f.reason})" if f.measured is None else f"{f.measured:.3g}"),
-    ("floor", "floor", "g"),
-    ("unit", "unit"),
-    ("verdict", "verdict"),
+    ("over compiled", _ratio("speedup_over_compiled")),
+    ("over eager", _ratio("speedup_over_eager")),
 )
 _NOTES = """\
 Rays uniform over film and pupil disc of each domain, blocked ones included; {threads}, {rounds} rounds in turn, each \
@@ -242,14 +201,14 @@ Thin lens and pinhole give ray and weight. Ratios: by the best times (median wit
 Python {python}, torch {torch}, {processor}."""
 
 
-def page(rows: Sequence[Row], floors: Sequence[Floor], threads: int, rounds: int) -> str:
+def page(rows: Sequence[Row], floors: Sequence[lab.Goal], threads: int, rounds: int) -> str:
     """The rows and the floors, with what a reader must know of the conditions."""
     versions = {"python": platform.python_version(), "torch": torch.__version__, "processor": platform.machine()}
     notes = _NOTES.format(threads=f"{threads} thread" + "s" * (threads > 1), rounds=rounds, **versions)
     load = lab.most_load(rows)
     if load is not None:
         notes += f" Load average of the machine meanwhile: up to {load:.1f} on {os.cpu_count()} cores."
-    parts = ["## Floors", lab.table(_FLOORS, floors)] if floors else []
+    parts = ["## Floors", lab.goal_table("what", floors)] if floors else []
     return lab.page("# Models against the exact tracer", notes, lab.table(_COLUMNS, rows), *parts)
 
 
@@ -268,8 +227,7 @@ def run(args: argparse.Namespace) -> int:
 
     def save(outcome: Outcome) -> str:
         text = page(outcome.rows, outcome.floors, args.threads, args.rounds)
-        floors = [{**asdict(f), "verdict": f.verdict} for f in outcome.floors]
-        return lab.write_results(args.out, "bench", text, {"rows": outcome.rows, "floors": floors})
+        return lab.write_results(args.out, "bench", text, {"rows": outcome.rows, "floors": outcome.floors})
 
     outcome = bench_models(args, save)
     if not args.only:

@@ -27,9 +27,7 @@ from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.lens.prescription import Lens
 from neurolens.plan.costs import cycles_ns
-from neurolens.readers.lensfile import read_lens
 from neurolens.setting.pupils import pupil_bounds
-from neurolens.setting.states import set_lens
 from neurolens.shaders.blender_shader import lens_of
 from neurolens.shaders.osl import osl_program
 from neurolens.shaders.pupil_circles_fit import light_lost
@@ -84,9 +82,7 @@ SampleFunction = Callable[[Any, Any, Any], tuple[Any, Any]]
 
 def camera_of(case: Case) -> ExactCamera:
     """The lens of a case on `FILM_MM`, focused at infinity."""
-    lens = set_lens(
-        read_lens(lab.LENSES / f"{case.lens}.toml"), focal_length_mm=case.focal_length_mm, f_number=case.f_number
-    )
+    lens = lab.lens_of(case.lens, focal_length_mm=case.focal_length_mm, f_number=case.f_number)
     return ExactCamera(lens, film_mm=FILM_MM, focus_m=math.inf)
 
 
@@ -112,17 +108,10 @@ def measure(case: Case, samples: int = SAMPLES) -> lab.Row:
         sample_ns = _nanoseconds(pupil.sample, film, square, wavelength)
         rate = {"passed": float(passed.mean()), "light": light / true, "search_s": search_s, "sample_ns": sample_ns}
         rates[name] = rate
-    return {
-        "lens": case.lens,
-        "focal_length_mm": case.focal_length_mm,
-        "f_number": case.f_number,
-        "lit_radius_mm": outline.film_radius_mm,
-        "dark": 1 - film.shape[1] / samples,
-        "lost": lost_light(camera, film, square, wavelength),
-        "theirs_percent": case.theirs,
-        "source": case.source,
-        "rates": rates,
-    }
+    about = {"lens": case.lens, "focal_length_mm": case.focal_length_mm, "f_number": case.f_number}
+    about |= {"lit_radius_mm": outline.film_radius_mm, "dark": 1 - film.shape[1] / samples}
+    lost = lost_light(camera, film, square, wavelength)
+    return about | {"lost": lost, "theirs_percent": case.theirs, "source": case.source, "rates": rates}
 
 
 def true_irradiance(camera: ExactCamera, samples: int) -> float:
@@ -233,7 +222,7 @@ def pixel_rates(samples: int = SAMPLES) -> Iterator[tuple[float, float, float]]:
     r, angle = SobolEngine(2, scramble=True, seed=1).draw(samples).double().numpy().T
     r, angle = np.sqrt(r), 2 * math.pi * angle
     for f_number, theirs in TABLE_5_3.items():
-        lens = set_lens(read_lens(lab.LENSES / "brendel_tessar_100.toml"), focal_length_mm=50.0, f_number=f_number)
+        lens = lab.lens_of("brendel_tessar_100", focal_length_mm=50.0, f_number=f_number)
         rim = known.rear_rim(lens, radius)
         points = rim.along[0] * np.stack([r * np.cos(angle), r * np.sin(angle)])
         passed = known.passes_through(lens, rim.pupil_z_mm)(np.full(samples, radius), points)
@@ -318,12 +307,8 @@ def run(args: argparse.Namespace) -> None:
         return shaders(args)
     lab.quiet_glasses()
     cases = lab.chosen(CASES, lambda case: case.lens, args.only, "pupils")
-    with Progress(quiet=args.quiet).stage("pupils") as report:
-        done = []
-        for case in cases:
-            done.append(measure(case, args.rays))
-            report(len(done) / (len(cases) + 1))
-        pixel = [] if args.only else list(pixel_rates(args.rays))
+    done = [measure(case, args.rays) for case in lab.counted(cases, "pupils", args.quiet)]
+    pixel = [] if args.only else list(pixel_rates(args.rays))
     data = {"film_mm": FILM_MM, "samples": args.rays, "cases": done, "tessar_pixel": pixel}
     print(lab.write_results(args.out, "passage", page(done, pixel, args.rays), data))
 
@@ -350,17 +335,17 @@ def shaders(args: argparse.Namespace) -> None:
     """Share of the samples that pass, operations and CPU seconds of shaders of the library's models."""
     models = [file for kind in ("*.ols-64.onnx", "*-range.states-64.onnx") for file in lab.MODELS.glob(kind)]
     files = lab.chosen(sorted(models), lambda file: file.name, args.only, "pupils")
-    kept = args.out / "osl_passing.json"
-    done = lab.kept_rows(kept, "experiments pupils --shaders", lambda row: row["model"], "rows")
-    files = [file for file in files if args.only or file.stem not in done]
-    with Progress(quiet=args.quiet).stage("shaders") as report:
-        for k, file in enumerate(files):
-            done[file.stem] = shader_row(file)
-            rows = sorted(done.values(), key=lambda row: str(row["model"]))
-            data = {"machine": lab.machine(), "rows": rows}
-            text = lab.page("# Samples of shaders in OSL that pass", _SHADERS_TEXT, lab.table(SHADERS, rows))
-            lab.write_results(args.out, "osl_passing", text, data)
-            report((k + 1) / len(files))
+    lab.resume(
+        args,
+        "osl_passing",
+        {file.stem: file for file in files},
+        lambda file, report: shader_row(file),
+        lambda row: row["model"],
+        lambda rows: lab.page("# Samples of shaders in OSL that pass", _SHADERS_TEXT, lab.table(SHADERS, rows)),
+        listed="rows",
+        again=bool(args.only),
+        maker="experiments pupils --shaders",
+    )
 
 
 def shader_row(file: Path) -> lab.Row:

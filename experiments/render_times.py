@@ -1,26 +1,36 @@
-"""Render time by camera and scene: Willi's Tables 6.2 and 6.3, with surrogates beside the lenses.
+"""Render three scenes of rising cost through a pinhole, a thin lens, a stop without glass, and eight lenses.
 
-All cameras see the same 20 degrees at f/4, focused at 5 m: the film grows with the focal length. One wavelength per
-path for all, for ideal cameras could share a path between four. Renders run in turn, in one process on one thread.
-Source of the tables: Willi 2021 (multi-lens cameras in appleseed).
+The lenses, of 2 to 40 refractions, are traced exactly (torch, and compiled as C), through their polynomials and
+networks in onnxruntime and compiled (12 minutes of one core; --quick: one). Needs the extra "train" (torch) and a C
+compiler; what this machine cannot make is left out, and the page says so. The tables are those of Willi 2021
+(multi-lens cameras in appleseed), 6.2 and 6.3. Writes README.md, render_times.csv and render_times.png.
 """
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
+import torch
 
 from experiments import lab
 from experiments.lab import Report
+from neurolens.analysis.plot_style import INK, drawing
 from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_write_text
+from neurolens.base.progress import Progress
 from neurolens.cameras.build import FUSED, Shot, make_camera
 from neurolens.cameras.contract import RAYS_A_CALL, Camera
 from neurolens.lens.apertures import Aperture
 from neurolens.render.film_settings import FilmSettings
+from neurolens.render.pictures import make_aperture
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene, load_scene
 
@@ -46,6 +56,7 @@ LENSES = (
     (40, "zoom 70-200 (Nikon)", "nikon_zoom_70_200", 71.5),
 )
 _QUICK = (2, 14, 40)
+_MASKS = lab.ROOT / "experiments" / "gallery" / "scenes"
 _FILM = (0.36, 0.2025)  # of the focal length
 _FOCUS_M, _F_NUMBER = 5.0, 4.0
 _ALONE_ROUNDS, _SLOW_S = 15, 0.1
@@ -63,13 +74,13 @@ class Size:
 
 @dataclass
 class Subject:
-    """A camera of the table.
+    """A camera of the table; where it cannot be made, `camera` is None, and `reason` says why.
 
     Attributes:
         refractions: of the lens, None for an ideal camera. kind: one of `KINDS`, or an ideal camera.
-        camera: None where it cannot be made, `reason` says why. made_s: to make it, compiling included.
-        ns, ns_moves: of a ray without and with differentials, camera alone, best of the rounds.
-        moves_error: of differentials that are fitted, see `LensCamera`.
+        made_s: seconds to make it, compiling included.
+        ns, ns_moves: nanoseconds of a ray without and with differentials, the camera alone, best of the rounds.
+        moves_error: RMS error of differentials that are fitted.
     """
 
     lens: str
@@ -133,13 +144,12 @@ def shot(efl: float, spec: str, aperture: Aperture | None = None) -> Shot:
 
 def _differentials(camera: Camera, count: int) -> Callable[[], object] | None:
     """A call that samples rays with differentials, run once; None for a camera without them."""
-    film, square, wavelength = _inputs(camera, count)
-    ask = camera.sample_differentials  # type: ignore[attr-defined]
+    call = partial(camera.sample_differentials, *_inputs(camera, count))  # type: ignore[attr-defined]
     try:
-        ask(film, square, wavelength)
+        call()
     except InputError:
         return None
-    return lambda: ask(film, square, wavelength)
+    return call
 
 
 def _inputs(camera: Camera, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -152,33 +162,24 @@ def _inputs(camera: Camera, count: int) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def time_alone(subjects: Sequence[Subject], report: Report) -> None:
-    """Nanoseconds a ray of every camera by itself, with and without differentials, in turn."""
+    """Time every camera by itself, with and without differentials, in turn."""
     calls: list[tuple[Subject, str, int, Callable[[], object]]] = []
     for s in subjects:
         if s.camera is not None:
             count = getattr(s.camera, "rays_a_call", RAYS_A_CALL)
-            film, square, wavelength = _inputs(s.camera, count)
-            sample = s.camera.sample
-            calls.append((s, "ns", count, lambda f=sample, a=(film, square, wavelength): f(*a)))  # type: ignore[misc]
+            calls.append((s, "ns", count, partial(s.camera.sample, *_inputs(s.camera, count))))
             moves = _differentials(s.camera, count)
             if moves is not None:
                 calls.append((s, "ns_moves", count, moves))
     for k in range(_ALONE_ROUNDS):
         for s, what, count, call in calls:
-            known: float | None = getattr(s, what)
-            if known is not None and known * count > _SLOW_S * 1e9:
-                continue  # a tenth of a second a call is measured well enough by one
-            began = time.perf_counter()
-            call()
-            taken = (time.perf_counter() - began) / count * 1e9
-            setattr(s, what, taken if known is None else min(known, taken))
+            least: float | None = getattr(s, what)
+            if least is None or least * count <= _SLOW_S * 1e9:  # one slow call is measured well enough
+                began = time.perf_counter()
+                call()
+                ns = (time.perf_counter() - began) / count * 1e9
+                setattr(s, what, ns if least is None else min(least, ns))
         report((k + 1) / _ALONE_ROUNDS)
-
-
-def load_scenes(quick: bool) -> dict[str, Scene]:
-    """The scenes by what they cost."""
-    chosen = list(SCENES.items())[: 1 if quick else 3]
-    return {cost: load_scene(lab.SCENES / f"{name}.toml") for cost, name in chosen}
 
 
 def time_renders(subjects: Sequence[Subject], scenes: dict[str, Scene], size: Size, report: Report) -> list[Timed]:
@@ -205,17 +206,13 @@ def time_renders(subjects: Sequence[Subject], scenes: dict[str, Scene], size: Si
 
 def one_render(scene: Scene, camera: Camera, size: Size, differentials: bool = False) -> dict[str, float]:
     """Statistics of one render."""
-    film = FilmSettings(wavelengths="one")
-    if differentials:
-        camera = _WithDifferentials(camera)
-    done = render(
-        scene, camera, width=size.width, height=size.height, samples=size.samples, seed=1, threads=1, film=film
-    )  # fmt: skip
-    return done.stats
+    pixels: dict[str, Any] = {"width": size.width, "height": size.height, "samples": size.samples}
+    shown = _WithDifferentials(camera) if differentials else camera
+    return render(scene, shown, **pixels, seed=1, threads=1, film=FilmSettings(wavelengths="one")).stats
 
 
 class _WithDifferentials:
-    """A camera that computes the differentials of all its rays, which the renderer does not use: to time them."""
+    """A camera that computes the differentials of all its rays, which the renderer does not use, to time them."""
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
@@ -225,55 +222,280 @@ class _WithDifferentials:
         return getattr(self._camera, name)
 
     def for_worker(self) -> _WithDifferentials:
-        """This camera about the one that the camera has for a worker."""
+        """The same about the camera of a worker."""
         opener = getattr(self._camera, "for_worker", None)
         return _WithDifferentials(opener() if opener else self._camera)
 
 
 @dataclass
 class Shape:
-    """A shape of the biconvex lens's stop: area over that of the round one, rays that pass, seconds of every round."""
+    """A shape of the biconvex lens's stop: the share of rays that pass, seconds of every round."""
 
     name: str
     aperture: Aperture | None
-    area: float
     passed: float = 0.0
     seconds: list[float] = field(default_factory=list)
 
+    @property
+    def area(self) -> float:
+        """Its area over that of the round stop."""
+        return 1.0 if self.aperture is None else self.aperture.area_share
+
 
 def shapes() -> list[Shape]:
-    """The round stop, 5 and 50 straight edges, a star and a heart, with their areas over the circle's."""
-    found = [Shape("round", None, 1.0)]
-    for n in (5, 50):
-        found.append(Shape(f"{n} edges", Aperture(blades=n), n / 2 * np.sin(2 * np.pi / n) / np.pi))
-    side = (np.arange(1024) + 0.5) / 512 - 1
-    x, y = np.meshgrid(side, -side)
-    # A star of five points whose inner corners lie at 0.48 of the radius; a heart, (x^2 + y^2 - 1)^3 <= x^2 y^3.
-    part = np.mod(np.arctan2(x, y) + np.pi / 5, 2 * np.pi / 5) - np.pi / 5
-    across, along = np.hypot(x, y) * np.abs(np.sin(part)), np.hypot(x, y) * np.cos(part)
-    inner = 0.48 * np.array([np.sin(np.pi / 5), np.cos(np.pi / 5)])
-    star = along <= 1 - across * (1 - inner[1]) / inner[0]
-    u, v = 1.5 * x, 1.5 * y + 0.1
-    heart = (u * u + v * v - 1) ** 3 <= u * u * v**3
-    disc = x * x + y * y <= 1
-    for name, mask in (("star", star), ("heart", heart)):
-        found.append(Shape(name, Aperture(mask=mask & disc), float((mask & disc).sum() / disc.sum())))
-    return found
+    """The round stop, 5 and 50 straight edges, a star and a heart."""
+    made = {f"{n} edges": Aperture(blades=n) for n in (5, 50)}
+    masks = {name: make_aperture(mask=_MASKS / f"{name}.png") for name in ("star", "heart")}
+    return [Shape("round", None), *(Shape(name, aperture) for name, aperture in (made | masks).items())]
 
 
 def time_shapes(scene: Scene, size: Size, report: Report) -> list[Shape]:
     """The biconvex lens, compiled, with every shape of its stop."""
     _, _, stem, efl = LENSES[0]
     spec = f"{FUSED}{lab.LENSES / stem}.toml"
-    found = shapes()
+    made = shapes()
     try:
-        cameras = [make_camera(spec, shot(efl, spec, shape.aperture)) for shape in found]
+        cameras = [make_camera(spec, shot(efl, spec, shape.aperture)) for shape in made]
     except InputError:
         return []
     for k in range(size.rounds):
-        for shape, camera in zip(found, cameras, strict=True):
+        for shape, camera in zip(made, cameras, strict=True):
             stats = one_render(scene, camera, size)
             shape.seconds.append(stats["seconds"])
             shape.passed = stats["passed_fraction"]
         report((k + 1) / size.rounds)
-    return found
+    return made
+
+
+# ---- The page. -------------------------------------------------------------------------------------------------------
+
+ABOVE_THIN, MOVES, PER_REFRACTION = 0.05, 0.30, 0.10  # the goals, as shares
+_NOTES = """\
+Every camera sees the same 20 degrees at f/4, focused at 5 m, one wavelength per path, {width} x {height} pixels,
+{samples} samples, one thread, {rounds} rounds of all cameras in turn ({more} times as many in the cheap scene);
+seconds are the best round (the median in brackets), what differentials add is the median of the rounds' ratios.
+`cheap` is a textured wall and one bounce ({cheap}.toml), `middle` small lights and three ({middle}.toml), `dear`
+meshes, gloss, glass and six ({dear}.toml). "exact, torch" is the eager tracer, "exact, C" the same trace written as C
+and compiled, with the pupil, weights and status around it in one call, as the models "C" are (`--camera fused:FILE`);
+polynomials are `ols-64` of models/, networks `mlp-16x2`. Overhead is the time above the pinhole's, as a share of the
+pinhole's render, per refraction. Camera is the share of a render's time that its camera takes. Blocked rays cost no
+path: a lens that loses light renders faster for it. Differentials are computed and handed on; nothing uses them. Those
+of compiled cameras are polynomials of low order, whose RMS error stands beside them."""
+
+
+@dataclass
+class Found:
+    """The results so far."""
+
+    size: Size
+    subjects: list[Subject] = field(default_factory=list)
+    rows: list[Timed] = field(default_factory=list)
+    shapes: list[Shape] = field(default_factory=list)
+
+    def row(self, subject: Subject | str, scene: str, differentials: bool = False) -> Timed | None:
+        """The times of a camera (of an ideal one by its kind) in a scene, if there are any."""
+        for r in self.rows:
+            if subject in (r.subject, r.subject.kind) and (r.scene, r.differentials) == (scene, differentials):
+                return r if r.seconds else None
+        return None
+
+    def above_thin(self, subject: Subject, scene: str) -> float | None:
+        """Seconds in the camera above those of the thin lens, over the pinhole's render."""
+        if (row := self.row(subject, scene)) and (thin := self.row(THIN, scene)) and (hole := self.row(PINHOLE, scene)):
+            return (min(row.camera_s) - min(thin.camera_s)) / min(hole.seconds)
+        return None
+
+    def moves_share(self, subject: Subject) -> float | None:
+        """Median over the rounds of the camera's seconds with differentials over those without, less 1."""
+        if (row := self.row(subject, CHEAP)) and (more := self.row(subject, CHEAP, True)):
+            return median(with_ / without for with_, without in zip(more.camera_s, row.camera_s, strict=True)) - 1
+        return None
+
+    def overhead(self, subject: Subject, scene: str) -> float | None:
+        """Time above the pinhole's over the pinhole's, per refraction; of an ideal camera as a whole."""
+        if (row := self.row(subject, scene)) and (pinhole := self.row(PINHOLE, scene)):
+            return (min(row.seconds) / min(pinhole.seconds) - 1) / max(subject.refractions or 1, 1)
+        return None
+
+    def ns_in_render(self, subject: Subject, differentials: bool = False) -> float | None:
+        """Nanoseconds a ray in the cheap render."""
+        row = self.row(subject, CHEAP, differentials)
+        return None if row is None else min(row.camera_s) / row.paths * 1e9
+
+
+def goals(found: Found) -> list[lab.Goal]:
+    """The goals of every kind of camera in every scene; the worst lens counts."""
+
+    def goal(kind: str, text: str, wanted: float, share: Callable[[Subject], float | None]) -> lab.Goal:
+        known = {s.lens: v for s in found.subjects if s.kind == kind and (v := share(s)) is not None}
+        worst = max(known, key=lambda name: known[name], default="")
+        return lab.Goal(f"{kind}: {text}", wanted, known.get(worst), worst=worst)
+
+    above, adds = "camera above the thin lens's, of the {} pinhole render", "what differentials add to the camera"
+    made = [
+        goal(kind, above.format(scene), ABOVE_THIN, partial(found.above_thin, scene=scene))
+        for kind in (*FUSED_MODELS, *GRAPHS)
+        for scene in SCENES
+    ]
+    made += [goal(k, f"{adds}, in the cheap render", MOVES, found.moves_share) for k in (EXACT_C, *FUSED_MODELS)]
+    text, overhead = "overhead a refraction, of the cheap pinhole render", partial(found.overhead, scene=CHEAP)
+    return made + [goal(kind, text, PER_REFRACTION, overhead) for kind in (EXACT_C, TORCH)]
+
+
+def write(found: Found, out: Path) -> str:
+    """Write README.md and render_times.csv; returns the page."""
+    out.mkdir(parents=True, exist_ok=True)
+    text = page(found)
+    atomic_write_text(out / "README.md", text)
+    atomic_write_text(out / "render_times.csv", lab.csv_text(_CSV, [r for r in found.rows if r.seconds]))
+    return text
+
+
+def _percent(share: float | None) -> str | None:
+    return None if share is None else f"{100 * share:.3g}%"
+
+
+_GOALS = lab.columns(
+    ("goal", "text"), ("wanted", lambda g: f"at most {_percent(g.wanted)}"),
+    ("measured, worst lens", lambda g: _percent(g.measured)), ("lens", "worst"), ("", "verdict"),
+)  # fmt: skip
+_LEGEND = """\
+Seconds (median); overhead over the pinhole per refraction; share of the camera. Ideal cameras stand in the
+first column."""
+_SHAPES_NOTE = "Biconvex lens, C, cheap scene. Passage and time over the round stop's, area over the disc's."
+
+
+def page(found: Found) -> str:
+    """All tables."""
+    timed = {r.scene for r in found.rows if r.seconds}
+    parts = [] if not timed else ["![Seconds over refractions](render_times.png)"]
+    parts += [f"## Seconds, {s}\n\n{_LEGEND}\n\n{_scene_table(found, s)}" for s in SCENES if s in timed]
+    missing = [f"{s.name}: {s.reason}." for s in found.subjects if s.reason]
+    by_shape = lab.table(_shape_columns(found.shapes[0]), found.shapes) if found.shapes else ""
+    return lab.page(
+        "# Render time by camera",
+        "`python -m experiments render`",
+        _NOTES.format(**vars(found.size), **SCENES, more=CHEAP_ROUNDS),
+        lab.machine_line(", one of them used"),
+        "## Goals",
+        lab.table(_GOALS, goals(found), "–"),
+        *parts,
+        "## Cameras by themselves",
+        lab.table(_camera_columns(found), found.subjects, "–"),
+        *missing,
+        f"## Shapes of the stop\n\n{_SHAPES_NOTE}\n\n{by_shape}" if by_shape else "",
+    )
+
+
+def _scene_table(found: Found, scene: str) -> str:
+    """One row per lens, one column per kind: seconds, overhead a refraction, share of the camera."""
+
+    def cell(kind: str, of: dict[str, Subject]) -> str | None:
+        row = found.row(of[kind], scene) if kind in of else None
+        if row is None:
+            return None
+        over = "" if kind == PINHOLE else f"; {_percent(found.overhead(of[kind], scene))}"
+        share = _percent(min(row.camera_s) / min(row.seconds))
+        return f"{lab.best_median(min(row.seconds), median(row.seconds), '.3f')}{over}; {share}"
+
+    rows = []
+    for lens, count in dict.fromkeys((s.lens, s.refractions) for s in found.subjects):
+        of = {s.kind: s for s in found.subjects if s.lens == lens}
+        shown = (lens, *KINDS[1:]) if lens in (PINHOLE, THIN, STOP) else KINDS
+        rows.append([lens, count, *(cell(kind, of) for kind in shown)])
+    return lab.table(["lens", "refractions", *KINDS], rows, "–")
+
+
+def _camera_columns(found: Found) -> tuple[lab.Column, ...]:
+    return lab.columns(
+        ("camera", "name"),
+        ("refractions", "refractions"),
+        ("ns per ray, alone", "ns", ".3g"),
+        ("with differentials", "ns_moves", ".3g"),
+        ("ns per ray in the cheap render", found.ns_in_render, ".3g"),
+        ("with differentials", partial(found.ns_in_render, differentials=True), ".3g"),
+        ("differentials add", lambda s: _percent(found.moves_share(s))),
+        ("their error", lambda s: _percent(s.moves_error)),
+        ("rays that pass", lambda s: _percent(row.passed) if (row := found.row(s, CHEAP)) else None),
+        ("made in s", "made_s", ".2g"),
+    )
+
+
+def _shape_columns(first: Shape) -> tuple[lab.Column, ...]:
+    return lab.columns(
+        ("stop", "name"), ("area", lambda s: _percent(s.area)),
+        ("rays that pass", lambda s: _percent(s.passed / first.passed)),
+        ("time", lambda s: _percent(min(s.seconds) / min(first.seconds))),
+    )  # fmt: skip
+
+
+_CSV = lab.columns(
+    ("scene", "scene"), ("lens", "subject.lens"), ("refractions", "subject.refractions"), ("camera", "subject.kind"),
+    ("differentials", lambda r: int(r.differentials)), ("seconds_min", lambda r: min(r.seconds), ".5f"),
+    ("seconds_median", lambda r: median(r.seconds), ".5f"), ("camera_seconds_min", lambda r: min(r.camera_s), ".5f"),
+    ("passed", "passed", ".5f"), ("paths", "paths"), ("threads", lambda r: 1), ("rounds", lambda r: len(r.seconds)),
+    ("camera_alone_ns", lambda r: r.subject.ns_moves if r.differentials else r.subject.ns, ".2f"),
+)  # fmt: skip
+# Okabe and Ito's colours; what runs compiled is filled.
+_LOOK = {
+    TORCH: (INK, "s", "white"),
+    EXACT_C: (INK, "s", INK),
+    GRAPHS[0]: ("#0072b2", "o", "white"),
+    FUSED_MODELS[0]: ("#0072b2", "o", "#0072b2"),
+    GRAPHS[1]: ("#d55e00", "^", "white"),
+    FUSED_MODELS[1]: ("#d55e00", "^", "#d55e00"),
+}
+_LINES = {THIN: ("#009e73", "--"), PINHOLE: ("#7f7f7f", ":")}
+
+
+def draw(found: Found, path: Path) -> None:
+    """Draw one panel for every scene that was rendered; nothing where none was."""
+    scenes = [s for s in SCENES if found.row(PINHOLE, s)]
+    if not scenes:
+        return
+    with drawing(path, 4.4 * len(scenes) + 2.6, 4.6) as figure:
+        for axes, scene in zip(figure.subplots(1, len(scenes), squeeze=False)[0], scenes, strict=True):
+            for kind, (colour, marker, fill) in _LOOK.items():
+                timed = [(s.refractions, found.row(s, scene)) for s in found.subjects if s.kind == kind]
+                points = [(count, min(row.seconds)) for count, row in timed if row is not None]
+                if points:
+                    look = {"color": colour, "mfc": fill, "mec": colour, "ms": 5, "lw": 1.1}
+                    axes.plot(*zip(*points, strict=True), marker=marker, label=kind, **look)
+            for kind, (colour, dash) in _LINES.items():
+                row = found.row(kind, scene)
+                if row is not None:
+                    axes.axhline(min(row.seconds), color=colour, ls=dash, lw=1.2, label=kind)
+            axes.set(xlabel="refractions of the lens", ylabel="seconds a render", title=scene)
+            axes.set(xlim=(0, None), ylim=(0, None))
+            axes.grid(True)
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.suptitle("Render time over refractions", x=0.01, ha="left", fontweight="bold")
+        figure.legend(handles, labels, loc="outside right upper")
+
+
+OPTIONS = (
+    lab.option("--quick", action="store_true", help="three lenses in the cheap scene, one small round"),
+    lab.out(lab.RESULTS / "render_times"),
+)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Make the cameras, time them alone and in renders; the tables are written after each step."""
+    lab.quiet_glasses()
+    torch.set_num_threads(1)
+    found = Found(Size(64, 36, 16, 1) if args.quick else Size())
+    chosen = list(SCENES.items())[: 1 if args.quick else 3]
+    scenes = {cost: load_scene(lab.SCENES / f"{name}.toml") for cost, name in chosen}
+    progress = Progress({"cameras": 25, "cameras alone": 5, "renders": 65, "stop shapes": 5}, quiet=args.quiet)
+    with progress.stage("cameras") as report:
+        found.subjects = make_subjects(args.quick, report)
+    with progress.stage("cameras alone") as report:
+        time_alone(found.subjects, report)
+    write(found, args.out)
+    with progress.stage("renders") as report:
+        found.rows = time_renders(found.subjects, scenes, found.size, report)
+    write(found, args.out)
+    with progress.stage("stop shapes") as report:
+        found.shapes = time_shapes(scenes[CHEAP], found.size, report)
+    draw(found, args.out / "render_times.png")
+    print(write(found, args.out))

@@ -20,14 +20,13 @@ import numpy as np
 from experiments import lab
 from experiments.plans import suited
 from neurolens.base.progress import Report
+from neurolens.cameras.graphcamera import Runtime
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.plan import footprints as prints
 from neurolens.plan import shot_fits
 from neurolens.plan.costs import glsl_operations, ns_a_ray
 from neurolens.plan.probe import COUNTED, LIGHT, Probed, probe
-from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import load_scene
-from neurolens.setting.states import set_lens
 from neurolens.study.experiment import near_limit_m
 from neurolens.surrogates.bases import pinned_threads
 
@@ -73,7 +72,7 @@ class Model:
 
 def measure_lens(name: str, folder: Path, report: Report) -> dict[str, Any]:
     """All shots of a lens."""
-    lens = set_lens(read_lens(lab.LENSES / f"{name}.toml"))
+    lens = lab.lens_of(name)
     shots = []
     terms = max(n for n in range(SHIPPED_TERMS + 1) if (lab.MODELS / f"{name}.ols-{n}.onnx").is_file())
     for number, sitting in enumerate(SITTINGS):
@@ -104,14 +103,10 @@ def _smallest(found: Probed, shipped: Model, folder: Path) -> Model:
     return _measured(found, fit(TERMS[best])[0], TERMS[best])
 
 
-def _real(found: Probed) -> dict[str, Any]:
-    asked = found.asked
-    shot = {"film_mm": asked.film_mm, "focus_m": asked.focus_m, "f_number": asked.f_number}
-    return {**shot, "wavelength_nm": asked.wavelength_nm}
-
-
-def _onnx(found: Probed, file: Path) -> OnnxCamera:
-    return OnnxCamera(load_model(file), **_real(found))
+def _onnx(found: Probed, file: Path, runtime: Runtime = "onnxruntime") -> OnnxCamera:
+    keys = ("film_mm", "focus_m", "f_number", "wavelength_nm")
+    shot: dict[str, Any] = {key: getattr(found.asked, key) for key in keys}
+    return OnnxCamera(load_model(file), runtime=runtime, **shot)
 
 
 def _errors(found: Probed, camera: OnnxCamera) -> tuple[float, float]:
@@ -126,7 +121,7 @@ def _errors(found: Probed, camera: OnnxCamera) -> tuple[float, float]:
 def _measured(found: Probed, file: Path, terms: int) -> Model:
     camera = _onnx(found, file)
     um, light = _errors(found, camera)
-    ns = ns_a_ray(OnnxCamera(load_model(file), **_real(found), runtime="c"), found.places)["min"]
+    ns = ns_a_ray(_onnx(found, file, "c"), found.places)["min"]
     return Model(terms, um, light, glsl_operations(camera), ns)
 
 
@@ -166,7 +161,7 @@ def page(rows: Sequence[Mapping[str, Any]]) -> str:
 
 OPTIONS = (
     lab.ONLY,
-    lab.option("--restart", old=("--again",), action="store_true", help="measure the chosen lenses again"),
+    lab.AGAIN,
     lab.option("--models", metavar="DIR", type=Path, default=Path("runs/shots"), help="for them (default: runs/shots)"),
     lab.out(),
 )
@@ -175,13 +170,10 @@ OPTIONS = (
 def run(args: argparse.Namespace) -> None:
     """Measure what is missing, and write the table after each lens."""
     lab.quiet_glasses()
-    names = lab.chosen(LENSES, lambda n: n, args.only, "shots")
-    kept = lab.kept_rows(args.out / "shots.json", "experiments shots", lambda r: r["lens"], "lenses")
+    names = lab.chosen(LENSES, str, args.only, "shots")
     args.models.mkdir(parents=True, exist_ok=True)
     with pinned_threads():
-        missing = [n for n in names if args.restart or n not in kept]
-        for name, report in lab.stages(missing, lambda n: n, args.quiet, 60.0):
-            kept[name] = measure_lens(name, args.models, report)
-            rows = [kept[n] for n in LENSES if n in kept]
-            lab.write_results(args.out, "shots", page(rows), {"lenses": rows})
-    print(page([kept[n] for n in LENSES if n in kept]))
+        lab.resume(
+            args, "shots", {name: name for name in names}, lambda name, report: measure_lens(name, args.models, report),
+            lambda row: row["lens"], page, listed="lenses", again=args.restart, seconds=60.0, order=LENSES,
+        )  # fmt: skip

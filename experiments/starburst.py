@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -36,7 +36,6 @@ _RAYS, _MOST_BYTES = 1 << 20, 350_000
 OPTIONS = [
     lab.count("wavelengths", 5, "of the pictures drawn (default: 5)"),
     lab.count("threads", 2, "default: 2"),
-    lab.PICTURE,
     lab.out(),
 ]
 
@@ -57,10 +56,6 @@ class Check:
 def run(args: argparse.Namespace) -> int:
     """Check, draw, write; 1 where a check is off by more than its goal."""
     progress = Progress(quiet=args.quiet)
-    if args.picture:
-        with progress.stage("pictures") as report:
-            _draw(args, report)
-        return 0
     with progress.stage("checks"):
         rings, streaks, light = _rings(), _streaks(), _light()
         keller = _keller_rows()
@@ -79,9 +74,9 @@ def run(args: argparse.Namespace) -> int:
         "Keller's cones, sampled, beside the far field, f/16:", lab.table(_KELLER, keller),
         lab.goal_table("Goal", goals), f"{_PICTURE} {lab.machine_line()}",
     )  # fmt: skip
-    checks = [asdict(c) for c in (*rings, *streaks, *light)]
-    told = {"machine": lab.machine(), "checks": checks, "seconds": seconds, "keller": keller}
-    print(lab.write_results(args.out, "starburst", text, told))
+    checks = [*rings, *streaks, *light]
+    data = {"machine": lab.machine(), "checks": checks, "seconds": seconds, "keller": keller}
+    print(lab.write_results(args.out, "starburst", text, data))
     return int(any(goal.verdict == "missed" for goal in goals))
 
 
@@ -211,16 +206,12 @@ def _keller_rows() -> list[dict[str, Any]]:
         # Where Airy's first ring is dark and the next bright, cones say the same.
         fringe = NM * 1e-6 * 16 * np.array([1.22, 1.635])
         first, second = (far_field(pupil, lines, np.array([r]), np.zeros(1))[0, 0] for r in fringe)
-        rows.append(
-            {
-                "stop": name,
-                "light": float(cones[ring].sum() / exact[ring].sum()),
-                "dim": float(cones[dim].sum() / exact[dim].sum()) if dim.any() else None,
-                "noise": float(np.std(cones[ring] / even[ring] - 1)) if aperture is None else None,
-                "contrast": float((second - first) / (second + first)) if aperture is None else None,
-                "too_much": _edge_light(pupil, lines) / light_of(pupil, lines) / (NM * 1e-6 * 16),
-            }
-        )
+        row = {"stop": name, "light": float(cones[ring].sum() / exact[ring].sum())}
+        row["dim"] = float(cones[dim].sum() / exact[dim].sum()) if dim.any() else None
+        row["noise"] = float(np.std(cones[ring] / even[ring] - 1)) if aperture is None else None
+        row["contrast"] = float((second - first) / (second + first)) if aperture is None else None
+        row["too_much"] = _edge_light(pupil, lines) / light_of(pupil, lines) / (NM * 1e-6 * 16)
+        rows.append(row)
     return rows
 
 
@@ -273,7 +264,8 @@ def _draw(args: argparse.Namespace, report: Any) -> None:
             put(len(rows) + row, column, np.repeat(film[..., None], 3, 2), white, f"f/16 550 nm {title}")
     args.out.mkdir(parents=True, exist_ok=True)
     colours = (sheet.quantize(n) for n in (256, 64, 32))
-    lab.write_small_png(args.out / "starburst.png", [sheet, *colours], _MOST_BYTES)
+    forms = ((picture, {"optimize": True}) for picture in (sheet, *colours))
+    lab.write_small(args.out / "starburst.png", forms, _MOST_BYTES)
 
 
 _PICTURE = (

@@ -133,10 +133,9 @@ def _case(case: Case, kills: int, chance: random.Random, place: Path) -> tuple[s
         same += _ended(folder, case, wanted)
         counts.append(starts)
     told = (_full(case, fresh, place, wanted), _two(case, fresh, place, wanted), _back(case, fresh, place, wanted))
-    counts.sort()
-    agree = f"{same} of {len(counts)}"
     shutil.rmtree(place)
-    return case.name, str(done), str(counts[len(counts) // 2]), agree, str(broken), *told, _nowhere(case)
+    middle, agree = sorted(counts)[len(counts) // 2], f"{same} of {len(counts)}"
+    return case.name, str(done), str(middle), agree, str(broken), *told, _nowhere(case)
 
 
 def _undisturbed(case: Case, fresh: Path, folder: Path) -> tuple[dict[str, str], float]:

@@ -20,9 +20,7 @@ from neurolens.base import status as st
 from neurolens.base.progress import Progress
 from neurolens.cli.arguments import whole
 from neurolens.lens.prescription import Lens
-from neurolens.readers.lensfile import read_lens
 from neurolens.setting.pupils import camera_rays
-from neurolens.setting.states import set_lens
 from neurolens.study.candidates import COMPILED_BATCHES, EAGER_BATCHES
 from neurolens.study.speed import POOL, Call, Candidate, Race, Unavailable, race
 from neurolens.surrogates.domain import FilmRays
@@ -42,11 +40,7 @@ LENSES = {
 MAIN = 12  # the double Gauss on which the goals stand, with and without aspheres
 ASPHERIC_SURFACES = (0, 12)  # of that double Gauss: first and last, where aspheres are used
 DTYPES = (torch.float32, torch.float64)
-
-
-def lens_of(count: int) -> Lens:
-    """The lens of so many refractions."""
-    return set_lens(read_lens(lab.LENSES / f"{LENSES[count]}.toml"))
+ASPHERES = "aspheres, "
 
 
 def with_aspheres(lens: Lens) -> Lens:
@@ -104,45 +98,27 @@ def candidates(lens: Lens, label: str = "") -> list[Candidate]:
     return found
 
 
-ASPHERES = "aspheres, "
-
-
 def time_lens(lens: Lens, threads: Sequence[int], rounds: int, report: Report, aspheric: Lens | None) -> list[Row]:
-    """Race the tracer on one lens, and beside it on one with aspheres, a race per thread count, compiled once.
-
-    Returns: rows with units in their keys.
-    """
+    """Rows of the tracer on one lens, and beside it on one with aspheres: a race per thread count, compiled once."""
     rays = film_rays(lens)
     field = candidates(lens) + (candidates(aspheric, ASPHERES) if aspheric is not None else [])
     share = float((trace(lens, *launched(lens, rays, torch.float32)).status == st.PASSED).double().mean())
     rows = []
     for i, count in enumerate(threads):
-
-        def part(done: float, before: int = i) -> None:
-            report((before + done) / len(threads))
-
+        part = lab.part_of(report, i, len(threads))
         timed = race(field, rays, threads=count, rounds=rounds, fresh=i == 0, report=part)
         rows += [_row(c.name, lens, timed, share) for c in field]
     return rows
 
 
 def _row(name: str, lens: Lens, timed: Race, passing: float) -> Row:
-    aspheric = name.startswith(ASPHERES)
+    aspheric, timing = name.startswith(ASPHERES), timed.timing(name)
     kind, dtype = name.removeprefix(ASPHERES).split()
-    row: Row = {
-        "lens": Path(lens.path).stem,
-        "refractions": lens.refractions,
-        "surfaces": len(lens.surfaces),
-        "aspheres": len(ASPHERIC_SURFACES) if aspheric else sum(bool(s.asphere) for s in lens.surfaces),
-        "cylinders": sum(s.cylinder is not None for s in lens.surfaces),
-        "kind": kind,
-        "dtype": dtype,
-        "threads": timed.threads,
-        "passing_share": passing,
-        "load": [timed.load_before, timed.load_after],
-        "reason": timed.unavailable.get(name),
-    }
-    timing = timed.timing(name)
+    row: Row = {"lens": Path(lens.path).stem, "refractions": lens.refractions, "surfaces": len(lens.surfaces)}
+    row["aspheres"] = len(ASPHERIC_SURFACES) if aspheric else sum(bool(s.asphere) for s in lens.surfaces)
+    row |= {"cylinders": sum(s.cylinder is not None for s in lens.surfaces), "kind": kind, "dtype": dtype}
+    row |= {"threads": timed.threads, "passing_share": passing, "load": [timed.load_before, timed.load_after]}
+    row["reason"] = timed.unavailable.get(name)
     if timing is not None:
         row |= {"ns_min": timing["min"], "ns_median": timing["median"], "batch": timing["batch"]}
     if aspheric:  # times as long as the spherical lens, in the same race
@@ -164,20 +140,14 @@ def goals(rows: Sequence[Row]) -> list[lab.Goal]:
 
 
 SIZES = (100_000, 1_000_000, 10_000_000)
-
-
 _PART = 65536
 
 
 def memory_of(lens_file: str, count: int) -> Row:
-    """Trace `count` float32 rays, in a fresh process.
-
-    Returns: rays, results_mb (the tensors that come out), growth_mb (highest resident memory while tracing, less that
-        before), working_mb (growth less results: what tracing itself needs).
-    """
+    """Trace `count` float32 rays in a fresh process: the MB of results, of all memory added, of tracing itself."""
     torch.set_num_threads(1)
-    lens = set_lens(read_lens(lens_file))
-    rays, wavelength = _rays(lens, count)
+    lens = lab.lens_of(Path(lens_file))
+    rays, wavelength = repeated_rays(lens, count)
     with torch.no_grad():
         trace(lens, Rays(*(c[:_PART] for c in rays)), wavelength[:_PART])  # what torch sets up once
         out, growth = lab.memory_growth(lambda: trace(lens, rays, wavelength))
@@ -186,7 +156,7 @@ def memory_of(lens_file: str, count: int) -> Row:
     return {"rays": count, "results_mb": results, "growth_mb": grown, "working_mb": grown - results}
 
 
-def _rays(lens: Lens, count: int) -> tuple[Rays, torch.Tensor]:
+def repeated_rays(lens: Lens, count: int) -> tuple[Rays, torch.Tensor]:
     """Float32 rays, the same few again and again, made without temporaries of their size."""
     start, wavelength = launched(lens, film_rays(lens, _PART), torch.float32)
     columns = [torch.empty(count) for _ in range(7)]
@@ -212,12 +182,7 @@ _MEMORY_COLUMNS = lab.columns(
 
 @dataclass
 class Found:
-    """What has been measured so far.
-
-    Attributes:
-        rows: of `time_lens`. memory: of `memory_of`.
-        missing: what could not be measured, as sentences.
-    """
+    """The results so far: rows of `time_lens` and of `memory_of`; `missing` says what could not be measured."""
 
     rounds: int
     rows: list[Row] = field(default_factory=list)
@@ -225,10 +190,9 @@ class Found:
     missing: list[str] = field(default_factory=list)
 
     def write(self, folder: Path) -> str:
-        """Write trace_speed.md and trace_speed.json, each whole or not at all; returns the page."""
-        told = {"machine": lab.machine(), "rounds": self.rounds, "rows": self.rows, "memory": self.memory}
-        told |= {"goals": [g.to_dict() for g in goals(self.rows)], "missing": self.missing}
-        return lab.write_results(folder, "trace_speed", page(self), told)
+        """Write trace_speed.md and trace_speed.json; returns the page."""
+        data = {"machine": lab.machine(), **vars(self), "goals": goals(self.rows)}
+        return lab.write_results(folder, "trace_speed", page(self), data)
 
 
 def page(found: Found) -> str:
@@ -284,7 +248,7 @@ def run(args: argparse.Namespace) -> None:
     """Time the tracer, lens by lens; the table is written after each."""
     lab.quiet_glasses()
     counts = lab.chosen([MAIN] if args.quick else list(LENSES), lambda n: LENSES[n], args.only, "trace")
-    lenses, found = {n: lens_of(n) for n in counts}, Found(lab.rounds_of(args))
+    lenses, found = {n: lab.lens_of(LENSES[n]) for n in counts}, Found(lab.rounds_of(args))
     threads = args.threads[:1] if args.quick else args.threads
     plan = {f"{n} refractions": (2.0 if n == MAIN else 1.0) * (8 + n + n * len(threads)) for n in lenses}
     progress = Progress(plan | {"memory": 10.0}, quiet=args.quiet)

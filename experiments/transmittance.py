@@ -16,12 +16,9 @@ import torch
 
 from experiments import lab
 from neurolens.base import status as st
-from neurolens.base.progress import Progress
 from neurolens.flare.ghosts import coated
 from neurolens.lens.prescription import Lens
-from neurolens.readers.lensfile import read_lens
 from neurolens.setting.pupils import camera_rays
-from neurolens.setting.states import set_lens
 from neurolens.surrogates.domain import domain_of, sample_domain
 from neurolens.surrogates.model import Domain
 from neurolens.trace.sequence import follow
@@ -30,26 +27,21 @@ COATINGS = {"bare": None, "coated": "quarter-wave"}
 
 
 def difference(lens: Lens, domain: Domain, count: int) -> lab.Row:
-    """The difference of the averaged transmittance from the true one: largest, where, and median."""
+    """How far the averaged transmittance is from the true one: the largest difference, where it is, the median."""
     rays = sample_domain(domain, count, seed=3)
     start = camera_rays(rays.film_x, rays.film_y, rays.film_z, rays.pupil_x, rays.pupil_y, domain.pupil_z_mm)
     steps: Any = [(k, "T") for k in reversed(range(len(lens.surfaces)))]
     with torch.no_grad():
-        found = [follow(lens, start, steps, rays.wavelength_nm, towards="scene", polarised=p) for p in (False, True)]
-    passed = found[1].status == st.PASSED
-    averaged, true = (one.power[passed] for one in found)
+        traced = [follow(lens, start, steps, rays.wavelength_nm, towards="scene", polarised=p) for p in (False, True)]
+    passed = traced[1].status == st.PASSED
+    averaged, true = (one.power[passed] for one in traced)
     off = averaged - true
     relative = (off / true).abs()
     worst = int(relative.argmax())
     radius = torch.hypot(rays.film_x, rays.film_y)[passed] / domain.film_radius_mm
-    return {
-        "absolute": float(off.abs().max()),
-        "relative": float(relative[worst]),
-        "averaged": float(averaged[worst]),
-        "true": float(true[worst]),
-        "film_radius": float(radius[worst]),
-        "median": float(relative.median()),
-    }
+    figures = {"relative": relative, "averaged": averaged, "true": true, "film_radius": radius}
+    at_worst = {name: float(values[worst]) for name, values in figures.items()}
+    return {"absolute": float(off.abs().max()), **at_worst, "median": float(relative.median())}
 
 
 _COLUMNS = lab.columns(
@@ -62,24 +54,22 @@ _COLUMNS = lab.columns(
     ("true", "bare.true", ".3f"),
     *((f"{kind}: median, %", f"{kind}.median", ".3f", 100) for kind in COATINGS),
 )
-OPTIONS = (lab.count("rays", 12_000, "of each lens's domain (default 12,000)"), lab.out())
+OPTIONS = (lab.count("rays", 12_000, "of each lens's domain (default 12,000)"), lab.ONLY, lab.out())
 
 
 def run(args: argparse.Namespace) -> None:
     """Measure and write."""
     lab.quiet_glasses()
-    rows, files = list[lab.Row](), sorted(lab.LENSES.glob("*.toml"))
-    with Progress(quiet=args.quiet).stage("lenses") as report:
-        for file in files:
-            lens = set_lens(read_lens(file))
-            domain = domain_of(lens, focus_m=(math.inf, math.inf))
-            row: lab.Row = {"lens": file.stem, "refractions": lens.refractions}
-            for kind, design in COATINGS.items():
-                row[kind] = difference(coated(lens, design) if design else lens, domain, args.rays)
-            rows.append(row)
-            report(len(rows) / len(files))
+    rows = list[lab.Row]()
+    files = lab.chosen(sorted(lab.LENSES.glob("*.toml")), lambda file: file.stem, args.only, "transmittance")
+    for file in lab.counted(files, "lenses", args.quiet):
+        lens = lab.lens_of(file.stem)
+        domain = domain_of(lens, focus_m=(math.inf, math.inf))
+        each = {kind: coated(lens, design) if design else lens for kind, design in COATINGS.items()}
+        figures = {kind: difference(one, domain, args.rays) for kind, one in each.items()}
+        rows.append({"lens": file.stem, "refractions": lens.refractions} | figures)
     about = [
-        f"{kind}: at most {100 * max(r[kind]['relative'] for r in rows):.1f}%, of the worst ray of each lens "
+        f"- {kind}: at most {100 * max(r[kind]['relative'] for r in rows):.1f}%, of the worst ray of each lens "
         f"{100 * median(r[kind]['relative'] for r in rows):.2f}% and of the median ray "
         f"{100 * median(r[kind]['median'] for r in rows):.3f}% (medians of {len(rows)} lenses)"
         for kind in COATINGS
@@ -88,7 +78,7 @@ def run(args: argparse.Namespace) -> None:
         "# Transmittance: averaged over polarisation at every surface, and true",
         f"`python -m experiments transmittance`: {args.rays} rays of each lens's domain. How far the product of\n"
         "(Ts + Tp) / 2 is from the power of unpolarised light whose polarisation is followed.",
-        "\n".join(f"- {line}" for line in about),
+        "\n".join(about),
         lab.table(_COLUMNS, rows),
     )
     print(lab.write_results(args.out, "transmittance", text, {"lenses": rows}))

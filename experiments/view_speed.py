@@ -72,10 +72,11 @@ def run(args: argparse.Namespace) -> int:
         for words, file in zip(([args.lens], [], [args.flare, ghosts]), files, strict=True):
             main(["view", *words, *(["--downloads", "glsl"] if words else []), "-o", str(file)])
         opened = play.chromium.launch(executable_path=browser, args=list(FLAGS))
-        rows = [_first(opened, files[0], "first picture", args.repeats)]
-        rows.append(
-            _first(opened, files[1], f"first picture, library ({files[1].stat().st_size / 1e6:.2f} MB)", args.repeats)
-        )
+        library = f"first picture, library ({files[1].stat().st_size / 1e6:.2f} MB)"
+        rows = [
+            _first(opened, file, name, args.repeats)
+            for file, name in ((files[0], "first picture"), (files[1], library))
+        ]
         page = _opened(opened, files[0])
         rows += [_change(page, name, script, args.repeats) for name, script in CHANGES.items()]
         page.close()
@@ -84,21 +85,12 @@ def run(args: argparse.Namespace) -> int:
         count = page.evaluate(_ALL_GHOSTS)
         rows += [_change(page, f"{name}, {count} ghosts", script, args.repeats) for name, script in LAMPS.items()]
         opened.close()
-    head = ("change", "least ms", "median ms", "processor ms", "wanted ms")
-    keys = ("least_ms", "median_ms", "processor_ms", "wanted_ms")
-    lines = [[r["change"], *("–" if r[key] is None else f"{r[key]:.0f}" for key in keys)] for r in rows]
-    machine = (
-        f"{lab.machine_line()} Load at the end: {os.getloadavg()[0]:.1f} (one process of ours and the browser: 1 to 2)."
-    )
-    text = lab.page("# The page in software WebGL", __doc__ or "", machine, lab.table(head, lines))
-    print(
-        lab.write_results(
-            args.out,
-            "view_speed",
-            text,
-            {"machine": lab.machine(), "lens": args.lens, "flare": args.flare, "rows": rows},
-        )
-    )
+    kinds = ("least", "median", "processor", "wanted")
+    columns = lab.columns(("change", "change"), *((f"{kind} ms", f"{kind}_ms", ".0f") for kind in kinds))
+    load = f"Load at the end: {os.getloadavg()[0]:.1f} (one process of ours and the browser: 1 to 2)."
+    parts = [__doc__ or "", f"{lab.machine_line()} {load}", lab.table(columns, rows, "–")]
+    data = {"machine": lab.machine(), "lens": args.lens, "flare": args.flare, "rows": rows}
+    print(lab.write_results(args.out, "view_speed", lab.page("# The page in software WebGL", *parts), data))
     return 0
 
 

@@ -18,7 +18,6 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -27,7 +26,6 @@ from experiments import lab
 from experiments.lab import Row
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
-from neurolens.base.progress import Progress
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens
 from neurolens.study.describe import lens_files, read_quietly
@@ -38,7 +36,7 @@ from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.model import Domain, LensModel
 from neurolens.surrogates.pairs import make_pairs, trace_pairs
 
-# Stops closed, and the blades if any.
+# By how many stops the lens is closed, and its blades.
 OPENINGS: dict[str, tuple[int, Aperture | None]] = {
     "full": (0, None),
     "2 stops": (2, None),
@@ -55,7 +53,7 @@ _BATCH = 65536
 
 
 def model_of(file: Path, choice: DomainChoice) -> tuple[LensModel, float, float]:
-    """The fitted model of a lens file, the share of its disc that passes, and the seconds of rays and fit together."""
+    """The fitted model of a lens file, the share of the disc that passes, and the seconds for rays and fit together."""
     lens = LensChoice(file).read()
     start = time.perf_counter()
     pairs = make_pairs(lens, choice.of(lens))
@@ -64,24 +62,24 @@ def model_of(file: Path, choice: DomainChoice) -> tuple[LensModel, float, float]
 
 
 def opening_errors(lens: Lens, model: LensModel, count: int, seed: int = SEED) -> dict[str, Row]:
-    """false_pass, false_block and the rays that pass the exact lens, by name of `OPENINGS`; one fit, one trace."""
-    found: dict[str, list[tuple[Tensor, Tensor]]] = {name: [] for name in OPENINGS}
+    """false_pass, false_block and how many rays pass the exact lens, by name of `OPENINGS`, from one fit and trace."""
+    parts: dict[str, list[tuple[Tensor, Tensor]]] = {name: [] for name in OPENINGS}
     for start in range(0, count, _BATCH):
         rays = sample_domain(model.domain, min(_BATCH, count - start), seed, start)
         for name, both in passing(lens, model, rays).items():
-            found[name].append(both)
-    joined = {name: [torch.cat(parts) for parts in zip(*both, strict=True)] for name, both in found.items()}
+            parts[name].append(both)
+    joined = {name: [torch.cat(column) for column in zip(*both, strict=True)] for name, both in parts.items()}
     return {name: {**false_shares(a, b), "passing": int(a.sum())} for name, (a, b) in joined.items()}
 
 
 def passing(lens: Lens, model: LensModel, rays: FilmRays) -> dict[str, tuple[Tensor, Tensor]]:
     """Which rays pass the exact lens, and which the model says do, by name of `OPENINGS`."""
-    exact, said = trace_pairs(lens, rays, model.domain.pupil_z_mm), model.predict(rays)
+    exact, predicted = trace_pairs(lens, rays, model.domain.pupil_z_mm), model.predict(rays)
     x, y = exact.cross_x[lens.stop_index], exact.cross_y[lens.stop_index]
     return {
         name: (
             (exact.status == st.PASSED) & _within(x, y, model.domain, name),
-            (said.status == st.PASSED) & _within(said.stop_x, said.stop_y, model.domain, name),
+            (predicted.status == st.PASSED) & _within(predicted.stop_x, predicted.stop_y, model.domain, name),
         )
         for name in OPENINGS
     }
@@ -95,9 +93,9 @@ def _within(x: Tensor, y: Tensor, domain: Domain, name: str) -> Tensor:
     return x * x + y * y <= radius * radius
 
 
-def measure(file: Path, domain: str, rays: int) -> dict[str, Any]:
-    """One row: of one lens over one of `DOMAINS`; a lens that cannot be measured has its reason."""
-    row: dict[str, Any] = {"lens": file.stem, "domain": domain}
+def measure(file: Path, domain: str, rays: int) -> Row:
+    """The row of one lens over one of `DOMAINS`, or the reason why it cannot be measured."""
+    row: Row = {"lens": file.stem, "domain": domain}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NeurolensWarning)
         try:
@@ -141,10 +139,9 @@ def _percent(values: Iterable[float | None], choose: Choose) -> str:
 
 
 def _errors(opening: str, rows: Sequence[Row], choose: Choose) -> str:
-    """Both shares of an opening, chosen from the rows'."""
-    return " / ".join(
-        _percent((r["openings"][opening][k] for r in rows), choose) for k in ("false_pass", "false_block")
-    )
+    """Both shares of an opening, chosen from those of the rows."""
+    shares = ("false_pass", "false_block")
+    return " / ".join(_percent((r["openings"][opening][k] for r in rows), choose) for k in shares)
 
 
 _CHOSEN: dict[str, Callable[[Sequence[Row], Choose], str]] = {n: partial(_errors, n) for n in OPENINGS}
@@ -188,14 +185,14 @@ def run(args: argparse.Namespace) -> None:
     files = [f for f in lens_files(args.lenses) if args.only in f.stem and not read_quietly(f).anamorphic]
     if not files:
         raise InputError("experiments vignetting", "--only", args.only, f"part of a lens's name in {args.lenses}")
-    jobs = [(file, domain) for file in files for domain in ([args.domain] if args.domain else DOMAINS)]
-    target = args.out / "vignetting.json"
-    rows = lab.kept_rows(target, "experiments vignetting", lambda r: (r["domain"], r["lens"]))
-    text = ""
-    with Progress(quiet=args.quiet).stage("vignetting") as report:
-        for i, (file, domain) in enumerate(jobs):
-            rows[domain, file.stem] = measure(file, domain, args.rays)
-            done = [rows[key] for key in sorted(rows)]
-            text = lab.write_results(args.out, "vignetting", page(done), done)
-            report((i + 1) / len(jobs))
-    print(text)
+    domains = [args.domain] if args.domain else DOMAINS
+    jobs = {(domain, file.stem): (file, domain) for file in files for domain in domains}
+    lab.resume(
+        args,
+        "vignetting",
+        jobs,
+        lambda job, report: measure(*job, args.rays),
+        lambda row: (row["domain"], row["lens"]),
+        page,
+        again=True,
+    )

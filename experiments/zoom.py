@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median_high
-from typing import Any
 
 from experiments import lab
+from experiments.lab import Row
 from neurolens import __version__
 from neurolens.analysis.plot_style import FIELD_COLOURS, INK, drawing
 from neurolens.base.errors import InputError
@@ -75,13 +75,8 @@ CASES = (
 )
 
 
-def measure_case(case: Case, folder: Path, states: int, report: Report) -> dict[str, Any]:
-    """Fit and measure one case.
-
-    Args:
-        folder: for the model, which is kept; see `train_states.fit_and_measure_states`.
-        states: random states of the measurement.
-    """
+def measure_case(case: Case, folder: Path, states: int, report: Report) -> Row:
+    """Fit one case, whose model is kept in a folder, and measure it at `states` random states."""
     space = case.space()
     settings = StateSettings(terms=TERMS, rays=RAYS, name=case.name)
     record = fit_and_measure_states(space, settings, folder, states=states, report=lambda done: report(0.8 * done))
@@ -89,14 +84,8 @@ def measure_case(case: Case, folder: Path, states: int, report: Report) -> dict[
     for place in FIXED if len(space.axes) == 1 else ():
         fixed.append(_fixed(space, place))
         report(0.8 + 0.2 * len(fixed) / len(FIXED))
-    return {
-        "case": case.name,
-        "lens": space.lens.name,
-        "version": __version__,
-        "axes": [a.to_dict() for a in space.axes],
-        "fixed": fixed,
-        **record,
-    }
+    about = {"case": case.name, "lens": space.lens.name, "version": __version__}
+    return about | {"axes": [a.to_dict() for a in space.axes], "fixed": fixed} | record
 
 
 def _fixed(space: StateSpace, place: float) -> dict[str, float]:
@@ -121,10 +110,7 @@ median of {states} random states, rays that no fit saw, micrometres on the film;
 Made by `python -m experiments zoom`."""
 _COLUMNS = lab.columns(
     ("model", "case"),
-    (
-        "state",
-        lambda r: ", ".join("{name} {range[0]:.4g}–{range[1]:.4g} {unit}".format(**axis) for axis in r["axes"]),
-    ),
+    ("state", lambda r: ", ".join("{name} {range[0]:.4g}–{range[1]:.4g} {unit}".format(**axis) for axis in r["axes"])),
     ("nodes", "nodes"),
     ("RMS um, median", "median.rms_um", ".2g"),
     ("worst", "rms_um", ".2g"),
@@ -141,62 +127,60 @@ _COLUMNS = lab.columns(
 )
 
 
-def page(rows: Sequence[Mapping[str, Any]]) -> str:
+def page(rows: Sequence[Row]) -> str:
     """The table."""
     head = _HEAD.format(terms=TERMS, states=max((len(r["states"]) for r in rows), default=0))
     return lab.page(head, lab.table(_COLUMNS, rows, "–"), "![error over the state](zoom.png)")
 
 
-def write_records(records: Mapping[str, Mapping[str, Any]], out: Path) -> str:
-    """Write zoom.json, zoom.md and zoom.png; returns the page."""
-    order = [c.name for c in CASES]
-    rows = sorted(records.values(), key=lambda r: order.index(r["case"]) if r["case"] in order else len(order))
-    out.mkdir(parents=True, exist_ok=True)
-    draw(rows, out / "zoom.png")
-    return lab.write_results(out, "zoom", page(rows), {"cases": rows})
-
-
-def draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+def draw(rows: Sequence[Row], path: Path) -> None:
     """A panel for each model: its error over the first state axis, and those of models fitted to one state each."""
     columns = 2 if len(rows) > 1 else 1
     lines = -(-len(rows) // columns)
     with drawing(path, 5.2 * columns, 3.0 * lines) as figure:
-        places = figure.subplots(lines, columns, squeeze=False).ravel()
-        for place, row in zip(places, rows, strict=False):
+        panels = figure.subplots(lines, columns, squeeze=False).ravel()
+        for panel, row in zip(panels, rows, strict=False):
             axis, states, fixed = Axis.from_dict(row["axes"][0]), row["states"], row["fixed"]
-            error_line(place, axis, states, FIELD_COLOURS[0], "one model of all states")
+            error_line(panel, axis, states, FIELD_COLOURS[0], "one model of all states")
             if fixed:
                 x = [r[axis.name] for r in fixed]
-                place.plot(x, [r["rms_um"] for r in fixed], "s", ms=5, mfc="none", color=INK, label="one state each")
-            error_axes(place, axis, [r["rms_um"] for r in (*states, *fixed)])
-            place.set_title(row["case"], loc="left", fontsize="medium")
-            place.set(xlabel=AXIS_LABELS.get(axis.name, f"{axis.name} ({axis.unit})"), ylabel="RMS (um)")
-            place.legend(loc="best", fontsize="small")
-        for place in places[len(rows) :]:
-            place.set_visible(False)
+                panel.plot(x, [r["rms_um"] for r in fixed], "s", ms=5, mfc="none", color=INK, label="one state each")
+            error_axes(panel, axis, [r["rms_um"] for r in (*states, *fixed)])
+            panel.set_title(row["case"], loc="left", fontsize="medium")
+            panel.set(xlabel=AXIS_LABELS.get(axis.name, f"{axis.name} ({axis.unit})"), ylabel="RMS (um)")
+            panel.legend(loc="best", fontsize="small")
+        for panel in panels[len(rows) :]:
+            panel.set_visible(False)
 
 
 OPTIONS = (
     lab.option("cases", metavar="CASE", nargs="*", help="cases by name, as in the table (default: all)"),
     lab.count("states", 25, "random states (default: 25)", 2, 1000),
-    lab.option("--restart", old=("--again",), action="store_true", help="measure the chosen cases again"),
+    lab.AGAIN,
     lab.option("--models", metavar="DIR", type=Path, default=Path("runs/zoom"), help="for them (default: runs/zoom)"),
     lab.out(),
 )
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure what is missing, and write the table after each case."""
+    """Measure what is missing, and write table and picture after each case."""
     known = {c.name: c for c in CASES}
     unknown = [name for name in args.cases if name not in known]
     if unknown:
         raise InputError("experiments zoom", "CASE", unknown[0], f"one of: {', '.join(known)}")
-    args.models.mkdir(parents=True, exist_ok=True)
-    records = lab.kept_rows(args.out / "zoom.json", "experiments zoom", lambda r: r["case"], "cases")
-    missing = [known[n] for n in args.cases or known if args.restart or n not in records]
-    text = page(list(records.values()))
-    with pinned_threads():
-        for case, report in lab.stages(missing, lambda c: c.name, args.quiet, 60.0):
-            records[case.name] = measure_case(case, args.models, args.states, report)
-            text = write_records(records, args.out)
-    print(text)
+
+    def measured(case: Case, report: Report) -> Row:
+        args.models.mkdir(parents=True, exist_ok=True)
+        with pinned_threads():
+            return measure_case(case, args.models, args.states, report)
+
+    def drawn(rows: list[Row]) -> str:
+        if args.out.is_dir():
+            draw(rows, args.out / "zoom.png")
+        return page(rows)
+
+    chosen = {name: known[name] for name in args.cases or known}
+    lab.resume(
+        args, "zoom", chosen, measured, lambda row: row["case"], drawn,
+        listed="cases", again=args.restart, seconds=60.0, order=list(known),
+    )  # fmt: skip

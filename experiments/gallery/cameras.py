@@ -5,8 +5,6 @@ One surrogate serves all shots of a state of the lens; a window is a part of a f
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 import warnings
 from collections.abc import Callable, Sequence
@@ -23,6 +21,7 @@ from experiments.gallery.settings import Panel
 from neurolens import __version__
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.files import fingerprint_of, read_kept
 from neurolens.base.progress import Report
 from neurolens.cameras import build
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FloatArray
@@ -97,15 +96,9 @@ def shot_of(panel: Panel, scene: Scene) -> Shot:
     assert lens.film_z_mm is not None  # `at` places the film
     film_z = float(lens.film_z_mm) + panel.film_offset_mm
     lens = replace(lens, infinity_mm=())  # groups that have moved to focus stay there
-    return Shot(
-        panel,
-        scene,
-        replace(lens, film_z_mm=film_z),
-        focus_m,
-        f_number,
-        panel.film_mm or (camera.film_width_mm, camera.film_height_mm),
-        film_z - film_z_mm(lens, focus_m),
-    )
+    film_mm = panel.film_mm or (camera.film_width_mm, camera.film_height_mm)
+    placed, offset_mm = replace(lens, film_z_mm=film_z), film_z - film_z_mm(lens, focus_m)
+    return Shot(panel, scene, placed, focus_m, f_number, film_mm, offset_mm)
 
 
 def widened(lens: Lens, factor: float) -> Lens:
@@ -157,15 +150,11 @@ def fitted(
 ) -> Surrogate:
     """A surrogate of `lens` over the domain `asked` (arguments of `domain_of`), kept in `cache`."""
     made_of = [__version__, lens.sha256, lens.stop_radius_mm, asked, asdict(fit), asdict(pairs)]
-    fingerprint = hashlib.sha256(json.dumps(made_of, sort_keys=True, default=str).encode()).hexdigest()
-    folder = cache / f"{lens.lens_id}-{fingerprint[:12]}"
+    folder = cache / f"{lens.lens_id}-{fingerprint_of(made_of)[:12]}"
     file = folder / f"{fit.label}.onnx"
-    made = sorted(folder.glob(f"{fit.label}.json"))
-    if made and file.is_file():
-        told = json.loads(made[0].read_text(encoding="utf-8"))
-        record = known_record(file, told.get("fingerprint", ""))
-        if record is not None:
-            return Surrogate(file, Domain.from_dict(load_model(file).card["domain"]), record)
+    record = known_record(file, (read_kept(file.with_suffix(".json")) or {}).get("fingerprint", "(none)"))
+    if record is not None:  # a domain takes seconds, too
+        return Surrogate(file, Domain.from_dict(load_model(file).card["domain"]), record)
     folder.mkdir(parents=True, exist_ok=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NeurolensWarning)  # its errors stand in the table
@@ -272,32 +261,21 @@ class Window:
 
 def exact_camera(shot: Shot, surrogate: Surrogate | None, runtime: Runtime = "trace") -> Camera:
     """The prescription itself, sampled over the surrogate's pupil: the same rays for the same random numbers."""
-    return ExactCamera(
-        replace(shot.lens, film_z_mm=None),
-        film_mm=shot.film_mm,
-        focus_m=shot.focus_m,
-        wavelength_nm=shot.wavelength_nm,
-        bounds=None if surrogate is None else surrogate.domain.bounds,
-        focus="paraxial",
-        film_offset_mm=shot.offset_mm,
-        runtime=runtime,
-    )
+    bounds = None if surrogate is None else surrogate.domain.bounds
+    return ExactCamera(replace(shot.lens, film_z_mm=None), bounds=bounds, runtime=runtime, **_settings(shot))
 
 
 def surrogate_camera(shot: Shot, surrogate: Surrogate | None, runtime: Runtime = "onnxruntime") -> Camera:
     """The exported model."""
     assert surrogate is not None
-    return OnnxCamera(
-        load_model(surrogate.file),
-        film_mm=shot.film_mm,
-        focus_m=shot.focus_m,
-        f_number=float(first_order(shot.lens).f_number),
-        aperture=shot.lens.aperture,
-        wavelength_nm=shot.wavelength_nm,
-        focus="paraxial",
-        film_offset_mm=shot.offset_mm,
-        runtime=runtime,
-    )
+    stop: Any = {"f_number": float(first_order(shot.lens).f_number), "aperture": shot.lens.aperture}
+    return OnnxCamera(load_model(surrogate.file), runtime=runtime, **stop, **_settings(shot))
+
+
+def _settings(shot: Shot) -> dict[str, Any]:
+    """The settings that the exact lens and the model share."""
+    film = {"film_mm": shot.film_mm, "focus_m": shot.focus_m, "film_offset_mm": shot.offset_mm}
+    return film | {"wavelength_nm": shot.wavelength_nm, "focus": "paraxial"}
 
 
 def ideal_camera(kind: str, shot: Shot, surrogate: Surrogate | None) -> Camera:
@@ -326,13 +304,7 @@ _COMPILED: dict[str, Callable[[Shot, Surrogate | None], Camera]] = {
     "exact": partial(exact_camera, runtime="c"),
     "surrogate": partial(surrogate_camera, runtime="c"),
 }
-TITLES = {
-    "exact": "exact lens",
-    "surrogate": "surrogate",
-    "thin": "thin lens",
-    "pinhole": "pinhole",
-    "post": "post-process",
-}
+TITLES = {"exact": "exact lens", "thin": "thin lens", "post": "post-process"}  # others are called by their names
 
 
 def camera_of(column: str, shot: Shot, surrogate: Surrogate | None, compiled: bool = False) -> Camera:

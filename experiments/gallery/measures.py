@@ -9,18 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.gallery import aberrations, bokeh
+from experiments.gallery import aberrations, bokeh, cameras
 from experiments.gallery.bokeh import light_disc
-from experiments.gallery.cameras import (
-    NEAR_CORNER,
-    View,
-    illumination,
-    outward,
-    passing_weight,
-    post_process,
-    pupil_rays,
-    strength_for,
-)
+from experiments.gallery.cameras import NEAR_CORNER, View, illumination, post_process, strength_for
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
@@ -88,8 +79,8 @@ def panorama(view: View) -> dict[str, float]:
 
 def field_angles(camera: Camera, radii_mm: Array) -> Array:
     """Angle to the axis, radians, of the mean ray of film points [N] mm from the centre; NaN where none passes."""
-    rays = pupil_rays(camera, outward(radii_mm), _SQUARE, LINE_D_NM)
-    weight = passing_weight(rays, len(radii_mm))
+    rays = cameras.pupil_rays(camera, cameras.outward(radii_mm), _SQUARE, LINE_D_NM)
+    weight = cameras.passing_weight(rays, len(radii_mm))
     mean = (rays.direction.reshape(3, len(radii_mm), -1) * weight).sum(axis=2)
     angle = np.arctan2(np.hypot(mean[0], mean[1]), -mean[2])
     return np.asarray(np.where(weight.sum(axis=1) > 0, angle, np.nan))

@@ -36,8 +36,6 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text, write_json
 from neurolens.base.progress import Progress, Report
 from neurolens.base.records import versions
-from neurolens.cli.arguments import add_json
-from neurolens.cli.output import number, print_json, table
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene
 
@@ -70,26 +68,12 @@ def run_effect(
     rows, panels = [], []
     with progress.stage(f"{effect.name}: render") as report:
         for k, (shot, surrogate) in enumerate(zip(shots, surrogates, strict=True)):
-
-            def part(fraction: float, seconds_left: float | None = None, before: int = k) -> None:
-                report((before + fraction) / len(shots))
-
-            views = _views(effect, shot, surrogate, samples, threads, part)
-            row = _row(shot, views)
-            rows.append(row)
-            panels.append(_record(effect, shot, surrogate, views, row))
-    record = {
-        "schema": SCHEMA,
-        "name": effect.name,
-        "title": effect.title,
-        "text": effect.text,
-        "source": effect.source,
-        "command": f"python -m experiments gallery {effect.name}",
-        "panels": panels,
-        "samples": samples,
-        "versions": versions(),
-        "fingerprint": fingerprint,
-    }
+            views = _views(effect, shot, surrogate, samples, threads, lab.part_of(report, k, len(shots)))
+            rows.append(_row(shot, views))
+            panels.append(_record(effect, shot, surrogate, views, rows[-1]))
+    record = {"schema": SCHEMA, "name": effect.name, "title": effect.title, "text": effect.text}
+    record |= {"source": effect.source, "command": f"python -m experiments gallery {effect.name}", "panels": panels}
+    record |= {"samples": samples, "versions": versions(), "fingerprint": fingerprint}
     draw(effect.title, rows, out / f"{effect.name}.jpg")
     write_json(out / f"{effect.name}.json", _plain(record))
     return record
@@ -158,15 +142,9 @@ def _views(
         camera = camera_of(column, shot, surrogate)
         # One wavelength per path where the lens disperses: exact lens and surrogate then share their random numbers.
         film = replace(shot.scene.settings.film, wavelengths="one" if camera.dispersive else "hero")
-        done = render(
-            shot.scene,
-            Window(camera_of(column, shot, surrogate, compiled=True), window),
-            width=panel.width,
-            height=max(1, round(panel.width * window[3] / window[2])),
-            samples=samples or panel.samples,
-            threads=threads,
-            film=film,
-        )
+        seen, height = camera_of(column, shot, surrogate, compiled=True), round(panel.width * window[3] / window[2])
+        size: dict[str, Any] = {"width": panel.width, "height": max(1, height), "samples": samples or panel.samples}
+        done = render(shot.scene, Window(seen, window), **size, threads=threads, film=film)
         views[column] = View(shot, camera, column, done.rgb)
         report((k + 1) / len(effect.columns))
     return views
@@ -183,20 +161,14 @@ def _row(shot: Shot, views: dict[str, View]) -> Row:
 
 def _record(effect: Effect, shot: Shot, surrogate: Surrogate | None, views: dict[str, View], row: Row) -> Record:
     measured = {column: MEASURES[effect.measure](view) for column, view in views.items()}
-    names = list(dict.fromkeys(name for found in measured.values() for name in found))
-    return {
-        "label": shot.panel.label,
-        "lens": shot.lens.lens_id,
-        "f_number": shot.f_number,
-        "surrogate": None
-        if surrogate is None
-        else {
-            "name": surrogate.file.stem,
-            **{k: surrogate.record.get(k) for k in ("rms_um", "direction_rms_deg", "false_pass", "false_block")},
-        },
-        "difference_mean": None if row.difference is None else float(row.difference.mean()),
-        "measured": {name: {c: found.get(name) for c, found in measured.items()} for name in names},
-    }
+    names = list(dict.fromkeys(name for figures in measured.values() for name in figures))
+    errors = None
+    if surrogate is not None:
+        keys = ("rms_um", "direction_rms_deg", "false_pass", "false_block")
+        errors = {"name": surrogate.file.stem, **{k: surrogate.record.get(k) for k in keys}}
+    about = {"label": shot.panel.label, "lens": shot.lens.lens_id, "f_number": shot.f_number, "surrogate": errors}
+    about["difference_mean"] = None if row.difference is None else float(row.difference.mean())
+    return about | {"measured": {name: {c: figures.get(name) for c, figures in measured.items()} for name in names}}
 
 
 def _plain(value: Any) -> Any:
@@ -243,13 +215,12 @@ def effect_table(record: Record) -> str:
     """The measured numbers: a row a panel and quantity, a column per camera, and the surrogate's error."""
     panels = record["panels"]
     cameras = list(dict.fromkeys(c for p in panels for found in p["measured"].values() for c in found))
-    rows = [
-        [p["label"] if k == 0 else "", quantity_name(quantity)]
-        + [None if found.get(c) is None else f"{found[c]:.3g}" for c in cameras]
-        + [_surrogate_error(p["surrogate"]) if k == 0 else ""]
-        for p in panels
-        for k, (quantity, found) in enumerate(p["measured"].items())
-    ]
+    rows = []
+    for p in panels:
+        for k, (quantity, figures) in enumerate(p["measured"].items()):
+            values = [None if figures.get(c) is None else f"{figures[c]:.3g}" for c in cameras]
+            ends = ("", "") if k else (p["label"], _surrogate_error(p["surrogate"]))
+            rows.append([ends[0], quantity_name(quantity), *values, ends[1]])
     head = ["panel", "measured", *(TITLES.get(c, c) for c in cameras), "RMS of the surrogate"]
     return lab.table(head, rows, "–")
 
@@ -273,7 +244,6 @@ def _surrogate_error(surrogate: Record | None) -> str | None:
 
 OPTIONS = (
     lab.option("effects", metavar="EFFECT", nargs="*", help="names of effects (default: all)"),
-    lab.option("--list", action="store_true", help="list the effects and stop"),
     lab.option(
         "--effects-in", metavar="DIR", type=Path, default=Path(__file__).parent,
         help="effect files (default: experiments/gallery)",
@@ -281,7 +251,6 @@ OPTIONS = (
     lab.count("samples", None, "samples per pixel (default: the effect's own)", 1, 1 << 16),
     lab.count("threads", 2, "workers (default: 2)", 1, 256),
     lab.out(lab.RESULTS / "gallery", "folder"),
-    add_json,
 )  # fmt: skip
 
 
@@ -291,9 +260,6 @@ def run(args: argparse.Namespace) -> None:
     effects = [read_effect(path) for path in find_effects(folder, args.effects)]
     for effect in effects:
         check(effect)
-    if args.list:
-        print(table(("effect", "title"), [(effect.name, effect.title) for effect in effects], left=2))
-        return
     out.mkdir(parents=True, exist_ok=True)
     progress, records = Progress(quiet=args.quiet), []
     for effect in effects:
@@ -301,15 +267,4 @@ def run(args: argparse.Namespace) -> None:
         records.append(run_effect(effect, out, cache, samples=args.samples, threads=args.threads, progress=progress))
         everything = [finished(read_effect(path), out) for path in find_effects(folder)]
         atomic_write_text(out / "README.md", page([record for record in everything if record is not None]))
-    if args.json:
-        print_json({"effects": records})
-        return
-    columns = ("exact", "surrogate", "thin")
-    rows = [
-        (record["name"], panel["label"], quantity_name(name), *(number(found.get(c)) for c in columns))
-        for record in records
-        for panel in record["panels"]
-        for name, found in panel["measured"].items()
-    ]
-    print(table(("effect", "panel", "measured", *columns), rows, left=3))
-    print(out / "README.md")
+    print(lab.page(*map(section, records), str(out / "README.md")))

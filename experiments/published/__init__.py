@@ -37,7 +37,7 @@ class PublishedSettings(ModelSettings):
 
 
 class PublishedMethod(NamedTuple):
-    """Where a method was published, and the settings of its rows; the first is the one the paper prefers."""
+    """Where a method was published, and the settings of its rows; the first are those that the paper prefers."""
 
     citation: str
     presets: tuple[ModelSettings, ...]

@@ -37,8 +37,34 @@ def knot(around: int = 96, across: int = 10) -> tuple[np.ndarray, np.ndarray]:
     i, j = np.meshgrid(np.arange(around), np.arange(across), indexing="ij")
     a, b = i * across + j, i * across + (j + 1) % across
     c, d = (i + 1) % around * across + (j + 1) % across, (i + 1) % around * across + j
-    faces = np.concatenate([np.stack(x, axis=-1).reshape(-1, 3) for x in ((a, b, c), (a, c, d))])
-    return vertices, faces
+    return vertices, triangles(a, b, c, d)
+
+
+def triangles(*corners: np.ndarray) -> np.ndarray:
+    """Two triangles [T, 3] for each four corners."""
+    a, b, c, d = corners
+    return np.concatenate([np.stack(x, axis=-1).reshape(-1, 3) for x in ((a, b, c), (a, c, d))])
+
+
+def grid_faces(rows: int, columns: int) -> np.ndarray:
+    """Triangles [T, 3] between `rows` + 1 rows of `columns` + 1 vertices, anticlockwise with columns to the right."""
+    i, j = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
+    return triangles(*(x * (columns + 1) + y for x, y in ((i, j), (i, j + 1), (i + 1, j + 1), (i + 1, j))))
+
+
+def revolved(line: np.ndarray, slope: np.ndarray, around: int, repeats: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 8] (point, normal, texture coordinates) and faces [T, 3] of an outline turned about the y axis.
+
+    `line`, `slope`: [N, 2] radius and height, and their derivatives; `repeats`: of the texture around.
+    """
+    angle = np.linspace(0, 2 * np.pi, around + 1)
+    radius, height, dr, dy = (np.broadcast_to(x[:, None], (len(line), around + 1)) for x in (*line.T, *slope.T))
+    cos, sin = (np.broadcast_to(f(angle), radius.shape) for f in (np.cos, np.sin))
+    normal = np.stack([dy * cos, -dr, -dy * sin])
+    normal /= np.maximum(np.linalg.norm(normal, axis=0), 1e-12)
+    uv = [repeats * angle / (2 * np.pi) + 0 * radius, height / line[-1, 1]]
+    vertices = np.stack([radius * cos, height, -radius * sin, *normal, *uv], axis=-1).reshape(-1, 8)
+    return vertices, grid_faces(len(line) - 1, around)
 
 
 def poster(size: int = 384) -> np.ndarray:
@@ -62,20 +88,14 @@ def poster(size: int = 384) -> np.ndarray:
 
 
 def vase(around: int = 30, up: int = 20) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 8] (point, normal, texture coordinates) and faces [T, 3] of a vase 1 m high that stands on y = 0."""
-    t, angle = np.linspace(0, 1, up), np.linspace(0, 2 * np.pi, around + 1)
+    """Vertices [V, 8] and faces [T, 3] of a vase 1 m high that stands on y = 0."""
+    t = np.linspace(0, 1, up)
 
     def outline(t: np.ndarray) -> np.ndarray:
         return 0.20 + 0.11 * np.sin(2 * np.pi * (1.25 * t - 0.25 * t * t) - 0.6) - 0.04 * t
 
-    radius, slope = outline(t), (outline(t + 1e-5) - outline(t - 1e-5)) / 2e-5
-    t, angle = np.meshgrid(t, angle, indexing="ij")
-    radius, slope = (np.broadcast_to(x[:, None], t.shape) for x in (radius, slope))
-    point = [radius * np.cos(angle), t, -radius * np.sin(angle)]
-    normal = np.stack([np.cos(angle), -slope, -np.sin(angle)])
-    normal /= np.linalg.norm(normal, axis=0)
-    vertices = np.stack([*point, *normal, 3 * angle / (2 * np.pi), t], axis=-1).reshape(-1, 8)
-    return vertices, grid_faces(up, around)
+    slope = (outline(t + 1e-5) - outline(t - 1e-5)) / 2e-5
+    return revolved(np.stack([outline(t), t], axis=-1), np.stack([slope, np.ones(up)], axis=-1), around, repeats=3)
 
 
 # Outlines of turned pieces of chess: radius and height in mm, from the foot up; a repeated point is a corner.
@@ -124,23 +144,7 @@ def turned(foot: float, outline: list[tuple[float, float]], around: int = 48) ->
     line = np.concatenate(rows)
     line = line[np.concatenate([[True], np.linalg.norm(np.diff(line, axis=0), axis=1) > 1e-6])]
     line[:, 0] = np.maximum(line[:, 0], 0)
-    slope = np.gradient(line, axis=0)
-    angle = np.linspace(0, 2 * np.pi, around + 1)
-    radius, height = (np.broadcast_to(x[:, None], (len(line), around + 1)) for x in line.T)
-    dr, dy = (np.broadcast_to(x[:, None], radius.shape) for x in slope.T)
-    cos, sin = (np.broadcast_to(f(angle), radius.shape) for f in (np.cos, np.sin))
-    normal = np.stack([dy * cos, -dr, -dy * sin])
-    normal /= np.maximum(np.linalg.norm(normal, axis=0), 1e-12)
-    uv = [angle / (2 * np.pi) + 0 * radius, height / line[-1, 1]]
-    vertices = np.stack([radius * cos, height, -radius * sin, *normal, *uv], axis=-1).reshape(-1, 8)
-    return vertices, grid_faces(len(line), around)
-
-
-def grid_faces(up: int, around: int) -> np.ndarray:
-    """Triangles [T, 3] of a grid of `up` rows of `around` + 1 vertices."""
-    i, j = np.meshgrid(np.arange(up - 1), np.arange(around), indexing="ij")
-    a, b, c, d = (x * (around + 1) + y for x, y in ((i, j), (i, j + 1), (i + 1, j + 1), (i + 1, j)))
-    return np.concatenate([np.stack(x, axis=-1).reshape(-1, 3) for x in ((a, b, c), (a, c, d))])
+    return revolved(line, np.gradient(line, axis=0), around)
 
 
 def ridge(doublings: int = 8, slopes: int = 5) -> tuple[np.ndarray, np.ndarray]:
@@ -158,8 +162,8 @@ def ridge(doublings: int = 8, slopes: int = 5) -> tuple[np.ndarray, np.ndarray]:
     y[-1] = -0.02
     vertices = np.stack([x, y, np.broadcast_to(0.6 * down, x.shape)], axis=-1).reshape(-1, 3)
     i, j = np.meshgrid(np.arange(slopes - 1), np.arange(len(height) - 1), indexing="ij")
-    a, b, c, d = (u * len(height) + v for u, v in ((i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1)))
-    return vertices, np.concatenate([np.stack(f, axis=-1).reshape(-1, 3) for f in ((a, b, c), (a, c, d))])
+    corners = ((i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1))
+    return vertices, triangles(*(u * len(height) + v for u, v in corners))
 
 
 def firs(count: int = 90, boughs: int = 5, around: int = 7) -> tuple[np.ndarray, np.ndarray]:

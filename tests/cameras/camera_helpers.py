@@ -8,8 +8,8 @@ from typing import Any
 import lens_models
 import numpy as np
 import torch
+from film_light import FilmLight, film_light
 
-from experiments.radiometry import FilmLight, film_light
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.vignetting import Vignetted

@@ -8,8 +8,8 @@ from pathlib import Path
 import lens_models
 import numpy as np
 import pytest
+from film_light import film_light
 
-from experiments.radiometry import film_light
 from neurolens.base import status as st
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model

@@ -99,17 +99,6 @@ def test_squared_error_is_free_of_the_references_noise_and_that_noise_is_known()
     assert np.mean([reference_variance(h, np.ones(SHAPE)) for h in sets]) == pytest.approx(0.09 / 2, rel=0.03)
 
 
-@pytest.mark.parametrize("passes", [np.zeros((2, *SHAPE)), np.zeros(3), np.zeros((0, *SHAPE))])
-def test_too_few_passes_are_refused(passes: Picture) -> None:
-    with pytest.raises(InputError, match="at least three pictures"):
-        bias_and_variance(passes, [np.zeros(SHAPE)] * 2, np.ones(SHAPE))
-
-
-def test_passes_that_do_not_pair_are_refused() -> None:
-    with pytest.raises(InputError, match="those of the other camera"):
-        paired_bias(np.zeros((4, *SHAPE)), np.zeros((3, *SHAPE)), np.ones(SHAPE))
-
-
 # Laws of time
 
 EXACT = Law(0.0, 4.0, 2.0, ((0.5, 12.0), (1.0, 8.0)))

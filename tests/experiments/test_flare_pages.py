@@ -5,7 +5,6 @@ import shlex
 from pathlib import Path
 
 import pytest
-from PIL import Image
 
 from experiments import flare_gallery, flare_speed, lab
 from neurolens.base.errors import InputError
@@ -41,10 +40,3 @@ def test_commands_of_pictures_are_commands_and_make_what_they_show() -> None:
         shown = {file.partition(".0")[0] for panel in picture.panels for file in (*panel.files, panel.over) if file}
         assert made <= shown <= made | before
         before |= made
-
-
-def test_published_pictures_are_large_to_look_at_and_small_to_keep() -> None:
-    for picture in flare_gallery.PICTURES:
-        file = lab.RESULTS / "flare" / f"{picture.name}.jpg"
-        with Image.open(file) as opened:
-            assert opened.width >= 1280 and file.stat().st_size <= 700_000

@@ -117,8 +117,8 @@ def test_an_effect_becomes_a_figure_numbers_and_a_page_and_is_not_done_twice(
 ) -> None:
     path, out = written(tmp_path, '[[panel]]\nlabel = "one"\n', ""), tmp_path / "out"
     command = ["gallery", "--effects-in", str(tmp_path), "--output", str(out), "--threads", "1"]
-    assert main([*command, "--json"]) == 0
-    first = json.loads(capsys.readouterr().out)["effects"][0]
+    assert main(command) == 0 and "| two | middle (um) |" in capsys.readouterr().out
+    first = json.loads((out / "small.json").read_text(encoding="utf-8"))
     assert (out / "small.jpg").stat().st_size <= MOST_BYTES
     for panel in first["panels"]:
         found = panel["measured"]["edge_um"]

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments import lab, plans, shots
+from experiments import lab, plans
 from experiments.plan_errors import by_rays, fresh_places, fresh_prints, moved, pieces_of, rendered
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import CameraRays
@@ -147,18 +147,3 @@ def test_a_decision_is_held_against_the_cheapest_that_holds() -> None:
     ):  # fmt: skip
         made = plans._decision("render", budget, None if best is None else every[best], every, rows)
         assert (made["holds"], made["cheapest"], made["ratio"]) == (holds, cheapest, ratio)
-
-
-def test_tables_tell_misses() -> None:
-    told = {"px": 0.3, "noise_px": 0.01, "pieces": 3}
-    decision = {"target": "render", "budget_px": 0.25, "chosen": "x.shot-ols-8", "cheapest": "x.ols-64", "holds": False}
-    decision |= {"px": 0.26, "light": 0.0, "ratio": 0.9, "plan_s": 9.0, "render": told}
-    effects = [{"name": "coma", "unit": "px", "probe": 1.0, "fresh": 1.3}]
-    row = {"lens": "x", "scene": "room", "f_number": 2.0, "pixel_um": 18.0, "cameras": {}, "effects": effects}
-    text = plans.page([row | {"decisions": [decision, decision | {"holds": True, "render": None, "ratio": 1.1}]}])
-    assert "| 0.5 | missed |" in text and "| coma | 1 | 1.3 | px |" in text and "| 1.1 | reached |" in text
-    model = {"terms": 64, "um": 1.0, "light": 0.0, "operations": 300, "ns": 20.0}
-    shot = {"shot": "portrait", "f_number": 2.0, "focus_m": 3.0, "shipped": model}
-    own = model | {"terms": 16, "operations": 120, "ns": 14.0}
-    text = shots.page([{"lens": "x", "shots": [shot | {"own": own}]}])
-    assert "| 300 to 120 | 0.40 | 20.0 to 14.0 |" in text and "| 0.7 | missed |" in text

@@ -14,10 +14,10 @@ from lens_models import LENSES
 from experiments import methods as surrogate_bench
 from experiments.__main__ import main
 from experiments.methods import Bench, BenchSettings, Row, all_rows, chosen_rows, run_bench
-from experiments.methods_page import lens_page, write_lens
+from experiments.surrogates import lens_page, write_lens
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
-from neurolens.study.experiment import DomainChoice, LensChoice
+from neurolens.study.experiment import DomainChoice, EvaluationChoice, LensChoice
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.pairs import PairSettings
 
@@ -26,8 +26,9 @@ pytestmark = pytest.mark.slow
 TRIPLET = "cooke_triplet_50"
 SETTINGS = BenchSettings(
     DomainChoice(focus_m=(math.inf, math.inf), wavelength_nm=(400.0, 700.0)),
-    PairSettings(500, 300, 500), vignetting_rays=2000, rounds=0, compile_exact=False,
-)  # fmt: skip
+    PairSettings(500, 300, 500),
+    EvaluationChoice(vignetting_rays=2000, rounds=0, compile_exact=False),
+)
 ROWS = (
     Row("thick", "paraxial", ModelSettings("thick")),
     Row("ols-12", "ours", ModelSettings("ols", terms=12, degree=4)),
@@ -57,7 +58,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     command = ["surrogates", TRIPLET, "--quick", "--rays", "2000", "--rounds", "1", "--quiet"]
     with patch.context() as patched:
         patched.setattr(surrogate_bench, "fit_any", fit)
-        patched.setattr("experiments.surrogates.chosen_rows", lambda names: ROWS)
+        patched.setattr("experiments.surrogates.chosen_rows", lambda names, quick: ROWS)
         assert main([*command, "--output", str(folder)]) == 0
         files = [f for name in ("records", "models") for f in (folder / name).rglob("*") if f.is_file()]
         before = {f: f.stat().st_mtime_ns for f in files}
@@ -85,6 +86,8 @@ def test_rows_by_name_group_and_method() -> None:
     assert [r.name for r in chosen_rows(["ols-64", "thin", "ols-64"])] == ["ols-64", "thin"]
     assert {r.settings.method for r in chosen_rows(["schrade"])} == {"schrade"}
     assert all(re.search(r" 20\d\d, ", r.source) for r in rows if r.group == "published")
+    (short,) = chosen_rows(["neurolens2017"], quick=True)
+    assert short.settings.steps < chosen_rows(["neurolens2017"])[0].settings.steps and "--quick" in short.source
 
 
 def test_one_record_a_method_with_every_figure(made: Path) -> None:

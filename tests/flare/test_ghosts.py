@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from film_light import film_light
 
-from experiments.radiometry import film_light
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.flare.canvas import Raster, axis_irradiance

@@ -2,8 +2,9 @@
 
 `tests/data/patent_lenses.tar.xz` holds them: the figures that move a ray, the patent, and what ray-optics computes from
 the same file: focal length, back focus and film from the last surface at which the medium changes, focal length and
-back focus of every configuration, and the image heights of the rays through the middle of the stop at three fields. It
-is made by `python -m experiments collection FOLDER --ray-optics PYTHON --tables FILE`.
+back focus of every configuration, and the image heights of the rays through the middle of the stop at three fields.
+Files and answers are those of `python -m experiments collection`; the choice of two hundred that lie far apart was made
+once, by experiments/collection_tables.py of the project's history.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from film_light import film_light
 from shipped import NAMES, focused, tabled
 
 from experiments.pupil_methods import (
@@ -20,7 +21,6 @@ from experiments.pupil_methods import (
     rear_rim,
     wu_exit_pupil,
 )
-from experiments.radiometry import film_light
 from neurolens.base.errors import InputError
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens, Surface

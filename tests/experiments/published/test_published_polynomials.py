@@ -12,14 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as some
 
 from experiments.published import PublishedSettings, fit_any
-from experiments.published.data import (
-    PARITY,
-    RawData,
-    from_tangents,
-    parity_exponents,
-    slope_encoding,
-    to_tangents,
-)
+from experiments.published.data import PARITY, RawData, from_tangents, parity_exponents, to_tangents
 from experiments.published.polynomials import Pursuit
 from experiments.published.taylor import expand, truncated
 from neurolens.base import status as st
@@ -58,15 +51,6 @@ def test_tangents_and_back_is_the_same_direction(x: float, y: float, a: float, b
     torch.testing.assert_close(back, direction, rtol=0, atol=1e-12)
 
 
-def test_raw_coordinates_are_position_and_slope() -> None:
-    pairs = lens_models.prepared().pairs
-    encoding = slope_encoding(lens_models.prepared().encoding, pairs.train)
-    rays = pairs.train.inputs
-    rise = (rays.pupil_x - rays.film_x) / (encoding.pupil_plane_z_mm - rays.film_z)
-    u = encoding(rays).u[0]
-    assert torch.allclose(u / rise, (u / rise)[0].expand_as(u), rtol=1e-9)
-
-
 def test_lenses_with_cylinders_are_refused() -> None:
     prepared = lens_models.prepared()
     encoding = fit_encoding(prepared.pairs.domain, prepared.pairs.train, mirror=True)
@@ -79,17 +63,6 @@ def test_parity_splits_all_raw_terms() -> None:
     rows = {tuple(map(int, r)) for part in every for r in part}
     assert len(rows) == sum(map(len, every)) == 252  # binomial(5 + 5, 5)
     assert set(PARITY) == {(1, 0), (0, 1), (0, 0)}
-
-
-def test_pursuit_finds_the_terms_that_made_the_target() -> None:
-    generator = np.random.default_rng(0)
-    x = generator.uniform(-1, 1, (2, 400))
-    columns = np.array([x[0] ** i * x[1] ** j for i in range(6) for j in range(6)])
-    made_of = [3, 10, 17, 22, 35]
-    target = generator.uniform(1, 2, 5) @ columns[made_of]
-    pursuit = Pursuit(columns, target)
-    assert pursuit.run(5) == made_of
-    assert pursuit.error() < 1e-16 * (target @ target)
 
 
 def test_pursuit_adds_the_term_that_leaves_least_and_replacement_only_helps() -> None:

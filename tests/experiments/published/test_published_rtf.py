@@ -16,7 +16,7 @@ from experiments.published import PublishedSettings, fit_any
 from experiments.published.adaptive import Cells, fit_adaptive
 from experiments.published.data import RawData
 from experiments.published.neural import Averaged, Layers
-from experiments.published.rtf import least_ellipse, meridian_exponents, meridian_variables, turn
+from experiments.published.rtf import least_ellipse, meridian_variables, turn
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.study.rays import ray_errors
@@ -30,11 +30,6 @@ from neurolens.surrogates.pairs import trace_pairs
 @cache
 def fitted(degree: int = 4, name: str = "laikin_double_gauss_50") -> LensModel:
     return fit_any(lens_models.prepared(name), PublishedSettings("rtf", basis="raw", degree=degree))
-
-
-def test_degree_six_has_84_terms_as_published() -> None:
-    assert len(meridian_exponents(6, dispersive=False)) == 84
-    assert len(meridian_exponents(6, dispersive=True)) == 3 * 84
 
 
 def test_turning_is_a_rotation_onto_the_y_axis() -> None:
