@@ -364,24 +364,24 @@ def shorten() -> None:
     from neurolens.base.tasks import Here
     from neurolens.blender.pack import Form
     from neurolens.cameras.onnxlens import load_model
-    from neurolens.cli import blender_lenses, flare_lights, survey
+    from neurolens.cli import blender_lenses, flare_run, survey
 
     def form_of(file: Path, **_: Any) -> Form:
         card = load_model(file).card
         return Form("polynomial", card["fit"]["method"], "shader", 1.0, 21.6, 2.0, 0.7)
 
     fields: dict[tuple[Any, ...], Any] = {}
-    field_of = flare_lights.Sources._field
+    field_of = flare_run.Shots._field
 
-    def field(sources: flare_lights.Sources, args: argparse.Namespace, *rest: Any) -> Any:
+    def field(shots: flare_run.Shots, args: argparse.Namespace, *rest: Any) -> Any:
         if args.file != Path("good.toml"):
-            return field_of(sources, args, *rest)
+            return field_of(shots, args, *rest)
         key = args.film, args.focus, args.f_number, args.zoom, args.efl, args.field, args.focusing
         if key not in fields:
-            fields[key] = field_of(sources, args, *rest)
+            fields[key] = field_of(shots, args, *rest)
         return fields[key]
 
-    flare_lights.Sources._field = field  # type: ignore[assignment,method-assign]
+    flare_run.Shots._field = field  # type: ignore[assignment,method-assign]
     survey.Processes = lambda *_: Here()  # type: ignore[assignment,misc]
     blender_lenses.form_of = form_of
 

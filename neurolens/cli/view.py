@@ -205,7 +205,7 @@ def _has_models(root: Path, key: str) -> bool:
 
 def _flare(file: Path) -> GhostModel | None:
     """The ghosts of a file that holds such; others are refused or read elsewhere."""
-    from neurolens.flare.ghostfile import KIND, read_ghosts
+    from neurolens.flare.ghostmodel import KIND, read_ghosts
     from neurolens.surrogates.metadata import card_in, read_metadata
 
     try:

@@ -91,7 +91,7 @@ def _light(towards: Array, rgb: Array, distance: FloatArray, shape: Shape) -> Li
     return light_towards(towards, rgb.tolist(), mean, shape if extended else None)
 
 
-class Kept(NamedTuple):
+class KeptLights(NamedTuple):
     """Lights, brightest first, of how many, and the share of their energy that is left out."""
 
     lights: list[Light]
@@ -99,7 +99,7 @@ class Kept(NamedTuple):
     dropped: float
 
 
-def keep(lights: Sequence[Light], most: int, fade: bool = False) -> Kept:
+def keep(lights: Sequence[Light], most: int, fade: bool = False) -> KeptLights:
     """The lights of the most energy at the lens.
 
     Args:
@@ -112,15 +112,15 @@ def keep(lights: Sequence[Light], most: int, fade: bool = False) -> Kept:
     if 0 < cut < _energy(ordered[0]):
         kept = [_dimmed(k, min((_energy(k) / cut - 1) / (_FADES - 1), 1.0)) for k in kept if _energy(k) > cut]
     left = 1 - sum(map(_energy, kept)) / max(whole, 1e-300) if len(ordered) > most else 0.0
-    return Kept(kept, len(ordered), left)
+    return KeptLights(kept, len(ordered), left)
 
 
-def keep_named(lights: Mapping[Name, Light], names: frozenset[Name]) -> Kept:
+def keep_named(lights: Mapping[Name, Light], names: frozenset[Name]) -> KeptLights:
     """The lights of these names; see `chosen`."""
     kept = sorted((light for name, light in lights.items() if name in names), key=_energy, reverse=True)
     whole = sum(map(_energy, lights.values()))
     left = 1 - sum(map(_energy, kept)) / max(whole, 1e-300) if len(kept) < len(lights) else 0.0
-    return Kept(kept, len(lights), left)
+    return KeptLights(kept, len(lights), left)
 
 
 def chosen(frames: Sequence[Mapping[Name, Light]], most: int) -> frozenset[Name]:
@@ -146,7 +146,7 @@ def _dimmed(light: Light, share: float) -> Light:
 
 def highlights(
     picture: FloatArray, field: Field, film_mm: tuple[float, float], threshold: float, most: int, fade: bool = False
-) -> Kept:
+) -> KeptLights:
     """The regions of a picture [H, W, 3] (linear; 1 is a white card of radiance 1) that reach a threshold in a colour.
 
     A region of connected pixels is a light far away with the region's radiance times solid angle; a large one is
@@ -169,7 +169,7 @@ def highlights(
         raise InputError("picture", "threshold", found, f"one that at most {_MOST_PIXELS} pixels reach")
     row, column = np.nonzero(bright)
     if not row.size:
-        return Kept([], 0, 0.0)
+        return KeptLights([], 0, 0.0)
     region = _regions(bright, max(1, round(_CELL * width)))
     count = int(region.max()) + 1
     colour, moments = np.zeros((count, 3)), np.zeros((13, count))
@@ -188,7 +188,7 @@ def highlights(
     lights = [light_towards(middle[:, k], colour[k], shape=shape) for k, shape in zip(first, shapes, strict=True)]
     kept = keep([light for light in lights if light], most, fade).lights
     left = 1 - sum(map(_energy, kept)) / float(each[seen].sum()) if len(seen) > most else 0.0
-    return Kept(kept, len(seen), left)
+    return KeptLights(kept, len(seen), left)
 
 
 def _spread_of(means: Array) -> Shape:

@@ -8,12 +8,14 @@ from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from string import Template
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.graph.program import Argument, Mixture, Program, Step
+
+BLOCK = 256  # rays
 
 
 @cache
@@ -28,6 +30,19 @@ def part(file: str, key: str, /, **values: object) -> str:
     return _parts(file)[key].substitute(values)
 
 
+def comment_of(lines: Sequence[str]) -> str:
+    """Lines of a comment that begins with /* and ends with */."""
+    return "\n".join(f" * {line}".rstrip() for line in lines).replace("*/", "* /")
+
+
+def literal(value: float) -> str:
+    """A float32 number in nine digits, which give it back exactly; negative ones in brackets."""
+    text = f"{np.float32(value):.9g}"
+    if "." not in text and "e" not in text:
+        text += ".0"
+    return f"({text}f)" if text.startswith("-") else f"{text}f"
+
+
 @dataclass(frozen=True)
 class Signature:
     """Names of a written function.
@@ -36,8 +51,8 @@ class Signature:
         name: of the function. per_ray, per_call: inputs, in order.
         outputs: floats in order; then comes status, where the program has one.
         bands: wavelengths of the coefficient tables; a function of several takes `band`, a number from 0.
-        state: names of the numbers of a state, of which NAME_at makes the argument `state`.
         tables: each is an array [cells, columns], which its number of cells follows, NAME_cells.
+        state: names of the numbers of a state, of which NAME_at makes the argument `state`.
     """
 
     name: str
@@ -61,8 +76,8 @@ class Signature:
         outputs = tuple(o for o in program.outputs if o != "status")
         mixture, bands = program.mixture, program.tables
         state = () if mixture is None else tuple(s.name for s in mixture.program.steps if s.kind == "input")
-        given = bands if mixture is None else 1
-        return Signature(name, per_ray, per_call, outputs, given, tables, "status" in program.outputs, state)
+        bands = bands if mixture is None else 1
+        return Signature(name, per_ray, per_call, outputs, bands, tables, "status" in program.outputs, state)
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -85,6 +100,104 @@ class Extras:
 NOTHING = Extras()
 
 
+class Writer:
+    """Writes steps as expressions of C; the writers of other languages replace some of the texts.
+
+    Args:
+        name: of the written function, with which the names of its helpers begin.
+
+    Attributes:
+        table: coefficients that differ between tables, each a row of one value a table, in the order of their use.
+        texts: an expression for each kind of step, of its arguments; {name} and {macro} are the function's.
+        place: a coefficient of the table, by its number.
+        lookup: a number of a table of the caller. own_lookup: one of a table of the program, if that differs.
+    """
+
+    texts: ClassVar[dict[str, str]] = {
+        "add": "{0} + {1}",
+        "sub": "{0} - {1}",
+        "mul": "{0} * {1}",
+        "div": "{0} / {1}",
+        "neg": "-({0})",
+        "sqrt": "{name}_sqrt({0})",
+        "floor": "floorf({0})",
+        "max": "{0} > {1} ? {0} : {1}",
+        "min": "{0} < {1} ? {0} : {1}",
+        "clamp": "{name}_clamp({0}, {1})",
+        "select": "{0} <= {1} ? {2} : {3}",
+        "pick": "{name}_pick({0}, {1}, {2})",
+        "fma": "{macro}_FMA({0}, {1}, {2})",
+    }
+    place = "c[{}]"
+    lookup = "{table}[{name}_cell({index}, {cells}) * {width} + {place}]"
+    own_lookup = ""
+
+    def __init__(self, program: Program, name: str) -> None:
+        self.program, self.name, self.table = program, name, list[tuple[float, ...]]()
+
+    def value(self, argument: Argument) -> str:
+        """A step's name, a number, or a place in the table of coefficients."""
+        if isinstance(argument, int):
+            step = self.program.steps[argument]
+            return step.name if step.kind == "input" else f"t{argument}"
+        if all(v == argument[0] for v in argument):
+            return literal(argument[0])
+        if argument not in self.table:
+            self.table.append(argument)
+        return self.place.format(self.table.index(argument))
+
+    def output(self, name: str) -> str:
+        """The expression of an output."""
+        return self.value(self.program.outputs[name].argument)
+
+    def step(self, step: Step) -> str:
+        """The expression of a step."""
+        values = [self.value(a) for a in step.arguments]
+        if step.kind != "lookup":
+            return self.texts[step.kind].format(*values, name=self.name, macro=self.name.upper())
+        text, table, cells = self.lookup, step.name, f"{step.name}_cells"
+        if (own := self.program.own_tables.get(step.name)) is not None:
+            text, table, cells = self.own_lookup or self.lookup, f"{self.name}_{step.name}", str(len(own))
+        width = step.columns * (len(values) - step.indices) // step.indices
+        known = {"table": table, "cells": cells, "width": width, "name": self.name}
+        return " + ".join(
+            f"{weight} * {text.format(index=index, place=place, **known)}"
+            for index, weights in step.at_indices(values)
+            for weight, place in zip(weights, range(step.column, width, step.columns), strict=True)
+        )
+
+    def steps(self) -> list[str]:
+        """The steps of the program as lines."""
+        steps = [(k, self.program.steps[k]) for k in self.program.live()]
+        return [f"    float t{k} = {self.step(step)};" for k, step in steps if step.kind != "input"]
+
+    def one_number(self, name: str) -> str:
+        """A function `name` of the inputs of the program that gives its one output."""
+        steps = [self.program.steps[k] for k in self.program.live()]
+        inputs = ", ".join(f"float {step.name}" for step in steps if step.kind == "input")
+        (output,) = self.program.outputs
+        last = f"    return {self.output(output)};"
+        return "\n".join([f"float {name}({inputs})", "{", *self.steps(), last, "}\n"])
+
+    def state_parts(self, mixture: Mixture, table: Sequence[Sequence[float]]) -> dict[str, Any]:
+        """The parts of the function that makes a state; this is the writer of `mixture.program`.
+
+        Args:
+            table: coefficients that differ between the nodes, [n, nodes].
+        """
+        rows = np.array(table or [[0.0] * mixture.transform.shape[1]]) @ mixture.transform.T
+        return {
+            "count": len(rows),
+            "features": rows.shape[1],
+            "size": rows.size,
+            "rows": ",\n    ".join(", ".join(literal(v) for v in row) for row in rows),
+            "arguments": ", ".join(f"float {step.name}" for step in mixture.program.steps if step.kind == "input"),
+            "steps": "\n".join(self.steps()),
+            "made": ", ".join(self.output(name) for name in mixture.program.outputs if name != "inside"),
+            "inside": self.output("inside"),
+        }
+
+
 def write_c(program: Program, name: str, comment: Sequence[str], extras: Extras = NOTHING) -> str:
     """The text of a header.
 
@@ -94,32 +207,26 @@ def write_c(program: Program, name: str, comment: Sequence[str], extras: Extras 
         extras: what else the header holds.
     """
     signature = Signature.of(program, name)
-    macro = name.upper()
-    lines = "\n".join(f" * {line}".rstrip() for line in comment).replace("*/", "* /")
-    text = part("parts.h", "head", comment=lines, name=name, guard=f"{macro}_H", macro=macro)
-    live = program.live()
-    kinds = [p.steps[k].kind for p in (program, *extras.functions.values()) for k in p.live()]
+    macro, mixture, writer = name.upper(), program.mixture, Writer(program, name)
+    text = part("parts.h", "head", comment=comment_of(comment), name=name, guard=f"{macro}_H", macro=macro)
+    live = [program.steps[k] for k in program.live()]
+    others = [*extras.functions.values(), *([] if mixture is None else [mixture.program])]
+    kinds = {step.kind for step in live} | {p.steps[k].kind for p in others for k in p.live()}
     for kind in ("sqrt", "clamp", "pick", "floor", "lookup"):
         text += part("parts.h", kind, name=name, macro=macro) if kind in kinds else ""
-    for table in dict.fromkeys(program.steps[k].name for k in live if program.steps[k].kind == "lookup"):
+    for table in dict.fromkeys(step.name for step in live if step.kind == "lookup"):
         if table in program.own_tables:
             text += _numbers(f"{name}_{table}", program.own_tables[table])
     text += "\n" * bool(extras.constants)
     text += "".join(f"#define {macro}_{key.upper()} {literal(v)}\n" for key, v in extras.constants.items())
     for key, function in extras.functions.items():
-        own = Writer(function, f"{name}_sqrt", f"{macro}_FMA")
-        text += f"\n{macro}_INLINE {one_number(own, f'{name}_{key}')}"
-    lookup = f"{{table}}[{name}_cell({{index}}, {{cells}}) * {{width}} + {{place}}]"
-    writer = Writer(
-        program, f"{name}_sqrt", f"{macro}_FMA", clamp=f"{name}_clamp", floor="floorf", lookup=lookup, name=name
-    )
-    body = steps_of(writer)
-    results = [f"    ray.{o} = {writer.value(program.outputs[o].argument)};" for o in signature.outputs]
-    if "status" in program.outputs:
-        results.append(f"    ray.status = (int){writer.value(program.outputs['status'].argument)};")
-    if program.mixture is not None:
-        own = Writer(program.mixture.program, "sqrtf", f"{macro}_FMA")
-        parts = state_parts(program.mixture, writer.table, own)
+        text += f"\n{macro}_INLINE {Writer(function, name).one_number(f'{name}_{key}')}"
+    body = writer.steps()
+    results = [f"    ray.{o} = {writer.output(o)};" for o in signature.outputs]
+    if signature.status:
+        results.append(f"    ray.status = (int){writer.output('status')};")
+    if mixture is not None:
+        parts = Writer(mixture.program, name).state_parts(mixture, writer.table)
         text += part("parts.h", "state", name=name, macro=macro, **parts)
         body.insert(0, "    const float *const c = state->c;")
     elif writer.table:
@@ -135,77 +242,32 @@ def _numbers(name: str, rows: NDArray[np.float64]) -> str:
     return f"\nstatic const float {name}[{rows.size}] = {{\n{lines}}};\n"
 
 
-def one_number(writer: Writer, name: str) -> str:
-    """A function of the inputs of a program that gives its one output."""
-    program = writer.program
-    arguments = ", ".join(f"float {program.steps[k].name}" for k in program.live() if _input(program, k))
-    (found,) = program.outputs.values()
-    lines = steps_of(writer)
-    return "\n".join([f"float {name}({arguments})", "{", *lines, f"    return {writer.value(found.argument)};", "}\n"])
-
-
-def steps_of(writer: Writer) -> list[str]:
-    """The steps of a program as lines."""
-    steps = [(k, writer.program.steps[k]) for k in writer.program.live() if not _input(writer.program, k)]
-    return [f"    float t{k} = {writer.step(step)};" for k, step in steps]
-
-
-def state_parts(mixture: Mixture, table: Sequence[Sequence[float]], writer: Writer) -> dict[str, Any]:
-    """What the function of a state is written of: numbers [n, nodes] and, by a writer of its program, its features."""
-    rows = np.array(table or [[0.0] * mixture.transform.shape[1]]) @ mixture.transform.T
-    program = mixture.program
-    return {
-        "count": len(rows),
-        "features": rows.shape[1],
-        "size": rows.size,
-        "rows": ",\n    ".join(", ".join(literal(v) for v in row) for row in rows),
-        "arguments": ", ".join(f"float {step.name}" for step in program.steps if step.kind == "input"),
-        "steps": "\n".join(steps_of(writer)),
-        "made": ", ".join(writer.value(e.argument) for key, e in program.outputs.items() if key != "inside"),
-        "inside": writer.value(program.outputs["inside"].argument),
-    }
-
-
-def _input(program: Program, k: int) -> bool:
-    return program.steps[k].kind == "input"
-
-
 def _functions(s: Signature, macro: str, body: list[str], results: list[str]) -> str:
-    fields = "\n".join([*(f"    float {o};" for o in s.outputs), *["    int status;"] * s.status])
-    band, guard, chosen = [], [], []
+    """The struct of results, the function of one ray, and the one over arrays."""
+    pointer, band, guard, chosen = f"*{macro}_RESTRICT", list[str](), list[str](), list[str]()
     if s.state:
-        band, chosen = [f"const {s.name}_state *{macro}_RESTRICT state"], ["state"]
+        band, chosen = [f"const {s.name}_state {pointer} state"], ["state"]
         results = [*results, "    if (!state->inside) ray.status = 1;"]
     elif s.bands > 1:
         band, chosen = ["int band"], ["band"]
         guard = [f"    const int known = band >= 0 && band < {s.bands};", "    if (!known) band = 0;"]
         results = [*results, "    if (!known) ray.status = 1;"]
-    tables = [f"const float *{macro}_RESTRICT {t}, int {t}_cells" for t in s.tables]
-    one = ",\n    ".join([*(f"float {i}" for i in s.inputs), *tables, *band])
-    many = ",\n    ".join(
-        [
-            "size_t count",
-            *(f"const float *{macro}_RESTRICT {i}" for i in s.per_ray),
-            *(f"float {i}" for i in s.per_call),
-            *tables,
-            *band,
-            *(f"float *{macro}_RESTRICT {o}" for o in s.outputs),
-            *[f"int *{macro}_RESTRICT status"] * s.status,
-        ]
-    )
-    known = [*s.per_call, *(f"{t}, {t}_cells" for t in s.tables), *chosen]
-    given = ", ".join([*(f"{i}[i]" for i in s.per_ray), *known])
-    stores = "\n".join(f"        {o}[i] = ray.{o};" for o in (*s.outputs, *["status"] * s.status))
-    unused = "".join(f"    (void){i};\n" for i in s.inputs)
-    return (
-        f"\ntypedef struct {{\n{fields}\n}} {s.name}_ray;\n"
-        f"\n{macro}_INLINE {s.name}_ray {s.name}(\n    {one})\n{{\n{unused}    {s.name}_ray ray;\n"
-        + "\n".join([*guard, *body, *results])
-        + "\n    return ray;\n}\n"
-        f"\n{macro}_UNUSED static inline void {s.name}_rays(\n    {many})\n{{\n"
-        "    for (size_t i = 0; i < count; i++) {\n"
-        f"        const {s.name}_ray ray = {s.name}({given});\n{stores}\n    }}\n}}\n\n#endif\n"
-    )
+    outputs = (*s.outputs, *["status"] * s.status)
+    kinds = {o: "int" if o == "status" else "float" for o in outputs}
+    tables = [f"const float {pointer} {t}, int {t}_cells" for t in s.tables]
+    per_call = [*(f"float {i}" for i in s.per_call), *tables, *band]
+    one = ",\n    ".join([*(f"float {i}" for i in s.per_ray), *per_call])
+    rows = [f"const float {pointer} {i}" for i in s.per_ray]
+    many = ",\n    ".join(["size_t count", *rows, *per_call, *(f"{kinds[o]} {pointer} {o}" for o in outputs)])
+    values = [*(f"{i}[i]" for i in s.per_ray), *s.per_call, *(f"{t}, {t}_cells" for t in s.tables), *chosen]
+    return part(
+        "parts.h", "functions",
+        name=s.name, macro=macro, one=one, many=many, values=", ".join(values),
+        fields="\n".join(f"    {kinds[o]} {o};" for o in outputs),
+        unused="".join(f"    (void){i};\n" for i in s.inputs),
+        body="\n".join([*guard, *body, *results]),
+        stores="\n".join(f"        {o}[i] = ray.{o};" for o in outputs),
+    )  # fmt: skip
 
 
 def padded_columns(columns: int) -> int:
@@ -234,31 +296,23 @@ def write_blocks(program: Program, name: str) -> str:
     places |= {number: f"once.{number}" for number in same.outputs}
     places |= {row: f"made[{k}]" for k, row in enumerate(made)}
     width = padded_columns(columns)
-    row = width * groups
     cells = [
-        f"const float *const cell_{k} = table + {row} * {name}_cell(made[{made.index(f'index_{k}')}][i], cells);"
+        f"const float *const cell_{k} = table + {width * groups} * "
+        f"{name}_cell(made[{made.index(f'index_{k}')}][i], cells);"
         for k in range(step.indices)
     ]
     terms = (
         f"made[{made.index(f'weight_{g}')}][i] * cell_{g // groups}[{width * (g % groups)} + c]" for g in range(weights)
     )
+    call = f"const {same.name}_ray once = {same.name}({', '.join(places[n] for n in same.inputs)});"
     loops = part(
-        "parts.h",
-        "blocks",
-        name=name,
-        known=f"const {same.name}_ray once = {same.name}({', '.join(places[n] for n in same.inputs)});"
-        * bool(same.outputs),
-        block=BLOCK,
-        made=len(made),
-        columns=columns,
-        width=width,
-        cells="\n            ".join(cells),
-        total=" + ".join(terms),
+        "parts.h", "blocks",
+        name=name, known=call * bool(same.outputs), block=BLOCK, made=len(made), columns=columns, width=width,
+        cells="\n            ".join(cells), total=" + ".join(terms), looked=made.index("column_0"),
         first=", ".join(places[row] for row in (*first.inputs, *first.outputs)),
         last=", ".join(places[row] for row in last.inputs),
         out="".join(f", out[{k}] + at" for k in range(len(whole.outputs))),
-        looked=made.index("column_0"),
-    )
+    )  # fmt: skip
     text = write_c(once, same.name, ["Of the call."]) if same.outputs else ""
     text += write_c(before, first.name, ["Before the lookups."]) + write_c(after, last.name, ["After them."])
     if own is not None:
@@ -266,88 +320,3 @@ def write_blocks(program: Program, name: str) -> str:
         text += f"enum {{ {name}_table_cells = {len(own)} }};\n"
         text += _numbers(f"{name}_table", padded.reshape(len(own), -1))
     return text + part("parts.h", "lookup", name=name, macro=last.name.upper()) + loops
-
-
-BLOCK = 256  # rays
-
-
-class Writer:
-    """Steps as expressions of C, and of GLSL, which has the same ones.
-
-    Args:
-        sqrt, fma, clamp, floor: functions of those; without one its operations are written.
-        place: of the table's coefficient {}. lookup: of a column of a table of the caller, or where own_lookup says
-            none, of the program, whose name starts with `name`.
-
-    Attributes:
-        table: coefficients that differ between tables, each a row of one value a table, in the order of their use.
-    """
-
-    def __init__(
-        self,
-        program: Program,
-        sqrt: str,
-        fma: str = "",
-        place: str = "c[{}]",
-        clamp: str = "",
-        floor: str = "floor",
-        lookup: str = "",
-        own_lookup: str = "",
-        name: str = "",
-    ) -> None:
-        self.program, self.sqrt, self.fma, self.place, self.clamp = program, sqrt, fma, place, clamp
-        self.floor, self.lookup, self.own_lookup, self.name = floor, lookup, own_lookup or lookup, name
-        self.table: list[tuple[float, ...]] = []
-
-    def value(self, argument: Argument) -> str:
-        """A step's name, a number, or a place in the table of coefficients."""
-        if isinstance(argument, int):
-            step = self.program.steps[argument]
-            return step.name if step.kind == "input" else f"t{argument}"
-        if all(v == argument[0] for v in argument):
-            return literal(argument[0])
-        if argument not in self.table:
-            self.table.append(argument)
-        return self.place.format(self.table.index(argument))
-
-    def step(self, step: Step) -> str:
-        given = [self.value(a) for a in step.arguments]
-        if step.kind in _INFIX:
-            return f"{given[0]} {_INFIX[step.kind]} {given[1]}"
-        if step.kind == "select":
-            return "{} <= {} ? {} : {}".format(*given)
-        if step.kind in ("max", "min"):
-            a, b = given
-            return f"{a} {'>' if step.kind == 'max' else '<'} {b} ? {a} : {b}"
-        if step.kind == "clamp":
-            x, limit = given
-            return f"{self.clamp}({x}, {limit})" if self.clamp else f"max(min({x}, {limit}), -{limit})"
-        if step.kind == "pick":
-            return f"{self.name}_pick({', '.join(given)})"
-        if step.kind == "neg":
-            return f"-({given[0]})"
-        if step.kind == "lookup":
-            own = self.program.own_tables.get(step.name)
-            form, table, cells = self.lookup, step.name, f"{step.name}_cells"
-            if own is not None:
-                form, table, cells = self.own_lookup, f"{self.name}_{step.name}", str(len(own))
-            width = step.columns * (len(given) - step.indices) // step.indices
-            return " + ".join(
-                f"{weight} * {form.format(table=table, cells=cells, index=index, width=width, place=place)}"
-                for index, weights in step.at_indices(given)
-                for weight, place in zip(weights, range(step.column, width, step.columns), strict=True)
-            )
-        if step.kind in ("sqrt", "floor"):
-            return f"{getattr(self, step.kind)}({given[0]})"
-        return f"{self.fma}({', '.join(given)})" if self.fma else "{} * {} + {}".format(*given)
-
-
-_INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
-
-
-def literal(value: float) -> str:
-    """A float32 number in nine digits, which give it back exactly; negative ones in brackets."""
-    text = f"{np.float32(value):.9g}"
-    if "." not in text and "e" not in text:
-        text += ".0"
-    return f"({text}f)" if text.startswith("-") else f"{text}f"

@@ -129,3 +129,27 @@ void ${name}(
         ${name}_after_rays(n, ${last}${out}, status + at);
     }
 }
+//// functions
+
+typedef struct {
+${fields}
+} ${name}_ray;
+
+${macro}_INLINE ${name}_ray ${name}(
+    ${one})
+{
+${unused}    ${name}_ray ray;
+${body}
+    return ray;
+}
+
+${macro}_UNUSED static inline void ${name}_rays(
+    ${many})
+{
+    for (size_t i = 0; i < count; i++) {
+        const ${name}_ray ray = ${name}(${values});
+${stores}
+    }
+}
+
+#endif

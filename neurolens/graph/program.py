@@ -359,8 +359,8 @@ class Program:
     def around_lookups(self) -> tuple[Program, list[Step], Program]:
         """The steps that lookups need, the lookups, and the steps after them, which take what was made as inputs.
 
-        The first has outputs `index_0` ..., `weight_0` ..., and `step_K` that the last takes; of lookups it takes
-        `column_C`.
+        The first program has outputs `index_0` ..., `weight_0` ..., and `step_K` that the last takes; for a lookup the
+        last takes `column_C`.
 
         Raises:
             ValueError: no lookups, or others than columns of one table at the same indices.
@@ -369,70 +369,51 @@ class Program:
         lookups = [self.steps[k] for k in live if self.steps[k].kind == "lookup"]
         if len({(s.name, s.arguments) for s in lookups}) != 1:
             raise ValueError("lookups: expected columns of one table at the same indices")
-        given, count = [Expr(self, a) for a in lookups[0].arguments], lookups[0].indices
-        before = replace(self, outputs={f"index_{i}": index for i, index in enumerate(given[:count])})
-        before.outputs |= {f"weight_{g}": w for g, w in enumerate(given[count:])}
+        arguments, count = [Expr(self, a) for a in lookups[0].arguments], lookups[0].indices
+        before = replace(self, outputs={f"index_{i}": index for i, index in enumerate(arguments[:count])})
+        before.outputs |= {f"weight_{g}": w for g, w in enumerate(arguments[count:])}
         early = set(before.live())
-        late = [self.steps[k] for k in live if k not in early]
-        taken = {a for step in late if step.kind != "lookup" for a in step.arguments}
-        taken |= {e.argument for e in self.outputs.values()}
-        kept = [k for k in live if k in early & taken and self.steps[k].kind != "input"]
-        before.outputs |= {f"step_{k}": Expr(self, k) for k in kept}
-        after, place = Program(self.tables), dict[int, Expr]()
-        for k in (k for k in live if k not in early or k in kept or self.steps[k].kind == "input"):
-            step = self.steps[k]
-            if step.kind == "lookup" or k in kept:
-                place[k] = after.input(f"step_{k}" if k in kept else f"column_{step.column}")
-            else:
-                arguments = tuple(place[a].argument if isinstance(a, int) else a for a in step.arguments)
-                place[k] = after._append(replace(step, arguments=arguments))
-        after.outputs = {
-            name: place[e.argument] if isinstance(e.argument, int) else Expr(after, e.argument)
-            for name, e in self.outputs.items()
-        }
-        return before, lookups, after
+
+        def after(k: int, step: Step, given: Sequence[Expr]) -> Expr | None:
+            if step.kind == "lookup":
+                return given[0].program.input(f"column_{step.column}")
+            return given[0].program.input(f"step_{k}") if k in early and step.kind != "input" else None
+
+        last = self._rewritten(after)
+        names = [step.name for step in map(last.steps.__getitem__, last.live()) if step.name.startswith("step_")]
+        before.outputs |= {name: Expr(self, int(name.removeprefix("step_"))) for name in names}
+        return before, lookups, last
 
     def of_the_call(self) -> tuple[Program, Program]:
         """What is the same for all rays of a call, with outputs `once_K`, and the rest, which takes these as inputs.
 
         Compilers make no vectors of loops that choose by what does not change in them: such choices are `pick` there.
         """
-        live, same = self.live(), set[int]()
+        same = set[int]()
 
-        def of_call(arguments: Sequence[Argument]) -> bool:
+        def of_call(arguments: Iterable[Argument]) -> bool:
             return all(not isinstance(a, int) or a in same for a in arguments)
 
-        for k in live:
+        for k in self.live():
             step = self.steps[k]
             if step.per_call if step.kind == "input" else step.kind != "lookup" and of_call(step.arguments):
                 same.add(k)
         once = replace(self, steps=list(self.steps), outputs={}, _known=dict(self._known))
-        rest, place = Program(self.tables, own_tables=self.own_tables), dict[int, Expr]()
 
-        def known(expr: Expr) -> Expr:
-            """A value of the call, as an input of the rest."""
-            name = f"once_{expr.argument}"
-            once.outputs[name] = expr
-            return rest.input(name, per_call=True)
-
-        def moved(argument: Argument) -> Argument:
-            if not isinstance(argument, int):
-                return argument
-            if argument not in place:
-                place[argument] = known(Expr(once, argument))
-            return place[argument].argument
-
-        for k in live:
-            step = self.steps[k]
+        def varying(k: int, step: Step, given: Sequence[Expr]) -> Expr | None:
             if step.kind == "input":
-                place[k] = rest._append(step)
-            elif k not in same and step.kind == "select" and of_call(step.arguments[:2]):
-                low, high = (Expr(once, a) for a in step.arguments[:2])
-                truth = known(once.select(low, high, 1.0, 0.0)).argument
-                place[k] = rest._append(replace(step, kind="pick", arguments=(truth, *map(moved, step.arguments[2:]))))
-            elif k not in same:
-                place[k] = rest._append(replace(step, arguments=tuple(map(moved, step.arguments))))
-        rest.outputs = {name: Expr(rest, moved(e.argument)) for name, e in self.outputs.items()}
+                return None
+            if k in same:
+                return given[0].program.input(f"once_{k}", per_call=True)
+            if step.kind != "select" or not of_call(step.arguments[:2]):
+                return None
+            low, high = (Expr(once, a) for a in step.arguments[:2])
+            truth = given[0].program.input(f"once_{once.select(low, high, 1.0, 0.0).argument}", per_call=True)
+            return truth.program.op("pick", truth, *given[2:])
+
+        rest = self._rewritten(varying)
+        names = [step.name for step in map(rest.steps.__getitem__, rest.live()) if step.name.startswith("once_")]
+        once.outputs = {name: Expr(once, int(name.removeprefix("once_"))) for name in names}
         return once, rest
 
     def count(self) -> dict[str, int]:

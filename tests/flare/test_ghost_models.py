@@ -17,9 +17,8 @@ from neurolens.base.errors import InputError, ModelError
 from neurolens.cli import main
 from neurolens.flare import ghostfit
 from neurolens.flare.canvas import Raster
-from neurolens.flare.ghostfile import output_of, read_ghosts, write_ghost_source, write_ghosts
 from neurolens.flare.ghostfit import GhostSettings, fit_ghosts
-from neurolens.flare.ghostmodel import GhostModel
+from neurolens.flare.ghostmodel import GhostModel, output_of, read_ghosts, write_ghost_source, write_ghosts
 from neurolens.flare.ghosts import GhostTracer, Pair
 from neurolens.flare.lights import Light, light_rays
 from neurolens.flare.picture import ghost_picture

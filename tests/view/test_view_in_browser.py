@@ -17,8 +17,8 @@ from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import main
 from neurolens.flare.canvas import Raster
-from neurolens.flare.ghostfile import write_ghosts
 from neurolens.flare.ghostfit import GhostSettings, fit_ghosts
+from neurolens.flare.ghostmodel import write_ghosts
 from neurolens.flare.lights import Light
 from neurolens.flare.picture import ghost_picture
 from neurolens.readers.lensfile import read_lens
