@@ -20,7 +20,6 @@ from experiments import lab
 from experiments.osl_speed import BLENDER, checked_python, in_blender
 from neurolens.base.progress import Progress
 from neurolens.blender.pack import Form
-from neurolens.cli.blender_kept import kept_form
 from neurolens.cli.blender_lenses import form_of
 from neurolens.lens.paraxial import first_order
 
@@ -120,11 +119,11 @@ def _form(shot: Shot, folder: Path, quiet: bool) -> Form:
     """The shader of a model, or of a lens file without what names its glass: shaders of exact lenses absorb nothing."""
     if shot.state is None:
         model = lab.MODELS / f"{shot.model}.onnx"
-        return kept_form(model, make=lambda: form_of(model, quiet=quiet))
+        return form_of(model, quiet=quiet)
     clear = folder / f"{shot.name}.toml"
     named = (lab.LENSES / clear.name).read_text(encoding="utf-8")
     clear.write_text(re.sub(r', (material|glass) = "[^"]*"', "", named), encoding="utf-8")
-    return kept_form(clear, make=lambda: form_of(clear, quiet=quiet))
+    return form_of(clear, quiet=quiet)
 
 
 def focal_mm(shot: Shot) -> float:

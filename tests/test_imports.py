@@ -58,7 +58,7 @@ EXCEPTIONS: dict[str, set[str]] = {
 }
 # Modules that load torch; others load these when they are needed.
 SLOW = {"neurolens.cameras.exact", "neurolens.cameras.outline_cache"}
-SLOW |= {"neurolens.cli.export_lens", "neurolens.cli.flare_run"}
+SLOW |= {"neurolens.cli.export_lens", "neurolens.cli.flare_run", "neurolens.cli.view_run"}
 # What loads in a base install: these folders, models from their files, and what converts lens files.
 LEAN = ("base", "graph", "lens", "readers", "cameras", "shaders", "render", "mitsuba", "frames", "cli")
 LEAN_MODULES = {

@@ -1,4 +1,8 @@
-"""Lenses for Blender's extension, of models and lens files: their shaders, facts and thumbnails."""
+"""Lenses for Blender's extension, from models and lens files: their shaders, facts and thumbnails.
+
+Shaders and facts are kept between runs, so that an interrupted `neurolens blender build` goes on where it was. A kept
+file is named by what it is made from: the model or lens file, the zoom's state, and the code.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,8 @@ import io
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
@@ -14,21 +19,29 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+import neurolens
 from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError, NeurolensError
-from neurolens.base.files import safe_name
+from neurolens.base.files import (
+    cache_folder,
+    fingerprint_of,
+    keep_newest,
+    read_kept,
+    safe_name,
+    sha256_of,
+    write_kept,
+)
 from neurolens.base.lensname import is_model, lens_id_of
 from neurolens.base.tasks import Failed, Here, Processes, run_each
 from neurolens.blender.pack import Form, PackedLens
-from neurolens.cli.blender_kept import kept, kept_form
 from neurolens.shaders.blender_shader import shader_of
 
 if TYPE_CHECKING:
     from neurolens.lens.prescription import Lens
 
+_KEPT = 512  # kept files of some 100 kB
 _SIDE_IN, _DOTS, _MARGIN = 2.56, 100, 1.08  # of a thumbnail: 256 pixels; its side over the glass's
-_NETWORK = "mlp"
-_RADII, _NEAR = (0.0, 0.35, 0.6, 0.8, 0.97), 20.0  # of the picture's radius; focal lengths
+_RADII, _NEAR = (0.0, 0.35, 0.6, 0.8, 0.97), 20.0  # of a field: shares of the picture's radius; focal lengths
 Forms = dict[Path, Form]
 
 
@@ -36,18 +49,17 @@ def form_of(file: Path, *, zoom: str | None = None, quiet: bool = False) -> Form
     """The shader of a model (.onnx) or of a lens file, with its facts; kept between runs. See `shader_of`.
 
     Raises:
-        InputError: a lens that cannot be a shader. ModelError: a broken model.
+        InputError: the lens cannot be a shader. ModelError: the model is broken.
     """
-    return kept_form(file, zoom, make=lambda: _made_form(file, zoom, quiet))
+    return Form(**_kept(file, zoom, make=lambda: asdict(_made_form(file, zoom, quiet))))
 
 
 def _made_form(file: Path, zoom: str | None, quiet: bool) -> Form:
     shader = shader_of(file, zoom=zoom, quiet=quiet)
     kind, model, error, poor = "exact", "", None, []
     if is_model(file):
-        card = _card(file)
-        model, error = str(card["fit"]["method"]), float(card["errors"]["rms_um"])
-        kind = "network" if _family(card).startswith(_NETWORK) else "polynomial"
+        card = card_of(file)
+        kind, model, error = kind_of(card), str(card["fit"]["method"]), float(card["errors"]["rms_um"])
         poor = list(card["errors"].get("poor") or ())
     state = None if zoom == RANGE else zoom
     notes = [*shader.notes] if state is None else [*shader.notes, f"The zoom stands at {state}"]
@@ -60,27 +72,52 @@ def _made_form(file: Path, zoom: str | None, quiet: bool) -> Form:
     )  # fmt: skip
 
 
+def _kept(file: Path, *more: str | None, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """A table that is made from a file and from `more`: the one kept by an earlier run, else a new one, which is
+    kept if it can be."""
+    place = cache_folder() / f"{fingerprint_of([_code(), file.name, sha256_of(file), *more])}.form"
+    if (data := read_kept(place)) is None:
+        data = make()
+        with suppress(OSError):
+            write_kept(place, data)
+        keep_newest(place, _KEPT)
+    return data
+
+
+@cache
+def _code() -> list[str]:
+    """The checksums of all files of the package, and what else changes shaders."""
+    root = Path(neurolens.__file__).parent
+    files = [f for f in sorted(root.rglob("*")) if f.is_file() and f.suffix != ".pyc"]
+    return [*(f"{f.relative_to(root)} {sha256_of(f)}" for f in files), np.__version__, str(find_spec("torch") is None)]
+
+
 def _squeeze(file: Path, zoom: str | None) -> float:
     """See `cameras.lens_state`."""
-    from neurolens.setting.states import set_lens
-
     if not is_model(file):
-        from neurolens.lens.paraxial import first_order
         from neurolens.readers.any_format import read_any
+        from neurolens.setting.states import set_lens
 
-        lens = set_lens(read_any(file), zoom=zoom)
-        across = first_order(lens, meridian="x") if lens.anamorphic else first_order(lens)
-        return abs(float(first_order(lens).efl_mm / across.efl_mm))
+        return squeeze_of(set_lens(read_any(file), zoom=zoom))
     from neurolens.cameras.build import Shot, make_camera
 
     return float(make_camera(file, Shot((1.0, 1.0), math.inf, zoom=zoom)).settings["lens_state"]["squeeze"] or 1.0)
+
+
+def squeeze_of(lens: Lens) -> float:
+    """How many times an anamorphic lens squeezes its picture across; 1 for others."""
+    from neurolens.lens.paraxial import first_order
+
+    if not lens.anamorphic:
+        return 1.0
+    return abs(float(first_order(lens).efl_mm / first_order(lens, meridian="x").efl_mm))
 
 
 def forms_of(
     files: Sequence[Path], jobs: int, report: Callable[[float], object],
     zooms: Mapping[Path, str | None] = MappingProxyType({}),
 ) -> tuple[Forms, dict[Path, str]]:  # fmt: skip
-    """The forms of many files, `jobs` at a time in processes of their own, and why others have none.
+    """The forms of many files, made by `jobs` processes, and why other files have none.
 
     Args:
         zooms: `zoom` of `form_of`, for files that have one.
@@ -88,7 +125,7 @@ def forms_of(
     Raises:
         NeurolensError: a process ended early, as where memory is short.
     """
-    found: Forms = {}
+    forms: Forms = {}
     left: dict[Path, str] = {}
     tasks = [(file, zooms.get(file)) for file in files]
     with Here() if jobs == 1 else Processes(jobs) as executor:
@@ -96,11 +133,11 @@ def forms_of(
             if isinstance(made, Failed):
                 raise NeurolensError(f"{file}: {made.reason} ({jobs} jobs: where memory is short, try --jobs 1)")
             if isinstance(made, Form):
-                found[file] = made
+                forms[file] = made
             else:
                 left[file] = made
             report(done / len(files))
-    return found, left
+    return forms, left
 
 
 def _form_or_why(task: tuple[Path, str | None]) -> Form | str:
@@ -130,10 +167,11 @@ def packed_of(
 
     first, ranged = files[0], zoom == RANGE
     if is_model(first):
-        told = _card(first)
-        card, ranged = told["lens"], zoom in (None, RANGE) and "zoom" in _axes(told)
-        name, efl, f_number = card["name"], card["efl_mm"], card["f_number"]
-        source = str(card.get("source") or "") if lens is None else lens.source  # which may be told better since
+        card = card_of(first)
+        facts, axes = card["lens"], [axis["name"] for axis in (card.get("states") or {}).get("axes", ())]
+        ranged = zoom in (None, RANGE) and "zoom" in axes
+        name, efl, f_number = facts["name"], facts["efl_mm"], facts["f_number"]
+        source = str(facts.get("source") or "") if lens is None else lens.source  # the file may name it better by now
         name = f"{name}, any zoom" if ranged else name
     else:
         from neurolens.readers.any_format import read_any
@@ -145,22 +183,22 @@ def packed_of(
     table = None
     if lens is not None and forms and not ranged:
         radius = min(form.film_radius_mm for form in forms)
-        given = str(first_order(lens).efl_mm), str(radius)
-        table = kept(Path(lens.path), "field", *given, make=lambda: {"table": field_table(lens, radius)})["table"]
+        more = str(first_order(lens).efl_mm), str(radius)
+        table = _kept(Path(lens.path), "field", *more, make=lambda: {"table": field_table(lens, radius)})["table"]
     return PackedLens(key_of(first), str(name), float(efl), float(f_number), source, picture, list(forms), table)
 
 
 def stated_lens(model: Path, lenses: Path) -> Lens | None:
-    """The prescription of a model of one state of a lens file, scaled or zoomed, or of its range; None without it."""
+    """The prescription behind a model, scaled or zoomed as the model is, or of its range; None without a lens file."""
     from neurolens.lens.paraxial import first_order
     from neurolens.readers.lensfile import read_lens
     from neurolens.setting.states import set_lens
 
-    told = _card(model)["lens"]
-    file = lenses / f"{safe_name(told['id'])}.toml"
+    facts = card_of(model)["lens"]
+    file = lenses / f"{safe_name(facts['id'])}.toml"
     if not file.is_file():
         return None
-    lens, efl = read_lens(file), float(told["efl_mm"])
+    lens, efl = read_lens(file), float(facts["efl_mm"])
     if math.isclose(first_order(lens).efl_mm, efl, rel_tol=1e-3):
         return lens
     return set_lens(lens, zoom=str(efl)) if lens.configurations else set_lens(lens, focal_length_mm=efl)
@@ -199,14 +237,14 @@ def field_table(lens: Lens, radius_mm: float) -> dict[str, Any] | None:
 
 
 def key_of(file: Path) -> str:
-    """Name of a lens in the menu's files: of `NAME.ols-64.onnx` and of a lens file NAME.toml, NAME."""
+    """The name of a lens in the menu's files: NAME of a model NAME.ols-64.onnx or of a lens file NAME.toml."""
     return file.name.split(".")[0] if is_model(file) else lens_id_of(file)
 
 
 def library(folder: Path, lenses: Path, chosen: Sequence[str]) -> Iterator[tuple[list[Path], Path | None]]:
-    """Of every lens, the best polynomial and the best network among its models, and its lens file, if it has one.
+    """Yield for every lens the best polynomial and the best network among its models, and its lens file, if it has one.
 
-    A lens file of which there is no model is a lens as well.
+    A lens file without a model is a lens as well.
 
     Args:
         folder: of models. lenses: of lens files. chosen: names of lenses, all where empty.
@@ -217,11 +255,9 @@ def library(folder: Path, lenses: Path, chosen: Sequence[str]) -> Iterator[tuple
     known: dict[str, dict[str, tuple[float, Path]]] = {}
     modelled = set()
     for file in sorted(folder.glob("*.onnx")):
-        card = _card(file)
+        card = card_of(file)
         modelled.add(card["lens"]["id"])
-        kind = "network" if _family(card).startswith(_NETWORK) else "polynomial"
-        mine = known.setdefault(key_of(file), {})
-        error = float(card["errors"]["rms_um"])
+        kind, mine, error = kind_of(card), known.setdefault(key_of(file), {}), float(card["errors"]["rms_um"])
         if kind not in mine or error < mine[kind][0]:
             mine[kind] = error, file
     if known:  # a folder without a model is not the folder that was meant
@@ -263,15 +299,14 @@ def thumbnail(lens: Lens) -> bytes | None:
     return buffer.getvalue()
 
 
-def _card(file: Path) -> dict[str, Any]:
+def card_of(file: Path) -> dict[str, Any]:
+    """The card of a model."""
     from neurolens.surrogates.metadata import read_card
 
     return read_card(file)
 
 
-def _axes(card: dict[str, Any]) -> list[str]:
-    return [axis["name"] for axis in (card.get("states") or {}).get("axes", ())]
-
-
-def _family(card: dict[str, Any]) -> str:
-    return str(card["fit"]["settings"].get("method", card["fit"]["method"]))
+def kind_of(card: Mapping[str, Any]) -> str:
+    """Whether a card's model is a "network" or a "polynomial"."""
+    family = str(card["fit"]["settings"].get("method", card["fit"]["method"]))
+    return "network" if family.startswith("mlp") else "polynomial"

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,10 +18,7 @@ from neurolens.cli.output import answer
 from neurolens.cli.render import film_size
 
 if TYPE_CHECKING:
-    from neurolens.surrogates.model import LensModel
-    from neurolens.surrogates.pairs import RayPairs
     from neurolens.surrogates.source import Written
-    from neurolens.surrogates.specialise import Fix
 
 _DESCRIPTION = """\
 Write an exported model in another form: a self-contained C99 header (one function for a ray, one for
@@ -53,10 +51,9 @@ examples:
   neurolens export models/NAME.onnx --to onnx -o laser.onnx --fix wavelengths=633
   neurolens export models/NAME.onnx --to onnx -o lens.onnx --derivatives  # for ray differentials elsewhere
   neurolens export models/NAME.onnx --to onnx -o a.onnx --inverse         # and a.stop.onnx, a.scene.onnx"""
+_COMMAND = "neurolens export"
 _PARTS = ("ray", "transmittance", "stop", "vignetting")
 _FIXED = ("wavelengths", "film_z", "focus", "stop", "f_number")
-# Rays for the errors of an ONNX file with fixed inputs; rays to fit inverse maps.
-_HELD_OUT, _VIGNETTING, _TRAIN = 20_000, 100_000, 15_000
 
 
 def add_parser(subparsers: Any) -> None:
@@ -108,82 +105,91 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Load, fix, write."""
-    from neurolens.shaders.source import model_extras
+    """Check the options, then load, fix and write."""
     from neurolens.surrogates.source import checked_name
 
-    file = model_file(Path(args.model.removeprefix(FUSED)))
-    parts = _parts(args.only)
-    given = _given(args.fix)
+    file, parts, fixed = model_file(Path(args.model.removeprefix(FUSED))), _parts(args.only), _fixed(args.fix)
+    whole = set(parts) == set(_PARTS) and not fixed
     if args.to == "onnx" and (args.name is not None or set(parts) != set(_PARTS)):
-        raise InputError("neurolens export", "--only, --name", "(with --to onnx)", "neither: an ONNX file is whole")
+        raise InputError(_COMMAND, "--only, --name", "(with --to onnx)", "neither: an ONNX file is whole")
     if args.to != "onnx" and ((args.derivatives and not args.whole_camera) or args.inverse):
-        raise InputError("neurolens export", "--derivatives, --inverse", f"(with --to {args.to})", "--to onnx")
+        raise InputError(_COMMAND, "--derivatives, --inverse", f"(with --to {args.to})", "--to onnx")
     if args.name is not None:
         checked_name(args.to, "", args.name)
     if args.to == "osl":
-        return _write_osl(file, args, bool(given) or set(parts) != set(_PARTS))
-    exact = not is_model(file)
-    if args.whole_camera or exact:
-        if args.to == "onnx" or given or set(parts) != set(_PARTS):
+        if not whole or args.whole_camera or args.f_number is not None or args.focus != math.inf:
+            options = "--fix, --only, --whole-camera, --focus, --f-number"
+            expected = "none of them: stop and focus are inputs of the shader, which is a whole camera"
+            raise InputError(_COMMAND, options, "(with --to osl)", expected)
+        write: Callable[[Path, argparse.Namespace], dict[str, Any]] = _write_osl
+    elif args.whole_camera or not is_model(file):
+        if args.to == "onnx" or not whole:
             what = "a camera" if args.whole_camera else "a lens file"
-            raise InputError("neurolens export", str(file), f"({what})", "--to c or glsl, without --fix and --only")
-        check_writable(args.out)
-        if args.whole_camera:
-            return _answer(args, _about(_write_camera(file, args)))
-        from neurolens.cli.export_lens import write_lens
-
-        written = write_lens(file, args.out, args.to, name=args.name, zoom=args.zoom, quiet=args.json)
-        return _answer(args, _about(written))
+            raise InputError(_COMMAND, str(file), f"({what})", "--to c or glsl, without --fix and --only")
+        write = _write_camera if args.whole_camera else _write_lens
+    else:
+        write = partial(_write_model, parts=parts, fixed=fixed)
     check_writable(args.out)
+    about = write(file, args)
+    data = {"file": str(args.out), "to": args.to, "bytes": args.out.stat().st_size, **about}
+    maps = about.get("inverse", {}).values()
+    lines = [f"{m['file']}: finds {m['converged']:.3%} of the model's rays in three steps" for m in maps]
+    return answer(args, data, lambda: "\n".join([str(args.out), *lines]))
+
+
+def _write_model(
+    file: Path, args: argparse.Namespace, parts: Sequence[str], fixed: dict[str, list[float]]
+) -> dict[str, Any]:
+    """A model as source code or ONNX, some of its inputs fixed."""
     from neurolens.cameras.onnxlens import load_model
+    from neurolens.shaders.source import model_extras
     from neurolens.surrogates.source import Parts, export_source
-    from neurolens.surrogates.specialise import Fix, fixed_models
+    from neurolens.surrogates.specialise import Fix
 
     loaded = load_model(file)
-    card, whole = loaded.card, set(parts) == set(_PARTS) and not given
-    if loaded.axes and (args.to == "onnx" or not whole):
-        raise InputError(
-            "neurolens export", str(file), "(a model of many states)", "--to c or glsl without --fix, --only"
-        )
-    fix, models = _fix(given, loaded.fitted) if given else Fix(), loaded.file.nodes
-    if given:
-        models = fixed_models(loaded.fitted, fix)
+    if loaded.axes and (args.to == "onnx" or fixed or set(parts) != set(_PARTS)):
+        expected = "--to c or glsl without --fix, --only"
+        raise InputError(_COMMAND, str(file), "(a model of many states)", expected)
+    fix, models = Fix(), loaded.file.nodes
+    if fixed:
+        from neurolens.cli.export_lens import fixed_model
+
+        fix, models = fixed_model(fixed, loaded.fitted)
     if args.to == "onnx":
-        _write_onnx(models, args.out, card if not given else None, args.derivatives)
-        about: dict[str, Any] = _write_inverse(models[0], args.out) if args.inverse else {}
-    else:
-        asked = Parts(*(name in parts for name in _PARTS[1:]))
-        stop = fix.stop_radius_mm if asked.vignetting else models[0].domain.stop_radius_mm
-        extras, notes = model_extras(loaded, film=fix.film_z_mm is None, stop_mm=stop)
-        written = export_source(
-            models, args.out, args.to, card, parts=asked, fix=fix, name=args.name, extras=extras, notes=notes
-        )
-        about = _about(written, [m.domain.wavelength_nm[0] for m in models])
-    return _answer(args, about)
+        from neurolens.cli.export_lens import write_inverse, write_onnx_model
+
+        write_onnx_model(models, args.out, None if fixed else loaded.card, args.derivatives)
+        return write_inverse(models[0], args.out) if args.inverse else {}
+    kept = Parts(*(name in parts for name in _PARTS[1:]))
+    stop = fix.stop_radius_mm if kept.vignetting else models[0].domain.stop_radius_mm
+    extras, notes = model_extras(loaded, film=fix.film_z_mm is None, stop_mm=stop)
+    written = export_source(
+        models, args.out, args.to, loaded.card, parts=kept, fix=fix, name=args.name, extras=extras, notes=notes
+    )
+    return _about(written, [m.domain.wavelength_nm[0] for m in models])
 
 
-def _write_osl(file: Path, args: argparse.Namespace, partly: bool) -> int:
+def _write_lens(file: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """The exact lens of a file as source code."""
+    from neurolens.cli.export_lens import write_lens
+
+    return _about(write_lens(file, args.out, args.to, name=args.name, zoom=args.zoom, quiet=args.json))
+
+
+def _write_osl(file: Path, args: argparse.Namespace) -> dict[str, Any]:
     """A camera for Cycles."""
     from neurolens.shaders.blender_shader import shader_of
 
-    if partly or args.whole_camera or args.f_number is not None or args.focus != math.inf:
-        expected = "none of them: stop and focus are inputs of the shader, which is a whole camera"
-        raise InputError(
-            "neurolens export", "--fix, --only, --whole-camera, --focus, --f-number", "(with --to osl)", expected
-        )
-    check_writable(args.out)
     shader = shader_of(file, zoom=args.zoom, name=args.name, quiet=args.json)
     atomic_write_text(args.out, shader.text)
-    about = {
+    return {
         "function": shader.name, "inputs": shader.parameters, "operations_per_ray": shader.operations,
         "passing": shader.passing,
     }  # fmt: skip
-    return _answer(args, about)
 
 
-def _write_camera(file: Path, args: argparse.Namespace) -> Written:
-    """A whole camera, of a model or a lens file."""
+def _write_camera(file: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """The whole camera of a model or a lens file as source code."""
     from neurolens.base.progress import Progress
     from neurolens.cameras.build import Shot, make_camera
     from neurolens.graph.c import Extras
@@ -213,11 +219,11 @@ def _write_camera(file: Path, args: argparse.Namespace) -> Written:
             temporary.write_bytes(table.astype("<f4").tobytes())
         size = f"{table.shape[1]} wide, {len(table)} high"
         comment.append(f"outline: texture of one float a texel, {size}: {beside.name}, little-endian, line by line.")
-    return write_program(program, args.out, args.to, name, lines_of(comment), Extras(constants))
+    return _about(write_program(program, args.out, args.to, name, lines_of(comment), Extras(constants)))
 
 
 def _about(written: Written, bands_nm: Sequence[float] = ()) -> dict[str, Any]:
-    """What --json tells of source code."""
+    """What --json prints about source code."""
     s = written.signature
     return {
         "function": s.name,
@@ -227,13 +233,6 @@ def _about(written: Written, bands_nm: Sequence[float] = ()) -> dict[str, Any]:
         "bands_nm": bands_nm if s.bands > 1 else [],
         "operations_per_ray": written.operations,
     }
-
-
-def _answer(args: argparse.Namespace, about: dict[str, Any]) -> int:
-    data = {"file": str(args.out), "to": args.to, "bytes": args.out.stat().st_size, **about}
-    maps = about.get("inverse", {}).values()
-    said = [f"{m['file']}: finds {m['converged']:.3%} of the model's rays in three steps" for m in maps]
-    return answer(args, data, lambda: "\n".join([str(args.out), *said]))
 
 
 def model_file(path: Path) -> Path:
@@ -249,7 +248,7 @@ def model_file(path: Path) -> Path:
     found = [p for p in files if not p.name.startswith(".") and not p.name.endswith((".stop.onnx", ".scene.onnx"))]
     if len(found) != 1:
         names = ", ".join(str(p) for p in found) or "(none)"
-        raise InputError("neurolens export", str(path), f"({names})", "one exported model: name its file")
+        raise InputError(_COMMAND, str(path), f"({names})", "one exported model: name its file")
     return found[0]
 
 
@@ -257,90 +256,25 @@ def _parts(text: str) -> list[str]:
     parts = [word.strip() for word in text.split(",")]
     unknown = [p for p in parts if p not in _PARTS]
     if unknown or "ray" not in parts:
-        raise InputError("neurolens export", "--only", text, f"ray, and of {', '.join(_PARTS[1:])} what is wanted")
+        raise InputError(_COMMAND, "--only", text, f"ray, and of {', '.join(_PARTS[1:])} what is wanted")
     return parts
 
 
-def _given(texts: list[str]) -> dict[str, list[float]]:
-    found: dict[str, list[float]] = {}
+def _fixed(texts: list[str]) -> dict[str, list[float]]:
+    """The numbers of --fix by name."""
+    fixed: dict[str, list[float]] = {}
     for text in texts:
         key, _, value = text.partition("=")
         try:
             numbers = [float(v) for v in value.split(",")]
         except ValueError:
             numbers = []
-        infinite = key == "focus"
-        good = bool(numbers) and all(v > 0 and (infinite or math.isfinite(v)) for v in numbers)
-        if key not in _FIXED or key in found or not good or (key != "wavelengths" and len(numbers) > 1):
+        good = bool(numbers) and all(v > 0 and (key == "focus" or math.isfinite(v)) for v in numbers)
+        if key not in _FIXED or key in fixed or not good or (key != "wavelengths" and len(numbers) > 1):
             expected = f"KEY=NUMBER with KEY of {', '.join(_FIXED)} (wavelengths: a list), each once, above 0"
-            raise InputError("neurolens export", "--fix", text, expected)
-        found[key] = numbers
+            raise InputError(_COMMAND, "--fix", text, expected)
+        fixed[key] = numbers
     for pair in (("film_z", "focus"), ("stop", "f_number")):
-        if all(key in found for key in pair):
-            raise InputError("neurolens export", "--fix", f"(both {' and '.join(pair)})", "one of them")
-    return found
-
-
-def _fix(given: dict[str, list[float]], model: LensModel) -> Fix:
-    from neurolens.lens.paraxial import film_z_mm
-    from neurolens.setting.focusing import best_focus_z_mm
-    from neurolens.setting.states import set_lens
-    from neurolens.surrogates.specialise import Fix
-
-    film_z = given.get("film_z", [None])[0]
-    stop = given.get("stop", [None])[0]
-    if "f_number" in given:
-        stop = set_lens(model.lens, f_number=given["f_number"][0]).stop_radius_mm
-    if "focus" in given:
-        focus_m, lens = given["focus"][0], model.lens if stop is None else model.lens.with_stop_radius(stop)
-        Fix(film_z_mm=film_z_mm(lens, focus_m)).check(model.domain)
-        near, far = model.domain.film_z_mm
-        film_z = min(max(best_focus_z_mm(lens, focus_m), near), far)
-    return Fix(tuple(given.get("wavelengths", ())), film_z, stop)
-
-
-def _write_onnx(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] | None, derivatives: bool) -> None:
-    """The graph with its card: the errors of the card given, or measured anew for what was fixed."""
-    from neurolens.cameras.model import load_model
-    from neurolens.study.measure import fresh_rays, measure_on
-    from neurolens.surrogates.export import export_onnx
-
-    if len(models) > 1:
-        wavelengths = [m.domain.wavelength_nm[0] for m in models]
-        raise InputError("neurolens export", "--fix wavelengths", wavelengths, "one wavelength for an ONNX file")
-    model = models[0]
-    if card is not None:
-        export_onnx(model, out, card["errors"], derivatives=derivatives)
-        return
-    seed, held_out = _seed(model), _pairs(model, train=1).held_out
-    with atomic_path(out) as measured:  # a file without its errors never has the final name
-        export_onnx(model, measured, {})
-        rays = fresh_rays(model.lens, model.domain, held_out, count=_VIGNETTING, seed=seed + 1)
-        errors = measure_on(rays, load_model(measured))
-        export_onnx(model, measured, errors, derivatives=derivatives)
-
-
-def _write_inverse(model: LensModel, out: Path) -> dict[str, Any]:
-    """Both inverse maps beside the model's file: their files, and the share of fresh rays that each finds."""
-    from neurolens.cameras.model import load_model
-    from neurolens.surrogates.export import export_inverse
-    from neurolens.surrogates.inverse_fit import convergence, fit_inverse
-
-    pairs = _pairs(model, train=_TRAIN)
-    inverse = fit_inverse(model, pairs)
-    found = convergence(inverse, pairs.held_out.inputs)
-    files = export_inverse(inverse, out, load_model(out).card["errors"])
-    return {"inverse": {n: {"file": str(f), **found[n]} for n, f in zip(("stop", "scene"), files, strict=True)}}
-
-
-def _seed(model: LensModel) -> int:
-    from neurolens.study.measure import FRESH
-
-    return int(model.settings.get("rays_seed") or 0) + FRESH
-
-
-def _pairs(model: LensModel, train: int) -> RayPairs:
-    from neurolens.surrogates.pairs import PairSettings, make_pairs
-
-    settings = PairSettings(train=train, held_out=_HELD_OUT, rim=train, seed=_seed(model))
-    return make_pairs(model.lens, model.domain, settings)
+        if all(key in fixed for key in pair):
+            raise InputError(_COMMAND, "--fix", f"(both {' and '.join(pair)})", "one of them")
+    return fixed

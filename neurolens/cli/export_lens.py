@@ -1,4 +1,7 @@
-"""The exact lens of a file as source code: one zoom position, or all of them as an argument."""
+"""The parts of `neurolens export` that need torch: exact lenses, models with fixed inputs, ONNX, and inverse maps.
+
+The exact lens of a file is source code for one zoom position, or for all of them as an argument.
+"""
 
 from __future__ import annotations
 
@@ -7,26 +10,36 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from neurolens import __version__
 from neurolens.base import status as st
 from neurolens.base.bounds import RANGE
+from neurolens.base.errors import InputError
+from neurolens.base.files import atomic_path
 from neurolens.base.progress import Progress
+from neurolens.cameras.model import load_model
 from neurolens.graph.c import Extras
 from neurolens.graph.program import Program
 from neurolens.graph.scalars import lower
 from neurolens.lens.paraxial import film_z_mm, first_order
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any
-from neurolens.setting.focusing import best_focus_of_stops_mm, focus_states
+from neurolens.setting.focusing import best_focus_of_stops_mm, best_focus_z_mm, focus_states
 from neurolens.setting.pupils import image_radius_mm, pupil_bounds, pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.shaders.focus_function import Array, Focusing
 from neurolens.shaders.source import film_extras, followed, state_ranges
+from neurolens.study.measure import FRESH, fresh_rays, measure_on
 from neurolens.surrogates.axes import Axis, weights
+from neurolens.surrogates.export import export_inverse, export_onnx
+from neurolens.surrogates.inverse_fit import convergence, fit_inverse
+from neurolens.surrogates.model import LensModel
+from neurolens.surrogates.pairs import PairSettings, RayPairs, make_pairs
 from neurolens.surrogates.source import Written, checked_name, lines_of, write_program
+from neurolens.surrogates.specialise import Fix, fixed_models
 from neurolens.surrogates.stategraph import mixture_of
 from neurolens.surrogates.states import gap_axis, zoom_axis
 from neurolens.trace.tracegraph import TRANSMITTANCE, exact_graph
@@ -35,12 +48,14 @@ _LIGHT_NM = (400.0, 700.0)
 _NEAR_EFL = 10.0  # nearest focus of the function of that, in focal lengths
 _DISTANCES = 12  # about as many are placed for each lens
 _CHECKED = (0.12, 0.42, 0.83)  # of the range: where the film's position is measured
+# Rays for the errors of an ONNX file with fixed inputs; rays to fit inverse maps.
+_HELD_OUT, _VIGNETTING, _TRAIN = 20_000, 100_000, 15_000
 
 
 def write_lens(
     file: Path, out: Path, to: str, *, name: str | None = None, zoom: str | None = None, quiet: bool = False
 ) -> Written:  # fmt: skip
-    """The lens as a function of film and pupil point, wavelength, film position, stop radius and, of a range, zoom.
+    """Write a lens as a function of film and pupil point, wavelength, film position, stop radius and, of a range, zoom.
 
     Args:
         to: "c" or "glsl". name: of the function, None takes the lens's id. zoom: a state of `set_lens`, or "range".
@@ -152,3 +167,54 @@ def focusing_of(lens: Lens, nearest_m: float, tick: Callable[[], None]) -> Focus
         return best_focus_of_stops_mm(lens, focus_m, stops_mm.tolist(), _LIGHT_NM)
 
     return Focusing(nearest_m, float(lens.stop_radius_mm), lambda focus_m: film_z_mm(lens, focus_m), best)
+
+
+def fixed_model(fixed: dict[str, list[float]], model: LensModel) -> tuple[Fix, tuple[LensModel, ...]]:
+    """What the numbers of --fix fix, by name, and the models that know it."""
+    film_z = fixed.get("film_z", [None])[0]
+    stop = fixed.get("stop", [None])[0]
+    if "f_number" in fixed:
+        stop = set_lens(model.lens, f_number=fixed["f_number"][0]).stop_radius_mm
+    if "focus" in fixed:
+        focus_m, lens = fixed["focus"][0], model.lens if stop is None else model.lens.with_stop_radius(stop)
+        Fix(film_z_mm=film_z_mm(lens, focus_m)).check(model.domain)
+        near, far = model.domain.film_z_mm
+        film_z = min(max(best_focus_z_mm(lens, focus_m), near), far)
+    fix = Fix(tuple(fixed.get("wavelengths", ())), film_z, stop)
+    return fix, fixed_models(model, fix)
+
+
+def write_onnx_model(models: tuple[LensModel, ...], out: Path, card: dict[str, Any] | None, derivatives: bool) -> None:
+    """Write a model as ONNX, with the errors of its card, or with new ones where something was fixed (None)."""
+    if len(models) > 1:
+        wavelengths = [m.domain.wavelength_nm[0] for m in models]
+        raise InputError("neurolens export", "--fix wavelengths", wavelengths, "one wavelength for an ONNX file")
+    model = models[0]
+    if card is not None:
+        export_onnx(model, out, card["errors"], derivatives=derivatives)
+        return
+    seed, held_out = _seed(model), _pairs(model, train=1).held_out
+    with atomic_path(out) as measured:  # a file without its errors never has the final name
+        export_onnx(model, measured, {})
+        rays = fresh_rays(model.lens, model.domain, held_out, count=_VIGNETTING, seed=seed + 1)
+        errors = measure_on(rays, load_model(measured))
+        export_onnx(model, measured, errors, derivatives=derivatives)
+
+
+def write_inverse(model: LensModel, out: Path) -> dict[str, Any]:
+    """Write both inverse maps beside the model's file; returns their files and the share of fresh rays that each
+    finds."""
+    pairs = _pairs(model, train=_TRAIN)
+    inverse = fit_inverse(model, pairs)
+    converged = convergence(inverse, pairs.held_out.inputs)
+    files = export_inverse(inverse, out, load_model(out).card["errors"])
+    return {"inverse": {n: {"file": str(f), **converged[n]} for n, f in zip(("stop", "scene"), files, strict=True)}}
+
+
+def _seed(model: LensModel) -> int:
+    return int(model.settings.get("rays_seed") or 0) + FRESH
+
+
+def _pairs(model: LensModel, train: int) -> RayPairs:
+    settings = PairSettings(train=train, held_out=_HELD_OUT, rim=train, seed=_seed(model))
+    return make_pairs(model.lens, model.domain, settings)

@@ -18,8 +18,7 @@ import torch
 
 from neurolens.base.errors import InputError
 from neurolens.base.html import text_of
-from neurolens.cli import main
-from neurolens.cli import view as view_command
+from neurolens.cli import main, view_run
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.osl import urgent
@@ -301,7 +300,7 @@ def test_bad_input_is_one_line_and_no_page(
 def test_two_files_of_ghosts_of_one_lens_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(view_command, "_flare", lambda _: SimpleNamespace(lens=SimpleNamespace(lens_id=LENS)))
+    monkeypatch.setattr(view_run, "_ghosts", lambda _: SimpleNamespace(lens=SimpleNamespace(lens_id=LENS)))
     files = [tmp_path / "a.onnx", tmp_path / "b.onnx"]
     for file in files:
         file.touch()

@@ -1,0 +1,224 @@
+"""What `neurolens view` does: it finds lenses with their models and ghosts, writes their code, and the page."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from neurolens.analysis.fields import Scene
+from neurolens.analysis.layout import layout_profile
+from neurolens.base.bounds import RANGE
+from neurolens.base.errors import InputError, ModelError, NeurolensError, NeurolensWarning
+from neurolens.base.files import TemporaryFolder
+from neurolens.base.files import library as shipped
+from neurolens.base.lensname import is_model
+from neurolens.base.progress import Progress
+from neurolens.cameras.onnxlens import load_model
+from neurolens.cli.blender_lenses import card_of, forms_of, key_of, kind_of, library, squeeze_of
+from neurolens.cli.export_lens import write_lens
+from neurolens.cli.output import answer
+from neurolens.flare.ghostmodel import KIND, GhostModel, read_ghosts
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
+from neurolens.readers import lenswriter
+from neurolens.readers.any_format import read_any
+from neurolens.setting.pupils import image_radius_mm, pupil_plane_z_mm
+from neurolens.setting.states import set_lens
+from neurolens.shaders.source import model_extras
+from neurolens.surrogates.metadata import card_in, read_metadata
+from neurolens.surrogates.source import Written, export_source
+from neurolens.view.page import Form, ViewLens, section_svg, write_page
+from neurolens.view.shaders import ghosts_glsl, path_glsl
+
+_ERRORS = ("rms_um", "p99_um", "rms_infinity_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
+_LIGHT_NM = (400.0, 700.0)
+_NEAR_EFL = 10.0  # of an exact lens: nearest focus in focal lengths
+_SAME = 1e-3  # of the focal length: what models and lens file of one id may differ by
+_GHOSTS = 24  # of a lens at most: the brightest
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A lens with its models, in one state; `zoom` "range" is all of a zoom. `file` holds the lens for writers."""
+
+    key: str
+    models: Sequence[Path]
+    lens: Lens | None
+    zoom: str | None = None
+    ghosts: GhostModel | None = None
+    file: Path | None = None
+
+
+def run_view(args: argparse.Namespace) -> int:
+    """Write the page."""
+    entries = list(_named(args.lenses) if args.lenses else _library())
+    for entry in entries:
+        own = [kind_of(card_of(file)) for file in entry.models]
+        if len(set(own)) < len(own):
+            raise InputError("neurolens view", entry.key, f"({' and '.join(own)})", "one model of each kind")
+    kinds, progress = args.downloads, Progress(quiet=args.json)
+    made: list[ViewLens] = []
+    with TemporaryFolder() as place, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", re.escape(place), NeurolensWarning)  # the lens's own file has warned already
+        entries = [_with_file(entry, Path(place) / str(number)) for number, entry in enumerate(entries)]
+        shaders = _shaders(entries, args.jobs, progress) if "osl" in kinds else {}
+        with progress.stage(f"{len(entries)} lenses") as report:
+            for entry in entries:
+                made.append(_view_lens(entry, Path(place), kinds, shaders))
+                report(len(made) / len(entries))
+    about = write_page(args.out, made, kinds)
+    left = about["left_out"]
+    data = {"file": str(args.out), **about, "lenses": [lens.key for lens in made]}
+    more = f"; left out for its size: {', '.join(left)}" if left else ""
+    return answer(args, data, lambda: f"{args.out}: {len(made)} lenses, {about['bytes'] / 1e6:.2f} MB{more}")
+
+
+def _with_file(entry: _Entry, folder: Path) -> _Entry:
+    if entry.lens is None:
+        return entry
+    folder.mkdir()
+    file = folder / f"{entry.lens.lens_id}.toml"
+    lenswriter.write_lens(entry.lens, file)
+    return replace(entry, file=file)
+
+
+def _shaders(entries: Sequence[_Entry], jobs: int, progress: Progress) -> Mapping[Path, str]:
+    """OSL of lens files and models. A warning names those that cannot be OSL, which are left out."""
+    zooms = {e.file: e.zoom for e in entries if e.file is not None}
+    files = [*zooms, *(model for entry in entries for model in entry.models)]
+    with progress.stage("shaders") as report:
+        forms, left = forms_of(files, min(jobs, len(files)), report, zooms)
+    for file, why in left.items():
+        warnings.warn(f"no OSL: {why.replace(str(file), file.name)}", NeurolensWarning, stacklevel=2)
+    return {file: form.osl for file, form in forms.items()}
+
+
+def _library() -> Iterator[_Entry]:
+    """Every lens of lenses/ with its best models; zooms over their range where a model has it."""
+    root = shipped()
+    for models, file in library(root / "models", root / "lenses", ()):
+        base, _, state = key_of(models[0]).partition("-")
+        if state in ("", "range"):  # other states are second models of a lens that is here already
+            file = file or root / "lenses" / f"{base}.toml"
+            lens = read_any(file) if file.is_file() else None
+            yield _Entry(key_of(models[0]), models, lens, RANGE if state else None)
+
+
+def _named(paths: Sequence[Path]) -> Iterator[_Entry]:
+    """Lenses in the order of their first word; models join the lens of their id, in place of those of the library."""
+    root = shipped()
+    lenses: dict[str, Lens | None] = {}
+    models: dict[str, list[Path]] = {}
+    from_library: dict[str, list[Path]] = {}
+    ghosts: dict[str, GhostModel] = {}
+    for path in paths:
+        if is_model(path) and (model := _ghosts(path)):
+            if ghosts.setdefault(model.lens.lens_id, model) is not model:
+                raise InputError("neurolens view", f"ghosts of {model.lens.lens_id}", str(path), "one file a lens")
+        elif is_model(path):
+            lens_id = str(card_of(path)["lens"]["id"])
+            lenses.setdefault(lens_id, None)
+            models.setdefault(lens_id, []).append(path)
+        else:
+            lens = read_any(path)
+            lenses[lens.lens_id] = lens
+            ours = path.resolve().parent == (root / "lenses").resolve()  # a lens of the library brings its models
+            if ours and any((root / "models").glob(f"{path.stem}.*.onnx")):
+                ((from_library[lens.lens_id], _),) = library(root / "models", root / "lenses", [path.stem])
+    for lens_id in ghosts.keys() - lenses.keys():
+        raise InputError("neurolens view", f"ghosts of {lens_id}", "(no such lens)", "the lens beside its ghosts")
+    for lens_id, lens_or_none in lenses.items():
+        own = models.get(lens_id) or from_library.get(lens_id, [])
+        zoom = RANGE if any(card_of(m).get("states") for m in own) else None
+        yield _Entry(lens_id, own, lens_or_none, zoom, ghosts.get(lens_id))
+
+
+def _ghosts(file: Path) -> GhostModel | None:
+    """The ghosts of a file of fitted ghosts; None of a file of another kind."""
+    try:
+        card_in(file, read_metadata(file), KIND)
+    except ModelError:
+        return None
+    return read_ghosts(file)
+
+
+def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str], shaders: Mapping[Path, str]) -> ViewLens:
+    """A lens of the page.
+
+    Raises:
+        InputError: models of another state; a lens that the exact tracer's code cannot hold, without any model.
+    """
+    forms = [_model_form(file, folder, kinds, shaders.get(file)) for file in entry.models]
+    section: dict[str, Any] = {}
+    path, squeeze = None, 1.0
+    if entry.lens is not None and entry.file is not None:
+        lens = set_lens(entry.lens) if entry.zoom == RANGE else set_lens(entry.lens, zoom=entry.zoom)
+        try:
+            forms.append(_exact_form(entry.zoom, entry.file, lens, kinds, shaders.get(entry.file)))
+            path = path_glsl(lens, pupil_plane_z_mm(lens), _LIGHT_NM) if entry.zoom != RANGE else None
+        except NeurolensError:
+            if not forms:
+                raise  # a model of the lens stands in for it
+        section, squeeze = section_svg(replace(layout_profile(Scene(lens, axis="y")), rays=())), squeeze_of(lens)
+    best, focal_mm = forms[0], [float(f.card["efl_mm"]) for f in forms]
+    if entry.zoom != RANGE and max(focal_mm) - min(focal_mm) > _SAME * abs(focal_mm[0]):
+        raise InputError("neurolens view", f"{entry.key}: efl_mm", focal_mm, "models of the lens file, in its state")
+    return ViewLens(
+        entry.key, str(best.card["name"]), str(best.card["source"]), float(best.card["efl_mm"]),
+        min(float(f.card["film_radius_mm"]) for f in forms), squeeze, best.card["f_numbers"],
+        max(float(f.card["nearest_m"]) for f in forms), section, path, forms,
+        None if entry.ghosts is None else ghosts_glsl(entry.ghosts, _GHOSTS),
+    )  # fmt: skip
+
+
+def _model_form(file: Path, folder: Path, kinds: Sequence[str], osl: str | None) -> Form:
+    loaded = load_model(file)
+    card, domain, errors = loaded.card, loaded.card["domain"], loaded.card["errors"]
+    if any(axis.name != "zoom" for axis in loaded.axes):
+        raise InputError(file, "states", [axis.name for axis in loaded.axes], "a zoom, or a model of one state")
+    extras, notes = model_extras(loaded)
+    written = [
+        export_source(loaded.file.nodes, folder / f"model.{to}", to, card, extras=extras, notes=notes)
+        for to in ("glsl", "c")
+        if to in kinds
+    ]
+    states = [node["lens"] for node in card["states"]["nodes"]] if card.get("states") else [card["lens"]]
+    facts = {
+        **{key: card["lens"][key] for key in ("name", "source", "efl_mm")},
+        "film_radius_mm": domain["film_radius_mm"],
+        "nearest_m": domain["focus_m"][1],
+        "f_numbers": [(float(lens["efl_mm"]), float(lens["f_number"])) for lens in states],
+        "errors": {key: errors[key] for key in _ERRORS if isinstance(errors.get(key), (int, float))},
+        "zones": errors.get("zones") or {},
+        "poor": list(errors.get("poor") or ()),
+    }
+    return _form(kind_of(card), str(card["fit"]["method"]), written, facts, {"onnx": file.read_bytes()}, osl)
+
+
+def _exact_form(zoom: str | None, file: Path, lens: Lens, kinds: Sequence[str], osl: str | None) -> Form:
+    written = [
+        write_lens(file, file.with_suffix(f".{to}"), to, zoom=zoom, quiet=True) for to in ("glsl", "c") if to in kinds
+    ]
+    data = first_order(lens)
+    facts = {
+        "name": lens.name, "source": lens.source, "efl_mm": float(data.efl_mm),
+        "film_radius_mm": image_radius_mm(lens)[0],
+        "nearest_m": _NEAR_EFL * abs(float(data.efl_mm)) / 1000 * 1.05,
+        "f_numbers": [(float(data.efl_mm), float(data.f_number))],
+        "errors": {}, "zones": {}, "poor": [],
+    }  # fmt: skip
+    return _form("exact", "every surface traced", written, facts, {}, osl)
+
+
+def _form(
+    kind: str, method: str, written: Sequence[Written], facts: dict[str, Any], files: dict[str, bytes], osl: str | None
+) -> Form:
+    glsl, *others = written
+    files |= {w.path.suffix.removeprefix("."): w.path.read_bytes() for w in others}
+    files |= {} if osl is None else {"osl": osl.encode()}
+    return Form(kind, method, glsl.path.read_text("utf-8"), glsl.signature, facts, files)
