@@ -8,7 +8,7 @@ memory. An answer must depend on its task alone, because a cluster starts a task
         for task, answer in run_each(executor, work, tasks):
             print(task, answer.reason if isinstance(answer, Failed) else answer)
 
-The workers of a render (`render.workers`) are not tasks: they are forked because they add to one film in shared memory.
+The workers of a render (`render.renderer`) are not tasks: they are forked, so that each has the scene without a copy.
 """
 
 from __future__ import annotations

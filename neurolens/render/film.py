@@ -1,28 +1,20 @@
-"""The film: film points of pixels, and the accumulated sums.
-
-Sums of every pixel, by tiles and passes, lie in memory that forked workers share.
-"""
+"""The film: the film points of pixels, and the sums of every pixel, which grow by tiles and passes."""
 
 from __future__ import annotations
 
 import mmap
-import multiprocessing
 import os
-import sys
+import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.errors import InputError
 from neurolens.base.kept import CHUNK_BYTES
 from neurolens.cameras.contract import FloatArray
 
-FORKS = sys.platform.startswith("linux")
-CONTEXT: Any = multiprocessing.get_context("fork" if FORKS else None)
 BATCH = 32768  # paths; fewer, and calling numpy costs more than computing; many more, and their state leaves the cache
 SAMPLES_A_PASS = 16
 
@@ -31,7 +23,6 @@ SAMPLES_A_PASS = 16
 RGB, LUMINANCE2, DEPTH, HITS, PASSED, DROPPED, COLUMNS = slice(0, 3), 3, 4, 5, 6, 7, 8
 # Of a render in the main process: the sums, and at the end picture and layers, in the writer's order too.
 BYTES_A_PIXEL = 8 * COLUMNS + 100
-_LONGEST_WAIT_S = 5.0
 # Larger deviations from square pixels are taken as mistakes, unless no whole number comes nearer.
 _ASPECT_TOLERANCE = 0.02
 
@@ -80,15 +71,6 @@ def check_memory(width: int, height: int, bytes_a_pixel: int = BYTES_A_PIXEL) ->
     if width * height * bytes_a_pixel > most:
         expected = f"at most {most // bytes_a_pixel} pixels: each takes {bytes_a_pixel} bytes, of {most / 1e9:.3g} GB"
         raise InputError("picture", "width x height", (width, height), expected)
-
-
-def shared(shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
-    """Zeros that forked workers share; MemoryError where there is not enough of it."""
-    size = int(np.prod(shape, dtype=np.float64)) * np.dtype(dtype).itemsize
-    try:
-        return np.frombuffer(mmap.mmap(-1, size), dtype).reshape(shape)
-    except (OSError, OverflowError, ValueError):
-        raise MemoryError(f"{size} bytes") from None
 
 
 @dataclass(frozen=True)
@@ -143,43 +125,64 @@ class Tiling:
 
 
 class Film:
-    """Sums of the pixels and how many passes are in them.
-
-    Sums and passes of a tile change together, with the lock held: whoever copies them under the lock has a whole tile,
-    and a worker that is killed without the lock leaves no tile half done.
+    """The sums of the pixels, and which passes are in them; several threads may use one film.
 
     Attributes:
-        sums: [pixels, COLUMNS] float64. done: [tiles] passes finished.
+        sums: [pixels, COLUMNS] float64. done: [tiles] passes that are in the sums.
+        seconds: [2] spent by all workers: in the camera, and in all.
+
+    Raises:
+        MemoryError: there is not enough memory for the sums.
     """
 
     def __init__(self, tiling: Tiling) -> None:
         self.tiling = tiling
-        self.sums = shared((tiling.pixels, COLUMNS), np.float64)
-        self.done = shared((tiling.tiles,), np.int64)
-        self.lock = CONTEXT.Lock()
-
-    def add(self, tile: int, sums: NDArray[np.float64]) -> None:
-        """Add one pass to a tile."""
-        with self.lock:
-            self.sums[self.tiling.pixels_of(tile)] += sums
-            self.done[tile] += 1
-
-    @contextmanager
-    def held(self) -> Iterator[None]:
-        """Block changes of all tiles inside the block; NeurolensError where a worker was killed that held the lock."""
-        if not self.lock.acquire(timeout=_LONGEST_WAIT_S):
-            raise NeurolensError("a render worker was killed while it wrote to the film")
+        size = tiling.pixels * COLUMNS * 8
         try:
-            yield
-        finally:
-            self.lock.release()
+            # A shared mapping: forked workers, which do not use it, would else keep a second copy of each page.
+            self.sums = np.frombuffer(mmap.mmap(-1, size), np.float64).reshape(-1, COLUMNS)
+        except (OSError, OverflowError, ValueError):
+            raise MemoryError(f"{size} bytes") from None
+        self.done = np.zeros(tiling.tiles, np.int64)
+        self.seconds = np.zeros(2)
+        self._lock = threading.Lock()
+        self._early: dict[tuple[int, int], NDArray[np.float64]] = {}
+        self._missing = self._all_missing()
+
+    def _all_missing(self) -> Iterator[tuple[int, int]]:
+        for part in range(self.tiling.passes):
+            for tile in range(self.tiling.tiles):
+                if self.done[tile] <= part:  # else it was done before a checkpoint
+                    yield tile, part
+
+    def take(self) -> tuple[int, int] | None:
+        """The next tile and pass to render, all tiles of one pass before the next pass; None: there is no more."""
+        with self._lock:
+            return next(self._missing, None)
+
+    def stop(self) -> None:
+        """Give out no more tiles."""
+        with self._lock:
+            self._missing = iter(())
+
+    def add(self, tile: int, part: int, sums: NDArray[np.float64], seconds: NDArray[np.float64]) -> None:
+        """Add the sums [pixels, COLUMNS] of a pass of a tile, and the seconds [2] that it took.
+
+        A pass waits here for those before it: sums are always added in the same order, and so round the same.
+        """
+        with self._lock:
+            self.seconds += seconds
+            self._early[tile, part] = sums
+            while (ready := self._early.pop((tile, int(self.done[tile])), None)) is not None:
+                self.sums[self.tiling.pixels_of(tile)] += ready
+                self.done[tile] += 1
 
     def copy(self, first: int, stop: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Sums [n, COLUMNS] of the pixels, and passes, of the tiles from `first` up to `stop`."""
-        with self.held():
+        """Sums [n, COLUMNS] of the pixels, and passes, of the tiles from `first` up to `stop`, of one moment."""
+        with self._lock:
             return self.sums[self.tiling.pixels_of(first, stop)].copy(), self.done[first:stop].copy()
 
     @property
     def fraction(self) -> float:
-        """Share of the work that is done."""
+        """The share of the work that is done."""
         return float(self.done.sum()) / (self.tiling.tiles * self.tiling.passes)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
 from neurolens.render import film as columns
 from neurolens.render.colour import SRGB, balance, converted
-from neurolens.render.film import Film, PixelGrid, Tiling, shared
+from neurolens.render.film import Film, PixelGrid, Tiling
 from neurolens.render.film_settings import FilmSettings
 from neurolens.render.integrator import lit, trace
 from neurolens.render.sampler import FILM, PUPIL, WAVELENGTH, Sampler
@@ -36,7 +36,7 @@ def camera_axes(settings: CameraSettings) -> FloatArray:
 
 
 class Job:
-    """One render: the scene made ready, and memory shared by the workers.
+    """One render: the scene made ready for the workers, and the film.
 
     Attributes:
         scene, camera, grid, seed, max_depth, settings: as requested; settings are those of the film.
@@ -45,8 +45,6 @@ class Job:
         rows: first row and the one after the last, of the part of the picture that is rendered; own: its pixels among
             those of the tiles, which may begin before it and end after it.
         paths_a_sample: lanes of a sample; film: see `Film`.
-        seconds: [2] of all workers: in the camera, and total.
-        message: text of a worker's error. stop: set to end the work early.
     """
 
     def __init__(
@@ -82,8 +80,6 @@ class Job:
         self.tiling = Tiling.of(grid.width * grid.height, samples).around(first, stop)
         self.own = slice(first - self.tiling.start, stop - self.tiling.start)
         self.film = Film(self.tiling)
-        self.seconds = shared((2,), np.float64)
-        self.message, self.stop = shared((4096,), np.uint8), shared((1,), np.uint8)
 
     def asked(self) -> dict[str, Any]:
         """What the picture depends on besides scene and camera, for its metadata and its checkpoint."""
@@ -92,8 +88,9 @@ class Job:
         size = {"width": self.grid.width, "height": self.grid.height}
         return {**size, "seed": self.seed, "max_depth": self.max_depth, **settings}
 
-    def render_tile(self, camera: Camera, tile: int, part: int) -> tuple[NDArray[np.float64], float]:
-        """Sums [pixels, columns] of one pass of one tile, and the seconds that the camera took."""
+    def render_tile(self, camera: Camera, tile: int, part: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Sums [pixels, columns] of one pass of one tile, and the seconds [2] spent in the camera, and in all."""
+        began = time.perf_counter()
         within = self.tiling.pixels_of(tile)
         step = self.tiling.step
         pixels = np.arange(within.start, within.stop) + self.tiling.start
@@ -120,7 +117,7 @@ class Job:
         passed = np.zeros(len(hue), np.bool_)
         passed[lit(weight)] = True
         sums[:, columns.PASSED] = np.count_nonzero(passed.reshape(shape), axis=1)
-        return sums, answered - asked
+        return sums, np.array([answered - asked, time.perf_counter() - began])
 
     def _sum_light(self, sums: NDArray[np.float64], value: FloatArray, bins: Index, shape: tuple[int, int]) -> None:
         """Colour, and the squared luminance of each sample, whose paths are together.

@@ -257,7 +257,7 @@ def test_a_picture_on_its_way_is_divided_by_what_each_tile_has(monkeypatch: pyte
     assert (job.tiling.tiles, job.tiling.passes) == (9, 3)
     for tile, passes in ((0, 3), (1, 1), (8, 2)):
         for part in range(passes):
-            job.film.add(tile, job.render_tile(job.camera, tile, part)[0])
+            job.film.add(tile, part, *job.render_tile(job.camera, tile, part))
     rgb, layers = develop(job)
     samples = np.repeat([40, 16, 0, 0, 0, 0, 0, 0, 32], 100)[: 36 * 24].reshape(24, 36)
     assert np.array_equal(layers.samples, samples)
