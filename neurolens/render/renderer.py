@@ -282,7 +282,8 @@ def run(job: Job, workers: int, watch: Callable[[], bool] | None = None) -> None
     forks = _FORKS and not multiprocessing.current_process().daemon  # such as a worker of Dask: it may have no children
     with held():  # inherited by forked workers: only this process handles Ctrl-C
         forked = [_Forked(job, k, workers) for k in range(workers)] if forks else []
-    renderers = [worker.render for worker in forked] or [_renderer(job) for _ in range(workers)]
+    renderers: list[RenderTile] = [worker.render for worker in forked]
+    renderers = renderers or [_renderer(job) for _ in range(workers)]
     with ThreadPoolExecutor(workers) as threads:
         running = {threads.submit(_drive, job.film, render) for render in renderers}
         try:
