@@ -33,9 +33,9 @@ from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.onnxlens import load_model
 from neurolens.readers.lensfile import read_lens
-from neurolens.render.film_settings import FilmSettings
 from neurolens.render.renderer import render
 from neurolens.render.scene import CameraSettings, Scene, files_named, load_scene
+from neurolens.render.settings import FilmSettings
 from neurolens.study import scenes
 from neurolens.study.image import EPS, flip, flip_map
 from neurolens.surrogates.model import Domain

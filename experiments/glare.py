@@ -39,7 +39,7 @@ from neurolens.lens.apertures import Aperture
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.readers.lensfile import read_lens
-from neurolens.render.flaresettings import FlareSettings, Scatter
+from neurolens.render.settings import FlareSettings, Scatter
 from neurolens.setting.states import set_lens
 
 LENS, NM, HALF_MM = "laikin_double_gauss_50", 550.0, (18.0, 12.0)

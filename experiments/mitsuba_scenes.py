@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.mitsuba.library import matrix
-from neurolens.render.illuminants import table
+from neurolens.render.colour import table
 from neurolens.render.scene import Scene, scene_from_tables
 
 _SKIPPED = ("type", "integrator", "sensor")

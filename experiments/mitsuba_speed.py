@@ -37,9 +37,9 @@ from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.mitsuba import require_mitsuba
 from neurolens.mitsuba.library import libraries
-from neurolens.render.film_settings import FilmSettings
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene, load_scene
+from neurolens.render.settings import FilmSettings
 
 FOCAL_MM = 50.0
 FOCUS_M, F_NUMBER = 3.9, 2.0

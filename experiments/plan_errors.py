@@ -30,9 +30,9 @@ from neurolens.plan import footprints as prints
 from neurolens.plan.footprints import Footprints, Places
 from neurolens.plan.light import parts_of, spectrum_seen
 from neurolens.plan.probe import COUNTED
-from neurolens.render.film_settings import FilmSettings
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene
+from neurolens.render.settings import FilmSettings
 from neurolens.study.scenes import seen_depths_m
 
 Array = NDArray[np.float64]

@@ -29,10 +29,10 @@ from neurolens.base.progress import Progress
 from neurolens.cameras.build import FUSED, Shot, make_camera
 from neurolens.cameras.contract import RAYS_A_CALL, Camera
 from neurolens.lens.apertures import Aperture
-from neurolens.render.film_settings import FilmSettings
-from neurolens.render.pictures import make_aperture
+from neurolens.render.images import make_aperture
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene, load_scene
+from neurolens.render.settings import FilmSettings
 
 PINHOLE, THIN, STOP = "pinhole", "thin lens", "stop only"
 TORCH, EXACT_C = "exact, torch", "exact, C"

@@ -25,8 +25,8 @@ from neurolens.base.tomlfile import read_toml
 from neurolens.lens import catalogue
 from neurolens.readers.any_format import read_any
 from neurolens.readers.json_lens import image_and_field, read_json_lens
-from neurolens.render import pictures
-from neurolens.render.illuminants import illuminant, read_spectrum
+from neurolens.render import images, pictures
+from neurolens.render.colour import illuminant, read_spectrum
 from neurolens.render.meshfile import read_file
 
 ROOT = Path(__file__).parents[1]
@@ -137,18 +137,18 @@ def test_pictures_are_of_few_formats_whatever_their_name(tmp_path: Path) -> None
     for kind in ("EPS", "PDF", "GIF"):
         (tmp_path / "a.png").write_bytes(picture(kind))
         with pytest.raises(InputError, match="a readable picture, one of PNG, JPEG") as refused:
-            pictures.read_picture(tmp_path / "scene.toml", "file", tmp_path / "a.png")
+            images.read_picture(tmp_path / "scene.toml", "file", tmp_path / "a.png")
         assert "object at" not in str(refused.value)
 
 
 def test_pictures_have_a_budget_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.png").write_bytes(picture("PNG", (40, 30)))
     files = {field: tmp_path / "a.png" for field in ("first", "second")}
-    monkeypatch.setattr(pictures, "MOST_PIXELS", 2400)
-    assert len(pictures.read_pictures(tmp_path / "scene.toml", files)) == 2
-    monkeypatch.setattr(pictures, "MOST_PIXELS", 2399)
-    with pytest.raises(InputError, match="second: .*2399 pixels at most"):
-        pictures.read_pictures(tmp_path / "scene.toml", files)
+    monkeypatch.setattr(images, "MOST_PIXELS", 2400)
+    assert len(images.read_pictures(tmp_path / "scene.toml", files)) == 2
+    monkeypatch.setattr(images, "MOST_PIXELS", 2399)
+    with pytest.raises(InputError, match="second: .*at most 1199 pixels"):
+        images.read_pictures(tmp_path / "scene.toml", files)
     layers = {f"layer{k}": np.zeros((8, 8)) for k in range(153)}
     pictures.write_exr(tmp_path / "a.exr", np.zeros((8, 8, 3)), layers=layers)
     assert len(pictures.read_layers(tmp_path / "a.exr")) == 153
@@ -167,16 +167,16 @@ def test_damaged_chunks_of_a_png(chunk: bytes, content: bytes, tmp_path: Path) -
     bad = struct.pack(">I", len(content)) + said + struct.pack(">I", zlib.crc32(said))
     (tmp_path / "a.png").write_bytes(whole[:33] + bad + whole[33:])
     with suppress(InputError):
-        pictures.read_picture(tmp_path / "scene.toml", "file", tmp_path / "a.png")
+        images.read_picture(tmp_path / "scene.toml", "file", tmp_path / "a.png")
     with suppress(InputError):
-        pictures.read_mask(tmp_path / "a.png")
+        images.read_mask(tmp_path / "a.png")
 
 
 @pytest.mark.parametrize("name", ["a\0b", "\udfff\ud800", "a" * 300])
 def test_names_that_no_file_can_have(name: str, tmp_path: Path) -> None:
     with pytest.raises(OSError):
         open_regular(tmp_path / name)
-    for read in (read_toml, read_any, pictures.read_mask, pictures.read_exr, read_json_lens):
+    for read in (read_toml, read_any, images.read_mask, pictures.read_exr, read_json_lens):
         with pytest.raises(InputError):
             read(tmp_path / name)
     with pytest.raises(InputError):
@@ -269,5 +269,5 @@ def test_what_the_fuzzer_broke_is_one_line_or_no_fault(
     assert tag in good
     Path("scan.tif").write_bytes(good.replace(tag, other))
     with pytest.raises(InputError):
-        pictures.read_pictures(Path("scene.toml"), {"textures.scan.file": Path("scan.tif")})
+        images.read_pictures(Path("scene.toml"), {"textures.scan.file": Path("scan.tif")})
     assert capfd.readouterr().err == ""

@@ -32,7 +32,7 @@ from neurolens.cameras.vignetting import Vignetted
 from neurolens.lens.paraxial import film_z_mm, first_order
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.lensfile import read_lens
-from neurolens.render.pictures import make_aperture
+from neurolens.render.images import make_aperture
 from neurolens.render.scene import Scene
 from neurolens.setting.states import set_lens
 from neurolens.study.image import Image

@@ -211,7 +211,7 @@ def aperture_of(args: argparse.Namespace) -> Aperture | None:
     Raises:
         InputError: shapes that exclude each other, a picture that cannot be read.
     """
-    from neurolens.render.pictures import make_aperture
+    from neurolens.render.images import make_aperture
 
     return make_aperture(args.blades, args.blade_rotation, args.blade_curvature, args.aperture_mask)
 

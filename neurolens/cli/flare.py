@@ -25,8 +25,7 @@ from neurolens.cli.arguments import (
 )
 from neurolens.cli.render import film_size
 from neurolens.cli.render_frames import add_frames
-from neurolens.render.film_settings import FilmSettings
-from neurolens.render.flaresettings import FlareSettings
+from neurolens.render.settings import FilmSettings, FlareSettings
 
 _DESCRIPTION = """\
 Trace all ghosts of a lens exactly: light that two of its surfaces reflect on its way to the film, with

@@ -33,14 +33,19 @@ from neurolens.flare.ghosts import RANKED, Ghost, GhostTracer, ghost_layout, gho
 from neurolens.flare.layers import FlareJob, brightest, flare_layers, kept_beside, sum_of, with_coating
 from neurolens.flare.lights import SUN, Light, read_lights, with_disc
 from neurolens.flare.sources import KeptLights, SceneLights, chosen, highlights, keep_named
-from neurolens.frames.frame import Files
-from neurolens.frames.picture import flare_channels
+from neurolens.frames.frame import Files, flare_channels
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any
 from neurolens.render.colour import COLOUR_SPACES, SRGB, ColourSpace, conversion, converted
 from neurolens.render.environment import SUN_RADIUS_RAD
-from neurolens.render.exr_attributes import standard_attributes
-from neurolens.render.pictures import read_colour_space, read_exr, read_metadata, write_exr, write_png
+from neurolens.render.pictures import (
+    read_colour_space,
+    read_exr,
+    read_metadata,
+    standard_attributes,
+    write_exr,
+    write_png,
+)
 from neurolens.render.scene import Scene, files_named, load_scene, seen_from
 from neurolens.setting.states import set_lens
 

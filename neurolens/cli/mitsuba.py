@@ -72,8 +72,7 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.frames.frame import Files
     from neurolens.mitsuba import load_scene, render
     from neurolens.mitsuba.library import libraries
-    from neurolens.render.exr_attributes import standard_attributes
-    from neurolens.render.pictures import write_exr, write_png
+    from neurolens.render.pictures import standard_attributes, write_exr, write_png
 
     preview = Files.of(args.out).preview
     scene = load_scene(args.scene, args.variant)

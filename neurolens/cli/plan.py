@@ -203,8 +203,7 @@ def _run_trade(args: argparse.Namespace) -> int:
 
 def _write_samples(found: Plan, path: Path) -> None:
     from neurolens.plan.samples import blur_map
-    from neurolens.render.exr_attributes import standard_attributes
-    from neurolens.render.pictures import write_exr
+    from neurolens.render.pictures import standard_attributes, write_exr
 
     blur, depth = blur_map(found.probed)
     attributes = standard_attributes(found.probed.exact.settings, *blur.shape[::-1])

@@ -39,7 +39,7 @@ from neurolens.cli.render_files import (
     watch_of,
 )
 from neurolens.cli.render_frames import add_frames, frames_by_file, missing_frames
-from neurolens.render.film_settings import FilmSettings
+from neurolens.render.settings import FilmSettings
 
 if TYPE_CHECKING:
     from neurolens.cameras.contract import FloatArray
@@ -142,8 +142,7 @@ def run(args: argparse.Namespace) -> int:
     missing = frames if args.frames is None else missing_frames(args, frames)
     if args.dask is not None:
         return _run_on_dask(args, frames, missing)
-    from neurolens.frames.frame import prepare
-    from neurolens.frames.picture import flare_choice, flare_of
+    from neurolens.frames.frame import flare_choice, flare_of, prepare
 
     choice = None
     for number, (out, frame) in enumerate(missing.items()):
@@ -173,7 +172,7 @@ def frame_of(args: argparse.Namespace) -> Frame:
 
 def _render(args: argparse.Namespace, prepared: Prepared, flare: Mapping[str, FloatArray], progress: Progress) -> int:
     """Render a frame until it is done or a signal asks to stop, write its pictures, and print a summary."""
-    from neurolens.frames.picture import write_pictures
+    from neurolens.frames.frame import write_pictures
 
     files = prepared.files
     with Stopping() as stopping, progress.stage(f"render {prepared.name}") as report:

@@ -27,7 +27,7 @@ from neurolens.cli.arguments import (
 from neurolens.cli.output import answer, number
 from neurolens.cli.render import film_size
 from neurolens.cli.render_frames import LENS_KEYS, add_frames, frames_of
-from neurolens.render.film_settings import size_by_shape
+from neurolens.render.settings import size_by_shape
 
 if TYPE_CHECKING:
     from neurolens.cameras.build import Shot
@@ -224,8 +224,7 @@ def _traced(args: argparse.Namespace, text: str, progress: Progress) -> _Frame:
 
 def _written(args: argparse.Namespace, frame: _Frame, plates: Plates, report: Callable[[float], None]) -> list[str]:
     """Write the maps of one frame; their names."""
-    from neurolens.render.exr_attributes import standard_attributes
-    from neurolens.render.pictures import write_data_exr
+    from neurolens.render.pictures import standard_attributes, write_channels
     from neurolens.render.stmap import illumination_map, redistort_map, undistort_map
 
     makers = {"undistort": undistort_map, "redistort": redistort_map}
@@ -239,7 +238,7 @@ def _written(args: argparse.Namespace, frame: _Frame, plates: Plates, report: Ca
         planes = make(field, plates, _part(report, 2 * k, 2 * len(jobs)))
         words = [args.out.name, kind, *([name] if name else []), *([frame.number] if frame.number else []), "exr"]
         path = args.out.with_name(".".join(words))
-        write_data_exr(path, planes, _about(args, frame, plates, kind, field), header)
+        write_channels(path, planes, None, _about(args, frame, plates, kind, field), header)
         files.append(str(path))
         report((k + 1) / len(jobs))
     return files

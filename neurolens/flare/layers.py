@@ -25,8 +25,8 @@ from neurolens.flare.sources import Name, SceneLights, chosen, keep_named
 from neurolens.flare.steps import Floats
 from neurolens.lens.prescription import Lens
 from neurolens.render.film import check_memory
-from neurolens.render.flaresettings import LAYERS, FlareSettings
 from neurolens.render.scene import Scene
+from neurolens.render.settings import LAYERS, FlareSettings
 
 Layers = dict[str, Floats]
 REST = "rest"

@@ -32,7 +32,7 @@ from neurolens.flare.steps import LOST, STATE, Floats, Place, Stack, entering, r
 from neurolens.graph.compiler import c_source
 from neurolens.graph.ir import Graph, Value
 from neurolens.lens.prescription import Lens
-from neurolens.render.flaresettings import Scatter
+from neurolens.render.settings import Scatter
 from neurolens.trace.shapes import sag_mm
 
 BLOCK = 4096  # photons at a time: their states, 40 bytes at every surface, stay in the caches

@@ -24,8 +24,7 @@ from neurolens.base.files import noted_files
 from neurolens.base.progress import Progress
 from neurolens.base.tasks import Failed, Shared, run_each
 from neurolens.base.travel import absolute, packed, run_with_files, unpack
-from neurolens.frames.frame import Frame, Prepared, prepare
-from neurolens.frames.picture import flare_choice, render_frame
+from neurolens.frames.frame import Frame, Prepared, flare_choice, prepare, render_frame
 from neurolens.render.checkpoint import digest
 from neurolens.render.tiles import read_tile, tile_path, write_picture
 

@@ -34,11 +34,11 @@ from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
 from neurolens.mitsuba.library import libraries, matrix, number, require_mitsuba, rows, vector
 from neurolens.render.film import PixelGrid
-from neurolens.render.film_settings import FilmSettings
-from neurolens.render.pictures import make_aperture
+from neurolens.render.images import make_aperture
+from neurolens.render.job import mode_for
 from neurolens.render.sampler import hash32
+from neurolens.render.settings import FilmSettings
 from neurolens.render.spectrum import SpectralRange
-from neurolens.render.wavelengths import mode_for
 
 BATCH = RAYS_A_CALL  # of the camera
 _TURNED = np.array([[-1], [1], [-1]], np.float32)  # half a turn about y

@@ -22,9 +22,9 @@ from neurolens.base.files import fingerprint_of
 from neurolens.base.kept import read_arrays, write_arrays
 from neurolens.cameras.contract import Camera
 from neurolens.render.film import RGB, Film, Tiling
-from neurolens.render.film_settings import FilmSettings
 from neurolens.render.job import Job
 from neurolens.render.mesh import tracer
+from neurolens.render.settings import FilmSettings
 
 # Settings of a camera that do not affect its rays: where it was read and notes.
 _NO_MATTER = ("model", "notes")

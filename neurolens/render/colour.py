@@ -1,21 +1,34 @@
-"""Colour spaces of a picture, and the adaptation from one white to another.
+"""Colour spaces, the adaptation from one white to another, and spectra of light.
 
-The film gathers linear sRGB. Everything after that is one matrix: other primaries, another white, a white
-balance. Whites are adapted by von Kries scaling in the Bradford space.
+The film gathers linear sRGB. Everything after that is one matrix: other primaries, another white, a white balance.
+Whites are adapted by von Kries scaling in the Bradford space.
+
+Of the spectra of lights (the CIE's illuminants, daylight, black bodies, measured ones) only the shape is used: the
+emission of a light sets its brightness. Every spectrum is scaled as a whole, which keeps its chromaticity, so that
+emission 1 has the luminance of daylight D65 of emission 1.
 
 Sources: IEC 61966-2-1 (sRGB), Academy S-2014-004 (ACEScg: primaries AP1, the white of ACES near D60), SMPTE RP 177-1993
 (primaries to matrix), Lam 1985 and ICC.1 Annex E (Bradford), OpenEXR's standard attributes and the ids of the Color
-Interop Forum.
+Interop Forum, CIE 15:2018 (illuminants A, D50, D65, E), CODATA 2018 (second radiation constant).
 """
 
 from __future__ import annotations
 
+import math
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from neurolens.base.errors import InputError
+from neurolens.base.files import read_bytes
+from neurolens.base.tomlfile import suggestion
 from neurolens.cameras.contract import FloatArray
 
 Matrix = NDArray[np.float64]
@@ -119,3 +132,134 @@ def linear_to_srgb(linear: NDArray[np.floating]) -> FloatArray:
     """sRGB encoding of linear light, clipped to [0, 1] (IEC 61966-2-1)."""
     clipped = np.clip(np.nan_to_num(np.asarray(linear, np.float32), nan=0.0), 0.0, 1.0)
     return np.where(clipped <= 0.0031308, clipped * 12.92, 1.055 * clipped ** (1 / 2.4) - 0.055).astype(np.float32)
+
+
+FloatArray64 = NDArray[np.float64]
+Spectrum = tuple[FloatArray64, FloatArray64]  # wavelengths in nm, increasing, and values there
+
+CIE_NAMES = ("D65", "D50", "A", "E")
+_KELVIN = re.compile(r"([0-9]{1,9}(?:\.[0-9]{0,9})?) ?K")
+COLDEST_K, HOTTEST_K = 500.0, 1e5
+_SECOND_RADIATION_CONSTANT = 1.438776877e-2  # h c / k, m K
+_MOST_ROWS, _LARGEST_FILE = 10_000, 1_000_000
+
+
+def _csv(name: str) -> list[list[str]]:
+    text = resources.files("neurolens.render").joinpath(f"data/{name}.csv").read_text(encoding="utf-8")
+    return [line.split(",") for line in text.splitlines()]
+
+
+@cache
+def _tables() -> dict[str, FloatArray64]:
+    """Columns wavelength_nm, x, y, z, d65, d50, red, green, blue; made by experiments/make_spectral_tables.py."""
+    names, *rows = _csv("spectra")
+    columns = np.array(rows, np.float64).T
+    columns.flags.writeable = False
+    return dict(zip(names, columns, strict=True))
+
+
+def table(name: str) -> FloatArray64:
+    """A column of the shipped table, one value every 5 nm from 380 to 780 nm."""
+    return _tables()[name]
+
+
+@cache
+def daylight_table() -> tuple[FloatArray64, FloatArray64]:
+    """Wavelengths [41] in nm, and the CIE's components S0, S1, S2 of daylight [3, 41] there (CIE 15:2018)."""
+    rows = np.array(_csv("daylight")[1:], np.float64).T
+    return rows[0], rows[1:]
+
+
+def daylight_weights(x: FloatArray64, y: FloatArray64) -> FloatArray64:
+    """Weights 1, M1, M2 [3, N] of S0, S1, S2 of daylight of chromaticities (x, y) (Wyszecki and Stiles 1982)."""
+    below = 0.0241 + 0.2562 * x - 0.7341 * y
+    m1 = (-1.3515 - 1.7703 * x + 5.9114 * y) / below
+    m2 = (0.0300 - 31.4424 * x + 30.0717 * y) / below
+    return np.stack([np.ones_like(m1), m1, m2])
+
+
+def check_spectrum(file: Path, field: str, rows: Sequence[Sequence[float]], most: float | None = None) -> Spectrum:
+    """Rows (nm, value) as two arrays: scaled to the largest value 1, or with `most` as they are and at most that.
+
+    An InputError names the row at fault.
+    """
+    if not 2 <= len(rows) <= _MOST_ROWS:
+        raise InputError(file, field, f"({len(rows)} rows)", f"2 to {_MOST_ROWS} rows of nm, value")
+    last = 0.0
+    for k, (nm, value) in enumerate(rows):
+        if not last < nm < math.inf:
+            raise InputError(file, f"{field}[{k}]", nm, "wavelengths in nm that increase")
+        if not 0 <= value < math.inf:
+            raise InputError(file, f"{field}[{k}]", value, "a finite value of 0 or more")
+        if most is not None and value > most:
+            raise InputError(file, f"{field}[{k}]", value, f"a value from 0 to {most:g}")
+        last = nm
+    wavelengths, values = np.array(rows, np.float64).T
+    if most is not None:
+        return wavelengths, values
+    if not values.any():
+        raise InputError(file, field, "(all 0)", "a value above 0")
+    return wavelengths, values / values.max()
+
+
+def read_spectrum(scene: Path, field: str, path: Path, most: float | None = None) -> Spectrum:
+    """A CSV file of rows "nm, value"; a header may come first, and lines that start with # are skipped.
+
+    Raises:
+        InputError: missing, too large, not numbers, or refused by `check_spectrum`.
+    """
+    try:
+        lines = read_bytes(path, _LARGEST_FILE, "a CSV file", (scene, field)).decode("utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise InputError(scene, field, str(path), f"a readable CSV file ({error})") from None
+    rows: list[tuple[float, float]] = []
+    for number, line in enumerate(lines, 1):
+        cells = line.split(",")
+        if not line.strip() or line.startswith("#"):
+            continue
+        try:
+            nm, value = (float(cell) for cell in cells)
+        except ValueError:
+            if not rows and not any(character.isdigit() for character in cells[0]):
+                continue  # the names of the columns
+            raise InputError(path, f"line {number}", line[:60], "wavelength in nm, value") from None
+        rows.append((nm, value))
+    return check_spectrum(path, "row", rows, most)
+
+
+def planck(wavelength_nm: ArrayLike, kelvin: float) -> FloatArray64:
+    """Spectral radiance of a black body by Planck's law, 1 at 560 nm."""
+    nm = np.asarray(wavelength_nm, np.float64)
+
+    def exponent(length_nm: ArrayLike) -> FloatArray64:
+        return _SECOND_RADIATION_CONSTANT / (np.asarray(length_nm) * 1e-9 * kelvin)
+
+    # expm1(b) / expm1(a) without overflow where a black body is cold.
+    a, b = exponent(nm), exponent(560.0)
+    return (560.0 / nm) ** 5 * np.exp(b - a) * np.expm1(-b) / np.expm1(-a)
+
+
+def illuminant(name: str, measured: Mapping[str, Spectrum] | None = None) -> Spectrum | None:
+    """The spectrum that a name stands for: a CIE illuminant, "3200 K", or a measured one; None if it is unknown."""
+    nm = table("wavelength_nm")
+    if measured and name in measured:
+        return measured[name]
+    if name in ("D65", "D50"):
+        return nm, table(name.lower())
+    if name == "A":
+        # CIE 15: Planck's law at 2848 K with the constant of its day, 0.01435 m K: the law at 2855.5 K of today.
+        return nm, planck(nm, 2848 * _SECOND_RADIATION_CONSTANT / 1.435e-2)
+    if name == "E":
+        return nm, np.ones_like(nm)
+    if (kelvin := _KELVIN.fullmatch(name)) and COLDEST_K <= float(kelvin[1]) <= HOTTEST_K:
+        return nm, planck(nm, float(kelvin[1]))
+    return None
+
+
+def check_name(file: str | Path, field: str, name: str, measured: Mapping[str, object]) -> None:
+    """Refuse an unknown name of a spectrum; the InputError says what is known."""
+    if name in measured or illuminant(name) is not None:
+        return
+    known = [*CIE_NAMES, *measured]
+    kelvin = f"or a black body from {COLDEST_K:g} K to {HOTTEST_K:g} K such as '3200 K'"
+    raise InputError(file, field, name, f"one of: {', '.join(known)}, {kelvin}{suggestion(name, known)}")

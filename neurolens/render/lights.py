@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
-from neurolens.render.directions import TWO_PI, in_cone, one_less_cosine, orthonormal
 from neurolens.render.primitives import dot
+from neurolens.render.sampler import TWO_PI, in_cone, one_less_cosine, orthonormal
 from neurolens.render.scenetables import BLACK, Disc, PointLight, Quad, Sphere, SpotLight, Vector
 
 Numbers = NDArray[np.intp]

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
-from neurolens.render.directions import cosine_direction, orthonormal
 from neurolens.render.primitives import dot
+from neurolens.render.sampler import cosine_direction, orthonormal
 
 _PI = np.float32(np.pi)
 _NODES, _ENTRIES, _AROUND, _OUTWARDS = 48, 1024, 24, 128

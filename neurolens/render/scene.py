@@ -8,22 +8,32 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from neurolens.base.bounds import F_NUMBER, FILM_MM
 from neurolens.base.config import from_dict
 from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import read_toml, suggestion
 from neurolens.cameras.contract import FloatArray
 from neurolens.lens.apertures import Aperture
 from neurolens.render import scenetables as tables
-from neurolens.render.film_settings import FilmSettings
-from neurolens.render.flaresettings import FlareSettings
-from neurolens.render.illuminants import Spectrum, check_name, check_spectrum, illuminant, read_spectrum
+from neurolens.render.colour import Spectrum, check_name, check_spectrum, illuminant, read_spectrum
+from neurolens.render.images import make_aperture, read_environment, read_pictures
 from neurolens.render.meshfile import Parts, TriangleSet, encloses
-from neurolens.render.pictures import make_aperture, read_environment, read_pictures
-from neurolens.render.scenetables import BLACK, Checked, Material, MeasuredSpectrum, Texture, Vector, require
+from neurolens.render.scenetables import (
+    BLACK,
+    Checked,
+    Material,
+    MeasuredSpectrum,
+    Rule,
+    Texture,
+    Vector,
+    between,
+    require,
+)
+from neurolens.render.settings import FilmSettings, FlareSettings
 
 _SHAPES = ("planes", "quads", "discs", "spheres", "boxes", "rooms", "meshes")
 _WALLS = ("left", "right", "floor", "ceiling", "far", "near")
@@ -43,22 +53,24 @@ class CameraSettings(Checked):
         max_depth: number of surfaces along a path at which light is scattered.
     """
 
-    position_m: Vector
-    look_at_m: Vector
-    focus_m: float
-    up: Vector = (0.0, 1.0, 0.0)
-    f_number: float | None = None
+    position_m: tables.Place
+    look_at_m: tables.Place
+    focus_m: Annotated[float, Rule(lambda v: v > 0, "a number above 0")]
+    up: tables.Place = (0.0, 1.0, 0.0)
+    f_number: Annotated[float | None, between(*F_NUMBER, "an f-number")] = None
     blades: int | None = None
     blade_rotation_deg: float | None = None
     blade_curvature: float | None = None
     aperture_mask: Path | None = None
-    film_width_mm: float = 36.0
-    film_height_mm: float = 20.25
-    wavelengths_nm: tuple[float, float] = (400.0, 700.0)
-    width: int = 320
-    height: int = 180
-    samples: int = 64
-    max_depth: int = 6
+    film_width_mm: Annotated[float, between(*FILM_MM, "mm")] = 36.0
+    film_height_mm: Annotated[float, between(*FILM_MM, "mm")] = 20.25
+    wavelengths_nm: Annotated[
+        tuple[float, float], Rule(lambda v: 380 <= v[0] <= v[1] <= 780, "low and high within 380 to 780")
+    ] = (400.0, 700.0)
+    width: Annotated[int, between(1, 16384, "an integer")] = 320
+    height: Annotated[int, between(1, 16384, "an integer")] = 180
+    samples: Annotated[int, Rule(lambda v: 1 <= v <= 1 << 20, f"an integer from 1 to {1 << 20}")] = 64
+    max_depth: Annotated[int, between(1, 1000, "an integer")] = 6
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -76,12 +88,12 @@ class SceneSettings:
     camera: CameraSettings
     film: FilmSettings = FilmSettings()
     flare: FlareSettings | None = None
-    illuminants: dict[str, MeasuredSpectrum] | None = None
+    illuminants: dict[str, MeasuredSpectrum] = field(default_factory=dict)
     environment: tables.Environment = tables.Environment(colour=BLACK)
     sky: tables.Sky | None = None
-    reflectances: dict[str, MeasuredSpectrum] | None = None
-    textures: dict[str, Texture] | None = None
-    materials: dict[str, Material] | None = None
+    reflectances: dict[str, MeasuredSpectrum] = field(default_factory=dict)
+    textures: dict[str, Texture] = field(default_factory=dict)
+    materials: dict[str, Material] = field(default_factory=dict)
     planes: tuple[tables.Plane, ...] = ()
     quads: tuple[tables.Quad, ...] = ()
     discs: tuple[tables.Disc, ...] = ()
@@ -136,7 +148,7 @@ def scene_from_tables(tables: Mapping[str, Any], path: str | Path = "scene") -> 
     settings, triangles = _with_meshes(path, from_dict(SceneSettings, tables, path))
     _check_references(path, settings, triangles)
     _check_camera(path, settings, triangles)
-    textures = {name: t.file for name, t in (settings.textures or {}).items() if t.file is not None}
+    textures = {name: t.file for name, t in settings.textures.items() if t.file is not None}
     pictures = read_pictures(path, {f"textures.{name}.file": path.parent / file for name, file in textures.items()})
     images = dict(zip(textures, pictures.values(), strict=True))
     around, scale = settings.environment.file, settings.environment.scale
@@ -154,12 +166,12 @@ def scene_from_tables(tables: Mapping[str, Any], path: str | Path = "scene") -> 
 
 def _with_meshes(path: Path, settings: SceneSettings) -> tuple[SceneSettings, tuple[TriangleSet, ...]]:
     """The meshes, one a material, and the tables with the materials that their files bring."""
-    parts, materials = Parts(), settings.materials or {}
+    parts, materials = Parts(), settings.materials
     for k, mesh in enumerate(settings.meshes):
         parts.add(path, f"meshes[{k}]", mesh, materials)
     more: dict[str, Any] = {"meshes": tuple(parts.meshes)}
     if parts.materials:
-        more |= {"materials": parts.materials | materials, "textures": parts.textures | (settings.textures or {})}
+        more |= {"materials": parts.materials | materials, "textures": parts.textures | settings.textures}
     return replace(settings, **more), tuple(parts.triangles)
 
 
@@ -205,14 +217,14 @@ def _illuminants(path: Path, settings: SceneSettings) -> dict[str, Spectrum]:
 def _spectra(
     path: Path,
     kind: str,
-    tables: Mapping[str, MeasuredSpectrum] | None,
+    tables: Mapping[str, MeasuredSpectrum],
     camera: CameraSettings,
     most: float | None = None,
 ) -> dict[str, Spectrum]:
     """Measured spectra over all of the camera's wavelengths: scaled to a maximum of 1, or with `most` as they are."""
     low, high = camera.wavelengths_nm
     found = {}
-    for name, given in (tables or {}).items():
+    for name, given in tables.items():
         place = f"{kind}.{name}"
         if given.file is not None:
             nm, values = read_spectrum(path, f"{place}.file", path.parent / given.file, most)
@@ -227,12 +239,12 @@ def _spectra(
 
 def _check_references(path: Path, settings: SceneSettings, triangles: Sequence[TriangleSet]) -> None:
     """Check that named materials, textures and reflectances exist, and that textures fit their shapes."""
-    materials, textures = settings.materials or {}, settings.textures or {}
+    materials, textures = settings.materials, settings.textures
     for name, material in materials.items():
         if material.texture is not None:
             _known(path, f"materials.{name}.texture", material.texture, textures)
         if isinstance(material.reflectance, str):
-            _known(path, f"materials.{name}.reflectance", material.reflectance, settings.reflectances or {})
+            _known(path, f"materials.{name}.reflectance", material.reflectance, settings.reflectances)
     for kind in _SHAPES:
         for k, shape in enumerate(getattr(settings, kind)):
             for part in ("material", *(_WALLS if kind == "rooms" else ())):

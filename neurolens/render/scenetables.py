@@ -13,25 +13,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, get_args, get_type_hints
 
-from neurolens.base.bounds import F_NUMBER, FILM_MM, said, within
+from neurolens.base.bounds import said, within
 from neurolens.base.errors import InputError
 
 Vector = tuple[float, float, float]
 Row = tuple[float, float, float, float]
-Reflectance = Vector | str  # linear sRGB, or the name of a measured spectrum
 BLACK: Vector = (0.0, 0.0, 0.0)
 # Squares and products stay far from the limits of float32.
 SMALLEST_M, FARTHEST_M = 1e-9, 1e9
 BRIGHTEST = 1e18
-_MOST_DEG = 36000.0
 _NARROWEST_DEG = 0.01  # of the falloff of a spot: nearer, two cosines would differ by the rounding of float32
-
-
-def length(vector: Vector) -> float:
-    return math.sqrt(sum(x * x for x in vector))
 
 
 def require(ok: bool, field: str, value: object, expected: str) -> None:
@@ -39,16 +34,22 @@ def require(ok: bool, field: str, value: object, expected: str) -> None:
         raise InputError("scene", field, value, expected)
 
 
-Rule = tuple[Callable[[Any], bool], str]  # test of a value, and text of what is expected
-_SIZE: Rule = (lambda v: SMALLEST_M <= v <= FARTHEST_M, f"a length from {SMALLEST_M:g} to {FARTHEST_M:g} m")
-_ANGLE: Rule = (lambda v: abs(v) <= _MOST_DEG, f"degrees, at most {_MOST_DEG:g} either way")
-_PLACE: Rule = (lambda v: all(abs(x) <= FARTHEST_M for x in v), f"three numbers within {FARTHEST_M:g} m")
-_DIRECTION: Rule = (
-    lambda v: _PLACE[0](v) and length(v) >= SMALLEST_M,
-    f"a direction, between {SMALLEST_M:g} and {FARTHEST_M:g} long",
-)
-_EMISSION: Rule = (lambda v: all(0 <= x <= BRIGHTEST for x in v), f"three numbers from 0 to {BRIGHTEST:g}")
-_REFLECTANCE: Rule = (lambda v: isinstance(v, str) or all(0 <= x <= 1 for x in v), "three numbers from 0 to 1")
+@dataclass(frozen=True)
+class Rule:
+    """What the values of a field have in common: a test, and what is expected, for messages."""
+
+    good: Callable[[Any], bool]
+    expected: str
+
+
+def between(low: float, high: float, unit: str = "a number") -> Rule:
+    """The rule that a value lies from `low` to `high`."""
+    return Rule(lambda v: within((low, high), v), f"{unit} {said((low, high))}")
+
+
+def each_between(low: float, high: float) -> Rule:
+    """The rule that each of three numbers lies from `low` to `high`."""
+    return Rule(lambda v: all(low <= x <= high for x in v), f"three numbers from {low:g} to {high:g}")
 
 
 def _is_regular(rows: tuple[Row, ...]) -> bool:
@@ -57,60 +58,62 @@ def _is_regular(rows: tuple[Row, ...]) -> bool:
         return False
     (a, b, c), (d, e, f), (g, h, i) = (row[:3] for row in rows)
     volume = abs(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
-    return volume > 1e-9 * length((a, d, g)) * length((b, e, h)) * length((c, f, i))
+    return volume > 1e-9 * math.hypot(a, d, g) * math.hypot(b, e, h) * math.hypot(c, f, i)
 
 
-def _count(most: int) -> Rule:
-    return lambda v: 1 <= v <= most, f"an integer from 1 to {most}"
+def _is_near(vector: Vector) -> bool:
+    return all(abs(x) <= FARTHEST_M for x in vector)
 
 
-# By field name; a name has the same meaning in all tables.
-_RULES: dict[str, Rule] = {
-    **dict.fromkeys(("position_m", "look_at_m", "up", "point_m", "centre_m", "min_m", "max_m", "translate_m"), _PLACE),
-    **dict.fromkeys(("corner_m", "edge_u_m", "edge_v_m"), _PLACE),
-    **dict.fromkeys(("emission", "intensity", "colour", "zenith", "horizon", "ground"), _EMISSION),
-    **dict.fromkeys(("reflectance", "specular"), _REFLECTANCE),
-    **dict.fromkeys(("radius_m", "cell_m", "transmittance_depth_m"), _SIZE),
-    **dict.fromkeys(("rotate_y_deg", "sun_azimuth_deg"), _ANGLE),
-    "f_number": (lambda v: within(F_NUMBER, v), f"an f-number {said(F_NUMBER)}"),
-    **dict.fromkeys(("film_width_mm", "film_height_mm"), (lambda v: within(FILM_MM, v), f"mm {said(FILM_MM)}")),
-    "scale": (lambda v: all(0 < x < math.inf for x in (v if isinstance(v, tuple) else (v,))), "finite numbers above 0"),
-    "matrix": (lambda v: _is_regular(v), f"three rows of four numbers within {FARTHEST_M:g}, which flatten nothing"),
-    **dict.fromkeys(("width", "height"), _count(16384)),
-    "samples": _count(1 << 20),
-    "max_depth": _count(1000),
-    "focus_m": (lambda v: v > 0, "a number above 0"),
-    "wavelengths_nm": (lambda v: 380 <= v[0] <= v[1] <= 780, "low and high within 380 to 780"),
-    "normal": _DIRECTION,
-    "colours": (lambda v: all(map(_REFLECTANCE[0], v)), "three numbers from 0 to 1, twice"),
-    "size_m": (lambda v: all(map(_SIZE[0], v)), f"width and height, each {_SIZE[1]}"),
-    "roughness": (lambda v: 0.02 <= v <= 1, "a number from 0.02 to 1"),
-    "n_d": (lambda v: 1 < v <= 4, "a number above 1, at most 4"),
-    "V_d": (lambda v: 10 <= v < math.inf, "a number from 10"),
-    "transmittance": (lambda v: all(1e-6 <= x <= 1 for x in v), "three numbers from 0.000001 to 1"),
-    "outer_deg": (lambda v: 0.1 <= v <= 90, "a half angle from 0.1 to 90 degrees"),
-    "sun_elevation_deg": (lambda v: 0 <= v <= 90, "a number from 0 (horizon) to 90 (zenith)"),
-    "turbidity": (lambda v: 2 <= v <= 10, "a number from 2 to 10"),
-    "white_kcd_per_m2": (lambda v: 1e-6 <= v <= 1e6, "a number from 1e-06 to 1e+06"),
-}
+def _is_direction(vector: Vector) -> bool:
+    return _is_near(vector) and math.hypot(*vector) >= SMALLEST_M
+
+
+_SIZE = between(SMALLEST_M, FARTHEST_M, "a length")
+Size = Annotated[float, Rule(_SIZE.good, f"{_SIZE.expected} m")]
+Angle = Annotated[float, between(-36000, 36000, "degrees")]
+Place = Annotated[Vector, Rule(_is_near, f"three numbers within {FARTHEST_M:g} m")]
+Direction = Annotated[Vector, Rule(_is_direction, f"a direction, between {SMALLEST_M:g} and {FARTHEST_M:g} long")]
+Light = Annotated[Vector, each_between(0, BRIGHTEST)]
+Share = Annotated[Vector, each_between(0, 1)]
+Reflectance = Annotated[  # linear sRGB, or the name of a measured spectrum
+    Vector | str, Rule(lambda v: isinstance(v, str) or all(0 <= x <= 1 for x in v), "three numbers from 0 to 1")
+]
+# Rules that need names of this module stand here: a lambda within an annotation would not see them.
+_SCALE = Rule(lambda v: all(0 < x < math.inf for x in (v if isinstance(v, tuple) else (v,))), "finite numbers above 0")
+_BRIGHTNESS = Rule(lambda v: 0 < v <= BRIGHTEST, f"a number above 0, at most {BRIGHTEST:g}")
+_SIZES = Rule(lambda v: all(map(_SIZE.good, v)), f"width and height, each {_SIZE.expected} m")
+_COLOURS = Rule(lambda v: all(0 <= x <= 1 for colour in v for x in colour), "three numbers from 0 to 1, twice")
+_MATRIX = Rule(_is_regular, f"three rows of four numbers within {FARTHEST_M:g}, which flatten nothing")
+_ABBE = Rule(lambda v: 10 <= v < math.inf, "a number from 10")
+
+
+@cache
+def _rules(table: type) -> dict[str, Rule]:
+    """The rules of the fields of a table, which their types carry: `Annotated[kind, rule]`, also beside None."""
+    rules: dict[str, Rule] = {}
+    for name, hint in get_type_hints(table, include_extras=True).items():
+        for kind in (hint, *get_args(hint)):
+            if notes := getattr(kind, "__metadata__", ()):
+                rules[name] = notes[0]
+    return rules
 
 
 class Checked:
-    """A table whose values obey the rules of their field names; None is a missing field."""
+    """A table whose values obey the rules of their types; None is a missing field."""
 
     def __post_init__(self) -> None:
-        for field, value in vars(self).items():
-            if value is not None and field in _RULES:
-                ok, expected = _RULES[field]
-                require(ok(value), field, value, expected)
+        for field, rule in _rules(type(self)).items():  # type: ignore[arg-type]
+            value = getattr(self, field)
+            require(value is None or rule.good(value), field, value, rule.expected)
 
 
 @dataclass(frozen=True)
 class Plane(Checked):
     """An infinite plane."""
 
-    point_m: Vector
-    normal: Vector
+    point_m: Place
+    normal: Direction
     material: str
 
 
@@ -123,7 +126,7 @@ class Emitter(Checked):
     """
 
     material: str | None = None
-    emission: Vector = BLACK
+    emission: Light = BLACK
     illuminant: str = "D65"
 
     def __post_init__(self) -> None:
@@ -136,13 +139,13 @@ class Emitter(Checked):
 class Quad(Emitter):
     """A rectangle: a corner and two perpendicular edges. `emission` is the radiance on the side of edge_u x edge_v."""
 
-    corner_m: Vector
-    edge_u_m: Vector
-    edge_v_m: Vector
+    corner_m: Place
+    edge_u_m: Place
+    edge_v_m: Place
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        u, v = length(self.edge_u_m), length(self.edge_v_m)
+        u, v = math.hypot(*self.edge_u_m), math.hypot(*self.edge_v_m)
         require(u >= SMALLEST_M, "edge_u_m", self.edge_u_m, f"an edge of at least {SMALLEST_M:g} m")
         cosine = sum(a * b for a, b in zip(self.edge_u_m, self.edge_v_m, strict=True))
         right = v >= SMALLEST_M and abs(cosine) <= 1e-5 * u * v
@@ -153,25 +156,25 @@ class Quad(Emitter):
 class Disc(Emitter):
     """A flat disc; `emission` is the radiance on the side of `normal`."""
 
-    centre_m: Vector
-    normal: Vector
-    radius_m: float
+    centre_m: Place
+    normal: Direction
+    radius_m: Size
 
 
 @dataclass(frozen=True)
 class Sphere(Emitter):
     """A sphere; `emission` is the radiance of its outside, small ones are point-like."""
 
-    centre_m: Vector
-    radius_m: float
+    centre_m: Place
+    radius_m: Size
 
 
 @dataclass(frozen=True)
 class Box(Checked):
     """An axis-aligned box from one corner to the opposite one."""
 
-    min_m: Vector
-    max_m: Vector
+    min_m: Place
+    max_m: Place
     material: str
 
     def __post_init__(self) -> None:
@@ -216,10 +219,10 @@ class MeshSettings(Checked):
     file: Path | None = None
     vertices_m: tuple[Vector, ...] | None = None
     faces: tuple[tuple[int, int, int], ...] | None = None
-    matrix: tuple[Row, Row, Row] | None = None
-    scale: float | Vector = 1.0
-    rotate_y_deg: float = 0.0
-    translate_m: Vector = BLACK
+    matrix: Annotated[tuple[Row, Row, Row] | None, _MATRIX] = None
+    scale: Annotated[float | Vector, _SCALE] = 1.0
+    rotate_y_deg: Angle = 0.0
+    translate_m: Place = BLACK
     smooth: bool | None = None
 
     def __post_init__(self) -> None:
@@ -267,11 +270,11 @@ class Texture(Checked):
     """
 
     kind: Literal["checker", "grid", "image"]
-    colours: tuple[Vector, Vector] | None = None
-    cell_m: float | None = None
+    colours: Annotated[tuple[Vector, Vector] | None, _COLOURS] = None
+    cell_m: Size | None = None
     line_m: float | None = None
     file: Path | None = None
-    size_m: tuple[float, float] | None = None
+    size_m: Annotated[tuple[float, float] | None, _SIZES] = None
 
     _FIELDS = {
         "checker": (("colours", "cell_m"), ()),
@@ -300,12 +303,12 @@ class Material(Checked):
     kind: Literal["diffuse", "glossy", "mirror", "glass"]
     reflectance: Reflectance | None = None
     texture: str | None = None
-    specular: Vector | None = None
-    roughness: float | None = None
-    n_d: float | None = None
-    V_d: float | None = None
-    transmittance: Vector | None = None
-    transmittance_depth_m: float | None = None
+    specular: Share | None = None
+    roughness: Annotated[float | None, between(0.02, 1)] = None
+    n_d: Annotated[float | None, Rule(lambda v: 1 < v <= 4, "a number above 1, at most 4")] = None
+    V_d: Annotated[float | None, _ABBE] = None
+    transmittance: Annotated[Vector | None, each_between(1e-6, 1)] = None
+    transmittance_depth_m: Size | None = None
 
     _FIELDS = {
         "diffuse": ((), ("reflectance", "texture")),
@@ -330,8 +333,8 @@ class Material(Checked):
 class PointLight(Checked):
     """A point light, equal in all directions; `illuminant` as for an `Emitter`."""
 
-    position_m: Vector
-    intensity: Vector
+    position_m: Place
+    intensity: Light
     illuminant: str = "D65"
 
     def __post_init__(self) -> None:
@@ -347,8 +350,8 @@ class SpotLight(PointLight):
     falls by the smoothstep t^2 (3 - 2t) of t = (cos angle - cos outer) / (cos inner - cos outer).
     """
 
-    look_at_m: Vector
-    outer_deg: float
+    look_at_m: Place
+    outer_deg: Annotated[float, Rule(lambda v: 0.1 <= v <= 90, "a half angle from 0.1 to 90 degrees")]
     inner_deg: float = 0.0
 
     def __post_init__(self) -> None:
@@ -368,13 +371,13 @@ class Environment(Checked):
     tint.
     """
 
-    colour: Vector | None = None
-    zenith: Vector | None = None
-    horizon: Vector | None = None
-    ground: Vector | None = None
+    colour: Light | None = None
+    zenith: Light | None = None
+    horizon: Light | None = None
+    ground: Light | None = None
     file: Path | None = None
-    scale: float = 1.0
-    rotate_y_deg: float = 0.0
+    scale: Annotated[float, _BRIGHTNESS] = 1.0
+    rotate_y_deg: Angle = 0.0
     illuminant: str = "D65"
 
     def __post_init__(self) -> None:
@@ -388,7 +391,6 @@ class Environment(Checked):
         if self.file is None:
             require(self.scale == 1, "scale", self.scale, "left out: it multiplies a picture")
             require(self.rotate_y_deg == 0, "rotate_y_deg", self.rotate_y_deg, "left out: it turns a picture")
-        require(self.scale <= BRIGHTEST, "scale", self.scale, f"a number above 0, at most {BRIGHTEST:g}")
 
 
 @dataclass(frozen=True)
@@ -402,8 +404,8 @@ class Sky(Checked):
         white_kcd_per_m2: luminance that counts as emission 1. A white surface in the sun has some 30.
     """
 
-    sun_elevation_deg: float
-    sun_azimuth_deg: float = 0.0
-    turbidity: float = 3.0
+    sun_elevation_deg: Annotated[float, Rule(lambda v: 0 <= v <= 90, "a number from 0 (horizon) to 90 (zenith)")]
+    sun_azimuth_deg: Angle = 0.0
+    turbidity: Annotated[float, between(2, 10)] = 3.0
     sun: bool = True
-    white_kcd_per_m2: float = 20.0
+    white_kcd_per_m2: Annotated[float, between(1e-6, 1e6)] = 20.0

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurolens.cameras.contract import FloatArray
-from neurolens.render.colour import SRGB
-from neurolens.render.illuminants import FloatArray64, Spectrum, daylight_table, illuminant, table
+from neurolens.render.colour import SRGB, FloatArray64, Spectrum, daylight_table, illuminant, table
 from neurolens.render.scenetables import Vector
 
 _DFC_NM = 587.5618, 486.1327, 656.2725  # Fraunhofer lines d, F and C

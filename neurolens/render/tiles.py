@@ -20,9 +20,8 @@ from neurolens.base.files import check_writable
 from neurolens.cameras.contract import FloatArray
 from neurolens.render.checkpoint import difference
 from neurolens.render.colour import COLOUR_SPACES, SRGB, conversion, converted
-from neurolens.render.exr_attributes import standard_attributes
 from neurolens.render.film import check_memory
-from neurolens.render.pictures import read_channels, read_metadata, write_png, write_stored
+from neurolens.render.pictures import read_channels, read_metadata, standard_attributes, write_channels, write_png
 
 _EXPECTED = 'a tile of "neurolens render --tile"'
 # What a merged picture's statistics add up; the rest follows from these, or is the same in all tiles.
@@ -213,7 +212,7 @@ def write_picture(tiles: Sequence[Tile], out: Path, exposure: float) -> dict[str
     rgb = np.stack([channels[name].astype(np.float32) for name in _COLOURS], axis=-1)
     if space is not SRGB:
         rgb = converted(rgb, conversion(space, SRGB)).astype(np.float32)
-    write_stored(out, channels, space, told, _attributes(told, tiles[0].frame))
+    write_channels(out, channels, space, told, _attributes(told, tiles[0].frame))
     write_png(preview := out.with_suffix(".png"), rgb, exposure)
     return {"file": str(out), "preview": str(preview), "tiles": len(tiles), **render}
 

@@ -1,13 +1,13 @@
 """A scene made ready for tracing: shapes to hit, and one row of properties a surface.
 
 Every flat shape, box face, sphere and triangle is a surface with a number. What a path needs at a hit (normal, kind of
-material, colours) is looked up by that number in flat tables, because a gather costs a nanosecond a path. Row -1 is
-for rays without a hit.
+material, colours, patterns and pictures) is looked up by that number in flat tables, because a gather costs a
+nanosecond a path. Row -1 is for rays without a hit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -16,15 +16,132 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
-from neurolens.render import textures
 from neurolens.render.environment import SunLight, make_surroundings
 from neurolens.render.lights import FlatLights, Lights, LightSamples, PointLights, SphereLights
 from neurolens.render.materials import CoatTable
 from neurolens.render.mesh import Mesh, SphereTree, make_mesh, triangle_planes
 from neurolens.render.primitives import AxisQuad, Box, Disc, IntArray, Plane, Primitive, Quad, Rays, Spheres
 from neurolens.render.scene import Scene
-from neurolens.render.scenetables import BLACK, Emitter, Material, Vector
+from neurolens.render.scenetables import BLACK, Emitter, Material, Texture, Vector
 from neurolens.render.spectrum import Index, Palette, SpectralRange
+
+Frame = NDArray[np.float64]
+_STEEPEST = 1e25  # pictures or cells a metre; times the farthest point still finite in float32
+
+
+def _frame(origin: Frame, u: Frame, v: Frame, size: tuple[float, float]) -> Frame:
+    """Coordinates in metres along unit vectors u and v as affine functions of a point, [2, 4], and the size [2, 1]."""
+    rows = [[*axis, -(origin @ axis), length] for axis, length in zip((u, v), size, strict=True)]
+    return np.array(rows)
+
+
+def quad_frame(corner: Frame, edge_u: Frame, edge_v: Frame) -> Frame:
+    """From the corner of a rectangle along its edges."""
+    lengths = float(np.linalg.norm(edge_u)), float(np.linalg.norm(edge_v))
+    return _frame(corner, edge_u / lengths[0], edge_v / lengths[1], lengths)
+
+
+def plane_frame(point: Frame, normal: Frame) -> Frame:
+    """From a point of a plane along the axes of the scene as far as they lie in it: x first, else z."""
+    axis = np.eye(3)[2 if abs(normal[0]) > 0.9 else 0]
+    u = axis - normal * (axis @ normal)
+    u /= np.linalg.norm(u)
+    return _frame(point, u, np.cross(normal, u), (1.0, 1.0))
+
+
+def disc_frame(centre: Frame, normal: Frame, radius: float) -> Frame:
+    """The frame of a disc's texture, from the lower left corner of the square around the disc."""
+    frame = plane_frame(centre, normal)
+    frame[:, 3] += radius
+    frame[:, 4] = 2 * radius
+    return frame
+
+
+def box_frame(low: Frame, axis: int) -> Frame:
+    """From the lowest corner of a box along the axes of a face: x or z across, y up; x and z on floor and ceiling."""
+    u, v = {0: (2, 1), 1: (0, 2), 2: (0, 1)}[axis]
+    return _frame(low, np.eye(3)[u], np.eye(3)[v], (1.0, 1.0))
+
+
+def triangle_frames(planes: Frame, uv: Frame) -> Frame:
+    """Texture coordinates [T, 3 corners, 2] of triangles as affine functions of a point, [T, 2, 5], in pictures.
+
+    `planes`: [T, 3, 4] from `mesh.triangle_planes`; rows 1 and 2 are the weights of corners 1 and 2.
+    """
+    step = uv[:, 1:] - uv[:, :1]  # [T, 2, 2]
+    rows = np.einsum("tkc,tkj->tcj", step, planes[:, 1:])
+    rows[:, :, 3] += uv[:, 0]
+    return np.concatenate([rows, np.ones((len(uv), 2, 1))], axis=2)
+
+
+class TextureTable:
+    """The textures of a scene, looked up by surface.
+
+    Args:
+        textures: by name. images: linear RGB [H, W, 3] of those of kind "image".
+        surfaces: for surfaces in a row how many, the name of their texture and their frames [count, 2, 5] (one of the
+            functions above), or None. palette: with the rows of their colours.
+    """
+
+    def __init__(
+        self,
+        textures: dict[str, Texture],
+        images: dict[str, FloatArray],
+        surfaces: Sequence[tuple[int, str | None, Frame | None]],
+        palette: Palette,
+        spectral: SpectralRange,
+    ) -> None:
+        self._textures = list(textures.items())
+        self._images, self._palette = images, palette
+        self._basis = spectral.rotated(spectral.basis.astype(np.float32))
+        numbers = {name: k for k, name in enumerate(textures)}
+        self._rows = [np.array([palette.colour(c) for c in t.colours or ()], np.intp) for t in textures.values()]
+        total = sum(count for count, _, _ in surfaces)
+        self._number, self._frames = np.full(total, -1), np.zeros((2, 4, total), np.float32)
+        first = 0
+        for count, name, frames in surfaces:
+            if name is not None and frames is not None:
+                texture, rows = textures[name], slice(first, first + count)
+                cell = texture.cell_m
+                size = texture.size_m or ((cell, cell) if cell else frames[0, :, 4])
+                self._number[rows] = numbers[name]
+                # In cells, or in pictures.
+                scaled = np.clip(frames[:, :, :4] / np.array(size)[:, None], -_STEEPEST, _STEEPEST)
+                self._frames[:, :, rows] = np.moveaxis(scaled, 0, -1)
+            first += count
+        self._used = bool(np.any(self._number >= 0))
+
+    def apply(self, value: FloatArray, surface: Index, point: FloatArray, bins: Index) -> None:
+        """Write the reflectance at points [3, N] into `value` [lanes, N] where surfaces [N] have a texture."""
+        if not self._used:
+            return
+        number = self._number.take(surface)
+        for k, (name, texture) in enumerate(self._textures):
+            rows = np.flatnonzero(number == k)
+            if not rows.size:
+                continue
+            at, frame = point.take(rows, axis=1), self._frames.take(surface[rows], axis=2)
+            u, v = frame[:, 0] * at[0] + frame[:, 1] * at[1] + frame[:, 2] * at[2] + frame[:, 3]
+            if texture.kind == "image":
+                value[:, rows] = self._picture(self._images[name], u, v, bins[rows])
+                continue
+            if texture.kind == "checker":
+                # 2e-4 of a cell of slack: a shape that begins on a cell's edge shows no speckle of rounding there.
+                which = (np.floor(u + 2e-4).astype(np.intp) + np.floor(v + 2e-4).astype(np.intp)) & 1
+            else:
+                reach = np.float32(0.5 * (texture.line_m or 0) / (texture.cell_m or 1))
+                on_line = (np.abs(u - np.rint(u)) <= reach) | (np.abs(v - np.rint(v)) <= reach)
+                which = 1 - on_line.astype(np.intp)
+            value[:, rows] = self._palette.look_up(self._rows[k].take(which), bins[rows])
+
+    def _picture(self, image: FloatArray, u: FloatArray, v: FloatArray, bins: Index) -> FloatArray:
+        """Reflectance [lanes, N] of the texel at (u, v), in pictures from the lower left corner."""
+        height, width = image.shape[:2]
+        column = ((u - np.floor(u)) * width).astype(np.intp)
+        row = ((1 - (v - np.floor(v))) * height).astype(np.intp)
+        rgb = image[np.minimum(row, height - 1), np.minimum(column, width - 1)]
+        return np.einsum("nc,lcn->ln", rgb, self._basis.take(bins, axis=-1))
+
 
 DIFFUSE, GLOSSY, MIRROR, GLASS, NOTHING = range(5)
 _KINDS = {"diffuse": DIFFUSE, "glossy": GLOSSY, "mirror": MIRROR, "glass": GLASS}
@@ -55,7 +172,7 @@ class Assembly:
     """
 
     def __init__(self, scene: Scene) -> None:
-        self._scene, self._materials = scene, scene.settings.materials or {}
+        self._scene, self._materials = scene, scene.settings.materials
         self.primitives: list[Primitive] = []
         self.surfaces: list[Surfaces] = []
         self.boxes: list[Box] = []
@@ -94,16 +211,16 @@ class Assembly:
                 axis, first = int(np.argmax(np.abs(normal))), self._count
                 shape = AxisQuad(first, corner, corner + u + v, axis) if aligned else Quad(first, corner, u, v)
                 self.primitives.append(shape)
-            self._add(normal[None], quad.material, textures.quad_frame(corner, u, v)[None], quad)
+            self._add(normal[None], quad.material, quad_frame(corner, u, v)[None], quad)
         for disc in settings.discs:
             centre, normal = np.array(disc.centre_m, np.float64), _unit(disc.normal)
             self.primitives.append(Disc(self._count, centre, normal, disc.radius_m))
-            frame = textures.disc_frame(centre, normal, disc.radius_m)
+            frame = disc_frame(centre, normal, disc.radius_m)
             self._add(normal[None], disc.material, frame[None], disc)
         for plane in settings.planes:
             point, normal = np.array(plane.point_m, np.float64), _unit(plane.normal)
             self.primitives.append(Plane(self._count, point, normal))
-            self._add(normal[None], plane.material, textures.plane_frame(point, normal)[None])
+            self._add(normal[None], plane.material, plane_frame(point, normal)[None])
 
     def _add_boxes(self) -> None:
         rooms = [(room, room.walls(), True) for room in self._scene.settings.rooms]
@@ -116,7 +233,7 @@ class Assembly:
             for face, name in enumerate(materials):
                 normal = np.zeros((1, 3))
                 normal[0, face // 2] = 1.0 if face % 2 else -1.0
-                self._add(normal, name, textures.box_frame(low, face // 2)[None])
+                self._add(normal, name, box_frame(low, face // 2)[None])
 
     def _add_spheres(self) -> None:
         if spheres := self._scene.settings.spheres:
@@ -132,7 +249,7 @@ class Assembly:
             self.primitives.append(make_mesh(first, triangles.vertices, triangles.faces))
             planes = triangle_planes(triangles.vertices[triangles.faces])
             uv = triangles.uv
-            frames = None if uv is None else textures.triangle_frames(planes, uv[triangles.faces])
+            frames = None if uv is None else triangle_frames(planes, uv[triangles.faces])
             self._add(planes[:, 0, :3], mesh.material, frames)
             if triangles.normals is not None:
                 corners = triangles.normals[triangles.faces].astype(np.float32)
@@ -212,8 +329,8 @@ class World:
         self.coat_row = spread([used.index(alpha) if alpha in used else 0 for alpha in alphas], np.intp)
         named = [m.texture if m else None for m in materials]
         framed = [(n, t, part.frames) for n, t, part in zip(counts, named, parts, strict=True)]
-        tables, images = self.scene.settings.textures or {}, self.scene.images
-        self.textures = textures.TextureTable(tables, images, framed, palette, spectral)
+        tables, images = self.scene.settings.textures, self.scene.images
+        self.textures = TextureTable(tables, images, framed, palette, spectral)
 
     def _emission(self, emitter: Emitter | None) -> int:
         return 0 if emitter is None else self.palette.light(emitter.emission, emitter.illuminant)

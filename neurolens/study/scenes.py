@@ -21,9 +21,8 @@ from neurolens.cameras.pinhole import Pinhole
 from neurolens.graph.compiler import has_compiler
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.render.exr_attributes import standard_attributes
 from neurolens.render.job import camera_axes
-from neurolens.render.pictures import write_exr, write_png
+from neurolens.render.pictures import standard_attributes, write_exr, write_png
 from neurolens.render.primitives import Rays
 from neurolens.render.renderer import render
 from neurolens.render.scene import CameraSettings, Scene, load_scene

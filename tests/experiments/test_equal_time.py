@@ -33,8 +33,8 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.readers.lensfile import read_lens
-from neurolens.render.film_settings import FilmSettings
 from neurolens.render.scene import CameraSettings, load_scene
+from neurolens.render.settings import FilmSettings
 
 SHAPE = (12, 20, 3)
 Picture = NDArray[np.float64]

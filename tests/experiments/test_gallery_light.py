@@ -28,7 +28,7 @@ from neurolens.lens.apertures import Aperture
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.readers.lensfile import read_lens
-from neurolens.render.pictures import make_aperture
+from neurolens.render.images import make_aperture
 from neurolens.render.scene import load_scene
 from neurolens.setting.states import set_lens
 from neurolens.trace.rays import Rays, trace

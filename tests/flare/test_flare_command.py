@@ -16,7 +16,7 @@ from neurolens.flare.lights import Light, light_rays
 from neurolens.lens.apertures import Aperture
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.colour import COLOUR_SPACES, SRGB, conversion
-from neurolens.render.pictures import read_exr, read_layers, write_data_exr, write_exr
+from neurolens.render.pictures import read_exr, read_layers, write_channels, write_exr
 from neurolens.setting.states import set_lens
 
 
@@ -145,7 +145,7 @@ def test_highlights_are_where_the_lens_images_lights(tmp_path: Path, capsys: pyt
     pixel = math.degrees(0.1 / 50)
     assert found["azimuth_deg"] == pytest.approx(light.azimuth_deg, abs=0.8 * pixel)
     assert found["elevation_deg"] == pytest.approx(light.elevation_deg, abs=0.8 * pixel)
-    write_data_exr(file, {c: np.full((24, 36), np.nan, np.float32) for c in "RGB"}, {})
+    write_channels(file, {c: np.full((24, 36), np.nan, np.float32) for c in "RGB"})
     assert main(["flare", *SMALL, "--image", str(file)]) == 2
     assert "finite" in capsys.readouterr().err
 

@@ -16,7 +16,7 @@ from neurolens.flare.lights import Light, with_disc
 from neurolens.flare.picture import ghost_picture
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.colour import ACESCG, SRGB, conversion
-from neurolens.render.pictures import read_colour_space, read_exr, read_layers, write_data_exr, write_exr
+from neurolens.render.pictures import read_colour_space, read_exr, read_layers, write_channels, write_exr
 from neurolens.setting.states import set_lens
 
 GAUSS = ["flare", "laikin_double_gauss_50", "--light", "15,8", "--coating", "quarter-wave"]
@@ -144,10 +144,10 @@ def test_a_plate_says_its_colours(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert found[1][4:] == pytest.approx(conversion(SRGB, ACESCG) @ found[0][4:], rel=1e-3)
     # Without chromaticities the plate has the space that is asked for; those of another space are told.
     channels = {c: np.ascontiguousarray(read_exr(plate)[0][..., k]) for k, c in enumerate("RGB")}
-    write_data_exr(plate, channels, {})
+    write_channels(plate, channels)
     assert main([*SMALL, "--image", str(plate), "--colour-space", "ACEScg", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["lights"][0]["rgb"] == pytest.approx(found[0][:3], rel=1e-4)
-    write_data_exr(plate, channels, {}, {"chromaticities": (0.7, 0.3, 0.2, 0.7, 0.1, 0.1, 0.3, 0.3)})
+    write_channels(plate, channels, attributes={"chromaticities": (0.7, 0.3, 0.2, 0.7, 0.1, 0.1, 0.3, 0.3)})
     assert main([*SMALL, "--image", str(plate)]) == 0
     assert "neither sRGB nor ACEScg" in capsys.readouterr().err
 

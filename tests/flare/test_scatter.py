@@ -16,7 +16,7 @@ from neurolens.flare.picture import _smoothed, photon_picture
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.colour import SRGB
-from neurolens.render.flaresettings import Scatter
+from neurolens.render.settings import Scatter
 from neurolens.setting.states import set_lens
 from neurolens.trace.rays import Rays
 from neurolens.trace.sequence import follow, turning

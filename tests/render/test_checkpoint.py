@@ -19,8 +19,8 @@ from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.ideal import ThinLens
 from neurolens.render.checkpoint import SPENT, digest, write_checkpoint
 from neurolens.render.film import Film, Tiling
-from neurolens.render.film_settings import FilmSettings
 from neurolens.render.renderer import RenderResult, Watch, render
+from neurolens.render.settings import FilmSettings
 
 PATHS_A_PASS = 16 * 64
 

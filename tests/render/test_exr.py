@@ -18,10 +18,10 @@ from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.render import pictures
 from neurolens.render.film import BYTES_A_PIXEL, COLUMNS, PixelGrid
-from neurolens.render.film_settings import FilmSettings
 from neurolens.render.job import Job, develop
 from neurolens.render.pictures import read_exr, read_layers, write_exr, write_png
 from neurolens.render.renderer import Watch, render
+from neurolens.render.settings import FilmSettings
 
 PICTURE = np.random.default_rng(0).random((5, 7, 3), np.float32) * 10
 

@@ -14,8 +14,7 @@ from neurolens.cameras.sampling import stratified
 from neurolens.cli import main
 from neurolens.lens.glass import LINE_D_NM, index_of
 from neurolens.readers.lensfile import read_lens
-from neurolens.render.exr_attributes import standard_attributes
-from neurolens.render.pictures import read_exr, write_exr
+from neurolens.render.pictures import read_exr, standard_attributes, write_exr
 
 LENS = "lenses/laikin_double_gauss_50.toml"
 MODEL = "models/laikin_double_gauss_50.ols-60.onnx"

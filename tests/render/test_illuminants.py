@@ -19,15 +19,17 @@ from neurolens.render.colour import (
     adaptation,
     balance,
     conversion,
+    illuminant,
     linear_to_srgb,
+    planck,
     srgb_to_linear,
+    table,
     xyz_of,
 )
-from neurolens.render.film_settings import FilmSettings
-from neurolens.render.illuminants import illuminant, planck, table
 from neurolens.render.pictures import read_exr, write_exr
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene
+from neurolens.render.settings import FilmSettings
 from neurolens.render.spectrum import SpectralRange
 
 CAMERA = Pinhole(400.0, FILM)

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.render import pictures
-from neurolens.render.radiance import read_radiance
+from neurolens.render import images, pictures
+from neurolens.render.images import read_radiance
 
 HEADER = b"#?RADIANCE\n# a comment\nFORMAT=32-bit_rle_rgbe\n\n"
 
@@ -32,7 +32,7 @@ def test_pictures_are_those_that_opencv_reads(shape: tuple[int, int], tmp_path: 
     wanted[:, shape[1] // 2 :] = wanted[:, :1]  # long runs
     wanted[0, 0] = 0
     cv2.imwrite(str(tmp_path / "a.hdr"), wanted[..., ::-1])
-    found = pictures.read_picture(tmp_path, "file", tmp_path / "a.hdr", most=1 << 16)
+    found = images.read_picture(tmp_path, "file", tmp_path / "a.hdr", most=1 << 16)
     assert np.array_equal(found, cv2.imread(str(tmp_path / "a.hdr"), cv2.IMREAD_UNCHANGED)[..., ::-1])
     assert np.all(np.abs(found - wanted) <= wanted.max(axis=-1, keepdims=True) / 127)  # of a shared exponent
 
@@ -69,7 +69,7 @@ def test_old_rows_repeat_pixels_and_axes_turn_the_picture() -> None:
 def test_damaged_pictures_are_named(data: bytes, message: str, tmp_path: Path) -> None:
     (tmp_path / "a.hdr").write_bytes(data)
     with pytest.raises(InputError, match=f"environment.file.*a.hdr.*{message}"):
-        pictures.read_environment(tmp_path / "s.toml", "environment.file", tmp_path / "a.hdr")
+        images.read_environment(tmp_path / "s.toml", "environment.file", tmp_path / "a.hdr")
 
 
 def test_no_mutation_of_a_picture_raises_anything_else(tmp_path: Path) -> None:
@@ -79,16 +79,14 @@ def test_no_mutation_of_a_picture_raises_anything_else(tmp_path: Path) -> None:
     kept = 0
 
     def check(width: int, height: int) -> None:
-        pictures._check_size("", "", "", (width, height), 64, 4096)
+        pictures.check_size("", "", "", (width, height), 64, 4096)
 
     for _ in range(3000):
         data = bytearray(whole[: rng.integers(1, len(whole) + 1)] if rng.random() < 0.3 else whole)
         for place in rng.integers(0, len(data), rng.integers(1, 4)):
             data[place] = rng.choice([0, 1, 2, 127, 128, 129, 255, rng.integers(256)])
         try:
-            read_radiance(
-                bytes(data), lambda width, height: pictures._check_size("", "", "", (width, height), 64, 4096)
-            )
+            read_radiance(bytes(data), lambda width, height: pictures.check_size("", "", "", (width, height), 64, 4096))
             kept += 1
         except ValueError:  # InputError is one
             pass
@@ -98,7 +96,7 @@ def test_no_mutation_of_a_picture_raises_anything_else(tmp_path: Path) -> None:
 def test_what_a_header_asks_for_and_is_not_done_is_said(tmp_path: Path) -> None:
     (tmp_path / "a.hdr").write_bytes(old(b"-Y 1 +X 2", *[(64, 64, 64, 129)] * 2).replace(b"# a", b"EXPOSURE=2.0\n# a"))
     with pytest.warns(NeurolensWarning, match=r"textures.*a\.hdr.*without EXPOSURE=2\.0"):
-        found = pictures.read_pictures(tmp_path / "s.toml", {"textures.a.file": tmp_path / "a.hdr"})
+        found = images.read_pictures(tmp_path / "s.toml", {"textures.a.file": tmp_path / "a.hdr"})
     assert np.array_equal(found["textures.a.file"], np.full((1, 2, 3), 0.5))
 
 
@@ -108,13 +106,13 @@ def test_stray_pixels_are_clamped_counted_and_placed(stray: float, tmp_path: Pat
     pixels = np.full((4, 8, 3), 0.25, np.float32)
     pixels[3, 1, 0] = 7.0  # of a texture, more light than falls on it
     pixels[1, 6, 2] = pixels[2, 7, 0] = stray
-    pictures.write_stored(tmp_path / "a.exr", {n: pixels[..., k].copy() for k, n in enumerate("RGB")}, pictures.SRGB)
+    pictures.write_channels(tmp_path / "a.exr", {n: pixels[..., k].copy() for k, n in enumerate("RGB")}, pictures.SRGB)
     for most, bad in ((7.0, 2), (1.0, 3)):
         with pytest.warns(NeurolensWarning) as said:
             if most == 7:
-                found = pictures.read_environment(tmp_path / "s.toml", "environment.file", tmp_path / "a.exr")
+                found = images.read_environment(tmp_path / "s.toml", "environment.file", tmp_path / "a.exr")
             else:
-                found = pictures.read_pictures(tmp_path / "s.toml", {"textures.t.file": tmp_path / "a.exr"})
+                found = images.read_pictures(tmp_path / "s.toml", {"textures.t.file": tmp_path / "a.exr"})
                 found = found["textures.t.file"]
         assert f"a.exr: {bad} of 32 pixels" in str(said[0].message)
         assert "first in row 2 from the top, column 7" in str(said[0].message)

@@ -13,7 +13,7 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.lens.apertures import Aperture
-from neurolens.render import pictures
+from neurolens.render import images
 from neurolens.render.meshfile import encloses
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene, scene_from_tables
@@ -220,10 +220,10 @@ def test_grey_pictures_of_16_bits_are_as_bright_as_those_of_8(tmp_path: Path) ->
     Image.fromarray(grey).save(tmp_path / "8.png")
     Image.fromarray(grey.astype(np.uint16) * 257).save(tmp_path / "16.png")
     Image.fromarray(grey.astype(np.float32)).save(tmp_path / "32.tiff")
-    few, many = (pictures.read_picture(tmp_path, "file", tmp_path / name) for name in ("8.png", "16.png"))
+    few, many = (images.read_picture(tmp_path, "file", tmp_path / name) for name in ("8.png", "16.png"))
     assert few.shape == (16, 16, 3) and few.max() == 1 and np.allclose(few, many, atol=1e-6)
     with pytest.raises(InputError, match="8 or 16 bits"):
-        pictures.read_picture(tmp_path, "file", tmp_path / "32.tiff")
+        images.read_picture(tmp_path, "file", tmp_path / "32.tiff")
 
 
 def test_broken_and_large_environments_are_named(tmp_path: Path) -> None:

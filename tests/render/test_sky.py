@@ -7,7 +7,7 @@ import pytest
 from render_helpers import FLOOR, MATERIALS, assert_aimed, radiance, scene, world
 
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.render.colour import SRGB
+from neurolens.render.colour import SRGB, table
 from neurolens.render.environment import (
     SunLight,
     daylight_table,
@@ -17,12 +17,11 @@ from neurolens.render.environment import (
     sun_spectrum,
     zenith,
 )
-from neurolens.render.film_settings import FilmSettings
-from neurolens.render.illuminants import table
+from neurolens.render.job import expected_light
 from neurolens.render.renderer import render
 from neurolens.render.scenetables import Sky
+from neurolens.render.settings import FilmSettings
 from neurolens.render.spectrum import SpectralRange
-from neurolens.render.wavelengths import expected_light
 
 WHITE_FLOOR = FLOOR | {"material": "white"}
 

@@ -13,13 +13,13 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.build import Shot, make_camera
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
+from neurolens.render.colour import table
 from neurolens.render.film import PixelGrid
-from neurolens.render.film_settings import FilmSettings
-from neurolens.render.illuminants import table
+from neurolens.render.job import dispersion_px, expected_light, mode_for, spectral_range
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene
+from neurolens.render.settings import FilmSettings
 from neurolens.render.spectrum import SpectralRange
-from neurolens.render.wavelengths import dispersion_px, expected_light, mode_for, spectral_range
 
 FLAT = (table("wavelength_nm"), np.ones(81))
 SPIKE = (np.array([400.0, 499.0, 500.0, 501.0, 700.0]), np.array([0.01, 0.01, 5.0, 0.01, 0.01]))

@@ -19,9 +19,9 @@ from neurolens.plan.plan import plan
 from neurolens.plan.probe import effects_of, probe
 from neurolens.plan.samples import blur_map
 from neurolens.readers.lensfile import read_lens
-from neurolens.render.flaresettings import FlareSettings
 from neurolens.render.renderer import render
 from neurolens.render.scene import scene_from_tables
+from neurolens.render.settings import FlareSettings
 from neurolens.render.world import World
 from neurolens.setting.pupils import camera_rays
 from neurolens.setting.states import set_lens

@@ -17,7 +17,7 @@ from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Surface
 from neurolens.readers.lensfile import read_lens
 from neurolens.readers.lenswriter import write_lens
-from neurolens.render.pictures import make_aperture, read_mask
+from neurolens.render.images import make_aperture, read_mask
 from neurolens.setting.pupils import camera_rays, pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.trace.rays import Rays, trace
