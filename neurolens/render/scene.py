@@ -21,7 +21,8 @@ from neurolens.lens.apertures import Aperture
 from neurolens.render import scenetables as tables
 from neurolens.render.colour import Spectrum, check_name, check_spectrum, illuminant, read_spectrum
 from neurolens.render.images import make_aperture, read_environment, read_pictures
-from neurolens.render.meshfile import Parts, TriangleSet, encloses
+from neurolens.render.mesh import Parts, encloses
+from neurolens.render.meshfile import TriangleSet
 from neurolens.render.scenetables import (
     BLACK,
     Checked,

@@ -14,7 +14,7 @@ from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.lens.apertures import Aperture
 from neurolens.render import images
-from neurolens.render.meshfile import encloses
+from neurolens.render.mesh import encloses
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene, scene_from_tables
 
