@@ -48,7 +48,7 @@ def identity(job: Job) -> dict[str, Any]:
     common = replace(scene.settings.camera, width=1, height=1, samples=1, max_depth=1, focus_m=1.0, f_number=None)
     bare = replace(scene, name="", settings=replace(scene.settings, camera=common, film=FilmSettings()))
     kept = {key: value for key, value in camera.settings.items() if key not in _NO_MATTER}
-    told = {
+    identity = {
         "neurolens": __version__,
         "scene": digest(bare),
         "camera": {"name": camera.name, **kept, "rays": _rays(camera)},
@@ -56,8 +56,8 @@ def identity(job: Job) -> dict[str, Any]:
         **job.asked(),
     }
     if scene.triangles:
-        told["meshes traced by"] = tracer()
-    return json.loads(json.dumps(told, default=str))
+        identity["meshes traced by"] = tracer()
+    return json.loads(json.dumps(identity, default=str))
 
 
 def _leaves(tree: Any, place: str = "") -> dict[str, Any]:
@@ -106,8 +106,7 @@ def _rays(camera: Camera) -> str:
     nm = np.linspace(low, high, _PROBES).astype(np.float32)
     rays = camera.sample(film, random.random((2, _PROBES), np.float32), nm)
     passed = rays.status == 0
-    told = [rays.status, *(np.where(passed, part, 0) for part in (rays.origin_m, rays.direction, rays.weight))]
-    return digest(told)
+    return digest([rays.status, *(np.where(passed, p, 0) for p in (rays.origin_m, rays.direction, rays.weight))])
 
 
 def write_checkpoint(path: Path, film: Film, identity: dict[str, Any], spent: dict[str, float]) -> None:
@@ -142,11 +141,22 @@ def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[st
     """
     try:
         with read_arrays(path, ("sums", "done")) as (about, read):
-            _check_render(path, about, identity)
+            if about["format"] != _FORMAT:
+                raise InputError(path, "format", about["format"], f"{_FORMAT}, {_AGAIN}")
+            if differs := difference(about["render"], identity):
+                place, there, here = differs
+                raise InputError(path, place, there, f"{here} as asked now, {_AGAIN}")
             _check_tiling(path, about, film.tiling)
             done = read("done", np.empty_like(film.done))
             _check_samples(path, about["samples"], film.tiling, done)
-            _check_sums(read("sums", film.sums))
+            sums = read("sums", film.sums)
+            # No render has others: samples that are not finite are dropped, and emission is bounded.
+            for columns, most in (
+                (sums[:, RGB], _BRIGHTEST),
+                (sums, _BRIGHTEST**2),
+            ):  # squares of luminance are largest
+                if not (columns.min() >= -most and columns.max() <= most):
+                    raise ValueError("impossible sums")
             film.done[:] = done
             return {name: float(value) for name, value in about["spent"].items()}
     except InputError as error:
@@ -157,14 +167,6 @@ def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[st
         raise InputError(path, "file", "(missing)", "a checkpoint of this render") from None
     except ValueError as error:
         raise InputError(path, "file", f"({error})", f"a whole checkpoint of a render, {_AGAIN}") from None
-
-
-def _check_render(path: Path, about: dict[str, Any], identity: dict[str, Any]) -> None:
-    if about["format"] != _FORMAT:
-        raise InputError(path, "format", about["format"], f"{_FORMAT}, {_AGAIN}")
-    if differs := difference(about["render"], identity):
-        place, there, here = differs
-        raise InputError(path, place, there, f"{here} as asked now, {_AGAIN}")
 
 
 def _short(value: Any) -> str:
@@ -196,11 +198,3 @@ def _check_samples(path: Path, samples: int, tiling: Tiling, done: NDArray[np.in
         raise InputError(path, "samples", most, f"{tiling.samples} at most, as asked now: ask for more, {_AGAIN}")
     expected = f"a multiple of {tiling.step}, which alone can be raised to {tiling.samples}; give the same, {_AGAIN}"
     raise InputError(path, "samples", samples, expected)
-
-
-def _check_sums(sums: NDArray[np.float64]) -> None:
-    """No render has others: samples that are not finite are dropped, and emission is bounded."""
-    for columns, most in ((sums[:, RGB], _BRIGHTEST), (sums, _BRIGHTEST**2)):  # squares of luminance are the largest
-        if columns.min() >= -most and columns.max() <= most:
-            continue
-        raise ValueError("impossible sums")

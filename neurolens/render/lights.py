@@ -95,11 +95,6 @@ class Lights:
     def sample(self, point: FloatArray, choice: FloatArray, square: FloatArray) -> LightSamples:
         """A direction from each point [3, N] to one of the lights, for numbers [N] and [2, N] in [0, 1)."""
         light = self._table.take((choice * np.float32(len(self._table))).astype(np.intp), mode="clip")
-        if len(self._groups) == 1:
-            ((_, group),) = self._groups
-            direction, distance, scale = group.sample(light, point, square)
-            scale /= self.probability.take(light)
-            return LightSamples(direction, distance, light, np.zeros_like(scale) if group.sizeless else scale, scale)
         direction, distance, scale = np.empty_like(point), np.empty_like(choice), np.empty_like(choice)
         inverse_pdf = np.empty_like(choice)
         for group, rows, number in self._by_group(light):

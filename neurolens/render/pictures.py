@@ -342,17 +342,14 @@ def standard_attributes(
         **_lens(settings),
         **({} if width is None or height is None else _film(settings, width, height)),
     }
-    typed = {name: _typed(name, value) for name, value in found.items() if value is not None}
-    return {name: value for name, value in typed.items() if not _empty(value)}
-
-
-def _typed(name: str, value: Any) -> Any:
-    """A header value of the type of its attribute."""
-    if name.startswith(_TEXTS):
-        if not isinstance(value, str):
+    typed: dict[str, Any] = {}
+    for name, value in found.items():
+        if name.startswith(_TEXTS) and not isinstance(value, str | None):
             raise TypeError(f"{name}: {value!r} is no text")
-        return value
-    return float(value) if name in ("focus", *_STATE) else value
+        if value is not None and not (isinstance(value, str) and not value):  # the standard wants no empty text ...
+            typed[name] = float(value) if name in ("focus", *_STATE) else value
+    # ... nor a number that is none.
+    return {name: value for name, value in typed.items() if not (isinstance(value, float) and math.isnan(value))}
 
 
 def _lens(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -363,7 +360,8 @@ def _lens(settings: Mapping[str, Any]) -> dict[str, Any]:
     # The makers of a published prescription are those who designed it, or who published it.
     found |= {"lensMake": lens.get("designer") or lens.get("source"), "lensModel": lens.get("name")}
     found |= {"lensSerialNumber": lens.get("sha256"), "lensFirmwareVersion": card.get("fit", {}).get("method")}
-    if "focus_m" in settings and not _a_point(settings):
+    point = str(settings.get("camera")).startswith(("pinhole", "fisheye-"))  # everything is in focus
+    if "focus_m" in settings and not point:
         found["focus"] = math.inf if settings["focus_m"] is None else float(settings["focus_m"])
     return found
 
@@ -385,14 +383,3 @@ def _film(settings: Mapping[str, Any], width: int, height: int) -> dict[str, Any
         "sensorPhotositePitch": 1e3 * across if abs(aspect - 1) < _SQUARE else None,
         "pixelAspectRatio": squeeze if abs(aspect - 1) < _SQUARE else squeeze * aspect,
     }
-
-
-def _a_point(settings: Mapping[str, Any]) -> bool:
-    """Whether everything is in focus."""
-    kind = str(settings.get("camera"))
-    return kind == "pinhole" or kind.startswith("fisheye-")
-
-
-def _empty(value: Any) -> bool:
-    """A text without letters, a number that is none: the standard wants neither."""
-    return value == "" if isinstance(value, str) else isinstance(value, float) and math.isnan(value)

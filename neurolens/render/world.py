@@ -320,7 +320,8 @@ class World:
         self.reflectance_row = spread(reflectances, np.intp)
         self.specular_row = spread([colour((m and m.specular) or BLACK) for m in materials], np.intp)
         self.index_row = spread([palette.index(m.n_d, m.V_d) if m and m.n_d else 0 for m in materials], np.intp)
-        self.absorption_row = spread([self._absorption(m) for m in materials], np.intp)
+        absorbing = ((m and m.transmittance, m and m.transmittance_depth_m) for m in materials)
+        self.absorption_row = spread([palette.absorption(t, d) if t and d else 0 for t, d in absorbing], np.intp)
         self.absorbs = bool(self.absorption_row.any())
         alphas = [m.roughness**2 if m and m.roughness else 1.0 for m in materials]
         self.alpha = spread(alphas, np.float32)
@@ -334,11 +335,6 @@ class World:
 
     def _emission(self, emitter: Emitter | None) -> int:
         return 0 if emitter is None else self.palette.light(emitter.emission, emitter.illuminant)
-
-    def _absorption(self, material: Material | None) -> int:
-        if material is None or material.transmittance is None or material.transmittance_depth_m is None:
-            return 0
-        return self.palette.absorption(material.transmittance, material.transmittance_depth_m)
 
     def _fill_spheres(self, first: int) -> None:
         """Centre and 1 / radius of each sphere, 0 for other surfaces."""
