@@ -18,8 +18,7 @@ from neurolens.cameras.contract import CameraRays, FloatArray, RayDifferentials
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.sampling import is_light, stratified
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph
-from neurolens.graph.passes import pruned
+from neurolens.graph.ir import Graph, pruned
 from neurolens.lens.apertures import Aperture
 
 # Points a side of the quadrature of the exposure on the axis.

@@ -18,9 +18,8 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.onnxsession import open_session, run_batches
-from neurolens.graph.ir import Graph
+from neurolens.graph.ir import Graph, pruned
 from neurolens.graph.onnx import write_onnx
-from neurolens.graph.passes import pruned
 from neurolens.surrogates.assemble import ONNX, SCALARS, Form, model_graph
 from neurolens.surrogates.cardstates import card_at, default_state, state_numbers
 from neurolens.surrogates.file import ModelFile, read_model

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.graph.ir import Exponents, Graph, Node, Value
-from neurolens.graph.passes import pruned
+from neurolens.graph.ir import Exponents, Graph, Node, Value, pruned
 from neurolens.graph.program import row_names
 
 Array = NDArray[np.float64]

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph, Value
-from neurolens.graph.passes import live_rows
+from neurolens.graph.ir import Graph, Value, live_rows
 from neurolens.graph.program import FILM_X_Y
 
 Array = NDArray[np.float64]

@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.graph.ir import Graph, Node
+from neurolens.graph.ir import Graph, Node, pruned, same_structure
 from neurolens.graph.monomials import Block, Exponent, Pair, blocks_alone, by_block, plan_products
-from neurolens.graph.passes import pruned, same_structure
 from neurolens.graph.protobuf import FLOAT, INT32, model_proto, node_proto, tensor_proto, value_proto
 
 Array = NDArray[np.float64]

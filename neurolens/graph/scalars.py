@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.graph.ir import Exponents, Graph, Node
+from neurolens.graph.ir import Exponents, Graph, Node, pruned, same_structure
 from neurolens.graph.monomials import plan_monomials
-from neurolens.graph.passes import pruned, same_structure
 from neurolens.graph.program import Expr, Program, row_names
 
 Array = NDArray[np.float64]

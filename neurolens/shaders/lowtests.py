@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph, Node, Value
+from neurolens.graph.ir import Graph, Node, Value, live_rows, pruned
 from neurolens.graph.loworder import pursue
-from neurolens.graph.passes import live_rows, pruned
 
 Array = NDArray[np.float64]
 Truths = NDArray[np.bool_]

@@ -23,9 +23,8 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Exponents, Graph, Value
+from neurolens.graph.ir import Exponents, Graph, Value, pruned
 from neurolens.graph.newton import determinant, limited_newton
-from neurolens.graph.passes import pruned
 from neurolens.graph.program import RAY
 from neurolens.surrogates.assemble import (
     EXACT,

@@ -1,10 +1,16 @@
-"""The page as one file: its template, style, scripts and shaders, and the lenses as packed data."""
+"""The page as one file: its template, style, scripts and shaders, and the lenses as packed data.
+
+Texts and files of lenses are one stream of printable characters, which `page/packed.js` unpacks: a fifth of gzip's. C,
+GLSL and OSL of lenses say much the same with temporaries of other numbers. Counted from the line's own number most
+lines of one are lines of the others; LZMA, unlike gzip, looks back far enough to find them.
+"""
 
 from __future__ import annotations
 
 import json
+import lzma
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import product
 from pathlib import Path
@@ -18,7 +24,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.base.html import html, text_of
 from neurolens.graph.c import Signature
-from neurolens.view.packed import packed, packed_parts
+from neurolens.graph.osl import TEMPORARY, urgent
 from neurolens.view.shaders import Ghosts, call_of, shared_glsl
 
 SCRIPTS = ("packed.js", "gl.js", "scene.js", "engine.js", "ghosts.js", "layout.js", "main.js")
@@ -29,6 +35,13 @@ _TOGETHER = 6  # lenses of a stream: each says less for those before, and takes 
 _AIR, _ARC = 1.01, 4  # a medium of a smaller index is drawn as air; of 65 points of an arc every fourth is drawn
 _CONSTANT = re.compile(r"^const float ([A-Z][A-Z0-9_]*_(?:MM|NM)) = ", re.MULTILINE)
 _FUNCTION = re.compile(r"^float ([a-z]\w*)\(([^)]*)\)$", re.MULTILINE)
+# Of 91 characters two hold 13 bits; none ends an element of HTML, begins an entity or an escape.
+CHARACTERS = "".join(chr(code) for code in range(33, 127) if chr(code) not in "&<\\")
+FILTERS = [
+    {"id": lzma.FILTER_LZMA1, "preset": 9 | lzma.PRESET_EXTREME, "dict_size": 1 << 22, "lc": 3, "lp": 0, "pb": 0}
+]
+_STEPS = re.compile(r"(?:^    float t\d+ = .*\n)+", re.M)
+_UNTOLD = re.compile(r"\x01|\bt\d+-")  # what `_counted` could not give back
 _GIVEN = {"zoom_mm": "zoom", "focus_m": "focus", "stop_radius_mm": "stop_radius"}
 
 
@@ -136,7 +149,7 @@ def _page(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> str:
         "lenses": entries,
     }
     data = json.dumps(shared, allow_nan=False, separators=(",", ":")).encode()
-    # Packed texts are of `packed.CHARACTERS`, which end no element.
+    # Packed texts are of `CHARACTERS`, which end no element.
     elements.insert(0, {"key": "data", "text": packed(data), "bytes": len(data)})
     title = lenses[0].name if len(lenses) == 1 else "neurolens: lenses and their models"
     return html("view.html", title=title, streams=elements, scripts=SCRIPTS)
@@ -202,3 +215,46 @@ def _path(points: np.ndarray[Any, Any]) -> str:
     """A closed path; of an outline's arcs every fourth point."""
     kept = np.concatenate([points[:65:_ARC], points[65:-65], points[-65::_ARC]])
     return "M" + "L".join(f"{z:.2f} {h:.2f}" for z, h in kept) + "Z"
+
+
+def packed(data: bytes) -> str:
+    """Bytes as LZMA (raw, lc 3, lp 0, pb 0) in `CHARACTERS`, 13 bits a pair, high bits and characters first."""
+    bits = np.unpackbits(np.frombuffer(lzma.compress(data, lzma.FORMAT_RAW, filters=FILTERS), np.uint8))
+    values = np.pad(bits, (0, -bits.size % 13)).reshape(-1, 13) @ (1 << np.arange(12, -1, -1))
+    return np.array(list(CHARACTERS))[np.stack(np.divmod(values, len(CHARACTERS)), 1)].tobytes().decode("utf-32-le")
+
+
+def packed_parts(parts: Iterable[tuple[str, str | bytes]]) -> tuple[str, list[tuple[str, int, int, int]]]:
+    """The stream of named parts, and for each its name, place, bytes, and form: 0 as it is, 1 with temporaries counted,
+    2 with steps in the order of their numbers, too, which `urgent` had moved."""
+    data, index = b"", []
+    for name, part in parts:
+        how = int(isinstance(part, str) and not _UNTOLD.search(part))
+        if isinstance(part, str):
+            in_turn = _STEPS.sub(lambda steps: "".join(sorted(steps[0].splitlines(True), key=_own)), part)
+            if how and in_turn != part == _STEPS.sub(lambda steps: "".join(urgent(steps[0].splitlines(True))), in_turn):
+                how, part = 2, in_turn
+            part = (_counted(part) if how else part).encode()
+        index.append((name, len(data), len(part), how))
+        data += part
+    return packed(data), index
+
+
+def _own(line: str) -> int:
+    return int(TEMPORARY.findall(line)[0])
+
+
+def _counted(text: str) -> str:
+    """A text with each line's first temporary counted from that of the line before (1 is left out), others back from
+    the first."""
+    before, lines = 0, []
+    for line in text.split("\n"):
+        numbers = [int(n) for n in TEMPORARY.findall(line)]
+        if numbers:
+            steps = [numbers[0] - before, *(numbers[0] - n for n in numbers[1:])]
+            between, before = TEMPORARY.split(line)[::2], numbers[0]
+            line = between[0] + "".join(
+                f"\x01{'' if step == 1 else step}{text}" for step, text in zip(steps, between[1:], strict=True)
+            )
+        lines.append(line)
+    return "\n".join(lines)

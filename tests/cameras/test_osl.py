@@ -13,9 +13,8 @@ from neurolens.cameras.model import OnnxCamera
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import main
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph
+from neurolens.graph.ir import Graph, pruned
 from neurolens.graph.osl import write_osl
-from neurolens.graph.passes import pruned
 from neurolens.graph.scalars import lower
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.paraxial import first_order

@@ -18,10 +18,9 @@ from neurolens.graph.compiler import compile_c
 from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.glsl import write_glsl
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph, Value
+from neurolens.graph.ir import Graph, Value, pruned
 from neurolens.graph.newton import determinant, limited_newton, solve
 from neurolens.graph.onnx import write_onnx
-from neurolens.graph.passes import pruned
 from neurolens.graph.program import row_names
 from neurolens.graph.scalars import lower
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.passes import pruned, same_structure
+from neurolens.graph.ir import pruned, same_structure
 from neurolens.graph.program import RAY, WAVELENGTH
 from neurolens.graph.scalars import lower
 from neurolens.lens.paraxial import film_z_mm

@@ -27,8 +27,8 @@ from neurolens.setting.states import set_lens
 from neurolens.trace.rays import trace
 from neurolens.trace.surfaces import Rays
 from neurolens.trace.tracegraph import TRANSMITTANCE, exact_graph
-from neurolens.view import packed, shaders
 from neurolens.view import page as pages
+from neurolens.view import shaders
 
 ROOT = Path(__file__).parents[2]
 LENS = "thorlabs_lb1471_biconvex_50"
@@ -50,9 +50,9 @@ def data_of(text: str) -> Any:
 
 def unpacked(letters: str, size: int) -> bytes:
     """By the library's own LZMA."""
-    values = np.array([packed.CHARACTERS.index(c) for c in letters]).reshape(-1, 2) @ (91, 1)
+    values = np.array([pages.CHARACTERS.index(c) for c in letters]).reshape(-1, 2) @ (91, 1)
     data = np.packbits((values[:, None] >> np.arange(12, -1, -1)) & 1).tobytes()
-    return lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=packed.FILTERS).decompress(data, size)
+    return lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=pages.FILTERS).decompress(data, size)
 
 
 class Elements(HTMLParser):
@@ -141,7 +141,7 @@ def test_parts_are_unpacked_as_they_were() -> None:
     noise = np.random.default_rng(0).integers(0, 256, 3000).astype(np.uint8).tobytes()
     parts = {"c": CODE, "bytes": noise, "none": "", "less": f"{CODE}t2-1 t1\n", "mark": f"{CODE}\x01\n"}
     parts |= {"again": noise + b"x", "in turn": in_turn, "shader": shader}
-    text, index = packed.packed_parts(parts.items())
+    text, index = pages.packed_parts(parts.items())
     assert len(text) < 1.25 * len(noise) + 900
     assert [how for *_, how in index] == [2, 0, 1, 0, 0, 0, 1, 2]
     script = f"""{text_of("packed.js")}
