@@ -18,9 +18,9 @@ from pathlib import Path
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, cache_folder, keep_newest, seal, sealed_bytes
 
-# -march=native takes what the machine has; the others let square roots and divisions become vectors, also where only
-# one side of a choice needs them. NaN and infinity stay what they are. A function put into its caller loses what is
-# known of its arguments, that arrays do not overlap; functions of single rays are marked to be put into theirs still.
+# -march=native uses all of the machine; the next two let square roots and divisions become vectors, also where only one
+# side of a choice needs them. NaN and infinity stay what they are. -fno-inline keeps the knowledge that the arrays of a
+# function do not overlap; functions of single rays are marked to be inlined anyway.
 FLAGS = ("-std=c99", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fno-inline")
 _SECONDS = 300  # the largest models known compile in ten
 _ROOM = 2**20
@@ -28,10 +28,10 @@ _KEPT = 64  # libraries of 50 to 200 kB
 
 
 def find_compiler() -> str:
-    """A C compiler: $CC, which may have arguments ("ccache gcc"), else cc, gcc or clang.
+    """The C compiler: $CC, which may have arguments ("ccache gcc"), else cc, gcc or clang.
 
     Raises:
-        InputError: none is there, or $CC names none.
+        InputError: there is none, or $CC names none.
     """
     asked = os.environ.get("CC", "").strip()
     if asked:
@@ -54,7 +54,7 @@ def has_compiler() -> bool:
 
 
 def _words(compiler: str) -> list[str]:
-    """The command of a compiler; a path with spaces that is there is one word."""
+    """The words of a compiler's command; the path of a file, also with spaces, is one word."""
     if shutil.which(compiler):
         return [compiler]
     try:
@@ -84,7 +84,7 @@ def compile_c(source: str, library: Path, flags: tuple[str, ...] = FLAGS) -> str
 def _run(command: list[str], text: str = "") -> subprocess.CompletedProcess[str]:
     pipe, english = subprocess.PIPE, {**os.environ, "LC_ALL": "C"}
     try:
-        # A group of its own: the driver's children, which do the work, are to end with it, at Ctrl-C too.
+        # In a group of its own, the driver's children, which do the work, end with it, also at Ctrl-C.
         with subprocess.Popen(
             command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, errors="replace", start_new_session=True,
             env=english,
@@ -101,7 +101,7 @@ def _run(command: list[str], text: str = "") -> subprocess.CompletedProcess[str]
 
 
 def _end(child: subprocess.Popen[str]) -> None:
-    """End a process and, where the system has groups of them, all that it has started."""
+    """End a process and, where the system has process groups, all that it has started."""
     with suppress(OSError):
         os.killpg(child.pid, signal.SIGKILL) if hasattr(os, "killpg") else child.kill()
 
@@ -113,9 +113,9 @@ def c_source(file: str, **constants: object) -> str:
 
 
 def load_compiled(source: str) -> ctypes.CDLL:
-    """The library of a source: compiled once for this machine, then taken from the folder.
+    """The library of a source, which is compiled once for this machine and kept in `cache_folder`.
 
-    It is kept in `cache_folder`; a library of another user, or a damaged one, is made anew.
+    A library of another user, or a damaged one, is compiled again.
 
     Raises:
         InputError: as `compile_c`; a library that cannot be loaded.
@@ -136,7 +136,7 @@ def load_compiled(source: str) -> ctypes.CDLL:
 
 
 def _key(source: str) -> str:
-    """Hash a source, its flags, the compiler and the processor: a library for another one may crash on this one."""
+    """A hash of a source, its flags, the compiler and the processor: a library for another one may crash here."""
     made_by = _compiler_and_processor(find_compiler())
     return hashlib.sha256("\0".join((source, *FLAGS, made_by)).encode()).hexdigest()[:32]
 

@@ -1,13 +1,13 @@
 """Derivatives of graphs: forward-mode differentiation, one rule an operator.
 
-What values and derivatives have in common is done once (Griewank and Walther, "Evaluating Derivatives", 2008, chapter
-3): a polynomial's partial derivatives are further rows of the same polynomial, for they need (nearly) its monomials.
+Work that values and derivatives share is done once (Griewank and Walther, "Evaluating Derivatives", 2008, chapter 3):
+a polynomial's partial derivatives are further rows of the same polynomial, for they need (nearly) its monomials.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,17 +21,17 @@ Moved = Value | None
 
 
 def derivative(output: str, by: str) -> str:
-    """Name of the output that holds the derivatives of one output by one row of an input (`program.row_names`)."""
+    """The name of the output that holds the derivatives of an output by one row of an input (`program.row_names`)."""
     return f"{output}_by_{by}"
 
 
 def with_derivatives(graph: Graph, outputs: Sequence[str], inputs: Sequence[tuple[str, int]]) -> Graph:
-    """The graph with outputs `derivative(output, row)`, of as many rows as the output, besides its own.
+    """The graph with its outputs and, for each output and input row, `derivative(output, row)`, of the output's rows.
 
-    At a choice (select, max, min, clip) the derivative is that of what was chosen.
+    At a choice (select, max, min, clip) the derivative is that of the value that was chosen.
 
     Args:
-        outputs: those to differentiate. inputs: names and rows of those to differentiate by.
+        outputs: the outputs to differentiate. inputs: names and rows of the inputs to differentiate by.
     """
     g = Graph()
     values: dict[int, Value] = {}  # by the old graph's numbers
@@ -67,35 +67,11 @@ def with_derivatives(graph: Graph, outputs: Sequence[str], inputs: Sequence[tupl
         for output in outputs:
             value = g.outputs[output]
             g.outputs[derivative(output, names[place])] = direction.get(value.number) or value * 0.0
-    return _joined(pruned(g))
-
-
-def _joined(graph: Graph) -> Graph:
-    """Products of several matrices with one value, as those of all directions with the planes, as one product."""
-    groups: dict[tuple[Any, ...], list[Node]] = {}
-    for node in graph.nodes:
-        if node.kind == "affine" and not node.static[1]:
-            groups.setdefault((node.inputs, node.static), []).append(node)
-    found, values = Graph(), list[Value]()
-    for node in graph.nodes:
-        inputs = [values[k] for k in node.inputs]
-        group = groups.get((node.inputs, node.static), []) if node.kind == "affine" else []
-        if len(group) > 1:
-            rows = sum(n.rows for n in group)
-            arrays = [np.concatenate(a) for a in zip(*(n.arrays for n in group), strict=True)]
-            start = sum(n.rows for n in group[: next(k for k, n in enumerate(group) if n is node)])
-            whole = found.add("affine", inputs, rows, arrays=arrays, static=node.static)
-            values.append(whole[start : start + node.rows])
-        elif node.kind == "take":
-            values.append(found.take(inputs[0], node.static))
-        else:
-            values.append(found.like(node, inputs))
-    found.outputs = {name: values[v.number] for name, v in graph.outputs.items()}
-    return found
+    return pruned(g)
 
 
 def _factors(x: Sequence[Value], moves: Sequence[Sequence[Moved]], chains: dict[int, tuple[int, Value]]) -> list[Moved]:
-    """Derivatives of an operation's values by the one that they all depend on."""
+    """Derivatives of an operation's values by the one value that they all depend on."""
     one = x[0].graph.constant(1.0)
     return [
         None if all(d[i] is None for d in moves) else chains[v.number][1] if v.number in chains else one
@@ -106,9 +82,9 @@ def _factors(x: Sequence[Value], moves: Sequence[Sequence[Moved]], chains: dict[
 def _base(
     node: Node, x: Sequence[Value], moves: Sequence[Sequence[Moved]], chains: dict[int, tuple[int, Value]]
 ) -> int | None:
-    """The one value, of as many rows, that an operation row by row depends on; None: there are several, or none.
+    """The one value, of as many rows, that an operation row by row depends on; None if there are several, or none.
 
-    Its derivative by that value serves all directions.
+    The derivative by that value serves all directions.
     """
     moved = {v.number: v for i, v in enumerate(x) if any(d[i] is not None for d in moves)}
     bases = {chains[n][0] if n in chains else n for n in moved}
@@ -118,37 +94,7 @@ def _base(
 
 def _sum(terms: Sequence[Moved]) -> Moved:
     there = [t for t in terms if t is not None]
-    total = there[0] if there else None
-    for term in there[1:]:
-        total = _merged(total, term) or total + term  # type: ignore[arg-type, operator]
-    return total
-
-
-_FEW = 2  # columns
-
-
-def _merged(a: Value, b: Value) -> Value | None:
-    """A sum of which one or both are products of narrow matrices, of the call or of numbers, as one product."""
-    g, narrow = a.graph, [v for v in (a, b) if _is_narrow(v)]
-    if not narrow or a.rows != b.rows or a.node.per_call or b.node.per_call:
-        return None
-    parts = [g.inputs_of(v.number) for v in narrow]
-    moving, added = narrow[0].node.static
-    if len(narrow) == 2:
-        other = narrow[1].node
-        if other.static[0] != moving or (moving and parts[0][1] != parts[1][1]):
-            return None
-        rest = _sum([p[-1] for v, p in zip(narrow, parts, strict=True) if v.node.static[1]])
-    else:
-        rest = _sum([parts[0][-1] if added else None, b if narrow[0] == a else a])
-    weights = [np.hstack([v.node.arrays[k] for v in narrow]) for k in ((0, 2) if moving else (0,))]
-    move = (parts[0][1], weights[1]) if moving else None
-    return g.affine(weights[0], g.concat(*(p[0] for p in parts)), moving=move, added=rest)
-
-
-def _is_narrow(v: Value) -> bool:
-    node = v.node
-    return node.kind == "affine" and node.rows > 1 and node.arrays[0].shape[1] <= _FEW and not node.arrays[1].any()
+    return reduce(Value.__add__, there) if there else None
 
 
 def _times(a: Moved, b: Value) -> Moved:
@@ -164,7 +110,7 @@ def _times(a: Moved, b: Value) -> Moved:
 
 
 def _column(value: Value) -> tuple[Array, tuple[Value, Array] | None] | None:
-    """Two or more rows that are numbers, or numbers of which some times a value of the call are added, as columns."""
+    """Two or more rows of numbers, or of numbers plus others times a value of the call, as columns; else None."""
     g, node, rows = value.graph, value.node, list(range(value.rows))
     if node.kind == "take":
         node, rows = g.nodes[node.inputs[0]], list(node.static)
@@ -184,7 +130,7 @@ def _is_one(value: Value) -> bool:
 
 
 def _is_zero(value: Value) -> bool:
-    """Whether all rows are 0 whatever the rays: constants, and rows of matrices that hold nothing."""
+    """Whether all rows are 0 for any rays: constants, and rows of matrices that hold nothing."""
     g, node, rows = value.graph, value.node, list(range(value.rows))
     if node.kind == "take":
         node, rows = g.nodes[node.inputs[0]], list(node.static)
@@ -228,7 +174,7 @@ def _affine(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Mov
 
 
 def _quadratic(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
-    """Linear in x where the derivative of x is the same for all rays."""
+    """The result is linear in x where the derivative of x is the same for all rays."""
     g, dx = y.graph, d[0]
     assert dx is not None
     column = _column(dx)
@@ -244,7 +190,7 @@ def _quadratic(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> 
 
 
 def _linear(node: Node, dx: Array) -> Array:
-    """[R, K]: the derivative of a quadratic along dx [K] as a matrix on x."""
+    """The derivative of a quadratic along dx [K] as a matrix [R, K] on x."""
     matrix = np.zeros((node.rows, len(dx)))
     for r, form in enumerate(node.static):
         for i, j in form:
@@ -254,10 +200,7 @@ def _linear(node: Node, dx: Array) -> Array:
 
 
 def partial_derivatives(exponents: Exponents, weight: Array) -> tuple[Exponents, Array]:
-    """A polynomial with its partial derivatives.
-
-    Args:
-        exponents: [M, V]. weight: [R, M].
+    """A polynomial of exponents [M, V] and weights [R, M] with its partial derivatives.
 
     Returns exponents [M', V] that hold the monomials of all of them, and weights [1 + V, R, M']: the polynomial's,
     then those of each derivative.
@@ -298,7 +241,7 @@ def _series(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Mov
 
 
 def _lookup(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
-    """Cells are those of an index that does not move."""
+    """The cells of an index are constant: only the weights move."""
     return None if d[2] is None else y.graph.lookup(x[0], x[1], d[2])[list(node.static)]
 
 

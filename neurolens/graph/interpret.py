@@ -32,32 +32,29 @@ def evaluate(graph: Graph, inputs: Mapping[str, Rows]) -> dict[str, Rows]:
     space = _Space(first)
     known: dict[int, Rows] = {}
     with np.errstate(all="ignore"):
-        for number, node, plain, done in _plan(graph):
+        for number, done in _plan(graph):
+            node = graph.nodes[number]
             if node.name:
                 known[number] = inputs[node.name]
-            elif plain is not None:
-                known[number] = plain(*[known[k] for k in node.inputs])
             else:
-                known[number] = _OTHERS[node.kind](space, node, [known[k] for k in node.inputs])
+                known[number] = _RULES[node.kind](space, node, [known[k] for k in node.inputs])
             for k in done:  # their memory serves the next
                 del known[k]
     return {name: known[v.number] for name, v in graph.outputs.items()}
 
 
-_Planned = tuple[int, Node, Callable[..., Rows] | None, list[int]]
-_PLANS: WeakKeyDictionary[Graph, tuple[tuple[int, ...], list[_Planned]]] = WeakKeyDictionary()
+_Plan = list[tuple[int, list[int]]]
+_PLANS: WeakKeyDictionary[Graph, tuple[tuple[int, ...], _Plan]] = WeakKeyDictionary()
 
 
-def _plan(graph: Graph) -> list[_Planned]:
-    """Nodes that the outputs need, in order, each with its plain operation, if it is one, and with those that nothing
-    after it needs; kept while a graph stays."""
+def _plan(graph: Graph) -> _Plan:
+    """Numbers of the nodes that the outputs need, in order, each with those that nothing after it needs; kept while a
+    graph stays."""
     wanted = (len(graph.nodes), *(v.number for v in graph.outputs.values()))
     kept = _PLANS.get(graph)
     if kept is None or kept[0] != wanted:
         live = set(wanted[1:])
-        for number in range(
-            len(graph.nodes) - 1, -1, -1
-        ):  # of nodes, not of rows: an operation takes all of its inputs
+        for number in range(len(graph.nodes) - 1, -1, -1):  # nodes, not rows: an operation takes all of its inputs
             if number in live:
                 live.update(graph.nodes[number].inputs)
         last = {k: number for number in sorted(live) for k in (number, *graph.nodes[number].inputs)}
@@ -65,13 +62,12 @@ def _plan(graph: Graph) -> list[_Planned]:
         for k, number in last.items():
             if k not in wanted[1:]:
                 done[number].append(k)
-        nodes = graph.nodes
-        kept = _PLANS[graph] = wanted, [(n, nodes[n], _PLAIN.get(nodes[n].kind), left) for n, left in done.items()]
+        kept = _PLANS[graph] = wanted, list(done.items())
     return kept[1]
 
 
 class _Space:
-    """What numpy and torch write differently."""
+    """The operations that numpy and torch write differently."""
 
     def __init__(self, like: Rows | None) -> None:
         self.torch = None if like is None or isinstance(like, np.ndarray) else import_module("torch")
@@ -82,7 +78,7 @@ class _Space:
         self.floor, self.concat = library.floor, library.cat if self.torch else np.concatenate
 
     def numbers(self, array: NDArray[Any]) -> Rows:
-        """Coefficients in the precision (and place) of the rays."""
+        """Coefficients in the precision and on the device of the rays."""
         if self.torch:
             return self.torch.as_tensor(array, dtype=self.like.dtype, device=self.like.device)
         return array.astype(self.like.dtype)
@@ -107,7 +103,7 @@ def monomials(x: Rows, exponents: Exponents) -> Rows:
     powers = [space.ones_like(x)]
     for _ in range(int(exponents.max(initial=0))):
         powers.append(powers[-1] * x)
-    # Of the first variables; many monomials go on from the same.
+    # Products of the first variables, with which many monomials begin.
     known: dict[tuple[int, ...], Rows] = {}
     rows = []
     for exponent in exponents.tolist():
@@ -176,16 +172,14 @@ def _first_failure(space: _Space, node: Node, given: list[Rows]) -> Rows:
     return status
 
 
-_PLAIN: dict[str, Callable[..., Rows]] = {
-    "add": operator.add,
-    "sub": operator.sub,
-    "mul": operator.mul,
-    "div": operator.truediv,
-    "neg": operator.neg,
-    "abs": operator.abs,
-    "and": operator.mul,
-}
-_OTHERS: dict[str, Callable[[_Space, Node, list[Rows]], Rows]] = {
+_RULES: dict[str, Callable[[_Space, Node, list[Rows]], Rows]] = {
+    "add": lambda s, node, given: given[0] + given[1],
+    "sub": lambda s, node, given: given[0] - given[1],
+    "mul": lambda s, node, given: given[0] * given[1],
+    "div": lambda s, node, given: given[0] / given[1],
+    "neg": lambda s, node, given: -given[0],
+    "abs": lambda s, node, given: abs(given[0]),
+    "and": lambda s, node, given: given[0] * given[1],
     "sqrt": lambda s, node, given: s.sqrt(*given),
     "tanh": lambda s, node, given: s.tanh(*given),
     "floor": lambda s, node, given: s.floor(*given),

@@ -1,4 +1,4 @@
-"""A model as one graph: operators on rows of rays, written once and read by every evaluator and writer.
+"""A lens or a model as one graph: operators on rows of rays, written once and read by every evaluator and writer.
 
 A value has R rows and one column a ray, or one for the whole call (a film position, a stop radius). `affine`,
 `polynomial`, `quadratic` and `series` stay whole and are lowered late: to matrix products and few passes over the rays
@@ -174,7 +174,7 @@ class Graph:
         return self.add("input", (), rows, name=name, per_call=per_call)
 
     def table(self, name: str, columns: int) -> Value:
-        """Numbers [cells, columns] of the caller, for `lookup` alone."""
+        """Numbers [cells, columns] that the caller gives, for `lookup` alone."""
         return self.add("table", (), columns, name=name, per_call=True)
 
     def own_table(self, values: ArrayLike) -> Value:
@@ -183,9 +183,9 @@ class Graph:
         return self.add("table", (), array.shape[1], arrays=(array,), per_call=True)
 
     def lookup(self, table: Value, index: Value, weights: Value) -> Value:
-        """The sum of weight (i, g) times group g of the columns of a table, in the cell of index i: interpolation.
+        """Interpolate: the sum of weight (i, g) times group g of the columns of a table, in the cell of index i.
 
-        The index's fraction is cut off. One beyond the table's ends, or NaN, takes some cell of the table: never
+        The index's fraction is cut off. An index beyond the table's ends, or NaN, takes some cell of the table, never
         anything outside it. There are as many groups, of equally many columns, as weights of each index; the weights
         of the first index come first.
         """
@@ -201,7 +201,7 @@ class Graph:
         return operand if isinstance(operand, Value) else self.constant(operand)
 
     def each(self, kind: str, *operands: Operand) -> Value:
-        """An operation row by row; a single row stands for as many as the others have."""
+        """Append an operation row by row; a single row stands for as many as the others have."""
         values = [self.value(v) for v in operands]
         rows = max(v.rows for v in values)
         if any(v.rows not in (1, rows) for v in values):
@@ -227,7 +227,7 @@ class Graph:
         return self.add("take", (x,), len(rows), static=tuple(int(r) for r in rows))
 
     def split(self, x: Value, sizes: Iterable[int]) -> list[Value]:
-        """Consecutive rows of `x`, so many in each part."""
+        """Parts of `x` of consecutive rows, of these sizes."""
         ends = np.cumsum([0, *sizes])
         return [x[int(a) : int(b)] for a, b in zip(ends, ends[1:], strict=False)]
 
@@ -292,23 +292,23 @@ class Graph:
         return self.each("select", truth, then, otherwise)
 
     def first_failure(self, tests: Sequence[tuple[Value, Value]], codes: Sequence[int]) -> Value:
-        """The status of a ray: code k of the first test, in order, that is not value <= limit; NaN fails; 0 if none.
+        """The status of a ray: the code of the first test for which value <= limit is false, as it is for NaN; else 0.
 
         Codes fall in the order in which rays meet the tests, but for several at one surface (`base.status`). ONNX
-        clips value - limit between 0 and the code: tests are to be scaled so that a failure exceeds every code.
+        clips value - limit between 0 and the code, so tests must be scaled so that a failure exceeds every code.
         """
         flat = [v for pair in tests for v in pair]
         return self.add("first_failure", flat, 1, static=tuple(int(c) for c in codes))
 
     def like(self, node: Node, inputs: Sequence[Value]) -> Value:
-        """Append the operation of a node of any graph."""
+        """Append the operation of a node of any graph to these inputs."""
         per_call = node.per_call if node.kind in ("input", "table", "constant", "lookup") else None
         return self.add(
             node.kind, inputs, node.rows, name=node.name, arrays=node.arrays, static=node.static, per_call=per_call
         )
 
     def inline(self, other: Graph, given: Mapping[str, Value]) -> dict[str, Value]:
-        """Append all of another graph, these values as its inputs (others stay inputs); returns its outputs."""
+        """Append another graph with these values as its inputs (others stay inputs); returns its outputs."""
         values: list[Value] = []
         for node in other.nodes:
             if node.kind in ("input", "table") and node.name in given:

@@ -1,7 +1,7 @@
 """Derivatives of a lens's graph as sparse polynomials of low order, for ray differentials.
 
-A ray differential says how wide a pixel's footprint is, to choose the texels that it averages: a few percent do.
-Carried through a surrogate, derivatives double its work; as polynomials of some ten terms each they are a few products.
+A ray differential says how wide a pixel's footprint is, to choose the texels that it averages: a few percent of error do
+no harm. Derivatives of the graph itself double its work; polynomials of some ten terms each are a few products.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from neurolens.graph.ir import Graph, Value, live_rows
 from neurolens.graph.program import FILM_X_Y
 
 Array = NDArray[np.float64]
-_DEGREE, _DEGREE_WAVE = 4, 2  # of film and pupil point; of what may be multiplied by the wavelength's variable
-_STOP, _MOST_TERMS = 0.005, 16  # error at which an output has enough, as a share of its group's; terms of an output
+_DEGREE, _DEGREE_WAVE = 4, 2  # in film and pupil point, alone and times the wavelength's variable
+_STOP, _MOST_TERMS = 0.005, 16  # of an output: the error that is good enough, as a share of its group's; terms
 WORST = 0.03  # RMS error, as a share of a derivative, above which there is no such graph
 _FEWEST = 500  # rays that pass, to fit to
 _ONE_WAVELENGTH = 1e-3  # relative spread of 1 / wavelength^2 below which it is one
@@ -45,7 +45,7 @@ class LowOrder:
 
 
 def with_film_derivatives(graph: Graph) -> Graph:
-    """The graph of a lens with the derivatives of `scene_ray` by the film point: its own, not fitted ones."""
+    """The graph of a lens with the derivatives of `scene_ray` by the film point: the graph's own, not fitted ones."""
     return with_derivatives(graph, ["scene_ray"], [("rays", row) for row in range(len(FILM_X_Y))])
 
 
@@ -55,13 +55,13 @@ def with_low_order_derivatives(
     """Fit the derivatives of a lens's graph by orthogonal matching pursuit, each until it is good enough.
 
     Args:
-        samples: inputs of rays that cover those it will be asked for, [rows, N] or, of the call, [rows, 1].
+        samples: inputs of rays that cover those of later calls, [rows, N] or, of the call, [rows, 1].
         enough, worst: see `_STOP` and `WORST`.
 
-    Returns None where low orders do not do: a lens too strong, or too few rays that pass.
+    Returns None where low orders are not enough, as for a strong lens, or too few rays pass.
     """
-    found = low_orders([graph], [samples], enough, worst)
-    return None if found is None else found[0]
+    fitted = low_orders([graph], [samples], enough, worst)
+    return None if fitted is None else fitted[0]
 
 
 def low_orders(
@@ -71,11 +71,11 @@ def low_orders(
     worst: float = WORST,
     reach_mm: float = 0.0,
 ) -> list[LowOrder] | None:
-    """`with_low_order_derivatives` of a lens in several states: the terms are those of all, their weights of each.
+    """`with_low_order_derivatives` of a lens in several states, which share the terms and have their own weights.
 
     Args:
-        reach_mm: nothing is seen from nearer: errors of the point's derivatives are shares of what the direction's make
-            of them there, where that is more.
+        reach_mm: distance of the nearest object: errors of the point's derivatives are shares of those that the
+            direction's make of them there, where that is more.
     """
     states = [_Fitted.of(graph, given) for graph, given in zip(graphs, samples, strict=True)]
     if any(state is None for state in states):
@@ -95,8 +95,8 @@ def low_orders(
 
 @dataclass(frozen=True)
 class _Fitted:
-    """A lens in one state while it is fitted: monomials [M, N] of the rays that pass, derivatives [6, 2, N] wanted,
-    and weights [6, 2, M]."""
+    """A lens in one state while it is fitted: `products` [M, N], the monomials of the rays that pass, the derivatives
+    `wanted` [6, 2, N], and the weights [6, 2, M]."""
 
     graph: Graph
     samples: Mapping[str, NDArray[np.float32]]
@@ -109,7 +109,7 @@ class _Fitted:
 
     @staticmethod
     def of(graph: Graph, samples: Mapping[str, NDArray[np.float32]]) -> _Fitted | None:
-        """None where too few rays pass."""
+        """The start of a fit; None where too few rays pass."""
         exact = evaluate(with_film_derivatives(graph), samples)
         passed = np.broadcast_to(exact["status"][0] == st.PASSED, samples["rays"].shape[1:])
         passed = passed & np.isfinite(_matrices(exact, np.ones_like(passed))).all((0, 1))  # float32 has no root of 0
@@ -125,7 +125,7 @@ class _Fitted:
         return _Fitted(found, samples, passed, variables, monomials, products, _matrices(exact, passed), weights)
 
     def finished(self, used: NDArray[np.bool_], reach_mm: float) -> LowOrder:
-        """The graph with its derivatives, of the monomials that any state uses."""
+        """The graph with its derivatives, by the monomials that any state uses."""
         count = self.variables.rows
         exponents = np.array([np.bincount(m, minlength=count) for m in self.monomials], np.int64)[used]
         weights = self.weights[..., used].transpose(1, 0, 2).reshape(12, -1)
@@ -149,12 +149,12 @@ def _rms(values: Array) -> float:
 
 
 def _error(found: Array, wanted: Array, size: Array) -> float:
-    """RMS over rays of the error in the Frobenius norm over a size [N]."""
+    """The RMS over rays of the error (Frobenius norm) over a size [N]."""
     return _rms(np.linalg.norm(found - wanted, axis=(0, 1)) / np.maximum(size, 1e-30))
 
 
 def _variables(g: Graph, rays: Array) -> tuple[Array, Value]:
-    """Film and pupil point, and 1 / wavelength^2 from its mean where the lens knows the wavelength: numbers, rows."""
+    """Film and pupil point and, if the lens disperses, 1 / wavelength^2 less its mean: as numbers [V, N] and value."""
     inputs = g.input("rays", 5)
     if 4 in live_rows(g, g.outputs).get(inputs.number, ()):
         wave = (1000 / rays[4]) ** 2
@@ -173,10 +173,12 @@ def _monomials(count: int) -> list[Monomial]:
 def pursue(
     columns: Sequence[Array], wanted: Sequence[Array], good: Sequence[float], most: int = _MOST_TERMS
 ) -> tuple[list[int], list[Array]]:
-    """Rows of `columns` [M, N] of each state, and their weights there, whose sum comes within `good` (RMS) of `wanted`
-    [N] in all.
+    """Orthogonal matching pursuit for several states at once, with the same columns for all.
 
-    A plain pursuit of a few dozen columns: those of `surrogates.fits` need torch, and a render with a model does not.
+    It chooses rows of `columns` [M, N] of each state until their weighted sum is within `good` (RMS) of `wanted` [N] in
+    every state. The pursuits of `surrogates.fits` need torch, which a render with a model does not have.
+
+    Returns the numbers of the rows, and their weights in each state.
     """
     sizes = [np.maximum(np.linalg.norm(c, axis=1), 1e-30) for c in columns]
     scales = [max(float(np.linalg.norm(w)), 1e-30) for w in wanted]

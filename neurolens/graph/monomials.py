@@ -1,36 +1,30 @@
-"""How monomials are made, each the product of two: for rows of rays in few blocks, for one ray in few products."""
+"""Plans that make each monomial as the product of two others: in few blocks of rows, or in few products of one ray."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import product
 
 Exponent = tuple[int, ...]
 Pair = tuple[Exponent, Exponent]
 Block = tuple[str, list[Exponent]]  # a name, and the monomials of its rows
-Made = tuple[Exponent, tuple[Exponent, Exponent] | None]  # a monomial and the two that it is the product of
+Made = tuple[Exponent, Pair | None]  # a monomial and the two that it is the product of
 
 
 def plan_monomials(wanted: Sequence[Exponent], variables: int) -> list[Made]:
     """An order in which every monomial is a variable (None) or the product of two before it.
 
-    Factors that exist anyway are taken first; where none do, the one that adds least. Depth first: what a monomial is
-    made of was made just before.
+    Factors that exist anyway are taken first, else those that add least. The order is depth first: the factors of a
+    monomial were made just before it.
     """
     units = [tuple(int(i == v) for i in range(variables)) for v in range(variables)]
-    factors: dict[Exponent, tuple[Exponent, Exponent]] = {}
+    factors: dict[Exponent, Pair] = {}
     known = {*units, *wanted}
 
     def resolve(e: Exponent) -> None:
         if sum(e) == 1 or e in factors:
             return
-        options = []
-        for right in product(*(range(k + 1) for k in e)):
-            left = tuple(a - b for a, b in zip(e, right, strict=True))
-            if 0 < sum(right) <= sum(left):
-                options.append((sum(f not in known for f in {left, right}), sum(right), left, right))
-        _, _, left, right = min(options)
+        _, _, left, right = min((sum(f not in known for f in {*pair}), sum(pair[1]), *pair) for pair in _splits(e))
         known.update((left, right))
         factors[e] = (left, right)
         resolve(left)
@@ -41,10 +35,15 @@ def plan_monomials(wanted: Sequence[Exponent], variables: int) -> list[Made]:
     return _depth_first([*units, *sorted(factors, key=lambda e: (sum(e), e))], factors, set(wanted))
 
 
-def _depth_first(
-    nodes: list[Exponent], factors: dict[Exponent, tuple[Exponent, Exponent]], wanted: set[Exponent]
-) -> list[Made]:
-    """Nodes after their factors; each is followed by those that it was the last factor of."""
+def _splits(e: Exponent) -> Iterator[Pair]:
+    """All pairs of monomials whose product is e, the right one of no higher degree."""
+    for right in product(*(range(k + 1) for k in e)):
+        if 0 < sum(right) <= sum(e) // 2:
+            yield tuple(a - b for a, b in zip(e, right, strict=True)), right
+
+
+def _depth_first(nodes: list[Exponent], factors: dict[Exponent, Pair], wanted: set[Exponent]) -> list[Made]:
+    """Nodes in an order with factors first; each node is followed by those that waited for it alone."""
     waiting: dict[Exponent, set[Exponent]] = {e: set(pair) for e, pair in factors.items()}
     order: list[Made] = []
     stack = [e for e in reversed(nodes) if e not in factors]
@@ -60,14 +59,14 @@ def _depth_first(
 
 
 def level_of(e: Exponent) -> int:
-    """0 for a variable, 1 for degree 2, 2 for 3 to 4, 3 for 5 to 8 ..."""
+    """The level of a monomial: 0 for a variable, 1 for degree 2, 2 for 3 to 4, 3 for 5 to 8 ..."""
     return (sum(e) - 1).bit_length()
 
 
 def plan_products(exponents: list[Exponent], variables: int) -> dict[int, dict[Exponent, Pair]]:
-    """How to build every monomial as a product of two of lower levels: {level: {monomial: (left, right)}}.
+    """Every monomial as a product of two of lower levels: {level: {monomial: (left, right)}}; greedy.
 
-    Factors that are wanted anyway come first, then small right factors; what is still missing is added. Greedy.
+    Factors that are wanted anyway come first, then small right factors; factors that are missing are added.
     """
     wanted = {e for e in exponents if sum(e) > 1}
     parents: dict[Exponent, Pair] = {}
@@ -76,9 +75,8 @@ def plan_products(exponents: list[Exponent], variables: int) -> dict[int, dict[E
     while queue:
         e = queue.pop()
         options = []
-        for right in product(*(range(k + 1) for k in e)):
-            left = tuple(x - y for x, y in zip(e, right, strict=True))
-            if 0 < sum(right) <= sum(left) and level_of(left) < level_of(e):
+        for left, right in _splits(e):
+            if level_of(left) < level_of(e):
                 missing = sum(sum(part) > 1 and part not in wanted for part in {left, right})
                 options.append((missing, level_of(right), sum(right), left, right))
         *_, left, right = min(options)
@@ -98,15 +96,3 @@ def by_block(blocks: Sequence[Block], pairs: dict[Exponent, Pair]) -> list[dict[
     for e, (a, b) in sorted(pairs.items()):
         groups.setdefault((home[a], home[b]), {})[e] = (a, b)
     return list(groups.values())
-
-
-def blocks_alone(blocks: Sequence[Block]) -> int:
-    """How many blocks matrix products take one by one; the others are joined, where copying costs less."""
-    copy_row, one_product = 0.07, 1.2  # ns a ray, measured in onnxruntime (12 outputs)
-    best, alone = math.inf, 0
-    for first in range(len(blocks)):
-        rows = sum(len(known) for _, known in blocks[first:])
-        cost = one_product * first + (copy_row * rows if first < len(blocks) - 1 else 0.0)
-        if cost < best:
-            best, alone = cost, first
-    return alone

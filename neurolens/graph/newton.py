@@ -1,8 +1,8 @@
 """Newton's method in a graph, for many small systems at once, limited so that no start makes it diverge.
 
 Plain Newton iterations of a fixed count, as published for lens polynomials, run away where a step leaves the data. Here
-a step is never longer than a limit, and a point that is worse than the best one so far is given up for a shorter step
-from that one.
+no step is longer than a limit, and a point that is worse than the best one so far is replaced by a shorter step from
+the best one.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from neurolens.graph.derive import with_derivatives
 from neurolens.graph.ir import Graph, Value
 
-# A step that did not help is tried again at this share of its length.
+# A step that did not help is repeated at this share of its length.
 SHORTER = 0.25
 # The unknowns stay within this, each: scaled so that passing rays fill the unit disc.
 REACH = 2.0
@@ -31,10 +31,10 @@ def with_jacobian(system: Graph) -> Graph:
 
 @dataclass(frozen=True)
 class Solved:
-    """What an iteration comes to.
+    """The result of an iteration.
 
     Attributes:
-        last: unknowns after the last step, which nothing has judged yet.
+        last: unknowns after the last step, whose residual is not known yet.
         best: unknowns of the smallest residual before that. size: its squared length. None of zero steps.
     """
 
@@ -43,7 +43,7 @@ class Solved:
     size: Value | None
 
     def judged(self, size: Value) -> tuple[Value, Value]:
-        """The best unknowns, and the squared length of their residual, given that of the last ones."""
+        """The best unknowns, and the squared length of their residual, from that of the last unknowns."""
         if self.best is None or self.size is None:
             return self.last, size
         g, better = size.graph, size <= self.size
@@ -54,8 +54,8 @@ def limited_newton(system: Graph, given: Mapping[str, Value], start: Value, step
     """Append so many steps from `start` (2 or 4 rows).
 
     Args:
-        system: from `unknown`, and the inputs `given`, to `residual`, of as many rows.
-        limit: longest step, in units of the unknowns.
+        system: a graph from `unknown`, and the inputs `given`, to `residual`, of as many rows.
+        limit: the longest step, in units of the unknowns.
     """
     g, both = start.graph, with_jacobian(system)
     x, best, size, step = start.clip(-REACH, REACH), None, None, None

@@ -1,7 +1,7 @@
 """Graphs as ONNX: rays on the last axis, linear steps as matrix products, few passes over the rays.
 
-Opset 17, float32. Constants are held once; several graphs of one structure become one whose constants follow a state.
-What is of the call has one column, or where it is one number the shape [1].
+Opset 17, float32. Constants are stored once; several graphs of one structure become one whose constants follow a state.
+Values of the call have one column, or the shape [1] where they are one number.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Node, pruned, same_structure
-from neurolens.graph.monomials import Block, Exponent, Pair, blocks_alone, by_block, plan_products
+from neurolens.graph.monomials import Block, Exponent, Pair, by_block, plan_products
 from neurolens.graph.protobuf import FLOAT, INT32, model_proto, node_proto, tensor_proto, value_proto
 
 Array = NDArray[np.float64]
@@ -26,7 +26,7 @@ OPSET, IR_VERSION = 17, 8
 
 @dataclass(frozen=True)
 class Mixing:
-    """What a state does to the constants of the graphs of its nodes.
+    """How a state mixes the constants of the graphs of its nodes.
 
     Attributes:
         graph: of the call: input `state`, and output `features`; inputs and outputs of other names stand before the
@@ -75,7 +75,7 @@ def _shape(node: Node) -> list[int | str]:
 
 @dataclass(frozen=True)
 class _Linear:
-    """weight @ value + bias, not yet written: what takes it folds it into its own product. [T, R, K] and [T, R]."""
+    """weight [T, R, K] @ value + bias [T, R], not yet written: an affine that takes it folds it into its own product."""
 
     value: str
     weight: Array
@@ -165,7 +165,7 @@ class _Writer:
         return self._constants[key]
 
     def numbers(self, stack: Array) -> str:
-        """Numbers [T, ...], one for each graph: a constant where they agree, else what follows the state."""
+        """Numbers [T, ...] of each graph: a constant where they agree, else a value that follows the state."""
         if len(stack) == 1 or (stack == stack[0]).all():
             return self.const(stack[0])
         assert self.mixing is not None
@@ -194,7 +194,7 @@ class _Writer:
         return names[0] if len(names) == 1 else self.op("Concat", *names, axis=0)
 
     def _state(self) -> list[bytes]:
-        """Nodes that make what follows the state: all of it in one product, cut and shaped."""
+        """The nodes that make the values that follow the state: all of them by one product, cut and shaped."""
         if self.mixing is None:
             return []
         if not self._moved and "features" in self.mixing.graph.outputs:
@@ -238,7 +238,7 @@ def _take(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
 
 
 def _take_rows(w: _Writer, source: int, rows: Sequence[int]) -> str:
-    """Rows, by one cut for all that take consecutive rows of the same value, where these do not overlap."""
+    """Rows of a value; one cut serves all takes of consecutive rows of it that do not overlap."""
     value, nodes = w.known[source], w.graphs[0].nodes
     longer = value if isinstance(value, _Longer) else _Longer(w.name(source), nodes[source].rows, 0)
     name, total, place = longer.name, nodes[source].rows + longer.sums, longer.place
@@ -361,9 +361,7 @@ def _polynomial(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str
         else:
             blocks += made
     out, nothing = "", np.zeros(weight.shape[:2])
-    alone = blocks_alone(blocks)
-    names, lists = zip(*blocks[alone:], strict=True)
-    for name, known in [*blocks[:alone], (w.concat(names), [e for each in lists for e in each])]:
+    for name, known in blocks:
         part = np.stack([table.get(e, nothing) for e in known], axis=2)
         if not out:
             out = w.affine(part, name, table.get((0,) * variables, nothing))
@@ -414,7 +412,7 @@ def _between(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
 
 
 def _first_failure(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
-    """Camera rays meet the last surface first, so the first failure is the largest code (at one, the smallest)."""
+    """Camera rays meet the last surface first: the first failure has the largest code, at one surface the smallest."""
     failed: dict[int, str] = {}  # by surface
     tests = zip(node.inputs[::2], node.inputs[1::2], node.static, strict=True)
     for value, limit, status in sorted(tests, key=lambda t: t[2]):

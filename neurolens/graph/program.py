@@ -1,4 +1,4 @@
-"""Arithmetic on one ray as a list of single assignments, from which C and GLSL are written (see `graph.scalars`).
+"""Arithmetic on one ray as a list of single assignments, from which C, GLSL and OSL are written (see `graph.scalars`).
 
 Every step is one operation on floats, without branches. A literal holds one number for each coefficient table of the
 program (one table, unless several wavelengths are fixed), so that all tables share their operations.
@@ -27,16 +27,16 @@ KINDS = {
     "select": 4, "pick": 3,
 }  # fmt: skip
 
-# Names of the rows of what a lens is given and gives: millimetres and nanometres, lens frame.
+# Names of the rows of inputs and outputs: first of a lens, in millimetres and nanometres of the lens frame.
 RAY = ("film_x_mm", "film_y_mm", "pupil_x_mm", "pupil_y_mm")
 FILM_X_Y, WAVELENGTH = RAY[:2], "wavelength_nm"
 FILM_Z, STOP_RADIUS = "film_z_mm", "stop_radius_mm"  # for a whole call
 SCENE_RAY = ("x_mm", "y_mm", "z_mm", "dx", "dy", "dz")
 TRANSMITTANCE, STOP, STATUS = "transmittance", ("stop_x_mm", "stop_y_mm"), "status"
 _ROWS = {"rays": (*RAY, WAVELENGTH), "film_mm": FILM_X_Y, "scene_ray": SCENE_RAY, "stop_xy_mm": STOP}
-# Of what a camera is given and gives: points of the unit square, and rays in metres.
+# Of a camera: points of the unit square, and rays in metres.
 _ROWS |= {"square": ("u", "v"), "pupil_mm": RAY[2:], "ray": ("x_m", "y_m", "z_m", "dx", "dy", "dz")}
-# Of what a ghost is given, light at the front, and gives, light at the film.
+# Of a ghost: light at the front, and light at the film.
 ENTERING, ARRIVING = ("dx", "dy", "x_mm", "y_mm", WAVELENGTH), ("film_x_mm", "film_y_mm", "power", "worst")
 _ROWS |= {"entering": ENTERING, "arriving": ARRIVING}
 
@@ -52,7 +52,7 @@ Argument = int | Literal  # the number of an earlier step, or a literal
 
 
 def row_names(name: str, rows: int) -> tuple[str, ...]:
-    """Names of the rows of an input or output of a graph, one by one."""
+    """The names of the rows of an input or output of a graph."""
     if "_by_" in name:  # derivatives
         output, by = name.split("_by_")
         return tuple(f"{row}_by_{by}" for row in row_names(output, rows))
@@ -79,7 +79,7 @@ class Step:
     indices: int = 1
 
     def at_indices(self, arguments: Sequence[T]) -> list[tuple[T, Sequence[T]]]:
-        """Each index of a lookup with its weights, from its arguments or what stands for them."""
+        """Each index of a lookup with its weights, from its arguments, or from values in place of these."""
         count = (len(arguments) - self.indices) // self.indices
         starts = range(self.indices, len(arguments), count)
         return [(index, arguments[k : k + count]) for index, k in zip(arguments, starts, strict=False)]
@@ -97,7 +97,7 @@ class Expr:
         return self.argument if isinstance(self.argument, tuple) else None
 
     def is_literal(self, value: float) -> bool:
-        """Whether this is that number in every table."""
+        """Whether this is the same number in every table."""
         return self.literal is not None and all(v == value for v in self.literal)
 
     def __add__(self, other: Number) -> Expr:
@@ -136,10 +136,10 @@ _FOLDED: dict[str, Callable[..., Any]] = {
 
 @dataclass(frozen=True)
 class Mixture:
-    """How the numbers of a state come of those of its nodes, a coefficient table each.
+    """How the numbers of a state are mixed from those of its nodes, each of which has a coefficient table.
 
     Attributes:
-        program: of the state's own numbers: outputs `feature_0` ..., and `inside`, 1 where the state is in range.
+        program: from the state's own numbers to outputs `feature_0` ..., and `inside`, 1 where the state is in range.
         transform: [K, nodes]: features @ transform are the weights of the tables.
     """
 
@@ -147,10 +147,10 @@ class Mixture:
     transform: NDArray[np.float64]
 
     def weights(self, inputs: Mapping[str, ArrayLike]) -> tuple[NDArray[np.float64], bool]:
-        """[nodes] of a state, and whether it is in range."""
-        found = self.program.evaluate(inputs)
-        inside = bool(found.pop("inside"))
-        return np.array(list(found.values()), np.float64) @ self.transform, inside
+        """The weights [nodes] of a state, and whether the state is in range."""
+        features = self.program.evaluate(inputs)
+        inside = bool(features.pop("inside"))
+        return np.array(list(features.values()), np.float64) @ self.transform, inside
 
 
 @dataclass
@@ -158,9 +158,9 @@ class Program:
     """Steps in order, and the named results.
 
     Attributes:
-        tables: coefficient tables, the length of every literal.
-        mixture: where the tables are not chosen by `band`, but mixed by a state. Nothing but sums of numbers that
-            differ between tables may then have been folded into others.
+        tables: how many coefficient tables there are, the length of every literal.
+        mixture: mixes the tables by a state; None: `band` chooses one. Of numbers that differ between tables that are
+            mixed, only sums may have been folded.
         own_tables: numbers [cells, columns] that lookups read and that no caller gives, by name.
     """
 
@@ -175,7 +175,7 @@ class Program:
         return self._append(Step("input", (), name, per_call))
 
     def lookup(self, table: str, columns: int, column: int, indices: Sequence[Expr], weights: Sequence[Expr]) -> Expr:
-        """A column of groups of so many, in the cells of some indices: the sum over these and the groups."""
+        """A column of each group of `columns` in the cells at some indices: the weighted sum over all of them."""
         arguments = tuple(e.argument for e in (*indices, *weights))
         return self._append(Step("lookup", arguments, table, column=column, columns=columns, indices=len(indices)))
 
@@ -195,12 +195,12 @@ class Program:
         return value if isinstance(value, Expr) else self.literal(value)
 
     def op(self, kind: str, *values: Number) -> Expr:
-        """Append an operation, or what it comes to: equal steps are shared, and literals folded in float64."""
-        given = [self.expr(v) for v in values]
-        if kind == "clamp" and (given[1].literal is None or min(given[1].literal) <= 0):
+        """Append an operation, unless a simpler one does: equal steps are shared, and literals folded in float64."""
+        arguments = [self.expr(v) for v in values]
+        if kind == "clamp" and (arguments[1].literal is None or min(arguments[1].literal) <= 0):
             raise ValueError("clamp: expected a limit that is a number above 0")
-        simple = self._simplified(kind, given)
-        return simple if simple is not None else self._append(Step(kind, tuple(e.argument for e in given)))
+        simple = self._simplified(kind, arguments)
+        return simple if simple is not None else self._append(Step(kind, tuple(e.argument for e in arguments)))
 
     def fma(self, a: Number, b: Number, c: Number) -> Expr:
         """a b + c."""
@@ -216,7 +216,7 @@ class Program:
         return a + b
 
     def tanh(self, value: Expr) -> Expr:
-        """By additions, multiplications and one division, which every compiler vectorises."""
+        """tanh by additions, multiplications and one division, which every compiler vectorises."""
         x = self.op("clamp", value, TANH_LIMIT)
         t = x * x
         return x * self.horner(t, TANH_NUMERATOR) / self.horner(t, TANH_DENOMINATOR)
@@ -226,7 +226,7 @@ class Program:
         return self.op("select", a, b, then, otherwise)
 
     def horner(self, t: Expr, coefficients: Sequence[Number]) -> Expr:
-        """Polynomial in t, lowest coefficient first."""
+        """A polynomial in t, lowest coefficient first."""
         value = self.expr(coefficients[-1])
         for c in reversed(coefficients[:-1]):
             value = self.fma(value, t, c)
@@ -268,7 +268,7 @@ class Program:
         return None
 
     def live(self) -> list[int]:
-        """Numbers of the steps that any output needs, in order."""
+        """The numbers of the steps that any output needs, in order."""
         wanted = {e.argument for e in self.outputs.values() if isinstance(e.argument, int)}
         for k in range(len(self.steps) - 1, -1, -1):
             if k in wanted:
@@ -276,7 +276,7 @@ class Program:
         return sorted(wanted)
 
     def in_order_of_need(self) -> Program:
-        """The same program, every product right before the first sum that spends it: so, few values wait in registers.
+        """The same program with every product right before the first sum that uses it, so that few registers wait.
 
         Sums (fma) keep their order, for a row of a matrix product after the other would need all products at once.
         """
@@ -293,8 +293,8 @@ class Program:
         return self._rewritten(order=order)
 
     def with_shorter_sums(self, parts: int = 3, least: int = 8) -> Program:
-        """The same program but for rounding: sums of at least so many products in parts, for one that is added up in
-        turn keeps a core waiting after every product."""
+        """The same program but for rounding, with sums of at least so many products in parts: a sum that is added up
+        in turn keeps a core waiting after every product."""
         totals: dict[int, list[Expr]] = {}
         sums = self._sums(least)
 
@@ -314,7 +314,7 @@ class Program:
         return self._rewritten(shorter)
 
     def with_shared_inverses(self) -> Program:
-        """The same program but for rounding: of several numbers that are divided by the same, one division."""
+        """The same program but for rounding, with one division where several numbers are divided by the same."""
         live = [self.steps[k] for k in self.live()]
         uses = Counter(step.arguments[1] for step in live if step.kind == "div")
 
@@ -328,8 +328,11 @@ class Program:
     def _rewritten(
         self, rule: Callable[[int, Step, Sequence[Expr]], Expr | None] | None = None, order: Iterable[int] = ()
     ) -> Program:
-        """The same program in another order of its live steps, or with others in place of some: what a rule makes of a
-        step's number, itself and what is in place of its arguments, or None."""
+        """The same program in another order of its live steps, or with other steps in place of some.
+
+        Args:
+            rule: from a step's number, the step and its new arguments to what replaces it; None keeps the step.
+        """
         found, place = Program(self.tables, mixture=self.mixture, own_tables=self.own_tables), dict[int, Expr]()
 
         def moved(argument: Argument) -> Expr:
@@ -343,8 +346,8 @@ class Program:
         return found
 
     def _sums(self, least: int) -> dict[int, tuple[int, int]]:
-        """Steps of sums of at least so many products, each spent by the next alone: the last of its sum, and how many
-        are before it."""
+        """The steps of sums of at least so many products, each of which only the next one uses: for each, the last
+        step of its sum, and how many steps come before it."""
         live = self.live()
         uses = Counter(a for k in live for a in self.steps[k].arguments)
         uses.update(e.argument for e in self.outputs.values())
@@ -357,7 +360,7 @@ class Program:
         return {k: (steps[-1], number) for steps in long for number, k in enumerate(steps)}
 
     def around_lookups(self) -> tuple[Program, list[Step], Program]:
-        """The steps that lookups need, the lookups, and the steps after them, which take what was made as inputs.
+        """The steps that lookups need, the lookups, and the steps after them, which take the results as inputs.
 
         The first program has outputs `index_0` ..., `weight_0` ..., and `step_K` that the last takes; for a lookup the
         last takes `column_C`.
@@ -385,9 +388,9 @@ class Program:
         return before, lookups, last
 
     def of_the_call(self) -> tuple[Program, Program]:
-        """What is the same for all rays of a call, with outputs `once_K`, and the rest, which takes these as inputs.
+        """The steps that are the same for all rays of a call, with outputs `once_K`, and the rest, which takes these.
 
-        Compilers make no vectors of loops that choose by what does not change in them: such choices are `pick` there.
+        Compilers do not vectorise loops that choose by a value that stays the same: such choices become `pick`.
         """
         same = set[int]()
 
@@ -417,15 +420,15 @@ class Program:
         return once, rest
 
     def count(self) -> dict[str, int]:
-        """Operations by kind: the floor of the work."""
+        """The number of operations of each kind."""
         kinds = [self.steps[k].kind for k in self.live()]
         return {kind: kinds.count(kind) for kind in sorted(set(kinds) - {"input"})}
 
     def evaluate(self, inputs: Mapping[str, ArrayLike], table: int = 0) -> dict[str, NDArray[np.float32]]:
-        """Results in float32, step by step as the written sources have them (fma rounds once).
+        """The results in float32, step by step as written sources compute them (fma rounds once).
 
         Args:
-            inputs: rows [N] by their names, and tables [cells, columns]; of a mixture, the numbers of the state.
+            inputs: rows [N] by their names, tables [cells, columns] and, for a mixture, the numbers of the state.
         """
         found: dict[int, NDArray[np.float32]] = {}
         weights, inside = (None, True) if self.mixture is None else self.mixture.weights(inputs)

@@ -18,7 +18,7 @@ _DATA_TYPES = {"f": FLOAT, "4": INT32, "8": INT64}
 
 
 def walk(data: memoryview) -> Iterator[tuple[int, int, Any]]:
-    """Number, wire type and value of every field, in the order of the bytes.
+    """Yield number, wire type and value of every field, in the order of the bytes.
 
     Raises:
         ValueError: the bytes are no message, or end within a field.

@@ -1,4 +1,4 @@
-"""Graphs as programs of float steps, one ray at a time: what C, GLSL and their like are written from.
+"""Graphs as programs of float steps, one ray at a time, from which C, GLSL and OSL are written.
 
 Several graphs of one structure (one for each of several fixed wavelengths) become one program with as many coefficient
 tables. Polynomials take few products; sums of products are fused multiply-adds, numbers are folded.
@@ -18,7 +18,7 @@ from neurolens.graph.monomials import plan_monomials
 from neurolens.graph.program import Expr, Program, row_names
 
 Array = NDArray[np.float64]
-# Pairs (a, b) of a truth: it holds where a <= b in all of them.
+# A truth as pairs (a, b): it holds where a <= b in all of them.
 Tests = list[tuple[Expr, Expr]]
 # Weights of matrices: each is a step, and compilers take minutes; onnxruntime multiplies larger matrices by blocks.
 MOST_WEIGHTS = 20_000
@@ -26,12 +26,12 @@ _ROWS = 8  # of a matrix product at a time, of 16 registers; fewer would wait fo
 
 
 def lower(graphs: Graph | Sequence[Graph], fixed: Mapping[str, ArrayLike] | None = None) -> Program:
-    """The program of a graph, or of several of one structure, a coefficient table each.
+    """The program of a graph, or of several graphs of one structure, each of which has a coefficient table.
+
+    Inputs and outputs are named row by row, see `program.row_names`. Inputs that nothing needs are left out.
 
     Args:
-        fixed: inputs of the call that are numbers: they are folded in.
-
-    Inputs and outputs are named row by row, see `program.row_names`. Inputs that nothing needs are none.
+        fixed: inputs of the call that are numbers, which are folded in.
 
     Raises:
         InputError: graphs that differ in more than numbers, or with more than `MOST_WEIGHTS`; numbers that float32
@@ -108,7 +108,7 @@ def _input(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Arra
 
 
 def _affine(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
-    """By groups of rows whose sums fit the registers; each of the columns is spent on every row of a group at once."""
+    """A matrix product in groups of rows whose sums fit the registers; a column serves all rows of a group at once."""
     p, x = at.program, given[0]
     moving, added = node.static
     found = [p.literal(bias) for bias in arrays[1]]
@@ -130,7 +130,7 @@ def _affine(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Arr
 
 
 def _moved(p: Program, s: Expr, base: Array, change: Array) -> Expr:
-    """base + s change; from s = 1 where it can cancel: the film at infinity focus, where 1 - s is exact."""
+    """base + s change, counted from s = 1 where it can cancel: at infinity focus of the film 1 - s is exact."""
     if not base.any():
         return s * p.literal(change)
     return p.fma(p.literal(1.0) - s, p.literal(-change), p.literal(base + change)) if change.any() else p.literal(base)
@@ -147,7 +147,7 @@ def _quadratic(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[
 
 
 def _polynomial(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
-    """Each monomial is made once, by one multiplication, and spent at once on every row: few stay in registers."""
+    """Each monomial is made once, by one multiplication, and used at once in every row: few stay in registers."""
     p, variables = at.program, given[0]
     table = _collected(variables, node.arrays[0], arrays[1])
     rows = [p.literal(c) for c in table.pop((0,) * len(variables), np.zeros((node.rows, p.tables)))]
@@ -163,7 +163,7 @@ def _polynomial(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list
 
 
 def _collected(variables: Sequence[Expr], exponents: Exponents, weight: Array) -> dict[tuple[int, ...], Array]:
-    """Coefficients [R, T] of the monomials that have any; variables that are numbers are multiplied in."""
+    """The coefficients [R, T] of the monomials that have any; variables that are numbers are multiplied in."""
     numbers = {v: np.array(e.literal) for v, e in enumerate(variables) if e.literal is not None}
     table: dict[tuple[int, ...], Array] = {}
     for e, column in zip(exponents.tolist(), np.moveaxis(weight, 1, 0), strict=True):
