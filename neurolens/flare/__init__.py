@@ -1,1 +1,1 @@
-"""Light that does not form the image: ghosts between the surfaces of a lens."""
+"""Light that does not form the image: ghosts, glare and stars."""

@@ -1,4 +1,4 @@
-"""Which part of a light's disc each ghost takes on its way to a picture, and how fine a grid draws it there."""
+"""Grids of rays that draw ghosts: the part of a light's disc that each ghost takes, and how fine its grid is."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from neurolens.flare.lights import Light, Patch, light_towards, rays_across
 from neurolens.flare.steps import LOST, Floats
 
 FEWEST, MOST = 320, 512  # lit cells, and cells along a side
-REACH = 16.0  # of `GhostTracer.trace`: rims are cut between rays inside and outside
-_SCOUTS = 48  # cells a side of the grid that looks for ghosts
-_FEW = 2  # of the scouts, one in so many a side, are traced at both ends of the spectrum
-_NEAR = 2.0  # r^2 / R^2 to which rays beyond rims tell it, too
-_EVEN = 0.02  # least unevenness, and spread of colours over the size, of a ghost
-_STEP = 0.25  # of a cell: how far the shadow of a rim may move on the film between two wavelengths
-_BAND = 0.02  # of the irradiance that wide ghosts leave on the film: a step of colour that may remain in one ghost
-_NODES = 31  # wavelengths at which scouts look
-_FOLD = 2.0  # of the logarithm of a ray's power: by so much it may change, up and down together, from band to band
+REACH = 16.0  # of `GhostTracer.follow`: rims are cut between rays inside and outside
+_SCOUTS = 48  # cells a side of the grid of scouts, the rays that look for ghosts
+_FEW = 2  # one scout in so many a side is traced at all wavelengths
+_NEAR = 2.0  # r^2 / R^2 up to which rays beyond rims count for the spread of colours
+_EVEN = 0.02  # least unevenness, and least spread of colours over the size, of a ghost
+_STEP = 0.25  # part of a cell by which the shadow of a rim may move on the film between two wavelengths
+_BAND = 0.02  # step of colour that may remain in one ghost, over the irradiance that wide ghosts leave on the film
+_NODES = 31  # wavelengths of scouts
+_FOLD = 2.0  # change of the logarithm of a ray's power, up and down together, from band to band
 _AT_ONCE = 128  # ghosts
-_MOVED, _LONG, _SOFT = 32, math.radians(0.25), 0.2  # cells a side, step, and edge in r^2 / R^2, by which ghosts move
-_ERROR, _WORST = 3.0, 0.25  # light beside its place, times the cells that half the film is wide; at most
+_MOVED, _LONG, _SOFT = 32, math.radians(0.25), 0.2  # for moves: cells a side, step, and soft edge in r^2 / R^2
+_ERROR, _WORST = 3.0, 0.25  # share of light beside its place, times the cells across half the film; at most
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Grid:
 
     Attributes:
         low, high: corners of the rectangle, in disc radii. columns, rows: cells.
-        wavelengths: about so many stand for all of the range.
-        spectrum: wavelengths in nm, and the power of a ray at each of them over that at the first; empty where unknown.
+        wavelengths: how many, about, stand for all of the range.
+        spectrum: wavelengths in nm, and the power of a ray at each of them over that at the first; empty if unknown.
     """
 
     low: tuple[float, float]
@@ -49,7 +49,7 @@ class Grid:
 
     @property
     def places(self) -> NDArray[np.float64]:
-        """[2, (rows + 1) (columns + 1)] of the corners of cells, row after row."""
+        """The corners of cells, [2, (rows + 1) (columns + 1)], row after row."""
         u, v = (
             np.linspace(a, b, n + 1) for a, b, n in zip(self.low, self.high, (self.columns, self.rows), strict=True)
         )
@@ -72,22 +72,22 @@ def grids_of(
 ) -> dict[Pair, Grid]:
     """The grids of all ghosts that reach the film.
 
-    A cell has one density, and a wavelength stands for those beside it: both put light beside its place, by a / n with
-    n cells a side and b / k with k wavelengths. Edges drawn are n k times what is seen of the ghost; of all sums of
-    errors that is least where a / n and b / k of each ghost are the cube root of a b size, times what is the same for
-    all: so most cells go to what is bright, small and uneven.
+    A cell has one density, and a wavelength stands for its neighbours: both put light beside its place, a share a / n
+    with n cells a side and b / k with k wavelengths. The work of a ghost is n k times its size on the film. For a given
+    sum of errors all work is least where a / n and b / k of each ghost are the cube root of a b size, times a number
+    that all ghosts share: so most cells go to ghosts that are bright, small and uneven.
 
     Args:
-        wavelength_nm: of the rays that look for them; others differ little.
+        wavelength_nm: of the scouts; others differ little.
         half_mm: half the film's width and height.
-        cell_mm: size of cells on the film, about, which the share of light beside its place follows.
+        cell_mm: about the size of cells on the film, which the share of light beside its place follows.
         wavelengths_nm: of light, increasing.
     """
     whole = Grid((-1.0, -1.0), (1.0, 1.0), _SCOUTS, _SCOUTS)
     start = tracer.start(rays_across(tracer.lens, light, whole.places)[0])
     few = np.ascontiguousarray(start.reshape(len(start), _SCOUTS + 1, -1)[:, ::_FEW, ::_FEW].reshape(len(start), -1))
     nodes = sorted({wavelengths_nm[round(at)] for at in np.linspace(0, len(wavelengths_nm) - 1, _NODES)})
-    found: list[tuple[Pair, NDArray[np.bool_], _Look]] = []
+    ghosts: list[tuple[Pair, NDArray[np.bool_], _Look]] = []
     for k in range(0, len(tracer.pairs), _AT_ONCE):
         some = tracer.pairs[k : k + _AT_ONCE]
         rays = tracer.follow(start, wavelength_nm, only=some, reach=REACH)
@@ -96,30 +96,30 @@ def grids_of(
             some, _kept(rays, half_mm), rays.rows, _spread(each, half_mm), _swept(each, half_mm), _spectra(each, nodes),
             strict=True,
         )  # fmt: skip
-        found += [
+        ghosts += [
             (pair, kept, _look(kept, of_one, spread, half_mm)._replace(swept_mm=swept, spectrum=spectrum))
             for pair, kept, of_one, spread, swept, spectrum in looks
             if kept.any()
         ]
-    work = np.array([((look.along_u + look.along_v) * look.colours * look.size_mm) ** (1 / 3) for *_, look in found])
+    work = np.array([((look.along_u + look.along_v) * look.colours * look.size_mm) ** (1 / 3) for *_, look in ghosts])
     most = min(_ERROR * cell_mm / half_mm[0], _WORST)
     error = work * (most / max(float(work.sum()), 1e-300)) + 1e-30
     film = 4 * half_mm[0] * half_mm[1]
-    band = _BAND * sum(k.light / k.size_mm**2 * min(k.size_mm**2 / film, 1.0) ** 2 for *_, k in found)
+    band = _BAND * sum(k.light / k.size_mm**2 * min(k.size_mm**2 / film, 1.0) ** 2 for *_, k in ghosts)
     return {
         pair: _around(
             kept, look, each,
             math.ceil(min(look.swept_mm / (_STEP * cell_mm), look.light / max(look.size_mm**2 * band, 1e-300))),
         )
-        for (pair, kept, look), each in zip(found, error.tolist(), strict=True)
+        for (pair, kept, look), each in zip(ghosts, error.tolist(), strict=True)
     }  # fmt: skip
 
 
 def ghost_moves(tracer: GhostSource, patch: Patch, pair: Pair, grid: Grid, wavelength_nm: float) -> NDArray[np.float64]:
-    """How far the middle of a ghost's light moves on the film (mm), [2, 2], along each of the sides of a light's patch.
+    """How far the middle of a ghost's light moves on the film (mm) along the sides of a light's patch, [2, 2].
 
-    The middle moves as the edges do, which are those of the stop most often: on the film they move by another amount
-    than the light of a place of the front. Rays near rims count by how near they are, so that none comes or goes.
+    The middle moves as the ghost's edges do, which are most often those of the stop: on the film these move by another
+    amount than the light of one point of the front. Rays near rims have smaller weights, so that none comes or goes.
     """
     coarse = replace(grid, columns=min(grid.columns, _MOVED), rows=min(grid.rows, _MOVED))
 
@@ -133,8 +133,8 @@ def ghost_moves(tracer: GhostSource, patch: Patch, pair: Pair, grid: Grid, wavel
         lit = weight > 0
         return np.stack([x, y])[:, lit] @ weight[lit] / weight.sum() if lit.any() else None
 
-    found = np.zeros((2, 2))
-    for along, side in zip(found, patch.sides, strict=True):
+    moves = np.zeros((2, 2))
+    for along, side in zip(moves, patch.sides, strict=True):
         step = _LONG / max(float(np.linalg.norm(side)), 1e-300)
         places = [(f, place) for f in (-step, step) if side.any() and (place := middle(f * side)) is not None]
         if len(places) == 1:
@@ -142,18 +142,18 @@ def ghost_moves(tracer: GhostSource, patch: Patch, pair: Pair, grid: Grid, wavel
         if len(places) == 2:
             (f, one), (g, other) = places
             along[:] = (other - one) / (g - f)
-    return found
+    return moves
 
 
 class _Look(NamedTuple):
-    """What scouts tell of a ghost.
+    """A ghost as scouts see it.
 
     Attributes:
         along_u, along_v: light that cells of one density put beside its place, times the cells of a side.
-        colours: the same of wavelengths, times their number. size_mm: of what is on the film.
-        lit: share of the rectangle that holds its light. light: of it on the film.
+        colours: the same for wavelengths, times their number. size_mm: of the part on the film.
+        lit: share of the rectangle that holds its light. light: its light on the film.
         swept_mm: about how far the shadow of a rim moves on the film from one end of the spectrum to the other.
-        spectrum: as of `Grid`.
+        spectrum: as in `Grid`.
     """
 
     along_u: float
@@ -167,7 +167,7 @@ class _Look(NamedTuple):
 
 
 def _look(kept: NDArray[np.bool_], rows: Floats, spread: float, half_mm: tuple[float, float]) -> _Look:
-    """Of a ghost's rays `rows` [4, N] and the cells that are kept."""
+    """Measure a ghost by its scouts `rows` [4, N] and the cells that are kept."""
     x, y, power, worst = rows.reshape(4, _SCOUTS + 1, _SCOUTS + 1).astype(np.float64)
     lit, half = worst <= 1, np.array(half_mm)[:, None]
     whole = kept & _corners(lit, np.logical_and)
@@ -196,7 +196,7 @@ def _pairs(a: NDArray[Any], axis: int, of: Callable[[Any, Any], Any]) -> NDArray
 
 
 def _spread(each: Sequence[Floats], half_mm: tuple[float, float]) -> list[float]:
-    """How far apart ghosts at the first and the last of some wavelengths are in mm; inf for those without light.
+    """How far each ghost moves from the first to the last wavelength in mm; inf for a ghost without light.
 
     Args:
         each: rows [P, 4, N] of the ghosts' rays at each wavelength.
@@ -208,7 +208,7 @@ def _spread(each: Sequence[Floats], half_mm: tuple[float, float]) -> list[float]
 
 
 def _swept(each: Sequence[Floats], half_mm: tuple[float, float]) -> list[float]:
-    """About how far in mm the shadows of rims move on the film, from wavelength to wavelength, summed.
+    """About how far in mm the shadows of rims move on the film, summed from wavelength to wavelength.
 
     A rim may cut a ghost at another place in each colour even where the rays themselves do not move. Between two
     wavelengths a shadow moves by the share of the rays on the film that pass at only one of them, times the ghost's
@@ -226,7 +226,7 @@ def _swept(each: Sequence[Floats], half_mm: tuple[float, float]) -> list[float]:
 
 
 def _spectra(each: Sequence[Floats], nm: Sequence[float]) -> list[tuple[tuple[float, float], ...]]:
-    """Each ghost's power at some wavelengths over that at the first, by the rays that pass at two neighbours alike.
+    """Each ghost's power at some wavelengths over that at the first, by the rays that pass at both of two neighbours.
 
     Args:
         each: rows [P, 4, N] of the ghosts' rays at each wavelength.
@@ -239,9 +239,9 @@ def _spectra(each: Sequence[Floats], nm: Sequence[float]) -> list[tuple[tuple[fl
 
 
 def _kept(rays: GhostRays, half_mm: tuple[float, float]) -> NDArray[np.bool_]:
-    """[P, S, S] whether light of a cell may reach the film.
+    """Whether light of each cell may reach the film, [P, S, S].
 
-    A cell all of whose corners a rim stops is kept where the worst, going on as it does within it, may reach 1.
+    A cell all of whose corners a rim stops is kept where `worst`, extrapolated by its change in the cell, reaches 1.
     """
     shape = (len(rays.rows), 4, _SCOUTS + 1, _SCOUTS + 1)
     xy, worst = np.split(rays.rows.reshape(shape)[:, [0, 1, 3]], [2], 1)
@@ -259,8 +259,10 @@ def _corners(a: NDArray[Any], of: Callable[[Any, Any], Any]) -> NDArray[Any]:
 
 
 def _around(kept: NDArray[np.bool_], look: _Look, error: float, least: int) -> Grid:
-    """About the cells that are kept [S, S], so fine that so much light is beside its place each way; `least` bounds the
-    number of wavelengths from below."""
+    """The grid about the cells that are kept [S, S], so fine that the light beside its place is `error` each way.
+
+    It has at least so many wavelengths.
+    """
     low, high, fewest = [], [], math.sqrt(FEWEST / look.lit)
     for axis in (0, 1):
         at = np.flatnonzero(kept.any(axis))

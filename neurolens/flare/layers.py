@@ -1,6 +1,6 @@
-"""The layers of flare, and the module of each: pictures that are added to a render of the same lens, film and focus.
+"""The layers of flare: pictures that are added to a render of the same lens, film and focus.
 
-Each maker gives a picture of its own, and more by name that are parts of it. A layer that is switched off is absent.
+Each maker makes one picture, and by name others that are parts of it. A layer that is switched off is absent.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ _FINER = 4  # wavelengths of a ghost at most, for one of a star
 
 @dataclass(frozen=True)
 class FlareJob:
-    """A flare to make.
+    """Everything that decides the flare of one picture.
 
     Attributes:
-        lens: its film must be placed (`set_lens`); `settings.coating` is not applied to it any more.
+        lens: its film must be placed (`set_lens`), and it must have the coating of the settings (`with_coating`).
         wavelength_nm: range of light. threads: of the work.
-        ghosts: what traces ghosts, or stands for that, of the same lens and stop; None traces all of two reflections.
+        ghosts: traces the ghosts of the same lens and stop, exactly or fitted; None traces all of two reflections.
         single: names of the ghosts that become layers; the others are the layer "rest".
-        keep: picture beside which photons of long work are kept until they are whole (see `kept_beside`).
+        keep: picture beside which the photons of long work are kept until they are whole (see `kept_beside`).
     """
 
     lens: Lens
@@ -67,9 +67,9 @@ def flare_layers(job: FlareJob, progress: Progress | None = None) -> Layers:
     """The layers that are switched on, by name, [H, W, 3] linear sRGB each; those of `MAKERS` sum to the flare.
 
     Raises:
-        InputError: as of the makers.
+        InputError: as the makers.
     """
-    found: Layers = {}
+    layers: Layers = {}
     progress = progress or Progress(quiet=True)
     for name, make in MAKERS.items():
         if job.settings.makes(name):
@@ -77,20 +77,21 @@ def flare_layers(job: FlareJob, progress: Progress | None = None) -> Layers:
                 made = make(job, report)
             for picture in made.values():
                 picture *= np.array(job.settings.gain(name), np.float32)
-            found |= made
-    return found
+            layers |= made
+    return layers
 
 
 class Choice(NamedTuple):
-    """What all frames of a scene show: names of lights (`sources.chosen`), and of ghosts that become layers."""
+    """The names of the lights that all frames of a scene have (`sources.chosen`), and of ghosts that become layers."""
 
     lights: frozenset[Name]
     single: tuple[str, ...]
 
 
 def scene_choice(frames: Sequence[tuple[Scene, Lens]], raster: Raster, threads: int) -> Choice:
-    """The lights of the most energy in all frames together, and the ghosts that `brightest` names, of a scene that has
-    the table [flare].
+    """The lights of the most energy in all frames together, and the ghosts that `brightest` names.
+
+    The scene must have the table [flare].
 
     Args:
         frames: the scene, its camera in the frame's place, and the lens in its state.
@@ -101,11 +102,11 @@ def scene_choice(frames: Sequence[tuple[Scene, Lens]], raster: Raster, threads: 
     scene = frames[0][0]
     settings, sources = scene.settings.flare, SceneLights(scene)
     assert settings is not None
-    seen = [sources.named(at, lens.film_z_mm or 0.0) for at, lens in frames]
-    names = chosen(seen, settings.most)
+    of_frames = [sources.named(at, lens.film_z_mm or 0.0) for at, lens in frames]
+    names = chosen(of_frames, settings.most)
     jobs = []
-    for (_, lens), there in zip(frames, seen, strict=True):
-        lens, lights = with_coating(lens, settings), keep_named(there, names).lights
+    for (_, lens), named in zip(frames, of_frames, strict=True):
+        lens, lights = with_coating(lens, settings), keep_named(named, names).lights
         jobs.append(FlareJob(lens, lights, raster, settings, scene.settings.camera.wavelengths_nm, threads))
     return Choice(names, brightest(jobs))
 
@@ -124,13 +125,13 @@ def scene_flare(
     progress: Progress,
     choice: Choice | None = None,
 ) -> Layers:
-    """The layers of a scene that has the table [flare], of its own lights, by a lens whose film is placed.
+    """The layers of a scene that has the table [flare], by its own lights and a lens whose film is placed.
 
     Args:
-        choice: of all frames; None: of this picture.
+        choice: of all frames; None chooses by this picture.
 
     Raises:
-        InputError: as of `flare_layers` and `coated`.
+        InputError: as `flare_layers` and `coated`.
     """
     settings, sources = scene.settings.flare, SceneLights(scene)
     assert settings is not None and lens.film_z_mm is not None
@@ -220,7 +221,7 @@ def _photons(job: FlareJob, done: Report, part: str, count: int) -> Floats:
 
 
 def kept_beside(picture: Path) -> list[Path]:
-    """Files of photons that are there beside a picture, of work that was interrupted."""
+    """The files of photons that interrupted work has left beside a picture."""
     return [path for part in PARTS if (path := _kept_file(picture, part)).is_file()]
 
 
@@ -231,8 +232,7 @@ def _kept_file(picture: Path, part: str) -> Path:
 def _factors(
     pairs: Sequence[Pair], settings: FlareSettings, every: Sequence[Pair]
 ) -> dict[Pair, tuple[float, float, float]]:
-    """The gain of each of the pairs; a gain may name a ghost of `every` that is not among the pairs, as fits leave some
-    out."""
+    """The gain of each pair. A gain may also name a ghost of `every`, since fits leave ghosts out."""
     known = {*MAKERS, *(pair.name for pair in (*pairs, *every))}
     for name in settings.gains:
         if name not in known:

@@ -1,7 +1,7 @@
-"""Lights of flare, over frames or not, lists of them, and the light that they send into the lens.
+"""The lights of flare: points and extended lights, over frames, in lists, and the rays that they send into the lens.
 
-Rays go through a disc across the light's way that holds the whole front surface, at the places of a low-discrepancy
-sequence that is the same every time: an animated light has no noise of its own.
+Rays go through a disc across the light's direction that holds the whole front surface, at the points of a
+low-discrepancy sequence that is the same every time: an animated light has no noise of its own.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _PLASTIC = 1.32471795724474602596  # of the R2 sequence (Roberts 2018): x^3 = x 
 
 SUN = math.pi  # irradiance by which the sun lights a white card across its way to radiance 1
 MOST_LIGHTS = 10_000  # of a list, and of --most
-# Columns of a list of lights: what is left out, and least and most.
+# Columns of a list of lights: the default (NaN: none), least and most.
 _COLUMNS: dict[str, tuple[float, float, float]] = {
     "frame": (0.0, -1e7, 1e7),
     "azimuth_deg": (math.nan, -360.0, 360.0),
@@ -56,7 +56,7 @@ class Shape(NamedTuple):
 
 @dataclass(frozen=True)
 class Light:
-    """A light far away, or at a place: a point, or one that has a shape.
+    """A light far away, or at a distance: a point, or one that has a shape.
 
     Attributes:
         azimuth_deg: to the right of the axis, seen by the camera; elevation_deg: above it.
@@ -77,8 +77,8 @@ class Light:
 
     def __post_init__(self) -> None:
         if not (abs(self.elevation_deg) < 90 and math.isfinite(self.azimuth_deg) and self.towards[2] < 0):
-            found = (self.azimuth_deg, self.elevation_deg)
-            raise InputError("light", "azimuth, elevation", found, "angles within 90 degrees of the axis")
+            angles = (self.azimuth_deg, self.elevation_deg)
+            raise InputError("light", "azimuth, elevation", angles, "angles within 90 degrees of the axis")
         if not self.distance_m > 0:
             raise InputError("light", "distance_m", self.distance_m, "a positive distance in metres, or inf")
         if not all(0 <= v < math.inf for v in self.rgb):
@@ -92,10 +92,9 @@ class Light:
 
     @property
     def about(self) -> dict[str, Any]:
-        """Its attributes for metadata: the shape only by its size, in degrees along both sides."""
-        told = asdict(replace(self, shape=None))
-        told["shape"] = None if self.shape is None else np.degrees(_lengths(self.shape.corners)).round(4).tolist()
-        return told
+        """Its attributes for metadata; the shape is its size in degrees along both sides."""
+        size = None if self.shape is None else np.degrees(_lengths(self.shape.corners)).round(4).tolist()
+        return asdict(replace(self, shape=None)) | {"shape": size}
 
 
 def light_towards(
@@ -128,10 +127,10 @@ def with_disc(light: Light, diameter_deg: float) -> Light:
 
 
 class Patch(NamedTuple):
-    """A part of a light, small enough that what it makes is that of its middle, smeared.
+    """A part of a light, so small that its ghosts and star are those of its middle, smeared.
 
     Attributes:
-        light: the point in its middle that has all its light.
+        light: the point in its middle, with all of its light.
         sides: [2, 3], of the parallelogram of directions about it. weights: [N, M] light of its cells.
         round: whether it is the ellipse in the parallelogram.
     """
@@ -145,17 +144,17 @@ class Patch(NamedTuple):
 def patches(light: Light, most_deg: float, most: int = CELLS // 2) -> list[Patch]:
     """A light in patches of about so many degrees a side.
 
-    Each fades into those beside it: where what two of them make does not quite meet, no seam is seen.
+    Each patch fades into its neighbours, so that no seam is seen where their ghosts do not quite meet.
 
     Args:
-        most: patches along a side, at most. `CELLS` takes each cell as one.
+        most: patches along a side, at most; `CELLS` makes a patch of each cell.
     """
     if light.shape is None:
         return [Patch(light, np.zeros((2, 3)), np.ones((1, 1)), False)]
     corners, weights, is_round = light.shape
     middles = 0.25 * (corners[1:, 1:] + corners[:-1, 1:] + corners[1:, :-1] + corners[:-1, :-1])
     counts = [min(math.ceil(math.degrees(side) / most_deg + 1e-9), most) for side in _lengths(corners)]
-    found = []
+    parts = []
     for along in _shares(counts[0]):
         for across in _shares(counts[1]):
             own = weights * np.outer(along, across)
@@ -167,12 +166,12 @@ def patches(light: Light, most_deg: float, most: int = CELLS // 2) -> list[Patch
                 (top, below), (left, right) = ((v.nonzero()[0][0], v.nonzero()[0][-1] + 1) for v in (along, across))
                 a, b, c, d = corners[top, left], corners[top, right], corners[below, left], corners[below, right]
                 sides = np.stack([c + d - a - b, b + d - a - c]) / 2
-                found.append(Patch(part, sides, own[top:below, left:right], is_round and counts == [1, 1]))
-    return found
+                parts.append(Patch(part, sides, own[top:below, left:right], is_round and counts == [1, 1]))
+    return parts
 
 
 def _shares(count: int) -> NDArray[np.float64]:
-    """[count, CELLS] of each cell along a side, the share that each of so many patches has: in sum 1."""
+    """The share [count, CELLS] of each cell along a side that each of so many patches has: their sum is 1."""
     at = (np.arange(CELLS) + 0.5) * count / CELLS - 0.5
     return np.maximum(1 - np.abs(at.clip(0, count - 1) - np.arange(count)[:, None]), 0)
 
@@ -190,7 +189,7 @@ class Track:
 
     Attributes:
         name: of the light. keys: [K, 8] frame, azimuth and elevation in degrees, r, g, b, diameter in degrees,
-            1 / distance in 1/m; linear in between, before the first and after the last as there.
+            1 / distance in 1/m; linear between keys, constant before the first and after the last.
     """
 
     name: str
@@ -209,28 +208,28 @@ class Track:
 def read_lights(path: Path) -> list[Track]:
     """The lights of a list: CSV with a header, or JSON, a list of objects.
 
-    Columns or keys: azimuth_deg, elevation_deg; and, where they are not left out, light (a name; without it each row is
-    a light), frame (rows of one light are its keys, frames increasing), r, g, b (irradiance, `SUN`), distance_m (inf),
-    diameter_deg (of a round light, 0; the sun has 0.53).
+    Columns or keys are azimuth_deg, elevation_deg and, with their defaults, light (a name; without it each row is a
+    light), frame (rows of one light are its keys, frames increasing), r, g, b (irradiance, `SUN`), distance_m (inf),
+    and diameter_deg (of a round light, 0; the sun has 0.53).
 
     Raises:
-        InputError: names file, row and column, for an unknown or missing one, or a value that is none; no light, or
+        InputError: a column is unknown or missing, or a value is out of range, by file, row and column; no light, or
             more than `MOST_LIGHTS`.
     """
-    rows, found = read_rows(path, "a list of lights"), dict[str, list[list[float]]]()
+    rows, lights = read_rows(path, "a list of lights"), dict[str, list[list[float]]]()
     if not rows:
         raise InputError(path, "lights", "(none)", "at least one light")
     for number, row in enumerate(rows):
         place = f"row {number + 1}, "
         reject_unknown(path, place, row, ["light", *_COLUMNS])
         frame, *values, distance = (_value(path, place, name, row.get(name)) for name in _COLUMNS)
-        keys = found.setdefault(str(row.get("light") or f"light {number + 1}"), [])
-        if len(found) > MOST_LIGHTS:
+        keys = lights.setdefault(str(row.get("light") or f"light {number + 1}"), [])
+        if len(lights) > MOST_LIGHTS:
             raise InputError(path, "lights", f"(more than {MOST_LIGHTS})", f"at most {MOST_LIGHTS} lights in a list")
         if keys and not frame > keys[-1][0]:
             raise InputError(path, f"{place}frame", frame, f"a frame after {keys[-1][0]:g}, the light's key before")
         keys.append([frame, *values, 1 / distance])
-    return [Track(name, np.array(keys)) for name, keys in found.items()]
+    return [Track(name, np.array(keys)) for name, keys in lights.items()]
 
 
 def _value(path: Path, place: str, name: str, given: Any) -> float:
@@ -249,14 +248,14 @@ def _value(path: Path, place: str, name: str, given: Any) -> float:
 def light_rays(
     lens: Lens, light: Light, first: int, count: int, shift: float = 0.0, jitter: float = 0.0
 ) -> tuple[Floats, float]:
-    """Rays number `first` and following of a light, [6, count] lens frame, and the area in mm^2 that all N share: the
-    irradiance at the lens times area / N is the light of one of N rays. All carry the same: they are uniform across the
-    way of a light far away, and in solid angle from a near one.
+    """Rays of a light from number `first` on, [6, count] in the lens frame, and the area in mm^2 that all N rays share.
 
-    An extended light shares its rays out among points, one in each of its cells, by their light; `shift` moves them.
+    Each of N rays carries the irradiance at the lens times area / N. The rays of a light far away are uniform across
+    its direction, those of a near light in solid angle. An extended light divides its rays among points, one in each of
+    its cells, by their light; `shift` moves the points.
 
     Args:
-        shift: of the sequence, for each wavelength another. jitter: see `disc`.
+        shift: of the sequence, another for each wavelength. jitter: see `disc`.
     """
     if light.shape is None:
         return rays_across(lens, light, disc(first, count, shift, jitter))
@@ -280,17 +279,17 @@ def front_sphere(lens: Lens) -> tuple[NDArray[np.float64], float]:
 
 
 def sides_across(ahead: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Two unit vectors [2, 3] across a direction before the lens, which turn without a jump while it moves (Duff et al.
-    2017, of one hemisphere)."""
+    """Two unit vectors [2, 3] across a direction before the lens, which turn smoothly while the direction moves (Duff
+    et al. 2017, for one hemisphere)."""
     x, y, z = ahead
     return np.array([[1 - x * x / (1 - z), -x * y / (1 - z), x], [x * y / (1 - z), y * y / (1 - z) - 1, -y]])
 
 
 def rays_across(lens: Lens, light: Light, place: NDArray[np.floating[Any]]) -> tuple[Floats, float]:
-    """Rays [6, N] of a light through places [2, N] of the disc across its way, the unit disc, and the area in mm^2 that
-    the whole disc stands for: equal shares of the unit disc carry equal light; see `light_rays`.
+    """Rays [6, N] of a light through points [2, N] of the unit disc, which stands across its direction, and the area of
+    the whole disc in mm^2: equal shares of the disc carry equal light; see `light_rays`.
 
-    Places may also lie in the corners of the square about the disc.
+    Points may also lie in the corners of the square about the disc.
     """
     centre, radius = front_sphere(lens)
     ahead = light.towards
@@ -316,9 +315,9 @@ def rays_across(lens: Lens, light: Light, place: NDArray[np.floating[Any]]) -> t
 
 
 def disc(first: int, count: int, shift: float = 0.0, jitter: float = 0.0) -> NDArray[np.float64]:
-    """Points [2, count] of the unit disc, of equal shares: the R2 sequence from a number on, shifted.
+    """Points [2, count] of equal shares of the unit disc: the R2 sequence from a number on, shifted.
 
-    `jitter` moves each by up to so much of the square's side: regular places make patterns in a picture.
+    `jitter` moves each point by up to so much of the square's side, because regular points make patterns in a picture.
     """
     n = np.arange(first, first + count) + 1.0
     moved = jitter * np.random.default_rng([first, int(shift * 2**32)]).random((2, count))

@@ -1,7 +1,7 @@
-"""Lights of flare from where they are: in a scene, or in a picture of one.
+"""Lights of flare that come from a scene, or from a picture of one.
 
-Of a scene: rectangles, discs, spheres, points, spots and the sun, as far as they are seen from the lens's front vertex.
-Of a picture: regions brighter than a threshold. The sky and other surroundings are no lights.
+A scene's lights are its rectangles, discs, spheres, points, spots and the sun, as far as the lens's front vertex sees
+them; a picture's are regions brighter than a threshold. The sky and other surroundings are no lights.
 """
 
 from __future__ import annotations
@@ -26,16 +26,15 @@ from neurolens.render.spectrum import SpectralRange
 from neurolens.render.world import World
 
 _CELL = 1 / 48  # of the picture's width: larger highlights are several lights
-_FADES = 1.25
-_MOST_PIXELS, _AT_ONCE = 1 << 22, 1 << 18  # above the threshold; of these together, each of some 500 bytes
-_DIMMEST = 0.02  # relative illumination that a highlight's radiance is told from
+_FADES = 1.25  # lights fade from so many times the energy of the brightest light that is left out
+_MOST_PIXELS, _AT_ONCE = 1 << 22, 1 << 18  # above the threshold; at a time, each of some 500 bytes
+_DIMMEST = 0.02  # relative illumination below which a highlight's radiance is not known
 
-
-Name = int  # of a light of a scene: its number
+Name = int  # the number of a light in its scene
 
 
 class SceneLights:
-    """The lights of a scene, to be seen from anywhere."""
+    """The lights of a scene, as any camera in it sees them."""
 
     def __init__(self, scene: Scene) -> None:
         low, high = scene.settings.camera.wavelengths_nm
@@ -56,11 +55,11 @@ class SceneLights:
         return list(self.named(scene, film_z_mm, most).values())
 
     def named(self, scene: Scene, film_z_mm: float, most: int | None = None) -> dict[Name, Light]:
-        """The lights before the lens of a camera of `scene`, whose place may be another.
+        """The lights before the lens of the camera of `scene`, which may stand anywhere in this scene.
 
         Args:
             film_z_mm: of the lens: the front vertex lies so far before the film.
-            most: lights to look at, those that are strongest there if nothing hides them; None: all.
+            most: how many lights to test, those that are strongest there if nothing hides them; None tests all.
         """
         pose = scene.settings.camera
         axes = camera_axes(pose).astype(np.float64)
@@ -68,7 +67,7 @@ class SceneLights:
         middle, corner = ((2 * np.arange(CELLS + k) + 1 - k) / CELLS - 1 for k in (0, 1))
         place = np.concatenate([np.stack(np.meshgrid(a, a, indexing="ij")).reshape(2, -1) for a in (middle, corner)], 1)
         point = np.repeat(front[:, None], place.shape[1], 1).astype(np.float32)
-        lights, own, found = self._world.lights, CELLS * CELLS, dict[Name, Light]()
+        lights, own, visible = self._world.lights, CELLS * CELLS, dict[Name, Light]()
         numbers = range(lights.count) if most is None else lights.strongest(tuple(front.tolist()), most)
         for number, (is_round, aimed) in zip(numbers, lights.each(numbers, point, place), strict=True):
             direction, distance, scale = (a[..., :own] for a in aimed)
@@ -80,19 +79,19 @@ class SceneLights:
             )  # fmt: skip
             rgb = self._rgb[self._colour[number]] * (seen.sum() / inside.sum())
             if rgb.any() and (light := _light(axes.T @ (direction @ seen), rgb, distance, shape)):
-                found[number] = light
-        return found
+                visible[number] = light
+        return visible
 
 
 def _light(towards: Array, rgb: Array, distance: FloatArray, shape: Shape) -> Light | None:
-    """A light of a scene; one without size has the same direction in all its corners."""
+    """A light of a scene. All corners of a light without size have the same direction."""
     mean = float(np.average(distance, weights=shape.weights.ravel())) if np.isfinite(distance).all() else math.inf
     extended = np.ptp(shape.corners, axis=(0, 1)).any()
     return light_towards(towards, rgb.tolist(), mean, shape if extended else None)
 
 
 class KeptLights(NamedTuple):
-    """Lights, brightest first, of how many, and the share of their energy that is left out."""
+    """The lights that are kept, brightest first; of how many; and the share of the energy that is left out."""
 
     lights: list[Light]
     of: int
@@ -103,8 +102,8 @@ def keep(lights: Sequence[Light], most: int, fade: bool = False) -> KeptLights:
     """The lights of the most energy at the lens.
 
     Args:
-        fade: whether lights fade as their energy comes down to that of the brightest one left out, from `_FADES` times
-            it on: over frames none then comes or goes at once. Where all would be dark, none fades.
+        fade: whether lights fade as their energy approaches that of the brightest light that is left out, so that none
+            comes or goes at once over frames. Where all would be dark, none fades.
     """
     ordered = sorted(lights, key=_energy, reverse=True)
     kept, whole = ordered[:most], sum(map(_energy, ordered))
@@ -124,9 +123,9 @@ def keep_named(lights: Mapping[Name, Light], names: frozenset[Name]) -> KeptLigh
 
 
 def chosen(frames: Sequence[Mapping[Name, Light]], most: int) -> frozenset[Name]:
-    """Numbers of the lights that are kept in all frames: so many at most, of the most energy in all frames together.
+    """The names of the lights that are kept in all frames: at most so many, of the most energy in all frames together.
 
-    So none comes or goes because others do.
+    So no light comes or goes because others do.
     """
     energy: dict[Name, float] = {}
     for frame in frames:
@@ -149,12 +148,12 @@ def highlights(
 ) -> KeptLights:
     """The regions of a picture [H, W, 3] (linear; 1 is a white card of radiance 1) that reach a threshold in a colour.
 
-    A region of connected pixels is a light far away with the region's radiance times solid angle; a large one is
-    several. Radiance is the picture's value over the relative illumination. Pixels count in full from twice the
-    threshold on, less the nearer they are to it: a light that a film brings over it does not switch on at once.
+    A region of connected pixels is a light far away with the region's radiance times solid angle; a large region is
+    several lights. Radiance is the picture's value over the relative illumination. Pixels count in full from twice the
+    threshold on, and less the nearer they are to it, so that over frames no light switches on at once.
 
     Args:
-        field: of the camera that took the picture, laid out as equidistant. most, fade: lights, as of `keep`.
+        field: of the camera that took the picture, laid out as equidistant. most, fade: as for `keep`.
 
     Raises:
         InputError: values that are not finite; more than `_MOST_PIXELS` pixels that reach the threshold.
@@ -192,7 +191,7 @@ def highlights(
 
 
 def _spread_of(means: Array) -> Shape:
-    """The parallelogram with the variances of a region, by means [13] of directions, their products, solid angles."""
+    """The parallelogram with the variances of a region, from means [13] of directions, their products, solid angles."""
     towards = means[:3] / np.linalg.norm(means[:3])
     across = sides_across(towards)
     variance = across @ (means[3:12].reshape(3, 3) - np.outer(means[:3], means[:3])) @ across.T
@@ -202,8 +201,8 @@ def _spread_of(means: Array) -> Shape:
 
 
 def _regions(bright: NDArray[np.bool_], cell: int) -> NDArray[np.intp]:
-    """Numbers from 0 of connected regions [N], of the bright pixels row by row; one larger than two cells has a number
-    for each cell of it. Time and memory grow with the pixels alone, not with the regions."""
+    """The number of the connected region of each bright pixel, [N] row by row; a region larger than two cells has a
+    number for each of its cells. Time and memory grow with the pixels alone, not with the regions."""
     label, _ = ndimage.label(bright, np.ones((3, 3)))
     number = label[bright] - 1
     boxes = np.array([[(s.start, s.stop) for s in box] for box in ndimage.find_objects(label)]).reshape(-1, 2, 2)
@@ -219,8 +218,8 @@ def _pixels(
     colour: FloatArray, row: NDArray[np.intp], column: NDArray[np.intp], field: Field, film_mm: tuple[float, float],
     size: tuple[int, int],
 ) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Irradiance at the lens [N, 3], unit direction [3, N] (lens frame) and solid angle [N] of pixels, as their corners
-    are seen."""
+    """Irradiance at the lens [N, 3], unit direction [3, N] (lens frame) and solid angle [N] of pixels, by the
+    directions of their corners."""
     x = (np.array([[0], [1], [1], [0]]) + column) * (film_mm[0] / size[1]) - film_mm[0] / 2
     y = film_mm[1] / 2 - (np.array([[0], [0], [1], [1]]) + row) * (film_mm[1] / size[0])
     corner = field.directions((x + 1j * y).reshape(-1)).reshape(3, 4, -1)

@@ -1,7 +1,8 @@
 """Derivatives of a lens's graph as sparse polynomials of low order, for ray differentials.
 
-A ray differential says how wide a pixel's footprint is, to choose the texels that it averages: a few percent of error do
-no harm. Derivatives of the graph itself double its work; polynomials of some ten terms each are a few products.
+A ray differential says how wide a pixel's footprint is, to choose the texels that it averages: an error of a few
+percent does no harm. Derivatives of the graph itself double its work; polynomials of some ten terms each are a few
+products.
 """
 
 from __future__ import annotations

@@ -75,7 +75,7 @@ def _shape(node: Node) -> list[int | str]:
 
 @dataclass(frozen=True)
 class _Linear:
-    """weight [T, R, K] @ value + bias [T, R], not yet written: an affine that takes it folds it into its own product."""
+    """weight [T, R, K] @ value + bias [T, R], not yet written: an affine that takes it folds it into its product."""
 
     value: str
     weight: Array
