@@ -19,6 +19,7 @@ from __future__ import annotations
 import argparse
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,7 @@ from neurolens.lens import glass
 from neurolens.lens.prescription import Lens
 from neurolens.study.speed import POOL, Call, Candidate, Race, race
 from neurolens.surrogates.domain import FilmRays
-from neurolens.trace.rays import Rays, compile_trace, trace
+from neurolens.trace.rays import Rays, compile_tracing, trace
 
 try:
     import optiland
@@ -116,7 +117,7 @@ def theirs(lens: Lens, backend: str, dtype: str) -> tuple[Callable[[FilmRays], C
 
 def ours(lens: Lens, dtype: str, compiled: bool) -> Callable[[FilmRays], Call]:
     """What prepares our call."""
-    fast = compile_trace(lens, towards="film") if compiled else None
+    fast = compile_tracing(partial(trace, lens, towards="film"), lens) if compiled else None
 
     def prepare(rays: FilmRays) -> Call:
         start = light(lens, rays, DTYPES[dtype])

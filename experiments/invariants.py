@@ -142,7 +142,7 @@ def trace_all(folder: Path, item: str, count: int) -> None:
     """Trace every lens both ways, or 1,000 ghost paths, in float64 and float32: LENS.npz, arrays by precision."""
     import torch
 
-    tracer = sys.modules[find("compile_trace").__module__]
+    tracer = sys.modules[find("trace_differentials").__module__]
     files = sorted(Path("lenses").glob("*.toml"))
     for number, file in enumerate(progress(files, item)):
         if (folder / f"{file.stem}.npz").exists():

@@ -34,7 +34,7 @@ from neurolens.surrogates.inverse import STEPS, TOLERANCE, InverseModel, front_i
 from neurolens.surrogates.inverse_fit import convergence, fit_inverse
 from neurolens.surrogates.model import Domain, LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.trace.sag import front_rays
+from neurolens.trace.surfaces import front_rays
 
 PUBLISHED_STEPS = (3, 5, 10, 20)
 # A residual beyond this (in stop radii; of the front's radius, in radians) counts as diverged, not just missed.

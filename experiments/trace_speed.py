@@ -10,6 +10,7 @@ import argparse
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -24,7 +25,7 @@ from neurolens.setting.pupils import camera_rays
 from neurolens.study.candidates import COMPILED_BATCHES, EAGER_BATCHES
 from neurolens.study.speed import POOL, Call, Candidate, Race, Unavailable, race
 from neurolens.surrogates.domain import FilmRays
-from neurolens.trace.rays import Rays, compile_trace, trace
+from neurolens.trace.rays import Rays, compile_tracing, trace
 
 # Lens files by number of refractions.
 LENSES = {
@@ -76,7 +77,7 @@ def launched(lens: Lens, rays: FilmRays, dtype: torch.dtype) -> tuple[Rays, torc
 
 def candidates(lens: Lens, label: str = "") -> list[Candidate]:
     """The tracer eager and compiled in each precision, named "{label}eager float32" and so on."""
-    fast = compile_trace(lens)
+    fast = compile_tracing(partial(trace, lens), lens)
     found = []
     for dtype in DTYPES:
 

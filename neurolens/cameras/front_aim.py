@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.lens_film import LensFilm
-from neurolens.trace.sag import meet_front
 from neurolens.trace.shapes import Shape, sag_and_derivatives
+from neurolens.trace.surfaces import meet_front
 
 Array = NDArray[np.float64]
 

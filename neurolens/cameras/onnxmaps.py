@@ -18,8 +18,8 @@ from neurolens.graph.onnx import write_onnx
 from neurolens.surrogates.assemble import ONNX
 from neurolens.surrogates.file import ModelFile, check_size, read_model
 from neurolens.surrogates.inverse import Guess, front_index, scene_graph, stop_graph
-from neurolens.trace.sag import front_rays
 from neurolens.trace.shapes import Shape
+from neurolens.trace.surfaces import front_rays
 
 # Rays a call: these graphs have more rows than those of models alone.
 _BATCH = 4096

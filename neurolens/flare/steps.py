@@ -27,13 +27,12 @@ from neurolens.graph.ir import Graph, Value
 from neurolens.graph.scalars import lower
 from neurolens.lens import glass
 from neurolens.lens.apertures import Aperture
-from neurolens.lens.prescription import Lens
+from neurolens.lens.prescription import Lens, same_medium
 from neurolens.trace import coatings
 from neurolens.trace.arithmetic import TINY, Graphs
-from neurolens.trace.coatinggraph import transmitted
-from neurolens.trace.sag import same_medium
 from neurolens.trace.shapes import Figure, figure_of, is_plain
 from neurolens.trace.surfaces import Medium, Rays, meet, normal_at, radius2, reflect, refract
+from neurolens.trace.tracegraph import transmitted
 from neurolens.trace.transmission import path_mm
 
 Floats = NDArray[np.float32]

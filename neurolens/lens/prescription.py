@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from typing import Any, Literal
@@ -307,6 +307,14 @@ class Lens:
     def with_aperture(self, aperture: Aperture | None) -> Lens:
         """The same lens with blades or a mask in its stop; None is a round stop."""
         return replace(self, aperture=aperture)
+
+
+def same_medium(surfaces: Sequence[Surface], k: int, in_front: Medium | None = None) -> bool:
+    """Whether the medium is the same before and behind surface k; `in_front`, by default air, lies before the first."""
+    first = surfaces[k - 1] if k else in_front
+    before = (first.n_d, first.V_d, first.glass) if first else (1.0, None, None)
+    s = surfaces[k]
+    return before == (s.n_d, s.V_d, s.glass) and s.focal_mm is None
 
 
 def _figures(s: Surface) -> list[Any]:

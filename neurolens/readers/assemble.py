@@ -16,7 +16,7 @@ from neurolens.lens.paraxial import FirstOrder
 from neurolens.lens.prescription import Lens
 from neurolens.readers.lensfile import MAX_INDEX, MAX_POWER, MAX_SURFACES
 from neurolens.readers.source import Line, assume, warn
-from neurolens.trace.sag import check_figures
+from neurolens.setting.rims import check_figures
 
 # A diameter that the file does not give, until `finish` has found it.
 UNKNOWN = math.nan

@@ -24,8 +24,9 @@ from neurolens.lens.prescription import Configuration, Lens, Surface
 from neurolens.readers.assemble import UNKNOWN, finish, first_order, same_glass
 from neurolens.readers.draft import Given
 from neurolens.readers.json_others import read_others
-from neurolens.readers.lensfile import MAX_SURFACES, Table, check_states
+from neurolens.readers.lensfile import MAX_SURFACES, Table
 from neurolens.readers.source import read_text, warn
+from neurolens.setting.rims import check_states
 
 KEYS = (
     *("name", "designer", "source", "efl_mm", "f_number", "field_or_image_circle", "notes", "computed_at_nd"),

@@ -19,7 +19,7 @@ from neurolens.lens import catalogue, designs
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.glass import by_figures, check_against_table, index_at
 from neurolens.lens.prescription import Coating, Configuration, Lens, Medium, Surface
-from neurolens.trace.sag import check_clearance
+from neurolens.setting.rims import check_states, with_derived_rims
 
 SCHEMA = 1
 MAX_SURFACES = 500
@@ -174,13 +174,6 @@ def read_lens(path: str | Path, data: Mapping[str, Any] | None = None) -> Lens:
     return lens
 
 
-def check_states(lens: Lens) -> None:
-    """Raise for rims beyond their sphere and surfaces that overlap, in the table and in every state of it."""
-    check_clearance(lens.surfaces, lens.path)
-    for c in lens.configurations:
-        check_clearance(lens.with_gaps(dict(c.thickness_mm)).surfaces, lens.path, f'configuration "{c.name}", ')
-
-
 def _with_rims(lens: Lens, table: Table) -> Lens:
     """The lens with the diameters that its file leaves out."""
     missing = [k for k, s in enumerate(lens.surfaces) if math.isnan(s.diameter_mm)]
@@ -189,8 +182,6 @@ def _with_rims(lens: Lens, table: Table) -> Lens:
     if lens.rims != "derived":
         expected = 'the full clear diameter in mm, or rims = "derived" to have it computed'
         raise table.error(f"surface {missing[0]}, diameter_mm", "(missing)", expected)
-    from neurolens.setting.rims import with_derived_rims  # rays are traced, which needs torch
-
     return with_derived_rims(lens)
 
 

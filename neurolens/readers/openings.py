@@ -12,8 +12,7 @@ from neurolens.lens.paraxial import system_of
 from neurolens.lens.prescription import Lens, Medium
 from neurolens.readers.assemble import check_rows, first_order
 from neurolens.readers.source import assume, warn
-from neurolens.setting.rims import narrowed_rims, with_derived_rims
-from neurolens.trace.sag import end_mm
+from neurolens.setting.rims import end_mm, narrowed_rims, with_derived_rims
 
 if TYPE_CHECKING:
     from neurolens.readers.draft import Draft

@@ -18,9 +18,9 @@ from neurolens.base.errors import InputError
 from neurolens.lens.paraxial import FirstOrder, first_order
 from neurolens.lens.prescription import Configuration, Lens
 from neurolens.setting.pupils import camera_rays, pupil_plane_z_mm
+from neurolens.setting.rims import end_mm
 from neurolens.trace.aiming import aim_at_stop
 from neurolens.trace.rays import trace
-from neurolens.trace.sag import end_mm
 from neurolens.trace.shapes import sag_mm
 from neurolens.trace.surfaces import Rays
 

@@ -14,8 +14,8 @@ from neurolens.base.errors import InputError
 from neurolens.lens.film_plane import PupilBounds
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
+from neurolens.setting.rims import end_mm
 from neurolens.trace.rays import passing, trace
-from neurolens.trace.sag import end_mm
 from neurolens.trace.shapes import sag_mm
 from neurolens.trace.surfaces import Rays
 

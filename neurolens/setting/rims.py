@@ -1,4 +1,4 @@
-"""Rim diameters that follow from a stated rule, for tables that print none: patents rarely do.
+"""Rims: checks that surfaces are clear of each other inside them, and diameters by a stated rule for tables without.
 
 The rule: the stop is as wide as the f-number asks; every other rim lets through the whole beam of the axis, and of a
 field the rays whose height in the stop is within a share of the stop's radius that falls linearly from 1 on the axis to
@@ -11,18 +11,114 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.lens.paraxial import first_order, stop_radius_mm
-from neurolens.lens.prescription import Configuration, Lens, Surface
-from neurolens.trace.sag import end_mm, neighbours
+from neurolens.lens.prescription import Configuration, Lens, Surface, same_medium
 from neurolens.trace.shapes import sag_mm
 
+TOUCH_MM = 1e-6  # edge contact is common in patents; only rounding is forgiven
 _FIELDS = 17  # from the axis to the edge; rims are usually widest at one of the ends
 _HEIGHTS = (-1.0, -0.75, -0.5, 0.0, 0.5, 0.75, 1.0)  # in the stop, as shares of what the rule lets through
 _STEP_MM = 1e-3  # diameters are given to a micrometre
 _STEPS = 64
 _ROUNDS = 12  # rims of aspheres settle in 2 to 4
+
+
+def end_mm(surface: Surface) -> float:
+    """Distance from the axis at which a surface's conic ends: the radius of a sphere; inf where it goes on."""
+    sections = [(float(surface.radius_mm), float(surface.conic))]
+    if surface.across is not None:
+        sections.append((surface.across[0], surface.across[1] or 0.0))
+    return min(abs(radius) / math.sqrt(1 + k) if k > -1 else math.inf for radius, k in sections)
+
+
+def check_figures(surfaces: Sequence[Surface], file: str, state: str = "") -> None:
+    """Raise for figures that no lens has, whose squares and inverses would overflow; a NaN is not yet known.
+
+    Raises:
+        InputError: names the file, the zoom state if there is one, the surface and the figure.
+    """
+    for k, s in enumerate(surfaces):
+        if s.focal_mm is not None and any(t.n_d != 1 or t.glass for t in surfaces[max(k - 1, 0) : k + 1]):
+            raise InputError(file, f"{state}surface {k}, focal_mm", s.focal_mm, "air on both sides of an ideal lens")
+        rim = min(s.semi_diameter_mm, 1e6)
+        figures: tuple[tuple[str, Any, float, float], ...] = (
+            ("radius_mm", abs(s.radius_mm), 1e-6, math.inf),
+            ("across_mm", abs(s.across[0]) if s.across else 1.0, 1e-6, math.inf),
+            ("across_conic", abs(s.across[1] or 0.0) if s.across else 0.0, 0.0, 1e9),
+            ("focal_mm", abs(s.focal_mm or 1.0), 1e-6, 1e9),
+            ("thickness_mm", abs(s.thickness_mm), 0.0, 1e6),
+            ("diameter_mm", s.diameter_mm, 1e-6, 1e6),
+            ("V_d", 100.0 if s.V_d is None else s.V_d, 1.0, 1e4),
+            ("conic", abs(s.conic), 0.0, 1e9),
+            ("asphere", sum(abs(float(a)) * rim**p for p, a in s.asphere), 0.0, 1e6),
+            ("absorption_per_mm", s.absorption_per_mm, 0.0, 1e6),
+        )
+        for name, value, low, high in figures:
+            if value < low or value > high:
+                expected = f"a size from {low:g} to {high:g}" + (" mm of sag at the rim" if name == "asphere" else "")
+                raise InputError(file, f"{state}surface {k}, {name}", float(value), expected)
+
+
+def check_clearance(surfaces: Sequence[Surface], file: str, state: str = "") -> None:
+    """Raise as `check_figures`, for rims beyond the radius of curvature, and for neighbours that overlap inside theirs.
+
+    The gap between two spheres is monotone from the axis outwards, so that axis and the smaller of the two rims
+    decide; other shapes are also tested in between. A stop that bends nothing may lie inside an element beside which
+    it is listed; what stands on both sides of it must be clear of each other.
+
+    Raises:
+        InputError: names the file, the zoom state if there is one, the surface and by how much.
+    """
+    check_figures(surfaces, file, state)
+    for k, s in enumerate(surfaces):
+        if s.semi_diameter_mm > end_mm(s):
+            limit = f"at most {2 * end_mm(s):g} mm, where its {'conic' if s.conic else 'sphere'} ends"
+            raise InputError(file, f"{state}surface {k}, diameter_mm", s.diameter_mm, limit)
+    for k, after, axis_gap_mm in neighbours(surfaces):
+        if axis_gap_mm < -TOUCH_MM:
+            expected = "at least 0, except beside a stop with the same medium before and behind it"
+            raise InputError(file, f"{state}surface {k}, thickness_mm", axis_gap_mm, expected)
+        gap_mm, height_mm = _narrowest(surfaces[k], surfaces[after], axis_gap_mm)
+        if gap_mm < -TOUCH_MM:
+            found = f"(an overlap of {-gap_mm:.4g} mm with surface {after}, {height_mm:.4g} mm from the axis)"
+            raise InputError(file, f"{state}surface {k}, thickness_mm", found, "surfaces that are clear of each other")
+
+
+def check_states(lens: Lens) -> None:
+    """Raise for rims beyond their sphere and surfaces that overlap, in the table and in every state of it."""
+    check_clearance(lens.surfaces, lens.path)
+    for c in lens.configurations:
+        check_clearance(lens.with_gaps(dict(c.thickness_mm)).surfaces, lens.path, f'configuration "{c.name}", ')
+
+
+def _narrowest(before: Surface, after: Surface, axis_gap_mm: float) -> tuple[float, float]:
+    """The smallest gap between two surfaces inside the smaller of their rims, and its distance from the axis, mm."""
+    rim = min(before.semi_diameter_mm, after.semi_diameter_mm)
+    spheres = all(not s.conic and not s.asphere and not s.cylinder for s in (before, after))
+    steps = 1 if spheres else 32
+    azimuths = [(1.0, 0.0), (0.0, 1.0)] if before.cylinder or after.cylinder else [(1.0, 0.0)]
+    found = (axis_gap_mm, 0.0)
+    for cos, sin in azimuths:
+        for i in range(1, steps + 1):
+            h = rim * i / steps
+            x, y = h * cos, h * sin
+            gap = axis_gap_mm + sag_mm(after, x, y) - sag_mm(before, x, y)
+            found = min(found, (gap, h))
+    return found
+
+
+def neighbours(surfaces: Sequence[Surface]) -> Iterator[tuple[int, int, float]]:
+    """Pairs of surfaces that may collide, a stop that bends nothing aside, with the distance of their vertices."""
+    idle = [s.stop and same_medium(surfaces, k) for k, s in enumerate(surfaces)]
+    for k in range(len(surfaces) - 1):
+        if not idle[k] and not idle[k + 1]:
+            yield k, k + 1, surfaces[k].thickness_mm
+    for k in range(1, len(surfaces) - 1):
+        if idle[k] and math.isinf(surfaces[k].radius_mm):
+            yield k - 1, k + 1, surfaces[k - 1].thickness_mm + surfaces[k].thickness_mm
 
 
 @dataclass(frozen=True)

@@ -29,9 +29,9 @@ from neurolens.setting.focusing import (
     zoom_state_of,
 )
 from neurolens.setting.pupils import image_radius_mm
+from neurolens.setting.rims import check_clearance
 from neurolens.trace.aiming import aim_at_stop
 from neurolens.trace.rays import trace
-from neurolens.trace.sag import check_clearance
 
 
 def set_lens(

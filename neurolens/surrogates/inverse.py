@@ -41,7 +41,7 @@ from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, CoreValues, Fi
 from neurolens.surrogates.file import pack, unpack
 from neurolens.surrogates.lightfield import MIRROR, ROUND
 from neurolens.surrogates.model import Encoding, LensModel, Prediction, prediction_of
-from neurolens.trace.sag import front_rays
+from neurolens.trace.surfaces import front_rays
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, partial
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -52,7 +52,7 @@ class Crossing(NamedTuple):
     """Where rays cross one surface, each [N]; mm, and the margins of Snell's and the sphere's square roots.
 
     `meets` is positive where the ray meets the surface, `refracts` where it is not totally reflected there. Points on
-    the far half of a sphere, beyond any rim, lie mirrored outwards (see `unfolded`).
+    the far half of a sphere, beyond any rim, lie mirrored outwards (see `_unfolded`).
     """
 
     x: Tensor
@@ -78,14 +78,6 @@ class Traced(NamedTuple):
     transmittance: Tensor | None
     crossings: dict[int, Crossing]
     path: tuple[Rays, ...] = ()
-
-
-class _Wanted(NamedTuple):
-    """What to follow besides the rays; see `trace`."""
-
-    transmittance: bool
-    record: tuple[int, ...]
-    path: bool
 
 
 def trace(
@@ -126,16 +118,18 @@ def trace(
         raise InputError("trace", "towards", towards, '"scene" or "film"')
     if any(not 0 <= k < len(lens.surfaces) for k in record):
         raise InputError("trace", "record", tuple(record), f"surfaces from 0 to {len(lens.surfaces) - 1}")
-    wanted = _Wanted(transmittance, tuple(record), path)
     needs_grad = any(_differentiated(v) for v in (*rays, wavelength_nm, *_parameters(lens)))
+    chunk = partial(
+        _trace_chunk, lens, towards=towards, transmittance=transmittance, record=record, path=path, freeze=needs_grad
+    )
     count = rays.x.shape[0]
     if needs_grad or count <= CHUNK:
-        return _trace_chunk(lens, rays, wavelength_nm, towards, wanted, needs_grad)
+        return chunk(rays, wavelength_nm)
     parts = []
     for i in range(0, count, CHUNK):
         part = slice(i, i + CHUNK)
         lam = wavelength_nm[part] if isinstance(wavelength_nm, Tensor) and wavelength_nm.ndim else wavelength_nm
-        parts.append(_trace_chunk(lens, Rays(*(c[part] for c in rays)), lam, towards, wanted, False))
+        parts.append(chunk(Rays(*(c[part] for c in rays)), lam))
     return _joined(parts)
 
 
@@ -179,32 +173,18 @@ def _passing_chunk(lens: Lens, rays: Rays, wavelength_nm: float, towards: Toward
     return passed
 
 
-def compile_trace(
-    lens: Lens, *, towards: Towards = "scene", transmittance: bool = False
-) -> Callable[[Rays, Tensor], Traced]:
-    """The same trace with the prescription folded in as constants, compiled by torch for chunks of one length.
+def compile_tracing(run: Callable[..., Any], lens: Lens | None = None, fullgraph: bool = False) -> Callable[..., Any]:
+    """Compile a function that traces rays through a lens by torch, the prescription folded in as constants.
 
-    The result takes rays and wavelengths [N]; every new N compiles anew, so call it with chunks of one length.
-    Without a C++ compiler the first call raises torch's own error; the eager `trace` needs none.
+    Every new number of rays compiles anew, so call it with batches of one length. Without a C++ compiler the first call
+    raises torch's own error; the eager `trace` needs none.
+
+    What the compiler may take for constant is marked here only: that imports it, which takes longer than a camera needs
+    to start. Torch keeps the machine code that it makes, and runs what it finds: by default in a folder that every user
+    of the machine can create, so that its cache is moved into the user's own.
     """
-
-    def run(rays: Rays, wavelength_nm: Tensor) -> Traced:
-        return _trace_chunk(lens, rays, wavelength_nm, towards, _Wanted(transmittance, (), False), False)
-
-    for surface in lens.surfaces:
-        # Read the catalogue now: compiled code cannot read files.
+    for surface in lens.surfaces if lens else ():  # read the catalogue now: compiled code cannot read files
         glass.index_of(surface, glass.LINE_D_NM)
-        glass.absorption_of(surface, glass.LINE_D_NM)
-    return compile_tracing(run)
-
-
-def compile_tracing(run: Callable[..., Any], fullgraph: bool = False) -> Callable[..., Any]:
-    """`torch.compile` of a function that traces, for chunks of one length.
-
-    What it may take for constant is marked here only: that imports the compiler, which takes longer than a camera
-    needs to start. Torch keeps the machine code that it makes, and runs what it finds: by default in a folder that
-    every user of the machine can create, so that its cache is moved into the user's own.
-    """
     if "TORCHINDUCTOR_CACHE_DIR" not in os.environ:
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(own_folder("torch"))
     torch.compiler.assume_constant_result(start_of)
@@ -327,27 +307,35 @@ class Tracing:
 
 
 def _trace_chunk(
-    lens: Lens, rays: Rays, wavelength_nm: Tensor | float, towards: Towards, wanted: _Wanted, freeze: bool
+    lens: Lens,
+    rays: Rays,
+    wavelength_nm: Tensor | float,
+    *,
+    towards: Towards,
+    transmittance: bool,
+    record: Sequence[int],
+    path: bool,
+    freeze: bool,
 ) -> Traced:
     sense, order = _path(lens, towards)
-    tracing = Tracing(lens, rays, wavelength_nm, sense, order[0], wanted.path or bool(wanted.record), freeze)
-    power = Passage(tracing.o, lens, TensorLosses(lens, tracing.wavelength_nm)) if wanted.transmittance else None
+    tracing = Tracing(lens, rays, wavelength_nm, sense, order[0], path or bool(record), freeze)
+    power = Passage(tracing.o, lens, TensorLosses(lens, tracing.wavelength_nm)) if transmittance else None
     crossings: dict[int, Crossing] = {}
-    path: list[Rays] = []
+    passed: list[Rays] = []
     for k in order:
         r, (met, bent, _), (before, after) = tracing.cross(k)
         if power is not None:
             power.pass_surface(k, r, met, bent.q, (before, after), sense)
-        if k in wanted.record:
+        if k in record:
             margins = times(met.q2, before.inverse_n2), times(bent.q2, after.inverse_n2)
-            crossings[k] = Crossing(*unfolded(lens.surfaces[k], met), *margins)
-        if wanted.path:
-            path.append(tracing.in_lens_frame())
+            crossings[k] = Crossing(*_unfolded(lens.surfaces[k], met), *margins)
+        if path:
+            passed.append(tracing.in_lens_frame())
     arrived = None if power is None else tracing.tests.only(power.arrived(rays.x), 0.0)
-    return Traced(tracing.leave(), tracing.tests.status(), arrived, crossings, tuple(path))
+    return Traced(tracing.leave(), tracing.tests.status(), arrived, crossings, tuple(passed))
 
 
-def unfolded(surface: Surface, met: Met) -> tuple[Tensor, Tensor]:
+def _unfolded(surface: Surface, met: Met) -> tuple[Tensor, Tensor]:
     """x and y of a meeting, [N] each, mm; on the far half of a deep sphere mirrored outwards at its equator.
 
     So the distance from the axis grows on beyond a deep rim, where it would fall again, and tells the half.
@@ -444,11 +432,9 @@ def film_derivatives(rays: Rays, distance_mm: Tensor | float) -> tuple[Rays, Ray
 
     With d = (P - F) / |P - F|, dd/dF_x = (d d_x - e_x) / |P - F|.
     """
-    zero, one = torch.zeros_like(rays.x), torch.ones_like(rays.x)
-    found = []
-    for axis, along in enumerate((rays.dx, rays.dy)):
-        e = [0.0, 0.0, 0.0]
-        e[axis] = 1.0
-        dx, dy, dz = ((c * along - k) / distance_mm for c, k in zip(rays[3:], e, strict=True))
-        found.append(Rays(one * e[0], one * e[1], zero, dx, dy, dz))
-    return found[0], found[1]
+
+    def moved(along: Tensor, e: tuple[float, float, float]) -> Rays:
+        directions = ((c * along - k) / distance_mm for c, k in zip(rays[3:], e, strict=True))
+        return Rays(*(torch.full_like(rays.x, k) for k in e), *directions)
+
+    return moved(rays.dx, (1.0, 0.0, 0.0)), moved(rays.dy, (0.0, 1.0, 0.0))

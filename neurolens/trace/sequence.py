@@ -6,18 +6,15 @@ The surfaces and their tests are those of `trace`; in addition, light may be ref
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
-import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.lens.prescription import Lens, Surface
-from neurolens.trace import coatings
-from neurolens.trace.arithmetic import times
+from neurolens.lens.prescription import Lens
 from neurolens.trace.rays import Tracing, check_rays
-from neurolens.trace.surfaces import Medium, Met, Rays
-from neurolens.trace.transmission import Passage, TensorLosses, path_mm
+from neurolens.trace.surfaces import Rays
+from neurolens.trace.transmission import Passage, TensorLosses
 
 Action = Literal["T", "R"]
 Towards = Literal["scene", "film"]
@@ -88,39 +85,15 @@ def follow(
     check_rays(rays, wavelength_nm)
     _check(len(lens.surfaces), steps, towards)
     tracing = Tracing(lens, rays, wavelength_nm, 1 if towards == "film" else -1, steps[0][0], guard=True)
-    losses = TensorLosses(lens, tracing.wavelength_nm)
-    power, passage = torch.ones_like(rays.x), Passage(tracing.o, lens, losses) if polarised else None
+    passage = Passage(tracing.o, lens, TensorLosses(lens, tracing.wavelength_nm), polarised)
     points = []
     for k, action in steps:
         sense, reflected = tracing.sense, action == "R"
-        r, (met, bent, _), (before, after) = tracing.cross(k, reflected)
+        r, (met, bent, _), mediums = tracing.cross(k, reflected)
         points.append((met.x, met.y, met.z + tracing.vertex))
-        if passage is not None:
-            passage.pass_surface(k, r, met, bent.q, (before, after), sense, reflected)
-            continue
-        power = power * _share(lens.surfaces[k], met, before, after, sense, tracing.wavelength_nm, action)
-        absorbed = losses.absorption(k if sense > 0 else k + 1)
-        if absorbed is not None:
-            power = power * torch.exp(-path_mm(tracing.o, r, met, before) * absorbed)
-    power = power if passage is None else passage.arrived(rays.x)
-    return Followed(tracing.leave(), tracing.tests.status(), tracing.tests.only(power, 0.0), tuple(points))
-
-
-def backwards(steps: Steps) -> list[tuple[int, Action]]:
-    """The steps of the same way from its end."""
-    return list(reversed(steps))
-
-
-def _share(
-    surface: Surface, met: Met, before: Medium, after: Medium, sense: int, wavelength_nm: Any, action: Action
-) -> Tensor | float:
-    """Unpolarised power that goes on, [N]: transmitted or reflected at one surface."""
-    coated = surface.coating is not None and surface.coating.layers
-    if before is after and not coated:
-        return 0.0 if action == "R" else 1.0
-    layers = surface.coating.layers if surface.coating else ()
-    share = coatings.reflectance if action == "R" else coatings.transmittance
-    return share(times(met.q, 1 / before.n), before.n, after.n, layers, wavelength_nm, sense)
+        passage.pass_surface(k, r, met, bent.q, mediums, sense, reflected)
+    power = tracing.tests.only(passage.arrived(rays.x), 0.0)
+    return Followed(tracing.leave(), tracing.tests.status(), power, tuple(points))
 
 
 def _check(count: int, steps: Steps, towards: Towards) -> None:

@@ -17,11 +17,29 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from neurolens.base import status as st
 from neurolens.lens import glass, prescription
 from neurolens.lens.prescription import Lens, Surface
-from neurolens.trace.arithmetic import TINY, Arithmetic, is_number, times
-from neurolens.trace.shapes import STEEPEST, Figure, Quadric, crossed, depth, height2, is_deep, rim_sine
+from neurolens.trace.arithmetic import NUMPY, TINY, Arithmetic, is_number, times
+from neurolens.trace.shapes import (
+    STEEPEST,
+    Figure,
+    Quadric,
+    Shape,
+    crossed,
+    curve_of,
+    depth,
+    height2,
+    is_deep,
+    rim_sine,
+    sag_and_derivatives,
+    without_rim,
+)
+
+Array = NDArray[np.float64]
 
 # A test that a ray passes where the first value is at most the second; NaN does not pass.
 Test = tuple[Any, Any]
@@ -363,3 +381,64 @@ def rim_tests(o: Arithmetic, surface: Surface) -> Callable[[Met], list[Test]]:
 def radius2(o: Arithmetic, met: Met) -> Any:
     """Squared distance of a meeting from the axis, mm^2."""
     return o.dot(met[:2], met[:2])
+
+
+def meet_front(
+    shape: Shape | None, x: Array, y: Array, z: Array, dx: Array, dy: Array, dz: Array
+) -> tuple[Array, Array]:
+    """(x, y) where the line of each ray meets the front surface, None the plane z = 0, next to its vertex; else NaN.
+
+    Rays are points (mm) and directions of either sense, float64 [N].
+    """
+    # Before the lens light travels towards +z, or from the side and beyond: the sense is that of the camera ray's end.
+    rays = Rays(x, y, z, -dx, -dy, -dz)
+    figure = Figure(0.0, plain=True) if shape is None else without_rim(curve_of(shape))
+    with np.errstate(all="ignore"):
+        met = meet(NUMPY, rays, figure, 1, AIR, entering=True)
+        passed = np.logical_and.reduce([low <= high for low, high in met.tests])
+        return np.where(passed, met.x, math.nan), np.where(passed, met.y, math.nan)
+
+
+def front_rays(
+    shape: Shape | None,
+    x: Array,
+    y: Array,
+    z: Array,
+    dx: Array,
+    dy: Array,
+    dz: Array,
+    *,
+    index: Sequence[float] | None = None,
+    wavelength_nm: Array | float = math.nan,
+) -> tuple[Array, Array]:
+    """Scene rays as models have them, and the solid angle per area of their direction vectors [N].
+
+    Rows [4, N]: x and y (mm) on the front surface, and the direction vector, theta (dx, dy) / |(dx, dy)| with theta
+    from -z; of first-order models, which have no shape, the slope. Arguments as of `meet_front`, unit directions away
+    from the lens. `index`: where direction vectors are those inside the front glass, its index as a power series in
+    1 / lambda^2 (1/um^2).
+    """
+    x, y = meet_front(shape, x, y, z, dx, dy, dz)
+    with np.errstate(all="ignore"):
+        if shape is None:
+            return np.stack([x, y, dx / -dz, dy / -dz]), np.abs(dz) ** 3
+        wider: Array | float = 1.0
+        if index is not None:
+            n = np.polyval(np.asarray(index)[::-1], (1000 / wavelength_nm) ** 2)
+            (dx, dy, dz), wider = entered(shape, x, y, np.stack([dx, dy, dz]), n)
+        sine = np.hypot(dx, dy)
+        angle = np.arctan2(sine, -dz)
+        ratio = np.where(sine > 1e-12, angle / sine, 1.0)
+        return np.stack([x, y, ratio * dx, ratio * dy]), wider * np.where(angle > 1e-12, sine / angle, 1.0)
+
+
+def entered(shape: Shape, x: Array, y: Array, d: Array, index: Array) -> tuple[Array, Array]:
+    """Unit directions [3, N] inside the front glass of rays that leave it at (x, y) along d [3, N].
+
+    Also the solid angle of a bundle of them outside over that inside, n^2 cos(inside) / cos(outside) [N].
+    """
+    _, zx, zy = sag_and_derivatives(shape, x, y)
+    normal = np.stack([zx, zy, np.full_like(zx, -1.0)]) / np.sqrt(1 + zx * zx + zy * zy)
+    cosine = (d * normal).sum(0)
+    inner = np.sqrt(1 - (1 - cosine * cosine) / index**2)
+    return d / index + normal * (inner - cosine / index), index**2 * inner / cosine

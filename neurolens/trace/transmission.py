@@ -144,7 +144,7 @@ def coated_shares(
 
 
 class Losses(Protocol):
-    """What glass and coatings do to light: `TensorLosses` with tensors, `filmgraph.GraphLosses` in a graph."""
+    """What glass and coatings do to light: `TensorLosses` with tensors, `tracegraph.GraphLosses` in a graph."""
 
     def absorption(self, k: int) -> Any: ...
     def coated(self, k: int, met: Met, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares: ...
@@ -176,10 +176,13 @@ class TensorLosses:
 
 
 class Passage:
-    """Power carried along while rays are traced; absorption is by Beer and Lambert's law."""
+    """Power carried along while rays are traced; absorption is by Beer and Lambert's law.
 
-    def __init__(self, o: Arithmetic, lens: Lens, losses: Losses) -> None:
-        self._o, self._lens, self._losses = o, lens, losses
+    `polarised`: whether the polarisation is followed that each surface gives to the light, or averaged at each surface.
+    """
+
+    def __init__(self, o: Arithmetic, lens: Lens, losses: Losses, polarised: bool = True) -> None:
+        self._o, self._lens, self._losses, self._polarised = o, lens, losses, polarised
         self._light: Light | None = None
         self._depth: Any = None
         self._last: tuple[int, Vector, Any] | None = None  # surface, its normal, n cos behind it
@@ -203,6 +206,10 @@ class Passage:
             both = before.n * after.n
             p = self._o.fma(met.q, times(both, before.inverse_n2), q * times(both, after.inverse_n2))
             shares = fresnel(met.q, q, p)
+        if not self._polarised:
+            share = shares.mean * (shares.above / shares.below)
+            self._light = Light(share if self._light is None else self._light.power * share, 0.0)
+            return
         normal = normal_at(self._o, met, surface.curvature)
         turn = None if self._last is None else self._turn(k, normal, r, met, before)
         self._light = pass_surface(self._light, turn, shares)

@@ -16,8 +16,8 @@ from neurolens.surrogates.assemble import refracted, tilt_series
 from neurolens.surrogates.cores import Refracted
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.fits import front
-from neurolens.trace.sag import entered
 from neurolens.trace.shapes import sag_and_derivatives
+from neurolens.trace.surfaces import entered
 
 FRONTS = {
     "sphere": Surface(60.0, 2.0, 70.0, 1.6, 50.0),

@@ -13,10 +13,9 @@ from neurolens.base.errors import InputError
 from neurolens.lens.paraxial import first_order, stop_radius_mm
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.lensfile import read_lens
-from neurolens.setting.rims import RimRule, derive_rims, half_field_deg, narrowed_rims
+from neurolens.setting.rims import RimRule, check_clearance, derive_rims, half_field_deg, narrowed_rims
 from neurolens.trace.aiming import aim_at_stop, without_rims
 from neurolens.trace.rays import trace
-from neurolens.trace.sag import check_clearance
 
 INF = math.inf
 LENSES = Path(__file__).parents[2] / "lenses"

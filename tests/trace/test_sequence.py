@@ -17,10 +17,9 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.flare.ghosts import GhostTracer, Pair
 from neurolens.lens.glass import LINE_D_NM
-from neurolens.lens.prescription import Coating, Lens, Surface
+from neurolens.lens.prescription import Coating, Lens, Surface, same_medium
 from neurolens.trace.rays import Rays, trace
-from neurolens.trace.sag import same_medium
-from neurolens.trace.sequence import Followed, backwards, follow, ghost
+from neurolens.trace.sequence import Followed, follow, ghost
 
 DATA = Path(__file__).parents[1] / "data" / "ghost_paths.json"
 WHOLE = oracle.SHARED / "oracle" / "ghosts_and_fresnel.json"
@@ -217,7 +216,7 @@ def test_light_goes_the_same_way_back(polarised: bool) -> None:
         steps = ghost(count, first, second)
         there = follow(lens, rays, steps, 500.0, polarised=polarised)
         back = Rays(*there.rays[:3], *(-d for d in there.rays[3:]))
-        again = follow(lens, back, backwards(steps), 500.0, towards="scene", polarised=polarised)
+        again = follow(lens, back, steps[::-1], 500.0, towards="scene", polarised=polarised)
         ok = there.status == st.PASSED
         arrived += int(ok.sum())
         assert torch.equal(again.status[ok], there.status[ok])

@@ -26,9 +26,9 @@ from neurolens.setting.focusing import (
     monotone,
     nearest_focus_m,
 )
+from neurolens.setting.rims import check_clearance
 from neurolens.setting.states import set_lens
 from neurolens.trace.rays import Rays, trace
-from neurolens.trace.sag import check_clearance
 
 ZOOMS = ("ogawa_zoom_70_200", "nikon_zoom_70_200", "nikon_zoom_14_24", "nikon_zoom_80_200", "itoh_zoom_100_146")
 INTERNAL = ("nikon_zoom_70_200", "nikon_zoom_14_24", "sony_sonnar_55", "tajima_retrofocus_24")

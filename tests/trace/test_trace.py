@@ -3,6 +3,7 @@
 import math
 import shutil
 import sysconfig
+from functools import partial
 from pathlib import Path
 
 import mpmath
@@ -16,7 +17,7 @@ from neurolens.base import status as st
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.setting.pupils import camera_rays, pupil_plane_z_mm
-from neurolens.trace.rays import CHUNK, Rays, Towards, Traced, compile_trace, passing, trace
+from neurolens.trace.rays import CHUNK, Rays, Towards, Traced, compile_tracing, passing, trace
 
 INF = math.inf
 WIDE = 1000.0
@@ -346,7 +347,7 @@ def test_compiled_equals_eager() -> None:
     with torch.no_grad():
         eager = trace(singlet, start, wavelength, transmittance=True)
         with inductor_config.patch({"cpp.vec_isa_ok": True}):  # else trial programs are compiled first, for 6 s
-            compiled = compile_trace(singlet, transmittance=True)(start, wavelength)
+            compiled = compile_tracing(partial(trace, singlet, transmittance=True), singlet)(start, wavelength)
     assert int((eager.status != compiled.status).sum()) <= 1  # a ray may pass an edge closely
     both = (eager.status == 0) & (compiled.status == 0)
     for a, b in zip(eager.rays, compiled.rays, strict=True):

@@ -25,8 +25,8 @@ from neurolens.readers.lenswriter import write_lens
 from neurolens.setting.states import set_lens
 from neurolens.surrogates.assemble import Form, sag
 from neurolens.trace.rays import Rays, trace
-from neurolens.trace.sag import meet_front
 from neurolens.trace.shapes import sag_and_derivatives, sag_mm
+from neurolens.trace.surfaces import meet_front
 
 GLASS = 1.6
 TOROID: dict[str, Any] = {"cylinder": "y", "across": (34.0, None)}

@@ -18,7 +18,7 @@ from neurolens.surrogates.assemble import tilt_series
 from neurolens.surrogates.cores import Array
 from neurolens.surrogates.model import Encoding
 from neurolens.surrogates.pairs import PairSet, RayPairs
-from neurolens.trace.sag import entered
+from neurolens.trace.surfaces import entered
 
 # Cosine of the flattest ray that leaves the front surface, below which a fit refracts there.
 GRAZING = 0.3
