@@ -116,8 +116,7 @@ def write_checked(lens: Lens, path: Path) -> None:
     Raises:
         InputError: it does not; with the file to be written.
     """
-    from neurolens.readers.lensfile import read_lens
-    from neurolens.readers.lenswriter import format_lens
+    from neurolens.readers.lensfile import format_lens, read_lens
 
     with atomic_path(path) as temporary:
         temporary.write_text(format_lens(lens), encoding="utf-8")

@@ -335,7 +335,7 @@ def _add_rims(parser: argparse.ArgumentParser) -> None:
 
 def _run_rims(args: argparse.Namespace) -> int:
     """Print the table of rims; write the lens with derived rims only where -o asks for it."""
-    from neurolens.readers.lenswriter import write_lens
+    from neurolens.readers.lensfile import write_lens
     from neurolens.setting.rims import RimRule, derive_rims, half_field_deg
     from neurolens.study.describe import read_quietly
 

@@ -25,7 +25,7 @@ from neurolens.cli.output import answer
 from neurolens.flare.ghostmodel import KIND, GhostModel, read_ghosts
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.readers import lenswriter
+from neurolens.readers import lensfile
 from neurolens.readers.any_format import read_any
 from neurolens.setting.pupils import image_radius_mm, pupil_plane_z_mm
 from neurolens.setting.states import set_lens
@@ -83,7 +83,7 @@ def _with_file(entry: _Entry, folder: Path) -> _Entry:
         return entry
     folder.mkdir()
     file = folder / f"{entry.lens.lens_id}.toml"
-    lenswriter.write_lens(entry.lens, file)
+    lensfile.write_lens(entry.lens, file)
     return replace(entry, file=file)
 
 

@@ -14,8 +14,7 @@ from neurolens.lens.catalogue import LINE_C_NM, LINE_D_NM, LINE_F_NM, Glass
 from neurolens.lens.glass import by_figures
 from neurolens.lens.paraxial import FirstOrder
 from neurolens.lens.prescription import Lens
-from neurolens.readers.lensfile import MAX_INDEX, MAX_POWER, MAX_SURFACES
-from neurolens.readers.source import Line, assume, warn
+from neurolens.readers.source import MAX_INDEX, MAX_POWER, MAX_SURFACES, Line, assume, warn
 from neurolens.setting.rims import check_figures
 
 # A diameter that the file does not give, until `finish` has found it.

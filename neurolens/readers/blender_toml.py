@@ -14,7 +14,7 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.draft import Draft, Given, Row, State, lens_of
-from neurolens.readers.lensfile import MAX_SURFACES, Table
+from neurolens.readers.source import MAX_SURFACES, Table
 
 _LENS = ("name", "patent", "focal_length", "max_fstop", "coating", "squeeze", "image_circle", "sensor_width")
 _SURFACE = ("type", "radius", "thickness", "ior", "aperture", "abbe_v", "conic", "aspheric_coeffs")
@@ -70,13 +70,8 @@ def _surface(row: Table) -> Surface:
         raise row.error("type", kind, f"one of {', '.join(_TYPES)}")
     shape: dict[str, Any] = {}
     if kind == "aspheric":
-        terms = row.data.get("aspheric_coeffs", [])
-        if not isinstance(terms, list):
-            raise row.error("aspheric_coeffs", terms, "a list of coefficients of r^4, r^6, ...")
-        table = Table({f"aspheric_coeffs[{k}]": value for k, value in enumerate(terms)}, row.file, row.where)
-        figures = [(2 * k + 4, table.number(key)) for k, key in enumerate(table.data)]
-        shape = {"asphere": tuple((p, a) for p, a in figures if a)}
-        shape["conic"] = row.number("conic") if "conic" in row else 0.0
+        conic = row.number("conic") if "conic" in row else 0.0
+        shape = {"conic": conic, "asphere": row.series("aspheric_coeffs", 4)}
     elif "aspheric_coeffs" in row or "conic" in row:
         raise row.error("type", kind, "aspheric, as there are coefficients")
     radius = math.inf if kind in ("stop", "flat") else row.number("radius", unit="mm, 0 for a plane") or math.inf

@@ -20,8 +20,7 @@ from neurolens.readers.codev_model import (
     shape_of,
 )
 from neurolens.readers.draft import INFINITE, Draft, Given, Row, lens_of, primary_first
-from neurolens.readers.lensfile import MAX_SURFACES
-from neurolens.readers.source import assume, by_word, read_lines, warn
+from neurolens.readers.source import MAX_SURFACES, assume, by_word, read_lines, warn
 
 
 @dataclass

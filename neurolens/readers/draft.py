@@ -17,9 +17,8 @@ from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Configuration, Lens, Medium, Surface, same_medium
 from neurolens.readers.assemble import UNKNOWN, finish, first_order, smaller_stop
 from neurolens.readers.forbes import MAX_TERMS, qbfs_terms, qcon_terms
-from neurolens.readers.lensfile import MAX_SURFACES
 from neurolens.readers.openings import narrowed, stop_aperture, with_likely_rims, with_rims, with_stop
-from neurolens.readers.source import UNITS_MM, Line, warn
+from neurolens.readers.source import MAX_SURFACES, UNITS_MM, Line, warn
 from neurolens.setting.rims import check_states
 
 

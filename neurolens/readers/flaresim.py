@@ -17,8 +17,7 @@ from typing import Any
 
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.draft import Draft, Given, Row, lens_of
-from neurolens.readers.lensfile import MAX_SURFACES
-from neurolens.readers.source import Line, assume, read_lines
+from neurolens.readers.source import MAX_SURFACES, Line, assume, read_lines
 
 _COLUMNS = ("radius", "thickness", "ior", "abbe", "semi_ap", "coating")
 _BENT = {"cyl_x": "y", "cylinder_x": "y", "cyl_y": "x", "cylinder_y": "x"}

@@ -14,7 +14,7 @@ import math
 from collections.abc import Callable, Sequence
 from decimal import Context, Decimal, localcontext
 
-from neurolens.readers.lensfile import MAX_POWER
+from neurolens.readers.source import MAX_POWER
 
 CLOSE_MM, WORST_MM = 1e-11, 1e-9  # of sag, in the unit of the heights: what is aimed at, and what steep conics get
 MAX_TERMS = MAX_POWER // 2 - 1  # of either kind, m from 0

@@ -24,8 +24,7 @@ from neurolens.lens.prescription import Configuration, Lens, Surface
 from neurolens.readers.assemble import UNKNOWN, finish, first_order, same_glass
 from neurolens.readers.draft import Given
 from neurolens.readers.json_others import read_others
-from neurolens.readers.lensfile import MAX_SURFACES, Table
-from neurolens.readers.source import read_text, warn
+from neurolens.readers.source import MAX_SURFACES, Table, read_text, warn
 from neurolens.setting.rims import check_states
 
 KEYS = (
@@ -162,13 +161,15 @@ def _surface(given: Any, k: int, file: str, is_last: bool, catalogue: bool) -> S
     stop, shape = row.flag("stop"), given.get("shape", "sphere")
     if not isinstance(shape, str) or shape not in SHAPES:
         raise row.error("shape", shape, f"one of {', '.join(SHAPES)}")
+    key = "aspheric_coefficients"
+    terms = row.powers(key, 'an object such as {"4": 1e-6}') if given.get(key) else ()
     return Surface(
         radius_mm=radius or math.inf,
         thickness_mm=thickness,
         diameter_mm=diameter,
         stop=stop,
         conic=row.optional("conic", above=None) or 0.0,
-        asphere=_asphere(row),
+        asphere=tuple((p, a) for p, a in terms if a),
         cylinder=SHAPES[shape],
         **_glass(row, catalogue),
     )
@@ -185,18 +186,6 @@ def _glass(row: Table, catalogue: bool) -> dict[str, Any]:
     material = _optional_text(row, "material") or None
     glass = same_glass(material, n_d, V_d) if catalogue else None
     return {"n_d": n_d, "V_d": V_d, "material": material, "glass": glass}
-
-
-def _asphere(row: Table) -> tuple[tuple[int, float], ...]:
-    given = row.data.get("aspheric_coefficients") or {}
-    if not isinstance(given, Mapping):
-        raise row.error("aspheric_coefficients", given, 'an object such as {"4": 1e-6}')
-    terms = []
-    for key in given:
-        if not (key.isascii() and key.isdecimal() and len(key) < 4):
-            raise row.error("aspheric_coefficients", key, "powers of r as keys")
-        terms.append((int(key), Table(given, row.file, f"{row.where}aspheric_coefficients, power ").number(key)))
-    return tuple(sorted((power, value) for power, value in terms if value))
 
 
 def _optional_text(table: Table, key: str) -> str:

@@ -17,8 +17,7 @@ from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.assemble import first_order, named_glass
 from neurolens.readers.draft import Draft, Given, Row, lens_of
-from neurolens.readers.lensfile import Table
-from neurolens.readers.source import warn
+from neurolens.readers.source import Table, warn
 
 _DEEPLENS = (
     *("info", "foclen", "fnum", "r_sensor", "d_sensor", "sensor_size", "sensor_res", "hfov", "fov", "float_hfov"),
@@ -92,13 +91,7 @@ def _deeplens_surface(row: Table, before: Surface | None, skipped: Counter[str])
         skipped[key] += not (_repeats(key) or (key[:2] == "ai" and key[2:].isdecimal() and "ai" in given))
     shape: dict[str, Any] = {}
     if kind == "Aspheric":
-        terms = given.get("ai") or []
-        if not isinstance(terms, list):
-            raise row.error("ai", terms, "a list of coefficients of r^2, r^4, ...")
-        table = Table({f"ai[{k}]": value for k, value in enumerate(terms)}, row.file, row.where)
-        sag = [(2 * k + 2, table.number(key)) for k, key in enumerate(table.data)]
-        conic = row.number("k") if "k" in row else 0.0
-        shape = {"conic": conic, "asphere": tuple((power, value) for power, value in sag if value)}
+        shape = {"conic": row.number("k") if "k" in row else 0.0, "asphere": row.series("ai", 2)}
     return Surface(
         radius_mm=math.inf if stop else _radius_mm(row),
         thickness_mm=row.number("d_next", unit="mm"),

@@ -1,4 +1,4 @@
-"""Reads lens files, strictly: one prescription in a TOML file. `lenswriter` writes them.
+"""Lens files: one prescription in a TOML file, read strictly, written in aligned columns and exact to every figure.
 
 docs/pages/reference/lens-file.md describes the format: every key with its unit, default and limits, and an example.
 """
@@ -6,122 +6,51 @@ docs/pages/reference/lens-file.md describes the format: every key with its unit,
 from __future__ import annotations
 
 import math
+import re
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from neurolens.base.bounds import WAVELENGTH_NM, said, within
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.base.tomlfile import read_toml, reject_unknown
+from neurolens.base.files import atomic_write_text
+from neurolens.base.tomlfile import format_value, read_toml
 from neurolens.lens import catalogue, designs
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.glass import by_figures, check_against_table, index_at
 from neurolens.lens.prescription import Coating, Configuration, Lens, Medium, Surface
+from neurolens.readers.source import MAX_INDEX, MAX_SURFACES, Table
 from neurolens.setting.rims import check_states, with_derived_rims
 
 SCHEMA = 1
-MAX_SURFACES = 500
 MAX_TERMS = 1000  # aspheric coefficients of all surfaces: each costs every ray a step, and lenses have at most 400
 MAX_LAYERS = 200
 _LONGEST_NM = 780.0  # of visible light
 FILM_KEYS = ("index", "thickness_nm", "V_d")
-MAX_POWER = 40
-LARGEST = 1e15  # of any figure but a radius
-MAX_INDEX = 4.5  # germanium, the densest lens material there is, has 4.0
 RIMS = ("source", "estimated", "derived")
-LENS_KEYS = (
-    *("schema", "name", "designer", "source", "f_number", "efl_mm", "efl_x_mm", "image_radius_mm", "half_field_deg"),
-    *("rims", "notes", "surfaces", "coating", "configuration", "aperture", "object_medium", "wavelengths_nm"),
-)
-MEDIUM_KEYS = ("n_d", "V_d", "glass", "material")
 MAX_WAVELENGTHS = 100
-SURFACE_KEYS = (
-    *("radius_mm", "thickness_mm", "diameter_mm", "n_d", "V_d", "glass", "material", "stop", "conic", "asphere"),
-    *("cylinder", "across_mm", "across_conic", "focal_mm", "absorption_per_mm", "coating"),
+# Keys of the head and the field of `Lens` that each one is, in the order in which they are written.
+HEAD = {
+    **{key: key for key in ("name", "designer", "source", "f_number")},
+    **{"efl_mm": "stated_efl_mm", "efl_x_mm": "stated_efl_x_mm"},
+    **{key: key for key in ("image_radius_mm", "half_field_deg", "rims", "wavelengths_nm")},
+}
+LENS_KEYS = ("schema", *HEAD, "notes", "object_medium", "surfaces", "coating", "configuration", "aperture")
+MEDIUM_KEYS = ("n_d", "V_d", "glass", "material")
+# Numbers of a surface stand in columns; texts and tables go last, as a column of glass names needs no right edge.
+COLUMNS = (
+    *("radius_mm", "thickness_mm", "diameter_mm", "n_d", "V_d", "cylinder", "across_mm", "across_conic", "focal_mm"),
 )
-CONFIGURATION_KEYS = (
-    *("name", "efl_mm", "half_field_deg", "thickness_mm", "f_number", "stop_diameter_mm", "object_distance_mm"),
-)
-
-
-@dataclass(frozen=True)
-class Table:
-    """One table of a file, read strictly.
-
-    Attributes:
-        where: goes in front of the key in errors, with its separator: "surface 3, ".
-    """
-
-    data: Mapping[str, Any]
-    file: str
-    where: str = ""
-
-    def __contains__(self, key: str) -> bool:
-        return key in self.data
-
-    def error(self, key: str, value: object, expected: str) -> InputError:
-        return InputError(self.file, self.where + key, value, expected)
-
-    def only(self, known: Sequence[str]) -> None:
-        """Raise for a key that is not known."""
-        reject_unknown(self.file, self.where, self.data, known)
-
-    def number(self, key: str, *, unit: str = "", above: float | None = None, finite: bool = True) -> float:
-        """A number: an integer or a float, never a bool, a text or NaN."""
-        value = self.data.get(key, "(missing)")
-        expected = "a finite number" if finite else "a number"
-        expected += (f" above {above:g}" if above is not None else "") + (f" in {unit}" if unit else "")
-        try:
-            found = math.nan if isinstance(value, bool) or not isinstance(value, int | float) else float(value)
-        except OverflowError:
-            found = math.nan
-        expected += f", at most {LARGEST:g}" if finite and LARGEST < abs(found) < math.inf else ""
-        if math.isnan(found) or (finite and not abs(found) <= LARGEST) or (above is not None and not found > above):
-            raise self.error(key, value, expected)
-        return found
-
-    def optional(self, key: str, *, above: float | None = 0.0) -> float | None:
-        """The number, above 0 unless said otherwise; None where it is absent or null."""
-        return None if self.data.get(key) is None else self.number(key, above=above)
-
-    def gaps(self, key: str, n_surfaces: int, expected: str) -> tuple[tuple[int, float], ...]:
-        """Thicknesses in mm by surface number."""
-        given = self.data.get(key, "(missing)")
-        if not isinstance(given, Mapping):
-            raise self.error(key, given, expected)
-        found = []
-        for place in given:
-            if place not in map(str, range(n_surfaces)):
-                raise self.error(key, place, f"a surface number from 0 to {n_surfaces - 1}")
-            found.append((int(place), Table(given, self.file, f"{self.where}{key}, surface ").number(place, unit="mm")))
-        return tuple(found)
-
-    def text(self, key: str, *, required: bool = True) -> str:
-        """A text; an empty one where a text that is not required is absent."""
-        if key not in self.data and not required:
-            return ""
-        value = self.data.get(key, "(missing)")
-        if key not in self.data or not isinstance(value, str) or (required and not value.strip()):
-            raise self.error(key, value, "a text")
-        return value
-
-    def flag(self, key: str) -> bool:
-        """True or false; false where it is absent."""
-        value = self.data.get(key, False)
-        if not isinstance(value, bool):
-            raise self.error(key, value, "true or false")
-        return value
-
-    def half_field(self) -> float | None:
-        """The optional `half_field_deg`."""
-        if "half_field_deg" not in self.data:
-            return None
-        angle = self.number("half_field_deg", unit="degrees", above=0)
-        if angle >= 180:
-            raise self.error("half_field_deg", angle, "an angle from the axis, below 180 degrees")
-        return angle
+SURFACE_KEYS = (*COLUMNS, "conic", "asphere", "glass", "material", "absorption_per_mm", "coating", "stop")
+STATE_NUMBERS = ("efl_mm", "half_field_deg", "f_number", "stop_diameter_mm", "object_distance_mm")
+APERTURE_KEYS = ("blades", "rotation_deg", "curvature")
+ROWS_COMMENT = """\
+# From the scene to the film, numbered from 0. radius_mm is positive when the centre of curvature lies towards the film;
+# inf is a plane. n_d and V_d are of the glass after the surface; air where they are left out.
+"""
+WRAP = 110
 
 
 def read_lens(path: str | Path, data: Mapping[str, Any] | None = None) -> Lens:
@@ -145,22 +74,17 @@ def read_lens(path: str | Path, data: Mapping[str, Any] | None = None) -> Lens:
         expected = 'where the diameters come from: "source", "estimated" or "derived"'
         raise table.error("rims", data.get("rims", "(missing)"), expected)
     lens = Lens(
-        name=table.text("name"),
-        source=table.text("source"),
         surfaces=surfaces,
         f_number=table.number("f_number", above=0),
-        image_radius_mm=table.optional("image_radius_mm"),
         half_field_deg=table.half_field(),
-        designer=table.text("designer", required=False),
-        notes=table.text("notes", required=False),
-        rims=table.text("rims"),
         configurations=_configurations(table, len(surfaces)),
         path=file,
         aperture=_aperture(table),
-        stated_efl_mm=table.optional("efl_mm"),
-        stated_efl_x_mm=table.optional("efl_x_mm"),
         object_medium=medium,
         wavelengths_nm=_wavelengths(table),
+        **{key: table.text(key) for key in ("name", "source", "rims")},
+        **{key: table.text(key, required=False) for key in ("designer", "notes")},
+        **{HEAD[key]: table.optional(key) for key in ("image_radius_mm", "efl_mm", "efl_x_mm")},
     )
     lens = _with_rims(lens, table)
     check_states(lens)
@@ -283,20 +207,9 @@ def _shape(row: Table) -> dict[str, Any]:
         if shape["cylinder"] not in ("x", "y"):
             raise row.error("cylinder", shape["cylinder"], 'the axis along which it is curved: "x" or "y"')
     shape |= _across(row) | _ideal(row)
-    if "asphere" not in row:
-        return shape
-    given = row.data["asphere"]
-    if not isinstance(given, Mapping) or not given:
-        raise row.error("asphere", given, "a table such as { 4 = 1e-6, 6 = 2e-9 }")
-    terms = []
-    for key in given:
-        if not (key.isascii() and key.isdecimal() and str(int(key)) == key and 2 <= int(key) <= MAX_POWER):
-            raise row.error("asphere", key, f"a power from 2 to {MAX_POWER}")
-        if isinstance(given[key], Mapping) and len(given[key]) == 1:  # TOML takes 4.5 for a key in a key
-            power = f"{key}.{next(iter(given[key]))}"
-            raise row.error("asphere", power, f"a whole power from 2 to {MAX_POWER}")
-        terms.append((int(key), Table(given, row.file, f"{row.where}asphere, power ").number(key)))
-    return {**shape, "asphere": tuple(sorted(terms))}
+    if "asphere" in row:
+        shape["asphere"] = row.powers("asphere", "a table such as { 4 = 1e-6, 6 = 2e-9 }")
+    return shape
 
 
 def _across(row: Table) -> dict[str, Any]:
@@ -323,11 +236,9 @@ def _ideal(row: Table) -> dict[str, Any]:
     focal = row.number("focal_mm", unit="mm")
     shaped = [key for key in ("conic", "asphere", "cylinder", "coating") if key in row]
     if shaped or not math.isinf(row.number("radius_mm", finite=False)):
-        raise row.error(
-            shaped[0] if shaped else "radius_mm",
-            row.data.get((shaped or ["radius_mm"])[0]),
-            "a plane in air (radius_mm = inf, nothing else), as focal_mm makes it an ideal thin lens",
-        )
+        key = shaped[0] if shaped else "radius_mm"
+        expected = "a plane in air (radius_mm = inf, nothing else), as focal_mm makes it an ideal thin lens"
+        raise row.error(key, row.data.get(key), expected)
     if focal == 0:
         raise row.error("focal_mm", focal, "a focal length other than 0")
     return {"focal_mm": focal}
@@ -335,7 +246,7 @@ def _ideal(row: Table) -> dict[str, Any]:
 
 def _coatings(table: Table) -> dict[str, Coating]:
     found: dict[str, Coating] = {}
-    for place, given in enumerate(_tables(table, "coating")):
+    for place, given in enumerate(table.tables("coating")):
         one = Table(given, table.file, f"coating {place}, ")
         one.only(("name", "layers"))
         name, rows = one.text("name"), given.get("layers", "(missing)")
@@ -358,21 +269,14 @@ def _coatings(table: Table) -> dict[str, Coating]:
     return found
 
 
-def _tables(table: Table, key: str) -> list[Mapping[str, Any]]:
-    tables = table.data.get(key, [])
-    if not isinstance(tables, list) or not all(isinstance(t, Mapping) for t in tables):
-        raise table.error(key, tables, f"tables under [[{key}]]")
-    return tables
-
-
 def _aperture(table: Table) -> Aperture | None:
     if "aperture" not in table:
         return None
     if not isinstance(table.data["aperture"], Mapping):
         raise table.error("aperture", table.data["aperture"], "a table under [aperture]")
     blades = Table(table.data["aperture"], table.file, "aperture, ")
-    blades.only(("blades", "rotation_deg", "curvature"))
-    more: dict[str, Any] = {k: blades.number(k) for k in ("rotation_deg", "curvature") if k in blades}
+    blades.only(APERTURE_KEYS)
+    more: dict[str, Any] = {k: blades.number(k) for k in APERTURE_KEYS[1:] if k in blades}
     try:
         return Aperture(blades.data.get("blades"), **more)
     except InputError as error:
@@ -381,17 +285,116 @@ def _aperture(table: Table) -> Aperture | None:
 
 def _configurations(lens: Table, n_surfaces: int) -> tuple[Configuration, ...]:
     result: list[Configuration] = []
-    for place, given in enumerate(_tables(lens, "configuration")):
+    for place, given in enumerate(lens.tables("configuration")):
         table = Table(given, lens.file, f"configuration {place}, ")
-        table.only(CONFIGURATION_KEYS)
+        table.only(("name", *STATE_NUMBERS, "thickness_mm"))
         name = table.text("name")
         if name in [c.name for c in result]:
             raise table.error("name", name, "a name that no other configuration has")
         table = replace(table, where=f'configuration "{name}", ')
         thickness = table.gaps("thickness_mm", n_surfaces, "a table such as { 5 = 26.15 }, by surface number")
-        above_0 = ("efl_mm", "f_number", "stop_diameter_mm", "object_distance_mm")
-        values = {key: table.optional(key) for key in above_0}
+        values = {key: table.optional(key) for key in STATE_NUMBERS if key != "half_field_deg"}
         if values["efl_mm"] is None and values["object_distance_mm"] is None:
             raise table.error("efl_mm", "(missing)", "the focal length of a zoom state")
         result.append(Configuration(name, thickness_mm=thickness, half_field_deg=table.half_field(), **values))
     return tuple(result)
+
+
+def write_lens(lens: Lens, path: str | Path) -> None:
+    """Write a lens file that `read_lens` reads back to the same lens (but for its `path`).
+
+    A lens that was focused keeps its film plane: it becomes the last thickness. What is derived goes into the notes.
+    """
+    atomic_write_text(path, format_lens(lens))
+
+
+def format_lens(lens: Lens) -> str:
+    """The text of a lens file."""
+    values = {"schema": SCHEMA} | {key: getattr(lens, field) for key, field in HEAD.items()}
+    values["f_number"] = float(lens.f_number)
+    head = {key: value for key, value in values.items() if value not in (None, "", ())}
+    lines = [f"{key} = {format_value(value)}" for key, value in head.items()]
+    notes = " ".join(text for text in (lens.notes, lens.derived) if text)
+    if notes:
+        lines.append(f"notes = {_wrapped(notes)}")
+    if lens.object_medium != Medium():
+        medium = ((key, getattr(lens.object_medium, key)) for key in MEDIUM_KEYS)
+        lines.append(f"object_medium = {format_value({key: value for key, value in medium if value is not None})}")
+    text = "\n".join(lines) + "\n\n" + ROWS_COMMENT + "surfaces = [\n" + _rows(lens) + "]\n"
+    for name, layers in _stacks(lens).items():
+        text += f"\n[[coating]]\nname = {format_value(name)}\nlayers = {format_value(layers)}\n"
+    text += _aperture(lens)
+    for c in lens.configurations:
+        text += f"\n[[configuration]]\nname = {format_value(c.name)}\n"
+        for key in STATE_NUMBERS:
+            value = getattr(c, key)
+            text += "" if value is None else f"{key} = {format_value(float(value))}\n"
+        text += f"thickness_mm = {format_value({str(k): float(t) for k, t in c.thickness_mm})}\n"
+    return text
+
+
+def _stacks(lens: Lens) -> dict[str, tuple[tuple[float, ...], ...]]:
+    """Layers by name of the coatings that are no designs: those follow from their name and the glass they are on."""
+    found, before = {}, float(lens.object_medium.n_d)
+    for s in lens.surfaces:
+        if s.coating and not designs.is_design(s.coating, before, float(s.n_d)):
+            found[s.coating.name] = s.coating.layers
+        before = float(s.n_d)
+    return found
+
+
+def _aperture(lens: Lens) -> str:
+    """The table of the stop's blades; a mask is refused, for a lens file has no form for it."""
+    if lens.aperture is None:
+        return ""
+    if lens.aperture.blades is None:
+        raise InputError(lens.path, "aperture", "(a mask)", "blades, or a round stop: masks are no part of lens files")
+    blades, *more = (getattr(lens.aperture, key) for key in APERTURE_KEYS)
+    values = zip(APERTURE_KEYS, (blades, *map(float, more)), strict=True)
+    return "\n[aperture]\n" + "".join(f"{key} = {format_value(v)}\n" for key, v in values)
+
+
+def _rows(lens: Lens) -> str:
+    """One inline table per surface, keys in columns; a column that no surface uses is left out."""
+    cells = [_cells(s) for s in lens.surfaces]
+    if lens.film_z_mm is not None:
+        cells[-1]["thickness_mm"] = repr(float(lens.film_z_mm) - float(lens.vertices_mm[-2]))
+    widths = {key: max(len(row.get(key, "")) for row in cells) for key in COLUMNS}
+    text = ""
+    for row in cells:
+        parts = (f"{key} = {row[key].rjust(widths.get(key, 0))}" for key in SURFACE_KEYS if key in row)
+        text += "  { " + ", ".join(parts) + " },\n"
+    return text
+
+
+def _cells(s: Surface) -> dict[str, str]:
+    """The texts of a surface's figures by key; those that say nothing are left out."""
+    bare = float(s.n_d) == 1 and s.V_d is None and s.material is None and not s.absorption_per_mm
+    across = s.across or (None, None)
+    values: dict[str, Any] = {
+        **{key: float(getattr(s, key)) for key in ("radius_mm", "thickness_mm", "diameter_mm")},
+        "n_d": None if bare else float(s.n_d),
+        "V_d": None if s.V_d is None else float(s.V_d),
+        "across_mm": across[0],
+        "across_conic": across[1],
+        "conic": float(s.conic) or None,
+        "asphere": {str(p): float(a) for p, a in s.asphere} or None,
+        "absorption_per_mm": s.absorption_per_mm or None,
+        "coating": s.coating and s.coating.name,
+        "stop": s.stop or None,
+        **{key: getattr(s, key) for key in ("cylinder", "focal_mm", "glass", "material")},
+    }
+    return {key: format_value(value) for key, value in values.items() if value is not None}
+
+
+def _wrapped(text: str) -> str:
+    """A text in short lines. TOML drops a backslash at the end of a line and the blanks after it."""
+    if len(text) <= WRAP:
+        return format_value(text)
+    lines: list[str] = []
+    for word in re.split(r"(?<= )(?=\S)", text):
+        if lines and len(lines[-1]) + len(word.split(" ", 1)[0]) <= WRAP:
+            lines[-1] += word
+        else:
+            lines.append(word)
+    return '"""\\\n' + "\\\n".join(format_value(line)[1:-1] for line in lines) + '"""'

@@ -20,8 +20,7 @@ from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.assemble import same_glass
 from neurolens.readers.draft import INFINITE, Draft, Given, Row, State, lens_of
-from neurolens.readers.lensfile import MAX_SURFACES
-from neurolens.readers.source import Line, assume, read_lines, warn
+from neurolens.readers.source import MAX_SURFACES, Line, assume, read_lines, warn
 
 SECTIONS = ("descriptive data", "constants", "variable distances", "lens data", "aspherical data")
 _PLANE = ("AS", "FS", "CG", "INFINITY", "INF")

@@ -16,8 +16,7 @@ from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers import draft
 from neurolens.readers.assemble import UNKNOWN, by_indices, named_glass
 from neurolens.readers.draft import INFINITE, Draft, Given, Row, lens_of, primary_first
-from neurolens.readers.lensfile import MAX_SURFACES
-from neurolens.readers.source import UNITS_MM, Line, by_word, read_lines
+from neurolens.readers.source import MAX_SURFACES, UNITS_MM, Line, by_word, read_lines
 
 TERMS = {"AD": 4, "AE": 6, "AF": 8, "AG": 10}
 # Designer, weights, settings of the program, drawings.

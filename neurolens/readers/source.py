@@ -1,21 +1,28 @@
-"""Reading of foreign text files with limits: bytes, text of unknown encoding, numbers; errors name the line."""
+"""What all readers share: limits, lines of text files, strict tables of TOML and JSON; errors name line or key."""
 
 from __future__ import annotations
 
 import math
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from neurolens.base.errors import AssumedWarning, InputError, NeurolensWarning
 from neurolens.base.files import read_bytes
+from neurolens.base.tomlfile import reject_unknown
 
 MAX_BYTES = 4_000_000  # the longest real lens files, with tolerances and merit function, stay below 1 MB
 MAX_LINES = 100_000
 MAX_LINE = 10_000
-MAX_WORD, LARGEST = 60, 1e30  # characters of a number; its size, more than any program writes for infinity
+MAX_WORD = 60  # characters of a number
+ENDLESS = 1e30  # more than any program writes for infinity
+LARGEST = 1e15  # of any figure of a table but a radius
+MAX_SURFACES = 500
+MAX_POWER = 40
+MAX_INDEX = 4.5  # germanium, the densest lens material there is, has 4.0
 
 # Units of length in mm.
 UNITS_MM = {"mm": 1.0, "cm": 10.0, "in": 25.4, "m": 1000.0}
@@ -43,7 +50,7 @@ class Line:
             value = float(word) if "_" not in word and len(word) <= MAX_WORD else math.nan
         except ValueError:
             value = math.nan
-        if not abs(value) <= LARGEST:
+        if not abs(value) <= ENDLESS:
             comma = re.fullmatch("[-+]?[0-9]+,[0-9]+(e[-+]?[0-9]+)?", word, re.IGNORECASE)
             raise self.error(
                 keyword, word, f"a finite number{', with a point: decimal commas are not read' * bool(comma)}"
@@ -63,6 +70,114 @@ class Line:
             found = " ".join(words) or "(nothing)"
             raise self.error(keyword, found, f"{least} number{'s' if least > 1 else ''} after it")
         return [self.number_of(keyword, word) for word in words]
+
+
+@dataclass(frozen=True)
+class Table:
+    """One table of a file, read strictly.
+
+    Attributes:
+        where: goes in front of the key in errors, with its separator: "surface 3, ".
+    """
+
+    data: Mapping[str, Any]
+    file: str
+    where: str = ""
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.data
+
+    def error(self, key: str, value: object, expected: str) -> InputError:
+        return InputError(self.file, self.where + key, value, expected)
+
+    def only(self, known: Sequence[str]) -> None:
+        """Raise for a key that is not known."""
+        reject_unknown(self.file, self.where, self.data, known)
+
+    def number(self, key: str, *, unit: str = "", above: float | None = None, finite: bool = True) -> float:
+        """A number: an integer or a float, never a bool, a text or NaN."""
+        value = self.data.get(key, "(missing)")
+        expected = "a finite number" if finite else "a number"
+        expected += (f" above {above:g}" if above is not None else "") + (f" in {unit}" if unit else "")
+        try:
+            found = math.nan if isinstance(value, bool) or not isinstance(value, int | float) else float(value)
+        except OverflowError:
+            found = math.nan
+        expected += f", at most {LARGEST:g}" if finite and LARGEST < abs(found) < math.inf else ""
+        if math.isnan(found) or (finite and not abs(found) <= LARGEST) or (above is not None and not found > above):
+            raise self.error(key, value, expected)
+        return found
+
+    def optional(self, key: str, *, above: float | None = 0.0) -> float | None:
+        """The number, above 0 unless said otherwise; None where it is absent or null."""
+        return None if self.data.get(key) is None else self.number(key, above=above)
+
+    def gaps(self, key: str, n_surfaces: int, expected: str) -> tuple[tuple[int, float], ...]:
+        """Thicknesses in mm by surface number."""
+        given = self.data.get(key, "(missing)")
+        if not isinstance(given, Mapping):
+            raise self.error(key, given, expected)
+        found = []
+        for place in given:
+            if place not in map(str, range(n_surfaces)):
+                raise self.error(key, place, f"a surface number from 0 to {n_surfaces - 1}")
+            found.append((int(place), Table(given, self.file, f"{self.where}{key}, surface ").number(place, unit="mm")))
+        return tuple(found)
+
+    def powers(self, key: str, example: str) -> tuple[tuple[int, float], ...]:
+        """Coefficients of powers of the height, sorted by power."""
+        given = self.data[key]
+        if not isinstance(given, Mapping) or not given:
+            raise self.error(key, given, example)
+        terms, row = [], Table(given, self.file, f"{self.where}{key}, power ")
+        for power, value in given.items():
+            if power not in map(str, range(2, MAX_POWER + 1)):
+                raise self.error(key, power, f"a power from 2 to {MAX_POWER}")
+            if isinstance(value, Mapping) and len(value) == 1:  # TOML takes 4.5 for a key in a key
+                raise self.error(key, f"{power}.{next(iter(value))}", f"a whole power from 2 to {MAX_POWER}")
+            terms.append((int(power), row.number(power)))
+        return tuple(sorted(terms))
+
+    def series(self, key: str, first: int) -> tuple[tuple[int, float], ...]:
+        """Coefficients of `first`, `first` + 2, ... from an optional list, without those that are 0."""
+        terms = self.data.get(key) or []
+        if not isinstance(terms, list):
+            raise self.error(key, terms, f"a list of coefficients of r^{first}, r^{first + 2}, ...")
+        row = Table({f"{key}[{k}]": value for k, value in enumerate(terms)}, self.file, self.where)
+        found = ((2 * k + first, row.number(name)) for k, name in enumerate(row.data))
+        return tuple((power, value) for power, value in found if value)
+
+    def tables(self, key: str) -> list[Mapping[str, Any]]:
+        """The tables under [[key]], none where it is absent."""
+        tables = self.data.get(key, [])
+        if not isinstance(tables, list) or not all(isinstance(t, Mapping) for t in tables):
+            raise self.error(key, tables, f"tables under [[{key}]]")
+        return tables
+
+    def text(self, key: str, *, required: bool = True) -> str:
+        """A text; an empty one where a text that is not required is absent."""
+        if key not in self.data and not required:
+            return ""
+        value = self.data.get(key, "(missing)")
+        if key not in self.data or not isinstance(value, str) or (required and not value.strip()):
+            raise self.error(key, value, "a text")
+        return value
+
+    def flag(self, key: str) -> bool:
+        """True or false; false where it is absent."""
+        value = self.data.get(key, False)
+        if not isinstance(value, bool):
+            raise self.error(key, value, "true or false")
+        return value
+
+    def half_field(self) -> float | None:
+        """The optional `half_field_deg`."""
+        if "half_field_deg" not in self.data:
+            return None
+        angle = self.number("half_field_deg", unit="degrees", above=0)
+        if angle >= 180:
+            raise self.error("half_field_deg", angle, "an angle from the axis, below 180 degrees")
+        return angle
 
 
 def by_word(*groups: tuple[str, str]) -> dict[str, str]:

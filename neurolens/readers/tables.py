@@ -17,8 +17,7 @@ from pathlib import Path
 from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.draft import Draft, Given, Row, lens_of
-from neurolens.readers.lensfile import MAX_SURFACES
-from neurolens.readers.source import Line, read_lines
+from neurolens.readers.source import MAX_SURFACES, Line, read_lines
 
 COLUMNS = ("radius", "thickness", "index", "diameter")
 

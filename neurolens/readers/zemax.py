@@ -18,8 +18,7 @@ from neurolens.lens import catalogue
 from neurolens.lens.prescription import Lens
 from neurolens.readers.assemble import named_glass
 from neurolens.readers.draft import Draft, Given, Row, lens_of, primary_first
-from neurolens.readers.lensfile import MAX_SURFACES
-from neurolens.readers.source import Line, assume, read_lines, warn
+from neurolens.readers.source import MAX_SURFACES, Line, assume, read_lines, warn
 from neurolens.readers.zemax_model import (
     HARMLESS,
     Q_TYPE,

@@ -11,8 +11,7 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.readers import draft
 from neurolens.readers.draft import INFINITE, State
-from neurolens.readers.lensfile import MAX_POWER
-from neurolens.readers.source import Line, assume, by_word
+from neurolens.readers.source import MAX_POWER, Line, assume, by_word
 
 # Settings of the program, and what its editor shows of a surface: written to most files, and no ray depends on them.
 HARMLESS = frozenset(

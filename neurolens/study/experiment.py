@@ -19,7 +19,7 @@ from neurolens.lens.glass import glass_of
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import OURS, kind_of, read_any
-from neurolens.readers.lenswriter import write_lens
+from neurolens.readers.lensfile import write_lens
 from neurolens.setting.states import set_lens
 from neurolens.study.rays import PIXELS_ACROSS, frame_width_mm
 from neurolens.surrogates.domain import domain_of

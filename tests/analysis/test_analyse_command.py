@@ -23,7 +23,7 @@ from neurolens.analysis.spots import mtf, spots
 from neurolens.analysis.wavefront import psf
 from neurolens.cli import main
 from neurolens.cli.analyse import WHATS
-from neurolens.readers.lenswriter import write_lens
+from neurolens.readers.lensfile import write_lens
 
 GAUSS = LENSES / "laikin_double_gauss_50.toml"
 D = 587.5618

@@ -16,7 +16,7 @@ from neurolens.analysis.fields import Scene
 from neurolens.cli import main
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.any_format import read_any
-from neurolens.readers.lenswriter import write_lens
+from neurolens.readers.lensfile import write_lens
 from neurolens.setting.states import set_lens
 
 FUJINON = Path(__file__).parents[1] / "data" / "fujinon_35.toml"

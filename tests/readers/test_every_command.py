@@ -20,8 +20,7 @@ from neurolens.cli.plan import shipped_models
 from neurolens.lens.prescription import Lens
 from neurolens.readers import any_format
 from neurolens.readers.any_format import read_any
-from neurolens.readers.lensfile import read_lens
-from neurolens.readers.lenswriter import write_lens
+from neurolens.readers.lensfile import read_lens, write_lens
 from neurolens.render.pictures import read_exr
 
 LENSES = Path(__file__).parents[2] / "lenses"

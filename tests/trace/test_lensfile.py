@@ -13,8 +13,7 @@ from shipped import PATHS
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.lens.prescription import Coating, Configuration, Lens, Surface
-from neurolens.readers.lensfile import read_lens
-from neurolens.readers.lenswriter import format_lens, write_lens
+from neurolens.readers.lensfile import format_lens, read_lens, write_lens
 from neurolens.trace.shapes import sag_mm
 
 # A cemented doublet, the stop, a meniscus; surfaces 0 to 5.

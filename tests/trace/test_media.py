@@ -16,8 +16,7 @@ from neurolens.graph.interpret import evaluate
 from neurolens.lens.glass import LINE_D_NM, index_of
 from neurolens.lens.paraxial import chief_reach_mm, film_z_mm, first_order, image_z_mm
 from neurolens.lens.prescription import Lens, Medium, Surface
-from neurolens.readers.lensfile import read_lens
-from neurolens.readers.lenswriter import write_lens
+from neurolens.readers.lensfile import read_lens, write_lens
 from neurolens.setting.focusing import axial_rays
 from neurolens.setting.states import set_lens
 from neurolens.trace.rays import trace

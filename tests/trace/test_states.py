@@ -14,8 +14,7 @@ from neurolens.base.errors import InputError
 from neurolens.lens.glass import LINE_D_NM
 from neurolens.lens.paraxial import film_z_mm, first_order
 from neurolens.lens.prescription import Coating, Lens, Surface
-from neurolens.readers.lensfile import read_lens
-from neurolens.readers.lenswriter import write_lens
+from neurolens.readers.lensfile import read_lens, write_lens
 from neurolens.setting.check import in_state
 from neurolens.setting.focusing import (
     axial_rays,

@@ -15,8 +15,7 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Surface
-from neurolens.readers.lensfile import read_lens
-from neurolens.readers.lenswriter import write_lens
+from neurolens.readers.lensfile import read_lens, write_lens
 from neurolens.render.images import make_aperture, read_mask
 from neurolens.setting.pupils import camera_rays, pupil_plane_z_mm
 from neurolens.setting.states import set_lens

@@ -20,8 +20,7 @@ from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens, Surface
-from neurolens.readers.lensfile import read_lens
-from neurolens.readers.lenswriter import write_lens
+from neurolens.readers.lensfile import read_lens, write_lens
 from neurolens.setting.states import set_lens
 from neurolens.surrogates.assemble import Form, sag
 from neurolens.trace.rays import Rays, trace
