@@ -73,6 +73,9 @@ def read_lens(path: str | Path, data: Mapping[str, Any] | None = None) -> Lens:
     if data.get("rims", "(missing)") not in RIMS:
         expected = 'where the diameters come from: "source", "estimated" or "derived"'
         raise table.error("rims", data.get("rims", "(missing)"), expected)
+    stated: dict[str, Any] = {key: table.text(key) for key in ("name", "source", "rims")}
+    stated |= {key: table.text(key, required=False) for key in ("designer", "notes")}
+    stated |= {HEAD[key]: table.optional(key) for key in ("image_radius_mm", "efl_mm", "efl_x_mm")}
     lens = Lens(
         surfaces=surfaces,
         f_number=table.number("f_number", above=0),
@@ -82,9 +85,7 @@ def read_lens(path: str | Path, data: Mapping[str, Any] | None = None) -> Lens:
         aperture=_aperture(table),
         object_medium=medium,
         wavelengths_nm=_wavelengths(table),
-        **{key: table.text(key) for key in ("name", "source", "rims")},
-        **{key: table.text(key, required=False) for key in ("designer", "notes")},
-        **{HEAD[key]: table.optional(key) for key in ("image_radius_mm", "efl_mm", "efl_x_mm")},
+        **stated,
     )
     lens = _with_rims(lens, table)
     check_states(lens)
@@ -323,7 +324,7 @@ def format_lens(lens: Lens) -> str:
     text = "\n".join(lines) + "\n\n" + ROWS_COMMENT + "surfaces = [\n" + _rows(lens) + "]\n"
     for name, layers in _stacks(lens).items():
         text += f"\n[[coating]]\nname = {format_value(name)}\nlayers = {format_value(layers)}\n"
-    text += _aperture(lens)
+    text += _blades(lens)
     for c in lens.configurations:
         text += f"\n[[configuration]]\nname = {format_value(c.name)}\n"
         for key in STATE_NUMBERS:
@@ -343,7 +344,7 @@ def _stacks(lens: Lens) -> dict[str, tuple[tuple[float, ...], ...]]:
     return found
 
 
-def _aperture(lens: Lens) -> str:
+def _blades(lens: Lens) -> str:
     """The table of the stop's blades; a mask is refused, for a lens file has no form for it."""
     if lens.aperture is None:
         return ""
