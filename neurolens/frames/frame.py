@@ -118,7 +118,7 @@ class Frame:
         """A block in which the glasses of `glass_files` are known."""
         if not self.glass_files:
             return nullcontext()
-        from neurolens.readers.agf import more_glasses
+        from neurolens.readers.glasses import more_glasses
 
         return more_glasses(self.glass_files)
 

@@ -131,7 +131,7 @@ ALIASES = {
 }
 
 
-# Glasses of catalogues that a command names (`readers.agf`) by every key that finds them, and what is not read of them.
+# Glasses of catalogues that a command names (`readers.glasses`) by every key that finds them, and those not read.
 _ADDED: dict[str, list[Glass]] = {}
 _REFUSED: dict[str, str] = {}
 

@@ -1,32 +1,27 @@
-"""Last step of every reader: from the data of a file to a complete, checked lens."""
+"""Stop, f-number, film and rims of a lens where its file leaves them open, contradicts itself, or cannot mean them."""
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 from neurolens.base.errors import InputError
-from neurolens.lens import catalogue, paraxial
-from neurolens.lens.catalogue import LINE_C_NM, LINE_D_NM, LINE_F_NM, Glass
-from neurolens.lens.glass import by_figures
-from neurolens.lens.paraxial import FirstOrder
-from neurolens.lens.prescription import Lens
-from neurolens.readers.source import MAX_INDEX, MAX_POWER, MAX_SURFACES, Line, assume, warn
-from neurolens.setting.rims import check_figures
+from neurolens.lens import paraxial
+from neurolens.lens.paraxial import FirstOrder, system_of
+from neurolens.lens.prescription import Lens, Medium
+from neurolens.readers.source import MAX_INDEX, MAX_POWER, MAX_SURFACES, assume, warn
+from neurolens.setting.rims import check_figures, end_mm, narrowed_rims, with_derived_rims
+
+if TYPE_CHECKING:
+    from neurolens.readers.draft import Draft
 
 # A diameter that the file does not give, until `finish` has found it.
 UNKNOWN = math.nan
 NARROWER = 1e-4  # relative: smaller differences of stop diameters are rounding
-_NAMES = frozenset(m.upper() for m in catalogue.MAKERS)
-_SAME_LINE_NM = 0.1
-_MOULDED = re.compile("([ _-]?MOLD(ED)?|M)$", re.IGNORECASE)
-_MOULDING = 0.01  # by how much moulding lowers an index at the most
-# Discontinued glasses of Schott, of which no dispersion formula is at hand: n_d (Elphel's optical-design-viewer), V_d.
-_DISCONTINUED: dict[str, tuple[float, float | None]] = {"LASF14A": (1.82223, None), "SF58": (1.917613, 21.5)}
-SAME_INDEX, SAME_ABBE = 2e-5, 0.005  # tolerance of printed figures against those of a catalogue glass
+_SLIGHTLY = 0.1  # of a rim's diameter
+_TWICE, _SAME = (0.4, 0.7), (0.7, 1.4)  # f-number by the stop's diameter over the stated one: rims twice as wide, right
 
 
 def finish(
@@ -143,101 +138,97 @@ def _check_stop(lens: Lens) -> None:
         raise InputError(lens.path, "stop", found, "exactly one surface that is the aperture stop")
 
 
-def named_glass(
-    name: str,
-    file: str,
-    field: str,
-    makers: Sequence[str] = (),
-    *,
-    said: str | None = None,
-    figures: tuple[float, float] | None = None,
-) -> dict[str, Any]:
-    """Fields of a surface whose glass the file gives by name alone; warns where it is ambiguous.
-
-    For a discontinued glass its replacement, with the prefix "N-", is taken. A moulded variant of a glass ("..._MOLD",
-    "...M") has an index lower by some 0.004, which no catalogue here states; its base glass is offered.
-
-    Args:
-        makers: the makers' catalogues that the file names; the first that has the glass is meant.
-        said: the file's text, if it names the maker.
-        figures: n_d and V_d that the file gives beside the name, for a glass that the catalogue does not know.
+def with_stop(draft: Draft, wanted: str | None) -> Draft:
+    """The draft with a stop: the surface wanted, that of the file, or else that whose rim limits the beam of the axis.
 
     Raises:
-        InputError: such a name without figures; the message suggests the nearest.
+        InputError: no surface of that number.
     """
-    same = catalogue.same_name(name)
-    if not same and not figures and (left := _DISCONTINUED.get(name.upper())):
-        warn(file, f"{field}: glass {name} is discontinued: taken by n_d {left[0]:g} and V_d {left[1] or 'unknown'}")
-        return {"n_d": left[0], "V_d": left[1], "material": name}
-    base = next(iter(catalogue.same_name(_MOULDED.sub("", name))), None)
-    if base and not same and not figures:
-        expected = f"a glass of the catalogue: it has {base.name}, whose moulded variant this may be; or give --glass"
-        raise InputError(file, field, name, expected)
-    if base and not same and figures and not 0 <= base.n_d - figures[0] <= _MOULDING:
-        told = f"assumed to be {base} (n_d {base.n_d:.5f}), moulded: n_d {figures[0]:g} beside it fits no such glass"
-        assume(file, f"{field}: glass {name} is {told}")
-        return {"n_d": base.n_d, "V_d": base.V_d, "glass": short_name(base), "material": name}
-    known = next((g for m in makers for g in same if g.maker.upper() == m), None)
-    replacing = next((g for m in makers for g in catalogue.same_name(f"{m}:N-{name}") if m in _NAMES), None)
-    if not (same or replacing or makers):
-        replacing = next(iter(catalogue.same_name(f"N-{name}")), None)
-    if figures and not (same or replacing):
-        return by_figures(name, *figures, f"{file}: {field}")
-    taken = known or replacing or catalogue.find(name, file, field)
-    if makers and taken.maker.upper() not in makers:
-        why = f"no glass of that name in the catalogues that the file names ({', '.join(makers)})"
-    elif not makers and said is None:
-        why = "the file names no maker"
+    names = [row.name or str(k) for k, row in enumerate(draft.rows)]
+    if wanted is not None:
+        if wanted not in names:
+            raise InputError(draft.file, "--stop", wanted, f"the number of a surface in the file: {', '.join(names)}")
+        k = names.index(wanted)
+    elif any(row.surface.stop for row in draft.rows) or not draft.rows:
+        return draft
     else:
-        other = _letters(taken.name) not in _letters(said or name)
-        why = "its maker's catalogue has none of that very name" if other else ""
-    if why:
-        warn(file, f"glass {said or name} is taken as {taken} (n_d {taken.n_d:.5f}, V_d {taken.V_d:.2f}): {why}")
-    return {"n_d": taken.n_d, "V_d": taken.V_d, "glass": short_name(taken), "material": name}
+        rows = tuple(row.surface for row in draft.rows)
+        lens = Lens("", "", rows, math.nan, path=draft.file, object_medium=Medium(**draft.object_medium))
+        check_rows(lens)
+        heights = system_of(lens).march(1.0, 0.0).y
+        k = min(range(len(rows)), key=lambda k: _share(rows[k].semi_diameter_mm, heights[k]))
+        assume(draft.file, f"no stop is marked: surface {names[k]}, whose rim limits the beam of the axis, is taken")
+    # Its rim stays, where the f-number or pupil of the file would have a wider one.
+    marked = (replace(row, surface=replace(row.surface, stop=i == k)) for i, row in enumerate(draft.rows))
+    return replace(draft, rows=tuple(replace(row, aperture=row.aperture or row.surface.stop) for row in marked))
 
 
-def by_indices(line: Line, field: str, indices: Sequence[float], wavelengths_nm: Sequence[float]) -> dict[str, Any]:
-    """Fields of a surface from indices at some wavelengths, reduced to n_d and V_d with a warning; one index is n_d.
+def _share(rim: float, height: float) -> float:
+    """A rim over the height of the marginal ray of a beam 2 mm wide; infinite where there is no rim."""
+    return math.inf if math.isnan(rim) or height == 0 else rim / abs(height)
 
-    Between the wavelengths the index is a polynomial of 1 / lambda^2 through the four that are nearest.
 
-    Raises:
-        InputError: several indices, whose wavelengths do not enclose the lines d, F and C.
+def stop_aperture(draft: Draft) -> float | None:
+    """Diameter of the aperture that the file sets on the stop itself, in its unit."""
+    stops = (row.surface.diameter_mm for row in draft.rows if row.surface.stop and row.aperture)
+    return next((d for d in stops if not math.isnan(d)), None)
+
+
+def with_likely_rims(lens: Lens, draft: Draft) -> Lens:
+    """The lens with rims of half the width, where stop and spheres say that radii were meant by diameters."""
+    f_number = draft.f_number or draft.nominal
+    if not any(s.stop for s in lens.surfaces):
+        return lens  # `finish` says so
+    beyond = [k for k, s in enumerate(lens.surfaces) if s.semi_diameter_mm > end_mm(s) * (1 + 1e-6)]
+    evidence = f"the rim of surface {beyond[0]} is wider than its sphere" if beyond else ""
+    if f_number and not math.isnan(lens.stop_radius_mm):  # some files write 0 for none
+        by_stop = first_order(lens).f_number
+        if _SAME[0] <= by_stop / f_number <= _SAME[1]:
+            return lens
+        if _TWICE[0] <= by_stop / f_number < _TWICE[1]:
+            evidence = f"the stop would give f/{by_stop:.3g}, the file says f/{f_number:.3g}"
+    if not evidence:
+        return lens
+    assume(lens.path, f"rims are assumed to be half as wide as the format has them: {draft.in_file(evidence)}")
+    rows = (replace(s, diameter_mm=s.diameter_mm / 2) for s in lens.surfaces)
+    return replace(lens, surfaces=tuple(rows))
+
+
+def with_rims(lens: Lens, in_file: Callable[[str], str] = str) -> Lens:
+    """The lens with the rims that its file does not give derived by rule (`neurolens.setting.rims`), with a warning, in
+    which `in_file` calls surfaces as the file does.
     """
-    if len(indices) == 1:
-        return {"n_d": indices[0]}
-    table = {nm: n for nm, n in zip(wavelengths_nm, indices, strict=False) if nm > 0}
-    lines = (LINE_D_NM, LINE_F_NM, LINE_C_NM)
-    if not table or min(table) > min(lines) + _SAME_LINE_NM or max(table) < max(lines) - _SAME_LINE_NM:
-        expected = "indices from the F line (486.13 nm) to the C line (656.27 nm), to reduce the glass to n_d and V_d"
-        raise line.error(field, f"(wavelengths {list(wavelengths_nm)})", expected)
-    found = []
-    for line_nm in lines:
-        near = sorted(table, key=lambda nm: abs(nm - line_nm))[:4]
-        if abs(near[0] - line_nm) <= _SAME_LINE_NM:
-            near = near[:1]
-        shares = (math.prod((line_nm**-2 - b**-2) / (a**-2 - b**-2) for b in near if b != a) for a in near)
-        found.append(sum(table[nm] * share for nm, share in zip(near, shares, strict=True)))
-    n_d, n_F, n_C = found
-    warn(line.file, f"line {line.number}, {field}: the glass is reduced to n_d and V_d")
-    return {"n_d": n_d, "V_d": (n_d - 1) / (n_F - n_C) if n_F > n_C else None}
+    missing = [k for k, s in enumerate(lens.surfaces) if math.isnan(s.diameter_mm)]
+    if not missing:
+        return lens
+    derived = with_derived_rims(lens)
+    surfaces = in_file(f"surface {', '.join(map(str, missing))}")
+    warn(lens.path, f"no rim is given for {surfaces}: derived from f-number and field")
+    return derived
 
 
-def _letters(name: str) -> str:
-    """Letters and digits of a name, the rest of which does not count."""
-    return "".join(filter(str.isalnum, name.upper()))
+def narrowed(lens: Lens, draft: Draft) -> Lens:
+    """The lens with rims no wider than their spheres and than where neighbours touch, in every state.
 
-
-def same_glass(name: str | None, n_d: float, V_d: float | None) -> str | None:
-    """The catalogue's glass of that name whose figures are the given ones to the digits printed, or None."""
-    if name is None or V_d is None:
-        return None
-    for known in catalogue.same_name(name):
-        if abs(known.n_d - n_d) <= SAME_INDEX and abs(known.V_d - V_d) <= SAME_ABBE * V_d:
-            return short_name(known)
-    return None
-
-
-def short_name(glass: Glass) -> str:
-    """The name that finds a glass again, with its maker only where others have one of that name."""
-    return glass.name if catalogue.find(glass.name) is glass else str(glass)
+    Unless rims are `drawn`, a table stays as it is where rims are much wider (`_SLIGHTLY`) than their spheres, or would
+    have to be much narrower and then cut the beam of the axis: its figures are wrong.
+    """
+    found = narrowed_rims(lens)
+    pairs = list(zip(lens.surfaces, found.surfaces, strict=True))
+    if not draft.drawn:
+        if any((1 - _SLIGHTLY) * s.semi_diameter_mm > end_mm(s) for s in lens.surfaces):
+            return lens
+        for state in (lens, *(lens.with_gaps(dict(c.thickness_mm)) for c in lens.configurations)):
+            heights = system_of(state).march(1.0, 0.0).y
+            beam = [abs(2 * lens.stop_radius_mm * y / (heights[lens.stop_index] or math.inf)) for y in heights]
+            if any(
+                b.diameter_mm < min((1 - _SLIGHTLY) * a.diameter_mm, need)
+                for (a, b), need in zip(pairs, beam, strict=True)
+            ):
+                return lens
+    widths = [(k, f"{a.diameter_mm:.4g} to {b.diameter_mm:.4g} mm") for k, (a, b) in enumerate(pairs) if a != b]
+    changed = [f"{draft.in_file(f'surface {k}')} ({width})" for k, width in widths]
+    if changed:  # no rim is wider than its sphere: where one is said to be, table or rims are in doubt
+        say = assume if any(s.semi_diameter_mm > end_mm(s) * (1 + 1e-6) for s in lens.surfaces) else warn
+        say(lens.path, f"rims narrowed to where spheres end or neighbours touch: {', '.join(changed)}")
+    return found

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from neurolens.readers import draft
-from neurolens.readers.assemble import by_indices, named_glass
 from neurolens.readers.draft import INFINITE, State
+from neurolens.readers.glasses import by_indices, named_glass
 from neurolens.readers.source import Line, assume
 
 _MAX_COMMAND = 100_000  # characters of one command with all its continuation lines

@@ -15,9 +15,18 @@ from typing import Any
 from neurolens.base.bounds import WAVELENGTH_NM, within
 from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Configuration, Lens, Medium, Surface, same_medium
-from neurolens.readers.assemble import UNKNOWN, finish, first_order, smaller_stop
+from neurolens.readers.assemble import (
+    UNKNOWN,
+    finish,
+    first_order,
+    narrowed,
+    smaller_stop,
+    stop_aperture,
+    with_likely_rims,
+    with_rims,
+    with_stop,
+)
 from neurolens.readers.forbes import MAX_TERMS, qbfs_terms, qcon_terms
-from neurolens.readers.openings import narrowed, stop_aperture, with_likely_rims, with_rims, with_stop
 from neurolens.readers.source import MAX_SURFACES, UNITS_MM, Line, warn
 from neurolens.setting.rims import check_states
 

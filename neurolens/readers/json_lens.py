@@ -21,9 +21,10 @@ from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import check_tree
 from neurolens.lens import paraxial
 from neurolens.lens.prescription import Configuration, Lens, Surface
-from neurolens.readers.assemble import UNKNOWN, finish, first_order, same_glass
+from neurolens.readers.assemble import UNKNOWN, finish, first_order
 from neurolens.readers.draft import Given
-from neurolens.readers.json_others import read_others
+from neurolens.readers.glasses import same_glass
+from neurolens.readers.keyed import read_others
 from neurolens.readers.source import MAX_SURFACES, Table, read_text, warn
 from neurolens.setting.rims import check_states
 

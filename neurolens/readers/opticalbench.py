@@ -18,8 +18,8 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Lens, Surface
-from neurolens.readers.assemble import same_glass
 from neurolens.readers.draft import INFINITE, Draft, Given, Row, State, lens_of
+from neurolens.readers.glasses import same_glass
 from neurolens.readers.source import MAX_SURFACES, Line, assume, read_lines, warn
 
 SECTIONS = ("descriptive data", "constants", "variable distances", "lens data", "aspherical data")

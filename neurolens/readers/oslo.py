@@ -14,8 +14,9 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers import draft
-from neurolens.readers.assemble import UNKNOWN, by_indices, named_glass
+from neurolens.readers.assemble import UNKNOWN
 from neurolens.readers.draft import INFINITE, Draft, Given, Row, lens_of, primary_first
+from neurolens.readers.glasses import by_indices, named_glass
 from neurolens.readers.source import MAX_SURFACES, UNITS_MM, Line, by_word, read_lines
 
 TERMS = {"AD": 4, "AE": 6, "AF": 8, "AG": 10}

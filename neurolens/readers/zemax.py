@@ -16,8 +16,8 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.lens import catalogue
 from neurolens.lens.prescription import Lens
-from neurolens.readers.assemble import named_glass
 from neurolens.readers.draft import Draft, Given, Row, lens_of, primary_first
+from neurolens.readers.glasses import named_glass
 from neurolens.readers.source import MAX_SURFACES, Line, assume, read_lines, warn
 from neurolens.readers.zemax_model import (
     HARMLESS,

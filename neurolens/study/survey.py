@@ -24,9 +24,9 @@ from neurolens.base.files import TemporaryFolder, fingerprint_of
 from neurolens.base.records import plain
 from neurolens.cameras.model import load_model
 from neurolens.lens.prescription import Lens
-from neurolens.readers.agf import more_glasses
 from neurolens.readers.any_format import kind_of, read_any
 from neurolens.readers.draft import Given
+from neurolens.readers.glasses import more_glasses
 from neurolens.setting.check import check_lens
 from neurolens.setting.states import set_lens
 from neurolens.study.check import check_model

@@ -10,7 +10,7 @@ from command_line import failure, run_json
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.lens import catalogue
 from neurolens.lens.glass import index_at, index_of
-from neurolens.readers.agf import more_glasses, read_agf
+from neurolens.readers.glasses import more_glasses, read_agf
 from neurolens.readers.lensfile import read_lens
 
 TRIPLET = Path(__file__).parents[2] / "lenses" / "cooke_triplet_50.toml"
