@@ -6,12 +6,12 @@ row of index 0 (appleseed) or of radius 0 (pbrt, which has no other planes). Of 
 the paraxial focus. Kolb's tables of 1995 have the separation in front of each surface instead, and some have
 semi-diameters: see `Given`.
 
-FlareSim, a simulator of flare for compositing programs, writes `name: TEXT`, `focal_length: MM`, `surfaces:` and a row a
-surface, from the scene to the film: radius (0 a plane, "stop" the stop), thickness, index behind, Abbe number (0
-unknown), semi-diameter of the rim, layers of coating, and for surfaces that are not round the type: cyl_x (axis along x,
-bent in y), cyl_y, toric with the radius of a circle along y, which is turned about a line along y at the radius of the
-first column. The format has no aspheres and no f-number; a collection of it states that in a comment ("f/4.1"), and its
-rims are diameters in the column of radii.
+FlareSim, a simulator of flare for compositing programs, writes `name: TEXT`, `focal_length: MM`, `surfaces:` and a row
+a surface, from the scene to the film: radius (0 a plane, "stop" the stop), thickness, index behind, Abbe number (0
+unknown), semi-diameter of the rim, layers of coating, and for surfaces that are not round the type: cyl_x (axis along
+x, bent in y), cyl_y, toric with the radius of a circle along y, which is turned about a line along y at the radius of
+the first column. The format has no aspheres and no f-number; a collection of it states that in a comment ("f/4.1"), and
+its rims are diameters in the column of radii.
 """
 
 from __future__ import annotations

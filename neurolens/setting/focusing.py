@@ -258,7 +258,9 @@ def best_focus_z_mm(lens: Lens, focus_m: float = math.inf, wavelength_nm: tuple[
     film_z = _paraxial_film_z_mm(lens, focus_m)
     if paraxial.is_pinhole(lens):
         return film_z
-    wavelengths, weights = _colours(lens, wavelength_nm)
+    # Without dispersion all light is of one colour.
+    one = (lens.reference_nm, lens.reference_nm)
+    wavelengths, weights = film_plane.colours(wavelength_nm or lens.light_nm if lens.dispersive else one)
     for _ in range(1 if math.isinf(focus_m) else _ROUNDS):
         along, across = _moments(lens, film_z - 1000 * focus_m, wavelengths)
         w = torch.from_numpy(weights)[:, None, None]
@@ -268,48 +270,12 @@ def best_focus_z_mm(lens: Lens, focus_m: float = math.inf, wavelength_nm: tuple[
     return film_z
 
 
-def _colours(lens: Lens, wavelength_nm: tuple[float, float] | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Wavelengths of best focus and their weights in a range, by default `Lens.light_nm`; one without dispersion."""
-    one = (lens.reference_nm, lens.reference_nm)
-    return film_plane.colours(wavelength_nm or lens.light_nm if lens.dispersive else one)
-
-
-_COARSER = 4.0  # stops below the widest by more are left to rays of their own: few rings lie within them
-
-
 def best_focus_of_stops_mm(
     lens: Lens, focus_m: float, stops_mm: Sequence[float], wavelength_nm: tuple[float, float] | None = None
 ) -> NDArray[np.float64]:
-    """`best_focus_z_mm` at some stop radii up to the lens's own, of those of its rays that each lets through.
-
-    Raises:
-        InputError: as `best_focus_z_mm`.
-    """
-    stops = np.asarray(stops_mm, np.float64)
-    if lens.anamorphic or lens.aperture is not None:  # too few rays for their parts
-        each = (lens.with_stop_radius(float(r)) for r in stops)
-        return np.array([best_focus_z_mm(one, focus_m, wavelength_nm) for one in each])
-    widest, whole = float(lens.stop_radius_mm), best_focus_z_mm(lens, focus_m, wavelength_nm)
-    if paraxial.is_pinhole(lens):
-        return np.full(stops.shape, whole)
-    small = stops < widest / _COARSER
-    found = np.empty(stops.shape)
-    if small.any():
-        narrow = lens.with_stop_radius(widest / _COARSER)
-        found[small] = best_focus_of_stops_mm(narrow, focus_m, stops[small].tolist(), wavelength_nm)
-    wavelengths, weights = _colours(lens, wavelength_nm)
-    moments = _moments(lens, whole - 1000 * focus_m, wavelengths, at_stop=True)
-    along, across, squared = (m.numpy() for m in moments)
-    # Rings are of equal areas: those at the edge count in part.
-    ring = (_WIDER * widest) ** 2 / along.shape[1]
-    share = ((stops[~small, None, None, None] ** 2 - squared) / ring + 0.5).clip(0, 1) * weights[:, None, None]
-    z = -(share * along).sum((1, 2, 3)) / (share * across).sum((1, 2, 3))
-    # The object keeps its distance from the film: where that moves, its image moves by the square of its scale, times
-    # the index behind the lens over that in front.
-    data = paraxial.first_order(lens)
-    scale = 0.0 if math.isinf(focus_m) else float((whole - data.rear_focal_z_mm) / data.efl_mm)
-    found[~small] = z + (z - whole) * scale**2 * (data.efl_mm / data.front_efl_mm)
-    return found
+    """`best_focus_z_mm` at some stop radii; errors as there."""
+    each = (lens.with_stop_radius(float(radius)) for radius in stops_mm)
+    return np.array([best_focus_z_mm(one, focus_m, wavelength_nm) for one in each])
 
 
 def best_focused(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float] | None = None) -> Lens:
@@ -372,24 +338,19 @@ def axial_rays(lens: Lens, object_z_mm: float) -> Rays:
     return Rays(dx * t, dy * t, object_z_mm + dz * t, dx, dy, dz)
 
 
-def _moments(
-    lens: Lens, object_z_mm: float, wavelength_nm: NDArray[np.float64], at_stop: bool = False
-) -> tuple[Tensor, ...]:
-    """Of each ray [colours, rings, spokes] x0 tx + y0 ty and tx^2 + ty^2, with (x0, y0) where it meets the plane z = 0
-    and (tx, ty) its slopes; 0 of one that is blocked. The sum of (x0 + z tx)^2 is least where the first make up for z
-    times the second. `at_stop`: the square of its radius there, too.
+def _moments(lens: Lens, object_z_mm: float, wavelength_nm: NDArray[np.float64]) -> tuple[Tensor, Tensor]:
+    """x0 tx + y0 ty and tx^2 + ty^2 of each ray [colours, rings, spokes]; 0 of one that is blocked.
+
+    (x0, y0) is where it meets the plane z = 0 and (tx, ty) its slopes: the sum of (x0 + z tx)^2 + (y0 + z ty)^2 is
+    least where the sum of the first makes up for z times that of the second.
     """
     rays = axial_rays(lens, object_z_mm)
     count, colours = len(rays.x), len(wavelength_nm)
-    record = (lens.stop_index,) if at_stop else ()
     with torch.no_grad():
         many = Rays(*(c.repeat(colours) for c in rays))
-        nm = torch.from_numpy(wavelength_nm).repeat_interleave(count)
-        out = trace(lens, many, nm, towards="film", record=record)
+        out = trace(lens, many, torch.from_numpy(wavelength_nm).repeat_interleave(count), towards="film")
     r, passed = out.rays, out.status == 0
     tx, ty = r.dx / r.dz, r.dy / r.dz
     along, across = (r.x - r.z * tx) * tx + (r.y - r.z * ty) * ty, tx * tx + ty * ty
     shape = (colours, _RINGS, 1) if count == _RINGS else (colours, _RINGS_OF_SPOKES, _SPOKES)
-    found = [along.where(passed, 0.0), across.where(passed, 0.0)]
-    found += [c.x * c.x + c.y * c.y for c in out.crossings.values()]
-    return tuple(m.reshape(shape) for m in found)
+    return along.where(passed, 0.0).reshape(shape), across.where(passed, 0.0).reshape(shape)

@@ -2,24 +2,22 @@
 
 import json
 import math
-import random
 import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from lens_formats import DRAWN, CannotSay, assert_same_optics, optical_bench, plain, swapped
-from shipped import PATHS
+from lens_formats import DRAWN, optical_bench, plain, swapped
+from shipped import tabled
 
 from neurolens.base.errors import AssumedWarning, InputError
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import kind_of, read_any
-from neurolens.readers.lensfile import read_lens
 from neurolens.study.survey import SurveySettings, Task, run_task
 
-GAUSS = plain(read_lens(Path(__file__).parents[2] / "lenses" / "laikin_double_gauss_50.toml"))
+GAUSS = plain(tabled("laikin_double_gauss_50"))
 
 
 def read_text(text: str, suffix: str, tmp_path: Path) -> tuple[Lens, list[str]]:
@@ -30,37 +28,6 @@ def read_text(text: str, suffix: str, tmp_path: Path) -> tuple[Lens, list[str]]:
         warnings.simplefilter("always")
         lens = read_any(path)
     return lens, [str(w.message) for w in heard if issubclass(w.category, AssumedWarning)]
-
-
-@pytest.mark.parametrize("suffix", DRAWN)
-@pytest.mark.parametrize("path", PATHS, ids=lambda p: p.stem)
-def test_library_lens_comes_back_from_a_collection(path: Path, suffix: str, tmp_path: Path) -> None:
-    lens = replace(plain(read_lens(path)), configurations=())
-    try:
-        text = DRAWN[suffix](lens)
-    except CannotSay:
-        return  # counted below
-    found, assumed = read_text(text, suffix, tmp_path)
-    assert assumed == []
-    assert found.name == lens.name and found.rims == "estimated"
-    for a, b in zip(found.surfaces, lens.surfaces, strict=True):
-        assert (a.stop, a.cylinder, a.n_d, a.V_d) == (b.stop, b.cylinder, b.n_d, b.V_d)
-        assert a.thickness_mm == b.thickness_mm and a.conic == b.conic
-        assert dict(a.asphere) == {p: c for p, c in b.asphere if c}
-        assert a.diameter_mm == pytest.approx(b.diameter_mm, rel=1e-9)
-    assert_same_optics(found.with_stop_radius(lens.stop_radius_mm), lens)
-
-
-def test_every_collection_is_met_by_many_lenses() -> None:
-    said = dict.fromkeys(DRAWN, 0)
-    for path in PATHS:
-        for suffix, write in DRAWN.items():
-            try:
-                write(plain(read_lens(path)))
-                said[suffix] += 1
-            except CannotSay:
-                pass
-    assert said[".bench.txt"] >= 28 and said[".lens"] >= 20 and said[".camera.toml"] >= 28, said
 
 
 @pytest.mark.parametrize("suffix", DRAWN)
@@ -234,16 +201,3 @@ def test_near_state_of_a_camera_file(tmp_path: Path) -> None:
     lens, _ = read_text(text, ".camera.toml", tmp_path)
     (near,) = lens.configurations
     assert near.object_distance_mm == 500 and dict(near.thickness_mm)[1] == 0.5
-
-
-@pytest.mark.parametrize("suffix", DRAWN)
-def test_mangled_collections_never_raise_anything_else(suffix: str, tmp_path: Path) -> None:
-    chance, text = random.Random(2), ZOOM if suffix == ".bench.txt" else DRAWN[suffix](GAUSS)
-    for _ in range(60):
-        letters = list(text)
-        for _ in range(chance.randint(1, 4)):
-            letters[chance.randrange(len(letters))] = chance.choice("0123456789.-+eE \t\n'\"&;!#/:[]SZ\x00\u00e9")
-        try:
-            read_text("".join(letters), suffix, tmp_path)
-        except InputError as error:
-            assert f"lens{suffix}" in str(error) and "\n" not in str(error)
