@@ -19,6 +19,7 @@ from neurolens.lens.paraxial import FirstOrder, first_order
 from neurolens.lens.prescription import Configuration, Lens
 from neurolens.setting.pupils import camera_rays, pupil_plane_z_mm
 from neurolens.setting.rims import end_mm
+from neurolens.setting.states import in_state
 from neurolens.trace.aiming import aim_at_stop
 from neurolens.trace.rays import trace
 from neurolens.trace.shapes import sag_mm
@@ -65,7 +66,7 @@ def check_lens(lens: Lens) -> list[Check]:
         found.append(_blur(lens, data))
         found += _corner(lens)
     for c in lens.configurations:
-        state = in_state(lens, c)
+        state = _stated(lens, c)
         try:
             data = first_order(state)
         except InputError as error:
@@ -89,18 +90,11 @@ def verdict(checks: list[Check]) -> str:
     return "doubtful" if any(c.doubt for c in checks) else "ok"
 
 
-def in_state(lens: Lens, c: Configuration) -> Lens:
-    """The table with the thicknesses, stop and stated figures of a zoom or focus state, film as tabled."""
-    same = c.efl_mm is not None and lens.stated_efl_mm is not None and c.efl_mm == lens.stated_efl_mm
-    state = replace(
-        lens.with_gaps(dict(c.thickness_mm)),
-        stated_efl_mm=c.efl_mm,
-        stated_efl_x_mm=None,  # a state names one focal length
-        half_field_deg=lens.half_field_in(c),
-        # Where a state has no f-number its stop is that of the table, and any f-number is as good as another.
-        f_number=c.f_number or (lens.f_number if same else math.nan),
-    )
-    return state if c.stop_diameter_mm is None else state.with_stop_radius(c.stop_diameter_mm / 2)
+def _stated(lens: Lens, c: Configuration) -> Lens:
+    """The lens in a state, with the f-number that the source states for it, NaN where it states none."""
+    # Where a state has no f-number its stop is that of the table, and any f-number is as good as another.
+    same = c.efl_mm is not None and c.efl_mm == lens.stated_efl_mm
+    return replace(in_state(lens, c), f_number=c.f_number or (lens.f_number if same else math.nan))
 
 
 def _first_order(lens: Lens, data: FirstOrder) -> Iterator[Check]:

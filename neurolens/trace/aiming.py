@@ -25,9 +25,7 @@ Axis = Literal["x", "y"]
 _WIDEST_DEG = 89.9  # of the angles tried at the stop
 _GRID = 721  # odd, so that the axis is included; a step of a quarter of a degree
 _ZOOM, _ROUNDS = 17, 4  # each round narrows the bracket 16 times, until a straight line has the last digit
-_JUMP = (
-    1.0  # rad of field between neighbours in the search: more is a jump, from one side of the axis to the other, say
-)
+_JUMP = 1.0  # rad of field between neighbours in the search: more is a jump, such as to the other side of the axis
 _MET = 1e-7  # rad from the wanted field
 
 

@@ -117,13 +117,3 @@ def test_fisheyes_are_reached_behind_the_lens(name: str, widest: float) -> None:
     fields = torch.deg2rad(torch.tensor([0.0, 45.0, 89.9, 90.0, widest], dtype=torch.float64))
     found = aim_at_stop(tabled(name), fields, torch.zeros(5, 1, dtype=torch.float64))
     assert found.reached.all() and found.field_rad[:, 0].tolist() == pytest.approx(fields.tolist(), abs=1e-11)
-
-
-def test_a_field_that_no_ray_reaches_gives_the_nearest() -> None:
-    """Through a plane face no ray comes from more than 90 degrees."""
-    rows = (Surface(INF, 5.0, 20.0, 1.5), Surface(INF, 20.0, 10.0, 1.5, stop=True), Surface(-30.0, 60.0, 40.0))
-    found = aim_at_stop(
-        Lens("", "", rows, 4.0), torch.tensor([1.0, 2.0], dtype=torch.float64), torch.zeros(2, 1).double()
-    )
-    assert found.reached[:, 0].tolist() == [True, False]
-    assert math.degrees(float(found.field_rad[1, 0])) == pytest.approx(90, abs=0.1)

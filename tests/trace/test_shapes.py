@@ -15,7 +15,6 @@ from neurolens.graph.program import FILM_Z, RAY, SCENE_RAY, STATUS, STOP_RADIUS,
 from neurolens.graph.scalars import lower
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Coating, Lens, Surface
-from neurolens.trace import tensors
 from neurolens.trace.rays import Rays, Traced, trace
 from neurolens.trace.shapes import sag_mm
 from neurolens.trace.tracegraph import exact_graph
@@ -244,25 +243,6 @@ def test_gradients_of_an_asphere_equal_finite_differences() -> None:
         e[i] = step
         slope = (spot(at + e) - spot(at - e)) / (2 * step)
         assert float(gradient[i]) == pytest.approx(float(slope), rel=2e-6), name
-
-
-def saved_bytes(polish: int, monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setattr(tensors, "POLISH", {torch.float64: polish, torch.float32: polish})
-    total = 0
-
-    def pack(t: Tensor) -> Tensor:
-        nonlocal total
-        total += t.numel() * t.element_size()
-        return t
-
-    at = torch.tensor([30.0, -0.4, -2e-5, 1e-8, 5.0, 2.0, 0.05], dtype=torch.float64, requires_grad=True)
-    with torch.autograd.graph.saved_tensors_hooks(pack, lambda t: t):
-        spot(at)
-    return total
-
-
-def test_memory_for_gradients_does_not_grow_with_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert saved_bytes(1, monkeypatch) == saved_bytes(20, monkeypatch) > 0
 
 
 def test_absorption_follows_the_way_through_the_glass() -> None:

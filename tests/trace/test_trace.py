@@ -243,16 +243,6 @@ def test_fisheye_rays_from_behind_the_camera_are_reversible() -> None:
             torch.testing.assert_close(there.rays[k] + reach * there.rays[3 + k], start[k][behind], rtol=0, atol=atol)
 
 
-def test_shorter_wavelengths_bend_more() -> None:
-    singlet = focused("thorlabs_lb1471_biconvex_50")
-    wavelength = torch.tensor([380.0, 587.5618, 780.0], dtype=torch.float64)
-    out = trace(singlet, rays(*[(0, 5, -10, 0, 0, 1)] * 3), wavelength, towards="film")
-    bend = -out.rays.dy
-    assert bend[0] > bend[1] > bend[2] > 0
-    one = trace(singlet, rays((0, 5, -10, 0, 0, 1)), 587.5618, towards="film")
-    torch.testing.assert_close(bend[1:2], -one.rays.dy, rtol=0, atol=1e-15)
-
-
 # ---- arrays ----
 
 
@@ -279,27 +269,6 @@ def test_an_empty_batch() -> None:
     out = trace(singlet, none, torch.empty(0), transmittance=True, record=[1])
     assert out.status.shape == out.rays.x.shape == out.crossings[1].x.shape == (0,)
     assert out.status.dtype == torch.int32
-
-
-@pytest.mark.parametrize("name", ["laikin_double_gauss_50", "shimizu_fisheye_220", "ogawa_zoom_70_200"])
-def test_float32_agrees_with_float64(name: str) -> None:
-    """Where the statuses differ, the ray passes an edge closely."""
-    table = focused(name)
-    start = bundle(table, 20000)
-    fine = trace(table, start, 500.0, record=range(len(table.surfaces)))
-    coarse = trace(table, Rays(*(c.float() for c in start)), 500.0)
-    differ = fine.status != coarse.status
-    assert differ.sum() < 20
-    for i in torch.nonzero(differ)[:, 0]:
-        edges = [
-            abs(float(torch.hypot(fine.crossings[k].x[i], fine.crossings[k].y[i])) - s.semi_diameter_mm)
-            for k, s in enumerate(table.surfaces)
-        ]
-        margins = [min(abs(float(c.meets[i])), abs(float(c.refracts[i]))) for c in fine.crossings.values()]
-        assert min(edges) < 1e-3 or min(margins) < 1e-4
-    passed = (fine.status == 0) & (coarse.status == 0)
-    for a, b in zip(fine.rays, coarse.rays, strict=True):
-        assert (a - b)[passed].abs().max() < 3e-4
 
 
 def test_recording_changes_no_status() -> None:
