@@ -62,7 +62,7 @@ SLOW |= {"neurolens.cli.export_lens", "neurolens.cli.flare_run", "neurolens.cli.
 # What loads in a base install: these folders, models from their files, and what converts lens files.
 LEAN = ("base", "graph", "lens", "readers", "cameras", "shaders", "render", "mitsuba", "frames", "cli")
 LEAN_MODULES = {
-    *(f"neurolens.trace.{name}" for name in ("arithmetic", "sag", "shapes", "surfaces")),
+    *(f"neurolens.trace.{name}" for name in ("arithmetic", "shapes", "surfaces")),
     *(f"neurolens.surrogates.{name}" for name in ("assemble", "cardstates", "cores", "file", "inverse", "lightfield")),
     *(f"neurolens.surrogates.{name}" for name in ("metadata", "model", "source", "stategraph")),
 }

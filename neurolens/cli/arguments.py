@@ -321,9 +321,9 @@ def more_glasses(args: object) -> AbstractContextManager[None]:
     files = getattr(args, "glass_files", ())
     if not files:
         return nullcontext()
-    from neurolens.readers import agf
+    from neurolens.readers.glasses import more_glasses
 
-    return agf.more_glasses(files)
+    return more_glasses(files)
 
 
 def check_folder(path: Path, option: str) -> None:

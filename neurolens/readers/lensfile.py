@@ -45,6 +45,7 @@ COLUMNS = (
 )
 SURFACE_KEYS = (*COLUMNS, "conic", "asphere", "glass", "material", "absorption_per_mm", "coating", "stop")
 STATE_NUMBERS = ("efl_mm", "half_field_deg", "f_number", "stop_diameter_mm", "object_distance_mm")
+CONFIGURATION_KEYS = ("name", *STATE_NUMBERS, "thickness_mm")
 APERTURE_KEYS = ("blades", "rotation_deg", "curvature")
 ROWS_COMMENT = """\
 # From the scene to the film, numbered from 0. radius_mm is positive when the centre of curvature lies towards the film;
@@ -288,7 +289,7 @@ def _configurations(lens: Table, n_surfaces: int) -> tuple[Configuration, ...]:
     result: list[Configuration] = []
     for place, given in enumerate(lens.tables("configuration")):
         table = Table(given, lens.file, f"configuration {place}, ")
-        table.only(("name", *STATE_NUMBERS, "thickness_mm"))
+        table.only(CONFIGURATION_KEYS)
         name = table.text("name")
         if name in [c.name for c in result]:
             raise table.error("name", name, "a name that no other configuration has")
