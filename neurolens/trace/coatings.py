@@ -33,15 +33,6 @@ SMALL_PHASE2 = 1e-2
 FLOOR = 1e-30
 
 
-class Powers(NamedTuple):
-    """Power transmitted and reflected by polarisation, each [N], in [0, 1]."""
-
-    T_s: Tensor
-    T_p: Tensor
-    R_s: Tensor
-    R_p: Tensor
-
-
 class Response(NamedTuple):
     """One polarisation: u + i v of the incident (`plus`) and the reflected (`minus`) wave that make the same wave
     behind the stack, and the admittances around it; t = 2 before fade / plus, r = minus / plus.
@@ -58,26 +49,12 @@ class Response(NamedTuple):
     fade: Any
 
 
-def transmittance(
-    cos_i: Tensor, n_before: Any, n_after: Any, layers: Layers, wavelength_nm: Any, sense: int = 1
-) -> Tensor:
-    """Unpolarised power transmitted, (Ts + Tp) / 2 in [0, 1], [N]. No films: Fresnel's formulas."""
-    s, p = _responses(cos_i, n_before, n_after, layers, wavelength_nm, sense, phase_beyond=False)
-    return 0.5 * (_transmitted(s) + _transmitted(p))
-
-
 def reflectance(
     cos_i: Tensor, n_before: Any, n_after: Any, layers: Layers, wavelength_nm: Any, sense: int = 1
 ) -> Tensor:
-    """Unpolarised power reflected, (Rs + Rp) / 2 in [0, 1], [N]; 1 - transmittance up to rounding."""
-    s, p = _responses(cos_i, n_before, n_after, layers, wavelength_nm, sense, phase_beyond=False)
-    return 0.5 * (_reflected(s) + _reflected(p))
-
-
-def powers(cos_i: Tensor, n_before: Any, n_after: Any, layers: Layers, wavelength_nm: Any, sense: int = 1) -> Powers:
-    """Power transmitted and reflected for each polarisation."""
-    s, p = _responses(cos_i, n_before, n_after, layers, wavelength_nm, sense, phase_beyond=False)
-    return Powers(_transmitted(s), _transmitted(p), _reflected(s), _reflected(p))
+    """Unpolarised power reflected, (Rs + Rp) / 2 in [0, 1], [N]."""
+    (a, b), (c, d) = power_amplitudes(cos_i, n_before, n_after, layers, wavelength_nm, sense, reflected=True)
+    return 0.5 * (a * a + b * b + c * c + d * d)
 
 
 def power_amplitudes(
@@ -98,19 +75,6 @@ def power_amplitudes(
     if reflected:
         return _reflected_amplitude(s), _reflected_amplitude(p)
     return _transmitted_amplitude(s), _transmitted_amplitude(p)
-
-
-def _transmitted(r: Response) -> Tensor:
-    u, v = r.plus
-    square = u * u + v * v
-    # NaN (an invalid wavelength) fails the comparison.
-    return torch.where(r.passes & (square > 0), 4 * r.fade * r.fade * r.before * r.after / square, 0.0)
-
-
-def _reflected(r: Response) -> Tensor:
-    (u, v), (x, y) = r.plus, r.minus
-    square = u * u + v * v
-    return torch.where(r.passes & (square > 0), (x * x + y * y) / square, 1.0)
 
 
 def _over_plus(r: Response, x: Any, y: Any) -> tuple[Tensor, Tensor]:

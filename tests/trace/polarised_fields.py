@@ -39,6 +39,27 @@ class Step(NamedTuple):
     reflected: bool = False
 
 
+class Powers(NamedTuple):
+    """Power transmitted and reflected by polarisation, each [N]."""
+
+    T_s: Tensor
+    T_p: Tensor
+    R_s: Tensor
+    R_p: Tensor
+
+
+def powers(*arguments: Any) -> Powers:
+    """The powers of `power_amplitudes`, whose arguments these are."""
+    pairs = [pair for reflected in (False, True) for pair in power_amplitudes(*arguments, reflected=reflected)]
+    return Powers(*(a * a + b * b for a, b in pairs))
+
+
+def transmittance(*arguments: Any) -> Tensor:
+    """The power of unpolarised light that is transmitted."""
+    p = powers(*arguments)
+    return 0.5 * (p.T_s + p.T_p)
+
+
 def unpolarised(direction: Vector) -> Tensor:
     """Two orthogonal fields of unit power across unit directions (x, y, z each [N]), for `pass_surface` and `power`.
 

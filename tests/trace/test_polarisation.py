@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 import tmm
 import torch
-from polarised_fields import Step, pass_surface, power, unpolarised
+from polarised_fields import Step, pass_surface, power, powers, transmittance, unpolarised
 from torch import Tensor
 
 from neurolens.trace import transmission
-from neurolens.trace.coatings import Layers, powers, transmittance
+from neurolens.trace.coatings import Layers
 from neurolens.trace.transmission import Light, coated_shares, crossed, fresnel, turned
 
 ROOT = Path(__file__).parents[2]
