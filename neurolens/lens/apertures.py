@@ -22,7 +22,7 @@ from neurolens.graph.ir import Graph, Value
 MIN_BLADES, MAX_BLADES = 3, 100
 MAX_MASK = 4096
 THRESHOLD = 0.5
-_AT_ONCE = 1 << 16  # points: each takes a number a blade
+_AT_ONCE = 1 << 16  # points, each of which takes a number per blade
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,14 +88,14 @@ class Aperture:
         return share + radius**2 * (angle - math.sin(angle)) / (2 * half)
 
     def settings(self) -> dict[str, Any]:
-        """What goes into a picture's metadata."""
+        """Return the description that a picture's metadata holds."""
         if self.blades is None:
             assert self.mask is not None
             return {"mask": list(self.mask.shape), "rotation_deg": self.rotation_deg, "area_share": self.area_share}
         return {"blades": self.blades, "rotation_deg": self.rotation_deg, "curvature": self.curvature}
 
     def inside(self, x: Any, y: Any, radius_mm: float) -> Any:
-        """Whether points of the stop lie in the opening: booleans of the shape of x and y; False for NaN.
+        """Test whether points of the stop lie in the opening: booleans of the shape of x and y; False for NaN.
 
         Numpy arrays or torch tensors x, y and the stop's radius in mm.
         """
@@ -110,7 +110,7 @@ class Aperture:
         return library.concatenate(opened).reshape(x.shape)
 
     def opening(self, g: Graph, xy: Value, radius: Value) -> Value:
-        """Whether points [2] of the stop of a radius (mm) lie in the opening, as a truth; a mask is the table `mask`.
+        """Test whether points [2] of a stop of this radius (mm) lie in the opening; a mask is the table `mask` of the graph.
 
         Within every blade's edge: half planes, or discs through two corners each. In units of the radius, a disc of
         curvature k that touches the edge's middle line at distance e holds what has
@@ -135,7 +135,7 @@ class Aperture:
         return within & (along <= limit)
 
     def rim(self, g: Graph, xy: Value, radius: Value, shut: float) -> Value:
-        """What r^2 / R^2 is of a round stop: at most 1 in the opening, and continuous across the edges of blades.
+        """Measure how far points are out: at most 1 in the opening (r^2 / R^2 if it is round), continuous across blades.
 
         The arguments are those of `opening`; `shut`: the value where a mask passes no light.
         """
@@ -148,7 +148,7 @@ class Aperture:
         return g.square(point).maximum(along - limit + 1.0)
 
     def _edges(self, g: Graph, point: Value) -> tuple[Value, Value]:
-        """A point lies within the blades' edges where the first is at most the second."""
+        """Return two values; a point lies within the blades' edges where the first is at most the second."""
         assert self.blades is not None
         half = math.pi / self.blades
         rise = self.curvature * (1 - math.cos(half))
@@ -186,12 +186,13 @@ def _real(value: object) -> bool:
 
 
 def _read_only(mask: ArrayLike) -> NDArray[np.bool_]:
-    """A mask as the dataclass keeps it; refuses what is no array of two dimensions, too large, or passes no light."""
-    given = np.asarray(mask)
-    if given.ndim != 2 or not 1 <= min(given.shape) <= max(given.shape) <= MAX_MASK or given.dtype.kind not in "bfiu":
-        found = f"({given.dtype} {given.shape})"
-        raise InputError("aperture", "mask", found, f"numbers [H, W], at most {MAX_MASK} a side")
-    whole = np.array(given >= THRESHOLD)  # a copy, independent of the caller's array
+    """Check a mask and copy it; an array that is not two-dimensional, is too large or passes no light is refused."""
+    array = np.asarray(mask)
+    if array.ndim != 2 or not 1 <= min(array.shape) <= max(array.shape) <= MAX_MASK or array.dtype.kind not in "bfiu":
+        raise InputError(
+            "aperture", "mask", f"({array.dtype} {array.shape})", f"numbers [H, W], at most {MAX_MASK} a side"
+        )
+    whole = np.array(array >= THRESHOLD)  # a copy, independent of the caller's array
     if not whole.any():
         raise InputError("aperture", "mask", "(shut everywhere)", "an opening: values of at least 0.5")
     whole.flags.writeable = False

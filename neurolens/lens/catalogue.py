@@ -148,12 +148,12 @@ Added = tuple[dict[str, list[Glass]], dict[str, str]]
 
 
 def added() -> Added:
-    """What `add` has put in so far."""
+    """Return a copy of the glasses that `add` has put in so far."""
     return {key: [*glasses] for key, glasses in _ADDED.items()}, dict(_REFUSED)
 
 
 def restore(before: Added) -> None:
-    """Keep what `added` returned alone."""
+    """Go back to the glasses that `added` returned."""
     _ADDED.clear()
     _REFUSED.clear()
     _ADDED.update(before[0])

@@ -58,8 +58,10 @@ def by_figures(name: str, n_d: float, V_d: float, place: str) -> dict[str, Any]:
     Warns:
         NeurolensWarning: always, with the dispersion taken; `place` is the file and the field.
     """
-    told = f"glass {name} is not in the catalogue: taken by n_d {n_d:g} and V_d {V_d:g}, n = A + B / lambda^2 (Cauchy)"
-    warnings.warn(f"{place}: {told}, without absorption", NeurolensWarning, stacklevel=3)
+    message = (
+        f"glass {name} is not in the catalogue: taken by n_d {n_d:g} and V_d {V_d:g}, n = A + B / lambda^2 (Cauchy)"
+    )
+    warnings.warn(f"{place}: {message}, without absorption", NeurolensWarning, stacklevel=3)
     return {"n_d": n_d, "V_d": V_d, "material": name}
 
 
@@ -111,7 +113,7 @@ def check_against_table(surface: Surface, file: str | Path, where: str) -> None:
 
 
 def table_notes(surface: Surface) -> list[str]:
-    """What `check_against_table` warns of, as sentences without the place; empty if all is well."""
+    """List the warnings of `check_against_table` without their place; empty if the stated values agree."""
     if surface.glass is None:
         return []
     glass, notes = glass_of(surface.glass), []
@@ -132,7 +134,7 @@ def table_notes(surface: Surface) -> list[str]:
 
 
 def _contradiction(surface: Surface, glass: Glass) -> str:
-    """Text of stated values that differ from this glass's; empty where they agree."""
+    """Name the stated values that differ from this glass's; empty where they agree."""
     n_d, V_d = float(surface.n_d), surface.V_d
     wrong = [f"n_d = {n_d:.6g}"] if n_d != 1 and abs(glass.n_d - n_d) > TOLERANCE_N_D else []
     if V_d is not None and abs(glass.V_d - V_d) > TOLERANCE_V_D:

@@ -318,7 +318,7 @@ def same_medium(surfaces: Sequence[Surface], k: int, in_front: Medium | None = N
 
 
 def _figures(s: Surface) -> list[Any]:
-    """What a surface does to rays, for the hash; default values are left out."""
+    """List the figures of a surface that decide where rays go, for the hash; default values are left out."""
     radius = float(s.radius_mm)
     row = [
         abs(radius) if math.isinf(radius) else radius,

@@ -215,7 +215,7 @@ def _shape(row: Table) -> dict[str, Any]:
 
 
 def _across(row: Table) -> dict[str, Any]:
-    """What bends a toroid or a biconic across its cylinder; an infinite radius leaves a cylinder."""
+    """Read the second section of a toroid or a biconic; an infinite radius leaves a cylinder."""
     for key in (k for k in ("across_mm", "across_conic") if k in row):
         if "cylinder" not in row:
             raise row.error("cylinder", "(missing)", f'the axis of the curve that {key} goes with: "x" or "y"')

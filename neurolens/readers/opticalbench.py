@@ -31,7 +31,7 @@ _MAX_STATES = 200
 
 @dataclass
 class _File:
-    """What is found, by section; `gaps` by surface, where the table names one."""
+    """The content of a file by section; `gaps` holds the names that the table has in place of thicknesses."""
 
     draft: Draft
     constants: dict[str, str] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""What all readers share: limits, lines of text files, strict tables of TOML and JSON; errors name line or key."""
+"""Limits, lines of text files and strict tables of TOML and JSON for all readers; errors name the line or the key."""
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ class Table:
 
 
 def by_word(*groups: tuple[str, str]) -> dict[str, str]:
-    """What is expected in the place of each keyword, from groups of keywords that share it."""
+    """Map each keyword to the text that says what is expected in its place, from groups of keywords that share it."""
     return {word: expected for words, expected in groups for word in words.split()}
 
 

@@ -158,7 +158,7 @@ def _edges(lens: Lens) -> Check:
 
 
 def _field(lens: Lens) -> Iterator[Check]:
-    """How far from the axis chief rays pass; beyond, light may still come through the side of the pupil."""
+    """Find the last field whose chief ray passes; beyond it, light may still come through the side of the pupil."""
     stated = lens.half_field_deg
     if stated is None:
         return

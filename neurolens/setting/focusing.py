@@ -113,7 +113,7 @@ def gaps_mm(lens: Lens, *states: Configuration | None) -> dict[int, float]:
 
 @dataclass(frozen=True)
 class FocusPath:
-    """How the gaps move while focusing: `steps[j]` holds what is added to each gap at the state j, 0 at infinity.
+    """The moves of the gaps while focusing: `steps[j]` holds the change of each gap at state j, 0 at infinity.
 
     `film` is the surface whose thickness is the distance to the film.
     """
@@ -122,7 +122,7 @@ class FocusPath:
     film: int
 
     def moved(self, s: float) -> dict[int, float]:
-        """What is added to the gaps at the parameter s, from 0 (infinity) to the number of states beyond."""
+        """Return the change of each gap at the parameter s, from 0 (infinity) to the number of states beyond."""
         j = min(int(s), len(self.steps) - 2)
         share = s - j
         low, high = self.steps[j], self.steps[j + 1]

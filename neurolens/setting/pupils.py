@@ -1,4 +1,4 @@
-"""From film points and pupil points to camera rays, and where on the pupil plane the passing rays lie."""
+"""Camera rays from film and pupil points, and a search for the pupil points through which light passes."""
 
 from __future__ import annotations
 
@@ -276,8 +276,8 @@ def pupil_bounds(
 
 
 def _starts(lens: Lens, place: Place, plane: float, near: float, exit_z: float) -> list[Box]:
-    """Where on the pupil plane light of a film point may pass: what the rear rim bounds, and within `near` mm of the
-    exit pupil's middle where the rear rim bounds it badly.
+    """Bound the light of a film point on the pupil plane by the rear rim, and also by `near` mm about the exit pupil's
+    middle where the rear rim bounds it badly.
     """
     rear = lens.surfaces[-1]
     rear_z = float(lens.vertices_mm[len(lens.surfaces) - 1])

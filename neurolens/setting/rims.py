@@ -123,7 +123,7 @@ def neighbours(surfaces: Sequence[Surface]) -> Iterator[tuple[int, int, float]]:
 
 @dataclass(frozen=True)
 class RimRule:
-    """How rims are derived.
+    """The rule by which rims are derived.
 
     Attributes:
         vignetting: share of the stop's height that is kept at the edge of the field, above 0, at most 1.

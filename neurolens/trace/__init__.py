@@ -1,1 +1,1 @@
-"""What a ray does at one surface, written once for tensors, arrays and graphs, and rays traced through whole lenses."""
+"""Ray tracing: one surface step, written once for tensors, arrays and graphs, and rays through whole lenses."""

@@ -102,7 +102,7 @@ def _joined(value: Tensor, exists: Tensor, jump: float = _JUMP) -> Tensor:
 
 
 def _off(field: Tensor, exists: Tensor, target: Tensor) -> Tensor:
-    """How far fields [n, G] are from their targets [n], inf where there is no ray."""
+    """Return the distances of fields [n, G] from their targets [n], inf where there is no ray."""
     return torch.where(exists, (field - target[:, None]).abs(), math.inf)
 
 
@@ -135,7 +135,7 @@ def between(ends: Tensor) -> Tensor:
 def _follow(
     front: Lens, height: Tensor, angle: Tensor, axis: Axis, wavelength_nm: float
 ) -> tuple[Rays, Tensor, Tensor]:
-    """From the stop to the scene: the reversed rays, [n * G], their field angle and existence [n, G]."""
+    """Trace from the stop to the scene; return the reversed rays [n * G], their field angles and existence [n, G]."""
     stop, z = front.surfaces[-1], float(front.vertices_mm[-2])
     h, a = height.reshape(-1), angle.reshape(-1)
     known = {float(v): sag_mm(stop, float(v), 0.0) if axis == "x" else sag_mm(stop, 0.0, float(v))

@@ -1,4 +1,4 @@
-"""What stacks of thin films do to light, vectorised over rays.
+"""Transmission and reflection of light by stacks of thin films, vectorised over rays.
 
 Powers and amplitudes follow from characteristic matrices. A lossless layer's has the form [[a, -i b], [-i c, d]] with
 real a, b, c, d and a d + b c = 1, and so has every product of them: real arithmetic suffices, which compiles well. A p

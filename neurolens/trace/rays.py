@@ -49,7 +49,7 @@ _FEWER = 0.8
 
 
 class Crossing(NamedTuple):
-    """Where rays cross one surface, each [N]; mm, and the margins of Snell's and the sphere's square roots.
+    """The crossings of rays with one surface, each [N]: points in mm, margins of Snell's and the sphere's square roots.
 
     `meets` is positive where the ray meets the surface, `refracts` where it is not totally reflected there. Points on
     the far half of a sphere, beyond any rim, lie mirrored outwards (see `_unfolded`).
@@ -62,7 +62,7 @@ class Crossing(NamedTuple):
 
 
 class Traced(NamedTuple):
-    """What tracing gives.
+    """The result of a trace.
 
     Attributes:
         rays: point on the last surface met (lens frame, mm) and unit direction after it. Rays that missed a surface or
@@ -134,7 +134,7 @@ def trace(
 
 
 def _joined(parts: Sequence[Any]) -> Any:
-    """Chunks of results as one."""
+    """Join the results of chunks."""
     first = parts[0]
     if isinstance(first, Tensor):
         return torch.cat(list(parts))
@@ -147,7 +147,7 @@ def _joined(parts: Sequence[Any]) -> Any:
 
 
 def passing(lens: Lens, rays: Rays, wavelength_nm: float, *, towards: Towards = "scene") -> Tensor:
-    """Whether rays pass the whole lens, bool [N]: where the status of `trace` is 0, bit for bit.
+    """Test whether rays pass the whole lens, bool [N]: exactly where the status of `trace` is 0.
 
     Rays that are lost are left out of the work on later surfaces. For questions of which most are answered by no.
     Arguments and errors are those of `trace`, with one wavelength.

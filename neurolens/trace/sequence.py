@@ -1,4 +1,4 @@
-"""Light along any sequence of surfaces, reflected or refracted at each: the paths of ghosts.
+"""Ghost paths: light that any sequence of surfaces refracts or reflects.
 
 The surfaces and their tests are those of `trace`; in addition, light may be reflected.
 """
@@ -22,12 +22,12 @@ Steps = Sequence[tuple[int, Action]]
 
 
 class Followed(NamedTuple):
-    """What following a sequence gives.
+    """The result of following a sequence.
 
     Attributes:
         rays: point on the last surface and unit direction after it, lens frame, mm; along the axis for lost rays.
         status: [N] int32 as in `trace`: the surface and the reason that ended a ray first.
-        power: [N], of unpolarised light, what surfaces transmit or reflect and glass does not absorb.
+        power: [N], the share of unpolarised light that the surfaces send on and the glass does not absorb.
         points: x, y, z of the meeting points of every step, lens frame, mm.
     """
 

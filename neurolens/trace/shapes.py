@@ -95,7 +95,7 @@ class Figure(NamedTuple):
 
 
 class Beyond(NamedTuple):
-    """How a curve continues where its figures end.
+    """The continuation of a curve beyond the height up to which its figures are followed.
 
     With d the distance beyond the end: its slope there is slope + bend * length * (1 - exp(-d / length)).
     """

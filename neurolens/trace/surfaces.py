@@ -332,7 +332,7 @@ def through_ideal(o: Arithmetic, r: Rays, met: Met, focal_mm: float) -> Rays:
 
 
 class Crossed(NamedTuple):
-    """What a surface does to rays: those before it are given, those behind it are in its vertex frame.
+    """The passage of rays through a surface; the rays behind it are in its vertex frame.
 
     `bent` has the rays behind; `tests` are all tests at the surface in order, each with its reason (`base.status`).
     """

@@ -89,7 +89,7 @@ def exact_graph(
 
 
 class GraphLosses:
-    """What glass and coatings do to light in a graph, as `transmission.Losses` does it with tensors.
+    """The losses of light in glass and coatings as parts of a graph; see `transmission.Losses`.
 
     Args:
         wavelength_nm: of the rays. range_nm: wavelengths from and to which it may lie.
@@ -117,7 +117,7 @@ class GraphLosses:
         return transmitted(depth)
 
     def coated(self, k: int, met: Met, q: Value, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares:
-        """What the coating of surface k transmits of light on its way to the scene; see `coatings`."""
+        """Return the shares that the coating of surface k transmits of light on its way to the scene; see `coatings`."""
         (one, two), coating, g = media, self.lens.surfaces[k].coating, self.wavelength_nm.graph
         assert sense < 0 and not reflected and coating is not None
         sides = self.lens.media[k : k + 2]

@@ -1,4 +1,4 @@
-"""Power of unpolarised light that arrives: what surfaces transmit or reflect, and what glass absorbs on the way.
+"""The power of unpolarised light that arrives: transmission or reflection at surfaces, absorption in glass.
 
 Each surface polarises the light that the next one meets, whose plane of incidence may be another. So Stokes parameters
 are followed: at each surface they are turned into its plane of incidence, and the surface acts on s and p. Angles stand
@@ -44,7 +44,7 @@ class Light(NamedTuple):
 
 
 class Shares(NamedTuple):
-    """What a surface does to s and p, all but the last two to be multiplied by `above / below`.
+    """The shares of s and p that a surface sends on; all but the last two are to be multiplied by `above / below`.
 
     Attributes:
         mean, half: mean of the shares of power of s and p that go on, and half of their difference.
@@ -60,7 +60,7 @@ class Shares(NamedTuple):
 
 
 def fresnel(before: Any, after: Any, p: Any) -> Shares:
-    """What a bare surface transmits (Born and Wolf, 1.5.2).
+    """Return the shares that a bare surface transmits (Born and Wolf, 1.5.2).
 
     Args:
         before, after: index times cosine in front of the surface and behind it, n cos i and n' cos t.
@@ -137,14 +137,14 @@ def _plus(total: Any, a: Any, b: Any) -> Any:
 def coated_shares(
     cos_i: Tensor, n_before: Any, n_after: Any, layers: Layers, wavelength_nm: Any, sense: int, reflected: bool = False
 ) -> Shares:
-    """What a surface transmits, or reflects with `reflected`; arguments as in `trace.coatings`."""
+    """Return the shares that a surface transmits, or reflects with `reflected`; arguments as in `trace.coatings`."""
     (a, b), (c, d) = power_amplitudes(cos_i, n_before, n_after, layers, wavelength_nm, sense, reflected)
     s, p = a * a + b * b, c * c + d * d
     return Shares((s + p) * 0.5, (s - p) * 0.5, a * c + b * d, b * c - a * d)
 
 
 class Losses(Protocol):
-    """What glass and coatings do to light: `TensorLosses` with tensors, `tracegraph.GraphLosses` in a graph."""
+    """The losses of light in glass and coatings: `TensorLosses` with tensors, `tracegraph.GraphLosses` in a graph."""
 
     def absorption(self, k: int) -> Any: ...
     def coated(self, k: int, met: Met, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares: ...
@@ -152,7 +152,7 @@ class Losses(Protocol):
 
 
 class TensorLosses:
-    """What glass and coatings do to light, with tensors."""
+    """The losses of light in glass and coatings, with tensors."""
 
     def __init__(self, lens: Lens, wavelength_nm: Any) -> None:
         self.lens, self.wavelength_nm = lens, wavelength_nm
@@ -163,7 +163,7 @@ class TensorLosses:
         return absorption_of(self.lens.surfaces[k - 1], self.wavelength_nm) if k else None
 
     def coated(self, k: int, met: Met, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares:
-        """What the coating of surface k transmits or reflects; arguments as of `Passage.pass_surface`."""
+        """Return the shares that the coating of surface k transmits or reflects; arguments: see `Passage.pass_surface`."""
         before, after = media
         coating = self.lens.surfaces[k].coating
         cos_i = times(met.q, 1 / before.n)
@@ -176,7 +176,7 @@ class TensorLosses:
 
 
 class Passage:
-    """Power carried along while rays are traced; absorption is by Beer and Lambert's law.
+    """The power of rays while they are traced; absorption follows Beer and Lambert's law.
 
     `polarised`: whether the polarisation is followed that each surface gives to the light, or averaged at each surface.
     """
