@@ -110,7 +110,7 @@ class Aperture:
         return library.concatenate(opened).reshape(x.shape)
 
     def opening(self, g: Graph, xy: Value, radius: Value) -> Value:
-        """Test whether points [2] of a stop of this radius (mm) lie in the opening; a mask is the table `mask` of the graph.
+        """Test whether points [2] of a stop of this radius (mm) lie in the opening; a mask is the graph's table `mask`.
 
         Within every blade's edge: half planes, or discs through two corners each. In units of the radius, a disc of
         curvature k that touches the edge's middle line at distance e holds what has
@@ -135,7 +135,7 @@ class Aperture:
         return within & (along <= limit)
 
     def rim(self, g: Graph, xy: Value, radius: Value, shut: float) -> Value:
-        """Measure how far points are out: at most 1 in the opening (r^2 / R^2 if it is round), continuous across blades.
+        """Return a value that is at most 1 in the opening, continuous across blades, and r^2 / R^2 for a round stop.
 
         The arguments are those of `opening`; `shut`: the value where a mask passes no light.
         """

@@ -58,10 +58,9 @@ def by_figures(name: str, n_d: float, V_d: float, place: str) -> dict[str, Any]:
     Warns:
         NeurolensWarning: always, with the dispersion taken; `place` is the file and the field.
     """
-    message = (
-        f"glass {name} is not in the catalogue: taken by n_d {n_d:g} and V_d {V_d:g}, n = A + B / lambda^2 (Cauchy)"
-    )
-    warnings.warn(f"{place}: {message}, without absorption", NeurolensWarning, stacklevel=3)
+    message = f"glass {name} is not in the catalogue: taken by n_d {n_d:g} and V_d {V_d:g}"
+    message += ", n = A + B / lambda^2 (Cauchy), without absorption"
+    warnings.warn(f"{place}: {message}", NeurolensWarning, stacklevel=3)
     return {"n_d": n_d, "V_d": V_d, "material": name}
 
 

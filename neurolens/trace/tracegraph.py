@@ -117,7 +117,7 @@ class GraphLosses:
         return transmitted(depth)
 
     def coated(self, k: int, met: Met, q: Value, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares:
-        """Return the shares that the coating of surface k transmits of light on its way to the scene; see `coatings`."""
+        """Return the shares that the coating of surface k transmits of light towards the scene; see `coatings`."""
         (one, two), coating, g = media, self.lens.surfaces[k].coating, self.wavelength_nm.graph
         assert sense < 0 and not reflected and coating is not None
         sides = self.lens.media[k : k + 2]

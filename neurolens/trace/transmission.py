@@ -163,7 +163,7 @@ class TensorLosses:
         return absorption_of(self.lens.surfaces[k - 1], self.wavelength_nm) if k else None
 
     def coated(self, k: int, met: Met, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares:
-        """Return the shares that the coating of surface k transmits or reflects; arguments: see `Passage.pass_surface`."""
+        """Return the shares that the coating of surface k transmits or reflects; see `Passage.pass_surface`."""
         before, after = media
         coating = self.lens.surfaces[k].coating
         cos_i = times(met.q, 1 / before.n)
