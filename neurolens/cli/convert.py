@@ -77,15 +77,15 @@ def run(args: argparse.Namespace) -> int:
     if args.out.exists() and not args.force:
         raise InputError(args.out, "--output", "(an existing file)", "a new file, or --force to replace it")
     from neurolens.readers.any_format import read_any
-    from neurolens.readers.draft import Given
+    from neurolens.readers.draft import ReadOptions
 
-    given = Given(
+    options = ReadOptions(
         name=args.name, source=args.source, f_number=args.f_number, units=args.units, half_field_deg=args.half_field,
         stop=args.stop, gap_before=args.gap_before, semi_diameters=args.semi_diameters,
     )  # fmt: skip
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", NeurolensWarning)
-        lens = read_any(args.file, given)
+        lens = read_any(args.file, options)
     told = [str(w.message).removeprefix(f"{args.file}: ") for w in caught if issubclass(w.category, NeurolensWarning)]
     read = list(dict.fromkeys(told))
     if read:  # the file keeps what its source had besides, and what was assumed

@@ -11,7 +11,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import read_toml
 from neurolens.lens.prescription import Lens
 from neurolens.readers.codev import looks_like_seq, read_seq
-from neurolens.readers.draft import Given
+from neurolens.readers.draft import ReadOptions
 from neurolens.readers.json_lens import looks_like_json, read_json_lens
 from neurolens.readers.keyed import is_blender, read_blender
 from neurolens.readers.lensfile import read_lens
@@ -31,7 +31,7 @@ class Format:
 
     name: str
     suffixes: tuple[str, ...]
-    read: Callable[[str | Path, Given], Lens]
+    read: Callable[[str | Path, ReadOptions], Lens]
     looks_like: Callable[[str], bool]
 
 
@@ -49,18 +49,18 @@ FORMATS = (
 SUFFIXES = frozenset([".toml", *(suffix for f in FORMATS for suffix in f.suffixes)])
 
 
-def read_any(path: str | Path, given: Given | None = None) -> Lens:
-    """The lens of a file in any format that neurolens reads, its own TOML too, with what the file lacks from `given`.
+def read_any(path: str | Path, options: ReadOptions | None = None) -> Lens:
+    """The lens of a file in any format that neurolens reads, its own TOML too, with what the file lacks from `options`.
 
     The content decides; the suffix is used if the content is not recognised.
 
     Raises:
         InputError: a file in no known format, or the mistake in it; names file and line. Where an option of `neurolens
-            convert` would help, and `given` is None, the message says how.
+            convert` would help, and `options` is None, the message says how.
     """
-    if given is None:
+    if options is None:
         try:
-            return read_any(path, Given())
+            return read_any(path, ReadOptions())
         except InputError as error:
             if (option := re.search(r"--[a-z-]+", error.expected)) is None:
                 raise
@@ -69,17 +69,17 @@ def read_any(path: str | Path, given: Given | None = None) -> Lens:
     if Path(path).suffix.lower() == ".toml":
         data = read_toml(path)
         if is_blender(data):
-            return read_blender(data, str(path), given)
+            return read_blender(data, str(path), options)
         lens = read_lens(path, data)
-        lens = replace(lens, name=given.name or lens.name, source=given.source or lens.source)
-        if given != Given(name=given.name, source=given.source):
+        lens = replace(lens, name=options.name or lens.name, source=options.source or lens.source)
+        if options != ReadOptions(name=options.name, source=options.source):
             raise InputError(path, "options", "(of a lens file)", "--name and --source only: the file has the rest")
         return lens
     found = format_of(path)
-    for name, said in (("--gap-before", given.gap_before), ("--semi-diameters", given.semi_diameters)):
+    for name, said in (("--gap-before", options.gap_before), ("--semi-diameters", options.semi_diameters)):
         if said and found.read is not read_table:
             raise InputError(path, name, f"(a {found.name} file)", "a plain table: other formats define it")
-    return found.read(path, given)
+    return found.read(path, options)
 
 
 def format_of(path: str | Path) -> Format:

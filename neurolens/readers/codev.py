@@ -19,7 +19,7 @@ from neurolens.readers.codev_model import (
     medium,
     shape_of,
 )
-from neurolens.readers.draft import INFINITE, Draft, Given, Row, lens_of, primary_first
+from neurolens.readers.draft import INFINITE, Draft, ReadOptions, Row, lens_of, primary_first
 from neurolens.readers.source import MAX_SURFACES, assume, by_word, read_lines, warn
 
 
@@ -104,7 +104,7 @@ READ = (
 )
 
 
-def read_seq(path: str | Path, given: Given | None = None) -> Lens:
+def read_seq(path: str | Path, options: ReadOptions | None = None) -> Lens:
     """The lens of a CODE V sequence file.
 
     Raises:
@@ -125,7 +125,7 @@ def read_seq(path: str | Path, given: Given | None = None) -> Lens:
     if not file.closed:
         raise InputError(file.file, "SI", "(missing)", "an image surface at the end of the lens")
     _complete(file)
-    return lens_of(file, given)
+    return lens_of(file, options)
 
 
 def looks_like_seq(head: str) -> bool:

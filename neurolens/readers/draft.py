@@ -32,7 +32,7 @@ from neurolens.setting.rims import check_states
 
 
 @dataclass(frozen=True)
-class Given:
+class ReadOptions:
     """Values from the user that the file does not give.
 
     Attributes:
@@ -190,38 +190,40 @@ def primary_first(wavelengths_nm: Iterable[float], primary_nm: float) -> tuple[f
     return tuple(sorted(sound, key=lambda nm: nm != round(primary_nm, 6)))
 
 
-def lens_of(draft: Draft, given: Given | None = None) -> Lens:
+def lens_of(draft: Draft, options: ReadOptions | None = None) -> Lens:
     """The lens of a draft, in mm, checked as by `assemble.finish`; a unit other than the file's is an InputError."""
-    given = given or Given()
+    options = options or ReadOptions()
     if +draft.skipped:
         listed = (word if count == 1 else f"{word} ({count})" for word, count in (+draft.skipped).items())
         warn(draft.file, f"left out, since no ray depends on it: {', '.join(listed)}")
     try:
-        draft = with_stop(draft, given.stop)
+        draft = with_stop(draft, options.stop)
         draft = _without_dummies(draft)
-        return _lens_of(draft, given)
+        return _lens_of(draft, options)
     except InputError as error:
         value = draft.in_file(error.value) if isinstance(error.value, str) else error.value
         raise InputError(error.file, draft.in_file(error.field), value, draft.in_file(error.expected)) from None
 
 
-def _lens_of(draft: Draft, given: Given) -> Lens:
-    unit = given.units or draft.unit or "mm"
-    if given.units and draft.unit and given.units != draft.unit:
-        raise InputError(draft.file, "--units", given.units, f"{draft.unit!r}, as the file itself says (or no --units)")
+def _lens_of(draft: Draft, options: ReadOptions) -> Lens:
+    unit = options.units or draft.unit or "mm"
+    if options.units and draft.unit and options.units != draft.unit:
+        raise InputError(
+            draft.file, "--units", options.units, f"{draft.unit!r}, as the file itself says (or no --units)"
+        )
     if unit not in UNITS_MM:
         raise InputError(draft.file, "--units", unit, f"one of {', '.join(UNITS_MM)}")
     factor = UNITS_MM[unit]
-    if given.f_number is not None and (draft.f_number or draft.pupil) is not None:
-        warn(draft.file, f"--f-number {given.f_number:g} is not used: the file sizes the stop itself")
-    f_number = draft.f_number or given.f_number or math.nan
+    if options.f_number is not None and (draft.f_number or draft.pupil) is not None:
+        warn(draft.file, f"--f-number {options.f_number:g} is not used: the file sizes the stop itself")
+    f_number = draft.f_number or options.f_number or math.nan
     lens = Lens(
-        name=given.name or draft.name or Path(draft.file).stem,
-        source=given.source or f"{draft.kind} file {Path(draft.file).name}",
+        name=options.name or draft.name or Path(draft.file).stem,
+        source=options.source or f"{draft.kind} file {Path(draft.file).name}",
         surfaces=tuple(row.surface for row in draft.rows),
         f_number=f_number,
         image_radius_mm=draft.image_radius,
-        half_field_deg=given.half_field_deg or draft.half_field_deg,
+        half_field_deg=options.half_field_deg or draft.half_field_deg,
         notes="\n".join(draft.notes),
         rims=draft.rims,
         path=draft.file,

@@ -22,7 +22,7 @@ from neurolens.base.tomlfile import check_tree
 from neurolens.lens import paraxial
 from neurolens.lens.prescription import Configuration, Lens, Surface
 from neurolens.readers.assemble import UNKNOWN, finish, first_order
-from neurolens.readers.draft import Given
+from neurolens.readers.draft import ReadOptions
 from neurolens.readers.glasses import same_glass
 from neurolens.readers.keyed import read_others
 from neurolens.readers.source import MAX_SURFACES, Table, read_text, warn
@@ -49,11 +49,11 @@ AGREES = 1e-4  # relative: more than rounding of the printed figures, less than 
 _NUMBER = r"(?<![0-9.])([0-9]{1,9}(?:\.[0-9]{1,9})?)"  # bounded: a search tries every place
 
 
-def read_json_lens(path: str | Path, given: Given | None = None, *, catalogue: bool = True) -> Lens:
+def read_json_lens(path: str | Path, options: ReadOptions | None = None, *, catalogue: bool = True) -> Lens:
     """The lens of a JSON file, unfocused.
 
     Args:
-        given: name and source that replace those of the file; f-number and half field for a file that states none.
+        options: name and source that replace those of the file; f-number and half field for a file that states none.
         catalogue: set `Surface.glass` where the named glass is in the catalogue with the same figures; without it the
             figures of the file rule over all colours.
 
@@ -64,15 +64,15 @@ def read_json_lens(path: str | Path, given: Given | None = None, *, catalogue: b
         InputError: the first mistake met; it names file, surface and field.
     """
     file = str(path)
-    given = given or Given()
-    if given.units not in (None, "mm"):
-        raise InputError(file, "--units", given.units, "mm, as the keys of the file say (or no --units)")
+    options = options or ReadOptions()
+    if options.units not in (None, "mm"):
+        raise InputError(file, "--units", options.units, "mm, as the keys of the file say (or no --units)")
     data = _load(path)
-    other = read_others(data, file, given)
+    other = read_others(data, file, options)
     if other is not None:
         return other
-    if given.stop is not None:
-        raise InputError(file, "--stop", given.stop, "no such option: this form of JSON marks its stop")
+    if options.stop is not None:
+        raise InputError(file, "--stop", options.stop, "no such option: this form of JSON marks its stop")
     table = Table(data, file)
     table.only(KEYS)
     rows = data.get("surfaces", "(missing)")
@@ -87,18 +87,18 @@ def read_json_lens(path: str | Path, given: Given | None = None, *, catalogue: b
         estimated = True
     stated = table.optional("f_number")
     lens = Lens(
-        name=given.name or table.text("name"),
-        source=given.source or table.text("source"),
+        name=options.name or table.text("name"),
+        source=options.source or table.text("source"),
         surfaces=surfaces,
-        f_number=stated or given.f_number or math.nan,
+        f_number=stated or options.f_number or math.nan,
         designer=_optional_text(table, "designer"),
         notes=notes,
         rims="estimated" if estimated else "source",
         path=file,
         **image_and_field(data, file),
     )
-    if lens.half_field_deg is None and given.half_field_deg is not None:
-        lens = replace(lens, half_field_deg=given.half_field_deg)
+    if lens.half_field_deg is None and options.half_field_deg is not None:
+        lens = replace(lens, half_field_deg=options.half_field_deg)
     lens = finish(lens, film_given=bool(surfaces[-1].thickness_mm))
     lens = stated_efl(lens, data)
     check_computed(lens, data)

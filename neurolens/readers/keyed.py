@@ -21,7 +21,7 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.assemble import first_order
-from neurolens.readers.draft import Draft, Given, Row, State, lens_of
+from neurolens.readers.draft import Draft, ReadOptions, Row, State, lens_of
 from neurolens.readers.glasses import named_glass
 from neurolens.readers.source import MAX_SURFACES, Table, warn
 
@@ -40,7 +40,7 @@ _SURFACE = ("type", "radius", "thickness", "ior", "aperture", "abbe_v", "conic",
 _TYPES = ("spherical", "flat", "stop", "aspheric", "cylindrical_x", "cylindrical_y")
 
 
-def read_others(data: Mapping[str, Any], file: str, given: Given) -> Lens | None:
+def read_others(data: Mapping[str, Any], file: str, options: ReadOptions) -> Lens | None:
     """The lens of a JSON object of DeepLens or ISET; None where it is of neither.
 
     Warns:
@@ -52,7 +52,7 @@ def read_others(data: Mapping[str, Any], file: str, given: Given) -> Lens | None
     draft = _draft(data, file)
     if draft is None:
         return None
-    lens = lens_of(draft, given)
+    lens = lens_of(draft, options)
     if "foclen" in data:
         stated, found = Table(data, file).number("foclen"), first_order(lens).efl_mm
         if abs(found - stated) > 0.01 * abs(stated):
@@ -181,7 +181,7 @@ def is_blender(data: Mapping[str, Any]) -> bool:
     return "schema" not in data and isinstance(data.get("surface"), list) and isinstance(data.get("lens"), Mapping)
 
 
-def read_blender(data: Mapping[str, Any], file: str, given: Given | None = None) -> Lens:
+def read_blender(data: Mapping[str, Any], file: str, options: ReadOptions | None = None) -> Lens:
     """The lens of such a file.
 
     Raises:
@@ -215,7 +215,7 @@ def read_blender(data: Mapping[str, Any], file: str, given: Given | None = None)
         stated_efl=head.optional("focal_length"),
         drawn=True,
     )
-    return lens_of(draft, given)
+    return lens_of(draft, options)
 
 
 def _blender_surface(row: Table) -> Surface:

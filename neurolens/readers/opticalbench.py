@@ -18,7 +18,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Lens, Surface
-from neurolens.readers.draft import INFINITE, Draft, Given, Row, State, lens_of
+from neurolens.readers.draft import INFINITE, Draft, ReadOptions, Row, State, lens_of
 from neurolens.readers.glasses import same_glass
 from neurolens.readers.source import MAX_SURFACES, Line, assume, read_lines, warn
 
@@ -55,7 +55,7 @@ class _File:
         return math.inf if word.lower().startswith("inf") else line.number_of(name, word)
 
 
-def read_opticalbench(path: str | Path, given: Given | None = None) -> Lens:
+def read_opticalbench(path: str | Path, options: ReadOptions | None = None) -> Lens:
     """The lens of a text of the Optical Bench, with a state for every column that has all gaps of the table.
 
     Raises:
@@ -77,7 +77,7 @@ def read_opticalbench(path: str | Path, given: Given | None = None) -> Lens:
         found.surfaces.append(Surface(math.inf, 0.0, found.surfaces[-1].diameter_mm))
     for line, words in found.aspheres:
         _bend(found, line, words)
-    return lens_of(_complete(found), given)
+    return lens_of(_complete(found), options)
 
 
 def looks_like_opticalbench(head: str) -> bool:

@@ -15,7 +15,7 @@ from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers import draft
 from neurolens.readers.assemble import UNKNOWN
-from neurolens.readers.draft import INFINITE, Draft, Given, Row, lens_of, primary_first
+from neurolens.readers.draft import INFINITE, Draft, ReadOptions, Row, lens_of, primary_first
 from neurolens.readers.glasses import by_indices, named_glass
 from neurolens.readers.source import MAX_SURFACES, UNITS_MM, Line, by_word, read_lines
 
@@ -56,7 +56,7 @@ class File(Draft):
     waves_um: list[float] = field(default_factory=list)
 
 
-def read_len(path: str | Path, given: Given | None = None) -> Lens:
+def read_len(path: str | Path, options: ReadOptions | None = None) -> Lens:
     """The lens of an OSLO file.
 
     Raises:
@@ -71,7 +71,7 @@ def read_len(path: str | Path, given: Given | None = None) -> Lens:
     if len(file.blocks) < 3:
         raise InputError(file.file, "NXT", f"({len(file.blocks)} surfaces)", "object, at least one surface, and image")
     _complete(file)
-    return lens_of(file, given)
+    return lens_of(file, options)
 
 
 def looks_like_len(head: str) -> bool:

@@ -4,7 +4,7 @@ One row per surface from the scene to the film: radius of curvature, thickness t
 behind, aperture (full diameter); mm. "#" begins a comment. appleseed puts the count of rows in front. The stop is the
 row of index 0 (appleseed) or of radius 0 (pbrt, which has no other planes). Of a last thickness of 0 the film is put in
 the paraxial focus. Kolb's tables of 1995 have the separation in front of each surface instead, and some have
-semi-diameters: see `Given`.
+semi-diameters: see `ReadOptions`.
 
 FlareSim, a simulator of flare for compositing programs, writes `name: TEXT`, `focal_length: MM`, `surfaces:` and a row
 a surface, from the scene to the film: radius (0 a plane, "stop" the stop), thickness, index behind, Abbe number (0
@@ -25,7 +25,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Lens, Surface
-from neurolens.readers.draft import Draft, Given, Row, lens_of
+from neurolens.readers.draft import Draft, ReadOptions, Row, lens_of
 from neurolens.readers.source import MAX_SURFACES, Line, assume, read_lines
 
 COLUMNS = ("radius", "thickness", "index", "diameter")
@@ -35,13 +35,13 @@ _ROUND = ("spherical", "sphere", "sph")
 _STATED = re.compile(r"(\d+) surfaces,.*?(?:f/(\d+(?:\.\d+)?))?\s*$")
 
 
-def read_table(path: str | Path, given: Given | None = None) -> Lens:
+def read_table(path: str | Path, options: ReadOptions | None = None) -> Lens:
     """The lens of a table.
 
     Raises:
         InputError: a row without four numbers, a count that is not that of the rows, no stop or several.
     """
-    given = given or Given()
+    options = options or ReadOptions()
     file, lines = str(path), read_lines(path)
     comments = [line.text.strip().lstrip("#").strip() for line in lines if line.text.lstrip().startswith("#")]
     rows: list[tuple[Line, list[float]]] = []
@@ -62,8 +62,8 @@ def read_table(path: str | Path, given: Given | None = None) -> Lens:
         raise InputError(file, "rows", "(none)", f"rows of {len(COLUMNS)} numbers: {', '.join(COLUMNS)}")
     if count is not None and count[1] != len(rows):
         raise count[0].error("count", count[1], f"{len(rows)}, the number of rows in the file")
-    surfaces = _surfaces(file, rows, 2.0 if given.semi_diameters else 1.0)
-    if given.gap_before:
+    surfaces = _surfaces(file, rows, 2.0 if options.semi_diameters else 1.0)
+    if options.gap_before:
         gaps = [s.thickness_mm for s in surfaces[1:]] + [0.0]
         surfaces = [replace(s, thickness_mm=gap) for s, gap in zip(surfaces, gaps, strict=True)]
     draft = Draft(
@@ -74,7 +74,7 @@ def read_table(path: str | Path, given: Given | None = None) -> Lens:
         notes=comments,
         film_given=surfaces[-1].thickness_mm != 0,
     )
-    return lens_of(draft, given)
+    return lens_of(draft, options)
 
 
 def looks_like_table(head: str) -> bool:
@@ -107,7 +107,7 @@ def _surfaces(file: str, rows: Sequence[tuple[Line, list[float]]], factor: float
     return surfaces
 
 
-def read_flaresim(path: str | Path, given: Given | None = None) -> Lens:
+def read_flaresim(path: str | Path, options: ReadOptions | None = None) -> Lens:
     """The lens of a .lens file.
 
     Raises:
@@ -142,7 +142,7 @@ def read_flaresim(path: str | Path, given: Given | None = None) -> Lens:
     draft.notes = [note for note in draft.notes if any(map(str.isalpha, note)) and "ior" not in note]
     draft.rows = tuple(Row(s, aperture=not s.stop) for s in rows)
     draft.film_given = bool(rows) and rows[-1].thickness_mm != 0
-    return lens_of(draft, given)
+    return lens_of(draft, options)
 
 
 def looks_like_flaresim(head: str) -> bool:

@@ -16,7 +16,7 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.lens import catalogue
 from neurolens.lens.prescription import Lens
-from neurolens.readers.draft import Draft, Given, Row, lens_of, primary_first
+from neurolens.readers.draft import Draft, ReadOptions, Row, lens_of, primary_first
 from neurolens.readers.glasses import named_glass
 from neurolens.readers.source import MAX_SURFACES, Line, assume, read_lines, warn
 from neurolens.readers.zemax_model import (
@@ -133,7 +133,7 @@ SURFACE = (
 )
 
 
-def read_zmx(path: str | Path, given: Given | None = None) -> Lens:
+def read_zmx(path: str | Path, options: ReadOptions | None = None) -> Lens:
     """The lens of a Zemax file.
 
     Raises:
@@ -148,7 +148,7 @@ def read_zmx(path: str | Path, given: Given | None = None) -> Lens:
     if len(file.blocks) < 3:
         raise InputError(file.file, "SURF", f"({len(file.blocks)} surfaces)", "object, at least one surface, and image")
     _complete(file)
-    return lens_of(file, given)
+    return lens_of(file, options)
 
 
 def looks_like_zmx(head: str) -> bool:

@@ -25,7 +25,7 @@ from neurolens.base.records import plain
 from neurolens.cameras.model import load_model
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import kind_of, read_any
-from neurolens.readers.draft import Given
+from neurolens.readers.draft import ReadOptions
 from neurolens.readers.glasses import more_glasses
 from neurolens.setting.check import check_lens
 from neurolens.setting.states import set_lens
@@ -172,7 +172,7 @@ def _read(file: Path, settings: SurveySettings) -> tuple[Lens, list[str]]:
         if error.field != "diameter":  # as `rims.with_derived_rims` names a missing field
             raise
     half = settings.half_field_deg
-    lens = read_any(file, Given(half_field_deg=half))
+    lens = read_any(file, ReadOptions(half_field_deg=half))
     return lens, [f"neither rims nor a field are given: a half field of {half:g} degrees is assumed for the rims"]
 
 

@@ -15,17 +15,17 @@ from neurolens.lens import catalogue
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any
-from neurolens.readers.draft import Given
+from neurolens.readers.draft import ReadOptions
 
 CASES = Path(__file__).parents[3] / "shared" / "data" / "cases"
 needs_cases = pytest.mark.skipif(not CASES.exists(), reason="../shared/data/cases is not here")
 
 
-def heard(path: Path, given: Given | None = None) -> tuple[Lens, str]:
+def heard(path: Path, options: ReadOptions | None = None) -> tuple[Lens, str]:
     """The lens of a file, and all warnings in one text."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        lens = read_any(path, given)
+        lens = read_any(path, options)
     return lens, "\n".join(str(w.message) for w in caught)
 
 

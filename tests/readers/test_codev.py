@@ -14,7 +14,7 @@ from neurolens.lens import catalogue
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.readers.codev import read_seq
-from neurolens.readers.draft import Given
+from neurolens.readers.draft import ReadOptions
 from neurolens.readers.forbes import qbfs_terms, qcon_terms
 
 TEXT = """\
@@ -44,10 +44,10 @@ def swapped(old: str, new: str, text: str = TEXT) -> str:
     return swapped_in(old, new, text)
 
 
-def read(text: str, tmp_path: Path, given: Given | None = None) -> Lens:
+def read(text: str, tmp_path: Path, options: ReadOptions | None = None) -> Lens:
     path = tmp_path / "lens.seq"
     path.write_text(text)
-    return read_seq(path, given)
+    return read_seq(path, options)
 
 
 @pytest.mark.parametrize("text", [TEXT, TEXT.lower(), TEXT.replace("\n", "\r\n")])

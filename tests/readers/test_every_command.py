@@ -220,9 +220,9 @@ def test_what_a_file_lacks_is_asked_of_convert(tessar: Lens, tmp_path: Path) -> 
     with pytest.raises(InputError, match=r"neurolens convert FILE --f-number \.\.\. -o LENS\.toml"):
         read_any(file)
     with pytest.raises(InputError) as plain:
-        read_any(file, any_format.Given())
+        read_any(file, any_format.ReadOptions())
     assert "convert" not in str(plain.value)
-    assert read_any(file, any_format.Given(f_number=8.0)).f_number == 8
+    assert read_any(file, any_format.ReadOptions(f_number=8.0)).f_number == 8
 
 
 def test_one_file_is_warned_of_once_in_a_command(files: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,7 +18,7 @@ from neurolens.cli import main
 from neurolens.lens.paraxial import system_of
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any
-from neurolens.readers.draft import Given
+from neurolens.readers.draft import ReadOptions
 from neurolens.readers.lensfile import read_lens
 from neurolens.readers.source import MAX_BYTES
 
@@ -87,10 +87,10 @@ TEXTS = {suffix: write(CONSTANT if suffix in NO_DISPERSION else GAUSS) for suffi
 THICKNESS = repr(GAUSS.surfaces[0].thickness_mm)
 
 
-def read_text(text: str | bytes, suffix: str, tmp_path: Path, given: Given | None = None) -> Lens:
+def read_text(text: str | bytes, suffix: str, tmp_path: Path, options: ReadOptions | None = None) -> Lens:
     path = tmp_path / f"lens{suffix}"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    return read_any(path, given)
+    return read_any(path, options)
 
 
 @pytest.mark.parametrize("suffix", WRITERS)
@@ -153,9 +153,9 @@ def test_without_a_stop_the_rim_that_limits_the_axial_beam_is_taken(suffix: str,
     first = "1" if suffix in (".zmx", ".seq", ".len") else "0"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        assert read_text(text, suffix, tmp_path, Given(stop=first)).stop_index == 0
+        assert read_text(text, suffix, tmp_path, ReadOptions(stop=first)).stop_index == 0
     with pytest.raises(InputError, match="--stop: got '99', expected the number of a surface in the file"):
-        read_text(text, suffix, tmp_path, Given(stop="99"))
+        read_text(text, suffix, tmp_path, ReadOptions(stop="99"))
 
 
 def _without_stop(suffix: str) -> str:

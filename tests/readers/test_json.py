@@ -11,7 +11,7 @@ from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any
-from neurolens.readers.draft import Given
+from neurolens.readers.draft import ReadOptions
 from neurolens.readers.json_lens import read_json_lens
 
 SHARED = sorted((Path(__file__).parents[3] / "shared" / "data" / "lenses").glob("*.json"))
@@ -26,10 +26,10 @@ def singlet(**changes: Any) -> dict[str, Any]:
     return {"name": "singlet", "source": "a book, p. 1", "f_number": 6, "surfaces": rows, **changes}
 
 
-def read(data: object, tmp_path: Path, given: Given | None = None, **more: Any) -> Lens:
+def read(data: object, tmp_path: Path, options: ReadOptions | None = None, **more: Any) -> Lens:
     path = tmp_path / "lens.json"
     path.write_text(data if isinstance(data, str) else json.dumps(data))
-    return read_json_lens(path, given, **more)
+    return read_json_lens(path, options, **more)
 
 
 @pytest.mark.skipif(not SHARED, reason="../shared/data is not here")
@@ -118,8 +118,8 @@ def test_rims_of_doubtful_origin_are_marked(tmp_path: Path) -> None:
 def test_an_f_number_that_is_not_stated(tmp_path: Path) -> None:
     data = first_order(read(singlet(), tmp_path))
     assert read(singlet(f_number=None), tmp_path).f_number == pytest.approx(data.f_number)
-    assert read(singlet(f_number=None), tmp_path, Given(f_number=7.0)).f_number == 7.0
-    assert read(singlet(), tmp_path, Given(f_number=7.0)).f_number == 6.0
+    assert read(singlet(f_number=None), tmp_path, ReadOptions(f_number=7.0)).f_number == 7.0
+    assert read(singlet(), tmp_path, ReadOptions(f_number=7.0)).f_number == 6.0
 
 
 @pytest.mark.parametrize(
@@ -178,7 +178,7 @@ def test_text_that_is_no_prescription(text: str, message: str, tmp_path: Path) -
 
 def test_units_are_millimetres(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--units"):
-        read(singlet(), tmp_path, Given(units="in"))
+        read(singlet(), tmp_path, ReadOptions(units="in"))
 
 
 N, RADIUS = 1.5, 50.0

@@ -11,7 +11,7 @@ from neurolens.base.errors import AssumedWarning, InputError, NeurolensWarning
 from neurolens.lens import catalogue
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.readers.draft import Given
+from neurolens.readers.draft import ReadOptions
 from neurolens.readers.oslo import read_len
 from neurolens.readers.tables import read_table
 
@@ -55,10 +55,10 @@ END  3
 """
 
 
-def read(text: str, suffix: str, tmp_path: Path, given: Given | None = None) -> Lens:
+def read(text: str, suffix: str, tmp_path: Path, options: ReadOptions | None = None) -> Lens:
     path = tmp_path / f"lens{suffix}"
     path.write_text(text)
-    return read_len(path, given) if suffix == ".len" else read_table(path, given)
+    return read_len(path, options) if suffix == ".len" else read_table(path, options)
 
 
 @pytest.mark.parametrize("count", ["", "3\n"])
@@ -74,7 +74,7 @@ def test_table_by_the_lensmakers_formula(count: str, tmp_path: Path) -> None:
 
 
 def test_the_users_word_where_a_table_says_nothing(tmp_path: Path) -> None:
-    given = Given(name="mine", source="a book", f_number=4.9, units="in")
+    given = ReadOptions(name="mine", source="a book", f_number=4.9, units="in")
     lens = read(TABLE, ".dat", tmp_path, given)
     assert (lens.name, lens.source, lens.f_number) == ("mine", "a book", 4.9)
     assert first_order(lens).efl_mm == pytest.approx(25.4 * EFL_MM)
@@ -84,7 +84,7 @@ def test_the_users_word_where_a_table_says_nothing(tmp_path: Path) -> None:
 def test_semi_diameters_and_gaps_in_front(tmp_path: Path) -> None:
     lens = read(TABLE, ".dat", tmp_path)
     rows = "0 0 0 5\n50 4.0 1.5 10\n-50 5.0 1 10\n"
-    other = read(rows, ".txt", tmp_path, Given(gap_before=True, semi_diameters=True))
+    other = read(rows, ".txt", tmp_path, ReadOptions(gap_before=True, semi_diameters=True))
     assert other.surfaces == lens.surfaces
 
 

@@ -14,7 +14,7 @@ from neurolens.base.errors import AssumedWarning, InputError, NeurolensWarning
 from neurolens.lens import catalogue
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.readers.draft import Given
+from neurolens.readers.draft import ReadOptions
 from neurolens.readers.zemax import read_zmx
 
 HEAD = """\
@@ -74,10 +74,10 @@ def swapped(old: str, new: str, text: str = HEAD + BODY + TAIL) -> str:
     return swapped_in(old, new, text)
 
 
-def read(text: str, tmp_path: Path, given: Given | None = None, encoding: str = "utf-8") -> Lens:
+def read(text: str, tmp_path: Path, options: ReadOptions | None = None, encoding: str = "utf-8") -> Lens:
     path = tmp_path / "lens.zmx"
     path.write_text(text, encoding=encoding)
-    return read_zmx(path, given)
+    return read_zmx(path, options)
 
 
 def test_a_model_glass_s_partial_dispersion_is_told(tmp_path: Path) -> None:
@@ -131,8 +131,8 @@ def test_units_scale_every_length(tmp_path: Path) -> None:
     inches = read(swapped("UNIT MM", "UNIT IN"), tmp_path)
     assert inches == mm.scaled(25.4)
     with pytest.raises(InputError, match="--units"):
-        read(HEAD + BODY + TAIL, tmp_path, Given(units="cm"))
-    assert read(swapped("UNIT MM X W X CM MR CPMM\n", ""), tmp_path, Given(units="in")) == inches
+        read(HEAD + BODY + TAIL, tmp_path, ReadOptions(units="cm"))
+    assert read(swapped("UNIT MM X W X CM MR CPMM\n", ""), tmp_path, ReadOptions(units="in")) == inches
 
 
 def test_a_q_type_asphere_says_how_its_rows_were_taken(tmp_path: Path) -> None:
@@ -371,7 +371,7 @@ def test_rims_that_are_not_given_are_derived_for_the_field(tmp_path: Path) -> No
     without = swapped("YFLN 0 2.5 4 9", "YFLN 0 0 0 0", swapped("XFLN 0 0 3 9", "XFLN 0 0 0 0", text))
     with pytest.raises(InputError, match=r"not given for surface 2 of the file.*--half-field"):
         read(without, tmp_path)
-    assert read(without, tmp_path, Given(half_field_deg=5.0)).surfaces == lens.surfaces
+    assert read(without, tmp_path, ReadOptions(half_field_deg=5.0)).surfaces == lens.surfaces
     assert math.isfinite(lens.surfaces[1].diameter_mm)
 
 
