@@ -32,6 +32,7 @@ from neurolens.base.records import plain
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.onnxlens import load_model
+from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.renderer import render
 from neurolens.render.scene import CameraSettings, Scene, files_named, load_scene
@@ -60,9 +61,9 @@ def scene_cameras(shot: CameraSettings) -> tuple[dict[str, Camera], ExactCamera]
     fused = scenes.scene_cameras(lens, domain, {"mlp-16x2": files["mlp-16x2"]}, shot, fused=True)
     cameras = {EXACT: plain[EXACT], **{name: plain[name] for name in files}}
     cameras |= {"fused mlp-16x2": fused["mlp-16x2"], FUSED_EXACT: fused[EXACT], THIN: plain[THIN]}
-    settings = {name: plain[EXACT].settings[name] for name in ("focus_m", "f_number")}
-    film, light = plain[EXACT].film_mm, shot.wavelengths_nm
-    truth = ExactCamera(lens, dtype="float64", film_mm=film, wavelength_nm=light, bounds=domain.bounds, **settings)
+    focus_m, f_number = (plain[EXACT].settings[name] for name in ("focus_m", "f_number"))
+    real = Shot(plain[EXACT].film_mm, focus_m, f_number, wavelength_nm=shot.wavelength_nm)
+    truth = ExactCamera(lens, real, dtype="float64", bounds=domain.bounds)
     return cameras, truth
 
 
@@ -220,7 +221,7 @@ def measure_scene(file: Path, run: Path, counts: Counts, threads: int, report: l
     film = replace(scene.settings.film, wavelengths="one")  # for every camera: they share their random numbers
     shelves = {name: Shelf(run, file, scene, name, c, film, counts.size) for name, c in cameras.items()}
     halves, rendered = _render(shelves, counts, threads, report)
-    maps = {name: film_map(truth, c, wavelengths_nm=shot.wavelengths_nm) for name, c in cameras.items()}
+    maps = {name: film_map(truth, c, wavelengths_nm=shot.wavelength_nm) for name, c in cameras.items()}
     reference = (halves[0] + halves[1]) / 2
     by = {measure: weights(reference, eps) for measure, eps in MEASURES.items()}
     found = {

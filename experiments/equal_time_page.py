@@ -295,7 +295,7 @@ def _film_maps(result: SceneResult, path: Path, title: str) -> None:
     rows = -(-count // columns)
     with drawing(path, 4.0 * columns, 0.7 + 2.3 * rows, title, note) as figure:
         places = figure.subplots(rows, columns, squeeze=False).ravel()
-        across, up = result.settings.film_width_mm / 2, result.settings.film_height_mm / 2
+        across, up = result.settings.film_mm[0] / 2, result.settings.film_mm[1] / 2
         for axes, (name, camera) in zip(places, result.cameras.items(), strict=False):
             film = camera.film
             shown = axes.imshow(film.median_um, cmap="magma", vmin=0, extent=(-across, across, -up, up))

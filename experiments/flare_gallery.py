@@ -72,7 +72,7 @@ PICTURES = (
         "ghosts, the star of six blades, and a veil about the sun, by 63 million photons. The plate is by "
         "the thin lens whose focal length images the sun at the same place.",
         (
-            f"neurolens render {_SUN} --camera thin:{_RETRO} --efl 23.9 --channels beauty -o OUT/sun.exr",
+            f"neurolens render {_SUN} --camera thin:{_RETRO} --focal-length 23.9 --channels beauty -o OUT/sun.exr",
             f"{_OF_SUN} --f-number 8 --coating single-layer --starburst --width 1280 -o OUT/sun-flare.exr",
             f"{_OF_SUN} --f-number 8 --coating single-layer --without ghosts --dust 0.02 --glare 4194304 --kernel 24 "
             "--width 640 -o OUT/veil.exr",

@@ -16,7 +16,8 @@ import numpy as np
 
 from experiments import lab
 from neurolens.base.progress import Progress
-from neurolens.cameras.build import FUSED, Shot, make_camera
+from neurolens.cameras.build import FUSED, make_camera
+from neurolens.lens.shot import Shot
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene
 from neurolens.study.image import Image, to_srgb
@@ -90,7 +91,7 @@ def picture_of(lens: Lens, size: tuple[int, int], samples: int, report: lab.Repo
     back = (position - target) / np.linalg.norm(position - target) * (focus_m - settings.focus_m)
     film_mm = (lens.film_height_mm * 16 / 9 / lens.squeeze, lens.film_height_mm)
     focus: Any = "internal" if internal else "best"
-    shot = Shot(film_mm, focus_m, lens.f_number, efl_mm=None if internal else 50.0, focus=focus)
+    shot = Shot(film_mm, focus_m, lens.f_number, focal_length_mm=None if internal else 50.0, focus_mode=focus)
     camera = make_camera(lens.camera if lens.camera == "thin" else f"{FUSED}{lens.camera}", shot)
     moved = replace(settings, position_m=tuple(position + back))
     scene = replace(scene, settings=replace(scene.settings, camera=moved))

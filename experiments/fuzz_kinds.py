@@ -376,7 +376,7 @@ def shorten() -> None:
     def field(shots: flare_run.Shots, args: argparse.Namespace, *rest: Any) -> Any:
         if args.file != Path("good.toml"):
             return field_of(shots, args, *rest)
-        key = args.film, args.focus, args.f_number, args.zoom, args.efl, args.field, args.focusing
+        key = args.film, args.focus_m, args.f_number, args.zoom, args.focal_length_mm, args.field_deg, args.focus_mode
         if key not in fields:
             fields[key] = field_of(shots, args, *rest)
         return fields[key]

@@ -25,6 +25,7 @@ from experiments import lab
 from experiments.lab import Row
 from experiments.promises import read_index
 from neurolens import __version__
+from neurolens.base.bounds import RANGE
 from neurolens.base.config import read_config
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_path, atomic_write_text, fingerprint_of, sha256_of, write_json
@@ -75,8 +76,9 @@ class Entry:
     def state(self) -> str:
         """Name of the lens and its state, as model files carry it."""
         c = self.lens
-        parts = [c.file.stem, c.configuration or "", f"{c.efl_mm:g}mm" if c.efl_mm else "", c.zoom or ""]
-        parts += ["internal"] if c.focusing == "internal" else []
+        size = f"{c.focal_length_mm:g}mm" if c.focal_length_mm else ""
+        parts = [c.file.stem, str(c.state or ""), size, RANGE if c.zoom == RANGE else ""]
+        parts += ["internal"] if c.focus_mode == "internal" else []
         return "-".join(p for p in parts if p)
 
     def file(self, settings: ModelSettings) -> str:
@@ -277,7 +279,8 @@ def fingerprint(entry: Entry, pairs: PairSettings) -> str:
     """
     c, lens = entry.lens, entry.lens.read()
     glass = [lens.sha256, lens.stop_radius_mm, lens.image_radius_mm]
-    state = [*glass, c.efl_mm, c.configuration, c.f_number, c.zoom, c.focusing]
+    zoom = RANGE if c.zoom == RANGE else None
+    state = [*glass, c.focal_length_mm, c.state, c.f_number, zoom, c.focus_mode]
     models = [asdict(m) for m in entry.models]
     return fingerprint_of([__version__, state, asdict(entry.domain), models, entry.best, asdict(pairs)])
 
@@ -386,8 +389,8 @@ def _row(entry: Entry, lens: Lens, domain: Domain, m: Measured) -> Row:
         "file": entry.file(m.settings),
         "sha256": sha256_of(m.file),
         "lens": lens.name,
-        "configuration": entry.lens.configuration,
-        "efl_mm": entry.lens.efl_mm,
+        "configuration": entry.lens.state,
+        "efl_mm": entry.lens.focal_length_mm,
         "model": m.settings.label,
         "wavelength_nm": list(domain.wavelength_nm),
         "focus_m": ["inf" if f == float("inf") else f for f in domain.focus_m],
@@ -423,7 +426,7 @@ def _make_of_many_states(entry: Entry, library: Library, out: Path, progress: Pr
                 "file": f"{entry.state}.{settings.label}.onnx",
                 "sha256": sha256_of(file),
                 "lens": space.lens.name,
-                "configuration": entry.lens.configuration,
+                "configuration": entry.lens.state,
                 "efl_mm": None,
                 "model": settings.label,
                 "axes": [axis.to_dict() for axis in space.axes],

@@ -167,7 +167,7 @@ class Bench:
 
     @property
     def name(self) -> str:
-        return "-".join(part for part in (lens_id_of(self.choice.file), self.choice.configuration) if part)
+        return "-".join(part for part in (lens_id_of(self.choice.file), str(self.choice.state or "")) if part)
 
     @cached_property
     def lens(self) -> Lens:

@@ -136,7 +136,7 @@ def rows(model: Path, settings: Settings) -> list[Row]:
     ]
     # Natural vignetting of the pinhole, [size, size, 1], which Mitsuba's has not.
     place = (np.arange(settings.size) + 0.5) / settings.size - 0.5
-    tangent2 = (place[:, None] ** 2 + place[None, :] ** 2) * (pinhole.film_mm[0] / pinhole.focal_mm) ** 2
+    tangent2 = (place[:, None] ** 2 + place[None, :] ** 2) * (pinhole.film_mm[0] / pinhole.focal_length_mm) ** 2
     cos4 = ((1 + tangent2) ** -2.0).astype(np.float32)[..., None]
     for variant in VARIANTS:
         try:
@@ -278,7 +278,7 @@ def _stage_of(function: Function) -> str | None:
 def thin_camera(scene: Scene) -> ThinLens:
     """A 50 mm thin lens with the scene's focus and stop."""
     settings = scene.settings.camera
-    film_mm = (settings.film_width_mm, settings.film_height_mm)
+    film_mm = settings.film_mm
     return ThinLens(50.0, settings.f_number or 2.8, settings.focus_m, film_mm)
 
 

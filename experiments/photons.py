@@ -72,7 +72,7 @@ class Row:
 
 def run(args: argparse.Namespace) -> int:
     """Trace the cases, write the tables; 1 where the goal is missed."""
-    lens = lab.lens_of(LENS, zoom=ZOOM, focus_m=DISTANCE_MM / 1000, focus="best")
+    lens = lab.lens_of(LENS, zoom=ZOOM, focus_m=DISTANCE_MM / 1000, focus_mode="best")
     tracer, rows, progress = PhotonTracer(lens), [], Progress(quiet=args.quiet)
     cases = [(*case, args.photons) for case in CASES] + [(*at, 10, "12 to 15 h", 2 * args.photons) for at in TWICE]
     for x, y, most, his, count in cases:

@@ -55,7 +55,7 @@ def fresh_places(scene: Scene, exact: Camera, rgb: Array, across: int = 22, seed
     """Places at random in the cells of a grid, `across` along the width, at the centroids of fifths of the range of the
     light, whose picture has this mean colour."""
     shot = scene.settings.camera
-    film = np.array([shot.film_width_mm, shot.film_height_mm])
+    film = np.array([shot.film_mm])
     cells = across, max(round(across * film[1] / film[0]), 1)
     index = np.stack(np.meshgrid(*(np.arange(n) for n in cells))).reshape(2, -1)
     points = ((index + np.random.default_rng(seed).random(index.shape)) / np.array(cells)[:, None] - 0.5) * film[
@@ -159,7 +159,7 @@ def rendered(
 ) -> NDArray[np.float64]:
     """Renders [seeds, K, side, side, 3] of pieces of the picture."""
     shot = scene.settings.camera
-    pieces = Pieces(camera, centre_mm, side_px * shot.film_width_mm / shot.width)
+    pieces = Pieces(camera, centre_mm, side_px * shot.film_mm[0] / shot.width)
     count = centre_mm.shape[1]
     pictures = []
     for seed in range(seeds):

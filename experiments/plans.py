@@ -20,12 +20,13 @@ import numpy as np
 
 from experiments import lab, plan_errors
 from neurolens.base.progress import Report
-from neurolens.cameras.build import Shot, ideal_as, make_camera
+from neurolens.cameras.build import ideal_as, make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.warped import Warped
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
+from neurolens.lens.shot import Shot
 from neurolens.plan import footprints as prints
 from neurolens.plan import plan as plans
 from neurolens.plan import shot_fits
@@ -105,8 +106,8 @@ def suited(scene: Scene, lens: Lens, f_number: float | None = None, focus_m: flo
     widest = first_order(lens).f_number
     asked = f_number or (0.0 if scene.name == "lights" else shot.f_number or widest)
     camera = replace(
-        shot, position_m=(x, y, z), focus_m=focus, f_number=max(asked, widest), film_width_mm=across,
-        film_height_mm=across * 9 / 16, width=_WIDTH, height=_WIDTH * 9 // 16,
+        shot, position_m=(x, y, z), focus_m=focus, f_number=max(asked, widest), film_mm=(across, across * 9 / 16),
+        width=_WIDTH, height=_WIDTH * 9 // 16,
     )  # fmt: skip
     return replace(scene, settings=replace(scene.settings, camera=camera))
 
@@ -121,7 +122,13 @@ def measure_case(case: Case, folder: Path, report: Report) -> dict[str, Any]:
     found = probe(scene, lens)
     probe_s = time.process_time() - began
     asked = found.asked
-    shot = Shot(asked.film_mm, asked.focus_m, asked.f_number, zoom=case.state, wavelength_nm=asked.wavelength_nm)
+    shot = Shot(
+        asked.shot.film_mm,
+        asked.shot.focus_m,
+        asked.f_number,
+        zoom=case.state,
+        wavelength_nm=asked.shot.wavelength_nm,
+    )
     compiled = "fused:" if found.exact.runtime == "c" else ""
     exact = make_camera(
         f"{compiled}{lens.path}", shot
@@ -214,23 +221,23 @@ def _held(choice: plans.Choice, found: Probed, state: str | None, exact: Any) ->
     """The camera that a plan names; of a model within the outline of the exact lens's pupil, see `plans._model`."""
     if not choice.camera.endswith(".onnx"):
         return camera_of(choice, found, state)
-    return OnnxCamera(load_model(choice.camera.rpartition(":")[2]), **plans._real(found), outline=exact.film.outline)
+    return OnnxCamera(load_model(choice.camera.rpartition(":")[2]), found.asked.shot, outline=exact.film.outline)
 
 
 def camera_of(choice: plans.Choice, found: Probed, state: str | None, smooth: bool = False) -> Camera:
     """The camera that a plan names, as a render makes it; with `smooth`, a warped picture by tables of the field."""
     asked = found.asked
-    shot = Shot(asked.film_mm, asked.focus_m, asked.f_number, wavelength_nm=asked.wavelength_nm)
+    shot = Shot(asked.shot.film_mm, asked.shot.focus_m, asked.f_number, wavelength_nm=asked.shot.wavelength_nm)
     if choice.camera.endswith(".onnx"):
         return make_camera(choice.camera, shot)
     if "ST map" not in choice.name:
         return make_camera(choice.camera, replace(shot, zoom=state))
-    flat = ideal_as(f"{choice.name.partition(' ')[0]}:", found.exact.lens, Shot(asked.film_mm, asked.focus_m))
-    return Warped(flat, found.exact, asked.focus_m, tables=smooth)
+    flat = ideal_as(f"{choice.name.partition(' ')[0]}:", found.exact.lens, Shot(asked.shot.film_mm, asked.shot.focus_m))
+    return Warped(flat, found.exact, asked.shot.focus_m, tables=smooth)
 
 
 def _thin(found: Probed) -> Camera:
-    return ideal_as("thin:", found.exact.lens, Shot(found.asked.film_mm, found.asked.focus_m))
+    return ideal_as("thin:", found.exact.lens, Shot(found.asked.shot.film_mm, found.asked.shot.focus_m))
 
 
 def _counted(value: Any) -> float:

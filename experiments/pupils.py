@@ -26,6 +26,7 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.lens.prescription import Lens
+from neurolens.lens.shot import Shot
 from neurolens.plan.costs import cycles_ns
 from neurolens.setting.pupils import pupil_bounds
 from neurolens.shaders.blender_shader import lens_of
@@ -83,7 +84,7 @@ SampleFunction = Callable[[Any, Any, Any], tuple[Any, Any]]
 def camera_of(case: Case) -> ExactCamera:
     """The lens of a case on `FILM_MM`, focused at infinity."""
     lens = lab.lens_of(case.lens, focal_length_mm=case.focal_length_mm, f_number=case.f_number)
-    return ExactCamera(lens, film_mm=FILM_MM, focus_m=math.inf)
+    return ExactCamera(lens, Shot(FILM_MM, math.inf))
 
 
 def measure(case: Case, samples: int = SAMPLES) -> lab.Row:

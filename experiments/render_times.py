@@ -26,9 +26,10 @@ from neurolens.analysis.plot_style import INK, drawing
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
-from neurolens.cameras.build import FUSED, Shot, make_camera
+from neurolens.cameras.build import FUSED, make_camera
 from neurolens.cameras.contract import RAYS_A_CALL, Camera
 from neurolens.lens.apertures import Aperture
+from neurolens.lens.shot import Shot, StopShape
 from neurolens.render.images import make_aperture
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene, load_scene
@@ -245,7 +246,7 @@ class Shape:
 def shapes() -> list[Shape]:
     """The round stop, 5 and 50 straight edges, a star and a heart."""
     made = {f"{n} edges": Aperture(blades=n) for n in (5, 50)}
-    masks = {name: make_aperture(mask=_MASKS / f"{name}.png") for name in ("star", "heart")}
+    masks = {name: make_aperture(StopShape(aperture_mask=_MASKS / f"{name}.png")) for name in ("star", "heart")}
     return [Shape("round", None), *(Shape(name, aperture) for name, aperture in (made | masks).items())]
 
 

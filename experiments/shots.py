@@ -81,7 +81,7 @@ def measure_lens(name: str, folder: Path, report: Report) -> dict[str, Any]:
         found = probe(scene, lens)
         shipped = _measured(found, lab.MODELS / f"{name}.ols-{terms}.onnx", terms)
         own = _smallest(found, shipped, folder)
-        facts = {"shot": sitting.name, "f_number": found.asked.f_number, "focus_m": found.asked.focus_m}
+        facts = {"shot": sitting.name, "f_number": found.asked.f_number, "focus_m": found.asked.shot.focus_m}
         shots.append(facts | {"shipped": asdict(shipped), "own": asdict(own)})
         report((number + 1) / len(SITTINGS))
     return {"lens": name, "shots": shots}
@@ -104,9 +104,7 @@ def _smallest(found: Probed, shipped: Model, folder: Path) -> Model:
 
 
 def _onnx(found: Probed, file: Path, runtime: Runtime = "onnxruntime") -> OnnxCamera:
-    keys = ("film_mm", "focus_m", "f_number", "wavelength_nm")
-    shot: dict[str, Any] = {key: getattr(found.asked, key) for key in keys}
-    return OnnxCamera(load_model(file), runtime=runtime, **shot)
+    return OnnxCamera(load_model(file), found.asked.shot, runtime=runtime)
 
 
 def _errors(found: Probed, camera: OnnxCamera) -> tuple[float, float]:

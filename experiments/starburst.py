@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
 def lens_at(f_number: float, aperture: Aperture | None = None) -> Lens:
     """The lens, focused at infinity."""
     lens = read_lens(lab.LENSES / f"{LENS}.toml").with_aperture(aperture)
-    return set_lens(lens, f_number=f_number, focus_m=math.inf, focus="best")
+    return set_lens(lens, f_number=f_number, focus_m=math.inf, focus_mode="best")
 
 
 def _pupil(f_number: float, aperture: Aperture | None = None) -> tuple[ExitPupil, list[Array]]:

@@ -20,6 +20,7 @@ from neurolens.base.errors import NeurolensWarning
 from neurolens.cameras.exact import ExactCamera
 from neurolens.lens import paraxial
 from neurolens.lens.prescription import Lens, Surface
+from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
 from neurolens.surrogates.cardkeys import CARD_KEY, MODEL_KEY
@@ -67,7 +68,7 @@ def domain(name: str = GAUSS) -> Domain:
 @cache
 def exact_camera(focus_m: float, f_number: float | None) -> ExactCamera:
     """The traced lens on 36 x 24 mm, in the bounds of `domain`: the search for its outline takes a second."""
-    return ExactCamera(lens(), film_mm=(36.0, 24.0), focus_m=focus_m, f_number=f_number, bounds=domain().bounds)
+    return ExactCamera(lens(), Shot((36.0, 24.0), focus_m, f_number), bounds=domain().bounds)
 
 
 @cache

@@ -237,7 +237,7 @@ KEYS = "frame,focus,f-number,position\n1,,2,0/0.5/5\n2,1,,\n3,,8,1/0.5/5\n4,inf,
 
 def test_keys_of_files(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """CSV and JSON say what the same keys do on the command line; an error names the file, the row and the column."""
-    args = argparse.Namespace(frames=range(1, 6), focus=None, f_number=None, position_m=None)
+    args = argparse.Namespace(frames=range(1, 6), focus_m=None, f_number=None, position_m=None)
     words = ["focus=2:1,4:inf", "f-number=1:2,3:8", "position=1:0/0.5/5,3:1/0.5/5"]
     csv, js = tmp_path / "keys.csv", tmp_path / "keys.JSON"
     csv.write_text(KEYS)

@@ -97,7 +97,7 @@ def test_the_picture_keeps_the_state_of_its_lens(
     state = ("--zoom", "100", "--focusing", "internal", "--focus", "2")
     run_json(capsys, "render", scene, "--camera", NIKON, "-o", out, "--quiet", *state)
     camera = read_exr(out)[1]["camera"]
-    assert (camera["zoom"], camera["focusing"], camera["rims"]) == ("100", "internal", "derived")
+    assert (camera["zoom"], camera["focus_mode"], camera["rims"]) == ("100", "internal", "derived")
     assert "100 mm" in camera["derived"]
 
 

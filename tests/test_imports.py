@@ -26,7 +26,7 @@ PARTS = {
     "cameras": "graph lens trace setting readers surrogates",
     "shaders": "graph lens trace setting readers surrogates cameras",
     "render": "lens cameras",
-    "mitsuba": "cameras render",
+    "mitsuba": "lens cameras render",
     "flare": "graph lens trace analysis surrogates cameras render",
     "study": "graph lens trace setting readers analysis surrogates cameras render",
     "plan": "graph lens setting analysis surrogates cameras shaders render flare study",

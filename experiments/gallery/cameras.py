@@ -31,6 +31,8 @@ from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.vignetting import Vignetted
 from neurolens.lens.paraxial import film_z_mm, first_order
 from neurolens.lens.prescription import Lens, Surface
+from neurolens.lens.shot import Shot as CameraShot
+from neurolens.lens.shot import StopShape
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.images import make_aperture
 from neurolens.render.scene import Scene
@@ -65,7 +67,7 @@ class Shot:
 
     @property
     def wavelength_nm(self) -> tuple[float, float]:
-        return self.scene.settings.camera.wavelengths_nm
+        return self.scene.settings.camera.wavelength_nm
 
 
 @dataclass(frozen=True)
@@ -88,15 +90,15 @@ def shot_of(panel: Panel, scene: Scene) -> Shot:
         warnings.simplefilter("ignore", NeurolensWarning)  # a lens of one wavelength is what the file asks for
         lens = set_lens(read_lens(panel.lens), focal_length_mm=panel.efl_mm, field_deg=panel.field_deg, zoom=panel.zoom)
     lens = widened(lens, panel.widen)
-    shape = make_aperture(panel.blades, panel.blade_rotation_deg, panel.blade_curvature, panel.aperture_mask)
+    shape = make_aperture(StopShape(panel.blades, panel.blade_rotation_deg, panel.blade_curvature, panel.aperture_mask))
     lens = lens.with_aperture(shape or scene.aperture or lens.aperture)
     focus_m = camera.focus_m if panel.focus_m is None else panel.focus_m
     f_number = panel.f_number or camera.f_number or float(first_order(lens).f_number)
-    lens = set_lens(lens, f_number=f_number, focus_m=focus_m, focus=panel.focusing)
+    lens = set_lens(lens, f_number=f_number, focus_m=focus_m, focus_mode=panel.focusing)
     assert lens.film_z_mm is not None  # `at` places the film
     film_z = float(lens.film_z_mm) + panel.film_offset_mm
     lens = replace(lens, infinity_mm=())  # groups that have moved to focus stay there
-    film_mm = panel.film_mm or (camera.film_width_mm, camera.film_height_mm)
+    film_mm = panel.film_mm or camera.film_mm
     placed, offset_mm = replace(lens, film_z_mm=film_z), film_z - film_z_mm(lens, focus_m)
     return Shot(panel, scene, placed, focus_m, f_number, film_mm, offset_mm)
 
@@ -262,20 +264,22 @@ class Window:
 def exact_camera(shot: Shot, surrogate: Surrogate | None, runtime: Runtime = "trace") -> Camera:
     """The prescription itself, sampled over the surrogate's pupil: the same rays for the same random numbers."""
     bounds = None if surrogate is None else surrogate.domain.bounds
-    return ExactCamera(replace(shot.lens, film_z_mm=None), bounds=bounds, runtime=runtime, **_settings(shot))
+    return ExactCamera(replace(shot.lens, film_z_mm=None), _settings(shot), bounds=bounds, runtime=runtime)
 
 
 def surrogate_camera(shot: Shot, surrogate: Surrogate | None, runtime: Runtime = "onnxruntime") -> Camera:
     """The exported model."""
     assert surrogate is not None
-    stop: Any = {"f_number": float(first_order(shot.lens).f_number), "aperture": shot.lens.aperture}
-    return OnnxCamera(load_model(surrogate.file), runtime=runtime, **stop, **_settings(shot))
+    stop = {"f_number": float(first_order(shot.lens).f_number), "aperture": shot.lens.aperture}
+    return OnnxCamera(load_model(surrogate.file), _settings(shot, **stop), runtime=runtime)
 
 
-def _settings(shot: Shot) -> dict[str, Any]:
-    """The settings that the exact lens and the model share."""
-    film = {"film_mm": shot.film_mm, "focus_m": shot.focus_m, "film_offset_mm": shot.offset_mm}
-    return film | {"wavelength_nm": shot.wavelength_nm, "focus": "paraxial"}
+def _settings(shot: Shot, **more: Any) -> CameraShot:
+    """The settings that the exact lens and the model share, and more."""
+    return CameraShot(
+        shot.film_mm, shot.focus_m, film_offset_mm=shot.offset_mm, wavelength_nm=shot.wavelength_nm,
+        focus_mode="paraxial", **more,
+    )  # fmt: skip
 
 
 def ideal_camera(kind: str, shot: Shot, surrogate: Surrogate | None) -> Camera:
@@ -285,7 +289,7 @@ def ideal_camera(kind: str, shot: Shot, surrogate: Surrogate | None) -> Camera:
     """
     offset = shot.panel.film_offset_mm
     lens = replace(shot.lens, film_z_mm=float(shot.lens.film_z_mm or 0) - offset)
-    return build.ideal_as(kind, lens, build.Shot(shot.film_mm, shot.focus_m, film_offset_mm=offset))
+    return build.ideal_as(kind, lens, CameraShot(shot.film_mm, shot.focus_m, film_offset_mm=offset))
 
 
 thin_camera = partial(ideal_camera, "thin:")

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 from neurolens.base.errors import InputError
 from neurolens.lens import paraxial
-from neurolens.lens.prescription import Focus, Lens
+from neurolens.lens.prescription import Lens
+from neurolens.lens.shot import FocusMode
 from neurolens.setting.pupils import image_radius_mm
 from neurolens.setting.states import set_lens
 
@@ -34,7 +35,7 @@ class Breath:
     working_f_number: float
 
 
-def breathing(lens: Lens, focus_m: Sequence[float], focus: Focus = "paraxial") -> list[Breath]:
+def breathing(lens: Lens, focus_m: Sequence[float], focus_mode: FocusMode = "paraxial") -> list[Breath]:
     """The lens, in the zoom position wanted, at several focus distances from object to film, `inf` allowed.
 
     With h the radius of the image circle at infinity focus (the film does not grow) and x' the film's distance behind
@@ -49,7 +50,7 @@ def breathing(lens: Lens, focus_m: Sequence[float], focus: Focus = "paraxial") -
     radius, _ = image_radius_mm(set_lens(lens))
     found = []
     for distance in focus_m:
-        state = set_lens(lens, focus_m=distance, focus=focus)
+        state = set_lens(lens, focus_m=distance, focus_mode=focus_mode)
         data = paraxial.first_order(state)
         assert state.film_z_mm is not None
         extension = state.film_z_mm - data.rear_focal_z_mm

@@ -92,6 +92,7 @@ def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: s
             `__post_init__` refuses.
     """
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
+    data = _with_new_names(fields, data, file, prefix)
     reject_unknown(file, prefix and f"{prefix}.", data, list(fields))
     hints = get_type_hints(cls)
     values: dict[str, Any] = {}
@@ -105,6 +106,22 @@ def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: s
         return cls(**values)
     except InputError as error:
         raise InputError(file, _join(prefix, error.field), error.value, error.expected) from None
+
+
+def _with_new_names(
+    fields: Mapping[str, dataclasses.Field[Any]], data: Mapping[str, Any], file: str | Path, prefix: str
+) -> Mapping[str, Any]:
+    """The data with keys that were renamed (the field's metadata `was`) under their new names."""
+    for name, field in fields.items():
+        for old in field.metadata.get("was", ()):
+            if old not in data:
+                continue
+            values = [data[key] for key in (name, old) if data.get(key, "none") != "none"]
+            if len(values) > 1:
+                raise InputError(file, _join(prefix, old), data[old], f"left out beside {name}, its new name")
+            rest = {key: value for key, value in data.items() if key not in (name, old)}
+            data = {**rest, name: values[0] if values else "none"}
+    return data
 
 
 def _join(prefix: str, name: str) -> str:

@@ -22,6 +22,7 @@ import re
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import field, fields, is_dataclass, replace
 from functools import partial
+from numbers import Real
 from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
@@ -61,7 +62,8 @@ def check_bounds(settings: Any, what: str) -> None:
     hints = get_type_hints(type(settings))
     for f in fields(settings):
         value, bounds = getattr(settings, f.name), f.metadata.get("within")
-        if bounds and value is not None and not bounds[0] <= value <= bounds[1]:
+        good = isinstance(value, Real) and not isinstance(value, bool) and bounds and bounds[0] <= value <= bounds[1]
+        if bounds and value is not None and not good:
             raise InputError(what, f.name, value, _expected(_kind(hints[f.name])[0], bounds, f.metadata["unit"]))
 
 
@@ -138,9 +140,20 @@ def _add(
             more["type"] = number(kind, good, _expected(kind, within, unit))
     if many:
         more["action"] = "append"
-    action = parser.add_argument(f"--{option or (match[1] if match else name).replace('_', '-')}", **more)
+    action = parser.add_argument(_option(name, option), **more)
     parser._option_string_actions.update({f"--{word}": action for word in old})
     return action
+
+
+def option_names(cls: type, names: Collection[str] = ()) -> dict[str, str]:
+    """The options of `add_options` by the attribute of the parsed arguments."""
+    every = [f for f in fields(cls) if f.metadata.get("about") is not None and (not names or f.name in names)]
+    return {_dest(f.name, f.metadata["option"]): _option(f.name, f.metadata["option"]) for f in every}
+
+
+def _option(name: str, option: str) -> str:
+    match = _UNIT.fullmatch(name)
+    return f"--{option or (match[1] if match else name).replace('_', '-')}"
 
 
 def _dest(name: str, option: str) -> str:
@@ -149,11 +162,12 @@ def _dest(name: str, option: str) -> str:
 
 
 def _kind(hint: Any) -> tuple[Any, bool]:
-    """The type of one value, and whether the field takes many: of `int | None` int, of `tuple[str, ...]` str."""
+    """The type of one value, the first of several, and whether the field takes many: of `int | None` int, of
+    `tuple[str, ...]` str."""
     kinds = [kind for kind in get_args(hint) if kind is not NoneType]
     if get_origin(hint) is tuple and kinds[1:] == [Ellipsis]:
         return kinds[0], True
-    return (kinds[0], False) if NoneType in get_args(hint) and len(kinds) == 1 else (hint, False)
+    return (kinds[0], False) if NoneType in get_args(hint) else (hint, False)
 
 
 def _expected(kind: Any, within: tuple[float, float], unit: str) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,12 +26,13 @@ from neurolens.cameras.outline_cache import kept_outline, search_key
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.pupil_search import COARSE, COARSE_TIGHT, FINE, Detail, outline_of
-from neurolens.cameras.sampling import arrived, check_film, positive
+from neurolens.cameras.sampling import arrived
 from neurolens.lens.film_plane import PupilBounds
 from neurolens.lens.glass import LINE_D_NM
 from neurolens.lens.paraxial import chief_reach_mm, first_order
-from neurolens.lens.prescription import Focus, Lens
-from neurolens.setting.focusing import best_focused
+from neurolens.lens.prescription import Lens
+from neurolens.lens.shot import Shot
+from neurolens.setting.focusing import at_infinity
 from neurolens.setting.pupils import camera_rays, passes_at_any_azimuth, pupil_bounds, pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.surrogates.assemble import SCALARS, Form
@@ -43,11 +44,9 @@ class ExactCamera(LensCamera):
     """A camera whose lens is the prescription itself.
 
     Args:
-        lens: in the zoom state wanted.
-        film_mm, focus_m, film_offset_mm: as of `build.Shot`. f_number: None keeps the lens's stop.
-        wavelength_nm: range of the wavelengths; the d line stands in for a lens without known dispersion.
+        lens: as its file has it, or in a zoom state.
+        shot: the settings of the camera; the d line stands in for the light of a lens without known dispersion.
         dtype: precision of the trace.
-        focus: how the lens is focused; see `set_lens`. After "internal" the film, too, moves to the least spot.
         bounds: pupil bounds of a domain that holds this focus and stop; rays are then those of the domain's models for
             the same random numbers. None searches for them, over the whole film.
         progress: shows the search for the outline, where it was not found before (`outline_cache`).
@@ -60,34 +59,22 @@ class ExactCamera(LensCamera):
     def __init__(
         self,
         lens: Lens,
+        shot: Shot,
         *,
-        film_mm: tuple[float, float],
-        focus_m: float,
-        f_number: float | None = None,
-        wavelength_nm: tuple[float, float] = (400.0, 700.0),
         dtype: Literal["float32", "float64"] = "float32",
         bounds: PupilBounds | None = None,
-        focus: Focus = "best",
-        film_offset_mm: float = 0.0,
         progress: Progress | None = None,
         runtime: Runtime = "trace",
     ) -> None:
         self._pid = os.getpid()
-        self.film_mm, self.path = check_film(film_mm), Path(lens.path)
-        self.focus_m = positive("focus_m", focus_m, infinite=True)
-        self.name = lens.name
+        self.film_mm, self.path, self.name = shot.film_mm, Path(lens.path), lens.name
         self.dispersive = lens.dispersive
-        self.wavelength_nm = wavelength_nm if self.dispersive else None
-        self._range_nm = wavelength_nm
-        used = wavelength_nm if self.dispersive else (LINE_D_NM, LINE_D_NM)
-        self.lens = set_lens(lens, f_number=f_number, focus_m=self.focus_m, focus=focus, wavelength_nm=used)
-        if focus == "internal":
-            self.lens = best_focused(self.lens, self.focus_m, used)
-        film_z = self.lens.film_z_mm
-        assert film_z is not None  # `at` places the film
-        if film_offset_mm:
-            film_z += film_offset_mm
-            self.lens = replace(self.lens, film_z_mm=film_z)
+        self.wavelength_nm = shot.wavelength_nm if self.dispersive else None
+        self._range_nm = shot.wavelength_nm
+        used = shot.wavelength_nm if self.dispersive else (LINE_D_NM, LINE_D_NM)
+        self.lens = set_lens(lens, shot)
+        film_z, tabled = self.lens.film_z_mm, at_infinity(self.lens)
+        assert film_z is not None  # `set_lens` places the film
         # A lens with cylinders is searched at many azimuths for one outline: coarser, for it fits none of them closely.
         detail = FINE if not self.lens.anamorphic else COARSE if bounds is None else COARSE_TIGHT
         self._film_z_mm, self._pupil_z_mm = film_z, pupil_plane_z_mm(self.lens) if bounds is None else bounds.pupil_z_mm
@@ -101,20 +88,21 @@ class ExactCamera(LensCamera):
         data = first_order(self.lens)
         self.settings: dict[str, Any] = {
             "camera": "exact",
-            "lens": lens.identity,
+            "lens": tabled.identity,
             "efl_mm": float(data.efl_mm),
             "f_number": float(data.f_number),
-            "focus_m": None if math.isinf(self.focus_m) else self.focus_m,
+            "focus_m": None if math.isinf(shot.focus_m) else shot.focus_m,
             "film_mm": list(self.film_mm),
             "film_z_mm": float(film_z),
-            "film_offset_mm": film_offset_mm,
+            "film_offset_mm": shot.film_offset_mm,
             "stop_radius_mm": float(self.lens.stop_radius_mm),
-            "focusing": focus,
+            "focus_mode": shot.focus_mode,
+            "zoom": shot.zoom,
             "derived": self.lens.derived,
             "rims": lens.rims,
             "aperture": self.lens.aperture and self.lens.aperture.settings(),
             "dtype": dtype,
-            "lens_state": state_of(self.lens, self._light_nm, float(first_order(lens).efl_mm)),
+            "lens_state": state_of(self.lens, self._light_nm, float(first_order(tabled).efl_mm)),
         }
         self.start(runtime)
 

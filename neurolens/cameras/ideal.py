@@ -31,7 +31,7 @@ class ThickLens:
     """An ideal lens with two principal planes and two pupils; planes are z in mm, lens frame.
 
     Args:
-        focal_mm: focal length.
+        focal_length_mm: focal length.
         f_number: focal length over diameter of the entrance pupil; it does not change with focus.
         focus_m: distance from film to the object in focus, or infinity.
         film_mm: width and height of the film.
@@ -55,7 +55,7 @@ class ThickLens:
 
     def __init__(
         self,
-        focal_mm: float,
+        focal_length_mm: float,
         f_number: float,
         focus_m: float,
         film_mm: tuple[float, float] = (36.0, 24.0),
@@ -67,7 +67,7 @@ class ThickLens:
         name: str = "thick",
     ) -> None:
         self.name, self.film_mm, self.aperture = name, check_film(film_mm), aperture
-        self.focal_mm = f = positive("focal_mm", focal_mm)
+        self.focal_length_mm = f = positive("focal_length_mm", focal_length_mm)
         self.f_number = positive("f_number", f_number)
         self.focus_m = positive("focus_m", focus_m, infinite=True)
         front, rear = (_finite("principal_z_mm", z) for z in principal_z_mm)
@@ -159,7 +159,7 @@ class ThickLens:
 
     def _slopes(self, film_mm: NDArray[Any], entrance_mm: NDArray[Any]) -> NDArray[Any]:
         """Slopes [2, N] of the film-side rays of film points towards the images of points of the entrance pupil."""
-        return entrance_mm * (self.focal_mm / self._seen) - film_mm * (self._x / self._seen)
+        return entrance_mm * (self.focal_length_mm / self._seen) - film_mm * (self._x / self._seen)
 
     def _stopped(self, opening_mm: NDArray[Any], status: NDArray[np.int32]) -> NDArray[np.int32]:
         """The status, of those that pass outside the shape, at points [2, N] of the opening, the rim's."""
@@ -170,10 +170,10 @@ class ThickLens:
 
 
 class ThinLens(ThickLens):
-    """A thin lens of focal length `focal_mm` and diameter `focal_mm / f_number`.
+    """A thin lens of focal length `focal_length_mm` and diameter `focal_length_mm / f_number`.
 
     Args:
-        focal_mm: focal length.
+        focal_length_mm: focal length.
         f_number: focal length over aperture diameter; it does not change with focus.
         focus_m: distance from film to the object in focus, or infinity.
         film_mm: width and height of the film.
@@ -186,7 +186,7 @@ class ThinLens(ThickLens):
 
     def __init__(
         self,
-        focal_mm: float,
+        focal_length_mm: float,
         f_number: float,
         focus_m: float,
         film_mm: tuple[float, float] = (36.0, 24.0),
@@ -196,9 +196,13 @@ class ThinLens(ThickLens):
     ) -> None:
         film_at_mm = None
         if film_offset_mm:
-            focused = film_z_mm(positive("focal_mm", focal_mm), 0.0, 0.0, positive("focus_m", focus_m, infinite=True))
+            focused = film_z_mm(
+                positive("focal_length_mm", focal_length_mm), 0.0, 0.0, positive("focus_m", focus_m, infinite=True)
+            )
             film_at_mm = positive("film_offset_mm, film distance", focused + film_offset_mm)
-        super().__init__(focal_mm, f_number, focus_m, film_mm, film_at_mm=film_at_mm, aperture=aperture, name="thin")
+        super().__init__(
+            focal_length_mm, f_number, focus_m, film_mm, film_at_mm=film_at_mm, aperture=aperture, name="thin"
+        )
         for key in ("film_z_mm", "principal_z_mm", "entrance_pupil_z_mm"):
             del self.settings[key]
         self.settings |= {"camera": "thin", "film_offset_mm": film_offset_mm}

@@ -6,7 +6,7 @@ import math
 import warnings
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,17 +24,16 @@ from neurolens.cameras.onnxmaps import InverseRays, OnnxInverse, load_inverse
 from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.pupil_search import COARSE_TIGHT, outline_of
-from neurolens.cameras.sampling import arrived, check_film, common_light, positive
+from neurolens.cameras.sampling import arrived, beyond_circle, common_light, refuse
 from neurolens.graph.interpret import evaluate
 from neurolens.lens import film_plane
 from neurolens.lens.apertures import Aperture
+from neurolens.lens.shot import Shot
 from neurolens.surrogates.assemble import SCALARS, Form
 from neurolens.surrogates.cardkeys import DOMAIN_SLACK
 from neurolens.surrogates.cardstates import state_for
 
 __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
-
-Focus = Literal["best", "paraxial", "internal"]
 
 # Parts of the card that the metadata of pictures leave out.
 _NOT_KEPT = ("reference", "units", "frame", "status_codes", "states")
@@ -46,13 +45,10 @@ class OnnxCamera(LensCamera):
 
     Args:
         model: see `load_model`.
-        film_mm: width and height of the film. What lies beyond the model's film radius stays dark.
-        focus_m, f_number, aperture, film_offset_mm: as of `build.Shot`; an f-number up to 2% below the model's widest
-            stop means that (an engraved f/1.8 may be 1.83). Focusing moves the groups of a model that knows them.
-        zoom: of a model of a zoom's whole range, as of `Shot`; None leaves it at `model.state`.
-        wavelength_nm: range of the light, which sets the exposure and the best focus; None takes the model's own.
-        focus: "best" places the film where the model's rays from the axis make the least spot, as `set_lens` does for
-            the lens; "paraxial" in the paraxial image. "internal" is as "best": groups move where a model knows them.
+        shot: the settings of the camera. Film beyond the model's film radius stays dark. An f-number up to 2% below the
+            model's widest stop means that (an engraved f/1.8 may be 1.83). A zoom of None leaves the model in its
+            state. Focusing moves the groups of a model that knows them, in every mode; the film then stands where the
+            model's rays from the axis make the least spot, or with "paraxial" in the paraxial image.
         outline: of the pupil of the lens itself, to hold the model against it; None searches the model's own.
         runtime: what runs the camera, "onnxruntime" or "c".
 
@@ -66,38 +62,31 @@ class OnnxCamera(LensCamera):
     def __init__(
         self,
         model: OnnxLens,
+        shot: Shot,
         *,
-        film_mm: tuple[float, float],
-        focus_m: float,
-        f_number: float | None = None,
-        aperture: Aperture | None = None,
-        zoom: str | float | None = None,
-        wavelength_nm: tuple[float, float] | None = None,
-        focus: Focus = "best",
-        film_offset_mm: float = 0.0,
         outline: PupilOutline | None = None,
         runtime: Runtime = "onnxruntime",
     ) -> None:
-        self.focus_m = positive("focus_m", focus_m, infinite=True)
-        if model.axes or zoom is not None:
-            model = model.at(*state_for(model.path, model.axes, model.state, zoom, self.focus_m))
+        _check_shot(model, shot)
+        if model.axes:
+            model = model.at(*state_for(model.path, model.axes, model.state, shot.zoom, shot.focus_m))
         card = model.card
         lens, domain = card["lens"], card["domain"]
         self.model, self.path, self.threads = model, model.path, model.threads
         self._inverse: tuple[OnnxInverse, FrontAim] | None = None
         self.name = str(lens.get("name", model.path.stem))
-        self.film_mm = check_film(film_mm)
+        self.film_mm = shot.film_mm
         low, high = (float(v) for v in domain["wavelength_nm"])
         self.dispersive = low < high
         # A model for one wavelength of a dispersive lens knows that wavelength only; without dispersion any will do.
         self.wavelength_nm = (low, high) if lens["dispersive"] else None
         # Glass takes more of some wavelengths than of others: exposure is for those that the light has.
-        self._light_nm = used = common_light((low, high), wavelength_nm or (low, high))
-        stop = _stop_radius(model, f_number)
-        paraxial, (near, far) = _paraxial_film_z(model, self.focus_m), domain["film_z_mm"]
-        start = ModelScene(model, min(max(paraxial, near), far), stop, aperture)
-        best = paraxial if focus == "paraxial" else best_focus_z_mm(start, self.focus_m, used)
-        film_z = _film_z(model, best, film_offset_mm, lens["f_number"] * lens["stop_radius_mm"] / stop)
+        self._light_nm = used = common_light((low, high), shot.wavelength_nm)
+        stop = _stop_radius(model, shot)
+        paraxial, (near, far) = _paraxial_film_z(model, shot.focus_m), domain["film_z_mm"]
+        start = ModelScene(model, min(max(paraxial, near), far), stop, shot.aperture)
+        best = paraxial if shot.focus_mode == "paraxial" else best_focus_z_mm(start, shot.focus_m, used)
+        film_z = _film_z(model, best, shot.film_offset_mm, lens["f_number"] * lens["stop_radius_mm"] / stop)
         scene = replace(start, film_z_mm=film_z)
         round_stop = replace(scene, aperture=None)
         if outline is not None:
@@ -110,17 +99,20 @@ class OnnxCamera(LensCamera):
             "model": str(model.path),
             "efl_mm": lens["efl_mm"],
             "f_number": lens["f_number"] * lens["stop_radius_mm"] / stop,
-            "focus_m": None if math.isinf(self.focus_m) else self.focus_m,
+            "focus_m": None if math.isinf(shot.focus_m) else shot.focus_m,
             "film_mm": list(self.film_mm),
             "film_z_mm": film_z,
-            "film_offset_mm": film_offset_mm,
-            "focusing": focus,
+            "film_offset_mm": shot.film_offset_mm,
+            "focus_mode": shot.focus_mode,
             "stop_radius_mm": stop,
-            "aperture": aperture and aperture.settings(),
+            "aperture": shot.aperture and shot.aperture.settings(),
             "state": dict(zip((a.name for a in model.axes), model.state, strict=True)),
             "card": {k: v for k, v in card.items() if k not in _NOT_KEPT},
         }
         self.settings["lens_state"] = _state_of(scene, used, self.settings["f_number"])
+        notes = beyond_circle(shot.film_mm, domain["film_radius_mm"], "the model's picture", "stay dark")
+        poor = ", ".join(card["errors"].get("poor") or ())
+        self.settings["notes"] = [*([f"the model is poor, as its card says: {poor}"] if poor else []), *notes]
         self.start(runtime)
 
     def lens_graph(self, form: Form = SCALARS) -> LensGraph:
@@ -309,7 +301,7 @@ def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, f
         passed = (status == st.PASSED) & np.isfinite(moments).all(0)
         along, across = np.where(passed, moments, 0.0).sum(1)
         if not across > 0:
-            raise InputError(scene.model.path, "focus", "best", "a model that lets axial light pass")
+            raise InputError(scene.model.path, "focus_mode", "best", "a model that lets axial light pass")
         best = scene.film_z_mm - float(along / across)
         film = np.where(np.isfinite(film), film, 0.0).clip(-reach, reach)  # rays that do not pass may go anywhere
     return _Spot(best, (film.astype(np.float32), pupil.astype(np.float32), nanometres), moments, passed)
@@ -385,12 +377,24 @@ def _limits(model: OnnxLens) -> str:
     return " to ".join(f"{v} m" for v in reversed(model.card["domain"]["focus_m"]))
 
 
-def _stop_radius(model: OnnxLens, f_number: float | None) -> float:
+def _stop_radius(model: OnnxLens, shot: Shot) -> float:
     lens, widest = model.card["lens"], float(model.card["domain"]["stop_radius_mm"])
+    widest_f = float(lens["f_number"] * lens["stop_radius_mm"] / widest)
+    f_number = shot.f_number_for(widest_f)
     if f_number is None:
         return widest
-    radius = lens["stop_radius_mm"] * lens["f_number"] / positive("f_number", f_number)
+    radius = lens["stop_radius_mm"] * lens["f_number"] / f_number
     if radius > widest * _NOMINAL:
-        least = lens["stop_radius_mm"] * lens["f_number"] / widest
-        raise InputError(model.path, "f_number", f_number, f"at least {least:.4g}, the model's widest stop")
+        raise InputError(model.path, "f_number", f_number, f"at least {widest_f:.4g}, the model's widest stop")
     return float(min(radius, widest))
+
+
+def _check_shot(model: OnnxLens, shot: Shot) -> None:
+    """Refuse settings that a model does not have."""
+    axes, path = [a.name for a in model.axes], str(model.path)
+    for field in ("focal_length_mm", "field_deg"):
+        refuse(path, field, getattr(shot, field), "left out: a model is of one size of its lens")
+    if "zoom" not in axes:
+        refuse(path, "zoom", shot.zoom, "left out: the model is of one zoom position")
+    if "focus" not in axes and shot.focus_mode == "internal":
+        refuse(path, "focus_mode", shot.focus_mode, "left out: the model knows no moving groups")

@@ -35,13 +35,13 @@ Function = Callable[[Array], Array]
 
 
 class Pinhole:
-    """A hole at distance `focal_mm` from the film.
+    """A hole at distance `focal_length_mm` from the film.
 
     The hole stands for a lens of the nominal f-number, E = pi L / (4 N^2) on the axis, so the weight is cos^4 of the
     angle to the axis, 1 on the axis; `f_number` is kept in the settings and changes no ray.
 
     Args:
-        focal_mm: distance from hole to film.
+        focal_length_mm: distance from hole to film.
         film_mm: width and height of the film.
         f_number: nominal.
 
@@ -55,30 +55,32 @@ class Pinhole:
     rays_a_call = MANY_RAYS_A_CALL
     wavelength_nm: tuple[float, float] | None = None
 
-    def __init__(self, focal_mm: float, film_mm: tuple[float, float] = (36.0, 24.0), f_number: float = 8.0) -> None:
-        self.focal_mm = positive("focal_mm", focal_mm)
+    def __init__(
+        self, focal_length_mm: float, film_mm: tuple[float, float] = (36.0, 24.0), f_number: float = 8.0
+    ) -> None:
+        self.focal_length_mm = positive("focal_length_mm", focal_length_mm)
         self.film_mm = check_film(film_mm)
         self.f_number = positive("f_number", f_number)
         self.settings: dict[str, Any] = {
             "camera": self.name,
-            "efl_mm": self.focal_mm,
+            "efl_mm": self.focal_length_mm,
             "f_number": self.f_number,
             "focus_m": None,
             "film_mm": list(self.film_mm),
-            "lens_state": ideal_state(self.focal_mm, f_number, self.focal_mm),
+            "lens_state": ideal_state(self.focal_length_mm, f_number, self.focal_length_mm),
         }
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """Rays through the hole for film points [2, N] in mm; pupil and wavelength change nothing."""
         count = film_mm.shape[1]
         direction = np.empty((3, count), np.float32)
-        np.divide(film_mm, np.float32(-self.focal_mm), out=direction[:2])
+        np.divide(film_mm, np.float32(-self.focal_length_mm), out=direction[:2])
         direction[2] = -1.0
         with np.errstate(over="ignore", invalid="ignore"):
             cos2 = 1.0 / (1.0 + direction[0] ** 2 + direction[1] ** 2)
             direction *= np.sqrt(cos2)
         origin = np.zeros((3, count), np.float32)
-        origin[2] = -1e-3 * self.focal_mm
+        origin[2] = -1e-3 * self.focal_length_mm
         rays = CameraRays(origin, direction, (cos2 * cos2).astype(np.float32), np.zeros(count, np.int32))
         return sound(rays, cos2, pupil, wavelength_nm)
 
@@ -86,7 +88,7 @@ class Pinhole:
         """Sample rays as `sample` does, with their differentials; all rays start at the hole."""
         rays = self.sample(film_mm, pupil, wavelength_nm)
         slope = np.zeros((3, 2, film_mm.shape[1]), np.float32)
-        slope[0, 0] = slope[1, 1] = -1 / self.focal_mm
+        slope[0, 0] = slope[1, 1] = -1 / self.focal_length_mm
         return replace(rays, differentials=towards(rays.direction / -rays.direction[2], slope, rays.origin_m))
 
     def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
@@ -95,13 +97,13 @@ class Pinhole:
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """Film points of scene points [3, N] in m through the hole; pupil and wavelength change nothing."""
-        origin = np.array([[0.0], [0.0], [-1e-3 * self.focal_mm]]) + np.zeros((1, point_m.shape[1]))
+        origin = np.array([[0.0], [0.0], [-1e-3 * self.focal_length_mm]]) + np.zeros((1, point_m.shape[1]))
         with np.errstate(all="ignore"):
             way = point_m - origin
             squared = np.einsum("in,in->n", way, way)
-            film = self.focal_mm * way[:2] / way[2]
+            film = self.focal_length_mm * way[:2] / way[2]
             # A' / E0 of a small hole is the square of its distance from the film.
-            weight = self.focal_mm**2 * -way[2] / squared**1.5
+            weight = self.focal_length_mm**2 * -way[2] / squared**1.5
         return arrived(film, origin, point_m, weight, ahead(-way[2]), wavelength_nm)
 
 
@@ -147,11 +149,11 @@ PROJECTIONS = {
 
 
 class Fisheye:
-    """A hole at distance `focal_mm` from the film whose picture obeys a fisheye projection.
+    """A hole at distance `focal_length_mm` from the film whose picture obeys a fisheye projection.
 
     Args:
         projection: one of `PROJECTIONS`.
-        focal_mm: focal length of the projection.
+        focal_length_mm: focal length of the projection.
         film_mm: width and height of the film.
         field_deg: full field of view, beyond which the film is dark; None sees as far as the projection goes.
         f_number: nominal, as the pinhole's.
@@ -167,7 +169,7 @@ class Fisheye:
     def __init__(
         self,
         projection: str,
-        focal_mm: float,
+        focal_length_mm: float,
         film_mm: tuple[float, float] = (36.0, 24.0),
         *,
         field_deg: float | None = None,
@@ -177,16 +179,16 @@ class Fisheye:
             raise InputError("camera", "projection", projection, f"one of: {', '.join(PROJECTIONS)}")
         self.name = f"fisheye-{projection}"
         self.projection = PROJECTIONS[projection]
-        self.focal_mm, self.film_mm = positive("focal_mm", focal_mm), check_film(film_mm)
+        self.focal_length_mm, self.film_mm = positive("focal_length_mm", focal_length_mm), check_film(film_mm)
         self.widest_rad = check_field(projection, field_deg)
         self.settings: dict[str, Any] = {
             "camera": self.name,
-            "efl_mm": self.focal_mm,
+            "efl_mm": self.focal_length_mm,
             "f_number": positive("f_number", f_number),
             "focus_m": None,
             "field_deg": 2 * math.degrees(self.widest_rad),
             "film_mm": list(self.film_mm),
-            "lens_state": ideal_state(self.focal_mm, f_number, self.focal_mm),
+            "lens_state": ideal_state(self.focal_length_mm, f_number, self.focal_length_mm),
         }
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
@@ -198,7 +200,7 @@ class Fisheye:
         direction[:2] = -towards * (np.sin(theta) * lit)
         direction[2] = -np.where(lit, np.cos(theta), np.float32(1))
         origin = np.zeros_like(direction)
-        origin[2] = -1e-3 * self.focal_mm
+        origin[2] = -1e-3 * self.focal_length_mm
         weight = (self.projection.falloff(theta) * lit).astype(np.float32)
         status = np.where(lit, st.PASSED, st.OUTSIDE_DOMAIN).astype(np.int32)
         return sound(CameraRays(origin, direction, weight, status), np.ones_like(rho), pupil, wavelength_nm)
@@ -216,7 +218,7 @@ class Fisheye:
             moves[axis, axis] = -across
             moves[:2, axis] -= radial * towards * towards[axis]
             moves[2, axis] = np.sin(theta) * along * towards[axis]
-        moves *= np.where(rays.status == st.PASSED, np.float32(1 / self.focal_mm), np.float32(0))
+        moves *= np.where(rays.status == st.PASSED, np.float32(1 / self.focal_length_mm), np.float32(0))
         return replace(rays, differentials=RayDifferentials(np.zeros_like(moves), moves))
 
     def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
@@ -225,14 +227,14 @@ class Fisheye:
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """Film points of scene points [3, N] in m through the hole; pupil and wavelength change nothing."""
-        origin = np.array([[0.0], [0.0], [-1e-3 * self.focal_mm]]) + np.zeros((1, point_m.shape[1]))
+        origin = np.array([[0.0], [0.0], [-1e-3 * self.focal_length_mm]]) + np.zeros((1, point_m.shape[1]))
         with np.errstate(all="ignore"):
             way = point_m - origin
             side, squared = np.hypot(way[0], way[1]), np.einsum("in,in->n", way, way)
             theta = np.arctan2(side, -way[2])
-            film = -self.focal_mm * self.projection.radius(theta) * way[:2] / np.where(side > 0, side, 1)
+            film = -self.focal_length_mm * self.projection.radius(theta) * way[:2] / np.where(side > 0, side, 1)
             # A' / E0 of a small hole is the square of its distance from the film, where it faces the ray.
-            weight = self.focal_mm**2 / squared * (np.cos(theta) if self.projection.flat else 1)
+            weight = self.focal_length_mm**2 / squared * (np.cos(theta) if self.projection.flat else 1)
         out = np.where(theta > self.widest_rad, st.blocked(0, st.MISSED), st.OUTSIDE_DOMAIN)
         # Straight behind, the projection has no direction to lay the point in.
         lit = (theta <= self.widest_rad) & (self.projection.radius(theta) < self.projection.end) & (theta < math.pi)
@@ -241,7 +243,7 @@ class Fisheye:
 
     def _place(self, film_mm: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
         """rho [N] and the unit vectors [2, N] from the axis to film points, and which lie within the projection."""
-        scaled = film_mm * np.float32(1 / self.focal_mm)
+        scaled = film_mm * np.float32(1 / self.focal_length_mm)
         with np.errstate(over="ignore", invalid="ignore"):
             rho = np.hypot(scaled[0], scaled[1])
             lit = (rho < np.float32(self.projection.end)) & (rho < np.float32(1e18))

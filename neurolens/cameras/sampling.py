@@ -12,6 +12,7 @@ from neurolens.base.bounds import FILM_MM, said, within
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
 
+_BEYOND = 1.02  # diagonal of the film over the image circle: 36x24 over 43.2 mm is as lenses are engraved
 _LEAST_COS2 = 1e-30  # squares of tangents beyond come near the end of float32
 _AHEAD = np.array([[0], [0], [-1]], np.float32)
 
@@ -109,6 +110,21 @@ def common_light(known_nm: tuple[float, float], light_nm: tuple[float, float]) -
     """The part of a range of light that a lens knows; where they have none in common, its own end that is nearest."""
     low, high = known_nm
     return min(max(low, light_nm[0]), high), max(min(high, light_nm[1]), low)
+
+
+def beyond_circle(film_mm: tuple[float, float], radius_mm: float, what: str, then: str) -> list[str]:
+    """A sentence on a film that is larger than the image circle, if it is."""
+    circle, diagonal = 2 * radius_mm, math.hypot(*film_mm)
+    if diagonal <= _BEYOND * circle:
+        return []
+    told = f"the film's diagonal of {diagonal:.3g} mm is {diagonal / circle:.3g} times {what} of {circle:.3g} mm"
+    return [f"{told}: its corners {then}"]
+
+
+def refuse(camera: str, field: str, value: object, expected: str) -> None:
+    """Raise InputError for a setting that a kind of camera does not have, where it is given."""
+    if value is not None:
+        raise InputError(f"camera {camera}", field, value, expected)
 
 
 def positive(field: str, value: float, *, infinite: bool = False) -> float:

@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 from copy import copy
 from dataclasses import replace
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import RAYS_A_CALL, CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.sampling import common_light, stratified
+from neurolens.lens.shot import Vignetting
 
-Vignetting = Literal["both", "natural", "optical", "none"]
 VIGNETTINGS: tuple[str, ...] = get_args(Vignetting)
 
 Array = NDArray[np.float64]
@@ -160,7 +160,7 @@ class _Table:
 
     def _end_of_light(self, camera: Any) -> float:
         """The largest film radius up to the corner at which light is found at any of the azimuths tried."""
-        corner = 1.0001 * math.hypot(*camera.film_mm) / 2
+        corner = 1.0001 * math.hypotcamera.film_mm / 2
 
         def lit(radius: Array) -> NDArray[np.bool_]:
             angle = np.arange(_TRIED_AZIMUTHS) * (2 * math.pi / _TRIED_AZIMUTHS)

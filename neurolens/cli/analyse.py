@@ -67,7 +67,7 @@ _EPILOG = """\
 examples:
   neurolens analyse lenses/laikin_double_gauss_50.toml
   neurolens analyse lenses/shimizu_fisheye_220.toml distortion vignetting -o pictures
-  neurolens analyse lenses/brendel_tessar_100.toml spots mtf --f-number 5.6 --focusing best --json"""
+  neurolens analyse lenses/brendel_tessar_100.toml spots mtf --f-number 5.6 --focus-mode best --json"""
 
 
 class Analysis(NamedTuple):
@@ -85,7 +85,7 @@ def add_parser(subparsers: Any) -> None:
     )
     add_lens(parser, "file")
     parser.add_argument("what", metavar="WHAT", nargs="*", help="what to show (default: all)")
-    add_lens_state(parser, efl="as tabled", f_number="the tabled stop")
+    add_lens_state(parser)
     add_option(
         parser, "--field-points", old=("--fields",), metavar="DEG", nargs="+", type=between(0, 179, "degrees"),
         help="angles from the axis for spots, fans, mtf and psf (default: axis, 50%, 70%, 85% and edge of the field)",

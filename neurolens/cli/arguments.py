@@ -12,11 +12,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from neurolens.base.bounds import F_NUMBER, FOCAL_MM, WAVELENGTH_NM
+from neurolens.base.bounds import WAVELENGTH_NM
 from neurolens.base.errors import InputError, one_line
 from neurolens.base.lensname import lens_id_of, resolve
-from neurolens.base.options import number
+from neurolens.base.options import add_options, from_options, number, option_names
 from neurolens.base.records import program
+from neurolens.lens.shot import LENS_SIZE, LENS_STATE, FocusMode, Shot, StopShape
 
 if TYPE_CHECKING:
     from neurolens.lens.apertures import Aperture
@@ -125,10 +126,9 @@ def wavelengths_nm(text: str) -> tuple[float, ...]:
     return tuple(between(*WAVELENGTH_NM, "wavelengths in nm")(word) for word in text.split(","))
 
 
+SHOT_OPTIONS = (*LENS_SIZE, *LENS_STATE, "film_offset_mm", "vignetting")  # fields of a `Shot`, of `shot_of`
 QUIET_HELP = "neither progress nor warnings on stderr"
 
-# Repeated here, so that help imports no camera; a test compares it with `cameras.vignetting`.
-VIGNETTINGS = ("both", "natural", "optical", "none")
 CAMERAS_HELP = """\
 cameras:
   LENS                         the lens of a file (.toml, .zmx, ..., see neurolens convert) or of a name in lenses/,
@@ -137,7 +137,7 @@ cameras:
   fused:LENS, fused:MODEL.onnx the same, compiled by the system's C compiler: many times faster
   thick:LENS                   its principal planes and pupils: ideal imaging, no rims
   thin:LENS, pinhole:LENS      a thin lens, a point: the plane in focus has the lens's size
-  thin, pinhole                the same of any focal length (--efl)
+  thin, pinhole                the same of any focal length (--focal-length)
   fisheye-equidistant, fisheye-equisolid, fisheye-stereographic, fisheye-orthographic
                                points with these projections; --field sets the picture's circle"""
 
@@ -145,64 +145,16 @@ cameras:
 def add_camera(parser: argparse.ArgumentParser) -> None:
     """Add --camera, --film-offset and --vignetting."""
     add_lens(parser, "--camera", models=True, cameras=True)
-    parser.add_argument(
-        "--film-offset", metavar="MM", type=between(-1e3, 1e3, "mm"), default=0.0,
-        help="move the film away from the lens after focusing (default: 0)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--vignetting", choices=VIGNETTINGS, default="both",
-        help="parts that are kept: both; natural, the cos^4 law; optical, the effective aperture; none (default: both)",
-    )  # fmt: skip
+    add_options(parser, Shot, ("film_offset_mm", "vignetting"), unset=True)
 
 
-def add_lens_state(parser: argparse.ArgumentParser, *, efl: str, f_number: str, focus: str = "inf") -> None:
-    """Add --efl, --field, --zoom, --f-number, --focus, --focusing and the stop's shape; texts describe defaults."""
+def add_lens_state(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a `Shot` that set a lens, and of the shape of its stop."""
     add_glass(parser)
     group = parser.add_argument_group("state of the lens")
-    size = group.add_mutually_exclusive_group()
-    size.add_argument(
-        "--efl", metavar="MM", type=between(*FOCAL_MM, "a focal length in mm"),
-        help=f"scale the whole lens to this focal length in mm (default: {efl})",
-    )  # fmt: skip
-    size.add_argument(
-        "--field", metavar="DEG", type=between(0.001, 359.0, "degrees"),
-        help="scale the whole lens so that its image circle sees this full field of view, traced, in degrees",
-    )  # fmt: skip
-    add_option(
-        group, "--zoom", old=("--configuration",), metavar="STATE",
-        help="state of the lens file by name, or a focal length in mm between its states (derived: its table and "
-        "interpolated gaps); default: the state of the table",
-    )  # fmt: skip
-    group.add_argument(
-        "--f-number", metavar="N", type=between(*F_NUMBER, "an f-number"),
-        help=f"focal length over entrance-pupil diameter at infinity focus (default: {f_number})",
-    )  # fmt: skip
-    group.add_argument(
-        "--focus", metavar="M", type=positive("a distance in metres", infinite=True),
-        help=f"distance from the film to the object in focus in metres, or inf (default: {focus})",
-    )  # fmt: skip
-    group.add_argument(
-        "--focusing", choices=("best", "paraxial", "internal"), default="best",
-        help="the film where the spot on the axis is smallest at this aperture, in the paraxial image, or first the "
-        "groups moved as the focus states of the lens file do (default: best)",
-    )  # fmt: skip
-    shape = parser.add_argument_group("shape of the stop")
-    shape.add_argument(
-        "--blades", metavar="N", type=whole(3, 100),
-        help="blades, their corners on the circle of the stop (default: the lens file's, else round)",
-    )  # fmt: skip
-    shape.add_argument(
-        "--blade-rotation", metavar="DEG", type=between(-360, 360, "degrees"),
-        help="of the first corner (or of the mask), from x towards y, seen from the film (default: 0)",
-    )  # fmt: skip
-    shape.add_argument(
-        "--blade-curvature", metavar="C", type=between(0, 1, "a number"),
-        help="of the blades' edges: 0 straight, 1 round (default: 0)",
-    )  # fmt: skip
-    shape.add_argument(
-        "--aperture-mask", metavar="PICTURE", type=Path,
-        help="opening of any shape: light passes where the picture is brighter than half; it spans the stop",
-    )  # fmt: skip
+    add_options(group.add_mutually_exclusive_group(), Shot, LENS_SIZE, unset=True)
+    add_options(group, Shot, LENS_STATE, unset=True)
+    add_options(parser.add_argument_group("shape of the stop"), StopShape)
 
 
 def aperture_of(args: argparse.Namespace) -> Aperture | None:
@@ -213,7 +165,17 @@ def aperture_of(args: argparse.Namespace) -> Aperture | None:
     """
     from neurolens.render.images import make_aperture
 
-    return make_aperture(args.blades, args.blade_rotation, args.blade_curvature, args.aperture_mask)
+    return make_aperture(from_options(StopShape(), args))
+
+
+def shot_of(args: argparse.Namespace, film_mm: tuple[float, float], **settings: Any) -> Shot:
+    """The shot by the arguments of `add_lens_state` and `add_camera`, at infinity without --focus; `settings` are other
+    fields.
+
+    Raises:
+        InputError: as `Shot` and `aperture_of`.
+    """
+    return from_options(Shot(film_mm, math.inf, aperture=aperture_of(args), **settings), args)
 
 
 def state_of(args: argparse.Namespace, tabled: Lens) -> Lens:
@@ -221,11 +183,12 @@ def state_of(args: argparse.Namespace, tabled: Lens) -> Lens:
     from neurolens.setting.focusing import best_focused
     from neurolens.setting.states import set_lens
 
+    mode: FocusMode = args.focus_mode or "best"
     lens = set_lens(tabled.with_aperture(aperture_of(args) or tabled.aperture),
-        zoom=args.zoom, focal_length_mm=args.efl, field_deg=args.field, f_number=args.f_number,
-        focus_m=args.focus, focus=args.focusing,
+        zoom=args.zoom, focal_length_mm=args.focal_length_mm, field_deg=args.field_deg, f_number=args.f_number,
+        focus_m=args.focus_m, focus_mode=mode,
     )  # fmt: skip
-    return best_focused(lens, focus_of(args, tabled, lens)) if args.focusing == "internal" else lens
+    return best_focused(lens, focus_of(args, tabled, lens)) if mode == "internal" else lens
 
 
 def focus_of(args: argparse.Namespace, tabled: Lens, lens: Lens) -> float:
@@ -233,8 +196,8 @@ def focus_of(args: argparse.Namespace, tabled: Lens, lens: Lens) -> float:
 
     `tabled` is the lens of the file, `lens` its state.
     """
-    if args.focus is not None:
-        return float(args.focus)
+    if args.focus_m is not None:
+        return float(args.focus_m)
     near = next((c.object_distance_mm for c in tabled.configurations if c.name == args.zoom), None)
     if near is None:
         return math.inf
@@ -245,9 +208,8 @@ def focus_of(args: argparse.Namespace, tabled: Lens, lens: Lens) -> float:
 
 def given_options(args: argparse.Namespace) -> list[str]:
     """The options of `add_lens_state` that were given, for modes without a lens state."""
-    names = ("efl", "field", "zoom", "f_number", "focus", "blades", "blade_rotation", "blade_curvature")
-    given = [f"--{n.replace('_', '-')}" for n in (*names, "aperture_mask") if getattr(args, n) is not None]
-    return given + (["--focusing"] if args.focusing != "best" else [])
+    options = option_names(Shot, (*LENS_SIZE, *LENS_STATE)) | option_names(StopShape)
+    return [option for name, option in options.items() if getattr(args, name) is not None]
 
 
 def add_exposure(parser: argparse._ActionsContainer, default: float | None = 0.0, about: str = "0") -> None:

@@ -99,7 +99,8 @@ def _squeeze(file: Path, zoom: str | None) -> float:
         from neurolens.setting.states import set_lens
 
         return squeeze_of(set_lens(read_any(file), zoom=zoom))
-    from neurolens.cameras.build import Shot, make_camera
+    from neurolens.cameras.build import make_camera
+    from neurolens.lens.shot import Shot
 
     return float(make_camera(file, Shot((1.0, 1.0), math.inf, zoom=zoom)).settings["lens_state"]["squeeze"] or 1.0)
 
@@ -208,10 +209,11 @@ def field_table(lens: Lens, radius_mm: float) -> dict[str, Any] | None:
     """What a lens does to its picture wide open, as `extension.library.Field`; None where it cannot be traced."""
     if find_spec("torch") is None:
         return None
-    from neurolens.cameras.build import Shot, ideal_as
+    from neurolens.cameras.build import ideal_as
     from neurolens.cameras.exact import ExactCamera
     from neurolens.cameras.field import spectrum_of
     from neurolens.lens.paraxial import first_order
+    from neurolens.lens.shot import Shot
     from neurolens.plan import footprints as prints
 
     film, radii = (2 * radius_mm, 2 * radius_mm), radius_mm * np.array(_RADII)
@@ -220,7 +222,7 @@ def field_table(lens: Lens, radius_mm: float) -> dict[str, Any] | None:
     rows: dict[str, list[Any]] = {"distortion_um": [], "blur_um": [], "light": []}
     with suppress(InputError):
         for focus in (math.inf, near):
-            camera = ExactCamera(lens, film_mm=film, focus_m=focus)
+            camera = ExactCamera(lens, Shot(film, focus))
             nm, share = spectrum_of(camera)
             share = share / share.sum()
             places = prints.places_of(camera, points, np.full(radii.size, focus), nm, share)

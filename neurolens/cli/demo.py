@@ -26,7 +26,8 @@ _PICTURES = (
     ("pinhole", "pinhole", "a pinhole: no blur at all"),
     ("fisheye", "isshiki_fisheye_10.mlp-16x2", "another lens: the model of a 180-degree fisheye"),
 )
-_MORE = {"thin": "--efl 49.64 --f-number 1.8", "pinhole": "--efl 49.64", "fisheye": "--film 30x16.875"}
+_SIZE = "--focal-length 49.64"
+_MORE = {"thin": f"{_SIZE} --f-number 1.8", "pinhole": _SIZE, "fisheye": "--film 30x16.875"}
 
 
 def add_parser(subparsers: Any) -> None:

@@ -191,8 +191,9 @@ def _write_osl(file: Path, args: argparse.Namespace) -> dict[str, Any]:
 def _write_camera(file: Path, args: argparse.Namespace) -> dict[str, Any]:
     """The whole camera of a model or a lens file as source code."""
     from neurolens.base.progress import Progress
-    from neurolens.cameras.build import Shot, make_camera
+    from neurolens.cameras.build import make_camera
     from neurolens.graph.c import Extras
+    from neurolens.lens.shot import Shot
     from neurolens.shaders.source import CAMERA_FRAME, camera_program
     from neurolens.surrogates.source import checked_name, lines_of, write_program
 

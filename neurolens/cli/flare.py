@@ -96,7 +96,7 @@ def add_parser(subparsers: Any) -> None:
     add_within(group, about, default=("rms_um", 10.0))
     add_frames(parser, _FRAMES)
     parser.add_argument("--restart", action="store_true", help="of --frames: make those that exist again")
-    add_lens_state(parser, efl="as tabled", f_number="the widest")
+    add_lens_state(parser)
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="nothing is written", position_m=None, look_at_m=None, frame=None)
 

@@ -19,12 +19,11 @@ from neurolens.base.errors import InputError, warn
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain
-from neurolens.cameras.build import Shot as CameraShot
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.exact import ExactCamera, placed_settings
 from neurolens.cameras.field import Field, field_of
-from neurolens.cli.arguments import aperture_of, check_suffix, given_options, state_of
+from neurolens.cli.arguments import aperture_of, check_suffix, given_options, shot_of, state_of
 from neurolens.cli.output import answer, number, table
 from neurolens.cli.render_frames import frames_of
 from neurolens.flare.canvas import Raster
@@ -35,6 +34,7 @@ from neurolens.flare.lights import SUN, Light, read_lights, with_disc
 from neurolens.flare.sources import KeptLights, SceneLights, chosen, highlights, keep_named
 from neurolens.frames.frame import Files, flare_channels
 from neurolens.lens.prescription import Lens
+from neurolens.lens.shot import Shot as CameraShot
 from neurolens.readers.any_format import read_any
 from neurolens.render.colour import COLOUR_SPACES, SRGB, ColourSpace, conversion, converted
 from neurolens.render.environment import SUN_RADIUS_RAD
@@ -112,7 +112,7 @@ def _states(args: argparse.Namespace) -> Iterator[argparse.Namespace]:
     frames = [(None, "", {})] if args.frames is None else frames_of(args, _COMMAND)
     for frame, digits, values in frames:
         state = argparse.Namespace(**vars(args) | values | {"frame": frame})
-        state.focus = math.inf if state.focus is None else state.focus
+        state.focus_m = math.inf if state.focus_m is None else state.focus_m
         if frame is not None:
             state.out = args.out.with_name(f"{args.out.stem}.{digits}{args.out.suffix}")
         yield state
@@ -129,7 +129,7 @@ def _model(args: argparse.Namespace, states: Sequence[argparse.Namespace]) -> Gh
         return None
     wrong = [name for name in given_options(args) if name not in _FREE]
     wrong += [f"--{name}" for name in ("coating", "photons") if getattr(args, name)]
-    wrong += ["--key focus"] * any(math.isfinite(s.focus) for s in states)
+    wrong += ["--key focus"] * any(math.isfinite(s.focus_m) for s in states)
     wrong += ["--key zoom"] * any(s.zoom is not None for s in states)
     if wrong:
         raise InputError(_COMMAND, wrong[0], args.file, "a lens: fitted ghosts have one state and two reflections")
@@ -190,7 +190,7 @@ class Shots:
 
     def _lens(self, args: argparse.Namespace) -> tuple[Lens, GhostModel | None]:
         """The lens in its state, coated; or the fitted ghosts at the f-number and with the blades of the options."""
-        state = args.focus, args.f_number, args.zoom
+        state = args.focus_m, args.f_number, args.zoom
         if state not in self._lenses and self._model is not None:
             lens = self._model.lens.with_aperture(aperture_of(args))
             model = replace(self._model, lens=lens if args.f_number is None else set_lens(lens, f_number=args.f_number))
@@ -242,20 +242,16 @@ class Shots:
 
     def _field(self, args: argparse.Namespace, lens: Lens) -> Field:
         """The directions that the film sees, which frames of one state share."""
-        state = args.focus, args.f_number, args.zoom
+        state = args.focus_m, args.f_number, args.zoom
         if state not in self._fields:
             if self._model is not None:  # fitted ghosts, with their film
                 moved = (lens.film_z_mm or 0.0) - (set_lens(lens, focus_m=math.inf).film_z_mm or 0.0)
                 camera: Any = ExactCamera(
-                    lens, film_mm=args.film, focus_m=math.inf, film_offset_mm=moved, progress=self._progress
+                    lens, CameraShot(args.film, math.inf, film_offset_mm=moved), progress=self._progress
                 )
             else:
-                shot = CameraShot(
-                    film_mm=args.film, focus_m=args.focus, f_number=args.f_number, efl_mm=args.efl, zoom=args.zoom,
-                    field_deg=args.field, focus=args.focusing, aperture=aperture_of(args),
-                )  # fmt: skip
-                camera = make_camera(args.file, shot, self._progress)
-            self._fields[state] = field_of(camera, args.focus, "equidistant")
+                camera = make_camera(args.file, shot_of(args, args.film), self._progress)
+            self._fields[state] = field_of(camera, args.focus_m, "equidistant")
         return self._fields[state]
 
 
@@ -331,7 +327,7 @@ def _write(
     options = {k: v for k, v in vars(args).items() if isinstance(v, str | int | float | list | tuple | None)}
     about = {**shot.metadata(), "exposure": exposure, "settings": options | asdict(args.settings)}
     metadata = plain({"neurolens": __version__, "colour": space.stated, "flare": about})
-    camera = placed_settings(job.lens, args.film, args.focus)
+    camera = placed_settings(job.lens, args.film, args.focus_m)
     header = standard_attributes(camera, job.raster.width, job.raster.height, args.frame)
     write_png(files.preview, total, exposure or 0.0)  # first: a frame whose EXR exists is kept
     channels = flare_channels(layers, space)

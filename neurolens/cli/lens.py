@@ -45,7 +45,7 @@ are from the axis in degrees; first-order data is for the d line (587.56 nm). Ne
 _EPILOG = """\
 examples:
   neurolens lens laikin_double_gauss_50
-  neurolens lens lenses/brendel_tessar_100.toml --efl 50 --focus 1.5 --layout tessar.png
+  neurolens lens lenses/brendel_tessar_100.toml --focal-length 50 --focus 1.5 --layout tessar.png
   neurolens lens lenses/ogawa_zoom_70_200.toml --zoom 135mm --json
   neurolens lens downloads/ --json
   neurolens lens list --layouts lenses.png
@@ -64,7 +64,7 @@ def add_parser(subparsers: Any) -> None:
         "ship)",
     )  # fmt: skip
     parser.intermixed = True
-    add_lens_state(parser, efl="as tabled", f_number="the tabled stop")
+    add_lens_state(parser)
     parser.add_argument(
         "--layout", metavar="OUT.png", type=Path,
         help="draw the lens with rays from three field points: axis, 70% and edge of the film (.png, .pdf, .svg)",
@@ -139,7 +139,7 @@ def run(args: argparse.Namespace) -> int:
         "file": str(args.file),
         **facts,
         "zoom": args.zoom,
-        "focusing": args.focusing,
+        "focus_mode": args.focus_mode or "best",
         "derived": lens.derived,
         "aperture": lens.aperture and lens.aperture.settings(),
         "configurations": configurations,
@@ -168,7 +168,7 @@ def _lens_text(data: dict[str, Any]) -> str:
         zoom = [f"{c['name']} ({number(c['efl_mm'])} mm)" for c in data["configurations"] if not _near(c)]
         near = [f"{c['name']} ({number(c['object_distance_mm'])} mm)" for c in data["configurations"] if _near(c)]
         parts += [f"Zoom states (--zoom, also mm between them): {', '.join(zoom)}"] if zoom else []
-        parts += [f"Focus states (--zoom, or --focusing internal): {', '.join(near)} to the object"] if near else []
+        parts += [f"Focus states (--zoom, or --focus-mode internal): {', '.join(near)} to the object"] if near else []
     if data["derived"]:
         parts.append(f"Derived: {data['derived']}")
     parts += [f"Warning: {text}" for text in data["warnings"]]

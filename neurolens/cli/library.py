@@ -153,7 +153,7 @@ def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
     from neurolens.setting.states import set_lens
     from neurolens.study.figures import draw_breathing
 
-    scene = Scene(set_lens(lens, focus_m=math.inf, focus="best"))
+    scene = Scene(set_lens(lens, focus_m=math.inf, focus_mode="best"))
 
     def drawn(what: str) -> Any:
         def draw(path: Path) -> None:
@@ -167,7 +167,7 @@ def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
         """Lights at infinity, the lens focused near; at three points of the field."""
         near = 1e-3 * _BOKEH_FOCUS * abs(scene.first_order.efl_mm)
         edge = max(scene.default_fields())
-        blurred = Scene(set_lens(lens, focus_m=near, focus="best"))
+        blurred = Scene(set_lens(lens, focus_m=near, focus_mode="best"))
         found = spots(blurred, [share * edge for share in _BOKEH_FIELDS], rings=20, shift_mm=[0.0])
         analysis_of("spots").draw(replace(found, airy_um=math.nan), path, lens.name, f"focused at {near:.3g} m")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -17,15 +16,15 @@ from neurolens.cli.arguments import (
     add_lens,
     add_lens_state,
     add_output,
-    aperture_of,
     positive,
+    shot_of,
     whole,
 )
 from neurolens.cli.output import answer
 from neurolens.cli.render import film_size
 
 if TYPE_CHECKING:
-    from neurolens.cameras.build import Shot
+    from neurolens.lens.shot import Shot
 
 _DESCRIPTION = """\
 Render a scene of Mitsuba 3 (.xml, or its own cornell-box) with its integrator and its film, through
@@ -59,9 +58,7 @@ def add_parser(subparsers: Any) -> None:
         help="of the scene (default: 1; 1000 for one in millimetres)",
     )  # fmt: skip
     add_exposure(parser)
-    add_lens_state(
-        parser, efl="as tabled; 50 for thin and pinhole; a model has its own", f_number="the widest; 4 for thin"
-    )
+    add_lens_state(parser)
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="no picture was written; older files of that name are untouched")
 
@@ -107,17 +104,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _shot(args: argparse.Namespace, shape: float) -> Shot:
     """What the command line sets, on a film for a picture of `shape`, its height over its width."""
-    from neurolens.cameras.build import Shot
     from neurolens.mitsuba.sensor import FILM_WIDTH_MM, LIGHT_NM
 
-    return Shot(
-        film_mm=args.film or (FILM_WIDTH_MM, FILM_WIDTH_MM * shape),
-        focus_m=math.inf if args.focus is None else args.focus,
-        f_number=args.f_number,
-        efl_mm=args.efl,
-        zoom=args.zoom,
-        field_deg=args.field,
-        focus=args.focusing,
-        aperture=aperture_of(args),
-        wavelength_nm=LIGHT_NM,
-    )
+    return shot_of(args, args.film or (FILM_WIDTH_MM, FILM_WIDTH_MM * shape), wavelength_nm=LIGHT_NM)

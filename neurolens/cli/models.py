@@ -75,7 +75,7 @@ def _advice(model: dict[str, Any]) -> list[Advice]:
     other = file.name.startswith(f"{lens}-")  # of another state or focal length than the lens's file has
     row = {**model, "name": file.stem, "file": f"{file.parent.name}/{file.name}"}
     results = {"models": [row], "exact": [expected_exact(model["refractions"])], "lens": {"file": f"{lens}.toml"}}
-    return advice(results | {"settings": {"lens": {"configuration": file.stem if other else None}}}, file.parent.parent)
+    return advice(results | {"settings": {"lens": {"zoom": file.stem if other else None}}}, file.parent.parent)
 
 
 def _places() -> list[Path]:

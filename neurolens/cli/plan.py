@@ -219,7 +219,7 @@ def _text(args: argparse.Namespace, found: Plan, folder: Path) -> str:
     view = "nothing with a distance" if asked.nearest_m is None else (
         f"{asked.nearest_m:.4g} to {asked.farthest_m:.4g} m"
     )  # fmt: skip
-    facts = f"f/{asked.f_number:.3g}, focus {asked.focus_m:g} m, in view {view}"
+    facts = f"f/{asked.f_number:.3g}, focus {asked.shot.focus_m:g} m, in view {view}"
     facts += f", {100 * asked.distant:.0f}% of the picture is distant; a pixel is {1e3 * asked.pixel_mm:.3g} um"
     facts += (
         f"\nlight from {asked.light_nm[0]:.0f} to {asked.light_nm[1]:.0f} nm; blur differs between neighbours over "
@@ -285,6 +285,14 @@ def _commands(args: argparse.Namespace, found: Plan, best: Choice, folder: Path)
         language, asked = found.target, found.asked
         words = ["export", f"{folder}/plan.toml", "--to", language, *state, "-o", f"camera.{language}"]
         if language != "osl":  # whose inputs they are
-            film, focus = "x".join(f"{v:g}" for v in asked.film_mm), f"{asked.focus_m:g}"
-            words[2:2] = ["--whole-camera", "--film", film, "--focus", focus, "--f-number", f"{asked.f_number:.6g}"]
+            film, focus = "x".join(f"{v:g}" for v in asked.shot.film_mm), f"{asked.shot.focus_m:g}"
+            words[2:2] = [
+                "--whole-camera",
+                "--film",
+                film,
+                "--focus",
+                focus,
+                "--f-number",
+                f"{asked.f_number:.6g}",
+            ]
     return [f"  {program()} {shlex.join(words)}"]

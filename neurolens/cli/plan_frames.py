@@ -33,9 +33,7 @@ def run_plan_frames(args: argparse.Namespace, lens: Lens, models: list[Path], fo
     scene, frames = load_scene(args.scene), []
     for frame, _, at in frames_of(args, "neurolens plan"):
         there = seen_from(scene, args.scene, at.get("position_m"), at.get("look_at_m"))
-        moved: dict[str, Any] = {k: at[k] for k in ("f_number",) if k in at}
-        if "focus" in at:
-            moved["focus_m"] = at["focus"]
+        moved: dict[str, Any] = {k: at[k] for k in ("f_number", "focus_m") if k in at}
         camera = replace(there.settings.camera, **moved)
         frames.append(Frame(frame, replace(there, settings=replace(there.settings, camera=camera)), at.get("zoom")))
     progress = Progress({"plan": 10}, quiet=args.quiet)

@@ -13,9 +13,9 @@ from neurolens.base.errors import InputError, warn
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain
-from neurolens.cli.arguments import CAMERAS_HELP, add_json, add_option, add_output, check_folder
+from neurolens.cli.arguments import CAMERAS_HELP, add_json, add_lens_state, add_option, add_output, check_folder
 from neurolens.cli.output import answer, number, table
-from neurolens.cli.stmap import LIGHT_NM, add_picture, add_state, shot_of, size_of
+from neurolens.cli.stmap import LIGHT_NM, add_picture, picture_shot, size_of
 
 if TYPE_CHECKING:
     from neurolens.analysis.projections import Projection, Residual
@@ -50,7 +50,7 @@ def add_parser(subparsers: Any) -> None:
     add_picture(parser)
     add_option(parser, "--projection", old=("--model",), choices=MODELS, required=True, help="the projection to fit")
     add_output(parser, "NAME", "write NAME.json and, for OpenCV's, NAME.yaml")
-    add_state(parser)
+    add_lens_state(parser)
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="files that were written are whole")
 
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.cameras.build import make_camera
     from neurolens.cameras.field import field_of, spectrum_of
 
-    shot, progress = shot_of(args), Progress(quiet=args.quiet)
+    shot, progress = picture_shot(args), Progress(quiet=args.quiet)
     camera = make_camera(args.camera, shot, progress)
     for note in camera.settings.get("notes", ()):
         warn(note)

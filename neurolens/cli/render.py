@@ -15,6 +15,7 @@ from neurolens.base.progress import Progress
 from neurolens.base.records import plain
 from neurolens.cli.arguments import (
     CAMERAS_HELP,
+    SHOT_OPTIONS,
     Parser,
     add_camera,
     add_exposure,
@@ -107,12 +108,7 @@ def add_parser(subparsers: Any) -> None:
     add_frames(parser)
     add_tile(parser)
     add_safety(parser)
-    add_lens_state(
-        parser,
-        efl="as tabled; 50 for thin and pinhole, 14 for fisheyes; a model has its own",
-        f_number="the scene's, or the widest that the lens opens to; 4 for thin",
-        focus="the scene's",
-    )
+    add_lens_state(parser)
     parser.add_argument(
         "--threads", metavar="N", type=whole(1, 256), default=2,
         help="workers, each pinned to a core if there are as many as cores (default: 2)",
@@ -160,9 +156,8 @@ def frame_of(args: argparse.Namespace) -> Frame:
     from neurolens.frames.frame import Frame
 
     return Frame.of(
-        args.scene, args.camera, focus_m=args.focus, f_number=args.f_number, efl_mm=args.efl, zoom=args.zoom,
-        field_deg=args.field, focus=args.focusing, aperture=aperture_of(args), film_offset_mm=args.film_offset,
-        vignetting=args.vignetting, glass_files=tuple(args.glass_files), film_mm=args.film,
+        args.scene, args.camera, **{name: getattr(args, name) for name in SHOT_OPTIONS}, aperture=aperture_of(args),
+        glass_files=tuple(args.glass_files), film_mm=args.film,
         width=args.width, height=args.height, samples=args.samples, seed=args.seed, max_depth=args.max_depth,
         colour_space=args.colour_space, white_balance=args.white_balance, wavelengths=args.wavelength_mode,
         wavelength_sampling=args.wavelength_sampling, half=args.half, channels=args.channels, exposure=args.exposure,

@@ -45,7 +45,7 @@ def _itself(value: float) -> float:
 
 
 _QUANTITIES = {
-    "focus": _Quantity("focus", 1, _FOCUS_M, "1/m", _inverse, _inverse),
+    "focus": _Quantity("focus_m", 1, _FOCUS_M, "1/m", _inverse, _inverse),
     "f-number": _Quantity("f_number", 1, F_NUMBER, "stops", math.log, math.exp),
     "zoom": _Quantity("zoom", 1, FOCAL_MM, "the logarithm of mm", math.log, math.exp),
     "position": _Quantity("position_m", 3, _PLACE_M, "m", _itself, _itself),
@@ -82,9 +82,8 @@ def frames_by_file(args: argparse.Namespace, frame: Frame) -> dict[Path, Frame]:
     """
     frames = {}
     for number, digits, values in frames_of(args):
-        changes = {"focus_m" if name == "focus" else name: value for name, value in values.items()}
         out = args.out.with_name(f"{args.out.stem}.{digits}{args.out.suffix}")
-        frames[out] = replace(frame, **changes, number=number, seed=frame.seed + number)
+        frames[out] = replace(frame, **values, number=number, seed=frame.seed + number)
     return frames
 
 

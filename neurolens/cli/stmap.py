@@ -18,9 +18,9 @@ from neurolens.cli.arguments import (
     add_lens_state,
     add_option,
     add_output,
-    aperture_of,
     check_folder,
     positive,
+    shot_of,
     wavelengths_nm,
     whole,
 )
@@ -30,8 +30,8 @@ from neurolens.cli.render_frames import LENS_KEYS, add_frames, frames_of
 from neurolens.render.settings import size_by_shape
 
 if TYPE_CHECKING:
-    from neurolens.cameras.build import Shot
     from neurolens.cameras.field import Field
+    from neurolens.lens.shot import Shot
     from neurolens.render.stmap import Plates
 
 _COMMAND = "neurolens stmap"
@@ -97,7 +97,7 @@ def add_parser(subparsers: Any) -> None:
         help="those of red, green and blue (default: 611.4,549.1,464.2 nm, the dominant ones of Rec. 709)",
     )  # fmt: skip
     add_frames(parser, "maps of these frames, SHOT.undistort.0001.exr and so on, all of one overscan", names=LENS_KEYS)
-    add_state(parser)
+    add_lens_state(parser)
     add_json(parser, quiet=True)
     parser.set_defaults(run=run, kept="files that were written are whole")
 
@@ -112,14 +112,6 @@ def add_picture(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--film", metavar="WxH", type=film_size, required=True, help="size of the film in mm")
 
 
-def add_state(parser: argparse.ArgumentParser) -> None:
-    """Add the state of the lens, for `shot_of`."""
-    add_lens_state(
-        parser, efl="as tabled; 50 for thin and pinhole, 14 for fisheyes; a model has its own",
-        f_number="the widest; 4 for thin",
-    )  # fmt: skip
-
-
 def size_of(args: argparse.Namespace) -> tuple[int, int]:
     """Width and height of the lens's picture in pixels.
 
@@ -131,21 +123,16 @@ def size_of(args: argparse.Namespace) -> tuple[int, int]:
     return args.size or size_by_shape(args.film[0] / args.film[1], args.width, args.height)
 
 
-def shot_of(args: argparse.Namespace) -> Shot:
+def picture_shot(args: argparse.Namespace) -> Shot:
     """What the command line sets.
 
     Raises:
         InputError: as of `size_of`; a film whose shape is not that of the picture.
     """
-    from neurolens.cameras.build import Shot
     from neurolens.render.film import PixelGrid
 
     PixelGrid(*size_of(args), args.film)
-    return Shot(
-        film_mm=args.film, focus_m=math.inf if args.focus is None else args.focus, f_number=args.f_number,
-        efl_mm=args.efl, zoom=args.zoom, field_deg=args.field, focus=args.focusing, aperture=aperture_of(args),
-        wavelength_nm=LIGHT_NM,
-    )  # fmt: skip
+    return shot_of(args, args.film, wavelength_nm=LIGHT_NM)
 
 
 def _pixels(text: str) -> tuple[int, int]:
@@ -206,7 +193,7 @@ def _traced(args: argparse.Namespace, text: str, progress: Progress) -> _Frame:
     from neurolens.cameras.build import make_camera
     from neurolens.cameras.field import field_of, frame_of, spectrum_of
 
-    shot = shot_of(args)
+    shot = picture_shot(args)
     camera = make_camera(args.camera, shot, progress)
     for note in camera.settings.get("notes", ()):
         warn(note)

@@ -56,7 +56,7 @@ examples:
   neurolens train --lens lenses/*_50.toml -o runs/fifties --dask tcp://cluster:8786
   neurolens train --lens lenses/nikon_zoom_70_200.toml --zoom-range -o runs/zoom
   neurolens train --lens lenses/brendel_tessar_100.toml -o runs/tessar \\
-      --set lens.efl_mm=50
+      --set lens.focal_length_mm=50
 
 The folder holds report.html, results.json, config.toml (all settings, defaults written out),
 lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
@@ -141,7 +141,7 @@ class Training:
     @property
     def settings(self) -> list[str]:
         """The options as changes of the experiment's settings, KEY=VALUE; --set comes last."""
-        states = ['lens.zoom="range"'] * self.zoom_range + ['lens.focusing="internal"'] * self.internal_focus
+        states = ['lens.zoom="range"'] * self.zoom_range + ['lens.focus_mode="internal"'] * self.internal_focus
         if self.within is not None:
             unit = self.within[0].removeprefix("rms_")
             states.append(f"target.{unit}={self.within[1]!r}")

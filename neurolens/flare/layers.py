@@ -107,7 +107,7 @@ def scene_choice(frames: Sequence[tuple[Scene, Lens]], raster: Raster, threads: 
     jobs = []
     for (_, lens), named in zip(frames, of_frames, strict=True):
         lens, lights = with_coating(lens, settings), keep_named(named, names).lights
-        jobs.append(FlareJob(lens, lights, raster, settings, scene.settings.camera.wavelengths_nm, threads))
+        jobs.append(FlareJob(lens, lights, raster, settings, scene.settings.camera.wavelength_nm, threads))
     return Choice(names, brightest(jobs))
 
 
@@ -137,7 +137,7 @@ def scene_flare(
     assert settings is not None and lens.film_z_mm is not None
     names, single = choice or scene_choice([(scene, lens)], raster, threads)
     lights = keep_named(sources.named(scene, lens.film_z_mm), names).lights
-    light_nm = scene.settings.camera.wavelengths_nm
+    light_nm = scene.settings.camera.wavelength_nm
     job = FlareJob(with_coating(lens, settings), lights, raster, settings, light_nm, threads, single=single)
     matrix = sources.balance(white_balance).T.astype(np.float32)
     return {name: picture @ matrix for name, picture in flare_layers(job, progress).items()}

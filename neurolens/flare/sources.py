@@ -37,7 +37,7 @@ class SceneLights:
     """The lights of a scene, as any camera in it sees them."""
 
     def __init__(self, scene: Scene) -> None:
-        low, high = scene.settings.camera.wavelengths_nm
+        low, high = scene.settings.camera.wavelength_nm
         spectral = SpectralRange(low, high)
         self._world, self._spectral, every = World(scene, spectral), spectral, np.arange(spectral.bins)
         rows, palette = self._world.light_emission_row, self._world.palette

@@ -22,8 +22,9 @@ from neurolens.base.files import check_writable
 from neurolens.base.lensname import Named, resolve
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera
+from neurolens.lens.shot import FocusMode, Shot, Vignetting
 from neurolens.render.colour import check_name
 from neurolens.render.film import PixelGrid
 from neurolens.render.renderer import RenderResult, Watch, render
@@ -67,8 +68,8 @@ class Frame:
 
     Attributes:
         scene: the scene file. camera: what `base.lensname.resolve` makes of a camera's name.
-        film_mm, focus_m, f_number, efl_mm, zoom, field_deg, focus, aperture, film_offset_mm, vignetting: as in
-            `cameras.build.Shot`.
+        film_mm, focus_m, f_number, focal_length_mm, zoom, field_deg, focus_mode, aperture, film_offset_mm, vignetting:
+            as in `lens.shot.Shot`.
         glass_files: catalogues of Zemax, whose glasses come before those that ship.
         position_m, look_at_m: where the camera stands, and a point on its optical axis.
         width, height: in pixels; one of them follows from the other and the film's shape. samples: in each pixel.
@@ -83,13 +84,13 @@ class Frame:
     camera: Named
     focus_m: float | None = None
     f_number: float | None = None
-    efl_mm: float | None = None
+    focal_length_mm: float | None = None
     zoom: str | float | None = None
     field_deg: float | None = None
-    focus: Literal["best", "paraxial", "internal"] = "best"
+    focus_mode: FocusMode | None = None
     aperture: Aperture | None = None
-    film_offset_mm: float = 0.0
-    vignetting: str = "both"
+    film_offset_mm: float | None = None
+    vignetting: Vignetting | None = None
     glass_files: tuple[Path, ...] = ()
     position_m: Vector | None = None
     look_at_m: Vector | None = None
@@ -124,12 +125,8 @@ class Frame:
 
     def shot(self, settings: CameraSettings, aperture: Aperture | None) -> Shot:
         """The scene's settings of the camera, and its stop's shape, with the changes of the frame."""
-        film_mm, light_nm = (settings.film_width_mm, settings.film_height_mm), settings.wavelengths_nm
-        clamped = self.f_number is None  # a scene's f-number is clamped to the lens; one of the frame must be possible
-        scene = Shot(
-            film_mm, settings.focus_m, settings.f_number, aperture=aperture, wavelength_nm=light_nm,
-            clamp_f_number=clamped,
-        )  # fmt: skip
+        # A scene's f-number is clamped to the lens; one of the frame must be possible.
+        scene = replace(settings.shot(aperture), clamp_f_number=self.f_number is None)
         changes = {field.name: getattr(self, field.name, None) for field in fields(Shot)}
         return replace(scene, **{name: value for name, value in changes.items() if value is not None})
 
@@ -141,7 +138,7 @@ class Frame:
 
     def size(self, settings: CameraSettings) -> tuple[int, int]:
         """Width and height in pixels."""
-        film = self.film_mm or (settings.film_width_mm, settings.film_height_mm)
+        film = self.film_mm or settings.film_mm
         width, height = self.width, self.height
         if width is None and height is None:
             if self.film_mm is None:

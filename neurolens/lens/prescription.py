@@ -8,14 +8,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
-from typing import Any, Literal
+from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.lensname import lens_id_of
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.film_plane import LINE_D_NM
 
-Focus = Literal["best", "paraxial", "internal"]
 VISIBLE_NM = (400.0, 700.0)
 
 

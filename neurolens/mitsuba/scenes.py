@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from neurolens.base.errors import InputError, NeurolensError
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, FloatArray
+from neurolens.lens.shot import Shot
 from neurolens.mitsuba.library import matrix, require_mitsuba
 from neurolens.mitsuba.sensor import FILM_WIDTH_MM, LIGHT_NM, PLUGIN, register
 

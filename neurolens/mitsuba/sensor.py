@@ -25,13 +25,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from neurolens.base.errors import InputError
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
+from neurolens.lens.shot import Shot, StopShape
 from neurolens.mitsuba.library import libraries, matrix, number, require_mitsuba, rows, vector
 from neurolens.render.film import PixelGrid
 from neurolens.render.images import make_aperture
@@ -161,10 +163,10 @@ def register() -> type:
 def _initialise(self: Any, props: Any, camera: Camera | None = None) -> None:
     """The plugin's constructor.
 
-    Parameters in a scene: camera (a model, a lens file, "thin" or "pinhole"), focus_m (default inf), f_number, efl_mm,
-    zoom, film_width_mm (default 36), film_height_mm (default: by the picture's shape), blades, blade_rotation_deg,
-    blade_curvature, aperture_mask, units_per_m (default 1), to_world (of the centre of the film plane, without scale),
-    film, sampler. From Python `camera` may be an object, which has its own film size in mm.
+    Parameters in a scene: camera (a model, a lens file, "thin" or "pinhole"), focus_m (default inf), f_number,
+    focal_length_mm, zoom, film_width_mm (default 36), film_height_mm (default: by the picture's shape), blades,
+    blade_rotation_deg, blade_curvature, aperture_mask, units_per_m (default 1), to_world (of the centre of the film
+    plane, without scale), film, sampler. From Python `camera` may be an object, which has its own film size in mm.
     """
     libraries()[0].Sensor.__init__(self, props)
     film = self.film()
@@ -199,12 +201,13 @@ def _camera_of(props: Any, shape: float) -> Camera:
         raise InputError(PLUGIN, "camera", "(missing)", "a model (.onnx), a lens file (.toml), thin or pinhole")
     names = ("blades", "blade_rotation_deg", "blade_curvature", "aperture_mask")
     blades, rotation, curvature, mask = (props.get(k, None) for k in names)
-    aperture = make_aperture(blades, rotation, curvature, _found(mask) if isinstance(mask, str) else mask)
+    mask = Path(_found(mask)) if isinstance(mask, str) else mask
+    aperture = make_aperture(StopShape(blades, rotation, curvature, mask))
     shot = Shot(
         film_mm=(width_mm, height_mm),
         focus_m=_number_of(props, "focus_m", math.inf),
         f_number=props.get("f_number", None),
-        efl_mm=props.get("efl_mm", None),
+        focal_length_mm=props.get("focal_length_mm", props.get("efl_mm", None)),
         zoom=props.get("zoom", None),
         aperture=aperture,
         wavelength_nm=LIGHT_NM,

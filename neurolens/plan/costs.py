@@ -70,7 +70,7 @@ def small(scene: Scene, across: int) -> tuple[int, int]:
     """Width and height of the scene's picture, no wider than `across`."""
     shot = scene.settings.camera
     width = min(across, shot.width)
-    return width, max(round(width * shot.film_height_mm / shot.film_width_mm), 1)
+    return width, max(round(width * shot.film_mm[1] / shot.film_mm[0]), 1)
 
 
 def rest_ns(scene: Scene, camera: Camera) -> float:

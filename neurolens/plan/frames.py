@@ -178,7 +178,7 @@ def _stretches(
     founds: Sequence[Probed], target: Target, budget_px: float, folder: Path
 ) -> Iterable[tuple[list[int], Choice]]:
     """Rows of `founds` that one model serves, and the model; what none serves is left out."""
-    order = sorted(range(len(founds)), key=lambda k: (_zoom(founds[k]), founds[k].asked.focus_m))
+    order = sorted(range(len(founds)), key=lambda k: (_zoom(founds[k]), founds[k].asked.shot.focus_m))
     sizes, done = shot_terms(founds[0]) if founds else [], 0
     while done < len(order):
         # From here on to as far as the largest model reaches: halves, for less is easier.
@@ -214,7 +214,7 @@ class _Stretch:
 
     def __init__(self, founds: Sequence[Probed], target: Target, budget_px: float, folder: Path) -> None:
         self.founds, self.target, self.budget_px, self.folder = founds, target, budget_px, folder
-        near, far = (f(p.asked.focus_m for p in founds) for f in (min, max))
+        near, far = (f(p.asked.shot.focus_m for p in founds) for f in (min, max))
         self.name = f"shot-{near:.4g}-{far:.4g}m" if near < far else f"shot-{near:.4g}m"
         self._files: dict[int, tuple[Path, ModelSettings]] = {}
 
@@ -259,8 +259,8 @@ def _effects(founds: Sequence[Probed], budget_px: float) -> tuple[Effect, ...]:
 def breathing_px(founds: Sequence[Probed]) -> tuple[float, float, float] | None:
     """By how much the picture of what stays in its place moves while the focus does, between its extremes, in pixels:
     what 95% of the picture keeps, the median, and the share beyond a pixel; None without a movement of focus."""
-    near, far = (f(founds, key=lambda p: p.asked.focus_m) for f in (min, max))
-    if near.asked.focus_m == far.asked.focus_m or _zoom(near) != _zoom(far):
+    near, far = (f(founds, key=lambda p: p.asked.shot.focus_m) for f in (min, max))
+    if near.asked.shot.focus_m == far.asked.shot.focus_m or _zoom(near) != _zoom(far):
         return None
     moved = prints.footprints(near.exact, far.places)
     share = far.places.share

@@ -93,7 +93,7 @@ def light_of(scene: Scene, camera: Camera, rgb: Array) -> tuple[tuple[float, flo
     Equal parts of the range that holds all but the last of it are each one wavelength, their centroid: a narrow line
     is one.
     """
-    low, high = scene.settings.camera.wavelengths_nm
+    low, high = scene.settings.camera.wavelength_nm
     if not camera.dispersive and getattr(camera, "achromatic", False):
         return (low, high), np.array([(low + high) / 2]), np.ones(1)
     nm, seen = spectrum_seen(scene, rgb)
@@ -105,7 +105,7 @@ def light_of(scene: Scene, camera: Camera, rgb: Array) -> tuple[tuple[float, flo
 def spectrum_seen(scene: Scene, rgb: Array) -> tuple[Array, Array]:
     """Wavelengths in nm and their light as the eye weighs it: of the scene's lights, tinted so that its picture has the
     mean colour [3]."""
-    low, high = scene.settings.camera.wavelengths_nm
+    low, high = scene.settings.camera.wavelength_nm
     nm, light = expected_light(scene)
     spectral = SpectralRange(low, high, len(nm))
     if spectral.colours and rgb.max() > 0:
@@ -144,7 +144,7 @@ def stray_light(scene: Scene, camera: Any, seen: Glance, white_balance: str | No
     none = np.zeros((height, width))
     if not lights:
         return dict.fromkeys(STRAY.values(), none)
-    raster, light_nm = Raster(camera.film_mm, width, height), scene.settings.camera.wavelengths_nm
+    raster, light_nm = Raster(camera.film_mm, width, height), scene.settings.camera.wavelength_nm
     settings = FlareSettings(bins=_WAVES, cell_px=_CELL_PX, glare=_PHOTONS // len(lights))
     layers = flare_layers(FlareJob(lens, lights, raster, settings, light_nm, threads=1))
     half = np.array(camera.film_mm) / 2 / camera.settings["lens_state"]["pinhole_focal_length_mm"]

@@ -28,7 +28,7 @@ from neurolens.base.lensname import IDEAL_OF, split_kind
 from neurolens.base.progress import Report
 from neurolens.base.records import Timing, noisy
 from neurolens.base.tomlfile import format_toml
-from neurolens.cameras.build import Shot, ideal_as
+from neurolens.cameras.build import ideal_as
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.model import OnnxCamera, OnnxLens, load_model
 from neurolens.cameras.warped import Warped
@@ -100,6 +100,9 @@ class Choice:
         return self.error_px <= budget_px and self.light_error <= LIGHT
 
 
+_SHOWN = "film_mm", "focus_m", "f_number", "wavelength_nm"  # settings of the shot in `Plan.to_dict`
+
+
 @dataclass(frozen=True)
 class Plan:
     """What was asked, the effects in falling order of worth, every camera tried by rising cost, the one to use.
@@ -128,6 +131,8 @@ class Plan:
         """JSON-able: what is above `probed`."""
         told = asdict(replace(self, probed=None))  # type: ignore[arg-type]
         del told["probed"]
+        shot = told["asked"].pop("shot")
+        told["asked"] = {name: shot[name] for name in _SHOWN} | told["asked"]
         return told
 
     def to_toml(self, lens: Lens, folder: Path) -> str:
@@ -140,7 +145,7 @@ class Plan:
         if best.settings is None:
             return format_toml({"title": title, "camera": camera})
         file, asked = Path(os.path.relpath(lens.path, folder)), self.asked
-        choice = LensChoice(file, configuration=asked.zoom, f_number=asked.f_number)
+        choice = LensChoice(file, zoom=asked.zoom, f_number=asked.f_number)
         checks = EvaluationChoice(vignetting_rays=50_000, rounds=0, compile_exact=False)
         return to_toml(Experiment(title, choice, (best.settings,), self.domain, PAIRS, checks, camera=camera))
 
@@ -304,7 +309,7 @@ class _Trial:
         asked = self.found.asked
         state = asked.zoom if str(file) == self.found.lens.path else None  # models are of one
         lens = lens_of(Path(file), state, lambda done, left=None: None)[1]
-        ns, times = shader_cost(lens, self.found.places, asked.film_mm, asked.f_number, asked.focus_m)
+        ns, times = shader_cost(lens, self.found.places, asked.shot.film_mm, asked.f_number, asked.shot.focus_m)
         return _counted(ns), times
 
 
@@ -323,17 +328,10 @@ def camera_of(found: Probed, choice: Choice) -> Camera:
     if choice.name == _EXACT:
         return found.exact
     if kind in IDEAL_OF:
-        flat = ideal_as(kind, found.exact.lens, Shot(found.asked.film_mm, found.asked.focus_m))
+        flat = ideal_as(kind, found.exact.lens, found.asked.shot)
         mapped = choice.name.endswith(_MAPPED)
-        return Warped(flat, found.exact, found.asked.focus_m, tables=found.exact_field) if mapped else flat
-    return OnnxCamera(load_model(path), **_real(found), runtime="c" if kind else "onnxruntime")
-
-
-def _real(found: Probed) -> dict[str, Any]:
-    """The shot as cameras of models take it."""
-    asked = found.asked
-    shot = {"film_mm": asked.film_mm, "focus_m": asked.focus_m, "f_number": asked.f_number}
-    return {**shot, "wavelength_nm": asked.wavelength_nm, "aperture": found.lens.aperture}
+        return Warped(flat, found.exact, found.asked.shot.focus_m, tables=found.exact_field) if mapped else flat
+    return OnnxCamera(load_model(path), found.asked.shot, runtime="c" if kind else "onnxruntime")
 
 
 def _ideal(trial: _Trial) -> Iterator[_Judged]:
@@ -341,7 +339,7 @@ def _ideal(trial: _Trial) -> Iterator[_Judged]:
 
     In C and GLSL they are their own source.
     """
-    found, shot = trial.found, Shot(trial.found.asked.film_mm, trial.found.asked.focus_m)
+    found, shot = trial.found, trial.found.asked.shot
     for name in {"onnx": (), "osl": _IDEAL[:2]}.get(trial.target, _IDEAL):
         spec = f"{name}:{found.lens.path}"
         with suppress(InputError):  # no thick lens of cylinders; no maps of half a sphere, or of a film that is dark
@@ -352,7 +350,7 @@ def _ideal(trial: _Trial) -> Iterator[_Judged]:
                 continue
             if name == "thin" and trial.target in _OURS:
                 continue  # in our renderer the thick lens stands in its place
-            maps = Warped(camera, found.exact, found.asked.focus_m)
+            maps = Warped(camera, found.exact, found.asked.shot.focus_m)
             if maps.area < _MOST_OVERSCAN:
                 how = f"then the ST map of 'neurolens stmap' over the picture, of {maps.area:.3g} times the area"
                 cost = partial(trial.ideal, name, camera, seen, maps.area)
@@ -388,7 +386,7 @@ def _model(trial: _Trial, file: Path, how: str = "", without: Collection[str] = 
         form = model.card["fit"]["method"].partition("-")[0]
         if form in without or not (compiled or target != "c"):
             return
-        camera = OnnxCamera(model, **_real(trial.found), outline=trial.found.exact.film.outline)
+        camera = OnnxCamera(model, trial.found.asked.shot, outline=trial.found.exact.film.outline)
         seen = prints.footprints(camera, trial.found.places)
         beside = prints.light_beside(camera, trial.found.places) / np.maximum(trial.found.seen.light, 1e-30)
 

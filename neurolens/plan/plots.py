@@ -28,7 +28,7 @@ def plot_effects(plan: Plan, path: Path, title: str) -> None:
     groups = {unit: [e.name for e in shown if e.unit == unit] for unit in _TITLES}
     groups = {unit: names for unit, names in groups.items() if names}
     heights = [4.2, *(1.6 * -(-len(names) // _COLUMNS) + 0.15 for names in groups.values())]
-    subtitle = f"f/{asked.f_number:.3g}, focus {asked.focus_m:g} m; 95% of the picture keeps these figures"
+    subtitle = f"f/{asked.f_number:.3g}, focus {asked.shot.focus_m:g} m; 95% of the picture keeps these figures"
     with drawing(path, 9.5, sum(heights), title, subtitle) as figure:
         if not groups:
             _bars_and_trade(plan, figure)
@@ -36,7 +36,7 @@ def plot_effects(plan: Plan, path: Path, title: str) -> None:
         above, *below = figure.subfigures(len(heights), 1, height_ratios=heights)
         _bars_and_trade(plan, above)
         for part, (unit, names) in zip(below, groups.items(), strict=True):
-            _maps(part, {name: plan.probed.maps[name][1] for name in names}, unit, asked.film_mm)
+            _maps(part, {name: plan.probed.maps[name][1] for name in names}, unit, asked.shot.film_mm)
 
 
 def _maps(figure: Any, maps: Mapping[str, Any], unit: str, film_mm: tuple[float, float]) -> None:

@@ -21,12 +21,14 @@ from numpy.typing import NDArray
 from neurolens.analysis.field_curves import illumination
 from neurolens.analysis.fields import Scene as Fields
 from neurolens.base.errors import InputError
-from neurolens.cameras.build import Shot, ideal_as
+from neurolens.cameras.build import ideal_as
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.field import Field, field_of
 from neurolens.graph.compiler import has_compiler
+from neurolens.lens.film_plane import PupilBounds
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
+from neurolens.lens.shot import Shot
 from neurolens.plan import footprints as prints
 from neurolens.plan.footprints import AFTERWARDS, Array, Footprints, Places
 from neurolens.plan.light import STRAY, Glance, glance, small_raster, stray_light
@@ -57,8 +59,8 @@ class Asked:
     """What a scene asks of its camera.
 
     Attributes:
-        film_mm: width and height in use. pixel_mm: pitch. focus_m, f_number, wavelength_nm: of the shot; no wider
-            than the lens opens. nearest_m, farthest_m: along the axis from the film; None where nothing is in view.
+        shot: for the lens at its zoom; the f-number is no wider than the lens opens. pixel_mm: pitch.
+        nearest_m, farthest_m: along the axis from the film; None where nothing is in view.
         distant: share of the picture that shows what has no distance. dark: share that the lens leaves dark.
         light_nm: between which all but 0.2% of the scene's light lies, as the eye weighs it.
         contrast: RMS relative difference of neighbours on 48 pixels across, the median. edges: share of neighbours
@@ -68,11 +70,8 @@ class Asked:
             denoised: whether noise is taken out, so that cameras are not charged for it. zoom: state of the lens.
     """
 
-    film_mm: tuple[float, float]
+    shot: Shot
     pixel_mm: float
-    focus_m: float
-    f_number: float
-    wavelength_nm: tuple[float, float]
     nearest_m: float | None
     farthest_m: float | None
     distant: float
@@ -85,6 +84,11 @@ class Asked:
     afterwards: tuple[str, ...] = ()
     denoised: bool = False
     zoom: str | None = None
+
+    @property
+    def f_number(self) -> float:
+        """The f-number of the shot."""
+        return float(self.shot.f_number or math.nan)
 
 
 @dataclass(frozen=True)
@@ -131,7 +135,7 @@ class Probed:
         Raises:
             InputError: as `field_of`.
         """
-        return field_of(self.exact, self.asked.focus_m)
+        return field_of(self.exact, self.asked.shot.focus_m)
 
     @cached_property
     def camera_maps(self) -> Maps:
@@ -149,7 +153,7 @@ class Probed:
     def on_film(self, value: Array) -> Array:
         """Values [N] of places as a picture [rows, columns], as prints show it: upright; NaN where none is."""
         found = np.full(self.shape, np.nan)
-        at = self.places.film_mm / np.array(self.asked.film_mm)[:, None] + 0.5
+        at = self.places.film_mm / np.array(self.asked.shot.film_mm)[:, None] + 0.5
         column, row = (np.minimum((at[k] * n).astype(int), n - 1) for k, n in enumerate(self.shape[::-1]))
         found[row, column] = np.broadcast_to(value, row.shape)
         return upright(found)
@@ -173,11 +177,11 @@ def probe(
     if not set(afterwards) <= set(AFTERWARDS):
         raise InputError("plan", "afterwards", sorted(afterwards), f"of {', '.join(AFTERWARDS)}")
     lens, shot = lens if zoom is None else set_lens(lens, zoom=zoom), scene.settings.camera
-    film, widest = (shot.film_width_mm, shot.film_height_mm), first_order(lens).f_number
+    film, widest = shot.film_mm, first_order(lens).f_number
     f_number = max(shot.f_number or widest, widest)
     stopped, domain = set_lens(lens, f_number=f_number, focus_m=shot.focus_m), _domain(lens, scene, f_number)
-    real: dict[str, Any] = {"film_mm": film, "focus_m": shot.focus_m, "f_number": f_number}
-    exact = exact_camera(lens, {**real, "bounds": domain.bounds, "wavelength_nm": shot.wavelengths_nm})
+    real = Shot(film, shot.focus_m, f_number, aperture=lens.aperture, wavelength_nm=shot.wavelength_nm)
+    exact = exact_camera(lens, real, domain.bounds)
     shape = _shape(film, across)
     points = _grid(film, shape)
     with shared_worlds():
@@ -187,10 +191,10 @@ def probe(
     places = prints.places_of(exact, points, far, small.wavelength_nm, small.share)
     if not places.film_mm.shape[1]:
         raise InputError(scene.name, "camera", lens.name, "a lens that lights some of this film")
-    thin = ideal_as("thin:", exact.lens, Shot(film, shot.focus_m))
+    thin = ideal_as("thin:", exact.lens, real)
     met = depth[np.isfinite(depth)]
     asked = Asked(
-        film, film[0] / shot.width, shot.focus_m, f_number, shot.wavelengths_nm,
+        real, film[0] / shot.width,
         float(met.min()) if met.size else None, float(met.max()) if met.size else None,
         float(np.isinf(depth).mean()), 1 - places.film_mm.shape[1] / points.shape[1],
         small.range_nm, float(np.median(small.contrast)),
@@ -206,16 +210,16 @@ def _domain(lens: Lens, scene: Scene, f_number: float) -> Domain:
     """What a model of the shot must know: its film, stop and wavelengths, and as much more of the film's way as blurs a
     quarter of a pixel, for models have their own focus; none more of a lens that goes no nearer."""
     shot, plain = scene.settings.camera, lens.with_aperture(None)
-    film = shot.film_width_mm, shot.film_height_mm
+    film = shot.film_mm
     stopped = set_lens(plain, f_number=f_number, focus_m=shot.focus_m)
     radius = min(math.hypot(*film) / 2, image_radius_mm(lens)[0])
     move = _FOCUS_SPARE * f_number * film[0] / shot.width / first_order(stopped).efl_mm ** 2  # of the vergence, 1/mm
     vergence = 1e-3 / shot.focus_m
     ends = 1e-3 / (vergence - move) if vergence > move else math.inf, 1e-3 / (vergence + move)
     with suppress(InputError):
-        return domain_of(stopped, film_radius_mm=radius, focus_m=ends, wavelength_nm=shot.wavelengths_nm)
+        return domain_of(stopped, film_radius_mm=radius, focus_m=ends, wavelength_nm=shot.wavelength_nm)
     return domain_from_camera(
-        plain, film_mm=film, focus_m=shot.focus_m, f_number=f_number, wavelength_nm=shot.wavelengths_nm
+        plain, film_mm=film, focus_m=shot.focus_m, f_number=f_number, wavelength_nm=shot.wavelength_nm
     )[1]
 
 
@@ -277,7 +281,7 @@ def passed_share(found: Probed) -> Array:
 
     def along(axis: Literal["x", "y"], height_mm: Array) -> Array:
         try:
-            data = illumination(Fields(found.lens, found.asked.focus_m, axis), fields=_FIELDS)
+            data = illumination(Fields(found.lens, found.asked.shot.focus_m, axis), fields=_FIELDS)
         except InputError:  # no chief rays: what the rims take is then part of the natural fall-off
             return np.ones_like(height_mm)
         known = np.isfinite(data.passed)
@@ -306,12 +310,12 @@ def effects_of(found: Probed, budget_px: float, stray: bool = True) -> tuple[Eff
     return tuple(sorted(effects, key=lambda e: (e.unit, -e.worth)))
 
 
-def exact_camera(lens: Lens, real: dict[str, Any]) -> ExactCamera:
+def exact_camera(lens: Lens, shot: Shot, bounds: PupilBounds) -> ExactCamera:
     """The exact camera, compiled as C where the machine has a compiler."""
     with suppress(InputError):
         if has_compiler():
-            return ExactCamera(lens, **real, runtime="c")
-    return ExactCamera(lens, **real)
+            return ExactCamera(lens, shot, bounds=bounds, runtime="c")
+    return ExactCamera(lens, shot, bounds=bounds)
 
 
 def _shape(film_mm: tuple[float, float], across: int) -> tuple[int, int]:

@@ -37,7 +37,7 @@ def blur_map(found: Probed) -> tuple[Pixels, Pixels]:
     Raises:
         InputError: a picture beyond memory.
     """
-    shot, film = found.scene.settings.camera, np.array(found.asked.film_mm)
+    shot, film = found.scene.settings.camera, np.array(found.asked.shot.film_mm)
     check_memory(shot.width, shot.height)
     x, y = (((np.arange(n) + 0.5) / n - 0.5) * side for n, side in zip((shot.width, shot.height), film, strict=True))
     depth = np.empty((shot.height, shot.width), np.float32)

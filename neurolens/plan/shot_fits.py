@@ -29,7 +29,7 @@ PAIRS = PairSettings(train=5000, held_out=1000, rim=5000)
 
 def shot_domain(found: Probed) -> DomainChoice:
     """That of `Probed.domain`, as an experiment asks for it."""
-    return DomainChoice(found.domain.film_radius_mm, found.domain.focus_m, found.asked.wavelength_nm)
+    return DomainChoice(found.domain.film_radius_mm, found.domain.focus_m, found.asked.shot.wavelength_nm)
 
 
 def shot_terms(found: Probed) -> list[int]:

@@ -30,6 +30,7 @@ from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import read_bytes
 from neurolens.cameras.contract import FloatArray
 from neurolens.lens.apertures import MAX_MASK, THRESHOLD, Aperture
+from neurolens.lens.shot import StopShape
 from neurolens.render.colour import srgb_to_linear
 from neurolens.render.pictures import COLOURS, check_size, colours_of, decoded_channels
 from neurolens.render.scenetables import BRIGHTEST
@@ -160,26 +161,22 @@ def read_environment(scene: Path, field: str, path: Path, scale: float = 1.0) ->
     return picture
 
 
-def make_aperture(
-    blades: int | None = None,
-    rotation_deg: float | None = None,
-    curvature: float | None = None,
-    mask: str | Path | None = None,
-) -> Aperture | None:
-    """The stop's shape of a command line or a scene; None if not given.
+def make_aperture(shape: StopShape) -> Aperture | None:
+    """The stop's opening of a command line or a scene; None if no shape is given.
 
     Raises:
         InputError: blades and a mask together, a rotation or curvature of nothing, a picture that cannot be read.
     """
-    if blades is None and mask is None:
+    blades, rotation_deg, curvature = shape.blades, shape.blade_rotation_deg, shape.blade_curvature
+    if blades is None and shape.aperture_mask is None:
         if rotation_deg is None and curvature is None:
             return None
         raise InputError("aperture", "blades", "(missing)", "a number of blades, or a mask, with the other options")
-    if blades is not None and mask is not None:
-        raise InputError("aperture", "mask", str(mask), "blades or a mask, not both")
-    if mask is not None and curvature is not None:
+    if blades is not None and shape.aperture_mask is not None:
+        raise InputError("aperture", "mask", str(shape.aperture_mask), "blades or a mask, not both")
+    if shape.aperture_mask is not None and curvature is not None:
         raise InputError("aperture", "curvature", curvature, "left out: a mask has no blades")
-    opening = None if mask is None else read_mask(mask)
+    opening = None if shape.aperture_mask is None else read_mask(shape.aperture_mask)
     return Aperture(blades, rotation_deg or 0.0, curvature or 0.0, opening)
 
 

@@ -64,7 +64,7 @@ class Job:
         self.scene, self.camera, self.grid = scene, camera, grid
         self.seed, self.max_depth, self.settings = seed, max_depth, settings
         pose = scene.settings.camera
-        self.mode = mode_for(camera, grid, pose.wavelengths_nm, settings)
+        self.mode = mode_for(camera, grid, pose.wavelength_nm, settings)
         self.spectral = spectral_range(scene, camera, settings, LANES if self.mode == "hero" else 1)
         self.world = world_of(scene, self.spectral)
         white = settings.white_balance if self.spectral.colours else None
@@ -265,18 +265,18 @@ _FARTHEST_M = 1e4
 def spectral_range(scene: Scene, camera: Camera, film: FilmSettings, lanes: int = 1) -> SpectralRange:
     """The scene's wavelengths, in bins by their importance; InputError where a camera that disperses lacks some."""
     settings = scene.settings.camera
-    low, high = settings.wavelengths_nm
+    low, high = settings.wavelength_nm
     accepted = camera.wavelength_nm
     if camera.dispersive and accepted is not None and not (accepted[0] <= low and high <= accepted[1]):
         expected = f"within the {accepted[0]:g}-{accepted[1]:g} nm of camera {camera.name}"
-        raise InputError("scene", "camera.wavelengths_nm", settings.wavelengths_nm, expected)
+        raise InputError("scene", "camera.wavelength_nm", settings.wavelength_nm, expected)
     light = expected_light(scene) if film.wavelength_sampling == "importance" else None
     return SpectralRange(low, high, light=light, lanes=lanes)
 
 
 def expected_light(scene: Scene) -> Spectrum:
     """Spectrum (nm, radiance relative to D65) of a scene's light: lamps by area, the environment with equal weight."""
-    fine = SpectralRange(*scene.settings.camera.wavelengths_nm, _FINE)
+    fine = SpectralRange(*scene.settings.camera.wavelength_nm, _FINE)
     lamps: dict[str, FloatArray64] = {}  # sums of emission by illuminant
     for name, emission, area in _lamps(scene):
         lamps[name] = lamps.get(name, 0.0) + area * np.array(emission)

@@ -12,12 +12,13 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from neurolens.base.bounds import F_NUMBER, FILM_MM
+from neurolens.base.bounds import F_NUMBER, FILM_MM, said, within
 from neurolens.base.config import from_dict
 from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import read_toml, suggestion
 from neurolens.cameras.contract import FloatArray
 from neurolens.lens.apertures import Aperture
+from neurolens.lens.shot import Shot, StopShape
 from neurolens.render import scenetables as tables
 from neurolens.render.colour import Spectrum, check_name, check_spectrum, illuminant, read_spectrum
 from neurolens.render.images import make_aperture, read_environment, read_pictures
@@ -37,11 +38,12 @@ from neurolens.render.scenetables import (
 from neurolens.render.settings import FilmSettings, FlareSettings
 
 _SHAPES = ("planes", "quads", "discs", "spheres", "boxes", "rooms", "meshes")
+_FILM_MM = (36.0, 20.25)
 _WALLS = ("left", "right", "floor", "ceiling", "far", "near")
 
 
-@dataclass(frozen=True)
-class CameraSettings(Checked):
+@dataclass(frozen=True, kw_only=True)
+class CameraSettings(StopShape, Checked):
     """Place, film and picture of the camera; the camera itself is chosen by the caller of `render`.
 
     Attributes:
@@ -49,8 +51,8 @@ class CameraSettings(Checked):
         focus_m: distance from film to the object in focus. f_number: None leaves it to the lens.
         blades, blade_rotation_deg, blade_curvature, aperture_mask: shape of the stop's opening, see
             `lens.apertures`; the mask is a picture beside the scene. Without them the lens's own, else round.
-        film_width_mm, film_height_mm: the part of the film that is used.
-        wavelengths_nm: range of light. width, height: picture in pixels. samples: a pixel.
+        film_mm: width and height of the part of the film that is used.
+        wavelength_nm: range of light. width, height: picture in pixels. samples: a pixel.
         max_depth: number of surfaces along a path at which light is scattered.
     """
 
@@ -59,15 +61,13 @@ class CameraSettings(Checked):
     focus_m: Annotated[float, Rule(lambda v: v > 0, "a number above 0")]
     up: tables.Place = (0.0, 1.0, 0.0)
     f_number: Annotated[float | None, between(*F_NUMBER, "an f-number")] = None
-    blades: int | None = None
-    blade_rotation_deg: float | None = None
-    blade_curvature: float | None = None
-    aperture_mask: Path | None = None
-    film_width_mm: Annotated[float, between(*FILM_MM, "mm")] = 36.0
-    film_height_mm: Annotated[float, between(*FILM_MM, "mm")] = 20.25
-    wavelengths_nm: Annotated[
+    film_mm: Annotated[
+        tuple[float, float],
+        Rule(lambda v: all(within(FILM_MM, side) for side in v), f"sides {said(FILM_MM)} mm"),
+    ] = _FILM_MM
+    wavelength_nm: Annotated[
         tuple[float, float], Rule(lambda v: 380 <= v[0] <= v[1] <= 780, "low and high within 380 to 780")
-    ] = (400.0, 700.0)
+    ] = field(default=(400.0, 700.0), metadata={"was": ("wavelengths_nm",)})
     width: Annotated[int, between(1, 16384, "an integer")] = 320
     height: Annotated[int, between(1, 16384, "an integer")] = 180
     samples: Annotated[int, Rule(lambda v: 1 <= v <= 1 << 20, f"an integer from 1 to {1 << 20}")] = 64
@@ -80,6 +80,13 @@ class CameraSettings(Checked):
         require(far > 0, "look_at_m", self.look_at_m, "a point other than position_m")
         across = float(np.linalg.norm(np.cross(axis, up)))
         require(across > 1e-6 * far * high, "up", self.up, "a direction not along the optical axis")
+
+    def shot(self, aperture: Aperture | None = None) -> Shot:
+        """The shot of the scene, whose f-number is clamped to that of the lens."""
+        light_nm = self.wavelength_nm
+        return Shot(
+            self.film_mm, self.focus_m, self.f_number, aperture=aperture, wavelength_nm=light_nm, clamp_f_number=True
+        )
 
 
 @dataclass(frozen=True)
@@ -146,7 +153,7 @@ def load_scene(path: str | Path) -> Scene:
 def scene_from_tables(tables: Mapping[str, Any], path: str | Path = "scene") -> Scene:
     """Make a scene from tables in memory, as `load_scene` does; `path` is for messages and for finding files."""
     path = Path(path)
-    settings, triangles = _with_meshes(path, from_dict(SceneSettings, tables, path))
+    settings, triangles = _with_meshes(path, from_dict(SceneSettings, _with_film(tables, path), path))
     _check_references(path, settings, triangles)
     _check_camera(path, settings, triangles)
     textures = {name: t.file for name, t in settings.textures.items() if t.file is not None}
@@ -163,6 +170,18 @@ def scene_from_tables(tables: Mapping[str, Any], path: str | Path = "scene") -> 
         _spectra(path, "reflectances", settings.reflectances, settings.camera, most=1.0),
         None if around is None else read_environment(path, "environment.file", path.parent / around, scale),
     )
+
+
+def _with_film(tables: Mapping[str, Any], path: Path) -> Mapping[str, Any]:
+    """The tables of a scene with `film_mm` in place of its earlier keys, film_width_mm and film_height_mm."""
+    camera, sides = tables.get("camera"), ("film_width_mm", "film_height_mm")
+    if not (isinstance(camera, Mapping) and set(sides) & camera.keys()):
+        return tables
+    if "film_mm" in camera:
+        raise InputError(path, "camera.film_mm", camera["film_mm"], f"left out beside {sides[0]} and {sides[1]}")
+    film_mm = [camera.get(side, default) for side, default in zip(sides, _FILM_MM, strict=True)]
+    rest = {key: value for key, value in camera.items() if key not in sides}
+    return {**tables, "camera": {**rest, "film_mm": film_mm}}
 
 
 def _with_meshes(path: Path, settings: SceneSettings) -> tuple[SceneSettings, tuple[TriangleSet, ...]]:
@@ -193,13 +212,13 @@ def seen_from(scene: Scene, path: str | Path, position_m: Vector | None, look_at
 def _aperture(path: Path, camera: CameraSettings) -> Aperture | None:
     mask = None if camera.aperture_mask is None else path.parent / camera.aperture_mask
     try:
-        return make_aperture(camera.blades, camera.blade_rotation_deg, camera.blade_curvature, mask)
+        return make_aperture(replace(camera, aperture_mask=mask))
     except InputError as error:
         raise InputError(path, f"camera, {error.file} {error.field}", error.value, error.expected) from None
 
 
 def _illuminants(path: Path, settings: SceneSettings) -> dict[str, Spectrum]:
-    low, high = settings.camera.wavelengths_nm
+    low, high = settings.camera.wavelength_nm
     measured = _spectra(path, "illuminants", settings.illuminants, settings.camera)
     for name, (nm, values) in measured.items():
         if illuminant(name) is not None:
@@ -223,7 +242,7 @@ def _spectra(
     most: float | None = None,
 ) -> dict[str, Spectrum]:
     """Measured spectra over all of the camera's wavelengths: scaled to a maximum of 1, or with `most` as they are."""
-    low, high = camera.wavelengths_nm
+    low, high = camera.wavelength_nm
     found = {}
     for name, given in tables.items():
         place = f"{kind}.{name}"

@@ -136,7 +136,7 @@ def focus_path(lens: Lens) -> FocusPath:
         InputError: a file without focus states.
     """
     if not focus_states(lens):
-        raise InputError(lens.path, "focus", "internal", '"best" or "paraxial": the file has no focus states')
+        raise InputError(lens.path, "focus_mode", "internal", '"best" or "paraxial": the file has no focus states')
     film = len(lens.surfaces) - 1
     moved = sorted({film, *(k for c in focus_states(lens) for k, _ in c.thickness_mm)})
     by_zoom: dict[Configuration | None, list[Configuration]] = {}
@@ -179,7 +179,7 @@ def focused_inside(lens: Lens, focus_m: float | None, object_mm: float | None = 
     furthest = len(path.steps) - 1
     nearest = _vergence(place(furthest))
     if not nearest > 0:
-        raise InputError(lens.path, "focus", "internal", "focus states that focus nearer than infinity")
+        raise InputError(lens.path, "focus_mode", "internal", "focus states that focus nearer than infinity")
     if wanted > nearest * (1 + 1e-9):
         limit = f"at least {_rounded_up(1 / nearest / 1000):g} m, the nearest focus of the source's states"
         raise InputError(lens.path, "focus_m", focus_m, limit)
@@ -265,7 +265,7 @@ def best_focus_z_mm(lens: Lens, focus_m: float = math.inf, wavelength_nm: tuple[
         along, across = _moments(lens, film_z - 1000 * focus_m, wavelengths)
         w = torch.from_numpy(weights)[:, None, None]
         if not float(across.sum()) > 0:
-            raise InputError(lens.path, "focus", "best", "a lens that axial light passes and bends")
+            raise InputError(lens.path, "focus_mode", "best", "a lens that axial light passes and bends")
         film_z = -float((w * along).sum() / (w * across).sum())
     return film_z
 

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from neurolens.base.bounds import F_NUMBER, FOCAL_MM, said, within
 from neurolens.base.errors import InputError
 from neurolens.lens import paraxial
-from neurolens.lens.prescription import Configuration, Focus, Lens
+from neurolens.lens.prescription import Configuration, Lens
+from neurolens.lens.shot import FocusMode, Shot
 from neurolens.setting.focusing import (
     at_infinity,
     best_focused,
@@ -36,20 +37,23 @@ from neurolens.trace.rays import trace
 
 def set_lens(
     lens: Lens,
+    shot: Shot | None = None,
     *,
     focus_m: float | None = None,
     f_number: float | None = None,
     focal_length_mm: float | None = None,
     field_deg: float | None = None,
     zoom: str | float | None = None,
-    focus: Focus = "paraxial",
+    focus_mode: FocusMode = "paraxial",
     wavelength_nm: tuple[float, float] | None = None,
 ) -> Lens:
-    """Return the lens zoomed, scaled, stopped down and focused::
+    """Return the lens zoomed, scaled, stopped down and focused, for a shot or for some settings of one::
 
         lens = set_lens(read_lens("lenses/laikin_double_gauss_50.toml"), focus_m=2.0, f_number=4.0)
 
     Args:
+        shot: all of the settings, with the shape of the stop and the film's offset; the other arguments are then left
+            out. After "internal" focus the film, too, moves to the least spot.
         focus_m: distance from object to film in metres, `inf` allowed; None focuses at infinity (a focus state that is
             named: at the object of the source), and leaves the focus where `f_number` alone is given.
         f_number: focal length over the diameter of the paraxial entrance pupil at infinity focus, of a bladed stop by
@@ -60,9 +64,9 @@ def set_lens(
             (by the traced chief ray, along x; distortion included).
         zoom: name of a state of the file, or a focal length in mm between those of its states, as a number or its text.
             A lens between states is marked in `derived`.
-        focus: "paraxial" moves the film as the paraxial image does; "best", which cameras and commands take, to the
-            least RMS spot of the axial point (`focusing.best_focus_z_mm`); "internal" moves the groups as the file's
-            focus states do, and the film stays.
+        focus_mode: "paraxial" moves the film as the paraxial image does; "best", which cameras and commands take, to
+            the least RMS spot of the axial point (`focusing.best_focus_z_mm`); "internal" moves the groups as the
+            file's focus states do, and the film stays.
         wavelength_nm: range of the light that "best" focuses; None takes `Lens.light_nm`.
 
     Raises:
@@ -70,7 +74,9 @@ def set_lens(
             focus is nearer than the lens allows, the lens does not see the field, or a size is asked of a lens that
             diverges.
     """
-    _check(lens, focus_m, f_number, focal_length_mm, field_deg, focus)
+    if shot is not None:
+        return _set_for(lens, shot)
+    _check(lens, focus_m, f_number, focal_length_mm, field_deg, focus_mode)
     others = (focus_m, focal_length_mm, field_deg, zoom)
     if f_number is not None and lens.film_z_mm is not None and others == (None,) * 4:
         # Closing the stop leaves the focus where it is.
@@ -81,7 +87,7 @@ def set_lens(
     if isinstance(zoom, str):
         state = state_named(lens, zoom)
         lens, object_mm = in_state(lens, state), state.object_distance_mm
-        if focus == "internal" and focus_m is not None:
+        if focus_mode == "internal" and focus_m is not None:
             lens = at_infinity(lens)
     elif zoom is not None:
         lens = zoomed(lens, zoom)
@@ -96,7 +102,7 @@ def set_lens(
         lens = replace(lens, image_radius_mm=image_radius, half_field_deg=field_deg / 2)
     if f_number is not None:
         lens = lens.with_stop_radius(paraxial.stop_radius_mm(at_infinity(lens), f_number))
-    if focus == "internal":
+    if focus_mode == "internal":
         return focused_inside(lens, focus_m, object_mm)
     if object_mm is not None and focus_m is None:
         film_z = paraxial.image_z_mm(lens, -object_mm)
@@ -105,7 +111,18 @@ def set_lens(
         focus_m = math.inf if focus_m is None else focus_m
         film_z = paraxial.film_z_mm(lens, focus_m)
     lens = replace(lens, film_z_mm=film_z)
-    return best_focused(lens, focus_m, wavelength_nm or lens.light_nm) if focus == "best" else lens
+    return best_focused(lens, focus_m, wavelength_nm or lens.light_nm) if focus_mode == "best" else lens
+
+
+def _set_for(lens: Lens, shot: Shot) -> Lens:
+    lens = set_lens(lens, focal_length_mm=shot.focal_length_mm, field_deg=shot.field_deg, zoom=shot.zoom)
+    lens = lens.with_aperture(shot.aperture or lens.aperture)
+    f_number, light_nm = shot.f_number_for(paraxial.first_order(lens).f_number), shot.wavelength_nm
+    lens = set_lens(lens, f_number=f_number, focus_m=shot.focus_m, focus_mode=shot.focus_mode, wavelength_nm=light_nm)
+    if shot.focus_mode == "internal":
+        lens = best_focused(lens, shot.focus_m, light_nm)
+    assert lens.film_z_mm is not None  # `set_lens` places the film
+    return replace(lens, film_z_mm=lens.film_z_mm + shot.film_offset_mm) if shot.film_offset_mm else lens
 
 
 def state_named(lens: Lens, name: str) -> Configuration:
@@ -149,7 +166,7 @@ def _check(
     f_number: float | None,
     focal_length_mm: float | None,
     field_deg: float | None,
-    focus: Focus,
+    focus_mode: FocusMode,
 ) -> None:
     for field, value, bounds in (("f_number", f_number, F_NUMBER), ("focal_length_mm", focal_length_mm, FOCAL_MM)):
         if value is not None and not within(bounds, value):
@@ -160,8 +177,8 @@ def _check(
         raise InputError(lens.path, "field_deg", field_deg, "a full field of view in degrees, above 0 and below 360")
     if field_deg is not None and focal_length_mm is not None:
         raise InputError(lens.path, "field_deg", field_deg, "left out beside focal_length_mm: each sets the size")
-    if focus not in get_args(Focus):
-        raise InputError(lens.path, "focus", focus, " or ".join(f'"{f}"' for f in get_args(Focus)))
+    if focus_mode not in get_args(FocusMode):
+        raise InputError(lens.path, "focus_mode", focus_mode, " or ".join(f'"{f}"' for f in get_args(FocusMode)))
 
 
 def _millimetres(text: str) -> float | str:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+from neurolens.base.bounds import RANGE
 from neurolens.base.files import library
 from neurolens.base.records import error_of, noisy, program, reaches, time_of
 
@@ -91,7 +92,8 @@ def advice(results: Mapping[str, Any], folder: Path) -> list[Advice]:
     within = target["within_um"] if target else CLOSE_UM
     lens = folder / "lenses" / f"{Path(str(results.get('lens', {}).get('file') or 'lens')).stem}.toml"
     state = (results.get("settings") or {}).get("lens") or {}
-    whole = all(state.get(k) in (None, "none") for k in ("efl_mm", "configuration", "f_number"))  # as its file has it
+    names = "focal_length_mm", "zoom", "f_number", "efl_mm", "configuration"  # the last two by their earlier names
+    whole = all(state.get(k) in (None, "none", RANGE) for k in names)  # as its file has it
     found = []
     for where, rest in (("In this renderer", PATH_NS), ("In other programs", 0.0)):
         best = to_use(models, within, exact=exact, rest=rest)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from neurolens.base.bounds import RANGE
 from neurolens.base.config import apply_overrides, from_dict, read_config, to_dict, to_toml
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
@@ -52,21 +53,26 @@ class LensChoice:
     """Which lens, in which state: rescaled to a focal length, a zoom state of its file, a stop other than its own.
 
     Attributes:
-        zoom: "range" asks for one model of all zoom positions between the file's states.
-        focusing: "internal" for one model of internal focus from infinity to the near limit.
+        zoom: state of the file by name, or a focal length in mm between its states; "range" asks for one model of all
+            zoom positions between the file's states.
+        focus_mode: "internal" for one model of internal focus from infinity to the near limit.
     """
 
     file: Path
-    efl_mm: float | None = None
-    configuration: str | None = None
+    focal_length_mm: float | None = field(default=None, metadata={"was": ("efl_mm",)})
+    zoom: str | float | None = field(default=None, metadata={"was": ("configuration",)})
     f_number: float | None = None
-    zoom: Literal["range"] | None = None
-    focusing: Literal["film", "internal"] = "film"
+    focus_mode: Literal["film", "internal"] = field(default="film", metadata={"was": ("focusing",)})
 
     @property
     def many_states(self) -> bool:
         """Whether models are of many states of the lens."""
-        return self.zoom is not None or self.focusing == "internal"
+        return self.zoom == RANGE or self.focus_mode == "internal"
+
+    @property
+    def state(self) -> str | float | None:
+        """The one zoom state of the models; None for that of the table, and for all of them."""
+        return None if self.zoom == RANGE else self.zoom
 
     def read(self) -> Lens:
         """The lens at infinity focus with a round stop; cameras apply blades outside the models.
@@ -74,11 +80,11 @@ class LensChoice:
         Raises:
             InputError: a length or f-number that is not positive, and as `read_any` and `set_lens`.
         """
-        for name, value in (("lens.efl_mm", self.efl_mm), ("lens.f_number", self.f_number)):
+        for name, value in (("lens.focal_length_mm", self.focal_length_mm), ("lens.f_number", self.f_number)):
             if value is not None and not value > 0:
                 raise InputError("settings", name, value, "a positive number")
         lens = read_any(self.file).with_aperture(None)
-        return set_lens(lens, focal_length_mm=self.efl_mm, zoom=self.configuration, f_number=self.f_number)
+        return set_lens(lens, focal_length_mm=self.focal_length_mm, zoom=self.state, f_number=self.f_number)
 
 
 @dataclass(frozen=True)
@@ -253,16 +259,15 @@ class Experiment:
             InputError: a rescaled lens, or states that the file does not have.
         """
         chosen, domain = self.lens, self.domain
-        if chosen.efl_mm is not None:
-            raise InputError("settings", "lens.efl_mm", chosen.efl_mm, "left out: many states are of the tabled size")
-        if chosen.zoom is not None and chosen.configuration is not None:
-            raise InputError("settings", "lens.configuration", chosen.configuration, 'left out beside zoom = "range"')
+        if chosen.focal_length_mm is not None:
+            expected = "left out: many states are of the tabled size"
+            raise InputError("settings", "lens.focal_length_mm", chosen.focal_length_mm, expected)
         lens = read_any(chosen.file).with_aperture(None)
-        internal = chosen.focusing == "internal"
+        internal = chosen.focus_mode == "internal"
         return StateSpace(
             lens,
-            axes_of(lens, zoom=chosen.zoom is not None, internal=internal, state=chosen.configuration),
-            zoom=chosen.configuration,
+            axes_of(lens, zoom=chosen.zoom == RANGE, internal=internal, state=chosen.state),
+            zoom=chosen.state,
             f_number=chosen.f_number,
             film_radius_mm=domain.film_radius_mm,
             focus_m=domain.focus_m or (lambda state: (math.inf, near_limit_m(state))),

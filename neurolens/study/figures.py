@@ -15,7 +15,8 @@ from neurolens.analysis.layout import Layout, draw_section
 from neurolens.analysis.plot_style import FIELD_COLOURS, INK, drawing, plain_log_ticks
 from neurolens.base.errors import InputError
 from neurolens.lens.paraxial import first_order
-from neurolens.lens.prescription import Focus, Lens
+from neurolens.lens.prescription import Lens
+from neurolens.lens.shot import FocusMode
 from neurolens.setting.focusing import focus_states, nearest_focus_m
 from neurolens.setting.states import set_lens
 from neurolens.study.image import ImageErrors, checked_image, to_srgb
@@ -172,7 +173,7 @@ def draw_breathing(lens: Lens, path: str | Path, count: int = 48) -> dict[str, l
     """
     data = first_order(set_lens(lens))
     nearest = 1.05 * (4 * abs(data.efl_mm) + data.rear_principal_z_mm - data.front_principal_z_mm) / 1000
-    ways: dict[str, Focus] = {"film moves": "paraxial"}
+    ways: dict[str, FocusMode] = {"film moves": "paraxial"}
     if focus_states(lens):
         ways["groups move"] = "internal"
         nearest = max(nearest, 1.0001 * nearest_focus_m(lens))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.progress import Progress, Report
-from neurolens.cameras.build import Shot, ideal_as
+from neurolens.cameras.build import ideal_as
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
@@ -21,6 +21,7 @@ from neurolens.cameras.pinhole import Pinhole
 from neurolens.graph.compiler import has_compiler
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
+from neurolens.lens.shot import Shot
 from neurolens.render.job import camera_axes
 from neurolens.render.pictures import standard_attributes, write_exr, write_png
 from neurolens.render.primitives import Rays
@@ -58,19 +59,16 @@ def scene_cameras(
 
     All are in best focus, and show the plane in focus at one size. Lens and models as C if `fused`.
     """
-    film = (shot.film_width_mm, shot.film_height_mm)
+    film = shot.film_mm
     data = first_order(lens)
     f_number = max(shot.f_number or data.f_number, data.f_number)
     # The same light for all cameras.
-    real: dict[str, Any] = {"film_mm": film, "focus_m": shot.focus_m, "f_number": f_number}
-    real["wavelength_nm"] = shot.wavelengths_nm
-    exact = ExactCamera(lens, bounds=domain.bounds, **real, runtime="c" if fused else "trace")
+    real = Shot(film, shot.focus_m, f_number, wavelength_nm=shot.wavelength_nm)
+    exact = ExactCamera(lens, real, bounds=domain.bounds, runtime="c" if fused else "trace")
     cameras: dict[str, Camera] = {EXACT: exact}
     for name, file in models.items():
-        cameras[name] = OnnxCamera(load_model(file), **real, runtime="c" if fused else "onnxruntime")
-    cameras["thin lens"], cameras["pinhole"] = (
-        ideal_as(kind, exact.lens, Shot(film, shot.focus_m)) for kind in ("thin:", "pinhole:")
-    )
+        cameras[name] = OnnxCamera(load_model(file), real, runtime="c" if fused else "onnxruntime")
+    cameras["thin lens"], cameras["pinhole"] = (ideal_as(kind, exact.lens, real) for kind in ("thin:", "pinhole:"))
     return cameras
 
 
@@ -164,10 +162,10 @@ def scene_gain(experiment: Experiment, folder: Path, progress: Progress) -> dict
     widest = data.f_number
     shot_lens, shot_domain = domain_from_camera(
         lens,
-        film_mm=(shot.film_width_mm, shot.film_height_mm),
+        film_mm=shot.film_mm,
         focus_m=shot.focus_m,
         f_number=max(shot.f_number or widest, widest),
-        wavelength_nm=shot.wavelengths_nm,
+        wavelength_nm=shot.wavelength_nm,
         nearest_m=nearest_depth_m(scene, abs(data.efl_mm)),
     )
     half = replace(choice.model, name="", terms=max(choice.model.terms // 2, 2), units=max(choice.model.units // 2, 2))
@@ -202,7 +200,7 @@ def nearest_depth_m(scene: Scene, efl_mm: float, across: int = 96) -> float | No
     Rays of a pinhole of the lens's focal length through a grid of `across` x `across` points of the film; surfaces
     smaller than a step of the grid may be missed.
     """
-    film = (scene.settings.camera.film_width_mm, scene.settings.camera.film_height_mm)
+    film = scene.settings.camera.film_mm
     steps = np.linspace(-0.5, 0.5, across)
     points = np.stack(np.meshgrid(steps * film[0], steps * film[1])).reshape(2, -1)
     nearest = float(seen_depths_m(scene, Pinhole(efl_mm, film), points).min())
@@ -215,10 +213,10 @@ def seen_depths_m(scene: Scene, camera: Camera, film_mm: NDArray[np.float64]) ->
     inf where they meet nothing, NaN where no light passes.
     """
     shot, count = scene.settings.camera, film_mm.shape[1]
-    nanometres = np.full(count, np.mean(shot.wavelengths_nm), np.float32)
+    nanometres = np.full(count, np.mean(shot.wavelength_nm), np.float32)
     rays = camera.sample(film_mm.astype(np.float32), np.full((2, count), 0.5, np.float32), nanometres)
     axes, position = camera_axes(shot), np.array(shot.position_m, np.float32)[:, None]
-    world = world_of(scene, SpectralRange(*shot.wavelengths_nm), geometry=True)
+    world = world_of(scene, SpectralRange(*shot.wavelength_nm), geometry=True)
     distance, _ = world.nearest(Rays.of(axes @ rays.origin_m + position, axes @ rays.direction))
     with np.errstate(invalid="ignore"):
         depth = -(rays.origin_m[2] + distance * rays.direction[2])  # the camera looks along -z

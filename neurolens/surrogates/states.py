@@ -88,7 +88,7 @@ class StateSpace:
         if focus_m is None:
             return set_lens(self.lens, zoom=zoom, f_number=self.f_number)
         distance = None if math.isinf(focus_m) else focus_m
-        return set_lens(self.lens, zoom=zoom, f_number=self.f_number, focus="internal", focus_m=distance)
+        return set_lens(self.lens, zoom=zoom, f_number=self.f_number, focus_mode="internal", focus_m=distance)
 
     def domain_at(self, state: Sequence[float]) -> Domain:
         """The domain of a state: the full lit film, and the film positions that focusing by the film needs.

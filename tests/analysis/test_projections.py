@@ -11,9 +11,10 @@ import pytest
 import torch
 
 from neurolens.analysis.projections import NAMES, Projection, fit, inverse_polynomial, residual
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.field import Field, field_of
 from neurolens.cli import projection as command
+from neurolens.lens.shot import Shot
 from tests.command_line import failure, run_json
 
 ROOT = Path(__file__).parents[2]

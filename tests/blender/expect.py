@@ -18,11 +18,12 @@ import numpy as np
 from measure import crop_at, measures
 
 from neurolens.base.progress import Progress
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.sampling import stratified
 from neurolens.cli import main as command_line
 from neurolens.cli.blender_lenses import form_of
+from neurolens.lens.shot import Shot
 
 _SIDE = 512  # rays of a point: this squared
 _LIGHT_NM = (400.0, 700.0)
@@ -44,7 +45,7 @@ class Lens:
     def camera(self, focus_m: float, f_number: float, zoom_mm: float | None = None) -> Camera:
         """The exact one."""
         how: Literal["best", "internal"] = "internal" if self.name == "inside" else "best"
-        return make_camera(self.exact, Shot(self.film_mm, focus_m, f_number, zoom=zoom_mm, focus=how))
+        return make_camera(self.exact, Shot(self.film_mm, focus_m, f_number, zoom=zoom_mm, focus_mode=how))
 
 
 _GAUSS = "lenses/laikin_double_gauss_50.toml"

@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from film_light import FilmLight, film_light
 
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.vignetting import Vignetted
+from neurolens.lens.shot import Shot
 
 ROOT = Path(__file__).parents[2]
 FILM = (36.0, 24.0)
@@ -35,7 +36,7 @@ def camera(kind: str, focus_m: float = 2.0, f_number: float | None = 4.0) -> Any
         return double
     if kind in _MODELS:
         model = load_model(ROOT / "models" / f"{GAUSS.stem}.{_MODELS[kind]}.onnx")
-        return OnnxCamera(model, film_mm=FILM, focus_m=focus_m, f_number=f_number, wavelength_nm=(400.0, 700.0))
+        return OnnxCamera(model, Shot(FILM, focus_m, f_number, wavelength_nm=(400.0, 700.0)))
     return make_camera(f"thick:{GAUSS}" if kind == "thick" else kind, Shot(FILM, focus_m, f_number))
 
 

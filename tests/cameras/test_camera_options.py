@@ -11,13 +11,14 @@ from camera_helpers import GAUSS, ROOT, camera, film_rays
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cli import main
 from neurolens.lens.apertures import Aperture
+from neurolens.lens.shot import Shot
 from neurolens.render.pictures import read_exr
 
 SCENE = ROOT / "experiments" / "scenes" / "white.toml"
@@ -95,11 +96,11 @@ def shaped(kind: str, name: str | None) -> Camera:
     shape = None if name is None else SHAPES[name]
     if kind == "exact":
         lens, bounds = lens_models.lens().with_aperture(shape), lens_models.domain().bounds
-        return ExactCamera(lens, film_mm=FILM, focus_m=2.0, f_number=5.6, bounds=bounds)
+        return ExactCamera(lens, Shot(FILM, 2.0, 5.6), bounds=bounds)
     if kind == "thin":
         return ThinLens(50.0, 5.6, 2.0, FILM, aperture=shape)
     model = load_model(lens_models.exported(kind))
-    return OnnxCamera(model, film_mm=FILM, focus_m=2.0, f_number=5.6, aperture=shape)
+    return OnnxCamera(model, Shot(FILM, 2.0, 5.6, aperture=shape))
 
 
 def sample(camera: Camera, point: tuple[float, float], count: int = 40_000) -> tuple[np.ndarray, np.ndarray]:
@@ -159,11 +160,11 @@ def test_a_shot_shapes_every_camera_but_a_point() -> None:
 
 def test_a_shot_zooms_and_focuses_inside() -> None:
     zoom = lens_models.LENSES / "nikon_zoom_70_200.toml"
-    near = make_camera(zoom, Shot(FILM, 3.0, zoom=100.0, focus="internal"))
+    near = make_camera(zoom, Shot(FILM, 3.0, zoom=100.0, focus_mode="internal"))
     far = make_camera(zoom, Shot(FILM, 3.0, zoom=100.0))
     assert near.settings["film_z_mm"] < far.settings["film_z_mm"]
     assert near.settings["efl_mm"] < far.settings["efl_mm"] == pytest.approx(100, rel=1e-9)
-    for field, shot in (("zoom", Shot(FILM, 2.0, zoom="x")), ("focus", Shot(FILM, 2.0, focus="internal"))):
+    for field, shot in (("zoom", Shot(FILM, 2.0, zoom="x")), ("focus", Shot(FILM, 2.0, focus_mode="internal"))):
         for spec in ("thin", "pinhole", lens_models.exported("invariants")):
             with pytest.raises(InputError, match=field):
                 make_camera(spec, shot)

@@ -15,9 +15,8 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.cameras.vignetting import VIGNETTINGS
-from neurolens.cli import arguments
 from neurolens.lens.paraxial import film_z_mm, first_order
+from neurolens.lens.shot import Shot
 
 FILM = (36.0, 24.0)
 
@@ -27,8 +26,8 @@ def camera(kind: str, focus_m: float = 2.0, f_number: float | None = None) -> Ca
     if kind == "exact":
         return lens_models.exact_camera(focus_m, f_number)
     if kind == "exact, own bounds":
-        return ExactCamera(lens_models.lens(), film_mm=FILM, focus_m=focus_m, f_number=f_number)
-    return OnnxCamera(load_model(lens_models.exported(kind)), film_mm=FILM, focus_m=focus_m, f_number=f_number)
+        return ExactCamera(lens_models.lens(), Shot(FILM, focus_m, f_number))
+    return OnnxCamera(load_model(lens_models.exported(kind)), Shot(FILM, focus_m, f_number))
 
 
 @pytest.mark.parametrize("f_number", [None, 8.0])
@@ -103,9 +102,7 @@ def test_exact_camera_in_double_precision_agrees() -> None:
     bounds = lens_models.domain().bounds
     square, wavelength = jittered(40)[0], np.full(1600, 550, np.float32)
     film = at((12.0, 3.0), 1600)
-    double = ExactCamera(lens, film_mm=FILM, focus_m=2.0, bounds=bounds, dtype="float64").sample(
-        film, square, wavelength
-    )
+    double = ExactCamera(lens, Shot(FILM, 2.0), bounds=bounds, dtype="float64").sample(film, square, wavelength)
     single = camera("exact").sample(film, square, wavelength)
     both = (single.status == 0) & (double.status == 0)
     assert np.abs(single.direction - double.direction)[:, both].max() < 3e-6
@@ -114,8 +111,7 @@ def test_exact_camera_in_double_precision_agrees() -> None:
 def test_fisheye_sees_beyond_75_degrees() -> None:
     exact = ExactCamera(
         lens_models.lens("muller_fisheye_100"),
-        film_mm=FILM,
-        focus_m=math.inf,
+        Shot(FILM, math.inf),
         bounds=lens_models.domain("muller_fisheye_100").bounds,
     )
     assert len(exact.film.outline.wavelength_nm) == 1  # no dispersion is known
@@ -130,7 +126,7 @@ def test_fisheye_sees_beyond_75_degrees() -> None:
 
 def test_focus_that_no_film_plane_reaches() -> None:
     with pytest.raises(InputError, match="focus_m"):
-        ExactCamera(lens_models.lens(), film_mm=FILM, focus_m=0.1)
+        ExactCamera(lens_models.lens(), Shot(FILM, 0.1))
 
 
 @pytest.mark.parametrize("name", ["cooke_anamorphic_42", "schneider_anamorphic_31"])
@@ -138,7 +134,7 @@ def test_anamorphic_outlines_lose_no_light_between_the_azimuths_they_are_sought_
     """Rays through an outline half as wide again carry no more light than those through the outline itself."""
     lens = lens_models.lens(name)
     film_mm = (20.0, 15.0)
-    exact = ExactCamera(lens, film_mm=film_mm, focus_m=3.0)
+    exact = ExactCamera(lens, Shot(film_mm, 3.0))
     outline, side = exact.film.outline, 64
     wide = replace(outline, x=np.float32(1.5) * outline.x, y=np.float32(1.5) * outline.y)
     square = jittered(side)[0]
@@ -160,7 +156,3 @@ def test_beyond_the_light_and_for_nonsense_there_is_no_area() -> None:
     rays = film.sample(points, np.full((2, 4), 0.4, np.float32), np.full(4, 550, np.float32))
     assert (rays.status == st.OUTSIDE_DOMAIN).all() and (rays.weight == 0).all()
     assert np.isfinite(rays.direction).all()
-
-
-def test_the_command_line_knows_the_same_names() -> None:
-    assert arguments.VIGNETTINGS == VIGNETTINGS

@@ -15,7 +15,7 @@ import pytest
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras import graphcamera
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.graphcamera import Runtime
@@ -25,6 +25,7 @@ from neurolens.graph import compiler
 from neurolens.graph.ir import Graph
 from neurolens.graph.loworder import WORST, with_low_order_derivatives
 from neurolens.lens.apertures import Aperture
+from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene
@@ -62,8 +63,7 @@ def pair(f_number: float | None = None, aperture: Aperture | None = None) -> tup
     """The same model in onnxruntime and fused."""
     model = load_model(model_file())
     plain, fused = (
-        OnnxCamera(model, film_mm=FILM, focus_m=2.0, f_number=f_number, aperture=aperture, runtime=runtime)
-        for runtime in RUNTIMES
+        OnnxCamera(model, Shot(FILM, 2.0, f_number, aperture=aperture), runtime=runtime) for runtime in RUNTIMES
     )
     return plain, fused
 
@@ -163,7 +163,7 @@ def test_differentials_of_a_model_come_as_near_to_those_of_its_graph_as_the_came
 def test_differentials_that_no_low_order_meets_are_those_of_the_graph(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(graphcamera, "with_low_order_derivatives", partial(with_low_order_derivatives, worst=0.0))
     plain, _ = pair()
-    fused = OnnxCamera(load_model(model_file()), film_mm=FILM, focus_m=2.0, runtime="c")
+    fused = OnnxCamera(load_model(model_file()), Shot(FILM, 2.0), runtime="c")
     given = numbers(5000, seed=5)
     wanted, found = plain.sample_differentials(*given), fused.sample_differentials(*given)
     ok = (found.status == st.PASSED) & (wanted.status == st.PASSED)
@@ -179,7 +179,7 @@ def test_the_exact_lens(design: str) -> None:
     lens = read_lens(lens_models.LENSES / "thorlabs_lb1471_biconvex_50.toml").with_aperture(Aperture(blades=6))
     lens = replace(lens, surfaces=tuple(replace(s, absorption_per_mm=0.02 * (s.n_d != 1)) for s in lens.surfaces))
     lens = coated(lens, design) if design else lens
-    plain, fused = (ExactCamera(lens, film_mm=FILM, focus_m=3.0, runtime=kind) for kind in ("trace", "c"))
+    plain, fused = (ExactCamera(lens, Shot(FILM, 3.0), runtime=kind) for kind in ("trace", "c"))
     film, square, _ = numbers(4000, seed=7)
     given = film, square, np.linspace(400, 700, 4000, dtype=np.float32)
     wanted, found = plain.sample_differentials(*given), fused.sample_differentials(*given)
@@ -205,7 +205,7 @@ def test_aspheres_and_cylinders(name: str) -> None:
 
 def test_rays_that_are_lost_on_their_way_stay_finite() -> None:
     lens = read_lens(lens_models.LENSES / "thorlabs_lb1471_biconvex_50.toml").with_aperture(Aperture(blades=6))
-    fused = ExactCamera(lens, film_mm=FILM, focus_m=3.0, runtime="c")
+    fused = ExactCamera(lens, Shot(FILM, 3.0), runtime="c")
     given = np.zeros((2, 3), np.float32), np.full((2, 3), 0.3, np.float32), np.float32([math.nan, 0.0, 550.0])
     found = fused.sample_differentials(*given)
     assert found.differentials is not None and (found.status[:2] != st.PASSED).all() and found.status[2] == st.PASSED
@@ -229,7 +229,7 @@ def test_directions_of_another_length_pass_nothing(length: float, monkeypatch: p
         return g
 
     _, whole = pair()
-    half = OnnxCamera(load_model(model_file()), film_mm=FILM, focus_m=2.0, runtime="c")
+    half = OnnxCamera(load_model(model_file()), Shot(FILM, 2.0), runtime="c")
     monkeypatch.setattr(OnnxLens, "graph", spoilt)
     half.start("c")
     given = numbers(4000, seed=2)
@@ -263,7 +263,7 @@ def test_no_torch_no_onnx(tmp_path: Path) -> None:
         "sys.modules.update(dict.fromkeys(['torch', 'onnx', 'sklearn', 'matplotlib']))\n"
         "from neurolens.graph import compiler\n"
         f"compiler.FLAGS = {compiler.FLAGS!r}\n"
-        "from neurolens.cameras.build import Shot, make_camera\n"
+        "from neurolens.cameras.build import make_camera\nfrom neurolens.lens.shot import Shot\n"
         f"camera = make_camera('fused:{model_file()}', Shot((36.0, 24.0), 2.0))\n"
         "import numpy as np\n"
         "rays = camera.sample(np.zeros((2, 9), 'f4'), np.full((2, 9), .5, 'f4'), np.full(9, 550, 'f4'))\n"
@@ -276,7 +276,7 @@ def test_no_torch_no_onnx(tmp_path: Path) -> None:
 def test_onnxruntime_runs_the_exact_lens_too() -> None:
     """The graph of a prescription in all three runtimes; at the rims rounding decides who passes."""
     lens = read_lens(ROOT / "lenses" / "cooke_triplet_50.toml")
-    traced, run = (ExactCamera(lens, film_mm=FILM, focus_m=3.0, runtime=kind) for kind in ("trace", "onnxruntime"))
+    traced, run = (ExactCamera(lens, Shot(FILM, 3.0), runtime=kind) for kind in ("trace", "onnxruntime"))
     film, square, _ = numbers(4000, seed=7)
     given = film, square, np.linspace(400, 700, 4000, dtype=np.float32)
     for wanted, found in (

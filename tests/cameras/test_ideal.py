@@ -11,7 +11,7 @@ from shipped import disc_irradiance
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.ideal import ThickLens, ThinLens
 from neurolens.cameras.pinhole import PROJECTIONS, Fisheye, Pinhole
@@ -20,6 +20,7 @@ from neurolens.lens.apertures import Aperture
 from neurolens.lens.film_plane import film_z_mm
 from neurolens.lens.paraxial import first_order, system_of
 from neurolens.lens.prescription import Lens
+from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
 
@@ -100,7 +101,7 @@ def test_rays_of_a_film_point_meet_at_the_focus_distance_and_fill_the_entrance_p
     rays = camera.sample(at((height, 0.0), 576), square, wavelength)
     t = (-focus_m - rays.origin_m[2]) / rays.direction[2]
     met = rays.origin_m[:2] + t * rays.direction[:2]
-    lens = set_lens(read_lens(path), focus_m=focus_m, focus="best")
+    lens = set_lens(read_lens(path), focus_m=focus_m, focus_mode="best")
     data = first_order(lens)
     assert lens.film_z_mm is not None
     magnification = paraxial_chief_slope(lens, height) * (data.entrance_pupil_z_mm - lens.film_z_mm + 1e3 * focus_m)
@@ -127,12 +128,12 @@ def paraxial_chief_slope(lens: Lens, height_mm: float) -> float:
 @pytest.mark.parametrize("path", [GAUSS, RETROFOCUS, TELEPHOTO, ZOOM])
 def test_ideal_cameras_frame_the_plane_in_focus_as_the_lens_does(path: Path, focus_m: float, focus: str) -> None:
     """Chief rays of a film point of the lens and of its thin lens, thick lens and pinhole meet there (item 16)."""
-    lens = set_lens(read_lens(path), focus_m=focus_m, focus=focus)  # type: ignore[arg-type]
+    lens = set_lens(read_lens(path), focus_m=focus_m, focus_mode=focus)  # type: ignore[arg-type]
     height, depth = 8.0, 1e7 if math.isinf(focus_m) else 1e3 * focus_m  # from the film, mm
     pupil = first_order(lens).entrance_pupil_z_mm - float(lens.film_z_mm or 0.0)
     wanted = -paraxial_chief_slope(lens, height) * (depth + pupil)
     for kind in ("thin", "thick", "pinhole"):
-        camera = make_camera(f"{kind}:{path}", Shot(FILM, focus_m, focus=focus))  # type: ignore[arg-type]
+        camera = make_camera(f"{kind}:{path}", Shot(FILM, focus_m, focus_mode=focus))  # type: ignore[arg-type]
         rays = camera.sample(at((height, 0.0), 1), np.full((2, 1), 0.5, np.float32), np.full(1, 550.0, np.float32))
         t = (-1e-3 * depth - rays.origin_m[2]) / rays.direction[2]
         assert 1e3 * (rays.origin_m + t * rays.direction)[0, 0] == pytest.approx(wanted, rel=2e-5), kind
@@ -141,7 +142,7 @@ def test_ideal_cameras_frame_the_plane_in_focus_as_the_lens_does(path: Path, foc
 @pytest.mark.parametrize("path", [GAUSS, RETROFOCUS, TELEPHOTO])
 def test_light_falls_off_as_that_of_the_exit_pupil(path: Path) -> None:
     """The irradiance of a uniform disc, at any height (Foote 1915), is that of the paraxial exit pupil."""
-    camera = made(path, math.inf, focus="paraxial")
+    camera = made(path, math.inf, focus_mode="paraxial")
     data = first_order(set_lens(read_lens(path), focus_m=math.inf))
     distance = data.rear_focal_z_mm - data.exit_pupil_z_mm
     heights = np.array([0.0, 10.0, 20.0])
@@ -179,7 +180,7 @@ def test_shapes_of_the_stop_keep_the_exposure() -> None:
 
 
 def test_settings_are_those_of_the_lens_in_its_state() -> None:
-    camera = made(GAUSS, f_number=4.0, efl_mm=35.0)
+    camera = made(GAUSS, f_number=4.0, focal_length_mm=35.0)
     assert camera.settings["efl_mm"] == pytest.approx(35, rel=2e-3)  # of the film in best focus
     assert camera.settings["f_number"] == pytest.approx(4, rel=2e-3)
     assert camera.settings["lens"]["sha256"] == set_lens(lens_models.lens(), focal_length_mm=35.0).sha256
@@ -189,10 +190,10 @@ def test_settings_are_those_of_the_lens_in_its_state() -> None:
     ("make", "field"),
     [
         (lambda: ThinLens(50.0, 1.8, 0.19), "focus_m"),
-        (lambda: ThinLens(-50.0, 1.8, 2.0), "focal_mm"),
+        (lambda: ThinLens(-50.0, 1.8, 2.0), "focal_length_mm"),
         (lambda: ThinLens(50.0, 0.0, 2.0), "f_number"),
         (lambda: ThinLens(50.0, 2.0, math.nan), "focus_m"),
-        (lambda: Pinhole(math.inf), "focal_mm"),
+        (lambda: Pinhole(math.inf), "focal_length_mm"),
         (lambda: Pinhole(50.0, (36.0, 0.0)), "film_mm height"),
         (lambda: made(ROOT / "lenses" / "cooke_anamorphic_42.toml"), "cylinders"),
         (lambda: make_camera("thick:absent.toml", Shot(FILM, 2.0)), "absent.toml"),
@@ -327,11 +328,11 @@ def test_field_sets_the_circle_within_the_film() -> None:
     [
         ("fisheye-equal", {}, "camera"),
         ("fisheye-equidistant", {"zoom": 50.0}, "zoom"),
-        ("fisheye-equidistant", {"focus": "internal"}, "focus"),
+        ("fisheye-equidistant", {"focus_mode": "internal"}, "focus_mode"),
         ("fisheye-equidistant", {"field_deg": 361.0}, "field_deg"),
         ("fisheye-orthographic", {"field_deg": 181.0}, "field_deg"),
-        ("fisheye-equisolid", {"field_deg": 90.0, "efl_mm": 8.0}, "efl_mm"),
-        ("fisheye-equisolid", {"efl_mm": math.inf}, "focal_mm"),
+        ("fisheye-equisolid", {"field_deg": 90.0, "focal_length_mm": 8.0}, "focal_length_mm"),
+        ("fisheye-equisolid", {"focal_length_mm": math.inf}, "focal_length_mm"),
     ],
 )
 def test_bad_settings_are_named(spec: str, change: dict[str, object], field: str) -> None:

@@ -22,6 +22,7 @@ from neurolens.cameras.model import ModelScene, OnnxCamera, OnnxLens, best_focus
 from neurolens.cameras.pupil_boxes import PupilTable, tightened
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.paraxial import film_z_mm, first_order
+from neurolens.lens.shot import Shot
 from neurolens.setting import focusing
 from neurolens.surrogates import metadata
 
@@ -234,14 +235,14 @@ def test_shapes_are_checked(model: OnnxLens, film: object, pupil: object, wavele
 
 def test_camera_settings_outside_the_domain(model: OnnxLens) -> None:
     with pytest.raises(InputError, match="0.7 m"):
-        OnnxCamera(model, film_mm=(36.0, 24.0), focus_m=0.5)
+        OnnxCamera(model, Shot((36.0, 24.0), 0.5))
     with pytest.raises(InputError, match="four focal lengths"):
-        OnnxCamera(model, film_mm=(36.0, 24.0), focus_m=0.1)
+        OnnxCamera(model, Shot((36.0, 24.0), 0.1))
     with pytest.raises(InputError, match="widest stop"):
-        OnnxCamera(model, film_mm=(36.0, 24.0), focus_m=2.0, f_number=1.2)
+        OnnxCamera(model, Shot((36.0, 24.0), 2.0, 1.2))
     for bad in (0.0, -1.0, math.nan):
         with pytest.raises(InputError):
-            OnnxCamera(model, film_mm=(36.0, 24.0), focus_m=bad)
+            OnnxCamera(model, Shot((36.0, 24.0), bad))
 
 
 @pytest.mark.parametrize("focus_m", [math.inf, 1.5])
@@ -274,12 +275,12 @@ def test_an_aperture_s_blades_count_in_the_focus_of_both() -> None:
 
 
 def test_cameras_are_in_best_focus_by_default(model: OnnxLens) -> None:
-    best, paraxial = (OnnxCamera(model, film_mm=(36.0, 24.0), focus_m=math.inf, focus=f) for f in ("best", "paraxial"))
+    best, paraxial = (OnnxCamera(model, Shot((36.0, 24.0), math.inf, focus_mode=f)) for f in ("best", "paraxial"))
     exact = lens_models.exact_camera(math.inf, None).settings["film_z_mm"]
     assert paraxial.settings["film_z_mm"] == pytest.approx(film_z_mm(lens_models.lens(), math.inf))
     assert best.settings["film_z_mm"] == pytest.approx(exact, abs=0.02)
     assert exact < paraxial.settings["film_z_mm"] - 0.25
-    assert OnnxCamera(model, film_mm=(36.0, 24.0), focus_m=math.inf).settings == best.settings
+    assert OnnxCamera(model, Shot((36.0, 24.0), math.inf)).settings == best.settings
 
 
 def test_a_film_range_that_ends_before_best_focus_is_said_and_held(path: Path) -> None:
@@ -287,12 +288,12 @@ def test_a_film_range_that_ends_before_best_focus_is_said_and_held(path: Path) -
     older = load_model(path)
     end = older.card["domain"]["film_z_mm"][0] = film_z_mm(lens_models.lens(), math.inf)
     with pytest.warns(NeurolensWarning, match=rf"{path.name}: best focus needs its film at 91.3.* ends at {end:.6g}"):
-        camera = OnnxCamera(older, film_mm=(36.0, 24.0), focus_m=math.inf)
+        camera = OnnxCamera(older, Shot((36.0, 24.0), math.inf))
     assert camera.settings["film_z_mm"] == end
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        OnnxCamera(older, film_mm=(36.0, 24.0), focus_m=math.inf, focus="paraxial")
-        OnnxCamera(older, film_mm=(36.0, 24.0), focus_m=2.0)
+        OnnxCamera(older, Shot((36.0, 24.0), math.inf, focus_mode="paraxial"))
+        OnnxCamera(older, Shot((36.0, 24.0), 2.0))
 
 
 def test_films_of_a_domain_may_lie_beside_the_paraxial_image(path: Path) -> None:
@@ -300,15 +301,15 @@ def test_films_of_a_domain_may_lie_beside_the_paraxial_image(path: Path) -> None
     model = load_model(path)
     paraxial, far = film_z_mm(lens_models.lens(), 2.0), film_z_mm(lens_models.lens(), 2.0) - 0.1
     model.card["domain"] |= {"film_z_mm": [far - 1, far], "focus_m": [2.0, 2.0]}
-    assert OnnxCamera(model, film_mm=(36.0, 24.0), focus_m=2.0).settings["film_z_mm"] < far
-    moved = OnnxCamera(model, film_mm=(36.0, 24.0), focus_m=2.0, focus="paraxial", film_offset_mm=-0.5)
+    assert OnnxCamera(model, Shot((36.0, 24.0), 2.0)).settings["film_z_mm"] < far
+    moved = OnnxCamera(model, Shot((36.0, 24.0), 2.0, focus_mode="paraxial", film_offset_mm=-0.5))
     assert moved.settings["film_z_mm"] == pytest.approx(paraxial - 0.5)
     with pytest.raises(InputError, match="focus_m"):
-        OnnxCamera(model, film_mm=(36.0, 24.0), focus_m=3.0e3)
+        OnnxCamera(model, Shot((36.0, 24.0), 3.0e3))
 
 
 def test_film_beyond_the_model_is_dark(model: OnnxLens) -> None:
-    camera = OnnxCamera(model, film_mm=(60.0, 60.0), focus_m=2.0)
+    camera = OnnxCamera(model, Shot((60.0, 60.0), 2.0))
     film = np.array([[25.0, 0.0, np.nan], [25.0, 0.0, 1.0]], np.float32)
     rays = camera.sample(film, np.full((2, 3), 0.4, np.float32), np.full(3, 550, np.float32))
     assert rays.weight[0] == rays.weight[2] == 0 and rays.status[0] == rays.status[2] == st.OUTSIDE_DOMAIN
@@ -316,7 +317,7 @@ def test_film_beyond_the_model_is_dark(model: OnnxLens) -> None:
 
 
 def test_worker_camera_gives_the_same_rays(model: OnnxLens) -> None:
-    camera = OnnxCamera(model, film_mm=(36.0, 24.0), focus_m=2.0, f_number=4.0)
+    camera = OnnxCamera(model, Shot((36.0, 24.0), 2.0, 4.0))
     film, square, wavelength = (a.astype(np.float32) for a in some_rays(model, 500))
     square = np.abs(square) % 1
     a, b = (c.sample(film, square, wavelength) for c in (camera, camera.for_worker()))
@@ -330,7 +331,8 @@ def test_models_need_no_torch_and_write_nothing(path: Path, tmp_path: Path) -> N
         "import sys\n"
         "sys.modules.update(dict.fromkeys(['torch', 'sklearn', 'matplotlib']))\n"
         "from neurolens.cameras.model import OnnxCamera, load_model\n"
-        f"camera = OnnxCamera(load_model({str(path)!r}), film_mm=(36, 24), focus_m=2)\n"
+        "from neurolens.lens.shot import Shot\n"
+        f"camera = OnnxCamera(load_model({str(path)!r}), Shot((36, 24), 2))\n"
         "import numpy as np\n"
         "rays = camera.sample(np.zeros((2, 9), 'f4'), np.full((2, 9), .5, 'f4'), np.full(9, 550, 'f4'))\n"
         "assert (rays.status == 0).all() and (rays.direction[2] < -.9).all()\n"

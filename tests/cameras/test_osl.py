@@ -18,6 +18,7 @@ from neurolens.graph.osl import write_osl
 from neurolens.graph.scalars import lower
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.paraxial import first_order
+from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.pupils import pupil_plane_z_mm
 from neurolens.setting.states import set_lens
@@ -88,7 +89,7 @@ def test_disc_is_filled_evenly() -> None:
 
 @pytest.mark.parametrize("f_number, focus_m", [(1.8, 2.0), (4.0, math.inf), (11.0, 0.8)])
 def test_light_of_film_points_is_that_of_the_camera_of_the_model(f_number: float, focus_m: float) -> None:
-    camera = OnnxCamera(load_model(MODEL), film_mm=FILM, focus_m=focus_m, f_number=f_number)
+    camera = OnnxCamera(load_model(MODEL), Shot(FILM, focus_m, f_number))
     rng = np.random.default_rng(2)
     for point in ((0.0, 0.0), (8.0, -6.0), (-16.0, 9.0)):
         square = rng.random((2, 30_000)).astype(np.float32)
@@ -100,7 +101,7 @@ def test_light_of_film_points_is_that_of_the_camera_of_the_model(f_number: float
 
 
 def test_rays_are_those_of_the_model_in_the_frame_of_cycles() -> None:
-    camera = OnnxCamera(load_model(MODEL), film_mm=FILM, focus_m=2.0, f_number=1.8)
+    camera = OnnxCamera(load_model(MODEL), Shot(FILM, 2.0, 1.8))
     found = shot((10.0, 5.0), in_colour=0)
     passed = found["throughput"][0] > 0
     start, way = (found[name][:, passed].mean(1) for name in ("position", "direction"))
@@ -160,7 +161,7 @@ def test_zoom_is_an_input() -> None:
         given = inputs(film, square, f_number=4.0, asked_m=5.0, in_colour=0)
         rows = {name: value[0] for name, value in given.items()}
         found = program.evaluate(rows | {"zoom_mm": np.float32(zoom_mm)})
-        camera = OnnxCamera(load_model(file).at(zoom_mm), film_mm=FILM, focus_m=5.0, f_number=4.0)
+        camera = OnnxCamera(load_model(file).at(zoom_mm), Shot(FILM, 5.0, 4.0))
         rays = camera.sample(film.astype(np.float32), square.astype(np.float32), np.full(16_000, 587.56, np.float32))
         lit, passed = rays.weight > 0, found["throughput_0"] > 0
         assert passed.mean() > 0.5
@@ -196,7 +197,7 @@ def test_groups_of_a_lens_file_move_where_the_camera_is_focused() -> None:
     assert passed.mean() > 0.5
     start, way = (np.array([found[f"{name}_{k}"][passed] for k in range(3)]) for name in ("position", "direction"))
     # All rays of a film point meet where the lens, its groups moved, has the point's image.
-    lens = set_lens(read_lens(file), focus="internal", focus_m=focus_m)
+    lens = set_lens(read_lens(file), focus_mode="internal", focus_m=focus_m)
     data = first_order(lens)
     away = (focus_m * 1e3 + data.front_principal_z_mm - lens.film_z_mm) / 1e3  # from the front principal plane
     plane = start + (focus_m - start[2]) / way[2] * way
@@ -353,7 +354,7 @@ def test_light_is_that_of_the_camera_where_rims_leave_half_a_pupil() -> None:
     made = osl.model_lens(load_model(file), None, lambda share: None)
     assert min(made.passing().values()) > 0.97
     again, rng = osl.osl_graph(made.nodes[0]), np.random.default_rng(11)
-    camera = OnnxCamera(load_model(file), film_mm=FILM, focus_m=math.inf)
+    camera = OnnxCamera(load_model(file), Shot(FILM, math.inf))
     for point in ((0.0, 0.0), (-16.0, 9.0)):
         square, film = rng.random((2, 30_000)).astype(np.float32), np.repeat(np.array(point)[:, None], 30_000, 1)
         nm = rng.uniform(400, 700, 30_000).astype(np.float32)
@@ -419,7 +420,7 @@ def film_z(focus_m: float, stop_mm: float) -> np.ndarray:
 
 def test_film_is_where_the_camera_of_the_model_has_it() -> None:
     for f_number, focus_m in ((1.8, math.inf), (2.8, 1.0), (5.6, 0.7), (11.0, 3.0)):
-        camera = OnnxCamera(load_model(MODEL), film_mm=FILM, focus_m=focus_m, f_number=f_number)
+        camera = OnnxCamera(load_model(MODEL), Shot(FILM, focus_m, f_number))
         stop = camera.settings["stop_radius_mm"]
         assert float(film_z(focus_m, stop)[0, 0]) == pytest.approx(camera.film.film_z_mm, abs=2e-3)
     # The same distance from the entrance pupil, which stands before the film.

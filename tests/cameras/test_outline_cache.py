@@ -16,6 +16,7 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.outline_cache import kept_outline, search_key
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.lens.prescription import Lens
+from neurolens.lens.shot import Shot
 from neurolens.setting.states import set_lens
 
 KEY = "0123456789abcdef" * 4
@@ -44,7 +45,7 @@ def never(*given: object) -> PupilOutline:
 
 def test_a_camera_starts_from_the_outline_of_the_run_before(monkeypatch: pytest.MonkeyPatch) -> None:
     def camera(focus_m: float, shown: Progress | None = None) -> ExactCamera:
-        return ExactCamera(lens, film_mm=(36, 24), focus_m=focus_m, progress=shown)
+        return ExactCamera(lens, Shot((36, 24), focus_m), progress=shown)
 
     lens, written = lens_models.lens("tronnier_double_gauss_100"), io.StringIO()
     first = camera(2.0, Progress(stream=written))

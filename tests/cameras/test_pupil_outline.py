@@ -18,6 +18,7 @@ from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.pupil_search import outline_of
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens, Surface
+from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
 
@@ -202,7 +203,7 @@ MODELS = ["laikin_double_gauss_50.ols-28", "muller_fisheye_100-14mm.ols-40", "th
 @cache
 def exact(name: str, efl_mm: float, f_number: float | None) -> ExactCamera:
     lens = set_lens(read_lens(ROOT / "lenses" / f"{name}.toml"), focal_length_mm=efl_mm, f_number=f_number)
-    return ExactCamera(lens, film_mm=FILM, focus_m=math.inf)
+    return ExactCamera(lens, Shot(FILM, math.inf))
 
 
 def film_rays(camera: ExactCamera | OnnxCamera, count: int, seed: int = 0) -> tuple[np.ndarray, ...]:
@@ -239,7 +240,7 @@ def test_nearly_all_rays_of_lit_film_points_pass(
 @pytest.mark.parametrize("f_number", [None, 8.0])
 def test_models_that_ship_find_their_outlines_when_a_camera_is_made(name: str, f_number: float | None) -> None:
     model = load_model(ROOT / "models" / f"{name}.onnx")
-    camera = OnnxCamera(model, film_mm=FILM, focus_m=math.inf, f_number=f_number)
+    camera = OnnxCamera(model, Shot(FILM, math.inf, f_number))
     rays = camera.sample(*film_rays(camera, 40_000))
     assert (rays.status == st.PASSED).mean() >= 0.99
     assert lost_share(camera, 40_000) <= 2e-4
@@ -301,10 +302,8 @@ def test_the_dark_costs_nothing() -> None:
 
 def test_exact_and_model_sample_the_same_pupil() -> None:
     """The outlines of a lens and of its model agree as closely as the two agree on which rays pass."""
-    exact_camera = ExactCamera(
-        lens_models.lens(), film_mm=FILM, focus_m=2.0, f_number=4.0, bounds=lens_models.domain().bounds
-    )
-    model = OnnxCamera(load_model(lens_models.exported("invariants")), film_mm=FILM, focus_m=2.0, f_number=4.0)
+    exact_camera = ExactCamera(lens_models.lens(), Shot(FILM, 2.0, 4.0), bounds=lens_models.domain().bounds)
+    model = OnnxCamera(load_model(lens_models.exported("invariants")), Shot(FILM, 2.0, 4.0))
     rays = film_rays(exact_camera, 20_000)
     (a, area), (b, _) = (c.film.outline.sample(*rays) for c in (exact_camera, model))
     radius = np.sqrt(area / math.pi)
@@ -315,7 +314,7 @@ def test_blades_and_cylinders_are_held() -> None:
     """A bladed stop passes its share of the circle about it; a lens with cylinders passes what it does at any
     azimuth."""
     lens = set_lens(read_lens(ROOT / "lenses" / "tronnier_double_gauss_100.toml"), f_number=8.0)
-    camera = ExactCamera(lens.with_aperture(Aperture(blades=5)), film_mm=FILM, focus_m=math.inf)
+    camera = ExactCamera(lens.with_aperture(Aperture(blades=5)), Shot(FILM, math.inf))
     passed = camera.sample(*film_rays(camera, 40_000)).status == st.PASSED
     # Area of a regular pentagon over that of its circle: 5/2 sin(72 deg) / pi; Willi 2021, Table 6.3: 76.6%.
     assert passed.mean() == pytest.approx(2.5 * math.sin(math.radians(72)) / math.pi, abs=0.01)
@@ -326,7 +325,7 @@ def test_blades_and_cylinders_are_held() -> None:
         Surface(60.0, 3.0, 14.0, 1.6),
         Surface(-60.0, 30.0, 14.0),
     )
-    anamorphic = ExactCamera(set_lens(Lens("anamorphic", "", rows, 4.0)), film_mm=(20.0, 15.0), focus_m=math.inf)
+    anamorphic = ExactCamera(set_lens(Lens("anamorphic", "", rows, 4.0)), Shot((20.0, 15.0), math.inf))
     passed = anamorphic.sample(*film_rays(anamorphic, 20_000)).status == st.PASSED
     assert passed.mean() > 0.9
     assert lost_share(anamorphic, 40_000) <= 3e-4

@@ -14,12 +14,13 @@ from command_line import failure
 from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base import status as st
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cli import main
 from neurolens.cli.export_lens import lens_program, pupil_planes_mm
 from neurolens.lens.paraxial import film_z_mm, first_order
+from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.focusing import best_focus_of_stops_mm, best_focus_z_mm
 from neurolens.setting.states import set_lens
@@ -101,7 +102,7 @@ def test_the_film_of_a_model_is_where_its_camera_has_it() -> None:
     extras, (line, _) = model_extras(load_model(file))
     told = float(re.findall(r"within (\S+) um", line)[0])
     for focus_m, f_number in ((np.inf, None), (0.9, 8.0)):
-        made = OnnxCamera(load_model(file), film_mm=FILM, focus_m=focus_m, f_number=f_number)
+        made = OnnxCamera(load_model(file), Shot(FILM, focus_m, f_number))
         given = {"focus_m": focus_m, "stop_radius_mm": made.settings["stop_radius_mm"]}
         found = float(extras.functions["film_z_mm"].evaluate(given)["film_z_mm"])
         assert 1e3 * abs(found - made.film.film_z_mm) < told + 1.0 < 3
@@ -132,7 +133,7 @@ def test_the_exact_lens_as_a_function(tmp_path: Path) -> None:
     program = program.replace("STOP", f"{name.upper()}_STOP_RADIUS_MAX_MM")
     assert "film_z_paraxial_mm(focus_m): film plane of the paraxial image" in text
     found = np.array(run_compiled("c", program, tmp_path, rays).split(), np.float64).reshape(-1, 6).T
-    exact = ExactCamera(lens_models.lens(), film_mm=FILM, focus_m=2.0, bounds=domain.bounds)
+    exact = ExactCamera(lens_models.lens(), Shot(FILM, 2.0), bounds=domain.bounds)
     exact._film_z_mm = best_focus_z_mm(lens_models.lens(), 2.0)
     wanted = exact._scene(np.stack(columns[:2]), np.stack(columns[2:4]), columns[4])
     passed = wanted.status == st.PASSED
@@ -275,7 +276,7 @@ def test_the_state_of_a_zoom_is_an_argument(tmp_path: Path) -> None:
         known = [lens["efl_mm"], domain["film_radius_mm"], *domain["film_z_mm"], domain["pupil_z_mm"]]
         np.testing.assert_allclose(part[6:12, 0], [*known, domain["pupil_radius_mm"]], rtol=2e-6)
         f_number = lens["f_number"] * lens["stop_radius_mm"] / 9.0
-        film_mm = OnnxCamera(model, film_mm=FILM, focus_m=3.0, f_number=f_number, zoom=state).film.film_z_mm
+        film_mm = OnnxCamera(model, Shot(FILM, 3.0, f_number, zoom=state)).film.film_z_mm
         assert abs(part[12, 0] - film_mm) < 4e-3
 
 

@@ -12,9 +12,10 @@ from camera_helpers import FILM, FISHEYES, GAUSS, camera, film_rays, jittered, t
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
+from neurolens.lens.shot import Shot
 from neurolens.surrogates.export import export_inverse, export_onnx
 from neurolens.surrogates.inverse_fit import fit_inverse
 
@@ -27,7 +28,7 @@ def inverted(folder: Path) -> OnnxCamera:
     model = lens_models.model("invariants")
     export_inverse(fit_inverse(model, lens_models.prepared().pairs), folder / "m.onnx")
     path = export_onnx(model, folder / "m.onnx")
-    return OnnxCamera(load_model(path), film_mm=FILM, focus_m=2.0, f_number=4.0, wavelength_nm=(400.0, 700.0))
+    return OnnxCamera(load_model(path), Shot(FILM, 2.0, 4.0, wavelength_nm=(400.0, 700.0)))
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from shipped import disc_irradiance
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import ThickLens, ThinLens
@@ -22,6 +22,7 @@ from neurolens.cameras.onnxlens import load_model
 from neurolens.cameras.pinhole import PROJECTIONS, Pinhole
 from neurolens.cameras.vignetting import VIGNETTINGS, Vignetted
 from neurolens.lens.paraxial import first_order
+from neurolens.lens.shot import Shot
 from neurolens.setting.states import set_lens
 
 MODELS = Path(__file__).parents[2] / "models"
@@ -83,8 +84,7 @@ def test_extreme_stops(f_number: float) -> None:
     for lens in (ThinLens(50.0, f_number, math.inf), ThickLens(50.0, f_number, math.inf)):
         found = [film_value(lens, (r, 0.0)) for r in RADII]
         assert found == pytest.approx(wanted / wanted[0], abs=5e-4)
-    shot = {"film_mm": FILM, "focus_m": 2.0, "f_number": f_number, "bounds": lens_models.domain().bounds}
-    lens = ExactCamera(lens_models.lens(), **shot)  # type: ignore[arg-type]
+    lens = ExactCamera(lens_models.lens(), Shot(FILM, 2.0, f_number), bounds=lens_models.domain().bounds)
     assert film_value(lens, (0.0, 0.0)) == pytest.approx(1, abs=4e-3)
     assert 0 < film_value(lens, (17.5, 11.5)) < 1
 

@@ -32,6 +32,7 @@ from neurolens.cameras.contract import Camera, CameraRays, FloatArray
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
+from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import CameraSettings, load_scene
 from neurolens.render.settings import FilmSettings
@@ -154,7 +155,7 @@ def result(cameras: Sequence[tuple[str, float, float]]) -> SceneResult:
         for name, bias, seconds in cameras
     }
     noise2 = {m: reference_variance(halves, w) for m, w in by.items()}
-    shot = CameraSettings((0, 0, 1), (0, 0, 0), 1.0)
+    shot = CameraSettings(position_m=(0, 0, 1), look_at_m=(0, 0, 0), focus_m=1.0)
     return SceneResult("wall", shot, 1.8, COUNTS, 1, truth(), noise2, 0.01, found)
 
 
@@ -312,7 +313,7 @@ def test_the_map_is_turned_as_the_picture_is() -> None:
 def singlet() -> ExactCamera:
     """f/4 biconvex lens, with much spherical aberration, coma and colour."""
     lens = read_lens(lens_models.LENSES / "thorlabs_lb1471_biconvex_50.toml")
-    return ExactCamera(lens, film_mm=(12.0, 6.0), focus_m=2.0, f_number=4.0)
+    return ExactCamera(lens, Shot((12.0, 6.0), 2.0, 4.0))
 
 
 def test_a_shift_behind_a_real_lens_is_found_through_its_aberrations(singlet: ExactCamera) -> None:

@@ -18,7 +18,7 @@ from experiments.gallery.run import check
 from experiments.gallery.settings import read_effect
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
@@ -27,6 +27,7 @@ from neurolens.cameras.vignetting import Vignetted
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
+from neurolens.lens.shot import Shot, StopShape
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.images import make_aperture
 from neurolens.render.scene import load_scene
@@ -46,7 +47,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*V_d is not given")
 @cache
 def camera(name: str, f_number: float, film: tuple[float, float], focus_m: float, efl_mm: float | None = None) -> Any:
     folder = "models" if name.endswith(".onnx") else "lenses"
-    shot = Shot(film_mm=film, focus_m=focus_m, f_number=f_number, efl_mm=efl_mm, wavelength_nm=(550.0, 550.0))
+    shot = Shot(film_mm=film, focus_m=focus_m, f_number=f_number, focal_length_mm=efl_mm, wavelength_nm=(550.0, 550.0))
     return make_camera(name if name == "thin" else ROOT / folder / name, shot)
 
 
@@ -220,13 +221,13 @@ TRONNIER, COOKE = "tronnier_double_gauss_100", "cooke_anamorphic_42"
 FILM, FOCUS_M = (54.0, 36.0), 1.42
 FAR_M, NEAR_M = 12.0, 0.85
 SHAPES = {"4": {"blades": 4}, "6": {"blades": 6}, "50": {"blades": 50}} | {
-    name: {"mask": GALLERY / "scenes" / f"{name}.png"} for name in ("star", "heart")
+    name: {"aperture_mask": GALLERY / "scenes" / f"{name}.png"} for name in ("star", "heart")
 }
 
 
 @cache
 def shape(name: str) -> Aperture | None:
-    return None if name == "round" else make_aperture(**SHAPES[name])  # type: ignore[arg-type]
+    return None if name == "round" else make_aperture(StopShape(**SHAPES[name]))  # type: ignore[arg-type]
 
 
 @cache
@@ -236,10 +237,10 @@ def taken_by(kind: str, stop: str = "round", f_number: float = 2.0302) -> ExactC
         return ThinLens(100.7163, f_number, FOCUS_M, FILM, aperture=shape(stop))
     if kind == "surrogate":
         model = load_model(ROOT / "models" / f"{TRONNIER}.mlp-16x2.onnx")
-        return OnnxCamera(model, film_mm=FILM, focus_m=FOCUS_M, f_number=f_number, aperture=shape(stop))
+        return OnnxCamera(model, Shot(FILM, FOCUS_M, f_number, aperture=shape(stop)))
     with pytest.warns(UserWarning, match="V_d"):
         lens = read_lens(ROOT / "lenses" / f"{TRONNIER}.toml")
-    return ExactCamera(lens.with_aperture(shape(stop)), film_mm=FILM, focus_m=FOCUS_M, f_number=f_number)
+    return ExactCamera(lens.with_aperture(shape(stop)), Shot(FILM, FOCUS_M, f_number))
 
 
 @cache
@@ -345,7 +346,7 @@ def test_a_heart_stands_behind_the_focus_and_hangs_before_it(kind: str) -> None:
 def test_an_anamorphic_lens_draws_upright_ovals() -> None:
     """Blur grows with the square of the focal length: four to one on film where the picture is squeezed two to one."""
     model = load_model(ROOT / "models" / f"{COOKE}.mlp-16x2.onnx")
-    taken = OnnxCamera(model, film_mm=(21.3, 17.8), focus_m=math.inf, focus="paraxial")
+    taken = OnnxCamera(model, Shot((21.3, 17.8), math.inf, focus_mode="paraxial"))
     width, height = light_disc(taken, (0.0, 0.0, -2.0), count=4000).widths_mm
     squeeze = bokeh.squeeze_of(taken, 20.0)
     assert squeeze == pytest.approx(42.47 / 21.47, rel=0.01)

@@ -14,8 +14,9 @@ from experiments.gallery.figure import MOST_BYTES
 from experiments.gallery.run import check, fingerprint_of
 from experiments.gallery.settings import find_effects, read_effect
 from neurolens.base.errors import InputError
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.ideal import ThinLens
+from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 
 EFFECT = """\

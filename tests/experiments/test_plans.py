@@ -7,9 +7,10 @@ import pytest
 
 from experiments import lab, plans
 from experiments.plan_errors import by_rays, fresh_places, fresh_prints, moved, pieces_of, rendered
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pupil_outline import PupilOutline
+from neurolens.lens.shot import Shot
 from neurolens.plan.footprints import distance_mm, places_of
 from neurolens.plan.plan import Choice
 from neurolens.readers.lensfile import read_lens
@@ -82,8 +83,8 @@ class Shifted:
 def test_a_shifted_camera_is_as_far_off_by_rays_and_by_renders() -> None:
     scene = plans.suited(load_scene(lab.SCENES / "grid.toml"), read_lens("lenses/canon_gauss_35.toml"), 4.0, 2.0)
     shot = scene.settings.camera
-    exact = make_camera("thin", Shot((shot.film_width_mm, shot.film_height_mm), 2.0, efl_mm=35.0, f_number=4.0))
-    pixel = shot.film_width_mm / shot.width
+    exact = make_camera("thin", Shot(shot.film_mm, 2.0, focal_length_mm=35.0, f_number=4.0))
+    pixel = shot.film_mm[0] / shot.width
     other = Shifted(exact, 0.4 * pixel)
     places = fresh_places(scene, exact, np.ones(3), across=5)
     apart, light = by_rays(other, exact, places, fresh_prints(exact, places), pixel, (0.05,))
@@ -135,8 +136,8 @@ def test_scenes_suit_lenses() -> None:
         assert shot.focus_m >= near_limit_m(lens) and shot.width == 1920
         moved_m = np.linalg.norm(np.subtract(shot.position_m, own.position_m))
         assert moved_m == pytest.approx(shot.focus_m - own.focus_m, abs=1e-6)  # what is in focus stays so
-        corner = np.hypot(shot.film_width_mm, shot.film_height_mm) / 2
-        assert corner == pytest.approx(0.95 * image_radius_mm(lens)[0]) or shot.film_width_mm == 36.0
+        corner = np.hypotshot.film_mm / 2
+        assert corner == pytest.approx(0.95 * image_radius_mm(lens)[0]) or shot.film_mm[0] == 36.0
 
 
 def test_a_decision_is_held_against_the_cheapest_that_holds() -> None:

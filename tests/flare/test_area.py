@@ -248,7 +248,7 @@ def test_faint_ghosts_that_a_rim_cuts_by_colour_cost_little() -> None:
 def test_a_caustic_takes_no_light_from_beside_it() -> None:
     """A cell with a caustic in one half keeps the other half's density: no pixel has a negative luminance."""
     lens = read_lens("lenses/tajima_retrofocus_24.toml").with_aperture(Aperture(blades=6))
-    lens = set_lens(lens, focus_m=40.0, f_number=2.8, focus="best")
+    lens = set_lens(lens, focus_m=40.0, f_number=2.8, focus_mode="best")
     tracer = GhostTracer(lens, [pair for pair in ghost_pairs(lens) if pair.name == "g11-06"])
     light = Light(13.7266, 10.0068, (2.57, 1.6, 0.67))
     luminance = ghost_picture(tracer, [light], Raster((36.0, 24.0), 640, 427))[0] @ SRGB.to_xyz[1]

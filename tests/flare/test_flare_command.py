@@ -65,7 +65,7 @@ def test_starburst_is_a_layer(tmp_path: Path) -> None:
     assert main(["flare", *words, *few, "-o", str(out)]) == 0
     layers, rgb = read_layers(out), read_exr(out)[0]
     lens = read_lens("lenses/laikin_double_gauss_50.toml").with_aperture(Aperture(blades=5))
-    lens = set_lens(lens, f_number=11.0, focus_m=math.inf, focus="best")
+    lens = set_lens(lens, f_number=11.0, focus_m=math.inf, focus_mode="best")
     alone = starburst_picture(lens, [Light(4.0, 2.0, (3.0, 3.0, 3.0))], Raster((36, 24), 48, 32), wavelengths=2)
     np.testing.assert_allclose(layers["starburst.G"], 2 * alone[..., 1], rtol=1e-4, atol=1e-6 * alone.max())
     np.testing.assert_allclose(layers["ghosts.G"] + layers["starburst.G"], rgb[..., 1], rtol=1e-5)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.field import field_of
 from neurolens.cli import main
 from neurolens.flare import picture, sources
@@ -22,6 +22,7 @@ from neurolens.flare.photons import PhotonTracer
 from neurolens.flare.picture import ghost_picture, photon_picture
 from neurolens.flare.sources import highlights
 from neurolens.lens.prescription import Lens, Surface
+from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.pictures import read_exr, write_exr
 from neurolens.setting.states import set_lens
@@ -75,7 +76,7 @@ def test_a_list_of_too_many_lights_names_the_limit(tmp_path: Path, capsys: pytes
 def test_nested_rings_take_memory_and_time_by_their_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     """A thousand regions whose boxes hold each other: they took the boxes' areas, 1.7 GB and 11 s at 2000 pixels."""
     n, film = 400, (24.0, 24.0)
-    camera = make_camera("pinhole", Shot(film_mm=film, focus_m=math.inf, efl_mm=50.0))
+    camera = make_camera("pinhole", Shot(film_mm=film, focus_m=math.inf, focal_length_mm=50.0))
     field = field_of(camera, math.inf, "equidistant")
     y, x = np.mgrid[:n, :n]
     ring = np.minimum(np.minimum(x, y), n - 1 - np.maximum(x, y))

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from neurolens.base.errors import InputError
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.field import field_of
 from neurolens.flare.lights import SUN, Light, light_rays, patches, read_lights, with_disc
 from neurolens.flare.sources import SceneLights, chosen, highlights, keep, keep_named
+from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import scene_from_tables, seen_from
 
@@ -228,7 +229,9 @@ def test_lights_fade_before_they_are_left_out() -> None:
 def test_highlights_by_closed_forms() -> None:
     """Of a pinhole 50 mm before the film: directions, solid angles and energy of painted regions."""
     film, size = (36.0, 24.0), (180, 120)
-    field = field_of(make_camera("pinhole", Shot(film_mm=film, focus_m=math.inf, efl_mm=50.0)), math.inf, "equidistant")
+    field = field_of(
+        make_camera("pinhole", Shot(film_mm=film, focus_m=math.inf, focal_length_mm=50.0)), math.inf, "equidistant"
+    )
     picture = np.zeros((size[1], size[0], 3), np.float32)
     picture[60:62, 90:92] = 10.0  # four pixels about (0.2 mm, -0.2 mm)
     picture[10, 150] = (0.0, 30.0, 0.0)
@@ -266,7 +269,7 @@ def test_highlights_by_closed_forms() -> None:
 
 def test_highlights_do_not_switch_on_at_once() -> None:
     """None at the threshold, whole from twice it on, and in between as near as its value is."""
-    camera = make_camera("pinhole", Shot(film_mm=(36.0, 24.0), focus_m=math.inf, efl_mm=50.0))
+    camera = make_camera("pinhole", Shot(film_mm=(36.0, 24.0), focus_m=math.inf, focal_length_mm=50.0))
     field = field_of(camera, math.inf, "equidistant")
 
     def energy(value: float) -> float:

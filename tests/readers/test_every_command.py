@@ -14,10 +14,11 @@ from command_line import failure, run_json
 
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.lensname import lens_id_of, resolve, split_kind
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cli import main
 from neurolens.cli.plan import shipped_models
 from neurolens.lens.prescription import Lens
+from neurolens.lens.shot import Shot
 from neurolens.readers import any_format
 from neurolens.readers.any_format import read_any
 from neurolens.readers.lensfile import read_lens, write_lens

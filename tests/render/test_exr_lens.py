@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from neurolens import __version__
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.sampling import stratified
 from neurolens.cli import main
 from neurolens.lens.glass import LINE_D_NM, index_of
+from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.pictures import read_exr, standard_attributes, write_exr
 

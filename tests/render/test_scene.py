@@ -45,7 +45,7 @@ TRIANGLE = {"material": "m", "vertices_m": [[0, 0, 0], [1, 0, 0], [0, 1, 0]], "f
 def test_shipped_scenes_render(name: str) -> None:
     loaded = load_scene(SCENES / f"{name}.toml")
     settings = loaded.settings.camera
-    film = (settings.film_width_mm, settings.film_height_mm)
+    film = settings.film_mm
     camera = ThinLens(50.0, settings.f_number or 2.0, settings.focus_m, film)
     height = round(64 * film[1] / film[0])
     picture = render(loaded, camera, width=64, height=height, samples=4, threads=1).rgb
@@ -59,7 +59,7 @@ def test_shipped_scenes_render(name: str) -> None:
         ("camera", {"up": [0, 0, 2]}, "camera.up"),
         ("camera", {"look_at_m": [0, 0, 1]}, "look_at_m"),
         ("camera", {"focus_m": -1}, "focus_m"),
-        ("camera", {"wavelengths_nm": [700, 400]}, "wavelengths_nm"),
+        ("camera", {"wavelengths_nm": [700, 400]}, "wavelength_nm"),
         ("camera", {"samples": 0}, "samples"),
         ("camera", {"position_m": [0, float("inf"), 0]}, "position_m"),
         ("camera", {"blade_curvature": 0.5}, "camera, aperture blades"),

@@ -15,12 +15,13 @@ import pytest
 from neurolens.analysis.field_curves import colour, distortion, illumination
 from neurolens.analysis.fields import Scene
 from neurolens.cameras import field as fields
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.field import Field, field_of, frame_of, spectrum_of
 from neurolens.cameras.sampling import stratified
 from neurolens.cli import main
 from neurolens.cli import stmap as command
 from neurolens.lens.paraxial import chief_reach_mm, first_order
+from neurolens.lens.shot import Shot
 from neurolens.readers.any_format import read_any
 from neurolens.render.pictures import read_exr, read_layers
 from neurolens.render.renderer import render
@@ -98,7 +99,7 @@ def test_f_theta_onto_a_plane_is_a_tangent_and_its_overscan_holds_every_pixel() 
     radius = np.hypot((s - 0.5) * film[0], (t - 0.5) * film[1])
     expected = 0.5 + (s - 0.5) * 960 / plates.undistorted[0] * focal * np.tan(radius / focal) / radius
     assert np.abs(there["R"] - expected).max() * plates.undistorted[0] < 0.01
-    steep = traced("fisheye-equidistant", (36.0, 20.25), efl_mm=14.2)
+    steep = traced("fisheye-equidistant", (36.0, 20.25), focal_length_mm=14.2)
     assert 83 < steep.field_deg < 85 and worst_px(steep, plates_of([steep], (960, 540), (36.0, 20.25)))[1] < 0.01
     # There and back by the maps themselves: what the one reads, read through the other.
     again = read_through(np.stack([back["R"], back["G"]], -1), there)
@@ -122,7 +123,7 @@ def test_a_model_and_its_lens_have_one_field_and_that_of_the_chief_rays_when_sto
     assert np.abs(exact.ideal(points) - model.ideal(points)).max() < 2e-3
     assert np.allclose(exact.frame, model.frame, rtol=1e-4)
     # The stop closed, the centroid is the chief ray, and heights are those of the analysis's own search.
-    camera = make_camera(str(GAUSS), Shot(film_mm=FILM, focus_m=2.0, f_number=90, focus="paraxial"))
+    camera = make_camera(str(GAUSS), Shot(film_mm=FILM, focus_m=2.0, f_number=90, focus_mode="paraxial"))
     closed = field_of(camera, 2.0, spectrum=spectrum_of(camera, only_nm=587.6))
     found = distortion(Scene(camera.lens, 2.0), wavelength_nm=587.6, fields=9)  # type: ignore[attr-defined]
     height = found.height_mm[1:-1]
@@ -166,7 +167,7 @@ def test_a_render_undistorted_by_the_map_is_the_pinholes(tmp_path: Path) -> None
 
 
 def test_light_is_that_of_the_analysis() -> None:
-    camera = make_camera(str(GAUSS), Shot(film_mm=FILM, focus_m=2.0, focus="paraxial"))
+    camera = make_camera(str(GAUSS), Shot(film_mm=FILM, focus_m=2.0, focus_mode="paraxial"))
     field = field_of(camera, 2.0, spectrum=spectrum_of(camera, only_nm=587.6))
     found = illumination(Scene(camera.lens, 2.0), fields=9)  # type: ignore[attr-defined]
     keep = found.height_mm < 20
@@ -178,7 +179,7 @@ def test_light_is_that_of_the_analysis() -> None:
 
 
 def test_lateral_colour_is_that_of_the_analysis() -> None:
-    camera = make_camera(str(GAUSS), Shot(film_mm=FILM, focus_m=2.0, f_number=60, focus="paraxial"))
+    camera = make_camera(str(GAUSS), Shot(film_mm=FILM, focus_m=2.0, f_number=60, focus_mode="paraxial"))
     lens, lines = camera.lens, (549.1, 611.4, 464.2)  # type: ignore[attr-defined]
     by_line = [field_of(camera, 2.0, spectrum=spectrum_of(camera, only_nm=nm)) for nm in lines]
     found = colour(Scene(lens, 2.0), line_nm=lines, fields=9)

@@ -10,9 +10,10 @@ from PIL import Image
 from render_helpers import FILM, WHITE, assert_same_mean, diffuse, scene
 
 from neurolens.base.errors import InputError
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
+from neurolens.lens.shot import Shot
 from neurolens.render.colour import table
 from neurolens.render.film import PixelGrid
 from neurolens.render.job import dispersion_px, expected_light, mode_for, spectral_range

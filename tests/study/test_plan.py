@@ -13,7 +13,7 @@ import pytest
 from neurolens.base.errors import InputError
 from neurolens.base.lensname import resolve
 from neurolens.base.tomlfile import format_toml
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.field import spectrum_of
 from neurolens.cameras.pinhole import Pinhole
@@ -21,6 +21,7 @@ from neurolens.cameras.warped import Warped
 from neurolens.cli import main
 from neurolens.cli.plan import TARGETS
 from neurolens.lens.apertures import Aperture
+from neurolens.lens.shot import Shot
 from neurolens.plan import plan as planned
 from neurolens.plan import shot_fits
 from neurolens.plan.costs import noise, rest_ns, shader_cost
@@ -122,7 +123,7 @@ def test_exact_footprints_are_the_spots_of_the_lens() -> None:
     from neurolens.analysis.fields import Scene
     from neurolens.analysis.spots import spots
 
-    camera = make_camera(LENS, Shot((36.0, 24.0), math.inf, focus="paraxial"))
+    camera = make_camera(LENS, Shot((36.0, 24.0), math.inf, focus_mode="paraxial"))
     places = places_of(camera, np.array([[0.0], [0.0]]), np.array([math.inf]), np.array([587.56]), np.ones(1))
     lens = set_lens(read_lens(LENS))
     found = blur_mm(footprints(camera, places, samples=48), np.ones(1))[0] / 2
@@ -130,12 +131,13 @@ def test_exact_footprints_are_the_spots_of_the_lens() -> None:
 
 
 def test_a_pupil_s_outline_serves_any_plane_and_tells_what_passes_beside_it() -> None:
-    lens, film, real = read_lens(LENS), (24.0, 16.0), {"film_mm": (24.0, 16.0), "focus_m": 2.0, "f_number": 8.0}
-    camera, waves = ExactCamera(lens, **real), np.full(FILM.shape[1], 550.0, np.float32)
+    lens, film = read_lens(LENS), (24.0, 16.0)
+    shot = Shot(film, 2.0, 8.0)
+    camera, waves = ExactCamera(lens, shot), np.full(FILM.shape[1], 550.0, np.float32)
     outline, film_z = camera.film.outline, camera.film.film_z_mm
     stopped, other = set_lens(lens, f_number=8.0, focus_m=2.0), outline.pupil_z_mm - 15.0
     bounds = domain_of(stopped, film_radius_mm=math.hypot(*film) / 2, focus_m=(2.0, 2.0), pupil_z_mm=other).bounds
-    searched, moved = ExactCamera(lens, **real, bounds=bounds).film.outline, outline.on_plane(other, film_z)
+    searched, moved = ExactCamera(lens, shot, bounds=bounds).film.outline, outline.on_plane(other, film_z)
     for square in (np.full(FILM.shape, 0.5), np.full(FILM.shape, 0.9)):
         (there, area), (own, size) = (o.sample(FILM.astype(np.float32), square, waves) for o in (moved, searched))
         assert np.abs(there - own).max() < 0.03 and area == pytest.approx(size, rel=0.005)  # of radii of 2 mm and more
@@ -248,7 +250,7 @@ def test_shaders_cost_what_cycles_took() -> None:
     found = garden()
     lens = lens_of(Path(GAUSS), None, lambda done, left=None: None)[1]
     asked = found.asked
-    ns, times = shader_cost(lens, found.places, asked.film_mm, asked.f_number, asked.focus_m)
+    ns, times = shader_cost(lens, found.places, asked.shot.film_mm, asked.f_number, asked.shot.focus_m)
     count = sum(osl_program(lens, {"count": 0.0}).count().values())
     assert count == measured["operations"] and ns == pytest.approx(measured["ns_min"], rel=0.02)
     place = (np.arange(1000) + 0.5) / 1000
@@ -256,7 +258,7 @@ def test_shaders_cost_what_cycles_took() -> None:
     y = np.array([0.2126, 0.7152, 0.0722]) @ colour
     passes = min(lens.passing().values())
     assert (y**2).mean() < times < (y**2).mean() / passes * 1.01
-    too_near = shader_cost(lens, found.places, asked.film_mm, asked.f_number, 0.15)
+    too_near = shader_cost(lens, found.places, asked.shot.film_mm, asked.f_number, 0.15)
     assert math.isinf(too_near[1])
 
 

@@ -84,7 +84,7 @@ def test_stretches_are_the_fewest(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
 
     class Short:
         def __init__(self, some: Any, *_: Any) -> None:
-            self.reach = [1 / p.asked.focus_m for p in some]
+            self.reach = [1 / p.asked.shot.focus_m for p in some]
 
         def choice(self, terms: int, costed: bool = False) -> Any:
             return terms if max(self.reach) - min(self.reach) <= 0.5 + 1e-9 and terms >= 12 else None

@@ -9,10 +9,11 @@ import torch
 
 from neurolens.analysis.fields import Scene as Fields
 from neurolens.base.errors import InputError
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.flare.canvas import Raster
 from neurolens.flare.layers import FlareJob, flare_layers
 from neurolens.flare.sources import SceneLights
+from neurolens.lens.shot import Shot
 from neurolens.plan.footprints import Footprints, blur_mm, distance_mm, left_to
 from neurolens.plan.light import glance, stray_light
 from neurolens.plan.plan import plan
@@ -77,7 +78,7 @@ def test_vignetting_darkens_the_corner_as_traced_rays_say() -> None:
     found = probe(wall(camera={"f_number": 2.0}), set_lens(read_lens("lenses/laikin_double_gauss_50.toml")))
     unit, taken = found.camera_maps["vignetting"]
     fall = found.camera_maps["natural fall-off"][1]
-    x, y = (mm * (0.5 / n - 0.5) for mm, n in zip(found.asked.film_mm, taken.shape[::-1], strict=True))
+    x, y = (mm * (0.5 / n - 0.5) for mm, n in zip(found.asked.shot.film_mm, taken.shape[::-1], strict=True))
     side = torch.linspace(-35, 35, 801, dtype=torch.float64)
     u, v = (a.reshape(-1) for a in torch.meshgrid(side, side, indexing="ij"))
     film = torch.full_like(u, x), torch.full_like(u, y), torch.full_like(u, found.lens.film_z_mm)

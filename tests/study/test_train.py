@@ -149,7 +149,7 @@ def test_resolved_configuration_runs_again_without_fitting(run: tuple[Path, dict
     [
         ("render.seeds=2", "seeds"),
         ("model=[]", "model"),
-        ("lens.efl_mm=-3", "efl_mm"),
+        ("lens.focal_length_mm=-3", "focal_length_mm"),
         ("domain.wavelength_nm=[700, 400]", "wavelength_nm"),
         ("nonsense=1", "nonsense"),
         ('model=[{name="../../evil"}]', "model"),
@@ -214,7 +214,7 @@ def test_experiments_ask_for_states() -> None:
 @pytest.mark.parametrize(
     ("file", "overrides", "field"),
     [
-        (ZOOM, ['lens.zoom="range"', "lens.efl_mm=50"], "lens.efl_mm"),
+        (ZOOM, ['lens.zoom="range"', "lens.efl_mm=50"], "lens.focal_length_mm"),
         (ZOOM, ['lens.zoom="range"', 'lens.configuration="135mm"'], "lens.configuration"),
         (lens_models.LENSES / "laikin_double_gauss_50.toml", ['lens.zoom="range"'], "zoom"),
         (lens_models.LENSES / "laikin_double_gauss_50.toml", ['lens.focusing="internal"'], "focus"),

@@ -19,6 +19,7 @@ from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.graph.c import Signature
 from neurolens.graph.program import SCENE_RAY, Program
 from neurolens.lens.paraxial import first_order
+from neurolens.lens.shot import Shot
 from neurolens.surrogates.assemble import ALL
 from neurolens.surrogates.cores import Core
 from neurolens.surrogates.domain import FilmRays, sample_domain
@@ -307,7 +308,7 @@ def test_one_wavelength(kind: str, wavelength_nm: float, tmp_path: Path) -> None
         assert (a - b)[expected.status == 0].abs().max() < 1e-9
 
     lens = load_model(export_onnx(fixed, tmp_path / "fixed.onnx"), model.lens.sha256)
-    camera = OnnxCamera(lens, film_mm=(36.0, 24.0), focus_m=2.0)
+    camera = OnnxCamera(lens, Shot((36.0, 24.0), 2.0))
     assert not camera.dispersive and camera.wavelength_nm == (wavelength_nm, wavelength_nm)
 
 

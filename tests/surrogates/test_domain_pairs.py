@@ -110,7 +110,7 @@ def test_one_shot_needs_less_than_the_whole_lens() -> None:
     near, far = shot.film_z_mm
     assert near < film_z_mm(lens, 2.0) < far and far - near < 0.2 * (full.film_z_mm[1] - full.film_z_mm[0])
     assert full.film_z_mm[0] < near and far < full.film_z_mm[1]
-    assert near < set_lens(stopped, f_number=8.0, focus_m=2.0, focus="best").film_z_mm < far
+    assert near < set_lens(stopped, f_number=8.0, focus_m=2.0, focus_mode="best").film_z_mm < far
     assert shot.wavelength_nm == (500, 600)
     # A film larger than the image: the image rules.
     _, wide = domain_from_camera(lens, film_mm=(60.0, 60.0), focus_m=2.0)

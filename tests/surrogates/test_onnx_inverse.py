@@ -15,6 +15,7 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.onnxmaps import load_inverse
+from neurolens.lens.shot import Shot
 from neurolens.surrogates.cardkeys import MODEL_KEY
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_inverse, export_onnx
@@ -67,8 +68,7 @@ def test_cameras_agree_on_ray_differentials(tmp_path: Path) -> None:
     known = prepared()
     m = fit_model(known, ModelSettings("ols", terms=64, planes=False))
     model = load_model(export_onnx(m, tmp_path / "m.onnx"))
-    shot = {"film_mm": (36.0, 24.0), "focus_m": 2.0}
-    camera = OnnxCamera(model, **shot)  # type: ignore[arg-type]
+    camera = OnnxCamera(model, Shot((36.0, 24.0), 2.0))
     exact = lens_models.exact_camera(2.0, None)
     random = np.random.default_rng(0)
     film = (random.random((2, 2000), np.float32) - np.float32(0.5)) * np.array([[36], [24]], np.float32)

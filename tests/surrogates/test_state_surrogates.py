@@ -22,6 +22,7 @@ from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.lens.film_plane import colours
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
+from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.focusing import axial_rays, best_focus_z_mm
 from neurolens.setting.states import set_lens
@@ -149,8 +150,8 @@ def test_a_model_of_internal_focus_is_focused_as_its_lens_is(tmp_path: Path) -> 
     fitted = fit_states(StateSpace(lens, (axis,)), StateSettings(terms=40, degree=5, rays=3000))
     loaded = load_model(export_states(fitted, tmp_path / "focus.onnx", {"rms_um": 1.0}))
     for focus_m in (math.inf, 1.0001 / axis.range[1]):
-        camera = OnnxCamera(loaded, film_mm=(36.0, 24.0), focus_m=focus_m)
-        placed = set_lens(lens, focus="internal", focus_m=None if math.isinf(focus_m) else focus_m)
+        camera = OnnxCamera(loaded, Shot((36.0, 24.0), focus_m))
+        placed = set_lens(lens, focus_mode="internal", focus_m=None if math.isinf(focus_m) else focus_m)
         best, found = best_focus_z_mm(placed, focus_m), camera.film.film_z_mm
         assert placed.film_z_mm is not None and placed.film_z_mm - best > 0.1  # groups stand in paraxial focus
         assert found == pytest.approx(best, abs=0.02)
@@ -299,34 +300,34 @@ def test_graph_of_two_axes_agrees_with_the_model(tmp_path: Path) -> None:
 def test_cameras_zoom() -> None:
     """A camera set to a zoom position sends the rays of the model there; names and rounded ends of the source count."""
     film = (12.0, 8.0)
-    camera = OnnxCamera(loaded(), film_mm=film, focus_m=10.0, zoom=120.0)
+    camera = OnnxCamera(loaded(), Shot(film, 10.0, zoom=120.0))
     assert camera.settings["state"] == {"zoom": 120.0} and camera.settings["efl_mm"] == pytest.approx(120.0)
     assert "states" not in camera.settings["card"]
     low, high = loaded().axes[0].range
-    assert OnnxCamera(loaded(), film_mm=film, focus_m=10.0).settings["state"] == {"zoom": low}
-    assert OnnxCamera(loaded(), film_mm=film, focus_m=10.0, zoom="200mm").settings["state"] == {"zoom": high}
-    assert OnnxCamera(loaded(), film_mm=film, focus_m=10.0, zoom=200.0).settings["state"] == {"zoom": 200.0}
-    assert OnnxCamera(loaded(), film_mm=film, focus_m=10.0, zoom=80.0).settings["state"] == {"zoom": low}
+    assert OnnxCamera(loaded(), Shot(film, 10.0)).settings["state"] == {"zoom": low}
+    assert OnnxCamera(loaded(), Shot(film, 10.0, zoom="200mm")).settings["state"] == {"zoom": high}
+    assert OnnxCamera(loaded(), Shot(film, 10.0, zoom=200.0)).settings["state"] == {"zoom": 200.0}
+    assert OnnxCamera(loaded(), Shot(film, 10.0, zoom=80.0)).settings["state"] == {"zoom": low}
     square = np.random.default_rng(0).random((2, 500), np.float32)
     point = np.zeros((2, 500), np.float32)
     wavelength = np.full(500, 550, np.float32)
     rays, again = camera.sample(point, square, wavelength), camera.for_worker().sample(point, square, wavelength)
     assert np.array_equal(rays.direction, again.direction) and (rays.weight > 0).mean() > 0.9
     # Through a small stop, rays of the film's centre meet where the camera is focused: 10 m from the film.
-    rays = OnnxCamera(loaded(), film_mm=film, focus_m=10.0, zoom=120.0, f_number=11).sample(point, square, wavelength)
+    rays = OnnxCamera(loaded(), Shot(film, 10.0, zoom=120.0, f_number=11)).sample(point, square, wavelength)
     t = (-10.0 - rays.origin_m[2]) / rays.direction[2]
     at = rays.origin_m[:2] + t * rays.direction[:2]
     assert np.abs(at[:, rays.weight > 0]).max() < 0.001
     for wrong in (60.0, "wide", 250.0):
         with pytest.raises(InputError, match="zoom"):
-            OnnxCamera(loaded(), film_mm=film, focus_m=10.0, zoom=wrong)  # type: ignore[arg-type]
+            OnnxCamera(loaded(), Shot(film, 10.0, zoom=wrong))  # type: ignore[arg-type]
 
 
 def test_exposure_is_for_the_wavelengths_of_the_light() -> None:
     """White light of narrow range on the axis: the mean weight is 1 for that light, whatever range the model knows."""
     square = np.random.default_rng(0).random((2, 4000), np.float32)
     for nm in (420.0, 680.0):
-        camera = OnnxCamera(loaded(), film_mm=(12, 8), focus_m=10.0, zoom=120.0, wavelength_nm=(nm, nm))
+        camera = OnnxCamera(loaded(), Shot((12, 8), 10.0, zoom=120.0, wavelength_nm=(nm, nm)))
         rays = camera.sample(np.zeros((2, 4000), np.float32), square, np.full(4000, nm, np.float32))
         assert rays.weight.mean() == pytest.approx(1.0, abs=2e-3)
 

@@ -154,8 +154,8 @@ def test_first_order_data_stand_at_the_primary_wavelength_of_other_light() -> No
     assert (visible.reference_nm, visible.light_nm) == (LINE_D_NM, (400.0, 700.0))
     assert (infrared.reference_nm, infrared.light_nm) == (1550.0, (1500.0, 1600.0))
     assert first_order(infrared) == first_order(visible, 1550.0) != first_order(visible)
-    film = set_lens(infrared, focus="best").film_z_mm
+    film = set_lens(infrared, focus_mode="best").film_z_mm
     assert film is not None
     assert film == pytest.approx(
-        float(set_lens(visible, focus="best", wavelength_nm=(1500.0, 1600.0)).film_z_mm or 0), rel=1e-5
+        float(set_lens(visible, focus_mode="best", wavelength_nm=(1500.0, 1600.0)).film_z_mm or 0), rel=1e-5
     )

@@ -201,8 +201,8 @@ def test_the_edge_of_the_image_circle_sees_the_field_asked_for() -> None:
         ),
         ({"f_number": math.inf}, "f_number"),
         ({"focal_length_mm": math.inf}, "focal_length_mm"),
-        ({"focus": "manual"}, "focus"),
-        ({"focus": "internal", "focus_m": 2.0}, "no focus states"),
+        ({"focus_mode": "manual"}, "focus_mode"),
+        ({"focus_mode": "internal", "focus_m": 2.0}, "no focus states"),
     ],
 )
 def test_states_that_a_double_gauss_has_not(state: dict, expected: str) -> None:
@@ -243,7 +243,7 @@ def test_pure_third_order_aberration_focuses_best_two_thirds_of_the_way() -> Non
     ray = Rays(*(torch.tensor([v], dtype=torch.float64) for v in (5.0, 0.0, -1.0, 0.0, 0.0, 1.0)))
     out = trace(lens, ray, towards="film").rays
     marginal = float(out.z - out.x * out.dz / out.dx)
-    best = set_lens(lens, focus="best").film_z_mm
+    best = set_lens(lens, focus_mode="best").film_z_mm
     assert marginal < best < paraxial
     assert (best - paraxial) / (marginal - paraxial) == pytest.approx(2 / 3, abs=0.01)
 
@@ -319,7 +319,7 @@ def test_best_focus_weighs_colours_as_the_eye_does() -> None:
 def test_a_film_range_holds_best_focus_at_every_aperture_and_colour(name: str, focus_m: float) -> None:
     lens = tabled(name)
     internal = "nikon" in name
-    lens = set_lens(lens, zoom=100.0, focus_m=focus_m, focus="internal") if internal else lens
+    lens = set_lens(lens, zoom=100.0, focus_m=focus_m, focus_mode="internal") if internal else lens
     low, high = film_range_mm(lens, focus_m, (400.0, 700.0))
     assert low < (lens.film_z_mm if internal else film_z_mm(lens, focus_m)) < high
     found = [
@@ -333,7 +333,7 @@ def test_a_film_range_holds_best_focus_at_every_aperture_and_colour(name: str, f
 
 def test_a_shut_stop_has_no_best_focus() -> None:
     with pytest.raises(InputError, match="best"):
-        set_lens(tabled("brendel_tessar_100").with_stop_radius(0.0), focus="best")
+        set_lens(tabled("brendel_tessar_100").with_stop_radius(0.0), focus_mode="best")
 
 
 # --- Focus by moving groups
@@ -344,7 +344,7 @@ def test_focused_inside_near_rays_from_the_object_meet_on_a_film_that_stands_sti
     for zoom in [c.name for c in infinity_states(tabled(name))]:
         infinity = set_lens(tabled(name), zoom=zoom)
         for focus_m in (20.0, 3.0, 1.001 * nearest_focus_m(infinity)):
-            lens = set_lens(infinity, focus_m=focus_m, focus="internal").with_stop_radius(1e-3)
+            lens = set_lens(infinity, focus_m=focus_m, focus_mode="internal").with_stop_radius(1e-3)
             out = trace(lens, axial_rays(lens, lens.film_z_mm - 1000 * focus_m), towards="film")
             r = out.rays
             miss = torch.hypot(r.x + (lens.film_z_mm - r.z) * r.dx / r.dz, r.y + (lens.film_z_mm - r.z) * r.dy / r.dz)
@@ -378,7 +378,7 @@ def test_magnifications_of_focus_states_are_those_the_source_states(name: str, s
     assert paraxial == pytest.approx(stated, rel=0.02)
     # The path from infinity passes through the state.
     focus_m = max((lens.film_z_mm + near.object_distance_mm) / 1000, nearest_focus_m(lens))
-    again = set_lens(lens, focus_m=focus_m, focus="internal")
+    again = set_lens(lens, focus_m=focus_m, focus_mode="internal")
     assert gaps(again) == pytest.approx(gaps(lens), abs=0.01)
 
 
@@ -386,7 +386,7 @@ def test_between_zoom_states_focusing_is_interpolated_too() -> None:
     lens = tabled("nikon_zoom_70_200")
     for asked in (90.0, 160.0):
         zoomed = set_lens(lens, zoom=asked)
-        near = set_lens(lens, zoom=asked, focus_m=1.2, focus="internal")
+        near = set_lens(lens, zoom=asked, focus_m=1.2, focus_mode="internal")
         assert near.film_z_mm == pytest.approx(zoomed.film_z_mm, abs=0.02)
         assert near.derived
         check_clearance(near.surfaces, "near")
@@ -396,22 +396,22 @@ def test_between_zoom_states_focusing_is_interpolated_too() -> None:
 
 def test_focusing_again_starts_from_infinity() -> None:
     lens = set_lens(tabled("sony_sonnar_55"))
-    near = set_lens(lens, focus_m=1.8, focus="internal")
+    near = set_lens(lens, focus_m=1.8, focus_mode="internal")
     assert gaps(set_lens(near)) == gaps(lens)
-    again, once = (set_lens(given, focus_m=4.0, focus="internal") for given in (near, lens))
+    again, once = (set_lens(given, focus_m=4.0, focus_mode="internal") for given in (near, lens))
     assert gaps(again) == pytest.approx(gaps(once), abs=1e-12)
-    assert gaps(set_lens(lens, focus="internal")) == gaps(lens)
+    assert gaps(set_lens(lens, focus_mode="internal")) == gaps(lens)
     by_name = set_lens(lens, zoom="1.7m")
     assert gaps(set_lens(by_name)) == gaps(lens)
     # f-numbers are those of infinity, wherever the groups stand.
-    for closed in (set_lens(by_name, f_number=4), set_lens(near, f_number=4, focus_m=2, focus="internal")):
+    for closed in (set_lens(by_name, f_number=4), set_lens(near, f_number=4, focus_m=2, focus_mode="internal")):
         assert closed.stop_radius_mm == pytest.approx(set_lens(lens, f_number=4).stop_radius_mm, rel=1e-12)
 
 
 def test_size_and_internal_focus_go_together() -> None:
     lens = tabled("sony_sonnar_55")
-    twice = set_lens(lens, focal_length_mm=2 * first_order(lens).efl_mm, focus_m=4.0, focus="internal")
-    once = set_lens(lens, focus_m=2.0, focus="internal")
+    twice = set_lens(lens, focal_length_mm=2 * first_order(lens).efl_mm, focus_m=4.0, focus_mode="internal")
+    once = set_lens(lens, focus_m=2.0, focus_mode="internal")
     assert gaps(twice) == pytest.approx([2 * g for g in gaps(once)], rel=1e-9)
 
 
@@ -419,14 +419,14 @@ def test_nearer_than_the_nearest_is_an_error_that_names_it() -> None:
     lens = set_lens(tabled("sony_sonnar_55"))
     nearest = nearest_focus_m(lens)
     assert nearest == pytest.approx(1.71, abs=0.02)
-    set_lens(lens, focus_m=nearest, focus="internal")
+    set_lens(lens, focus_m=nearest, focus_mode="internal")
     with pytest.raises(InputError, match=r"1\.71"):
-        set_lens(lens, focus_m=0.99 * nearest, focus="internal")
+        set_lens(lens, focus_m=0.99 * nearest, focus_mode="internal")
     with pytest.raises(InputError) as caught:
-        set_lens(lens, focus_m=nearest * (1 - 1e-6), focus="internal")
+        set_lens(lens, focus_m=nearest * (1 - 1e-6), focus_mode="internal")
     limit = float(caught.value.expected.split()[2])
     assert nearest <= limit < 1.001 * nearest  # rounded up: what is printed is allowed
-    set_lens(lens, focus_m=limit, focus="internal")
+    set_lens(lens, focus_m=limit, focus_mode="internal")
 
 
 # --- Breathing
@@ -449,7 +449,7 @@ def test_a_thin_lens_breathes_by_its_extension() -> None:
 def test_breathing_of_groups_that_move_inside_is_traced_magnification() -> None:
     lens = set_lens(tabled("nikon_zoom_70_200"), zoom="196mm")
     near = breathing(lens, [1.2], "internal")[0]
-    state = set_lens(lens, focus_m=1.2, focus="internal")
+    state = set_lens(lens, focus_m=1.2, focus_mode="internal")
     assert near.magnification == pytest.approx(magnification(state, state.film_z_mm - 1200), rel=1e-6)
     film = breathing(lens, [math.inf, 1.2])
     inside = breathing(lens, [math.inf, 1.2], "internal")
@@ -486,7 +486,7 @@ def test_closing_the_stop_leaves_the_focus() -> None:
     closed = set_lens(lens, f_number=8)
     assert closed.film_z_mm == lens.film_z_mm and first_order(closed).f_number == pytest.approx(8)
     assert closed == set_lens(tabled("laikin_double_gauss_50"), focus_m=1.0, f_number=8)
-    zoom = set_lens(tabled("nikon_zoom_70_200"), zoom="135mm", focus_m=2.0, focus="internal")
+    zoom = set_lens(tabled("nikon_zoom_70_200"), zoom="135mm", focus_m=2.0, focus_mode="internal")
     assert set_lens(zoom, f_number=8).vertices_mm == zoom.vertices_mm
 
 

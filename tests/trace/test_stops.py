@@ -15,6 +15,7 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Surface
+from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens, write_lens
 from neurolens.render.images import make_aperture, read_mask
 from neurolens.setting.pupils import camera_rays, pupil_plane_z_mm
@@ -60,13 +61,13 @@ def test_a_pinhole_maps_tangents_and_knows_no_focus(tmp_path: Path) -> None:
     assert (data.efl_mm, data.f_number, data.exit_pupil_z_mm, data.entrance_pupil_z_mm) == (50.0, 100.0, 0.0, 0.0)
     for focus_m in (math.inf, 1.0, 0.01):
         for focus in ("paraxial", "best"):
-            state = set_lens(hole, focus_m=focus_m, focus=focus)  # type: ignore[arg-type]
+            state = set_lens(hole, focus_m=focus_m, focus_mode=focus)  # type: ignore[arg-type]
             assert state.film_z_mm == 50.0
     assert set_lens(hole, f_number=200).stop_radius_mm == 0.125
     assert first_order(set_lens(hole, focal_length_mm=25)).efl_mm == pytest.approx(25, rel=1e-12)
     assert first_order(set_lens(hole, field_deg=60)).efl_mm == pytest.approx(20 / math.tan(math.radians(30)), rel=1e-9)
     with pytest.raises(InputError, match="no focus states"):
-        set_lens(hole, focus="internal", focus_m=2.0)
+        set_lens(hole, focus_mode="internal", focus_m=2.0)
     write_lens(replace(hole, source="a tin"), tmp_path / "hole.toml")
     assert first_order(read_lens(tmp_path / "hole.toml")).efl_mm == 50.0
 
@@ -91,7 +92,7 @@ def test_plates_before_and_behind_a_pinhole_shorten_its_distances() -> None:
 def test_the_exact_camera_takes_a_pinhole(point: tuple[float, float]) -> None:
     """Its falloff is cos^4, and its rays leave from the hole, opposite to the film point."""
     hole = pinhole(30.0, 0.2, image_radius_mm=21.6)
-    camera = ExactCamera(hole, film_mm=(36.0, 24.0), focus_m=math.inf, dtype="float64")
+    camera = ExactCamera(hole, Shot((36.0, 24.0), math.inf), dtype="float64")
     rng = np.random.default_rng(0)
     film = np.repeat(np.array([point], np.float32).T, 20_000, axis=1)
     out = camera.sample(film, rng.random((2, 20_000), np.float32), np.full(20_000, 550, np.float32))

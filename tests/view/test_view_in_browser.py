@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from neurolens.cameras.build import Shot, make_camera
+from neurolens.cameras.build import make_camera
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli import main
 from neurolens.flare.canvas import Raster
@@ -21,6 +21,7 @@ from neurolens.flare.ghostfit import GhostSettings, fit_ghosts
 from neurolens.flare.ghostmodel import write_ghosts
 from neurolens.flare.lights import Light
 from neurolens.flare.picture import ghost_picture
+from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.renderer import render
 from neurolens.render.scene import scene_from_tables

@@ -1,0 +1,120 @@
+"""The camera settings of one frame, in one vocabulary for cameras, scene files, options, experiments and plans."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import MISSING, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from neurolens.base.bounds import F_NUMBER, FILM_MM, FOCAL_MM, said, within
+from neurolens.base.errors import InputError
+from neurolens.base.options import check_bounds, setting
+
+FocusMode = Literal["best", "paraxial", "internal"]
+Vignetting = Literal["both", "natural", "optical", "none"]
+
+
+@dataclass(frozen=True)
+class Shot:
+    """Camera settings for one frame: film, focus, f-number, zoom, size, shape of the stop and light::
+
+        shot = Shot(film_mm=(36.0, 24.0), focus_m=2.0, f_number=2.8)
+
+    Attributes:
+        film_mm: width and height of the film.
+        focus_m: distance from the film to the object in focus, inf allowed.
+        f_number: None: the widest stop of a lens or model; f/4 for the thin lens, nominally f/8 for a point.
+        focal_length_mm: None: a lens file as tabled; 50 mm for thin lens and pinhole, 14 mm for a fisheye projection
+            unless `field_deg` sets it. A model has its own.
+        zoom: state of a lens file by name, or a focal length in mm between its states; also of a model of a whole zoom.
+        field_deg: full field of view that the film's image circle shall see; sets the size of a lens file. For a
+            fisheye projection it is what the circle within the film shall see; beyond it the film is dark.
+        focus_mode: "best" places the film where the spot on the axis is smallest, "paraxial" in the paraxial image;
+            "internal" moves the groups as the lens file's focus states do, and then the film to the smallest spot.
+        aperture: an `Aperture`, the shape of the stop's opening; None is that of the lens file, else round.
+        wavelength_nm: shortest and longest wavelength of the light, which sets exposure and best focus.
+        film_offset_mm: moves the film away from the lens after focusing; a pinhole has none.
+        clamp_f_number: an f-number wider than the lens opens becomes its widest; else it is an error for a model, and
+            opens the stop of a lens file as far as the rims let light through.
+        vignetting: the part that is kept; see `neurolens.cameras.vignetting`.
+
+    Raises:
+        InputError: a film, focus or f-number that no camera has.
+    """
+
+    film_mm: tuple[float, float]
+    focus_m: float = setting(
+        MISSING, "distance from the film to the object in focus, or inf (default: the scene's, or inf)",
+        within=(1e-6, math.inf), unit="a distance in metres",
+    )  # fmt: skip
+    f_number: float | None = setting(
+        None, "focal length over entrance-pupil diameter at infinity focus (default: the scene's, or the widest; 4 for "
+        "thin)", within=F_NUMBER, unit="an f-number", metavar="N",
+    )  # fmt: skip
+    focal_length_mm: float | None = setting(
+        None, "scale the whole lens to this focal length (default: as tabled; 50 for thin and pinhole, 14 for "
+        "fisheyes; a model has its own)", within=FOCAL_MM, unit="a focal length in mm", old=("efl",),
+    )  # fmt: skip
+    zoom: str | float | None = setting(
+        None, "state of the lens file by name, or a focal length in mm between its states (derived: its table and "
+        "interpolated gaps); default: the state of the table", old=("configuration",), metavar="STATE",
+    )  # fmt: skip
+    field_deg: float | None = setting(
+        None, "scale the whole lens so that its image circle sees this full field of view, traced",
+        within=(0.001, 360.0), unit="degrees",
+    )  # fmt: skip
+    focus_mode: FocusMode = setting(
+        "best", "the film where the spot on the axis is smallest at this aperture, in the paraxial image, or first the "
+        "groups moved as the focus states of the lens file do (default: best)", old=("focusing",),
+    )  # fmt: skip
+    aperture: Any = None  # an `Aperture`, whose module loads numpy, which help of the command line does not
+    wavelength_nm: tuple[float, float] = (400.0, 700.0)
+    film_offset_mm: float = setting(
+        0.0, "move the film away from the lens after focusing (default: 0)", within=(-1e3, 1e3), unit="mm"
+    )
+    clamp_f_number: bool = False
+    vignetting: Vignetting = setting(
+        "both", "parts that are kept: both; natural, the cos^4 law; optical, the effective aperture; none (default: "
+        "both)",
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "camera")
+        if len(self.film_mm) != 2:
+            raise InputError("camera", "film_mm", self.film_mm, "a width and a height")
+        if not all(within(FILM_MM, side) for side in self.film_mm):
+            raise InputError("camera", "film_mm", self.film_mm, f"sides {said(FILM_MM)} mm")
+
+    def f_number_for(self, widest: float) -> float | None:
+        """The f-number of a lens that opens to `widest`; None stands for its widest."""
+        too_wide = self.clamp_f_number and self.f_number is not None and self.f_number < widest
+        return None if too_wide else self.f_number
+
+
+# The fields of a shot that rule how a lens is set.
+LENS_STATE = "f_number", "zoom", "focus_m", "focus_mode"
+LENS_SIZE = "focal_length_mm", "field_deg"
+
+
+@dataclass(frozen=True)
+class StopShape:
+    """The shape of the stop's opening, as files and options state it; without any field it is the lens file's.
+
+    `render.pictures.make_aperture` makes an `Aperture` of it, which reads the picture of a mask.
+    """
+
+    blades: int | None = setting(
+        None, "blades, their corners on the circle of the stop (default: the lens file's, else round)", within=(3, 100)
+    )
+    blade_rotation_deg: float | None = setting(
+        None, "of the first corner (or of the mask), from x towards y, seen from the film (default: 0)",
+        within=(-360.0, 360.0), unit="degrees",
+    )  # fmt: skip
+    blade_curvature: float | None = setting(
+        None, "of the blades' edges: 0 straight, 1 round (default: 0)", within=(0.0, 1.0), metavar="C"
+    )
+    aperture_mask: Path | None = setting(
+        None, "opening of any shape: light passes where the picture is brighter than half; it spans the stop",
+        metavar="PICTURE",
+    )  # fmt: skip
