@@ -24,10 +24,10 @@ from neurolens.lens.prescription import Lens, Surface
 from neurolens.trace.arithmetic import is_number, times
 from neurolens.trace.shapes import figure_of, is_deep, start_of
 from neurolens.trace.surfaces import (
-    Crossed,
+    Hit,
     Medium,
-    Met,
     Rays,
+    SurfaceStep,
     Test,
     cross,
     media,
@@ -262,7 +262,7 @@ class Tracing:
             rays = Rays(*nearest_approach(o, rays, 1.0), *rays[3:])
         return tests, Rays(*rays[:3], *(times(d, self.medium.n) for d in rays[3:]))
 
-    def cross(self, k: int, reflected: bool = False) -> tuple[Rays, Crossed, tuple[Medium, Medium]]:
+    def cross(self, k: int, reflected: bool = False) -> tuple[Rays, SurfaceStep, tuple[Medium, Medium]]:
         """Go on to surface k and through it, or back from it where `reflected`.
 
         Returns the rays before it, in its vertex frame, what it does to them, and the media as they meet them.
@@ -289,7 +289,7 @@ class Tracing:
             self.rays = self.tests.along_axis(self.rays, self.sense, 0.0)
         return r, crossed, met_media
 
-    def _rim(self, surface: Surface) -> Callable[[Met], list[Test]] | None:
+    def _rim(self, surface: Surface) -> Callable[[Hit], list[Test]] | None:
         aperture, radius_mm = self.lens.aperture, surface.semi_diameter_mm
         if aperture is None or not surface.stop:
             return None
@@ -335,7 +335,7 @@ def _trace_chunk(
     return Traced(tracing.leave(), tracing.tests.status(), arrived, crossings, tuple(passed))
 
 
-def _unfolded(surface: Surface, met: Met) -> tuple[Tensor, Tensor]:
+def _unfolded(surface: Surface, met: Hit) -> tuple[Tensor, Tensor]:
     """x and y of a meeting, [N] each, mm; on the far half of a deep sphere mirrored outwards at its equator.
 
     So the distance from the axis grows on beyond a deep rim, where it would fall again, and tells the half.

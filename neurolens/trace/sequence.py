@@ -21,7 +21,7 @@ Towards = Literal["scene", "film"]
 Steps = Sequence[tuple[int, Action]]
 
 
-class Followed(NamedTuple):
+class GhostTrace(NamedTuple):
     """The result of following a sequence.
 
     Attributes:
@@ -66,7 +66,7 @@ def follow(
     *,
     towards: Towards = "film",
     polarised: bool = False,
-) -> Followed:
+) -> GhostTrace:
     """Follow light along a sequence of surfaces.
 
     Args:
@@ -93,7 +93,7 @@ def follow(
         points.append((met.x, met.y, met.z + tracing.vertex))
         passage.pass_surface(k, r, met, bent.q, mediums, sense, reflected)
     power = tracing.tests.only(passage.arrived(rays.x), 0.0)
-    return Followed(tracing.leave(), tracing.tests.status(), power, tuple(points))
+    return GhostTrace(tracing.leave(), tracing.tests.status(), power, tuple(points))
 
 
 def _check(count: int, steps: Steps, towards: Towards) -> None:

@@ -67,8 +67,8 @@ class Medium(NamedTuple):
 AIR = Medium(1.0, 1.0, 1.0)
 
 
-class Met(NamedTuple):
-    """A meeting with a surface, each [N].
+class Hit(NamedTuple):
+    """The intersection of rays with a surface, each [N].
 
     `q` is n times the cosine of incidence and `q2` its square: positive where the ray meets the surface, and with
     guards a smooth measure of how far it misses elsewhere. The ray meets the surface where it passes the `tests`.
@@ -84,7 +84,7 @@ class Met(NamedTuple):
     normal: Quadric | None = None
 
 
-class Bent(NamedTuple):
+class Outgoing(NamedTuple):
     """Rays behind a surface (vertex frame), n' times their cosine there, its square, and the test for total reflection.
 
     The square `q2` is not positive where rays are totally reflected.
@@ -126,7 +126,7 @@ def nearest_approach(o: Arithmetic, r: Rays, inverse_n2: Any) -> Quadric:
     return o.fma(e, r.dx, r.x, -1), o.fma(e, r.dy, r.y, -1), o.fma(e, r.dz, r.z, -1)
 
 
-def meet(o: Arithmetic, r: Rays, figure: Figure, sense: int, before: Medium, entering: bool = False) -> Met:
+def meet(o: Arithmetic, r: Rays, figure: Figure, sense: int, before: Medium, entering: bool = False) -> Hit:
     """Meet a surface at the point next to its vertex.
 
     `entering` marks the first surface met, where rays may arrive at more than 90 degrees.
@@ -141,14 +141,14 @@ def meet(o: Arithmetic, r: Rays, figure: Figure, sense: int, before: Medium, ent
     return _meet_conic(o, r, nearest, figure, sense, before)
 
 
-def _meet_plane(o: Arithmetic, r: Rays, sense: int) -> Met:
+def _meet_plane(o: Arithmetic, r: Rays, sense: int) -> Hit:
     q = times(r.dz, sense)
     t = r.z / o.positive(q)
     x, y = (o.fma(t, d, a, -sense) for d, a in ((r.dx, r.x), (r.dy, r.y)))
-    return Met(x, y, o.like(r.z, 0.0), q, r.dz * r.dz, [(TINY, q)])
+    return Hit(x, y, o.like(r.z, 0.0), q, r.dz * r.dz, [(TINY, q)])
 
 
-def _meet_sphere(o: Arithmetic, r: Rays, m: Quadric, curvature: Any, sense: int, before: Medium, entering: bool) -> Met:
+def _meet_sphere(o: Arithmetic, r: Rays, m: Quadric, curvature: Any, sense: int, before: Medium, entering: bool) -> Hit:
     c = times(curvature, sense)
     f = o.fma(m[2], -2.0 * sense, o.dot(m, m) * c)
     q2 = o.fma(f, before.n2, r.dz * r.dz, times(c, -1))
@@ -158,17 +158,17 @@ def _meet_sphere(o: Arithmetic, r: Rays, m: Quadric, curvature: Any, sense: int,
         t = f / o.positive(denominator)
         x, y, z = (o.add_to(a, t, d) for a, d in zip(m, r[3:], strict=True))
         # A root that is NaN fails the test of the denominator, too.
-        return Met(x, y, z, q, q2, [(TINY, denominator), *([(TINY, q2)] if o.guard else [])])
+        return Hit(x, y, z, q, q2, [(TINY, denominator), *([(TINY, q2)] if o.guard else [])])
     # Beyond 90 degrees the usual form divides two vanishing numbers; the conjugate form is exact there.
     forward = times(r.dz, sense)
     conjugate = times(forward - q, before.inverse_n2) / (c if is_number(c) else o.nonzero(c))
     t = o.select(forward, 0.0, conjugate, f / o.select(forward, 0.0, 1.0, forward + q))
     x, y, z = _along(o, m, t, r)
     # A general ray may meet the far half of the sphere, where there is no glass.
-    return Met(x, y, z, q, q2, [(TINY, q2), (times(z, curvature), 1.0)])
+    return Hit(x, y, z, q, q2, [(TINY, q2), (times(z, curvature), 1.0)])
 
 
-def _meet_conic(o: Arithmetic, r: Rays, m: Quadric, figure: Figure, sense: int, before: Medium) -> Met:
+def _meet_conic(o: Arithmetic, r: Rays, m: Quadric, figure: Figure, sense: int, before: Medium) -> Hit:
     c = figure.curvature
     kind = (c * figure.bent[0], c * figure.bent[1], c * figure.stretch)
     q2, denominator, t = _meet_quadric(o, r, m, kind, sense, before)
@@ -176,7 +176,7 @@ def _meet_conic(o: Arithmetic, r: Rays, m: Quadric, figure: Figure, sense: int, 
     nx, ny, nz = times(x, -kind[0]), times(y, -kind[1]), o.fma(z, -kind[2], 1.0)
     scale = o.inverse_root(o.dot((nx, ny, nz), (nx, ny, nz)))
     tests = [(TINY, q2), (TINY, denominator * denominator), (TINY, nz)]
-    return Met(x, y, z, o.root(q2) * scale, q2 * scale * scale, tests, (nx * scale, ny * scale, nz * scale))
+    return Hit(x, y, z, o.root(q2) * scale, q2 * scale * scale, tests, (nx * scale, ny * scale, nz * scale))
 
 
 def _meet_quadric(o: Arithmetic, r: Rays, m: Quadric, c: Quadric, sense: int, before: Medium) -> tuple[Any, Any, Any]:
@@ -214,7 +214,7 @@ def _along(o: Arithmetic, m: Quadric, t: Any, r: Rays) -> Quadric:
     return o.fma(t, r.dx, m[0]), o.fma(t, r.dy, m[1]), o.fma(t, r.dz, m[2])
 
 
-def _meet_asphere(o: Arithmetic, r: Rays, m: Quadric, figure: Figure, sense: int, before: Medium) -> Met:
+def _meet_asphere(o: Arithmetic, r: Rays, m: Quadric, figure: Figure, sense: int, before: Medium) -> Hit:
     """Iterate along the rays, from the quadric that fits the asphere best.
 
     Only the last step carries the derivative (implicit function theorem), so that gradients cost no memory for
@@ -252,7 +252,7 @@ def _meet_asphere(o: Arithmetic, r: Rays, m: Quadric, figure: Figure, sense: int
     if o.guard:
         for low, high in tests:
             q2 = o.select(low, high, q2, o.least(missed, -q * q))
-    return Met(x, y, z, q, q2, tests, (nx * scale, ny * scale, times(scale, nz)))
+    return Hit(x, y, z, q, q2, tests, (nx * scale, ny * scale, times(scale, nz)))
 
 
 def _toward(o: Arithmetic, at: Quadric, r: Rays, figure: Figure, sense: int) -> Any:
@@ -287,7 +287,7 @@ def _last_step(o: Arithmetic, at: Quadric, r: Rays, figure: Figure) -> Any:
     return (at[2] - sag) / o.fma(slope, along, -r.dz)
 
 
-def normal_at(o: Arithmetic, met: Met, curvature: Any) -> Quadric:
+def normal_at(o: Arithmetic, met: Hit, curvature: Any) -> Quadric:
     """Unit normal towards +z at a meeting point; spheres and planes have it by their curvature."""
     if met.normal is not None:
         return met.normal
@@ -295,8 +295,8 @@ def normal_at(o: Arithmetic, met: Met, curvature: Any) -> Quadric:
 
 
 def refract(
-    o: Arithmetic, r: Rays, met: Met, curvature: Any, sense: int, before: Medium, after: Medium, step: Any = None
-) -> Bent:
+    o: Arithmetic, r: Rays, met: Hit, curvature: Any, sense: int, before: Medium, after: Medium, step: Any = None
+) -> Outgoing:
     """Snell's law: the tangential part of the optical direction cosines stays, the normal part follows their length.
 
     `step` is n'^2 - n^2, where it is known better than from the media.
@@ -314,16 +314,16 @@ def refract(
         pull = times(curvature, -sense)
         ahead = o.fma(bend, sense, r.dz)
         direction = [o.fma(bend, met.x, r.dx, pull), o.fma(bend, met.y, r.dy, pull), o.add_to(ahead, bend, met.z, pull)]
-    return Bent(Rays(*met[:3], *direction), q, q2, tests)
+    return Outgoing(Rays(*met[:3], *direction), q, q2, tests)
 
 
-def reflect(o: Arithmetic, r: Rays, met: Met, curvature: Any, sense: int) -> Rays:
+def reflect(o: Arithmetic, r: Rays, met: Hit, curvature: Any, sense: int) -> Rays:
     """Rays with the normal part of their direction turned round."""
     normal = normal_at(o, met, curvature)
     return Rays(*met[:3], *(o.fma(met.q, n, p, -2 * sense) for p, n in zip(r[3:], normal, strict=True)))
 
 
-def through_ideal(o: Arithmetic, r: Rays, met: Met, focal_mm: float) -> Rays:
+def through_ideal(o: Arithmetic, r: Rays, met: Hit, focal_mm: float) -> Rays:
     """Rays in air behind an ideal thin lens: slopes change by -x / f and -y / f, so that points become points."""
     towards = o.abs(r.dz) * (1 / focal_mm)
     dx, dy = o.fma(towards, met.x, r.dx, -1), o.fma(towards, met.y, r.dy, -1)
@@ -331,14 +331,14 @@ def through_ideal(o: Arithmetic, r: Rays, met: Met, focal_mm: float) -> Rays:
     return Rays(*met[:3], dx * scale, dy * scale, r.dz * scale)
 
 
-class Crossed(NamedTuple):
+class SurfaceStep(NamedTuple):
     """The passage of rays through a surface; the rays behind it are in its vertex frame.
 
     `bent` has the rays behind; `tests` are all tests at the surface in order, each with its reason (`base.status`).
     """
 
-    met: Met
-    bent: Bent
+    met: Hit
+    bent: Outgoing
     tests: list[tuple[list[Test], int]]
 
 
@@ -353,23 +353,23 @@ def cross(
     *,
     entering: bool = False,
     reflected: bool = False,
-    rim: Callable[[Met], list[Test]] | None = None,
-) -> Crossed:
+    rim: Callable[[Hit], list[Test]] | None = None,
+) -> SurfaceStep:
     """Take rays through a surface, or back from it where they are `reflected`; `rim` replaces the tests of the rim."""
     met = meet(o, r, figure, sense, before, entering)
     tests = [(met.tests, st.MISSED), ((rim or rim_tests(o, surface))(met), st.RIM)]
     if reflected:
-        return Crossed(met, Bent(reflect(o, r, met, figure.curvature, sense), met.q, met.q2, []), tests)
+        return SurfaceStep(met, Outgoing(reflect(o, r, met, figure.curvature, sense), met.q, met.q2, []), tests)
     if surface.focal_mm is not None:
-        bent = Bent(through_ideal(o, r, met, surface.focal_mm), met.q, met.q2, [])
+        bent = Outgoing(through_ideal(o, r, met, surface.focal_mm), met.q, met.q2, [])
     elif before is after:
-        bent = Bent(Rays(*met[:3], *r[3:]), met.q, met.q2, [])
+        bent = Outgoing(Rays(*met[:3], *r[3:]), met.q, met.q2, [])
     else:
         bent = refract(o, r, met, figure.curvature, sense, before, after)
-    return Crossed(met, bent, [*tests, (bent.tests, st.TOTAL_REFLECTION)])
+    return SurfaceStep(met, bent, [*tests, (bent.tests, st.TOTAL_REFLECTION)])
 
 
-def rim_tests(o: Arithmetic, surface: Surface) -> Callable[[Met], list[Test]]:
+def rim_tests(o: Arithmetic, surface: Surface) -> Callable[[Hit], list[Test]]:
     """Tests whether a meeting lies inside a surface's rim."""
     if is_deep(surface):
         # By its depth: a point on the far half of the sphere may be near the axis, but there is no glass.
@@ -378,7 +378,7 @@ def rim_tests(o: Arithmetic, surface: Surface) -> Callable[[Met], list[Test]]:
     return lambda met: [(radius2(o, met), surface.semi_diameter_mm**2)]
 
 
-def radius2(o: Arithmetic, met: Met) -> Any:
+def radius2(o: Arithmetic, met: Hit) -> Any:
     """Squared distance of a meeting from the axis, mm^2."""
     return o.dot(met[:2], met[:2])
 

@@ -17,7 +17,7 @@ from neurolens.lens.prescription import Lens
 from neurolens.trace.arithmetic import Graphs, is_number, times
 from neurolens.trace.coatings import times_film
 from neurolens.trace.shapes import figure_of
-from neurolens.trace.surfaces import Medium, Met, Rays, Test, cross, media, radius2
+from neurolens.trace.surfaces import Hit, Medium, Rays, Test, cross, media, radius2
 from neurolens.trace.transmission import Passage, Shares
 
 TRANSMITTANCE = (
@@ -53,7 +53,7 @@ def exact_graph(
     scale = times(1.0 / o.dot(d, d).sqrt(), mediums[-1].n)
     r = Rays(rays[0], rays[1], film_z, *(c * scale for c in d))
 
-    def opening(met: Met) -> list[Test]:
+    def opening(met: Hit) -> list[Test]:
         """The test of the stop, whose radius is a number of the call; none where only the ray is wanted."""
         return [] if stop_square is None else [(radius2(o, met), stop_square)]
 
@@ -116,7 +116,7 @@ class GraphLosses:
         """exp(-depth)."""
         return transmitted(depth)
 
-    def coated(self, k: int, met: Met, q: Value, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares:
+    def coated(self, k: int, met: Hit, q: Value, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares:
         """Return the shares that the coating of surface k transmits of light towards the scene; see `coatings`."""
         (one, two), coating, g = media, self.lens.surfaces[k].coating, self.wavelength_nm.graph
         assert sense < 0 and not reflected and coating is not None

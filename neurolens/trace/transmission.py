@@ -20,7 +20,7 @@ from neurolens.lens.prescription import Lens
 from neurolens.trace.arithmetic import Arithmetic, times
 from neurolens.trace.coatings import Layers, power_amplitudes
 from neurolens.trace.shapes import is_plain
-from neurolens.trace.surfaces import Medium, Met, Rays, normal_at
+from neurolens.trace.surfaces import Hit, Medium, Rays, normal_at
 
 Vector = Any  # x, y, z in the lens frame: three tensors [N], or the rows of a value
 
@@ -147,7 +147,7 @@ class Losses(Protocol):
     """The losses of light in glass and coatings: `TensorLosses` with tensors, `tracegraph.GraphLosses` in a graph."""
 
     def absorption(self, k: int) -> Any: ...
-    def coated(self, k: int, met: Met, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares: ...
+    def coated(self, k: int, met: Hit, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares: ...
     def transmitted(self, depth: Any) -> Any: ...
 
 
@@ -162,7 +162,7 @@ class TensorLosses:
         # What the medium in front of the lens absorbs is a matter of the scene.
         return absorption_of(self.lens.surfaces[k - 1], self.wavelength_nm) if k else None
 
-    def coated(self, k: int, met: Met, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares:
+    def coated(self, k: int, met: Hit, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares:
         """Return the shares that the coating of surface k transmits or reflects; see `Passage.pass_surface`."""
         before, after = media
         coating = self.lens.surfaces[k].coating
@@ -188,7 +188,7 @@ class Passage:
         self._last: tuple[int, Vector, Any] | None = None  # surface, its normal, n cos behind it
 
     def pass_surface(
-        self, k: int, r: Rays, met: Met, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool = False
+        self, k: int, r: Rays, met: Hit, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool = False
     ) -> None:
         """Surface k: rays before it, their meeting, n' cos t; media as the light meets them, of the sense of travel."""
         before, after = media
@@ -215,7 +215,7 @@ class Passage:
         self._light = pass_surface(self._light, turn, shares)
         self._last = k, normal, met.q if reflected else q
 
-    def _turn(self, k: int, normal: Vector, r: Rays, met: Met, before: Medium) -> tuple[Any, Any]:
+    def _turn(self, k: int, normal: Vector, r: Rays, met: Hit, before: Medium) -> tuple[Any, Any]:
         """The turn between the planes of incidence (`turned`), times the square of the index."""
         assert self._last is not None
         last, other, q = self._last
@@ -233,7 +233,7 @@ class Passage:
         return power if self._depth is None else power * self._losses.transmitted(self._depth)
 
 
-def path_mm(o: Arithmetic, r: Rays, met: Met, before: Medium) -> Any:
+def path_mm(o: Arithmetic, r: Rays, met: Hit, before: Medium) -> Any:
     """Length of the path from a ray's point to its meeting, mm; negative where the meeting lies behind it."""
     along = o.fma(met.z - r.z, r.dz, o.fma(met.y - r.y, r.dy, (met.x - r.x) * r.dx))
     return times(along, times(before.n, before.inverse_n2))

@@ -19,7 +19,7 @@ from neurolens.flare.ghosts import GhostTracer, Pair
 from neurolens.lens.glass import LINE_D_NM
 from neurolens.lens.prescription import Coating, Lens, Surface, same_medium
 from neurolens.trace.rays import Rays, trace
-from neurolens.trace.sequence import Followed, follow, ghost
+from neurolens.trace.sequence import GhostTrace, follow, ghost
 
 DATA = Path(__file__).parents[1] / "data" / "ghost_paths.json"
 WHOLE = oracle.SHARED / "oracle" / "ghosts_and_fresnel.json"
@@ -28,7 +28,7 @@ WHOLE = oracle.SHARED / "oracle" / "ghosts_and_fresnel.json"
 def compare(lens: Lens, entry: dict[str, Any], dtype: torch.dtype) -> int:
     rows = [{**r, "origin": r["o"], "direction": r["d"]} for r in entry["rays"]]
     rays = oracle.launched(rows, dtype)
-    out: Followed = follow(lens, rays, ghost(len(lens.surfaces), *entry["ghost"]))
+    out: GhostTrace = follow(lens, rays, ghost(len(lens.surfaces), *entry["ghost"]))
     exact = dtype == torch.float64
     for i, row in enumerate(rows):
         status = int(out.status[i])
