@@ -83,7 +83,7 @@ class Glass:
         return total
 
     def bends(self) -> list[tuple[float, float]]:
-        """The piecewise linear absorption as hinges: wavelength, and the change of the derivative there.
+        """Return the piecewise linear absorption as hinges: wavelength, and the change of the derivative there.
 
         Faster than a search, fusible, and from the red end, where absorption is least, so that float32 does not lose
         it.
@@ -104,7 +104,7 @@ class Glass:
         return (self.n_d - 1.0) / (self.index(LINE_F_NM) - self.index(LINE_C_NM))
 
     def covers(self, wavelength_nm: float) -> bool:
-        """Whether the source states the formula for this wavelength."""
+        """Test whether the source states the formula for this wavelength."""
         low, high = self.range_um
         return low - 1e-9 <= wavelength_nm * 1e-3 <= high + 1e-9  # 700 * 1e-3 is a digit more than 0.7
 
@@ -161,7 +161,7 @@ def restore(before: Added) -> None:
 
 
 def find(name: str, file: str | Path = "glass catalogue", where: str = "glass") -> Glass:
-    """The glass of a name: "N-BK7", or with its maker "Schott:N-BK7", "schott N-BK7", "N-BK7 (SCHOTT)".
+    """Return the glass of a name: "N-BK7", or with its maker "Schott:N-BK7", "schott N-BK7", "N-BK7 (SCHOTT)".
 
     Case, blanks, hyphens and brackets do not count. Of several makers' glasses of one name it is that of the first in
     `MAKERS` (`same_name` lists them). A name without N- is not matched to the glass with it: SK16 is Hikari's.
@@ -186,18 +186,18 @@ def same_name(name: str) -> tuple[Glass, ...]:
 
 
 def all_glasses() -> tuple[Glass, ...]:
-    """The whole catalogue: what was added, then by maker in the order of `MAKERS`."""
+    """Return the whole catalogue: what was added, then by maker in the order of `MAKERS`."""
     added = dict.fromkeys(glass for glasses in _ADDED.values() for glass in glasses)
     return (*added, *(_glass(row) for row in range(len(_table()["glasses"]))))
 
 
 def nearest(n_d: float, V_d: float, count: int = 3) -> list[Glass]:
-    """The `count` glasses nearest to an index and Abbe number; 0.001 in n_d weighs as much as 0.5 in V_d."""
+    """Return the `count` glasses nearest to an index and Abbe number; 0.001 in n_d weighs as much as 0.5 in V_d."""
     return sorted(all_glasses(), key=lambda g: _distance(g.n_d - n_d, g.V_d - V_d))[:count]
 
 
 def by_code(code: str, count: int = 3) -> list[Glass]:
-    """The glasses nearest to a six-digit code: "517642", also written "517.642" or "517/642", is 1.517 and 64.2.
+    """Return the glasses nearest to a six-digit code: "517642", also written "517.642" or "517/642", is 1.517 and 64.2.
 
     Of those that share a code the order is that of `MAKERS`. Anything but six digits is an InputError.
     """
@@ -222,7 +222,7 @@ def _key(name: str) -> str:
 
 
 def _split(name: str) -> tuple[str | None, str]:
-    """Maker (None where the name does not say) and key of a name as people write it."""
+    """Return the maker (None where the name does not say) and key of a name as people write it."""
     text = " ".join(name[:_LONGEST].split())
     bare, bracket, said = text.rpartition("(") if text.endswith(")") else ("", "", "")
     if bracket and (maker := _BY_LETTERS.get(said[:-1].strip().upper())) and bare.strip():
@@ -250,7 +250,7 @@ def _suggestion(name: str) -> str:
 
 @lru_cache(maxsize=1)
 def _table() -> dict[str, Any]:
-    """The rows of the table's file in the order of `MAKERS`, read at the first lookup."""
+    """Return the rows of the table's file in the order of `MAKERS`, read at the first lookup."""
     text = (resources.files("neurolens.lens") / "data" / "glasses.json").read_text(encoding="utf-8")
     table = json.loads(text)
     table["glasses"].sort(key=lambda row: MAKERS.index(row[0]))
@@ -259,7 +259,7 @@ def _table() -> dict[str, Any]:
 
 @lru_cache(maxsize=1)
 def _rows_by_key() -> dict[str, list[int]]:
-    """Places in the table by the key of a name, in the order of `MAKERS`."""
+    """Return the places in the table by the key of a name, in the order of `MAKERS`."""
     rows: dict[str, list[int]] = {}
     for place, (_, name, *_) in enumerate(_table()["glasses"]):
         rows.setdefault(_key(name), []).append(place)

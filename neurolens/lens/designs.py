@@ -74,7 +74,7 @@ def v_coat(n_before: float, n_after: float, at_nm: float = DESIGN_NM) -> Coating
 
 
 def broadband(n_before: float, n_after: float, at_nm: float = BROADBAND_NM) -> Coating:
-    """The classic triple layer, quarter, half and quarter wave from the rarer side (Cox, Hass and Thelen 1962).
+    """Return the classic triple layer, quarter, half and quarter wave from the rarer side (Cox, Hass and Thelen 1962).
 
     The inner film's index, outer * sqrt(n_high / n_low), leaves no reflection at `at_nm`; mixtures of oxides have such
     indices (1.7 on crown glass).
@@ -108,7 +108,7 @@ def three_layer(n_before: float, n_after: float, at_nm: float = BROADBAND_NM) ->
 
 
 def multi_layer(n_before: float, n_after: float, at_nm: float = DESIGN_NM) -> Coating:
-    """Seven films on glass of index 1.43 to 2.05: today's broadband coatings.
+    """Return seven films on glass of index 1.43 to 2.05: today's broadband coatings.
 
     Fluoride over tantalum oxide and silica in turn; thicknesses by least squares of the reflected amplitude from 400 to
     700 nm at 0 and 30 degrees, for six glasses, linear between them, and scaled by `at_nm` / 550.
@@ -139,7 +139,7 @@ _DESIGNS: dict[str, tuple[Callable[[float, float, float], Coating], float]] = {
 
 
 def design(name: str, n_before: float, n_after: float, file: str | Path = "coating", where: str = "name") -> Coating:
-    """A coating by the name that lens files use: "bare", "quarter-wave", "v-coat 500", "broadband".
+    """Return a coating by the name that lens files use: "bare", "quarter-wave", "v-coat 500", "broadband".
 
     Args:
         name: the design, and after a space its wavelength in nm where that is not the usual one.
@@ -168,7 +168,7 @@ def design(name: str, n_before: float, n_after: float, file: str | Path = "coati
 
 
 def is_design(coating: Coating, n_before: float, n_after: float) -> bool:
-    """Whether `design` makes this coating of its name and these media."""
+    """Test whether `design` makes this coating of its name and these media."""
     try:
         return design(coating.name, n_before, n_after).layers == coating.layers
     except InputError:
@@ -188,7 +188,7 @@ def _film(index: float, phase: float, at_nm: float) -> tuple[float, float]:
 def _oriented(
     from_low: tuple[tuple[float, ...], ...], n_before: float, n_after: float
 ) -> tuple[tuple[float, ...], ...]:
-    """Layers given from the side of the lower index, as seen from the scene's side."""
+    """Return the layers given from the side of the lower index, as seen from the scene's side."""
     return from_low if n_before <= n_after else from_low[::-1]
 
 

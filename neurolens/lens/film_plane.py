@@ -84,7 +84,7 @@ def entrance_pupil_z_mm(
 
 
 def colours(range_nm: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Wavelengths (nm) in the middle of equal parts of a range and their weights in the spot of best focus.
+    """Return the wavelengths (nm) in the middle of equal parts of a range and their weights in the spot of best focus.
 
     A picture is judged by its luminance: weights are the eye's photopic sensitivity (CIE V, as a Gaussian of 559 nm).
     """

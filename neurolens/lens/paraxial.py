@@ -44,7 +44,7 @@ class FirstOrder:
     front_efl_mm: float
 
     def image_z_mm(self, object_z_mm: float) -> float:
-        """Paraxial image (mm) of a point on the axis, by Newton's x x' = -f f'."""
+        """Return the paraxial image (mm) of a point on the axis, by Newton's x x' = -f f'."""
         return self.rear_focal_z_mm - self.efl_mm * self.front_efl_mm / (object_z_mm - self.front_focal_z_mm)
 
 
@@ -61,16 +61,16 @@ class System:
     ideal: list[float]
 
     def turned(self) -> System:
-        """The system as light meets it that comes from the other side."""
+        """Return the system as light meets it that comes from the other side."""
         return System([-c for c in reversed(self.curvature)], self.gap_mm[::-1], self.index[::-1], self.ideal[::-1])
 
     def behind(self, surface: int) -> System:
-        """The surfaces behind one."""
+        """Return the surfaces behind one."""
         rest = slice(surface + 1, None)
         return System(self.curvature[rest], self.gap_mm[rest], self.index[rest], self.ideal[rest])
 
     def march(self, y: Any, u: Any) -> PathOfRay:
-        """The paraxial ray of height y (mm) at the first surface and slope u before it.
+        """Return the paraxial ray of height y (mm) at the first surface and slope u before it.
 
         Smith, Modern Optical Engineering, ch. 2.
         """
@@ -94,7 +94,7 @@ class PathOfRay(NamedTuple):
 
 
 def system_of(lens: Lens, wavelength_nm: float | None = None, meridian: Meridian = "y") -> System:
-    """The lens in one meridian at one wavelength; None takes `Lens.reference_nm`."""
+    """Return the lens in one meridian at one wavelength; None takes `Lens.reference_nm`."""
     light = lens.reference_nm if wavelength_nm is None else wavelength_nm
     curvature = [s.vertex_curvature(meridian) for s in lens.surfaces]
     index = [index_of(medium, light) for medium in lens.media]
@@ -156,13 +156,13 @@ def first_order(lens: Lens, wavelength_nm: float | None = None, meridian: Meridi
 
 
 def is_pinhole(lens: Lens) -> bool:
-    """Whether no surface bends light: a hole, perhaps behind plane filters."""
+    """Test whether no surface bends light: a hole, perhaps behind plane filters."""
     flat = all(s.radius_mm in (math.inf, -math.inf) and not (s.asphere or s.across) for s in lens.surfaces)
     return flat and not lens.ideal
 
 
 def _pinhole(lens: Lens, system: System) -> FirstOrder:
-    """The data of a hole among planes: planes shorten what lies behind them, seen from the other side, by n."""
+    """Return the data of a hole among planes: planes shorten what lies behind them, seen from the other side, by n."""
     k, n, front, rear = lens.stop_index, len(lens.surfaces), system.index[0], system.index[-1]
     depth = [s.thickness_mm / i for s, i in zip(lens.surfaces, system.index[1:], strict=True)]
     last_z = lens.vertices_mm[n - 1]
@@ -201,13 +201,13 @@ def framing_mm(lens: Lens, focus_m: float) -> tuple[float, float]:
 
 
 def stop_radius_mm(lens: Lens, f_number: float) -> float:
-    """Radius of the stop for f-number N = EFL / paraxial entrance-pupil diameter at infinity focus."""
+    """Return the radius of the stop for f-number N = EFL / paraxial entrance-pupil diameter at infinity focus."""
     # From an opening of 1 mm: a closed stop has no f-number to scale.
     return first_order(lens.with_stop_radius(1.0)).f_number / f_number
 
 
 def film_z_mm(lens: Lens, focus_m: float) -> float:
-    """Film plane that focuses an object `focus_m` metres from the film (unit focusing; see `film_plane`).
+    """Return the film plane that focuses an object `focus_m` metres from the film (unit focusing; see `film_plane`).
 
     A pinhole's film stays in place: it is equally sharp at every distance.
 
@@ -222,7 +222,7 @@ def film_z_mm(lens: Lens, focus_m: float) -> float:
 
 
 def image_z_mm(lens: Lens, object_z_mm: float) -> float:
-    """Paraxial image of a point on the axis, lens frame, at `Lens.reference_nm`; of a pinhole, the film."""
+    """Return the paraxial image of a point on the axis, lens frame, at `Lens.reference_nm`; of a pinhole, the film."""
     data = first_order(lens)
     if is_pinhole(lens):
         return float(data.rear_focal_z_mm)

@@ -249,7 +249,7 @@ class Lens:
         return texts | {"sha256": self.sha256}
 
     def scaled(self, factor: float) -> Lens:
-        """All lengths times `factor`; angles, indices and f-number stay.
+        """Return all lengths times `factor`; angles, indices and f-number stay.
 
         A grey filter keeps its density (its absorption per mm shrinks as it grows), a catalogue glass absorbs more when
         it is thicker, and coatings keep their layers.
@@ -293,18 +293,18 @@ class Lens:
         return state.half_field_deg or (self.half_field_deg if self.image_radius_mm is None else None)
 
     def with_stop_radius(self, radius_mm: float) -> Lens:
-        """The same lens with another opening of the stop."""
+        """Return the same lens with another opening of the stop."""
         k = self.stop_index
         stop = replace(self.surfaces[k], diameter_mm=2 * radius_mm)
         return replace(self, surfaces=(*self.surfaces[:k], stop, *self.surfaces[k + 1 :]))
 
     def with_gaps(self, gaps_mm: Mapping[int, Any]) -> Lens:
-        """The same lens with other thicknesses, by surface index."""
+        """Return the same lens with other thicknesses, by surface index."""
         rows = (replace(s, thickness_mm=gaps_mm.get(k, s.thickness_mm)) for k, s in enumerate(self.surfaces))
         return replace(self, surfaces=tuple(rows))
 
     def with_aperture(self, aperture: Aperture | None) -> Lens:
-        """The same lens with blades or a mask in its stop; None is a round stop."""
+        """Return the same lens with blades or a mask in its stop; None is a round stop."""
         return replace(self, aperture=aperture)
 
 

@@ -83,7 +83,7 @@ def read_any(path: str | Path, options: ReadOptions | None = None) -> Lens:
 
 
 def format_of(path: str | Path) -> Format:
-    """The format of a file, by its content, else by a suffix that no other format has.
+    """Return the format of a file, by its content, else by a suffix that no other format has.
 
     Raises:
         InputError: neither tells.
@@ -99,7 +99,7 @@ def format_of(path: str | Path) -> Format:
 
 
 def kind_of(path: str | Path) -> str:
-    """The name of a file's format, "neurolens" for our own; raises as `format_of` and `read_toml`."""
+    """Return the name of a file's format, "neurolens" for our own; raises as `format_of` and `read_toml`."""
     if Path(path).suffix.lower() == ".toml":
         return "Physical Camera" if is_blender(read_toml(path)) else OURS
     return format_of(path).name
@@ -119,7 +119,7 @@ class Collection:
 
 
 def collection_of(folder: Path) -> Collection:
-    """The files of a folder and of its folders by suffix; hidden ones and links to folders are others.
+    """Return the files of a folder and of its folders by suffix; hidden ones and links to folders are others.
 
     Raises:
         InputError: no such folder, or no lens file in it.

@@ -27,7 +27,7 @@ _TWICE, _SAME = (0.4, 0.7), (0.7, 1.4)  # f-number by the stop's diameter over t
 def finish(
     lens: Lens, *, pupil_mm: float | None = None, film_given: bool = True, stop_limit_mm: float | None = None
 ) -> Lens:
-    """A lens from the rows of a file, with what follows from them: f-number or stop, and back focus.
+    """Return a lens from the rows of a file, with what follows from them: f-number or stop, and back focus.
 
     Rims that the file does not give stay `UNKNOWN`; states and overlaps are for the caller (`with_rims`,
     `check_states`).
@@ -85,7 +85,7 @@ def smaller_stop(file: str, asked: float, limit: float | None, state: str = "") 
 
 
 def first_order(lens: Lens) -> FirstOrder:
-    """First-order data in the y-z plane; of a lens without power there, in the x-z plane.
+    """Return the first-order data in the y-z plane; of a lens without power there, in the x-z plane.
 
     Raises InputError for a lens without power, or whose entrance pupil is a point or infinite; a figure out of range.
     """
@@ -164,18 +164,18 @@ def with_stop(draft: Draft, wanted: str | None) -> Draft:
 
 
 def _share(rim: float, height: float) -> float:
-    """A rim over the height of the marginal ray of a beam 2 mm wide; infinite where there is no rim."""
+    """Return a rim over the height of the marginal ray of a beam 2 mm wide; infinite where there is no rim."""
     return math.inf if math.isnan(rim) or height == 0 else rim / abs(height)
 
 
 def stop_aperture(draft: Draft) -> float | None:
-    """Diameter of the aperture that the file sets on the stop itself, in its unit."""
+    """Return the diameter of the aperture that the file sets on the stop itself, in its unit."""
     stops = (row.surface.diameter_mm for row in draft.rows if row.surface.stop and row.aperture)
     return next((d for d in stops if not math.isnan(d)), None)
 
 
 def with_likely_rims(lens: Lens, draft: Draft) -> Lens:
-    """The lens with rims of half the width, where stop and spheres say that radii were meant by diameters."""
+    """Return the lens with rims of half the width, where stop and spheres say that radii were meant by diameters."""
     f_number = draft.f_number or draft.nominal
     if not any(s.stop for s in lens.surfaces):
         return lens  # `finish` says so
@@ -208,7 +208,7 @@ def with_rims(lens: Lens, in_file: Callable[[str], str] = str) -> Lens:
 
 
 def narrowed(lens: Lens, draft: Draft) -> Lens:
-    """The lens with rims no wider than their spheres and than where neighbours touch, in every state.
+    """Return the lens with rims no wider than their spheres and than where neighbours touch, in every state.
 
     Unless rims are `drawn`, a table stays as it is where rims are much wider (`_SLIGHTLY`) than their spheres, or would
     have to be much narrower and then cut the beam of the axis: its figures are wrong.

@@ -68,7 +68,7 @@ def _complete(file: File) -> None:
 
 
 def _edge(file: File, *pairs: tuple[str, str]) -> float | None:
-    """The field point farthest from the axis; None where the file has none of that kind."""
+    """Return the field point farthest from the axis; None where the file has none of that kind."""
     far = 0.0
     for x, y in pairs:
         across, up = file.fields.get(x, []), file.fields.get(y, [])
@@ -105,7 +105,7 @@ READ = (
 
 
 def read_seq(path: str | Path, options: ReadOptions | None = None) -> Lens:
-    """The lens of a CODE V sequence file.
+    """Return the lens of a CODE V sequence file.
 
     Raises:
         InputError: see the module; also tilts, mirrors and everything else that the lens model cannot represent.
@@ -129,7 +129,7 @@ def read_seq(path: str | Path, options: ReadOptions | None = None) -> Lens:
 
 
 def looks_like_seq(head: str) -> bool:
-    """Whether the beginning of a text is that of a CODE V file."""
+    """Test whether the beginning of a text is that of a CODE V file."""
     first = [line.replace(";", " ").split()[0].upper() for line in head.splitlines() if line.replace(";", " ").split()]
     return bool({"RDM", "LEN"} & set(first)) and "NEW" not in head.upper().split()[:3]
 
@@ -220,7 +220,7 @@ def _surface(file: File, command: Command) -> None:
 
 
 def _named(file: File, command: Command) -> Block:
-    """The surface that the first word of a command names: Sk, SO or SI."""
+    """Return the surface that the first word of a command names: Sk, SO or SI."""
     word = command.words[0].upper()
     place = {"SO": 0, "SI": len(file.blocks) - 1}.get(word, int(word[1:]) if word[1:].isdecimal() else -1)
     if not 0 <= place < len(file.blocks):

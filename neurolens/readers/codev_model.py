@@ -51,7 +51,7 @@ def commands(lines: Sequence[Line]) -> Iterator[Command]:
 
 
 def _outside_quotes(text: str, mark: str) -> list[str]:
-    """A text split at a mark that stands outside quotes."""
+    """Return a text split at a mark that stands outside quotes."""
     parts, quote, begin = [], "", 0
     for place, letter in enumerate(text):
         if quote:
@@ -97,7 +97,7 @@ def medium(
 
 
 def _private(command: Command, wavelengths_nm: Sequence[float]) -> dict[str, Any]:
-    """Fields of a surface from a row of a PRV block: indices at the wavelengths of its PWL line."""
+    """Return the fields of a surface from a row of a PRV block: indices at the wavelengths of its PWL line."""
     if command.words and not re.match(r"[-+.0-9]", command.words[0]):
         expected = "an index at each wavelength of PWL: formulas of private glasses are not read"
         raise command.line.error(f"PRV {command.word}", command.words[0], expected)
@@ -158,7 +158,7 @@ class Block(draft.Block):
 
 
 def shape_of(block: Block) -> dict[str, Any]:
-    """Radius, conic, asphere and what bends it across of a surface, for `Surface`.
+    """Return the radius, conic, asphere and what bends it across of a surface, for `Surface`.
 
     YTO is a curve in y (curvature CUY, K, A y^4, ...) turned about an axis along y at 1 / CUX; XTO likewise in x; a
     cylinder where one of both is zero. AAS with its two conics K and KX is a biconic.
@@ -294,7 +294,7 @@ class Zoom:
         self.thickness[int(surface), int(place) - 1] = command.numbers(command.words[2:])[0]
 
     def states(self, middle: Sequence[Block], object_distance: float, defocus: float) -> Iterator[State]:
-        """The positions of a file, by rows of the draft (surface numbers less one)."""
+        """Return the positions of a file, by rows of the draft (surface numbers less one)."""
         for surface, (_, command) in self.semi_diameter.items():
             if not (0 < surface <= len(middle) and middle[surface - 1].stop):
                 raise command.line.error("ZOO CIR", f"S{surface}", "the stop: other rims cannot change")

@@ -76,7 +76,7 @@ class Block:
         return 1 / self.curvature if self.curvature else math.inf
 
     def rotational(self, asphere: Iterable[tuple[int, float]] = ()) -> dict[str, Any]:
-        """Fields of `Surface` for a surface of revolution; the conic of a plane has no effect."""
+        """Return the fields of `Surface` for a surface of revolution; the conic of a plane has no effect."""
         conic = self.conic if self.curvature else 0.0
         return {"radius_mm": self.radius, "conic": conic, "asphere": tuple((p, a) for p, a in asphere if a)}
 
@@ -175,7 +175,7 @@ class Draft:
     wavelengths_nm: tuple[float, ...] = ()
 
     def in_file(self, text: str) -> str:
-        """A message about the rows, each called as the file calls its surface."""
+        """Return a message about the rows, each called as the file calls its surface."""
 
         def renamed(found: re.Match[str]) -> str:
             rows = [self.rows[k].name for k in map(int, found[1].split(", ")) if k < len(self.rows)]
@@ -185,7 +185,7 @@ class Draft:
 
 
 def primary_first(wavelengths_nm: Iterable[float], primary_nm: float) -> tuple[float, ...]:
-    """Wavelengths of a file as `Lens` holds them; those beyond what neurolens traces are left out."""
+    """Return the wavelengths of a file as `Lens` holds them; those beyond what neurolens traces are left out."""
     sound = [round(nm, 6) for nm in wavelengths_nm if within(WAVELENGTH_NM, nm)]  # as read in micrometres
     return tuple(sorted(sound, key=lambda nm: nm != round(primary_nm, 6)))
 
@@ -256,14 +256,14 @@ _ROWS = re.compile(r"\bsurface ([0-9]+(?:, [0-9]+(?![0-9.]| mm))*)(?! of the fil
 
 
 def _states(draft: Draft) -> tuple[State, ...]:
-    """The states of the file; a table without states that is focused near becomes a focus state."""
+    """Return the states of the file; a table without states that is focused near becomes a focus state."""
     if not draft.states and math.isfinite(draft.object_distance):
         return (State("as filed", object_distance=draft.object_distance, film_given=draft.film_given),)
     return draft.states
 
 
 def _configuration(lens: Lens, draft: Draft, state: State) -> Configuration:
-    """A state for the lens file; its stop follows from the pupil or f-number of the state."""
+    """Return a state for the lens file; its stop follows from the pupil or f-number of the state."""
     last = len(lens.surfaces) - 1
     thickness = dict(state.thickness)
     if not state.film_given:
@@ -300,7 +300,7 @@ def _configuration(lens: Lens, draft: Draft, state: State) -> Configuration:
 
 
 def _without_dummies(draft: Draft) -> Draft:
-    """The draft without planes between equal media that cut no beam; gaps on both sides become one."""
+    """Return the draft without planes between equal media that cut no beam; gaps on both sides become one."""
     if len(draft.rows) > MAX_SURFACES:
         raise InputError(draft.file, "surfaces", f"({len(draft.rows)} of them)", f"at most {MAX_SURFACES}")
     rows = draft.rows

@@ -94,7 +94,7 @@ def _qbfs_sum(a: Sequence[float]) -> list[Decimal]:
 
 
 def _interpolated(function: Callable[[Decimal], Decimal], reach: Decimal, degree: int) -> list[Decimal]:
-    """The polynomial through a function of x in Chebyshev's points of [0, reach]."""
+    """Return the polynomial through a function of x in Chebyshev's points of [0, reach]."""
     nodes = [reach / 2 * (1 - Decimal(math.cos(math.pi * (k + 0.5) / (degree + 1)))) for k in range(degree + 1)]
     table = [function(x) for x in nodes]
     for order in range(1, degree + 1):  # Newton's divided differences

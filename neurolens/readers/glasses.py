@@ -56,7 +56,7 @@ def named_glass(
     said: str | None = None,
     figures: tuple[float, float] | None = None,
 ) -> dict[str, Any]:
-    """Fields of a surface whose glass the file gives by name alone; warns where it is ambiguous.
+    """Return the fields of a surface whose glass the file gives by name alone; warns where it is ambiguous.
 
     For a discontinued glass its replacement, with the prefix "N-", is taken. A moulded variant of a glass ("..._MOLD",
     "...M") has an index lower by some 0.004, which no catalogue here states; its base glass is offered.
@@ -128,12 +128,12 @@ def by_indices(line: Line, field: str, indices: Sequence[float], wavelengths_nm:
 
 
 def _letters(name: str) -> str:
-    """Letters and digits of a name, the rest of which does not count."""
+    """Return the letters and digits of a name, the rest of which does not count."""
     return "".join(filter(str.isalnum, name.upper()))
 
 
 def same_glass(name: str | None, n_d: float, V_d: float | None) -> str | None:
-    """The catalogue's glass of that name whose figures are the given ones to the digits printed, or None."""
+    """Return the catalogue's glass of that name whose figures are the given ones to the digits printed, or None."""
     if name is None or V_d is None:
         return None
     for known in catalogue.same_name(name):
@@ -143,7 +143,7 @@ def same_glass(name: str | None, n_d: float, V_d: float | None) -> str | None:
 
 
 def short_name(glass: Glass) -> str:
-    """The name that finds a glass again, with its maker only where others have one of that name."""
+    """Return the name that finds a glass again, with its maker only where others have one of that name."""
     return glass.name if catalogue.find(glass.name) is glass else str(glass)
 
 
@@ -161,7 +161,7 @@ class _Entry:
 
 
 def read_agf(path: str | Path) -> tuple[list[Glass], dict[str, str]]:
-    """The glasses of a catalogue, its file's stem their maker; and by name why others are not read.
+    """Return the glasses of a catalogue, its file's stem their maker; and by name why others are not read.
 
     Raises:
         InputError: no such file, one too large, a line without its numbers; names file and line.
@@ -177,7 +177,7 @@ def read_agf(path: str | Path) -> tuple[list[Glass], dict[str, str]]:
 
 @contextmanager
 def more_glasses(files: Iterable[str | Path]) -> Iterator[None]:
-    """The glasses of these catalogues within the block, before those of the same names that ship."""
+    """Return the glasses of these catalogues within the block, before those of the same names that ship."""
     read, before = [read_agf(file) for file in files], catalogue.added()
     try:
         for found, refused in reversed(read):

@@ -50,7 +50,7 @@ _NUMBER = r"(?<![0-9.])([0-9]{1,9}(?:\.[0-9]{1,9})?)"  # bounded: a search tries
 
 
 def read_json_lens(path: str | Path, options: ReadOptions | None = None, *, catalogue: bool = True) -> Lens:
-    """The lens of a JSON file, unfocused.
+    """Return the lens of a JSON file, unfocused.
 
     Args:
         options: name and source that replace those of the file; f-number and half field for a file that states none.
@@ -106,18 +106,18 @@ def read_json_lens(path: str | Path, options: ReadOptions | None = None, *, cata
 
 
 def _tells_of_other_diameters(notes: str) -> bool:
-    """Whether a clause has "diameter" and after it one of the words."""
+    """Test whether a clause has "diameter" and after it one of the words."""
     clauses = (clause.partition("diameter")[2] for clause in re.split("[.;]", notes.lower()))
     return any(not _NOT_THE_SOURCE_S.isdisjoint(re.findall(r"\w+", rest)) for rest in clauses)
 
 
 def looks_like_json(head: str) -> bool:
-    """Whether the beginning of a text is that of a JSON object."""
+    """Test whether the beginning of a text is that of a JSON object."""
     return head.lstrip().startswith("{")
 
 
 def _load(path: str | Path) -> dict[str, Any]:
-    """The top-level object; what JSON itself forbids (NaN) or leaves open (a key twice) is an error."""
+    """Return the top-level object; what JSON itself forbids (NaN) or leaves open (a key twice) is an error."""
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         found = dict(pairs)
@@ -194,7 +194,7 @@ def _optional_text(table: Table, key: str) -> str:
 
 
 def stated_efl(lens: Lens, data: Mapping[str, Any]) -> Lens:
-    """The lens with the focal length stated: of several, an anamorphic lens's by meridian, else the first (the
+    """Return the lens with the focal length stated: of several, an anamorphic lens's by meridian, else the first (the
     table's).
     """
     given = data.get("efl_mm")
@@ -263,7 +263,7 @@ def image_and_field(data: Mapping[str, Any], file: str) -> dict[str, Any]:
 
 
 def read_states(lens: Lens, data: Mapping[str, Any]) -> Lens:
-    """The lens with the states of the file, checked."""
+    """Return the lens with the states of the file, checked."""
     states: list[Configuration] = []
     for place, given in enumerate(_tables(data, lens.path)):
         if not isinstance(given, Mapping):
@@ -318,7 +318,7 @@ def _state(lens: Lens, table: Table, name: str) -> Configuration:
 
 
 def _object_distance_mm(lens: Lens) -> float:
-    """Distance from the object in focus on the tabled film to the front vertex (Newton's x x' = -f f')."""
+    """Return the distance from the object in focus on the tabled film to the front vertex (Newton's x x' = -f f')."""
     data = first_order(lens)
     beyond = float(lens.vertices_mm[-1]) - data.rear_focal_z_mm
     return data.efl_mm * data.front_efl_mm / beyond - data.front_focal_z_mm if beyond else math.inf

@@ -41,7 +41,7 @@ _TYPES = ("spherical", "flat", "stop", "aspheric", "cylindrical_x", "cylindrical
 
 
 def read_others(data: Mapping[str, Any], file: str, options: ReadOptions) -> Lens | None:
-    """The lens of a JSON object of DeepLens or ISET; None where it is of neither.
+    """Return the lens of a JSON object of DeepLens or ISET; None where it is of neither.
 
     Warns:
         NeurolensWarning: a stated focal length that is not that of the surfaces to 1%.
@@ -168,7 +168,7 @@ def _iset(data: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], file: str)
 
 
 def _repeats(key: str) -> bool:
-    """Whether a key is in brackets: it repeats other keys."""
+    """Test whether a key is in brackets: it repeats other keys."""
     return key.startswith("(") and key.endswith(")")
 
 
@@ -177,12 +177,12 @@ def _line(text: Any) -> str:
 
 
 def is_blender(data: Mapping[str, Any]) -> bool:
-    """Whether the tables of a TOML file are those of such a lens."""
+    """Test whether the tables of a TOML file are those of such a lens."""
     return "schema" not in data and isinstance(data.get("surface"), list) and isinstance(data.get("lens"), Mapping)
 
 
 def read_blender(data: Mapping[str, Any], file: str, options: ReadOptions | None = None) -> Lens:
-    """The lens of such a file.
+    """Return the lens of such a file.
 
     Raises:
         InputError: a key or type that is not of the format, a figure out of range.
@@ -245,7 +245,7 @@ def _blender_surface(row: Table) -> Surface:
 
 
 def _states(top: Table, count: int, film_given: bool) -> tuple[State, ...]:
-    """The near focus state, where there is one, after that at infinity."""
+    """Return the near focus state, where there is one, after that at infinity."""
     if "focus" not in top:
         return ()
     if not isinstance(top.data["focus"], Mapping):

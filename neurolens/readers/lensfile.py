@@ -101,7 +101,7 @@ def read_lens(path: str | Path, data: Mapping[str, Any] | None = None) -> Lens:
 
 
 def _with_rims(lens: Lens, table: Table) -> Lens:
-    """The lens with the diameters that its file leaves out."""
+    """Return the lens with the diameters that its file leaves out."""
     missing = [k for k, s in enumerate(lens.surfaces) if math.isnan(s.diameter_mm)]
     if not missing:
         return lens
@@ -177,7 +177,7 @@ def _surface(row: Table, n_before: float, known: Mapping[str, Coating]) -> Surfa
 
 
 def _glass(row: Table) -> dict[str, Any]:
-    """The medium after the surface; what a catalogue knows need not be in the file."""
+    """Return the medium after the surface; what a catalogue knows need not be in the file."""
     for key in ("V_d", "material", "absorption_per_mm"):
         if key in row and "n_d" not in row and "glass" not in row:
             raise row.error("n_d", "(missing)", f"the index of the glass, as {key} is given")
@@ -311,7 +311,7 @@ def write_lens(lens: Lens, path: str | Path) -> None:
 
 
 def format_lens(lens: Lens) -> str:
-    """The text of a lens file."""
+    """Return the text of a lens file."""
     values = {"schema": SCHEMA} | {key: getattr(lens, field) for key, field in HEAD.items()}
     values["f_number"] = float(lens.f_number)
     head = {key: value for key, value in values.items() if value not in (None, "", ())}
@@ -346,7 +346,7 @@ def _stacks(lens: Lens) -> dict[str, tuple[tuple[float, ...], ...]]:
 
 
 def _blades(lens: Lens) -> str:
-    """The table of the stop's blades; a mask is refused, for a lens file has no form for it."""
+    """Return the table of the stop's blades; a mask is refused, for a lens file has no form for it."""
     if lens.aperture is None:
         return ""
     if lens.aperture.blades is None:
@@ -370,7 +370,7 @@ def _rows(lens: Lens) -> str:
 
 
 def _cells(s: Surface) -> dict[str, str]:
-    """The texts of a surface's figures by key; those that say nothing are left out."""
+    """Return the texts of a surface's figures by key; those that say nothing are left out."""
     bare = float(s.n_d) == 1 and s.V_d is None and s.material is None and not s.absorption_per_mm
     across = s.across or (None, None)
     values: dict[str, Any] = {
@@ -390,7 +390,7 @@ def _cells(s: Surface) -> dict[str, str]:
 
 
 def _wrapped(text: str) -> str:
-    """A text in short lines. TOML drops a backslash at the end of a line and the blanks after it."""
+    """Return a text in short lines. TOML drops a backslash at the end of a line and the blanks after it."""
     if len(text) <= WRAP:
         return format_value(text)
     lines: list[str] = []

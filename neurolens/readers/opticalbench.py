@@ -43,11 +43,11 @@ class _File:
     field_stops: set[int] = field(default_factory=set)
 
     def names(self) -> list[str]:
-        """The numbers of the surfaces; a plane that was added has none."""
+        """Return the numbers of the surfaces; a plane that was added has none."""
         return [*self.ids, *[""] * (len(self.surfaces) - len(self.ids))]
 
     def value(self, name: str, place: int) -> float | None:
-        """A variable in a state, None where it is not told; "Infinity" is `math.inf`."""
+        """Return a variable in a state, None where it is not told; "Infinity" is `math.inf`."""
         line, words = self.variables.get(name.lower(), (None, []))
         word = words[place].strip() if place < len(words) else ""
         if line is None or word.lower() in _UNKNOWN:
@@ -56,7 +56,7 @@ class _File:
 
 
 def read_opticalbench(path: str | Path, options: ReadOptions | None = None) -> Lens:
-    """The lens of a text of the Optical Bench, with a state for every column that has all gaps of the table.
+    """Return the lens of a text of the Optical Bench, with a state for every column that has all gaps of the table.
 
     Raises:
         InputError: a section without its columns, a gap without a value, aspheric data of no surface.
@@ -81,7 +81,7 @@ def read_opticalbench(path: str | Path, options: ReadOptions | None = None) -> L
 
 
 def looks_like_opticalbench(head: str) -> bool:
-    """Whether the beginning of a text names sections of the format."""
+    """Test whether the beginning of a text names sections of the format."""
     rows = {row.strip().lower() for row in head.splitlines() if row.startswith("[")}
     return bool(rows & {"[lens data]", "[variable distances]"})
 
@@ -161,7 +161,7 @@ def _bend(found: _File, line: Line, words: list[str]) -> None:
 
 
 def _complete(found: _File) -> Draft:
-    """The draft of the first state, with all states where there are several."""
+    """Return the draft of the first state, with all states where there are several."""
     draft, file = found.draft, found.draft.file
     columns = max((len(words) for _, words in found.variables.values()), default=1)
     states = [s for s in (_state(found, place) for place in range(columns)) if s is not None]
@@ -194,7 +194,7 @@ def _complete(found: _File) -> Draft:
 
 
 def _cuts(found: _File, rows: list[Surface], k: int) -> bool:
-    """Whether the file sets an aperture: a rim on glass, or a field stop that does not reach into an element."""
+    """Test whether the file sets an aperture: a rim on glass, or a field stop that does not reach into an element."""
     before = rows[k - 1].thickness_mm if k else 0.0
     if k in found.field_stops and min(before, rows[k].thickness_mm) < 0:
         assume(found.draft.file, f"field stop {k}, a ring about an element, is left out: rims are assumed to decide")
@@ -207,7 +207,7 @@ def _positive(value: float | None) -> float | None:
 
 
 def _state(found: _File, place: int) -> State | None:
-    """The state of a column; None where a gap that the table names has no value in it."""
+    """Return the state of a column; None where a gap that the table names has no value in it."""
     gaps: dict[int, float] = {}
     last = len(found.surfaces) - 1
     for k, (line, name) in found.gaps.items():

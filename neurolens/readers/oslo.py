@@ -57,7 +57,7 @@ class File(Draft):
 
 
 def read_len(path: str | Path, options: ReadOptions | None = None) -> Lens:
-    """The lens of an OSLO file.
+    """Return the lens of an OSLO file.
 
     Raises:
         InputError: see the module; also solves and pickups that are not carried out in the file.
@@ -75,12 +75,12 @@ def read_len(path: str | Path, options: ReadOptions | None = None) -> Lens:
 
 
 def looks_like_len(head: str) -> bool:
-    """Whether the beginning of a text is that of an OSLO file."""
+    """Test whether the beginning of a text is that of an OSLO file."""
     return any(line.upper().split(maxsplit=2)[:2] == ["LEN", "NEW"] for line in head.splitlines())
 
 
 def _parts(text: str) -> list[str]:
-    """The commands of a line: "//" begins a comment, ";" ends a command, both only outside quotes."""
+    """Return the commands of a line: "//" begins a comment, ";" ends a command, both only outside quotes."""
     bare = re.match(r'(?:[^"/]|"[^"]*"|/(?!/))*', text)
     parts = re.findall(r'(?:[^";]|"[^"]*")+', bare[0] if bare else text)
     return [part.strip() for part in parts if part.strip()]

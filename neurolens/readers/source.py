@@ -41,11 +41,11 @@ class Line:
         return self.text.split()
 
     def error(self, keyword: str, value: object, expected: str) -> InputError:
-        """The error for something on this line."""
+        """Return the error for something on this line."""
         return InputError(self.file, f"line {self.number}, {keyword}", value, expected)
 
     def number_of(self, keyword: str, word: str) -> float:
-        """A finite number from one word of this line."""
+        """Return a finite number from one word of this line."""
         try:
             value = float(word) if "_" not in word and len(word) <= MAX_WORD else math.nan
         except ValueError:
@@ -58,14 +58,14 @@ class Line:
         return value
 
     def positive(self, keyword: str, words: Sequence[str]) -> float:
-        """The first word as a number above 0."""
+        """Return the first word as a number above 0."""
         value = self.numbers(keyword, words[:1])[0]
         if value <= 0:
             raise self.error(keyword, value, "a number above 0")
         return value
 
     def numbers(self, keyword: str, words: Sequence[str], least: int = 1) -> list[float]:
-        """Finite numbers from words of this line, at least so many."""
+        """Return the finite numbers from words of this line, at least so many."""
         if len(words) < least:
             found = " ".join(words) or "(nothing)"
             raise self.error(keyword, found, f"{least} number{'s' if least > 1 else ''} after it")
@@ -95,7 +95,7 @@ class Table:
         reject_unknown(self.file, self.where, self.data, known)
 
     def number(self, key: str, *, unit: str = "", above: float | None = None, finite: bool = True) -> float:
-        """A number: an integer or a float, never a bool, a text or NaN."""
+        """Return a number: an integer or a float, never a bool, a text or NaN."""
         value = self.data.get(key, "(missing)")
         expected = "a finite number" if finite else "a number"
         expected += (f" above {above:g}" if above is not None else "") + (f" in {unit}" if unit else "")
@@ -109,11 +109,11 @@ class Table:
         return found
 
     def optional(self, key: str, *, above: float | None = 0.0) -> float | None:
-        """The number, above 0 unless said otherwise; None where it is absent or null."""
+        """Return the number, above 0 unless said otherwise; None where it is absent or null."""
         return None if self.data.get(key) is None else self.number(key, above=above)
 
     def gaps(self, key: str, n_surfaces: int, expected: str) -> tuple[tuple[int, float], ...]:
-        """Thicknesses in mm by surface number."""
+        """Return the thicknesses in mm by surface number."""
         given = self.data.get(key, "(missing)")
         if not isinstance(given, Mapping):
             raise self.error(key, given, expected)
@@ -125,7 +125,7 @@ class Table:
         return tuple(found)
 
     def powers(self, key: str, example: str) -> tuple[tuple[int, float], ...]:
-        """Coefficients of powers of the height, sorted by power."""
+        """Return the coefficients of powers of the height, sorted by power."""
         given = self.data[key]
         if not isinstance(given, Mapping) or not given:
             raise self.error(key, given, example)
@@ -139,7 +139,7 @@ class Table:
         return tuple(sorted(terms))
 
     def series(self, key: str, first: int) -> tuple[tuple[int, float], ...]:
-        """Coefficients of `first`, `first` + 2, ... from an optional list, without those that are 0."""
+        """Return the coefficients of `first`, `first` + 2, ... from an optional list, without those that are 0."""
         terms = self.data.get(key) or []
         if not isinstance(terms, list):
             raise self.error(key, terms, f"a list of coefficients of r^{first}, r^{first + 2}, ...")
@@ -148,14 +148,14 @@ class Table:
         return tuple((power, value) for power, value in found if value)
 
     def tables(self, key: str) -> list[Mapping[str, Any]]:
-        """The tables under [[key]], none where it is absent."""
+        """Return the tables under [[key]], none where it is absent."""
         tables = self.data.get(key, [])
         if not isinstance(tables, list) or not all(isinstance(t, Mapping) for t in tables):
             raise self.error(key, tables, f"tables under [[{key}]]")
         return tables
 
     def text(self, key: str, *, required: bool = True) -> str:
-        """A text; an empty one where a text that is not required is absent."""
+        """Return a text; an empty one where a text that is not required is absent."""
         if key not in self.data and not required:
             return ""
         value = self.data.get(key, "(missing)")
@@ -171,7 +171,7 @@ class Table:
         return value
 
     def half_field(self) -> float | None:
-        """The optional `half_field_deg`."""
+        """Return the optional `half_field_deg`."""
         if "half_field_deg" not in self.data:
             return None
         angle = self.number("half_field_deg", unit="degrees", above=0)
@@ -186,7 +186,7 @@ def by_word(*groups: tuple[str, str]) -> dict[str, str]:
 
 
 def read_text(path: str | Path) -> str:
-    """The text of a lens file of bounded size.
+    """Return the text of a lens file of bounded size.
 
     Raises:
         InputError: as `files.read_bytes` and `decode`; an empty file.
@@ -198,7 +198,7 @@ def read_text(path: str | Path) -> str:
 
 
 def decode(raw: bytes, path: str | Path) -> str:
-    """Text of a file: UTF-16 by its byte-order mark (or by its zero bytes), else UTF-8, else Latin-1.
+    """Return the text of a file: UTF-16 by its byte-order mark (or by its zero bytes), else UTF-8, else Latin-1.
 
     Raises:
         InputError: bytes that are not text.
@@ -222,7 +222,7 @@ def decode(raw: bytes, path: str | Path) -> str:
 
 
 def read_lines(path: str | Path) -> list[Line]:
-    """The lines of a text file, those without content left out; refuses too many, or one too long."""
+    """Return the lines of a text file, those without content left out; refuses too many, or one too long."""
     file = str(path)
     rows = read_text(path).splitlines()
     if len(rows) > MAX_LINES:

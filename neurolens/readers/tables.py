@@ -36,7 +36,7 @@ _STATED = re.compile(r"(\d+) surfaces,.*?(?:f/(\d+(?:\.\d+)?))?\s*$")
 
 
 def read_table(path: str | Path, options: ReadOptions | None = None) -> Lens:
-    """The lens of a table.
+    """Return the lens of a table.
 
     Raises:
         InputError: a row without four numbers, a count that is not that of the rows, no stop or several.
@@ -78,7 +78,7 @@ def read_table(path: str | Path, options: ReadOptions | None = None) -> Lens:
 
 
 def looks_like_table(head: str) -> bool:
-    """Whether the beginning of a text is that of a table: numbers in the first line that is not a comment."""
+    """Test whether the beginning of a text is that of a table: numbers in the first line that is not a comment."""
     for row in head.splitlines():
         words = row.partition("#")[0].split()
         if words:
@@ -108,7 +108,7 @@ def _surfaces(file: str, rows: Sequence[tuple[Line, list[float]]], factor: float
 
 
 def read_flaresim(path: str | Path, options: ReadOptions | None = None) -> Lens:
-    """The lens of a .lens file.
+    """Return the lens of a .lens file.
 
     Raises:
         InputError: a type that is not of the format, a row without its six figures, no rows.
@@ -146,7 +146,7 @@ def read_flaresim(path: str | Path, options: ReadOptions | None = None) -> Lens:
 
 
 def looks_like_flaresim(head: str) -> bool:
-    """Whether the beginning of a text is that of a .lens file: its line "surfaces:"."""
+    """Test whether the beginning of a text is that of a .lens file: its line "surfaces:"."""
     return any(row.partition("#")[0].strip() == "surfaces:" for row in head.splitlines())
 
 

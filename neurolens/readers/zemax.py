@@ -134,7 +134,7 @@ SURFACE = (
 
 
 def read_zmx(path: str | Path, options: ReadOptions | None = None) -> Lens:
-    """The lens of a Zemax file.
+    """Return the lens of a Zemax file.
 
     Raises:
         InputError: see the module; also tilts, mirrors, obscurations and everything else that the lens model
@@ -152,7 +152,7 @@ def read_zmx(path: str | Path, options: ReadOptions | None = None) -> Lens:
 
 
 def looks_like_zmx(head: str) -> bool:
-    """Whether the beginning of a text is that of a Zemax file."""
+    """Test whether the beginning of a text is that of a Zemax file."""
     first = [line.split()[0] for line in head.splitlines() if line.split()]
     return bool({"SURF", "VERS", "MODE", "UNIT"} & set(first)) and ("SURF" in first or "MODE" in first)
 

@@ -69,7 +69,7 @@ class Block(draft.Block):
 
 
 def thickness(line: Line, word: str, rest: list[str], *, is_object: bool) -> float:
-    """A thickness; that of the object may be infinite, in words or as a number from 1e9."""
+    """Return a thickness; that of the object may be infinite, in words or as a number from 1e9."""
     if is_object and rest == ["INFINITY"]:
         return math.inf
     value = line.numbers(word, rest)[0]
@@ -77,7 +77,7 @@ def thickness(line: Line, word: str, rest: list[str], *, is_object: bool) -> flo
 
 
 def shape_of(block: Block) -> dict[str, Any]:
-    """Radius, conic, asphere and what else describes the shape of a surface, for `Surface`.
+    """Return the radius, conic, asphere and what else describes the shape of a surface, for `Surface`.
 
     Even asphere: sum of PARM i r^(2 i); odd asphere: sum of PARM i r^i; the extended ones have XDAT in the place of
     PARM, and powers of r over a normalisation radius. Q-type: XDAT 1 is 0 for Qbfs and 1 for Qcon. Toroidal: CURV,
@@ -147,7 +147,7 @@ def _q_type(block: Block) -> dict[str, Any]:
 
 
 def _crossed(block: Block) -> dict[str, Any]:
-    """A toroidal or biconic surface, a cylinder where one of its radii is infinite, or round."""
+    """Return a toroidal or biconic surface, a cylinder where one of its radii is infinite, or round."""
     biconic, radius_x = block.kind == "BICONICX", block.parameter(1)
     conic_x = block.parameter(2) if biconic else None
     curve = block.rotational(() if biconic else [(2 * i - 2, block.parameter(i)) for i in range(2, 9)])
@@ -208,7 +208,7 @@ class Zoom:
 
 
 def draft_states(zoom: Zoom, blocks: Sequence[Block], aperture_is_f_number: bool) -> Iterator[State]:
-    """The configurations of a file, thickness solves carried out in each.
+    """Return the configurations of a file, thickness solves carried out in each.
 
     Raises:
         InputError: a semi-diameter that changes anywhere but at the stop.

@@ -91,7 +91,7 @@ def verdict(checks: list[Check]) -> str:
 
 
 def _stated(lens: Lens, c: Configuration) -> Lens:
-    """The lens in a state, with the f-number that the source states for it, NaN where it states none."""
+    """Return the lens in a state, with the f-number that the source states for it, NaN where it states none."""
     # Where a state has no f-number its stop is that of the table, and any f-number is as good as another.
     same = c.efl_mm is not None and c.efl_mm == lens.stated_efl_mm
     return replace(in_state(lens, c), f_number=c.f_number or (lens.f_number if same else math.nan))
@@ -127,7 +127,7 @@ def _back_focus(lens: Lens, computed: float, efl: float) -> Check:
 
 
 def _focused(lens: Lens, data: FirstOrder, c: Configuration) -> Iterator[Check]:
-    """The image of an object at the state's distance against the tabled film."""
+    """Return the image of an object at the state's distance against the tabled film."""
     image_z = data.image_z_mm(-(c.object_distance_mm or 0.0))
     if lens.stated_efl_mm is not None:
         yield _focal_length(lens, data.efl_mm, lens.stated_efl_mm)
@@ -146,7 +146,7 @@ def _beam(lens: Lens, data: FirstOrder) -> Check:
 
 
 def _edges(lens: Lens) -> Check:
-    """The thinnest edge of an element, each surface ending flat at its own rim."""
+    """Return the thinnest edge of an element, each surface ending flat at its own rim."""
     edges = {
         k: float(a.thickness_mm) + sag_mm(b, b.semi_diameter_mm, 0.0) - sag_mm(a, a.semi_diameter_mm, 0.0)
         for k, (a, b) in enumerate(zip(lens.surfaces, lens.surfaces[1:], strict=False))
@@ -183,14 +183,14 @@ def _field(lens: Lens) -> Iterator[Check]:
 
 
 def _through(lens: Lens, field: Tensor, heights: Tensor) -> tuple[Tensor, Tensor]:
-    """Rays of fields [F] to heights [F, H] in the stop: whether such a ray exists, and its status, [F * H]."""
+    """Return rays of fields [F] to heights [F, H] in the stop: whether such a ray exists, and its status, [F * H]."""
     bundle = aim_at_stop(lens, field, heights)
     with torch.no_grad():
         return bundle.reached.reshape(-1), trace(lens, bundle.rays, towards="film").status
 
 
 def _blur(lens: Lens, data: FirstOrder) -> Check:
-    """RMS radius of the axial spot in its best focus, all rims open as tabled, over the focal length."""
+    """Return the RMS radius of the axial spot in its best focus, all rims open as tabled, over the focal length."""
     blur = axial_blur_mm(lens) / data.efl_mm
     doubt = ""
     if blur > BLUR_LIMIT and lens.refractions > SIMPLE:
@@ -214,7 +214,7 @@ _PUPIL = 3.0  # paraxial exit pupils within which the pupil of every film point 
 
 
 def parallel_beam(lens: Lens, x: Tensor, y: Tensor) -> Rays:
-    """Rays along the axis at heights x, y [N] (mm), in front of the lens."""
+    """Return rays along the axis at heights x, y [N] (mm), in front of the lens."""
     reach = max(s.semi_diameter_mm for s in lens.surfaces)
     zero = torch.zeros_like(x)
     return Rays(x, y, zero - reach, zero, zero, zero + 1)
@@ -244,7 +244,7 @@ def axial_beam(lens: Lens) -> tuple[float, int | None]:
 
 
 def axial_blur_mm(lens: Lens) -> float:
-    """RMS radius of the image of an axial point at infinity, in the plane where it is smallest.
+    """Return the RMS radius of the image of an axial point at infinity, in the plane where it is smallest.
 
     Rays are even over the beam's cross-section; both coordinates count, for an anamorphic lens may have two foci.
     """
@@ -298,7 +298,7 @@ def corner_illumination(lens: Lens, radius_mm: float) -> float:
 
 
 def _light(lens: Lens, x_mm: float, y_mm: float) -> float:
-    """Film irradiance in arbitrary units: the passing rays' cos^4 integrated over the pupil's plane."""
+    """Return the film irradiance in arbitrary units: the passing rays' cos^4 integrated over the pupil's plane."""
     data = first_order(lens)
     plane, film_z = pupil_plane_z_mm(lens), data.rear_focal_z_mm
     rear = lens.surfaces[-1].semi_diameter_mm
@@ -317,7 +317,7 @@ def _light(lens: Lens, x_mm: float, y_mm: float) -> float:
 def _look(
     lens: Lens, film: tuple[float, float, float], plane: float, box: tuple[float, float, float, float]
 ) -> tuple[float, tuple[float, float, float, float] | None]:
-    """The integral over a box of the plane, and the box, a step wider, of the points from which light comes."""
+    """Return the integral over a box of the plane, and the box, a step wider, of the points from which light comes."""
     du, dv = (box[1] - box[0]) / _SEARCH, (box[3] - box[2]) / _SEARCH
     steps = torch.arange(_SEARCH, dtype=torch.float64) + 0.5
     u, v = (t.reshape(-1) for t in torch.meshgrid(box[0] + du * steps, box[2] + dv * steps, indexing="ij"))

@@ -48,7 +48,7 @@ def monotone(x: Sequence[float], rows: Sequence[Sequence[float]], place: float) 
 
 
 def _derivatives(x: Sequence[float], values: Sequence[float]) -> list[float]:
-    """Derivative at every place: a weighted harmonic mean of those beside it, 0 at a turning point."""
+    """Return the derivative at every place: a weighted harmonic mean of those beside it, 0 at a turning point."""
     steps = [b - a for a, b in zip(x, x[1:], strict=False)]
     secants = [(b - a) / h for a, b, h in zip(values, values[1:], steps, strict=False)]
     if len(secants) == 1:
@@ -61,7 +61,7 @@ def _derivatives(x: Sequence[float], values: Sequence[float]) -> list[float]:
 
 
 def _end(steps: Sequence[float], secants: Sequence[float]) -> float:
-    """Derivative at an end: of the parabola through three values, kept within what stays monotone."""
+    """Return the derivative at an end: of the parabola through three values, kept within what stays monotone."""
     (h0, h1), (d0, d1) = steps[:2], secants[:2]
     derivative = ((2 * h0 + h1) * d0 - h0 * d1) / (h0 + h1)
     if derivative * d0 <= 0:
@@ -73,24 +73,24 @@ SAME_MM = 0.005  # gaps of two states that differ by less are the same: sources 
 
 
 def at_infinity(lens: Lens) -> Lens:
-    """The lens with its groups at their places for infinity focus."""
+    """Return the lens with its groups at their places for infinity focus."""
     if not lens.infinity_mm:
         return lens
     return replace(lens.with_gaps(dict(lens.infinity_mm)), infinity_mm=())
 
 
 def infinity_states(lens: Lens) -> list[Configuration]:
-    """The zoom states of the source: those with the object at infinity."""
+    """Return the zoom states of the source: those with the object at infinity."""
     return [c for c in lens.configurations if c.object_distance_mm is None]
 
 
 def focus_states(lens: Lens) -> list[Configuration]:
-    """The focus states of the source: those with an object at a distance."""
+    """Return the focus states of the source: those with an object at a distance."""
     return [c for c in lens.configurations if c.object_distance_mm is not None]
 
 
 def zoom_state_of(lens: Lens, near: Configuration) -> Configuration | None:
-    """The infinity state of the zoom position of a focus state; None where the file has none: its table then.
+    """Return the infinity state of the zoom position of a focus state; None where the file has none: its table then.
 
     It is the one with the fewest different gaps, then with the smallest differences.
     """
@@ -104,7 +104,7 @@ def zoom_state_of(lens: Lens, near: Configuration) -> Configuration | None:
 
 
 def gaps_mm(lens: Lens, *states: Configuration | None) -> dict[int, float]:
-    """All thicknesses, by surface index, with those of the states on top of the lens's own, in that order."""
+    """Return all thicknesses, by surface index, with those of the states on top of the lens's own, in that order."""
     gaps = {k: s.thickness_mm for k, s in enumerate(lens.surfaces)}
     for state in states:
         gaps.update(() if state is None else state.thickness_mm)
@@ -130,7 +130,7 @@ class FocusPath:
 
 
 def focus_path(lens: Lens) -> FocusPath:
-    """The path of a lens at infinity focus, at a state of its zoom or between (then interpolated in log EFL).
+    """Return the path of a lens at infinity focus, at a state of its zoom or between (then interpolated in log EFL).
 
     Raises:
         InputError: a file without focus states.
@@ -161,7 +161,7 @@ def focus_path(lens: Lens) -> FocusPath:
 
 
 def focused_inside(lens: Lens, focus_m: float | None, object_mm: float | None = None) -> Lens:
-    """The lens focused by moving its groups.
+    """Return the lens focused by moving its groups.
 
     Args:
         lens: at infinity focus; or in a focus state of its file, which is kept where `focus_m` is None.
@@ -188,19 +188,19 @@ def focused_inside(lens: Lens, focus_m: float | None, object_mm: float | None = 
 
 
 def _rounded_up(value: float) -> float:
-    """A positive number rounded up to four digits: a distance printed as the limit must be accepted."""
+    """Return a positive number rounded up to four digits: a distance printed as the limit must be accepted."""
     step = 10.0 ** (math.floor(math.log10(value)) - 3)
     return math.ceil(value / step - 1e-9) * step
 
 
 def nearest_focus_m(lens: Lens) -> float:
-    """Nearest distance from object to film that internal focusing reaches."""
+    """Return the nearest distance from object to film that internal focusing reaches."""
     path, place = _mover(at_infinity(lens))
     return 1 / _vergence(place(len(path.steps) - 1)) / 1000
 
 
 def _mover(lens: Lens) -> tuple[FocusPath, Callable[[float], Lens]]:
-    """The path of a lens at infinity focus, and the lens with its groups moved along it, film fixed."""
+    """Return the path of a lens at infinity focus, and the lens with its groups moved along it, film fixed."""
     path, back_mm = focus_path(lens), paraxial.first_order(lens).back_focus_mm
 
     def place(s: float) -> Lens:
@@ -220,7 +220,7 @@ def _vergence(lens: Lens) -> float:
 
 
 def _solve(excess: Callable[[float], float], furthest: float) -> float:
-    """Root between 0 (below) and `furthest` (above): regula falsi with halving (Illinois), to rounding."""
+    """Return the root between 0 (below) and `furthest` (above): regula falsi with halving (Illinois), to rounding."""
     low, high, f_low, f_high = 0.0, float(furthest), excess(0.0), excess(float(furthest))
     for _ in range(100):
         s = high - f_high * (high - low) / (f_high - f_low) if f_high != f_low else high
@@ -279,7 +279,7 @@ def best_focus_of_stops_mm(
 
 
 def best_focused(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float] | None = None) -> Lens:
-    """A lens that `set_lens` has placed, by film or groups, with its film where `best_focus_z_mm` says."""
+    """Return a lens that `set_lens` has placed, by film or groups, with its film where `best_focus_z_mm` says."""
     return replace(lens, film_z_mm=best_focus_z_mm(lens, focus_m, wavelength_nm))
 
 

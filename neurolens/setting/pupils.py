@@ -64,7 +64,7 @@ def passes_at_any_azimuth(
     wavelength_nm: float,
     film_mm: tuple[float, float] | None = None,
 ) -> Tensor:
-    """Whether light passes from film points on +x through pupil points at any azimuth of the whole, bool [N].
+    """Test whether light passes from film points on +x through pupil points at any azimuth of the whole, bool [N].
 
     Blades and masks are left out: the round opening about them holds what they let through at every azimuth. Only
     lenses with cylinders are traced at more than one azimuth, `AZIMUTHS`.
@@ -129,7 +129,7 @@ class Place(NamedTuple):
 
 
 def union(boxes: Sequence[Box]) -> Box:
-    """The box that holds all; an empty one (low > high) of none."""
+    """Return the box that holds all; an empty one (low > high) of none."""
     if not boxes:
         return Box(1.0, -1.0, 0.0, 0.0)
     return Box(
@@ -188,7 +188,7 @@ def search(
 
 
 def _extent(passed: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Least and largest u, largest v and largest distance from the axis of the passing points, each [M]."""
+    """Return the least and largest u, largest v and largest distance from the axis of the passing points, each [M]."""
     nothing = torch.tensor(-math.inf, dtype=u.dtype)
     largest = [torch.where(passed, c, nothing).amax((1, 2)) for c in (-u, u, v, torch.hypot(u, v))]
     return -largest[0], largest[1], largest[2], largest[3]
@@ -302,7 +302,7 @@ def _starts(lens: Lens, place: Place, plane: float, near: float, exit_z: float) 
 
 
 def _found(look: _Look, lens: Lens, places: list[Place], starts: list[Box]) -> list[Box | None]:
-    """Boxes of what passes, by a grid over each start and another over what it finds."""
+    """Return the boxes of what passes, by a grid over each start and another over what it finds."""
     coarse = look(lens, places, starts)
     few = [k for k, box in enumerate(coarse) if box is None or box.points < FEW]
     # A small stop may lie between the points of the grid: refine where light passes the open one.
@@ -321,7 +321,7 @@ def _found(look: _Look, lens: Lens, places: list[Place], starts: list[Box]) -> l
 
 
 def image_radius_mm(lens: Lens) -> tuple[float, str]:
-    """Radius of the lit film, and where it comes from.
+    """Return the radius of the lit film, and where it comes from.
 
     The file's own; else f tan(half field) below 60 degrees; beyond, the film radius whose mean passing ray leaves at
     the half field; else where the relative illumination falls to 10%.
@@ -357,7 +357,7 @@ def image_radius_mm(lens: Lens) -> tuple[float, str]:
 
 
 def _illumination(lens: Lens, radii: Tensor, points: int = 48) -> tuple[Tensor, Tensor]:
-    """Relative film irradiance (any unit) and mean angle (rad) of the passing rays at each film radius."""
+    """Return the relative film irradiance (any unit) and mean angle (rad) of the passing rays at each film radius."""
     film_z = lens.film_z_mm if lens.film_z_mm is not None else float(lens.vertices_mm[-1])
     rear, rear_z = _rear_opening_mm(lens, film_z)
     grid = torch.linspace(-rear, rear, points, dtype=torch.float64)
@@ -372,7 +372,7 @@ def _illumination(lens: Lens, radii: Tensor, points: int = 48) -> tuple[Tensor, 
 
 
 def _rear_opening_mm(lens: Lens, film_z: float) -> tuple[float, float]:
-    """Radius and z of the disc through which light comes to the film: the last rim.
+    """Return the radius and z of the disc through which light comes to the film: the last rim.
 
     Of a cover glass that all but lies on the film the light of one film point fills a speck; then it is the rim before,
     so much wider as the plates between shift rays.

@@ -156,7 +156,7 @@ class Rim:
 
 
 def derive_rims(lens: Lens, rule: RimRule | None = None) -> tuple[Lens, list[Rim]]:
-    """The lens with derived rims (marked `rims = "derived"`) and stops, and how they compare with those it had.
+    """Return the lens with derived rims (marked `rims = "derived"`) and stops, and how they compare with those it had.
 
     Raises:
         InputError: a rule out of range, a lens without a stated field, a lens with cylinders, a field that no ray
@@ -194,7 +194,7 @@ def derive_rims(lens: Lens, rule: RimRule | None = None) -> tuple[Lens, list[Rim
 
 
 def narrowed_rims(lens: Lens) -> Lens:
-    """The lens with rims, but never the stop's, narrowed to where spheres end and neighbours touch in any state.
+    """Return the lens with rims, but never the stop's, narrowed to where spheres end and neighbours touch in any state.
 
     Rims of surfaces whose vertices lie in the wrong order stay: no width helps, and the check of clearance says so.
     """
@@ -209,7 +209,7 @@ def narrowed_rims(lens: Lens) -> Lens:
 
 
 def with_derived_rims(lens: Lens) -> Lens:
-    """The lens with a diameter wherever it has none (NaN), by the rule as it is; given ones stay.
+    """Return the lens with a diameter wherever it has none (NaN), by the rule as it is; given ones stay.
 
     Raises:
         InputError: as `derive_rims`, and where no field is stated.
@@ -244,7 +244,7 @@ def _spherical(lens: Lens) -> Lens:
 
 
 def half_field_deg(lens: Lens) -> float:
-    """Half field of a lens: its own, or that of its image circle by r = f tan(field).
+    """Return the half field of a lens: its own, or that of its image circle by r = f tan(field).
 
     Raises:
         InputError: neither is stated.
@@ -257,7 +257,7 @@ def half_field_deg(lens: Lens) -> float:
 
 
 def _states(lens: Lens) -> Iterator[Lens]:
-    """The table and every zoom state of the lens with the stop of its f-number."""
+    """Return the table and every zoom state of the lens with the stop of its f-number."""
     yield lens.with_stop_radius(round(stop_radius_mm(lens, lens.f_number), 5))
     for c in lens.configurations:
         if c.object_distance_mm is None:
@@ -265,13 +265,13 @@ def _states(lens: Lens) -> Iterator[Lens]:
 
 
 def _moved(lens: Lens, c: Configuration) -> Lens:
-    """The table with the thicknesses, field and f-number of a state."""
+    """Return the table with the thicknesses, field and f-number of a state."""
     moved = lens.with_gaps(dict(c.thickness_mm))
     return replace(moved, half_field_deg=lens.half_field_in(c), f_number=c.f_number or lens.f_number)
 
 
 def _stop_of(lens: Lens, c: Configuration) -> float:
-    """Diameter of the stop in a state; a focus state has that of the zoom state with the same tabled stop.
+    """Return the diameter of the stop in a state; a focus state has that of the zoom state with the same tabled stop.
 
     A state without f-number and stop has that of the table.
     """
@@ -286,7 +286,7 @@ def _stop_of(lens: Lens, c: Configuration) -> float:
 
 
 def _beams(lens: Lens, rule: RimRule, field_deg: float) -> tuple[list[float], list[float]]:
-    """Semi-diameters that the beam of the axis and those of the field need at every surface, mm."""
+    """Return the semi-diameters that the beam of the axis and those of the field need at every surface, mm."""
     import torch  # rays are traced; rims are narrowed without it
 
     from neurolens.trace.aiming import aim_at_stop, without_rims
@@ -311,7 +311,7 @@ def _beams(lens: Lens, rule: RimRule, field_deg: float) -> tuple[list[float], li
 
 
 def _end_mm(surface: Surface) -> float:
-    """The widest diameter, just inside where the surface's conic ends."""
+    """Return the widest diameter, just inside where the surface's conic ends."""
     return 2 * end_mm(surface) * (1 - 1e-9)
 
 
@@ -343,7 +343,7 @@ def _which_to_trim(before: Surface, after: Surface, k: int, k_after: int, h: flo
 
 
 def _meeting_height(before: Surface, after: Surface, gap: float, limit: float) -> float:
-    """Distance from the axis, up to `limit`, at which two surfaces first meet, mm."""
+    """Return the distance from the axis, up to `limit`, at which two surfaces first meet, mm."""
 
     def clear(h: float) -> bool:
         return gap + sag_mm(after, h, 0.0) - sag_mm(before, h, 0.0) >= 0

@@ -126,7 +126,7 @@ def _set_for(lens: Lens, shot: Shot) -> Lens:
 
 
 def state_named(lens: Lens, name: str) -> Configuration:
-    """The zoom or focus state of that name; an error lists those of the file."""
+    """Return the zoom or focus state of that name; an error lists those of the file."""
     for c in lens.configurations:
         if c.name == name:
             return c
@@ -135,7 +135,7 @@ def state_named(lens: Lens, name: str) -> Configuration:
 
 
 def in_state(lens: Lens, state: Configuration) -> Lens:
-    """The lens with the thicknesses, stop, field and f-number of a state as the source gives them."""
+    """Return the lens with the thicknesses, stop, field and f-number of a state as the source gives them."""
     near = state.object_distance_mm is not None
     start = gaps_mm(lens, zoom_state_of(lens, state) if near else None)
     moved = lens.with_gaps(start | dict(state.thickness_mm))
@@ -182,7 +182,7 @@ def _check(
 
 
 def _millimetres(text: str) -> float | str:
-    """A focal length that was typed, or the text itself: a name, then, that no state has."""
+    """Return a focal length that was typed, or the text itself: a name, then, that no state has."""
     try:
         return float(text)
     except ValueError:
@@ -234,7 +234,7 @@ class _State:
 
 
 def zoomed(lens: Lens, efl_mm: float) -> Lens:
-    """The lens at infinity focus, zoomed to a focal length between those of its states.
+    """Return the lens at infinity focus, zoomed to a focal length between those of its states.
 
     At the focal length of a state, stated or computed, it is that state. Else its `derived` says between which states
     it lies; stop, field and nominal f-number are interpolated too.
@@ -280,7 +280,7 @@ def _states(lens: Lens) -> list[_State]:
 
 
 def _varying_gaps(lens: Lens) -> list[int]:
-    """Surfaces behind which a zoom state sets the gap, but the last, whose gap ends at the film."""
+    """Return the surfaces behind which a zoom state sets the gap, but the last, whose gap ends at the film."""
     last = len(lens.surfaces) - 1
     return sorted({k for c in infinity_states(lens) for k, _ in c.thickness_mm} - {last})
 
@@ -326,7 +326,7 @@ def _movement(places: Vector) -> tuple[NDArray[np.bool_], int]:
 
 
 def _directions(moving: NDArray[np.bool_], kept: int) -> Vector:
-    """The moves [D, groups] that may correct the interpolation."""
+    """Return the moves [D, groups] that may correct the interpolation."""
     unit = np.eye(len(moving))
     if moving.sum() < 2:
         return unit
@@ -339,7 +339,7 @@ def _directions(moving: NDArray[np.bool_], kept: int) -> Vector:
 
 
 def _interpolated_texts(lens: Lens, states: list[_State], efl_mm: float) -> Lens:
-    """Stop, half field (by the image's height) and nominal f-number between those of the states that say."""
+    """Return the stop, half field (by the image's height) and nominal f-number between those of the states that say."""
     x = [math.log(s.efl_mm) for s in states]
     place = min(max(math.log(efl_mm), x[0]), x[-1])
 

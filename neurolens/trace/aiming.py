@@ -44,7 +44,7 @@ class Bundle(NamedTuple):
 
 
 def without_rims(lens: Lens) -> Lens:
-    """The lens with every surface, the stop too, open as far as it goes; aspheres continue beyond their rims."""
+    """Return the lens with every surface, the stop too, open as far as it goes; aspheres continue beyond their rims."""
     ends = (followed_mm(s) if s.asphere else math.inf for s in lens.surfaces)
     rows = (replace(s, diameter_mm=math.inf, followed_mm=end) for s, end in zip(lens.surfaces, ends, strict=True))
     return replace(lens, aperture=None, surfaces=tuple(rows))
@@ -53,7 +53,7 @@ def without_rims(lens: Lens) -> Lens:
 def aim_at_stop(
     lens: Lens, field_rad: Tensor, height_mm: Tensor, *, axis: Axis = "x", wavelength_nm: float | None = None
 ) -> Bundle:
-    """Meridional rays of collimated light that cross the stop at given heights, rims ignored.
+    """Return the meridional rays of collimated light that cross the stop at given heights, rims ignored.
 
     Args:
         field_rad: [F] angles to the axis, from 0 to below pi. The light comes from the positive side of `axis`, and
@@ -86,7 +86,7 @@ def aim_at_stop(
 
 
 def _axial(angle: Tensor, field: Tensor, exists: Tensor) -> Tensor:
-    """Index [n] of the last angle [G] before the ray that is parallel to the axis in the scene.
+    """Return the index [n] of the last angle [G] before the ray that is parallel to the axis in the scene.
 
     Of several such rays the one that is least inclined at the stop is meant: others graze the lens's edges.
     """
@@ -97,7 +97,7 @@ def _axial(angle: Tensor, field: Tensor, exists: Tensor) -> Tensor:
 
 
 def _joined(value: Tensor, exists: Tensor, jump: float = _JUMP) -> Tensor:
-    """Whether neighbours [n, G - 1] both exist and are of one branch."""
+    """Test whether neighbours [n, G - 1] both exist and are of one branch."""
     return exists[:, 1:] & exists[:, :-1] & ((value[:, 1:] - value[:, :-1]).abs() < jump)
 
 
@@ -128,7 +128,7 @@ def bracket(angle: Tensor, value: Tensor, exists: Tensor, target: Tensor, jump: 
 
 
 def between(ends: Tensor) -> Tensor:
-    """Angles [n, 17] from the first to the last of `bracket`, for the next closer look."""
+    """Return the angles [n, 17] from the first to the last of `bracket`, for the next closer look."""
     return ends[:, :1] + (ends[:, 2:] - ends[:, :1]) * torch.linspace(0, 1, _ZOOM, dtype=torch.float64)
 
 

@@ -19,7 +19,7 @@ TINY = 1e-30
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value is a plain number, which is folded into the operations around it."""
+    """Test whether a value is a plain number, which is folded into the operations around it."""
     return isinstance(value, int | float)
 
 
@@ -57,18 +57,18 @@ class Arithmetic:
         return self.fma(a, b, c, k)
 
     def dot(self, a: Sequence[Any], b: Sequence[Any]) -> Any:
-        """The scalar product of two vectors."""
+        """Return the scalar product of two vectors."""
         total = a[0] * b[0]
         for p, q in zip(a[1:], b[1:], strict=True):
             total = self.fma(p, q, total)
         return total
 
     def root(self, square: Any, finite: bool = False) -> Any:
-        """Square root; NaN for negative numbers, unless it is to be `finite` or lost rays are guarded."""
+        """Return the square root; NaN for negative numbers, unless it is to be `finite` or lost rays are guarded."""
         return np.sqrt(square)
 
     def held_root(self, square: Any, least: float = TINY) -> Any:
-        """Square root of a number, or of the least one where it is less."""
+        """Return the square root of a number, or of the least one where it is less."""
         return np.sqrt(np.maximum(square, least))
 
     def inverse_root(self, square: Any) -> Any:
@@ -76,19 +76,19 @@ class Arithmetic:
         return 1.0 / np.sqrt(square)
 
     def positive(self, value: Any) -> Any:
-        """A divisor. With guards it is 1 where it is not positive."""
+        """Return a divisor. With guards it is 1 where it is not positive."""
         return value
 
     def nonzero(self, value: Any) -> Any:
-        """A divisor of either sign. With guards it is 1 where its square is 0."""
+        """Return a divisor of either sign. With guards it is 1 where its square is 0."""
         return value
 
     def least(self, a: Any, b: Any) -> Any:
-        """The smaller of two values."""
+        """Return the smaller of two values."""
         return np.minimum(a, b)
 
     def abs(self, value: Any) -> Any:
-        """The size of a value."""
+        """Return the size of a value."""
         return np.abs(value)
 
     def select(self, low: Any, high: Any, then: Any, otherwise: Any) -> Any:
@@ -96,19 +96,19 @@ class Arithmetic:
         return np.where(low <= high, then, otherwise)
 
     def fixed(self, value: Any) -> Any:
-        """The value as a constant: derivatives are not taken through it."""
+        """Return the value as a constant: derivatives are not taken through it."""
         return value
 
     def constant(self) -> AbstractContextManager[Any]:
-        """A context in which derivatives are not followed."""
+        """Return a context in which derivatives are not followed."""
         return nullcontext()
 
     def like(self, value: Any, number: Any) -> Any:
-        """A number in the form of a value."""
+        """Return a number in the form of a value."""
         return np.full_like(value, number)
 
     def horner(self, x: Any, coefficients: Sequence[Any]) -> Any:
-        """The polynomial of these coefficients, lowest power first."""
+        """Return the polynomial of these coefficients, lowest power first."""
         total: Any = coefficients[-1]
         for c in coefficients[-2::-1]:
             total = total * x + c

@@ -144,7 +144,7 @@ def times_film(s: tuple[Any, ...], p: tuple[Any, ...], film: tuple[Any, Any, Any
 
 
 def _times(m: tuple[Any, ...], k: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Product of two matrices [[a, -i b], [-i c, d]] given as (a, b, c, d)."""
+    """Return the product of two matrices [[a, -i b], [-i c, d]] given as (a, b, c, d)."""
     return (m[0] * k[0] - m[1] * k[2], m[0] * k[1] + m[1] * k[3], m[2] * k[0] + m[3] * k[2], m[3] * k[3] - m[2] * k[1])
 
 
@@ -163,7 +163,7 @@ def _response(
 
 
 def _always_propagates(index: Any, n_before: Any, n_after: Any) -> bool:
-    """Whether light that gets through cannot be evanescent in a layer: its n sin is at most n of both media."""
+    """Test whether light that gets through cannot be evanescent in a layer: its n sin is at most n of both media."""
     known = isinstance(index, float | int)
     return known and any(isinstance(n, float | int) and n < index for n in (n_before, n_after))
 
@@ -177,7 +177,7 @@ def _propagating(q2: Tensor, phase_per_q: Any) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _propagating_or_evanescent(q2: Tensor, phase_per_q: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The same through q2 = 0 to evanescent waves (cosh, sinh), and the factor `fade` that all three contain.
+    """Return the same through q2 = 0 to evanescent waves (cosh, sinh), and the factor `fade` that all three contain.
 
     cos and sin / q are entire functions of q2: there is no kink at q2 = 0, and none in the derivatives. Without the
     factor exp(-phase) of evanescent waves a thick film would overflow.

@@ -202,7 +202,7 @@ def _keep_memory() -> None:
 
 
 def _differentiated(value: Any) -> bool:
-    """Whether derivatives with respect to a value are followed, backwards or forwards."""
+    """Test whether derivatives with respect to a value are followed, backwards or forwards."""
     if not isinstance(value, Tensor):
         return False
     return (value.requires_grad and torch.is_grad_enabled()) or forward_ad.unpack_dual(value).tangent is not None
@@ -217,7 +217,7 @@ def _parameters(lens: Lens) -> list[Any]:
 
 
 def _path(lens: Lens, towards: Towards) -> tuple[int, range]:
-    """The sense of travel along z, and the surfaces in the order in which light meets them."""
+    """Return the sense of travel along z, and the surfaces in the order in which light meets them."""
     last = len(lens.surfaces) - 1
     return (1, range(last + 1)) if towards == "film" else (-1, range(last, -1, -1))
 
@@ -245,7 +245,7 @@ class Tracing:
         self.tests, self.rays = self._start(rays, lit, st.blocked(entering, st.MISSED))
 
     def _start(self, rays: Rays, lit: Tensor | None, otherwise: int) -> tuple[Survival, Rays]:
-        """Rays with optical direction cosines, and the test that their directions are unit vectors."""
+        """Return rays with optical direction cosines, and the test that their directions are unit vectors."""
         o = self.o
         length2 = o.dot(rays[3:], rays[3:])
         sound = at_most((length2 - 1).abs(), UNIT_SLACK)
@@ -297,12 +297,12 @@ class Tracing:
         return lambda met: [*outer(met), (0.5, aperture.inside(met.x, met.y, radius_mm).to(met.x.dtype))]
 
     def in_lens_frame(self) -> Rays:
-        """The rays behind the last surface with unit directions."""
+        """Return the rays behind the last surface with unit directions."""
         r, n = self.rays._replace(z=self.rays.z + self.vertex), self.medium.n
         return r if is_number(n) and n == 1 else Rays(*r[:3], *(d / n for d in r[3:]))
 
     def leave(self) -> Rays:
-        """The rays in the lens frame; those that did not go on are along the axis."""
+        """Return the rays in the lens frame; those that did not go on are along the axis."""
         return self.tests.along_axis(self.in_lens_frame(), self.sense, self.vertex)
 
 
@@ -424,7 +424,7 @@ def trace_differentials(
 
 
 def film_derivatives(rays: Rays, distance_mm: Tensor | float) -> tuple[Rays, Rays]:
-    """Derivatives of camera rays with respect to the film point's x and y (mm), the pupil point held.
+    """Return the derivatives of camera rays with respect to the film point's x and y (mm), the pupil point held.
 
     Args:
         rays: from the film point towards the pupil point, unit directions, each [N].

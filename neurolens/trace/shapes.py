@@ -107,13 +107,13 @@ class Beyond(NamedTuple):
 
 
 def is_plain(surface: Surface) -> bool:
-    """Whether a surface is a sphere or a plane."""
+    """Test whether a surface is a sphere or a plane."""
     conic = not is_number(surface.conic) or surface.conic != 0
     return not (conic or surface.asphere or surface.cylinder)
 
 
 def curve_of(shape: Shape, number: Callable[[Any], Any] = float) -> Figure:
-    """The figure of a shape by its own numbers; `number` turns fields that are tensors into numbers."""
+    """Return the figure of a shape by its own numbers; `number` turns fields that are tensors into numbers."""
     c, k = number(shape.curvature), number(shape.conic)
     powers = {int(n): number(a) for n, a in shape.asphere}
     if is_number(k) and k == 0 and not powers and not shape.cylinder:
@@ -131,7 +131,7 @@ def curve_of(shape: Shape, number: Callable[[Any], Any] = float) -> Figure:
 
 
 def figure_of(surface: Surface, number: Callable[[Any], Any] = lambda value: value) -> Figure:
-    """The figure of a surface with the start of its iteration; arguments as of `curve_of`."""
+    """Return the figure of a surface with the start of its iteration; arguments as of `curve_of`."""
     figure = curve_of(surface, number)
     if not figure.terms and not figure.across:
         return figure
@@ -141,7 +141,7 @@ def figure_of(surface: Surface, number: Callable[[Any], Any] = lambda value: val
 
 
 def without_rim(figure: Figure) -> Figure:
-    """A figure whose iteration starts from the quadric of its vertex."""
+    """Return a figure whose iteration starts from the quadric of its vertex."""
     if not figure.terms and not figure.across:
         return figure
     c, (other, _) = figure.curvature, figure.across or (0.0, 1.0)
@@ -150,7 +150,7 @@ def without_rim(figure: Figure) -> Figure:
 
 
 def start_of(surface: Surface) -> tuple[tuple[float, float, float], int]:
-    """The quadric cx x^2 + cy y^2 + cz z^2 = 2 z nearest to a surface inside its rim, and the steps it needs."""
+    """Return the quadric cx x^2 + cy y^2 + cz z^2 = 2 z nearest to a surface inside its rim, and the steps it needs."""
     asphere = tuple((p, _number(a)) for p, a in surface.asphere)
     curve = _number(surface.curvature), _number(surface.conic), asphere, _extent_mm(surface)
     if not surface.across:
@@ -178,7 +178,7 @@ def _profile(surface: Surface, height: Any) -> tuple[Any, Any]:
 
 
 def _extent_mm(surface: Surface) -> float:
-    """Distance from the axis up to which a surface's own figures hold."""
+    """Return the distance from the axis up to which a surface's own figures hold."""
     return min(surface.semi_diameter_mm, surface.followed_mm)
 
 
@@ -225,7 +225,7 @@ def _fitted_crossed(
     rim_mm: float,
     across: tuple[float, float | None],
 ) -> tuple[tuple[float, float, float], int]:
-    """The fit of a toroid or biconic: along the curve, across it, along z."""
+    """Return the fit of a toroid or biconic: along the curve, across it, along z."""
     if not math.isfinite(rim_mm):
         return (curvature, 1 / across[0], 0.0), STEPS[-1][1]
     radius_mm = 1 / curvature if curvature else math.inf
@@ -256,7 +256,7 @@ class Depth(NamedTuple):
 
 
 def depth(o: Arithmetic, figure: Figure, h2: Any, order: int = 2, steepest: float = STEEPEST) -> Depth:
-    """The depth of a figure's curve at squared distances h2 (mm^2); held finite where its conic ends.
+    """Return the depth of a figure's curve at squared distances h2 (mm^2); held finite where its conic ends.
 
     `order`: 0 for depth and slope, 1 for the slope alone, 2 for everything. `steepest`: least squared cosine of the
     conic's slope.
@@ -275,7 +275,7 @@ def depth(o: Arithmetic, figure: Figure, h2: Any, order: int = 2, steepest: floa
 
 
 def _followed(o: Arithmetic, figure: Figure, h2: Any, order: int, steepest: float) -> Depth:
-    """The depth by a figure's own numbers: c h^2 / (1 + cos) + sum A_p h^p."""
+    """Return the depth by a figure's own numbers: c h^2 / (1 + cos) + sum A_p h^p."""
     sag, slope = _polynomials(o, figure, h2, order)
     c = figure.curvature
     if is_number(c) and c == 0:
@@ -338,14 +338,14 @@ def biconic(
 
 
 def height2(o: Arithmetic, figure: Figure, x: Any, y: Any) -> Any:
-    """Squared distance from the axis, or from a cylinder's plane of symmetry."""
+    """Return the squared distance from the axis, or from a cylinder's plane of symmetry."""
     if all(figure.bent):
         return o.dot((x, y), (x, y))
     return x * x if figure.bent[0] else y * y
 
 
 def sag(o: Arithmetic, figure: Figure, x: Any, y: Any) -> tuple[Any, Any]:
-    """Depth at points, and what is at least 0 where the surface exists; None where that is everywhere."""
+    """Return the depth at points, and what is at least 0 where the surface exists; None where that is everywhere."""
     h2 = height2(o, figure, x, y)
     if not figure.across:
         curve = depth(o, figure, h2, order=0, steepest=TINY)
@@ -363,7 +363,7 @@ def sag(o: Arithmetic, figure: Figure, x: Any, y: Any) -> tuple[Any, Any]:
 
 
 def sag_mm(shape: Shape, x: Any, y: Any, *, held: bool = False) -> Any:
-    """Depth z (mm) of a surface at points x, y (mm) relative to its vertex, towards +z.
+    """Return the depth z (mm) of a surface at points x, y (mm) relative to its vertex, towards +z.
 
     Args:
         x, y: floats, numpy arrays or torch tensors.
@@ -387,7 +387,7 @@ def sag_and_derivatives(shape: Shape, x: Any, y: Any) -> tuple[Any, Any, Any]:
 
 
 def crossed(o: Arithmetic, figure: Figure, at: Quadric, p: Quadric) -> tuple[Any, Quadric, Any, Any]:
-    """A function that is 0 on a toroid or biconic and grows with -z.
+    """Return a function that is 0 on a toroid or biconic and grows with -z.
 
     Returns its value at points, its gradient, its second derivative along p, and what is positive where the surface
     exists.
@@ -409,12 +409,12 @@ def crossed(o: Arithmetic, figure: Figure, at: Quadric, p: Quadric) -> tuple[Any
 
 
 def is_deep(surface: Surface) -> bool:
-    """Whether a sphere's depth at its rim tells heights as exactly as their squares do."""
+    """Test whether a sphere's depth at its rim tells heights as exactly as their squares do."""
     if not is_number(surface.radius_mm) or not is_plain(surface):
         return False
     return DEEP < rim_sine(surface) <= 1
 
 
 def rim_sine(surface: Surface) -> float:
-    """Rim radius over radius of curvature."""
+    """Return the rim radius over radius of curvature."""
     return abs(surface.semi_diameter_mm * surface.curvature)

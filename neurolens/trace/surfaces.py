@@ -97,7 +97,7 @@ class Outgoing(NamedTuple):
 
 
 def medium(n: Any) -> Medium:
-    """A medium of index `n`, a number or a value."""
+    """Return a medium of index `n`, a number or a value."""
     n2 = n * n
     return Medium(n, n2, 1 / n2)
 
@@ -278,7 +278,7 @@ def _toward(o: Arithmetic, at: Quadric, r: Rays, figure: Figure, sense: int) -> 
 
 
 def _last_step(o: Arithmetic, at: Quadric, r: Rays, figure: Figure) -> Any:
-    """Newton's step, which by then is Euler's."""
+    """Return Newton's step, which by then is Euler's."""
     if figure.across:
         value, gradient, *_ = crossed(o, figure, at, (r.dx, r.dy, r.dz))
         return -value / o.dot(gradient, r[3:])
@@ -288,7 +288,7 @@ def _last_step(o: Arithmetic, at: Quadric, r: Rays, figure: Figure) -> Any:
 
 
 def normal_at(o: Arithmetic, met: Hit, curvature: Any) -> Quadric:
-    """Unit normal towards +z at a meeting point; spheres and planes have it by their curvature."""
+    """Return the unit normal towards +z at a meeting point; spheres and planes have it by their curvature."""
     if met.normal is not None:
         return met.normal
     return met.x * -curvature, met.y * -curvature, 1.0 - met.z * curvature
@@ -318,7 +318,7 @@ def refract(
 
 
 def reflect(o: Arithmetic, r: Rays, met: Hit, curvature: Any, sense: int) -> Rays:
-    """Rays with the normal part of their direction turned round."""
+    """Return rays with the normal part of their direction turned round."""
     normal = normal_at(o, met, curvature)
     return Rays(*met[:3], *(o.fma(met.q, n, p, -2 * sense) for p, n in zip(r[3:], normal, strict=True)))
 
@@ -370,7 +370,7 @@ def cross(
 
 
 def rim_tests(o: Arithmetic, surface: Surface) -> Callable[[Hit], list[Test]]:
-    """Tests whether a meeting lies inside a surface's rim."""
+    """Return the tests whether a meeting lies inside a surface's rim."""
     if is_deep(surface):
         # By its depth: a point on the far half of the sphere may be near the axis, but there is no glass.
         most = 1 - math.sqrt(1 - rim_sine(surface) ** 2)
@@ -379,7 +379,7 @@ def rim_tests(o: Arithmetic, surface: Surface) -> Callable[[Hit], list[Test]]:
 
 
 def radius2(o: Arithmetic, met: Hit) -> Any:
-    """Squared distance of a meeting from the axis, mm^2."""
+    """Return the squared distance of a meeting from the axis, mm^2."""
     return o.dot(met[:2], met[:2])
 
 
@@ -411,7 +411,7 @@ def front_rays(
     index: Sequence[float] | None = None,
     wavelength_nm: Array | float = math.nan,
 ) -> tuple[Array, Array]:
-    """Scene rays as models have them, and the solid angle per area of their direction vectors [N].
+    """Return the scene rays as models have them, and the solid angle per area of their direction vectors [N].
 
     Rows [4, N]: x and y (mm) on the front surface, and the direction vector, theta (dx, dy) / |(dx, dy)| with theta
     from -z; of first-order models, which have no shape, the slope. Arguments as of `meet_front`, unit directions away
@@ -433,7 +433,7 @@ def front_rays(
 
 
 def entered(shape: Shape, x: Array, y: Array, d: Array, index: Array) -> tuple[Array, Array]:
-    """Unit directions [3, N] inside the front glass of rays that leave it at (x, y) along d [3, N].
+    """Return the unit directions [3, N] inside the front glass of rays that leave it at (x, y) along d [3, N].
 
     Also the solid angle of a bundle of them outside over that inside, n^2 cos(inside) / cos(outside) [N].
     """

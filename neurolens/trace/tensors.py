@@ -126,12 +126,12 @@ class Survival:
         return kept if is_number(otherwise) and otherwise == 0 else kept + (1 - self._goes_on) * otherwise
 
     def along_axis(self, r: Rays, sense: int, z: Any) -> Rays:
-        """The rays that go on; the others replaced by rays along the axis from z."""
+        """Return the rays that go on; the others replaced by rays along the axis from z."""
         on_axis = (0.0, 0.0, z, 0.0, 0.0, float(sense))
         return Rays(*(self.only(c, a) for a, c in zip(on_axis, r, strict=True)))
 
     def status(self) -> Tensor:
-        """Status of every ray, [N] int32; see `neurolens.base.status`."""
+        """Return the status of every ray, [N] int32; see `neurolens.base.status`."""
         return _table((*self._meanings, st.PASSED), self._count.device).index_select(0, self._count.int())
 
 

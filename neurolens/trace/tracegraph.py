@@ -54,7 +54,7 @@ def exact_graph(
     r = Rays(rays[0], rays[1], film_z, *(c * scale for c in d))
 
     def opening(met: Hit) -> list[Test]:
-        """The test of the stop, whose radius is a number of the call; none where only the ray is wanted."""
+        """Return the test of the stop, whose radius is a number of the call; none where only the ray is wanted."""
         return [] if stop_square is None else [(radius2(o, met), stop_square)]
 
     last = len(lens.surfaces) - 1
@@ -168,7 +168,7 @@ def _cos_and_sinc(phase2: Value, low: float, high: float) -> tuple[Value, Value]
 
 @cache
 def _series(low: float, high: float) -> tuple[tuple[float, ...], tuple[float, ...], int]:
-    """Coefficients of the series of cos and sin x / x by x^2, and how often the phase is halved before."""
+    """Return the coefficients of the series of cos and sin x / x by x^2, and how often the phase is halved before."""
     for halvings in range(_HALVINGS + 1):
         ends = low * 0.25**halvings, high * 0.25**halvings
         square = (ends[0] + ends[1]) / 2 + (ends[1] - ends[0]) / 2 * np.cos(np.linspace(0, math.pi, 100))

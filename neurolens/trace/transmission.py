@@ -72,7 +72,7 @@ def fresnel(before: Any, after: Any, p: Any) -> Shares:
 
 
 def pass_surface(light: Light | None, turn: tuple[Any, Any] | None, shares: Shares) -> Light:
-    """The light behind a surface that transmits or reflects it.
+    """Return the light behind a surface that transmits or reflects it.
 
     Args:
         light: from the last surface that did anything to it; None before the first, where it is unpolarised.
@@ -103,7 +103,7 @@ def pass_surface(light: Light | None, turn: tuple[Any, Any] | None, shares: Shar
 
 
 def turned(last: Vector, normal: Vector, cosines: Any, across: Any) -> tuple[Any, Any]:
-    """The turn from one plane of incidence into the next: its cosine and sine, both times the same size.
+    """Return the turn from one plane of incidence into the next: its cosine and sine, both times the same size.
 
     The direction d lies in both planes; across them are s = d x n and s' = d x n', with s s' = n n' - (d n)(d n') and
     s x s' = d det(d, n, n').
@@ -158,7 +158,7 @@ class TensorLosses:
         self.lens, self.wavelength_nm = lens, wavelength_nm
 
     def absorption(self, k: int) -> Any:
-        """Napierian absorption (1/mm) of the medium before surface k; None where there is none."""
+        """Return the Napierian absorption (1/mm) of the medium before surface k; None where there is none."""
         # What the medium in front of the lens absorbs is a matter of the scene.
         return absorption_of(self.lens.surfaces[k - 1], self.wavelength_nm) if k else None
 
@@ -216,7 +216,7 @@ class Passage:
         self._last = k, normal, met.q if reflected else q
 
     def _turn(self, k: int, normal: Vector, r: Rays, met: Hit, before: Medium) -> tuple[Any, Any]:
-        """The turn between the planes of incidence (`turned`), times the square of the index."""
+        """Return the turn between the planes of incidence (`turned`), times the square of the index."""
         assert self._last is not None
         last, other, q = self._last
         pair = self._lens.surfaces[last], self._lens.surfaces[k]
@@ -228,7 +228,7 @@ class Passage:
         return turned([times(c, before.n2) for c in other], normal, q * met.q, times(across, before.n))
 
     def arrived(self, like: Any) -> Any:
-        """The power of all rays, in the form of a value."""
+        """Return the power of all rays, in the form of a value."""
         power = self._o.like(like, 1.0) if self._light is None else self._light.power
         return power if self._depth is None else power * self._losses.transmitted(self._depth)
 
