@@ -249,7 +249,7 @@ class Lens:
         return texts | {"sha256": self.sha256}
 
     def scaled(self, factor: float) -> Lens:
-        """Return all lengths times `factor`; angles, indices and f-number stay.
+        """Return the lens with all lengths times `factor`; angles, indices and f-number stay.
 
         A grey filter keeps its density (its absorption per mm shrinks as it grows), a catalogue glass absorbs more when
         it is thicker, and coatings keep their layers.

@@ -177,7 +177,7 @@ def read_agf(path: str | Path) -> tuple[list[Glass], dict[str, str]]:
 
 @contextmanager
 def more_glasses(files: Iterable[str | Path]) -> Iterator[None]:
-    """Return the glasses of these catalogues within the block, before those of the same names that ship."""
+    """Add the glasses of these catalogues within a block, before those of the same names that ship."""
     read, before = [read_agf(file) for file in files], catalogue.added()
     try:
         for found, refused in reversed(read):
