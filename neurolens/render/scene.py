@@ -39,6 +39,7 @@ from neurolens.render.settings import FilmSettings, FlareSettings
 
 _SHAPES = ("planes", "quads", "discs", "spheres", "boxes", "rooms", "meshes")
 _FILM_MM = (36.0, 20.25)
+_SIDES = Rule(lambda film: all(within(FILM_MM, side) for side in film), f"sides {said(FILM_MM)} mm")
 _WALLS = ("left", "right", "floor", "ceiling", "far", "near")
 
 
@@ -61,10 +62,7 @@ class CameraSettings(StopShape, Checked):
     focus_m: Annotated[float, Rule(lambda v: v > 0, "a number above 0")]
     up: tables.Place = (0.0, 1.0, 0.0)
     f_number: Annotated[float | None, between(*F_NUMBER, "an f-number")] = None
-    film_mm: Annotated[
-        tuple[float, float],
-        Rule(lambda v: all(within(FILM_MM, side) for side in v), f"sides {said(FILM_MM)} mm"),
-    ] = _FILM_MM
+    film_mm: Annotated[tuple[float, float], _SIDES] = _FILM_MM
     wavelength_nm: Annotated[
         tuple[float, float], Rule(lambda v: 380 <= v[0] <= v[1] <= 780, "low and high within 380 to 780")
     ] = field(default=(400.0, 700.0), metadata={"was": ("wavelengths_nm",)})

@@ -15,7 +15,7 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Surface
-from neurolens.lens.shot import Shot
+from neurolens.lens.shot import Shot, StopShape
 from neurolens.readers.lensfile import read_lens, write_lens
 from neurolens.render.images import make_aperture, read_mask
 from neurolens.setting.pupils import camera_rays, pupil_plane_z_mm
@@ -284,7 +284,7 @@ def test_masks_from_pictures(tmp_path: Path) -> None:
     clear[0, 0, 3] = 0  # transparent is shut
     image.fromarray(clear).save(tmp_path / "clear.png")
     assert read_mask(tmp_path / "clear.png").tolist() == [[False, True], [True, True]]
-    shape = make_aperture(mask=tmp_path / "grey.png", rotation_deg=5.0)
+    shape = make_aperture(StopShape(aperture_mask=tmp_path / "grey.png", blade_rotation_deg=5.0))
     assert shape is not None and shape.rotation_deg == 5.0
 
 
@@ -298,9 +298,9 @@ def test_bad_masks(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=expected):
             read_mask(tmp_path / f"{file}.png")
     with pytest.raises(InputError, match="not both"):
-        make_aperture(blades=5, mask=tmp_path / "dark.png")
+        make_aperture(StopShape(blades=5, aperture_mask=tmp_path / "dark.png"))
     with pytest.raises(InputError, match="blades"):
-        make_aperture(rotation_deg=5.0)
+        make_aperture(StopShape(blade_rotation_deg=5.0))
     with pytest.raises(InputError, match="curvature"):
-        make_aperture(mask=tmp_path / "dark.png", curvature=0.5)
-    assert make_aperture() is None
+        make_aperture(StopShape(aperture_mask=tmp_path / "dark.png", blade_curvature=0.5))
+    assert make_aperture(StopShape()) is None
