@@ -38,8 +38,7 @@ from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.source import fused_program
-from neurolens.surrogates.specialise import Fix, fixed_models
+from neurolens.surrogates.source import Fix, fixed_models, fused_program
 from neurolens.trace.tracegraph import exact_graph
 
 WITHIN_UM = 1.0

@@ -46,7 +46,7 @@ CPU_S, LONG_CPU_S, WALL_S, MEMORY = 10.0, 60.0, 300.0, 2 << 30
 _BATCH = 200
 _JUDGES = ("evaluate", "models", "library", "survey", "train")  # their exit code 1 is an answer
 _LOADED = (
-    *("onnxruntime", "torch", "onnx", "matplotlib.pyplot", "sklearn.linear_model", "neurolens.readers.any_format"),
+    *("onnxruntime", "torch", "onnx", "matplotlib.pyplot", "neurolens.readers.any_format"),
     *("neurolens.surrogates.export", "neurolens.render.renderer", "neurolens.render.scene", "neurolens.cameras.build"),
     *("neurolens.cameras.model", "neurolens.render.pictures", "neurolens.setting.check", "neurolens.flare.layers"),
     *("neurolens.cli.render_files", "neurolens.study.survey_run", "neurolens.analysis.spots"),

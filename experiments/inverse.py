@@ -27,13 +27,13 @@ from neurolens.graph.newton import solve, with_jacobian
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.study.experiment import LensChoice
-from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.inverse import STEPS, TOLERANCE, InverseModel, front_index, scene_system, stop_system
 from neurolens.surrogates.inverse_fit import convergence, fit_inverse
 from neurolens.surrogates.model import Domain, LensModel
 from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.terms import pinned_threads
 from neurolens.trace.surfaces import front_rays
 
 PUBLISHED_STEPS = (3, 5, 10, 20)

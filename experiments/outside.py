@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from experiments import lab
 from neurolens.base import status as st
 from neurolens.cameras.onnxlens import OnnxLens, load_model
-from neurolens.surrogates.cardkeys import DOMAIN_SLACK
+from neurolens.surrogates.card import DOMAIN_SLACK
 from neurolens.surrogates.model import ANY_WAVELENGTH_NM
 
 _BATCH = 1 << 12  # of one film plane and stop

@@ -36,7 +36,7 @@ from neurolens.render.scene import Scene, load_scene
 from neurolens.setting.pupils import image_radius_mm
 from neurolens.setting.states import set_lens
 from neurolens.study.experiment import near_limit_m
-from neurolens.surrogates.bases import pinned_threads
+from neurolens.surrogates.terms import pinned_threads
 
 LENSES = (
     "laikin_double_gauss_50", "ogawa_zoom_70_200@135mm", "horimoto_fisheye_16", "phone_lens_6", "cooke_anamorphic_42",

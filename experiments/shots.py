@@ -28,7 +28,7 @@ from neurolens.plan.costs import glsl_operations, ns_a_ray
 from neurolens.plan.probe import COUNTED, LIGHT, Probed, probe
 from neurolens.render.scene import load_scene
 from neurolens.study.experiment import near_limit_m
-from neurolens.surrogates.bases import pinned_threads
+from neurolens.surrogates.terms import pinned_threads
 
 # All kinds: wide to long, f/1 to f/5.4, simple and not, from plastic, a zoom's default state.
 LENSES = (

@@ -24,11 +24,10 @@ from neurolens.study.experiment import near_limit_m, wavelengths_nm
 from neurolens.study.rays import ray_errors
 from neurolens.study.train_states import AXIS_LABELS, error_axes, error_line, fit_and_measure_states
 from neurolens.surrogates.axes import Axis
-from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.states import StateSpace, axes_of
-from neurolens.surrogates.states_fit import StateSettings
+from neurolens.surrogates.states import StateSettings, StateSpace, axes_of
+from neurolens.surrogates.terms import pinned_threads
 
 # Coefficients per vector, rays of a node, rays of a single fit's test.
 TERMS, RAYS, TESTS = 64, 15_000, 8_000

@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import onnx
-import torch
-from torch import Tensor
 
 from experiments.published import PublishedSettings, fit_any
 from neurolens.base.errors import NeurolensWarning
@@ -23,16 +21,14 @@ from neurolens.lens.prescription import Lens, Surface
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
-from neurolens.surrogates.cardkeys import CARD_KEY, MODEL_KEY
-from neurolens.surrogates.cores import Network
+from neurolens.surrogates.card import CARD_KEY, MODEL_KEY
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.export import export_onnx
-from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
-from neurolens.surrogates.gates import gate_values
+from neurolens.surrogates.fit import ModelSettings, Prepared, as_model, fit_model, prepare
+from neurolens.surrogates.fits.network import fit_network
 from neurolens.surrogates.model import Domain, LensModel
-from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, with_angle
-from neurolens.surrogates.specialise import at_wavelength
-from neurolens.surrogates.targets import scales_of, targets_of
+from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.source import at_wavelength
 
 LENSES = Path(__file__).parents[1] / "lenses"
 GAUSS, FISHEYE, COLOURLESS = "laikin_double_gauss_50", "horimoto_fisheye_16", "muller_fisheye_100"
@@ -121,7 +117,8 @@ def model(kind: str) -> LensModel:
     if kind in ("fisheye", "colourless"):
         return fit_model(prepared(FISHEYE if kind == "fisheye" else COLOURLESS), _FITS["invariants"])
     if kind == "network":
-        return _network(prepared(), 12)
+        settings = ModelSettings("mlp", units=12, steps=4)
+        return as_model(prepared(), fit_network(prepared(), settings), settings, 0.0)
     if kind == "laser":
         return at_wavelength(model("invariants"), 550.0)
     if kind.startswith("cylinders"):
@@ -157,39 +154,3 @@ def edited(source: Path, target: Path, change: Callable[[dict[str, Any]], object
 @cache
 def _folder() -> tempfile.TemporaryDirectory[str]:
     return tempfile.TemporaryDirectory(prefix="neurolens-tests-")
-
-
-def _network(known: Prepared, units: int) -> LensModel:
-    """Two layers of random tanh units whose outputs are fitted by ridge regression: a network without a training."""
-    pairs, encoding = known.pairs, known.encoding
-    generator = torch.Generator().manual_seed(0)
-
-    def random(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-    targets = targets_of(pairs.lens, encoding, pairs.train)
-    invariants = targets.field.invariants()
-    low, high = invariants.min(1).values, invariants.max(1).values
-    hidden = ((random(units, 4) / 2, random(units) * 0.3), (random(units, units) / units**0.5, random(units) * 0.3))
-    shift, scale = (low + high) / 2, 2 / (high - low)
-
-    def features(pairs: PairSet) -> Tensor:
-        h = (encoding(pairs.inputs).invariants() - shift[:, None]) * scale[:, None]
-        for weight, bias in hidden:
-            h = torch.tanh(weight @ h + bias[:, None])
-        return torch.cat([h, torch.ones_like(h[:1])])
-
-    def ridge(a: Tensor, b: Tensor) -> Tensor:
-        gram = a @ a.T
-        return torch.linalg.solve(gram + 1e-7 * gram.trace() * torch.eye(len(gram), dtype=gram.dtype), a @ b.T).T
-
-    m, f = features(pairs.train), targets.field
-    both = torch.cat([torch.cat([m * f.p[i], m * f.u[i]]) for i in (0, 1)], dim=1)
-    ab = ridge(both, targets.vectors.reshape(3, -1)).reshape(6, -1)
-    gates = ridge(features(pairs.rim), gate_values(pairs.lens, known.gates, pairs.rim))
-    out = torch.cat([ab, ridge(m, targets.transmittance[None]), gates])
-    layers = tuple((w.numpy(), b.numpy()) for w, b in hidden)
-    core = Network(layers, (out[:, :-1].numpy(), out[:, -1].numpy()), shift.numpy(), scale.numpy())
-    return with_angle(
-        LensModel(pairs.lens, pairs.domain, encoding, scales_of(pairs.lens), known.gates, core, "random network")
-    )

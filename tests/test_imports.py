@@ -63,8 +63,11 @@ SLOW |= {"neurolens.cli.export_lens", "neurolens.cli.flare_run", "neurolens.cli.
 LEAN = ("base", "graph", "lens", "readers", "cameras", "shaders", "render", "mitsuba", "frames", "cli")
 LEAN_MODULES = {
     *(f"neurolens.trace.{name}" for name in ("arithmetic", "shapes", "surfaces")),
-    *(f"neurolens.surrogates.{name}" for name in ("assemble", "cardstates", "cores", "file", "inverse", "lightfield")),
-    *(f"neurolens.surrogates.{name}" for name in ("metadata", "model", "source", "stategraph")),
+    *(
+        f"neurolens.surrogates.{name}"
+        for name in ("assemble", "axes", "card", "cores", "file", "inverse", "lightfield")
+    ),
+    *(f"neurolens.surrogates.{name}" for name in ("model", "source")),
 }
 
 

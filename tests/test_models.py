@@ -21,7 +21,7 @@ from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
 from neurolens.study.check import check_states, promises_of, space_of_card
 from neurolens.study.measure import FreshRays, fresh_rays, measure, onnx_predictor
-from neurolens.surrogates.cardkeys import AVERAGED, POLARISED
+from neurolens.surrogates.card import AVERAGED, POLARISED
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.file import read_model

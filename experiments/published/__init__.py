@@ -21,12 +21,12 @@ from experiments.published.raylut import fit_table
 from experiments.published.rtf import fit_rtf
 from experiments.published.taylor import fit_taylor
 from neurolens.base.errors import InputError
-from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.cores import Core
 from neurolens.surrogates.fit import as_model, fit_model
-from neurolens.surrogates.model import Encoding, Gate, LensModel
-from neurolens.surrogates.settings import ModelSettings
-from neurolens.surrogates.targets import Prepared
+from neurolens.surrogates.lightfield import Encoding
+from neurolens.surrogates.model import Gate, LensModel
+from neurolens.surrogates.targets import ModelSettings, Prepared
+from neurolens.surrogates.terms import pinned_threads
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Adaptive sparse polynomials with a partition of the light field (Zheng and Zheng 2017, The Visual Computer).
 
-Every scalar output has terms of its own, grown from the lowest (`fits.selection.grow`): each chosen term brings its
+Every scalar output has terms of its own, grown from the lowest (`surrogates.terms.grow`): each chosen term brings its
 products with the variables into the candidates, so that no degree limits them. Where the error stays high the light
 field is divided: the cell with the largest summed error is cut in two halves of its rays, along whichever of its
 coordinates leaves least, and each half is fitted anew, until the number of cells asked for is reached.
@@ -23,12 +23,11 @@ from experiments.published.data import Outputs, RawData, outer_pupil, solve_outp
 from experiments.published.polynomials import fit_dense
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph
-from neurolens.surrogates.bases import Exponents
 from neurolens.surrogates.cores import Composite, CoreValues, Field, RawPolynomial, Units, stored_as
-from neurolens.surrogates.fits.selection import grow
 from neurolens.surrogates.lightfield import ROUND
 from neurolens.surrogates.pairs import PairSet
 from neurolens.surrogates.targets import squared_error
+from neurolens.surrogates.terms import Exponents, grow
 
 # A cell's fit sees this share of its rays' range beyond a cut, so that neighbours meet.
 MARGIN = 0.03

@@ -13,12 +13,13 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
-from neurolens.surrogates.bases import Exponents, monomials, raw_exponents, raw_variables, united
 from neurolens.surrogates.cores import DIRECTION, POSITION, Core, CoreValues, Field, RawPolynomial, Units, stored_as
 from neurolens.surrogates.gates import gate_reach
-from neurolens.surrogates.model import Encoding, Gate
+from neurolens.surrogates.lightfield import Encoding
+from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import PairSet, RayPairs
 from neurolens.surrogates.targets import Prepared, scales_of
+from neurolens.surrogates.terms import Exponents, monomials, raw_exponents, raw_variables, united
 
 # Outputs of the published polynomials, with the parity in x and in y that mirror symmetry gives each.
 OUTPUTS = ("position x", "position y", "tangent x", "tangent y", "stop x", "stop y", "transmittance")
@@ -212,7 +213,7 @@ def raw_polynomial(exponents: Exponents, rows: Tensor) -> RawPolynomial:
 
 
 def stable_solve(columns: Tensor, outputs: Tensor, weights: Tensor | None = None, cut: float = 1e-7) -> Tensor:
-    """Least squares as `bases.solve`, with singular values cut where float32 could not evaluate what they add.
+    """Least squares as `terms.solve`, with singular values cut where float32 could not evaluate what they add.
 
     Raw coordinates of a wide angle are nearly dependent (the slope follows the position), and plain least squares then
     gives large terms that cancel. `cut` is relative to the largest singular value of columns of unit length.

@@ -34,8 +34,7 @@ from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.lightfield import ROUND
 from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import PairSet, trace_pairs
-from neurolens.surrogates.settings import ModelSettings
-from neurolens.surrogates.targets import scales_of
+from neurolens.surrogates.targets import ModelSettings, scales_of
 
 NETWORKS = 3  # whose mean is taken
 BATCH = 128

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.published.data import PARITY, Outputs, RawData, parity_exponents, solve_outputs
-from neurolens.surrogates.bases import monomials
 from neurolens.surrogates.cores import RawPolynomial
+from neurolens.surrogates.terms import monomials
 
 # Rays that decide the choice of terms; the coefficients are fitted on all of them afterwards.
 SELECTION_RAYS = 6000

@@ -28,13 +28,13 @@ from experiments.published.data import RawData, stable_solve
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Value
-from neurolens.surrogates.bases import Exponents, monomials
 from neurolens.surrogates.cores import Core, CoreValues, Field, Units, stored_as
 from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import Gate
 from neurolens.surrogates.pairs import trace_pairs
 from neurolens.surrogates.targets import scales_of
+from neurolens.surrogates.terms import Exponents, monomials
 
 Array = NDArray[np.float64]
 # Positions of the input plane at which the ellipse is fitted, and rays of each.

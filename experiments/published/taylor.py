@@ -29,10 +29,10 @@ from experiments.published.data import raw_polynomial
 from neurolens.base.errors import InputError
 from neurolens.lens.glass import index_of
 from neurolens.lens.prescription import Lens, Surface
-from neurolens.surrogates.bases import ordered
 from neurolens.surrogates.cores import RawPolynomial
-from neurolens.surrogates.model import Encoding
+from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.targets import scales_of
+from neurolens.surrogates.terms import ordered
 from neurolens.trace.rays import trace
 from neurolens.trace.surfaces import Rays
 

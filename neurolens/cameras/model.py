@@ -30,8 +30,7 @@ from neurolens.lens import film_plane
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.shot import Shot
 from neurolens.surrogates.assemble import SCALARS, Form
-from neurolens.surrogates.cardkeys import DOMAIN_SLACK
-from neurolens.surrogates.cardstates import state_for
+from neurolens.surrogates.card import DOMAIN_SLACK, state_for
 
 __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
 

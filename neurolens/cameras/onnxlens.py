@@ -21,7 +21,8 @@ from neurolens.cameras.onnxsession import open_session, run_batches
 from neurolens.graph.ir import Graph, pruned
 from neurolens.graph.onnx import write_onnx
 from neurolens.surrogates.assemble import ONNX, SCALARS, Form, model_graph
-from neurolens.surrogates.cardstates import card_at, default_state, state_numbers
+from neurolens.surrogates.axes import state_numbers
+from neurolens.surrogates.card import card_at, default_state
 from neurolens.surrogates.file import ModelFile, read_model
 from neurolens.surrogates.model import LensModel
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
-from neurolens.surrogates.cardcheck import pupil_rows
+from neurolens.surrogates.card import pupil_rows
 
 # Halvings that place the end of the light; lattice on a box that looks for light.
 _END_HALVINGS = 10

@@ -21,7 +21,7 @@ from neurolens.base.signals import handled
 from neurolens.cli.arguments import Help, Parser, more_glasses
 
 # Packages of the extra that a base install lacks.
-_TRAIN_PACKAGES = {"torch", "sklearn", "scipy", "onnx", "matplotlib", "flip_evaluator", "mpmath"}
+_TRAIN_PACKAGES = {"torch", "scipy", "onnx", "matplotlib", "flip_evaluator", "mpmath"}
 _BROKEN_PIPE = 141  # 128 plus the signal's number, as shells report it
 _FAULT, _TRACEBACK = 70, "NEUROLENS_TRACEBACK"  # EX_SOFTWARE of sysexits.h; the variable that asks for tracebacks
 # Names that commands had: they still work.

@@ -146,7 +146,7 @@ def _form_or_why(task: tuple[Path, str | None]) -> Form | str:
     file, zoom = task
     with ExitStack() as stack:
         if find_spec("torch") is not None:
-            from neurolens.surrogates.bases import pinned_threads
+            from neurolens.surrogates.terms import pinned_threads
 
             stack.enter_context(pinned_threads())
         try:
@@ -303,7 +303,7 @@ def thumbnail(lens: Lens) -> bytes | None:
 
 def card_of(file: Path) -> dict[str, Any]:
     """The card of a model."""
-    from neurolens.surrogates.metadata import read_card
+    from neurolens.surrogates.card import read_card
 
     return read_card(file)
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 from neurolens.base.progress import Progress
 from neurolens.cli.arguments import add_glass, add_json, add_lens, whole
 from neurolens.cli.output import answer, number, table
-from neurolens.surrogates.cardkeys import AVERAGED, transmittance_of
 
 if TYPE_CHECKING:
     from neurolens.study.check import Promise
@@ -72,6 +71,7 @@ def run(args: argparse.Namespace) -> int:
     from neurolens.cameras.model import load_model
     from neurolens.study.candidates import time_model
     from neurolens.study.check import check_model, check_states, lens_of_card, space_of_card
+    from neurolens.surrogates.card import transmittance_of
 
     model = load_model(args.model)  # on one thread: the race distributes batches
     space = space_of_card(model.card, model.axes, args.lens, args.model) if model.axes else None
@@ -101,6 +101,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _text(data: dict[str, Any], promises: list[Promise]) -> str:
+    from neurolens.surrogates.card import AVERAGED
+
     header: tuple[str, ...] = ("figure", "promised", "measured", "allowed", "")
     rows: list[tuple[str, ...]] = [
         (p.key, number(p.promised), number(p.measured), number(p.allowed), "" if p.holds else "does not hold")

@@ -143,8 +143,7 @@ def _write_model(
     """A model as source code or ONNX, some of its inputs fixed."""
     from neurolens.cameras.onnxlens import load_model
     from neurolens.shaders.source import model_extras
-    from neurolens.surrogates.source import Parts, export_source
-    from neurolens.surrogates.specialise import Fix
+    from neurolens.surrogates.source import Fix, Parts, export_source
 
     loaded = load_model(file)
     if loaded.axes and (args.to == "onnx" or fixed or set(parts) != set(_PARTS)):

@@ -33,14 +33,12 @@ from neurolens.setting.states import set_lens
 from neurolens.shaders.focus_function import Array, Focusing
 from neurolens.shaders.source import film_extras, followed, state_ranges
 from neurolens.study.measure import FRESH, fresh_rays, measure_on
-from neurolens.surrogates.axes import Axis, weights
+from neurolens.surrogates.axes import Axis, mixture_of, weights
 from neurolens.surrogates.export import export_inverse, export_onnx
 from neurolens.surrogates.inverse_fit import convergence, fit_inverse
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSettings, RayPairs, make_pairs
-from neurolens.surrogates.source import Written, checked_name, lines_of, write_program
-from neurolens.surrogates.specialise import Fix, fixed_models
-from neurolens.surrogates.stategraph import mixture_of
+from neurolens.surrogates.source import Fix, Written, checked_name, fixed_models, lines_of, write_program
 from neurolens.surrogates.states import gap_axis, zoom_axis
 from neurolens.trace.tracegraph import TRANSMITTANCE, exact_graph
 

@@ -16,7 +16,6 @@ from neurolens.base.records import program, reaches, time_of
 from neurolens.cli.arguments import add_json, add_within
 from neurolens.cli.output import answer, number, table
 from neurolens.study.advice import CLOSE_UM, Advice, advice, expected_exact, to_use
-from neurolens.surrogates.cardkeys import AVERAGED, transmittance_of
 
 _DESCRIPTION = """\
 List exported models by lens: film circle, focus, film-equivalent RMS error on rays held out, and
@@ -88,7 +87,7 @@ def _places() -> list[Path]:
 
 def models_in(folder: Path) -> Iterator[dict[str, Any]]:
     """What the cards of a folder say, with the times beside them; a file that is no model is left out."""
-    from neurolens.surrogates.metadata import read_card
+    from neurolens.surrogates.card import read_card, transmittance_of
 
     times = _times(folder / "index.json") | _times(folder.parent / "results.json")
     for file in sorted(folder.glob("*.onnx")):
@@ -176,6 +175,8 @@ def _text(args: argparse.Namespace, listed: Sequence[dict[str, Any]], kept: Sequ
 
 def _remarks(model: dict[str, Any]) -> list[str]:
     """What the last column says of a model."""
+    from neurolens.surrogates.card import AVERAGED
+
     found = [f"poor: {', '.join(model['poor'])}"] if model["poor"] else []
     found += ["one focus"] * _of_a_shot(model)
     found += [f"in one: {', '.join(model['states'])}"] if model["states"] and not found else []

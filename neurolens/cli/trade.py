@@ -29,7 +29,7 @@ def look_of(args: argparse.Namespace) -> dict[str, Any]:
 def shipped_models(lens: Lens, zoom: str | None) -> list[Path]:
     """The models that ship of a lens, or of a state of its zoom, by its id and its figures."""
     from neurolens.setting.states import set_lens
-    from neurolens.surrogates.metadata import read_card
+    from neurolens.surrogates.card import read_card
 
     name = lens.lens_id if zoom is None else f"{lens.lens_id}-{zoom}"
     files = sorted((library() / "models").glob(f"{name}.*.onnx"))

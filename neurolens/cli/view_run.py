@@ -30,7 +30,7 @@ from neurolens.readers.any_format import read_any
 from neurolens.setting.pupils import image_radius_mm, pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.shaders.source import model_extras
-from neurolens.surrogates.metadata import card_in, read_metadata
+from neurolens.surrogates.card import card_in, read_metadata
 from neurolens.surrogates.source import Written, export_source
 from neurolens.view.page import Form, ViewLens, section_svg, write_page
 from neurolens.view.shaders import ghosts_glsl, path_glsl

@@ -18,7 +18,8 @@ from neurolens.flare.ghostmodel import GhostModel, GhostPolynomial
 from neurolens.flare.ghosts import GhostTracer, Pair, ghost_pairs
 from neurolens.lens.glass import inverse_square_um
 from neurolens.lens.prescription import Lens
-from neurolens.surrogates.bases import (
+from neurolens.surrogates.lightfield import LightField
+from neurolens.surrogates.terms import (
     invariant_exponents,
     monomials,
     pinned_threads,
@@ -27,7 +28,6 @@ from neurolens.surrogates.bases import (
     solve,
     vector_columns,
 )
-from neurolens.surrogates.lightfield import LightField
 from neurolens.trace.rays import Rays
 from neurolens.trace.sequence import follow, ghost
 

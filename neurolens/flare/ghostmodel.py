@@ -42,11 +42,9 @@ from neurolens.graph.program import ARRIVING, ENTERING
 from neurolens.graph.scalars import lower
 from neurolens.lens.glass import inverse_square_um
 from neurolens.lens.prescription import Lens
-from neurolens.surrogates.card import card_to_json
-from neurolens.surrogates.cardkeys import CARD_KEY, MODEL_KEY
+from neurolens.surrogates.card import CARD_KEY, MODEL_KEY, card_in, card_to_json, read_metadata
 from neurolens.surrogates.file import deflated, inflated, pack, packed_lens, unpack, unpacked_lens
 from neurolens.surrogates.lightfield import ROUND
-from neurolens.surrogates.metadata import card_in, read_metadata
 from neurolens.surrogates.source import WRITERS, identifier
 
 Array = NDArray[np.float64]

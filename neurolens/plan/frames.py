@@ -36,7 +36,7 @@ from neurolens.plan.probe import COUNTED, Effect, Probed, effects_of, probe
 from neurolens.plan.shot_fits import shot_domain, shot_fits, shot_terms
 from neurolens.render.scene import Scene
 from neurolens.setting.states import set_lens
-from neurolens.surrogates.settings import ModelSettings
+from neurolens.surrogates.targets import ModelSettings
 
 _MOST = 5  # frames that are probed, but for more extremes
 _HOW = "fitted for this shot"

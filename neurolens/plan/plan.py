@@ -53,7 +53,7 @@ from neurolens.render.scene import Scene
 from neurolens.shaders.blender_shader import lens_of
 from neurolens.study.advice import recommended
 from neurolens.study.experiment import DomainChoice, EvaluationChoice, Experiment, LensChoice
-from neurolens.surrogates.settings import ModelSettings
+from neurolens.surrogates.targets import ModelSettings
 
 Target = Literal["render", "c", "onnx", "osl", "glsl"]
 Cost = Callable[[], tuple[Timing, float]]  # of a ray, and noise

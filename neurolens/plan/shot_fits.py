@@ -15,10 +15,9 @@ from neurolens.study.experiment import DomainChoice
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import fit_model, prepare
-from neurolens.surrogates.fits.planes import fit_planes
+from neurolens.surrogates.fits.polynomial import fit_planes
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.settings import ModelSettings
-from neurolens.surrogates.targets import Prepared
+from neurolens.surrogates.targets import ModelSettings, Prepared
 
 TERMS = (2, 4, 6, 8, 12, 16, 22, 28, 36, 48, 64, 90)  # of the polynomials that are fitted on the spot
 _FIT = ModelSettings("ols", planes=False, elimination=False, idle_gates=IDLE)

@@ -100,7 +100,7 @@ def lens_of(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens,
 def _of_model(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:
     from neurolens.cameras.onnxlens import load_model
     from neurolens.shaders.osl import model_lens
-    from neurolens.surrogates.cardstates import state_for
+    from neurolens.surrogates.card import state_for
 
     model, fixed = load_model(file), zoom not in (None, RANGE)
     if fixed or (zoom is not None and not model.axes):
@@ -119,7 +119,7 @@ def _smallest(model: OnnxLens) -> Graph | None:
     if model.axes or find_spec("torch") is None:
         return None
     from neurolens.surrogates.assemble import SCALARS, model_graph
-    from neurolens.surrogates.specialise import without_idle_gates
+    from neurolens.surrogates.pairs import without_idle_gates
 
     (smallest,) = without_idle_gates((model.fitted,), IDLE)
     return model_graph(smallest, SCALARS)

@@ -12,9 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from neurolens.graph.ir import Graph, Value
 from neurolens.graph.program import STOP_RADIUS, Program
 from neurolens.graph.scalars import lower
-from neurolens.surrogates.axes import Axis
-from neurolens.surrogates.cardstates import STATE
-from neurolens.surrogates.stategraph import state_graph, state_names
+from neurolens.surrogates.axes import STATE, Axis, state_graph, state_names
 
 Array = NDArray[np.float64]
 FOCUS = "focus_m"

@@ -48,9 +48,7 @@ from neurolens.shaders.pupil_disc import PupilDisc
 from neurolens.shaders.pupil_passing import passing_share
 from neurolens.shaders.shader_lens import ShaderLens
 from neurolens.shaders.source import model_focusing
-from neurolens.surrogates.axes import Axis, product, weights
-from neurolens.surrogates.cardstates import STATE
-from neurolens.surrogates.stategraph import state_graph, state_names
+from neurolens.surrogates.axes import STATE, Axis, product, state_graph, state_names, weights
 
 Array = NDArray[np.float64]
 OUTPUTS = ("position", "direction", "throughput", "dPdx", "dPdy", "dDdx", "dDdy")

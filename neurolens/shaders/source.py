@@ -21,8 +21,7 @@ from neurolens.graph.program import STOP_RADIUS, Program
 from neurolens.graph.scalars import lower
 from neurolens.lens.film_plane import film_z_of_card_mm
 from neurolens.shaders.focus_function import FOCUS, SMALLEST, Array, Focus, Focusing, film_function, number_of
-from neurolens.surrogates.axes import Axis, product
-from neurolens.surrogates.stategraph import state_names
+from neurolens.surrogates.axes import Axis, product, state_names
 
 CAMERA_FRAME = """\
 Camera frame: metres, origin at the film's centre, the camera looks along -z, y up, x right. Film points are mm in the
@@ -55,7 +54,7 @@ def camera_program(film: LensFilm, lens: LensGraph, derivatives: bool = False, o
     return program
 
 
-# Names in the source, where they stand in the card, and how they follow a state (as in `surrogates.cardstates`).
+# Names in the source, where they stand in the card, and how they follow a state (as in `surrogates.card`).
 _NUMBERS = (
     (("efl_mm",), "lens", "efl_mm", "reciprocal"),
     (("film_radius_mm",), "domain", "film_radius_mm", "square"),

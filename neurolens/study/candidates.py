@@ -34,8 +34,7 @@ from neurolens.surrogates.assemble import ALL, Parts
 from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.file import read_model
 from neurolens.surrogates.model import Domain, LensModel
-from neurolens.surrogates.source import FREE, fused_program
-from neurolens.surrogates.specialise import Fix
+from neurolens.surrogates.source import FREE, Fix, fused_program
 from neurolens.trace.rays import Traced, compile_tracing, trace
 from neurolens.trace.tracegraph import exact_graph
 

@@ -27,7 +27,7 @@ from neurolens.study.vignetting import NEAR_RIM, ZONES, deciding_rim_ratio, fals
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, fit_model
-from neurolens.surrogates.fits import checkpoint
+from neurolens.surrogates.fits.network import clear_training
 from neurolens.surrogates.model import Domain, Prediction
 from neurolens.surrogates.pairs import PairSet, PairSettings, join_pairs, make_pairs, trace_pairs
 from neurolens.trace.surfaces import Rays
@@ -299,7 +299,7 @@ def fit_and_measure(
         "load_s": seconds_to_load(file),
     }
     note_record(file, fingerprint, record)
-    checkpoint.clear(training)
+    clear_training(training)
     return Measured(settings, file, record)
 
 

@@ -21,9 +21,9 @@ import torch
 
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.records import ExactRecord, Timing, break_even_rays
-from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.model import Domain
+from neurolens.surrogates.terms import pinned_threads
 
 # Rays of one pass: every batch size divides it, and float32 inputs of a pass stay in the third-level cache.
 POOL = 65536

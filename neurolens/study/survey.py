@@ -33,10 +33,10 @@ from neurolens.study.check import check_model
 from neurolens.study.describe import layout_profile, lens_row
 from neurolens.study.experiment import DomainChoice
 from neurolens.study.measure import CARD_KEYS, fit_and_measure, fresh_rays
-from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.fit import ModelSettings, prepare
 from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import PairSettings, make_pairs
+from neurolens.surrogates.terms import pinned_threads
 
 SCHEMA = 1
 # What a lens that was read is: "ok", or "doubtful"; what was not: "refused" by name, or a "fault" of neurolens.

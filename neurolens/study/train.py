@@ -39,10 +39,10 @@ from neurolens.study.scenes import Pictures, domain_facts, render_all, scene_gai
 from neurolens.study.speed import Race, race
 from neurolens.study.train_states import run_states
 from neurolens.study.vignetting import Illumination, relative_illumination
-from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.fit import NETWORKS, Prepared, prepare
 from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import RayPairs, make_pairs, save_pairs
+from neurolens.surrogates.terms import pinned_threads
 
 _IDEAL = ("thin lens", "pinhole")
 _LIT_RAYS = 4096  # a film radius: a quarter of a second a model

@@ -25,8 +25,7 @@ from neurolens.study.report import write_report
 from neurolens.surrogates.axes import Axis
 from neurolens.surrogates.export import export_states
 from neurolens.surrogates.fit import ModelSettings
-from neurolens.surrogates.states import StateSpace
-from neurolens.surrogates.states_fit import StateSettings, fit_states
+from neurolens.surrogates.states import StateSettings, StateSpace, fit_states
 
 # States at which a model is measured for its card, and the rays of each (that pass).
 STATES, RAYS = 16, 8_000

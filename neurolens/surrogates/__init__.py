@@ -1,1 +1,1 @@
-"""Surrogates: ray domain and pairs, bases, fits, networks, cards and ONNX graphs."""
+"""Surrogates: ray domain and pairs, terms, fits, networks, cards and ONNX files."""

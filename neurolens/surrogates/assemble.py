@@ -1,4 +1,4 @@
-"""A whole model as one graph: raw mm and nm in; scene ray, transmittance, stop crossing and status out.
+"""A whole model as one graph: mm and nm in; scene ray, transmittance, stop crossing and status out.
 
 Light field, core, decoding, front surface, rims, domain: everything round a core is written here, once, for every kind
 of model. Inputs of the graph are `rays` (film x, y, pupil x, y in mm, wavelength in nm) and, of the call, `film_z_mm`
@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.graph.ir import Graph, Value
-from neurolens.surrogates.cardkeys import DOMAIN_SLACK
+from neurolens.surrogates.card import DOMAIN_SLACK
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, CoreValues, Field, Units
 
 if TYPE_CHECKING:
     from neurolens.lens.prescription import Surface
-    from neurolens.surrogates.model import Encoding, LensModel
+    from neurolens.surrogates.lightfield import Encoding
+    from neurolens.surrogates.model import LensModel
 
 Array = NDArray[np.float64]
 
@@ -60,7 +61,7 @@ EXACT = Form(sag_terms=0, exact=True, wavelength=True)
 
 @dataclass(frozen=True)
 class Parts:
-    """What of a model's work is wanted besides the scene ray and the domain guard.
+    """The outputs of a graph besides the scene ray and the test of the domain.
 
     Attributes:
         transmittance: the transmittance.
@@ -250,26 +251,22 @@ def refracted(position: Value, inside: Value, index: Value, front: Surface) -> V
 def tilt_series(front: Surface) -> Array | None:
     """Power series in the squared height h^2 (mm^2) of the sine of a round surface's tilt over h.
 
-    None: not round, no glass behind it, or no short series tells it.
+    None: not round, no glass behind it, or no short series fits.
     """
     if front.cylinder or front.across is not None or front.focal_mm is not None or float(front.n_d) == 1.0:
         return None
     c, bend = float(front.curvature), (1 + float(front.conic)) * float(front.curvature) ** 2
     if not front.asphere and not front.conic:
         return np.array([c])
-    reach = (_FRONT_REACH * front.semi_diameter_mm) ** 2
 
-    def exact(s: Array) -> Array:
-        h2 = s * reach
+    def exact(h2: Array) -> Array:
         rise = c / np.sqrt(np.maximum(1 - bend * h2, 1e-6))
         rise = rise + sum(int(p) * float(a) * h2 ** (int(p) / 2 - 1) for p, a in front.asphere)
         return np.asarray(rise / np.sqrt(1 + rise * rise * h2))
 
     with np.errstate(all="ignore"):
-        series = fit_series(exact, 1.0, _TILT / math.sqrt(reach))
-        t = np.linspace(0, 1, 1000)
-        off = np.abs(np.polynomial.Polynomial(series)(t) - exact(t)).max()
-    return series / reach ** np.arange(len(series)) if off * math.sqrt(reach) < 2 * _TILT else None
+        reach_mm = _FRONT_REACH * front.semi_diameter_mm
+        return _series_in(exact, reach_mm**2, _TILT / reach_mm)
 
 
 def sag(position: Value, surface: Surface, form: Form) -> Value:
@@ -287,13 +284,10 @@ def sag(position: Value, surface: Surface, form: Form) -> Value:
         z = c * square / (1 + np.sqrt(np.maximum(1 - bend * square, 0.0)))
         return np.asarray(z + sum(a * square ** (p / 2) for p, a in powers.items()))
 
-    if form.sag_terms and surface.across is None:  # in units of the rim, so that high powers stay within float32
-        reach = (_FRONT_REACH * surface.semi_diameter_mm) ** 2
-        series = fit_series(lambda s: exact(s * reach), 1.0, _SAG_MM)
-        t = np.linspace(0, 1, 1000)
-        held = np.abs(np.polynomial.Polynomial(series)(t) - exact(t * reach)).max() < 2 * _SAG_MM
-        if held and len(series) <= form.sag_terms:
-            return g.series(h2, series / reach ** np.arange(len(series)))
+    if form.sag_terms and surface.across is None:
+        series = _series_in(exact, (_FRONT_REACH * surface.semi_diameter_mm) ** 2, _SAG_MM)
+        if series is not None and len(series) <= form.sag_terms:
+            return g.series(h2, series)
     # c h^2 / (1 + root) has no cancellation and no case for a paraboloid.
     other, square, sum_ = surface.across, 1.0 - h2 * bend, h2 * c
     if other is not None and other[1] is not None:
@@ -333,3 +327,11 @@ def fit_series(function: Callable[[Array], Array], upper: float, tolerance: floa
         if np.abs(fit(t) - function(t)).max() < tolerance:
             break
     return np.asarray(fit.convert(kind=np.polynomial.Polynomial).coef, dtype=np.float64)
+
+
+def _series_in(function: Callable[[Array], Array], reach: float, tolerance: float) -> Array | None:
+    """Power series on [0, reach] that holds twice the tolerance, or None; fitted in units of `reach`."""
+    series = fit_series(lambda s: function(s * reach), 1.0, tolerance)
+    t = np.linspace(0, 1, 1000)
+    off = np.abs(np.polynomial.Polynomial(series)(t) - function(t * reach)).max()
+    return series / reach ** np.arange(len(series)) if off < 2 * tolerance else None

@@ -1,28 +1,32 @@
-"""States of a lens as numbers (focal length of a zoom, vergence of internal focus) and interpolation between nodes.
+"""State axes of a lens (focal length of a zoom, vergence of internal focus) and interpolation between their nodes.
 
-A quantity of a lens with cams is smooth in its state but where the source states a position: cams are interpolated
-between those, piece by piece. So it is interpolated piece by piece too, by polynomials through Chebyshev-Lobatto
-nodes (the ends of a piece among them) in a coordinate in which lens quantities are nearly straight.
+A quantity of a zoom lens is smooth in the state, except at the positions that the source states: cams are interpolated
+piece by piece between those. So every quantity is interpolated piece by piece, too, by polynomials through
+Chebyshev-Lobatto nodes (the ends of a piece among them), in a coordinate in which lens quantities are nearly straight.
+`weights` does it with numbers, `state_graph` in a graph.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base.errors import InputError
+from neurolens.graph.ir import Graph, Value
+from neurolens.graph.program import Mixture
+from neurolens.graph.scalars import lower
 
 Array = NDArray[np.float64]
-
-# Relative slack of a state's range, of its largest magnitude: the rounding of float32 inputs, and no more.
-STATE_SLACK = 1e-5
-MOST_NODES = 64
+STATE = "state"  # name of a graph's input
+_SLACK = 1e-5  # of a state's range, relative to its largest magnitude: the rounding of float32 inputs, and no more
+_MOST_NODES = 64
 
 
 @dataclass(frozen=True)
@@ -51,8 +55,8 @@ class Axis:
             raise InputError("state", "knots", self.knots, "two or more finite numbers, rising")
         if self.reciprocal and not self.knots[0] > 0:
             raise InputError("state", "knots", self.knots, "numbers above 0, of which there is a reciprocal")
-        if not (self.degree >= 1 and (len(self.knots) - 1) * self.degree < MOST_NODES):
-            raise InputError("state", "degree", self.degree, f"at least 1, and fewer than {MOST_NODES} nodes in all")
+        if not (self.degree >= 1 and (len(self.knots) - 1) * self.degree < _MOST_NODES):
+            raise InputError("state", "degree", self.degree, f"at least 1, and fewer than {_MOST_NODES} nodes in all")
 
     @property
     def range(self) -> tuple[float, float]:
@@ -62,17 +66,17 @@ class Axis:
     @property
     def limits(self) -> tuple[float, float]:
         """Least and largest value accepted: the range with its slack."""
-        slack = STATE_SLACK * max(abs(v) for v in self.range)
+        slack = _SLACK * max(abs(v) for v in self.range)
         return self.range[0] - slack, self.range[1] + slack
 
     @cached_property
     def nodes(self) -> tuple[float, ...]:
         """[K] ascending values, the knots among them bit for bit."""
-        places = [math.cos(math.pi * (1 - j / self.degree)) for j in range(1, self.degree)]
+        cosines = [math.cos(math.pi * (1 - j / self.degree)) for j in range(1, self.degree)]
         values = [self.knots[0]]
         for low, high in zip(self.knots, self.knots[1:], strict=False):
             a, b = (self._coordinate(v) for v in (low, high))
-            inner = [(a + b) / 2 + (b - a) / 2 * t for t in places]
+            inner = [(a + b) / 2 + (b - a) / 2 * t for t in cosines]
             values += [1 / v if self.reciprocal else v for v in inner]
             values.append(high)
         return tuple(values)
@@ -88,11 +92,10 @@ class Axis:
         return 1 / value if self.reciprocal else value
 
     def features(self, value: float) -> Array:
-        """[K] basis of the interpolation: 1, then T_j(t) - T_j(-1), j = 1 to the degree, of each piece in turn.
+        """[K] basis of the interpolation: 1, then T_1(t) - T_1(-1) of each piece, then T_2(t) - T_2(-1), and so on.
 
-        T_j are Chebyshev polynomials, t is the piece's own coordinate. Whole degrees of all pieces stand together:
-        degree 1 of every piece, then degree 2. Every function that is a polynomial on each piece and continuous is a
-        sum of these.
+        T_j are Chebyshev polynomials, t is the coordinate of the piece. Every continuous function that is a polynomial
+        on each piece is a sum of these.
         """
         factor, offset = self.pieces
         t = np.clip(factor * self._coordinate(value) + offset, -1, 1)
@@ -138,10 +141,7 @@ class Axis:
 
 def product(axes: Sequence[Axis]) -> list[tuple[float, ...]]:
     """The nodes of all axes together, the last axis fastest."""
-    found: list[tuple[float, ...]] = [()]
-    for axis in axes:
-        found = [(*state, v) for state in found for v in axis.nodes]
-    return found
+    return list(itertools.product(*(axis.nodes for axis in axes)))
 
 
 def weights(axes: Sequence[Axis], state: Sequence[float]) -> Array:
@@ -152,7 +152,73 @@ def weights(axes: Sequence[Axis], state: Sequence[float]) -> Array:
     """
     if len(state) != len(axes):
         raise InputError("state", "state", tuple(state), f"{len(axes)} numbers: {', '.join(a.name for a in axes)}")
-    found: Array = np.ones(1)
-    for axis, value in zip(axes, state, strict=True):
-        found = np.asarray(np.kron(found, axis.weights(value)), dtype=np.float64)
-    return found
+    return _kron(axis.weights(value) for axis, value in zip(axes, state, strict=True))
+
+
+def _kron(arrays: Iterable[Array]) -> Array:
+    """Kronecker's product of them all."""
+    total: Array = np.ones(1)
+    for array in arrays:
+        total = np.asarray(np.kron(total, array), np.float64)
+    return total
+
+
+def state_numbers(axes: Sequence[Axis], state: ArrayLike) -> tuple[float, ...]:
+    """The numbers of a state, in range or not.
+
+    Raises:
+        InputError: another number of values than axes, or no numbers.
+    """
+    try:
+        values = tuple(float(v) for v in np.atleast_1d(np.asarray(state, np.float64)))
+    except (TypeError, ValueError):
+        values = ()
+    if not axes or len(values) != len(axes):
+        expected = f"{len(axes)} numbers ({', '.join(a.name for a in axes) or 'a model of one state'})"
+        raise InputError("OnnxLens.rays", "state", state, expected)
+    return values
+
+
+def state_names(axes: Sequence[Axis]) -> tuple[str, ...]:
+    """Names of the state's numbers as arguments of functions: `zoom_mm`, `focus_per_m`."""
+    return tuple(f"{a.name}_{a.unit.replace('1/', 'per_')}" for a in axes)
+
+
+def state_graph(axes: Sequence[Axis]) -> tuple[Graph, Array]:
+    """The graph of a state, and the matrix [K, nodes] by which its features become the weights of the nodes.
+
+    Input `state` [A] of the call. Outputs: `features` [K], the products of the axes' features, those of the last axis
+    fastest; `inside`, whether the state lies in its range.
+    """
+    g = Graph()
+    state = g.input(STATE, len(axes), per_call=True)
+    low, high = zip(*(a.limits for a in axes), strict=True)
+    within = state.between(low, high)
+    inside, features = within[0], _axis_features(axes[0], state[0])
+    for k, axis in enumerate(axes[1:], 1):
+        inside, further = inside & within[k], _axis_features(axis, state[k])
+        # Kronecker's product: every feature so far times every one of this axis.
+        firsts = np.repeat(np.arange(features.rows), further.rows).tolist()
+        seconds = np.tile(np.arange(further.rows), features.rows).tolist()
+        features = g.take(features, firsts) * g.take(further, seconds)
+    g.outputs = {"features": features, "inside": inside}
+    return g, _kron(axis.to_features for axis in axes)
+
+
+def mixture_of(axes: Sequence[Axis]) -> Mixture:
+    """How a program with a table for each node follows the state, whose numbers are arguments (`state_names`)."""
+    graph, transform = state_graph(axes)
+    g = Graph()
+    g.outputs = g.inline(graph, {STATE: g.concat(*(g.input(name, per_call=True) for name in state_names(axes)))})
+    return Mixture(lower(g), transform)
+
+
+def _axis_features(axis: Axis, value: Value) -> Value:
+    """[K rows] as `Axis.features`, T_j by their recurrence."""
+    g, (factor, offset) = value.graph, axis.pieces
+    coordinate = 1.0 / value if axis.reciprocal else value
+    t = (coordinate * factor + offset).clip(-1.0, 1.0)
+    chebyshev = [g.constant(np.ones_like(factor)), t]
+    for _ in range(2, axis.degree + 1):
+        chebyshev.append((t + t) * chebyshev[-1] - chebyshev[-2])
+    return g.concat(g.constant(1.0), *(c + -((-1.0) ** j) for j, c in enumerate(chebyshev) if j))

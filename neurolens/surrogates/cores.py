@@ -87,10 +87,10 @@ class Units:
 
 @dataclass(frozen=True)
 class CoreValues:
-    """What a core gives: three vectors (2 rows each), transmittance, gates (a row each; None without any).
+    """The outputs of a core: three vectors (2 rows each), transmittance, gates (a row each; None without any).
 
-    `unit`: where a core gives it, the unit direction (3 rows) itself, which then stands for `vectors[DIRECTION]`.
-    `index`: where a core gives it, its direction is that inside the front glass, which has this index: see `Refracted`.
+    `unit`: the unit direction (3 rows) where a core gives it instead of `vectors[DIRECTION]`. `index`: the index of the
+    front glass, where the direction is that inside it (see `Refracted`).
     """
 
     vectors: tuple[Value, Value, Value]
@@ -182,7 +182,7 @@ def symmetric(rows: Value, field: Field, scalars: int) -> CoreValues:
 
 
 class _Polynomial(Core):
-    """What the three polynomials share: exponents whose last column is that of w, and tables over the terms."""
+    """Base of the three polynomials: exponents, whose last column is that of w, and tables over the terms."""
 
     exponents: Exponents
     scalars: Array

@@ -1,4 +1,4 @@
-"""The rays that a surrogate is asked to know: film, pupil, wavelengths and film positions (focus)."""
+"""Domains: the camera rays (film, pupil, wavelengths, film positions) that a surrogate stands for; samples."""
 
 from __future__ import annotations
 
@@ -19,21 +19,17 @@ from neurolens.setting.pupils import image_radius_mm, pupil_bounds
 from neurolens.setting.states import set_lens
 from neurolens.surrogates.model import Domain
 
-# The disc on the pupil plane is that of all passing rays, enlarged by this much (design: "enlarged by 5%").
-PUPIL_MARGIN = 1.05
-
+_PUPIL_MARGIN = 1.05  # of the disc on the pupil plane beyond that of all passing rays
 # Film positions of sampled rays, both limits of focus among them: a picture has one film position, and so has a call of
 # an exported model.
-FILM_PLANES = 17
-
-# Where the boxes about what passes hold less than this share of the domain, rays are drawn from them.
+_FILM_PLANES = 17
+# Where the boxes around passing rays hold less than this share of the domain, rays are drawn from the boxes.
 SPARSE = 0.3
-# Boxes are drawn from with this share of their half width more on every side: rays that a rim just blocks are wanted.
+# Boxes are enlarged by this share of their half width on every side, so that rays just beyond a rim are among them.
 _BOX_MARGIN = 0.15
 _EDGE = 0.03  # of the film radius
-
-# Another pupil plane is taken where so many times more of the disc passes there; the planes tried are so much further
-# from the film each than the one before, out to so many focal lengths.
+# Another pupil plane is taken where so many times more of the disc passes; each plane tried is this factor further from
+# the film than the one before, out to so many focal lengths.
 _BETTER, _STEP, _REACH = 1.25, 1.02, 20
 
 
@@ -58,6 +54,9 @@ class FilmRays:
 
     def select(self, index: Tensor | slice) -> FilmRays:
         return FilmRays(*(c[index] for c in self.columns()))
+
+    def to(self, dtype: torch.dtype) -> FilmRays:
+        return FilmRays(*(c.to(dtype) for c in self.columns()))
 
     def columns(self) -> tuple[Tensor, ...]:
         return (self.film_x, self.film_y, self.film_z, self.pupil_x, self.pupil_y, self.wavelength_nm)
@@ -98,18 +97,20 @@ def domain_of(
         raise InputError("domain", "wavelength_nm", wavelength_nm, expected)
     if not lens.dispersive:
         low = high = lens.reference_nm
-    planes = sorted(film_z_mm or _film_planes_mm(lens, focus_m, (low, high)))
+    # At both distances the paraxial image and the best focus at every aperture.
+    planes = film_z_mm or [z for distance in focus_m for z in film_range_mm(lens, distance, (low, high))]
+    travel = (min(planes), max(planes))
     radius = film_radius_mm if film_radius_mm is not None else image_radius_mm(lens)[0]
-    bounds = pupil_bounds(lens, radius, (planes[0], planes[-1]), (low, high), pupil_z_mm=pupil_z_mm)
-    plane = _best_plane_z_mm(lens, bounds, planes[0]) if pupil_z_mm is None else pupil_z_mm
+    bounds = pupil_bounds(lens, radius, travel, (low, high), pupil_z_mm=pupil_z_mm)
+    plane = _best_plane_z_mm(lens, bounds, travel[0]) if pupil_z_mm is None else pupil_z_mm
     if plane != bounds.pupil_z_mm:
-        bounds = pupil_bounds(lens, radius, (planes[0], planes[-1]), (low, high), pupil_z_mm=plane)
+        bounds = pupil_bounds(lens, radius, travel, (low, high), pupil_z_mm=plane)
     return Domain(
         film_radius_mm=radius,
-        film_z_mm=(planes[0], planes[-1]),
+        film_z_mm=travel,
         focus_m=(max(focus_m), min(focus_m)),
         pupil_z_mm=bounds.pupil_z_mm,
-        pupil_radius_mm=PUPIL_MARGIN * bounds.disc_mm,
+        pupil_radius_mm=_PUPIL_MARGIN * bounds.disc_mm,
         wavelength_nm=(low, high),
         stop_radius_mm=lens.stop_radius_mm,
         bounds=bounds,
@@ -117,18 +118,12 @@ def domain_of(
     )
 
 
-def _film_planes_mm(lens: Lens, focus_m: tuple[float, float], wavelength_nm: tuple[float, float]) -> list[float]:
-    """Ends of the film's travel: at both distances the paraxial image and the best focus at every aperture."""
-    ends = (film_range_mm(lens, f, wavelength_nm) for f in focus_m)
-    return [z for end in ends for z in end]
-
-
 def _best_plane_z_mm(lens: Lens, bounds: PupilBounds, film_z_mm: float) -> float:
-    """The plane of `bounds`, or that on which one disc holds the passing rays of all film points most tightly.
+    """The plane of `bounds`, or the one on which a disc holds the passing rays of all film points most tightly.
 
-    The pupil of a fisheye or of a condenser walks as the film point moves, and that of a lens almost telecentric on
-    the film's side lies far away: then the paraxial exit pupil, or the rear vertex in its place, needs a disc that is
-    mostly dark. Rays are straight behind the lens, so that what is known on one plane is known on all.
+    The pupil of a fisheye or of a condenser walks as the film point moves, and the pupil of a lens that is almost
+    telecentric on the film's side lies far away: on the plane of the paraxial exit pupil, or of the rear vertex in its
+    place, most of the disc is dark. Rays are straight behind the lens, so that boxes on one plane give those on all.
     """
     here = film_z_mm - bounds.pupil_z_mm
     rows = zip(bounds.low_mm, bounds.high_mm, bounds.half_mm, strict=True)
@@ -158,16 +153,13 @@ def domain_from_camera(
     wavelength_nm: tuple[float, float] | None = None,
     nearest_m: float | None = None,
 ) -> tuple[Lens, Domain]:
-    """Only what one shot requires: its film crop, stop, focus and wavelengths. Returns the stopped lens and its domain.
+    """The stopped lens and the domain of one shot alone: its film crop, stop, focus and wavelengths.
 
     The lit film may be smaller than the crop (fisheyes); the smaller radius rules. `nearest_m` is the distance from the
-    film of the nearest object in view: objects before the plane in focus keep their place then.
+    film of the nearest object in view, so that fits count errors of position for objects before the plane in focus.
     """
-    stopped = (
-        set_lens(lens, f_number=f_number, focus_m=focus_m) if f_number is not None else set_lens(lens, focus_m=focus_m)
-    )
-    corner = math.hypot(*film_mm) / 2
-    radius = min(corner, image_radius_mm(lens)[0])
+    stopped = set_lens(lens, f_number=f_number, focus_m=focus_m)
+    radius = min(math.hypot(*film_mm) / 2, image_radius_mm(lens)[0])
     focus = (focus_m, focus_m)
     return stopped, domain_of(
         stopped, film_radius_mm=radius, focus_m=focus, wavelength_nm=wavelength_nm, nearest_m=nearest_m
@@ -185,7 +177,7 @@ def focused_plane_z_mm(lens: Lens, film_z: Tensor) -> Tensor:
 
 
 def sample_domain(domain: Domain, count: int, seed: int, skip: int = 0) -> FilmRays:
-    """Rays of a domain: uniform on the film and pupil discs and in wavelength, film positions in `FILM_PLANES` steps.
+    """Rays of a domain: uniform on the film and pupil discs and in wavelength, film positions in `_FILM_PLANES` steps.
 
     Scrambled Sobol points (Owen scrambling, torch): the same seed gives the same rays; `skip` continues the sequence,
     so that splits never share a ray.
@@ -203,8 +195,8 @@ def _drawn(domain: Domain, count: int, seed: int, skip: int) -> tuple[Tensor, Te
         engine.fast_forward(skip)
     s = engine.draw(count, dtype=torch.float64).T
     (near, far), (low, high) = domain.film_z_mm, domain.wavelength_nm
-    step = torch.floor(s[5] * FILM_PLANES).clamp_max(FILM_PLANES - 1)
-    return s[:4], near + (far - near) * step / (FILM_PLANES - 1), low + (high - low) * s[4]
+    step = torch.floor(s[5] * _FILM_PLANES).clamp_max(_FILM_PLANES - 1)
+    return s[:4], near + (far - near) * step / (_FILM_PLANES - 1), low + (high - low) * s[4]
 
 
 def _disc(a: Tensor, b: Tensor, radius: float) -> tuple[Tensor, Tensor]:
@@ -213,15 +205,17 @@ def _disc(a: Tensor, b: Tensor, radius: float) -> tuple[Tensor, Tensor]:
 
 
 def draw(domain: Domain, count: int, seed: int, skip: int = 0) -> tuple[FilmRays, float]:
-    """Rays of a domain, uniform where any passes, at most `count`; and how many of `sample_domain` they stand for."""
+    """At most `count` rays of a domain, uniform where any passes, and the number of uniform rays they stand for."""
     if lit_share(domain) < SPARSE:
         return sample_lit(domain, count, seed, skip)
     return sample_domain(domain, count, seed, skip), float(count)
 
 
 def draw_everywhere(domain: Domain, count: int, seed: int) -> FilmRays:
-    """Rays that show what blocks light: of the whole domain, where little of it passes as many about what does, and a
-    tenth as many from the edge of the first and the last film plane, where a rim may just begin to block.
+    """Rays that meet everything that blocks light.
+
+    They are uniform over the domain; where little of it passes, as many lie near the passing rays; and a tenth as many
+    start at the edge of the first and the last film plane, where a rim may just begin to block.
     """
     rays = [sample_domain(domain, count, seed)]
     if lit_share(domain) < SPARSE:
@@ -235,10 +229,10 @@ def draw_everywhere(domain: Domain, count: int, seed: int) -> FilmRays:
 
 
 def sample_lit(domain: Domain, count: int, seed: int, skip: int = 0) -> tuple[FilmRays, float]:
-    """Rays like those of `sample_domain`, of which only those near `Domain.bounds` are drawn.
+    """Rays of the same distribution as `sample_domain`, but from the boxes of `Domain.bounds` alone.
 
-    Returns fewer than `count` rays, for the corners of a box may lie outside the disc; and how many rays of
-    `sample_domain` they stand for.
+    Returns fewer than `count` rays, because the corners of a box may lie outside the disc; and the number of rays of
+    `sample_domain` that they stand for.
     """
     edges, low, high, half, area = _boxes(domain)
     weight = (edges[1:] ** 2 - edges[:-1] ** 2) * area
@@ -262,7 +256,7 @@ def lit_share(domain: Domain) -> float:
 
 
 def _boxes(domain: Domain) -> tuple[Tensor, ...]:
-    """Edges of rings of the film [K + 1]; of each the box about what passes, enlarged: low, high, half, area [K]."""
+    """Edges of rings of the film [K + 1]; the enlarged box of each ring's passing rays: low, high, half, area [K]."""
     b = domain.bounds
     low, high, half = (torch.tensor(v, dtype=torch.float64) for v in (b.low_mm, b.high_mm, b.half_mm))
     dark = low >= high

@@ -1,8 +1,8 @@
-"""A model file is its coefficients: what a model is made of, as compact JSON in an ONNX file's metadata.
+"""The coefficients of a model file: compact JSON in an ONNX file's metadata, from which the model is built again.
 
 An exported file is a complete ONNX model that any program runs. This package reads the card and the coefficients alone,
 checks them, and builds the graph again, which onnxruntime, C, GLSL and numpy then run; it does so without torch.
-Coefficients are kept in float32; floats of the prescription and of the encoding in float64, exactly.
+Coefficients are float32; floats of the prescription and of the encoding are float64, exactly.
 """
 
 from __future__ import annotations
@@ -29,14 +29,19 @@ from neurolens.graph.onnx import Mixing, write_onnx
 from neurolens.graph.program import RAY
 from neurolens.lens.prescription import Coating, Lens, Surface
 from neurolens.surrogates.assemble import ONNX, model_graph
-from neurolens.surrogates.axes import Axis, weights
-from neurolens.surrogates.cardcheck import check_card, tolerances
-from neurolens.surrogates.cardkeys import MODEL_KEY, transmittance_of
-from neurolens.surrogates.cardstates import axes_of, default_state
+from neurolens.surrogates.axes import Axis, state_graph, weights
+from neurolens.surrogates.card import (
+    MODEL_KEY,
+    axes_of,
+    card_in,
+    check_card,
+    default_state,
+    read_metadata,
+    transmittance_of,
+)  # fmt: skip
 from neurolens.surrogates.cores import CORES, Core
-from neurolens.surrogates.metadata import card_in, read_metadata
-from neurolens.surrogates.model import Domain, Encoding, Gate, LensModel, Scales, mixed, with_one_angle
-from neurolens.surrogates.stategraph import state_graph
+from neurolens.surrogates.lightfield import Encoding
+from neurolens.surrogates.model import Domain, Gate, LensModel, Scales, mixed, with_one_angle
 
 SCHEMA = 2
 _ONE_NODE = 1  # an earlier schema: one state, and no angle
@@ -45,17 +50,18 @@ _MAX_DEPTH = 16  # of cores in cores
 _MAX_CORES = 1000  # of one file
 _MAX_ROWS = 20_000  # of any array: terms, or units of a layer
 _MAX_DEGREE = 64  # of any term; settings allow half, and growth without limit stays far below
-_MAX_RAYS = 1000  # of the card's reference; `card.reference_rays` gives 4 a status
+_MAX_RAYS = 1000  # of the card's reference; `export.reference_rays` gives 4 a status
 _MAX_NODES = 256  # states of one model
-# Of a model: terms and units, each of which is a row for every ray; numbers; and ways in which terms are products of
-# two others, all of which a writer compares. The largest that settings allow have 5,000, 1.9 and one million.
+# Limits of a model: terms and units, each of which is a row for every ray; numbers; and products of two terms that are
+# terms, all of which a writer compares. The largest models that settings allow have 5,000, 1.9 and one million.
 _MAX_WORK, _MAX_WEIGHTS, _MAX_PRODUCTS = 10_000, 2_000_000, 3_000_000
 _MAX_SURFACES, _MAX_TERMS, _MAX_POWER = 500, 1000, 40  # of a prescription, as `readers.lensfile` has them
 _LENS = ("name", "source", "f_number", "image_radius_mm", "half_field_deg", "designer", "rims", "film_z_mm", "path")
-_NOWHERE = -1.0  # A film position in no domain: it takes the place of the film where the state is out of range.
+_NOWHERE = -1.0  # a film position in no domain, which replaces that of the call where the state is out of range
 DERIVATIVES = {"scene_ray_d_film": RAY[:2], "scene_ray_d_pupil": RAY[2:]}
-# RecursionError: of lists in lists.
 _DAMAGE = (ValueError, TypeError, KeyError, IndexError, ArithmeticError, AttributeError, AssertionError, RecursionError)
+# Errors of reference rays that are allowed at least; of position and stop crossing, for each mm of the focal length.
+_OFF = 1e-5
 
 
 @dataclass(frozen=True)
@@ -120,38 +126,32 @@ def _nodes(file: Path, card: Mapping[str, Any], data: Mapping[str, Any]) -> tupl
     parts = [data] if data["schema"] == _ONE_NODE else data["nodes"]
     if len(parts) != len(domains) or len(parts) > _MAX_NODES:
         raise ValueError(f"{len(parts)} nodes, expected {len(domains)}, at most {_MAX_NODES}")
-    lens, gates = unpacked_lens(data["lens"]), tuple(Gate(int(k), int(r)) for k, r in data["gates"])
+    lens = unpacked_lens(data["lens"])
     if not states and lens.sha256 != card["lens"]["sha256"]:
         raise ModelError(f"{file}: its prescription is not that of its card")
-    common = LensModel(
-        lens=lens,
-        domain=Domain.from_dict(card["domain"]),
-        encoding=_numbers(Encoding, parts[0]["encoding"]),
-        scales=_numbers(Scales, data["scales"]),
-        gates=gates,
-        core=unpack(parts[0]["core"]),
-        method=str(card["fit"]["method"]),
-        settings=dict(card["fit"]["settings"]),
-        fit_s=float(card["fit"]["seconds"]),
-        direction="slope" if data["direction"] == "slope" else "angle",
-        transmittance=transmittance_of(card),
-        angle=float(data.get("angle", math.pi)),
-    )
-    if "angle" not in data:
-        common = _traced(file, common)
-    if not 0 < common.angle <= math.pi:
-        raise ValueError(f"angle: got {common.angle!r}, expected above 0, up to pi")
-    nodes = tuple(
-        replace(
-            common,
+    nodes = [
+        LensModel(
+            lens=lens,
             domain=Domain.from_dict(domain),
             encoding=_numbers(Encoding, part["encoding"]),
+            scales=_numbers(Scales, data["scales"]),
+            gates=tuple(Gate(int(surface), int(reason)) for surface, reason in data["gates"]),
             core=unpack(part["core"]),
+            method=str(card["fit"]["method"]),
+            settings=dict(card["fit"]["settings"]),
+            fit_s=float(card["fit"]["seconds"]),
+            direction="slope" if data["direction"] == "slope" else "angle",
+            transmittance=transmittance_of(card),
+            angle=float(data.get("angle", math.pi)),
         )
         for part, domain in zip(parts, domains, strict=True)
-    )
+    ]
     check_size(nodes[0].core)
-    return nodes
+    if "angle" not in data:
+        nodes = [_traced(file, node) for node in nodes]
+    if not 0 < nodes[0].angle <= math.pi:
+        raise ValueError(f"angle: got {nodes[0].angle!r}, expected above 0, up to pi")
+    return tuple(nodes)
 
 
 def check_size(core: Any) -> None:
@@ -195,9 +195,9 @@ def _traced(file: Path, model: LensModel) -> LensModel:
 def _check_reference(model: ModelFile) -> None:
     """Compute the card's reference rays, at every state that has some: a changed coefficient shows."""
     states = model.card.get("states") or {}
-    known = [(default_state(model.card), model.card.get("reference"))]
-    known += [(tuple(r["state"]), r) for r in states.get("reference", ())]
-    for state, reference in known:
+    references = [(default_state(model.card), model.card.get("reference"))]
+    references += [(tuple(r["state"]), r) for r in states.get("reference", ())]
+    for state, reference in references:
         try:
             _check_rays(model, state, reference)
         except ModelError:
@@ -207,30 +207,33 @@ def _check_reference(model: ModelFile) -> None:
 
 
 def _check_rays(model: ModelFile, state: Sequence[float], reference: Any) -> None:
-    rays = np.array(reference["rays"], np.float64)
-    status = np.array(reference["status"])
-    wanted = {
-        k: np.atleast_2d(np.array(reference[k], np.float64)) for k in ("scene_ray", "transmittance", "stop_xy_mm")
-    }
+    rays, status = np.array(reference["rays"], np.float64), np.array(reference["status"])
     if rays.shape != (5, len(status)) or len(status) > _MAX_RAYS:
         raise ValueError(f"rays of shape {rays.shape}, expected 5 rows, and at most {_MAX_RAYS} columns as of status")
-    given = {
+    inputs = {
         "rays": rays,
         "film_z_mm": np.array(reference["film_z_mm"], np.float64).reshape(1, -1)[:, :1],
         "stop_radius_mm": np.full((1, 1), float(reference["stop_radius_mm"])),
     }
-    found = evaluate(model.at(state).graph, given)
-    same = np.broadcast_to(found["status"], (1, len(status)))[0] == status
+    outputs = evaluate(model.at(state).graph, inputs)
+    same = np.broadcast_to(outputs["status"], (1, len(status)))[0] == status
     passed = status == st.PASSED
     if not same.all() or not passed.any():
         raise ModelError(f"{model.path}: reference rays: the status of {int((~same).sum())} is not that of its card")
-    try:
-        position, direction, power, stop = tolerances(model.card, reference).values()
+    mm = _OFF * max(1.0, abs(float(model.card["lens"]["efl_mm"])))
+    rounding = {"position_mm": mm, "direction": _OFF, "transmittance": _OFF, "stop_mm": mm}
+    try:  # the card says where float32 costs more
+        stated = reference.get("rounding") or {}
+        rounding = {name: max(least, float(stated.get(name, 0.0))) for name, least in rounding.items()}
+        if not all(map(math.isfinite, rounding.values())):
+            raise ValueError("not finite")
     except (AttributeError, TypeError, ValueError) as error:
         raise ValueError(f"rounding: {error}") from error
+    position, direction, power, stop = rounding.values()
     allowed = {"scene_ray": [[position]] * 3 + [[direction]] * 3, "transmittance": [[power]], "stop_xy_mm": [[stop]]}
     for name, limit in allowed.items():
-        off = np.abs(np.broadcast_to(found[name], wanted[name].shape) - wanted[name])[:, passed]
+        wanted = np.atleast_2d(np.array(reference[name], np.float64))
+        off = np.abs(np.broadcast_to(outputs[name], wanted.shape) - wanted)[:, passed]
         if not (off <= limit).all():  # NaN fails
             raise ModelError(
                 f"{model.path}: reference rays: {name} is off by {off.max():.3g}: its coefficients are damaged"
@@ -259,7 +262,7 @@ def onnx_of(
     if derivatives:
         graphs = [_with_ray_derivatives(graph) for graph in graphs]
         shapes = dict.fromkeys(DERIVATIVES, (2, 6))
-    return write_onnx(graphs, metadata or {}, mixing_of(axes) if axes else None, shapes)
+    return write_onnx(graphs, metadata or {}, _mixing_of(axes) if axes else None, shapes)
 
 
 def _with_ray_derivatives(graph: Graph) -> Graph:
@@ -269,7 +272,7 @@ def _with_ray_derivatives(graph: Graph) -> Graph:
     return graph
 
 
-def mixing_of(axes: Sequence[Axis]) -> Mixing:
+def _mixing_of(axes: Sequence[Axis]) -> Mixing:
     """How constants follow the state; one out of range puts the film where no domain is."""
     g, transform = state_graph(axes)
     film_z = g.input("film_z_mm", per_call=True)
@@ -352,7 +355,7 @@ def pack(value: Any) -> Any:
 
 
 def unpack(packed: Any) -> Any:
-    """What `pack` packed. Raises ValueError, KeyError, TypeError: it is damaged, or larger than files may be."""
+    """The inverse of `pack`. Raises ValueError, KeyError, TypeError: damaged, or larger than files may be."""
     return _unpacked(packed, 0, [_MAX_CORES])
 
 
@@ -390,7 +393,7 @@ def _numbers(kind: Any, packed: dict[str, Any]) -> Any:
 
 
 def packed_lens(lens: Lens) -> dict[str, Any]:
-    """What stands in a prescription but for its other states and notes; numbers as they are, infinity as a word."""
+    """A prescription without its other states and notes; numbers as they are, infinity as a word."""
     rows = []
     for surface in lens.surfaces:
         row = {}
@@ -415,7 +418,7 @@ def _plain(value: Any) -> Any:
 
 
 def unpacked_lens(packed: dict[str, Any]) -> Lens:
-    """What `packed_lens` packed. Raises ValueError, KeyError, TypeError: it is damaged, or larger than lenses are."""
+    """The inverse of `packed_lens`. Raises ValueError, KeyError, TypeError: damaged, or larger than lenses are."""
     surfaces: list[Surface] = []
     if len(packed["surfaces"]) > _MAX_SURFACES:
         raise ValueError(f"{len(packed['surfaces'])} surfaces, expected at most {_MAX_SURFACES}")

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, NeurolensWarning
-from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.cores import (
     Core,
     InvariantPolynomial,
@@ -26,18 +25,25 @@ from neurolens.surrogates.cores import (
     Residual,
 )
 from neurolens.surrogates.domain import FilmRays, draw_everywhere
-from neurolens.surrogates.fits.checkpoint import of_zone, spent_s
-from neurolens.surrogates.fits.front import grazes, index_series, inside_front
-from neurolens.surrogates.fits.mirror import fit_mirror
-from neurolens.surrogates.fits.network import fit_network, with_boundary_terms
-from neurolens.surrogates.fits.planes import fit_planes
-from neurolens.surrogates.fits.polynomial import fit_paraxial, fit_polynomial
+from neurolens.surrogates.fits.network import fit_network, of_zone, training_s, with_boundary_terms
+from neurolens.surrogates.fits.polynomial import fit_mirror, fit_paraxial, fit_planes, fit_polynomial
 from neurolens.surrogates.gates import choose_gates, explained
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.pairs import RayPairs, join_pairs, trace_pairs, with_angle
-from neurolens.surrogates.settings import NETWORKS, PLANES_SEARCHED, POLYNOMIALS, ModelSettings
-from neurolens.surrogates.specialise import without_idle_gates
-from neurolens.surrogates.targets import Prepared, fit_encoding, scales_of, squared_error
+from neurolens.surrogates.pairs import RayPairs, join_pairs, trace_pairs, with_angle, without_idle_gates
+from neurolens.surrogates.targets import (
+    NETWORKS,
+    PLANES_SEARCHED,
+    POLYNOMIALS,
+    ModelSettings,
+    Prepared,
+    fit_encoding,
+    grazes,
+    index_series,
+    inside_front,
+    scales_of,
+    squared_error,
+)  # fmt: skip
+from neurolens.surrogates.terms import pinned_threads
 from neurolens.trace.rays import CHUNK
 
 # Rays drawn over the domain to find what blocks anything: a share of 1e-4 is 20 of them.
@@ -53,7 +59,7 @@ def prepare(pairs: RayPairs) -> Prepared:
     """Find the encoding, and the rims and discriminants that block anything in the domain.
 
     Warns:
-        NeurolensWarning: more than one ray in 10,000 is lost in a way that no gate can tell (beyond 90 degrees to a
+        NeurolensWarning: more than one ray in 10,000 is lost in a way that no gate shows (beyond 90 degrees to a
             plane, or on the far half of a sphere).
     """
     seed = pairs.settings.seed + 1_000_003
@@ -72,11 +78,11 @@ def prepare(pairs: RayPairs) -> Prepared:
     if lost > 1e-4:
         warnings.warn(
             f"{pairs.lens.path}: {100 * lost:.2f}% of the domain's rays end by missing a surface or by total "
-            "reflection in a way that no gate can tell; the rims near by stand in for that boundary",
+            "reflection in a way that no gate shows; the rims near by stand in for that boundary",
             NeurolensWarning,
             stacklevel=2,
         )
-    return Prepared(pairs, fit_encoding(pairs.domain, pairs.train, mirror=pairs.lens.anamorphic), gates, lost)
+    return Prepared(pairs, fit_encoding(pairs.domain, pairs.train, mirror=pairs.lens.anamorphic), gates)
 
 
 def fit_model(
@@ -90,7 +96,7 @@ def fit_model(
 
     Args:
         checkpoint: file in which the training of networks keeps its state, to go on from there after a kill (see
-            `fit_network`). It stays when the fit has ended; `checkpoint.clear` removes it.
+            `fit_network`). It stays when the fit has ended; `clear_training` removes it.
 
     Raises:
         InputError: an unknown method, or settings that the method refuses.
@@ -106,7 +112,7 @@ def fit_model(
         core = _fit_core(replace(prepared, pairs=shown, encoding=encoding), settings, progress, checkpoint)
         if refracts:
             core = Refracted((core,), index_series(pairs.lens, encoding))
-    fit_s = max(time.perf_counter() - start, spent_s(checkpoint))
+    fit_s = max(time.perf_counter() - start, training_s(checkpoint))
     model = as_model(replace(prepared, encoding=encoding), core, settings, fit_s)
     return without_idle_gates((model,), settings.idle_gates)[0] if settings.idle_gates else model
 

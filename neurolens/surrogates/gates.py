@@ -1,8 +1,8 @@
-"""Boundaries that block rays: which rims and discriminants a model must test, their exact values, and rays near them.
+"""Gates: the rims and discriminants that a model must test, their exact values, and the rays near them.
 
-A rim is tested on the ray's crossing with it. Where rays end by missing a surface or by total reflection there is no
-crossing; there the sign of what stands under the square root (of the intersection, or of Snell's law) decides. It is
-smooth across the boundary, for it depends only on the ray that arrives.
+A rim is tested at the ray's crossing with its surface. A ray that misses a surface or is totally reflected has no
+crossing; there the sign of the discriminant decides (of the intersection, or of Snell's law). It is smooth across the
+boundary, because it depends only on the ray that arrives.
 """
 
 from __future__ import annotations
@@ -29,13 +29,6 @@ BOUNDARY_WIDTH = 0.03
 # The stop crossing is wanted to the same share of the opening down to this one, in stop radii: four stops.
 STOPPED_DOWN = 0.25
 
-# A far ray that a fit lets pass is given this value of a gate, or its own where that is less than a rim radius twice
-# over; first with this weight, which doubles while it still passes, up to the last.
-_TARGET, _MOST_TARGET = 0.1, 1.0
-_WEIGHT, _MOST_WEIGHT = 0.03, 1.0
-_ROUNDS = 8
-_RIDGE, _DEPENDENT = 1e-13, 1e-12  # relative
-
 
 def gate_reach(gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
     """[G, N] bool: rays of which the gate's value is known, because they get as far as its surface (and to its rim)."""
@@ -59,10 +52,10 @@ def gate_values(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
 
 
 def _beyond_rim(surface: Surface, height: Tensor) -> Tensor:
-    """[N] a rim's gate at crossings `height` [N] mm from the axis: squares over the rim's, less 1.
+    """[N] a rim's gate at crossings `height` [N] mm from the axis: the height's square over the rim's, less 1.
 
-    Where the rays that tell of a rim go on to its sphere's equator the square turns there, and a fit of it tells
-    nothing: there it is the depth over the rim's, which to first order is the same and never turns.
+    On a sphere whose equator lies within reach of the rays near the rim, the square turns back there and cannot be
+    fitted. The gate is then the depth over the rim's depth, less 1, which agrees to first order and never turns.
     """
     if not (is_deep(surface) and RIM_REACH * rim_sine(surface) > 1):
         return height**2 / surface.semi_diameter_mm**2 - 1
@@ -74,11 +67,11 @@ def _beyond_rim(surface: Surface, height: Tensor) -> Tensor:
 
 
 def boundary_weights(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> tuple[Tensor, Tensor]:
-    """What rays of `boundary_rays` count in the fits of the gates [G, N] and of the stop crossing [N].
+    """Weights of the rays of `boundary_rays` in the fits of the gates [G, N] and of the stop crossing [N].
 
-    A gate decides where its value is near 0 and no other boundary stops the ray; the stop crossing counts wherever the
-    ray passes, for the stop may be closed, and the more the nearer to the middle, for an error there is to a smaller
-    opening. Rays lost before a boundary say nothing of it and weigh 0.
+    A gate decides where its value is near 0 and no other boundary stops the ray. The stop crossing counts wherever the
+    ray passes, because the stop may be closed, and more near the middle, where an error meets smaller openings. Rays
+    that are lost before a boundary weigh 0.
     """
     every = (*gates, Gate(lens.stop_index, st.RIM))
     values, known = gate_values(lens, every, pairs), gate_reach(every, pairs)
@@ -99,10 +92,7 @@ def _near(distance: Tensor) -> Tensor:
 
 
 def boundary_rays(pairs: RayPairs, gates: tuple[Gate, ...]) -> PairSet:
-    """The rays that the gates are fitted on: those near the rims, and with them lost rays where a gate is about those.
-
-    Fits without such a gate see no lost ray.
-    """
+    """The rays that the gates are fitted on: those near the rims, and lost rays where a gate is about those."""
     if all(gate.reason == st.RIM for gate in gates) or not len(pairs.edge):
         return pairs.rim
     both = join_pairs([pairs.rim, pairs.edge])
@@ -116,8 +106,8 @@ def choose_gates(lens: Lens, blocked: PairSet, drawn: int | None = None) -> tupl
     reflection covers the rays that miss the same surface, whose discriminant is lower still.
 
     Args:
-        blocked: rays that did not pass, drawn uniformly over the domain.
-        drawn: how many were drawn to find them; None: only they.
+        blocked: rays that did not pass, of uniform ones over the domain.
+        drawn: number of those uniform rays; None: of `blocked`.
 
     Returns the gates in the order in which camera rays meet them. The stop is no gate: it is tested on its crossing.
     """
@@ -154,68 +144,3 @@ def explained(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
     """[N] bool: rays that a gate, exact, or the stop would stop."""
     stop = Gate(lens.stop_index, st.RIM)
     return (gate_values(lens, (*gates, stop), pairs) > 0).any(0)
-
-
-class GateFit:
-    """Gates [G] on common features [M, N], each with weights of its own."""
-
-    def __init__(self, features: Tensor, values: Tensor, weights: Tensor) -> None:
-        """Fit values [G, N] with weights [G, N]."""
-        # In orthogonal columns, so that normal equations keep their digits; what depends on others is left out.
-        norms = features.norm(dim=1).clamp_min(1e-300)
-        _, sizes, right = torch.linalg.svd(torch.linalg.qr((features / norms[:, None]).T)[1], full_matrices=False)
-        kept = sizes > _DEPENDENT * sizes[:1]  # the largest, where there is any ray
-        self._turn = (right[kept] / sizes[kept, None]).T / norms[:, None] * math.sqrt(features.shape[1])  # [M, K]
-        columns = features.T @ self._turn
-        self._grams, self._moments = [], []
-        for value, weight in zip(values, weights, strict=True):
-            rows = columns * weight[:, None]
-            self._grams.append(rows.T @ rows)
-            self._moments.append(rows.T @ (value * weight))
-        self._found = [self._solve(g) for g in range(len(values))]
-
-    def _solve(self, gate: int) -> Tensor:
-        gram = self._grams[gate]
-        ridge = _RIDGE * gram.diagonal().mean() + 1e-300
-        return torch.linalg.solve(gram + ridge * torch.eye(len(gram), dtype=gram.dtype), self._moments[gate])
-
-    def coefficients(self) -> Tensor:
-        """[G, M]."""
-        found = torch.stack(self._found) if self._found else torch.empty((0, self._turn.shape[1]), dtype=torch.float64)
-        return found @ self._turn.T
-
-    def block(self, features: Tensor, values: Tensor, known: Tensor) -> None:
-        """Fit again until rays that do not pass are blocked by one gate at least.
-
-        Args:
-            features: [M, N] of those rays.
-            values: [G, N] of the gates, where `known` [G, N]. A gate that does not block a ray is never made to; one
-                whose value is not known, because the ray ends before it, may be.
-        """
-        blocks = (values > 0) | ~known
-        if not values.numel():
-            return
-        columns = features.T @ self._turn
-        said = torch.stack([columns @ f for f in self._found])
-        weight = torch.zeros_like(values)
-        for _ in range(_ROUNDS):
-            passing = (said <= 0).all(0) & blocks.any(0)
-            if not passing.any():
-                return
-            # The gate that blocks it truly, before others; of several the one that is nearest to saying so.
-            rank = torch.where(blocks, said, -math.inf) + torch.where(known & (values > 0), 1e6, 0.0)
-            gate = rank.argmax(0)
-            for g in range(len(values)):
-                at = torch.nonzero(passing & (gate == g))[:, 0]
-                if not len(at):
-                    continue
-                heavier = (2 * weight[g, at]).clamp(_WEIGHT, _MOST_WEIGHT)
-                # Rows add to what is summed already: the weight's square grows by the difference.
-                more = torch.sqrt(heavier**2 - weight[g, at] ** 2)
-                weight[g, at] = heavier
-                target = torch.where(known[g, at], values[g, at].clamp(_TARGET, _MOST_TARGET), _TARGET)
-                rows = columns[at] * more[:, None]
-                self._grams[g] = self._grams[g] + rows.T @ rows
-                self._moments[g] = self._moments[g] + rows.T @ (target * more)
-                self._found[g] = self._solve(g)
-                said[g] = columns @ self._found[g]

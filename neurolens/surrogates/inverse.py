@@ -1,8 +1,8 @@
-"""The inverse of a surrogate: which camera ray crosses the stop here, and which one leaves as this scene ray.
+"""Inverse maps of a surrogate: the camera ray through a point of the stop, and the camera ray of a given scene ray.
 
-A direct fit of the inverse map gives the first guess; Newton's method with the model's own Jacobian, limited so that it
-never diverges, makes it the model's own ray to rounding. Whether that ray passes is the model's own answer, so that
-both directions agree. Hanika and Dachsbacher 2014 introduced the iteration on the stop for polynomial lenses.
+A direct fit of the inverse map gives the first guess. Newton's method with the model's Jacobian, limited so that it
+never diverges, takes it to the model's own ray to rounding. The model itself says whether that ray passes, so that both
+directions agree. Hanika and Dachsbacher 2014 introduced the iteration on the stop for polynomial lenses.
 
 Each map is one graph: the guess, the steps written out, the model itself at the solution. It is evaluated on torch
 tensors, or exported: in onnxruntime one call takes 5 to 8 (stop) and 7 to 14 (scene) times that of the model.
@@ -39,8 +39,8 @@ from neurolens.surrogates.assemble import (
 )  # fmt: skip
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, CoreValues, Field, Refracted, Units
 from neurolens.surrogates.file import pack, unpack
-from neurolens.surrogates.lightfield import MIRROR, ROUND
-from neurolens.surrogates.model import Encoding, LensModel, Prediction, prediction_of
+from neurolens.surrogates.lightfield import MIRROR, ROUND, Encoding
+from neurolens.surrogates.model import LensModel, Prediction, prediction_of
 from neurolens.trace.surfaces import front_rays
 
 if TYPE_CHECKING:
@@ -105,12 +105,12 @@ class InverseRays(NamedTuple):
     Attributes:
         rays: with the pupil points found (of scene rays, the film points too).
         prediction: of the model for those rays. Its status is that of `neurolens.base.status`, NO_SOLUTION among them.
-        density: of stop points |d stop / d pupil|: area on the stop per area on the pupil plane, the film point held. A
-            stop point drawn with density q per mm^2 is a pupil point drawn with density q times this. Of scene rays
-            |d (film, pupil) / d (position, direction)|: mm^2 on the film times mm^2 on the pupil plane, per mm^2 of
+        density: for stop points |d stop / d pupil|, area on the stop per area on the pupil plane, the film point held:
+            a stop point drawn with density q per mm^2 is a pupil point drawn with density q times this. For scene rays
+            |d (film, pupil) / d (position, direction)|, mm^2 on the film times mm^2 on the pupil plane, per mm^2 of
             (x, y) on the front surface and steradian.
-        residual: distance from the stop point asked for in stop radii; from the scene ray asked for of the front's
-            radius, and in radians (both squared, summed).
+        residual: distance from the given stop point, in stop radii; from the given scene ray, in front radii and in
+            radians (root of the summed squares).
     """
 
     rays: FilmRays

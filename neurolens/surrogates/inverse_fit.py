@@ -1,10 +1,8 @@
-"""Fitting the inverse of a surrogate: first guesses of both maps, and how often three Newton steps from them arrive."""
+"""Fits of the first guesses of both inverse maps, and how often three Newton steps from them converge."""
 
 from __future__ import annotations
 
-import itertools
 import time
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -13,23 +11,21 @@ from torch import Tensor
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.graph.interpret import monomials
-from neurolens.surrogates.bases import Exponents, kept, ordered, pinned_threads, solve
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Refracted
 from neurolens.surrogates.domain import FilmRays
-from neurolens.surrogates.fits.front import inside_front
-from neurolens.surrogates.fits.selection import Sweep, forward
 from neurolens.surrogates.inverse import STEPS, TOLERANCE, Guess, InverseModel, InverseRays, scaled_film_z
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import RayPairs, join_pairs
-from neurolens.surrogates.targets import targets_of
+from neurolens.surrogates.targets import inside_front, targets_of
+from neurolens.surrogates.terms import Exponents, Sweep, forward, kept, ordered, pinned_threads, powers, solve
 from neurolens.trace.surfaces import Rays
 
-# Rays beyond the rims teach the guess how the map goes on; those that pass count more.
+# Rays beyond the rims show the fit how the map goes on; passing rays count more.
 _BEYOND_WEIGHT = 0.3
-# Rays teach where the model is within this of the lens, of the largest value of each output, ...
+# Rays are fitted where the model errs by no more than this share of the largest value of each output, ...
 _AWAY = 0.02
-# ... and the guess of the stop where the stop is seen at least at this share of its usual area.
+# ... and the guess of the stop where the stop's image has at least this share of its usual area.
 _FOLD = 0.1
 # Terms and degree of the guesses: first, and where too few rays converge.
 _SIZES = ((40, 6), (80, 7))
@@ -54,26 +50,27 @@ def fit_inverse(model: LensModel, pairs: RayPairs) -> InverseModel:
         raise InputError("fit_inverse", "pairs", pairs.lens.name, f"ray pairs of {model.lens.name}")
     start = time.perf_counter()
     with pinned_threads(), torch.no_grad():
-        rays, weight = _teaching(model, pairs)
-        rounds = [_fit(model, rays, weight, *_SIZES[0])]
-        report = convergence(rounds[0], pairs.train.inputs.select(slice(0, _CHECKED)))
-        if min(report["stop"]["converged"], report["scene"]["converged"]) < _WANTED:
-            rounds.append(_fit(model, rays, weight, *_SIZES[1]))
-            other = convergence(rounds[1], pairs.train.inputs.select(slice(0, _CHECKED)))
-            best = {n: int(other[n]["converged"] > report[n]["converged"]) for n in ("stop", "scene")}
-            rounds[0] = InverseModel(model, rounds[best["stop"]].stop, rounds[best["scene"]].scene)
-            report = {n: (report, other)[best[n]][n] for n in ("stop", "scene")}
-    found = rounds[0]
-    report["stop"]["coefficients"], report["scene"]["coefficients"] = found.stop.coefficients, found.scene.coefficients
+        rays, weight = _fit_rays(model, pairs)
+        checked = pairs.train.inputs.select(slice(0, _CHECKED))
+        found: dict[str, Guess] = {}
+        report: dict[str, Any] = {}
+        for terms, degree in _SIZES:
+            inverse = _fit(model, rays, weight, terms, degree)
+            for name, figures in convergence(inverse, checked).items():
+                if name not in found or figures["converged"] > report[name]["converged"]:
+                    guess: Guess = getattr(inverse, name)
+                    found[name], report[name] = guess, {**figures, "coefficients": guess.coefficients}
+            if min(figures["converged"] for figures in report.values()) >= _WANTED:
+                break
     report |= {"rays": len(rays), "seconds": time.perf_counter() - start}
-    return replace(found, report=report)
+    return InverseModel(model, found["stop"], found["scene"], report)
 
 
 def convergence(inverse: InverseModel, rays: FilmRays, steps: int = STEPS) -> dict[str, Any]:
     """How often the inverse maps find the model's own passing rays, in the dtype of `rays`.
 
-    Returns for "stop" and "scene": converged (share with a residual below TOLERANCE) and other (share that came to
-    another ray of the same stop point, or scene ray: the map is folded there, and that ray is not found).
+    Returns for "stop" and "scene": converged (share with a residual below TOLERANCE) and other (share that converged to
+    another ray of the same stop point, or scene ray, because the map is folded there).
     """
     forward = inverse.model.predict(rays)
     passed = forward.status == st.PASSED
@@ -81,10 +78,10 @@ def convergence(inverse: InverseModel, rays: FilmRays, steps: int = STEPS) -> di
     scene = Rays(*(c[passed] for c in forward.rays))
     stop = inverse.through_stop(rays.film_x, rays.film_y, rays.film_z, x, y, rays.wavelength_nm, steps=steps)
     back = inverse.from_scene(scene, rays.film_z, rays.wavelength_nm, steps=steps)
-    return {"stop": _found(inverse.model, rays, stop), "scene": _found(inverse.model, rays, back)}
+    return {"stop": _shares(inverse.model, rays, stop), "scene": _shares(inverse.model, rays, back)}
 
 
-def _found(model: LensModel, rays: FilmRays, out: InverseRays) -> dict[str, Any]:
+def _shares(model: LensModel, rays: FilmRays, out: InverseRays) -> dict[str, Any]:
     solved = out.residual < TOLERANCE
     away = torch.hypot(out.rays.pupil_x - rays.pupil_x, out.rays.pupil_y - rays.pupil_y)
     other = solved & (away > _OTHER * model.domain.pupil_radius_mm)
@@ -97,35 +94,35 @@ def _fit(model: LensModel, rays: FilmRays, weight: Tensor, terms: int, degree: i
     vectors, _ = model.core(light)
     film, pupil = torch.stack([rays.film_x, rays.film_y]), torch.stack([rays.pupil_x, rays.pupil_y])
     chief, scale = (torch.tensor(v, dtype=torch.float64)[:, None] for v in (e.chiefs, e.pupil_scales_mm))
-    # Where the stop is seen through a caustic two rays cross it in one point: the guess follows the sheet of the axis.
-    d = model.differentiate(rays).stop_d_pupil
+    # Through a caustic two rays cross the stop at one point: the guess follows the sheet of the axis.
+    d = model.differentiate(rays)[2][:, 2:4]
     turned = d[0, 0] * d[1, 1] - d[0, 1] * d[1, 0]
     weight_stop = weight * (turned > _FOLD * turned.median())
-    known: dict[str, Any] = {"mirror": e.mirror, "terms": terms, "degree": degree}
+    size: dict[str, Any] = {"mirror": e.mirror, "terms": terms, "degree": degree}
     none = torch.zeros_like(weight)
     z = scaled_film_z(model, rays.film_z)
     stop_field = LightField(film / e.film_scale_mm, vectors[STOP], light.w)
     u = (pupil - chief * film) / scale
-    stop = fit_guess(stop_field, none if z is None else z, u[None], weight_stop, **known)
+    stop = fit_guess(stop_field, none if z is None else z, u[None], weight_stop, **size)
     scene_field = LightField(vectors[POSITION], vectors[DIRECTION], light.w)
-    return InverseModel(model, stop, fit_guess(scene_field, none, torch.stack([light.u, light.p]), weight, **known))
+    return InverseModel(model, stop, fit_guess(scene_field, none, torch.stack([light.u, light.p]), weight, **size))
 
 
-def _teaching(model: LensModel, pairs: RayPairs) -> tuple[FilmRays, Tensor]:
-    """Rays of the fits and their weights [N]: those that pass, and those a little beyond the rims that the model knows.
+def _fit_rays(model: LensModel, pairs: RayPairs) -> tuple[FilmRays, Tensor]:
+    """Rays of the fits and their weights [N]: passing ones, and some beyond the rims where the model is near the lens.
 
-    What is inverted is the model, not the lens: rays where it has run away from the lens would mislead the fit.
+    The model is inverted, not the lens: rays where it has run away from the lens would mislead the fit.
     """
     size = min(len(pairs.train), len(pairs.rim))
     sets = join_pairs([pairs.train.select(slice(0, 2 * size)), pairs.rim.select(slice(0, size))])
-    known_to = inside_front(model.lens, sets) if isinstance(model.core, Refracted) else sets
-    exact = targets_of(model.lens, model.encoding, known_to).vectors
+    truth = inside_front(model.lens, sets) if isinstance(model.core, Refracted) else sets
+    exact = targets_of(model.lens, model.encoding, truth).vectors
     away = (model.core(model.encoding(sets.inputs))[0] - exact).norm(dim=1)  # [3, N]
-    known = (away < _AWAY * exact.norm(dim=1).amax(1, keepdim=True)).all(0)
+    near = (away < _AWAY * exact.norm(dim=1).amax(1, keepdim=True)).all(0)
     weight = torch.ones(len(sets), dtype=torch.float64)
     weight[-size:] = _BEYOND_WEIGHT
     order = torch.randperm(len(sets), generator=torch.Generator().manual_seed(0))
-    order = order[known[order]]
+    order = order[near[order]]
     return sets.inputs.select(order), weight[order]
 
 
@@ -160,16 +157,16 @@ def fit_guess(
 
 def _candidates(degree: int, mirror: bool, dispersive: bool, moves: bool) -> Exponents:
     """Exponents up to a total degree; w and z multiply lower degrees only."""
-    variables = 6 if mirror else 3
     most = min(degree, 3) if mirror else degree
-    rows = [
-        (*powers, w, z)
-        for w in range(3 if dispersive else 1)
-        for z in range(3 if moves else 1)
-        for powers in itertools.product(range(most + 1), repeat=variables)
-        if sum(powers) + 2 * w + z + w * z <= most or (sum(powers) == 0 and w + z <= 2)
-    ]
-    return ordered(rows)
+    return ordered(
+        [
+            (*p, w, z)
+            for w in range(3 if dispersive else 1)
+            for z in range(3 if moves else 1)
+            for p in powers(6 if mirror else 3, most)
+            if sum(p) + 2 * w + z + w * z <= most or (sum(p) == 0 and w + z <= 2)
+        ]
+    )
 
 
 def _columns(field: LightField, z: Tensor, exponents: Exponents, mirror: bool, part: slice) -> Tensor:

@@ -1,4 +1,4 @@
-"""A complete surrogate: raw millimetres and nanometres in; scene ray, transmittance, stop crossing and status out.
+"""A complete surrogate: millimetres and nanometres in; scene ray, transmittance, stop crossing and status out.
 
 A `LensModel` is plain data: the domain, the encoding, the core's coefficients. `assemble` writes its graph, which
 onnxruntime, compiled C and numpy run without torch. Methods that take or give tensors import torch when they run.
@@ -7,7 +7,7 @@ onnxruntime, compiled C and numpy run without torch. Methods that take or give t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -21,13 +21,11 @@ from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.program import RAY, WAVELENGTH
 from neurolens.lens.film_plane import PupilBounds
-from neurolens.lens.glass import inverse_square_um
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.surrogates.assemble import EXACT, model_graph
-from neurolens.surrogates.cardkeys import DOMAIN_SLACK, POLARISED
-from neurolens.surrogates.cardstates import mix_domain
+from neurolens.surrogates.card import DOMAIN_SLACK, POLARISED, mix_domain
 from neurolens.surrogates.cores import Array, Core
-from neurolens.surrogates.lightfield import LightField
+from neurolens.surrogates.lightfield import Encoding
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -88,69 +86,6 @@ class Domain:
 
 
 @dataclass(frozen=True)
-class Encoding:
-    """From raw millimetres and nanometres to the light field.
-
-    Attributes:
-        film_plane_z_mm, pupil_plane_z_mm: the two planes (lens frame).
-        chief: k of the chief ray's u = k p, subtracted so that u is centred on the passing rays.
-        film_scale_mm, pupil_scale_mm: largest |p| and |u - k p| of the domain's passing rays.
-        w_middle, w_half: w = (1 / lambda^2 - middle) / half in 1/um^2; the index is linear in 1 / lambda^2 (Cauchy).
-            half is 0 for a lens without known dispersion, and then w = 0.
-        chief_y, pupil_scale_y_mm: of y where the lens has cylinders, and then the two above are of x; None: of both.
-    """
-
-    film_plane_z_mm: float
-    pupil_plane_z_mm: float
-    chief: float
-    film_scale_mm: float
-    pupil_scale_mm: float
-    w_middle: float
-    w_half: float
-    chief_y: float | None = None
-    pupil_scale_y_mm: float | None = None
-
-    @property
-    def mirror(self) -> bool:
-        """Whether the lens has two planes of symmetry instead of an axis."""
-        return self.chief_y is not None
-
-    @property
-    def dispersive(self) -> bool:
-        """Whether rays depend on the wavelength."""
-        return self.w_half != 0
-
-    @property
-    def chiefs(self) -> tuple[float, float]:
-        """k of x and of y."""
-        return self.chief, self.chief if self.chief_y is None else self.chief_y
-
-    @property
-    def pupil_scales_mm(self) -> tuple[float, float]:
-        """The pupil scales of x and of y, in mm."""
-        return self.pupil_scale_mm, self.pupil_scale_mm if self.pupil_scale_y_mm is None else self.pupil_scale_y_mm
-
-    def planes(self, rays: FilmRays) -> tuple[Tensor, Tensor]:
-        """Crossings with the two planes in mm, [2, N] each."""
-        import torch
-
-        u = torch.stack([rays.pupil_x, rays.pupil_y])
-        film = torch.stack([rays.film_x, rays.film_y])
-        along = (self.film_plane_z_mm - self.pupil_plane_z_mm) / (rays.film_z - self.pupil_plane_z_mm)
-        return u + (film - u) * along, u
-
-    def __call__(self, rays: FilmRays) -> LightField:
-        import torch
-
-        p, u = self.planes(rays)
-        u = torch.stack([(u[i] - self.chiefs[i] * p[i]) / self.pupil_scales_mm[i] for i in (0, 1)])
-        w = torch.zeros_like(rays.wavelength_nm)
-        if self.dispersive:
-            w = (inverse_square_um(rays.wavelength_nm) - self.w_middle) / self.w_half
-        return LightField(p / self.film_scale_mm, u, w)
-
-
-@dataclass(frozen=True)
 class Gate:
     """A boundary that blocks rays: the scalar output is positive where surface `surface` stops the ray for `reason`.
 
@@ -175,32 +110,13 @@ class Scales:
 
 
 class Prediction(NamedTuple):
-    """What a model gives for N rays; lens frame, mm. The ray is meaningful where status is 0."""
+    """The answers of a model for N rays; lens frame, mm. The ray is meaningful where the status is 0."""
 
     rays: Rays
     transmittance: Tensor
     stop_x: Tensor
     stop_y: Tensor
     status: Tensor
-
-
-class Derivatives(NamedTuple):
-    """A model's prediction and its derivatives; lens frame. Rows of a ray: x, y, z (mm), dx, dy, dz.
-
-    Attributes:
-        prediction: as `LensModel.predict` gives it.
-        d_film, d_pupil: [6, 2, N] per mm of the film point's and of the pupil point's x and y, the other point held.
-        d_wavelength: [6, N] per nm.
-        stop_d_film, stop_d_pupil: [2, 2, N] of the stop crossing, mm per mm. stop_d_wavelength: [2, N] mm per nm.
-    """
-
-    prediction: Prediction
-    d_film: Tensor
-    d_pupil: Tensor
-    d_wavelength: Tensor
-    stop_d_film: Tensor
-    stop_d_pupil: Tensor
-    stop_d_wavelength: Tensor
 
 
 def prediction_of(out: Mapping[str, Tensor], count: int) -> Prediction:
@@ -256,11 +172,12 @@ class LensModel:
         """
         return prediction_of(evaluate(self.graph, self._inputs(rays, stop_radius_mm)), len(rays))
 
-    def differentiate(self, rays: FilmRays, stop_radius_mm: float | None = None) -> Derivatives:
+    def differentiate(self, rays: FilmRays, stop_radius_mm: float | None = None) -> tuple[Prediction, Tensor, Tensor]:
         """Evaluate the model with its derivatives; arguments and errors as `predict`.
 
-        The wavelength's derivative is at fixed film and pupil point. Where the status is not 0 the figures mean
-        nothing.
+        Returns the prediction, the derivatives [6, 5, N] of the scene ray (x, y, z in mm, unit direction) and [2, 5, N]
+        of the stop crossing: per mm of the film point's x, y and of the pupil point's x, y, and per nm, the other
+        arguments held. Where the status is not 0 they mean nothing.
         """
         import torch
 
@@ -269,8 +186,7 @@ class LensModel:
             torch.stack([out[derivative(name, row)].expand(-1, len(rays)) for row in (*RAY, WAVELENGTH)], 1)
             for name in _DIFFERENTIATED
         )
-        parts = [block for d in (scene, stop) for block in (d[:, :2], d[:, 2:4], d[:, 4])]
-        return Derivatives(prediction_of(out, len(rays)), *parts)
+        return prediction_of(out, len(rays)), scene, stop
 
     def _inputs(self, rays: FilmRays, stop_radius_mm: float | None) -> dict[str, Tensor]:
         radius = rays.film_z.new_full((1, 1), self.checked_radius_mm(stop_radius_mm))
@@ -321,25 +237,8 @@ def mixed(nodes: Sequence[LensModel], weights: Array) -> LensModel:
     return replace(
         nodes[0],
         domain=Domain.from_dict(mix_domain([n.domain.to_dict() for n in nodes], weights)),
-        encoding=mix_encodings([n.encoding for n in nodes], weights),
+        encoding=Encoding.mixed([n.encoding for n in nodes], weights),
         core=mix([n.core for n in nodes], weights),
-    )
-
-
-def mix_encodings(encodings: Sequence[Encoding], weights: Array) -> Encoding:
-    """The encoding of a state: planes as they are, scales by their reciprocals, as the graph's matrices hold them."""
-
-    def of(value: Callable[[Encoding], float]) -> float:
-        return float(weights @ np.array([value(e) for e in encodings]))
-
-    pupil_scale = 1 / of(lambda e: 1 / e.pupil_scale_mm)
-    return replace(
-        encodings[0],
-        film_plane_z_mm=of(lambda e: e.film_plane_z_mm),
-        pupil_plane_z_mm=of(lambda e: e.pupil_plane_z_mm),
-        chief=pupil_scale * of(lambda e: e.chief / e.pupil_scale_mm),
-        film_scale_mm=1 / of(lambda e: 1 / e.film_scale_mm),
-        pupil_scale_mm=pupil_scale,
     )
 
 

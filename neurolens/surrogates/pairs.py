@@ -1,4 +1,4 @@
-"""Ray pairs: camera rays of a domain and their exact images, in four splits, saved and reloaded bit for bit."""
+"""Ray pairs: camera rays of a domain and their exact images, in five splits."""
 
 from __future__ import annotations
 
@@ -18,17 +18,19 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path
 from neurolens.lens.prescription import Lens
 from neurolens.setting.pupils import camera_rays
-from neurolens.surrogates.cores import DIRECTION, Refracted
+from neurolens.surrogates.cores import DIRECTION, STOP, Refracted
 from neurolens.surrogates.domain import SPARSE, FilmRays, draw, lit_share, sample_domain
 from neurolens.surrogates.model import Domain, LensModel
 from neurolens.trace.rays import CHUNK, Rays, trace
 
 SCHEMA = 3
 SPLITS = ("train", "held_out", "rim", "edge", "far")
-# Rays beyond this many rim radii are too far from any boundary to teach a model where it lies.
+# Rays beyond this many rim radii are too far from any boundary to show where it lies.
 RIM_REACH = 1.25
 _BATCH = 65536
-_ANGLE_RAYS, _FEWEST_RAYS = 32_768, 300  # that tell the largest angle of a lens
+# A gate goes where at most this share of the domain's rays is blocked by it and by nothing else.
+IDLE_SHARE, _IDLE_RAYS = 1e-5, 200_000
+_ANGLE_RAYS, _FEWEST_RAYS = 32_768, 300  # sampled for the largest angle of a lens; fewer passing rays do not show it
 
 
 @dataclass(frozen=True)
@@ -88,10 +90,11 @@ class RayPairs:
     Attributes:
         lens, domain, settings: what was traced.
         train, held_out: rays that pass; no ray is in both.
-        rim: rays that reach the scene but for a rim or the stop, up to a quarter of a radius beyond it.
-        edge: rays that miss a surface or are totally reflected, and are no further from the rims before that than the
-            rays of `rim`; at most half as many as asked for of `rim`. What they never reached is 0.
-        far: other rays that do not pass, so that models know those too; at most as many. What they never reached is 0.
+        rim: rays that pass, or that only a rim or the stop blocks, by up to a quarter of its radius.
+        edge: rays that miss a surface or are totally reflected, and before that are no further from the rims than the
+            rays of `rim`; at most half as many as the settings ask for `rim`. Figures of surfaces that a ray never
+            reached are 0.
+        far: other rays that do not pass, so that models block those, too; as many, and with such zeros.
         tested: rays drawn until `train` was full, so that len(train) / tested is the share of the disc that passes.
     """
 
@@ -148,9 +151,17 @@ def make_pairs(
     found: dict[str, list[PairSet]] = {name: [] for name in SPLITS}
     counts = dict.fromkeys(found, 0)
     drawn, tested = 0, 0.0
-    if lit_share(domain) < SPARSE:  # then `draw` leaves out what is far
-        everywhere = trace_pairs(lens, sample_domain(domain, _BATCH, settings.seed + 1), domain.pupil_z_mm)
-        _keep(found, counts, everywhere, {"far": _taught(lens, everywhere)["far"]}, settings)
+
+    def keep(batch: PairSet, *names: str) -> None:
+        """Add the blocked rays of a batch to these splits, as far as those are not full."""
+        for name, chosen in _blocked_splits(lens, batch).items():
+            if name in names:
+                most = settings.rim if name == "rim" else (settings.rim + 1) // 2
+                found[name].append(batch.select(torch.nonzero(chosen)[: most - counts[name], 0]))
+                counts[name] += len(found[name][-1])
+
+    if lit_share(domain) < SPARSE:  # then `draw` leaves far rays out
+        keep(trace_pairs(lens, sample_domain(domain, _BATCH, settings.seed + 1), domain.pupil_z_mm), "far")
     total = sum(wanted.values())
     while counts["train"] < wanted["train"] or counts["held_out"] < wanted["held_out"]:
         split = "train" if counts["train"] < wanted["train"] else "held_out"
@@ -162,7 +173,7 @@ def make_pairs(
             order = torch.nonzero(passed)[:, 0]
             used = int(order[needed - 1]) + 1 if len(order) >= needed else len(batch)
             tested += stands_for * used / max(len(batch), 1)
-            _keep(found, counts, batch, _taught(lens, batch), settings)
+            keep(batch, "rim", "edge", "far")
         found[split].append(batch.select(torch.nonzero(passed)[: wanted[split] - counts[split], 0]))
         counts[split] += len(found[split][-1])
         del batch, passed  # before the next one: they are large
@@ -177,27 +188,13 @@ def make_pairs(
     return RayPairs(lens, domain, settings, **joined, tested=round(tested))
 
 
-def _keep(
-    found: dict[str, list[PairSet]],
-    counts: dict[str, int],
-    batch: PairSet,
-    chosen: dict[str, Tensor],
-    settings: PairSettings,
-) -> None:
-    """Add the chosen rays of a batch to their splits, as far as those are not full."""
-    for name, rays in chosen.items():
-        most = settings.rim if name == "rim" else (settings.rim + 1) // 2
-        found[name].append(batch.select(torch.nonzero(rays)[: most - counts[name], 0]))
-        counts[name] += len(found[name][-1])
-
-
-def _taught(lens: Lens, batch: PairSet) -> dict[str, Tensor]:
-    """Which rays tell of what, [N] bool each; see `RayPairs`."""
+def _blocked_splits(lens: Lens, batch: PairSet) -> dict[str, Tensor]:
+    """[N] bool for each split of `RayPairs` about boundaries: the rays that belong there."""
     radii = torch.tensor(lens.semi_diameters_mm, dtype=torch.float64)[:, None]
     near = batch.cross_x**2 + batch.cross_y**2 <= (RIM_REACH * radii) ** 2
     refracts = (batch.meets > 0) & (batch.refracts > 0)
     whole = refracts.all(0)
-    # Status cannot tell: a ray that a rim stops may end for another reason later. A lost ray comes back along the axis.
+    # Not by status alone: a ray that a rim stops may be lost at a later surface. A lost ray comes back along the axis.
     rim = whole & torch.isfinite(batch.cross_x).all(0) & ~_lost(batch) & near.all(0)
     edge = ~whole & (~(reached(batch) & refracts) | near).all(0)
     return {"rim": rim, "edge": edge, "far": ~(rim | edge | (batch.status == st.PASSED))}
@@ -232,7 +229,11 @@ def join_pairs(sets: list[PairSet]) -> PairSet:
 
 
 def save_pairs(pairs: RayPairs, path: str | Path) -> None:
-    """Write a .npz (plain arrays, no pickle) with the configuration as JSON; whole or not at all."""
+    """Write a .npz (plain arrays, no pickle) with what was traced as JSON; whole or not at all.
+
+    Arrays: `header`, the JSON's bytes; for each split `SPLIT_vectors` [13, N] (film x, y, z, pupil x, y, wavelength,
+    scene ray, transmittance), `SPLIT_status` [N] and `SPLIT_surfaces` [4, S, N] (crossings x and y, margins).
+    """
     header = {
         "schema": SCHEMA,
         "lens_sha256": pairs.lens.sha256,
@@ -250,36 +251,6 @@ def save_pairs(pairs: RayPairs, path: str | Path) -> None:
         np.savez(stream, **arrays)
 
 
-def load_pairs(path: str | Path, lens: Lens) -> RayPairs:
-    """Read what `save_pairs` wrote, bit for bit.
-
-    Raises:
-        InputError: not such a file, another schema, or pairs of another lens.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            arrays = {k: data[k] for k in data.files}
-        header = json.loads(arrays["header"].tobytes())
-        if header["schema"] != SCHEMA:
-            raise InputError(path, "schema", header["schema"], str(SCHEMA))
-        if header["lens_sha256"] != lens.sha256:
-            raise InputError(path, "lens_sha256", header["lens_sha256"], f"{lens.sha256} ({lens.path})")
-        sets = {name: _unpack(arrays, name) for name in SPLITS}
-        domain, settings = Domain.from_dict(header["domain"]), PairSettings(**header["settings"])
-        return RayPairs(lens, domain, settings, **sets, tested=header["tested"])
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(
-            path, "file", f"({type(error).__name__}: {error})", "ray pairs written by neurolens"
-        ) from error
-
-
-def _unpack(arrays: dict[str, Any], name: str) -> PairSet:
-    vectors, status, surfaces = (torch.from_numpy(arrays[f"{name}_{k}"]) for k in ("vectors", "status", "surfaces"))
-    return PairSet.of_columns([*vectors, status, *surfaces])
-
-
 def with_angle(model: LensModel) -> LensModel:
     """The model with the largest angle of its lens's rays, by a sample of the domain; see `LensModel.angle`."""
     rays, _ = draw(model.domain, _ANGLE_RAYS, seed=5)
@@ -290,8 +261,40 @@ def with_angle(model: LensModel) -> LensModel:
         else:
             angles = torch.atan2(torch.hypot(exact.scene.dx, exact.scene.dy), -exact.scene.dz)
     angles = angles[exact.status == st.PASSED]
-    if len(angles) < _FEWEST_RAYS:  # they do not tell the largest
+    if len(angles) < _FEWEST_RAYS:
         return replace(model, angle=math.pi)
     angle = float(angles.max())
     bound = next((b for b in (math.pi / 2, math.pi) if angle < b), math.pi)
     return replace(model, angle=min(1.05 * angle, (angle + bound) / 2, bound))
+
+
+def without_idle_gates(models: tuple[LensModel, ...], share: float = IDLE_SHARE) -> tuple[LensModel, ...]:
+    """The models without the gates that block (next to) nothing that the others and the stop let through.
+
+    Which surface a status names may change with that: the first of those left. `share`: see `IDLE_SHARE`.
+    """
+    left = list(range(len(models[0].gates)))
+    sole = [_blocked(m) for m in models]  # [1 + G, N] of each, the stop first
+    while left:
+        others = [[b[[0, *(1 + k for k in left if k != g)]].any(0) for b in sole] for g in left]
+        counts = [
+            sum(int((b[1 + g] & ~rest).sum()) for b, rest in zip(sole, each, strict=True))
+            for g, each in zip(left, others, strict=True)
+        ]
+        least = min(range(len(left)), key=lambda i: counts[i])
+        if counts[least] > share * sum(b.shape[1] for b in sole):
+            break
+        del left[least]
+    if len(left) == len(models[0].gates):
+        return models
+    return tuple(
+        replace(m, gates=tuple(m.gates[k] for k in left), core=m.core.keep([0, *(1 + k for k in left)])) for m in models
+    )
+
+
+def _blocked(model: LensModel) -> Tensor:
+    """[1 + G, N] bool: which of the stop and the gates block each ray of the domain."""
+    with torch.no_grad():
+        vectors, scalars = model.core(model.encoding(sample_domain(model.domain, _IDLE_RAYS, seed=17)))
+    stop = ((vectors[STOP] * model.scales.stop_mm) ** 2).sum(0) > model.domain.stop_radius_mm**2
+    return torch.cat([stop[None], scalars[1:] > 0])

@@ -1,4 +1,7 @@
-"""Source code of models: a C99 header or a GLSL function, the card as a comment on top. It needs no torch."""
+"""Source code of models: a C99 header or a GLSL function, the card as a comment on top; and what a scene fixes of them.
+
+Only fixing needs torch.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import math
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,18 +30,15 @@ from neurolens.graph.program import (
     Program,
 )
 from neurolens.graph.scalars import lower
+from neurolens.lens.glass import inverse_square_um
 from neurolens.surrogates.assemble import ALL, SCALARS, Parts, model_graph
-from neurolens.surrogates.cardkeys import POLARISED, transmittance_of
-from neurolens.surrogates.cardstates import axes_of
-from neurolens.surrogates.model import LensModel, with_one_angle
-from neurolens.surrogates.specialise import Fix
-from neurolens.surrogates.stategraph import mixture_of, state_names
+from neurolens.surrogates.axes import mixture_of, state_names
+from neurolens.surrogates.card import DOMAIN_SLACK, POLARISED, axes_of, transmittance_of
+from neurolens.surrogates.model import Domain, LensModel, with_one_angle
 
-# Nothing fixed. Wavelengths are fixed in the models themselves, one model a table; film plane and stop here too.
-FREE = Fix()
 WRITERS = {"c": write_c, "glsl": write_glsl}
 OSL = "osl"  # of whole cameras: `cameras.osl`
-_WIDTH = 110
+_WIDTH, _MOST_WAVELENGTHS = 110, 64
 # Keywords of C11, C++20 and GLSL 4.60 and words reserved there, types and functions of GLSL and OSL,
 # names of the code that is written.
 _WORDS = """
@@ -62,6 +62,87 @@ _PATTERNS = re.compile(
     r"|dmat\w*|fvec\d|u?int(8|16|32|64)?_t|u?int|float_t|double_t"
 )
 _ERRORS = ("rms_um", "p99_um", "max_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
+
+
+# ---- what a scene fixes ----
+
+
+@dataclass(frozen=True)
+class Fix:
+    """The arguments that a scene fixes; None or empty ones stay free. Film plane and stop in mm, lens frame."""
+
+    wavelengths_nm: tuple[float, ...] = ()
+    film_z_mm: float | None = None
+    stop_radius_mm: float | None = None
+
+    def check(self, domain: Domain) -> None:
+        """Raise InputError for a film position or a stop outside a domain."""
+        z, stop, (near, far), widest = self.film_z_mm, self.stop_radius_mm, domain.film_z_mm, domain.stop_radius_mm
+        if z is not None and not near / DOMAIN_SLACK <= z <= far * DOMAIN_SLACK:
+            raise InputError("fix", "film_z", z, f"{near:.6g} to {far:.6g} mm, the film positions of the fit")
+        if stop is not None and not 0 < stop <= widest * DOMAIN_SLACK:
+            raise InputError("fix", "stop", stop, f"above 0, up to {widest:.6g} mm, the widest stop of the fit")
+
+
+# Wavelengths are fixed in the models themselves, one model a table; film plane and stop in programs, too.
+FREE = Fix()
+
+
+def fixed_models(model: LensModel, fix: Fix) -> tuple[LensModel, ...]:
+    """The model for what is fixed: one for each wavelength, of one structure, or one where the wavelength stays free.
+
+    One wavelength folds every power of w into the coefficients: for pictures in one colour of light (a laser line, a
+    filter, a measurement at the d line), or one model a channel where dispersion within a channel does not count.
+    Pictures in white light take the whole model. A film position and a stop narrow the domain; rims that then block
+    nothing go.
+
+    Raises:
+        InputError: a wavelength, film position or stop outside the model's domain; too many wavelengths, or one twice.
+    """
+    from neurolens.surrogates.pairs import with_angle, without_idle_gates  # rays are traced, which needs torch
+
+    wanted = fix.wavelengths_nm
+    if len(wanted) > _MOST_WAVELENGTHS or len(set(wanted)) < len(wanted):
+        raise InputError("fix", "wavelengths", list(wanted), f"up to {_MOST_WAVELENGTHS} that differ")
+    fix.check(model.domain)
+    domain, lens, settings = model.domain, model.lens, dict(model.settings)
+    if fix.film_z_mm is not None:
+        domain = replace(domain, film_z_mm=(fix.film_z_mm, fix.film_z_mm))
+        settings["film_z_mm"] = fix.film_z_mm
+    if fix.stop_radius_mm is not None:
+        domain = replace(domain, stop_radius_mm=fix.stop_radius_mm)
+        lens = lens.with_stop_radius(fix.stop_radius_mm)
+        settings["stop_radius_mm"] = fix.stop_radius_mm
+    narrow = replace(model, domain=domain, lens=lens, settings=settings)
+    models = tuple(at_wavelength(narrow, w) for w in wanted) or (with_angle(narrow),)
+    return without_idle_gates(models) if fix != FREE else models
+
+
+def at_wavelength(model: LensModel, wavelength_nm: float) -> LensModel:
+    """The same model for one wavelength: smaller and faster. Rays of any other wavelength are outside its domain.
+
+    Raises:
+        InputError: a wavelength outside the model's domain, or a model without a wavelength input.
+    """
+    from neurolens.surrogates.pairs import with_angle
+
+    low, high = model.domain.wavelength_nm
+    if model.encoding.w_half == 0:
+        raise InputError("at_wavelength", "model", model.method, "a model whose rays depend on the wavelength")
+    if not low <= wavelength_nm <= high:
+        raise InputError("at_wavelength", "wavelength_nm", wavelength_nm, f"{low:g} to {high:g} nm")
+    w = (inverse_square_um(wavelength_nm) - model.encoding.w_middle) / model.encoding.w_half
+    fixed = replace(
+        model,
+        domain=replace(model.domain, wavelength_nm=(wavelength_nm, wavelength_nm)),
+        encoding=replace(model.encoding, w_half=0.0),
+        core=model.core.fixed(w),
+        settings={**model.settings, "wavelength_nm": wavelength_nm},
+    )
+    return with_angle(fixed)
+
+
+# ---- files ----
 
 
 @dataclass(frozen=True)
@@ -165,9 +246,9 @@ def identifier(text: str) -> str:
 
 
 def comment_of(
-    card: Mapping[str, Any], domain: Mapping[str, Any], waves: Sequence[Sequence[float]], fix: Fix, codes: Sequence[int]
+    card: Mapping[str, Any], domain: Mapping[str, Any], waves: Sequence[Sequence[float]], fix: Fix, gates: Sequence[int]
 ) -> list[str]:
-    """What the card says, in lines: of this domain, its bands of wavelengths, the codes of the gates that are left."""
+    """The card in lines of text, for this domain, its bands of wavelengths and the status codes of its gates."""
     lens, fit, d = card["lens"], card["fit"], domain
     lines = [
         f"{lens['name']}: {fit['method']}, written by neurolens {neurolens.__version__}.",
@@ -203,9 +284,9 @@ def comment_of(
     how = "followed" if transmittance_of(card) == POLARISED else "averaged at every surface"
     lines.append("Units: mm, nm; directions are unit vectors, transmittance a share of the power of unpolarised light.")
     lines.append(f"Transmittance: the polarisation that surfaces give to the light is {how}.")
-    gone = {g["status"] for g in card["gates"]} - set(codes)
-    told = {c: w for c, w in card["status_codes"].items() if int(c) not in gone}
-    lines.append(f"Status: {'; '.join(f'{c} {w}' for c, w in told.items())}.")
+    gone = {g["status"] for g in card["gates"]} - set(gates)
+    codes = [f"{code} {words}" for code, words in card["status_codes"].items() if int(code) not in gone]
+    lines.append(f"Status: {'; '.join(codes)}.")
     return lines_of(lines)
 
 

@@ -2,15 +2,21 @@
 
 A `StateSpace` says which states: the axes of a lens file, and its lens and domain at every state. Every number of the
 model at a state is interpolated from the nodes (see `surrogates.axes`), so that the model at a state is a plain
-`LensModel`, and everything that knows those knows this one. A core is linear in its numbers: its error at a state is at
-most a small multiple (the Lebesgue constant) of the nodes' errors, plus that of interpolating the exact lens itself.
+`LensModel`. A core is linear in its numbers: its error at a state is at most a small multiple (the Lebesgue constant)
+of the nodes' errors, plus the error of interpolating the exact lens itself.
+
+A fit chooses one support and the same gates for all nodes; the coefficients of each node are fitted on its own rays.
+They need not vary smoothly, because what is mixed between nodes is the functions. Measured on three zooms: between
+nodes the error is that at the nodes, and at most doubles.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,8 +28,26 @@ from neurolens.setting.focusing import film_range_mm, infinity_states, nearest_f
 from neurolens.setting.pupils import image_radius_mm
 from neurolens.setting.states import set_lens
 from neurolens.surrogates.axes import Array, Axis, product, weights
+from neurolens.surrogates.cores import STOP
 from neurolens.surrogates.domain import domain_of
-from neurolens.surrogates.model import Domain, LensModel, mixed
+from neurolens.surrogates.fit import prepare
+from neurolens.surrogates.fits.boundaries import invariant_core
+from neurolens.surrogates.lightfield import Encoding
+from neurolens.surrogates.model import Domain, LensModel, Scales, mixed
+from neurolens.surrogates.pairs import PairSettings, RayPairs, make_pairs, with_angle
+from neurolens.surrogates.targets import Prepared, film_equivalent, fit_encoding, scales_of
+from neurolens.surrogates.terms import (
+    Exponents,
+    Sweep,
+    forward,
+    invariant_exponents,
+    kept,
+    monomials,
+    pinned_threads,
+    replace_terms,
+    solve,
+    vector_columns,
+)  # fmt: skip
 
 State = tuple[float, ...]
 
@@ -38,6 +62,9 @@ _SAME = 1e-3  # focal lengths that differ by less than this share are one
 _LIMITS = 9
 _GAP_MM, _MOST = 1e-4, 12  # error of interpolated gaps that is enough, and the highest degree tried for it
 _BETWEEN = (0.08, 0.35, 0.5, 0.77, 0.93)  # of the way from knot to knot: where gaps are measured
+# Nodes that choose the support and the gates; the others only fit coefficients.
+_CHOOSERS = 7
+_PASSES = 2  # of replacement
 
 
 @dataclass(frozen=True)
@@ -63,16 +90,16 @@ class StateSpace:
     focus_m: tuple[float, float] | Callable[[Lens], tuple[float, float]] = (math.inf, math.inf)
     wavelength_nm: tuple[float, float] = (400.0, 700.0)
 
-    @cached_property
-    def _planes_mm(self) -> list[float]:
-        """The tightest pupil plane at every knot of the axes."""
-        return [self._domain(state, None).pupil_z_mm for state in product(self._knots)]
-
     @property
     def _knots(self) -> tuple[Axis, ...]:
         return tuple(replace(a, degree=1) for a in self.axes)
 
-    def _asked(self, state: Sequence[float]) -> tuple[str | float | None, float | None]:
+    @cached_property
+    def _planes_mm(self) -> Array:
+        """The tightest pupil plane at every knot of the axes."""
+        return np.array([self._domain(state, None).pupil_z_mm for state in product(self._knots)])
+
+    def _settings(self, state: Sequence[float]) -> tuple[str | float | None, float | None]:
         """Zoom position, and the distance (m) of internal focus where that is an axis."""
         values = dict(zip((a.name for a in self.axes), state, strict=True))
         vergence = values.get("focus")
@@ -81,8 +108,7 @@ class StateSpace:
 
     def lens_at(self, state: Sequence[float]) -> Lens:
         """The exact lens at a state; with internal focus, focused there, else at infinity focus."""
-        zoom, focus_m = self._asked(state)
-        return self._lens(zoom, focus_m)
+        return self._lens(*self._settings(state))
 
     def _lens(self, zoom: str | float | None, focus_m: float | None) -> Lens:
         if focus_m is None:
@@ -95,10 +121,10 @@ class StateSpace:
 
         Its pupil plane is straight between the knots: the tightest one of every state by itself would jump.
         """
-        return self._domain(state, float(weights(self._knots, state) @ np.array(self._planes_mm)))
+        return self._domain(state, float(weights(self._knots, state) @ self._planes_mm))
 
     def _domain(self, state: Sequence[float], pupil_z_mm: float | None) -> Domain:
-        zoom, focus_m = self._asked(state)
+        zoom, focus_m = self._settings(state)
         lens, radius, film_z = self._lens(zoom, focus_m), self.film_radius_mm, None
         if focus_m is None:
             focus = self.focus_m if isinstance(self.focus_m, tuple) else self.focus_m(lens)
@@ -106,9 +132,7 @@ class StateSpace:
             # The picture's size is that of the lens at infinity focus: it breathes, the film does not.
             if radius is None:
                 radius = image_radius_mm(self._lens(zoom, math.inf))[0]
-            assert lens.film_z_mm is not None
-            film_z = film_range_mm(lens, focus_m, self.wavelength_nm)
-            focus = (focus_m, focus_m)
+            focus, film_z = (focus_m, focus_m), film_range_mm(lens, focus_m, self.wavelength_nm)
         return domain_of(
             lens,
             film_radius_mm=radius,
@@ -127,9 +151,9 @@ def zoom_axis(lens: Lens, degree: int | None = None) -> Axis:
     Raises:
         InputError: a file with fewer than two zoom states.
     """
-    found = sorted((float(first_order(set_lens(lens, zoom=s.name)).efl_mm), s.name) for s in infinity_states(lens))
+    stated = sorted((float(first_order(set_lens(lens, zoom=s.name)).efl_mm), s.name) for s in infinity_states(lens))
     knots: list[float] = []
-    for efl, _ in found:
+    for efl, _ in stated:
         if not knots or efl > knots[-1] * (1 + _SAME):
             knots.append(efl)
     if len(knots) < 2:
@@ -139,7 +163,7 @@ def zoom_axis(lens: Lens, degree: int | None = None) -> Axis:
         degree = _BASE_DEGREE + math.ceil(_DEGREES_PER_LOG * math.log(largest))
         degree = max(degree, math.ceil(_LEAST_STEPS / (len(knots) - 1)))
     # Ray slopes go as 1 / f: in that coordinate they are straight.
-    return Axis("zoom", "mm", tuple(knots), degree, reciprocal=True, stated=tuple((n, e) for e, n in found))
+    return Axis("zoom", "mm", tuple(knots), degree, reciprocal=True, stated=tuple((n, e) for e, n in stated))
 
 
 def focus_axis(lens: Lens, zoom: Sequence[str | float | None] = (None,), degree: int = FOCUS_DEGREE) -> Axis:
@@ -222,19 +246,141 @@ def gap_axis(first: Axis, lens_at: Callable[[float], Lens]) -> tuple[Axis, float
         first: the axis, of the least degree that is tried.
     """
 
-    def places(value: float) -> Array:
+    def vertices_mm(value: float) -> Array:
         lens = lens_at(value)
         return np.array(lens.vertices_mm[: len(lens.surfaces)])
 
-    def turned(value: float) -> float:
-        return 1 / value if first.reciprocal else value
-
-    ends = [(turned(a), turned(b)) for a, b in zip(first.knots, first.knots[1:], strict=False)]
-    known = [(v, places(v)) for a, b in ends for v in (turned(a + (b - a) * share) for share in _BETWEEN)]
+    coordinates = [1 / knot if first.reciprocal else knot for knot in first.knots]
+    between = [a + (b - a) * share for a, b in itertools.pairwise(coordinates) for share in _BETWEEN]
+    exact = {v: vertices_mm(v) for v in (1 / c if first.reciprocal else c for c in between)}
     for degree in range(first.degree, _MOST + 1):
         axis = replace(first, degree=degree)
-        nodes = np.array([places(v) for v in axis.nodes])
-        error = max(float(np.abs(weights((axis,), (v,)) @ nodes - exact).max()) for v, exact in known)
+        nodes = np.array([vertices_mm(v) for v in axis.nodes])
+        error = max(float(np.abs(axis.weights(v) @ nodes - wanted).max()) for v, wanted in exact.items())
         if error < _GAP_MM:
             break
     return axis, error
+
+
+# ---- fits ----
+
+
+@dataclass(frozen=True)
+class StateSettings:
+    """How a model of many states is fitted: see `ModelSettings`; rays are those of each node."""
+
+    terms: int = 64
+    degree: int = 7
+    rays: int = 20_000
+    seed: int = 1
+    name: str = ""
+
+    @property
+    def label(self) -> str:
+        return self.name or f"states-{self.terms}"
+
+
+def fit_states(
+    space: StateSpace, settings: StateSettings | None = None, progress: Callable[[float], None] | None = None
+) -> StateModel:
+    """Fit a model of all states of a space.
+
+    Args:
+        progress: called with the share done.
+
+    Raises:
+        InputError: what `pairs.make_pairs` refuses at a node; fewer than two terms.
+    """
+    settings, start = settings or StateSettings(), time.perf_counter()
+    if space.lens.anamorphic:
+        raise InputError(space.lens.path, "surfaces", "(cylinders)", "a lens that is round about its axis, for states")
+    if not 2 <= settings.terms < settings.rays:
+        raise InputError("fit", "terms", settings.terms, f"from 2 to fewer than the {settings.rays} rays of a node")
+    states = product(space.axes)
+    with pinned_threads():
+        choosers = sorted({round(float(k)) for k in np.linspace(0, len(states) - 1, _CHOOSERS)})
+        chosen: dict[int, Prepared] = {}
+        for done, k in enumerate(choosers):
+            chosen[k] = prepare(_pairs(space, states[k], settings))
+            if progress:
+                progress(0.3 * (done + 1) / len(choosers))
+        # Every gate that any node needs, in the order in which camera rays meet them.
+        needed = {g for p in chosen.values() for g in p.gates}
+        gates = tuple(sorted(needed, key=lambda g: (-g.surface, g.reason)))
+        scales = _common_encoding([d.encoding for d in chosen.values()])
+        chosen = {k: replace(d, encoding=_scaled_like(scales, d.encoding)) for k, d in chosen.items()}
+        stop_mm = max(d.pairs.lens.stop_radius_mm for d in chosen.values())
+        exponents, columns = _choose_jointly(list(chosen.values()), settings)
+        nodes = []
+        for k, state in enumerate(states):
+            if k in chosen:
+                data = replace(chosen.pop(k), gates=gates)
+            else:
+                pairs = _pairs(space, state, settings)
+                data = Prepared(pairs, _scaled_like(scales, fit_encoding(pairs.domain, pairs.train)), gates)
+            nodes.append(_fit_node(data, exponents, columns, stop_mm, settings))
+            if progress:
+                progress(0.4 + 0.6 * (k + 1) / len(states))
+    return StateModel(space, tuple(nodes), time.perf_counter() - start)
+
+
+def _pairs(space: StateSpace, state: State, settings: StateSettings) -> RayPairs:
+    lens, domain = space.lens_at(state), space.domain_at(state)
+    return make_pairs(lens, domain, PairSettings(settings.rays, 1, settings.rays, settings.seed))
+
+
+def _common_encoding(encodings: Sequence[Encoding]) -> Encoding:
+    """Scales and chief ray for all nodes: the largest, and the mean.
+
+    A node's own scales follow its domain, which need not be smooth in the state; nor would be the lens in them.
+    """
+    return replace(
+        encodings[0],
+        chief=sum(e.chief for e in encodings) / len(encodings),
+        film_scale_mm=max(e.film_scale_mm for e in encodings),
+        pupil_scale_mm=max(e.pupil_scale_mm for e in encodings),
+    )
+
+
+def _scaled_like(scales: Encoding, own: Encoding) -> Encoding:
+    """The planes of a node with the scales of all."""
+    return replace(scales, film_plane_z_mm=own.film_plane_z_mm, pupil_plane_z_mm=own.pupil_plane_z_mm)
+
+
+def _choose_jointly(data: Sequence[Prepared], settings: StateSettings) -> tuple[Exponents, list[int]]:
+    """One support for all nodes: orthogonal least squares by the sum of the nodes' gains, then replacement.
+
+    Returns the exponents [M, 4] kept and the columns of `vector_columns` chosen among them (m p, then m u).
+    """
+    dispersive = data[0].encoding.dispersive
+    exponents = invariant_exponents(settings.degree, dispersive=dispersive)
+    sweeps = []
+    for d in data:
+        train = d.train
+        outputs = film_equivalent(d.pairs.lens, d.pairs.domain, train.vectors)
+        sweeps.append(Sweep.of_vectors(monomials(train.field.invariants(), exponents), train.field, outputs))
+    joint = Sweep.joined(sweeps)
+    forward(joint, settings.terms)
+    replace_terms(joint, _PASSES)
+    return kept(exponents, sorted(joint.chosen))
+
+
+def _fit_node(
+    data: Prepared, exponents: Exponents, columns: list[int], stop_mm: float, settings: StateSettings
+) -> LensModel:
+    """The model of one node; its stop crossing is in units of `stop_mm`, the same at every node."""
+    pairs, train, scales = data.pairs, data.train, scales_of(data.pairs.lens)
+    vectors = vector_columns(monomials(train.field.invariants(), exponents), train.field)[columns]
+    core = invariant_core(data, exponents, columns, solve(vectors, train.vectors[:STOP].flatten(1)))
+    core.ab[STOP] *= scales.stop_mm / stop_mm
+    model = LensModel(
+        lens=pairs.lens,
+        domain=pairs.domain,
+        encoding=data.encoding,
+        scales=Scales(scales.position_mm, stop_mm),
+        gates=data.gates,
+        core=core,
+        method=settings.label,
+        settings={"method": "ols", **asdict(settings), "rays_seed": settings.seed},
+    )
+    return with_angle(model)

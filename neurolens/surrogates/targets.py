@@ -1,22 +1,100 @@
-"""What a core is fitted to: ray pairs, their exact vectors and scalars, scaled, with weights that say what counts."""
+"""The input of a fit: settings, ray pairs with their exact vectors and scalars, scaled, and weights.
+
+Of a lens whose rays leave the front surface at grazing angles, polynomials are fitted up to the front glass, and models
+refract there exactly (`cores.Refracted`): near grazing the direction outside turns as the square root of what is left
+to the grazing ray. Networks follow that themselves, and measured worse when their error was that inside the glass.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from neurolens.lens.glass import inverse_square_um
+from neurolens.base.errors import InputError
+from neurolens.base.options import check_bounds, setting
+from neurolens.lens.glass import index_of, inverse_square_um
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Core
+from neurolens.surrogates.assemble import tilt_series
+from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, Array, Basis, Core
 from neurolens.surrogates.gates import boundary_rays, boundary_weights
-from neurolens.surrogates.lightfield import LightField, angle_vector
-from neurolens.surrogates.model import Domain, Encoding, Gate, Scales
+from neurolens.surrogates.lightfield import Encoding, LightField, angle_vector
+from neurolens.surrogates.model import Domain, Gate, Scales
 from neurolens.surrogates.pairs import PairSet, RayPairs
+from neurolens.trace.surfaces import entered
+
+Method = Literal["thin", "thick", "dense", "omp", "ols", "adaptive", "mlp", "ols+mlp"]
+POLYNOMIALS = ("dense", "omp", "ols", "adaptive")
+NETWORKS = ("mlp", "ols+mlp")
+PLANES_SEARCHED = ("ols", "adaptive", "ols+mlp")
+# About 5000 candidate columns, whose Gram matrix takes 200 MB.
+_MOST_DEGREE = {"invariants": 16, "raw": 11}
+
+
+@dataclass(frozen=True)
+class ModelSettings:
+    """The settings of one fit.
+
+    Raises:
+        InputError: numbers that ask for more than a fit can hold, or for less than one.
+    """
+
+    # First order; polynomials: all terms up to `degree`, matching pursuit, orthogonal least squares with replacement,
+    # terms of any degree grown from chosen terms; a network; a polynomial, and a network on what it leaves.
+    method: Method = setting("ols", "of the fit")
+    name: str = setting("", "of the file and of the table's row; empty: made from the other settings")
+    basis: Basis = setting("invariants", "of polynomials; raw: p_x, p_y, u_x, u_y, w, without the lens's symmetry")
+    terms: int = setting(40, "coefficients per vector output; dense ignores it", within=(1, 2000))
+    degree: int = setting(7, "largest total degree of the first candidates; adaptive ignores it")
+    replacement: bool = setting(True, "whether ols exchanges terms afterwards")
+    elimination: bool = setting(True, "whether ols first chooses half as many terms again, and drops the cheapest")
+    # From 2 on a few more rounds follow where directions still err.
+    growth: int = setting(2, "rounds in which ols adds products of the chosen terms to the candidates", within=(0, 16))
+    position_weight: float = setting(2.0, "weight of the position in the choice of terms, relative to first order")
+    transmittance_terms: int = setting(16, "most further terms where the transmittance needs them", within=(0, 200))
+    idle_gates: float = setting(0.0, "rims that alone block at most this share of the domain's rays are left out")
+    planes: bool = setting(True, "whether methods of `PLANES_SEARCHED` search the planes of the light field")
+    partitions: int = setting(1, "zones of the film with a fit of their own", within=(1, 64))
+    units: int = setting(16, "units of each layer of a network", within=(1, 512))
+    layers: int = setting(2, "layers of a network", within=(1, 8))
+    # Never a time, so that the load of a machine changes no byte. On n times the fewest rays a step counts n.
+    steps: int = setting(400, "most iterations of a network's training", within=(1, 100_000))
+    seed: int = setting(0, "of a network's first weights")
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "settings")
+        most_degree = _MOST_DEGREE.get(self.basis, min(_MOST_DEGREE.values()))
+        for name, good, expected in (
+            ("degree", 0 <= self.degree <= most_degree, f"an integer from 0 to {most_degree}"),
+            ("idle_gates", 0 <= self.idle_gates < 1, "a share from 0 to below 1"),
+            ("position_weight", 0 < self.position_weight < math.inf, "a number above 0"),
+        ):
+            if not good:
+                raise InputError("settings", name, getattr(self, name), expected)
+
+    @property
+    def label(self) -> str:
+        """The name, or one made from the settings: "ols-40", "raw-omp-80", "dense-d4", "mlp-16x2"."""
+        if self.name:
+            return self.name
+        zones = f"-{self.partitions}zones" if self.partitions > 1 else ""
+        if self.method in NETWORKS:
+            before = f"ols-{self.terms}-" if self.method == "ols+mlp" else ""
+            return f"{before}mlp-{self.units}x{self.layers}{zones}"
+        if self.method in ("thin", "thick"):
+            return self.method
+        size = f"-d{self.degree}" if self.method == "dense" else f"-{self.terms}"
+        return f"{'raw-' if self.basis == 'raw' else ''}{self.method}{size}{zones}"
+
+    @property
+    def family(self) -> str:
+        return "paraxial" if self.method in ("thin", "thick") else self.method
 
 
 def scales_of(lens: Lens) -> Scales:
@@ -55,13 +133,11 @@ class Prepared:
 
     Attributes:
         encoding, gates: of the model.
-        lost_share: rays of the domain that miss a surface or are totally reflected in a way that no gate tells.
     """
 
     pairs: RayPairs
     encoding: Encoding
     gates: tuple[Gate, ...]
-    lost_share: float = 0.0
 
     @property
     def train(self) -> Targets:
@@ -140,3 +216,44 @@ def fit_encoding(domain: Domain, passing: PairSet, *, mirror: bool = False) -> E
         chief_y=chiefs[1] if mirror else None,
         pupil_scale_y_mm=scales[1] if mirror else None,
     )
+
+
+# ---- rays that leave the front surface at grazing angles ----
+
+# Cosine of the flattest ray that leaves the front surface, below which a fit refracts there.
+GRAZING = 0.3
+_SERIES_DEGREE, _SERIES_ERROR = 8, 3e-8  # of the index: float32's last bit
+
+
+def grazes(pairs: RayPairs) -> bool:
+    """Whether any of the rays to fit leaves the front surface at a grazing angle, and models can refract there."""
+    flattest = float(pairs.train.refracts[0].min()) if len(pairs.train) else 1.0
+    return flattest < GRAZING**2 and tilt_series(pairs.lens.surfaces[0]) is not None
+
+
+def inside_front(lens: Lens, pairs: PairSet) -> PairSet:
+    """The same rays with the directions that they have inside the front glass; as they were where rays end before."""
+    front, scene = lens.surfaces[0], pairs.scene
+    n, outside = np.asarray(_index(lens, pairs.inputs.wavelength_nm.numpy())), torch.stack(scene[3:]).numpy()
+    with np.errstate(all="ignore"):
+        d, _ = entered(front, scene.x.numpy(), scene.y.numpy(), outside, n)
+    d = np.where(np.isfinite(d).all(0), d, outside)
+    return replace(pairs, scene=scene._replace(**dict(zip(("dx", "dy", "dz"), torch.from_numpy(d), strict=True))))
+
+
+def _index(lens: Lens, wavelength_nm: Any) -> Any:
+    """The index of the front glass over that of the medium in front of it."""
+    return index_of(lens.surfaces[0], wavelength_nm) / index_of(lens.object_medium, wavelength_nm)
+
+
+def index_series(lens: Lens, encoding: Encoding) -> Array:
+    """[K] the relative index of the front glass as a power series in the encoding's w, to float32's last bit."""
+    if not encoding.dispersive:
+        return np.array([float(lens.surfaces[0].n_d) / float(lens.object_medium.n_d)])
+    w = np.linspace(-1, 1, 200)
+    n = np.array([float(_index(lens, 1000 / v**0.5)) for v in encoding.w_middle + encoding.w_half * w])
+    for degree in range(_SERIES_DEGREE + 1):
+        series = np.polynomial.Polynomial.fit(w, n, degree, domain=[-1, 1])
+        if np.abs(series(w) - n).max() < _SERIES_ERROR:
+            break
+    return np.asarray(series.convert().coef)

@@ -24,7 +24,7 @@ from neurolens.lens.apertures import Aperture
 from neurolens.lens.paraxial import film_z_mm, first_order
 from neurolens.lens.shot import Shot
 from neurolens.setting import focusing
-from neurolens.surrogates import metadata
+from neurolens.surrogates import card as cards
 
 ROOT = Path(__file__).parents[2]
 
@@ -148,7 +148,7 @@ def test_files_that_are_no_models(path: Path, tmp_path: Path, monkeypatch: pytes
         file.write_bytes(data[:cut])
         with pytest.raises(ModelError):
             load_model(file)
-    monkeypatch.setattr(metadata, "MAX_BYTES", 1000)
+    monkeypatch.setattr(cards, "_MAX_BYTES", 1000)
     with pytest.raises(ModelError, match="at most 1000"):
         load_model(path)
 

@@ -28,7 +28,7 @@ from neurolens.lens.prescription import Lens
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.pictures import read_exr
 from neurolens.setting.states import set_lens
-from neurolens.surrogates.cardkeys import CARD_KEY, MODEL_KEY
+from neurolens.surrogates.card import CARD_KEY, MODEL_KEY
 from neurolens.surrogates.source import identifier
 
 LENS = Path(__file__).parents[2] / "lenses" / "brendel_tessar_100.toml"

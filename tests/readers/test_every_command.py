@@ -155,7 +155,7 @@ def test_a_run_keeps_the_lens_in_our_format_and_a_model_knows_its_lens(
     assert read_lens(kept).sha256 == read_any(files["zmx"]).sha256
     capsys.readouterr()
     from neurolens.study.check import lens_of_card
-    from neurolens.surrogates.metadata import read_card
+    from neurolens.surrogates.card import read_card
 
     card = read_card(model)
     assert card["lens"]["id"] == "Tessar_100mm_1_4_5_v2_0"

@@ -15,9 +15,9 @@ from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
 from neurolens.study.candidates import camera_candidate, exact_candidates
 from neurolens.study.speed import Call, Candidate, Race, Unavailable, race
-from neurolens.surrogates.bases import pinned_threads
 from neurolens.surrogates.domain import FilmRays, domain_of
 from neurolens.surrogates.model import Domain
+from neurolens.surrogates.terms import pinned_threads
 
 LENSES = Path(__file__).parents[2] / "lenses"
 

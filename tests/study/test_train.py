@@ -27,7 +27,7 @@ from neurolens.study.train_states import fit_and_measure_states, state_settings
 from neurolens.surrogates.file import pack, read_model
 from neurolens.surrogates.fit import ModelSettings, prepare
 from neurolens.surrogates.pairs import make_pairs
-from neurolens.surrogates.states_fit import StateSettings
+from neurolens.surrogates.states import StateSettings
 
 pytestmark = pytest.mark.slow
 

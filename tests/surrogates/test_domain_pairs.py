@@ -1,4 +1,4 @@
-"""Domains and ray pairs: uniform, repeatable, apart, and saved so that nothing wrong comes back."""
+"""Domains and ray pairs: uniform, repeatable, and without a ray in two splits."""
 
 import json
 import math
@@ -18,7 +18,7 @@ from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
 from neurolens.surrogates.domain import domain_from_camera, domain_of, focused_plane_z_mm, sample_domain
 from neurolens.surrogates.model import Domain
-from neurolens.surrogates.pairs import SPLITS, PairSettings, RayPairs, load_pairs, make_pairs, save_pairs, trace_pairs
+from neurolens.surrogates.pairs import SPLITS, PairSettings, RayPairs, make_pairs, save_pairs, trace_pairs
 from neurolens.surrogates.targets import film_equivalent_weights
 
 ROOT = Path(__file__).parents[2] / "lenses"
@@ -123,12 +123,9 @@ def test_focused_plane_is_the_inverse_of_focusing(focus_m: float) -> None:
     film = film_z_mm(lens, focus_m)
     plane = float(focused_plane_z_mm(lens, torch.tensor([film], dtype=torch.float64))[0])
     assert film - plane == pytest.approx(1000 * focus_m, rel=1e-9)
-
-
-def test_infinity_focus_has_no_plane() -> None:
-    lens = singlet()
-    film = torch.tensor([film_z_mm(lens, math.inf), film_z_mm(lens, math.inf) - 0.1], dtype=torch.float64)
-    assert torch.equal(focused_plane_z_mm(lens, film), torch.full((2,), -math.inf, dtype=torch.float64))
+    infinity = film_z_mm(lens, math.inf)
+    beyond = torch.tensor([infinity, infinity - 0.1], dtype=torch.float64)
+    assert torch.equal(focused_plane_z_mm(lens, beyond), torch.full((2,), -math.inf, dtype=torch.float64))
 
 
 def test_without_dispersion_there_is_one_wavelength() -> None:
@@ -199,52 +196,16 @@ def test_the_seed_decides(pairs: RayPairs) -> None:
     assert not torch.equal(one.train.scene.x, other.train.scene.x)
 
 
-def test_saved_and_reloaded_bit_for_bit(pairs: RayPairs, tmp_path: Path) -> None:
-    path = tmp_path / "pairs.npz"
-    save_pairs(pairs, path)
-    back = load_pairs(path, pairs.lens)
-    assert (back.domain, back.settings, back.tested) == (pairs.domain, pairs.settings, pairs.tested)
-    for name in SPLITS:
-        for a, b in zip(getattr(pairs, name).columns(), getattr(back, name).columns(), strict=True):
-            assert a.dtype == b.dtype and torch.equal(a, b)
-
-
-def test_pairs_of_another_lens_are_refused(pairs: RayPairs, tmp_path: Path) -> None:
-    path = tmp_path / "pairs.npz"
-    save_pairs(pairs, path)
-    with pytest.raises(InputError, match="lens_sha256"):
-        load_pairs(path, pairs.lens.scaled(1.001))
-    load_pairs(path, set_lens(pairs.lens, f_number=8.0, focus_m=2.0))  # stop and focus are no part of the glass
-
-
-@pytest.mark.parametrize("kind", ["missing", "empty", "text", "truncated", "flipped", "pickled", "no header", "schema"])
-def test_files_that_are_no_pairs(pairs: RayPairs, tmp_path: Path, kind: str) -> None:
-    path = tmp_path / "pairs.npz"
-    save_pairs(pairs, path)
-    data = path.read_bytes()
-    with np.load(path) as stored:
-        arrays = dict(stored)
-    match kind:
-        case "missing":
-            path.unlink()
-        case "empty":
-            path.write_bytes(b"")
-        case "text":
-            path.write_text("radius_mm = 3")
-        case "truncated":
-            path.write_bytes(data[: len(data) // 2])
-        case "flipped":
-            middle = len(data) // 2
-            path.write_bytes(data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :])
-        case "pickled":
-            np.savez(path, **{**arrays, "train_status": np.array([{"a": 1}], dtype=object)})
-        case "no header":
-            np.savez(path, **{k: v for k, v in arrays.items() if k != "header"})
-        case "schema":
-            header = {**json.loads(arrays["header"].tobytes()), "schema": 99}
-            np.savez(path, **{**arrays, "header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)})
-    with pytest.raises(InputError, match="pairs.npz"):
-        load_pairs(path, pairs.lens)
+def test_saved_pairs_are_plain_arrays(pairs: RayPairs, tmp_path: Path) -> None:
+    save_pairs(pairs, tmp_path / "pairs.npz")
+    with np.load(tmp_path / "pairs.npz", allow_pickle=False) as data:
+        header = json.loads(data["header"].tobytes())
+        assert Domain.from_dict(header["domain"]) == pairs.domain and header["lens_sha256"] == pairs.lens.sha256
+        for name in SPLITS:
+            columns = getattr(pairs, name).columns()
+            stored = [*data[f"{name}_vectors"], data[f"{name}_status"], *data[f"{name}_surfaces"]]
+            for a, b in zip(columns, stored, strict=True):
+                assert np.array_equal(a.numpy(), b)
 
 
 @pytest.mark.parametrize("wrong", [{"train": 0}, {"held_out": 0}, {"rim": 0}, {"train": -5}])

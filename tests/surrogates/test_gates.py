@@ -20,8 +20,9 @@ from neurolens.surrogates.cores import InvariantPolynomial
 from neurolens.surrogates.domain import SPARSE, FilmRays, domain_of, lit_share, sample_domain, sample_lit
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, fit_model, prepare
+from neurolens.surrogates.fits.boundaries import GateFit
 from neurolens.surrogates.fits.polynomial import fit_polynomial
-from neurolens.surrogates.gates import GateFit, boundary_rays, choose_gates, gate_reach, gate_values
+from neurolens.surrogates.gates import boundary_rays, choose_gates, gate_reach, gate_values
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import Domain, Gate, LensModel
 from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, reached, trace_pairs
@@ -47,11 +48,12 @@ def false_blocks(model: LensModel, rays: PairSet) -> float:
 
 
 def test_gates_are_found_where_rays_are_lost() -> None:
-    """A singlet's corner rays are totally reflected at its front; half a ball is missed and reflects."""
+    """A singlet's corner rays are totally reflected at its front; half a ball is missed and reflects.
+
+    `gated` makes an error of the warning that gates miss more than one ray in 10,000.
+    """
     assert gated("singlet").gates == (Gate(2, st.RIM), Gate(1, st.RIM), Gate(1, st.TOTAL_REFLECTION))
     assert gated("hemisphere").gates == (Gate(2, st.MISSED), Gate(1, st.TOTAL_REFLECTION))
-    assert gated("singlet").lost_share == 0
-    assert gated("hemisphere").lost_share < 1e-4  # a few meet the far half of the ball
 
 
 def test_where_no_ray_is_lost_there_are_rims_alone() -> None:
@@ -300,7 +302,7 @@ POOR = {
 }
 
 
-@pytest.mark.parametrize("method", ["ols", "omp", "adaptive", "dense"])
+@pytest.mark.parametrize("method", ["ols", "adaptive"])
 @pytest.mark.parametrize("kind", POOR)
 def test_poor_data_are_fitted_as_far_as_they_tell(kind: str, method: str) -> None:
     """Finite, sound in float32, and right on the rays that there were."""

@@ -1,26 +1,33 @@
-"""Derivatives of models and inverse maps: against finite differences, the exact lens, and étendue; or they say no."""
+"""Derivatives and inverse maps, in torch and as files: finite differences, the exact lens, étendue; or they say no."""
 
 import math
+import shutil
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
+from pathlib import Path
 
 import lens_models
 import numpy as np
+import onnxruntime
 import pytest
 import torch
-from lens_models import KINDS, model, prepared
+from lens_models import KINDS, edited, model, prepared
 from torch import Tensor
 
 from neurolens.base import status as st
-from neurolens.base.errors import InputError
+from neurolens.base.errors import InputError, ModelError
+from neurolens.cameras.model import load_model
+from neurolens.cameras.onnxmaps import load_inverse
 from neurolens.setting.pupils import camera_rays
+from neurolens.surrogates.card import MODEL_KEY
 from neurolens.surrogates.domain import FilmRays, sample_domain
+from neurolens.surrogates.export import export_inverse, export_onnx
 from neurolens.surrogates.fit import ModelSettings, fit_model
 from neurolens.surrogates.inverse import InverseModel, InverseRays
 from neurolens.surrogates.inverse_fit import convergence, fit_inverse
 from neurolens.surrogates.model import LensModel
-from neurolens.surrogates.pairs import PairSet
+from neurolens.surrogates.pairs import PairSet, trace_pairs
 from neurolens.trace.rays import film_derivatives, trace_differentials
 from neurolens.trace.shapes import sag_and_derivatives
 from neurolens.trace.surfaces import Rays
@@ -42,16 +49,12 @@ def _passing(name: str) -> PairSet:
     return prepared(name).pairs.train
 
 
-def _cast(rays: FilmRays, dtype: torch.dtype) -> FilmRays:
-    return FilmRays(*(c.to(dtype) for c in rays.columns()))
-
-
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("name", [GAUSS, FISHEYE, ASPHERE])
 def test_stop_points_of_passing_rays_lead_to_those_rays(name: str, dtype: torch.dtype) -> None:
     inv, pairs = inverse(name), _passing(name)
     stop = pairs.cross_x[inv.model.lens.stop_index], pairs.cross_y[inv.model.lens.stop_index]
-    rays = _cast(pairs.inputs, dtype)
+    rays = pairs.inputs.to(dtype)
     out = _through(inv, rays, *(s.to(dtype) for s in stop))
     assert float((out.residual < 1e-4).double().mean()) >= 0.9999
     off = torch.hypot(out.rays.pupil_x - rays.pupil_x, out.rays.pupil_y - rays.pupil_y)
@@ -104,8 +107,6 @@ def test_a_scene_point_and_a_point_of_the_front_make_a_ray() -> None:
     assert int(passed.sum()) > 10
     assert torch.allclose(out.prediction.rays.x[passed], x[passed], atol=1e-4 * inv.model.scales.position_mm)
     # The exact lens images the point where the model does: its own ray from there passes the point.
-    from neurolens.surrogates.pairs import trace_pairs
-
     exact = trace_pairs(lens, out.rays.select(passed), inv.model.domain.pupil_z_mm).scene
     along = (point[2] - exact.z) / exact.dz
     miss = torch.hypot(exact.x + along * exact.dx - point[0], exact.y + along * exact.dy - point[1])
@@ -129,8 +130,8 @@ def test_sampling_the_stop_weighs_as_sampling_the_pupil() -> None:
     by_stop = math.pi * radius**2 * float((lit / out.density).mean())
     assert by_stop == pytest.approx(by_pupil, rel=0.01)
     some = lit.nonzero()[:200, 0]
-    d = inv.model.differentiate(out.rays.select(some))
-    area = torch.linalg.det(d.stop_d_pupil.permute(2, 0, 1)).abs()
+    _, _, stop = inv.model.differentiate(out.rays.select(some))
+    area = torch.linalg.det(stop[:, 2:4].permute(2, 0, 1)).abs()
     assert torch.allclose(area, out.density[some], rtol=1e-9)
 
 
@@ -224,10 +225,8 @@ CYLINDERS = [pytest.param(kind, marks=pytest.mark.slow) for kind in ("cylinders"
 def test_derivatives_are_the_finite_differences_of_the_model(kind: str) -> None:
     m = model(kind)
     rays = sample_domain(m.domain, 3000, seed=3)
-    d = m.differentiate(rays)
-    ok = d.prediction.status == st.PASSED
-    ray = torch.cat([d.d_film, d.d_pupil, d.d_wavelength[:, None]], 1)
-    stop = torch.cat([d.stop_d_film, d.stop_d_pupil, d.stop_d_wavelength[:, None]], 1)
+    prediction, ray, stop = m.differentiate(rays)
+    ok = prediction.status == st.PASSED
     for k, name in enumerate(COLUMNS):
         step = 1e-2 if name == "wavelength_nm" else 1e-4
         ends = [_outputs(m, replace(rays, **{name: getattr(rays, name) + s * step})) for s in (1, -1)]
@@ -251,7 +250,7 @@ def test_differentials_are_those_of_the_exact_lens_to_one_percent(name: str) -> 
     known = prepared(name)
     m = fit_model(known, ModelSettings("ols", terms=64, planes=False))
     rays = known.pairs.train.inputs.select(slice(0, 2000))
-    d = m.differentiate(rays)
+    d_film = m.differentiate(rays)[1][:, :2]
     plane = m.domain.pupil_z_mm
     start = camera_rays(rays.film_x, rays.film_y, rays.film_z, rays.pupil_x, rays.pupil_y, plane)
     distance = torch.sqrt(
@@ -260,5 +259,122 @@ def test_differentials_are_those_of_the_exact_lens_to_one_percent(name: str) -> 
     exact = trace_differentials(m.lens, start, film_derivatives(start, distance), rays.wavelength_nm)
     wanted = torch.stack([torch.stack(list(t)) for t in exact.derivatives], 1)  # [6, 2, N]
     for rows in (slice(0, 3), slice(3, 6)):
-        off = (d.d_film - wanted)[rows].square().mean().sqrt() / wanted[rows].square().mean().sqrt()
+        off = (d_film - wanted)[rows].square().mean().sqrt() / wanted[rows].square().mean().sqrt()
         assert float(off) < 0.01, (name, rows)
+
+
+# ---- as files ----
+
+
+FILE_KINDS = ("invariants", "raw", "network", "thick", "fisheye")
+
+
+@cache
+def inverse_of_kind(kind: str) -> InverseModel:
+    name = "horimoto_fisheye_16" if kind == "fisheye" else "laikin_double_gauss_50"
+    return fit_inverse(lens_models.model(kind), prepared(name).pairs)
+
+
+def _rays(kind: str, count: int = 3000) -> FilmRays:
+    """Rays of the domain's farthest film plane, as float32 holds them."""
+    domain = lens_models.model(kind).domain
+    rays = sample_domain(domain, count, seed=21)
+    plane = torch.full_like(rays.film_z, domain.film_z_mm[1])
+    columns = (rays.film_x, rays.film_y, plane, rays.pupil_x, rays.pupil_y, rays.wavelength_nm)
+    return FilmRays(*(c.float().double() for c in columns))
+
+
+@pytest.mark.parametrize("kind", FILE_KINDS)
+def test_derivatives_of_the_file_are_those_of_the_model(kind: str, tmp_path: Path) -> None:
+    m = lens_models.model(kind)
+    plain = load_model(lens_models.exported(kind))
+    loaded = load_model(export_onnx(m, tmp_path / "m.onnx", derivatives=True))
+    rays = _rays(kind)
+    film, pupil = (torch.stack(p).float().numpy() for p in ((rays.film_x, rays.film_y), (rays.pupil_x, rays.pupil_y)))
+    w, plane, stop = rays.wavelength_nm.float().numpy(), float(rays.film_z[0]), m.domain.stop_radius_mm
+    session = onnxruntime.InferenceSession(loaded.path.read_bytes(), providers=["CPUExecutionProvider"])
+    feeds = {"rays": np.concatenate([film, pupil, w[None]]), "film_z_mm": np.float32([plane])}
+    names = ["scene_ray_d_film", "scene_ray_d_pupil"]
+    found = [np.moveaxis(a, 0, 1) for a in session.run(names, feeds | {"stop_radius_mm": np.float32([stop])})]
+    prediction, wanted, _ = m.differentiate(rays)
+    ok = (prediction.status == st.PASSED).numpy()
+    for a, b in zip(found, (wanted[:, :2].numpy(), wanted[:, 2:4].numpy()), strict=True):
+        for rows in (slice(0, 3), slice(3, 6)):
+            assert np.abs(a - b)[rows][..., ok].max() < 1e-5 * np.abs(b[rows][..., ok]).max()
+    # Those who do not ask get what the plain file gives.
+    for a, b in zip(loaded.rays(film, pupil, w, plane), plain.rays(film, pupil, w, plane), strict=True):
+        np.testing.assert_allclose(a[..., ok], b[..., ok], atol=2e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["invariants", "network", "fisheye"])
+def test_inverse_maps_of_the_file_are_those_of_torch(kind: str, tmp_path: Path) -> None:
+    inv, rays = inverse_of_kind(kind), _rays(kind)
+    export_inverse(inv, tmp_path / "m.onnx", {"rms_um": 1.0})
+    loaded = load_inverse(tmp_path / "m.onnx", lens=inv.model.lens.sha256)
+    forward = inv.model.predict(rays)
+    film, w, plane = torch.stack([rays.film_x, rays.film_y]).numpy(), rays.wavelength_nm.numpy(), float(rays.film_z[0])
+    stop = torch.stack([forward.stop_x, forward.stop_y])
+    found = loaded.through_stop(film, stop.numpy(), w, plane)
+    wanted = inv.through_stop(rays.film_x, rays.film_y, rays.film_z, stop[0], stop[1], rays.wavelength_nm)
+    passed = (forward.status == st.PASSED).numpy()
+    rim = (stop.norm(dim=0) > 0.999 * inv.model.domain.stop_radius_mm).numpy()
+    sure = passed & ~rim
+    assert (found.status == wanted.prediction.status.numpy())[sure].mean() > 0.999
+    scale = inv.model.domain.pupil_radius_mm
+    assert np.abs(found.rays[2] - wanted.rays.pupil_x.numpy())[sure].max() < 2e-4 * scale
+    np.testing.assert_allclose(found.density[sure], wanted.density.numpy()[sure], rtol=2e-3)
+    scene = torch.stack(list(forward.rays)).numpy()
+    back = loaded.from_scene(scene[:3] + 50 * scene[3:], scene[3:], w, plane)
+    side = inv.from_scene(forward.rays, rays.film_z, rays.wavelength_nm)
+    assert (back.status == side.prediction.status.numpy())[sure].mean() > 0.999
+    inverted = (side.rays.film_x, side.rays.film_y, side.rays.pupil_x, side.rays.pupil_y)
+    for row, column in zip(back.rays[:4], inverted, strict=True):
+        assert np.abs(row - column.numpy())[sure].max() < 2e-4 * scale
+    np.testing.assert_allclose(back.density[sure], side.density.numpy()[sure], rtol=5e-3)
+    fit = loaded.card["inverse"]["fit"]
+    assert min(fit["stop"]["converged"], fit["scene"]["converged"]) >= 0.999
+
+
+def test_nonsense_gets_a_status(tmp_path: Path) -> None:
+    export_inverse(inverse_of_kind("invariants"), tmp_path / "m.onnx")
+    loaded = load_inverse(tmp_path / "m.onnx")
+    odd = np.array([0.0, 1e-40, 5.0, 1e6, 1e38, np.inf, -np.inf, np.nan])
+    a, b, c = (v.ravel() for v in np.meshgrid(odd, odd, odd))
+    points = np.stack([a, b, c])
+    wild = (~np.isfinite(points) | (np.abs(points) > 100)).any(0)
+    out = loaded.through_stop(np.stack([a, np.zeros_like(a)]), np.stack([b, c]), 550.0)
+    assert (out.status != st.PASSED)[wild].all()
+    back = loaded.from_scene(points, np.stack([c, a, b]), 550.0)
+    assert (back.status != st.PASSED)[~np.isfinite(points).all(0)].all()
+    for bad in (np.zeros(3), [["a"], ["b"]]):
+        with pytest.raises(InputError, match="film_xy_mm"):
+            loaded.through_stop(bad, np.zeros((2, 3)), 550.0)
+
+
+def test_files_that_are_no_inverse_maps_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="no such files"):
+        load_inverse(tmp_path / "m.onnx")
+    shutil.copy(lens_models.exported("invariants"), tmp_path / "m.stop.onnx")
+    with pytest.raises(ModelError, match="inverse"):
+        load_inverse(tmp_path / "m.onnx")
+    export_inverse(inverse_of_kind("invariants"), tmp_path / "m.onnx")
+    with pytest.raises(ModelError, match="another lens"):
+        load_inverse(tmp_path / "m.onnx", lens="0" * 64)
+    scene = shutil.copy(tmp_path / "m.scene.onnx", tmp_path / "whole.onnx")
+    edited(scene, tmp_path / "m.scene.onnx", lambda card: card["inverse"].update(map="stop"))
+    with pytest.raises(ModelError, match="card: inverse"):
+        load_inverse(tmp_path / "m.onnx")
+    for change in (
+        lambda d: d.pop("guess"),
+        lambda d: d["guess"]["ab"].update(shape=[1, 1]),
+        lambda d: d["guess"].pop("ab"),
+    ):
+        edited(scene, tmp_path / "m.scene.onnx", change, MODEL_KEY)
+        with pytest.raises(ModelError, match="first guess"):
+            load_inverse(tmp_path / "m.onnx")
+    shutil.copy(scene, tmp_path / "m.scene.onnx")
+    (tmp_path / "m.stop.onnx").unlink()
+    with pytest.raises(InputError, match="map"):
+        load_inverse(tmp_path / "m.onnx").through_stop(np.zeros((2, 1)), np.zeros((2, 1)), 550.0)
+    with pytest.raises(ModelError):
+        load_model(tmp_path / "m.scene.onnx")

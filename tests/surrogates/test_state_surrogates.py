@@ -33,8 +33,7 @@ from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_states
 from neurolens.surrogates.model import LensModel, mix
 from neurolens.surrogates.pairs import PairSettings, make_pairs
-from neurolens.surrogates.states import StateModel, StateSpace, focus_axis, zoom_axis
-from neurolens.surrogates.states_fit import StateSettings, fit_states
+from neurolens.surrogates.states import StateModel, StateSettings, StateSpace, fit_states, focus_axis, zoom_axis
 from neurolens.trace.rays import trace
 
 ZOOM = Axis("zoom", "mm", (70.0, 135.0, 200.0), 3, reciprocal=True, stated=(("70mm", 70.0),))

@@ -19,7 +19,7 @@ from neurolens.base.records import Results
 from neurolens.cli import main
 from neurolens.render.pictures import write_exr, write_png
 from neurolens.study.report import write_report
-from neurolens.surrogates.cardkeys import CARD_KEY
+from neurolens.surrogates.card import CARD_KEY
 
 ROOT = Path(__file__).parents[2]
 RUN = "window.__pwned = 1"

@@ -1,13 +1,13 @@
-"""What every model fits after position and direction: stop crossing, transmittance and gates.
+"""Fits of the stop crossing, the transmittance and the gates, which follow those of position and direction.
 
-Polynomials use the terms that are there anyway, networks their last hidden layer. Both get more terms where those do
-not tell the boundaries or the transmittance well: absorption and coatings change with the wavelength faster than any
-ray's path does, and near grazing rays faster with the ray.
+Polynomials use the terms that are there anyway, networks their last hidden layer. Both get more terms where the
+boundaries or the transmittance need them: absorption and coatings change with the wavelength faster than any ray's path
+does, and near grazing rays faster with the ray.
 """
 
 from __future__ import annotations
 
-import itertools
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -15,19 +15,27 @@ import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.surrogates.bases import Exponents, invariant_exponents, monomials, solve, vector_columns
 from neurolens.surrogates.cores import STOP, InvariantPolynomial
-from neurolens.surrogates.fits.selection import Sweep
-from neurolens.surrogates.gates import GateFit, gate_reach, gate_values
+from neurolens.surrogates.gates import gate_reach, gate_values
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.targets import Prepared
+from neurolens.surrogates.terms import (
+    Exponents,
+    Sweep,
+    further,
+    invariant_exponents,
+    monomials,
+    powers,
+    solve,
+    vector_columns,
+)
 
 # Terms are added for boundaries until each is met to this RMS: of a gate (twice the relative radius of a rim), and of
 # the stop crossing in stop radii.
 GATE_ERROR, STOP_ERROR = 2e-3, 5e-4
 STOP_KEPT = 0.04  # least share of that error, squared, to which growth may hold the stop crossing
 MOST_BOUNDARY_TERMS = 64
-# Networks, whose units learn where rays go rather than what blocks them, are held to this share of those errors.
+# Networks, whose units follow where rays go rather than what blocks them, are held to this share of those errors.
 NETWORK_SHARE, MOST_NETWORK_TERMS = 1 / 3, 96
 _DEGREE = 9  # of the terms among which those for boundaries are found
 _RAYS = 12_000  # on which they are found
@@ -35,7 +43,12 @@ TRANSMITTANCE_ERROR = 2.5e-4  # RMS at which no term is added
 _TRANSMITTANCE_RAYS = 6000
 _TRANSMITTANCE_DEGREE, _MOST_W = 7, 8  # of the candidates
 _LEAST_GAIN = 0.03  # a term must take away this share of the squared error left
-
+# A far ray that passes all fitted gates is fitted with this value of one gate, or its own where that is less than a rim
+# radius twice over; first with this weight, which doubles while it still passes, up to the last.
+_TARGET, _MOST_TARGET = 0.1, 1.0
+_WEIGHT, _MOST_WEIGHT = 0.03, 1.0
+_ROUNDS = 8
+_RIDGE, _DEPENDENT = 1e-13, 1e-12  # relative
 
 Features = Callable[[LightField], Tensor]  # [M, N] of N rays
 
@@ -110,42 +123,53 @@ def boundary_terms(data: Prepared, exponents: Exponents, first: Exponents, hidde
             crossing: where those meet it better it is met as well.
         hidden: the features of a network's last hidden layer, which are held to a share of the errors.
     """
-    every = invariant_exponents(_DEGREE, dispersive=data.encoding.dispersive)
-    known = {tuple(e) for e in exponents.tolist()}
-    added = np.array([e for e in every.tolist() if tuple(e) not in known], dtype=np.int64).reshape(-1, 4)
-    candidates = np.concatenate([exponents, added])
+    added = further(invariant_exponents(_DEGREE, dispersive=data.encoding.dispersive), exponents)
     field = LightField(*(c[..., :_RAYS] for c in data.boundary_field))
     allowed, most, share = 1.0, MOST_BOUNDARY_TERMS, 1.0
     if hidden is not None:
         allowed, most = NETWORK_SHARE**2, MOST_NETWORK_TERMS
     if not np.array_equal(first, exponents[: len(first)]):
-        (stop,) = _boundary_fits(data, field, features_of(first)(field), only=[0])
+        stop = _boundary_fits(data, field, features_of(first)(field), which=[0])[0]
         share = min(max(stop.error, STOP_KEPT), 1.0)
     features = features_of(exponents, hidden)(field)
-    met = _boundary_fits(data, field, features, stop_share=share)
-    bad = [k for k, f in enumerate(met) if f.error > allowed]
+    fits = _boundary_fits(data, field, features, stop_share=share)
+    bad = [k for k, fit in enumerate(fits) if fit.error > allowed]
     if not bad:
         return added[:0]
-    start = len(features)
-    fits = _boundary_fits(data, field, features_of(candidates, hidden)(field), start, bad, share)
-    chosen: list[int] = []
-    while fits and len(chosen) < min(most, len(added)):
-        scores = np.sum([f.scores() for f in fits], axis=0)
-        best = int(np.argmax(scores))
-        if not scores[best] > 0:
-            break
-        chosen.append(best)
-        for f in fits:
-            f.add(best)
-        fits = [f for f in fits if f.error > allowed]
-    return added[[k - start for k in chosen]]
+    start, features = len(features), features_of(np.concatenate([exponents, added]), hidden)(field)
+    fits = _boundary_fits(data, field, features, start, bad, share)
+    return added[[k - start for k in _selected(fits, min(most, len(added)), allowed)]]
+
+
+def transmittance_terms(data: Prepared, exponents: Exponents, most: int) -> Exponents:
+    """[K, 4] further exponents, at most `most`, by forward selection beside those given [M, 4]; often none."""
+    rays = data.pairs.train.select(slice(0, _TRANSMITTANCE_RAYS))
+    if most == 0 or len(rays) < 2 * (len(exponents) + most):
+        return exponents[:0]
+    invariants, wanted = data.encoding(rays.inputs).invariants(), rays.transmittance[None]
+    features = monomials(invariants, exponents)
+    left = wanted - solve(features, wanted) @ features
+    allowed = TRANSMITTANCE_ERROR**2 * len(rays)
+    if not float((left**2).sum()) > allowed:
+        return exponents[:0]
+    candidates = invariant_exponents(_TRANSMITTANCE_DEGREE, dispersive=data.encoding.dispersive)
+    if data.encoding.dispersive:  # absorption: high powers of w, with low ones of the others
+        colours = np.array([(*p, w) for w in range(1, _MOST_W + 1) for p in powers(3, 1)], dtype=np.int64)
+        candidates = np.unique(np.concatenate([candidates, colours]), axis=0)
+    added, start = further(candidates, exponents), len(exponents)
+    features = monomials(invariants, np.concatenate([exponents, added]))
+    fit = _BoundaryFit(Sweep.of_columns(features, wanted), len(features), 1 / allowed, start)
+    return added[[k - start for k in _selected([fit], most, 1.0, _LEAST_GAIN) if k >= start]]
 
 
 class _BoundaryFit:
     """One boundary's normal equations: `blocks` columns a term (A and B of a vector, or one)."""
 
-    def __init__(self, sweep: Sweep, terms: int, scale: float) -> None:
+    def __init__(self, sweep: Sweep, terms: int, scale: float, start: int) -> None:
+        """Take the first `start` of the terms in; `scale` makes 1 of the squared error that is allowed."""
         self.sweep, self.terms, self.scale, self.blocks = sweep, terms, scale, sweep.count // terms
+        for term in range(start):
+            self.add(term)
 
     @property
     def error(self) -> float:
@@ -161,22 +185,37 @@ class _BoundaryFit:
         return self.scale * np.maximum(self.sweep.scores("ols"), 0.0).reshape(self.blocks, self.terms).sum(0)
 
 
+def _selected(fits: list[_BoundaryFit], most: int, allowed: float, least_gain: float = 0.0) -> list[int]:
+    """Terms by forward selection until no fit errs by more than allowed, or no term gains that share of the errors."""
+    chosen: list[int] = []
+    while fits and len(chosen) < most:
+        scores = np.sum([fit.scores() for fit in fits], axis=0)
+        best = int(np.argmax(scores))
+        if not scores[best] > least_gain * sum(fit.error for fit in fits):
+            break
+        chosen.append(best)
+        for fit in fits:
+            fit.add(best)
+        fits = [fit for fit in fits if fit.error > allowed]
+    return chosen
+
+
 def _boundary_fits(
     data: Prepared,
     field: LightField,
     features: Tensor,
     start: int | None = None,
-    only: list[int] | None = None,
+    which: list[int] | None = None,
     stop_share: float = 1.0,
 ) -> list[_BoundaryFit]:
-    """The fits of the stop crossing and of every gate, or `only` some of them, with the first `start` terms in.
+    """The fits of the stop crossing and of every gate, or some `which` of them, with the first `start` terms in.
 
     `stop_share`: of the squared error that the stop crossing may have otherwise.
     """
     crossing, weight = stop_crossing(data)
     values, weights = gate_values(data.pairs.lens, data.gates, data.boundary), data.boundary_weights[0]
     rays, terms, fits = features.shape[1], len(features), []
-    for k in range(1 + len(values)) if only is None else only:
+    for k in range(1 + len(values)) if which is None else which:
         w = (weights[k - 1] if k else weight)[:rays]
         if k:
             sweep = Sweep.of_columns(features * w, (values[k - 1, :rays] * w)[None])
@@ -184,48 +223,71 @@ def _boundary_fits(
             weighed = LightField(field.p * w, field.u * w, field.w)  # only p.p, p.u and u.u of it are used
             sweep = Sweep.of_vectors(features, weighed, (crossing[:, :rays] * w)[None])
         allowed = (GATE_ERROR**2 if k else STOP_ERROR**2 * stop_share) * max(float((w * w).sum()), 1e-300)
-        fit = _BoundaryFit(sweep, terms, 1 / allowed)
-        for term in range(terms if start is None else start):
-            fit.add(term)
-        fits.append(fit)
+        fits.append(_BoundaryFit(sweep, terms, 1 / allowed, terms if start is None else start))
     return fits
 
 
-def transmittance_terms(data: Prepared, exponents: Exponents, most: int) -> Exponents:
-    """[K, 4] further exponents, at most `most`, by forward selection beside those given [M, 4]; often none."""
-    rays = data.pairs.train.select(slice(0, _TRANSMITTANCE_RAYS))
-    none = exponents[:0]
-    if most == 0 or len(rays) < 2 * (len(exponents) + most):
-        return none
-    invariants, wanted = data.encoding(rays.inputs).invariants(), rays.transmittance[None]
-    features = monomials(invariants, exponents)
-    left = wanted - solve(features, wanted) @ features
-    allowed = TRANSMITTANCE_ERROR**2 * len(rays)
-    if not float((left**2).sum()) > allowed:
-        return none
-    known = {tuple(e) for e in exponents.tolist()}
-    offered = [tuple(e) for e in _candidates(dispersive=data.encoding.dispersive).tolist()]
-    new = np.array([e for e in offered if e not in known], dtype=np.int64).reshape(-1, 4)
-    features = monomials(invariants, np.concatenate([exponents, new]))
-    sweep = Sweep.of_columns(features, wanted)
-    for k in range(len(exponents)):
-        if sweep.scores("ols")[k] >= 0:
-            sweep.add(k)
-    chosen: list[int] = []
-    while len(chosen) < most and sweep.residual > allowed:
-        scores = sweep.scores("ols")
-        best = int(scores.argmax())
-        if not scores[best] > _LEAST_GAIN * sweep.residual:
-            break
-        sweep.add(best)
-        chosen.append(best - len(exponents))
-    return new[[k for k in chosen if k >= 0]]
+class GateFit:
+    """Gates [G] on common features [M, N], each with weights of its own."""
 
+    def __init__(self, features: Tensor, values: Tensor, weights: Tensor) -> None:
+        """Fit values [G, N] with weights [G, N]."""
+        # In orthogonal columns, so that normal equations keep their digits; what depends on others is left out.
+        norms = features.norm(dim=1).clamp_min(1e-300)
+        _, sizes, right = torch.linalg.svd(torch.linalg.qr((features / norms[:, None]).T)[1], full_matrices=False)
+        kept = sizes > _DEPENDENT * sizes[:1]  # the largest, where there is any ray
+        self._turn = (right[kept] / sizes[kept, None]).T / norms[:, None] * math.sqrt(features.shape[1])  # [M, K]
+        columns = features.T @ self._turn
+        self._grams, self._moments = [], []
+        for value, weight in zip(values, weights, strict=True):
+            rows = columns * weight[:, None]
+            self._grams.append(rows.T @ rows)
+            self._moments.append(rows.T @ (value * weight))
+        self._solutions = [self._solve(g) for g in range(len(values))]
 
-def _candidates(*, dispersive: bool) -> Exponents:
-    plain = invariant_exponents(_TRANSMITTANCE_DEGREE, dispersive=dispersive)
-    if not dispersive:
-        return plain
-    low = [p for p in itertools.product(range(2), repeat=3) if sum(p) <= 1]
-    colours = np.array([(*p, w) for w in range(1, _MOST_W + 1) for p in low], dtype=np.int64)
-    return np.unique(np.concatenate([plain, colours]), axis=0)
+    def _solve(self, gate: int) -> Tensor:
+        gram = self._grams[gate]
+        ridge = _RIDGE * gram.diagonal().mean() + 1e-300
+        return torch.linalg.solve(gram + ridge * torch.eye(len(gram), dtype=gram.dtype), self._moments[gate])
+
+    def coefficients(self) -> Tensor:
+        """[G, M]."""
+        if not self._solutions:
+            return torch.empty((0, len(self._turn)), dtype=torch.float64)
+        return torch.stack(self._solutions) @ self._turn.T
+
+    def block(self, features: Tensor, values: Tensor, reached: Tensor) -> None:
+        """Fit again until rays that do not pass are blocked by one gate at least.
+
+        Args:
+            features: [M, N] of those rays.
+            values: [G, N] of the gates. `reached` [G, N]: whether the ray gets so far that the value is known. A gate
+                that does not block a ray is never made to; one that the ray does not reach may be.
+        """
+        blocks = (values > 0) | ~reached
+        if not values.numel():
+            return
+        columns = features.T @ self._turn
+        fitted = torch.stack([columns @ solution for solution in self._solutions])
+        weight = torch.zeros_like(values)
+        for _ in range(_ROUNDS):
+            passing = (fitted <= 0).all(0) & blocks.any(0)
+            if not passing.any():
+                return
+            # The gate that truly blocks it, before others; of several the one whose fit is nearest to blocking it.
+            rank = torch.where(blocks, fitted, -math.inf) + torch.where(reached & (values > 0), 1e6, 0.0)
+            gate = rank.argmax(0)
+            for g in range(len(values)):
+                at = torch.nonzero(passing & (gate == g))[:, 0]
+                if not len(at):
+                    continue
+                heavier = (2 * weight[g, at]).clamp(_WEIGHT, _MOST_WEIGHT)
+                # Rows add to what is summed already: the weight's square grows by the difference.
+                more = torch.sqrt(heavier**2 - weight[g, at] ** 2)
+                weight[g, at] = heavier
+                target = torch.where(reached[g, at], values[g, at].clamp(_TARGET, _MOST_TARGET), _TARGET)
+                rows = columns[at] * more[:, None]
+                self._grams[g] = self._grams[g] + rows.T @ rows
+                self._moments[g] = self._moments[g] + rows.T @ (target * more)
+                self._solutions[g] = self._solve(g)
+                fitted[g] = columns @ self._solutions[g]

@@ -1,17 +1,21 @@
 """Small networks with the symmetry of the lens (after NeuroLens, Zheng and Zheng 2017b), and the course of a training.
 
-Several starts run on few rays, then the best, on as many rays as it takes not to overfit: a smooth lens is learnt from
-2000 rays as well as from 16,000, at an eighth of the cost of a step. Where the error on rays that the fit has not seen
-runs ahead of that on its own, it goes on with twice as many. Steps are counted by their rays, so that their number
-bounds the work and tells the share done.
+Several starts run on few rays; then the best goes on, on as many rays as it takes not to overfit: a smooth lens is
+learnt from 2000 rays as well as from 16,000, at an eighth of the cost of a step. Where the error on rays that the fit
+has not seen exceeds the error on its own rays, it goes on with twice as many. Steps are counted by their rays, so that
+their number bounds the work and gives the share done. A killed training goes on from its file.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,10 +23,8 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.base.kept import Kept
-from neurolens.surrogates.bases import pinned_threads
+from neurolens.base.kept import Kept, read_arrays
 from neurolens.surrogates.cores import DIRECTION, POSITION, STOP, InvariantPolynomial, Network, Residual
-from neurolens.surrogates.fits import checkpoint as kept_training
 from neurolens.surrogates.fits.boundaries import (
     MOST_NETWORK_TERMS,
     boundary_terms,
@@ -30,13 +32,12 @@ from neurolens.surrogates.fits.boundaries import (
     fit_stop,
     solve_scalars,
 )
-from neurolens.surrogates.fits.checkpoint import fingerprint
 from neurolens.surrogates.fits.projection import Problem, Projection, Stand, activations, minimise, project
 from neurolens.surrogates.gates import boundary_weights, gate_values
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.pairs import PairSet
-from neurolens.surrogates.settings import ModelSettings
-from neurolens.surrogates.targets import Prepared, film_equivalent_weights, targets_of
+from neurolens.surrogates.targets import ModelSettings, Prepared, film_equivalent_weights, targets_of
+from neurolens.surrogates.terms import pinned_threads
 
 # What the other outputs weigh against film-equivalent micrometres: so many um for 1 mm at the stop; and, for each mm of
 # the film radius, for a transmittance of 1 and for a gate of 1 (a rim radius twice over). They only decide which
@@ -44,7 +45,7 @@ from neurolens.surrogates.targets import Prepared, film_equivalent_weights, targ
 _STOP_UM_PER_MM, _TRANSMITTANCE_UM, _GATE_UM = 30.0, 20.0, 10.0
 # Training ends at an RMS of this share of the film radius: float32 itself, which evaluates the model, has eps 1.2e-7.
 _ENOUGH = 1e-7
-FEWEST_RAYS, RAYS = 2000, 16_000
+FEWEST_RAYS, _RAYS = 2000, 16_000
 STARTS = 3  # with random weights
 # Each start gets this share of the steps before the best goes on.
 _TRIAL_STEPS = 0.1
@@ -56,6 +57,8 @@ _GAP = 1.15
 _RAYS_A_TERM = 4
 # Converged, when so many bursts in a row lower the loss by less than this share each.
 _LITTLE, _IDLE = 0.01, 3
+# A training's state is kept (`base.kept`) every few seconds; another schema starts anew.
+_SCHEMA, EVERY_S = 2, 3.0
 
 
 def fit_network(
@@ -87,9 +90,9 @@ def fit_network(
     with pinned_threads():
         problem, shift, scale = _problem(data, base)
         decisive = {name: getattr(settings, name) for name in ("units", "layers", "steps", "seed")}
-        key = fingerprint(problem.tensors, {**decisive, "starts": STARTS, "rays": RAYS})
+        key = _fingerprint(problem.tensors, {**decisive, "starts": STARTS, "rays": _RAYS})
         enough = (_ENOUGH * 1000 * data.pairs.domain.film_radius_mm) ** 2
-        best = Training(problem, settings, enough, Kept(checkpoint, key, kept_training.EVERY_S), progress).run()
+        best = _Training(problem, settings, enough, Kept(checkpoint, key, EVERY_S), progress).run()
     if progress:
         progress(1.0)
     *hidden, output = ((w[:, :-1].numpy().copy(), w[:, -1].numpy().copy()) for w in (*best.hidden, best.output))
@@ -129,8 +132,8 @@ def with_boundary_terms(data: Prepared, network: Network) -> Network | Residual:
 def _problem(data: Prepared, base: InvariantPolynomial | None) -> tuple[Problem, Tensor, Tensor]:
     """The weighted fit, and shift and scale [4] of the invariants."""
     pairs, boundary = data.pairs, data.boundary
-    train = pairs.train.select(slice(0, max(RAYS - len(boundary), RAYS - RAYS // 2)))
-    boundary = boundary.select(slice(0, RAYS - len(train)))
+    train = pairs.train.select(slice(0, max(_RAYS - len(boundary), _RAYS - _RAYS // 2)))
+    boundary = boundary.select(slice(0, _RAYS - len(train)))
     parts = [_part(data, s, base) for s in (train, boundary) if len(s)]
     inputs, *rest = (torch.cat(c, -1) for c in zip(*parts, strict=True))
     low, high = inputs.amin(1), inputs.amax(1)
@@ -165,24 +168,21 @@ def _part(data: Prepared, pairs: PairSet, base: InvariantPolynomial | None) -> t
 
 @dataclass
 class _Place:
-    """Where a training is, but for the weights: plain numbers.
+    """The course of a training but for the weights: plain numbers, which a checkpoint keeps.
 
     Attributes:
-        start: the start that runs, or their number once the best goes on.
-        taken: steps of the present start, or of the best; of twice the rays, twice.
-        bursts: of the best.
-        level: how often the rays were doubled.
-        champion: the best start so far, by its loss `least`.
-        previous: loss after the last burst.
+        start: the start that runs, or `STARTS` once the best goes on.
+        taken: steps of the present start, or of the best; on twice the rays a step counts twice.
+        bursts: of the best. level: how often its rays were doubled.
+        least: loss of the best start so far. previous: loss after the last burst.
+        damping, growth: see `Stand`.
         idle: bursts in a row that gained little.
-        ended: whether the training is over.
     """
 
     start: int = 0
     taken: int = 0
     bursts: int = 0
     level: int = 0
-    champion: int = -1
     least: float = math.inf
     previous: float = math.inf
     damping: float = 0.0
@@ -191,35 +191,33 @@ class _Place:
     ended: bool = False
 
 
-@dataclass
-class Training:
-    """One training, which can be left at any burst and taken up again.
+class _Training:
+    """One training, which can be left at any burst and taken up again."""
 
-    Attributes:
-        problem: all rays.
-        settings: units, layers, seed and steps are read.
-        enough: a loss so low that the rounding of float32 evaluation is larger.
-        checkpoint: what earlier runs left.
-        progress: called with the share done.
-    """
-
-    problem: Problem
-    settings: ModelSettings
-    enough: float
-    checkpoint: Kept
-    progress: Callable[[float], None] | None = None
-    _place: _Place = field(default_factory=_Place)
-    _champion: list[Tensor] = field(default_factory=list)
+    def __init__(
+        self,
+        problem: Problem,
+        settings: ModelSettings,
+        enough: float,
+        checkpoint: Kept,
+        progress: Callable[[float], None] | None,
+    ) -> None:
+        """Start, or go on from a checkpoint; `enough` is a loss below the rounding of float32 evaluation."""
+        self._problem, self._settings, self._enough = problem, settings, enough
+        self._checkpoint, self._progress = checkpoint, progress
+        halvings = max(0, (len(problem) // FEWEST_RAYS).bit_length() - 1)
+        self._levels = [2**k for k in range(halvings, -1, -1)]  # a fit sees every so many-th ray
+        self._short = max(1, round(_TRIAL_STEPS * settings.steps))
+        self._place, self._stand, self._champion = _Place(), self._start(0), list[Tensor]()
+        if (known := checkpoint.load()) is not None:
+            state, arrays = known[0], [torch.from_numpy(array) for array in known[1]]
+            self._place = _Place(**state)
+            self._stand = Stand(arrays[: settings.layers], self._place.damping, self._place.growth)
+            self._champion = arrays[settings.layers :]
+        self._take_rays()
 
     def run(self) -> Projection:
-        """Train, from the start or from where the checkpoint was written; the last layer fits all rays."""
-        halvings = max(0, (len(self.problem) // FEWEST_RAYS).bit_length() - 1)
-        self._levels = [2**k for k in range(halvings, -1, -1)]
-        self._stand = self._start(0)
-        self._resume()
-        self._take_rays()
-        if STARTS == 1:
-            self._place.start = 1
+        """Train; the last layer fits all rays."""
         while not self._place.ended:
             if self._place.start < STARTS:
                 self._try_start()
@@ -227,76 +225,60 @@ class Training:
                 self._go_on()
             self._save()
         self._save(now=True)
-        return project(self.problem, self._stand.hidden)
+        return project(self._problem, self._stand.hidden)
 
     def _start(self, number: int) -> Stand:
-        s = self.settings
-        return Stand(random_layers(self.problem.inputs, s.units, s.layers, s.seed + 7919 * number))
+        s = self._settings
+        return Stand(random_layers(self._problem.inputs, s.units, s.layers, s.seed + 7919 * number))
 
     def _take_rays(self) -> None:
-        self._rays = self.problem.every(self._levels[self._place.level])
-        odd = self.problem.every(4, first=1) if self._levels[0] > 1 else None
-        self._unseen = odd if self._place.level + 1 < len(self._levels) else None
+        level = self._place.level
+        self._rays = self._problem.every(self._levels[level])
+        self._unseen = self._problem.every(4, first=1) if level + 1 < len(self._levels) else None
 
     def _burst(self, steps: int) -> Projection:
         """At most `_BURST` steps, each counted by its rays."""
         place, each = self._place, self._levels[0] // self._levels[self._place.level]
         count = min(_BURST, -(-(steps - place.taken) // each))
-        best, self._stand = minimise(
-            self._rays, self._stand, count, lambda share: self._report(place.taken + share * count * each)
-        )
+
+        def report(share: float) -> None:
+            if self._progress:
+                done = place.start * self._short + place.taken + share * count * each
+                self._progress(min(1.0, done / (STARTS * self._short + self._settings.steps)))
+
+        best, self._stand = minimise(self._rays, self._stand, count, report)
         place.taken += count * each
         return best
 
     def _try_start(self) -> None:
         """A burst of one of the starts; the end of its trial compares it with the best so far."""
-        place, short = self._place, max(1, round(_TRIAL_STEPS * self.settings.steps))
-        best = self._burst(short)
-        if place.taken < short and not self._stand.stuck:
+        place, best = self._place, self._burst(self._short)
+        if place.taken < self._short and not self._stand.stuck:
             return
         if best.loss < place.least or not self._champion:
-            place.least, place.champion, self._champion = best.loss, place.start, self._stand.hidden
+            place.least, self._champion = best.loss, self._stand.hidden
         place.start, place.taken = place.start + 1, 0
         self._stand = self._start(place.start) if place.start < STARTS else Stand(self._champion)
 
     def _go_on(self) -> None:
         """A burst of the best start; then more rays, or the end."""
-        place, s = self._place, self.settings
-        best = self._burst(s.steps)
+        place, best = self._place, self._burst(self._settings.steps)
         place.bursts += 1
-        little = best.loss > (1 - _LITTLE) * place.previous
-        place.idle = place.idle + 1 if little else 0
+        place.idle = place.idle + 1 if best.loss > (1 - _LITTLE) * place.previous else 0
         place.previous = best.loss
-        done = place.idle >= _IDLE or best.loss <= self.enough
+        done = place.idle >= _IDLE or best.loss <= self._enough
         if self._unseen is not None and (done or place.bursts % 2 == 0):
             outputs = activations(best.hidden, self._unseen.inputs)[-1] @ best.output.T
             if self._unseen.loss(outputs) > _GAP**2 * best.loss:
                 place.level, place.previous, place.idle, done = place.level + 1, math.inf, 0, False
                 self._stand = Stand(best.hidden, min(self._stand.damping, Stand.damping))
                 self._take_rays()
-        place.ended = done or place.taken >= s.steps or self._stand.stuck
-
-    def _report(self, taken: float) -> None:
-        """Tell the share of the iterations done."""
-        if self.progress:
-            s = self.settings
-            short = max(1, round(_TRIAL_STEPS * s.steps)) if STARTS > 1 else 0
-            done = min(self._place.start, STARTS) * short + taken
-            self.progress(min(1.0, done / (STARTS * short + s.steps)))
+        place.ended = done or place.taken >= self._settings.steps or self._stand.stuck
 
     def _save(self, *, now: bool = False) -> None:
         self._place.damping, self._place.growth = self._stand.damping, self._stand.growth
         arrays = [array.numpy() for array in (*self._stand.hidden, *self._champion)]
-        self.checkpoint.save(asdict(self._place), arrays, now=now)
-
-    def _resume(self) -> None:
-        known = self.checkpoint.load()
-        if known is None:
-            return
-        state, arrays = known[0], [torch.from_numpy(array) for array in known[1]]
-        self._place = _Place(**state)
-        self._stand = Stand(arrays[: self.settings.layers], self._place.damping, self._place.growth)
-        self._champion = arrays[self.settings.layers :]
+        self._checkpoint.save(asdict(self._place), arrays, now=now)
 
 
 def random_layers(inputs: Tensor, units: int, layers: int, seed: int) -> list[Tensor]:
@@ -313,3 +295,39 @@ def random_layers(inputs: Tensor, units: int, layers: int, seed: int) -> list[Te
         hidden.append(torch.cat([weight * changes if k == 0 else weight, bias], 1))
         width = units
     return hidden
+
+
+# ---- files of a training ----
+
+
+def _fingerprint(tensors: list[Tensor], settings: dict[str, Any]) -> str:
+    """SHA-256 of everything that decides the weights: the data, the settings and the version of torch."""
+    digest = hashlib.sha256(json.dumps([settings, str(torch.__version__), _SCHEMA], sort_keys=True).encode())
+    for tensor in tensors:
+        digest.update(str(tuple(tensor.shape)).encode())
+        digest.update(tensor.contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def of_zone(path: Path | None, zone: int) -> Path | None:
+    """The file of the zone-th fit (from 0) of a model; the first keeps the name."""
+    return path if path is None or zone == 0 else path.with_name(f"{path.stem}.{zone}{path.suffix}")
+
+
+def _files(path: Path) -> list[Path]:
+    return [f for f in (path, *path.parent.glob(f"{path.stem}.*{path.suffix}")) if f.is_file()]
+
+
+def training_s(path: Path | None) -> float:
+    """Seconds that a model's training took, all runs of it together; 0 where no file has them."""
+    total = 0.0
+    for file in [] if path is None else _files(path):
+        with suppress(OSError, ValueError), read_arrays(file) as (about, _):
+            total += float(about["spent_s"])
+    return total
+
+
+def clear_training(path: Path) -> None:
+    """Remove the files of a model's training, once the model itself is written."""
+    for file in _files(path):
+        file.unlink()

@@ -25,7 +25,7 @@ from neurolens.study.rays import ray_errors
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.fit import ModelSettings
 from neurolens.surrogates.fits.polynomial import ideal_map
-from neurolens.surrogates.model import Encoding
+from neurolens.surrogates.lightfield import Encoding
 from neurolens.surrogates.pairs import trace_pairs
 from neurolens.surrogates.targets import fit_encoding, scales_of
 from neurolens.trace.rays import Rays, trace

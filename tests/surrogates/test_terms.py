@@ -6,11 +6,22 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from sklearn import linear_model
 
 from neurolens.graph.interpret import monomials
-from neurolens.surrogates.bases import invariant_exponents, raw_exponents, solve, vector_columns, vector_gram
-from neurolens.surrogates.fits.selection import SPANNED, Sweep, backward, forward, matching_pursuit, replace_terms
 from neurolens.surrogates.lightfield import LightField
+from neurolens.surrogates.terms import (
+    SPANNED,
+    Sweep,
+    backward,
+    forward,
+    invariant_exponents,
+    raw_exponents,
+    replace_terms,
+    solve,
+    vector_columns,
+    vector_gram,
+)
 
 Floats = NDArray[np.float64]
 
@@ -200,13 +211,6 @@ def test_exponents_are_complete_and_unique(degree: int) -> None:
     assert len(coloured) == len({tuple(e) for e in coloured}) and coloured[:, :3].sum(1).max() == degree
 
 
-def test_monomials_are_products_of_powers() -> None:
-    variables = field().invariants()
-    exponents = invariant_exponents(3)
-    expected = torch.stack([torch.prod(variables ** torch.tensor(e)[:, None], dim=0) for e in exponents])
-    torch.testing.assert_close(monomials(variables, exponents), expected, rtol=1e-12, atol=1e-14)
-
-
 def test_the_gram_matrix_is_that_of_the_columns() -> None:
     rays = field()
     features = monomials(rays.invariants(), invariant_exponents(2))
@@ -237,11 +241,23 @@ def test_forward_omp_is_the_same_pursuit_as_scikit_learns() -> None:
     gram, moments = columns.T @ columns, columns.T @ output
     sweep = Sweep(gram, moments[:, None], np.array([output @ output]))
     forward(sweep, 6, "omp")
-    assert sorted(sweep.chosen) == matching_pursuit(gram, moments, 6)
+    lengths = np.linalg.norm(columns, axis=0)
+    found = linear_model.orthogonal_mp_gram(gram / np.outer(lengths, lengths), moments / lengths, n_nonzero_coefs=6)
+    assert sorted(sweep.chosen) == np.flatnonzero(found).tolist()
 
 
-def test_matching_pursuit_asked_for_more_terms_than_there_are_takes_all() -> None:
-    rng = np.random.default_rng(6)
-    columns = rng.normal(size=(200, 5))
-    moments = columns.T @ rng.normal(size=200)
-    assert matching_pursuit(columns.T @ columns, moments, 9) == list(range(5))
+def test_joined_problems_choose_by_the_sum_of_their_residuals() -> None:
+    columns, outputs = correlated(7), np.random.default_rng(8).normal(size=(2, 400))
+    halves = [np.s_[:200], np.s_[200:]]
+    parts = [(columns[:, half], outputs[:, half]) for half in halves]
+    joint = Sweep.joined([sweep_of(*part) for part in parts])
+    forward(joint, 6)
+    replace_terms(joint)
+    unit = [c / np.linalg.norm(c, axis=1, keepdims=True) for c, _ in parts]
+    assert joint.residual == pytest.approx(
+        sum(residual(u, o, joint.chosen) for u, (_, o) in zip(unit, parts, strict=True))
+    )
+    gains = joint.scores("ols")
+    best = int(gains.argmax())
+    after = sum(residual(u, o, [*joint.chosen, best]) for u, (_, o) in zip(unit, parts, strict=True))
+    assert gains[best] == pytest.approx(joint.residual - after, rel=1e-6)
