@@ -100,7 +100,7 @@ def frame_of(camera: Any) -> Frame:
 
 def _measured(camera: Any) -> Frame:
     """From where points close to the axis are seen on two planes, in both meridians."""
-    height = _SMALL * math.hypotcamera.film_mm / 2
+    height = _SMALL * math.hypot(*camera.film_mm) / 2
     points = height * np.array([[1.0, 0, -1, 0, 2, 0, -2, 0], [0, 1, 0, -1, 0, 2, 0, -2]])
     near, far, origin = 1000.0, 3000.0, Frame((1.0, 1.0), (0.0, 0.0))
     sizes = []
@@ -202,7 +202,7 @@ def laid(direction: Array, frame: Frame, target: str) -> Complex:
 
 def is_round(camera: Any) -> bool:
     """Whether points at some azimuths, none of which is another's mirror image, are seen alike."""
-    corner = math.hypotcamera.film_mm / 2
+    corner = math.hypot(*camera.film_mm) / 2
     angle = np.arange(_AZIMUTHS) * 0.83
     turn = np.exp(1j * np.tile(angle, len(_TRIED)))
     points = np.repeat(corner * np.array(_TRIED), angle.size) * turn
@@ -359,7 +359,7 @@ def field_of(
         found = seen(camera, np.stack([points.real, points.imag]), spectrum, frame, target, distance_m)
         return np.where(found.light > 0, laid(found.direction, frame, target), np.nan), found
 
-    corner = math.hypotcamera.film_mm / 2
+    corner = math.hypot(*camera.film_mm) / 2
     end = corner if azimuths > 1 else _end_of_light(lambda r: at(np.array([r + 0j]), distance)[1].light[0] > 0, corner)
     points = (np.linspace(0, end, rings)[:, None] * turns(azimuths)).reshape(-1)
     place, found = at(points, distance)
@@ -408,7 +408,7 @@ def _check_plane(camera: Any, widest_deg: float, bright: bool, end_mm: float) ->
         raise InputError(camera.name, "field", f"({widest_deg:.4g} degrees from the axis)",
                          f"at most {WIDEST_DEG:g}, to be laid on a plane: {other}")  # fmt: skip
     if not bright:
-        film, diagonal = " x ".join(f"{v:g}" for v in camera.film_mm), math.hypotcamera.film_mm
+        film, diagonal = " x ".join(f"{v:g}" for v in camera.film_mm), math.hypot(*camera.film_mm)
         lit = f"{2 * end_mm:.4g} mm" if 2 * end_mm < diagonal else "less"
         raise InputError(camera.name, "film_mm", f"({film} mm, {diagonal:.4g} mm across corners, of which {lit} lit)",
                          f"a film within the image circle: {other}")  # fmt: skip

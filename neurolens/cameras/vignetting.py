@@ -160,7 +160,7 @@ class _Table:
 
     def _end_of_light(self, camera: Any) -> float:
         """The largest film radius up to the corner at which light is found at any of the azimuths tried."""
-        corner = 1.0001 * math.hypotcamera.film_mm / 2
+        corner = 1.0001 * math.hypot(*camera.film_mm) / 2
 
         def lit(radius: Array) -> NDArray[np.bool_]:
             angle = np.arange(_TRIED_AZIMUTHS) * (2 * math.pi / _TRIED_AZIMUTHS)

@@ -136,7 +136,7 @@ def test_scenes_suit_lenses() -> None:
         assert shot.focus_m >= near_limit_m(lens) and shot.width == 1920
         moved_m = np.linalg.norm(np.subtract(shot.position_m, own.position_m))
         assert moved_m == pytest.approx(shot.focus_m - own.focus_m, abs=1e-6)  # what is in focus stays so
-        corner = np.hypotshot.film_mm / 2
+        corner = np.hypot(*shot.film_mm) / 2
         assert corner == pytest.approx(0.95 * image_radius_mm(lens)[0]) or shot.film_mm[0] == 36.0
 
 
