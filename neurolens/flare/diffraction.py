@@ -38,8 +38,7 @@ from neurolens.flare.lights import Light, patches
 from neurolens.flare.steps import Floats
 from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.lens.prescription import Lens
-from neurolens.render.colour import in_gamut
-from neurolens.render.spectrum import SpectralRange
+from neurolens.render.colour import SpectralRange, in_gamut
 
 _PER_CYCLE = 2.5  # cells a cycle of the field
 _NEAR, _FAR = 2.0, 4.0  # pixels from the centre between which the sum over cells gives way to the outline

@@ -34,9 +34,8 @@ from neurolens.flare.photons import LEVELS, Photons, PhotonTracer
 from neurolens.flare.steps import Floats
 from neurolens.lens.glass import inverse_square_um
 from neurolens.lens.paraxial import first_order
-from neurolens.render.checkpoint import digest
-from neurolens.render.colour import SRGB, in_gamut
-from neurolens.render.spectrum import SpectralRange
+from neurolens.render.colour import SRGB, SpectralRange, in_gamut
+from neurolens.render.film import digest
 
 _AT_ONCE = 1 << 16  # photons of a call
 _ENOUGH = 200  # photons of a kernel: a noise of 8%

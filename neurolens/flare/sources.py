@@ -19,10 +19,9 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.field import Array, Field
 from neurolens.flare.lights import CELLS, Light, Shape, flat_shape, light_towards, sides_across
-from neurolens.render.colour import balance
+from neurolens.render.colour import SpectralRange, balance
 from neurolens.render.job import camera_axes
 from neurolens.render.scene import Scene
-from neurolens.render.spectrum import SpectralRange
 from neurolens.render.world import World
 
 _CELL = 1 / 48  # of the picture's width: larger highlights are several lights

@@ -25,7 +25,7 @@ from neurolens.base.progress import Progress
 from neurolens.base.tasks import Failed, Shared, run_each
 from neurolens.base.travel import absolute, packed, run_with_files, unpack
 from neurolens.frames.frame import Frame, Prepared, flare_choice, prepare, render_frame
-from neurolens.render.checkpoint import digest
+from neurolens.render.film import digest
 from neurolens.render.tiles import read_tile, tile_path, write_picture
 
 if TYPE_CHECKING:

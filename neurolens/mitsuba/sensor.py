@@ -35,12 +35,12 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
 from neurolens.lens.shot import Shot, StopShape
 from neurolens.mitsuba.library import libraries, matrix, number, require_mitsuba, rows, vector
+from neurolens.render.colour import SpectralRange
 from neurolens.render.film import PixelGrid
 from neurolens.render.images import make_aperture
 from neurolens.render.job import mode_for
 from neurolens.render.sampler import hash32
 from neurolens.render.settings import FilmSettings
-from neurolens.render.spectrum import SpectralRange
 
 BATCH = RAYS_A_CALL  # of the camera
 _TURNED = np.array([[-1], [1], [-1]], np.float32)  # half a turn about y

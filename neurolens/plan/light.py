@@ -23,11 +23,11 @@ from neurolens.flare.sources import SceneLights, highlights, keep
 from neurolens.graph.compiler import has_compiler
 from neurolens.lens.film_plane import colours
 from neurolens.lens.prescription import Lens
+from neurolens.render.colour import SpectralRange
 from neurolens.render.job import expected_light
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene
 from neurolens.render.settings import FlareSettings
-from neurolens.render.spectrum import SpectralRange
 
 Array = NDArray[np.float64]
 

@@ -27,12 +27,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
-from neurolens.render.colour import FloatArray64, daylight_table, daylight_weights, planck, table
+from neurolens.render.colour import FloatArray64, Index, Palette, daylight_table, daylight_weights, planck, table
 from neurolens.render.lights import Aimed, LightGroup, Numbers
 from neurolens.render.primitives import dot
 from neurolens.render.sampler import TWO_PI, DirectionTable, cell_of, centres, in_cone
 from neurolens.render.scenetables import BLACK, Environment, Sky, Vector
-from neurolens.render.spectrum import Index, Palette
 
 Coefficients = Callable[[FloatArray], FloatArray]  # of the three spectra, [3, N] in directions [3, N]
 _TABLE = (128, 256)  # rows are even, so that the horizon is the edge of one

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
 from neurolens.render import sampler as dims
+from neurolens.render.colour import Index
 from neurolens.render.materials import GlossyLobes, fresnel_dielectric, glass_direction
 from neurolens.render.primitives import Rays, dot
 from neurolens.render.sampler import PathKeys, Sampler, cosine_direction
-from neurolens.render.spectrum import Index
 from neurolens.render.world import GLASS, GLOSSY, MIRROR, NOTHING, World
 
 _ONE_OVER_PI = np.float32(1 / np.pi)

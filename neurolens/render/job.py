@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FloatArray
 from neurolens.render import film as columns
-from neurolens.render.colour import SRGB, FloatArray64, Spectrum, balance, converted, illuminant
+from neurolens.render.colour import SRGB, FloatArray64, Index, SpectralRange, Spectrum, balance, converted, illuminant
 from neurolens.render.environment import sun_spectrum, total_spectrum
 from neurolens.render.film import Film, PixelGrid, Tiling
 from neurolens.render.integrator import lit, trace
@@ -21,7 +21,6 @@ from neurolens.render.sampler import FILM, PUPIL, WAVELENGTH, Sampler, centres
 from neurolens.render.scene import CameraSettings, Scene
 from neurolens.render.scenetables import Vector
 from neurolens.render.settings import FilmSettings, WavelengthMode
-from neurolens.render.spectrum import Index, SpectralRange
 from neurolens.render.world import world_of
 
 WeightedRays = tuple[FloatArray, FloatArray, FloatArray]  # origin, direction [3, N] and weight ([lanes,] N)

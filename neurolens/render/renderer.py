@@ -27,9 +27,17 @@ import numpy as np
 from neurolens.base.errors import InputError, NeurolensError, one_line
 from neurolens.base.signals import held
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.render.checkpoint import identity, read_checkpoint, write_checkpoint
 from neurolens.render.colour import check_name
-from neurolens.render.film import DROPPED, PASSED, Film, PixelGrid, check_memory
+from neurolens.render.film import (
+    DROPPED,
+    PASSED,
+    Film,
+    PixelGrid,
+    check_memory,
+    identity,
+    read_checkpoint,
+    write_checkpoint,
+)
 from neurolens.render.job import Job, Layers, develop
 from neurolens.render.scene import Scene
 from neurolens.render.settings import FilmSettings

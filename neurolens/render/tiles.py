@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError
 from neurolens.base.files import check_writable
 from neurolens.cameras.contract import FloatArray
-from neurolens.render.checkpoint import difference
 from neurolens.render.colour import COLOUR_SPACES, SRGB, conversion, converted
-from neurolens.render.film import check_memory
+from neurolens.render.film import check_memory, difference
 from neurolens.render.pictures import read_channels, read_metadata, standard_attributes, write_channels, write_png
 
 _EXPECTED = 'a tile of "neurolens render --tile"'

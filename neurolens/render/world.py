@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.cameras.contract import FloatArray
+from neurolens.render.colour import Index, Palette, SpectralRange
 from neurolens.render.environment import SunLight, make_surroundings
 from neurolens.render.lights import FlatLights, Lights, LightSamples, PointLights, SphereLights
 from neurolens.render.materials import CoatTable
@@ -23,7 +24,6 @@ from neurolens.render.mesh import Mesh, SphereTree, make_mesh, triangle_planes
 from neurolens.render.primitives import AxisQuad, Box, Disc, IntArray, Plane, Primitive, Quad, Rays, Spheres
 from neurolens.render.scene import Scene
 from neurolens.render.scenetables import BLACK, Emitter, Material, Texture, Vector
-from neurolens.render.spectrum import Index, Palette, SpectralRange
 
 Frame = NDArray[np.float64]
 _STEEPEST = 1e25  # pictures or cells a metre; times the farthest point still finite in float32

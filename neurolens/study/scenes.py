@@ -22,12 +22,12 @@ from neurolens.graph.compiler import has_compiler
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Shot
+from neurolens.render.colour import SpectralRange
 from neurolens.render.job import camera_axes
 from neurolens.render.pictures import standard_attributes, write_exr, write_png
 from neurolens.render.primitives import Rays
 from neurolens.render.renderer import render
 from neurolens.render.scene import CameraSettings, Scene, load_scene
-from neurolens.render.spectrum import SpectralRange
 from neurolens.render.world import world_of
 from neurolens.study.candidates import model_candidate
 from neurolens.study.experiment import Experiment, RenderChoice

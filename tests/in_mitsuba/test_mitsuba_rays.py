@@ -11,8 +11,8 @@ from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.mitsuba import library, load_scene
 from neurolens.mitsuba.sensor import BATCH, ChannelWavelengths, FilmRays, wavelength_samples
+from neurolens.render.colour import SpectralRange
 from neurolens.render.film import PixelGrid
-from neurolens.render.spectrum import SpectralRange
 
 FILM = (30.0, 20.0)
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
+from neurolens.render.colour import SpectralRange
 from neurolens.render.integrator import trace
 from neurolens.render.sampler import Sampler
 from neurolens.render.scene import Scene, scene_from_tables
-from neurolens.render.spectrum import SpectralRange
 from neurolens.render.world import World
 
 CAMERA: dict[str, Any] = {"position_m": [0, 0, 1], "look_at_m": [0, 0, 0], "focus_m": 2}

@@ -17,8 +17,7 @@ from render_helpers import FILM, PINHOLE, SIZE, THIN, WHITE, diffuse, files_of_a
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.ideal import ThinLens
-from neurolens.render.checkpoint import SPENT, digest, write_checkpoint
-from neurolens.render.film import Film, Tiling
+from neurolens.render.film import SPENT, Film, Tiling, digest, write_checkpoint
 from neurolens.render.renderer import RenderResult, Watch, render
 from neurolens.render.settings import FilmSettings
 

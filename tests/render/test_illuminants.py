@@ -16,6 +16,7 @@ from neurolens.render.colour import (
     BRADFORD,
     COLOUR_SPACES,
     SRGB,
+    SpectralRange,
     adaptation,
     balance,
     conversion,
@@ -30,7 +31,6 @@ from neurolens.render.pictures import read_exr, write_exr
 from neurolens.render.renderer import render
 from neurolens.render.scene import load_scene
 from neurolens.render.settings import FilmSettings
-from neurolens.render.spectrum import SpectralRange
 
 CAMERA = Pinhole(400.0, FILM)
 # CIE 15:2018, tables T.3 and T.8.1; black bodies: Wyszecki and Stiles 1982, table 1(3.11), c2 = 0.014388 m K.

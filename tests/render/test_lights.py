@@ -10,11 +10,11 @@ from PIL import Image
 from render_helpers import FLOOR, MATERIALS, WHITE, assert_aimed, on_floor, radiance, world
 
 from neurolens.cameras.pinhole import Pinhole
+from neurolens.render.colour import SpectralRange
 from neurolens.render.film import PixelGrid
 from neurolens.render.integrator import trace
 from neurolens.render.sampler import FILM, DirectionTable, Sampler, centres
 from neurolens.render.scene import load_scene
-from neurolens.render.spectrum import SpectralRange
 from neurolens.render.world import World
 
 

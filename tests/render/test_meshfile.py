@@ -12,12 +12,12 @@ from render_helpers import CAMERA, WHITE, diffuse, radiance, scene, world
 from neurolens.base.config import from_dict
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.render import meshfile
+from neurolens.render.colour import SpectralRange
 from neurolens.render.mesh import read_mesh
 from neurolens.render.meshfile import TriangleSet, read_file
 from neurolens.render.primitives import Rays
 from neurolens.render.scene import Scene, scene_from_tables
 from neurolens.render.scenetables import MeshSettings
-from neurolens.render.spectrum import SpectralRange
 from neurolens.render.world import World
 
 HERE = Path("scene.toml")

@@ -125,7 +125,7 @@ _LOAD = """
 import sys
 import numpy as np
 from neurolens.render.scene import scene_from_tables
-from neurolens.render.spectrum import SpectralRange
+from neurolens.render.colour import SpectralRange
 from neurolens.render.world import World
 
 camera = dict(position_m=[0, 0, 0], look_at_m=[0, 0, -1], focus_m=2, film_width_mm=36, film_height_mm=24)

@@ -7,7 +7,7 @@ import pytest
 from render_helpers import FLOOR, MATERIALS, assert_aimed, radiance, scene, world
 
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.render.colour import SRGB, table
+from neurolens.render.colour import SRGB, SpectralRange, table
 from neurolens.render.environment import (
     SunLight,
     daylight_table,
@@ -21,7 +21,6 @@ from neurolens.render.job import expected_light
 from neurolens.render.renderer import render
 from neurolens.render.scenetables import Sky
 from neurolens.render.settings import FilmSettings
-from neurolens.render.spectrum import SpectralRange
 
 WHITE_FLOOR = FLOOR | {"material": "white"}
 

@@ -20,7 +20,6 @@ from neurolens.render.job import dispersion_px, expected_light, mode_for, spectr
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene
 from neurolens.render.settings import FilmSettings
-from neurolens.render.spectrum import SpectralRange
 
 FLAT = (table("wavelength_nm"), np.ones(81))
 SPIKE = (np.array([400.0, 499.0, 500.0, 501.0, 700.0]), np.array([0.01, 0.01, 5.0, 0.01, 0.01]))
