@@ -123,7 +123,7 @@ def render_frames(
 
 
 def how_to_resume(folder: Path) -> str:
-    """How to resume frames whose tiles are in a folder."""
+    """A sentence that says how to resume frames whose tiles are in a folder."""
     return f"tiles that are done are kept in {folder}: the same command goes on"
 
 
@@ -155,9 +155,9 @@ def _finish(picture: _Picture, prepared: Prepared) -> dict[str, Any]:
     """Put a picture together, with the paths as they are here, and remove its tiles."""
     tiles = [read_tile(tile) for tile in picture.tiles]
     for tile in tiles:
-        tile.told["scene"] = str(picture.frame.scene)
-        if "model" in tile.told["camera"]:
-            tile.told["camera"]["model"] = prepared.camera.settings["model"]
+        tile.metadata["scene"] = str(picture.frame.scene)
+        if "model" in tile.metadata["camera"]:
+            tile.metadata["camera"]["model"] = prepared.camera.settings["model"]
     written = write_picture(tiles, picture.out, picture.frame.exposure)
     for file in picture.tiles:
         file.unlink()

@@ -180,7 +180,7 @@ class Files:
                     raise InputError(self.out, "--output", written.name, f"another name: the scene reads {read}")
 
     def kept(self) -> str:
-        """How to resume a render that ended early."""
+        """A sentence that says how to resume a render that ended early."""
         if self.checkpoint.exists():
             return f"the same command resumes from {self.checkpoint}"
         return "there is no checkpoint to resume from"
@@ -219,7 +219,7 @@ class Prepared:
         )  # fmt: skip
 
     def metadata(self) -> dict[str, Any]:
-        """What the EXR says of the scene and the camera."""
+        """The metadata of the EXR about scene and camera."""
         return {"version": __version__, "scene": str(self.frame.scene), "camera": plain(self.camera.settings)}
 
 
@@ -251,7 +251,7 @@ def prepare(frame: Frame, out: Path, progress: Progress | None = None) -> Prepar
 
 
 def _pixel_notes(camera: Camera, width: int) -> list[str]:
-    """A sentence on a model whose error is larger than the pixels of a picture so many wide."""
+    """A warning where the error of a model is larger than the pixels of a picture of some width."""
     error = (camera.settings.get("card") or {}).get("errors", {}).get("rms_um") or 0.0
     pixel = 1e3 * camera.film_mm[0] / width
     return [f"the model's RMS error of {error:.3g} um is more than a pixel, {pixel:.3g} um"] if error > pixel else []
@@ -314,7 +314,7 @@ def flare_of(prepared: Prepared, choice: Choice | None, threads: int, progress: 
 
 
 def flare_choice(frames: Sequence[Frame], prepared: Prepared, threads: int = 2) -> Choice | None:
-    """Which lights and ghosts the layers of flare show in all frames of an animation.
+    """Choose the lights and ghosts that the layers of flare show in all frames of an animation.
 
     At most 16 of the frames, evenly spread, decide which are brightest. `prepared` is one of the frames, or of the same
     camera and scene. The choice is None where there is no flare.

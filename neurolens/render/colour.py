@@ -86,7 +86,7 @@ class ColourSpace:
 
     @property
     def stated(self) -> dict[str, Any]:
-        """What the metadata of a picture say of its colours."""
+        """The metadata of a picture about its colours."""
         return {"space": self.name, "white_xy": list(self.white), "adaptation": "Bradford"}
 
 
@@ -313,7 +313,7 @@ class SpectralRange:
             self._set_edges(self._quantiles(*light))
 
     def same(self, other: SpectralRange) -> bool:
-        """Whether its tables are those of another."""
+        """Whether another range has the same tables."""
         tables = ("edges_nm", "basis", "response")
         return self.lanes == other.lanes and all(np.array_equal(getattr(self, n), getattr(other, n)) for n in tables)
 

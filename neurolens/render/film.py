@@ -232,7 +232,7 @@ def identity(job: Job) -> dict[str, Any]:
         "scene": digest(bare),
         "camera": {"name": camera.name, **kept, "rays": _rays(camera)},
         "film_mm": list(job.grid.film_mm),
-        **job.asked(),
+        **job.picture_settings(),
     }
     if scene.triangles:
         identity["meshes traced by"] = tracer()

@@ -83,8 +83,8 @@ class Job:
         self.own = slice(first - self.tiling.start, stop - self.tiling.start)
         self.film = Film(self.tiling)
 
-    def asked(self) -> dict[str, Any]:
-        """What the picture depends on besides scene and camera, for its metadata and its checkpoint."""
+    def picture_settings(self) -> dict[str, Any]:
+        """The settings besides scene and camera that decide the picture, for its metadata and its checkpoint."""
         settings = asdict(self.settings)
         del settings["colour_space"]  # of the file alone
         size = {"width": self.grid.width, "height": self.grid.height}
@@ -105,7 +105,7 @@ class Job:
         film_mm = self.grid.film_points(pixel, self.sampler.draw2(keys, FILM))
         pupil = self.sampler.draw2(keys, PUPIL)
 
-        asked = time.perf_counter()
+        called = time.perf_counter()
         origin, direction, weight = self._hero_rays(camera, film_mm, pupil, hue)
         answered = time.perf_counter()
 
@@ -119,7 +119,7 @@ class Job:
         passed = np.zeros(len(hue), np.bool_)
         passed[lit(weight)] = True
         sums[:, columns.PASSED] = np.count_nonzero(passed.reshape(shape), axis=1)
-        return sums, np.array([answered - asked, time.perf_counter() - began])
+        return sums, np.array([answered - called, time.perf_counter() - began])
 
     def _sum_light(self, sums: NDArray[np.float64], value: FloatArray, bins: Index, shape: tuple[int, int]) -> None:
         """Colour, and the squared luminance of each sample, whose paths are together.
@@ -274,7 +274,7 @@ def spectral_range(scene: Scene, camera: Camera, film: FilmSettings, lanes: int 
 
 
 def expected_light(scene: Scene) -> Spectrum:
-    """Spectrum (nm, radiance relative to D65) of a scene's light: lamps by area, the environment with equal weight."""
+    """The spectrum (nm, radiance relative to D65) of a scene's light: lamps by area, the environment as all lamps."""
     fine = SpectralRange(*scene.settings.camera.wavelength_nm, _FINE)
     lamps: dict[str, FloatArray64] = {}  # sums of emission by illuminant
     for name, emission, area in _lamps(scene):
@@ -335,10 +335,10 @@ def mode_for(camera: Camera, grid: PixelGrid, limits_nm: tuple[float, float], fi
 
 
 def dispersion_px(camera: Camera, grid: PixelGrid, limits_nm: tuple[float, float]) -> float:
-    """How far the point in focus that a ray finds moves with the wavelength: RMS over film and pupil, in pixels.
+    """By how many pixels the wavelength moves what the camera shows: RMS over film and pupil.
 
-    A pixel is what the point moves by when the film point moves by a pixel. The largest over five wavelengths against
-    the middle one, of the rays that pass at both.
+    Each ray reaches a point of the plane in focus. A pixel is the way that this point goes when the film point moves by
+    a pixel. Five wavelengths are compared with the middle one by the rays that pass at both; the largest RMS counts.
     """
     low, high = limits_nm
     random = np.random.default_rng(0)

@@ -119,7 +119,7 @@ class Lights:
     def each(
         self, numbers: Iterable[int], point: FloatArray, place: NDArray[np.float64]
     ) -> Iterator[tuple[bool, Aimed]]:
-        """From points [3, N] to lights, one after another: whether each is round, and as of `LightGroup.sample`.
+        """Sample lights one after another from points [3, N]; yields whether each is round, and the group's samples.
 
         Args:
             place: [2, N] from -1 to 1 in the light's own square, or in the one about it.
@@ -133,7 +133,7 @@ class Lights:
             yield is_round, group.sample(some, point, disc if is_round else square)
 
     def strongest(self, target_m: Vector, most: int) -> list[int]:
-        """So many lights that bring a point the most light if nothing is between, by rising number."""
+        """The numbers of the `most` lights that bring a point the most light if nothing is between, in rising order."""
         importance = [group.importance(target_m) for _, group in self._groups]
         order = np.argsort(-np.concatenate([np.zeros(0), *importance]), kind="stable")
         return sorted(order[:most].tolist())

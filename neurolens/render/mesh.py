@@ -343,8 +343,8 @@ def _checked(scene: Path, field: str, mesh: TriangleSet, file: Path | None) -> T
         k = int(np.flatnonzero(flat)[0])
         expected = "a triangle with an area, not a degenerate one"
         raise InputError(scene, f"{field}.faces[{k}]", faces[k].tolist(), expected)
-    told = f"{file}: {flat.sum()} of {len(flat)} triangles have no area and are left out"
-    warnings.warn(told, NeurolensWarning, stacklevel=2)
+    text = f"{file}: {flat.sum()} of {len(flat)} triangles have no area and are left out"
+    warnings.warn(text, NeurolensWarning, stacklevel=2)
     return replace(mesh, faces=faces[~flat])
 
 
@@ -367,7 +367,7 @@ def encloses(mesh: TriangleSet, point: NDArray[np.float64]) -> bool:
 
 
 def _is_closed(corners: NDArray[np.float64]) -> bool:
-    """Whether each edge of triangles [T, 3, 3] runs as often one way as the other, by position."""
+    """Whether each edge of triangles [T, 3, 3], by position, runs as often forwards as backwards."""
     _, number = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
     faces = number.reshape(-1, 3)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
@@ -422,16 +422,16 @@ class Parts:
             self.meshes.append(part)
             self.triangles.append(read_mesh(scene, place, part, _part(whole, chosen)))
 
-    def _defined(self, name: str, given: tuple[Vector, Path | None], coordinates: bool, which: str) -> str:
+    def _defined(self, name: str, look: tuple[Vector, Path | None], coordinates: bool, which: str) -> str:
         """The name of a material of an MTL file, for faces with texture coordinates or without, once it is defined."""
-        colour, picture = given
+        colour, picture = look
         if picture is not None and coordinates:
             self.textures[name] = Texture("image", file=picture)
             self.materials[name] = Material("diffuse", texture=name)
             return name
         if picture is not None:
-            told = f"{which[:300]}: no texture coordinates: {picture.name} is left out there"
-            warnings.warn(told, NeurolensWarning, stacklevel=2)
+            text = f"{which[:300]}: no texture coordinates: {picture.name} is left out there"
+            warnings.warn(text, NeurolensWarning, stacklevel=2)
             name += " without coordinates" if name in self.materials else ""
         self.materials[name] = Material("diffuse", reflectance=colour)
         return name

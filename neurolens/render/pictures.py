@@ -279,7 +279,7 @@ def _whole(file: str | Path, field: str, path: Path) -> Iterator[None]:
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Without stderr and Python's stdout, on which the library prints what it also raises."""
+    """Close stderr and Python's stdout inside the block: the library prints there what it also raises."""
     sys.stderr.flush()
     kept = os.dup(2)
     nowhere = os.open(os.devnull, os.O_WRONLY)

@@ -43,7 +43,7 @@ class Primitive(Protocol):
     first: int
 
     def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
-        """Where this shape is hit nearer than `best`, write distance and surface number."""
+        """Write distance and surface number of the hits that are nearer than `best`."""
         ...
 
 

@@ -255,7 +255,7 @@ def _stats(job: Job, seconds: float) -> dict[str, Any]:
         "samples": tiling.samples,
         "samples_done": paths / len(sums),
         "complete": job.film.fraction == 1,
-        **job.asked(),
+        **job.picture_settings(),
         "wavelengths": job.mode,
         "wavelengths_nm": [job.spectral.low_nm, job.spectral.high_nm],
         "seconds": seconds,

@@ -196,11 +196,11 @@ def _with_meshes(path: Path, settings: SceneSettings) -> tuple[SceneSettings, tu
 def seen_from(scene: Scene, path: str | Path, position_m: Vector | None, look_at_m: Vector | None) -> Scene:
     """The scene from another place, towards another point; None keeps its own. Errors as of `load_scene`."""
     moved: dict[str, Any] = {"position_m": position_m, "look_at_m": look_at_m}
-    given = {name: value for name, value in moved.items() if value is not None}
-    if not given:
+    changes = {name: value for name, value in moved.items() if value is not None}
+    if not changes:
         return scene
     try:
-        settings = replace(scene.settings, camera=replace(scene.settings.camera, **given))
+        settings = replace(scene.settings, camera=replace(scene.settings.camera, **changes))
     except InputError as error:
         raise InputError(path, f"camera.{error.field}", error.value, error.expected) from None
     _check_camera(Path(path), settings, scene.triangles)
@@ -242,12 +242,12 @@ def _spectra(
     """Measured spectra over all of the camera's wavelengths: scaled to a maximum of 1, or with `most` as they are."""
     low, high = camera.wavelength_nm
     found = {}
-    for name, given in tables.items():
+    for name, table in tables.items():
         place = f"{kind}.{name}"
-        if given.file is not None:
-            nm, values = read_spectrum(path, f"{place}.file", path.parent / given.file, most)
+        if table.file is not None:
+            nm, values = read_spectrum(path, f"{place}.file", path.parent / table.file, most)
         else:
-            nm, values = check_spectrum(path, f"{place}.spectrum", given.spectrum or (), most)
+            nm, values = check_spectrum(path, f"{place}.spectrum", table.spectrum or (), most)
         if nm[0] > low or nm[-1] < high:
             expected = f"the {low:g} to {high:g} nm of the camera; what is dark there is written as 0"
             raise InputError(path, place, f"({nm[0]:g} to {nm[-1]:g} nm)", expected)

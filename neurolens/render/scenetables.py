@@ -14,8 +14,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from inspect import get_annotations
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_type_hints
+from typing import Annotated, Any, Literal, get_args
 
 from neurolens.base.bounds import said, within
 from neurolens.base.errors import InputError
@@ -79,7 +80,6 @@ Share = Annotated[Vector, each_between(0, 1)]
 Reflectance = Annotated[  # linear sRGB, or the name of a measured spectrum
     Vector | str, Rule(lambda v: isinstance(v, str) or all(0 <= x <= 1 for x in v), "three numbers from 0 to 1")
 ]
-# Rules that need names of this module stand here: a lambda within an annotation would not see them.
 _SCALE = Rule(lambda v: all(0 < x < math.inf for x in (v if isinstance(v, tuple) else (v,))), "finite numbers above 0")
 _BRIGHTNESS = Rule(lambda v: 0 < v <= BRIGHTEST, f"a number above 0, at most {BRIGHTEST:g}")
 _SIZES = Rule(lambda v: all(map(_SIZE.good, v)), f"width and height, each {_SIZE.expected} m")
@@ -92,10 +92,11 @@ _ABBE = Rule(lambda v: 10 <= v < math.inf, "a number from 10")
 def _rules(table: type) -> dict[str, Rule]:
     """The rules of the fields of a table, which their types carry: `Annotated[kind, rule]`, also beside None."""
     rules: dict[str, Rule] = {}
-    for name, hint in get_type_hints(table, include_extras=True).items():
-        for kind in (hint, *get_args(hint)):
-            if notes := getattr(kind, "__metadata__", ()):
-                rules[name] = notes[0]
+    for base in reversed(table.__mro__):
+        for name, hint in get_annotations(base, eval_str=True).items():  # in the base's own module
+            for kind in (hint, *get_args(hint)):
+                if notes := getattr(kind, "__metadata__", ()):
+                    rules[name] = notes[0]
     return rules
 
 

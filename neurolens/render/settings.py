@@ -57,7 +57,7 @@ _QUICK_BINS, _QUICK_CELL_PX, _QUICK_PHOTONS = 5, 24.0, 1 << 16
 
 @dataclass(frozen=True)
 class Scatter:
-    """What scatters light in a lens, and how much; nothing by default.
+    """The parts of a lens that scatter light, and how much; none by default.
 
     Attributes:
         barrel: share of light that the tube, its rings and the stop's plate reflect; gloss: share of it that goes about
@@ -102,7 +102,7 @@ class Scatter:
 
 @dataclass(frozen=True)
 class FlareSettings:
-    """What flare is made of, and how finely.
+    """The layers of flare, and how finely they are computed.
 
     Attributes:
         gains: factors of red, green and blue by the name of a layer or of a ghost (g07-03).

@@ -129,8 +129,10 @@ def _blocks(size: tuple[int, int], pixel_mm: tuple[float, float], report: Report
 
 
 def worst_px(field: Field, plates: Plates) -> tuple[float, float]:
-    """In pixels, the worst of the picture: how far distortion moves a point, and by how much one misses its place that
-    goes to the undistorted picture and back."""
+    """The farthest that distortion moves a point, and the largest error of going to the undistorted picture and back.
+
+    Both are in pixels, and over a grid of points of the picture.
+    """
     x, y = (np.linspace(-0.5, 0.5, n) * s * p for n, s, p in zip(_TRIED, plates.picture, plates.pixel_mm, strict=True))
     point = (x[None, :] + 1j * y[:, None]).reshape(-1)
     point = point[np.abs(point) <= field.end_mm]

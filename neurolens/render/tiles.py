@@ -39,7 +39,7 @@ def rows_of(height: int, tile: tuple[int, int]) -> tuple[int, int]:
 
 
 def tile_path(out: Path, tile: tuple[int, int] | None) -> Path:
-    """Where a tile of the picture `out` is written: OUT.tile-03-of-16.exr; no tile: `out`."""
+    """The file of a tile of the picture `out`, OUT.tile-03-of-16.exr; without a tile `out` itself."""
     if tile is None:
         return out
     number, count = tile
@@ -63,25 +63,29 @@ class Tile:
     number: int
     count: int
     rows: tuple[int, int]
-    told: dict[str, Any]
+    metadata: dict[str, Any]
 
     @property
     def frame(self) -> int | None:
         """Number of its picture in a sequence."""
-        frame: int | None = self.told["tile"]["frame"]
+        frame: int | None = self.metadata["tile"]["frame"]
         return frame
 
     def settings(self) -> dict[str, Any]:
-        """What tiles of one picture have in common."""
-        told, render = self.told, self.told["render"]
+        """The settings that all tiles of one picture share."""
+        metadata, render = self.metadata, self.metadata["render"]
         chosen = {name: render[name] for name in ("width", "height", "samples")}
-        stored = {"half": told["tile"]["half"], "colour": told["colour"], "layers": sorted(told.get("layers", ()))}
-        return {**told["tile"]["identity"], **chosen, **stored, "tiles": self.count}
+        stored = {
+            "half": metadata["tile"]["half"],
+            "colour": metadata["colour"],
+            "layers": sorted(metadata.get("layers", ())),
+        }
+        return {**metadata["tile"]["identity"], **chosen, **stored, "tiles": self.count}
 
     def channels(self) -> dict[str, FloatArray]:
         """Its channels [rows, width] by name, R, G and B among them; InputError: a file of other rows than it says."""
         found, _ = read_channels(self.path)
-        shape = self.rows[1] - self.rows[0], self.told["render"]["width"]
+        shape = self.rows[1] - self.rows[0], self.metadata["render"]["width"]
         if not found.keys() >= set("RGB") or any(plane.shape != shape for plane in found.values()):
             raise InputError(self.path, "channels", "(other channels or rows than its metadata tell)", _EXPECTED)
         return found
@@ -93,19 +97,19 @@ def read_tile(path: Path) -> Tile:
     Raises:
         InputError: no OpenEXR file, none of ours, or one that an interrupted run left.
     """
-    told = read_metadata(path)
+    metadata = read_metadata(path)
     try:
-        facts, render = told["tile"], told["render"]
+        facts, render = metadata["tile"], metadata["render"]
         numbers = number, count, width, height = facts["number"], facts["of"], render["width"], render["height"]
         if any(type(n) is not int for n in numbers) or not 1 <= number <= count <= height or width < 1:
             raise ValueError(f"tile {number} of {count}")
-        tile = Tile(path, number, count, rows_of(height, (number, count)), told)
+        tile = Tile(path, number, count, rows_of(height, (number, count)), metadata)
         if tile.settings()["colour"]["space"] not in COLOUR_SPACES:
             raise ValueError("other metadata")
         if not all(0 <= render[name] <= _MOST for name in (*_SUMMED, "passed_fraction")):
             raise ValueError("other statistics")
         complete, done = bool(render["complete"]), float(render["samples_done"])
-        _attributes(told, tile.frame)  # can be written
+        _attributes(metadata, tile.frame)  # can be written
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         why = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise InputError(path, "metadata", f"({why})", _EXPECTED) from None
@@ -121,13 +125,13 @@ def check_together(tiles: Sequence[Tile]) -> None:
         if differs := difference(other.settings(), first.settings()):
             place, there, here = differs
             raise InputError(other.path, place, there, f"{here} as in {first.path}")
-    seen: dict[int, Path] = {}
+    paths: dict[int, Path] = {}
     for tile in tiles:
-        if tile.number in seen:
+        if tile.number in paths:
             name = f"{tile.number} of {tile.count}"
-            raise InputError(tile.path, "tile", name, f"each tile once: {seen[tile.number]} is that one, too")
-        seen[tile.number] = tile.path
-    if missing := [number for number in range(1, first.count + 1) if number not in seen]:
+            raise InputError(tile.path, "tile", name, f"each tile once: {paths[tile.number]} is that one, too")
+        paths[tile.number] = tile.path
+    if missing := [number for number in range(1, first.count + 1) if number not in paths]:
         of = "" if first.frame is None else f" of frame {first.frame}"
         shown = ", ".join(map(str, missing[:20])) + (", ..." if len(missing) > 20 else "")
         raise InputError("neurolens render --merge", f"tiles{of}", f"({shown} missing)", f"all {first.count}")
@@ -143,9 +147,9 @@ def merged(tiles: Sequence[Tile]) -> tuple[dict[str, NDArray[Any]], dict[str, An
     """
     check_together(tiles)
     first, *_ = tiles = sorted(tiles, key=lambda tile: tile.number)
-    width, height = first.told["render"]["width"], first.told["render"]["height"]
+    width, height = first.metadata["render"]["width"], first.metadata["render"]["height"]
     check_memory(width, height, _BYTES_A_PIXEL)
-    half = first.told["tile"]["half"]
+    half = first.metadata["tile"]["half"]
     channels: dict[str, NDArray[Any]] = {}
     for tile in tiles:
         planes = tile.channels()
@@ -156,9 +160,9 @@ def merged(tiles: Sequence[Tile]) -> tuple[dict[str, NDArray[Any]], dict[str, An
             raise InputError(tile.path, "channels", sorted(planes), f"{sorted(channels)} as in {first.path}")
         for name, plane in planes.items():
             channels[name][slice(*tile.rows)] = plane
-    told = {key: value for key, value in first.told.items() if key != "tile"}
-    told["render"] = _statistics([tile.told["render"] for tile in tiles])
-    return channels, told
+    metadata = {key: value for key, value in first.metadata.items() if key != "tile"}
+    metadata["render"] = _statistics([tile.metadata["render"] for tile in tiles])
+    return channels, metadata
 
 
 def _statistics(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -206,16 +210,16 @@ def write_picture(tiles: Sequence[Tile], out: Path, exposure: float) -> dict[str
     Raises:
         InputError: as `merged`. OSError: it cannot be written.
     """
-    channels, told = merged(tiles)
-    space, render = COLOUR_SPACES[told["colour"]["space"]], told["render"]
+    channels, metadata = merged(tiles)
+    space, render = COLOUR_SPACES[metadata["colour"]["space"]], metadata["render"]
     rgb = np.stack([channels[name].astype(np.float32) for name in _COLOURS], axis=-1)
     if space is not SRGB:
         rgb = converted(rgb, conversion(space, SRGB)).astype(np.float32)
-    write_channels(out, channels, space, told, _attributes(told, tiles[0].frame))
+    write_channels(out, channels, space, metadata, _attributes(metadata, tiles[0].frame))
     write_png(preview := out.with_suffix(".png"), rgb, exposure)
     return {"file": str(out), "preview": str(preview), "tiles": len(tiles), **render}
 
 
-def _attributes(told: Mapping[str, Any], frame: int | None) -> dict[str, Any]:
-    render = told["render"]
-    return standard_attributes(told["camera"], render["width"], render["height"], frame)
+def _attributes(metadata: Mapping[str, Any], frame: int | None) -> dict[str, Any]:
+    render = metadata["render"]
+    return standard_attributes(metadata["camera"], render["width"], render["height"], frame)

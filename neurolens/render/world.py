@@ -36,13 +36,13 @@ def _frame(origin: Frame, u: Frame, v: Frame, size: tuple[float, float]) -> Fram
 
 
 def quad_frame(corner: Frame, edge_u: Frame, edge_v: Frame) -> Frame:
-    """From the corner of a rectangle along its edges."""
+    """The frame of a rectangle: it begins at the corner and runs along the edges."""
     lengths = float(np.linalg.norm(edge_u)), float(np.linalg.norm(edge_v))
     return _frame(corner, edge_u / lengths[0], edge_v / lengths[1], lengths)
 
 
 def plane_frame(point: Frame, normal: Frame) -> Frame:
-    """From a point of a plane along the axes of the scene as far as they lie in it: x first, else z."""
+    """The frame of a plane: it begins at a point and follows the scene's x axis, or z where that is steeper."""
     axis = np.eye(3)[2 if abs(normal[0]) > 0.9 else 0]
     u = axis - normal * (axis @ normal)
     u /= np.linalg.norm(u)
@@ -58,7 +58,7 @@ def disc_frame(centre: Frame, normal: Frame, radius: float) -> Frame:
 
 
 def box_frame(low: Frame, axis: int) -> Frame:
-    """From the lowest corner of a box along the axes of a face: x or z across, y up; x and z on floor and ceiling."""
+    """The frame of a box's face from the lowest corner: x or z across, y up; on floor and ceiling x and z."""
     u, v = {0: (2, 1), 1: (0, 2), 2: (0, 1)}[axis]
     return _frame(low, np.eye(3)[u], np.eye(3)[v], (1.0, 1.0))
 
@@ -374,7 +374,7 @@ class World:
         self.dark = self._sky.dark and not self._sun.count
 
     def _never_shades(self, shape: Primitive) -> bool:
-        """Whether no shadow ray can be blocked: the walls of a room around every light, as walls let light in."""
+        """Whether the shape blocks no shadow ray: a room that holds every light, whose walls let light in."""
         if not isinstance(shape, Box) or not shape.room or self._sky.count or self._sun.count:
             return False
         return all(bool(np.all((p > shape.low) & (p < shape.high))) for p in self._shining_m)

@@ -14,7 +14,7 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.lens.shot import Shot
-from neurolens.render.colour import table
+from neurolens.render.colour import SpectralRange, table
 from neurolens.render.film import PixelGrid
 from neurolens.render.job import dispersion_px, expected_light, mode_for, spectral_range
 from neurolens.render.renderer import render
