@@ -36,7 +36,7 @@ from neurolens.trace.surfaces import (
     rim_tests,
 )
 from neurolens.trace.tensors import Survival, Tensors, at_most
-from neurolens.trace.transmission import Passage, TensorLosses
+from neurolens.trace.transmission import Passage
 
 Towards = Literal["scene", "film"]
 
@@ -319,7 +319,7 @@ def _trace_chunk(
 ) -> Traced:
     sense, order = _path(lens, towards)
     tracing = Tracing(lens, rays, wavelength_nm, sense, order[0], path or bool(record), freeze)
-    power = Passage(tracing.o, lens, TensorLosses(lens, tracing.wavelength_nm)) if transmittance else None
+    power = Passage(tracing.o, lens, tracing.wavelength_nm) if transmittance else None
     crossings: dict[int, Crossing] = {}
     passed: list[Rays] = []
     for k in order:

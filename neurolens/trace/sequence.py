@@ -14,7 +14,7 @@ from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Lens
 from neurolens.trace.rays import Tracing, check_rays
 from neurolens.trace.surfaces import Rays
-from neurolens.trace.transmission import Passage, TensorLosses
+from neurolens.trace.transmission import Passage
 
 Action = Literal["T", "R"]
 Towards = Literal["scene", "film"]
@@ -85,7 +85,7 @@ def follow(
     check_rays(rays, wavelength_nm)
     _check(len(lens.surfaces), steps, towards)
     tracing = Tracing(lens, rays, wavelength_nm, 1 if towards == "film" else -1, steps[0][0], guard=True)
-    passage = Passage(tracing.o, lens, TensorLosses(lens, tracing.wavelength_nm), polarised)
+    passage = Passage(tracing.o, lens, tracing.wavelength_nm, polarised)
     points = []
     for k, action in steps:
         sense, reflected = tracing.sense, action == "R"

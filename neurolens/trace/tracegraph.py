@@ -45,7 +45,7 @@ def exact_graph(
     stop_square = None if stop_radius is None else stop_radius * stop_radius
     single = wavelength_nm[0] == wavelength_nm[1]
     mediums = media(lens, wavelength_nm[0] if single else rays[4])
-    power = Passage(o, lens, GraphLosses(lens, rays[4], wavelength_nm)) if whole else None
+    power = GraphPassage(o, lens, rays[4], wavelength_nm) if whole else None
     tests: list[tuple[Test, int]] = []  # in the order in which rays meet them, with their codes
     at_stop, crossings = rays[0:2], list[Value]()
     d = rays[2] - rays[0], rays[3] - rays[1], pupil_z_mm - film_z
@@ -88,15 +88,16 @@ def exact_graph(
     return g
 
 
-class GraphLosses:
-    """The losses of light in glass and coatings as parts of a graph; see `transmission.Losses`.
+class GraphPassage(Passage):
+    """The power of rays in a graph.
 
     Args:
-        wavelength_nm: of the rays. range_nm: wavelengths from and to which it may lie.
+        wavelength_nm: the wavelength of the rays. range_nm: wavelengths from and to which it may lie.
     """
 
-    def __init__(self, lens: Lens, wavelength_nm: Value, range_nm: tuple[float, float]) -> None:
-        self.lens, self.wavelength_nm, self.range_nm = lens, wavelength_nm, range_nm
+    def __init__(self, o: Graphs, lens: Lens, wavelength_nm: Value, range_nm: tuple[float, float]) -> None:
+        super().__init__(o, lens, wavelength_nm)
+        self.range_nm = range_nm
 
     def absorption(self, k: int) -> Value | None:
         """Napierian absorption (1/mm) of the medium before surface k, in the range; None where there is none."""

@@ -10,7 +10,7 @@ Principles of Optics, 1.5.2 and 10.9.3; Chipman, Lam and Young, Polarized Light 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -143,19 +143,17 @@ def coated_shares(
     return Shares((s + p) * 0.5, (s - p) * 0.5, a * c + b * d, b * c - a * d)
 
 
-class Losses(Protocol):
-    """The losses of light in glass and coatings: `TensorLosses` with tensors, `tracegraph.GraphLosses` in a graph."""
+class Passage:
+    """The power of rays while they are traced with tensors; absorption follows Beer and Lambert's law.
 
-    def absorption(self, k: int) -> Any: ...
-    def coated(self, k: int, met: Hit, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares: ...
-    def transmitted(self, depth: Any) -> Any: ...
+    `polarised`: whether the polarisation is followed that each surface gives to the light, or averaged at each surface.
+    """
 
-
-class TensorLosses:
-    """The losses of light in glass and coatings, with tensors."""
-
-    def __init__(self, lens: Lens, wavelength_nm: Any) -> None:
-        self.lens, self.wavelength_nm = lens, wavelength_nm
+    def __init__(self, o: Arithmetic, lens: Lens, wavelength_nm: Any, polarised: bool = True) -> None:
+        self._o, self.lens, self.wavelength_nm, self._polarised = o, lens, wavelength_nm, polarised
+        self._light: Light | None = None
+        self._depth: Any = None
+        self._last: tuple[int, Vector, Any] | None = None  # surface, its normal, n cos behind it
 
     def absorption(self, k: int) -> Any:
         """Return the Napierian absorption (1/mm) of the medium before surface k; None where there is none."""
@@ -163,7 +161,7 @@ class TensorLosses:
         return absorption_of(self.lens.surfaces[k - 1], self.wavelength_nm) if k else None
 
     def coated(self, k: int, met: Hit, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool) -> Shares:
-        """Return the shares that the coating of surface k transmits or reflects; see `Passage.pass_surface`."""
+        """Return the shares that the coating of surface k transmits or reflects; see `pass_surface`."""
         before, after = media
         coating = self.lens.surfaces[k].coating
         cos_i = times(met.q, 1 / before.n)
@@ -171,37 +169,24 @@ class TensorLosses:
         return coated_shares(cos_i, before.n, after.n, layers, self.wavelength_nm, sense, reflected)
 
     def transmitted(self, depth: Any) -> Any:
-        """exp(-depth)."""
+        """Return exp(-depth)."""
         return torch.exp(-depth)
-
-
-class Passage:
-    """The power of rays while they are traced; absorption follows Beer and Lambert's law.
-
-    `polarised`: whether the polarisation is followed that each surface gives to the light, or averaged at each surface.
-    """
-
-    def __init__(self, o: Arithmetic, lens: Lens, losses: Losses, polarised: bool = True) -> None:
-        self._o, self._lens, self._losses, self._polarised = o, lens, losses, polarised
-        self._light: Light | None = None
-        self._depth: Any = None
-        self._last: tuple[int, Vector, Any] | None = None  # surface, its normal, n cos behind it
 
     def pass_surface(
         self, k: int, r: Rays, met: Hit, q: Any, media: tuple[Medium, Medium], sense: int, reflected: bool = False
     ) -> None:
-        """Surface k: rays before it, their meeting, n' cos t; media as the light meets them, of the sense of travel."""
+        """Take the power through surface k: rays before it, their hit, n' cos t; media in the order of travel."""
         before, after = media
-        absorbed = self._losses.absorption(k if sense > 0 else k + 1)
+        absorbed = self.absorption(k if sense > 0 else k + 1)
         if absorbed is not None:
             depth = path_mm(self._o, r, met, before) * absorbed
             self._depth = depth if self._depth is None else self._depth + depth
-        surface = self._lens.surfaces[k]
+        surface = self.lens.surfaces[k]
         coated = bool(surface.coating and surface.coating.layers)
         if before is after and not coated and not reflected:
             return
         if coated or reflected:
-            shares = self._losses.coated(k, met, q, media, sense, reflected)
+            shares = self.coated(k, met, q, media, sense, reflected)
         else:
             both = before.n * after.n
             p = self._o.fma(met.q, times(both, before.inverse_n2), q * times(both, after.inverse_n2))
@@ -219,9 +204,9 @@ class Passage:
         """Return the turn between the planes of incidence (`turned`), times the square of the index."""
         assert self._last is not None
         last, other, q = self._last
-        pair = self._lens.surfaces[last], self._lens.surfaces[k]
+        pair = self.lens.surfaces[last], self.lens.surfaces[k]
         if all(is_plain(s) for s in pair):
-            gap = self._lens.vertices_mm[k] - self._lens.vertices_mm[last]
+            gap = self.lens.vertices_mm[k] - self.lens.vertices_mm[last]
             across = crossed_spheres(met, r[3:], (pair[0].curvature, pair[1].curvature), gap)
         else:
             across = crossed(r[3:], other, normal)
@@ -230,7 +215,7 @@ class Passage:
     def arrived(self, like: Any) -> Any:
         """Return the power of all rays, in the form of a value."""
         power = self._o.like(like, 1.0) if self._light is None else self._light.power
-        return power if self._depth is None else power * self._losses.transmitted(self._depth)
+        return power if self._depth is None else power * self.transmitted(self._depth)
 
 
 def path_mm(o: Arithmetic, r: Rays, met: Hit, before: Medium) -> Any:
