@@ -125,9 +125,9 @@ class Aperture:
             cos, sin = math.cos(turn) * scale, math.sin(turn) * scale
             place = g.affine([[sin, -cos], [cos, sin]], point, [height / 2, width / 2]).floor()
             cell = g.affine([[float(width), 1.0]], place)
-            seen = g.constant(THRESHOLD) <= g.lookup(g.table("mask", 1), cell, g.constant(1.0))
+            bright = g.constant(THRESHOLD) <= g.lookup(g.table("mask", 1), cell, g.constant(1.0))
             on_mask = place.between([0.0, 0.0], [height - 1.0, width - 1.0])
-            return within & on_mask[0] & on_mask[1] & seen
+            return within & on_mask[0] & on_mask[1] & bright
         assert self.blades is not None
         if self.curvature == 1:
             return within

@@ -224,8 +224,8 @@ def _key(name: str) -> str:
 def _split(name: str) -> tuple[str | None, str]:
     """Return the maker (None where the name does not say) and key of a name as people write it."""
     text = " ".join(name[:_LONGEST].split())
-    bare, bracket, said = text.rpartition("(") if text.endswith(")") else ("", "", "")
-    if bracket and (maker := _BY_LETTERS.get(said[:-1].strip().upper())) and bare.strip():
+    bare, bracket, inside = text.rpartition("(") if text.endswith(")") else ("", "", "")
+    if bracket and (maker := _BY_LETTERS.get(inside[:-1].strip().upper())) and bare.strip():
         return maker, _key(bare)
     for letters, maker in _BY_LETTERS.items():
         rest = text[len(letters) :]

@@ -76,8 +76,8 @@ def read_any(path: str | Path, options: ReadOptions | None = None) -> Lens:
             raise InputError(path, "options", "(of a lens file)", "--name and --source only: the file has the rest")
         return lens
     found = format_of(path)
-    for name, said in (("--gap-before", options.gap_before), ("--semi-diameters", options.semi_diameters)):
-        if said and found.read is not read_table:
+    for name, value in (("--gap-before", options.gap_before), ("--semi-diameters", options.semi_diameters)):
+        if value and found.read is not read_table:
             raise InputError(path, name, f"(a {found.name} file)", "a plain table: other formats define it")
     return found.read(path, options)
 

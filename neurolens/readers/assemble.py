@@ -57,9 +57,9 @@ def finish(
         if math.isnan(stated):
             raise InputError(lens.path, "stop", "(no diameter, no f-number)", "one of them: give --f-number")
         trial = trial.with_stop_radius(trial.stop_radius_mm * data.f_number / stated)
-    asked = 2 * trial.stop_radius_mm
-    if smaller_stop(lens.path, asked, stop_limit_mm) != asked:
-        trial = trial.with_stop_radius((stop_limit_mm or asked) / 2)
+    wanted = 2 * trial.stop_radius_mm
+    if smaller_stop(lens.path, wanted, stop_limit_mm) != wanted:
+        trial = trial.with_stop_radius((stop_limit_mm or wanted) / 2)
         stated = first_order(trial).f_number
     if math.isnan(stated):
         stated = first_order(trial).f_number
@@ -75,12 +75,12 @@ def finish(
     return replace(lens, surfaces=tuple(rows), f_number=float(stated))
 
 
-def smaller_stop(file: str, asked: float, limit: float | None, state: str = "") -> float:
+def smaller_stop(file: str, wanted: float, limit: float | None, state: str = "") -> float:
     """The smaller of two diameters of the stop: by pupil or f-number, and of its own aperture; warns of the latter."""
-    if limit is None or not limit < asked * (1 - NARROWER):
-        return asked
-    told = f"{state}pupil or f-number ask for a stop {asked:.6g} wide, its own aperture is {limit:.6g}"
-    warn(file, f"{told} (in the file's unit): the smaller is taken")
+    if limit is None or not limit < wanted * (1 - NARROWER):
+        return wanted
+    message = f"{state}pupil or f-number ask for a stop {wanted:.6g} wide, its own aperture is {limit:.6g}"
+    warn(file, f"{message} (in the file's unit): the smaller is taken")
     return limit
 
 

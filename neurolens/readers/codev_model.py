@@ -92,7 +92,7 @@ def medium(
     name, _, maker = word.rpartition("_")
     makers = [maker.upper()] if name else []
     place = f"line {command.line.number}, glass"
-    known = named_glass(name or word, command.line.file, place, makers, said=word if name else None)
+    known = named_glass(name or word, command.line.file, place, makers, text=word if name else None)
     return {**known, "material": word}
 
 
@@ -221,8 +221,8 @@ def _special(block: Block) -> dict[str, Any]:
         raise block.start.error(f"conic of SPS {kind}", block.conic, "0: Qbfs departs from a sphere")
     if not radius > 0:
         raise block.start.error(f"NRADIUS of SPS {kind}", radius, "a normalisation radius above 0")
-    told = f"SPS {kind}: coefficient {SPECIAL[kind]}n is taken as that of Forbes's m = (n - 4) / 2"
-    assume(block.start.file, f"line {block.start.number}: {told}")
+    message = f"SPS {kind}: coefficient {SPECIAL[kind]}n is taken as that of Forbes's m = (n - 4) / 2"
+    assume(block.start.file, f"line {block.start.number}: {message}")
     terms = [found.get(n, 0.0) for n in range(4, max(found, default=2) + 1, 2)]
     return block.q_type(f"SPS {kind}", kind == "QCN", terms, radius)
 

@@ -144,10 +144,10 @@ class Draft:
         unit: "mm", "cm", "in", "m", or None if unknown.
         stated_efl: focal length as the file states it, to be checked.
         drawn: rims are somebody's measures of a drawing, some of them radii where diameters are meant: halved where
-            they are twice what they can be, and narrowed by however much neighbours would overlap; both is told.
+            they are twice what they can be, and narrowed by however much neighbours would overlap; both are warned of.
         nominal: f-number that the file states with few digits, to tell radii from diameters by.
         stop_given: whether the file states the stop's own diameter, which then rules over its f-number.
-        skipped: what was not read since no ray depends on it, and how often it occurs; told in one line.
+        skipped: what was not read since no ray depends on it, and how often it occurs; one warning lists all.
         object_medium: fields of `Medium` for the medium in front of the lens.
         wavelengths_nm: as `Lens.wavelengths_nm`.
     """
@@ -239,8 +239,8 @@ def _lens_of(draft: Draft, options: ReadOptions) -> Lens:
         lens = replace(lens, surfaces=tuple(rows))
     lens = finish(lens, pupil_mm=draft.pupil, film_given=draft.film_given, stop_limit_mm=stop_aperture(draft))
     if draft.stop_given and abs((by_stop := first_order(lens).f_number) / lens.f_number - 1) > _AGREES:
-        told = f"a stop {lens.stop_radius_mm * 2:g} wide gives f/{by_stop:.3g}, the file says f/{lens.f_number:.3g}"
-        warn(draft.file, f"{told}: the diameter is kept")
+        message = f"a stop {lens.stop_radius_mm * 2:g} wide gives f/{by_stop:.3g}, the file says f/{lens.f_number:.3g}"
+        warn(draft.file, f"{message}: the diameter is kept")
     lens = replace(lens, configurations=tuple(_configuration(lens, draft, state) for state in _states(draft)))
     lens = with_rims(lens.scaled(factor) if factor != 1 else lens, draft.in_file)
     with suppress(InputError):
@@ -280,9 +280,9 @@ def _configuration(lens: Lens, draft: Draft, state: State) -> Configuration:
         if pupil is None and draft.f_number is not None:
             pupil = abs(data.efl_mm) / draft.f_number
     if pupil is not None and opening is None:
-        asked = 2 * there.stop_radius_mm * pupil / data.entrance_pupil_diameter_mm
-        opening = smaller_stop(draft.file, asked, stop_aperture(draft), f'state "{state.name}": ')
-        f_number = f_number if opening == asked else None
+        wanted = 2 * there.stop_radius_mm * pupil / data.entrance_pupil_diameter_mm
+        opening = smaller_stop(draft.file, wanted, stop_aperture(draft), f'state "{state.name}": ')
+        f_number = f_number if opening == wanted else None
     if f_number is None and opening is not None:
         f_number = data.f_number * 2 * there.stop_radius_mm / opening
     distance = state.object_distance if math.isfinite(state.object_distance) else None

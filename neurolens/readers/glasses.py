@@ -53,7 +53,7 @@ def named_glass(
     field: str,
     makers: Sequence[str] = (),
     *,
-    said: str | None = None,
+    text: str | None = None,
     figures: tuple[float, float] | None = None,
 ) -> dict[str, Any]:
     """Return the fields of a surface whose glass the file gives by name alone; warns where it is ambiguous.
@@ -63,7 +63,7 @@ def named_glass(
 
     Args:
         makers: the makers' catalogues that the file names; the first that has the glass is meant.
-        said: the file's text, if it names the maker.
+        text: the file's words, if it names the maker.
         figures: n_d and V_d that the file gives beside the name, for a glass that the catalogue does not know.
 
     Raises:
@@ -78,8 +78,8 @@ def named_glass(
         expected = f"a glass of the catalogue: it has {base.name}, whose moulded variant this may be; or give --glass"
         raise InputError(file, field, name, expected)
     if base and not same and figures and not 0 <= base.n_d - figures[0] <= _MOULDING:
-        told = f"assumed to be {base} (n_d {base.n_d:.5f}), moulded: n_d {figures[0]:g} beside it fits no such glass"
-        assume(file, f"{field}: glass {name} is {told}")
+        message = f"assumed to be {base} (n_d {base.n_d:.5f}), moulded: n_d {figures[0]:g} beside it fits no such glass"
+        assume(file, f"{field}: glass {name} is {message}")
         return {"n_d": base.n_d, "V_d": base.V_d, "glass": short_name(base), "material": name}
     known = next((g for m in makers for g in same if g.maker.upper() == m), None)
     replacing = next((g for m in makers for g in catalogue.same_name(f"{m}:N-{name}") if m in _NAMES), None)
@@ -90,13 +90,13 @@ def named_glass(
     taken = known or replacing or catalogue.find(name, file, field)
     if makers and taken.maker.upper() not in makers:
         why = f"no glass of that name in the catalogues that the file names ({', '.join(makers)})"
-    elif not makers and said is None:
+    elif not makers and text is None:
         why = "the file names no maker"
     else:
-        other = _letters(taken.name) not in _letters(said or name)
+        other = _letters(taken.name) not in _letters(text or name)
         why = "its maker's catalogue has none of that very name" if other else ""
     if why:
-        warn(file, f"glass {said or name} is taken as {taken} (n_d {taken.n_d:.5f}, V_d {taken.V_d:.2f}): {why}")
+        warn(file, f"glass {text or name} is taken as {taken} (n_d {taken.n_d:.5f}, V_d {taken.V_d:.2f}): {why}")
     return {"n_d": taken.n_d, "V_d": taken.V_d, "glass": short_name(taken), "material": name}
 
 
@@ -237,7 +237,7 @@ def _glass(entry: _Entry, maker: str) -> Glass:
     return made
 
 
-def _form(kind: int, c: list[float], told: str) -> tuple[str, tuple[float, ...]]:
+def _form(kind: int, c: list[float], name: str) -> tuple[str, tuple[float, ...]]:
     """`Glass.form` and `Glass.coefficients` of a formula's coefficients, with zeros behind them."""
     if kind in _SELLMEIER:
         terms = [tuple(c[2 * k : 2 * k + 2]) for k in range(_SELLMEIER[kind])]
@@ -245,7 +245,7 @@ def _form(kind: int, c: list[float], told: str) -> tuple[str, tuple[float, ...]]
     if kind == 9:  # n^2 = A + B L^2 / (L^2 - C) + D L^2 / (L^2 - E)
         return "sellmeier", (c[0] - 1, 0.0, *c[1:5])
     if kind not in _POWERS:
-        raise _Refused(f"{told} is not read")
+        raise _Refused(f"{name} is not read")
     if c[_SIXTH_POWER.get(kind, -1)]:
-        raise _Refused(f"{told} with a sixth power is not read")
+        raise _Refused(f"{name} with a sixth power is not read")
     return "power", tuple(0.0 if k is None else c[k] for k in _POWERS[kind])

@@ -305,8 +305,8 @@ def _state(lens: Lens, table: Table, name: str) -> Configuration:
     if isinstance(distance, str):
         if not (math.isfinite(paraxial_mm) and paraxial_mm > 0):
             raise table.error("object_distance_mm", distance, "a distance in mm, or null")
-        said = f"{table.where}object_distance_mm {distance!r}"
-        warn(lens.path, f"{said}: {paraxial_mm:.6g} mm follows from the thicknesses")
+        place = f"{table.where}object_distance_mm {distance!r}"
+        warn(lens.path, f"{place}: {paraxial_mm:.6g} mm follows from the thicknesses")
         return replace(state, object_distance_mm=paraxial_mm)
     if distance is not None:
         stated = table.number("object_distance_mm", unit="mm", above=0)

@@ -49,7 +49,7 @@ class File(Draft):
         return [*self.ids, *[""] * (len(self.surfaces) - len(self.ids))]
 
     def value(self, name: str, place: int) -> float | None:
-        """Return a variable in a state, None where it is not told; "Infinity" is `math.inf`."""
+        """Return a variable in a state, None where it is not stated; "Infinity" is `math.inf`."""
         line, words = self.variables.get(name.lower(), (None, []))
         word = words[place].strip() if place < len(words) else ""
         if line is None or word.lower() in _UNKNOWN:

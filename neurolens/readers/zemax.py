@@ -42,7 +42,7 @@ class File(Draft):
     zoom: Zoom = field(default_factory=Zoom)
     makers: list[str] = field(default_factory=list)
     without_film: bool = False
-    working: Line | None = None  # where the f-number is said to be the working one
+    working: Line | None = None  # where the f-number is the working one
     field_type: int = 0
     fields: int = 0
     heights: dict[str, list[float]] = field(default_factory=dict)
@@ -306,5 +306,5 @@ def _glass(line: Line, rest: list[str], makers: list[str]) -> dict[str, Any]:
         )
     figures = [] if catalogue.same_name(name) else [line.number_of("GLAS", word) for word in rest[3:5]]
     # 1.5 and 40 is what the program writes in the place of both.
-    told = (figures[0], figures[1]) if len(figures) == 2 and min(figures) > 1 and figures != [1.5, 40.0] else None
-    return named_glass(name, line.file, f"line {line.number}, GLAS", makers, figures=told)
+    stated = (figures[0], figures[1]) if len(figures) == 2 and min(figures) > 1 and figures != [1.5, 40.0] else None
+    return named_glass(name, line.file, f"line {line.number}, GLAS", makers, figures=stated)

@@ -92,13 +92,13 @@ def shape_of(block: Block) -> dict[str, Any]:
         case "STANDARD":
             shape = block.rotational()
         case "XASPHERE" if any(v for v, _ in block.parameters.values()) and not any(v for v, _ in block.extra.values()):
-            told = "an XASPHERE with its terms in PARM is taken as EVENASPH"
-            assume(block.start.file, f"surface {block.name} of the file: {told}")
+            message = "an XASPHERE with its terms in PARM is taken as EVENASPH"
+            assume(block.start.file, f"surface {block.name} of the file: {message}")
             return shape_of(replace(block, kind="EVENASPH", extra={}))
         case "EVENASPH":
             if any(n > _EVEN and value for n, (value, _) in block.parameters.items()):
-                told = f"PARM {_EVEN + 1} and beyond of EVENASPH are taken as its next even powers"
-                assume(block.start.file, f"surface {block.name} of the file: {told}")
+                message = f"PARM {_EVEN + 1} and beyond of EVENASPH are taken as its next even powers"
+                assume(block.start.file, f"surface {block.name} of the file: {message}")
             shape = block.rotational([(2 * i, block.parameter(i)) for i in range(1, MAX_POWER // 2 + 1)])
         case "ODDASPHE":
             terms = [(i, block.parameter(i)) for i in range(1, 9)]

@@ -81,10 +81,10 @@ def passes_at_any_azimuth(
     for group in ((0.0,),) if round_ else _GROUPS:
         # In one trace: few rays take nearly as long as many.
         azimuth = torch.tensor(group, dtype=film_radius.dtype)[:, None]
-        asked = (~passed).expand(len(group), -1)
+        todo = (~passed).expand(len(group), -1)
         if low is not None and high is not None:
-            asked = asked & (low <= azimuth.abs()) & (high >= azimuth.abs())
-        which, left = torch.nonzero(asked, as_tuple=True)
+            todo = todo & (low <= azimuth.abs()) & (high >= azimuth.abs())
+        which, left = torch.nonzero(todo, as_tuple=True)
         if not len(left):
             continue
         r, u, v = film_radius[left], pupil_x[left], pupil_y[left]
@@ -253,8 +253,8 @@ def pupil_bounds(
             place = Place(film_radius_mm * i / (rows - 1), z)
             jobs += [(i, place, start) for start in _starts(lens, place, plane, near, data.exit_pupil_z_mm)]
 
-    def look(seen: Lens, places: list[Place], starts: list[Box]) -> list[Box | None]:
-        return search(seen, places, wavelengths, plane, starts, points, film_mm)
+    def look(lens: Lens, places: list[Place], starts: list[Box]) -> list[Box | None]:
+        return search(lens, places, wavelengths, plane, starts, points, film_mm)
 
     found = _found(look, lens, [place for _, place, _ in jobs], [start for _, _, start in jobs])
     by_row: list[list[Box]] = [[] for _ in range(rows)]
@@ -307,11 +307,11 @@ def _found(look: _Look, lens: Lens, places: list[Place], starts: list[Box]) -> l
     few = [k for k, box in enumerate(coarse) if box is None or box.points < FEW]
     # A small stop may lie between the points of the grid: refine where light passes the open one.
     wide = look(lens.with_stop_radius(math.inf), [places[k] for k in few], [starts[k] for k in few])
-    seen = [(k, box) for k, box in zip(few, wide, strict=True) if box]
-    closer = look(lens, [places[k] for k, _ in seen], [box for _, box in seen])
+    lit = [(k, box) for k, box in zip(few, wide, strict=True) if box]
+    closer = look(lens, [places[k] for k, _ in lit], [box for _, box in lit])
     for k in few:
         coarse[k] = None
-    for (k, _), box in zip(seen, closer, strict=True):
+    for (k, _), box in zip(lit, closer, strict=True):
         coarse[k] = box
     some = [(k, box) for k, box in enumerate(coarse) if box]
     fine = look(lens, [places[k] for k, _ in some], [box for _, box in some])

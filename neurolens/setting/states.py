@@ -210,8 +210,8 @@ def _factor_for_field(lens: Lens, field_deg: float) -> float:
     r = out.rays
     height = abs(float(r.x + (lens.film_z_mm - r.z) * r.dx / r.dz))
     if not bool(chief.reached.all()) or int(out.status[0]) != 0 or not height > 0:
-        seen = min(math.degrees(reached) * 2, lens.half_field_deg * 2 if lens.half_field_deg else 360.0)
-        raise InputError(lens.path, "field_deg", field_deg, f"a field that this lens sees (about {seen:.3g} degrees)")
+        widest = min(math.degrees(reached) * 2, lens.half_field_deg * 2 if lens.half_field_deg else 360.0)
+        raise InputError(lens.path, "field_deg", field_deg, f"a field that this lens sees (about {widest:.3g} degrees)")
     return radius / height
 
 
