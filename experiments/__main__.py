@@ -1,11 +1,12 @@
 """`python -m experiments NAME`: the measurements behind the README's tables, the gallery, and the models that ship.
 
 Run from the project's folder. A measurement is a module of this folder with `OPTIONS` and `run`, its docstring is the
-help; see `lab`.
+help; see `lab`. A second measurement PART of a module has `PART_OPTIONS` and `run_part`, whose docstring is its help.
 """
 
 from __future__ import annotations
 
+import inspect
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -19,7 +20,7 @@ NAMES = {
     "pupils": ("pupils", "share of rays that pass a lens, by how its pupil is sampled"),
     "surrogates": ("surrogates", "all methods on a set of lenses, or on the whole library"),
     "vignetting": ("vignetting", "false passes and blocks, illumination"),
-    "clipping": ("clipping", "rays that shipped models pass or block wrongly, networks beside polynomials"),
+    "clipping": ("vignetting:clipping", "rays that shipped models pass or block wrongly, networks beside polynomials"),
     "outside": ("outside", "random inputs through exported models"),
     "fused": ("fused_speed", "models as C against the exact lens as C"),
     "gpu": ("gpu", "lenses and models as GLSL compute shaders, on a GPU or by software OpenGL"),
@@ -32,7 +33,7 @@ NAMES = {
     "render": ("render_times", "render time by camera and scene"),
     "mitsuba": ("mitsuba_speed", "speed of the renderer beside Mitsuba 3"),
     "osl": ("osl_speed", "cameras in Blender's Cycles: shaders of models beside its own"),
-    "osl-pictures": ("osl_pictures", "lenses in Cycles beside its own depth of field"),
+    "osl-pictures": ("osl_speed:pictures", "lenses in Cycles beside its own depth of field"),
     "view": ("view_speed", "the page of `neurolens view` in software WebGL: first picture, each change"),
     "promises": ("promises", "models against the speed that their index promises"),
     "four-lenses": ("four_lenses", "the README's first picture: a night through a thin lens and three real ones"),
@@ -62,10 +63,12 @@ def build_parser(argv: Sequence[str]) -> Parser:
     for name, (module, text) in NAMES.items():
         chosen = kinds.add_parser(name, help=text)
         if argv[:1] == [name]:
-            found = import_module(f"experiments.{module}")
-            chosen.description = found.__doc__
-            chosen.set_defaults(run=lambda args, run=found.run: run(args) or 0, kept="what was finished is kept")
-            for add in found.OPTIONS:
+            name, _, part = module.partition(":")
+            found = import_module(f"experiments.{name}")
+            run = getattr(found, f"run_{part}" if part else "run")
+            chosen.description = inspect.getdoc(run if part else found)
+            chosen.set_defaults(run=lambda args, run=run: run(args) or 0, kept="what was finished is kept")
+            for add in getattr(found, f"{part.upper()}_OPTIONS" if part else "OPTIONS"):
                 add(chosen)
     return parser
 

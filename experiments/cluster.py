@@ -1,9 +1,9 @@
-"""What a Dask cluster gains and costs: speed-up with workers of this machine, overhead a task, and 100,000 tasks.
+"""Gains and costs of a Dask cluster: speed-up with workers of this machine, overhead a task, and 100,000 tasks.
 
 Speed-up: the same survey and the same render by the plain command on one core, and on a cluster of one and of two
 workers (processes of this machine, started for each run, which is in the time); results are compared bit for bit.
 Overhead: tasks that do nothing, with payloads as large as those of a lens and of a tile of a 4K film, through a real
-cluster of two workers; scheduler and driver are this process, whose CPU and memory are told. 100,000 tasks, or more
+cluster of two workers; scheduler and driver are this process, whose CPU and memory are measured. 100,000 tasks, or more
 workers than this machine has, are a simulation: each worker takes a task when it is free, is idle for a round trip
 after it, and the driver, one core, needs its measured CPU time for each.
 """
@@ -100,7 +100,7 @@ def _quietly(argv: Sequence[str]) -> None:
 
 
 def _result(out: Path) -> str:
-    """What a run has made, without its times and names of folders."""
+    """The results of a run as text, without its times and names of folders."""
     if out.is_dir():
         files = sorted((out / "records").iterdir())
         return "".join(f"{file.name}{file.read_text()}" for file in files)
@@ -204,7 +204,7 @@ def _page(rows: Sequence[Row], simulated: Sequence[Row]) -> str:
 
 
 def _words(rows: Sequence[Row], simulated: Sequence[Row]) -> str:
-    """What grows with what."""
+    """A paragraph on what grows with the number of tasks and workers."""
     lens = [row for row in rows if row.get("what") == "lens"]
     if len(lens) < 2 or not simulated:
         return ""

@@ -197,7 +197,7 @@ def judged(own: Row, theirs: Row, mended: Row | None) -> Row:
 
 
 def reach(row: Row) -> int:
-    """How many tenths of the field have a chief ray."""
+    """The number of tenths of the field that have a chief ray."""
     return next((k for k, height in enumerate(row["heights_mm"]) if height is None), len(row["heights_mm"]))
 
 

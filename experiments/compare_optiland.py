@@ -89,7 +89,7 @@ def optiland_lens(lens: Lens) -> Optic:
 
 
 def theirs(lens: Lens, backend: str, dtype: str) -> tuple[Callable[[FilmRays], Call], Callable[[FilmRays], np.ndarray]]:
-    """What prepares Optiland's call, and what gives its landing points and directions, [6, N]."""
+    """A function that prepares Optiland's call, and one that returns its landing points and directions [6, N]."""
 
     def prepare(rays: FilmRays) -> Call:
         be.set_backend(backend)
@@ -116,7 +116,7 @@ def theirs(lens: Lens, backend: str, dtype: str) -> tuple[Callable[[FilmRays], C
 
 
 def ours(lens: Lens, dtype: str, compiled: bool) -> Callable[[FilmRays], Call]:
-    """What prepares our call."""
+    """A function that prepares our call."""
     fast = compile_tracing(partial(trace, lens, towards="film"), lens) if compiled else None
 
     def prepare(rays: FilmRays) -> Call:
@@ -130,7 +130,7 @@ def ours(lens: Lens, dtype: str, compiled: bool) -> Callable[[FilmRays], Call]:
 
 
 def passing(lens: Lens, rays: FilmRays) -> FilmRays:
-    """As many rays, those that pass alone, again and again."""
+    """As many rays, all of which pass: those that do, repeated."""
     with torch.no_grad():
         status = trace(lens, light(lens, rays, torch.float64), glass.LINE_D_NM, towards="film").status
     places = torch.nonzero(status == 0)[:, 0]
@@ -183,7 +183,7 @@ def _times(backend: str) -> Callable[[Row], str | None]:
 
     def cell(row: Row) -> str | None:
         found = row.get("faster_than", {}).get(f"Optiland, {backend}")
-        return None if found is None else lab.best_median(found["min"], found["median"], ".1f")
+        return None if found is None else lab.best_median(found["min"], found["median"], form=".1f")
 
     return cell
 

@@ -127,7 +127,7 @@ _PASS_SEED, _SHORT_SEED, _REFERENCE_SEED = 100, 1000, 1_000_000
 
 @dataclass(frozen=True)
 class Counts:
-    """How much is rendered.
+    """The amount of rendering.
 
     Attributes:
         size: width and height in pixels.
@@ -280,7 +280,7 @@ def camera_result(
     counts: Counts,
     film: FilmMap,
 ) -> CameraResult:
-    """What one camera's renders say, against the exact lens's and the halves of the reference; weights `by` measure."""
+    """The errors of a camera's renders against the exact lens's and the reference's halves; weights `by` measure."""
     passes, others = np.stack(own.pictures[-counts.passes :]), np.stack(exact.pictures[-counts.passes :])
     times = own.seconds[-counts.passes :]
     both = {measure: bias_and_variance(passes, halves, weight) for measure, weight in by.items()}

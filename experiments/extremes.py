@@ -203,7 +203,7 @@ Vector = tuple[Any, Any, Any]
 
 @dataclass(frozen=True)
 class ReferenceRay:
-    """Where one ray ends: point on the last surface (lens frame, mm), unit direction after it, and its status.
+    """The end of one ray: point on the last surface (lens frame, mm), unit direction after it, and its status.
 
     Point and direction are None where the ray is blocked.
     """
@@ -252,7 +252,7 @@ def _unit(v: Vector) -> Vector:
 
 
 def _weights(s: Surface) -> tuple[int, int]:
-    """How x^2 and y^2 enter the square of the height at which the sag is taken."""
+    """The weights of x^2 and y^2 in the squared height at which the sag is taken."""
     return (1, 0) if s.cylinder == "x" else (0, 1) if s.cylinder == "y" else (1, 1)
 
 

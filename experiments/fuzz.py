@@ -67,8 +67,8 @@ _PROGRESS = re.compile(r": (done in|stopped after|\d+%)")  # of a command whose 
 
 @dataclass(frozen=True)
 class Verdict:
-    """How a case ended: its number and kind, the command's words, its exit code, the end of what it said, its faults,
-    seconds of processor time (its processes included), and the largest memory of it or of one of its processes."""
+    """The end of a case: number and kind, words of the command, exit code, end of stderr, faults, seconds of processor
+    time (its processes included), and the largest memory of it or of one of its processes."""
 
     case: int
     kind: str
@@ -94,7 +94,7 @@ class Folder:
         self.clean = self.state()
 
     def state(self) -> dict[Path, tuple[int, int, int]]:
-        """What is in the folder, and numbers that change with it."""
+        """The paths in the folder, with numbers that change with their contents."""
         found = {}
         for path in self.place.rglob("*"):
             about = path.lstat()
@@ -131,7 +131,7 @@ def _remove(path: Path) -> None:
 
 
 def _batch(good: Path, scratch: Path, cases: Sequence[int], seed: int, only: str, answers: int) -> None:
-    """In the new process: run cases, and write a line for each of them to a pipe."""
+    """Run cases in the new process, and write a line for each of them to a pipe."""
     try:
         os.setsid()
         os.environ["NEUROLENS_TRACEBACK"] = "1"
@@ -192,7 +192,7 @@ def _case(case: int, kind: str, argv: list[str], folder: Folder, parser: Callabl
 
 
 def _faults(argv: Sequence[str], code: int, said: str, new: Sequence[str], memory: int) -> Iterator[str]:
-    """What is wrong with how a command ended: its code, what it said on stderr, new files by name."""
+    """The faults of how a command ended, by its exit code, its stderr and the names of its new files."""
     lines = [line for line in said.splitlines() if not line.startswith("neurolens: warning: ")]
     if code not in (0, 2) and not (code == 1 and argv[0] in _JUDGES):
         yield f"exit code {code}"

@@ -163,7 +163,7 @@ def _of_ghosts(chance: Chance, folder: Path) -> Words:
 
 
 def _of_listing(chance: Chance, folder: Path) -> Words:
-    """What `models` finds in the working folder."""
+    """A damaged model in a folder that `models` lists."""
     (folder / "models").mkdir()
     name = chance.choice(("model.onnx", "network.onnx"))
     hurt(chance, folder, name)
@@ -213,7 +213,7 @@ def _of_archive(chance: Chance, folder: Path) -> Words:
 
 
 def _of_kept(chance: Chance, folder: Path) -> Words:
-    """What an interrupted or an earlier run has left."""
+    """The files that an interrupted or an earlier run has left."""
     records = sorted(str(file.relative_to(folder)) for file in folder.glob("done/records/*.json"))
     commands = {
         "out.exr.part": _render("thin", "--samples", "16"),

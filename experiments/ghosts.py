@@ -240,7 +240,7 @@ def _rms(tracer: GhostTracer, model: GhostModel) -> float:
 
 
 def _shown(found: Any, reference: Any) -> tuple[Any, Any]:
-    """As they are looked at: the 99.9th percentile of the converged one is white."""
+    """Both pictures for display: the 99.9th percentile of the converged one is white."""
     white = float(np.quantile(reference, 0.999))
     return np.clip(found / white, 0, 1), np.clip(reference / white, 0, 1)
 

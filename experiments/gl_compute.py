@@ -29,7 +29,7 @@ Reader = Callable[..., Any]
 
 
 def _opened(devices: bool) -> Reader:
-    """As `_context`; without one the process ends."""
+    """The reader of `_context`; the process ends where there is no context."""
     try:
         return _context(devices)
     except OSError as error:

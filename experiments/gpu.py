@@ -190,7 +190,7 @@ class ShaderRace:
                     self.jobs.append(job | {"keep": f"{name}.{form}.npy"})
 
     def run(self, rounds: int) -> dict[str, Any]:
-        """What `gl_compute.race` found.
+        """Run the race of `gl_compute` and return its results.
 
         Raises:
             Unmeasured: no OpenGL 4.3; the message says why.
@@ -205,7 +205,7 @@ class ShaderRace:
         return found
 
     def errors(self, subject: Subject, form: str) -> tuple[float, float]:
-        """Of the rays that came back: RMS in um where both pass, and the share that passes or is blocked wrongly."""
+        """RMS in um over rays that pass here and in float64, and the share that passes or is blocked wrongly."""
         found = torch.from_numpy(np.load(self.folder / f"{subject.name}.{form}.npy").reshape(_RESULTS, _CHECKED))
         exact = self.exact[subject.name]
         passed, truly = found[-1] == st.PASSED, exact.status == st.PASSED

@@ -77,7 +77,7 @@ def measure_lens(file: Path, rays: int, uniform: int = 10_000, terms: int = 64) 
 
 
 def _domain(lens: Lens) -> Domain:
-    """From infinity to 14 focal lengths, or infinity alone where that is nearer than the near limit."""
+    """The domain from infinity to 14 focal lengths, or of infinity alone where that is nearer than the near limit."""
     try:
         return domain_of(lens, focus_m=(math.inf, 14e-3 * abs(first_order(lens).efl_mm)))
     except InputError:
@@ -201,7 +201,7 @@ def _share(title: str, path: str, rest: bool = False) -> lab.Column:
 
 
 def _published_columns(missed: str, away: str) -> list[lab.Column]:
-    """What the published iteration misses, by steps, and what ran away after the most."""
+    """The shares that the published iteration misses, by steps, and that ran away after the most."""
     first, *more = PUBLISHED_STEPS
     heads = {first: f"published: {first}"} | {n: str(n) for n in more}
     return [*(_share(head, f"{missed}.{n}") for n, head in heads.items()), _share("away", f"{away}.{more[-1]}")]

@@ -1,4 +1,4 @@
-"""What all measurements share: folders, options, tables of columns, goals, kept rows, results, the machine.
+"""The common parts of all measurements: folders, options, tables of columns, goals, kept rows, results, the machine.
 
 A measurement is a module with `OPTIONS` and `run(args)`, and its docstring is its help. Its results are rows
 (dataclasses or dictionaries); its page is some words and tables, and each table is a sequence of `Column`.
@@ -121,7 +121,7 @@ def counted(items: Iterable[T], stage: str, quiet: bool) -> Iterator[T]:
 
 
 def part_of(report: Report, k: int, count: int) -> Report:
-    """What part `k` of `count` equal parts reports to, to fill its share of a whole."""
+    """The report of part `k` of `count` equal parts of a whole."""
     return lambda fraction, seconds_left=None: report((k + fraction) / count)
 
 
@@ -195,7 +195,7 @@ def page(*parts: str) -> str:
     return "\n\n".join(part.rstrip("\n") for part in parts if part) + "\n"
 
 
-def best_median(best: float, median: float, form: str = ".2f") -> str:
+def best_median(best: float, median: float, *, form: str = ".2f") -> str:
     """Two figures of a race: "best (median)"."""
     return f"{best:{form}} ({median:{form}})"
 

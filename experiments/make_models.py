@@ -328,7 +328,7 @@ def _make_of_one_state(entry: Entry, library: Library, out: Path, progress: Prog
 def _times(
     entry: Entry, library: Library, lens: Lens, domain: Domain, files: Mapping[str, Path], progress: Progress
 ) -> dict[str, Row]:
-    """What the index says of the times of models, by their labels: one race with the exact tracer compiled."""
+    """The times of models for the index, by their labels, from one race with the compiled exact tracer."""
     candidates = exact_candidates(lens, domain, compiled=library.compile_exact and entry.promise)
     candidates += model_candidates(files, domain)
     with progress.stage(f"{entry.state}: race") as report:
@@ -380,7 +380,7 @@ def best_of_each_kind(measured: Sequence[Measured]) -> list[Measured]:
 
 
 def _row(entry: Entry, lens: Lens, domain: Domain, m: Measured) -> Row:
-    """What the index says of a model but its times; its card is checked on fresh rays."""
+    """The row of a model in the index, without its times; its card is checked on fresh rays."""
     scale = REFERENCE_RADIUS_MM / image_radius_mm(lens)[0]
     widest = lens.with_stop_radius(domain.stop_radius_mm)
     broken = [p.key for p in check_model(load_model(m.file), widest)[1] if not p.holds]
@@ -405,7 +405,7 @@ _CHECKED = 4  # states at which a card is checked on fresh rays
 
 
 def _make_of_many_states(entry: Entry, library: Library, out: Path, progress: Progress) -> list[Row]:
-    """Figures are the worst over states at random."""
+    """The rows of models of many states, whose figures are the worst over random states."""
     experiment = Experiment(entry.state, entry.lens, entry.models, entry.domain, library.pairs)
     rows = []
     with warnings.catch_warnings(), tempfile.TemporaryDirectory() as scratch:

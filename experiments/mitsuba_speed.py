@@ -50,7 +50,7 @@ VARIANTS = ("scalar_rgb", "scalar_spectral", "llvm_ad_rgb", "llvm_ad_spectral")
 
 @dataclass(frozen=True)
 class Settings:
-    """What all renderers do: a picture of size x size pixels, samples per pixel, threads, repeats."""
+    """The task of all renderers: a picture of size x size pixels, samples per pixel, threads, repeats."""
 
     size: int = 256
     samples: int = 16
@@ -59,7 +59,7 @@ class Settings:
 
     @property
     def paths(self) -> int:
-        """Of one picture."""
+        """The paths of one picture."""
         return self.size * self.size * self.samples
 
 
@@ -128,7 +128,7 @@ def rows(model: Path, settings: Settings) -> list[Row]:
     behind, meshes = (
         our_scene(box, pinhole.film_mm, back_m=1e-3 * FOCAL_MM, triangles=triangles) for triangles in (False, True)
     )
-    found = [
+    results = [
         _ours(behind, pinhole, "hero", settings),
         _ours(behind, pinhole, "one", settings),
         _ours(meshes, pinhole, "hero", settings, _TRIANGLES),
@@ -143,11 +143,11 @@ def rows(model: Path, settings: Settings) -> list[Row]:
             require_mitsuba(variant)
         except NeurolensError:
             continue
-        found.append(_theirs(variant, None, settings, np.reciprocal(cos4)))
+        results.append(_theirs(variant, None, settings, np.reciprocal(cos4)))
         if variant.startswith("llvm"):
-            found.append(_theirs(variant, lens, settings, _NO_WHITE))
+            results.append(_theirs(variant, lens, settings, _NO_WHITE))
     mi.set_variant("scalar_rgb")
-    return found
+    return results
 
 
 def _ours(scene: Scene, chosen: Camera, wavelengths: Any, settings: Settings, how: str = "rectangles") -> Row:
@@ -300,7 +300,7 @@ def memory_of(scene_file: str, width: int, samples: int) -> lab.Row:
 
 
 @dataclass
-class Found:
+class Results:
     """The results: rows of `record`, of scenes and of memory; `missing` says what was not measured, and why."""
 
     settings: Settings
@@ -345,22 +345,22 @@ _SCENES = lab.columns(
 _MEMORY = lab.columns(("picture", "{width} x {height}".format_map), ("samples", "samples"), ("MB", "growth_mb", ".0f"))
 
 
-def page(found: Found) -> str:
+def page(results: Results) -> str:
     """The tables as Markdown."""
-    s = found.settings
-    versions = ", ".join(f"{name} {version}" for name, version in found.versions.items())
+    s = results.settings
+    versions = ", ".join(f"{name} {version}" for name, version in results.versions.items())
     parts = [f"One run of `python -m experiments mitsuba` ({versions}); {s.threads} threads."]
-    if found.rows:
-        parts += ["## Beside Mitsuba 3", _BESIDE.format(**vars(s)), lab.table(_SPEEDS, found.rows, "–")]
-    if found.scenes:
-        parts += ["## Scenes, and where the time goes", _WHERE, lab.table(_SCENES, found.scenes)]
-    if found.memory:
-        parts += ["## Memory", _memory_text(found.memory), lab.table(_MEMORY, found.memory)]
-    return lab.page("# Speed of the renderer", *parts, *(f"Not measured: {reason}" for reason in found.missing))
+    if results.rows:
+        parts += ["## Beside Mitsuba 3", _BESIDE.format(**vars(s)), lab.table(_SPEEDS, results.rows, "–")]
+    if results.scenes:
+        parts += ["## Scenes, and where the time goes", _WHERE, lab.table(_SCENES, results.scenes)]
+    if results.memory:
+        parts += ["## Memory", _memory_text(results.memory), lab.table(_MEMORY, results.memory)]
+    return lab.page("# Speed of the renderer", *parts, *(f"Not measured: {reason}" for reason in results.missing))
 
 
 def _memory_text(rows: list[lab.Row]) -> str:
-    """What grows with the picture, from the two largest at equal samples, and what does not."""
+    """The memory that grows with the picture, from the two largest at equal samples, and the rest."""
     sizes = sorted((r["width"] * r["height"], r["growth_mb"]) for r in rows if r["samples"] == rows[0]["samples"])
     (small, small_mb), (large, large_mb) = sizes[-2:]
     each = (large_mb - small_mb) * 1e6 / (large - small)
@@ -386,17 +386,17 @@ OPTIONS = (
 
 def run(args: argparse.Namespace) -> None:
     """Measure, writing the page after each part."""
-    found = Found(Settings(args.size, args.samples, args.threads, args.repeats), _versions())
+    results = Results(Settings(args.size, args.samples, args.threads, args.repeats), _versions())
     parts = {"beside Mitsuba": _beside, "scenes": _scenes, "memory": _memory}
     progress = Progress(dict(zip(parts, (120.0, 60.0, 40.0), strict=True)), quiet=args.quiet)
     text = ""
     for name, part in parts.items():
         with progress.stage(name) as report:
             try:
-                part(found, report)
+                part(results, report)
             except NeurolensError as error:
-                found.missing.append(f"{name} ({error})")
-        text = lab.write_results(args.out, "render_speed", page(found), vars(found))
+                results.missing.append(f"{name} ({error})")
+        text = lab.write_results(args.out, "render_speed", page(results), vars(results))
     print(text)
 
 
@@ -411,19 +411,19 @@ def _versions() -> dict[str, str]:
     return known
 
 
-def _beside(found: Found, report: Report) -> None:
+def _beside(results: Results, report: Report) -> None:
     """Run every renderer once to warm up, then in turn `repeats` times."""
-    made = rows(lab.MODELS / MODEL, found.settings)
-    total = len(made) * (found.settings.repeats + 1)
+    made = rows(lab.MODELS / MODEL, results.settings)
+    total = len(made) * (results.settings.repeats + 1)
     for k in range(total):
         made[k % len(made)].run(seed=k // len(made))
         report((k + 1) / total)
-    found.rows = [record(row, found.settings, made[0]) for row in made]
+    results.rows = [record(row, results.settings, made[0]) for row in made]
 
 
-def _scenes(found: Found, report: Report) -> None:
+def _scenes(results: Results, report: Report) -> None:
     """Each scene: timed with all threads, then profiled with one."""
-    threads, repeats = found.settings.threads, min(found.settings.repeats, 5)
+    threads, repeats = results.settings.threads, min(results.settings.repeats, 5)
     for k, name in enumerate(SCENES):
         scene = load_scene(lab.SCENES / f"{name}.toml")
         camera = thin_camera(scene)
@@ -432,12 +432,12 @@ def _scenes(found: Found, report: Report) -> None:
         speeds = mpaths_per_s(scene, repeats=repeats, threads=threads, **size)
         row = {"scene": name, "max_depth": scene.settings.camera.max_depth, "mpaths_per_s": max(speeds)}
         row |= {"mpaths_per_s_median": sorted(speeds)[len(speeds) // 2], "shares": profile(scene, camera, **size)}
-        found.scenes.append(row)
+        results.scenes.append(row)
         report((k + 1) / len(SCENES))
 
 
-def _memory(found: Found, report: Report) -> None:
+def _memory(results: Results, report: Report) -> None:
     cases = [*((width, 1) for width in WIDTHS), (WIDTHS[0], MANY_SAMPLES)]
     for k, (width, samples) in enumerate(cases):
-        found.memory.append(lab.in_child(memory_of, str(lab.SCENES / "room.toml"), width, samples))
+        results.memory.append(lab.in_child(memory_of, str(lab.SCENES / "room.toml"), width, samples))
         report((k + 1) / len(cases))

@@ -1,4 +1,4 @@
-"""What `osl_speed` and `osl_pictures` ask of Blender's own Python, which has no neurolens: PLAN.json RESULT.json.
+"""Renders for `osl_speed` by Blender's own Python, which has no neurolens: PLAN.json RESULT.json.
 
 The plan holds `cameras`, each with `name`, `focal_mm`, `depth_of_field` and `shader`, the text of one in OSL or null
 for the camera that Blender has, and `scenes` by name, each with `size` (pixels), `samples`, `rounds` and names of

@@ -93,13 +93,13 @@ def _wavelengths(model: OnnxLens) -> tuple[float, float]:
 
 
 class _Place(Enum):
-    """Of a state: among the model's, beyond them, or so close to their ends that rounding decides."""
+    """Where a state lies: among the model's, beyond them, or so close to their ends that rounding decides."""
 
     INSIDE, OUTSIDE, BETWEEN = range(3)
 
 
 def _state(model: OnnxLens, rng: np.random.Generator) -> tuple[tuple[float, ...], _Place]:
-    """Of a model of many states: six times in seven one of its own, else any number; none for a model of one state."""
+    """A state, six times in seven one of the model's, else any number; none for a model of one state."""
     values, places = [], []
     for low, high in (axis.limits for axis in model.axes):
         v = low + (high - low) * rng.uniform()

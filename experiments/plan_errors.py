@@ -1,4 +1,4 @@
-"""How far a camera's picture of a scene is from the exact lens's, in pixels, by two ways that no plan takes.
+"""The distance in pixels of a camera's picture of a scene from that of the exact lens, in two ways that no plan takes.
 
 `by_rays`: footprints as a plan has them, at other places (closer, at random in their cells), other pupil samples, other
 wavelengths, of the camera that `--camera` names. `by_renders`: pieces of the picture, rendered by both cameras with the
@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, uniform_filter  # type: ignore[import-untyped]
 
 from neurolens.cameras.contract import Camera, CameraRays, FloatArray
 from neurolens.plan import footprints as prints
@@ -124,7 +125,7 @@ class Pieces:
         self.film_mm = (float(side_mm) * centre_mm.shape[1], float(side_mm))
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As `Camera.sample`."""
+        """The rays of points on the pieces, as `Camera.sample`."""
         count = self._centre.shape[1]
         place = film_mm[0] / self._side + np.float32(count / 2)
         piece = np.clip(np.floor(place).astype(np.intp), 0, count - 1)
@@ -141,7 +142,8 @@ def pieces_of(scene: Scene, exact: Camera, side_px: int, cells: tuple[int, int] 
     image = render(scene, exact, **settings, film=FilmSettings(wavelengths="one")).rgb
     grey = np.log1p(np.maximum(image @ _COLOURS, 0.0) * 4)
     side = max(round(side_px * width / scene.settings.camera.width), 2)
-    rough = _box(np.hypot(*np.gradient(_smooth(grey, 1.0))), side)
+    smooth = gaussian_filter(grey, 1.0, mode="nearest", truncate=3)
+    rough = uniform_filter(np.hypot(*np.gradient(smooth)), side, mode="constant")
     columns, rows = (np.linspace(0, n, k + 1).astype(int) for n, k in zip((width, height), cells, strict=True))
     centres = []
     for top, bottom in pairwise(rows):
@@ -175,8 +177,11 @@ def rendered(
 
 @dataclass(frozen=True)
 class Moved:
-    """What a camera does to a piece of a picture: pixels that light moves by, as far as they are above the noise;
-    standard error of the shift in them, inf where the piece has too little contrast to tell; relative gain of light."""
+    """The change that a camera makes to a piece of a picture.
+
+    `px`: pixels that light moves by, as far as they are above the noise; `noise_px`: standard error of the shift, inf
+    where the piece has too little contrast to tell; `gain`: relative, of light.
+    """
 
     px: float
     noise_px: float
@@ -184,7 +189,7 @@ class Moved:
 
 
 def moved(exact: Array, other: Array, blur_px: float) -> Moved:
-    """Of renders [seeds, H, W, 3] of a piece by two cameras, the same seeds; see the module.
+    """The change between renders [seeds, H, W, 3] of a piece by two cameras with the same seeds; see the module.
 
     Args:
         blur_px: RMS distance of the exact camera's footprint there from its centroid.
@@ -209,7 +214,7 @@ def _fit(exact: Array, other: Array) -> tuple[Array, Array]:
     seeds = exact.shape[0]
     columns, wanted = [], []
     for a, b in zip(exact, other, strict=True):
-        flat, apart = _smooth(a, _SMOOTH_PX), _smooth(b - a, _SMOOTH_PX)
+        flat, apart = (gaussian_filter(c, _SMOOTH_PX, mode="nearest", truncate=3) for c in (a, b - a))
         down, right = (np.gradient(flat, axis=k) for k in (0, 1))
         bend = np.asarray(np.gradient(down, axis=0) + np.gradient(right, axis=1))
         inner = (slice(_EDGE, -_EDGE),) * 2
@@ -236,20 +241,3 @@ def _fit(exact: Array, other: Array) -> tuple[Array, Array]:
         return np.zeros(4), np.full(4, np.inf)
     error = np.sqrt((seeds - 1) * ((without - without.mean(0)) ** 2).mean(0))
     return found, error
-
-
-def _smooth(image: Array, sigma: float) -> Array:
-    reach = int(np.ceil(3 * sigma))
-    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
-    kernel /= kernel.sum()
-    for axis in (0, 1):
-        padded = np.pad(image, [(reach, reach) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
-        image = np.apply_along_axis(np.convolve, axis, padded, kernel, "valid")
-    return image
-
-
-def _box(image: Array, side: int) -> Array:
-    kernel = np.ones(side) / side
-    for axis in (0, 1):
-        image = np.apply_along_axis(np.convolve, axis, image, kernel, "same")
-    return image

@@ -69,12 +69,12 @@ class Case:
 
     @property
     def state(self) -> str | None:
-        """Of the zoom."""
+        """The state of the zoom."""
         return self.lens.partition("@")[2] or None
 
     @property
     def file(self) -> Path:
-        """Of the lens."""
+        """The file of the lens."""
         return lab.LENSES / f"{self.lens.partition('@')[0]}.toml"
 
     def load(self) -> tuple[Lens, Scene]:
@@ -119,21 +119,13 @@ def measure_case(case: Case, folder: Path, report: Report) -> dict[str, Any]:
     """Plan, try all, measure; see the module."""
     lens, scene = case.load()
     began = time.process_time()
-    found = probe(scene, lens)
+    probed = probe(scene, lens)
     probe_s = time.process_time() - began
-    asked = found.asked
-    shot = Shot(
-        asked.shot.film_mm,
-        asked.shot.focus_m,
-        asked.f_number,
-        zoom=case.state,
-        wavelength_nm=asked.shot.wavelength_nm,
-    )
-    compiled = "fused:" if found.exact.runtime == "c" else ""
-    exact = make_camera(
-        f"{compiled}{lens.path}", shot
-    )  # as a render has it: a plan's own has another outline of pupils
-    places = plan_errors.fresh_places(scene, exact, found.glance.rgb.mean((0, 1)))
+    asked, own = probed.asked, probed.asked.shot
+    shot = Shot(own.film_mm, own.focus_m, asked.f_number, zoom=case.state, wavelength_nm=own.wavelength_nm)
+    compiled = "fused:" if probed.exact.runtime == "c" else ""
+    exact = make_camera(f"{compiled}{lens.path}", shot)  # as in a render: a plan's own has another outline of pupils
+    places = plan_errors.fresh_places(scene, exact, probed.glance.rgb.mean((0, 1)))
     fresh = Fresh(exact, places, plan_errors.fresh_prints(exact, places))
     report(0.1)
     rows: dict[str, dict[str, Any]] = {}
@@ -143,42 +135,41 @@ def measure_case(case: Case, folder: Path, report: Report) -> dict[str, Any]:
     for number, target in enumerate(TARGETS):
         began = time.process_time()
         if number == 0:
-            picks = plans.candidates(found, BUDGETS, target, models=case.shipped(), folder=folder)
+            picks = plans.candidates(probed, BUDGETS, target, models=case.shipped(), folder=folder)
             fitted = [folder / f"{c.name}.onnx" for c in picks if c.how == plans._SHOT]
         else:  # fits are the same for all targets
-            picks = plans.candidates(found, BUDGETS, target, models=[*case.shipped(), *fitted])
+            picks = plans.candidates(probed, BUDGETS, target, models=[*case.shipped(), *fitted])
         plan_s = probe_s + time.process_time() - began
         report(0.2 + 0.3 * number)
-        every = {c.name: c for c in picks} | {
-            c.name: c for c in _more(found, target, folder, picks, sizes, case.shipped())
-        }
+        more = _more(probed, target, folder, picks, sizes, case.shipped())
+        every = {c.name: c for c in (*picks, *more)}
         report(0.3 + 0.3 * number)
         for choice in every.values():
             row = rows.setdefault(choice.name, {"plan_px": choice.error_px, "plan_light": choice.light_error})
             row[f"cost_{target}"] = choice.cost if math.isfinite(choice.cost) else None
             if "px" not in row and row["plan_px"] <= _TRIED_PX:
-                camera = _held(choice, found, case.state, exact)
+                camera = _held(choice, probed, case.state, exact)
                 apart, light = plan_errors.by_rays(camera, exact, places, fresh.seen, asked.pixel_mm, BUDGETS)
                 if isinstance(camera, OnnxCamera):
                     light = light + prints.light_beside(camera, places) / np.maximum(fresh.seen.light, 1e-30)
                 row |= {"px": _counted(apart), "light": _counted(light)}
         for budget in BUDGETS:
-            best = plans.decided(found, picks, budget, target).best
+            best = plans.decided(probed, picks, budget, target).best
             decisions.append(_decision(target, budget, best, list(every.values()), rows) | {"plan_s": plan_s})
             if best is not None and best.name != "exact":
                 chosen.setdefault(best.name, best)
     report(0.7)
-    told = _by_renders(case, scene, found, fresh, list(chosen.values()))
+    changes = _by_renders(case, scene, probed, fresh, list(chosen.values()))
     for decision in decisions:
-        decision["render"] = _seen_in(told.get(decision["chosen"]), decision["budget_px"])
-    dense = replace(found, places=places, seen=fresh.seen, thin_seen=plan_errors.fresh_prints(_thin(found), places))
-    facts = {"lens": case.lens, "scene": case.scene, "f_number": found.asked.f_number}
-    facts |= {"pixel_um": 1e3 * found.asked.pixel_mm, "nearest_m": found.asked.nearest_m}
-    return facts | {"effects": _effects(found, dense), "cameras": rows, "decisions": decisions}
+        decision["render"] = _seen_in(changes.get(decision["chosen"]), decision["budget_px"])
+    dense = replace(probed, places=places, seen=fresh.seen, thin_seen=plan_errors.fresh_prints(_thin(probed), places))
+    facts = {"lens": case.lens, "scene": case.scene, "f_number": probed.asked.f_number}
+    facts |= {"pixel_um": 1e3 * probed.asked.pixel_mm, "nearest_m": probed.asked.nearest_m}
+    return facts | {"effects": _effects(probed, dense), "cameras": rows, "decisions": decisions}
 
 
 def _more(
-    found: Probed,
+    probed: Probed,
     target: plans.Target,
     folder: Path,
     picks: Sequence[plans.Choice],
@@ -191,7 +182,7 @@ def _more(
     No polynomials are larger than what has half of the least budget: they cost more. `made` keeps files for the next
     target.
     """
-    trial = plans._Trial(found, target, (_TRIED_PX,))
+    trial = plans._Trial(probed, target, (_TRIED_PX,))
     costs = {c.name: c for c in picks}
 
     def costed(file: Path) -> plans.Choice | None:
@@ -205,10 +196,10 @@ def _more(
 
     yield from (c for c in map(costed, shipped) if c is not None)
     fit: Any = None
-    for terms in sorted({*shot_fits.shot_terms(found), *MORE_TERMS}):
-        file = folder / f"{Path(found.lens.path).stem}.shot-ols-{terms}.onnx"
+    for terms in sorted({*shot_fits.shot_terms(probed), *MORE_TERMS}):
+        file = folder / f"{Path(probed.lens.path).stem}.shot-ols-{terms}.onnx"
         if file.stem not in costs and file not in made:
-            fit = fit or shot_fits.shot_fits(found, folder)
+            fit = fit or shot_fits.shot_fits(probed, folder)
             made.append(fit(terms)[0])
         choice = costed(file)
         if choice is not None:
@@ -217,27 +208,27 @@ def _more(
                 return
 
 
-def _held(choice: plans.Choice, found: Probed, state: str | None, exact: Any) -> Camera:
+def _held(choice: plans.Choice, probed: Probed, state: str | None, exact: Any) -> Camera:
     """The camera that a plan names; of a model within the outline of the exact lens's pupil, see `plans._model`."""
     if not choice.camera.endswith(".onnx"):
-        return camera_of(choice, found, state)
-    return OnnxCamera(load_model(choice.camera.rpartition(":")[2]), found.asked.shot, outline=exact.film.outline)
+        return camera_of(choice, probed, state)
+    return OnnxCamera(load_model(choice.camera.rpartition(":")[2]), probed.asked.shot, outline=exact.film.outline)
 
 
-def camera_of(choice: plans.Choice, found: Probed, state: str | None, smooth: bool = False) -> Camera:
+def camera_of(choice: plans.Choice, probed: Probed, state: str | None, smooth: bool = False) -> Camera:
     """The camera that a plan names, as a render makes it; with `smooth`, a warped picture by tables of the field."""
-    asked = found.asked
-    shot = Shot(asked.shot.film_mm, asked.shot.focus_m, asked.f_number, wavelength_nm=asked.shot.wavelength_nm)
+    own = probed.asked.shot
+    shot = Shot(own.film_mm, own.focus_m, probed.asked.f_number, wavelength_nm=own.wavelength_nm)
     if choice.camera.endswith(".onnx"):
         return make_camera(choice.camera, shot)
     if "ST map" not in choice.name:
         return make_camera(choice.camera, replace(shot, zoom=state))
-    flat = ideal_as(f"{choice.name.partition(' ')[0]}:", found.exact.lens, Shot(asked.shot.film_mm, asked.shot.focus_m))
-    return Warped(flat, found.exact, asked.shot.focus_m, tables=smooth)
+    flat = ideal_as(f"{choice.name.partition(' ')[0]}:", probed.exact.lens, Shot(own.film_mm, own.focus_m))
+    return Warped(flat, probed.exact, own.focus_m, tables=smooth)
 
 
-def _thin(found: Probed) -> Camera:
-    return ideal_as("thin:", found.exact.lens, Shot(found.asked.shot.film_mm, found.asked.shot.focus_m))
+def _thin(probed: Probed) -> Camera:
+    return ideal_as("thin:", probed.exact.lens, Shot(probed.asked.shot.film_mm, probed.asked.shot.focus_m))
 
 
 def _counted(value: Any) -> float:
@@ -247,7 +238,7 @@ def _counted(value: Any) -> float:
 def _decision(
     target: str, budget: float, best: plans.Choice | None, every: Sequence[plans.Choice], rows: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """What was chosen, whether it holds at fresh places, and the cheapest camera that does."""
+    """The chosen camera, whether it holds at fresh places, and the cheapest camera that does."""
 
     def holds(name: str) -> bool:
         return bool(rows[name].get("px", math.inf) <= budget and rows[name]["light"] <= LIGHT)
@@ -278,15 +269,15 @@ class Fresh:
 
 
 def _by_renders(
-    case: Case, scene: Scene, found: Probed, fresh: Fresh, chosen: Sequence[plans.Choice]
+    case: Case, scene: Scene, probed: Probed, fresh: Fresh, chosen: Sequence[plans.Choice]
 ) -> dict[str | None, list[plan_errors.Moved]]:
-    """What some cameras do to pieces of the picture."""
+    """The changes that some cameras make to pieces of the picture."""
     centres = plan_errors.pieces_of(scene, fresh.exact, _PIECE_PX)
-    blur = fresh.blur_px(centres, found.asked.pixel_mm)
+    blur = fresh.blur_px(centres, probed.asked.pixel_mm)
     truth = plan_errors.rendered(scene, fresh.exact, centres, _PIECE_PX, _SAMPLES, _SEEDS)
     made: dict[str | None, list[plan_errors.Moved]] = {}
     for choice in chosen:
-        camera = camera_of(choice, found, case.state, smooth=True)
+        camera = camera_of(choice, probed, case.state, smooth=True)
         other = plan_errors.rendered(scene, camera, centres, _PIECE_PX, _SAMPLES, _SEEDS)
         pairs = [(truth[:, k], other[:, k], float(blur[k])) for k in range(len(blur))]
         made[choice.name] = [plan_errors.moved(*pair) for pair in pairs]
@@ -302,12 +293,12 @@ def _seen_in(pieces: Sequence[plan_errors.Moved] | None, budget_px: float) -> di
     return {"pieces": len(sure), "px": _counted([t.px for t in sure]), "noise_px": noise}
 
 
-def _effects(found: Probed, dense: Probed) -> list[dict[str, Any]]:
-    """What the probe says of each effect, and what it is at fresh places."""
+def _effects(probed: Probed, dense: Probed) -> list[dict[str, Any]]:
+    """Each effect by the probe and at fresh places."""
     truth = {e.name: e for e in effects_of(dense, 0.0)}
     return [
         {"name": e.name, "unit": e.unit, "probe": e.worth, "fresh": truth[e.name].worth}
-        for e in effects_of(found, 0.0)
+        for e in effects_of(probed, 0.0)
         if e.name != "diffraction"
     ]
 
@@ -353,7 +344,7 @@ def render_holds(decision: Mapping[str, Any]) -> bool:
 
 
 def goals(rows: Sequence[Mapping[str, Any]]) -> list[lab.Goal]:
-    """Of issue and page."""
+    """The goals of the page."""
     made = decisions_of(rows)
     if not made:
         return []
@@ -373,16 +364,10 @@ def goals(rows: Sequence[Mapping[str, Any]]) -> list[lab.Goal]:
 
 def page(rows: Sequence[Mapping[str, Any]]) -> str:
     """The tables."""
-    wrong = [
-        {"lens": r["lens"], "scene": r["scene"]} | e for r in rows for e in r["effects"] if not effect_holds(e)
-    ]  # fmt: skip
-    tried = [len(r["cameras"]) for r in rows] or [0]
-    head = _HEAD.format(
-        cases=len(rows),
-        all=len(CASES),
-        tried=f"{min(tried)} to {max(tried)}",
-        sizes=len({*shot_fits.TERMS, *MORE_TERMS}),
-    )
+    cases = [({"lens": r["lens"], "scene": r["scene"]}, e) for r in rows for e in r["effects"]]
+    wrong = [case | effect for case, effect in cases if not effect_holds(effect)]
+    tried, sizes = [len(r["cameras"]) for r in rows] or [0], len({*shot_fits.TERMS, *MORE_TERMS})
+    head = _HEAD.format(cases=len(rows), all=len(CASES), tried=f"{min(tried)} to {max(tried)}", sizes=sizes)
     named = lab.columns(
         ("lens", "lens"), ("scene", "scene"), ("effect", "name"), ("probe", "probe", ".3g"), ("fresh", "fresh", ".3g"),
         ("", "unit"),

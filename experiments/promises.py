@@ -1,24 +1,20 @@
 """Race each model of which models/index.json promises a speed-up against the exact tracer of its lens (`make bench`).
 
-Beside the thin lens and the pinhole, all in one run; then the floors of the tracer and the renderer. Exit code 1 where
-a model is slower, relative to the compiled exact tracer, than promised, or where a floor is missed.
-Writes bench.md and bench.json. `python -m experiments trace` times the exact tracer alone.
+All models of a lens race in one run with it, on rays uniform over film and pupil disc of their domain, blocked ones
+included; then the floors of the tracer and the renderer. Prints the times. Exit code 1 where a model is slower,
+relative to the compiled exact tracer, than promised, or where a floor is missed.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
-import platform
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from experiments import lab
 from experiments.lab import Row
@@ -26,12 +22,12 @@ from experiments.mitsuba_speed import mpaths_per_s
 from neurolens.base.errors import InputError
 from neurolens.cameras.model import load_model
 from neurolens.render.scene import load_scene
-from neurolens.study.candidates import exact_candidates, ideal_cameras, model_candidate
+from neurolens.study.candidates import exact_candidates, model_candidate
 from neurolens.study.speed import Race, race
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.model import Domain
 
-COMPILED, EAGER = "exact compiled", "exact eager"
+COMPILED = "exact compiled"
 LENS, SCENE = "laikin_double_gauss_50", lab.SCENES / "room.toml"
 TRACER_MRAY_S = {"eager": 6.0, "compiled": 20.0}  # one core, float32, 12 refractions, stop, rims and dispersion
 RENDER_MPATH_S = 1.0  # the room, depth 3, two cores
@@ -39,15 +35,11 @@ RENDER_MPATH_S = 1.0  # the room, depth 3, two cores
 
 @dataclass
 class Outcome:
-    """Rows of the table, one per candidate, and what failed.
+    """The promises that were checked, those that could not be, and those that were not kept, as sentences.
 
-    Attributes:
-        missed: promises that were not kept, as sentences.
-        checked, unchecked: promises held against a measurement, and those that could not be.
-        floors: least speeds of the tracer and the renderer.
+    `floors`: least speeds of the tracer and the renderer.
     """
 
-    rows: list[Row] = field(default_factory=list)
     missed: list[str] = field(default_factory=list)
     checked: int = 0
     unchecked: list[str] = field(default_factory=list)
@@ -77,8 +69,8 @@ def read_index(folder: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def bench_models(args: argparse.Namespace, save: Callable[[Outcome], str]) -> Outcome:
-    """Race the models of the index in `args.models`, lens by lens; `save` the outcome so far after each.
+def bench_models(args: argparse.Namespace) -> Outcome:
+    """Race the models of the index in `args.models`, lens by lens, and print their times.
 
     Without --only, those of which the index promises a speed-up.
     """
@@ -96,12 +88,22 @@ def bench_models(args: argparse.Namespace, save: Callable[[Outcome], str]) -> Ou
         domain = Domain.from_dict(next(iter(models.values())).card["domain"])
         lens = lens.with_stop_radius(domain.stop_radius_mm)
         made = [model_candidate(name, model, domain.stop_radius_mm) for name, model in models.items()]
-        candidates = [*exact_candidates(lens, domain), *made, *ideal_cameras(lens, domain)]
+        candidates = [*exact_candidates(lens, domain), *made]
         timed = race(candidates, domain, threads=args.threads, rounds=args.rounds, report=report)
-        outcome.rows += table_rows(_state(group), timed)
+        print(f"{_state(group)}\n{times(timed)}\n")
         hold_to_promises(rows, timed, outcome)
-        save(outcome)
     return outcome
+
+
+def times(timed: Race) -> str:
+    """A table of the times of a race, and of the speed-ups over the compiled exact tracer (by the medians)."""
+    rows = []
+    for name in (*timed.ns, *timed.unavailable):
+        timing, ratio = timed.timing(name), timed.speedup(name, COMPILED)
+        cells = (timing["min"], timing["median"]) if timing else ()
+        shown = lab.best_median(*cells, form=".1f") if cells else f"unavailable: {timed.unavailable.get(name)}"
+        rows.append([name, shown, lab.best_median(ratio["min"], ratio["median"]) if ratio else None])
+    return lab.table("candidate|ns per ray, best (median)|over compiled", rows)
 
 
 def _state(group: tuple[Any, ...]) -> str:
@@ -160,77 +162,20 @@ def report_outcome(outcome: Outcome) -> int:
     return 1 if outcome.missed or below else 0
 
 
-def table_rows(state: str, timed: Race) -> list[Row]:
-    """One row per candidate of a race.
-
-    Its ratios to the exact tracers are {"min", "median"} as of `Race.speedup`; None where that tracer did not run.
-    Where several exact tracers raced, each is held against those of its own kind.
-    """
-    rows: list[Row] = []
-    for name in (*timed.ns, *timed.unavailable):
-        own = name.rsplit(" ", 1)[0]
-        compiled, eager = (n if n in timed.ns else f"{own} {n.split()[-1]}" for n in (COMPILED, EAGER))
-        ratios = {"speedup_over_compiled": timed.speedup(name, compiled)}
-        ratios |= {"speedup_over_eager": timed.speedup(name, eager)}
-        load = [timed.load_before, timed.load_after]
-        about = {"lens": state, "name": name, "ns_per_ray": timed.timing(name)}
-        rows.append(about | ratios | {"reason": timed.unavailable.get(name), "load": load})
-    return rows
-
-
-def _ratio(key: str) -> Callable[[Row], str | None]:
-    return lambda row: lab.best_median(row[key]["min"], row[key]["median"]) if row[key] else None
-
-
-_COLUMNS = lab.columns(
-    ("lens", "lens"),
-    ("candidate", "name"),
-    ("ns per ray, best", lambda r: f"{t['min']:.1f}" if (t := r["ns_per_ray"]) else f"unavailable: {r['reason']}"),
-    ("median", "ns_per_ray.median", ".1f"),
-    ("Mray/s", lambda r: 1000 / t["min"] if (t := r["ns_per_ray"]) else None, ".1f"),
-    ("batch", "ns_per_ray.batch"),
-    ("threads", "ns_per_ray.threads"),
-    ("over compiled", _ratio("speedup_over_compiled")),
-    ("over eager", _ratio("speedup_over_eager")),
-)
-_NOTES = """\
-Rays uniform over film and pupil disc of each domain, blocked ones included; {threads}, {rounds} rounds in turn, each \
-the best of a few short samples; float32 unless told. Exact tracer and models do the same work: film and pupil points \
-in; scene ray, transmittance and status out, with stop, rims and dispersion; models add the crossing with the stop. \
-Thin lens and pinhole give ray and weight. Ratios: by the best times (median within rounds), above 1 is faster. \
-Python {python}, torch {torch}, {processor}."""
-
-
-def page(rows: Sequence[Row], floors: Sequence[lab.Goal], threads: int, rounds: int) -> str:
-    """The rows and the floors, with what a reader must know of the conditions."""
-    versions = {"python": platform.python_version(), "torch": torch.__version__, "processor": platform.machine()}
-    notes = _NOTES.format(threads=f"{threads} thread" + "s" * (threads > 1), rounds=rounds, **versions)
-    load = lab.most_load(rows)
-    if load is not None:
-        notes += f" Load average of the machine meanwhile: up to {load:.1f} on {os.cpu_count()} cores."
-    parts = ["## Floors", lab.goal_table("what", floors)] if floors else []
-    return lab.page("# Models against the exact tracer", notes, lab.table(_COLUMNS, rows), *parts)
-
-
 OPTIONS = (
     lab.option("--models", metavar="DIR", type=Path, default=lab.MODELS, help="with index.json (default: models)"),
     lab.option("--only", metavar="TEXT", default="", help="models whose names hold this, promised or not; no floors"),
     lab.count("threads", 1, "that share out batches (default 1)"),
     lab.count("rounds", 20, "of each candidate (default 20)"),
-    lab.out(),
+    lab.QUIET,
 )
 
 
 def run(args: argparse.Namespace) -> int:
     """0 where all that could be checked is kept, 1 where something is not."""
     warnings.simplefilter("ignore")
-
-    def save(outcome: Outcome) -> str:
-        text = page(outcome.rows, outcome.floors, args.threads, args.rounds)
-        return lab.write_results(args.out, "bench", text, {"rows": outcome.rows, "floors": outcome.floors})
-
-    outcome = bench_models(args, save)
+    outcome = bench_models(args)
     if not args.only:
         outcome.floors = check_floors(args.rounds)
-    print(save(outcome))
+        print(lab.goal_table("floor", outcome.floors))
     return report_outcome(outcome)

@@ -1,4 +1,4 @@
-"""What share of the rays that a pupil sends pass the lens: pupils of the literature, and the outlines of our cameras.
+"""The share of the rays of a pupil that pass the lens: pupils of the literature, and the outlines of our cameras.
 
 On the lenses of the theses, beside their figures (half a minute). Writes passage.md and passage.json. With --shaders
 the library's models as shaders in OSL instead, up to half a minute each: writes osl_passing.md and osl_passing.json
@@ -194,7 +194,7 @@ METHODS: dict[str, Callable[[Lens, PupilOutline], Any]] = {
 
 
 def _irradiance(camera: ExactCamera, pupil: Any, film: Any, square: Any, wavelength: Any) -> tuple[Any, float]:
-    """Which rays through a pupil's samples pass, bool [N], and the mean irradiance (T = 1, radiance 1)."""
+    """Whether rays through a pupil's samples pass, bool [N], and the mean irradiance (T = 1, radiance 1)."""
     points, area = pupil.sample(film, square, wavelength)
     distance = camera.film.film_z_mm - pupil.pupil_z_mm
     slope = (points - film) / distance

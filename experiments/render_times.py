@@ -65,7 +65,7 @@ _ALONE_ROUNDS, _SLOW_S = 15, 0.1
 
 @dataclass(frozen=True)
 class Size:
-    """How much is rendered: pixels, samples per pixel, rounds."""
+    """The amount of rendering: pixels, samples per pixel, rounds."""
 
     width: int = 128
     height: int = 72
@@ -138,7 +138,7 @@ def make_subjects(quick: bool, report: Report) -> list[Subject]:
 
 
 def shot(efl: float, spec: str, aperture: Aperture | None = None) -> Shot:
-    """What every camera is set to."""
+    """The settings of every camera."""
     f_number = None if spec == "pinhole" else _F_NUMBER
     return Shot((_FILM[0] * efl, _FILM[1] * efl), _FOCUS_M, f_number, aperture=aperture)
 
@@ -285,7 +285,7 @@ of compiled cameras are polynomials of low order, whose RMS error stands beside 
 
 
 @dataclass
-class Found:
+class Results:
     """The results so far."""
 
     size: Size
@@ -324,31 +324,31 @@ class Found:
         return None if row is None else min(row.camera_s) / row.paths * 1e9
 
 
-def goals(found: Found) -> list[lab.Goal]:
+def goals(results: Results) -> list[lab.Goal]:
     """The goals of every kind of camera in every scene; the worst lens counts."""
 
     def goal(kind: str, text: str, wanted: float, share: Callable[[Subject], float | None]) -> lab.Goal:
-        known = {s.lens: v for s in found.subjects if s.kind == kind and (v := share(s)) is not None}
+        known = {s.lens: v for s in results.subjects if s.kind == kind and (v := share(s)) is not None}
         worst = max(known, key=lambda name: known[name], default="")
         return lab.Goal(f"{kind}: {text}", wanted, known.get(worst), worst=worst)
 
     above, adds = "camera above the thin lens's, of the {} pinhole render", "what differentials add to the camera"
     made = [
-        goal(kind, above.format(scene), ABOVE_THIN, partial(found.above_thin, scene=scene))
+        goal(kind, above.format(scene), ABOVE_THIN, partial(results.above_thin, scene=scene))
         for kind in (*FUSED_MODELS, *GRAPHS)
         for scene in SCENES
     ]
-    made += [goal(k, f"{adds}, in the cheap render", MOVES, found.moves_share) for k in (EXACT_C, *FUSED_MODELS)]
-    text, overhead = "overhead a refraction, of the cheap pinhole render", partial(found.overhead, scene=CHEAP)
+    made += [goal(k, f"{adds}, in the cheap render", MOVES, results.moves_share) for k in (EXACT_C, *FUSED_MODELS)]
+    text, overhead = "overhead a refraction, of the cheap pinhole render", partial(results.overhead, scene=CHEAP)
     return made + [goal(kind, text, PER_REFRACTION, overhead) for kind in (EXACT_C, TORCH)]
 
 
-def write(found: Found, out: Path) -> str:
+def write(results: Results, out: Path) -> str:
     """Write README.md and render_times.csv; returns the page."""
     out.mkdir(parents=True, exist_ok=True)
-    text = page(found)
+    text = page(results)
     atomic_write_text(out / "README.md", text)
-    atomic_write_text(out / "render_times.csv", lab.csv_text(_CSV, [r for r in found.rows if r.seconds]))
+    atomic_write_text(out / "render_times.csv", lab.csv_text(_CSV, [r for r in results.rows if r.seconds]))
     return text
 
 
@@ -366,58 +366,58 @@ first column."""
 _SHAPES_NOTE = "Biconvex lens, C, cheap scene. Passage and time over the round stop's, area over the disc's."
 
 
-def page(found: Found) -> str:
+def page(results: Results) -> str:
     """All tables."""
-    timed = {r.scene for r in found.rows if r.seconds}
+    timed = {r.scene for r in results.rows if r.seconds}
     parts = [] if not timed else ["![Seconds over refractions](render_times.png)"]
-    parts += [f"## Seconds, {s}\n\n{_LEGEND}\n\n{_scene_table(found, s)}" for s in SCENES if s in timed]
-    missing = [f"{s.name}: {s.reason}." for s in found.subjects if s.reason]
-    by_shape = lab.table(_shape_columns(found.shapes[0]), found.shapes) if found.shapes else ""
+    parts += [f"## Seconds, {s}\n\n{_LEGEND}\n\n{_scene_table(results, s)}" for s in SCENES if s in timed]
+    missing = [f"{s.name}: {s.reason}." for s in results.subjects if s.reason]
+    by_shape = lab.table(_shape_columns(results.shapes[0]), results.shapes) if results.shapes else ""
     return lab.page(
         "# Render time by camera",
         "`python -m experiments render`",
-        _NOTES.format(**vars(found.size), **SCENES, more=CHEAP_ROUNDS),
+        _NOTES.format(**vars(results.size), **SCENES, more=CHEAP_ROUNDS),
         lab.machine_line(", one of them used"),
         "## Goals",
-        lab.table(_GOALS, goals(found), "–"),
+        lab.table(_GOALS, goals(results), "–"),
         *parts,
         "## Cameras by themselves",
-        lab.table(_camera_columns(found), found.subjects, "–"),
+        lab.table(_camera_columns(results), results.subjects, "–"),
         *missing,
         f"## Shapes of the stop\n\n{_SHAPES_NOTE}\n\n{by_shape}" if by_shape else "",
     )
 
 
-def _scene_table(found: Found, scene: str) -> str:
+def _scene_table(results: Results, scene: str) -> str:
     """One row per lens, one column per kind: seconds, overhead a refraction, share of the camera."""
 
     def cell(kind: str, of: dict[str, Subject]) -> str | None:
-        row = found.row(of[kind], scene) if kind in of else None
+        row = results.row(of[kind], scene) if kind in of else None
         if row is None:
             return None
-        over = "" if kind == PINHOLE else f"; {_percent(found.overhead(of[kind], scene))}"
+        over = "" if kind == PINHOLE else f"; {_percent(results.overhead(of[kind], scene))}"
         share = _percent(min(row.camera_s) / min(row.seconds))
-        return f"{lab.best_median(min(row.seconds), median(row.seconds), '.3f')}{over}; {share}"
+        return f"{lab.best_median(min(row.seconds), median(row.seconds), form='.3f')}{over}; {share}"
 
     rows = []
-    for lens, count in dict.fromkeys((s.lens, s.refractions) for s in found.subjects):
-        of = {s.kind: s for s in found.subjects if s.lens == lens}
+    for lens, count in dict.fromkeys((s.lens, s.refractions) for s in results.subjects):
+        of = {s.kind: s for s in results.subjects if s.lens == lens}
         shown = (lens, *KINDS[1:]) if lens in (PINHOLE, THIN, STOP) else KINDS
         rows.append([lens, count, *(cell(kind, of) for kind in shown)])
     return lab.table(["lens", "refractions", *KINDS], rows, "–")
 
 
-def _camera_columns(found: Found) -> tuple[lab.Column, ...]:
+def _camera_columns(results: Results) -> tuple[lab.Column, ...]:
     return lab.columns(
         ("camera", "name"),
         ("refractions", "refractions"),
         ("ns per ray, alone", "ns", ".3g"),
         ("with differentials", "ns_moves", ".3g"),
-        ("ns per ray in the cheap render", found.ns_in_render, ".3g"),
-        ("with differentials", partial(found.ns_in_render, differentials=True), ".3g"),
-        ("differentials add", lambda s: _percent(found.moves_share(s))),
+        ("ns per ray in the cheap render", results.ns_in_render, ".3g"),
+        ("with differentials", partial(results.ns_in_render, differentials=True), ".3g"),
+        ("differentials add", lambda s: _percent(results.moves_share(s))),
         ("their error", lambda s: _percent(s.moves_error)),
-        ("rays that pass", lambda s: _percent(row.passed) if (row := found.row(s, CHEAP)) else None),
+        ("rays that pass", lambda s: _percent(row.passed) if (row := results.row(s, CHEAP)) else None),
         ("made in s", "made_s", ".2g"),
     )
 
@@ -449,21 +449,21 @@ _LOOK = {
 _LINES = {THIN: ("#009e73", "--"), PINHOLE: ("#7f7f7f", ":")}
 
 
-def draw(found: Found, path: Path) -> None:
+def draw(results: Results, path: Path) -> None:
     """Draw one panel for every scene that was rendered; nothing where none was."""
-    scenes = [s for s in SCENES if found.row(PINHOLE, s)]
+    scenes = [s for s in SCENES if results.row(PINHOLE, s)]
     if not scenes:
         return
     with drawing(path, 4.4 * len(scenes) + 2.6, 4.6) as figure:
         for axes, scene in zip(figure.subplots(1, len(scenes), squeeze=False)[0], scenes, strict=True):
             for kind, (colour, marker, fill) in _LOOK.items():
-                timed = [(s.refractions, found.row(s, scene)) for s in found.subjects if s.kind == kind]
+                timed = [(s.refractions, results.row(s, scene)) for s in results.subjects if s.kind == kind]
                 points = [(count, min(row.seconds)) for count, row in timed if row is not None]
                 if points:
                     look = {"color": colour, "mfc": fill, "mec": colour, "ms": 5, "lw": 1.1}
                     axes.plot(*zip(*points, strict=True), marker=marker, label=kind, **look)
             for kind, (colour, dash) in _LINES.items():
-                row = found.row(kind, scene)
+                row = results.row(kind, scene)
                 if row is not None:
                     axes.axhline(min(row.seconds), color=colour, ls=dash, lw=1.2, label=kind)
             axes.set(xlabel="refractions of the lens", ylabel="seconds a render", title=scene)
@@ -484,19 +484,19 @@ def run(args: argparse.Namespace) -> None:
     """Make the cameras, time them alone and in renders; the tables are written after each step."""
     lab.quiet_glasses()
     torch.set_num_threads(1)
-    found = Found(Size(64, 36, 16, 1) if args.quick else Size())
+    results = Results(Size(64, 36, 16, 1) if args.quick else Size())
     chosen = list(SCENES.items())[: 1 if args.quick else 3]
     scenes = {cost: load_scene(lab.SCENES / f"{name}.toml") for cost, name in chosen}
     progress = Progress({"cameras": 25, "cameras alone": 5, "renders": 65, "stop shapes": 5}, quiet=args.quiet)
     with progress.stage("cameras") as report:
-        found.subjects = make_subjects(args.quick, report)
+        results.subjects = make_subjects(args.quick, report)
     with progress.stage("cameras alone") as report:
-        time_alone(found.subjects, report)
-    write(found, args.out)
+        time_alone(results.subjects, report)
+    write(results, args.out)
     with progress.stage("renders") as report:
-        found.rows = time_renders(found.subjects, scenes, found.size, report)
-    write(found, args.out)
+        results.rows = time_renders(results.subjects, scenes, results.size, report)
+    write(results, args.out)
     with progress.stage("stop shapes") as report:
-        found.shapes = time_shapes(scenes[CHEAP], found.size, report)
-    draw(found, args.out / "render_times.png")
-    print(write(found, args.out))
+        results.shapes = time_shapes(scenes[CHEAP], results.size, report)
+    draw(results, args.out / "render_times.png")
+    print(write(results, args.out))

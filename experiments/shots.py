@@ -78,48 +78,48 @@ def measure_lens(name: str, folder: Path, report: Report) -> dict[str, Any]:
     for number, sitting in enumerate(SITTINGS):
         near = _NEAR * near_limit_m(lens) if sitting.near else None
         scene = suited(load_scene(lab.SCENES / f"{sitting.scene}.toml"), lens, sitting.f_number, near)
-        found = probe(scene, lens)
-        shipped = _measured(found, lab.MODELS / f"{name}.ols-{terms}.onnx", terms)
-        own = _smallest(found, shipped, folder)
-        facts = {"shot": sitting.name, "f_number": found.asked.f_number, "focus_m": found.asked.shot.focus_m}
+        probed = probe(scene, lens)
+        shipped = _measured(probed, lab.MODELS / f"{name}.ols-{terms}.onnx", terms)
+        own = _smallest(probed, shipped, folder)
+        facts = {"shot": sitting.name, "f_number": probed.asked.f_number, "focus_m": probed.asked.shot.focus_m}
         shots.append(facts | {"shipped": asdict(shipped), "own": asdict(own)})
         report((number + 1) / len(SITTINGS))
     return {"lens": name, "shots": shots}
 
 
-def _smallest(found: Probed, shipped: Model, folder: Path) -> Model:
+def _smallest(probed: Probed, shipped: Model, folder: Path) -> Model:
     """The smallest polynomial of the shot with errors no larger than the shipped one's, by halves; else the largest."""
-    fit = shot_fits.shot_fits(found, folder)
+    fit = shot_fits.shot_fits(probed, folder)
     low, high = 0, len(TERMS) - 1
     best = -1
     while low <= high:
         size = (low + high) // 2
-        um, light = _errors(found, _onnx(found, fit(TERMS[size])[0]))
+        um, light = _errors(probed, _onnx(probed, fit(TERMS[size])[0]))
         # Light that a plan takes for right is no reason for more terms.
         if um <= shipped.um and light <= max(shipped.light, LIGHT):
             best, high = size, size - 1
         else:
             low = size + 1
-    return _measured(found, fit(TERMS[best])[0], TERMS[best])
+    return _measured(probed, fit(TERMS[best])[0], TERMS[best])
 
 
-def _onnx(found: Probed, file: Path, runtime: Runtime = "onnxruntime") -> OnnxCamera:
-    return OnnxCamera(load_model(file), found.asked.shot, runtime=runtime)
+def _onnx(probed: Probed, file: Path, runtime: Runtime = "onnxruntime") -> OnnxCamera:
+    return OnnxCamera(load_model(file), probed.asked.shot, runtime=runtime)
 
 
-def _errors(found: Probed, camera: OnnxCamera) -> tuple[float, float]:
+def _errors(probed: Probed, camera: OnnxCamera) -> tuple[float, float]:
     """Counted: of place and blur in um on the film, and of light."""
-    seen = prints.footprints(camera, found.places)
-    apart = prints.distance_mm(found.seen, seen, found.places.share)
-    light = np.abs(seen.light / np.maximum(found.seen.light, 1e-30) - 1)
+    seen = prints.footprints(camera, probed.places)
+    apart = prints.distance_mm(probed.seen, seen, probed.places.share)
+    light = np.abs(seen.light / np.maximum(probed.seen.light, 1e-30) - 1)
     um, dim = (float(np.percentile(np.where(np.isfinite(v), v, np.inf), COUNTED)) for v in (1e3 * apart, light))
     return um, dim
 
 
-def _measured(found: Probed, file: Path, terms: int) -> Model:
-    camera = _onnx(found, file)
-    um, light = _errors(found, camera)
-    ns = ns_a_ray(_onnx(found, file, "c"), found.places)["min"]
+def _measured(probed: Probed, file: Path, terms: int) -> Model:
+    camera = _onnx(probed, file)
+    um, light = _errors(probed, camera)
+    ns = ns_a_ray(_onnx(probed, file, "c"), probed.places)["min"]
     return Model(terms, um, light, glsl_operations(camera), ns)
 
 

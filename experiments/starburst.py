@@ -42,7 +42,7 @@ OPTIONS = [
 
 @dataclass(frozen=True)
 class Check:
-    """What was measured beside what it should be; `off` is the relative error."""
+    """A measured figure and the right one; `off` is the relative error."""
 
     what: str
     found: float
@@ -110,7 +110,7 @@ def _star(pupil: ExitPupil, lines: list[Array], pixel: float, reach: int) -> Arr
 
 
 def streaks(film: Array, low: int, high: int) -> int:
-    """How many streaks a star [N, N] has from `low` to `high` pixels out."""
+    """The number of streaks of a star [N, N] from `low` to `high` pixels out."""
     angle, middle = np.arange(720) * math.pi / 360, len(film) // 2
     rows, columns = (np.rint(middle + np.arange(low, high)[:, None] * f(angle)).astype(int) for f in (np.sin, np.cos))
     smooth = np.fft.irfft(np.fft.rfft(film[rows, columns].mean(0))[:60], 720)

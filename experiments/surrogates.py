@@ -103,7 +103,8 @@ def _settings(args: argparse.Namespace) -> BenchSettings:
 def _conditions(args: argparse.Namespace, settings: BenchSettings) -> str:
     focus = "focus from infinity to the near limit" if args.near else "focus at infinity"
     pairs, e = settings.pairs, settings.evaluation
-    quick = f" Quick: NeuroLens is trained for {QUICK_STEPS:,} steps, which is too few." if args.quick else ""
+    cut = " and ".join(f"{name} for {steps}" for name, steps in QUICK_STEPS.items())
+    quick = f" Quick: steps of training, too few: {cut}." if args.quick else ""
     return (
         f"Full aperture and lit film, 400-700 nm (one wavelength where no dispersion is known), {focus}; {pairs.train} "
         f"rays to fit, {pairs.held_out} to measure, {e.vignetting_rays} for the vignetting, seed {pairs.seed}; "

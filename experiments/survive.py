@@ -139,7 +139,7 @@ def _case(case: Case, kills: int, chance: random.Random, place: Path) -> tuple[s
 
 
 def _undisturbed(case: Case, fresh: Path, folder: Path) -> tuple[dict[str, str], float]:
-    """What the command writes, and the seconds that it takes."""
+    """The digests of what the command writes, and the seconds that it takes."""
     _copy(fresh, folder)
     began = time.perf_counter()
     code, said = _run(folder, case.argv)

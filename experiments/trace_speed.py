@@ -78,7 +78,7 @@ def launched(lens: Lens, rays: FilmRays, dtype: torch.dtype) -> tuple[Rays, torc
 def candidates(lens: Lens, label: str = "") -> list[Candidate]:
     """The tracer eager and compiled in each precision, named "{label}eager float32" and so on."""
     fast = compile_tracing(partial(trace, lens), lens)
-    found = []
+    results = []
     for dtype in DTYPES:
 
         def eager(rays: FilmRays, dtype: torch.dtype = dtype) -> Call:
@@ -94,9 +94,9 @@ def candidates(lens: Lens, label: str = "") -> list[Candidate]:
             return lambda: fast(*given)
 
         name = str(dtype).removeprefix("torch.")
-        found.append(Candidate(f"{label}eager {name}", eager, EAGER_BATCHES))
-        found.append(Candidate(f"{label}compiled {name}", compiled, COMPILED_BATCHES))
-    return found
+        results.append(Candidate(f"{label}eager {name}", eager, EAGER_BATCHES))
+        results.append(Candidate(f"{label}compiled {name}", compiled, COMPILED_BATCHES))
+    return results
 
 
 def time_lens(lens: Lens, threads: Sequence[int], rounds: int, report: Report, aspheric: Lens | None) -> list[Row]:
@@ -130,14 +130,14 @@ def _row(name: str, lens: Lens, timed: Race, passing: float) -> Row:
 def goals(rows: Sequence[Row]) -> list[lab.Goal]:
     """Goals of the tracer, for the main lens on one thread in float32."""
     main = [r for r in rows if r["threads"] == 1 and r["refractions"] == MAIN and r["dtype"] == "float32"]
-    found = []
+    results = []
     for kind, wanted in (("eager", 10.0), ("compiled", 30.0)):
         best = [r["ns_min"] for r in main if r["kind"] == kind and not r["aspheres"] and "ns_min" in r]
-        found.append(lab.Goal(f"Mray/s per core, {kind}", wanted, 1000 / min(best) if best else None, at_least=True))
+        results.append(lab.Goal(f"Mray/s per core, {kind}", wanted, 1000 / min(best) if best else None, at_least=True))
     for kind in ("eager", "compiled"):
         ratios = [r["over_spheres"]["min"] for r in main if r["kind"] == kind and r.get("over_spheres")]
-        found.append(lab.Goal(f"times slower with two aspheres, {kind}", 1.7, min(ratios) if ratios else None))
-    return found
+        results.append(lab.Goal(f"times slower with two aspheres, {kind}", 1.7, min(ratios) if ratios else None))
+    return results
 
 
 SIZES = (100_000, 1_000_000, 10_000_000)
@@ -182,7 +182,7 @@ _MEMORY_COLUMNS = lab.columns(
 
 
 @dataclass
-class Found:
+class Results:
     """The results so far: rows of `time_lens` and of `memory_of`; `missing` says what could not be measured."""
 
     rounds: int
@@ -196,19 +196,19 @@ class Found:
         return lab.write_results(folder, "trace_speed", page(self), data)
 
 
-def page(found: Found) -> str:
+def page(results: Results) -> str:
     """The whole page."""
-    load = lab.most_load(found.rows)
+    load = lab.most_load(results.rows)
     machine = lab.machine_line(f", {lab.machine()['vectors']}")
     return lab.page(
         "# The exact tracer",
         "`python -m experiments trace`",
-        _NOTES.format(rounds=found.rounds),
+        _NOTES.format(rounds=results.rounds),
         machine + ("" if load is None else f" Load average meanwhile up to {load:.1f}."),
-        lab.goal_table("goal (12 refractions, float32, one thread)", goals(found.rows)),
-        speed_table(found.rows),
-        f"{_MEMORY}\n\n{lab.table(_MEMORY_COLUMNS, found.memory)}" if found.memory else "",
-        f"Not measured: {'; '.join(found.missing)}." if found.missing else "",
+        lab.goal_table("goal (12 refractions, float32, one thread)", goals(results.rows)),
+        speed_table(results.rows),
+        f"{_MEMORY}\n\n{lab.table(_MEMORY_COLUMNS, results.memory)}" if results.memory else "",
+        f"Not measured: {'; '.join(results.missing)}." if results.missing else "",
     )
 
 
@@ -232,7 +232,7 @@ def speed_table(rows: Sequence[Row]) -> str:
         return f"times as long as spheres: {', '.join(ratios)}" if ratios else ""
 
     kinds = [kind for kind in kinds if any(kind in cells for cells in lines.values())]
-    cells = [[*key, *(speed(found, kind) for kind in kinds), note(found)] for key, found in lines.items()]
+    cells = [[*key, *(speed(results, kind) for kind in kinds), note(results)] for key, results in lines.items()]
     return lab.table([*keys, *(f"{kind}, Mray/s" for kind in kinds), ""], cells)
 
 
@@ -249,22 +249,22 @@ def run(args: argparse.Namespace) -> None:
     """Time the tracer, lens by lens; the table is written after each."""
     lab.quiet_glasses()
     counts = lab.chosen([MAIN] if args.quick else list(LENSES), lambda n: LENSES[n], args.only, "trace")
-    lenses, found = {n: lab.lens_of(LENSES[n]) for n in counts}, Found(lab.rounds_of(args))
+    lenses, results = {n: lab.lens_of(LENSES[n]) for n in counts}, Results(lab.rounds_of(args))
     threads = args.threads[:1] if args.quick else args.threads
     plan = {f"{n} refractions": (2.0 if n == MAIN else 1.0) * (8 + n + n * len(threads)) for n in lenses}
     progress = Progress(plan | {"memory": 10.0}, quiet=args.quiet)
     for n, lens in lenses.items():
         with progress.stage(f"{n} refractions") as report:
             aspheric = with_aspheres(lens) if n == MAIN else None
-            found.rows += time_lens(lens, threads, found.rounds, report, aspheric)
-        text = found.write(args.out)
+            results.rows += time_lens(lens, threads, results.rounds, report, aspheric)
+        text = results.write(args.out)
     if MAIN in lenses:
         with progress.stage("memory") as report:
             try:
                 for i, size in enumerate(SIZES[: 2 if args.quick else 3]):
-                    found.memory.append(lab.in_child(memory_of, lenses[MAIN].path, size))
+                    results.memory.append(lab.in_child(memory_of, lenses[MAIN].path, size))
                     report((i + 1) / len(SIZES))
             except lab.Unmeasured as reason:
-                found.missing.append(str(reason))
-        text = found.write(args.out)
+                results.missing.append(str(reason))
+        text = results.write(args.out)
     print(text)

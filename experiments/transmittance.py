@@ -27,7 +27,7 @@ COATINGS = {"bare": None, "coated": "quarter-wave"}
 
 
 def difference(lens: Lens, domain: Domain, count: int) -> lab.Row:
-    """How far the averaged transmittance is from the true one: the largest difference, where it is, the median."""
+    """The difference of the averaged transmittance from the true one: the largest, its place, the median."""
     rays = sample_domain(domain, count, seed=3)
     start = camera_rays(rays.film_x, rays.film_y, rays.film_z, rays.pupil_x, rays.pupil_y, domain.pupil_z_mm)
     steps: Any = [(k, "T") for k in reversed(range(len(lens.surfaces)))]

@@ -1,4 +1,4 @@
-"""How soon the page of `neurolens view` shows its first picture and each change, in a browser with software WebGL2.
+"""The time to the first picture and to each change on the page of `neurolens view`, by software WebGL2 in a browser.
 
 480 x 270 pixels, one sample, headless Chromium with SwiftShader (the extra "web"; Debian: chromium): the time from a
 setting, the page at rest, to the first picture with it, and the processor's time that the GPU process of the browser
@@ -102,7 +102,7 @@ def _opened(browser: Any, file: Path) -> Any:
 
 
 def _first(browser: Any, file: Path, name: str, repeats: int) -> dict[str, Any]:
-    """From opening the file to the first picture, shaders compiled."""
+    """The time from opening the file to the first picture, shaders compiled."""
     took = []
     for _ in range(min(repeats, 5)):
         page = browser.new_page()
@@ -113,7 +113,7 @@ def _first(browser: Any, file: Path, name: str, repeats: int) -> dict[str, Any]:
 
 
 def _change(page: Any, name: str, script: str, repeats: int) -> dict[str, Any]:
-    """After one change that is not counted: it compiles what the change needs."""
+    """The time of each change after a first one, which compiles what the change needs and is not counted."""
     once = f"""async (k) => {{
       const {{ set, engine }} = neurolens;
       await new Promise((settled) => setTimeout(settled, 300));

@@ -190,7 +190,7 @@ _MOVES = np.eye(2)[:, :, None] * _STEP_MM
 
 
 def _miss(target: Array, across: Array, origin: Array, direction: Array) -> Array:
-    """How far rays pass a point, [2, N] metres along the two directions `across` [2, 3]."""
+    """The distances by which rays miss a point, [2, N] metres along the two directions `across` [2, 3]."""
     gap = origin - target[:, None]
     return np.asarray(across @ (gap - np.einsum("in,in->n", gap, direction) * direction))
 
@@ -221,7 +221,7 @@ _SQUARE = 128  # pupil samples per side of a passage rate
 
 
 def stop_shape(view: View) -> dict[str, float]:
-    """How a stop's shape shows: passage on the axis beside its area, corners, near discs turned, discs cut at the edge.
+    """The signs of a stop's shape: passage on the axis, its area, corners, near discs turned, discs cut at the edge.
 
     Options of the panel: far_m, near_m, the distances of the lights.
     """
@@ -305,7 +305,7 @@ def overlap(a: LightDisc, b: LightDisc, *, turned: bool = False) -> float:
 
 
 def _shape(disc: LightDisc, sign: int) -> NDArray[np.bool_]:
-    """Which cells of a grid the disc covers, its size (root mean square radius) and place taken away."""
+    """The cells of a grid that the disc covers, its size (root mean square radius) and place taken away."""
     off = (disc.film_mm - disc.centre_mm[:, None]) * sign
     off = off / np.sqrt(2 * (off**2 * disc.flux).sum() / disc.total)
     cell = np.floor((off / 3.2 + 0.5) * _CELLS).astype(np.intp)

@@ -224,7 +224,7 @@ class PostProcessed:
         self.settings: dict[str, Any] = {**plain.settings, "post_process_k": self.strength}
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As the camera's, every ray weighing what the post-process leaves at its film point [2, N]."""
+        """The rays of the camera, each with the weight that the post-process leaves at its film point [2, N]."""
         rays = self._plain.sample(film_mm, pupil, wavelength_nm)
         left = post_process(np.hypot(film_mm[0], film_mm[1]), self.strength).astype(np.float32)
         return replace(rays, weight=np.where(rays.status == st.PASSED, left, np.float32(0)))
@@ -249,7 +249,7 @@ class Window:
         self.settings: dict[str, Any] = {**camera.settings, "window_mm": list(window_mm)}
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """As the camera's, the film points [2, N] in mm counted from the window's centre."""
+        """The rays of film points [2, N] in mm, counted from the window's centre."""
         return self._camera.sample(film_mm + self._centre, pupil, wavelength_nm)
 
     def for_worker(self) -> Window:

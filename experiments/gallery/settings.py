@@ -1,4 +1,4 @@
-"""What a file of experiments/gallery says: an effect, and its panels, each one shot through one state of a lens."""
+"""The contents of a file of experiments/gallery: an effect and its panels, each a shot through one state of a lens."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class Panel:
         return (self.options or {}).get(name, default)
 
     def files(self) -> list[Path]:
-        """What the panel is made from."""
+        """The files that the panel is made from."""
         named = (self.lens, self.scene, self.aperture_mask, self.model)
         return [file for file in named if file is not None]
 

@@ -1,4 +1,4 @@
-"""What the published fits share: raw coordinates, targets on the outer pupil, and the tests of who passes."""
+"""The common part of the published fits: raw coordinates, targets on the outer pupil, and the tests of who passes."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ class RawData:
 
     @property
     def curvature(self) -> float:
-        """Of the outer pupil, in units of 1 / position unit."""
+        """The curvature of the outer pupil in units of 1 / position unit."""
         return float(self.pairs.lens.surfaces[0].vertex_curvature("x")) * scales_of(self.pairs.lens).position_mm
 
     def variables(self, rays: PairSet) -> Tensor:
@@ -171,7 +171,7 @@ class RawData:
 
     @cached_property
     def outputs(self) -> tuple[Outputs, ...]:
-        """In the order of `OUTPUTS`: ray and transmittance on the training rays, the stop crossing about its rim too.
+        """The fits of `OUTPUTS`: ray and transmittance on the training rays, the stop crossing about its rim too.
 
         The published fits discard blocked rays; on those alone the edge of the stop would lie at the edge of the data.
         """

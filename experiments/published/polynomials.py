@@ -83,7 +83,7 @@ class Pursuit:
         return self._state(self.chosen)[2]
 
     def _state(self, chosen: list[int]) -> tuple[Floats, Floats, float]:
-        """What each candidate has left [M], its product with the residual [M], and the residual's square."""
+        """The part of each candidate that is left [M], its product with the residual [M], and the residual's square."""
         count = len(self._unit)
         left, residual, square = np.ones(count), self._moments.copy(), self._square
         factor = np.empty((len(chosen), count))

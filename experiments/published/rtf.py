@@ -99,7 +99,7 @@ class Meridian(Core):
 
     @property
     def coefficients_per_vector(self) -> int:
-        """Of the direction, which has three outputs."""
+        """The coefficients of the direction, which has three outputs."""
         return int((self.outputs[2:5] != 0).sum())
 
     @property

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from gallery_shots import GALLERY, measured, shot
 
-from experiments.gallery.aberrations import light_profile, spot
 from experiments.gallery.cameras import Shot, View, Window, exact_camera, shot_of, thin_camera
+from experiments.gallery.measures import light_profile, spot
 from experiments.gallery.settings import read_effect
 from neurolens.analysis.field_curves import RECTILINEAR, curvature, distortion
 from neurolens.analysis.fields import Scene

@@ -23,7 +23,6 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.pinhole import Pinhole
-from neurolens.cameras.vignetting import Vignetted
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
@@ -104,17 +103,6 @@ def test_no_post_process_has_the_falloff_of_a_lens(lens: str, least: float) -> N
     assert (ours - theirs).min() > -1e-3
     curve = relative(thin, corner)
     assert post_process(np.linspace(0, corner, 5), strength_for(corner, curve[-1])) == pytest.approx(curve, abs=1e-3)
-
-
-def test_a_white_card_four_ways() -> None:
-    """Of a fisheye: the two parts multiply to the whole; a thin lens has no aperture part."""
-    fisheye = camera("muller_fisheye_100-14mm.mlp-16x2.onnx", 4.0, (36.0, 24.0), 10.0)
-    ways = {kind: relative(Vignetted(fisheye, kind), 16.0) for kind in ("natural", "optical")}
-    both = relative(fisheye, 16.0)
-    assert ways["natural"] * ways["optical"] == pytest.approx(both, abs=4e-3)
-    assert both[-1] < 0.5 and ways["natural"][-1] > ways["optical"][-1]
-    thin = camera("thin", 4.0, (36.0, 24.0), 10.0, 14.0)
-    assert relative(Vignetted(thin, "optical"), 16.0) == pytest.approx(np.ones(5), abs=4e-3)
 
 
 def paraxial_blur_mm(lens: Lens, distance_m: float, wavelength_nm: float = 550.0) -> float:

@@ -1,7 +1,6 @@
 """The gallery's files, windows, widened lenses and cache, and one small effect from its file to the page."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +9,10 @@ from gallery_shots import GALLERY, ROOT, shipped, shot
 
 from experiments.__main__ import main
 from experiments.gallery.cameras import Window, exact_camera, surrogate_camera, widened
-from experiments.gallery.figure import MOST_BYTES
-from experiments.gallery.run import check, fingerprint_of
+from experiments.gallery.run import MOST_BYTES, check, fingerprint_of
 from experiments.gallery.settings import find_effects, read_effect
 from neurolens.base.errors import InputError
-from neurolens.cameras.build import make_camera
 from neurolens.cameras.ideal import ThinLens
-from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 
 EFFECT = """\
@@ -111,6 +107,9 @@ def test_exact_and_surrogate_put_the_film_in_the_same_place_however_it_is_focuse
     surrogate = shipped(taken)
     for make in (exact_camera, surrogate_camera):
         assert make(taken, surrogate).settings["film_z_mm"] == pytest.approx(taken.lens.film_z_mm, abs=1e-4)
+    beyond = shot("laikin_double_gauss_50", focus_m=2.0, film_offset_mm=-3.0, model=".ols-60")
+    with pytest.raises(InputError, match="film_offset_mm"):  # before the film of infinity
+        surrogate_camera(beyond, shipped(beyond))
 
 
 def test_an_effect_becomes_a_figure_numbers_and_a_page_and_is_not_done_twice(
@@ -138,19 +137,3 @@ def test_an_effect_becomes_a_figure_numbers_and_a_page_and_is_not_done_twice(
     assert fingerprint_of(read_effect(path), 4) != first["fingerprint"] == fingerprint_of(read_effect(path), None)
     path.write_text(path.read_text(encoding="utf-8").replace('"two"', '"three"'), encoding="utf-8")
     assert fingerprint_of(read_effect(path), None) != first["fingerprint"]
-
-
-def test_a_shot_moves_the_film_of_a_thin_lens_and_of_no_pinhole() -> None:
-    moved = Shot(film_mm=(36.0, 24.0), focus_m=2.0, film_offset_mm=0.7)
-    camera = make_camera("thin", moved)
-    assert isinstance(camera, ThinLens)
-    still = make_camera("thin", replace(moved, film_offset_mm=0.0))
-    assert isinstance(still, ThinLens)
-    assert camera.image_distance_mm == pytest.approx(still.image_distance_mm + 0.7)
-    with pytest.raises(InputError, match="film_offset_mm"):
-        make_camera("pinhole", moved)
-    with pytest.raises(InputError, match="film_offset_mm"):  # beyond the lens
-        make_camera("thin", replace(moved, film_offset_mm=-60.0))
-    beyond = shot("laikin_double_gauss_50", focus_m=2.0, film_offset_mm=-3.0, model=".ols-60")
-    with pytest.raises(InputError, match="film_offset_mm"):  # before the film of infinity
-        surrogate_camera(beyond, shipped(beyond))
