@@ -107,11 +107,11 @@ def card_in(file: Any, metadata: dict[str, str], expected: str = CARD_KIND) -> d
         card = parse_json(metadata[CARD_KEY], "card")
     except (ValueError, RecursionError) as error:
         raise ModelError(f"{file}: the card is not strict JSON ({error})") from error
-    known = card if isinstance(card, dict) else {}
+    table = card if isinstance(card, dict) else {}
     for key, wanted in (("kind", expected), ("schema", CARD_SCHEMA)):
-        if known.get(key) != wanted:
-            raise ModelError(f"{file}: card: {key}: got {known.get(key)!r}, expected {wanted!r}")
-    return known
+        if table.get(key) != wanted:
+            raise ModelError(f"{file}: card: {key}: got {table.get(key)!r}, expected {wanted!r}")
+    return table
 
 
 def card_to_json(card: dict[str, Any]) -> str:
@@ -131,7 +131,7 @@ def card_to_json(card: dict[str, Any]) -> str:
     return text
 
 
-def _culprit(value: Any, place: str) -> tuple[str, Any]:
+def _culprit(value: Any, path: str) -> tuple[str, Any]:
     """The place of the first value that JSON cannot hold, and the value."""
     items: Any = value.items() if isinstance(value, dict) else ()
     if isinstance(value, (list, tuple)):
@@ -140,8 +140,8 @@ def _culprit(value: Any, place: str) -> tuple[str, Any]:
         try:
             json.dumps(inner, allow_nan=False)
         except (TypeError, ValueError):
-            return _culprit(inner, f"{place}.{key}" if place else str(key))
-    return place, value
+            return _culprit(inner, f"{path}.{key}" if path else str(key))
+    return path, value
 
 
 def transmittance_of(card: Mapping[str, Any]) -> str:
@@ -255,15 +255,15 @@ def check_card(file: Any, card: Mapping[str, Any]) -> None:
 
 
 def _check_places(where: str, card: Mapping[str, Any], rules: Mapping[str, Rule]) -> None:
-    for place, (holds, expected) in {**rules, **_OPTIONAL}.items():
-        *tables, last = place.split(".")
+    for path, (holds, expected) in {**rules, **_OPTIONAL}.items():
+        *tables, last = path.split(".")
         # All tables but the last are there, for they have rules of their own; a node has the lens and the domain alone.
         table = reduce(lambda table, key: table.get(key, {}), tables, card)
-        if place in _OPTIONAL and last not in table:
+        if path in _OPTIONAL and last not in table:
             continue
         if last not in table or not holds(table[last]):
             shown = repr(table[last])[:80] if last in table else "(missing)"
-            raise ModelError(f"{where}: {place}: got {shown}, expected {expected}")
+            raise ModelError(f"{where}: {path}: got {shown}, expected {expected}")
     try:
         pupil_rows(card["domain"]["bounds"])
     except (InputError, ValueError, OverflowError) as error:

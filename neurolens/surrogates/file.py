@@ -319,12 +319,12 @@ def inflated(text: str) -> bytes:
     """The JSON of `deflated`. Raises ValueError: damaged, or too long."""
     unpacker = zlib.decompressobj()
     try:
-        found = unpacker.decompress(base64.b64decode(text, validate=True), _MAX_TEXT)
+        data = unpacker.decompress(base64.b64decode(text, validate=True), _MAX_TEXT)
     except (binascii.Error, zlib.error) as error:
         raise ValueError(str(error)) from error
     if unpacker.unconsumed_tail or not unpacker.eof:
         raise ValueError(f"more than {_MAX_TEXT} bytes, or cut short")
-    return found
+    return data
 
 
 def pack(value: Any) -> Any:
@@ -423,15 +423,15 @@ def unpacked_lens(packed: dict[str, Any]) -> Lens:
     if len(packed["surfaces"]) > _MAX_SURFACES:
         raise ValueError(f"{len(packed['surfaces'])} surfaces, expected at most {_MAX_SURFACES}")
     for row in packed["surfaces"]:
-        known = {f.name: row[f.name] for f in fields(Surface) if f.name in row}
+        values = {f.name: row[f.name] for f in fields(Surface) if f.name in row}
         for key in ("radius_mm", "thickness_mm", "diameter_mm"):
-            known[key] = float(known[key])  # "inf" too
-        if "asphere" in known:
-            known["asphere"] = tuple((int(p), float(a)) for p, a in known["asphere"])
-            if len(known["asphere"]) > _MAX_TERMS or any(not 0 <= p <= _MAX_POWER for p, _ in known["asphere"]):
+            values[key] = float(values[key])  # "inf" too
+        if "asphere" in values:
+            values["asphere"] = tuple((int(p), float(a)) for p, a in values["asphere"])
+            if len(values["asphere"]) > _MAX_TERMS or any(not 0 <= p <= _MAX_POWER for p, _ in values["asphere"]):
                 raise ValueError(f"an asphere of more than {_MAX_TERMS} terms, or of powers beyond {_MAX_POWER}")
-        if known.get("coating"):
-            name, layers = known["coating"]
-            known["coating"] = Coating(str(name), tuple(tuple(float(v) for v in layer) for layer in layers))
-        surfaces.append(Surface(**known))
+        if values.get("coating"):
+            name, layers = values["coating"]
+            values["coating"] = Coating(str(name), tuple(tuple(float(v) for v in layer) for layer in layers))
+        surfaces.append(Surface(**values))
     return Lens(surfaces=tuple(surfaces), **{k: packed[k] for k in _LENS})

@@ -142,8 +142,8 @@ def _fit_core(
     if settings.method in ("thin", "thick") and not mirror:
         return fit_paraxial(prepared, settings.method)
     if settings.method not in (*POLYNOMIALS, *NETWORKS):
-        known = ("thin", "thick", *POLYNOMIALS, *NETWORKS)
-        raise InputError("fit", "method", settings.method, f"one of {', '.join(known)}")
+        methods = ("thin", "thick", *POLYNOMIALS, *NETWORKS)
+        raise InputError("fit", "method", settings.method, f"one of {', '.join(methods)}")
     if mirror and settings.method != "mlp":
         return fit_mirror(prepared, settings.method, settings.terms, settings.degree)
     zones, fits = itertools.count(), 2 * settings.partitions - 1

@@ -32,8 +32,8 @@ STOPPED_DOWN = 0.25
 
 def gate_reach(gates: tuple[Gate, ...], pairs: PairSet) -> Tensor:
     """[G, N] bool: rays of which the gate's value is known, because they get as far as its surface (and to its rim)."""
-    known = reached(pairs)
-    rows = [known[g.surface] & (pairs.meets[g.surface] > 0 if g.reason == st.RIM else True) for g in gates]
+    arrives = reached(pairs)
+    rows = [arrives[g.surface] & (pairs.meets[g.surface] > 0 if g.reason == st.RIM else True) for g in gates]
     return torch.stack(rows) if rows else torch.empty((0, len(pairs)), dtype=torch.bool)
 
 
@@ -74,15 +74,15 @@ def boundary_weights(lens: Lens, gates: tuple[Gate, ...], pairs: PairSet) -> tup
     that are lost before a boundary weigh 0.
     """
     every = (*gates, Gate(lens.stop_index, st.RIM))
-    values, known = gate_values(lens, every, pairs), gate_reach(every, pairs)
-    beyond = values.where(known, 0.0).clamp_min(0.0)
+    values, arrives = gate_values(lens, every, pairs), gate_reach(every, pairs)
+    beyond = values.where(arrives, 0.0).clamp_min(0.0)
     rows = []
     for i, value in enumerate(values):
         others = torch.cat([beyond[:i], beyond[i + 1 :]])
         stopped = others.amax(0) if len(others) else torch.zeros_like(value)
         distance = value if i < len(gates) else beyond[i]
-        rows.append((_near(distance) * _near(stopped)).where(known[i], 0.0))
-    opening = torch.sqrt((values[-1] + 1).clamp_min(0.0)).where(known[-1], 1.0)
+        rows.append((_near(distance) * _near(stopped)).where(arrives[i], 0.0))
+    opening = torch.sqrt((values[-1] + 1).clamp_min(0.0)).where(arrives[-1], 1.0)
     rows[-1] *= (1 + STOPPED_DOWN) / (opening + STOPPED_DOWN)
     return torch.stack(rows[:-1]) if gates else values[:0], rows[-1]
 
@@ -111,15 +111,15 @@ def choose_gates(lens: Lens, blocked: PairSet, drawn: int | None = None) -> tupl
 
     Returns the gates in the order in which camera rays meet them. The stop is no gate: it is tested on its crossing.
     """
-    known = reached(blocked)
+    arrives = reached(blocked)
     radii = torch.tensor(lens.semi_diameters_mm, dtype=torch.float64)[:, None]
-    outside = ((blocked.cross_x**2 + blocked.cross_y**2) > radii**2) & known & (blocked.meets > 0)  # [S, N]
+    outside = ((blocked.cross_x**2 + blocked.cross_y**2) > radii**2) & arrives & (blocked.meets > 0)  # [S, N]
     whole = ((blocked.meets > 0) & (blocked.refracts > 0)).all(0)
     left = outside[:, whole & ~outside[lens.stop_index]]
     rims = _greedy(left, math.floor(_UNEXPLAINED * int(whole.sum())))
     stopped = outside[[*rims, lens.stop_index]].any(0)
     # Rows: total reflection, then missed. The first of equals is taken.
-    lost = torch.cat([known & ~(blocked.refracts > 0), known & ~(blocked.meets > 0)])
+    lost = torch.cat([arrives & ~(blocked.refracts > 0), arrives & ~(blocked.meets > 0)])
     edges = _greedy(lost[:, ~stopped], math.floor(_UNEXPLAINED * (drawn or len(blocked))))
     count = len(lens.surfaces)
     gates = [Gate(k, st.RIM) for k in rims]

@@ -157,10 +157,10 @@ class InverseModel:
         """
         import torch
 
-        given = {"stop_rays": torch.stack([film_x, film_y, stop_x, stop_y, wavelength_nm])}
+        inputs = {"stop_rays": torch.stack([film_x, film_y, stop_x, stop_y, wavelength_nm])}
         if start is not None:
-            given["start"] = start
-        return self._solved("stop", given, film_z, stop_radius_mm, steps)
+            inputs["start"] = start
+        return self._solved("stop", inputs, film_z, stop_radius_mm, steps)
 
     def from_scene(
         self,
@@ -184,22 +184,22 @@ class InverseModel:
         import torch
 
         *lines, wavelength = (c.detach().double().numpy() for c in (*scene, wavelength_nm))
-        found = front_rays(self.model.front, *lines, index=front_index(self.model), wavelength_nm=wavelength)
-        known, solid = (torch.from_numpy(a).to(film_z.dtype) for a in found)
-        given = {"front_rays": torch.cat([known, wavelength_nm[None]])}
-        out = self._solved("scene", given, film_z, stop_radius_mm, steps)
+        rays_at_front = front_rays(self.model.front, *lines, index=front_index(self.model), wavelength_nm=wavelength)
+        front, solid = (torch.from_numpy(a).to(film_z.dtype) for a in rays_at_front)
+        inputs = {"front_rays": torch.cat([front, wavelength_nm[None]])}
+        out = self._solved("scene", inputs, film_z, stop_radius_mm, steps)
         return out._replace(density=out.density / solid)
 
     def _solved(
-        self, name: str, given: dict[str, Tensor], film_z: Tensor, stop_radius_mm: float | None, steps: int
+        self, name: str, inputs: dict[str, Tensor], film_z: Tensor, stop_radius_mm: float | None, steps: int
     ) -> InverseRays:
         import torch
 
         from neurolens.surrogates.domain import FilmRays
 
         radius = film_z.new_full((1, 1), self.model.checked_radius_mm(stop_radius_mm))
-        graph = _exact_graph(self, name, steps, "start" in given)
-        out = evaluate(graph, {**given, "film_z_mm": film_z[None], "stop_radius_mm": radius})
+        graph = _exact_graph(self, name, steps, "start" in inputs)
+        out = evaluate(graph, {**inputs, "film_z_mm": film_z[None], "stop_radius_mm": radius})
         film_x, film_y, pupil_x, pupil_y, wavelength = out["rays"]
         rays = FilmRays(film_x, film_y, film_z, pupil_x, pupil_y, wavelength)
         density, residual = (out[n].expand(1, len(rays))[0] for n in ("density", "residual"))
@@ -282,14 +282,14 @@ def stop_graph(model: LensModel, guess: Guess, form: Form, steps: int = STEPS, s
     e, g = model.encoding, Graph()
     film, stop, wavelength = g.split(g.input("stop_rays", 5), [2, 2, 1])
     wanted = stop * (1 / model.scales.stop_mm)
-    known = {"film": film, "wanted": wanted, "wavelength_nm": wavelength}
+    inputs = {"film": film, "wanted": wanted, "wavelength_nm": wavelength}
     if start:
         first = g.input("start", 2)
     else:
         z = scaled_film_z(model, g.input("film_z_mm", per_call=True))
         (first,) = guess.build(g, _light(e, [film * (1 / e.film_scale_mm), wanted], wavelength), z)
     system = stop_system(model)
-    u, size = _solve(system, known, first, steps, form)
+    u, size = _solve(system, inputs, first, steps, form)
     rays = _pupil_rays(e, film, u, wavelength)
     judge = with_derivatives(model_graph(model, form), ["stop_xy_mm"], [("rays", 2), ("rays", 3)])
     out = g.inline(judge, {"rays": rays})
@@ -311,8 +311,8 @@ def scene_graph(model: LensModel, guess: Guess, form: Form, steps: int = STEPS) 
     position = position * (1 / model.scales.position_mm)
     wanted = g.concat(position, direction)
     first = g.concat(*guess.build(g, _light(e, [position, direction], wavelength), None))
-    known = {"wanted": wanted, "wavelength_nm": wavelength}
-    unknown, size = _solve(scene_system(model), known, first, steps, form)
+    inputs = {"wanted": wanted, "wavelength_nm": wavelength}
+    unknown, size = _solve(scene_system(model), inputs, first, steps, form)
     # Free space from the two planes to the film: F = U + (P - U) / along.
     u, p = g.split(unknown, [2, 2])
     p = p * e.film_scale_mm
@@ -324,11 +324,11 @@ def scene_graph(model: LensModel, guess: Guess, form: Form, steps: int = STEPS) 
     inside, light = within_domain(model, rays, film_z, form), light_field(g, e, rays, film_z)
     series = DirectionSeries.of(model, form)
     core, planes = _core_graph(model, light, units_of(model, series, form)), (2, 3, 0, 1)
-    found = g.inline(with_derivatives(core, _SCENE, [("planes", k) for k in planes]), {"planes": light.planes})
-    vectors = (found["position"], found["direction"], found["stop"])
-    values = CoreValues(vectors, found["transmittance"], found.get("gates"), index=found.get("index"))
+    outputs = g.inline(with_derivatives(core, _SCENE, [("planes", k) for k in planes]), {"planes": light.planes})
+    vectors = (outputs["position"], outputs["direction"], outputs["stop"])
+    values = CoreValues(vectors, outputs["transmittance"], outputs.get("gates"), index=outputs.get("index"))
     status = add_outputs(model, values, inside, series, form)
-    area = determinant([g.concat(*(found[derivative(n, f"planes_{k}")] for n in _SCENE)) for k in planes]).abs()
+    area = determinant([g.concat(*(outputs[derivative(n, f"planes_{k}")] for n in _SCENE)) for k in planes]).abs()
     # Of (p, u), scaled, per mm^2 and (kappa rad)^2.
     factor = e.film_scale_mm**2 * math.prod(e.pupil_scales_mm) * series.kappa**2
     off = g.concat(*vectors[:2]) * (1 / np.repeat([model.scales.position_mm, series.kappa], 2)) - wanted
@@ -356,13 +356,13 @@ def scaled_film_z(model: LensModel, film_z: Any) -> Any:
     return (film_z - (near + far) / 2) * (2 / (far - near)) if far > near else None
 
 
-def _solve(system: Graph, known: dict[str, Value], first: Value, steps: int, form: Form) -> tuple[Value, Value | None]:
+def _solve(system: Graph, inputs: dict[str, Value], first: Value, steps: int, form: Form) -> tuple[Value, Value | None]:
     """Unknowns, and the squared length of their residual where the form is exact."""
-    solved = limited_newton(system, known, first, steps, LIMIT)
+    solved = limited_newton(system, inputs, first, steps, LIMIT)
     if not form.exact:
         return solved.last, None
     g = first.graph
-    return solved.judged(g.square(g.inline(system, {**known, "unknown": solved.last})["residual"]))
+    return solved.judged(g.square(g.inline(system, {**inputs, "unknown": solved.last})["residual"]))
 
 
 def _finished(

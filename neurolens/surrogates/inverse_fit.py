@@ -52,18 +52,18 @@ def fit_inverse(model: LensModel, pairs: RayPairs) -> InverseModel:
     with pinned_threads(), torch.no_grad():
         rays, weight = _fit_rays(model, pairs)
         checked = pairs.train.inputs.select(slice(0, _CHECKED))
-        found: dict[str, Guess] = {}
+        guesses: dict[str, Guess] = {}
         report: dict[str, Any] = {}
         for terms, degree in _SIZES:
             inverse = _fit(model, rays, weight, terms, degree)
             for name, figures in convergence(inverse, checked).items():
-                if name not in found or figures["converged"] > report[name]["converged"]:
+                if name not in guesses or figures["converged"] > report[name]["converged"]:
                     guess: Guess = getattr(inverse, name)
-                    found[name], report[name] = guess, {**figures, "coefficients": guess.coefficients}
+                    guesses[name], report[name] = guess, {**figures, "coefficients": guess.coefficients}
             if min(figures["converged"] for figures in report.values()) >= _WANTED:
                 break
     report |= {"rays": len(rays), "seconds": time.perf_counter() - start}
-    return InverseModel(model, found["stop"], found["scene"], report)
+    return InverseModel(model, guesses["stop"], guesses["scene"], report)
 
 
 def convergence(inverse: InverseModel, rays: FilmRays, steps: int = STEPS) -> dict[str, Any]:

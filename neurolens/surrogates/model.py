@@ -81,8 +81,8 @@ class Domain:
         table = {f.name: data["bounds"][f.name] for f in fields(PupilBounds)}
         bounds: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
         pairs = {k: tuple(float(v) for v in data[k]) for k in ("film_z_mm", "focus_m", "wavelength_nm")}
-        known = {f.name: data[f.name] for f in fields(Domain) if f.name in data}
-        return Domain(**{**known, **pairs, "bounds": PupilBounds(**bounds)})
+        values = {f.name: data[f.name] for f in fields(Domain) if f.name in data}
+        return Domain(**{**values, **pairs, "bounds": PupilBounds(**bounds)})
 
 
 @dataclass(frozen=True)

@@ -148,8 +148,8 @@ def make_pairs(
         if getattr(settings, name) < 1:
             raise InputError("pairs", name, getattr(settings, name), "at least one ray")
     wanted = {"train": settings.train, "held_out": settings.held_out}
-    found: dict[str, list[PairSet]] = {name: [] for name in SPLITS}
-    counts = dict.fromkeys(found, 0)
+    splits: dict[str, list[PairSet]] = {name: [] for name in SPLITS}
+    counts = dict.fromkeys(splits, 0)
     drawn, tested = 0, 0.0
 
     def keep(batch: PairSet, *names: str) -> None:
@@ -157,8 +157,8 @@ def make_pairs(
         for name, chosen in _blocked_splits(lens, batch).items():
             if name in names:
                 most = settings.rim if name == "rim" else (settings.rim + 1) // 2
-                found[name].append(batch.select(torch.nonzero(chosen)[: most - counts[name], 0]))
-                counts[name] += len(found[name][-1])
+                splits[name].append(batch.select(torch.nonzero(chosen)[: most - counts[name], 0]))
+                counts[name] += len(splits[name][-1])
 
     if lit_share(domain) < SPARSE:  # then `draw` leaves far rays out
         keep(trace_pairs(lens, sample_domain(domain, _BATCH, settings.seed + 1), domain.pupil_z_mm), "far")
@@ -174,8 +174,8 @@ def make_pairs(
             used = int(order[needed - 1]) + 1 if len(order) >= needed else len(batch)
             tested += stands_for * used / max(len(batch), 1)
             keep(batch, "rim", "edge", "far")
-        found[split].append(batch.select(torch.nonzero(passed)[: wanted[split] - counts[split], 0]))
-        counts[split] += len(found[split][-1])
+        splits[split].append(batch.select(torch.nonzero(passed)[: wanted[split] - counts[split], 0]))
+        counts[split] += len(splits[split][-1])
         del batch, passed  # before the next one: they are large
         drawn += _BATCH
         if drawn > 10000 * (counts["train"] + counts["held_out"] + 10):
@@ -183,8 +183,8 @@ def make_pairs(
             raise InputError(lens.path, "domain", shown, "a domain that the lens can reach")
         if progress:
             progress((counts["train"] + counts["held_out"]) / total)
-    joined = {name: join_pairs(found.pop(name)) for name in SPLITS}
-    joined |= {name: _without_the_rest(joined[name]) for name in ("edge", "far")}
+    joined = {name: join_pairs(splits.pop(name)) for name in SPLITS}
+    joined |= {name: _unreached_as_zero(joined[name]) for name in ("edge", "far")}
     return RayPairs(lens, domain, settings, **joined, tested=round(tested))
 
 
@@ -214,13 +214,13 @@ def _lost(pairs: PairSet) -> Tensor:
     return (pairs.status >= 4) & (pairs.status % 4 != st.RIM)
 
 
-def _without_the_rest(lost: PairSet) -> PairSet:
+def _unreached_as_zero(lost: PairSet) -> PairSet:
     """Lost rays with 0 for what they never reached, where tracing them further gave figures without meaning."""
-    known = reached(lost)
-    meets = lost.meets.where(known, 0.0)
-    met = known & (meets > 0)
+    arrived = reached(lost)
+    meets = lost.meets.where(arrived, 0.0)
+    met = arrived & (meets > 0)
     cross_x, cross_y = lost.cross_x.where(met, 0.0), lost.cross_y.where(met, 0.0)
-    return replace(lost, cross_x=cross_x, cross_y=cross_y, meets=meets, refracts=lost.refracts.where(known, 0.0))
+    return replace(lost, cross_x=cross_x, cross_y=cross_y, meets=meets, refracts=lost.refracts.where(arrived, 0.0))
 
 
 def join_pairs(sets: list[PairSet]) -> PairSet:

@@ -182,7 +182,7 @@ def export_source(
             what the comment says.
     """
     model, axes = models[0], axes_of(card)
-    own = checked_name(language, model.lens.lens_id, name)
+    function_name = checked_name(language, model.lens.lens_id, name)
     program = fused_program(models, parts, fix)
     if axes:
         program.mixture = mixture_of(axes)
@@ -193,25 +193,25 @@ def export_source(
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         expected = "a card of neurolens, whole"
         raise InputError("export", "card", f"({type(error).__name__}: {error})", expected) from error
-    return write_program(program, Path(path), language, own, comment, extras)
+    return write_program(program, Path(path), language, function_name, comment, extras)
 
 
 def checked_name(language: str, lens_id: str, name: str | None) -> str:
     if language not in (*WRITERS, OSL):
         raise InputError("export", "to", language, f"one of {', '.join((*WRITERS, OSL))}")
-    own = identifier(lens_id) if name is None else name
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,99}", own) or "__" in own or _taken(own):
+    function_name = identifier(lens_id) if name is None else name
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,99}", function_name) or "__" in function_name or _taken(function_name):
         expected = (
             "letters, digits and single underscores, a letter first, and no word of C, C++, GLSL or OSL or of the code"
         )
-        raise InputError("export", "name", own, expected)
-    return own
+        raise InputError("export", "name", function_name, expected)
+    return function_name
 
 
 def _taken(word: str) -> bool:
     """Whether a word has a meaning in a language, or in the code that is written."""
-    known = {*_WORDS, *RAY, *SCENE_RAY, *STOP, WAVELENGTH, FILM_Z, STOP_RADIUS, TRANSMITTANCE, STATUS}
-    return word in known or word.removesuffix("f") in dir(math) or _PATTERNS.fullmatch(word) is not None
+    reserved = {*_WORDS, *RAY, *SCENE_RAY, *STOP, WAVELENGTH, FILM_Z, STOP_RADIUS, TRANSMITTANCE, STATUS}
+    return word in reserved or word.removesuffix("f") in dir(math) or _PATTERNS.fullmatch(word) is not None
 
 
 def write_program(
@@ -234,9 +234,9 @@ def fused_program(models: Sequence[LensModel], parts: Parts = ALL, fix: Fix = FR
     """
     fix.check(models[0].domain)
     fixed = {FILM_Z: fix.film_z_mm, STOP_RADIUS: fix.stop_radius_mm}
-    known = {name: value for name, value in fixed.items() if value is not None}
+    constants = {name: value for name, value in fixed.items() if value is not None}
     graphs = [model_graph(model, SCALARS, parts) for model in with_one_angle(models)]
-    return lower(graphs, known)
+    return lower(graphs, constants)
 
 
 def identifier(text: str) -> str:
@@ -276,9 +276,9 @@ def comment_of(
         if value is not None:
             lines.append(f"Fixed: {what} {value:.9g} mm.")
     errors = card.get("errors") or {}
-    known = [f"{key} {errors[key]:.3g}" for key in _ERRORS if isinstance(errors.get(key), (int, float))]
-    if known:
-        lines.append(f"Errors on held-out rays, whole domain of the exported model: {', '.join(known)}.")
+    figures = [f"{key} {errors[key]:.3g}" for key in _ERRORS if isinstance(errors.get(key), (int, float))]
+    if figures:
+        lines.append(f"Errors on held-out rays, whole domain of the exported model: {', '.join(figures)}.")
     if errors.get("poor"):
         lines.append(f"Poor: {', '.join(errors['poor'])}.")
     how = "followed" if transmittance_of(card) == POLARISED else "averaged at every surface"

@@ -193,8 +193,8 @@ def axes_of(lens: Lens, *, zoom: bool, internal: bool, state: str | float | None
     if not internal:
         return (first,)
     low, high = first.range
-    places = [1 / (1 / high + (1 / low - 1 / high) * k / (_LIMITS - 1)) for k in range(_LIMITS)]
-    inner = [v for v in places if low < v < high]
+    zooms = [1 / (1 / high + (1 / low - 1 / high) * k / (_LIMITS - 1)) for k in range(_LIMITS)]
+    inner = [v for v in zooms if low < v < high]
     focus = focus_axis(lens, [*(n for n, _ in first.stated), *inner])
     return replace(first, degree=max(1, first.degree - _FEWER)), replace(focus, degree=focus.degree - _FEWER)
 

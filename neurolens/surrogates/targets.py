@@ -183,8 +183,8 @@ def film_equivalent(lens: Lens, domain: Domain, vectors: Tensor) -> Tensor:
 def squared_error(pairs: RayPairs, encoding: Encoding, core: Core, rays: PairSet) -> float:
     """Summed squared film-equivalent error (um^2) of a core over rays of a lens and domain."""
     targets = targets_of(pairs.lens, encoding, rays)
-    found, wanted = (film_equivalent(pairs.lens, pairs.domain, v) for v in (core(targets.field)[0], targets.vectors))
-    return float(((found - wanted) ** 2).sum())
+    fitted, wanted = (film_equivalent(pairs.lens, pairs.domain, v) for v in (core(targets.field)[0], targets.vectors))
+    return float(((fitted - wanted) ** 2).sum())
 
 
 def weighed_apart(lens: Lens, domain: Domain, vectors: Tensor, position_weight: float) -> Tensor:

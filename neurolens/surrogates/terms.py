@@ -67,9 +67,9 @@ def ordered(rows: Sequence[tuple[int, ...]]) -> Exponents:
 
 def united(supports: Sequence[Exponents]) -> tuple[Exponents, list[list[int]]]:
     """Every exponent of several supports once, in the order in which they come, and the places of each support's."""
-    place: dict[tuple[int, ...], int] = {}
-    columns = [[place.setdefault(tuple(map(int, e)), len(place)) for e in support] for support in supports]
-    return np.array(list(place), dtype=np.int64), columns
+    number: dict[tuple[int, ...], int] = {}
+    columns = [[number.setdefault(tuple(map(int, e)), len(number)) for e in support] for support in supports]
+    return np.array(list(number), dtype=np.int64), columns
 
 
 def further(candidates: Exponents, known: Exponents) -> Exponents:
@@ -83,8 +83,8 @@ def kept(exponents: Exponents, chosen: Sequence[int]) -> tuple[Exponents, list[i
     """Exponents that chosen columns of `vector_columns` need, and where those columns are among these exponents'."""
     count = len(exponents)
     rows = sorted({k % count for k in chosen})
-    place = {k: i for i, k in enumerate(rows)}
-    return exponents[rows], [place[k % count] + (k >= count) * len(rows) for k in chosen]
+    number = {k: i for i, k in enumerate(rows)}
+    return exponents[rows], [number[k % count] + (k >= count) * len(rows) for k in chosen]
 
 
 def raw_variables(field: LightField) -> Tensor:
@@ -114,13 +114,13 @@ def vector_gram(
 
 def _products(features: Tensor, weights: Tensor) -> Tensor:
     """[M, M] sums over rays of features [M, N] times each other, weighted by [N]: symmetric, a third is not summed."""
-    found = features.new_empty((len(features), len(features)))
+    gram = features.new_empty((len(features), len(features)))
     size = -(-len(features) // 3)
     for start in range(0, len(features), max(size, 1)):
         rows = slice(start, start + size)
         part = (features[rows] * weights) @ features[start:].T
-        found[rows, start:], found[start:, rows] = part, part.T
-    return found
+        gram[rows, start:], gram[start:, rows] = part, part.T
+    return gram
 
 
 def solve(columns: Tensor, outputs: Tensor, weights: Tensor | None = None) -> Tensor:
@@ -140,8 +140,8 @@ def solve(columns: Tensor, outputs: Tensor, weights: Tensor | None = None) -> Te
     ridge = ROUNDING * torch.eye(len(columns), dtype=r.dtype)
     rows, wanted = torch.cat([r, ridge]), q.T @ outputs.T
     padded = torch.cat([wanted, wanted.new_zeros((len(columns), wanted.shape[1]))])
-    found = torch.linalg.lstsq(rows, padded, rcond=1e-13, driver="gelsd").solution
-    return (found / norms[:, None]).T
+    solution = torch.linalg.lstsq(rows, padded, rcond=1e-13, driver="gelsd").solution
+    return (solution / norms[:, None]).T
 
 
 @contextmanager
@@ -305,7 +305,7 @@ def replace_terms(sweep: Sweep, passes: int = 10) -> int:
     """
     exchanged = 0
     for _ in range(passes):
-        before, known, residual = exchanged, list(sweep.chosen), sweep.residual
+        before, start, residual = exchanged, list(sweep.chosen), sweep.residual
         for k in list(sweep.chosen):
             with_k = sweep.residual
             sweep.drop(k)
@@ -321,7 +321,7 @@ def replace_terms(sweep: Sweep, passes: int = 10) -> int:
         sweep.refresh()
         # Exchanges for gains within the rounding may add up to a loss.
         if sweep.residual > residual:
-            sweep.restart(known)
+            sweep.restart(start)
             return before
         if exchanged == before:
             break

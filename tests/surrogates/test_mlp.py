@@ -19,7 +19,14 @@ from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import fit_model
 from neurolens.surrogates.fits import network as networks
 from neurolens.surrogates.fits.network import fit_network, with_boundary_terms
-from neurolens.surrogates.fits.projection import Problem, Stand, activations, minimise, normal_equations, project
+from neurolens.surrogates.fits.projection import (
+    OptimiserState,
+    Problem,
+    activations,
+    minimise,
+    normal_equations,
+    project,
+)
 from neurolens.surrogates.gates import choose_gates
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.model import LensModel
@@ -221,7 +228,7 @@ def test_a_network_that_made_the_data_is_found_again():
     made = Problem(problem.inputs, problem.p, problem.u, vectors, weights[0], y[6:], weights[1])
     start = [w + 0.2 * torch.ones_like(w) for w in truth]
     assert project(made, truth).loss < 1e-10
-    assert minimise(made, Stand(start), 40)[0].loss < 1e-8
+    assert minimise(made, OptimiserState(start), 40)[0].loss < 1e-8
 
 
 class _Killed(Exception):

@@ -32,7 +32,7 @@ from neurolens.surrogates.fits.boundaries import (
     fit_stop,
     solve_scalars,
 )
-from neurolens.surrogates.fits.projection import Problem, Projection, Stand, activations, minimise, project
+from neurolens.surrogates.fits.projection import OptimiserState, Problem, Projection, activations, minimise, project
 from neurolens.surrogates.gates import boundary_weights, gate_values
 from neurolens.surrogates.lightfield import LightField
 from neurolens.surrogates.pairs import PairSet
@@ -157,8 +157,8 @@ def _part(data: Prepared, pairs: PairSet, base: InvariantPolynomial | None) -> t
     scalar_weights = torch.cat([_TRANSMITTANCE_UM * size * passes[None], _GATE_UM * size * gate_weights])
     field = targets.field
     if base is not None:
-        known, known_scalars = base(field)
-        vectors, scalars = vectors - known, scalars - known_scalars
+        fitted, fitted_scalars = base(field)
+        vectors, scalars = vectors - fitted, scalars - fitted_scalars
     mirror, p, u = data.encoding.mirror, field.p[None], field.u[None]
     if mirror:  # x and y of each vector by themselves
         p, u = (torch.cat([v] * 3)[:, None] for v in (field.p, field.u))
@@ -167,7 +167,7 @@ def _part(data: Prepared, pairs: PairSet, base: InvariantPolynomial | None) -> t
 
 
 @dataclass
-class _Place:
+class _Course:
     """The course of a training but for the weights: plain numbers, which a checkpoint keeps.
 
     Attributes:
@@ -175,7 +175,7 @@ class _Place:
         taken: steps of the present start, or of the best; on twice the rays a step counts twice.
         bursts: of the best. level: how often its rays were doubled.
         least: loss of the best start so far. previous: loss after the last burst.
-        damping, growth: see `Stand`.
+        damping, growth: see `OptimiserState`.
         idle: bursts in a row that gained little.
     """
 
@@ -208,77 +208,77 @@ class _Training:
         halvings = max(0, (len(problem) // FEWEST_RAYS).bit_length() - 1)
         self._levels = [2**k for k in range(halvings, -1, -1)]  # a fit sees every so many-th ray
         self._short = max(1, round(_TRIAL_STEPS * settings.steps))
-        self._place, self._stand, self._champion = _Place(), self._start(0), list[Tensor]()
-        if (known := checkpoint.load()) is not None:
-            state, arrays = known[0], [torch.from_numpy(array) for array in known[1]]
-            self._place = _Place(**state)
-            self._stand = Stand(arrays[: settings.layers], self._place.damping, self._place.growth)
+        self._course, self._optimiser, self._champion = _Course(), self._start(0), list[Tensor]()
+        if (saved := checkpoint.load()) is not None:
+            state, arrays = saved[0], [torch.from_numpy(array) for array in saved[1]]
+            self._course = _Course(**state)
+            self._optimiser = OptimiserState(arrays[: settings.layers], self._course.damping, self._course.growth)
             self._champion = arrays[settings.layers :]
         self._take_rays()
 
     def run(self) -> Projection:
         """Train; the last layer fits all rays."""
-        while not self._place.ended:
-            if self._place.start < STARTS:
+        while not self._course.ended:
+            if self._course.start < STARTS:
                 self._try_start()
             else:
                 self._go_on()
             self._save()
         self._save(now=True)
-        return project(self._problem, self._stand.hidden)
+        return project(self._problem, self._optimiser.hidden)
 
-    def _start(self, number: int) -> Stand:
+    def _start(self, number: int) -> OptimiserState:
         s = self._settings
-        return Stand(random_layers(self._problem.inputs, s.units, s.layers, s.seed + 7919 * number))
+        return OptimiserState(random_layers(self._problem.inputs, s.units, s.layers, s.seed + 7919 * number))
 
     def _take_rays(self) -> None:
-        level = self._place.level
+        level = self._course.level
         self._rays = self._problem.every(self._levels[level])
-        self._unseen = self._problem.every(4, first=1) if level + 1 < len(self._levels) else None
+        self._validation = self._problem.every(4, first=1) if level + 1 < len(self._levels) else None
 
     def _burst(self, steps: int) -> Projection:
         """At most `_BURST` steps, each counted by its rays."""
-        place, each = self._place, self._levels[0] // self._levels[self._place.level]
-        count = min(_BURST, -(-(steps - place.taken) // each))
+        course, each = self._course, self._levels[0] // self._levels[self._course.level]
+        count = min(_BURST, -(-(steps - course.taken) // each))
 
         def report(share: float) -> None:
             if self._progress:
-                done = place.start * self._short + place.taken + share * count * each
+                done = course.start * self._short + course.taken + share * count * each
                 self._progress(min(1.0, done / (STARTS * self._short + self._settings.steps)))
 
-        best, self._stand = minimise(self._rays, self._stand, count, report)
-        place.taken += count * each
+        best, self._optimiser = minimise(self._rays, self._optimiser, count, report)
+        course.taken += count * each
         return best
 
     def _try_start(self) -> None:
         """A burst of one of the starts; the end of its trial compares it with the best so far."""
-        place, best = self._place, self._burst(self._short)
-        if place.taken < self._short and not self._stand.stuck:
+        course, best = self._course, self._burst(self._short)
+        if course.taken < self._short and not self._optimiser.stuck:
             return
-        if best.loss < place.least or not self._champion:
-            place.least, self._champion = best.loss, self._stand.hidden
-        place.start, place.taken = place.start + 1, 0
-        self._stand = self._start(place.start) if place.start < STARTS else Stand(self._champion)
+        if best.loss < course.least or not self._champion:
+            course.least, self._champion = best.loss, self._optimiser.hidden
+        course.start, course.taken = course.start + 1, 0
+        self._optimiser = self._start(course.start) if course.start < STARTS else OptimiserState(self._champion)
 
     def _go_on(self) -> None:
         """A burst of the best start; then more rays, or the end."""
-        place, best = self._place, self._burst(self._settings.steps)
-        place.bursts += 1
-        place.idle = place.idle + 1 if best.loss > (1 - _LITTLE) * place.previous else 0
-        place.previous = best.loss
-        done = place.idle >= _IDLE or best.loss <= self._enough
-        if self._unseen is not None and (done or place.bursts % 2 == 0):
-            outputs = activations(best.hidden, self._unseen.inputs)[-1] @ best.output.T
-            if self._unseen.loss(outputs) > _GAP**2 * best.loss:
-                place.level, place.previous, place.idle, done = place.level + 1, math.inf, 0, False
-                self._stand = Stand(best.hidden, min(self._stand.damping, Stand.damping))
+        course, best = self._course, self._burst(self._settings.steps)
+        course.bursts += 1
+        course.idle = course.idle + 1 if best.loss > (1 - _LITTLE) * course.previous else 0
+        course.previous = best.loss
+        done = course.idle >= _IDLE or best.loss <= self._enough
+        if self._validation is not None and (done or course.bursts % 2 == 0):
+            outputs = activations(best.hidden, self._validation.inputs)[-1] @ best.output.T
+            if self._validation.loss(outputs) > _GAP**2 * best.loss:
+                course.level, course.previous, course.idle, done = course.level + 1, math.inf, 0, False
+                self._optimiser = OptimiserState(best.hidden, min(self._optimiser.damping, OptimiserState.damping))
                 self._take_rays()
-        place.ended = done or place.taken >= self._settings.steps or self._stand.stuck
+        course.ended = done or course.taken >= self._settings.steps or self._optimiser.stuck
 
     def _save(self, *, now: bool = False) -> None:
-        self._place.damping, self._place.growth = self._stand.damping, self._stand.growth
-        arrays = [array.numpy() for array in (*self._stand.hidden, *self._champion)]
-        self._checkpoint.save(asdict(self._place), arrays, now=now)
+        self._course.damping, self._course.growth = self._optimiser.damping, self._optimiser.growth
+        arrays = [array.numpy() for array in (*self._optimiser.hidden, *self._champion)]
+        self._checkpoint.save(asdict(self._course), arrays, now=now)
 
 
 def random_layers(inputs: Tensor, units: int, layers: int, seed: int) -> list[Tensor]:

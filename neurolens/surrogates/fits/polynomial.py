@@ -98,9 +98,9 @@ def fit_polynomial(data: Prepared, settings: ModelSettings) -> InvariantPolynomi
     Raises:
         InputError: an unknown method or basis, fewer than two terms, or too few training rays.
     """
-    for name, value, known in (("method", settings.method, POLYNOMIALS), ("basis", settings.basis, get_args(Basis))):
-        if value not in known:
-            raise InputError("fit", name, value, f"one of {', '.join(known)}")
+    for name, value, allowed in (("method", settings.method, POLYNOMIALS), ("basis", settings.basis, get_args(Basis))):
+        if value not in allowed:
+            raise InputError("fit", name, value, f"one of {', '.join(allowed)}")
     if settings.terms < 2:
         raise InputError("fit", "terms", settings.terms, "at least 2 coefficients per vector output")
     count = len(data.pairs.train)
@@ -170,8 +170,8 @@ def _grown_on(
         before, best = trial.residual, (trial.residual, start)
         if trial.residuals[0] < fine**2 * min(len(data.pairs.train), _CHOICE_RAYS):
             break
-        for surplus, known in ((1.25, start), (1.5, start), (2.0, start), (1.5, [])):
-            trial.restart(known)
+        for surplus, first in ((1.25, start), (1.5, start), (2.0, start), (1.5, [])):
+            trial.restart(first)
             forward(trial, math.ceil(surplus * terms))
             backward(trial, terms)
             replace_terms(trial, _PASSES)

@@ -181,7 +181,7 @@ def _unpacked(packed: Tensor, size: int) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Stand:
+class OptimiserState:
     """Where the optimiser stands; from here it goes on to the very same bits.
 
     Attributes:
@@ -199,7 +199,9 @@ class Stand:
         return self.damping >= _DAMPING_END
 
 
-def minimise(problem: Problem, start: Stand, steps: int, progress: Progress | None = None) -> tuple[Projection, Stand]:
+def minimise(
+    problem: Problem, start: OptimiserState, steps: int, progress: Progress | None = None
+) -> tuple[Projection, OptimiserState]:
     """Levenberg-Marquardt on the hidden weights (damping after Nielsen 1999), scaled by the diagonal (Marquardt 1963).
 
     Args:
@@ -228,7 +230,7 @@ def minimise(problem: Problem, start: Stand, steps: int, progress: Progress | No
             damping, growth = damping * growth, 2 * growth
         if progress:
             progress(taken / steps)
-    return best, Stand(best.hidden, damping, growth)
+    return best, OptimiserState(best.hidden, damping, growth)
 
 
 def _try(problem: Problem, hidden: list[Tensor]) -> Projection | None:
