@@ -17,6 +17,7 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.lens.paraxial import FirstOrder, first_order
 from neurolens.lens.prescription import Configuration, Lens
+from neurolens.setting.focusing import axial_rays, best_focus_z_mm
 from neurolens.setting.pupils import camera_rays, pupil_plane_z_mm
 from neurolens.setting.rims import end_mm
 from neurolens.setting.states import in_state
@@ -209,15 +210,8 @@ def _corner(lens: Lens) -> Iterator[Check]:
     yield Check("illumination of the corner", share, None, doubt)
 
 
-_FAN, _SPOT, _SEARCH = 1001, 64, 64
+_FAN, _SEARCH = 1001, 64
 _PUPIL = 3.0  # paraxial exit pupils within which the pupil of every film point lies
-
-
-def parallel_beam(lens: Lens, x: Tensor, y: Tensor) -> Rays:
-    """Return rays along the axis at heights x, y [N] (mm), in front of the lens."""
-    reach = max(s.semi_diameter_mm for s in lens.surfaces)
-    zero = torch.zeros_like(x)
-    return Rays(x, y, zero - reach, zero, zero, zero + 1)
 
 
 def axial_beam(lens: Lens) -> tuple[float, int | None]:
@@ -225,14 +219,13 @@ def axial_beam(lens: Lens) -> tuple[float, int | None]:
 
     The beam ends at the first height that does not pass; None where the whole front surface is used.
     """
-    front = lens.surfaces[0]
-    limit = min(front.semi_diameter_mm, end_mm(front))
-    low, high = 0.0, limit
-    blocker = None
+    front, reach = lens.surfaces[0], max(s.semi_diameter_mm for s in lens.surfaces)
+    low, high = 0.0, min(front.semi_diameter_mm, end_mm(front))
+    zero, blocker = torch.zeros(_FAN, dtype=torch.float64), None
     for _ in range(3):
         y = torch.linspace(low, high, _FAN, dtype=torch.float64)
         with torch.no_grad():
-            status = trace(lens, parallel_beam(lens, torch.zeros_like(y), y), towards="film").status
+            status = trace(lens, Rays(zero, y, zero - reach, zero, zero, zero + 1), towards="film").status
         passed = int((status == st.PASSED).to(torch.int8).cumprod(0).sum())
         if passed == _FAN:
             return float(y[-1]), blocker
@@ -246,27 +239,16 @@ def axial_beam(lens: Lens) -> tuple[float, int | None]:
 def axial_blur_mm(lens: Lens) -> float:
     """Return the RMS radius of the image of an axial point at infinity, in the plane where it is smallest.
 
-    Rays are even over the beam's cross-section; both coordinates count, for an anamorphic lens may have two foci.
+    Both coordinates count, for an anamorphic lens may have two foci; inf where no ray passes.
     """
-    reach = min(lens.surfaces[0].semi_diameter_mm, 1.02 * axial_beam(lens)[0])
-    side = torch.linspace(-reach, reach, 2 * _SPOT + 1, dtype=torch.float64)
-    x, y = (t.reshape(-1) for t in torch.meshgrid(side, side[_SPOT:], indexing="ij"))
-    inside = torch.hypot(x, y) <= reach
-    x, y = x[inside], y[inside]
     with torch.no_grad():
-        out = trace(lens, parallel_beam(lens, x, y), towards="film")
-    passed = out.status == st.PASSED
-    if not passed.any():
+        out = trace(lens, axial_rays(lens, -math.inf), towards="film")
+    r = Rays(*(c[out.status == st.PASSED] for c in out.rays))
+    if not len(r.x):
         return math.inf
-    r = Rays(*(c[passed] for c in out.rays))
-    # Position in the plane z is p + z q; the sum of squares is least where its derivative vanishes. Each ray of the
-    # half plane stands for its mirror image too: the centroid is on the axis.
-    weight = torch.where(y[passed] == 0, 1.0, 2.0)
-    qx, qy = r.dx / r.dz, r.dy / r.dz
-    px, py = r.x - r.z * qx, r.y - r.z * qy
-    best = -(weight * (px * qx + py * qy)).sum() / (weight * (qx * qx + qy * qy)).sum()
-    spread = (px + best * qx) ** 2 + (py + best * qy) ** 2
-    return math.sqrt(float((weight * spread).sum() / weight.sum()))
+    z = best_focus_z_mm(lens, math.inf, (lens.reference_nm, lens.reference_nm))
+    x, y = (c + (z - r.z) * d / r.dz for c, d in ((r.x, r.dx), (r.y, r.dy)))
+    return math.sqrt(float((x * x + y * y).mean()))
 
 
 def film_edge_mm(lens: Lens) -> float | None:
