@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera, CameraRays, DifferentialCamera, FloatArray
-from neurolens.cameras.lens_film import LensFilm
+from neurolens.cameras.lenscamera import LensFilm
 
 Floats = NDArray[np.float64]
 

@@ -23,7 +23,7 @@ import numpy as np
 from experiments import lab
 from experiments.lab import Report
 from neurolens.cameras.model import load_model
-from neurolens.cameras.onnxsession import open_session
+from neurolens.cameras.onnxlens import open_session
 from neurolens.graph.compiler import FLAGS, find_compiler
 from neurolens.graph.program import Program
 from neurolens.graph.scalars import lower

@@ -23,15 +23,15 @@ from experiments import lab
 from experiments import pupil_methods as known
 from neurolens.base.progress import Progress
 from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
+from neurolens.cameras.pupil_search import PupilTable
 from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Shot
 from neurolens.plan.costs import cycles_ns
 from neurolens.setting.pupils import pupil_bounds
 from neurolens.shaders.blender_shader import lens_of
 from neurolens.shaders.osl import osl_program
-from neurolens.shaders.pupil_circles_fit import light_lost
+from neurolens.shaders.pupil_fit import light_lost
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ import numpy as np
 from experiments import lab
 from experiments.plans import suited
 from neurolens.base.progress import Report
-from neurolens.cameras.graphcamera import Runtime
+from neurolens.cameras.lenscamera import Runtime
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.plan import footprints as prints
 from neurolens.plan import shot_fits

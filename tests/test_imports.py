@@ -54,10 +54,9 @@ PACKAGES = {
 EXCEPTIONS: dict[str, set[str]] = {
     "neurolens.base.cluster": {"dask", "distributed"},  # where a cluster is asked for
     "neurolens.cameras.exact": {"torch"},  # the one camera that traces rays
-    "neurolens.cameras.outline_cache": {"torch"},
 }
 # Modules that load torch; others load these when they are needed.
-SLOW = {"neurolens.cameras.exact", "neurolens.cameras.outline_cache"}
+SLOW = {"neurolens.cameras.exact"}
 SLOW |= {"neurolens.cli.export_lens", "neurolens.cli.flare_run", "neurolens.cli.view_run"}
 # What loads in a base install: these folders, models from their files, and what converts lens files.
 LEAN = ("base", "graph", "lens", "readers", "cameras", "shaders", "render", "mitsuba", "frames", "cli")

@@ -26,7 +26,7 @@ from neurolens.base.progress import Report
 from neurolens.cameras import build
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FloatArray
 from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.graphcamera import Runtime
+from neurolens.cameras.lenscamera import Runtime
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.cameras.vignetting import Vignetted
 from neurolens.lens.paraxial import film_z_mm, first_order

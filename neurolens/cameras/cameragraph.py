@@ -1,18 +1,22 @@
 """Lens cameras as graphs: from film point, two random numbers and wavelength to the ray, its weight and its status.
 
 What stands around a lens is written here, and in `pupil_outline`, once: onnxruntime and compiled cameras run it whole
-(`fused.whole_camera`) with the graph of their lens; cameras whose lens is a function (a trace) evaluate its two halves.
+(`whole_camera`) with the graph of their lens; cameras whose lens is a function (a trace) evaluate its two halves.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
 
 from neurolens.base import status as st
 from neurolens.graph.derive import derivative
-from neurolens.graph.ir import Graph
+from neurolens.graph.ir import Graph, pruned
 from neurolens.graph.program import FILM_X_Y
 from neurolens.lens.apertures import Aperture
+
+if TYPE_CHECKING:
+    from neurolens.cameras.lenscamera import LensFilm
 
 # How far the squared length of a direction may be from 1: where a poor network decodes none, the ray is no ray.
 UNIT_SLACK = 1e-3
@@ -79,3 +83,53 @@ def weight_graph(
     for name in derivatives:
         g.outputs[name] = g.input(name, 6) * _METRES
     return g
+
+
+class LensGraph(NamedTuple):
+    """The graph of a lens with what its camera's graph takes from it.
+
+    Attributes:
+        graph: inputs `rays` [5] (film and pupil point, wavelength), `film_z_mm` and `stop_radius_mm`; outputs
+            `scene_ray` [6], `transmittance`, `status`, `stop_xy_mm` [2], and any derivatives of `scene_ray`.
+        stop_radius_mm: of its round stop.
+        aperture: the shape of the opening, tested on the rays' crossings with the stop; None is round.
+        stopped: status of rays that the shape blocks.
+    """
+
+    graph: Graph
+    stop_radius_mm: float
+    aperture: Aperture | None = None
+    stopped: int = 0
+
+    @property
+    def blades(self) -> Aperture | None:
+        """The opening where it is no mask: a mask's table is too large for compiled loops."""
+        return None if self.aperture is None or self.aperture.mask is not None else self.aperture
+
+
+def whole_camera(
+    film: LensFilm, lens: LensGraph, pupil_too: bool = False, mask_too: bool = False
+) -> tuple[Graph, dict[str, float]]:
+    """The graph of a camera with the graph of its lens inside, and its numbers of the call.
+
+    Inputs: those of `pupil_graph` and `weight_graph`. Outputs: those of `weight_graph`, derivatives of the ray that the
+    lens's graph has, and with `pupil_too` the outputs of `pupil_graph`. A mask in the stop is tested in the graph with
+    `mask_too`; else `stop_xy_mm` is an output, for the caller to test it.
+    """
+    aperture = lens.aperture if mask_too else lens.blades
+    wanted = {k: v for k, v in lens.graph.outputs.items() if k != "stop_xy_mm" or lens.aperture is not None}
+    g = Graph()
+    pupil = g.inline(film.outline.graph, {})
+    film_mm, wavelength = g.input("film_mm", 2), g.input("wavelength_nm")
+    found = g.inline(pruned(lens.graph, wanted), {"rays": g.concat(film_mm, pupil["pupil_mm"], wavelength)})
+    derivatives = tuple(name for name in found if "_by_" in name)
+    status = found["status"]
+    if status.node.kind == "whole":  # the camera's tests take the number before it is made an integer
+        (status,) = g.inputs_of(status.number)
+    given = {"film_mm": film_mm, **pupil, **found, "lens_status": status}
+    g.outputs = g.inline(weight_graph(derivatives, aperture, lens.stopped), given)
+    if aperture is None and "stop_xy_mm" in found:
+        g.outputs["stop_xy_mm"] = found["stop_xy_mm"]
+    if pupil_too:
+        g.outputs |= pupil
+    return g, film.outline.numbers | film.numbers | {"stop_radius_mm": lens.stop_radius_mm}

@@ -5,9 +5,16 @@ These are the only cameras that need torch. They sample the outline of the light
 
 from __future__ import annotations
 
+import io
 import math
 import os
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,19 +23,17 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
+from neurolens.base.files import atomic_path, cache_folder, fingerprint_of, keep_newest, seal, sealed_bytes, sha256_of
 from neurolens.base.progress import Progress
+from neurolens.cameras.cameragraph import LensGraph
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
-from neurolens.cameras.graphcamera import LensCamera, Runtime
-from neurolens.cameras.lens_film import LensFilm, LensGraph, SceneRays
-from neurolens.cameras.lens_state import axial_transmittance, lens_state
-from neurolens.cameras.outline_cache import kept_outline, search_key
-from neurolens.cameras.pupil_boxes import PupilTable
-from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.cameras.pupil_search import COARSE, COARSE_TIGHT, FINE, Detail, outline_of
-from neurolens.cameras.sampling import arrived
+from neurolens.cameras.lenscamera import LensCamera, LensFilm, Runtime, SceneRays, axial_transmittance
+from neurolens.cameras.pupil_outline import PupilOutline, wavelength_between
+from neurolens.cameras.pupil_search import COARSE, COARSE_TIGHT, FINE, Detail, PupilTable, outline_of
+from neurolens.cameras.sampling import arrived, lens_state
 from neurolens.lens.film_plane import PupilBounds
-from neurolens.lens.glass import LINE_D_NM
+from neurolens.lens.glass import LINE_D_NM, index_of
 from neurolens.lens.paraxial import chief_reach_mm, first_order
 from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Shot
@@ -222,3 +227,71 @@ def placed_settings(lens: Lens, film_mm: tuple[float, float], focus_m: float) ->
         "film_mm": list(film_mm),
         "lens_state": state_of(lens, (400.0, 700.0), nominal),
     }
+
+
+_KEPT = 256  # files of 5 to 40 kB
+_LARGEST = 1 << 20  # bytes
+_DAMAGED = (OSError, ValueError, KeyError, EOFError, struct.error, zipfile.BadZipFile, zlib.error)
+
+
+def search_key(lens: Lens, wavelength_nm: tuple[float, float], shares: tuple[float, ...], *settings: Any) -> str:
+    """A name for all that the search for an outline reads.
+
+    Args:
+        lens: focused. wavelength_nm, shares: the range, and the shares of it at which rays are traced.
+        settings: whatever else rules the search, as JSON takes it.
+    """
+    waves = {lens.reference_nm, *wavelength_nm, *(wavelength_between(wavelength_nm, share) for share in shares)}
+    rows: list[Any] = [[float(index_of(lens.object_medium, w)) for w in sorted(waves)]]
+    for s in lens.surfaces:
+        numbers = (s.radius_mm, s.thickness_mm, s.diameter_mm, s.conic, *(index_of(s, w) for w in sorted(waves)))
+        more = s.across, s.focal_mm, [(p, float(a)) for p, a in s.asphere]
+        rows.append([[float(v) for v in numbers], s.stop, s.cylinder, *more])
+    return fingerprint_of([_code(), rows, float(lens.film_z_mm or 0), sorted(waves), *settings])
+
+
+@cache
+def _code() -> list[str]:
+    """Hash the modules that trace and search, and torch's arithmetic on this machine."""
+    package = Path(__file__).parents[1]
+    found = (package.glob(pattern) for pattern in ("lens/*.py", "trace/*.py", "setting/*.py", "cameras/pupil_*.py"))
+    files = [f"{file.name} {sha256_of(file)}" for folder in found for file in sorted(folder)]
+    return [*files, torch.__version__, torch.backends.cpu.get_cpu_capability()]
+
+
+def kept_outline(key: str, search: Callable[[], PupilOutline | None]) -> PupilOutline | None:
+    """The outline of a key: from the cache, else what `search` finds, which is kept if a file can be written."""
+    file = cache_folder() / f"{key[:32]}.npz"
+    outline = _read(file, key)
+    if outline is not None:
+        return outline
+    outline = search()
+    if outline is not None:
+        with suppress(OSError), atomic_path(file) as temporary:
+            with temporary.open("wb") as stream:
+                arrays: dict[str, Any] = {"key": key} | asdict(outline)
+                np.savez(stream, **arrays)
+            seal(temporary)
+        keep_newest(file, _KEPT)
+    return outline
+
+
+def _read(file: Path, key: str) -> PupilOutline | None:
+    data = sealed_bytes(file)
+    if data is None or len(data) > _LARGEST:
+        return None
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as held:
+            found = {name: held[name] for name in held.files}
+        if str(found.pop("key")) != key:
+            return None
+        z, radius, waves = (np.atleast_1d(found.pop(n)) for n in ("pupil_z_mm", "film_radius_mm", "wavelength_nm"))
+        centre, x, y = (found.pop(name) for name in ("centre", "x", "y"))
+        shape = (len(waves), len(centre), x.shape[-1])
+        sizes = len(waves) in (1, 2) and min(shape[1:]) > 1 and x.shape == y.shape == shape and not found
+        kinds = {centre.dtype, x.dtype, y.dtype} == {np.dtype(np.float32)} and {z.size, radius.size} == {1}
+        if not (sizes and kinds and all(np.isfinite(a).all() for a in (z, radius, waves, centre, x, y))):
+            return None
+        return PupilOutline(z.item(), radius.item(), tuple(waves.tolist()), centre, x, y)
+    except _DAMAGED:
+        return None

@@ -360,7 +360,7 @@ def field_of(
         return np.where(found.light > 0, laid(found.direction, frame, target), np.nan), found
 
     corner = math.hypot(*camera.film_mm) / 2
-    end = corner if azimuths > 1 else _end_of_light(lambda r: at(np.array([r + 0j]), distance)[1].light[0] > 0, corner)
+    end = corner if azimuths > 1 else end_of_light(lambda r: at(np.array([r + 0j]), distance)[1].light[0] > 0, corner)
     points = (np.linspace(0, end, rings)[:, None] * turns(azimuths)).reshape(-1)
     place, found = at(points, distance)
     edge = film_edge(camera.film_mm)
@@ -389,8 +389,8 @@ def film_edge(film_mm: tuple[float, float]) -> Complex:
     return np.concatenate(sides)
 
 
-def _end_of_light(lit: Callable[[float], bool], corner: float) -> float:
-    """Radius up to which a round picture is lit, at most that of the corner."""
+def end_of_light(lit: Callable[[float], bool], corner: float) -> float:
+    """Radius up to which a picture is lit, at most that of the corner."""
     steps = np.linspace(0, corner, 33)
     dark = next((k for k, r in enumerate(steps) if not lit(float(r))), None)
     if dark is None:

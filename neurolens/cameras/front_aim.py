@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.lens_film import LensFilm
+from neurolens.cameras.lenscamera import LensFilm
 from neurolens.trace.shapes import Shape, sag_and_derivatives
 from neurolens.trace.surfaces import meet_front
 

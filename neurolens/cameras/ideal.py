@@ -19,8 +19,16 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints, FloatArray, RayDifferentials, towards
-from neurolens.cameras.lens_state import ideal_state
-from neurolens.cameras.sampling import ahead, arrived, check_film, concentric_disk, positive, sound, stratified
+from neurolens.cameras.sampling import (
+    ahead,
+    arrived,
+    check_film,
+    concentric_disk,
+    ideal_state,
+    positive,
+    sound,
+    stratified,
+)
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.film_plane import film_z_mm
 

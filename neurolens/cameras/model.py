@@ -13,18 +13,21 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
-from neurolens.cameras.cameragraph import status_graph
+from neurolens.cameras.cameragraph import LensGraph, status_graph
 from neurolens.cameras.contract import FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
-from neurolens.cameras.graphcamera import LensCamera, Runtime
-from neurolens.cameras.lens_film import LensFilm, LensGraph, SceneRays
-from neurolens.cameras.lens_state import axial_transmittance, lens_state, squeeze_of
+from neurolens.cameras.lenscamera import LensCamera, LensFilm, Runtime, SceneRays, axial_transmittance, squeeze_of
 from neurolens.cameras.onnxlens import LensRays, OnnxLens, load_model
 from neurolens.cameras.onnxmaps import InverseRays, OnnxInverse, load_inverse
-from neurolens.cameras.pupil_boxes import PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.cameras.pupil_search import COARSE_TIGHT, outline_of
-from neurolens.cameras.sampling import arrived, beyond_circle, common_light, refuse
+from neurolens.cameras.pupil_search import COARSE_TIGHT, PupilTable, outline_of
+from neurolens.cameras.sampling import (
+    arrived,
+    beyond_circle,
+    common_light,
+    lens_state,
+    refuse,
+)
 from neurolens.graph.interpret import evaluate
 from neurolens.lens import film_plane
 from neurolens.lens.apertures import Aperture

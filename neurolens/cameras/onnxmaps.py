@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
 from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.onnxlens import OUTPUTS, check_lens, ray_columns
-from neurolens.cameras.onnxsession import open_session, run_batches
+from neurolens.cameras.onnxlens import OUTPUTS, check_lens, open_session, ray_columns, run_batches
 from neurolens.graph.onnx import write_onnx
 from neurolens.surrogates.assemble import ONNX
 from neurolens.surrogates.file import ModelFile, check_size, read_model

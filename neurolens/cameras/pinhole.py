@@ -27,8 +27,7 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints, FloatArray, RayDifferentials, towards
-from neurolens.cameras.lens_state import ideal_state
-from neurolens.cameras.sampling import ahead, arrived, check_film, positive, sound
+from neurolens.cameras.sampling import ahead, arrived, check_film, ideal_state, positive, sound
 
 Array = NDArray[Any]
 Function = Callable[[Array], Array]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,3 +154,45 @@ def check_film(film_mm: tuple[float, float]) -> tuple[float, float]:
     if not all(within(FILM_MM, side) for side in found):
         raise InputError("camera", "film_mm", film_mm, f"sides {said(FILM_MM)} mm")
     return found
+
+
+def lens_state(
+    *,
+    nominal_mm: float | None,
+    efl_mm: float,
+    pinhole_mm: float,
+    entrance_pupil_mm: float,
+    f_number: float,
+    transmittance: float | None = 1.0,
+    squeeze: float | None = 1.0,
+) -> dict[str, Any]:
+    """The table `lens_state` of a camera's settings, None where a number is not defined.
+
+    Args:
+        nominal_mm: focal length at infinity, None where nothing is engraved.
+        efl_mm, pinhole_mm: as in the module.
+        entrance_pupil_mm: from the film towards the scene.
+        f_number: focal length over the entrance pupil's diameter, as it is.
+        transmittance: of the axial ray, 0 to 1.
+        squeeze: as in the module.
+    """
+    t_stop = f_number / math.sqrt(transmittance) if transmittance else None
+    engraved = None if nominal_mm is None else round(abs(nominal_mm), 0 if abs(nominal_mm) >= 10 else 1)
+    found = {
+        "nominal_focal_length_mm": engraved,
+        "effective_focal_length_mm": efl_mm,
+        "pinhole_focal_length_mm": pinhole_mm,
+        "entrance_pupil_offset_mm": entrance_pupil_mm,
+        "f_number": f_number,
+        "t_stop": t_stop,
+        "squeeze": squeeze,
+    }
+    return {k: float(v) if v is not None and math.isfinite(v) else None for k, v in found.items()}
+
+
+def ideal_state(
+    efl_mm: float, f_number: float, pinhole_mm: float, entrance_pupil_mm: float | None = None
+) -> dict[str, Any]:
+    """The table of an ideal lens: nothing is engraved, all light passes; the pupil is where the pinhole would be."""
+    pupil = pinhole_mm if entrance_pupil_mm is None else entrance_pupil_mm
+    return lens_state(nominal_mm=None, efl_mm=efl_mm, pinhole_mm=pinhole_mm, entrance_pupil_mm=pupil, f_number=f_number)

@@ -93,7 +93,7 @@ def _code() -> list[str]:
 
 
 def _squeeze(file: Path, zoom: str | None) -> float:
-    """See `cameras.lens_state`."""
+    """See `cameras.sampling.lens_state`."""
     if not is_model(file):
         from neurolens.readers.any_format import read_any
         from neurolens.setting.states import set_lens

@@ -30,8 +30,7 @@ from neurolens.readers.any_format import read_any
 from neurolens.setting.focusing import best_focus_of_stops_mm, best_focus_z_mm, focus_states
 from neurolens.setting.pupils import image_radius_mm, pupil_bounds, pupil_plane_z_mm
 from neurolens.setting.states import set_lens
-from neurolens.shaders.focus_function import Array, Focusing
-from neurolens.shaders.source import film_extras, followed, state_ranges
+from neurolens.shaders.source import Array, Focusing, film_extras, followed, state_ranges
 from neurolens.study.measure import FRESH, fresh_rays, measure_on
 from neurolens.surrogates.axes import Axis, mixture_of, weights
 from neurolens.surrogates.export import export_inverse, export_onnx

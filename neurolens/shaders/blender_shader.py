@@ -178,12 +178,12 @@ def _traced(lens: Lens, plane_mm: float, far: Lens | None = None, inside_m: floa
         plane_mm: of its pupil points. far, inside_m: of groups that have moved, the lens at infinity focus, whose
             picture's size holds, and the distance in focus.
     """
-    from neurolens.cameras.pupil_boxes import PupilTable
+    from neurolens.cameras.pupil_search import PupilTable
     from neurolens.lens.paraxial import film_z_mm, first_order
     from neurolens.setting.focusing import best_focus_of_stops_mm, film_range_mm
     from neurolens.setting.pupils import image_radius_mm, pupil_bounds
-    from neurolens.shaders.focus_function import Focusing
     from neurolens.shaders.shader_lens import ShaderLens
+    from neurolens.shaders.source import Focusing
     from neurolens.trace.tracegraph import exact_graph
 
     data, (radius, _) = first_order(lens), image_radius_mm(far or lens)

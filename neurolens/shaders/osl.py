@@ -27,11 +27,10 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.base.progress import Report
 from neurolens.cameras.cameragraph import D_FILM, weight_graph
-from neurolens.cameras.lens_state import squeeze_of
+from neurolens.cameras.lenscamera import squeeze_of, stratified
 from neurolens.cameras.model import ModelScene
 from neurolens.cameras.onnxlens import OnnxLens
-from neurolens.cameras.pupil_boxes import PupilTable
-from neurolens.cameras.sampling import stratified
+from neurolens.cameras.pupil_search import PupilTable
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value
 from neurolens.graph.loworder import low_orders, with_film_derivatives
@@ -39,15 +38,11 @@ from neurolens.graph.osl import Parameter, write_osl
 from neurolens.graph.program import STOP_RADIUS, Mixture, Program
 from neurolens.graph.scalars import lower
 from neurolens.lens.film_plane import LINE_D_NM
-from neurolens.shaders.blades import MAX_BLADES, Blades
-from neurolens.shaders.focus_function import FOCUS, SMALLEST, Focusing, film_function, followed_rows
 from neurolens.shaders.lowtests import low_tests
-from neurolens.shaders.pupil_circles import PupilCircles
-from neurolens.shaders.pupil_circles_fit import fit_pupil
-from neurolens.shaders.pupil_disc import PupilDisc
-from neurolens.shaders.pupil_passing import passing_share
-from neurolens.shaders.shader_lens import ShaderLens
-from neurolens.shaders.source import model_focusing
+from neurolens.shaders.pupil import MAX_BLADES, Blades, PupilCircles, PupilDisc
+from neurolens.shaders.pupil_fit import fit_pupil
+from neurolens.shaders.shader_lens import ShaderLens, passing_share
+from neurolens.shaders.source import FOCUS, SMALLEST, Focusing, film_function, followed_rows, model_focusing
 from neurolens.surrogates.axes import STATE, Axis, product, state_graph, state_names, weights
 
 Array = NDArray[np.float64]

@@ -1,27 +1,204 @@
 """What source code for integrators holds besides a lens's function: whole cameras, constants, focusing.
 
-A camera's program is the graph that compiled cameras run (`fused`), its numbers and its table of the pupil's outline
+A camera's program is the graph that compiled cameras run (`cameragraph`), its numbers and its table of the pupil's outline
 written in: from a film point and two random numbers to a weighted ray, at one focus and stop.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.cameras.lens_film import LensFilm, LensGraph, whole_camera
+from neurolens.cameras.cameragraph import LensGraph, whole_camera
+from neurolens.cameras.lenscamera import LensFilm
 from neurolens.cameras.model import ModelScene, best_focus_of_stops_mm
 from neurolens.cameras.onnxlens import OnnxLens
 from neurolens.graph.c import Extras
+from neurolens.graph.ir import Graph, Value
 from neurolens.graph.loworder import with_film_derivatives
 from neurolens.graph.program import STOP_RADIUS, Program
 from neurolens.graph.scalars import lower
 from neurolens.lens.film_plane import film_z_of_card_mm
-from neurolens.shaders.focus_function import FOCUS, SMALLEST, Array, Focus, Focusing, film_function, number_of
-from neurolens.surrogates.axes import Axis, product, state_names
+from neurolens.surrogates.axes import STATE, Axis, product, state_graph, state_names
+
+Array = NDArray[np.float64]
+FOCUS = "focus_m"
+Focus = Literal["best", "widest", "paraxial"]
+
+SMALLEST = 1 / 16  # of the widest stop: at smaller ones the film stays
+_SAMPLES = (8, 12)  # distances and stops at which the film is placed, and where errors are measured
+_CHECKS = (4, 6)
+# Degrees in 1 / distance and in the stop's radius, and the error (mm) that is enough.
+_SAMPLES_OF_STATES = (5, 8)  # at each of the nodes
+_BEST, _BEST_MM = ((3, 2), (4, 4), (4, 6), (5, 6), (6, 8), (6, 10)), 2e-4
+_PARAXIAL, _PARAXIAL_MM = tuple((n, 0) for n in range(2, 13)), 1e-5
+_RISING, _RISING_MM = 200, 1e-4  # distances at which the film must rise; a fall by less is rounding
+
+
+@dataclass(frozen=True)
+class Focusing:
+    """How a lens in one state is focused.
+
+    Attributes:
+        nearest_m: nearest object, distance to the film; inf where the film does not focus.
+        stop_radius_mm: of the widest stop.
+        paraxial: the film's place (mm) in the paraxial image of an object at so many metres.
+        best: that of least spot at some stop radii [S].
+        film_z_mm: first and last place of the film, None where it has no ends.
+    """
+
+    nearest_m: float
+    stop_radius_mm: float
+    paraxial: Callable[[float], float]
+    best: Callable[[float, Array], Array]
+    film_z_mm: tuple[float, float] | None = None
+
+    def places(self, vergence: Array, stops: Array) -> Array:
+        """[D, S] film for 1 / distance [D] as share of the nearest's, at shares [S] of the stop; of none: paraxial."""
+        far = [self.nearest_m / v if v > 0 else np.inf for v in vergence]
+        if stops.size:
+            z = np.array([self.best(d, stops * self.stop_radius_mm) for d in far])
+        else:
+            z = np.array([[self.paraxial(d)] for d in far])
+        return z if self.film_z_mm is None else z.clip(*self.film_z_mm)
+
+
+class FilmFunction(NamedTuple):
+    """The film's position as a graph and its program, and its largest error (mm) at places between those of the fit."""
+
+    program: Program
+    error_mm: float
+    graph: Graph
+
+
+def number_of(axes: Sequence[Axis], nodes: Sequence[float], rule: str = "") -> float | Program:
+    """A number that follows the state as those of a model do: of one value at all nodes a constant, else a function.
+
+    Args:
+        nodes: at each node. rule: "square" or "reciprocal" where that is what is mixed.
+    """
+    values = np.array(nodes, np.float64)
+    if (values == values[0]).all():
+        return float(values[0])
+    powers = {"square": 2.0, "reciprocal": -1.0}
+    g, row = followed_rows(axes, values[:, None] ** powers.get(rule, 1.0))
+    g.outputs["value"] = row.sqrt() if rule == "square" else 1.0 / row if rule == "reciprocal" else row
+    return lower(g)
+
+
+def film_function(
+    nodes: Sequence[Focusing],
+    axes: Sequence[Axis] = (),
+    between: Sequence[tuple[Sequence[float], Focusing]] = (),
+    focus: Focus = "best",
+) -> FilmFunction:
+    """The film by the distance in m (inf allowed) and, of "best", the stop's radius in mm.
+
+    The film never falls back as the object comes nearer, and stays beyond the nearest one and the ends of the stop.
+
+    Args:
+        nodes: the lens at every node of the axes; one without.
+        between: states, and the lens there, at which errors are measured; without axes that is the lens itself.
+        focus: "widest" is best focus at the widest stop.
+    """
+    moved = np.isfinite(nodes[0].nearest_m)
+    choices, enough = (_BEST, _BEST_MM) if focus == "best" else (_PARAXIAL, _PARAXIAL_MM)
+    samples = _SAMPLES_OF_STATES if axes and focus == "best" else _SAMPLES
+    if focus == "paraxial":
+        samples = (_PARAXIAL[-1][0] + 4, 1)
+    choices = tuple((i, j) for i, j in choices if i < samples[0] and j < samples[1])
+
+    def grid(distances: Array, stops: Array) -> tuple[Array, Array]:
+        by_stop = {"best": SMALLEST + (1 - SMALLEST) * stops, "widest": np.ones(1), "paraxial": np.zeros(0)}
+        return distances if moved else np.zeros(1), by_stop[focus]
+
+    fit, check = grid(*(_roots(n) for n in samples)), grid(*(np.linspace(0, 1, n) for n in _CHECKS))
+    placed = np.array([node.places(*fit) for node in nodes])
+    checked = [(state, lens, lens.places(*check)) for state, lens in between or [((), nodes[0])]]
+    found: list[FilmFunction] = []
+    for degrees in choices:
+        graph = _fitted(nodes, axes, placed, fit, degrees)
+        program = lower(graph)
+        error = max(_error(program, axes, *known, check) for known in checked)
+        found.append(FilmFunction(program, error, graph))
+        if error < enough:
+            break
+    return min(found, key=lambda f: f.error_mm)
+
+
+def followed_rows(axes: Sequence[Axis], nodes: ArrayLike) -> tuple[Graph, Value]:
+    """A graph of the state's numbers, and in it numbers [nodes, n] that follow it, n rows; constants of no axes."""
+    g, values = Graph(), np.asarray(nodes, np.float64)
+    if not axes:
+        return g, g.constant(values[0])
+    graph, transform = state_graph(axes)
+    state = g.concat(*(g.input(name, per_call=True) for name in state_names(axes)))
+    return g, g.affine((transform @ values).T, g.inline(graph, {STATE: state})["features"])
+
+
+def _roots(count: int) -> Array:
+    """The roots of the Chebyshev polynomial of that degree, scaled to 0 to 1."""
+    return np.asarray((1 - np.cos(np.pi * (np.arange(count) + 0.5) / count)) / 2)
+
+
+def _fitted(
+    nodes: Sequence[Focusing], axes: Sequence[Axis], placed: Array, at: tuple[Array, Array], degrees: tuple[int, int]
+) -> Graph:
+    """The function of polynomials of these degrees: least squares of what is `placed` [nodes, D, S] at each node."""
+    moved, by_stop = (len(places) > 1 for places in at)
+    across, along = degrees[0] * moved, degrees[1] * by_stop
+    # Of high degree in one alone, not in both.
+    exponents = np.array(
+        [(i, j) for i in range(across + 1) for j in range(along + 1) if i * along + j * across <= across * along]
+    )
+    x, y = np.meshgrid(2 * at[0] - 1, _centred(at[1]) if by_stop else np.zeros(1), indexing="ij")
+    basis = np.prod(np.stack([x.ravel(), y.ravel()], -1)[:, None] ** exponents, -1)
+    terms = np.linalg.lstsq(basis, placed.reshape(len(nodes), -1).T, rcond=None)[0].T
+    ends = [(1 / node.nearest_m, node.stop_radius_mm, *(node.film_z_mm or ())) for node in nodes]
+    g, numbers = followed_rows(axes, np.concatenate([terms, ends], 1))
+    count = len(exponents)
+    near, stop, *film = (numbers[count + k] for k in range(len(ends[0])))
+    rows = [((1.0 / g.input(FOCUS)) / near).clip(0.0, 1.0) * 2.0 - 1.0] if moved else []
+    rows += [_centred((g.input(STOP_RADIUS) / stop).clip(SMALLEST, 1.0))] if by_stop else []
+    z = numbers[0]
+    if rows:
+        used = exponents[:, [k for k, there in enumerate((moved, by_stop)) if there]]
+        z = g.dot(numbers[0:count], g.polynomial(used, np.eye(count), g.concat(*rows)))
+    g.outputs["film_z_mm"] = z.maximum(film[0]).minimum(film[1]) if film else z
+    return g
+
+
+def _centred(share: Any) -> Any:
+    """A share of the stop, from `SMALLEST` to 1, as -1 to 1."""
+    return share * (2 / (1 - SMALLEST)) - (1 + SMALLEST) / (1 - SMALLEST)
+
+
+def _error(
+    program: Program,
+    axes: Sequence[Axis],
+    state: Sequence[float],
+    lens: Focusing,
+    wanted: Array,
+    at: tuple[Array, Array],
+) -> float:
+    """Largest error in mm at a state, infinite of a function that falls as the object comes nearer."""
+
+    def values(distances: Array) -> Array:
+        v, s = np.meshgrid(distances, at[1] if at[1].size else np.ones(1), indexing="ij")
+        with np.errstate(divide="ignore"):
+            given = {FOCUS: lens.nearest_m / v, STOP_RADIUS: s * lens.stop_radius_mm}
+        found = program.evaluate(given | dict(zip(state_names(axes), state, strict=True)))
+        return np.broadcast_to(found["film_z_mm"], v.shape).astype(np.float64)
+
+    rising = len(at[0]) == 1 or np.diff(values(np.linspace(0, 1, _RISING)), axis=0).min() >= -_RISING_MM
+    return float(np.abs(values(at[0]) - wanted).max()) if rising else np.inf
+
 
 CAMERA_FRAME = """\
 Camera frame: metres, origin at the film's centre, the camera looks along -z, y up, x right. Film points are mm in the

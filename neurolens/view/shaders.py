@@ -16,7 +16,7 @@ from neurolens.graph.ir import Graph
 from neurolens.graph.program import FILM_Z, STOP_RADIUS, WAVELENGTH, Program
 from neurolens.graph.scalars import lower
 from neurolens.lens.prescription import Lens
-from neurolens.shaders.blades import Blades
+from neurolens.shaders.pupil import Blades
 from neurolens.trace.tracegraph import exact_graph
 
 # What stands in the page's shaders for inputs and outputs of functions.

@@ -14,11 +14,11 @@ import pytest
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras import graphcamera
+from neurolens.cameras import lenscamera
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.graphcamera import Runtime
+from neurolens.cameras.lenscamera import Runtime
 from neurolens.cameras.model import OnnxCamera, OnnxLens, load_model
 from neurolens.flare.ghosts import coated
 from neurolens.graph import compiler
@@ -161,7 +161,7 @@ def test_differentials_of_a_model_come_as_near_to_those_of_its_graph_as_the_came
 
 
 def test_differentials_that_no_low_order_meets_are_those_of_the_graph(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(graphcamera, "with_low_order_derivatives", partial(with_low_order_derivatives, worst=0.0))
+    monkeypatch.setattr(lenscamera, "with_low_order_derivatives", partial(with_low_order_derivatives, worst=0.0))
     plain, _ = pair()
     fused = OnnxCamera(load_model(model_file()), Shot(FILM, 2.0), runtime="c")
     given = numbers(5000, seed=5)

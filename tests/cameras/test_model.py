@@ -19,7 +19,7 @@ from onnx import ModelProto
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
 from neurolens.cameras.model import ModelScene, OnnxCamera, OnnxLens, best_focus_z_mm, load_model
-from neurolens.cameras.pupil_boxes import PupilTable, tightened
+from neurolens.cameras.pupil_search import PupilTable, tightened
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.paraxial import film_z_mm, first_order
 from neurolens.lens.shot import Shot
@@ -63,59 +63,50 @@ def change_card(change: Callable[[dict], object]) -> Callable[[ModelProto], None
     return apply
 
 
+def change_text(old: str, new: str) -> Callable[[ModelProto], object]:
+    return lambda p: setattr(p.metadata_props[0], "value", p.metadata_props[0].value.replace(old, new))
+
+
+def with_value(key: str, value: object) -> Callable[[dict], None]:
+    """Change a card's value by its dotted key; `LEFT_OUT` removes it."""
+
+    def change(card: dict) -> None:
+        *parts, last = key.split(".")
+        for part in parts:
+            card = card[part]
+        card.pop(last) if value is LEFT_OUT else card.update({last: value})
+
+    return change
+
+
+LEFT_OUT = object()
+# A key of the card, a value that it must not have, and words of the message: the key itself where there are none.
+CARD: list[tuple[str, object, str]] = [
+    ("kind", "x", ""), ("schema", 2, "schema: got 2, expected 1"), ("lens", "lens", "lens: got 'lens'"),
+    ("lens.efl_mm", LEFT_OUT, ""), ("lens.efl_mm", 10**400, ""), ("lens.id", LEFT_OUT, ""),
+    ("lens.stop_radius_mm", 0, ""), ("domain.film_radius_mm", "20", ""), ("domain.film_radius_mm", -20, ""),
+    ("domain.bounds.film_radius_mm", 1e-308, ""), ("domain.film_z_mm", [90.0, 80.0], ""),
+    ("domain.focus_m", ["far", 1.0], ""), ("domain.focus_m", LEFT_OUT, ""), ("domain.nearest_m", -1, ""),
+    ("domain.bounds", LEFT_OUT, ""), ("domain.bounds.low_mm", ["1", "2"], ""),
+    ("domain.bounds.low_mm", [1.0], "bounds"),
+    ("fit.settings", LEFT_OUT, ""), ("fit.settings.rays_seed", "x", ""),
+    ("fit.note", "x" * 2**20, "card: .* characters"),
+    ("errors", [1], ""), ("errors.false_pass", -0.1, "errors: got"), ("errors.poor", 5, ""),
+    ("errors.zones", {"full": {"edge": {"rays": -3}}}, "errors: got"),
+    ("errors.rms_um", 10**400, "errors.rms_um: got"),
+    ("reference.stop_radius_mm", 10**400, "reference"), ("reference", LEFT_OUT, ""),
+]  # fmt: skip
 DAMAGE: dict[str, tuple[Callable[[ModelProto], object], str]] = {
+    **{f"{n} {key}": (change_card(with_value(key, value)), words or key) for n, (key, value, words) in enumerate(CARD)},
     "no card": (lambda p: p.ClearField("metadata_props"), "no card"),
     "card cut": (lambda p: setattr(p.metadata_props[0], "value", p.metadata_props[0].value[:-9]), "JSON"),
-    "card with NaN": (
-        lambda p: setattr(p.metadata_props[0], "value", p.metadata_props[0].value.replace('{"rms_um": 1.0}', "NaN")),
-        "NaN",
-    ),
+    "card with NaN": (change_text('{"rms_um": 1.0}', "NaN"), "NaN"),
     "card a list": (lambda p: setattr(p.metadata_props[0], "value", "[1]"), "kind"),
-    "other kind": (change_card(lambda c: c.update(kind="x")), "kind"),
-    "later schema": (change_card(lambda c: c.update(schema=2)), r"schema: got 2, expected 1"),
-    "no focal length": (change_card(lambda c: c["lens"].pop("efl_mm")), "lens.efl_mm"),
-    "text for a number": (change_card(lambda c: c["domain"].update(film_radius_mm="20")), "domain.film_radius_mm"),
     "card too deep": (
         lambda p: setattr(p.metadata_props[0], "value", '{"kind":' + "[" * 200_000 + "]" * 200_000 + "}"),
         "JSON",
     ),
-    "card too long": (change_card(lambda c: c.update(fit=c["fit"] | {"note": "x" * 2**20})), "card: .* characters"),
-    "a section of text": (change_card(lambda c: c.update(lens="lens")), "lens: got 'lens'"),
-    "no name of the lens": (change_card(lambda c: c["lens"].pop("id")), "lens.id"),
-    "negative radius": (change_card(lambda c: c["domain"].update(film_radius_mm=-20)), "domain.film_radius_mm"),
-    "a radius of nothing": (
-        change_card(lambda c: c["domain"]["bounds"].update(film_radius_mm=1e-308)),
-        "domain.bounds.film_radius_mm",
-    ),
-    "no stop": (change_card(lambda c: c["lens"].update(stop_radius_mm=0)), "lens.stop_radius_mm"),
-    "integer beyond floats": (change_card(lambda c: c["lens"].update(efl_mm=10**400)), "lens.efl_mm"),
-    "infinite by its digits": (
-        lambda p: setattr(
-            p.metadata_props[0],
-            "value",
-            p.metadata_props[0].value.replace('"wavelength_nm": [400.0', '"wavelength_nm": [1e400'),
-        ),
-        "1e400 is no finite number",
-    ),
-    "film planes reversed": (change_card(lambda c: c["domain"]["film_z_mm"].reverse()), "domain.film_z_mm"),
-    "focus of text": (change_card(lambda c: c["domain"].update(focus_m=["far", 1.0])), "domain.focus_m"),
-    "no focus": (change_card(lambda c: c["domain"].pop("focus_m")), "domain.focus_m"),
-    "bounds of text": (change_card(lambda c: c["domain"]["bounds"].update(low_mm=["1", "2"])), "domain.bounds.low_mm"),
-    "bounds of unequal length": (change_card(lambda c: c["domain"]["bounds"]["low_mm"].pop()), "domain.bounds"),
-    "nearest object behind the film": (change_card(lambda c: c["domain"].update(nearest_m=-1)), "domain.nearest_m"),
-    "no settings": (change_card(lambda c: c["fit"].pop("settings")), "fit.settings"),
-    "strange seed": (change_card(lambda c: c["fit"]["settings"].update(rays_seed="x")), "fit.settings.rays_seed"),
-    "errors a list": (change_card(lambda c: c.update(errors=[1])), "errors"),
-    "a negative error": (change_card(lambda c: c["errors"].update(false_pass=-0.1)), "errors: got"),
-    "a count below nothing": (
-        change_card(lambda c: c["errors"].update(zones={"full": {"edge": {"rays": -3}}})),
-        "errors: got",
-    ),
-    "a number for words": (change_card(lambda c: c["errors"].update(poor=5)), "errors.poor"),
-    "an error beyond floats": (change_card(lambda c: c["errors"].update(rms_um=10**400)), "errors.rms_um: got"),
-    "reference beyond floats": (change_card(lambda c: c["reference"].update(stop_radius_mm=10**400)), "reference"),
-    "no bounds": (change_card(lambda c: c["domain"].pop("bounds")), "domain.bounds"),
-    "no reference rays": (change_card(lambda c: c.pop("reference")), "reference"),
+    "infinite by its digits": (change_text('"wavelength_nm": [400.0', '"wavelength_nm": [1e400'), "1e400 is no finite"),
     "no graph": (lambda p: p.ClearField("graph"), "0 graphs"),
     "two cards": (lambda p: p.metadata_props.append(p.metadata_props[0]), "stands twice"),
     "much metadata": (
@@ -331,6 +322,7 @@ def test_models_need_no_torch_and_write_nothing(path: Path, tmp_path: Path) -> N
         "import sys\n"
         "sys.modules.update(dict.fromkeys(['torch', 'sklearn', 'matplotlib']))\n"
         "from neurolens.cameras.model import OnnxCamera, load_model\n"
+        "from neurolens.lens.shot import Shot\n"
         "from neurolens.lens.shot import Shot\n"
         f"camera = OnnxCamera(load_model({str(path)!r}), Shot((36, 24), 2))\n"
         "import numpy as np\n"

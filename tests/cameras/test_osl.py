@@ -24,13 +24,10 @@ from neurolens.setting.pupils import pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.shaders import blender_shader as shaders
 from neurolens.shaders import lowtests, osl
-from neurolens.shaders.blades import Blades
 from neurolens.shaders.blender_shader import _smallest, exact_lens
-from neurolens.shaders.pupil_circles import PupilCircles, unit_disc
-from neurolens.shaders.pupil_circles_fit import fit_pupil
-from neurolens.shaders.pupil_disc import PupilDisc
-from neurolens.shaders.pupil_passing import passing_share
-from neurolens.shaders.shader_lens import ShaderLens
+from neurolens.shaders.pupil import Blades, PupilCircles, PupilDisc, unit_disc
+from neurolens.shaders.pupil_fit import fit_pupil
+from neurolens.shaders.shader_lens import ShaderLens, passing_share
 from neurolens.surrogates.axes import Axis, product, weights
 from neurolens.trace.tracegraph import exact_graph
 

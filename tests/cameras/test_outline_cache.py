@@ -12,8 +12,7 @@ from neurolens.base.files import atomic_path, cache_folder, seal
 from neurolens.base.progress import Progress
 from neurolens.cameras import exact
 from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.exact import ExactCamera
-from neurolens.cameras.outline_cache import kept_outline, search_key
+from neurolens.cameras.exact import ExactCamera, kept_outline, search_key
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Shot
@@ -111,7 +110,7 @@ def test_damaged_files_are_made_again(folder: Path, tmp_path: Path, harm: str) -
 
 
 def test_a_disk_that_takes_nothing_costs_the_cache_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.cameras.outline_cache.atomic_path", full)
+    monkeypatch.setattr("neurolens.cameras.exact.atomic_path", full)
     assert parts(kept_outline(KEY, outline)) == parts(outline())
     assert kept_outline(KEY, lambda: None) is None
 

@@ -13,9 +13,8 @@ from film_light import film_light
 from neurolens.base import status as st
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera, load_model
-from neurolens.cameras.pupil_boxes import Passes, PupilTable
 from neurolens.cameras.pupil_outline import PupilOutline
-from neurolens.cameras.pupil_search import outline_of
+from neurolens.cameras.pupil_search import Passes, PupilTable, outline_of
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.lens.shot import Shot

@@ -24,8 +24,7 @@ from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.focusing import best_focus_of_stops_mm, best_focus_z_mm
 from neurolens.setting.states import set_lens
-from neurolens.shaders.focus_function import Focusing, number_of
-from neurolens.shaders.source import camera_program, film_extras, model_extras
+from neurolens.shaders.source import Focusing, camera_program, film_extras, model_extras, number_of
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.states import gap_axis, zoom_axis
 from neurolens.trace.rays import trace

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from neurolens.analysis.breathing import breathing
-from neurolens.cameras.outline_cache import search_key
+from neurolens.cameras.exact import search_key
 from neurolens.graph.interpret import evaluate
 from neurolens.lens.glass import LINE_D_NM, index_of
 from neurolens.lens.paraxial import chief_reach_mm, film_z_mm, first_order, image_z_mm

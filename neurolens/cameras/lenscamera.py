@@ -1,6 +1,6 @@
 """The camera class of lenses, exact or modelled: everything between the random numbers and the weighted ray.
 
-A camera is one graph, that of its lens between the pupil and the weights (`lens_film.whole_camera`). Three runtimes
+A camera is one graph, that of its lens between the pupil and the weights (`cameragraph.whole_camera`). Three runtimes
 give the same rays to rounding:
 
     "onnxruntime"  the graph written as ONNX
@@ -12,28 +12,149 @@ give the same rays to rounding:
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from copy import copy
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.cameragraph import D_FILM
-from neurolens.cameras.contract import MANY_RAYS_A_CALL, RAYS_A_CALL, CameraRays, FloatArray
-from neurolens.cameras.lens_film import LensFilm, LensGraph, camera_rays, whole_camera
-from neurolens.cameras.onnxsession import open_session, run_batches
+from neurolens.cameras.cameragraph import D_FILM, LensGraph, weight_graph, whole_camera
+from neurolens.cameras.contract import MANY_RAYS_A_CALL, RAYS_A_CALL, CameraRays, FloatArray, RayDifferentials
+from neurolens.cameras.onnxlens import open_session, run_batches
+from neurolens.cameras.pupil_outline import PupilOutline
+from neurolens.cameras.sampling import is_light, stratified
 from neurolens.graph.c import Signature, padded_columns, write_blocks
 from neurolens.graph.compiler import load_compiled
+from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.loworder import with_film_derivatives, with_low_order_derivatives
 from neurolens.graph.onnx import write_onnx
 from neurolens.graph.program import row_names
 from neurolens.graph.scalars import lower
+from neurolens.lens.film_plane import LINE_D_NM
 from neurolens.surrogates.assemble import ONNX, SCALARS, Form
+
+_ROUND = 0.02  # of the squeeze: less than this from 1 is the error of a model, not a cylinder
+# Points a side of the quadrature of the exposure on the axis.
+_QUADRATURE = 256
+_AHEAD = np.array([[0], [0], [0], [0], [0], [-1]], np.float32)
+
+
+class SceneRays(NamedTuple):
+    """Scene-side rays: scene_ray [6, N] (x, y, z mm, unit direction; lens frame), transmittance [N], status [N].
+
+    `d_film`: derivatives [6, 2, N] of scene_ray by the film point's x and y (per mm), where they were asked for.
+    """
+
+    scene_ray: FloatArray
+    transmittance: FloatArray
+    status: NDArray[np.int32]
+    d_film: FloatArray | None = None
+
+
+# Film points [2, N] mm, pupil points [2, N] mm and wavelengths [N] nm to scene-side rays.
+SceneFunction = Callable[[FloatArray, FloatArray, FloatArray], SceneRays]
+
+
+class LensFilm:
+    """Film and pupil of a lens at one focus and stop: from film points and random numbers to weighted rays.
+
+    Args:
+        outline: the pupil of every film radius; None where no ray passes.
+        film_z_mm: film plane, lens frame.
+        wavelength_nm: range of the wavelengths used.
+        scene: the lens.
+
+    Raises:
+        InputError: no ray passes from the film's centre.
+    """
+
+    def __init__(
+        self, outline: PupilOutline | None, film_z_mm: float, wavelength_nm: tuple[float, float], scene: SceneFunction
+    ) -> None:
+        if outline is None:
+            raise InputError("camera", "f_number, focus_m", "(no ray passes)", "a lens that light can pass")
+        self.film_z_mm, self.scene = film_z_mm, scene
+        self.distance_mm = film_z_mm - outline.pupil_z_mm
+        self.outline = outline
+        self.exposure = 1.0
+        self.exposure = self._exposure_on_axis(wavelength_nm)
+
+    def sample(
+        self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray, scene: SceneFunction | None = None
+    ) -> CameraRays:
+        """Rays for film points [2, N] in mm, random numbers [2, N] in [0, 1) and wavelengths [N] in nm.
+
+        `scene` stands in for the lens's own function, for one that gives more (`SceneRays.d_film`).
+        """
+        scene = scene or self.scene
+        pupil, area = self.outline.sample(film_mm, square, wavelength_nm)
+        lit = (area > 0) & is_light(wavelength_nm)
+        if lit.all():
+            return camera_rays(self._weighted(scene, film_mm, pupil, area, wavelength_nm))
+        # A film point that nothing reaches is dark: no ray is traced.
+        some = np.flatnonzero(lit)
+        found = self._weighted(scene, film_mm[:, some], pupil[:, some], area[some], wavelength_nm[some])
+        whole = {name: np.zeros((*part.shape[:-1], lit.size), part.dtype) for name, part in found.items()}
+        whole["status"][:] = st.OUTSIDE_DOMAIN
+        for name, part in found.items():
+            whole[name][..., some] = part
+        return camera_rays(whole)
+
+    def _weighted(
+        self, scene: SceneFunction, film: FloatArray, pupil: FloatArray, area: FloatArray, wavelength_nm: FloatArray
+    ) -> dict[str, NDArray[Any]]:
+        """What `camera_rays` takes, for lit film points [2, N] through pupil points [2, N], densities 1 / area [N]."""
+        out = scene(film, pupil, wavelength_nm)
+        given = {"film_mm": film, "pupil_mm": pupil, "area_mm2": area[None], "scene_ray": out.scene_ray}
+        given |= {"transmittance": out.transmittance[None], "lens_status": out.status[None].astype(np.float32)}
+        given |= {} if out.d_film is None else dict(zip(D_FILM, np.moveaxis(out.d_film, 1, 0), strict=True))
+        given |= {name: np.array([[value]], np.float32) for name, value in self.numbers.items()}
+        found = evaluate(weight_graph(() if out.d_film is None else D_FILM), given)
+        moves = [found.pop(name) for name in D_FILM if name in found]
+        return found | ({"d_film": np.stack(moves, 1)} if moves else {})
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """The inputs of the call of `cameragraph.weight_graph`."""
+        scale = 1 / (self.distance_mm**2 * self.exposure)
+        return {"per_distance": 1 / self.distance_mm, "scale": scale, "film_z_mm": self.film_z_mm}
+
+    def natural(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
+        """cos^4 of the angles between the axis and the rays of `sample` on the film's side."""
+        slope = (self.outline.sample(film_mm, square, wavelength_nm)[0] - film_mm) * np.float32(1 / self.distance_mm)
+        cos4: FloatArray = np.square(1 / (1 + np.einsum("in,in->n", slope, slope)))
+        return cos4
+
+    def _exposure_on_axis(self, wavelength_nm: tuple[float, float]) -> float:
+        """Integral of T cos over solid angle at the film's centre, mean over the wavelengths."""
+        square, wavelength = stratified(_QUADRATURE, wavelength_nm)
+        weight = self.sample(np.zeros_like(square), square, wavelength).weight
+        exposure = float(weight.mean(dtype=np.float64))
+        if not exposure > 0:
+            raise InputError("camera", "f_number, focus_m", "(no ray passes on the axis)", "a lens that light can pass")
+        return exposure
+
+
+def camera_rays(found: Mapping[str, NDArray[Any]]) -> CameraRays:
+    """Rays of the outputs of `cameragraph.weight_graph`, [R, N] each; those that do not pass look ahead.
+
+    Derivatives by the film point stand together, `d_film` [6, 2, N].
+    """
+    ray, moves = found["ray"], found.get("d_film")
+    lost = np.flatnonzero(found["status"][0] != st.PASSED)
+    if lost.size:
+        ray[:, lost] = _AHEAD
+        if moves is not None:
+            moves[..., lost] = 0
+    differentials = None if moves is None else RayDifferentials(moves[:3], moves[3:])
+    return CameraRays(ray[:3], ray[3:], found["weight"][0], found["status"][0], differentials)
+
 
 Runtime = Literal["onnxruntime", "c", "trace"]
 # Film points, pupil squares [2, N] and wavelengths [1, N] by name to what `camera_rays` takes.
@@ -213,3 +334,27 @@ class _CompiledGraph:
         numbers, table = self._numbers.ctypes.data, self._table.ctypes.data
         self._call(count, given.ctypes.data, numbers, table, len(self._table), out.ctypes.data, places["status"])
         return found
+
+
+def axial_transmittance(scene: SceneFunction, wavelength_nm: tuple[float, float]) -> float | None:
+    """Transmittance of the axial ray at the wavelength nearest to the d line; None where the stop's shape blocks it."""
+    axis = np.zeros((2, 1), np.float32)
+    out = scene(axis, axis, np.clip([LINE_D_NM], *wavelength_nm).astype(np.float32))
+    through = float(out.transmittance[0])
+    return through if out.status[0] == st.PASSED and 0 < through <= 1 else None
+
+
+def squeeze_of(scene: SceneFunction, height_mm: float, wavelength_nm: tuple[float, float]) -> float | None:
+    """Squeeze of a lens that is known by its rays alone: one that leaves parallel to the axis at height h slopes h / f.
+
+    Rays count whether they pass or not.
+    """
+    h = height_mm
+    film = np.array([[h, -h, 0, 0], [0, 0, h, -h]], np.float32)
+    out = scene(film, film, np.clip([LINE_D_NM] * 4, *wavelength_nm).astype(np.float32))
+    with np.errstate(all="ignore"):
+        slope = out.scene_ray[3:5].astype(np.float64) / out.scene_ray[5]
+        squeeze = float((slope[0, 0] - slope[0, 1]) / (slope[1, 2] - slope[1, 3]))
+    if abs(squeeze - 1) < _ROUND:
+        return 1.0
+    return squeeze if math.isfinite(squeeze) and squeeze > 0 else None

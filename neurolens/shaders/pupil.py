@@ -19,12 +19,65 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.graph.ir import Exponents, Graph, Value
-from neurolens.shaders.blades import Blades
 from neurolens.shaders.stop_image import HAIR, StopImage, moving_polynomial
+
+MAX_BLADES = 16
+_CLOSEST = 0.05  # of the stop's radius: the middle of a pupil to an edge; nearer, or beyond it, points stay apart
+
+
+class Blades:
+    """The opening of `Aperture` of inputs of the call: `count` (below 3 the stop is round), `roundness` of its edges,
+    cosine and sine of half a blade's angle and of the first edge's direction (`half_cos`, `edge_cos` and so on).
+
+    Points are in units of the stop's radius. Edges of fewer blades repeat.
+    """
+
+    def __init__(self, g: Graph) -> None:
+        names = "count", "roundness", "half_cos", "half_sin", "edge_cos", "edge_sin"
+        count, roundness, cos, sin, *edge = (g.input(name, per_call=True) for name in names)
+        self.none = count <= 2.5
+        step_cos, step_sin = cos * cos - sin * sin, cos * sin * 2.0
+        self.edges: list[tuple[Value, Value]] = []
+        for _ in range(MAX_BLADES):
+            self.edges.append((edge[0], edge[1]))
+            edge = [edge[0] * step_cos - edge[1] * step_sin, edge[0] * step_sin + edge[1] * step_cos]
+        rise = roundness * (1.0 - cos)
+        self.curvature, self.middle = rise * 2.0 / (sin * sin + rise * rise), cos + rise
+        self.scale = 1.0 - self.curvature * self.middle
+
+    def _excess(self, point: Value) -> Value:
+        """With `scale` times the distance of a point along an edge's direction added, above 0 beyond the edge; see
+        `Aperture.opening`."""
+        return self.curvature * 0.5 * (self.middle * self.middle + point.graph.square(point)) - self.middle
+
+    def opened(self, point: Value) -> Value:
+        """Whether a point [2] lies in the opening, 1 or 0."""
+        along = reduce(Value.maximum, (point[0] * cos + point[1] * sin for cos, sin in self.edges))
+        inside = point.graph.select(along * self.scale + self._excess(point) <= 0.0, 1.0, 0.0)
+        return point.graph.select(self.none, 1.0, inside)
+
+    def drawn(self, start: Value, way: Value, margin: float) -> Value:
+        """The share of a way [2] from a point [2] on which the opening ends, 1 at most.
+
+        Beyond an edge at the share s is a s^2 + b s > c, with one end 1 / s = (b + sqrt(b^2 + 4 a c)) / 2 c.
+
+        Args:
+            margin: by which edges are moved out.
+        """
+        g = start.graph
+        a, turned = self.curvature * 0.5 * g.square(way), self.curvature * g.dot(start, way)
+        within, inverse = margin - self._excess(start), g.constant(1.0)
+        for cos, sin in self.edges:
+            along, ahead = (self.scale * (v[0] * cos + v[1] * sin) for v in (start, way))
+            b, c = ahead + turned, (within - along).maximum(_CLOSEST)
+            inverse = inverse.maximum((b + (b * b + 4.0 * a * c).sqrt()) * 0.5 / c)
+        return g.select(self.none, 1.0, 1.0 / inverse)
+
 
 Array = NDArray[np.float64]
 _NODES = ((-(0.5**0.5), 0.25), (0.0, 0.5), (0.5**0.5, 0.25))  # Gauss's nodes and weights over a disc, on a diameter
 _TIP = 1e-7  # of 1 - x^2 near the ends of a diameter
+_LEAST = 0.01  # of the widest stop's radius: a disc is nowhere narrower
 _ROUNDS = 2  # of finding the blades from the pupil's middle: the pupil's width there depends on where they are
 
 
@@ -266,3 +319,54 @@ def _series(function: Callable[[Array], Array]) -> Array:
 
 _COS = _series(lambda s: np.cos(np.pi / 4 * np.sqrt(np.maximum(s, 0))))
 _SIN = _series(lambda s: np.pi / 4 * np.sinc(np.sqrt(np.maximum(s, 0)) / 4))
+
+
+@dataclass(frozen=True)
+class PupilDisc:
+    """An ellipse that holds the passing rays of film points, in the frame of the film point (x towards it).
+
+    Attributes:
+        film_radius_mm: beyond it no light passes. unit_mm, stop_mm: units of film radius and stop, the same in all
+            states of a lens.
+        exponents: [M, 2] of film radius and stop. numbers: [3, M]: centre, half width along x and half height (mm).
+    """
+
+    film_radius_mm: float
+    unit_mm: float
+    stop_mm: float
+    exponents: Exponents
+    numbers: Array
+
+    @cached_property
+    def graph(self) -> Graph:
+        """`sampler`."""
+        return self.sampler()
+
+    def sampler(self, blades: type[Blades] | None = None, margin: float = 0.0) -> Graph:
+        """See `PupilCircles.sampler`; blades do not move points, and there is no `at_stop`."""
+        g = Graph()
+        film, disc = g.input("film_mm", 2), unit_disc(g.input("square", 2))
+        radius, turn, aside = frame_of_film_point(film)
+        size = g.input("stop_radius_mm", per_call=True) * (1 / self.stop_mm)
+        centre, wide, tall = self._rows(radius * (1 / self.unit_mm), size)
+        area = wide * tall * math.pi
+        g.outputs["pupil_mm"] = turn * (centre + wide * disc[0]) + aside * (tall * disc[1])
+        g.outputs["area_mm2"] = g.select(radius <= self.film_radius_mm, area, 0.0)
+        g.outputs["mean_area_mm2"] = area
+        return g
+
+    def _rows(self, radius: Value, size: Value) -> list[Value]:
+        """Centre and half widths, with coefficients of the call."""
+        g, powers = radius.graph, np.unique(self.exponents[:, 0])
+        rows = []
+        for numbers in self.numbers:
+            weights = np.stack([numbers[self.exponents[:, 0] == p] for p in powers])
+            coefficients = g.polynomial(np.unique(self.exponents[:, 1])[:, None], weights, size)
+            rows.append(g.dot(coefficients, g.polynomial(powers[:, None], np.eye(len(powers)), radius)))
+        return [rows[0], *(row.maximum(_LEAST * self.stop_mm) for row in rows[1:])]
+
+    def mixed(self, others: Sequence[PupilDisc], weights: Array) -> PupilDisc:
+        """The disc of a state between states, with these weights of itself and of others of the same lens."""
+        states = [self, *others]
+        radius = float(weights @ [s.film_radius_mm for s in states])
+        return replace(self, film_radius_mm=radius, numbers=np.tensordot(weights, [s.numbers for s in states], 1))

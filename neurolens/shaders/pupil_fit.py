@@ -18,11 +18,9 @@ from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Report
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Exponents
-from neurolens.shaders.pupil_circles import PupilCircles
-from neurolens.shaders.pupil_disc import PupilDisc, disc_lost, fit_discs
-from neurolens.shaders.pupil_passing import passing_share
-from neurolens.shaders.shader_lens import ShaderLens
+from neurolens.graph.ir import Exponents, Graph
+from neurolens.shaders.pupil import PupilCircles, PupilDisc
+from neurolens.shaders.shader_lens import ShaderLens, passing_share
 from neurolens.shaders.stop_image import StopImage, draw_rays, fit_stop_images
 
 Array = NDArray[np.float64]
@@ -47,6 +45,10 @@ _CALM = 1e-3  # rays, by whose force numbers stay at those that all states share
 _ALLOWED = (6e-4, 6e-4, 4e-4, 2e-4)  # shares of a zone's new rays that all circles may lose, in turn until at most
 LOST = 1e-3  # of a zone's rays are lost in all
 _NEIGHBOUR = 0.3  # of the greatest weight, which nodes beside a state have
+# Discs: film radii and stops at which extents are measured, with so many rays; highest powers of film radius and stop.
+_DISC_RADII, _DISC_STOPS, _DISC_RAYS, _DISC_POWERS = 17, (0.08, 0.16, 0.25, 0.35, 0.5, 0.7, 1.0), 20_000, (6, 3)
+_RCOND = 1e-4  # of least squares: numbers stay small enough for float32
+_DISC_CHECKED, _DISC_LOST, _DISC_STEP = 400_000, 8e-4, 1.02  # rays that check; what may be lost; widening
 _INNER = 0.1  # zones of a smaller part of what `PupilCircles.wide` grows by count as the axis
 
 
@@ -349,3 +351,78 @@ def _beside(lens: ShaderLens, image: StopImage) -> float:
     away = np.hypot(*(evaluate(image.graph, inputs)["pupil_mm"] - rays.pupil_mm)) > _BESIDE * rays.pupil_mm.std()
     part = (np.square(rays.film_mm).sum(0) / lens.film_radius_mm**2 * _ZONES[0]).astype(np.intp)
     return float((np.bincount(part, away) / np.maximum(np.bincount(part), _FEW)).max())
+
+
+def fit_discs(
+    lenses: Sequence[ShaderLens], report: Report, between: Sequence[tuple[Array, ShaderLens]] = ()
+) -> list[PupilDisc]:
+    """The disc of a lens in each of its states; arguments of `fit_pupil`."""
+    exponents = np.array([(i, j) for i in range(_DISC_POWERS[0] + 1) for j in range(_DISC_POWERS[1] + 1)])
+    unit, stop = max(x.film_radius_mm for x in lenses), max(x.stop_radius_mm for x in lenses)
+    discs = []
+    for lens in lenses:
+        disc = PupilDisc(lens.end_of_light_mm(), unit, stop, exponents, np.zeros((3, len(exponents))))
+        discs.append(replace(disc, numbers=_fitted_disc(lens, disc)))
+        report(len(discs) / (len(lenses) + 1))
+    states = [*zip(np.eye(len(discs)), lenses, strict=True), *between]
+    while max(disc_lost(discs[0].mixed(discs[1:], weights), lens) for weights, lens in states) > _DISC_LOST:
+        discs = [replace(d, numbers=d.numbers * [[1.0], [_DISC_STEP], [_DISC_STEP]]) for d in discs]
+    return discs
+
+
+def _fitted_disc(lens: ShaderLens, disc: PupilDisc) -> Array:
+    """Numbers [3, M] by asymmetric least squares on the extents of what passes: those too small weigh more."""
+    rng, extents, at = np.random.default_rng(6), [], []
+    for radius in np.linspace(0, 0.9999 * disc.film_radius_mm, _DISC_RADII):
+        for share in _DISC_STOPS:
+            size = share * lens.stop_radius_mm
+            pupil, passed = _drawn_in_boxes(lens, np.full(_DISC_RAYS, radius), np.full(_DISC_RAYS, size), rng)
+            if passed.any():
+                (x, y), scaled = pupil[:, passed], (radius / disc.unit_mm, size / disc.stop_mm)
+                centre, wide, tall = (x.max() + x.min()) / 2, (x.max() - x.min()) / 2, np.abs(y).max()
+                corners = np.hypot((x - centre) / max(wide, 1e-9), y / max(tall, 1e-9)).max()
+                extents.append((centre, wide * corners, tall * corners))
+                at.append(np.prod(np.array(scaled) ** disc.exponents, axis=1))
+    rows, wanted = np.array(at), np.array(extents).T
+    numbers = list[Array]()
+    for k, values in enumerate(wanted):
+        # A centre may lie on either side: half widths are measured about the fitted one.
+        if k == 1:
+            values = values + np.abs(wanted[0] - rows @ numbers[0])
+        weight = np.ones(len(values))
+        for _ in range(20):
+            fit = np.linalg.lstsq(rows * weight[:, None], values * weight, rcond=_RCOND)[0]
+            weight = np.where((rows @ fit < values) & (k > 0), 10.0, 1.0)
+        numbers.append(fit)
+    return np.stack(numbers)
+
+
+def _drawn_in_boxes(
+    lens: ShaderLens, radius: Array, stop: Array, rng: np.random.Generator
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Random pupil points [2, N] in the boxes of film points, in their frames, and whether rays pass there."""
+    count, radii = radius.size, np.linspace(0, lens.film_radius_mm, lens.table.rows.shape[1])
+    low, high, half = (np.interp(radius, radii, row) for row in lens.table.rows)
+    pupil = np.stack([low + (high - low) * rng.random(count), half * rng.uniform(-1, 1, count)])
+    angle = 2 * np.pi * rng.random(count) * lens.anamorphic
+    turn = np.exp(1j * angle)
+    film, turned = radius * turn, (pupil[0] + 1j * pupil[1]) * turn
+    z, nm = (rng.uniform(*span, count) for span in (lens.film_z_mm, lens.wavelength_nm))
+    film_mm, pupil_mm = (np.stack([v.real, v.imag]) for v in (film, turned))
+    return pupil, np.asarray(lens.status(film_mm, pupil_mm, nm, z, stop) == st.PASSED)
+
+
+def disc_lost(disc: PupilDisc, lens: ShaderLens) -> float:
+    """The share of random rays that pass beyond the disc, in the worst zone of film and stop."""
+    rng = np.random.default_rng(7)
+    area, share = rng.random(_DISC_CHECKED), rng.choice(_DISC_STOPS, _DISC_CHECKED)
+    radius, stop = disc.film_radius_mm * np.sqrt(area), share * lens.stop_radius_mm
+    pupil, passed = _drawn_in_boxes(lens, radius, stop, rng)
+    g = Graph()
+    g.outputs["rows"] = g.concat(*disc._rows(g.input("radius"), g.input("stop")))
+    inputs = {"radius": radius[None] / disc.unit_mm, "stop": stop[None] / disc.stop_mm}
+    centre, wide, tall = evaluate(g, inputs)["rows"]
+    out = passed & (np.hypot((pupil[0] - centre) / wide, pupil[1] / tall) > 1)
+    zone = (8 * area).astype(np.intp) * 3 + np.digitize(share, (0.3, 0.6))
+    counts, missed = (np.bincount(zone[rows], minlength=24) for rows in (passed, out))
+    return float((missed / np.maximum(counts, _FEW)).max())
