@@ -54,7 +54,7 @@ class ExactCamera(LensCamera):
         dtype: precision of the trace.
         bounds: pupil bounds of a domain that holds this focus and stop; rays are then those of the domain's models for
             the same random numbers. None searches for them, over the whole film.
-        progress: shows the search for the outline, where it was not found before (`outline_cache`).
+        progress: shows the search for the outline, where no run has kept it (`kept_outline`).
         runtime: what runs the camera. Only "trace" can compute in float64.
 
     Raises:

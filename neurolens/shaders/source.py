@@ -1,7 +1,7 @@
-"""What source code for integrators holds besides a lens's function: whole cameras, constants, focusing.
+"""Source code for other integrators: whole cameras, constants of a model, the film's position by focus and stop.
 
-A camera's program is the graph that compiled cameras run (`cameragraph`), its numbers and its table of the pupil's outline
-written in: from a film point and two random numbers to a weighted ray, at one focus and stop.
+A camera's program is the graph that compiled cameras run (`cameragraph`), with its numbers and the table of the pupil's
+outline written in: it takes a film point and two random numbers to a weighted ray, at one focus and stop.
 """
 
 from __future__ import annotations
