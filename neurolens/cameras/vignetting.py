@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import RAYS_A_CALL, CameraRays, FilmPoints, FloatArray
-from neurolens.cameras.field import Complex, end_of_light, is_round, on_rings, turns
+from neurolens.cameras.field import Complex, end_of_light, on_rings, turns
 from neurolens.cameras.sampling import common_light, stratified
 from neurolens.lens.shot import Vignetting
 
@@ -37,7 +37,8 @@ Array = NDArray[np.float64]
 
 # Rings, azimuths and samples a side of the tables, of round cameras and of others.
 _ROUND, _OTHER = (129, 1, 64), (33, 36, 24)
-_TRIED = 7, 16  # azimuths and samples a side that look for the end of the light
+# Where roundness is tried, at azimuths of which none is the mirror image of another; of the largest value.
+_TRIED, _AROUND, _UNEVEN = (0.5, 0.8, 0.95), np.exp(0.83j * np.arange(7)), 0.01
 _BATCH = 1 << 17
 
 
@@ -64,12 +65,11 @@ class Vignetted:
         self.rays_a_call = getattr(camera, "rays_a_call", RAYS_A_CALL)
         self.settings: dict[str, Any] = {**camera.settings, "vignetting": vignetting}
         light = common_light(camera.wavelength_nm or wavelength_nm, wavelength_nm)
-        rings, azimuths, side = _ROUND if is_round(camera) else _OTHER
-        around = turns(_TRIED[0])
-        self._end = end_of_light(
-            lambda r: bool((_means(camera, light, r * around, _TRIED[1])[0] > 0).any()),
-            1.0001 * math.hypot(*camera.film_mm) / 2,
-        )
+        corner = 1.0001 * math.hypot(*camera.film_mm) / 2
+        self._end = end_of_light(lambda r: bool((_means(camera, light, r * _AROUND, 16)[0] > 0).any()), corner)
+        tried = _means(camera, light, self._end * np.outer(_TRIED, _AROUND).reshape(-1), _OTHER[2])[0]
+        uneven = np.ptp(tried.reshape(len(_TRIED), -1), axis=1) > _UNEVEN * tried.max()
+        rings, azimuths, side = _OTHER if uneven.any() else _ROUND
         radius = self._end * (1 - (1 - np.arange(rings) / (rings - 1)) ** 2)
         means = _means(camera, light, (radius[:, None] * turns(azimuths)).reshape(-1), side)
         value, optical = (m.reshape(rings, azimuths) for m in means)
@@ -77,8 +77,7 @@ class Vignetted:
         natural = np.where(optical > 0, value / np.where(optical > 0, optical, 1) / value[0].mean(), np.nan)
         for row in range(1, rings):  # where it is dark, as where light was last
             natural[row] = np.where(np.isnan(natural[row]), natural[row - 1], natural[row])
-        wanted = {"natural": natural, "optical": optical, "none": np.ones_like(value), "both": value}
-        self._value, self._wanted = value, wanted[vignetting]
+        self._cards = {"natural": natural, "optical": optical, "none": np.ones_like(value), "both": value}
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """The camera's rays, weighed anew."""
@@ -105,7 +104,7 @@ class Vignetted:
         radius = np.hypot(x, y)
         place = 1 - np.sqrt(1 - np.minimum(radius / self._end, 1))  # rings are equal steps of it
         point = (x + 1j * y) / np.where(radius > 0, radius, 1) * place
-        value, wanted = (on_rings(table, 1.0, point) for table in (self._value, self._wanted))
+        value, wanted = (on_rings(table, 1.0, point) for table in (self._cards["both"], self._cards[self.vignetting]))
         lit = (value > 0) & (rays.weight > 0)
         factor = np.where(lit, np.maximum(wanted, 0) / np.where(lit, value, 1), 0)
         return replace(rays, weight=np.where(lit, rays.weight * factor, 0).astype(np.float32))
