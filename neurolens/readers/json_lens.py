@@ -49,13 +49,11 @@ AGREES = 1e-4  # relative: more than rounding of the printed figures, less than 
 _NUMBER = r"(?<![0-9.])([0-9]{1,9}(?:\.[0-9]{1,9})?)"  # bounded: a search tries every place
 
 
-def read_json_lens(path: str | Path, options: ReadOptions | None = None, *, catalogue: bool = True) -> Lens:
+def read_json_lens(path: str | Path, options: ReadOptions | None = None) -> Lens:
     """Return the lens of a JSON file, unfocused.
 
     Args:
         options: name and source that replace those of the file; f-number and half field for a file that states none.
-        catalogue: set `Surface.glass` where the named glass is in the catalogue with the same figures; without it the
-            figures of the file rule over all colours.
 
     Warns:
         NeurolensWarning: for everything left out, computed or doubtful.
@@ -80,7 +78,7 @@ def read_json_lens(path: str | Path, options: ReadOptions | None = None, *, cata
         found = f"({len(rows)} of them)" if isinstance(rows, list) else rows
         raise table.error("surfaces", found, f"a list of 1 to {MAX_SURFACES} objects")
     last = len(rows) - 1
-    surfaces = tuple(_surface(row, k, file, k == last, catalogue) for k, row in enumerate(rows))
+    surfaces = tuple(_surface(row, k, file, k == last) for k, row in enumerate(rows))
     notes, estimated = table.text("notes", required=False), table.flag("diameters_estimated")
     if not estimated and _tells_of_other_diameters(notes):
         warn(file, "the notes tell of diameters that are not the source's; rims are taken as estimated")
@@ -149,7 +147,7 @@ def _load(path: str | Path) -> dict[str, Any]:
     return data
 
 
-def _surface(given: Any, k: int, file: str, is_last: bool, catalogue: bool) -> Surface:
+def _surface(given: Any, k: int, file: str, is_last: bool) -> Surface:
     if not isinstance(given, Mapping):
         raise InputError(file, f"surface {k}", given, "an object with radius_mm, thickness_mm, diameter_mm")
     row = Table(given, file, f"surface {k}, ")
@@ -172,11 +170,12 @@ def _surface(given: Any, k: int, file: str, is_last: bool, catalogue: bool) -> S
         conic=row.optional("conic", above=None) or 0.0,
         asphere=tuple((p, a) for p, a in terms if a),
         cylinder=SHAPES[shape],
-        **_glass(row, catalogue),
+        **_glass(row),
     )
 
 
-def _glass(row: Table, catalogue: bool) -> dict[str, Any]:
+def _glass(row: Table) -> dict[str, Any]:
+    """Read a glass; it is that of the catalogue where the named one has the same figures."""
     if row.data.get("n_d") is None:
         for key in ("V_d", "material"):
             if row.data.get(key) not in (None, "air"):
@@ -185,8 +184,7 @@ def _glass(row: Table, catalogue: bool) -> dict[str, Any]:
     n_d = row.number("n_d", above=0)
     V_d = row.optional("V_d")
     material = _optional_text(row, "material") or None
-    glass = same_glass(material, n_d, V_d) if catalogue else None
-    return {"n_d": n_d, "V_d": V_d, "material": material, "glass": glass}
+    return {"n_d": n_d, "V_d": V_d, "material": material, "glass": same_glass(material, n_d, V_d)}
 
 
 def _optional_text(table: Table, key: str) -> str:

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +27,10 @@ def singlet(**changes: Any) -> dict[str, Any]:
     return {"name": "singlet", "source": "a book, p. 1", "f_number": 6, "surfaces": rows, **changes}
 
 
-def read(data: object, tmp_path: Path, options: ReadOptions | None = None, **more: Any) -> Lens:
+def read(data: object, tmp_path: Path, options: ReadOptions | None = None) -> Lens:
     path = tmp_path / "lens.json"
     path.write_text(data if isinstance(data, str) else json.dumps(data))
-    return read_json_lens(path, options, **more)
+    return read_json_lens(path, options)
 
 
 @pytest.mark.skipif(not SHARED, reason="../shared/data is not here")
@@ -37,7 +38,8 @@ def test_reference_set_agrees_with_its_own_figures() -> None:
     """EFL and back focus to the digits printed, in both meridians of the anamorphic ones."""
     for path in SHARED:
         data = json.loads(path.read_text())
-        lens = read_json_lens(path, catalogue=False)
+        lens = read_json_lens(path)
+        lens = replace(lens, surfaces=tuple(replace(s, glass=None) for s in lens.surfaces))
         assert len(lens.surfaces) == len(data["surfaces"])
         for axis, suffix in (("y", ""), ("y", "_y"), ("x", "_x")):
             computed, found = data["computed_at_nd"], first_order(lens, meridian=axis)  # type: ignore[arg-type]
@@ -100,13 +102,12 @@ def test_field(text: str | None, image_radius_mm: float | None, half_field_deg: 
 
 
 def test_a_named_glass_is_that_of_the_catalogue_where_the_figures_agree(tmp_path: Path) -> None:
-    def glass(n_d: float, V_d: float, **more: Any) -> str | None:
+    def glass(n_d: float, V_d: float) -> str | None:
         rows = [row(50, 5, n_d, V_d=V_d, material="N-BK7"), *singlet()["surfaces"][1:]]
-        return read(singlet(surfaces=rows), tmp_path, **more).surfaces[0].glass
+        return read(singlet(surfaces=rows), tmp_path).surfaces[0].glass
 
     assert glass(1.5168, 64.17) == "N-BK7"
     assert glass(1.517, 64.2) is None and glass(1.5168, 60.0) is None
-    assert glass(1.5168, 64.17, catalogue=False) is None
 
 
 def test_rims_of_doubtful_origin_are_marked(tmp_path: Path) -> None:
