@@ -45,7 +45,7 @@ PACKAGES = {
     "setting": {"numpy", "torch"},
     "analysis": {"numpy", "torch", "matplotlib"},
     "mitsuba": {"numpy"},
-    "readers": set(),
+    "readers": {"numpy"},
     "cameras": {"numpy", "onnxruntime"},
     "shaders": {"numpy"},
     "render": {"numpy", "OpenEXR", "PIL"},

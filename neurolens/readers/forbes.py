@@ -14,6 +14,9 @@ import math
 from collections.abc import Callable, Sequence
 from decimal import Context, Decimal, localcontext
 
+from numpy.polynomial import Polynomial
+from numpy.polynomial.polynomial import polyval
+
 from neurolens.readers.source import MAX_POWER
 
 CLOSE_MM, WORST_MM = 1e-11, 1e-9  # of sag, in the unit of the heights: what is aimed at, and what steep conics get
@@ -25,114 +28,81 @@ Terms = tuple[tuple[int, float], ...]
 
 
 def qcon_terms(a: Sequence[float], radius: float, rim: float) -> Terms:
-    """Powers of the height and their coefficients of a Qcon departure; ValueError where float64 cannot hold them.
+    """Return the powers of the height of a Qcon departure with their coefficients.
 
     Args:
         a: a_0, a_1, ... radius: normalisation radius. rim: height up to which the surface is used.
+
+    Raises:
+        ValueError: float64 cannot hold the coefficients.
     """
-    found = [Decimal(0)] * (len(a) + 2)
+    in_x = [Decimal(0)] * (len(a) + 2)
     with localcontext(Context(prec=_DIGITS)):
         for m, value in enumerate(a):
             for k in range(m + 1):
-                found[k + 2] += (-1) ** (m + k) * math.comb(m, k) * math.comb(m + k + 4, m) * Decimal(value)
-        return _powers(found, radius, rim)
+                in_x[k + 2] += (-1) ** (m + k) * math.comb(m, k) * math.comb(m + k + 4, m) * Decimal(value)
+        return _powers(in_x, radius, rim)
 
 
 def qbfs_terms(a: Sequence[float], radius: float, curvature: float, rim: float, conic: float = 0.0) -> Terms:
-    """The terms of a Qbfs departure from a conic, as of `qcon_terms`; ValueError where the conic is too steep."""
+    """Return the terms of a Qbfs departure from a conic; see `qcon_terms`. ValueError where the conic is too steep."""
     with localcontext(Context(prec=_DIGITS)):
-        s2, k, reach = (
-            (Decimal(curvature) * Decimal(radius)) ** 2,
-            Decimal(conic),
-            (Decimal(rim) / Decimal(radius)) ** 2,
-        )
+        s2, k = (Decimal(curvature) * Decimal(radius)) ** 2, Decimal(conic)
+        reach = (Decimal(rim) / Decimal(radius)) ** 2
         if (1 + k) * s2 * reach >= 1:
             raise ValueError("a rim inside the conic")
 
         def inverse_cosine(x: Decimal) -> Decimal:
             return ((1 - k * s2 * x) / (1 - (1 + k) * s2 * x)).sqrt()
 
-        x_1mx = [Decimal(0), Decimal(1), Decimal(-1)]
-        form = _product(x_1mx, _qbfs_sum(a))
+        form = _polynomial(0, 1, -1) * _qbfs_sum(a)
         samples = [reach * k / (_SAMPLES - 1) for k in range(_SAMPLES)]
-        exact = [_at(form, x) * inverse_cosine(x) for x in samples]
-        for degree in range(0, MAX_POWER // 2 - len(form) + 2):
-            found = _product(form, _interpolated(inverse_cosine, reach, degree))
-            off = max(abs(_at(found, x) - y) for x, y in zip(samples, exact, strict=True))
+        exact = [polyval(x, form.coef) * inverse_cosine(x) for x in samples]
+        for degree in range(MAX_POWER // 2 - max(len(a), 1)):
+            found = form * _interpolated(inverse_cosine, reach, degree)
+            off = max(abs(polyval(x, found.coef) - y) for x, y in zip(samples, exact, strict=True))
             if off <= Decimal(CLOSE_MM):
                 break
         if off > Decimal(WORST_MM):
             raise ValueError(f"a conic that powers up to {MAX_POWER} follow to {WORST_MM:g}")
-        return _powers(found, radius, rim)
+        return _powers(found.coef, radius, rim)
 
 
-def _qbfs_sum(a: Sequence[float]) -> list[Decimal]:
-    """sum a_m Qbfs_m(x) in powers of x, by the recurrence of Forbes, Opt. Express 18, 19700 (2010), appendix A."""
+def _qbfs_sum(a: Sequence[float]) -> Polynomial:
+    """Return sum a_m Qbfs_m(x), by the recurrence of Forbes, Opt. Express 18, 19700 (2010), appendix A."""
     d = Decimal
-    total = [d(0)] * max(len(a), 1)
-    p_before, p = [d(2)], [d(6), d(-8)]
-    q_before, q = [d(1)], list[Decimal]()
+    p = [_polynomial(2), _polynomial(6, -8)]
+    q = [_polynomial(1), _polynomial(13, -16) / d(19).sqrt()]
     f, g, h = [d(2), d(19).sqrt() / 2], [d(-1) / 2], list[Decimal]()
-    for m, value in enumerate(a):
-        if m == 0:
-            now = q_before
-        else:
-            if m > 1:
-                h.append(-d(m * (m - 1)) / (2 * f[m - 2]))
-                g.append(-(1 + g[m - 2] * h[m - 2]) / f[m - 1])
-                f.append((m * (m + 1) + 3 - g[m - 1] ** 2 - h[m - 2] ** 2).sqrt())
-                p_before, p = p, _sum(_product([d(2), d(-4)], p), p_before, -1)
-            now = _sum(p, q if m > 1 else q_before, -g[m - 1])
-            if m > 1:
-                now = _sum(now, q_before, -h[m - 2])
-                q_before = q
-            now = [c / f[m] for c in now]
-            q = now
-        for k, c in enumerate(now):
-            total[k] += Decimal(value) * c
-    return total
+    for m in range(2, len(a)):
+        h.append(-d(m * (m - 1)) / (2 * f[m - 2]))
+        g.append(-(1 + g[m - 2] * h[m - 2]) / f[m - 1])
+        f.append((m * (m + 1) + 3 - g[m - 1] ** 2 - h[m - 2] ** 2).sqrt())
+        p.append(_polynomial(2, -4) * p[m - 1] - p[m - 2])
+        q.append((p[m] - q[m - 1] * g[m - 1] - q[m - 2] * h[m - 2]) / f[m])
+    return sum((term * d(value) for value, term in zip(a, q, strict=False)), _polynomial(0))
 
 
-def _interpolated(function: Callable[[Decimal], Decimal], reach: Decimal, degree: int) -> list[Decimal]:
+def _interpolated(function: Callable[[Decimal], Decimal], reach: Decimal, degree: int) -> Polynomial:
     """Return the polynomial through a function of x in Chebyshev's points of [0, reach]."""
     nodes = [reach / 2 * (1 - Decimal(math.cos(math.pi * (k + 0.5) / (degree + 1)))) for k in range(degree + 1)]
     table = [function(x) for x in nodes]
     for order in range(1, degree + 1):  # Newton's divided differences
         for k in range(degree, order - 1, -1):
             table[k] = (table[k] - table[k - 1]) / (nodes[k] - nodes[k - order])
-    found = [table[-1]]
-    for k in range(degree - 1, -1, -1):
-        found = _sum(_product([-nodes[k], Decimal(1)], found), [table[k]])
+    found = _polynomial(table[-1])
+    for x, value in zip(nodes[-2::-1], table[-2::-1], strict=True):
+        found = _polynomial(-x, 1) * found + value
     return found
 
 
 def _powers(in_x: Sequence[Decimal], radius: float, rim: float) -> Terms:
-    """Powers of the height of a polynomial in x; ValueError where its terms cancel beyond what float64 holds."""
+    """Return the powers of the height of a polynomial in x; ValueError where its terms cancel beyond float64."""
     terms = tuple((2 * k, float(c / Decimal(radius) ** (2 * k))) for k, c in enumerate(in_x) if c)
     if sum(abs(a) * rim**p for p, a in terms) * 2.0**-52 > _ROUNDING:
         raise ValueError("fewer terms: powers of the height cancel in float64")
     return terms
 
 
-def _product(a: Sequence[Decimal], b: Sequence[Decimal]) -> list[Decimal]:
-    found = [Decimal(0)] * (len(a) + len(b) - 1)
-    for i, p in enumerate(a):
-        for k, q in enumerate(b):
-            found[i + k] += p * q
-    return found
-
-
-def _sum(a: Sequence[Decimal], b: Sequence[Decimal], factor: Decimal | int = 1) -> list[Decimal]:
-    longer = [Decimal(0)] * max(len(a), len(b))
-    for k, p in enumerate(a):
-        longer[k] += p
-    for k, q in enumerate(b):
-        longer[k] += factor * q
-    return longer
-
-
-def _at(a: Sequence[Decimal], x: Decimal) -> Decimal:
-    total = Decimal(0)
-    for c in reversed(a):
-        total = total * x + c
-    return total
+def _polynomial(*coefficients: Decimal | int) -> Polynomial:
+    return Polynomial([Decimal(c) for c in coefficients])

@@ -29,7 +29,7 @@ def test_qcon_is_its_jacobi_polynomial(rim: float) -> None:
 
 def _qbfs(m: int):  # type: ignore[no-untyped-def]
     """Qbfs_m as a polynomial, from the unit vectors of the sum."""
-    coefficients = [mp.mpf(str(c)) for c in _qbfs_sum([0.0] * m + [1.0])]
+    coefficients = [mp.mpf(str(c)) for c in _qbfs_sum([0.0] * m + [1.0]).coef]
     return lambda x: sum(c * x**k for k, c in enumerate(coefficients))
 
 
