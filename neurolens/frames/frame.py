@@ -10,23 +10,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from neurolens import __version__
-from neurolens.base.errors import InputError, warn
+from neurolens.base.errors import InputError, NeurolensError, warn
 from neurolens.base.files import check_writable
 from neurolens.base.lensname import Named, resolve
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain
 from neurolens.cameras.build import make_camera
-from neurolens.cameras.contract import Camera
+from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.lens.shot import FocusMode, Shot, Vignetting
-from neurolens.render.colour import check_name
+from neurolens.render.colour import COLOUR_SPACES, SRGB, ColourSpace, check_name, conversion, converted
 from neurolens.render.film import PixelGrid
+from neurolens.render.job import MEANING
+from neurolens.render.pictures import standard_attributes
 from neurolens.render.renderer import RenderResult, Watch, render
 from neurolens.render.scene import CameraSettings, Scene, files_named, load_scene, seen_from
 from neurolens.render.settings import (
@@ -36,30 +38,17 @@ from neurolens.render.settings import (
     WavelengthSampling,
     size_by_shape,
 )
-from neurolens.render.tiles import rows_of, tile_path
-
-if TYPE_CHECKING:
-    from neurolens.lens.apertures import Aperture
-
-
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict
-from typing import TYPE_CHECKING
-
-from neurolens.base.errors import NeurolensError
-from neurolens.cameras.contract import FloatArray
-from neurolens.render.colour import COLOUR_SPACES, SRGB, ColourSpace, conversion, converted
-from neurolens.render.job import MEANING
-from neurolens.render.pictures import standard_attributes
-from neurolens.render.tiles import windows
+from neurolens.render.tiles import rows_of, tile_path, windows
 
 if TYPE_CHECKING:
     from neurolens.flare.canvas import Raster
     from neurolens.flare.layers import Choice
+    from neurolens.lens.apertures import Aperture
     from neurolens.lens.prescription import Lens
 
 Vector = tuple[float, float, float]
+Layers = dict[str, FloatArray]
+_CHOICE_FRAMES = 16  # of an animation, which decide the brightest lights and ghosts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,10 +244,6 @@ def _pixel_notes(camera: Camera, width: int) -> list[str]:
     error = (camera.settings.get("card") or {}).get("errors", {}).get("rms_um") or 0.0
     pixel = 1e3 * camera.film_mm[0] / width
     return [f"the model's RMS error of {error:.3g} um is more than a pixel, {pixel:.3g} um"] if error > pixel else []
-
-
-_CHOICE_FRAMES = 16  # of an animation, which decide the brightest lights and ghosts
-Layers = dict[str, FloatArray]
 
 
 def render_frame(

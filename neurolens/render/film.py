@@ -31,7 +31,6 @@ from neurolens.render.settings import FilmSettings
 if TYPE_CHECKING:
     from neurolens.render.job import Job
 
-
 BATCH = 32768  # paths; fewer, and calling numpy costs more than computing; many more, and their state leaves the cache
 SAMPLES_A_PASS = 16
 
