@@ -264,17 +264,15 @@ def _header(file: str | Path, field: str, path: Path) -> dict[str, Any]:
 @contextmanager
 def _whole(file: str | Path, field: str, path: Path) -> Iterator[None]:
     """Turn errors of reading an OpenEXR file inside the block into InputError."""
-    alone = str(file) == str(path)
     try:
         yield
     except (InputError, MemoryError):
         raise
-    except OSError as error:
-        found = "(missing)" if alone else str(path)
-        raise InputError(file, field, found, f"an OpenEXR file that exists ({error.strerror})") from None
-    except Exception as error:  # the library raises bare RuntimeError, ValueError and its own
-        found = f"({error})" if alone else str(path)
-        raise InputError(file, field, found, f"a whole OpenEXR file ({error})") from None
+    except Exception as error:  # the library raises bare RuntimeError, ValueError, OSError and its own
+        missing = error.strerror if isinstance(error, OSError) else None
+        expected = f"an OpenEXR file that exists ({missing})" if missing else f"a whole OpenEXR file ({error})"
+        found = "(missing)" if missing else f"({error})"
+        raise InputError(file, field, found if str(file) == str(path) else str(path), expected) from None
 
 
 @contextmanager
