@@ -373,10 +373,10 @@ def shorten() -> None:
     fields: dict[tuple[Any, ...], Any] = {}
     field_of = flare_run.Shots._field
 
-    def field(shots: flare_run.Shots, args: argparse.Namespace, *rest: Any) -> Any:
+    def field(shots: flare_run.Shots, args: Any, *rest: Any) -> Any:
         if args.file != Path("good.toml"):
             return field_of(shots, args, *rest)
-        key = args.film, args.focus_m, args.f_number, args.zoom, args.focal_length_mm, args.field_deg, args.focus_mode
+        key = args.film, args.state
         if key not in fields:
             fields[key] = field_of(shots, args, *rest)
         return fields[key]

@@ -29,7 +29,8 @@ from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_path, atomic_write_text, write_json
 from neurolens.base.progress import Progress, Report
 from neurolens.base.records import plain
-from neurolens.cli.arguments import QUIET_HELP, add_option, add_output, whole
+from neurolens.base.settings import whole
+from neurolens.cli.arguments import QUIET_HELP
 from neurolens.lens.prescription import Lens
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
@@ -51,9 +52,14 @@ def lens_of(name: str | Path, **state: Any) -> Lens:
 Option = Callable[[argparse.ArgumentParser], object]
 
 
-def option(*names: str, **settings: Any) -> Option:
-    """An option with the arguments of `add_option`."""
-    return lambda parser: add_option(parser, *names, **settings)
+def option(*names: str, old: Sequence[str] = (), **settings: Any) -> Option:
+    """An option with the arguments of `add_argument`; `old` spellings still work, and the help does not show them."""
+
+    def add(parser: argparse.ArgumentParser) -> None:
+        action = parser.add_argument(*names, **settings)
+        parser._option_string_actions.update(dict.fromkeys(old, action))
+
+    return add
 
 
 def count(name: str, default: int | None, text: str, least: int = 1, most: int | None = None) -> Option:
@@ -67,7 +73,10 @@ def out(folder: Path = RESULTS, what: str = "folder for the tables") -> Option:
 
     def add(parser: argparse.ArgumentParser) -> None:
         shown = place.relative_to(ROOT)
-        add_output(parser, "DIR", f"{what} (default: {shown})", default=place)
+        option(
+            "-o", "--output", old=("--out",), dest="out", metavar="DIR", type=Path, default=place,
+            help=f"{what} (default: {shown})",
+        )(parser)  # fmt: skip
         if place != folder:
             text = f"the folder is {folder.relative_to(ROOT)}, which the README shows"
             parser.add_argument("--commit", dest="out", action="store_const", const=folder, help=text)

@@ -15,6 +15,7 @@ import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,8 @@ from neurolens.base.errors import InputError, printable
 from neurolens.base.files import atomic_write_text, write_json
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain, versions
-from neurolens.cli.arguments import add_glass, add_lens, check_ids, check_run_folder, whole
+from neurolens.base.settings import add_options, whole
+from neurolens.cli.arguments import Glasses, check_ids, check_run_folder, named_lens
 from neurolens.graph.scalars import MOST_WEIGHTS
 from neurolens.study.describe import lens_files
 from neurolens.study.experiment import DomainChoice, EvaluationChoice, LensChoice
@@ -37,7 +39,10 @@ DEFAULT_LENSES = (
     "laikin_double_gauss_50", "ogawa_zoom_70_200", "schaefter_primoplan_100", "horimoto_fisheye_16", "phone_lens_6"
 )  # fmt: skip
 OPTIONS = (
-    lambda parser: add_lens(parser, "lenses", nargs="*"),
+    lab.option(
+        "lenses", metavar="LENS", nargs="*", type=partial(named_lens, False, False),
+        help="lens file of any format, or its name in lenses/",
+    ),
     lab.option("--library", action="store_true", help="every lens file of lenses/"),
     lab.option(
         "--methods", metavar="METHOD", nargs="+", default=[],
@@ -51,7 +56,7 @@ OPTIONS = (
     lab.option("--threads", metavar="N", type=whole(1, 256), default=1, help="threads of the race (default 1)"),
     lab.option("--restart", action="store_true", help="make the records of the chosen rows again"),
     lab.out(lab.ROOT / "runs" / "surrogates", "folder"),
-    add_glass,
+    lambda parser: add_options(parser, Glasses),
 )  # fmt: skip
 
 

@@ -19,7 +19,7 @@ from experiments import lab
 from experiments.lab import Report, Row
 from neurolens.base import status as st
 from neurolens.base.progress import Progress
-from neurolens.cli.arguments import whole
+from neurolens.base.settings import whole
 from neurolens.lens.prescription import Lens
 from neurolens.setting.pupils import camera_rays
 from neurolens.study.candidates import COMPILED_BATCHES, EAGER_BATCHES

@@ -1,6 +1,5 @@
 """`neurolens render` when things go wrong: signals, places that cannot be written, checkpoints."""
 
-import argparse
 import errno
 import os
 import re
@@ -20,7 +19,7 @@ from PIL import Image
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cli import main
-from neurolens.cli.render_frames import frames_of
+from neurolens.cli.keys import frames_of
 from neurolens.render.pictures import read_exr, read_layers, write_exr
 
 
@@ -237,7 +236,6 @@ KEYS = "frame,focus,f-number,position\n1,,2,0/0.5/5\n2,1,,\n3,,8,1/0.5/5\n4,inf,
 
 def test_keys_of_files(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """CSV and JSON say what the same keys do on the command line; an error names the file, the row and the column."""
-    args = argparse.Namespace(frames=range(1, 6), focus_m=None, f_number=None, position_m=None)
     words = ["focus=2:1,4:inf", "f-number=1:2,3:8", "position=1:0/0.5/5,3:1/0.5/5"]
     csv, js = tmp_path / "keys.csv", tmp_path / "keys.JSON"
     csv.write_text(KEYS)
@@ -245,9 +243,9 @@ def test_keys_of_files(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
         '[{"frame": 1, "f-number": 2, "position": [0, 0.5, 5]}, {"frame": 2, "focus": 1.0},'
         '{"frame": 3, "f-number": 8, "position": [1, 0.5, 5]}, {"frame": 4, "focus": "inf"}]'
     )
-    expected = list(frames_of(argparse.Namespace(**vars(args), key=words)))
+    expected = list(frames_of(range(1, 6), words, {}, "render"))
     for file in (csv, js):
-        assert list(frames_of(argparse.Namespace(**vars(args), key=[str(file)]))) == expected
+        assert list(frames_of(range(1, 6), [str(file)], {}, "render")) == expected
     start = ("render", scene, "--camera", "thin", "-o", tmp_path / "b.exr", "--frames", "1:2", "--key", csv)
     for text, said in (
         ("frame,iso\n1,100\n", "row 1, iso"),
@@ -294,7 +292,9 @@ def test_frames_follow_their_keys_and_what_exists_is_kept(
     # A frame that was interrupted goes on; one that fails ends the run.
     (tmp_path / "a.0001.exr.part").write_bytes(b"")
     asked: list[str] = []
-    monkeypatch.setattr("neurolens.cli.render._render", lambda _, made, *__: asked.append(made.files.out.name) or 3)
+    monkeypatch.setattr(
+        "neurolens.cli.render.Render._render", lambda _, made, *__: asked.append(made.files.out.name) or 3
+    )
     assert main([*command, "-o", str(tmp_path / "a.exr")]) == 3 and asked == ["a.0001.exr"]
     capsys.readouterr()
     for wrong, words in (

@@ -18,9 +18,9 @@ from command_line import failure
 
 from experiments import fuzz
 from neurolens import cli
-from neurolens.base.config import apply_overrides
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, open_regular
+from neurolens.base.settings import apply_overrides
 from neurolens.base.tomlfile import read_toml
 from neurolens.lens import catalogue
 from neurolens.readers.any_format import read_any

@@ -19,7 +19,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs" / "pages").rglob("*.md")), R
 BLOCK = re.compile(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```|^ {4}(\S[^\n]*)$|`([^`\n]+)`', re.MULTILINE | re.DOTALL)
 PROGRAMS = re.compile(r"(neurolens|python -m experiments|make) (?=[a-z-])")
 PARSER = build_parser()
-WRITTEN = {"out", "layout", "layouts", "breathing", "fit"}  # what options name that a command writes
+WRITTEN = {"out", "output", "layout", "layouts", "breathing", "fit"}  # what options name that a command writes
 
 
 def lines_of(page: Path) -> Iterator[tuple[str, bool]]:
@@ -52,7 +52,7 @@ def check(line: str, words: list[str], made: set[Path]) -> None:
             file = Path(split_kind(each)[1]) if name == "camera" and isinstance(each, str) else each
             if isinstance(file, Path) and name not in WRITTEN and file.name not in {"list", *lensname.IDEAL}:
                 assert exists(file, made), f"{line}: nothing makes {file}"
-    if (out := getattr(args, "out", None)) is not None:
+    if (out := getattr(args, "output", None) or getattr(args, "out", None)) is not None:
         assert exists(out.parent, made) or "runs" in out.parts, f"{line}: no folder {out.parent}"
         tiles = [out.with_name(f"{out.stem}.tile-*{out.suffix}")] if getattr(args, "tile", None) else []
         made.update({out, out.with_suffix(".png"), *tiles})

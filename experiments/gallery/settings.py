@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from neurolens.base.config import from_dict
 from neurolens.base.errors import InputError
+from neurolens.base.settings import from_dict
 from neurolens.base.tomlfile import read_toml, suggestion
 from neurolens.cameras.vignetting import Vignetting
 from neurolens.surrogates.fit import ModelSettings

@@ -1,4 +1,4 @@
-"""What a lens, a stop and a film can be, wherever one is asked for: beyond, searches take minutes or find no light."""
+"""Bounds that every input keeps: beyond them searches take minutes or find no light."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ F_NUMBER = 0.1, 10_000.0
 FOCAL_MM = 1e-3, 1e6
 FILM_MM = 1e-3, 1e4  # a side
 WAVELENGTH_NM = 100.0, 20_000.0  # from lithography to thermal cameras
-RANGE = "range"  # as a zoom position: all of them
+RANGE = "range"  # a zoom position that stands for all of them
 
 
 def within(bounds: tuple[float, float], value: float) -> bool:
-    """Whether a value lies between two bounds; NaN does not."""
+    """True for a value between two bounds, False for NaN."""
     return bounds[0] <= value <= bounds[1]
 
 

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 from neurolens import __version__
 from neurolens.base.errors import NeurolensError, one_line
-from neurolens.base.files import own_folder
+from neurolens.base.files import cache_folder
 from neurolens.base.tasks import Failed, Lost, Shared, answer_of, cores, failure
 
 R = TypeVar("R")
@@ -59,9 +59,9 @@ class Dask(ThreadPoolExecutor):
 
     @property
     def room(self) -> int:
-        """How many tasks the cluster takes: one for each thread of its workers.
+        """The number of tasks that the cluster takes: one for each thread of its workers.
 
-        None is sent ahead, because Dask blames all tasks that a worker has when it is killed.
+        No task is sent ahead, because Dask blames all tasks that a worker has when it is killed.
         """
         if time.monotonic() > self._asked + _ASK_EVERY_S:
             client = self._client()
@@ -215,7 +215,7 @@ class _Cluster:
         with dask.config.set(quiet):
             cluster = self._distributed.LocalCluster(
                 n_workers=workers, threads_per_worker=1, host="127.0.0.1", security=Security.temporary(),
-                dashboard_address="127.0.0.1:0", local_directory=str(own_folder("dask")),
+                dashboard_address="127.0.0.1:0", local_directory=str(cache_folder("dask")),
                 silence_logs=logging.CRITICAL, memory_limit=0,
             )  # fmt: skip
         cluster.scheduler.http_server.stop()

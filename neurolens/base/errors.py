@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -63,3 +65,16 @@ class AssumedWarning(NeurolensWarning):
 def warn(text: str) -> None:
     """Warn with a NeurolensWarning, which the command line prints to stderr."""
     warnings.warn(text, NeurolensWarning, stacklevel=2)
+
+
+@contextmanager
+def warned(file: str | Path = "") -> Iterator[list[str]]:
+    """Collect the NeurolensWarnings of the block, each once and without the name of the file, and show none of them."""
+    texts: list[str] = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", NeurolensWarning)
+        try:
+            yield texts
+        finally:
+            own = (str(w.message) for w in caught if issubclass(w.category, NeurolensWarning))
+            texts += dict.fromkeys(text.removeprefix(f"{file}: ") for text in own)

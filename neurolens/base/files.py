@@ -189,21 +189,18 @@ def read_bytes(
     return data
 
 
-def cache_folder() -> Path:
-    """`neurolens` in $XDG_CACHE_HOME or ~/.cache; where that is not this user's alone, a folder of this process."""
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    folder = Path(home) / "neurolens"
-    return folder if _is_own_folder(folder) else Path(_folder_of_process().name)
+def cache_folder(name: str = "") -> Path:
+    """`neurolens` in $XDG_CACHE_HOME or ~/.cache, or a folder of that name in it.
 
-
-def own_folder(name: str) -> Path:
-    """A folder of the cache for what another library keeps and runs; of this process where it is not the user's."""
-    folder = cache_folder() / name
-    return folder if _is_own_folder(folder) else Path(_folder_of_process().name)
+    A folder that is not this user's alone is replaced by one of this process: others could put code there.
+    """
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "neurolens"
+    own = _is_own_folder(folder) and _is_own_folder(folder / name)
+    return folder / name if own else Path(_folder_of_process().name)
 
 
 def _is_own_folder(folder: Path) -> bool:
-    """Make a folder unless it is there, and say whether it is this user's, and nobody else can write to it."""
+    """Make a folder if it is missing; True if it is this user's and nobody else can write to it."""
     with suppress(OSError):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         found = folder.lstat()
@@ -250,7 +247,7 @@ def _remove_folders_of_killed() -> None:
 
 
 def _mine(found: os.stat_result) -> bool:
-    """What others can write to, others can put code into."""
+    """True for a file or folder of this user that nobody else can write to, so that nobody else can put code there."""
     return hasattr(os, "getuid") and found.st_uid == os.getuid() and not found.st_mode & 0o022
 
 
@@ -300,7 +297,7 @@ def safe_name(text: str) -> str:
 
 
 def place_inside(folder: Path, entry: str) -> Path:
-    """Where an archive's entry belongs in a folder.
+    """The path of an archive's entry in a folder.
 
     Raises:
         ValueError: a name that leads out of the folder, or none that a file can have.
@@ -335,12 +332,12 @@ def write_json(path: str | Path, data: Any) -> None:
 
 
 def write_kept(path: Path, data: Mapping[str, Any]) -> None:
-    """Write what a later run may take instead of making it again, as JSON with a checksum, atomically."""
+    """Write results that a later run may reuse, as JSON with a checksum, atomically."""
     write_json(path, {**data, _CHECKSUM: fingerprint_of([data])})
 
 
 def read_kept(path: Path) -> dict[str, Any] | None:
-    """What `write_kept` wrote; None where there is none, or it was damaged since."""
+    """The data that `write_kept` wrote; None where the file is missing or was damaged."""
     try:
         data = json.loads(read_bytes(path, _LARGEST_LIST))
         return data if data.pop(_CHECKSUM) == fingerprint_of([data]) else None

@@ -1,4 +1,4 @@
-"""What a lens argument names: a lens or a model that ships, a file of either, or a camera made from one.
+"""Arguments that name a lens: a lens or a model that ships, a file of either, or a camera made from one.
 
 laikin_double_gauss_50              a lens of lenses/, or a model of models/, by its name
 FILE.toml, FILE.zmx, ...            a lens file of any format that `neurolens.readers.any_format` reads
@@ -45,7 +45,7 @@ def split_kind(text: str) -> tuple[str, str]:
 
 
 def is_model(file: str | Path) -> bool:
-    """Whether a file is an exported model by its name; any other file is read as a lens."""
+    """True for a file that is an exported model by its name; any other file is read as a lens."""
     return Path(file).suffix.lower() == ".onnx"
 
 
@@ -55,7 +55,7 @@ def lens_id_of(file: str | Path) -> str:
 
 
 def resolve(text: str | Path, *, models: bool = True, cameras: bool = True) -> Named:
-    """What a lens argument names. A file comes first, then a name that ships, then a folder (of a run).
+    """Resolve an argument that names a lens. A file comes first, then a name that ships, then a folder (of a run).
 
     Args:
         models: whether models are taken. cameras: whether kinds of cameras are, and files of `neurolens plan`.

@@ -45,7 +45,7 @@ class ExactRecord(TypedDict, total=False):
 
 @dataclass(frozen=True, kw_only=True)
 class Results:
-    """What a run found, as in `results.json`; parts that were not measured are empty.
+    """The results of a run, as in `results.json`; parts that were not measured are empty.
 
     Attributes:
         lens, domain: flat tables of figures with units in their keys.
@@ -101,7 +101,7 @@ def versions() -> dict[str, str]:
 
 
 def noisy(timing: Mapping[str, Any] | None) -> bool:
-    """Whether the rounds of a timing spread too far (`NOISY`) to tell it from one that is a little shorter."""
+    """True if the rounds of a timing spread too far (`NOISY`) to tell it from one that is a little shorter."""
     median = (timing or {}).get("median")
     return timing is not None and median is not None and median > NOISY * timing["min"]
 
@@ -146,7 +146,7 @@ def break_even_rays(
 
 
 def reaches(record: Mapping[str, Any], most: float, key: str = "rms_um") -> bool:
-    """Whether a model's film-equivalent RMS is within an error."""
+    """True if a model's film-equivalent RMS is at most `most`."""
     found = record.get(key)
     return found is not None and bool(found <= most)
 
@@ -163,7 +163,7 @@ def target_record(models: Sequence[Mapping[str, Any]], within_um: float) -> dict
 
 
 def error_of(record: Mapping[str, Any]) -> tuple[float, float]:
-    """Micrometres, where all rays lie beyond 60 degrees the angle."""
+    """A sort key: the error in micrometres, or the angle where all rays lie beyond 60 degrees."""
     found = (record.get("rms_um"), record.get("direction_rms_deg"))
     return tuple(math.inf if v is None else v for v in found)  # type: ignore[return-value]
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 ASKING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+_AT_ONCE_S = 1.0
 
 
 @contextmanager
@@ -35,6 +37,42 @@ def handled(by: Callable[[int], None]) -> Iterator[dict[int, Any]]:
     finally:
         for number, old in before.items():
             signal.signal(number, old)
+
+
+class Stopping:
+    """Inside the block, a signal of `ASKING` first requests a stop; a second one takes its usual effect.
+
+    `timeout` and others send a signal twice at once, to the process and to its group: that counts as one.
+    """
+
+    def __init__(self) -> None:
+        self._handled = handled(self._asked)
+        self._before: dict[int, Any] = {}
+        self.number: int | None = None  # of the signal
+        self._at = 0.0
+
+    def __enter__(self) -> Stopping:
+        self._before = self._handled.__enter__()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> bool:
+        self._handled.__exit__(None, None, None)
+        return kind is Unfinished
+
+    def __call__(self) -> bool:
+        """True once a stop was requested."""
+        return self.number is not None
+
+    def _asked(self, number: int) -> None:
+        if self.number is None:
+            self.number, self._at = number, time.monotonic()
+        elif time.monotonic() > self._at + _AT_ONCE_S:
+            signal.signal(number, self._before[number])
+            signal.raise_signal(number)
+
+
+class Unfinished(Exception):
+    """Leaves the block of a `Stopping`, and a stage of the progress without its final line."""
 
 
 @contextmanager

@@ -177,14 +177,14 @@ def failure(error: Exception) -> Failed:
 
 
 def answer_of(outcome: Any) -> Any:
-    """What another process has sent: its answer, or NeurolensError with the reason of its failure."""
+    """The answer that another process has sent, or NeurolensError with the reason of its failure."""
     if isinstance(outcome, Failed):
         raise NeurolensError(outcome.reason)
     return outcome
 
 
 def cores() -> int:
-    """How many cores this process may use."""
+    """The number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -18,7 +18,7 @@ from typing import Any
 from neurolens import __version__
 from neurolens.base.errors import NeurolensError, NeurolensWarning, one_line, printable
 from neurolens.base.signals import handled
-from neurolens.cli.arguments import Help, Parser, more_glasses
+from neurolens.cli.arguments import Command, Help, Parser, more_glasses
 
 # Packages of the extra that a base install lacks.
 _TRAIN_PACKAGES = {"torch", "scipy", "onnx", "matplotlib", "flip_evaluator", "mpmath"}
@@ -47,33 +47,31 @@ def build_parser() -> Parser:
 
     Commands are imported here, so that `main` handles an interrupt of the imports.
     """
-    from neurolens.cli import (
-        analyse,
-        blender,
-        convert,
-        demo,
-        evaluate,
-        export,
-        flare,
-        glass,
-        lens,
-        library,
-        mitsuba,
-        models,
-        plan,
-        projection,
-        render,
-        stmap,
-        survey,
-        train,
-        view,
-    )
+    from neurolens.cli.analyse import Analyse
+    from neurolens.cli.blender import Blender
+    from neurolens.cli.convert import Convert
+    from neurolens.cli.demo import Demo
+    from neurolens.cli.evaluate import Evaluate
+    from neurolens.cli.export import Export
+    from neurolens.cli.flare import Flare
+    from neurolens.cli.glass import Glass
+    from neurolens.cli.lens import Lens
+    from neurolens.cli.library import Library
+    from neurolens.cli.mitsuba import Mitsuba
+    from neurolens.cli.models import Models
+    from neurolens.cli.plan import Plan
+    from neurolens.cli.projection import Projection
+    from neurolens.cli.render import Render
+    from neurolens.cli.stmap import StMap
+    from neurolens.cli.survey import Survey
+    from neurolens.cli.train import Train
+    from neurolens.cli.view import View
 
-    groups = {
-        "lenses": (lens, analyse, convert, glass, library, survey, view),
-        "camera models of a lens": (train, models, evaluate),
-        "pictures": (demo, plan, render, flare),
-        "compositing and other programs": (stmap, projection, export, blender, mitsuba),
+    groups: dict[str, tuple[type[Command], ...]] = {
+        "lenses": (Lens, Analyse, Convert, Glass, Library, Survey, View),
+        "camera models of a lens": (Train, Models, Evaluate),
+        "pictures": (Demo, Plan, Render, Flare),
+        "compositing and other programs": (StMap, Projection, Export, Blender, Mitsuba),
     }
     parser = Parser(
         prog="neurolens", usage="neurolens COMMAND ...", description=_DESCRIPTION, epilog=_EPILOG,
@@ -106,14 +104,15 @@ def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] = build_
     try:
         with handled(interrupt):
             args = build().parse_args(argv)
-            with _plain_warnings(quiet=getattr(args, "quiet", False)), more_glasses(args):
+            with _plain_warnings(quiet=getattr(args, "quiet", False)), more_glasses(getattr(args, "glass", ())):
                 code: int = args.run(args)
         sys.stdout.flush()
         return code
     except (Exception, KeyboardInterrupt) as error:
         # A signal that comes while a package is imported can end in another error, which the package makes of it.
         if received or isinstance(error, KeyboardInterrupt):
-            print(f"\nneurolens: interrupted; {printable(args.kept)}", file=sys.stderr)
+            kept = [args.kept, *getattr(error, "__notes__", ())][-1]
+            print(f"\nneurolens: interrupted; {printable(kept)}", file=sys.stderr)
             return 128 + (received[0] if received else signal.SIGINT)
         return _failed(error)
 

@@ -2,31 +2,28 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
-import warnings
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 from neurolens.base.bounds import WAVELENGTH_NM, said
-from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.errors import InputError, warned
+from neurolens.base.settings import between, setting
 from neurolens.cli.arguments import (
-    add_json,
-    add_lens,
-    add_lens_state,
-    add_option,
-    add_output,
-    between,
+    Answering,
+    Glasses,
+    LensState,
     check_run_folder,
-    focus_of,
-    state_of,
+    lens,
+    lens_state,
+    output_path,
     wavelengths_nm,
-)
-from neurolens.cli.output import answer, number, table
+)  # fmt: skip
+from neurolens.cli.output import number, table
 
 if TYPE_CHECKING:
     from neurolens.analysis.fields import Scene
@@ -43,32 +40,6 @@ _BULK = {  # left out of the JSON unless asked for: a number per ray or a pixel
     "psf": ("geometric", "diffraction"),
 }
 
-_DESCRIPTION = """\
-Trace a lens from the scene and analyse its image. WHAT is any of:
-
-  layout      the section of the lens with rays
-  spots       spot diagrams over field and focus, RMS and geometric radius, Airy disc
-  fans        transverse aberration over the pupil, tangential and sagittal
-  colour      longitudinal colour by zones, 380 to 780 nm, and lateral colour over the field
-  curvature   field curvature and astigmatism, from close rays about the chief ray
-  distortion  against f tan(theta), and for wide lenses against the projection that fits best
-  vignetting  vignetting and relative illumination
-  mtf         geometric MTF, tangential and sagittal, with the diffraction limit beside
-  mtf-height  the same at 10, 20 and 40 cycles/mm against image height, as lens makers print it
-  seidel      Seidel sums S1 to S5 and the colour sums C1 and C2, surface by surface
-  psf         point spread, geometric and by diffraction
-
-Without WHAT all are shown. Rays fill the real stop, not a paraxial pupil; fields are angles
-from the axis in degrees, of the chief ray in the scene. The edge is that of the film, or the
-text says which; one that no chief ray reaches is a warning. Pupils are sampled finer and finer
-until two samplings agree to the digits that are printed; what does not settle has fewer.
-Needs the extra "train" (torch)."""
-_EPILOG = """\
-examples:
-  neurolens analyse lenses/laikin_double_gauss_50.toml
-  neurolens analyse lenses/shimizu_fisheye_220.toml distortion vignetting -o pictures
-  neurolens analyse lenses/brendel_tessar_100.toml spots mtf --f-number 5.6 --focus-mode best --json"""
-
 
 class Analysis(NamedTuple):
     """Computes a result of a scene, draws it (result, path, title, subtitle), and tells its figures as a table."""
@@ -78,136 +49,147 @@ class Analysis(NamedTuple):
     table: Callable[[dict[str, Any]], str]
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add the command to the command line."""
-    parser = subparsers.add_parser(
-        "analyse", help="spots, MTF, distortion and more of a lens file", description=_DESCRIPTION, epilog=_EPILOG
-    )
-    add_lens(parser, "file")
-    parser.add_argument("what", metavar="WHAT", nargs="*", help="what to show (default: all)")
-    add_lens_state(parser)
-    add_option(
-        parser, "--field-points", old=("--fields",), metavar="DEG", nargs="+", type=between(0, 179, "degrees"),
-        help="angles from the axis for spots, fans, mtf and psf (default: axis, 50%, 70%, 85% and edge of the field)",
+@dataclass(frozen=True, kw_only=True)
+class Analyse(Glasses, Answering):
+    """Trace a lens from the scene and analyse its image. WHAT is any of:
+
+      layout      the section of the lens with rays
+      spots       spot diagrams over field and focus, RMS and geometric radius, Airy disc
+      fans        transverse aberration over the pupil, tangential and sagittal
+      colour      longitudinal colour by zones, 380 to 780 nm, and lateral colour over the field
+      curvature   field curvature and astigmatism, from close rays about the chief ray
+      distortion  against f tan(theta), and for wide lenses against the projection that fits best
+      vignetting  vignetting and relative illumination
+      mtf         geometric MTF, tangential and sagittal, with the diffraction limit beside
+      mtf-height  the same at 10, 20 and 40 cycles/mm against image height, as lens makers print it
+      seidel      Seidel sums S1 to S5 and the colour sums C1 and C2, surface by surface
+      psf         point spread, geometric and by diffraction
+
+    Without WHAT all are shown. Rays fill the real stop, not a paraxial pupil; fields are angles
+    from the axis in degrees, of the chief ray in the scene. The edge is that of the film, or the
+    text says which; one that no chief ray reaches is a warning. Pupils are sampled finer and finer
+    until two samplings agree to the digits that are printed; what does not settle has fewer.
+    Needs the extra "train" (torch)."""
+
+    about: ClassVar[str] = "spots, MTF, distortion and more of a lens file"
+    epilog: ClassVar[str] = """\
+examples:
+  neurolens analyse lenses/laikin_double_gauss_50.toml
+  neurolens analyse lenses/shimizu_fisheye_220.toml distortion vignetting -o pictures
+  neurolens analyse lenses/brendel_tessar_100.toml spots mtf --f-number 5.6 --focus-mode best --json"""
+    kept: ClassVar[str] = "finished pictures are kept"
+    intermixed: ClassVar[bool] = True
+
+    file: Path = lens(positional=True)
+    what: tuple[str, ...] = setting((), "what to show (default: all)", positional=True, metavar="WHAT", nargs="*")
+    state: LensState = lens_state()
+    field_points: tuple[float, ...] | None = setting(
+        None, "angles from the axis for spots, fans, mtf and psf (default: axis, 50%, 70%, 85% and edge of the field)",
+        kind=between(0, 179, "degrees"), nargs="+", metavar="DEG", old=("fields",),
     )  # fmt: skip
-    parser.add_argument(
-        "--wavelengths", metavar="NM", nargs="+", type=wavelengths_nm,
-        help=f"of spots, fans, the MTF and psf, {said(WAVELENGTH_NM)} nm, the reference first "
+    wavelengths: tuple[tuple[float, ...], ...] | None = setting(
+        None, f"of spots, fans, the MTF and psf, {said(WAVELENGTH_NM)} nm, the reference first "
         "(default: d, F and C, or the file's own where its range lacks the d line)",
+        kind=wavelengths_nm, nargs="+", metavar="NM",
     )  # fmt: skip
-    parser.add_argument(
-        "--frequencies", metavar="PER_MM", nargs="+", type=between(0, 1000, "cycles per mm"),
-        help="of mtf-height (default: 10 20 40)",
+    frequencies: tuple[float, ...] | None = setting(
+        None, "of mtf-height (default: 10 20 40)", kind=between(0, 1000, "cycles per mm"), nargs="+",
+        metavar="PER_MM",
     )  # fmt: skip
-    parser.add_argument(
-        "--axis", choices=("x", "y"), default="y", help="plane of the field, for anamorphic lenses (default: y)"
-    )
-    add_output(parser, "FOLDER", "draw a picture of each in this folder")
-    parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png", help="of the pictures (default: png)")
-    add_json(parser)
-    parser.add_argument("--full", action="store_true", help="with --json: also every ray and every pixel")
-    parser.intermixed = True
-    parser.set_defaults(run=run, kept="finished pictures are kept")
+    axis: Literal["x", "y"] = setting("y", "plane of the field, for anamorphic lenses (default: y)")
+    out: Path | None = output_path("FOLDER", "draw a picture of each in this folder", None)
+    format: Literal["png", "pdf", "svg"] = setting("png", "of the pictures (default: png)")
+    full: bool = setting(False, "with --json: also every ray and every pixel")
 
+    @property
+    def waves_nm(self) -> list[float] | None:
+        """The wavelengths that the command line names."""
+        return None if self.wavelengths is None else [nm for some in self.wavelengths for nm in some]
 
-def run(args: argparse.Namespace) -> int:
-    """Print the requested analyses, and draw them if a folder is given."""
-    args.wavelengths = [nm for some in args.wavelengths or () for nm in some] or None
-    unknown = [w for w in args.what if w not in WHATS]
-    if unknown:
-        raise InputError("neurolens analyse", "WHAT", unknown[0], f"any of: {', '.join(WHATS)}")
-    if args.full and not args.json:
-        raise InputError("neurolens analyse", "--full", "(given)", "this option only with --json")
-    if args.out is not None:
-        check_run_folder(args.out, args.out, "--output")
+    def run(self) -> int:
+        """Print the requested analyses, and draw them if a folder is given."""
+        if unknown := [w for w in self.what if w not in WHATS]:
+            self.refuse("WHAT", unknown[0], f"any of: {', '.join(WHATS)}")
+        if self.full and not self.json:
+            self.refuse("--full", "(given)", "this option only with --json")
+        if self.out is not None:
+            check_run_folder(self.out, self.out, "--output")
 
-    from neurolens.analysis.layout import state_text
+        from neurolens.analysis.layout import state_text
 
-    began = time.perf_counter()
-    scene, doubts = _scene_of(args)
-    if args.out is not None:
-        args.out.mkdir(parents=True, exist_ok=True)
-    edge = scene.edge
-    doubts += [edge.warning] if edge.warning else []
-    found, pictures, notes = {}, {}, [f"derived: {scene.lens.derived}"] if scene.lens.derived else []
-    for what in args.what or WHATS:
-        try:
-            found[what], picture = _one(what, scene, args, doubts)
-        except InputError as error:
-            if args.what:
-                raise
-            notes.append(f"{what} left out: {error}")
-            continue
-        if picture is not None:
-            pictures[what] = str(picture)
-    head = {
-        "file": str(args.file),
-        "name": scene.lens.name,
-        "axis": scene.axis,
-        "focus_m": scene.focus_m,
-        "edge": edge.to_dict(),
-    }
-    more = {"pictures": pictures, "notes": notes, "warnings": doubts, "seconds": time.perf_counter() - began}
-    bulk = {} if args.full else _BULK
-    shown = {w: {k: v for k, v in d.items() if k not in bulk.get(w, ())} for w, d in found.items()}
+        began = time.perf_counter()
+        scene, doubts = self._scene()
+        if self.out is not None:
+            self.out.mkdir(parents=True, exist_ok=True)
+        edge = scene.edge
+        doubts += [edge.warning] if edge.warning else []
+        results: dict[str, Any] = {}
+        pictures, notes = {}, [f"derived: {scene.lens.derived}"] if scene.lens.derived else []
+        for what in self.what or WHATS:
+            try:
+                results[what], picture = self._one(what, scene, doubts)
+            except InputError as error:
+                if self.what:
+                    raise
+                notes.append(f"{what} left out: {error}")
+                continue
+            if picture is not None:
+                pictures[what] = str(picture)
+        head = {"file": str(self.file), "name": scene.lens.name, "axis": scene.axis, "focus_m": scene.focus_m}
+        more = {"pictures": pictures, "notes": notes, "warnings": doubts, "seconds": time.perf_counter() - began}
+        bulk = {} if self.full else _BULK
+        shown = {w: {k: v for k, v in d.items() if k not in bulk.get(w, ())} for w, d in results.items()}
 
-    def text() -> str:
-        widest = f"fields to {edge.field_deg:.2f}°, {edge.height_mm:.2f} mm: {edge.name}"
-        parts = [
-            f"{scene.lens.name}\n{state_text(scene)}\n{widest}",
-            *(analysis_of(w).table(d) for w, d in found.items()),
-        ]
-        parts += [*(f"Note: {n}" for n in notes), *(f"Warning: {w}" for w in doubts)]
-        if pictures:
-            parts.append(f"{len(pictures)} pictures drawn in {args.out}")
-        return "\n\n".join(parts)
+        def text() -> str:
+            widest = f"fields to {edge.field_deg:.2f}°, {edge.height_mm:.2f} mm: {edge.name}"
+            parts = [
+                f"{scene.lens.name}\n{state_text(scene)}\n{widest}",
+                *(analysis_of(w).table(d) for w, d in results.items()),
+            ]
+            parts += [*(f"Note: {n}" for n in notes), *(f"Warning: {w}" for w in doubts)]
+            if pictures:
+                parts.append(f"{len(pictures)} pictures drawn in {self.out}")
+            return "\n\n".join(parts)
 
-    return answer(args, {**head, **shown, **more}, text)
+        return self.answer({**head, "edge": edge.to_dict(), **shown, **more}, text)
 
+    def _scene(self) -> tuple[Scene, list[str]]:
+        """The lens with its object in its state, and warnings."""
+        from neurolens.analysis.fields import Scene
+        from neurolens.readers.any_format import read_any
+        from neurolens.study.describe import file_doubts, rim_doubts
 
-def _scene_of(args: argparse.Namespace) -> tuple[Scene, list[str]]:
-    """The lens with its object in the state of the arguments of `add_lens_state`, and warnings."""
-    from neurolens.analysis.fields import Scene
-    from neurolens.readers.any_format import read_any
-    from neurolens.study.describe import file_doubts, rim_doubts
+        with warned(self.file) as notes:  # glasses that contradict the catalogue, constant indices
+            tabled = read_any(self.file)
+        lens = self.state.set_lens(tabled)
+        notes += rim_doubts(lens) + file_doubts(tabled, states=bool(self.state.zoom))
+        scene = Scene(lens, self.state.focus_of(tabled, lens), self.axis)
+        return scene, notes + _wavelength_warnings(lens, self.waves_nm or scene.waves_nm)
 
-    with warnings.catch_warnings(record=True) as caught:  # glasses that contradict the catalogue, constant indices
-        warnings.simplefilter("always", NeurolensWarning)
-        tabled = read_any(args.file)
-    lens = state_of(args, tabled)
-    notes = [str(w.message).removeprefix(f"{tabled.path}: ") for w in caught]
-    notes += rim_doubts(lens) + file_doubts(tabled, states=bool(args.zoom))
-    scene = Scene(lens, focus_of(args, tabled, lens), args.axis)
-    notes += _wavelength_warnings(lens, args.wavelengths or scene.waves_nm)
-    return scene, notes
+    def _one(self, what: str, scene: Scene, doubts: list[str]) -> tuple[dict[str, Any], Path | None]:
+        """One analysis as plain data, and its picture where a folder is given; new warnings are added to `doubts`."""
+        from neurolens.analysis.bundles import check_light
+        from neurolens.analysis.layout import state_text
 
-
-def _one(what: str, scene: Scene, args: argparse.Namespace, doubts: list[str]) -> tuple[dict[str, Any], Path | None]:
-    """One analysis as plain data, and its picture where a folder is given; new warnings are added to `doubts`."""
-    from neurolens.analysis.bundles import check_light
-    from neurolens.analysis.layout import state_text
-
-    analysis = analysis_of(what)
-    options = {"field_deg": args.field_points, "wavelength_nm": args.wavelengths}
-    asked = {k: v for k, v in options.items() if v is not None} if what in _OF_FIELDS else {}
-    if what == "mtf-height":
-        options = {"frequency_per_mm": args.frequencies, "wavelength_nm": args.wavelengths}
-        asked = {k: v for k, v in options.items() if v is not None}
-    if what in _OF_FIELDS:
-        dark = check_light(scene, args.field_points, (args.wavelengths or scene.waves_nm)[0])
-        doubts += [d for d in dark if d not in doubts]
-    result = analysis.compute(scene, **asked)
-    data = result.to_dict()
-    if args.out is None:
-        return data, None
-    across = f"_{args.axis}" if any(s.cylinder for s in scene.lens.surfaces) else ""
-    path = args.out / f"{scene.lens.lens_id}_{what}{across}.{args.format}"
-    warning = wrap(f"Warning: {scene.edge.warning}", _WRAP) if scene.edge.warning else []
-    if what == "layout":
-        analysis.draw(replace(result, subtitle="\n".join([result.subtitle, *warning])), path)
-    else:
-        analysis.draw(result, path, scene.lens.name, "\n".join([state_text(scene), *warning]))
-    return data, path
+        analysis, options = analysis_of(what), dict[str, Any]()
+        if what in _OF_FIELDS:
+            options = {"field_deg": self.field_points, "wavelength_nm": self.waves_nm}
+            dark = check_light(scene, self.field_points, (self.waves_nm or scene.waves_nm)[0])
+            doubts += [d for d in dark if d not in doubts]
+        elif what == "mtf-height":
+            options = {"frequency_per_mm": self.frequencies, "wavelength_nm": self.waves_nm}
+        result = analysis.compute(scene, **{k: v for k, v in options.items() if v is not None})
+        data = result.to_dict()
+        if self.out is None:
+            return data, None
+        across = f"_{self.axis}" if any(s.cylinder for s in scene.lens.surfaces) else ""
+        path = self.out / f"{scene.lens.lens_id}_{what}{across}.{self.format}"
+        warning = wrap(f"Warning: {scene.edge.warning}", _WRAP) if scene.edge.warning else []
+        if what == "layout":
+            analysis.draw(replace(result, subtitle="\n".join([result.subtitle, *warning])), path)
+        else:
+            analysis.draw(result, path, scene.lens.name, "\n".join([state_text(scene), *warning]))
+        return data, path
 
 
 def analysis_of(what: str) -> Analysis:

@@ -1,27 +1,50 @@
-"""Shared arguments of commands: numbers with range and unit, the state of a lens, help with examples."""
+"""The parser, the class of a command, and the options and checks that commands share."""
 
 from __future__ import annotations
 
 import argparse
+import inspect
 import math
 import re
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, Self
 
-from neurolens.base.bounds import WAVELENGTH_NM
-from neurolens.base.errors import InputError, one_line
+from neurolens.base.bounds import FILM_MM, WAVELENGTH_NM
+from neurolens.base.errors import InputError, one_line, printable
 from neurolens.base.lensname import lens_id_of, resolve
-from neurolens.base.options import add_options, from_options, number, option_names
+from neurolens.base.progress import Progress
 from neurolens.base.records import program
-from neurolens.lens.shot import LENS_SIZE, LENS_STATE, FocusMode, Shot, StopShape
+from neurolens.base.settings import (
+    add_options,
+    between,
+    from_options,
+    group,
+    setting,
+    setting_of,
+)
+from neurolens.cli.output import print_json
+from neurolens.lens.shot import FocusMode, Shot, StopShape
 
 if TYPE_CHECKING:
     from neurolens.lens.apertures import Aperture
     from neurolens.lens.prescription import Lens
+
+CAMERAS_HELP = """\
+cameras:
+  LENS                         the lens of a file (.toml, .zmx, ..., see neurolens convert) or of a name in lenses/,
+                               traced exactly, every ray through every surface
+  MODEL.onnx                   an exported model of a lens
+  fused:LENS, fused:MODEL.onnx the same, compiled by the system's C compiler: many times faster
+  thick:LENS                   its principal planes and pupils: ideal imaging, no rims
+  thin:LENS, pinhole:LENS      a thin lens, a point: the plane in focus has the lens's size
+  thin, pinhole                the same of any focal length (--focal-length)
+  fisheye-equidistant, fisheye-equisolid, fisheye-stereographic, fisheye-orthographic
+                               points with these projections; --field sets the picture's circle"""
 
 
 class Help(argparse.RawDescriptionHelpFormatter):
@@ -70,36 +93,96 @@ class Parser(argparse.ArgumentParser):
         )
 
 
-def positive(unit: str, *, infinite: bool = False) -> Callable[[str], float]:
-    """Type of an argument that is a number above 0; "inf" only if `infinite`."""
-    expected = f"{unit} above 0{', or inf' if infinite else ''}"
-    return number(float, lambda value: value > 0 and (infinite or not math.isinf(value)), expected)
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """A command: its fields are arguments and options (`base.settings`), its docstring is the text of its help.
+
+    Attributes:
+        about: one line for the list of commands. epilog: the end of the help.
+        kept: what an interrupted command leaves (see also `keeps`).
+        called: the command as errors name it.
+        intermixed: whether options may stand before and between the arguments of a list.
+    """
+
+    about: ClassVar[str]
+    epilog: ClassVar[str] = ""
+    kept: ClassVar[str] = "nothing is written"
+    intermixed: ClassVar[bool] = False
+    called: ClassVar[str]
+
+    def __init_subclass__(cls) -> None:
+        """Name the command by its class."""
+        cls.called = cls.__dict__.get("called", f"neurolens {cls.__name__.lower()}")
+
+    @classmethod
+    def add_parser(cls, subparsers: Any) -> None:
+        """Add the command to the command line."""
+        parser = subparsers.add_parser(
+            cls.called.rpartition(" ")[2], help=cls.about, description=inspect.getdoc(cls), epilog=cls.epilog
+        )
+        parser.intermixed = cls.intermixed
+        cls.add_options(parser)
+        parser.set_defaults(run=lambda args: cls.of(args).run(), kept=cls.kept)
+
+    @classmethod
+    def add_options(cls, parser: Parser) -> None:
+        """Add its arguments and options to its parser."""
+        add_options(parser, cls)
+
+    @classmethod
+    def of(cls, args: argparse.Namespace) -> Self:
+        """The command that parsed arguments describe."""
+        return from_options(cls, args)
+
+    def run(self) -> int:
+        """Run the command; returns its exit code."""
+        raise NotImplementedError
+
+    def refuse(self, option: str, value: object, expected: str) -> NoReturn:
+        """Raise an InputError about an option."""
+        raise InputError(self.called, option, value, expected)
 
 
-def between(low: float, high: float, unit: str) -> Callable[[str], float]:
-    """Type of an argument that is a number from `low` to `high`."""
-    return number(float, lambda value: low <= value <= high, f"{unit} from {low:g} to {high:g}")
+@dataclass(frozen=True, kw_only=True)
+class Answering(Command):
+    """A command that prints a text, or with --json one JSON object."""
+
+    json: bool = setting(False, "print one JSON object on stdout instead of the text; keys carry their unit", last=3)
+
+    def answer(self, data: Mapping[str, Any], text: Callable[[], str], code: int = 0) -> int:
+        """Print `data` if --json asks for it, else `text`; returns the exit code."""
+        if self.json:
+            print_json(data)
+        else:
+            print(printable(text()))
+        return code
 
 
-def whole(least: int, most: int | None = None) -> Callable[[str], int]:
-    """Type of an argument that is an integer from `least` to `most`."""
-    span = f"from {least}" + ("" if most is None else f" to {most}")
-    return number(int, lambda value: value >= least and (most is None or value <= most), f"an integer {span}")
+QUIET_HELP = "neither progress nor warnings on stderr"
 
 
-def add_option(
-    parser: argparse._ActionsContainer, *names: str, old: Sequence[str] = (), **options: Any
-) -> argparse.Action:
-    """Add an option as `add_argument` does; its `old` spellings still work, and neither help nor errors show them."""
-    action = parser.add_argument(*names, **options)
-    parser._option_string_actions.update(dict.fromkeys(old, action))
-    return action
+@dataclass(frozen=True, kw_only=True)
+class Reporting(Answering):
+    """A command that shows its progress, unless it has --quiet."""
+
+    quiet: bool = setting(False, QUIET_HELP, last=2)
+
+    def progress(self, plan: Mapping[str, float] | None = None) -> Progress:
+        """Its progress, with the expected seconds of stages."""
+        return Progress(plan, quiet=self.quiet)
 
 
-def add_output(parser: argparse._ActionsContainer, metavar: str, about: str, **options: Any) -> None:
-    """Add -o and --output, the file or folder that a command writes."""
-    options = {"dest": "out", "metavar": metavar, "type": Path, "help": about} | options
-    add_option(parser, "-o", "--output", old=("--out",), **options)
+@contextmanager
+def keeps(text: str) -> Iterator[None]:
+    """Say this, not the command's `kept`, of what an interrupt inside the block leaves."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        error.add_note(text)
+        raise
+
+
+# Types of arguments
 
 
 def rms_error(text: str) -> tuple[str, float]:
@@ -113,143 +196,156 @@ def rms_error(text: str) -> tuple[str, float]:
     raise argparse.ArgumentTypeError(f"got {text!r}, expected a number above 0 and its unit, as 1um or 0.1px")
 
 
-def add_within(parser: argparse._ActionsContainer, about: str, **options: Any) -> None:
-    """Add --within, an RMS error with its unit as `rms_error`, and its old spelling for each unit."""
-    parser.add_argument("--within", metavar="ERROR", type=rms_error, help=about, **options)
-    for unit in ("um", "px"):
-        kind = partial(lambda unit, text: rms_error(text + unit), unit)
-        parser.add_argument(f"--target-{unit}", dest="within", type=kind, help=argparse.SUPPRESS, **options)
-
-
 def wavelengths_nm(text: str) -> tuple[float, ...]:
     """Type of --wavelengths: one or more in nm, with commas between them."""
     return tuple(between(*WAVELENGTH_NM, "wavelengths in nm")(word) for word in text.split(","))
 
 
-SHOT_OPTIONS = (*LENS_SIZE, *LENS_STATE, "film_offset_mm", "vignetting")  # fields of a `Shot`, of `shot_of`
-QUIET_HELP = "neither progress nor warnings on stderr"
-
-CAMERAS_HELP = """\
-cameras:
-  LENS                         the lens of a file (.toml, .zmx, ..., see neurolens convert) or of a name in lenses/,
-                               traced exactly, every ray through every surface
-  MODEL.onnx                   an exported model of a lens
-  fused:LENS, fused:MODEL.onnx the same, compiled by the system's C compiler: many times faster
-  thick:LENS                   its principal planes and pupils: ideal imaging, no rims
-  thin:LENS, pinhole:LENS      a thin lens, a point: the plane in focus has the lens's size
-  thin, pinhole                the same of any focal length (--focal-length)
-  fisheye-equidistant, fisheye-equisolid, fisheye-stereographic, fisheye-orthographic
-                               points with these projections; --field sets the picture's circle"""
+def film_size(text: str) -> tuple[float, float]:
+    """Type of --film: width x height in mm, as in 36x24."""
+    width, _, height = text.lower().partition("x")
+    side = between(*FILM_MM, "the film's width x height in mm, as in 36x24, each")
+    try:
+        return side(width), side(height)
+    except argparse.ArgumentTypeError as error:
+        raise argparse.ArgumentTypeError(f"{text!r}: {error}") from None
 
 
-def add_camera(parser: argparse.ArgumentParser) -> None:
-    """Add --camera, --film-offset and --vignetting."""
-    add_lens(parser, "--camera", models=True, cameras=True)
-    add_options(parser, Shot, ("film_offset_mm", "vignetting"), unset=True)
+def named_lens(models: bool, cameras: bool, text: str) -> Any:
+    """Type of an argument that names a lens, as `resolve`: a path, or with `cameras` the text of a `Named`."""
+    try:
+        found = resolve(text, models=models, cameras=cameras)
+        return str(found) if cameras else found.file
+    except InputError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
-def add_lens_state(parser: argparse.ArgumentParser) -> None:
-    """Add the options of a `Shot` that set a lens, and of the shape of its stop."""
-    add_glass(parser)
-    group = parser.add_argument_group("state of the lens")
-    add_options(group.add_mutually_exclusive_group(), Shot, LENS_SIZE, unset=True)
-    add_options(group, Shot, LENS_STATE, unset=True)
-    add_options(parser.add_argument_group("shape of the stop"), StopShape)
+# Options of several commands
 
 
-def aperture_of(args: argparse.Namespace) -> Aperture | None:
-    """The stop's shape by the arguments of `add_lens_state`; None if not given.
-
-    Raises:
-        InputError: shapes that exclude each other, a picture that cannot be read.
-    """
-    from neurolens.render.images import make_aperture
-
-    return make_aperture(from_options(StopShape(), args))
-
-
-def shot_of(args: argparse.Namespace, film_mm: tuple[float, float], **settings: Any) -> Shot:
-    """The shot by the arguments of `add_lens_state` and `add_camera`, at infinity without --focus; `settings` are other
-    fields.
-
-    Raises:
-        InputError: as `Shot` and `aperture_of`.
-    """
-    return from_options(Shot(film_mm, math.inf, aperture=aperture_of(args), **settings), args)
-
-
-def state_of(args: argparse.Namespace, tabled: Lens) -> Lens:
-    """The lens of a file in the state of the arguments of `add_lens_state`; raises InputError as `set_lens`."""
-    from neurolens.setting.focusing import best_focused
-    from neurolens.setting.states import set_lens
-
-    mode: FocusMode = args.focus_mode or "best"
-    lens = set_lens(tabled.with_aperture(aperture_of(args) or tabled.aperture),
-        zoom=args.zoom, focal_length_mm=args.focal_length_mm, field_deg=args.field_deg, f_number=args.f_number,
-        focus_m=args.focus_m, focus_mode=mode,
-    )  # fmt: skip
-    return best_focused(lens, focus_of(args, tabled, lens)) if mode == "internal" else lens
-
-
-def focus_of(args: argparse.Namespace, tabled: Lens, lens: Lens) -> float:
-    """Film to object in metres by the arguments of `add_lens_state` or the focus state they name, else inf.
-
-    `tabled` is the lens of the file, `lens` its state.
-    """
-    if args.focus_m is not None:
-        return float(args.focus_m)
-    near = next((c.object_distance_mm for c in tabled.configurations if c.name == args.zoom), None)
-    if near is None:
-        return math.inf
-    row = 1 if tabled.surfaces[0].stop else 0  # a stop's diameter follows the f-number, too
-    scale = lens.surfaces[row].diameter_mm / tabled.surfaces[row].diameter_mm
-    return float(near * scale + (lens.film_z_mm or lens.vertices_mm[-1])) / 1000
-
-
-def given_options(args: argparse.Namespace) -> list[str]:
-    """The options of `add_lens_state` that were given, for modes without a lens state."""
-    options = option_names(Shot, (*LENS_SIZE, *LENS_STATE)) | option_names(StopShape)
-    return [option for name, option in options.items() if getattr(args, name) is not None]
-
-
-def add_exposure(parser: argparse._ActionsContainer, default: float | None = 0.0, about: str = "0") -> None:
-    """Add --exposure; `about` describes the default."""
-    parser.add_argument(
-        "--exposure", metavar="STOPS", type=between(-40, 40, "stops"), default=default,
-        help=f"stops by which the preview OUT.png is brighter; OUT.exr keeps the light as it is (default: {about})",
-    )  # fmt: skip
-
-
-def add_json(parser: argparse.ArgumentParser, quiet: bool = False) -> None:
-    """Add --json, and --quiet before it where a command shows its progress."""
-    if quiet:
-        parser.add_argument("--quiet", action="store_true", help=QUIET_HELP)
-    parser.add_argument(
-        "--json", action="store_true", help="print one JSON object on stdout instead of the text; keys carry their unit"
-    )
-
-
-def add_lens(
-    parser: argparse._ActionsContainer, name: str, also: str = "", *, models: bool = False, cameras: bool = False,
-    **options: Any,
-) -> None:  # fmt: skip
-    """Add an argument that names a lens, as `resolve`; its value is a path, or with `cameras` the text of a `Named`.
-
-    Args:
-        also: what the help adds. models, cameras: what is taken besides lenses. options: of `add_argument`.
-    """
-
-    def named(text: str) -> Any:
-        try:
-            found = resolve(text, models=models, cameras=cameras)
-            return str(found) if cameras else found.file
-        except InputError as error:
-            raise argparse.ArgumentTypeError(str(error)) from None
-
+def lens(default: Any = ..., also: str = "", *, models: bool = False, cameras: bool = False, **details: Any) -> Any:
+    """An argument of `named_lens`; `also`: what its help adds."""
     taken = ", model (.onnx), or name of either" if models else ", or its name in lenses/"
     taken += ", fused: before it, thick:LENS, thin, pinhole or fisheye-PROJECTION" if cameras else ""
-    options = {"metavar": "CAMERA" if cameras else "LENS", "help": f"lens file of any format{taken}{also}"} | options
-    parser.add_argument(name, type=named, **options)
+    details = {"metavar": "CAMERA" if cameras else "LENS", "kind": partial(named_lens, models, cameras)} | details
+    return setting(default, f"lens file of any format{taken}{also}", **details)
+
+
+def output_path(metavar: str, about: str, default: Any = ..., title: str = "") -> Any:
+    """-o and --output, the file or folder that a command writes."""
+    return setting(default, about, metavar=metavar, option="output", short="-o", old=("out",), kind=Path, title=title)
+
+
+def within(about: str, default: Any = None, title: str = "") -> Any:
+    """--within, an RMS error with its unit as `rms_error`."""
+    old = {f"target-{unit}": partial(lambda unit, text: rms_error(text + unit), unit) for unit in ("um", "px")}
+    return setting(default, about, metavar="ERROR", kind=rms_error, old=old, title=title)
+
+
+def dask(title: str = "") -> Any:
+    """--dask."""
+    return setting(
+        None, "run on a Dask cluster: the address of its scheduler (tcp://HOST:8786), or local (processes of this "
+        "machine), or local:N, which no other user can reach. What a task reads travels with it: workers need "
+        "neurolens alone, and no folder in common. Whoever reaches a scheduler at tcp:// can run programs as you; "
+        "tls:// takes keys", metavar="ADDRESS", title=title,
+    )  # fmt: skip
+
+
+def exposure(default: float | None = 0.0, said: str = "0", title: str = "") -> Any:
+    """--exposure; `said`: what the help says of the default."""
+    about = "stops by which the preview OUT.png is brighter; OUT.exr keeps the light as it is"
+    return setting(default, f"{about} (default: {said})", within=(-40, 40), unit="stops", metavar="STOPS", title=title)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Glasses:
+    """--glass, for `more_glasses`."""
+
+    glass: tuple[Path, ...] = setting(
+        (), "glass catalogue of Zemax, whose glasses come before those that ship (repeatable)", metavar="FILE.agf",
+        last=1,
+    )  # fmt: skip
+
+
+def more_glasses(files: Sequence[Path]) -> AbstractContextManager[None]:
+    """A block in which the catalogues of --glass are known; without any, nothing is imported."""
+    if not files:
+        return nullcontext()
+    from neurolens.readers import glasses
+
+    return glasses.more_glasses(files)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensState:
+    """The options that set a lens: fields of a `Shot`, None where the command line has none."""
+
+    focus_m: float | None = setting_of(Shot, "focus_m")
+    f_number: float | None = setting_of(Shot, "f_number")
+    focal_length_mm: float | None = setting_of(Shot, "focal_length_mm")
+    zoom: str | None = setting_of(Shot, "zoom")
+    field_deg: float | None = setting_of(Shot, "field_deg")
+    focus_mode: FocusMode | None = setting_of(Shot, "focus_mode")
+    stop: StopShape = group("shape of the stop")
+
+    def aperture(self) -> Aperture | None:
+        """The stop's shape; None if not given.
+
+        Raises:
+            InputError: shapes that exclude each other, a picture that cannot be read.
+        """
+        from neurolens.render.images import make_aperture
+
+        return make_aperture(self.stop)
+
+    def camera(self) -> dict[str, Any]:
+        """The settings as `Shot` and `frames.frame.Frame` name them; None is not given."""
+        return {k: v for k, v in vars(self).items() if k != "stop"} | {"aperture": self.aperture()}
+
+    def shot(self, film_mm: tuple[float, float], **settings: Any) -> Shot:
+        """The settings of a camera with such a film; a focus that is not given is infinity.
+
+        Raises:
+            InputError: as `Shot` and `aperture`.
+        """
+        given = {name: value for name, value in self.camera().items() if value is not None}
+        return Shot(film_mm, **({"focus_m": math.inf} | given | settings))
+
+    def set_lens(self, tabled: Lens) -> Lens:
+        """The lens of a file in this state; raises InputError as `setting.states.set_lens`."""
+        from neurolens.setting.focusing import best_focused
+        from neurolens.setting.states import set_lens
+
+        mode = self.focus_mode or "best"
+        lens = set_lens(
+            tabled.with_aperture(self.aperture() or tabled.aperture), zoom=self.zoom,
+            focal_length_mm=self.focal_length_mm, field_deg=self.field_deg, f_number=self.f_number,
+            focus_m=self.focus_m, focus_mode=mode,
+        )  # fmt: skip
+        return best_focused(lens, self.focus_of(tabled, lens)) if mode == "internal" else lens
+
+    def focus_of(self, tabled: Lens, lens: Lens) -> float:
+        """Film to object in metres: as given, else of the focus state that the zoom names, else inf.
+
+        `tabled` is the lens of the file, `lens` its state.
+        """
+        if self.focus_m is not None:
+            return self.focus_m
+        near = next((c.object_distance_mm for c in tabled.configurations if c.name == self.zoom), None)
+        if near is None:
+            return math.inf
+        row = 1 if tabled.surfaces[0].stop else 0  # a stop's diameter follows the f-number, too
+        scale = lens.surfaces[row].diameter_mm / tabled.surfaces[row].diameter_mm
+        return float(near * scale + (lens.film_z_mm or lens.vertices_mm[-1])) / 1000
+
+
+def lens_state() -> Any:
+    """A field of `LensState` in a command."""
+    return group("state of the lens")
+
+
+# Checks
 
 
 def check_ids(files: Sequence[Path], command: str, option: str) -> None:
@@ -257,35 +353,6 @@ def check_ids(files: Sequence[Path], command: str, option: str) -> None:
     ids = [lens_id_of(file) for file in files]
     if twice := sorted({name for name in ids if ids.count(name) > 1}):
         raise InputError(command, option, twice, "files whose names differ")
-
-
-def add_glass(parser: argparse._ActionsContainer) -> None:
-    """Add --glass, for `more_glasses`."""
-    parser.add_argument(
-        "--glass", metavar="FILE.agf", dest="glass_files", type=Path, action="append", default=[],
-        help="glass catalogue of Zemax, whose glasses come before those that ship (repeatable)",
-    )  # fmt: skip
-
-
-def add_dask(parser: argparse._ActionsContainer) -> None:
-    """Add --dask."""
-    parser.add_argument(
-        "--dask", metavar="ADDRESS",
-        help="run on a Dask cluster: the address of its scheduler (tcp://HOST:8786), or local (processes of this "
-        "machine), or local:N, which no other user can reach. What a task reads travels with it: workers need "
-        "neurolens alone, and no folder in common. Whoever reaches a scheduler at tcp:// can run programs as you; "
-        "tls:// takes keys",
-    )  # fmt: skip
-
-
-def more_glasses(args: object) -> AbstractContextManager[None]:
-    """A block in which the catalogues of --glass are known; without any, nothing is imported."""
-    files = getattr(args, "glass_files", ())
-    if not files:
-        return nullcontext()
-    from neurolens.readers.glasses import more_glasses
-
-    return more_glasses(files)
 
 
 def check_folder(path: Path, option: str) -> None:

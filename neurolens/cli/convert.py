@@ -2,98 +2,86 @@
 
 from __future__ import annotations
 
-import argparse
 import math
-import warnings
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.errors import InputError, warned
 from neurolens.base.files import atomic_path
-from neurolens.cli.arguments import add_glass, add_json, add_output, between, check_folder, check_suffix, positive
-from neurolens.cli.output import answer, number
+from neurolens.base.settings import group, positive, setting
+from neurolens.cli.arguments import Answering, Glasses, check_folder, check_suffix, output_path
+from neurolens.cli.output import number
 
 if TYPE_CHECKING:
     from neurolens.lens.prescription import Lens
 
-_DESCRIPTION = """\
-Read a lens file of another program and write it as a lens file of neurolens (.toml).
 
-Formats: Zemax (.zmx), CODE V (.seq), OSLO (.len, the simple ones), texts of the Optical Bench (.txt), FlareSim
-(.lens), the TOML of the Blender add-on Physical Camera, plain tables of four
-columns as in pbrt and appleseed (.dat, .txt), and JSON (our own, DeepLens, ISET). The content decides.
-What changes rays and is not supported is an error that names the line; what was left out, computed,
-assumed or doubtful is printed as a warning and kept in the notes of the new file. Rims that a file does
-not give, and the check of the lens against its own statements, are traced: they need the extra "train" (torch)."""
-_EPILOG = """\
+@dataclass(frozen=True, kw_only=True)
+class Unsaid:
+    """Facts that a file may leave out, in the names of `readers.draft.ReadOptions`."""
+
+    name: str | None = setting(None, "name of the lens (default: the title in the file, else its file name)")
+    source: str | None = setting(None, "where the figures come from (default: the file's name)", metavar="SOURCE")
+    f_number: float | None = setting(
+        None, "nominal f-number of a file without one (default: as the stop's diameter gives it)",
+        kind=positive("an f-number"), metavar="N",
+    )  # fmt: skip
+    stop: str | None = setting(
+        None, "number in the file of the surface that is the stop (default: the one marked, else the limiting rim)",
+        metavar="N",
+    )  # fmt: skip
+    units: Literal["mm", "cm", "in", "m"] | None = setting(None, "unit of lengths (default: the file's own, mm)")
+    half_field_deg: float | None = setting(
+        None, "edge of the field from the axis, for rims that the file does not give (default: the file's own)",
+        within=(1e-3, 179.0), unit="degrees", option="half-field", metavar="DEG",
+    )  # fmt: skip
+    gap_before: bool = setting(False, "plain table: thickness is that in front of each surface (Kolb 1995)")
+    semi_diameters: bool = setting(False, "plain table: the last column holds rim radii")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Convert(Glasses, Answering):
+    """Read a lens file of another program and write it as a lens file of neurolens (.toml).
+
+    Formats: Zemax (.zmx), CODE V (.seq), OSLO (.len, the simple ones), texts of the Optical Bench (.txt), FlareSim
+    (.lens), the TOML of the Blender add-on Physical Camera, plain tables of four
+    columns as in pbrt and appleseed (.dat, .txt), and JSON (our own, DeepLens, ISET). The content decides.
+    What changes rays and is not supported is an error that names the line; what was left out, computed,
+    assumed or doubtful is printed as a warning and kept in the notes of the new file. Rims that a file does
+    not give, and the check of the lens against its own statements, are traced: they need the extra "train" (torch)."""
+
+    about: ClassVar[str] = "read a lens file of another program"
+    epilog: ClassVar[str] = """\
 examples:
   neurolens convert double_gauss.zmx -o lenses/double_gauss.toml
   neurolens convert wide.22mm.dat -o wide.toml --name "Wide angle 22 mm" --source "Smith p. 360"
   neurolens convert triplet.seq -o triplet.toml --half-field 20 --json"""
+    kept: ClassVar[str] = "only a finished lens file is written"
 
+    file: Path = setting(..., "lens file of another program", positional=True, metavar="FILE")
+    out: Path = output_path("OUT.toml", "lens file to write")
+    force: bool = setting(False, "replace an existing file")
+    unsaid: Unsaid = group("what the file does not say")
 
-def add_parser(subparsers: Any) -> None:
-    """Add the command to the command line."""
-    parser = subparsers.add_parser(
-        "convert", help="read a lens file of another program", description=_DESCRIPTION, epilog=_EPILOG
-    )
-    parser.add_argument("file", metavar="FILE", type=Path, help="lens file of another program")
-    add_output(parser, "OUT.toml", "lens file to write", required=True)
-    parser.add_argument("--force", action="store_true", help="replace an existing file")
-    group = parser.add_argument_group("what the file does not say")
-    group.add_argument(
-        "--name", metavar="NAME", help="name of the lens (default: the title in the file, else its file name)"
-    )
-    group.add_argument("--source", help="where the figures come from (default: the file's name)")
-    group.add_argument(
-        "--f-number", metavar="N", type=positive("an f-number"),
-        help="nominal f-number of a file without one (default: as the stop's diameter gives it)",
-    )  # fmt: skip
-    group.add_argument(
-        "--stop", metavar="N",
-        help="number in the file of the surface that is the stop (default: the one marked, else the limiting rim)",
-    )  # fmt: skip
-    group.add_argument("--units", choices=("mm", "cm", "in", "m"), help="unit of lengths (default: the file's own, mm)")
-    group.add_argument(
-        "--half-field", metavar="DEG", type=between(1e-3, 179.0, "degrees"),
-        help="edge of the field from the axis, for rims that the file does not give (default: the file's own)",
-    )  # fmt: skip
-    group.add_argument(
-        "--gap-before", action="store_true", help="plain table: thickness is that in front of each surface (Kolb 1995)"
-    )
-    group.add_argument("--semi-diameters", action="store_true", help="plain table: the last column holds rim radii")
-    add_glass(parser)
-    add_json(parser)
-    parser.set_defaults(run=run, kept="only a finished lens file is written")
+    def run(self) -> int:
+        """Convert one file and print what was read."""
+        check_suffix(self.out, "--output", (".toml",))
+        check_folder(self.out, "--output")
+        if self.out.exists() and not self.force:
+            raise InputError(self.out, "--output", "(an existing file)", "a new file, or --force to replace it")
+        from neurolens.readers.any_format import read_any
+        from neurolens.readers.draft import ReadOptions
 
-
-def run(args: argparse.Namespace) -> int:
-    """Convert one file and print what was read."""
-    check_suffix(args.out, "--output", (".toml",))
-    check_folder(args.out, "--output")
-    if args.out.exists() and not args.force:
-        raise InputError(args.out, "--output", "(an existing file)", "a new file, or --force to replace it")
-    from neurolens.readers.any_format import read_any
-    from neurolens.readers.draft import ReadOptions
-
-    options = ReadOptions(
-        name=args.name, source=args.source, f_number=args.f_number, units=args.units, half_field_deg=args.half_field,
-        stop=args.stop, gap_before=args.gap_before, semi_diameters=args.semi_diameters,
-    )  # fmt: skip
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", NeurolensWarning)
-        lens = read_any(args.file, options)
-    told = [str(w.message).removeprefix(f"{args.file}: ") for w in caught if issubclass(w.category, NeurolensWarning)]
-    read = list(dict.fromkeys(told))
-    if read:  # the file keeps what its source had besides, and what was assumed
-        lens = replace(lens, notes="\n".join(filter(None, (lens.notes, "As converted by neurolens:", *read))))
-    write_checked(lens, args.out)
-    notes = [*read, *_doubts(lens)]
-    data = {"file": str(args.file), "output": str(args.out), **_summary(lens, notes)}
-    return answer(args, data, lambda: _text(data))
+        with warned(self.file) as read:
+            lens = read_any(self.file, ReadOptions(**vars(self.unsaid)))
+        if read:  # the file keeps what its source had besides, and what was assumed
+            lens = replace(lens, notes="\n".join(filter(None, (lens.notes, "As converted by neurolens:", *read))))
+        write_checked(lens, self.out)
+        data = {"file": str(self.file), "output": str(self.out), **_summary(lens, [*read, *_doubts(lens)])}
+        return self.answer(data, lambda: _text(data))
 
 
 def _doubts(lens: Lens) -> list[str]:
@@ -103,8 +91,7 @@ def _doubts(lens: Lens) -> list[str]:
     from neurolens.setting.check import check_lens, doubts
 
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NeurolensWarning)
+        with warned():
             return doubts(check_lens(lens))
     except InputError as error:
         return [f"the lens cannot be checked: {error.field}: expected {error.expected}"]
@@ -120,17 +107,16 @@ def write_checked(lens: Lens, path: Path) -> None:
 
     with atomic_path(path) as temporary:
         temporary.write_text(format_lens(lens), encoding="utf-8")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NeurolensWarning)  # already reported by the reader of the other format
-            try:
+        try:
+            with warned():  # the reader of the other format has warned already
                 back = read_lens(temporary)
-            except InputError as error:
-                raise InputError(path, error.field, error.value, error.expected) from None
+        except InputError as error:
+            raise InputError(path, error.field, error.value, error.expected) from None
         if replace(back, path=lens.path) != lens:
             raise InputError(path, "content", "(another lens when read back)", "the lens that was read")
 
 
-def _summary(lens: Lens, told: list[str]) -> dict[str, Any]:
+def _summary(lens: Lens, notes: list[str]) -> dict[str, Any]:
     """Figures of the lens for text and --json; mm."""
     from neurolens.lens import paraxial
     from neurolens.readers.assemble import first_order
@@ -153,7 +139,7 @@ def _summary(lens: Lens, told: list[str]) -> dict[str, Any]:
         "stated_f_number": lens.f_number,
         "rims": lens.rims,
         "configurations": [c.name for c in lens.configurations],
-        "warnings": told,
+        "warnings": notes,
     }
 
 

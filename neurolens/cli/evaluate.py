@@ -2,37 +2,43 @@
 
 from __future__ import annotations
 
-import argparse
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from neurolens.base.progress import Progress
-from neurolens.cli.arguments import add_glass, add_json, add_lens, whole
-from neurolens.cli.output import answer, number, table
+from neurolens.base.settings import setting, whole
+from neurolens.cli.arguments import Glasses, Reporting, lens
+from neurolens.cli.output import number, table
 
 if TYPE_CHECKING:
     from neurolens.study.check import Promise
 
-_DESCRIPTION = """\
-Measure an exported model on fresh rays of its card's domain, traced through the exact lens in
-float64 and through the ONNX model in onnxruntime. Prints each figure beside the card's promise and
-exits with code 1 if one does not hold. Needs the extra "train" (torch).
+# Shown of a card without promises.
+_UNPROMISED = ("rms_um", "p99_um", "max_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
 
-Micrometres are film-equivalent: the distance between the exact and the predicted ray on the plane in
-focus, taken back to the film, for rays within 60 degrees of the axis (rms_infinity_um: on the plane at
-infinity). False passes and blocks are shares of all rays that the model, or the lens, passes.
 
-Promises are over the whole film, stopped down with the same fit ("2_stops.false_pass") and of the
-film's centre, mid and edge, its thirds by radius ("full.edge.rms_um").
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(Glasses, Reporting):
+    """Measure an exported model on fresh rays of its card's domain, traced through the exact lens in
+    float64 and through the ONNX model in onnxruntime. Prints each figure beside the card's promise and
+    exits with code 1 if one does not hold. Needs the extra "train" (torch).
 
-A model of many states (zoom, internal focus) is measured at six random states; its figures are the
-worst of them, and hold while they are at most 25% above the promise.
+    Micrometres are film-equivalent: the distance between the exact and the predicted ray on the plane in
+    focus, taken back to the film, for rays within 60 degrees of the axis (rms_infinity_um: on the plane at
+    infinity). False passes and blocks are shares of all rays that the model, or the lens, passes.
 
-As the rays differ from the card's, an error holds while it is above the promise by at most 4 standard
-deviations of its estimate from so many rays, at least 10% and at most 50%; a share by at most 4
-standard deviations of the root of its count. A largest error is only shown."""
-_EPILOG = """\
+    Promises are over the whole film, stopped down with the same fit ("2_stops.false_pass") and of the
+    film's centre, mid and edge, its thirds by radius ("full.edge.rms_um").
+
+    A model of many states (zoom, internal focus) is measured at six random states; its figures are the
+    worst of them, and hold while they are at most 25% above the promise.
+
+    As the rays differ from the card's, an error holds while it is above the promise by at most 4 standard
+    deviations of its estimate from so many rays, at least 10% and at most 50%; a share by at most 4
+    standard deviations of the root of its count. A largest error is only shown."""
+
+    about: ClassVar[str] = "measure a model against the promises of its card"
+    epilog: ClassVar[str] = """\
 examples:
   neurolens evaluate models/NAME.onnx
   neurolens evaluate runs/quickstart/models/ols-60.onnx --rays 100000 --seed 5
@@ -41,63 +47,48 @@ examples:
 The lens file is looked for by the card's lens id: lenses/ beside the model and its folder, where a run
 keeps its own; ./lenses; the project's."""
 
-# Shown of a card without promises.
-_UNPROMISED = ("rms_um", "p99_um", "max_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
-
-
-def add_parser(subparsers: Any) -> None:
-    """Add the command to the command line."""
-    parser = subparsers.add_parser(
-        "evaluate", help="measure a model against the promises of its card", description=_DESCRIPTION, epilog=_EPILOG
-    )
-    parser.add_argument("model", metavar="MODEL", type=Path, help="exported model (.onnx)")
-    add_lens(parser, "--lens", " (default: found by the card's lens id)")
-    parser.add_argument(
-        "--rays", metavar="N", type=whole(1000, 1_000_000), default=30_000,
-        help="rays that the lens passes, eight times as many if a few bad ones dominate an error; "
-        "four times as many test the vignetting (default: 30000)",
+    model: Path = setting(..., "exported model (.onnx)", positional=True, metavar="MODEL")
+    lens: Path | None = lens(None, " (default: found by the card's lens id)")
+    rays: int = setting(
+        30_000, "rays that the lens passes, eight times as many if a few bad ones dominate an error; "
+        "four times as many test the vignetting (default: 30000)", within=(1000, 1_000_000),
     )  # fmt: skip
-    parser.add_argument(
-        "--seed", metavar="N", type=whole(0), help="of the rays (default: one that differs from the fit's)"
+    seed: int | None = setting(
+        None, "of the rays (default: one that differs from the fit's)", kind=whole(0), metavar="N"
     )
-    parser.add_argument("--threads", metavar="N", type=whole(1, 256), default=1, help="for the timing (default: 1)")
-    add_glass(parser)
-    add_json(parser, quiet=True)
-    parser.set_defaults(run=run, kept="nothing is written")
+    threads: int = setting(1, "for the timing (default: 1)", within=(1, 256))
 
+    def run(self) -> int:
+        """Measure, compare, time; 1 where a promise does not hold."""
+        from neurolens.cameras.model import load_model
+        from neurolens.study.candidates import time_model
+        from neurolens.study.check import check_model, check_states, lens_of_card, space_of_card
+        from neurolens.surrogates.card import transmittance_of
 
-def run(args: argparse.Namespace) -> int:
-    """Measure, compare, time; 1 where a promise does not hold."""
-    from neurolens.cameras.model import load_model
-    from neurolens.study.candidates import time_model
-    from neurolens.study.check import check_model, check_states, lens_of_card, space_of_card
-    from neurolens.surrogates.card import transmittance_of
-
-    model = load_model(args.model)  # on one thread: the race distributes batches
-    space = space_of_card(model.card, model.axes, args.lens, args.model) if model.axes else None
-    lens = space.lens if space else lens_of_card(model.card, args.lens, args.model)
-    progress = Progress({"measure": 10, "time": 2}, quiet=args.quiet)
-    with progress.stage("measure"):
-        if space is not None:
-            figures, promises = check_states(model, space, rays=args.rays, seed=args.seed)
-        else:
-            figures, promises = check_model(model, lens, rays=args.rays, seed=args.seed)
-    with progress.stage("time"):
-        timing = time_model(model, args.model.stem, rounds=10, threads=args.threads)
-    holds = all(p.holds for p in promises)
-    data = {
-        "model": str(args.model),
-        "lens": {"id": model.card["lens"]["id"], "name": lens.name, "file": lens.path},
-        "method": model.card["fit"]["method"],
-        "transmittance": transmittance_of(model.card),
-        **figures,
-        "ns_per_ray": timing,
-        "promises": [{**asdict(p), "holds": p.holds} for p in promises],
-        "holds": holds,
-        "poor": model.card["errors"].get("poor") or [],
-    }
-    answer(args, data, lambda: _text(data, promises))
-    return 0 if holds else 1
+        model = load_model(self.model)  # on one thread: the race distributes batches
+        space = space_of_card(model.card, model.axes, self.lens, self.model) if model.axes else None
+        lens = space.lens if space else lens_of_card(model.card, self.lens, self.model)
+        progress = self.progress({"measure": 10, "time": 2})
+        with progress.stage("measure"):
+            if space is not None:
+                figures, promises = check_states(model, space, rays=self.rays, seed=self.seed)
+            else:
+                figures, promises = check_model(model, lens, rays=self.rays, seed=self.seed)
+        with progress.stage("time"):
+            timing = time_model(model, self.model.stem, rounds=10, threads=self.threads)
+        holds = all(p.holds for p in promises)
+        data = {
+            "model": str(self.model),
+            "lens": {"id": model.card["lens"]["id"], "name": lens.name, "file": lens.path},
+            "method": model.card["fit"]["method"],
+            "transmittance": transmittance_of(model.card),
+            **figures,
+            "ns_per_ray": timing,
+            "promises": [{**asdict(p), "holds": p.holds} for p in promises],
+            "holds": holds,
+            "poor": model.card["errors"].get("poor") or [],
+        }
+        return self.answer(data, lambda: _text(data, promises), 0 if holds else 1)
 
 
 def _text(data: dict[str, Any], promises: list[Promise]) -> str:

@@ -2,37 +2,45 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from neurolens import __version__
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text, check_writable
 from neurolens.base.lensname import FUSED, is_model
-from neurolens.cli.arguments import add_json, add_lens, add_option, add_output, positive
-from neurolens.cli.output import answer
-from neurolens.cli.render import film_size
+from neurolens.base.settings import positive, setting
+from neurolens.cli.arguments import Answering, film_size, lens, output_path
 
 if TYPE_CHECKING:
     from neurolens.surrogates.source import Written
 
-_DESCRIPTION = """\
-Write an exported model in another form: a self-contained C99 header (one function for a ray, one for
-arrays that compilers vectorise), a GLSL function, or an ONNX file. Domain guard, stop, rims,
-transmittance and status codes are those of the model; the card is a comment at the top. Constants
-(planes, ranges) and the film's position for a focus stand beside it. Of a model of a zoom's whole range
-(or of internal focus) the state is an argument. A lens file gives the exact lens.
-OSL is a camera of Blender's Cycles (4.5 and later): stop, focus, blades and more are its inputs, and the
-zoom of a model of its range, or of a lens file with --zoom range. Lens files focus as they say groups move.
-With --whole-camera, the whole camera for one focus and stop: film point and two random numbers in, weighted
-ray out, its pupil's outline as a table in the file (of GLSL, the data of a texture beside it).
-Needs the extra "train" (torch); without it C and GLSL are written from the graph in the file,
-whole and with nothing fixed."""
-_EPILOG = """\
+_COMMAND = "neurolens export"
+_PARTS = ("ray", "transmittance", "stop", "vignetting")
+_CAMERA = "camera: what a whole camera is set to"
+_FIXED = ("wavelengths", "film_z", "focus", "stop", "f_number")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export(Answering):
+    """Write an exported model in another form: a self-contained C99 header (one function for a ray, one for
+    arrays that compilers vectorise), a GLSL function, or an ONNX file. Domain guard, stop, rims,
+    transmittance and status codes are those of the model; the card is a comment at the top. Constants
+    (planes, ranges) and the film's position for a focus stand beside it. Of a model of a zoom's whole range
+    (or of internal focus) the state is an argument. A lens file gives the exact lens.
+    OSL is a camera of Blender's Cycles (4.5 and later): stop, focus, blades and more are its inputs, and the
+    zoom of a model of its range, or of a lens file with --zoom range. Lens files focus as they say groups move.
+    With --whole-camera, the whole camera for one focus and stop: film point and two random numbers in, weighted
+    ray out, its pupil's outline as a table in the file (of GLSL, the data of a texture beside it).
+    Needs the extra "train" (torch); without it C and GLSL are written from the graph in the file,
+    whole and with nothing fixed."""
+
+    about: ClassVar[str] = "source code (C, GLSL, OSL) of a model; fix what a scene fixes"
+    epilog: ClassVar[str] = """\
 values fixed by a scene are folded into fewer operations (--fix, repeatable):
   wavelengths=450,550,650   one coefficient table per wavelength, chosen by the argument band (a single one:
                             no argument; an ONNX file takes one)
@@ -51,175 +59,151 @@ examples:
   neurolens export models/NAME.onnx --to onnx -o laser.onnx --fix wavelengths=633
   neurolens export models/NAME.onnx --to onnx -o lens.onnx --derivatives  # for ray differentials elsewhere
   neurolens export models/NAME.onnx --to onnx -o a.onnx --inverse         # and a.stop.onnx, a.scene.onnx"""
-_COMMAND = "neurolens export"
-_PARTS = ("ray", "transmittance", "stop", "vignetting")
-_FIXED = ("wavelengths", "film_z", "focus", "stop", "f_number")
 
-
-def add_parser(subparsers: Any) -> None:
-    """Add the command to the command line."""
-    parser = subparsers.add_parser(
-        "export", help="source code (C, GLSL, OSL) of a model; fix what a scene fixes", description=_DESCRIPTION,
-        epilog=_EPILOG,
+    model: str = lens(
+        also="; a run folder with one model, a file of neurolens plan; of --to onnx models alone", models=True,
+        cameras=True, positional=True, metavar="MODEL",
     )  # fmt: skip
-    add_lens(
-        parser, "model", "; a run folder with one model, a file of neurolens plan; of --to onnx models alone",
-        models=True, cameras=True, metavar="MODEL",
+    to: Literal["c", "glsl", "osl", "onnx"] = setting(..., "form to write")
+    out: Path = output_path("FILE", "file to write")
+    fix: tuple[str, ...] = setting((), "a value fixed by the scene (see below)", metavar="KEY=VALUE")
+    only: str = setting(
+        ",".join(_PARTS), f"comma-separated: {', '.join(_PARTS)} (default: all; the domain guard is always there)",
+        metavar="PARTS",
     )  # fmt: skip
-    parser.add_argument("--to", choices=("c", "glsl", "osl", "onnx"), required=True, help="form to write")
-    add_output(parser, "FILE", "file to write", required=True)
-    parser.add_argument(
-        "--fix", metavar="KEY=VALUE", action="append", default=[], help="a value fixed by the scene (see below)"
+    name: str | None = setting(None, "of the function (default: the lens's id)")
+    derivatives: bool = setting(False, "of ONNX and with --whole-camera: additional outputs for ray differentials")
+    inverse: bool = setting(
+        False, "of ONNX: the inverse maps too (film and stop point to ray; scene ray to film), fitted and checked"
     )
-    parser.add_argument(
-        "--only", metavar="PARTS", default=",".join(_PARTS),
-        help=f"comma-separated: {', '.join(_PARTS)} (default: all; the domain guard is always there)",
-    )  # fmt: skip
-    parser.add_argument("--name", metavar="NAME", help="of the function (default: the lens's id)")
-    parser.add_argument(
-        "--derivatives", action="store_true",
-        help="of ONNX and with --whole-camera: additional outputs for ray differentials",
-    )  # fmt: skip
-    parser.add_argument(
-        "--inverse", action="store_true",
-        help="of ONNX: the inverse maps too (film and stop point to ray; scene ray to film), fitted and checked",
-    )  # fmt: skip
-    group = parser.add_argument_group("camera", "what a whole camera is set to")
-    about = "the whole camera, of C and GLSL"
-    add_option(group, "--whole-camera", old=("--camera",), action="store_true", help=about)
-    group.add_argument(
-        "--film", metavar="WxH", type=film_size, default=(36.0, 24.0), help="film in mm (default: 36x24)"
+    whole_camera: bool = setting(False, "the whole camera, of C and GLSL", old=("camera",), title=_CAMERA)
+    film: tuple[float, float] = setting(
+        (36.0, 24.0), "film in mm (default: 36x24)", kind=film_size, metavar="WxH", title=_CAMERA
     )
-    group.add_argument(
-        "--focus", metavar="M", type=positive("a distance in metres", infinite=True), default=math.inf,
-        help="distance from the film to the object in focus in metres (default: inf)",
+    focus_m: float = setting(
+        math.inf, "distance from the film to the object in focus in metres (default: inf)",
+        kind=positive("a distance in metres", infinite=True), title=_CAMERA,
     )  # fmt: skip
-    group.add_argument("--f-number", metavar="N", type=positive("an f-number"), help="default: the widest")
-    group.add_argument(
-        "--zoom",
-        metavar="STATE",
-        help="state of a zoom by name or focal length; of a lens file also range: an argument, of OSL an input",
+    f_number: float | None = setting(
+        None, "default: the widest", kind=positive("an f-number"), metavar="N", title=_CAMERA
     )
-    add_json(parser)
-    parser.set_defaults(run=run, kept="nothing is written")
+    zoom: str | None = setting(
+        None, "state of a zoom by name or focal length; of a lens file also range: an argument, of OSL an input",
+        metavar="STATE", title=_CAMERA,
+    )  # fmt: skip
 
+    def run(self) -> int:
+        """Check the options, then load, fix and write."""
+        from neurolens.surrogates.source import checked_name
 
-def run(args: argparse.Namespace) -> int:
-    """Check the options, then load, fix and write."""
-    from neurolens.surrogates.source import checked_name
+        file, parts, fixed = model_file(Path(self.model.removeprefix(FUSED))), _parts(self.only), _fixed(self.fix)
+        whole = set(parts) == set(_PARTS) and not fixed
+        if self.to == "onnx" and (self.name is not None or set(parts) != set(_PARTS)):
+            raise InputError(_COMMAND, "--only, --name", "(with --to onnx)", "neither: an ONNX file is whole")
+        if self.to != "onnx" and ((self.derivatives and not self.whole_camera) or self.inverse):
+            raise InputError(_COMMAND, "--derivatives, --inverse", f"(with --to {self.to})", "--to onnx")
+        if self.name is not None:
+            checked_name(self.to, "", self.name)
+        if self.to == "osl":
+            if not whole or self.whole_camera or self.f_number is not None or self.focus_m != math.inf:
+                options = "--fix, --only, --whole-camera, --focus, --f-number"
+                expected = "none of them: stop and focus are inputs of the shader, which is a whole camera"
+                raise InputError(_COMMAND, options, "(with --to osl)", expected)
+            write: Callable[[Path], dict[str, Any]] = self._write_osl
+        elif self.whole_camera or not is_model(file):
+            if self.to == "onnx" or not whole:
+                what = "a camera" if self.whole_camera else "a lens file"
+                raise InputError(_COMMAND, str(file), f"({what})", "--to c or glsl, without --fix and --only")
+            write = self._write_camera if self.whole_camera else self._write_lens
+        else:
+            write = partial(self._write_model, parts=parts, fixed=fixed)
+        check_writable(self.out)
+        about = write(file)
+        data = {"file": str(self.out), "to": self.to, "bytes": self.out.stat().st_size, **about}
+        maps = about.get("inverse", {}).values()
+        lines = [f"{m['file']}: finds {m['converged']:.3%} of the model's rays in three steps" for m in maps]
+        return self.answer(data, lambda: "\n".join([str(self.out), *lines]))
 
-    file, parts, fixed = model_file(Path(args.model.removeprefix(FUSED))), _parts(args.only), _fixed(args.fix)
-    whole = set(parts) == set(_PARTS) and not fixed
-    if args.to == "onnx" and (args.name is not None or set(parts) != set(_PARTS)):
-        raise InputError(_COMMAND, "--only, --name", "(with --to onnx)", "neither: an ONNX file is whole")
-    if args.to != "onnx" and ((args.derivatives and not args.whole_camera) or args.inverse):
-        raise InputError(_COMMAND, "--derivatives, --inverse", f"(with --to {args.to})", "--to onnx")
-    if args.name is not None:
-        checked_name(args.to, "", args.name)
-    if args.to == "osl":
-        if not whole or args.whole_camera or args.f_number is not None or args.focus != math.inf:
-            options = "--fix, --only, --whole-camera, --focus, --f-number"
-            expected = "none of them: stop and focus are inputs of the shader, which is a whole camera"
-            raise InputError(_COMMAND, options, "(with --to osl)", expected)
-        write: Callable[[Path, argparse.Namespace], dict[str, Any]] = _write_osl
-    elif args.whole_camera or not is_model(file):
-        if args.to == "onnx" or not whole:
-            what = "a camera" if args.whole_camera else "a lens file"
-            raise InputError(_COMMAND, str(file), f"({what})", "--to c or glsl, without --fix and --only")
-        write = _write_camera if args.whole_camera else _write_lens
-    else:
-        write = partial(_write_model, parts=parts, fixed=fixed)
-    check_writable(args.out)
-    about = write(file, args)
-    data = {"file": str(args.out), "to": args.to, "bytes": args.out.stat().st_size, **about}
-    maps = about.get("inverse", {}).values()
-    lines = [f"{m['file']}: finds {m['converged']:.3%} of the model's rays in three steps" for m in maps]
-    return answer(args, data, lambda: "\n".join([str(args.out), *lines]))
+    def _write_model(self, file: Path, parts: Sequence[str], fixed: dict[str, list[float]]) -> dict[str, Any]:
+        """A model as source code or ONNX, some of its inputs fixed."""
+        from neurolens.cameras.onnxlens import load_model
+        from neurolens.shaders.source import model_extras
+        from neurolens.surrogates.source import Fix, Parts, export_source
 
+        loaded = load_model(file)
+        if loaded.axes and (self.to == "onnx" or fixed or set(parts) != set(_PARTS)):
+            expected = "--to c or glsl without --fix, --only"
+            raise InputError(_COMMAND, str(file), "(a model of many states)", expected)
+        fix, models = Fix(), loaded.file.nodes
+        if fixed:
+            from neurolens.cli.export_lens import fixed_model
 
-def _write_model(
-    file: Path, args: argparse.Namespace, parts: Sequence[str], fixed: dict[str, list[float]]
-) -> dict[str, Any]:
-    """A model as source code or ONNX, some of its inputs fixed."""
-    from neurolens.cameras.onnxlens import load_model
-    from neurolens.shaders.source import model_extras
-    from neurolens.surrogates.source import Fix, Parts, export_source
+            fix, models = fixed_model(fixed, loaded.fitted)
+        if self.to == "onnx":
+            from neurolens.cli.export_lens import write_inverse, write_onnx_model
 
-    loaded = load_model(file)
-    if loaded.axes and (args.to == "onnx" or fixed or set(parts) != set(_PARTS)):
-        expected = "--to c or glsl without --fix, --only"
-        raise InputError(_COMMAND, str(file), "(a model of many states)", expected)
-    fix, models = Fix(), loaded.file.nodes
-    if fixed:
-        from neurolens.cli.export_lens import fixed_model
+            write_onnx_model(models, self.out, None if fixed else loaded.card, self.derivatives)
+            return write_inverse(models[0], self.out) if self.inverse else {}
+        kept = Parts(*(name in parts for name in _PARTS[1:]))
+        stop = fix.stop_radius_mm if kept.vignetting else models[0].domain.stop_radius_mm
+        extras, notes = model_extras(loaded, film=fix.film_z_mm is None, stop_mm=stop)
+        written = export_source(
+            models, self.out, self.to, loaded.card, parts=kept, fix=fix, name=self.name, extras=extras, notes=notes
+        )
+        return _about(written, [m.domain.wavelength_nm[0] for m in models])
 
-        fix, models = fixed_model(fixed, loaded.fitted)
-    if args.to == "onnx":
-        from neurolens.cli.export_lens import write_inverse, write_onnx_model
+    def _write_lens(self, file: Path) -> dict[str, Any]:
+        """The exact lens of a file as source code."""
+        from neurolens.cli.export_lens import write_lens
 
-        write_onnx_model(models, args.out, None if fixed else loaded.card, args.derivatives)
-        return write_inverse(models[0], args.out) if args.inverse else {}
-    kept = Parts(*(name in parts for name in _PARTS[1:]))
-    stop = fix.stop_radius_mm if kept.vignetting else models[0].domain.stop_radius_mm
-    extras, notes = model_extras(loaded, film=fix.film_z_mm is None, stop_mm=stop)
-    written = export_source(
-        models, args.out, args.to, loaded.card, parts=kept, fix=fix, name=args.name, extras=extras, notes=notes
-    )
-    return _about(written, [m.domain.wavelength_nm[0] for m in models])
+        return _about(write_lens(file, self.out, self.to, name=self.name, zoom=self.zoom, quiet=self.json))
 
+    def _write_osl(self, file: Path) -> dict[str, Any]:
+        """A camera for Cycles."""
+        from neurolens.shaders.blender_shader import shader_of
 
-def _write_lens(file: Path, args: argparse.Namespace) -> dict[str, Any]:
-    """The exact lens of a file as source code."""
-    from neurolens.cli.export_lens import write_lens
+        shader = shader_of(file, zoom=self.zoom, name=self.name, quiet=self.json)
+        atomic_write_text(self.out, shader.text)
+        return {
+            "function": shader.name, "inputs": shader.parameters, "operations_per_ray": shader.operations,
+            "passing": shader.passing,
+        }  # fmt: skip
 
-    return _about(write_lens(file, args.out, args.to, name=args.name, zoom=args.zoom, quiet=args.json))
+    def _write_camera(self, file: Path) -> dict[str, Any]:
+        """The whole camera of a model or a lens file as source code."""
+        from neurolens.base.progress import Progress
+        from neurolens.cameras.build import make_camera
+        from neurolens.graph.c import Extras
+        from neurolens.lens.shot import Shot
+        from neurolens.shaders.source import CAMERA_FRAME, camera_program
+        from neurolens.surrogates.source import checked_name, lines_of, write_program
 
-
-def _write_osl(file: Path, args: argparse.Namespace) -> dict[str, Any]:
-    """A camera for Cycles."""
-    from neurolens.shaders.blender_shader import shader_of
-
-    shader = shader_of(file, zoom=args.zoom, name=args.name, quiet=args.json)
-    atomic_write_text(args.out, shader.text)
-    return {
-        "function": shader.name, "inputs": shader.parameters, "operations_per_ray": shader.operations,
-        "passing": shader.passing,
-    }  # fmt: skip
-
-
-def _write_camera(file: Path, args: argparse.Namespace) -> dict[str, Any]:
-    """The whole camera of a model or a lens file as source code."""
-    from neurolens.base.progress import Progress
-    from neurolens.cameras.build import make_camera
-    from neurolens.graph.c import Extras
-    from neurolens.lens.shot import Shot
-    from neurolens.shaders.source import CAMERA_FRAME, camera_program
-    from neurolens.surrogates.source import checked_name, lines_of, write_program
-
-    shot = Shot(args.film, args.focus, args.f_number, zoom=args.zoom)
-    camera: Any = make_camera(file, shot, Progress(quiet=args.json))
-    facts = camera.settings
-    lens = facts["lens"] if "lens" in facts else facts["card"]["lens"]
-    name = checked_name(args.to, f"{lens['id']}_camera", args.name)
-    graph = camera.lens_graph()
-    # Compilers of GLSL take minutes for an array of 43,000 constants: there the table is a texture of the caller.
-    program = camera_program(camera.film, graph, args.derivatives, own_table=args.to == "c")
-    numbers = {key: facts[key] for key in ("efl_mm", "f_number", "film_z_mm", "stop_radius_mm")}
-    constants = {"film_width_mm": args.film[0], "film_height_mm": args.film[1], **numbers}
-    constants |= {"pupil_z_mm": camera.film.outline.pupil_z_mm, "exposure": camera.film.exposure}
-    told = ", ".join(f"{key} {value:.6g}" for key, value in constants.items())
-    comment = [
-        f"{lens['name']}: a whole camera, written by neurolens {__version__} from {file.name}.",
-        f"Lens data: sha256 {str(lens.get('sha256'))[:16]}. Focus {args.focus:g} m; {told}.",
-        CAMERA_FRAME,
-    ]
-    if args.to == "glsl":
-        table, beside = camera.film.outline.table, args.out.with_name(f"{args.out.name}.outline.f32")
-        with atomic_path(beside) as temporary:
-            temporary.write_bytes(table.astype("<f4").tobytes())
-        size = f"{table.shape[1]} wide, {len(table)} high"
-        comment.append(f"outline: texture of one float a texel, {size}: {beside.name}, little-endian, line by line.")
-    return _about(write_program(program, args.out, args.to, name, lines_of(comment), Extras(constants)))
+        shot = Shot(self.film, self.focus_m, self.f_number, zoom=self.zoom)
+        camera: Any = make_camera(file, shot, Progress(quiet=self.json))
+        facts = camera.settings
+        lens = facts["lens"] if "lens" in facts else facts["card"]["lens"]
+        name = checked_name(self.to, f"{lens['id']}_camera", self.name)
+        graph = camera.lens_graph()
+        # Compilers of GLSL take minutes for an array of 43,000 constants: there the table is a texture of the caller.
+        program = camera_program(camera.film, graph, self.derivatives, own_table=self.to == "c")
+        numbers = {key: facts[key] for key in ("efl_mm", "f_number", "film_z_mm", "stop_radius_mm")}
+        constants = {"film_width_mm": self.film[0], "film_height_mm": self.film[1], **numbers}
+        constants |= {"pupil_z_mm": camera.film.outline.pupil_z_mm, "exposure": camera.film.exposure}
+        told = ", ".join(f"{key} {value:.6g}" for key, value in constants.items())
+        comment = [
+            f"{lens['name']}: a whole camera, written by neurolens {__version__} from {file.name}.",
+            f"Lens data: sha256 {str(lens.get('sha256'))[:16]}. Focus {self.focus_m:g} m; {told}.",
+            CAMERA_FRAME,
+        ]
+        if self.to == "glsl":
+            table, beside = camera.film.outline.table, self.out.with_name(f"{self.out.name}.outline.f32")
+            with atomic_path(beside) as temporary:
+                temporary.write_bytes(table.astype("<f4").tobytes())
+            size = f"{table.shape[1]} wide, {len(table)} high"
+            comment.append(
+                f"outline: texture of one float a texel, {size}: {beside.name}, little-endian, line by line."
+            )
+        return _about(write_program(program, self.out, self.to, name, lines_of(comment), Extras(constants)))
 
 
 def _about(written: Written, bands_nm: Sequence[float] = ()) -> dict[str, Any]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -19,13 +18,14 @@ from neurolens.base.errors import InputError, warn
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
 from neurolens.base.records import plain
+from neurolens.base.settings import changed
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.exact import ExactCamera, placed_settings
 from neurolens.cameras.field import Field, field_of
-from neurolens.cli.arguments import aperture_of, check_suffix, given_options, shot_of, state_of
-from neurolens.cli.output import answer, number, table
-from neurolens.cli.render_frames import frames_of
+from neurolens.cli.arguments import check_suffix
+from neurolens.cli.keys import frames_of
+from neurolens.cli.output import number, table
 from neurolens.flare.canvas import Raster
 from neurolens.flare.ghostmodel import GhostModel, read_ghosts, write_ghost_source, write_ghosts
 from neurolens.flare.ghosts import RANKED, Ghost, GhostTracer, ghost_layout, ghost_pairs, ghost_table
@@ -48,6 +48,9 @@ from neurolens.render.pictures import (
 )
 from neurolens.render.scene import Scene, files_named, load_scene, seen_from
 from neurolens.setting.states import set_lens
+
+if TYPE_CHECKING:
+    from neurolens.cli.flare import Flare
 
 _COMMAND = "neurolens flare"
 _SHOWN, _SHOWN_LIGHTS, _KEPT = 12, 4, 64  # ghosts of a table; tables; ghosts of a light in metadata
@@ -76,7 +79,7 @@ class Shot(NamedTuple):
         return {"lights": [plain(light.about) for light in self.job.lights], "ghosts": ghosts}
 
 
-def run_flare(args: argparse.Namespace) -> int:
+def run_flare(args: Flare) -> int:
     """Trace the ghosts, print their table, and write the picture; or fit them."""
     progress, began = Progress(quiet=args.quiet or args.json), time.perf_counter()
     if args.quick:
@@ -99,26 +102,31 @@ def run_flare(args: argparse.Namespace) -> int:
         results["preview"] = [str(state.out.with_suffix(".png")) for state in states]
         try:
             results |= _write_all(states, shots, progress)
-        except KeyboardInterrupt:
-            if args.frames is None and (kept := [str(path) for path in kept_beside(args.out)]):
-                args.kept = f"the same command goes on from {' and '.join(kept)}"
+        except KeyboardInterrupt as error:
+            if args.frames.frames is not None:
+                error.add_note("the frames that are there are kept: the same command goes on")
+            elif kept := [str(path) for path in kept_beside(args.out)]:
+                error.add_note(f"the same command goes on from {' and '.join(kept)}")
             raise
     results["seconds"] = time.perf_counter() - began
-    return answer(args, results, lambda: _text(first, results))
+    return args.answer(results, lambda: _text(first, results))
 
 
-def _states(args: argparse.Namespace) -> Iterator[argparse.Namespace]:
-    """The arguments of each frame."""
-    frames = [(None, "", {})] if args.frames is None else frames_of(args, _COMMAND)
-    for frame, digits, values in frames:
-        state = argparse.Namespace(**vars(args) | values | {"frame": frame})
-        state.focus_m = math.inf if state.focus_m is None else state.focus_m
-        if frame is not None:
-            state.out = args.out.with_name(f"{args.out.stem}.{digits}{args.out.suffix}")
-        yield state
+def _states(flare: Flare) -> Iterator[Flare]:
+    """The command with the settings of each frame."""
+    state = replace(flare.state, focus_m=math.inf) if flare.state.focus_m is None else flare.state
+    if flare.frames.frames is None:
+        yield replace(flare, state=state)
+        return
+    for frame, digits, values in frames_of(flare.frames.frames, flare.frames.key, vars(flare.state), _COMMAND):
+        of_lens = {name: value for name, value in values.items() if name in vars(state)}
+        place = {name: value for name, value in values.items() if name not in of_lens}
+        assert flare.out is not None
+        out = flare.out.with_name(f"{flare.out.stem}.{digits}{flare.out.suffix}")
+        yield replace(flare, state=replace(state, **of_lens), frame=frame, out=out, **place)
 
 
-def _model(args: argparse.Namespace, states: Sequence[argparse.Namespace]) -> GhostModel | None:
+def _model(args: Flare, states: Sequence[Flare]) -> GhostModel | None:
     """The fitted ghosts, if the file holds these instead of a lens.
 
     Raises:
@@ -127,10 +135,10 @@ def _model(args: argparse.Namespace, states: Sequence[argparse.Namespace]) -> Gh
     """
     if not is_model(args.file):
         return None
-    wrong = [name for name in given_options(args) if name not in _FREE]
-    wrong += [f"--{name}" for name in ("coating", "photons") if getattr(args, name)]
-    wrong += ["--key focus"] * any(math.isfinite(s.focus_m) for s in states)
-    wrong += ["--key zoom"] * any(s.zoom is not None for s in states)
+    wrong = [name for name in changed(args.state) if name not in _FREE]
+    wrong += [f"--{name}" for name in ("coating", "photons") if getattr(args.settings, name)]
+    wrong += ["--key focus"] * any(math.isfinite(s.state.focus_m) for s in states)
+    wrong += ["--key zoom"] * any(s.state.zoom is not None for s in states)
     if wrong:
         raise InputError(_COMMAND, wrong[0], args.file, "a lens: fitted ghosts have one state and two reflections")
     model, half = read_ghosts(args.file), math.hypot(*args.film) / 2
@@ -144,8 +152,8 @@ class Shots:
 
     def __init__(
         self,
-        args: argparse.Namespace,
-        states: Sequence[argparse.Namespace],
+        args: Flare,
+        states: Sequence[Flare],
         tabled: Lens,
         model: GhostModel | None,
         progress: Progress,
@@ -157,13 +165,13 @@ class Shots:
         self._tracks = [t for path in args.lights if path.suffix.lower() != ".toml" for t in read_lights(path)]
         scenes = [(path, load_scene(path)) for path in args.lights if path.suffix.lower() == ".toml"]
         self._scenes: list[tuple[Path, Scene, SceneLights]] = [(p, scene, SceneLights(scene)) for p, scene in scenes]
-        self._states = states[:: -(-len(states) // _LIGHT_FRAMES)] if args.frames is not None else ()
+        self._states = states[:: -(-len(states) // _LIGHT_FRAMES)] if args.frames.frames is not None else ()
         self._chosen: dict[Path, frozenset[int]] = {}
         self._fields: dict[tuple[Any, ...], Field] = {}
         self._lenses: dict[tuple[Any, ...], tuple[Lens, GhostModel | None]] = {}
-        self._last: tuple[argparse.Namespace, Shot] | None = None
+        self._last: tuple[Flare, Shot] | None = None
 
-    def at(self, args: argparse.Namespace) -> Shot:
+    def at(self, args: Flare) -> Shot:
         """The flare of the frame with these arguments."""
         if self._last is None or self._last[0] is not args:
             lens, model = self._lens(args)
@@ -174,13 +182,13 @@ class Shots:
             self._last = args, Shot(job, [ghost_table(tracer, light, 550.0, rays) for light in lights])
         return self._last[1]
 
-    def reads(self, args: argparse.Namespace) -> Iterator[Path]:
+    def reads(self, args: Flare) -> Iterator[Path]:
         """The files that a frame's lights and the shape of the stop come from, which no picture may overwrite."""
         yield from args.lights
         yield from (path.parent / name for path, scene, _ in self._scenes for name in files_named(scene.settings))
-        yield from (path for path in (args.aperture_mask, _plate(args)) if path is not None)
+        yield from (path for path in (args.state.stop.aperture_mask, _plate(args)) if path is not None)
 
-    def colour_space(self, args: argparse.Namespace) -> ColourSpace:
+    def colour_space(self, args: Flare) -> ColourSpace:
         """The colour space of a frame's picture: that of --colour-space, of --image or of a scene, or else sRGB."""
         if args.colour_space is not None:
             return COLOUR_SPACES[args.colour_space]
@@ -188,18 +196,20 @@ class Shots:
             return read_colour_space(plate) or SRGB
         return COLOUR_SPACES[self._scenes[0][1].settings.film.colour_space] if self._scenes else SRGB
 
-    def _lens(self, args: argparse.Namespace) -> tuple[Lens, GhostModel | None]:
+    def _lens(self, args: Flare) -> tuple[Lens, GhostModel | None]:
         """The lens in its state, coated; or the fitted ghosts at the f-number and with the blades of the options."""
-        state = args.focus_m, args.f_number, args.zoom
+        state = args.state.focus_m, args.state.f_number, args.state.zoom
         if state not in self._lenses and self._model is not None:
-            lens = self._model.lens.with_aperture(aperture_of(args))
-            model = replace(self._model, lens=lens if args.f_number is None else set_lens(lens, f_number=args.f_number))
+            lens = self._model.lens.with_aperture(args.state.aperture())
+            model = replace(
+                self._model, lens=lens if args.state.f_number is None else set_lens(lens, f_number=args.state.f_number)
+            )
             self._lenses[state] = model.lens, model
         elif state not in self._lenses:
-            self._lenses[state] = with_coating(state_of(args, self._tabled), args.settings), None
+            self._lenses[state] = with_coating(args.state.set_lens(self._tabled), args.settings), None
         return self._lenses[state]
 
-    def _lights(self, args: argparse.Namespace, lens: Lens) -> list[Light]:
+    def _lights(self, args: Flare, lens: Lens) -> list[Light]:
         """The lights at a frame, where the lens and the camera of a scene are as `args` says."""
         at = "" if args.frame is None else f" at frame {args.frame}"
         of_lists = [track.at(args.frame or 0) for track in self._tracks]
@@ -209,14 +219,14 @@ class Shots:
         for path, scene, sources in self._scenes:
 
             def visible(
-                state: argparse.Namespace, path: Path = path, scene: Scene = scene, sources: SceneLights = sources
+                state: Flare, path: Path = path, scene: Scene = scene, sources: SceneLights = sources
             ) -> Mapping[int, Light]:
                 camera = seen_from(scene, path, state.position_m, state.look_at_m)
                 return sources.named(camera, lens.film_z_mm or 0.0)
 
             here = visible(args)
             if path not in self._chosen:
-                self._chosen[path] = chosen([visible(state) for state in self._states] or [here], args.most)
+                self._chosen[path] = chosen([visible(state) for state in self._states] or [here], args.settings.most)
             lights += _with_warning(keep_named(here, self._chosen[path]), path)
         if (plate := _plate(args)) is not None:
             lights += self._of_picture(args, plate, lens)
@@ -224,7 +234,7 @@ class Shots:
             warn(f"no light: the flare is black{at}")
         return lights
 
-    def _of_picture(self, args: argparse.Namespace, path: Path, lens: Lens) -> list[Light]:
+    def _of_picture(self, args: Flare, path: Path, lens: Lens) -> list[Light]:
         picture, _ = read_exr(path)
         space = read_colour_space(path) or self.colour_space(args)
         if space is not SRGB:
@@ -235,14 +245,14 @@ class Shots:
             raise InputError(path, "shape", f"({size})", "the film's, {:g}x{:g}".format(*args.film))
         try:
             fade = args.frame is not None and path != args.image
-            regions = highlights(picture, self._field(args, lens), args.film, args.threshold, args.most, fade)
+            regions = highlights(picture, self._field(args, lens), args.film, args.threshold, args.settings.most, fade)
         except InputError as error:
             raise InputError(path, error.field, error.value, error.expected) from None
         return _with_warning(regions, path)
 
-    def _field(self, args: argparse.Namespace, lens: Lens) -> Field:
+    def _field(self, args: Flare, lens: Lens) -> Field:
         """The directions that the film sees, which frames of one state share."""
-        state = args.focus_m, args.f_number, args.zoom
+        state = args.state.focus_m, args.state.f_number, args.state.zoom
         if state not in self._fields:
             if self._model is not None:  # fitted ghosts, with their film
                 moved = (lens.film_z_mm or 0.0) - (set_lens(lens, focus_m=math.inf).film_z_mm or 0.0)
@@ -250,8 +260,8 @@ class Shots:
                     lens, CameraShot(args.film, math.inf, film_offset_mm=moved), progress=self._progress
                 )
             else:
-                camera = make_camera(args.file, shot_of(args, args.film), self._progress)
-            self._fields[state] = field_of(camera, args.focus_m, "equidistant")
+                camera = make_camera(args.file, args.state.shot(args.film), self._progress)
+            self._fields[state] = field_of(camera, args.state.focus_m, "equidistant")
         return self._fields[state]
 
 
@@ -262,7 +272,7 @@ def _with_warning(kept: KeptLights, path: Path) -> list[Light]:
     return kept.lights
 
 
-def _plate(args: argparse.Namespace) -> Path | None:
+def _plate(args: Flare) -> Path | None:
     """The file of --image at a frame."""
     if args.image is None:
         return None
@@ -287,19 +297,19 @@ def _light(text: str) -> Light:
         raise InputError(_COMMAND, "--light", text, error.expected) from None
 
 
-def _write_all(states: list[argparse.Namespace], shots: Shots, progress: Progress) -> dict[str, Any]:
+def _write_all(states: list[Flare], shots: Shots, progress: Progress) -> dict[str, Any]:
     """Write the picture, or those of the frames that are missing.
 
     Returns the names of the ghosts that are layers, and the exposure of the previews in stops.
     """
     args, single, exposure = states[0], tuple[str, ...](), states[0].exposure
-    if args.layers:  # the same in all frames
+    if most := args.settings.brightest:  # the same in all frames
         jobs = [shots.at(state).job for state in states[:: -(-len(states) // _GHOST_FRAMES)]]
         with progress.stage("brightest ghosts") as report:
             single = brightest(jobs, report)
-        if len(single) < args.layers:
-            warn(f"layers of {len(single)} single ghosts, not {args.layers}: no other leaves light on the film")
-    if args.frames is None:
+        if len(single) < most:
+            warn(f"layers of {len(single)} single ghosts, not {most}: no other leaves light on the film")
+    if args.frames.frames is None:
         exposure = _write(args, shots, single, exposure, progress)
         return {"layers": single, "exposure": exposure or 0.0}
     with progress.stage(f"{len(states)} frames") as report:
@@ -313,7 +323,7 @@ def _write_all(states: list[argparse.Namespace], shots: Shots, progress: Progres
 
 
 def _write(
-    args: argparse.Namespace, shots: Shots, single: tuple[str, ...], exposure: float | None, progress: Progress
+    args: Flare, shots: Shots, single: tuple[str, ...], exposure: float | None, progress: Progress
 ) -> float | None:
     """Write a picture and its preview; returns the exposure in stops, or None where it is free and all is dark."""
     files, shot, space = Files.of(args.out), shots.at(args), shots.colour_space(args)
@@ -321,13 +331,13 @@ def _write(
     job = replace(shot.job, single=single, keep=args.out)
     layers = flare_layers(job, progress)
     total = sum_of(layers, job.raster)
-    if args.frames is None:  # frames have the same layers, dark ones too
+    if args.frames.frames is None:  # frames have the same layers, dark ones too
         layers = {name: picture for name, picture in layers.items() if picture.any()}
     exposure = _exposure(total) if exposure is None else exposure
-    options = {k: v for k, v in vars(args).items() if isinstance(v, str | int | float | list | tuple | None)}
+    options = {name.removeprefix("--"): value for name, value in changed(args).items()}
     about = {**shot.metadata(), "exposure": exposure, "settings": options | asdict(args.settings)}
     metadata = plain({"neurolens": __version__, "colour": space.stated, "flare": about})
-    camera = placed_settings(job.lens, args.film, args.focus_m)
+    camera = placed_settings(job.lens, args.film, args.state.focus_m)
     header = standard_attributes(camera, job.raster.width, job.raster.height, args.frame)
     write_png(files.preview, total, exposure or 0.0)  # first: a frame whose EXR exists is kept
     channels = flare_channels(layers, space)
@@ -381,9 +391,7 @@ def _text(shot: Shot, results: dict[str, Any]) -> str:
     return "\n\n".join([*lines, f"{end}: {results['seconds']:.1f} s"])
 
 
-def _fit(
-    args: argparse.Namespace, progress: Progress, tabled: Lens, model: GhostModel | None, state: argparse.Namespace
-) -> int:
+def _fit(args: Flare, progress: Progress, tabled: Lens, model: GhostModel | None, state: Flare) -> int:
     """Fit and write a lens's ghosts, or write those of a model as source."""
     from neurolens.flare.ghostfit import GhostSettings, fit_ghosts
 
@@ -391,14 +399,14 @@ def _fit(
         check_suffix(args.fit, "--fit", (".h", ".glsl"))
         write_ghost_source(model, args.fit)
     else:
-        lens = with_coating(state_of(state, tabled), args.settings)
+        lens = with_coating(state.state.set_lens(tabled), args.settings)
         check_suffix(args.fit, "--fit", (".onnx",))
         settings = GhostSettings(args.angle, film_radius_mm=math.hypot(*args.film) / 2, target_um=args.within[1])
         with progress.stage("ghosts") as report:
             model = fit_ghosts(lens, settings, report)
         write_ghosts(model, args.fit)
     results = {"lens": model.lens.name, "out": str(args.fit), **model.report}
-    return answer(args, results, lambda: _fit_text(results))
+    return args.answer(results, lambda: _fit_text(results))
 
 
 def _fit_text(results: dict[str, Any]) -> str:

@@ -2,58 +2,53 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import re
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 from neurolens.base.errors import InputError
-from neurolens.cli.arguments import add_glass, add_json
-from neurolens.cli.output import answer, number, table
+from neurolens.base.settings import setting
+from neurolens.cli.arguments import Answering, Glasses
+from neurolens.cli.output import number, table
 
-if TYPE_CHECKING:
-    from neurolens.lens.catalogue import Glass
-
-_DESCRIPTION = """\
-Look glasses up in the catalogue that ships with neurolens: index, Abbe number, the
-wavelengths that the maker states the index for, and what 10 mm transmit inside (without
-reflections). A name gives the glass of every maker that has one of that name, the one that a
-lens file gets first; a six-digit code (517642) the glasses nearest to it, up to 0.01 in
-n_d and 2 in V_d away."""
-_EPILOG = """\
-examples:
-  neurolens glass N-BK7 "F2 (CDGM)" PMMA
-  neurolens glass 517642 --json"""
 _CODE = re.compile(r"[0-9]{3}[./]?[0-9]{3}")
 _NEAR_N_D, _NEAR_V_D = 0.01, 2.0  # what lies farther from a code has nothing to do with it
 _TRANSMITTED_NM = (400.0, 450.0, 550.0, 700.0)
 _PLATE_MM = 10.0
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add the command to the command line."""
-    parser = subparsers.add_parser(
-        "glass", help="look glasses up by name or code", description=_DESCRIPTION, epilog=_EPILOG
+@dataclass(frozen=True, kw_only=True)
+class Glass(Glasses, Answering):
+    """Look glasses up in the catalogue that ships with neurolens: index, Abbe number, the
+    wavelengths that the maker states the index for, and what 10 mm transmit inside (without
+    reflections). A name gives the glass of every maker that has one of that name, the one that a
+    lens file gets first; a six-digit code (517642) the glasses nearest to it, up to 0.01 in
+    n_d and 2 in V_d away."""
+
+    about: ClassVar[str] = "look glasses up by name or code"
+    epilog: ClassVar[str] = """\
+examples:
+  neurolens glass N-BK7 "F2 (CDGM)" PMMA
+  neurolens glass 517642 --json"""
+
+    name: tuple[str, ...] = setting(
+        ..., '"N-BK7", "Schott:N-BK7", or a code such as 517642', positional=True, metavar="NAME", nargs="+"
     )
-    parser.add_argument("name", metavar="NAME", nargs="+", help='"N-BK7", "Schott:N-BK7", or a code such as 517642')
-    add_glass(parser)
-    add_json(parser)
-    parser.set_defaults(run=run, kept="nothing is written")
 
+    def run(self) -> int:
+        """Print the requested glasses."""
+        from neurolens.lens import catalogue
 
-def run(args: argparse.Namespace) -> int:
-    """Print the requested glasses."""
-    from neurolens.lens import catalogue
-
-    found: list[Glass] = []
-    for name in args.name:
-        if _CODE.fullmatch(name):
-            found += _near(name)
-        else:
-            catalogue.find(name, "argument", "NAME")
-            found += catalogue.same_name(name)
-    rows = [_record(glass) for glass in dict.fromkeys(found)]
-    return answer(args, {"glasses": rows}, lambda: _text(rows))
+        glasses: list[catalogue.Glass] = []
+        for name in self.name:
+            if _CODE.fullmatch(name):
+                glasses += _near(name)
+            else:
+                catalogue.find(name, "argument", "NAME")
+                glasses += catalogue.same_name(name)
+        rows = [_record(glass) for glass in dict.fromkeys(glasses)]
+        return self.answer({"glasses": rows}, lambda: _text(rows))
 
 
 def _text(rows: list[dict[str, Any]]) -> str:
@@ -68,7 +63,7 @@ def _text(rows: list[dict[str, Any]]) -> str:
     return table(header, lines)
 
 
-def _near(code: str) -> list[Glass]:
+def _near(code: str) -> list[Any]:
     """The glasses nearest to a code, those alone that are near it.
 
     Raises:
@@ -87,7 +82,7 @@ def _near(code: str) -> list[Glass]:
     return found
 
 
-def _record(glass: Glass) -> dict[str, Any]:
+def _record(glass: Any) -> dict[str, Any]:
     """Figures of one glass; internal transmittance by wavelength in nm, empty where the source has none."""
     absorption = {nm: glass.absorption_per_mm(nm) for nm in _TRANSMITTED_NM if glass.absorption}
     return {

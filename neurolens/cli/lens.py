@@ -2,47 +2,48 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
-import warnings
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from neurolens.base.errors import InputError, NeurolensWarning, one_line
+from neurolens.base.errors import one_line, warned
 from neurolens.base.files import library
 from neurolens.base.lensname import resolve
+from neurolens.base.settings import changed, setting
 from neurolens.cli.arguments import (
-    add_json,
-    add_lens_state,
-    add_option,
-    add_output,
-    between,
+    Answering,
+    Glasses,
+    LensState,
     check_folder,
     check_suffix,
-    focus_of,
-    given_options,
-    state_of,
-)
-from neurolens.cli.output import answer, number, table
+    lens_state,
+    output_path,
+)  # fmt: skip
+from neurolens.cli.output import number, table
 
 if TYPE_CHECKING:
-    from neurolens.lens.prescription import Lens
+    from neurolens.lens import prescription
     from neurolens.setting.rims import Rim, RimRule
 
+_LAYOUT_SUFFIXES = (".png", ".pdf", ".svg")
 
-_DESCRIPTION = """\
-Read a lens file strictly and print what follows from it: focal length, pupils, film plane,
-image circle, how much of the light gets through and what stops the rest, and anything
-doubtful about it. Several files, or folders (of all formats that "neurolens convert" reads), are
-a table with one line for each lens, in milliseconds a lens; after the word "list" each of them is
-checked, too. --derive-rims computes the rim diameters that a patent does not print.
 
-Lengths are in mm along the axis, z = 0 at the front vertex, light travelling to +z; angles
-are from the axis in degrees; first-order data is for the d line (587.56 nm). Needs the extra
-"train" (torch)."""
-_EPILOG = """\
+@dataclass(frozen=True, kw_only=True)
+class Lens(Glasses, Answering):
+    """Read a lens file strictly and print what follows from it: focal length, pupils, film plane,
+    image circle, how much of the light gets through and what stops the rest, and anything
+    doubtful about it. Several files, or folders (of all formats that "neurolens convert" reads), are
+    a table with one line for each lens, in milliseconds a lens; after the word "list" each of them is
+    checked, too. --derive-rims computes the rim diameters that a patent does not print.
+
+    Lengths are in mm along the axis, z = 0 at the front vertex, light travelling to +z; angles
+    are from the axis in degrees; first-order data is for the d line (587.56 nm). Needs the extra
+    "train" (torch)."""
+
+    about: ClassVar[str] = "first-order data, field and layout of a lens file"
+    epilog: ClassVar[str] = """\
 examples:
   neurolens lens laikin_double_gauss_50
   neurolens lens lenses/brendel_tessar_100.toml --focal-length 50 --focus 1.5 --layout tessar.png
@@ -50,52 +51,146 @@ examples:
   neurolens lens downloads/ --json
   neurolens lens list --layouts lenses.png
   neurolens lens lenses/brendel_tessar_100.toml --derive-rims -o tessar.toml"""
-_LAYOUT_SUFFIXES = (".png", ".pdf", ".svg")
+    kept: ClassVar[str] = "only a finished --layout picture is written"
+    intermixed: ClassVar[bool] = True
 
-
-def add_parser(subparsers: Any) -> None:
-    """Add the command to the command line."""
-    parser = subparsers.add_parser(
-        "lens", help="first-order data, field and layout of a lens file", description=_DESCRIPTION, epilog=_EPILOG
-    )
-    parser.add_argument(
-        "files", metavar="FILE", type=Path, nargs="+",
-        help='lens files, names of lenses/, or folders; after the word "list" they are checked (default: those that '
-        "ship)",
+    files: tuple[Path, ...] = setting(
+        ..., 'lens files, names of lenses/, or folders; after the word "list" they are checked (default: those that '
+        "ship)", positional=True, metavar="FILE", nargs="+",
     )  # fmt: skip
-    parser.intermixed = True
-    add_lens_state(parser)
-    parser.add_argument(
-        "--layout", metavar="OUT.png", type=Path,
-        help="draw the lens with rays from three field points: axis, 70% and edge of the film (.png, .pdf, .svg)",
+    state: LensState = lens_state()
+    layout: Path | None = setting(
+        None, "draw the lens with rays from three field points: axis, 70% and edge of the film (.png, .pdf, .svg)",
+        metavar="OUT.png",
     )  # fmt: skip
-    parser.add_argument(
-        "--layouts", metavar="OUT.png", type=Path, help="of several files: draw all lenses in section on one sheet"
-    )
-    _add_rims(parser)
-    parser.add_argument(
-        "--breathing", metavar="OUT.png", type=Path,
-        help="draw field of view, focal length and magnification against the focus distance (.png, .pdf, .svg)",
+    layouts: Path | None = setting(None, "of several files: draw all lenses in section on one sheet", metavar="OUT.png")
+    derive_rims: bool = setting(
+        False, "compute the diameters from the f-number and the field, and print them beside those of the file",
+        title="rims",
     )  # fmt: skip
-    add_json(parser)
-    parser.set_defaults(run=run, kept="only a finished --layout picture is written")
+    edge_pupil: float | None = setting(
+        None, "share of the pupil's height that is kept at the edge of the field (default: 0.5)", within=(0.01, 1),
+        unit="a share", metavar="SHARE", old=("vignetting",), title="rims",
+    )  # fmt: skip
+    half_field: float | None = setting(
+        None, "edge of the field, in degrees from the axis (default: as the file states)", within=(0.01, 179),
+        unit="an angle in degrees", metavar="DEG", title="rims",
+    )  # fmt: skip
+    out: Path | None = output_path("OUT.toml", "write the lens with its derived rims", None, "rims")
+    breathing: Path | None = setting(
+        None, "draw field of view, focal length and magnification against the focus distance (.png, .pdf, .svg)",
+        metavar="OUT.png",
+    )  # fmt: skip
 
+    def run(self) -> int:
+        """Print and draw the data of a lens, or the table of several, or derived rims."""
+        checked = str(self.files[0]) == "list"
+        several = checked or len(self.files) > 1 or self.files[0].is_dir()
+        self._check_mode(several)
+        if several:
+            return self._list(self.files[1:] or (library() / "lenses",) if checked else self.files, checked)
+        return self._derive(_file(self.files[0])) if self.derive_rims else self._describe(_file(self.files[0]))
 
-def _check_mode(args: argparse.Namespace, several: bool) -> None:
-    alone = not several and not args.derive_rims
-    kinds = {
-        "--layouts": (args.layouts is not None, several, 'with "list", a folder or several files'),
-        "--edge-pupil": (args.edge_pupil is not None, args.derive_rims, "with --derive-rims"),
-        "--breathing": (args.breathing is not None, alone, "with one lens file alone"),
-        "--output": (args.out is not None, args.derive_rims, "with --derive-rims"),
-        "--half-field": (args.half_field is not None, args.derive_rims, "with --derive-rims"),
-        "--derive-rims": (args.derive_rims, not several, "with one lens file"),
-        "--layout": (args.layout is not None, alone, "with one lens file alone"),
-        **dict.fromkeys(given_options(args), (True, alone, "with one lens file alone")),
-    }
-    for option, (given, allowed, where) in kinds.items():
-        if given and not allowed:
-            raise InputError("neurolens lens", option, "(given)", f"this option only {where}")
+    def _check_mode(self, several: bool) -> None:
+        """Refuse the options of other modes."""
+        anywhere = {"--glass", "--json"}
+        if several:
+            modes, allowed = "with one lens file", {"--layouts"}
+        elif self.derive_rims:
+            modes, allowed = "with one lens file alone", {"--derive-rims", "--edge-pupil", "--half-field", "--output"}
+        else:
+            modes, allowed = "with --derive-rims", {*changed(self.state), "--layout", "--breathing"}
+        for option in changed(self):
+            if option not in allowed | anywhere:
+                where = 'with "list", a folder or several files' if option == "--layouts" else modes
+                self.refuse(option, "(given)", f"this option only {where}")
+
+    def _describe(self, file: Path) -> int:
+        """Print and draw one lens."""
+        for option, path in (("--layout", self.layout), ("--breathing", self.breathing)):
+            if path is not None:
+                check_suffix(path, option, _LAYOUT_SUFFIXES)
+                check_folder(path, option)
+        from neurolens.readers.any_format import read_any
+        from neurolens.study.describe import file_doubts, glass_table, layout_profile, lens_facts
+        from neurolens.surrogates.domain import domain_of
+
+        began = time.perf_counter()
+        with warned(file) as notes:
+            tabled = read_any(file)
+        lens = self.state.set_lens(tabled)
+        focus, film_z = self.state.focus_of(tabled, lens), float(lens.film_z_mm or 0.0)
+        domain = domain_of(lens, focus_m=(focus, focus), film_z_mm=(film_z, film_z))
+        facts = lens_facts(lens, domain)
+        facts["warnings"] += notes + file_doubts(tabled)
+        data = {
+            "file": str(file),
+            **facts,
+            "zoom": self.state.zoom,
+            "focus_mode": self.state.focus_mode or "best",
+            "derived": lens.derived,
+            "aperture": lens.aperture and lens.aperture.settings(),
+            "configurations": [
+                {"name": c.name, "efl_mm": c.efl_mm, "object_distance_mm": c.object_distance_mm}
+                for c in tabled.configurations
+            ],
+            "surfaces": glass_table(lens),
+            "layout": self.layout and str(self.layout),
+            "breathing_plot": self.breathing and str(self.breathing),
+        }
+        if self.layout is not None:
+            from neurolens.analysis.layout import lens_layout
+
+            lens_layout(layout_profile(lens, domain), self.layout)
+        if self.breathing is not None:
+            from neurolens.study.figures import draw_breathing
+
+            figures = draw_breathing(lens, self.breathing)
+            data["breathing"] = {name: [asdict(b) for b in breaths] for name, breaths in figures.items()}
+        data["seconds"] = time.perf_counter() - began
+        return self.answer(data, lambda: _lens_text(data))
+
+    def _list(self, paths: tuple[Path, ...], checked: bool) -> int:
+        """Print a table of lenses, and draw their sections."""
+        from neurolens.study.describe import lens_files, library_row, section
+
+        if self.layouts is not None:
+            check_folder(self.layouts, "--layouts")
+        files = (lens_files(path) if path.is_dir() else [_file(path)] for path in paths)
+        rows = [library_row(file, checked) for folder in files for file in folder]
+        if self.layouts is not None:
+            from neurolens.study.figures import sheet
+
+            sheet([section(Path(r["file"])) for r in rows if "name" in r], self.layouts)
+        note = "" if self.layouts is None else f"\n\nSections drawn in {self.layouts}"
+        data = {"lenses": rows, "layouts": self.layouts and str(self.layouts)}
+        return self.answer(data, lambda: _list_text(rows) + note)
+
+    def _derive(self, file: Path) -> int:
+        """Print the table of rims; write the lens with derived rims only where -o asks for it."""
+        from neurolens.readers.lensfile import write_lens
+        from neurolens.setting.rims import RimRule, derive_rims, half_field_deg
+        from neurolens.study.describe import read_quietly
+
+        out, edge_pupil = self.out, self.edge_pupil
+        if out is not None:
+            check_folder(out, "--output")
+        lens = read_quietly(file)
+        rule = RimRule(0.5 if edge_pupil is None else edge_pupil, half_field_deg=self.half_field)
+        derived, rims = derive_rims(lens, rule)
+        field = self.half_field or half_field_deg(lens)
+        if out is not None:
+            write_lens(replace(derived, notes=_notes(derived, rule, field)), out)
+        data = {
+            "file": str(file),
+            "f_number": lens.f_number,
+            "vignetting": rule.vignetting,
+            "clear_edge": rule.clear_edge,
+            "half_field_deg": field,
+            "rims": [vars(rim) for rim in rims],
+            "output": out and str(out),
+        }
+        return self.answer(data, lambda: _rims_text(lens, data, rims))
 
 
 def _file(name: Path) -> Path:
@@ -105,63 +200,8 @@ def _file(name: Path) -> Path:
     return file
 
 
-def run(args: argparse.Namespace) -> int:
-    """Print and draw the data of a lens, or the table of several, or derived rims."""
-    checked = str(args.files[0]) == "list"
-    several = checked or len(args.files) > 1 or args.files[0].is_dir()
-    _check_mode(args, several)
-    if several:
-        return _run_list(args, args.files[1:] or [library() / "lenses"] if checked else args.files, checked)
-    args.file = _file(args.files[0])
-    if args.derive_rims:
-        return _run_rims(args)
-    for option, path in (("--layout", args.layout), ("--breathing", args.breathing)):
-        if path is not None:
-            check_suffix(path, option, _LAYOUT_SUFFIXES)
-            check_folder(path, option)
-    from neurolens.readers.any_format import read_any
-    from neurolens.study.describe import file_doubts, glass_table, layout_profile, lens_facts
-    from neurolens.surrogates.domain import domain_of
-
-    began = time.perf_counter()
-    with warnings.catch_warnings(record=True) as caught:  # part of the answer
-        warnings.simplefilter("always", NeurolensWarning)
-        tabled = read_any(args.file)
-    lens = state_of(args, tabled)
-    focus, film_z = focus_of(args, tabled, lens), float(lens.film_z_mm or 0.0)
-    domain = domain_of(lens, focus_m=(focus, focus), film_z_mm=(film_z, film_z))
-    configurations = [
-        {"name": c.name, "efl_mm": c.efl_mm, "object_distance_mm": c.object_distance_mm} for c in tabled.configurations
-    ]
-    facts = lens_facts(lens, domain)
-    facts["warnings"] += [str(w.message).removeprefix(f"{tabled.path}: ") for w in caught] + file_doubts(tabled)
-    data = {
-        "file": str(args.file),
-        **facts,
-        "zoom": args.zoom,
-        "focus_mode": args.focus_mode or "best",
-        "derived": lens.derived,
-        "aperture": lens.aperture and lens.aperture.settings(),
-        "configurations": configurations,
-        "surfaces": glass_table(lens),
-        "layout": None if args.layout is None else str(args.layout),
-        "breathing_plot": None if args.breathing is None else str(args.breathing),
-    }
-    if args.layout is not None:
-        from neurolens.analysis.layout import lens_layout
-
-        lens_layout(layout_profile(lens, domain), args.layout)
-    if args.breathing is not None:
-        from neurolens.study.figures import draw_breathing
-
-        found = draw_breathing(lens, args.breathing)
-        data["breathing"] = {name: [asdict(b) for b in breaths] for name, breaths in found.items()}
-    data["seconds"] = time.perf_counter() - began
-    return answer(args, data, lambda: _lens_text(data))
-
-
 def _lens_text(data: dict[str, Any]) -> str:
-    """What is printed as JSON, as a page of text."""
+    """The page of text for the data that --json prints."""
     by = f", {data['designer']}" if data["designer"] else ""
     parts = [f"{data['name']}{by}\n{data['source']}", _first_order(data), _light(data), _surfaces(data["surfaces"])]
     if data["configurations"]:
@@ -282,22 +322,6 @@ _LIST_HEADER = (
 )
 
 
-def _run_list(args: argparse.Namespace, paths: list[Path], checked: bool) -> int:
-    from neurolens.study.describe import lens_files, library_row, section
-
-    if args.layouts is not None:
-        check_folder(args.layouts, "--layouts")
-    files = (lens_files(path) if path.is_dir() else [_file(path)] for path in paths)
-    rows = [library_row(file, checked) for folder in files for file in folder]
-    if args.layouts is not None:
-        from neurolens.study.figures import sheet
-
-        sheet([section(Path(r["file"])) for r in rows if "name" in r], args.layouts)
-    drawn = None if args.layouts is None else str(args.layouts)
-    note = f"\n\nSections drawn in {drawn}" if drawn else ""
-    return answer(args, {"lenses": rows, "layouts": drawn}, lambda: _list_text(rows) + note)
-
-
 def _list_text(rows: list[dict[str, Any]]) -> str:
     text = table(_LIST_HEADER, [_cells(row) for row in rows], left=2)
     doubtful = [row for row in rows if row["doubts"]]
@@ -316,50 +340,7 @@ def _cells(row: dict[str, Any]) -> list[str]:
     return [row["lens"], one_line(row["name"], 40), *figures, *counts, row["rims"], row["verdict"]]
 
 
-def _add_rims(parser: argparse.ArgumentParser) -> None:
-    rims = parser.add_argument_group("rims")
-    rims.add_argument(
-        "--derive-rims", action="store_true",
-        help="compute the diameters from the f-number and the field, and print them beside those of the file",
-    )  # fmt: skip
-    add_option(
-        rims, "--edge-pupil", old=("--vignetting",), metavar="SHARE", type=between(0.01, 1, "a share"),
-        help="share of the pupil's height that is kept at the edge of the field (default: 0.5)",
-    )  # fmt: skip
-    rims.add_argument(
-        "--half-field", metavar="DEG", type=between(0.01, 179, "an angle in degrees"),
-        help="edge of the field, in degrees from the axis (default: as the file states)",
-    )  # fmt: skip
-    add_output(rims, "OUT.toml", "write the lens with its derived rims")
-
-
-def _run_rims(args: argparse.Namespace) -> int:
-    """Print the table of rims; write the lens with derived rims only where -o asks for it."""
-    from neurolens.readers.lensfile import write_lens
-    from neurolens.setting.rims import RimRule, derive_rims, half_field_deg
-    from neurolens.study.describe import read_quietly
-
-    if args.out is not None:
-        check_folder(args.out, "--output")
-    lens = read_quietly(args.file)
-    rule = RimRule(vignetting=0.5 if args.edge_pupil is None else args.edge_pupil, half_field_deg=args.half_field)
-    derived, rims = derive_rims(lens, rule)
-    field = args.half_field or half_field_deg(lens)
-    if args.out is not None:
-        write_lens(replace(derived, notes=_notes(derived, rule, field)), args.out)
-    data = {
-        "file": str(args.file),
-        "f_number": lens.f_number,
-        "vignetting": rule.vignetting,
-        "clear_edge": rule.clear_edge,
-        "half_field_deg": field,
-        "rims": [vars(rim) for rim in rims],
-        "output": None if args.out is None else str(args.out),
-    }
-    return answer(args, data, lambda: _rims_text(lens, data, rims))
-
-
-def _notes(lens: Lens, rule: RimRule, field: float) -> str:
+def _notes(lens: prescription.Lens, rule: RimRule, field: float) -> str:
     said = (
         f"Rims are derived by neurolens lens --derive-rims: the stop from the f-number, the whole axial beam, "
         f"{100 * rule.vignetting:g}% of the pupil's height kept at {field:.4g} degrees, "
@@ -368,7 +349,7 @@ def _notes(lens: Lens, rule: RimRule, field: float) -> str:
     return f"{lens.notes} {said}".strip()
 
 
-def _rims_text(lens: Lens, data: dict[str, Any], rims: list[Rim]) -> str:
+def _rims_text(lens: prescription.Lens, data: dict[str, Any], rims: list[Rim]) -> str:
     rows = []
     for rim in rims:
         note = "stop" if lens.surfaces[rim.surface].stop else "trimmed: limited by a neighbour" if rim.trimmed else ""

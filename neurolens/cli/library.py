@@ -2,33 +2,21 @@
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import atomic_path, atomic_write_text, library, read_kept, safe_name, write_kept
 from neurolens.base.lensname import lens_id_of
-from neurolens.base.progress import Progress
-from neurolens.cli.arguments import add_json, add_lens, add_output, check_run_folder
-from neurolens.cli.output import answer
+from neurolens.cli.arguments import Reporting, check_run_folder, lens, output_path
 
 if TYPE_CHECKING:
     from neurolens.lens.prescription import Lens
 
-_DESCRIPTION = """\
-Write a folder of pages: of each lens its section, spots, MTF, distortion, vignetting, colour, breathing and bokeh at
-three points of the field, its models with error and cost, its source and what is doubtful about it; and an
-index with search, sorted by year, focal length, speed, error. A lens whose page is there, from the same file
-by the same version, is kept. Needs the extra "train" (torch)."""
-_EPILOG = """\
-examples:
-  neurolens library -o pages
-  neurolens library -o pages laikin_double_gauss_50 my_lens.toml"""
 _SHOWN = {
     "layout": "Section", "spots": "Spots through focus", "mtf": "Geometric MTF",
     "mtf-height": "MTF against image height", "distortion": "Distortion", "vignetting": "Vignetting",
@@ -38,37 +26,43 @@ _BOKEH_FOCUS, _BOKEH_FIELDS = 30, (0.0, 0.6, 0.95)  # focal lengths; shares of t
 _COLOURS = 96  # in the palette of a picture
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add the command to the command line."""
-    parser = subparsers.add_parser(
-        "library", help="pages of lenses: pictures, figures, models", description=_DESCRIPTION, epilog=_EPILOG
-    )
-    add_lens(parser, "lenses", " (default: all of lenses/)", nargs="*")
-    add_output(parser, "FOLDER", "for the pages", required=True)
-    add_json(parser, quiet=True)
-    parser.set_defaults(run=run, kept="finished pages are kept; the same command goes on")
+@dataclass(frozen=True, kw_only=True)
+class Library(Reporting):
+    """Write a folder of pages: of each lens its section, spots, MTF, distortion, vignetting, colour, breathing and
+    bokeh at three points of the field, its models with error and cost, its source and what is doubtful about it; and an
+    index with search, sorted by year, focal length, speed, error. A lens whose page is there, from the same file
+    by the same version, is kept. Needs the extra "train" (torch)."""
 
+    about: ClassVar[str] = "pages of lenses: pictures, figures, models"
+    epilog: ClassVar[str] = """\
+examples:
+  neurolens library -o pages
+  neurolens library -o pages laikin_double_gauss_50 my_lens.toml"""
+    kept: ClassVar[str] = "finished pages are kept; the same command goes on"
 
-def run(args: argparse.Namespace) -> int:
-    """Write the pages; 1 where a lens could not be shown."""
-    from neurolens.study.describe import lens_files
+    lenses: tuple[Path, ...] = lens((), " (default: all of lenses/)", positional=True, nargs="*")
+    out: Path = output_path("FOLDER", "for the pages")
 
-    folder = args.out
-    check_run_folder(folder, "neurolens library", "--output")
-    files = args.lenses or lens_files(library() / "lenses")
-    names = _page_names(files)
-    folder.mkdir(parents=True, exist_ok=True)
-    progress, records = Progress({"lenses": 12.0 * len(files)}, quiet=args.quiet), []
-    with progress.stage("lenses") as report:
-        for k, file in enumerate(files):
-            records.append(_record(file, folder / names[k]))
-            report((k + 1) / len(files))
-    atomic_write_text(folder / "index.html", _index(records))
-    failed = [f"{r['lens']}: {r['fault']}" for r in records if "fault" in r]
-    size = sum(f.stat().st_size for f in folder.rglob("*") if f.is_file())
-    lines = [f"{len(records) - len(failed)} lenses, {size / 1e6:.1f} MB: {folder}/index.html", *failed]
-    answer(args, {"folder": str(folder), "bytes": size, "lenses": records}, lambda: "\n".join(lines))
-    return 1 if failed else 0
+    def run(self) -> int:
+        """Write the pages; 1 where a lens could not be shown."""
+        from neurolens.study.describe import lens_files
+
+        folder = self.out
+        check_run_folder(folder, self.called, "--output")
+        files = self.lenses or lens_files(library() / "lenses")
+        names = _page_names(files)
+        folder.mkdir(parents=True, exist_ok=True)
+        records = []
+        with self.progress({"lenses": 12.0 * len(files)}).stage("lenses") as report:
+            for k, file in enumerate(files):
+                records.append(_record(file, folder / names[k]))
+                report((k + 1) / len(files))
+        atomic_write_text(folder / "index.html", _index(records))
+        failed = [f"{r['lens']}: {r['fault']}" for r in records if "fault" in r]
+        size = sum(f.stat().st_size for f in folder.rglob("*") if f.is_file())
+        lines = [f"{len(records) - len(failed)} lenses, {size / 1e6:.1f} MB: {folder}/index.html", *failed]
+        data = {"folder": str(folder), "bytes": size, "lenses": records}
+        return self.answer(data, lambda: "\n".join(lines), 1 if failed else 0)
 
 
 def _page_names(files: Sequence[Path]) -> list[str]:

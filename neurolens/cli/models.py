@@ -2,74 +2,72 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-from neurolens.base.errors import InputError, ModelError, NeurolensWarning
+from neurolens.base.errors import ModelError, NeurolensWarning
 from neurolens.base.files import library
 from neurolens.base.lensname import lens_id_of
 from neurolens.base.records import program, reaches, time_of
-from neurolens.cli.arguments import add_json, add_within
-from neurolens.cli.output import answer, number, table
+from neurolens.base.settings import setting
+from neurolens.cli.arguments import Answering, within
+from neurolens.cli.output import number, table
 from neurolens.study.advice import CLOSE_UM, Advice, advice, expected_exact, to_use
 
-_DESCRIPTION = """\
-List exported models by lens: film circle, focus, film-equivalent RMS error on rays held out, and
-nanoseconds a ray in onnxruntime and as C where they were timed, on the machine that made them. The
-star is the best model of a lens: the fastest of those within 2 um (or --within) that their card does
-not call poor; where none is, the closest. Of one lens the last lines say whether to use that model or
-the lens itself, whose time is expected from its number of refractions. Models of one focus alone, such
-as those that "neurolens plan" fits for a shot, come last.
 
-Looked for in: models/ of the working folder and of the project (those that ship), and models/ of every
-run folder in runs/. Exit code 1 where there is none, or none within the error asked for."""
-_EPILOG = """\
+@dataclass(frozen=True, kw_only=True)
+class Models(Answering):
+    """List exported models by lens: film circle, focus, film-equivalent RMS error on rays held out, and
+    nanoseconds a ray in onnxruntime and as C where they were timed, on the machine that made them. The
+    star is the best model of a lens: the fastest of those within 2 um (or --within) that their card does
+    not call poor; where none is, the closest. Of one lens the last lines say whether to use that model or
+    the lens itself, whose time is expected from its number of refractions. Models of one focus alone, such
+    as those that "neurolens plan" fits for a shot, come last.
+
+    Looked for in: models/ of the working folder and of the project (those that ship), and models/ of every
+    run folder in runs/. Exit code 1 where there is none, or none within the error asked for."""
+
+    about: ClassVar[str] = "list models that are here, and the one to use"
+    epilog: ClassVar[str] = """\
 examples:
   neurolens models
   neurolens models double_gauss --within 0.5um
   neurolens models lenses/cooke_triplet_50.toml --within 0.1px --json"""
 
-
-def add_parser(subparsers: Any) -> None:
-    """Add the command to the command line."""
-    parser = subparsers.add_parser(
-        "models", help="list models that are here, and the one to use", description=_DESCRIPTION, epilog=_EPILOG
+    lens: str | None = setting(
+        None, "lens file, or part of a lens's name or id", positional=True, metavar="LENS", nargs="?"
     )
-    parser.add_argument("lens", metavar="LENS", nargs="?", help="lens file, or part of a lens's name or id")
-    add_within(parser, "only models of at most this RMS error: 1um, or 0.1px of a picture 4000 pixels wide")
-    add_json(parser)
-    parser.set_defaults(run=run, kept="nothing is written")
+    within: tuple[str, float] | None = within(
+        "only models of at most this RMS error: 1um, or 0.1px of a picture 4000 pixels wide"
+    )
 
-
-def run(args: argparse.Namespace) -> int:
-    """Print the models; 1 where none is left."""
-    places = _places()
-    found = [m for place in places for m in models_in(place)]
-    of_lens = [m for m in found if args.lens is None or _is_of(m, args.lens)]
-    if not of_lens:
-        asked = "(none)" if args.lens is None else args.lens
-        known = ", ".join(sorted({m["lens"] for m in found})) or "a model in one of these folders"
-        looked = ", ".join(map(str, places)) or "models/, runs/*/models/"
-        raise InputError("neurolens models", "LENS", asked, f"one of: {known} (looked in {looked})")
-    key, most = args.within or ("rms_um", CLOSE_UM)
-    listed = sorted(of_lens, key=lambda m: (_of_a_shot(m), m["lens"], m["film_radius_mm"], m["rms_um"] or 0.0))
-    kept = [m for m in listed if args.within is None or reaches(m, most, key)]
-    for state in {_state(m) for m in listed}:
-        alike = [m for m in kept if _state(m) == state]
-        best = to_use([m for m in alike if not _of_a_shot(m)] or alike, most, key)
-        if best:
-            best["use"] = [vars(a) for a in _advice(best)]
-    data = {"looked_in": [str(p) for p in places], "within": args.within, "models": kept}
-    answer(args, data, lambda: _text(args, listed, kept))
-    return 0 if kept else 1
+    def run(self) -> int:
+        """Print the models; 1 where none is left."""
+        places = _places()
+        rows = [m for place in places for m in models_in(place)]
+        of_lens = [m for m in rows if self.lens is None or _is_of(m, self.lens)]
+        if not of_lens:
+            known = ", ".join(sorted({m["lens"] for m in rows})) or "a model in one of these folders"
+            looked = ", ".join(map(str, places)) or "models/, runs/*/models/"
+            self.refuse("LENS", self.lens or "(none)", f"one of: {known} (looked in {looked})")
+        key, most = self.within or ("rms_um", CLOSE_UM)
+        listed = sorted(of_lens, key=lambda m: (_of_a_shot(m), m["lens"], m["film_radius_mm"], m["rms_um"] or 0.0))
+        kept = [m for m in listed if self.within is None or reaches(m, most, key)]
+        for state in {_state(m) for m in listed}:
+            alike = [m for m in kept if _state(m) == state]
+            best = to_use([m for m in alike if not _of_a_shot(m)] or alike, most, key)
+            if best:
+                best["use"] = [vars(a) for a in _advice(best)]
+        data = {"looked_in": [str(p) for p in places], "within": self.within, "models": kept}
+        return self.answer(data, lambda: _text(self.within, listed, kept), 0 if kept else 1)
 
 
 def _advice(model: dict[str, Any]) -> list[Advice]:
-    """Whether to use the best model of a lens, or the lens itself, whose time is expected from its refractions."""
+    """Advice between the best model of a lens and the lens itself, whose time is expected from its refractions."""
     file, lens = Path(model["file"]), model["lens"]
     other = file.name.startswith(f"{lens}-")  # of another state or focal length than the lens's file has
     row = {**model, "name": file.stem, "file": f"{file.parent.name}/{file.name}"}
@@ -86,7 +84,7 @@ def _places() -> list[Path]:
 
 
 def models_in(folder: Path) -> Iterator[dict[str, Any]]:
-    """What the cards of a folder say, with the times beside them; a file that is no model is left out."""
+    """The facts of the cards in a folder, with the times beside them; a file that is no model is left out."""
     from neurolens.surrogates.card import read_card, transmittance_of
 
     times = _times(folder / "index.json") | _times(folder.parent / "results.json")
@@ -126,12 +124,12 @@ def _times(file: Path) -> dict[str, dict[str, Any]]:
 
 
 def _state(model: dict[str, Any]) -> tuple[Any, ...]:
-    """Models of one state of a lens do the same."""
+    """A key that models of the same state of a lens share."""
     return model["lens"], round(model["efl_mm"], 3), *model["states"]
 
 
 def _of_a_shot(model: dict[str, Any]) -> bool:
-    """Whether a model has one focus alone, as those that `neurolens plan` fits for a shot."""
+    """True for a model of one focus alone, such as those that `neurolens plan` fits for a shot."""
     near, far = model["focus_m"]
     return bool(near == far)
 
@@ -142,10 +140,11 @@ def _is_of(model: dict[str, Any], asked: str) -> bool:
     return any(asked.casefold() in text.casefold() for text in (model["lens"], model["name"], Path(model["file"]).stem))
 
 
-def _text(args: argparse.Namespace, listed: Sequence[dict[str, Any]], kept: Sequence[dict[str, Any]]) -> str:
+def _text(within: tuple[str, float] | None, listed: Sequence[dict[str, Any]], kept: Sequence[dict[str, Any]]) -> str:
     if not kept:
         best = min(listed, key=lambda m: m["rms_um"] if m["rms_um"] is not None else 1e9)
-        key, most = args.within
+        assert within is not None
+        key, most = within
         unit = key.removeprefix("rms_")
         more = f"{program()} train --lens {best['lens']} --within {most:g}{unit}"
         return f"None of {len(listed)} models is within {most:g} {unit}; the closest is {_said(best)}.\nFit one: {more}"
@@ -174,7 +173,7 @@ def _text(args: argparse.Namespace, listed: Sequence[dict[str, Any]], kept: Sequ
 
 
 def _remarks(model: dict[str, Any]) -> list[str]:
-    """What the last column says of a model."""
+    """The remarks in the last column."""
     from neurolens.surrogates.card import AVERAGED
 
     found = [f"poor: {', '.join(model['poor'])}"] if model["poor"] else []

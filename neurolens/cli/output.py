@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from neurolens.base.errors import printable
@@ -15,15 +14,6 @@ from neurolens.base.records import plain
 def print_json(data: Mapping[str, Any]) -> None:
     """Print one JSON object on stdout."""
     print(printable(json.dumps(plain(data), indent=1, allow_nan=False, ensure_ascii=False)))
-
-
-def answer(args: argparse.Namespace, data: Mapping[str, Any], text: Callable[[], str]) -> int:
-    """Print `data` as one JSON object if --json asks for it, else `text`; the exit code of a finished command."""
-    if args.json:
-        print_json(data)
-    else:
-        print(printable(text()))
-    return 0
 
 
 def number(value: Any, digits: int = 4) -> str:

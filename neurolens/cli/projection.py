@@ -2,90 +2,97 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from neurolens import __version__
-from neurolens.base.errors import InputError, warn
+from neurolens.base.errors import warn
 from neurolens.base.files import atomic_write_text
-from neurolens.base.progress import Progress
 from neurolens.base.records import plain
-from neurolens.cli.arguments import CAMERAS_HELP, add_json, add_lens_state, add_option, add_output, check_folder
-from neurolens.cli.output import answer, number, table
-from neurolens.cli.stmap import LIGHT_NM, add_picture, picture_shot, size_of
+from neurolens.base.settings import setting
+from neurolens.cli.arguments import CAMERAS_HELP, check_folder, output_path
+from neurolens.cli.output import number, table
+from neurolens.cli.stmap import LIGHT_NM, PictureCommand
 
 if TYPE_CHECKING:
-    from neurolens.analysis.projections import Projection, Residual
+    from neurolens.analysis import projections
 
-# Repeated here, so that help imports no torch; a test compares with `analysis.projections`.
-MODELS = ("opencv", "opencv-rational", "kannala-brandt", "f-theta", "table", "two-axis")
 _FITTED, _HELD_OUT = (61, 41), (50, 34)  # points over the film
-_DESCRIPTION = """\
-Fit a lens (or model, or any other camera) with a projection of other programs, and say what it leaves in
-pixels:
 
-  opencv            fx fy cx cy, k1 k2 p1 p2 k3      opencv-rational   and k4 k5 k6
-  kannala-brandt    OpenCV's fisheye, k1 k2 k3 k4    f-theta           NVIDIA's polynomials, both ways
-  table             radius over angle                two-axis          of lenses with cylinders: a polynomial an axis
 
-Directions are those of the light's centroid at this stop, from the lens's entrance pupil to what is in focus. With
--o NAME: NAME.yaml for OpenCV's FileStorage, NAME.json for nerfstudio (its camera block; cx, cy from the corner of
-the first pixel, OpenCV's from its centre), NVIDIA's names for f-theta. A projection that turns back within the
-field is said, and an error of a planar one beyond 85 degrees. Needs the extra "train" (torch)."""
-_EPILOG = """\
+@dataclass(frozen=True, kw_only=True)
+class Projection(PictureCommand):
+    """Fit a lens (or model, or any other camera) with a projection of other programs, and say what it leaves in
+    pixels:
+
+      opencv            fx fy cx cy, k1 k2 p1 p2 k3      opencv-rational   and k4 k5 k6
+      kannala-brandt    OpenCV's fisheye, k1 k2 k3 k4    f-theta           NVIDIA's polynomials, both ways
+      table             radius over angle                two-axis       of lenses with cylinders: a polynomial an axis
+
+    Directions are those of the light's centroid at this stop, from the lens's entrance pupil to what is in focus. With
+    -o NAME: NAME.yaml for OpenCV's FileStorage, NAME.json for nerfstudio (its camera block; cx, cy from the corner of
+    the first pixel, OpenCV's from its centre), NVIDIA's names for f-theta. A projection that turns back within the
+    field is said, and an error of a planar one beyond 85 degrees. Needs the extra "train" (torch)."""
+
+    about: ClassVar[str] = "fit a lens with a projection of OpenCV, nerfstudio or NVIDIA"
+    epilog: ClassVar[str] = f"""{CAMERAS_HELP}
+
 examples:
   neurolens projection laikin_double_gauss_50 --width 1920 --film 36x20.25 --projection opencv -o gauss
   neurolens projection models/NAME.onnx --width 1920 --film 36x24 --projection f-theta --focus 2 -o fisheye"""
 
+    projection: Literal["opencv", "opencv-rational", "kannala-brandt", "f-theta", "table", "two-axis"] = setting(
+        ..., "the projection to fit", old=("model",)
+    )
+    out: Path | None = output_path("NAME", "write NAME.json and, for OpenCV's, NAME.yaml", None)
 
-def add_parser(subparsers: Any) -> None:
-    """Add the command to the command line."""
-    parser = subparsers.add_parser(
-        "projection", help="fit a lens with a projection of OpenCV, nerfstudio or NVIDIA",
-        description=_DESCRIPTION, epilog=f"{CAMERAS_HELP}\n\n{_EPILOG}",
-    )  # fmt: skip
-    add_picture(parser)
-    add_option(parser, "--projection", old=("--model",), choices=MODELS, required=True, help="the projection to fit")
-    add_output(parser, "NAME", "write NAME.json and, for OpenCV's, NAME.yaml")
-    add_lens_state(parser)
-    add_json(parser, quiet=True)
-    parser.set_defaults(run=run, kept="files that were written are whole")
+    def run(self) -> int:
+        """Trace, fit, write."""
+        out = self.out
+        if out is not None:
+            check_folder(out, "--output")
+            if not out.name:
+                self.refuse("--output", str(out), "a name")
+            if out.suffix in (".json", ".yaml"):  # the name of a file that will be written
+                out = out.with_suffix("")
+        from neurolens.analysis.projections import fit, residual
+        from neurolens.cameras.field import field_of, spectrum_of
 
-
-def run(args: argparse.Namespace) -> int:
-    """Trace, fit, write."""
-    if args.out is not None:
-        check_folder(args.out, "--output")
-        if not args.out.name:
-            raise InputError("neurolens projection", "--output", str(args.out), "a name")
-        if args.out.suffix in (".json", ".yaml"):  # the name of a file that will be written
-            args.out = args.out.with_suffix("")
-    from neurolens.analysis.projections import fit, residual
-    from neurolens.cameras.build import make_camera
-    from neurolens.cameras.field import field_of, spectrum_of
-
-    shot, progress = picture_shot(args), Progress(quiet=args.quiet)
-    camera = make_camera(args.camera, shot, progress)
-    for note in camera.settings.get("notes", ()):
-        warn(note)
-    with progress.stage(f"trace the field of {args.camera}"):
-        field = field_of(camera, shot.focus_m, "equidistant", spectrum=spectrum_of(camera, LIGHT_NM))
-    size = size_of(args)
-    step = [side / count for side, count in zip(args.film, size, strict=True)]
-    focal = (field.frame.reach_mm[0] / step[0], field.frame.reach_mm[1] / step[1])
-    if math.isclose(*field.frame.reach_mm, rel_tol=1e-9) and math.isclose(*step, rel_tol=1e-9):
-        focal = focal[0], focal[0]
-    with progress.stage(f"fit {args.projection}"):
-        found = fit(args.projection, *shown(field, size, args.film), size, focal, source=str(args.camera))
-        left = residual(found, *shown(field, size, args.film, _HELD_OUT))
-    data = _told(args, found, left) | {"before_film_mm": list(field.frame.pupil_mm)}
-    data["files"] = _write(args.out, found, data) if args.out is not None else []
-    if not left.sound:
-        warn(f"{args.projection} turns back at {left.fold_deg:.4g} degrees; the picture goes to {left.field_deg:.4g}")
-    return answer(args, data, lambda: _text(data, left))
+        progress, size, film = self.progress(), self.picture, self.film
+        camera, shot = self.make(self.state, progress)
+        with progress.stage(f"trace the field of {self.camera}"):
+            field = field_of(camera, shot.focus_m, "equidistant", spectrum=spectrum_of(camera, LIGHT_NM))
+        step = [side / count for side, count in zip(film, size, strict=True)]
+        focal = (field.frame.reach_mm[0] / step[0], field.frame.reach_mm[1] / step[1])
+        if math.isclose(*field.frame.reach_mm, rel_tol=1e-9) and math.isclose(*step, rel_tol=1e-9):
+            focal = focal[0], focal[0]
+        with progress.stage(f"fit {self.projection}"):
+            fitted = fit(self.projection, *shown(field, size, film), size, focal, source=str(self.camera))
+            left = residual(fitted, *shown(field, size, film, _HELD_OUT))
+        rows = [dict(zip(("from_deg", "to_deg", "rms_px", "worst_px"), row, strict=True)) for row in left.by_field]
+        data: dict[str, Any] = {
+            "camera": str(self.camera),
+            "model": fitted.kind,
+            "size": list(fitted.size),
+            "focal_px": list(fitted.focal_px),
+            "centre_px": list(fitted.centre_px),
+            "coefficients": fitted.named,
+            "rms_px": left.rms_px,
+            "worst_px": left.worst_px,
+            "worst_at_deg": left.worst_at_deg,
+            "field_deg": left.field_deg,
+            "turns_back_at_deg": None if left.sound else left.fold_deg,
+            "by_field": rows,
+            "before_film_mm": list(field.frame.pupil_mm),
+        }
+        data["files"] = _write(out, fitted, data) if out is not None else []
+        if not left.sound:
+            told = f"turns back at {left.fold_deg:.4g} degrees; the picture goes to {left.field_deg:.4g}"
+            warn(f"{self.projection} {told}")
+        return self.answer(data, lambda: _text(data, left))
 
 
 def shown(
@@ -102,38 +109,19 @@ def shown(
     return field.directions(point[lit]).T * [1, -1, 1], pixel[lit]
 
 
-def _told(args: argparse.Namespace, found: Projection, left: Residual) -> dict[str, Any]:
-    """What --json tells."""
-    rows = [dict(zip(("from_deg", "to_deg", "rms_px", "worst_px"), row, strict=True)) for row in left.by_field]
-    return {
-        "camera": str(args.camera),
-        "model": found.kind,
-        "size": list(found.size),
-        "focal_px": list(found.focal_px),
-        "centre_px": list(found.centre_px),
-        "coefficients": found.named,
-        "rms_px": left.rms_px,
-        "worst_px": left.worst_px,
-        "worst_at_deg": left.worst_at_deg,
-        "field_deg": left.field_deg,
-        "turns_back_at_deg": None if left.sound else left.fold_deg,
-        "by_field": rows,
-    }
-
-
-def _write(out: Path, found: Projection, data: dict[str, Any]) -> list[str]:
+def _write(out: Path, fitted: projections.Projection, data: dict[str, Any]) -> list[str]:
     """Write the files of a projection; their names."""
     files = {}
-    if found.kind in ("opencv", "opencv-rational", "kannala-brandt"):
-        files[out.with_name(f"{out.name}.yaml")] = _file_storage(found, data["rms_px"])
-    block = _block(found) | {"neurolens": {"version": __version__, **data}}
+    if fitted.kind in ("opencv", "opencv-rational", "kannala-brandt"):
+        files[out.with_name(f"{out.name}.yaml")] = _file_storage(fitted, data["rms_px"])
+    block = _block(fitted) | {"neurolens": {"version": __version__, **data}}
     files[out.with_name(f"{out.name}.json")] = json.dumps(plain(block), indent=1, allow_nan=False) + "\n"
     for path, text in files.items():
         atomic_write_text(path, text)
     return [str(path) for path in files]
 
 
-def _file_storage(found: Projection, rms_px: float) -> str:
+def _file_storage(fitted: projections.Projection, rms_px: float) -> str:
     """YAML as OpenCV's FileStorage reads it, with the names of its own calibration sample."""
 
     def matrix(name: str, rows: list[list[float]]) -> str:
@@ -141,45 +129,45 @@ def _file_storage(found: Projection, rms_px: float) -> str:
         shape = f"   rows: {len(rows)}\n   cols: {len(rows[0])}\n   dt: d\n"
         return f"{name}: !!opencv-matrix\n{shape}   data: [ {values} ]\n"
 
-    (fx, fy), (cx, cy) = found.focal_px, found.centre_px
+    (fx, fy), (cx, cy) = fitted.focal_px, fitted.centre_px
     return (
-        f"%YAML:1.0\n---\nimage_width: {found.size[0]}\nimage_height: {found.size[1]}\n"
-        f'distortion_model: "{found.kind}"\nfisheye_model: {int(found.kind == "kannala-brandt")}\n'
+        f"%YAML:1.0\n---\nimage_width: {fitted.size[0]}\nimage_height: {fitted.size[1]}\n"
+        f'distortion_model: "{fitted.kind}"\nfisheye_model: {int(fitted.kind == "kannala-brandt")}\n'
         + matrix("camera_matrix", [[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        + matrix("distortion_coefficients", [[v] for v in found.coefficients])
+        + matrix("distortion_coefficients", [[v] for v in fitted.coefficients])
         + f"avg_reprojection_error: {rms_px!r}\n"
     )
 
 
-def _block(found: Projection) -> dict[str, Any]:
+def _block(fitted: projections.Projection) -> dict[str, Any]:
     """The camera as nerfstudio, or NVIDIA's f-theta, or nobody but us has it."""
-    size = {"w": found.size[0], "h": found.size[1]}
-    if found.kind in ("opencv", "kannala-brandt"):
-        cx, cy = (c + 0.5 for c in found.centre_px)
-        name = "OPENCV" if found.kind == "opencv" else "OPENCV_FISHEYE"
-        focal = {"fl_x": found.focal_px[0], "fl_y": found.focal_px[1], "cx": cx, "cy": cy}
-        return {"camera_model": name, **size, **focal, **found.named, "frames": []}
-    if found.kind == "f-theta":
+    size = {"w": fitted.size[0], "h": fitted.size[1]}
+    if fitted.kind in ("opencv", "kannala-brandt"):
+        cx, cy = (c + 0.5 for c in fitted.centre_px)
+        name = "OPENCV" if fitted.kind == "opencv" else "OPENCV_FISHEYE"
+        focal = {"fl_x": fitted.focal_px[0], "fl_y": fitted.focal_px[1], "cx": cx, "cy": cy}
+        return {"camera_model": name, **size, **focal, **fitted.named, "frames": []}
+    if fitted.kind == "f-theta":
         from neurolens.analysis.projections import inverse_polynomial
 
         return {
-            "resolution": list(found.size),
+            "resolution": list(fitted.size),
             "shutter_type": "GLOBAL",
-            "principal_point": list(found.centre_px),
+            "principal_point": list(fitted.centre_px),
             "reference_poly": "ANGLE_TO_PIXELDIST",
-            "angle_to_pixeldist_poly": [0.0, *found.coefficients],
-            "pixeldist_to_angle_poly": [0.0, *inverse_polynomial(found)],
-            "max_angle": found.widest_rad,
-            "linear_cde": [found.focal_px[0], 0.0, 0.0],
+            "angle_to_pixeldist_poly": [0.0, *fitted.coefficients],
+            "pixeldist_to_angle_poly": [0.0, *inverse_polynomial(fitted)],
+            "max_angle": fitted.widest_rad,
+            "linear_cde": [fitted.focal_px[0], 0.0, 0.0],
         }
-    if found.kind == "table":
-        steps = len(found.coefficients) - 1
-        angle = [math.degrees(found.widest_rad) * k / steps for k in range(steps + 1)]
-        return {**size, "angle_deg": angle, "radius_px": list(found.coefficients)}
-    return {"camera_model": found.kind, **size, "focal_px": list(found.focal_px), **found.named}
+    if fitted.kind == "table":
+        steps = len(fitted.coefficients) - 1
+        angle = [math.degrees(fitted.widest_rad) * k / steps for k in range(steps + 1)]
+        return {**size, "angle_deg": angle, "radius_px": list(fitted.coefficients)}
+    return {"camera_model": fitted.kind, **size, "focal_px": list(fitted.focal_px), **fitted.named}
 
 
-def _text(data: dict[str, Any], left: Residual) -> str:
+def _text(data: dict[str, Any], left: projections.Residual) -> str:
     numbers = ", ".join(f"{k} {number(v, 6)}" for k, v in data["coefficients"].items())
     focal, centre = (" x ".join(number(v, 7) for v in data[k]) for k in ("focal_px", "centre_px"))
     radii = f"scale {focal}" if data["model"] in ("f-theta", "table") else f"focal length {focal}"

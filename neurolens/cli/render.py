@@ -3,61 +3,100 @@
 from __future__ import annotations
 
 import argparse
+import signal
+import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from neurolens.base.bounds import FILM_MM
 from neurolens.base.cluster import Dask
-from neurolens.base.errors import InputError, NeurolensError, warn
-from neurolens.base.options import add_options
-from neurolens.base.progress import Progress
+from neurolens.base.errors import NeurolensError, printable, warn
+from neurolens.base.progress import Progress, duration
 from neurolens.base.records import plain
+from neurolens.base.settings import changed, group, positive, setting, setting_of, whole
+from neurolens.base.signals import Stopping, Unfinished
 from neurolens.cli.arguments import (
     CAMERAS_HELP,
-    SHOT_OPTIONS,
-    Parser,
-    add_camera,
-    add_exposure,
-    add_json,
-    add_lens_state,
-    add_option,
-    add_output,
-    aperture_of,
-    between,
+    Glasses,
+    LensState,
+    Reporting,
     check_folder,
     check_suffix,
-    whole,
-)
-from neurolens.cli.output import answer
-from neurolens.cli.render_files import (
-    Stopping,
-    Unfinished,
-    add_safety,
-    add_tile,
-    so_far,
-    summary,
-    watch_of,
-)
-from neurolens.cli.render_frames import add_frames, frames_by_file, missing_frames
+    dask,
+    exposure,
+    film_size,
+    keeps,
+    lens,
+    lens_state,
+    output_path,
+)  # fmt: skip
+from neurolens.cli.keys import Frames, frames_group, frames_of
+from neurolens.lens.shot import Shot, Vignetting
 from neurolens.render.settings import FilmSettings
 
 if TYPE_CHECKING:
     from neurolens.cameras.contract import FloatArray
-    from neurolens.frames.frame import Frame, Prepared
+    from neurolens.frames.frame import Files, Frame, Prepared
+    from neurolens.render.renderer import RenderResult, Watch
 
-_DESCRIPTION = """\
-Path-trace a scene (experiments/scenes/*.toml) and write OpenEXR, linear sRGB or ACEScg, with
-a PNG preview beside it. The settings, the camera and the card of a model are kept in the EXR's
-metadata, attribute "neurolens", as JSON.
+_FARMS, _LONG = "farms", "long renders"  # titles in the help
 
-The same seed gives the same picture for any number of threads; all cameras share its
-random numbers. A model (.onnx), the thin lens and the points need no torch; a lens file
-(.toml) does (extra "train").
 
-The preview is updated during the render. Ctrl-C (SIGTERM, SIGHUP) writes the picture so far; the same
-command then resumes from OUT.exr.part and ends with the same picture, bit for bit."""
-_EPILOG = """\
+def _tile(text: str) -> tuple[int, int]:
+    """Type of --tile."""
+    words = text.split("/")
+    if len(words) == 2 and all(w.isascii() and w.isdecimal() and len(w) <= 6 for w in words):
+        number, count = map(int, words)
+        if 1 <= number <= count:
+            return number, count
+    raise argparse.ArgumentTypeError(f"got {text!r}, expected I/N, tile I of N, from 1/N to N/N")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """Settings of the picture in the names of `frames.frame.Frame`; None leaves a setting to the scene."""
+
+    samples: int | None = setting(None, "per pixel (default: the scene's)", within=(1, 2**20))
+    width: int | None = setting(
+        None, "width (default: the scene's, or from --height and the film's shape)", within=(1, 16384),
+        metavar="PIXELS",
+    )  # fmt: skip
+    height: int | None = setting(
+        None, "height (default: the scene's, or from --width and the film's shape)", within=(1, 16384),
+        metavar="PIXELS",
+    )  # fmt: skip
+    film_mm: tuple[float, float] | None = setting(
+        None, "width and height of the film in mm (default: the scene's)", option="film", kind=film_size,
+        metavar="WxH",
+    )  # fmt: skip
+    seed: int = setting(0, "of the random numbers (default: 0)", kind=whole(0))
+    max_depth: int | None = setting(None, "bounces (default: the scene's)", within=(1, 1000))
+    half: bool = setting(False, "16-bit floats in the EXR (default: 32-bit)")
+    exposure: float = exposure()
+    channels: Literal["all", "beauty"] = setting(
+        "all", "of the EXR: colour alone, or also samples, variance (of the pixel's luminance), Z (depth in m along "
+        "the axis from the film) and blocked (share of camera rays that do not pass) (default: all)", old=("layers",),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Render(Glasses, Reporting):
+    """Path-trace a scene (experiments/scenes/*.toml) and write OpenEXR, linear sRGB or ACEScg, with
+    a PNG preview beside it. The settings, the camera and the card of a model are kept in the EXR's
+    metadata, attribute "neurolens", as JSON.
+
+    The same seed gives the same picture for any number of threads; all cameras share its
+    random numbers. A model (.onnx), the thin lens and the points need no torch; a lens file
+    (.toml) does (extra "train").
+
+    The preview is updated during the render. Ctrl-C (SIGTERM, SIGHUP) writes the picture so far; the same
+    command then resumes from OUT.exr.part and ends with the same picture, bit for bit."""
+
+    about: ClassVar[str] = "a scene through a lens, a model, a thin lens or a pinhole"
+    epilog: ClassVar[str] = f"""{CAMERAS_HELP}
+
 examples:
   neurolens render experiments/scenes/room.toml --camera pinhole --samples 4 -o quick.exr
   neurolens render experiments/scenes/room.toml --camera lenses/laikin_double_gauss_50.toml -o exact.exr
@@ -71,174 +110,204 @@ examples:
   neurolens render --merge room.tile-*.exr -o room.exr
   neurolens render experiments/scenes/room.toml --camera fused:models/NAME.onnx --frames 1:48 \\
       --key focus=1:1.2,48:3 --key position=1:0/1.6/3,48:0.5/1.6/2.5 -o pull.exr"""
+    kept: ClassVar[str] = "no picture was written; older files of that name are untouched"
 
-
-def add_parser(subparsers: Any) -> None:
-    """Add the command to the command line."""
-    parser = subparsers.add_parser(
-        "render", help="a scene through a lens, a model, a thin lens or a pinhole",
-        description=_DESCRIPTION, epilog=f"{CAMERAS_HELP}\n\n{_EPILOG}",
-    )  # fmt: skip
-    parser.add_argument("scene", metavar="SCENE", nargs="*", type=Path, help="scene file (.toml), or tiles of --merge")
-    add_camera(parser)
-    add_output(parser, "OUT.exr", "picture to write; the preview is OUT.png", required=True)
-    picture = parser.add_argument_group("picture")
-    picture.add_argument("--samples", metavar="N", type=whole(1, 2**20), help="per pixel (default: the scene's)")
-    picture.add_argument(
-        "--width", metavar="PIXELS", type=whole(1, 16384),
-        help="width (default: the scene's, or from --height and the film's shape)",
-    )  # fmt: skip
-    picture.add_argument(
-        "--height", metavar="PIXELS", type=whole(1, 16384),
-        help="height (default: the scene's, or from --width and the film's shape)",
-    )  # fmt: skip
-    picture.add_argument(
-        "--film", metavar="WxH", type=film_size, help="width and height of the film in mm (default: the scene's)"
+    scene: tuple[Path, ...] = setting(
+        (), "scene file (.toml), or tiles of --merge", positional=True, metavar="SCENE", nargs="*"
     )
-    picture.add_argument("--seed", metavar="N", type=whole(0), default=0, help="of the random numbers (default: 0)")
-    picture.add_argument("--max-depth", metavar="N", type=whole(1, 1000), help="bounces (default: the scene's)")
-    picture.add_argument("--half", action="store_true", help="16-bit floats in the EXR (default: 32-bit)")
-    add_exposure(picture)
-    add_option(
-        picture, "--channels", old=("--layers",), choices=("all", "beauty"), default="all",
-        help="of the EXR: colour alone, or also samples, variance (of the pixel's luminance), Z (depth in m along the "
-        "axis from the film) and blocked (share of camera rays that do not pass) (default: all)",
+    camera: str | None = lens(None, models=True, cameras=True)
+    film_offset_mm: float | None = setting_of(Shot, "film_offset_mm")
+    vignetting: Vignetting | None = setting_of(Shot, "vignetting")
+    out: Path = output_path("OUT.exr", "picture to write; the preview is OUT.png")
+    picture: Picture = group("picture")
+    colour: FilmSettings = group("colour (left out: the scene's [film] table)", unset=True)
+    frames: Frames = frames_group(
+        "render these frames to OUT.0001.exr and so on; a frame that exists is kept (--restart: none is), an "
+        "interrupted one goes on; the seed grows by the frame's number; --json prints an object a frame"
+    )
+    tile: tuple[int, int] | None = setting(
+        None, "render the I-th of N bands of rows, to OUT.tile-I-of-N.exr (goes with --frames). A scene's [flare] is "
+        "computed whole for each tile", kind=_tile, metavar="I/N", title=_FARMS,
     )  # fmt: skip
-    add_options(parser.add_argument_group("colour (left out: the scene's [film] table)"), FilmSettings, unset=True)
-    add_frames(parser)
-    add_tile(parser)
-    add_safety(parser)
-    add_lens_state(parser)
-    parser.add_argument(
-        "--threads", metavar="N", type=whole(1, 256), default=2,
-        help="workers, each pinned to a core if there are as many as cores (default: 2)",
+    merge: bool = setting(
+        False, "put tiles together: the picture that one run gives, bit for bit, with its preview and metadata, whose "
+        "times are summed; of tiles of frames a picture a frame. Takes -o and --exposure alone, and no tile of other "
+        "settings, missing, doubled or unfinished", title=_FARMS,
     )  # fmt: skip
-    add_json(parser, quiet=True)
-    parser.set_defaults(run=run_kept, kept="no picture was written; older files of that name are untouched")
-
-
-def run_kept(args: argparse.Namespace) -> int:
-    """As `run`, or tiles merged, with running out of memory as a one-line error."""
-    if not args.merge:
-        if len(args.scene) != 1 or args.camera is None:
-            missing = "SCENE" if len(args.scene) != 1 else "--camera"
-            raise InputError("neurolens render", missing, " ".join(map(str, args.scene)) or "(none)", "one of it")
-        (args.scene,) = args.scene
-    try:
-        return (_run_merge if args.merge else run)(args)
-    except MemoryError as error:
-        raise NeurolensError(f"render: out of memory ({str(error) or 'no more said'})") from None
-
-
-def run(args: argparse.Namespace) -> int:
-    """Render one picture, or one for each frame; the exit code of the first that fails."""
-    if args.frames is None and args.key:
-        raise InputError("neurolens render", "--key", args.key[0], "--frames beside it")
-    frames = {args.out: frame_of(args)} if args.frames is None else frames_by_file(args, frame_of(args))
-    missing = frames if args.frames is None else missing_frames(args, frames)
-    if args.dask is not None:
-        return _run_on_dask(args, frames, missing)
-    from neurolens.frames.frame import flare_choice, flare_of, prepare
-
-    choice = None
-    for number, (out, frame) in enumerate(missing.items()):
-        progress = Progress(quiet=args.quiet)
-        prepared = prepare(frame, out, progress)
-        choice = choice if number else flare_choice(list(frames.values()), prepared, args.threads)
-        code = _render(args, prepared, flare_of(prepared, choice, args.threads, progress), progress)
-        if code:
-            return code
-    return 0
-
-
-def frame_of(args: argparse.Namespace) -> Frame:
-    """The frame that the options describe."""
-    from neurolens.frames.frame import Frame
-
-    return Frame.of(
-        args.scene, args.camera, **{name: getattr(args, name) for name in SHOT_OPTIONS}, aperture=aperture_of(args),
-        glass_files=tuple(args.glass_files), film_mm=args.film,
-        width=args.width, height=args.height, samples=args.samples, seed=args.seed, max_depth=args.max_depth,
-        colour_space=args.colour_space, white_balance=args.white_balance, wavelengths=args.wavelength_mode,
-        wavelength_sampling=args.wavelength_sampling, half=args.half, channels=args.channels, exposure=args.exposure,
-        tile=args.tile,
+    dask: str | None = dask(_FARMS)
+    checkpoint_every: float = setting(
+        30.0, "seconds between checkpoints, OUT.exr.part; inf: only when the render is stopped (default: 30)",
+        kind=positive("seconds", infinite=True), metavar="S", title=_LONG,
     )  # fmt: skip
+    restart: bool = setting(False, "start anew, ignoring OUT.exr.part", title=_LONG)
+    keep_checkpoint: bool = setting(
+        False, "keep OUT.exr.part, so that the same command with more --samples adds them (from a multiple of 16)",
+        title=_LONG,
+    )  # fmt: skip
+    state: LensState = lens_state()
+    threads: int = setting(
+        2, "workers, each pinned to a core if there are as many as cores (default: 2)", within=(1, 256)
+    )
 
+    def run(self) -> int:
+        """Render frames, or merge tiles; returns the exit code of the first frame that fails."""
+        if not self.merge and (len(self.scene) != 1 or self.camera is None):
+            missing = "SCENE" if len(self.scene) != 1 else "--camera"
+            self.refuse(missing, " ".join(map(str, self.scene)) or "(none)", "one of it")
+        try:
+            return self._merge() if self.merge else self._run()
+        except MemoryError as error:  # in one line
+            raise NeurolensError(f"render: out of memory ({str(error) or 'no more said'})") from None
 
-def _render(args: argparse.Namespace, prepared: Prepared, flare: Mapping[str, FloatArray], progress: Progress) -> int:
-    """Render a frame until it is done or a signal asks to stop, write its pictures, and print a summary."""
-    from neurolens.frames.frame import write_pictures
+    def _run(self) -> int:
+        self.frames.check(self.called)
+        frame = self.frame()
+        frames = {self.out: frame} if self.frames.frames is None else self._by_file(frame)
+        missing = frames if self.frames.frames is None else self._missing(frames)
+        if self.dask is not None:
+            return self._run_on_dask(self.dask, frames, missing)
+        from neurolens.frames.frame import flare_choice, flare_of, prepare
 
-    files = prepared.files
-    with Stopping() as stopping, progress.stage(f"render {prepared.name}") as report:
-        result = prepared.render(args.threads, report, watch_of(args, files, stopping))
-        if not result.stats["complete"]:
-            raise Unfinished
-    if stopping():
-        args.kept = files.kept()
-    if not result.stats["paths"]:
-        return stopping.say(args.kept)
-    write_pictures(prepared, result, flare)
-    if dropped := result.stats["dropped_samples"]:
-        warn(f"{dropped} of {result.stats['paths']} samples were not finite and count as black")
-    if not result.stats["complete"]:
-        return stopping.say(f"{so_far(result, files)}; {files.kept()}")
-    if not args.keep_checkpoint:
-        files.checkpoint.unlink(missing_ok=True)
-    stats = plain(result.stats)
-    data = {"file": str(files.out), "preview": str(files.preview), **stats, "camera": prepared.camera.settings}
-    return answer(args, data, lambda: summary(stats, files))
-
-
-def _run_on_dask(args: argparse.Namespace, frames: Mapping[Path, Frame], missing: Mapping[Path, Frame]) -> int:
-    """Render frames by tiles on a cluster."""
-    from neurolens.frames.farm import how_to_resume, render_frames
-
-    for option, value in (("--tile", args.tile), ("--keep-checkpoint", args.keep_checkpoint or None)):
-        if value is not None:
-            raise InputError("neurolens render", option, value, "left out beside --dask")
-    if not missing:
+        choice = None
+        for number, (out, frame) in enumerate(missing.items()):
+            progress = self.progress()
+            prepared = prepare(frame, out, progress)
+            choice = choice if number else flare_choice(list(frames.values()), prepared, self.threads)
+            code = self._render(prepared, flare_of(prepared, choice, self.threads, progress), progress)
+            if code:
+                return code
         return 0
-    folder, progress = args.out.with_name(f"{args.out.name}.tiles"), Progress(quiet=args.quiet)
-    args.kept = how_to_resume(folder)
-    with Dask(args.dask) as executor:
-        pictures = render_frames(
-            missing, executor, folder, shown=list(frames.values()), restart=args.restart, progress=progress
-        )
-    return _say_pictures(args, pictures)
+
+    def frame(self) -> Frame:
+        """The frame that the options describe."""
+        from neurolens.frames.frame import Frame
+
+        assert self.camera is not None
+        return Frame.of(
+            self.scene[0], self.camera, **self.state.camera(), **vars(self.picture), **vars(self.colour),
+            film_offset_mm=self.film_offset_mm, vignetting=self.vignetting, glass_files=self.glass, tile=self.tile,
+        )  # fmt: skip
+
+    def _by_file(self, frame: Frame) -> dict[Path, Frame]:
+        """The frames of --frames by the files of their pictures; `frame` has the settings that no key sets."""
+        assert self.frames.frames is not None
+        frames = {}
+        for number, digits, values in frames_of(self.frames.frames, self.frames.key, vars(frame), self.called):
+            out = self.out.with_name(f"{self.out.stem}.{digits}{self.out.suffix}")
+            frames[out] = replace(frame, **values, number=number, seed=frame.seed + number)
+        return frames
+
+    def _missing(self, frames: Mapping[Path, Frame]) -> dict[Path, Frame]:
+        """The frames that are to be rendered: without --restart those that do not exist, or that have a checkpoint.
+
+        Warns:
+            NeurolensWarning: frames that exist are kept, whatever keys they were rendered by.
+        """
+        from neurolens.frames.frame import Files
+        from neurolens.render.tiles import tile_path
+
+        missing = {}
+        for out, frame in frames.items():
+            written = tile_path(out, frame.tile)
+            if self.restart or not written.is_file() or Files.of(written).checkpoint.exists():
+                missing[out] = frame
+        if kept := len(frames) - len(missing):
+            warn(
+                f"{kept} of {len(frames)} frames exist and are kept, even if their settings differ; "
+                "--restart renders them again"
+            )
+        return missing
+
+    def _render(self, prepared: Prepared, flare: Mapping[str, FloatArray], progress: Progress) -> int:
+        """Render a frame until it is done or a signal asks to stop, write its pictures, and print a summary."""
+        from neurolens.frames.frame import write_pictures
+
+        files = prepared.files
+        with Stopping() as stopping, progress.stage(f"render {prepared.name}") as report:
+            result = prepared.render(self.threads, report, self._watch(files, stopping))
+            if not result.stats["complete"]:
+                raise Unfinished
+        kept = files.kept() if stopping() else self.kept
+        if not result.stats["paths"]:
+            return _interrupted(stopping, kept)
+        with keeps(kept):
+            write_pictures(prepared, result, flare)
+        if dropped := result.stats["dropped_samples"]:
+            warn(f"{dropped} of {result.stats['paths']} samples were not finite and count as black")
+        if not result.stats["complete"]:
+            return _interrupted(stopping, f"{_so_far(result, files)}; {files.kept()}")
+        if not self.keep_checkpoint:
+            files.checkpoint.unlink(missing_ok=True)
+        stats = plain(result.stats)
+        data = {"file": str(files.out), "preview": str(files.preview), **stats, "camera": prepared.camera.settings}
+        return self.answer(data, lambda: _summary(stats, files))
+
+    def _watch(self, files: Files, stop: Stopping) -> Watch:
+        """Preview, checkpoint and stop."""
+        from neurolens.render.pictures import write_png
+        from neurolens.render.renderer import Watch
+
+        return Watch(
+            preview=partial(write_png, files.preview, exposure=self.picture.exposure), checkpoint=files.checkpoint,
+            checkpoint_s=self.checkpoint_every, restart=self.restart, keep=self.keep_checkpoint,
+            stop=stop, note=warn,
+        )  # fmt: skip
+
+    def _run_on_dask(self, address: str, frames: Mapping[Path, Frame], missing: Mapping[Path, Frame]) -> int:
+        """Render frames by tiles on a cluster."""
+        from neurolens.frames.farm import how_to_resume, render_frames
+
+        for option, value in (("--tile", self.tile), ("--keep-checkpoint", self.keep_checkpoint or None)):
+            if value is not None:
+                self.refuse(option, value, "left out beside --dask")
+        if not missing:
+            return 0
+        folder = self.out.with_name(f"{self.out.name}.tiles")
+        with keeps(how_to_resume(folder)), Dask(address) as executor:
+            pictures = render_frames(
+                missing, executor, folder, shown=list(frames.values()), restart=self.restart,
+                progress=self.progress(),
+            )  # fmt: skip
+        return self._say_pictures(pictures)
+
+    def _merge(self) -> int:
+        """Put tiles together."""
+        taken = ("--merge", "--output", "--exposure", "--quiet", "--json")
+        for option in changed(self):
+            if option not in taken:
+                self.refuse(option, "(beside --merge)", "tiles, -o and --exposure alone")
+        if not self.scene:
+            self.refuse("--merge", "(no tiles)", "the tiles of a render")
+        check_suffix(self.out, "--output", (".exr",))
+        check_folder(self.out, "--output")
+        from neurolens.render.tiles import merge_tiles
+
+        return self._say_pictures(merge_tiles(list(self.scene), self.out, self.picture.exposure))
+
+    def _say_pictures(self, pictures: Sequence[Mapping[str, Any]]) -> int:
+        return self.answer({"pictures": pictures}, lambda: "\n".join(str(p["file"]) for p in pictures))
 
 
-def _run_merge(args: argparse.Namespace) -> int:
-    """Put tiles together."""
-    _check_alone(args)
-    check_suffix(args.out, "--output", (".exr",))
-    check_folder(args.out, "--output")
-    from neurolens.render.tiles import merge_tiles
-
-    return _say_pictures(args, merge_tiles(args.scene, args.out, args.exposure))
+def _interrupted(stopping: Stopping, kept: str) -> int:
+    """Print what remains of an interrupted render to stderr; the exit code, 128 plus the signal's number."""
+    print(f"\nneurolens: interrupted; {printable(kept)}", file=sys.stderr)
+    return 128 + (stopping.number or signal.SIGINT)
 
 
-def _check_alone(args: argparse.Namespace) -> None:
-    """Refuse no tiles at all, and options that tiles have settled already; raises InputError."""
-    parser, taken = Parser(), ("scene", "merge", "out", "exposure", "quiet", "json")
-    add_parser(parser.add_subparsers())
-    for name, unset in vars(parser.parse_args(["render", "-o", "a.exr"])).items():
-        if name not in taken and getattr(args, name) != unset:
-            option = f"--{name.replace('_', '-')}"
-            raise InputError("neurolens render", option, "(beside --merge)", "tiles, -o and --exposure alone")
-    if not args.scene:
-        raise InputError("neurolens render", "--merge", "(no tiles)", "the tiles of a render")
+def _so_far(result: RenderResult, files: Files) -> str:
+    """The part of an interrupted picture that is done."""
+    samples = result.layers.samples
+    least, most = int(samples.min()), int(samples.max())
+    spread = f" ({least} to {most})" if least < most else ""
+    done, asked = result.stats["samples_done"], result.stats["samples"]
+    return f"{files.out} holds {done:.3g} of {asked} samples per pixel{spread}"
 
 
-def _say_pictures(args: argparse.Namespace, pictures: Sequence[Mapping[str, Any]]) -> int:
-    return answer(args, {"pictures": pictures}, lambda: "\n".join(str(p["file"]) for p in pictures))
-
-
-def film_size(text: str) -> tuple[float, float]:
-    """Type of --film: width x height in mm, as in 36x24."""
-    width, _, height = text.lower().partition("x")
-    side = between(*FILM_MM, "the film's width x height in mm, as in 36x24, each")
-    try:
-        return side(width), side(height)
-    except argparse.ArgumentTypeError as error:
-        raise argparse.ArgumentTypeError(f"{text!r}: {error}") from None
+def _summary(stats: dict[str, Any], files: Files) -> str:
+    """Summary of a finished render."""
+    return (
+        f"{stats['scene']} through {stats['camera']}: {stats['width']} x {stats['height']}, {stats['samples']} samples "
+        f"in {duration(stats['seconds'])} ({stats['mpaths_per_s']:.2f} Mpath/s, "
+        f"{100 * stats['passed_fraction']:.0f}% of the rays pass, "
+        f"{100 * stats['camera_fraction']:.0f}% of the time in the camera)\n{files.out}\n{files.preview}"
+    )

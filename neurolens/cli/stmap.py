@@ -5,134 +5,41 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from neurolens import __version__
-from neurolens.base.errors import InputError, warn
+from neurolens.base.errors import warn
 from neurolens.base.progress import Progress
+from neurolens.base.settings import positive, setting
 from neurolens.cli.arguments import (
     CAMERAS_HELP,
-    add_json,
-    add_lens,
-    add_lens_state,
-    add_option,
-    add_output,
+    Glasses,
+    LensState,
+    Reporting,
     check_folder,
-    positive,
-    shot_of,
+    film_size,
+    lens,
+    lens_state,
+    output_path,
     wavelengths_nm,
-    whole,
-)
-from neurolens.cli.output import answer, number
-from neurolens.cli.render import film_size
-from neurolens.cli.render_frames import LENS_KEYS, add_frames, frames_of
+)  # fmt: skip
+from neurolens.cli.keys import LENS_KEYS, Frames, frames_group, frames_of
+from neurolens.cli.output import number
 from neurolens.render.settings import size_by_shape
 
 if TYPE_CHECKING:
+    from neurolens.cameras.contract import Camera
     from neurolens.cameras.field import Field
     from neurolens.lens.shot import Shot
     from neurolens.render.stmap import Plates
 
-_COMMAND = "neurolens stmap"
-# Repeated here, so that help imports no camera; a test compares with `cameras.field`.
-PROJECTIONS = ("rectilinear", "equidistant", "equisolid", "stereographic", "orthographic")
 _LARGEST = 16384  # pixels a side
 LIGHT_NM = (400.0, 700.0)
 # Dominant wavelengths of the primaries of Rec. 709 (and sRGB), for light of D65.
 _CHANNELS_NM = (611.4, 549.1, 464.2)
 _NAMES = ("red", "green", "blue")
-
-_DESCRIPTION = """\
-Write ST maps of a lens (or model, or any other camera) for compositing, float32 OpenEXR:
-
-  SHOT.undistort.exr     makes the undistorted picture from that of the lens (the plate)
-  SHOT.redistort.exr     makes the picture of the lens from an undistorted one, as CG is rendered
-  SHOT.illumination.exr  relative illumination of the plate, channel Y, 1 on the axis
-
-R is s, G is t, B is 1 inside the picture that is read and 0 outside it. s and t are 0 at the left and
-bottom edge of that picture, 1 at its right and top edge; the centre of pixel x, y from its lower left
-corner is (x + 0.5) / width, (y + 0.5) / height: as Nuke's STMap and Blender's Map UV read them (which
-takes B for alpha). Load the maps as raw data. A map has the size of the picture it makes.
-
-The undistorted picture has the plate's pixels and centre, and is larger by the overscan, which is printed:
-it holds every pixel of the plate. Render CG of that size with a pinhole camera of the focal length and place
-that are printed: the lens's paraxial size in the plane in focus, seen from its entrance pupil. Things at other
-distances are off by what is printed as parallax, for a lens's pupil moves with the field: --distance makes maps
-for another plane.
-
-The place of a thing in the picture is the centroid of its light at this stop, over pupil and wavelengths as the
-eye weighs them. Lenses with cylinders keep their squeeze: each meridian has its own focal length and its own
-entrance pupil. All maps have the pixel aspect ratio, which is printed, in the attribute pixelAspectRatio."""
-_EPILOG = """\
-examples:
-  neurolens stmap lenses/laikin_double_gauss_50.toml --width 3840 --film 36x20.25 --focus 2 -o shot
-  neurolens stmap models/NAME.onnx --width 1920 --film 24x13.5 --frames 1:48 --key focus=1:1.2,48:3 -o pull
-  neurolens stmap lenses/NAME.toml --width 1920 --film 36x20.25 --lateral-colour -o shot   # and per channel
-  neurolens stmap lenses/isshiki_fisheye_10.toml --width 2000 --film 18x18 --projection equidistant -o fisheye"""
-
-
-def add_parser(subparsers: Any) -> None:
-    """Add the command to the command line."""
-    parser = subparsers.add_parser(
-        "stmap", help="ST maps, which undistort and redistort pictures of a lens",
-        description=_DESCRIPTION, epilog=f"{CAMERAS_HELP}\n\n{_EPILOG}",
-    )  # fmt: skip
-    add_picture(parser)
-    add_output(parser, "SHOT", "start of the files' names", required=True)
-    parser.add_argument(
-        "--projection", choices=PROJECTIONS, default=PROJECTIONS[0],
-        help="of the undistorted picture (default: rectilinear, a plane: fields up to 85 degrees from the axis)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--distance", metavar="M", type=positive("a distance in metres", infinite=True),
-        help="distance from the film to what shall be in place, in metres, or inf (default: what is in focus)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--lateral-colour", action="store_true",
-        help="maps for each channel too, SHOT.undistort.red.exr and so on, of the --wavelengths",
-    )  # fmt: skip
-    add_option(
-        parser, "--wavelengths", old=("--channels-nm",), metavar="NM", type=_channels, default=_CHANNELS_NM,
-        help="those of red, green and blue (default: 611.4,549.1,464.2 nm, the dominant ones of Rec. 709)",
-    )  # fmt: skip
-    add_frames(parser, "maps of these frames, SHOT.undistort.0001.exr and so on, all of one overscan", names=LENS_KEYS)
-    add_lens_state(parser)
-    add_json(parser, quiet=True)
-    parser.set_defaults(run=run, kept="files that were written are whole")
-
-
-def add_picture(parser: argparse.ArgumentParser) -> None:
-    """Add the camera, the size of the picture and --film."""
-    add_lens(parser, "camera", ", see below", models=True, cameras=True)
-    for side, other in (("width", "height"), ("height", "width")):
-        about = f"{side} of the lens's picture (default: from --{other} and the film's shape)"
-        parser.add_argument(f"--{side}", metavar="PIXELS", type=whole(1, _LARGEST), help=about)
-    parser.add_argument("--size", type=_pixels, help=argparse.SUPPRESS)  # the old spelling
-    parser.add_argument("--film", metavar="WxH", type=film_size, required=True, help="size of the film in mm")
-
-
-def size_of(args: argparse.Namespace) -> tuple[int, int]:
-    """Width and height of the lens's picture in pixels.
-
-    Raises:
-        InputError: the command line states neither.
-    """
-    if not (args.size or args.width or args.height):
-        raise InputError(_COMMAND, "--width", "(missing)", "--width or --height of the lens's picture")
-    return args.size or size_by_shape(args.film[0] / args.film[1], args.width, args.height)
-
-
-def picture_shot(args: argparse.Namespace) -> Shot:
-    """What the command line sets.
-
-    Raises:
-        InputError: as of `size_of`; a film whose shape is not that of the picture.
-    """
-    from neurolens.render.film import PixelGrid
-
-    PixelGrid(*size_of(args), args.film)
-    return shot_of(args, args.film, wavelength_nm=LIGHT_NM)
 
 
 def _pixels(text: str) -> tuple[int, int]:
@@ -145,11 +52,54 @@ def _pixels(text: str) -> tuple[int, int]:
 
 def _channels(text: str) -> tuple[float, ...]:
     """Type of --wavelengths: those of red, green and blue."""
-    found = wavelengths_nm(text)
-    if len(found) == 3 and all(LIGHT_NM[0] <= nm <= LIGHT_NM[1] for nm in found):
-        return found
+    waves = wavelengths_nm(text)
+    if len(waves) == 3 and all(LIGHT_NM[0] <= nm <= LIGHT_NM[1] for nm in waves):
+        return waves
     span = f"{LIGHT_NM[0]:g} to {LIGHT_NM[1]:g}"
     raise argparse.ArgumentTypeError(f"got {text!r}, expected three wavelengths from {span} nm: red,green,blue")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureCommand(Glasses, Reporting):
+    """A command about the picture of a lens."""
+
+    kept: ClassVar[str] = "files that were written are whole"
+
+    camera: str = lens(also=", see below", models=True, cameras=True, positional=True)
+    width: int | None = setting(
+        None, "width of the lens's picture (default: from --height and the film's shape)", within=(1, _LARGEST),
+        metavar="PIXELS",
+    )  # fmt: skip
+    height: int | None = setting(
+        None, "height of the lens's picture (default: from --width and the film's shape)", within=(1, _LARGEST),
+        metavar="PIXELS",
+    )  # fmt: skip
+    size: tuple[int, int] | None = setting(None, argparse.SUPPRESS, kind=_pixels, metavar="WxH")  # the old spelling
+    film: tuple[float, float] = setting(..., "size of the film in mm", kind=film_size, metavar="WxH")
+    state: LensState = lens_state()
+
+    @property
+    def picture(self) -> tuple[int, int]:
+        """Width and height of the lens's picture in pixels."""
+        if not (self.size or self.width or self.height):
+            self.refuse("--width", "(missing)", "--width or --height of the lens's picture")
+        return self.size or size_by_shape(self.film[0] / self.film[1], self.width, self.height)
+
+    def make(self, state: LensState, progress: Progress) -> tuple[Camera, Shot]:
+        """The camera in a state of its lens, and its settings; what the camera notes is a warning.
+
+        Raises:
+            InputError: a film whose shape is not that of the picture.
+        """
+        from neurolens.cameras.build import make_camera
+        from neurolens.render.film import PixelGrid
+
+        PixelGrid(*self.picture, self.film)
+        shot = state.shot(self.film, wavelength_nm=LIGHT_NM)
+        camera = make_camera(self.camera, shot, progress)
+        for note in camera.settings.get("notes", ()):
+            warn(note)
+        return camera, shot
 
 
 @dataclass(frozen=True)
@@ -158,90 +108,159 @@ class _Frame:
 
     number: str
     focus_m: float
-    camera: str
-    settings: dict[str, Any]
+    camera: Camera
     fields: dict[str, Field]
 
 
-def run(args: argparse.Namespace) -> int:
-    """Trace the fields of all frames, then write their maps, of one size."""
-    check_folder(args.out, "--output")
-    if not args.out.name:
-        raise InputError(_COMMAND, "--output", str(args.out), "the start of the files' names")
-    if args.frames is None and args.key:
-        raise InputError(_COMMAND, "--key", args.key[0], "--frames beside it")
-    from neurolens.render.stmap import plates_of
+@dataclass(frozen=True, kw_only=True)
+class StMap(PictureCommand):
+    """Write ST maps of a lens (or model, or any other camera) for compositing, float32 OpenEXR:
 
-    progress = Progress(quiet=args.quiet)
-    states = [("", {})] if args.frames is None else [(n, v) for _, n, v in frames_of(args, _COMMAND, LENS_KEYS)]
-    frames = []
-    with progress.stage(f"trace the field of {args.camera}") as report:
-        for k, (text, values) in enumerate(states):
-            frames.append(_traced(argparse.Namespace(**vars(args) | values), text, progress))
-            report((k + 1) / len(states))
-    plates = plates_of([f for frame in frames for f in frame.fields.values()], size_of(args), args.film)
-    files = []
-    with progress.stage("write the maps") as report:
-        for k, frame in enumerate(frames):
-            files += _written(args, frame, plates, _part(report, k, len(frames)))
-    data = _told(args, frames, plates) | {"files": files}
-    return answer(args, data, lambda: _text(data))
+      SHOT.undistort.exr     makes the undistorted picture from that of the lens (the plate)
+      SHOT.redistort.exr     makes the picture of the lens from an undistorted one, as CG is rendered
+      SHOT.illumination.exr  relative illumination of the plate, channel Y, 1 on the axis
 
+    R is s, G is t, B is 1 inside the picture that is read and 0 outside it. s and t are 0 at the left and
+    bottom edge of that picture, 1 at its right and top edge; the centre of pixel x, y from its lower left
+    corner is (x + 0.5) / width, (y + 0.5) / height: as Nuke's STMap and Blender's Map UV read them (which
+    takes B for alpha). Load the maps as raw data. A map has the size of the picture it makes.
 
-def _traced(args: argparse.Namespace, text: str, progress: Progress) -> _Frame:
-    """The fields of one frame."""
-    from neurolens.cameras.build import make_camera
-    from neurolens.cameras.field import field_of, frame_of, spectrum_of
+    The undistorted picture has the plate's pixels and centre, and is larger by the overscan, which is printed:
+    it holds every pixel of the plate. Render CG of that size with a pinhole camera of the focal length and place
+    that are printed: the lens's paraxial size in the plane in focus, seen from its entrance pupil. Things at other
+    distances are off by what is printed as parallax, for a lens's pupil moves with the field: --distance makes maps
+    for another plane.
 
-    shot = picture_shot(args)
-    camera = make_camera(args.camera, shot, progress)
-    for note in camera.settings.get("notes", ()):
-        warn(note)
-    frame = frame_of(camera)
-    wavelengths = dict(zip(_NAMES, args.wavelengths, strict=True)) if args.lateral_colour else {}
-    fields = {
-        name: field_of(
-            camera, shot.focus_m, args.projection, frame=frame, distance_m=args.distance,
-            spectrum=spectrum_of(camera, LIGHT_NM, nm),
-        )
-        for name, nm in {"": None, **wavelengths}.items()
-    }  # fmt: skip
-    return _Frame(text, shot.focus_m, camera.name, camera.settings, fields)
+    The place of a thing in the picture is the centroid of its light at this stop, over pupil and wavelengths as the
+    eye weighs them. Lenses with cylinders keep their squeeze: each meridian has its own focal length and its own
+    entrance pupil. All maps have the pixel aspect ratio, which is printed, in the attribute pixelAspectRatio."""
 
+    about: ClassVar[str] = "ST maps, which undistort and redistort pictures of a lens"
+    epilog: ClassVar[str] = f"""{CAMERAS_HELP}
 
-def _written(args: argparse.Namespace, frame: _Frame, plates: Plates, report: Callable[[float], None]) -> list[str]:
-    """Write the maps of one frame; their names."""
-    from neurolens.render.pictures import standard_attributes, write_channels
-    from neurolens.render.stmap import illumination_map, redistort_map, undistort_map
+examples:
+  neurolens stmap lenses/laikin_double_gauss_50.toml --width 3840 --film 36x20.25 --focus 2 -o shot
+  neurolens stmap models/NAME.onnx --width 1920 --film 24x13.5 --frames 1:48 --key focus=1:1.2,48:3 -o pull
+  neurolens stmap lenses/NAME.toml --width 1920 --film 36x20.25 --lateral-colour -o shot   # and per channel
+  neurolens stmap lenses/isshiki_fisheye_10.toml --width 2000 --film 18x18 --projection equidistant -o fisheye"""
 
-    makers = {"undistort": undistort_map, "redistort": redistort_map}
-    jobs = [(kind, name, makers[kind]) for name in frame.fields for kind in makers]
-    jobs.append(("illumination", "", illumination_map))
-    files = []
-    header = standard_attributes(frame.settings, frame=int(frame.number) if frame.number else None)
-    header["pixelAspectRatio"] = _ideal(frame.fields[""], plates)["pixel_aspect"]
-    for k, (kind, name, make) in enumerate(jobs):
-        field = frame.fields[name]
-        planes = make(field, plates, _part(report, 2 * k, 2 * len(jobs)))
-        words = [args.out.name, kind, *([name] if name else []), *([frame.number] if frame.number else []), "exr"]
-        path = args.out.with_name(".".join(words))
-        write_channels(path, planes, None, _about(args, frame, plates, kind, field), header)
-        files.append(str(path))
-        report((k + 1) / len(jobs))
-    return files
+    out: Path = output_path("SHOT", "start of the files' names")
+    projection: Literal["rectilinear", "equidistant", "equisolid", "stereographic", "orthographic"] = setting(
+        "rectilinear",
+        "of the undistorted picture (default: rectilinear, a plane: fields up to 85 degrees from the axis)",
+    )
+    distance: float | None = setting(
+        None, "distance from the film to what shall be in place, in metres, or inf (default: what is in focus)",
+        kind=positive("a distance in metres", infinite=True), metavar="M",
+    )  # fmt: skip
+    lateral_colour: bool = setting(
+        False, "maps for each channel too, SHOT.undistort.red.exr and so on, of the --wavelengths"
+    )
+    wavelengths: tuple[float, float, float] = setting(
+        _CHANNELS_NM, "those of red, green and blue (default: 611.4,549.1,464.2 nm, the dominant ones of Rec. 709)",
+        kind=_channels, metavar="NM", old=("channels-nm",),
+    )  # fmt: skip
+    frames: Frames = frames_group(
+        "maps of these frames, SHOT.undistort.0001.exr and so on, all of one overscan", LENS_KEYS
+    )
+
+    def run(self) -> int:
+        """Trace the fields of all frames, then write their maps, of one size."""
+        check_folder(self.out, "--output")
+        if not self.out.name:
+            self.refuse("--output", str(self.out), "the start of the files' names")
+        self.frames.check(self.called)
+        from neurolens.render.stmap import plates_of
+
+        progress, states = self.progress(), [("", self.state)]
+        if self.frames.frames is not None:
+            keyed = frames_of(self.frames.frames, self.frames.key, vars(self.state), self.called, LENS_KEYS)
+            states = [(digits, replace(self.state, **values)) for _, digits, values in keyed]
+        frames = []
+        with progress.stage(f"trace the field of {self.camera}") as report:
+            for k, (digits, state) in enumerate(states):
+                frames.append(self._traced(state, digits, progress))
+                report((k + 1) / len(states))
+        plates = plates_of([f for frame in frames for f in frame.fields.values()], self.picture, self.film)
+        files = []
+        with progress.stage("write the maps") as report:
+            for k, frame in enumerate(frames):
+                files += self._written(frame, plates, _part(report, k, len(frames)))
+        data = self._data(frames, plates) | {"files": files}
+        return self.answer(data, lambda: _text(data))
+
+    def _traced(self, state: LensState, digits: str, progress: Progress) -> _Frame:
+        """The fields of one frame."""
+        from neurolens.cameras.field import field_of, frame_of, spectrum_of
+
+        camera, shot = self.make(state, progress)
+        frame = frame_of(camera)
+        wavelengths = dict(zip(_NAMES, self.wavelengths, strict=True)) if self.lateral_colour else {}
+        fields = {
+            name: field_of(
+                camera, shot.focus_m, self.projection, frame=frame, distance_m=self.distance,
+                spectrum=spectrum_of(camera, LIGHT_NM, nm),
+            )
+            for name, nm in {"": None, **wavelengths}.items()
+        }  # fmt: skip
+        return _Frame(digits, shot.focus_m, camera, fields)
+
+    def _written(self, frame: _Frame, plates: Plates, report: Callable[[float], None]) -> list[str]:
+        """Write the maps of one frame; their names."""
+        from neurolens.render.pictures import standard_attributes, write_channels
+        from neurolens.render.stmap import illumination_map, redistort_map, undistort_map
+
+        makers = {"undistort": undistort_map, "redistort": redistort_map}
+        jobs = [(kind, name, makers[kind]) for name in frame.fields for kind in makers]
+        jobs.append(("illumination", "", illumination_map))
+        files = []
+        header = standard_attributes(frame.camera.settings, frame=int(frame.number) if frame.number else None)
+        header["pixelAspectRatio"] = _ideal(frame.fields[""], plates)["pixel_aspect"]
+        about: dict[str, Any] = {"version": __version__, "camera": str(self.camera), "name": frame.camera.name}
+        about |= {"picture_px": list(plates.picture), "undistorted_px": list(plates.undistorted)}
+        about |= {"film_mm": list(self.film), "focus_m": None if math.isinf(frame.focus_m) else frame.focus_m}
+        for k, (kind, name, make) in enumerate(jobs):
+            field = frame.fields[name]
+            planes = make(field, plates, _part(report, 2 * k, 2 * len(jobs)))
+            path = self.out.with_name(".".join(filter(None, (self.out.name, kind, name, frame.number, "exr"))))
+            facts = {"map": kind, "wavelengths_nm": field.spectrum[0].tolist(), **_ideal(field, plates)}
+            write_channels(path, planes, None, about | facts, header)
+            files.append(str(path))
+            report((k + 1) / len(jobs))
+        return files
+
+    def _data(self, frames: list[_Frame], plates: Plates) -> dict[str, Any]:
+        """The figures of the maps."""
+        from neurolens.render.stmap import worst_px
+
+        rows = []
+        for frame in frames:
+            field = frame.fields[""]
+            moved, missed = worst_px(field, plates)
+            pixel = min(plates.pixel_mm)
+            parallax = [{"distance_m": d, "px": mm / pixel} for d, mm in field.parallax_mm.items()]
+            row: dict[str, Any] = {"frame": int(frame.number) if frame.number else None, "focus_m": frame.focus_m}
+            row |= _ideal(field, plates)
+            row |= {"field_deg": field.field_deg, "shift_px": moved, "there_and_back_px": missed}
+            # One pinhole, at the y meridian's pupil, shows widths in this plane as the pupil of the x meridian does.
+            plane = 1e3 * (frame.focus_m if self.distance is None else self.distance)
+            x, y = field.frame.pupil_mm
+            nearer = 1.0 if math.isinf(plane) else (plane - x) / (plane - y)
+            row |= {"plane_m": plane / 1e3, "pixel_aspect_of_one_pinhole": row["pixel_aspect"] * nearer}
+            rows.append(row | {"parallax": parallax})
+        return {
+            "camera": str(self.camera),
+            "picture_px": list(plates.picture),
+            "undistorted_px": list(plates.undistorted),
+            "overscan": list(plates.overscan),
+            "film_undistorted_mm": [n * p for n, p in zip(plates.undistorted, plates.pixel_mm, strict=True)],
+            "frames": rows,
+        }
 
 
 def _part(report: Callable[[float], None], done: int, of: int) -> Callable[[float], None]:
     """The report of the part of a stage that begins when `done` of so many are done."""
     return lambda share: report((done + share) / of)
-
-
-def _about(args: argparse.Namespace, frame: _Frame, plates: Plates, kind: str, field: Field) -> dict[str, Any]:
-    """The metadata of a map."""
-    said: dict[str, Any] = {"version": __version__, "map": kind, "camera": str(args.camera), "name": frame.camera}
-    said |= {"picture_px": list(plates.picture), "undistorted_px": list(plates.undistorted)}
-    said |= {"film_mm": list(args.film), "wavelengths_nm": field.spectrum[0].tolist()}
-    return said | _ideal(field, plates) | {"focus_m": None if math.isinf(frame.focus_m) else frame.focus_m}
 
 
 def _ideal(field: Field, plates: Plates) -> dict[str, Any]:
@@ -253,34 +272,6 @@ def _ideal(field: Field, plates: Plates) -> dict[str, Any]:
         "focal_mm": [x, y],
         "before_film_mm": list(field.frame.pupil_mm),
         "pixel_aspect": float(f"{y / x * width / height:.6g}"),
-    }
-
-
-def _told(args: argparse.Namespace, frames: list[_Frame], plates: Plates) -> dict[str, Any]:
-    """What --json tells."""
-    from neurolens.render.stmap import worst_px
-
-    rows = []
-    for frame in frames:
-        field = frame.fields[""]
-        moved, missed = worst_px(field, plates)
-        pixel = min(plates.pixel_mm)
-        parallax = [{"distance_m": d, "px": mm / pixel} for d, mm in field.parallax_mm.items()]
-        row: dict[str, Any] = {"frame": int(frame.number) if frame.number else None, "focus_m": frame.focus_m}
-        row |= _ideal(field, plates) | {"field_deg": field.field_deg, "shift_px": moved, "there_and_back_px": missed}
-        # One pinhole, at the y meridian's pupil, shows widths in this plane as the pupil of the x meridian does.
-        plane = 1e3 * (frame.focus_m if args.distance is None else args.distance)
-        x, y = field.frame.pupil_mm
-        nearer = 1.0 if math.isinf(plane) else (plane - x) / (plane - y)
-        row |= {"plane_m": plane / 1e3, "pixel_aspect_of_one_pinhole": row["pixel_aspect"] * nearer}
-        rows.append(row | {"parallax": parallax})
-    return {
-        "camera": str(args.camera),
-        "picture_px": list(plates.picture),
-        "undistorted_px": list(plates.undistorted),
-        "overscan": list(plates.overscan),
-        "film_undistorted_mm": [n * p for n, p in zip(plates.undistorted, plates.pixel_mm, strict=True)],
-        "frames": rows,
     }
 
 

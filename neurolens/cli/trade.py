@@ -1,79 +1,45 @@
-"""`neurolens plan SCENE --lens LENS --trade`: the error of every camera for a scene against the time it takes."""
+"""The answer of `neurolens plan --trade`: the error of every camera for a scene against the time it takes."""
 
 from __future__ import annotations
 
-import argparse
-import json
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from neurolens.base.files import atomic_write_text, library
-from neurolens.base.progress import Progress
+from neurolens.base.files import atomic_write_text, write_json
 from neurolens.base.records import plain
-from neurolens.cli.arguments import check_run_folder
-from neurolens.cli.output import answer, number, table
+from neurolens.cli.arguments import Answering
+from neurolens.cli.output import number, table
 
 if TYPE_CHECKING:
-    from neurolens.lens.prescription import Lens
     from neurolens.plan.trade import Offer, Trade
 
-_SAMPLES = 16  # a pixel of the small pictures
 
-
-def look_of(args: argparse.Namespace) -> dict[str, Any]:
-    """What --comp, --denoise and --zoom say, as arguments of `plan.probe.probe`."""
-    return {"afterwards": args.afterwards, "denoised": args.denoise, "zoom": args.zoom}
-
-
-def shipped_models(lens: Lens, zoom: str | None) -> list[Path]:
-    """The models that ship of a lens, or of a state of its zoom, by its id and its figures."""
-    from neurolens.setting.states import set_lens
-    from neurolens.surrogates.card import read_card
-
-    name = lens.lens_id if zoom is None else f"{lens.lens_id}-{zoom}"
-    files = sorted((library() / "models").glob(f"{name}.*.onnx"))
-    figures = set_lens(lens, zoom=zoom).sha256 if files else ""
-    return [file for file in files if read_card(file)["lens"]["sha256"] == figures]
-
-
-def run_trade(args: argparse.Namespace) -> int:
-    """Price, draw, write, print."""
+def answer_trade(command: Answering, result: Trade, folder: Path, title: str, names: Mapping[str, str]) -> int:
+    """Draw, write, print; 1 where no camera keeps the budget."""
     from neurolens.plan.plots import plot_trade
-    from neurolens.plan.trade import trade
-    from neurolens.readers.any_format import read_any
-    from neurolens.render.scene import load_scene
     from neurolens.study.figures import side_by_side
 
-    lens, scene = read_any(args.lens), load_scene(args.scene)
-    folder = args.out or Path("runs") / f"trade-{scene.name}-{lens.lens_id}"
-    check_run_folder(folder, "neurolens plan", "--output")
-    with Progress({"trade": 30}, quiet=args.quiet).stage("trade") as report:
-        found = trade(
-            scene, lens, args.budget, target=args.target, models=shipped_models(lens, args.zoom), report=report,
-            samples=args.samples or _SAMPLES, folder=None if args.no_fit else folder / "models", **look_of(args),
-        )  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)
-    title = f"{scene.name} through {lens.name}"
-    plot_trade(found, folder / "trade.png", title)
-    chosen = found.chosen
-    pictures = {_marked(s.offer, chosen): s for s in found.shown if s.offer.choice.error_px > 0}
+    plot_trade(result, folder / "trade.png", title)
+    chosen = result.chosen
+    pictures = {_marked(s.offer, chosen): s for s in result.shown if s.offer.choice.error_px > 0}
     exact = "● exact" if chosen is not None and chosen.choice.error_px == 0 else "exact"
     side_by_side(
-        {exact: found.exact, **{k: s.rgb for k, s in pictures.items()}},
+        {exact: result.exact, **{k: s.rgb for k, s in pictures.items()}},
         {k: s.difference for k, s in pictures.items()}, folder / "pictures.png",
-        {k: f"{_time(found, s.offer)}, {number(s.offer.choice.error_px, 2)} px\nFLIP {number(s.flip, 2)}"
+        {k: f"{_time(result, s.offer)}, {number(s.offer.choice.error_px, 2)} px\nFLIP {number(s.flip, 2)}"
          for k, s in pictures.items()},
     )  # fmt: skip
-    atomic_write_text(folder / "trade.html", _page(found, folder, title))
-    flips = {s.offer.choice.name: s.flip for s in found.shown}
-    rows = [{**asdict(o.choice), "seconds": o.seconds, "flip": flips.get(o.choice.name)} for o in found.offered]
-    data = {"scene": str(args.scene), "lens": str(args.lens), "target": args.target, "unit": found.unit}
-    data |= {"base": found.base, "cameras": rows, "front": [o.choice.name for o in found.front]}
-    data |= {"chosen": found.chosen and found.chosen.choice.name, "half": found.half and found.half.choice.name}
-    atomic_write_text(folder / "trade.json", json.dumps(plain(data), indent=1) + "\n")
-    answer(args, data, lambda: _text(found, folder))
-    return 0 if found.chosen else 1
+    atomic_write_text(folder / "trade.html", _page(result, folder, title))
+    flips = {s.offer.choice.name: s.flip for s in result.shown}
+    rows = [{**asdict(o.choice), "seconds": o.seconds, "flip": flips.get(o.choice.name)} for o in result.offered]
+    data = {**names, "unit": result.unit, "base": result.base, "cameras": rows}
+    data |= {"front": [o.choice.name for o in result.front], "chosen": chosen and chosen.choice.name}
+    data |= {"half": result.half and result.half.choice.name}
+    write_json(folder / "trade.json", plain(data))
+    return command.answer(data, lambda: _text(result, folder), 0 if chosen else 1)
 
 
 def _short(offer: Offer) -> str:
@@ -88,76 +54,82 @@ def _seconds(offer: Offer) -> str:
     return "~" * offer.choice.noisy + number(offer.seconds, 3)
 
 
-def _time(found: Trade, offer: Offer) -> str:
-    return f"{_seconds(offer)} {found.unit}"
+def _time(result: Trade, offer: Offer) -> str:
+    return f"{_seconds(offer)} {result.unit}"
 
 
-def _said(found: Trade) -> list[str]:
+def _sentences(result: Trade) -> list[str]:
     """The choice for the budget, and what half of its time buys."""
-    chosen, half = found.chosen, found.half
+    chosen, half = result.chosen, result.half
     if chosen is None:
-        return [f"No camera keeps {found.plan.budget_px:g} px."]
-    told = [f"For {found.plan.budget_px:g} px: {_short(chosen)}, which adds {_time(found, chosen)}, "
+        return [f"No camera keeps {result.plan.budget_px:g} px."]
+    sentences = [f"For {result.plan.budget_px:g} px: {_short(chosen)}, which adds {_time(result, chosen)}, "
             f"{number(chosen.choice.error_px, 3)} px"]  # fmt: skip
-    if found.base:
-        told[0] += f"; the scene itself takes {number(found.base, 3)} {found.unit}"
+    if result.base:
+        sentences[0] += f"; the scene itself takes {number(result.base, 3)} {result.unit}"
     if half is None:
-        least = found.front[0]
-        told.append(f"Half of that buys no camera: the least is {_time(found, least)}, {_short(least)}, "
+        least = result.front[0]
+        sentences.append(f"Half of that buys no camera: the least is {_time(result, least)}, {_short(least)}, "
                     f"{number(least.choice.error_px, 3)} px")  # fmt: skip
     else:
-        told.append(f"Half of that buys {_short(half)}: {_time(found, half)}, "
+        sentences.append(f"Half of that buys {_short(half)}: {_time(result, half)}, "
                     f"{number(half.choice.error_px, 3)} px")  # fmt: skip
-    if later := " and ".join(found.plan.asked.afterwards):
-        told.append(f"Pixels leave out {later}, which compositing adds; FLIP and the pictures, taken before it, do not")
-    return told
+    if later := " and ".join(result.plan.asked.afterwards):
+        sentences.append(
+            f"Pixels leave out {later}, which compositing adds; FLIP and the pictures, taken before it, do not"
+        )
+    return sentences
 
 
-def _text(found: Trade, folder: Path) -> str:
-    flips, front = {s.offer.choice.name: s.flip for s in found.shown}, found.front
+def _text(result: Trade, folder: Path) -> str:
+    flips, front = {s.offer.choice.name: s.flip for s in result.shown}, result.front
     rows = [
-        ("*" if o == found.chosen else "+" if o in front else "", o.choice.name, number(o.choice.error_px, 3),
+        ("*" if o == result.chosen else "+" if o in front else "", o.choice.name, number(o.choice.error_px, 3),
          number(o.choice.light_error, 2), _seconds(o), number(flips.get(o.choice.name), 2), o.choice.how)
-        for o in found.offered
+        for o in result.offered
     ]  # fmt: skip
-    shown = table(("", "camera", "px", "light", found.unit, "FLIP", ""), rows, left=2)
-    legend = f"* for the budget, + no other betters it; {found.unit}: added, of one thread to equal noise, ~ noisy; "
-    legend += f"FLIP at {found.samples} samples a pixel of the same random numbers, with noise where cameras use them "
+    shown = table(("", "camera", "px", "light", result.unit, "FLIP", ""), rows, left=2)
+    legend = f"* for the budget, + no other betters it; {result.unit}: added, of one thread to equal noise, ~ noisy; "
+    legend += f"FLIP at {result.samples} samples a pixel of the same random numbers, with noise where cameras use them "
     legend += "otherwise"
     written = f"Written: {folder}/trade.html, trade.png, pictures.png, trade.json"
-    return "\n\n".join([shown, legend, "\n".join(_said(found)), written])
+    return "\n\n".join([shown, legend, "\n".join(_sentences(result)), written])
 
 
-def _page(found: Trade, folder: Path, title: str) -> str:
+def _page(result: Trade, folder: Path, title: str) -> str:
     from neurolens.base.html import html
     from neurolens.study import pages
 
-    flips = {s.offer.choice.name: s.flip for s in found.shown}
+    flips = {s.offer.choice.name: s.flip for s in result.shown}
     records = [
         {**asdict(o.choice), "seconds": {"min": o.seconds, "median": o.seconds + o.more},
-         "flip": flips.get(o.choice.name)} for o in found.offered
+         "flip": flips.get(o.choice.name)} for o in result.offered
     ]  # fmt: skip
     columns = (
         pages.Column("error, px", "error_px", about="distance of footprints that 95% of the picture keep"),
         pages.Column("light, %", "light_error", 100, 2, "relative error of light that 95% of the picture keep"),
         pages.Column(
-            f"{found.unit} added",
+            f"{result.unit} added",
             "seconds.min",
             about="one thread, the scene's size and samples, to equal noise; ~ noisy",
         ),
-        pages.Column("a ray", "cost", about=f"{found.plan.unit} times the noise"),
+        pages.Column("a ray", "cost", about=f"{result.plan.unit} times the noise"),
         pages.Column("noise", "noise", about="times the rays that equal error takes"),
         pages.Column("FLIP", "flip", digits=2, about="of the small pictures, from the exact lens's"),
     )
-    front = found.front
-    marks = ["● " if o == found.chosen else "○ " if o in front else "" for o in found.offered]
-    names = [f"{m}{_short(o)}" for m, o in zip(marks, found.offered, strict=True)]
-    told = f"{found.samples} samples a pixel each, the same random numbers. Below each its FLIP difference from the "
-    told += "exact lens's picture: with noise, where a camera makes other rays of the same numbers, as thin lenses do."
+    front = result.front
+    marks = ["● " if o == result.chosen else "○ " if o in front else "" for o in result.offered]
+    names = [f"{m}{_short(o)}" for m, o in zip(marks, result.offered, strict=True)]
+    caption = (
+        f"{result.samples} samples a pixel each, the same random numbers. Below each its FLIP difference from the "
+    )
+    caption += (
+        "exact lens's picture: with noise, where a camera makes other rays of the same numbers, as thin lenses do."
+    )
     figures = [
         {"file": "trade.png", "title": "Error against time", "caption": "Ring: the choice for the budget."},
-        {"file": "pictures.png", "title": "What is seen", "caption": told},
+        {"file": "pictures.png", "title": "What is seen", "caption": caption},
     ]
     shown = pages.figures_of(folder, [{**f, "wide": True} for f in figures], inside=True)
     cameras = pages.table(names, records, columns)
-    return html("trade.html", title=title, lead=_said(found), shown=shown, cameras=cameras)
+    return html("trade.html", title=title, lead=_sentences(result), shown=shown, cameras=cameras)

@@ -2,52 +2,56 @@
 
 from __future__ import annotations
 
-import argparse
 import shlex
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from neurolens import __version__
 from neurolens.base.cluster import Dask
-from neurolens.base.errors import InputError, NeurolensError, one_line
+from neurolens.base.errors import NeurolensError, one_line
 from neurolens.base.files import fingerprint_of, sha256_of
 from neurolens.base.lensname import lens_id_of
 from neurolens.base.progress import Progress
 from neurolens.base.records import NOISY, noisy
+from neurolens.base.settings import setting, whole
 from neurolens.base.travel import run_remotely
 from neurolens.cli.arguments import (
-    add_dask,
-    add_glass,
-    add_json,
-    add_lens,
-    add_output,
-    add_within,
+    Glasses,
+    Reporting,
     check_ids,
     check_run_folder,
+    dask,
+    lens,
     more_glasses,
-    whole,
-)
-from neurolens.cli.output import answer, number, table
+    output_path,
+    within,
+)  # fmt: skip
+from neurolens.cli.output import number, table
 from neurolens.study.advice import advice, said_ns
 
 _MARK = "task.sha256"  # in a run folder that came from a cluster
-_DESCRIPTION = """\
-Run an experiment: trace ray pairs of the lens, fit the surrogates, export them as ONNX,
-measure errors and speed against the exact tracer, render the scenes, and write one report.
-Needs the extra "train" (torch).
 
-Without an experiment file, --lens fits a polynomial and a network to that lens in its default state:
-full aperture, its whole lit film, all wavelengths from 380 to 780 nm (less where its glasses are stated
-for less; one where no dispersion is known), focus from infinity to 14 focal lengths (further where the
-lens is too long for that). It takes a minute; --within asks for an error instead. A file of another
-program (Zemax, CODE V, ...) is read as "neurolens convert" reads it; where that lacks something, convert
-first, with its options.
 
-An interrupted run resumes where it stopped: existing models of the same settings are kept."""
-_EPILOG = """\
+@dataclass(frozen=True, kw_only=True)
+class Train(Glasses, Reporting):
+    """Run an experiment: trace ray pairs of the lens, fit the surrogates, export them as ONNX,
+    measure errors and speed against the exact tracer, render the scenes, and write one report.
+    Needs the extra "train" (torch).
+
+    Without an experiment file, --lens fits a polynomial and a network to that lens in its default state:
+    full aperture, its whole lit film, all wavelengths from 380 to 780 nm (less where its glasses are stated
+    for less; one where no dispersion is known), focus from infinity to 14 focal lengths (further where the
+    lens is too long for that). It takes a minute; --within asks for an error instead. A file of another
+    program (Zemax, CODE V, ...) is read as "neurolens convert" reads it; where that lacks something, convert
+    first, with its options.
+
+    An interrupted run resumes where it stopped: existing models of the same settings are kept."""
+
+    about: ClassVar[str] = "fit, measure and render the models of an experiment"
+    epilog: ClassVar[str] = """\
 examples:
   neurolens train experiments/quickstart.toml
   neurolens train experiments/quickstart.toml -o runs/try --set render.samples=4 --set pairs.seed=2
@@ -60,83 +64,71 @@ examples:
 
 The folder holds report.html, results.json, config.toml (all settings, defaults written out),
 lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
+    kept: ClassVar[str] = "fitted models are kept in the run folder; the same command resumes"
 
-
-def add_parser(subparsers: Any) -> None:
-    """Add the command to the command line."""
-    parser = subparsers.add_parser(
-        "train", help="fit, measure and render the models of an experiment", description=_DESCRIPTION, epilog=_EPILOG
+    experiment: Path | None = setting(None, "experiment file", positional=True, metavar="EXPERIMENT.toml", nargs="?")
+    lens: tuple[Path, ...] | None = lens(
+        None, ", instead of an experiment; of several, each has a run folder in DIR (runs)", nargs="+"
     )
-    parser.add_argument("experiment", metavar="EXPERIMENT.toml", nargs="?", type=Path, help="experiment file")
-    instead = ", instead of an experiment; of several, each has a run folder in DIR (runs)"
-    add_lens(parser, "--lens", instead, nargs="+")
-    add_output(parser, "DIR", "run folder, made if needed (default: runs/NAME of the experiment or lens file)")
-    parser.add_argument(
-        "--set", metavar="KEY=VALUE", dest="overrides", action="append", default=[],
-        help="change a setting, for example --set pairs.train=10000; values are TOML, may be repeated",
+    out: Path | None = output_path(
+        "DIR", "run folder, made if needed (default: runs/NAME of the experiment or lens file)", None
+    )
+    set: tuple[str, ...] = setting(
+        (), "change a setting, for example --set pairs.train=10000; values are TOML, may be repeated",
+        metavar="KEY=VALUE",
     )  # fmt: skip
-    parser.add_argument(
-        "--zoom-range", action="store_true",
-        help="of --lens: one model of all focal lengths between the file's zoom states (input \"state\", in mm)",
+    zoom_range: bool = setting(
+        False, 'of --lens: one model of all focal lengths between the file\'s zoom states (input "state", in mm)'
+    )
+    internal_focus: bool = setting(
+        False, 'of --lens: one model of internal focus, infinity to the near limit (input "state", in 1/m)'
+    )
+    within: tuple[str, float] | None = within(
+        "of --lens: the fastest model whose film-equivalent RMS on rays held out is at most this, 2um or "
+        "0.1px; models from 12 coefficients to a network of 2 x 32 units are fitted until one is (exit code 1: none)"
+    )
+    pixels_across: int = setting(
+        4000, "of --within in pixels: how many make the width of the 3:2 frame inscribed in the film circle (default: "
+        "4000: 9 um each for a radius of 21.6 mm)", within=(1, 10**6),
     )  # fmt: skip
-    parser.add_argument(
-        "--internal-focus", action="store_true",
-        help="of --lens: one model of internal focus, infinity to the near limit (input \"state\", in 1/m)",
-    )  # fmt: skip
-    add_within(
-        parser, "of --lens: the fastest model whose film-equivalent RMS on rays held out is at most this, 2um or "
-        "0.1px; models from 12 coefficients to a network of 2 x 32 units are fitted until one is (exit code 1: none)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--pixels-across", metavar="N", type=whole(1, 10**6), default=4000,
-        help="of --within in pixels: how many make the width of the 3:2 frame inscribed in the film circle (default: "
-        "4000: 9 um each for a radius of 21.6 mm)",
-    )  # fmt: skip
-    parser.add_argument("--rounds", metavar="N", type=whole(0), help="of the race, 0 for none (default: the setting's)")
-    parser.add_argument("--no-race", dest="rounds", action="store_const", const=0, help=argparse.SUPPRESS)
-    add_dask(parser)
-    add_glass(parser)
-    add_json(parser, quiet=True)
-    parser.set_defaults(run=run, kept="fitted models are kept in the run folder; the same command resumes")
+    rounds: int | None = setting(
+        None, "of the race, 0 for none (default: the setting's)", kind=whole(0), metavar="N", old={"no-race": 0}
+    )
+    dask: str | None = dask()
+    named: bool = True  # whether the command line names `out`
 
+    def run(self) -> int:
+        """Run the experiment, or one a lens, and print a summary."""
+        if self.dask is not None or (self.lens is not None and len(self.lens) > 1):
+            return self._run_many()
+        one = self._one(None if self.lens is None else self.lens[0], self.out)
+        folder, results = one.folder, one.train(self.progress())
+        data = {"folder": str(folder), "report": str(folder / "report.html"), **results}
+        met = (results.get("target") or {"met": True})["met"]
+        return self.answer(data, lambda: _text(results, folder), 0 if met else 1)
 
-@dataclass(frozen=True)
-class Training:
-    """One run of an experiment file, or of a lens file without one; attributes are those of the options.
+    @property
+    def folder(self) -> Path:
+        """The run folder of one training."""
+        assert self.out is not None
+        return self.out
 
-    Raises:
-        InputError: both or neither of experiment and lens, options that take a lens, a run folder that is a file.
-    """
+    def _one(self, lens: Path | None, out: Path | None) -> Train:
+        """The training of a lens, or of the experiment where there is none.
 
-    experiment: Path | None
-    lens: Path | None
-    out: Path
-    named: bool  # whether the command line names `out`
-    overrides: tuple[str, ...] = ()
-    zoom_range: bool = False
-    internal_focus: bool = False
-    within: tuple[str, float] | None = None
-    pixels_across: int = 4000
-    rounds: int | None = None
-    glass_files: tuple[Path, ...] = ()
-
-    @classmethod
-    def of(cls, args: argparse.Namespace, lens: Path | None, out: Path | None) -> Training:
-        """The training of a lens, or of the experiment where there is none."""
-        file = args.experiment or lens
-        if file is None or None not in (args.experiment, lens):
-            found = "(neither)" if file is None else "(both)"
-            raise InputError("neurolens train", "EXPERIMENT.toml or --lens", found, "one of them")
-        folder = out if out is not None else Path("runs") / lens_id_of(file)
-        check_run_folder(folder, "neurolens train", "--output")
-        made = cls(
-            args.experiment, lens, folder, out is not None, tuple(args.overrides), args.zoom_range,
-            args.internal_focus, args.within, args.pixels_across, args.rounds, tuple(args.glass_files),
-        )  # fmt: skip
-        if lens is None and (made.within or made.zoom_range or made.internal_focus):
-            option = "--within" if made.within else "--zoom-range, --internal-focus"
-            raise InputError("neurolens train", option, "(without --lens)", "--lens FILE")
-        return made
+        Raises:
+            InputError: both or neither of experiment and lens, options that take a lens, a run folder that is a file.
+        """
+        file = self.experiment or lens
+        if file is None or None not in (self.experiment, lens):
+            self.refuse("EXPERIMENT.toml or --lens", "(neither)" if file is None else "(both)", "one of them")
+        folder = Path("runs") / lens_id_of(file) if out is None else out
+        check_run_folder(folder, self.called, "--output")
+        if lens is None and (self.within or self.zoom_range or self.internal_focus):
+            self.refuse(
+                "--within" if self.within else "--zoom-range, --internal-focus", "(without --lens)", "--lens FILE"
+            )
+        return replace(self, lens=None if lens is None else (lens,), out=folder, named=out is not None)
 
     @property
     def settings(self) -> list[str]:
@@ -147,89 +139,80 @@ class Training:
             states.append(f"target.{unit}={self.within[1]!r}")
             states += [f"target.pixels_across={self.pixels_across}"] * (unit == "px")
         rounds = [] if self.rounds is None else [f"evaluation.rounds={self.rounds}"]
-        return [*states, *rounds, *self.overrides]
+        return [*states, *rounds, *self.set]
 
     @property
     def command(self) -> str:
-        """The command line that makes this run."""
+        """The command line that makes one run."""
         parts = ["neurolens", "train"]
-        parts += ["--lens", str(self.lens)] if self.lens is not None else [str(self.experiment)]
+        parts += ["--lens", str(self.lens[0])] if self.lens else [str(self.experiment)]
         parts += ["--output", str(self.out)] if self.named else []
-        for setting in self.settings:
-            parts += ["--set", setting]
+        for change in self.settings:
+            parts += ["--set", change]
         return shlex.join(parts)
+
+    @property
+    def files(self) -> list[Path]:
+        """The files that the command line names."""
+        return [*filter(None, [self.experiment]), *(self.lens or ()), *self.glass]
 
     @property
     def mark(self) -> str:
         """Hash of everything that the models depend on: the lens, catalogues of glass, options, the version."""
-        files = [each for each in (self.experiment, self.lens, *self.glass_files) if each is not None]
-        return fingerprint_of([__version__, self.settings, *map(sha256_of, files)])
+        return fingerprint_of([__version__, self.settings, *map(sha256_of, self.files)])
 
-    def run(self, progress: Progress) -> dict[str, Any]:
-        """Run the experiment; its results."""
+    def train(self, progress: Progress) -> dict[str, Any]:
+        """Run one experiment; its results."""
         from neurolens.study.experiment import default_experiment, read_experiment
         from neurolens.study.train import run_experiment
 
-        if self.lens is not None:
-            experiment = default_experiment(self.lens, self.settings)
+        if self.lens:
+            experiment = default_experiment(self.lens[0], self.settings)
         else:
             assert self.experiment is not None
             experiment = read_experiment(self.experiment, self.settings)
-        return run_experiment(experiment, self.out, progress=progress, command=self.command)
+        return run_experiment(experiment, self.folder, progress=progress, command=self.command)
+
+    def _run_many(self) -> int:
+        """One run a lens, here or on a cluster; a lens that fails is a line, and the exit code is 2 then."""
+        if self.lens is None:
+            self.refuse("--dask", self.dask, "--lens FILE ... beside it")
+        check_ids(self.lens, self.called, "--lens")
+        base = self.out if self.out is not None else Path("runs")
+        check_run_folder(base, self.called, "--output")
+        progress, failed = self.progress(), dict[str, str]()
+        each = [self._one(file, base / lens_id_of(file)) for file in self.lens]
+        if self.dask is None:
+            for one in each:
+                try:
+                    one.train(progress)
+                except NeurolensError as error:
+                    failed[one.folder.name] = str(error)
+        else:
+            failed = _on_dask(self.dask, each, base, progress)
+        for name, why in failed.items():
+            print(f"neurolens: {one_line(f'{name}: {why}', 3000)}", file=sys.stderr)
+        done = [str(one.folder) for one in each if one.folder.name not in failed]
+        return self.answer({"folders": done, "failed": failed}, lambda: "\n".join(done), 2 if failed else 0)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the experiment, or one a lens, and print a summary."""
-    if args.dask is not None or (args.lens is not None and len(args.lens) > 1):
-        return _run_many(args)
-    training = Training.of(args, None if args.lens is None else args.lens[0], args.out)
-    results, folder = training.run(Progress(quiet=args.quiet)), training.out
-    data = {"folder": str(folder), "report": str(folder / "report.html"), **results}
-    answer(args, data, lambda: _text(results, folder))
-    return 0 if (results.get("target") or {"met": True})["met"] else 1
-
-
-def _run_many(args: argparse.Namespace) -> int:
-    """One run a lens, here or on a cluster; a lens that fails is a line, and the exit code is 2 then."""
-    if args.lens is None:
-        raise InputError("neurolens train", "--dask", args.dask, "--lens FILE ... beside it")
-    check_ids(args.lens, "neurolens train", "--lens")
-    base = args.out if args.out is not None else Path("runs")
-    check_run_folder(base, "neurolens train", "--output")
-    progress, failed = Progress(quiet=args.quiet), dict[str, str]()
-    each = [Training.of(args, file, base / lens_id_of(file)) for file in args.lens]
-    if args.dask is None:
-        for training in each:
-            try:
-                training.run(progress)
-            except NeurolensError as error:
-                failed[training.out.name] = str(error)
-    else:
-        failed = _on_dask(args.dask, each, base, progress)
-    for name, why in failed.items():
-        print(f"neurolens: {one_line(f'{name}: {why}', 3000)}", file=sys.stderr)
-    done = [str(training.out) for training in each if training.out.name not in failed]
-    answer(args, {"folders": done, "failed": failed}, lambda: "\n".join(done))
-    return 2 if failed else 0
-
-
-def _on_dask(address: str, each: list[Training], base: Path, progress: Progress) -> dict[str, str]:
+def _on_dask(address: str, each: Sequence[Train], base: Path, progress: Progress) -> dict[str, str]:
     """Run on a cluster what is not there yet; the reasons of what failed."""
-    missing = {training.out.name: training for training in each if _marked(training.out) != training.mark}
+    missing = {one.folder.name: one for one in each if _marked(one.folder) != one.mark}
     base.mkdir(parents=True, exist_ok=True)
     with progress.stage(f"train {len(missing)} of {len(each)} lenses") as report:
         if not missing:
             return {}
-        files = {file for training in missing.values() for file in (training.lens, *training.glass_files) if file}
+        files = {file for one in missing.values() for file in one.files}
         with Dask(address) as executor:
             return run_remotely(executor, train_alone, missing, files, base, report)
 
 
-def train_alone(training: Training) -> None:
+def train_alone(one: Train) -> None:
     """One lens, as a task of a cluster; the folder's mark, written last, says that it is whole, and of what."""
-    with more_glasses(training):
-        training.run(Progress(quiet=True))
-    (training.out / _MARK).write_text(training.mark)
+    with more_glasses(one.glass):
+        one.train(Progress(quiet=True))
+    (one.folder / _MARK).write_text(one.mark)
 
 
 def _marked(folder: Path) -> str | None:

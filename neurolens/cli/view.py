@@ -4,48 +4,15 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
-from neurolens.cli.arguments import add_glass, add_json, add_lens, add_output, check_folder, check_suffix, whole
+from neurolens.base.settings import setting
+from neurolens.cli.arguments import Answering, Glasses, check_folder, check_suffix, lens, output_path
 
-_DESCRIPTION = """\
-Write one page for a browser, which needs neither server nor network: lenses traced exactly and their
-models as GLSL in a path tracer of WebGL2, side by side or as their difference, at any focus, stop,
-blades and wavelength; their layout with the rays of a pixel, their error and what a ray costs there.
-
-LENS is a lens file of any format that `neurolens convert` reads, or a name of lenses/; MODEL an exported
-model, shown with the lens of its name; fitted ghosts (`neurolens flare --fit`) are drawn where a lamp
-is dragged. Without any, every lens of lenses/ with the best polynomial and
-the best network of models/."""
-_EPILOG = """\
-examples:
-  neurolens view -o view.html
-  neurolens view petzval_portrait_100 laikin_double_gauss_50 -o two.html
-  neurolens view my_lens.zmx runs/mine/models/ols-64.onnx -o mine.html
-  neurolens view laikin_double_gauss_50 ghosts.onnx -o flare.html"""
 _DOWNLOADS = ("glsl", "onnx", "c", "osl")
-
-
-def add_parser(subparsers: Any) -> None:
-    """Add the command to the command line."""
-    parser = subparsers.add_parser(
-        "view", help="write a page that runs lenses and models in a browser", description=_DESCRIPTION, epilog=_EPILOG
-    )
-    add_lens(parser, "lenses", models=True, metavar="LENS|MODEL", nargs="*")
-    add_output(parser, "FILE.html", "page (default: view.html)", default=Path("view.html"))
-    parser.add_argument(
-        "--downloads", metavar="KINDS", type=_kinds, default=_DOWNLOADS,
-        help="of glsl, onnx, c, osl what the page brings as files of each form (default: all; osl takes seconds a "
-        "form, a minute of a zoom, once); the last are left out where the page grows beyond 3 MB, exact lenses' first",
-    )  # fmt: skip
-    parser.add_argument(
-        "--jobs", metavar="N", type=whole(1, 64), default=min(8, os.cpu_count() or 1),
-        help="processes that write OSL, each of a core and 0.5 GB (default: all cores, at most 8)",
-    )  # fmt: skip
-    add_glass(parser)
-    add_json(parser)
-    parser.set_defaults(run=run, kept="nothing was written")
 
 
 def _kinds(text: str) -> list[str]:
@@ -57,10 +24,42 @@ def _kinds(text: str) -> list[str]:
     return words
 
 
-def run(args: argparse.Namespace) -> int:
-    """Write the page."""
-    check_suffix(args.out, "--output", (".html", ".htm"))
-    check_folder(args.out, "--output")
-    from neurolens.cli.view_run import run_view
+@dataclass(frozen=True, kw_only=True)
+class View(Glasses, Answering):
+    """Write one page for a browser, which needs neither server nor network: lenses traced exactly and their
+    models as GLSL in a path tracer of WebGL2, side by side or as their difference, at any focus, stop,
+    blades and wavelength; their layout with the rays of a pixel, their error and what a ray costs there.
 
-    return run_view(args)
+    LENS is a lens file of any format that `neurolens convert` reads, or a name of lenses/; MODEL an exported
+    model, shown with the lens of its name; fitted ghosts (`neurolens flare --fit`) are drawn where a lamp
+    is dragged. Without any, every lens of lenses/ with the best polynomial and
+    the best network of models/."""
+
+    about: ClassVar[str] = "write a page that runs lenses and models in a browser"
+    epilog: ClassVar[str] = """\
+examples:
+  neurolens view -o view.html
+  neurolens view petzval_portrait_100 laikin_double_gauss_50 -o two.html
+  neurolens view my_lens.zmx runs/mine/models/ols-64.onnx -o mine.html
+  neurolens view laikin_double_gauss_50 ghosts.onnx -o flare.html"""
+    kept: ClassVar[str] = "nothing was written"
+
+    lenses: tuple[Path, ...] = lens((), models=True, positional=True, metavar="LENS|MODEL", nargs="*")
+    out: Path = output_path("FILE.html", "page (default: view.html)", Path("view.html"))
+    downloads: Sequence[str] = setting(
+        _DOWNLOADS, "of glsl, onnx, c, osl what the page brings as files of each form (default: all; osl takes seconds "
+        "a form, a minute of a zoom, once); the last are left out where the page grows beyond 3 MB, exact lenses' "
+        "first", kind=_kinds, metavar="KINDS",
+    )  # fmt: skip
+    jobs: int = setting(
+        min(8, os.cpu_count() or 1),
+        "processes that write OSL, each of a core and 0.5 GB (default: all cores, at most 8)", within=(1, 64),
+    )  # fmt: skip
+
+    def run(self) -> int:
+        """Write the page."""
+        check_suffix(self.out, "--output", (".html", ".htm"))
+        check_folder(self.out, "--output")
+        from neurolens.cli.view_run import run_view
+
+        return run_view(self)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.layout import layout_profile
@@ -21,7 +20,6 @@ from neurolens.base.progress import Progress
 from neurolens.cameras.onnxlens import load_model
 from neurolens.cli.blender_lenses import card_of, forms_of, key_of, kind_of, library, squeeze_of
 from neurolens.cli.export_lens import write_lens
-from neurolens.cli.output import answer
 from neurolens.flare.ghostmodel import KIND, GhostModel, read_ghosts
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
@@ -34,6 +32,9 @@ from neurolens.surrogates.card import card_in, read_metadata
 from neurolens.surrogates.source import Written, export_source
 from neurolens.view.page import Form, ViewLens, section_svg, write_page
 from neurolens.view.shaders import ghosts_glsl, path_glsl
+
+if TYPE_CHECKING:
+    from neurolens.cli.view import View
 
 _ERRORS = ("rms_um", "p99_um", "rms_infinity_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
 _LIGHT_NM = (400.0, 700.0)
@@ -54,7 +55,7 @@ class _Entry:
     file: Path | None = None
 
 
-def run_view(args: argparse.Namespace) -> int:
+def run_view(args: View) -> int:
     """Write the page."""
     entries = list(_named(args.lenses) if args.lenses else _library())
     for entry in entries:
@@ -75,7 +76,7 @@ def run_view(args: argparse.Namespace) -> int:
     left = about["left_out"]
     data = {"file": str(args.out), **about, "lenses": [lens.key for lens in made]}
     more = f"; left out for its size: {', '.join(left)}" if left else ""
-    return answer(args, data, lambda: f"{args.out}: {len(made)} lenses, {about['bytes'] / 1e6:.2f} MB{more}")
+    return args.answer(data, lambda: f"{args.out}: {len(made)} lenses, {about['bytes'] / 1e6:.2f} MB{more}")
 
 
 def _with_file(entry: _Entry, folder: Path) -> _Entry:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import MISSING, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from neurolens.base.bounds import F_NUMBER, FILM_MM, FOCAL_MM, said, within
 from neurolens.base.errors import InputError
-from neurolens.base.options import check_bounds, setting
+from neurolens.base.settings import check_bounds, setting
 
 FocusMode = Literal["best", "paraxial", "internal"]
 Vignetting = Literal["both", "natural", "optical", "none"]
@@ -45,7 +45,7 @@ class Shot:
 
     film_mm: tuple[float, float]
     focus_m: float = setting(
-        MISSING, "distance from the film to the object in focus, or inf (default: the scene's, or inf)",
+        ..., "distance from the film to the object in focus, or inf (default: the scene's, or inf)",
         within=(1e-6, math.inf), unit="a distance in metres",
     )  # fmt: skip
     f_number: float | None = setting(
@@ -55,6 +55,7 @@ class Shot:
     focal_length_mm: float | None = setting(
         None, "scale the whole lens to this focal length (default: as tabled; 50 for thin and pinhole, 14 for "
         "fisheyes; a model has its own)", within=FOCAL_MM, unit="a focal length in mm", old=("efl",),
+        apart="size",
     )  # fmt: skip
     zoom: str | float | None = setting(
         None, "state of the lens file by name, or a focal length in mm between its states (derived: its table and "
@@ -62,7 +63,7 @@ class Shot:
     )  # fmt: skip
     field_deg: float | None = setting(
         None, "scale the whole lens so that its image circle sees this full field of view, traced",
-        within=(0.001, 360.0), unit="degrees",
+        within=(0.001, 360.0), unit="degrees", apart="size",
     )  # fmt: skip
     focus_mode: FocusMode = setting(
         "best", "the film where the spot on the axis is smallest at this aperture, in the paraxial image, or first the "

@@ -65,7 +65,7 @@ def require_mitsuba(variant: str | None = None) -> Any:
 
 
 def _llvm_doubt(dr: Any) -> str:
-    """What is wrong with the LLVM that Dr.Jit found; empty if nothing is."""
+    """The fault of the LLVM that Dr.Jit loads; empty if it has none."""
     version = dr.detail.llvm_version()
     if version[0] >= _OLDEST_LLVM:
         return ""

@@ -22,11 +22,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from neurolens.base.config import to_toml
 from neurolens.base.errors import InputError, ModelError, NeurolensWarning
 from neurolens.base.lensname import IDEAL_OF, split_kind
 from neurolens.base.progress import Report
 from neurolens.base.records import Timing, noisy
+from neurolens.base.settings import to_toml
 from neurolens.base.tomlfile import format_toml
 from neurolens.cameras.build import ideal_as
 from neurolens.cameras.contract import Camera

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from neurolens.base.errors import InputError
-from neurolens.base.options import check_bounds, setting
+from neurolens.base.settings import check_bounds, setting
 
 ColourSpaceName = Literal["sRGB", "ACEScg"]
 WavelengthMode = Literal["auto", "one", "hero", "lanes"]

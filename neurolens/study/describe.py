@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,7 +12,7 @@ import torch
 from neurolens.analysis import layout
 from neurolens.analysis.fields import Scene
 from neurolens.base import status as st
-from neurolens.base.errors import NeurolensError, NeurolensWarning
+from neurolens.base.errors import NeurolensError, warned
 from neurolens.lens.glass import glass_of
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
@@ -207,8 +206,7 @@ def lens_files(folder: Path) -> list[Path]:
 
 def read_quietly(path: Path) -> Lens:
     """A lens read without warnings, which its check repeats."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NeurolensWarning)
+    with warned():
         return read_any(path)
 
 
@@ -219,14 +217,13 @@ def library_row(path: Path, checked: bool = True) -> dict[str, Any]:
         read the verdict "unreadable" with the error as its doubt.
     """
     place = {"lens": path.stem, "file": str(path)}
-    with warnings.catch_warnings(record=True) as heard:
-        warnings.simplefilter("always", NeurolensWarning)
+    with warned(path) as notes:
         try:
             lens = read_any(path)
             row = lens_row(lens, check_lens(lens) if checked else None)
         except NeurolensError as error:
             row = {"verdict": "unreadable", "doubts": [str(error).removeprefix(f"{path}: ")]}
-    return {**place, **row, "notes": [str(w.message).removeprefix(f"{path}: ") for w in heard]}
+    return {**place, **row, "notes": notes}
 
 
 def lens_row(lens: Lens, checks: list[Check] | None) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Settings of an experiment: one TOML file per run, read by `base.config`."""
+"""Settings of an experiment: one TOML file per run, read by `base.settings`."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from neurolens.base.bounds import RANGE
-from neurolens.base.config import apply_overrides, from_dict, read_config, to_dict, to_toml
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
 from neurolens.base.lensname import lens_id_of
+from neurolens.base.settings import apply_overrides, from_dict, read_config, to_dict, to_toml
 from neurolens.lens.glass import glass_of
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from neurolens.base.errors import InputError
-from neurolens.base.options import check_bounds, setting
+from neurolens.base.settings import check_bounds, setting
 from neurolens.lens.glass import index_of, inverse_square_um
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens

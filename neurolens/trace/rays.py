@@ -18,7 +18,7 @@ from torch.autograd import forward_ad
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.base.files import own_folder
+from neurolens.base.files import cache_folder
 from neurolens.lens import glass
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.trace.arithmetic import is_number, times
@@ -186,7 +186,7 @@ def compile_tracing(run: Callable[..., Any], lens: Lens | None = None, fullgraph
     for surface in lens.surfaces if lens else ():  # read the catalogue now: compiled code cannot read files
         glass.index_of(surface, glass.LINE_D_NM)
     if "TORCHINDUCTOR_CACHE_DIR" not in os.environ:
-        os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(own_folder("torch"))
+        os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(cache_folder("torch"))
     torch.compiler.assume_constant_result(start_of)
     return torch.compile(run, dynamic=False, fullgraph=fullgraph)
 

@@ -11,10 +11,10 @@ from experiments import make_models
 from experiments.__main__ import main
 from experiments.make_models import Entry, Library, chosen, fingerprint, read_list
 from experiments.promises import read_index
-from neurolens.base.config import from_dict
 from neurolens.base.errors import InputError
 from neurolens.base.files import sha256_of
 from neurolens.base.progress import Progress
+from neurolens.base.settings import from_dict
 from neurolens.study.measure import Measured
 from neurolens.surrogates.fit import ModelSettings
 

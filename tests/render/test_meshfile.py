@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 from render_helpers import CAMERA, WHITE, diffuse, radiance, scene, world
 
-from neurolens.base.config import from_dict
 from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.settings import from_dict
 from neurolens.render import meshfile
 from neurolens.render.colour import SpectralRange
 from neurolens.render.mesh import read_mesh

@@ -6,7 +6,7 @@ import json
 import math
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import OpenEXR
@@ -298,4 +298,4 @@ def test_bad_input_is_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixtu
         rest = [word for name, value in given.items() if name != "camera" for word in (name, value)]
         assert words in failure(capsys, "stmap", given["camera"], *rest, "--quiet"), change
     assert not list(tmp_path.iterdir())
-    assert json.dumps(command.PROJECTIONS) == json.dumps(fields.TARGETS)
+    assert json.dumps(get_args(get_type_hints(command.StMap)["projection"])) == json.dumps(fields.TARGETS)

@@ -1,0 +1,466 @@
+"""Settings as frozen dataclasses: one declaration for Python, for TOML files and for a command line::
+
+    @dataclass(frozen=True)
+    class Blur:
+        radius_px: float = setting(3.0, "radius of the kernel", within=(0, 100), unit="pixels")
+        only: tuple[str, ...] = setting((), "a layer that is blurred")
+
+        def __post_init__(self) -> None:
+            check_bounds(self, "blur")
+
+    add_options(parser, Blur)  # --radius PX, --only NAME
+    blur = from_options(Blur, parser.parse_args())
+    blur = read_config(Blur, "blur.toml", overrides=["radius_px=2"])
+
+Options: the option of a field is its name without its unit, which becomes the placeholder of the value. Those that
+overrule a file's table are added `unset`: their default is None.
+
+TOML: a nested dataclass is a table. The types of fields are bool, int, float (takes an integer, refuses NaN), str,
+Path, Literal, Optional and other unions, tuple, and dict with text keys. A class checks its values in `__post_init__`
+by `raise InputError("settings", field, value, expected)`; `from_dict` adds the file and the table.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import math
+import re
+import types
+from collections.abc import Callable, Collection, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field, fields, is_dataclass
+from numbers import Real
+from pathlib import Path
+from types import NoneType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from neurolens.base.bounds import within
+from neurolens.base.errors import InputError
+from neurolens.base.tomlfile import format_toml, parse_toml, read_toml, reject_unknown
+
+T = TypeVar("T")
+_UNIT = re.compile(r"(.+?)_(per_mm|px|mm|um|nm|m|deg|s)")
+_PLACEHOLDERS = {int: "N", float: "X", str: "NAME", Path: "FILE"}
+_NAMES = {
+    bool: "true or false",
+    int: "an integer",
+    float: "a number",
+    str: "a text",
+    Path: "a path",
+    NoneType: '"none"',
+}
+
+
+@dataclass(frozen=True)
+class Option:
+    """The option of a command line that a field is.
+
+    Attributes:
+        about: the help; `add_options` adds the default where the help does not mention one, and texts for {}.
+        within: the smallest and the largest value of a number; the largest may be inf. unit: what the number is, for
+            messages.
+        option: name of the option ("reflections") and of the parsed argument, where it is not the field's.
+        short: a short name ("-o"). old: earlier names, which still work and which help does not show; as a mapping,
+            with a function that converts the text of their value, or with the value for which they stand.
+        metavar: placeholder of the value in the help.
+        kind: converts the text of a value, where the type of the field does not.
+        nargs: as argparse has it; without it a tuple is an option that may be repeated.
+        positional: whether it is an argument without a name. apart: options with the same word exclude each other.
+        title: of the group of options in the help.
+        last: above 0 for what help shows after all other options, in this order.
+    """
+
+    about: str
+    within: tuple[float, float] | None = None
+    unit: str = "a number"
+    option: str = ""
+    short: str = ""
+    old: Sequence[str] | Mapping[str, Any] = ()
+    metavar: str | tuple[str, ...] = ""
+    kind: Callable[[str], Any] | None = None
+    nargs: int | str | None = None
+    positional: bool = False
+    apart: str = ""
+    title: str = ""
+    last: int = 0
+
+
+def setting(default: Any, about: str, **details: Any) -> Any:
+    """A field of a settings dataclass that is also an option, see `Option`; a default of `...` must be given."""
+    metadata = {"option": Option(about, **details)}
+    return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
+
+
+def setting_of(cls: Any, name: str, default: Any = None) -> Any:
+    """A field that is the same option as one of another class, with another default."""
+    return field(default=default, metadata=cls.__dataclass_fields__[name].metadata)
+
+
+def group(title: str, **more: Any) -> Any:
+    """A field that is a dataclass of options, under a title in the help; further arguments as of `add_options`."""
+    return field(metadata={"group": title, "more": more})
+
+
+def check_bounds(settings: Any, what: str) -> None:
+    """Refuse numbers out of the bounds of their fields, for `__post_init__`; raises InputError about `what`."""
+    hints = get_type_hints(type(settings))
+    for f in fields(settings):
+        value, option = getattr(settings, f.name), f.metadata.get("option")
+        if not option or option.within is None or value is None:
+            continue
+        if not isinstance(value, Real) or isinstance(value, bool) or not within(option.within, float(value)):
+            raise InputError(what, f.name, value, _expected(_kind(hints[f.name])[0], option.within, option.unit))
+
+
+def number(kind: Callable[[str], T], good: Callable[[T], bool], expected: str) -> Callable[[str], T]:
+    """Type of an argument: the number of a text where it is `good`, which NaN never is."""
+
+    def convert(text: str) -> T:
+        try:
+            value = kind(text)
+            if good(value):
+                return value
+        except ValueError:
+            pass
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected {expected}")
+
+    return convert
+
+
+def between(low: float, high: float, unit: str) -> Callable[[str], float]:
+    """Type of an argument that is a number from `low` to `high`."""
+    return _within(float, (low, high), unit)
+
+
+def whole(least: int, most: int | None = None) -> Callable[[str], int]:
+    """Type of an argument that is an integer from `least` to `most`."""
+    return _within(int, (least, math.inf if most is None else most), "an integer")
+
+
+def positive(unit: str, *, infinite: bool = False) -> Callable[[str], float]:
+    """Type of an argument that is a number above 0; "inf" only if `infinite`."""
+    expected = f"{unit} above 0{', or inf' if infinite else ''}"
+    return number(float, lambda value: value > 0 and (infinite or not math.isinf(value)), expected)
+
+
+def _within(kind: Any, bounds: tuple[float, float], unit: str) -> Callable[[str], Any]:
+    return number(kind, lambda value: bounds[0] <= value <= bounds[1], _expected(kind, bounds, unit))
+
+
+def _expected(kind: Any, bounds: tuple[float, float], unit: str) -> str:
+    low, high = (f"{bound}" if kind is int else f"{bound:g}" for bound in bounds)
+    return f"{'an integer' if kind is int else unit} from {low}" + ("" if math.isinf(bounds[1]) else f" to {high}")
+
+
+def add_options(
+    parser: argparse._ActionsContainer, cls: type, names: Collection[str] = (), *, unset: bool = False,
+    texts: Mapping[str, str] | None = None, root: argparse._ActionsContainer | None = None, **defaults: Any,
+) -> list[argparse.Action]:  # fmt: skip
+    """Add the fields of `cls` that are declared by `setting` as options, also those of dataclasses inside it.
+
+    Args:
+        parser: a parser, or a group of its arguments.
+        names: these fields alone. defaults: of this command, where they differ from those of the fields.
+        unset: whether all options have the default None.
+        texts: for some fields, what replaces {} in their help.
+        root: the parser that gets the groups of arguments, where `parser` is a group.
+    """
+    hints, actions, apart, texts = get_type_hints(cls), list[argparse.Action](), dict[str, Any](), texts or {}
+    for f in sorted(_options(cls), key=lambda f: getattr(f.metadata.get("option"), "last", 0)):
+        option: Option | None = f.metadata.get("option")
+        if option is None:
+            place = titled(root or parser, f.metadata["group"]) or parser
+            actions += add_options(place, hints[f.name], root=root or parser, **f.metadata["more"])
+        elif is_dataclass(hints[f.name]):
+            actions += add_options(parser, hints[f.name], names, unset=unset, texts=texts, **defaults)
+        elif not names or f.name in names:
+            place = titled(root or parser, option.title) or parser
+            if option.apart:
+                place = apart[option.apart] = apart.get(option.apart) or place.add_mutually_exclusive_group()
+            default = defaults.get(f.name, None if unset else f.default)
+            names_of, details = _details(f, option, hints[f.name], default, texts.get(f.name))
+            actions.append(place.add_argument(*names_of, **details))
+            for word in option.old:
+                if not isinstance(option.old, Mapping):
+                    parser._option_string_actions[f"--{word}"] = actions[-1]
+                    continue
+                value = option.old[word]
+                more = {"type": value} if callable(value) else {"action": "store_const", "const": value}
+                keep = {"dest": details["dest"], "default": details["default"], "help": argparse.SUPPRESS}
+                parser.add_argument(f"--{word}", **keep, **more)
+    return actions
+
+
+def titled(parser: argparse._ActionsContainer, title: str) -> argparse._ActionsContainer | None:
+    """The group of a title, which is made once; None without a title."""
+    named = (group for group in parser._action_groups if group.title == title)
+    return (next(named, None) or parser.add_argument_group(title)) if title else None
+
+
+def _details(
+    f: Any, option: Option, hint: Any, default: Any, text: str | None
+) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """The names and the other arguments of `add_argument`."""
+    (kind, many), required = _kind(hint), default is dataclasses.MISSING
+    about = option.about if text is None else option.about.format(text)
+    if not (required or "default" in about or default is None or default is False or default == ()):
+        about += f" (default: {f'{default:g}' if isinstance(default, float) else default})"
+    details: dict[str, Any] = {"help": about}
+    if not required:
+        details["default"] = list(default) if isinstance(default, tuple) and many else default
+    if kind is bool:
+        details["action"] = "store_true"
+    elif get_origin(kind) is Literal and option.kind is None:
+        details["choices"] = get_args(kind)
+    else:
+        unit = _UNIT.fullmatch(f.name)
+        details["metavar"] = option.metavar or (unit[2].upper() if unit else _PLACEHOLDERS[kind])
+        bounds = None if option.kind else option.within
+        details["type"] = _within(kind, bounds, option.unit) if bounds else option.kind or kind
+    if option.nargs is not None:
+        details["nargs"] = option.nargs
+    elif many:
+        details["action"] = "append"
+    if option.positional:
+        return (f.name,), details
+    details |= {"dest": _dest(f, option)} | ({"required": True} if required else {})
+    return tuple(filter(None, (option.short, _spelling(f, option)))), details
+
+
+def from_options(cls: type[T], args: argparse.Namespace, *, unset: bool = False) -> T:
+    """Settings with the values of the options of `add_options`, and the defaults of those that were not added.
+
+    Args:
+        unset: whether options that were not given are None in the result.
+
+    Raises:
+        InputError: what the class refuses.
+    """
+    hints, values = get_type_hints(cls), dict[str, Any]()
+    for f in _options(cls):
+        if is_dataclass(hints[f.name]):
+            values[f.name] = from_options(hints[f.name], args, unset=f.metadata.get("more", {}).get("unset", False))
+        elif (value := getattr(args, _dest(f, f.metadata["option"]), None)) is not None or unset:
+            values[f.name] = tuple(value) if isinstance(value, list) else value
+    return cls(**values)
+
+
+def changed(settings: Any) -> dict[str, Any]:
+    """The options of settings whose values are not their defaults, by their spelling: {"--f-number": 4.0}."""
+    found: dict[str, Any] = {}
+    for f in _options(type(settings)):
+        value = getattr(settings, f.name)
+        if is_dataclass(value):
+            found |= changed(value)
+        elif value != f.default and not f.metadata["option"].positional:
+            found[_spelling(f, f.metadata["option"])] = value
+    return found
+
+
+def _options(cls: type) -> list[Any]:
+    return [f for f in fields(cls) if {"option", "group"} & f.metadata.keys()]
+
+
+def _spelling(f: Any, option: Option) -> str:
+    unit = _UNIT.fullmatch(f.name)
+    return f"--{option.option or (unit[1] if unit else f.name).replace('_', '-')}"
+
+
+def _dest(f: Any, option: Option) -> str:
+    """The attribute of the parsed arguments."""
+    return f.name if option.positional else (option.option or f.name).replace("-", "_")
+
+
+def _kind(hint: Any) -> tuple[Any, bool]:
+    """The type of one value, the first of several, and whether the field takes many: of `int | None` int, of
+    `tuple[str, ...]` str."""
+    kinds = [kind for kind in get_args(hint) if kind is not NoneType]
+    if NoneType in get_args(hint):
+        return _kind(kinds[0])
+    return (kinds[0], True) if get_origin(hint) is tuple and kinds[1:] == [Ellipsis] else (hint, False)
+
+
+def read_config(cls: type[T], path: str | Path, overrides: Sequence[str] = ()) -> T:
+    """The settings of a TOML file, with overrides such as "fit.terms=40" applied on top.
+
+    Raises:
+        InputError: see `read_toml`, `apply_overrides` and `from_dict`; a mistake in an override names "--set".
+    """
+    data = apply_overrides(read_toml(path), overrides)
+    try:
+        return from_dict(cls, data, path)
+    except InputError as error:
+        if error.field in {text.partition("=")[0].strip() for text in overrides}:
+            raise InputError("--set", error.field, error.value, error.expected) from None
+        raise
+
+
+def apply_overrides(data: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+    """A copy of `data` with each "dotted.key=value" set. Values are TOML; a bare word is a string.
+
+    Raises:
+        InputError: no "=", an empty key, broken TOML, or a key inside something that is not a table.
+    """
+    result = deepcopy(dict(data))
+    for text in overrides:
+        dotted, equals, value = (part.strip() for part in text.partition("="))
+        keys = dotted.split(".")
+        if not equals or not all(keys):
+            raise InputError("--set", text, "(not of this form)", "key=value or table.key=value")
+        table: Any = result
+        for depth, key in enumerate(keys[:-1]):
+            table = table.setdefault(key, {})
+            if not isinstance(table, dict):
+                raise InputError("--set", dotted, f"({'.'.join(keys[: depth + 1])} is not a table)", "a key of a table")
+        table[keys[-1]] = _override_value(dotted, value)
+    return result
+
+
+def _override_value(dotted: str, text: str) -> Any:
+    try:
+        parsed = parse_toml(f"value = {text}\n", "--set")
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as error:
+        if text and text[0] not in "[{\"'" and "\n" not in text:
+            return text
+        raise InputError("--set", dotted, text, f"a TOML value ({error})") from None
+    if set(parsed) != {"value"}:
+        raise InputError("--set", dotted, text, "one TOML value")
+    return parsed["value"]
+
+
+def from_dict(cls: type[T], data: Mapping[str, Any], file: str | Path, prefix: str = "") -> T:
+    """An instance of the dataclass `cls` from the tables of a TOML file.
+
+    Args:
+        file: source of the data, for messages.
+        prefix: dotted place of `data` in the file, "" for the top.
+
+    Raises:
+        InputError: an unknown key (with the known ones and the nearest), a missing key, a wrong type, or what
+            `__post_init__` refuses.
+    """
+    known = {f.name: f for f in fields(cls) if f.init}  # type: ignore[arg-type]
+    data = _with_new_names(known, data, file, prefix)
+    reject_unknown(file, prefix and f"{prefix}.", data, list(known))
+    hints = get_type_hints(cls)
+    values: dict[str, Any] = {}
+    for name, f in known.items():
+        place = _join(prefix, name)
+        if name in data:
+            values[name] = _convert(data[name], hints[name], file, place)
+        elif f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
+            raise InputError(file, place, "(missing)", _describe(hints[name]))
+    try:
+        return cls(**values)
+    except InputError as error:
+        raise InputError(file, _join(prefix, error.field), error.value, error.expected) from None
+
+
+def _with_new_names(
+    known: Mapping[str, dataclasses.Field[Any]], data: Mapping[str, Any], file: str | Path, prefix: str
+) -> Mapping[str, Any]:
+    """The data with keys that were renamed (the field's metadata `was`) under their new names."""
+    for name, f in known.items():
+        for old in f.metadata.get("was", ()):
+            if old not in data:
+                continue
+            values = [data[key] for key in (name, old) if data.get(key, "none") != "none"]
+            if len(values) > 1:
+                raise InputError(file, _join(prefix, old), data[old], f"left out beside {name}, its new name")
+            rest = {key: value for key, value in data.items() if key not in (name, old)}
+            data = {**rest, name: values[0] if values else "none"}
+    return data
+
+
+def _join(prefix: str, name: str) -> str:
+    return f"{prefix}.{name}" if prefix else name
+
+
+def _convert(value: Any, kind: Any, file: str | Path, place: str) -> Any:
+    """`value` as the type `kind`, or an InputError."""
+    origin, args = get_origin(kind), get_args(kind)
+    if origin in (Union, types.UnionType):
+        return _convert_union(value, args, file, place)
+    if origin is dict and isinstance(value, Mapping):
+        return {str(k): _convert(v, args[1], file, f"{place}.{k}") for k, v in value.items()}
+    if origin is tuple and isinstance(value, list | tuple):
+        kinds = (args[0],) * len(value) if Ellipsis in args else args
+        if len(kinds) == len(value):
+            return tuple(
+                _convert(v, k, file, f"{place}[{i}]") for i, (v, k) in enumerate(zip(value, kinds, strict=True))
+            )
+    if is_dataclass(kind) and isinstance(kind, type) and isinstance(value, Mapping):
+        return from_dict(kind, value, file, place)
+    if origin is Literal and any(value == choice and type(value) is type(choice) for choice in args):
+        return value
+    scalar = _convert_scalar(value, kind)
+    if scalar is None:
+        raise InputError(file, place, value, _describe(kind))
+    return scalar
+
+
+def _convert_scalar(value: Any, kind: Any) -> Any:
+    """`value` as bool, int, float, str or Path; None where it is not one. A bool is no number, NaN neither."""
+    if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+        try:
+            return None if math.isnan(value) else float(value)
+        except OverflowError:
+            return None
+    if kind is int and isinstance(value, bool):
+        return None
+    if kind is Path and isinstance(value, str | Path):
+        return Path(value)
+    return value if kind in (bool, int, str) and isinstance(value, kind) else None
+
+
+def _convert_union(value: Any, kinds: tuple[Any, ...], file: str | Path, place: str) -> Any:
+    """The first kind that fits; the text "none" is None where None is allowed, as TOML has no null."""
+    if type(None) in kinds and (value is None or value == "none"):
+        return None
+    inner = [kind for kind in kinds if kind is not type(None)]
+    if len(inner) == 1:
+        return _convert(value, inner[0], file, place)  # keeps the precise message of a nested table
+    for kind in inner:
+        try:
+            return _convert(value, kind, file, place)
+        except InputError:
+            continue
+    raise InputError(file, place, value, " or ".join(_describe(kind) for kind in kinds))
+
+
+def _describe(kind: Any) -> str:
+    origin, args = get_origin(kind), get_args(kind)
+    if origin in (Union, types.UnionType):
+        return " or ".join(_describe(a) for a in args)
+    if origin is Literal:
+        return "one of: " + ", ".join(map(repr, args))
+    if origin is tuple and Ellipsis not in args:
+        return "a list of " + ", ".join(_describe(a) for a in args)
+    if origin is tuple:
+        return f"a list, each {_describe(args[0])}"
+    if is_dataclass(kind):
+        return "a table with " + ", ".join(f.name for f in fields(kind) if f.init)
+    return "a table" if origin is dict else _NAMES.get(kind, str(kind))
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """Settings as plain tables and values, the form that `from_dict` takes; None becomes the text "none"."""
+
+    def plain(value: Any) -> Any:
+        if is_dataclass(value):
+            return {f.name: plain(getattr(value, f.name)) for f in fields(value) if f.init}
+        if isinstance(value, Mapping):
+            return {key: plain(item) for key, item in value.items()}
+        if isinstance(value, list | tuple):
+            return [plain(item) for item in value]
+        return "none" if value is None else str(value) if isinstance(value, Path) else value
+
+    return plain(config)
+
+
+def to_toml(config: Any) -> str:
+    """The resolved settings as TOML, every default written out; `read_config` gives the same settings back."""
+    return format_toml(to_dict(config))

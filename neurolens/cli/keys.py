@@ -1,0 +1,163 @@
+"""--frames and --key: focus, stop, zoom and place of the camera between keys, for commands that make many frames."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from neurolens.base.bounds import F_NUMBER, FOCAL_MM, said, within
+from neurolens.base.errors import InputError
+from neurolens.base.files import read_rows
+from neurolens.base.settings import group, setting
+from neurolens.base.tomlfile import reject_unknown
+from neurolens.render.scenetables import FARTHEST_M
+
+_MOST = 100_000
+_PLACE_M = (-FARTHEST_M, FARTHEST_M)
+_Keys = list[tuple[int, list[float]]]  # frames, and the values there in the measure that is linear between keys
+
+
+def _inverse(value: float) -> float:
+    return 1 / value if value else math.inf
+
+
+class _Quantity(NamedTuple):
+    """A quantity that keys change: its name in a `Frame`, its components and their bounds, and the measure that is
+    linear between keys with the functions that lead to it and back."""
+
+    setting: str
+    size: int
+    bounds: tuple[float, float]
+    linear_in: str
+    to: Callable[[float], float] = float
+    back: Callable[[float], float] = float
+
+
+_QUANTITIES = {
+    "focus": _Quantity("focus_m", 1, (1e-6, math.inf), "1/m", _inverse, _inverse),
+    "f-number": _Quantity("f_number", 1, F_NUMBER, "stops", math.log, math.exp),
+    "zoom": _Quantity("zoom", 1, FOCAL_MM, "the logarithm of mm", math.log, math.exp),
+    "position": _Quantity("position_m", 3, _PLACE_M, "m"),
+    "look-at": _Quantity("look_at_m", 3, _PLACE_M, "m"),
+}
+ALL_KEYS, LENS_KEYS = tuple(_QUANTITIES), ("focus", "f-number", "zoom")
+
+
+def _frames(text: str) -> range:
+    """Type of --frames; farms write FIRST-LAST."""
+    words = re.split("[:-]", text)
+    if 2 <= len(words) <= 3 and all(w.isascii() and w.isdecimal() and len(w) <= 7 for w in words):
+        first, last, step = (*map(int, words), 1)[:3]
+        if first <= last and step > 0 and (last - first) // step < _MOST:
+            return range(first, last + 1, step)
+    raise argparse.ArgumentTypeError(f"got {text!r}, expected FIRST:LAST or FIRST:LAST:STEP, at most {_MOST} frames")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frames:
+    """The numbers of frames, and the keys of their settings."""
+
+    frames: range | None = setting(None, "{}", kind=_frames, metavar="FIRST:LAST[:STEP]")
+    key: tuple[str, ...] = setting(
+        (), "values at frames, repeatable: {}; before the first key and after the last one they stay. Or a file of "
+        "keys, .csv with a header or .json (a list of objects): a column frame, and one for each NAME; an empty cell "
+        "is no key", metavar="NAME=FRAME:VALUE,...",
+    )  # fmt: skip
+
+    def check(self, command: str) -> None:
+        """Refuse keys without frames."""
+        if self.frames is None and self.key:
+            raise InputError(command, "--key", self.key[0], "--frames beside it")
+
+
+def frames_group(does: str, names: Sequence[str] = ALL_KEYS) -> Any:
+    """A field of `Frames`; `does`: the help of --frames. `names`: the quantities of the keys."""
+    return group("frames", texts=_texts(does, names))
+
+
+def _texts(does: str, names: Sequence[str]) -> dict[str, str]:
+    measures = ", ".join(f"{name} (linear in {_QUANTITIES[name].linear_in})" for name in names)
+    return {"frames": does, "key": measures + ("; position and look-at are X/Y/Z in m" if "position" in names else "")}
+
+
+def frames_of(
+    frames: range, keys: Sequence[str], fixed: Mapping[str, Any], command: str, names: Sequence[str] = ALL_KEYS
+) -> Iterator[tuple[int, str, dict[str, Any]]]:
+    """The frames of --frames: number, its digits in file names, and the settings that the keys have there.
+
+    Args:
+        fixed: the settings of the command line, of which no key may set one that is not None.
+
+    Raises:
+        InputError: a key that is none, or of a quantity that the command line sets too.
+    """
+    given = [track for text in keys for track in _tracks(text, command, names)]
+    tracks = dict(given)
+    if len(tracks) < len(given):
+        raise InputError(command, "--key", keys, "each quantity once")
+    for name in tracks:
+        if (value := fixed.get(_QUANTITIES[name].setting)) is not None:
+            raise InputError(command, f"--{name}", value, f"left out: --key {name} sets it")
+    digits = max(4, len(str(frames[-1])))
+    for frame in frames:
+        yield (
+            frame,
+            f"{frame:0{digits}d}",
+            {_QUANTITIES[n].setting: _at(n, track, frame) for n, track in tracks.items()},
+        )
+
+
+def _tracks(text: str, command: str, names: Sequence[str]) -> Iterator[tuple[str, _Keys]]:
+    """The quantities of one --key, or of the file of keys that it names."""
+    path = Path(text)
+    if path.suffix.lower() not in (".csv", ".json") or "=" in path.name:
+        name, _, rest = text.partition("=")
+        if name not in names:
+            raise InputError(command, "--key", text, f"NAME=FRAME:VALUE,... with NAME of {', '.join(names)}")
+        keys: _Keys = []
+        for word in rest.split(","):
+            frame, _, value = word.partition(":")
+            _append(keys, name, frame, value, (command, f"--key {name}"))
+        yield name, keys
+        return
+    rows = read_rows(path, "a list of keys")
+    for number, row in enumerate(rows):
+        reject_unknown(path, f"row {number + 1}, ", row, ["frame", *names])
+    for name in names:
+        keys = []
+        for number, row in enumerate(rows):
+            if (cell := row.get(name)) not in (None, ""):
+                value = "/".join(map(str, cell)) if isinstance(cell, list) else str(cell)
+                place = (path, f"row {number + 1}, {name}")
+                _append(keys, name, str(row.get("frame")).strip(), value.strip(), place)
+        if keys:
+            yield name, keys
+
+
+def _append(keys: _Keys, name: str, frame: str, value: str, place: tuple[str | Path, str]) -> None:
+    """Append a key that two words give; `place`: where they stand, for errors."""
+    quantity = _QUANTITIES[name]
+    try:
+        numbers = [float(v) for v in value.split("/")] if len(value) < 100 else []
+    except ValueError:
+        numbers = []
+    good = [within(quantity.bounds, v) for v in numbers]
+    later = frame.isascii() and frame.isdecimal() and len(frame) <= 7 and (not keys or int(frame) > keys[-1][0])
+    if not later or len(numbers) != quantity.size or not all(good):
+        form = f"{'X/Y/Z in m' if quantity.size > 1 else 'a number'} {said(quantity.bounds)}"
+        raise InputError(*place, f"{frame}:{value}", f"FRAME:VALUE, frames increasing, VALUE {form}")
+    keys.append((int(frame), [quantity.to(v) for v in numbers]))
+
+
+def _at(name: str, keys: _Keys, frame: int) -> float | tuple[float, ...]:
+    """The value of a quantity at a frame."""
+    import numpy as np
+
+    frames, measures = [k for k, _ in keys], np.transpose([m for _, m in keys])
+    values = tuple(_QUANTITIES[name].back(float(np.interp(frame, frames, row))) for row in measures)
+    return values if len(values) > 1 else values[0]
