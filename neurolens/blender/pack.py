@@ -38,7 +38,7 @@ _LARGEST = 1 << 26
 
 @dataclass(frozen=True)
 class Form:
-    """A shader of a lens; see `extension.library.Variant` for the numbers."""
+    """A shader of a lens; `extension.library.Variant` describes the numbers."""
 
     kind: str
     model: str
@@ -53,8 +53,8 @@ class Form:
 
 @dataclass(frozen=True)
 class PackedLens:
-    """A lens of the menu: `lens_id` names its files; `picture` is a PNG, `lens_field` an `extension.library.Field` as a
-    table, None without."""
+    """A lens of the menu, whose files are named by `lens_id`. `picture` is a PNG, `lens_field` an
+    `extension.library.Field` as a table."""
 
     lens_id: str
     name: str
@@ -66,7 +66,7 @@ class PackedLens:
     lens_field: dict[str, Any] | None = None
 
     def files(self) -> dict[str, bytes]:
-        """Contents by place."""
+        """The contents of its files, by their places in the extension."""
         found = {f"shaders/{self._stem(f)}.osl": f.osl.encode() for f in self.forms}
         if self.picture is not None:
             found[f"thumbnails/{safe_name(self.lens_id)}.png"] = self.picture
@@ -91,13 +91,13 @@ class PackedLens:
         }
 
     def _stem(self, form: Form) -> str:
-        """A name of files: the model's is a text of its card, which anybody may have written."""
+        """A safe name of files: the model's name is a text of its card, which anybody may have written."""
         return safe_name(f"{self.lens_id}.{form.model or form.kind}")
 
 
 @cache
 def extension_library() -> ModuleType:
-    """The extension's own reader of its facts, by itself: its package starts with Blender."""
+    """The module of the extension that reads facts, without its package, which needs Blender."""
     spec = spec_from_file_location("neurolens_library", EXTENSION / "library.py")
     assert spec is not None and spec.loader is not None
     module = module_from_spec(spec)
@@ -107,7 +107,7 @@ def extension_library() -> ModuleType:
 
 
 def year_of(source: str) -> int | None:
-    """The year that a source names, of several the first: the lens's own stands before the book that reprints it."""
+    """The first year that a source names: the lens's own stands before that of a book that reprints it."""
     found = _YEAR.search(source)
     return None if found is None else int(found[1] or _SHOWA + int(found[2]))
 
@@ -128,19 +128,19 @@ def write_pack(out: Path, lenses: Iterable[PackedLens]) -> None:
 
 
 def check_takes(to: Path) -> None:
-    """Refuse a zip or a user folder that takes no lens, before there is one.
+    """Refuse a zip or a user folder that takes no lens, before a lens is made.
 
     Raises:
-        InputError: as of `add_to_zip` and `add_to_folder`.
+        InputError: as `add_to_zip` and `add_to_folder`.
     """
     (_of_zip if to.suffix == ".zip" else _of_folder)(to)
 
 
 def add_to_zip(path: Path, lens: PackedLens) -> None:
-    """Put a lens into a packed extension, in place of one of its id.
+    """Put a lens into a packed extension, in place of one with its id.
 
     Raises:
-        InputError: no extension of ours.
+        InputError: the file is no packed extension.
     """
     files, known = _of_zip(path)
     _write_zip(path, files | lens.files() | {FACTS: _facts(_merged(known, lens))})
@@ -162,16 +162,16 @@ def _of_zip(path: Path) -> tuple[dict[str, bytes], list[dict[str, Any]]]:
     except MemoryError:
         raise
     except Exception as error:  # zipfile raises many types: for passwords, methods of compression, damaged data
-        said = isinstance(error, (zipfile.BadZipFile, ValueError))  # the others speak of the code, not of the file
-        found = f"no {error}" if isinstance(error, KeyError) else str(error) if said else "damaged or encrypted"
-        raise InputError(path, "file", f"({found or type(error).__name__})", expected) from None
+        clear = isinstance(error, (zipfile.BadZipFile, ValueError))  # other messages are about the code
+        why = f"no {error}" if isinstance(error, KeyError) else str(error) if clear else "damaged or encrypted"
+        raise InputError(path, "file", f"({why or type(error).__name__})", expected) from None
 
 
 def add_to_folder(folder: Path, lens: PackedLens) -> None:
-    """Put a lens into the extension's user folder, which is made, in place of one of its id.
+    """Put a lens into the extension's user folder, which is made if needed, in place of one with its id.
 
     Raises:
-        InputError: facts there that are not ours, or no folder. OSError: a place that cannot be written.
+        InputError: its facts are not those of neurolens, or it is no folder. OSError: it cannot be written.
     """
     known = _of_folder(folder)
     for name, data in {**lens.files(), FACTS: _facts(_merged(known, lens))}.items():  # the facts last: they name files
@@ -181,7 +181,7 @@ def add_to_folder(folder: Path, lens: PackedLens) -> None:
 
 
 def _of_folder(folder: Path) -> list[dict[str, Any]]:
-    """The entries of the facts of a user folder, none where it is new."""
+    """The entries in the facts of a user folder, none if the folder is new."""
     file = folder / FACTS
     if folder.exists() and not folder.is_dir():
         raise InputError(folder, "--to", "(a file)", "a zip that `neurolens blender build` wrote, or a folder")
@@ -195,7 +195,7 @@ def _of_folder(folder: Path) -> list[dict[str, Any]]:
 
 
 def user_folders() -> list[Path]:
-    """User folders of the extension where a Blender on this machine has it installed, the newest Blender first."""
+    """The user folders of the extension in the Blenders of this machine that have it, the newest Blender first."""
     home = Path.home()
     if given := os.environ.get("BLENDER_USER_RESOURCES"):
         places = [Path(given)]
@@ -225,7 +225,7 @@ def _entries(text: bytes) -> list[dict[str, Any]]:
 
 
 def _merged(known: Iterable[dict[str, Any]], lens: PackedLens) -> list[dict[str, Any]]:
-    """The entries with the lens; forms of it that are kept are those that it does not bring."""
+    """The entries with the lens added; an entry of its id keeps the forms that the lens does not bring."""
     mine = lens.facts()
     kinds = {v["kind"] for v in mine["variants"]}
     others = []

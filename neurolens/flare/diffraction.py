@@ -4,18 +4,18 @@ The field on the film is U(x, y) = 1/lambda times the integral of sqrt(e) exp(i 
 light's exit pupil (Debye; Born and Wolf, section 8.8), with e the light per area of direction cosines (L, M): |U|^2
 sums to the light that arrives.
 
-Near its centre the integral is summed over cells of the pupil. A picture is thousands of fringes wide, and pixels are
-wider than fringes: farther out, at a distance u, the mean over a pixel is had from the pupil's outline. With n dl its
+Near the centre the integral is summed over cells of the pupil. A picture is thousands of fringes wide, and pixels are
+wider than fringes: farther out, at a distance u, the mean over a pixel follows from the pupil's outline. With n dl its
 elements, |k u|^2 |U|^2 is the power spectrum of sqrt(e) n exp(i k W) dl (the divergence theorem), and the mean over a
-pixel that of pairs of elements less than about lambda / pixel apart. Between the streaks of straight edges this is
+pixel is that of pairs of elements less than about lambda / pixel apart. Between the streaks of straight edges this is
 right to some 5e-5 of the streaks.
 
 Out of focus u counts from where the rays of each element meet the film (Born and Wolf, section 8.9, the boundary
 diffraction wave at short wavelengths). Elements are summed in three groups by the direction of n. A pixel has light
-of those of which u lies along n, and no group holds both the near and the far edge of an image: of each group one u
-is enough, that of the element whose n is closest to it. Phases of the wave of another wavelength differ, and so do the
-fringes: out of focus each of five parts of the range has a spectrum of its own, and at 400 and 700 nm rings 1 mm out of
-focus at f/8 are right to 5%.
+from the elements whose n lies along u, and no group holds both the near and the far edge of an image: so each group
+needs only one u, that of the element whose n is closest to it. At another wavelength the phases and the fringes differ:
+out of focus each of five parts of the range has its own spectrum, and at 400 and 700 nm rings 1 mm out of focus at f/8
+are right to 5%.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _GROUPS, _SAMPLES = 3, 64  # of elements out of focus; of each, those whose plac
 
 
 def cells_needed(pupil: ExitPupil, reach_mm: float) -> int:
-    """Cells across the pupil, a power of two, that `far_field` takes at least for points so far out."""
+    """The least number of cells across the pupil, a power of two, that `far_field` needs for points so far out."""
     cycles = 2 * float(pupil.half.max()) * (reach_mm + pupil.blur_mm) / (pupil.wavelength_nm * 1e-6)
     return max(64, 1 << math.ceil(math.log2(_PER_CYCLE * cycles + 1)))
 
@@ -59,10 +59,10 @@ def far_field(pupil: ExitPupil, lines: Sequence[Array], x_mm: Array, y_mm: Array
     """Irradiance [Y, X] on the film, for 1 at the lens, at x and y from the pupil's centre, by the sum over cells.
 
     Args:
-        lines: `outline` of the pupil, of whatever wavelength.
+        lines: `outline` of the pupil at any wavelength.
 
     Raises:
-        InputError: points so far out, or such aberrations, that cells are too few.
+        InputError: the points are so far out, or the aberrations so large, that cells are too few.
     """
     wave = pupil.wavelength_nm * 1e-6
     farthest = max(float(np.abs(x_mm).max()), float(np.abs(y_mm).max()))
@@ -92,8 +92,8 @@ class Spectrum:
     Attributes:
         values: [G, N, N], the parts of groups of elements, at multiples of `step` in y and x, 0 at N // 2.
         step: cycles per unit of cosine.
-        edges: [G] of [M, 4], some elements of each: x, y in mm from the centre where their rays meet the film, and n
-            of length 1. M = 0: all rays meet at the centre.
+        edges: [G] arrays [M, 4], some elements of each group: x, y in mm from the centre where their rays meet the
+            film, and n of length 1. M = 0: all rays meet at the centre.
     """
 
     values: Floats
@@ -116,7 +116,7 @@ class Spectrum:
 
 
 def _squares(edges: Array, x_mm: Array, y_mm: Array) -> Floats:
-    """|u|^2 [Y, X] of points from those of elements (`Spectrum.edges`) that each has light of."""
+    """|u|^2 [Y, X] of points, each from the element (`Spectrum.edges`) whose light it has."""
     found = np.empty((len(y_mm), len(x_mm)), np.float32)
     between = np.pad((np.diff(edges[:, :2], axis=0) ** 2).sum(1), 1, constant_values=np.inf)
     edges = np.column_stack([edges, np.minimum(between[1:], between[:-1]) if len(edges) else edges[:, :1]])
@@ -137,11 +137,11 @@ def outline_spectrum(
 ) -> Spectrum:
     """The spectrum that holds film points up to `reach_mm` from the centre.
 
-    It is smoothed as by pixels (or as many samples allow) at the shortest wavelength: there by the fourth power of
-    sinc(x / 2), x in pixels, whose samples a pixel apart have always the same sum.
+    It is smoothed as by pixels at the shortest wavelength (or more, if samples are too few): by the fourth power of
+    sinc(x / 2), x in pixels, whose samples a pixel apart always have the same sum.
 
     Args:
-        part: number of it, and of how many, whose sum is wanted: each starts pairs at its own share of the places.
+        part: K and N for the K-th of N spectra whose mean is wanted: each starts pairs at its own share of elements.
     """
     wave = shortest_nm * 1e-6
     pixel = max(pixel_mm, 8 * reach_mm / _SPECTRUM)
@@ -183,7 +183,7 @@ def outline_spectrum(
 
 
 def _groups(normal: Array) -> NDArray[np.int_]:
-    """Groups [N] of elements by the direction of n; their limits lie where fewest elements do, not along an edge."""
+    """The group of each element [N] by the direction of n; limits lie where elements are fewest, not along an edge."""
     turn = np.arctan2(normal[1], normal[0]) * (_GROUPS / (2 * math.pi))
     fewest = np.histogram(turn % 1, 60, (0, 1))[0].argmin()
     found = np.floor(turn - (fewest + 0.5) / 60).astype(int) % _GROUPS
@@ -191,7 +191,7 @@ def _groups(normal: Array) -> NDArray[np.int_]:
 
 
 def _elements(pupil: ExitPupil, lines: Sequence[Array], spacing: float) -> tuple[Array, Array]:
-    """Elements of outlines, equally long in each and at most so: cosines from the middle of the box, and n dl."""
+    """Elements of outlines, at most `spacing` long: cosines from the middle of the box, and n dl."""
     places, normals = [], []
     for line in lines:
         ends = np.append(line, line[:, :1], 1) * pupil.half[:, None]
@@ -215,14 +215,14 @@ def starburst_picture(
 ) -> Floats:
     """The stars of lights, [H, W, 3] linear sRGB: the light that diffraction takes out of their images.
 
-    Of a point it is 0 where rays make the image itself, and at the pixels next to that: there a render has the light,
-    which keeps its energy if the render's is less by what this layer would sum to on a film without edges. An extended
-    light has the sum of its points' stars, also within its image. What is sent aside is taken to pass the rear of the
-    lens unhindered. Nothing comes of a light whose rays do not reach the film. Fringes of one wavelength lie beyond the
-    gamut of sRGB: see `in_gamut`.
+    For a point it is 0 where rays make the image itself, and at the pixels next to that: there a render has the light.
+    Energy is kept if the render's light is less by the sum of this layer on a film without edges. An extended light has
+    the sum of its points' stars, also within its image. Diffracted light is taken to pass the rear of the lens
+    unhindered. A light whose rays do not reach the film has no star. Fringes of one wavelength lie beyond the gamut of
+    sRGB: see `in_gamut`.
 
     Args:
-        wavelengths: of equal shares of the range. done: told the share of the work that is done.
+        wavelengths: of equal shares of the range. done: is called with the share of the work that is done.
     """
     spectral = SpectralRange(*wavelength_nm, bins=wavelengths)
     exposure = axis_irradiance(lens, 0.5 * (spectral.low_nm + spectral.high_nm)) if lights else 1.0
@@ -275,7 +275,7 @@ def star(pupil: ExitPupil, lines: Sequence[Array], far: Spectrum, x: Array, y: A
     and next to it.
 
     Args:
-        lines, far: outline and its spectrum, of whatever wavelength.
+        lines, far: the outline and its spectrum, at any wavelength.
     """
     found = far.irradiance(x, y, pupil.wavelength_nm)
     columns, rows = (np.nonzero(np.abs(p) < (_FAR + 0.5) * pixel_mm)[0] for p in (x, y))

@@ -1,9 +1,9 @@
 """Where and how a light's rays leave a lens, and the outline of the opening that they leave through.
 
-The exit pupil of a light is described by the direction cosines (L, M) in which its rays meet the film: what of that
-plane the stop's blades or mask and every rim leave open, as traced for this light, how much light there is, and the
-wavefront W: the mixed characteristic, whose slopes are the aberrations of the rays, dW/dL = -x, dW/dM = -y (Born
-and Wolf, section 4.1). All are polynomials of a few thousand traced rays, so that the pupil can be asked anywhere.
+The exit pupil of a light is a part of the plane of direction cosines (L, M) in which its rays meet the film: the part
+that the stop's blades or mask and every rim leave open, as traced for this light. There it has the light per area and
+the wavefront W: the mixed characteristic, whose slopes are the aberrations of the rays, dW/dL = -x, dW/dM = -y (Born
+and Wolf, section 4.1). All are polynomials fitted to a few thousand traced rays, so that they are known everywhere.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from neurolens.trace.rays import Rays, passing, trace
 Array = NDArray[np.floating[Any]]
 
 CELLS = 1024  # across the pupil
-_SEARCH, _BOX = 1 << 16, 48  # rays that find where light passes; rays a side that describe it
-_DEGREE = 14  # of the polynomials that do
-_FEWEST = 240  # rays for its 120 terms
-_BEYOND = 1.15  # of a rim: as far as rays describe a pupil
+_SEARCH, _BOX = 1 << 16, 48  # rays that find where light passes; rays a side for the polynomials
+_DEGREE = 14  # of the polynomials
+_FEWEST = 240  # rays for their 120 terms
+_BEYOND = 1.15  # radii of a rim up to which rays count for the polynomials
 _FLAT = 1e-6  # half width in cosines of a beam that does not meet on the film
 _BENT = 0.1  # sine of the least angle of a corner
 
@@ -44,14 +44,14 @@ class ExitPupil:
 
     Attributes:
         wavelength_nm: of the light.
-        centre_mm: film point [2] that x and y are counted from: the mean of the rays.
-        middle, half: [2] of the box of cosines that holds what passes.
-        figures: [D, D, K] Chebyshev coefficients on that box, of: the wavefront W in mm, light per area of cosines
+        centre_mm: film point [2] from which x and y are counted: the mean of the rays.
+        middle, half: [2] of the box of cosines that holds the light.
+        figures: [D, D, K] Chebyshev coefficients on that box, for the wavefront W in mm, the light per area of cosines
             in mm^2 (for an irradiance of 1 at the lens), and x, y in mm at each surface that may cut the beam.
         limits_mm: radii of those surfaces; the stop is the first.
         aperture: the stop's shape.
-        hits_mm: [2, N] where some of its rays meet the film, from the centre.
-        box: of the disc across the light's way, [2 low, high, 2].
+        hits_mm: [2, N] where some of the rays meet the film, from the centre.
+        box: the part of the disc across the light's direction that holds the rays, [2 low, high, 2].
     """
 
     wavelength_nm: float
@@ -66,11 +66,11 @@ class ExitPupil:
 
     @property
     def blur_mm(self) -> float:
-        """Greatest distance of a ray from the centre on the film."""
+        """The greatest distance of a ray from the centre on the film."""
         return float(np.hypot(*self.hits_mm).max())
 
     def passes(self, places: Array | tuple[Array, Array]) -> NDArray[np.bool_]:
-        """Whether light passes at places [2, N] of the box, -1 to 1 each; for a tuple of two, at all of their grid."""
+        """Whether light passes at points [2, N] of the box (-1 to 1), or for a tuple of two axes on their grid."""
         at = self._at(places, slice(2, None))
         inside = np.ones(at.shape[1:], bool)
         for x, y, limit in zip(at[::2], at[1::2], self.limits_mm, strict=True):
@@ -80,17 +80,17 @@ class ExitPupil:
         return inside
 
     def field(self, places: Array | tuple[Array, Array]) -> NDArray[np.complex128]:
-        """sqrt(e) exp(i k W) at places, as for `passes`."""
+        """sqrt(e) exp(i k W) at points, which are as in `passes`."""
         w, e = self._at(places, slice(2))
         return np.sqrt(np.maximum(e, 0)) * np.exp(2e6j * math.pi / self.wavelength_nm * w)
 
     def hits(self, places: Array) -> Array:
-        """Where the rays of places [2, N] meet the film, [2, N] in mm from the centre."""
+        """Where the rays of points [2, N] meet the film, [2, N] in mm from the centre."""
         (u, v), wave = places, self.figures[..., 0]
         return -np.stack([chebyshev.chebval2d(u, v, chebyshev.chebder(wave, axis=k)) / self.half[k] for k in (0, 1)])
 
     def _at(self, places: Array | tuple[Array, Array], rows: slice) -> Array:
-        """Figures [K, ...] at places."""
+        """The figures [K, ...] at points, which are as in `passes`."""
         u, v = (chebyshev.chebvander(p, _DEGREE) for p in places)
         figures = np.moveaxis(self.figures[..., rows], -1, 0)
         if isinstance(places, tuple):
@@ -99,14 +99,14 @@ class ExitPupil:
 
 
 def exit_pupil(lens: Lens, light: Light, wavelength_nm: float, like: ExitPupil | None = None) -> ExitPupil | None:
-    """The exit pupil of a light; None where none of its light arrives, or its rays meet nowhere (a pinhole, a plate).
+    """The exit pupil of a light; None if none of its light arrives, or its rays meet nowhere (a pinhole, a plate).
 
     Args:
         lens: its film must be placed (`set_lens`).
-        like: that of another wavelength; its boxes are taken.
+        like: the pupil of another wavelength, whose boxes are used again.
 
     Raises:
-        InputError: a lens without film, a light inside the lens.
+        InputError: the lens has no film, or the light is inside the lens.
     """
     if lens.film_z_mm is None:
         raise InputError(lens.path, "film", None, "a focused lens (set_lens)")
@@ -151,16 +151,16 @@ def exit_pupil(lens: Lens, light: Light, wavelength_nm: float, like: ExitPupil |
 
 
 def image_moves(lens: Lens, patch: Patch, wavelength_nm: float) -> Array:
-    """How far the image of a point moves on the film (mm), [2, 2], along each of the sides of a light's patch."""
-    found = np.zeros((2, 2))
-    for along, side in zip(found, patch.sides, strict=True):
+    """How far the image of a point moves on the film (mm) along the sides of a light's patch, [2, 2]."""
+    moves = np.zeros((2, 2))
+    for along, side in zip(moves, patch.sides, strict=True):
         ends = [
             light_towards(patch.light.towards + f * side, patch.light.rgb, patch.light.distance_m) for f in (-0.5, 0.5)
         ]
         pupils = [exit_pupil(lens, light, wavelength_nm) for light in ends if light is not None and side.any()]
         if len(pupils) == 2 and pupils[0] and pupils[1]:
             along[:] = pupils[1].centre_mm - pupils[0].centre_mm
-    return found
+    return moves
 
 
 def _pair(a: Tensor, b: Tensor) -> Array:
@@ -168,7 +168,7 @@ def _pair(a: Tensor, b: Tensor) -> Array:
 
 
 def _box(lens: Lens, light: Light, wavelength_nm: float) -> Array | None:
-    """Corners [2 low, high, 2] of what passes on the disc across the light's way, for a round stop."""
+    """The box [2 low, high, 2] of the rays that pass, on the disc across the light's direction, for a round stop."""
     lens, box = replace(lens, aperture=None), np.zeros((2, 2))
     places: Array = disc(0, _SEARCH)
     for step in (0.02, 0.05, 0.05):
@@ -190,9 +190,8 @@ def _grid(box: Array, widened: float, count: int) -> Array:
 
 
 def _fitted(places: Array, half: Array, off_mm: Array, disc_places: Array, power: Array, at_mm: Array) -> Array:
-    """`ExitPupil.figures` by least squares from rays at places [2, N]: the wavefront from its slopes, the light per
-    area of cosines by the derivatives of the places on the disc.
-    """
+    """`ExitPupil.figures` by least squares from rays at points [2, N] of the box: the wavefront by its slopes, the
+    light per area of cosines by the derivatives of the points on the disc."""
     orders = np.add.outer(np.arange(_DEGREE + 1), np.arange(_DEGREE + 1)) <= _DEGREE
     # Chebyshev polynomials of each coordinate, and their slopes.
     value = [chebyshev.chebvander(p, _DEGREE) for p in places]
@@ -215,12 +214,12 @@ def _fitted(places: Array, half: Array, off_mm: Array, disc_places: Array, power
 
 
 def _least(q: Array, r: Array, given: Array) -> Array:
-    """Least squares by a matrix's QR."""
+    """The least-squares solution by a matrix's QR decomposition."""
     return np.asarray(np.linalg.solve(r, q.T @ given))
 
 
-# Of a cell's corners that light passes (1, 2, 4, 8, counterclockwise from the lower left), the edges (lower, right,
-# upper, left) that its outline goes from and to, light on its left.
+# For the corners of a cell where light passes (1, 2, 4, 8, counterclockwise from the lower left): the edges (0 lower, 1
+# right, 2 upper, 3 left) from which and to which the outline goes, with the light on its left.
 _MARCH = {
     1: ((0, 3),), 2: ((1, 0),), 3: ((1, 3),), 4: ((2, 1),), 5: ((0, 3), (2, 1)), 6: ((2, 0),), 7: ((2, 3),),
     8: ((3, 2),), 9: ((0, 2),), 10: ((1, 0), (3, 2)), 11: ((1, 2),), 12: ((3, 1),), 13: ((0, 1),), 14: ((3, 0),),
@@ -228,7 +227,7 @@ _MARCH = {
 
 
 def outline(pupil: ExitPupil) -> list[Array]:
-    """The edge of the opening: closed lines, each [2, P] places of the box, by a grid's cells, light on their left."""
+    """The edge of the opening: closed lines [2, P] of points of the box, through a grid's cells, light on the left."""
     nodes = np.linspace(-1, 1, CELLS + 1)
     lit = pupil.passes((nodes, nodes))
     lit[[0, -1]] = lit[:, [0, -1]] = False
@@ -267,7 +266,7 @@ def outline(pupil: ExitPupil) -> list[Array]:
 
 
 def _with_corners(line: Array) -> Array:
-    """A closed line through cells with the corners that it cuts: where its parts before and after a cell meet."""
+    """A closed line through cells with the corners that it cuts off, where its parts before and after a cell meet."""
     before, here, there, after = (np.roll(line, k, 1) for k in (1, 0, -1, -2))
     come, go, gap = here - before, after - there, there - here
 
@@ -285,13 +284,13 @@ def _with_corners(line: Array) -> Array:
 
 
 def coverage(lines: Sequence[Array], cells: int) -> Array:
-    """Share [cells, cells] of each cell of the box that lies inside an outline; exact for a divisor of its grid's."""
-    found = np.zeros((cells + 1, cells))
+    """The share [cells, cells] of each cell of the box inside an outline; exact if `cells` divides `CELLS`."""
+    share = np.zeros((cells + 1, cells))
     for line in lines:
         a = (line + 1) / 2 * cells
         b = np.roll(a, -1, 1)
         column, row = np.minimum(((a + b) / 2).astype(int), cells - 1)
         rise, beside = b[1] - a[1], (a[0] + b[0]) / 2 - column
-        np.add.at(found, (column, row), -rise * (1 - beside))
-        np.add.at(found, (column + 1, row), -rise * beside)
-    return np.cumsum(found, 0)[:-1]
+        np.add.at(share, (column, row), -rise * (1 - beside))
+        np.add.at(share, (column + 1, row), -rise * beside)
+    return np.cumsum(share, 0)[:-1]

@@ -35,25 +35,25 @@ Array = NDArray[np.float64]
 DEGREES = (3, 4, 5, 6, 7, 9)  # in the invariants; the first that is good enough
 _MIRROR_DEGREES = (5, 7, 9, 11)  # in p and u, of lenses with cylinders
 _SEARCH = 1 << 16  # rays that look for the light of each ghost
-_DRAWS = 4  # at most, where few rays serve
-_MARGIN = 1.12  # of the disc in which they find it
-_FAR = 2.0  # film radii: light beyond counts little
-_OPEN = 50.0  # times the diameters of a lens whose rims stop nothing
-_REACH = 1.25  # r / R to which rays beyond rims are fitted
-_BEYOND = 0.3  # what they count
-_RIMS, _UNEXPLAINED = 5, 1e-3
-_LOST = 1e6  # where a ray that misses a surface would be
+_DRAWS = 4  # samples at most, where few rays are useful
+_MARGIN = 1.12  # factor of the disc in which the search finds the light
+_FAR = 2.0  # film radii beyond which light counts little
+_OPEN = 50.0  # factor of all diameters, with which rims stop nothing
+_REACH = 1.25  # r / R up to which rays beyond rims are fitted
+_BEYOND = 0.3  # weight of these
+_RIMS, _UNEXPLAINED = 5, 1e-3  # rims besides the stop's; share of blocked rays that may remain without a rim
+_LOST = 1e6  # coordinates of a ray that misses a surface
 
 
 @dataclass(frozen=True)
 class GhostSettings:
-    """What is fitted, and how finely.
+    """The light that ghosts are fitted for, and how finely.
 
     Attributes:
         angle_deg: largest angle between light and axis. wavelength_nm: range.
-        film_radius_mm: light that falls beyond does not count.
-        keep: share of the ghosts' light that the kept ones carry. target_um: RMS on the film, of each ghost.
-        rays: of a ghost, for its fit; half as many judge it. seed: of theirs.
+        film_radius_mm: light that falls beyond it does not count.
+        keep: share of all ghosts' light that the kept ghosts carry. target_um: RMS error of each ghost on the film.
+        rays: for the fit of a ghost; about half as many test it. seed: of the random numbers.
     """
 
     angle_deg: float = 35.0
@@ -75,8 +75,8 @@ class Sample:
     """Rays of one ghost; numpy [.., N] float64.
 
     Attributes:
-        p, u, w: as the polynomials take them. film: [2, N] mm. crossings: [S, 2, N] in units of each step's rim.
-        ratio: [S, N] their squared lengths; whole: whether the ray meets all surfaces. power: [N] whatever rims do.
+        p, u, w: variables of the polynomials. film: [2, N] mm. crossings: [S, 2, N] in units of each step's rim.
+        whole: whether the ray meets all surfaces. power: [N], as if no rim stopped the ray.
     """
 
     p: Array
@@ -89,18 +89,18 @@ class Sample:
 
     @property
     def ratio(self) -> Array:
+        """The squared lengths [S, N] of the crossings."""
         return np.asarray((self.crossings**2).sum(1))
 
 
 def fit_ghosts(lens: Lens, settings: GhostSettings, done: Callable[[float], None] = lambda share: None) -> GhostModel:
-    """Fit the ghosts of a lens in its state.
+    """Fit the ghosts of a set lens.
 
     Args:
-        done: told the share of the work that is done.
+        done: is called with the share of the work that is done.
 
     Raises:
-        InputError: a lens with a mask in its stop or without film; settings out of range; no ghost that reaches the
-            film.
+        InputError: the lens has a mask in its stop or no film, settings are out of range, or no ghost reaches the film.
     """
     _check(lens, settings)
     began, plain, rng = time.perf_counter(), replace(lens, aperture=None), np.random.default_rng(settings.seed)
@@ -147,13 +147,13 @@ def _check(lens: Lens, settings: GhostSettings) -> None:
 
 
 def _rays(direction: Array, place: Array) -> Array:
-    """[6, N] through places [2, N] of the plane z = 0, from well before the front, of directions' x and y [2, N]."""
+    """Rays [6, N] from well before the front, with directions' x and y [2, N], to points [2, N] of the plane z = 0."""
     d = np.concatenate([direction, np.sqrt(1 - (direction**2).sum(0, keepdims=True))])
     return np.concatenate([np.concatenate([place, np.zeros((1, place.shape[1]))]) - 1000.0 * d, d])
 
 
 def _drawn(lens: Lens, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """p and u [2, N], each of a disc; with an axis of symmetry p along x alone, which stands for all."""
+    """Random p and u [2, N], each in the unit disc; with an axis of symmetry p lies along x, which stands for all."""
     r, turn = np.sqrt(rng.random(count)), 2 * np.pi * rng.random(count)
     length = np.sqrt(rng.random(count))
     about = 2 * np.pi * rng.random(count) if lens.anamorphic else np.zeros(count)
@@ -163,7 +163,7 @@ def _drawn(lens: Lens, count: int, rng: np.random.Generator) -> tuple[Array, Arr
 def _search(
     tracer: GhostTracer, every: Sequence[Pair], settings: GhostSettings, rng: np.random.Generator
 ) -> dict[Pair, tuple[float, Array, Array]]:
-    """Find the light of every ghost on the film over all directions, and where it enters: chief and scale of u (mm)."""
+    """The light of every ghost on the film over all directions, and where it enters: chief and scale of u (mm)."""
     sine, front = settings.sine, tracer.lens.surfaces[0].semi_diameter_mm
     p, u = _drawn(tracer.lens, _SEARCH, rng)
     place = 1.3 * front * u
@@ -189,7 +189,7 @@ def _search(
 def sample(
     lens: Lens, pair: Pair, chief: Array, scale: Array, settings: GhostSettings, count: int, rng: np.random.Generator
 ) -> Sample:
-    """Random rays of a ghost, by the scales of `GhostPolynomial`; rims stop none."""
+    """Random rays of a ghost, by the scales of `GhostPolynomial`; no rim stops them."""
     p, u = _drawn(lens, count, rng)
     short, long = (float(inverse_square_um(v)) for v in settings.wavelength_nm)
     w = 2 * rng.random(count) - 1
@@ -212,8 +212,8 @@ def sample(
 def _fit(
     lens: Lens, pair: Pair, chief: Array, scale: Array, settings: GhostSettings, rng: np.random.Generator
 ) -> tuple[GhostPolynomial, dict[str, Any]] | None:
-    """A ghost of the lowest degree that is good enough, and what was measured on rays held out; None of so few rays
-    that none can be fitted."""
+    """Fit a ghost with the lowest degree that is good enough; returns it and its errors on other rays, or None if too
+    few rays are useful."""
     steps = [k for k, _ in ghost(len(lens.surfaces), *pair)]
     drawn, near, rims = list[Sample](), list[NDArray[np.int_]](), list[int]()
     while len(drawn) < _DRAWS and sum(map(len, near)) < settings.rays:
@@ -243,8 +243,7 @@ def _fit(
 
 
 def _rims(data: Sample, steps: list[int], stop: int) -> list[int]:
-    """Steps whose rims are tested: the stop's, and up to `_RIMS` that explain most of what is blocked, as far as it
-    counts."""
+    """The steps whose rims are tested: the stop's, and up to `_RIMS` others that block most of the rays."""
     blocked = data.ratio[:, data.whole] > 1
     chosen = [n for n, k in enumerate(steps) if k == stop]
     left = blocked.any(0) & ~blocked[chosen].any(0)
@@ -266,7 +265,7 @@ def solved(
     chief: Array,
     scale: Array,
 ) -> GhostPolynomial:
-    """The ghost by least squares from rays number `use` with weights; `rims`: which of the `steps` have crossings."""
+    """Fit a ghost by least squares to rays number `use` with weights; `rims`: which of the `steps` have crossings."""
     field = LightField(*(torch.from_numpy(v[..., use]) for v in (data.p, data.u, data.w)))
     vectors = torch.from_numpy(np.concatenate([data.film[None], data.crossings[rims]])[..., use])
     given, weights = torch.from_numpy(data.power[None, use]), torch.from_numpy(weight)
@@ -288,8 +287,9 @@ def solved(
 
 
 def mirror_exponents(degree: int) -> Any:
-    """[M, 5] exponents of p_x, p_y, u_x, u_y, w up to a total `degree` in the first four, of lower degrees with w, that
-    are odd in x or in y but not in both: components of vectors, and scalars, where x and y each may be mirrored."""
+    """Exponents [M, 5] of p_x, p_y, u_x, u_y, w up to a total `degree` in the first four, and to lower degrees with w.
+
+    They are not odd in both x and y, so that vectors and scalars allow a mirrored x and a mirrored y."""
     rows = raw_exponents(degree)
     reach = np.array([degree, degree - 4, degree - 8, degree - 10])
     low = rows[(rows[:, 4] < 4) & (rows[:, :4].sum(1) <= reach[rows[:, 4].clip(max=3)])]
@@ -297,7 +297,7 @@ def mirror_exponents(degree: int) -> Any:
 
 
 def _measured(fit: GhostPolynomial, test: Sample, film_radius: float) -> dict[str, float]:
-    """Measure light on the film: RMS distance in um, shares that are wrong or missing, and the error of the sum."""
+    """Errors of the light on the film: RMS distance in um, shares that are wrong or missing, and that of the sum."""
     field = LightField(*(torch.from_numpy(v) for v in (test.p, test.u, test.w)))
     if fit.exponents.shape[1] == 4:
         features = monomials(field.invariants(), fit.exponents).numpy()

@@ -52,7 +52,7 @@ class Form:
     Attributes:
         kind: "exact", "polynomial" or "network". method: of the model, as "ols-64".
         glsl: the text of `neurolens export --to glsl`. signature: of its function.
-        card: what the page says of it: numbers of the domain and errors.
+        card: the facts that the page shows: numbers of the domain and errors.
         files: other downloads, contents by kind ("c", "onnx", "osl").
     """
 
@@ -64,7 +64,7 @@ class Form:
     files: Mapping[str, bytes] = field(default_factory=dict)
 
     def program(self) -> dict[str, Any]:
-        """What a shader needs besides the text: the call, and an expression for each number of the lens."""
+        """The call of the function for a shader, and an expression for each number of the lens."""
         own = self.signature.name
         values = {name.removeprefix(f"{own.upper()}_").lower(): name for name in _CONSTANT.findall(self.glsl)}
         for name, arguments in _FUNCTION.findall(self.glsl):
@@ -75,11 +75,11 @@ class Form:
 
 @dataclass(frozen=True)
 class ViewLens:
-    """A lens of the menu: `key` tells it from others, `path` is of `shaders.path_glsl`.
+    """A lens of the menu, named by `key`.
 
     Attributes:
-        squeeze: of an anamorphic picture across. f_numbers: the widest stop's by zoom position (mm). focus_m: nearest.
-        section: of `section_svg`. ghosts: fitted.
+        squeeze: of an anamorphic picture across. f_numbers: (focal length in mm, f-number of the widest stop) by zoom.
+        nearest_m: the nearest focus. section: from `section_svg`. path: from `shaders.path_glsl`. ghosts: fitted ones.
     """
 
     key: str
@@ -99,13 +99,14 @@ class ViewLens:
 def write_page(
     out: Path, lenses: Sequence[ViewLens], kinds: Sequence[str], most_bytes: int = MOST_BYTES
 ) -> dict[str, Any]:
-    """Write the page; of the `kinds` of files that it brings, "glsl" first, the last go where they do not fit, of each
-    those of exact lenses first.
+    """Write the page with these `kinds` of downloads, "glsl" first.
 
-    Returns its size and what of the downloads is there and what is left out.
+    Where they do not fit, the last kinds are left out, in each kind first the files of exact lenses.
+
+    Returns the size of the page, and which downloads it has and which are left out.
 
     Raises:
-        InputError: no lens; lenses that do not fit without any download.
+        InputError: there is no lens, or the lenses do not fit without any download.
     """
     if not lenses:
         raise InputError(out, "lenses", "(none)", "at least one lens")
@@ -122,7 +123,7 @@ def write_page(
 
 
 def _without_exact(lenses: Sequence[ViewLens], kind: str) -> list[ViewLens]:
-    """Lenses whose exact forms bring no such file."""
+    """The lenses without such a file of their exact forms."""
 
     def forms(lens: ViewLens) -> list[Form]:
         files = [{k: v for k, v in f.files.items() if f.kind != "exact" or k != kind} for f in lens.forms]
@@ -156,7 +157,7 @@ def _page(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> str:
 
 
 def _entry(lens: ViewLens, kinds: Sequence[str]) -> dict[str, Any]:
-    """What the menu and the first picture need."""
+    """The facts that the menu and the first picture need."""
     found = {k: v for k, v in asdict(lens).items() if k not in ("forms", "path", "section", "ghosts")}
     forms = [
         {"kind": f.kind, "method": f.method, **f.program(), "card": f.card, "files": _kept(f, kinds)}
@@ -171,7 +172,7 @@ def _kept(form: Form, kinds: Sequence[str]) -> list[str]:
 
 
 def _parts(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> Iterator[tuple[str, str | bytes]]:
-    """Texts and files of lenses, what a picture needs first: the page unpacks no further than it is asked."""
+    """Yield texts and files of lenses, first those that a picture needs: the page unpacks no further than it must."""
     for lens in lenses:
         text, outputs = lens.path or ("", ())
         yield f"{lens.key}/lens", json.dumps({"section": lens.section, "outputs": list(outputs)}).encode()
@@ -188,7 +189,7 @@ def _parts(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> Iterator[tuple[s
 
 
 def section_svg(layout: Layout) -> dict[str, Any]:
-    """The section of a lens as paths of SVG in mm, z to the right and heights upwards: glass, rims, stop, film."""
+    """The section of a lens (glass, rims, stop, film) as paths of SVG in mm, z to the right and heights upwards."""
     glass = [
         {"path": _path(element_outline(front, back)), "n": round(front.n_after, 3)}
         for front, back in zip(layout.surfaces, layout.surfaces[1:], strict=False)
@@ -212,7 +213,7 @@ def section_svg(layout: Layout) -> dict[str, Any]:
 
 
 def _path(points: np.ndarray[Any, Any]) -> str:
-    """A closed path; of an outline's arcs every fourth point."""
+    """A closed path, with every fourth point of an outline's arcs."""
     kept = np.concatenate([points[:65:_ARC], points[65:-65], points[-65::_ARC]])
     return "M" + "L".join(f"{z:.2f} {h:.2f}" for z, h in kept) + "Z"
 

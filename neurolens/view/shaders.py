@@ -1,5 +1,6 @@
-"""What the page's shaders take from graphs besides the functions of lenses and models: weights, blades, a thin lens,
-the crossings of rays with the surfaces of a lens, and its fitted ghosts.
+"""Functions of the page's shaders that come from graphs, besides those of lenses and models.
+
+They are the weights of rays, the blades, a thin lens, the crossings of rays with the surfaces of a lens, and ghosts.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from neurolens.lens.prescription import Lens
 from neurolens.shaders.pupil import Blades
 from neurolens.trace.tracegraph import exact_graph
 
-# What stands in the page's shaders for inputs and outputs of functions.
+# The names that inputs and outputs of functions have in the page's shaders.
 _PLACES = {
     "film_x_mm": "film.x", "film_y_mm": "film.y", "pupil_x_mm": "pupil.x", "pupil_y_mm": "pupil.y",
     WAVELENGTH: "nm", FILM_Z: "film_z", STOP_RADIUS: "stop_radius", "x_mm": "p.x", "y_mm": "p.y", "z_mm": "p.z",
@@ -42,9 +43,10 @@ def call_of(signature: Signature) -> str:
 
 
 def shared_glsl() -> dict[str, tuple[str, str]]:
-    """Functions for all lenses, by name, and their calls.
+    """Functions for all lenses, and their calls, by name.
 
-    `weigh`: the ray in the camera's frame and its weight. `opened`: whether it goes through the blades. `thin`: a lens.
+    `weigh` gives the ray in the camera's frame and its weight, `opened` whether it goes through the blades, and `thin`
+    is a thin lens.
     """
     graphs = {"weigh": _weight_in_frame(), "opened": _blades_opened(), "thin": _thin_lens()}
     programs = {name: lower(graph) for name, graph in graphs.items()}
@@ -52,7 +54,7 @@ def shared_glsl() -> dict[str, tuple[str, str]]:
 
 
 def _blades_opened() -> Graph:
-    """Whether a crossing with the stop lies between the blades, 1 or 0."""
+    """A graph that is 1 where a crossing with the stop lies between the blades, else 0."""
     g = Graph()
     g.outputs["inside"] = Blades(g).opened(g.input("stop_xy_mm", 2) * (1.0 / g.input(STOP_RADIUS, per_call=True)))
     return g
@@ -90,7 +92,7 @@ def _thin_lens() -> Graph:
 
 
 def path_glsl(lens: Lens, pupil_z_mm: float, light_nm: tuple[float, float]) -> tuple[str, list[str]]:
-    """`lens_path`, of meridional rays (film and pupil points on the y axis): its text, and the names of its outputs.
+    """The text of `lens_path` for meridional rays (film and pupil points on the y axis), and the names of its outputs.
 
     These are z and y (mm) at each surface from the film on, the direction in front of the lens, and the status.
     """
@@ -106,7 +108,7 @@ def path_glsl(lens: Lens, pupil_z_mm: float, light_nm: tuple[float, float]) -> t
 
 @dataclass(frozen=True)
 class GhostFunction:
-    """One ghost: `name` of its two surfaces; its rays cross the plane z = 0 at chief_mm p + scale_mm u, of x and y."""
+    """The function of a ghost, whose rays cross the plane z = 0 at (x, y) = chief_mm p + scale_mm u."""
 
     name: str
     text: str
@@ -117,7 +119,8 @@ class GhostFunction:
 
 @dataclass(frozen=True)
 class Ghosts:
-    """Fitted ghosts, brightest first; p = direction / sine, and a stop beyond `stop_radius_mm` means nothing."""
+    """Fitted ghosts, brightest first, for p = direction / sine and stops up to `stop_radius_mm`, and their share of all
+    ghosts' light."""
 
     functions: Sequence[GhostFunction]
     sine: float
@@ -127,7 +130,7 @@ class Ghosts:
 
 
 def ghosts_glsl(model: GhostModel, most: int) -> Ghosts:
-    """The brightest ghosts of a model, at most so many, and their share of its light."""
+    """The brightest ghosts of a model, at most so many."""
     of = {row["ghost"]: float(row["energy"]) for row in model.report["ghosts"]}
     energy = [of[pair.name] for pair in model.pairs]
     found = []

@@ -219,18 +219,6 @@ def test_the_eye_whose_picture_leaves_the_image_circle_is_told() -> None:
     assert library.outside(variant(), setting(**film, shift=(0.2, 0.0), stereo=(-0.18, -0.2))) == []
 
 
-def test_what_a_lens_does_to_passes_is_told_where_they_are_rendered() -> None:
-    """As Cycles has it: `test_optics` measures it."""
-    assert library.notes(variant(), setting()) == []
-    alpha, matte = library.notes(variant(), setting(passes=("cryptomatte", "alpha")))
-    assert alpha.startswith("Alpha where nothing is: 1 minus the lens's light there") and "Vignetting off" in alpha
-    assert (
-        matte.startswith("Cryptomatte's coverage of what is opaque: the lens's light") and "illumination map" in matte
-    )
-    [alpha] = library.notes(variant(), setting(passes=("alpha",), darkens=False))
-    assert "nearly 1" in alpha and "Vignetting" not in alpha
-
-
 def test_error_in_pixels_of_the_render() -> None:
     assert library.error_px(variant(rms_um=5.0), setting()) == pytest.approx(0.5)
     assert library.error_px(variant(rms_um=None), setting()) is None

@@ -163,14 +163,6 @@ def test_ghosts_have_the_light_of_their_rays(case: str, distance_m: float) -> No
     assert total < 1e-3 * expected.sum()
 
 
-def test_light_of_one_wavelength_takes_no_finer_grids() -> None:
-    """What costs nothing is no reason for cells: neither colours that do not part, nor ghosts of one density."""
-    tracer, light = GhostTracer(lens_of("laikin_double_gauss_50")), Light(15.0, 8.0)
-    one, many = (grids_of(tracer, light, 550.0, (18.0, 12.0), 0.6, ends) for ends in ((550.0, 550.0), (400.0, 700.0)))
-    costs = [sum(grid.columns * grid.rows * grid.wavelengths for grid in grids.values()) for grids in (one, many)]
-    assert costs[0] < 0.7 * costs[1] and np.median([grid.columns for grid in one.values()]) < 40
-
-
 def test_any_number_of_threads_and_layers_is_one_picture() -> None:
     lens, light = lens_of("laikin_double_gauss_50"), [Light(15.0, 8.0), Light(-4.0, 2.0, (0.1, 0.5, 0.2))]
     tracer, raster = GhostTracer(lens), Raster((36.0, 24.0), 48, 32)
@@ -235,14 +227,6 @@ def test_a_picture_of_all_ghosts_has_no_bands(coating: str) -> None:
         fine = ghost_picture(tracer, [light], raster, wavelengths=24)[0]
     assert np.quantile(np.abs(picture - fine).max(-1) / fine.max(-1).clip(1e-30), 0.95) < 0.1
     assert np.abs(picture.sum((0, 1)) / fine.sum((0, 1)) - 1).max() < 0.1  # each colour's light
-
-
-def test_faint_ghosts_that_a_rim_cuts_by_colour_cost_little() -> None:
-    """Four wavelengths for every ghost are the least; wavelengths for the faint ones, too, are a third more rays."""
-    tracer = GhostTracer(coated(lens_of("laikin_double_gauss_50"), "quarter-wave"))
-    grids = grids_of(tracer, Light(15.0, 8.0), 550.0, (18.0, 12.0), 0.3, (410.0, 690.0)).values()
-    cells = np.array([grid.columns * grid.rows for grid in grids])
-    assert cells @ np.clip([grid.wavelengths for grid in grids], 4, 15) < 1.1 * 4 * cells.sum()
 
 
 def test_a_caustic_takes_no_light_from_beside_it() -> None:

@@ -137,17 +137,6 @@ def test_masks_are_those_of_their_lens() -> None:
     assert 0.3 * found[1].sum() < through < found[1].sum()  # twelve bare surfaces
 
 
-def test_direct_light_is_the_plain_trace() -> None:
-    lens = double_gauss()
-    rays, _ = light_rays(lens, Light(3.0, 2.0), 0, 2000)
-    plain = follow(lens, Rays(*torch.from_numpy(rays.copy())), turning(len(lens.surfaces), ()), 550.0)
-    found = GhostTracer(lens, []).trace(rays, 550.0, direct=True)
-    passed = (plain.status == 0).numpy()
-    assert passed.sum() > 500
-    assert np.all((found.worst[0] <= 1) == passed)
-    np.testing.assert_allclose(found.power[0][passed], plain.power.numpy()[passed], rtol=2e-6)
-
-
 def test_energy_of_a_point_is_irradiance_times_pupil() -> None:
     """Light that gets through is that of the entrance pupil, pi (f / 2 N)^2."""
     lens = set_lens(double_gauss(), f_number=4.0)
@@ -235,19 +224,15 @@ def test_refusals(call: object, word: str) -> None:
         call()  # type: ignore[operator]
 
 
-def test_coatings_of_single_surfaces() -> None:
-    found = [s.coating and s.coating.name for s in coated(plate(), "three-layer,s01=multi-layer 520").surfaces]
-    assert found == ["three-layer", "multi-layer 520", None]
-    assert [s.coating and s.coating.name for s in coated(plate(), "s00=bare").surfaces] == ["bare", None, None]
+def test_single_surfaces_have_coatings_of_their_own_and_those_of_the_file_stay() -> None:
+    def names(lens: Lens, design: str) -> list[str | None]:
+        return [s.coating and s.coating.name for s in coated(lens, design).surfaces]
 
-
-def test_coatings_of_the_file_stay() -> None:
     lens = plate()
-    own = Coating("own", ((1.7, 50.0),))
-    lens = replace(lens, surfaces=(replace(lens.surfaces[0], coating=own), *lens.surfaces[1:]))
-    after = coated(lens, "quarter-wave")
-    assert after.surfaces[0].coating == own and after.surfaces[1].coating is not None
-    assert after.surfaces[2].coating is None
+    assert names(lens, "three-layer,s01=multi-layer 520") == ["three-layer", "multi-layer 520", None]
+    assert names(lens, "s00=bare") == ["bare", None, None]
+    own = replace(lens.surfaces[0], coating=Coating("own", ((1.7, 50.0),)))
+    assert names(replace(lens, surfaces=(own, *lens.surfaces[1:])), "quarter-wave") == ["own", "quarter-wave", None]
 
 
 @pytest.mark.parametrize(("distance_m", "depth"), [(math.inf, 0.0), (3.0, 0.0), (0.08, 0.0), (0.08, 4.0)])
