@@ -29,39 +29,30 @@ static inline ALWAYS int64_t laid(float at, float *share)
     return (int64_t)middle;
 }
 
-enum { LANES = 16 };
-typedef float lanes __attribute__((vector_size(4 * LANES)));
-typedef int32_t truth __attribute__((vector_size(4 * LANES)));
-
-static inline ALWAYS lanes chosen(truth first, lanes a, lanes b)
-{
-    return (lanes)((first & (truth)a) | (~first & (truth)b));
-}
+enum { BLOCK = 256 };
 
 void squares(
     int64_t width, int64_t height, int64_t count, const float *x, const float *y, const float *edge, float *found)
 {
-    for (int64_t first = 0; first < width * height; first += LANES) {
-        const int64_t some = width * height - first < LANES ? width * height - first : LANES;
-        lanes q = { 0.0f }, r = q, none = q;
+    float q[BLOCK], r[BLOCK], least[BLOCK], of[BLOCK]; /* the smallest ratio is least / of */
+    for (int64_t first = 0; first < width * height; first += BLOCK) {
+        const int64_t some = width * height - first < BLOCK ? width * height - first : BLOCK;
+        float *const result = found + first;
         for (int64_t i = 0; i < some; i++) {
             q[i] = x[(first + i) % width];
             r[i] = y[(first + i) / width];
+            least[i] = of[i] = 1.0f;
+            result[i] = q[i] * q[i] + r[i] * r[i];
         }
-        lanes least = none + 1.0f, of = least; /* the smallest ratio is least / of */
-        lanes result = q * q + r * r;
-        for (const float *e = edge; e < edge + 5 * count; e += 5) {
-            const lanes a = q - e[0], b = r - e[1], whole = a * a + b * b, aside = a * e[3] - b * e[2];
-            const lanes square = aside * aside, most = 0.9f * whole, gap = none + e[4];
-            const truth closer = square * of < least * whole;
-            lanes less = chosen(most < gap, most, gap);
-            less = chosen(square < less, square, less);
-            least = chosen(closer, square, least);
-            of = chosen(closer, whole, of);
-            result = chosen(closer, whole - less, result);
-        }
-        for (int64_t i = 0; i < some; i++)
-            found[first + i] = result[i];
+        for (const float *e = edge; e < edge + 5 * count; e += 5)
+            for (int64_t i = 0; i < some; i++) {
+                const float a = q[i] - e[0], b = r[i] - e[1], whole = a * a + b * b, aside = a * e[3] - b * e[2];
+                const float square = aside * aside, most = 0.9f * whole, less = most < e[4] ? most : e[4];
+                const int closer = square * of[i] < least[i] * whole;
+                least[i] = closer ? square : least[i];
+                of[i] = closer ? whole : of[i];
+                result[i] = closer ? whole - (square < less ? square : less) : result[i];
+            }
     }
 }
 

@@ -66,7 +66,6 @@ LETTER = np.zeros((50, 50), bool)
 LETTER[5:45, 10:20] = LETTER[5:15, 10:40] = LETTER[22:30, 10:32] = True
 
 CASES = {
-    "spheres": lambda: double_gauss(),
     "blades": lambda: replace(set_lens(double_gauss(), f_number=5.6), aperture=Aperture(blades=6)),
     "mask": lambda: replace(set_lens(double_gauss(), f_number=4.0), aperture=Aperture(mask=LETTER, rotation_deg=30.0)),
     "coated": lambda: coated(double_gauss(), "broadband"),
