@@ -1,4 +1,4 @@
-"""A lens put on a camera, and taken off it: what is changed is first written down on the camera and the scene.
+"""Puts a lens on a camera and takes it off: all that is changed is first written down on the camera and the scene.
 
 The shader's text and its compiled form are kept in the .blend file, and its settings are the custom camera's own
 properties: the file renders where the extension is missing, and keyframes and drivers act on them directly.
@@ -47,7 +47,7 @@ def applied(camera: Any) -> bool:
 
 
 def setting_of(scene: Any, found: Any) -> Setting:
-    """What the scene asks of a lens on this camera object."""
+    """The scene's settings for a lens on this camera object."""
     camera, render = found.data, scene.render
     custom = camera.cycles_custom if applied(camera) else {}
     f_number = float(custom["f_number"]) if "f_number" in custom else None
@@ -77,7 +77,7 @@ def setting_of(scene: Any, found: Any) -> Setting:
 
 
 def _stereo(camera: Any, render: Any) -> tuple[float, ...]:
-    """What stereo adds to shift X of the left and the right eye, as Blender computes it."""
+    """The amounts that stereo adds to shift X of the left and the right eye, as Blender computes them."""
     stereo = camera.stereo
     off_axis = stereo.convergence_mode == "OFFAXIS" and render.use_multiview and render.views_format == "STEREO_3D"
     if not off_axis:
@@ -100,7 +100,7 @@ def _passes(scene: Any) -> tuple[str, ...]:
 
 
 def focus_m(found: Any) -> float:
-    """Distance along the view to what is in focus, in units of the scene, as Cycles has it."""
+    """The focus distance along the view, in units of the scene, as Cycles computes it."""
     dof = found.data.dof
     if dof.focus_object is None:
         return float(dof.focus_distance)
@@ -110,7 +110,7 @@ def focus_m(found: Any) -> float:
 
 
 def depths_in_view(context: Any, found: Any, setting: Setting, efl_mm: float) -> list[float]:
-    """Depths along the view, in m, of what rays of a pinhole of this focal length meet; inf where they meet nothing."""
+    """The depths along the view, in m, at which rays of a pinhole of this focal length end; inf if they meet nothing."""
     graph = context.evaluated_depsgraph_get()
     frame = found.evaluated_get(graph).matrix_world.normalized()
     right, up, back = (frame.col[k].xyz for k in range(3))
@@ -271,7 +271,7 @@ def _follow_zoom(camera: Any) -> None:
 
 
 def _remembered(scene: Any, camera: Any) -> dict[str, Any]:
-    """What `apply` changes, as it is, JSON-able."""
+    """The state of all that `apply` changes, JSON-able."""
     kept = {name: getattr(camera, name) for name in _CAMERA}
     kept["custom_shader"] = None if camera.custom_shader is None else camera.custom_shader.name
     kept["use_dof"] = camera.dof.use_dof

@@ -1,4 +1,4 @@
-"""What the extension knows of its lenses, and what is wrong with a setting. Without Blender: plain Python."""
+"""The facts of the extension's lenses, and the checks of a camera's settings. Plain Python, without Blender."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from typing import Any
 
 FACTS = "lenses.json"  # beside shaders/ and thumbnails/, in the extension and in its user folder
 SCHEMA = 1
-PASSES = ("alpha", "cryptomatte", "vector")  # in which a lens shows otherwise than Blender's own camera
+PASSES = ("alpha", "cryptomatte", "vector")  # passes that differ from those of Blender's own camera
 KINDS = {"polynomial": "Polynomial", "network": "Network", "exact": "Exact"}
 OLDEST = (4, 5, 0)  # the first Blender whose Cycles runs cameras written in OSL
 BEYOND = 1.02  # a film of 36 x 24 mm over an image circle of 43.2 mm is as lenses are engraved
 NOMINAL = 1.02  # and so is f/1.8 for f/1.83
-DAMAGED = (ValueError, KeyError, TypeError, AttributeError, OverflowError)  # what reading strangers' facts raises
+DAMAGED = (ValueError, KeyError, TypeError, AttributeError, OverflowError)  # errors of reading damaged facts
 _HEADROOM = 1.001  # of a near limit, for rounding
 
 
 class LensError(Exception):
-    """One sentence for the user; whatever raised it has left the scene as it was."""
+    """One sentence for the user; the scene is as it was before."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class Variant:
 
     Attributes:
         kind: of `KINDS`. model: its name ("ols-64"), "" of an exact lens. path: of the OSL source.
-        rms_um: error of rays on the film, None of an exact lens. poor: what its card calls poor.
-        film_radius_mm: of the picture. f_number: the widest. nearest_m: the nearest focus, None where there is none.
-        notes: what the shader leaves out.
+        rms_um: error of rays on the film, None of an exact lens. poor: properties that its card calls poor.
+        film_radius_mm: of the picture. f_number: the widest. nearest_m: the nearest focus, None if there is none.
+        notes: sentences on what the shader leaves out.
     """
 
     kind: str
@@ -49,11 +49,11 @@ class Variant:
 
 @dataclass(frozen=True)
 class Field:
-    """What a lens, wide open, does to its picture at film radii, focused far away (first row) and near (second).
+    """Distortion, blur and light of a lens, wide open, at film radii, focused far away (first row) and near (second).
 
     Attributes:
-        radius_mm: rising. near_m: the second row's focus. distortion_um: away from where a thin lens has it. blur_um:
-            diameter of what is in focus. light: over that of the middle.
+        radius_mm: rising. near_m: the second row's focus. distortion_um: from the place that a thin lens has. blur_um:
+            diameter of a point in focus. light: over that of the middle.
     """
 
     radius_mm: tuple[float, ...]
@@ -63,7 +63,7 @@ class Field:
     light: tuple[tuple[float, ...], ...]
 
     def at(self, rows: Sequence[Sequence[float]], radius_mm: float, focus_m: float) -> float:
-        """The largest value (of light the least) up to a radius, between the rows by the inverse focus."""
+        """The largest value (for light the least) up to a radius; rows are interpolated in the inverse focus."""
         share = min(self.near_m / max(focus_m, 1e-6), 1.0)
         values = [a + share * (b - a) for a, b in zip(*rows, strict=True)]
         inside = [v for r, v in zip(self.radius_mm, values, strict=True) if r <= radius_mm]
@@ -76,7 +76,7 @@ class Field:
 
 @dataclass(frozen=True)
 class LensFacts:
-    """One lens of the menu; `variants` by kind, `picture` None without a thumbnail, `field` where it is not known."""
+    """One lens of the menu; `variants` by kind; `picture` and `field` are None if there is none."""
 
     lens_id: str
     name: str
@@ -96,12 +96,12 @@ class LensFacts:
 
     @property
     def number(self) -> int:
-        """For menus: the same whatever other lenses there are, since files keep numbers, not names."""
+        """The number in menus, which depends on this lens alone, since files keep numbers, not names."""
         return zlib.crc32(self.lens_id.encode()) & 0x7FFFFFFF
 
 
 def read_library(folders: Sequence[Path]) -> tuple[dict[str, LensFacts], list[str]]:
-    """The lenses of folders by id, those of later folders in place of earlier ones, and what could not be read."""
+    """The lenses of folders by id, those of later folders in place of earlier ones, and why others cannot be read."""
     found: dict[str, LensFacts] = {}
     wrong: list[str] = []
     for folder in folders:
@@ -123,7 +123,7 @@ def read_library(folders: Sequence[Path]) -> tuple[dict[str, LensFacts], list[st
 
 
 def lens_of(folder: Path, entry: dict[str, Any]) -> LensFacts:
-    """A lens from its entry in the facts of a folder; exceptions of `DAMAGED` where it is none."""
+    """A lens from its entry in the facts of a folder; raises `DAMAGED` if it is none."""
     variants = {}
     for v in entry["variants"]:
         if v["kind"] not in KINDS:
@@ -174,18 +174,18 @@ def _inside(folder: Path, name: str) -> Path:
 
 @dataclass(frozen=True)
 class Setting:
-    """What a scene asks of a lens.
+    """The settings of a scene for a lens.
 
     Attributes:
-        sensor_mm: width and height that are exposed. pixels: of the picture's width, as rendered.
+        sensor_mm: width and height that are exposed. pixels: the width of the picture as rendered.
         focus_m: distance in focus; None where depth of field is off. focus_object: its name, "" for a distance.
-        f_number: None where the shader's own.
-        shift, shift_side_mm: Blender's, and the side that its own camera counts it in.
-        stereo: of each eye, what its view adds to shift X; () without stereo.
+        f_number: None for that of the shader.
+        shift, shift_side_mm: Blender's, and the side that Blender's own camera counts it in.
+        stereo: for each eye, the amount that its view adds to shift X; () without stereo.
         unit_m, lens_unit_m: metres of a unit of the scene, by its unit scale and as the lens takes it.
         on_gpu: whether a GPU that cannot run OSL cameras is chosen.
         darkens: whether vignetting or exposure let the lens weaken light.
-        passes: of `PASSES`, what is rendered besides the picture.
+        passes: those of `PASSES` that are rendered.
     """
 
     sensor_mm: tuple[float, float]
@@ -204,7 +204,7 @@ class Setting:
 
 
 def refused(version: tuple[int, ...], has_osl: bool = True) -> str | None:
-    """Why this Blender cannot run the lenses, if it cannot."""
+    """The reason why this Blender cannot run the lenses, or None."""
     if tuple(version[:3]) < OLDEST:
         said = ".".join(map(str, version[:3]))
         return f"This is Blender {said}: cameras written in OSL need {'.'.join(map(str, OLDEST[:2]))} or later"
@@ -212,7 +212,7 @@ def refused(version: tuple[int, ...], has_osl: bool = True) -> str | None:
 
 
 def refusals(variant: Variant, setting: Setting) -> list[str]:
-    """Why a lens is not put on a camera."""
+    """The reasons why a lens is not put on a camera."""
     found = []
     if too_large(variant, setting):
         (width, height), circle = setting.sensor_mm, 2 * variant.film_radius_mm
@@ -246,7 +246,7 @@ def fitting_width_mm(variant: Variant, setting: Setting) -> float:
 
 
 def notes(variant: Variant, setting: Setting) -> list[str]:
-    """What else the user should know of a setting that works."""
+    """Sentences for the user on a setting that works."""
     found = []
     if setting.f_number is not None and setting.f_number * NOMINAL < variant.f_number:
         found.append(f"The lens opens to f/{variant.f_number:.3g}: f/{setting.f_number:.3g} renders as that")
@@ -272,7 +272,7 @@ def notes(variant: Variant, setting: Setting) -> list[str]:
 
 
 def _pass_notes(setting: Setting) -> list[str]:
-    """What Cycles makes of a lens in passes: it counts the throughput of rays into alpha and coverage."""
+    """Sentences on passes: Cycles counts the throughput of a lens's rays into alpha and coverage."""
     light, remedy = "the share of the rays that pass there, nearly 1", ""
     if setting.darkens:
         light = "the lens's light there"
@@ -290,7 +290,7 @@ def _pass_notes(setting: Setting) -> list[str]:
 
 
 def outside(variant: Variant, setting: Setting) -> list[str]:
-    """Warnings of corners that shift and stereo take out of the lens's picture."""
+    """Warnings about corners that shift and stereo take out of the lens's picture."""
     (width, height), (shift_x, shift_y) = setting.sensor_mm, setting.shift
     eyes = [abs(shift_x + more) for more in setting.stereo or (0.0,)]
     corner = math.hypot(width * (0.5 + max(eyes)), height * (0.5 + abs(shift_y)))

@@ -1,7 +1,7 @@
-"""What a shot needs of its camera: a pinhole, Cycles' own depth of field, a model of the lens, or the lens itself.
+"""The camera that a shot needs: a pinhole, Cycles' own depth of field, a model of the lens, or the lens itself.
 
-From what the extension ships: the lens's errors by field, found when the extension was built, the error of each shader,
-and the circles of confusion of a thin lens at the depths in view. Without Blender: plain Python.
+The answer follows from the facts that the extension ships (the lens's errors by field and the error of each shader) and
+from the circles of confusion of a thin lens at the depths in view. Plain Python, without Blender.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _ORDER = ("polynomial", "network", "exact")  # by cost in Cycles
 
 @dataclass(frozen=True)
 class Advice:
-    """What to use: `PINHOLE`, `THIN`, a variant's kind, or "" where none keeps the tolerance; and why, in two lines."""
+    """The camera to use (`PINHOLE`, `THIN`, a variant's kind, or "" if none keeps the tolerance), and two reasons."""
 
     use: str
     why: tuple[str, str]
