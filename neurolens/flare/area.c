@@ -56,7 +56,7 @@ static inline ALWAYS void in_row(rgb *row, double a, double b, rgb amount)
 static void line(struct canvas c, struct point p, struct point q, struct plane density)
 {
     if (!(p.y < q.y && p.y < c.last && q.y > c.first)) return;
-    const double slope = (q.x - p.x) / (q.y - p.y), wide = fabs(slope), half = 0.5 / wide;
+    const double slope = (q.x - p.x) / (q.y - p.y);
     const rgb slope_light = density.right * c.light;
     const int sloped = density.right != 0.0, last = q.y < c.last ? (int)q.y : c.last - 1;
     int k = p.y > c.first ? (int)p.y : c.first;
@@ -66,24 +66,9 @@ static void line(struct canvas c, struct point p, struct point q, struct plane d
         const rgb light = (density.level + density.down * (k + 0.5)) * c.light;
         const int ends = q.y <= k + 1;
         const double next = ends ? q.y : k + 1, end = ends ? q.x : p.x + slope * (k + 1 - p.y);
-        if (next - y == 1.0 && wide <= 1.0) { /* a whole row and at most two pixels: the same without a branch */
-            const double a = x < end ? x : end;
-            const int first = (int)a;
-            const double t = first + 1 - a, all = t - 0.5 * wide, r = t < wide ? half * t * t : all;
-            const double rest = 1.0 + all - r;
-            row[first] += r * light;
-            row[first + 1] += (rest - r) * light;
-            row[first + 2] += (1.0 - rest) * light;
-            if (sloped) {
-                slopes[first] += r * slope_light;
-                slopes[first + 1] += (rest - r) * slope_light;
-                slopes[first + 2] += (1.0 - rest) * slope_light;
-            }
-        } else {
-            const double a = x < end ? x : end, b = x < end ? end : x;
-            in_row(row, a, b, (next - y) * light);
-            if (sloped) in_row(slopes, a, b, (next - y) * slope_light);
-        }
+        const double a = x < end ? x : end, b = x < end ? end : x;
+        in_row(row, a, b, (next - y) * light);
+        if (sloped) in_row(slopes, a, b, (next - y) * slope_light);
         x = end;
         y = next;
     }

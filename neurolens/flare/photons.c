@@ -35,7 +35,7 @@ static inline ALWAYS void append(
 }
 
 struct light {
-    int most, scatters, plain; /* `plain`: all weights are 1 and nothing scatters */
+    int most, scatters;
     const float *boost, *number, *film;
     float barrel, sensor;
     uint64_t state;
@@ -106,22 +106,21 @@ static void scatter_on_way(struct room *room, struct light *light, int k, int ba
 
 /* Let the photons of `room->now` meet surface k. Those that pass become the new list, whose length is returned; those
    that turn round wait at surface `next`. */
-static inline ALWAYS int meet_as(
-    struct lens lens, struct room *room, struct light *light, int k, int back, int n, int next, const int plain)
+static int meet(struct lens lens, struct room *room, struct light *light, int k, int back, int n, int next)
 {
     const float *const power = room->after + POWER * BLOCK, *const worst = power + BLOCK, *const list = room->now;
     const float *const kind = room->event + (EVENT - 2) * BLOCK, *const boosts = light->boost + LEVELS * (2 * k + back);
     const int reflects = lens.functions[ACTIONS * k + 2 + back] >= 0;
     int on = 0, turning = 0;
     go(lens, k, back, n, room->now, room->after, BLOCK);
-    if (!plain && light->scatters) scatter_on_way(room, light, k, back, n, next);
+    if (light->scatters) scatter_on_way(room, light, k, back, n, next);
     float *const turn = room->then;
     for (int i = 0; i < n; i++) {
-        if (!plain && light->scatters && kind[i] > 0.5f) continue;
-        const float weight = plain ? 1.0f : list[POWER * BLOCK + i], times = list[TIMES * BLOCK + i];
-        const float scatters = plain ? 0.0f : list[SCATTERS * BLOCK + i];
+        if (light->scatters && kind[i] > 0.5f) continue;
+        const float weight = list[POWER * BLOCK + i], times = list[TIMES * BLOCK + i];
+        const float scatters = list[SCATTERS * BLOCK + i];
         const float through = worst[i] <= 1.0f ? power[i] / weight : 0.0f;
-        const float boost = plain || !reflects ? 1.0f : boosts[times < LEVELS ? (int)times : LEVELS - 1];
+        const float boost = !reflects ? 1.0f : boosts[times < LEVELS ? (int)times : LEVELS - 1];
         /* A photon passes with T / all and turns round with boost (1 - T) / all; its weight makes up for that. */
         const float all = 1.0f + (boost - 1.0f) * (1.0f - through), drawn = chance(&light->state) * all;
         if (drawn < through) {
@@ -154,12 +153,6 @@ static inline ALWAYS int meet_as(
     room->now = room->after;
     room->after = other;
     return on;
-}
-
-static int meet(struct lens lens, struct room *room, struct light *light, int k, int back, int n, int next)
-{
-    return light->plain ? meet_as(lens, room, light, k, back, n, next, 1)
-                        : meet_as(lens, room, light, k, back, n, next, 0);
 }
 
 static inline ALWAYS void copy(const float *list, int i, float *to, int *count)
@@ -213,14 +206,14 @@ static void at_film(struct room *room, struct light *light, int last, int n, str
 }
 
 size_t photons(
-    size_t count, int surfaces, int most, int scatters, int plain, const float *shares, uint64_t seed,
+    size_t count, int surfaces, int most, int scatters, const float *shares, uint64_t seed,
     const float *start, const int *functions, const float *numbers, const float *boost, const float *scattering,
     float *rows, float *place, float *weight, int *reflections, int *scattered, int64_t *books)
 {
     const struct lens lens = { surfaces, functions, numbers };
     struct room room;
     int waiting[2][4096] = { { 0 } };
-    struct light light = { most, scatters, plain, boost, scattering, shares, shares[2], shares[3], seed, books };
+    struct light light = { most, scatters, boost, scattering, shares, shares[2], shares[3], seed, books };
     struct arrivals arrivals = { count, 0, place, weight, reflections, scattered };
     room.now = rows, room.then = rows + LIST, room.after = rows + 2 * LIST, room.turned = rows + 3 * LIST;
     room.wait[0] = rows + 4 * LIST, room.wait[1] = rows + (5 + surfaces) * LIST;

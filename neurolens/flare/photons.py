@@ -103,7 +103,7 @@ class PhotonTracer:
         graphs = {"scatter": scatter_graph(), "film_scatter": film_scatter_graph()}
         self._call = self.stack.compiled(driver, "photons", graphs)
         whole, pointer = ctypes.c_int, ctypes.c_void_p
-        self._call.argtypes = [ctypes.c_size_t, whole, whole, whole, whole, pointer, ctypes.c_uint64, *[pointer] * 11]
+        self._call.argtypes = [ctypes.c_size_t, whole, whole, whole, pointer, ctypes.c_uint64, *[pointer] * 11]
         self._call.restype = ctypes.c_size_t
 
     def turning(self, wavelength_nm: float, times: int) -> NDArray[np.float64]:
@@ -156,8 +156,7 @@ class PhotonTracer:
         on_way = bool(scatter.barrel or scatter.dust or scatter.haze_per_mm)
         arrays = (start, self.stack.functions, numbers, boosts, self._scattering, room, place, weight, reflections)
         pointers = [a.ctypes.data for a in (*arrays, scattered, books)]
-        plain = not scatter.on and bool((boosts == 1).all())
-        arrived = self._call(count, surfaces, most_reflections, on_way, plain, shares.ctypes.data, seed, *pointers)
+        arrived = self._call(count, surfaces, most_reflections, on_way, shares.ctypes.data, seed, *pointers)
         arrivals = (place[:, :arrived], weight[:arrived], reflections[:arrived], scattered[:arrived])
         return Photons(*arrivals, count, *(int(v) for v in books))
 
