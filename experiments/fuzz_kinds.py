@@ -28,7 +28,6 @@ SEEDS = Path(__file__).with_name("fuzz_seeds")
 Chance = random.Random
 Words = list[str]
 _SMALL_FLARE = ("--width", "24", "--wavelengths", "2", "--cell", "64", "--threads", "1", "--quiet")
-_ANALYSES = "spots", "layout", "vignetting", "mtf", "psf", "fans"  # that take longer than others
 _FILM = ("--size", "8x6", "--film", "24x18", "--quiet")
 _PLATE, _PLATE_FILM = (12, 8), "36x24"  # pixels; mm
 
