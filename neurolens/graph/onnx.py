@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Node, pruned, same_structure
-from neurolens.graph.monomials import Block, Exponent, Pair, by_block, plan_products
+from neurolens.graph.monomials import Block, Exponent, Pair, blocks_alone, by_block, plan_products
 from neurolens.graph.protobuf import FLOAT, INT32, model_proto, node_proto, tensor_proto, value_proto
 
 Array = NDArray[np.float64]
@@ -361,7 +361,9 @@ def _polynomial(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str
         else:
             blocks += made
     out, nothing = "", np.zeros(weight.shape[:2])
-    for name, known in blocks:
+    alone = blocks_alone(blocks)
+    names, lists = zip(*blocks[alone:], strict=True)
+    for name, known in [*blocks[:alone], (w.concat(names), [e for each in lists for e in each])]:
         part = np.stack([table.get(e, nothing) for e in known], axis=2)
         if not out:
             out = w.affine(part, name, table.get((0,) * variables, nothing))
