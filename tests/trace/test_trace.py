@@ -343,7 +343,7 @@ def tensors(out: Traced) -> list[torch.Tensor]:
 
 
 @pytest.mark.parametrize("name", ON_DEVICE)
-@pytest.mark.parametrize("options", [{}, {"transmittance": True}, {"record": [0, 3]}])
+@pytest.mark.parametrize("options", [{}, {"transmittance": True, "record": [0, 3]}])
 def test_the_host_decides_nothing(name: str, options: dict[str, object]) -> None:
     """Rays without values go through the whole lens, in one chunk and in several."""
     lens = focused(name)
