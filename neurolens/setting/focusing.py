@@ -34,39 +34,33 @@ def monotone(x: Sequence[float], rows: Sequence[Sequence[float]], place: float) 
     if len(x) == 1:
         return list(rows[0])
     i = min(max(bisect_right(x, place) - 1, 0), len(x) - 2)
-    step = x[i + 1] - x[i]
-    t = (place - x[i]) / step
+    steps, values = np.diff(x), np.asarray(rows, np.float64)
+    t = (place - x[i]) / steps[i]
     if t in (0, 1):
         return list(rows[i + int(t)])
-    found = []
-    for values in zip(*rows, strict=True):
-        d = _derivatives(x, values)
-        low, high = values[i], values[i + 1]
-        bump = t * (1 - t) * ((1 - t) * (d[i] * step - (high - low)) - t * (d[i + 1] * step - (high - low)))
-        found.append(low + t * (high - low) + bump)
-    return found
+    d, low, high = _slopes(steps, np.diff(values, axis=0) / steps[:, None]), values[i], values[i + 1]
+    rise = high - low
+    bump = t * (1 - t) * ((1 - t) * (d[i] * steps[i] - rise) - t * (d[i + 1] * steps[i] - rise))
+    return (low + t * rise + bump).tolist()
 
 
-def _derivatives(x: Sequence[float], values: Sequence[float]) -> list[float]:
-    """Return the derivative at every place: a weighted harmonic mean of those beside it, 0 at a turning point."""
-    steps = [b - a for a, b in zip(x, x[1:], strict=False)]
-    secants = [(b - a) / h for a, b, h in zip(values, values[1:], steps, strict=False)]
-    if len(secants) == 1:
-        return secants * 2
-    inner = []
-    for h0, h1, d0, d1 in zip(steps, steps[1:], secants, secants[1:], strict=False):
-        w0, w1 = 2 * h1 + h0, h1 + 2 * h0
-        inner.append((w0 + w1) / (w0 / d0 + w1 / d1) if d0 * d1 > 0 else 0.0)
-    return [_end(steps, secants), *inner, _end(steps[::-1], secants[::-1])]
+def _slopes(steps: NDArray[np.float64], secants: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the slopes [R, M] at all places: weighted harmonic means of the secants beside, 0 at a turning point."""
+    if len(steps) == 1:
+        return np.repeat(secants, 2, axis=0)
+    h0, h1, d0, d1 = steps[:-1, None], steps[1:, None], secants[:-1], secants[1:]
+    w0, w1 = 2 * h1 + h0, h1 + 2 * h0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inner = np.where(d0 * d1 > 0, (w0 + w1) / (w0 / d0 + w1 / d1), 0.0)
+    return np.vstack([_end(steps, secants), inner, _end(steps[::-1], secants[::-1])])
 
 
-def _end(steps: Sequence[float], secants: Sequence[float]) -> float:
-    """Return the derivative at an end: of the parabola through three values, kept within what stays monotone."""
+def _end(steps: NDArray[np.float64], secants: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the slope at an end: of the parabola through three values, kept within what stays monotone."""
     (h0, h1), (d0, d1) = steps[:2], secants[:2]
-    derivative = ((2 * h0 + h1) * d0 - h0 * d1) / (h0 + h1)
-    if derivative * d0 <= 0:
-        return 0.0
-    return 3 * d0 if d0 * d1 <= 0 and abs(derivative) > 3 * abs(d0) else derivative
+    slope = ((2 * h0 + h1) * d0 - h0 * d1) / (h0 + h1)
+    slope = np.where((d0 * d1 <= 0) & (np.abs(slope) > 3 * np.abs(d0)), 3 * d0, slope)
+    return np.where(slope * d0 <= 0, 0.0, slope)
 
 
 SAME_MM = 0.005  # gaps of two states that differ by less are the same: sources give two decimals
