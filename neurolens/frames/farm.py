@@ -46,7 +46,7 @@ class TileTask:
 
     @property
     def number(self) -> int:
-        """The tile's, from 1."""
+        """The number of the tile, from 1."""
         return self.frame.tile[0] if self.frame.tile else 1
 
 

@@ -91,7 +91,7 @@ def check_memory(width: int, height: int, bytes_a_pixel: int = BYTES_A_PIXEL) ->
 
 @dataclass(frozen=True)
 class Tiling:
-    """How a render is cut: tiles of consecutive pixels, passes of consecutive samples.
+    """The cut of a render into tiles of consecutive pixels and passes of consecutive samples.
 
     A function of the picture alone. What a worker holds at a time depends on a tile, not on the picture.
 
@@ -130,7 +130,7 @@ class Tiling:
         return slice(first * self.tile, min((first + 1 if stop is None else stop) * self.tile, self.pixels))
 
     def samples_done(self, done: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Samples a pixel after so many passes."""
+        """The samples of a pixel after some passes."""
         return np.minimum(done * self.step, self.samples)
 
     def chunks(self) -> Iterator[tuple[int, int]]:

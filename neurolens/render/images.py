@@ -141,7 +141,7 @@ def _warn(scene: Path, field: str, said: str) -> None:
 
 
 def read_environment(scene: Path, field: str, path: Path, scale: float = 1.0) -> FloatArray:
-    """Linear sRGB [H, W, 3] of an equirectangular picture as of `read_picture`; not yet times `scale`.
+    """Read an equirectangular picture by `read_picture`: linear sRGB [H, W, 3], not yet times `scale`.
 
     Values that are negative, infinite or not a number are clamped, with a warning.
 

@@ -54,7 +54,7 @@ class Paths:
 
 
 def lit(value: FloatArray | NDArray[np.bool_]) -> Index:
-    """Where any lane of numbers [lanes, N] is not 0."""
+    """The paths [n] of numbers [lanes, N] of which any lane is not 0."""
     return np.flatnonzero(value.any(axis=0))
 
 
@@ -142,7 +142,7 @@ class Vertex:
 
 
 def aim_at_lights(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int, radiance: FloatArray) -> None:
-    """Light from one point on one light, where nothing stands in between, weighted against scattering into it."""
+    """Add light from one point on one light, unless something is in between, weighted against scattering into it."""
     rough, world, paths = vertex.rough, vertex.world, vertex.paths
     keys = keys.cut(0, rough)
     origin = vertex.start()[:, :rough]
@@ -206,7 +206,7 @@ def _scatter_rough(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int,
 def _scatter_glass(
     vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int, direction: FloatArray
 ) -> NDArray[np.bool_]:
-    """Write the directions of the glass paths; which of them refract.
+    """Write the directions of the glass paths, and return which of them refract.
 
     The hero is refracted as its index says. Lanes of another index would go elsewhere: to them this path has density 0,
     and the balance heuristic gives the hero the weight of all of them.
@@ -300,7 +300,7 @@ def _add_environment(world: World, paths: Paths, found: NDArray[np.int32], aim: 
 def _add_emission(
     world: World, paths: Paths, surface: Index, point: FloatArray, distance: FloatArray, aim: bool, radiance: FloatArray
 ) -> None:
-    """Light from paths that run into a light, weighted against aiming at it."""
+    """Add the light of paths that run into a light, weighted against aiming at it."""
     if world.lights.black:
         return
     light = world.light.take(surface)

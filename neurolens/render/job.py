@@ -224,8 +224,9 @@ class Layers:
 
 
 def develop(job: Job) -> tuple[FloatArray, Layers]:
-    """The job's rows of the picture, [H, W, 3] float32 linear sRGB, and its layers, each tile divided by its samples so
-    far; safe while workers run.
+    """The job's rows of the picture, [H, W, 3] float32 linear sRGB, and their layers, also while workers run.
+
+    Each tile is divided by the samples that it has so far.
     """
     tiling, grid = job.tiling, job.grid
     rgb = np.zeros((tiling.pixels, 3), np.float32)

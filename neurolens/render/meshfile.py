@@ -246,7 +246,7 @@ class Element:
 
 
 def read_polygons(content: bytes) -> TriangleSet:
-    """What the bytes of a PLY file hold; polygons are cut into fans.
+    """Read the bytes of a PLY file; polygons are cut into fans.
 
     Raises:
         ValueError: no PLY file, or one that ends early; says what is wrong.
@@ -318,7 +318,7 @@ def _numbers(text: bytes) -> NDArray[np.float64]:
 
 
 class _Body:
-    """What follows the header of a PLY file: bytes in an order ("<", ">"), or the numbers of an ASCII file ("").
+    """The part of a PLY file after its header: bytes in an order ("<", ">"), or the numbers of an ASCII file ("").
 
     It is read from the place `at` on, which counts bytes, or numbers. IndexError: it ends too early.
     """
@@ -346,7 +346,7 @@ class _Body:
             return {p.name: v.astype(np.float64) for p, v in zip(element.properties, values, strict=True)}
 
     def lists(self, element: Element) -> dict[str, tuple[array[int], array[int]]]:
-        """By the name of each list of the next elements, where its values begin, and how many there are."""
+        """The lists of the next elements by name: where the values of each begin, and how many there are."""
         found = {p.name: (array("q"), array("q")) for p in element.properties if p.length}
         if any(p.length[:1] == "f" for p in element.properties):
             raise ValueError("lists whose length is a fraction")

@@ -196,7 +196,7 @@ def read_colour_space(path: str | Path) -> ColourSpace | None:
 
 
 def _metadata(path: str | Path, header: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings in our attribute, whose type in a stranger's file may be any that OpenEXR has."""
+    """The settings in our attribute, which in a stranger's file may have any type of OpenEXR."""
     text = header.get(METADATA_KEY, "{}")
     with suppress(ValueError, RecursionError, InputError):
         if isinstance(text, str) and isinstance(metadata := parse_json(text, path), dict):

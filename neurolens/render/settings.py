@@ -173,7 +173,7 @@ class FlareSettings:
             object.__setattr__(self, "glare", GLARE)
 
     def quick(self) -> FlareSettings:
-        """The same, coarse enough for a quick look."""
+        """The same settings, but coarse enough for a quick look."""
         photons, glare = (min(n, _QUICK_PHOTONS) for n in (self.photons, self.glare))
         cell = max(self.cell_px, _QUICK_CELL_PX)
         return replace(self, bins=min(self.bins, _QUICK_BINS), cell_px=cell, photons=photons, glare=glare)

@@ -49,7 +49,7 @@ class Plates:
         return self.undistorted[0] / self.picture[0], self.undistorted[1] / self.picture[1]
 
     def pixels(self, way: Complex) -> NDArray[np.float64]:
-        """Lengths, in pixels, of ways in mm."""
+        """The lengths, in pixels, of displacements in mm."""
         return np.hypot(way.real / self.pixel_mm[0], way.imag / self.pixel_mm[1])
 
 

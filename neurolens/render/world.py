@@ -261,7 +261,7 @@ _shared: ContextVar[list[World] | None] = ContextVar("worlds", default=None)
 
 @contextmanager
 def shared_worlds() -> Iterator[None]:
-    """Within it `world_of` keeps what it makes: of a million lights a world takes half a minute."""
+    """Let `world_of` keep its worlds inside the block: that of a million lights takes half a minute to make."""
     token = _shared.set([])
     try:
         yield
@@ -270,15 +270,15 @@ def shared_worlds() -> Iterator[None]:
 
 
 def world_of(scene: Scene, spectral: SpectralRange, geometry: bool = False) -> World:
-    """The world of a scene over a range; within `shared_worlds` one made before. Of the geometry alone any range's."""
-    kept = _shared.get()
-    for known in kept or ():
-        if known.scene is scene and (geometry or known.spectral.same(spectral)):
-            return known
-    made = World(scene, spectral)
-    if kept is not None:
-        kept.append(made)
-    return made
+    """The world of a scene over a range, or over any range for its `geometry`; `shared_worlds` keeps it."""
+    worlds = _shared.get()
+    for world in worlds or ():
+        if world.scene is scene and (geometry or world.spectral.same(spectral)):
+            return world
+    world = World(scene, spectral)
+    if worlds is not None:
+        worlds.append(world)
+    return world
 
 
 class World:
@@ -374,7 +374,7 @@ class World:
         self.dark = self._sky.dark and not self._sun.count
 
     def _never_shades(self, shape: Primitive) -> bool:
-        """Whether the shape blocks no shadow ray: a room that holds every light, whose walls let light in."""
+        """Whether the shape blocks no shadow ray: a room that holds every light, as its walls let rays in."""
         if not isinstance(shape, Box) or not shape.room or self._sky.count or self._sun.count:
             return False
         return all(bool(np.all((p > shape.low) & (p < shape.high))) for p in self._shining_m)
