@@ -190,10 +190,7 @@ FILM = (36.0, 24.0)
 # Lens, focal length, f-number, least share of rays that pass.
 LENSES = [
     ("laikin_double_gauss_50", 50.0, None, 0.995),
-    ("laikin_double_gauss_50", 50.0, 11.0, 0.995),
-    ("tronnier_double_gauss_100", 100.0, 4.0, 0.995),
     ("muller_fisheye_100", 14.0, 4.0, 0.99),
-    ("muller_fisheye_100", 14.0, 8.0, 0.99),
     ("mizuguchi_fisheye_10", 10.5, 8.0, 0.97),
 ]
 MODELS = ["laikin_double_gauss_50.ols-28", "muller_fisheye_100-14mm.ols-40", "thorlabs_lb1471_biconvex_50.ols-64"]
