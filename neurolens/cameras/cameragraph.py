@@ -1,7 +1,7 @@
 """Lens cameras as graphs: from film point, two random numbers and wavelength to the ray, its weight and its status.
 
-What stands around a lens is written here, and in `pupil_outline`, once: onnxruntime and compiled cameras run it whole
-(`whole_camera`) with the graph of their lens; cameras whose lens is a function (a trace) evaluate its two halves.
+The graph of a camera is written here, and in `pupil_outline`, once. onnxruntime and compiled cameras run it whole, with
+the graph of their lens inside (`whole_camera`); cameras whose lens is a function (a trace) evaluate its two halves.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _METRES = [1e-3, 1e-3, 1e-3, 1.0, 1.0, 1.0]
 
 @lru_cache(maxsize=16)
 def status_graph(aperture: Aperture | None = None, stopped: int = 0) -> Graph:
-    """What is left of a lens's status 0 (PASSED): rays of unit direction through the stop's shape.
+    """The status of rays: those that pass the lens must have a unit direction and cross the stop within its shape.
 
     Args:
         aperture: shape of the stop's opening, tested on the crossing `stop_xy_mm`; None: the round one of the lens.

@@ -55,7 +55,7 @@ MANY_RAYS_A_CALL = 32768  # for cameras that keep next to nothing, where a call 
 
 @dataclass(frozen=True)
 class RayDifferentials:
-    """How rays change with the film point's x and y, per mm, the point on the pupil held (Igehy 1999).
+    """The derivatives of rays by the film point's x and y, per mm, with the point on the pupil held (Igehy 1999).
 
     Attributes:
         origin_m: [3, 2, N] float32, metres per mm; the origin moves on the surface where rays start.
@@ -88,7 +88,7 @@ class CameraRays:
 
 @dataclass(frozen=True)
 class FilmPoints:
-    """Where light of scene points arrives: the camera rays that lead to them.
+    """The film points at which light of scene points arrives, and the camera rays that lead to the scene points.
 
     Attributes:
         film_mm: [2, N] float32, lens frame; may lie beyond the edges of the film. 0 where nothing arrives.
@@ -106,7 +106,7 @@ class FilmPoints:
 
 
 class Camera(Protocol):
-    """What the renderer knows of a camera.
+    """The interface of a camera to the renderer.
 
     Attributes:
         name: a word for reports ("pinhole", "thin", the lens's or model's name).
@@ -130,7 +130,7 @@ class Camera(Protocol):
 
 
 class DifferentialCamera(Camera, Protocol):
-    """What all cameras of this package know besides; `Vignetted` but for `natural`."""
+    """The interface of all cameras of this package; `Vignetted` has no `natural`."""
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """Sample rays as `sample` does, and give their differentials, too."""

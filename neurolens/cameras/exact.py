@@ -181,7 +181,7 @@ class ExactCamera(LensCamera):
         return self._scene(film, pupil, wavelength_nm)._replace(d_film=d_film)
 
     def _passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
-        """Whether light passes from film points (r, 0) through pupil points; see `passes_at_any_azimuth`."""
+        """Test whether light passes from film points (r, 0) through pupil points; see `passes_at_any_azimuth`."""
         r, u, v = _tensors(self._dtype, film[0], *pupil)
         with torch.no_grad():
             film_z, pupil_z = self._film_z_mm, self._pupil_z_mm
@@ -193,7 +193,7 @@ def _tensors(dtype: torch.dtype, *arrays: NDArray[Any]) -> list[torch.Tensor]:
 
 
 def state_of(lens: Lens, wavelength_nm: tuple[float, float], nominal_mm: float | None = None) -> dict[str, Any]:
-    """The table `lens_state` of a lens that `at` has placed; `nominal_mm` is its focal length at infinity."""
+    """The table `lens_state` of a lens that `set_lens` has placed; `nominal_mm` is its focal length at infinity."""
     data, film_z = first_order(lens), lens.film_z_mm
     assert film_z is not None
 
@@ -218,7 +218,7 @@ def state_of(lens: Lens, wavelength_nm: tuple[float, float], nominal_mm: float |
 
 
 def placed_settings(lens: Lens, film_mm: tuple[float, float], focus_m: float) -> dict[str, Any]:
-    """What the settings of an exact camera say of lens and film, of a lens that `at` has placed, without a camera."""
+    """The settings of an exact camera that describe lens and film, for a lens that `set_lens` has placed."""
     nominal = None if lens.infinity_mm else float(first_order(lens).efl_mm)
     return {
         "camera": "exact",

@@ -1,4 +1,4 @@
-"""Where a camera sees what lies at a point of its picture: its undistorted place, both ways, and the light there.
+"""The field of a camera: the undistorted place of every point of its picture, the way back, and the light there.
 
 Picture points are mm on the film as the picture is looked at: x right, y up, origin at its centre. What a point of the
 picture shows is the centroid of the light that arrives there: the mean, over pupil and wavelengths and by weight, of
@@ -55,8 +55,8 @@ class Frame(NamedTuple):
 
 
 class Light(NamedTuple):
-    """What film points see: direction [3, N] from the ideal camera's point, x right, y up, z towards the scene, not of
-    unit length; light [N] over that on the axis; angle of the mean ray to the axis [N], rad."""
+    """The light of film points: direction [3, N] from the ideal camera's point (x right, y up, z towards the scene, of any
+    length); light [N] over that on the axis; angle of the mean ray to the axis [N], rad."""
 
     direction: Array
     light: Array
@@ -99,7 +99,7 @@ def frame_of(camera: Any) -> Frame:
 
 
 def _measured(camera: Any) -> Frame:
-    """From where points close to the axis are seen on two planes, in both meridians."""
+    """The frame of a camera without first-order data: its rays close to the axis meet two planes, in both meridians."""
     height = _SMALL * math.hypot(*camera.film_mm) / 2
     points = height * np.array([[1.0, 0, -1, 0, 2, 0, -2, 0], [0, 1, 0, -1, 0, 2, 0, -2]])
     near, far, origin = 1000.0, 3000.0, Frame((1.0, 1.0), (0.0, 0.0))
@@ -123,7 +123,7 @@ def seen(
     distance_m: float,
     pupil: tuple[int, int] = _PUPIL,
 ) -> Light:
-    """What picture points [2, N] show; see the module.
+    """The light of picture points [2, N]; see the module.
 
     Args:
         distance_m: from the film to the object on the axis, inf allowed.
@@ -201,7 +201,7 @@ def laid(direction: Array, frame: Frame, target: str) -> Complex:
 
 
 def is_round(camera: Any) -> bool:
-    """Whether points at some azimuths, none of which is another's mirror image, are seen alike."""
+    """Test whether points at some azimuths, none of which is another's mirror image, have the same places and light."""
     corner = math.hypot(*camera.film_mm) / 2
     angle = np.arange(_AZIMUTHS) * 0.83
     turn = np.exp(1j * np.tile(angle, len(_TRIED)))
@@ -244,7 +244,7 @@ class Polar:
         return cls(end, ratio, (3 * a - 4 * b + c) / (2 * radius[1] * turn), shift)
 
     def __call__(self, point: Complex) -> Complex:
-        """Where points go."""
+        """The points to which the map takes points."""
         radius = np.abs(point)
         inner = np.minimum(radius, self.end)
         turn = point / np.where(radius > 0, radius, 1.0)
@@ -307,7 +307,7 @@ class Field:
     spectrum: Spectrum
 
     def lit(self, point: Complex) -> NDArray[np.bool_]:
-        """Whether light arrives at picture points."""
+        """Test whether light arrives at picture points."""
         if (self.light > 0).all():
             return np.asarray(np.abs(point) <= self.end_mm * (1 + 1e-9))
         return self.relative_light(point) > 0

@@ -1,4 +1,4 @@
-"""Where light from the scene is aimed at a lens: boxes on its front surface, by the angle from which the light comes.
+"""Boxes on a lens's front surface at which light from the scene is aimed, by the angle from which the light comes.
 
 Light of a direction that reaches the film crosses a part of the front surface that moves with the angle to the axis.
 What comes from a scene point has directions as far apart as the front is wide as seen from there: the boxes of all of
@@ -78,7 +78,7 @@ class FrontAim:
         return np.stack([low, high, np.minimum(half, far), cos, sin])
 
     def aim(self, point_mm: Array, square: FloatArray) -> Aim:
-        """From scene points [3, N] (mm, lens frame) to points of the surface chosen by numbers [2, N] in [0, 1)."""
+        """Aim scene points [3, N] (mm, lens frame) at points of the surface that numbers [2, N] in [0, 1) choose."""
         finite = np.isfinite(point_mm).all(0)
         low, high, half, cos, sin = self.box(np.where(finite, point_mm, 0.0))
         along, across = low + (high - low) * square[0], half * (2 * square[1].astype(np.float64) - 1)

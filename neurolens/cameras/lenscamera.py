@@ -109,7 +109,7 @@ class LensFilm:
     def _weighted(
         self, scene: SceneFunction, film: FloatArray, pupil: FloatArray, area: FloatArray, wavelength_nm: FloatArray
     ) -> dict[str, NDArray[Any]]:
-        """What `camera_rays` takes, for lit film points [2, N] through pupil points [2, N], densities 1 / area [N]."""
+        """The input of `camera_rays` for lit film points [2, N] through pupil points [2, N], densities 1 / area [N]."""
         out = scene(film, pupil, wavelength_nm)
         given = {"film_mm": film, "pupil_mm": pupil, "area_mm2": area[None], "scene_ray": out.scene_ray}
         given |= {"transmittance": out.transmittance[None], "lens_status": out.status[None].astype(np.float32)}
@@ -170,7 +170,7 @@ _OUTPUTS = {"ray": ("tensor(float)", 6, None), "weight": ("tensor(float)", None)
 
 
 class LensCamera:
-    """What cameras of lenses share; see `contract.Camera` for what all cameras do.
+    """The camera of a lens, exact or modelled; `contract.Camera` is the interface of all cameras.
 
     Attributes:
         path: of the file of the lens or the model, for messages.
@@ -315,7 +315,7 @@ class _CompiledGraph:
         self._call.restype = None
 
     def __call__(self, rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
-        """What `lens_film.camera_rays` takes, for inputs [R, N]."""
+        """The input of `camera_rays` for inputs [R, N]."""
         count = rays["film_mm"].shape[1]
         found: dict[str, NDArray[Any]] = {
             name: np.empty((rows, count), kind) for name, (rows, kind) in self._rows.items() if name not in D_FILM

@@ -195,14 +195,14 @@ class ModelScene:
         return st.blocked(int(self.model.card["lens"].get("stop_surface", 0)), st.RIM)
 
     def passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
-        """Whether rays pass at one wavelength; bool [N]. Of a round stop directions are not looked at: it is faster."""
+        """Test whether rays pass at one wavelength; bool [N]. Behind a round stop only the status is computed."""
         waves = np.full(film.shape[1], wavelength_nm, np.float32)
         if self.aperture is not None:
             return self(film, pupil, waves).status == st.PASSED
         return self.model.status(film, pupil, waves, self.film_z_mm, self.stop_radius_mm) == st.PASSED
 
     def passes_at_any_azimuth(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
-        """Whether rays of a lens with cylinders pass at any azimuth of their film and pupil points; bool [N]."""
+        """Test whether rays of a lens with cylinders pass at any azimuth of their film and pupil points; bool [N]."""
         passed = np.zeros(film.shape[1], bool)
         for azimuth in _AZIMUTHS:
             left = np.flatnonzero(~passed)
@@ -277,7 +277,7 @@ def _axial_spot(scene: ModelScene, focus_m: float, wavelength_nm: tuple[float, f
     film, best, shift = np.zeros_like(pupil), scene.film_z_mm, _SHIFT * reach
 
     def miss(film: FloatArray, object_z_mm: float) -> tuple[FloatArray, FloatArray, NDArray[np.int32]]:
-        """By how much rays miss the object, where it sees them in the entrance pupil, and their status."""
+        """The miss distance of rays at the object, their place in the entrance pupil, and their status."""
         out = scene(film.astype(np.float32), pupil.astype(np.float32), nanometres)
         place, way = out.scene_ray[:3].astype(np.float64), out.scene_ray[3:].astype(np.float64)
         with np.errstate(all="ignore"):

@@ -116,7 +116,7 @@ MAX_RAYS = 2**27
 
 
 class LensRays(NamedTuple):
-    """What a model gives for N rays; lens frame, mm. Rays mean something where status is 0.
+    """The answer of a model for N rays; lens frame, mm. Rays are valid where status is 0.
 
     scene_ray [6, N] float32 (x, y, z, unit direction), transmittance [N], stop_xy_mm [2, N] (crossing with the stop),
     status [N] int32 (see `neurolens.base.status`).

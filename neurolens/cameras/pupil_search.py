@@ -47,7 +47,7 @@ class PupilTable:
 
     @staticmethod
     def of(bounds: Mapping[str, Any]) -> PupilTable:
-        """From the fields of `setting.pupils.PupilBounds`, as a model's card holds them."""
+        """Make it of the fields of `PupilBounds`, in which a model's card holds them."""
         return PupilTable(float(bounds["pupil_z_mm"]), float(bounds["film_radius_mm"]), pupil_rows(bounds))
 
 
@@ -85,7 +85,7 @@ def tightened(
 def passes_any(
     passes: Passes, film: FloatArray, pupil: FloatArray, wavelength_nm: Sequence[float]
 ) -> NDArray[np.bool_]:
-    """Whether rays of film points [2, N] through pupil points [2, N] pass at any of the wavelengths."""
+    """Test whether rays of film points [2, N] through pupil points [2, N] pass at any of the wavelengths."""
     passed = np.zeros(film.shape[1], bool)
     for wavelength in wavelength_nm:
         left = np.flatnonzero(~passed)
@@ -177,7 +177,7 @@ def _boxes(table: PupilTable, place: Float64Array) -> Float64Array:
 
 
 def _lattice(boxes: Float64Array, radius: Float64Array, ask: Ask) -> tuple[NDArray[np.bool_], Float64Array]:
-    """Which points of lattices on boxes [3, M] pass from film radii [M], [M, A, B], and the points, [2, M, A, B]."""
+    """Test lattices on boxes [3, M] from film radii [M]: which points pass [M, A, B], and the points [2, M, A, B]."""
     low, high, half = boxes
     u, v = ((np.arange(n) + 0.5) / n for n in _COARSE_LATTICE)
     points = np.empty((2, radius.size, *_COARSE_LATTICE))
@@ -218,7 +218,7 @@ _BULGE = 1.04
 
 
 class Detail(NamedTuple):
-    """How closely an outline is sought.
+    """The fineness of the search for an outline.
 
     Attributes:
         rows: film radii. segments: edges of the upper half of a polygon.
@@ -259,7 +259,7 @@ def outline_of(
         passes: the lens at one focus and stop.
         wavelength_nm: shortest and longest wavelength; equal ones give an outline for one.
         detail: how closely.
-        report: told the share of the search that is done.
+        report: takes the share of the search that is done.
 
     The polygons hold every point found to pass at the rows, between them and between vertices, even where the region
     is not convex or the outline bends: their vertices are pushed out until they do.
@@ -391,7 +391,7 @@ def _pushed_out(
 def _excess(
     outline: PupilOutline, vertices: tuple[Float64Array, Float64Array], ask: Ask
 ) -> list[tuple[float, Float64Array]]:
-    """How far what passes reaches, as a share of the outline, between rows and vertices: each place's part of the
+    """The reach of passing rays, as a share of the outline, between rows and vertices: each place's part of the
     step between rows, and the shares [rows, edges]."""
 
     def between(c: Float64Array, step: float) -> Float64Array:

@@ -1,4 +1,4 @@
-"""What the cameras share: the map from the unit square to a disk, rays that stay finite, checks of arguments."""
+"""Helpers of all cameras: the map from the unit square to a disk, finite rays, checks, and the lens data of headers."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def stratified(side: int, wavelength_nm: tuple[float, float]) -> tuple[FloatArra
 
 
 def is_light(wavelength_nm: FloatArray) -> NDArray[np.bool_]:
-    """Which wavelengths [N] are finite and above 0: other rays are outside the domain of every camera."""
+    """Test which wavelengths [N] are finite and above 0: other rays are outside the domain of every camera."""
     return (wavelength_nm > 0) & (wavelength_nm < np.inf)
 
 

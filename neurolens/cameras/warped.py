@@ -27,7 +27,7 @@ from neurolens.cameras.field import (
 
 
 class Warped:
-    """What compositing makes of an ideal camera's picture by maps of a lens's plane field: its places and light.
+    """An ideal camera whose picture is warped by ST maps of a lens's plane field, and has the lens's light.
 
     Args:
         flat: pinhole, thin or thick lens, of the same film. camera: to be shown. focus_m: from the film to the plane

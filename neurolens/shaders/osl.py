@@ -80,7 +80,7 @@ _FRAME = """\
 
 @dataclass(frozen=True)
 class OslCamera:
-    """What the shader of a lens in one state is made of.
+    """The parts of the shader of a lens in one state.
 
     Attributes:
         lens: the lens. graph: its graph with derivatives by the film point. pupil: where rays are sampled.
@@ -191,7 +191,7 @@ def osl_program(lens: OslLens, fixed: Mapping[str, float] | None = None) -> Prog
 
 
 def _mixture(lens: OslLens) -> Mixture:
-    """How the nodes are mixed; internal focus stands where the camera is focused."""
+    """The mixture of the nodes; internal focus follows the distance in focus."""
     focus = [a for a in lens.axes if a.name == FOCUS_AXIS]
     others = tuple(a for a in lens.axes if a.name != FOCUS_AXIS)
     far = lens.nodes[:: len(focus[0].nodes)] if focus else lens.nodes  # the last axis goes fastest
@@ -254,7 +254,7 @@ def _set_outputs(
 
 
 class _Call:
-    """What is the same for all rays: stop, film position, exposure."""
+    """The values that all rays of a call share: stop, film position, exposure."""
 
     def __init__(self, g: Graph, camera: OslCamera) -> None:
         self.g, self.camera = g, camera
@@ -428,7 +428,7 @@ def shader_lens(model: OnnxLens, graph: Graph | None = None) -> ShaderLens:
 
 
 def _light_of(short_nm: float, long_nm: float) -> tuple[float, float]:
-    """Those wavelengths of a model that pictures are made of; all where it has none of these."""
+    """The visible part of a model's wavelengths; all of them where none is visible."""
     short, long = max(short_nm, _LIGHT_NM[0]), min(long_nm, _LIGHT_NM[1])
     return (short, long) if short < long else (short_nm, long_nm)
 

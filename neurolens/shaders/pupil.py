@@ -51,7 +51,7 @@ class Blades:
         return self.curvature * 0.5 * (self.middle * self.middle + point.graph.square(point)) - self.middle
 
     def opened(self, point: Value) -> Value:
-        """Whether a point [2] lies in the opening, 1 or 0."""
+        """1 for points [2] within the opening, 0 for others."""
         along = reduce(Value.maximum, (point[0] * cos + point[1] * sin for cos, sin in self.edges))
         inside = point.graph.select(along * self.scale + self._excess(point) <= 0.0, 1.0, 0.0)
         return point.graph.select(self.none, 1.0, inside)
@@ -186,7 +186,7 @@ class PupilCircles:
         return circles
 
     def _terms(self, row: int) -> NDArray[np.bool_]:
-        """Which monomials c, a or b has, by symmetry."""
+        """The monomials that c, a or b has by symmetry."""
         x, y = self.exponents[:, 0] + (row == 1), self.exponents[:, 1] + (row == 2)
         return np.asarray((x % 2 == 0) & (y % 2 == 0) & (self.image.anamorphic | (row < 2)))
 
@@ -242,8 +242,10 @@ class _Circle:
 
 
 class _Shape:
-    """What circles have in common, the first of them that of the stop; the unit disc maps to it chord by chord, so that
-    densities stay nearly even."""
+    """The region that circles have in common, of which the first is the stop's.
+
+    The unit disc maps to it chord by chord, so that densities stay nearly even.
+    """
 
     def __init__(self, circles: Sequence[_Circle]) -> None:
         self.circles = circles

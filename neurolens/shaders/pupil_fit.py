@@ -326,7 +326,7 @@ def _lost(rays: _Rays, within: Array) -> float:
 
 
 def _missed(rays: _Rays, within: Array) -> Array:
-    """How many rays pass [2, zones], and how many of them lie outside."""
+    """Counts [2, zones] of the rays that pass, and of those among them that lie outside."""
     out = rays.passed & (within < 0).any(0)
     return np.stack([np.bincount(rays.zone[rows], minlength=_ALL) for rows in (rays.passed, out)])
 

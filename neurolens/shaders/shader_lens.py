@@ -21,7 +21,7 @@ _PART = 1 << 15  # rays that are evaluated together
 
 
 class Pupil(Protocol):
-    """Where a shader samples its rays: `graph` takes a film point and two random numbers to a pupil point."""
+    """The sampler of a shader's rays: `graph` takes a film point and two random numbers to a pupil point."""
 
     @property
     def film_radius_mm(self) -> float: ...
@@ -72,7 +72,7 @@ class ShaderLens:
     def _passes(
         self, film: FloatArray, pupil: FloatArray, nanometres: float, film_z: float, azimuth: float
     ) -> NDArray[np.bool_]:
-        """Whether rays pass through points [2, N] of the boxes, turned about the axis by an azimuth, or mirrored."""
+        """Test whether rays pass through points [2, N] of the boxes, turned about the axis or mirrored."""
         cos, sin = np.cos(azimuth), np.sin(azimuth)
         turn, sides = np.array([[cos, -sin], [sin, cos]]), (1.0, -1.0) if self.anamorphic else (1.0,)
         points = [(turn @ film, turn @ (pupil * [[1.0], [side]])) for side in sides]
@@ -135,7 +135,7 @@ def passing_share(lens: ShaderLens, pupil: Pupil, stops: Sequence[float] = (1.0,
 def _sampled(
     lens: ShaderLens, pupil: Pupil, square: Array, film: Array, call: Array, share: float
 ) -> NDArray[np.bool_]:
-    """Whether rays [N] of points of the unit square pass, at film positions and wavelengths `call` [2, N]."""
+    """Test whether rays [N] of points of the unit square pass, at film positions and wavelengths `call` [2, N]."""
     (film_z, nanometres), stop = call, np.array([[share * lens.stop_radius_mm]])
     inputs = {"film_mm": film, "square": square, "film_z_mm": film_z[None], "wavelength_nm": nanometres[None]}
     sample = evaluate(pupil.graph, inputs | {"stop_radius_mm": stop})

@@ -43,7 +43,7 @@ _RISING, _RISING_MM = 200, 1e-4  # distances at which the film must rise; a fall
 
 @dataclass(frozen=True)
 class Focusing:
-    """How a lens in one state is focused.
+    """The focusing of a lens in one state.
 
     Attributes:
         nearest_m: nearest object, distance to the film; inf where the film does not focus.
@@ -298,7 +298,7 @@ def state_ranges(axes: Sequence[Axis]) -> dict[str, float]:
 
 
 def model_focusing(model: OnnxLens, state: Sequence[float] = (), stop_mm: float | None = None) -> Focusing:
-    """How a model in a state is focused, with its stop as wide as it goes, or fixed."""
+    """The focusing of a model in a state, with its stop as wide as it goes, or fixed."""
     at = model.at(*state) if state else model
     lens, domain = at.card["lens"], at.card["domain"]
     light, widest = tuple(domain["wavelength_nm"]), float(domain["stop_radius_mm"])
