@@ -55,7 +55,7 @@ class Frame(NamedTuple):
 
 
 class Light(NamedTuple):
-    """The light of film points: direction [3, N] from the ideal camera's point (x right, y up, z towards the scene, of any
+    """The light of film points: direction [3, N] from the ideal camera's point (x right, y up, z to the scene, of any
     length); light [N] over that on the axis; angle of the mean ray to the axis [N], rad."""
 
     direction: Array
