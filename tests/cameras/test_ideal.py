@@ -16,8 +16,6 @@ from neurolens.cameras.contract import Camera
 from neurolens.cameras.ideal import ThickLens, ThinLens
 from neurolens.cameras.pinhole import PROJECTIONS, Fisheye, Pinhole
 from neurolens.cameras.sampling import concentric_disk
-from neurolens.lens.apertures import Aperture
-from neurolens.lens.film_plane import film_z_mm
 from neurolens.lens.paraxial import first_order, system_of
 from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Shot
@@ -42,7 +40,7 @@ def test_disk_map_is_uniform() -> None:
 
 
 @pytest.mark.parametrize("film", [(0.0, 0.0), (10.0, -5.0), (-18.0, 12.0)])
-@pytest.mark.parametrize("focus_m", [0.3, 2.0, 30.0])
+@pytest.mark.parametrize("focus_m", [0.3, 30.0, 1e3])
 def test_thin_lens_rays_of_a_film_point_meet_at_the_focus_distance(film: tuple[float, float], focus_m: float) -> None:
     camera = ThinLens(50.0, 1.8, focus_m)
     pupil = square_grid(16)
@@ -55,21 +53,6 @@ def test_thin_lens_rays_of_a_film_point_meet_at_the_focus_distance(film: tuple[f
     assert np.allclose(np.sum(rays.direction**2, axis=0), 1, atol=1e-6)
     assert np.all(rays.status == 0)
     assert rays.origin_m.dtype == rays.direction.dtype == rays.weight.dtype == np.float32
-
-
-def test_thin_lens_at_infinity_gives_parallel_rays_towards_the_upside_down_scene() -> None:
-    camera = ThinLens(50.0, 2.0, math.inf)
-    pupil = square_grid(8)
-    rays = camera.sample(at((10.0, 5.0), 64), pupil, np.full(64, 550, np.float32))
-    assert np.ptp(rays.direction, axis=1).max() == 0
-    assert rays.direction[0, 0] < 0 and rays.direction[1, 0] < 0 and rays.direction[2, 0] < 0
-    assert np.allclose(rays.direction[:2, 0] / rays.direction[2, 0], [10 / 50, 5 / 50], atol=1e-6)
-
-
-def test_conjugate_distances_obey_the_lens_equation() -> None:
-    for focus_m in (0.2, 0.5, 3.0, 1e6):
-        image = film_z_mm(50.0, 0.0, 0.0, focus_m)
-        assert 1 / image + 1 / (1e3 * focus_m - image) == pytest.approx(1 / 50.0, rel=1e-12)
 
 
 RETROFOCUS = ROOT / "lenses" / "angenieux_retrofocus_35.toml"
@@ -124,7 +107,7 @@ def paraxial_chief_slope(lens: Lens, height_mm: float) -> float:
 
 
 @pytest.mark.parametrize("focus", ["best", "paraxial"])
-@pytest.mark.parametrize("focus_m", [math.inf, 2.0, 0.9])
+@pytest.mark.parametrize("focus_m", [math.inf, 0.9])
 @pytest.mark.parametrize("path", [GAUSS, RETROFOCUS, TELEPHOTO, ZOOM])
 def test_ideal_cameras_frame_the_plane_in_focus_as_the_lens_does(path: Path, focus_m: float, focus: str) -> None:
     """Chief rays of a film point of the lens and of its thin lens, thick lens and pinhole meet there (item 16)."""
@@ -169,14 +152,6 @@ def test_thick_lens_and_exact_lens_see_the_same_to_first_order() -> None:
         lines.append((rays.origin_m + t * rays.direction)[:2, passed].mean(1))
     assert lines[0] == pytest.approx(lines[1], rel=5e-3)
     assert film_value(thick, (1.0, 0.5)) == pytest.approx(film_value(exact, (1.0, 0.5)), abs=2e-3)
-
-
-def test_shapes_of_the_stop_keep_the_exposure() -> None:
-    camera = made(GAUSS, aperture=Aperture(blades=5))
-    assert film_value(camera, (0.0, 0.0)) == pytest.approx(1, abs=5e-3)
-    square, wavelength = jittered(128)
-    passed = camera.sample(at((3.0, 0.0), 128 * 128), square, wavelength).status == st.PASSED
-    assert passed.mean() == pytest.approx(2.5 * math.sin(math.radians(72)) / math.pi, abs=0.01)
 
 
 def test_settings_are_those_of_the_lens_in_its_state() -> None:
@@ -253,14 +228,6 @@ def test_weight_is_that_of_etendue(name: str) -> None:
     foreshortening = -rays.direction[2] if name == "orthographic" else 1
     assert rays.weight == pytest.approx(foreshortening * solid, abs=2e-3)
     assert sample(camera, np.zeros((2, 1))).weight[0] == 1
-
-
-def test_laws_of_the_falloff() -> None:
-    theta = np.radians([20.0, 60.0, 89.0, 130.0])
-    laws = {"equidistant": np.sin(theta) / theta, "equisolid": 1 + 0 * theta, "stereographic": np.cos(theta / 2) ** 4}
-    for name, law in laws.items():
-        radius = FOCAL * PROJECTIONS[name].radius(theta)
-        assert sample(Fisheye(name, FOCAL), np.stack([radius, 0 * radius])).weight == pytest.approx(law, abs=1e-5)
 
 
 @pytest.mark.parametrize(
