@@ -177,7 +177,7 @@ def ray_candidate(name: str, file: Path) -> Candidate:
 
     part = Extractor(onnx.load(file)).extract_model(["rays", "film_z_mm"], ["scene_ray"]).SerializeToString()
     wanted = {"rays": ("tensor(float)", 5, None), "film_z_mm": ("tensor(float)", 1)}
-    session = open_session(file, part, 1, wanted, {"scene_ray": ("tensor(float)", 6, None)})
+    session = open_session(file, part, wanted, {"scene_ray": ("tensor(float)", 6, None)})
 
     def prepare(rays: FilmRays) -> Call:
         columns = [np.ascontiguousarray(c.numpy(), dtype=np.float32) for c in rays.columns()]

@@ -175,7 +175,6 @@ class LensCamera:
     Attributes:
         path: of the file of the lens or the model, for messages.
         film: film and pupil of the lens at its focus and stop. film_mm: width and height of the film.
-        threads: of onnxruntime, within one operator.
         runtime: what runs the camera's graph.
         differentials_error: RMS error of fitted differentials over their size; None where differentials are the
             graph's own, or were not sampled yet. Compiled cameras fit them by polynomials of low order, within
@@ -187,7 +186,6 @@ class LensCamera:
     film_mm: tuple[float, float]
     settings: dict[str, Any]
     runtime: Runtime
-    threads: int = 1
     differentials_error: float | None = None
 
     def lens_graph(self, form: Form = SCALARS) -> LensGraph:
@@ -250,7 +248,7 @@ class LensCamera:
         g.outputs = g.inline(whole, constants)
         shapes = _OUTPUTS | {name: ("tensor(float)", 6, None) for name in D_FILM if name in g.outputs}
         path, names = self.path, tuple(shapes)
-        session = open_session(path, write_onnx(g, {}), self.threads, _INPUTS, shapes)
+        session = open_session(path, write_onnx(g, {}), _INPUTS, shapes)
 
         def run(rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
             done = run_batches(path, session, names, rays, {}, RAYS_A_CALL)

@@ -74,7 +74,7 @@ class OnnxCamera(LensCamera):
             model = model.at(*state_for(model.path, model.axes, model.state, shot.zoom, shot.focus_m))
         card = model.card
         lens, domain = card["lens"], card["domain"]
-        self.model, self.path, self.threads = model, model.path, model.threads
+        self.model, self.path = model, model.path
         self._inverse: tuple[OnnxInverse, FrontAim] | None = None
         self.name = str(lens.get("name", model.path.stem))
         self.film_mm = shot.film_mm

@@ -28,7 +28,7 @@ from neurolens.surrogates.model import LensModel
 
 
 def open_session(
-    path: Path, data: bytes, threads: int, inputs: dict[str, tuple[Any, ...]], outputs: dict[str, tuple[Any, ...]]
+    path: Path, data: bytes, inputs: dict[str, tuple[Any, ...]], outputs: dict[str, tuple[Any, ...]]
 ) -> Any:
     """A session of onnxruntime on the CPU.
 
@@ -37,8 +37,7 @@ def open_session(
             type, then the dimensions, None for the number of rays.
     """
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.inter_op_num_threads = 1
+    options.intra_op_num_threads = options.inter_op_num_threads = 1  # batches fit a core's cache
     options.log_severity_level = 4  # what goes wrong is raised, not printed
     try:
         session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
@@ -139,8 +138,8 @@ class OnnxLens:
         state: a number for every axis.
     """
 
-    def __init__(self, file: ModelFile, threads: int) -> None:
-        self.file, self.path, self.card, self.threads = file, file.path, file.card, threads
+    def __init__(self, file: ModelFile) -> None:
+        self.file, self.path, self.card = file, file.path, file.card
         self.axes, self.state = file.axes, default_state(file.card)
         self._sessions: dict[tuple[str, ...], Any] = {}  # by the outputs that they compute; opened when they are needed
         self._graphs: dict[Form, Graph] = {}
@@ -153,7 +152,7 @@ class OnnxLens:
         """
         if not self.axes and not state:
             return self
-        other = OnnxLens(self.file, self.threads)
+        other = OnnxLens(self.file)
         other.card, other.state = card_at(self.file.card, self.axes, state), tuple(float(v) for v in state)
         return other
 
@@ -240,28 +239,24 @@ class OnnxLens:
             graph = self.graph(ONNX)
             wanted = pruned(graph, {name: graph.outputs[name] for name in outputs})
             shapes = {name: OUTPUTS[name] for name in outputs}
-            self._sessions[outputs] = open_session(self.path, write_onnx(wanted, {}), self.threads, INPUTS, shapes)
+            self._sessions[outputs] = open_session(self.path, write_onnx(wanted, {}), INPUTS, shapes)
         return self._sessions[outputs]
 
 
-def load_model(path: str | Path, lens: str | None = None, threads: int = 1) -> OnnxLens:
+def load_model(path: str | Path, lens: str | None = None) -> OnnxLens:
     """Load an exported model and check it.
 
     Args:
         lens: SHA-256 of the prescription (`Lens.sha256`) that the model must stand for; None takes any.
-        threads: of onnxruntime, within one operator. Batches that fit a core's cache gain nothing from more than one.
 
     Raises:
         ModelError: as `read_model`; a file of another lens, or of an inverse map.
-        InputError: fewer than one thread.
     """
-    if threads < 1:
-        raise InputError("load_model", "threads", threads, "at least 1")
     file = read_model(path)
     if "inverse" in file.card:
         raise ModelError(f"{file.path}: card: inverse: it is an inverse map, expected a model")
     check_lens(file, lens)
-    return OnnxLens(file, threads)
+    return OnnxLens(file)
 
 
 def check_lens(file: ModelFile, lens: str | None) -> None:

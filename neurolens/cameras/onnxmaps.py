@@ -125,11 +125,11 @@ class OnnxInverse:
         return InverseRays(*run_batches(self.path, session, InverseRays._fields, rays, call, _BATCH))
 
 
-def load_inverse(path: str | Path, lens: str | None = None, threads: int = 1) -> OnnxInverse:
+def load_inverse(path: str | Path, lens: str | None = None) -> OnnxInverse:
     """Load the inverse maps that lie beside a model: NAME.stop.onnx and NAME.scene.onnx for NAME.onnx.
 
     Args:
-        path: of the model. lens, threads: see `load_model`.
+        path: of the model. lens: see `load_model`.
 
     Raises:
         ModelError: neither file is there, or one is damaged, of another lens, or does not lead the card's reference
@@ -140,7 +140,7 @@ def load_inverse(path: str | Path, lens: str | None = None, threads: int = 1) ->
     for name in _GIVEN:
         file = base.with_name(f"{base.name}.{name}.onnx")
         if file.is_file():
-            maps[name] = _load(file, name, lens, threads)
+            maps[name] = _load(file, name, lens)
     if not maps:
         raise ModelError(f"{base}.stop.onnx, {base}.scene.onnx: no such files, expected exported inverse maps")
     inverse = OnnxInverse(maps, Path(path))
@@ -149,7 +149,7 @@ def load_inverse(path: str | Path, lens: str | None = None, threads: int = 1) ->
     return inverse
 
 
-def _load(path: Path, name: str, lens: str | None, threads: int) -> tuple[Any, ModelFile]:
+def _load(path: Path, name: str, lens: str | None) -> tuple[Any, ModelFile]:
     file = read_model(path)
     facts = file.card.get("inverse")
     if not isinstance(facts, dict) or facts.get("map") != name or file.axes:
@@ -164,7 +164,7 @@ def _load(path: Path, name: str, lens: str | None, threads: int) -> tuple[Any, M
     except (ValueError, TypeError, KeyError, IndexError, ArithmeticError, AttributeError) as error:
         raise ModelError(f"{path}: its first guess is damaged ({type(error).__name__}: {error})") from error
     inputs = {_GIVEN[name]: ("tensor(float)", 5, None), **_CALL}
-    return open_session(path, data, threads, inputs, _OUTPUTS), file
+    return open_session(path, data, inputs, _OUTPUTS), file
 
 
 def _check(inverse: OnnxInverse, name: str, card: dict[str, Any]) -> None:

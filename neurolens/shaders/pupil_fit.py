@@ -331,12 +331,12 @@ def _missed(rays: _Rays, within: Array) -> Array:
     return np.stack([np.bincount(rays.zone[rows], minlength=_ALL) for rows in (rays.passed, out)])
 
 
-def light_lost(lens: ShaderLens, pupil: PupilCircles | PupilDisc, draws: int = 4) -> float:
+def light_lost(lens: ShaderLens, pupil: PupilCircles | PupilDisc) -> float:
     """The share of the rays that pass which no sample is, in the worst zone of film and stop, by new random rays."""
     if isinstance(pupil, PupilDisc):
         return disc_lost(pupil, lens)
     counts = np.zeros((2, _ALL))
-    for seed in range(draws):
+    for seed in range(4):
         rays = _drawn(lens, pupil, 100 + seed)
         counts += _missed(rays, evaluate(pupil.checked, rays.inputs)["within"])
     return float((counts[1] / np.maximum(counts[0], _FEW)).max())

@@ -161,8 +161,6 @@ def test_flipped_bytes_never_crash(path: Path, tmp_path: Path) -> None:
 def test_model_of_another_lens(path: Path) -> None:
     with pytest.raises(ModelError, match="another lens"):
         load_model(path, lens_models.lens("muller_fisheye_100").sha256)
-    with pytest.raises(InputError, match="threads"):
-        load_model(path, threads=0)
 
 
 def test_rays_do_not_depend_on_batches(model: OnnxLens) -> None:
