@@ -55,10 +55,10 @@ class Frame(NamedTuple):
 
 
 class Light(NamedTuple):
-    """The light of film points: direction [3, N] from the ideal camera's point (x right, y up, z to the scene, of any
-    length); light [N] over that on the axis; angle of the mean ray to the axis [N], rad."""
+    """The light of picture points [N]: its undistorted place (x + i y, mm), its amount over that on the axis, and the
+    angle of its mean ray to the axis (rad)."""
 
-    direction: Array
+    place: Complex
     light: Array
     angle: Array
 
@@ -101,12 +101,12 @@ def frame_of(camera: Any) -> Frame:
 def _measured(camera: Any) -> Frame:
     """The frame of a camera without first-order data: its rays close to the axis meet two planes, in both meridians."""
     height = _SMALL * math.hypot(*camera.film_mm) / 2
-    points = height * np.array([[1.0, 0, -1, 0, 2, 0, -2, 0], [0, 1, 0, -1, 0, 2, 0, -2]])
+    points = height * np.array([1, 1j, -1, -1j, 2, 2j, -2, -2j])
     near, far, origin = 1000.0, 3000.0, Frame((1.0, 1.0), (0.0, 0.0))
     sizes = []
     for distance in (near, far):  # by the middle of the pupil
-        found = seen(camera, points, spectrum_of(camera), origin, RECTILINEAR, distance / 1000, (1, 1))
-        x, y = found.direction[:2] * distance / height
+        z = traced_light(camera, points, spectrum_of(camera), origin, RECTILINEAR, distance / 1000, (1, 1)).place
+        x, y = z.real * distance / height, z.imag * distance / height
         once, twice = np.array([x[0] - x[2], y[1] - y[3]]) / 2, np.array([x[4] - x[6], y[5] - y[7]]) / 4
         sizes.append((4 * once - twice) / 3)  # the error goes with the square
     growth = [(b - a) / (far - near) for a, b in zip(*sizes, strict=True)]  # per mm: 1 / reach
@@ -114,16 +114,16 @@ def _measured(camera: Any) -> Frame:
     return Frame((float(1 / growth[0]), float(1 / growth[1])), (float(pupil[0]), float(pupil[1])))
 
 
-def seen(
+def traced_light(
     camera: Any,
-    picture_mm: Array,
+    point: Complex,
     spectrum: Spectrum,
     frame: Frame,
     target: str,
     distance_m: float,
     pupil: tuple[int, int] = _PUPIL,
 ) -> Light:
-    """The light of picture points [2, N]; see the module.
+    """The light of picture points [N]; see the module.
 
     Args:
         distance_m: from the film to the object on the axis, inf allowed.
@@ -133,11 +133,11 @@ def seen(
     each = np.tile(square, waves.size).astype(np.float32)
     nm = np.repeat(waves, shares.size).astype(np.float32)
     share = np.outer(weights / weights.sum(), shares).reshape(-1)
-    count, step = picture_mm.shape[1], max(1, _RAYS // nm.size)
+    count, step = point.size, max(1, _RAYS // nm.size)
     direction, light, angle = np.zeros((3, count)), np.zeros(count), np.zeros(count)
     for start in range(0, count, step):
         part = slice(start, start + step)
-        film = np.repeat(-picture_mm[:, part], nm.size, axis=1).astype(np.float32)
+        film = np.repeat(-np.stack([point.real, point.imag])[:, part], nm.size, axis=1).astype(np.float32)
         points = film.shape[1] // nm.size
         rays = camera.sample(film, np.tile(each, points), np.tile(nm, points))
         weight = rays.weight.astype(np.float64).reshape(points, -1) * share
@@ -148,7 +148,7 @@ def seen(
         sound = np.isfinite(place).all(0)
         met, place = np.where(sound, weight, 0.0), np.where(sound, place, 0.0)
         direction[:, part] = np.einsum("inm,nm->in", place, met) / np.maximum(met.sum(1), 1e-30)
-    return Light(direction, light, angle)
+    return Light(_undistorted(direction, frame, target), light, angle)
 
 
 def _pupil_samples(rings: int, around: int) -> tuple[Array, Array]:
@@ -189,7 +189,7 @@ def _on_object(origin: Array, way: Array, frame: Frame, target: str, distance_m:
         return found
 
 
-def laid(direction: Array, frame: Frame, target: str) -> Complex:
+def _undistorted(direction: Array, frame: Frame, target: str) -> Complex:
     """Undistorted places x + i y [N], mm, of directions [3, N]."""
     side = np.hypot(direction[0], direction[1])
     angle = np.arctan2(side, direction[2])
@@ -206,10 +206,9 @@ def is_round(camera: Any) -> bool:
     angle = np.arange(_AZIMUTHS) * 0.83
     turn = np.exp(1j * np.tile(angle, len(_TRIED)))
     points = np.repeat(corner * np.array(_TRIED), angle.size) * turn
-    found = seen(camera, np.stack([points.real, points.imag]), spectrum_of(camera), Frame((1, 1), (0, 0)),
-                 "equidistant", math.inf)  # fmt: skip
-    place = (laid(found.direction, Frame((1, 1), (0, 0)), "equidistant") / turn).reshape(len(_TRIED), -1)
-    light = found.light.reshape(place.shape) > 0
+    traced = traced_light(camera, points, spectrum_of(camera), Frame((1, 1), (0, 0)), "equidistant", math.inf)
+    place = (traced.place / turn).reshape(len(_TRIED), -1)
+    light = traced.light.reshape(place.shape) > 0
     lit = light.all(1)  # a row that is dark in part is not round, one that is dark says nothing
     uneven = np.abs(place[lit] - place[lit].mean(1, keepdims=True))
     return bool((lit | ~light.any(1)).all() and (uneven <= _UNEVEN * np.abs(place[lit])).all())
@@ -356,8 +355,8 @@ def field_of(
     rings, azimuths = _ROUND if is_round(camera) else _OTHER
 
     def at(points: Complex, distance_m: float) -> tuple[Complex, Light]:
-        found = seen(camera, np.stack([points.real, points.imag]), spectrum, frame, target, distance_m)
-        return np.where(found.light > 0, laid(found.direction, frame, target), np.nan), found
+        traced = traced_light(camera, points, spectrum, frame, target, distance_m)
+        return np.where(traced.light > 0, traced.place, np.nan), traced
 
     corner = math.hypot(*camera.film_mm) / 2
     end = corner if azimuths > 1 else end_of_light(lambda r: at(np.array([r + 0j]), distance)[1].light[0] > 0, corner)

@@ -20,9 +20,8 @@ from neurolens.cameras.field import (
     field_of,
     film_edge,
     frame_of,
-    laid,
-    seen,
     spectrum_of,
+    traced_light,
 )
 
 
@@ -72,14 +71,14 @@ class Warped:
         each, back = -(film_mm[0] + 1j * film_mm[1]).astype(np.complex128), np.arange(film_mm.shape[1])
         if not self._fields:
             each, back = np.unique(each, return_inverse=True)
-        ideal, light = self._seen(self._shown, each)
+        ideal, light = self._place_and_light(self._shown, each)
         place = self._before(ideal)
-        light = light / np.maximum(self._seen(self._flat, place)[1], 1e-30)
+        light = light / np.maximum(self._place_and_light(self._flat, place)[1], 1e-30)
         film = -np.stack([place.real, place.imag])[:, back].astype(np.float32)
         rays = self._flat.sample(np.ascontiguousarray(film), pupil, wavelength_nm)
         return replace(rays, weight=rays.weight * light[back].astype(np.float32))
 
-    def _seen(self, camera: Camera, point: Complex) -> tuple[Complex, Array]:
+    def _place_and_light(self, camera: Camera, point: Complex) -> tuple[Complex, Array]:
         """Undistorted places of picture points, and light over that on the axis."""
         if field := self._fields.get(id(camera)):
             return field.ideal(point), field.relative_light(point)
@@ -87,9 +86,9 @@ class Warped:
         return ideal, light / self._axis[id(camera)]
 
     def _traced(self, camera: Camera, point: Complex) -> tuple[Complex, Array]:
-        picture, frame = np.stack([point.real, point.imag]), self._frames[id(camera)]
-        found = seen(camera, picture, spectrum_of(camera), frame, RECTILINEAR, self._focus_m)
-        return laid(found.direction, frame, RECTILINEAR), found.light
+        frame = self._frames[id(camera)]
+        traced = traced_light(camera, point, spectrum_of(camera), frame, RECTILINEAR, self._focus_m)
+        return traced.place, traced.light
 
     def _before(self, ideal: Complex) -> Complex:
         """Places in the ideal camera's picture, mm."""
