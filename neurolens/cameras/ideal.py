@@ -22,7 +22,6 @@ from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints,
 from neurolens.cameras.sampling import (
     ahead,
     arrived,
-    check_film,
     concentric_disk,
     ideal_state,
     positive,
@@ -31,6 +30,7 @@ from neurolens.cameras.sampling import (
 )
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.film_plane import film_z_mm
+from neurolens.lens.shot import check_film
 
 _QUADRATURE = 256  # points a side
 

@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints, FloatArray, RayDifferentials, towards
-from neurolens.cameras.sampling import ahead, arrived, check_film, ideal_state, positive, sound
+from neurolens.cameras.sampling import ahead, arrived, ideal_state, positive, sound
+from neurolens.lens.shot import check_film
 
 Array = NDArray[Any]
 Function = Callable[[Array], Array]

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
-from neurolens.base.bounds import FILM_MM, said, within
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
 
@@ -140,20 +139,6 @@ def positive(field: str, value: float, *, infinite: bool = False) -> float:
     if math.isinf(value) and not infinite:
         raise InputError("camera", field, value, expected)
     return float(value)
-
-
-def check_film(film_mm: tuple[float, float]) -> tuple[float, float]:
-    """Width and height of the film as two floats above 0.
-
-    Raises:
-        InputError: it is not two such numbers, or no film's.
-    """
-    if len(film_mm) != 2:
-        raise InputError("camera", "film_mm", film_mm, "a width and a height")
-    found = positive("film_mm width", film_mm[0]), positive("film_mm height", film_mm[1])
-    if not all(within(FILM_MM, side) for side in found):
-        raise InputError("camera", "film_mm", film_mm, f"sides {said(FILM_MM)} mm")
-    return found
 
 
 def lens_state(

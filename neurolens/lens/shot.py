@@ -82,15 +82,23 @@ class Shot:
 
     def __post_init__(self) -> None:
         check_bounds(self, "camera")
-        if len(self.film_mm) != 2:
-            raise InputError("camera", "film_mm", self.film_mm, "a width and a height")
-        if not all(within(FILM_MM, side) for side in self.film_mm):
-            raise InputError("camera", "film_mm", self.film_mm, f"sides {said(FILM_MM)} mm")
+        object.__setattr__(self, "film_mm", check_film(self.film_mm))
+        object.__setattr__(self, "focus_m", float(self.focus_m))
 
     def f_number_for(self, widest: float) -> float | None:
         """The f-number of a lens that opens to `widest`; None stands for its widest."""
         too_wide = self.clamp_f_number and self.f_number is not None and self.f_number < widest
         return None if too_wide else self.f_number
+
+
+def check_film(film_mm: tuple[float, float]) -> tuple[float, float]:
+    """Width and height of a film as floats; raises InputError for any that no film has."""
+    if len(film_mm) != 2:
+        raise InputError("camera", "film_mm", film_mm, "a width and a height")
+    width, height = film_mm
+    if not (within(FILM_MM, width) and within(FILM_MM, height)):
+        raise InputError("camera", "film_mm", film_mm, f"sides {said(FILM_MM)} mm")
+    return float(width), float(height)
 
 
 # The fields of a shot that rule how a lens is set.

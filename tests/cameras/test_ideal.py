@@ -169,7 +169,7 @@ def test_settings_are_those_of_the_lens_in_its_state() -> None:
         (lambda: ThinLens(50.0, 0.0, 2.0), "f_number"),
         (lambda: ThinLens(50.0, 2.0, math.nan), "focus_m"),
         (lambda: Pinhole(math.inf), "focal_length_mm"),
-        (lambda: Pinhole(50.0, (36.0, 0.0)), "film_mm height"),
+        (lambda: Pinhole(50.0, (36.0, 0.0)), "film_mm"),
         (lambda: made(ROOT / "lenses" / "cooke_anamorphic_42.toml"), "cylinders"),
         (lambda: make_camera("thick:absent.toml", Shot(FILM, 2.0)), "absent.toml"),
         (lambda: make_camera("thick:model.onnx", Shot(FILM, 2.0)), "camera"),
