@@ -1,6 +1,6 @@
 """Finding the outline of what passes a lens on its pupil plane, from nothing but whether rays pass.
 
-The exact tracer and an exported model answer that question alike, so one search serves both, at any focus and stop.
+The exact tracer and an exported model have the same test, so one search serves both, at any focus and stop.
 All rows of the outline are searched at once, ray by ray from a centre outwards.
 """
 
@@ -26,7 +26,7 @@ _COARSE_LATTICE = (40, 20)
 Passes = Callable[[FloatArray, FloatArray, float], NDArray[np.bool_]]
 Float64Array = NDArray[np.float64]
 # Whether rays pass from film points (radius, 0) through points [2, ...]; the radius broadcasts with the points.
-Ask = Callable[[Float64Array, Float64Array], NDArray[np.bool_]]
+PassTest = Callable[[Float64Array, Float64Array], NDArray[np.bool_]]
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def _with_neighbours(boxes: FloatArray) -> FloatArray:
     return np.stack([np.where(empty, 1, low), np.where(empty, -1, high), half]).astype(np.float32)
 
 
-class Frame(NamedTuple):
+class SearchFrame(NamedTuple):
     """For each row [R]: film radius, centre of the polygon, half widths along and across [2, R], and farthest reach.
 
     Directions and the reach are those of a frame in which the region is about as wide as it is high.
@@ -117,48 +117,48 @@ class Frame(NamedTuple):
     reach: Float64Array
 
 
-def asking(passes: Passes, wavelength_nm: Sequence[float]) -> Ask:
-    """The question whether rays pass at any of the wavelengths."""
+def pass_test(passes: Passes, wavelength_nm: Sequence[float]) -> PassTest:
+    """A test whether rays pass at any of the wavelengths."""
 
-    def ask(radius: Float64Array, points: Float64Array) -> NDArray[np.bool_]:
+    def passing(radius: Float64Array, points: Float64Array) -> NDArray[np.bool_]:
         film = np.zeros(points.shape, np.float32)
         film[0] = radius
         flat = film.reshape(2, -1), points.astype(np.float32).reshape(2, -1)
         return passes_any(passes, *flat, wavelength_nm).reshape(points.shape[1:])
 
-    return ask
+    return passing
 
 
-def end_of_light(table: PupilTable, ask: Ask) -> float | None:
+def end_of_light(table: PupilTable, passing: PassTest) -> float | None:
     """The largest film radius, within those of the table, from which a ray is found to pass."""
     last = table.rows.shape[1] - 1
     lit, dark = None, None
     for place in np.minimum(np.flatnonzero(table.rows[0] <= table.rows[1]), last * (1 - 1e-6))[::-1]:
         # The rows of the table hold their neighbours, so the last of them may be dark.
-        seen = _seen(_boxes(table, place[None]), table.film_radius_mm * place / last, ask)
-        if seen is not None:
+        box = _passing_box(_boxes(table, place[None]), table.film_radius_mm * place / last, passing)
+        if box is not None:
             lit = place
             break
         dark = place
-    if lit is None or seen is None:
+    if lit is None or box is None:
         return None
     for _ in range(_END_HALVINGS if dark is not None else 0):
         middle = (lit + dark) / 2
         # What is left of the pupil mostly lies in what was left before: a lattice there finds smaller regions.
         radius = table.film_radius_mm * middle / last
-        left = _seen(seen, radius, ask)
+        left = _passing_box(box, radius, passing)
         if left is None:
-            left = _seen(_boxes(table, middle[None]), radius, ask)
+            left = _passing_box(_boxes(table, middle[None]), radius, passing)
         if left is None:
             dark = middle
         else:
-            lit, seen = middle, left
+            lit, box = middle, left
     return float(table.film_radius_mm * lit / last) if lit > 0 else None
 
 
-def _seen(box: Float64Array, radius: float, ask: Ask) -> Float64Array | None:
+def _passing_box(box: Float64Array, radius: float, passing: PassTest) -> Float64Array | None:
     """The box [3, 1] about what passes of a lattice on a box, a step wider, or None where nothing does."""
-    passed, (x, y) = _lattice(box, np.array([radius]), ask)
+    passed, (x, y) = _lattice(box, np.array([radius]), passing)
     if not passed.any():
         return None
     x, y, (low, high, half) = x[passed], y[passed], box[:, 0]
@@ -176,21 +176,21 @@ def _boxes(table: PupilTable, place: Float64Array) -> Float64Array:
     return np.stack([np.minimum(low[a], low[b]), np.maximum(high[a], high[b]), np.maximum(half[a], half[b])])
 
 
-def _lattice(boxes: Float64Array, radius: Float64Array, ask: Ask) -> tuple[NDArray[np.bool_], Float64Array]:
+def _lattice(boxes: Float64Array, radius: Float64Array, passing: PassTest) -> tuple[NDArray[np.bool_], Float64Array]:
     """Test lattices on boxes [3, M] from film radii [M]: which points pass [M, A, B], and the points [2, M, A, B]."""
     low, high, half = boxes
     u, v = ((np.arange(n) + 0.5) / n for n in _COARSE_LATTICE)
     points = np.empty((2, radius.size, *_COARSE_LATTICE))
     points[0] = low[:, None, None] + (high - low)[:, None, None] * u[:, None]
     points[1] = half[:, None, None] * v
-    return ask(radius[:, None, None], points), points
+    return passing(radius[:, None, None], points), points
 
 
-def frame_of(table: PupilTable, radius: Float64Array, ask: Ask) -> Frame:
+def frame_of(table: PupilTable, radius: Float64Array, passing: PassTest) -> SearchFrame:
     """Centroid and extent of what passes at each film radius, from a lattice."""
     place = radius / table.film_radius_mm * (table.rows.shape[1] - 1)
     low, high, half = boxes = _boxes(table, place)
-    passed, (x, y) = _lattice(boxes, radius, ask)
+    passed, (x, y) = _lattice(boxes, radius, passing)
     count = passed.sum((1, 2))
     centre = np.where(passed, x, 0).sum((1, 2)) / np.maximum(count, 1)
     low = np.where(passed, x, np.inf).min((1, 2)) - (high - low) / _COARSE_LATTICE[0]
@@ -201,7 +201,7 @@ def frame_of(table: PupilTable, radius: Float64Array, ask: Ask) -> Frame:
     centre, low, high, half = (np.interp(rows, rows[found], a[found]) for a in (centre, low, high, half))
     stretch = np.stack([(high - low) / 2, half])
     off_centre = np.abs(centre - (low + high) / 2) / stretch[0]
-    return Frame(radius, centre, stretch, 1.05 * np.hypot(1 + off_centre, 1))
+    return SearchFrame(radius, centre, stretch, 1.05 * np.hypot(1 + off_centre, 1))
 
 
 _DIRECTIONS = 33  # in which the first outline is sought
@@ -239,7 +239,7 @@ class Detail(NamedTuple):
 
 
 FINE = Detail()
-# For a lens with cylinders, each question about which takes tracing at many azimuths, and no outline fits all of them.
+# For a lens with cylinders: each test takes tracing at many azimuths, and no outline fits all of them.
 # What is left out errs towards outlines too wide: halvings end outside what passes.
 COARSE = Detail(33, 16, (0.0, 0.5, 1.0), 12, 2, 5, 1.2, None)
 COARSE_TIGHT = COARSE._replace(tighten=(48, 24))
@@ -265,29 +265,29 @@ def outline_of(
     is not convex or the outline bends: their vertices are pushed out until they do.
     """
     ends = tuple(sorted(set(wavelength_nm)))
-    looked_at = sorted({wavelength_between(ends, share) for share in detail.wavelengths})
-    ask = asking(passes, looked_at)
-    tight = tightened(table, passes, looked_at, detail.tighten) if detail.tighten else table
-    end = end_of_light(tight, ask)
+    wavelengths_nm = sorted({wavelength_between(ends, share) for share in detail.wavelengths})
+    passing = pass_test(passes, wavelengths_nm)
+    tight = tightened(table, passes, wavelengths_nm, detail.tighten) if detail.tighten else table
+    end = end_of_light(tight, passing)
     if end is None:
         return None
     rows = detail.rows
     empty = np.zeros((len(ends), rows, 1), np.float32)
     outline = PupilOutline(table.pupil_z_mm, end, ends, empty[0, :, 0], empty, empty)
-    frame = frame_of(tight, outline.radii(np.arange(rows, dtype=np.float64)), ask)
+    frame = frame_of(tight, outline.radii(np.arange(rows, dtype=np.float64)), passing)
     start = np.repeat(np.linspace(0, np.pi, _DIRECTIONS)[None], rows, axis=0)
     reach = np.repeat(frame.reach[:, None], _DIRECTIONS, axis=1)
     report(0.1)
-    rough = _boundary(ask, frame, start, reach, detail.steps, detail.coarse)
+    rough = _boundary(passing, frame, start, reach, detail.steps, detail.coarse)
     report(0.2)
     angles = _equal_areas(start, rough, detail.segments)
     if detail.reach < math.inf:
         reach = np.minimum(reach, np.maximum(detail.reach * rough, reach / detail.steps))
     reach = np.stack([np.interp(*row) for row in zip(angles, start, reach, strict=True)])
     found = []
-    for w in looked_at:
-        found.append(_boundary(asking(passes, (w,)), frame, angles, reach, detail.steps, detail.fine))
-        report(0.2 + 0.4 * len(found) / len(looked_at))
+    for w in wavelengths_nm:
+        found.append(_boundary(pass_test(passes, (w,)), frame, angles, reach, detail.steps, detail.fine))
+        report(0.2 + 0.4 * len(found) / len(wavelengths_nm))
     fine = _together(np.stack(found), detail.wavelengths)
     x, y = (fine * a[:, None] * f(angles) for a, f in zip(frame.stretch, (np.cos, np.sin), strict=True))
     y[..., [0, -1]] = 0
@@ -297,7 +297,7 @@ def outline_of(
 
 
 def _boundary(
-    ask: Ask, frame: Frame, angles: Float64Array, reach: Float64Array, steps: int, halvings: int
+    passing: PassTest, frame: SearchFrame, angles: Float64Array, reach: Float64Array, steps: int, halvings: int
 ) -> Float64Array:
     """Distance [R, D] from the centre to the last passing point in each direction, in the stretched frame.
 
@@ -305,7 +305,7 @@ def _boundary(
     """
     direction = np.stack([np.cos(angles), np.sin(angles)]) * frame.stretch[:, :, None]
     tried = np.linspace(0, 1, steps + 1)[:, None] * reach.ravel()
-    flat = _farthest(ask, *_flat(frame.radius, frame.centre, direction), tried, halvings)
+    flat = _farthest(passing, *_flat(frame.radius, frame.centre, direction), tried, halvings)
     return flat.reshape(angles.shape)
 
 
@@ -319,18 +319,23 @@ def _flat(
 
 
 def _farthest(
-    ask: Ask, radius: Float64Array, origin: Float64Array, direction: Float64Array, steps: Float64Array, halvings: int
+    passing: PassTest,
+    radius: Float64Array,
+    origin: Float64Array,
+    direction: Float64Array,
+    steps: Float64Array,
+    halvings: int,
 ) -> Float64Array:
     """The largest t [M] at which origin + t direction passes, to the last halving and never less.
 
     Args:
-        ask: whether rays pass.
+        passing: whether rays pass.
         radius, origin, direction: [M], [2, M], [2, M] mm.
         steps: [S, M] rising values of t. All are tried, so that a region with a dent is held whole. Where none
             passes, the first is the answer.
     """
-    # All in one question: tracing few rays at a time costs more than tracing many.
-    passed = ask(np.broadcast_to(radius, steps.shape), origin[:, None] + steps * direction[:, None])
+    # All in one test: tracing few rays at a time costs more than tracing many.
+    passed = passing(np.broadcast_to(radius, steps.shape), origin[:, None] + steps * direction[:, None])
     last = len(steps) - 1 - np.argmax(passed[::-1], axis=0)
     found = np.flatnonzero(passed.any(0))
     low, high = steps[0].copy(), steps[np.minimum(last + 1, len(steps) - 1), np.arange(radius.size)]
@@ -339,7 +344,7 @@ def _farthest(
     a, b = low[found], high[found]
     for _ in range(halvings):
         middle = (a + b) / 2
-        now = ask(radius, origin + middle * direction)
+        now = passing(radius, origin + middle * direction)
         a, b = np.where(now, middle, a), np.where(now, b, middle)
     low[found] = b
     return low
@@ -376,10 +381,10 @@ def _pushed_out(
     both = len(outline.wavelength_nm) > 1
     for done, share in enumerate(shares if both else (0.0,)):
         report(done / len(shares))
-        ask = asking(passes, (wavelength_between(outline.wavelength_nm, share),))
+        passing = pass_test(passes, (wavelength_between(outline.wavelength_nm, share),))
         ends = {0.0: slice(0, 1), 1.0: slice(-1, None)}.get(share, slice(None))
         x, y = ((1 - share) * c[0].astype(np.float64) + share * c[-1] for c in (outline.x, outline.y))
-        for step, found in _excess(outline, (x, y), ask):
+        for step, found in _excess(outline, (x, y), passing):
             rows = len(found)
             for row in (slice(0, rows), slice(1, 1 + rows)) if step else (slice(0, rows),):
                 for edge in (slice(0, -1), slice(1, None)):
@@ -389,7 +394,7 @@ def _pushed_out(
 
 
 def _excess(
-    outline: PupilOutline, vertices: tuple[Float64Array, Float64Array], ask: Ask
+    outline: PupilOutline, vertices: tuple[Float64Array, Float64Array], passing: PassTest
 ) -> list[tuple[float, Float64Array]]:
     """The reach of passing rays, as a share of the outline, between rows and vertices: each place's part of the
     step between rows, and the shares [rows, edges]."""
@@ -406,7 +411,7 @@ def _excess(
             parts.append(_flat(outline.radii(between(rows, step)), between(centres, step), point))
     radius, origin, direction = (np.concatenate(c, axis=-1) for c in zip(*parts, strict=True))
     steps = np.repeat(np.array(_CHECKS)[:, None], radius.size, axis=1)
-    found = _farthest(ask, radius, origin, direction, steps, _CHECK_HALVINGS)
+    found = _farthest(passing, radius, origin, direction, steps, _CHECK_HALVINGS)
     edges = vertices[0].shape[1] - 1
     shares = np.split(found, np.cumsum([len(part[0]) for part in parts])[:-1])
     steps_between = np.repeat(_BETWEEN_ROWS, len(_ALONG_EDGE))

@@ -67,7 +67,7 @@ class Vignetted:
         light = common_light(camera.wavelength_nm or wavelength_nm, wavelength_nm)
         corner = 1.0001 * math.hypot(*camera.film_mm) / 2
         self._end = end_of_light(lambda r: bool((_means(camera, light, r * _AROUND, 16)[0] > 0).any()), corner)
-        tried = _means(camera, light, self._end * np.outer(_TRIED, _AROUND).reshape(-1), _OTHER[2])[0]
+        tried = _means(camera, light, (self._end * np.array(_TRIED)[:, None] * _AROUND).reshape(-1), _OTHER[2])[0]
         uneven = np.ptp(tried.reshape(len(_TRIED), -1), axis=1) > _UNEVEN * tried.max()
         rings, azimuths, side = _OTHER if uneven.any() else _ROUND
         radius = self._end * (1 - (1 - np.arange(rings) / (rings - 1)) ** 2)

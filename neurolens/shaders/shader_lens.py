@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurolens.base import status as st
 from neurolens.cameras.contract import FloatArray
-from neurolens.cameras.pupil_search import PupilTable, asking, end_of_light
+from neurolens.cameras.pupil_search import PupilTable, end_of_light, pass_test
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.shaders.source import Focusing
@@ -66,7 +66,7 @@ class ShaderLens:
         for z in {low, (low + high) / 2, high}:
             for azimuth in np.linspace(0, np.pi / 2, 4) if self.anamorphic else [0.0]:
                 passes = partial(self._passes, film_z=z, azimuth=azimuth)
-                radii.append(end_of_light(self.table, asking(passes, self.wavelength_nm)) or 0.0)
+                radii.append(end_of_light(self.table, pass_test(passes, self.wavelength_nm)) or 0.0)
         return min(max(radii), self.film_radius_mm)
 
     def _passes(
