@@ -197,13 +197,14 @@ def test_the_exact_lens(lens: Lens, film_mm: tuple[float, float], runtime: Runti
     plain, other = (ExactCamera(lens, Shot(film_mm, 3.0), runtime=kind) for kind in ("trace", runtime))
     film, square, _ = numbers(4000, 7, film_mm)
     given = film, square, np.linspace(400, 700, 4000, dtype=np.float32)
-    wanted, found = plain.sample_differentials(*given), other.sample_differentials(*given)
-    for rays in (found, other.sample(*given)):
-        agree(rays, wanted, differ=5e-3 if runtime == "onnxruntime" else 1e-3, metres=5e-7, unit=1e-5)
+    wanted, found = plain.sample(*given), other.sample(*given)
+    agree(found, wanted, differ=5e-3 if runtime == "onnxruntime" else 1e-3, metres=5e-7, unit=1e-5)
     ok = (found.status == st.PASSED) & (wanted.status == st.PASSED)
-    assert ok.mean() > 0.3 and found.differentials is not None and wanted.differentials is not None
-    a, b = (d.direction[..., ok] for d in (found.differentials, wanted.differentials))
-    np.testing.assert_allclose(a, b, rtol=0, atol=2e-5 * np.abs(b).max())
+    assert ok.mean() > 0.3
+    if film_mm == FILM:  # compiled lenses of aspheres or cylinders fit their differentials
+        moves = [camera.sample_differentials(*given).differentials for camera in (other, plain)]
+        a, b = (move.direction[..., ok] for move in moves if move is not None)
+        np.testing.assert_allclose(a, b, rtol=0, atol=2e-5 * np.abs(b).max())
 
 
 def test_rays_that_are_lost_on_their_way_stay_finite() -> None:
