@@ -220,7 +220,7 @@ def _words(rows: Sequence[Row], simulated: Sequence[Row]) -> str:
 
 
 def _draw(file: Path, rows: Sequence[Row], simulated: Sequence[Row]) -> None:
-    from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, drawing, plain_log_ticks
+    from neurolens.analysis.plots import FAINT, FIELD_COLOURS, drawing, plain_log_ticks
 
     with drawing(file, 9.0, 3.8, "A Dask cluster", "left: measured, tasks that do nothing; right: simulated") as figure:
         left, right = figure.subplots(1, 2)

@@ -33,9 +33,8 @@ from experiments.equal_time import (
     scene_file,
 )
 from experiments.equal_time_errors import Estimate, crossover_s, log_interpolate
-from neurolens.analysis.plot_style import FAINT, INK, drawing, plain_log_ticks
-from neurolens.study.figures import side_by_side
-from neurolens.study.plots import family_colour
+from neurolens.analysis.plots import FAINT, INK, drawing, plain_log_ticks
+from neurolens.study.plots import family_colour, side_by_side
 
 _INTRO = """\
 # Equal time and equal samples

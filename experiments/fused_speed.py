@@ -28,10 +28,9 @@ from neurolens.graph.compiler import FLAGS, find_compiler
 from neurolens.graph.program import Program
 from neurolens.graph.scalars import lower
 from neurolens.lens.prescription import Lens
-from neurolens.study.candidates import exact_candidates, fused_candidate, model_candidate, program_candidate
 from neurolens.study.experiment import LensChoice
 from neurolens.study.rays import ray_errors
-from neurolens.study.speed import Call, Candidate, race
+from neurolens.study.speed import Call, Candidate, exact_candidates, model_candidate, program_candidate, race
 from neurolens.surrogates.assemble import ALL, RAY_ONLY
 from neurolens.surrogates.domain import FilmRays, domain_of
 from neurolens.surrogates.export import export_onnx
@@ -148,10 +147,9 @@ def measure(case: Case, *, rounds: int, torch_compiled: bool, report: Report) ->
         known = {"rms_um": error, "coefficients": model.core.coefficients}
         for name, models, fixed in _forms(model):
             for work, parts in (("ray", RAY_ONLY), ("whole", ALL)):
-                candidate = fused_candidate(name, models, domain, parts=parts, fix=fixed)
                 program = fused_program(models, parts, fixed)
-                add(name, work, candidate, program if candidate else None, **known)
-                for words, flags in OTHERWISE.items() if name.endswith(_FUSED) and candidate else ():
+                add(name, work, program_candidate(name, program, domain, fixed.stop_radius_mm), program, **known)
+                for words, flags in OTHERWISE.items() if name.endswith(_FUSED) else ():
                     other = program_candidate("", program, domain, flags=flags)
                     add(f"{name}, {words}", work, other, program, **known)
     with tempfile.TemporaryDirectory(prefix="neurolens-fused-") as scratch:

@@ -49,7 +49,7 @@ _LOADED = (
     *("onnxruntime", "torch", "onnx", "matplotlib.pyplot", "neurolens.readers.any_format"),
     *("neurolens.surrogates.export", "neurolens.render.renderer", "neurolens.render.scene", "neurolens.cameras.build"),
     *("neurolens.cameras.model", "neurolens.render.pictures", "neurolens.setting.check", "neurolens.flare.layers"),
-    *("neurolens.cli.render", "neurolens.study.survey_run", "neurolens.analysis.spots"),
+    *("neurolens.cli.render", "neurolens.study.survey", "neurolens.analysis.spots"),
 )
 OPTIONS = (
     lab.count("cases", 1000, "cases (default 1000)"),

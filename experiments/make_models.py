@@ -34,14 +34,13 @@ from neurolens.base.settings import read_config
 from neurolens.cameras.model import load_model
 from neurolens.lens.prescription import Lens
 from neurolens.setting.pupils import image_radius_mm
-from neurolens.study.candidates import exact_candidates, model_candidate, model_candidates
 from neurolens.study.check import check_model, check_states
 from neurolens.study.describe import lens_files
 from neurolens.study.experiment import DomainChoice, Experiment, LensChoice, check_names
 from neurolens.study.measure import Measured, fit_and_measure, shared_rays
 from neurolens.study.rays import REFERENCE_RADIUS_MM
-from neurolens.study.speed import race
-from neurolens.study.train_states import fit_and_measure_states, state_settings
+from neurolens.study.speed import exact_candidates, model_candidate, model_candidates, race
+from neurolens.study.train import fit_and_measure_states, state_settings
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, prepare
 from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import PairSettings, make_pairs

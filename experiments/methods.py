@@ -19,11 +19,10 @@ from neurolens.base.records import plain
 from neurolens.cameras.model import load_model
 from neurolens.lens.prescription import Lens
 from neurolens.setting.pupils import image_radius_mm
-from neurolens.study.candidates import EXACT, exact_candidates, exact_records, model_candidates
 from neurolens.study.experiment import DomainChoice, EvaluationChoice, LensChoice
 from neurolens.study.measure import FreshRays, measure, onnx_predictor, seconds_to_load, shared_rays
 from neurolens.study.rays import REFERENCE_RADIUS_MM
-from neurolens.study.speed import Race, race
+from neurolens.study.speed import EXACT, Race, exact_candidates, exact_records, model_candidates, race
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, prepare
 from neurolens.surrogates.model import Domain

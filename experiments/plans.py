@@ -27,10 +27,10 @@ from neurolens.cameras.warped import Warped
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Shot
+from neurolens.plan import candidates as choices
 from neurolens.plan import footprints as prints
 from neurolens.plan import plan as plans
-from neurolens.plan import shot_fits
-from neurolens.plan.probe import COUNTED, LIGHT, Probed, effects_of, probe
+from neurolens.plan.probe import COUNTED, LIGHT, Probe, effects_of, probe
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import Scene, load_scene
 from neurolens.setting.pupils import image_radius_mm
@@ -44,7 +44,7 @@ LENSES = (
 )  # fmt: skip
 SCENES = ("distant", "garden", "room", "lights")  # stopped down and grey, to wide open among coloured lights
 BUDGETS = (1.0, 0.25, 0.05)
-TARGETS: tuple[plans.Target, ...] = ("render", "onnx")
+TARGETS: tuple[choices.Target, ...] = ("render", "onnx")
 MORE_TERMS = (10, 19)  # besides those of plans
 _WIDTH = 1920
 _LIT = 0.95  # of the image circle that the film's corners reach
@@ -125,20 +125,20 @@ def measure_case(case: Case, folder: Path, report: Report) -> dict[str, Any]:
     shot = Shot(own.film_mm, own.focus_m, asked.f_number, zoom=case.state, wavelength_nm=own.wavelength_nm)
     compiled = "fused:" if probed.exact.runtime == "c" else ""
     exact = make_camera(f"{compiled}{lens.path}", shot)  # as in a render: a plan's own has another outline of pupils
-    places = plan_errors.fresh_places(scene, exact, probed.glance.rgb.mean((0, 1)))
+    places = plan_errors.fresh_places(scene, exact, probed.overview.rgb.mean((0, 1)))
     fresh = Fresh(exact, places, plan_errors.fresh_prints(exact, places))
     report(0.1)
     rows: dict[str, dict[str, Any]] = {}
-    chosen: dict[str, plans.Choice] = {}
+    chosen: dict[str, choices.Choice] = {}
     decisions: list[dict[str, Any]] = []
     sizes: list[Path] = []
     for number, target in enumerate(TARGETS):
         began = time.process_time()
         if number == 0:
-            picks = plans.candidates(probed, BUDGETS, target, models=case.shipped(), folder=folder)
-            fitted = [folder / f"{c.name}.onnx" for c in picks if c.how == plans._SHOT]
+            picks = choices.candidates(probed, BUDGETS, target, models=case.shipped(), folder=folder)
+            fitted = [folder / f"{c.name}.onnx" for c in picks if c.how == choices.FITTED]
         else:  # fits are the same for all targets
-            picks = plans.candidates(probed, BUDGETS, target, models=[*case.shipped(), *fitted])
+            picks = choices.candidates(probed, BUDGETS, target, models=[*case.shipped(), *fitted])
         plan_s = probe_s + time.process_time() - began
         report(0.2 + 0.3 * number)
         more = _more(probed, target, folder, picks, sizes, case.shipped())
@@ -169,37 +169,37 @@ def measure_case(case: Case, folder: Path, report: Report) -> dict[str, Any]:
 
 
 def _more(
-    probed: Probed,
-    target: plans.Target,
+    probed: Probe,
+    target: choices.Target,
     folder: Path,
-    picks: Sequence[plans.Choice],
+    picks: Sequence[choices.Choice],
     made: list[Path],
     shipped: Sequence[Path],
-) -> Iterator[plans.Choice]:
+) -> Iterator[choices.Choice]:
     """Models that ship and polynomials of the shot of all sizes that the plan tried without their cost, or not at all,
     made as it does.
 
     No polynomials are larger than what has half of the least budget: they cost more. `made` keeps files for the next
     target.
     """
-    trial = plans._Trial(probed, target, (_TRIED_PX,))
+    trial = choices.Trial(probed, target, (_TRIED_PX,))
     costs = {c.name: c for c in picks}
 
-    def costed(file: Path) -> plans.Choice | None:
+    def costed(file: Path) -> choices.Choice | None:
         choice = costs.get(file.stem)
         if choice is not None and (math.isfinite(choice.cost) or not choice.meets(_TRIED_PX)):
             return choice
-        judged = next(plans._model(trial, file), None)
+        judged = next(choices._model(trial, file), None)
         if judged is None:
             return None
         return trial.costed(judged) if judged.choice.meets(_TRIED_PX) else judged.choice
 
     yield from (c for c in map(costed, shipped) if c is not None)
     fit: Any = None
-    for terms in sorted({*shot_fits.shot_terms(probed), *MORE_TERMS}):
+    for terms in sorted({*choices.shot_terms(probed), *MORE_TERMS}):
         file = folder / f"{Path(probed.lens.path).stem}.shot-ols-{terms}.onnx"
         if file.stem not in costs and file not in made:
-            fit = fit or shot_fits.shot_fits(probed, folder)
+            fit = fit or choices.shot_fits(probed, folder)
             made.append(fit(terms)[0])
         choice = costed(file)
         if choice is not None:
@@ -208,14 +208,14 @@ def _more(
                 return
 
 
-def _held(choice: plans.Choice, probed: Probed, state: str | None, exact: Any) -> Camera:
-    """The camera that a plan names; of a model within the outline of the exact lens's pupil, see `plans._model`."""
+def _held(choice: choices.Choice, probed: Probe, state: str | None, exact: Any) -> Camera:
+    """The camera that a plan names; of a model within the outline of the exact lens's pupil, see `choices._model`."""
     if not choice.camera.endswith(".onnx"):
         return camera_of(choice, probed, state)
     return OnnxCamera(load_model(choice.camera.rpartition(":")[2]), probed.asked.shot, outline=exact.film.outline)
 
 
-def camera_of(choice: plans.Choice, probed: Probed, state: str | None, smooth: bool = False) -> Camera:
+def camera_of(choice: choices.Choice, probed: Probe, state: str | None, smooth: bool = False) -> Camera:
     """The camera that a plan names, as a render makes it; with `smooth`, a warped picture by tables of the field."""
     own = probed.asked.shot
     shot = Shot(own.film_mm, own.focus_m, probed.asked.f_number, wavelength_nm=own.wavelength_nm)
@@ -227,7 +227,7 @@ def camera_of(choice: plans.Choice, probed: Probed, state: str | None, smooth: b
     return Warped(flat, probed.exact, own.focus_m, tables=smooth)
 
 
-def _thin(probed: Probed) -> Camera:
+def _thin(probed: Probe) -> Camera:
     return ideal_as("thin:", probed.exact.lens, Shot(probed.asked.shot.film_mm, probed.asked.shot.focus_m))
 
 
@@ -236,7 +236,7 @@ def _counted(value: Any) -> float:
 
 
 def _decision(
-    target: str, budget: float, best: plans.Choice | None, every: Sequence[plans.Choice], rows: Mapping[str, Any]
+    target: str, budget: float, best: choices.Choice | None, every: Sequence[choices.Choice], rows: Mapping[str, Any]
 ) -> dict[str, Any]:
     """The chosen camera, whether it holds at fresh places, and the cheapest camera that does."""
 
@@ -269,7 +269,7 @@ class Fresh:
 
 
 def _by_renders(
-    case: Case, scene: Scene, probed: Probed, fresh: Fresh, chosen: Sequence[plans.Choice]
+    case: Case, scene: Scene, probed: Probe, fresh: Fresh, chosen: Sequence[choices.Choice]
 ) -> dict[str | None, list[plan_errors.Moved]]:
     """The changes that some cameras make to pieces of the picture."""
     centres = plan_errors.pieces_of(scene, fresh.exact, _PIECE_PX)
@@ -293,7 +293,7 @@ def _seen_in(pieces: Sequence[plan_errors.Moved] | None, budget_px: float) -> di
     return {"pieces": len(sure), "px": _counted([t.px for t in sure]), "noise_px": noise}
 
 
-def _effects(probed: Probed, dense: Probed) -> list[dict[str, Any]]:
+def _effects(probed: Probe, dense: Probe) -> list[dict[str, Any]]:
     """Each effect by the probe and at fresh places."""
     truth = {e.name: e for e in effects_of(dense, 0.0)}
     return [
@@ -366,7 +366,7 @@ def page(rows: Sequence[Mapping[str, Any]]) -> str:
     """The tables."""
     cases = [({"lens": r["lens"], "scene": r["scene"]}, e) for r in rows for e in r["effects"]]
     wrong = [case | effect for case, effect in cases if not effect_holds(effect)]
-    tried, sizes = [len(r["cameras"]) for r in rows] or [0], len({*shot_fits.TERMS, *MORE_TERMS})
+    tried, sizes = [len(r["cameras"]) for r in rows] or [0], len({*choices.TERMS, *MORE_TERMS})
     head = _HEAD.format(cases=len(rows), all=len(CASES), tried=f"{min(tried)} to {max(tried)}", sizes=sizes)
     named = lab.columns(
         ("lens", "lens"), ("scene", "scene"), ("effect", "name"), ("probe", "probe", ".3g"), ("fresh", "fresh", ".3g"),

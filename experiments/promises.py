@@ -22,8 +22,7 @@ from experiments.mitsuba_speed import mpaths_per_s
 from neurolens.base.errors import InputError
 from neurolens.cameras.model import load_model
 from neurolens.render.scene import load_scene
-from neurolens.study.candidates import exact_candidates, model_candidate
-from neurolens.study.speed import Race, race
+from neurolens.study.speed import Race, exact_candidates, model_candidate, race
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.model import Domain
 

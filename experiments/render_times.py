@@ -22,7 +22,7 @@ import torch
 
 from experiments import lab
 from experiments.lab import Report
-from neurolens.analysis.plot_style import INK, drawing
+from neurolens.analysis.plots import INK, drawing
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.base.progress import Progress

@@ -23,9 +23,9 @@ from neurolens.base.progress import Report
 from neurolens.cameras.lenscamera import Runtime
 from neurolens.cameras.model import OnnxCamera, load_model
 from neurolens.plan import footprints as prints
-from neurolens.plan import shot_fits
+from neurolens.plan.candidates import shot_fits
 from neurolens.plan.costs import glsl_operations, ns_a_ray
-from neurolens.plan.probe import COUNTED, LIGHT, Probed, probe
+from neurolens.plan.probe import COUNTED, LIGHT, Probe, probe
 from neurolens.render.scene import load_scene
 from neurolens.study.experiment import near_limit_m
 from neurolens.surrogates.terms import pinned_threads
@@ -87,9 +87,9 @@ def measure_lens(name: str, folder: Path, report: Report) -> dict[str, Any]:
     return {"lens": name, "shots": shots}
 
 
-def _smallest(probed: Probed, shipped: Model, folder: Path) -> Model:
+def _smallest(probed: Probe, shipped: Model, folder: Path) -> Model:
     """The smallest polynomial of the shot with errors no larger than the shipped one's, by halves; else the largest."""
-    fit = shot_fits.shot_fits(probed, folder)
+    fit = shot_fits(probed, folder)
     low, high = 0, len(TERMS) - 1
     best = -1
     while low <= high:
@@ -103,11 +103,11 @@ def _smallest(probed: Probed, shipped: Model, folder: Path) -> Model:
     return _measured(probed, fit(TERMS[best])[0], TERMS[best])
 
 
-def _onnx(probed: Probed, file: Path, runtime: Runtime = "onnxruntime") -> OnnxCamera:
+def _onnx(probed: Probe, file: Path, runtime: Runtime = "onnxruntime") -> OnnxCamera:
     return OnnxCamera(load_model(file), probed.asked.shot, runtime=runtime)
 
 
-def _errors(probed: Probed, camera: OnnxCamera) -> tuple[float, float]:
+def _errors(probed: Probe, camera: OnnxCamera) -> tuple[float, float]:
     """Counted: of place and blur in um on the film, and of light."""
     seen = prints.footprints(camera, probed.places)
     apart = prints.distance_mm(probed.seen, seen, probed.places.share)
@@ -116,7 +116,7 @@ def _errors(probed: Probed, camera: OnnxCamera) -> tuple[float, float]:
     return um, dim
 
 
-def _measured(probed: Probed, file: Path, terms: int) -> Model:
+def _measured(probed: Probe, file: Path, terms: int) -> Model:
     camera = _onnx(probed, file)
     um, light = _errors(probed, camera)
     ns = ns_a_ray(_onnx(probed, file, "c"), probed.places)["min"]

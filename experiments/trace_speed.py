@@ -22,8 +22,7 @@ from neurolens.base.progress import Progress
 from neurolens.base.settings import whole
 from neurolens.lens.prescription import Lens
 from neurolens.setting.pupils import camera_rays
-from neurolens.study.candidates import COMPILED_BATCHES, EAGER_BATCHES
-from neurolens.study.speed import POOL, Call, Candidate, Race, Unavailable, race
+from neurolens.study.speed import COMPILED_BATCHES, EAGER_BATCHES, POOL, Call, Candidate, Race, Unavailable, race
 from neurolens.surrogates.domain import FilmRays
 from neurolens.trace.rays import Rays, compile_tracing, trace
 

@@ -34,7 +34,7 @@ from neurolens.lens.prescription import Lens
 from neurolens.study.describe import lens_files, read_quietly
 from neurolens.study.experiment import DomainChoice, LensChoice
 from neurolens.study.measure import onnx_predictor
-from neurolens.study.vignetting import SEED, false_shares, relative_illumination
+from neurolens.study.rays import SEED, false_shares, relative_illumination
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.model import Domain, LensModel

@@ -16,13 +16,14 @@ from statistics import median_high
 from experiments import lab
 from experiments.lab import Row
 from neurolens import __version__
-from neurolens.analysis.plot_style import FIELD_COLOURS, INK, drawing
+from neurolens.analysis.plots import FIELD_COLOURS, INK, drawing
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Report
 from neurolens.readers.lensfile import read_lens
 from neurolens.study.experiment import near_limit_m, wavelengths_nm
+from neurolens.study.plots import AXIS_LABELS, error_axes, error_line
 from neurolens.study.rays import ray_errors
-from neurolens.study.train_states import AXIS_LABELS, error_axes, error_line, fit_and_measure_states
+from neurolens.study.train import fit_and_measure_states
 from neurolens.surrogates.axes import Axis
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.pairs import PairSettings, make_pairs

@@ -1,6 +1,40 @@
-"""Results of a run with every field that the report shows, in each of which a text may stand."""
+"""Results of a run with every field that the report shows, in each of which a text may stand; a reader of pages."""
 
+from html.parser import HTMLParser
 from typing import Any
+
+_VOID = {"meta", "img", "br", "hr", "link", "input"}
+
+
+class Page(HTMLParser):
+    """Checks that tags nest, and collects tags, text, pictures, links and rows of tables."""
+
+    def __init__(self, source: str) -> None:
+        super().__init__()
+        self.open, self.tags, self.sources, self.links = list[str](), list[str](), list[str](), list[str]()
+        self.rows, self.text = list[dict[str, str | None]](), ""
+        self.feed(source)
+        self.close()
+        assert not self.open, f"never closed: {self.open}"
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        assert not any(name.startswith("on") for name in values), values
+        self.tags.append(tag)
+        self.open += [tag] * (tag not in _VOID)
+        if tag == "img":
+            self.sources.append(values["src"] or "")
+            assert "alt" in values
+        self.links += [str(values["href"])] if tag == "a" else []
+        self.rows += [values] * (tag == "tr" and "tbody" in self.open)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open and self.open[-1] == tag, f"</{tag}> closes {self.open[-1:]}"
+        self.open.pop()
+
+    def handle_data(self, data: str) -> None:
+        if not {"style", "script"} & {*self.open}:
+            self.text += data
 
 
 def full_results(name: str = "Tessar 50 mm") -> dict[str, Any]:

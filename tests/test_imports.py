@@ -43,7 +43,7 @@ PACKAGES = {
     "lens": {"numpy"},
     "trace": {"numpy", "torch"},
     "setting": {"numpy", "torch"},
-    "analysis": {"numpy", "torch", "matplotlib"},
+    "analysis": {"numpy", "scipy", "torch", "matplotlib"},
     "mitsuba": {"numpy"},
     "readers": {"numpy"},
     "cameras": {"numpy", "onnxruntime"},

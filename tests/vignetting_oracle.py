@@ -7,7 +7,7 @@ import torch
 
 from neurolens.base import status as st
 from neurolens.lens.prescription import Lens
-from neurolens.study.vignetting import NEAR_RIM, SEED, ZONES, deciding_rim_ratio, false_shares
+from neurolens.study.rays import NEAR_RIM, SEED, ZONES, deciding_rim_ratio, false_shares
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import trace_pairs
@@ -16,42 +16,33 @@ _BATCH = 65536
 
 
 def vignetting_errors(
-    lens: Lens,
-    domain: Domain,
-    predict: Callable[[FilmRays, float | None], Any],
-    *,
-    stop_radius_mm: float | None = None,
-    count: int = 300_000,
-    seed: int = SEED,
-) -> dict[str, Any]:
-    """False passes and blocks at one stop: false_shares in all, near a rim, and by zone; the share that passes.
+    lens: Lens, domain: Domain, predict: Callable[[FilmRays, float | None], Any], *,
+    stop_radius_mm: float | None = None, count: int = 300_000, seed: int = SEED,
+) -> dict[str, Any]:  # fmt: skip
+    """The false shares over all rays, near a rim, and by zone; and the share that passes.
 
     Args:
-        predict: takes rays and the stop radius in mm, gives what has a status [N], 0 where the ray passes.
+        predict: takes rays and the stop radius in mm, gives a status [N], 0 where the ray passes.
         stop_radius_mm: None takes the domain's, full aperture; a smaller one tests the same fit stopped down.
         seed: of scrambled Sobol points; other than the fit's, so that rays are fresh.
     """
     radius = domain.stop_radius_mm if stop_radius_mm is None else stop_radius_mm
-    stopped = lens.with_stop_radius(radius)
-    passes, model, near, place = [], [], [], []
+    stopped, parts = lens.with_stop_radius(radius), []
     for start in range(0, count, _BATCH):
         rays = sample_domain(domain, min(_BATCH, count - start), seed, start)
         exact = trace_pairs(stopped, rays, domain.pupil_z_mm)
-        passes.append(exact.status == st.PASSED)
-        model.append(predict(rays, radius).status == st.PASSED)
-        near.append((deciding_rim_ratio(stopped, exact) - 1).abs() <= NEAR_RIM)
-        place.append(torch.hypot(rays.film_x, rays.film_y) / domain.film_radius_mm)
-    right, said, close, where = (torch.cat(v) for v in (passes, model, near, place))
-    near_rim = false_shares(right[close], said[close])
-    zones = {}
-    for name, (low, high) in ZONES.items():
-        part = (where >= low) & ((where < high) | (high == 1.0))
-        zones[name] = false_shares(right[part], said[part])
+        near = (deciding_rim_ratio(stopped, exact) - 1).abs() <= NEAR_RIM
+        zone = torch.hypot(rays.film_x, rays.film_y) / domain.film_radius_mm
+        parts.append((exact.status == st.PASSED, predict(rays, radius).status == st.PASSED, near, zone))
+    exact_passes, model_passes, near, zone = (torch.cat(v) for v in zip(*parts, strict=True))
+
+    def shares(part: torch.Tensor) -> dict[str, float | None]:
+        return false_shares(exact_passes[part], model_passes[part])
+
     return {
-        **false_shares(right, said),
-        **{f"{key}_near_rim": value for key, value in near_rim.items()},
+        **false_shares(exact_passes, model_passes),
+        **{f"{key}_near_rim": value for key, value in shares(near).items()},
         "stop_radius_mm": radius,
-        "rays": count,
-        "passing_share": float(right.double().mean()),
-        "zones": zones,
+        "passing_share": float(exact_passes.double().mean()),
+        "zones": {n: shares((zone >= low) & ((zone < high) | (high == 1.0))) for n, (low, high) in ZONES.items()},
     }

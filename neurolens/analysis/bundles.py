@@ -85,8 +85,8 @@ _MARGIN = 0.1  # of the box of the stop's edge in front of the lens, in which li
 class Aim:
     """The mapping from the plane across the chief rays at the front to the stop, for F * W * P rays at once."""
 
-    def __init__(self, scene: Scene, chief: ChiefRays, shape: tuple[int, int, int], waves: tuple[float, ...]) -> None:
-        lens = scene.lens
+    def __init__(self, scene: Scene, chief: ChiefRays, points: int, waves: tuple[float, ...]) -> None:
+        lens, shape = scene.lens, (len(chief.exists), len(waves), points)
         self.front = without_rims(replace(lens, surfaces=lens.surfaces[: lens.stop_index + 1]))
         self.stop_mm = lens.stop_radius_mm
         self.step_mm = _DIFFERENCE * lens.stop_radius_mm
@@ -128,47 +128,41 @@ class Aim:
 
     def at(self, pattern: Pattern) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """u, v of the rays through the points of a pattern, whether they were found, and d(beam) / d(stop share)."""
-        goal_t, goal_s = (g.expand(self.shape).reshape(-1) for g in (-pattern.tangential, pattern.sagittal))
-        zero = torch.zeros_like(goal_t)
-        everything = torch.arange(len(zero))
-        u, v = self._newton(zero, zero, goal_t, goal_s, everything, _DIRECT)
-        error, stretch = self._error(u, v, goal_t, goal_s, everything)
+        goal = torch.stack([-pattern.tangential, pattern.sagittal])[:, None, None].expand(2, *self.shape).flatten(1)
+        everything = torch.arange(goal.shape[1])
+        uv = self._newton(torch.zeros_like(goal), goal, everything, _DIRECT)
+        error, stretch = self._error(uv, goal, everything)
         lost = torch.nonzero(~(error < _AIMED) & self.exists)[:, 0]
         if len(lost):
-            walk_u, walk_v = torch.zeros_like(goal_t[lost]), torch.zeros_like(goal_t[lost])
+            walk, far = torch.zeros_like(goal[:, lost]), goal[:, lost]
             for stride in range(1, _STRIDES + 1):
-                share = stride / _STRIDES
-                walk_u, walk_v = self._newton(
-                    walk_u, walk_v, share * goal_t[lost], share * goal_s[lost], lost, _PER_STRIDE
-                )
-            u, v = u.index_copy(0, lost, walk_u), v.index_copy(0, lost, walk_v)
-            again, stretch_again = self._error(walk_u, walk_v, goal_t[lost], goal_s[lost], lost)
+                walk = self._newton(walk, stride / _STRIDES * far, lost, _PER_STRIDE)
+            uv = uv.index_copy(1, lost, walk)
+            again, stretch_again = self._error(walk, far, lost)
             error, stretch = error.index_copy(0, lost, again), stretch.index_copy(0, lost, stretch_again)
         aimed = (error < _AIMED) & self.exists
-        return torch.where(aimed, u, 0.0), torch.where(aimed, v, 0.0), aimed, stretch
+        u, v = torch.where(aimed, uv, 0.0)
+        return u, v, aimed, stretch
 
-    def _newton(
-        self, u: Tensor, v: Tensor, goal_t: Tensor, goal_s: Tensor, rows: Tensor, steps: int
-    ) -> tuple[Tensor, Tensor]:
-        """Newton's steps from (u, v); a step that leaves the lens is halved and tried again."""
-        good_u, good_v = u, v
+    def _newton(self, uv: Tensor, goal: Tensor, rows: Tensor, steps: int) -> Tensor:
+        """Newton's steps from places [2, N]; a step that leaves the lens is halved and tried again."""
+        good = uv
         for _ in range(steps):
-            t, s, exists, (tu, tv, su, sv) = self._map(u, v, rows)
-            exists = exists & torch.isfinite(t + s)
-            good_u, good_v = torch.where(exists, u, good_u), torch.where(exists, v, good_v)
+            stop, exists, (tu, tv, su, sv) = self._map(uv, rows)
+            exists = exists & torch.isfinite(stop.sum(0))
+            good = torch.where(exists, uv, good)
             det = tu * sv - tv * su
             det = torch.where(det == 0, 1.0, det)
-            et, es = goal_t - t, goal_s - s
-            next_u, next_v = u + (sv * et - tv * es) / det, v + (tu * es - su * et) / det
-            u = torch.where(exists, next_u, (u + good_u) / 2)
-            v = torch.where(exists, next_v, (v + good_v) / 2)
-        return u, v
+            et, es = goal - stop
+            step = torch.stack([sv * et - tv * es, tu * es - su * et]) / det
+            uv = torch.where(exists, uv + step, (uv + good) / 2)
+        return uv
 
-    def _error(self, u: Tensor, v: Tensor, goal_t: Tensor, goal_s: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+    def _error(self, uv: Tensor, goal: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Distance from the goal in stop radii (inf for rays that do not exist), and beam area per stop share."""
-        t, s, exists, (tu, tv, su, sv) = self._map(u, v, rows)
-        error = torch.where(exists, torch.hypot(t - goal_t, s - goal_s), math.inf)
-        return error, math.pi / (tu * sv - tv * su).abs() * self.spread(u, v, rows)
+        stop, exists, (tu, tv, su, sv) = self._map(uv, rows)
+        error = torch.where(exists, torch.hypot(*(stop - goal)), math.inf)
+        return error, math.pi / (tu * sv - tv * su).abs() * self.spread(uv[0], uv[1], rows)
 
     def spread(self, u: Tensor, v: Tensor, rows: Tensor | slice = slice(None)) -> Tensor | float:
         """Energy of an area on the plane across the chief rays: 1, or of a near object the solid angle, 1/mm^2."""
@@ -178,20 +172,19 @@ class Aim:
         distance2 = _distance2(self.chief[:3], self.origin)[rows]
         return torch.sqrt(distance2) / (distance2 + u * u + v * v) ** 1.5
 
-    def _map(self, u: Tensor, v: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, tuple[Tensor, ...]]:
-        """Stop coordinates (tangential, sagittal; in radii) of rays, whether they exist, and their derivatives."""
-        h, n = self.step_mm, len(u)
+    def _map(self, uv: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+        """Stop coordinates [2, N] (tangential, sagittal; in radii), whether rays exist, and the derivatives."""
+        (u, v), h = uv, self.step_mm
         three = rows.repeat(3)
         rays = self.rays(torch.cat([u, u + h, u]), torch.cat([v, v, v + h]), three)
         with torch.no_grad():
             out = trace(self.front, rays, self.wavelength[three], towards="film")
         # The stop is the last surface of this lens: rays end on it.
-        x, y = out.rays.x / self.stop_mm, out.rays.y / self.stop_mm
+        x, y = (c.reshape(3, -1) / self.stop_mm for c in out.rays[:2])
         t, s = (x, y) if self.along_x else (y, x)
-        exists = (out.status == 0).reshape(3, n).all(0)
-        t, s = t.reshape(3, n), s.reshape(3, n)
+        exists = (out.status == 0).reshape(3, -1).all(0)
         slopes = ((t[1] - t[0]) / h, (t[2] - t[0]) / h, (s[1] - s[0]) / h, (s[2] - s[0]) / h)
-        return t[0], s[0], exists, slopes
+        return torch.stack([t[0], s[0]]), exists, slopes
 
 
 def _distance2(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
@@ -209,10 +202,9 @@ class Bundle:
         start: before the front surface, travelling to the film.
         film: on the film plane.
         tangential_mm, sagittal_mm: film points relative to the chief ray of the first wavelength.
-        pattern: None where the rays are nodes of `Filled`.
         status: of the trace with all rims and the stop; rays that could not be aimed count as missing surface 0.
         weight: energy of each ray: beam area in mm^2 (distant object) or solid angle in sr; 0 where it is blocked.
-        open_weight: the same without the rims.
+        open_weight: the same for all rays through the stop, whatever stops them; of `Filled` without those at rims.
         path_mm: optical path from the wavefront (or object point) to the film.
         chief_height_mm: [F], image height of the chief ray of the first wavelength, positive.
     """
@@ -220,7 +212,6 @@ class Bundle:
     scene: Scene
     field_deg: tuple[float, ...]
     wavelength_nm: tuple[float, ...]
-    pattern: Pattern | None
     start: Rays
     film: Rays
     tangential_mm: Tensor
@@ -233,13 +224,18 @@ class Bundle:
 
     @property
     def passed(self) -> Tensor:
+        """Whether each ray reaches the film."""
         return self.status == 0
 
     @property
     def slopes(self) -> tuple[Tensor, Tensor]:
         """Tangential and sagittal slope (mm per mm along +z) of the rays at the film, [F, W, P]."""
-        x, y = self.film.dx / self.film.dz, self.film.dy / self.film.dz
-        return (-x, y) if self.scene.axis == "x" else (-y, x)
+        return self.scene.image_axes(self.film.dx / self.film.dz, self.film.dy / self.film.dz)
+
+    @property
+    def cosines(self) -> tuple[Tensor, Tensor]:
+        """Tangential and sagittal direction cosine of the rays at the film, [F, W, P]."""
+        return self.scene.image_axes(self.film.dx, self.film.dy)
 
     def at_shift(self, shift_mm: float) -> tuple[Tensor, Tensor]:
         """Tangential and sagittal points with the film moved by `shift_mm` away from the lens, [F, W, P]."""
@@ -248,11 +244,9 @@ class Bundle:
 
 
 def bundle(
-    scene: Scene,
-    field_deg: Sequence[float] | None,
-    wavelength_nm: Sequence[float] | None = None,
+    scene: Scene, field_deg: Sequence[float] | None, wavelength_nm: Sequence[float] | None = None,
     pattern: Pattern | None = None,
-) -> Bundle:
+) -> Bundle:  # fmt: skip
     """Aim and trace rays of several fields and wavelengths through the points of a pupil pattern.
 
     Args:
@@ -264,12 +258,14 @@ def bundle(
     """
     pattern = pattern or hexapolar(8)
     fields, waves, chief = _chief(scene, field_deg, wavelength_nm)
-    shape = (len(fields), len(waves), len(pattern.weight))
-    aim = Aim(scene, chief, shape, waves)
+    aim = Aim(scene, chief, len(pattern.weight), waves)
     u, v, aimed, stretch = aim.at(pattern)
-    area = pattern.weight.expand(shape).reshape(-1) * stretch
-    area = torch.where(aimed & _inside_stop(scene, pattern).expand(shape).reshape(-1), area, 0.0)
-    return _traced(scene, fields, chief, aim, (u, v), aimed, area, pattern)
+    area = pattern.weight
+    if scene.lens.aperture is not None:  # blades or a mask
+        x, y = (-pattern.tangential, pattern.sagittal)[:: 1 if scene.axis == "x" else -1]
+        area = torch.where(scene.lens.aperture.inside(x, y, 1.0), area, 0.0)
+    area = torch.where(aimed, area.expand(aim.shape).reshape(-1) * stretch, 0.0)
+    return _traced(scene, fields, chief, aim, (u, v), aimed, area)
 
 
 class Filled:
@@ -279,13 +275,10 @@ class Filled:
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        field_deg: Sequence[float] | None = None,
-        wavelength_nm: Sequence[float] | None = None,
+        self, scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: Sequence[float] | None = None,
         to_stop: bool = False,
-    ) -> None:
-        """Find the light; arguments as of `bundle`. `to_stop`: all light that enters the stop, whatever rims take."""
+    ) -> None:  # fmt: skip
+        """Find the light; arguments as for `bundle`. `to_stop`: all light that enters the stop, whatever rims take."""
         self.scene = scene
         self.lens = scene.to_stop if to_stop else scene.traced
         self.fields, self.waves, self.chief = _chief(scene, field_deg, wavelength_nm)
@@ -301,36 +294,30 @@ class Filled:
 
     def only(self, fields: list[int]) -> Filled:
         """The same for some of the fields, by their numbers."""
-        found, waves = copy(self), len(self.waves)
+        some = copy(self)
         start, exists, height, film = self.chief
-        found.chief = ChiefRays(
-            Rays(*(c[fields] for c in start)), exists[fields], height[fields], Rays(*(c[fields] for c in film))
-        )
-        found.fields = tuple(self.fields[k] for k in fields)
-        found.part = LitPart(*(c.reshape(-1, waves)[fields].reshape(-1) for c in self.part))
-        return found
+        rays = (Rays(*(c[fields] for c in r)) for r in (start, film))
+        some.chief = ChiefRays(next(rays), exists[fields], height[fields], next(rays))
+        some.fields = tuple(self.fields[k] for k in fields)
+        some.part = LitPart(*(c.reshape(-1, len(self.waves))[fields].reshape(-1) for c in self.part))
+        return some
 
     def bundle(self, level: int, path: bool = False) -> Bundle:
-        """The bundle of a level of `lit_nodes`; its weights hold no light that rims take, nor does `open_weight`.
-
-        Without `path` the optical paths are NaN: they take half of the time.
-        """
+        """The bundle of a level of `lit_nodes`. Without `path` the optical paths, half of the time, are NaN."""
         nodes = lit_nodes(self._passes, self.part, level)
         aim = self._aim(nodes.u.shape[1])
         u, v, area = (c.reshape(-1) for c in nodes)
-        return _traced(
-            self.scene, self.fields, self.chief, aim, (u, v), aim.exists, area * aim.spread(u, v), None, path
-        )
+        return _traced(self.scene, self.fields, self.chief, aim, (u, v), aim.exists, area * aim.spread(u, v), path)
 
     def energy(self, level: int) -> Tensor:
-        """Energy [F] of all wavelengths; units as of `Bundle.weight`."""
+        """Energy [F] of all wavelengths, in the units of `Bundle.weight`."""
         nodes = lit_nodes(self._passes, self.part, level)
         u, v = (c.reshape(-1) for c in nodes[:2])
         weight = nodes.area * self._passes(*nodes[:2])
         return (weight.reshape(-1) * self._aim(nodes.u.shape[1]).spread(u, v)).reshape(len(self.fields), -1).sum(1)
 
     def _aim(self, count: int) -> Aim:
-        return Aim(self.scene, self.chief, (len(self.fields), len(self.waves), count), self.waves)
+        return Aim(self.scene, self.chief, count, self.waves)
 
     def _passes(self, u: Tensor, v: Tensor) -> Tensor:
         aim = self._aim(u.shape[1])
@@ -350,71 +337,47 @@ def _chief(
 
 def _traced(
     scene: Scene, fields: tuple[float, ...], chief: ChiefRays, aim: Aim, at: tuple[Tensor, Tensor], aimed: Tensor,
-    area: Tensor, pattern: Pattern | None, path: bool = True,
+    area: Tensor, path: bool = True,
 ) -> Bundle:  # fmt: skip
     """Trace the rays at places (u, v) of an aim to the film."""
-    start, shape = aim.rays(*at), aim.shape
-    film, status, length = _to_film(scene, start, aim.wavelength, path)
-    status = torch.where(aimed, status, st.blocked(0, st.MISSED))
-    passed = status == 0
-    x, y = (c.reshape(shape) for c in (film.x, film.y))
-    x, y = x - chief.film.x[:, None, None], y - chief.film.y[:, None, None]
-    t, s = (-x, y) if scene.axis == "x" else (-y, x)
+    start = aim.rays(*at)
+    with torch.no_grad():
+        out = trace(scene.traced, start, aim.wavelength, towards="film", path=path)
+    film, status = on_plane(out.rays, scene.film_z_mm), torch.where(aimed, out.status, st.blocked(0, st.MISSED))
+    length = _path_mm(scene, [start, *out.path, film], aim.wavelength) if path else math.nan
 
-    def shaped(value: Tensor, keep: Tensor = passed, other: float = math.nan) -> Tensor:
-        return torch.where(keep, value, other).reshape(shape)
+    def shaped(value: Tensor, blocked: float = math.nan) -> Tensor:
+        return torch.where(status == 0, value, blocked).reshape(aim.shape)
 
+    rays = Rays(*(shaped(c) for c in film))
+    t, s = scene.image_axes(*(c - middle[:, None, None] for c, middle in zip(rays[:2], chief.film[:2], strict=True)))
     return Bundle(
-        scene, fields, aim.waves, pattern,
-        Rays(*(c.reshape(shape) for c in start)),
-        Rays(*(shaped(c) for c in film)),
-        shaped(t.reshape(-1)), shaped(s.reshape(-1)),
-        status.reshape(shape), shaped(area, other=0.0), area.reshape(shape),
-        shaped(aim.lead_mm(*at) + length), chief.height_mm,
+        scene, fields, aim.waves, Rays(*(c.reshape(aim.shape) for c in start)), rays, t, s, status.reshape(aim.shape),
+        shaped(area, blocked=0.0), area.reshape(aim.shape), shaped(aim.lead_mm(*at) + length), chief.height_mm,
     )  # fmt: skip
 
 
+def _path_mm(scene: Scene, points: Sequence[Rays], wavelength_nm: Tensor) -> Tensor:
+    """Optical path along the points of rays on the surfaces."""
+    path = torch.zeros_like(points[0].x)
+    for medium, before, after in zip(media(scene.traced, wavelength_nm), points, points[1:], strict=False):
+        # Along the ray, not the distance: steps back to the stop inside an element count as negative.
+        path = path + medium.n * sum((b - a) * d for a, b, d in zip(before[:3], after[:3], before[3:], strict=True))
+    return path
+
+
 def check_light(scene: Scene, field_deg: Sequence[float] | None, wavelength_nm: float) -> list[str]:
-    """A warning of each of the default fields (None) from which no ray reaches the film.
+    """A warning for each of the default fields (None) from which no ray reaches the film.
 
     Raises:
         InputError: a requested field from which no ray reaches the film, or a lens that passes no ray.
     """
     fields = scene.default_fields() if field_deg is None else field_deg
-    seen = (Filled(scene, [0.0, *fields], [wavelength_nm]).part.reach > 0).tolist()
-    if not any(seen):
+    axis_lit, *lit = (Filled(scene, [0.0, *fields], [wavelength_nm]).part.reach > 0).tolist()
+    if not (axis_lit or any(lit)):
         raise InputError(scene.lens.path, "surfaces", "(no ray reaches the film)", "a lens that passes light")
-    dark = [field for field, lit in zip(field_deg or (), seen[1:], strict=False) if not lit]
-    if dark:
+    dark = [field for field, light in zip(fields, lit, strict=True) if not light]
+    if dark and field_deg is not None:
         edge = f"at most {scene.edge.field_deg:.4g} degrees, the edge of the image"
         raise InputError(scene.lens.path, f"field {dark[0]:g}", "(no light reaches the film)", edge)
-    lit = zip(fields, seen[1:], strict=True)
-    return [f"rims leave no light of the field of {field:.4g} degrees" for field, light in lit if not light]
-
-
-def _to_film(scene: Scene, start: Rays, wavelength_nm: Tensor, wanted: bool) -> tuple[Rays, Tensor, Tensor | float]:
-    """Rays on the film, their status, and the optical path from their start to the film, NaN if that is not wanted."""
-    lens = scene.traced
-    with torch.no_grad():
-        out = trace(lens, start, wavelength_nm, towards="film", path=wanted)
-    film = on_plane(out.rays, scene.film_z_mm)
-    if not wanted:
-        return film, out.status, math.nan
-    path = torch.zeros_like(start.x)
-    indices = [m.n for m in media(lens, wavelength_nm)]
-    points: list[Rays] = [start, *out.path, film]
-    for n, before, after in zip(indices, points, points[1:], strict=False):
-        # Along the ray, not the distance: steps back to the stop inside an element count as negative.
-        gap = sum((b - a) * d for a, b, d in zip(before[:3], after[:3], before[3:], strict=True))
-        path = path + n * gap
-    return film, out.status, path
-
-
-def _inside_stop(scene: Scene, pattern: Pattern) -> Tensor:
-    """Whether the points of a pattern lie inside the blades or the mask of the stop, [P]."""
-    t, s = pattern.tangential, pattern.sagittal
-    if scene.lens.aperture is None:
-        return torch.ones_like(t, dtype=torch.bool)
-    x, y = (-t, s) if scene.axis == "x" else (s, -t)
-    opened: Tensor = scene.lens.aperture.inside(x, y, 1.0)
-    return opened
+    return [f"rims leave no light of the field of {field:.4g} degrees" for field in dark]

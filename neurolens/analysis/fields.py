@@ -98,7 +98,7 @@ class FieldEdge(Result):
 
     @property
     def warning(self) -> str | None:
-        """What to say of an edge that was not reached."""
+        """A sentence on an edge that was not reached."""
         where = f"{self.field_deg:.4g} degrees, {self.height_mm:.4g} mm"
         return None if self.reached else f"no chief ray comes from {self.meant}; fields end at {where}"
 
@@ -122,6 +122,7 @@ class Scene:
 
     @property
     def film_z_mm(self) -> float:
+        """z of the film."""
         return float(self.lens.film_z_mm if self.lens.film_z_mm is not None else self.lens.vertices_mm[-1])
 
     @property
@@ -138,6 +139,10 @@ class Scene:
         """Radius of the lit film."""
         return _image_radius_mm(self.lens)
 
+    def image_axes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Tangential component, positive towards the image, and sagittal component of x and y on the film."""
+        return (-x, y) if self.axis == "x" else (-y, x)
+
     @property
     def object_z_mm(self) -> float:
         """z of the object on the axis, mm; -inf for a distant one."""
@@ -147,19 +152,17 @@ class Scene:
         """Chief rays of fields in degrees, 0 to below 180, at one wavelength, that of reference where none is given."""
         nm = self.lens.reference_nm if wavelength_nm is None else wavelength_nm
         angles = torch.deg2rad(torch.as_tensor(field_deg, dtype=torch.float64).reshape(-1))
-        found = aim_at_stop(
-            self.lens, angles, torch.zeros(len(angles), 1, dtype=torch.float64), axis=self.axis,
-            wavelength_nm=nm,
-        )  # fmt: skip
+        middle = torch.zeros(len(angles), 1, dtype=torch.float64)
+        aimed = aim_at_stop(self.lens, angles, middle, axis=self.axis, wavelength_nm=nm)
         with torch.no_grad():
-            out = trace(without_rims(self.lens), found.rays, nm, towards="film")
-        exists = found.reached[:, 0] & (out.status == 0)
+            out = trace(without_rims(self.lens), aimed.rays, nm, towards="film")
+        exists = aimed.reached[:, 0] & (out.status == 0)
         film = on_plane(out.rays, self.film_z_mm)
-        height = -(film.x if self.axis == "x" else film.y)
-        return ChiefRays(found.rays, exists, torch.where(exists, height, math.nan), film)
+        height, _ = self.image_axes(film.x, film.y)
+        return ChiefRays(aimed.rays, exists, torch.where(exists, height, math.nan), film)
 
     def object_points(self, chief: Rays) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Where the chief rays leave the object, [F] each, mm; None for a distant object."""
+        """The points of the object that the chief rays leave, [F] each, mm; None for a distant object."""
         if math.isinf(self.focus_m):
             return None
         if self.wide:
@@ -188,8 +191,7 @@ class Scene:
 
     def default_fields(self) -> tuple[float, ...]:
         """The axis, 50%, 70%, 85% and the edge of the field, degrees."""
-        edge = self.edge.field_deg
-        return tuple(f * edge for f in _FRACTIONS)
+        return tuple(share * self.edge.field_deg for share in _FRACTIONS)
 
     def fields_at(self, height_mm: Sequence[float]) -> list[float]:
         """Fields in degrees whose chief rays meet the film at these heights; NaN for one that none reaches."""
@@ -246,12 +248,6 @@ class Scene:
         if is_pinhole(self.lens):
             raise InputError(self.lens.path, "surfaces", "(a pinhole)", "a lens with power")
 
-    def check(self) -> None:
-        """Raise InputError for a lens that forms no image on a film."""
-        focal = self.first_order.efl_mm
-        if focal <= 0:
-            raise InputError(self.lens.path, "efl_mm", f"{focal:.4g}", "a lens that forms an image (EFL above 0)")
-
 
 def on_plane(rays: Rays, z_mm: float) -> Rays:
     """Rays moved along themselves to the plane at z."""
@@ -266,17 +262,13 @@ def _image_radius_mm(lens: Lens) -> float:
 
 @lru_cache(maxsize=16)
 def _edge(scene: Scene) -> FieldEdge:
-    scene.check()
-    lens, stated = scene.lens, scene.lens.half_field_deg
-    by_field = False
-    if lens.image_radius_mm is None and stated is not None:
-        by_field, wanted = True, stated
-        meant = f"the stated half field, {stated:.4g} degrees"
-    else:
-        wanted = scene.image_radius_mm
-        meant = f"the edge of the film, {wanted:.4g} mm"
-        if lens.image_radius_mm is None:
-            meant = f"the edge of the lit film (10% of the light), {wanted:.4g} mm"
+    lens, stated, focal = scene.lens, scene.lens.half_field_deg, scene.first_order.efl_mm
+    if focal <= 0:
+        raise InputError(lens.path, "efl_mm", f"{focal:.4g}", "a lens that forms an image (EFL above 0)")
+    by_field = lens.image_radius_mm is None and stated is not None
+    wanted = float(stated) if by_field and stated is not None else scene.image_radius_mm
+    film = "film" if lens.image_radius_mm is not None else "lit film (10% of the light)"
+    meant = f"the stated half field, {wanted:.4g} degrees" if by_field else f"the edge of the {film}, {wanted:.4g} mm"
     (field,), (reached,) = scene.nearest_fields([wanted], degrees=by_field)
     if not field > 0:
         raise InputError(lens.path, "half_field_deg", stated, "a lens with chief rays off the axis")

@@ -13,7 +13,7 @@ import torch
 
 from neurolens.analysis.bundles import Pattern, bundle, fan
 from neurolens.analysis.fields import Array, Result, Scene
-from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, heading, new_figure, save, style
+from neurolens.analysis.plots import FAINT, FIELD_COLOURS, INK, drawing
 from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Surface
 from neurolens.trace.rays import trace
@@ -163,18 +163,42 @@ def _fan_lines(scene: Scene, field: float) -> list[Array]:
 
 def lens_layout(layout: Layout, path: str | Path) -> None:
     """Draw a lens with rays, light from left to right, as PNG, PDF or SVG."""
-    with style():
-        z, top = _limits(layout)
-        figure = new_figure(9.4, min(9.0, max(3.9, 8.6 * 2 * top / (z[1] - z[0]) + 2.1)))
+    z, top = _limits(layout)
+    height_in = min(9.0, max(3.9, 8.6 * 2 * top / (z[1] - z[0]) + 2.1))
+    with drawing(path, 9.4, height_in, layout.title, layout.subtitle) as figure:
         axes = figure.add_subplot()
         axes.set(xlabel="z (mm), light travels this way →", ylabel=f"{layout.height} (mm)")
         draw_section(axes, layout, lw=0.7, ls=(0, (12, 3, 2, 3)))
-        heading(figure, layout.title, layout.subtitle)
-        handles, labels = axes.get_legend_handles_labels()
-        order = sorted(range(len(labels)), key=lambda i: labels[i] in ("stop", "film"))  # fields first
-        handles, labels = [handles[i] for i in order], [labels[i] for i in order]
+        entries = sorted(zip(*axes.get_legend_handles_labels(), strict=True), key=lambda e: e[1] in ("stop", "film"))
+        handles, labels = zip(*entries, strict=True)  # fields first
         figure.legend(handles, labels, loc="outside lower center", ncols=min(7, len(labels)))
-        save(figure, path)
+
+
+_SHEET_COLUMNS, _CELL_IN = 6, (2.6, 2.0)  # width and height of one section with its title
+
+
+def sheet(layouts: Sequence[Layout], path: str | Path) -> None:
+    """Draw lenses in section, light from left to right, each as large as its cell allows, axes of equal scale.
+
+    Args:
+        path: PNG, PDF or SVG to write.
+    Raises:
+        InputError: no lens at all.
+    """
+    if not layouts:
+        raise InputError("lens sheet", "layouts", "(none)", "at least one lens")
+    columns = min(_SHEET_COLUMNS, len(layouts))
+    rows = math.ceil(len(layouts) / columns)
+    with drawing(path, _CELL_IN[0] * columns, _CELL_IN[1] * rows) as figure:
+        for k, layout in enumerate(layouts):
+            axes = figure.add_subplot(rows, columns, k + 1)
+            axes.axis("off")
+            draw_section(axes, layout, lw=0.4)
+            for line in axes.lines:
+                line.set_linewidth(0.6 * line.get_linewidth())
+            for patch in axes.patches:
+                patch.set_linewidth(0.5)
+            axes.set_title(f"{layout.title}\n{layout.subtitle}", fontsize=6, loc="left")
 
 
 def draw_section(axes: Any, layout: Layout, **axis: Any) -> None:
@@ -186,11 +210,11 @@ def draw_section(axes: Any, layout: Layout, **axis: Any) -> None:
     _draw_rims(axes, layout.surfaces)
     film, half = layout.film_z_mm, layout.film_half_height_mm
     axes.plot((film, film), (-half, half), color="#8b1a1a", lw=2.2, solid_capstyle="butt", zorder=5, label="film")
-    named: set[str] = set()
+    unnamed = {ray.label for ray in layout.rays}
     for ray in layout.rays:
         colour = FIELD_COLOURS[ray.field % len(FIELD_COLOURS)]
-        label = None if ray.label in named else ray.label  # one entry of the legend for the rays of a field
-        named.add(ray.label)
+        label = ray.label if ray.label in unnamed else None  # one entry of the legend for the rays of a field
+        unnamed.discard(ray.label)
         axes.plot(*ray.points.T, color=colour, lw=0.85, alpha=0.85, zorder=3.5, label=label)
 
 

@@ -1,18 +1,114 @@
-"""Plots of the analyses: one function each. All but the Seidel sums are curves, or one panel per field."""
+"""Plots: the style that all plots of the package share, and one function for each analysis of a lens."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neurolens.analysis.field_curves import Colour, Curvature, Distortion, Illumination
-from neurolens.analysis.plot_style import FAINT, FIELD_COLOURS, INK, drawing, field_name, wavelength_colour
-from neurolens.analysis.seidel import Seidel
-from neurolens.analysis.spots import Fans, Mtf, Spots
-from neurolens.analysis.wavefront import Psf
+from neurolens.base.errors import NeurolensError
+from neurolens.base.files import atomic_path
+
+if TYPE_CHECKING:
+    from neurolens.analysis.field_curves import Colour, Curvature, Distortion, Illumination, Seidel
+    from neurolens.analysis.spots import Fans, Mtf, Psf, Spots
+
+# Okabe and Ito's colours, distinguishable by colour-blind readers.
+FIELD_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9", "#7f7f7f")
+INK, FAINT = "#1b1f24", "#8a929b"
+_GREY = "#7f7f7f"
+_STYLE: Any = {
+    "font.family": "DejaVu Sans", "font.size": 9.5, "axes.titlesize": 11, "axes.labelsize": 10.5,
+    "axes.edgecolor": "#4a5058", "axes.labelcolor": INK, "axes.spines.top": False, "axes.spines.right": False,
+    "axes.axisbelow": True, "grid.color": "#e3e6ea", "grid.linewidth": 0.7, "legend.frameon": False,
+    "legend.fontsize": 8.8, "text.color": INK, "xtick.color": "#33383f", "ytick.color": "#33383f",
+    "figure.dpi": 150, "savefig.dpi": 150, "text.parse_math": False,  # no mathtext in names with dollar signs
+}  # fmt: skip
+
+
+def style() -> Any:
+    """A context in which a figure is built and written: the user's own settings are neither used nor changed."""
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise NeurolensError(
+            "plots need matplotlib: pip install 'neurolens[train]', or '.[train]' in a checkout"
+        ) from error
+    return matplotlib.rc_context(_STYLE)
+
+
+def new_figure(width_in: float, height_in: float) -> Any:
+    """A matplotlib Figure on an Agg canvas: no pyplot, no window, nothing left open."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_in, height_in), facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+@contextmanager
+def drawing(path: str | Path, width_in: float, height_in: float, title: str = "", subtitle: str = "") -> Iterator[Any]:
+    """A figure in the common style, written to `path` (PNG, PDF or SVG, by its suffix) at the end of the block.
+
+    A title stands at its top left, with the subtitle in a lighter colour below it.
+    """
+    with style():
+        figure = new_figure(width_in, height_in)
+        if title:
+            room = "\n\n" + "\n" * subtitle.count("\n") if subtitle else ""  # the layout keeps these lines free
+            figure.suptitle(title + room, x=0.01, ha="left", fontsize=12, fontweight="bold")
+            figure.text(0.01, 1 - 0.36 / height_in, subtitle, ha="left", va="top", fontsize=9, color="#555b63")
+        yield figure
+        with atomic_path(path) as temporary:
+            figure.savefig(temporary, facecolor="white")
+
+
+def plain_log_ticks(*axes: Any) -> None:
+    """Label logarithmic axes 0.1, 1, 10 rather than by powers, with 2 and 5 between where that leaves few ticks."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    for axis in axes:
+        low, high = sorted(axis.get_view_interval())
+        subs = (1.0,) if high / max(low, 1e-300) > 400 else (1.0, 2.0, 5.0)
+        axis.set_major_locator(LogLocator(base=10, subs=subs, numticks=15))
+        axis.set_minor_locator(LogLocator(base=10, subs=tuple(range(2, 10)), numticks=60))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.6g}" if value < 1e4 else f"{value:.0e}"))
+        axis.set_minor_formatter(NullFormatter())
+
+
+def _wavelength_colour(wavelength_nm: float) -> str:
+    """A colour similar to that of the wavelength, legible on white."""
+    limits = ((450, "#7b4fa3"), (505, "#0072b2"), (600, "#009e73"), (1e9, "#d55e00"))
+    return next(colour for limit, colour in limits if wavelength_nm < limit)
+
+
+def _field_name(field_deg: float) -> str:
+    return "axis" if field_deg == 0 else f"{field_deg:.1f}°"
+
+
+def _wavelengths(wavelength_nm: Iterable[float]) -> str:
+    return ", ".join(f"{nm:.0f}" for nm in wavelength_nm) + " nm"
+
+
+@contextmanager
+def _curves(
+    path: str | Path, size: tuple[float, float], title: str, subtitle: str, labels: dict[str, Any], columns: int = 0
+) -> Iterator[Any]:
+    """Axes with a grid for curves, the legend inside them or, in some columns, below; `labels` go to `axes.set`."""
+    with drawing(path, *size, title, subtitle) as figure:
+        axes = figure.add_subplot()
+        axes.grid(True)
+        axes.set(**labels)
+        yield axes
+        if columns:
+            figure.legend(loc="outside lower center", ncols=columns)
+        else:
+            axes.legend()
 
 
 def plot_colour(data: Colour, path: str | Path, title: str, subtitle: str) -> None:
@@ -25,7 +121,7 @@ def plot_colour(data: Colour, path: str | Path, title: str, subtitle: str) -> No
         left.axhline(0, color=FAINT, lw=0.7)
         left.set(xlabel="wavelength (nm)", ylabel="focus from the film (mm)", title="longitudinal, on the axis")
         for k, nm in enumerate(data.line_nm):
-            right.plot(data.field_deg, data.lateral_um[:, k], color=wavelength_colour(nm), label=f"{nm:.0f} nm")
+            right.plot(data.field_deg, data.lateral_um[:, k], color=_wavelength_colour(nm), label=f"{nm:.0f} nm")
         right.set(xlabel="field (degrees)", ylabel=f"height from that at {data.line_nm[0]:.0f} nm (µm)")
         right.set_title("lateral, chief rays")
         if (np.nan_to_num(np.abs(data.lateral_um)) < 1e-3).all():
@@ -38,87 +134,74 @@ def plot_colour(data: Colour, path: str | Path, title: str, subtitle: str) -> No
 def plot_curvature(data: Curvature, path: str | Path, title: str, subtitle: str) -> None:
     """Sagittal, tangential and Petzval foci (across) against image height (up), as lens catalogues draw them."""
     text = f"Field curvature and astigmatism, {data.wavelength_nm:.0f} nm\n{subtitle}"
-    with drawing(path, 6.4, 5.2, title, text) as figure:
-        axes = figure.add_subplot()
+    labels = {"xlabel": "focus from the film, away from the lens (mm)", "ylabel": "image height (mm)"}
+    with _curves(path, (6.4, 5.2), title, text, labels) as axes:
         axes.plot(data.sagittal_mm, data.height_mm, color=FIELD_COLOURS[0], label="sagittal")
         axes.plot(data.tangential_mm, data.height_mm, color=FIELD_COLOURS[3], label="tangential")
         if np.isfinite(data.petzval_mm).all():
-            axes.plot(data.petzval_mm, data.height_mm, color="#7f7f7f", ls="--", label="Petzval (third order)")
+            axes.plot(data.petzval_mm, data.height_mm, color=_GREY, ls="--", label="Petzval (third order)")
         axes.axvline(0, color=FAINT, lw=0.7)
-        axes.grid(True)
-        axes.set(xlabel="focus from the film, away from the lens (mm)", ylabel="image height (mm)")
-        _degrees(axes, data.height_mm, data.field_deg)
-        axes.legend()
+        _degrees(axes, data)
 
 
 def plot_distortion(data: Distortion, path: str | Path, title: str, subtitle: str) -> None:
     """Distortion against the closest projections, the reference drawn thick."""
-    with drawing(path, 7.4, 4.8, title, f"Distortion, {data.wavelength_nm:.0f} nm; {subtitle}") as figure:
-        axes = figure.add_subplot()
-        limit = max(2.0, 1.25 * float(np.nan_to_num(np.abs(data.error_percent[data.reference])).max()))
+    limit = max(2.0, 1.25 * float(np.nan_to_num(np.abs(data.error_percent[data.reference])).max()))
+    text = f"Distortion, {data.wavelength_nm:.0f} nm; {subtitle}"
+    labels = {"xlabel": "field (degrees)", "ylabel": "distortion (%)", "ylim": (-limit, limit)}
+    with _curves(path, (7.4, 4.8), title, text, labels, columns=2) as axes:
         for k, (name, error) in enumerate(data.error_percent.items()):
             chosen = name == data.reference
             label = f"against {name}{' (reference)' if chosen else ''}"
             look = {"lw": 2.2, "zorder": 3} if chosen else {"lw": 1.0, "zorder": 2}
             axes.plot(data.field_deg, error, color=FIELD_COLOURS[k], label=label, **look)
         axes.axhline(0, color=FAINT, lw=0.7)
-        axes.grid(True)
-        axes.set(xlabel="field (degrees)", ylabel="distortion (%)", ylim=(-limit, limit))
-        figure.legend(loc="outside lower center", ncols=2)
 
 
 def plot_vignetting(data: Illumination, path: str | Path, title: str, subtitle: str) -> None:
-    """Relative illumination and what it is made of, against image height."""
-    with drawing(path, 7.4, 4.8, title, f"Vignetting and relative illumination; {subtitle}") as figure:
-        axes = figure.add_subplot()
-        rows = (
-            (data.relative, "relative illumination", FIELD_COLOURS[0], "-", 2.2),
-            (data.unvignetted, "without the rims", FIELD_COLOURS[2], "-", 1.2),
-            (data.passed, "share of the stop's beam that the rims pass", FIELD_COLOURS[3], "-", 1.2),
-            (data.cos4, "cos⁴ of the field", "#7f7f7f", "--", 1.2),
-        )
+    """Relative illumination and its factors, against image height."""
+    rows = (
+        (data.relative, "relative illumination", FIELD_COLOURS[0], "-", 2.2),
+        (data.unvignetted, "without the rims", FIELD_COLOURS[2], "-", 1.2),
+        (data.passed, "share of the stop's beam that the rims pass", FIELD_COLOURS[3], "-", 1.2),
+        (data.cos4, "cos⁴ of the field", _GREY, "--", 1.2),
+    )
+    top = max(105.0, 105 * float(np.nan_to_num([data.relative, data.unvignetted]).max()))
+    text = f"Vignetting and relative illumination; {subtitle}"
+    labels = {"xlabel": "image height (mm)", "ylabel": "share of the axis (%)", "ylim": (0, top)}
+    with _curves(path, (7.4, 4.8), title, text, labels) as axes:
         for values, label, colour, line, width in rows:
             axes.plot(data.height_mm, 100 * values, color=colour, ls=line, lw=width, label=label)
-        axes.grid(True)
-        axes.set(xlabel="image height (mm)", ylabel="share of the axis (%)")
-        axes.set_ylim(0, max(105.0, 105 * float(np.nan_to_num([data.relative, data.unvignetted]).max())))
-        _degrees(axes, data.height_mm, data.field_deg, across=True)
-        axes.legend(loc="lower left")
+        _degrees(axes, data, across=True)
 
 
 def plot_mtf(data: Mtf, path: str | Path, title: str, subtitle: str) -> None:
     """MTF against frequency: a colour per field, tangential solid, sagittal dashed."""
-    waves = ", ".join(f"{nm:.0f}" for nm in data.wavelength_nm)
-    with drawing(path, 8.4, 6.0, title, f"Geometric MTF at {waves} nm, without diffraction; {subtitle}") as figure:
-        axes = figure.add_subplot()
+    text = f"Geometric MTF at {_wavelengths(data.wavelength_nm)}, without diffraction; {subtitle}"
+    labels: dict[str, Any] = {"xlabel": "frequency (cycles/mm)", "ylabel": "contrast", "ylim": (0, 1.02)}
+    labels["xlim"] = (0, data.frequency_per_mm[-1])
+    with _curves(path, (8.4, 6.0), title, text, labels, columns=4) as axes:
         for k, field in enumerate(data.field_deg):
-            colour, look = FIELD_COLOURS[k % len(FIELD_COLOURS)], {"tangential": "-", "sagittal": "--"}
-            for name, contrast in (("tangential", data.tangential), ("sagittal", data.sagittal))[: 2 if field else 1]:
-                label = f"{field_name(field)}, {name}"
-                axes.plot(data.frequency_per_mm, contrast[k], color=colour, ls=look[name], label=label)
+            both = (("tangential", data.tangential, "-"), ("sagittal", data.sagittal, "--"))
+            for name, contrast, line in both[: 2 if field else 1]:
+                look = {"color": FIELD_COLOURS[k % len(FIELD_COLOURS)], "ls": line}
+                axes.plot(data.frequency_per_mm, contrast[k], label=f"{_field_name(field)}, {name}", **look)
         if np.isfinite(data.diffraction_limit).all():
             limit = f"diffraction limit, f/{data.working_f_number:.3g}"
             axes.plot(data.frequency_per_mm, data.diffraction_limit, color=INK, ls=":", label=limit)
-        axes.grid(True)
-        axes.set(xlabel="frequency (cycles/mm)", ylabel="contrast", ylim=(0, 1.02))
-        axes.set_xlim(0, data.frequency_per_mm[-1])
-        figure.legend(loc="outside lower center", ncols=4)
 
 
 def plot_mtf_over_height(data: Mtf, path: str | Path, title: str, subtitle: str) -> None:
     """MTF against image height: a colour per frequency, tangential solid, sagittal dashed."""
-    waves = ", ".join(f"{nm:.0f}" for nm in data.wavelength_nm)
-    with drawing(path, 7.4, 5.4, title, f"Geometric MTF at {waves} nm, without diffraction; {subtitle}") as figure:
-        axes = figure.add_subplot()
+    text = f"Geometric MTF at {_wavelengths(data.wavelength_nm)}, without diffraction; {subtitle}"
+    labels: dict[str, Any] = {"xlabel": "image height (mm)", "ylabel": "contrast", "ylim": (0, 1.02)}
+    labels["xlim"] = (0, float(np.nanmax(data.height_mm)))
+    with _curves(path, (7.4, 5.4), title, text, labels, columns=len(data.frequency_per_mm)) as axes:
         for k, frequency in enumerate(data.frequency_per_mm):
             for name, values, line in (("tangential", data.tangential, "-"), ("sagittal", data.sagittal, "--")):
                 look = {"color": FIELD_COLOURS[k % len(FIELD_COLOURS)], "ls": line, "lw": 1.6}
                 axes.plot(data.height_mm, values[:, k], label=f"{frequency:g} cycles/mm, {name}", **look)
-        axes.grid(True)
-        axes.set(xlabel="image height (mm)", ylabel="contrast", ylim=(0, 1.02))
-        axes.set_xlim(0, float(np.nanmax(data.height_mm)))
-        _degrees(axes, data.height_mm, data.field_deg, across=True)
-        figure.legend(loc="outside lower center", ncols=len(data.frequency_per_mm))
+        _degrees(axes, data, across=True)
 
 
 def plot_seidel(data: Seidel, path: str | Path, title: str, subtitle: str) -> None:
@@ -139,29 +222,21 @@ def plot_seidel(data: Seidel, path: str | Path, title: str, subtitle: str) -> No
         figure.legend(*rows[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
 
 
-def _degrees(axes: Any, height: Any, field: Any, across: bool = False) -> None:
-    sound = np.isfinite(height)
-    height, field = (_lengthened(v[sound]) for v in (height, field))
-
-    def to_field(h: Any) -> Any:
-        return np.interp(h, height, field)
-
-    def to_height(f: Any) -> Any:
-        return np.interp(f, field, height)
-
+def _degrees(axes: Any, data: Any, across: bool = False) -> None:
+    """A second axis with the field in degrees, beside that of image heights."""
+    known = np.isfinite(data.height_mm)
+    height, field = data.height_mm[known], data.field_deg[known]
     if len(height) < 2 or not (np.diff(height) > 0).all():
         return
-    make = axes.secondary_xaxis if across else axes.secondary_yaxis
-    second = make("top" if across else "right", functions=(to_field, to_height))
-    (second.set_xlabel if across else second.set_ylabel)("field (degrees)")
-
-
-def _lengthened(values: Any) -> Any:
-    """The values extrapolated linearly at both ends, for ticks beyond them."""
-    if len(values) < 2:
-        return values
-    before, after = values[0] - 100 * (values[1] - values[0]), values[-1] + 100 * (values[-1] - values[-2])
-    return np.concatenate([[before], values, [after]])
+    # Both go on linearly at their ends, for ticks beyond them.
+    height, field = (
+        np.concatenate([[v[0] - 100 * (v[1] - v[0])], v, [v[-1] + 100 * (v[-1] - v[-2])]]) for v in (height, field)
+    )
+    functions = (lambda h: np.interp(h, height, field), lambda f: np.interp(f, field, height))
+    if across:
+        axes.secondary_xaxis("top", functions=functions).set_xlabel("field (degrees)")
+    else:
+        axes.secondary_yaxis("right", functions=functions).set_ylabel("field (degrees)")
 
 
 _SHIFTS = 5
@@ -169,39 +244,38 @@ _SHIFTS = 5
 
 def plot_spots(data: Spots, path: str | Path, title: str, subtitle: str) -> None:
     """Spots: rows are fields, columns the film moved through focus, the middle one unshifted, with the Airy disc."""
-    columns = min(_SHIFTS, len(data.shift_mm))
-    shifts = np.linspace(data.shift_mm[0], data.shift_mm[-1], columns)
-    rows = len(data.field_deg)
-    half = _half_width(data)
-    with drawing(
-        path, 1.4 + 1.6 * max(columns, 2), 1.75 * rows + 1.3, title, f"Spots through focus; {subtitle}"
-    ) as figure:
+    rows, columns = len(data.field_deg), min(_SHIFTS, len(data.shift_mm))
+    shifts, half = np.linspace(data.shift_mm[0], data.shift_mm[-1], columns), _half_width(data)
+    size = 1.4 + 1.6 * max(columns, 2), 1.75 * rows + 1.3
+    with drawing(path, *size, title, f"Spots through focus; {subtitle}") as figure:
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         for i, j in np.ndindex(rows, columns):
             axes = grid[i, j]
             _spot(axes, data, i, float(shifts[j]))
             axes.set(xlim=(-half, half), ylim=(-half, half), aspect="equal")
             axes.tick_params(labelsize=8)
-            if i == 0:
-                axes.set_title(f"film {1000 * shifts[j]:+.0f} µm" if abs(shifts[j]) > 1e-12 else "film in place")
-            if j == 0:
-                axes.set_ylabel(
-                    f"{field_name(float(data.field_deg[i]))}, {data.height_mm[i]:.1f} mm\ntangential (µm)", size=8.5
-                )
-            if i == rows - 1:
-                axes.set_xlabel("sagittal (µm)", size=8.5)
+        for j, axes in enumerate(grid[0]):
+            axes.set_title(f"film {1000 * shifts[j]:+.0f} µm" if abs(shifts[j]) > 1e-12 else "film in place")
+        for i, axes in enumerate(grid[:, 0]):
+            name = f"{_field_name(float(data.field_deg[i]))}, {data.height_mm[i]:.1f} mm"
+            axes.set_ylabel(f"{name}\ntangential (µm)", size=8.5)
+        for axes in grid[-1]:
+            axes.set_xlabel("sagittal (µm)", size=8.5)
         handles, labels = grid[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), markerscale=4)
 
 
-def _spot(axes: Any, data: Spots, field: int, shift_mm: float) -> None:
+def _points(data: Spots, field: int, shift_mm: float) -> tuple[Any, Any]:
+    """Tangential and sagittal points [W, P] of a field from their middle, with the film moved; NaN where blocked."""
     t = data.tangential_um[field] + 1000 * shift_mm * data.slope_tangential[field]
     s = data.sagittal_um[field] + 1000 * shift_mm * data.slope_sagittal[field]
-    middle_t, middle_s = _middle(t), _middle(s)
+    return (t, s) if np.isnan(t).all() else (t - np.nanmean(t), s - np.nanmean(s))
+
+
+def _spot(axes: Any, data: Spots, field: int, shift_mm: float) -> None:
+    t, s = _points(data, field, shift_mm)
     for k, nm in enumerate(data.wavelength_nm):
-        axes.plot(
-            s[k] - middle_s, t[k] - middle_t, ".", ms=1.3, mew=0, color=wavelength_colour(nm), label=f"{nm:.0f} nm"
-        )
+        axes.plot(s[k], t[k], ".", ms=1.3, mew=0, color=_wavelength_colour(nm), label=f"{nm:.0f} nm")
     angle = np.linspace(0, 2 * math.pi, 65)
     if math.isfinite(data.airy_um):
         ring = data.airy_um * np.array([np.cos(angle), np.sin(angle)])
@@ -211,20 +285,12 @@ def _spot(axes: Any, data: Spots, field: int, shift_mm: float) -> None:
     axes.annotate(text, (0.04, 0.03), xycoords="axes fraction", fontsize=7, color="#555b63")
 
 
-def _middle(values: np.ndarray) -> float:
-    return 0.0 if np.isnan(values).all() else float(np.nanmean(values))
-
-
 def _half_width(data: Spots) -> float:
     """Half width that contains nearly all rays at every focus shown."""
     reach = [data.airy_um * 1.5] if math.isfinite(data.airy_um) else []
     for shift in (data.shift_mm[0], 0.0, data.shift_mm[-1]):
-        t = data.tangential_um + 1000 * shift * data.slope_tangential
-        s = data.sagittal_um + 1000 * shift * data.slope_sagittal
-        for i in range(len(t)):
-            away = np.hypot(t[i] - _middle(t[i]), s[i] - _middle(s[i]))
-            if np.isfinite(away).any():
-                reach.append(float(np.nanquantile(away, 0.97)))
+        away = [np.hypot(*_points(data, i, shift)) for i in range(len(data.field_deg))]
+        reach += [float(np.nanquantile(a, 0.97)) for a in away if np.isfinite(a).any()]
     return 1.1 * max(reach, default=0.0) or 1.0
 
 
@@ -237,16 +303,15 @@ def plot_fans(data: Fans, path: str | Path, title: str, subtitle: str) -> None:
     with drawing(path, 8.6, 1.55 * rows + 1.5, title, heading) as figure:
         grid = figure.subplots(rows, 2, sharex=True, sharey=True, squeeze=False)
         for i in range(rows):
-            both = (("tangential", data.tangential_um[i]), ("sagittal", data.sagittal_um[i]))
-            for axes, (name, values) in zip(grid[i], both, strict=True):
+            for axes, values in zip(grid[i], (data.tangential_um[i], data.sagittal_um[i]), strict=True):
                 for k, nm in enumerate(data.wavelength_nm):
-                    axes.plot(data.pupil, values[k], color=wavelength_colour(nm), lw=1.3, label=f"{nm:.0f} nm")
+                    axes.plot(data.pupil, values[k], color=_wavelength_colour(nm), lw=1.3, label=f"{nm:.0f} nm")
                 axes.axhline(0, color=FAINT, lw=0.6)
                 axes.axvline(0, color=FAINT, lw=0.6)
                 axes.set(xlim=(-1, 1), ylim=(-reach, reach))
-                if i == 0:
-                    axes.set_title(name)
-            grid[i, 0].set_ylabel(f"{field_name(float(data.field_deg[i]))}\naberration (µm)", size=8.5)
+            grid[i, 0].set_ylabel(f"{_field_name(float(data.field_deg[i]))}\naberration (µm)", size=8.5)
+        for axes, name in zip(grid[0], ("tangential", "sagittal"), strict=True):
+            axes.set_title(name)
         for axes in grid[-1]:
             axes.set_xlabel("height in the stop / its radius")
         handles, labels = grid[0, 0].get_legend_handles_labels()
@@ -265,15 +330,14 @@ def plot_psf(data: Psf, path: str | Path, title: str, subtitle: str) -> None:
                 axes.tick_params(labelsize=7.5)
                 axes.set(xlim=(-half, half), ylim=(-half, half), aspect="equal")
                 if np.isfinite(image).all():
-                    shown = np.sqrt(np.maximum(image, 0))
-                    axes.imshow(shown, origin="lower", extent=(-half, half, -half, half), cmap="magma", vmin=0)
+                    brightness = np.sqrt(np.maximum(image, 0))
+                    axes.imshow(brightness, origin="lower", extent=(-half, half, -half, half), cmap="magma", vmin=0)
                 else:
                     why = "aberrations far larger\nthan diffraction" if data.pupil_points[i] else "almost no light"
                     axes.text(0, 0, why, ha="center", va="center", fontsize=8)
-            grid[0, i].set_title(field_name(float(data.field_deg[i])))
+            grid[0, i].set_title(_field_name(float(data.field_deg[i])))
             if np.isfinite(data.strehl[i]):
                 grid[1, i].set_title(f"Strehl ratio {data.strehl[i]:.3f}", fontsize=9)
             grid[1, i].set_xlabel("sagittal (µm)", size=8.5)
-        waves = ", ".join(f"{nm:.0f}" for nm in data.wavelength_nm)
-        grid[0, 0].set_ylabel(f"geometric ({waves} nm)\ntangential (µm)", size=8.5)
+        grid[0, 0].set_ylabel(f"geometric ({_wavelengths(data.wavelength_nm)})\ntangential (µm)", size=8.5)
         grid[1, 0].set_ylabel(f"diffraction ({data.wavelength_nm[0]:.0f} nm)\ntangential (µm)", size=8.5)

@@ -18,13 +18,13 @@ NVIDIA, documentation of NCore, sensor models.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.optimize import least_squares  # type: ignore[import-untyped]
 from torch import Tensor
 from torch.func import jacfwd, jvp
 
@@ -49,7 +49,6 @@ _KNOTS = 1025  # of tables
 _ON_AXIS = 1e-6  # rad
 _NOT_FOLDED = 179.0, 89.9  # degrees to which a fold is looked for, about the lens and on the plane
 _STEPS, _TRUST, _CONVERGED = 25, 0.5, 1e-14  # of Newton's method on the plane; its longest and shortest step
-_FITTED = 60  # steps of Levenberg and Marquardt
 _MISSED_PX = 1e-3  # of a direction found for a pixel
 _BINS = 5  # fields of a report
 
@@ -87,18 +86,18 @@ class Projection:
         NaN where a projection that divides by z sees nothing. `numbers`: fx, fy and the coefficients, instead of its
         own.
         """
-        given = self.numbers.to(direction) if numbers is None else numbers
+        values = self.numbers.to(direction) if numbers is None else numbers
         x, y, z = direction.unbind(-1)
         if self.kind in PLANAR:
             ahead = z > 0
             x, y = (torch.where(ahead, v / torch.where(ahead, z, 1.0), math.nan) for v in (x, y))
-            u, v = _bent(self.kind, given[2:], x, y)
+            u, v = _bent(self.kind, values[2:], x, y)
         else:
             side = torch.sqrt(x * x + y * y + _TINY * (x * x + y * y + z * z))
-            distance = self._distance(given[2:], torch.atan2(side, z)) / side
+            distance = self._distance(values[2:], torch.atan2(side, z)) / side
             u, v = distance * x, distance * y
         centre = torch.tensor(self.centre_px, dtype=u.dtype, device=u.device)
-        return torch.stack([u, v], -1) * given[:2] + centre
+        return torch.stack([u, v], -1) * values[:2] + centre
 
     def jacobian(self, direction: Tensor) -> Tensor:
         """Derivatives [..., 2, 3] of `project` by the direction."""
@@ -187,7 +186,7 @@ def _series(coefficients: Tensor, x: Tensor) -> Tensor:
 
 
 def _bent(kind: str, c: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Where the plane's points x', y' go."""
+    """The images of points x', y' of the plane."""
     if kind == "two-axis":
         powers = [x ** (2 * i) * y ** (2 * j) for i, j in _TWO_AXIS]
         half = len(powers)
@@ -204,7 +203,7 @@ def _bent(kind: str, c: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class Residual:
-    """What a projection leaves, in pixels.
+    """The distances in pixels that a fitted projection leaves.
 
     Attributes:
         rms_px, worst_px: over all points. worst_at_deg: the field of the worst.
@@ -261,7 +260,7 @@ def fit(
 
 
 def residual(projection: Projection, direction: Array, pixel: Array) -> Residual:
-    """What a projection leaves of pixels [N, 2] at directions [N, 3]: others than those it was fitted to."""
+    """The residual of a projection at pixels [N, 2] of directions [N, 3] that it was not fitted to."""
     ray, goal = (torch.from_numpy(np.ascontiguousarray(a, np.float64)) for a in (direction, pixel))
     miss = torch.linalg.vector_norm(projection.project(ray) - goal, dim=-1)
     angle = torch.rad2deg(torch.atan2(torch.hypot(ray[:, 0], ray[:, 1]), ray[:, 2]))
@@ -290,15 +289,13 @@ def _tabled(start: Projection, angle: Tensor, radius: Tensor) -> Projection:
 
 
 def _adjusted(start: Projection, ray: Tensor, goal: Tensor, round_: bool) -> Projection:
-    """The numbers of a kind, by Levenberg's and Marquardt's method from the paraxial ones."""
-    names = NAMES[start.kind]
-    first = start.numbers.clone()
-    if start.kind == "f-theta":
+    """The projection whose numbers, found from the paraxial ones, have the least squares of distances."""
+    theta = start.kind == "f-theta"
+    first, tied = start.numbers.clone(), round_ and not theta
+    if theta:
         first[:2], first[2] = torch.tensor([start.focal_px[0] / start.focal_px[1], 1.0]), start.focal_px[1]
-    free = [k + 2 for k, name in enumerate(names) if name not in _FIXED]
-    free += [] if start.kind == "f-theta" and round_ else [0]
-    tied = round_ and start.kind != "f-theta"
-    free += [] if tied or start.kind == "f-theta" else [1]
+    free = [k + 2 for k, name in enumerate(NAMES[start.kind]) if name not in _FIXED]
+    free += ([] if theta and round_ else [0]) + ([] if theta or tied else [1])
 
     def numbers(x: Tensor) -> Tensor:
         whole = first.index_copy(0, torch.tensor(free), x)
@@ -307,28 +304,12 @@ def _adjusted(start: Projection, ray: Tensor, goal: Tensor, round_: bool) -> Pro
     def miss(x: Tensor) -> Tensor:
         return (start.project(ray, numbers(x)) - goal).reshape(-1)
 
-    best = numbers(_least_squares(miss, first[free])).tolist()
-    return replace(start, focal_px=(best[0], best[1]), coefficients=tuple(best[2:]))
-
-
-def _least_squares(miss: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-    """Numbers of least squares; columns are scaled, steps that do not help are damped."""
-    damping, cost = 1e-6, float(miss(x).square().sum())
-    for _ in range(_FITTED):
-        jacobian, wrong = jacfwd(miss)(x), miss(x)
-        scale = torch.linalg.vector_norm(jacobian, dim=0).clamp_min(1e-30)
-        rows = torch.cat([jacobian / scale, math.sqrt(damping) * torch.eye(len(x), dtype=x.dtype)])
-        step = torch.linalg.lstsq(rows, torch.cat([-wrong, torch.zeros_like(x)])[:, None], driver="gelsd").solution
-        trial = x + step[:, 0] / scale
-        now = float(miss(trial).square().sum())
-        if math.isfinite(now) and now <= cost:
-            done = cost - now <= 1e-12 * cost
-            x, cost, damping = trial, now, damping / 10
-            if done and damping < 1e-12:
-                break
-        else:
-            damping = min(damping * 10, 1e6)
-    return x
+    found = least_squares(
+        lambda x: miss(torch.from_numpy(x)).numpy(), first[free].numpy(), lambda x: jacfwd(miss)(torch.from_numpy(x)),
+        method="lm", x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15,
+    )  # fmt: skip
+    fx, fy, *coefficients = numbers(torch.from_numpy(found.x)).tolist()
+    return replace(start, focal_px=(fx, fy), coefficients=tuple(coefficients))
 
 
 def inverse_polynomial(projection: Projection) -> tuple[float, ...]:

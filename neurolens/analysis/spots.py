@@ -1,4 +1,4 @@
-"""Ray aberrations: spot diagrams over field and focus, ray fans, and the geometric MTF of the spots."""
+"""Spots over field and focus, ray fans, geometric MTF, and point spread by rays and by diffraction."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neurolens.analysis.bundles import Bundle, Filled, bundle, fan, hexapolar
+from neurolens.analysis.bundles import Bundle, Filled, bundle, fan, hexapolar, points
 from neurolens.analysis.fields import Array, Result, Scene
-from neurolens.analysis.pupil_nodes import converged
+from neurolens.analysis.pupil_nodes import LEVELS, converged
 from neurolens.lens.paraxial import is_pinhole
 
 _RINGS = 16
@@ -59,56 +59,52 @@ class Spots(Result):
 
 
 def spots(
-    scene: Scene,
-    field_deg: Sequence[float] | None = None,
-    wavelength_nm: Sequence[float] | None = None,
-    *,
-    rings: int = _RINGS,
-    shift_mm: Sequence[float] | None = None,
-) -> Spots:
+    scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: Sequence[float] | None = None, *,
+    rings: int = _RINGS, shift_mm: Sequence[float] | None = None,
+) -> Spots:  # fmt: skip
     """Spot diagrams; the fields are those of `Scene.default_fields` and the shifts span the best foci if not given."""
     rays = bundle(scene, field_deg, wavelength_nm, hexapolar(rings))
     waves = rays.wavelength_nm
-    n = working_f_number(scene, waves[0])
-    airy = 1.22e-3 * waves[0] * n
+    n, airy = _airy(scene, waves[0])
     filled, stop = (Filled(scene, rays.field_deg, waves, to_stop=to_stop) for to_stop in (False, True))
 
     def figures(level: int, fields: list[int]) -> list[Array]:
         return _figures(filled.only(fields).bundle(level), stop.only(fields).energy(level))
 
-    found, spread = converged(figures, lambda f: _shown(f, np.nan_to_num(airy)), len(rays.field_deg))
-    rms, geometric, by_wavelength, passed, best, best_rms, *parabola = found
+    found, spread = converged(figures, lambda f: _scaled(f, np.nan_to_num(airy)), len(rays.field_deg))
+    rms, geometric, by_wavelength, passed, best, best_rms, *moments = found
     shifts = np.asarray(_span(best, n, waves[0]) if shift_mm is None else shift_mm, dtype=np.float64)
-    st, ss = rays.slopes
+    slope_t, slope_s = rays.slopes
     return Spots(
         np.array(rays.field_deg), np.array(waves), rays.chief_height_mm.numpy(),
-        1000 * rays.tangential_mm.numpy(), 1000 * rays.sagittal_mm.numpy(), st.numpy(), ss.numpy(),
+        1000 * rays.tangential_mm.numpy(), 1000 * rays.sagittal_mm.numpy(), slope_t.numpy(), slope_s.numpy(),
         rms, geometric, by_wavelength, passed, n, airy,
-        shifts, _rms_um(parabola, shifts), best, best_rms, spread,
+        shifts, _rms_um(moments, shifts), best, best_rms, spread,
     )  # fmt: skip
 
 
 def _figures(rays: Bundle, open_energy: Tensor) -> list[Array]:
-    """The figures of `Spots` that depend on how the pupil is sampled, and the second moments, each [F, ...].
+    """The figures of `Spots` that depend on the sampling of the pupil, and the second moments, each [F, ...].
 
-    In the order of `_shown`; `open_energy` [F] is the light that enters the stop.
+    They stand in the order of `_scaled`; `open_energy` [F] is the light that enters the stop.
     """
-    moments, each = _Moments(rays), _Moments(rays, by_wavelength=True)
-    away = torch.hypot(*(p - c for p, c in zip((rays.tangential_mm, rays.sagittal_mm), moments.centroid, strict=True)))
+    centroid, moments = _moments(rays, (1, 2))
+    spread, mixed, steep = moments
+    away = torch.hypot(*(p - c for p, c in zip((rays.tangential_mm, rays.sagittal_mm), centroid, strict=True)))
     largest = torch.where(rays.passed, away, -math.inf).amax((1, 2))
-    passed, best = rays.weight.sum((1, 2)) / open_energy, moments.best_shift()
-    here = np.zeros(1)
-    parabola = [v.numpy() for v in (moments.spread, moments.mixed, moments.steep)]
+    # Rays that are parallel up to rounding have no best focus.
+    best = torch.where(steep > 1e-20, -mixed / steep, math.nan).numpy()
+    here, whole = np.zeros(1), [m.numpy() for m in moments]
     return [
-        _rms_um(parabola, here)[:, 0],
+        _rms_um(whole, here)[:, 0],
         1000 * largest.where(largest >= 0, math.nan).numpy(),
-        _rms_um([v.numpy() for v in (each.spread, each.mixed, each.steep)], here)[..., 0],
-        passed.numpy(), best.numpy(), _rms_um(parabola, best.numpy()[:, None])[:, 0], *parabola,
+        _rms_um([m.numpy() for m in _moments(rays, (2,))[1]], here)[..., 0],
+        (rays.weight.sum((1, 2)) / open_energy).numpy(), best, _rms_um(whole, best[:, None])[:, 0], *whole,
     ]  # fmt: skip
 
 
-def _shown(figures: list[Array], airy_um: float) -> dict[str, tuple[Array, Array | float]]:
-    """What is shown of `_figures`, with scales. The largest radius is that of a single ray: to fewer digits."""
+def _scaled(figures: list[Array], airy_um: float) -> dict[str, tuple[Array, Array | float]]:
+    """The figures of `_figures` that are shown, with their scales: the largest radius, of one ray, to fewer digits."""
     rms, geometric, by_wavelength, passed, best, best_rms = figures[:6]
     least = 0.01 * airy_um
     return {
@@ -121,51 +117,52 @@ def _shown(figures: list[Array], airy_um: float) -> dict[str, tuple[Array, Array
     }
 
 
-class _Moments:
-    """Energy-weighted second moments of a spot, from which its RMS radius at every focus follows: it is a parabola."""
+def _moments(rays: Bundle, along: tuple[int, ...]) -> tuple[list[Tensor], list[Tensor]]:
+    """Centroid of a spot, and the energy-weighted second moments of points, of points with slopes, and of slopes.
 
-    def __init__(self, rays: Bundle, by_wavelength: bool = False) -> None:
-        along = (2,) if by_wavelength else (1, 2)
-        weight = rays.weight / rays.weight.sum(along, keepdim=True)
-        self.centroid: list[Tensor] = []
-        self.spread = self.mixed = self.steep = torch.zeros(1, dtype=torch.float64)
-        for place, slope in zip((rays.tangential_mm, rays.sagittal_mm), rays.slopes, strict=True):
-            a, b = torch.nan_to_num(place), torch.nan_to_num(slope)
-            mean_a, mean_b = (weight * a).sum(along, keepdim=True), (weight * b).sum(along, keepdim=True)
-            self.centroid.append(mean_a)
-            self.spread = self.spread + (weight * (a - mean_a) ** 2).sum(along)
-            self.mixed = self.mixed + (weight * (a - mean_a) * (b - mean_b)).sum(along)
-            self.steep = self.steep + (weight * (b - mean_b) ** 2).sum(along)
-
-    def best_shift(self) -> Tensor:
-        # Rays parallel up to rounding have no best focus.
-        return torch.where(self.steep > 1e-20, -self.mixed / self.steep, math.nan)
+    From these its RMS radius at every focus follows: its square is a parabola.
+    """
+    weight = rays.weight / rays.weight.sum(along, keepdim=True)
+    centroid, sums = [], [torch.zeros(1, dtype=torch.float64)] * 3
+    for place, slope in zip((rays.tangential_mm, rays.sagittal_mm), rays.slopes, strict=True):
+        a, b = torch.nan_to_num(place), torch.nan_to_num(slope)
+        centroid.append((weight * a).sum(along, keepdim=True))
+        a, b = a - centroid[-1], b - (weight * b).sum(along, keepdim=True)
+        products = (weight * a**2, weight * a * b, weight * b**2)
+        sums = [total + product.sum(along) for total, product in zip(sums, products, strict=True)]
+    return centroid, sums
 
 
-def _rms_um(parabola: Sequence[Array], shift_mm: Array) -> Array:
-    """RMS radius at shifts [K] (or one for each field [F, 1]), with shifts last, in um, of spread, mixed and steep."""
-    a, b, c = (m[..., None] for m in parabola)
+def _rms_um(moments: Sequence[Array], shift_mm: Array) -> Array:
+    """RMS radius in um by the three second moments, at shifts [K] (or one for each field [F, 1]), shifts last."""
+    a, b, c = (m[..., None] for m in moments)
     return np.asarray(1000 * np.sqrt(np.maximum(a + 2 * b * shift_mm + c * shift_mm**2, 0.0)))
 
 
 def working_f_number(scene: Scene, wavelength_nm: float) -> float:
     """1 / (2 sin theta') of the outermost real ray of the axis that passes stop and rims; NaN if none does.
 
-    Of a hole without a lens: its distance from the film over its diameter.
+    A hole without a lens has that of its distance from the film over its diameter.
     """
     if is_pinhole(scene.lens):
         return float(scene.first_order.f_number)
     rays = Filled(scene.round, [0.0], [wavelength_nm]).bundle(0)
-    across = rays.film.dx if scene.axis == "x" else rays.film.dy
+    across, _ = scene.image_axes(rays.film.dx, rays.film.dy)
     sine = float(torch.where(rays.passed, across.abs(), 0.0).max())
     return 1 / (2 * sine) if sine > 0 else math.nan
+
+
+def _airy(scene: Scene, wavelength_nm: float) -> tuple[float, float]:
+    """Working f-number, and radius in um of the first dark ring about a point on the axis."""
+    n = working_f_number(scene, wavelength_nm)
+    return n, 1.22e-3 * wavelength_nm * n
 
 
 def _span(best: Array, f_number: float, wavelength_nm: float) -> Array:
     """Shifts about the film that include the best foci of the fields, and at least a few depths of focus."""
     depth = 4e-6 * wavelength_nm * f_number**2 if math.isfinite(f_number) else 0.0  # Rayleigh's, +- 2 lambda N^2
-    reach = max(2 * depth, 1.5 * float(np.median(np.abs(np.nan_to_num(best)))))
-    return np.linspace(-reach, reach, _SHIFTS) if reach > 0 else np.linspace(-0.1, 0.1, _SHIFTS)
+    reach = max(2 * depth, 1.5 * float(np.median(np.abs(np.nan_to_num(best))))) or 0.1
+    return np.linspace(-reach, reach, _SHIFTS)
 
 
 @dataclass(frozen=True)
@@ -194,13 +191,10 @@ def fans(
     pattern = fan(n)
     rays = bundle(scene, field_deg, wavelength_nm, pattern)
     return Fans(
-        np.array(rays.field_deg),
-        np.array(rays.wavelength_nm),
-        rays.chief_height_mm.numpy(),
+        np.array(rays.field_deg), np.array(rays.wavelength_nm), rays.chief_height_mm.numpy(),
         pattern.tangential[:n].numpy(),
-        1000 * rays.tangential_mm[..., :n].numpy(),
-        1000 * rays.sagittal_mm[..., n:].numpy(),
-    )
+        1000 * rays.tangential_mm[..., :n].numpy(), 1000 * rays.sagittal_mm[..., n:].numpy(),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -233,13 +227,9 @@ _SHOWN_PER_MM = 50.0  # of the frequencies that are taken where none are given, 
 
 
 def mtf(
-    scene: Scene,
-    field_deg: Sequence[float] | None = None,
-    wavelength_nm: Sequence[float] | None = None,
-    *,
-    frequency_per_mm: Sequence[float] | None = None,
-    shift_mm: float = 0.0,
-) -> Mtf:
+    scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: Sequence[float] | None = None, *,
+    frequency_per_mm: Sequence[float] | None = None, shift_mm: float = 0.0,
+) -> Mtf:  # fmt: skip
     """Modulus of the energy-weighted mean of exp(2 pi i f x) over the rays of all wavelengths; NaN without light.
 
     The frequencies are 0 to 100 per mm where none are given.
@@ -268,12 +258,9 @@ HEIGHT_PER_MM = (10.0, 20.0, 40.0)  # the frequencies that lens makers print
 
 
 def mtf_over_height(
-    scene: Scene,
-    wavelength_nm: Sequence[float] | None = None,
-    *,
-    frequency_per_mm: Sequence[float] = HEIGHT_PER_MM,
-    fields: int = 21,
-) -> Mtf:
+    scene: Scene, wavelength_nm: Sequence[float] | None = None, *,
+    frequency_per_mm: Sequence[float] = HEIGHT_PER_MM, fields: int = 21,
+) -> Mtf:  # fmt: skip
     """MTF of some frequencies at fields from the axis to the edge: the chart of lens makers."""
     angles = np.linspace(0, scene.edge.field_deg, fields).tolist()
     return mtf(scene, angles, wavelength_nm, frequency_per_mm=sorted(set(frequency_per_mm)))
@@ -282,18 +269,166 @@ def mtf_over_height(
 def diffraction_mtf(frequency_per_mm: Array, wavelength_nm: float, f_number: float) -> Array:
     """MTF of a perfect lens with a round pupil: 2/pi (acos s - s sqrt(1 - s^2)), s = f lambda N (Goodman, 6.3)."""
     s = np.clip(frequency_per_mm * wavelength_nm * 1e-6 * f_number, 0.0, 1.0)
-    found: Array = 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s * s))
-    return found
+    return np.asarray(2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s * s)))
 
 
 def _contrast(x_mm: Tensor, weight: Tensor, frequency: Array) -> Array:
-    found, before, step, turn = [], 0.0, math.nan, weight
-    now = weight.to(torch.complex128)
+    rows, before, step, turn = [], 0.0, math.nan, weight
+    phases = weight.to(torch.complex128)
     for f in frequency.tolist():
         if not abs(f - before - step) < 1e-9:  # evenly spaced frequencies share the turn of the phases between them
             step = f - before
             turn = torch.polar(torch.ones_like(x_mm), x_mm * (2 * np.pi * step))
-        now, before = now * turn, f
-        found.append(now.sum(1).abs())
-    result: Array = torch.stack(found, 1).numpy()
-    return result
+        phases, before = phases * turn, f
+        rows.append(phases.sum(1).abs())
+    return np.asarray(torch.stack(rows, 1).numpy())
+
+
+def opd_mm(rays: Bundle) -> Tensor:
+    """Path difference [F, W, P] in mm from the chief ray of each wavelength, NaN where a ray is blocked.
+
+    It is positive as for an undercorrected lens. Each ray's path is taken to its foot of the perpendicular from the
+    chief ray's film point (of the first wavelength): a reference sphere about that point whose radius is large against
+    the aberrations.
+    """
+    chief = bundle(rays.scene.open, rays.field_deg, rays.wavelength_nm, points([0.0], [0.0]))
+    return _path_to_chief_mm(chief) - _path_to_chief_mm(rays)
+
+
+def _path_to_chief_mm(rays: Bundle) -> Tensor:
+    """Optical path to the plane through the chief ray's film point that stands on the ray, [F, W, P].
+
+    Raises:
+        InputError: a lens with ideal surfaces, which have a law of rays and none of phases.
+    """
+    rays.scene.lens.require_glass("optical path")
+    along_t, along_s = rays.cosines
+    return rays.path_mm - rays.tangential_mm * along_t - rays.sagittal_mm * along_s
+
+
+_BINS, _POINTS = 49, 97  # of the geometric and the diffraction image, odd: one on the centre
+_FINEST = 128  # points across the pupil that are still traced
+_ENCIRCLED = 0.98  # share of the geometric spot's energy that the window contains
+
+
+@dataclass(frozen=True)
+class Psf(Result):
+    """Point spread of F fields; images are indexed [tangential, sagittal], centred on the spot's centroid.
+
+    Attributes:
+        half_width_um: [F], from the centre of the image to its edge; NaN without light.
+        geometric: [F, 49, 49] share of all wavelengths' energy in each square; what lies outside is missing; NaN
+            without light.
+        diffraction: [F, 97, 97] at the first wavelength, 1 at the peak of the same pupil without aberrations; NaN where
+            the aberrations are too large for it (then diffraction is negligible against `geometric`) or almost
+            no light arrives.
+        strehl: [F], greatest value of `diffraction`.
+        pupil_points: [F], points across the pupil that the diffraction image needs; 0 without light.
+        airy_um: radius of the first dark ring on the axis.
+        spread: by figure, [F, ...], by how much two samplings of the pupil differ (`pupil_nodes.converged`).
+    """
+
+    field_deg: Array
+    wavelength_nm: Array
+    half_width_um: Array
+    geometric: Array
+    diffraction: Array
+    strehl: Array
+    pupil_points: Array
+    airy_um: float
+    spread: dict[str, Array]
+
+
+def psf(scene: Scene, field_deg: Sequence[float] | None = None, wavelength_nm: Sequence[float] | None = None) -> Psf:
+    """Point spread of fields; the window holds the spot and six Airy radii.
+
+    Raises:
+        InputError: a pinhole, whose rays do not meet: it has no focus that waves could be summed about.
+    """
+    scene.require_power()
+    filled = Filled(scene, field_deg, wavelength_nm)
+    _, airy = _airy(scene, filled.waves[0])
+    least_mm = 6e-3 * float(np.nan_to_num(airy))
+
+    def images(level: int, fields: list[int]) -> list[Array]:
+        return _images(filled.only(fields).bundle(level, path=True), least_mm)
+
+    def scaled(found: list[Array]) -> dict[str, tuple[Array, Array | float]]:
+        return {"half_width_um": (found[0], 20 * found[0]), "strehl": (found[2].max((1, 2)), 1.0)}
+
+    (half, centre, diffraction, needed), spread = converged(images, scaled, len(filled.fields), first=1)
+    rays = filled.bundle(LEVELS - 1)  # a picture needs rays in every square, whatever figures need
+    each = zip(rays.tangential_mm, rays.sagittal_mm, rays.weight, centre, half, strict=True)
+    geometric = np.stack([_histogram(t - c[0], s - c[1], w, h / 1000) for t, s, w, c, h in each])
+    return Psf(
+        np.array(filled.fields), np.array(filled.waves), half, geometric, diffraction, diffraction.max((1, 2)), needed,
+        airy, spread,
+    )  # fmt: skip
+
+
+def _images(rays: Bundle, least_mm: float) -> list[Array]:
+    """Half widths (um), centres (mm), diffraction images and points across the pupil that these need, [F, ...].
+
+    The windows have at least some half width.
+    """
+    rows = []
+    for k in range(len(rays.field_deg)):
+        t, s, w = (v[k].flatten() for v in (rays.tangential_mm, rays.sagittal_mm, rays.weight))
+        centre, radius = _spot(t, s, w)
+        window = max(least_mm, 1.1 * radius)
+        if not (window > 0 and w.sum() > 0):
+            window = math.nan
+        needed, image = _needed(rays, k, window), np.full((_POINTS, _POINTS), np.nan)
+        if 0 < needed <= _FINEST:
+            image = diffraction_image(rays, centre, window, field=k)
+        rows.append((1000 * window, centre, image, float(needed)))
+    return [np.array(column) for column in zip(*rows, strict=True)]
+
+
+def _spot(t: Tensor, s: Tensor, w: Tensor) -> tuple[tuple[float, float], float]:
+    """Centroid (mm) and the radius about it that holds most of the energy."""
+    if not w.sum() > 0:
+        return (0.0, 0.0), 0.0
+    t, s = torch.nan_to_num(t), torch.nan_to_num(s)
+    centre = (float((w * t).sum() / w.sum()), float((w * s).sum() / w.sum()))
+    away, order = torch.hypot(t - centre[0], s - centre[1]).sort()
+    within = w[order].cumsum(0) / w.sum()
+    return centre, float(away[min(int((within < _ENCIRCLED).sum()), len(away) - 1)])
+
+
+def _histogram(t: Tensor, s: Tensor, w: Tensor, half_mm: float) -> Array:
+    if math.isnan(half_mm):
+        return np.full((_BINS, _BINS), np.nan)
+    keep = w > 0
+    edges = np.linspace(-half_mm, half_mm, _BINS + 1)
+    counts, _, _ = np.histogram2d(t[keep].numpy(), s[keep].numpy(), bins=(edges, edges), weights=w[keep].numpy())
+    return np.asarray(counts / float(w.sum()))
+
+
+def _needed(rays: Bundle, field: int, half_mm: float) -> int:
+    """Points across the pupil so that the phase anywhere in the window turns by less than half a turn between two."""
+    if math.isnan(half_mm) or not rays.passed[field].any():
+        return 0
+    span = max(float(np.nanmax(v[field]) - np.nanmin(v[field])) for v in rays.cosines)
+    blur = float(torch.nan_to_num(torch.hypot(rays.tangential_mm[field], rays.sagittal_mm[field])).max())
+    return max(32, math.ceil(span * 2 * (math.sqrt(2) * half_mm + blur) / (rays.wavelength_nm[0] * 1e-6)))
+
+
+def diffraction_image(
+    rays: Bundle, centre_mm: tuple[float, float], half_mm: float, points: int = _POINTS, field: int = 0
+) -> Array:
+    """Diffraction image of a field of a bundle at its first wavelength, [points, points]; see `Psf.diffraction`.
+
+    Its centre is given as tangential and sagittal distance from the chief ray's film point.
+    """
+    wave = 2 * math.pi / (rays.wavelength_nm[0] * 1e-6)
+    keep = rays.passed[field, 0]
+    t, s = (c[field, 0][keep] for c in rays.cosines)
+    path, weight = _path_to_chief_mm(rays)[field, 0][keep], rays.weight[field, 0][keep]
+    # Paths are metres of waves: only their differences may be turned into phases.
+    lead = path - path.mean() + t * centre_mm[0] + s * centre_mm[1]
+    amplitude = torch.polar(weight / weight.sum(), wave * lead)
+    line = torch.linspace(-half_mm, half_mm, points, dtype=torch.float64)
+    one = torch.ones(1, dtype=torch.float64)
+    along, across = (torch.polar(one, wave * line[:, None] * c) for c in (t, s))
+    return np.asarray(((along * amplitude) @ across.T).abs().square().numpy())

@@ -195,11 +195,9 @@ examples:
 def analysis_of(what: str) -> Analysis:
     """The analysis of a name; torch and matplotlib are imported here, not when the command line starts."""
     from neurolens.analysis import plots
-    from neurolens.analysis.field_curves import colour, curvature, distortion, illumination
+    from neurolens.analysis.field_curves import colour, curvature, distortion, illumination, seidel
     from neurolens.analysis.layout import layout_profile, lens_layout
-    from neurolens.analysis.seidel import seidel
-    from neurolens.analysis.spots import fans, mtf, mtf_over_height, spots
-    from neurolens.analysis.wavefront import psf
+    from neurolens.analysis.spots import fans, mtf, mtf_over_height, psf, spots
 
     return {
         "layout": Analysis(layout_profile, lens_layout, _layout_text),

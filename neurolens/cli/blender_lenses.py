@@ -282,7 +282,7 @@ def thumbnail(lens: Lens) -> bytes | None:
         return None
     from neurolens.analysis.fields import Scene
     from neurolens.analysis.layout import draw_section, layout_profile
-    from neurolens.analysis.plot_style import new_figure, style
+    from neurolens.analysis.plots import new_figure, style
 
     with style():
         figure = new_figure(_SIDE_IN, _SIDE_IN)

@@ -61,8 +61,8 @@ keeps its own; ./lenses; the project's."""
     def run(self) -> int:
         """Measure, compare, time; 1 where a promise does not hold."""
         from neurolens.cameras.model import load_model
-        from neurolens.study.candidates import time_model
         from neurolens.study.check import check_model, check_states, lens_of_card, space_of_card
+        from neurolens.study.speed import time_model
         from neurolens.surrogates.card import transmittance_of
 
         model = load_model(self.model)  # on one thread: the race distributes batches

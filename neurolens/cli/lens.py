@@ -143,7 +143,7 @@ examples:
 
             lens_layout(layout_profile(lens, domain), self.layout)
         if self.breathing is not None:
-            from neurolens.study.figures import draw_breathing
+            from neurolens.analysis.breathing import draw_breathing
 
             figures = draw_breathing(lens, self.breathing)
             data["breathing"] = {name: [asdict(b) for b in breaths] for name, breaths in figures.items()}
@@ -159,7 +159,7 @@ examples:
         files = (lens_files(path) if path.is_dir() else [_file(path)] for path in paths)
         rows = [library_row(file, checked) for folder in files for file in folder]
         if self.layouts is not None:
-            from neurolens.study.figures import sheet
+            from neurolens.analysis.layout import sheet
 
             sheet([section(Path(r["file"])) for r in rows if "name" in r], self.layouts)
         note = "" if self.layouts is None else f"\n\nSections drawn in {self.layouts}"

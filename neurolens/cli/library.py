@@ -140,12 +140,12 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
 
 def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
     """Name and title of each drawing, and the function that draws it to a path."""
+    from neurolens.analysis.breathing import draw_breathing
     from neurolens.analysis.fields import Scene
     from neurolens.analysis.layout import state_text
     from neurolens.analysis.spots import spots
     from neurolens.cli.analyse import analysis_of
     from neurolens.setting.states import set_lens
-    from neurolens.study.figures import draw_breathing
 
     scene = Scene(set_lens(lens, focus_m=math.inf, focus_mode="best"))
 

@@ -142,7 +142,7 @@ the table), trade.png, trade.json and models/ with what was fitted."""
             "denoised": self.denoise, "folder": None if self.no_fit else folder / "models",
         }  # fmt: skip
         if self.trade:
-            from neurolens.plan.trade import trade
+            from neurolens.plan.plan import trade
 
             with self.progress({"trade": 30}).stage("trade") as report:
                 look |= {"samples": self.samples or 16, "zoom": self.zoom, "report": report}
@@ -176,9 +176,8 @@ the table), trade.png, trade.json and models/ with what was fitted."""
 
     def _plan(self, scene: Scene, lens: Lens, folder: Path, look: Mapping[str, Any]) -> int:
         """Plan one frame."""
-        from neurolens.plan.plan import plan
+        from neurolens.plan.plan import plan, plan_seen, plan_within
         from neurolens.plan.plots import plot_effects
-        from neurolens.plan.trade import plan_seen, plan_within
 
         progress = self.progress({"plan": 10} | ({"map of samples": 2} if self.sample_map else {}))
         with progress.stage("plan") as report:
@@ -232,7 +231,7 @@ def shipped_models(lens: Lens, zoom: str | None) -> list[Path]:
 
 
 def _write_samples(result: plans.Plan, path: Path) -> None:
-    from neurolens.plan.samples import blur_map
+    from neurolens.plan.footprints import blur_map
     from neurolens.render.pictures import standard_attributes, write_exr
 
     blur, depth = blur_map(result.probed)

@@ -50,9 +50,7 @@ DIR holds survey.html (a table with sections of the lenses, to sort and filter),
         """Survey a folder; 1 where a file met a fault of neurolens."""
         from neurolens.readers.any_format import collection_of
         from neurolens.readers.source import MAX_BYTES
-        from neurolens.study.survey import SurveySettings, summary_of
-        from neurolens.study.survey_page import summary_lines
-        from neurolens.study.survey_run import TIME_LIMIT_S, survey
+        from neurolens.study.survey import TIME_LIMIT_S, SurveySettings, summary_lines, summary_of, survey
 
         check_run_folder(self.out, self.called, "--output")
         if self.out.resolve() == self.folder.resolve():

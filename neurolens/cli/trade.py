@@ -13,13 +13,13 @@ from neurolens.cli.arguments import Answering
 from neurolens.cli.output import number, table
 
 if TYPE_CHECKING:
-    from neurolens.plan.trade import Offer, Trade
+    from neurolens.plan.plan import Offer, Trade
 
 
 def answer_trade(command: Answering, result: Trade, folder: Path, title: str, names: Mapping[str, str]) -> int:
     """Draw, write, print; 1 where no camera keeps the budget."""
     from neurolens.plan.plots import plot_trade
-    from neurolens.study.figures import side_by_side
+    from neurolens.study.plots import side_by_side
 
     folder.mkdir(parents=True, exist_ok=True)
     plot_trade(result, folder / "trade.png", title)

@@ -30,7 +30,7 @@ from neurolens.cli.arguments import (
     within,
 )  # fmt: skip
 from neurolens.cli.output import number, table
-from neurolens.study.advice import advice, said_ns
+from neurolens.study.advice import advice, ns_text
 
 _MARK = "task.sha256"  # in a run folder that came from a cluster
 
@@ -246,6 +246,6 @@ def _text(results: Mapping[str, Any], folder: Path) -> str:
 def _row(model: Mapping[str, Any]) -> tuple[str, ...]:
     errors = (number(model.get(key), 3) for key in ("rms_um", "p99_um", "direction_rms_deg"))
     shares = (model.get(key) for key in ("false_pass", "false_block"))
-    times = (said_ns(model.get(key) or {}).removesuffix(" ns") for key in ("ns_per_ray", "fused_ns_per_ray"))
+    times = (ns_text(model.get(key) or {}).removesuffix(" ns") for key in ("ns_per_ray", "fused_ns_per_ray"))
     percent = ("-" if share is None else f"{100 * share:.2f}%" for share in shares)
     return (str(model.get("name")), *errors, *percent, *times, number(model.get("fit_s"), 3))

@@ -1,1 +1,1 @@
-"""What a scene asks for: effects of the lens that show in its picture, and the cheapest camera that keeps them."""
+"""The needs of a scene: effects of the lens that show in its picture, and the cheapest camera that has them."""

@@ -1,4 +1,4 @@
-"""What a camera costs where it runs: nanoseconds or operations a ray, times the noise of its weights.
+"""The cost of a camera in its target: nanoseconds or operations a ray, times the noise of its weights.
 
 That is proportional to the seconds to equal error. A pixel is the mean of n samples w L of weights and radiances, which
 are independent; with a and b their squared relative deviations its relative variance is ((1 + a)(1 + b) - 1) / n. Where
@@ -42,7 +42,7 @@ _MOST_DARK = 0.05  # of the places
 
 
 def noise(weight: Array, share: Array) -> float:
-    """How many times the rays a camera needs, of weights [N, W, P] and the share of each wavelength: mean over places.
+    """The factor of rays that a camera with weights [N, W, P] needs, by the share of each wavelength: mean over places.
 
     inf where more than 5% of the places get no light.
     """

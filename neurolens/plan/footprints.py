@@ -1,4 +1,4 @@
-"""What a film point of a camera sees at a distance, measured on the film: footprints, their parts, and how two differ.
+"""Footprints: the places on the film that a camera's rays of a film point stand for; their parts, and how two differ.
 
 The rays of a film point meet the plane across its chief ray at the distance of what it shows. Taken back to the film by
 the first-order map of the exact camera there, the points where they meet it are its footprint, in mm on the film: the
@@ -12,17 +12,26 @@ rays, and holds what a picture shows: place, size and shape of the blur, and of 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage  # type: ignore[import-untyped]
+from scipy.interpolate import RectBivariateSpline  # type: ignore[import-untyped]
 
 from neurolens.cameras.contract import Camera, CameraRays
+from neurolens.render.film import check_memory
+from neurolens.study.scenes import seen_depths_m
+
+if TYPE_CHECKING:
+    from neurolens.plan.probe import Probe
 
 Array = NDArray[np.float64]
+_Real = TypeVar("_Real", bound=np.floating[Any])
 
 _LINES = 8  # directions of the sliced distance
 _QUANTILES = 64
@@ -92,45 +101,39 @@ def places_of(exact: Camera, film_mm: Array, depth_m: Array, wavelength_nm: Arra
     Depths become distances along the chief ray of the exact camera, in the middle of the wavelengths.
     """
     middle = float((wavelength_nm * share).sum())
-    origin, way, lit = _chief(exact, film_mm, middle)
+    origin, direction, lit = _chief(exact, film_mm, middle)
     lit &= (depth_m > 0) | np.isinf(depth_m)
-    film_mm, depth_m, origin, way = film_mm[:, lit], depth_m[lit], origin[:, lit], way[:, lit]
-    with np.errstate(all="ignore"):  # a ray of a fisheye across the axis meets no depth: what it shows is distant
-        distance = (depth_m + origin[2]) / np.maximum(-way[2], 0.0)
+    film_mm, depth_m, origin, direction = film_mm[:, lit], depth_m[lit], origin[:, lit], direction[:, lit]
+    with np.errstate(all="ignore"):  # a ray of a fisheye across the axis meets no depth: it shows something distant
+        distance = (depth_m + origin[2]) / np.maximum(-direction[2], 0.0)
     distance = np.where(np.isfinite(distance) & (distance > 0), distance, np.inf)
-    helper = np.where(np.abs(way[0]) < 0.9, np.array([[1.0], [0.0], [0.0]]), np.array([[0.0], [1.0], [0.0]]))
-    first = np.cross(way, helper, axis=0)
+    helper = np.where(np.abs(direction[0]) < 0.9, *np.eye(3)[:2, :, None])
+    first = np.cross(direction, helper, axis=0)
     first /= np.linalg.norm(first, axis=0)
-    across = np.stack([first, np.cross(way, first, axis=0)])
+    across = np.stack([first, np.cross(direction, first, axis=0)])
     empty = np.zeros((2, 2, film_mm.shape[1]))
-    raw = Places(film_mm, distance, origin, way, across, empty, wavelength_nm, share)
-    step = _STEP * max(exact.film_mm)
-    slopes = []
-    for axis in (0, 1):
-        moved = np.zeros((2, 1))
-        moved[axis] = step
+    raw = Places(film_mm, distance, origin, direction, across, empty, wavelength_nm, share)
+    step, slopes = _STEP * max(exact.film_mm), []
+    for moved in step * np.eye(2)[:, :, None]:
         ends = [_meet(raw, *_chief(exact, film_mm + s * moved, middle)[:2]) for s in (1.0, -1.0)]
         slopes.append((ends[0] - ends[1]) / (2 * step))
-    jacobian = np.stack(slopes, axis=1)  # [slope, film, N]
-    sound = np.isfinite(jacobian).all((0, 1)) & (np.abs(np.linalg.det(jacobian.transpose(2, 0, 1))) > 1e-12)
-    inverse = np.linalg.inv(jacobian.transpose(2, 0, 1)[sound]).transpose(1, 2, 0)
-    keep = (film_mm[:, sound], distance[sound], origin[:, sound], way[:, sound], across[..., sound])
-    return Places(*keep, inverse, wavelength_nm, share)
+    jacobian = np.stack(slopes, axis=1).transpose(2, 0, 1)  # [N, slope, film]
+    sound = np.isfinite(jacobian).all((1, 2)) & (np.abs(np.linalg.det(jacobian)) > 1e-12)
+    return replace(raw.at(np.flatnonzero(sound)), to_film=np.linalg.inv(jacobian[sound]).transpose(1, 2, 0))
 
 
 def footprints(camera: Camera, places: Places, samples: int = 16) -> Footprints:
     """Footprints of a camera at places, by `samples` by `samples` stratified points of its pupil."""
     steps = (np.arange(samples) + 0.5) / samples
-    found, shape = _sampled(camera, places, np.stack(np.meshgrid(steps, steps)).reshape(2, -1))
+    rays, shape = _sampled(camera, places, np.stack(np.meshgrid(steps, steps)).reshape(2, -1))
     points = shape[0]
-    origin, way = (a.astype(np.float64).reshape(3, points, -1) for a in (found.origin_m, found.direction))
-    slope = _meet(places, origin, way)
+    origin, direction = (a.astype(np.float64).reshape(3, points, -1) for a in (rays.origin_m, rays.direction))
+    slope = _meet(places, origin, direction)
     place = np.einsum("ijn,jnk->ink", places.to_film, slope).reshape(2, *shape)
-    from_chief = origin - places.origin_m[:, :, None]
-    along = (from_chief * places.direction[:, :, None]).sum(0) / (way * places.direction[:, :, None]).sum(0)
-    at_pupil = from_chief - along * way
+    from_chief, chief = origin - places.origin_m[:, :, None], places.direction[:, :, None]
+    at_pupil = from_chief - (from_chief * chief).sum(0) / (direction * chief).sum(0) * direction
     across = 1e3 * np.einsum("icn,cnk->ink", places.across, at_pupil).reshape(2, *shape)
-    weight = np.where(np.isfinite(place).all(0), found.weight.astype(np.float64).reshape(shape), 0.0)
+    weight = np.where(np.isfinite(place).all(0), rays.weight.astype(np.float64).reshape(shape), 0.0)
     return Footprints(np.where(weight > 0, place, 0.0), np.where(weight > 0, across, 0.0), weight)
 
 
@@ -139,8 +142,8 @@ def light_beside(camera: Camera, places: Places) -> Array:
     angle = 2 * np.pi * (np.arange(_BESIDE_POINTS) + 0.5) / _BESIDE_POINTS
     edge = np.stack([np.cos(angle), np.sin(angle)])
     square = 0.5 + 0.5 * (1 + _BESIDE) * edge / np.abs(edge).max(0)  # outlines go on beyond the edge of the square
-    found, shape = _sampled(camera, places, square)
-    return np.asarray(2 * _BESIDE * found.weight.astype(np.float64).reshape(shape).mean((1, 2)))
+    rays, shape = _sampled(camera, places, square)
+    return np.asarray(2 * _BESIDE * rays.weight.astype(np.float64).reshape(shape).mean((1, 2)))
 
 
 def left_to(exact: Footprints, thin: Footprints, share: Array, afterwards: Collection[str]) -> Footprints:
@@ -175,13 +178,11 @@ def effects_mm(exact: Footprints, thin: Footprints, share: Array) -> dict[str, A
     the pupil point: by degree, each part orthogonal to those below it over the light that passes (as Zernike's are over
     a disc: coma with the tilt that balances it, spherical aberration with its best focus).
     """
-    (centre, by_wave), (ideal, _) = centroids(exact, share), centroids(thin, share)
-    linear, parts = _expanded(exact, by_wave)
-    plain, _ = _expanded(thin, centroids(thin, share)[1])
+    (centre, by_wave), (ideal, ideal_by_wave) = centroids(exact, share), centroids(thin, share)
+    (linear, parts), (plain, _) = _expanded(exact, by_wave), _expanded(thin, ideal_by_wave)
     size = _pupil_size(exact)
-    mean = np.einsum("ijnw,w->ijn", linear, share)
-    own = np.einsum("ijnw,w->ijn", plain, share)
-    extra = mean - own
+    mean, defocus = (np.einsum("ijnw,w->ijn", part, share) for part in (linear, plain))
+    extra = mean - defocus
     focus = (extra[0, 0] + extra[1, 1]) / 2
     bent = extra - focus * np.eye(2)[:, :, None]
     colour = (linear - mean[..., None])[[0, 1], [0, 1]].mean(0)
@@ -191,10 +192,10 @@ def effects_mm(exact: Footprints, thin: Footprints, share: Array) -> dict[str, A
 
     return {
         "distortion": np.hypot(*(centre - ideal)),
-        "defocus": _of_matrix(own) * size,
+        "defocus": np.sqrt((defocus**2).sum((0, 1))) * size,
         "spherical aberration": over_waves(parts[1]),
         "coma": over_waves(parts[0]),
-        "astigmatism": _of_matrix(bent) * size,
+        "astigmatism": np.sqrt((bent**2).sum((0, 1))) * size,
         "field curvature": np.abs(focus) * size * np.sqrt(2),
         "higher orders": over_waves(parts[2]),
         "longitudinal colour": over_waves(colour**2) * size * np.sqrt(2),
@@ -227,19 +228,16 @@ def _chief(camera: Camera, film_mm: Array, nanometres: float) -> tuple[Array, Ar
     return rays.origin_m.astype(np.float64), rays.direction.astype(np.float64), lit
 
 
-def _meet(places: Places, origin: Array, way: Array) -> Array:
-    """Slopes [2, N(, K)] against the chief rays of where rays [3, N(, K)] meet the planes of what they show."""
-    more = (slice(None), slice(None)) + (None,) * (origin.ndim - 2)
-    base, along, near = places.origin_m[more], places.direction[more], 1 / places.distance_m[more[1:]]
-    rate = (way * along).sum(0)
-    from_base = origin - base
+def _meet(places: Places, origin: Array, direction: Array) -> Array:
+    """Slopes [2, N(, K)] against the chief rays at which rays [3, N(, K)] meet the planes at the places' distances."""
+    new = (None,) * (origin.ndim - 2)
+    base, along, near = places.origin_m[..., *new], places.direction[..., *new], 1 / places.distance_m[..., *new]
+    rate, from_base = (direction * along).sum(0), origin - base
     with np.errstate(all="ignore"):
         # Everything over the distance, so that the plane may lie at infinity.
         step = (1 - near * (from_base * along).sum(0)) / rate
-        meet = near * from_base + step * way
-        meet = np.where(rate > 1e-3, meet, np.nan)
-    axes: Any = places.across[(slice(None), slice(None), slice(None)) + (None,) * (origin.ndim - 2)]
-    return np.asarray((axes * meet).sum(1))
+        meet = np.where(rate > 1e-3, near * from_base + step * direction, np.nan)
+    return np.asarray((places.across[..., *new] * meet).sum(1))
 
 
 def centroids(prints: Footprints, share: Array) -> tuple[Array, Array]:
@@ -257,12 +255,12 @@ def _quantiles(value: Array, weight: Array) -> Array:
     with np.errstate(all="ignore"):
         middle = (np.cumsum(weight, -1) - weight / 2) / total
     steps = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
-    found = np.full((*value.shape[:2], _QUANTILES), np.nan)
+    quantiles = np.full((*value.shape[:2], _QUANTILES), np.nan)
     for n, w in np.ndindex(*value.shape[:2]):
         if total[n, w, 0] > 0:
             lit = weight[n, w] > 0
-            found[n, w] = np.interp(steps, middle[n, w][lit], value[n, w][lit])
-    return found
+            quantiles[n, w] = np.interp(steps, middle[n, w][lit], value[n, w][lit])
+    return quantiles
 
 
 def _pupil_size(prints: Footprints) -> Array:
@@ -270,10 +268,6 @@ def _pupil_size(prints: Footprints) -> Array:
     weight = prints.weight / np.maximum(prints.weight.sum(2, keepdims=True), 1e-300)
     mean = (prints.pupil_mm * weight).sum(3, keepdims=True)
     return np.asarray(np.sqrt((((prints.pupil_mm - mean) ** 2) * weight).sum((0, 3)).mean(1) / 2))
-
-
-def _of_matrix(matrix: Array) -> Array:
-    return np.asarray(np.sqrt((matrix**2).sum((0, 1))))
 
 
 def _expanded(prints: Footprints, centre: Array) -> tuple[Array, Array]:
@@ -286,11 +280,95 @@ def _expanded(prints: Footprints, centre: Array) -> tuple[Array, Array]:
     basis = np.stack([root * m for m in monomials], axis=-1)  # [N, W, P, 10]
     q, r = np.linalg.qr(basis)
     wanted = np.moveaxis((prints.place_mm - centre[..., None]) * root, 0, -1)  # [N, W, P, 2]
-    found = np.swapaxes(q, -1, -2) @ wanted  # [N, W, 10, 2]
+    factors = np.swapaxes(q, -1, -2) @ wanted  # [N, W, 10, 2]
     with np.errstate(all="ignore"):
         weak = np.abs(np.diagonal(r, axis1=-2, axis2=-1))[..., 1:3].min(-1) < 1e-9
-        steep = np.linalg.solve(np.where(weak[..., None, None], np.eye(2), r[..., 1:3, 1:3]), found[..., 1:3, :])
+        steep = np.linalg.solve(np.where(weak[..., None, None], np.eye(2), r[..., 1:3, 1:3]), factors[..., 1:3, :])
     linear = np.where(weak[..., None, None], 0.0, steep) / size[..., None]
-    square = (found**2).sum(-1)
+    square = (factors**2).sum(-1)
     rest = np.maximum((wanted**2).sum((-1, -2)) - square.sum(-1), 0.0)
     return linear.transpose(3, 2, 0, 1), np.stack([square[..., 3:6].sum(-1), square[..., 6:].sum(-1), rest])
+
+
+def upright(film: NDArray[_Real]) -> NDArray[_Real]:
+    """Rows by rising y and columns by rising x of the film (lens frame) as a picture shows them, turned by 180 degrees:
+    its top left is at +x, -y."""
+    return film[:, ::-1]
+
+
+def cell_centres(film_mm: tuple[float, float], shape: tuple[int, int]) -> tuple[Array, Array]:
+    """x and y in mm of the centres of equal cells of the film, rows and columns as in `shape`."""
+    x, y = (((np.arange(n) + 0.5) / n - 0.5) * side for n, side in zip(shape[::-1], film_mm, strict=True))
+    return x, y
+
+
+_ACROSS, _LEAST = 17, 4  # film points along the longer side, and along either
+_DEPTHS, _SAMPLES = 5, 12
+_AT_ONCE = 1 << 18  # pixels
+_NEAREST = 1e-3  # m from the entrance pupil
+
+
+def blur_map(probed: Probe) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Diameter of the blur in pixels, and depth in m along the axis from the film (inf: none), [H, W], upright.
+
+    The diameter is that of the disc whose light is as far from its middle, RMS: a thin lens's circle of confusion. It
+    is 0 where the chief ray is dark. The blur of a point depends on its place in the picture and its depth, smoothly:
+    footprints on a grid of film points at a few depths are interpolated, and each pixel takes its own depth, so that
+    nothing is smeared across edges. The square of an aberration-free lens's blur is a parabola of the inverse distance
+    from the entrance pupil.
+
+    Raises:
+        InputError: a picture beyond memory.
+    """
+    shot, film = probed.scene.settings.camera, np.array(probed.asked.shot.film_mm)
+    check_memory(shot.width, shot.height)
+    x, y = cell_centres(probed.asked.shot.film_mm, (shot.height, shot.width))
+    depth = np.empty((shot.height, shot.width), np.float32)
+    rows = max(_AT_ONCE // shot.width, 1)
+    bands = [slice(first, first + rows) for first in range(0, shot.height, rows)]
+    for band in bands:
+        points = np.stack(np.meshgrid(x, y[band])).reshape(2, -1)
+        depth[band] = seen_depths_m(probed.scene, probed.exact, points).reshape(-1, shot.width)
+    pupil = 1e-3 * float(probed.exact.settings["lens_state"]["entrance_pupil_offset_mm"] or 0.0)
+    near = 1 / np.maximum(np.where(np.isnan(depth), np.inf, depth) - pupil, _NEAREST)
+    nodes = _nodes(float(near.min()), float(near.max()))
+    surfaces = [_squares(probed, film, pupil + (1 / node if node else math.inf)) for node in nodes]
+    blur = np.empty_like(depth)
+    for band in bands:
+        parts = [s(y[band], x) * w for s, w in zip(surfaces, _lagrange(nodes, near[band]), strict=True)]
+        blur[band] = np.sqrt(np.maximum(sum(parts), 0.0)) / probed.asked.pixel_mm
+    blur[np.isnan(depth)] = 0
+    depth[np.isnan(depth)] = np.inf
+    return upright(blur), upright(depth)
+
+
+def _nodes(low: float, high: float) -> Array:
+    """Chebyshev's points of an interval, its ends among them; one if it is a point."""
+    if high - low <= 1e-6 * high:
+        return np.array([high])
+    return (low + high) / 2 - (high - low) / 2 * np.cos(np.arange(_DEPTHS) * (np.pi / (_DEPTHS - 1)))
+
+
+def _lagrange(nodes: Array, at: Array) -> list[Array]:
+    """Weights of the values at nodes for those elsewhere."""
+    return [
+        np.prod([(at - other) / (node - other) for other in nodes if other != node], axis=0, initial=1.0)
+        for node in nodes
+    ]
+
+
+def _squares(probed: Probe, film: Array, depth_m: float) -> RectBivariateSpline:
+    """The square of the diameter in mm over film y and x, of what lies at one depth."""
+    counts = [max(round(_ACROSS * side / film.max()), _LEAST) for side in film]
+    x, y = (np.linspace(-side / 2, side / 2, n) for side, n in zip(film, counts, strict=True))
+    points = np.stack(np.meshgrid(x, y)).reshape(2, -1)
+    share, nm = probed.places.share, probed.places.wavelength_nm
+    places = places_of(probed.exact, points, np.full(points.shape[1], depth_m), nm, share)
+    diameter = math.sqrt(2) * blur_mm(footprints(probed.exact, places, _SAMPLES), share)
+    square = np.full(counts[::-1], np.nan)
+    column, row = (np.rint((places.film_mm[k] / film[k] + 0.5) * (counts[k] - 1)).astype(int) for k in (0, 1))
+    square[row, column] = diameter**2
+    if np.isnan(square).any():  # dark points take the value of the nearest that is not
+        lit = ndimage.distance_transform_edt(np.isnan(square), return_distances=False, return_indices=True)
+        square = square[tuple(lit)]
+    return RectBivariateSpline(y, x, square, kx=3, ky=3)

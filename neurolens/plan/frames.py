@@ -1,17 +1,19 @@
 """One plan for the frames of an animation, whose focus, stop, zoom or place move: cameras that serve many of them.
 
-Frames that show the extremes, and some between, are probed. A camera that is there anyhow (ideal, exact, shipped)
-serves a frame as in a plan of one. Models fitted for the shot serve stretches of focus: the domain of each is all that
-its frames ask for, so that a stretch within another asks for less, and the fewest stretches are those which, from the
+Frames that show the extremes, and some between, are probed. A camera that needs no fit (ideal, exact, shipped) serves a
+frame as in a plan of one. Models fitted for the shot serve stretches of focus: the domain of each is all that its
+frames ask for, so that a stretch within another asks for less, and the fewest stretches are those which, from the
 nearest focus on, reach as far as the largest model keeps the budget. Each has the smallest model that does.
 """
 
 from __future__ import annotations
 
+import bisect
+import itertools
 import math
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,24 +24,23 @@ from neurolens.base.progress import Report
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.plan import footprints as prints
-from neurolens.plan.plan import (
-    UNIT,
+from neurolens.plan.candidates import (
+    FITTED,
     Choice,
     Target,
-    best_of,
     candidates,
-    exact_suffices,
     model_choice,
-    rest_of,
-)  # fmt: skip
-from neurolens.plan.probe import COUNTED, Effect, Probed, effects_of, probe
-from neurolens.plan.shot_fits import shot_domain, shot_fits, shot_terms
+    shot_domain,
+    shot_fits,
+    shot_terms,
+)
+from neurolens.plan.costs import UNIT
+from neurolens.plan.plan import best_of, exact_suffices, rest_of
+from neurolens.plan.probe import COUNTED, Effect, Probe, effects_of, probe
 from neurolens.render.scene import Scene
 from neurolens.setting.states import set_lens
-from neurolens.surrogates.targets import ModelSettings
 
 _MOST = 5  # frames that are probed, but for more extremes
-_HOW = "fitted for this shot"
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class Run:
 
 @dataclass(frozen=True)
 class FramesPlan:
-    """What an animation needs.
+    """The cameras of an animation.
 
     Attributes:
         probed: frames that were looked at. effects: the dearest of them, with breathing. runs: in order of frames.
@@ -110,21 +111,21 @@ def plan_frames(
         raise InputError("plan", "frames", len(frames), "one or more, and a budget of 0 or more pixels")
     say = report or (lambda done, left=None: None)
     chosen = representatives(frames)
-    founds: list[Probed] = []
+    probes: list[Probe] = []
     for frame in chosen:
-        founds.append(probe(frame.scene, set_lens(lens, zoom=frame.zoom), afterwards=afterwards, denoised=denoised))
-        say(0.4 * len(founds) / len(chosen))
+        probes.append(probe(frame.scene, set_lens(lens, zoom=frame.zoom), afterwards=afterwards, denoised=denoised))
+        say(0.4 * len(probes) / len(chosen))
     best: list[Choice | None] = []
-    rest = rest_of(chosen[0].scene, founds[0], target)
-    for found in founds:
-        tried = candidates(found, (budget_px,), target, models=models)
+    rest = rest_of(chosen[0].scene, probes[0], target)
+    for probed in probes:
+        tried = candidates(probed, (budget_px,), target, models=models)
         best.append(best_of([c for c in tried if c.meets(budget_px)], rest))
-        say(0.4 + 0.3 * len(best) / len(founds))
+        say(0.4 + 0.3 * len(best) / len(probes))
     fits = 0
-    if folder is not None and not exact_suffices(founds[0], rest):
-        # What has no camera, or one that costs more than a small model may.
+    if folder is not None and not exact_suffices(probes[0], rest):
+        # Frames without a camera, or with one that costs more than a small model may.
         asks = [k for k, c in enumerate(best) if c is None or not c.name.startswith(("pinhole", "thin"))]
-        for rows, choice in _stretches([founds[k] for k in asks], target, budget_px, folder):
+        for rows, choice in _stretches([probes[k] for k in asks], target, budget_px, folder):
             cheaper = [asks[k] for k in rows if best_of([choice, *filter(None, [best[asks[k]]])], rest) is choice]
             fits += bool(cheaper)
             for k in cheaper:
@@ -132,10 +133,9 @@ def plan_frames(
             say(0.7 + 0.3 * (1 + max(rows)) / len(asks))
     say(1.0)
     served = [best[_nearest(frame, chosen)] for frame in frames]
-    costs = [c.cost if c else math.nan for c in served]
-    mean = float(np.mean(costs))
+    mean = float(np.mean([c.cost if c else math.nan for c in served]))
     return FramesPlan(
-        budget_px, target, UNIT[target], tuple(f.number for f in chosen), _effects(founds, budget_px),
+        budget_px, target, UNIT[target], tuple(f.number for f in chosen), _effects(probes, budget_px),
         tuple(_runs(frames, served)), fits, mean if math.isfinite(mean) else None,
     )  # fmt: skip
 
@@ -161,105 +161,87 @@ def _nearest(frame: Frame, chosen: Sequence[Frame]) -> int:
     )
 
 
-def _runs(frames: Sequence[Frame], served: Sequence[Choice | None]) -> Iterable[Run]:
-    start = 0
-    for k in range(1, len(frames) + 1):
-        if k == len(frames) or _camera(served[k]) != _camera(served[start]):
-            part = [c for c in served[start:k] if c is not None]
-            yield Run(frames[start].number, frames[k - 1].number, max(part, key=lambda c: c.error_px, default=None))
-            start = k
-
-
-def _camera(choice: Choice | None) -> tuple[str, str] | None:
-    return None if choice is None else (choice.name, choice.camera)
+def _runs(frames: Sequence[Frame], served: Sequence[Choice | None]) -> Iterator[Run]:
+    rows = zip(frames, served, strict=True)
+    for _, group in itertools.groupby(rows, lambda row: row[1] and (row[1].name, row[1].camera)):
+        some, choices = zip(*group, strict=True)
+        yield Run(some[0].number, some[-1].number, max(filter(None, choices), key=lambda c: c.error_px, default=None))
 
 
 def _stretches(
-    founds: Sequence[Probed], target: Target, budget_px: float, folder: Path
-) -> Iterable[tuple[list[int], Choice]]:
-    """Rows of `founds` that one model serves, and the model; what none serves is left out."""
-    order = sorted(range(len(founds)), key=lambda k: (_zoom(founds[k]), founds[k].asked.shot.focus_m))
-    sizes, done = shot_terms(founds[0]) if founds else [], 0
+    probes: Sequence[Probe], target: Target, budget_px: float, folder: Path
+) -> Iterator[tuple[list[int], Choice]]:
+    """Rows of `probes` that one model serves, and the model; rows that none serves are left out."""
+    order = sorted(range(len(probes)), key=lambda k: (_zoom(probes[k]), probes[k].asked.shot.focus_m))
+    sizes, done = shot_terms(probes[0]) if probes else [], 0
     while done < len(order):
+        fit_of = cache(lambda n, at=done: _stretch([probes[k] for k in order[at : at + n]], target, budget_px, folder))
         # From here on to as far as the largest model reaches: halves, for less is easier.
-        same = sum(_zoom(founds[k]) == _zoom(founds[order[done]]) for k in order[done:])
-        low, high, fit = 0, same, None
-        while low < high:
-            count = (low + high + 1) // 2
-            trial = _Stretch([founds[k] for k in order[done : done + count]], target, budget_px, folder)
-            if trial.choice(sizes[-1]) is not None:
-                low, fit = count, trial
-            else:
-                high = count - 1
-        if fit is None:
-            done += 1
-            continue
-        small, large = 0, len(sizes) - 1  # the least that holds
-        while small < large:
-            middle = (small + large) // 2
-            small, large = (small, middle) if fit.choice(sizes[middle]) is not None else (middle + 1, large)
-        choice = fit.choice(sizes[small], costed=True)
-        assert choice is not None
-        yield order[done : done + low], choice
-        done += low
+        same = sum(_zoom(probes[k]) == _zoom(probes[order[done]]) for k in order[done:])
+        count = bisect.bisect_left(range(1, same + 1), True, key=lambda n: fit_of(n)(sizes[-1], False) is None)
+        if count:
+            fit = fit_of(count)
+            least = bisect.bisect_left(sizes[:-1], True, key=lambda terms: fit(terms, False) is not None)
+            choice = fit(sizes[least], True)
+            assert choice is not None
+            yield order[done : done + count], choice
+        done += max(count, 1)
 
 
-def _zoom(found: Probed) -> float:
+def _zoom(probed: Probe) -> float:
     """Frames of one lens state, but for its film and stop, can share a model."""
-    return round(first_order(found.lens).efl_mm, 6)
+    return round(first_order(probed.lens).efl_mm, 6)
 
 
-class _Stretch:
-    """Models for all that some frames ask of a lens."""
+def _stretch(
+    probes: Sequence[Probe], target: Target, budget_px: float, folder: Path
+) -> Callable[[int, bool], Choice | None]:
+    """A function that fits a model of a size over the domain that holds the domains of all frames.
 
-    def __init__(self, founds: Sequence[Probed], target: Target, budget_px: float, folder: Path) -> None:
-        self.founds, self.target, self.budget_px, self.folder = founds, target, budget_px, folder
-        near, far = (f(p.asked.shot.focus_m for p in founds) for f in (min, max))
-        self.name = f"shot-{near:.4g}-{far:.4g}m" if near < far else f"shot-{near:.4g}m"
-        self._files: dict[int, tuple[Path, ModelSettings]] = {}
+    Arguments are the size and whether the cost is asked for. It returns the model with its largest error over the
+    frames, or None where one is beyond the budget.
+    """
+    near, far = (f(p.asked.shot.focus_m for p in probes) for f in (min, max))
+    name = f"shot-{near:.4g}-{far:.4g}m" if near < far else f"shot-{near:.4g}m"
+    ends = [focus for p in probes for focus in shot_domain(p).focus_m or ()]
+    widest = min(probes, key=lambda p: p.asked.f_number)
+    radius = max(p.domain.film_radius_mm for p in probes)
+    domain = replace(shot_domain(widest), film_radius_mm=radius, focus_m=(max(ends), min(ends)))
+    fit = cache(shot_fits(widest, folder, domain, name))
 
-    @cached_property
-    def fit(self) -> Callable[[int], tuple[Path, ModelSettings]]:
-        """Fit a model over the domain that holds the domains of all frames."""
-        ends = [focus for p in self.founds for focus in shot_domain(p).focus_m or ()]
-        widest = min(self.founds, key=lambda p: p.asked.f_number)
-        radius = max(p.domain.film_radius_mm for p in self.founds)
-        choice = replace(shot_domain(widest), film_radius_mm=radius, focus_m=(max(ends), min(ends)))
-        return shot_fits(widest, self.folder, choice, self.name)
-
-    def choice(self, terms: int, costed: bool = False) -> Choice | None:
-        """The model of a size, with its largest error over the frames; None where one is beyond the budget."""
-        if terms not in self._files:
-            self._files[terms] = self.fit(terms)
-        file, settings = self._files[terms]
-        found: list[Choice] = []
-        for probed in self.founds:
-            made = model_choice(probed, self.target, file, _HOW, costed and not found)
-            if made is None or not made.meets(self.budget_px):
+    def choice(terms: int, costed: bool) -> Choice | None:
+        file, settings = fit(terms)
+        choices: list[Choice] = []
+        for probed in probes:
+            made = model_choice(probed, target, file, FITTED, costed and not choices)
+            if made is None or not made.meets(budget_px):
                 return None
-            found.append(made)
-        worst = max(found, key=lambda c: c.error_px)
-        light = max(c.light_error for c in found)
-        return replace(worst, cost=found[0].cost, noise=found[0].noise, light_error=light, settings=settings)
+            choices.append(made)
+        worst = max(choices, key=lambda c: c.error_px)
+        light = max(c.light_error for c in choices)
+        return replace(worst, cost=choices[0].cost, noise=choices[0].noise, light_error=light, settings=settings)
+
+    return choice
 
 
-def _effects(founds: Sequence[Probed], budget_px: float) -> tuple[Effect, ...]:
-    """Collect the largest of each effect over the frames, and breathing; stray light is that of the first frame."""
+def _effects(probes: Sequence[Probe], budget_px: float) -> tuple[Effect, ...]:
+    """The largest of each effect over the frames, and breathing; stray light is that of the first frame."""
     every: dict[str, Effect] = {}
-    for k, found in enumerate(founds):
-        for effect in effects_of(found, budget_px, stray=k == 0):
-            if effect.name not in every or effect.worth > every[effect.name].worth:
-                every[effect.name] = effect
-    if (worth := breathing_px(founds)) is not None:
+    for k, probed in enumerate(probes):
+        for effect in effects_of(probed, budget_px, stray=k == 0):
+            every[effect.name] = max(every.get(effect.name, effect), effect, key=lambda e: e.worth)
+    if (worth := breathing_px(probes)) is not None:
         needed = worth[0] > budget_px
         every["breathing"] = Effect("breathing", *worth, "px", needed, "" if needed else "left out")
     return tuple(sorted(every.values(), key=lambda e: (e.unit, -e.worth)))
 
 
-def breathing_px(founds: Sequence[Probed]) -> tuple[float, float, float] | None:
-    """By how much the picture of what stays in its place moves while the focus does, between its extremes, in pixels:
-    what 95% of the picture keeps, the median, and the share beyond a pixel; None without a movement of focus."""
-    near, far = (f(founds, key=lambda p: p.asked.shot.focus_m) for f in (min, max))
+def breathing_px(probes: Sequence[Probe]) -> tuple[float, float, float] | None:
+    """The movement in pixels of the picture of things that stay in place, while the focus moves between its extremes.
+
+    The bound that 95% of the picture keeps, the median, and the share beyond a pixel; None without a movement of focus.
+    """
+    near, far = (f(probes, key=lambda p: p.asked.shot.focus_m) for f in (min, max))
     if near.asked.shot.focus_m == far.asked.shot.focus_m or _zoom(near) != _zoom(far):
         return None
     moved = prints.footprints(near.exact, far.places)

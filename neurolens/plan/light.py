@@ -1,13 +1,14 @@
-"""The light of a scene at a glance: a small picture of it, its spectrum, its contrast, and what a lens adds of its own.
+"""An overview of the light of a scene: a small picture, its spectrum and contrast, and the light that a lens adds.
 
-A small picture with few samples tells how bright the scene is where; two of other seeds, where it has contrast that is
-no noise. The lens's ghosts, glare and stars of the scene's own lights, drawn on as few pixels, are set against it.
+A small picture with few samples shows where the scene is bright; two of other seeds, where it has contrast that is no
+noise. The lens's ghosts, glare and stars of the scene's own lights, drawn on as few pixels, are set against it.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,7 @@ Array = NDArray[np.float64]
 
 ACROSS = 48  # pixels of the small picture along its longer side
 BLACK = 0.01  # of the picture's mean: relative to less than that nothing counts
-STRAY = {"ghosts": "flare", "glare": "glare", "starburst": "star-bursts"}  # layers, and what a plan calls them
+STRAY = {"ghosts": "flare", "glare": "glare", "starburst": "star-bursts"}  # layers, and their names in a plan
 _SAMPLES = 16
 _MOST_LIGHTS = 8
 _STARS = 2  # lights whose stars are drawn, the brightest in view: a second each
@@ -44,13 +45,14 @@ _TAIL = 1e-3  # of the light, that its range leaves out at either end
 
 
 @dataclass(frozen=True)
-class Glance:
+class Overview:
     """A small picture of a scene.
 
     Attributes:
-        rgb: [H, W, 3] linear sRGB. contrast: [H, W] RMS relative difference of neighbours (one to the right and one
-            below), noise taken out. range_nm: of all but the last of its light by the eye; wavelength_nm, share: [W] of
-            that, of sum 1.
+        rgb: [H, W, 3] linear sRGB.
+        contrast: [H, W] RMS relative difference of neighbours (one to the right and one below), noise taken out.
+        range_nm: the range of all but the last of its light by the eye.
+        wavelength_nm, share: [W] of that, of sum 1.
     """
 
     rgb: Array
@@ -62,28 +64,29 @@ class Glance:
     @property
     def floor(self) -> float:
         """Radiance below which the picture is black."""
-        return max(BLACK * float(self.rgb.mean()), 1e-30)
+        return _floor(self.rgb)
 
 
-def glance(scene: Scene, camera: Camera) -> Glance:
+def _floor(rgb: Array) -> float:
+    return max(BLACK * float(rgb.mean()), 1e-30)
+
+
+def overview(scene: Scene, camera: Camera) -> Overview:
     """Look at a scene through a camera."""
     width, height = small_raster(camera.film_mm)
-    two = [
-        render(scene, camera, width=width, height=height, samples=_SAMPLES, seed=seed, threads=1).rgb.astype(np.float64)
-        for seed in (0, 1)
-    ]
+    drawn = partial(render, scene, camera, width=width, height=height, samples=_SAMPLES, threads=1)
+    two = [drawn(seed=seed).rgb.astype(np.float64) for seed in (0, 1)]
     rgb = (two[0] + two[1]) / 2
     steps = [_steps(picture.mean(-1)) for picture in two]
     # Noise of two seeds is independent: its product is 0 on the mean.
     square = (steps[0] * steps[1]).mean(0)
-    floor = max(BLACK * float(rgb.mean()), 1e-30)
-    contrast = np.sqrt(np.maximum(square, 0)) / np.maximum(rgb.mean(-1), floor)
-    return Glance(rgb, contrast, *light_of(scene, camera, rgb.mean((0, 1))))
+    contrast = np.sqrt(np.maximum(square, 0)) / np.maximum(rgb.mean(-1), _floor(rgb))
+    return Overview(rgb, contrast, *light_of(scene, camera, rgb.mean((0, 1))))
 
 
-def small_raster(film_mm: tuple[float, float]) -> tuple[int, int]:
-    """Width and height in pixels."""
-    width, height = (max(round(ACROSS * side / max(film_mm)), 1) for side in film_mm)
+def small_raster(film_mm: tuple[float, float], across: int = ACROSS) -> tuple[int, int]:
+    """Width and height in pixels of a picture with so many along its longer side."""
+    width, height = (max(round(across * side / max(film_mm)), 1) for side in film_mm)
     return width, height
 
 
@@ -124,7 +127,7 @@ def parts_of(nm: Array, seen: Array, first: int, last: int, count: int) -> tuple
     return np.bincount(part, seen * nm, count)[lit] / share[lit], share[lit] / share[lit].sum()
 
 
-def stray_light(scene: Scene, camera: Any, seen: Glance, white_balance: str | None = None) -> dict[str, Array]:
+def stray_light(scene: Scene, camera: Any, seen: Overview) -> dict[str, Array]:
     """Light that the lens adds, relative to the small picture, [H, W] by name of `STRAY`; the most of its colours.
 
     The lights are those of the scene, in view or not, and highlights of the picture that are not their images. What
@@ -152,10 +155,10 @@ def stray_light(scene: Scene, camera: Any, seen: Glance, white_balance: str | No
     only = replace(settings, glare=0, starburst=True, without=("ghosts",))
     layers |= flare_layers(FlareJob(lens, stars, raster, only, light_nm, threads=1)) if stars else {}
     base = np.maximum(seen.rgb.mean(-1), seen.floor)
-    return {told: layers[name].max(-1) / base if name in layers else none for name, told in STRAY.items()}
+    return {effect: layers[name].max(-1) / base if name in layers else none for name, effect in STRAY.items()}
 
 
-def _highlights(camera: Any, seen: Glance, known: list[Light]) -> list[Light]:
+def _highlights(camera: Any, seen: Overview, known: list[Light]) -> list[Light]:
     """Bright regions of the picture that are not where a known light is."""
     threshold = _HIGHLIGHT * float(seen.rgb.mean())
     if not threshold > 0 or not (seen.rgb.max(-1) >= threshold).any():
@@ -169,10 +172,8 @@ def _highlights(camera: Any, seen: Glance, known: list[Light]) -> list[Light]:
 
 
 def _steps(picture: Array) -> Array:
-    """Differences [2, H, W] to the neighbours on the right and below; the last ones as those before."""
-    found = []
-    for axis in (1, 0):
-        step = np.diff(picture, axis=axis)
-        last = np.take(step, [-1], axis) if step.shape[axis] else np.zeros_like(picture)
-        found.append(np.concatenate([step, last], axis))
-    return np.stack(found)
+    """Differences [2, H, W] to the neighbours on the right and below; the last ones repeat those before."""
+    steps = [np.diff(picture, axis=axis) for axis in (1, 0)]
+    pads = ((0, 0), (0, 1)), ((0, 1), (0, 0))
+    edged = (np.pad(s, pad, "edge") if s.size else np.zeros_like(picture) for s, pad in zip(steps, pads, strict=True))
+    return np.stack([*edged])

@@ -1,120 +1,65 @@
-"""The cheapest camera that shows a scene as the lens does, within a budget; the exact lens where that saves too little.
+"""The camera for a scene by a budget of error, time or visible difference; and the trade of error against time.
 
 A camera's error is the distance of its footprints from the exact lens's in pixels, and of its light, at the places of a
-scene that a `probe` finds; both count where they are largest but for 5% of the picture.
+scene that a `probe` finds; both count where they are largest but for 5% of the picture. Its cost is the time of a ray
+in the target named, times the noise of its weights: see `costs`. In C and onnxruntime it is measured here, with one
+thread; for shaders it is counted. The exact lens is chosen where the cheapest camera saves too little.
 
-Cost is what a ray takes in the target named, times the noise of its weights: see `costs`. In C and onnxruntime that is
-measured here, with one thread; of shaders it is counted.
+Seconds are of one thread, for the scene's own size and samples. They are those that a camera adds to a camera that
+costs nothing and whose rays all weigh the same: the time of its own rays, and the scene's time for the further rays
+that its noise asks for. The scene's time for a ray is measured by a small picture in our renderer; in other targets the
+camera alone counts, in Cycles under a white sky.
 """
 
 from __future__ import annotations
 
+import bisect
 import math
 import os
-import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from neurolens.base.errors import InputError, ModelError, NeurolensWarning
-from neurolens.base.lensname import IDEAL_OF, split_kind
+from neurolens.base.errors import InputError
+from neurolens.base.lensname import split_kind
 from neurolens.base.progress import Report
-from neurolens.base.records import Timing, noisy
+from neurolens.base.records import pareto_front
 from neurolens.base.settings import to_toml
 from neurolens.base.tomlfile import format_toml
-from neurolens.cameras.build import ideal_as
-from neurolens.cameras.contract import Camera
-from neurolens.cameras.model import OnnxCamera, OnnxLens, load_model
-from neurolens.cameras.warped import Warped
-from neurolens.graph.compiler import has_compiler
-from neurolens.graph.scalars import lower
+from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.lens.prescription import Lens
-from neurolens.plan import footprints as prints
-from neurolens.plan.costs import (
-    CYCLES_NS,
-    GLSL_OPERATIONS,
-    UNIT,
-    glsl_operations,
-    noise,
-    ns_a_ray,
-    rest_ns,
-    shader_cost,
-)
-from neurolens.plan.footprints import Footprints
-from neurolens.plan.probe import COUNTED, LIGHT, Asked, Effect, Probed, effects_of, probe
-from neurolens.plan.shot_fits import PAIRS, shot_domain, shot_fits, shot_terms
+from neurolens.plan.candidates import EXACT, PAIRS, Choice, Target, camera_of, candidates, shot_domain
+from neurolens.plan.costs import UNIT, ns_a_ray, rest_ns, small
+from neurolens.plan.probe import LIGHT, Effect, Probe, SceneNeeds, effects_of, probe
+from neurolens.render.renderer import render
 from neurolens.render.scene import Scene
-from neurolens.shaders.blender_shader import lens_of
 from neurolens.study.advice import recommended
 from neurolens.study.experiment import DomainChoice, EvaluationChoice, Experiment, LensChoice
-from neurolens.surrogates.targets import ModelSettings
+from neurolens.study.image import Image, flip_map
 
-Target = Literal["render", "c", "onnx", "osl", "glsl"]
-Cost = Callable[[], tuple[Timing, float]]  # of a ray, and noise
-_OURS = ("render", "c")  # run compiled C
-_EXACT, _IDEAL = "exact", ("pinhole", "thin", "thick")
-_MAPPED = " + ST map"  # after the name of an ideal camera
-_SHOT = "fitted for this shot"
-_CLOSE = 1.3  # times the operations of the smallest model that holds, up to which others of its form are timed
-_MOST_OVERSCAN = 4.0  # of a plane picture that is warped afterwards
-
-
-@dataclass(frozen=True)
-class Choice:
-    """A camera that was tried.
-
-    Attributes:
-        camera: as `--camera` takes it, or what `export` takes. error_px, light_error: at the counted percentile; inf
-            where it has no light that the lens has. cost: of a ray, in the plan's unit, times `noise`; inf where it was
-            not asked for. noise: how many times the rays it needs for equal error, see `costs`.
-        spread: how many times as long as the least the median of its timed calls took (1 where cost is counted).
-        how: what else it needs, or how it was made. within: whether it meets the budget of its plan.
-        settings: of a model that was fitted for the shot. flip: of its picture, where a budget of FLIP asked for it.
-    """
-
-    name: str
-    camera: str
-    error_px: float
-    light_error: float
-    cost: float
-    noise: float
-    how: str = ""
-    within: bool = False
-    settings: ModelSettings | None = None
-    flip: float | None = None
-    spread: float = 1.0
-
-    @property
-    def noisy(self) -> bool:
-        """Whether the timing spreads too far to tell it from one that is a little shorter: see `records.noisy`."""
-        return noisy({"min": 1.0, "median": self.spread})
-
-    def meets(self, budget_px: float) -> bool:
-        """Whether it may be used."""
-        return self.error_px <= budget_px and self.light_error <= LIGHT
-
-
-_SHOWN = "film_mm", "focus_m", "f_number", "wavelength_nm"  # settings of the shot in `Plan.to_dict`
+_SHOT_KEYS = "film_mm", "focus_m", "f_number", "wavelength_nm"  # settings of the shot in `Plan.to_dict`
+_ACROSS, _SAMPLES = 240, 16  # of pictures
+_STRIPS, _STRIP_ROWS, _STRIP_PATHS = 3, 16, 2_000_000  # of a picture: their number, least rows, paths of all
+_SHOWN = 8  # most of them, beside the exact lens
+_BUDGETS = (1.0, 0.25, 0.05)  # that polynomials are fitted for, besides the one asked for
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What was asked, the effects in falling order of worth, every camera tried by rising cost, the one to use.
+    """A scene's needs, the effects in falling order of worth, every camera tried by rising cost, the one to use.
 
     Attributes:
         budget_s, budget_flip: seconds, or FLIP difference, of a plan for those, whose `budget_px` is then the error of
             the best camera.
         unit: of costs: "ns" or, where no time is known, "operations". domain: of models that are fitted.
-        rest: what a path takes besides its camera, in the same unit; 0 where the camera alone counts.
+        rest: cost of a path besides its camera, in the same unit; 0 where the camera alone counts.
     """
 
-    asked: Asked
+    asked: SceneNeeds
     budget_px: float
     budget_s: float | None
     target: Target
@@ -123,17 +68,17 @@ class Plan:
     effects: tuple[Effect, ...]
     choices: tuple[Choice, ...]
     best: Choice | None
-    probed: Probed
+    probed: Probe
     budget_flip: float | None = None
     rest: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able: what is above `probed`."""
-        told = asdict(replace(self, probed=None))  # type: ignore[arg-type]
-        del told["probed"]
-        shot = told["asked"].pop("shot")
-        told["asked"] = {name: shot[name] for name in _SHOWN} | told["asked"]
-        return told
+        """JSON-able: all fields but `probed`."""
+        fields = asdict(replace(self, probed=None))  # type: ignore[arg-type]
+        del fields["probed"]
+        shot = fields["asked"].pop("shot")
+        fields["asked"] = {name: shot[name] for name in _SHOT_KEYS} | fields["asked"]
+        return fields
 
     def to_toml(self, lens: Lens, folder: Path) -> str:
         """The text of a file in a folder that `render` and `export` take for the best camera, and `train` as the
@@ -170,54 +115,32 @@ def plan(
     """
     if not budget_px >= 0:
         raise InputError("plan", "budget_px", budget_px, "0 or more pixels")
-    found = probe(scene, lens, **look)
-    rest = rest_of(scene, found, target)
-    folder = folder if explain or not exact_suffices(found, rest) else None
-    tried = candidates(found, (budget_px,), target, models=models, folder=folder, explain=explain, report=report)
-    return decided(found, tried, budget_px, target, rest)
+    probed = probe(scene, lens, **look)
+    rest = rest_of(scene, probed, target)
+    folder = folder if explain or not exact_suffices(probed, rest) else None
+    tried = candidates(probed, (budget_px,), target, models=models, folder=folder, explain=explain, report=report)
+    return decided(probed, tried, budget_px, target, rest)
 
 
-def rest_of(scene: Scene, found: Probed, target: Target) -> float:
-    """What a path takes besides its camera: in our renderer by a small picture, in other targets 0."""
-    return rest_ns(scene, found.exact) if target == "render" else 0.0
+def rest_of(scene: Scene, probed: Probe, target: Target) -> float:
+    """Cost of a path besides its camera: in our renderer by a small picture, in other targets 0."""
+    return rest_ns(scene, probed.exact) if target == "render" else 0.0
 
 
-def exact_suffices(found: Probed, rest: float) -> bool:
+def exact_suffices(probed: Probe, rest: float) -> bool:
     """Whether not even a camera that costs nothing would save enough, so that nothing needs to be fitted."""
-    exact = ns_a_ray(found.exact, found.places)["min"] if rest else math.inf
+    exact = ns_a_ray(probed.exact, probed.places)["min"] if rest else math.inf
     return recommended((0.0,), float, exact, rest) == exact
 
 
-def candidates(
-    found: Probed, budgets_px: Sequence[float], target: Target, *, models: Sequence[Path] = (),
-    folder: Path | None = None, explain: bool = False, report: Report | None = None,
-) -> tuple[Choice, ...]:  # fmt: skip
-    """Cameras with error and cost, enough to decide for each of some budgets; arguments as of `plan`."""
-    say = report or (lambda done, left=None: None)
-    say(0.2)
-    trial = _Trial(found, target, tuple(budgets_px), explain)
-    tried = [*_ideal(trial), *_exact(trial)]
-    # What one thread fits and the other looks at has nothing to do with each other. A film beyond the end of a model's
-    # range is not told of: its error counts.
-    with warnings.catch_warnings(), ThreadPoolExecutor(1) as other:
-        warnings.simplefilter("ignore", NeurolensWarning)
-        shipped = other.submit(_shipped, trial, models)
-        if not explain:  # what the lens adds to the light
-            other.submit(lambda: found.maps)
-        fitted = [] if folder is None else _fitted(trial, folder, tried, lambda done, left=None: say(0.2 + 0.6 * done))
-        tried += shipped.result() + fitted
-        say(0.8)
-        return tuple(_costed(trial, tried))
-
-
 def best_of(within: Sequence[Choice], rest: float | None) -> Choice | None:
-    """The camera to use of those within a budget; `rest` as of `decided`."""
-    exact = next((c for c in within if c.name == _EXACT and math.isfinite(c.cost)), None)
+    """The camera to use of those within a budget; `rest` as for `decided`."""
+    exact = next((c for c in within if c.name == EXACT and math.isfinite(c.cost)), None)
     return recommended(within, lambda c: c.cost, None if rest is None else exact, rest or 0.0)
 
 
 def decided(
-    found: Probed, tried: Sequence[Choice], budget_px: float, target: Target, rest: float | None = None
+    probed: Probe, tried: Sequence[Choice], budget_px: float, target: Target, rest: float | None = None
 ) -> Plan:
     """The plan for a budget, from candidates that serve it.
 
@@ -226,254 +149,218 @@ def decided(
     """
     ranked = tuple(replace(c, within=c.meets(budget_px)) for c in sorted(tried, key=lambda c: c.cost))
     best = best_of([c for c in ranked if c.within], rest)
-    effects = effects_of(found, budget_px)
+    effects = effects_of(probed, budget_px)
     return Plan(
-        found.asked, budget_px, None, target, UNIT[target], shot_domain(found), effects, ranked, best, found,
+        probed.asked, budget_px, None, target, UNIT[target], shot_domain(probed), effects, ranked, best, probed,
         rest=rest or 0.0,
     )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class _Judged:
-    """A camera with its errors, and what tells the cost of a ray and its noise.
-
-    Attributes:
-        form: of models, "ols" or another method. size: operations of a ray. Where both are given, a model of more size
-            is taken to cost no less than one of the same form.
-    """
+class Offer:
+    """A camera with the seconds of one thread that it adds (10^9 operations, where no time is known), by the least of
+    its timed calls; by their median it takes `more` than that."""
 
     choice: Choice
-    cost: Cost
-    form: str = ""
-    size: int = 0
+    seconds: float
+    more: float = 0.0
 
 
 @dataclass(frozen=True)
-class _Trial:
-    """What cameras are tried for, and whether all are to have their cost."""
+class CameraPicture:
+    """A camera's small picture [H, W, 3], linear, and its FLIP from the exact lens's of the same random numbers."""
 
-    found: Probed
-    target: Target
-    budgets_px: tuple[float, ...]
-    explain: bool = False
-
-    @property
-    def share(self) -> prints.Array:
-        """The share of the scene's light that each wavelength stands for."""
-        return self.found.places.share
+    offer: Offer
+    rgb: FloatArray
+    difference: Image
 
     @property
-    def by_size(self) -> bool:
-        """Whether costs rise with size; shaders of models have pupils and noise of their own."""
-        return self.target != "osl" and not self.explain
-
-    def judged(
-        self, name: str, spec: str, seen: Footprints, cost: Cost, how: str = "", form: str = "", size: int = 0,
-        beside: prints.Array | float = 0.0,
-    ) -> _Judged:  # fmt: skip
-        """A camera's error against the exact footprints, its cost not told yet; `beside`: light outside the lens's."""
-        found = self.found
-        apart = prints.distance_mm(found.wanted, seen, self.share) / found.asked.pixel_mm
-        light = np.abs(seen.light / np.maximum(found.wanted.light, 1e-30) - 1) + beside
-        if "distortion" in found.asked.afterwards:  # its map corrects light, too
-            light = np.where(seen.light > 0, 0.0, light)
-        error, dim = (float(np.percentile(np.where(np.isfinite(v), v, np.inf), COUNTED)) for v in (apart, light))
-        choice = Choice(name, spec, error, dim, math.inf, noise(seen.weight, self.share), how)
-        return _Judged(choice, cost, form, size)
-
-    def costed(self, judged: _Judged) -> Choice:
-        """A camera with its cost."""
-        choice, (timing, times) = judged.choice, judged.cost()
-        # A shader that does not focus so near shows nothing.
-        return replace(
-            choice,
-            cost=timing["min"] * (1.0 if self.found.asked.denoised else times),
-            noise=times,
-            spread=timing["median"] / timing["min"] if timing["min"] else 1.0,
-            error_px=choice.error_px if math.isfinite(times) else math.inf,
-        )
-
-    def timed(self, camera: Camera, seen: Footprints) -> tuple[Timing, float]:
-        return ns_a_ray(camera, self.found.places), noise(seen.weight, self.share)
-
-    def ideal(self, name: str, camera: Camera, seen: Footprints, area: float = 1.0) -> tuple[Timing, float]:
-        """The cost of a camera without a lens, whose picture is so many times as large."""
-        known = {"osl": CYCLES_NS, "glsl": GLSL_OPERATIONS}.get(self.target)
-        if known is not None:
-            return _counted(area * known[name]), noise(seen.weight, self.share)
-        timing, times = self.timed(camera, seen)
-        return {"min": area * timing["min"], "median": area * timing["median"]}, times
-
-    def shader(self, file: str | Path) -> tuple[Timing, float]:
-        """The cost of the shader of a model or a lens."""
-        asked = self.found.asked
-        state = asked.zoom if str(file) == self.found.lens.path else None  # models are of one
-        lens = lens_of(Path(file), state, lambda done, left=None: None)[1]
-        ns, times = shader_cost(lens, self.found.places, asked.shot.film_mm, asked.f_number, asked.shot.focus_m)
-        return _counted(ns), times
+    def flip(self) -> float:
+        """The mean of the differences."""
+        return float(self.difference.mean())
 
 
-def _counted(cost: float) -> Timing:
-    """A cost that is no measurement, and so has no spread."""
-    return {"min": cost, "median": cost}
+@dataclass(frozen=True)
+class Trade:
+    """Every camera that was priced, by rising seconds; the plan for the budget; and pictures of those to look at.
 
-
-def camera_of(found: Probed, choice: Choice) -> Camera:
-    """The camera of a choice, in our renderer; with the maps of its picture, where it needs them.
-
-    Raises:
-        InputError, ModelError: as the cameras.
+    Attributes:
+        base: time of the scene itself. unit: of it and of `Offer.seconds`. samples: a pixel of the pictures.
+        exact: the lens's picture.
     """
-    kind, path = split_kind(choice.camera)
-    if choice.name == _EXACT:
-        return found.exact
-    if kind in IDEAL_OF:
-        flat = ideal_as(kind, found.exact.lens, found.asked.shot)
-        mapped = choice.name.endswith(_MAPPED)
-        return Warped(flat, found.exact, found.asked.shot.focus_m, tables=found.exact_field) if mapped else flat
-    return OnnxCamera(load_model(path), found.asked.shot, runtime="c" if kind else "onnxruntime")
+
+    plan: Plan
+    offered: tuple[Offer, ...]
+    base: float
+    unit: str
+    samples: int
+    exact: FloatArray
+    shown: tuple[CameraPicture, ...]
+
+    @property
+    def front(self) -> list[Offer]:
+        """The cameras that no other betters, see `front`."""
+        return front(self.offered)
+
+    @property
+    def chosen(self) -> Offer | None:
+        """The plan's camera."""
+        return next((o for o in self.offered if self.plan.best is not None and o.choice == self.plan.best), None)
+
+    @property
+    def half(self) -> Offer | None:
+        """The best camera for half of the seconds that the chosen one adds."""
+        return None if self.chosen is None else best_within(self.offered, self.chosen.seconds / 2)
 
 
-def _ideal(trial: _Trial) -> Iterator[_Judged]:
-    """Pinhole, thin and thick lens, as they are and with their picture warped afterwards, where the target has them.
+def _priced(
+    scene: Scene, lens: Lens, budget_px: float, *, target: Target = "render", models: Sequence[Path] = (),
+    folder: Path | None = None, report: Report | None = None, **look: Any,
+) -> tuple[Plan, list[Offer]]:  # fmt: skip
+    """A plan in which every camera has its cost, and its cameras by rising seconds; arguments as for `plan`."""
+    say = report or (lambda done, left=None: None)
+    probed = probe(scene, lens, **look)
+    tried = candidates(
+        probed, (*_BUDGETS, budget_px), target, models=models, folder=folder, explain=True,
+        report=lambda done, left=None: say(0.5 * done),
+    )  # fmt: skip
+    rest = rest_of(scene, probed, target)
+    made = decided(probed, tried, budget_px, target, rest)
+    return made, offers(scene, probed, made.choices, rest)
 
-    In C and GLSL they are their own source.
+
+def trade(scene: Scene, lens: Lens, budget_px: float, *, samples: int = _SAMPLES, **options: Any) -> Trade:
+    """Every camera for a scene with its error and its seconds, and pictures of those that no other betters.
+
+    Other arguments and errors as for `plan`.
     """
-    found, shot = trial.found, trial.found.asked.shot
-    for name in {"onnx": (), "osl": _IDEAL[:2]}.get(trial.target, _IDEAL):
-        spec = f"{name}:{found.lens.path}"
-        with suppress(InputError):  # no thick lens of cylinders; no maps of half a sphere, or of a film that is dark
-            camera = ideal_as(f"{name}:", found.exact.lens, shot)
-            seen = prints.footprints(camera, found.places)
-            yield trial.judged(name, spec, seen, partial(trial.ideal, name, camera, seen))
-            if "distortion" in found.asked.afterwards:
-                continue
-            if name == "thin" and trial.target in _OURS:
-                continue  # in our renderer the thick lens stands in its place
-            maps = Warped(camera, found.exact, found.asked.shot.focus_m)
-            if maps.area < _MOST_OVERSCAN:
-                how = f"then the ST map of 'neurolens stmap' over the picture, of {maps.area:.3g} times the area"
-                cost = partial(trial.ideal, name, camera, seen, maps.area)
-                yield trial.judged(f"{name}{_MAPPED}", spec, prints.footprints(maps, found.places), cost, how)
+    if not budget_px >= 0:
+        raise InputError("trade", "budget_px", budget_px, "0 or more pixels")
+    say: Report = options.get("report") or (lambda done, left=None: None)
+    made, offered = _priced(scene, lens, budget_px, **options)
+    some = spread(front(offered), next((o for o in offered if o.choice == made.best), None))
+    exact, pictures = _pictures(scene, made.probed, some, samples, lambda done, left=None: say(0.5 + 0.5 * done))
+    unit = "s" if made.unit == "ns" else "10^9 operations"
+    return Trade(made, tuple(offered), 1e-9 * paths(scene) * made.rest, unit, samples, exact, tuple(pictures))
 
 
-def _exact(trial: _Trial) -> Iterator[_Judged]:
-    """The exact lens, which has no error: as C where that runs, and as code where its surfaces have a form in it."""
-    found, target = trial.found, trial.target
-    exact, path, compiled = found.exact, found.lens.path, found.exact.runtime == "c"
-    cost: Cost = {
-        "osl": lambda: trial.shader(path),
-        "glsl": lambda: (_counted(glsl_operations(exact)), noise(found.seen.weight, trial.share)),
-    }.get(target, lambda: trial.timed(exact, found.seen))
-    if target == "render" or (target != "onnx" and compiled) or target in ("osl", "glsl"):
-        with suppress(InputError):  # a shader that is too large
-            yield trial.judged(_EXACT, f"{'fused:' if compiled and target in _OURS else ''}{path}", found.seen, cost)
+def plan_within(scene: Scene, lens: Lens, seconds: float, **options: Any) -> Plan:
+    """The plan with the most faithful camera that takes no longer than so many seconds of one thread.
 
-
-def _model(trial: _Trial, file: Path, how: str = "", without: Collection[str] = ()) -> Iterator[_Judged]:
-    """A model in the form that the target runs; none where its domain is not the shot's, or it has no such form, or is
-    of a form to do without.
-
-    Errors are of onnxruntime: compilers take seconds, and C and shaders give the same rays. They are told within the
-    outline of the exact lens's pupil, from the same points of it: rows of samples leave out the rim of what fills an
-    outline, and two outlines of one lens would differ by a percent of light and 0.2% of the blur. What a model lets
-    pass outside it counts as its light's error.
+    Other arguments and errors as for `plan`; InputError, too, for seconds that are none and a target without time.
     """
-    target = trial.target
-    compiled = target in _OURS and has_compiler()
-    with suppress(InputError, ModelError):
-        model = load_model(file)
-        form = model.card["fit"]["method"].partition("-")[0]
-        if form in without or not (compiled or target != "c"):
-            return
-        camera = OnnxCamera(model, trial.found.asked.shot, outline=trial.found.exact.film.outline)
-        seen = prints.footprints(camera, trial.found.places)
-        beside = prints.light_beside(camera, trial.found.places) / np.maximum(trial.found.seen.light, 1e-30)
-
-        def cost() -> tuple[Timing, float]:
-            if target == "osl":
-                return trial.shader(file)
-            if target == "glsl":
-                return _counted(glsl_operations(camera)), noise(seen.weight, trial.share)
-            return trial.timed(camera.compiled() if compiled else camera, seen)
-
-        spec = f"{'fused:' if compiled else ''}{file}"
-        yield trial.judged(file.stem, spec, seen, cost, how, form, _operations(model), beside)
+    target = options.get("target", "render")
+    if not seconds > 0 or UNIT[target] != "ns":
+        raise InputError("plan", "budget", f"({seconds:g} s for {target})", "above 0, and a target whose time is known")
+    made, offered = _priced(scene, lens, 0.0, **options)
+    added = seconds - 1e-9 * paths(scene) * made.rest
+    offer = best_within(offered, added)
+    fits = {id(o.choice) for o in offered if o.seconds <= added and o.choice.light_error <= LIGHT}
+    choices = [replace(c, within=id(c) in fits) for c in made.choices]
+    return _rebudgeted(made, choices, None if offer is None else replace(offer.choice, within=True), budget_s=seconds)
 
 
-def _operations(model: OnnxLens) -> int:
-    """The number of float operations that a ray of a model costs; 0 of networks that only onnxruntime runs."""
-    with suppress(InputError):
-        return sum(lower(model.graph()).count().values())
-    return 0
+def _rebudgeted(made: Plan, choices: Sequence[Choice], best: Choice | None, **budget: Any) -> Plan:
+    """The plan with another best camera, whose error is then the budget that effects are held against."""
+    error = math.inf if best is None else best.error_px
+    effects = effects_of(made.probed, error)
+    return replace(made, budget_px=error, effects=effects, choices=tuple(choices), best=best, **budget)
 
 
-def _shipped(trial: _Trial, files: Sequence[Path]) -> list[_Judged]:
-    """Models that are there; of one form from the smallest on, up to one that holds the least budget."""
-    found: list[_Judged] = []
-    for file in sorted(files, key=lambda f: f.stat().st_size if f.is_file() else 0):
-        done = {j.form for j in found if trial.by_size and j.choice.meets(min(trial.budgets_px))}
-        found += _model(trial, file, without=done)
-    return found
+def plan_seen(scene: Scene, lens: Lens, flip_budget: float, **options: Any) -> Plan:
+    """The plan with the cheapest camera whose picture differs from the exact lens's by no more than so much FLIP.
 
-
-def _costed(trial: _Trial, tried: Sequence[_Judged]) -> Iterator[Choice]:
-    """Cameras with their cost where it matters: of those that hold a budget, and of models of one form the smallest
-    and what is about as small."""
-    asked = {id(j) for j in tried} if trial.explain else set[int]()
-    for budget_px in trial.budgets_px:
-        holds = [j for j in tried if j.choice.meets(budget_px)]
-        for j in holds:
-            least = min(k.size for k in holds if k.form == j.form)
-            if not (trial.by_size and j.size > _CLOSE * least > 0):
-                asked.add(id(j))
-    for j in tried:
-        yield trial.costed(j) if id(j) in asked else j.choice
-
-
-def model_choice(found: Probed, target: Target, file: Path, how: str, costed: bool) -> Choice | None:
-    """A model in the form that the target runs; None where it has none, or its domain is not the shot's."""
-    with warnings.catch_warnings():  # film beyond the end of its range: its error counts
-        warnings.simplefilter("ignore", NeurolensWarning)
-        trial = _Trial(found, target, ())
-        judged = next(_model(trial, file, how), None)
-        return None if judged is None else trial.costed(judged) if costed else judged.choice
-
-
-def _fitted(trial: _Trial, folder: Path, tried: Sequence[_Judged], say: Report) -> list[_Judged]:
-    """Polynomials fitted for the shot alone: the smallest that holds each budget, and those on the way to it.
-
-    None where a camera without a lens does, in targets where it costs less than any, unless all is asked for.
+    FLIP is measured on strips of the picture at its own pixels (`_strips`), 16 samples, the same random numbers. It
+    contains the noise of what samples meet otherwise, so that it is more than that of finished pictures (0.02 for
+    0.01 px among many edges). Cameras that no other betters are tried by halves: with less error they are taken to have
+    less FLIP. Other arguments and errors as for `plan`; InputError, too, for a budget that is no number from 0 to 1.
     """
-    found, ideal = trial.found, ("pinhole",) if trial.target in _OURS else ("pinhole", "thin")
-    easy = [j.choice for j in tried if j.choice.name.startswith(ideal) and not trial.explain]
-    # Nothing that is fitted has no error.
-    asked = [b for b in trial.budgets_px if (b > 0 or trial.explain) and not any(c.meets(b) for c in easy)]
-    if not asked:
-        return []
-    fit, sizes = shot_fits(found, folder), shot_terms(found)
-    known: dict[int, list[_Judged]] = {}
-    for k, budget_px in enumerate(asked):
-        low, high = 0, len(sizes)  # sizes below `low` do not hold, those from `high` on do
-        while low < high:
-            errors = {n: j.choice.error_px for n, judged in known.items() for j in judged}
-            size = _next_size(sizes, low, high, budget_px, errors)
-            if size not in known:
-                file, settings = fit(sizes[size])
-                made = _model(trial, file, _SHOT)
-                known[size] = [replace(j, choice=replace(j.choice, settings=settings)) for j in made]
-            holds = any(j.choice.meets(budget_px) for j in known[size])
-            low, high = (low, size) if holds else (size + 1, high)
-            say((k + 1 - (high - low) / len(sizes)) / len(asked))
-    return [j for js in known.values() for j in js]
+    if not 0 <= flip_budget <= 1:
+        raise InputError("plan", "budget", f"{flip_budget:g} FLIP", "0 to 1")
+    if options.get("afterwards"):
+        raise InputError("plan", "afterwards", ", ".join(options["afterwards"]), "nothing with a budget of FLIP")
+    say: Report = options.get("report") or (lambda done, left=None: None)
+    made, offered = _priced(scene, lens, 0.0, **options)
+    by_time = front(offered)
+    exact = _strips(scene, made.probed.exact)
+    flips: dict[str, float] = {}
+
+    def holds(offer: Offer) -> bool:
+        choice = offer.choice
+        pairs = zip(_strips(scene, camera_of(made.probed, choice)), exact, strict=True)
+        flips[choice.name] = 0.0 if choice.error_px == 0 else float(np.mean([flip_map(*pair) for pair in pairs]))
+        say(1 - 0.5 ** (1 + len(flips)))
+        return flips[choice.name] <= flip_budget
+
+    def judged(choice: Choice) -> Choice:
+        value = flips.get(choice.name)
+        return replace(choice, flip=value, within=value is not None and value <= flip_budget)
+
+    first = bisect.bisect_left(by_time, True, key=holds)
+    best = judged(by_time[first].choice) if first < len(by_time) else None
+    return _rebudgeted(made, [*map(judged, made.choices)], best, budget_flip=flip_budget)
 
 
-def _next_size(sizes: Sequence[int], low: int, high: int, budget_px: float, errors: Mapping[int, float]) -> int:
-    """The size to try next of those from `low` up to `high`: the least that holds if from what is known beside them
-    errors fall with the square of the terms; where nothing is, the one in the middle."""
-    ends = [n for n in (low - 1, high) if 0 < budget_px * errors.get(n, 0.0) < math.inf]
-    if not ends:
-        return (low + high) // 2
-    near = min(ends, key=lambda n: abs(math.log(errors[n] / budget_px)))
-    wanted = sizes[near] * math.sqrt(errors[near] / budget_px)
-    return min(max(int(np.searchsorted(sizes, wanted)), low), high - 1)
+def _strips(scene: Scene, camera: Camera) -> list[FloatArray]:
+    """Rows of a camera's picture at the scene's own size, in some places."""
+    shot = scene.settings.camera
+    rows = min(max(_STRIP_PATHS // (_STRIPS * _SAMPLES * shot.width), _STRIP_ROWS), shot.height)
+    firsts = np.unique(np.linspace(0, shot.height - rows, _STRIPS + 2).astype(int)[1:-1])
+    drawn = partial(render, scene, camera, samples=_SAMPLES, film=replace(scene.settings.film, wavelengths="one"))
+    return [drawn(rows=(int(first), int(first) + rows)).rgb for first in firsts]
+
+
+def paths(scene: Scene) -> int:
+    """The paths of a picture of the scene's own size and samples."""
+    shot = scene.settings.camera
+    return shot.width * shot.height * shot.samples
+
+
+def offers(scene: Scene, probed: Probe, tried: Sequence[Choice], rest: float) -> list[Offer]:
+    """Cameras of known cost by rising seconds; `rest`: nanoseconds of a path in the scene."""
+    each = ((c, rest * (0.0 if probed.asked.denoised else c.noise - 1) + c.cost) for c in tried)
+    count = 1e-9 * paths(scene)
+    offered = (Offer(c, count * ns, count * c.cost * (c.spread - 1)) for c, ns in each if math.isfinite(ns))
+    return sorted(offered, key=lambda o: o.seconds)
+
+
+def front(offered: Sequence[Offer]) -> list[Offer]:
+    """The cameras of right light that no other betters in error and seconds."""
+    bright = [o for o in offered if o.choice.light_error <= LIGHT]
+    return [bright[i] for i in pareto_front([(o.seconds, o.choice.error_px) for o in bright])]
+
+
+def best_within(offered: Sequence[Offer], seconds: float) -> Offer | None:
+    """The most faithful camera that adds no more."""
+    affordable = (o for o in front(offered) if o.seconds <= seconds)
+    return min(affordable, key=lambda o: (o.choice.error_px, o.seconds), default=None)
+
+
+def _pictures(
+    scene: Scene, probed: Probe, offered: Sequence[Offer], samples: int, report: Report
+) -> tuple[FloatArray, list[CameraPicture]]:
+    """The exact lens's small picture, and those of cameras: equal samples, the same random numbers."""
+    film = replace(scene.settings.film, wavelengths="one")  # for every camera: they share their random numbers
+    width, height = small(scene, _ACROSS)
+    drawn = partial(render, scene, width=width, height=height, samples=samples, film=film)
+    exact = drawn(probed.exact).rgb
+    pictures = []
+    for k, offer in enumerate(offered):
+        report((k + 1) / (len(offered) + 1))
+        same = offer.choice.error_px == 0
+        rgb = exact if same else drawn(camera_of(probed, offer.choice)).rgb
+        pictures.append(CameraPicture(offer, rgb, np.zeros(rgb.shape[:2]) if same else flip_map(rgb, exact)))
+    return exact, pictures
+
+
+def spread(offered: Sequence[Offer], chosen: Offer | None, most: int = _SHOWN) -> list[Offer]:
+    """At most so many of a front, evenly, and the chosen one among them, even where it is not on the front."""
+    if chosen is not None and chosen not in offered:
+        offered = sorted([*offered, chosen], key=lambda o: o.seconds)
+    if len(offered) <= most:
+        return list(offered)
+    rows = {round(k * (len(offered) - 1) / (most - 1)) for k in range(most)}
+    at = [k for k, o in enumerate(offered) if o == chosen]
+    if at and not rows & set(at):
+        rows = rows - {min(rows, key=lambda k: (abs(k - at[0]), k))} | set(at)
+    return [offered[k] for k in sorted(rows)]

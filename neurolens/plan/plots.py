@@ -1,4 +1,4 @@
-"""What a plan found, in pictures: effects beside their budget, maps of them, each camera's error over its time."""
+"""Pictures of plans: effects beside their budget, maps of them, each camera's error over its time."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from neurolens.analysis.plot_style import INK, drawing, plain_log_ticks
-from neurolens.plan.plan import Choice, Plan
-from neurolens.plan.trade import Trade
-from neurolens.study.figures import error_scale, log_norm
-from neurolens.study.plots import CHOSEN, family_colour, noisy_lines, place_labels
+from neurolens.analysis.plots import INK, drawing, plain_log_ticks
+from neurolens.plan.candidates import Choice
+from neurolens.plan.plan import Plan, Trade
+from neurolens.study.plots import CHOSEN, error_scale, family_colour, log_norm, noisy_lines, place_labels
 
 _COLUMNS = 4  # of maps
 # Light that an effect takes is dark, light that it adds is orange; none is white.
@@ -21,8 +20,8 @@ _TITLES = {"px": "pixels (logarithmic)", "relative": "% of the light\n(dark: tak
 
 
 def plot_effects(plan: Plan, path: Path, title: str) -> None:
-    """What a plan found: effects as bars with the budget, error against time of every camera that was timed, and where
-    in the picture the effects are that a camera needs: those in pixels, then those of light, each with one scale."""
+    """Draw effects as bars with the budget, the error of every timed camera against its time, and maps of the effects
+    that a camera needs: those in pixels, then those of light, each with one scale."""
     asked = plan.asked
     shown = [e for e in plan.effects if e.needed and e.name in plan.probed.maps]
     groups = {unit: [e.name for e in shown if e.unit == unit] for unit in _TITLES}
@@ -77,30 +76,29 @@ def _bars_and_trade(plan: Plan, figure: Any) -> None:
     bars.set_xlim(left=least)
     bars.set_xlabel("worth (pixels), grey: left out")
     timed = [c for c in plan.choices if 0 < c.cost < float("inf") and c.error_px < float("inf")]
-    _cameras(trade, timed, [c.cost for c in timed], [c.cost * c.spread for c in timed], plan.best)
+    _cameras(trade, plan, [(c, c.cost, c.cost * c.spread) for c in timed])
     trade.set_xlabel(f"cost ({plan.unit} a ray times noise), --for {plan.target}")
     if plan.budget_px > 0:
         bars.axvline(plan.budget_px, color=CHOSEN, lw=1.2)
-        trade.axhline(plan.budget_px, color=CHOSEN, lw=1.2, label=f"budget {plan.budget_px:g} px; ring: chosen")
-        trade.legend(loc="lower right", bbox_to_anchor=(1, 1), frameon=False, ncols=2)
-    plain_log_ticks(bars.xaxis, trade.xaxis, trade.yaxis)
+    plain_log_ticks(bars.xaxis)
 
 
-def _cameras(
-    axes: Any, choices: Sequence[Choice], places: Sequence[float], medians: Sequence[float], best: Choice | None
-) -> None:
-    """Errors of cameras over their time, those within the budget in colour, the chosen one with a ring.
-
-    From a noisy time a line leads to the median of its repeats.
-    """
-    errors = [max(c.error_px, 1e-4) for c in choices]
-    axes.scatter(places, errors, c=["#0072b2" if c.within else "#b8b8b8" for c in choices], s=26)
-    chosen = [k for k, c in enumerate(choices) if c == best]
+def _cameras(axes: Any, plan: Plan, timed: Sequence[tuple[Choice, float, float]]) -> None:
+    """Errors of cameras over their least time, with their median: within the budget in colour, the chosen one with a
+    ring. From a noisy time a line leads to the median of its repeats."""
+    points = [(x, max(c.error_px, 1e-4)) for c, x, _ in timed]
+    axes.scatter(*np.reshape(points, (-1, 2)).T, c=["#0072b2" if c.within else "#b8b8b8" for c, _, _ in timed], s=26)
     ring = {"s": 150, "fc": "none", "ec": CHOSEN, "lw": 1.8}
-    axes.scatter([places[k] for k in chosen], [errors[k] for k in chosen], **ring)
-    noisy_lines(axes, [(e, x, m) for c, e, x, m in zip(choices, errors, places, medians, strict=True) if c.noisy])
+    for point in (p for p, (c, _, _) in zip(points, timed, strict=True) if c == plan.best):
+        axes.scatter(*point, **ring)
+    noisy_lines(axes, [(y, x, m) for (x, y), (c, _, m) in zip(points, timed, strict=True) if c.noisy])
     axes.set(xscale="log", yscale="log", ylabel="error (pixels; none is drawn at 0.0001)")
-    place_labels(axes, list(zip(places, errors, strict=True)), [_short(c.name) for c in choices])
+    place_labels(axes, points, [c.name.rpartition(".")[2] or c.name for c, _, _ in timed])  # a model without its lens
+    if plan.budget_px > 0:
+        axes.axhline(plan.budget_px, color=CHOSEN, lw=1.2, label=f"budget {plan.budget_px:g} px; ring: chosen")
+    if any(axes.get_legend_handles_labels()):
+        axes.legend(loc="lower right", bbox_to_anchor=(1, 1), frameon=False, ncols=2)
+    plain_log_ticks(axes.xaxis, axes.yaxis)
 
 
 def plot_trade(trade: Trade, path: Path, title: str) -> None:
@@ -110,18 +108,7 @@ def plot_trade(trade: Trade, path: Path, title: str) -> None:
     subtitle += f"; the scene itself takes {trade.base:.3g} {trade.unit}" * bool(trade.base)
     with drawing(path, 8.5, 5.0, title, subtitle) as figure:
         axes = figure.subplots()
-        medians = [o.seconds + o.more for o in offered]
-        _cameras(axes, [o.choice for o in offered], [o.seconds for o in offered], medians, plan.best)
-        best = trade.front
-        at = [o.seconds for o in best], [max(o.choice.error_px, 1e-4) for o in best]
+        at = [o.seconds for o in trade.front], [max(o.choice.error_px, 1e-4) for o in trade.front]
         axes.step(*at, where="post", color=INK, lw=1.2, alpha=0.7, label="no camera betters both")
         axes.set_xlabel(f"{trade.unit} that the camera adds, one thread, to equal noise")
-        if plan.budget_px > 0:
-            axes.axhline(plan.budget_px, color=CHOSEN, lw=1.2, label=f"budget {plan.budget_px:g} px; ring: chosen")
-        axes.legend(loc="lower right", bbox_to_anchor=(1, 1), frameon=False, ncols=2)
-        plain_log_ticks(axes.xaxis, axes.yaxis)
-
-
-def _short(name: str) -> str:
-    """A model's name without its lens."""
-    return name.rpartition(".")[2] or name
+        _cameras(axes, plan, [(o.choice, o.seconds, o.seconds + o.more) for o in offered])

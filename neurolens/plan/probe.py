@@ -13,10 +13,9 @@ from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neurolens.analysis.field_curves import illumination
 from neurolens.analysis.fields import Scene as Fields
@@ -30,8 +29,8 @@ from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Shot
 from neurolens.plan import footprints as prints
-from neurolens.plan.footprints import AFTERWARDS, Array, Footprints, Places
-from neurolens.plan.light import STRAY, Glance, glance, small_raster, stray_light
+from neurolens.plan.footprints import AFTERWARDS, Array, Footprints, Places, cell_centres, upright
+from neurolens.plan.light import STRAY, Overview, overview, small_raster, stray_light
 from neurolens.render.scene import Scene
 from neurolens.render.world import shared_worlds
 from neurolens.setting.pupils import image_radius_mm
@@ -41,13 +40,12 @@ from neurolens.surrogates.domain import domain_from_camera, domain_of
 from neurolens.surrogates.model import Domain
 
 COUNTED = 95.0  # percentile over the picture that a budget is held against
-_Real = TypeVar("_Real", bound=np.floating[Any])
 Maps = dict[str, tuple[Literal["px", "relative"], Array]]
 LIGHT = 0.01  # relative error of light that a plan allows beside its budget of place
-_FOCUS_SPARE = 0.25  # of a pixel of blur: what a model may place its film beside the lens's
+_FOCUS_SPARE = 0.25  # of a pixel of blur: how far a model may place its film from the lens's
 _FIELDS = 17  # from the axis to the edge of the film, at which vignetting is traced
 _ACROSS = 16  # points of the probe along the longer side
-# Of effects, what makes them where the picture is finished: a blur by depth makes all blur.
+# The step of compositing that makes an effect: a blur by depth makes all blur.
 _MADE_BY = {"distortion": "distortion", "natural fall-off": "distortion", "vignetting": "distortion"} | dict.fromkeys(
     ("defocus", "spherical aberration", "coma", "astigmatism", "field curvature", "higher orders",
      "longitudinal colour", "diffraction"), "defocus",
@@ -55,19 +53,22 @@ _MADE_BY = {"distortion": "distortion", "natural fall-off": "distortion", "vigne
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What a scene asks of its camera.
+class SceneNeeds:
+    """The properties of a scene and of its shot that a camera must serve.
 
     Attributes:
         shot: for the lens at its zoom; the f-number is no wider than the lens opens. pixel_mm: pitch.
         nearest_m, farthest_m: along the axis from the film; None where nothing is in view.
-        distant: share of the picture that shows what has no distance. dark: share that the lens leaves dark.
-        light_nm: between which all but 0.2% of the scene's light lies, as the eye weighs it.
-        contrast: RMS relative difference of neighbours on 48 pixels across, the median. edges: share of neighbours
-            there whose blur differs by more than a pixel. edge_contrast: median contrast at those, None without any: if
-            it is little, how well blur is made there matters little.
-        filter_px: side of the pixel filter, a box. afterwards: what compositing makes, of `footprints.AFTERWARDS`.
-            denoised: whether noise is taken out, so that cameras are not charged for it. zoom: state of the lens.
+        distant: share of the picture that shows things without a distance. dark: share that the lens leaves dark.
+        light_nm: range of all but 0.2% of the scene's light, as the eye weighs it.
+        contrast: RMS relative difference of neighbours on 48 pixels across, the median.
+        edges: share of neighbours there whose blur differs by more than a pixel.
+        edge_contrast: median contrast at those, None without any: if it is little, the quality of the blur there
+            matters little.
+        filter_px: side of the pixel filter, a box.
+        afterwards: effects that compositing makes, of `footprints.AFTERWARDS`.
+        denoised: whether noise is taken out, so that cameras are not charged for it.
+        zoom: state of the lens.
     """
 
     shot: Shot
@@ -93,9 +94,14 @@ class Asked:
 
 @dataclass(frozen=True)
 class Effect:
-    """An effect's worth: pixels (RMS of what it moves light by; `relative`: share of the light) at the counted
-    percentile, its median over the picture, the share of the picture where it is beyond the budget, and whether a
-    camera needs it; `why` not, or why that is not known (worth inf)."""
+    """The worth of an effect of the lens in a picture.
+
+    Attributes:
+        worth: at the counted percentile, in pixels (RMS distance by which it moves light) or, `relative`, as a share of
+            the light; inf where it is not known.
+        median: over the picture. over: share of the picture where it is beyond the budget.
+        needed: whether a camera needs it. why: the reason where it does not, or where its worth is not known.
+    """
 
     name: str
     worth: float
@@ -107,17 +113,18 @@ class Effect:
 
 
 @dataclass(frozen=True)
-class Probed:
+class Probe:
     """A scene's places as the exact lens sees them: its camera, its footprints there, and those of a thin lens.
 
     Attributes:
-        scene, lens, domain: the lens stopped and focused, and what models of this shot must know. places: those with
-            light, of `shape` rows and columns over the film. wanted: what a camera is asked for, `seen` without what is
-            done afterwards.
+        scene, lens, domain: the lens stopped and focused, and the domain of models of this shot.
+        places: those with light, of `shape` rows and columns over the film.
+        seen, thin_seen: footprints of the exact camera and of a thin lens.
+        wanted: the footprints that a camera should have: `seen` without the effects that are made afterwards.
     """
 
     scene: Scene
-    asked: Asked
+    asked: SceneNeeds
     lens: Lens
     domain: Domain
     exact: ExactCamera
@@ -126,7 +133,7 @@ class Probed:
     seen: Footprints
     thin_seen: Footprints
     wanted: Footprints
-    glance: Glance
+    overview: Overview
 
     @cached_property
     def exact_field(self) -> Field:
@@ -146,28 +153,28 @@ class Probed:
     def maps(self) -> Maps:
         """The same, and those of the light that the lens adds, on more pixels; without that where it is not known."""
         with suppress(InputError):
-            added = stray_light(self.scene, self.exact, self.glance)
+            added = stray_light(self.scene, self.exact, self.overview)
             return self.camera_maps | {k: ("relative", v) for k, v in added.items()}
         return self.camera_maps
 
     def on_film(self, value: Array) -> Array:
         """Values [N] of places as a picture [rows, columns], as prints show it: upright; NaN where none is."""
-        found = np.full(self.shape, np.nan)
+        film = np.full(self.shape, np.nan)
         at = self.places.film_mm / np.array(self.asked.shot.film_mm)[:, None] + 0.5
         column, row = (np.minimum((at[k] * n).astype(int), n - 1) for k, n in enumerate(self.shape[::-1]))
-        found[row, column] = np.broadcast_to(value, row.shape)
-        return upright(found)
+        film[row, column] = np.broadcast_to(value, row.shape)
+        return upright(film)
 
 
 def probe(
     scene: Scene, lens: Lens, *, across: int = _ACROSS, afterwards: Collection[str] = (), denoised: bool = False,
     zoom: str | None = None,
-) -> Probed:  # fmt: skip
+) -> Probe:  # fmt: skip
     """Look through the exact lens at a scene.
 
     Args:
         across: places along the longer side. afterwards: effects that compositing makes, of `footprints.AFTERWARDS`:
-            distortion, where the ST map corrects the picture's light, too, and defocus. denoised: see `Asked`.
+            distortion, where the ST map corrects the picture's light, too, and defocus. denoised: see `SceneNeeds`.
         zoom: state of the lens by name or focal length; None leaves it as it is.
 
     Raises:
@@ -182,10 +189,10 @@ def probe(
     stopped, domain = set_lens(lens, f_number=f_number, focus_m=shot.focus_m), _domain(lens, scene, f_number)
     real = Shot(film, shot.focus_m, f_number, aperture=lens.aperture, wavelength_nm=shot.wavelength_nm)
     exact = exact_camera(lens, real, domain.bounds)
-    shape = _shape(film, across)
+    shape = small_raster(film, across)[::-1]
     points = _grid(film, shape)
     with shared_worlds():
-        small, depth = glance(scene, exact), seen_depths_m(scene, exact, points)
+        small, depth = overview(scene, exact), seen_depths_m(scene, exact, points)
         edges = _edges(scene, exact, small, film[0] / shot.width)
     far = np.where(np.isnan(depth), np.inf, depth)
     places = prints.places_of(exact, points, far, small.wavelength_nm, small.share)
@@ -193,22 +200,22 @@ def probe(
         raise InputError(scene.name, "camera", lens.name, "a lens that lights some of this film")
     thin = ideal_as("thin:", exact.lens, real)
     met = depth[np.isfinite(depth)]
-    asked = Asked(
-        real, film[0] / shot.width,
-        float(met.min()) if met.size else None, float(met.max()) if met.size else None,
-        float(np.isinf(depth).mean()), 1 - places.film_mm.shape[1] / points.shape[1],
-        small.range_nm, float(np.median(small.contrast)),
-        *edges, afterwards=tuple(sorted(afterwards)), denoised=denoised,
-        zoom=zoom,
+    nearest, farthest = (float(met.min()), float(met.max())) if met.size else (None, None)
+    asked = SceneNeeds(
+        real, film[0] / shot.width, nearest, farthest,
+        float(np.isinf(depth).mean()), 1 - places.film_mm.shape[1] / points.shape[1], small.range_nm,
+        float(np.median(small.contrast)), *edges, afterwards=tuple(sorted(afterwards)), denoised=denoised, zoom=zoom,
     )  # fmt: skip
     seen, ideal = (prints.footprints(c, places) for c in (exact, thin))
     wanted = prints.left_to(seen, ideal, places.share, afterwards)
-    return Probed(scene, asked, stopped, domain, exact, places, shape, seen, ideal, wanted, small)
+    return Probe(scene, asked, stopped, domain, exact, places, shape, seen, ideal, wanted, small)
 
 
 def _domain(lens: Lens, scene: Scene, f_number: float) -> Domain:
-    """What a model of the shot must know: its film, stop and wavelengths, and as much more of the film's way as blurs a
-    quarter of a pixel, for models have their own focus; none more of a lens that goes no nearer."""
+    """The domain of models of the shot: its film, stop and wavelengths, and a quarter of a pixel of defocus beyond it.
+
+    Models have their own focus. A lens that goes no nearer has no room beyond it.
+    """
     shot, plain = scene.settings.camera, lens.with_aperture(None)
     film = shot.film_mm
     stopped = set_lens(plain, f_number=f_number, focus_m=shot.focus_m)
@@ -223,8 +230,8 @@ def _domain(lens: Lens, scene: Scene, f_number: float) -> Domain:
     )[1]
 
 
-def _edges(scene: Scene, exact: Any, small: Glance, pixel_mm: float) -> tuple[float, float | None]:
-    """`Asked.edges` and `edge_contrast`, with the blur of a thin lens: its difference at two depths of one point."""
+def _edges(scene: Scene, exact: Any, small: Overview, pixel_mm: float) -> tuple[float, float | None]:
+    """`edges` and `edge_contrast` of the needs, by the blur of a thin lens: its difference at two depths of a point."""
     first, (width, height) = first_order(exact.lens), small_raster(exact.film_mm)
     depth = seen_depths_m(scene, exact, _grid(exact.film_mm, (height, width)))
     near = upright((1 / np.where(np.isnan(depth), np.inf, depth)).reshape(height, width))
@@ -237,13 +244,7 @@ def _edges(scene: Scene, exact: Any, small: Glance, pixel_mm: float) -> tuple[fl
     return float(there.mean()), float(np.median(small.contrast[there])) if there.any() else None
 
 
-def upright(film: NDArray[_Real]) -> NDArray[_Real]:
-    """Rows by rising y and columns by rising x of the film (lens frame) as a picture shows them, turned by 180 degrees:
-    its top left is at +x, -y."""
-    return film[:, ::-1]
-
-
-def effect_maps(found: Probed) -> Maps:
+def effect_maps(probed: Probe) -> Maps:
     """Unit and map [H, W] of each effect over the picture, upright; NaN where the lens is dark. See `effects_mm`.
 
     Light has a sign: the share of it that an effect adds, below 0 where the effect makes the picture darker. Vignetting
@@ -254,25 +255,25 @@ def effect_maps(found: Probed) -> Maps:
     the f-number (Born and Wolf, 8.5.2). Transmittance is the colour that the lens gives, by its glass and coatings and
     an aperture that changes with the wavelength: RMS over wavelengths of the light there relative to its mean.
     """
-    pixel, share = found.asked.pixel_mm, found.places.share
-    parts = {k: v / pixel for k, v in prints.effects_mm(found.seen, found.thin_seen, share).items()}
-    middle = float((found.places.wavelength_nm * share).sum())
-    parts["diffraction"] = np.full(1, 0.53 * 1e-6 * middle * found.asked.f_number / pixel)
-    passed = passed_share(found)
-    open_light = found.seen.light / np.maximum(passed, 1e-30)
-    axis = int(np.argmin(np.hypot(*found.places.film_mm)))
-    by_wave = found.seen.weight.mean(2) / np.maximum((found.seen.weight.mean(2) * share).sum(1), 1e-30)[:, None]
+    pixel, share = probed.asked.pixel_mm, probed.places.share
+    parts = {k: v / pixel for k, v in prints.effects_mm(probed.seen, probed.thin_seen, share).items()}
+    middle = float((probed.places.wavelength_nm * share).sum())
+    parts["diffraction"] = np.full(1, 0.53 * 1e-6 * middle * probed.asked.f_number / pixel)
+    passed = passed_share(probed)
+    open_light = probed.seen.light / np.maximum(passed, 1e-30)
+    axis = int(np.argmin(np.hypot(*probed.places.film_mm)))
+    by_wave = probed.seen.weight.mean(2) / np.maximum((probed.seen.weight.mean(2) * share).sum(1), 1e-30)[:, None]
     light = {
         "natural fall-off": open_light / max(open_light[axis], 1e-30) - 1,
         "vignetting": passed - 1,
         "transmittance": np.sqrt((share * (by_wave - 1) ** 2).sum(1)),
     }
-    maps: Maps = {k: ("px", found.on_film(v)) for k, v in parts.items()}
-    maps |= {k: ("relative", found.on_film(v)) for k, v in light.items()}
+    maps: Maps = {k: ("px", probed.on_film(v)) for k, v in parts.items()}
+    maps |= {k: ("relative", probed.on_film(v)) for k, v in light.items()}
     return maps
 
 
-def passed_share(found: Probed) -> Array:
+def passed_share(probed: Probe) -> Array:
     """[N] share of the light through the stop that no rim takes, by exact tracing (`analysis.field_curves`).
 
     It is traced from the axis outwards; beyond the last field with a chief ray its share is kept. An anamorphic lens is
@@ -281,27 +282,24 @@ def passed_share(found: Probed) -> Array:
 
     def along(axis: Literal["x", "y"], height_mm: Array) -> Array:
         try:
-            data = illumination(Fields(found.lens, found.asked.shot.focus_m, axis), fields=_FIELDS)
+            data = illumination(Fields(probed.lens, probed.asked.shot.focus_m, axis), fields=_FIELDS)
         except InputError:  # no chief rays: what the rims take is then part of the natural fall-off
             return np.ones_like(height_mm)
         known = np.isfinite(data.passed)
         order = np.argsort(data.height_mm[known])
         return np.interp(height_mm, data.height_mm[known][order], data.passed[known][order])
 
-    x, y = np.abs(found.places.film_mm)
-    return along("x", x) * along("y", y) if found.lens.anamorphic else along("y", np.hypot(x, y))
+    x, y = np.abs(probed.places.film_mm)
+    return along("x", x) * along("y", y) if probed.lens.anamorphic else along("y", np.hypot(x, y))
 
 
-def effects_of(found: Probed, budget_px: float, stray: bool = True) -> tuple[Effect, ...]:
-    """What each effect is worth in this picture, the dearest first; `stray`: light that the lens adds among them."""
+def effects_of(probed: Probe, budget_px: float, stray: bool = True) -> tuple[Effect, ...]:
+    """The effects with their worth in this picture, the largest first; `stray`: with the light that the lens adds."""
     effects = []
-    for name, (unit, value) in (found.maps if stray else found.camera_maps).items():
+    for name, (unit, value) in (probed.maps if stray else probed.camera_maps).items():
         budget = budget_px if unit == "px" else LIGHT
         known = np.abs(value[np.isfinite(value)])
-        worth, later = (
-            float(np.percentile(known, COUNTED)),
-            name in _MADE_BY and _MADE_BY[name] in found.asked.afterwards,
-        )
+        worth, later = float(np.percentile(known, COUNTED)), _MADE_BY.get(name) in probed.asked.afterwards
         why = "made afterwards" if later else "left out" if worth <= budget else ""
         over = float((known > budget).mean())
         effects.append(Effect(name, worth, float(np.median(known)), over, unit, not why, why))
@@ -318,13 +316,6 @@ def exact_camera(lens: Lens, shot: Shot, bounds: PupilBounds) -> ExactCamera:
     return ExactCamera(lens, shot, bounds=bounds)
 
 
-def _shape(film_mm: tuple[float, float], across: int) -> tuple[int, int]:
-    """Rows and columns of about square cells."""
-    width, height = (max(round(across * side / max(film_mm)), 1) for side in film_mm)
-    return height, width
-
-
 def _grid(film_mm: tuple[float, float], shape: tuple[int, int]) -> Array:
     """Centres of equal cells of the film, [2, N] mm, row after row."""
-    x, y = (((np.arange(n) + 0.5) / n - 0.5) * side for n, side in zip(shape[::-1], film_mm, strict=True))
-    return np.stack(np.meshgrid(x, y)).reshape(2, -1)
+    return np.stack(np.meshgrid(*cell_centres(film_mm, shape))).reshape(2, -1)

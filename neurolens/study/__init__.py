@@ -1,1 +1,1 @@
-"""What a model is worth: its errors, vignetting, images and time against exact tracing, and pages of them."""
+"""The worth of a model: its errors, vignetting, images and time against exact tracing, and pages that show them."""

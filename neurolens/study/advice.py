@@ -31,7 +31,9 @@ def recommended(cameras: Iterable[C], cost: Callable[[C], float], exact: C | Non
     """The cheapest of the cameras that keep a budget, or the exact lens where that one does not save enough.
 
     Args:
-        cost: of a ray. exact: None where the exact lens cannot run. rest: cost of the rest of the work a ray.
+        cost: gives the cost of a ray.
+        exact: None where the exact lens cannot run.
+        rest: cost of the rest of the work for each ray.
     """
     best = min(cameras, key=cost, default=None)
     if exact is None or best is None:
@@ -42,13 +44,14 @@ def recommended(cameras: Iterable[C], cost: Callable[[C], float], exact: C | Non
 def to_use(
     models: Sequence[R], most: float = CLOSE_UM, key: str = "rms_um", exact: R | None = None, rest: float = 0.0
 ) -> R | None:
-    """The model to use, or the exact lens: see `recommended`.
+    """The model to use, or the exact lens: see `recommended`. None without any.
 
     Models count that are within an error and not poor; ideal lenses (thin, thick) do not. If no model counts and the
-    exact lens was not timed, the closest model is taken. None where nothing is there.
+    exact lens was not timed, the closest model is taken.
 
     Args:
-        exact: record of the exact lens (`records.ExactRecord`). rest: nanoseconds, as of `recommended`.
+        exact: record of the exact lens (`records.ExactRecord`).
+        rest: nanoseconds of the rest of the work for each ray.
     """
     fits = [m for m in models if m.get("family") != "paraxial"]
     close = [m for m in fits if reaches(m, most, key) and not m.get("poor")]
@@ -70,7 +73,7 @@ def expected_exact(refractions: int) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Advice:
-    """What to use in one place: its name, the reason, and the command that uses it (empty: none is known)."""
+    """The camera to use in one place: its name, the reason, and the command that uses it (empty: none is known)."""
 
     where: str
     name: str
@@ -82,10 +85,11 @@ class Advice:
 
 
 def advice(results: Mapping[str, Any], folder: Path) -> list[Advice]:
-    """What to use of a run in our renderer, and what in other programs; none of a run without models.
+    """The cameras of a run to use in our renderer and in other programs; empty for a run without models.
 
     Args:
-        results: as `records.Results` has them, as a table. folder: of the run, which commands name.
+        results: a table of the fields of `records.Results`.
+        folder: of the run, which commands name.
     """
     models: Sequence[Mapping[str, Any]] = results["models"]
     exact, target = exact_of(results.get("exact") or ()), results.get("target")
@@ -94,7 +98,7 @@ def advice(results: Mapping[str, Any], folder: Path) -> list[Advice]:
     state = (results.get("settings") or {}).get("lens") or {}
     names = "focal_length_mm", "zoom", "f_number", "efl_mm", "configuration"  # the last two by their earlier names
     whole = all(state.get(k) in (None, "none", RANGE) for k in names)  # as its file has it
-    found = []
+    advices = []
     for where, rest in (("In this renderer", PATH_NS), ("In other programs", 0.0)):
         best = to_use(models, within, exact=exact, rest=rest)
         if best is None or not (best is exact or best.get("file")):
@@ -106,41 +110,41 @@ def advice(results: Mapping[str, Any], folder: Path) -> list[Advice]:
             name, file, fused = str(best["name"]), str(folder / best["file"]), bool(best.get("fused_ns_per_ray"))
             why = _why_model(best, exact, within)
         if rest:
-            command = use_command(file, fused)
+            command = _render_command(file, fused)
         else:  # one model of many states is no function of a ray alone
             command = "" if best.get("states") else f"{program()} export {shlex.quote(file)} --to c -o lens.h"
-        found.append(Advice(where, name, why, command if file else ""))
-    return found
+        advices.append(Advice(where, name, why, command if file else ""))
+    return advices
 
 
 def _why_exact(exact: Mapping[str, Any], model: Mapping[str, Any] | None, within: float, rest: float) -> str:
-    said = f"{said_ns(time_of(exact))} a ray ({exact['name']}), without error"
+    reason = f"{ns_text(time_of(exact))} a ray ({exact['name']}), without error"
     if model is None or not reaches(model, within) or model.get("poor"):
-        return f"{said}; no model is within {within:.3g} um"
+        return f"{reason}; no model is within {within:.3g} um"
     times = (time_of(exact)["min"] + rest) / (time_of(model).get("min", math.inf) + rest)
     whole = "a picture of even a cheap scene" if rest else "that"
-    faster = f"with {model['name']} ({said_ns(time_of(model))}) {whole} is {times:.3g} times as fast"
-    return f"{said}; {faster}, and an error is worth it from {SAVING:g} on"
+    faster = f"with {model['name']} ({ns_text(time_of(model))}) {whole} is {times:.3g} times as fast"
+    return f"{reason}; {faster}, and an error is worth it from {SAVING:g} on"
 
 
 def _why_model(model: Mapping[str, Any], exact: Mapping[str, Any] | None, within: float) -> str:
-    close, timing, as_c = reaches(model, within), time_of(model), bool(model.get("fused_ns_per_ray"))
-    said = [f"{'the fastest' if close else 'the closest, as none is'} within {within:.3g} um"]
+    timing = time_of(model)
+    reasons = [f"{'the fastest' if reaches(model, within) else 'the closest, as none is'} within {within:.3g} um"]
     if model.get("rms_um") is not None:
-        said.append(f"error {model['rms_um']:.3g} um RMS")
+        reasons.append(f"error {model['rms_um']:.3g} um RMS")
     if timing:
-        said.append(f"{said_ns(timing)} a ray {'as C' if as_c else 'in onnxruntime'}")
+        reasons.append(f"{ns_text(timing)} a ray {'as C' if model.get('fused_ns_per_ray') else 'in onnxruntime'}")
     if exact is not None and timing:
-        said.append(f"{time_of(exact)['min'] / timing['min']:.2g} times as fast as the exact lens")
-    return ", ".join(said)
+        reasons.append(f"{time_of(exact)['min'] / timing['min']:.2g} times as fast as the exact lens")
+    return ", ".join(reasons)
 
 
-def said_ns(timing: Mapping[str, Any]) -> str:
-    """A time in words; "~" before one that is noisy."""
+def ns_text(timing: Mapping[str, Any]) -> str:
+    """A time in words, with "~" before a noisy one."""
     return f"{'~' * noisy(timing)}{timing['min']:.3g} ns" if timing else "-"
 
 
-def use_command(file: str, fused: bool) -> str:
+def _render_command(file: str, fused: bool) -> str:
     """The command that renders a scene through a model or a lens, as C where that runs here."""
     scene, camera = Path("experiments/scenes/room.toml"), f"{'fused:' if fused else ''}{file}"
     words = [str(scene if scene.is_file() else library() / scene), "--camera", camera, "-o", "room.exr"]

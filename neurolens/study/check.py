@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,19 +26,19 @@ from neurolens.study.measure import (
     ZONED,
     Findings,
     FreshRays,
+    finite,
     fresh_rays,
     measure,
     onnx_predictor,
+    passing_rays,
     rms_deviation,
     well_known,
     with_more,
     zone_of,
 )
-from neurolens.study.rays import EachRay, ray_errors
-from neurolens.study.vignetting import ZONES, false_shares
+from neurolens.study.rays import ZONES, EachRay, false_shares, ray_errors
 from neurolens.surrogates.axes import Axis
 from neurolens.surrogates.model import Domain
-from neurolens.surrogates.pairs import PairSettings, make_pairs
 from neurolens.surrogates.states import State, StateSpace
 
 # How much worse than promised a figure may be on other rays: standard deviations of the estimate from a sample of this
@@ -93,75 +93,65 @@ def check_model(
     Warns:
         NeurolensWarning: a seed that is the fit's own.
     """
-    card, domain = model.card, Domain.from_dict(model.card["domain"])
-    fitted = int(card["fit"]["settings"].get("rays_seed") or 0)
-    seed = fitted + _FRESH if seed is None else seed
-    if seed == fitted:
-        warnings.warn(f"seed {seed} is that of the fit: these rays are not fresh", NeurolensWarning, stacklevel=2)
-    pairs = make_pairs(lens, domain, PairSettings(train=1, held_out=rays, rim=1, seed=seed))
-    fresh = fresh_rays(lens, domain, pairs.held_out, count=4 * rays, seed=seed)
-    found = measure(fresh, onnx_predictor(model))
-    if not well_known(fresh, found.each):
+    domain, seed = Domain.from_dict(model.card["domain"]), _fresh_seed(model, seed)
+    fresh = fresh_rays(lens, domain, passing_rays(lens, domain, rays, seed), count=4 * rays, seed=seed)
+    findings = measure(fresh, onnx_predictor(model))
+    if not well_known(fresh, findings.each):
         fresh = with_more(fresh, seed + _FRESH)
-        found = measure(fresh, onnx_predictor(model))
-    figures = {**found.figures, "stopped_down": found.stopped_down, "zones": found.zones, "seed": seed}
+        findings = measure(fresh, onnx_predictor(model))
+    figures = {**findings.figures, "stopped_down": findings.stopped_down, "zones": findings.zones, "seed": seed}
     figures["rays"] = len(fresh.held_out)
-    return figures, promises_of(card["errors"], fresh, found)
+    return figures, promises_of(model.card["errors"], fresh, findings)
 
 
-def promises_of(errors: Mapping[str, Any], fresh: FreshRays, found: Findings) -> list[Promise]:
-    """The promises of a card's `errors` against what a model's `measure` found on fresh rays."""
-    return [*_promises(errors, fresh, found), *_zone_promises(errors, fresh, found)]
+def _fresh_seed(model: OnnxLens, seed: int | None) -> int:
+    fitted = int(model.card["fit"]["settings"].get("rays_seed") or 0)
+    if seed == fitted:
+        warnings.warn(f"seed {seed} is that of the fit: these rays are not fresh", NeurolensWarning, stacklevel=3)
+    return fitted + _FRESH if seed is None else seed
 
 
-def _promises(errors: Mapping[str, Any], fresh: FreshRays, found: Findings) -> Iterator[Promise]:
-    """Promises over the whole film, full aperture and stopped down."""
-    passing, promised_of = int(fresh.passes.sum()), _count(errors, "passing")
-    for key, promised in _numbers(errors):
-        measured = found.figures.get(key)
+def promises_of(errors: Mapping[str, Any], fresh: FreshRays, findings: Findings) -> list[Promise]:
+    """The promises of a card's `errors` against what a model's `measure` findings on fresh rays."""
+    promises, passing, promised_of = [], int(fresh.passes.sum()), _numbers(errors).get("passing")
+    for key, promised in _numbers(errors).items():
         if key in SHARES:
-            yield share_promise(key, promised, measured, passing, promised_of)
-        elif key in found.figures and key != "rays":
-            yield _error(key, promised, measured, found.each, _count(errors, "rays"))
-    for state, shares in _tables(errors.get("stopped_down")):
-        for key, promised in _numbers(shares) if state in found.stopped_down else ():
-            closed = 2 ** STOPS[state]  # factor by which fewer rays pass
-            said = found.stopped_down[state].get(key)
-            yield share_promise(f"{state}.{key}", promised, said, passing / closed, (promised_of or passing) / closed)
+            promises.append(share_promise(key, promised, findings.figures[key], passing, promised_of))
+        elif key in findings.figures and key != "rays":
+            promises.append(_error(key, promised, findings.figures[key], findings.each, _numbers(errors).get("rays")))
+    for state, shares in _tables(errors.get("stopped_down"), findings.stopped_down):
+        closed = 2 ** STOPS[state]  # factor by which fewer rays pass
+        counts = passing / closed, (promised_of or passing) / closed
+        for key, promised in _numbers(shares).items():
+            promises.append(share_promise(f"{state}.{key}", promised, findings.stopped_down[state].get(key), *counts))
+    zones = [(s, z, p) for s, inner in _tables(errors.get("zones"), ZONED) for z, p in _tables(inner, ZONES)]
+    for state, zone, table in zones:
+        measured, each, numbers = (
+            findings.zones[state][zone],
+            zone_of(fresh, findings.each, state, zone),
+            _numbers(table),
+        )
+        for key, promised in numbers.items():
+            place, value = f"{state}.{zone}.{key}", measured.get(key)
+            if value is None:
+                continue  # too few rays
+            if key in SHARES:
+                promises.append(share_promise(place, promised, value, measured["passing"], numbers.get("passing")))
+            elif key in _RMS:
+                promises.append(_error(place, promised, value, each, numbers.get("rays")))
+    return promises
 
 
-def _zone_promises(errors: Mapping[str, Any], fresh: FreshRays, found: Findings) -> Iterator[Promise]:
-    """Promises of thirds of the film."""
-    for state, zones in _tables(errors.get("zones")):
-        for zone, promises in _tables(zones):
-            if state not in ZONED or zone not in ZONES:
-                continue
-            measured, each = found.zones[state][zone], zone_of(fresh, found.each, state, zone)
-            for key, promised in _numbers(promises):
-                place, said = f"{state}.{zone}.{key}", measured.get(key)
-                if said is None:
-                    continue  # too few rays
-                if key in SHARES:
-                    yield share_promise(place, promised, said, measured["passing"], _count(promises, "passing"))
-                elif key in _RMS:
-                    yield _error(place, promised, said, each, _count(promises, "rays"))
+def _tables(value: Any, names: Collection[str]) -> list[tuple[str, Mapping[str, Any]]]:
+    """The tables of these names in a table."""
+    items = value.items() if isinstance(value, Mapping) else ()
+    return [(name, inner) for name, inner in items if name in names and isinstance(inner, Mapping)]
 
 
-def _tables(value: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    for name, inner in value.items() if isinstance(value, Mapping) else ():
-        if isinstance(inner, Mapping):
-            yield name, inner
-
-
-def _numbers(table: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
+def _numbers(table: Mapping[str, Any]) -> dict[str, float]:
     """The finite numbers of a table."""
-    for key, value in table.items():
-        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
-            yield key, float(value)
-
-
-def _count(table: Mapping[str, Any], key: str) -> float | None:
-    return dict(_numbers(table)).get(key)
+    numbers = {k: v for k, v in table.items() if isinstance(v, int | float) and not isinstance(v, bool)}
+    return {key: float(value) for key, value in numbers.items() if math.isfinite(value)}
 
 
 def _error(place: str, promised: float, measured: float | None, each: EachRay, promised_of: float | None) -> Promise:
@@ -172,16 +162,18 @@ def _error(place: str, promised: float, measured: float | None, each: EachRay, p
         return Promise(place, promised, value, None)
     values = getattr(each, (_RMS | _P99)[key])
     two = math.sqrt(1 + len(values) / (promised_of or len(values)))  # both figures are samples
-    known = rms_deviation(values) if key in _RMS else _p99_deviation(values)
-    tolerance = min(max(SIGMAS * two * known, LEAST), MOST)
+    deviation = rms_deviation(values) if key in _RMS else _p99_deviation(values)
+    tolerance = min(max(SIGMAS * two * deviation, LEAST), MOST)
     return Promise(place, promised, value, promised * (1 + tolerance) + _FLOOR)
 
 
 def _p99_deviation(values: Tensor) -> float:
     """Relative standard deviation of the 99th percentile, from the quantile one deviation of its rank higher."""
-    above = torch.quantile(values, min(1.0, 0.99 + math.sqrt(0.99 * 0.01 / len(values)))) if len(values) else None
-    at = float(torch.quantile(values, 0.99)) if len(values) else 0.0
-    return (float(above) - at) / at if above is not None and at > 0 else 0.0
+    if not len(values):
+        return 0.0
+    higher = min(1.0, 0.99 + math.sqrt(0.99 * 0.01 / len(values)))
+    at, above = (float(torch.quantile(values, q)) for q in (0.99, higher))
+    return (above - at) / at if at > 0 else 0.0
 
 
 def share_promise(
@@ -212,14 +204,17 @@ def lens_of_card(
     Raises:
         InputError: no such file, or one whose prescription is not the card's in any zoom state.
     """
-    wanted = card["lens"]
-    path = Path(lens_file) if lens_file is not None else find_lens(str(wanted["id"]), Path(model_file))
+    path = Path(lens_file) if lens_file is not None else find_lens(str(card["lens"]["id"]), Path(model_file))
     tabled = read_any(path)
-    for lens in _states(tabled, float(wanted["efl_mm"])):
-        if lens.sha256 == wanted["sha256"]:
+    for lens in _states(tabled, float(card["lens"]["efl_mm"])):
+        if lens.sha256 == card["lens"]["sha256"]:
             return lens.with_stop_radius(float(card["domain"]["stop_radius_mm"]))
-    expected = f"the prescription of {model_file}: {wanted['name']}, sha256 {str(wanted['sha256'])[:12]}..."
-    raise InputError(path, "sha256", f"({tabled.name}, {tabled.sha256[:12]}...)", expected)
+    raise _another_lens(tabled, card, path, model_file)
+
+
+def _another_lens(lens: Lens, card: Mapping[str, Any], path: Path, model_file: str | Path) -> InputError:
+    expected = f"the prescription of {model_file}: {card['lens']['name']}, sha256 {str(card['lens']['sha256'])[:12]}..."
+    return InputError(path, "sha256", f"({lens.name}, {lens.sha256[:12]}...)", expected)
 
 
 def find_lens(lens_id: str, model_file: Path) -> Path:
@@ -242,9 +237,9 @@ def _states(tabled: Lens, efl_mm: float) -> Iterator[Lens]:
         yield lens
         # The card has the computed focal length; the requested one, needed bit by bit, had fewer digits.
         for digits in (9, 12, 15):
-            asked = float(f"{efl_mm:.{digits}g}")
-            if abs(first_order(lens).efl_mm / asked - 1) > 1e-12:
-                yield set_lens(tabled, zoom=configuration, focal_length_mm=asked)
+            wanted = float(f"{efl_mm:.{digits}g}")
+            if abs(first_order(lens).efl_mm / wanted - 1) > 1e-12:
+                yield set_lens(tabled, zoom=configuration, focal_length_mm=wanted)
 
 
 RAY_KEYS = (
@@ -276,15 +271,14 @@ def errors_at(model: OnnxLens, space: StateSpace, state: State, rays: int, seed:
     domain, predict = Domain.from_dict(here.card["domain"]), onnx_predictor(here)
     # The stop is the card's: the graph guards its radius, and between nodes the last digits differ.
     lens = lens.with_stop_radius(domain.stop_radius_mm)
-    pairs = make_pairs(lens, domain, PairSettings(train=1, held_out=rays, rim=1, seed=seed))
-    ray = ray_errors(lens, domain, pairs.held_out, predict)
-    fresh = fresh_rays(lens, domain, pairs.held_out, count=_VIGNETTING * rays, seed=seed)
+    passing = passing_rays(lens, domain, rays, seed)
+    ray = ray_errors(lens, domain, passing, predict)
+    fresh = fresh_rays(lens, domain, passing, count=_VIGNETTING * rays, seed=seed)
     share = false_shares(fresh.passes, predict(fresh.drawn, domain.stop_radius_mm).status == st.PASSED)
-    figures = {k: getattr(ray, k) for k in RAY_KEYS} | share
     assert lens.film_z_mm is not None
     return {
         **dict(zip((a.name for a in model.axes), state, strict=True)),
-        **{k: None if v is None or not math.isfinite(v) else v for k, v in figures.items()},
+        **{key: finite(value) for key, value in ({k: getattr(ray, k) for k in RAY_KEYS} | share).items()},
         "film_z_um": 1000 * (here.card["lens"]["film_z_mm"] - lens.film_z_mm),
         "passing_share": float(fresh.passes.double().mean()),
     }
@@ -297,14 +291,8 @@ def card_errors(rows: Sequence[Mapping[str, Any]], rays: int) -> dict[str, Any]:
         columns = {key: [r[key] for r in rows] for key in (*RAY_KEYS, *SHARES)}
         return {key: None if None in values else float(how(values)) for key, values in columns.items()}
 
-    passing = _VIGNETTING * rays * float(np.mean([r["passing_share"] for r in rows]))
-    return {
-        **over(max),
-        "median": over(np.median),
-        "states": [dict(r) for r in rows],
-        "rays": rays,
-        "passing": int(passing),
-    }
+    passing = int(_VIGNETTING * rays * float(np.mean([r["passing_share"] for r in rows])))
+    return {**over(max), "median": over(np.median), "states": [*map(dict, rows)], "rays": rays, "passing": passing}
 
 
 def space_of_card(
@@ -318,10 +306,9 @@ def space_of_card(
     path = lens_file if lens_file is not None else find_lens(str(card["lens"]["id"]), model_file)
     states = card["states"]
     space = StateSpace(read_any(path).with_aperture(None), tuple(axes), states["zoom"], states["f_number"])
-    found = space.lens_at([float(v) for v in states["default"]])
-    if found.sha256 != card["lens"]["sha256"]:
-        expected = f"the prescription of {model_file}: {card['lens']['name']}, {str(card['lens']['sha256'])[:12]}..."
-        raise InputError(path, "sha256", f"({found.name}, {found.sha256[:12]}...)", expected)
+    lens = space.lens_at([float(v) for v in states["default"]])
+    if lens.sha256 != card["lens"]["sha256"]:
+        raise _another_lens(lens, card, path, model_file)
     return space
 
 
@@ -332,15 +319,13 @@ def check_states(
 
     Returns the worst figures (with `states`, `median`, `rays` and `seed`) and the promises of the card.
     """
-    fitted = int(model.card["fit"]["settings"].get("rays_seed") or 0)
-    seed = fitted + _FRESH if seed is None else seed
+    seed = _fresh_seed(model, seed)
     rows = [errors_at(model, space, s, rays, seed) for s in random_states(model.axes, count, seed)]
-    found, promises = card_errors(rows, rays), []
-    errors = model.card["errors"]
-    for key, promised in _numbers(errors):
+    measured, promises, errors = card_errors(rows, rays), [], _numbers(model.card["errors"])
+    for key, promised in errors.items():
         if key in SHARES:
-            promises.append(share_promise(key, promised, found[key], found["passing"], _count(errors, "passing")))
+            promises.append(share_promise(key, promised, measured[key], measured["passing"], errors.get("passing")))
         elif key in RAY_KEYS:
             allowed = None if key == "max_um" else promised * (1 + TOLERANCE) + _FLOOR
-            promises.append(Promise(key, promised, found[key], allowed))
-    return {**found, "seed": seed}, promises
+            promises.append(Promise(key, promised, measured[key], allowed))
+    return {**measured, "seed": seed}, promises

@@ -34,31 +34,32 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
 
     They are those of the file, those of `FirstOrder` (of an anamorphic lens in the y-z plane), and:
 
-        efl_x_mm: in the x-z plane; None of a round lens.
+        efl_x_mm: in the x-z plane; None for a round lens.
         working_f_number: of the real marginal ray (y-z); None where no ray passes.
-        image_radius_from: what the radius follows from.
+        image_radius_from: how the radius is known.
         half_field_deg: as the file states it.
         half_field_reached_deg: mean angle of the rays that reach the edge of the domain's film, along y of an
-            anamorphic lens; None where none does. half_field_reached_x_deg is None of a round lens, too.
+            anamorphic lens; None where none does. half_field_reached_x_deg is None for a round lens, too.
         passing_share: of rays uniform over the film and pupil discs of the domain.
         ended: what stops the others, a list of {status, text, share}, largest share first.
         warnings: sentences.
     """
-    radius, radius_from = image_radius_mm(lens)
+    data, squeezed = first_order(lens), lens.anamorphic
     film_z = float(lens.film_z_mm if lens.film_z_mm is not None else domain.film_z_mm[0])
+    radius, radius_from = image_radius_mm(lens)
     passing, ended = passing_share(lens, domain)
     # A round lens has the same field along y; the mean over rays along x is used.
-    reached = field_reached_deg(lens, domain, film_z, "y" if lens.anamorphic else "x")
-    reached_x = field_reached_deg(lens, domain, film_z, "x") if lens.anamorphic else reached
+    reached = field_reached_deg(lens, domain, film_z, "y" if squeezed else "x")
+    reached_x = field_reached_deg(lens, domain, film_z, "x") if squeezed else reached
     notes = warnings_of(lens, first_order(at_infinity(lens)).f_number, reached, math.isinf(domain.focus_m[0]))
     if reached is None or reached_x is None:
         where = " and ".join(axis for axis, deg in (("y", reached), ("x", reached_x)) if deg is None)
-        along = f", along {where}" if lens.anamorphic else ""
+        along = f", along {where}" if squeezed else ""
         notes.append(f"no ray reaches the edge of the film ({domain.film_radius_mm:.4g} mm from the axis{along})")
     return {
         **{key: getattr(lens, key) for key in ("name", "designer", "source", "rims", "sha256", "refractions")},
-        **{key: float(value) for key, value in asdict(first_order(lens)).items()},
-        "efl_x_mm": float(first_order(lens, meridian="x").efl_mm) if lens.anamorphic else None,
+        **{key: float(value) for key, value in asdict(data).items()},
+        "efl_x_mm": float(first_order(lens, meridian="x").efl_mm) if squeezed else None,
         "wavelength_nm": lens.reference_nm,
         "object_medium": {**asdict(lens.object_medium), "n_d": float(lens.object_medium.n_d)},
         "working_f_number": working_f_number(lens, domain, film_z),
@@ -70,39 +71,30 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
         "image_radius_from": radius_from,
         "half_field_deg": lens.half_field_deg,
         "half_field_reached_deg": reached,
-        "half_field_reached_x_deg": reached_x if lens.anamorphic else None,
+        "half_field_reached_x_deg": reached_x if squeezed else None,
         "passing_share": passing,
         "ended": ended,
         "warnings": notes,
     }
 
 
+_AS_FILED = ("diameter_mm", "material", "stop", "cylinder", "across", "focal_mm", "glass", "absorption_per_mm")
+
+
 def glass_table(lens: Lens) -> list[dict[str, Any]]:
     """The prescription row by row, every figure of it: n_d and V_d are the catalogue's where a glass rules; asphere is
     {power: coefficient}; coating None or {name, layers: [[index, thickness in nm, V_d if known], ...]}.
     """
-    return [
-        {
-            "surface": k,
-            "z_mm": float(z),
-            "radius_mm": float(s.radius_mm),
-            "thickness_mm": float(s.thickness_mm),
-            "diameter_mm": s.diameter_mm,
-            "n_d": float(s.n_d) if s.glass is None else float(glass_of(s.glass).n_d),
-            "V_d": s.V_d if s.glass is None else float(glass_of(s.glass).V_d),
-            "material": s.material,
-            "stop": s.stop,
-            "conic": float(s.conic),
-            "asphere": {str(power): float(a) for power, a in s.asphere},
-            "cylinder": s.cylinder,
-            "across": s.across,
-            "focal_mm": s.focal_mm,
-            "glass": s.glass,
-            "absorption_per_mm": s.absorption_per_mm,
-            "coating": s.coating and {"name": s.coating.name, "layers": [list(layer) for layer in s.coating.layers]},
-        }
-        for k, (s, z) in enumerate(zip(lens.surfaces, lens.vertices_mm[:-1], strict=True))
-    ]
+    rows = []
+    for k, (s, z) in enumerate(zip(lens.surfaces, lens.vertices_mm[:-1], strict=True)):
+        row: dict[str, Any] = {key: getattr(s, key) for key in _AS_FILED}
+        row.update(surface=k, z_mm=float(z), radius_mm=float(s.radius_mm), thickness_mm=float(s.thickness_mm))
+        glass = None if s.glass is None else glass_of(s.glass)
+        row.update(n_d=float(s.n_d if glass is None else glass.n_d), V_d=s.V_d if glass is None else float(glass.V_d))
+        row.update(conic=float(s.conic), asphere={str(power): float(a) for power, a in s.asphere})
+        layers = s.coating and {"name": s.coating.name, "layers": [list(layer) for layer in s.coating.layers]}
+        rows.append(row | {"coating": layers})
+    return rows
 
 
 def working_f_number(lens: Lens, domain: Domain, film_z: float) -> float | None:
@@ -155,14 +147,14 @@ def passing_share(lens: Lens, domain: Domain, seed: int = 5) -> tuple[float, lis
 
 
 def file_doubts(tabled: Lens, states: bool = True) -> list[str]:
-    """Doubts about a lens file as sentences; without its states where not asked for. See also `warnings_of`."""
+    """Doubts about a lens file as sentences, with or without those of its states. See also `warnings_of`."""
     # A smaller stop than stated is a choice, not a doubt.
     checks = [c for c in check_lens(tabled) if c.quantity != "f-number" or (c.computed or 0.0) > (c.stated or 0.0)]
     return doubts([c for c in checks if states or not c.state])
 
 
 def rim_doubts(lens: Lens) -> list[str]:
-    """That rims are not the source's, as a sentence."""
+    """A sentence on rims that are not the source's."""
     return {
         "estimated": ["rim diameters are estimated, not the source's: vignetting is a guess"],
         "derived": ["rim diameters are derived by a rule, the source has none: vignetting follows that rule"],
@@ -177,12 +169,14 @@ def warnings_of(lens: Lens, f_number: float, reached_deg: float | None, far: boo
         reached_deg: half field that reaches the edge of the film.
         far: whether the lens is focused at infinity, where its source states the field.
     """
-    found = rim_doubts(lens)
+    sentences = rim_doubts(lens)
     if abs(f_number / lens.f_number - 1) > 0.05 and f_number < lens.f_number:
-        found.append(f"the stop gives f/{f_number:.3g}, wider than the f/{lens.f_number:.3g} of the source")
+        sentences.append(f"the stop gives f/{f_number:.3g}, wider than the f/{lens.f_number:.3g} of the source")
     if far and lens.half_field_deg is not None and reached_deg is not None and reached_deg < lens.half_field_deg - 2:
-        found.append(f"the edge of the film sees {reached_deg:.1f} degrees, the source says {lens.half_field_deg:.1f}")
-    return found
+        sentences.append(
+            f"the edge of the film sees {reached_deg:.1f} degrees, the source says {lens.half_field_deg:.1f}"
+        )
+    return sentences
 
 
 def layout_profile(lens: Lens, domain: Domain) -> layout.Layout:
@@ -194,9 +188,6 @@ def layout_profile(lens: Lens, domain: Domain) -> layout.Layout:
     if lens.film_z_mm is None:
         lens = replace(lens, film_z_mm=float(domain.film_z_mm[0]))
     return layout.layout_profile(Scene(lens, domain.focus_m[0]), domain.film_radius_mm)
-
-
-_NO_FIELD = 0.2  # film radius over focal length at which a lens of unknown field is drawn
 
 
 def lens_files(folder: Path) -> list[Path]:
@@ -213,17 +204,19 @@ def read_quietly(path: Path) -> Lens:
 def library_row(path: Path, checked: bool = True) -> dict[str, Any]:
     """A lens file in a table of many.
 
-    Returns: lens, file, notes (what its reader warned of), and `lens_row`, checked or not; of a file that cannot be
+    Returns: lens, file, notes (the warnings of its reader), and `lens_row`, checked or not; of a file that cannot be
         read the verdict "unreadable" with the error as its doubt.
     """
-    place = {"lens": path.stem, "file": str(path)}
     with warned(path) as notes:
         try:
             lens = read_any(path)
             row = lens_row(lens, check_lens(lens) if checked else None)
         except NeurolensError as error:
             row = {"verdict": "unreadable", "doubts": [str(error).removeprefix(f"{path}: ")]}
-    return {**place, **row, "notes": notes}
+    return {"lens": path.stem, "file": str(path), **row, "notes": notes}
+
+
+_STATED = ("name", "stated_efl_mm", "half_field_deg", "image_radius_mm", "refractions", "rims")
 
 
 def lens_row(lens: Lens, checks: list[Check] | None) -> dict[str, Any]:
@@ -234,40 +227,32 @@ def lens_row(lens: Lens, checks: list[Check] | None) -> dict[str, Any]:
         states (zoom or focus), rims, verdict ("ok" or "doubtful"; without checks "read"), doubts, and checks: a list of
         {state, quantity, computed, stated, doubt}.
     """
-    data = first_order(lens)
-    cylinders = sum(s.cylinder is not None for s in lens.surfaces)
+    data, cylinders = first_order(lens), sum(s.cylinder is not None for s in lens.surfaces)
     return {
-        "name": lens.name,
-        "efl_mm": float(data.efl_mm),
+        **{key: getattr(lens, key) for key in _STATED},
+        **{key: float(getattr(data, key)) for key in ("efl_mm", "back_focus_mm", "f_number")},
         "efl_x_mm": float(first_order(lens, meridian="x").efl_mm) if cylinders else None,
-        "stated_efl_mm": lens.stated_efl_mm,
-        "back_focus_mm": float(data.back_focus_mm),
-        "f_number": float(data.f_number),
-        "half_field_deg": lens.half_field_deg,
-        "image_radius_mm": lens.image_radius_mm,
-        "refractions": lens.refractions,
         "aspheres": sum(s.conic != 0 or bool(s.asphere) for s in lens.surfaces),
         "cylinders": cylinders,
         "states": len(lens.configurations),
-        "rims": lens.rims,
         "verdict": "read" if checks is None else verdict(checks),
         "doubts": doubts(checks or []),
         "checks": [asdict(c) for c in checks or []],
     }
 
 
+_NO_FIELD = 0.2  # film radius over focal length at which a lens of unknown field is drawn
+
+
 def section(path: Path) -> layout.Layout:
-    """A lens in section with rays, focused at infinity, as `figures.sheet` draws it; an anamorphic one in y-z."""
+    """A lens in section with rays, focused at infinity, as `layout.sheet` draws it; an anamorphic one in y-z."""
     lens = set_lens(read_quietly(path))
     data, edge = first_order(lens), film_edge_mm(lens)
     if edge is None:
         edge = _NO_FIELD * abs(data.efl_mm) if lens.half_field_deg is None else image_radius_mm(lens)[0]
-    profile = layout.layout_profile(Scene(lens, math.inf, "y"), edge)
-    return replace(profile, title=path.stem, subtitle=_caption(lens, data.efl_mm, data.f_number))
-
-
-def _caption(lens: Lens, efl_mm: float, f_number: float) -> str:
-    text = f"{efl_mm:.4g} mm f/{f_number:.2g}"
+    focal = f"{data.efl_mm:.4g}"
     if lens.anamorphic:
-        text = f"{efl_mm:.3g} / {first_order(lens, meridian='x').efl_mm:.3g} mm f/{f_number:.2g}"
-    return text + ("" if lens.half_field_deg is None else f", {lens.half_field_deg:.3g}°") + f", rims {lens.rims}"
+        focal = f"{data.efl_mm:.3g} / {first_order(lens, meridian='x').efl_mm:.3g}"
+    field = "" if lens.half_field_deg is None else f", {lens.half_field_deg:.3g}°"
+    subtitle = f"{focal} mm f/{data.f_number:.2g}{field}, rims {lens.rims}"
+    return replace(layout.layout_profile(Scene(lens, math.inf, "y"), edge), title=path.stem, subtitle=subtitle)

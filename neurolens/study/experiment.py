@@ -121,8 +121,8 @@ class DomainChoice:
         lit_mm, film_mm, asked = domain.bounds.lit_radius_mm, domain.film_radius_mm, self.film_radius_mm is not None
         if lit_mm > DARK_FROM * film_mm:
             return domain
-        said = f"{lens.path}: the film, {film_mm:.4g} mm in radius, is dark beyond {lit_mm:.4g} mm"
-        warnings.warn(said if asked else f"{said}: models are of what is lit", NeurolensWarning, stacklevel=2)
+        text = f"{lens.path}: the film, {film_mm:.4g} mm in radius, is dark beyond {lit_mm:.4g} mm"
+        warnings.warn(text if asked else f"{text}: models are of what is lit", NeurolensWarning, stacklevel=2)
         return domain if asked else domain_of(lens, film_radius_mm=lit_mm, focus_m=focus_m, wavelength_nm=wavelengths)
 
 

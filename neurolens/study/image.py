@@ -13,11 +13,9 @@ from neurolens.base.errors import InputError, NeurolensError
 Image = NDArray[np.float64]
 
 MIN_PAIRS = 4  # with fewer pairs the noise floor is too noisy to divide by
-# In the denominator of the relative MSE, squared radiance, so that dark pixels do not dominate the mean.
-EPS = 1e-2
-# Of visual angle, for FLIP: its authors' default (0.7 m from a 0.7 m wide 4K display).
-PIXELS_PER_DEGREE = 67.0
-# Of the comparison, as a run's results have them; the exposure is a factor before the sRGB curve.
+EPS = 1e-2  # squared radiance in the denominator of the relative MSE: dark pixels do not dominate the mean
+PIXELS_PER_DEGREE = 67.0  # of FLIP, its authors' default: 0.7 m from a 0.7 m wide 4K display
+# Settings of the comparison for a run's results; the exposure is a factor before the sRGB curve.
 SETTINGS = {"exposure": 1.0, "pixels_per_degree": PIXELS_PER_DEGREE, "eps": EPS}
 
 
@@ -84,26 +82,15 @@ def flip_map(test: ArrayLike, reference: ArrayLike) -> Image:
         raise NeurolensError(
             "FLIP needs flip-evaluator: pip install 'neurolens[train]', or '.[train]' in a checkout"
         ) from error
-    shown_a, shown_b = (np.ascontiguousarray(to_srgb(x), dtype=np.float32) for x in (a, b))
+    pictures = (np.ascontiguousarray(to_srgb(x), dtype=np.float32) for x in (b, a))
     options = {"applyMagma": False, "computeMeanError": False, "parameters": {"ppd": PIXELS_PER_DEGREE}}
-    errors, _, _ = flip_evaluator.evaluate(shown_b, shown_a, "LDR", **options)
+    errors, _, _ = flip_evaluator.evaluate(*pictures, "LDR", **options)
     return np.asarray(errors, dtype=np.float64).reshape(a.shape[:2])
 
 
 def flip(test: ArrayLike, reference: ArrayLike) -> float:
     """Mean of `flip_map`: 0 for equal pictures, 1 at most."""
     return float(flip_map(test, reference).mean())
-
-
-def seed_pairs(count: int) -> list[tuple[int, int]]:
-    """(i, j) with j the next render in a ring: every render is once the test and once the reference, never with itself.
-
-    Raises:
-        InputError: fewer than MIN_PAIRS renders.
-    """
-    if count < MIN_PAIRS:
-        raise InputError("image", "renders of different seeds", count, f"at least {MIN_PAIRS}, for {MIN_PAIRS} pairs")
-    return [(i, (i + 1) % count) for i in range(count)]
 
 
 @dataclass(frozen=True)
@@ -130,7 +117,7 @@ def compare(renders: Sequence[ArrayLike], exact_renders: Sequence[ArrayLike]) ->
     """Error of a surrogate's renders against exact ones, beside the noise floor.
 
     Render i of the surrogate is compared with exact render i, whose random numbers it shares (paired), and with exact
-    render j != i of `seed_pairs`, as two independent renders differ. The floor is exact i against the same exact j.
+    render i + 1 (the last with the first), as two independent renders differ. The floor is exact i against that one.
 
     Args:
         renders: one or more [H, W, 3] linear renders; number i has the seed of exact render i.
@@ -139,22 +126,23 @@ def compare(renders: Sequence[ArrayLike], exact_renders: Sequence[ArrayLike]) ->
     Raises:
         InputError: too few renders, or pictures that do not fit each other.
     """
-    ring = seed_pairs(len(exact_renders))
-    if not (1 <= len(renders) <= len(ring)):
-        raise InputError("image", "surrogate renders", len(renders), f"1 to {len(ring)}, one for each exact render")
+    count = len(exact_renders)
+    if count < MIN_PAIRS:
+        raise InputError("image", "renders of different seeds", count, f"at least {MIN_PAIRS}, for {MIN_PAIRS} pairs")
+    if not (1 <= len(renders) <= count):
+        raise InputError("image", "surrogate renders", len(renders), f"1 to {count}, one for each exact render")
+    others = [*exact_renders[1:], exact_renders[0]]
 
-    def errors(tests: Sequence[ArrayLike], measure: Callable[..., float]) -> list[float]:
-        """Compare each pair (i, j): test render i against exact render j."""
-        return [measure(tests[i], exact_renders[j]) for i, j in ring[: len(tests)]]
+    def mean(measure: Callable[..., float], tests: Sequence[ArrayLike], references: Sequence[ArrayLike]) -> float:
+        return float(np.mean([measure(a, b) for a, b in zip(tests, references, strict=False)]))
 
-    floor = float(np.mean(errors(exact_renders, flip)))
-    paired = float(np.mean([flip(a, b) for a, b in zip(renders, exact_renders, strict=False)]))
+    floor, paired = mean(flip, exact_renders, others), mean(flip, renders, exact_renders)
     return ImageErrors(
         flip_paired=paired,
         paired_share=paired / floor if floor > 0 else None,
-        flip=float(np.mean(errors(renders, flip))),
-        rel_mse=float(np.mean(errors(renders, rel_mse))),
+        flip=mean(flip, renders, others),
+        rel_mse=mean(rel_mse, renders, others),
         noise_floor_flip=floor,
-        noise_floor_rel_mse=float(np.mean(errors(exact_renders, rel_mse))),
+        noise_floor_rel_mse=mean(rel_mse, exact_renders, others),
         pairs=len(renders),
     )

@@ -1,6 +1,6 @@
-"""Errors of models by zone, on rays not used in any fit, traced once through the exact lens.
+"""Errors of models by zone, on rays not used in any fit, traced once through the exact lens; fits with their errors.
 
-A smaller stop changes no ray, only which of them pass: the crossing with the stop, kept from the one trace, tells.
+A smaller stop changes no ray, only which of them pass, which the crossing with the stop decides.
 """
 
 from __future__ import annotations
@@ -22,8 +22,17 @@ from neurolens.base.files import atomic_path, fingerprint_of, read_kept, sha256_
 from neurolens.base.progress import Report
 from neurolens.cameras.model import OnnxLens, load_model
 from neurolens.lens.prescription import Lens
-from neurolens.study.rays import PIXELS_ACROSS, EachRay, Predict, RayErrors, each_ray
-from neurolens.study.vignetting import NEAR_RIM, ZONES, deciding_rim_ratio, false_shares
+from neurolens.study.rays import (
+    NEAR_RIM,
+    PIXELS_ACROSS,
+    ZONES,
+    EachRay,
+    Predict,
+    RayErrors,
+    deciding_rim_ratio,
+    each_ray,
+    false_shares,
+)
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import NETWORKS, ModelSettings, Prepared, fit_model
@@ -85,27 +94,30 @@ def fresh_rays(lens: Lens, domain: Domain, held_out: PairSet, *, count: int, see
 
 
 def with_more(fresh: FreshRays, seed: int) -> FreshRays:
-    """`MORE` times as many passing rays, those there among them; at most `MOST` are added."""
-    lens, domain, count = fresh.lens, fresh.domain, len(fresh.held_out)
-    sets, squares, wanted = [_without_crossings(fresh.held_out)], [fresh.held_square], min((MORE - 1) * count, MOST)
+    """`MORE` times as many passing rays, the given ones among them; at most `MOST` are added."""
+
+    def without_crossings(pairs: PairSet) -> PairSet:
+        """The same rays without the data per surface, which is most of their memory."""
+        by_surface = ("cross_x", "cross_y", "meets", "refracts")
+        return replace(pairs, **{name: getattr(pairs, name)[:0].clone() for name in by_surface})
+
+    lens, count = fresh.lens, len(fresh.held_out)
+    sets, squares, wanted = [without_crossings(fresh.held_out)], [fresh.held_square], min((MORE - 1) * count, MOST)
     while wanted > 0:
-        part = PairSettings(train=1, held_out=min(count, wanted), rim=1, seed=seed + len(sets))
-        pairs = make_pairs(lens, domain, part).held_out
-        sets.append(_without_crossings(pairs))
+        pairs = passing_rays(lens, fresh.domain, min(count, wanted), seed + len(sets))
+        sets.append(without_crossings(pairs))
         squares.append(_stop_square(lens, pairs))
         wanted -= len(pairs)
     return replace(fresh, held_out=join_pairs(sets), held_square=torch.cat(squares))
 
 
+def passing_rays(lens: Lens, domain: Domain, count: int, seed: int) -> PairSet:
+    """So many rays of a domain that the exact lens passes."""
+    return make_pairs(lens, domain, PairSettings(train=1, held_out=count, rim=1, seed=seed)).held_out
+
+
 def _stop_square(lens: Lens, pairs: PairSet) -> Tensor:
     return pairs.cross_x[lens.stop_index] ** 2 + pairs.cross_y[lens.stop_index] ** 2
-
-
-def _without_crossings(pairs: PairSet) -> PairSet:
-    """The same rays without the data per surface, which is most of their memory."""
-    return replace(
-        pairs, **{name: getattr(pairs, name)[:0].clone() for name in ("cross_x", "cross_y", "meets", "refracts")}
-    )
 
 
 @dataclass(frozen=True)
@@ -128,19 +140,19 @@ class Findings:
 
     def errors(self, keys: tuple[str, ...]) -> dict[str, Any]:
         """Data for card and record: figures of `keys`, None if not finite, then `zones`."""
-        plain = {key: _finite(self.figures[key]) for key in keys}
+        plain = {key: finite(self.figures[key]) for key in keys}
         return {**plain, "stopped_down": self.stopped_down, "zones": self.zones}
 
 
 def measure(fresh: FreshRays, predict: Predict) -> Findings:
     """Errors of one model; `predict` as `onnx_predictor` gives it."""
     each = each_ray(fresh.lens, fresh.domain, fresh.held_out, predict)
-    said = {s: predict(fresh.drawn, fresh.stop_radius_mm(s)).status == st.PASSED for s in STOPS}
+    model = {s: predict(fresh.drawn, fresh.stop_radius_mm(s)).status == st.PASSED for s in STOPS}
     exact = {s: fresh.passes & (fresh.stop_square <= fresh.stop_radius_mm(s) ** 2) for s in STOPS}
-    shares = {s: false_shares(exact[s], said[s]) for s in STOPS}
-    near = false_shares(exact["full"][fresh.near], said["full"][fresh.near])
+    shares = {s: false_shares(exact[s], model[s]) for s in STOPS}
+    near = false_shares(exact["full"][fresh.near], model["full"][fresh.near])
     full = {**shares.pop("full"), **{f"{key}_near_rim": value for key, value in near.items()}}
-    zones = {s: {z: _zone(fresh, each, s, z, exact[s], said[s]) for z in ZONES} for s in ZONED}
+    zones = {s: {z: _zone(fresh, each, s, z, exact[s], model[s]) for z in ZONES} for s in ZONED}
     return Findings({**asdict(RayErrors.over(fresh.lens, fresh.domain, each)), **full}, shares, zones, each)
 
 
@@ -171,10 +183,10 @@ def _within(domain: Domain, rays: FilmRays, zone: str) -> Tensor:
     return (place >= low) & ((place < high) | (high == 1.0))
 
 
-def _zone(fresh: FreshRays, each: EachRay, state: str, zone: str, exact: Tensor, said: Tensor) -> dict[str, Any]:
+def _zone(fresh: FreshRays, each: EachRay, state: str, zone: str, exact: Tensor, model: Tensor) -> dict[str, Any]:
     part = zone_of(fresh, each, state, zone)
     within = _within(fresh.domain, fresh.drawn, zone)
-    passing, shares = int(exact[within].sum()), false_shares(exact[within], said[within])
+    passing, shares = int(exact[within].sum()), false_shares(exact[within], model[within])
     return {
         "rms_um": _rms(part.focus_um),
         "direction_rms_deg": _rms(part.direction_deg),
@@ -188,10 +200,11 @@ def _rms(values: Tensor) -> float | None:
     """RMS with four digits; None with too few rays, or if a few of them dominate."""
     if len(values) < LEAST_RAYS or rms_deviation(values) > KNOWN:
         return None
-    return _finite(float(f"{float(torch.sqrt((values * values).mean())):.4g}"))
+    return finite(float(f"{float(torch.sqrt((values * values).mean())):.4g}"))
 
 
-def _finite(value: float | None) -> float | None:
+def finite(value: float | None) -> float | None:
+    """The value, or None where it is not finite."""
     return None if value is None or not math.isfinite(value) else value
 
 
@@ -225,13 +238,12 @@ def onnx_predictor(model: OnnxLens) -> Predict:
     """An exported model as `rays` and `vignetting` want it."""
 
     def predict(rays: FilmRays, stop_radius_mm: float | None = None) -> Prediction:
-        columns = [np.ascontiguousarray(c.numpy(), dtype=np.float32) for c in rays.columns()]
-        film, pupil = np.stack(columns[0:2]), np.stack(columns[3:5])
-        out = model.rays(film, pupil, columns[5], columns[2], stop_radius_mm)
-        x, y, z, dx, dy, dz = torch.from_numpy(out.scene_ray)
-        stop_x, stop_y = torch.from_numpy(out.stop_xy_mm)
-        power, status = torch.from_numpy(out.transmittance), torch.from_numpy(out.status)
-        return Prediction(Rays(x, y, z, dx, dy, dz), power, stop_x, stop_y, status)
+        x, y, z, u, v, nm = (np.ascontiguousarray(c.numpy(), dtype=np.float32) for c in rays.columns())
+        out = model.rays(np.stack([x, y]), np.stack([u, v]), nm, z, stop_radius_mm)
+        scene, power, stop, status = (
+            torch.from_numpy(a) for a in (out.scene_ray, out.transmittance, out.stop_xy_mm, out.status)
+        )
+        return Prediction(Rays(*scene), power, stop[0], stop[1], status)
 
     return predict
 
@@ -252,23 +264,16 @@ def measure_on(rays: FreshRays, model: OnnxLens) -> dict[str, Any]:
 
 def what_is_poor(errors: Mapping[str, Any]) -> list[str]:
     """Errors of a model that are visible in a picture, as sentences for its card."""
-    said = [
-        f"{key.replace('_', ' ')} {100 * errors[key]:.2g}%"
-        for key in ("false_pass", "false_block")
-        if (errors.get(key) or 0.0) > POOR_SHARE
-    ]
+    shares = {key: errors.get(key) or 0.0 for key in ("false_pass", "false_block")}
+    poor = [f"{key.replace('_', ' ')} {100 * share:.2g}%" for key, share in shares.items() if share > POOR_SHARE]
     pixels = errors.get("rms_px") or 0.0
-    return [*said, f"RMS error {pixels:.2g} pixels of a picture {PIXELS_ACROSS} wide"] if pixels > POOR_PX else said
+    return [*poor, f"RMS error {pixels:.2g} pixels of a picture {PIXELS_ACROSS} wide"] if pixels > POOR_PX else poor
 
 
 def fit_and_measure(
-    prepared: Prepared,
-    settings: ModelSettings,
-    folder: Path,
-    vignetting_rays: int,
-    report: Report,
+    prepared: Prepared, settings: ModelSettings, folder: Path, vignetting_rays: int, report: Report,
     rays: Callable[[], FreshRays] | None = None,
-) -> Measured:
+) -> Measured:  # fmt: skip
     """Fit, export and measure one model, or take an existing one of the same settings and version from the folder.
 
     Errors are of the exported float32 graph in onnxruntime. `rays`: `shared_rays`, where several models share them.
@@ -276,43 +281,48 @@ def fit_and_measure(
     file, pairs = folder / f"{settings.label}.onnx", prepared.pairs
     made_of = (pairs.domain.to_dict(), asdict(pairs.settings), asdict(settings), vignetting_rays)
     fingerprint = fingerprint_of([__version__, pairs.lens.sha256, *made_of])
-    known = known_record(file, fingerprint)
-    if known is not None:
-        return Measured(settings, file, known)
+    if (record := known_record(file, fingerprint)) is not None:
+        return Measured(settings, file, record)
     training = folder / f"{settings.label}.training.npz"  # left by a killed run
     model = fit_model(prepared, settings, report, checkpoint=training)
     on = rays() if rays else shared_rays(prepared, vignetting_rays)
-    with atomic_path(file) as measured:  # a file without its errors never has the final name
-        export_onnx(model, measured, errors={})
-        errors = measure_on(on, load_model(measured))
-        export_onnx(model, measured, errors=errors)
-    record: dict[str, Any] = {
-        "name": settings.label,
-        "family": settings.family,
-        "variables": settings.basis,
-        "file": f"models/{file.name}",
-        **errors,
+    facts = {
+        "name": settings.label, "family": settings.family, "variables": settings.basis, "file": f"models/{file.name}",
         "coefficients_per_vector": None if settings.method in NETWORKS else model.core.coefficients_per_vector,
-        "parameters": model.core.coefficients,
-        "bytes": file.stat().st_size,
-        "fit_s": model.fit_s,
-        "load_s": seconds_to_load(file),
-    }
-    note_record(file, fingerprint, record)
+        "parameters": model.core.coefficients, "fit_s": model.fit_s,
+    }  # fmt: skip
+    record = export_measured(
+        file, fingerprint, facts, lambda path, errors: export_onnx(model, path, errors), lambda m: measure_on(on, m)
+    )
     clear_training(training)
     return Measured(settings, file, record)
 
 
+def export_measured(
+    file: Path, fingerprint: str, facts: dict[str, Any], export: Callable[[Path, dict[str, Any]], object],
+    errors_of: Callable[[OnnxLens], dict[str, Any]],
+) -> dict[str, Any]:  # fmt: skip
+    """Export a model, measure the exported file, and export it with its errors; the record is kept beside it.
+
+    Args:
+        fingerprint: by which `known_record` knows the record again.
+        facts: of the record, besides the errors and what the file tells.
+        export: writes the model with errors to a path.
+    """
+    with atomic_path(file) as unmeasured:  # a file without its errors never has the final name
+        export(unmeasured, {})
+        errors = errors_of(load_model(unmeasured))
+        export(unmeasured, errors)
+    record = {**facts, **errors, "bytes": file.stat().st_size, "load_s": seconds_to_load(file)}
+    write_kept(file.with_suffix(".json"), {"fingerprint": fingerprint, "sha256": sha256_of(file), "record": record})
+    return record
+
+
 def seconds_to_load(file: Path) -> float:
+    """Seconds that it takes to load a model."""
     start = time.perf_counter()
     load_model(file)
     return time.perf_counter() - start
-
-
-def note_record(file: Path, fingerprint: str, record: dict[str, Any]) -> None:
-    """Write the record of a finished fit beside its model, for `known_record`."""
-    made = {"fingerprint": fingerprint, "sha256": sha256_of(file), "record": record}
-    write_kept(file.with_suffix(".json"), made)
 
 
 def known_record(file: Path, fingerprint: str) -> dict[str, Any] | None:

@@ -1,15 +1,23 @@
-"""Error against time and against size, in one picture; colours of families, placement of labels."""
+"""Plots of a run: error against time and size, renders beside their errors, illumination, error over zoom and focus."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from neurolens.analysis.plot_style import INK, drawing, plain_log_ticks
+import numpy as np
+from numpy.typing import ArrayLike
+
+from neurolens.analysis.plots import FIELD_COLOURS, INK, drawing, plain_log_ticks
+from neurolens.base.errors import InputError
 from neurolens.base.records import NOISY, noisy, pareto_front, time_of
-from neurolens.study.advice import said_ns
+from neurolens.study.advice import ns_text
+from neurolens.study.image import checked_image, to_srgb
 from neurolens.study.pages import Record, number
+from neurolens.study.rays import Illumination
+from neurolens.surrogates.axes import Axis
 
 # Names, Okabe and Ito's colours, and markers, which tell kinds apart without colours; black is the exact tracer's.
 Kinds = Mapping[str, tuple[str, str, str]]
@@ -33,18 +41,14 @@ _Point = tuple[float, float, Record, bool]  # time or size, error, the model, wh
 
 
 def family_colour(family: str | None) -> str:
+    """The colour of a family of models."""
     return FAMILIES.get(str(family), _OTHER)[1]
 
 
 def trade_plot(
-    title: str,
-    records: Sequence[Record],
-    exact: Sequence[Record],
-    path: Path,
-    kinds: Kinds = FAMILIES,
-    kind: str = "family",
-    use: str | None = None,
-) -> bool:
+    title: str, records: Sequence[Record], exact: Sequence[Record], path: Path, kinds: Kinds = FAMILIES,
+    kind: str = "family", use: str | None = None,
+) -> bool:  # fmt: skip
     """Draw error against time (hollow: as C) and against size, logarithmic; returns whether there was anything to draw.
 
     Exact tracers, which have no error, are lines at their time. The staircase is the front that nothing betters. From a
@@ -66,17 +70,17 @@ def trade_plot(
     times = [*_points(shown, "ns_per_ray.min", error), *_points(shown, "fused_ns_per_ray.min", error)]
     sizes = _points(shown, "coefficients_per_vector", error)
     sizes += [p for p in _points(shown, "parameters", error) if number(p[2], "coefficients_per_vector") is None]
+    timings = [(number(r, error), r.get(key)) for r in shown for key in ("ns_per_ray", "fused_ns_per_ray")]
     with drawing(path, 13.0, 5.8) as figure:
         left, right = figure.subplots(1, 2, sharey=True)
         _panel(left, times, "time per ray (ns, best of the rounds)", kinds, kind)
-        _spread(left, shown, error)
-        for one in exact:
-            time = number(one, "ns_per_ray.min")
-            if time:
-                look = {"color": INK, "lw": 1.0, "ls": "--" if "compiled" in one["name"] else ":"}
-                look |= {"color": CHOSEN, "lw": 2.0} if one["name"] == use else {}
-                said = f"{one['name']} {said_ns(time_of(one))}" + ": use" * (one["name"] == use)
-                left.axvline(time, label=said, **look)
+        noisy_lines(left, [(e, t["min"], t["median"]) for e, t in timings if t is not None and noisy(t)])
+        for tracer in exact:
+            if time := number(tracer, "ns_per_ray.min"):
+                look = {"color": INK, "lw": 1.0, "ls": "--" if "compiled" in tracer["name"] else ":"}
+                look |= {"color": CHOSEN, "lw": 2.0} if tracer["name"] == use else {}
+                label = f"{tracer['name']} {ns_text(time_of(tracer))}" + ": use" * (tracer["name"] == use)
+                left.axvline(time, label=label, **look)
         advised = [(x, number(r, error)) for r in shown if r["name"] == use and (x := number(time_of(r), "min"))]
         if advised:
             left.plot(*advised[0], "o", label=f"use {use}", **_RING)
@@ -84,8 +88,8 @@ def trade_plot(
         left.set_ylabel(_ERRORS[error])
         plain_log_ticks(left.yaxis)
         figure.suptitle(f"{title}: error against time and size", x=0.01, ha="left", fontweight="bold")
-        found = [axes.get_legend_handles_labels() for axes in (left, right)]
-        handles = {label: h for each in found for h, label in zip(*each, strict=True)}
+        legends = [axes.get_legend_handles_labels() for axes in (left, right)]
+        handles = {label: h for legend in legends for h, label in zip(*legend, strict=True)}
         figure.legend(handles.values(), handles.keys(), loc="outside right upper")
         for axes, points in ((left, times), (right, sizes)):
             plain_log_ticks(axes.xaxis)
@@ -93,17 +97,6 @@ def trade_plot(
             if points:
                 place_labels(axes, [p[:2] for p in points], [str(p[2]["name"]) for p in points])
     return True
-
-
-def _spread(axes: Any, records: Sequence[Record], error: str) -> None:
-    """Lines from noisy times to the medians of their rounds."""
-    lines = [
-        (number(record, error), timing["min"], timing["median"])
-        for record in records
-        for timing in (record.get("ns_per_ray"), record.get("fused_ns_per_ray"))
-        if timing is not None and noisy(timing)
-    ]
-    noisy_lines(axes, lines)
 
 
 def noisy_lines(axes: Any, lines: Sequence[tuple[Any, float, float]]) -> None:
@@ -135,42 +128,214 @@ def _panel(axes: Any, points: Sequence[_Point], label: str, kinds: Kinds, kind: 
 def place_labels(axes: Any, points: Sequence[tuple[float, float]], labels: Sequence[str]) -> None:
     """Write each label beside its point where it covers the fewest other points and labels.
 
-    Greedy: each label takes the best of twelve places round its marker, in pixels, after the labels before it.
+    Each label takes the best of twenty-two places round its marker, in pixels, after the labels before it.
     """
+    from matplotlib.transforms import Bbox
+
     axes.figure.canvas.draw()  # the transform and text extents are known only after a layout pass
     renderer = axes.figure.canvas.get_renderer()
-    pixels = [tuple(axes.transData.transform(point)) for point in points]
-    frame = axes.get_window_extent(renderer)
-    taken: list[tuple[float, float, float, float]] = []
-    for (x, y), point, label in zip(pixels, points, labels, strict=True):
+    pixels, frame = axes.transData.transform(np.reshape(points, (-1, 2))), axes.get_window_extent(renderer)
+    taken: list[Any] = []
+    for at, point, label in zip(pixels, points, labels, strict=True):
         note = axes.annotate(label, point, textcoords="offset pixels", xytext=(0, 0), fontsize=6.4, color="#333333")
-        box = note.get_window_extent(renderer)
-        best = min(
-            _places(box.width, box.height),
-            key=lambda d: _cost((x + d[0], y + d[1], box.width, box.height), pixels, taken, frame) + 0.002 * abs(d[1]),
-        )
+        extent = note.get_window_extent(renderer)
+
+        def cost(corner: tuple[float, float], at: Any = at, extent: Any = extent) -> float:
+            """The markers and labels that a label here would cover; most of all it stays within the axes."""
+            box = Bbox.from_bounds(at[0] + corner[0], at[1] + corner[1], extent.width, extent.height)
+            covered = 2.0 * box.padded(6).count_contains(pixels)
+            common = (Bbox.intersection(box.padded(3, 1), other) for other in taken)
+            covered += sum(3.0 * b.width * b.height for b in common if b) / (box.width * box.height)
+            outside = box.x0 < frame.x0 or box.y0 < frame.y0 or box.x1 > frame.x1 or box.y1 > frame.y1
+            return float(covered + 100.0 * outside + 0.002 * abs(corner[1]))
+
+        best = min(_corners(extent.width, extent.height), key=cost)
         note.set_position(best)
         note.set(ha="left", va="bottom")
-        taken.append((x + best[0], y + best[1], box.width, box.height))
+        taken.append(Bbox.from_bounds(at[0] + best[0], at[1] + best[1], extent.width, extent.height))
 
 
-def _places(width: float, height: float) -> list[tuple[float, float]]:
+def _corners(width: float, height: float) -> list[tuple[float, float]]:
     """Offsets in pixels from a point to the lower left corner of its label, nearest first."""
-    places = []
+    corners = []
     for gap in (9.0, 20.0):
         rows = (-height / 2, gap / 2, -height - gap / 2)
-        places += [(gap, row) for row in rows] + [(-width - gap, row) for row in rows]
-        places += [(-width / 2, gap), (-width / 2, -height - gap)]
-    return places
+        corners += [(gap, row) for row in rows] + [(-width - gap, row) for row in rows]
+        corners += [(-width / 2, gap), (-width / 2, -height - gap)]
+    return corners
 
 
-def _cost(box: tuple[float, float, float, float], points: Sequence[Any], taken: Sequence[Any], frame: Any) -> float:
-    """Cost of a label's place: markers covered, label area overlapped, and most of all leaving the axes."""
-    x, y, w, h = box
-    cost = sum(2.0 for px, py in points if x - 6 < px < x + w + 6 and y - 6 < py < y + h + 6)
-    for x2, y2, w2, h2 in taken:
-        across, along = min(x + w, x2 + w2) - max(x, x2), min(y + h, y2 + h2) - max(y, y2)
-        cost += 3.0 * max(0.0, across + 3) * max(0.0, along + 1) / (w * h)
-    if x < frame.x0 or y < frame.y0 or x + w > frame.x1 or y + h > frame.y1:
-        cost += 100.0
-    return cost
+_COLUMNS = 4  # with more, each picture would be too small
+
+
+def side_by_side(
+    images: Mapping[str, ArrayLike], error_maps: Mapping[str, ArrayLike], path: str | Path,
+    captions: Mapping[str, str] | None = None, title: str = "",
+) -> Path:  # fmt: skip
+    """Renders in rows of four, each with its FLIP error image below; one colour bar serves all of them.
+
+    Args:
+        images: name to linear RGB [H, W, 3], shown through `image.to_srgb`; all of one shape.
+        error_maps: name to error [H, W]; a name without one (the reference) keeps its place below for its caption.
+            All share one logarithmic scale (`error_scale`), so that small errors show beside large ones.
+        path: PNG, PDF or SVG to write.
+        captions: name to one or two lines shown below its picture.
+    Raises:
+        InputError: no image, shapes that differ, values that are not finite, a map without its image.
+    """
+    pictures = {name: checked_image(image, name) for name, image in images.items()}
+    maps = {name: np.asarray(error, dtype=np.float64) for name, error in error_maps.items()}
+    _check_shapes(pictures, maps)
+    low, high = error_scale(maps.values(), 99.5)
+    height, width = next(iter(pictures.values())).shape[:2]
+    rows, each = math.ceil(len(pictures) / _COLUMNS), 2 if maps else 1
+    columns = math.ceil(len(pictures) / rows)
+    wide = max(2.45, 7.6 / columns)
+    note = {"xycoords": "axes fraction", "xytext": (0, -5), "textcoords": "offset points", "ha": "center", "va": "top"}
+    with drawing(path, columns * wide + 1, rows * (each * wide * height / width + 1), title) as figure:
+        figure.set_layout_engine("compressed", h_pad=0.06)  # for pictures, which keep their aspect
+        grid = figure.subplots(each * rows, columns, squeeze=False)
+        for axes in grid.flat:
+            axes.set_axis_off()
+        for k, (name, picture) in enumerate(pictures.items()):
+            above, below = (grid[k // columns * each + i, k % columns] for i in (0, each - 1))
+            above.imshow(to_srgb(picture), interpolation="nearest")
+            above.set_title(name, fontsize=10.5, fontweight="bold", pad=4)
+            if name in maps:
+                look = {"cmap": "magma", "norm": log_norm(low, high), "interpolation": "nearest"}
+                shown = below.imshow(np.maximum(maps[name], low), **look)
+            captioned = below if name in maps else above
+            captioned.annotate((captions or {}).get(name, ""), (0.5, 0), fontsize=8.6, color="#444444", **note)
+        if maps:
+            label = "FLIP difference, no unit: 0 none, 1 the most (logarithmic, one scale for all)"
+            bar = figure.colorbar(shown, ax=grid, label=label, aspect=40, extend="both")
+            bar.outline.set_visible(False)
+            plain_log_ticks(bar.ax.yaxis)
+    return Path(path)
+
+
+def _check_shapes(pictures: Mapping[str, Any], maps: Mapping[str, Any]) -> None:
+    if not pictures:
+        raise InputError("side by side", "images", "(none)", "at least one image")
+    first = next(iter(pictures.values())).shape
+    for name, picture in pictures.items():
+        if picture.shape != first:
+            raise InputError("side by side", f"image {name}", f"({picture.shape})", f"the shape of the first, {first}")
+    for name, error in maps.items():
+        if name not in pictures:
+            raise InputError("side by side", "error map", name, "the name of an image: " + ", ".join(pictures))
+        if error.shape != first[:2] or not np.isfinite(error).all():
+            raise InputError("side by side", f"error map {name}", f"({error.shape})", f"finite values, {first[:2]}")
+
+
+_DECADES = 3  # of a scale of errors
+
+
+def error_scale(maps: Iterable[ArrayLike], counted: float) -> tuple[float, float]:
+    """Ends of the logarithmic scale that maps of errors share: three decades up to the counted percentile of the map
+    with the largest errors (not the maximum: fireflies), rounded up."""
+    finite = [m[np.isfinite(m)] for m in map(np.asarray, maps)]
+    high = rounded_up(max((float(np.percentile(m, counted)) for m in finite if m.size), default=0.0))
+    return high / 10**_DECADES, high
+
+
+def log_norm(low: float, high: float) -> Any:
+    """Matplotlib's logarithmic scale of colours."""
+    from matplotlib.colors import LogNorm
+
+    return LogNorm(low, high, clip=False)
+
+
+def rounded_up(value: float) -> float:
+    """1, 2 or 5 times a power of ten, at least `value`; 1 where that is not positive."""
+    if value <= 0:
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(step * power for step in (1, 2, 5, 10) if step * power >= value * (1 - 1e-9))
+
+
+def illumination_plot(
+    curves: Mapping[str, Illumination], path: str | Path, title: str = "Relative illumination"
+) -> Path:
+    """Relative illumination against film radius: the exact lens as a line, models dashed on it, differences below.
+
+    Args:
+        curves: of models by name, all against the same exact lens.
+        path: PNG, PDF or SVG to write.
+    Raises:
+        InputError: no model, values that are not finite.
+    """
+    if not curves or not all(np.isfinite([c.exact, c.model]).all() for c in curves.values()):
+        raise InputError("illumination plot", "curves", f"({', '.join(curves) or 'none'})", "finite values of a model")
+    first = next(iter(curves.values()))
+    radius, exact = first.film_radius_mm, np.asarray(first.exact)
+    with drawing(path, 7.6, 5.4) as figure:
+        upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": (3, 1.2)})
+        upper.plot(radius, exact, color=INK, lw=2.6, alpha=0.45, label="exact")
+        for k, (name, curve) in enumerate(curves.items()):
+            colour, values = FIELD_COLOURS[k % len(FIELD_COLOURS)], np.asarray(curve.model)
+            upper.plot(radius, values, color=colour, lw=1.4, ls=(0, (4, 2 + k)), label=name)
+            lower.plot(radius, 100 * (values - exact), color=colour, lw=1.4, marker=".", ms=4)
+        upper.set_ylim(0, 1.04 * max(1.0, *first.exact, *(v for c in curves.values() for v in c.model)))
+        upper.set_ylabel("illumination (share of the axis)")
+        upper.set_title(title, loc="left", fontweight="bold")
+        upper.legend(loc="lower left")
+        lower.axhline(0, color=INK, lw=0.9)
+        lower.set_ylabel("model - exact\n(% of the axis)")
+        lower.set_xlabel("film radius (mm)")
+        for axes in (upper, lower):
+            axes.grid(True)
+    return Path(path)
+
+
+AXIS_LABELS = {"zoom": "focal length (mm)", "focus": "1 / distance in focus (1/m)"}
+
+
+def states_plot(models: Mapping[str, Sequence[Mapping[str, Any]]], axis: Axis, path: Path) -> None:
+    """Film-equivalent RMS over the first state axis, and false passes and blocks below it.
+
+    Args:
+        models: name to rows of `check.errors_at`.
+        axis: the first axis.
+        path: PNG, PDF or SVG to write.
+    """
+    with drawing(path, 7.2, 5.6) as figure:
+        top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+        for k, (name, rows) in enumerate(models.items()):
+            colour = FIELD_COLOURS[k % len(FIELD_COLOURS)]
+            error_line(top, axis, rows, colour, name)
+            for key, mark in (("false_pass", "^"), ("false_block", "v")):
+                x, share = [r[axis.name] for r in rows], [100 * (r[key] or 0.0) for r in rows]
+                bottom.plot(x, share, mark, ms=4, color=colour, alpha=0.8, label=f"{name}: {key.replace('_', ' ')}")
+        error_axes(top, axis, [r["rms_um"] for rows in models.values() for r in rows])
+        top.set_title("One model of many states", loc="left", fontweight="bold")
+        top.set_ylabel("film-equivalent RMS (um)")
+        top.legend(loc="best", fontsize="small")
+        bottom.set_ylabel("share of rays (%)")
+        bottom.set_ylim(0, max(0.02, *bottom.get_ylim()))
+        bottom.set_xlabel(AXIS_LABELS.get(axis.name, f"{axis.name} ({axis.unit})"))
+        bottom.grid(True)
+        bottom.legend(loc="best", fontsize="small")
+
+
+def error_line(axes: Any, axis: Axis, rows: Sequence[Mapping[str, Any]], colour: str, label: str) -> None:
+    """Film-equivalent RMS of rows over a state axis, joined by lines where no other axis varies."""
+    ordered = sorted(rows, key=lambda r: r[axis.name])
+    several = any(set(r) & set(AXIS_LABELS) - {axis.name} for r in rows)
+    y = [r["rms_um"] or float("nan") for r in ordered]
+    axes.plot([r[axis.name] for r in ordered], y, "o" if several else "o-", ms=4, color=colour, label=label)
+
+
+def error_axes(axes: Any, axis: Axis, errors: Sequence[float | None]) -> None:
+    """Logarithmic axes of errors over a state axis, its nodes marked."""
+    for knot in axis.knots:
+        axes.axvline(knot, color=INK, lw=0.5, ls=":")
+    if axis.name == "zoom":
+        axes.set_xscale("log")
+        plain_log_ticks(axes.xaxis)
+    axes.set_yscale("log")
+    plain_log_ticks(axes.yaxis)
+    known = [e for e in errors if e]
+    if known:  # at least a decade, so that noise is not seen as a trend
+        axes.set_ylim(min(known) / 2, max(10 * min(known), 2 * max(known)))
+    axes.grid(True)

@@ -1,7 +1,7 @@
-"""Ray errors of a surrogate against the exact lens.
+"""Errors of a surrogate against the exact lens: of its rays, of what it passes and blocks, and of its illumination.
 
-Rays are those of a domain that the exact lens passes, independent of the model's status (false blocks are counted by
-`vignetting`). Film-equivalent error: the exact and the approximate ray meet the plane in focus, and the
+Ray errors are over rays of a domain that the exact lens passes, independent of the model's status (false blocks are
+counted by `false_shares`). Film-equivalent error: the exact and the approximate ray meet the plane in focus, and the
 distance between the two points is taken back to the film with the exact lens's local Jacobian at that film point.
 It is given for rays within 60 degrees of the axis; beyond, only angles are given.
 """
@@ -9,7 +9,7 @@ It is given for rays within 60 degrees of the axis; beyond, only angles are give
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -90,16 +90,12 @@ class RayErrors:
         pitch, focus = pixel_um(domain), _spread(each.focus_um)
         position, transmittance = _spread(each.position_um), _spread(each.transmittance)
         return cls(
-            *focus,
-            *_spread(each.infinity_um),
-            *(focus[0] / pitch, focus[1] / pitch, focus[2] / pitch, pitch),
+            *focus, *_spread(each.infinity_um),
+            focus[0] / pitch, focus[1] / pitch, focus[2] / pitch, pitch,
             focus[0] * REFERENCE_RADIUS_MM / image_radius_mm(lens)[0],
-            *_spread(each.direction_deg),
-            *(position[0], position[1]),
-            *(transmittance[0], transmittance[2]),
-            float(len(each.inside)),
-            float((~each.inside).double().mean()),
-        )
+            *_spread(each.direction_deg), position[0], position[1], transmittance[0], transmittance[2],
+            float(len(each.inside)), float((~each.inside).double().mean()),
+        )  # fmt: skip
 
 
 def _spread(values: Tensor) -> tuple[float, float, float]:
@@ -151,9 +147,8 @@ class EachRay:
 def each_ray(lens: Lens, domain: Domain, held_out: PairSet, predict: Predict) -> EachRay:
     """Errors of every ray; arguments and what they raise as `ray_errors`."""
     if len(held_out) == 0 or bool((held_out.status != st.PASSED).any()):
-        raise InputError(
-            "ray_errors", "held_out", f"({len(held_out)} rays)", "at least one ray, all passed by the exact lens"
-        )
+        expected = "at least one ray, all passed by the exact lens"
+        raise InputError("ray_errors", "held_out", f"({len(held_out)} rays)", expected)
     exact, inputs = held_out.scene, held_out.inputs
     predicted = predict(inputs)
     rays = Rays(*(c.to(torch.float64) for c in predicted.rays))
@@ -163,26 +158,24 @@ def each_ray(lens: Lens, domain: Domain, held_out: PairSet, predict: Predict) ->
     vergence = focused_vergence(lens, kept.film_z)
     return EachRay(
         inside,
-        1000 * film_equivalent_mm(lens, domain, kept, *pair, vergence),
-        1000 * film_equivalent_mm(lens, domain, kept, *pair, torch.zeros_like(vergence)),
+        1000 * _film_equivalent_mm(lens, domain, kept, *pair, vergence),
+        1000 * _film_equivalent_mm(lens, domain, kept, *pair, torch.zeros_like(vergence)),
         angles_deg(exact, rays),
-        1000 * distance_to_ray(exact, rays),
+        1000 * _cross_length([p - e for p, e in zip(rays[:3], exact[:3], strict=True)], exact[3:]),
         (predicted.transmittance.to(torch.float64) - held_out.transmittance).abs(),
     )
 
 
 def angles_deg(a: Rays, b: Rays) -> Tensor:
     """[N] angle between directions in degrees, by atan2(|a x b|, a.b): exact for small angles, unlike acos."""
-    cx, cy, cz = a.dy * b.dz - a.dz * b.dy, a.dz * b.dx - a.dx * b.dz, a.dx * b.dy - a.dy * b.dx
     dot = a.dx * b.dx + a.dy * b.dy + a.dz * b.dz
-    return torch.rad2deg(torch.atan2(torch.sqrt(cx * cx + cy * cy + cz * cz), dot))
+    return torch.rad2deg(torch.atan2(_cross_length(a[3:], b[3:]), dot))
 
 
-def distance_to_ray(exact: Rays, predicted: Rays) -> Tensor:
-    """[N] perpendicular distance (mm) from the predicted points to the exact rays."""
-    x, y, z = predicted.x - exact.x, predicted.y - exact.y, predicted.z - exact.z
-    cx, cy, cz = y * exact.dz - z * exact.dy, z * exact.dx - x * exact.dz, x * exact.dy - y * exact.dx
-    return torch.sqrt(cx * cx + cy * cy + cz * cz)
+def _cross_length(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
+    """Length [N] of the cross products of vectors given by their components."""
+    x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    return torch.sqrt(x * x + y * y + z * z)
 
 
 def pupil_disc_share(lens: Lens, domain: Domain, count: int = 400_000, seed: int = 7) -> float:
@@ -229,7 +222,7 @@ def focused_vergence(lens: Lens, film_z: Tensor) -> Tensor:
     return -1.0 / focused_plane_z_mm(lens, film_z)
 
 
-def plane_coordinates(rays: Rays, vergence: Tensor) -> Tensor:
+def _plane_coordinates(rays: Rays, vergence: Tensor) -> Tensor:
     """[2, N] where rays meet the plane z = -1 / vergence, over the plane's distance; tan(angle) at infinity.
 
     Infinite for rays that do not travel towards the plane.
@@ -241,16 +234,15 @@ def plane_coordinates(rays: Rays, vergence: Tensor) -> Tensor:
     return torch.where(forward <= 0, torch.inf, points)
 
 
-def film_equivalent_mm(
+def _film_equivalent_mm(
     lens: Lens, domain: Domain, inputs: FilmRays, exact: Rays, rays: Rays, vergence: Tensor
 ) -> Tensor:
     """[N] distance on the film (mm) equivalent to the distance between two rays on an object plane."""
-    dx, dy = plane_coordinates(rays, vergence) - plane_coordinates(exact, vergence)
+    dx, dy = _plane_coordinates(rays, vergence) - _plane_coordinates(exact, vergence)
     least = _LEAST / abs(first_order(lens).efl_mm)
     if lens.anamorphic:
-        # Of each ray itself, which passes: no one plane holds its chief ray.
+        # By the ray itself, which passes: no one plane holds its chief ray.
         along_x, along_y, _ = _differences(lens, domain, inputs, vergence)
-        along_x, along_y = along_x / _step_mm(domain), along_y / _step_mm(domain)
         area = (along_x[0] * along_y[1] - along_x[1] * along_y[0]).abs()
         area = area.clamp_min(least / abs(first_order(lens, meridian="x").efl_mm))
         return torch.hypot((dx * along_y[1] - dy * along_y[0]) / area, (dy * along_x[0] - dx * along_x[1]) / area)
@@ -263,7 +255,7 @@ def film_equivalent_mm(
 
 
 def local_jacobian(lens: Lens, domain: Domain, inputs: FilmRays, vergence: Tensor) -> tuple[Tensor, Tensor]:
-    """Radial and tangential derivative [N] of `plane_coordinates` by film position, 1/mm, of the exact lens.
+    """Radial and tangential derivative [N] of `_plane_coordinates` by film position, 1/mm, of the exact lens.
 
     Central differences in float64 of the ray through the middle of the passing rays (a chief-like ray; the pupil point
     stays as the film point moves), at each ray's own film radius, film plane and wavelength. The lens is round, so
@@ -282,16 +274,11 @@ def local_jacobian(lens: Lens, domain: Domain, inputs: FilmRays, vergence: Tenso
         v = torch.where(r > 0, (part.pupil_y * part.film_x - part.pupil_x * part.film_y) / safe, part.pupil_y)
         turned = replace(part, film_x=r, film_y=zero[lost], pupil_x=u, pupil_y=v)
         radial[:, lost], tangential[:, lost], _ = _differences(lens, domain, turned, vergence[lost])
-    length, step = torch.linalg.vector_norm, _step_mm(domain)
-    return length(radial, dim=0) / step, length(tangential, dim=0) / step
-
-
-def _step_mm(domain: Domain) -> float:
-    return 2 * _STEP * domain.film_radius_mm
+    return torch.linalg.vector_norm(radial, dim=0), torch.linalg.vector_norm(tangential, dim=0)
 
 
 def _differences(lens: Lens, domain: Domain, inputs: FilmRays, vergence: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Central differences [2, N] of `plane_coordinates` over `_step_mm` of film_x and of film_y, the pupil point kept.
+    """Derivatives [2, N] of `_plane_coordinates` by film_x and by film_y, the pupil point kept: central differences.
 
     Also [N], whether all four rays could be followed.
     """
@@ -303,8 +290,9 @@ def _differences(lens: Lens, domain: Domain, inputs: FilmRays, vergence: Tensor)
         out = trace(lens, rays, wavelength)
     # Rays that only a rim stops go on; the others come back along the axis and would give a wrong derivative.
     lost = (out.status != st.PASSED) & (out.rays.dz == -1.0) & (out.rays.x == 0.0)
-    points = plane_coordinates(out.rays, vergence.repeat(4)).reshape(2, 4, -1)
-    return points[:, 0] - points[:, 1], points[:, 2] - points[:, 3], ~lost.reshape(4, -1).any(0)
+    points = _plane_coordinates(out.rays, vergence.repeat(4)).reshape(2, 4, -1)
+    along_x, along_y = (points[:, ::2] - points[:, 1::2]).unbind(1)
+    return along_x / (2 * h), along_y / (2 * h), ~lost.reshape(4, -1).any(0)
 
 
 def pupil_middle(domain: Domain, radius: Tensor) -> Tensor:
@@ -314,3 +302,90 @@ def pupil_middle(domain: Domain, radius: Tensor) -> Tensor:
     place = (radius / domain.bounds.film_radius_mm * (len(middle) - 1)).clamp(0, len(middle) - 1)
     below = place.floor().long().clamp_max(len(middle) - 2)
     return torch.lerp(middle[below], middle[below + 1], place - below)
+
+
+NEAR_RIM = 0.02  # relative distance to a rim's radius that counts as near
+ZONES = {"centre": (0.0, 1 / 3), "mid": (1 / 3, 2 / 3), "edge": (2 / 3, 1.0)}  # shares of the film radius
+SEED = 104729  # unlikely as the seed of a fit's rays
+
+
+def false_shares(exact_passes: Tensor, model_passes: Tensor) -> dict[str, float | None]:
+    """false_pass and false_block of [N] booleans of rays uniform over the lit film and the domain's pupil disc.
+
+    False pass: rays that the model passes and the exact lens blocks, over those that the model passes. False block:
+    rays that the model blocks and the exact lens passes, over those that the exact lens passes. None over no rays.
+    """
+    wrong_pass, wrong_block = model_passes & ~exact_passes, exact_passes & ~model_passes
+    return {"false_pass": _share(wrong_pass, model_passes), "false_block": _share(wrong_block, exact_passes)}
+
+
+def _share(part: Tensor, whole: Tensor) -> float | None:
+    total = int(whole.sum())
+    return int(part.sum()) / total if total else None
+
+
+def deciding_rim_ratio(lens: Lens, pairs: PairSet) -> Tensor:
+    """[N] largest crossing radius over rim radius along each ray, stop included: at most 1 where every rim passes it.
+
+    Surfaces beyond one that the ray misses, or that reflects it totally, do not count.
+    """
+    radii = torch.tensor(lens.semi_diameters_mm, dtype=torch.float64)[:, None]
+    ratio = torch.hypot(pairs.cross_x, pairs.cross_y) / radii
+    on_the_way, largest = torch.ones(len(pairs), dtype=torch.bool), torch.zeros(len(pairs), dtype=torch.float64)
+    for k in range(len(lens.surfaces) - 1, -1, -1):  # camera rays meet the last surface first
+        on_the_way = on_the_way & (pairs.meets[k] > 0)
+        largest = torch.where(on_the_way, torch.maximum(largest, ratio[k]), largest)
+        on_the_way = on_the_way & (pairs.refracts[k] > 0)
+    return largest
+
+
+@dataclass(frozen=True)
+class Illumination:
+    """Shares of the exact lens's value on the axis, by film radius.
+
+    Attributes:
+        film_radius_mm, exact, model: one value a radius.
+        max_difference: of the two.
+    """
+
+    film_radius_mm: list[float]
+    exact: list[float]
+    model: list[float]
+    max_difference: float
+
+
+def relative_illumination(
+    lens: Lens, domain: Domain, predict: Predict, *, points: int = 16384, rows: int = 17, seed: int = SEED
+) -> Illumination:
+    """Film irradiance of a uniform environment by film radius, of the exact lens and of the model.
+
+    The weight of a ray is T cos^4(theta) / Z^2 over the pupil disc, T the transmittance; wavelengths are uniform over
+    the domain. Both curves are divided by the exact lens's value on the axis, so that a uniformly dark model is
+    visible. The film plane is the domain's nearest to the lens (its farthest focus), the stop the domain's.
+
+    Args:
+        points: rays per film radius, the same pupil points and wavelengths for all.
+        rows: film radii.
+
+    Raises:
+        InputError: no ray passes on the axis.
+    """
+    radius = domain.stop_radius_mm
+    stopped = lens.with_stop_radius(radius)
+    sample = sample_domain(domain, points, seed)
+    film_z = torch.full_like(sample.film_z, domain.film_z_mm[0])
+    radii = [domain.film_radius_mm * i / (rows - 1) for i in range(rows)]
+    sums: tuple[list[float], list[float]] = ([], [])
+    for r in radii:
+        rays = FilmRays(torch.full_like(film_z, r), torch.zeros_like(film_z), film_z, *sample.columns()[3:])
+        start = camera_rays(rays.film_x, rays.film_y, film_z, rays.pupil_x, rays.pupil_y, domain.pupil_z_mm)
+        with torch.no_grad():
+            traced = trace(stopped, start, rays.wavelength_nm, transmittance=True)
+        for values, out in zip(sums, (traced, predict(rays, radius)), strict=True):
+            power = torch.where(out.status == st.PASSED, out.transmittance.to(torch.float64), 0.0)
+            values.append(float((power * start.dz**4).sum()))  # one film plane and pupil plane: Z is the same for all
+    axis, expected = sums[0][0], "a lens that illuminates the centre of the film"
+    if not axis > 0:
+        raise InputError(lens.path, "domain", "(no ray passes on the axis)", expected)
+    exact, model = ([v / axis for v in values] for values in sums)
+    return Illumination(radii, exact, model, max(abs(a - b) for a, b in zip(exact, model, strict=True)))

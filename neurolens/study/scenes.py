@@ -4,10 +4,10 @@ restricted to one shot.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,12 +29,11 @@ from neurolens.render.primitives import Rays
 from neurolens.render.renderer import render
 from neurolens.render.scene import CameraSettings, Scene, load_scene
 from neurolens.render.world import world_of
-from neurolens.study.candidates import model_candidate
 from neurolens.study.experiment import Experiment, RenderChoice
-from neurolens.study.figures import image_caption, side_by_side
 from neurolens.study.image import compare, flip_map
 from neurolens.study.measure import fit_and_measure
-from neurolens.study.speed import Candidate, race
+from neurolens.study.plots import side_by_side
+from neurolens.study.speed import Candidate, model_candidate, race
 from neurolens.surrogates.domain import domain_from_camera
 from neurolens.surrogates.fit import prepare
 from neurolens.surrogates.model import Domain
@@ -59,24 +58,21 @@ def scene_cameras(
 
     All are in best focus, and show the plane in focus at one size. Lens and models as C if `fused`.
     """
-    film = shot.film_mm
-    data = first_order(lens)
-    f_number = max(shot.f_number or data.f_number, data.f_number)
+    widest = first_order(lens).f_number
     # The same light for all cameras.
-    real = Shot(film, shot.focus_m, f_number, wavelength_nm=shot.wavelength_nm)
+    real = Shot(shot.film_mm, shot.focus_m, max(shot.f_number or widest, widest), wavelength_nm=shot.wavelength_nm)
     exact = ExactCamera(lens, real, bounds=domain.bounds, runtime="c" if fused else "trace")
-    cameras: dict[str, Camera] = {EXACT: exact}
-    for name, file in models.items():
-        cameras[name] = OnnxCamera(load_model(file), real, runtime="c" if fused else "onnxruntime")
-    cameras["thin lens"], cameras["pinhole"] = (ideal_as(kind, exact.lens, real) for kind in ("thin:", "pinhole:"))
-    return cameras
+    runtime: Literal["c", "onnxruntime"] = "c" if fused else "onnxruntime"
+    fitted = {name: OnnxCamera(load_model(file), real, runtime=runtime) for name, file in models.items()}
+    thin, pinhole = (ideal_as(kind, exact.lens, real) for kind in ("thin:", "pinhole:"))
+    return {EXACT: exact, **fitted, "thin lens": thin, "pinhole": pinhole}
 
 
 def render_all(
     choice: RenderChoice, lens: Lens, domain: Domain, models: Mapping[str, Path], folder: Path, report: Report
 ) -> Pictures:
     """Every scene through every camera with several seeds: for the noise floor, and their mean as the picture."""
-    found, fused = Pictures(), choice.fused and has_compiler()
+    records, fused = Pictures(), choice.fused and has_compiler()
     scenes = [load_scene(path) for path in choice.scenes]
     done, total = 0, len(scenes) * (3 + len(models)) * choice.seeds
     for scene in scenes:
@@ -91,20 +87,17 @@ def render_all(
                 renders.setdefault(name, []).append(result.rgb)
                 done += 1
                 report(done / total)
-            found.cameras.append(_camera_record(scene, name, result.stats))
+            stats = result.stats
+            share, record = stats["camera_fraction"], {"name": name, "scene": scene.name, "render_s": stats["seconds"]}
+            record |= {"camera_s": share * stats["seconds"], "camera_share": share}
+            records.cameras.append(record | {key: stats[key] for key in ("samples", "width", "height", "threads")})
             metadata = {"render": result.stats, "camera": camera.settings, "mean_of_renders": choice.seeds}
             file, mean = folder / f"{_stem(scene, name)}.exr", np.mean(renders[name], axis=0, dtype=np.float32)
             attributes = standard_attributes(camera.settings, choice.width, choice.height)
             write_exr(file, mean, half=True, metadata=metadata, attributes=attributes)
             write_png(file.with_suffix(".png"), mean)
-        _compare_scene(found, scene, choice, renders, folder)
-    return found
-
-
-def _camera_record(scene: Scene, name: str, stats: Mapping[str, Any]) -> dict[str, Any]:
-    share, seconds = stats["camera_fraction"], stats["seconds"]
-    known = {"name": name, "scene": scene.name, "render_s": seconds, "camera_s": share * seconds, "camera_share": share}
-    return known | {key: stats[key] for key in ("samples", "width", "height", "threads")}
+        _compare_scene(records, scene, choice, renders, folder)
+    return records
 
 
 def _stem(scene: Scene, name: str) -> str:
@@ -112,39 +105,32 @@ def _stem(scene: Scene, name: str) -> str:
 
 
 def _compare_scene(
-    found: Pictures, scene: Scene, choice: RenderChoice, renders: Mapping[str, list[FloatArray]], folder: Path
+    records: Pictures, scene: Scene, choice: RenderChoice, renders: Mapping[str, list[FloatArray]], folder: Path
 ) -> None:
     exact = renders[EXACT]
     captions, maps = {}, {}
     for name, pictures in renders.items():
-        record: dict[str, Any] = {
-            "name": f"{scene.name}, {name}",
-            "scene": scene.name,
-            "camera": name,
-            "file_png": f"{folder.name}/{_stem(scene, name)}.png",
-            "file_exr": f"{folder.name}/{_stem(scene, name)}.exr",
-            "samples": choice.samples * choice.seeds,
-        }
+        record: dict[str, Any] = {"name": f"{scene.name}, {name}", "scene": scene.name, "camera": name}
+        record |= {f"file_{kind}": f"{folder.name}/{_stem(scene, name)}.{kind}" for kind in ("png", "exr")}
+        record["samples"] = choice.samples * choice.seeds
         if name != EXACT:
             errors = compare(pictures, exact)
             record |= asdict(errors)
-            captions[name] = image_caption(errors)
+            captions[name] = (
+                f"FLIP {errors.flip_paired:.3g} (noise {errors.noise_floor_flip:.3g})\n"
+                f"relMSE {errors.rel_mse:.3g} (noise {errors.noise_floor_rel_mse:.3g})"
+            )
             maps[name] = flip_map(np.mean(pictures, axis=0), np.mean(exact[: len(pictures)], axis=0))
-        found.images.append(record)
+        records.images.append(record)
     maps[EXACT] = flip_map(exact[0], exact[1])
     captions[EXACT] = "two seeds: the noise floor"
     file = folder / f"{scene.name}-side-by-side.png"
     shown = {name: np.mean(pictures, axis=0) for name, pictures in renders.items()}
     side_by_side(shown, maps, file, captions, title=f"{scene.name}, error against exact")
-    found.figures.append(
-        {
-            "file": f"{folder.name}/{file.name}",
-            "title": f"{scene.name}: every camera",
-            "caption": f"The mean of {choice.seeds} renders of {choice.samples} samples a pixel. Below each its FLIP "
-            "difference from the exact lens's with the same random numbers; below the exact lens that of two seeds.",
-            "wide": True,
-        }
-    )
+    caption = f"The mean of {choice.seeds} renders of {choice.samples} samples a pixel. Below each its FLIP difference "
+    caption += "from the exact lens's with the same random numbers; below the exact lens that of two seeds."
+    title = f"{scene.name}: every camera"
+    records.figures.append({"file": f"{folder.name}/{file.name}", "title": title, "caption": caption, "wide": True})
 
 
 def scene_gain(experiment: Experiment, folder: Path, progress: Progress) -> dict[str, Any] | None:
@@ -155,16 +141,13 @@ def scene_gain(experiment: Experiment, folder: Path, progress: Progress) -> dict
     choice = experiment.scene_domain
     if choice is None:
         return None
-    scene = load_scene(choice.scene)
-    shot = scene.settings.camera
-    lens = experiment.lens.read()
-    data = first_order(lens)
-    widest = data.f_number
+    scene, lens = load_scene(choice.scene), experiment.lens.read()
+    shot, data = scene.settings.camera, first_order(lens)
     shot_lens, shot_domain = domain_from_camera(
         lens,
         film_mm=shot.film_mm,
         focus_m=shot.focus_m,
-        f_number=max(shot.f_number or widest, widest),
+        f_number=max(shot.f_number or data.f_number, data.f_number),
         wavelength_nm=shot.wavelength_nm,
         nearest_m=nearest_depth_m(scene, abs(data.efl_mm)),
     )
@@ -182,8 +165,8 @@ def scene_gain(experiment: Experiment, folder: Path, progress: Progress) -> dict
             place.mkdir(parents=True, exist_ok=True)
             for settings in models:
                 m = fit_and_measure(prepared, settings, place, experiment.evaluation.vignetting_rays, report)
-                rows.append({**m.record, "domain": name, **domain_facts(state, domain)})
-                rows[-1]["file"] = f"models/{place.name}/{m.file.name}"
+                row = {**m.record, "domain": name, **domain_facts(state, domain)}
+                rows.append(row | {"file": f"models/{place.name}/{m.file.name}"})
                 candidate = model_candidate(f"{name}: {settings.label}", load_model(m.file), domain.stop_radius_mm)
                 candidates.append(replace(candidate, domain=domain))
         # One race, so that the times can be set against each other.
@@ -191,7 +174,14 @@ def scene_gain(experiment: Experiment, folder: Path, progress: Progress) -> dict
         timed = race(candidates, shot_domain, threads=chosen.threads, rounds=chosen.rounds)
         for row, candidate in zip(rows, candidates, strict=True):
             row["ns_per_ray"] = timed.timing(candidate.name)
-    return {"scene": scene.name, "text": _words(rows), "rows": rows}
+    whole, same, half_row = rows
+    text = ""
+    if all(row.get("rms_um") for row in rows):
+        text = (
+            f"{whole['name']} has {whole['rms_um']:.3g} um RMS over the whole lens, {same['rms_um']:.3g} um over this "
+        )
+        text += f"shot; {half_row['name']} has {half_row['rms_um']:.3g} um over the shot."
+    return {"scene": scene.name, "text": text, "rows": rows}
 
 
 def nearest_depth_m(scene: Scene, efl_mm: float, across: int = 96) -> float | None:
@@ -232,14 +222,3 @@ def domain_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
         "focus_m": ["infinity" if f == float("inf") else f for f in domain.focus_m],
         "nearest_m": domain.nearest_m,
     }
-
-
-def _words(rows: Sequence[Mapping[str, Any]]) -> str:
-    whole, same, half = rows
-    if not all(row.get("rms_um") for row in rows):
-        return ""
-    return (
-        f"{whole['name']} has {whole['rms_um']:.3g} um RMS over the whole lens, "
-        f"{same['rms_um']:.3g} um over this shot; "
-        f"{half['name']} has {half['rms_um']:.3g} um over the shot."
-    )

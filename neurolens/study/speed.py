@@ -1,4 +1,4 @@
-"""Speed in nanoseconds per ray, measured in races so that ratios are meaningful.
+"""Speed in nanoseconds per ray, measured in races so that ratios are meaningful, and what may run in them.
 
 Candidates run in turn, round after round, in one process with the same number of threads, so that a machine that
 slows down slows all of them; ratios are taken within rounds. Every candidate does the same rays: uniform over the film
@@ -8,22 +8,46 @@ one film plane, as in a picture. Each candidate uses its fastest batch size.
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cache, partial
+from pathlib import Path
+from threading import get_ident
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
 
-from neurolens.base.errors import InputError, NeurolensError
+from neurolens.base.errors import InputError, ModelError, NeurolensError
+from neurolens.base.files import TemporaryFolder
 from neurolens.base.records import ExactRecord, Timing, break_even_rays
+from neurolens.cameras.contract import Camera
+from neurolens.cameras.ideal import ThinLens
+from neurolens.cameras.model import OnnxLens, load_model
+from neurolens.cameras.pinhole import Pinhole
+from neurolens.graph.c import Signature, write_blocks, write_c
+from neurolens.graph.compiler import FLAGS, compile_c, has_compiler
+from neurolens.graph.program import Program
+from neurolens.graph.scalars import lower
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
+from neurolens.setting.pupils import camera_rays
+from neurolens.study.rays import frame_width_mm
 from neurolens.surrogates.domain import FilmRays, sample_domain
+from neurolens.surrogates.file import read_model
 from neurolens.surrogates.model import Domain
+from neurolens.surrogates.source import fused_program
 from neurolens.surrogates.terms import pinned_threads
+from neurolens.trace.rays import Traced, compile_tracing, trace
+from neurolens.trace.tracegraph import exact_graph
 
 # Rays of one pass: every batch size divides it, and float32 inputs of a pass stay in the third-level cache.
 POOL = 65536
@@ -57,9 +81,8 @@ class Candidate:
     domain: Domain | None = None
 
 
-@dataclass(frozen=True)
-class Gain:
-    """A model on the clock: its times, how many times faster it is (by the minima), after how many rays it pays off.
+class Gain(NamedTuple):
+    """A model's times, how many times faster it is (by the minima), and after how many rays it pays off.
 
     None where one of the two was not timed; break_even_rays also where the model is no faster.
     """
@@ -91,26 +114,21 @@ class Race:
 
     def timing(self, name: str) -> Timing | None:
         """Best and median of the rounds; None where the candidate could not run."""
-        ns = self.ns.get(name)
-        if ns is None:
+        if name not in self.ns:
             return None
-        return {
-            "min": min(ns),
-            "median": statistics.median(ns),
-            "threads": self.threads,
-            "batch": self.batch[name],
-            "repeats": len(ns),
-        }
+        ns = self.ns[name]
+        timing: Timing = {"min": min(ns), "median": statistics.median(ns), "threads": self.threads}
+        return {**timing, "batch": self.batch[name], "repeats": len(ns)}
 
     def speedup(self, name: str, over: str) -> dict[str, float] | None:
-        """How many times faster `name` is than `over`: "min" by the minima, "median" of the ratios within rounds."""
+        """The factor by which `name` is faster than `over`: "min" by minima, "median" of the ratios within rounds."""
         if name not in self.ns or over not in self.ns:
             return None
         ratios = [b / a for a, b in zip(self.ns[name], self.ns[over], strict=True)]
         return {"min": min(self.ns[over]) / min(self.ns[name]), "median": statistics.median(ratios)}
 
     def gain(self, name: str, exact: str, fit_s: float | None, load_s: float | None) -> Gain:
-        """What a model that took `fit_s` to fit and `load_s` to load gains over an exact tracer."""
+        """The gain over an exact tracer of a model that took `fit_s` to fit and `load_s` to load."""
         timing, ratio, slow = self.timing(name), self.speedup(name, exact), self.timing(exact)
         pays = break_even_rays(fit_s, load_s, slow["min"], timing["min"]) if slow and timing else None
         return Gain(timing, ratio["min"] if ratio else None, pays)
@@ -123,14 +141,9 @@ class Race:
 
 
 def race(
-    candidates: Sequence[Candidate],
-    domain: Domain | FilmRays,
-    *,
-    threads: int = 1,
-    rounds: int = 20,
-    fresh: bool = True,
-    report: Callable[[float], None] = lambda share: None,
-) -> Race:
+    candidates: Sequence[Candidate], domain: Domain | FilmRays, *, threads: int = 1, rounds: int = 20,
+    fresh: bool = True, report: Callable[[float], None] = lambda share: None,
+) -> Race:  # fmt: skip
     """Time candidates in turn on the same rays of a domain, or each on its own.
 
     Args:
@@ -223,17 +236,238 @@ def _workers(threads: int) -> Iterator[ThreadPoolExecutor | None]:
 def _best_batch(candidate: Candidate, pool: FilmRays, workers: ThreadPoolExecutor | None) -> _Pass:
     """One pass over the pool in the fastest of the candidate's batch sizes."""
     threads = 1 if workers is None else workers._max_workers
-    best, found = math.inf, None
+    passes = []
     for batch in candidate.batches:
         calls = tuple(candidate.prepare(pool.select(slice(i, i + batch))) for i in range(0, len(pool), batch))
-        each = _Pass(batch, calls, workers, threads)
-        each.sample_ns(1)
-        took = min(each.sample_ns(1) for _ in range(2 * _SAMPLES)) if len(candidate.batches) > 1 else 0.0
-        if took < best:
-            best, found = took, each
-    assert found is not None
-    return found
+        passes.append(_Pass(batch, calls, workers, threads))
+        passes[-1].sample_ns(1)
+    if len(passes) == 1:
+        return passes[0]
+    return min(passes, key=lambda each: min(each.sample_ns(1) for _ in range(2 * _SAMPLES)))
 
 
 def _load() -> float | None:
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+
+
+# Names of `exact_candidates` of a whole camera, and of `exact_c_candidate`.
+EXACT = ("exact eager", "exact compiled", "exact C")
+EAGER_BATCHES = (8192, 16384, 32768)
+COMPILED_BATCHES = (16384,)  # each further size costs half a minute of compilation
+
+
+def exact_candidates(
+    lens: Lens, domain: Domain, *, transmittance: bool = True, build_rays: bool = True, compiled: bool = True,
+    label: str = "exact",
+) -> list[Candidate]:  # fmt: skip
+    """The exact tracer in float32, eager and compiled: every surface, stop, rims and dispersion, status out.
+
+    Args:
+        transmittance: whether to follow it, as surrogates do.
+        build_rays: start from film and pupil points, as surrogates do; else from camera rays made beforehand.
+        compiled: whether to include the compiled one.
+        label: names are "{label} eager" and "{label} compiled".
+    """
+
+    def tracing(rays: Any, wavelength: Any) -> Traced:
+        return trace(lens, rays, wavelength, transmittance=transmittance)
+
+    def whole(fx: Any, fy: Any, fz: Any, px: Any, py: Any, wavelength: Any) -> Traced:
+        return tracing(camera_rays(fx, fy, fz, px, py, domain.pupil_z_mm), wavelength)
+
+    def arguments(rays: FilmRays) -> tuple[Any, ...]:
+        fx, fy, fz, px, py, wavelength = (c.to(torch.float32).contiguous() for c in rays.columns())
+        points = fx, fy, fz[0].clone(), px, py  # one film plane, as in a picture
+        return (*points, wavelength) if build_rays else (camera_rays(*points, domain.pupil_z_mm), wavelength)
+
+    run: Callable[..., Traced] = whole if build_rays else tracing
+    fast = compile_tracing(run, fullgraph=True)
+
+    def prepare_compiled(rays: FilmRays) -> Call:
+        call = partial(fast, *arguments(rays))
+        try:
+            call()
+        except Exception as error:  # of many types: no compiler, a compiler that fails, an unsupported platform
+            raise Unavailable(f"torch cannot compile here: {_reason(error)}") from error
+        return call
+
+    eager = Candidate(f"{label} eager", lambda rays: partial(run, *arguments(rays)), EAGER_BATCHES)
+    return [eager, Candidate(f"{label} compiled", prepare_compiled, COMPILED_BATCHES)] if compiled else [eager]
+
+
+def exact_c_candidate(lens: Lens, domain: Domain) -> Candidate:
+    """The exact trace as C, by the same writer and flags as the models: the measure of a model as C."""
+    graph = exact_graph(lens, domain.pupil_z_mm, domain.wavelength_nm)
+    return program_candidate(EXACT[2], lower(graph), domain)
+
+
+def exact_records(timed: Race) -> list[ExactRecord]:
+    """Records of the exact tracers that a race timed, or that could not run."""
+    return [timed.record(name) for name in EXACT if name in timed.ns or name in timed.unavailable]
+
+
+def _reason(error: BaseException) -> str:
+    # Torch wraps the reason: the innermost cause is the informative one.
+    while error.__cause__ is not None:
+        error = error.__cause__
+    text = next((line.strip() for line in str(error).splitlines() if line.strip()), "")
+    return f"{type(error).__name__}: {text}"[:200]
+
+
+def camera_candidate(camera: Camera, domain: Domain, name: str | None = None) -> Candidate:
+    """A camera of the renderer (thin lens, pinhole), from film points and pupil samples to weighted scene rays."""
+
+    def prepare(rays: FilmRays) -> Call:
+        film = _float32(torch.stack([rays.film_x, rays.film_y]))
+        pupil = _float32(torch.stack([rays.pupil_x, rays.pupil_y]) / (2 * domain.pupil_radius_mm) + 0.5)
+        return partial(camera.sample, film, pupil, _float32(rays.wavelength_nm))
+
+    return Candidate(name or camera.name, prepare)
+
+
+def _float32(values: torch.Tensor) -> NDArray[np.float32]:
+    return np.ascontiguousarray(values.numpy(), dtype=np.float32)
+
+
+def ideal_cameras(lens: Lens, domain: Domain) -> list[Candidate]:
+    """Thin lens and pinhole of the lens's focal length, named "thin lens" and "pinhole"."""
+    data = first_order(lens)
+    focal, width = abs(data.efl_mm), frame_width_mm(domain.film_radius_mm)
+    frame = (width, width * 2 / 3)
+    thin, pinhole = ThinLens(focal, data.f_number, math.inf, frame), Pinhole(focal, frame)
+    return [camera_candidate(thin, domain, "thin lens"), camera_candidate(pinhole, domain, "pinhole")]
+
+
+def model_candidate(name: str, model: OnnxLens, stop_radius_mm: float) -> Candidate:
+    """An exported model, loaded with one thread: the race shares out batches."""
+
+    def prepare(rays: FilmRays) -> Call:
+        film_x, film_y, _, pupil_x, pupil_y, wavelength = map(_float32, rays.columns())
+        film, pupil = np.stack([film_x, film_y]), np.stack([pupil_x, pupil_y])
+        return partial(model.rays, film, pupil, wavelength, float(rays.film_z[0]), stop_radius_mm)
+
+    return Candidate(name, prepare)
+
+
+def model_candidates(files: Mapping[str, Path], domain: Domain, threads: int = 1) -> list[Candidate]:
+    """Exported models by name, in onnxruntime; and on one thread "NAME fused", as C, where that is possible."""
+    candidates = []
+    for name, file in files.items():
+        candidates.append(model_candidate(name, load_model(file), domain.stop_radius_mm))
+        fused = fused_candidate(f"{name} fused", file, domain) if threads == 1 else None
+        candidates += [fused] if fused else []
+    return candidates
+
+
+def time_model(model: OnnxLens, name: str, *, rounds: int, threads: int = 1) -> Timing | None:
+    """Nanoseconds per ray of an exported model over its domain."""
+    domain = Domain.from_dict(model.card["domain"])
+    candidate = model_candidate(name, model, domain.stop_radius_mm)
+    return race([candidate], domain, threads=threads, rounds=rounds).timing(name)
+
+
+class CompiledSource:
+    """A program as a shared library in its own temporary folder.
+
+    Raises:
+        Unavailable: there is no compiler, or it fails; the message says how.
+    """
+
+    def __init__(self, program: Program, flags: tuple[str, ...] = FLAGS) -> None:
+        self.signature = Signature.of(program, "lens")
+        self._folder = TemporaryFolder()
+        library = Path(self._folder.name) / "lens.so"
+        blocks = bool(program.own_tables)  # lookups: loops of arrays have them apart
+        text = write_blocks(program, "lens") if blocks else write_c(program, "lens", ["A timed model."])
+        text += self._wrapper(blocks)
+        try:
+            self.warnings = compile_c(text, library, flags)
+        except InputError as error:
+            raise Unavailable(str(error)) from error
+        self._run = ctypes.CDLL(str(library)).neurolens_run
+        self._run.argtypes, self._run.restype = [ctypes.c_size_t, ctypes.c_void_p], None
+
+    def _wrapper(self, blocks: bool) -> str:
+        """All arguments as one array of pointers: ctypes is slow per argument."""
+        s = self.signature
+        if blocks:
+            first = len(s.per_ray)
+            call, out = ", ".join(f"*(const float *)a[{k}]" for k in range(first, len(s.inputs))), len(s.inputs)
+            given = f"(const float *const *)a, call, lens_table, lens_table_cells, (float *const *)(a + {out})"
+            body = f"const float call[] = {{{call}}}; lens(n, {given}, (int *)a[{out + len(s.outputs)}]);"
+            return f"void neurolens_run(size_t n, void **a) {{ {body} }}\n"
+        kinds = ["(const float *)a[{}]"] * len(s.per_ray) + ["*(const float *)a[{}]"] * len(s.per_call)
+        kinds += ["*(const int *)a[{}]"] * (s.bands > 1) + ["(float *)a[{}]"] * len(s.outputs) + ["(int *)a[{}]"]
+        given = ", ".join(kind.format(i) for i, kind in enumerate(kinds))
+        return f"void neurolens_run(size_t n, void **a) {{ lens_rays(n, {given}); }}\n"
+
+    def outputs(self, count: int) -> dict[str, NDArray[Any]]:
+        """Arrays for the results of so many rays."""
+        found: dict[str, NDArray[Any]] = {name: np.empty(count, np.float32) for name in self.signature.outputs}
+        return {**found, "status": np.empty(count, np.int32)}
+
+    def prepared(self, inputs: Mapping[str, ArrayLike], out: Mapping[str, NDArray[Any]], band: int = 0) -> Call:
+        """A call that computes rays into `out`; inputs by name, arrays [N] or numbers; others are ignored."""
+        s = self.signature
+        count = len(out["status"])
+        arrays = [np.ascontiguousarray(inputs[name], np.float32) for name in (*s.per_ray, *s.per_call)]
+        if any(a.shape != (count,) for a in arrays[: len(s.per_ray)]):
+            raise ValueError("inputs and outputs of one length expected")
+        arrays += [np.array([band], np.int32)] if s.bands > 1 else []
+        arrays += [*(out[name] for name in s.outputs), out["status"]]
+        pointers = (ctypes.c_void_p * len(arrays))(*(a.ctypes.data for a in arrays))
+        run, size = self._run, ctypes.c_size_t(count)
+
+        def call(kept: Any = arrays) -> None:
+            run(size, pointers)
+
+        return call
+
+    def rays(self, inputs: Mapping[str, ArrayLike], band: int = 0) -> dict[str, NDArray[Any]]:
+        """Results of rays, by name, status among them."""
+        out = self.outputs(len(np.asarray(inputs[self.signature.per_ray[0]])))
+        self.prepared(inputs, out, band)()
+        return out
+
+
+# Inputs and results of a batch lie in the second-level cache.
+FUSED_BATCHES = (2048, 4096, 8192, 16384)
+
+
+def program_candidate(
+    name: str, program: Program, domain: Domain, stop_radius_mm: float | None = None, flags: tuple[str, ...] = FLAGS
+) -> Candidate:
+    """A program of `surrogates.source`, compiled when the race prepares it; no stop radius: the domain's."""
+    compiled = cache(lambda: CompiledSource(program, flags))
+
+    @cache
+    def room(thread: int, count: int) -> dict[str, NDArray[Any]]:
+        """The output memory of a thread, which it uses again, as tracers and onnxruntime do."""
+        return compiled().outputs(count)
+
+    def prepare(rays: FilmRays) -> Call:
+        names = ("film_x_mm", "film_y_mm", "film_z_mm", "pupil_x_mm", "pupil_y_mm", "wavelength_nm")
+        columns: dict[str, Any] = {n: c.numpy().astype(np.float32) for n, c in zip(names, rays.columns(), strict=False)}
+        columns["film_z_mm"] = columns["film_z_mm"][0]
+        columns["stop_radius_mm"] = np.float32(domain.stop_radius_mm if stop_radius_mm is None else stop_radius_mm)
+        source = compiled()
+        calls: dict[int, Call] = {}
+
+        def call() -> None:
+            thread = get_ident()
+            if thread not in calls:
+                calls[thread] = source.prepared(columns, room(thread, len(rays)))
+            calls[thread]()
+
+        return call
+
+    return Candidate(name, prepare, FUSED_BATCHES)
+
+
+def fused_candidate(name: str, file: Path, domain: Domain) -> Candidate | None:
+    """The model of an exported file as compiled C; None without a compiler or a form in C."""
+    try:
+        program = fused_program([read_model(file).at()]) if has_compiler() else None
+    except (ModelError, InputError):
+        return None
+    return None if program is None else program_candidate(name, program, domain)

@@ -11,10 +11,9 @@ import torch
 from analysis_lenses import INF, cartesian, library, scene, slower, thin
 
 from neurolens.analysis.bundles import bundle, points
-from neurolens.analysis.field_curves import colour, curvature, distortion
+from neurolens.analysis.field_curves import colour, curvature, distortion, seidel
 from neurolens.analysis.fields import Scene
-from neurolens.analysis.seidel import seidel
-from neurolens.analysis.wavefront import opd_mm
+from neurolens.analysis.spots import opd_mm
 from neurolens.base.errors import InputError
 from neurolens.lens.glass import index_of
 from neurolens.lens.prescription import Lens, Surface

@@ -12,9 +12,8 @@ from gallery_shots import GALLERY, measured, shot
 from experiments.gallery.cameras import Shot, View, Window, exact_camera, shot_of, thin_camera
 from experiments.gallery.measures import light_profile, spot
 from experiments.gallery.settings import read_effect
-from neurolens.analysis.field_curves import RECTILINEAR, curvature, distortion
+from neurolens.analysis.field_curves import RECTILINEAR, curvature, distortion, seidel
 from neurolens.analysis.fields import Scene
-from neurolens.analysis.seidel import seidel
 from neurolens.cameras.ideal import ThinLens
 from neurolens.lens.glass import LINE_D_NM, index_of
 from neurolens.lens.paraxial import first_order

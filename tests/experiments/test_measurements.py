@@ -27,10 +27,10 @@ from neurolens.cameras.model import load_model
 from neurolens.graph.compiler import find_compiler
 from neurolens.graph.program import SCENE_RAY
 from neurolens.graph.scalars import lower
-from neurolens.study.candidates import CompiledSource, fused_candidate
-from neurolens.study.speed import Race, Unavailable, race
+from neurolens.study.speed import CompiledSource, Race, Unavailable, fused_candidate, program_candidate, race
 from neurolens.surrogates.assemble import RAY_ONLY
 from neurolens.surrogates.domain import sample_domain
+from neurolens.surrogates.source import fused_program
 from neurolens.trace.rays import trace
 from neurolens.trace.tracegraph import exact_graph
 
@@ -267,8 +267,7 @@ def test_candidates_time_models_and_files() -> None:
     except InputError as reason:
         pytest.skip(f"the C form is not timed here: {reason}")
     model = lens_models.model("invariants")
-    candidate = fused_candidate("fused", model, model.domain, parts=RAY_ONLY)
-    assert candidate is not None
+    candidate = program_candidate("fused", fused_program([model], RAY_ONLY), model.domain)
     timing = race([candidate], model.domain, rounds=1).timing("fused")
     assert timing is not None and 0 < timing["min"] < 1e4
     assert fused_candidate("x", lens_models.exported("invariants"), model.domain) is not None
@@ -291,7 +290,7 @@ def test_without_a_compiler_or_coefficients_there_is_no_candidate(
     assert fused_candidate("x", tmp_path / "no.onnx", model.domain) is None
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setenv("CC", "")
-    assert fused_candidate("x", model, model.domain) is None
+    assert fused_candidate("x", lens_models.exported("invariants"), model.domain) is None
     with pytest.raises(Unavailable, match="a C compiler"):
         CompiledSource(lower(exact_graph(lens_models.lens(), 0.0, (400.0, 700.0))))
 

@@ -11,8 +11,8 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.lens.shot import Shot
+from neurolens.plan.candidates import Choice
 from neurolens.plan.footprints import distance_mm, places_of
-from neurolens.plan.plan import Choice
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import load_scene
 from neurolens.setting.pupils import image_radius_mm

@@ -15,7 +15,7 @@ from experiments.vignetting import DOMAINS, OPENINGS, opening_errors, passing
 from neurolens.base import status as st
 from neurolens.cameras.onnxlens import load_model
 from neurolens.study.experiment import LensChoice
-from neurolens.study.vignetting import relative_illumination
+from neurolens.study.rays import relative_illumination
 from neurolens.surrogates.domain import FilmRays
 from neurolens.surrogates.fit import ModelSettings, fit_model, prepare
 from neurolens.surrogates.model import LensModel

@@ -13,7 +13,7 @@ from experiments.starburst import light_of, streaks
 from neurolens.analysis.bundles import bundle
 from neurolens.analysis.bundles import points as stop_points
 from neurolens.analysis.fields import Scene
-from neurolens.analysis.wavefront import opd_mm
+from neurolens.analysis.spots import opd_mm
 from neurolens.base.errors import InputError
 from neurolens.flare import diffraction as d
 from neurolens.flare import exit_pupil as p

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 from neurolens.plan import plan as planned
-from neurolens.plan.plan import Choice, decided
+from neurolens.plan.candidates import Choice
+from neurolens.plan.plan import decided
 from neurolens.study.advice import PATH_NS, SAVING, advice, recommended, to_use
 from neurolens.study.train import shown_models
 
@@ -36,7 +37,7 @@ def timed(refractions: int) -> tuple[list[dict[str, Any]], dict[str, Any]]:
 
 
 def by_plan(models: list[dict[str, Any]], exact: dict[str, Any], rest: float, monkeypatch: pytest.MonkeyPatch) -> str:
-    """What a plan decides of the same costs."""
+    """The camera that a plan chooses by the same costs."""
     tried = [Choice(m["name"], "", 0.01, 0.0, m["fused_ns_per_ray"]["min"], 1.0) for m in models]
     tried.append(Choice("exact", "", 0.0, 0.0, exact["ns_per_ray"]["min"], 1.0))
     monkeypatch.setattr(planned, "effects_of", lambda found, budget: ())

@@ -21,13 +21,6 @@ def noisy(picture: np.ndarray, sigma: float, seed: int) -> np.ndarray:
     return picture + sigma * np.random.default_rng(seed).normal(size=picture.shape)
 
 
-def test_equal_pictures_have_no_error(picture: np.ndarray) -> None:
-    assert image.rel_mse(picture, picture) == 0.0
-    assert image.flip(picture, picture) == 0.0
-    found = image.flip_map(picture, picture)
-    assert found.shape == (24, 32) and not found.any()
-
-
 @pytest.mark.parametrize(("level", "offset", "eps"), [(1.0, 0.1, 0.01), (0.0, 0.1, 0.01), (20.0, -2.0, 1e-4)])
 def test_relative_mse_of_a_constant_offset(
     level: float, offset: float, eps: float, monkeypatch: pytest.MonkeyPatch
@@ -45,15 +38,6 @@ def test_relative_mse_of_one_channel_counts_a_third() -> None:
     assert image.rel_mse(test, reference) == pytest.approx(0.25 / (4 + 0.01) / 3, rel=1e-12)
 
 
-def test_relative_mse_does_not_change_with_radiance_scale_when_eps_scales_too(
-    picture: np.ndarray, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    test = noisy(picture, 0.05, 0)
-    plain = image.rel_mse(test, picture)
-    monkeypatch.setattr(image, "EPS", 64 * image.EPS)
-    assert image.rel_mse(8 * test, 8 * picture) == pytest.approx(plain, rel=1e-12)
-
-
 def test_srgb_curve_at_known_points() -> None:
     linear = np.array([-1.0, 0.0, 0.0031308, 0.2140411, 1.0, 9.0])
     assert image.to_srgb(linear) == pytest.approx([0, 0, 0.04045, 0.5, 1, 1], abs=2e-5)
@@ -61,6 +45,7 @@ def test_srgb_curve_at_known_points() -> None:
 
 
 def test_flip_grows_with_noise_is_symmetric_and_bounded(picture: np.ndarray) -> None:
+    assert image.rel_mse(picture, picture) == image.flip(picture, picture) == 0.0
     errors = [image.flip(noisy(picture, sigma, 1), picture) for sigma in (0.01, 0.03, 0.1, 0.3)]
     assert errors == sorted(errors) and errors[0] > 0 and errors[-1] < 1
     test = noisy(picture, 0.1, 1)
@@ -77,15 +62,6 @@ def test_flip_sees_what_the_display_shows(picture: np.ndarray) -> None:
     assert image.rel_mse(2 * bright, bright) > 0.5
 
 
-def test_fine_noise_is_less_visible_from_farther_away(picture: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
-    def seen(pixels_per_degree: float) -> float:
-        monkeypatch.setattr(image, "PIXELS_PER_DEGREE", pixels_per_degree)
-        return image.flip(test, picture)
-
-    test, kept = noisy(picture, 0.1, 3), picture.copy()
-    assert seen(120.0) < seen(30.0) and np.array_equal(picture, kept)
-
-
 def test_noise_floor_of_known_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two renders of level L with noise s: the mean of (a - b)^2 / b^2 is about 2 s^2 / L^2."""
     monkeypatch.setattr(image, "EPS", 1e-9)
@@ -95,14 +71,6 @@ def test_noise_floor_of_known_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     assert floor.pairs == 5
     assert floor.noise_floor_rel_mse == pytest.approx(2 * sigma**2, rel=0.03)
     assert floor.noise_floor_flip > 0
-
-
-@pytest.mark.parametrize("count", [4, 5, 9])
-def test_pairs_never_join_a_seed_with_itself(count: int) -> None:
-    pairs = image.seed_pairs(count)
-    assert len({frozenset(pair) for pair in pairs}) == count >= image.MIN_PAIRS
-    assert all(len(set(pair)) == 2 for pair in pairs)
-    assert {i for i, _ in pairs} == {j for _, j in pairs} == set(range(count))
 
 
 def test_comparing_tells_a_true_camera_from_a_wrong_one(picture: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""What `neurolens train --lens FILE` takes for a lens that nobody has tried: its promises hold on fresh rays."""
+"""The defaults of `neurolens train --lens FILE` suit lenses that nobody has tried: promises hold on fresh rays."""
 
 import math
 from pathlib import Path

@@ -22,8 +22,8 @@ from neurolens.cli import main
 from neurolens.cli import plan as command
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.shot import Shot
-from neurolens.plan import plan as planned
-from neurolens.plan import shot_fits
+from neurolens.plan import candidates as tried
+from neurolens.plan.candidates import Target, candidates
 from neurolens.plan.costs import noise, rest_ns, shader_cost
 from neurolens.plan.footprints import (
     Footprints,
@@ -35,15 +35,14 @@ from neurolens.plan.footprints import (
     light_beside,
     places_of,
 )
-from neurolens.plan.plan import Target, candidates, decided, plan
-from neurolens.plan.probe import Probed, effects_of, probe
+from neurolens.plan.plan import decided, plan
+from neurolens.plan.probe import Probe, effects_of, probe
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.pictures import read_exr
 from neurolens.render.scene import load_scene, scene_from_tables
 from neurolens.setting.states import set_lens
 from neurolens.shaders.blender_shader import lens_of
 from neurolens.shaders.osl import osl_program
-from neurolens.study.scenes import seen_depths_m
 from neurolens.surrogates.cores import InvariantPolynomial
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.file import read_model
@@ -149,12 +148,6 @@ def test_a_pupil_s_outline_serves_any_plane_and_tells_what_passes_beside_it() ->
     assert light_beside(camera, places) == pytest.approx(0.01 * narrow, rel=0.02)  # 0.5% of the radius, all of it lit
 
 
-def test_depths_are_along_the_axis() -> None:
-    camera = make_camera("pinhole", Shot((36.0, 20.25), 3.0))
-    seen = seen_depths_m(scene_from_tables(wall(4.0)), camera, FILM)
-    assert seen == pytest.approx(4.0, abs=1e-4)
-
-
 def test_what_a_shot_needs_falls_with_its_stop() -> None:
     lens = set_lens(read_lens(LENS))
     wide, small = (
@@ -197,13 +190,6 @@ def test_budgets_at_the_extremes(budget: float, distance_m: float, f_number: flo
     assert again.best is not None and again.best.name == "exact" and again.rest > 2 * again.best.cost
 
 
-def test_a_scene_with_nothing_in_view_is_distant() -> None:
-    tables = wall(4.0)
-    tables["planes"][0]["point_m"] = [0.0, 0.0, 4.0]  # behind the camera
-    asked = probe(scene_from_tables(tables), set_lens(read_lens(LENS)), across=4).asked
-    assert asked.nearest_m is None and asked.distant == 1.0
-
-
 def test_bad_budgets_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(InputError, match="budget_px"):
         plan(scene_from_tables(wall(4.0)), set_lens(read_lens(LENS)), math.nan)
@@ -229,14 +215,14 @@ def test_noise_of_weights_is_how_many_times_the_rays_it_takes() -> None:
 
 
 @cache
-def garden() -> Probed:
+def garden() -> Probe:
     return probe(load_scene(Path("experiments/scenes/garden.toml")), set_lens(read_lens(GAUSS)), across=6)
 
 
 def test_what_is_cheapest_differs_by_target(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Blender's own thin lens costs less than any shader; in our renderer a small polynomial costs less than it."""
     found = garden()
-    monkeypatch.setattr(shot_fits, "TERMS", (8,))
+    monkeypatch.setattr(tried, "TERMS", (8,))
     targets: tuple[Target, ...] = ("render", "osl")
     best = {t: decided(found, candidates(found, (1.0,), t, folder=tmp_path), 1.0, t).best for t in targets}
     assert best["osl"] is not None and best["osl"].name == "thin + ST map" and best["osl"].error_px < 1
@@ -263,7 +249,7 @@ def test_shaders_cost_what_cycles_took() -> None:
 
 
 def test_a_warped_pinhole_lacks_the_blur_alone() -> None:
-    """Of a wall in focus: places and light are right, so that its error is the RMS radius of the lens's footprints."""
+    """A wall in focus: places and light are right, so that its error is the RMS radius of the lens's footprints."""
     scene, lens = scene_from_tables(wall(3.0)), set_lens(read_lens(GAUSS))
     choices, found = {c.name: c for c in plan(scene, lens, 1e9, explain=True).choices}, probe(scene, lens)
     blur = np.percentile(blur_mm(found.seen, found.places.share) / 2, 95) / found.asked.pixel_mm
@@ -279,7 +265,7 @@ def test_targets_are_those_of_the_command() -> None:
 
 def test_a_plan_s_file_is_taken_by_train_render_and_export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same model again from scratch, in numbers; the pictures of the file and of the model that it names agree."""
-    monkeypatch.setattr(shot_fits, "TERMS", (6,))
+    monkeypatch.setattr(tried, "TERMS", (6,))
     scene, folder = tmp_path / "scene.toml", tmp_path / "plan"
     film = {"film_width_mm": 18.0, "film_height_mm": 10.125, "width": 64, "height": 36, "samples": 2}
     scene.write_text(format_toml(wall(4.0, 4.0, **film)))
@@ -314,9 +300,9 @@ def test_models_have_the_blades_of_the_lens_file() -> None:
     shaped = read_lens(GAUSS).with_aperture(Aperture(blades=5, rotation_deg=20.0))
     found = probe(scene_from_tables(wall(1.0, 4.0)), shaped)
     model = Path("models/laikin_double_gauss_50.ols-60.onnx")
-    own = planned.model_choice(found, "onnx", model, "", False)
+    own = tried.model_choice(found, "onnx", model, "", False)
     lens = replace(found.lens, aperture=None)
-    bare = planned.model_choice(replace(found, lens=lens), "onnx", model, "", False)
+    bare = tried.model_choice(replace(found, lens=lens), "onnx", model, "", False)
     assert own is not None and bare is not None
     assert own.error_px < 0.05 and own.light_error < 0.01 and bare.error_px > 0.3
 

@@ -77,19 +77,16 @@ def test_a_rack_takes_as_few_fits_as_hold(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_stretches_are_the_fewest(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Where a model holds a range of 1 / focus of at most 0.5, greedy stretches are as few as can be."""
+    """A model holds a range of 1 / focus of at most 0.5: greedy stretches are as few as can be."""
     near = [0.2, 0.3, 0.65, 0.7, 0.75, 1.3, 1.85]  # 1 / m
     lens = set_lens(read_lens(LENS))
     founds: Any = [SimpleNamespace(lens=lens, asked=SimpleNamespace(focus_m=1 / v)) for v in near]
 
-    class Short:
-        def __init__(self, some: Any, *_: Any) -> None:
-            self.reach = [1 / p.asked.shot.focus_m for p in some]
+    def short(some: Any, *_: Any) -> Any:
+        reach = [1 / p.asked.shot.focus_m for p in some]
+        return lambda terms, costed: terms if max(reach) - min(reach) <= 0.5 + 1e-9 and terms >= 12 else None
 
-        def choice(self, terms: int, costed: bool = False) -> Any:
-            return terms if max(self.reach) - min(self.reach) <= 0.5 + 1e-9 and terms >= 12 else None
-
-    monkeypatch.setattr(module, "_Stretch", Short)
+    monkeypatch.setattr(module, "_stretch", short)
     found = list(module._stretches(founds, "render", 1.0, tmp_path))
     got = [sorted(near[k] for k in rows) for rows, _ in found]
     assert sorted(v for g in got for v in g) == near and all(max(g) - min(g) <= 0.5 + 1e-9 for g in got)

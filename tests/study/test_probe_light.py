@@ -1,4 +1,4 @@
-"""What a probe finds besides footprints: light, contrast, flare, what is made afterwards, blur of each pixel."""
+"""A probe's results besides footprints: light, contrast, flare, effects that are made afterwards, each pixel's blur."""
 
 import math
 from typing import Any
@@ -14,19 +14,17 @@ from neurolens.flare.canvas import Raster
 from neurolens.flare.layers import FlareJob, flare_layers
 from neurolens.flare.sources import SceneLights
 from neurolens.lens.shot import Shot
-from neurolens.plan.footprints import Footprints, blur_mm, distance_mm, left_to
-from neurolens.plan.light import glance, stray_light
+from neurolens.plan.footprints import Footprints, blur_map, blur_mm, distance_mm, left_to
+from neurolens.plan.light import overview, stray_light
 from neurolens.plan.plan import plan
 from neurolens.plan.probe import effects_of, probe
-from neurolens.plan.samples import blur_map
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.renderer import render
 from neurolens.render.scene import scene_from_tables
 from neurolens.render.settings import FlareSettings
-from neurolens.render.world import World
 from neurolens.setting.pupils import camera_rays
 from neurolens.setting.states import set_lens
-from neurolens.study.scenes import seen_depths_m
+from neurolens.study.scenes import nearest_depth_m
 from neurolens.trace.rays import Rays, trace
 
 LENS = "lenses/cooke_triplet_50.toml"  # of glass that absorbs
@@ -99,10 +97,10 @@ def test_vignetting_darkens_the_corner_as_traced_rays_say() -> None:
 
 def test_contrast_is_that_of_the_scene_and_not_noise() -> None:
     camera = make_camera("pinhole", Shot((36.0, 20.25), 3.0))
-    bare = glance(wall(), camera)
+    bare = overview(wall(), camera)
     assert np.median(bare.contrast) < 0.02
     # The right half is four times as bright: on its left a step of 3 to one of two neighbours.
-    half = glance(wall(quads=[card(9.0, 3.99, (0.0, -4.5), "light")]), camera)
+    half = overview(wall(quads=[card(9.0, 3.99, (0.0, -4.5), "light")]), camera)
     assert np.median(half.contrast[:, 23]) == pytest.approx(3 / math.sqrt(2), rel=0.1)
     assert np.median(half.contrast[:, [10, 40]]) < 0.02
 
@@ -117,11 +115,11 @@ def test_edges_are_where_blur_differs() -> None:
 
 
 def test_flare_is_that_of_the_layers() -> None:
-    """As its layers at four times the pixels, in proportion to the light, and none without a light."""
+    """It equals the layers at four times the pixels, grows with the light, and is none without a light."""
     bright = {"centre_m": [0.5, 0.3, -3.0], "radius_m": 0.03}
     scenes = [wall(spheres=[bright | {"emission": [e, e, e]}]) for e in (300.0, 600.0)]
     camera = make_camera(LENS, Shot((36.0, 20.25), 3.0))
-    small = glance(wall(), camera)
+    small = overview(wall(), camera)
     once, twice = (stray_light(s, camera, small) for s in scenes)
     for name in ("flare", "star-bursts"):
         assert twice[name].mean() == pytest.approx(2 * once[name].mean(), rel=1e-3) and once[name].mean() > 0
@@ -189,7 +187,7 @@ def test_extremes_have_an_answer(name: str) -> None:
     found = probe(wall(**EXTREMES[name]), set_lens(read_lens(LENS)), across=3)
     effects = effects_of(found, 0.25)
     assert all(e.worth >= 0 for e in effects) and {"defocus", "flare"} <= {e.name for e in effects}
-    assert (found.asked.nearest_m is None) == (name == "distant")
+    assert (found.asked.nearest_m is None) == (found.asked.distant == 1.0) == (name == "distant")
     blur, _ = blur_map(found)
     assert np.isfinite(blur).all() and blur.shape == (found.scene.settings.camera.height, blur.shape[1])
     if name == "at the front glass":
@@ -197,7 +195,7 @@ def test_extremes_have_an_answer(name: str) -> None:
 
 
 def test_lights_beyond_number_are_bounded() -> None:
-    """Of many lights those that are strongest at the lens are looked at: a near one among weak ones is found."""
+    """Only the lights that are strongest at the lens are used: a near one among weak ones is found."""
     place = np.random.default_rng(0).uniform([-9, -9, -60], [9, 9, -40], (20_000, 3))
     points = [{"position_m": [float(v) for v in p], "intensity": [1e-6] * 3} for p in place]
     points[12_345] = {"position_m": [0.2, 0.1, -2.0], "intensity": [5.0] * 3}
@@ -206,13 +204,14 @@ def test_lights_beyond_number_are_bounded() -> None:
     assert len(seen) <= 8 and max(a.rgb[0] for a in seen) == pytest.approx(5 / 2.01**2, rel=0.1)
 
 
-def test_a_probe_makes_its_scene_ready_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a million lights that takes half a minute."""
-    made, whole = [], World.__init__
-    monkeypatch.setattr(World, "__init__", lambda self, *args: (made.append(1), whole(self, *args))[1])
-    bulb = {"centre_m": [0.0, 0.0, -2.5], "radius_m": 0.5, "emission": [5.0, 4.0, 3.0]}
-    scene = wall(spheres=[bulb])
-    found = probe(scene, set_lens(read_lens(LENS)), across=4)
-    assert len(made) == 1 and 2.0 < found.asked.nearest_m < 2.3
-    seen_depths_m(scene, found.exact, found.places.film_mm)  # outside nothing is kept
-    assert len(made) == 2
+def test_the_nearest_ball_in_view_counts_from_the_film() -> None:
+    """A ball on the axis has its depth in closed form; it is that of the plane through its front."""
+
+    def nearest(*centres: list[float]) -> float | None:
+        camera = {"position_m": [1.0, 2.0, 3.0], "look_at_m": [1.0, 2.0, 0.0], "focus_m": 2.0}
+        balls = [{"centre_m": c, "radius_m": 0.5, "material": "grey"} for c in centres]
+        return nearest_depth_m(wall(camera=camera, planes=[], spheres=balls), 50.0)
+
+    assert nearest([1.0, 2.0, 0.0], [1.0, 2.0, -4.0]) == pytest.approx(2.5, abs=1e-3)
+    assert nearest([2.0, 2.0, -2.0], [1.0, 2.0, 5.0]) == pytest.approx(4.5, abs=0.02)  # one is behind the camera
+    assert nearest() is nearest([1.0, 2.0, 5.0]) is None

@@ -21,14 +21,15 @@ from neurolens.setting.pupils import camera_rays, image_radius_mm
 from neurolens.setting.states import set_lens
 from neurolens.study.rays import (
     angles_deg,
+    deciding_rim_ratio,
     focused_vergence,
     frame_width_mm,
     local_jacobian,
     pupil_disc_share,
     pupil_middle,
     ray_errors,
+    relative_illumination,
 )
-from neurolens.study.vignetting import deciding_rim_ratio, relative_illumination
 from neurolens.surrogates.domain import FilmRays, domain_of, sample_domain
 from neurolens.surrogates.model import Domain
 from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, trace_pairs
@@ -218,11 +219,9 @@ def test_blocked_or_no_rays_are_refused(gauss: tuple[Lens, Domain, PairSet]) -> 
 
 def test_the_pupil_disc_of_a_hole() -> None:
     """A hole of radius 10: a disc of half that radius holds a quarter of its rays."""
-    hole = Lens("hole", "test", (Surface(math.inf, 50.0, 20.0, stop=True),), 2.5)
-    bounds = PupilBounds(0.0, 15.0, (-10.0, -10.0), (10.0, 10.0), (10.0, 10.0), 10.0)
-    domain = Domain(15.0, (50.0, 50.0), (math.inf, math.inf), 0.0, 10.5, (500.0, 600.0), 10.0, bounds)
-    assert pupil_disc_share(hole, domain, 65536) == 1.0
-    assert pupil_disc_share(hole, replace(domain, pupil_radius_mm=5.0), 65536) == pytest.approx(0.25, rel=2e-3)
+    lens, domain = hole(10.0)
+    assert pupil_disc_share(lens, domain, 65536) == 1.0
+    assert pupil_disc_share(lens, replace(domain, pupil_radius_mm=5.0), 65536) == pytest.approx(0.25, rel=2e-3)
 
 
 @pytest.mark.parametrize("name, efl_mm", [("laikin_double_gauss_50", None), ("brendel_tessar_100", 50.0)])

@@ -13,8 +13,7 @@ from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
-from neurolens.study.candidates import camera_candidate, exact_candidates
-from neurolens.study.speed import Call, Candidate, Race, Unavailable, race
+from neurolens.study.speed import Call, Candidate, Race, Unavailable, camera_candidate, exact_candidates, race
 from neurolens.surrogates.domain import FilmRays, domain_of
 from neurolens.surrogates.model import Domain
 from neurolens.surrogates.terms import pinned_threads
@@ -22,14 +21,16 @@ from neurolens.surrogates.terms import pinned_threads
 LENSES = Path(__file__).parents[2] / "lenses"
 
 
+LENS = set_lens(read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml"))
+
+
 @pytest.fixture(scope="module")
 def domain() -> Domain:
-    return domain_of(set_lens(read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml")), film_radius_mm=10.0)
+    return domain_of(LENS, film_radius_mm=10.0)
 
 
 def test_a_race_of_cameras_and_the_eager_tracer(domain: Domain) -> None:
-    lens = set_lens(read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml"))
-    eager = exact_candidates(lens, domain, compiled=False)
+    eager = exact_candidates(LENS, domain, compiled=False)
     cameras = [camera_candidate(c, domain) for c in (Pinhole(50.0), ThinLens(50.0, 2.0, math.inf))]
     result = race([*eager, *cameras], domain, rounds=3)
     assert list(result.ns) == ["exact eager", "pinhole", "thin"]
@@ -69,22 +70,18 @@ def test_what_cannot_run_is_reported_with_its_reason(domain: Domain) -> None:
         raise Unavailable("no such thing here")
 
     result = race([Candidate("absent", refuse), camera_candidate(Pinhole(50.0), domain)], domain, rounds=1)
-    assert result.unavailable == {"absent": "no such thing here"}
-    known = {"name": "absent", "available": False, "reason": "no such thing here", "ns_per_ray": None}
-    assert result.record("absent") == known
-    assert result.record("pinhole")["available"]
-    assert result.timing("absent") is None
-    assert result.speedup("pinhole", "absent") is None
+    record = {"name": "absent", "available": False, "reason": "no such thing here", "ns_per_ray": None}
+    assert result.record("absent") == record and result.record("pinhole")["available"]
+    assert result.timing("absent") is None and result.speedup("pinhole", "absent") is None
 
 
 @pytest.mark.slow
 def test_without_a_compiler_the_compiled_tracer_is_unavailable(domain: Domain) -> None:
     import torch._inductor.config as inductor
 
-    lens = set_lens(read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml"))
     # torch's own patch: monkeypatch leaves its settings unusable. A kernel compiled before would need no compiler.
     with inductor.patch({"cpp.cxx": ("/nowhere/c++",), "fx_graph_cache": False}):
-        result = race(exact_candidates(lens, domain), domain, rounds=1)
+        result = race(exact_candidates(LENS, domain), domain, rounds=1)
     assert "exact eager" in result.ns
     assert "compiler" in result.unavailable["exact compiled"].lower()
 
@@ -100,7 +97,7 @@ def test_bad_settings_are_refused(domain: Domain) -> None:
 
 def test_candidates_of_several_domains_run_in_one_race() -> None:
     """Each does rays of its own domain; all are timed round by round together."""
-    wide = domain_of(set_lens(read_lens(LENSES / "thorlabs_lb1471_biconvex_50.toml"), f_number=8), film_radius_mm=20.0)
+    wide = domain_of(set_lens(LENS, f_number=8), film_radius_mm=20.0)
     small = replace(wide, film_radius_mm=5.0)
     reached: dict[str, float] = {}
 

@@ -11,10 +11,9 @@ import pytest
 from neurolens.base.errors import InputError
 from neurolens.base.tomlfile import format_toml
 from neurolens.cli import main
-from neurolens.plan import trade as traded
-from neurolens.plan.plan import Choice
-from neurolens.plan.probe import probe
-from neurolens.plan.trade import Offer, best_within, front, offers, small, spread
+from neurolens.plan import plan as traded
+from neurolens.plan.candidates import Choice
+from neurolens.plan.plan import Offer, best_within, front, offers, spread
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import scene_from_tables
 
@@ -46,13 +45,7 @@ def test_seconds_are_those_of_the_camera_and_of_the_rays_that_its_noise_asks_for
 
 
 def test_the_front_holds_what_nothing_betters_and_time_buys_the_most_faithful() -> None:
-    rows = [
-        ("a", 2.0, 1.0, 0.0),
-        ("b", 1.0, 2.0, 0.0),
-        ("dull", 1.5, 3.0, 0.0),
-        ("dark", 0.1, 1.5, 0.5),
-        ("c", 0, 9, 0),
-    ]
+    rows = [("a", 2, 1, 0), ("b", 1, 2, 0), ("dull", 1.5, 3, 0), ("dark", 0.1, 1.5, 0.5), ("c", 0, 9, 0)]
     offered = [Offer(choice(n, e, 0.0, light=dim), s) for n, e, s, dim in rows]
     assert [o.choice.name for o in front(offered)] == ["a", "b", "c"]
     bought = {s: best_within(offered, s) for s in (0.5, 1.0, 5.0, 9.0)}
@@ -67,13 +60,6 @@ def test_what_is_shown_holds_the_ends_and_the_chosen_one() -> None:
     assert spread(many[:3], None, 6) == many[:3]
     beside = Offer(choice("beside", 0.5, 0.0), 2.5)  # a choice that another camera betters is shown, too
     assert beside in spread(many, beside, 6) and spread(many[:2], beside) == [*many[:2], beside]
-
-
-def test_small_pictures_keep_the_shape_of_the_film() -> None:
-    for width, height in ((640, 360), (1, 1), (997, 561), (64, 36)):
-        film = {"film_width_mm": 36.0, "film_height_mm": 36.0 * height / width}
-        across, down = small(scene_from_tables(scene(width=width, height=height, **film)), 240)
-        assert across == min(width, 240) and abs(down - across * height / width) <= 0.5
 
 
 def test_a_trade_leaves_one_page_that_needs_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -111,10 +97,8 @@ def test_a_plan_for_a_time_takes_the_most_faithful_camera_that_fits(tmp_path: Pa
 
 def test_a_plan_for_flip_takes_the_cheapest_camera_that_looks_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     shown = scene_from_tables(scene(width=64, height=36, film_width_mm=18.0, film_height_mm=10.125, samples=4))
-    found, seen = probe(shown, read_lens(LENS)), {}
-    priced = traded._priced(shown, found, 0.0, "render", [], None, None)
-    monkeypatch.setattr(traded, "probe", lambda *args: found)  # once for all budgets
-    monkeypatch.setattr(traded, "_priced", lambda *args: priced)
+    seen, priced = {}, traded._priced(shown, read_lens(LENS), 0.0)
+    monkeypatch.setattr(traded, "_priced", lambda *args: priced)  # once for all budgets
     for budget in (0.0, 0.05, 1.0):
         seen[budget] = traded.plan_seen(shown, read_lens(LENS), budget).best
         assert seen[budget] is not None and seen[budget].flip <= budget

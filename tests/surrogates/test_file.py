@@ -28,7 +28,7 @@ from neurolens.graph.compiler import FLAGS, find_compiler
 from neurolens.graph.program import FILM_Z, RAY, SCENE_RAY, STOP_RADIUS, WAVELENGTH
 from neurolens.graph.scalars import lower
 from neurolens.lens.paraxial import first_order
-from neurolens.study.candidates import CompiledSource
+from neurolens.study.speed import CompiledSource
 from neurolens.surrogates.assemble import ALL, RAY_ONLY, Parts
 from neurolens.surrogates.axes import mixture_of
 from neurolens.surrogates.card import MODEL_KEY, card_to_json, read_metadata

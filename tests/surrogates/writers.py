@@ -19,7 +19,7 @@ from neurolens.graph.c import Signature, literal
 from neurolens.graph.compiler import find_compiler
 from neurolens.graph.glsl import write_glsl
 from neurolens.graph.program import SCENE_RAY, Program
-from neurolens.study.candidates import CompiledSource
+from neurolens.study.speed import CompiledSource
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.source import fused_program

@@ -11,9 +11,9 @@ import torch
 from mpmath import mp, mpf, polyroots
 from torch import Tensor
 
+from neurolens.analysis.field_curves import seidel
 from neurolens.analysis.fields import Scene
-from neurolens.analysis.seidel import seidel
-from neurolens.analysis.wavefront import psf
+from neurolens.analysis.spots import psf
 from neurolens.base.errors import InputError
 from neurolens.flare.ghosts import GhostTracer
 from neurolens.graph.interpret import evaluate

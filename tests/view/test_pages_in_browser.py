@@ -18,7 +18,7 @@ from report_results import full_results
 from neurolens.base.records import Results
 from neurolens.cli import main
 from neurolens.render.pictures import write_exr, write_png
-from neurolens.study.report import write_report
+from neurolens.study.pages import write_report
 from neurolens.surrogates.card import CARD_KEY
 
 ROOT = Path(__file__).parents[2]
