@@ -21,6 +21,7 @@ from neurolens.cli.trade import answer_trade
 if TYPE_CHECKING:
     from neurolens.lens.prescription import Lens
     from neurolens.plan import plan as plans
+    from neurolens.plan.candidates import Choice
     from neurolens.plan.frames import FramesPlan
     from neurolens.render.scene import Scene
 
@@ -302,7 +303,7 @@ def _text(command: Plan, result: plans.Plan, folder: Path) -> str:
     return "\n\n".join([*parts, f"Written: {folder}/{', '.join(written)}"])
 
 
-def _commands(command: Plan, result: plans.Plan, best: plans.Choice, folder: Path) -> list[str]:
+def _commands(command: Plan, result: plans.Plan, best: Choice, folder: Path) -> list[str]:
     """The command that makes the camera for the target; none for ideal cameras, which every renderer has."""
     ideal = best.camera.startswith(("pinhole:", "thin:", "thick:"))
     lens = result.probed.lens
