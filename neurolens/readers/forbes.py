@@ -65,7 +65,7 @@ def qbfs_terms(a: Sequence[float], radius: float, curvature: float, rim: float, 
                 break
         if off > Decimal(WORST_MM):
             raise ValueError(f"a conic that powers up to {MAX_POWER} follow to {WORST_MM:g}")
-        return _powers(found.coef, radius, rim)
+        return _powers(found.coef.tolist(), radius, rim)
 
 
 def _qbfs_sum(a: Sequence[float]) -> Polynomial:
