@@ -40,6 +40,19 @@ from neurolens.render.scenetables import Vector
 Matrix = NDArray[np.float64]
 
 BRADFORD: Matrix = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+FloatArray64 = NDArray[np.float64]
+Spectrum = tuple[FloatArray64, FloatArray64]  # wavelengths in nm, increasing, and values there
+CIE_NAMES = ("D65", "D50", "A", "E")
+_KELVIN = re.compile(r"([0-9]{1,9}(?:\.[0-9]{0,9})?) ?K")
+COLDEST_K, HOTTEST_K = 500.0, 1e5
+_SECOND_RADIATION_CONSTANT = 1.438776877e-2  # h c / k, m K
+_MOST_ROWS, _LARGEST_FILE = 10_000, 1_000_000
+_DFC_NM = 587.5618, 486.1327, 656.2725  # Fraunhofer lines d, F and C
+# Beyond this condition number the three responses are too similar: separating them would only amplify noise.
+_LARGEST_CONDITION = 30.0
+_DEFENSIVE = 0.1  # share of the wavelengths drawn uniformly, independent of the importance
+_STEPS = 2048  # at which the importance is sampled
+Index = NDArray[np.intp]
 
 
 def xyz_of(xy: ArrayLike) -> Matrix:
@@ -138,16 +151,6 @@ def linear_to_srgb(linear: NDArray[np.floating]) -> FloatArray:
     """sRGB encoding of linear light, clipped to [0, 1] (IEC 61966-2-1)."""
     clipped = np.clip(np.nan_to_num(np.asarray(linear, np.float32), nan=0.0), 0.0, 1.0)
     return np.where(clipped <= 0.0031308, clipped * 12.92, 1.055 * clipped ** (1 / 2.4) - 0.055).astype(np.float32)
-
-
-FloatArray64 = NDArray[np.float64]
-Spectrum = tuple[FloatArray64, FloatArray64]  # wavelengths in nm, increasing, and values there
-
-CIE_NAMES = ("D65", "D50", "A", "E")
-_KELVIN = re.compile(r"([0-9]{1,9}(?:\.[0-9]{0,9})?) ?K")
-COLDEST_K, HOTTEST_K = 500.0, 1e5
-_SECOND_RADIATION_CONSTANT = 1.438776877e-2  # h c / k, m K
-_MOST_ROWS, _LARGEST_FILE = 10_000, 1_000_000
 
 
 def _csv(name: str) -> list[list[str]]:
@@ -269,13 +272,6 @@ def check_name(file: str | Path, field: str, name: str, measured: Mapping[str, o
     known = [*CIE_NAMES, *measured]
     kelvin = f"or a black body from {COLDEST_K:g} K to {HOTTEST_K:g} K such as '3200 K'"
     raise InputError(file, field, name, f"one of: {', '.join(known)}, {kelvin}{suggestion(name, known)}")
-
-
-_DFC_NM = 587.5618, 486.1327, 656.2725  # Fraunhofer lines d, F and C
-# Beyond this condition number the three responses are too similar: separating them would only amplify noise.
-_LARGEST_CONDITION = 30.0
-_DEFENSIVE = 0.1  # share of the wavelengths drawn uniformly, independent of the importance
-_STEPS = 2048  # at which the importance is sampled
 
 
 class SpectralRange:
@@ -408,9 +404,6 @@ class SpectralRange:
         d, f, c = (1 / nm**2 for nm in _DFC_NM)
         b = (n_d - 1) / v_d / (f - c)
         return (n_d + b * (self.centres_nm**-2.0 - d)).astype(np.float32)
-
-
-Index = NDArray[np.intp]
 
 
 class Palette:

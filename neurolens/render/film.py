@@ -41,6 +41,15 @@ RGB, LUMINANCE2, DEPTH, HITS, PASSED, DROPPED, COLUMNS = slice(0, 3), 3, 4, 5, 6
 BYTES_A_PIXEL = 8 * COLUMNS + 100
 # Larger deviations from square pixels are taken as mistakes, unless no whole number comes nearer.
 _ASPECT_TOLERANCE = 0.02
+# Settings of a camera that do not affect its rays: where it was read and notes.
+_NO_MATTER = ("model", "notes")
+_NOTHING = "(nothing)"  # a place that one of two identities lacks
+_PROBES, _DIGITS = 1024, 16
+_FORMAT = 3
+SPENT = ("seconds", "camera_thread_seconds", "thread_seconds")
+_BRIGHTEST = 1e37  # sum of a pixel, which float32 shall hold after the white balance, too
+_LONGEST = 80  # characters of a value in a message
+_AGAIN = "or --restart to begin again"
 
 
 @dataclass(frozen=True)
@@ -202,17 +211,6 @@ class Film:
     def fraction(self) -> float:
         """The share of the work that is done."""
         return float(self.done.sum()) / (self.tiling.tiles * self.tiling.passes)
-
-
-# Settings of a camera that do not affect its rays: where it was read and notes.
-_NO_MATTER = ("model", "notes")
-_NOTHING = "(nothing)"  # a place that one of two identities lacks
-_PROBES, _DIGITS = 1024, 16
-_FORMAT = 3
-SPENT = ("seconds", "camera_thread_seconds", "thread_seconds")
-_BRIGHTEST = 1e37  # sum of a pixel, which float32 shall hold after the white balance, too
-_LONGEST = 80  # characters of a value in a message
-_AGAIN = "or --restart to begin again"
 
 
 def identity(job: Job) -> dict[str, Any]:

@@ -26,6 +26,11 @@ from neurolens.render.world import world_of
 WeightedRays = tuple[FloatArray, FloatArray, FloatArray]  # origin, direction [3, N] and weight ([lanes,] N)
 # Of a sample's luminance; sums of colours up to a million times as bright stay within float32.
 _BRIGHTEST_SAMPLE = 1e30
+LANES = 4  # wavelengths of a hero path, and paths that share their random numbers
+_FINE = 1024  # wavelengths at which the light of a scene is summed
+_PROBES, _PROBED_WAVELENGTHS = 1024, 5
+_LITTLE_PX = 0.05  # pixels; a smaller shift is hidden by the pixel filter, a box one pixel wide
+_FARTHEST_M = 1e4
 
 
 def camera_axes(settings: CameraSettings) -> FloatArray:
@@ -253,13 +258,6 @@ def _layers(job: Job, sums: NDArray[np.float64], samples: NDArray[np.int64]) -> 
         depth = np.where(sums[:, columns.HITS] > 0, sums[:, columns.DEPTH] / sums[:, columns.HITS], np.inf)
         blocked = np.where(samples > 0, 1 - sums[:, columns.PASSED] / samples, 0.0)
         return np.stack([samples, variance, depth, blocked]).astype(np.float32)
-
-
-LANES = 4  # wavelengths of a hero path, and paths that share their random numbers
-_FINE = 1024  # wavelengths at which the light of a scene is summed
-_PROBES, _PROBED_WAVELENGTHS = 1024, 5
-_LITTLE_PX = 0.05  # pixels; a smaller shift is hidden by the pixel filter, a box one pixel wide
-_FARTHEST_M = 1e4
 
 
 def spectral_range(scene: Scene, camera: Camera, film: FilmSettings, lanes: int = 1) -> SpectralRange:

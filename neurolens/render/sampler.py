@@ -40,6 +40,8 @@ _JOE_KUO: tuple[tuple[int, int, tuple[int, ...]], ...] = (
     (5, 7, (1, 1, 7, 11, 19)),
 )
 
+_PI, TWO_PI = np.float32(math.pi), np.float32(2 * math.pi)
+
 
 def _direction_numbers(dimension: int) -> list[int]:
     if dimension == 0:
@@ -140,9 +142,6 @@ class Sampler:
     def draw2(self, keys: PathKeys, dimension: int) -> FloatArray:
         """Numbers [2, N] of two dimensions in a row."""
         return np.stack([self.draw(keys, dimension), self.draw(keys, dimension + 1)])
-
-
-_PI, TWO_PI = np.float32(math.pi), np.float32(2 * math.pi)
 
 
 def orthonormal(normal: FloatArray) -> tuple[FloatArray, FloatArray]:

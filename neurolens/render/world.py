@@ -27,6 +27,9 @@ from neurolens.render.scenetables import BLACK, Emitter, Material, Texture, Vect
 
 Frame = NDArray[np.float64]
 _STEEPEST = 1e25  # pictures or cells a metre; times the farthest point still finite in float32
+DIFFUSE, GLOSSY, MIRROR, GLASS, NOTHING = range(5)
+_KINDS = {"diffuse": DIFFUSE, "glossy": GLOSSY, "mirror": MIRROR, "glass": GLASS}
+_MANY_QUADS, _MANY_SPHERES = 128, 1024  # beyond, a tree is faster than testing one after the other
 
 
 def _frame(origin: Frame, u: Frame, v: Frame, size: tuple[float, float]) -> Frame:
@@ -141,11 +144,6 @@ class TextureTable:
         row = ((1 - (v - np.floor(v))) * height).astype(np.intp)
         rgb = image[np.minimum(row, height - 1), np.minimum(column, width - 1)]
         return np.einsum("nc,lcn->ln", rgb, self._basis.take(bins, axis=-1))
-
-
-DIFFUSE, GLOSSY, MIRROR, GLASS, NOTHING = range(5)
-_KINDS = {"diffuse": DIFFUSE, "glossy": GLOSSY, "mirror": MIRROR, "glass": GLASS}
-_MANY_QUADS, _MANY_SPHERES = 128, 1024  # beyond, a tree is faster than testing one after the other
 
 
 @dataclass(frozen=True)
