@@ -244,7 +244,7 @@ def _parts(text: str) -> list[str]:
     return parts
 
 
-def _fixed(texts: list[str]) -> dict[str, list[float]]:
+def _fixed(texts: Sequence[str]) -> dict[str, list[float]]:
     """The numbers of --fix by name."""
     fixed: dict[str, list[float]] = {}
     for text in texts:

@@ -162,6 +162,17 @@ examples:
     position_m: tuple[float, float, float] | None = None  # of a scene's camera
     look_at_m: tuple[float, float, float] | None = None
 
+    @property
+    def focus_m(self) -> float:
+        """Distance to the object in focus in metres."""
+        return math.inf if self.state.focus_m is None else self.state.focus_m
+
+    @property
+    def picture(self) -> Path:
+        """The picture to write, with -o."""
+        assert self.out is not None
+        return self.out
+
     @classmethod
     def add_options(cls, parser: Parser) -> None:
         """Add its arguments and options, those of `FlareSettings` under several titles."""

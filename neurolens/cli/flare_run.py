@@ -89,7 +89,7 @@ def run_flare(args: Flare) -> int:
     model = _model(args, states)
     tabled = read_any(args.file) if model is None else model.lens
     if args.fit is not None:
-        return _fit(args, progress, tabled, model, states[0])
+        return _fit(args, args.fit, progress, tabled, model, states[0])
     shots = Shots(args, states, tabled, model, progress)
     first = shots.at(states[0])
     results = {"lens": first.job.lens.name, "pairs": len(ghost_pairs(first.job.lens)), **first.metadata()}
@@ -99,7 +99,7 @@ def run_flare(args: Flare) -> int:
         results["path"] = args.path[1]
     if args.out is not None:
         results["out"] = [str(state.out) for state in states]
-        results["preview"] = [str(state.out.with_suffix(".png")) for state in states]
+        results["preview"] = [str(state.picture.with_suffix(".png")) for state in states]
         try:
             results |= _write_all(states, shots, progress)
         except KeyboardInterrupt as error:
@@ -114,15 +114,14 @@ def run_flare(args: Flare) -> int:
 
 def _states(flare: Flare) -> Iterator[Flare]:
     """The command with the settings of each frame."""
-    state = replace(flare.state, focus_m=math.inf) if flare.state.focus_m is None else flare.state
+    state = replace(flare.state, focus_m=flare.focus_m)
     if flare.frames.frames is None:
         yield replace(flare, state=state)
         return
     for frame, digits, values in frames_of(flare.frames.frames, flare.frames.key, vars(flare.state), _COMMAND):
         of_lens = {name: value for name, value in values.items() if name in vars(state)}
         place = {name: value for name, value in values.items() if name not in of_lens}
-        assert flare.out is not None
-        out = flare.out.with_name(f"{flare.out.stem}.{digits}{flare.out.suffix}")
+        out = flare.picture.with_name(f"{flare.picture.stem}.{digits}{flare.picture.suffix}")
         yield replace(flare, state=replace(state, **of_lens), frame=frame, out=out, **place)
 
 
@@ -137,7 +136,7 @@ def _model(args: Flare, states: Sequence[Flare]) -> GhostModel | None:
         return None
     wrong = [name for name in changed(args.state) if name not in _FREE]
     wrong += [f"--{name}" for name in ("coating", "photons") if getattr(args.settings, name)]
-    wrong += ["--key focus"] * any(math.isfinite(s.state.focus_m) for s in states)
+    wrong += ["--key focus"] * any(math.isfinite(s.focus_m) for s in states)
     wrong += ["--key zoom"] * any(s.state.zoom is not None for s in states)
     if wrong:
         raise InputError(_COMMAND, wrong[0], args.file, "a lens: fitted ghosts have one state and two reflections")
@@ -261,7 +260,7 @@ class Shots:
                 )
             else:
                 camera = make_camera(args.file, args.state.shot(args.film), self._progress)
-            self._fields[state] = field_of(camera, args.state.focus_m, "equidistant")
+            self._fields[state] = field_of(camera, args.focus_m, "equidistant")
         return self._fields[state]
 
 
@@ -314,10 +313,10 @@ def _write_all(states: list[Flare], shots: Shots, progress: Progress) -> dict[st
         return {"layers": single, "exposure": exposure or 0.0}
     with progress.stage(f"{len(states)} frames") as report:
         for done, state in enumerate(states, start=1):
-            if args.restart or not state.out.is_file():
+            if args.restart or not state.picture.is_file():
                 exposure = _write(state, shots, single, exposure, Progress(quiet=True))
             elif exposure is None:  # the frames of all runs share it
-                exposure = read_metadata(state.out).get("flare", {}).get("exposure")
+                exposure = read_metadata(state.picture).get("flare", {}).get("exposure")
             report(done / len(states))
     return {"layers": single, "exposure": exposure or 0.0}
 
@@ -326,7 +325,7 @@ def _write(
     args: Flare, shots: Shots, single: tuple[str, ...], exposure: float | None, progress: Progress
 ) -> float | None:
     """Write a picture and its preview; returns the exposure in stops, or None where it is free and all is dark."""
-    files, shot, space = Files.of(args.out), shots.at(args), shots.colour_space(args)
+    files, shot, space = Files.of(args.picture), shots.at(args), shots.colour_space(args)
     files.spare(shots.reads(args))
     job = replace(shot.job, single=single, keep=args.out)
     layers = flare_layers(job, progress)
@@ -337,12 +336,12 @@ def _write(
     options = {name.removeprefix("--"): value for name, value in changed(args).items()}
     about = {**shot.metadata(), "exposure": exposure, "settings": options | asdict(args.settings)}
     metadata = plain({"neurolens": __version__, "colour": space.stated, "flare": about})
-    camera = placed_settings(job.lens, args.film, args.state.focus_m)
+    camera = placed_settings(job.lens, args.film, args.focus_m)
     header = standard_attributes(camera, job.raster.width, job.raster.height, args.frame)
     write_png(files.preview, total, exposure or 0.0)  # first: a frame whose EXR exists is kept
     channels = flare_channels(layers, space)
-    write_exr(args.out, total, metadata=metadata, space=space, layers=channels, attributes=header)
-    for path in kept_beside(args.out):
+    write_exr(args.picture, total, metadata=metadata, space=space, layers=channels, attributes=header)
+    for path in kept_beside(args.picture):
         path.unlink()
     return exposure
 
@@ -391,21 +390,21 @@ def _text(shot: Shot, results: dict[str, Any]) -> str:
     return "\n\n".join([*lines, f"{end}: {results['seconds']:.1f} s"])
 
 
-def _fit(args: Flare, progress: Progress, tabled: Lens, model: GhostModel | None, state: Flare) -> int:
+def _fit(args: Flare, out: Path, progress: Progress, tabled: Lens, model: GhostModel | None, state: Flare) -> int:
     """Fit and write a lens's ghosts, or write those of a model as source."""
     from neurolens.flare.ghostfit import GhostSettings, fit_ghosts
 
     if model is not None:
-        check_suffix(args.fit, "--fit", (".h", ".glsl"))
-        write_ghost_source(model, args.fit)
+        check_suffix(out, "--fit", (".h", ".glsl"))
+        write_ghost_source(model, out)
     else:
         lens = with_coating(state.state.set_lens(tabled), args.settings)
-        check_suffix(args.fit, "--fit", (".onnx",))
+        check_suffix(out, "--fit", (".onnx",))
         settings = GhostSettings(args.angle, film_radius_mm=math.hypot(*args.film) / 2, target_um=args.within[1])
         with progress.stage("ghosts") as report:
             model = fit_ghosts(lens, settings, report)
-        write_ghosts(model, args.fit)
-    results = {"lens": model.lens.name, "out": str(args.fit), **model.report}
+        write_ghosts(model, out)
+    results = {"lens": model.lens.name, "out": str(out), **model.report}
     return args.answer(results, lambda: _fit_text(results))
 
 
