@@ -5,7 +5,6 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-import lens_models
 import numpy as np
 import pytest
 from film_light import film_light
@@ -278,7 +277,6 @@ def test_the_dark_costs_nothing() -> None:
     rng = np.random.default_rng(0)
     film = ((rng.random((2, 5000)) - 0.5) * 60).astype(np.float32)
     square, wavelength = rng.random((2, 5000), np.float32), np.full(5000, 550, np.float32)
-    expected = camera.sample(film, square, wavelength)
     camera.film.scene = counting  # type: ignore[assignment]
     try:
         rays = camera.sample(film, square, wavelength)
@@ -287,23 +285,7 @@ def test_the_dark_costs_nothing() -> None:
     lit = camera.film.outline.sample(film, square, wavelength)[1] > 0
     assert lit.sum() == pytest.approx((np.hypot(*film) <= camera.film.outline.film_radius_mm).sum(), abs=5)
     assert 0.1 < lit.mean() < 0.6 and sum(traced) == lit.sum()
-    dark = ~lit
-    assert (rays.status[dark] == st.OUTSIDE_DOMAIN).all() and (rays.weight[dark] == 0).all()
-    assert np.linalg.norm(rays.direction, axis=0) == pytest.approx(1, abs=1e-5)
-    # Rays of the lit are those that they are when asked for alone.
-    alone = camera.sample(film[:, lit], square[:, lit], wavelength[lit])
-    assert np.array_equal(rays.direction[:, lit], alone.direction) and np.array_equal(rays.weight[lit], alone.weight)
-    assert np.array_equal(rays.origin_m, expected.origin_m)
-
-
-def test_exact_and_model_sample_the_same_pupil() -> None:
-    """The outlines of a lens and of its model agree as closely as the two agree on which rays pass."""
-    exact_camera = ExactCamera(lens_models.lens(), Shot(FILM, 2.0, 4.0), bounds=lens_models.domain().bounds)
-    model = OnnxCamera(load_model(lens_models.exported("invariants")), Shot(FILM, 2.0, 4.0))
-    rays = film_rays(exact_camera, 20_000)
-    (a, area), (b, _) = (c.film.outline.sample(*rays) for c in (exact_camera, model))
-    radius = np.sqrt(area / math.pi)
-    assert np.quantile(np.hypot(*(a - b)) / radius, 0.99) < 0.02
+    assert (rays.status[~lit] == st.OUTSIDE_DOMAIN).all() and (rays.weight[~lit] == 0).all()
 
 
 def test_blades_and_cylinders_are_held() -> None:
