@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from neurolens.base.bounds import F_NUMBER, FILM_MM, FOCAL_MM, said, within
 from neurolens.base.errors import InputError
@@ -40,7 +40,7 @@ class Shot:
         vignetting: the part that is kept; see `neurolens.cameras.vignetting`.
 
     Raises:
-        InputError: a film, focus or f-number that no camera has.
+        InputError: a film, focus, f-number, focus mode or vignetting that no camera has.
     """
 
     film_mm: tuple[float, float]
@@ -82,6 +82,9 @@ class Shot:
 
     def __post_init__(self) -> None:
         check_bounds(self, "camera")
+        for field, choices in (("focus_mode", get_args(FocusMode)), ("vignetting", get_args(Vignetting))):
+            if getattr(self, field) not in choices:
+                raise InputError("camera", field, getattr(self, field), f"one of: {', '.join(choices)}")
         object.__setattr__(self, "film_mm", check_film(self.film_mm))
         object.__setattr__(self, "focus_m", float(self.focus_m))
 
@@ -101,16 +104,11 @@ def check_film(film_mm: tuple[float, float]) -> tuple[float, float]:
     return float(width), float(height)
 
 
-# The fields of a shot that rule how a lens is set.
-LENS_STATE = "f_number", "zoom", "focus_m", "focus_mode"
-LENS_SIZE = "focal_length_mm", "field_deg"
-
-
 @dataclass(frozen=True)
 class StopShape:
     """The shape of the stop's opening, as files and options state it; without any field it is the lens file's.
 
-    `render.pictures.make_aperture` makes an `Aperture` of it, which reads the picture of a mask.
+    `render.images.make_aperture` makes an `Aperture` of it, which reads the picture of a mask.
     """
 
     blades: int | None = setting(
