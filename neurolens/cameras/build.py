@@ -51,7 +51,9 @@ def _camera(spec: str, shot: Shot, progress: Progress | None) -> Camera:
     if kind in IDEAL_OF:
         return _ideal_of(kind, path, shot)
     if is_model(path):
-        return _model(path, shot, kind == FUSED)
+        from neurolens.cameras.model import OnnxCamera, load_model
+
+        return OnnxCamera(load_model(path), shot, runtime="c" if kind == FUSED else "onnxruntime")
     return _exact(path, shot, kind == FUSED, progress)
 
 
@@ -160,9 +162,3 @@ def _film_notes(lens: Lens, film_mm: tuple[float, float]) -> list[str]:
     if lens.image_radius_mm is None and (lens.half_field_deg is None or lens.half_field_deg >= 60):
         return []  # only a long search would tell
     return beyond_circle(film_mm, image_radius_mm(lens)[0], "the image circle", "may stay dark")
-
-
-def _model(path: Path, shot: Shot, fused: bool) -> Camera:
-    from neurolens.cameras.model import OnnxCamera, load_model
-
-    return OnnxCamera(load_model(path), shot, runtime="c" if fused else "onnxruntime")

@@ -231,7 +231,7 @@ def placed_settings(lens: Lens, film_mm: tuple[float, float], focus_m: float) ->
 
 _KEPT = 256  # files of 5 to 40 kB
 _LARGEST = 1 << 20  # bytes
-_DAMAGED = (OSError, ValueError, KeyError, EOFError, struct.error, zipfile.BadZipFile, zlib.error)
+_DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, struct.error, zipfile.BadZipFile, zlib.error)
 
 
 def search_key(lens: Lens, wavelength_nm: tuple[float, float], shares: tuple[float, ...], *settings: Any) -> str:
@@ -260,7 +260,10 @@ def _code() -> list[str]:
 
 
 def kept_outline(key: str, search: Callable[[], PupilOutline | None]) -> PupilOutline | None:
-    """The outline of a key: from the cache, else what `search` finds, which is kept if a file can be written."""
+    """The outline of a key: from the cache, else what `search` finds, which is kept if a file can be written.
+
+    The search takes seconds. Of two runs that write at once either one's file stays; both are right.
+    """
     file = cache_folder() / f"{key[:32]}.npz"
     outline = _read(file, key)
     if outline is not None:
@@ -277,21 +280,17 @@ def kept_outline(key: str, search: Callable[[], PupilOutline | None]) -> PupilOu
 
 
 def _read(file: Path, key: str) -> PupilOutline | None:
+    """The outline in a file of this key; None where the file is damaged, of another key, or of another user."""
     data = sealed_bytes(file)
     if data is None or len(data) > _LARGEST:
         return None
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as held:
-            found = {name: held[name] for name in held.files}
-        if str(found.pop("key")) != key:
-            return None
-        z, radius, waves = (np.atleast_1d(found.pop(n)) for n in ("pupil_z_mm", "film_radius_mm", "wavelength_nm"))
-        centre, x, y = (found.pop(name) for name in ("centre", "x", "y"))
-        shape = (len(waves), len(centre), x.shape[-1])
-        sizes = len(waves) in (1, 2) and min(shape[1:]) > 1 and x.shape == y.shape == shape and not found
-        kinds = {centre.dtype, x.dtype, y.dtype} == {np.dtype(np.float32)} and {z.size, radius.size} == {1}
-        if not (sizes and kinds and all(np.isfinite(a).all() for a in (z, radius, waves, centre, x, y))):
-            return None
-        return PupilOutline(z.item(), radius.item(), tuple(waves.tolist()), centre, x, y)
+        with np.load(io.BytesIO(data), allow_pickle=False) as file_arrays:
+            arrays = dict(file_arrays)
+        if str(arrays.pop("key")) == key:
+            plane_mm, radius_mm = (arrays.pop(name).item() for name in ("pupil_z_mm", "film_radius_mm"))
+            waves_nm = tuple(np.atleast_1d(arrays.pop("wavelength_nm")).tolist())
+            return PupilOutline(plane_mm, radius_mm, waves_nm, **arrays)
     except _DAMAGED:
-        return None
+        pass
+    return None

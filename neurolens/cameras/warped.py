@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -62,7 +62,8 @@ class Warped:
         sides = 2 * BEYOND * np.array([np.abs(before.real).max(), np.abs(before.imag).max()]) / self.film_mm
         self.area = float(np.maximum(sides, 1.0).prod())  # of the picture before it is warped, over that of the film
         if tables:
-            wide: Any = _OfFilm(flat, (float(sides[0] * self.film_mm[0]), float(sides[1] * self.film_mm[1])))
+            wide = copy(flat)
+            wide.film_mm = float(sides[0] * self.film_mm[0]), float(sides[1] * self.film_mm[1])
             shown = tables if isinstance(tables, Field) else field_of(camera, focus_m)
             self._fields = {id(camera): shown, id(flat): field_of(wide, focus_m)}
 
@@ -93,13 +94,3 @@ class Warped:
     def _before(self, ideal: Complex) -> Complex:
         """Places in the ideal camera's picture, mm."""
         return np.asarray(self._size[0] * ideal.real + 1j * (self._size[1] * ideal.imag))
-
-
-class _OfFilm:
-    """A camera with another film."""
-
-    def __init__(self, camera: Camera, film_mm: tuple[float, float]) -> None:
-        self._camera, self.film_mm = camera, film_mm
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._camera, name)
