@@ -156,7 +156,7 @@ def _expected(kind: Any, bounds: tuple[float, float], unit: str) -> str:
 def add_options(
     parser: argparse._ActionsContainer, cls: type, names: Collection[str] = (), *, unset: bool = False,
     texts: Mapping[str, str] | None = None, root: argparse._ActionsContainer | None = None, **defaults: Any,
-) -> list[argparse.Action]:  # fmt: skip
+) -> None:  # fmt: skip
     """Add the fields of `cls` that are declared by `setting` as options, also those of dataclasses inside it.
 
     Args:
@@ -166,30 +166,29 @@ def add_options(
         texts: for some fields, what replaces {} in their help.
         root: the parser that gets the groups of arguments, where `parser` is a group.
     """
-    hints, actions, apart, texts = get_type_hints(cls), list[argparse.Action](), dict[str, Any](), texts or {}
+    hints, apart, texts = get_type_hints(cls), dict[str, Any](), texts or {}
     for f in sorted(_options(cls), key=lambda f: getattr(f.metadata.get("option"), "last", 0)):
         option: Option | None = f.metadata.get("option")
         if option is None:
             place = titled(root or parser, f.metadata["group"]) or parser
-            actions += add_options(place, hints[f.name], root=root or parser, **f.metadata["more"])
+            add_options(place, hints[f.name], root=root or parser, **f.metadata["more"])
         elif is_dataclass(hints[f.name]):
-            actions += add_options(parser, hints[f.name], names, unset=unset, texts=texts, **defaults)
+            add_options(parser, hints[f.name], names, unset=unset, texts=texts, **defaults)
         elif not names or f.name in names:
             place = titled(root or parser, option.title) or parser
             if option.apart:
                 place = apart[option.apart] = apart.get(option.apart) or place.add_mutually_exclusive_group()
             default = defaults.get(f.name, None if unset else f.default)
             names_of, details = _details(f, option, hints[f.name], default, texts.get(f.name))
-            actions.append(place.add_argument(*names_of, **details))
-            for word in option.old:
-                if not isinstance(option.old, Mapping):
-                    parser._option_string_actions[f"--{word}"] = actions[-1]
-                    continue
-                value = option.old[word]
+            action = place.add_argument(*names_of, **details)
+            if not isinstance(option.old, Mapping):
+                parser._option_string_actions.update({f"--{word}": action for word in option.old})
+                continue
+            for word, value in option.old.items():
                 more = {"type": value} if callable(value) else {"action": "store_const", "const": value}
-                keep = {"dest": details["dest"], "default": details["default"], "help": argparse.SUPPRESS}
-                parser.add_argument(f"--{word}", **keep, **more)
-    return actions
+                parser.add_argument(
+                    f"--{word}", dest=details["dest"], default=details["default"], help=argparse.SUPPRESS, **more
+                )
 
 
 def titled(parser: argparse._ActionsContainer, title: str) -> argparse._ActionsContainer | None:

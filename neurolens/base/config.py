@@ -1,3 +1,0 @@
-"""Moved to `base.settings`."""
-
-from neurolens.base.settings import *  # noqa: F403
