@@ -95,10 +95,7 @@ class LensFilm:
         scene = scene or self.scene
         pupil, area = self.outline.sample(film_mm, square, wavelength_nm)
         lit = (area > 0) & is_light(wavelength_nm)
-        if lit.all():
-            return camera_rays(self._weighted(scene, film_mm, pupil, area, wavelength_nm))
-        # A film point that nothing reaches is dark: no ray is traced.
-        some = np.flatnonzero(lit)
+        some = np.flatnonzero(lit)  # a film point that nothing reaches is dark: no ray is traced
         found = self._weighted(scene, film_mm[:, some], pupil[:, some], area[some], wavelength_nm[some])
         whole = {name: np.zeros((*part.shape[:-1], lit.size), part.dtype) for name, part in found.items()}
         whole["status"][:] = st.OUTSIDE_DOMAIN

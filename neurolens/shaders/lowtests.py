@@ -1,8 +1,9 @@
-"""Tests of a lens's graph, its stop and its transmittance as sparse polynomials, for rays that all but pass.
+"""Cheap replacements for a surrogate's clipping tests, for cameras that sample their rays near the pupil.
 
-Surrogates spend as many terms on whether a ray passes as on where it goes, all over the domain of their rays. A camera
-that draws its rays within the pupil asks only where the pupil ends, and of the few terms of what is smooth: these are
-fitted anew to its own rays, of the variables that the surrogate has anyway. Where rays go is not touched.
+A surrogate spends as many terms on whether a ray passes as on where it goes, all over its domain. A camera that samples
+the pupil needs to know only where the pupil ends: a few polynomial terms, fitted to its own rays in the variables that
+the surrogate computes anyway, decide whether such a ray is vignetted, and give stop point and transmittance. The
+directions of rays stay as they are.
 """
 
 from __future__ import annotations
@@ -32,9 +33,9 @@ _UNIT = 1e-4  # by which squared lengths of directions may differ from 1
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """Of one graph: values [R, N] of the node that gives rows to what is fitted, monomials [M, N] of its variables,
-    weights [R, N] of errors, and rays that pass."""
+class _GateSamples:
+    """Samples of one graph: values [R, N] of the node whose rows are fitted, monomials [M, N] of its variables, weights
+    [R, N] of errors, and which rays pass."""
 
     graph: Graph
     values: Array
@@ -44,14 +45,16 @@ class _Seen:
 
 
 def low_tests(graphs: Sequence[Graph], samples: Sequence[Mapping[str, NDArray[np.float32]]]) -> list[Graph] | None:
-    """Graphs of a lens, in one state or in several, with tests, stop and transmittance of few terms. What stops a ray
-    is not told, nor whether it lies in the domain: it is one that the camera may draw.
+    """Graphs of a lens, in one state or in several, with tests, stop point and transmittance of few terms.
+
+    Their status says whether a ray passes, but no longer which rim stops it. They test no domain, for rays are those
+    that the camera samples.
 
     Args:
         samples: inputs of the rays of a camera, as of `low_orders`.
 
-    Returns None where the lens is no surrogate of a few variables, where its directions are not sure to be of unit
-    length, or where so few terms tell too many rays otherwise.
+    Returns None where the lens is no surrogate of a few variables, where its directions may not be of unit length, or
+    where so few terms change the answer for too many rays.
     """
     number = _shared(graphs[0])
     variables = None if number is None else _variables(graphs[0], number)
@@ -59,7 +62,7 @@ def low_tests(graphs: Sequence[Graph], samples: Sequence[Mapping[str, NDArray[np
         return None
     kept = live_rows(graphs[0], {"scene_ray": graphs[0].outputs["scene_ray"]})[number]
     gates, exponents = _gates(graphs[0], number), _exponents(graphs[0].nodes[variables].rows)
-    seen = [_seen(g, number, variables, gates, exponents, s) for g, s in zip(graphs, samples, strict=True)]
+    seen = [_gate_samples(g, number, variables, gates, exponents, s) for g, s in zip(graphs, samples, strict=True)]
     if any(s is None for s in seen):
         return None
     known = [s for s in seen if s is not None]
@@ -80,7 +83,7 @@ def low_tests(graphs: Sequence[Graph], samples: Sequence[Mapping[str, NDArray[np
     return made
 
 
-def _low_row(seen: Sequence[_Seen], row: int, most: int, good: float) -> tuple[list[Array], bool]:
+def _low_row(seen: Sequence[_GateSamples], row: int, most: int, good: float) -> tuple[list[Array], bool]:
     """Weights [M] of at most so many monomials in each state, and whether they come as near as `good`."""
     columns, wanted = [s.products * s.weights[row] for s in seen], [s.values[row] * s.weights[row] for s in seen]
     chosen, own = pursue(columns, wanted, [good] * len(seen), most)
@@ -92,7 +95,7 @@ def _low_row(seen: Sequence[_Seen], row: int, most: int, good: float) -> tuple[l
 
 
 def _same(found: Truths, wanted: Truths, samples: Mapping[str, NDArray[np.float32]]) -> bool:
-    """Whether tests tell nearly all rays alike, and pass as many in every zone."""
+    """Check that two tests agree on nearly all rays, and pass as many in every zone."""
     order = np.argsort(np.hypot(*samples["rays"][:2]))
     stop = np.broadcast_to(samples["stop_radius_mm"][0], wanted.shape)
     good = np.sum(found != wanted) <= _CHANGED * wanted.sum()
@@ -137,8 +140,8 @@ def _tests(graph: Graph) -> Node:
     return node
 
 
-def _idle(seen: Sequence[_Seen], gates: Mapping[int, int]) -> set[int]:
-    """Rows whose tests stop next to nothing alone."""
+def _idle(seen: Sequence[_GateSamples], gates: Mapping[int, int]) -> set[int]:
+    """Rows whose tests alone stop next to no ray."""
     idle: set[int] = set()
     while left := [g for g in gates if g not in idle]:
         lost = dict.fromkeys(left, 0.0)
@@ -157,10 +160,10 @@ def _exponents(count: int) -> NDArray[np.int64]:
     return np.array([np.bincount(m, minlength=count) if m else np.zeros(count) for m in chosen], np.int64)
 
 
-def _seen(
+def _gate_samples(
     graph: Graph, number: int, variables: int, gates: Collection[int], exponents: NDArray[np.int64],
     samples: Mapping[str, NDArray[np.float32]],
-) -> _Seen | None:  # fmt: skip
+) -> _GateSamples | None:  # fmt: skip
     """None where a direction is not of unit length."""
     wanted = {"values": Value(graph, number), "variables": Value(graph, variables), "ray": graph.outputs["scene_ray"]}
     given = evaluate(pruned(graph, wanted), samples)
@@ -171,7 +174,7 @@ def _seen(
     for g in gates:  # what others stop need not be told exactly
         far = [values[g], *(values[other].clip(0) for other in gates if other != g)]
         weights[g] = np.prod([1 / np.hypot(1, v / _NEAR) for v in far], axis=0)
-    return _Seen(graph, values, np.prod(x ** exponents[:, :, None], axis=1), weights, _passed(graph, samples))
+    return _GateSamples(graph, values, np.prod(x ** exponents[:, :, None], axis=1), weights, _passed(graph, samples))
 
 
 def _passed(graph: Graph, samples: Mapping[str, NDArray[np.float32]]) -> Truths:

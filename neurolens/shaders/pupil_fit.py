@@ -1,8 +1,8 @@
-"""Fits the circles of `pupil_circles` to the rays that pass a lens.
+"""The fit of a shader's pupil to the rays that pass a lens: circles in the stop, or one wide disc.
 
 In points of the stop, whether a ray lies within a rim's circle is linear in the circle's numbers: logistic regression
 separates the rays that pass from those that this rim blocks. Rays that pass weigh more, zone by zone of the film and
-the stop, until few enough of them are lost. Where the stop's image folds, or circles lose too much, `pupil_disc` holds
+the stop, until few enough of them are lost. Where the stop's image folds, or circles lose too much, one disc holds
 them all.
 """
 

@@ -1,7 +1,7 @@
-"""The image of a lens's stop in its pupil, by film point: pupil points as sparse polynomials of points of the stop.
+"""The image of a lens's stop in its exit pupil: pupil points as sparse polynomials of film point and stop point.
 
-Seen from a film point, the pupil of a lens has many shapes, but in points of the stop it is nearly a disc that rims cut
-by other discs. That is easy to sample, and this map takes the samples to the pupil.
+Seen from a film point, a pupil may have many shapes. In coordinates of the stop it is nearly a disc, which the rims cut
+by other discs. Discs are easy to sample, and this map takes the samples to the pupil.
 """
 
 from __future__ import annotations
