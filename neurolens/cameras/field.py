@@ -101,7 +101,7 @@ def frame_of(camera: Any) -> Frame:
 def _measured(camera: Any) -> Frame:
     """The frame of a camera without first-order data: its rays close to the axis meet two planes, in both meridians."""
     height = _SMALL * math.hypot(*camera.film_mm) / 2
-    points = height * np.array([1, 1j, -1, -1j, 2, 2j, -2, -2j])
+    points = np.asarray(height * np.array([1, 1j, -1, -1j, 2, 2j, -2, -2j]), np.complex128)
     near, far, origin = 1000.0, 3000.0, Frame((1.0, 1.0), (0.0, 0.0))
     sizes = []
     for distance in (near, far):  # by the middle of the pupil
@@ -205,7 +205,7 @@ def is_round(camera: Any) -> bool:
     corner = math.hypot(*camera.film_mm) / 2
     angle = np.arange(_AZIMUTHS) * 0.83
     turn = np.exp(1j * np.tile(angle, len(_TRIED)))
-    points = np.repeat(corner * np.array(_TRIED), angle.size) * turn
+    points = np.asarray(np.repeat(corner * np.array(_TRIED), angle.size) * turn, np.complex128)
     traced = traced_light(camera, points, spectrum_of(camera), Frame((1, 1), (0, 0)), "equidistant", math.inf)
     place = (traced.place / turn).reshape(len(_TRIED), -1)
     light = traced.light.reshape(place.shape) > 0
