@@ -80,7 +80,7 @@ def test_stretches_are_the_fewest(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     """A model holds a range of 1 / focus of at most 0.5: greedy stretches are as few as can be."""
     near = [0.2, 0.3, 0.65, 0.7, 0.75, 1.3, 1.85]  # 1 / m
     lens = set_lens(read_lens(LENS))
-    founds: Any = [SimpleNamespace(lens=lens, asked=SimpleNamespace(focus_m=1 / v)) for v in near]
+    founds: Any = [SimpleNamespace(lens=lens, asked=SimpleNamespace(shot=SimpleNamespace(focus_m=1 / v))) for v in near]
 
     def short(some: Any, *_: Any) -> Any:
         reach = [1 / p.asked.shot.focus_m for p in some]
