@@ -176,7 +176,7 @@ class Reopened(Pinhole):
     """Works only where a worker has opened it."""
 
     def for_worker(self) -> Pinhole:
-        return Pinhole(self.focal_mm, self.film_mm)
+        return Pinhole(self.focal_length_mm, self.film_mm)
 
     def sample(self, film_mm: Any, pupil: Any, wavelength_nm: Any) -> CameraRays:
         raise AssertionError("not opened")
