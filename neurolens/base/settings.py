@@ -245,14 +245,17 @@ def from_options(cls: type[T], args: argparse.Namespace, *, unset: bool = False)
     return cls(**values)
 
 
-def changed(settings: Any) -> dict[str, Any]:
-    """The options of settings whose values are not their defaults, by their spelling: {"--f-number": 4.0}."""
+def changed(settings: Any, *, unset: bool = False) -> dict[str, Any]:
+    """The options of settings whose values are not their defaults, by their spelling: {"--f-number": 4.0}.
+
+    `unset`: whether the default of all is None, as of `add_options`.
+    """
     found: dict[str, Any] = {}
     for f in _options(type(settings)):
         value = getattr(settings, f.name)
         if is_dataclass(value):
-            found |= changed(value)
-        elif value != f.default and not f.metadata["option"].positional:
+            found |= changed(value, unset=f.metadata.get("more", {}).get("unset", False))
+        elif value != (None if unset else f.default) and not f.metadata["option"].positional:
             found[_spelling(f, f.metadata["option"])] = value
     return found
 

@@ -250,7 +250,7 @@ def check_card(file: Any, card: Mapping[str, Any]) -> None:
         return
     try:
         _check_states(file, card)
-    except (InputError, KeyError, TypeError, ValueError, ArithmeticError) as error:
+    except (InputError, KeyError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
         raise ModelError(f"{file}: card: states: {type(error).__name__}: {error}") from error
 
 
