@@ -71,7 +71,7 @@ def speed_up(quiet: bool) -> list[Row]:
         for lens in _SURVEYED:
             for k in range(_COPIES):  # another name is another task
                 shutil.copy(lab.LENSES / f"{lens}.toml", folder / "lenses" / f"{lens}-{k}.toml")
-        survey = ("survey", str(folder / "lenses"), "--rays", "4000", "--out")
+        survey = ("survey", str(folder / "lenses"), "--rays", "4000", "-o")
         picture = ("render", str(lab.SCENES / "room.toml"), "--camera", "thin", "--samples", "64", "--width", "384")
         rows = []
         for what, argv, plain in (

@@ -126,8 +126,7 @@ PICTURES = (
             f"neurolens render {_ROAD} --camera fused:lenses/cooke_anamorphic_42.toml --film 24x18 --width 640 "
             "--channels beauty -o OUT/squeezed.exr",
             f"{_ANAMORPHIC} -o OUT/anamorphic.exr",
-            f"{_ANAMORPHIC} --coating multi-layer --gain g13-12=1000 --tint g13-12=0.25/0.5/1 "
-            "-o OUT/anamorphic-blue.exr",
+            f"{_ANAMORPHIC} --coating multi-layer --gain g13-12=250/500/1000 -o OUT/anamorphic-blue.exr",
         ),
         (
             Panel(("squeezed", "anamorphic"), "bare, one stop darker", 2.0, -1.0),

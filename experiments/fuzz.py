@@ -57,7 +57,7 @@ OPTIONS = (
     lab.count("first", 0, "number of the first case (default 0)", 0),
     lab.option("--only", metavar="KIND", default="", help="cases of one kind"),
     lab.option("--keep", metavar="DIR", type=Path, help="folder for the files of cases with a fault"),
-    lab.option("--again", action="store_true", help="do finished batches again"),
+    lab.option("--restart", old=("--again",), action="store_true", help="do finished batches again"),
     lab.out(),
 )
 
@@ -325,7 +325,7 @@ def run(args: argparse.Namespace) -> int:
         for first in range(args.first, wanted.stop, _BATCH):
             cases = range(first, min(first + _BATCH, wanted.stop))
             kept = folder / f"{args.seed}-{first}-{len(cases)}{args.only and '-'}{args.only}.json"
-            if args.again or not kept.exists():
+            if args.restart or not kept.exists():
                 made = run_cases(good, Path(scratch), cases, args.seed, args.only, args.keep)
                 write_json(kept, [asdict(v) for v in made])
             verdicts += [Verdict(**row) for row in json.loads(kept.read_text())]

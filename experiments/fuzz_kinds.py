@@ -27,8 +27,8 @@ from neurolens.cli.arguments import Parser
 SEEDS = Path(__file__).with_name("fuzz_seeds")
 Chance = random.Random
 Words = list[str]
-_SMALL_FLARE = ("--width", "24", "--wavelengths", "2", "--cell", "64", "--threads", "1", "--quiet")
-_FILM = ("--size", "8x6", "--film", "24x18", "--quiet")
+_SMALL_FLARE = ("--width", "24", "--bins", "2", "--cell", "64", "--threads", "1", "--quiet")
+_FILM = ("--width", "8", "--height", "6", "--film", "24x18", "--quiet")
 _PLATE, _PLATE_FILM = (12, 8), "36x24"  # pixels; mm
 
 
@@ -91,7 +91,7 @@ def _of_zoom(chance: Chance, folder: Path) -> Words:
         (
             (4, ("lens", "states.toml", "good.toml")),
             (2, ("lens", "states.toml", "--zoom", "100", "--focus", "2")),
-            (1, ("lens", "states.toml", "--focusing", "internal", "--focus", "1.5")),
+            (1, ("lens", "states.toml", "--focus-mode", "internal", "--focus", "1.5")),
             (2, _render("thick:states.toml", "--zoom", "100")),
         ),
     )
@@ -151,7 +151,7 @@ def _of_model(chance: Chance, folder: Path) -> Words:
             (0.3, ("export", name, "--to", "c", "-o", "out.h", "--json")),
             (0.1, ("stmap", name, *_FILM, "-o", "shot")),
             (0.1, ("view", name, "--downloads", "glsl", "-o", "out.html", "--json")),
-            (0.1, ("blender", "add", name, "--to", "pack.zip", "--quiet")),
+            (0.1, ("blender", "add", name, "--extension", "pack.zip", "--quiet")),
         ),
     )
 
@@ -208,7 +208,7 @@ def _of_lights(chance: Chance, folder: Path) -> Words:
 
 def _of_archive(chance: Chance, folder: Path) -> Words:
     hurt(chance, folder, chance.choice(("pack.zip", "pack.zip", "user/lenses.json")))
-    return ["blender", "add", "model.onnx", "--to", chance.choice(("pack.zip", "user")), "--quiet"]
+    return ["blender", "add", "model.onnx", "--extension", chance.choice(("pack.zip", "user")), "--quiet"]
 
 
 def _of_kept(chance: Chance, folder: Path) -> Words:
@@ -232,8 +232,10 @@ def _of_words(chance: Chance, folder: Path) -> Words:
         ["lens", "lens.toml"], ["glass", "N-BK7"], ["convert", "lens.zmx", "-o", "out.toml"], ["models", "cooke"],
         ["export", "model.onnx", "--to", "c", "-o", "out.h", "--json"], ["analyse", "lens.toml", "seidel"],
         _flare("lens.toml", "--light", "5,3"), ["stmap", "thin", *_FILM, "-o", "shot"],
-        ["projection", "thin", *_FILM, "--model", "opencv"], ["evaluate", "model.onnx", "--rays", "1000", "--quiet"],
-        ["blender", "add", "model.onnx", "--to", "pack.zip", "--quiet"], ["view", "model.onnx", "--downloads", "glsl"],
+        ["projection", "thin", *_FILM, "--projection", "opencv"],
+        ["evaluate", "model.onnx", "--rays", "1000", "--quiet"],
+        ["blender", "add", "model.onnx", "--extension", "pack.zip", "--quiet"],
+        ["view", "model.onnx", "--downloads", "glsl"],
         ["survey", "fold", "--no-fit", "-o", "new", "--quiet"], ["plan", "scene.toml", "--lens", "missing"],
         ["train", "missing.toml"], ["mitsuba", "cornell-box"],
     )  # fmt: skip
@@ -288,7 +290,7 @@ def _of_long_runs(chance: Chance, folder: Path) -> Words:
         "model.onnx": (
             (1, ("evaluate", "model.onnx", "--rays", "1000", "--quiet")),
             (1, ("export", "model.onnx", "--to", "osl", "-o", "out.osl", "--json")),
-            (1, ("projection", "model.onnx", *_FILM, "--model", "f-theta", "-o", "shot")),
+            (1, ("projection", "model.onnx", *_FILM, "--projection", "f-theta", "-o", "shot")),
         ),
         "scene.toml": (
             (1, ("plan", "scene.toml", *lens)),
@@ -297,10 +299,10 @@ def _of_long_runs(chance: Chance, folder: Path) -> Words:
         "lens.toml": (
             (1, ("library", "-o", "new", "lens.toml", "--quiet")),
             (1, ("view", "lens.toml", "--json")),
-            (1, ("projection", "lens.toml", *_FILM, "--model", "opencv", "-o", "shot")),
+            (1, ("projection", "lens.toml", *_FILM, "--projection", "opencv", "-o", "shot")),
         ),
     }
-    train = (1.0, ("train", "experiment.toml", "-o", "run", "--no-race", "--quiet"))
+    train = (1.0, ("train", "experiment.toml", "-o", "run", "--rounds", "0", "--quiet"))
     return _pick(chance, by_file.get(name, (train,)))
 
 
@@ -425,7 +427,7 @@ def make_seeds(folder: Path, kinds: set[str], run: Callable[[Path, Words], tuple
     if "ghosts" in kinds:
         done(["flare", "lens.toml", "--fit", "ghosts.onnx", "--within", "1000um", "--angle", "10", "--quiet"])
     if "long runs" in kinds:
-        done(["train", "experiment.toml", "-o", "run", "--no-race", "--quiet"])
+        done(["train", "experiment.toml", "-o", "run", "--rounds", "0", "--quiet"])
     for made in (*folder.glob("out.*"), *folder.glob("tile*.png")):
         if made.name != "tile.png":
             made.unlink()

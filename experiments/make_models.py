@@ -113,7 +113,7 @@ def read_list(path: str | Path) -> Library:
     """The list of a file, with every lens of its folder as an entry; files lie relative to the list.
 
     Raises:
-        InputError: as `config.read_config`; no such folder of lenses; a file that two entries would write.
+        InputError: as `settings.read_config`; no such folder of lenses; a file that two entries would write.
     """
     library, folder = read_config(Library, path), Path(path).parent
     entries = [replace(e, lens=replace(e.lens, file=folder / e.lens.file)) for e in library.entry]

@@ -1,7 +1,7 @@
 """The distance in pixels of a camera's picture of a scene from that of the exact lens, in two ways that no plan takes.
 
 `by_rays`: footprints as a plan has them, at other places (closer, at random in their cells), other pupil samples, other
-wavelengths, of the camera that `--camera` names. `by_renders`: pieces of the picture, rendered by both cameras with the
+wavelengths, of the camera that `--camera` names. `moved`: pieces of the picture, rendered by both cameras with the
 same random numbers, at the picture's own pixels. What differs in a piece is fitted, in each colour, by what a shift, a
 change of blur and a change of light would make of it, to second order in the size of them:
 

@@ -209,7 +209,7 @@ def _more(
 
 
 def _held(choice: choices.Choice, probed: Probe, state: str | None, exact: Any) -> Camera:
-    """The camera that a plan names; of a model within the outline of the exact lens's pupil, see `choices._model`."""
+    """The camera of a plan; of a model within the outline of the exact lens's pupil, see `candidates._model`."""
     if not choice.camera.endswith(".onnx"):
         return camera_of(choice, probed, state)
     return OnnxCamera(load_model(choice.camera.rpartition(":")[2]), probed.asked.shot, outline=exact.film.outline)

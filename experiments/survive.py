@@ -80,7 +80,7 @@ _RENDER = (
     *("--threads", "2", "--checkpoint-every", "0.02", "--quiet"),
 )
 _MERGE = ("merge", *(f"out.tile-{k}-of-3.exr" for k in (1, 2, 3)), "-o", "out.exr")
-_SURVEY = ("survey", "lenses", "--rays", "1000", "--terms", "16", "--out", "run", "--jobs", "1", "--quiet")
+_SURVEY = ("survey", "lenses", "--rays", "1000", "--terms", "16", "-o", "run", "--jobs", "1", "--quiet")
 _TRAIN = """title = "survive"
 lens = { file = "lens.toml" }
 domain = { focus_m = [inf, inf], wavelength_nm = [400, 700] }
@@ -91,7 +91,7 @@ evaluation = { vignetting_rays = 2000, rounds = 0 }
 CASES = [
     Case("render", _RENDER, _scene, 0.35),
     Case("merge", _MERGE, _tiles, 0.25),
-    Case("train", ("train", "train.toml", "--out", "run", "--quiet"), _experiment, 0.25),
+    Case("train", ("train", "train.toml", "-o", "run", "--quiet"), _experiment, 0.25),
     Case("survey", _SURVEY, _lenses, 0.15),
 ]
 _TIMES = ("started", "seconds", "wall_s", "fit_s", "load_s", "bytes")  # of results and cards

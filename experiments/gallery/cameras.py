@@ -88,13 +88,15 @@ def shot_of(panel: Panel, scene: Scene) -> Shot:
     camera = scene.settings.camera
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NeurolensWarning)  # a lens of one wavelength is what the file asks for
-        lens = set_lens(read_lens(panel.lens), focal_length_mm=panel.efl_mm, field_deg=panel.field_deg, zoom=panel.zoom)
+        lens = set_lens(
+            read_lens(panel.lens), focal_length_mm=panel.focal_length_mm, field_deg=panel.field_deg, zoom=panel.zoom
+        )
     lens = widened(lens, panel.widen)
     shape = make_aperture(StopShape(panel.blades, panel.blade_rotation_deg, panel.blade_curvature, panel.aperture_mask))
     lens = lens.with_aperture(shape or scene.aperture or lens.aperture)
     focus_m = camera.focus_m if panel.focus_m is None else panel.focus_m
     f_number = panel.f_number or camera.f_number or float(first_order(lens).f_number)
-    lens = set_lens(lens, f_number=f_number, focus_m=focus_m, focus_mode=panel.focusing)
+    lens = set_lens(lens, f_number=f_number, focus_m=focus_m, focus_mode=panel.focus_mode)
     assert lens.film_z_mm is not None  # `at` places the film
     film_z = float(lens.film_z_mm) + panel.film_offset_mm
     lens = replace(lens, infinity_mm=())  # groups that have moved to focus stay there

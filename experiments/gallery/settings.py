@@ -10,7 +10,7 @@ from typing import Any, Literal
 from neurolens.base.errors import InputError
 from neurolens.base.settings import from_dict
 from neurolens.base.tomlfile import read_toml, suggestion
-from neurolens.cameras.vignetting import Vignetting
+from neurolens.lens.shot import FocusMode, Vignetting
 from neurolens.surrogates.fit import ModelSettings
 
 COLUMNS = ("exact", "surrogate", "thin")
@@ -23,7 +23,7 @@ class Panel:
     Attributes:
         label: what differs from the other rows.
         lens, scene, model, aperture_mask: files beside the effect's. model: a shipped one; None fits one.
-        efl_mm, field_deg, zoom: see `set_lens`. focusing: how the lens is focused, there called `focus`.
+        focal_length_mm, field_deg, zoom, focus_mode: see `set_lens`.
         widen: factor on all rims but the stop's, where an effect asks for more than the lens lets through; no rim
             comes nearer than 5% to its surface's radius of curvature.
         f_number: None takes the scene's, else the lens's own.
@@ -41,10 +41,10 @@ class Panel:
     label: str
     lens: Path
     scene: Path
-    efl_mm: float | None = None
+    focal_length_mm: float | None = None
     field_deg: float | None = None
     zoom: str | float | None = None
-    focusing: Literal["best", "paraxial", "internal"] = "paraxial"
+    focus_mode: FocusMode = "paraxial"
     widen: float = 1.0
     f_number: float | None = None
     focus_m: float | None = None

@@ -246,15 +246,15 @@ def fit(
     angle = torch.atan2(torch.hypot(ray[:, 0], ray[:, 1]), ray[:, 2])
     widest = float(angle.max())
     if kind in PLANAR and math.degrees(widest) > WIDEST_DEG:
-        expected = f"a field up to {WIDEST_DEG:g} degrees from the axis: --model kannala-brandt, f-theta or table"
-        raise InputError(source, f"--model {kind}", f"({math.degrees(widest):.4g} degrees)", expected)
+        expected = f"a field up to {WIDEST_DEG:g} degrees from the axis: --projection kannala-brandt, f-theta or table"
+        raise InputError(source, f"--projection {kind}", f"({math.degrees(widest):.4g} degrees)", expected)
     if len(goal) < 2 * len(NAMES[kind]) + 2:
         raise InputError(source, "picture", f"({len(goal)} lit points)", "a picture that light reaches")
     round_ = focal_px[0] == focal_px[1]
     start = Projection(kind, size, focal_px, (0.0,) * len(NAMES[kind]), widest)
     if kind == "table":
         if not round_:
-            raise InputError(source, "--model table", "(a lens with cylinders)", "--model two-axis: it has two of them")
+            raise InputError(source, "--projection table", "(a lens with cylinders)", "two-axis: it has two tables")
         return _tabled(start, angle, torch.linalg.vector_norm(goal - torch.tensor(start.centre_px), dim=-1))
     return _adjusted(start, ray, goal, round_)
 

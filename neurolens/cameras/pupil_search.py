@@ -1,4 +1,4 @@
-"""Finding the outline of what passes a lens on its pupil plane, from nothing but whether rays pass.
+"""The search for the outline of what passes a lens on its pupil plane, from nothing but whether rays pass.
 
 The exact tracer and an exported model have the same test, so one search serves both, at any focus and stop.
 All rows of the outline are searched at once, ray by ray from a centre outwards.

@@ -1,4 +1,4 @@
-"""Fitting ghosts: rays of all directions and wavelengths, followed exactly, and polynomials to them."""
+"""The fit of ghosts: rays of all directions and wavelengths, followed exactly, and polynomials to them."""
 
 from __future__ import annotations
 

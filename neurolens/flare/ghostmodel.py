@@ -1,4 +1,4 @@
-"""Fitted ghosts: where light of a direction that enters at a point of the front meets the film, and its power.
+"""Fitted ghosts: where light of a direction that enters at a point of the front meets the film, its power, and files.
 
 The film point of a ghost and its crossings with the rims that stop light are vectors A p + B u, and the power is a
 scalar, with A, B and the power polynomials in rho = p.p, sigma = p.u, tau = u.u and w: the form of the surrogates of

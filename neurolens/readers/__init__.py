@@ -1,1 +1,1 @@
-"""Lens files of other programs, each read by its public format definition; `any_format.read_any` reads all of them."""
+"""Lens files of this project, and by public format definitions of others; `any_format.read_any` reads all of them."""

@@ -3,7 +3,7 @@
 A radius of 0 is a plane, an index of null is air, a last thickness of 0 or null stands for the computed back focus,
 `cyl-x` is a cylinder curved along x. Other statements of the file are checked against its table: focal length and back
 focus, and the object's distance of every focus state. States marked as interpolated by the transcriber are left out
-with a warning. The forms of DeepLens and ISET are read too (`json_others`).
+with a warning. The forms of DeepLens and ISET are read too (`keyed`).
 """
 
 from __future__ import annotations

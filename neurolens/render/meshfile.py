@@ -1,4 +1,4 @@
-"""Reads triangle meshes: OBJ and PLY files, or tables of the scene itself; nothing is merged or repaired.
+"""Triangle meshes of OBJ and PLY files, or of tables of the scene itself; nothing is merged or repaired.
 
 Files are checked so that no vertex and no face is lost silently. Texture coordinates and normals of an OBJ file with
 materials count face by face, of one that has a material of the scene where every face has them. Of the MTL files

@@ -1,4 +1,4 @@
-"""Renders a scene through a camera, with workers, progress, previews, checkpoints and an early end.
+"""The render of a scene through a camera, with workers, progress, previews, checkpoints and an early end.
 
 Workers are forked processes: numpy's short operations leave no time for threads to share the interpreter (two threads
 were slower than one at 8k-element batches, two processes twice as fast). Where the system does not fork, threads do the

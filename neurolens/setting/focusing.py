@@ -1,4 +1,4 @@
-"""Focusing: groups that move inside a lens, the film plane of best focus, and breathing.
+"""Focusing: groups that move inside a lens, and the film plane of best focus.
 
 Internal focusing: the source lists a few states of the groups, between infinity and the nearest, for every zoom
 position. One parameter moves all gaps from state to state linearly (as a focus ring on straight cams would), and is

@@ -1,4 +1,4 @@
-"""Set a lens as a photographer does, in this order: zoom, size, f-number, focus.
+"""A lens set as a photographer does, in this order: zoom, size, f-number, focus.
 
 Between the zoom states of the source, the places of all groups, measured from the film, are interpolated against log
 focal length; then focal length and image are made exact by moving the groups behind the first varying gap (which

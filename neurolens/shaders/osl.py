@@ -1,7 +1,7 @@
 """Cameras as shaders of Blender's Cycles (4.5 and later), in Open Shading Language.
 
 The whole camera is a graph: from a point of the picture and two random numbers to a weighted ray, at any stop and
-focus of the lens. Inputs of the shader (`PARAMETERS`) are numbers when the renderer compiles it, and what depends on
+focus of the lens. Inputs of the shader (`parameters`) are numbers when the renderer compiles it, and what depends on
 them alone costs nothing then. Besides them it reads, of Blender's camera, the sensor's size (with its fit and the
 picture's aspect) and, where `focus_m` is 0, the distance of depth of field; shift moves the point in the picture.
 This distance and the places of the rays are in units of the scene, which are `unit_m` metres long.

@@ -300,7 +300,7 @@ def sag(position: Value, surface: Surface, form: Form) -> Value:
 
 
 def _turned(position: Value, curve: Value, surface: Surface) -> Value:
-    """z of a toroid from that of its curve; see `sag.sag_mm`."""
+    """z of a toroid from that of its curve; see `trace.shapes.sag_mm`."""
     assert surface.across is not None
     c, a2 = 1 / surface.across[0], position.graph.square(position[int(surface.cylinder == "x")])
     way = 1.0 - curve * c

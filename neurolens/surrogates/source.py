@@ -37,7 +37,7 @@ from neurolens.surrogates.card import DOMAIN_SLACK, POLARISED, axes_of, transmit
 from neurolens.surrogates.model import Domain, LensModel, with_one_angle
 
 WRITERS = {"c": write_c, "glsl": write_glsl}
-OSL = "osl"  # of whole cameras: `cameras.osl`
+OSL = "osl"  # of whole cameras: `shaders.osl`
 _WIDTH, _MOST_WAVELENGTHS = 110, 64
 # Keywords of C11, C++20 and GLSL 4.60 and words reserved there, types and functions of GLSL and OSL,
 # names of the code that is written.

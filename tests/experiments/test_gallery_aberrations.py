@@ -117,10 +117,10 @@ def test_rims_and_spokes_are_sharp_where_close_rays_meet() -> None:
 
 def test_the_field_of_a_singlet_is_curved_and_less_so_at_a_longer_focal_length() -> None:
     found = {}
-    for efl_mm in (50.0, 100.0):
-        taken = shot("thorlabs_lb1471_biconvex_50", focus_m=2.0, f_number=8.0, efl_mm=efl_mm, focusing="best",
+    for focal in (50.0, 100.0):
+        taken = shot("thorlabs_lb1471_biconvex_50", focus_m=2.0, f_number=8.0, focal_length_mm=focal, focus_mode="best",
                      options={"x_mm": 15.0, "y_mm": 10.0})  # fmt: skip
-        found[efl_mm] = measured(taken, "edge_blur", ("exact", "thin"))
+        found[focal] = measured(taken, "edge_blur", ("exact", "thin"))
     assert found[50.0]["exact"]["edge_over_middle"] > 2 * found[100.0]["exact"]["edge_over_middle"] > 10
     # The blur is that of a flat film before a curved image: it grows with h^2 / f, over the same f-number.
     assert found[50.0]["exact"]["edge_um"] / found[100.0]["exact"]["edge_um"] == pytest.approx(2, rel=0.15)
@@ -140,7 +140,7 @@ def test_lines_bow_outward_behind_a_singlet_as_its_distortion_says() -> None:
 
 
 def test_lines_bow_inward_in_a_fisheye_and_its_surrogate() -> None:
-    taken = shot("muller_fisheye_100", efl_mm=14, focus_m=2.0, f_number=16.0, model="-14mm.ols-100",
+    taken = shot("muller_fisheye_100", focal_length_mm=14, focus_m=2.0, f_number=16.0, model="-14mm.ols-100",
                  options={"x_mm": 12.0, "y_mm": 8.0})  # fmt: skip
     found = measured(taken, "line_bow", ALL)
     assert found["exact"]["bow_percent"] < -15

@@ -102,7 +102,7 @@ def test_widened_rims_stay_clear_of_the_centre_of_curvature() -> None:
 
 def test_exact_and_surrogate_put_the_film_in_the_same_place_however_it_is_focused() -> None:
     taken = shot(
-        "laikin_double_gauss_50", focus_m=2.0, f_number=4.0, focusing="best", film_offset_mm=0.3, model=".ols-60"
+        "laikin_double_gauss_50", focus_m=2.0, f_number=4.0, focus_mode="best", film_offset_mm=0.3, model=".ols-60"
     )
     surrogate = shipped(taken)
     for make in (exact_camera, surrogate_camera):

@@ -1,4 +1,4 @@
-"""Puts a lens on a camera and takes it off: all that is changed is first written down on the camera and the scene.
+"""A lens put on a camera and taken off it: all that is changed is first written down on the camera and the scene.
 
 The shader's text and its compiled form are kept in the .blend file, and its settings are the custom camera's own
 properties: the file renders where the extension is missing, and keyframes and drivers act on them directly.

@@ -1,1 +1,1 @@
-"""How surrogates are fitted: polynomials, networks, tests of what passes."""
+"""Fits of surrogates: polynomials, networks, tests of what passes."""
