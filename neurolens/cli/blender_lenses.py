@@ -78,7 +78,7 @@ def _kept(file: Path, *more: str | None, make: Callable[[], dict[str, Any]]) -> 
     place = cache_folder() / f"{fingerprint_of([_code(), file.name, sha256_of(file), *more])}.form"
     if (data := read_kept(place)) is None:
         data = make()
-        with suppress(OSError):
+        with suppress(OSError, ValueError):  # ValueError: a number is not finite
             write_kept(place, data)
         keep_newest(place, _KEPT)
     return data

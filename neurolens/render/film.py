@@ -291,7 +291,6 @@ def write_checkpoint(path: Path, film: Film, identity: dict[str, Any], spent: di
     Raises:
         OSError: it cannot be written; an older checkpoint is still there.
         InputError: an identity that no reader would take.
-        NeurolensError: a worker was killed while it wrote to the film.
     """
     tiling, done = film.tiling, list[NDArray[np.int64]]()
 
