@@ -45,7 +45,7 @@ class Build(Reporting):
     called: ClassVar[str] = "neurolens blender build"
 
     out: Path = output_path("OUT.zip", "default: neurolens.zip", Path("neurolens.zip"))
-    models: Path = setting(shipped() / "models", "default: the models that ship", metavar="DIR")
+    models: Path | None = setting(None, "default: the models that ship", metavar="DIR")
     lens: tuple[str, ...] = setting(
         (), "only this lens, repeatable: LENS of LENS.ols-64.onnx or of LENS.toml (default: all)", metavar="LENS"
     )
@@ -60,17 +60,18 @@ class Build(Reporting):
         check_suffix(self.out, "--output", (".zip",))
         check_folder(self.out, "--output")
         check_writable(self.out)
-        if not self.models.is_dir():
-            self.refuse("--models", str(self.models), "a folder of models that exists")
+        folder = self.models or shipped() / "models"  # of the installation as it is now
+        if not folder.is_dir():
+            self.refuse("--models", str(folder), "a folder of models that exists")
         from neurolens.blender.pack import write_pack
         from neurolens.cli.blender_lenses import forms_of, library, packed_of, stated_lens
         from neurolens.readers.any_format import read_any
 
         began, packed = time.perf_counter(), []
-        lens_folder = self.models.parent / "lenses"
-        places = list(library(self.models, lens_folder, self.lens))
+        lens_folder = folder.parent / "lenses"
+        places = list(library(folder, lens_folder, self.lens))
         if not places:
-            self.refuse("--models", str(self.models), "a folder with models (.onnx)")
+            self.refuse("--models", str(folder), "a folder with models (.onnx)")
         exact = [] if self.no_exact else [lens_file for _, lens_file in places if lens_file is not None]
         files = [
             *exact,
@@ -89,7 +90,7 @@ class Build(Reporting):
         for why in left.values():
             warn(f"left out: {why}")
         if not packed:
-            self.refuse("--models", str(self.models), "a folder with a model for a shader")
+            self.refuse("--models", str(folder), "a folder with a model for a shader")
         write_pack(self.out, packed)
         data = {
             "file": str(self.out),
