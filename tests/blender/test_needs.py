@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 
 from neurolens.blender import pack
-from neurolens.setting.states import set_lens
 
 
 def _extension() -> tuple[ModuleType, ModuleType]:
@@ -80,6 +79,7 @@ def test_field_is_that_of_the_lens_and_goes_through_the_zip(tmp_path: Path) -> N
     pytest.importorskip("torch")
     from neurolens.cli.blender_lenses import field_table
     from neurolens.readers.lensfile import read_lens
+    from neurolens.setting.states import set_lens
 
     path = "lenses/cooke_triplet_50.toml"
     once, twice = (
