@@ -130,7 +130,7 @@ def ours(lens: Lens, dtype: str, compiled: bool) -> Callable[[FilmRays], Call]:
 
 
 def passing(lens: Lens, rays: FilmRays) -> FilmRays:
-    """As many rays, all of which pass: those that do, repeated."""
+    """Replace the rays that are blocked by copies of those that pass, so that the count stays the same."""
     with torch.no_grad():
         status = trace(lens, light(lens, rays, torch.float64), glass.LINE_D_NM, towards="film").status
     places = torch.nonzero(status == 0)[:, 0]

@@ -130,7 +130,7 @@ def chosen_rows(names: Sequence[str], quick: bool = False) -> tuple[Row, ...]:
     return tuple(_quick(row) if quick else row for row in picked.values())
 
 
-# Of the networks that take minutes.
+# Steps of training of the networks that would take minutes.
 QUICK_STEPS = {"neurolens2017-128x3": 500, "mlp-32x2": 40}
 
 

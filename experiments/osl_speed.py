@@ -149,11 +149,11 @@ def run(args: argparse.Namespace) -> int:
     }
     texts, operations = _shaders(args.quiet)
     with Progress({"race in Blender": 120.0}, quiet=args.quiet).stage("race in Blender") as report:
-        told = race(python, texts | others, stages, report)
-    rows = [row for name, stage in stages.items() for row in rows_of(name, stage, told["scenes"][name], operations)]
+        results = race(python, texts | others, stages, report)
+    rows = [row for name, stage in stages.items() for row in rows_of(name, stage, results["scenes"][name], operations)]
     met = goals(rows)
-    data = {"machine": lab.machine(), "blender": told["blender"], "rows": rows, "goals": met}
-    print(lab.write_results(args.out, "osl_speed", _page(told["blender"], stages, rows, met), data))
+    data = {"machine": lab.machine(), "blender": results["blender"], "rows": rows, "goals": met}
+    print(lab.write_results(args.out, "osl_speed", _page(results["blender"], stages, rows, met), data))
     return int(any(g.verdict == "missed" for g in met))
 
 
@@ -375,12 +375,18 @@ def run_pictures(args: argparse.Namespace) -> None:
             for text in (None, form.osl):
                 plan.append(planned(shot, form.f_number, text, args.samples, Path(folder)))
         with Progress(quiet=args.quiet).stage("pictures") as report:
-            told = in_blender(python, {"cameras": [], "scenes": {}, "shots": plan}, report)
+            results = in_blender(python, {"cameras": [], "scenes": {}, "shots": plan}, report)
         args.out.mkdir(parents=True, exist_ok=True)
         for shot in shots:
             _write_pair(args.out / f"{shot.name}.jpg", Path(folder), shot)
-    rows, load = [_row(shot, told["shots"]) for shot in shots], os.getloadavg()[0]
-    data = {"machine": lab.machine(), "load": load, "blender": told["blender"], "samples": args.samples, "rows": rows}
+    rows, load = [_row(shot, results["shots"]) for shot in shots], os.getloadavg()[0]
+    data = {
+        "machine": lab.machine(),
+        "load": load,
+        "blender": results["blender"],
+        "samples": args.samples,
+        "rows": rows,
+    }
     print(lab.write_results(args.out, "README", _pictures_page(data, shots), data))
 
 

@@ -288,7 +288,7 @@ def line_blur(view: View) -> dict[str, float]:
 
 
 def edge_blur(view: View) -> dict[str, float]:
-    """RMS radius of the spot in the film's middle and at the film point asked for, and their ratio."""
+    """Measure the RMS radius of the spot on the axis and at a film point, and their ratio."""
     middle, edge = (math.hypot(*_spot(view, *place).widths_um) for place in ((0.0, 0.0), _place(view)))
     return {"middle_um": middle, "edge_um": edge, "edge_over_middle": _ratio(edge, middle)}
 
