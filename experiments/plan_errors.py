@@ -56,12 +56,10 @@ def fresh_places(scene: Scene, exact: Camera, rgb: Array, across: int = 22, seed
     """Places at random in the cells of a grid, `across` along the width, at the centroids of fifths of the range of the
     light, whose picture has this mean colour."""
     shot = scene.settings.camera
-    film = np.array([shot.film_mm])
-    cells = across, max(round(across * film[1] / film[0]), 1)
+    film = np.array(shot.film_mm)[:, None]
+    cells = across, max(round(across * shot.film_mm[1] / shot.film_mm[0]), 1)
     index = np.stack(np.meshgrid(*(np.arange(n) for n in cells))).reshape(2, -1)
-    points = ((index + np.random.default_rng(seed).random(index.shape)) / np.array(cells)[:, None] - 0.5) * film[
-        :, None
-    ]
+    points = ((index + np.random.default_rng(seed).random(index.shape)) / np.array(cells)[:, None] - 0.5) * film
     depth = seen_depths_m(scene, exact, points)
     nm, seen = spectrum_seen(scene, rgb)
     nanometres, share = parts_of(nm, seen, 0, len(nm) - 1, _WAVES if exact.dispersive else 1)
