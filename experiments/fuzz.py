@@ -42,7 +42,7 @@ from neurolens.base.files import atomic_write_text, write_json
 
 __all__ = ["KINDS", "SEEDS", "run_cases"]
 
-CPU_S, LONG_CPU_S, WALL_S, MEMORY = 10.0, 60.0, 300.0, 2 << 30
+CPU_S, LONG_CPU_S, WALL_S, MEMORY = 20.0, 60.0, 300.0, 2 << 30
 _BATCH = 200
 _JUDGES = ("evaluate", "models", "library", "survey", "train")  # their exit code 1 is an answer
 _LOADED = (
