@@ -6,12 +6,13 @@ the graph of their lens inside (`whole_camera`); cameras whose lens is a functio
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 from neurolens.base import status as st
 from neurolens.graph.derive import derivative
-from neurolens.graph.ir import Graph, pruned
+from neurolens.graph.ir import Graph, Value, pruned
 from neurolens.graph.program import FILM_X_Y
 from neurolens.lens.apertures import Aperture
 
@@ -107,14 +108,19 @@ class LensGraph(NamedTuple):
         return None if self.aperture is None or self.aperture.mask is not None else self.aperture
 
 
+def unrounded(status: Value) -> Value:
+    """The status of a lens's graph before it is made an integer, for more tests."""
+    return status.graph.inputs_of(status.number)[0] if status.node.kind == "whole" else status
+
+
 def whole_camera(
-    film: LensFilm, lens: LensGraph, pupil_too: bool = False, mask_too: bool = False
+    film: LensFilm, lens: LensGraph, also: Sequence[str] = (), mask_too: bool = False
 ) -> tuple[Graph, dict[str, float]]:
     """The graph of a camera with the graph of its lens inside, and its numbers of the call.
 
     Inputs: those of `pupil_graph` and `weight_graph`. Outputs: those of `weight_graph`, derivatives of the ray that the
-    lens's graph has, and with `pupil_too` the outputs of `pupil_graph`. A mask in the stop is tested in the graph with
-    `mask_too`; else `stop_xy_mm` is an output, for the caller to test it.
+    lens's graph has, and those of `also`, of the pupil's graph or the lens's. A mask in the stop is tested in the graph
+    with `mask_too`; else `stop_xy_mm` is an output, for the caller to test it.
     """
     aperture = lens.aperture if mask_too else lens.blades
     wanted = {k: v for k, v in lens.graph.outputs.items() if k != "stop_xy_mm" or lens.aperture is not None}
@@ -123,13 +129,9 @@ def whole_camera(
     film_mm, wavelength = g.input("film_mm", 2), g.input("wavelength_nm")
     found = g.inline(pruned(lens.graph, wanted), {"rays": g.concat(film_mm, pupil["pupil_mm"], wavelength)})
     derivatives = tuple(name for name in found if "_by_" in name)
-    status = found["status"]
-    if status.node.kind == "whole":  # the camera's tests take the number before it is made an integer
-        (status,) = g.inputs_of(status.number)
-    given = {"film_mm": film_mm, **pupil, **found, "lens_status": status}
+    given = {"film_mm": film_mm, **pupil, **found, "lens_status": unrounded(found["status"])}
     g.outputs = g.inline(weight_graph(derivatives, aperture, lens.stopped), given)
     if aperture is None and "stop_xy_mm" in found:
         g.outputs["stop_xy_mm"] = found["stop_xy_mm"]
-    if pupil_too:
-        g.outputs |= pupil
+    g.outputs |= {name: value for name, value in (pupil | found).items() if name in also}
     return g, film.outline.numbers | film.numbers | {"stop_radius_mm": lens.stop_radius_mm}

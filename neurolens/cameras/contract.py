@@ -33,6 +33,13 @@ it: their W is w times the film's area for an area square to the ray, so that bo
 has the unit mm^2 / m^2. For points drawn with the density p per m^2, add
 W L cos(theta_P) / (p N a) to the pixel of area a (mm^2) that holds the film point, for each of N points.
 
+Spectra. A path may carry several wavelengths along the scene ray of one of them, the hero (`SpectralCamera`). At the
+others, its companions, a lens that disperses takes the same scene ray from other film points, where their light
+belongs. Lenses keep etendue, so each wavelength would have drawn this ray with nearly the same density: n wavelengths
+that pass share a ray evenly. Each weighs 1 / n of its own T A cos^4(theta) / (Z^2 E0), with the hero's A, theta and Z,
+and a ray that the hero does not pass is left to the wavelengths that do (the balance heuristic of Wilkie et al. 2014
+for wavelengths that can draw the ray).
+
 Status. Every ray has one (`base.status`); what did not pass has weight 0 and finite numbers elsewhere, and so have
 film or scene points that are not finite. A wavelength that is no finite number above 0 is outside every camera's
 domain. Nothing in a ray raises; shapes and domains of settings do, when a camera is
@@ -84,6 +91,21 @@ class CameraRays:
     weight: FloatArray
     status: NDArray[np.int32]
     differentials: RayDifferentials | None = None
+
+
+@dataclass(frozen=True)
+class SpectralRays:
+    """Camera rays that carry several wavelengths; see the module.
+
+    Attributes:
+        rays: of the hero, the first wavelength, with its weight as the only one.
+        weight: [W, N] float32 of each wavelength, 0 where it does not pass.
+        film_mm: [W, 2, N] float32, where their light belongs; on the film where the weight is above 0.
+    """
+
+    rays: CameraRays
+    weight: FloatArray
+    film_mm: FloatArray
 
 
 @dataclass(frozen=True)
@@ -152,6 +174,21 @@ class DifferentialCamera(Camera, Protocol):
 
         For every ray, passed or not; what is left of a weight after division is area and transmittance.
         """
+        ...
+
+
+class SpectralCamera(Camera, Protocol):
+    """The interface of cameras that disperse and know their companions.
+
+    Attributes:
+        companion_reach_mm: bound of how far along x and along y companions lie from their hero on the film; None where
+            the camera does not know them.
+    """
+
+    companion_reach_mm: tuple[float, float] | None
+
+    def sample_spectrum(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SpectralRays:
+        """Rays as of `sample`, for wavelengths [W, N] in nm of which the first is the hero's."""
         ...
 
 

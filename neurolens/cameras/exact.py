@@ -26,12 +26,13 @@ from neurolens.base import status as st
 from neurolens.base.files import atomic_path, cache_folder, fingerprint_of, keep_newest, seal, sealed_bytes, sha256_of
 from neurolens.base.progress import Progress
 from neurolens.cameras.cameragraph import LensGraph
-from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
+from neurolens.cameras.contract import FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
-from neurolens.cameras.lenscamera import LensCamera, LensFilm, Runtime, SceneRays, axial_transmittance
+from neurolens.cameras.lenscamera import GraphRun, Kind, LensCamera, LensFilm, Runtime, SceneRays, axial_transmittance
 from neurolens.cameras.pupil_outline import PupilOutline, wavelength_between
 from neurolens.cameras.pupil_search import COARSE, COARSE_TIGHT, FINE, Detail, PupilTable, outline_of
 from neurolens.cameras.sampling import arrived, lens_state
+from neurolens.graph.interpret import evaluate
 from neurolens.lens.film_plane import PupilBounds
 from neurolens.lens.glass import LINE_D_NM, index_of
 from neurolens.lens.paraxial import chief_reach_mm, first_order
@@ -111,10 +112,19 @@ class ExactCamera(LensCamera):
         }
         self.start(runtime)
 
-    def _sampled(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray, moves: bool) -> CameraRays:
+    def _made(self, kind: Kind) -> GraphRun:
         if self.runtime != "trace":
-            return super()._sampled(film_mm, square, wavelength_nm, moves)
-        return self.film.sample(film_mm, square, wavelength_nm, self._with_differentials if moves else None)
+            return super()._made(kind)
+        if kind == "companion":
+            return self._companion
+        scene = self._with_differentials if kind == "differentials" else None
+        return lambda rays: self.film.outputs(rays["film_mm"], rays["square"], rays["wavelength_nm"][0], scene)
+
+    def _companion(self, rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
+        assert self._shift is not None
+        moved = evaluate(self._shift.graph, rays)["companion"]
+        found = self._scene(moved[:2], moved[2:], rays["companion_nm"][0])
+        return {"companion": moved, "transmittance": found.transmittance[None], "status": found.status[None]}
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """Film points of scene points [3, N] in m, traced through points of the front surface chosen by `pupil`."""

@@ -15,6 +15,7 @@ import ctypes
 import math
 from collections.abc import Callable, Mapping
 from copy import copy
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self
 
@@ -24,7 +25,15 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.cameragraph import D_FILM, LensGraph, weight_graph, whole_camera
-from neurolens.cameras.contract import MANY_RAYS_A_CALL, RAYS_A_CALL, CameraRays, FloatArray, RayDifferentials
+from neurolens.cameras.companions import Shift, companion_graph, fit_shift
+from neurolens.cameras.contract import (
+    MANY_RAYS_A_CALL,
+    RAYS_A_CALL,
+    CameraRays,
+    FloatArray,
+    RayDifferentials,
+    SpectralRays,
+)
 from neurolens.cameras.onnxlens import open_session, run_batches
 from neurolens.cameras.pupil_outline import PupilOutline
 from neurolens.cameras.sampling import is_light, stratified
@@ -85,10 +94,14 @@ class LensFilm:
         self.exposure = 1.0
         self.exposure = self._exposure_on_axis(wavelength_nm)
 
-    def sample(
+    def sample(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """Rays for film points [2, N] in mm, random numbers [2, N] in [0, 1) and wavelengths [N] in nm."""
+        return camera_rays(self.outputs(film_mm, square, wavelength_nm))
+
+    def outputs(
         self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray, scene: SceneFunction | None = None
-    ) -> CameraRays:
-        """Rays for film points [2, N] in mm, random numbers [2, N] in [0, 1) and wavelengths [N] in nm.
+    ) -> dict[str, NDArray[Any]]:
+        """The outputs of the camera's graph, with `pupil_mm` and `transmittance`, for the inputs of `sample`.
 
         `scene` stands in for the lens's own function, for one that gives more (`SceneRays.d_film`).
         """
@@ -101,7 +114,7 @@ class LensFilm:
         whole["status"][:] = st.OUTSIDE_DOMAIN
         for name, part in found.items():
             whole[name][..., some] = part
-        return camera_rays(whole)
+        return whole | {"pupil_mm": pupil}
 
     def _weighted(
         self, scene: SceneFunction, film: FloatArray, pupil: FloatArray, area: FloatArray, wavelength_nm: FloatArray
@@ -113,6 +126,7 @@ class LensFilm:
         given |= {} if out.d_film is None else dict(zip(D_FILM, np.moveaxis(out.d_film, 1, 0), strict=True))
         given |= {name: np.array([[value]], np.float32) for name, value in self.numbers.items()}
         found = evaluate(weight_graph(() if out.d_film is None else D_FILM), given)
+        found["transmittance"] = out.transmittance[None]
         moves = [found.pop(name) for name in D_FILM if name in found]
         return found | ({"d_film": np.stack(moves, 1)} if moves else {})
 
@@ -154,6 +168,8 @@ def camera_rays(found: Mapping[str, NDArray[Any]]) -> CameraRays:
 
 
 Runtime = Literal["onnxruntime", "c", "trace"]
+# What a camera computes: rays, with differentials, with what companions need, or companions (`companion_graph`).
+Kind = Literal["rays", "differentials", "hero", "companion"]
 # Film points, pupil squares [2, N] and wavelengths [1, N] by name to what `camera_rays` takes.
 GraphRun = Callable[[dict[str, FloatArray]], dict[str, NDArray[Any]]]
 
@@ -161,9 +177,6 @@ GraphRun = Callable[[dict[str, FloatArray]], dict[str, NDArray[Any]]]
 # 7100, and its time grows faster than their number.
 MAX_STEPS = 12_000
 _SAMPLES = 4096  # rays that low-order derivatives are fitted to
-_INPUTS = {"film_mm": ("tensor(float)", 2, None), "square": ("tensor(float)", 2, None)}
-_INPUTS |= {"wavelength_nm": ("tensor(float)", 1, None)}
-_OUTPUTS = {"ray": ("tensor(float)", 6, None), "weight": ("tensor(float)", None), "status": ("tensor(int32)", None)}
 
 
 class LensCamera:
@@ -214,38 +227,94 @@ class LensCamera:
 
     def start(self, runtime: Runtime) -> None:
         """Choose what runs the camera; C is compiled at once. Raises InputError: no C compiler, or one that fails."""
-        self.runtime, self._runs = runtime, dict[bool, GraphRun]()
+        self.runtime, self._runs = runtime, dict[Kind, GraphRun]()
         if runtime == "c":
             self.settings = self.settings | {"runtime": "fused"}
-            self._run(False)
+            self._run("rays")
+
+    def sample_spectrum(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SpectralRays:
+        """Rays as of `sample`, for wavelengths [W, N] in nm of which the first is the hero's; see the contract."""
+        assert self.companion_reach_mm is not None
+        light = np.ascontiguousarray(wavelength_nm, np.float32)
+        film, square = self._checked(film_mm, pupil, light[0])
+        hero = self._run("hero")({"film_mm": film, "square": square, "wavelength_nm": light[:1]})
+        rays, pupil = camera_rays(hero), np.ascontiguousarray(hero["pupil_mm"])
+        places, through = (
+            np.repeat(film[None], len(light), axis=0),
+            np.repeat(hero["transmittance"], len(light), axis=0),
+        )
+        passed = np.repeat((rays.weight > 0)[None], len(light), axis=0)
+        reach, edge = (np.array(v, np.float32)[:, None] for v in (self.companion_reach_mm, self.film_mm))
+        for k in range(1, len(light)):
+            given = {"film_mm": film, "pupil_mm": pupil, "wavelength_nm": light[:1], "companion_nm": light[k : k + 1]}
+            found = self._run("companion")(given)
+            places[k], through[k] = found["companion"][:2], found["transmittance"][0]
+            passed[k] &= found["status"][0] == st.PASSED
+            passed[k] &= (np.abs(places[k] - film) <= reach).all(0) & (np.abs(places[k]) < edge / 2).all(0)
+        shared = rays.weight / np.where(passed[0], through[0] * np.maximum(passed.sum(0), 1), 1)
+        return SpectralRays(rays, np.where(passed, np.maximum(through, 0) * shared, np.float32(0)), places)
+
+    @property
+    def companion_reach_mm(self) -> tuple[float, float] | None:
+        """Bound of how far along x and along y companions lie from their hero on the film; None: they are not known."""
+        return self._shift.reach_mm if self._shift else None
 
     def _sampled(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray, moves: bool) -> CameraRays:
-        film, square, wavelength = (np.ascontiguousarray(a, np.float32) for a in (film_mm, square, wavelength_nm))
+        wavelength = np.ascontiguousarray(wavelength_nm, np.float32)
+        film, square = self._checked(film_mm, square, wavelength)
+        run = self._run("differentials" if moves else "rays")
+        return camera_rays(run({"film_mm": film, "square": square, "wavelength_nm": wavelength[None]}))
+
+    @staticmethod
+    def _checked(film_mm: FloatArray, square: FloatArray, wavelength: FloatArray) -> tuple[FloatArray, FloatArray]:
+        film, square = (np.ascontiguousarray(a, np.float32) for a in (film_mm, square))
         count = film.shape[1]
         if film.shape != (2, count) or square.shape != (2, count) or wavelength.shape != (count,):
             raise ValueError(f"film {film.shape}, square {square.shape}, wavelengths {wavelength.shape}")
-        return camera_rays(self._run(moves)({"film_mm": film, "square": square, "wavelength_nm": wavelength[None]}))
+        return film, square
 
-    def _run(self, moves: bool) -> GraphRun:
-        """The camera's graph in its runtime, with differentials or without them, made when it is first needed."""
-        if moves not in self._runs:
-            lens = self.lens_graph(SCALARS if self.runtime == "c" else ONNX)
-            if moves:
-                lens = lens._replace(graph=self._with_moves(lens.graph))
-            self._runs[moves] = _compiled(self.film, lens) if self.runtime == "c" else self._in_onnxruntime(lens)
-        return self._runs[moves]
+    def _run(self, kind: Kind) -> GraphRun:
+        """The camera's graph in its runtime, made when it is first needed."""
+        if kind not in self._runs:
+            self._runs[kind] = self._made(kind)
+        return self._runs[kind]
 
-    def _in_onnxruntime(self, lens: LensGraph) -> GraphRun:
-        whole, numbers = whole_camera(self.film, lens, mask_too=True)
+    def _made(self, kind: Kind) -> GraphRun:
+        lens = self.lens_graph(SCALARS if self.runtime == "c" else ONNX)
+        if kind == "differentials":
+            lens = lens._replace(graph=self._with_moves(lens.graph))
+        mask_too = self.runtime != "c"
+        if kind == "companion":
+            assert self._shift is not None
+            graph, numbers = companion_graph(lens, self._shift.graph, mask_too), self._of_the_lens()
+        else:
+            also = ("pupil_mm", "transmittance") if kind == "hero" else ()
+            graph, numbers = whole_camera(self.film, lens, also, mask_too)
+        made = _compiled(graph, numbers, self.film, lens) if self.runtime == "c" else None
+        return made or self._in_onnxruntime(graph, numbers, lens)
+
+    @cached_property
+    def _shift(self) -> Shift | None:
+        """The shift of companions, fitted once."""
+        samples = {name: values.astype(np.float64) for name, values in self._film_samples().items()}
+        companions = np.random.default_rng(1).permutation(samples["rays"][4])
+        return fit_shift(self.lens_graph().graph, samples, companions)
+
+    def _of_the_lens(self) -> dict[str, float]:
+        """The inputs of the lens's graph for a whole call."""
+        return {"film_z_mm": self.film.film_z_mm, "stop_radius_mm": self.lens_graph().stop_radius_mm}
+
+    def _in_onnxruntime(self, whole: Graph, numbers: dict[str, float], lens: LensGraph) -> GraphRun:
         g, mask = Graph(), lens.aperture and lens.aperture.mask
         constants = {name: g.constant(value) for name, value in numbers.items()}
         constants["outline"] = g.own_table(self.film.outline.table)
         if lens.aperture is not None and mask is not None:
             constants["mask"] = g.own_table(lens.aperture.table)
         g.outputs = g.inline(whole, constants)
-        shapes = _OUTPUTS | {name: ("tensor(float)", 6, None) for name in D_FILM if name in g.outputs}
+        inputs = {n.name: ("tensor(float)", n.rows, None) for n in g.nodes if n.kind == "input"}
+        shapes = {name: _shape(name, value.rows) for name, value in g.outputs.items()}
         path, names = self.path, tuple(shapes)
-        session = open_session(path, write_onnx(g, {}), _INPUTS, shapes)
+        session = open_session(path, write_onnx(g, {}), inputs, shapes)
 
         def run(rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
             done = run_batches(path, session, names, rays, {}, RAYS_A_CALL)
@@ -271,15 +340,19 @@ class LensCamera:
         wavelength = rng.uniform(outline.wavelength_nm[0], outline.wavelength_nm[-1], _SAMPLES).astype(np.float32)
         film, square = film.astype(np.float32), rng.random((2, _SAMPLES), np.float32)
         rays = np.stack([*film, *outline.sample(film, square, wavelength)[0], wavelength])
-        per_call = {"film_z_mm": self.film.film_z_mm, "stop_radius_mm": self.lens_graph().stop_radius_mm}
-        return {"rays": rays} | {name: np.array([[value]], np.float32) for name, value in per_call.items()}
+        return {"rays": rays} | {k: np.array([[value]], np.float32) for k, value in self._of_the_lens().items()}
 
 
-def _compiled(film: LensFilm, lens: LensGraph) -> GraphRun:
-    """The camera's graph as a compiled function; a mask in the stop is tested on the rays that come back."""
+def _shape(name: str, rows: int) -> tuple[str | int | None, ...]:
+    """Type and dimensions of an output in ONNX: those of one row have one dimension."""
+    return ("tensor(int32)" if name == "status" else "tensor(float)", *((rows,) if rows > 1 else ()), None)
+
+
+def _compiled(graph: Graph, numbers: dict[str, float], film: LensFilm, lens: LensGraph) -> GraphRun:
+    """A graph of the camera as a compiled function; a mask in the stop is tested on the rays that come back."""
     table = film.outline.table
     groups = table.reshape(len(table), -1, 5)
-    run = _CompiledGraph(*whole_camera(film, lens), np.pad(groups, ((0, 0), (0, 0), (0, padded_columns(5) - 5))))
+    run = _CompiledGraph(graph, numbers, np.pad(groups, ((0, 0), (0, 0), (0, padded_columns(5) - 5))))
     mask = lens.aperture if lens.blades is None else None
     if mask is None:
         return run
@@ -288,7 +361,9 @@ def _compiled(film: LensFilm, lens: LensGraph) -> GraphRun:
         found = run(rays)
         inside = mask.inside(found["stop_xy_mm"][0], found["stop_xy_mm"][1], lens.stop_radius_mm)
         shut = ~inside & (found["status"][0] == st.PASSED)
-        found["weight"][0, shut], found["status"][0, shut] = 0, lens.stopped
+        found["status"][0, shut] = lens.stopped
+        if "weight" in found:
+            found["weight"][0, shut] = 0
         return found
 
     return masked

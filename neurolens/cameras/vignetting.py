@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.cameras.contract import RAYS_A_CALL, CameraRays, FilmPoints, FloatArray
+from neurolens.cameras.contract import RAYS_A_CALL, CameraRays, FilmPoints, FloatArray, SpectralRays
 from neurolens.cameras.field import Complex, end_of_light, on_rings, turns
 from neurolens.cameras.sampling import common_light, stratified
 from neurolens.lens.shot import Vignetting
@@ -87,6 +87,22 @@ class Vignetted:
         """Sample rays as `sample` does, and give their differentials, too."""
         return self._weighed(self.camera.sample_differentials(film_mm, pupil, wavelength_nm), film_mm)
 
+    def sample_spectrum(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SpectralRays:
+        """The camera's rays of several wavelengths, weighed anew at the film point of each."""
+        found = self.camera.sample_spectrum(film_mm, pupil, wavelength_nm)
+        passed = found.weight > 0
+        factor = np.stack([self._factors(p, film) for p, film in zip(passed, found.film_mm, strict=True)])
+        # Shared by density, which grows as the factor does: evenly, a companion at the end of the light would weigh
+        # anything.
+        share = passed.sum(axis=0) * factor[0] / np.maximum(factor.sum(axis=0), 1e-30)
+        return replace(found, weight=(found.weight * factor * share).astype(np.float32))
+
+    @property
+    def companion_reach_mm(self) -> tuple[float, float] | None:
+        """As of the camera."""
+        reach: tuple[float, float] | None = getattr(self.camera, "companion_reach_mm", None)
+        return reach
+
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """The camera's film points, weighed anew."""
         return self._weighed(found := self.camera.to_film(point_m, pupil, wavelength_nm), found.film_mm)
@@ -99,15 +115,17 @@ class Vignetted:
         return other
 
     def _weighed(self, rays: Any, film_mm: FloatArray) -> Any:
-        """The rays with new weights; 0 where the table is dark."""
+        return replace(rays, weight=(rays.weight * self._factors(rays.weight > 0, film_mm)).astype(np.float32))
+
+    def _factors(self, passed: NDArray[np.bool_], film_mm: FloatArray) -> Array:
+        """Factors of the weights of rays; 0 where none passes or the table is dark."""
         x, y = np.nan_to_num(film_mm.astype(np.float64), posinf=1e9, neginf=-1e9)
         radius = np.hypot(x, y)
         place = 1 - np.sqrt(1 - np.minimum(radius / self._end, 1))  # rings are equal steps of it
         point = (x + 1j * y) / np.where(radius > 0, radius, 1) * place
         value, wanted = (on_rings(table, 1.0, point) for table in (self._cards["both"], self._cards[self.vignetting]))
-        lit = (value > 0) & (rays.weight > 0)
-        factor = np.where(lit, np.maximum(wanted, 0) / np.where(lit, value, 1), 0)
-        return replace(rays, weight=np.where(lit, rays.weight * factor, 0).astype(np.float32))
+        lit = (value > 0) & passed
+        return np.where(lit, np.maximum(wanted, 0) / np.where(lit, value, 1), 0)
 
 
 def _means(camera: Any, light_nm: tuple[float, float], point: Complex, side: int) -> tuple[Array, Array]:

@@ -283,6 +283,8 @@ def write_blocks(program: Program, name: str) -> str:
     groups of the table's columns are padded to `padded_columns`. A table of the program's own is NAME_table, of
     NAME_table_cells.
     """
+    if not any(program.steps[k].kind == "lookup" for k in program.live()):
+        return _block_of_rays(program, name)
     once, rest = program.of_the_call()
     before, lookups, after = rest.around_lookups()
     parts = ((program, ""), (once, "_once"), (before, "_before"), (after, "_after"))
@@ -320,3 +322,18 @@ def write_blocks(program: Program, name: str) -> str:
         text += f"enum {{ {name}_table_cells = {len(own)} }};\n"
         text += _numbers(f"{name}_table", padded.reshape(len(own), -1))
     return text + part("parts.h", "lookup", name=name, macro=last.name.upper()) + loops
+
+
+def _block_of_rays(program: Program, name: str) -> str:
+    """The function of `write_blocks` for a program without lookups, which takes no table."""
+    once, rest = program.of_the_call()
+    parts = ((program, ""), (once, "_once"), (rest, "_each"))
+    whole, same, each = (Signature.of(p, f"{name}{part}") for p, part in parts)
+    places = {row: f"in[{k}]" for k, row in enumerate(whole.per_ray)}
+    places |= {number: f"call[{k}]" for k, number in enumerate(whole.per_call)}
+    known = f"const {same.name}_ray once = {same.name}({', '.join(places[n] for n in same.inputs)});"
+    places |= {number: f"once.{number}" for number in same.outputs}
+    given = [*(places[row] for row in each.inputs), *(f"out[{k}]" for k in range(len(each.outputs))), "status"]
+    text = write_c(once, same.name, ["Of the call."]) if same.outputs else ""
+    text += write_c(rest, each.name, ["Arrays of rays."])
+    return text + part("parts.h", "one_block", name=name, known=known * bool(same.outputs), given=", ".join(given))

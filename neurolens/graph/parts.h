@@ -129,6 +129,16 @@ void ${name}(
         ${name}_after_rays(n, ${last}${out}, status + at);
     }
 }
+//// one_block
+
+void ${name}(
+    size_t count, const float *const *in, const float *call, const float *table, int cells, float *const *out,
+    int *status)
+{
+    ${known}
+    (void)call, (void)table, (void)cells;
+    ${name}_each_rays(count, ${given});
+}
 //// functions
 
 typedef struct {

@@ -15,7 +15,7 @@ import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +45,7 @@ _ASPECT_TOLERANCE = 0.02
 _NO_MATTER = ("model", "notes")
 _NOTHING = "(nothing)"  # a place that one of two identities lacks
 _PROBES, _DIGITS = 1024, 16
-_FORMAT = 3
+_FORMAT = 4
 SPENT = ("seconds", "camera_thread_seconds", "thread_seconds")
 _BRIGHTEST = 1e37  # sum of a pixel, which float32 shall hold after the white balance, too
 _LONGEST = 80  # characters of a value in a message
@@ -85,6 +85,13 @@ class PixelGrid:
         points[0] = (0.5 - across) * self.film_mm[0]
         points[1] = (down - 0.5) * self.film_mm[1]
         return points
+
+    def pixels_at(self, film_mm: FloatArray) -> NDArray[np.intp]:
+        """The pixels [...] that hold film points [..., 2, N] in mm; those at the edge for points beyond it."""
+        across = (0.5 - film_mm[..., 0, :] / np.float32(self.film_mm[0])) * np.float32(self.width)
+        down = (0.5 + film_mm[..., 1, :] / np.float32(self.film_mm[1])) * np.float32(self.height)
+        column, row = (np.clip(v, 0, n - 1).astype(np.intp) for v, n in ((across, self.width), (down, self.height)))
+        return row * self.width + column
 
 
 def check_memory(width: int, height: int, bytes_a_pixel: int = BYTES_A_PIXEL) -> None:
@@ -149,6 +156,17 @@ class Tiling:
             yield first, min(first + tiles, self.tiles)
 
 
+class Spill(NamedTuple):
+    """Light of a pass of a tile that may belong to pixels other than those of its samples.
+
+    Attributes:
+        pixel: [K] numbers in the picture, none twice. sums: [K, 3] float64, of the columns `RGB`.
+    """
+
+    pixel: NDArray[np.intp]
+    sums: NDArray[np.float64]
+
+
 class Film:
     """The sums of the pixels, and which passes are in them; several threads may use one film.
 
@@ -171,8 +189,13 @@ class Film:
         self.done = np.zeros(tiling.tiles, np.int64)
         self.seconds = np.zeros(2)
         self._lock = threading.Lock()
-        self._early: dict[tuple[int, int], NDArray[np.float64]] = {}
-        self._missing = self._all_missing()
+        self._early: dict[tuple[int, int], tuple[NDArray[np.float64], Spill | None]] = {}
+        self.begin()
+
+    def begin(self) -> None:
+        """Give out all tiles and passes that are not in the sums, and expect them in this order."""
+        self._missing, self._order = self._all_missing(), self._all_missing()
+        self._next = next(self._order, None)
 
     def _all_missing(self) -> Iterator[tuple[int, int]]:
         for part in range(self.tiling.passes):
@@ -190,17 +213,27 @@ class Film:
         with self._lock:
             self._missing = iter(())
 
-    def add(self, tile: int, part: int, sums: NDArray[np.float64], seconds: NDArray[np.float64]) -> None:
-        """Add the sums [pixels, COLUMNS] of a pass of a tile, and the seconds [2] that it took.
+    def add(
+        self, tile: int, part: int, sums: NDArray[np.float64], spill: Spill | None, seconds: NDArray[np.float64]
+    ) -> None:
+        """Add the sums [pixels, COLUMNS] of a pass of a tile, its spill, and the seconds [2] that it took.
 
-        A pass waits here for those before it: sums are always added in the same order, and so round the same.
+        A tile waits here for all before it: sums are always added in the same order, and so round the same.
         """
         with self._lock:
             self.seconds += seconds
-            self._early[tile, part] = sums
-            while (ready := self._early.pop((tile, int(self.done[tile])), None)) is not None:
-                self.sums[self.tiling.pixels_of(tile)] += ready
-                self.done[tile] += 1
+            self._early[tile, part] = sums, spill
+            while self._next is not None and self._next in self._early:
+                self._put(self._next[0], *self._early.pop(self._next))
+                self._next = next(self._order, None)
+
+    def _put(self, tile: int, sums: NDArray[np.float64], spill: Spill | None) -> None:
+        self.sums[self.tiling.pixels_of(tile)] += sums
+        self.done[tile] += 1
+        if spill is not None:
+            here = spill.pixel - self.tiling.start
+            inside = (here >= 0) & (here < len(self.sums))
+            self.sums[here[inside], RGB] += spill.sums[inside]
 
     def copy(self, first: int, stop: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Sums [n, COLUMNS] of the pixels, and passes, of the tiles from `first` up to `stop`, of one moment."""
@@ -333,6 +366,7 @@ def read_checkpoint(path: Path, film: Film, identity: dict[str, Any]) -> dict[st
                 if not (columns.min() >= -most and columns.max() <= most):
                     raise ValueError("impossible sums")
             film.done[:] = done
+            film.begin()
             return {name: float(value) for name, value in about["spent"].items()}
     except InputError as error:
         if "--restart" in error.expected:

@@ -35,7 +35,7 @@ class Paths:
         bins: [N] wavelength bin, of the hero.
         slot: [N] place in the batch.
         density: [N] per solid angle with which the ray's direction was chosen.
-        alone: [N] whether the other lanes have left the hero, bent another way.
+        shared: [N] number of wavelengths that share the path; 1 once glass has bent the hero away from the others.
     """
 
     origin: FloatArray
@@ -44,13 +44,13 @@ class Paths:
     bins: Index
     slot: Index
     density: FloatArray
-    alone: NDArray[np.bool_]
+    shared: FloatArray
 
     def take(self, rows: Index) -> Paths:
         """Some of the paths."""
         vectors = (self.origin.take(rows, axis=1), self.direction.take(rows, axis=1))
         throughput, bins, slot = self.throughput.take(rows, axis=-1), self.bins.take(rows), self.slot.take(rows)
-        return Paths(*vectors, throughput, bins, slot, self.density.take(rows), self.alone.take(rows))
+        return Paths(*vectors, throughput, bins, slot, self.density.take(rows), self.shared.take(rows))
 
 
 def lit(value: FloatArray | NDArray[np.bool_]) -> Index:
@@ -184,7 +184,7 @@ def scatter(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int) -> Pat
         # Interpolated normals can send a ray through the surface: it ends there.
         leaving = dot(direction, vertex.facing)
         paths.throughput *= (leaving if side is None else leaving * side) > 0
-    return Paths(vertex.start(side), direction, paths.throughput, paths.bins, paths.slot, density, paths.alone)
+    return Paths(vertex.start(side), direction, paths.throughput, paths.bins, paths.slot, density, paths.shared)
 
 
 def _scatter_rough(vertex: Vertex, sampler: Sampler, keys: PathKeys, first: int, direction: FloatArray) -> FloatArray:
@@ -214,18 +214,18 @@ def _scatter_glass(
     g, index = vertex.glass, vertex.index()
     choice = sampler.draw(keys.cut(g.start, g.stop), first + dims.LOBE)
     travel, normal, outside = vertex.paths.direction[:, g], vertex.shading[:, g], vertex.outside[g]
-    alone = vertex.paths.alone[g]
+    shared = vertex.paths.shared[g]
+    alone = shared == 1
     cosine = np.clip(-dot(travel, normal), 0, 1)
     reflectance, _ = fresnel_dielectric(cosine, np.where(outside, index, 1 / index))
     chance = np.where(alone, reflectance[0], reflectance.mean(axis=0))
     direction[:, g], refracts = glass_direction(travel, normal, outside, index[0], choice, chance)
     factor = np.where(refracts, (1 - reflectance) / (1 - chance), reflectance / chance)
     part = refracts & ~alone & (index != index[0]).any(axis=0)
-    factor[0] *= np.where(part, np.float32(len(index)), np.float32(1))
-    alone |= part
-    factor[1:] = np.where(alone, np.float32(0), factor[1:])
+    factor[0] *= np.where(part, shared, np.float32(1))
+    factor[1:] = np.where(alone | part, np.float32(0), factor[1:])
     vertex.paths.throughput[:, g] *= factor
-    vertex.paths.alone[g] = alone
+    vertex.paths.shared[g] = np.where(part, np.float32(1), shared)
     return refracts
 
 
@@ -244,6 +244,7 @@ def trace(
     *,
     aim: bool = True,
     first_distance: FloatArray | None = None,
+    shared: FloatArray | None = None,
 ) -> FloatArray:
     """Weight times radiance [lanes, N] that arrives along camera rays, of the wavelengths of each path.
 
@@ -254,11 +255,13 @@ def trace(
         aim: sample lights directly; without it the mean is the same, found by scattering alone.
         first_distance: [N], where to write the distance in m to what camera rays hit first, inf for nothing; paths of
             weight 0 are left out.
+        shared: [N] number of wavelengths that share a path; left out, all lanes do.
     """
     radiance = np.zeros(weight.shape, np.float32)
     count = weight.shape[-1]
-    density, alone = np.full(count, SPECULAR), np.zeros(count, np.bool_)
-    paths = Paths(origin, direction, weight, bins, np.arange(count), density, alone).take(lit(weight))
+    density, together = np.full(count, SPECULAR), np.full(count, len(weight), np.float32)
+    shared = together if shared is None else shared
+    paths = Paths(origin, direction, weight, bins, np.arange(count), density, shared).take(lit(weight))
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         for depth in range(max_depth + 1):
             if not paths.slot.size:
@@ -330,8 +333,7 @@ def _arrive(world: World, paths: Paths, surface: Index, point: FloatArray, dista
 
 def _roulette(paths: Paths, sample: FloatArray) -> None:
     """End faint paths by chance; those that go on carry the light of those that end."""
-    lanes = np.float32(len(paths.throughput))
-    brightest = paths.throughput.max(axis=0) * np.where(paths.alone, np.float32(1), lanes)
+    brightest = paths.throughput.max(axis=0) * paths.shared
     survival = np.clip(brightest, np.float32(0.05), np.float32(1))
     paths.throughput /= survival
     paths.throughput *= sample < survival

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,22 +16,32 @@ from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FloatArr
 from neurolens.render import film as columns
 from neurolens.render.colour import SRGB, FloatArray64, Index, SpectralRange, Spectrum, balance, converted, illuminant
 from neurolens.render.environment import sun_spectrum, total_spectrum
-from neurolens.render.film import Film, PixelGrid, Tiling
+from neurolens.render.film import Film, PixelGrid, Spill, Tiling
 from neurolens.render.integrator import lit, trace
 from neurolens.render.sampler import FILM, PUPIL, WAVELENGTH, Sampler, centres
 from neurolens.render.scene import CameraSettings, Scene
 from neurolens.render.scenetables import Vector
-from neurolens.render.settings import FilmSettings, WavelengthMode
+from neurolens.render.settings import FilmSettings
 from neurolens.render.world import world_of
 
-WeightedRays = tuple[FloatArray, FloatArray, FloatArray]  # origin, direction [3, N] and weight ([lanes,] N)
+Seconds = NDArray[np.float64]
 # Of a sample's luminance; sums of colours up to a million times as bright stay within float32.
 _BRIGHTEST_SAMPLE = 1e30
-LANES = 4  # wavelengths of a hero path, and paths that share their random numbers
+LANES = 4  # wavelengths of a hero path
 _FINE = 1024  # wavelengths at which the light of a scene is summed
 _PROBES, _PROBED_WAVELENGTHS = 1024, 5
 _LITTLE_PX = 0.05  # pixels; a smaller shift is hidden by the pixel filter, a box one pixel wide
 _FARTHEST_M = 1e4
+
+
+class LensRays(NamedTuple):
+    """Camera rays in the scene: origin, direction [3, N], weight [lanes, N], and film points `places` [lanes, 2, N] of
+    wavelengths that have their own."""
+
+    origin: FloatArray
+    direction: FloatArray
+    weight: FloatArray
+    places: FloatArray | None = None
 
 
 def camera_axes(settings: CameraSettings) -> FloatArray:
@@ -47,11 +58,12 @@ class Job:
 
     Attributes:
         scene, camera, grid, seed, max_depth, settings: as requested; settings are those of the film.
-        mode: how wavelengths are taken. balance: matrix [3, 3] on the film's linear sRGB that makes the light of the
-            white balance neutral; where there is none, `neutral`. luminance_row: [3], of the film's sRGB after that.
+        mode: "one" wavelength a path, "hero" for several that share film points, or "companions" with their own.
+        balance: matrix [3, 3] on the film's linear sRGB that makes the light of the white balance neutral; where there
+            is none, `neutral`. luminance_row: [3], of the film's sRGB after that.
         rows: first row and the one after the last, of the part of the picture that is rendered; own: its pixels among
             those of the tiles, which may begin before it and end after it.
-        paths_a_sample: lanes of a sample; film: see `Film`.
+        film: see `Film`.
     """
 
     def __init__(
@@ -69,7 +81,7 @@ class Job:
         self.seed, self.max_depth, self.settings = seed, max_depth, settings
         pose = scene.settings.camera
         self.mode = mode_for(camera, grid, pose.wavelength_nm, settings)
-        self.spectral = spectral_range(scene, camera, settings, LANES if self.mode == "hero" else 1)
+        self.spectral = spectral_range(scene, camera, settings, 1 if self.mode == "one" else LANES)
         self.world = world_of(scene, self.spectral)
         white = settings.white_balance if self.spectral.colours else None
         self.neutral, self.balance = white is None, np.eye(3)
@@ -78,15 +90,25 @@ class Job:
         self._response = self.spectral.rotated(self.spectral.response)  # [lanes, 3, bins]
         self.luminance_row = SRGB.to_xyz[1] @ self.balance
         self._luminance = np.einsum("c,lcb->lb", self.luminance_row, self._response).astype(np.float32)
+        self._basis = self.spectral.rotated(self.spectral.basis)[1:].astype(np.float32)
         self.sampler = Sampler(samples, seed)
         self._axes, self._position = camera_axes(pose), np.array(pose.position_m, np.float32)
-        # Paths of one sample: four lanes share their random numbers, and are independent of the others only together.
-        self.paths_a_sample = LANES if self.mode == "lanes" else 1
         self.rows = rows or (0, grid.height)
         first, stop = (row * grid.width for row in self.rows)
-        self.tiling = Tiling.of(grid.width * grid.height, samples).around(first, stop)
+        near = self._reach()  # companions of samples so near arrive in the job's rows
+        tiling = Tiling.of(grid.width * grid.height, samples)
+        self.tiling = tiling.around(max(first - near, 0), min(stop + near, tiling.pixels))
         self.own = slice(first - self.tiling.start, stop - self.tiling.start)
         self.film = Film(self.tiling)
+
+    def _reach(self) -> int:
+        """How many pixels apart, row by row, a companion's pixel lies from its hero's at most."""
+        if self.mode != "companions":
+            return 0
+        reach_mm = self.camera.companion_reach_mm  # type: ignore[attr-defined]
+        sides = zip(reach_mm, (self.grid.width, self.grid.height), self.grid.film_mm, strict=True)
+        columns, rows = (math.ceil(reach * count / length) + 1 for reach, count, length in sides)
+        return rows * self.grid.width + columns
 
     def picture_settings(self) -> dict[str, Any]:
         """The settings besides scene and camera that decide the picture, for its metadata and its checkpoint."""
@@ -95,54 +117,97 @@ class Job:
         size = {"width": self.grid.width, "height": self.grid.height}
         return {**size, "seed": self.seed, "max_depth": self.max_depth, **settings}
 
-    def render_tile(self, camera: Camera, tile: int, part: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Sums [pixels, columns] of one pass of one tile, and the seconds [2] spent in the camera, and in all."""
+    def render_tile(self, camera: Camera, tile: int, part: int) -> tuple[NDArray[np.float64], Spill | None, Seconds]:
+        """Sums [pixels, columns] of one pass of one tile, what belongs to other pixels, and the seconds [2] spent in
+        the camera, and in all."""
         began = time.perf_counter()
         within = self.tiling.pixels_of(tile)
         step = self.tiling.step
         pixels = np.arange(within.start, within.stop) + self.tiling.start
         indices = np.arange(part * step, min((part + 1) * step, self.tiling.samples))
         pixel, sample = np.repeat(pixels, len(indices)), np.tile(indices, len(pixels))
-        keys = self.sampler.keys(pixel, sample // self.paths_a_sample)
+        keys = self.sampler.keys(pixel, sample)
         hue = self.sampler.draw(keys, WAVELENGTH)
-        if self.paths_a_sample > 1:
-            hue = _turned(hue, (sample % self.paths_a_sample / self.paths_a_sample).astype(np.float32))
         film_mm = self.grid.film_points(pixel, self.sampler.draw2(keys, FILM))
         pupil = self.sampler.draw2(keys, PUPIL)
 
         called = time.perf_counter()
-        origin, direction, weight = self._hero_rays(camera, film_mm, pupil, hue)
+        lens = self._hero_rays(camera, film_mm, pupil, hue)
         answered = time.perf_counter()
 
         bins, distance = self.spectral.bin_of(hue), np.full(len(hue), np.inf, np.float32)
-        rays = origin, direction, weight, bins
-        value = trace(self.world, self.sampler, keys, *rays, self.max_depth, first_distance=distance)
-        shape = (len(pixels), len(indices))
+        rays, shared = (lens.origin, lens.direction, lens.weight, bins), None
+        if lens.places is not None:
+            shared = np.count_nonzero(lens.weight, axis=0).astype(np.float32)
+        value = trace(self.world, self.sampler, keys, *rays, self.max_depth, first_distance=distance, shared=shared)
         sums = np.empty((len(pixels), columns.COLUMNS))
-        self._sum_light(sums, value, bins, shape)
-        self._sum_depth(sums, origin, direction, distance)
+        spill = self._sum_light(sums, value, bins, pixel, lens)
+        self._sum_depth(sums, lens.origin, lens.direction, distance)
         passed = np.zeros(len(hue), np.bool_)
-        passed[lit(weight)] = True
-        sums[:, columns.PASSED] = np.count_nonzero(passed.reshape(shape), axis=1)
-        return sums, np.array([answered - called, time.perf_counter() - began])
+        passed[lit(lens.weight)] = True
+        sums[:, columns.PASSED] = np.count_nonzero(passed.reshape(len(pixels), -1), axis=1)
+        return sums, spill, np.array([answered - called, time.perf_counter() - began])
 
-    def _sum_light(self, sums: NDArray[np.float64], value: FloatArray, bins: Index, shape: tuple[int, int]) -> None:
-        """Colour, and the squared luminance of each sample, whose paths are together.
+    def _sum_light(
+        self, sums: NDArray[np.float64], value: FloatArray, bins: Index, pixel: Index, lens: LensRays
+    ) -> Spill | None:
+        """Colour, and the squared luminance of each sample; and the light of companions, of any pixel.
 
         Paths whose light is not finite, or beyond any sum, are counted and add nothing: one would spoil its pixel and
         with it the whole file.
         """
-        luminance = np.einsum("ln,ln->n", self._luminance.take(bins, axis=-1), value)
-        dropped = ~(np.abs(luminance) <= _BRIGHTEST_SAMPLE)
+        response, factors = (t.take(bins, axis=-1) for t in (self._response, self._luminance))
+        dropped = ~(np.abs(np.einsum("ln,ln->n", factors, value)) <= _BRIGHTEST_SAMPLE)
         if dropped.any():
-            value, luminance = np.where(dropped, np.float32(0), value), np.where(dropped, np.float32(0), luminance)
+            value = np.where(dropped, np.float32(0), value)
+        shape = (len(sums), len(bins) // len(sums))
         sums[:, columns.DROPPED] = np.count_nonzero(dropped.reshape(shape), axis=1)
-        luminance = luminance.reshape(shape)
-        colour = self._response.take(bins, axis=-1).reshape(len(value), 3, *shape)
-        sums[:, columns.RGB] = np.einsum("lcps,lps->pc", colour, value.reshape(len(value), *shape))
-        if self.paths_a_sample > 1:
-            luminance = np.add.reduceat(luminance, np.arange(0, shape[1], self.paths_a_sample), axis=1)
+        luminance = np.einsum("ln,ln->n", factors, value).reshape(shape)
         sums[:, columns.LUMINANCE2] = np.einsum("ps,ps->p", luminance, luminance, dtype=np.float64)
+        response *= value[:, None]
+        own = response if lens.places is None else response[:1]
+        sums[:, columns.RGB] = np.einsum("lcps->pc", own.reshape(len(own), 3, *shape))
+        return None if lens.places is None else self._spill(response, bins, pixel, lens, shape)
+
+    def _spill(self, light: FloatArray, bins: Index, pixel: Index, lens: LensRays, shape: tuple[int, int]) -> Spill:
+        """The light [lanes, 3, N] of the companions, where they arrive.
+
+        How many companions cross the edge of a pixel is a matter of chance: noise that thin lenses do not have. Their
+        light is therefore that of what the other samples of the hero's pixel lead to expect (a control variate), and
+        the rest of it. The rest goes to the pixel of the film point; what was expected is parted between the pixels as
+        it would be on average over places in the hero's pixel, which does not change the mean.
+        """
+        assert lens.places is not None
+        width, height = self.grid.width, self.grid.height
+        target = self.grid.pixels_at(lens.places[1:])
+        per_mm = np.array([[-width / self.grid.film_mm[0]], [height / self.grid.film_mm[1]]], np.float32)
+        moved = (lens.places[1:] - lens.places[0]) * per_mm
+        whole = np.floor(moved)
+        part = moved - whole
+        row, column = np.divmod(pixel, width)
+        column, row = column + whole[:, 0].astype(np.intp), row + whole[:, 1].astype(np.intp)
+        inside = (column >= 0) & (column + 1 < width) & (row >= 0) & (row + 1 < height)
+        expected = self._expected(light, bins, lens.weight, shape)
+        expected *= inside[:, None]
+        first = np.where(inside, row * width + column, target)
+        places, parts = [target], [light[1:] - expected]
+        for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            share = (part[:, 0] if across else 1 - part[:, 0]) * (part[:, 1] if down else 1 - part[:, 1])
+            places.append(first + (down * width + across) * inside)
+            parts.append(expected * share[:, None])
+        return _gathered(np.stack(places), np.stack(parts))
+
+    def _expected(self, light: FloatArray, bins: Index, weight: FloatArray, shape: tuple[int, int]) -> FloatArray:
+        """Light [lanes - 1, 3, N] of the companions as the mean of the other samples of their pixel lets expect."""
+        pixels, samples = shape
+        if samples == 1:
+            return np.zeros_like(light[1:])
+        colour = light.sum(axis=0).reshape(3, pixels, samples)
+        others = (colour.sum(axis=2, keepdims=True) - colour) / np.float32(samples - 1)
+        open_share = weight.sum(axis=0).reshape(pixels, samples).mean(axis=1, keepdims=True)
+        others /= np.where(open_share > 0, open_share, np.float32(1))
+        radiance = np.einsum("lcn,cn->ln", self._basis.take(bins, axis=-1), others.reshape(3, -1))
+        return self._response[1:].take(bins, axis=-1) * (radiance * weight[1:])[:, None]
 
     def _sum_depth(
         self, sums: NDArray[np.float64], origin: FloatArray, direction: FloatArray, distance: FloatArray
@@ -157,35 +222,42 @@ class Job:
         sums[:, columns.DEPTH] = np.where(hit, depth, np.float32(0)).reshape(shape).sum(axis=1, dtype=np.float64)
         sums[:, columns.HITS] = np.count_nonzero(hit.reshape(shape), axis=1)
 
-    def _hero_rays(self, camera: Camera, film_mm: FloatArray, pupil: FloatArray, hue: FloatArray) -> WeightedRays:
+    def _hero_rays(self, camera: Camera, film_mm: FloatArray, pupil: FloatArray, hue: FloatArray) -> LensRays:
         """Rays of the hero wavelengths, with the weights of all lanes."""
-        origin, direction, hero = self._camera_rays(camera, film_mm, pupil, self._camera_wavelengths(hue))
         lanes = self.spectral.lanes
-        weight = np.repeat(hero[None], lanes, axis=0)
+        nm = np.stack([self._camera_wavelengths(_turned(hue, np.float32(k / lanes))) for k in range(lanes)])
+        if self.mode == "companions":
+            return self._camera_rays(camera, film_mm, pupil, nm)
+        hero = self._camera_rays(camera, film_mm, pupil, nm[:1])
+        weight = np.repeat(hero.weight, lanes, axis=0)
         if camera.dispersive or not getattr(camera, "achromatic", False):
             for lane in range(1, lanes):
-                wavelength_nm = self._camera_wavelengths(_turned(hue, np.float32(lane / lanes)))
-                weight[lane] = self._camera_rays(camera, film_mm, pupil, wavelength_nm)[2]
-            weight *= hero > 0  # the hero's ray must exist
+                weight[lane] = self._camera_rays(camera, film_mm, pupil, nm[lane : lane + 1]).weight
+            weight *= hero.weight > 0  # the hero's ray must exist
         weight /= lanes
-        return origin, direction, weight
+        return hero._replace(weight=weight)
 
     def _camera_rays(
         self, camera: Camera, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray
-    ) -> WeightedRays:
-        """Rays in the scene; their weight is 0 where they do not pass."""
-        count = len(wavelength_nm)
+    ) -> LensRays:
+        """Rays in the scene for wavelengths [lanes, N]; their weight is 0 where they do not pass."""
+        lanes, count = wavelength_nm.shape
         origin, direction = np.empty((3, count), np.float32), np.empty((3, count), np.float32)
-        weight = np.empty(count, np.float32)
+        weight = np.empty((lanes, count), np.float32)
+        places = np.empty((lanes, 2, count), np.float32) if lanes > 1 else None
         at_once = getattr(self.camera, "rays_a_call", RAYS_A_CALL)
         for start in range(0, count, at_once):
             part = slice(start, start + at_once)
-            inputs = (film_mm[:, part], pupil[:, part], wavelength_nm[part])
-            rays = camera.sample(*(np.ascontiguousarray(x) for x in inputs))
+            film, square, nm = (np.ascontiguousarray(x[:, part]) for x in (film_mm, pupil, wavelength_nm))
+            if places is None:
+                rays = camera.sample(film, square, nm[0])
+                weight[0, part] = np.where(rays.status == 0, rays.weight, np.float32(0))
+            else:
+                found = camera.sample_spectrum(film, square, nm)  # type: ignore[attr-defined]
+                rays, weight[:, part], places[..., part] = found.rays, found.weight, found.film_mm
             np.add(self._axes @ rays.origin_m, self._position[:, None], out=origin[:, part])
             np.matmul(self._axes, rays.direction, out=direction[:, part])
-            weight[part] = np.where(rays.status == 0, rays.weight, np.float32(0))
-        return origin, direction, weight
+        return LensRays(origin, direction, weight, places)
 
     def _camera_wavelengths(self, hue: FloatArray) -> FloatArray:
         """Wavelengths for the camera, clipped to its range if it does not disperse."""
@@ -194,6 +266,15 @@ class Job:
         if accepted is not None:
             np.clip(wavelengths, accepted[0], accepted[1], out=wavelengths)
         return wavelengths
+
+
+def _gathered(pixel: Index, light: FloatArray) -> Spill:
+    """The sums of light [M, lanes, 3, N] by pixels [M, lanes, N]."""
+    first = int(pixel.min(initial=0)) if pixel.size else 0
+    here = (pixel - first).reshape(-1)
+    sums = [np.bincount(here, weights=light[:, :, channel].reshape(-1)) for channel in range(3)]
+    rows = np.flatnonzero(np.bincount(here))
+    return Spill(first + rows, np.stack(sums, axis=1)[rows])
 
 
 def _turned(hue: FloatArray, by: FloatArray | np.float32) -> FloatArray:
@@ -219,7 +300,7 @@ class Layers:
         samples, depth, blocked: see `MEANING`; what is in focus is at depth `focus_m`.
         variance: of the pixel's luminance (of linear sRGB after the white balance), estimated from its samples as if
             they were independent: the sample variance over their number. That of low-discrepancy samples is lower.
-            Infinite below two samples. With wavelength lanes four paths count as one sample.
+            Infinite below two samples.
     """
 
     samples: FloatArray
@@ -250,11 +331,9 @@ def develop(job: Job) -> tuple[FloatArray, Layers]:
 def _layers(job: Job, sums: NDArray[np.float64], samples: NDArray[np.int64]) -> FloatArray:
     """Samples, variance, depth and blocked share [4, n]; what float32 does not hold is infinite."""
     total = converted(sums[:, columns.RGB], job.luminance_row[None])[:, 0]
-    groups = -(-samples // job.paths_a_sample)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        # Of the sum over independent samples, then of the mean over paths.
-        spread = np.maximum(sums[:, columns.LUMINANCE2] - total**2 / groups, 0) * groups / (groups - 1)
-        variance = np.where(groups > 1, spread / samples.astype(np.float64) ** 2, np.inf)
+        spread = np.maximum(sums[:, columns.LUMINANCE2] - total**2 / samples, 0) / (samples - 1)
+        variance = np.where(samples > 1, spread / samples, np.inf)
         depth = np.where(sums[:, columns.HITS] > 0, sums[:, columns.DEPTH] / sums[:, columns.HITS], np.inf)
         blocked = np.where(samples > 0, 1 - sums[:, columns.PASSED] / samples, 0.0)
         return np.stack([samples, variance, depth, blocked]).astype(np.float32)
@@ -317,18 +396,22 @@ def _lamps(scene: Scene) -> Iterator[tuple[str, Vector, float]]:
         yield spot.illuminant, spot.intensity, 2 * (1 - float(np.cos(middle)))
 
 
-def mode_for(camera: Camera, grid: PixelGrid, limits_nm: tuple[float, float], film: FilmSettings) -> WavelengthMode:
-    """The mode that "auto" selects for a camera: "hero" where one ray serves all wavelengths, else "one".
+def mode_for(
+    camera: Camera, grid: PixelGrid, limits_nm: tuple[float, float], film: FilmSettings
+) -> Literal["one", "hero", "companions"]:
+    """How paths carry wavelengths: see `Job`.
 
-    InputError: "hero" is asked for and the camera disperses.
+    InputError: "hero" is asked for and the camera disperses without knowing its companions.
     """
-    if film.wavelengths in ("one", "lanes"):
-        return film.wavelengths
+    if film.wavelengths == "one":
+        return "one"
     shift = dispersion_px(camera, grid, limits_nm) if camera.dispersive else 0.0
     if shift <= _LITTLE_PX:
         return "hero"
+    if getattr(camera, "companion_reach_mm", None) is not None:
+        return "companions"
     if film.wavelengths == "hero":
-        expected = f"one or lanes: camera {camera.name} moves its picture by {shift:.2g} pixels with the wavelength"
+        expected = f"one: camera {camera.name} moves its picture by {shift:.2g} pixels with the wavelength"
         raise InputError("render", "film.wavelengths", "hero", expected)
     return "one"
 

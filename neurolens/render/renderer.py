@@ -43,7 +43,7 @@ from neurolens.render.scene import Scene
 from neurolens.render.settings import FilmSettings
 
 Progress = Callable[[float, float], None]
-RenderTile = Callable[[int, int], tuple[Any, Any]]  # tile and pass to what `Job.render_tile` returns
+RenderTile = Callable[[int, int], tuple[Any, ...]]  # tile and pass to what `Job.render_tile` returns
 _FORKS = sys.platform.startswith("linux")
 _POLL_S, _POLL_PARENT_S, _PATIENCE_S = 0.05, 0.5, 5.0
 # Previews and checkpoints wait so many times as long as the last one took: they cost a twentieth of one core at most.
@@ -246,7 +246,8 @@ def render(
 def _stats(job: Job, seconds: float) -> dict[str, Any]:
     tiling = job.tiling
     began = tiling.tile * np.arange(tiling.tiles)
-    pixels = np.minimum(began + tiling.tile, job.own.stop) - np.maximum(began, job.own.start)  # of the job's rows
+    ends = np.minimum(began + tiling.tile, job.own.stop)
+    pixels = np.maximum(ends - np.maximum(began, job.own.start), 0)  # of the job's rows
     paths = int(np.sum(pixels * tiling.samples_done(job.film.done)))
     sums = job.film.sums[job.own]
     camera_s, thread_s = (float(s) for s in job.film.seconds)
@@ -317,7 +318,7 @@ def _renderer(job: Job) -> RenderTile:
     opener = getattr(job.camera, "for_worker", None)
     camera = opener() if opener else job.camera
 
-    def render(tile: int, part: int) -> tuple[Any, Any]:
+    def render(tile: int, part: int) -> tuple[Any, ...]:
         try:
             return job.render_tile(camera, tile, part)
         except Exception as error:
@@ -336,7 +337,7 @@ class _Forked:
         self._process.start()
         there.close()
 
-    def render(self, tile: int, part: int) -> tuple[Any, Any]:
+    def render(self, tile: int, part: int) -> tuple[Any, ...]:
         """Have a tile rendered.
 
         Raises:

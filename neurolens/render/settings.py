@@ -10,7 +10,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.settings import check_bounds, setting
 
 ColourSpaceName = Literal["sRGB", "ACEScg"]
-WavelengthMode = Literal["auto", "one", "hero", "lanes"]
+WavelengthMode = Literal["auto", "one", "hero"]
 WavelengthSampling = Literal["importance", "uniform"]
 
 
@@ -21,9 +21,8 @@ class FilmSettings:
     Attributes:
         colour_space: of the EXR, linear: "sRGB" (Rec. 709 primaries, D65) or "ACEScg" (AP1, the white of ACES).
         white_balance: illuminant that becomes neutral, named as those of lights are; None leaves D65 neutral.
-        wavelengths: of a path: "one"; "hero", four that share the path (Wilkie et al. 2014); "lanes", four paths one
-            after the other that share all random numbers, a quarter of the wavelengths apart; "auto", hero where the
-            camera's rays do not depend on the wavelength (by more than a twentieth of a pixel), else one.
+        wavelengths: of a path: "one"; "hero", four that share the path (Wilkie et al. 2014), each with its own film
+            point where the camera disperses; "auto", hero where the camera can, else one.
         wavelength_sampling: "importance", by the film's response times the light of the scene, or "uniform".
     """
 
@@ -33,8 +32,7 @@ class FilmSettings:
     )
     wavelengths: WavelengthMode = setting(
         "auto",
-        "of a path: one; hero, four that share it; lanes, four paths that share their random numbers; auto, hero where "
-        "the camera does not disperse",
+        "of a path: one; hero, four that share it; auto, hero where the camera can",
         option="wavelength-mode",
         old=("wavelengths",),
     )

@@ -224,7 +224,7 @@ def camera_program(film: LensFilm, lens: LensGraph, derivatives: bool = False, o
         raise InputError("export", "aperture", "(a picture)", "a round stop or one with blades")
     if derivatives:
         lens = lens._replace(graph=with_film_derivatives(lens.graph))
-    graph, numbers = whole_camera(film, lens, pupil_too=True)
+    graph, numbers = whole_camera(film, lens, ("pupil_mm", "area_mm2"))
     program = lower(graph, numbers)
     if own_table:
         program.own_tables["outline"] = film.outline.table.astype(np.float64)

@@ -46,7 +46,7 @@ def small_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("small_tiles")
-@pytest.mark.parametrize(("first", "then", "mode"), [(1, 2, "auto"), (2, 1, "lanes"), (2, 3, "one")])
+@pytest.mark.parametrize(("first", "then", "mode"), [(1, 2, "auto"), (2, 1, "hero"), (2, 3, "one")])
 def test_what_a_failed_render_had_goes_on_to_the_same_picture(first: int, then: int, mode: Any, tmp_path: Path) -> None:
     part, camera = tmp_path / "a.exr.part", Failing(50.0, 2.0, 3.0, FILM)
     options: dict[str, Any] = SIZE | {"samples": 40, "film": FilmSettings(wavelengths=mode)}
@@ -170,7 +170,7 @@ class Spoilt(ThinLens):
         return replace(rays, weight=weight.astype(np.float32))
 
 
-@pytest.mark.parametrize("mode", ["one", "hero", "lanes"])
+@pytest.mark.parametrize("mode", ["one", "hero"])
 def test_samples_that_are_not_finite_are_dropped_counted_and_remembered(mode: Any, tmp_path: Path) -> None:
     part, camera = tmp_path / "a.exr.part", Spoilt(50.0, 2.0, 3.0, FILM)
     film = FilmSettings(wavelengths=mode)

@@ -19,11 +19,13 @@ from neurolens.render.tiles import rows_of, tile_path
 
 FARM = Path(__file__).parents[2] / "experiments" / "farm"
 Render = Callable[..., Path]
-# Other kinds of picture: 16 bits and another space, the white balance, lanes, colour alone; 17 samples are two passes.
+MODEL = str(Path(__file__).parents[2] / "models" / "laikin_double_gauss_50.ols-60.onnx")
+# Other kinds of picture: 16 bits and another space, the white balance, light that crosses the edges of tiles, colour
+# alone; 17 samples are two passes.
 KINDS = {
     "plain": (),
     "ACEScg, half": ("--half", "--colour-space", "ACEScg", "--white-balance", "A"),
-    "lanes": ("--wavelength-mode", "lanes", "--samples", "17"),
+    "companions": ("--camera", MODEL, "--samples", "17"),
     "colour alone": ("--channels", "beauty"),
 }
 
@@ -32,6 +34,7 @@ KINDS = {
 def render(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Render:
     """Renders to a name; batches are so small that tiles end within them."""
     monkeypatch.setattr("neurolens.render.film.BATCH", 177)
+    monkeypatch.setattr("neurolens.render.job._LITTLE_PX", 0.0)  # pictures so small show no dispersion
     monkeypatch.chdir(tmp_path)
 
     def run(name: str, *options: object) -> Path:
