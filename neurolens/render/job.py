@@ -274,7 +274,7 @@ def _gathered(pixel: Index, light: FloatArray) -> Spill:
     here = (pixel - first).reshape(-1)
     sums = [np.bincount(here, weights=light[:, :, channel].reshape(-1)) for channel in range(3)]
     rows = np.flatnonzero(np.bincount(here))
-    return Spill(first + rows, np.stack(sums, axis=1)[rows])
+    return Spill(first + rows, np.stack(sums, axis=1, dtype=np.float64)[rows])
 
 
 def _turned(hue: FloatArray, by: FloatArray | np.float32) -> FloatArray:
