@@ -9,8 +9,10 @@ This distance and the places of the rays are in units of the scene, which are `u
 Of a lens in several states (zoom, internal focus) every number of the camera follows the state, mixed from cameras at
 the nodes of its axes as a model's numbers are: the zoom is an input, internal focus the distance in focus.
 
-One of the two random numbers tells the wavelength by its low bits, which leaves both as even as they were. Its colour
-weights are Bernstein's polynomials of second order: never negative, of mean 1 each.
+Cycles gives two random numbers, which are most even in their high bits. Those of the first choose one of sixteen parts
+of the spectrum, its lowest bits the wavelength within, and what lies between is a number for the pupil: so every
+sixteen samples of a pixel hold every part of the spectrum once. The colour weights of a wavelength are Bernstein's
+polynomials of second order: never negative, of mean 1 each.
 """
 
 from __future__ import annotations
@@ -48,7 +50,8 @@ from neurolens.surrogates.axes import STATE, Axis, product, state_graph, state_n
 Array = NDArray[np.float64]
 OUTPUTS = ("position", "direction", "throughput", "dPdx", "dPdy", "dDdx", "dDdy")
 _FAR_M = 1e-4  # Blender's focus distance below this means that depth of field is off
-_LOW_BITS = 4096.0  # of a random number: what lies below 1 / 4096 of it
+# Parts of the spectrum that a random number's high bits choose; the low bits of what is left are below 1 / 4096 of it.
+_PARTS, _LOW_BITS = 16.0, 4096.0
 _NEARLY, _EDGES = 0.99, 0.75  # of rays beyond this share of the stop's radius: their places at the stop are known
 _LEAST = 1.7e-3  # of the stop's radius, by which blades are widened; no other number of a graph, which would share it
 _QUADRATURE = 64  # points a side of the exposure on the axis
@@ -214,9 +217,9 @@ def osl_graph(camera: OslCamera) -> Graph:
     """The camera as a graph. Inputs are floats of `_FRAME` and the parameters, outputs `OUTPUTS` [3] each."""
     g = Graph()
     call = _Call(g, camera)
-    square = g.concat(g.input("first"), g.input("second"))
     film = (0.5 - g.concat(g.input("raster_x"), g.input("raster_y"))) * call.sensor
-    nanometres, colour = _light(camera, square[0], call.number("in_colour"))
+    nanometres, colour, first = _light(camera, g.input("first"), call.number("in_colour"))
+    square = g.concat(first, g.input("second"))
     per_call = {"film_z_mm": call.film_z, "stop_radius_mm": call.stop}
     sampler = camera.pupil.sampler(Blades, camera.margin)
     pupil = g.inline(sampler, {"film_mm": film, "square": square, "wavelength_nm": nanometres, **per_call})
@@ -304,17 +307,20 @@ def _film_position(camera: OslCamera) -> tuple[float, float]:
     return (low + high) / 2, max((high - low) / 2, 1e-6)
 
 
-def _light(camera: OslCamera, random: Value, in_colour: Value) -> tuple[Value, Value]:
-    """Wavelength and colour weights [3] of a ray, red to blue."""
+def _light(camera: OslCamera, random: Value, in_colour: Value) -> tuple[Value, Value, Value]:
+    """Wavelength and colour weights [3] of a ray, red to blue, and the random number that is left for its pupil."""
     g, (short, long) = random.graph, camera.lens.wavelength_nm
-    fine = random * _LOW_BITS
-    part = fine - fine.floor()
+    many = random * _PARTS
+    cell = many.floor()
+    left = many - cell
+    fine = left * _LOW_BITS
+    part = (cell + fine - fine.floor()) * (1 / _PARTS)
     rest = 1.0 - part
     grey = in_colour <= 0.5
     reference = min(max(LINE_D_NM, short), long)
     nanometres = g.select(grey, reference, part * (short - long) + long)
     colour = g.concat(rest * rest * 3.0, part * rest * 6.0, part * part * 3.0)
-    return nanometres, g.select(grey, 1.0, colour)
+    return nanometres, g.select(grey, 1.0, colour), g.select(grey, random, left)
 
 
 def _samples(lens: ShaderLens, pupil: PupilCircles | PupilDisc, count: int = 32768) -> dict[str, NDArray[np.float32]]:

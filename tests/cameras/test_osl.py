@@ -428,14 +428,32 @@ def lens_ray(film: np.ndarray, pupil: np.ndarray) -> np.ndarray:
     return evaluate(written().lens.graph, {"rays": rays, **call})["scene_ray"][3:]
 
 
-def test_colour_weights_are_white_and_never_negative() -> None:
+def light_of(random: np.ndarray, in_colour: float = 1.0) -> dict[str, np.ndarray]:
     g = Graph()
-    _, g.outputs["colour"] = osl._light(written(), g.input("first"), g.input("in_colour", per_call=True))
-    low_bits = (np.arange(1 << 20) + 0.5)[None] / (1 << 20)
-    colour = evaluate(g, {"first": low_bits, "in_colour": np.ones((1, 1))})["colour"]
+    found = osl._light(written(), g.input("first"), g.input("in_colour", per_call=True))
+    g.outputs = dict(zip(("nanometres", "colour", "left"), found, strict=True))
+    return evaluate(g, {"first": random[None], "in_colour": np.array([[in_colour]])})
+
+
+def test_colour_weights_are_white_and_never_negative() -> None:
+    colour = light_of((np.arange(1 << 20) + 0.5) / (1 << 20))["colour"]
     assert colour.min() >= 0
     np.testing.assert_allclose(colour.mean(1), 1, atol=1e-3)
-    np.testing.assert_allclose(colour[:, :256].mean(1), 1, atol=0.01)  # all over the spectrum within 1 / 4096
+
+
+@pytest.mark.parametrize("scrambled", range(3))
+def test_sixteen_even_numbers_hold_every_part_of_the_spectrum_and_leave_even_numbers(scrambled: int) -> None:
+    random = np.random.default_rng(scrambled)
+    even = (np.arange(1 << 16) + random.random(1 << 16)) / (1 << 16)
+    few = (random.permutation(16) + random.random(16)) / 16
+    nanometres = light_of(few)["nanometres"][0]
+    cells = np.floor((nanometres - 400) / 300 * 16)
+    assert sorted(cells) == list(range(16))
+    found = light_of(even)
+    np.testing.assert_allclose(np.histogram(found["left"], 64, (0, 1))[0], 1024, atol=1)
+    # The pupil's number tells nothing about the wavelength.
+    assert abs(np.corrcoef(found["left"][0], found["nanometres"][0])[0, 1]) < 0.01
+    assert np.array_equal(light_of(even, 0.0)["left"][0], even)  # without dispersion all bits are the pupil's
 
 
 def test_nothing_beyond_the_domain_unless_a_warning_is_asked_for() -> None:
