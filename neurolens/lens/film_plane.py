@@ -41,6 +41,7 @@ def film_z_mm(
         raise InputError(file, "focus_m", focus_m, "a distance in m above 0, or inf")
     if math.isinf(focus_m):
         return rear_principal_z_mm + efl_mm
+    efl_mm, focus_m = float(efl_mm), float(focus_m)  # numbers of numpy would warn of overflow
     separation = rear_principal_z_mm - front_principal_z_mm
     d = 1000.0 * focus_m - separation
     lengths = (1 + math.sqrt(ratio)) ** 2

@@ -170,7 +170,7 @@ def parameters(lens: OslLens) -> list[Parameter]:
         Parameter("exposure", "Exposure", "As Blender's camera, or as the lens: its stop and what glass and focus take",
                   0, widget="mapper", options="Blender:0|Lens:1"),
         Parameter("vignetting", "Vignetting", "Darkening towards the corners", 1, widget="boolean"),
-        Parameter("dispersion", "Dispersion", "Colours go their own ways", 1, widget="boolean"),
+        Parameter("dispersion", "Dispersion", "Colours part; off, pixels have less noise", 1, widget="boolean"),
         Parameter("origin", "Origin", "What stands where Blender's camera stands, and distances are measured from",
                   1, widget="mapper", options="Film:0|Entrance pupil:1"),
         Parameter("unit_m", "Metres per Unit", "Length of a unit of the scene, its Unit Scale", 1.0, 1e-6, 1e6),

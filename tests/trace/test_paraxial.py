@@ -1,13 +1,16 @@
 """First-order data against formulas of text books and against exact rays near the axis."""
 
 import math
+import warnings
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from shipped import NAMES, tabled
 
 from neurolens.base.errors import InputError
+from neurolens.lens import film_plane
 from neurolens.lens.paraxial import film_z_mm, first_order, stop_radius_mm
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.setting.states import set_lens
@@ -171,3 +174,11 @@ def test_wavelength_shifts_the_focus() -> None:
     lens = Lens("singlet", "", rows, 4.0)
     blue, red = (first_order(lens, w).efl_mm for w in (486.1327, 656.2725))
     assert red - blue == pytest.approx(first_order(lens).efl_mm / 64.17, rel=0.01)
+
+
+@pytest.mark.parametrize("focal_mm", [1e200, 1e308])
+def test_wild_numbers_of_a_card_place_a_film_without_warnings(focal_mm: float) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        film = film_plane.film_z_mm(np.float64(focal_mm), 0.0, 0.0, np.float64(1e306))
+    assert not math.isfinite(film) or film >= focal_mm
