@@ -189,13 +189,15 @@ class Job:
         inside = (column >= 0) & (column + 1 < width) & (row >= 0) & (row + 1 < height)
         expected = self._expected(light, bins, lens.weight, shape)
         expected *= inside[:, None]
-        first = np.where(inside, row * width + column, target)
-        places, parts = [target], [light[1:] - expected]
-        for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        near = np.where(inside, row * width + column, target)
+        places = np.empty((5, *target.shape), np.intp)
+        sums = np.empty((3, *places.shape))  # as `bincount` takes them
+        places[0], sums[:, 0] = target, (light[1:] - expected).swapaxes(0, 1)
+        for k, (down, across) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1)), 1):
             share = (part[:, 0] if across else 1 - part[:, 0]) * (part[:, 1] if down else 1 - part[:, 1])
-            places.append(first + (down * width + across) * inside)
-            parts.append(expected * share[:, None])
-        return _gathered(np.stack(places), np.stack(parts))
+            np.add(near, (down * width + across) * inside, out=places[k])
+            np.multiply(expected.swapaxes(0, 1), share, out=sums[:, k])
+        return _gathered(places.reshape(-1), sums.reshape(3, -1))
 
     def _expected(self, light: FloatArray, bins: Index, weight: FloatArray, shape: tuple[int, int]) -> FloatArray:
         """Light [lanes - 1, 3, N] of the companions as the mean of the other samples of their pixel lets expect."""
@@ -268,13 +270,13 @@ class Job:
         return wavelengths
 
 
-def _gathered(pixel: Index, light: FloatArray) -> Spill:
-    """The sums of light [M, lanes, 3, N] by pixels [M, lanes, N]."""
+def _gathered(pixel: Index, light: FloatArray64) -> Spill:
+    """The sums of light [3, N] by pixels [N]."""
     first = int(pixel.min(initial=0)) if pixel.size else 0
-    here = (pixel - first).reshape(-1)
-    sums = [np.bincount(here, weights=light[:, :, channel].reshape(-1)) for channel in range(3)]
-    rows = np.flatnonzero(np.bincount(here))
-    return Spill(first + rows, np.stack(sums, axis=1, dtype=np.float64)[rows])
+    pixel = pixel - first
+    red, green, blue = (np.bincount(pixel, weights=channel) for channel in light)
+    rows = np.flatnonzero((red != 0) | (green != 0) | (blue != 0))
+    return Spill(first + rows, np.stack([red[rows], green[rows], blue[rows]], axis=1, dtype=np.float64))
 
 
 def _turned(hue: FloatArray, by: FloatArray | np.float32) -> FloatArray:
