@@ -136,6 +136,7 @@ class Camera(Protocol):
         wavelength_nm: range of wavelengths accepted, None for any.
         dispersive: whether rays depend on the wavelength.
         achromatic: optional, true where neither rays nor weights depend on the wavelength.
+        costly: optional, true where a ray costs more than most paths: they carry one wavelength, unless asked for more.
         rays_a_call: optional, how many rays at once suit it best; `RAYS_A_CALL` where it says nothing.
         settings: JSON-able description (focal length, f-number, focus, model card), kept in the picture's metadata.
     """

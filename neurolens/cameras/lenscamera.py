@@ -203,6 +203,11 @@ class LensCamera:
         raise NotImplementedError
 
     @property
+    def costly(self) -> bool:
+        """Whether a ray costs more than most paths, as traced by torch."""
+        return self.runtime == "trace"
+
+    @property
     def rays_a_call(self) -> int:
         """The rays with which a call is fastest."""
         return MANY_RAYS_A_CALL if self.runtime == "c" else RAYS_A_CALL

@@ -410,9 +410,10 @@ def mode_for(
     shift = dispersion_px(camera, grid, limits_nm) if camera.dispersive else 0.0
     if shift <= _LITTLE_PX:
         return "hero"
-    if getattr(camera, "companion_reach_mm", None) is not None:
+    asked = film.wavelengths == "hero"
+    if (asked or not getattr(camera, "costly", False)) and getattr(camera, "companion_reach_mm", None) is not None:
         return "companions"
-    if film.wavelengths == "hero":
+    if asked:
         expected = f"one: camera {camera.name} moves its picture by {shift:.2g} pixels with the wavelength"
         raise InputError("render", "film.wavelengths", "hero", expected)
     return "one"

@@ -16,6 +16,8 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
+from neurolens.render.film import PixelGrid
+from neurolens.render.job import mode_for
 from neurolens.render.renderer import RenderResult, Watch, render
 from neurolens.render.settings import FilmSettings
 from neurolens.trace.rays import Rays, trace
@@ -30,6 +32,7 @@ LENSES: dict[str, tuple[tuple[float, float], float]] = {
     "cooke_anamorphic_42": ((20.6, 17.3), 2.4),
 }
 LARGE: dict[str, Any] = {"width": 180, "height": 120, "threads": 1}
+WAYS: tuple[Any, ...] = ("auto", "one", "hero")
 NARROW = {"sodium": {"spectrum": [[380, 0.0], [580, 0.0], [589, 1.0], [598, 0.0], [780, 0.0]]}}
 
 
@@ -91,6 +94,16 @@ def test_wavelengths_share_a_ray_and_the_hero_must_pass() -> None:
     assert weight[0] * passed.sum(axis=0) == pytest.approx(alone, rel=1e-5)
     # Transmittance alone parts those that pass.
     assert np.ptp(np.where(passed, weight, weight[:1]), axis=0).max() < 0.1 * weight.max()
+
+
+def test_lenses_traced_by_torch_carry_one_wavelength_unless_asked_for_more() -> None:
+    grid = PixelGrid(720, 480, FILM)
+    traced, model = lens_camera("laikin_double_gauss_50"), model_camera()
+    modes = {
+        (c, w): mode_for(c, grid, (400.0, 700.0), FilmSettings(wavelengths=w)) for c in (traced, model) for w in WAYS
+    }
+    assert [modes[traced, w] for w in WAYS] == ["one", "one", "companions"]
+    assert [modes[model, w] for w in WAYS] == ["companions", "one", "companions"]
 
 
 def blocks(picture: np.ndarray) -> np.ndarray:
