@@ -108,6 +108,19 @@ class LensGraph(NamedTuple):
         return None if self.aperture is None or self.aperture.mask is not None else self.aperture
 
 
+def lens_inside(g: Graph, lens: LensGraph, rays: Value, mask_too: bool) -> tuple[dict[str, Value], Aperture | None]:
+    """The outputs of a lens's graph for rays [5] of another graph, and the shape of the stop for that graph to test.
+
+    Where the caller is to test a mask, `stop_xy_mm` is an output of the graph.
+    """
+    aperture = lens.aperture if mask_too else lens.blades
+    wanted = {k: v for k, v in lens.graph.outputs.items() if k != "stop_xy_mm" or lens.aperture is not None}
+    found = g.inline(pruned(lens.graph, wanted), {"rays": rays})
+    if aperture is None and "stop_xy_mm" in found:
+        g.outputs["stop_xy_mm"] = found["stop_xy_mm"]
+    return found, aperture
+
+
 def unrounded(status: Value) -> Value:
     """The status of a lens's graph before it is made an integer, for more tests."""
     return status.graph.inputs_of(status.number)[0] if status.node.kind == "whole" else status
@@ -122,16 +135,12 @@ def whole_camera(
     lens's graph has, and those of `also`, of the pupil's graph or the lens's. A mask in the stop is tested in the graph
     with `mask_too`; else `stop_xy_mm` is an output, for the caller to test it.
     """
-    aperture = lens.aperture if mask_too else lens.blades
-    wanted = {k: v for k, v in lens.graph.outputs.items() if k != "stop_xy_mm" or lens.aperture is not None}
     g = Graph()
     pupil = g.inline(film.outline.graph, {})
     film_mm, wavelength = g.input("film_mm", 2), g.input("wavelength_nm")
-    found = g.inline(pruned(lens.graph, wanted), {"rays": g.concat(film_mm, pupil["pupil_mm"], wavelength)})
+    found, aperture = lens_inside(g, lens, g.concat(film_mm, pupil["pupil_mm"], wavelength), mask_too)
     derivatives = tuple(name for name in found if "_by_" in name)
     given = {"film_mm": film_mm, **pupil, **found, "lens_status": unrounded(found["status"])}
-    g.outputs = g.inline(weight_graph(derivatives, aperture, lens.stopped), given)
-    if aperture is None and "stop_xy_mm" in found:
-        g.outputs["stop_xy_mm"] = found["stop_xy_mm"]
+    g.outputs |= g.inline(weight_graph(derivatives, aperture, lens.stopped), given)
     g.outputs |= {name: value for name, value in (pupil | found).items() if name in also}
     return g, film.outline.numbers | film.numbers | {"stop_radius_mm": lens.stop_radius_mm}

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
-from neurolens.cameras.cameragraph import LensGraph, status_graph, unrounded
+from neurolens.cameras.cameragraph import LensGraph, lens_inside, status_graph, unrounded
 from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph, Value, pruned
+from neurolens.graph.ir import Graph, Value
 from neurolens.graph.program import RAY
 
 Array = NDArray[np.float64]
@@ -96,16 +96,12 @@ def companion_graph(lens: LensGraph, shift: Graph, mask_too: bool) -> Graph:
     Inputs: those of `Shift.graph`, and those of the lens for a whole call; with `mask_too` the table of a mask.
     Outputs: `companion` [4], `transmittance`, `status`; without `mask_too` also `stop_xy_mm` of a lens with a mask.
     """
-    aperture = lens.aperture if mask_too else lens.blades
     g = Graph()
     moved = g.inline(shift, {})["companion"]
-    wanted = {k: v for k, v in lens.graph.outputs.items() if k != "stop_xy_mm" or lens.aperture is not None}
-    found = g.inline(pruned(lens.graph, wanted), {"rays": g.concat(moved, g.input("companion_nm"))})
+    found, aperture = lens_inside(g, lens, g.concat(moved, g.input("companion_nm")), mask_too)
     given = {**found, "lens_status": unrounded(found["status"])}
-    g.outputs = {"companion": moved, "transmittance": found["transmittance"]}
-    g.outputs |= {"status": g.inline(status_graph(aperture, lens.stopped), given)["status"].whole()}
-    if aperture is None and "stop_xy_mm" in found:
-        g.outputs["stop_xy_mm"] = found["stop_xy_mm"]
+    status = g.inline(status_graph(aperture, lens.stopped), given)["status"].whole()
+    g.outputs |= {"companion": moved, "transmittance": found["transmittance"], "status": status}
     return g
 
 
