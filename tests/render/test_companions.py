@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from shutil import which
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from render_helpers import FILM, WHITE, scene
 from neurolens.base import status as st
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.exact import ExactCamera
+from neurolens.lens.apertures import Aperture
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.film import PixelGrid
@@ -243,3 +245,13 @@ def test_a_lens_set_for_a_zoom_has_companions_too() -> None:
     assert camera.companion_reach_mm is not None
     weight, alone = shares(camera, 2000)
     assert weight.sum(axis=0).mean() == pytest.approx(alone.mean(), rel=0.01)
+
+
+@pytest.mark.parametrize("shape", [Aperture(blades=5, rotation_deg=20.0), Aperture(mask=np.eye(7, dtype=bool))])
+def test_shapes_of_the_stop_block_companions_as_they_block_heroes(shape: Aperture) -> None:
+    """Of many rays, as much light of each wavelength comes by companions as by heroes, compiled or not."""
+    plain = make_camera(MODEL, Shot(FILM, 2.0, 2.8, aperture=shape))
+    for camera in (plain, plain.compiled()) if which("cc") else (plain,):  # type: ignore[attr-defined]
+        weight, alone = shares(camera)
+        assert 0.05 < np.mean(alone > 0) < 0.999
+        assert weight.sum(axis=0).mean() == pytest.approx(alone.mean(), rel=0.015)
