@@ -29,7 +29,7 @@ LENSES = {
 MODES = ("one", "auto")
 
 OPTIONS = (
-    lab.count("samples", 16, "of a pixel (default: 16)"), lab.count("seeds", 4, "to measure variances by (default: 4)", 2),
+    lab.count("samples", 16, "of a pixel (default: 16)"), lab.count("seeds", 4, "for variances (default: 4)", 2),
     lab.count("width", 480, "of the picture, of which a quarter of the rows is rendered (default: 480)", 64),
     lab.ONLY, lab.out(),
 )  # fmt: skip
