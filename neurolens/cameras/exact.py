@@ -112,9 +112,9 @@ class ExactCamera(LensCamera):
         }
         self.start(runtime)
 
-    def _made(self, kind: Kind) -> GraphRun:
+    def _run(self, kind: Kind) -> GraphRun:
         if self.runtime != "trace":
-            return super()._made(kind)
+            return super()._run(kind)
         if kind == "companion":
             return self._companion
         scene = self._with_differentials if kind == "differentials" else None
