@@ -100,7 +100,7 @@ class SpectralRays:
     Attributes:
         rays: of the hero, the first wavelength, with its weight as the only one.
         weight: [W, N] float32 of each wavelength, 0 where it does not pass.
-        film_mm: [W, 2, N] float32, where their light belongs; on the film where the weight is above 0.
+        film_mm: [W, 2, N] float32, where their light belongs, on the film; the hero's where the weight is 0.
     """
 
     rays: CameraRays
@@ -189,7 +189,11 @@ class SpectralCamera(Camera, Protocol):
     companion_reach_mm: tuple[float, float] | None
 
     def sample_spectrum(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SpectralRays:
-        """Rays as of `sample`, for wavelengths [W, N] in nm of which the first is the hero's."""
+        """Rays as of `sample`, for wavelengths [W, N] in nm of which the first is the hero's.
+
+        Raises:
+            InputError: companions that the camera does not know.
+        """
         ...
 
 

@@ -238,26 +238,29 @@ class LensCamera:
             self._run("rays")
 
     def sample_spectrum(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SpectralRays:
-        """Rays as of `sample`, for wavelengths [W, N] in nm of which the first is the hero's; see the contract."""
-        assert self.companion_reach_mm is not None
+        """Rays as of `sample`, for wavelengths [W, N] in nm of which the first is the hero's; see the contract.
+
+        Raises:
+            InputError: a lens whose companions are not known (`companion_reach_mm`).
+        """
+        if self.companion_reach_mm is None:
+            raise InputError(self.path, "wavelengths", "(several a ray)", "one: too few rays of this lens pass")
         light = np.ascontiguousarray(wavelength_nm, np.float32)
         film, square = self._checked(film_mm, pupil, light[0])
         hero = self._run("hero")({"film_mm": film, "square": square, "wavelength_nm": light[:1]})
         rays, pupil = camera_rays(hero), np.ascontiguousarray(hero["pupil_mm"])
-        places, through = (
-            np.repeat(film[None], len(light), axis=0),
-            np.repeat(hero["transmittance"], len(light), axis=0),
-        )
+        places, through = np.repeat(film[None], len(light), 0), np.repeat(hero["transmittance"], len(light), 0)
         passed = np.repeat((rays.weight > 0)[None], len(light), axis=0)
         reach, edge = (np.array(v, np.float32)[:, None] for v in (self.companion_reach_mm, self.film_mm))
         for k in range(1, len(light)):
             given = {"film_mm": film, "pupil_mm": pupil, "wavelength_nm": light[:1], "companion_nm": light[k : k + 1]}
             found = self._run("companion")(given)
-            places[k], through[k] = found["companion"][:2], found["transmittance"][0]
-            passed[k] &= found["status"][0] == st.PASSED
-            passed[k] &= (np.abs(places[k] - film) <= reach).all(0) & (np.abs(places[k]) < edge / 2).all(0)
+            place, through[k] = found["companion"][:2], np.maximum(found["transmittance"][0], 0)
+            passed[k] &= (found["status"][0] == st.PASSED) & np.isfinite(through[k])
+            passed[k] &= (np.abs(place - film) <= reach).all(0) & (np.abs(place) < edge / 2).all(0)
+            places[k] = np.where(passed[k], place, film)  # what does not pass has any place, or none
         shared = rays.weight / np.where(passed[0], through[0] * np.maximum(passed.sum(0), 1), 1)
-        return SpectralRays(rays, np.where(passed, np.maximum(through, 0) * shared, np.float32(0)), places)
+        return SpectralRays(rays, np.where(passed, through, np.float32(0)) * shared, places)
 
     @property
     def companion_reach_mm(self) -> tuple[float, float] | None:

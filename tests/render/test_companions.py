@@ -222,6 +222,12 @@ def test_one_pixel_one_line_and_no_light_end_well() -> None:
     waves[:, 4], waves[2, 3] = np.nan, -1.0
     found = camera.sample_spectrum(wild, np.full((2, 5), 0.5, np.float32), waves)
     assert np.isfinite(found.weight).all() and not found.weight[:, :3].any() and not found.weight[:, 4].any()
+    far = np.full((2, 3000), 17.0, np.float32) * [[1.0], [0.7]]  # near the end of the light, where many are lost
+    found_far = camera.sample_spectrum(far, *samples_of(camera, 3000)[1:])
+    lost = found_far.weight == 0
+    assert lost.any() and np.array_equal(
+        found_far.film_mm.swapaxes(0, 1)[:, lost][0], np.repeat(17.0, lost.sum()).astype(np.float32)
+    )
     assert found.weight[2, 3] == 0 and math.isclose(found.weight[0, 3], found.weight[1, 3], rel_tol=1e-4)
 
 
