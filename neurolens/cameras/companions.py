@@ -1,9 +1,8 @@
 """Companion wavelengths of camera rays: where on film and pupil another wavelength takes the same scene ray.
 
 A path that carries several wavelengths follows the scene ray of one, the hero. At a companion wavelength the same scene
-ray comes from another film point and another pupil point, some microns away. Polynomials of low order give both shifts;
-the lens's own graph then tests whether the companion passes, and how much of its light. Rays of one scene ray are a set
-that does not depend on which of its wavelengths was the hero, so a renderer may weigh them by how many of them pass.
+ray belongs to another film point, some microns away, and to another pupil point. Polynomials of low order give both
+shifts; the lens's own graph then says whether the companion passes and how much of its light arrives.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from neurolens.base import status as st
 from neurolens.cameras.cameragraph import LensGraph, lens_inside, status_graph, unrounded
 from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph, Value
+from neurolens.graph.ir import Graph
 from neurolens.graph.program import RAY
 
 Array = NDArray[np.float64]
@@ -35,22 +34,20 @@ _BEYOND = 1.5  # the farthest shift over that of the rays of the fit
 
 
 class Shift(NamedTuple):
-    """The shift from a ray's film and pupil point to those of a companion wavelength.
+    """The shift from the film and pupil point of the hero to those of a companion.
 
     Attributes:
         graph: inputs `film_mm`, `pupil_mm` [2], `wavelength_nm`, `companion_nm`; output `companion` [4], the film and
             pupil point in mm of the same scene ray at the companion wavelength.
-        reach_mm: bound of the film point's shift along x and along y; farther companions count as blocked.
-        error_mm: RMS error of the film point over rays that the fit has not seen.
+        reach_mm: the largest shift of the film point along x and along y; a companion beyond it counts as blocked.
     """
 
     graph: Graph
     reach_mm: tuple[float, float]
-    error_mm: float
 
 
 def fit_shift(lens: Graph, samples: Mapping[str, Array], companion_nm: Array) -> Shift | None:
-    """Fit the shifts of a lens; None where too few rays pass, or polynomials do not follow them.
+    """Fit the shift of a lens; None if too few rays pass, or the error on held-out rays is too large.
 
     Args:
         lens: the graph of the lens (`cameragraph.LensGraph`).
@@ -84,10 +81,11 @@ def fit_shift(lens: Graph, samples: Mapping[str, Array], companion_nm: Array) ->
     x, y = (_BEYOND * float(v) for v in np.abs(shift[:2]).max(axis=1))
     g = Graph()
     point = g.concat(g.input("film_mm", 2), g.input("pupil_mm", 2))
-    hero, other = ((_wave(g.input(name)) + -middle) * (1 / half) for name in ("wavelength_nm", "companion_nm"))
+    inverse = [1000.0 / g.input(name) for name in ("wavelength_nm", "companion_nm")]
+    hero, other = ((value * value + -middle) * (1 / half) for value in inverse)
     variables = g.concat(point * (1 / scale), hero, other)
     g.outputs["companion"] = point + g.polynomial(exponents, weights, variables) * (other - hero)
-    return Shift(g, (x, y), left)
+    return Shift(g, (x, y))
 
 
 def companion_graph(lens: LensGraph, shift: Graph, mask_too: bool) -> Graph:
@@ -103,11 +101,6 @@ def companion_graph(lens: LensGraph, shift: Graph, mask_too: bool) -> Graph:
     status = g.inline(status_graph(aperture, lens.stopped), given)["status"].whole()
     g.outputs |= {"companion": moved, "transmittance": found["transmittance"], "status": status}
     return g
-
-
-def _wave(nanometres: Value) -> Value:
-    inverse = 1000.0 / nanometres
-    return inverse * inverse
 
 
 @cache

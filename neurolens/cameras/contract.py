@@ -136,7 +136,8 @@ class Camera(Protocol):
         wavelength_nm: range of wavelengths accepted, None for any.
         dispersive: whether rays depend on the wavelength.
         achromatic: optional, true where neither rays nor weights depend on the wavelength.
-        costly: optional, true where a ray costs more than most paths: they carry one wavelength, unless asked for more.
+        costly: optional; true if a ray takes longer than the rest of its path in a simple scene. Paths then carry one
+            wavelength, unless the settings of the film ask for several.
         rays_a_call: optional, how many rays at once suit it best; `RAYS_A_CALL` where it says nothing.
         settings: JSON-able description (focal length, f-number, focus, model card), kept in the picture's metadata.
     """
@@ -182,8 +183,8 @@ class SpectralCamera(Camera, Protocol):
     """The interface of cameras that disperse and know their companions.
 
     Attributes:
-        companion_reach_mm: bound of how far along x and along y companions lie from their hero on the film; None where
-            the camera does not know them.
+        companion_reach_mm: the largest distance along x and along y between the film points of a hero and of its
+            companions; None if the camera cannot place companions.
     """
 
     companion_reach_mm: tuple[float, float] | None
@@ -192,7 +193,7 @@ class SpectralCamera(Camera, Protocol):
         """Rays as of `sample`, for wavelengths [W, N] in nm of which the first is the hero's.
 
         Raises:
-            InputError: companions that the camera does not know.
+            InputError: the camera cannot place companions.
         """
         ...
 

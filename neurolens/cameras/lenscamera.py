@@ -204,7 +204,7 @@ class LensCamera:
 
     @property
     def costly(self) -> bool:
-        """Whether a ray costs more than most paths, as traced by torch."""
+        """Whether a ray takes longer than the rest of most paths: torch traces it surface by surface."""
         return self.runtime == "trace"
 
     @property
@@ -241,10 +241,10 @@ class LensCamera:
         """Rays as of `sample`, for wavelengths [W, N] in nm of which the first is the hero's; see the contract.
 
         Raises:
-            InputError: a lens whose companions are not known (`companion_reach_mm`).
+            InputError: the camera cannot place companions (`companion_reach_mm`).
         """
         if self.companion_reach_mm is None:
-            raise InputError(self.path, "wavelengths", "(several a ray)", "one: too few rays of this lens pass")
+            raise InputError(self.path, "wavelengths", "(several a ray)", "one: this lens has no companions")
         light = np.ascontiguousarray(wavelength_nm, np.float32)
         film, square = self._checked(film_mm, pupil, light[0])
         hero = self._run("hero")({"film_mm": film, "square": square, "wavelength_nm": light[:1]})
@@ -260,11 +260,12 @@ class LensCamera:
             passed[k] &= (np.abs(place - film) <= reach).all(0) & (np.abs(place) < edge / 2).all(0)
             places[k] = np.where(passed[k], place, film)  # what does not pass has any place, or none
         shared = rays.weight / np.where(passed[0], through[0] * np.maximum(passed.sum(0), 1), 1)
-        return SpectralRays(rays, np.where(passed, through, np.float32(0)) * shared, places)
+        weight = np.where(passed, through, 0) * shared
+        return SpectralRays(rays, weight.astype(np.float32), places)
 
     @property
     def companion_reach_mm(self) -> tuple[float, float] | None:
-        """Bound of how far along x and along y companions lie from their hero on the film; None: they are not known."""
+        """The bound of `SpectralCamera`; None if too few rays pass, or no polynomial follows the shift."""
         return self._shift.reach_mm if self._shift else None
 
     def _sampled(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray, moves: bool) -> CameraRays:

@@ -93,16 +93,15 @@ class Vignetted:
         found = self.camera.sample_spectrum(film_mm, pupil, wavelength_nm)
         passed = found.weight > 0
         factor = np.stack([self._factors(p, film) for p, film in zip(passed, found.film_mm, strict=True)])
-        # Shared by density, which grows as the factor does: evenly, a companion at the end of the light would weigh
-        # anything.
+        # Wavelengths share a ray in proportion to their factors, as to the densities with which they would draw it.
+        # In equal shares a companion at the end of the light would have an unbounded weight.
         share = passed.sum(axis=0) * factor[0] / np.maximum(factor.sum(axis=0), 1e-30)
         return replace(found, weight=(found.weight * factor * share).astype(np.float32))
 
     @property
     def companion_reach_mm(self) -> tuple[float, float] | None:
-        """As of the camera."""
-        reach: tuple[float, float] | None = getattr(self.camera, "companion_reach_mm", None)
-        return reach
+        """The bound of the camera inside; None if it cannot place companions."""
+        return getattr(self.camera, "companion_reach_mm", None)
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """The camera's film points, weighed anew."""

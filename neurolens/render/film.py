@@ -157,7 +157,7 @@ class Tiling:
 
 
 class Spill(NamedTuple):
-    """Light of a pass of a tile that may belong to pixels other than those of its samples.
+    """The light of companions in one pass of a tile, which may arrive at pixels other than those of its samples.
 
     Attributes:
         pixel: [K] numbers in the picture, none twice. sums: [K, 3] float64, of the columns `RGB`.
@@ -193,7 +193,7 @@ class Film:
         self.begin()
 
     def begin(self) -> None:
-        """Give out all tiles and passes that are not in the sums, and expect them in this order."""
+        """Prepare to give out the tiles and passes that are not in the sums, and to add them in the same order."""
         self._missing, self._order = self._all_missing(), self._all_missing()
         self._next = next(self._order, None)
 

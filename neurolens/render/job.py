@@ -95,14 +95,14 @@ class Job:
         self._axes, self._position = camera_axes(pose), np.array(pose.position_m, np.float32)
         self.rows = rows or (0, grid.height)
         first, stop = (row * grid.width for row in self.rows)
-        near = self._reach()  # companions of samples so near arrive in the job's rows
+        near = self._reach()  # samples so far from the job's rows have companions in them
         tiling = Tiling.of(grid.width * grid.height, samples)
         self.tiling = tiling.around(max(first - near, 0), min(stop + near, tiling.pixels))
         self.own = slice(first - self.tiling.start, stop - self.tiling.start)
         self.film = Film(self.tiling)
 
     def _reach(self) -> int:
-        """How many pixels apart, row by row, a companion's pixel lies from its hero's at most."""
+        """The largest difference between the pixel numbers of a companion and of its hero."""
         if self.mode != "companions":
             return 0
         reach_mm = self.camera.companion_reach_mm  # type: ignore[attr-defined]
@@ -164,18 +164,22 @@ class Job:
         sums[:, columns.DROPPED] = np.count_nonzero(dropped.reshape(shape), axis=1)
         luminance = np.einsum("ln,ln->n", factors, value).reshape(shape)
         sums[:, columns.LUMINANCE2] = np.einsum("ps,ps->p", luminance, luminance, dtype=np.float64)
-        response *= value[:, None]
-        own = response if lens.places is None else response[:1]
+        light = response * value[:, None]
+        own = light if lens.places is None else light[:1]
         sums[:, columns.RGB] = np.einsum("lcps->pc", own.reshape(len(own), 3, *shape))
-        return None if lens.places is None else self._spill(response, bins, pixel, lens, shape)
+        return None if lens.places is None else self._spill(light, response, bins, pixel, lens, shape)
 
-    def _spill(self, light: FloatArray, bins: Index, pixel: Index, lens: LensRays, shape: tuple[int, int]) -> Spill:
-        """The light [lanes, 3, N] of the companions, where they arrive.
+    def _spill(
+        self, light: FloatArray, response: FloatArray, bins: Index, pixel: Index, lens: LensRays, shape: tuple[int, int]
+    ) -> Spill:
+        """The light [lanes, 3, N] of the companions, at the pixels where it arrives.
 
-        How many companions cross the edge of a pixel is a matter of chance: noise that thin lenses do not have. Their
-        light is therefore that of what the other samples of the hero's pixel lead to expect (a control variate), and
-        the rest of it. The rest goes to the pixel of the film point; what was expected is parted between the pixels as
-        it would be on average over places in the hero's pixel, which does not change the mean.
+        Chance decides how many companions cross the edge of a pixel, and that is noise which a thin lens does not have.
+        A control variate removes most of it: the light that the other samples of the hero's pixel predict. The
+        prediction is divided among pixels in the shares that it has on average over all places in the hero's pixel; the
+        residual goes to the pixel of the companion's film point. This leaves the mean as it is.
+
+        `response`: [lanes, 3, N], of the film.
         """
         assert lens.places is not None
         width, height = self.grid.width, self.grid.height
@@ -187,29 +191,29 @@ class Job:
         row, column = np.divmod(pixel, width)
         column, row = column + whole[:, 0].astype(np.intp), row + whole[:, 1].astype(np.intp)
         inside = (column >= 0) & (column + 1 < width) & (row >= 0) & (row + 1 < height)
-        expected = self._expected(light, bins, lens.weight, shape)
-        expected *= inside[:, None]
+        predicted = self._predicted(light, bins, lens.weight, shape)[:, None] * response[1:]
+        predicted *= inside[:, None]
         near = np.where(inside, row * width + column, target)
         places = np.empty((5, *target.shape), np.intp)
         sums = np.empty((3, *places.shape))  # as `bincount` takes them
-        places[0], sums[:, 0] = target, (light[1:] - expected).swapaxes(0, 1)
+        places[0], sums[:, 0] = target, (light[1:] - predicted).swapaxes(0, 1)
         for k, (down, across) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1)), 1):
             share = (part[:, 0] if across else 1 - part[:, 0]) * (part[:, 1] if down else 1 - part[:, 1])
             np.add(near, (down * width + across) * inside, out=places[k])
-            np.multiply(expected.swapaxes(0, 1), share, out=sums[:, k])
+            np.multiply(predicted.swapaxes(0, 1), share, out=sums[:, k])
         return _gathered(places.reshape(-1), sums.reshape(3, -1))
 
-    def _expected(self, light: FloatArray, bins: Index, weight: FloatArray, shape: tuple[int, int]) -> FloatArray:
-        """Light [lanes - 1, 3, N] of the companions as the mean of the other samples of their pixel lets expect."""
+    def _predicted(self, light: FloatArray, bins: Index, weight: FloatArray, shape: tuple[int, int]) -> FloatArray:
+        """Weighted radiance [lanes - 1, N] of the companions, predicted by the mean of their pixel's other samples."""
         pixels, samples = shape
         if samples == 1:
-            return np.zeros_like(light[1:])
+            return np.zeros_like(weight[1:])
         colour = light.sum(axis=0).reshape(3, pixels, samples)
         others = (colour.sum(axis=2, keepdims=True) - colour) / np.float32(samples - 1)
         open_share = weight.sum(axis=0).reshape(pixels, samples).mean(axis=1, keepdims=True)
         others /= np.where(open_share > 0, open_share, np.float32(1))
         radiance = np.einsum("lcn,cn->ln", self._basis.take(bins, axis=-1), others.reshape(3, -1))
-        return self._response[1:].take(bins, axis=-1) * (radiance * weight[1:])[:, None]
+        return radiance * weight[1:]
 
     def _sum_depth(
         self, sums: NDArray[np.float64], origin: FloatArray, direction: FloatArray, distance: FloatArray
@@ -403,7 +407,8 @@ def mode_for(
 ) -> Literal["one", "hero", "companions"]:
     """How paths carry wavelengths: see `Job`.
 
-    InputError: "hero" is asked for and the camera disperses without knowing its companions.
+    Raises:
+        InputError: the settings ask for "hero", and the camera disperses but cannot place companions.
     """
     if film.wavelengths == "one":
         return "one"

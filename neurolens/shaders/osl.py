@@ -9,10 +9,10 @@ This distance and the places of the rays are in units of the scene, which are `u
 Of a lens in several states (zoom, internal focus) every number of the camera follows the state, mixed from cameras at
 the nodes of its axes as a model's numbers are: the zoom is an input, internal focus the distance in focus.
 
-Cycles gives two random numbers, which are most even in their high bits. Those of the first choose one of sixteen parts
-of the spectrum, its lowest bits the wavelength within, and what lies between is a number for the pupil: so every
-sixteen samples of a pixel hold every part of the spectrum once. The colour weights of a wavelength are Bernstein's
-polynomials of second order: never negative, of mean 1 each.
+Cycles gives two random numbers, which are most even in their high bits. The high bits of the first choose one of
+sixteen parts of the spectrum, its lowest bits the wavelength within that part, and the bits between are the number for
+the pupil. So sixteen samples of a pixel hold each part of the spectrum once. The colour weights of a wavelength are
+Bernstein's polynomials of second order: never negative, of mean 1 each.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ from neurolens.surrogates.axes import STATE, Axis, product, state_graph, state_n
 Array = NDArray[np.float64]
 OUTPUTS = ("position", "direction", "throughput", "dPdx", "dPdy", "dDdx", "dDdy")
 _FAR_M = 1e-4  # Blender's focus distance below this means that depth of field is off
-# Parts of the spectrum that a random number's high bits choose; the low bits of what is left are below 1 / 4096 of it.
+# The high bits of a random number choose one of so many parts of the spectrum. Of the rest, the bits below 1 / 4096
+# choose the wavelength within the part.
 _PARTS, _LOW_BITS = 16.0, 4096.0
 _NEARLY, _EDGES = 0.99, 0.75  # of rays beyond this share of the stop's radius: their places at the stop are known
 _LEAST = 1.7e-3  # of the stop's radius, by which blades are widened; no other number of a graph, which would share it

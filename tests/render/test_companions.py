@@ -225,9 +225,7 @@ def test_one_pixel_one_line_and_no_light_end_well() -> None:
     far = np.full((2, 3000), 17.0, np.float32) * [[1.0], [0.7]]  # near the end of the light, where many are lost
     found_far = camera.sample_spectrum(far, *samples_of(camera, 3000)[1:])
     lost = found_far.weight == 0
-    assert lost.any() and np.array_equal(
-        found_far.film_mm.swapaxes(0, 1)[:, lost][0], np.repeat(17.0, lost.sum()).astype(np.float32)
-    )
+    assert lost.any() and (found_far.film_mm[:, 0][lost] == 17).all()
     assert found.weight[2, 3] == 0 and math.isclose(found.weight[0, 3], found.weight[1, 3], rel_tol=1e-4)
 
 
@@ -255,7 +253,7 @@ def test_a_lens_set_for_a_zoom_has_companions_too() -> None:
 
 @pytest.mark.parametrize("shape", [Aperture(blades=5, rotation_deg=20.0), Aperture(mask=np.eye(7, dtype=bool))])
 def test_shapes_of_the_stop_block_companions_as_they_block_heroes(shape: Aperture) -> None:
-    """Of many rays, as much light of each wavelength comes by companions as by heroes, compiled or not."""
+    """Summed over many rays, heroes and companions carry as much light as heroes alone, compiled or not."""
     plain = make_camera(MODEL, Shot(FILM, 2.0, 2.8, aperture=shape))
     for camera in (plain, plain.compiled()) if which("cc") else (plain,):  # type: ignore[attr-defined]
         weight, alone = shares(camera)
