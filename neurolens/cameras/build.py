@@ -16,6 +16,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.lensname import FISHEYES, FUSED, IDEAL_OF, is_model, resolve
 from neurolens.base.progress import Progress
 from neurolens.cameras.contract import Camera
+from neurolens.cameras.dispersion import ReducedDispersion
 from neurolens.cameras.ideal import ThickLens, ThinLens
 from neurolens.cameras.pinhole import PROJECTIONS, Fisheye, Pinhole, check_field
 from neurolens.cameras.sampling import beyond_circle, refuse
@@ -40,8 +41,13 @@ def make_camera(spec: str | Path, shot: Shot, progress: Progress | None = None) 
         ModelError: a model that cannot be trusted.
         ModuleNotFoundError: a lens file without torch.
     """
-    camera = _camera(str(spec), shot, progress)
+    camera = with_dispersion(_camera(str(spec), shot, progress), shot)
     return camera if shot.vignetting == "both" else Vignetted(camera, shot.vignetting, shot.wavelength_nm)
+
+
+def with_dispersion(camera: Camera, shot: Shot) -> Camera:
+    """The camera with the part of its dispersion that the shot keeps."""
+    return camera if shot.dispersion == "full" else ReducedDispersion(camera, shot.dispersion, shot.wavelength_nm)
 
 
 def _camera(spec: str, shot: Shot, progress: Progress | None) -> Camera:

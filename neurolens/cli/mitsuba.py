@@ -11,7 +11,7 @@ from neurolens import __version__
 from neurolens.base.errors import warn
 from neurolens.base.progress import duration
 from neurolens.base.records import plain
-from neurolens.base.settings import positive, setting, whole
+from neurolens.base.settings import positive, setting, setting_of, whole
 from neurolens.cli.arguments import (
     Glasses,
     LensState,
@@ -22,6 +22,7 @@ from neurolens.cli.arguments import (
     lens_state,
     output_path,
 )  # fmt: skip
+from neurolens.lens.shot import Dispersion, Shot
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +52,7 @@ examples:
         kind=positive("scene units in a metre"),
     )  # fmt: skip
     exposure: float = exposure()
+    dispersion: Dispersion | None = setting_of(Shot, "dispersion")
     state: LensState = lens_state()
 
     def run(self) -> int:
@@ -66,7 +68,8 @@ examples:
         scene = load_scene(self.scene, self.variant)
         width, height = (int(v) for v in scene.sensors()[0].film().size())
         progress = self.progress()
-        shot = self.state.shot(self.film or (FILM_WIDTH_MM, FILM_WIDTH_MM * height / width), wavelength_nm=LIGHT_NM)
+        film = self.film or (FILM_WIDTH_MM, FILM_WIDTH_MM * height / width)
+        shot = self.state.shot(film, wavelength_nm=LIGHT_NM, dispersion=self.dispersion or "full")
         camera = make_camera(self.camera, shot, progress)
         for note in camera.settings.get("notes", ()):
             warn(note)

@@ -33,7 +33,7 @@ from neurolens.cli.arguments import (
     output_path,
 )  # fmt: skip
 from neurolens.cli.keys import Frames, frames_group, frames_of
-from neurolens.lens.shot import Shot, Vignetting
+from neurolens.lens.shot import Dispersion, Shot, Vignetting
 from neurolens.render.settings import FilmSettings
 
 if TYPE_CHECKING:
@@ -118,6 +118,7 @@ examples:
     camera: str | None = lens(None, models=True, cameras=True)
     film_offset_mm: float | None = setting_of(Shot, "film_offset_mm")
     vignetting: Vignetting | None = setting_of(Shot, "vignetting")
+    dispersion: Dispersion | None = setting_of(Shot, "dispersion")
     out: Path = output_path("OUT.exr", "picture to write; the preview is OUT.png")
     picture: Picture = group("picture")
     colour: FilmSettings = group("colour (left out: the scene's [film] table)", unset=True)
@@ -185,7 +186,8 @@ examples:
         assert self.camera is not None
         return Frame.of(
             self.scene[0], self.camera, **self.state.camera(), **vars(self.picture), **vars(self.colour),
-            film_offset_mm=self.film_offset_mm, vignetting=self.vignetting, glass_files=self.glass, tile=self.tile,
+            film_offset_mm=self.film_offset_mm, vignetting=self.vignetting, dispersion=self.dispersion,
+            glass_files=self.glass, tile=self.tile,
         )  # fmt: skip
 
     def _by_file(self, frame: Frame) -> dict[Path, Frame]:

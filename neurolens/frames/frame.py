@@ -24,7 +24,7 @@ from neurolens.base.progress import Progress
 from neurolens.base.records import plain
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.lens.shot import FocusMode, Shot, Vignetting
+from neurolens.lens.shot import Dispersion, FocusMode, Shot, Vignetting
 from neurolens.render.colour import COLOUR_SPACES, SRGB, ColourSpace, check_name, conversion, converted
 from neurolens.render.film import PixelGrid
 from neurolens.render.job import MEANING
@@ -57,8 +57,8 @@ class Frame:
 
     Attributes:
         scene: the scene file. camera: what `base.lensname.resolve` makes of a camera's name.
-        film_mm, focus_m, f_number, focal_length_mm, zoom, field_deg, focus_mode, aperture, film_offset_mm, vignetting:
-            as in `lens.shot.Shot`.
+        film_mm, focus_m, f_number, focal_length_mm, zoom, field_deg, focus_mode, aperture, film_offset_mm, vignetting,
+            dispersion: as in `lens.shot.Shot`.
         glass_files: catalogues of Zemax, whose glasses come before those that ship.
         position_m, look_at_m: where the camera stands, and a point on its optical axis.
         width, height: in pixels; one of them follows from the other and the film's shape. samples: in each pixel.
@@ -80,6 +80,7 @@ class Frame:
     aperture: Aperture | None = None
     film_offset_mm: float | None = None
     vignetting: Vignetting | None = None
+    dispersion: Dispersion | None = None
     glass_files: tuple[Path, ...] = ()
     position_m: Vector | None = None
     look_at_m: Vector | None = None

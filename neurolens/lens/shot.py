@@ -13,6 +13,7 @@ from neurolens.base.settings import check_bounds, setting
 
 FocusMode = Literal["best", "paraxial", "internal"]
 Vignetting = Literal["both", "natural", "optical", "none"]
+Dispersion = Literal["full", "lateral", "off"]
 
 
 @dataclass(frozen=True)
@@ -38,9 +39,10 @@ class Shot:
         clamp_f_number: an f-number wider than the lens opens becomes its widest; else it is an error for a model, and
             opens the stop of a lens file as far as the rims let light through.
         vignetting: the part that is kept; see `neurolens.cameras.vignetting`.
+        dispersion: the part that is kept; see `neurolens.cameras.dispersion`.
 
     Raises:
-        InputError: a film, focus, f-number, focus mode or vignetting that no camera has.
+        InputError: a film, focus, f-number, focus mode, vignetting or dispersion that no camera has.
     """
 
     film_mm: tuple[float, float]
@@ -79,10 +81,15 @@ class Shot:
         "both", "parts that are kept: both; natural, the cos^4 law; optical, the effective aperture; none (default: "
         "both)",
     )  # fmt: skip
+    dispersion: Dispersion = setting(
+        "full", "parts that are kept: full; lateral, the picture's shift with the wavelength, for less noise; off "
+        "(default: full)",
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         check_bounds(self, "camera")
-        for field, choices in (("focus_mode", get_args(FocusMode)), ("vignetting", get_args(Vignetting))):
+        for field, kind in (("focus_mode", FocusMode), ("vignetting", Vignetting), ("dispersion", Dispersion)):
+            choices = get_args(kind)
             if getattr(self, field) not in choices:
                 raise InputError("camera", field, getattr(self, field), f"one of: {', '.join(choices)}")
         object.__setattr__(self, "film_mm", check_film(self.film_mm))

@@ -13,7 +13,7 @@ import numpy as np
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.lens.shot import Shot
+from neurolens.lens.shot import Dispersion, Shot
 from neurolens.mitsuba.library import matrix, require_mitsuba
 from neurolens.mitsuba.sensor import FILM_WIDTH_MM, LIGHT_NM, PLUGIN, register
 
@@ -27,20 +27,21 @@ def camera(
     film_mm: tuple[float, float] = (FILM_WIDTH_MM, FILM_WIDTH_MM),
     focus_m: float = math.inf,
     f_number: float | None = None,
+    dispersion: Dispersion = "full",
 ) -> Camera:
     """A camera for `render`: a model (.onnx), a lens file (.toml), "thin" or "pinhole".
 
     Args:
         film_mm: width and height; they have the shape of the scene's picture.
         focus_m: distance from the film to the object in focus.
-        f_number: None is the widest.
+        f_number: None is the widest. dispersion: "off" has the least noise, see `neurolens.cameras.dispersion`.
 
     Other settings: see `neurolens.cameras.build`.
 
     Raises:
         InputError, ModelError: as `make_camera`.
     """
-    return make_camera(spec, Shot(film_mm, focus_m, f_number, wavelength_nm=LIGHT_NM))
+    return make_camera(spec, Shot(film_mm, focus_m, f_number, wavelength_nm=LIGHT_NM, dispersion=dispersion))
 
 
 def load_scene(scene: str | Path | Mapping[str, Any], variant: str | None = None, **parameters: Any) -> Any:

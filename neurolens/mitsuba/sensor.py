@@ -4,8 +4,8 @@ Mitsuba's camera looks along +z with y up and x to the left of the picture, ours
 turn about y. The origin is the centre of the film plane, as in our scenes.
 
 In spectral variants a ray carries four wavelengths. Where the camera's rays hardly depend on the wavelength they are
-Mitsuba's own four, each with its weight (hero wavelengths, Wilkie et al. 2014); a lens that disperses gives all four
-lanes the same wavelength.
+Mitsuba's own four, each with its weight (hero wavelengths, Wilkie et al. 2014), as with its dispersion "off"; a lens
+that disperses, even "lateral", gives all four lanes the same wavelength.
 
 A path of an RGB renderer carries three numbers, not a wavelength; a lens that disperses needs one. Each ray takes a
 wavelength, drawn by the film's response, and its channel c is weighted by
@@ -165,7 +165,7 @@ def _initialise(self: Any, props: Any, camera: Camera | None = None) -> None:
 
     Parameters in a scene: camera (a model, a lens file, "thin" or "pinhole"), focus_m (default inf), f_number,
     focal_length_mm, zoom, film_width_mm (default 36), film_height_mm (default: by the picture's shape), blades,
-    blade_rotation_deg, blade_curvature, aperture_mask, units_per_m (default 1), to_world (of the centre of the film
+    blade_rotation_deg, blade_curvature, aperture_mask, dispersion (default "full"), units_per_m (default 1), to_world (of the centre of the film
     plane, without scale), film, sampler. From Python `camera` may be an object, which has its own film size in mm.
     """
     libraries()[0].Sensor.__init__(self, props)
@@ -211,6 +211,7 @@ def _camera_of(props: Any, shape: float) -> Camera:
         zoom=props.get("zoom", None),
         aperture=aperture,
         wavelength_nm=LIGHT_NM,
+        dispersion=props.get("dispersion", "full"),
     )
     return make_camera(_found(name), shot)
 

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
-from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FloatArray
+from neurolens.cameras.contract import RAYS_A_CALL, Camera, FloatArray
+from neurolens.cameras.dispersion import film_shift
 from neurolens.render import film as columns
 from neurolens.render.colour import SRGB, FloatArray64, Index, SpectralRange, Spectrum, balance, converted, illuminant
 from neurolens.render.environment import sun_spectrum, total_spectrum
@@ -31,7 +32,6 @@ LANES = 4  # wavelengths of a hero path
 _FINE = 1024  # wavelengths at which the light of a scene is summed
 _PROBES, _PROBED_WAVELENGTHS = 1024, 5
 _LITTLE_PX = 0.05  # pixels; a smaller shift is hidden by the pixel filter, a box one pixel wide
-_FARTHEST_M = 1e4
 
 
 class LensRays(NamedTuple):
@@ -177,7 +177,8 @@ class Job:
         Chance decides how many companions cross the edge of a pixel, and that is noise which a thin lens does not have.
         A control variate removes most of it: the light that the other samples of the hero's pixel predict. The
         prediction is divided among pixels in the shares that it has on average over all places in the hero's pixel; the
-        residual goes to the pixel of the companion's film point. This leaves the mean as it is.
+        residual goes to the pixel of the companion's film point. This leaves the mean as it is. Where the camera's
+        dispersion is only lateral, all light is divided so, as an ST map does that is read between pixels.
 
         `response`: [lanes, 3, N], of the film.
         """
@@ -191,7 +192,10 @@ class Job:
         row, column = np.divmod(pixel, width)
         column, row = column + whole[:, 0].astype(np.intp), row + whole[:, 1].astype(np.intp)
         inside = (column >= 0) & (column + 1 < width) & (row >= 0) & (row + 1 < height)
-        predicted = self._predicted(light, bins, lens.weight, shape)[:, None] * response[1:]
+        if getattr(self.camera, "lateral", False):
+            predicted = light[1:].copy()
+        else:
+            predicted = self._predicted(light, bins, lens.weight, shape)[:, None] * response[1:]
         predicted *= inside[:, None]
         near = np.where(inside, row * width + column, target)
         places = np.empty((5, *target.shape), np.intp)
@@ -425,39 +429,16 @@ def mode_for(
 
 
 def dispersion_px(camera: Camera, grid: PixelGrid, limits_nm: tuple[float, float]) -> float:
-    """By how many pixels the wavelength moves what the camera shows: RMS over film and pupil.
-
-    Each ray reaches a point of the plane in focus. A pixel is the way that this point goes when the film point moves by
-    a pixel. Five wavelengths are compared with the middle one by the rays that pass at both; the largest RMS counts.
-    """
+    """By how many pixels the wavelength moves what the camera shows: RMS over film and pupil, of the worst of some
+    wavelengths beside the middle one."""
     low, high = limits_nm
     random = np.random.default_rng(0)
-    film = ((random.random((2, _PROBES)) - 0.5) * np.array(grid.film_mm)[:, None]).astype(np.float32)
-    pupil = random.random((2, _PROBES), np.float32)
-    focus = camera.settings.get("focus_m")
-    reach = min(_FARTHEST_M if focus is None else float(focus), _FARTHEST_M)
-
-    def found(nm: float, at: FloatArray) -> tuple[FloatArray64, NDArray[np.bool_]]:
-        rays: CameraRays = camera.sample(at, pupil, np.full(_PROBES, nm, np.float32))
-        point = rays.origin_m.astype(np.float64) + rays.direction.astype(np.float64) * reach
-        return point, (rays.status == 0) & np.isfinite(point).all(axis=0)
-
-    middle, passed = found(0.5 * (low + high), film)
-    steps = []
-    for axis, pixels in enumerate((grid.width, grid.height)):
-        moved = film.copy()
-        # Towards the middle, so that no point leaves the film.
-        sign = np.where(film[axis] > 0, -1, 1)
-        moved[axis] += sign * grid.film_mm[axis] / pixels
-        point, also = found(0.5 * (low + high), moved)
-        steps.append((point - middle) * sign)
-        passed &= also
+    film = (random.random((2, _PROBES)) - 0.5) * np.array(grid.film_mm)[:, None]
+    pupil = random.random((2, _PROBES, 1))
+    step = grid.film_mm[0] / grid.width, grid.film_mm[1] / grid.height
     worst = 0.0
-    step = np.stack(steps, axis=-1).transpose(1, 0, 2)  # [N, 3, 2]
     for nm in np.linspace(low, high, _PROBED_WAVELENGTHS):
-        point, also = found(float(nm), film)
-        rows = np.flatnonzero(passed & also)
-        if rows.size:
-            shift = np.linalg.pinv(step[rows]) @ (point - middle).T[rows, :, None]
-            worst = max(worst, float(np.sqrt(np.mean(np.sum(shift**2, axis=(1, 2))))))
+        shift = film_shift(camera, film, pupil, float(nm), 0.5 * (low + high), step) / np.array(step)[:, None]
+        length = (shift**2).sum(axis=0)
+        worst = max(worst, float(np.sqrt(np.nanmean(length))) if np.isfinite(length).any() else 0.0)
     return worst

@@ -1,0 +1,219 @@
+"""Dispersion of any camera measured, and reduced: to the shift of the picture with the wavelength, or to nothing.
+
+A lens that disperses moves its picture with the wavelength (lateral colour) and blurs it differently (longitudinal
+colour, and the colours of other aberrations). `ReducedDispersion` follows the rays of one wavelength. With "lateral",
+polynomials in film point and wavelength still move the picture of every other one, as an ST map a wavelength would.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.base.errors import InputError
+from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FilmPoints, FloatArray, SpectralRays
+from neurolens.cameras.sampling import common_light, stratified
+from neurolens.lens.film_plane import LINE_D_NM
+from neurolens.lens.shot import Dispersion
+
+Array = NDArray[np.float64]
+
+_FARTHEST_M = 1e4
+_DEGREE, _ORDERS = 7, 3  # of the shift's polynomial, in the film point and in the wavelength
+_POINTS, _SIDE, _WAVES = 192, 8, 7  # of the fit: film points, pupil samples a side, wavelengths
+_BEYOND = 1.5  # the farthest companion over that of the points of the fit
+_STEP = 1e-3  # of the film's width: a step of the film point, to know how what it shows moves
+_QUADRATURE = 64  # pupil samples a side, for the exposure
+
+
+def film_shift(
+    camera: Camera,
+    film_mm: Array,
+    square: Array,
+    wavelength_nm: float,
+    reference_nm: float,
+    step_mm: tuple[float, float],
+) -> Array:
+    """The way [2, F] in mm from film points to those that show the same at another wavelength; NaN where none does.
+
+    What a film point shows is the mean of where its rays meet the object in focus, over the rays that pass.
+
+    Args:
+        film_mm: [2, F]. square: [2, F, P] pupil samples. step_mm: by which film points move along x and y to tell how
+            what they show moves; towards the middle, so that no point leaves the film.
+    """
+    count, pupils = square.shape[1:]
+    focus = camera.settings.get("focus_m")
+    reach = min(_FARTHEST_M if focus is None else float(focus), _FARTHEST_M)
+
+    def found(nm: float, at: Array) -> tuple[Array, NDArray[np.bool_]]:
+        film = np.repeat(at, pupils, axis=1).astype(np.float32)
+        rays = camera.sample(film, square.reshape(2, -1).astype(np.float32), np.full(film.shape[1], nm, np.float32))
+        point = rays.origin_m.astype(np.float64) + rays.direction.astype(np.float64) * reach
+        return point, (rays.status == 0) & np.isfinite(point).all(axis=0)
+
+    here, passed = found(reference_nm, film_mm)
+    there, also = found(wavelength_nm, film_mm)
+    passed &= also
+    moved = []
+    for axis in (0, 1):
+        way = np.where(film_mm[axis] > 0, -step_mm[axis], step_mm[axis])
+        point, also = found(reference_nm, film_mm + np.eye(2)[:, axis, None] * way)
+        passed &= also
+        moved.append((point - here) / np.repeat(way, pupils))
+    rows = passed.reshape(count, pupils)
+    shift, lit = np.full((2, count), np.nan), rows.any(axis=1)
+
+    def mean(values: Array) -> Array:
+        whole = np.where(passed, values, 0).reshape(3, count, pupils)[:, lit]
+        return whole.sum(axis=2) / rows[lit].sum(axis=1)
+
+    slopes = np.stack([mean(part) for part in moved], axis=-1).transpose(1, 0, 2)  # [F, 3, 2] per mm
+    shift[:, lit] = -(np.linalg.pinv(slopes) @ mean(there - here).T[..., None])[..., 0].T
+    return shift
+
+
+class ReducedDispersion:
+    """A camera without longitudinal colour ("lateral"), or without dispersion ("off"); see the module.
+
+    White surroundings stay 1 on the axis. Differentials are those of the one wavelength.
+
+    Args:
+        camera: of our contract. dispersion: "lateral" or "off".
+        wavelength_nm: range of the light; the rays are those of the d line, or of the nearest wavelength in it.
+
+    Attributes:
+        lateral: whether the picture moves with the wavelength; its companions may then be shared between pixels, as an
+            ST map that is read between pixels does.
+
+    Raises:
+        InputError: "lateral" of a camera that shows nothing.
+    """
+
+    costly = False  # companions need no rays
+
+    def __init__(
+        self, camera: Any, dispersion: Dispersion, wavelength_nm: tuple[float, float] = (400.0, 700.0)
+    ) -> None:
+        self.camera, self.name, self.film_mm = camera, camera.name, camera.film_mm
+        self.wavelength_nm, self.rays_a_call = camera.wavelength_nm, getattr(camera, "rays_a_call", RAYS_A_CALL)
+        light = common_light(camera.wavelength_nm or wavelength_nm, wavelength_nm)
+        self._nm = min(max(LINE_D_NM, light[0]), light[1])
+        self.lateral = self.dispersive = dispersion == "lateral" and camera.dispersive and light[0] < light[1]
+        self.achromatic = not self.lateral
+        self.settings: dict[str, Any] = {**camera.settings, "dispersion": dispersion}
+        square, _ = stratified(_QUADRATURE, light)
+        lit = camera.sample(np.zeros_like(square), square, self._reference(square)).weight.mean(dtype=np.float64)
+        self._scale = np.float32(1 / lit if lit > 0 else 1)
+        self.companion_reach_mm: tuple[float, float] | None = None
+        if self.lateral:
+            self._fit(light)
+
+    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """The camera's rays at the one wavelength, of the film points that show what these show at theirs."""
+        return self._scaled(self.camera.sample(self._base(film_mm, wavelength_nm), pupil, self._reference(film_mm)))
+
+    def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """Sample rays as `sample` does, and give their differentials, too."""
+        base = self._base(film_mm, wavelength_nm)
+        return self._scaled(self.camera.sample_differentials(base, pupil, self._reference(film_mm)))
+
+    def sample_spectrum(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SpectralRays:
+        """Rays as of `sample`, for wavelengths [W, N] in nm of which the first is the hero's; see the contract."""
+        base = self._base(film_mm, wavelength_nm[0])
+        rays = self._scaled(self.camera.sample(base, pupil, self._reference(film_mm)))
+        places = np.concatenate([film_mm[None], base + self._shifts(film_mm, wavelength_nm[1:])])
+        passed = (np.abs(places) < np.array(self.film_mm, np.float32)[:, None] / 2).all(axis=1) & (rays.weight > 0)
+        passed[0] = rays.weight > 0
+        share = rays.weight / np.maximum(passed.sum(axis=0), 1)
+        places = np.where(passed[:, None], places, film_mm).astype(np.float32)
+        return SpectralRays(rays, np.where(passed, share, 0).astype(np.float32), places)
+
+    def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
+        """The part of the weights that is the camera's own natural fall-off."""
+        base = self._base(film_mm, wavelength_nm)
+        return np.asarray(self.camera.natural(base, pupil, self._reference(film_mm)), np.float32)
+
+    def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
+        """The camera's film points at the one wavelength, moved to where these wavelengths are shown."""
+        found = self._scaled(self.camera.to_film(point_m, pupil, self._reference(point_m)))
+        shift = self._shifts(found.film_mm, wavelength_nm[None])[0]
+        return replace(found, film_mm=found.film_mm + shift * (found.weight > 0))
+
+    def for_worker(self) -> ReducedDispersion:
+        """This camera about the one that the camera has for a worker."""
+        other, opener = copy(self), getattr(self.camera, "for_worker", None)
+        other.camera = opener() if opener else self.camera
+        return other
+
+    def _reference(self, rays: FloatArray) -> FloatArray:
+        """The one wavelength, as often as there are rays [R, N]."""
+        return np.full(rays.shape[1], self._nm, np.float32)
+
+    def _scaled(self, rays: Any) -> Any:
+        return replace(rays, weight=rays.weight * self._scale)
+
+    def _base(self, film_mm: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
+        """The film points that show at the one wavelength what these show at theirs."""
+        # The shift changes by a thousandth of itself on its own length: it is not evaluated again at the base.
+        return film_mm - self._shifts(film_mm, wavelength_nm[None])[0] if self.lateral else film_mm
+
+    def _shifts(self, film_mm: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
+        """The ways [W, 2, N] from film points of the one wavelength to those of the same thing at others [W, N]."""
+        shift = np.zeros((len(wavelength_nm), *film_mm.shape), np.float32)
+        if not self.lateral:
+            return shift
+        bound = np.array(self.film_mm, np.float32)[:, None]
+        at = np.clip(film_mm / bound, -1, 1)  # beyond the film polynomials are anything
+        parts = (self._terms @ _monomials(at)).reshape(2, _ORDERS, -1) * at[:, None]
+        wave = self._wave(wavelength_nm)[:, None]
+        for order in range(_ORDERS)[::-1]:
+            shift += parts[:, order]
+            shift *= wave
+        return shift
+
+    def _wave(self, wavelength_nm: Any) -> Any:
+        """The variable of the wavelengths, 0 at the one of the rays."""
+        with np.errstate(divide="ignore"):  # what is no light has no rays
+            wave = np.square(1000 / wavelength_nm) - (1000 / self._nm) ** 2
+        return np.clip(np.nan_to_num(wave), -10, 10).astype(np.float32)
+
+    def _fit(self, light_nm: tuple[float, float]) -> None:
+        """Fit the shift to that of rays at film points all over the film; every second point measures the error."""
+        random = np.random.default_rng(0)
+        film = (random.random((2, _POINTS)) - 0.5) * np.array(self.film_mm)[:, None]
+        square = np.repeat(stratified(_SIDE, light_nm)[0][:, None], _POINTS, axis=1)
+        step = _STEP * self.film_mm[0], _STEP * self.film_mm[1]
+        waves = np.linspace(*light_nm, _WAVES)
+        found = np.stack([film_shift(self.camera, film, square, float(nm), self._nm, step) for nm in waves])
+        lit = np.isfinite(found).all(axis=(0, 1))
+        if not lit.any():
+            raise InputError(self.name, "dispersion", "lateral", "a camera that light can pass")
+        shift, at = found[..., lit], (film / np.array(self.film_mm)[:, None])[:, lit]
+        train = np.arange(at.shape[1]) % 2 == 0
+        powers = self._wave(waves)[:, None] ** np.arange(1, _ORDERS + 1)
+        products = np.einsum("wo,mn->womn", powers, _monomials(at))
+        terms, left = [], np.empty_like(shift)
+        for row in (0, 1):  # odd along the shift, even across it
+            part = (products * at[row]).reshape(_WAVES, -1, at.shape[1])
+            flat = part[..., train].transpose(0, 2, 1).reshape(-1, part.shape[1])
+            terms.append(np.linalg.lstsq(flat, shift[:, row, train].reshape(-1), rcond=1e-10)[0])
+            left[:, row] = shift[:, row] - np.einsum("wtn,t->wn", part, terms[row])
+        self._terms = np.concatenate(terms).reshape(2 * _ORDERS, -1).astype(np.float32)
+        self.settings["lateral_error_mm"] = float(np.sqrt(np.mean(np.sum(left[..., ~train] ** 2, axis=1))))
+        reach = _BEYOND * np.ptp(shift, axis=0).max(axis=1) + 1e-6
+        self.companion_reach_mm = float(reach[0]), float(reach[1])
+
+
+def _monomials(at: Array) -> Array:
+    """Products [M, N] of even powers of x and of y, of points [2, N]."""
+    half = _DEGREE // 2 + 1
+    square = at * at
+    powers = [np.ones_like(square), square]
+    while len(powers) < half:
+        powers.append(powers[-1] * square)
+    return np.stack([powers[a][0] * powers[b][1] for a in range(half) for b in range(half - a)])
