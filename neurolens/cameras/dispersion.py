@@ -186,7 +186,7 @@ class ReducedDispersion:
         """Fit the shift to that of rays at film points all over the film; every second point measures the error."""
         random = np.random.default_rng(0)
         film = (random.random((2, _POINTS)) - 0.5) * np.array(self.film_mm)[:, None]
-        square = np.repeat(stratified(_SIDE, light_nm)[0][:, None], _POINTS, axis=1)
+        square = np.repeat(stratified(_SIDE, light_nm)[0].astype(np.float64)[:, None], _POINTS, axis=1)
         step = _STEP * self.film_mm[0], _STEP * self.film_mm[1]
         waves = np.linspace(*light_nm, _WAVES)
         found = np.stack([film_shift(self.camera, film, square, float(nm), self._nm, step) for nm in waves])

@@ -165,8 +165,9 @@ def _initialise(self: Any, props: Any, camera: Camera | None = None) -> None:
 
     Parameters in a scene: camera (a model, a lens file, "thin" or "pinhole"), focus_m (default inf), f_number,
     focal_length_mm, zoom, film_width_mm (default 36), film_height_mm (default: by the picture's shape), blades,
-    blade_rotation_deg, blade_curvature, aperture_mask, dispersion (default "full"), units_per_m (default 1), to_world (of the centre of the film
-    plane, without scale), film, sampler. From Python `camera` may be an object, which has its own film size in mm.
+    blade_rotation_deg, blade_curvature, aperture_mask, dispersion (default "full"), units_per_m (default 1), to_world
+    (of the centre of the film plane, without scale), film, sampler. From Python `camera` may be an object, which has
+    its own film size in mm.
     """
     libraries()[0].Sensor.__init__(self, props)
     film = self.film()

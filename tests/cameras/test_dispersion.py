@@ -20,8 +20,12 @@ from neurolens.readers.lensfile import read_lens
 
 ROOT = Path(__file__).parents[2]
 FILM = (36.0, 24.0)
-# Two with strong lateral colour, one with cylinders: how far the fitted shift may be from that of the rays, um RMS.
-LENSES = {"laikin_double_gauss_50": (FILM, 1.8), "horimoto_fisheye_16": (FILM, 2.8), "cooke_anamorphic_42": ((20.6, 17.3), 2.4)}  # fmt: skip
+# Two with strong lateral colour, one with cylinders.
+LENSES = {
+    "laikin_double_gauss_50": (FILM, 1.8),
+    "horimoto_fisheye_16": (FILM, 2.8),
+    "cooke_anamorphic_42": ((20.6, 17.3), 2.4),
+}
 LINES_NM = (486.1327, 656.2725)  # F and C
 
 
