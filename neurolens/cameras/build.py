@@ -6,6 +6,7 @@ Only a lens file needs torch, which is imported when one is asked for.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,6 +22,7 @@ from neurolens.cameras.ideal import ThickLens, ThinLens
 from neurolens.cameras.pinhole import PROJECTIONS, Fisheye, Pinhole, check_field
 from neurolens.cameras.sampling import beyond_circle, refuse
 from neurolens.cameras.vignetting import Vignetted
+from neurolens.graph.compiler import has_compiler
 from neurolens.lens.shot import Shot
 
 if TYPE_CHECKING:
@@ -41,8 +43,15 @@ def make_camera(spec: str | Path, shot: Shot, progress: Progress | None = None) 
         ModelError: a model that cannot be trusted.
         ModuleNotFoundError: a lens file without torch.
     """
-    camera = with_dispersion(_camera(str(spec), shot, progress), shot)
+    camera = with_dispersion(as_c(_camera(str(spec), shot, progress)), shot)
     return camera if shot.vignetting == "both" else Vignetted(camera, shot.vignetting, shot.wavelength_nm)
+
+
+def as_c(camera: Camera) -> Camera:
+    """An ideal lens as C where the machine has a compiler; other cameras as they are."""
+    with suppress(InputError):
+        return camera.compiled() if isinstance(camera, ThickLens) and has_compiler() else camera
+    return camera
 
 
 def with_dispersion(camera: Camera, shot: Shot) -> Camera:

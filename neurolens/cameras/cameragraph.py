@@ -6,11 +6,15 @@ the graph of their lens inside (`whole_camera`); cameras whose lens is a functio
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from neurolens.base import status as st
+from neurolens.cameras.contract import CameraRays, RayDifferentials
 from neurolens.graph.derive import derivative
 from neurolens.graph.ir import Graph, Value, pruned
 from neurolens.graph.program import FILM_X_Y
@@ -26,6 +30,7 @@ _NO_AREA = 1e-30
 # Outputs of a lens's graph with derivatives by the film point.
 D_FILM = tuple(derivative("scene_ray", by) for by in FILM_X_Y)
 _METRES = [1e-3, 1e-3, 1e-3, 1.0, 1.0, 1.0]
+_AHEAD = np.array([[0], [0], [0], [0], [0], [-1]], np.float32)
 
 
 @lru_cache(maxsize=16)
@@ -144,3 +149,18 @@ def whole_camera(
     g.outputs |= g.inline(weight_graph(derivatives, aperture, lens.stopped), given)
     g.outputs |= {name: value for name, value in (pupil | found).items() if name in also}
     return g, film.outline.numbers | film.numbers | {"stop_radius_mm": lens.stop_radius_mm}
+
+
+def camera_rays(found: Mapping[str, NDArray[Any]]) -> CameraRays:
+    """Rays of the outputs of `weight_graph`, [R, N] each; those that do not pass look ahead.
+
+    Derivatives by the film point stand together, `d_film` [6, 2, N].
+    """
+    ray, moves = found["ray"], found.get("d_film")
+    lost = np.flatnonzero(found["status"][0] != st.PASSED)
+    if lost.size:
+        ray[:, lost] = _AHEAD
+        if moves is not None:
+            moves[..., lost] = 0
+    differentials = None if moves is None else RayDifferentials(moves[:3], moves[3:])
+    return CameraRays(ray[:3], ray[3:], found["weight"][0], found["status"][0], differentials)

@@ -10,24 +10,30 @@ order.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
-from typing import Any
+from functools import lru_cache
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
+from neurolens.cameras.cameragraph import camera_rays
 from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints, FloatArray, RayDifferentials, towards
 from neurolens.cameras.sampling import (
+    LEAST_COS2,
     ahead,
     arrived,
     concentric_disk,
     ideal_state,
     positive,
-    sound,
     stratified,
 )
+from neurolens.graph.interpret import evaluate
+from neurolens.graph.ir import Graph, Value
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.film_plane import film_z_mm
 from neurolens.lens.shot import check_film
@@ -106,30 +112,16 @@ class ThickLens:
         }
         # The exposure on the axis is pi rho^2 / (1 + rho^2), with the slope rho of the exit pupil's rim.
         self._exposure = 1.0 + (self.radius_mm * f / self._seen) ** 2
+        self._run: Callable[[dict[str, FloatArray]], dict[str, NDArray[Any]]] = self._evaluated
         if aperture is not None:
             square, wavelength = stratified(_QUADRATURE, (550.0, 550.0))
             self._part = float(self.sample(np.zeros_like(square), square, wavelength).weight.mean(dtype=np.float64))
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """Rays for film points [2, N] in mm and pupil samples [2, N]; the wavelength changes nothing."""
-        count = film_mm.shape[1]
-        entrance = concentric_disk(pupil) * np.float32(self.radius_mm)
-        direction = np.empty((3, count), np.float32)
-        direction[2] = -1.0
-        origin = np.empty((3, count), np.float32)
-        origin[2] = 1e-3 * (self.front_z_mm - self.film_z_mm)
-        with np.errstate(over="ignore", invalid="ignore"):
-            slope = self._slopes(film_mm, entrance)
-            height = film_mm + slope * np.float32(self.image_distance_mm)
-            # Written per unit of depth, an object plane at infinity is no special case.
-            direction[:2] = film_mm / np.float32(-self.image_distance_mm) - height * np.float32(self._per_depth)
-            direction /= np.sqrt(np.einsum("in,in->n", direction, direction))
-            cos2 = 1.0 / (1.0 + np.einsum("in,in->n", slope, slope))
-            np.multiply(height, np.float32(1e-3), out=origin[:2])
-        weight = cos2 * cos2 * np.float32(self._exposure / self._part)
-        status = self._stopped(entrance, np.zeros(count, np.int32))
-        weight = np.where(status == st.PASSED, weight, np.float32(0))
-        return sound(CameraRays(origin, direction, weight, status), cos2, pupil, wavelength_nm)
+        given = {"film_mm": film_mm, "square": pupil, "wavelength_nm": wavelength_nm[None]}
+        with np.errstate(all="ignore"):  # of points that are not sound
+            return camera_rays(self._run({k: np.ascontiguousarray(v, np.float32) for k, v in given.items()}))
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """Sample rays as `sample` does, with their differentials; the origins move on the front principal plane."""
@@ -165,6 +157,38 @@ class ThickLens:
         status = self._stopped(entrance, ahead(depth))
         return arrived(film, 1e-3 * np.concatenate([height, plane]), point_m, weight, status, wavelength_nm)
 
+    def compiled(self) -> Self:
+        """The same camera run as C, but for a mask in its stop, whose table is too large.
+
+        Raises:
+            InputError: no C compiler, or one that fails.
+        """
+        from neurolens.cameras.lenscamera import CompiledGraph
+
+        other = copy(self)
+        if self.aperture is None or self.aperture.mask is None:
+            other._run = CompiledGraph(ideal_graph(self.aperture), self._numbers, np.zeros((1, 1, 8), np.float32))
+        return other
+
+    def _evaluated(self, rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
+        mask = {} if self.aperture is None or self.aperture.mask is None else {"mask": self.aperture.table}
+        numbers = {name: np.array([[value]], np.float32) for name, value in self._numbers.items()}
+        return evaluate(ideal_graph(self.aperture), rays | numbers | mask)
+
+    @property
+    def _numbers(self) -> dict[str, float]:
+        """The inputs of the call of `ideal_graph`."""
+        return {
+            "radius_mm": self.radius_mm,
+            "spread": self.focal_length_mm / self._seen,
+            "lean": -self._x / self._seen,
+            "image_distance_mm": self.image_distance_mm,
+            "per_image_distance": -1 / self.image_distance_mm,
+            "per_depth": -self._per_depth,
+            "scale": self._exposure / self._part,
+            "place_m": 1e-3 * (self.front_z_mm - self.film_z_mm),
+        }
+
     def _slopes(self, film_mm: NDArray[Any], entrance_mm: NDArray[Any]) -> NDArray[Any]:
         """Slopes [2, N] of the film-side rays of film points towards the images of points of the entrance pupil."""
         return entrance_mm * (self.focal_length_mm / self._seen) - film_mm * (self._x / self._seen)
@@ -175,6 +199,49 @@ class ThickLens:
             return status
         inside = self.aperture.inside(opening_mm[0], opening_mm[1], self.radius_mm)
         return np.where(inside | (status != st.PASSED), status, st.blocked(0, st.RIM)).astype(np.int32)
+
+
+@lru_cache(maxsize=16)
+def ideal_graph(aperture: Aperture | None = None) -> Graph:
+    """The rays of an ideal lens as a graph, whose numbers are inputs of the call (`ThickLens._numbers`).
+
+    Inputs and outputs are those of `cameragraph.whole_camera`.
+    """
+    g = Graph()
+    film, square, light = g.input("film_mm", 2), g.input("square", 2), g.input("wavelength_nm")
+    names = "radius_mm spread lean image_distance_mm per_image_distance per_depth scale place_m"
+    radius_mm, spread, lean, distance, per_distance, per_depth, scale, place = (
+        g.input(name, per_call=True) for name in names.split()
+    )
+    entrance = _disk(g, square) * radius_mm
+    slope = entrance * spread + film * lean
+    height = film + slope * distance
+    across = film * per_distance + height * per_depth  # an object plane at infinity is no special case
+    direction = g.concat(across, g.constant(-1.0)) * (1.0 / (g.square(across) + 1.0).sqrt())
+    cos2 = 1.0 / (1.0 + g.square(slope))
+    status = g.constant(float(st.PASSED))
+    if aperture is not None:
+        status = g.select(aperture.opening(g, entrance, radius_mm), status, float(st.blocked(0, st.RIM)))
+    sound = cos2.between(LEAST_COS2, 2.0) & light.between(1e-30, 1e30)
+    for part in g.split(square, (1, 1)):
+        sound = sound & part.between(0.0, 1.0)
+    status = g.select(sound, status, float(st.OUTSIDE_DOMAIN))
+    g.outputs["ray"] = g.concat(height * 1e-3, place, direction)
+    g.outputs["weight"] = g.select(status <= float(st.PASSED), cos2 * cos2 * scale, 0.0)
+    g.outputs["status"] = status.whole()
+    return g
+
+
+def _disk(g: Graph, square: Value) -> Value:
+    """`sampling.concentric_disk` in a graph."""
+    a, b = g.split(square * 2.0 - 1.0, (1, 1))
+    steep = a.abs() <= b.abs()
+    radius, other = g.select(steep, b, a), g.select(steep, a, b)
+    angle = other * radius * (math.pi / 4) * (1.0 / (radius * radius).maximum(1e-30))
+    turn2 = angle * angle  # at most (pi / 4)^2, where these series end below the rounding of float32
+    cos = g.series(turn2, [(-1) ** k / math.factorial(2 * k) for k in range(6)])
+    sin = angle * g.series(turn2, [(-1) ** k / math.factorial(2 * k + 1) for k in range(5)])
+    return g.concat(g.select(steep, sin, cos), g.select(steep, cos, sin)) * radius
 
 
 class ThinLens(ThickLens):

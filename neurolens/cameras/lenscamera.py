@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from copy import copy
 from functools import cached_property
 from pathlib import Path
@@ -24,14 +24,13 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.cameragraph import D_FILM, LensGraph, weight_graph, whole_camera
+from neurolens.cameras.cameragraph import D_FILM, LensGraph, camera_rays, weight_graph, whole_camera
 from neurolens.cameras.companions import Shift, companion_graph, fit_shift
 from neurolens.cameras.contract import (
     MANY_RAYS_A_CALL,
     RAYS_A_CALL,
     CameraRays,
     FloatArray,
-    RayDifferentials,
     SpectralRays,
 )
 from neurolens.cameras.onnxlens import open_session, run_batches
@@ -51,7 +50,6 @@ from neurolens.surrogates.assemble import ONNX, SCALARS, Form
 _ROUND = 0.02  # of the squeeze: less than this from 1 is the error of a model, not a cylinder
 # Points a side of the quadrature of the exposure on the axis.
 _QUADRATURE = 256
-_AHEAD = np.array([[0], [0], [0], [0], [0], [-1]], np.float32)
 
 
 class SceneRays(NamedTuple):
@@ -150,21 +148,6 @@ class LensFilm:
         if not exposure > 0:
             raise InputError("camera", "f_number, focus_m", "(no ray passes on the axis)", "a lens that light can pass")
         return exposure
-
-
-def camera_rays(found: Mapping[str, NDArray[Any]]) -> CameraRays:
-    """Rays of the outputs of `cameragraph.weight_graph`, [R, N] each; those that do not pass look ahead.
-
-    Derivatives by the film point stand together, `d_film` [6, 2, N].
-    """
-    ray, moves = found["ray"], found.get("d_film")
-    lost = np.flatnonzero(found["status"][0] != st.PASSED)
-    if lost.size:
-        ray[:, lost] = _AHEAD
-        if moves is not None:
-            moves[..., lost] = 0
-    differentials = None if moves is None else RayDifferentials(moves[:3], moves[3:])
-    return CameraRays(ray[:3], ray[3:], found["weight"][0], found["status"][0], differentials)
 
 
 Runtime = Literal["onnxruntime", "c", "trace"]
@@ -361,7 +344,7 @@ def _compiled(graph: Graph, numbers: dict[str, float], film: LensFilm, lens: Len
     """A graph of the camera as a compiled function; a mask in the stop is tested on the rays that come back."""
     table = film.outline.table
     groups = table.reshape(len(table), -1, 5)
-    run = _CompiledGraph(graph, numbers, np.pad(groups, ((0, 0), (0, 0), (0, padded_columns(5) - 5))))
+    run = CompiledGraph(graph, numbers, np.pad(groups, ((0, 0), (0, 0), (0, padded_columns(5) - 5))))
     mask = lens.aperture if lens.blades is None else None
     if mask is None:
         return run
@@ -378,7 +361,7 @@ def _compiled(graph: Graph, numbers: dict[str, float], film: LensFilm, lens: Len
     return masked
 
 
-class _CompiledGraph:
+class CompiledGraph:
     """A camera's graph as a compiled function, with numbers of the call and the outline's table."""
 
     def __init__(self, graph: Graph, numbers: dict[str, float], table: FloatArray) -> None:

@@ -13,7 +13,7 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.contract import CameraRays, FilmPoints, FloatArray
 
 _BEYOND = 1.02  # diagonal of the film over the image circle: 36x24 over 43.2 mm is as lenses are engraved
-_LEAST_COS2 = 1e-30  # squares of tangents beyond come near the end of float32
+LEAST_COS2 = 1e-30  # squares of tangents beyond come near the end of float32
 _AHEAD = np.array([[0], [0], [-1]], np.float32)
 
 
@@ -64,9 +64,9 @@ def sound(rays: CameraRays, cos2: FloatArray, square: FloatArray, wavelength_nm:
     """
     lit = is_light(wavelength_nm)
     # Written so that NaN fails.
-    if cos2.min(initial=1) > _LEAST_COS2 and square.min(initial=0) >= 0 and square.max(initial=0) <= 1 and lit.all():
+    if cos2.min(initial=1) > LEAST_COS2 and square.min(initial=0) >= 0 and square.max(initial=0) <= 1 and lit.all():
         return rays
-    good = (cos2 > _LEAST_COS2) & ((square >= 0) & (square <= 1)).all(0) & lit
+    good = (cos2 > LEAST_COS2) & ((square >= 0) & (square <= 1)).all(0) & lit
     return CameraRays(
         np.where(good, rays.origin_m, np.float32(0)),
         np.where(good, rays.direction, _AHEAD),
