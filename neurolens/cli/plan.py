@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from neurolens.base.files import atomic_write_text, library, write_json
 from neurolens.base.records import NOISY, plain, program
-from neurolens.base.settings import setting
+from neurolens.base.settings import setting, setting_of
 from neurolens.cli.arguments import Glasses, Reporting, check_run_folder, lens, output_path
 from neurolens.cli.keys import Frames, frames_group, frames_of
 from neurolens.cli.output import number, table
 from neurolens.cli.trade import answer_trade
+from neurolens.lens.shot import Dispersion, Shot
 
 if TYPE_CHECKING:
     from neurolens.lens.prescription import Lens
@@ -69,11 +70,11 @@ class Plan(Glasses, Reporting):
     Errors are distances between footprints, the picture of a point by a camera and by the exact lens: the
     least RMS way on which light moves to turn one into the other, in pixels of the scene's picture (place,
     size and shape of the blur, each wavelength by itself), and the relative error of light, of which 1% is
-    allowed. Both are those that 95% of the picture keep. The cost of a ray, times the noise of its weights,
+    allowed. Both are those that 95% of the picture keep. The cost of a path, times the noise of its picture,
     is proportional to the time to equal error: measured here, on one thread; of Cycles counted and turned
-    into its nanoseconds, measured once; of GLSL in operations. The exact lens is chosen where the cheapest
-    camera would not make the whole work 1.5 times as fast; for our renderer the rest of a picture counts,
-    too."""
+    into its nanoseconds, measured once; of GLSL in operations. For our renderer the whole picture counts,
+    and the noise that dispersion adds. Cameras that take up to 1.2 times the least are alike, and the exact
+    lens is chosen where it is one of them."""
 
     about: ClassVar[str] = "what a scene asks of a lens, and the camera to use"
     epilog: ClassVar[str] = """\
@@ -88,10 +89,10 @@ models/ with what was fitted, and plan.toml: 'render' and 'export' take it for t
 model of the shot from it, from scratch.
 
 --trade draws what the scene's error costs, marks the cameras that no other betters and the choice for the budget,
-and says what half of its time would buy. Seconds are of one thread, for the scene's own size and samples, and what
-a camera adds to them: its rays, and what the scene takes for the further rays that its noise asks for. What the
-scene takes by itself stands beside them; a small picture in our renderer measures it. Of other targets the camera
-alone counts, in Cycles under a white sky; of GLSL its operations. -o (default: runs/trade-SCENE-LENS) leaves
+and says what half of its time would buy. Seconds are of one thread and of the whole picture at the scene's own size,
+to the noise that the exact lens has with the scene's samples; the camera's share stands beside them. Strips of the
+picture in our renderer measure what a path takes, and its noise. Of other targets the camera alone counts, in Cycles
+under a white sky; of GLSL its operations. -o (default: runs/trade-SCENE-LENS) leaves
 trade.html (one page that needs no other file: small pictures side by side, their difference from the exact lens's,
 the table), trade.png, trade.json and models/ with what was fitted."""
     kept: ClassVar[str] = "models fitted so far are kept, the plan is not written"
@@ -111,6 +112,7 @@ the table), trade.png, trade.json and models/ with what was fitted."""
         (), "what compositing makes of the picture later, distortion (with its light, by an ST map), defocus or both "
         "with a comma: the camera is held against the lens without it", kind=_afterwards, metavar="EFFECTS",
     )  # fmt: skip
+    dispersion: Dispersion = setting_of(Shot, "dispersion")
     denoise: bool = setting(False, "noise is taken out later: charge no camera for it")
     zoom: str | None = setting(
         None, "state of the lens by name, or a focal length in mm between its states", metavar="STATE"
@@ -140,7 +142,8 @@ the table), trade.png, trade.json and models/ with what was fitted."""
         check_run_folder(folder, self.called, "--output")
         look: dict[str, Any] = {
             "target": self.target, "models": shipped_models(lens, self.zoom), "afterwards": self.comp,
-            "denoised": self.denoise, "folder": None if self.no_fit else folder / "models",
+            "denoised": self.denoise, "dispersion": self.dispersion or "full",
+            "folder": None if self.no_fit else folder / "models",
         }  # fmt: skip
         if self.trade:
             from neurolens.plan.plan import trade
@@ -274,8 +277,8 @@ def _text(command: Plan, result: plans.Plan, folder: Path) -> str:
         ], left=2))  # fmt: skip
         parts.append(
             "* to use, + within the budget; px, light: errors that 95% of the picture keep; "
-            f"{result.unit} a ray times noise, the rays it takes for equal error; ~ noisy: the median of its calls "
-            f"took more than {NOISY:g} times the least, which is shown"
+            f"{result.unit} of the camera on a path times noise, the paths it takes for equal error; ~ noisy: the "
+            f"median of its calls took more than {NOISY:g} times the least, which is shown"
         )
     best = result.best
     if best is None and result.budget_s is not None:
@@ -291,11 +294,15 @@ def _text(command: Plan, result: plans.Plan, folder: Path) -> str:
         if result.budget_flip is not None:
             allowed = f"FLIP {number(best.flip, 2)} of {result.budget_flip:g}"
         sentence = f"Use {best.name}: {number(best.error_px, 3)} px {allowed}, {number(best.cost, 3)} "
-        sentence += f"{result.unit} a ray times noise"
-        if best.error_px == 0 and result.rest:
-            sentence += (
-                f"; a path takes {number(result.rest, 3)} besides, and no camera with an error saves enough of that"
-            )
+        sentence += f"{result.unit} a path times noise"
+        if rest := result.work.rest[best.disperses]:
+            sentence += f", of {number(best.whole(result.work, request.denoised), 3)}; without camera and noise a path "
+            sentence += f"takes {number(rest, 3)}"
+        if len(result.alike) > 1:
+            sentence += f".\nAny of these takes about as long: {', '.join(result.alike)}"
+        if (times := result.work.noise[best.disperses]) > 1 and not request.denoised:
+            sentence += f".\nDispersion takes {number(times, 2)} times the samples; --dispersion lateral leaves "
+            sentence += "longitudinal colour out"
         parts.append(
             "\n".join([f"{sentence}{', ' + best.how if best.how else ''}", *_commands(command, result, best, folder)])
         )
@@ -309,6 +316,7 @@ def _commands(command: Plan, result: plans.Plan, best: Choice, folder: Path) -> 
     lens = result.probed.lens
     model, shape = best.camera.endswith(".onnx"), lens.aperture
     state = ["--zoom", command.zoom] if command.zoom is not None and not model else []
+    state += ["--dispersion", command.dispersion] if command.dispersion not in (None, "full") else []
     words = ["render", str(command.scene), "--camera", f"{folder}/plan.toml", *state, "-o", "render.exr"]
     if model and shape is not None and shape.blades:  # models have none of their own
         words += ["--blades", f"{shape.blades}", "--blade-rotation", f"{shape.rotation_deg:g}"]
@@ -345,7 +353,7 @@ def _frames_text(command: Plan, result: FramesPlan, folder: Path) -> str:
     models = "no model is" if not result.fits else "1 model is" if result.fits == 1 else f"{result.fits} models are"
     sentence = f"{models} fitted; probed: frames {', '.join(map(str, result.probed))}"
     if result.cost is not None:
-        sentence += f"; {number(result.cost, 3)} {result.unit} a ray times noise, the mean of all frames"
+        sentence += f"; {number(result.cost, 3)} {result.unit} of a camera on a path times noise, mean of all frames"
     parts = [
         table(("effect", "worth", "", "beyond", ""), effects),
         table(("frames", "camera", "px", result.unit, ""), runs, left=2),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from neurolens.base.files import atomic_write_text, write_json
 from neurolens.base.records import plain
@@ -34,8 +34,12 @@ def answer_trade(command: Answering, result: Trade, folder: Path, title: str, na
     )  # fmt: skip
     atomic_write_text(folder / "trade.html", _page(result, folder, title))
     flips = {s.offer.choice.name: s.flip for s in result.shown}
-    rows = [{**asdict(o.choice), "seconds": o.seconds, "flip": flips.get(o.choice.name)} for o in result.offered]
-    data = {**names, "unit": result.unit, "base": result.base, "cameras": rows}
+    rows = [
+        {**asdict(o.choice), "seconds": o.seconds, "camera_seconds": o.camera, "flip": flips.get(o.choice.name)}
+        for o in result.offered
+    ]
+    data: dict[str, Any] = {**names, "unit": result.unit, "work": asdict(result.plan.work), "cameras": rows}
+    data |= {"alike": result.plan.alike}
     data |= {"front": [o.choice.name for o in result.front], "chosen": chosen and chosen.choice.name}
     data |= {"half": result.half and result.half.choice.name}
     write_json(folder / "trade.json", plain(data))
@@ -63,10 +67,12 @@ def _sentences(result: Trade) -> list[str]:
     chosen, half = result.chosen, result.half
     if chosen is None:
         return [f"No camera keeps {result.plan.budget_px:g} px."]
-    sentences = [f"For {result.plan.budget_px:g} px: {_short(chosen)}, which adds {_time(result, chosen)}, "
-            f"{number(chosen.choice.error_px, 3)} px"]  # fmt: skip
-    if result.base:
-        sentences[0] += f"; the scene itself takes {number(result.base, 3)} {result.unit}"
+    sentences = [f"For {result.plan.budget_px:g} px: {_short(chosen)}, with which the {result.what} takes "
+            f"{_time(result, chosen)}, {number(chosen.choice.error_px, 3)} px"]  # fmt: skip
+    if result.what != "camera":
+        sentences[0] += f"; the camera takes {number(chosen.camera, 2)} {result.unit} of that"
+    if len(result.plan.alike) > 1:
+        sentences.append(f"Any of these takes about as long: {', '.join(result.plan.alike)}")
     if half is None:
         least = result.front[0]
         sentences.append(f"Half of that buys no camera: the least is {_time(result, least)}, {_short(least)}, "
@@ -85,11 +91,13 @@ def _text(result: Trade, folder: Path) -> str:
     flips, front = {s.offer.choice.name: s.flip for s in result.shown}, result.front
     rows = [
         ("*" if o == result.chosen else "+" if o in front else "", o.choice.name, number(o.choice.error_px, 3),
-         number(o.choice.light_error, 2), _seconds(o), number(flips.get(o.choice.name), 2), o.choice.how)
+         number(o.choice.light_error, 2), _seconds(o), number(o.camera, 2), number(o.choice.noise, 3),
+         number(flips.get(o.choice.name), 2), o.choice.how)
         for o in result.offered
     ]  # fmt: skip
-    shown = table(("", "camera", "px", "light", result.unit, "FLIP", ""), rows, left=2)
-    legend = f"* for the budget, + no other betters it; {result.unit}: added, of one thread to equal noise, ~ noisy; "
+    shown = table(("", "camera", "px", "light", result.unit, "in camera", "noise", "FLIP", ""), rows, left=2)
+    legend = f"* for the budget, + no other betters it; {result.unit}: of the {result.what}, one thread, to the noise "
+    legend += "that the exact lens has with the scene's samples, ~ noisy; noise: times the paths that this takes; "
     legend += f"FLIP at {result.samples} samples a pixel of the same random numbers, with noise where cameras use them "
     legend += "otherwise"
     written = f"Written: {folder}/trade.html, trade.png, pictures.png, trade.json"
@@ -103,18 +111,18 @@ def _page(result: Trade, folder: Path, title: str) -> str:
     flips = {s.offer.choice.name: s.flip for s in result.shown}
     records = [
         {**asdict(o.choice), "seconds": {"min": o.seconds, "median": o.seconds + o.more},
-         "flip": flips.get(o.choice.name)} for o in result.offered
+         "camera": o.camera, "flip": flips.get(o.choice.name)} for o in result.offered
     ]  # fmt: skip
     columns = (
         pages.Column("error, px", "error_px", about="distance of footprints that 95% of the picture keep"),
         pages.Column("light, %", "light_error", 100, 2, "relative error of light that 95% of the picture keep"),
         pages.Column(
-            f"{result.unit} added",
+            result.unit,
             "seconds.min",
-            about="one thread, the scene's size and samples, to equal noise; ~ noisy",
+            about=f"of the {result.what}, one thread, to the exact lens's noise with the scene's samples; ~ noisy",
         ),
-        pages.Column("a ray", "cost", about=f"{result.plan.unit} times the noise"),
-        pages.Column("noise", "noise", about="times the rays that equal error takes"),
+        pages.Column("in the camera", "camera", about=f"{result.unit} of these"),
+        pages.Column("noise", "noise", about="times the paths that equal error takes"),
         pages.Column("FLIP", "flip", digits=2, about="of the small pictures, from the exact lens's"),
     )
     front = result.front

@@ -23,14 +23,14 @@ from neurolens.base.errors import InputError, ModelError, NeurolensWarning
 from neurolens.base.lensname import IDEAL_OF, split_kind
 from neurolens.base.progress import Report
 from neurolens.base.records import Timing, noisy
-from neurolens.cameras.build import ideal_as
+from neurolens.cameras.build import as_c, ideal_as, with_dispersion
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.model import OnnxCamera, OnnxLens, load_model
 from neurolens.cameras.warped import Warped
 from neurolens.graph.compiler import has_compiler
 from neurolens.graph.scalars import lower
 from neurolens.plan import footprints as prints
-from neurolens.plan.costs import CYCLES_NS, GLSL_OPERATIONS, glsl_operations, noise, ns_a_ray, shader_cost
+from neurolens.plan.costs import ALONE, CYCLES_NS, GLSL_OPERATIONS, Work, glsl_operations, noise, ns_a_ray, shader_cost
 from neurolens.plan.footprints import Footprints
 from neurolens.plan.probe import COUNTED, LIGHT, Probe
 from neurolens.shaders.blender_shader import IDLE, lens_of
@@ -46,7 +46,7 @@ Target = Literal["render", "c", "onnx", "osl", "glsl"]
 Cost = Callable[[], tuple[Timing, float]]  # of a ray, and noise
 EXACT = "exact"
 OURS = ("render", "c")  # targets that run compiled C
-_IDEAL = ("pinhole", "thin", "thick")
+IDEAL = ("pinhole", "thin", "thick")
 _MAPPED = " + ST map"  # after the name of an ideal camera
 FITTED = "fitted for this shot"
 _CLOSE = 1.3  # times the operations of the smallest model that holds, up to which others of its form are timed
@@ -60,13 +60,14 @@ class Choice:
     Attributes:
         camera: the text that `--camera` or `export` takes.
         error_px, light_error: at the counted percentile; inf where it has no light that the lens has.
-        cost: of a ray, in the plan's unit, times `noise`; inf where it was not asked for.
-        noise: how many times the rays it needs for equal error, see `costs`.
+        cost: of the camera on a path, in the plan's unit, times `noise`; inf where it was not asked for.
+        noise: how many times the paths it needs for equal error, see `costs`.
         how: what else it needs, or how it was made.
         within: whether it meets the budget of its plan.
         settings: of a model that was fitted for the shot.
         flip: of its picture, where a budget of FLIP asked for it.
         spread: how many times as long as the least the median of its timed calls took (1 where cost is counted).
+        disperses: whether its picture depends on the wavelength.
     """
 
     name: str
@@ -80,6 +81,7 @@ class Choice:
     settings: ModelSettings | None = None
     flip: float | None = None
     spread: float = 1.0
+    disperses: bool = False
 
     @property
     def noisy(self) -> bool:
@@ -90,15 +92,22 @@ class Choice:
         """Whether it may be used."""
         return self.error_px <= budget_px and self.light_error <= LIGHT
 
+    def whole(self, work: Work, denoised: bool = False) -> float:
+        """The cost of a path, times the noise of its picture unless that is taken out later."""
+        return self.cost + work.rest[self.disperses] * (1.0 if denoised else self.noise)
+
 
 def candidates(
     probed: Probe, budgets_px: Sequence[float], target: Target, *, models: Sequence[Path] = (),
-    folder: Path | None = None, explain: bool = False, report: Report | None = None,
+    folder: Path | None = None, explain: bool = False, report: Report | None = None, work: Work = ALONE,
 ) -> tuple[Choice, ...]:  # fmt: skip
-    """Cameras with error and cost, enough to decide for each of some budgets; arguments as for `plan.plan`."""
+    """Cameras with error and cost, enough to decide for each of some budgets; arguments as for `plan.plan`.
+
+    `work`: of the paths of the target.
+    """
     say = report or (lambda done, left=None: None)
     say(0.2)
-    trial = Trial(probed, target, tuple(budgets_px), explain)
+    trial = Trial(probed, target, tuple(budgets_px), explain, work)
     tried = [*_ideal(trial), *_exact(trial)]
     # One thread fits while the other measures what ships: neither needs the other. A film beyond the end of a model's
     # range is no warning here: its error counts.
@@ -131,12 +140,14 @@ class _Judged:
 
 @dataclass(frozen=True)
 class Trial:
-    """The scene, target and budgets that cameras are tried for, and whether all are to have their cost."""
+    """The scene, target and budgets that cameras are tried for, whether all are to have their cost, and the work of a
+    path."""
 
     probed: Probe
     target: Target
     budgets_px: tuple[float, ...] = ()
     explain: bool = False
+    work: Work = ALONE
 
     @property
     def share(self) -> prints.Array:
@@ -150,7 +161,7 @@ class Trial:
 
     def judged(
         self, name: str, spec: str, seen: Footprints, cost: Cost, how: str = "", form: str = "", size: int = 0,
-        beside: prints.Array | float = 0.0,
+        beside: prints.Array | float = 0.0, disperses: bool = False,
     ) -> _Judged:  # fmt: skip
         """A camera's error against the exact footprints, its cost not known yet; `beside`: light outside the lens's."""
         probed = self.probed
@@ -159,15 +170,18 @@ class Trial:
         if "distortion" in probed.asked.afterwards:  # its map corrects light, too
             light = np.where(seen.light > 0, 0.0, light)
         error, dim = (float(np.percentile(np.where(np.isfinite(v), v, np.inf), COUNTED)) for v in (apart, light))
-        choice = Choice(name, spec, error, dim, math.inf, noise(seen.weight, self.share), how)
+        times = noise(seen.weight, self.share) * self.work.noise[disperses]
+        choice = Choice(name, spec, error, dim, math.inf, times, how, disperses=disperses)
         return _Judged(choice, cost, form, size)
 
     def costed(self, judged: _Judged) -> Choice:
         """A camera with its cost."""
-        choice, (timing, times) = judged.choice, judged.cost()
+        choice, (timing, weights) = judged.choice, judged.cost()
+        times = weights * self.work.noise[choice.disperses]
+        a_path = timing["min"] * self.work.calls[choice.disperses]
         return replace(
             choice,
-            cost=timing["min"] * (1.0 if self.probed.asked.denoised else times),
+            cost=a_path * (1.0 if self.probed.asked.denoised else times),
             noise=times,
             spread=timing["median"] / timing["min"] if timing["min"] else 1.0,
             # A shader that does not focus so near shows nothing.
@@ -175,7 +189,7 @@ class Trial:
         )
 
     def timed(self, camera: Camera, seen: Footprints) -> tuple[Timing, float]:
-        """The cost of a camera that runs here, by the clock."""
+        """The cost of a ray of a camera that runs here, by the clock, and the noise of its weights."""
         return ns_a_ray(camera, self.probed.places), noise(seen.weight, self.share)
 
     def counted(self, cost: float, seen: Footprints) -> tuple[Timing, float]:
@@ -207,12 +221,13 @@ def camera_of(probed: Probe, choice: Choice) -> Camera:
     """
     kind, path = split_kind(choice.camera)
     if choice.name == EXACT:
-        return probed.exact
+        return with_dispersion(probed.exact, probed.asked.shot)
     if kind in IDEAL_OF:
-        flat = ideal_as(kind, probed.exact.lens, probed.asked.shot)
+        flat = as_c(ideal_as(kind, probed.exact.lens, probed.asked.shot))
         mapped = choice.name.endswith(_MAPPED)
         return Warped(flat, probed.exact, probed.asked.shot.focus_m, tables=probed.exact_field) if mapped else flat
-    return OnnxCamera(load_model(path), probed.asked.shot, runtime="c" if kind else "onnxruntime")
+    model = OnnxCamera(load_model(path), probed.asked.shot, runtime="c" if kind else "onnxruntime")
+    return with_dispersion(model, probed.asked.shot)
 
 
 def _ideal(trial: Trial) -> Iterator[_Judged]:
@@ -221,10 +236,10 @@ def _ideal(trial: Trial) -> Iterator[_Judged]:
     In C and GLSL they are their own source.
     """
     probed, shot = trial.probed, trial.probed.asked.shot
-    for name in {"onnx": (), "osl": _IDEAL[:2]}.get(trial.target, _IDEAL):
+    for name in {"onnx": (), "osl": IDEAL[:2]}.get(trial.target, IDEAL):
         spec = f"{name}:{probed.lens.path}"
         with suppress(InputError):  # no thick lens of cylinders; no maps of half a sphere, or of a film that is dark
-            camera = ideal_as(f"{name}:", probed.exact.lens, shot)
+            camera = as_c(ideal_as(f"{name}:", probed.exact.lens, shot))
             seen = prints.footprints(camera, probed.places)
             yield trial.judged(name, spec, seen, partial(trial.ideal, name, camera, seen))
             # In our renderer the thick lens stands in the thin one's place.
@@ -238,16 +253,20 @@ def _ideal(trial: Trial) -> Iterator[_Judged]:
 
 
 def _exact(trial: Trial) -> Iterator[_Judged]:
-    """The exact lens, which has no error: as C where that runs, and as code where its surfaces have a form in it."""
+    """The exact lens, which has no error with all of its dispersion: as C where that runs, and as code where its
+    surfaces have a form in it."""
     probed, target = trial.probed, trial.target
+    shown = with_dispersion(probed.exact, probed.asked.shot)
+    seen = probed.seen if shown is probed.exact else prints.footprints(shown, probed.places)
     exact, path, compiled = probed.exact, probed.lens.path, probed.exact.runtime == "c"
     cost: Cost = {
         "osl": lambda: trial.shader(path),
         "glsl": lambda: trial.counted(glsl_operations(exact), probed.seen),
-    }.get(target, lambda: trial.timed(exact, probed.seen))
+    }.get(target, lambda: trial.timed(shown, seen))
     if target in ("render", "osl", "glsl") or (target == "c" and compiled):
         with suppress(InputError):  # a shader that is too large
-            yield trial.judged(EXACT, f"{'fused:' if compiled and target in OURS else ''}{path}", probed.seen, cost)
+            spec = f"{'fused:' if compiled and target in OURS else ''}{path}"
+            yield trial.judged(EXACT, spec, seen, cost, disperses=shown.dispersive)
 
 
 def _model(trial: Trial, file: Path, how: str = "", without: Collection[str] = ()) -> Iterator[_Judged]:
@@ -266,7 +285,9 @@ def _model(trial: Trial, file: Path, how: str = "", without: Collection[str] = (
         form = model.card["fit"]["method"].partition("-")[0]
         if form in without or not (compiled or target != "c"):
             return
-        camera = OnnxCamera(model, trial.probed.asked.shot, outline=trial.probed.exact.film.outline)
+        shot = trial.probed.asked.shot
+        whole = OnnxCamera(model, shot, outline=trial.probed.exact.film.outline)
+        camera = with_dispersion(whole, shot)
         seen = prints.footprints(camera, trial.probed.places)
         beside = prints.light_beside(camera, trial.probed.places) / np.maximum(trial.probed.seen.light, 1e-30)
 
@@ -274,11 +295,12 @@ def _model(trial: Trial, file: Path, how: str = "", without: Collection[str] = (
             if target == "osl":
                 return trial.shader(file)
             if target == "glsl":
-                return trial.counted(glsl_operations(camera), seen)
-            return trial.timed(camera.compiled() if compiled else camera, seen)
+                return trial.counted(glsl_operations(whole), seen)
+            return trial.timed(with_dispersion(whole.compiled(), shot) if compiled else camera, seen)
 
         spec = f"{'fused:' if compiled else ''}{file}"
-        yield trial.judged(file.stem, spec, seen, cost, how, form, _operations(model), beside)
+        size = _operations(model)
+        yield trial.judged(file.stem, spec, seen, cost, how, form, size, beside, camera.dispersive)
 
 
 def _operations(model: OnnxLens) -> int:
@@ -311,11 +333,13 @@ def _costed(trial: Trial, tried: Sequence[_Judged]) -> Iterator[Choice]:
         yield trial.costed(j) if id(j) in asked else j.choice
 
 
-def model_choice(probed: Probe, target: Target, file: Path, how: str, costed: bool) -> Choice | None:
+def model_choice(
+    probed: Probe, target: Target, file: Path, how: str, costed: bool, work: Work = ALONE
+) -> Choice | None:
     """A model in the form that the target runs; None where it has none, or its domain is not the shot's."""
     with warnings.catch_warnings():  # film beyond the end of its range: its error counts
         warnings.simplefilter("ignore", NeurolensWarning)
-        trial = Trial(probed, target)
+        trial = Trial(probed, target, work=work)
         judged = next(_model(trial, file, how), None)
         return None if judged is None else trial.costed(judged) if costed else judged.choice
 
@@ -368,10 +392,10 @@ def shot_fits(
 def _fitted(trial: Trial, folder: Path, tried: Sequence[_Judged], say: Report) -> list[_Judged]:
     """Polynomials fitted for the shot alone: the smallest that holds each budget, and those on the way to it.
 
-    None where a camera without a lens does, in targets where it costs less than any, unless all is asked for.
+    None where a camera without a lens does, which costs less than any, unless all is asked for.
     """
-    probed, ideal = trial.probed, ("pinhole",) if trial.target in OURS else ("pinhole", "thin")
-    easy = [j.choice for j in tried if j.choice.name.startswith(ideal) and not trial.explain]
+    probed = trial.probed
+    easy = [j.choice for j in tried if j.choice.name.startswith(IDEAL) and not trial.explain]
     # Nothing that is fitted has no error.
     asked = [b for b in trial.budgets_px if (b > 0 or trial.explain) and not any(c.meets(b) for c in easy)]
     if not asked:

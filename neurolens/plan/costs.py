@@ -1,9 +1,12 @@
-"""The cost of a camera in its target: nanoseconds or operations a ray, times the noise of its weights.
+"""The cost of a camera in its target: nanoseconds or operations of a path, times the noise of its picture.
 
 That is proportional to the seconds to equal error. A pixel is the mean of n samples w L of weights and radiances, which
 are independent; with a and b their squared relative deviations its relative variance is ((1 + a)(1 + b) - 1) / n. Where
 radiances vary much, that is where samples are many, it goes with 1 + a = mean(w^2) / mean(w)^2: so many times the rays
 of a camera of even weights have its error. Weights that are 1 with probability p and else 0 need 1 / p times the rays.
+
+In our renderer a camera that disperses has more noise than that, and its paths take longer: both are measured for the
+scene, by strips of its picture through the exact lens and through a thin one (`work_of`).
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ import math
 import statistics
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,7 +25,9 @@ from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.model import OnnxCamera
 from neurolens.graph.program import Program
 from neurolens.plan.footprints import Array, Places
-from neurolens.render.renderer import render
+from neurolens.render.film import PixelGrid
+from neurolens.render.job import LANES, Job, develop
+from neurolens.render.renderer import run
 from neurolens.render.scene import Scene
 from neurolens.shaders.osl import OslLens, osl_program
 from neurolens.shaders.source import camera_program
@@ -36,9 +42,27 @@ _STEP_NS, _DEAR_NS, _DEAR = 0.2761, 2.324, ("div", "sqrt")
 # Of GLSL that anybody writes: a direction with its length, a point of a disc by concentric squares, the plane in focus.
 GLSL_OPERATIONS: Mapping[str, float] = {"pinhole": 14, "thin": 44, "thick": 47}
 _ROUNDS, _SIDE = 7, 16
-_REST_ACROSS, _REST_SAMPLES = 96, 4
+_STRIPS, _STRIP_PATHS, _SAMPLES = 3, 60_000, 16  # of a picture, to measure noise: number, paths of each, of a pixel
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709
 _MOST_DARK = 0.05  # of the places
+
+
+@dataclass(frozen=True)
+class Work:
+    """The parts of the cost of a path that all cameras of a kind share; each pair is without and with dispersion.
+
+    Attributes:
+        rest: cost of a path besides its evaluations of the camera; 0 where the camera alone counts.
+        calls: evaluations of the camera on a path.
+        noise: variance at equal samples and equal weights, over that of cameras that do not disperse.
+    """
+
+    rest: tuple[float, float] = (0.0, 0.0)
+    calls: tuple[float, float] = (1.0, 1.0)
+    noise: tuple[float, float] = (1.0, 1.0)
+
+
+ALONE = Work()  # where the camera alone counts
 
 
 def noise(weight: Array, share: Array) -> float:
@@ -73,11 +97,41 @@ def small(scene: Scene, across: int) -> tuple[int, int]:
     return width, max(round(width * shot.film_mm[1] / shot.film_mm[0]), 1)
 
 
-def rest_ns(scene: Scene, camera: Camera) -> float:
-    """Nanoseconds of one thread that a path takes besides its camera, by a small picture in our renderer."""
-    width, height = small(scene, _REST_ACROSS)
-    stats = render(scene, camera, width=width, height=height, samples=_REST_SAMPLES, threads=1).stats
-    return float(1e9 * (stats["thread_seconds"] - stats["camera_thread_seconds"]) / stats["paths"])
+def work_of(scene: Scene, plain: Camera, colours: Camera, places: Places, weights: tuple[Array, Array]) -> Work:
+    """Measure the work of a path of our renderer, and what dispersion does to its noise.
+
+    Args:
+        plain, colours: cameras of the same lens, without and with its dispersion. weights: theirs at the places, as
+            for `noise`.
+    """
+    width, height = scene.settings.camera.width, scene.settings.camera.height
+    rows = min(max(_STRIP_PATHS // (_SAMPLES * width), 2), height)
+    firsts = np.unique(np.linspace(0, height - rows, _STRIPS + 2).astype(int)[1:-1])
+    rest, calls, variance = [], [], []
+    for camera, weight in zip((plain, colours), weights, strict=True):
+        _strip(scene, camera, 0, (0, 1))  # what is fitted or compiled once is no part of a path
+        jobs = [[_strip(scene, camera, seed, (int(k), int(k) + rows)) for k in firsts] for seed in (0, 1)]
+        ns = [[1e9 * j.film.seconds[1] / (j.tiling.pixels * _SAMPLES) for j in some] for some in jobs]
+        several = jobs[0][0].mode == "companions" and not getattr(camera, "lateral", False)
+        calls.append(float(LANES) if several else 1.0)
+        besides = float(np.min(ns, axis=0).mean()) - calls[-1] * ns_a_ray(camera, places)["min"]
+        rest.append(max(besides, 0.0))
+        one, two = (np.concatenate([develop(j)[0] for j in some]).astype(np.float64) for some in jobs)
+        apart = np.square(one - two).mean(axis=-1)  # twice the variance
+        most = np.percentile(apart, 100 * (1 - _MOST_DARK))  # the rarest lights are left to chance
+        mean = max(float(one.mean()), 1e-30)
+        variance.append(float(np.minimum(apart, most).mean()) / mean**2 / noise(weight, places.share))
+    ratio = variance[1] / variance[0] if variance[0] > 0 and math.isfinite(variance[1]) else 1.0
+    return Work((rest[0], rest[1]), (calls[0], calls[1]), (1.0, ratio))
+
+
+def _strip(scene: Scene, camera: Camera, seed: int, rows: tuple[int, int]) -> Job:
+    """Rows of a picture, rendered on one thread."""
+    shot = scene.settings.camera
+    grid = PixelGrid(shot.width, shot.height, camera.film_mm)
+    job = Job(scene, camera, grid, _SAMPLES, seed, shot.max_depth, scene.settings.film, rows)
+    run(job, 1)
+    return job
 
 
 def glsl_operations(camera: OnnxCamera | ExactCamera) -> int:

@@ -23,9 +23,11 @@ from neurolens.base.errors import InputError
 from neurolens.base.progress import Report
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
+from neurolens.lens.shot import Dispersion
 from neurolens.plan import footprints as prints
 from neurolens.plan.candidates import (
     FITTED,
+    IDEAL,
     Choice,
     Target,
     candidates,
@@ -34,8 +36,8 @@ from neurolens.plan.candidates import (
     shot_fits,
     shot_terms,
 )
-from neurolens.plan.costs import UNIT
-from neurolens.plan.plan import best_of, exact_suffices, rest_of
+from neurolens.plan.costs import UNIT, Work
+from neurolens.plan.plan import best_of, exact_suffices, work_for
 from neurolens.plan.probe import COUNTED, Effect, Probe, effects_of, probe
 from neurolens.render.scene import Scene
 from neurolens.setting.states import set_lens
@@ -78,7 +80,7 @@ class FramesPlan:
     Attributes:
         probed: frames that were looked at. effects: the dearest of them, with breathing. runs: in order of frames.
         fits: models fitted that are used, the fewest that keep the budget where they cost least.
-        cost: of a ray times noise, mean over frames, in `unit`; None where a frame has no camera.
+        cost: of the camera on a path times noise, mean over frames, in `unit`; None where a frame has no camera.
     """
 
     budget_px: float
@@ -98,6 +100,7 @@ class FramesPlan:
 def plan_frames(
     frames: Sequence[Frame], lens: Lens, budget_px: float, *, target: Target = "render", models: Sequence[Path] = (),
     folder: Path | None = None, afterwards: Collection[str] = (), denoised: bool = False, report: Report | None = None,
+    dispersion: Dispersion = "full",
 ) -> FramesPlan:  # fmt: skip
     """The cheapest cameras for the frames of an animation; arguments as of `plan.plan`.
 
@@ -113,20 +116,22 @@ def plan_frames(
     chosen = representatives(frames)
     probes: list[Probe] = []
     for frame in chosen:
-        probes.append(probe(frame.scene, set_lens(lens, zoom=frame.zoom), afterwards=afterwards, denoised=denoised))
+        zoomed = set_lens(lens, zoom=frame.zoom)
+        probes.append(probe(frame.scene, zoomed, afterwards=afterwards, denoised=denoised, dispersion=dispersion))
         say(0.4 * len(probes) / len(chosen))
     best: list[Choice | None] = []
-    rest = rest_of(chosen[0].scene, probes[0], target)
+    work = work_for(chosen[0].scene, probes[0], target)
     for probed in probes:
-        tried = candidates(probed, (budget_px,), target, models=models)
-        best.append(best_of([c for c in tried if c.meets(budget_px)], rest))
+        tried = candidates(probed, (budget_px,), target, models=models, work=work)
+        best.append(best_of([c for c in tried if c.meets(budget_px)], work, denoised))
         say(0.4 + 0.3 * len(best) / len(probes))
     fits = 0
-    if folder is not None and not exact_suffices(probes[0], rest):
+    if folder is not None and not exact_suffices(probes[0], work):
         # Frames without a camera, or with one that costs more than a small model may.
-        asks = [k for k, c in enumerate(best) if c is None or not c.name.startswith(("pinhole", "thin"))]
-        for rows, choice in _stretches([probes[k] for k in asks], target, budget_px, folder):
-            cheaper = [asks[k] for k in rows if best_of([choice, *filter(None, [best[asks[k]]])], rest) is choice]
+        asks = [k for k, c in enumerate(best) if c is None or not c.name.startswith(IDEAL)]
+        for rows, choice in _stretches([probes[k] for k in asks], target, budget_px, folder, work):
+            against = [[choice, *filter(None, [best[asks[k]]])] for k in rows]
+            cheaper = [asks[k] for k, two in zip(rows, against, strict=True) if best_of(two, work, denoised) is choice]
             fits += bool(cheaper)
             for k in cheaper:
                 best[k] = choice
@@ -169,13 +174,14 @@ def _runs(frames: Sequence[Frame], served: Sequence[Choice | None]) -> Iterator[
 
 
 def _stretches(
-    probes: Sequence[Probe], target: Target, budget_px: float, folder: Path
+    probes: Sequence[Probe], target: Target, budget_px: float, folder: Path, work: Work
 ) -> Iterator[tuple[list[int], Choice]]:
     """Rows of `probes` that one model serves, and the model; rows that none serves are left out."""
     order = sorted(range(len(probes)), key=lambda k: (_zoom(probes[k]), probes[k].asked.shot.focus_m))
     sizes, done = shot_terms(probes[0]) if probes else [], 0
+    asked = target, budget_px, folder, work
     while done < len(order):
-        fit_of = cache(lambda n, at=done: _stretch([probes[k] for k in order[at : at + n]], target, budget_px, folder))
+        fit_of = cache(lambda n, at=done: _stretch([probes[k] for k in order[at : at + n]], *asked))
         # From here on to as far as the largest model reaches: halves, for less is easier.
         same = sum(_zoom(probes[k]) == _zoom(probes[order[done]]) for k in order[done:])
         count = bisect.bisect_left(range(1, same + 1), True, key=lambda n: fit_of(n)(sizes[-1], False) is None)
@@ -194,7 +200,7 @@ def _zoom(probed: Probe) -> float:
 
 
 def _stretch(
-    probes: Sequence[Probe], target: Target, budget_px: float, folder: Path
+    probes: Sequence[Probe], target: Target, budget_px: float, folder: Path, work: Work
 ) -> Callable[[int, bool], Choice | None]:
     """A function that fits a model of a size over the domain that holds the domains of all frames.
 
@@ -213,7 +219,7 @@ def _stretch(
         file, settings = fit(terms)
         choices: list[Choice] = []
         for probed in probes:
-            made = model_choice(probed, target, file, FITTED, costed and not choices)
+            made = model_choice(probed, target, file, FITTED, costed and not choices, work)
             if made is None or not made.meets(budget_px):
                 return None
             choices.append(made)

@@ -1,14 +1,15 @@
 """The camera for a scene by a budget of error, time or visible difference; and the trade of error against time.
 
 A camera's error is the distance of its footprints from the exact lens's in pixels, and of its light, at the places of a
-scene that a `probe` finds; both count where they are largest but for 5% of the picture. Its cost is the time of a ray
-in the target named, times the noise of its weights: see `costs`. In C and onnxruntime it is measured here, with one
-thread; for shaders it is counted. The exact lens is chosen where the cheapest camera saves too little.
+scene that a `probe` finds; both count where they are largest but for 5% of the picture. Its cost is the time of a path
+in the target named, times the noise of its picture: see `costs`. In C and onnxruntime it is measured here, with one
+thread; for shaders it is counted. The cheapest camera within the budget is chosen; those that take about as long are
+alike, and the exact lens is taken where it is one of them.
 
-Seconds are of one thread, for the scene's own size and samples. They are those that a camera adds to a camera that
-costs nothing and whose rays all weigh the same: the time of its own rays, and the scene's time for the further rays
-that its noise asks for. The scene's time for a ray is measured by a small picture in our renderer; in other targets the
-camera alone counts, in Cycles under a white sky.
+Seconds are of one thread and of the whole picture at the scene's own size, to the noise that the exact lens has with
+the scene's samples. What a path takes besides its camera, and how dispersion adds to noise, is measured by strips of
+the picture in our renderer; in other targets the camera alone counts, in Cycles under a white sky. There cameras count
+as alike up to `advice.SAVING`, for what else a path takes is not known.
 """
 
 from __future__ import annotations
@@ -30,14 +31,15 @@ from neurolens.base.progress import Report
 from neurolens.base.records import pareto_front
 from neurolens.base.settings import to_toml
 from neurolens.base.tomlfile import format_toml
+from neurolens.cameras.build import as_c, ideal_as, with_dispersion
 from neurolens.cameras.contract import Camera, FloatArray
 from neurolens.lens.prescription import Lens
 from neurolens.plan.candidates import EXACT, PAIRS, Choice, Target, camera_of, candidates, shot_domain
-from neurolens.plan.costs import UNIT, ns_a_ray, rest_ns, small
+from neurolens.plan.costs import ALONE, UNIT, Work, noise, ns_a_ray, small, work_of
 from neurolens.plan.probe import LIGHT, Effect, Probe, SceneNeeds, effects_of, probe
 from neurolens.render.renderer import render
 from neurolens.render.scene import Scene
-from neurolens.study.advice import recommended
+from neurolens.study.advice import SAVING, recommended
 from neurolens.study.experiment import DomainChoice, EvaluationChoice, Experiment, LensChoice
 from neurolens.study.image import Image, flip_map
 
@@ -45,6 +47,7 @@ _SHOT_KEYS = "film_mm", "focus_m", "f_number", "wavelength_nm"  # settings of th
 _ACROSS, _SAMPLES = 240, 16  # of pictures
 _STRIPS, _STRIP_ROWS, _STRIP_PATHS = 3, 16, 2_000_000  # of a picture: their number, least rows, paths of all
 _SHOWN = 8  # most of them, beside the exact lens
+ALIKE = 1.2  # times the least cost of a whole picture: costs are no more accurate
 _BUDGETS = (1.0, 0.25, 0.05)  # that polynomials are fitted for, besides the one asked for
 
 
@@ -56,7 +59,8 @@ class Plan:
         budget_s, budget_flip: seconds, or FLIP difference, of a plan for those, whose `budget_px` is then the error of
             the best camera.
         unit: of costs: "ns" or, where no time is known, "operations". domain: of models that are fitted.
-        rest: cost of a path besides its camera, in the same unit; 0 where the camera alone counts.
+        work: what a path takes besides its camera, in the same unit; none where the camera alone counts.
+        alike: names of the cameras within the budget that take about as long as the cheapest, the best among them.
     """
 
     asked: SceneNeeds
@@ -70,7 +74,8 @@ class Plan:
     best: Choice | None
     probed: Probe
     budget_flip: float | None = None
-    rest: float = 0.0
+    work: Work = ALONE
+    alike: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able: all fields but `probed`."""
@@ -100,7 +105,7 @@ def plan(
     folder: Path | None = None, explain: bool = False, report: Report | None = None, **look: Any,
 ) -> Plan:  # fmt: skip
     """The cheapest camera for a scene whose error stays within a budget, or the exact lens where that one saves too
-    little (`advice.recommended`). In our renderer the rest of the picture counts, too.
+    little to tell. In our renderer the whole picture counts.
 
     Args:
         lens: as its file has it. budget_px: error of place and blur in pixels of the scene's picture.
@@ -108,62 +113,90 @@ def plan(
             a renderer in GLSL.
         models: exported models of this lens to try. folder: where models fitted for the shot go; None fits none.
         explain: whether cameras beyond the budget are compiled and timed, too; else their cost is infinite.
-        look: further arguments of `probe`: zoom, and what is made of the picture later.
+        look: further arguments of `probe`: zoom, dispersion, and what is made of the picture later.
 
     Raises:
-        InputError: a budget that is negative or no number; as `probe`.
+        InputError: a budget that is negative or no number; a part of the dispersion for a target other than our
+            renderer; as `probe`.
     """
     if not budget_px >= 0:
         raise InputError("plan", "budget_px", budget_px, "0 or more pixels")
     probed = probe(scene, lens, **look)
-    rest = rest_of(scene, probed, target)
-    folder = folder if explain or not exact_suffices(probed, rest) else None
-    tried = candidates(probed, (budget_px,), target, models=models, folder=folder, explain=explain, report=report)
-    return decided(probed, tried, budget_px, target, rest)
+    work = work_for(scene, probed, target)
+    folder = folder if explain or not exact_suffices(probed, work) else None
+    tried = candidates(
+        probed, (budget_px,), target, models=models, folder=folder, explain=explain, report=report, work=work
+    )
+    return decided(probed, tried, budget_px, target, work)
 
 
-def rest_of(scene: Scene, probed: Probe, target: Target) -> float:
-    """Cost of a path besides its camera: in our renderer by a small picture, in other targets 0."""
-    return rest_ns(scene, probed.exact) if target == "render" else 0.0
+def work_for(scene: Scene, probed: Probe, target: Target) -> Work:
+    """The work of a path: in our renderer by strips of the picture, in other targets that of the camera alone.
+
+    Raises:
+        InputError: a part of the dispersion for another target.
+    """
+    shot = probed.asked.shot
+    if target != "render":
+        if shot.dispersion != "full":
+            expected = f"full for {target}: it is a setting of our renderer"
+            raise InputError("plan", "dispersion", shot.dispersion, expected)
+        return ALONE
+    thin, colours = as_c(ideal_as("thin:", probed.exact.lens, shot)), with_dispersion(probed.exact, shot)
+    seen = probed.thin_seen.weight, probed.seen.weight
+    return work_of(scene, thin, colours, probed.places, seen)
 
 
-def exact_suffices(probed: Probe, rest: float) -> bool:
-    """Whether not even a camera that costs nothing would save enough, so that nothing needs to be fitted."""
-    exact = ns_a_ray(probed.exact, probed.places)["min"] if rest else math.inf
-    return recommended((0.0,), float, exact, rest) == exact
+def exact_suffices(probed: Probe, work: Work) -> bool:
+    """Whether not even a model that costs nothing would save enough, so that nothing needs to be fitted."""
+    rest = work.rest[probed.exact.dispersive]
+    exact = work.calls[probed.exact.dispersive] * ns_a_ray(probed.exact, probed.places)["min"] if rest else math.inf
+    return recommended((0.0,), float, exact, rest, ALIKE) == exact
 
 
-def best_of(within: Sequence[Choice], rest: float | None) -> Choice | None:
-    """The camera to use of those within a budget; `rest` as for `decided`."""
+def best_of(within: Sequence[Choice], work: Work | None, denoised: bool = False) -> Choice | None:
+    """The camera to use of those within a budget; `work` as for `decided`."""
     exact = next((c for c in within if c.name == EXACT and math.isfinite(c.cost)), None)
-    return recommended(within, lambda c: c.cost, None if rest is None else exact, rest or 0.0)
+    cost = partial(Choice.whole, work=work or ALONE, denoised=denoised)
+    return recommended(within, cost, exact if work is not None else None, saving=_alike(work or ALONE))
 
 
-def decided(
-    probed: Probe, tried: Sequence[Choice], budget_px: float, target: Target, rest: float | None = None
-) -> Plan:
+def _alike(work: Work) -> float:
+    """The factor up to which costs count as the same."""
+    return ALIKE if any(work.rest) else SAVING
+
+
+def decided(probed: Probe, tried: Sequence[Choice], budget_px: float, target: Target, work: Work | None = None) -> Plan:
     """The plan for a budget, from candidates that serve it.
 
     Args:
-        rest: cost of a path besides its camera; None chooses the cheapest camera, whatever it saves.
+        work: of a path; None chooses the cheapest camera, whatever it saves.
     """
-    ranked = tuple(replace(c, within=c.meets(budget_px)) for c in sorted(tried, key=lambda c: c.cost))
-    best = best_of([c for c in ranked if c.within], rest)
-    effects = effects_of(probed, budget_px)
+    denoised, known = bool(probed.asked and probed.asked.denoised), work or ALONE
+    cost = partial(Choice.whole, work=known, denoised=denoised)
+    ranked = tuple(replace(c, within=c.meets(budget_px)) for c in sorted(tried, key=cost))
+    held = [c for c in ranked if c.within]
+    best, effects = best_of(held, work, denoised), effects_of(probed, budget_px)
+    alike = tuple(c.name for c in held if cost(c) <= _alike(known) * cost(held[0]))
     return Plan(
         probed.asked, budget_px, None, target, UNIT[target], shot_domain(probed), effects, ranked, best, probed,
-        rest=rest or 0.0,
+        work=known, alike=alike,
     )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Offer:
-    """A camera with the seconds of one thread that it adds (10^9 operations, where no time is known), by the least of
-    its timed calls; by their median it takes `more` than that."""
+    """A camera with the seconds of one thread that its picture takes (10^9 operations, where no time is known).
+
+    Attributes:
+        seconds: by the least of the camera's timed calls; by their median the picture takes `more` than that.
+        camera: the camera's share of them.
+    """
 
     choice: Choice
     seconds: float
     more: float = 0.0
+    camera: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -185,17 +218,21 @@ class Trade:
     """Every camera that was priced, by rising seconds; the plan for the budget; and pictures of those to look at.
 
     Attributes:
-        base: time of the scene itself. unit: of it and of `Offer.seconds`. samples: a pixel of the pictures.
+        unit: of `Offer.seconds`. samples: a pixel of the pictures.
         exact: the lens's picture.
     """
 
     plan: Plan
     offered: tuple[Offer, ...]
-    base: float
     unit: str
     samples: int
     exact: FloatArray
     shown: tuple[CameraPicture, ...]
+
+    @property
+    def what(self) -> str:
+        """What takes the seconds."""
+        return "whole picture" if any(self.plan.work.rest) else "camera"
 
     @property
     def front(self) -> list[Offer]:
@@ -209,7 +246,7 @@ class Trade:
 
     @property
     def half(self) -> Offer | None:
-        """The best camera for half of the seconds that the chosen one adds."""
+        """The best camera for half of the seconds that the picture of the chosen one takes."""
         return None if self.chosen is None else best_within(self.offered, self.chosen.seconds / 2)
 
 
@@ -220,13 +257,13 @@ def _priced(
     """A plan in which every camera has its cost, and its cameras by rising seconds; arguments as for `plan`."""
     say = report or (lambda done, left=None: None)
     probed = probe(scene, lens, **look)
+    work = work_for(scene, probed, target)
     tried = candidates(
         probed, (*_BUDGETS, budget_px), target, models=models, folder=folder, explain=True,
-        report=lambda done, left=None: say(0.5 * done),
+        report=lambda done, left=None: say(0.5 * done), work=work,
     )  # fmt: skip
-    rest = rest_of(scene, probed, target)
-    made = decided(probed, tried, budget_px, target, rest)
-    return made, offers(scene, probed, made.choices, rest)
+    made = decided(probed, tried, budget_px, target, work)
+    return made, offers(scene, probed, made.choices, work)
 
 
 def trade(scene: Scene, lens: Lens, budget_px: float, *, samples: int = _SAMPLES, **options: Any) -> Trade:
@@ -241,11 +278,11 @@ def trade(scene: Scene, lens: Lens, budget_px: float, *, samples: int = _SAMPLES
     some = spread(front(offered), next((o for o in offered if o.choice == made.best), None))
     exact, pictures = _pictures(scene, made.probed, some, samples, lambda done, left=None: say(0.5 + 0.5 * done))
     unit = "s" if made.unit == "ns" else "10^9 operations"
-    return Trade(made, tuple(offered), 1e-9 * paths(scene) * made.rest, unit, samples, exact, tuple(pictures))
+    return Trade(made, tuple(offered), unit, samples, exact, tuple(pictures))
 
 
 def plan_within(scene: Scene, lens: Lens, seconds: float, **options: Any) -> Plan:
-    """The plan with the most faithful camera that takes no longer than so many seconds of one thread.
+    """The plan with the most faithful camera whose picture takes no longer than so many seconds of one thread.
 
     Other arguments and errors as for `plan`; InputError, too, for seconds that are none and a target without time.
     """
@@ -253,9 +290,8 @@ def plan_within(scene: Scene, lens: Lens, seconds: float, **options: Any) -> Pla
     if not seconds > 0 or UNIT[target] != "ns":
         raise InputError("plan", "budget", f"({seconds:g} s for {target})", "above 0, and a target whose time is known")
     made, offered = _priced(scene, lens, 0.0, **options)
-    added = seconds - 1e-9 * paths(scene) * made.rest
-    offer = best_within(offered, added)
-    fits = {id(o.choice) for o in offered if o.seconds <= added and o.choice.light_error <= LIGHT}
+    offer = best_within(offered, seconds)
+    fits = {id(o.choice) for o in offered if o.seconds <= seconds and o.choice.light_error <= LIGHT}
     choices = [replace(c, within=id(c) in fits) for c in made.choices]
     return _rebudgeted(made, choices, None if offer is None else replace(offer.choice, within=True), budget_s=seconds)
 
@@ -264,7 +300,7 @@ def _rebudgeted(made: Plan, choices: Sequence[Choice], best: Choice | None, **bu
     """The plan with another best camera, whose error is then the budget that effects are held against."""
     error = math.inf if best is None else best.error_px
     effects = effects_of(made.probed, error)
-    return replace(made, budget_px=error, effects=effects, choices=tuple(choices), best=best, **budget)
+    return replace(made, budget_px=error, effects=effects, choices=tuple(choices), best=best, alike=(), **budget)
 
 
 def plan_seen(scene: Scene, lens: Lens, flip_budget: float, **options: Any) -> Plan:
@@ -316,11 +352,15 @@ def paths(scene: Scene) -> int:
     return shot.width * shot.height * shot.samples
 
 
-def offers(scene: Scene, probed: Probe, tried: Sequence[Choice], rest: float) -> list[Offer]:
-    """Cameras of known cost by rising seconds; `rest`: nanoseconds of a path in the scene."""
-    each = ((c, rest * (0.0 if probed.asked.denoised else c.noise - 1) + c.cost) for c in tried)
-    count = 1e-9 * paths(scene)
-    offered = (Offer(c, count * ns, count * c.cost * (c.spread - 1)) for c, ns in each if math.isfinite(ns))
+def offers(scene: Scene, probed: Probe, tried: Sequence[Choice], work: Work) -> list[Offer]:
+    """Cameras of known cost by rising seconds, to the noise that the exact lens has with the scene's samples."""
+    denoised = probed.asked.denoised
+    exact = noise(probed.seen.weight, probed.places.share) * work.noise[probed.exact.dispersive]
+    count = 1e-9 * paths(scene) / (1.0 if denoised else exact)
+    some = ((c, c.whole(work, denoised)) for c in tried)
+    offered = (
+        Offer(c, count * ns, count * c.cost * (c.spread - 1), count * c.cost) for c, ns in some if math.isfinite(ns)
+    )
     return sorted(offered, key=lambda o: o.seconds)
 
 
@@ -331,7 +371,7 @@ def front(offered: Sequence[Offer]) -> list[Offer]:
 
 
 def best_within(offered: Sequence[Offer], seconds: float) -> Offer | None:
-    """The most faithful camera that adds no more."""
+    """The most faithful camera whose picture takes no longer."""
     affordable = (o for o in front(offered) if o.seconds <= seconds)
     return min(affordable, key=lambda o: (o.choice.error_px, o.seconds), default=None)
 

@@ -76,8 +76,9 @@ def _bars_and_trade(plan: Plan, figure: Any) -> None:
     bars.set_xlim(left=least)
     bars.set_xlabel("worth (pixels), grey: left out")
     timed = [c for c in plan.choices if 0 < c.cost < float("inf") and c.error_px < float("inf")]
-    _cameras(trade, plan, [(c, c.cost, c.cost * c.spread) for c in timed])
-    trade.set_xlabel(f"cost ({plan.unit} a ray times noise), --for {plan.target}")
+    whole = [c.whole(plan.work, plan.asked.denoised) for c in timed]
+    _cameras(trade, plan, [(c, w, w + c.cost * (c.spread - 1)) for c, w in zip(timed, whole, strict=True)])
+    trade.set_xlabel(f"cost ({plan.unit} a path times noise), --for {plan.target}")
     if plan.budget_px > 0:
         bars.axvline(plan.budget_px, color=CHOSEN, lw=1.2)
     plain_log_ticks(bars.xaxis)
@@ -105,10 +106,9 @@ def plot_trade(trade: Trade, path: Path, title: str) -> None:
     """Error of every camera against its seconds, with the front of those that no other betters."""
     plan, offered = trade.plan, [o for o in trade.offered if o.choice.error_px < float("inf")]
     subtitle = f"--for {plan.target}; 95% of the picture keeps these errors"
-    subtitle += f"; the scene itself takes {trade.base:.3g} {trade.unit}" * bool(trade.base)
     with drawing(path, 8.5, 5.0, title, subtitle) as figure:
         axes = figure.subplots()
         at = [o.seconds for o in trade.front], [max(o.choice.error_px, 1e-4) for o in trade.front]
         axes.step(*at, where="post", color=INK, lw=1.2, alpha=0.7, label="no camera betters both")
-        axes.set_xlabel(f"{trade.unit} that the camera adds, one thread, to equal noise")
+        axes.set_xlabel(f"{trade.unit} of the {trade.what}, one thread, to equal noise")
         _cameras(axes, plan, [(o.choice, o.seconds, o.seconds + o.more) for o in offered])

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -27,7 +27,7 @@ from neurolens.graph.compiler import has_compiler
 from neurolens.lens.film_plane import PupilBounds
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.lens.shot import Shot
+from neurolens.lens.shot import Dispersion, Shot
 from neurolens.plan import footprints as prints
 from neurolens.plan.footprints import AFTERWARDS, Array, Footprints, Places, cell_centres, upright
 from neurolens.plan.light import STRAY, Overview, overview, small_raster, stray_light
@@ -168,7 +168,7 @@ class Probe:
 
 def probe(
     scene: Scene, lens: Lens, *, across: int = _ACROSS, afterwards: Collection[str] = (), denoised: bool = False,
-    zoom: str | None = None,
+    zoom: str | None = None, dispersion: Dispersion = "full",
 ) -> Probe:  # fmt: skip
     """Look through the exact lens at a scene.
 
@@ -176,6 +176,7 @@ def probe(
         across: places along the longer side. afterwards: effects that compositing makes, of `footprints.AFTERWARDS`:
             distortion, where the ST map corrects the picture's light, too, and defocus. denoised: see `SceneNeeds`.
         zoom: state of the lens by name or focal length; None leaves it as it is.
+        dispersion: that cameras are to have; the exact lens that they are held against has all of it.
 
     Raises:
         InputError: a scene's camera that the lens cannot be; a picture that the lens leaves dark; other names; an
@@ -202,7 +203,7 @@ def probe(
     met = depth[np.isfinite(depth)]
     nearest, farthest = (float(met.min()), float(met.max())) if met.size else (None, None)
     asked = SceneNeeds(
-        real, film[0] / shot.width, nearest, farthest,
+        replace(real, dispersion=dispersion), film[0] / shot.width, nearest, farthest,
         float(np.isinf(depth).mean()), 1 - places.film_mm.shape[1] / points.shape[1], small.range_nm,
         float(np.median(small.contrast)), *edges, afterwards=tuple(sorted(afterwards)), denoised=denoised, zoom=zoom,
     )  # fmt: skip

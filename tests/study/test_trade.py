@@ -3,9 +3,11 @@
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from neurolens.base.errors import InputError
@@ -13,6 +15,7 @@ from neurolens.base.tomlfile import format_toml
 from neurolens.cli import main
 from neurolens.plan import plan as traded
 from neurolens.plan.candidates import Choice
+from neurolens.plan.costs import Work
 from neurolens.plan.plan import Offer, best_within, front, offers, spread
 from neurolens.readers.lensfile import read_lens
 from neurolens.render.scene import scene_from_tables
@@ -34,14 +37,21 @@ def choice(name: str, error: float, cost: float, noise: float = 1.0, light: floa
     return Choice(name, "", error, light, cost, noise)
 
 
-def test_seconds_are_those_of_the_camera_and_of_the_rays_that_its_noise_asks_for() -> None:
-    tried = [choice("even", 0.1, 50.0), choice("noisy", 0.0, 20.0, 1.5), choice("untimed", 0.0, math.inf)]
+def test_seconds_are_those_of_the_picture_to_the_noise_of_the_exact_lens() -> None:
+    plain, coloured = choice("plain", 0.1, 50.0), replace(choice("coloured", 0.0, 30.0, 1.5), disperses=True)
     made, rays = scene_from_tables(scene(samples=100)), 320 * 180 * 100
+    work = Work((1000.0, 2000.0), noise=(1.0, 1.5))
     for denoised in (False, True):
-        found = SimpleNamespace(asked=SimpleNamespace(denoised=denoised))
-        seconds = {o.choice.name: o.seconds for o in offers(made, found, tried, 1000.0)}  # type: ignore[arg-type]
-        extra = 0.0 if denoised else 0.5 * 1000.0
-        assert seconds == pytest.approx({"even": 50e-9 * rays, "noisy": (20.0 + extra) * 1e-9 * rays})
+        found = SimpleNamespace(
+            asked=SimpleNamespace(denoised=denoised), seen=SimpleNamespace(weight=np.ones((2, 1, 8))),
+            places=SimpleNamespace(share=np.ones(1)), exact=SimpleNamespace(dispersive=True),
+        )  # fmt: skip
+        tried = [plain, coloured, choice("untimed", 0, math.inf)]
+        offered = {o.choice.name: o for o in offers(made, found, tried, work)}  # type: ignore[arg-type]
+        times = 1.0 if denoised else 1.5
+        seconds = {"plain": 1050e-9 * rays / times, "coloured": (30 + 2000 * times) * 1e-9 * rays / times}
+        assert {name: o.seconds for name, o in offered.items()} == pytest.approx(seconds)
+        assert offered["coloured"].camera == pytest.approx(30e-9 * rays / times)
 
 
 def test_the_front_holds_what_nothing_betters_and_time_buys_the_most_faithful() -> None:
@@ -79,10 +89,12 @@ def test_a_trade_leaves_one_page_that_needs_nothing_else(tmp_path: Path, capsys:
     seconds, errors = ([cameras[n][k] for n in told["front"]] for k in ("seconds", "error_px"))
     assert seconds == sorted(seconds) and errors == sorted(errors, reverse=True) and cameras["exact"]["seconds"] > 0
     chosen = cameras[told["chosen"]]
-    assert re.search(rf"which adds ~?{chosen['seconds']:.3g} s", said) and "Half of that buys" in said
+    assert re.search(rf"picture takes ~?{chosen['seconds']:.3g} s", said) and "Half of that buys" in said
+    assert 0 < chosen["camera_seconds"] < chosen["seconds"] and told["chosen"] in told["alike"]
     (row,) = (line for line in said.splitlines() if line.startswith("*  "))
     assert f"{chosen['seconds']:.3g}" in row.replace("~", " ").split()  # advice, table and plot use one measurement
-    assert told["chosen"] == "exact"  # a picture of our renderer takes many times what its camera does
+    held = [c["seconds"] for c in told["cameras"] if c["error_px"] <= 0.05 and c["light_error"] <= 0.01]
+    assert chosen["seconds"] <= 1.2 * min(held)  # nothing within the budget is surely faster to equal noise
 
 
 def test_a_plan_for_a_time_takes_the_most_faithful_camera_that_fits(tmp_path: Path) -> None:
