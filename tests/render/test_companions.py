@@ -35,7 +35,10 @@ LENSES: dict[str, tuple[tuple[float, float], float]] = {
 }
 LARGE: dict[str, Any] = {"width": 180, "height": 120, "threads": 1}
 WAYS: tuple[Any, ...] = ("auto", "one", "hero")
-NARROW = {"sodium": {"spectrum": [[380, 0.0], [580, 0.0], [589, 1.0], [598, 0.0], [780, 0.0]]}}
+NARROW = {
+    "sodium": {"spectrum": [[380, 0.0], [580, 0.0], [589, 1.0], [598, 0.0], [780, 0.0]]},
+    "led": {"spectrum": [[380, 0.0], [430, 0.0], [452, 1.0], [478, 0.15], [560, 0.6], [620, 0.45], [720, 0.0]]},
+}
 
 
 @cache
@@ -135,8 +138,9 @@ def test_white_surroundings_look_the_same_in_the_middle_and_in_corners(name: str
     assert several.mean(axis=(0, 1)) == pytest.approx(one.mean(axis=(0, 1)), rel=1e-3)
 
 
-def test_light_of_one_line_is_conserved() -> None:
-    one, several = both_modes(model_camera(), 64, "sodium")
+@pytest.mark.parametrize("light", NARROW)
+def test_light_of_a_line_or_of_a_lamp_is_conserved(light: str) -> None:
+    one, several = both_modes(model_camera(), 64, light)
     assert several.mean(axis=(0, 1)) == pytest.approx(one.mean(axis=(0, 1)), rel=5e-3, abs=2e-3)
 
 
@@ -241,6 +245,35 @@ def test_compiled_cameras_have_the_same_companions() -> None:
     both = (one.weight > 0) & (other.weight > 0)
     assert other.weight[both] == pytest.approx(one.weight[both], rel=1e-4)
     assert np.abs(one.film_mm - other.film_mm).transpose(0, 2, 1)[both].max() < 1e-5
+
+
+def test_blue_light_that_is_totally_reflected_is_left_out(tmp_path: Path) -> None:
+    # The rim's rays meet the dome from inside at the critical angle of the longest wavelengths that pass.
+    file = tmp_path / "dome.toml"
+    rows = "{ radius_mm = 10.0, thickness_mm = 5.0, diameter_mm = 11.6, n_d = 1.7847, V_d = 25.7 }"
+    for thickness, stop in ((0.1, ""), (8.0, ", stop = true")):
+        rows += f",\n  {{ radius_mm = inf, thickness_mm = {thickness}, diameter_mm = 11.6{stop} }}"
+    head = 'schema = 1\nname = "Dome"\ndesigner = "none"\nsource = "a test"\nrims = "source"\n'
+    file.write_text(f"{head}f_number = 1.2\nefl_mm = 12.9\nsurfaces = [\n  {rows}\n]\n")
+    camera = ExactCamera(read_lens(file), Shot((6.0, 4.0), 0.3, focus_mode="paraxial"))
+    film, square, waves = samples_of(camera, 8000)
+    waves[0], waves[1] = 690, 410
+    found = camera.sample_spectrum(film, square, waves)
+    red_alone = (found.weight[0] > 0) & (found.weight[1] == 0)
+    assert 0.02 < red_alone.mean() < 0.3
+    weight, alone = shares(camera, 8000)  # what blue leaves, other wavelengths have
+    assert weight.sum(axis=0).mean() == pytest.approx(alone.mean(), rel=0.01)
+
+
+def test_all_visible_light_from_380_to_780_nm() -> None:
+    lens = read_lens(ROOT / "lenses" / "laikin_double_gauss_50.toml")
+    camera = ExactCamera(lens, Shot(FILM, 2.0, 1.8, wavelength_nm=(380.0, 780.0)))
+    film, square, waves = samples_of(camera, 4000)
+    waves = (380 + 400 * (waves - 400) / 300).astype(np.float32)
+    found = camera.sample_spectrum(film, square, waves)
+    alone = camera.sample(film, square, waves[0])
+    assert found.weight.sum(axis=0).mean() == pytest.approx(alone.weight.mean(), rel=0.01)
+    assert 0.02 < np.abs(found.film_mm - found.film_mm[0]).max() < 0.2  # lateral colour of tens of micrometres
 
 
 def test_a_lens_set_for_a_zoom_has_companions_too() -> None:
