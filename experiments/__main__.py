@@ -27,6 +27,7 @@ NAMES = {
     "models": ("make_models", "make the models that ship"),
     "inverse": ("inverse", "inverse maps: how often they arrive"),
     "plans": ("plans", "plans of scenes: whether budgets are kept, and what the cheapest camera costs"),
+    "plan-times": ("plan_times", "seconds that plans print beside those of renders to equal noise"),
     "shots": ("shots", "models fitted to one shot beside those that ship: error, operations, time"),
     "zoom": ("zoom", "models of whole zooms, of internal focus"),
     "equal-time": ("equal_time_page", "error over render time of every camera"),
