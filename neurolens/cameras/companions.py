@@ -19,7 +19,7 @@ from neurolens.base import status as st
 from neurolens.cameras.cameragraph import LensGraph, lens_inside, status_graph, unrounded
 from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph
+from neurolens.graph.ir import Graph, Value
 from neurolens.graph.program import RAY
 
 Array = NDArray[np.float64]
@@ -37,22 +37,26 @@ class Shift(NamedTuple):
     """The shift from the film and pupil point of the hero to those of a companion.
 
     Attributes:
-        graph: inputs `film_mm`, `pupil_mm` [2], `wavelength_nm`, `companion_nm`; output `companion` [4], the film and
-            pupil point in mm of the same scene ray at the companion wavelength.
+        of_hero: inputs `film_mm`, `pupil_mm` [2], `wavelength_nm`; output `shift` [12], what all companions share.
+        graph: inputs those of `of_hero`, `shift` and `companion_nm`; outputs `companion` [4], the film and pupil point
+            in mm of the same scene ray at the companion wavelength, and `known`, 0 beyond the film or the reach.
         reach_mm: the largest shift of the film point along x and along y; a companion beyond it counts as blocked.
     """
 
+    of_hero: Graph
     graph: Graph
     reach_mm: tuple[float, float]
 
 
-def fit_shift(lens: Graph, samples: Mapping[str, Array], companion_nm: Array) -> Shift | None:
+def fit_shift(
+    lens: Graph, samples: Mapping[str, Array], companion_nm: Array, film_mm: tuple[float, float]
+) -> Shift | None:
     """Fit the shift of a lens; None if too few rays pass, or the error on held-out rays is too large.
 
     Args:
         lens: the graph of the lens (`cameragraph.LensGraph`).
         samples: its inputs for rays that cover film, pupil and wavelengths; half of them measure the error.
-        companion_nm: [N] wavelengths of the companions.
+        companion_nm: [N] wavelengths of the companions. film_mm: width and height of the film.
     """
     rays = samples["rays"]
     shift, kept = _solved(lens, samples, companion_nm)
@@ -61,9 +65,9 @@ def fit_shift(lens: Graph, samples: Mapping[str, Array], companion_nm: Array) ->
     rays, shift, companion_nm = rays[:, kept], shift[:, kept], companion_nm[kept]
     waves = (1000 / np.stack([rays[4], companion_nm])) ** 2
     low, high = float(waves.min()), float(waves.max())
-    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    middle, spread = 0.5 * (low + high), 0.5 * (high - low)
     scale = np.repeat([np.abs(rays[:2]).max(), np.abs(rays[2:4]).max()], 2)
-    columns = np.concatenate([rays[:4] / scale[:, None], (waves - middle) / half])
+    columns = np.concatenate([rays[:4] / scale[:, None], (waves - middle) / spread])
     exponents, odd = _monomials()
     products = np.stack([np.prod(columns.T**powers, axis=1) for powers in exponents]) * (columns[5] - columns[4])
     train = np.arange(rays.shape[1]) % 2 == 0
@@ -79,27 +83,46 @@ def fit_shift(lens: Graph, samples: Mapping[str, Array], companion_nm: Array) ->
     if left > max(_WORST_MM, _WORST * size):
         return None
     x, y = (_BEYOND * float(v) for v in np.abs(shift[:2]).max(axis=1))
-    g = Graph()
-    point = g.concat(g.input("film_mm", 2), g.input("pupil_mm", 2))
-    inverse = [1000.0 / g.input(name) for name in ("wavelength_nm", "companion_nm")]
-    hero, other = ((value * value + -middle) * (1 / half) for value in inverse)
-    variables = g.concat(point * (1 / scale), hero, other)
-    g.outputs["companion"] = point + g.polynomial(exponents, weights, variables) * (other - hero)
-    return Shift(g, (x, y))
+    each, place = np.unique(exponents[:, :5], axis=0, return_inverse=True)
+    powers = np.zeros((len(_DEGREES), 4, len(each)))  # of the companion's variable
+    powers[exponents[:, 5], :, place.ravel()] = weights.T
+
+    def variables(g: Graph) -> tuple[Value, Value]:
+        inverse = 1000.0 / g.input("wavelength_nm")
+        point = g.concat(g.input("film_mm", 2), g.input("pupil_mm", 2))
+        return point, (inverse * inverse + -middle) * (1 / spread)
+
+    of_hero, g = Graph(), Graph()
+    point, hero = variables(of_hero)
+    all_five = of_hero.concat(point * (1 / scale), hero)
+    of_hero.outputs["shift"] = of_hero.polynomial(each, powers.reshape(-1, len(each)), all_five)
+    point, hero = variables(g)
+    film, inverse = g.input("film_mm", 2), 1000.0 / g.input("companion_nm")
+    other = (inverse * inverse + -middle) * (1 / spread)
+    constant, linear, quadratic = g.split(g.input("shift", 12), [4, 4, 4])
+    moved = point + (constant + (linear + quadratic * other) * other) * (other - hero)
+    half = 0.5 * np.array(film_mm)
+    near = (moved[:2] - film).between([-x, -y], [x, y]) & moved[:2].between(-half, half)
+    g.outputs |= {"companion": moved, "known": near[0] & near[1]}
+    return Shift(of_hero, g, (x, y))
 
 
 def companion_graph(lens: LensGraph, shift: Graph, mask_too: bool) -> Graph:
     """The graph of companions: from a ray's film and pupil point and two wavelengths to the companion's light.
 
+    A companion that is not known (`Shift.graph`) is outside the domain.
+
     Inputs: those of `Shift.graph`, and those of the lens for a whole call; with `mask_too` the table of a mask.
-    Outputs: `companion` [4], `transmittance`, `status`; without `mask_too` also `stop_xy_mm` of a lens with a mask.
+    Outputs: `companion` [2], the film point, `transmittance`, `status`; without `mask_too` also `stop_xy_mm` of a lens
+    with a mask.
     """
     g = Graph()
-    moved = g.inline(shift, {})["companion"]
-    found, aperture = lens_inside(g, lens, g.concat(moved, g.input("companion_nm")), mask_too)
+    shifted = g.inline(shift, {})
+    found, aperture = lens_inside(g, lens, g.concat(shifted["companion"], g.input("companion_nm")), mask_too)
     given = {**found, "lens_status": unrounded(found["status"])}
-    status = g.inline(status_graph(aperture, lens.stopped), given)["status"].whole()
-    g.outputs |= {"companion": moved, "transmittance": found["transmittance"], "status": status}
+    status = g.inline(status_graph(aperture, lens.stopped), given)["status"]
+    status = g.select(shifted["known"], status, status.maximum(float(st.OUTSIDE_DOMAIN))).whole()
+    g.outputs |= {"companion": shifted["companion"][:2], "transmittance": found["transmittance"], "status": status}
     return g
 
 
