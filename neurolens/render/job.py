@@ -154,7 +154,7 @@ class Job:
         Paths whose light is not finite, or beyond any sum, are counted and add nothing: one would spoil its pixel and
         with it the whole file.
         """
-        response, factors = (t.take(bins, axis=-1) for t in (self._response, self._luminance))
+        response, factors = (t.take(bins, axis=-1, mode="clip") for t in (self._response, self._luminance))
         dropped = ~(np.abs(np.einsum("ln,ln->n", factors, value)) <= _BRIGHTEST_SAMPLE)
         if dropped.any():
             value = np.where(dropped, np.float32(0), value)
@@ -186,14 +186,17 @@ class Job:
         moved = (lens.places[1:] - lens.places[0]) * per_mm
         whole = np.floor(moved)
         across, down = (moved - whole).swapaxes(0, 1)
-        whole += np.stack(np.divmod(pixel, width)[::-1])
+        whole += np.stack(np.divmod(pixel, width)[::-1]).astype(np.float32)
         last = np.array([[width - 2], [height - 2]], np.float32)
         inside = ((whole >= 0) & (whole <= last)).all(axis=1)
         column, row = whole.swapaxes(0, 1).astype(np.intp)
         near = np.where(inside, row * width + column, target)
         predicted = self._predicted(light, bins, lens.weight, shape) * inside
         first = min(int(near.min()), int(target.min()))
-        places = np.stack([target, *(near + by for by in (0, 1, width, width + 1))]) - first
+        places = np.empty((5, *target.shape), np.intp)
+        for k, by in enumerate((0, 1, width, width + 1), 1):
+            np.add(near, by - first, out=places[k])
+        np.subtract(target, first, out=places[0])
         both = across * down
         shares = (1 - across - down + both, across - both, down - both, both)
         sums, amount = list[FloatArray64](), np.empty(places.shape)  # as `bincount` takes it
@@ -214,7 +217,7 @@ class Job:
         others = (colour.sum(axis=2, keepdims=True) - colour) / np.float32(samples - 1)
         open_share = weight.sum(axis=0).reshape(pixels, samples).mean(axis=1, keepdims=True)
         others /= np.where(open_share > 0, open_share, np.float32(1))
-        radiance = np.einsum("lcn,cn->ln", self._basis.take(bins, axis=-1), others.reshape(3, -1))
+        radiance = np.einsum("lcn,cn->ln", self._basis.take(bins, axis=-1, mode="clip"), others.reshape(3, -1))
         return radiance * weight[1:]
 
     def _sum_depth(
