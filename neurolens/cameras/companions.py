@@ -83,36 +83,40 @@ def fit_shift(
     if left > max(_WORST_MM, _WORST * size):
         return None
     x, y = (_BEYOND * float(v) for v in np.abs(shift[:2]).max(axis=1))
+    return Shift(*_shift_graphs((exponents, weights), scale, (middle, spread), (x, y), film_mm), (x, y))
+
+
+def _shift_graphs(
+    terms: tuple[NDArray[np.int64], Array], scale: Array, waves: tuple[float, float], *limits_mm: tuple[float, float]
+) -> tuple[Graph, Graph]:
+    """The graphs of `Shift`, for exponents [M, 6] and weights [4, M] of variables so scaled, the reach and the film."""
+    exponents, weights = terms
     each, place = np.unique(exponents[:, :5], axis=0, return_inverse=True)
     powers = np.zeros((len(_DEGREES), 4, len(each)))  # of the companion's variable
     powers[exponents[:, 5], :, place.ravel()] = weights.T
 
-    def variables(g: Graph) -> tuple[Value, Value]:
-        inverse = 1000.0 / g.input("wavelength_nm")
-        point = g.concat(g.input("film_mm", 2), g.input("pupil_mm", 2))
-        return point, (inverse * inverse + -middle) * (1 / spread)
+    def variable(g: Graph, name: str) -> Value:
+        inverse = 1000.0 / g.input(name)
+        return (inverse * inverse + -waves[0]) * (1 / waves[1])
 
     of_hero, g = Graph(), Graph()
-    point, hero = variables(of_hero)
-    all_five = of_hero.concat(point * (1 / scale), hero)
-    of_hero.outputs["shift"] = of_hero.polynomial(each, powers.reshape(-1, len(each)), all_five)
-    point, hero = variables(g)
-    film, inverse = g.input("film_mm", 2), 1000.0 / g.input("companion_nm")
-    other = (inverse * inverse + -middle) * (1 / spread)
+    start, point = (h.concat(h.input("film_mm", 2), h.input("pupil_mm", 2)) for h in (of_hero, g))
+    variables = of_hero.concat(start * (1 / scale), variable(of_hero, "wavelength_nm"))
+    of_hero.outputs["shift"] = of_hero.polynomial(each, powers.reshape(-1, len(each)), variables)
+    hero, other = (variable(g, name) for name in ("wavelength_nm", "companion_nm"))
     constant, linear, quadratic = g.split(g.input("shift", 12), [4, 4, 4])
     moved = point + (constant + (linear + quadratic * other) * other) * (other - hero)
-    half = 0.5 * np.array(film_mm)
-    near = (moved[:2] - film).between([-x, -y], [x, y]) & moved[:2].between(-half, half)
+    reach, half = np.array(limits_mm[0]), 0.5 * np.array(limits_mm[1])
+    near = (moved - point)[:2].between(-reach, reach) & moved[:2].between(-half, half)
     g.outputs |= {"companion": moved, "known": near[0] & near[1]}
-    return Shift(of_hero, g, (x, y))
+    return of_hero, g
 
 
 def companion_graph(lens: LensGraph, shift: Graph, mask_too: bool) -> Graph:
     """The graph of companions: from a ray's film and pupil point and two wavelengths to the companion's light.
 
-    A companion that is not known (`Shift.graph`) is outside the domain.
-
-    Inputs: those of `Shift.graph`, and those of the lens for a whole call; with `mask_too` the table of a mask.
+    Inputs: those of `Shift.graph`, beyond whose limits companions are outside the domain, and those of the lens for a
+    whole call; with `mask_too` the table of a mask.
     Outputs: `companion` [2], the film point, `transmittance`, `status`; without `mask_too` also `stop_xy_mm` of a lens
     with a mask.
     """

@@ -249,7 +249,8 @@ class LensCamera:
         film, square = self._checked(film_mm, pupil, light[0])
         hero = self._run("hero")({"film_mm": film, "square": square, "wavelength_nm": light[:1]})
         rays, lanes = camera_rays(hero), len(light)
-        same = {"film_mm": film, "wavelength_nm": light[:1], **{k: hero[k] for k in ("pupil_mm", "shift") if k in hero}}
+        same = {"film_mm": film, "wavelength_nm": light[:1]}
+        same |= {name: hero[name] for name in ("pupil_mm", "shift") if name in hero}
         passed, through = np.empty((lanes, film.shape[1]), np.bool_), np.empty(light.shape, np.float32)
         places = np.empty((lanes, *film.shape), np.float32)
         passed[0], places[0] = rays.weight > 0, film

@@ -199,7 +199,7 @@ class Job:
         np.subtract(target, first, out=places[0])
         both = across * down
         shares = (1 - across - down + both, across - both, down - both, both)
-        sums, amount = list[FloatArray64](), np.empty(places.shape)  # as `bincount` takes it
+        sums, amount = list[NDArray[Any]](), np.empty(places.shape)  # as `bincount` takes it
         for channel in range(3):
             expected = predicted * response[1:, channel]
             np.subtract(light[1:, channel], expected, out=amount[0])
