@@ -97,7 +97,7 @@ _COLUMNS = lab.columns(
     *((f"{mode}: channels", f"{mode}.gain_channels", ".1f") for mode in ("four", "lateral")),
 )  # fmt: skip
 _ABOUT = (
-    "Variance of luminance over the thin lens's, ratio of medians and of means over pixels, and of the channels' means: "
+    "Variance of luminance over the thin lens's, ratio of medians and of means over pixels, and of channels' means: "
     "for one wavelength a path, for four, and for four with lateral colour or none (`--dispersion lateral`, `off`: the "
     "same lens with all wavelengths at one film point). Seconds of CPU a picture, the least of all seeds; how many "
     "times less than one wavelength the modes take to the same mean error."
@@ -117,12 +117,12 @@ def run(args: argparse.Namespace) -> None:
         rows = [next(found) for _ in lab.counted(cases, "cases", args.quiet)]
     head = f"`python -m experiments dispersion`: {args.samples} samples, {args.seeds} seeds, {args.width} pixels wide; "
     parts = [head + lab.machine_line(), _ABOUT, lab.table(_COLUMNS, rows)]
-    over = [[a / b for r in rows for a, b in zip(r["four"]["channels"], r["off"]["channels"], strict=True)],
-            [r["four"]["mean"] / r["off"]["mean"] for r in rows], [r["four"]["seconds"] / r["one"]["seconds"] for r in rows]]  # fmt: skip
-    told = [
-        f"Four over the same lens without dispersion: luminance {_range(over[1])}, channels {_range(over[0])}; time "
-    ]
-    told[0] += f"over one wavelength {_range(over[2])}."
+    pairs = [(r["four"], r["off"]) for r in rows]
+    light = _range([four["mean"] / off["mean"] for four, off in pairs])
+    colours = _range([a / b for four, off in pairs for a, b in zip(four["channels"], off["channels"], strict=True)])
+    time = _range([r["four"]["seconds"] / r["one"]["seconds"] for r in rows])
+    told = [f"Four over the same lens without dispersion: luminance {light}, channels {colours};"]
+    told.append(f"time over one wavelength {time}.")
     for mode in ("four", "lateral"):
         gains = [_range([row[mode][key] for row in rows]) for key in ("gain", "gain_channels")]
         told.append(f"Time to equal error, {mode}: luminance {gains[0]}, channels {gains[1]}.")

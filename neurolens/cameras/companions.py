@@ -19,7 +19,7 @@ from neurolens.base import status as st
 from neurolens.cameras.cameragraph import LensGraph, lens_inside, status_graph, unrounded
 from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph
+from neurolens.graph.ir import Graph, Value
 from neurolens.graph.program import RAY
 
 Array = NDArray[np.float64]
@@ -37,22 +37,26 @@ class Shift(NamedTuple):
     """The shift from the film and pupil point of the hero to those of a companion.
 
     Attributes:
-        graph: inputs `film_mm`, `pupil_mm` [2], `wavelength_nm`, `companion_nm`; output `companion` [4], the film and
-            pupil point in mm of the same scene ray at the companion wavelength.
+        of_hero: inputs `film_mm`, `pupil_mm` [2], `wavelength_nm`; output `shift` [12], what all companions share.
+        graph: inputs those of `of_hero`, `shift` and `companion_nm`; outputs `companion` [4], the film and pupil point
+            in mm of the same scene ray at the companion wavelength, and `known`, 0 beyond the film or the reach.
         reach_mm: the largest shift of the film point along x and along y; a companion beyond it counts as blocked.
     """
 
+    of_hero: Graph
     graph: Graph
     reach_mm: tuple[float, float]
 
 
-def fit_shift(lens: Graph, samples: Mapping[str, Array], companion_nm: Array) -> Shift | None:
+def fit_shift(
+    lens: Graph, samples: Mapping[str, Array], companion_nm: Array, film_mm: tuple[float, float]
+) -> Shift | None:
     """Fit the shift of a lens; None if too few rays pass, or the error on held-out rays is too large.
 
     Args:
         lens: the graph of the lens (`cameragraph.LensGraph`).
         samples: its inputs for rays that cover film, pupil and wavelengths; half of them measure the error.
-        companion_nm: [N] wavelengths of the companions.
+        companion_nm: [N] wavelengths of the companions. film_mm: width and height of the film.
     """
     rays = samples["rays"]
     shift, kept = _solved(lens, samples, companion_nm)
@@ -61,9 +65,9 @@ def fit_shift(lens: Graph, samples: Mapping[str, Array], companion_nm: Array) ->
     rays, shift, companion_nm = rays[:, kept], shift[:, kept], companion_nm[kept]
     waves = (1000 / np.stack([rays[4], companion_nm])) ** 2
     low, high = float(waves.min()), float(waves.max())
-    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    middle, spread = 0.5 * (low + high), 0.5 * (high - low)
     scale = np.repeat([np.abs(rays[:2]).max(), np.abs(rays[2:4]).max()], 2)
-    columns = np.concatenate([rays[:4] / scale[:, None], (waves - middle) / half])
+    columns = np.concatenate([rays[:4] / scale[:, None], (waves - middle) / spread])
     exponents, odd = _monomials()
     products = np.stack([np.prod(columns.T**powers, axis=1) for powers in exponents]) * (columns[5] - columns[4])
     train = np.arange(rays.shape[1]) % 2 == 0
@@ -79,27 +83,50 @@ def fit_shift(lens: Graph, samples: Mapping[str, Array], companion_nm: Array) ->
     if left > max(_WORST_MM, _WORST * size):
         return None
     x, y = (_BEYOND * float(v) for v in np.abs(shift[:2]).max(axis=1))
-    g = Graph()
-    point = g.concat(g.input("film_mm", 2), g.input("pupil_mm", 2))
-    inverse = [1000.0 / g.input(name) for name in ("wavelength_nm", "companion_nm")]
-    hero, other = ((value * value + -middle) * (1 / half) for value in inverse)
-    variables = g.concat(point * (1 / scale), hero, other)
-    g.outputs["companion"] = point + g.polynomial(exponents, weights, variables) * (other - hero)
-    return Shift(g, (x, y))
+    return Shift(*_shift_graphs((exponents, weights), scale, (middle, spread), (x, y), film_mm), (x, y))
+
+
+def _shift_graphs(
+    terms: tuple[NDArray[np.int64], Array], scale: Array, waves: tuple[float, float], *limits_mm: tuple[float, float]
+) -> tuple[Graph, Graph]:
+    """The graphs of `Shift`, for exponents [M, 6] and weights [4, M] of variables so scaled, the reach and the film."""
+    exponents, weights = terms
+    each, place = np.unique(exponents[:, :5], axis=0, return_inverse=True)
+    powers = np.zeros((len(_DEGREES), 4, len(each)))  # of the companion's variable
+    powers[exponents[:, 5], :, place.ravel()] = weights.T
+
+    def variable(g: Graph, name: str) -> Value:
+        inverse = 1000.0 / g.input(name)
+        return (inverse * inverse + -waves[0]) * (1 / waves[1])
+
+    of_hero, g = Graph(), Graph()
+    start, point = (h.concat(h.input("film_mm", 2), h.input("pupil_mm", 2)) for h in (of_hero, g))
+    variables = of_hero.concat(start * (1 / scale), variable(of_hero, "wavelength_nm"))
+    of_hero.outputs["shift"] = of_hero.polynomial(each, powers.reshape(-1, len(each)), variables)
+    hero, other = (variable(g, name) for name in ("wavelength_nm", "companion_nm"))
+    constant, linear, quadratic = g.split(g.input("shift", 12), [4, 4, 4])
+    moved = point + (constant + (linear + quadratic * other) * other) * (other - hero)
+    reach, half = np.array(limits_mm[0]), 0.5 * np.array(limits_mm[1])
+    near = (moved - point)[:2].between(-reach, reach) & moved[:2].between(-half, half)
+    g.outputs |= {"companion": moved, "known": near[0] & near[1]}
+    return of_hero, g
 
 
 def companion_graph(lens: LensGraph, shift: Graph, mask_too: bool) -> Graph:
     """The graph of companions: from a ray's film and pupil point and two wavelengths to the companion's light.
 
-    Inputs: those of `Shift.graph`, and those of the lens for a whole call; with `mask_too` the table of a mask.
-    Outputs: `companion` [4], `transmittance`, `status`; without `mask_too` also `stop_xy_mm` of a lens with a mask.
+    Inputs: those of `Shift.graph`, beyond whose limits companions are outside the domain, and those of the lens for a
+    whole call; with `mask_too` the table of a mask.
+    Outputs: `companion` [2], the film point, `transmittance`, `status`; without `mask_too` also `stop_xy_mm` of a lens
+    with a mask.
     """
     g = Graph()
-    moved = g.inline(shift, {})["companion"]
-    found, aperture = lens_inside(g, lens, g.concat(moved, g.input("companion_nm")), mask_too)
+    shifted = g.inline(shift, {})
+    found, aperture = lens_inside(g, lens, g.concat(shifted["companion"], g.input("companion_nm")), mask_too)
     given = {**found, "lens_status": unrounded(found["status"])}
-    status = g.inline(status_graph(aperture, lens.stopped), given)["status"].whole()
-    g.outputs |= {"companion": moved, "transmittance": found["transmittance"], "status": status}
+    status = g.inline(status_graph(aperture, lens.stopped), given)["status"]
+    status = g.select(shifted["known"], status, status.maximum(float(st.OUTSIDE_DOMAIN))).whole()
+    g.outputs |= {"companion": shifted["companion"][:2], "transmittance": found["transmittance"], "status": status}
     return g
 
 

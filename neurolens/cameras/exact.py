@@ -122,9 +122,11 @@ class ExactCamera(LensCamera):
 
     def _companion(self, rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
         assert self._shift is not None
-        moved = evaluate(self._shift.graph, rays)["companion"]
+        shifted = evaluate(self._shift.graph, rays | evaluate(self._shift.of_hero, rays))
+        moved = shifted["companion"]
         found = self._scene(moved[:2], moved[2:], rays["companion_nm"][0])
-        return {"companion": moved, "transmittance": found.transmittance[None], "status": found.status[None]}
+        status = np.where(shifted["known"] > 0, found.status, st.OUTSIDE_DOMAIN)
+        return {"companion": moved, "transmittance": found.transmittance[None], "status": status}
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """Film points of scene points [3, N] in m, traced through points of the front surface chosen by `pupil`."""

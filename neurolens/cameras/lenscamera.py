@@ -231,20 +231,22 @@ class LensCamera:
         light = np.ascontiguousarray(wavelength_nm, np.float32)
         film, square = self._checked(film_mm, pupil, light[0])
         hero = self._run("hero")({"film_mm": film, "square": square, "wavelength_nm": light[:1]})
-        rays, pupil = camera_rays(hero), np.ascontiguousarray(hero["pupil_mm"])
-        places, through = np.repeat(film[None], len(light), 0), np.repeat(hero["transmittance"], len(light), 0)
-        passed = np.repeat((rays.weight > 0)[None], len(light), axis=0)
-        reach, edge = (np.array(v, np.float32)[:, None] for v in (self.companion_reach_mm, self.film_mm))
-        for k in range(1, len(light)):
-            given = {"film_mm": film, "pupil_mm": pupil, "wavelength_nm": light[:1], "companion_nm": light[k : k + 1]}
-            found = self._run("companion")(given)
-            place, through[k] = found["companion"][:2], np.maximum(found["transmittance"][0], 0)
-            passed[k] &= (found["status"][0] == st.PASSED) & np.isfinite(through[k])
-            passed[k] &= (np.abs(place - film) <= reach).all(0) & (np.abs(place) < edge / 2).all(0)
-            places[k] = np.where(passed[k], place, film)  # what does not pass has any place, or none
-        shared = rays.weight / np.where(passed[0], through[0] * np.maximum(passed.sum(0), 1), 1)
-        weight = np.where(passed, through, 0) * shared
-        return SpectralRays(rays, weight.astype(np.float32), places)
+        rays, lanes = camera_rays(hero), len(light)
+        same = {"film_mm": film, "wavelength_nm": light[:1]}
+        same |= {name: hero[name] for name in ("pupil_mm", "shift") if name in hero}
+        passed, through = np.empty((lanes, film.shape[1]), np.bool_), np.empty(light.shape, np.float32)
+        places = np.empty((lanes, *film.shape), np.float32)
+        passed[0], places[0] = rays.weight > 0, film
+        through[0] = np.where(passed[0], hero["transmittance"][0], 0)
+        for lane in range(1, lanes):
+            companion = self._run("companion")(same | {"companion_nm": light[lane : lane + 1]})
+            power = np.maximum(companion["transmittance"][0], 0)
+            passed[lane] = (companion["status"][0] == st.PASSED) & np.isfinite(power) & passed[0]
+            through[lane] = np.where(passed[lane], power, 0)
+            places[lane] = np.where(passed[lane], companion["companion"][:2], film)  # what does not pass has any place
+        shared = through[0] * passed.sum(axis=0, dtype=np.float32)
+        through *= rays.weight / np.maximum(shared, np.finfo(np.float32).tiny)
+        return SpectralRays(rays, through, places)
 
     @property
     def companion_reach_mm(self) -> tuple[float, float] | None:
@@ -282,6 +284,9 @@ class LensCamera:
         else:
             also = ("pupil_mm", "transmittance") if kind == "hero" else ()
             graph, numbers = whole_camera(self.film, lens, also, mask_too)
+            if kind == "hero" and self._shift is not None:
+                pupil = {"pupil_mm": graph.outputs["pupil_mm"]}
+                graph.outputs |= graph.inline(self._shift.of_hero, pupil)
         made = _compiled(graph, numbers, self.film, lens) if self.runtime == "c" else None
         return made or self._in_onnxruntime(graph, numbers, lens)
 
@@ -290,7 +295,7 @@ class LensCamera:
         """The shift of companions, fitted once."""
         samples = {name: values.astype(np.float64) for name, values in self._film_samples().items()}
         companions = np.random.default_rng(1).permutation(samples["rays"][4])
-        return fit_shift(self.lens_graph().graph, samples, companions)
+        return fit_shift(self.lens_graph().graph, samples, companions, self.film_mm)
 
     def _of_the_lens(self) -> dict[str, float]:
         """The inputs of the lens's graph for a whole call."""

@@ -160,10 +160,10 @@ class Spill(NamedTuple):
     """The light of companions in one pass of a tile, which may arrive at pixels other than those of its samples.
 
     Attributes:
-        pixel: [K] numbers in the picture, none twice. sums: [K, 3] float64, of the columns `RGB`.
+        first: number in the picture of the first pixel. sums: [K, 3] float64, of the columns `RGB` of consecutive ones.
     """
 
-    pixel: NDArray[np.intp]
+    first: int
     sums: NDArray[np.float64]
 
 
@@ -231,9 +231,9 @@ class Film:
         self.sums[self.tiling.pixels_of(tile)] += sums
         self.done[tile] += 1
         if spill is not None:
-            here = spill.pixel - self.tiling.start
-            inside = (here >= 0) & (here < len(self.sums))
-            self.sums[here[inside], RGB] += spill.sums[inside]
+            here = spill.first - self.tiling.start
+            there = self.sums[max(here, 0) : max(here + len(spill.sums), 0), RGB]
+            there += spill.sums[max(-here, 0) :][: len(there)]
 
     def copy(self, first: int, stop: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Sums [n, COLUMNS] of the pixels, and passes, of the tiles from `first` up to `stop`, of one moment."""

@@ -18,7 +18,7 @@ from neurolens.render import film as columns
 from neurolens.render.colour import SRGB, FloatArray64, Index, SpectralRange, Spectrum, balance, converted, illuminant
 from neurolens.render.environment import sun_spectrum, total_spectrum
 from neurolens.render.film import Film, PixelGrid, Spill, Tiling
-from neurolens.render.integrator import lit, trace
+from neurolens.render.integrator import trace
 from neurolens.render.sampler import FILM, PUPIL, WAVELENGTH, Sampler, centres
 from neurolens.render.scene import CameraSettings, Scene
 from neurolens.render.scenetables import Vector
@@ -143,9 +143,7 @@ class Job:
         sums = np.empty((len(pixels), columns.COLUMNS))
         spill = self._sum_light(sums, value, bins, pixel, lens)
         self._sum_depth(sums, lens.origin, lens.direction, distance)
-        passed = np.zeros(len(hue), np.bool_)
-        passed[lit(lens.weight)] = True
-        sums[:, columns.PASSED] = np.count_nonzero(passed.reshape(len(pixels), -1), axis=1)
+        sums[:, columns.PASSED] = np.count_nonzero(lens.weight[0].reshape(len(pixels), -1), axis=1)
         return sums, spill, np.array([answered - called, time.perf_counter() - began])
 
     def _sum_light(
@@ -156,7 +154,7 @@ class Job:
         Paths whose light is not finite, or beyond any sum, are counted and add nothing: one would spoil its pixel and
         with it the whole file.
         """
-        response, factors = (t.take(bins, axis=-1) for t in (self._response, self._luminance))
+        response, factors = (t.take(bins, axis=-1, mode="clip") for t in (self._response, self._luminance))
         dropped = ~(np.abs(np.einsum("ln,ln->n", factors, value)) <= _BRIGHTEST_SAMPLE)
         if dropped.any():
             value = np.where(dropped, np.float32(0), value)
@@ -188,24 +186,29 @@ class Job:
         per_mm = np.array([[-width / self.grid.film_mm[0]], [height / self.grid.film_mm[1]]], np.float32)
         moved = (lens.places[1:] - lens.places[0]) * per_mm
         whole = np.floor(moved)
-        part = moved - whole
-        row, column = np.divmod(pixel, width)
-        column, row = column + whole[:, 0].astype(np.intp), row + whole[:, 1].astype(np.intp)
-        inside = (column >= 0) & (column + 1 < width) & (row >= 0) & (row + 1 < height)
-        if getattr(self.camera, "lateral", False):
-            predicted = light[1:].copy()
-        else:
-            predicted = self._predicted(light, bins, lens.weight, shape)[:, None] * response[1:]
-        predicted *= inside[:, None]
+        across, down = (moved - whole).swapaxes(0, 1)
+        whole += np.stack(np.divmod(pixel, width)[::-1]).astype(np.float32)
+        last = np.array([[width - 2], [height - 2]], np.float32)
+        inside = ((whole >= 0) & (whole <= last)).all(axis=1)
+        column, row = whole.swapaxes(0, 1).astype(np.intp)
         near = np.where(inside, row * width + column, target)
+        lateral = getattr(self.camera, "lateral", False)
+        predicted = inside if lateral else self._predicted(light, bins, lens.weight, shape) * inside
+        first = min(int(near.min()), int(target.min()))
         places = np.empty((5, *target.shape), np.intp)
-        sums = np.empty((3, *places.shape))  # as `bincount` takes them
-        places[0], sums[:, 0] = target, (light[1:] - predicted).swapaxes(0, 1)
-        for k, (down, across) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1)), 1):
-            share = (part[:, 0] if across else 1 - part[:, 0]) * (part[:, 1] if down else 1 - part[:, 1])
-            np.add(near, (down * width + across) * inside, out=places[k])
-            np.multiply(predicted.swapaxes(0, 1), share, out=sums[:, k])
-        return _gathered(places.reshape(-1), sums.reshape(3, -1))
+        for k, by in enumerate((0, 1, width, width + 1), 1):
+            np.add(near, by - first, out=places[k])
+        np.subtract(target, first, out=places[0])
+        both = across * down
+        shares = (1 - across - down + both, across - both, down - both, both)
+        sums, amount = list[NDArray[Any]](), np.empty(places.shape)  # as `bincount` takes it
+        for channel in range(3):
+            expected = predicted * (light if lateral else response)[1:, channel]
+            np.subtract(light[1:, channel], expected, out=amount[0])
+            for k, share in enumerate(shares, 1):
+                np.multiply(expected, share, out=amount[k])
+            sums.append(np.bincount(places.reshape(-1), amount.reshape(-1)))
+        return Spill(first, np.stack(sums, axis=1))
 
     def _predicted(self, light: FloatArray, bins: Index, weight: FloatArray, shape: tuple[int, int]) -> FloatArray:
         """Weighted radiance [lanes - 1, N] of the companions, predicted by the mean of their pixel's other samples."""
@@ -216,7 +219,7 @@ class Job:
         others = (colour.sum(axis=2, keepdims=True) - colour) / np.float32(samples - 1)
         open_share = weight.sum(axis=0).reshape(pixels, samples).mean(axis=1, keepdims=True)
         others /= np.where(open_share > 0, open_share, np.float32(1))
-        radiance = np.einsum("lcn,cn->ln", self._basis.take(bins, axis=-1), others.reshape(3, -1))
+        radiance = np.einsum("lcn,cn->ln", self._basis.take(bins, axis=-1, mode="clip"), others.reshape(3, -1))
         return radiance * weight[1:]
 
     def _sum_depth(
@@ -276,15 +279,6 @@ class Job:
         if accepted is not None:
             np.clip(wavelengths, accepted[0], accepted[1], out=wavelengths)
         return wavelengths
-
-
-def _gathered(pixel: Index, light: FloatArray64) -> Spill:
-    """The sums of light [3, N] by pixels [N]."""
-    first = int(pixel.min(initial=0)) if pixel.size else 0
-    pixel = pixel - first
-    red, green, blue = (np.bincount(pixel, weights=channel) for channel in light)
-    rows = np.flatnonzero((red != 0) | (green != 0) | (blue != 0))
-    return Spill(first + rows, np.stack([red[rows], green[rows], blue[rows]], axis=1, dtype=np.float64))
 
 
 def _turned(hue: FloatArray, by: FloatArray | np.float32) -> FloatArray:
