@@ -1,7 +1,9 @@
 """Pinhole, thin lens, thick lens and fisheye projections against closed forms."""
 
 import math
+from copy import copy
 from pathlib import Path
+from typing import Any
 
 import lens_models
 import numpy as np
@@ -11,11 +13,14 @@ from shipped import disc_irradiance
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
+from neurolens.cameras import build
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera
 from neurolens.cameras.ideal import ThickLens, ThinLens
 from neurolens.cameras.pinhole import PROJECTIONS, Fisheye, Pinhole
 from neurolens.cameras.sampling import concentric_disk
+from neurolens.graph.compiler import has_compiler
+from neurolens.lens.apertures import Aperture
 from neurolens.lens.paraxial import first_order, system_of
 from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Shot
@@ -307,3 +312,30 @@ def test_bad_settings_are_named(spec: str, change: dict[str, object], field: str
         make_camera(spec, Shot((36.0, 24.0), 1.0, **change))  # type: ignore[arg-type]
     with pytest.raises(InputError, match="projection"):
         Fisheye("fish", 10.0)
+
+
+@pytest.mark.skipif(not has_compiler(), reason="no C compiler")
+@pytest.mark.parametrize("kind", ["thin:", "thick:"])
+@pytest.mark.parametrize("shape", [None, Aperture(blades=6, rotation_deg=10.0)])
+def test_compiled_ideal_lenses_give_the_same_rays(kind: str, shape: Aperture | None) -> None:
+    compiled: Any = make_camera(f"{kind}lenses/laikin_double_gauss_50.toml", Shot(FILM, 2.0, 2.8, aperture=shape))
+    plain = copy(compiled)
+    plain._run = plain._evaluated
+    rng, count = np.random.default_rng(0), 5000
+    film = ((rng.random((2, count)) - 0.5) * np.array(FILM)[:, None]).astype(np.float32)
+    square, waves = rng.random((2, count), np.float32), np.full(count, 550, np.float32)
+    square[:, :4] = [[0.5, 0.0, np.nan, 1.5], [0.5, 0.0, 0.5, 0.5]]
+    film[0, 4], film[1, 5], waves[6], waves[7] = np.inf, 1e30, np.nan, -1.0
+    one, other = (c.sample(film, square, waves) for c in (plain, compiled))
+    np.testing.assert_array_equal(one.status, other.status)
+    assert (one.status[2:8] != 0).all() and not one.weight[2:8].any()
+    for part in ("origin_m", "direction", "weight"):
+        np.testing.assert_allclose(getattr(one, part), getattr(other, part), rtol=0, atol=1e-6)
+
+
+def test_without_a_compiler_ideal_lenses_run_in_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(build, "has_compiler", lambda: False)
+    camera: Any = make_camera("thin", Shot(FILM, 2.0, 2.8))
+    assert camera._run == camera._evaluated
+    rays = camera.sample(np.zeros((2, 1), np.float32), np.full((2, 1), 0.5, np.float32), np.full(1, 550, np.float32))
+    assert rays.direction[:, 0] == pytest.approx([0, 0, -1]) and rays.status[0] == 0
