@@ -247,6 +247,7 @@ def _write_samples(result: plans.Plan, path: Path) -> None:
 
 def _text(command: Plan, result: plans.Plan, folder: Path) -> str:
     from neurolens.plan.light import STRAY
+    from neurolens.plan.plan import offers
 
     request = result.asked
     view = "nothing with a distance" if request.nearest_m is None else (
@@ -293,11 +294,14 @@ def _text(command: Plan, result: plans.Plan, folder: Path) -> str:
         allowed = f"within {result.budget_s:g} s" if result.budget_s is not None else f"of {result.budget_px:g}"
         if result.budget_flip is not None:
             allowed = f"FLIP {number(best.flip, 2)} of {result.budget_flip:g}"
-        sentence = f"Use {best.name}: {number(best.error_px, 3)} px {allowed}, {number(best.cost, 3)} "
-        sentence += f"{result.unit} a path times noise"
-        if rest := result.work.rest[best.disperses]:
-            sentence += f", of {number(best.whole(result.work, request.denoised), 3)}; without camera and noise a path "
-            sentence += f"takes {number(rest, 3)}"
+        sentence = f"Use {best.name}: {number(best.error_px, 3)} px {allowed}, "
+        sentence += f"{number(best.cost, 3)} {result.unit} a path times noise"
+        if result.work.rest[best.disperses]:
+            (offer,) = offers(result.probed.scene, result.probed, [best], result.work)
+            sentence += (
+                f".\nThe picture takes {number(offer.seconds, 3)} s of one thread to the noise that the exact lens "
+            )
+            sentence += f"at the scene's samples, the camera {number(offer.camera, 2)} s of that"
         if len(result.alike) > 1:
             sentence += f".\nAny of these takes about as long: {', '.join(result.alike)}"
         if (times := result.work.noise[best.disperses]) > 1 and not request.denoised:
