@@ -114,12 +114,13 @@ def chosen_rows(names: Sequence[str], quick: bool = False) -> tuple[Row, ...]:
     """Rows by name, by group, or by method ("ols", "schrade"; without ablations); none named: all but the ablations.
 
     Args:
-        quick: train networks that take minutes for their `QUICK_STEPS` only; their sources say so.
+        quick: none named: `QUICK_ROWS`. Train networks that take minutes for their `QUICK_STEPS` only; their sources
+            say so.
 
     Raises:
         InputError: an unknown name.
     """
-    rows, wanted = all_rows(), names or DEFAULT_GROUPS
+    rows, wanted = all_rows(), names or (QUICK_ROWS if quick else DEFAULT_GROUPS)
     picked: dict[str, Row] = {}
     for name in wanted:
         found = [r for r in rows if name in (r.name, r.group) or (name == r.settings.method and r.group != "ablations")]
@@ -130,8 +131,13 @@ def chosen_rows(names: Sequence[str], quick: bool = False) -> tuple[Row, ...]:
     return tuple(_quick(row) if quick else row for row in picked.values())
 
 
+# A row a method, or two, of those that take less than half a minute.
+QUICK_ROWS = (
+    *("thin", "thick", "taylor-d5", "hanika-d5", "schrade-28", "zheng-adaptive-36x1", "neurolens2017-128x3", "rtf-d6"),
+    *("ray-lut-16", "ols-20", "ols-64", "mlp-8x1", "mlp-16x2", "ols-40-mlp-8x2"),
+)
 # Steps of training of the networks that would take minutes.
-QUICK_STEPS = {"neurolens2017-128x3": 500, "mlp-32x2": 40}
+QUICK_STEPS = {"neurolens2017-128x3": 500, "mlp-16x2": 40, "mlp-32x2": 40}
 
 
 def _quick(row: Row) -> Row:

@@ -49,7 +49,10 @@ OPTIONS = (
         help="rows by name, or groups: paraxial, published, ours, ablations (default: the first three)",
     ),
     lab.option("--near", action="store_true", help="focus from infinity to the near limit, not infinity alone"),
-    lab.option("--quick", action="store_true", help="6000 rays, 3 rounds, less training: rough figures"),
+    lab.option(
+        "--quick", action="store_true",
+        help="a row or two a method, 6000 rays, 3 rounds, less training: rough figures in 3 minutes",
+    ),
     lab.option("--rays", metavar="N", type=whole(1000, 10**6), help="rays of fits and errors (default 30000)"),
     lab.option("--seed", metavar="N", type=whole(0), default=1, help="seed of the rays (default 1)"),
     lab.option("--rounds", metavar="N", type=whole(0), help="rounds of the race, 0 for none (default 10)"),
@@ -108,7 +111,7 @@ def _settings(args: argparse.Namespace) -> BenchSettings:
 def _conditions(args: argparse.Namespace, settings: BenchSettings) -> str:
     focus = "focus from infinity to the near limit" if args.near else "focus at infinity"
     pairs, e = settings.pairs, settings.evaluation
-    cut = " and ".join(f"{name} for {steps}" for name, steps in QUICK_STEPS.items())
+    cut = ", ".join(f"{name} for {steps}" for name, steps in QUICK_STEPS.items())
     quick = f" Quick: steps of training, too few: {cut}." if args.quick else ""
     return (
         f"Full aperture and lit film, 400-700 nm (one wavelength where no dispersion is known), {focus}; {pairs.train} "

@@ -26,7 +26,7 @@ import torch
 from numpy.typing import NDArray
 from scipy import signal  # type: ignore[import-untyped]
 
-from neurolens.flare.lights import Patch, disc
+from neurolens.flare.lights import CELLS, FADE, Patch, disc
 from neurolens.flare.steps import LOST, Floats
 from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.lens.prescription import Lens
@@ -36,7 +36,7 @@ Doubles = NDArray[np.float64]
 _AXIS = 1 << 15  # rays of the exposure
 _PER_CELL = 8  # edges of two triangles that rims cut, at most
 _LEAST = 0.5  # pixels that a picture moves, below which a light is a point
-_STEP, _STEPS = 0.125, 48  # movements are rounded to so many pixels, and to such a part of themselves
+_STEP, _STEPS = 0.125, 256  # movements are rounded to so many pixels, and to such a part of themselves
 _CORNERS = 64  # of an ellipse
 _THIN = 0.25  # least width of a patch in pixels
 _FINE = 12.0  # pixels that draw the width of a smear, at least
@@ -140,9 +140,10 @@ class Smear(NamedTuple):
     @property
     def coarse(self) -> int:
         """How many pixels wide those pixels may be that the smeared picture is drawn with."""
-        a, b, c, d = self.sides
-        wide = abs(a * d - b * c) / max(math.hypot(a, b), math.hypot(c, d)) / max(map(len, self.weights), default=1)
-        return 1 << max(0, math.floor(math.log2(wide / _FINE)))
+        (a, b, c, d), parts = self.sides, max(map(len, self.weights), default=1)
+        cells = parts // FADE if parts > CELLS else parts  # the light may jump between cells, not between their parts
+        wide = abs(a * d - b * c) / max(math.hypot(a, b), math.hypot(c, d))
+        return 1 << max(0, math.floor(math.log2(wide / cells / _FINE)))
 
     def kernel(self, most: int, coarse: int = 1) -> Floats:
         """The kernel [2 H + 1, 2 W + 1] about the middle of the light, of sum 1 but for what lies beyond `most` pixels.
@@ -184,7 +185,7 @@ def smear_of(patch: Patch, moved_px: NDArray[np.floating[Any]]) -> Smear | None:
         wide, thin = (a, b) if np.hypot(*a) > np.hypot(*b) else (b, a)
         thin += _THIN / np.hypot(*wide) * np.array([-wide[1], wide[0]])
     even = patch.round or np.ptp(patch.weights) < 0.01 * patch.weights.max()
-    weights = () if even else tuple(map(tuple, (patch.weights / patch.weights.max()).round(2).tolist()))
+    weights = () if even else tuple(map(tuple, (patch.weights / patch.weights.max()).round(4).tolist()))
     return Smear((float(a[0]), float(a[1]), float(b[0]), float(b[1])), weights, patch.round)
 
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage  # type: ignore[import-untyped]
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import read_rows
@@ -38,6 +39,7 @@ _COLUMNS: dict[str, tuple[float, float, float]] = {
     "distance_m": (math.inf, 1e-6, math.inf),
 }
 CELLS = 8  # along each side of an extended light
+FADE = 8  # parts of a cell's side where patches of a light fade into each other
 
 
 class Shape(NamedTuple):
@@ -102,11 +104,9 @@ def light_towards(
 ) -> Light | None:
     """The light in a direction [3] of any length; None where that does not lie before the lens."""
     x, y, z = towards / np.linalg.norm(towards)
-    if not z < -1e-6:
-        return None
     r, g, b = (max(float(v), 0.0) for v in rgb)
     azimuth, elevation = math.degrees(math.atan2(x, -z)), math.degrees(math.asin(max(-1.0, min(1.0, y))))
-    return Light(azimuth, elevation, (r, g, b), distance_m, shape)
+    return Light(azimuth, elevation, (r, g, b), distance_m, shape) if z < -1e-6 else None
 
 
 def flat_shape(towards: NDArray[np.floating[Any]], sides: NDArray[np.floating[Any]], round_: bool = False) -> Shape:
@@ -120,10 +120,8 @@ def flat_shape(towards: NDArray[np.floating[Any]], sides: NDArray[np.floating[An
 
 def with_disc(light: Light, diameter_deg: float) -> Light:
     """A light as a round disc of this diameter about its direction."""
-    if not diameter_deg > 0:
-        return light
     ahead, size = light.towards, 2 * math.tan(math.radians(diameter_deg) / 2)
-    return replace(light, shape=flat_shape(ahead, size * sides_across(ahead), True))
+    return replace(light, shape=flat_shape(ahead, size * sides_across(ahead), True)) if diameter_deg > 0 else light
 
 
 class Patch(NamedTuple):
@@ -144,7 +142,7 @@ class Patch(NamedTuple):
 def patches(light: Light, most_deg: float, most: int = CELLS // 2) -> list[Patch]:
     """A light in patches of about so many degrees a side.
 
-    Each patch fades into its neighbours, so that no seam is seen where their ghosts do not quite meet.
+    Each patch fades smoothly into its neighbours, so that no seam is seen where their ghosts do not quite meet.
 
     Args:
         most: patches along a side, at most; `CELLS` makes a patch of each cell.
@@ -152,17 +150,18 @@ def patches(light: Light, most_deg: float, most: int = CELLS // 2) -> list[Patch
     if light.shape is None:
         return [Patch(light, np.zeros((2, 3)), np.ones((1, 1)), False)]
     corners, weights, is_round = light.shape
-    middles = 0.25 * (corners[1:, 1:] + corners[:-1, 1:] + corners[1:, :-1] + corners[:-1, :-1])
     counts = [min(math.ceil(math.degrees(side) / most_deg + 1e-9), most) for side in _lengths(corners)]
+    if 1 < max(counts) and most < CELLS:
+        weights = weights.repeat(FADE, 0).repeat(FADE, 1)
+        corners = ndimage.zoom(corners, [(len(weights) + 1) / len(corners)] * 2 + [1], order=1)
+    middles = 0.25 * (corners[1:, 1:] + corners[:-1, 1:] + corners[1:, :-1] + corners[:-1, :-1])
     parts = []
-    for along in _shares(counts[0]):
-        for across in _shares(counts[1]):
+    for along in _shares(counts[0], len(weights)):
+        for across in _shares(counts[1], len(weights)):
             own = weights * np.outer(along, across)
-            if not own.any():
-                continue
+            middle = np.einsum("ij,ijk", own, middles)
             rgb = np.array(light.rgb) * (own.sum() / weights.sum())
-            part = light_towards(np.einsum("ij,ijk", own, middles), rgb.tolist(), light.distance_m)
-            if part is not None:
+            if own.any() and (part := light_towards(middle, rgb.tolist(), light.distance_m)):
                 (top, below), (left, right) = ((v.nonzero()[0][0], v.nonzero()[0][-1] + 1) for v in (along, across))
                 a, b, c, d = corners[top, left], corners[top, right], corners[below, left], corners[below, right]
                 sides = np.stack([c + d - a - b, b + d - a - c]) / 2
@@ -170,10 +169,11 @@ def patches(light: Light, most_deg: float, most: int = CELLS // 2) -> list[Patch
     return parts
 
 
-def _shares(count: int) -> NDArray[np.float64]:
-    """The share [count, CELLS] of each cell along a side that each of so many patches has: their sum is 1."""
-    at = (np.arange(CELLS) + 0.5) * count / CELLS - 0.5
-    return np.maximum(1 - np.abs(at.clip(0, count - 1) - np.arange(count)[:, None]), 0)
+def _shares(count: int, cells: int) -> NDArray[np.float64]:
+    """The share [count, cells] of each cell along a side that each of so many patches has: their sum is 1."""
+    at = (np.arange(cells) + 0.5) * count / cells - 0.5
+    far = np.abs(at.clip(0, count - 1) - np.arange(count)[:, None]).clip(0, 1)
+    return 0.5 + 0.5 * np.cos(math.pi * far)
 
 
 def _lengths(corners: NDArray[np.float64]) -> tuple[float, float]:
@@ -300,8 +300,7 @@ def rays_across(lens: Lens, light: Light, place: NDArray[np.floating[Any]]) -> t
     source = 1000 * light.distance_m * ahead
     far = float(np.linalg.norm(source - centre))
     if far <= 1.01 * radius:
-        expected = f"a light outside the lens, beyond {radius / 1000:.3g} m"
-        raise InputError("light", "distance_m", light.distance_m, expected)
+        raise InputError("light", "distance_m", light.distance_m, f"one outside the lens, beyond {radius / 1000:.3g} m")
     # Uniform in solid angle over the cone that holds the sphere about the front surface.
     solid = 1 - math.sqrt(1 - (radius / far) ** 2)
     off = across * np.sqrt(solid * (2 - solid * (across**2).sum(0)))

@@ -86,6 +86,8 @@ def test_rows_by_name_group_and_method() -> None:
     assert [r.name for r in chosen_rows(["ols-64", "thin", "ols-64"])] == ["ols-64", "thin"]
     assert {r.settings.method for r in chosen_rows(["schrade"])} == {"schrade"}
     assert all(re.search(r" 20\d\d, ", r.source) for r in rows if r.group == "published")
+    quick = chosen_rows([], quick=True)
+    assert len(quick) < 15 and {r.settings.method for r in quick} == {r.settings.method for r in chosen_rows([])}
     (short,) = chosen_rows(["neurolens2017"], quick=True)
     assert short.settings.steps < chosen_rows(["neurolens2017"])[0].settings.steps and "--quick" in short.source
 

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import uniform_filter, uniform_filter1d
+from scipy.stats import qmc
 
 from neurolens.flare.canvas import Raster, Smear
 from neurolens.flare.diffraction import starburst_picture
-from neurolens.flare.ghosts import GhostTracer, ghost_table
+from neurolens.flare.ghosts import GhostTracer, Pair, ghost_pairs, ghost_table
 from neurolens.flare.lights import CELLS, Light, light_towards, patches, sides_across, with_disc
 from neurolens.flare.photons import PhotonTracer
 from neurolens.flare.picture import ghost_picture, photon_picture
@@ -107,6 +108,55 @@ def test_a_softbox_is_no_lattice_of_points() -> None:
     assert off < 0.03 and off_of_lattice > 0.09
     rough, rough_lattice = (np.abs(np.diff(np.diff(v, axis=0), axis=1)).sum() for v in (smooth, lattice))
     assert rough < 0.05 * rough_lattice
+
+
+def ghost_by_chance(lens: Lens, light: Light, pair: Pair, raster: Raster, count: int) -> np.ndarray:
+    """The picture [H, W] of a ghost at 550 nm, of any exposure, by rays from random points of a near light's cells to
+    random points of the plane of the front vertex: without patches, smears or grids."""
+    assert light.shape
+    tracer, chance, film = GhostTracer(lens, [pair]), qmc.Sobol(4, seed=1), np.zeros((raster.height, raster.width))
+    edges = [(np.arange(n + 1) - n / 2) / raster.per_mm for n in film.shape]
+    high = np.full(2, 1.1 * lens.surfaces[0].semi_diameter_mm)
+    low = -high
+    for part in range(-1, max(count >> 18, 1)):  # the first part looks where the ghost's light enters
+        u = chance.random(1 << 18).T
+        (i, j), (s, t) = (CELLS * u[:2]).astype(int), CELLS * u[:2] % 1
+        a, b, c, d = (light.shape.corners[i + k, j + m].T for k in (0, 1) for m in (0, 1))
+        towards = (1 - s) * ((1 - t) * a + t * b) + s * ((1 - t) * c + t * d)
+        place = low[:, None] + (high - low)[:, None] * u[2:]
+        way = np.concatenate([place, 0 * place[:1]]) - 1000 * light.distance_m * towards / np.linalg.norm(
+            towards, axis=0
+        )
+        far = np.linalg.norm(way, axis=0)
+        rays = np.concatenate([place, 0 * place[:1], way / far])
+        rays[:3] -= 60 * rays[3:]
+        x, y, power, worst = tracer.follow_each(tracer.start(rays), [550.0], pair)[0].astype(np.float64)
+        lit = worst <= 1
+        if part < 0:
+            low, high = place[:, lit].min(1) - 0.2, place[:, lit].max(1) + 0.2
+            continue
+        weight = power * light.shape.weights[i, j] * way[2] / far**3  # cosine over squared distance
+        film += np.histogram2d(y[lit], -x[lit], bins=edges, weights=weight[lit])[0]
+    return film
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not CASE.is_file(), reason=f"{CASE} is not there")
+@pytest.mark.parametrize(("name", "most"), [("g11-09", 0.03), ("g12-08", 0.02)])
+def test_ghosts_in_focus_show_no_seams(name: str, most: float) -> None:
+    """The case's softbox in the two ghosts that it draws sharply, a point as 0.15 and 0.17 mm: the means of columns and
+    of rows, held against rays at random, have no lines; patches that ended at their cells' edges made some of 5%."""
+    scene, lens = load_scene(CASE), hexagonal("laikin_double_gauss_50", focus_m=3.0)
+    (light,) = SceneLights(scene).seen(scene, lens.film_z_mm)
+    (pair,), raster = [pair for pair in ghost_pairs(lens) if pair.name == name], Raster((36.0, 20.25), 160, 90)
+    right = ghost_by_chance(lens, light, pair, raster, 1 << 21)
+    found = ghost_picture(GhostTracer(lens, [pair]), [light], raster, wavelengths=1, threads=1)[0].sum(-1)
+    rows, columns = (np.flatnonzero((right > 0.3 * right.max()).any(axis))[4:-4] for axis in (1, 0))
+    inside = np.ix_(rows, columns)
+    for axis in (0, 1):
+        off = found[inside].mean(axis) / right[inside].mean(axis) * right[inside].sum() / found[inside].sum()
+        lines = np.abs(off - uniform_filter1d(off, 5))[2:-2]
+        assert lines.max() < most and np.abs(off - 1).max() < 0.07
 
 
 def test_streaks_of_the_sun_are_as_wide_as_its_disc() -> None:
