@@ -85,9 +85,10 @@ def test_the_nodes_of_a_zooms_file_follow_its_state(share: float) -> None:
     agree(model, built, outputs_of(ZOOM.read_bytes(), feeds), 1e-3)
 
 
-@pytest.mark.parametrize("file", [*map(lens_models.exported, ("network", "cylinders")), *SHIPPED], ids=lambda f: f.stem)
-def test_the_nodes_in_a_file_are_those_that_its_coefficients_give(file: Path) -> None:
+@pytest.mark.parametrize("name", ["network", "cylinders", *(file.stem for file in SHIPPED)])
+def test_the_nodes_in_a_file_are_those_that_its_coefficients_give(name: str) -> None:
     """What another program runs is what this package runs: to the byte, or where nodes are newer, to rounding."""
+    file = lens_models.exported(name) if "." not in name else ROOT / "models" / f"{name}.onnx"
     model = read_model(file)
     written = onnx_of(model.nodes, model.axes, read_metadata(file))
     if written != file.read_bytes():
