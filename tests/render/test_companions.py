@@ -44,6 +44,11 @@ def lens_camera(name: str) -> ExactCamera:
     return ExactCamera(read_lens(ROOT / "lenses" / f"{name}.toml"), Shot(film, 2.0, f_number))
 
 
+def compiled(camera: Any) -> Any:
+    """The camera as C, where that can be compiled: a picture takes a tenth of the time."""
+    return camera.compiled() if which("cc") else camera
+
+
 @cache
 def model_camera(vignetting: Any = "both") -> Any:
     return make_camera(MODEL, Shot(FILM, 2.0, 1.8, vignetting=vignetting))
@@ -130,13 +135,13 @@ def both_modes(camera: Any, samples: int, light: str = "D65", **tables: Any) -> 
 
 @pytest.mark.parametrize("name", LENSES)
 def test_white_surroundings_look_the_same_in_the_middle_and_in_corners(name: str) -> None:
-    one, several = both_modes(lens_camera(name), 16)
+    one, several = both_modes(compiled(lens_camera(name)), 16)
     assert blocks(several) == pytest.approx(blocks(one), rel=3e-3)
     assert several.mean(axis=(0, 1)) == pytest.approx(one.mean(axis=(0, 1)), rel=1e-3)
 
 
 def test_light_of_one_line_is_conserved() -> None:
-    one, several = both_modes(model_camera(), 64, "sodium")
+    one, several = both_modes(compiled(model_camera()), 64, "sodium")
     assert several.mean(axis=(0, 1)) == pytest.approx(one.mean(axis=(0, 1)), rel=5e-3, abs=2e-3)
 
 
@@ -149,7 +154,7 @@ def test_without_vignetting_white_stays_white() -> None:
 def test_glass_that_parts_the_wavelengths_loses_nothing() -> None:
     flint = {"kind": "glass", "n_d": 1.9, "V_d": 12.0}
     ball = {"centre_m": [0, 0, -1.0], "radius_m": 0.5, "material": "flint"}
-    one, several = both_modes(model_camera(), 16, materials={"flint": flint}, spheres=[ball])
+    one, several = both_modes(compiled(model_camera()), 16, materials={"flint": flint}, spheres=[ball])
     assert several.mean(axis=(0, 1)) == pytest.approx(one.mean(axis=(0, 1)), rel=6e-3)
 
 
