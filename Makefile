@@ -1,7 +1,7 @@
 # On a fresh machine with Python 3.11 or newer and make, each target does its own set-up in .venv; a second run starts at once.
 #
 #   make demo     train, evaluate and render the quickstart (4 CPU minutes after installing)
-#   make test     tests, then lint, format and types
+#   make test     tests, then lint, format and types; NEUROLENS_WHOLE=1 for every lens and model in tests of each
 #   make test-blender   the extension in Blender 5.0, in .venv-blender (Python 3.11; about 400 MB, once);
 #                       BLENDER=4.5.0 or 5.2.3 for another (from 5.1 on it needs Python 3.13)
 #   make test-web the pages that commands write, in headless Chromium (Debian: chromium; CHROMIUM=/path/to/another): what
