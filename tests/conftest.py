@@ -64,3 +64,9 @@ def scene(tmp_path: Path) -> Path:
     path = tmp_path / "ball.toml"
     path.write_text(SCENE)
     return path
+
+
+@pytest.fixture
+def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trainings without the plots of their report, which take longer to draw than small models to fit."""
+    monkeypatch.setattr("neurolens.study.train._draw", lambda *_: [])

@@ -107,6 +107,7 @@ def test_a_lens_without_a_real_focus_is_refused_and_leaves_nothing(
         default_experiment(path).domain.of(read_lens(path))
 
 
+@pytest.mark.usefixtures("no_plots")
 def test_a_run_folder_is_all_that_evaluate_needs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

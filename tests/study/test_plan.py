@@ -278,6 +278,7 @@ def test_targets_are_those_of_the_command() -> None:
     assert get_args(get_type_hints(command.Plan)["target"]) == get_args(Target)
 
 
+@pytest.mark.usefixtures("no_plots")
 def test_a_plan_s_file_is_taken_by_train_render_and_export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same model again from scratch, in numbers; the pictures of the file and of the model that it names agree."""
     monkeypatch.setattr(tried, "TERMS", (6,))
