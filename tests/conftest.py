@@ -2,10 +2,13 @@
 
 import gc
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+from neurolens import cli
 
 # A ball in white light.
 SCENE = """\
@@ -50,9 +53,10 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture(autouse=True, scope="session")
-def quick_races() -> Iterator[None]:
-    """Races of few rays and samples: no test judges a clock."""
+def quick() -> Iterator[None]:
+    """The command line is made once; races are of few rays and samples, for no test judges a clock."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli.main, "__defaults__", (None, cache(cli.build_parser)))
         patch.setattr("neurolens.study.speed.POOL", 16384)
         patch.setattr("neurolens.study.speed._SAMPLES", 1)
         yield

@@ -135,8 +135,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("distance_m", [math.inf, 0.6])
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(("case", "distance_m"), [*((case, math.inf) for case in CASES), ("open", 0.6)])
 def test_ghosts_have_the_light_of_their_rays(case: str, distance_m: float) -> None:
     """Every ghost that counts: grid and low-discrepancy rays agree in the light that falls on the film."""
     lens, light = CASES[case](), Light(11.0, -6.0, distance_m=distance_m)
