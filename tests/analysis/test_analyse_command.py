@@ -52,7 +52,7 @@ def test_every_analysis_as_text_picture_and_json(
                 computed[what] = usual(what).compute(scene, **options)
             return computed[what]
 
-        return replace(usual(what), compute=compute)
+        return usual(what)._replace(compute=compute)
 
     monkeypatch.setattr(analyse, "analysis_of", once)
     assert main(["analyse", str(TESSAR), "--f-number", "5.6", "-o", str(tmp_path)]) == 0
