@@ -53,7 +53,7 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture(autouse=True, scope="session")
-def quick() -> Iterator[None]:
+def quick_races() -> Iterator[None]:
     """The command line is made once; races are of few rays and samples, for no test judges a clock."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cli.main, "__defaults__", (None, cache(cli.build_parser)))
