@@ -1,7 +1,7 @@
 # On a fresh machine with Python 3.11 or newer and make, each target does its own set-up in .venv; a second run starts at once.
 #
 #   make demo     train, evaluate and render the quickstart (4 CPU minutes after installing)
-#   make test     tests, then lint, format and types
+#   make test     tests, then lint, format and types; NEUROLENS_WHOLE=1 for every lens and model in tests of each
 #   make test-blender   the extension in Blender 5.0, in .venv-blender (Python 3.11; about 400 MB, once);
 #                       BLENDER=4.5.0 or 5.2.3 for another (from 5.1 on it needs Python 3.13)
 #   make test-web the pages that commands write, in headless Chromium (Debian: chromium; CHROMIUM=/path/to/another): what
@@ -47,9 +47,10 @@ demo: $(INSTALLED)
 	$(BIN)/neurolens train experiments/quickstart.toml
 	@printf '\nThis puts neurolens on the PATH of this shell, for the commands of the README:\n  . $(BIN)/activate\n'
 
-# Two processes of one thread each: torch's threads only wait for each other in small tests.
+# Two processes of one thread each: torch's threads only wait for each other in small tests. Each takes half of the tests
+# in their order, so that those of a folder share fits and cameras; the one that is done first takes over from the other.
 test: $(INSTALLED)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile --durations=10
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist worksteal --durations=10
 	$(MAKE) --no-print-directory lint
 
 # Blender as a module wants one Python and, to 5.0, numpy 1: an environment of its own. On Debian without a desktop it also needs

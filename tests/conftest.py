@@ -1,11 +1,14 @@
-"""Order of the tests: those marked slow run last, so that a mistake shows within seconds."""
+"""Order of the tests: those marked slow run last in their file; races are short, and a small scene is at hand."""
 
 import gc
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+from neurolens import cli
 
 # A ball in white light.
 SCENE = """\
@@ -41,7 +44,8 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
+    files = {path: k for k, path in enumerate(dict.fromkeys(item.path for item in items))}
+    items.sort(key=lambda item: (files[item.path], item.get_closest_marker("slow") is not None))
 
 
 def pytest_collection_finish() -> None:
@@ -50,8 +54,9 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture(autouse=True, scope="session")
 def quick_races() -> Iterator[None]:
-    """Races of few rays and samples: no test judges a clock."""
+    """The command line is made once; races are of few rays and samples, for no test judges a clock."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli.main, "__defaults__", (None, cache(cli.build_parser)))
         patch.setattr("neurolens.study.speed.POOL", 16384)
         patch.setattr("neurolens.study.speed._SAMPLES", 1)
         yield
@@ -63,3 +68,9 @@ def scene(tmp_path: Path) -> Path:
     path = tmp_path / "ball.toml"
     path.write_text(SCENE)
     return path
+
+
+@pytest.fixture
+def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trainings without the plots of their report, which take longer to draw than small models to fit."""
+    monkeypatch.setattr("neurolens.study.train._draw", lambda *_: [])

@@ -27,7 +27,7 @@ from neurolens.base.files import (
     safe_name,
     write_kept,
 )
-from neurolens.base.progress import Progress, duration
+from neurolens.base.progress import Progress
 from neurolens.base.settings import (
     add_options,
     apply_overrides,
@@ -324,11 +324,6 @@ def test_any_fraction_is_taken_and_quiet_prints_nothing(fraction: float) -> None
         with progress.stage("a") as report:
             report(fraction)
         assert ("%" in stream.getvalue()) != quiet and bool(stream.getvalue()) != quiet
-
-
-def test_durations_read_well() -> None:
-    said = {0: "0.0 s", -1: "0.0 s", 0.44: "0.4 s", 9.96: "10 s", 59.7: "1 min 00 s", 185: "3 min 05 s"}
-    assert {seconds: duration(seconds) for seconds in said} == said
 
 
 def test_names_of_files_are_safe_and_stay_apart() -> None:

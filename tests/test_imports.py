@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from collections import Counter
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -97,7 +98,12 @@ def imported(path: Path) -> set[str]:
 
 
 TYPES_ALONE = re.compile(r"^if TYPE_CHECKING:\n(?:(?: .*)?\n)+", re.MULTILINE)
-IMPORTED = {module_name(path): imported(path) for path in MODULES}
+
+
+@cache
+def imports() -> dict[str, set[str]]:
+    """What each module imports, by its name."""
+    return {module_name(path): imported(path) for path in MODULES}
 
 
 def part_of(module: str) -> str:
@@ -107,7 +113,7 @@ def part_of(module: str) -> str:
 
 def test_imports_go_one_way() -> None:
     wrong = []
-    for module, names in IMPORTED.items():
+    for module, names in imports().items():
         part = part_of(module)
         assert part in {*PARTS, "base", "__init__", "__main__"}, f"{module}: give this folder its place in {__name__}"
         packages = {name.split(".")[0] for name in names} - set(sys.stdlib_module_names) - {"neurolens"}
@@ -124,15 +130,15 @@ def test_imports_go_one_way() -> None:
 
 def test_no_imports_go_in_a_circle() -> None:
     """Those inside functions count, too; those for types alone do not."""
-    graph = {}
+    graph, known = {}, imports().keys()
     for path in MODULES:
         text = TYPES_ALONE.sub("", path.read_text(encoding="utf-8"))
         found = set()
         for node in ast.walk(ast.parse(text)):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("neurolens"):
                 names = {f"{node.module}.{alias.name}" for alias in node.names}
-                found |= names & IMPORTED.keys() or {str(node.module)}
-        graph[module_name(path)] = (found & IMPORTED.keys()) - {module_name(path), "neurolens"}
+                found |= names & known or {str(node.module)}
+        graph[module_name(path)] = (found & known) - {module_name(path), "neurolens"}
     assert sum(map(len, graph.values())) > len(graph)
     try:
         list(TopologicalSorter(graph).static_order())
@@ -152,7 +158,7 @@ def test_the_package_keeps_within_its_budget_of_lines() -> None:
 
 
 def test_cameras_renderer_and_command_line_load_without_the_training_packages() -> None:
-    wanted = [m for m in IMPORTED if part_of(m) in LEAN or m in LEAN_MODULES]
+    wanted = [m for m in imports() if part_of(m) in LEAN or m in LEAN_MODULES]
     wanted = [m for m in wanted if m not in SLOW]
     forbidden = ["torch", "sklearn", "onnx", "matplotlib", "scipy", "flip_evaluator", "mitsuba", "drjit"]
     code = (

@@ -30,7 +30,6 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 RECTILINEAR = "rectilinear"
-TARGETS = (RECTILINEAR, *PROJECTIONS)
 WIDEST_DEG = 85.0  # field that is laid on a plane: there a picture is 11 focal lengths from the axis
 LIGHT_NM = (400.0, 700.0)
 

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -23,11 +24,12 @@ from neurolens.readers.lensfile import read_lens
 from neurolens.setting.pupils import pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.shaders import blender_shader as shaders
-from neurolens.shaders import lowtests, osl
+from neurolens.shaders import lowtests, osl, pupil_fit
 from neurolens.shaders.blender_shader import _smallest, exact_lens
 from neurolens.shaders.pupil import Blades, PupilCircles, PupilDisc, unit_disc
 from neurolens.shaders.pupil_fit import fit_pupil
 from neurolens.shaders.shader_lens import ShaderLens, passing_share
+from neurolens.surrogates import states
 from neurolens.surrogates.axes import Axis, product, weights
 from neurolens.trace.tracegraph import exact_graph
 
@@ -140,7 +142,14 @@ def zoom(name: str, *, knots: tuple[float, float]) -> osl.OslLens:
     return osl.osl_lens(states, lambda share: None, (axis,), between)
 
 
+@pytest.fixture
+def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A quick fit of the pupil, where it is not the pupil that is tested."""
+    monkeypatch.setattr(pupil_fit, "_RAYS", 3000)
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_rays")
 def test_zoom_is_an_input() -> None:
     file = ROOT / "models" / "nikon_zoom_80_200-range.states-64.onnx"
     made = zoom(file.stem, knots=(95.0, 125.0))
@@ -174,9 +183,11 @@ def test_a_zoom_whose_stop_changes_and_whose_rims_cut_on_both_sides() -> None:
 
 
 @pytest.mark.slow
-def test_groups_of_a_lens_file_move_where_the_camera_is_focused() -> None:
+@pytest.mark.usefixtures("few_rays")
+def test_groups_of_a_lens_file_move_where_the_camera_is_focused(monkeypatch: pytest.MonkeyPatch) -> None:
     file = ROOT / "lenses" / "tajima_retrofocus_24.toml"
-    _, made, _ = exact_lens(file, None, lambda share: None)
+    monkeypatch.setattr(states, "gap_axis", lambda axis, _: (replace(axis, knots=(1.7, axis.knots[-1]), degree=2), 0))
+    _, made, _ = exact_lens(file, None, lambda share: None)  # of the near half of its range
     assert made.near_m == pytest.approx((0.3, 0.3), rel=1e-6)
     program, focus_m = osl.osl_program(made), 0.45
     square = np.random.default_rng(9).random((2, 3000))
@@ -236,8 +247,7 @@ BICONVEX = "thorlabs_lb1471_biconvex_50.ols-64"  # far off its axis two parts of
     [
         pytest.param("phone_lens_6.ols-64", 0.95, marks=pytest.mark.slow),
         ("muller_fisheye_100.ols-64", 0.95),
-        pytest.param("panavision_anamorphic_zoom_21.ols-64", 0.95, marks=pytest.mark.slow),
-        pytest.param("sony_sonnar_55.ols-64", 0.95, marks=pytest.mark.slow),
+        pytest.param("cooke_anamorphic_42.ols-64", 0.95, marks=pytest.mark.slow),
         pytest.param(BICONVEX, 0.4, marks=pytest.mark.slow),
     ],
 )
@@ -479,17 +489,11 @@ def test_blades_are_those_of_apertures(blades: int, roundness: float, rotation: 
 @pytest.mark.parametrize("blades, roundness, rotation", [(5, 0.0, 20.0), (6, 0.5, 0.0), (9, 0.0, 11.0)])
 def test_samples_fill_the_blades(blades: int, roundness: float, rotation: float) -> None:
     shape = {"count": blades, "roundness": roundness, "rotation": rotation}
-    aperture, rng = Aperture(blades, rotation, roundness), np.random.default_rng(7)
-    film = (rng.random((2, 20_000)) - 0.5) * np.array([[30.0], [20.0]])
-    square = rng.random((2, 20_000))
+    aperture = Aperture(blades, rotation, roundness)
     for f_number in (1.8, 4.0, 8.0):
-        round_stop, bladed = (
-            evaluate(graph(), inputs(film, square, f_number=f_number, in_colour=0, **more))["throughput"][0]
-            for more in ({}, shape)
-        )
-        assert (bladed > 0).mean() > 0.95 * (round_stop > 0).mean()
         # Against samples of the round stop of which the blades' are kept: light and its spread over the stop.
-        found, kept = stop_light(f_number, shape, film, square), stop_light(f_number, {}, film, square)
+        found, kept = stop_light(f_number, **shape), stop_light(f_number)
+        assert (found[1] > 0).mean() > 0.95 * (kept[1] > 0).mean()
         inside = aperture.inside(*kept[0], 1.0)
         assert found[1].mean() == pytest.approx(kept[1][inside].sum() / kept[1].size, rel=0.015)
         for moment in (lambda p: p[0] ** 2, lambda p: p[1] ** 2, lambda p: p[0] ** 3 - 3 * p[0] * p[1] ** 2):
@@ -497,8 +501,11 @@ def test_samples_fill_the_blades(blades: int, roundness: float, rotation: float)
             assert pair[0] == pytest.approx(pair[1], abs=0.008)
 
 
-def stop_light(f_number: float, shape: dict[str, float], film: np.ndarray, square: np.ndarray) -> tuple:
-    """Where rays cross the stop, in units of its radius, and their weights."""
+@cache
+def stop_light(f_number: float, **shape: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays from all over the film cross the stop, in units of its radius, and their weights."""
+    rng = np.random.default_rng(7)
+    film, square = (rng.random((2, 20_000)) - 0.5) * np.array([[30.0], [20.0]]), rng.random((2, 20_000))
     given = inputs(film, square, f_number=f_number, in_colour=0, **shape)
     stop = min(written().lens.f_number / f_number, 1.0) * written().lens.stop_radius_mm
     z = film_z(2.0, stop)

@@ -1,10 +1,9 @@
-"""Equal time: bias and variance of known renders, errors in the film's space, laws of time, kept renders."""
+"""Equal time: bias and variance of known renders, errors in the film's space, laws of time."""
 
 import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import lens_models
@@ -31,11 +30,9 @@ from neurolens.base.errors import InputError
 from neurolens.cameras.contract import Camera, CameraRays, FloatArray
 from neurolens.cameras.exact import ExactCamera
 from neurolens.cameras.ideal import ThinLens
-from neurolens.cameras.pinhole import Pinhole
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
-from neurolens.render.scene import CameraSettings, load_scene
-from neurolens.render.settings import FilmSettings
+from neurolens.render.scene import CameraSettings
 
 SHAPE = (12, 20, 3)
 Picture = NDArray[np.float64]
@@ -188,79 +185,7 @@ def test_the_exact_lens_is_ahead_when_its_law_says_so(scene: SceneResult) -> Non
     assert equal_time_page.equal_time_s(scene) == pytest.approx(0.16)
 
 
-# Kept renders
-
-SCENE = """
-[camera]
-position_m = [0, 0, 2]
-look_at_m = [0, 0, 0]
-focus_m = 2.0
-film_width_mm = 36.0
-film_height_mm = 18.0
-width = 8
-height = 4
-[environment]
-colour = [1.0, 1.0, 1.0]
-[textures.wall]
-kind = "image"
-file = "wall.png"
-size_m = [1.0, 1.0]
-[materials]
-wall = { kind = "diffuse", texture = "wall" }
-[[planes]]
-point_m = [0.0, 0.0, 0.0]
-normal = [0.0, 0.0, 1.0]
-material = "wall"
-"""
-
-
-@pytest.fixture
-def scene_file(tmp_path: Path) -> Path:
-    from PIL import Image
-
-    Image.new("RGB", (4, 4), (200, 30, 30)).save(tmp_path / "wall.png")
-    file = tmp_path / "wall.toml"
-    file.write_text(SCENE)
-    return file
-
-
-def shelf(file: Path, camera: Camera | None = None) -> equal_time.Shelf:
-    shown, film = camera or Pinhole(50.0, (36.0, 18.0)), FilmSettings(wavelengths="one")
-    return equal_time.Shelf(file.parent / "run", file, load_scene(file), "a camera", shown, film, (8, 4))
-
-
-def test_a_finished_render_is_not_repeated(scene_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = shelf(scene_file).take(2, 7, 1)
-    again = shelf(scene_file)
-    monkeypatch.setattr(again, "render", None)
-    kept = again.take(2, 7, 1)
-    assert np.array_equal(first[0], kept[0]) and first[1] == kept[1]
-    for samples, seed, threads in ((4, 7, 1), (2, 8, 1), (2, 7, 2)):
-        with pytest.raises(TypeError):
-            again.take(samples, seed, threads)
-
-
-@pytest.mark.parametrize("damage", [b"", b"no archive", None])
-def test_a_broken_file_is_rendered_again(scene_file: Path, damage: bytes | None) -> None:
-    mine = shelf(scene_file)
-    picture, _ = mine.take(2, 7, 1)
-    file = mine.file(2, 7, 1)
-    file.write_bytes(file.read_bytes()[:-200] if damage is None else damage)
-    assert np.array_equal(mine.take(2, 7, 1)[0], picture)
-
-
-def test_whatever_changes_the_picture_changes_the_shelf(scene_file: Path) -> None:
-    from PIL import Image
-
-    before = shelf(scene_file).folder
-    assert shelf(scene_file).folder == before
-    assert shelf(scene_file, ThinLens(50.0, 2.0, 2.0, (36.0, 18.0))).folder != before
-    Image.new("RGB", (4, 4), (30, 30, 200)).save(scene_file.parent / "wall.png")
-    painted = shelf(scene_file).folder
-    assert painted != before
-    scene_file.write_text(SCENE.replace("width = 8", "width = 16"))
-    assert shelf(scene_file).folder not in (before, painted)
-
+# Errors in the film's space
 
 FILM = (36.0, 18.0)
 LIGHT = (450.0, 650.0)

@@ -15,8 +15,6 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import sha256_of
 from neurolens.base.progress import Progress
 from neurolens.base.settings import from_dict
-from neurolens.study.measure import Measured
-from neurolens.surrogates.fit import ModelSettings
 
 QUIET = Progress(quiet=True)
 
@@ -110,12 +108,6 @@ def test_what_changed_is_made_again(tmp_path: Path, library: Library, made: dict
     assert made["order"] == ["one", "three", "two"] and len(files(tmp_path)) == 4
 
 
-def test_a_broken_index_is_made_anew(tmp_path: Path, library: Library, made: dict[str, Any]) -> None:
-    (tmp_path / "index.json").write_text('{"models": [{"file": "two.ols-6.onnx", "lens_file": "a"}]}')
-    make_models.make_models(library, library.entry, tmp_path, QUIET)
-    assert made["order"] == ["two", "one", "three"] and len(files(tmp_path)) == 4
-
-
 def test_a_lens_that_cannot_be_done_is_said_and_the_others_go_on(
     tmp_path: Path, library: Library, made: dict[str, Any]
 ) -> None:
@@ -126,17 +118,6 @@ def test_a_lens_that_cannot_be_done_is_said_and_the_others_go_on(
     made["broken"].clear()
     assert make_models.make_models(library, library.entry, tmp_path, QUIET) == []
     assert json.loads((tmp_path / "index.json").read_text())["left_out"] == {}
-
-
-def test_the_best_of_each_kind_has_the_smallest_error() -> None:
-    errors = {"ols-20": 3.0, "ols-40": 2.0, "mlp-8x2": 1.0, "mlp-16x2": 1.5}
-    measured = []
-    for label, error in errors.items():
-        settings = ModelSettings("mlp" if label.startswith("mlp") else "ols", name=label)
-        measured.append(Measured(settings, Path(label), {"rms_um": error}))
-    assert [m.settings.label for m in make_models.best_of_each_kind(measured)] == ["ols-40", "mlp-8x2"]
-    beyond = [Measured(m.settings, m.file, {"rms_um": None, "direction_rms_deg": m.record["rms_um"]}) for m in measured]
-    assert [m.settings.label for m in make_models.best_of_each_kind(beyond)] == ["ols-40", "mlp-8x2"]
 
 
 @pytest.mark.slow

@@ -10,24 +10,21 @@ import numpy as np
 import pytest
 import torch
 
-from experiments import gpu, inverse, lab, osl_speed
+from experiments import lab
 from experiments import pupils as passage
 from experiments.__main__ import main
 from experiments.fused_speed import ray_candidate
-from experiments.mitsuba_speed import Row, Settings, record
 from experiments.promises import Outcome, hold_to_promises, read_index, report_outcome, times
 from experiments.pupils import CASES, TABLE_5_3
-from experiments.render_times import EXACT_C, PINHOLE, THIN, Results, Size, Subject, Timed, goals
 from experiments.render_times import FUSED_MODELS as MODELS
 from experiments.trace_speed import ASPHERIC_SURFACES, LENSES, MAIN, film_rays, launched, with_aspheres
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.model import load_model
 from neurolens.graph.compiler import find_compiler
 from neurolens.graph.program import SCENE_RAY
 from neurolens.graph.scalars import lower
-from neurolens.study.speed import CompiledSource, Race, Unavailable, fused_candidate, program_candidate, race
+from neurolens.study.speed import Race, fused_candidate, program_candidate, race
 from neurolens.surrogates.assemble import RAY_ONLY
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.source import fused_program
@@ -61,14 +58,6 @@ def test_results_of_another_kind_are_not_written_over(
         assert f"rows of experiments {name}" in capsys.readouterr().err and file.read_text() == text
 
 
-def test_goals_cannot_be_missed_unseen() -> None:
-    made = [lab.Goal("a", 5.0, v, at_least=at_least) for at_least in (True, False) for v in (4.9, 5.0, 5.1, None)]
-    reached, missed = "reached", "missed"
-    assert [g.verdict for g in made] == [
-        missed, reached, reached, "not measured", reached, reached, missed, "not measured",
-    ]  # fmt: skip
-
-
 @pytest.mark.parametrize(
     ("command", "told"),
     [
@@ -86,11 +75,6 @@ def test_what_is_not_there_is_one_line_and_leaves_no_folder(
     assert main([*command, "--quiet", "--output", str(tmp_path / "out")]) == 2
     shown = capsys.readouterr().err.strip()
     assert told in shown and "\n" not in shown and not (tmp_path / "out").exists()
-
-
-def test_a_child_that_fails_says_why() -> None:
-    with pytest.raises(lab.Unmeasured, match="missing 1 required positional argument"):
-        lab.in_child(lab.look_up, "alone")
 
 
 TIMES = {"exact eager": [200.0, 220.0], "exact compiled": [30.0, 33.0], "a.onnx": [15.0, 16.5], "b.onnx": [20.0, 22.0]}
@@ -175,63 +159,6 @@ def test_pixel_of_table_5_3() -> None:
         assert later / area == pytest.approx(1, rel=0.1)
 
 
-@pytest.mark.slow
-def test_inverse_maps_of_a_tame_lens_are_found_and_counted() -> None:
-    found = inverse.measure_lens(lab.LENSES / "cooke_triplet_50.toml", rays=1000, uniform=300, terms=24)
-    for ours in found["ours"].values():
-        assert ours["stop"]["converged"] == ours["scene"]["converged"] == 1
-    uniform, missed = found["uniform"], list(found["published"]["scene"]["missed"].values())
-    assert sum(uniform[k] for k in ("passed", "blocked", "outside", "unsolved")) == pytest.approx(1)
-    assert uniform["missed"] <= uniform["unsolved"] and missed == sorted(missed, reverse=True)  # by steps
-    text = inverse.page([found, {"lens": "other", "refused": "a reason"}])
-    assert "cooke_triplet_50" in text and "a reason" in text
-
-
-SETTINGS = Settings(size=100, samples=4, threads=2, repeats=3)
-
-
-def row(seconds: list[float], pictures: list[FloatArray]) -> Row:
-    return Row(
-        "name", "RGB", "pinhole", lambda seed: pictures[0], np.ones((1, 1, 1), np.float32), 9.0, seconds, pictures
-    )
-
-
-def test_figures_of_known_times_and_pictures() -> None:
-    base = row([0.4, 0.2, 0.3], [np.full((2, 2, 3), v, np.float32) for v in (1, 2, 3)])
-    found = record(row([0.5, 0.6, 0.7], base.pictures), SETTINGS, base)
-    assert found["mpaths_per_s"] == pytest.approx(40_000 / 0.5 * 1e-6)
-    assert found["mpaths_per_s_median"] == pytest.approx(40_000 / 0.6 * 1e-6)
-    assert found["time_over_ours"] == pytest.approx(0.6 / 0.3)
-    assert found["mean_rgb"] == pytest.approx([2, 2, 2])
-    assert found["noise"] == pytest.approx(1 / np.mean([1, 4, 9]))  # variance 1 over the mean square
-    # Twice the time: the variance decides the rest.
-    noisy = record(row([0.5, 0.6, 0.7], [2 * p - 2 for p in base.pictures]), SETTINGS, base)
-    assert noisy["equal_noise"] == pytest.approx(2 * noisy["noise"] / found["noise"])
-
-
-def test_goals_are_held_to_the_best_rounds() -> None:
-    """A pinhole render of 2 s, a thin lens that takes 0.2 s of its own, a lens of ten refractions."""
-
-    def verdicts(surrogate_s: float, moves_s: float, exact_s: float) -> dict[str, str]:
-        found, timed = Results(Size()), {PINHOLE: (2.0, 0.05), THIN: (2.2, 0.2), EXACT_C: (exact_s, 0.5)}
-        for kind, (seconds, camera_s) in (timed | {MODEL: (2.3, surrogate_s)}).items():
-            subject = Subject(kind, None if kind in (PINHOLE, THIN) else 10, kind)
-            found.subjects.append(subject)
-            found.rows.append(Timed(subject, "cheap", False, [seconds, 3 * seconds], [camera_s, 3 * camera_s]))
-        found.rows.append(Timed(subject, "cheap", True, [2.3, 2.3], [moves_s, 3 * moves_s]))
-        return {g.text: g.verdict for g in goals(found)}
-
-    texts = (
-        f"{MODEL}: camera above the thin lens's, of the cheap pinhole render",
-        f"{MODEL}: what differentials add to the camera, in the cheap render",
-        f"{EXACT_C}: overhead a refraction, of the cheap pinhole render",
-    )
-    # 5% of 2 s above 0.2 s; 30% above the camera; 10% of 2 s for each of ten refractions.
-    met, missed = verdicts(0.299, 0.299 * 1.29, 3.99), verdicts(0.301, 0.301 * 1.31, 4.01)
-    assert {met[t] for t in texts} == {"reached"} and {missed[t] for t in texts} == {"missed"}
-    assert met[texts[0].replace("cheap", "dear")] == "not measured"
-
-
 def test_two_aspheres_change_the_rays_and_little_else() -> None:
     plain = lab.lens_of(LENSES[MAIN])
     aspheric = with_aspheres(plain)
@@ -281,70 +208,3 @@ def test_the_part_of_a_graph_that_gives_rays_gives_the_same() -> None:
     columns = [c.numpy().astype(np.float32) for c in rays.columns()]
     whole = load_model(file).rays(np.stack(columns[0:2]), np.stack(columns[3:5]), columns[5], float(columns[2][0]))
     assert (whole.status == st.PASSED).sum() > 100 and np.abs(found - whole.scene_ray).max() < 1e-5
-
-
-def test_without_a_compiler_or_coefficients_there_is_no_candidate(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    model = lens_models.model("invariants")
-    assert fused_candidate("x", tmp_path / "no.onnx", model.domain) is None
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setenv("CC", "")
-    assert fused_candidate("x", lens_models.exported("invariants"), model.domain) is None
-    with pytest.raises(Unavailable, match="a C compiler"):
-        CompiledSource(lower(exact_graph(lens_models.lens(), 0.0, (400.0, 700.0))))
-
-
-def test_cameras_in_blender_are_timed_without_what_it_takes_to_begin(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    thin, model = osl_speed.THIN, osl_speed.POLYNOMIAL
-    stage = osl_speed.Stage((100, 100), 100, 2, (thin, model), thin)
-    times = {thin: {"full": [1.2, 1.1], "tiny": [0.1, 0.2]}, model: {"full": [2.3, 2.8], "tiny": [0.5, 0.3]}}
-    rows = osl_speed.rows_of("sky", stage, times, {model: 900})
-    assert [(r.camera, r.operations) for r in rows] == [(thin, None), (model, 900)]
-    assert [r.ns_min for r in rows] == pytest.approx([1000, 2000]) and rows[1].over_median == pytest.approx(
-        2.1591, 1e-4
-    )
-    met = osl_speed.goals(rows)
-    assert met[0].measured == pytest.approx(2.0) and met[0].verdict == "missed"
-    assert {g.verdict for g in met[1:]} == {"not measured"}
-    times[thin]["full"] = [0.1, 1.0]
-    with pytest.raises(lab.Unmeasured, match="too few"):
-        osl_speed.rows_of("sky", stage, times, {})
-    assert main(["osl", "--quiet", "--blender-python", str(tmp_path / "python"), "--output", str(tmp_path)]) == 2
-    assert "make test-blender" in capsys.readouterr().err
-
-
-def test_blender_that_fails_says_why(tmp_path: Path) -> None:
-    python = tmp_path / "python"
-    python.write_text("#!/bin/sh\necho share 0.5\necho no module bpy >&2\nexit 1\n", encoding="utf-8")
-    python.chmod(0o755)
-    told: list[float] = []
-    with pytest.raises(lab.Unmeasured, match="no module bpy"):
-        osl_speed.race(python, {}, {}, lambda share, left=None: told.append(share))
-    assert told == [0.5]
-
-
-def test_shaders_are_raced_and_what_they_give_comes_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    raced = gpu.ShaderRace(tmp_path, 64)
-    (tmp_path / "twice.comp").write_text(
-        "#version 430\nlayout(local_size_x = 64) in;\nlayout(std430, binding = 0) buffer A { float rays[]; };\n"
-        "layout(std430, binding = 1) buffer B { float found[]; };\n"
-        "layout(std430, binding = 2) buffer C { float by; };\n"
-        "void main() { uint i = gl_GlobalInvocationID.x; found[i] = by * rays[i]; }\n"
-    )
-    np.save(tmp_path / "rays.npy", np.arange(64, dtype=np.float32))
-    np.save(tmp_path / "call.npy", np.float32([2]))
-    job = {"shader": "twice.comp", "call": "call.npy", "rays": "rays.npy", "groups": 1, "size": 64}
-    raced.jobs = [job | {"keep": "kept.npy"}, job | {"name": "twice"}]
-    with monkeypatch.context() as none:
-        none.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", str(tmp_path / "none.json"))
-        with pytest.raises(lab.Unmeasured, match="experiments gpu: no OpenGL here"):
-            raced.run(rounds=3)
-    try:
-        found = raced.run(rounds=3)
-    except lab.Unmeasured as reason:
-        pytest.skip(str(reason))
-    assert np.load(tmp_path / "kept.npy").tolist() == [2.0 * k for k in range(64)]
-    assert len(found["seconds"]["twice"]) == 3 and min(found["seconds"]["twice"]) > 0 and found["renderer"]

@@ -135,8 +135,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("distance_m", [math.inf, 0.6])
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(("case", "distance_m"), [*((case, math.inf) for case in CASES), ("open", 0.6)])
 def test_ghosts_have_the_light_of_their_rays(case: str, distance_m: float) -> None:
     """Every ghost that counts: grid and low-discrepancy rays agree in the light that falls on the film."""
     lens, light = CASES[case](), Light(11.0, -6.0, distance_m=distance_m)
@@ -211,7 +210,7 @@ def test_a_ghost_that_a_rim_cuts_by_colour_has_no_bands() -> None:
     assert np.abs(np.diff(picture[5], axis=0)).max() < 1.5 * np.abs(np.diff(fine[5], axis=0)).max()
 
 
-@pytest.mark.parametrize("coating", ["bare", "quarter-wave", "multi-layer"])
+@pytest.mark.parametrize("coating", ["bare", "multi-layer"])
 def test_a_picture_of_all_ghosts_has_no_bands(coating: str) -> None:
     """Ghosts that are seen beside the others get the wavelengths that they need; faint ones keep few.
 

@@ -322,8 +322,8 @@ def test_numbers_have_bounds(option: str, value: str, capsys: pytest.CaptureFixt
 
 def test_layers_are_the_ghosts_with_the_greatest_peaks_on_the_film(tmp_path: Path) -> None:
     """Of the README's case: each ghost's own picture beside the layers, with the light of the sun that is meant."""
-    out, raster = tmp_path / "flare.exr", Raster((36.0, 24.0), 240, 160)
-    assert main([*GAUSS, "--layers", "8", "--width", "240", "-o", str(out)]) == 0
+    out, raster = tmp_path / "flare.exr", Raster((36.0, 24.0), 120, 80)
+    assert main([*GAUSS, "--layers", "8", "--width", "120", "-o", str(out)]) == 0
     lens = set_lens(read_lens("lenses/laikin_double_gauss_50.toml"), focus_m=math.inf, focus_mode="best")
     tracer = GhostTracer(coated(lens, "quarter-wave"))
     sun = with_disc(Light(15, 8, (math.pi,) * 3), 0.533)

@@ -1,6 +1,5 @@
 """Flare of lights and lenses at the edges: finite pictures or clear errors, bounded memory, an end when asked."""
 
-import json
 import math
 import os
 import signal
@@ -56,21 +55,6 @@ def test_no_light_is_a_black_picture_and_said(tmp_path: Path, capsys: pytest.Cap
         assert main([*COOKE[:-1], *words, "--layers", "2", "-o", str(out)]) == 0
         assert said in capsys.readouterr().err
         assert not read_exr(out)[0].any()
-
-
-@pytest.mark.parametrize("text", ["", "[]", "azimuth_deg,elevation_deg\n"])
-def test_a_list_without_a_light_is_refused(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = tmp_path / ("lights.json" if text == "[]" else "lights.csv")
-    file.write_text(text)
-    assert main([*COOKE, "--lights", str(file), "-o", str(tmp_path / "a.exr")]) == 2
-    assert "lights: got (none), expected at least one light" in capsys.readouterr().err
-
-
-def test_a_list_of_too_many_lights_names_the_limit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = tmp_path / "many.json"
-    file.write_text(json.dumps([{"azimuth_deg": k / 50_000, "elevation_deg": 0.5} for k in range(20_000)]))
-    assert main([*COOKE, "--lights", str(file), "-o", str(tmp_path / "a.exr")]) == 2
-    assert "expected at most 10000 lights" in capsys.readouterr().err
 
 
 def test_nested_rings_take_memory_and_time_by_their_pixels(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,8 +1,6 @@
 """Programs of float steps in another order and as C; low-order derivatives of graphs whose derivatives are known."""
 
 import ctypes
-import re
-from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +14,7 @@ from neurolens.graph.derive import derivative
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.loworder import WORST, with_low_order_derivatives
-from neurolens.graph.osl import urgent
-from neurolens.graph.program import RAY, Expr, Program
+from neurolens.graph.program import RAY, Program
 from neurolens.graph.scalars import lower
 
 X, Y = (v.ravel() for v in np.meshgrid(np.linspace(0.3, 2.0, 9), np.linspace(0.35, 1.9, 8)))
@@ -47,24 +44,6 @@ def test_another_order_is_the_same_program() -> None:
     assert ordered.count() == program().count()
     for k, step in enumerate(ordered.steps):
         assert all(a < k for a in step.arguments if isinstance(a, int))
-
-
-def test_what_others_wait_for_comes_first() -> None:
-    """A chain of nine squares begins before the ten products beside it, on which one sum waits, and nothing is taken
-    before it is made."""
-    p = Program()
-    x, y = p.input("x"), p.input("y")
-    beside = [x * (k + 2.0) for k in range(10)]
-    chain = reduce(lambda total, k: total * total + k, range(1, 10), y)
-    p.outputs = {"sum": reduce(Expr.__add__, [chain, *(b * b for b in beside)])}
-    lines = [f"    float t{k} = {step.kind} {step.arguments}" for k, step in enumerate(p.steps)][2:]
-    lines = [re.sub(r"(?<=[(, ])(\d+)(?=[,)])", r"t\1", line) for line in lines]
-    kinds = [line.split()[3] for line in urgent(lines)]
-    assert kinds[:4] == ["mul", "add", "mul", "add"] and sorted(urgent(lines)) == sorted(lines)
-    made = {"t0", "t1"}
-    for own, *given in (re.findall(r"\bt\d+\b", line) for line in urgent(lines)):
-        assert set(given) <= made
-        made.add(own)
 
 
 def test_what_is_divided_by_the_same_is_divided_once() -> None:

@@ -1,6 +1,5 @@
 """Pictures survive the disk; what they say of their own pixels: sample count, variance, depth, blocked rays."""
 
-import tracemalloc
 from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
@@ -17,8 +16,6 @@ from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.pinhole import Pinhole
 from neurolens.render import pictures
-from neurolens.render.film import BYTES_A_PIXEL, COLUMNS, PixelGrid
-from neurolens.render.job import Job, develop
 from neurolens.render.pictures import read_exr, read_layers, write_exr, write_png
 from neurolens.render.renderer import Watch, render
 from neurolens.render.settings import FilmSettings
@@ -243,44 +240,6 @@ def test_blocked_is_the_share_of_camera_rays_that_do_not_pass() -> None:
     found = render(scene(GREY, environment=WHITE), Coin(400.0, FILM), **SIZE, samples=64).layers
     # Half of the coin weighs 0: nothing passes there either.
     assert found.blocked == pytest.approx(np.full((24, 36), 0.5), abs=1e-6)
-
-
-def some_job(width: int, height: int, samples: int = 40) -> Job:
-    made, camera = scene(GREY, environment=WHITE), Pinhole(4000.0, FILM)
-    return Job(made, camera, PixelGrid(width, height, FILM), samples, 0, 2, FilmSettings())
-
-
-def test_a_picture_on_its_way_is_divided_by_what_each_tile_has(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.film.BATCH", 16 * 100)
-    job = some_job(36, 24)
-    assert (job.tiling.tiles, job.tiling.passes) == (9, 3)
-    # In order, but for the last tile, which waits for those before it.
-    for tile, part in (*((k, 0) for k in range(9)), (0, 1), (1, 1), (8, 1)):
-        job.film.add(tile, part, *job.render_tile(job.camera, tile, part))
-    rgb, layers = develop(job)
-    samples = np.repeat([32, 32, 16, 16, 16, 16, 16, 16, 16], 100)[: 36 * 24].reshape(24, 36)
-    assert np.array_equal(layers.samples, samples)
-    assert rgb == pytest.approx(np.ones((24, 36, 3)), rel=1e-4)
-    assert not layers.blocked.any()
-
-
-def peak_bytes(act: Any) -> int:
-    tracemalloc.start()
-    try:
-        act()
-        return tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-
-
-def test_a_worker_holds_a_tile_and_the_picture_156_bytes_a_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.film.BATCH", 16 * 256)
-    small, large = some_job(48, 32), some_job(960, 640)
-    assert large.film.sums.nbytes == 960 * 640 * 8 * COLUMNS
-    tiles = [peak_bytes(lambda job=job: job.render_tile(job.camera, 3, 1)) for job in (small, large)]
-    assert tiles[1] < 1.05 * tiles[0]
-    monkeypatch.setattr("neurolens.render.film.CHUNK_BYTES", 1 << 20)
-    assert peak_bytes(lambda: develop(large)) < (BYTES_A_PIXEL - 8 * COLUMNS) * 960 * 640
 
 
 def test_previews_come_while_the_render_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -155,23 +155,6 @@ def test_a_killed_worker_ends_the_render_and_what_was_done_is_kept(
         assert kept["done"].min() >= 1 and kept["done"].max() == 2
 
 
-@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system does not pin processes")
-def test_workers_are_pinned_where_there_is_one_for_each_core(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.render.film.BATCH", 256)
-    free = os.sched_getaffinity(0)
-
-    class Telling(Pinhole):
-        def for_worker(self) -> Pinhole:
-            (tmp_path / str(os.getpid())).write_text(",".join(map(str, os.sched_getaffinity(0))))
-            return self
-
-    threads = max(2, len(free))
-    render(scene(environment=WHITE), Telling(50.0, FILM), **SIZE, samples=16, threads=threads)
-    told = [path.read_text() for path in tmp_path.iterdir()]
-    assert len(told) == threads and {int(core) for core in told} == free
-    assert os.sched_getaffinity(0) == free  # those of the caller stay
-
-
 class Reopened(Pinhole):
     """Works only where a worker has opened it."""
 

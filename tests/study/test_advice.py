@@ -12,7 +12,6 @@ from neurolens.plan.candidates import Choice
 from neurolens.plan.costs import Work
 from neurolens.plan.plan import decided
 from neurolens.study.advice import PATH_NS, SAVING, advice, recommended, to_use
-from neurolens.study.train import shown_models
 
 ROOT = Path(__file__).parents[2]
 FUSED = json.loads((ROOT / "experiments" / "results" / "fused_speed.json").read_text(encoding="utf-8"))["rows"]
@@ -86,13 +85,3 @@ def test_without_times_the_smallest_close_model_is_taken_and_else_the_closest() 
     poor = [{**models[0], "poor": ["false pass 3%"]}]
     exact = {"name": "exact C", "ns_per_ray": {"min": 50.0}}
     assert to_use(poor) is poor[0] and to_use(poor, exact=exact) is exact
-
-
-def test_the_model_to_use_is_among_the_pictures() -> None:
-    rows = (("ols-20", "ols", 3.0), ("ols-100", "ols", 0.03), ("mlp-10x1", "mlp", 0.5), ("mlp-16x2", "mlp", 0.01))
-    made: Any = [
-        SimpleNamespace(settings=SimpleNamespace(label=n, method=m, family=m), error=e, record={"name": n})
-        for n, m, e in rows
-    ]
-    for use, shown in ((None, ("ols-100", "mlp-16x2")), (0, ("ols-20", "mlp-16x2")), (2, ("ols-100", "mlp-10x1"))):
-        assert shown_models(made, None if use is None else made[use].record) == shown

@@ -29,7 +29,6 @@ STOP = {"stop": "true"}
 Surfaces = list[tuple[float, float, float, dict[str, Any]]]
 # radius_mm, thickness_mm, diameter_mm, the rest.
 ODD: dict[str, tuple[float, Surfaces]] = {
-    "plano_convex": (6, [(math.inf, 8, 10, STOP), (math.inf, 5, 30, BK7), (-31, 59, 30, AIR)]),
     "ball": (8, [(math.inf, 0.5, 0.9, STOP), (5, 10, 8, BK7), (-5, 2.3, 8, AIR)]),
     "triplet_5mm": (
         5,
@@ -73,11 +72,11 @@ def test_promises_of_the_default_domain_hold(name: str, tmp_path: Path) -> None:
     domain = experiment.domain.of(lens)
     if name == "no_dispersion":
         assert domain.wavelength_nm == (LINE_D_NM, LINE_D_NM)
-    prepared = prepare(make_pairs(lens, domain, PairSettings(4000, 2000, 4000)))
+    prepared = prepare(make_pairs(lens, domain, PairSettings(4000, 1000, 4000)))
     model = fit_model(prepared, ModelSettings("ols", terms=32))
     file = export_onnx(model, tmp_path / "model.onnx")
     file = export_onnx(model, file, measure_on(shared_rays(prepared, 20_000), load_model(file)))
-    figures, promises = check_model(load_model(file), lens, rays=2000)
+    figures, promises = check_model(load_model(file), lens, rays=1000)
     assert len(promises) > 30 and [p for p in promises if not p.holds] == []
     # A model worth having: a tenth of a millirad, and boundaries good to a per cent.
     assert figures["direction_rms_deg"] < 0.01 and figures["false_pass"] < 0.01 and figures["false_block"] < 0.01
@@ -108,6 +107,7 @@ def test_a_lens_without_a_real_focus_is_refused_and_leaves_nothing(
         default_experiment(path).domain.of(read_lens(path))
 
 
+@pytest.mark.usefixtures("no_plots")
 def test_a_run_folder_is_all_that_evaluate_needs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

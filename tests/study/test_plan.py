@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -42,7 +43,7 @@ from neurolens.render.pictures import read_exr
 from neurolens.render.scene import load_scene, scene_from_tables
 from neurolens.setting.states import set_lens
 from neurolens.shaders.blender_shader import lens_of
-from neurolens.shaders.osl import osl_program
+from neurolens.shaders.osl import OslLens, osl_program
 from neurolens.surrogates.cores import InvariantPolynomial
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.file import read_model
@@ -218,6 +219,19 @@ def test_noise_of_weights_is_how_many_times_the_rays_it_takes() -> None:
     assert math.isinf(noise(np.zeros((2, 2, 8)), share))
 
 
+@pytest.fixture(autouse=True, scope="module")
+def fitted_once() -> Iterator[None]:
+    """The shader of a lens, whose pupil takes many seconds to fit, is the same in all tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tried, "lens_of", lambda file, zoom, report: shader_of(file, zoom))
+        yield
+
+
+@cache
+def shader_of(file: Path, zoom: str | None = None) -> tuple[str, OslLens, list[str]]:
+    return lens_of(file, zoom, lambda done, left=None: None)
+
+
 @cache
 def garden() -> Probe:
     return probe(load_scene(Path("experiments/scenes/garden.toml")), set_lens(read_lens(GAUSS)), across=6)
@@ -238,7 +252,7 @@ def test_shaders_cost_what_cycles_took() -> None:
     rows = json.loads(Path("experiments/results/osl_speed.json").read_text(encoding="utf-8"))["rows"]
     (measured,) = (r for r in rows if (r["scene"], r["camera"]) == ("sky", "exact, 12 refractions"))
     found = garden()
-    lens = lens_of(Path(GAUSS), None, lambda done, left=None: None)[1]
+    lens = shader_of(Path(GAUSS))[1]
     asked = found.asked
     ns, times = shader_cost(lens, found.places, asked.shot.film_mm, asked.f_number, asked.shot.focus_m)
     count = sum(osl_program(lens, {"count": 0.0}).count().values())
@@ -268,6 +282,7 @@ def test_targets_are_those_of_the_command() -> None:
     assert get_args(get_type_hints(command.Plan)["target"]) == get_args(Target)
 
 
+@pytest.mark.usefixtures("no_plots")
 def test_a_plan_s_file_is_taken_by_train_render_and_export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same model again from scratch, in numbers; the pictures of the file and of the model that it names agree."""
     monkeypatch.setattr(tried, "TERMS", (6,))
@@ -315,8 +330,11 @@ def test_models_have_the_blades_of_the_lens_file() -> None:
 def test_a_zoom_is_planned_in_its_state() -> None:
     lens, seen = read_lens("lenses/ogawa_zoom_70_200.toml"), []
     scene = scene_from_tables(wall(10.0, 5.6, focus_m=8.0))
-    for found in (probe(scene, lens, zoom="135mm"), probe(scene, set_lens(lens, zoom="135mm")), probe(scene, lens)):
+    for found in (
+        probe(scene, one, zoom=zoom, across=2)
+        for one, zoom in ((lens, "135mm"), (set_lens(lens, zoom="135mm"), None), (lens, None))
+    ):
         seen.append(found.exact.settings["efl_mm"])
     assert seen[0] == seen[1] != seen[2] and seen[0] == pytest.approx(135, rel=0.02)
     with pytest.raises(InputError, match="zoom"):
-        probe(scene, lens, zoom="9mm")
+        probe(scene, lens, zoom="9mm", across=2)

@@ -14,7 +14,6 @@ from neurolens.analysis.layout import Layout, Line, Section, lens_layout
 from neurolens.base.errors import InputError
 from neurolens.plan.plots import _TITLES, _maps
 from neurolens.study import plots
-from neurolens.study.advice import advice
 from neurolens.study.rays import Illumination
 
 MODELS = [
@@ -63,31 +62,6 @@ def test_trade_plot(error: str, exact: list[dict[str, Any]], tmp_path: Path, fig
     assert left.get_xscale() == left.get_yscale() == right.get_xscale() == "log"
     assert not plots.trade_plot("A lens", [{"name": "a"}], EXACT, tmp_path / "none.png")
     assert [p.name for p in tmp_path.iterdir()] == ["trade.png"]
-
-
-def test_labels_stay_clear_of_each_other(tmp_path: Path, figures: list[Any]) -> None:
-    """A cloud of models one marker apart: no two labels cover each other."""
-    models = [
-        {**MODELS[1], "name": str(20 + i), "rms_um": 2.0 * 1.6**-i, "ns_per_ray": {"min": 10 * 1.04**i}}
-        for i in range(10)
-    ]
-    plots.trade_plot("A lens", models, EXACT, tmp_path / "p.png")
-    wanted = {str(20 + i) for i in range(10)}
-    boxes = [t.get_window_extent() for t in figures[0].axes[0].texts if t.get_text() in wanted]
-    assert len(boxes) == 10
-    assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
-
-
-def test_the_ring_of_the_plot_is_at_the_time_of_the_advice(tmp_path: Path, figures: list[Any]) -> None:
-    """One timing of the record serves both; a noisy one has a line to its median, a quiet one has none."""
-    noisy = {**MODELS[1], "fused_ns_per_ray": {"min": 4.0, "median": 6.0}}
-    plots.trade_plot("A lens", [MODELS[0], noisy], EXACT, tmp_path / "trade.png", use="inv")
-    left = figures[0].axes[0]
-    (ring,) = (line for line in left.lines if line.get_label() == "use inv")
-    results = {"models": [noisy | {"file": "inv.onnx"}], "exact": []}
-    assert "~4 ns a ray as C" in advice(results, tmp_path)[1].why and list(ring.get_xdata()) == [4.0]
-    (lines,) = left.collections
-    assert [tuple(path[:, 0]) for path in lines.get_segments()] == [(4.0, 6.0)]
 
 
 def test_lens_layout(tmp_path: Path, figures: list[Any]) -> None:

@@ -85,15 +85,6 @@ def test_every_picture_and_link_exists_and_nothing_needs_the_network(run_dir: Pa
     assert "http" not in path.read_text(encoding="utf-8")
 
 
-def test_a_noisy_time_is_marked(run_dir: Path) -> None:
-    """The mark stands where the median of the rounds is more than 1.1 times the least."""
-    results = full_results("ols-40")
-    for median, mark in ((3.57, ""), (3.58, "~")):
-        model = {**results["models"][0], "fused_ns_per_ray": {"min": 3.25, "median": median}}
-        text = Page(write_report(run_dir, Results(**{**results, "models": [model]})).read_text()).text
-        assert f"{mark}3.25 ns a ray as C" in text and ("~3.25" in text) == bool(mark)
-
-
 def test_hostile_names_are_only_text(run_dir: Path) -> None:
     path = write_report(run_dir, Results(**full_results(HOSTILE)))
     page = Page(path.read_text(encoding="utf-8"))
@@ -156,7 +147,8 @@ def test_markup_is_made_by_templates_that_escape() -> None:
         r"</(a|b|p|t[dhr]|h\d|li|pre|div|span|script|style|small|label|d[dlt]|ul|section|html)>|<br>|<img "
     )
     for file in Path("neurolens").rglob("*.py"):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        text = file.read_text(encoding="utf-8")
+        for node in ast.walk(ast.parse(text)) if tag.search(text) else ():  # a comment or docstring may name a tag
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
                 assert not tag.search(node.value), f"{file}:{node.lineno}"
     templates = [file for folder in ("templates", "view/page") for file in Path("neurolens", folder).glob("*.html")]

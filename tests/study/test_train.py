@@ -133,6 +133,7 @@ def test_models_are_whole_and_fitted_again_where_changed(tmp_path: Path, monkeyp
     assert load_model(again.file).card["errors"]["rms_um"] == pytest.approx(first.record["rms_um"])
 
 
+@pytest.mark.usefixtures("no_plots")
 def test_resolved_configuration_runs_again_without_fitting(run: tuple[Path, dict]) -> None:
     out = run[0] / "out"
     before = {f: f.stat().st_mtime_ns for f in (out / "models").glob("*.onnx")}
@@ -168,6 +169,7 @@ RUNGS = "model=[{terms=3,planes=false},{terms=12,planes=false},{terms=20,planes=
 
 
 @pytest.mark.parametrize(("asked", "within_um", "tried"), [("um=2", 2.0, 2), ("px=1e-6", 1e-6 * 6.24, 3)])
+@pytest.mark.usefixtures("no_plots")
 def test_models_are_fitted_until_one_has_the_error_asked_for(tmp_path, capsys, asked, within_um, tried) -> None:
     kind, _, value = asked.partition("=")
     code = main(
@@ -260,6 +262,7 @@ main(sys.argv[1:])
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL on this system")
+@pytest.mark.usefixtures("no_plots")
 def test_a_training_that_was_killed_is_taken_up_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same command once more ends with the very bytes of a run that nothing stopped, but for the time it took."""
 

@@ -33,7 +33,7 @@ PUBLISHED = tuple(f"{method}{lens}" for method in lens_models.PUBLISHED for lens
 MODELS = (*CORES, *lens_models.GATED, "residual", "laser", *PUBLISHED)
 FORMS = [
     *(("onnx", kind) for kind in MODELS),
-    *(("c", kind) for kind in MODELS),
+    *(("c", kind) for kind in MODELS if kind not in PUBLISHED[1::2]),
     *(("glsl", kind) for kind in lens_models.KINDS),
     *(("torch", kind) for kind in (*lens_models.KINDS, "residual")),
     *(

@@ -19,6 +19,7 @@ import pytest
 from lens_models import edited
 from numpy.typing import NDArray
 from onnx import helper
+from shipped import SOME
 from writers import COLUMNS, compiled, glsl_rays, rays_of, written_rays
 
 from neurolens.base import status as st
@@ -39,7 +40,7 @@ from neurolens.surrogates.model import Domain
 from neurolens.surrogates.source import Fix, at_wavelength, export_source, fixed_models, fused_program, identifier
 
 ROOT = Path(__file__).parents[2]
-SHIPPED = sorted((ROOT / "models").glob("*.onnx"))
+SHIPPED = sorted(f for f in (ROOT / "models").glob("*.onnx") if f.name.partition(".")[0].partition("-")[0] in SOME)
 ZOOM = ROOT / "models" / "nikon_zoom_80_200-range.states-64.onnx"
 
 
@@ -85,9 +86,10 @@ def test_the_nodes_of_a_zooms_file_follow_its_state(share: float) -> None:
     agree(model, built, outputs_of(ZOOM.read_bytes(), feeds), 1e-3)
 
 
-@pytest.mark.parametrize("file", [*map(lens_models.exported, ("network", "cylinders")), *SHIPPED], ids=lambda f: f.stem)
-def test_the_nodes_in_a_file_are_those_that_its_coefficients_give(file: Path) -> None:
+@pytest.mark.parametrize("name", ["network", "cylinders", *(file.stem for file in SHIPPED)])
+def test_the_nodes_in_a_file_are_those_that_its_coefficients_give(name: str) -> None:
     """What another program runs is what this package runs: to the byte, or where nodes are newer, to rounding."""
+    file = lens_models.exported(name) if "." not in name else ROOT / "models" / f"{name}.onnx"
     model = read_model(file)
     written = onnx_of(model.nodes, model.axes, read_metadata(file))
     if written != file.read_bytes():

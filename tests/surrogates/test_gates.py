@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import lens_models
 import numpy as np
 import pytest
 import torch
@@ -29,6 +30,7 @@ from neurolens.surrogates.pairs import PairSet, PairSettings, make_pairs, reache
 from neurolens.surrogates.targets import targets_of
 
 LENSES = Path(__file__).parents[2] / "lenses"
+OLS = ModelSettings("ols", terms=40, planes=False)  # of `lens_models.model`
 
 
 @cache
@@ -66,29 +68,30 @@ def test_where_no_ray_is_lost_there_are_rims_alone() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["singlet", "hemisphere"])
 @pytest.mark.parametrize(
-    ("settings", "most"),
+    ("name", "method", "most"),
     [
-        (ModelSettings("ols", terms=60, planes=False), 0.005),
-        (ModelSettings("dense", basis="raw", degree=4), 0.03),
-        (ModelSettings("mlp", units=12, steps=15), 0.03),
-        (ModelSettings("thick"), 0.06),
+        ("hemisphere", "ols", 0.005),
+        ("singlet", ModelSettings("dense", basis="raw", degree=4), 0.03),
+        ("hemisphere", ModelSettings("dense", basis="raw", degree=4), 0.03),
+        ("singlet", ModelSettings("mlp", units=12, steps=15), 0.03),
+        ("singlet", ModelSettings("thick"), 0.06),
+        ("hemisphere", ModelSettings("thick"), 0.06),
     ],
-    ids=lambda v: v.label if isinstance(v, ModelSettings) else "",
 )
-def test_lost_rays_no_longer_pass(name: str, settings: ModelSettings, most: float) -> None:
-    known = gated(name)
+def test_lost_rays_no_longer_pass(name: str, method: ModelSettings | str, most: float) -> None:
+    known, rays = gated(name), fresh(name)
     rims = tuple(gate for gate in known.gates if gate.reason == st.RIM)
-    model, before = fit_model(known, settings), fit_model(replace(known, gates=rims), settings)
-    rays = fresh(name)
+    settings = OLS if isinstance(method, str) else method
+    model = lens_models.model(name) if isinstance(method, str) else fit_model(known, settings)
+    before = fit_model(replace(known, gates=rims), settings)
     assert false_passes(model, rays) < min(most, 0.6 * false_passes(before, rays))
     assert false_blocks(model, rays) < false_blocks(before, rays) + most
 
 
 @pytest.mark.slow
 def test_zones_have_the_gates_too() -> None:
-    model = fit_model(gated("singlet"), ModelSettings("ols", terms=30, partitions=2, planes=False))
+    model = fit_model(gated("singlet"), ModelSettings("ols", terms=16, degree=5, partitions=2, planes=False))
     assert false_passes(model, fresh("singlet")) < 0.006
 
 
@@ -199,7 +202,7 @@ def test_rays_of_the_boxes_pass_uniformly() -> None:
 @pytest.mark.slow
 def test_a_lens_where_almost_no_ray_passes() -> None:
     lens, domain = narrow()
-    found = vignetting_errors(lens, domain, fitted(lens, domain).predict, count=400_000)
+    found = vignetting_errors(lens, domain, fitted(lens, domain).predict, count=200_000)
     assert found["passing_share"] < 0.012
     assert found["false_pass"] < 0.005 and found["false_block"] < 0.005
 
@@ -209,7 +212,7 @@ def test_a_tiny_rim_far_in_front() -> None:
     surfaces = (replace(lens().surfaces[0], diameter_mm=4.0), *lens().surfaces[1:])
     small = replace(lens(), surfaces=surfaces)
     domain = domain_of(small)
-    found = vignetting_errors(small, domain, fitted(small, domain).predict, count=200_000)
+    found = vignetting_errors(small, domain, fitted(small, domain).predict, count=100_000)
     assert found["false_pass"] < 0.003 and found["false_block"] < 0.003
 
 
@@ -230,7 +233,7 @@ def test_a_hole_without_glass() -> None:
 @pytest.mark.parametrize(("rays", "named"), [((30, 10, 400), "train"), ((400, 10, 3), "rim")])
 def test_too_few_rays_are_refused(rays: tuple[int, int, int], named: str) -> None:
     with pytest.raises(InputError, match=named):
-        fitted(lens(), domain_of(lens()), rays=PairSettings(*rays))
+        fitted(lens(), lens_models.domain(), rays=PairSettings(*rays))
 
 
 @pytest.mark.parametrize("name", ["isshiki_fisheye_10", "edmund_asphere_30"])

@@ -252,16 +252,14 @@ def test_a_training_killed_anywhere_ends_with_the_very_same_weights(singlet, tmp
     monkeypatch.setattr(networks, "EVERY_S", 0.0)
     monkeypatch.setattr(networks, "FEWEST_RAYS", 500)
     settings = {"units": 4, "steps": 60, "seed": 5}
-    whole = _weights(fit(singlet, **settings))
-    file, steps = tmp_path / "training.npz", []
+    file, steps, again = tmp_path / "training.npz", list[float](), list[float]()
+    whole = _weights(fit(singlet, **settings, progress=again.append))
     with pytest.raises(_Killed):
         fit(singlet, **settings, checkpoint=file, progress=_kill_after(calls))
     assert calls <= 10 or file.exists()
     resumed = fit(singlet, **settings, checkpoint=file, progress=steps.append)
     assert torch.equal(whole, _weights(resumed))
     # It went on from its last checkpoint; what is left is less than the whole by most of what was done.
-    again: list[float] = []
-    fit(singlet, **settings, progress=again.append)
     assert len(steps) <= len(again) - calls + 10
     assert [f.name for f in tmp_path.iterdir()] == ["training.npz"]
 

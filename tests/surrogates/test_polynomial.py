@@ -241,8 +241,9 @@ def test_growth_goes_on_where_directions_err_and_takes_nothing_from_the_stop(mon
 
 @pytest.fixture(scope="module", params=["ols", "mlp"])
 def either(request: pytest.FixtureRequest) -> LensModel:
-    network = ModelSettings(method="mlp", units=12, layers=2, steps=25)
-    return fit_model(anamorphic(), network if request.param == "mlp" else ModelSettings(terms=96, degree=4))
+    if request.param == "mlp":
+        return lens_models.model("cylinders network")
+    return fit_model(anamorphic(), ModelSettings(terms=96, degree=4))
 
 
 @pytest.mark.slow

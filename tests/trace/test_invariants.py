@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from shipped import NAMES, focused
+from shipped import SOME, focused
 from torch import Tensor
 
 from experiments.extreme_cases import from_film, from_scene, generator, unit
@@ -16,7 +16,7 @@ from neurolens.lens.prescription import Lens, Surface
 from neurolens.trace.coatings import reflectance
 from neurolens.trace.rays import Rays, Towards, trace
 
-FISHEYES = [name for name in NAMES if "fisheye" in name]
+FISHEYES = [name for name in SOME if "fisheye" in name]
 
 
 def at_plane(r: Rays, z: float) -> tuple[Tensor, Tensor]:
@@ -46,7 +46,7 @@ def determinant(outputs: tuple[Tensor, ...], leaves: list[Tensor]) -> Tensor:
     return torch.linalg.det(torch.stack(rows).permute(2, 0, 1))
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name not in FISHEYES])
+@pytest.mark.parametrize("name", [name for name in SOME if name not in FISHEYES])
 def test_etendue_between_film_and_front_plane(name: str) -> None:
     """d(x', y', dx', dy') / d(x, y, dx, dy) = 1 between planes in air (Winston 2005, 3.2)."""
     leaves, out = film_to_scene(focused(name), 300)
@@ -138,7 +138,7 @@ def test_a_coating_takes_nothing(name: str) -> None:
     torch.testing.assert_close(out.transmittance + lost, torch.ones_like(cosines), rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SOME)
 def test_a_lens_transmits_between_nothing_and_all_along_unit_directions(name: str) -> None:
     lens = focused(name)
     out = trace(lens, from_film(lens, 500, generator()), transmittance=True)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from film_light import film_light
-from shipped import NAMES, focused, tabled
+from shipped import SOME, focused, tabled
 
 from experiments.pupil_methods import (
     RadialPupil,
@@ -58,7 +58,7 @@ def outside(lens: Lens, film_radius: float, rows: int, points: int) -> tuple[int
     return int(passed.sum()), int((~in_row).sum()), int((torch.hypot(x, y) > bounds.disc_mm).sum())
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SOME)
 def test_bounds_hold_what_passes(name: str) -> None:
     lens = focused(name)
     passed, beyond_row, beyond_disc = outside(lens, image_radius_mm(lens)[0], rows=17, points=64)
@@ -79,7 +79,7 @@ def test_bounds_hold_at_a_deep_rear_surface(radius: float) -> None:
     assert beyond_disc <= 1e-4 * passed
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SOME)
 def test_the_pupil_plane_is_apart_from_the_film(name: str) -> None:
     lens = focused(name)
     rear = lens.vertices_mm[len(lens.surfaces) - 1]
