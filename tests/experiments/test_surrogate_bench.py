@@ -12,6 +12,7 @@ from lens_models import LENSES
 from experiments import methods as surrogate_bench
 from experiments.__main__ import main
 from experiments.methods import Bench, BenchSettings, Row, run_bench
+from experiments.surrogates import chosen_rows
 from neurolens.base.errors import InputError
 from neurolens.base.progress import Progress
 from neurolens.study.experiment import DomainChoice, EvaluationChoice, LensChoice
