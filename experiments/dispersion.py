@@ -113,7 +113,8 @@ def run(args: argparse.Namespace) -> None:
     names = lab.chosen(list(LENSES), str, args.only, "dispersion")
     cases = [(scene, name) for scene in SCENES for name in names]
     with ProcessPoolExecutor(args.workers, mp_context=get_context("spawn")) as pool:
-        found = pool.map(partial(case, args=args), cases)
+        asked = argparse.Namespace(**{name: getattr(args, name) for name in ("samples", "seeds", "width")})
+        found = pool.map(partial(case, args=asked), cases)
         rows = [next(found) for _ in lab.counted(cases, "cases", args.quiet)]
     head = f"`python -m experiments dispersion`: {args.samples} samples, {args.seeds} seeds, {args.width} pixels wide; "
     parts = [head + lab.machine_line(), _ABOUT, lab.table(_COLUMNS, rows)]
