@@ -5,9 +5,11 @@ import re
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Iterator
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -80,6 +82,14 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
+def statements(body: list[Any]) -> Iterator[Any]:
+    """All statements of a module; looking through their expressions, too, takes ten times as long."""
+    for node in body:
+        yield node
+        for part in ("body", "orelse", "finalbody", "handlers", "cases"):
+            yield from statements(getattr(node, part, []))
+
+
 def imported(path: Path) -> set[str]:
     """Dotted names of everything a module imports, anywhere in it."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
@@ -87,7 +97,7 @@ def imported(path: Path) -> set[str]:
     if path.name != "__init__.py":
         package = package[:-1]
     names = set()
-    for node in ast.walk(tree):
+    for node in statements(tree.body):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -134,7 +144,7 @@ def test_no_imports_go_in_a_circle() -> None:
     for path in MODULES:
         text = TYPES_ALONE.sub("", path.read_text(encoding="utf-8"))
         found = set()
-        for node in ast.walk(ast.parse(text)):
+        for node in statements(ast.parse(text).body):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("neurolens"):
                 names = {f"{node.module}.{alias.name}" for alias in node.names}
                 found |= names & known or {str(node.module)}

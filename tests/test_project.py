@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from test_imports import statements
 
 import neurolens
 from neurolens.base.errors import InputError
@@ -37,20 +38,15 @@ def test_the_tested_versions_lie_in_the_ranges_that_are_declared() -> None:
         )
 
 
-def _called(call: ast.Call) -> str:
-    return str(getattr(call.func, "attr", getattr(call.func, "id", "")))
-
-
-def imported(tree: ast.Module) -> Iterator[str]:
+def imported(text: str, tree: ast.Module) -> Iterator[str]:
     """Top-level names that a module imports, also by `import_module` and `importorskip` of a literal."""
-    for node in ast.walk(tree):
+    yield from re.findall(r"\b(?:import_module|importorskip)\(\s*[\"'](\w+)", text)
+    for node in statements(tree.body):
         names: list[object] = []
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.level == 0:
             names = [node.module]
-        elif isinstance(node, ast.Call) and _called(node) in ("import_module", "importorskip"):
-            names = [arg.value for arg in node.args[:1] if isinstance(arg, ast.Constant)]
         yield from (str(name).partition(".")[0] for name in names)
 
 
@@ -78,8 +74,9 @@ def test_what_is_imported_is_declared_and_what_is_declared_is_imported() -> None
     files = [file for folder in FOLDERS for file in sorted((ROOT / folder).rglob("*.py"))]
     ours = {*FOLDERS, *(file.stem for file in files if "tests" in file.parts)} | IN_BLENDER | sys.stdlib_module_names
     for file in files:
-        tree = ast.parse(file.read_text(encoding="utf-8"))
-        for name in set(imported(tree)) - ours:
+        text = file.read_text(encoding="utf-8")
+        tree = ast.parse(text)
+        for name in set(imported(text, tree)) - ours:
             wanted = {plain(one) for one in distributions.get(name, [name])}
             used |= wanted
             known = wanted & allowed[file.relative_to(ROOT).parts[0]] or own_environment(file, tree, name)
