@@ -210,7 +210,7 @@ def _faults(argv: Sequence[str], code: int, said: str, new: Sequence[str], memor
         yield "control characters on stderr"
     if len(said) > 20_000:
         yield f"{len(said)} characters on stderr"
-    if memory > MEMORY or "memory" in said:
+    if memory > MEMORY or re.search(r"\bmemory\b", said):
         yield f"memory: {memory >> 20} MB"
 
 

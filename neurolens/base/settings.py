@@ -135,7 +135,9 @@ def between(low: float, high: float, unit: str) -> Callable[[str], float]:
 
 def whole(least: int, most: int | None = None) -> Callable[[str], int]:
     """Type of an argument that is an integer from `least` to `most`."""
-    return _within(int, (least, math.inf if most is None else most), "an integer")
+    largest = (1 << 63) - 1 if most is None else most  # what generators of random numbers take
+    expected = _expected(int, (least, math.inf if most is None else most), "an integer")
+    return number(int, lambda value: least <= value <= largest, expected)
 
 
 def positive(unit: str, *, infinite: bool = False) -> Callable[[str], float]:

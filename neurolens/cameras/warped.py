@@ -59,7 +59,8 @@ class Warped:
             expected = "a film within the image circle, and a narrower field"
             raise InputError(camera.name, "film_mm", self.film_mm, expected)
         before = self._before(ideal)
-        sides = 2 * BEYOND * np.array([np.abs(before.real).max(), np.abs(before.imag).max()]) / self.film_mm
+        # Beyond the edge of the film, too, which the lens's distortion moves farther out than points within it.
+        sides = 2 * BEYOND**2 * np.array([np.abs(before.real).max(), np.abs(before.imag).max()]) / self.film_mm
         self.area = float(np.maximum(sides, 1.0).prod())  # of the picture before it is warped, over that of the film
         if tables:
             wide = copy(flat)
@@ -74,7 +75,8 @@ class Warped:
             each, back = np.unique(each, return_inverse=True)
         ideal, light = self._place_and_light(self._shown, each)
         place = self._before(ideal)
-        light = light / np.maximum(self._place_and_light(self._flat, place)[1], 1e-30)
+        flat = self._place_and_light(self._flat, place)[1]
+        light = np.where(flat > 0, light / np.where(flat > 0, flat, 1), 0)  # dark where the flat picture ends
         film = -np.stack([place.real, place.imag])[:, back].astype(np.float32)
         rays = self._flat.sample(np.ascontiguousarray(film), pupil, wavelength_nm)
         return replace(rays, weight=rays.weight * light[back].astype(np.float32))

@@ -11,12 +11,12 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
 from neurolens import __version__
-from neurolens.base.errors import NeurolensError, NeurolensWarning, one_line, printable
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning, one_line, printable
 from neurolens.base.signals import handled
 from neurolens.cli.arguments import Command, Help, Parser, more_glasses
 
@@ -103,6 +103,7 @@ def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] = build_
 
     try:
         with handled(interrupt):
+            _check_words(sys.argv[1:] if argv is None else argv)
             args = build().parse_args(argv)
             with _plain_warnings(quiet=getattr(args, "quiet", False)), more_glasses(getattr(args, "glass", ())):
                 code: int = args.run(args)
@@ -115,6 +116,15 @@ def main(argv: Sequence[str] | None = None, build: Callable[[], Parser] = build_
             print(f"\nneurolens: interrupted; {printable(kept)}", file=sys.stderr)
             return 128 + (received[0] if received else signal.SIGINT)
         return _failed(error)
+
+
+def _check_words(words: Sequence[str]) -> None:
+    """Raise InputError for a word that no file of this system can have as its name."""
+    for word in words:
+        with suppress(UnicodeEncodeError):
+            if b"\0" not in os.fsencode(word):
+                continue
+        raise InputError("command line", "argument", printable(word), "text without null characters that is whole")
 
 
 def _failed(error: Exception) -> int:

@@ -26,6 +26,7 @@ import torch
 from numpy.typing import NDArray
 from scipy import signal  # type: ignore[import-untyped]
 
+from neurolens.base.errors import InputError
 from neurolens.flare.lights import CELLS, FADE, Patch, disc
 from neurolens.flare.steps import LOST, Floats
 from neurolens.graph.compiler import c_source, load_compiled
@@ -74,7 +75,10 @@ def axis_irradiance(lens: Lens, wavelength_nm: float) -> float:
     for _ in range(3):  # narrows to the cone that passes, and a little more
         lit = share(widest * coarse) > 0
         widest *= 1.02 * float(np.hypot(*coarse)[lit].max(initial=0.0)) if lit.any() else 0.3
-    return math.pi * widest**2 * float(share(min(widest, 1.0) * coarse).mean())
+    light = math.pi * widest**2 * float(share(min(widest, 1.0) * coarse).mean())
+    if not light > 0:
+        raise InputError(lens.path, "surfaces", "(no ray passes on the axis)", "a lens that light can pass")
+    return light
 
 
 def edges_of(rays: Floats, columns: int, size: tuple[int, int], per_mm: float) -> Doubles:

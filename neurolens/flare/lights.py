@@ -299,8 +299,10 @@ def rays_across(lens: Lens, light: Light, place: NDArray[np.floating[Any]]) -> t
         return np.concatenate([target, np.broadcast_to(-ahead[:, None], target.shape)]), math.pi * radius**2
     source = 1000 * light.distance_m * ahead
     far = float(np.linalg.norm(source - centre))
-    if far <= 1.01 * radius:
-        raise InputError("light", "distance_m", light.distance_m, f"one outside the lens, beyond {radius / 1000:.3g} m")
+    if not 1.01 * radius < far < math.inf:
+        raise InputError(
+            "light", "distance_m", light.distance_m, f"one beyond {radius / 1000:.3g} m, outside the lens, or inf"
+        )
     # Uniform in solid angle over the cone that holds the sphere about the front surface.
     solid = 1 - math.sqrt(1 - (radius / far) ** 2)
     off = across * np.sqrt(solid * (2 - solid * (across**2).sum(0)))

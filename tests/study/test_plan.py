@@ -177,6 +177,18 @@ def test_a_warped_pinhole_shows_what_is_in_focus_where_the_lens_does(lens: str) 
         assert apart < min(most, without)
 
 
+def test_a_warped_picture_has_the_lens_s_light_in_its_corners() -> None:
+    """The corners of a film of 16 to 9, which the distortion moves beyond what is seen within them."""
+    shot = Shot((36.0, 20.25), 2.0, f_number=2.0)
+    exact, flat = make_camera(GAUSS, shot), make_camera(f"thick:{GAUSS}", shot)
+    warped = Warped(flat, exact, 2.0, tables=True)
+    square, waves = np.random.default_rng(0).random((2, 20_000), np.float32), np.linspace(420, 680, 20_000, dtype=np.float32)
+    for x, y in ((17.97, 10.1), (-17.99, 10.12), (17.9, -10.0)):
+        film = np.repeat(np.array([[x], [y]], np.float32), 20_000, axis=1)
+        one, other = (c.sample(film, square, waves).weight.mean(dtype=np.float64) for c in (exact, warped))
+        assert other == pytest.approx(one, rel=0.04)
+
+
 @pytest.mark.parametrize(("budget", "distance_m", "f_number"), [(0.0, 4.0, None), (1e9, 4.0, 45.0), (1e9, 0.12, 45.0)])
 def test_budgets_at_the_extremes(budget: float, distance_m: float, f_number: float | None) -> None:
     """No budget leaves the exact lens; any budget, a point whose picture is warped, for it costs least as C. Where the
