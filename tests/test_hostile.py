@@ -9,6 +9,7 @@ import time
 import zlib
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -271,3 +272,29 @@ def test_what_the_fuzzer_broke_is_one_line_or_no_fault(
     with pytest.raises(InputError):
         images.read_pictures(Path("scene.toml"), {"textures.scan.file": Path("scan.tif")})
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("word", ["a\0b", "\udc00"])
+def test_words_that_name_no_file_are_refused(word: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "command line: argument" in failure(capsys, "survey", ".", "--no-fit", "-o", word)
+
+
+def test_numbers_beyond_what_random_generators_take_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    model = ROOT / "models" / "laikin_double_gauss_50.ols-36.onnx"
+    assert "--seed" in failure(capsys, "evaluate", model, "--seed", "1" * 300)
+
+
+def test_a_light_too_far_for_millimetres_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lights = tmp_path / "lights.json"
+    lights.write_text('[{"azimuth_deg": -4.5, "elevation_deg": 2, "distance_m": 1e308}]')
+    command = ("flare", "brendel_tessar_100", "--lights", lights, "--width", "24", "--bins", "2", "--quiet")
+    assert "distance_m: got 1e+308" in failure(capsys, *command, "-o", tmp_path / "flare.exr")
+
+
+def test_a_lens_without_light_on_its_axis_has_no_exposure() -> None:
+    from neurolens.flare.canvas import axis_irradiance
+    from neurolens.setting.states import set_lens
+
+    lens = set_lens(read_any(ROOT / "lenses" / "brendel_tessar_100.toml"))
+    with pytest.raises(InputError, match="no ray passes on the axis"):
+        axis_irradiance(replace(lens, film_z_mm=1e7), 550.0)

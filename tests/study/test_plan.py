@@ -182,7 +182,8 @@ def test_a_warped_picture_has_the_lens_s_light_in_its_corners() -> None:
     shot = Shot((36.0, 20.25), 2.0, f_number=2.0)
     exact, flat = make_camera(GAUSS, shot), make_camera(f"thick:{GAUSS}", shot)
     warped = Warped(flat, exact, 2.0, tables=True)
-    square, waves = np.random.default_rng(0).random((2, 20_000), np.float32), np.linspace(420, 680, 20_000, dtype=np.float32)
+    square = np.random.default_rng(0).random((2, 20_000), np.float32)
+    waves = np.linspace(420, 680, 20_000, dtype=np.float32)
     for x, y in ((17.97, 10.1), (-17.99, 10.12), (17.9, -10.0)):
         film = np.repeat(np.array([[x], [y]], np.float32), 20_000, axis=1)
         one, other = (c.sample(film, square, waves).weight.mean(dtype=np.float64) for c in (exact, warped))
