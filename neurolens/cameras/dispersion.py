@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from neurolens.base import status as st
 from neurolens.base.errors import InputError
 from neurolens.cameras.contract import RAYS_A_CALL, Camera, CameraRays, FilmPoints, FloatArray, SpectralRays
-from neurolens.cameras.sampling import common_light, stratified
+from neurolens.cameras.sampling import common_light, is_light, stratified
 from neurolens.lens.film_plane import LINE_D_NM
 from neurolens.lens.shot import Dispersion
 
@@ -27,7 +28,7 @@ _DEGREE, _ORDERS = 7, 3  # of the shift's polynomial, in the film point and in t
 _POINTS, _SIDE, _WAVES = 192, 8, 7  # of the fit: film points, pupil samples a side, wavelengths
 _BEYOND = 1.5  # the farthest companion over that of the points of the fit
 _STEP = 1e-3  # of the film's width: a step of the film point, to know how what it shows moves
-_QUADRATURE = 64  # pupil samples a side, for the exposure
+_SIDE_OF_AXIS = 64  # pupil samples a side, for the light on the axis
 
 
 def film_shift(
@@ -80,7 +81,8 @@ def film_shift(
 class ReducedDispersion:
     """A camera without longitudinal colour ("lateral"), or without dispersion ("off"); see the module.
 
-    White surroundings stay 1 on the axis. Differentials are those of the one wavelength.
+    White surroundings keep the colour that the lens gives them on the axis. Differentials are those of the one
+    wavelength.
 
     Args:
         camera: of our contract. dispersion: "lateral" or "off".
@@ -104,32 +106,34 @@ class ReducedDispersion:
         light = common_light(camera.wavelength_nm or wavelength_nm, wavelength_nm)
         self._nm = min(max(LINE_D_NM, light[0]), light[1])
         self.lateral = self.dispersive = dispersion == "lateral" and camera.dispersive and light[0] < light[1]
-        self.achromatic = not self.lateral
         self.settings: dict[str, Any] = {**camera.settings, "dispersion": dispersion}
-        square, _ = stratified(_QUADRATURE, light)
-        lit = camera.sample(np.zeros_like(square), square, self._reference(square)).weight.mean(dtype=np.float64)
-        self._scale = np.float32(1 / lit if lit > 0 else 1)
+        self._lit_nm = np.linspace(*light, _WAVES)
+        lit = np.array([self._exposure(nm) for nm in (self._nm, *self._lit_nm)])
+        self._tint = lit[1:] / lit[0] if lit[0] > 0 else np.ones(_WAVES)
+        self.achromatic = not self.lateral and bool(np.ptp(self._tint) == 0)
         self.companion_reach_mm: tuple[float, float] | None = None
         if self.lateral:
             self._fit(light)
 
     def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """The camera's rays at the one wavelength, of the film points that show what these show at theirs."""
-        return self._scaled(self.camera.sample(self._base(film_mm, wavelength_nm), pupil, self._reference(film_mm)))
+        base = self._base(film_mm, wavelength_nm)
+        return self._tinted(self.camera.sample(base, pupil, self._reference(film_mm)), wavelength_nm)
 
     def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
         """Sample rays as `sample` does, and give their differentials, too."""
         base = self._base(film_mm, wavelength_nm)
-        return self._scaled(self.camera.sample_differentials(base, pupil, self._reference(film_mm)))
+        return self._tinted(self.camera.sample_differentials(base, pupil, self._reference(film_mm)), wavelength_nm)
 
     def sample_spectrum(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SpectralRays:
         """Rays as of `sample`, for wavelengths [W, N] in nm of which the first is the hero's; see the contract."""
         base = self._base(film_mm, wavelength_nm[0])
-        rays = self._scaled(self.camera.sample(base, pupil, self._reference(film_mm)))
+        plain = self.camera.sample(base, pupil, self._reference(film_mm))
+        rays = self._tinted(plain, wavelength_nm[0])
         places = np.concatenate([film_mm[None], base + self._shifts(film_mm, wavelength_nm[1:])])
         passed = (np.abs(places) < np.array(self.film_mm, np.float32)[:, None] / 2).all(axis=1) & (rays.weight > 0)
         passed[0] = rays.weight > 0
-        share = rays.weight / np.maximum(passed.sum(axis=0), 1)
+        share = plain.weight * self._tints(wavelength_nm) / np.maximum(passed.sum(axis=0), 1)
         places = np.where(passed[:, None], places, film_mm).astype(np.float32)
         return SpectralRays(rays, np.where(passed, share, 0).astype(np.float32), places)
 
@@ -140,7 +144,7 @@ class ReducedDispersion:
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """The camera's film points at the one wavelength, moved to where these wavelengths are shown."""
-        found = self._scaled(self.camera.to_film(point_m, pupil, self._reference(point_m)))
+        found = self._tinted(self.camera.to_film(point_m, pupil, self._reference(point_m)), wavelength_nm)
         shift = self._shifts(found.film_mm, wavelength_nm[None])[0]
         return replace(found, film_mm=found.film_mm + shift * (found.weight > 0))
 
@@ -154,8 +158,20 @@ class ReducedDispersion:
         """The one wavelength, as often as there are rays [R, N]."""
         return np.full(rays.shape[1], self._nm, np.float32)
 
-    def _scaled(self, rays: Any) -> Any:
-        return replace(rays, weight=rays.weight * self._scale)
+    def _exposure(self, nm: float) -> float:
+        """The mean weight of the rays of the film's middle at a wavelength."""
+        square, _ = stratified(_SIDE_OF_AXIS, (nm, nm))
+        middle, light = np.zeros_like(square), np.full(square.shape[1], nm, np.float32)
+        return float(self.camera.sample(middle, square, light).weight.mean(dtype=np.float64))
+
+    def _tints(self, wavelength_nm: FloatArray) -> FloatArray:
+        """The light of wavelengths on the axis over that of the one wavelength."""
+        return np.interp(np.nan_to_num(wavelength_nm), self._lit_nm, self._tint).astype(np.float32)
+
+    def _tinted(self, rays: Any, wavelength_nm: FloatArray) -> Any:
+        light = is_light(wavelength_nm)  # else a ray would hide that its wavelength is none
+        status = np.where(light, rays.status, np.int32(st.OUTSIDE_DOMAIN))
+        return replace(rays, weight=rays.weight * self._tints(wavelength_nm) * light, status=status)
 
     def _base(self, film_mm: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
         """The film points that show at the one wavelength what these show at theirs."""
