@@ -269,7 +269,8 @@ def _fans_text(data: dict[str, Any]) -> str:
     header = [f"{name} {wave}" for name in ("tang.", "sag.") for wave in _nanometres(data)]
 
     def cells(i: int) -> list[str]:
-        return [_three(_largest(row)) for key in ("tangential_um", "sagittal_um") for row in data[key][i]]
+        rows = [row for key in ("tangential_um", "sagittal_um") for row in data[key][i]]
+        return [_three(max((abs(v) for v in row if not math.isnan(v)), default=math.nan)) for row in rows]
 
     head = "Ray fans (largest transverse aberration, µm)"
     return _over_field(head, data, header, cells, range(len(data["field_deg"])))
@@ -400,11 +401,6 @@ def _fixed(value: float, places: int = 3) -> str:
 
 def _percent(value: float, spread: float = 0.0) -> str:
     return "-" if math.isnan(value) else f"{100 * value:.{max(_digits(spread) - 2, 0)}f}%"
-
-
-def _largest(values: Sequence[float]) -> float:
-    seen = [abs(v) for v in values if not math.isnan(v)]
-    return max(seen) if seen else math.nan
 
 
 def _three(value: float, spread: float = 0.0) -> str:

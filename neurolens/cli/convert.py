@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from neurolens.base.errors import InputError, warned
 from neurolens.base.files import atomic_path
 from neurolens.base.settings import group, positive, setting
-from neurolens.cli.arguments import Answering, Glasses, check_folder, check_suffix, output_path
+from neurolens.cli.arguments import Answering, Glasses, check_suffix, output_path
 from neurolens.cli.output import number
 
 if TYPE_CHECKING:
@@ -69,7 +69,6 @@ examples:
     def run(self) -> int:
         """Convert one file and print what was read."""
         check_suffix(self.out, "--output", (".toml",))
-        check_folder(self.out, "--output")
         if self.out.exists() and not self.force:
             raise InputError(self.out, "--output", "(an existing file)", "a new file, or --force to replace it")
         from neurolens.readers.any_format import read_any

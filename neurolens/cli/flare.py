@@ -18,6 +18,7 @@ from neurolens.cli.arguments import (
     check_suffix,
     exposure,
     film_size,
+    floats,
     lens,
     lens_state,
     output_path,
@@ -43,10 +44,7 @@ _SETTINGS = {  # the fields of `FlareSettings` by the titles of their options
 def _gain(text: str) -> tuple[str, list[float]]:
     """The type of --gain: a name, and factors of red, green and blue."""
     name, _, rest = text.partition("=")
-    try:
-        factors = [float(word) for word in rest.split("/")]
-    except ValueError:
-        factors = []
+    factors = floats(rest, "/")
     if len(factors) not in (1, 3) or not all(0 <= v < math.inf for v in factors):
         raise argparse.ArgumentTypeError(f"got {text!r}, expected NAME=X or NAME=R/G/B, of at least 0")
     return name, factors * (3 // len(factors))

@@ -110,7 +110,6 @@ examples:
         for option, path in (("--layout", self.layout), ("--breathing", self.breathing)):
             if path is not None:
                 check_suffix(path, option, _LAYOUT_SUFFIXES)
-                check_folder(path, option)
         from neurolens.readers.any_format import read_any
         from neurolens.study.describe import file_doubts, glass_table, layout_profile, lens_facts
         from neurolens.surrogates.domain import domain_of
@@ -299,21 +298,17 @@ def _surface_words(row: dict[str, Any]) -> str:
     """Properties of a row of `study.describe.glass_table` besides radius and glass; empty for a sphere."""
     powers = sorted(map(int, row["asphere"]))
     span = "" if not powers else f"asphere {powers[0]}" + (f"-{powers[-1]}" if len(powers) > 1 else "")
+    (radius, conic), other = row["across"] or (None, None), "x" if row["cylinder"] == "y" else "y"
     words = [
         span,
         f"K {row['conic']:.4g}" if row["conic"] else "",
         f"cylinder {row['cylinder']}" if row["cylinder"] and not row["across"] else "",
-        _across_words(row["cylinder"], *row["across"]) if row["across"] else "",
+        f"{'toroid' if conic is None else f'biconic K {conic:.4g}'}, {radius:.4f} mm along {other}" if radius else "",
         f"ideal lens, f {row['focal_mm']:.4g} mm" if row["focal_mm"] else "",
         f"coating {row['coating']['name']}" if row["coating"] else "",
         f"absorbs {row['absorption_per_mm']:.3g}/mm" if row["absorption_per_mm"] else "",
     ]
     return ", ".join(word for word in words if word)
-
-
-def _across_words(axis: str, radius_mm: float, conic: float | None) -> str:
-    other = "x" if axis == "y" else "y"
-    return f"{'toroid' if conic is None else f'biconic K {conic:.4g}'}, {radius_mm:.4f} mm along {other}"
 
 
 _LIST_HEADER = (

@@ -18,7 +18,7 @@ from neurolens.base.files import library as shipped
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
 from neurolens.cameras.onnxlens import load_model
-from neurolens.cli.blender_lenses import card_of, forms_of, key_of, kind_of, library, squeeze_of
+from neurolens.cli.blender_lenses import forms_of, key_of, kind_of, library, squeeze_of
 from neurolens.cli.export_lens import write_lens
 from neurolens.flare.ghostmodel import KIND, GhostModel, read_ghosts
 from neurolens.lens.paraxial import first_order
@@ -28,7 +28,7 @@ from neurolens.readers.any_format import read_any
 from neurolens.setting.pupils import image_radius_mm, pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.shaders.source import model_extras
-from neurolens.surrogates.card import card_in, read_metadata
+from neurolens.surrogates.card import card_in, read_card, read_metadata
 from neurolens.surrogates.source import Written, export_source
 from neurolens.view.page import Form, ViewLens, section_svg, write_page
 from neurolens.view.shaders import ghosts_glsl, path_glsl
@@ -59,7 +59,7 @@ def run_view(args: View) -> int:
     """Write the page."""
     entries = list(_named(args.lenses) if args.lenses else _library())
     for entry in entries:
-        own = [kind_of(card_of(file)) for file in entry.models]
+        own = [kind_of(read_card(file)) for file in entry.models]
         if len(set(own)) < len(own):
             raise InputError("neurolens view", entry.key, f"({' and '.join(own)})", "one model of each kind")
     kinds, progress = args.downloads, Progress(quiet=args.json)
@@ -122,7 +122,7 @@ def _named(paths: Sequence[Path]) -> Iterator[_Entry]:
             if ghosts.setdefault(model.lens.lens_id, model) is not model:
                 raise InputError("neurolens view", f"ghosts of {model.lens.lens_id}", str(path), "one file a lens")
         elif is_model(path):
-            lens_id = str(card_of(path)["lens"]["id"])
+            lens_id = str(read_card(path)["lens"]["id"])
             lenses.setdefault(lens_id, None)
             models.setdefault(lens_id, []).append(path)
         else:
@@ -135,7 +135,7 @@ def _named(paths: Sequence[Path]) -> Iterator[_Entry]:
         raise InputError("neurolens view", f"ghosts of {lens_id}", "(no such lens)", "the lens beside its ghosts")
     for lens_id, lens_or_none in lenses.items():
         own = models.get(lens_id) or from_library.get(lens_id, [])
-        zoom = RANGE if any(card_of(m).get("states") for m in own) else None
+        zoom = RANGE if any(read_card(m).get("states") for m in own) else None
         yield _Entry(lens_id, own, lens_or_none, zoom, ghosts.get(lens_id))
 
 
