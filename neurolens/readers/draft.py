@@ -27,33 +27,8 @@ from neurolens.readers.assemble import (
     with_stop,
 )
 from neurolens.readers.forbes import MAX_TERMS, qbfs_terms, qcon_terms
-from neurolens.readers.source import MAX_SURFACES, UNITS_MM, Line, warn
+from neurolens.readers.source import MAX_SURFACES, UNITS_MM, Line, ReadOptions, warn
 from neurolens.setting.rims import check_states
-
-
-@dataclass(frozen=True)
-class ReadOptions:
-    """Values from the user that the file does not give.
-
-    Attributes:
-        name, source: for the lens file; else the title in the file, and "FORMAT file NAME".
-        f_number: nominal f-number, for a file that states none.
-        units: of a file without units: "mm", "cm", "in" or "m".
-        half_field_deg: edge of the field, for rims that have to be derived.
-        stop: number of the surface, as the file numbers it, that is the stop; replaces a stop that the file marks.
-        gap_before: of a plain table: its second column is the distance from the surface before (Kolb's tables of 1995).
-        semi_diameters: of a plain table: its last column holds radii of the rims.
-    """
-
-    name: str | None = None
-    source: str | None = None
-    f_number: float | None = None
-    units: str | None = None
-    half_field_deg: float | None = None
-    stop: str | None = None
-    gap_before: bool = False
-    semi_diameters: bool = False
-
 
 INFINITE = 1e9  # in any unit; programs write 1e10 or more for an object at infinity
 

@@ -21,9 +21,9 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.assemble import first_order
-from neurolens.readers.draft import Draft, ReadOptions, Row, State, lens_of
+from neurolens.readers.draft import Draft, Row, State, lens_of
 from neurolens.readers.glasses import named_glass
-from neurolens.readers.source import MAX_SURFACES, Table, warn
+from neurolens.readers.source import ReadOptions, Table, warn
 
 _DEEPLENS = (
     *("info", "foclen", "fnum", "r_sensor", "d_sensor", "sensor_size", "sensor_res", "hfov", "fov", "float_hfov"),
@@ -32,6 +32,7 @@ _DEEPLENS = (
 _DEEPLENS_SURFACE = (
     *("idx", "type", "r", "c", "roc", "d", "d_next", "mat1", "mat2", "k", "ai", "is_square", "diffraction", "use_ai2"),
 )
+_MEDIUM = ("n_d", "V_d", "material", "glass")
 _STOPS, _AIR = ("Stop", "Aperture"), ("air", "vacuum", "occluder")
 _ISET = ("name", "description", "type", "surfaces", "microlens")
 _ISET_SURFACE = ("radius", "thickness", "ior", "semi_aperture", "conic_constant")
@@ -107,7 +108,7 @@ def _deeplens_surface(row: Table, before: Surface | None, skipped: Counter[str])
         diameter_mm=2 * row.number("r", unit="mm", above=0),
         stop=stop,
         **shape,
-        **(_medium(row) if "mat2" in row or not stop else _medium_of(before)),
+        **(_medium(row) if "mat2" in row or not stop else {key: getattr(before, key) for key in _MEDIUM if before}),
     )
 
 
@@ -117,10 +118,6 @@ def _radius_mm(row: Table) -> float:
         return row.number("roc", unit="mm", finite=False) or math.inf
     c = row.number("c", unit="1/mm")
     return 1 / c if c else math.inf
-
-
-def _medium_of(before: Surface | None) -> dict[str, Any]:
-    return {key: getattr(before, key) for key in ("n_d", "V_d", "material", "glass")} if before else {}
 
 
 def _medium(row: Table) -> dict[str, Any]:
@@ -139,13 +136,13 @@ def _medium(row: Table) -> dict[str, Any]:
 
 
 def _iset(data: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], file: str) -> Draft:
-    Table(data, file).only(_ISET)
+    top = Table(data, file)
+    top.only(_ISET)
     if data.get("microlens"):
         raise InputError(file, "microlens", "(given)", "a lens without microlenses")
     surfaces = []
     for k, given in enumerate(rows):
-        row = Table(given, file, f"surface {k}, ")
-        row.only(_ISET_SURFACE)
+        row = top.inner(f"surface {k}", given, _ISET_SURFACE)
         ior = row.number("ior")
         surface = Surface(
             radius_mm=row.number("radius", unit="mm, 0 for a plane") or math.inf,
@@ -189,15 +186,8 @@ def read_blender(data: Mapping[str, Any], file: str, options: ReadOptions | None
     """
     top = Table(data, file)
     top.only(("lens", "surface", "focus"))
-    head, rows = Table(data["lens"], file, "lens, "), data["surface"]
-    head.only(_LENS)
-    if len(rows) > MAX_SURFACES:
-        raise top.error("surface", f"({len(rows)} of them)", f"at most {MAX_SURFACES}")
-    surfaces = []
-    for k, row in enumerate(rows):
-        if not isinstance(row, Mapping):
-            raise top.error(f"surface {k}", row, "a table")
-        surfaces.append(_blender_surface(Table(row, file, f"surface {k}, ")))
+    head = top.inner("lens", data["lens"], _LENS)
+    surfaces = [_blender_surface(top.inner(f"surface {k}", row, _SURFACE)) for k, row in enumerate(data["surface"])]
     if not surfaces:
         raise top.error("surface", "(none)", "a table for each surface")
     film_given = surfaces[-1].thickness_mm > 0
@@ -219,7 +209,6 @@ def read_blender(data: Mapping[str, Any], file: str, options: ReadOptions | None
 
 
 def _blender_surface(row: Table) -> Surface:
-    row.only(_SURFACE)
     kind = row.text("type", required=False) or "spherical"
     if kind not in _TYPES:
         raise row.error("type", kind, f"one of {', '.join(_TYPES)}")
@@ -248,16 +237,10 @@ def _states(top: Table, count: int, film_given: bool) -> tuple[State, ...]:
     """Return the near focus state, where there is one, after that at infinity."""
     if "focus" not in top:
         return ()
-    if not isinstance(top.data["focus"], Mapping):
-        raise top.error("focus", top.data["focus"], "a table")
-    focus = Table(top.data["focus"], top.file, "focus, ")
-    focus.only(("close_distance", "variable"))
+    focus = top.inner("focus", top.data["focus"], ("close_distance", "variable"))
     moved: dict[int, float] = {}
     for row in focus.data.get("variable", []):
-        if not isinstance(row, Mapping):
-            raise focus.error("variable", row, "a table")
-        table = Table(row, top.file, "focus.variable, ")
-        table.only(("surface", "thickness_close"))
+        table = focus.inner("variable", row, ("surface", "thickness_close"))
         k = table.number("surface")
         if k not in range(count):
             raise table.error("surface", k, f"a surface number from 0 to {count - 1}")
