@@ -41,7 +41,7 @@ def with_derivatives(graph: Graph, outputs: Sequence[str], inputs: Sequence[tupl
     for number, node in enumerate(graph.nodes):
         x = [values[k] for k in node.inputs]
         moves: list[list[Moved]] = [[direction.get(v.number) for v in x] for direction in known]
-        rule = _RULES.get(node.kind, _none)
+        rule = _RULES.get(node.kind, lambda node, y, x, d: None)  # truths and statuses are piecewise constant
         if node.kind == "polynomial" and any(d[0] is not None for d in moves):
             values[number], rule = _with_gradient(g, node, x[0])
         else:
@@ -137,11 +137,6 @@ def _is_zero(value: Value) -> bool:
     if node.kind == "constant":
         return not node.arrays[0][rows].any()
     return node.kind == "affine" and not node.static[1] and not any(a[rows].any() for a in node.arrays)
-
-
-def _none(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
-    """Truths and statuses are piecewise constant."""
-    return None
 
 
 def _take(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:

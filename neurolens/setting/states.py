@@ -8,6 +8,7 @@ keeps its interpolated value); a zoom of two moving groups has no freedom left. 
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import get_args
 
@@ -83,7 +84,8 @@ def set_lens(
         return lens.with_stop_radius(paraxial.stop_radius_mm(at_infinity(lens), f_number))
     lens, object_mm = at_infinity(lens), None
     if isinstance(zoom, str) and zoom not in [c.name for c in lens.configurations]:
-        zoom = _millimetres(zoom)
+        with suppress(ValueError):  # a name, then, that no state has
+            zoom = float(zoom)
     if isinstance(zoom, str):
         state = state_named(lens, zoom)
         lens, object_mm = in_state(lens, state), state.object_distance_mm
@@ -179,14 +181,6 @@ def _check(
         raise InputError(lens.path, "field_deg", field_deg, "left out beside focal_length_mm: each sets the size")
     if focus_mode not in get_args(FocusMode):
         raise InputError(lens.path, "focus_mode", focus_mode, " or ".join(f'"{f}"' for f in get_args(FocusMode)))
-
-
-def _millimetres(text: str) -> float | str:
-    """Return a focal length that was typed, or the text itself: a name, then, that no state has."""
-    try:
-        return float(text)
-    except ValueError:
-        return text
 
 
 def _factor_for_efl(lens: Lens, focal_length_mm: float) -> float:

@@ -414,7 +414,9 @@ def shader_lens(model: OnnxLens, graph: Graph | None = None) -> ShaderLens:
     """A model in its state; its graph, where that is not the one in its file."""
     lens, d = model.card["lens"], model.card["domain"]
     low, high = d["film_z_mm"]
-    short, long = _light_of(*map(float, d["wavelength_nm"]))
+    all_nm = short, long = tuple(map(float, d["wavelength_nm"]))
+    visible = max(short, _LIGHT_NM[0]), min(long, _LIGHT_NM[1])
+    short, long = visible if visible[0] < visible[1] else all_nm
     stop = float(d["stop_radius_mm"])
     if graph is None:
         graph = model.graph()
@@ -432,12 +434,6 @@ def shader_lens(model: OnnxLens, graph: Graph | None = None) -> ShaderLens:
         f_number=lens["f_number"] * lens["stop_radius_mm"] / stop,
         efl_mm=lens["efl_mm"],
     )
-
-
-def _light_of(short_nm: float, long_nm: float) -> tuple[float, float]:
-    """The visible part of a model's wavelengths; all of them where none is visible."""
-    short, long = max(short_nm, _LIGHT_NM[0]), min(long_nm, _LIGHT_NM[1])
-    return (short, long) if short < long else (short_nm, long_nm)
 
 
 def osl_lens(

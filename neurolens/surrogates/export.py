@@ -141,23 +141,20 @@ def export_states(model: StateModel, path: str | Path, errors: dict[str, Any] | 
     """
     _check_gates(model.nodes[0])
     card = card_of(model.at(*model.first_state), errors or {})
+    facts = [lens_facts(node.lens, node.domain) for node in model.nodes]
+    for fact, node in zip(facts, model.nodes, strict=True):  # at infinity focus, as photographers count
+        fact["f_number"] = float(first_order(at_infinity(node.lens)).f_number)
     card["units"] = {**card["units"], STATE: [f"{a.name} {a.unit}" for a in model.axes]}
     card["states"] = {
         "axes": [a.to_dict() for a in model.axes],
         "default": list(model.first_state),
         "zoom": model.space.zoom,
         "f_number": model.space.f_number,
-        "nodes": [{"lens": _node_facts(node), "domain": node.domain.to_dict()} for node in model.nodes],
+        "nodes": [{"lens": fact, "domain": n.domain.to_dict()} for fact, n in zip(facts, model.nodes, strict=True)],
         "reference": [{"state": list(s), **reference_rays(model.at(*s), 8, 1)} for s in _between_nodes(model)],
     }
     metadata = {CARD_KEY: card_to_json(card), MODEL_KEY: coefficients_text(model.nodes)}
     return write_file(path, onnx_of(as_stored(model.nodes), model.axes, metadata))
-
-
-def _node_facts(node: LensModel) -> dict[str, Any]:
-    """The card's table of a node's lens; the f-number is that at infinity focus, as photographers count."""
-    facts = lens_facts(node.lens, node.domain)
-    return {**facts, "f_number": float(first_order(at_infinity(node.lens)).f_number)}
 
 
 def _between_nodes(model: StateModel) -> list[tuple[float, ...]]:

@@ -14,6 +14,7 @@ import math
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, field, fields, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,6 @@ from neurolens.base.errors import InputError, ModelError
 from neurolens.base.tomlfile import check_tree
 from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph
 from neurolens.graph.onnx import Mixing, write_onnx
 from neurolens.graph.program import RAY
 from neurolens.lens.prescription import Coating, Lens, Surface
@@ -260,16 +260,11 @@ def onnx_of(
     graphs = [model_graph(node, ONNX) for node in with_one_angle(nodes)]
     shapes = {}
     if derivatives:
-        graphs = [_with_ray_derivatives(graph) for graph in graphs]
+        graphs = [with_derivatives(graph, ["scene_ray"], [("rays", k) for k in range(4)]) for graph in graphs]
+        for g, (name, by) in product(graphs, DERIVATIVES.items()):
+            g.outputs[name] = g.concat(*(g.outputs.pop(derivative("scene_ray", row)) for row in by))
         shapes = dict.fromkeys(DERIVATIVES, (2, 6))
     return write_onnx(graphs, metadata or {}, _mixing_of(axes) if axes else None, shapes)
-
-
-def _with_ray_derivatives(graph: Graph) -> Graph:
-    graph = with_derivatives(graph, ["scene_ray"], [("rays", k) for k in range(4)])
-    for name, by in DERIVATIVES.items():
-        graph.outputs[name] = graph.concat(*(graph.outputs.pop(derivative("scene_ray", row)) for row in by))
-    return graph
 
 
 def _mixing_of(axes: Sequence[Axis]) -> Mixing:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from typing import Any
 
 import bpy
@@ -158,7 +159,8 @@ def apply(scene: Any, found: Any, lens: LensFacts, kind: str, *, fit_sensor: boo
     width = None
     if fit_sensor:
         width = fitting_width_mm(variant, setting)
-        setting = _resized(setting, width)
+        share = width / setting.sensor_mm[0]
+        setting = replace(setting, sensor_mm=(width, setting.sensor_mm[1] * share))
     if wrong := refusals(variant, setting):
         raise LensError("; ".join(wrong))
     try:
@@ -176,13 +178,6 @@ def apply(scene: Any, found: Any, lens: LensFacts, kind: str, *, fit_sensor: boo
         if not scene.neurolens_before:
             scene.neurolens_before = json.dumps(memory["scene"])
     camera.neurolens.on = f"{lens.lens_id}/{kind}"
-
-
-def _resized(setting: Setting, width_mm: float) -> Setting:
-    from dataclasses import replace
-
-    share = width_mm / setting.sensor_mm[0]
-    return replace(setting, sensor_mm=(width_mm, setting.sensor_mm[1] * share))
 
 
 def _set(
