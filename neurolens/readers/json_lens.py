@@ -294,7 +294,9 @@ def _state(lens: Lens, table: Table, name: str) -> Configuration:
     gaps = table.gaps("thickness_overrides", len(lens.surfaces), 'an object such as {"5": 26.15}')
     state = Configuration(name, efl, tuple(sorted(gaps)), **sizes)
     table_lens = lens.with_gaps(dict(state.thickness_mm))
-    paraxial_mm = _object_distance_mm(table_lens)
+    data = first_order(table_lens)  # of the object in focus on the tabled film, by Newton's x x' = -f f'
+    beyond = float(table_lens.vertices_mm[-1]) - data.rear_focal_z_mm
+    paraxial_mm = data.efl_mm * data.front_efl_mm / beyond - data.front_focal_z_mm if beyond else math.inf
     if isinstance(distance, str):
         if not (math.isfinite(paraxial_mm) and paraxial_mm > 0):
             raise table.error("object_distance_mm", distance, "a distance in mm, or null")
@@ -307,11 +309,4 @@ def _state(lens: Lens, table: Table, name: str) -> Configuration:
             focused = f"{stated:g} is stated; the thicknesses focus {paraxial_mm:.6g}"
             warn(lens.path, f"{table.where}object_distance_mm {focused}")
         return replace(state, object_distance_mm=stated)
-    return state if efl is not None else replace(state, efl_mm=first_order(table_lens).efl_mm)
-
-
-def _object_distance_mm(lens: Lens) -> float:
-    """Return the distance from the object in focus on the tabled film to the front vertex (Newton's x x' = -f f')."""
-    data = first_order(lens)
-    beyond = float(lens.vertices_mm[-1]) - data.rear_focal_z_mm
-    return data.efl_mm * data.front_efl_mm / beyond - data.front_focal_z_mm if beyond else math.inf
+    return state if efl is not None else replace(state, efl_mm=data.efl_mm)

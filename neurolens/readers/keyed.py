@@ -79,16 +79,14 @@ def _deeplens(data: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], file: 
     for k, row in enumerate(rows):
         before = surfaces[-1] if surfaces else None
         surfaces.append(_deeplens_surface(Table(row, file, f"surface {k}, "), before, skipped))
-    return Draft(
-        file=file,
-        kind="DeepLens",
-        rows=tuple(Row(s, aperture=True) for s in surfaces),
-        name=_line(data.get("info")),
-        image_radius=Table(data, file).number("r_sensor", above=0) if "r_sensor" in data else None,
-        film_given=surfaces[-1].thickness_mm > 0,
-        unit="mm",
-        skipped=skipped,
-    )
+    radius = Table(data, file).number("r_sensor", above=0) if "r_sensor" in data else None
+    return _draft_of(file, "DeepLens", surfaces, _line(data.get("info")), image_radius=radius, skipped=skipped)
+
+
+def _draft_of(file: str, kind: str, surfaces: Sequence[Surface], name: str, **more: Any) -> Draft:
+    """The draft of a table in mm, with its film in the paraxial focus where the last thickness is 0."""
+    rows = tuple(Row(s, aperture=not s.stop or not more.get("drawn")) for s in surfaces)
+    return Draft(file, kind, rows, name, film_given=surfaces[-1].thickness_mm > 0, unit="mm", **more)
 
 
 def _deeplens_surface(row: Table, before: Surface | None, skipped: Counter[str]) -> Surface:
@@ -153,15 +151,7 @@ def _iset(data: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], file: str)
             conic=row.number("conic_constant") if "conic_constant" in row else 0.0,
         )
         surfaces.append(surface)
-    return Draft(
-        file=file,
-        kind="ISET",
-        rows=tuple(Row(s, aperture=True) for s in surfaces),
-        name=_line(data.get("name")),
-        notes=[_line(data.get("description"))],
-        film_given=surfaces[-1].thickness_mm > 0,
-        unit="mm",
-    )
+    return _draft_of(file, "ISET", surfaces, _line(data.get("name")), notes=[_line(data.get("description"))])
 
 
 def _repeats(key: str) -> bool:
@@ -190,21 +180,10 @@ def read_blender(data: Mapping[str, Any], file: str, options: ReadOptions | None
     surfaces = [_blender_surface(top.inner(f"surface {k}", row, _SURFACE)) for k, row in enumerate(data["surface"])]
     if not surfaces:
         raise top.error("surface", "(none)", "a table for each surface")
-    film_given = surfaces[-1].thickness_mm > 0
-    draft = Draft(
-        file=file,
-        kind="Physical Camera",
-        rows=tuple(Row(s, aperture=not s.stop) for s in surfaces),
-        name=head.text("name", required=False),
-        notes=[head.text("patent", required=False)],
-        states=_states(top, len(surfaces), film_given),
-        f_number=head.optional("max_fstop"),
-        film_given=film_given,
-        unit="mm",
-        rims="estimated",
-        stated_efl=head.optional("focal_length"),
-        drawn=True,
-    )
+    name, notes = head.text("name", required=False), [head.text("patent", required=False)]
+    draft = _draft_of(file, "Physical Camera", surfaces, name, notes=notes, rims="estimated", drawn=True)
+    draft.f_number, draft.stated_efl = head.optional("max_fstop"), head.optional("focal_length")
+    draft.states = _states(top, len(surfaces), draft.film_given)
     return lens_of(draft, options)
 
 

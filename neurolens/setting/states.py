@@ -284,7 +284,9 @@ def _solved(lens: Lens, gaps: list[int], states: list[_State], efl_mm: float) ->
     x = [math.log(s.efl_mm) for s in states]
     target = min(max(math.log(efl_mm), x[0]), x[-1])
     known = np.array([s.places for s in states])
-    places, (moving, kept) = np.array(monotone(x, known.tolist(), target)), _movement(known)
+    places, travel = np.array(monotone(x, known.tolist(), target)), np.ptp(known, axis=0)
+    least = MOVES * travel.max()
+    moving, kept = travel > least, int(np.argmax(np.ptp(known[:, :-1] - known[:, 1:], axis=0) > least))
     if moving.sum() > 2:
         (gap_mm,) = monotone(x, (known[:, kept : kept + 1] - known[:, kept + 1 : kept + 2]).tolist(), target)
         if moving[kept]:
@@ -309,14 +311,6 @@ def _solved(lens: Lens, gaps: list[int], states: list[_State], efl_mm: float) ->
         if np.abs(change).max() < 1e-13 * efl_mm:
             return places
     raise InputError(lens.path, "zoom", efl_mm, "a position between states that its groups can reach in focus")
-
-
-def _movement(places: Vector) -> tuple[NDArray[np.bool_], int]:
-    """Which groups move, and the first gap that varies, from the places [states, groups]."""
-    travel = np.ptp(places, axis=0)
-    least = MOVES * travel.max()
-    varies = np.ptp(places[:, :-1] - places[:, 1:], axis=0) > least
-    return travel > least, int(np.argmax(varies))
 
 
 def _directions(moving: NDArray[np.bool_], kept: int) -> Vector:

@@ -170,6 +170,8 @@ def _between_nodes(model: StateModel) -> list[tuple[float, ...]]:
 
 def card_of(model: LensModel, errors: dict[str, Any]) -> dict[str, Any]:
     """The card of a model, JSON-able; `errors` are those on held-out rays, as the evaluation gives them."""
+    stop, stopped = st.blocked(model.lens.stop_index, st.RIM), f"blocked by the stop, surface {model.lens.stop_index}"
+    codes = {st.PASSED, st.OUTSIDE_DOMAIN, stop, *(g.status for g in model.gates)}
     return {
         "kind": CARD_KIND,
         "schema": CARD_SCHEMA,
@@ -178,7 +180,7 @@ def card_of(model: LensModel, errors: dict[str, Any]) -> dict[str, Any]:
         "transmittance": model.transmittance,
         "frame": FRAME.format(place="the front surface" if model.direction == "angle" else "the plane z = 0"),
         "domain": model.domain.to_dict(),
-        "status_codes": _status_codes(model),
+        "status_codes": {str(code): st.describe(code) for code in sorted(codes)} | {str(stop): stopped},
         "gates": [{"surface": g.surface, "reason": g.reason, "status": g.status} for g in model.gates],
         "fit": {
             "method": model.method,
@@ -222,13 +224,6 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
         "dispersive": lens.dispersive,
         **({} if data.front_efl_mm == data.efl_mm else {"index_ratio": float(data.front_efl_mm / data.efl_mm)}),
     }
-
-
-def _status_codes(model: LensModel) -> dict[str, str]:
-    codes = {st.PASSED, st.OUTSIDE_DOMAIN, st.blocked(model.lens.stop_index, st.RIM), *(g.status for g in model.gates)}
-    words = {str(code): st.describe(code) for code in sorted(codes)}
-    words[str(st.blocked(model.lens.stop_index, st.RIM))] = f"blocked by the stop, surface {model.lens.stop_index}"
-    return words
 
 
 def reference_rays(model: LensModel, passing: int = 24, others: int = 4) -> dict[str, Any]:
