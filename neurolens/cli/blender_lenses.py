@@ -15,7 +15,7 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -36,14 +36,12 @@ from neurolens.base.tasks import Failed, Here, Processes, run_each
 from neurolens.blender.pack import Form, PackedLens
 from neurolens.cameras.build import ideal_as, make_camera
 from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
 from neurolens.lens.shot import Shot
 from neurolens.readers.any_format import read_any
 from neurolens.readers.lensfile import read_lens
 from neurolens.shaders.blender_shader import shader_of
 from neurolens.surrogates.card import read_card
-
-if TYPE_CHECKING:
-    from neurolens.lens.prescription import Lens
 
 _KEPT = 512  # kept files of some 100 kB
 _SIDE_IN, _DOTS, _MARGIN = 2.56, 100, 1.08  # of a thumbnail: 256 pixels; its side over the glass's

@@ -187,6 +187,7 @@ examples:
         """
         _check(args)
         flare = super().of(args)
+        flare.frames.check(_COMMAND)
         gains: dict[str, tuple[float, float, float]] = {}
         for name, factors in flare.gain:
             r, g, b = (a * b for a, b in zip(gains.get(name, (1.0, 1.0, 1.0)), factors, strict=True))
@@ -210,11 +211,8 @@ def _check(args: argparse.Namespace) -> None:
             raise InputError(_COMMAND, "--fit", args.fit, expected)
     if args.within[0] != "rms_um":
         raise InputError(_COMMAND, "--within", f"{args.within[1]:g}px", "micrometres, as 10um: a ghost has no pixels")
-    if args.frames is None and args.key:
-        raise InputError(_COMMAND, "--key", args.key[0], "--frames beside it")
-    if args.frames is not None:
-        if args.output is None:
-            raise InputError(_COMMAND, "--frames", f"({len(args.frames)})", "-o beside it")
+    if args.frames is not None and args.output is None:
+        raise InputError(_COMMAND, "--frames", f"({len(args.frames)})", "-o beside it")
     by_chance = args.photons or args.glare or args.barrel or args.sensor or args.dust or args.haze_per_mm
     if not by_chance and args.reflections not in (None, 2):
         expected = "2, or --photons or --glare beside it, whose light is reflected more often"

@@ -25,7 +25,7 @@ from neurolens.cli.output import number, table
 
 if TYPE_CHECKING:
     from neurolens.lens import prescription
-    from neurolens.setting.rims import Rim, RimRule
+    from neurolens.setting.rims import Rim
 
 _LAYOUT_SUFFIXES = (".png", ".pdf", ".svg")
 
@@ -179,7 +179,12 @@ examples:
         derived, rims = derive_rims(lens, rule)
         field = self.half_field or half_field_deg(lens)
         if out is not None:
-            write_lens(replace(derived, notes=_notes(derived, rule, field)), out)
+            said = (
+                f"Rims are derived by neurolens lens --derive-rims: the stop from the f-number, the whole axial beam, "
+                f"{100 * rule.vignetting:g}% of the pupil's height kept at {field:.4g} degrees, "
+                f"a clear edge of {100 * rule.clear_edge:g}%."
+            )
+            write_lens(replace(derived, notes=f"{derived.notes} {said}".strip()), out)
         data = {
             "file": str(file),
             "f_number": lens.f_number,
@@ -333,15 +338,6 @@ def _cells(row: dict[str, Any]) -> list[str]:
     counts = [str(row[key] or "-") for key in ("refractions", "aspheres", "cylinders", "states")]
     figures = [efl, number(row["back_focus_mm"]), number(row["f_number"], 3), field, number(row["image_radius_mm"])]
     return [row["lens"], one_line(row["name"], 40), *figures, *counts, row["rims"], row["verdict"]]
-
-
-def _notes(lens: prescription.Lens, rule: RimRule, field: float) -> str:
-    said = (
-        f"Rims are derived by neurolens lens --derive-rims: the stop from the f-number, the whole axial beam, "
-        f"{100 * rule.vignetting:g}% of the pupil's height kept at {field:.4g} degrees, "
-        f"a clear edge of {100 * rule.clear_edge:g}%."
-    )
-    return f"{lens.notes} {said}".strip()
 
 
 def _rims_text(lens: prescription.Lens, data: dict[str, Any], rims: list[Rim]) -> str:

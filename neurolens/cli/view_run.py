@@ -22,7 +22,7 @@ from neurolens.cli.blender_lenses import forms_of, key_of, kind_of, library, squ
 from neurolens.cli.export_lens import write_lens
 from neurolens.flare.ghostmodel import KIND, GhostModel, read_ghosts
 from neurolens.lens.paraxial import first_order
-from neurolens.lens.prescription import Lens
+from neurolens.lens.prescription import VISIBLE_NM, Lens
 from neurolens.readers import lensfile
 from neurolens.readers.any_format import read_any
 from neurolens.setting.pupils import image_radius_mm, pupil_plane_z_mm
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from neurolens.cli.view import View
 
 _ERRORS = ("rms_um", "p99_um", "rms_infinity_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
-_LIGHT_NM = (400.0, 700.0)
 _NEAR_EFL = 10.0  # of an exact lens: nearest focus in focal lengths
 _SAME = 1e-3  # of the focal length: what models and lens file of one id may differ by
 _GHOSTS = 24  # of a lens at most: the brightest
@@ -161,7 +160,7 @@ def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str], shaders: Mappi
         lens = set_lens(entry.lens) if entry.zoom == RANGE else set_lens(entry.lens, zoom=entry.zoom)
         try:
             forms.append(_exact_form(entry.zoom, entry.file, lens, kinds, shaders.get(entry.file)))
-            path = path_glsl(lens, pupil_plane_z_mm(lens), _LIGHT_NM) if entry.zoom != RANGE else None
+            path = path_glsl(lens, pupil_plane_z_mm(lens), VISIBLE_NM) if entry.zoom != RANGE else None
         except NeurolensError:
             if not forms:
                 raise  # a model of the lens stands in for it

@@ -278,8 +278,10 @@ def _without_dummies(draft: Draft) -> Draft:
     """Return the draft without planes between equal media that cut no beam; gaps on both sides become one."""
     if len(draft.rows) > MAX_SURFACES:
         raise InputError(draft.file, "surfaces", f"({len(draft.rows)} of them)", f"at most {MAX_SURFACES}")
-    rows = draft.rows
-    dropped = [k for k in range(len(rows)) if _is_dummy(draft, k)]
+    rows, surfaces, medium = draft.rows, [row.surface for row in draft.rows], Medium(**draft.object_medium)
+    flat = [math.isinf(s.radius_mm) and not s.stop and not s.asphere for s in surfaces]
+    idle = [flat[k] and not row.aperture and same_medium(surfaces, k, medium) for k, row in enumerate(rows)]
+    dropped = [k for k in range(len(rows)) if idle[k]]
     kept = [k for k in range(len(rows)) if k not in dropped]
     if not dropped or not kept:
         return draft
@@ -304,10 +306,3 @@ def _without_dummies(draft: Draft) -> Draft:
     listed = draft.in_file(f"surface {', '.join(map(str, dropped))}")
     warn(draft.file, f"{listed} left out: a plane in one medium that cuts no beam")
     return replace(draft, rows=new, states=tuple(states), object_distance=draft.object_distance + front)
-
-
-def _is_dummy(draft: Draft, k: int) -> bool:
-    s = draft.rows[k].surface
-    flat = math.isinf(s.radius_mm) and not s.stop and not s.asphere and not draft.rows[k].aperture
-    rows = [row.surface for row in draft.rows]
-    return flat and same_medium(rows, k, Medium(**draft.object_medium))

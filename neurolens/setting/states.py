@@ -94,7 +94,11 @@ def set_lens(
     elif zoom is not None:
         lens = zoomed(lens, zoom)
     if focal_length_mm is not None:
-        factor = _factor_for_efl(lens, focal_length_mm)
+        now_mm = paraxial.first_order(at_infinity(lens)).efl_mm
+        if now_mm < 0:
+            expected = f"none: this lens diverges (EFL {now_mm:.4g} mm)"
+            raise InputError(lens.path, "focal_length_mm", focal_length_mm, expected)
+        factor = focal_length_mm / now_mm
     else:
         factor = 1.0 if field_deg is None else _factor_for_field(lens, field_deg)
     image_radius = lens.image_radius_mm
@@ -181,14 +185,6 @@ def _check(
         raise InputError(lens.path, "field_deg", field_deg, "left out beside focal_length_mm: each sets the size")
     if focus_mode not in get_args(FocusMode):
         raise InputError(lens.path, "focus_mode", focus_mode, " or ".join(f'"{f}"' for f in get_args(FocusMode)))
-
-
-def _factor_for_efl(lens: Lens, focal_length_mm: float) -> float:
-    now_mm = paraxial.first_order(at_infinity(lens)).efl_mm
-    if now_mm < 0:
-        expected = f"none: this lens diverges (EFL {now_mm:.4g} mm)"
-        raise InputError(lens.path, "focal_length_mm", focal_length_mm, expected)
-    return focal_length_mm / now_mm
 
 
 def _factor_for_field(lens: Lens, field_deg: float) -> float:
