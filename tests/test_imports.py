@@ -45,7 +45,7 @@ PACKAGES = {
     "graph": {"numpy"},  # and torch where it is handed tensors
     "lens": {"numpy"},
     "trace": {"numpy", "torch"},
-    "setting": {"numpy", "torch"},
+    "setting": {"numpy", "scipy", "torch"},
     "analysis": {"numpy", "scipy", "torch", "matplotlib"},
     "mitsuba": {"numpy"},
     "readers": {"numpy"},

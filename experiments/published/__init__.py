@@ -91,7 +91,9 @@ PUBLISHED: dict[str, PublishedMethod] = {
 }
 
 
-def fit_any(prepared: Prepared, settings: ModelSettings, progress: Callable[[float], None] | None = None) -> LensModel:
+def fit_any(
+    prepared: Prepared, settings: ModelSettings, progress: Callable[[float], object] = lambda share: None
+) -> LensModel:
     """Fit a published method, or one of ours, and return the complete model.
 
     Raises:
@@ -107,7 +109,7 @@ def fit_any(prepared: Prepared, settings: ModelSettings, progress: Callable[[flo
 
 
 def fit_published(
-    prepared: Prepared, settings: PublishedSettings, progress: Callable[[float], None] | None = None
+    prepared: Prepared, settings: PublishedSettings, progress: Callable[[float], object] = lambda share: None
 ) -> tuple[Core, Encoding, tuple[Gate, ...]]:
     """Fit one published method.
 

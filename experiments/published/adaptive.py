@@ -76,7 +76,7 @@ class _Node:
 
 
 def fit_adaptive(
-    data: RawData, terms: int, cells: int, progress: Callable[[float], None] | None = None
+    data: RawData, terms: int, cells: int, progress: Callable[[float], object] = lambda share: None
 ) -> RawPolynomial | Cells:
     """`terms` terms of each scalar output in each of `cells` cells.
 
@@ -92,8 +92,7 @@ def fit_adaptive(
     root = _Node(data, everything, fit_grown(data, terms), 0.0)
     root.error = _squared_error(data, root.polynomial, data.pairs.train)
     for done in range(1, cells):
-        if progress:
-            progress(done / cells)
+        progress(done / cells)
         worst = max(root.leaves(), key=lambda leaf: leaf.error)
         variable, threshold = _where_to_cut(data, worst, invariants)
         worst.cut = (variable, threshold, *_halves(data, worst, invariants, variable, threshold, terms))

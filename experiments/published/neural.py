@@ -91,7 +91,7 @@ def _ring(inputs: Value, networks: tuple[Layers, ...]) -> Value:
 
 
 def fit_averaged(
-    data: RawData, settings: ModelSettings, progress: Callable[[float], None] | None = None
+    data: RawData, settings: ModelSettings, progress: Callable[[float], object] = lambda share: None
 ) -> tuple[Averaged, tuple[Gate, ...]]:
     """Train every network; the same seed gives the same weights.
 
@@ -118,8 +118,7 @@ def fit_averaged(
         for _ in range(NETWORKS):
             done = len(rings) * NETWORKS + len(networks)
             networks.append(_train(*ring, settings, settings.seed + done))
-            if progress:
-                progress((done + 1) / total)
+            progress((done + 1) / total)
         rings.append(tuple(networks))
     lens = data.pairs.lens
     gate = Gate(0 if lens.stop_index else len(lens.surfaces) - 1, st.RIM)

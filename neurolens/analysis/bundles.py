@@ -100,6 +100,9 @@ class Aim:
         self.chief = Rays(*(repeated(c) for c in chief.start))
         origin = scene.object_points(chief.start)
         self.origin = None if origin is None else tuple(repeated(c) for c in origin)
+        # Squared distance from the object point to the plane across the chief ray; None of a distant object.
+        ends = zip(self.chief[:3], self.origin or (), strict=False)
+        self.distance2 = None if origin is None else sum((a - b) ** 2 for a, b in ends)
         self.exists = repeated(chief.exists)
         self.wavelength: Tensor = torch.tensor(waves, dtype=torch.float64)[None, :, None].expand(shape).reshape(-1)
 
@@ -119,12 +122,11 @@ class Aim:
 
     def lead_mm(self, u: Tensor, v: Tensor) -> Tensor:
         """Path from the object point to the plane across the chief rays, less that of the chief ray."""
-        if self.origin is None:
+        if self.distance2 is None:
             return torch.zeros_like(u)
-        square = _distance2(self.chief[:3], self.origin)
         # sqrt(a + b) - sqrt(a) without the loss of digits.
         more = u * u + v * v
-        return more / (torch.sqrt(square + more) + torch.sqrt(square))
+        return more / (torch.sqrt(self.distance2 + more) + torch.sqrt(self.distance2))
 
     def at(self, pattern: Pattern) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """u, v of the rays through the points of a pattern, whether they were found, and d(beam) / d(stop share)."""
@@ -166,10 +168,10 @@ class Aim:
 
     def spread(self, u: Tensor, v: Tensor, rows: Tensor | slice = slice(None)) -> Tensor | float:
         """Energy of an area on the plane across the chief rays: 1, or of a near object the solid angle, 1/mm^2."""
-        if self.origin is None:
+        if self.distance2 is None:
             return 1.0
         # cos / r^2, with cos = distance / r.
-        distance2 = _distance2(self.chief[:3], self.origin)[rows]
+        distance2 = self.distance2[rows]
         return torch.sqrt(distance2) / (distance2 + u * u + v * v) ** 1.5
 
     def _map(self, uv: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
@@ -185,10 +187,6 @@ class Aim:
         exists = (out.status == 0).reshape(3, -1).all(0)
         slopes = ((t[1] - t[0]) / h, (t[2] - t[0]) / h, (s[1] - s[0]) / h, (s[2] - s[0]) / h)
         return torch.stack([t[0], s[0]]), exists, slopes
-
-
-def _distance2(a: Sequence[Tensor], b: Sequence[Tensor]) -> Tensor:
-    return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neurolens.analysis.bundles import Bundle, Filled, bundle, fan, hexapolar, points
+from neurolens.analysis.bundles import Bundle, Filled, bundle, fan, hexapolar
 from neurolens.analysis.fields import Array, Result, Scene
 from neurolens.analysis.pupil_nodes import LEVELS, converged
 from neurolens.lens.paraxial import is_pinhole
@@ -284,18 +284,7 @@ def _contrast(x_mm: Tensor, weight: Tensor, frequency: Array) -> Array:
     return np.asarray(torch.stack(rows, 1).numpy())
 
 
-def opd_mm(rays: Bundle) -> Tensor:
-    """Path difference [F, W, P] in mm from the chief ray of each wavelength, NaN where a ray is blocked.
-
-    It is positive as for an undercorrected lens. Each ray's path is taken to its foot of the perpendicular from the
-    chief ray's film point (of the first wavelength): a reference sphere about that point whose radius is large against
-    the aberrations.
-    """
-    chief = bundle(rays.scene.open, rays.field_deg, rays.wavelength_nm, points([0.0], [0.0]))
-    return _path_to_chief_mm(chief) - _path_to_chief_mm(rays)
-
-
-def _path_to_chief_mm(rays: Bundle) -> Tensor:
+def path_to_chief_mm(rays: Bundle) -> Tensor:
     """Optical path to the plane through the chief ray's film point that stands on the ray, [F, W, P].
 
     Raises:
@@ -424,7 +413,7 @@ def diffraction_image(
     wave = 2 * math.pi / (rays.wavelength_nm[0] * 1e-6)
     keep = rays.passed[field, 0]
     t, s = (c[field, 0][keep] for c in rays.cosines)
-    path, weight = _path_to_chief_mm(rays)[field, 0][keep], rays.weight[field, 0][keep]
+    path, weight = path_to_chief_mm(rays)[field, 0][keep], rays.weight[field, 0][keep]
     # Paths are metres of waves: only their differences may be turned into phases.
     lead = path - path.mean() + t * centre_mm[0] + s * centre_mm[1]
     amplitude = torch.polar(weight / weight.sum(), wave * lead)

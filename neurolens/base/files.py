@@ -84,7 +84,10 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     try:
         _remove_abandoned(temporary)
         yield temporary
-        _flush(temporary)
+        with temporary.open("rb+") as file:
+            if not os.fstat(file.fileno()).st_size:
+                raise OSError(errno.ENODATA, "nothing was written", str(temporary))
+            os.fsync(file.fileno())
         os.replace(temporary, target)
     except OSError as error:
         # An error of a full disk names no file, other errors name the temporary one.
@@ -124,13 +127,6 @@ def _temporary(target: Path) -> Path:
     except ValueError:
         raise OSError(errno.EINVAL, "no name of a file", repr(str(target))) from None
     return temporary
-
-
-def _flush(temporary: Path) -> None:
-    with temporary.open("rb+") as file:
-        if not os.fstat(file.fileno()).st_size:
-            raise OSError(errno.ENODATA, "nothing was written", str(temporary))
-        os.fsync(file.fileno())
 
 
 def _remove_abandoned(new: Path) -> None:
@@ -208,11 +204,6 @@ def _is_own_folder(folder: Path) -> bool:
     return False
 
 
-@cache
-def _folder_of_process() -> TemporaryFolder:
-    return TemporaryFolder()
-
-
 class TemporaryFolder(tempfile.TemporaryDirectory[str]):
     """A folder of this process, removed with this object, or by a later process of this user if this one is killed.
 
@@ -230,6 +221,9 @@ class TemporaryFolder(tempfile.TemporaryDirectory[str]):
         """Remove the folder."""
         self._lock.close()
         super().cleanup()
+
+
+_folder_of_process = cache(TemporaryFolder)
 
 
 @cache

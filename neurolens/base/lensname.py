@@ -73,15 +73,16 @@ def resolve(text: str | Path, *, models: bool = True, cameras: bool = True) -> N
         expected = _FORMATS + (", a model (.onnx)" if models else "") + " or a name that ships (neurolens lens list)"
         if cameras:
             expected += f", with {FUSED}, {', '.join(IDEAL_OF)} before it or not, or one of {', '.join(IDEAL)}"
-        near = suggestion(word, [*_ships(places), *_beside(Path(word)), *(IDEAL if cameras else ())])
+        ours = (file.stem for folder, suffix in places for file in sorted((library() / folder).glob(f"*{suffix}")))
+        near = suggestion(word, [*ours, *_beside(Path(word)), *(IDEAL if cameras else ())])
         raise InputError(
             word, "camera" if cameras else "lens", "(a model)" if path.exists() else "(missing)", expected + near
         )
     if cameras and path.suffix.lower() == ".toml" and (planned := _planned(path)):
         own, file = split_kind(planned)
         return Named(kind or own, Path(os.path.normpath(path.parent / file)))
-    ours = path in ships and path.is_relative_to(Path.cwd())
-    return Named(kind, Path(os.path.relpath(path)) if ours else path)
+    here = path in ships and path.is_relative_to(Path.cwd())
+    return Named(kind, Path(os.path.relpath(path)) if here else path)
 
 
 def _planned(path: Path) -> str | None:
@@ -90,11 +91,6 @@ def _planned(path: Path) -> str | None:
         camera = read_toml(path).get("camera")
         return camera if isinstance(camera, str) and camera != "none" else None
     return None
-
-
-def _ships(places: tuple[tuple[str, str], ...]) -> Iterator[str]:
-    for folder, suffix in places:
-        yield from (file.stem for file in sorted((library() / folder).glob(f"*{suffix}")))
 
 
 def _beside(path: Path) -> Iterator[str]:

@@ -106,7 +106,9 @@ class Processes(ThreadPoolExecutor):
                 raise NeurolensError(f"took longer than {self._limit_s:g} s")
             return answer_of(pipe.recv())
         except EOFError:
-            raise NeurolensError(_ending(_exit_code(process))) from None
+            code = _exit_code(process)
+            by = f"was killed by signal {-code}: did the memory run out?" if code < 0 else f"ended with code {code}"
+            raise NeurolensError(f"its process {by}") from None
         finally:
             pipe.close()
             _exit_code(process)
@@ -202,12 +204,6 @@ def _exit_code(process: Any) -> int:
     with _STARTING:
         process.join()
         return int(process.exitcode)
-
-
-def _ending(code: int) -> str:
-    if code < 0:
-        return f"its process was killed by signal {-code}: did the memory run out?"
-    return f"its process ended with code {code}"
 
 
 def _work(pipe: Any, work: Callable[..., Any], args: Any, named: Any) -> None:

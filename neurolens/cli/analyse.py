@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
@@ -208,7 +209,7 @@ def analysis_of(what: str) -> Analysis:
         "distortion": Analysis(distortion, plots.plot_distortion, _distortion_text),
         "vignetting": Analysis(illumination, plots.plot_vignetting, _vignetting_text),
         "mtf": Analysis(mtf, plots.plot_mtf, _mtf_text),
-        "mtf-height": Analysis(mtf_over_height, plots.plot_mtf_over_height, _mtf_height_text),
+        "mtf-height": Analysis(mtf_over_height, plots.plot_mtf_over_height, partial(_mtf_text, over_height=True)),
         "seidel": Analysis(seidel, plots.plot_seidel, _seidel_text),
         "psf": Analysis(psf, plots.plot_psf, _psf_text),
     }[what]
@@ -269,7 +270,8 @@ def _fans_text(data: dict[str, Any]) -> str:
     header = [f"{name} {wave}" for name in ("tang.", "sag.") for wave in _nanometres(data)]
 
     def cells(i: int) -> list[str]:
-        return [_three(_largest(row)) for key in ("tangential_um", "sagittal_um") for row in data[key][i]]
+        rows = [row for key in ("tangential_um", "sagittal_um") for row in data[key][i]]
+        return [_three(max((abs(v) for v in row if not math.isnan(v)), default=math.nan)) for row in rows]
 
     head = "Ray fans (largest transverse aberration, µm)"
     return _over_field(head, data, header, cells, range(len(data["field_deg"])))
@@ -314,17 +316,10 @@ def _vignetting_text(data: dict[str, Any]) -> str:
     return _over_field(head, data, header, cells)
 
 
-def _mtf_text(data: dict[str, Any]) -> str:
-    at = [data["frequency_per_mm"].index(f) for f in _MTF_PER_MM if f in data["frequency_per_mm"]]
-    return _mtf_table("Geometric MTF", data, at, range(len(data["field_deg"])))
-
-
-def _mtf_height_text(data: dict[str, Any]) -> str:
-    return _mtf_table("Geometric MTF against image height", data, range(len(data["frequency_per_mm"])), None)
-
-
-def _mtf_table(name: str, data: dict[str, Any], at: Sequence[int], fields: Iterable[int] | None) -> str:
-    """The contrast at some of the frequencies, by their numbers."""
+def _mtf_text(data: dict[str, Any], over_height: bool = False) -> str:
+    """The contrast at frequencies of `_MTF_PER_MM` for every field, or at all of them over the image height."""
+    at = [k for k, f in enumerate(data["frequency_per_mm"]) if over_height or f in _MTF_PER_MM]
+    name = "Geometric MTF" + " against image height" * over_height
     header = [f"{data['frequency_per_mm'][k]:g}/mm {d}" for k in at for d in "TS"]
     limit = ", ".join(_fixed(data["diffraction_limit"][k]) for k in at)
     waves = ", ".join(f"{w:.0f}" for w in data["wavelength_nm"])
@@ -334,7 +329,7 @@ def _mtf_table(name: str, data: dict[str, Any], at: Sequence[int], fields: Itera
         both = ("tangential", "sagittal")
         return [_fixed(data[key][i][k], _digits(data["spread"][key][i][k])) for k in at for key in both]
 
-    return _over_field(head, data, header, cells, fields)
+    return _over_field(head, data, header, cells, None if over_height else range(len(data["field_deg"])))
 
 
 def _seidel_text(data: dict[str, Any]) -> str:
@@ -400,11 +395,6 @@ def _fixed(value: float, places: int = 3) -> str:
 
 def _percent(value: float, spread: float = 0.0) -> str:
     return "-" if math.isnan(value) else f"{100 * value:.{max(_digits(spread) - 2, 0)}f}%"
-
-
-def _largest(values: Sequence[float]) -> float:
-    seen = [abs(v) for v in values if not math.isnan(v)]
-    return max(seen) if seen else math.nan
 
 
 def _three(value: float, spread: float = 0.0) -> str:

@@ -220,6 +220,14 @@ def named_lens(models: bool, cameras: bool, text: str) -> Any:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
+def floats(text: str, between: str = ",") -> list[float]:
+    """The numbers of a text; none where a word is no number."""
+    try:
+        return [float(word) for word in text.split(between)]
+    except ValueError:
+        return []
+
+
 # Options of several commands
 
 
@@ -340,9 +348,7 @@ class LensState:
         return float(near * scale + (lens.film_z_mm or lens.vertices_mm[-1])) / 1000
 
 
-def lens_state() -> Any:
-    """A field of `LensState` in a command."""
-    return group("state of the lens")
+lens_state = partial(group, "state of the lens")  # a field of `LensState` in a command
 
 
 # Checks
@@ -368,7 +374,8 @@ def check_run_folder(path: Path, command: str | Path, option: str) -> None:
 
 
 def check_suffix(path: Path, option: str, suffixes: tuple[str, ...]) -> None:
-    """Refuse a file to write of another kind, before the work; raises InputError."""
+    """Refuse a file to write of another kind, and see `check_folder`; raises InputError."""
     if path.suffix.lower() not in suffixes:
         expected = suffixes[0] if len(suffixes) == 1 else f"one of {', '.join(suffixes)}"
         raise InputError(path, option, path.suffix or "(no suffix)", expected)
+    check_folder(path, option)

@@ -12,7 +12,7 @@ from neurolens.base.errors import warn
 from neurolens.base.files import check_writable
 from neurolens.base.files import library as shipped
 from neurolens.base.settings import setting
-from neurolens.cli.arguments import Command, Parser, Reporting, check_folder, check_suffix, lens, output_path
+from neurolens.cli.arguments import Command, Parser, Reporting, check_suffix, lens, output_path
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,6 @@ class Build(Reporting):
     def run(self) -> int:
         """Pack the extension."""
         check_suffix(self.out, "--output", (".zip",))
-        check_folder(self.out, "--output")
         check_writable(self.out)
         folder = self.models or shipped() / "models"  # of the installation as it is now
         if not folder.is_dir():

@@ -15,7 +15,7 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -34,10 +34,14 @@ from neurolens.base.files import (
 from neurolens.base.lensname import is_model, lens_id_of
 from neurolens.base.tasks import Failed, Here, Processes, run_each
 from neurolens.blender.pack import Form, PackedLens
+from neurolens.cameras.build import ideal_as, make_camera
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
+from neurolens.lens.shot import Shot
+from neurolens.readers.any_format import read_any
+from neurolens.readers.lensfile import read_lens
 from neurolens.shaders.blender_shader import shader_of
-
-if TYPE_CHECKING:
-    from neurolens.lens.prescription import Lens
+from neurolens.surrogates.card import read_card
 
 _KEPT = 512  # kept files of some 100 kB
 _SIDE_IN, _DOTS, _MARGIN = 2.56, 100, 1.08  # of a thumbnail: 256 pixels; its side over the glass's
@@ -58,7 +62,7 @@ def _made_form(file: Path, zoom: str | None, quiet: bool) -> Form:
     shader = shader_of(file, zoom=zoom, quiet=quiet)
     kind, model, error, poor = "exact", "", None, []
     if is_model(file):
-        card = card_of(file)
+        card = read_card(file)
         kind, model, error = kind_of(card), str(card["fit"]["method"]), float(card["errors"]["rms_um"])
         poor = list(card["errors"].get("poor") or ())
     state = None if zoom == RANGE else zoom
@@ -95,20 +99,14 @@ def _code() -> list[str]:
 def _squeeze(file: Path, zoom: str | None) -> float:
     """See `cameras.sampling.lens_state`."""
     if not is_model(file):
-        from neurolens.readers.any_format import read_any
         from neurolens.setting.states import set_lens
 
         return squeeze_of(set_lens(read_any(file), zoom=zoom))
-    from neurolens.cameras.build import make_camera
-    from neurolens.lens.shot import Shot
-
     return float(make_camera(file, Shot((1.0, 1.0), math.inf, zoom=zoom)).settings["lens_state"]["squeeze"] or 1.0)
 
 
 def squeeze_of(lens: Lens) -> float:
     """How many times an anamorphic lens squeezes its picture across; 1 for others."""
-    from neurolens.lens.paraxial import first_order
-
     if not lens.anamorphic:
         return 1.0
     return abs(float(first_order(lens).efl_mm / first_order(lens, meridian="x").efl_mm))
@@ -163,20 +161,17 @@ def packed_of(
     Args:
         lens: its prescription, for the thumbnail, where it is at hand.
     """
-    from neurolens.lens.paraxial import first_order
     from neurolens.setting.states import set_lens
 
     first, ranged = files[0], zoom == RANGE
     if is_model(first):
-        card = card_of(first)
+        card = read_card(first)
         facts, axes = card["lens"], [axis["name"] for axis in (card.get("states") or {}).get("axes", ())]
         ranged = zoom in (None, RANGE) and "zoom" in axes
         name, efl, f_number = facts["name"], facts["efl_mm"], facts["f_number"]
         source = str(facts.get("source") or "") if lens is None else lens.source  # the file may name it better by now
         name = f"{name}, any zoom" if ranged else name
     else:
-        from neurolens.readers.any_format import read_any
-
         lens = set_lens(read_any(first), zoom=None if zoom == RANGE else zoom)
         data = first_order(lens)
         name, efl, f_number, source = lens.name, data.efl_mm, data.f_number, lens.source
@@ -191,11 +186,9 @@ def packed_of(
 
 def stated_lens(model: Path, lenses: Path) -> Lens | None:
     """The prescription behind a model, scaled or zoomed as the model is, or of its range; None without a lens file."""
-    from neurolens.lens.paraxial import first_order
-    from neurolens.readers.lensfile import read_lens
     from neurolens.setting.states import set_lens
 
-    facts = card_of(model)["lens"]
+    facts = read_card(model)["lens"]
     file = lenses / f"{safe_name(facts['id'])}.toml"
     if not file.is_file():
         return None
@@ -209,11 +202,8 @@ def field_table(lens: Lens, radius_mm: float) -> dict[str, Any] | None:
     """What a lens does to its picture wide open, as `extension.library.Field`; None where it cannot be traced."""
     if find_spec("torch") is None:
         return None
-    from neurolens.cameras.build import ideal_as
     from neurolens.cameras.exact import ExactCamera
     from neurolens.cameras.field import spectrum_of
-    from neurolens.lens.paraxial import first_order
-    from neurolens.lens.shot import Shot
     from neurolens.plan import footprints as prints
 
     film, radii = (2 * radius_mm, 2 * radius_mm), radius_mm * np.array(_RADII)
@@ -257,7 +247,7 @@ def library(folder: Path, lenses: Path, chosen: Sequence[str]) -> Iterator[tuple
     known: dict[str, dict[str, tuple[float, Path]]] = {}
     modelled = set()
     for file in sorted(folder.glob("*.onnx")):
-        card = card_of(file)
+        card = read_card(file)
         modelled.add(card["lens"]["id"])
         kind, mine, error = kind_of(card), known.setdefault(key_of(file), {}), float(card["errors"]["rms_um"])
         if kind not in mine or error < mine[kind][0]:
@@ -299,13 +289,6 @@ def thumbnail(lens: Lens) -> bytes | None:
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=_DOTS, facecolor="white", metadata={"Software": None})
     return buffer.getvalue()
-
-
-def card_of(file: Path) -> dict[str, Any]:
-    """The card of a model."""
-    from neurolens.surrogates.card import read_card
-
-    return read_card(file)
 
 
 def kind_of(card: Mapping[str, Any]) -> str:

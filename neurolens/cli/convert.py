@@ -11,35 +11,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from neurolens.base.errors import InputError, warned
 from neurolens.base.files import atomic_path
-from neurolens.base.settings import group, positive, setting
-from neurolens.cli.arguments import Answering, Glasses, check_folder, check_suffix, output_path
+from neurolens.base.settings import group, setting
+from neurolens.cli.arguments import Answering, Glasses, check_suffix, output_path
 from neurolens.cli.output import number
+from neurolens.readers.source import ReadOptions
 
 if TYPE_CHECKING:
     from neurolens.lens.prescription import Lens
-
-
-@dataclass(frozen=True, kw_only=True)
-class Unsaid:
-    """Facts that a file may leave out, in the names of `readers.draft.ReadOptions`."""
-
-    name: str | None = setting(None, "name of the lens (default: the title in the file, else its file name)")
-    source: str | None = setting(None, "where the figures come from (default: the file's name)", metavar="SOURCE")
-    f_number: float | None = setting(
-        None, "nominal f-number of a file without one (default: as the stop's diameter gives it)",
-        kind=positive("an f-number"), metavar="N",
-    )  # fmt: skip
-    stop: str | None = setting(
-        None, "number in the file of the surface that is the stop (default: the one marked, else the limiting rim)",
-        metavar="N",
-    )  # fmt: skip
-    units: Literal["mm", "cm", "in", "m"] | None = setting(None, "unit of lengths (default: the file's own, mm)")
-    half_field_deg: float | None = setting(
-        None, "edge of the field from the axis, for rims that the file does not give (default: the file's own)",
-        within=(1e-3, 179.0), unit="degrees", option="half-field", metavar="DEG",
-    )  # fmt: skip
-    gap_before: bool = setting(False, "plain table: thickness is that in front of each surface (Kolb 1995)")
-    semi_diameters: bool = setting(False, "plain table: the last column holds rim radii")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,19 +42,17 @@ examples:
     file: Path = setting(..., "lens file of another program", positional=True, metavar="FILE")
     out: Path = output_path("OUT.toml", "lens file to write")
     force: bool = setting(False, "replace an existing file")
-    unsaid: Unsaid = group("what the file does not say")
+    unsaid: ReadOptions = group("what the file does not say")
 
     def run(self) -> int:
         """Convert one file and print what was read."""
         check_suffix(self.out, "--output", (".toml",))
-        check_folder(self.out, "--output")
         if self.out.exists() and not self.force:
             raise InputError(self.out, "--output", "(an existing file)", "a new file, or --force to replace it")
         from neurolens.readers.any_format import read_any
-        from neurolens.readers.draft import ReadOptions
 
         with warned(self.file) as read:
-            lens = read_any(self.file, ReadOptions(**vars(self.unsaid)))
+            lens = read_any(self.file, self.unsaid)
         if read:  # the file keeps what its source had besides, and what was assumed
             lens = replace(lens, notes="\n".join(filter(None, (lens.notes, "As converted by neurolens:", *read))))
         write_checked(lens, self.out)

@@ -14,7 +14,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, atomic_write_text, check_writable
 from neurolens.base.lensname import FUSED, is_model
 from neurolens.base.settings import positive, setting
-from neurolens.cli.arguments import Answering, film_size, lens, output_path
+from neurolens.cli.arguments import Answering, film_size, floats, lens, output_path
 
 if TYPE_CHECKING:
     from neurolens.surrogates.source import Written
@@ -249,10 +249,7 @@ def _fixed(texts: Sequence[str]) -> dict[str, list[float]]:
     fixed: dict[str, list[float]] = {}
     for text in texts:
         key, _, value = text.partition("=")
-        try:
-            numbers = [float(v) for v in value.split(",")]
-        except ValueError:
-            numbers = []
+        numbers = floats(value)
         good = bool(numbers) and all(v > 0 and (key == "focus" or math.isfinite(v)) for v in numbers)
         if key not in _FIXED or key in fixed or not good or (key != "wavelengths" and len(numbers) > 1):
             expected = f"KEY=NUMBER with KEY of {', '.join(_FIXED)} (wavelengths: a list), each once, above 0"

@@ -25,7 +25,7 @@ from neurolens.graph.c import Extras
 from neurolens.graph.program import Program
 from neurolens.graph.scalars import lower
 from neurolens.lens.paraxial import film_z_mm, first_order
-from neurolens.lens.prescription import Lens
+from neurolens.lens.prescription import VISIBLE_NM, Lens
 from neurolens.readers.any_format import read_any
 from neurolens.setting.focusing import best_focus_of_stops_mm, best_focus_z_mm, focus_states
 from neurolens.setting.pupils import image_radius_mm, pupil_bounds, pupil_plane_z_mm
@@ -41,7 +41,6 @@ from neurolens.surrogates.source import Fix, Written, checked_name, fixed_models
 from neurolens.surrogates.states import gap_axis, zoom_axis
 from neurolens.trace.tracegraph import TRANSMITTANCE, exact_graph
 
-_LIGHT_NM = (400.0, 700.0)
 _NEAR_EFL = 10.0  # nearest focus of the function of that, in focal lengths
 _DISTANCES = 12  # about as many are placed for each lens
 _CHECKED = (0.12, 0.42, 0.83)  # of the range: where the film's position is measured
@@ -77,7 +76,7 @@ def write_lens(
     planes = pupil_planes_mm(nodes, axes)
     program = lens_program(nodes, axes, planes)
     constants, functions = followed(axes, numbers(nodes, planes))
-    constants |= {**state_ranges(axes), "wavelength_min_nm": _LIGHT_NM[0], "wavelength_max_nm": _LIGHT_NM[1]}
+    constants |= {**state_ranges(axes), "wavelength_min_nm": VISIBLE_NM[0], "wavelength_max_nm": VISIBLE_NM[1]}
     placed, said = _film(lens, nodes, axes, Progress(quiet=quiet))
     plane = f"z = {planes[0]:.6g} mm" if "pupil_z_mm" in constants else "z = NAME_pupil_z_mm(zoom_mm)"
     extras = Extras(constants, {**functions, **placed})
@@ -95,8 +94,8 @@ def _head(lens: Lens, plane: str) -> list[str]:
         f"Lens data: {lens.source} (sha256 {str(lens.sha256)[:16]}).",
         "Lens frame: mm, front vertex at z = 0, film at z > 0. Rays go from the film point through the pupil point on "
         f"the plane {plane}; the ray that comes out is a point on the front surface and a unit direction.",
-        f"Wavelengths from {_LIGHT_NM[0]:g} to {_LIGHT_NM[1]:g} nm. Status: 0 passed; at surface k, counted from 0 at "
-        f"the front, {st.blocked(0, st.MISSED)} + 4 k missed, {st.blocked(0, st.RIM)} + 4 k beyond its rim, "
+        f"Wavelengths from {VISIBLE_NM[0]:g} to {VISIBLE_NM[1]:g} nm. Status: 0 passed; at surface k, counted from 0 "
+        f"at the front, {st.blocked(0, st.MISSED)} + 4 k missed, {st.blocked(0, st.RIM)} + 4 k beyond its rim, "
         f"{st.blocked(0, st.TOTAL_REFLECTION)} + 4 k totally reflected.",
     ]
 
@@ -123,7 +122,7 @@ def _film(
 
 def lens_program(nodes: Sequence[Lens], axes: Sequence[Axis], planes_mm: Sequence[float]) -> Program:
     """The lens at the nodes of a state, a table each: gaps, and planes of pupil points, follow the state."""
-    program = lower([exact_graph(n, z, _LIGHT_NM) for n, z in zip(nodes, planes_mm, strict=True)])
+    program = lower([exact_graph(n, z, VISIBLE_NM) for n, z in zip(nodes, planes_mm, strict=True)])
     program.mixture = mixture_of(axes) if axes else None
     return program
 
@@ -143,7 +142,7 @@ def numbers(nodes: Sequence[Lens], planes_mm: Sequence[float]) -> list[tuple[str
     data, infinity = [first_order(n) for n in nodes], [film_z_mm(n, math.inf) for n in nodes]
     radii = [image_radius_mm(n)[0] for n in nodes]
     discs = [
-        pupil_bounds(n, r, (z, z), _LIGHT_NM, pupil_z_mm=plane, rows=9).disc_mm
+        pupil_bounds(n, r, (z, z), VISIBLE_NM, pupil_z_mm=plane, rows=9).disc_mm
         for n, r, z, plane in zip(nodes, radii, infinity, planes_mm, strict=True)
     ]
     return [
@@ -161,7 +160,7 @@ def focusing_of(lens: Lens, nearest_m: float, tick: Callable[[], None]) -> Focus
 
     def best(focus_m: float, stops_mm: Array) -> Array:
         tick()
-        return best_focus_of_stops_mm(lens, focus_m, stops_mm.tolist(), _LIGHT_NM)
+        return best_focus_of_stops_mm(lens, focus_m, stops_mm.tolist(), VISIBLE_NM)
 
     return Focusing(nearest_m, float(lens.stop_radius_mm), lambda focus_m: film_z_mm(lens, focus_m), best)
 

@@ -18,6 +18,7 @@ from neurolens.cli.arguments import (
     check_suffix,
     exposure,
     film_size,
+    floats,
     lens,
     lens_state,
     output_path,
@@ -43,10 +44,7 @@ _SETTINGS = {  # the fields of `FlareSettings` by the titles of their options
 def _gain(text: str) -> tuple[str, list[float]]:
     """The type of --gain: a name, and factors of red, green and blue."""
     name, _, rest = text.partition("=")
-    try:
-        factors = [float(word) for word in rest.split("/")]
-    except ValueError:
-        factors = []
+    factors = floats(rest, "/")
     if len(factors) not in (1, 3) or not all(0 <= v < math.inf for v in factors):
         raise argparse.ArgumentTypeError(f"got {text!r}, expected NAME=X or NAME=R/G/B, of at least 0")
     return name, factors * (3 // len(factors))
@@ -189,6 +187,7 @@ examples:
         """
         _check(args)
         flare = super().of(args)
+        flare.frames.check(_COMMAND)
         gains: dict[str, tuple[float, float, float]] = {}
         for name, factors in flare.gain:
             r, g, b = (a * b for a, b in zip(gains.get(name, (1.0, 1.0, 1.0)), factors, strict=True))
@@ -212,11 +211,8 @@ def _check(args: argparse.Namespace) -> None:
             raise InputError(_COMMAND, "--fit", args.fit, expected)
     if args.within[0] != "rms_um":
         raise InputError(_COMMAND, "--within", f"{args.within[1]:g}px", "micrometres, as 10um: a ghost has no pixels")
-    if args.frames is None and args.key:
-        raise InputError(_COMMAND, "--key", args.key[0], "--frames beside it")
-    if args.frames is not None:
-        if args.output is None:
-            raise InputError(_COMMAND, "--frames", f"({len(args.frames)})", "-o beside it")
+    if args.frames is not None and args.output is None:
+        raise InputError(_COMMAND, "--frames", f"({len(args.frames)})", "-o beside it")
     by_chance = args.photons or args.glare or args.barrel or args.sensor or args.dust or args.haze_per_mm
     if not by_chance and args.reflections not in (None, 2):
         expected = "2, or --photons or --glare beside it, whose light is reflected more often"

@@ -23,7 +23,7 @@ from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import FloatArray
 from neurolens.cameras.exact import ExactCamera, placed_settings
 from neurolens.cameras.field import Field, field_of
-from neurolens.cli.arguments import check_suffix
+from neurolens.cli.arguments import check_suffix, floats
 from neurolens.cli.keys import frames_of
 from neurolens.cli.output import number, table
 from neurolens.flare.canvas import Raster
@@ -281,16 +281,12 @@ def _plate(args: Flare) -> Path | None:
 def _light(text: str) -> Light:
     """The light of a --light option."""
     words = text.split(",")
-    try:
-        angles = [float(word) for word in words[:2]]
-        rgb = [float(word) for word in (words[2] if len(words) > 2 else str(SUN)).split("/")]
-        distance = float(words[3]) if len(words) > 3 else math.inf
-    except ValueError:
-        angles, rgb, distance = [], [], math.inf
-    if len(angles) != 2 or len(words) > 4 or len(rgb) not in (1, 3):
+    angles, rgb = floats(",".join(words[:2])), floats(words[2], "/") if len(words) > 2 else [SUN]
+    distance = floats(words[3]) if len(words) > 3 else [math.inf]
+    if len(angles) != 2 or len(words) > 4 or len(rgb) not in (1, 3) or not distance:
         raise InputError(_COMMAND, "--light", text, "AZ,EL[,E[,M]], numbers, E also as R/G/B")
     try:
-        light = Light(angles[0], angles[1], (rgb[0], rgb[-2 % len(rgb)], rgb[-1]), distance)
+        light = Light(angles[0], angles[1], (rgb[0], rgb[-2 % len(rgb)], rgb[-1]), distance[0])
         return with_disc(light, 0.0 if len(words) > 2 else 2 * math.degrees(SUN_RADIUS_RAD))
     except InputError as error:
         raise InputError(_COMMAND, "--light", text, error.expected) from None

@@ -15,6 +15,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import read_rows
 from neurolens.base.settings import group, setting
 from neurolens.base.tomlfile import reject_unknown
+from neurolens.cli.arguments import floats
 from neurolens.render.scenetables import FARTHEST_M
 
 _MOST = 100_000
@@ -77,12 +78,9 @@ class Frames:
 
 def frames_group(does: str, names: Sequence[str] = ALL_KEYS) -> Any:
     """A field of `Frames`; `does`: the help of --frames. `names`: the quantities of the keys."""
-    return group("frames", texts=_texts(does, names))
-
-
-def _texts(does: str, names: Sequence[str]) -> dict[str, str]:
     measures = ", ".join(f"{name} (linear in {_QUANTITIES[name].linear_in})" for name in names)
-    return {"frames": does, "key": measures + ("; position and look-at are X/Y/Z in m" if "position" in names else "")}
+    measures += "; position and look-at are X/Y/Z in m" if "position" in names else ""
+    return group("frames", texts={"frames": does, "key": measures})
 
 
 def frames_of(
@@ -142,10 +140,7 @@ def _tracks(text: str, command: str, names: Sequence[str]) -> Iterator[tuple[str
 def _append(keys: _Keys, name: str, frame: str, value: str, place: tuple[str | Path, str]) -> None:
     """Append a key that two words give; `place`: where they stand, for errors."""
     quantity = _QUANTITIES[name]
-    try:
-        numbers = [float(v) for v in value.split("/")] if len(value) < 100 else []
-    except ValueError:
-        numbers = []
+    numbers = floats(value, "/") if len(value) < 100 else []
     good = [within(quantity.bounds, v) for v in numbers]
     later = frame.isascii() and frame.isdecimal() and len(frame) <= 7 and (not keys or int(frame) > keys[-1][0])
     if not later or len(numbers) != quantity.size or not all(good):

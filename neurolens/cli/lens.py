@@ -25,7 +25,7 @@ from neurolens.cli.output import number, table
 
 if TYPE_CHECKING:
     from neurolens.lens import prescription
-    from neurolens.setting.rims import Rim, RimRule
+    from neurolens.setting.rims import Rim
 
 _LAYOUT_SUFFIXES = (".png", ".pdf", ".svg")
 
@@ -110,7 +110,6 @@ examples:
         for option, path in (("--layout", self.layout), ("--breathing", self.breathing)):
             if path is not None:
                 check_suffix(path, option, _LAYOUT_SUFFIXES)
-                check_folder(path, option)
         from neurolens.readers.any_format import read_any
         from neurolens.study.describe import file_doubts, glass_table, layout_profile, lens_facts
         from neurolens.surrogates.domain import domain_of
@@ -180,7 +179,12 @@ examples:
         derived, rims = derive_rims(lens, rule)
         field = self.half_field or half_field_deg(lens)
         if out is not None:
-            write_lens(replace(derived, notes=_notes(derived, rule, field)), out)
+            said = (
+                f"Rims are derived by neurolens lens --derive-rims: the stop from the f-number, the whole axial beam, "
+                f"{100 * rule.vignetting:g}% of the pupil's height kept at {field:.4g} degrees, "
+                f"a clear edge of {100 * rule.clear_edge:g}%."
+            )
+            write_lens(replace(derived, notes=f"{derived.notes} {said}".strip()), out)
         data = {
             "file": str(file),
             "f_number": lens.f_number,
@@ -299,21 +303,17 @@ def _surface_words(row: dict[str, Any]) -> str:
     """Properties of a row of `study.describe.glass_table` besides radius and glass; empty for a sphere."""
     powers = sorted(map(int, row["asphere"]))
     span = "" if not powers else f"asphere {powers[0]}" + (f"-{powers[-1]}" if len(powers) > 1 else "")
+    (radius, conic), other = row["across"] or (None, None), "x" if row["cylinder"] == "y" else "y"
     words = [
         span,
         f"K {row['conic']:.4g}" if row["conic"] else "",
         f"cylinder {row['cylinder']}" if row["cylinder"] and not row["across"] else "",
-        _across_words(row["cylinder"], *row["across"]) if row["across"] else "",
+        f"{'toroid' if conic is None else f'biconic K {conic:.4g}'}, {radius:.4f} mm along {other}" if radius else "",
         f"ideal lens, f {row['focal_mm']:.4g} mm" if row["focal_mm"] else "",
         f"coating {row['coating']['name']}" if row["coating"] else "",
         f"absorbs {row['absorption_per_mm']:.3g}/mm" if row["absorption_per_mm"] else "",
     ]
     return ", ".join(word for word in words if word)
-
-
-def _across_words(axis: str, radius_mm: float, conic: float | None) -> str:
-    other = "x" if axis == "y" else "y"
-    return f"{'toroid' if conic is None else f'biconic K {conic:.4g}'}, {radius_mm:.4f} mm along {other}"
 
 
 _LIST_HEADER = (
@@ -338,15 +338,6 @@ def _cells(row: dict[str, Any]) -> list[str]:
     counts = [str(row[key] or "-") for key in ("refractions", "aspheres", "cylinders", "states")]
     figures = [efl, number(row["back_focus_mm"]), number(row["f_number"], 3), field, number(row["image_radius_mm"])]
     return [row["lens"], one_line(row["name"], 40), *figures, *counts, row["rims"], row["verdict"]]
-
-
-def _notes(lens: prescription.Lens, rule: RimRule, field: float) -> str:
-    said = (
-        f"Rims are derived by neurolens lens --derive-rims: the stop from the f-number, the whole axial beam, "
-        f"{100 * rule.vignetting:g}% of the pupil's height kept at {field:.4g} degrees, "
-        f"a clear edge of {100 * rule.clear_edge:g}%."
-    )
-    return f"{lens.notes} {said}".strip()
 
 
 def _rims_text(lens: prescription.Lens, data: dict[str, Any], rims: list[Rim]) -> str:

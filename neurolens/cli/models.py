@@ -147,7 +147,10 @@ def _text(within: tuple[str, float] | None, listed: Sequence[dict[str, Any]], ke
         key, most = within
         unit = key.removeprefix("rms_")
         more = f"{program()} train --lens {best['lens']} --within {most:g}{unit}"
-        return f"None of {len(listed)} models is within {most:g} {unit}; the closest is {_said(best)}.\nFit one: {more}"
+        error = f"{number(best['rms_um'], 3)} um" if best["rms_um"] is not None else "error not known"
+        timing = f", {number(time['min'], 3)} ns a ray" if (time := time_of(best)) else ""
+        found = f"None of {len(listed)} models is within {most:g} {unit}; the closest is {best['file']}"
+        return f"{found} ({error}{timing}).\nFit one: {more}"
     header = ("", "model", "film mm", "focus m", "RMS um", "pixels", "ns", "C ns", "")
     rows = [
         (
@@ -180,10 +183,3 @@ def _remarks(model: dict[str, Any]) -> list[str]:
     found += ["one focus"] * _of_a_shot(model)
     found += [f"in one: {', '.join(model['states'])}"] if model["states"] and not found else []
     return found + ["averaged transmittance"] * (model["transmittance"] == AVERAGED)
-
-
-def _said(model: dict[str, Any]) -> str:
-    error = f"{number(model['rms_um'], 3)} um" if model["rms_um"] is not None else "error not known"
-    timing = time_of(model)
-    more = f", {number(timing['min'], 3)} ns a ray" if timing else ""
-    return f"{model['file']} ({error}{more})"

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from neurolens.base.settings import setting
-from neurolens.cli.arguments import Answering, Glasses, check_folder, check_suffix, lens, output_path
+from neurolens.base.settings import setting, setting_of
+from neurolens.cli.arguments import Answering, Glasses, check_suffix, lens, output_path
+from neurolens.cli.blender import Build
 
 _DOWNLOADS = ("glsl", "onnx", "c", "osl")
 
@@ -51,15 +51,11 @@ examples:
         "a form, a minute of a zoom, once); the last are left out where the page grows beyond 3 MB, exact lenses' "
         "first", kind=_kinds, metavar="KINDS",
     )  # fmt: skip
-    jobs: int = setting(
-        min(8, os.cpu_count() or 1),
-        "processes that write OSL, each of a core and 0.5 GB (default: all cores, at most 8)", within=(1, 64),
-    )  # fmt: skip
+    jobs: int = setting_of(Build, "jobs", Build.jobs)
 
     def run(self) -> int:
         """Write the page."""
         check_suffix(self.out, "--output", (".html", ".htm"))
-        check_folder(self.out, "--output")
         from neurolens.cli.view_run import run_view
 
         return run_view(self)

@@ -18,17 +18,17 @@ from neurolens.base.files import library as shipped
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress
 from neurolens.cameras.onnxlens import load_model
-from neurolens.cli.blender_lenses import card_of, forms_of, key_of, kind_of, library, squeeze_of
+from neurolens.cli.blender_lenses import forms_of, key_of, kind_of, library, squeeze_of
 from neurolens.cli.export_lens import write_lens
 from neurolens.flare.ghostmodel import KIND, GhostModel, read_ghosts
 from neurolens.lens.paraxial import first_order
-from neurolens.lens.prescription import Lens
+from neurolens.lens.prescription import VISIBLE_NM, Lens
 from neurolens.readers import lensfile
 from neurolens.readers.any_format import read_any
 from neurolens.setting.pupils import image_radius_mm, pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.shaders.source import model_extras
-from neurolens.surrogates.card import card_in, read_metadata
+from neurolens.surrogates.card import card_in, read_card, read_metadata
 from neurolens.surrogates.source import Written, export_source
 from neurolens.view.page import Form, ViewLens, section_svg, write_page
 from neurolens.view.shaders import ghosts_glsl, path_glsl
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from neurolens.cli.view import View
 
 _ERRORS = ("rms_um", "p99_um", "rms_infinity_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
-_LIGHT_NM = (400.0, 700.0)
 _NEAR_EFL = 10.0  # of an exact lens: nearest focus in focal lengths
 _SAME = 1e-3  # of the focal length: what models and lens file of one id may differ by
 _GHOSTS = 24  # of a lens at most: the brightest
@@ -59,7 +58,7 @@ def run_view(args: View) -> int:
     """Write the page."""
     entries = list(_named(args.lenses) if args.lenses else _library())
     for entry in entries:
-        own = [kind_of(card_of(file)) for file in entry.models]
+        own = [kind_of(read_card(file)) for file in entry.models]
         if len(set(own)) < len(own):
             raise InputError("neurolens view", entry.key, f"({' and '.join(own)})", "one model of each kind")
     kinds, progress = args.downloads, Progress(quiet=args.json)
@@ -122,7 +121,7 @@ def _named(paths: Sequence[Path]) -> Iterator[_Entry]:
             if ghosts.setdefault(model.lens.lens_id, model) is not model:
                 raise InputError("neurolens view", f"ghosts of {model.lens.lens_id}", str(path), "one file a lens")
         elif is_model(path):
-            lens_id = str(card_of(path)["lens"]["id"])
+            lens_id = str(read_card(path)["lens"]["id"])
             lenses.setdefault(lens_id, None)
             models.setdefault(lens_id, []).append(path)
         else:
@@ -135,7 +134,7 @@ def _named(paths: Sequence[Path]) -> Iterator[_Entry]:
         raise InputError("neurolens view", f"ghosts of {lens_id}", "(no such lens)", "the lens beside its ghosts")
     for lens_id, lens_or_none in lenses.items():
         own = models.get(lens_id) or from_library.get(lens_id, [])
-        zoom = RANGE if any(card_of(m).get("states") for m in own) else None
+        zoom = RANGE if any(read_card(m).get("states") for m in own) else None
         yield _Entry(lens_id, own, lens_or_none, zoom, ghosts.get(lens_id))
 
 
@@ -161,7 +160,7 @@ def _view_lens(entry: _Entry, folder: Path, kinds: Sequence[str], shaders: Mappi
         lens = set_lens(entry.lens) if entry.zoom == RANGE else set_lens(entry.lens, zoom=entry.zoom)
         try:
             forms.append(_exact_form(entry.zoom, entry.file, lens, kinds, shaders.get(entry.file)))
-            path = path_glsl(lens, pupil_plane_z_mm(lens), _LIGHT_NM) if entry.zoom != RANGE else None
+            path = path_glsl(lens, pupil_plane_z_mm(lens), VISIBLE_NM) if entry.zoom != RANGE else None
         except NeurolensError:
             if not forms:
                 raise  # a model of the lens stands in for it

@@ -197,10 +197,6 @@ def _bytes(pictures: int, layers: int) -> int:
     return 12 * (pictures + layers + 4)
 
 
-def _glare(job: FlareJob, done: Report) -> Layers:
-    return {"glare": _photons(job, done, "glare", job.settings.glare)}
-
-
 def _starburst(job: FlareJob, done: Report) -> Layers:
     return {
         "starburst": starburst_picture(
@@ -241,4 +237,9 @@ def _factors(
     return {pair: settings.gain(pair.name) for pair in pairs}
 
 
-MAKERS: dict[str, Callable[[FlareJob, Report], Layers]] = dict(zip(LAYERS, (_ghosts, _glare, _starburst), strict=True))
+MAKERS: dict[str, Callable[[FlareJob, Report], Layers]] = {
+    "ghosts": _ghosts,
+    "glare": lambda job, done: {"glare": _photons(job, done, "glare", job.settings.glare)},
+    "starburst": _starburst,
+}
+assert tuple(MAKERS) == LAYERS

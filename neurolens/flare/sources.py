@@ -7,7 +7,7 @@ them; a picture's are regions brighter than a threshold. The sky and other surro
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -105,18 +105,23 @@ def keep(lights: Sequence[Light], most: int, fade: bool = False) -> KeptLights:
             comes or goes at once over frames. Where all would be dark, none fades.
     """
     ordered = sorted(lights, key=_energy, reverse=True)
-    kept, whole = ordered[:most], sum(map(_energy, ordered))
+    kept = ordered[:most]
     cut = _energy(ordered[most]) if fade and len(ordered) > most else 0.0
     if 0 < cut < _energy(ordered[0]):
-        kept = [_dimmed(k, min((_energy(k) / cut - 1) / (_FADES - 1), 1.0)) for k in kept if _energy(k) > cut]
-    left = 1 - sum(map(_energy, kept)) / max(whole, 1e-300) if len(ordered) > most else 0.0
-    return KeptLights(kept, len(ordered), left)
+        shares = [min((_energy(k) / cut - 1) / (_FADES - 1), 1.0) for k in kept]
+        faded = ((k, s, *k.rgb) for k, s in zip(kept, shares, strict=True) if s > 0)
+        kept = [replace(k, rgb=(s * r, s * g, s * b)) for k, s, r, g, b in faded]
+    return _kept(kept, ordered)
 
 
 def keep_named(lights: Mapping[Name, Light], names: frozenset[Name]) -> KeptLights:
     """The lights of these names; see `chosen`."""
     kept = sorted((light for name, light in lights.items() if name in names), key=_energy, reverse=True)
-    whole = sum(map(_energy, lights.values()))
+    return _kept(kept, lights.values())
+
+
+def _kept(kept: list[Light], lights: Collection[Light]) -> KeptLights:
+    whole = sum(map(_energy, lights))
     left = 1 - sum(map(_energy, kept)) / max(whole, 1e-300) if len(kept) < len(lights) else 0.0
     return KeptLights(kept, len(lights), left)
 
@@ -135,11 +140,6 @@ def chosen(frames: Sequence[Mapping[Name, Light]], most: int) -> frozenset[Name]
 
 def _energy(light: Light) -> float:
     return sum(light.rgb)
-
-
-def _dimmed(light: Light, share: float) -> Light:
-    r, g, b = light.rgb
-    return replace(light, rgb=(share * r, share * g, share * b))
 
 
 def highlights(

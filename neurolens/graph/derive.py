@@ -41,7 +41,7 @@ def with_derivatives(graph: Graph, outputs: Sequence[str], inputs: Sequence[tupl
     for number, node in enumerate(graph.nodes):
         x = [values[k] for k in node.inputs]
         moves: list[list[Moved]] = [[direction.get(v.number) for v in x] for direction in known]
-        rule = _RULES.get(node.kind, _none)
+        rule = _RULES.get(node.kind, lambda node, y, x, d: None)  # truths and statuses are piecewise constant
         if node.kind == "polynomial" and any(d[0] is not None for d in moves):
             values[number], rule = _with_gradient(g, node, x[0])
         else:
@@ -137,11 +137,6 @@ def _is_zero(value: Value) -> bool:
     if node.kind == "constant":
         return not node.arrays[0][rows].any()
     return node.kind == "affine" and not node.static[1] and not any(a[rows].any() for a in node.arrays)
-
-
-def _none(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
-    """Truths and statuses are piecewise constant."""
-    return None
 
 
 def _take(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
@@ -240,21 +235,10 @@ def _series(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Mov
     return _times(d[0], y.graph.series(x[0], coefficients if len(coefficients) > 1 else [*coefficients, 0.0]))
 
 
-def _lookup(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
-    """The cells of an index are constant: only the weights move."""
-    return None if d[2] is None else y.graph.lookup(x[0], x[1], d[2])[list(node.static)]
-
-
 def _product(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
     if x[0] == x[1]:
         return _times(d[0], x[0] * 2.0)
     return _sum([_times(d[0], x[1]), _times(d[1], x[0])])
-
-
-def _quotient(node: Node, y: Value, x: Sequence[Value], d: Sequence[Moved]) -> Moved:
-    """One reciprocal serves all directions."""
-    below = None if d[1] is None else -(y * d[1])
-    return _times(_sum([d[0], below]), 1.0 / x[1])
 
 
 def _choice(truth: Value, then: Moved, otherwise: Moved) -> Moved:
@@ -273,11 +257,13 @@ _RULES: dict[str, Rule] = {
     "affine": _affine,
     "quadratic": _quadratic,
     "series": _series,
-    "lookup": _lookup,
+    # The cells of an index are constant: only the weights move.
+    "lookup": lambda node, y, x, d: None if d[2] is None else y.graph.lookup(x[0], x[1], d[2])[list(node.static)],
     "add": lambda node, y, x, d: _sum(d),
     "sub": lambda node, y, x, d: _sum([d[0], _minus(d[1])]),
     "mul": _product,
-    "div": _quotient,
+    # One reciprocal serves all directions.
+    "div": lambda node, y, x, d: _times(_sum([d[0], _minus(None if d[1] is None else y * d[1])]), 1.0 / x[1]),
     "neg": lambda node, y, x, d: _minus(d[0]),
     "sqrt": lambda node, y, x, d: _times(d[0], 0.5 / y),
     "tanh": lambda node, y, x, d: _times(d[0], 1.0 - y * y),

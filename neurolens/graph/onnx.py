@@ -229,14 +229,6 @@ def _input(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
     return name
 
 
-def _constant(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
-    return w.numbers(arrays[0] if node.rows == 1 else arrays[0][:, :, None])
-
-
-def _take(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
-    return _take_rows(w, node.inputs[0], node.static)
-
-
 def _take_rows(w: _Writer, source: int, rows: Sequence[int]) -> str:
     """Rows of a value; one cut serves all takes of consecutive rows of it that do not overlap."""
     value, nodes = w.known[source], w.graphs[0].nodes
@@ -460,8 +452,8 @@ _SIMPLE = {
 }  # fmt: skip
 _RULES: dict[str, Callable[[_Writer, int, Node, list[Array]], str | _Linear | _Longer]] = {
     "input": _input,
-    "constant": _constant,
-    "take": _take,
+    "constant": lambda w, number, node, arrays: w.numbers(arrays[0] if node.rows == 1 else arrays[0][:, :, None]),
+    "take": lambda w, number, node, arrays: _take_rows(w, node.inputs[0], node.static),
     "concat": _concat,
     "affine": _affine,
     "quadratic": _quadratic,

@@ -176,10 +176,6 @@ def _collected(variables: Sequence[Expr], exponents: Exponents, weight: Array) -
     return table
 
 
-def _series(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
-    return [at.program.horner(x, list(arrays[0])) for x in given[0]]
-
-
 def _between(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Tests]:
     p = at.program
     limits = [(p.literal(low), p.literal(high)) for low, high in arrays[0]]
@@ -219,7 +215,7 @@ _RULES: dict[str, Callable[[_Lowering, Node, list[Any], list[Array]], list[Any]]
     "affine": _affine,
     "quadratic": _quadratic,
     "polynomial": _polynomial,
-    "series": _series,
+    "series": lambda at, node, given, arrays: [at.program.horner(x, list(arrays[0])) for x in given[0]],
     "between": _between,
     "first_failure": _first_failure,
     "table": lambda at, node, given, arrays: [],

@@ -19,8 +19,8 @@ from neurolens.readers.codev_model import (
     medium,
     shape_of,
 )
-from neurolens.readers.draft import INFINITE, Draft, ReadOptions, Row, lens_of, primary_first
-from neurolens.readers.source import MAX_SURFACES, assume, by_word, read_lines, warn
+from neurolens.readers.draft import INFINITE, Draft, Row, lens_of, primary_first
+from neurolens.readers.source import ReadOptions, assume, by_word, read_lines, warn
 
 
 @dataclass
@@ -232,8 +232,6 @@ def _new_surface(file: File, command: Command) -> None:
     name, line = command.name, command.line
     if (name == "SO") != (not file.blocks) or file.closed:
         raise line.error(name, "(here)", "one object SO, then surfaces S, then one image SI")
-    if len(file.blocks) > MAX_SURFACES + 1:
-        raise line.error(name, f"({len(file.blocks)} surfaces)", f"at most {MAX_SURFACES} surfaces")
     far = name == "SO" and command.words[1:2] and command.words[1].lower() in ("inf", "infinity")
     numbers = command.numbers((command.words[0], str(INFINITE)) if far else command.words[:2], 2)
     if file.radii is None and numbers[0] != 0:

@@ -27,33 +27,8 @@ from neurolens.readers.assemble import (
     with_stop,
 )
 from neurolens.readers.forbes import MAX_TERMS, qbfs_terms, qcon_terms
-from neurolens.readers.source import MAX_SURFACES, UNITS_MM, Line, warn
+from neurolens.readers.source import MAX_SURFACES, UNITS_MM, Line, ReadOptions, warn
 from neurolens.setting.rims import check_states
-
-
-@dataclass(frozen=True)
-class ReadOptions:
-    """Values from the user that the file does not give.
-
-    Attributes:
-        name, source: for the lens file; else the title in the file, and "FORMAT file NAME".
-        f_number: nominal f-number, for a file that states none.
-        units: of a file without units: "mm", "cm", "in" or "m".
-        half_field_deg: edge of the field, for rims that have to be derived.
-        stop: number of the surface, as the file numbers it, that is the stop; replaces a stop that the file marks.
-        gap_before: of a plain table: its second column is the distance from the surface before (Kolb's tables of 1995).
-        semi_diameters: of a plain table: its last column holds radii of the rims.
-    """
-
-    name: str | None = None
-    source: str | None = None
-    f_number: float | None = None
-    units: str | None = None
-    half_field_deg: float | None = None
-    stop: str | None = None
-    gap_before: bool = False
-    semi_diameters: bool = False
-
 
 INFINITE = 1e9  # in any unit; programs write 1e10 or more for an object at infinity
 
@@ -303,8 +278,10 @@ def _without_dummies(draft: Draft) -> Draft:
     """Return the draft without planes between equal media that cut no beam; gaps on both sides become one."""
     if len(draft.rows) > MAX_SURFACES:
         raise InputError(draft.file, "surfaces", f"({len(draft.rows)} of them)", f"at most {MAX_SURFACES}")
-    rows = draft.rows
-    dropped = [k for k in range(len(rows)) if _is_dummy(draft, k)]
+    rows, surfaces, medium = draft.rows, [row.surface for row in draft.rows], Medium(**draft.object_medium)
+    flat = [math.isinf(s.radius_mm) and not s.stop and not s.asphere for s in surfaces]
+    idle = [flat[k] and not row.aperture and same_medium(surfaces, k, medium) for k, row in enumerate(rows)]
+    dropped = [k for k in range(len(rows)) if idle[k]]
     kept = [k for k in range(len(rows)) if k not in dropped]
     if not dropped or not kept:
         return draft
@@ -329,10 +306,3 @@ def _without_dummies(draft: Draft) -> Draft:
     listed = draft.in_file(f"surface {', '.join(map(str, dropped))}")
     warn(draft.file, f"{listed} left out: a plane in one medium that cuts no beam")
     return replace(draft, rows=new, states=tuple(states), object_distance=draft.object_distance + front)
-
-
-def _is_dummy(draft: Draft, k: int) -> bool:
-    s = draft.rows[k].surface
-    flat = math.isinf(s.radius_mm) and not s.stop and not s.asphere and not draft.rows[k].aperture
-    rows = [row.surface for row in draft.rows]
-    return flat and same_medium(rows, k, Medium(**draft.object_medium))

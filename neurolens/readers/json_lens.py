@@ -22,10 +22,9 @@ from neurolens.base.tomlfile import check_tree
 from neurolens.lens import paraxial
 from neurolens.lens.prescription import Configuration, Lens, Surface
 from neurolens.readers.assemble import UNKNOWN, finish, first_order
-from neurolens.readers.draft import ReadOptions
 from neurolens.readers.glasses import same_glass
 from neurolens.readers.keyed import read_others
-from neurolens.readers.source import MAX_SURFACES, Table, read_text, warn
+from neurolens.readers.source import MAX_SURFACES, ReadOptions, Table, read_text, warn
 from neurolens.setting.rims import check_states
 
 KEYS = (
@@ -78,7 +77,9 @@ def read_json_lens(path: str | Path, options: ReadOptions | None = None) -> Lens
         found = f"({len(rows)} of them)" if isinstance(rows, list) else rows
         raise table.error("surfaces", found, f"a list of 1 to {MAX_SURFACES} objects")
     last = len(rows) - 1
-    surfaces = tuple(_surface(row, k, file, k == last) for k, row in enumerate(rows))
+    example = "an object with radius_mm, thickness_mm, diameter_mm"
+    tables = (table.inner(f"surface {k}", row, SURFACE_KEYS, example) for k, row in enumerate(rows))
+    surfaces = tuple(_surface(row, k == last) for k, row in enumerate(tables))
     notes, estimated = table.text("notes", required=False), table.flag("diameters_estimated")
     if not estimated and _tells_of_other_diameters(notes):
         warn(file, "the notes tell of diameters that are not the source's; rims are taken as estimated")
@@ -147,12 +148,8 @@ def _load(path: str | Path) -> dict[str, Any]:
     return data
 
 
-def _surface(given: Any, k: int, file: str, is_last: bool) -> Surface:
-    if not isinstance(given, Mapping):
-        raise InputError(file, f"surface {k}", given, "an object with radius_mm, thickness_mm, diameter_mm")
-    row = Table(given, file, f"surface {k}, ")
-    row.only(SURFACE_KEYS)
-    radius = row.number("radius_mm", unit="mm, 0 for a plane")
+def _surface(row: Table, is_last: bool) -> Surface:
+    given, radius = row.data, row.number("radius_mm", unit="mm, 0 for a plane")
     thickness = 0.0 if is_last and given.get("thickness_mm") is None else row.number("thickness_mm")
     if given.get("diameter_mm") is None and not given.get("stop"):
         raise row.error("diameter_mm", "(null)", "the full clear diameter in mm")
@@ -264,10 +261,8 @@ def read_states(lens: Lens, data: Mapping[str, Any]) -> Lens:
     """Return the lens with the states of the file, checked."""
     states: list[Configuration] = []
     for place, given in enumerate(_tables(data, lens.path)):
-        if not isinstance(given, Mapping):
-            raise InputError(lens.path, f"configuration {place}", given, "an object with thickness_overrides")
-        table = Table(given, lens.path, f"configuration {place}, ")
-        table.only(STATE_KEYS)
+        expected = "an object with thickness_overrides"
+        table = Table(data, lens.path).inner(f"configuration {place}", given, STATE_KEYS, expected)
         name = table.text("name")
         if given.get("interpolated_by_transcriber"):
             warn(lens.path, f'configuration "{name}" is left out: interpolated by the transcriber, not from the source')
@@ -299,7 +294,9 @@ def _state(lens: Lens, table: Table, name: str) -> Configuration:
     gaps = table.gaps("thickness_overrides", len(lens.surfaces), 'an object such as {"5": 26.15}')
     state = Configuration(name, efl, tuple(sorted(gaps)), **sizes)
     table_lens = lens.with_gaps(dict(state.thickness_mm))
-    paraxial_mm = _object_distance_mm(table_lens)
+    data = first_order(table_lens)  # of the object in focus on the tabled film, by Newton's x x' = -f f'
+    beyond = float(table_lens.vertices_mm[-1]) - data.rear_focal_z_mm
+    paraxial_mm = data.efl_mm * data.front_efl_mm / beyond - data.front_focal_z_mm if beyond else math.inf
     if isinstance(distance, str):
         if not (math.isfinite(paraxial_mm) and paraxial_mm > 0):
             raise table.error("object_distance_mm", distance, "a distance in mm, or null")
@@ -312,11 +309,4 @@ def _state(lens: Lens, table: Table, name: str) -> Configuration:
             focused = f"{stated:g} is stated; the thicknesses focus {paraxial_mm:.6g}"
             warn(lens.path, f"{table.where}object_distance_mm {focused}")
         return replace(state, object_distance_mm=stated)
-    return state if efl is not None else replace(state, efl_mm=first_order(table_lens).efl_mm)
-
-
-def _object_distance_mm(lens: Lens) -> float:
-    """Return the distance from the object in focus on the tabled film to the front vertex (Newton's x x' = -f f')."""
-    data = first_order(lens)
-    beyond = float(lens.vertices_mm[-1]) - data.rear_focal_z_mm
-    return data.efl_mm * data.front_efl_mm / beyond - data.front_focal_z_mm if beyond else math.inf
+    return state if efl is not None else replace(state, efl_mm=data.efl_mm)

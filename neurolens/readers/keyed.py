@@ -21,9 +21,9 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers.assemble import first_order
-from neurolens.readers.draft import Draft, ReadOptions, Row, State, lens_of
+from neurolens.readers.draft import Draft, Row, State, lens_of
 from neurolens.readers.glasses import named_glass
-from neurolens.readers.source import MAX_SURFACES, Table, warn
+from neurolens.readers.source import ReadOptions, Table, warn
 
 _DEEPLENS = (
     *("info", "foclen", "fnum", "r_sensor", "d_sensor", "sensor_size", "sensor_res", "hfov", "fov", "float_hfov"),
@@ -32,6 +32,7 @@ _DEEPLENS = (
 _DEEPLENS_SURFACE = (
     *("idx", "type", "r", "c", "roc", "d", "d_next", "mat1", "mat2", "k", "ai", "is_square", "diffraction", "use_ai2"),
 )
+_MEDIUM = ("n_d", "V_d", "material", "glass")
 _STOPS, _AIR = ("Stop", "Aperture"), ("air", "vacuum", "occluder")
 _ISET = ("name", "description", "type", "surfaces", "microlens")
 _ISET_SURFACE = ("radius", "thickness", "ior", "semi_aperture", "conic_constant")
@@ -78,16 +79,14 @@ def _deeplens(data: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], file: 
     for k, row in enumerate(rows):
         before = surfaces[-1] if surfaces else None
         surfaces.append(_deeplens_surface(Table(row, file, f"surface {k}, "), before, skipped))
-    return Draft(
-        file=file,
-        kind="DeepLens",
-        rows=tuple(Row(s, aperture=True) for s in surfaces),
-        name=_line(data.get("info")),
-        image_radius=Table(data, file).number("r_sensor", above=0) if "r_sensor" in data else None,
-        film_given=surfaces[-1].thickness_mm > 0,
-        unit="mm",
-        skipped=skipped,
-    )
+    radius = Table(data, file).number("r_sensor", above=0) if "r_sensor" in data else None
+    return _draft_of(file, "DeepLens", surfaces, _line(data.get("info")), image_radius=radius, skipped=skipped)
+
+
+def _draft_of(file: str, kind: str, surfaces: Sequence[Surface], name: str, **more: Any) -> Draft:
+    """The draft of a table in mm, with its film in the paraxial focus where the last thickness is 0."""
+    rows = tuple(Row(s, aperture=not s.stop or not more.get("drawn")) for s in surfaces)
+    return Draft(file, kind, rows, name, film_given=surfaces[-1].thickness_mm > 0, unit="mm", **more)
 
 
 def _deeplens_surface(row: Table, before: Surface | None, skipped: Counter[str]) -> Surface:
@@ -107,7 +106,7 @@ def _deeplens_surface(row: Table, before: Surface | None, skipped: Counter[str])
         diameter_mm=2 * row.number("r", unit="mm", above=0),
         stop=stop,
         **shape,
-        **(_medium(row) if "mat2" in row or not stop else _medium_of(before)),
+        **(_medium(row) if "mat2" in row or not stop else {key: getattr(before, key) for key in _MEDIUM if before}),
     )
 
 
@@ -117,10 +116,6 @@ def _radius_mm(row: Table) -> float:
         return row.number("roc", unit="mm", finite=False) or math.inf
     c = row.number("c", unit="1/mm")
     return 1 / c if c else math.inf
-
-
-def _medium_of(before: Surface | None) -> dict[str, Any]:
-    return {key: getattr(before, key) for key in ("n_d", "V_d", "material", "glass")} if before else {}
 
 
 def _medium(row: Table) -> dict[str, Any]:
@@ -139,13 +134,13 @@ def _medium(row: Table) -> dict[str, Any]:
 
 
 def _iset(data: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], file: str) -> Draft:
-    Table(data, file).only(_ISET)
+    top = Table(data, file)
+    top.only(_ISET)
     if data.get("microlens"):
         raise InputError(file, "microlens", "(given)", "a lens without microlenses")
     surfaces = []
     for k, given in enumerate(rows):
-        row = Table(given, file, f"surface {k}, ")
-        row.only(_ISET_SURFACE)
+        row = top.inner(f"surface {k}", given, _ISET_SURFACE)
         ior = row.number("ior")
         surface = Surface(
             radius_mm=row.number("radius", unit="mm, 0 for a plane") or math.inf,
@@ -156,15 +151,7 @@ def _iset(data: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], file: str)
             conic=row.number("conic_constant") if "conic_constant" in row else 0.0,
         )
         surfaces.append(surface)
-    return Draft(
-        file=file,
-        kind="ISET",
-        rows=tuple(Row(s, aperture=True) for s in surfaces),
-        name=_line(data.get("name")),
-        notes=[_line(data.get("description"))],
-        film_given=surfaces[-1].thickness_mm > 0,
-        unit="mm",
-    )
+    return _draft_of(file, "ISET", surfaces, _line(data.get("name")), notes=[_line(data.get("description"))])
 
 
 def _repeats(key: str) -> bool:
@@ -189,37 +176,18 @@ def read_blender(data: Mapping[str, Any], file: str, options: ReadOptions | None
     """
     top = Table(data, file)
     top.only(("lens", "surface", "focus"))
-    head, rows = Table(data["lens"], file, "lens, "), data["surface"]
-    head.only(_LENS)
-    if len(rows) > MAX_SURFACES:
-        raise top.error("surface", f"({len(rows)} of them)", f"at most {MAX_SURFACES}")
-    surfaces = []
-    for k, row in enumerate(rows):
-        if not isinstance(row, Mapping):
-            raise top.error(f"surface {k}", row, "a table")
-        surfaces.append(_blender_surface(Table(row, file, f"surface {k}, ")))
+    head = top.inner("lens", data["lens"], _LENS)
+    surfaces = [_blender_surface(top.inner(f"surface {k}", row, _SURFACE)) for k, row in enumerate(data["surface"])]
     if not surfaces:
         raise top.error("surface", "(none)", "a table for each surface")
-    film_given = surfaces[-1].thickness_mm > 0
-    draft = Draft(
-        file=file,
-        kind="Physical Camera",
-        rows=tuple(Row(s, aperture=not s.stop) for s in surfaces),
-        name=head.text("name", required=False),
-        notes=[head.text("patent", required=False)],
-        states=_states(top, len(surfaces), film_given),
-        f_number=head.optional("max_fstop"),
-        film_given=film_given,
-        unit="mm",
-        rims="estimated",
-        stated_efl=head.optional("focal_length"),
-        drawn=True,
-    )
+    name, notes = head.text("name", required=False), [head.text("patent", required=False)]
+    draft = _draft_of(file, "Physical Camera", surfaces, name, notes=notes, rims="estimated", drawn=True)
+    draft.f_number, draft.stated_efl = head.optional("max_fstop"), head.optional("focal_length")
+    draft.states = _states(top, len(surfaces), draft.film_given)
     return lens_of(draft, options)
 
 
 def _blender_surface(row: Table) -> Surface:
-    row.only(_SURFACE)
     kind = row.text("type", required=False) or "spherical"
     if kind not in _TYPES:
         raise row.error("type", kind, f"one of {', '.join(_TYPES)}")
@@ -248,16 +216,10 @@ def _states(top: Table, count: int, film_given: bool) -> tuple[State, ...]:
     """Return the near focus state, where there is one, after that at infinity."""
     if "focus" not in top:
         return ()
-    if not isinstance(top.data["focus"], Mapping):
-        raise top.error("focus", top.data["focus"], "a table")
-    focus = Table(top.data["focus"], top.file, "focus, ")
-    focus.only(("close_distance", "variable"))
+    focus = top.inner("focus", top.data["focus"], ("close_distance", "variable"))
     moved: dict[int, float] = {}
     for row in focus.data.get("variable", []):
-        if not isinstance(row, Mapping):
-            raise focus.error("variable", row, "a table")
-        table = Table(row, top.file, "focus.variable, ")
-        table.only(("surface", "thickness_close"))
+        table = focus.inner("variable", row, ("surface", "thickness_close"))
         k = table.number("surface")
         if k not in range(count):
             raise table.error("surface", k, f"a surface number from 0 to {count - 1}")

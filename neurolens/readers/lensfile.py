@@ -69,7 +69,8 @@ def read_lens(path: str | Path, data: Mapping[str, Any] | None = None) -> Lens:
     table.only(LENS_KEYS)
     if data.get("schema") != SCHEMA or isinstance(data["schema"], bool):
         raise table.error("schema", data.get("schema", "(missing)"), f"{SCHEMA}, the version of the format")
-    medium = _object_medium(table)
+    example = "a table such as { n_d = 1.333, V_d = 55.8 }"
+    medium = Medium(**_glass(table.inner("object_medium", data.get("object_medium", {}), MEDIUM_KEYS, example)))
     surfaces = _surfaces(table, medium)
     if data.get("rims", "(missing)") not in RIMS:
         expected = 'where the diameters come from: "source", "estimated" or "derived"'
@@ -111,15 +112,6 @@ def _with_rims(lens: Lens, table: Table) -> Lens:
     return with_derived_rims(lens)
 
 
-def _object_medium(table: Table) -> Medium:
-    given = table.data.get("object_medium", {})
-    if not isinstance(given, Mapping):
-        raise table.error("object_medium", given, "a table such as { n_d = 1.333, V_d = 55.8 }")
-    row = Table(given, table.file, "object_medium, ")
-    row.only(MEDIUM_KEYS)
-    return Medium(**_glass(row))
-
-
 def _wavelengths(table: Table) -> tuple[float, ...]:
     given, expected = table.data.get("wavelengths_nm", []), f"a list of wavelengths {said(WAVELENGTH_NM)} nm"
     if not isinstance(given, list) or len(given) > MAX_WAVELENGTHS:
@@ -138,12 +130,10 @@ def _surfaces(table: Table, in_front: Medium) -> tuple[Surface, ...]:
         raise table.error("surfaces", f"({len(rows)} of them)", f"at most {MAX_SURFACES}")
     known = _coatings(table)
     surfaces: list[Surface] = []
+    example = "a table such as { radius_mm = 50.0, thickness_mm = 5.0, diameter_mm = 20.0 }"
     for k, row in enumerate(rows):
-        if not isinstance(row, Mapping):
-            expected = "a table such as { radius_mm = 50.0, thickness_mm = 5.0, diameter_mm = 20.0 }"
-            raise table.error(f"surface {k}", row, expected)
         before = surfaces[-1].n_d if surfaces else in_front.n_d
-        surfaces.append(_surface(Table(row, table.file, f"surface {k}, "), before, known))
+        surfaces.append(_surface(table.inner(f"surface {k}", row, SURFACE_KEYS, example), before, known))
     stops = [k for k, s in enumerate(surfaces) if s.stop]
     if len(stops) != 1:
         found = f"(stop = true on surfaces {', '.join(map(str, stops))})" if stops else "(no stop)"
@@ -154,7 +144,6 @@ def _surfaces(table: Table, in_front: Medium) -> tuple[Surface, ...]:
 
 
 def _surface(row: Table, n_before: float, known: Mapping[str, Coating]) -> Surface:
-    row.only(SURFACE_KEYS)
     radius_mm = row.number("radius_mm", unit="mm, inf for a plane", finite=False)
     if radius_mm == 0:
         raise row.error("radius_mm", radius_mm, "a radius that is not 0 (a plane is inf)")
@@ -249,8 +238,7 @@ def _ideal(row: Table) -> dict[str, Any]:
 def _coatings(table: Table) -> dict[str, Coating]:
     found: dict[str, Coating] = {}
     for place, given in enumerate(table.tables("coating")):
-        one = Table(given, table.file, f"coating {place}, ")
-        one.only(("name", "layers"))
+        one = table.inner(f"coating {place}", given, ("name", "layers"))
         name, rows = one.text("name"), given.get("layers", "(missing)")
         if name in found:
             raise one.error("name", name, "a name that no other coating has")
@@ -274,10 +262,7 @@ def _coatings(table: Table) -> dict[str, Coating]:
 def _aperture(table: Table) -> Aperture | None:
     if "aperture" not in table:
         return None
-    if not isinstance(table.data["aperture"], Mapping):
-        raise table.error("aperture", table.data["aperture"], "a table under [aperture]")
-    blades = Table(table.data["aperture"], table.file, "aperture, ")
-    blades.only(APERTURE_KEYS)
+    blades = table.inner("aperture", table.data["aperture"], APERTURE_KEYS, "a table under [aperture]")
     more: dict[str, Any] = {k: blades.number(k) for k in APERTURE_KEYS[1:] if k in blades}
     try:
         return Aperture(blades.data.get("blades"), **more)
@@ -288,8 +273,7 @@ def _aperture(table: Table) -> Aperture | None:
 def _configurations(lens: Table, n_surfaces: int) -> tuple[Configuration, ...]:
     result: list[Configuration] = []
     for place, given in enumerate(lens.tables("configuration")):
-        table = Table(given, lens.file, f"configuration {place}, ")
-        table.only(CONFIGURATION_KEYS)
+        table = lens.inner(f"configuration {place}", given, CONFIGURATION_KEYS)
         name = table.text("name")
         if name in [c.name for c in result]:
             raise table.error("name", name, "a name that no other configuration has")

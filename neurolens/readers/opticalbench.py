@@ -18,9 +18,9 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Lens, Surface
-from neurolens.readers.draft import INFINITE, Draft, ReadOptions, Row, State, lens_of
+from neurolens.readers.draft import INFINITE, Draft, Row, State, lens_of
 from neurolens.readers.glasses import same_glass
-from neurolens.readers.source import MAX_SURFACES, Line, assume, read_lines, warn
+from neurolens.readers.source import MAX_SURFACES, Line, ReadOptions, assume, read_lines, warn
 
 _PLANE = ("AS", "FS", "CG", "INFINITY", "INF")
 _UNKNOWN = ("", "undefined", "?", "-")
@@ -43,10 +43,6 @@ class File(Draft):
     gaps: dict[int, tuple[Line, str]] = field(default_factory=dict)
     aspheres: list[tuple[Line, list[str]]] = field(default_factory=list)
     field_stops: set[int] = field(default_factory=set)
-
-    def names(self) -> list[str]:
-        """Return the numbers of the surfaces; a plane that was added has none."""
-        return [*self.ids, *[""] * (len(self.surfaces) - len(self.ids))]
 
     def value(self, name: str, place: int) -> float | None:
         """Return a variable in a state, None where it is not stated; "Infinity" is `math.inf`."""
@@ -178,9 +174,8 @@ def _complete(file: File) -> None:
         rows = [replace(s, diameter_mm=opening) if s.stop else s for s in rows]
         file.stop_given = True
     file.object_distance = table.object_distance
-    file.rows = tuple(
-        Row(s, _cuts(file, rows, k), name) for k, (s, name) in enumerate(zip(rows, file.names(), strict=True))
-    )
+    names = [*file.ids, *[""] * (len(rows) - len(file.ids))]  # a plane that was added has none
+    file.rows = tuple(Row(s, _cuts(file, rows, k), name) for k, (s, name) in enumerate(zip(rows, names, strict=True)))
     file.f_number = table.f_number
     file.film_given = table.film_given
     if math.isinf(table.object_distance):

@@ -15,9 +15,9 @@ from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.readers import draft
 from neurolens.readers.assemble import UNKNOWN
-from neurolens.readers.draft import INFINITE, Draft, ReadOptions, Row, lens_of, primary_first
+from neurolens.readers.draft import INFINITE, Draft, Row, lens_of, primary_first
 from neurolens.readers.glasses import by_indices, named_glass
-from neurolens.readers.source import MAX_SURFACES, UNITS_MM, Line, by_word, read_lines
+from neurolens.readers.source import UNITS_MM, Line, ReadOptions, by_word, read_lines
 
 TERMS = {"AD": 4, "AE": 6, "AF": 8, "AG": 10}
 # Designer, weights, settings of the program, drawings.
@@ -130,8 +130,6 @@ def _system(file: File, line: Line, word: str, rest: list[str]) -> bool:
             if file.unit is None:
                 raise line.error(word, mm, "1 (mm), 10 (cm), 25.4 (inch) or 1000 (m)")
         case "NXT":
-            if len(file.blocks) > MAX_SURFACES + 1:
-                raise line.error(word, f"({len(file.blocks)} surfaces)", f"at most {MAX_SURFACES} surfaces")
             file.blocks.append(Block(line, str(len(file.blocks))))
         case "END":
             file.ended = True

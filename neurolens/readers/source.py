@@ -8,10 +8,11 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from neurolens.base.errors import AssumedWarning, InputError, NeurolensWarning
 from neurolens.base.files import read_bytes
+from neurolens.base.settings import positive, setting
 from neurolens.base.tomlfile import reject_unknown
 
 MAX_BYTES = 4_000_000  # the longest real lens files, with tolerances and merit function, stay below 1 MB
@@ -26,6 +27,29 @@ MAX_INDEX = 4.5  # germanium, the densest lens material there is, has 4.0
 
 # Units of length in mm.
 UNITS_MM = {"mm": 1.0, "cm": 10.0, "in": 25.4, "m": 1000.0}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadOptions:
+    """Facts that a file may leave out, from the user."""
+
+    name: str | None = setting(None, "name of the lens (default: the title in the file, else its file name)")
+    source: str | None = setting(None, "where the figures come from (default: the file's name)", metavar="SOURCE")
+    f_number: float | None = setting(
+        None, "nominal f-number of a file without one (default: as the stop's diameter gives it)",
+        kind=positive("an f-number"), metavar="N",
+    )  # fmt: skip
+    stop: str | None = setting(
+        None, "number in the file of the surface that is the stop (default: the one marked, else the limiting rim)",
+        metavar="N",
+    )  # fmt: skip
+    units: Literal["mm", "cm", "in", "m"] | None = setting(None, "unit of lengths (default: the file's own, mm)")
+    half_field_deg: float | None = setting(
+        None, "edge of the field from the axis, for rims that the file does not give (default: the file's own)",
+        within=(1e-3, 179.0), unit="degrees", option="half-field", metavar="DEG",
+    )  # fmt: skip
+    gap_before: bool = setting(False, "plain table: thickness is that in front of each surface (Kolb 1995)")
+    semi_diameters: bool = setting(False, "plain table: the last column holds rim radii")
 
 
 @dataclass(frozen=True)
@@ -93,6 +117,14 @@ class Table:
     def only(self, known: Sequence[str]) -> None:
         """Raise for a key that is not known."""
         reject_unknown(self.file, self.where, self.data, known)
+
+    def inner(self, key: str, given: Any, known: Sequence[str], expected: str = "a table") -> Table:
+        """Return what is given at a place of this table as a table that has no other than the known keys."""
+        if not isinstance(given, Mapping):
+            raise self.error(key, given, expected)
+        table = Table(given, self.file, f"{self.where}{key}, ")
+        table.only(known)
+        return table
 
     def number(self, key: str, *, unit: str = "", above: float | None = None, finite: bool = True) -> float:
         """Return a number: an integer or a float, never a bool, a text or NaN."""

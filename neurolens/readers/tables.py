@@ -25,8 +25,8 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Lens, Surface
-from neurolens.readers.draft import Draft, ReadOptions, Row, lens_of
-from neurolens.readers.source import MAX_SURFACES, Line, assume, read_lines
+from neurolens.readers.draft import Draft, Row, lens_of
+from neurolens.readers.source import Line, ReadOptions, assume, read_lines
 
 COLUMNS = ("radius", "thickness", "index", "diameter")
 FIGURES = ("radius", "thickness", "ior", "abbe", "semi_ap", "coating")
@@ -56,8 +56,6 @@ def read_table(path: str | Path, options: ReadOptions | None = None) -> Lens:
         if len(words) != len(COLUMNS):
             raise line.error("row", " ".join(words), f"{len(COLUMNS)} numbers: {', '.join(COLUMNS)}")
         rows.append((line, [line.number_of(name, word) for name, word in zip(COLUMNS, words, strict=True)]))
-        if len(rows) > MAX_SURFACES:
-            raise line.error("row", f"({len(rows)} of them)", f"at most {MAX_SURFACES}")
     if not rows:
         raise InputError(file, "rows", "(none)", f"rows of {len(COLUMNS)} numbers: {', '.join(COLUMNS)}")
     if count is not None and count[1] != len(rows):
@@ -126,8 +124,6 @@ def read_flaresim(path: str | Path, options: ReadOptions | None = None) -> Lens:
                 stated, draft.nominal = int(found[1]), float(found[2]) if found[2] else None
         elif listed:
             rows.append(_flaresim_surface(line, text.split()))
-            if len(rows) > MAX_SURFACES:
-                raise line.error("row", f"({len(rows)} of them)", f"at most {MAX_SURFACES}")
         elif colon and key == "surfaces":
             listed = True
         elif colon and key == "name":

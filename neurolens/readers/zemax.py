@@ -16,9 +16,9 @@ from typing import Any
 from neurolens.base.errors import InputError
 from neurolens.lens import catalogue
 from neurolens.lens.prescription import Lens
-from neurolens.readers.draft import Draft, ReadOptions, Row, lens_of, primary_first
+from neurolens.readers.draft import Draft, Row, lens_of, primary_first
 from neurolens.readers.glasses import named_glass
-from neurolens.readers.source import MAX_SURFACES, Line, assume, read_lines, warn
+from neurolens.readers.source import Line, ReadOptions, assume, read_lines, warn
 from neurolens.readers.zemax_model import (
     HARMLESS,
     Q_TYPE,
@@ -190,8 +190,6 @@ def _begin(file: File, line: Line, rest: list[str]) -> None:
     last = next((b.name for b in reversed(file.blocks) if b.name.isdecimal()), str(len(file.blocks) - 1))
     if not rest or not re.fullmatch(f"{int(last) + 1}|{last}[A-Z]+", rest[0]):  # 5AS: a stop behind surface 5
         raise line.error("SURF", " ".join(rest), f"surface {int(last) + 1}, as they are numbered in order")
-    if len(file.blocks) > MAX_SURFACES + 1:
-        raise line.error("SURF", rest[0], f"at most {MAX_SURFACES} surfaces")
     file.blocks.append(Block(line, name=rest[0]))
 
 

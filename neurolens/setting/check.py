@@ -67,7 +67,9 @@ def check_lens(lens: Lens) -> list[Check]:
         found.append(_blur(lens, data))
         found += _corner(lens)
     for c in lens.configurations:
-        state = _stated(lens, c)
+        # The f-number that the source states. A state without one has the table's stop, and any is as good as another.
+        same = c.efl_mm is not None and c.efl_mm == lens.stated_efl_mm
+        state = replace(in_state(lens, c), f_number=c.f_number or (lens.f_number if same else math.nan))
         try:
             data = first_order(state)
         except InputError as error:
@@ -89,13 +91,6 @@ def doubts(checks: list[Check]) -> list[str]:
 def verdict(checks: list[Check]) -> str:
     """Either "ok" or "doubtful"."""
     return "doubtful" if any(c.doubt for c in checks) else "ok"
-
-
-def _stated(lens: Lens, c: Configuration) -> Lens:
-    """Return the lens in a state, with the f-number that the source states for it, NaN where it states none."""
-    # Where a state has no f-number its stop is that of the table, and any f-number is as good as another.
-    same = c.efl_mm is not None and c.efl_mm == lens.stated_efl_mm
-    return replace(in_state(lens, c), f_number=c.f_number or (lens.f_number if same else math.nan))
 
 
 def _first_order(lens: Lens, data: FirstOrder) -> Iterator[Check]:

@@ -8,7 +8,6 @@ solved for so that the paraxial image of the object lies on the film, which is f
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -31,36 +30,14 @@ def monotone(x: Sequence[float], rows: Sequence[Sequence[float]], place: float) 
     constructing local monotone piecewise cubic interpolants": a value stays between those of its two rows, so that no
     gap can turn negative.
     """
-    if len(x) == 1:
-        return list(rows[0])
-    i = min(max(bisect_right(x, place) - 1, 0), len(x) - 2)
-    steps, values = np.diff(x), np.asarray(rows, np.float64)
-    t = (place - x[i]) / steps[i]
-    if t in (0, 1):
-        return list(rows[i + int(t)])
-    d, low, high = _slopes(steps, np.diff(values, axis=0) / steps[:, None]), values[i], values[i + 1]
-    rise = high - low
-    bump = t * (1 - t) * ((1 - t) * (d[i] * steps[i] - rise) - t * (d[i + 1] * steps[i] - rise))
-    return (low + t * rise + bump).tolist()
+    from scipy.interpolate import PchipInterpolator  # type: ignore[import-untyped]
 
-
-def _slopes(steps: NDArray[np.float64], secants: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the slopes [R, M] at all places: weighted harmonic means of the secants beside, 0 at a turning point."""
-    if len(steps) == 1:
-        return np.repeat(secants, 2, axis=0)
-    h0, h1, d0, d1 = steps[:-1, None], steps[1:, None], secants[:-1], secants[1:]
-    w0, w1 = 2 * h1 + h0, h1 + 2 * h0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inner = np.where(d0 * d1 > 0, (w0 + w1) / (w0 / d0 + w1 / d1), 0.0)
-    return np.vstack([_end(steps, secants), inner, _end(steps[::-1], secants[::-1])])
-
-
-def _end(steps: NDArray[np.float64], secants: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the slope at an end: of the parabola through three values, kept within what stays monotone."""
-    (h0, h1), (d0, d1) = steps[:2], secants[:2]
-    slope = ((2 * h0 + h1) * d0 - h0 * d1) / (h0 + h1)
-    slope = np.where((d0 * d1 <= 0) & (np.abs(slope) > 3 * np.abs(d0)), 3 * d0, slope)
-    return np.where(slope * d0 <= 0, 0.0, slope)
+    known, own = np.unique(x, return_index=True)
+    values = np.asarray(rows, np.float64)[own]
+    at = min(int(np.searchsorted(known, place)), len(known) - 1)
+    if len(known) == 1 or known[at] == place:
+        return values[at].tolist()
+    return PchipInterpolator(known, values)(place).tolist()
 
 
 SAME_MM = 0.005  # gaps of two states that differ by less are the same: sources give two decimals
@@ -167,6 +144,8 @@ def focused_inside(lens: Lens, focus_m: float | None, object_mm: float | None = 
     """
     if focus_m is None and object_mm is not None:
         return replace(lens, film_z_mm=paraxial.image_z_mm(lens, -object_mm))
+    from scipy.optimize import brentq  # type: ignore[import-untyped]
+
     lens = at_infinity(lens)
     path, place = _mover(lens)
     wanted = 0.0 if focus_m is None else 1 / (1000 * focus_m)
@@ -177,7 +156,9 @@ def focused_inside(lens: Lens, focus_m: float | None, object_mm: float | None = 
     if wanted > nearest * (1 + 1e-9):
         limit = f"at least {_rounded_up(1 / nearest / 1000):g} m, the nearest focus of the source's states"
         raise InputError(lens.path, "focus_m", focus_m, limit)
-    s = _solve(lambda s: _vergence(place(s)) - wanted, furthest) if wanted else 0.0
+    wanted, s = min(wanted, nearest), 0.0
+    if wanted > max(_vergence(place(0.0)), 0.0):
+        s = brentq(lambda s: _vergence(place(s)) - wanted, 0.0, furthest, xtol=1e-14)
     return replace(place(s), infinity_mm=tuple((k, lens.surfaces[k].thickness_mm) for k in path.steps[0]))
 
 
@@ -211,21 +192,6 @@ def _vergence(lens: Lens) -> float:
     assert lens.film_z_mm is not None
     extension = lens.film_z_mm - data.rear_focal_z_mm
     return float(extension / (data.efl_mm * data.front_efl_mm + extension * (lens.film_z_mm - data.front_focal_z_mm)))
-
-
-def _solve(excess: Callable[[float], float], furthest: float) -> float:
-    """Return the root between 0 (below) and `furthest` (above): regula falsi with halving (Illinois), to rounding."""
-    low, high, f_low, f_high = 0.0, float(furthest), excess(0.0), excess(float(furthest))
-    for _ in range(100):
-        s = high - f_high * (high - low) / (f_high - f_low) if f_high != f_low else high
-        f = excess(s)
-        if f == 0 or abs(high - low) < 1e-14:
-            return s
-        if f > 0:
-            high, f_high, f_low = s, f, f_low / 2
-        else:
-            low, f_low, f_high = s, f, f_high / 2
-    return s
 
 
 _RINGS, _SPOKES = 512, 24

@@ -223,7 +223,9 @@ def with_derived_rims(lens: Lens) -> Lens:
     if not any(s.asphere and math.isnan(s.diameter_mm) for s in lens.surfaces):
         return replace(_filled(lens, derive_rims(lens)[0]), rims="derived")
     # Figures of aspheres are followed little beyond a rim: from the rims of their vertex spheres, until they stay.
-    found = _filled(lens, derive_rims(_spherical(lens))[0])
+    radii = (1 / c if (c := s.vertex_curvature("y")) else math.inf for s in lens.surfaces)
+    rows = (replace(s, radius_mm=r, conic=0.0, asphere=()) for s, r in zip(lens.surfaces, radii, strict=True))
+    found = _filled(lens, derive_rims(replace(lens, surfaces=tuple(rows)))[0])
     for _ in range(_ROUNDS):
         before, found = found, _filled(lens, derive_rims(found)[0])
         if found == before:
@@ -234,12 +236,6 @@ def with_derived_rims(lens: Lens) -> Lens:
 def _filled(lens: Lens, other: Lens) -> Lens:
     pairs = zip(lens.surfaces, other.surfaces, strict=True)
     rows = (replace(s, diameter_mm=o.diameter_mm) if math.isnan(s.diameter_mm) else s for s, o in pairs)
-    return replace(lens, surfaces=tuple(rows))
-
-
-def _spherical(lens: Lens) -> Lens:
-    radii = (1 / c if (c := s.vertex_curvature("y")) else math.inf for s in lens.surfaces)
-    rows = (replace(s, radius_mm=r, conic=0.0, asphere=()) for s, r in zip(lens.surfaces, radii, strict=True))
     return replace(lens, surfaces=tuple(rows))
 
 

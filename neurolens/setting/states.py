@@ -8,6 +8,7 @@ keeps its interpolated value); a zoom of two moving groups has no freedom left. 
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import get_args
 
@@ -83,7 +84,8 @@ def set_lens(
         return lens.with_stop_radius(paraxial.stop_radius_mm(at_infinity(lens), f_number))
     lens, object_mm = at_infinity(lens), None
     if isinstance(zoom, str) and zoom not in [c.name for c in lens.configurations]:
-        zoom = _millimetres(zoom)
+        with suppress(ValueError):  # a name, then, that no state has
+            zoom = float(zoom)
     if isinstance(zoom, str):
         state = state_named(lens, zoom)
         lens, object_mm = in_state(lens, state), state.object_distance_mm
@@ -92,7 +94,11 @@ def set_lens(
     elif zoom is not None:
         lens = zoomed(lens, zoom)
     if focal_length_mm is not None:
-        factor = _factor_for_efl(lens, focal_length_mm)
+        now_mm = paraxial.first_order(at_infinity(lens)).efl_mm
+        if now_mm < 0:
+            expected = f"none: this lens diverges (EFL {now_mm:.4g} mm)"
+            raise InputError(lens.path, "focal_length_mm", focal_length_mm, expected)
+        factor = focal_length_mm / now_mm
     else:
         factor = 1.0 if field_deg is None else _factor_for_field(lens, field_deg)
     image_radius = lens.image_radius_mm
@@ -179,22 +185,6 @@ def _check(
         raise InputError(lens.path, "field_deg", field_deg, "left out beside focal_length_mm: each sets the size")
     if focus_mode not in get_args(FocusMode):
         raise InputError(lens.path, "focus_mode", focus_mode, " or ".join(f'"{f}"' for f in get_args(FocusMode)))
-
-
-def _millimetres(text: str) -> float | str:
-    """Return a focal length that was typed, or the text itself: a name, then, that no state has."""
-    try:
-        return float(text)
-    except ValueError:
-        return text
-
-
-def _factor_for_efl(lens: Lens, focal_length_mm: float) -> float:
-    now_mm = paraxial.first_order(at_infinity(lens)).efl_mm
-    if now_mm < 0:
-        expected = f"none: this lens diverges (EFL {now_mm:.4g} mm)"
-        raise InputError(lens.path, "focal_length_mm", focal_length_mm, expected)
-    return focal_length_mm / now_mm
 
 
 def _factor_for_field(lens: Lens, field_deg: float) -> float:
@@ -290,7 +280,9 @@ def _solved(lens: Lens, gaps: list[int], states: list[_State], efl_mm: float) ->
     x = [math.log(s.efl_mm) for s in states]
     target = min(max(math.log(efl_mm), x[0]), x[-1])
     known = np.array([s.places for s in states])
-    places, (moving, kept) = np.array(monotone(x, known.tolist(), target)), _movement(known)
+    places, travel = np.array(monotone(x, known.tolist(), target)), np.ptp(known, axis=0)
+    least = MOVES * travel.max()
+    moving, kept = travel > least, int(np.argmax(np.ptp(known[:, :-1] - known[:, 1:], axis=0) > least))
     if moving.sum() > 2:
         (gap_mm,) = monotone(x, (known[:, kept : kept + 1] - known[:, kept + 1 : kept + 2]).tolist(), target)
         if moving[kept]:
@@ -315,14 +307,6 @@ def _solved(lens: Lens, gaps: list[int], states: list[_State], efl_mm: float) ->
         if np.abs(change).max() < 1e-13 * efl_mm:
             return places
     raise InputError(lens.path, "zoom", efl_mm, "a position between states that its groups can reach in focus")
-
-
-def _movement(places: Vector) -> tuple[NDArray[np.bool_], int]:
-    """Which groups move, and the first gap that varies, from the places [states, groups]."""
-    travel = np.ptp(places, axis=0)
-    least = MOVES * travel.max()
-    varies = np.ptp(places[:, :-1] - places[:, 1:], axis=0) > least
-    return travel > least, int(np.argmax(varies))
 
 
 def _directions(moving: NDArray[np.bool_], kept: int) -> Vector:

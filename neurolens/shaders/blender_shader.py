@@ -4,21 +4,28 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from neurolens import __version__
 from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError
 from neurolens.base.lensname import is_model
 from neurolens.base.progress import Progress, Report
-
-if TYPE_CHECKING:
-    from neurolens.cameras.onnxlens import OnnxLens
-    from neurolens.graph.ir import Graph
-    from neurolens.lens.prescription import Lens
-    from neurolens.shaders.osl import OslLens
-    from neurolens.shaders.shader_lens import ShaderLens
+from neurolens.cameras.onnxlens import OnnxLens, load_model
+from neurolens.cameras.pupil_search import PupilTable
+from neurolens.graph.ir import Graph
+from neurolens.lens.paraxial import film_z_mm, first_order
+from neurolens.lens.prescription import Lens
+from neurolens.readers.any_format import read_any
+from neurolens.shaders.osl import FOCUS_AXIS, OslLens, model_lens, osl_lens, parameters, states_between, write_camera
+from neurolens.shaders.shader_lens import ShaderLens
+from neurolens.shaders.source import Focusing
+from neurolens.surrogates.assemble import SCALARS, model_graph
+from neurolens.surrogates.axes import product, weights
+from neurolens.surrogates.card import state_for
+from neurolens.surrogates.source import OSL, checked_name, lines_of
 
 # Of an exact lens: its wavelengths; its nearest focus in focal lengths; best focus lies beside the paraxial one by less
 # than this share of the film's travel.
@@ -58,9 +65,6 @@ def shader_of(file: Path, *, zoom: str | None = None, name: str | None = None, q
     Raises:
         InputError: a name that is no identifier, a lens that is too large for compilers.
     """
-    from neurolens.shaders.osl import FOCUS_AXIS, parameters, write_camera
-    from neurolens.surrogates.source import OSL, checked_name, lines_of
-
     with Progress(quiet=quiet).stage(f"fit the pupil of {file.stem}") as report:
         lens_id, lens, lines = lens_of(file, zoom, report)
     function = checked_name(OSL, lens_id, name)
@@ -98,10 +102,6 @@ def lens_of(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens,
 
 
 def _of_model(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLens, list[str]]:
-    from neurolens.cameras.onnxlens import load_model
-    from neurolens.shaders.osl import model_lens
-    from neurolens.surrogates.card import state_for
-
     model, fixed = load_model(file), zoom not in (None, RANGE)
     if fixed or (zoom is not None and not model.axes):
         model = model.at(*state_for(model.path, model.axes, model.state, zoom, math.inf))
@@ -114,11 +114,8 @@ def _of_model(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLen
 
 def _smallest(model: OnnxLens) -> Graph | None:
     """The graph of a model without the rims that block next to nothing, which need torch to be known; None without."""
-    from importlib.util import find_spec
-
     if model.axes or find_spec("torch") is None:
         return None
-    from neurolens.surrogates.assemble import SCALARS, model_graph
     from neurolens.surrogates.pairs import without_idle_gates
 
     (smallest,) = without_idle_gates((model.fitted,), IDLE)
@@ -136,12 +133,9 @@ def exact_lens(file: Path, zoom: str | None, report: Report) -> tuple[str, OslLe
     Raises:
         InputError: a range of no zoom, or of one whose groups move to focus.
     """
-    from neurolens.readers.any_format import read_any
     from neurolens.setting.focusing import focus_states
     from neurolens.setting.pupils import pupil_plane_z_mm
     from neurolens.setting.states import set_lens
-    from neurolens.shaders.osl import osl_lens, states_between
-    from neurolens.surrogates.axes import product, weights
     from neurolens.surrogates.states import StateSpace, axes_of, gap_axis
     from neurolens.trace.tracegraph import TRANSMITTANCE
 
@@ -178,12 +172,8 @@ def _traced(lens: Lens, plane_mm: float, far: Lens | None = None, inside_m: floa
         plane_mm: of its pupil points. far, inside_m: of groups that have moved, the lens at infinity focus, whose
             picture's size holds, and the distance in focus.
     """
-    from neurolens.cameras.pupil_search import PupilTable
-    from neurolens.lens.paraxial import film_z_mm, first_order
     from neurolens.setting.focusing import best_focus_of_stops_mm, film_range_mm
     from neurolens.setting.pupils import image_radius_mm, pupil_bounds
-    from neurolens.shaders.shader_lens import ShaderLens
-    from neurolens.shaders.source import Focusing
     from neurolens.trace.tracegraph import exact_graph
 
     data, (radius, _) = first_order(lens), image_radius_mm(far or lens)

@@ -40,6 +40,7 @@ from neurolens.graph.osl import Parameter, write_osl
 from neurolens.graph.program import STOP_RADIUS, Mixture, Program
 from neurolens.graph.scalars import lower
 from neurolens.lens.film_plane import LINE_D_NM
+from neurolens.lens.prescription import VISIBLE_NM
 from neurolens.shaders.lowtests import low_tests
 from neurolens.shaders.pupil import MAX_BLADES, Blades, PupilCircles, PupilDisc
 from neurolens.shaders.pupil_fit import fit_pupil
@@ -61,7 +62,6 @@ _NEAR, _ROUNDS = 0.999, 4  # of the near limit, for rounding; of finding the fil
 _DERIVATIVES, _WORST, _SEEN = 0.05, 0.05, 0.25
 _ACROSS, _FILM_POWERS = 16, (7, 5)  # distances and stops at which the film is placed; powers of stop and distance
 _BESIDE = 0.01  # of the film radius: near the axis
-_LIGHT_NM = (400.0, 700.0)  # light beyond is invisible, and would only add colour fringes
 FOCUS_AXIS = "focus"
 _FRAME = """\
     point raster = camera_shader_raster_position();
@@ -414,7 +414,9 @@ def shader_lens(model: OnnxLens, graph: Graph | None = None) -> ShaderLens:
     """A model in its state; its graph, where that is not the one in its file."""
     lens, d = model.card["lens"], model.card["domain"]
     low, high = d["film_z_mm"]
-    short, long = _light_of(*map(float, d["wavelength_nm"]))
+    all_nm = short, long = tuple(map(float, d["wavelength_nm"]))
+    visible = max(short, VISIBLE_NM[0]), min(long, VISIBLE_NM[1])
+    short, long = visible if visible[0] < visible[1] else all_nm
     stop = float(d["stop_radius_mm"])
     if graph is None:
         graph = model.graph()
@@ -432,12 +434,6 @@ def shader_lens(model: OnnxLens, graph: Graph | None = None) -> ShaderLens:
         f_number=lens["f_number"] * lens["stop_radius_mm"] / stop,
         efl_mm=lens["efl_mm"],
     )
-
-
-def _light_of(short_nm: float, long_nm: float) -> tuple[float, float]:
-    """The visible part of a model's wavelengths; all of them where none is visible."""
-    short, long = max(short_nm, _LIGHT_NM[0]), min(long_nm, _LIGHT_NM[1])
-    return (short, long) if short < long else (short_nm, long_nm)
 
 
 def osl_lens(

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.graph.ir import Exponents, Graph, Value
-from neurolens.shaders.stop_image import HAIR, StopImage, moving_polynomial
+from neurolens.shaders.stop_image import HAIR, StopImage, frame_of_film_point, moving_polynomial
 
 MAX_BLADES = 16
 _CLOSEST = 0.05  # of the stop's radius: the middle of a pupil to an edge; nearer, or beyond it, points stay apart
@@ -146,7 +146,9 @@ class PupilCircles:
         lit = (radius <= self.film_radius_mm) & (shape.low <= shape.high)
         g.outputs = {"pupil_mm": pupil, "at_stop": at_stop(x, y)}
         g.outputs["area_mm2"] = g.select(lit, tall * (share * share) * unit, 0.0)
-        g.outputs["mean_area_mm2"] = shape.mean_height() * unit
+        one = g.constant(1.0)
+        first, *others = (shape.chord(one * x)[1] * weight for x, weight in _NODES)
+        g.outputs["mean_area_mm2"] = sum(others, first) * unit
         return g
 
     def _disc(self, film: Value, size: Value) -> Value:
@@ -273,11 +275,6 @@ class _Shape:
         y = disc[1] * tall
         return self.middle + self.half * disc[0], y if centre is None else centre + y, tall
 
-    def mean_height(self) -> Value:
-        one = self.half.graph.constant(1.0)
-        heights = [self.chord(one * x)[1] * weight for x, weight in _NODES]
-        return heights[0] + heights[1] + heights[2]
-
 
 def _within_blades(
     disc: Value, shape: _Shape, at_stop: Callable[[Value, Value], Value], blades: Blades, margin: float
@@ -291,13 +288,6 @@ def _within_blades(
         x, y, _ = shape.point(direction, direction[0] * share)
         share = blades.drawn(start, at_stop(x, y) - start, margin)
     return share
-
-
-def frame_of_film_point(film: Value) -> tuple[Value, Value, Value]:
-    """Its distance from the axis, and unit vectors towards it and across."""
-    radius = film.graph.square(film).sqrt()
-    turn = (film + [HAIR, 0.0]) * (1.0 / (radius + HAIR))
-    return radius, turn, film.graph.affine([[0.0, -1.0], [1.0, 0.0]], turn)
 
 
 def unit_disc(square: Value) -> Value:

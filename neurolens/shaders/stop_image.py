@@ -102,13 +102,19 @@ class StopImage:
         if self.anamorphic:
             pupil, _ = self.placed(film, film_z, nanometres, point)
         else:
-            radius = g.square(film).sqrt()
-            x, y = g.split((film + [HAIR, 0.0]) * (1.0 / (radius + HAIR)), (1, 1))
-            turned = g.concat(x * point[0] + y * point[1], x * point[1] - y * point[0])
+            radius, turn, aside = frame_of_film_point(film)
+            turned = g.concat(g.dot(turn, point), g.dot(aside, point))
             image, _ = self.placed(g.concat(radius, radius * 0.0), film_z, nanometres, turned)
-            pupil = g.concat(x * image[0] - y * image[1], y * image[0] + x * image[1])
+            pupil = turn * image[0] + aside * image[1]
         g.outputs = g.inline(lens, {"rays": g.concat(film, pupil, nanometres), "film_z_mm": film_z})
         return g
+
+
+def frame_of_film_point(film: Value) -> tuple[Value, Value, Value]:
+    """Its distance from the axis, and unit vectors towards it and across."""
+    radius = film.graph.square(film).sqrt()
+    turn = (film + [HAIR, 0.0]) * (1.0 / (radius + HAIR))
+    return radius, turn, film.graph.affine([[0.0, -1.0], [1.0, 0.0]], turn)
 
 
 def moving_polynomial(exponents: Exponents, numbers: Array, variables: Value, position: Value) -> Value:

@@ -114,7 +114,9 @@ def advice(results: Mapping[str, Any], folder: Path) -> list[Advice]:
             name, file, fused = str(best["name"]), str(folder / best["file"]), bool(best.get("fused_ns_per_ray"))
             why = _why_model(best, exact, within)
         if rest:
-            command = _render_command(file, fused)
+            scene, camera = Path("experiments/scenes/room.toml"), f"{'fused:' if fused else ''}{file}"  # as C if it can
+            words = [str(scene if scene.is_file() else library() / scene), "--camera", camera, "-o", "room.exr"]
+            command = f"{program()} render {shlex.join(words)}"
         else:  # one model of many states is no function of a ray alone
             command = "" if best.get("states") else f"{program()} export {shlex.quote(file)} --to c -o lens.h"
         advices.append(Advice(where, name, why, command if file else ""))
@@ -146,10 +148,3 @@ def _why_model(model: Mapping[str, Any], exact: Mapping[str, Any] | None, within
 def ns_text(timing: Mapping[str, Any]) -> str:
     """A time in words, with "~" before a noisy one."""
     return f"{'~' * noisy(timing)}{timing['min']:.3g} ns" if timing else "-"
-
-
-def _render_command(file: str, fused: bool) -> str:
-    """The command that renders a scene through a model or a lens, as C where that runs here."""
-    scene, camera = Path("experiments/scenes/room.toml"), f"{'fused:' if fused else ''}{file}"
-    words = [str(scene if scene.is_file() else library() / scene), "--camera", camera, "-o", "room.exr"]
-    return f"{program()} render {shlex.join(words)}"

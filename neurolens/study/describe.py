@@ -11,6 +11,7 @@ import torch
 
 from neurolens.analysis import layout
 from neurolens.analysis.fields import Scene
+from neurolens.analysis.spots import working_f_number
 from neurolens.base import status as st
 from neurolens.base.errors import NeurolensError, warned
 from neurolens.lens.glass import glass_of
@@ -48,6 +49,7 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
     film_z = float(lens.film_z_mm if lens.film_z_mm is not None else domain.film_z_mm[0])
     radius, radius_from = image_radius_mm(lens)
     passing, ended = passing_share(lens, domain)
+    working = working_f_number(Scene(lens, domain.focus_m[0]), lens.reference_nm)
     # A round lens has the same field along y; the mean over rays along x is used.
     reached = field_reached_deg(lens, domain, film_z, "y" if squeezed else "x")
     reached_x = field_reached_deg(lens, domain, film_z, "x") if squeezed else reached
@@ -62,7 +64,7 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
         "efl_x_mm": float(first_order(lens, meridian="x").efl_mm) if squeezed else None,
         "wavelength_nm": lens.reference_nm,
         "object_medium": {**asdict(lens.object_medium), "n_d": float(lens.object_medium.n_d)},
-        "working_f_number": working_f_number(lens, domain, film_z),
+        "working_f_number": None if math.isnan(working) else working,
         "film_z_mm": film_z,
         "focus_m": domain.focus_m[0],
         "stop_surface": lens.stop_index,
@@ -97,26 +99,13 @@ def glass_table(lens: Lens) -> list[dict[str, Any]]:
     return rows
 
 
-def working_f_number(lens: Lens, domain: Domain, film_z: float) -> float | None:
-    """1 / (2 sin theta') of the outermost ray of the y-z plane to reach the middle of the film; None without one."""
-    u = torch.linspace(0, domain.pupil_radius_mm, 4001, dtype=torch.float64)
-    zero = torch.zeros_like(u)
-    rays = camera_rays(zero, zero, film_z, zero, u, domain.pupil_z_mm)
-    with torch.no_grad():
-        passed = trace(lens, rays).status == st.PASSED
-    sine = float(rays.dy[passed].abs().max()) if passed.any() else 0.0
-    return 1 / (2 * sine) if sine > 0 else None
-
-
-def field_reached_deg(
-    lens: Lens, domain: Domain, film_z: float, axis: Literal["x", "y"] = "x", points: int = 200
-) -> float | None:
+def field_reached_deg(lens: Lens, domain: Domain, film_z: float, axis: Literal["x", "y"] = "x") -> float | None:
     """Mean angle to the axis (degrees) of the rays from the edge of the film to the scene; None where none passes.
 
     The edge is that on the x or the y axis of the film.
     """
-    grid = torch.linspace(-domain.pupil_radius_mm, domain.pupil_radius_mm, points, dtype=torch.float64)
-    u, v = (t.reshape(-1) for t in torch.meshgrid(grid, grid[points // 2 :], indexing="ij"))  # symmetric across
+    grid = torch.linspace(-domain.pupil_radius_mm, domain.pupil_radius_mm, 200, dtype=torch.float64)
+    u, v = (t.reshape(-1) for t in torch.meshgrid(grid, grid[100:], indexing="ij"))  # symmetric across
     edge, zero = torch.full_like(u, domain.film_radius_mm), torch.zeros_like(u)
     film, pupil = ((edge, zero), (u, v)) if axis == "x" else ((zero, edge), (v, u))
     with torch.no_grad():

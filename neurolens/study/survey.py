@@ -49,9 +49,8 @@ from neurolens.base.tasks import Failed, run_each
 from neurolens.cameras.model import load_model
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import Collection, kind_of, read_any
-from neurolens.readers.draft import ReadOptions
 from neurolens.readers.glasses import more_glasses
-from neurolens.readers.source import MAX_BYTES
+from neurolens.readers.source import MAX_BYTES, ReadOptions
 from neurolens.setting.check import check_lens
 from neurolens.setting.states import set_lens
 from neurolens.study.check import check_model

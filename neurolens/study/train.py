@@ -120,7 +120,10 @@ def _of_one_state(experiment: Experiment, folder: Path, progress: Progress) -> d
     for model in experiment.model:
         with progress.stage(f"fit {model.label}") as report:
             measured.append(fit_and_measure(prepared, model, models, count, report, fresh))
-        _warn_of_poor(measured[-1])
+        poor = what_is_poor(measured[-1].record)
+        if poor and model.family != "paraxial":
+            text = f"{model.label}: {', '.join(poor)}; a smaller film or stop, or another method, may do better"
+            warnings.warn(text, NeurolensWarning, stacklevel=2)
         if within_um and reaches(measured[-1].record, within_um):
             break
     records = [m.record for m in measured]
@@ -152,13 +155,6 @@ def _of_one_state(experiment: Experiment, folder: Path, progress: Progress) -> d
         "domain_gain": gain,
         "figures": _draw(pairs, records, timed, light, pictures, use) + drawn.figures,
     }
-
-
-def _warn_of_poor(m: Measured) -> None:
-    poor = what_is_poor(m.record)
-    if poor and m.settings.family != "paraxial":
-        text = f"{m.settings.label}: {', '.join(poor)}; a smaller film or stop, or another method, may do better"
-        warnings.warn(text, NeurolensWarning, stacklevel=2)
 
 
 def _plan(experiment: Experiment) -> dict[str, float]:

@@ -248,8 +248,20 @@ def check_card(file: Any, card: Mapping[str, Any]) -> None:
     _check_places(f"{file}: card", card, _RULES)
     if card.get("states") is None:
         return
+    states = card["states"]
     try:
-        _check_states(file, card)
+        axes = axes_of(card)
+        names = [a.name for a in axes]
+        if not axes or len(set(names)) < len(names) or not set(names) <= {"zoom", "focus"}:
+            raise InputError("card", "states.axes", names, "zoom, focus, or both")
+        nodes, count = states["nodes"], len(product(axes))
+        if not isinstance(nodes, list) or len(nodes) != count:
+            raise InputError("card", "states.nodes", f"({len(nodes)})", f"a list of {count}")
+        for node in nodes:
+            _check_places(f"{file}: card: states.nodes", node, _NODE_RULES)
+        for reference in states["reference"]:
+            weights(axes, [float(v) for v in reference["state"]])
+        card_at(card, axes, default_state(card))
     except (InputError, KeyError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
         raise ModelError(f"{file}: card: states: {type(error).__name__}: {error}") from error
 
@@ -268,21 +280,6 @@ def _check_places(where: str, card: Mapping[str, Any], rules: Mapping[str, Rule]
         pupil_rows(card["domain"]["bounds"])
     except (InputError, ValueError, OverflowError) as error:
         raise ModelError(f"{where}: domain.bounds: {error}") from error
-
-
-def _check_states(file: Any, card: Mapping[str, Any]) -> None:
-    states, axes = card["states"], axes_of(card)
-    names = [a.name for a in axes]
-    if not axes or len(set(names)) < len(names) or not set(names) <= {"zoom", "focus"}:
-        raise InputError("card", "states.axes", names, "zoom, focus, or both")
-    nodes, count = states["nodes"], len(product(axes))
-    if not isinstance(nodes, list) or len(nodes) != count:
-        raise InputError("card", "states.nodes", f"({len(nodes)})", f"a list of {count}")
-    for node in nodes:
-        _check_places(f"{file}: card: states.nodes", node, _NODE_RULES)
-    for reference in states["reference"]:
-        weights(axes, [float(v) for v in reference["state"]])
-    card_at(card, axes, default_state(card))
 
 
 @np.errstate(over="ignore")

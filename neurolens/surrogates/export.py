@@ -141,23 +141,20 @@ def export_states(model: StateModel, path: str | Path, errors: dict[str, Any] | 
     """
     _check_gates(model.nodes[0])
     card = card_of(model.at(*model.first_state), errors or {})
+    facts = [lens_facts(node.lens, node.domain) for node in model.nodes]
+    for fact, node in zip(facts, model.nodes, strict=True):  # at infinity focus, as photographers count
+        fact["f_number"] = float(first_order(at_infinity(node.lens)).f_number)
     card["units"] = {**card["units"], STATE: [f"{a.name} {a.unit}" for a in model.axes]}
     card["states"] = {
         "axes": [a.to_dict() for a in model.axes],
         "default": list(model.first_state),
         "zoom": model.space.zoom,
         "f_number": model.space.f_number,
-        "nodes": [{"lens": _node_facts(node), "domain": node.domain.to_dict()} for node in model.nodes],
+        "nodes": [{"lens": fact, "domain": n.domain.to_dict()} for fact, n in zip(facts, model.nodes, strict=True)],
         "reference": [{"state": list(s), **reference_rays(model.at(*s), 8, 1)} for s in _between_nodes(model)],
     }
     metadata = {CARD_KEY: card_to_json(card), MODEL_KEY: coefficients_text(model.nodes)}
     return write_file(path, onnx_of(as_stored(model.nodes), model.axes, metadata))
-
-
-def _node_facts(node: LensModel) -> dict[str, Any]:
-    """The card's table of a node's lens; the f-number is that at infinity focus, as photographers count."""
-    facts = lens_facts(node.lens, node.domain)
-    return {**facts, "f_number": float(first_order(at_infinity(node.lens)).f_number)}
 
 
 def _between_nodes(model: StateModel) -> list[tuple[float, ...]]:
@@ -173,6 +170,8 @@ def _between_nodes(model: StateModel) -> list[tuple[float, ...]]:
 
 def card_of(model: LensModel, errors: dict[str, Any]) -> dict[str, Any]:
     """The card of a model, JSON-able; `errors` are those on held-out rays, as the evaluation gives them."""
+    stop, stopped = st.blocked(model.lens.stop_index, st.RIM), f"blocked by the stop, surface {model.lens.stop_index}"
+    codes = {st.PASSED, st.OUTSIDE_DOMAIN, stop, *(g.status for g in model.gates)}
     return {
         "kind": CARD_KIND,
         "schema": CARD_SCHEMA,
@@ -181,7 +180,7 @@ def card_of(model: LensModel, errors: dict[str, Any]) -> dict[str, Any]:
         "transmittance": model.transmittance,
         "frame": FRAME.format(place="the front surface" if model.direction == "angle" else "the plane z = 0"),
         "domain": model.domain.to_dict(),
-        "status_codes": _status_codes(model),
+        "status_codes": {str(code): st.describe(code) for code in sorted(codes)} | {str(stop): stopped},
         "gates": [{"surface": g.surface, "reason": g.reason, "status": g.status} for g in model.gates],
         "fit": {
             "method": model.method,
@@ -225,13 +224,6 @@ def lens_facts(lens: Lens, domain: Domain) -> dict[str, Any]:
         "dispersive": lens.dispersive,
         **({} if data.front_efl_mm == data.efl_mm else {"index_ratio": float(data.front_efl_mm / data.efl_mm)}),
     }
-
-
-def _status_codes(model: LensModel) -> dict[str, str]:
-    codes = {st.PASSED, st.OUTSIDE_DOMAIN, st.blocked(model.lens.stop_index, st.RIM), *(g.status for g in model.gates)}
-    words = {str(code): st.describe(code) for code in sorted(codes)}
-    words[str(st.blocked(model.lens.stop_index, st.RIM))] = f"blocked by the stop, surface {model.lens.stop_index}"
-    return words
 
 
 def reference_rays(model: LensModel, passing: int = 24, others: int = 4) -> dict[str, Any]:

@@ -12,8 +12,10 @@ import binascii
 import json
 import math
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import MISSING, asdict, dataclass, field, fields, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +26,6 @@ from neurolens.base.errors import InputError, ModelError
 from neurolens.base.tomlfile import check_tree
 from neurolens.graph.derive import derivative, with_derivatives
 from neurolens.graph.interpret import evaluate
-from neurolens.graph.ir import Graph
 from neurolens.graph.onnx import Mixing, write_onnx
 from neurolens.graph.program import RAY
 from neurolens.lens.prescription import Coating, Lens, Surface
@@ -59,7 +60,7 @@ _MAX_SURFACES, _MAX_TERMS, _MAX_POWER = 500, 1000, 40  # of a prescription, as `
 _LENS = ("name", "source", "f_number", "image_radius_mm", "half_field_deg", "designer", "rims", "film_z_mm", "path")
 _NOWHERE = -1.0  # a film position in no domain, which replaces that of the call where the state is out of range
 DERIVATIVES = {"scene_ray_d_film": RAY[:2], "scene_ray_d_pupil": RAY[2:]}
-_DAMAGE = (ValueError, TypeError, KeyError, IndexError, ArithmeticError, AttributeError, AssertionError, RecursionError)
+_DAMAGE = (ValueError, TypeError, KeyError, IndexError, ArithmeticError, AttributeError, AssertionError, RuntimeError)
 # Errors of reference rays that are allowed at least; of position and stop crossing, for each mm of the focal length.
 _OFF = 1e-5
 
@@ -105,19 +106,25 @@ def read_model(path: str | Path) -> ModelFile:
     again = "export it again (`neurolens train` fits the model and writes its file with them)"
     if MODEL_KEY not in metadata:
         raise ModelError(f"{file}: it holds no coefficients, from which its graph would be built: {again}")
-    try:
-        with np.errstate(all="ignore"):
-            data = json.loads(inflated(metadata[MODEL_KEY]))
-            check_tree(data, "coefficients")
-            if data["schema"] not in (_ONE_NODE, SCHEMA):
-                raise ModelError(f"{file}: coefficients: schema: got {data['schema']!r}, expected {SCHEMA}: {again}")
-            model = ModelFile(file, card, _nodes(file, card, data), data)
-            _check_reference(model)
-    except _DAMAGE as error:
-        if isinstance(error, ModelError):
-            raise
-        raise ModelError(f"{file}: its coefficients are damaged ({type(error).__name__}: {error})") from error
+    with np.errstate(all="ignore"), damage_said(file):
+        data = json.loads(inflated(metadata[MODEL_KEY]))
+        check_tree(data, "coefficients")
+        if data["schema"] not in (_ONE_NODE, SCHEMA):
+            raise ModelError(f"{file}: coefficients: schema: got {data['schema']!r}, expected {SCHEMA}: {again}")
+        model = ModelFile(file, card, _nodes(file, card, data), data)
+        _check_reference(model)
     return model
+
+
+@contextmanager
+def damage_said(file: str | Path, what: str = "its coefficients are damaged") -> Iterator[None]:
+    """Errors of reading damaged data as a ModelError."""
+    try:
+        yield
+    except ModelError:
+        raise
+    except _DAMAGE as error:
+        raise ModelError(f"{file}: {what} ({type(error).__name__}: {error})") from error
 
 
 def _nodes(file: Path, card: Mapping[str, Any], data: Mapping[str, Any]) -> tuple[LensModel, ...]:
@@ -198,12 +205,8 @@ def _check_reference(model: ModelFile) -> None:
     references = [(default_state(model.card), model.card.get("reference"))]
     references += [(tuple(r["state"]), r) for r in states.get("reference", ())]
     for state, reference in references:
-        try:
+        with damage_said(model.path, "card: reference"):
             _check_rays(model, state, reference)
-        except ModelError:
-            raise
-        except _DAMAGE as error:
-            raise ModelError(f"{model.path}: card: reference: {type(error).__name__}: {error}") from error
 
 
 def _check_rays(model: ModelFile, state: Sequence[float], reference: Any) -> None:
@@ -260,24 +263,16 @@ def onnx_of(
     graphs = [model_graph(node, ONNX) for node in with_one_angle(nodes)]
     shapes = {}
     if derivatives:
-        graphs = [_with_ray_derivatives(graph) for graph in graphs]
+        graphs = [with_derivatives(graph, ["scene_ray"], [("rays", k) for k in range(4)]) for graph in graphs]
+        for g, (name, by) in product(graphs, DERIVATIVES.items()):
+            g.outputs[name] = g.concat(*(g.outputs.pop(derivative("scene_ray", row)) for row in by))
         shapes = dict.fromkeys(DERIVATIVES, (2, 6))
-    return write_onnx(graphs, metadata or {}, _mixing_of(axes) if axes else None, shapes)
-
-
-def _with_ray_derivatives(graph: Graph) -> Graph:
-    graph = with_derivatives(graph, ["scene_ray"], [("rays", k) for k in range(4)])
-    for name, by in DERIVATIVES.items():
-        graph.outputs[name] = graph.concat(*(graph.outputs.pop(derivative("scene_ray", row)) for row in by))
-    return graph
-
-
-def _mixing_of(axes: Sequence[Axis]) -> Mixing:
-    """How constants follow the state; one out of range puts the film where no domain is."""
+    if not axes:
+        return write_onnx(graphs, metadata or {}, shapes=shapes)
     g, transform = state_graph(axes)
     film_z = g.input("film_z_mm", per_call=True)
     g.outputs["film_z_mm"] = g.select(g.outputs.pop("inside"), film_z, _NOWHERE)
-    return Mixing(g, transform)
+    return write_onnx(graphs, metadata or {}, Mixing(g, transform), shapes)
 
 
 def coefficients_text(nodes: Sequence[LensModel], **more: Any) -> str:

@@ -88,7 +88,7 @@ def prepare(pairs: RayPairs) -> Prepared:
 def fit_model(
     prepared: Prepared,
     settings: ModelSettings,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], object] = lambda share: None,
     *,
     checkpoint: Path | None = None,
 ) -> LensModel:
@@ -136,7 +136,7 @@ def as_model(prepared: Prepared, core: Core, settings: ModelSettings, fit_s: flo
 
 
 def _fit_core(
-    prepared: Prepared, settings: ModelSettings, progress: Callable[[float], None] | None, checkpoint: Path | None
+    prepared: Prepared, settings: ModelSettings, progress: Callable[[float], object], checkpoint: Path | None
 ) -> Core:
     mirror = prepared.encoding.mirror
     if settings.method in ("thin", "thick") and not mirror:
@@ -158,8 +158,8 @@ def _fit_core(
         if isinstance(base, RawPolynomial):
             raise InputError("fit", "basis", settings.basis, "invariants, with a network beside the polynomial")
         zone = next(zones)
-        share = None if progress is None else lambda part: progress((zone + part) / fits)
-        network = fit_network(data, settings, base=base, checkpoint=of_zone(checkpoint, zone), progress=share)
+        file, share = of_zone(checkpoint, zone), lambda part: progress((zone + part) / fits)
+        network = fit_network(data, settings, base=base, checkpoint=file, progress=share)
         return with_boundary_terms(data, network) if base is None else Residual((base, network))
 
     return fit_partitioned(prepared, settings.partitions, fit)

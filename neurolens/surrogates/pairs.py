@@ -129,8 +129,9 @@ def trace_pairs(lens: Lens, inputs: FilmRays, pupil_z: float) -> PairSet:
 
 
 def make_pairs(
-    lens: Lens, domain: Domain, settings: PairSettings | None = None, progress: Callable[[float], None] | None = None
-) -> RayPairs:
+    lens: Lens, domain: Domain, settings: PairSettings | None = None,
+    progress: Callable[[float], object] = lambda share: None,
+) -> RayPairs:  # fmt: skip
     """Sample a domain and trace it in float64 until `train` and `held_out` are full.
 
     `rim`, `edge` and `far` come from the rays drawn for `train`, as many as those hold.
@@ -181,8 +182,7 @@ def make_pairs(
         if drawn > 10000 * (counts["train"] + counts["held_out"] + 10):
             shown = f"({drawn} rays, {sum(counts.values())} passed)"
             raise InputError(lens.path, "domain", shown, "a domain that the lens can reach")
-        if progress:
-            progress((counts["train"] + counts["held_out"]) / total)
+        progress((counts["train"] + counts["held_out"]) / total)
     joined = {name: join_pairs(splits.pop(name)) for name in SPLITS}
     joined |= {name: _unreached_as_zero(joined[name]) for name in ("edge", "far")}
     return RayPairs(lens, domain, settings, **joined, tested=round(tested))

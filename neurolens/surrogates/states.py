@@ -281,7 +281,7 @@ class StateSettings:
 
 
 def fit_states(
-    space: StateSpace, settings: StateSettings | None = None, progress: Callable[[float], None] | None = None
+    space: StateSpace, settings: StateSettings | None = None, progress: Callable[[float], object] = lambda share: None
 ) -> StateModel:
     """Fit a model of all states of a space.
 
@@ -302,12 +302,15 @@ def fit_states(
         chosen: dict[int, Prepared] = {}
         for done, k in enumerate(choosers):
             chosen[k] = prepare(_pairs(space, states[k], settings))
-            if progress:
-                progress(0.3 * (done + 1) / len(choosers))
+            progress(0.3 * (done + 1) / len(choosers))
         # Every gate that any node needs, in the order in which camera rays meet them.
         needed = {g for p in chosen.values() for g in p.gates}
         gates = tuple(sorted(needed, key=lambda g: (-g.surface, g.reason)))
-        scales = _common_encoding([d.encoding for d in chosen.values()])
+        # Scales and chief ray are those of all nodes: a node's own follow its domain, which need not be smooth in the
+        # state; nor would be the lens in them.
+        encodings = [d.encoding for d in chosen.values()]
+        largest = {key: max(getattr(e, key) for e in encodings) for key in ("film_scale_mm", "pupil_scale_mm")}
+        scales = replace(encodings[0], chief=sum(e.chief for e in encodings) / len(encodings), **largest)
         chosen = {k: replace(d, encoding=_scaled_like(scales, d.encoding)) for k, d in chosen.items()}
         stop_mm = max(d.pairs.lens.stop_radius_mm for d in chosen.values())
         exponents, columns = _choose_jointly(list(chosen.values()), settings)
@@ -319,27 +322,13 @@ def fit_states(
                 pairs = _pairs(space, state, settings)
                 data = Prepared(pairs, _scaled_like(scales, fit_encoding(pairs.domain, pairs.train)), gates)
             nodes.append(_fit_node(data, exponents, columns, stop_mm, settings))
-            if progress:
-                progress(0.4 + 0.6 * (k + 1) / len(states))
+            progress(0.4 + 0.6 * (k + 1) / len(states))
     return StateModel(space, tuple(nodes), time.perf_counter() - start)
 
 
 def _pairs(space: StateSpace, state: State, settings: StateSettings) -> RayPairs:
     lens, domain = space.lens_at(state), space.domain_at(state)
     return make_pairs(lens, domain, PairSettings(settings.rays, 1, settings.rays, settings.seed))
-
-
-def _common_encoding(encodings: Sequence[Encoding]) -> Encoding:
-    """Scales and chief ray for all nodes: the largest, and the mean.
-
-    A node's own scales follow its domain, which need not be smooth in the state; nor would be the lens in them.
-    """
-    return replace(
-        encodings[0],
-        chief=sum(e.chief for e in encodings) / len(encodings),
-        film_scale_mm=max(e.film_scale_mm for e in encodings),
-        pupil_scale_mm=max(e.pupil_scale_mm for e in encodings),
-    )
 
 
 def _scaled_like(scales: Encoding, own: Encoding) -> Encoding:

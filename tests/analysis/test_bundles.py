@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from analysis_lenses import INF, cartesian, grid, library, scene, thin
+from path_difference import opd_mm
 from shipped import pinhole
 
 from neurolens.analysis.bundles import Pattern, bundle, hexapolar, points
@@ -19,7 +20,6 @@ from neurolens.analysis.spots import (
     diffraction_mtf,
     fans,
     mtf,
-    opd_mm,
     psf,
     spots,
     working_f_number,

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 from analysis_lenses import INF, cartesian, library, scene, slower, thin
+from path_difference import opd_mm
 
 from neurolens.analysis.bundles import bundle, points
 from neurolens.analysis.field_curves import colour, curvature, distortion, seidel
 from neurolens.analysis.fields import Scene
-from neurolens.analysis.spots import opd_mm
 from neurolens.base.errors import InputError
 from neurolens.lens.glass import index_of
 from neurolens.lens.prescription import Lens, Surface

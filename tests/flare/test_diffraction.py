@@ -8,12 +8,12 @@ from functools import lru_cache
 import numpy as np
 import pytest
 import torch
+from path_difference import opd_mm
 
 from experiments.starburst import light_of, streaks
 from neurolens.analysis.bundles import bundle
 from neurolens.analysis.bundles import points as stop_points
 from neurolens.analysis.fields import Scene
-from neurolens.analysis.spots import opd_mm
 from neurolens.base.errors import InputError
 from neurolens.flare import diffraction as d
 from neurolens.flare import exit_pupil as p

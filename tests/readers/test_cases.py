@@ -15,7 +15,7 @@ from neurolens.lens import catalogue
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any
-from neurolens.readers.draft import ReadOptions
+from neurolens.readers.source import ReadOptions
 
 CASES = Path(__file__).parents[3] / "shared" / "data" / "cases"
 needs_cases = pytest.mark.skipif(not CASES.exists(), reason="../shared/data/cases is not here")

@@ -14,8 +14,8 @@ from neurolens.lens import catalogue
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.readers.codev import read_seq
-from neurolens.readers.draft import ReadOptions
 from neurolens.readers.forbes import qbfs_terms, qcon_terms
+from neurolens.readers.source import ReadOptions
 
 TEXT = """\
 RDM;LEN       "VERSION: 11.2 SR1       LENS VERSION: 84       Creation Date: 28-May-2019"

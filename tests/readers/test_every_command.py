@@ -22,6 +22,7 @@ from neurolens.lens.shot import Shot
 from neurolens.readers import any_format
 from neurolens.readers.any_format import read_any
 from neurolens.readers.lensfile import read_lens, write_lens
+from neurolens.readers.source import ReadOptions
 from neurolens.render.pictures import read_exr
 
 LENSES = Path(__file__).parents[2] / "lenses"
@@ -222,9 +223,9 @@ def test_what_a_file_lacks_is_asked_of_convert(tessar: Lens, tmp_path: Path) -> 
     with pytest.raises(InputError, match=r"neurolens convert FILE --f-number \.\.\. -o LENS\.toml"):
         read_any(file)
     with pytest.raises(InputError) as plain:
-        read_any(file, any_format.ReadOptions())
+        read_any(file, ReadOptions())
     assert "convert" not in str(plain.value)
-    assert read_any(file, any_format.ReadOptions(f_number=8.0)).f_number == 8
+    assert read_any(file, ReadOptions(f_number=8.0)).f_number == 8
 
 
 def test_one_file_is_warned_of_once_in_a_command(files: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:

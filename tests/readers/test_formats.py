@@ -18,9 +18,8 @@ from neurolens.cli import main
 from neurolens.lens.paraxial import system_of
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any
-from neurolens.readers.draft import ReadOptions
 from neurolens.readers.lensfile import read_lens
-from neurolens.readers.source import MAX_BYTES
+from neurolens.readers.source import MAX_BYTES, ReadOptions
 
 NO_DISPERSION = (".len", ".dat", ".txt")
 

@@ -12,8 +12,8 @@ from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.readers.any_format import read_any
-from neurolens.readers.draft import ReadOptions
 from neurolens.readers.json_lens import read_json_lens
+from neurolens.readers.source import ReadOptions
 
 SHARED = sorted((Path(__file__).parents[3] / "shared" / "data" / "lenses").glob("*.json"))
 

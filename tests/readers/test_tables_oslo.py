@@ -11,8 +11,8 @@ from neurolens.base.errors import AssumedWarning, InputError, NeurolensWarning
 from neurolens.lens import catalogue
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.readers.draft import ReadOptions
 from neurolens.readers.oslo import read_len
+from neurolens.readers.source import ReadOptions
 from neurolens.readers.tables import read_table
 
 # A biconvex singlet of R = 50 mm, 5 mm thick, n = 1.5, behind a stop: EFL by the lensmaker's formula.

@@ -14,7 +14,7 @@ from neurolens.base.errors import AssumedWarning, InputError, NeurolensWarning
 from neurolens.lens import catalogue
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.readers.draft import ReadOptions
+from neurolens.readers.source import ReadOptions
 from neurolens.readers.zemax import read_zmx
 
 HEAD = """\

@@ -51,7 +51,7 @@ def _setup(name, **kwargs):
     return Prepared(pairs, fit_encoding(pairs.domain, pairs.train), gates)
 
 
-def fit(data, *, checkpoint=None, progress=None, **numbers):
+def fit(data, *, checkpoint=None, progress=lambda share: None, **numbers):
     return fit_network(data, ModelSettings("mlp", **numbers), checkpoint=checkpoint, progress=progress)
 
 

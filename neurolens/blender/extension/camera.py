@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from typing import Any
 
 import bpy
@@ -158,7 +159,8 @@ def apply(scene: Any, found: Any, lens: LensFacts, kind: str, *, fit_sensor: boo
     width = None
     if fit_sensor:
         width = fitting_width_mm(variant, setting)
-        setting = _resized(setting, width)
+        share = width / setting.sensor_mm[0]
+        setting = replace(setting, sensor_mm=(width, setting.sensor_mm[1] * share))
     if wrong := refusals(variant, setting):
         raise LensError("; ".join(wrong))
     try:
@@ -176,13 +178,6 @@ def apply(scene: Any, found: Any, lens: LensFacts, kind: str, *, fit_sensor: boo
         if not scene.neurolens_before:
             scene.neurolens_before = json.dumps(memory["scene"])
     camera.neurolens.on = f"{lens.lens_id}/{kind}"
-
-
-def _resized(setting: Setting, width_mm: float) -> Setting:
-    from dataclasses import replace
-
-    share = width_mm / setting.sensor_mm[0]
-    return replace(setting, sensor_mm=(width_mm, setting.sensor_mm[1] * share))
 
 
 def _set(
@@ -229,12 +224,10 @@ def _text(name: str, source: str) -> Any:
 
 
 def _compile(camera: Any) -> None:
-    try:
-        from cycles.osl import update_custom_camera_shader
-    except ImportError as error:
-        raise LensError(f"Cycles cannot compile shaders here: {error}") from None
     said: list[str] = []
     try:
+        from cycles.osl import update_custom_camera_shader
+
         done = update_custom_camera_shader(camera, lambda kind, text: said.append(text) if "ERROR" in kind else None)
     except ImportError as error:
         raise LensError(f"Cycles cannot compile shaders here: {error}") from None
@@ -275,12 +268,8 @@ def _remembered(scene: Any, camera: Any) -> dict[str, Any]:
     kept = {name: getattr(camera, name) for name in _CAMERA}
     kept["custom_shader"] = None if camera.custom_shader is None else camera.custom_shader.name
     kept["use_dof"] = camera.dof.use_dof
-    kept["custom"] = {k: _plain(v) for k, v in camera.cycles_custom.items()}
+    kept["custom"] = {k: list(v) if hasattr(v, "to_list") else v for k, v in camera.cycles_custom.items()}
     return {"camera": kept, "scene": {"engine": scene.render.engine, "device": scene.cycles.device}}
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if hasattr(value, "to_list") else value
 
 
 def take_back(scene: Any, found: Any) -> None:

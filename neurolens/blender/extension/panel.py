@@ -74,7 +74,8 @@ def _changed(props: Any, context: Any) -> None:
     if found is None:
         return
     try:
-        on_camera.apply(context.scene, found, lens_of(props), kind_of(props))
+        lens = lens_of(props)
+        on_camera.apply(context.scene, found, lens, kind_of(props, lens))
     except LensError as error:
         props.message = str(error)
 
@@ -119,10 +120,9 @@ def lens_of(props: Any) -> LensFacts:
     return LIBRARY.lenses[props.lens]
 
 
-def kind_of(props: Any) -> str:
+def kind_of(props: Any, lens: LensFacts) -> str:
     """The form that is chosen, or the first that the lens has."""
-    variants = lens_of(props).variants
-    return props.kind if props.kind in variants else next(iter(variants), "")
+    return props.kind if props.kind in lens.variants else next(iter(lens.variants), "")
 
 
 class _Operator(bpy.types.Operator):
@@ -160,12 +160,12 @@ class NEUROLENS_OT_apply(_Operator):
     }
 
     def act(self, context: Any, found: Any, props: Any) -> None:
-        lens_id, kind = self.lens or props.lens, self.kind
+        lens_id = self.lens or props.lens
         if lens_id not in LIBRARY.lenses:
             known = ", ".join(LIBRARY.lenses) or "none: the extension was packed without"
             raise LensError(f"There is no lens {lens_id!r}; lenses: {known}")
         lens = LIBRARY.lenses[lens_id]
-        chosen = kind or (props.kind if props.kind in lens.variants else next(iter(lens.variants), ""))
+        chosen = self.kind or kind_of(props, lens)
         on_camera.apply(context.scene, found, lens, chosen, fit_sensor=self.fit_sensor)
         props.busy = True
         props.lens, props.kind = lens_id, chosen
@@ -233,10 +233,11 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
         layout.template_icon_view(props, "lens", show_labels=True, scale=6.0)
         layout.prop(props, "lens", text="")
         try:
-            lens, kind = lens_of(props), kind_of(props)
+            lens = lens_of(props)
         except LensError as error:
             layout.label(text=str(error), icon="ERROR")
             return
+        kind = kind_of(props, lens)
         layout.label(text=lens.line)
         row = layout.row(align=True)
         row.use_property_split = False  # else the first form's name stands beside its button

@@ -67,7 +67,7 @@ def fit_network(
     *,
     base: InvariantPolynomial | None = None,
     checkpoint: Path | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], object] = lambda share: None,
 ) -> Network:
     """Fit a network of `layers` tanh layers of `units` units, in float64 on one thread.
 
@@ -93,8 +93,7 @@ def fit_network(
         key = _fingerprint(problem.tensors, {**decisive, "starts": STARTS, "rays": _RAYS})
         enough = (_ENOUGH * 1000 * data.pairs.domain.film_radius_mm) ** 2
         best = _Training(problem, settings, enough, Kept(checkpoint, key, EVERY_S), progress).run()
-    if progress:
-        progress(1.0)
+    progress(1.0)
     *hidden, output = ((w[:, :-1].numpy().copy(), w[:, -1].numpy().copy()) for w in (*best.hidden, best.output))
     return Network(tuple(hidden), output, shift.numpy(), scale.numpy())
 
@@ -200,7 +199,7 @@ class _Training:
         settings: ModelSettings,
         enough: float,
         checkpoint: Kept,
-        progress: Callable[[float], None] | None,
+        progress: Callable[[float], object],
     ) -> None:
         """Start, or go on from a checkpoint; `enough` is a loss below the rounding of float32 evaluation."""
         self._problem, self._settings, self._enough = problem, settings, enough
@@ -242,9 +241,8 @@ class _Training:
         count = min(_BURST, -(-(steps - course.taken) // each))
 
         def report(share: float) -> None:
-            if self._progress:
-                done = course.start * self._short + course.taken + share * count * each
-                self._progress(min(1.0, done / (STARTS * self._short + self._settings.steps)))
+            done = course.start * self._short + course.taken + share * count * each
+            self._progress(min(1.0, done / (STARTS * self._short + self._settings.steps)))
 
         best, self._optimiser = minimise(self._rays, self._optimiser, count, report)
         course.taken += count * each

@@ -200,7 +200,7 @@ class OptimiserState:
 
 
 def minimise(
-    problem: Problem, start: OptimiserState, steps: int, progress: Progress | None = None
+    problem: Problem, start: OptimiserState, steps: int, progress: Progress = lambda share: None
 ) -> tuple[Projection, OptimiserState]:
     """Levenberg-Marquardt on the hidden weights (damping after Nielsen 1999), scaled by the diagonal (Marquardt 1963).
 
@@ -228,8 +228,7 @@ def minimise(
             damping, growth = max(damping * max(0.1, 1 - (2 * min(gain, 1.0) - 1) ** 3), 1e-13), 2.0
         else:
             damping, growth = damping * growth, 2 * growth
-        if progress:
-            progress(taken / steps)
+        progress(taken / steps)
     return best, OptimiserState(best.hidden, damping, growth)
 
 
