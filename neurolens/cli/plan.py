@@ -298,8 +298,8 @@ def _text(command: Plan, result: plans.Plan, folder: Path) -> str:
         sentence += f"{number(best.cost, 3)} {result.unit} a path times noise"
         if result.work.rest[best.disperses]:
             (offer,) = offers(result.probed.scene, result.probed, [best], result.work)
-            sentence += f".\nThe picture takes {number(offer.seconds, 3)} s of one thread to the noise of the exact lens "
-            sentence += f"at the scene's samples, the camera {number(offer.camera, 2)} s of that"
+            sentence += f".\nThe picture takes {number(offer.seconds, 3)} s of one thread to the noise that the "
+            sentence += f"scene's samples have with the exact lens, the camera {number(offer.camera, 2)} s of that"
         if len(result.alike) > 1:
             sentence += f".\nAny of these takes about as long: {', '.join(result.alike)}"
         if (times := result.work.noise[best.disperses]) > 1 and not request.denoised:
