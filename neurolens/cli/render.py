@@ -22,7 +22,6 @@ from neurolens.cli.arguments import (
     Glasses,
     LensState,
     Reporting,
-    check_folder,
     check_suffix,
     dask,
     exposure,
@@ -281,7 +280,6 @@ examples:
         if not self.scene:
             self.refuse("--merge", "(no tiles)", "the tiles of a render")
         check_suffix(self.out, "--output", (".exr",))
-        check_folder(self.out, "--output")
         from neurolens.render.tiles import merge_tiles
 
         return self._say_pictures(merge_tiles(list(self.scene), self.out, self.picture.exposure))
