@@ -139,8 +139,7 @@ class ReducedDispersion:
 
     def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
         """The part of the weights that is the camera's own natural fall-off."""
-        base = self._base(film_mm, wavelength_nm)
-        return np.asarray(self.camera.natural(base, pupil, self._reference(film_mm)), np.float32)
+        return np.asarray(self.camera.natural(self._base(film_mm, wavelength_nm), pupil, self._reference(film_mm)))
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """The camera's film points at the one wavelength, moved to where these wavelengths are shown."""
@@ -229,7 +228,5 @@ def _monomials(at: Array) -> Array:
     """Products [M, N] of even powers of x and of y, of points [2, N]."""
     half = _DEGREE // 2 + 1
     square = at * at
-    powers = [np.ones_like(square), square]
-    while len(powers) < half:
-        powers.append(powers[-1] * square)
+    powers = np.cumprod([np.ones_like(square), *[square] * (half - 1)], axis=0)
     return np.stack([powers[a][0] * powers[b][1] for a in range(half) for b in range(half - a)])
