@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from experiments import lab
+from neurolens.cameras.build import as_c, ideal_as
 from neurolens.cameras.contract import Camera
 from neurolens.plan import plan as plans
 from neurolens.plan.candidates import EXACT, camera_of
@@ -50,10 +51,13 @@ def case(name: str, args: argparse.Namespace) -> list[lab.Row]:
     for offer in offered:
         if offer.choice.name in (EXACT, PLAIN) or offer.choice.name.endswith(MODEL):
             camera: Any = camera_of(made.probed, offer.choice)
+            area = getattr(camera, "area", 1.0)
+            if offer.choice.name == PLAIN:  # the map is applied afterwards, to a larger picture
+                camera = as_c(ideal_as("thick:", made.probed.exact.lens, made.probed.asked.shot))
             render(scene, camera, threads=1, samples=1)  # compiles what it needs
             seconds, variance = rendered(scene, camera)
             rows.append({"scene": name, "camera": offer.choice.name.rpartition(".")[2] or offer.choice.name,
-                         "planned": offer.seconds, "seconds": seconds, "variance": variance})  # fmt: skip
+                         "planned": offer.seconds, "seconds": area * seconds, "variance": variance})  # fmt: skip
     (exact,) = (row for row in rows if row["camera"] == EXACT)
     for row in rows:
         row["measured"] = row["seconds"] * row["variance"] / exact["variance"]

@@ -197,12 +197,10 @@ class Trial:
         return {"min": cost, "median": cost}, noise(seen.weight, self.share)
 
     def ideal(self, name: str, camera: Camera, seen: Footprints, area: float = 1.0) -> tuple[Timing, float]:
-        """The cost of a camera without a lens, whose picture is so many times as large."""
+        """The cost of a camera without a lens, and its noise times the area of its picture, which has more paths."""
         known = {"osl": CYCLES_NS, "glsl": GLSL_OPERATIONS}.get(self.target)
-        if known is not None:
-            return self.counted(area * known[name], seen)
-        timing, times = self.timed(camera, seen)
-        return {"min": area * timing["min"], "median": area * timing["median"]}, times
+        timing, times = self.timed(camera, seen) if known is None else self.counted(known[name], seen)
+        return timing, area * times
 
     def shader(self, file: str | Path) -> tuple[Timing, float]:
         """The cost of the shader of a model or a lens."""
