@@ -122,11 +122,11 @@ def run(args: argparse.Namespace) -> None:
     light = _range([four["mean"] / off["mean"] for four, off in pairs])
     colours = _range([a / b for four, off in pairs for a, b in zip(four["channels"], off["channels"], strict=True)])
     time = _range([r["four"]["seconds"] / r["one"]["seconds"] for r in rows])
-    told = [f"Four over the same lens without dispersion: luminance {light}, channels {colours};"]
-    told.append(f"time over one wavelength {time}.")
+    told = [f"Four wavelengths a path have {light} times the luminance variance of the same lens without dispersion,"]
+    told.append(f"and {colours} times in the channels; they take {time} times as long as one wavelength a path.")
     for mode in ("four", "lateral"):
         gains = [_range([row[mode][key] for row in rows]) for key in ("gain", "gain_channels")]
-        told.append(f"Time to equal error, {mode}: luminance {gains[0]}, channels {gains[1]}.")
+        told.append(f"Equal error takes {gains[0]} times less time in luminance with {mode}, {gains[1]} in channels.")
     parts.append(" ".join(told))
     data = {"machine": lab.machine(), "rows": rows}
     print(lab.write_results(args.out, "dispersion", lab.page("# Lenses that disperse", *parts), data))

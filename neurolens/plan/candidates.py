@@ -60,7 +60,7 @@ class Choice:
     Attributes:
         camera: the text that `--camera` or `export` takes.
         error_px, light_error: at the counted percentile; inf where it has no light that the lens has.
-        cost: of the camera on a path, in the plan's unit, times `noise`; inf where it was not asked for.
+        cost: what the camera takes on a path, in the plan's unit, times `noise`; inf where nobody asked for it.
         noise: how many times the paths it needs for equal error, see `costs`.
         how: what else it needs, or how it was made.
         within: whether it meets the budget of its plan.
@@ -390,7 +390,7 @@ def shot_fits(
 def _fitted(trial: Trial, folder: Path, tried: Sequence[_Judged], say: Report) -> list[_Judged]:
     """Polynomials fitted for the shot alone: the smallest that holds each budget, and those on the way to it.
 
-    None where a camera without a lens does, which costs less than any, unless all is asked for.
+    Nothing is fitted where a pinhole or an ideal lens, which costs less, holds a budget, unless all are asked for.
     """
     probed = trial.probed
     easy = [j.choice for j in tried if j.choice.name.startswith(IDEAL) and not trial.explain]

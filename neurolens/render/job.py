@@ -423,8 +423,8 @@ def mode_for(
 
 
 def dispersion_px(camera: Camera, grid: PixelGrid, limits_nm: tuple[float, float]) -> float:
-    """By how many pixels the wavelength moves what the camera shows: RMS over film and pupil, of the worst of some
-    wavelengths beside the middle one."""
+    """The shift of the camera's picture with the wavelength, in pixels: RMS over film and pupil, between the middle
+    wavelength and the one of five that moves it most."""
     low, high = limits_nm
     random = np.random.default_rng(0)
     film = (random.random((2, _PROBES)) - 0.5) * np.array(grid.film_mm)[:, None]
