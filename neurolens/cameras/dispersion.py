@@ -133,7 +133,7 @@ class ReducedDispersion:
         places = np.concatenate([film_mm[None], base + self._shifts(film_mm, wavelength_nm[1:])])
         passed = (np.abs(places) < np.array(self.film_mm, np.float32)[:, None] / 2).all(axis=1) & (rays.weight > 0)
         passed[0] = rays.weight > 0
-        share = plain.weight * self._tints(wavelength_nm) / np.maximum(passed.sum(axis=0), 1)
+        share = plain.weight * self.tints(wavelength_nm) / np.maximum(passed.sum(axis=0), 1)
         places = np.where(passed[:, None], places, film_mm).astype(np.float32)
         return SpectralRays(rays, np.where(passed, share, 0).astype(np.float32), places)
 
@@ -163,14 +163,14 @@ class ReducedDispersion:
         middle, light = np.zeros_like(square), np.full(square.shape[1], nm, np.float32)
         return float(self.camera.sample(middle, square, light).weight.mean(dtype=np.float64))
 
-    def _tints(self, wavelength_nm: FloatArray) -> FloatArray:
+    def tints(self, wavelength_nm: FloatArray) -> FloatArray:
         """The light of wavelengths on the axis over that of the one wavelength."""
         return np.interp(np.nan_to_num(wavelength_nm), self._lit_nm, self._tint).astype(np.float32)
 
     def _tinted(self, rays: Any, wavelength_nm: FloatArray) -> Any:
         light = is_light(wavelength_nm)  # else a ray would hide that its wavelength is none
         status = np.where(light, rays.status, np.int32(st.OUTSIDE_DOMAIN))
-        return replace(rays, weight=rays.weight * self._tints(wavelength_nm) * light, status=status)
+        return replace(rays, weight=rays.weight * self.tints(wavelength_nm) * light, status=status)
 
     def _base(self, film_mm: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
         """The film points that show at the one wavelength what these show at theirs."""

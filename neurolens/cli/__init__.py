@@ -65,10 +65,11 @@ def build_parser() -> Parser:
     from neurolens.cli.stmap import StMap
     from neurolens.cli.survey import Survey
     from neurolens.cli.train import Train
+    from neurolens.cli.verify import Verify
     from neurolens.cli.view import View
 
     groups: dict[str, tuple[type[Command], ...]] = {
-        "lenses": (Lens, Analyse, Convert, Glass, Library, Survey, View),
+        "lenses": (Lens, Analyse, Verify, Convert, Glass, Library, Survey, View),
         "camera models of a lens": (Train, Models, Evaluate),
         "pictures": (Demo, Plan, Render, Flare),
         "compositing and other programs": (StMap, Projection, Export, Blender, Mitsuba),

@@ -128,6 +128,8 @@ class Lens:
 
     Attributes:
         name, designer, source, notes: as cited in the lens file.
+        believed_to_be: the product that the source's example is believed to be, "" where nobody says so.
+        measured: what photographs of that product say (`photographs.verify`), as pairs of key and value.
         rims: whether the rim diameters are the source's own or "estimated" by somebody.
         f_number: nominal, of the source; the stop's own diameter rules the trace.
         stated_efl_mm: focal length as the source states it, to check the computed one against; of an anamorphic lens in
@@ -153,6 +155,8 @@ class Lens:
     half_field_deg: float | None = None
     designer: str = ""
     notes: str = ""
+    believed_to_be: str = ""
+    measured: tuple[tuple[str, Any], ...] = ()
     rims: str = "source"
     film_z_mm: float | None = None
     configurations: tuple[Configuration, ...] = ()

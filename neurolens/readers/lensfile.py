@@ -29,15 +29,18 @@ MAX_TERMS = 1000  # aspheric coefficients of all surfaces: each costs every ray 
 MAX_LAYERS = 200
 _LONGEST_NM = 780.0  # of visible light
 FILM_KEYS = ("index", "thickness_nm", "V_d")
-RIMS = ("source", "estimated", "derived")
+MEASURED_TEXTS, MEASURED_NUMBERS = ("profile", "match"), ("distortion_percent", "light_widest_stops", "light_f8_stops")
+RIMS = ("source", "estimated", "derived", "photographs")
 MAX_WAVELENGTHS = 100
 # Keys of the head and the field of `Lens` that each one is, in the order in which they are written.
 HEAD = {
-    **{key: key for key in ("name", "designer", "source", "f_number")},
+    **{key: key for key in ("name", "believed_to_be", "designer", "source", "f_number")},
     **{"efl_mm": "stated_efl_mm", "efl_x_mm": "stated_efl_x_mm"},
     **{key: key for key in ("image_radius_mm", "half_field_deg", "rims", "wavelengths_nm")},
 }
-LENS_KEYS = ("schema", *HEAD, "notes", "object_medium", "surfaces", "coating", "configuration", "aperture")
+LENS_KEYS = (
+    "schema", *HEAD, "notes", "object_medium", "surfaces", "coating", "configuration", "aperture", "measured"
+)  # fmt: skip
 MEDIUM_KEYS = ("n_d", "V_d", "glass", "material")
 # Numbers of a surface stand in columns; texts and tables go last, as a column of glass names needs no right edge.
 COLUMNS = (
@@ -73,10 +76,10 @@ def read_lens(path: str | Path, data: Mapping[str, Any] | None = None) -> Lens:
     medium = Medium(**_glass(table.inner("object_medium", data.get("object_medium", {}), MEDIUM_KEYS, example)))
     surfaces = _surfaces(table, medium)
     if data.get("rims", "(missing)") not in RIMS:
-        expected = 'where the diameters come from: "source", "estimated" or "derived"'
+        expected = 'where the diameters come from: "source", "estimated", "derived" or "photographs"'
         raise table.error("rims", data.get("rims", "(missing)"), expected)
     stated: dict[str, Any] = {key: table.text(key) for key in ("name", "source", "rims")}
-    stated |= {key: table.text(key, required=False) for key in ("designer", "notes")}
+    stated |= {key: table.text(key, required=False) for key in ("believed_to_be", "designer", "notes")}
     stated |= {HEAD[key]: table.optional(key) for key in ("image_radius_mm", "efl_mm", "efl_x_mm")}
     lens = Lens(
         surfaces=surfaces,
@@ -87,6 +90,7 @@ def read_lens(path: str | Path, data: Mapping[str, Any] | None = None) -> Lens:
         aperture=_aperture(table),
         object_medium=medium,
         wavelengths_nm=_wavelengths(table),
+        measured=_measured(table),
         **stated,
     )
     lens = _with_rims(lens, table)
@@ -270,6 +274,15 @@ def _aperture(table: Table) -> Aperture | None:
         raise blades.error(error.field, error.value, error.expected) from None
 
 
+def _measured(lens: Table) -> tuple[tuple[str, Any], ...]:
+    if "measured" not in lens:
+        return ()
+    keys = (*MEASURED_TEXTS, *MEASURED_NUMBERS)
+    table = lens.inner("measured", lens.data["measured"], keys, "a table under [measured]")
+    given = [key for key in keys if key in table]
+    return tuple((key, table.text(key) if key in MEASURED_TEXTS else table.number(key)) for key in given)
+
+
 def _configurations(lens: Table, n_surfaces: int) -> tuple[Configuration, ...]:
     result: list[Configuration] = []
     for place, given in enumerate(lens.tables("configuration")):
@@ -310,6 +323,8 @@ def format_lens(lens: Lens) -> str:
     for name, layers in _stacks(lens).items():
         text += f"\n[[coating]]\nname = {format_value(name)}\nlayers = {format_value(layers)}\n"
     text += _blades(lens)
+    if lens.measured:
+        text += "\n[measured]\n" + "".join(f"{key} = {format_value(value)}\n" for key, value in lens.measured)
     for c in lens.configurations:
         text += f"\n[[configuration]]\nname = {format_value(c.name)}\n"
         for key in STATE_NUMBERS:

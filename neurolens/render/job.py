@@ -243,7 +243,10 @@ class Job:
             return self._camera_rays(camera, film_mm, pupil, nm)
         hero = self._camera_rays(camera, film_mm, pupil, nm[:1])
         weight = np.repeat(hero.weight, lanes, axis=0)
-        if camera.dispersive or not getattr(camera, "achromatic", False):
+        if (tints := getattr(camera, "tints", None)) is not None:  # nothing else depends on the wavelength
+            light = tints(nm)
+            weight *= np.divide(light, light[0], out=np.zeros_like(light), where=light[0] > 0)
+        elif camera.dispersive or not getattr(camera, "achromatic", False):
             for lane in range(1, lanes):
                 weight[lane] = self._camera_rays(camera, film_mm, pupil, nm[lane : lane + 1]).weight
             weight *= hero.weight > 0  # the hero's ray must exist

@@ -40,7 +40,7 @@ def pupil_plane_z_mm(lens: Lens) -> float:
     film = data.rear_focal_z_mm
     z = data.exit_pupil_z_mm
     useful = math.isfinite(z) and 0.25 * (film - rear) < film - z < 20 * abs(data.efl_mm)
-    return float(z) if useful else _rear_opening_mm(lens, film)[1]
+    return float(z) if useful else rear_opening_mm(lens, film)[1]
 
 
 def camera_rays(
@@ -359,7 +359,7 @@ def image_radius_mm(lens: Lens) -> tuple[float, str]:
 def _illumination(lens: Lens, radii: Tensor, points: int = 48) -> tuple[Tensor, Tensor]:
     """Return the relative film irradiance (any unit) and mean angle (rad) of the passing rays at each film radius."""
     film_z = lens.film_z_mm if lens.film_z_mm is not None else float(lens.vertices_mm[-1])
-    rear, rear_z = _rear_opening_mm(lens, film_z)
+    rear, rear_z = rear_opening_mm(lens, film_z)
     grid = torch.linspace(-rear, rear, points, dtype=torch.float64)
     # The half above the axis stands for both.
     film, px, py = (t.reshape(-1) for t in torch.meshgrid(radii, grid, grid[points // 2 :], indexing="ij"))
@@ -371,7 +371,7 @@ def _illumination(lens: Lens, radii: Tensor, points: int = 48) -> tuple[Tensor, 
     return weight.sum(1), (theta * weight).sum(1) / weight.sum(1).clamp_min(1e-30)
 
 
-def _rear_opening_mm(lens: Lens, film_z: float) -> tuple[float, float]:
+def rear_opening_mm(lens: Lens, film_z: float) -> tuple[float, float]:
     """Return the radius and z of the disc through which light comes to the film: the last rim.
 
     Of a cover glass that all but lies on the film the light of one film point fills a speck; then it is the rim before,

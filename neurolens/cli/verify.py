@@ -1,0 +1,102 @@
+"""`neurolens verify LENS`: a lens file held against what photographs of the product measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from neurolens.base.settings import setting
+from neurolens.cli.arguments import Answering, Glasses, check_suffix, lens, output_path
+from neurolens.cli.output import number, table
+
+if TYPE_CHECKING:
+    from neurolens.photographs.compare import Comparison, Curve
+    from neurolens.photographs.verify import Verified
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verify(Glasses, Answering):
+    """Compare a lens file with photographs: lensfun's measured profiles of 1,300 lenses, found by maker, focal length,
+    f-number and name (what the file says it is believed to be, its name, the file's own name).
+
+    Compared are the shape of the distortion over image height, lateral colour over broad bands as a camera's, and light
+    by aperture. A profile leaves the scale of the picture free, and it is taken out. Rays come from infinity; the
+    photographs' distance is not known. Needs the extras "train" and "photographs" (lensfunpy, which brings the
+    profiles; their licence is CC BY-SA 3.0)."""
+
+    about: ClassVar[str] = "hold a lens file against photographs of the product"
+    epilog: ClassVar[str] = """\
+examples:
+  neurolens verify lenses/sony_sonnar_55.toml -o sonnar.png
+  neurolens verify "Nikon AF Nikkor 28mm f1.4D.zmx" --json
+  neurolens verify my_lens.toml --profile "Canon EF 50mm f/1.2L USM" --lens-file my_verified_lens.toml"""
+    kept: ClassVar[str] = "only a finished picture or lens file is written"
+
+    file: Path = lens(positional=True)
+    profile: str | None = setting(None, "lensfun's name of the lens, where it is not found by itself", metavar="NAME")
+    out: Path | None = output_path("OUT.png", "draw measured points and computed curves (png, pdf, svg)", None)
+    lens_file: Path | None = setting(
+        None, "write the lens with the result in its table [measured], which its models keep", metavar="OUT.toml",
+        kind=Path,
+    )  # fmt: skip
+
+    def run(self) -> int:
+        """Compare, draw, write."""
+        if self.out is not None:
+            check_suffix(self.out, "--output", (".png", ".pdf", ".svg"))
+        if self.lens_file is not None:
+            check_suffix(self.lens_file, "--lens-file", (".toml",))
+        from neurolens.photographs.verify import FREE, verify
+        from neurolens.readers.any_format import read_any
+
+        tabled = read_any(self.file)
+        found = verify(tabled, self.profile)
+        if self.out is not None:
+            from neurolens.photographs.plots import plot_verified
+
+            plot_verified(found, self.out, tabled.believed_to_be or tabled.name)
+        if self.lens_file is not None:
+            from neurolens.readers.lensfile import write_lens
+
+            write_lens(replace(tabled, measured=tuple(found.measured.items())), self.lens_file)
+        files = [str(path) for path in (self.out, self.lens_file) if path is not None]
+        data = {"file": str(self.file), "name": tabled.name, **found.to_dict(), "measured": found.measured}
+        return self.answer({**data, "free": FREE, "files": files}, lambda: _text(found, tabled.name, [FREE, *files]))
+
+
+def _text(found: Verified, name: str, last: list[str]) -> str:
+    other = f"; also possible: {', '.join(found.also)}" if found.also else ""
+    lines = [
+        f"{name}\nagainst lensfun's {found.profile}, crop {found.crop:g} (match of names: {found.certainty}{other})"
+    ]
+    header = (
+        "mm",
+        "distortion %",
+        "red µm",
+        "measured",
+        "blue µm",
+        "measured",
+        "f/8 stops",
+        "measured",
+        "widest",
+        "measured",
+    )
+    lines.append(table(header, [_row(c) for c in found.comparisons]))
+    lines.append("distortion: residual of its shape; colour and light: computed and measured at the largest height")
+    return "\n".join([*lines, *(f"- {sentence}" for sentence in found.verdict), *last])
+
+
+def _row(c: Comparison) -> list[str]:
+    from neurolens.photographs.verify import near_f8
+
+    cells = [f"{c.focal_mm:g}", number(c.distortion and c.distortion.rms, 2)]
+    eight, widest = (c.light[near_f8(c.light)], c.light[min(c.light)]) if c.light else (None, None)
+    for curve, digits in ((c.red, 2), (c.blue, 2), (eight, 3), (widest, 3)):
+        cells += [number(v, digits) for v in _last(curve)]
+    return cells
+
+
+def _last(curve: Curve | None) -> tuple[Any, Any]:
+    """The computed and the measured figure at the largest height."""
+    return (None, None) if curve is None else (float(curve.ours[-1]), float(curve.measured[-1]))

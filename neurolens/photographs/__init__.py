@@ -1,0 +1,1 @@
+"""Lenses held against measurements of photographs."""

@@ -1,0 +1,58 @@
+"""One picture of what photographs measured, as points, and what rays give, as lines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from neurolens.analysis.plots import FIELD_COLOURS, INK, drawing
+from neurolens.photographs.compare import Curve
+from neurolens.photographs.verify import Verified
+
+_MOST = 6  # apertures, or focal lengths, that are drawn
+
+
+def plot_verified(found: Verified, path: Path, title: str) -> None:
+    """Draw distortion, lateral colour and light over image height; of a zoom, some of its focal lengths."""
+    some = _spread(list(found.comparisons))
+    subtitle = f"points: photographs, lensfun's {found.profile} ({found.certainty}); lines: rays.\n" + "; ".join(
+        found.verdict
+    )
+    with drawing(path, 13.5, 5.2, title, subtitle) as figure:
+        left, middle, right = figure.subplots(1, 3)
+        for axes, label in (
+            (left, "distortion, % of the height, mean removed"),
+            (middle, "beside green, µm"),
+            (right, "light beside the axis, stops"),
+        ):
+            axes.grid(True)
+            axes.set(xlabel="image height, mm", ylabel=label)
+        for colour, c in zip(FIELD_COLOURS, some, strict=False):
+            if c.distortion is not None:
+                _both(left, c.distortion, colour, f"{c.focal_mm:g} mm")
+        for name, colour in (("red", "#d55e00"), ("blue", "#0072b2")):
+            curve = getattr(some[-1], name)
+            if curve is not None:
+                _both(middle, curve, colour, f"{name}, {some[-1].focal_mm:g} mm")
+        lit = [c for c in some if c.light]
+        if lit:
+            for colour, f_number in zip(FIELD_COLOURS, _spread(sorted(lit[0].light)), strict=False):
+                _both(right, lit[0].light[f_number], colour, f"f/{f_number:g}")
+            right.set_title(f"{lit[0].focal_mm:g} mm", loc="right", fontsize=9, color=INK)
+        for axes in (left, middle, right):
+            if axes.lines:
+                axes.legend()
+            else:
+                axes.text(0.5, 0.5, "not measured", ha="center", transform=axes.transAxes, color=INK)
+
+
+def _both(axes: Any, curve: Curve, colour: str, label: str) -> None:
+    axes.plot(curve.height_mm, curve.ours, color=colour, label=label)
+    axes.plot(curve.height_mm, curve.measured, "o", color=colour, markersize=3.5)
+
+
+def _spread(items: list[Any]) -> list[Any]:
+    """At most `_MOST` of a list, evenly spread, both ends among them."""
+    if len(items) <= _MOST:
+        return items
+    return [items[round(k * (len(items) - 1) / (_MOST - 1))] for k in range(_MOST)]

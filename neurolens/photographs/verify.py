@@ -1,0 +1,183 @@
+"""The verdict of photographs on a lens file: which profile, what differs, and in words what that means."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from neurolens.analysis.fields import Result
+from neurolens.base.errors import InputError
+from neurolens.lens.paraxial import first_order
+from neurolens.lens.prescription import Lens
+from neurolens.photographs.compare import Comparison, compare, heights_of
+from neurolens.photographs.profiles import Match, Profile, matches, name_of, profile_named
+from neurolens.setting.states import at_infinity
+
+# Residuals of the shape of distortion (percent) and of light (stops, root mean square over heights) that half and nine
+# tenths of sound tables keep: see experiments/results/photographs.md.
+SOUND_PERCENT, DOUBTFUL_PERCENT = 0.1, 0.3
+SOUND_STOPS = 0.15
+_OTHER_FOCAL = 0.06  # relative difference of focal length from which a profile is of another lens
+FREE = "free in a profile, and taken out: the scale, the light on the axis; unknown: the distance of the photographs"
+
+
+@dataclass(frozen=True)
+class Verified(Result):
+    """A lens held against a profile.
+
+    Attributes:
+        profile: as lensfun names it, with its maker. certainty: of the match, in a word; also: other likely profiles.
+        crop: that of the profile's camera.
+        comparisons: by focal length of the profile.
+        uncertainty_percent: of the profile's own distortion, where several cameras were measured; NaN where one was.
+        verdict: sentences.
+    """
+
+    profile: str
+    certainty: str
+    also: tuple[str, ...]
+    crop: float
+    comparisons: tuple[Comparison, ...]
+    uncertainty_percent: float
+    verdict: tuple[str, ...]
+
+    @property
+    def distortion_percent(self) -> float:
+        """Median over focal lengths of the residual; NaN where distortion was not measured."""
+        return _median(c.distortion.rms for c in self.comparisons if c.distortion is not None)
+
+    def light_stops(self, *, widest: bool) -> float:
+        """Median over focal lengths of the residual of light, at the widest aperture or at the one nearest to f/8."""
+        each = []
+        for c in (c for c in self.comparisons if c.light):
+            f_number = min(c.light) if widest else near_f8(c.light)
+            each.append(c.light[f_number].rms)
+        return _median(each)
+
+    @property
+    def measured(self) -> dict[str, Any]:
+        """What a lens file and the cards of its models keep."""
+        figures = {
+            "distortion_percent": self.distortion_percent,
+            "light_widest_stops": self.light_stops(widest=True),
+            "light_f8_stops": self.light_stops(widest=False),
+        }
+        kept = {key: round(value, 4) for key, value in figures.items() if math.isfinite(value)}
+        return {"profile": self.profile, "match": self.certainty, **kept}
+
+
+def near_f8(f_numbers: Iterable[float]) -> float:
+    """The aperture nearest to f/8, at which hardly any rim of a lens is seen."""
+    return min(f_numbers, key=lambda f: abs(math.log(f / 8)))
+
+
+def _median(values: Iterable[float]) -> float:
+    known = [v for v in values if math.isfinite(v)]
+    return median(known) if known else math.nan
+
+
+def names_of(lens: Lens) -> list[str]:
+    """The names under which a lens is looked for: what it is believed to be, its own, and that of its file."""
+    stem = Path(lens.path).stem.replace("_", " ")
+    return [name for name in (lens.believed_to_be, f"{lens.designer} {lens.name}", stem) if name.strip()]
+
+
+def found_for(lens: Lens, wanted: str | None = None) -> tuple[Match, list[Profile], tuple[str, ...]]:
+    """The profile for a lens, all profiles of that name, and the names of others that are likely.
+
+    Raises:
+        InputError: no profile for the lens, or none of the name that is wanted.
+    """
+    if wanted is not None:
+        same = profile_named(wanted)
+        return Match(same[0], 1.0), _by_film(same, lens), ()
+    found = [m for m in matches(names_of(lens)) if m.certainty != "uncertain"]
+    if not found:
+        known = [name for name in names_of(lens) if name_of(name)]
+        expected = "a lens that lensfun measured, or --profile NAME"
+        raise InputError(lens.path, "name", known[0] if known else lens.name, expected)
+    best = found[0]
+    same = [m.profile for m in found if (m.profile.maker, m.profile.model) == (best.profile.maker, best.profile.model)]
+    also = dict.fromkeys(m.profile.model for m in found if m.likeness == best.likeness and m.profile not in same)
+    return best, _by_film(same, lens), tuple(also)
+
+
+def _by_film(profiles: Sequence[Profile], lens: Lens) -> list[Profile]:
+    """Profiles in the order of use: of the largest film that the lens lights, then with light, then others."""
+    radius = 1.1 * (lens.image_radius_mm or math.inf)
+    return sorted(profiles, key=lambda p: (p.half_diagonal_mm > radius, p.crop, not p.light))
+
+
+def verify(lens: Lens, profile: str | None = None) -> Verified:
+    """Compare a lens of a file with the profile that its name finds, at every focal length of the profile.
+
+    Raises:
+        InputError: no profile; a lens with cylinders, which has two distortions; one of another focal length.
+    """
+    if lens.anamorphic:
+        raise InputError(lens.path, "cylinder", "(an anamorphic lens)", "a lens that is symmetric about its axis")
+    match, profiles, also = found_for(lens, profile)
+    used = profiles[0]
+    _check_focal_length(lens, used)
+    whole = [compare(lens, used, focal) for focal in used.focal_mm]
+    name = used.model if used.maker.split()[0].lower() in used.model.lower() else f"{used.maker} {used.model}"
+    bare = Verified(name, match.certainty, also, used.crop, tuple(whole), _spread(profiles, lens), ())
+    return Verified(**{**vars(bare), "verdict": tuple(_said(bare))})
+
+
+def _check_focal_length(lens: Lens, profile: Profile) -> None:
+    """Raise where no focal length of the profile is one of the lens."""
+    efl = [float(first_order(at_infinity(lens)).efl_mm)]
+    efl += [c.efl_mm for c in lens.configurations if c.efl_mm and c.object_distance_mm is None]
+    low, high = min(efl) * (1 - _OTHER_FOCAL), max(efl) * (1 + _OTHER_FOCAL)
+    if not any(low <= focal <= high for focal in profile.focal_mm):
+        expected = " or ".join(f"{focal:g} mm" for focal in profile.focal_mm[:4])
+        raise InputError(lens.path, "efl_mm", f"{efl[0]:.4g}", f"{expected}, of lensfun's {profile.model}")
+
+
+def _spread(profiles: Sequence[Profile], lens: Lens) -> float:
+    """Root mean square difference of distortion between the profiles of one lens, on the smaller film of two."""
+    each = []
+    first = profiles[0]
+    for other in profiles[1:]:
+        height = heights_of(max(first, other, key=lambda p: p.crop), lens)
+        for a in first.distortion:
+            for b in (b for b in other.distortion if b.focal_mm == a.focal_mm):
+                ratio = first.stretch(a, height) / other.stretch(b, height)
+                each.append(100 * float(np.nanstd(ratio)))
+    return _median(each)
+
+
+def _said(found: Verified) -> list[str]:
+    """The verdict in sentences."""
+    off, slack = found.distortion_percent, found.uncertainty_percent
+    lines = []
+    if math.isnan(off):
+        lines.append("distortion was not measured")
+    else:
+        own = f" (two cameras differ by {slack:.2g}%)" if math.isfinite(slack) else ""
+        sound = "agree" if off <= SOUND_PERCENT else "roughly agree" if off <= DOUBTFUL_PERCENT else "disagree"
+        lines.append(f"the figures {sound} with the photographs: distortion within {off:.2g}% of the image height{own}")
+    lines.append(_said_of_light(found))
+    if found.certainty != "certain":
+        lines.append(f"the match of the names is only {found.certainty}")
+    return lines
+
+
+def _said_of_light(found: Verified) -> str:
+    closed, wide = found.light_stops(widest=False), found.light_stops(widest=True)
+    if math.isnan(wide):
+        return "light was not measured"
+    if wide <= SOUND_STOPS:
+        return f"the rims agree with the photographs: light wide open within {wide:.2g} stops"
+    curves = [c.light[min(c.light)] for c in found.comparisons if c.light]
+    word = "darker" if _median(float(np.nanmean(c.measured - c.ours)) for c in curves) < 0 else "brighter"
+    if closed > SOUND_STOPS:
+        return f"the real lens is {word} by {wide:.2g} stops, at f/8 by {closed:.2g}: rims alone cannot explain that"
+    return f"the real lens is {word} wide open by {wide:.2g} stops: its rims are others (see neurolens rims)"

@@ -1,0 +1,165 @@
+"""Lens files held against profiles: profiles made of a lens's own rays agree with it, and changes to it are seen."""
+
+import json
+import math
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from neurolens.analysis.field_curves import illumination
+from neurolens.analysis.fields import Scene
+from neurolens.cli import main
+from neurolens.lens.prescription import Lens
+from neurolens.photographs.compare import compare, with_real_glasses
+from neurolens.photographs.light import open_light
+from neurolens.photographs.profiles import FULL_FRAME_MM, Light, Profile, Radial
+from neurolens.photographs.verify import names_of, verify
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
+
+ROOT = Path(__file__).parents[2]
+SONNAR = ROOT / "lenses" / "sony_sonnar_55.toml"
+
+
+@cache
+def lens_of(name: str) -> Lens:
+    return read_lens(ROOT / "lenses" / f"{name}.toml")
+
+
+def own_profile(lens: Lens, focal_mm: float, f_numbers: tuple[float, ...] = ()) -> Profile:
+    """A profile that somebody with perfect photographs of this lens would have fitted."""
+    scene = Scene(set_lens(lens))
+    tangent = np.linspace(0.01, 1.1 * FULL_FRAME_MM / scene.first_order.efl_mm, 60)
+    height = scene.chief_rays(np.degrees(np.arctan(tangent))).height_mm.numpy()
+    known = np.isfinite(height)
+    ideal = tangent[known] * 1.02 * scene.first_order.efl_mm / 12  # in half short sides, to a scale that is not told
+    factors = np.polynomial.polynomial.polyfit(ideal, height[known] / 12 / ideal, 8)
+    lights = []
+    for f_number in f_numbers:
+        seen = illumination(Scene(set_lens(lens, f_number=f_number)), fields=13)
+        r2 = (seen.height_mm / FULL_FRAME_MM) ** 2
+        k = np.linalg.lstsq(np.stack([r2, r2**2, r2**3], 1), seen.relative - 1, rcond=None)[0]
+        lights.append(Light(focal_mm, f_number, 1000.0, (float(k[0]), float(k[1]), float(k[2]))))
+    distortion = (Radial(focal_mm, tuple(map(float, factors))),)
+    return Profile(
+        "Some", f"{focal_mm:g}mm f/{lens.f_number:g}", 1.0, 1.5, "rectilinear", distortion, (), (), tuple(lights)
+    )
+
+
+@pytest.mark.parametrize("name", ["laikin_double_gauss_50", "tajima_retrofocus_24"])
+def test_a_profile_of_the_lens_itself_agrees(name: str) -> None:
+    lens = lens_of(name)
+    focal = float(Scene(set_lens(lens)).first_order.efl_mm)
+    found = compare(lens, own_profile(lens, focal, (lens.f_number, 8.0)), focal)
+    assert found.distortion is not None and found.distortion.rms < 0.005
+    assert np.ptp(found.distortion.measured) > 0.1  # there is something to agree with
+    for curve in found.light.values():
+        assert curve.rms < 0.03  # three terms do not hold the lens's curve better
+
+
+def test_aspheres_that_are_left_out_are_seen() -> None:
+    """The residual is what the change does to the distortion."""
+    lens = lens_of("sony_sonnar_55")
+    focal = float(Scene(set_lens(lens)).first_order.efl_mm)
+    plain = replace(lens, surfaces=tuple(replace(s, asphere=()) for s in lens.surfaces))
+    found = compare(plain, own_profile(lens, focal), focal).distortion
+    both = [Scene(set_lens(x)) for x in (lens, plain)]
+    fields = both[0].fields_at(list(np.linspace(6, 20, 8)))
+    ratio = np.divide(*(scene.chief_rays(fields).height_mm.numpy() for scene in both))
+    assert found is not None and found.rms > 0.1
+    assert found.rms == pytest.approx(100 * np.std(ratio), rel=0.35)  # the heights are others
+
+
+@pytest.mark.parametrize("name", ["sony_sonnar_55", "horimoto_fisheye_16", "phone_lens_6", "laikin_double_gauss_50"])
+def test_light_of_one_trace_is_that_of_a_trace_for_every_stop(name: str) -> None:
+    """Beside `illumination`, which searches the outline of what is lit and integrates over it."""
+    lens = lens_of(name)
+    rims = np.array(set_lens(lens).semi_diameters_mm)
+    for f_number, most in ((lens.f_number, 0.003), (8.0, 0.006)):
+        stopped = set_lens(lens, f_number=f_number)
+        seen = illumination(Scene(stopped), fields=5)
+        opened = open_light(set_lens(lens), seen.height_mm, rims)
+        radii = rims.copy()
+        radii[lens.stop_index] = stopped.stop_radius_mm
+        light = opened.at(radii)
+        np.testing.assert_allclose(np.log2(light / light[0]), np.log2(seen.relative), atol=most)
+
+
+def test_no_light_passes_a_closed_stop_or_a_film_point_beyond_all_rays() -> None:
+    lens = set_lens(lens_of("laikin_double_gauss_50"))
+    rims = np.array(lens.semi_diameters_mm)
+    opened = open_light(lens, np.array([0.0, 500.0]), rims)
+    assert opened.at(rims)[1] == 0 < opened.at(rims)[0]
+    rims[lens.stop_index] = 0.0
+    assert not opened.at(rims).any()
+
+
+def test_two_figures_of_a_glass_become_that_of_the_catalogue() -> None:
+    lens = with_real_glasses(lens_of("sony_sonnar_55"))
+    assert all(s.glass is not None for s in lens.surfaces if s.n_d != 1)
+    odd = replace(lens.surfaces[0], n_d=1.9, V_d=90.0, glass=None)
+    assert with_real_glasses(replace(lens, surfaces=(odd, *lens.surfaces[1:]))).surfaces[0].glass is None
+
+
+def test_the_shipped_sonnar_against_photographs() -> None:
+    """Distortion and colour agree; the rims that a rule derived let a stop too much light into the corner."""
+    pytest.importorskip("lensfunpy")
+    found = verify(lens_of("sony_sonnar_55"))
+    assert found.profile == "Sony FE 55mm f/1.8 ZA" and found.certainty == "certain"
+    assert found.distortion_percent < 0.1
+    (c,) = found.comparisons
+    assert c.blue is not None and abs(c.blue.measured[-1] - c.blue.ours[-1]) < 3
+    widest = c.light[1.8]
+    assert widest.measured[-1] - widest.ours[-1] == pytest.approx(-0.9, abs=0.15)
+
+
+def test_the_command_prints_draws_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("lensfunpy")
+    picture, written = tmp_path / "sonnar.png", tmp_path / "sonnar.toml"
+    assert main(["verify", str(SONNAR), "-o", str(picture), "--lens-file", str(written)]) == 0
+    text = capsys.readouterr().out
+    assert "Sony FE 55mm f/1.8 ZA" in text and "the figures agree" in text and "neurolens rims" in text
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    again = read_lens(written)
+    assert dict(again.measured)["profile"] == "Sony FE 55mm f/1.8 ZA" and again.sha256 == read_lens(SONNAR).sha256
+    assert main(["verify", str(written), "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["measured"] == pytest.approx(dict(again.measured))
+    assert len(data["comparisons"][0]["distortion"]["ours"]) == len(data["comparisons"][0]["distortion"]["height_mm"])
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("petzval_portrait_100", [], "a lens that lensfun measured, or --profile NAME"),
+        ("sony_sonnar_55", ["--profile", "Sony 56mm f/1.8"], "one of lensfun's names"),
+        ("sony_sonnar_55", ["--profile", "Nikon AF Nikkor 28mm f/1.4D"], "28 mm, of lensfun's"),
+        ("cooke_anamorphic_42", [], "symmetric about its axis"),
+        ("sony_sonnar_55", ["-o", "picture.gif"], "one of .png, .pdf, .svg"),
+    ],
+)
+def test_what_cannot_be_compared_is_one_line(
+    name: str, options: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("lensfunpy")
+    assert main(["verify", str(ROOT / "lenses" / f"{name}.toml"), *options]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+def test_light_alone_and_another_film(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A profile without distortion says so; one of a larger film is compared within the lens's image circle."""
+    lens = replace(lens_of("laikin_double_gauss_50"), believed_to_be="Some 50mm f/1.8")
+    whole = own_profile(lens, 50.0, (8.0,))
+    from neurolens.photographs import profiles
+
+    monkeypatch.setattr(profiles, "database", lambda: (replace(whole, distortion=()),))
+    found = verify(lens)
+    assert math.isnan(found.distortion_percent) and "distortion was not measured" in found.verdict
+    monkeypatch.setattr(profiles, "database", lambda: (replace(whole, crop=0.5),))
+    (c,) = verify(lens).comparisons
+    assert c.distortion is not None and c.distortion.height_mm.max() <= (lens.image_radius_mm or math.inf) * 1.02
+    assert names_of(lens)[0] == "Some 50mm f/1.8"
