@@ -74,7 +74,7 @@ LEAN_MODULES = {
 
 
 # Lines of Python that the package may have; a feature that needs more pays by what it replaces.
-MOST_LINES, MOST_MODULES = 57958, 242
+MOST_LINES, MOST_MODULES = 57957, 242
 
 
 def module_name(path: Path) -> str:

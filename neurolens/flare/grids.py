@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from neurolens.flare.ghosts import GhostRays, GhostSource, Pair
 from neurolens.flare.lights import Light, Patch, light_towards, rays_across
 from neurolens.flare.steps import LOST, Floats
+from neurolens.lens.paraxial import first_order
 
 FEWEST, MOST = 320, 512  # lit cells, and cells along a side
 REACH = 16.0  # of `GhostTracer.follow`: rims are cut between rays inside and outside
@@ -26,7 +27,7 @@ _BAND = 0.02  # step of colour that may remain in one ghost, over the irradiance
 _NODES = 31  # wavelengths of scouts
 _FOLD = 2.0  # change of the logarithm of a ray's power, up and down together, from band to band
 _AT_ONCE = 128  # ghosts
-_MOVED, _LONG, _SOFT = 32, math.radians(0.25), 0.2  # for moves: cells a side, step, and soft edge in r^2 / R^2
+_MOVED, _LONG, _SOFT, _SHORT = 32, math.radians(0.25), 0.2, 2.5  # for moves: cells a side, step, soft edge in r^2 / R^2
 _ERROR, _WORST = 3.0, 0.25  # share of light beside its place, times the cells across half the film; at most
 
 
@@ -125,13 +126,12 @@ def ghost_moves(
 
     The middle moves as the ghost's edges do, which are most often those of the stop: on the film these move by another
     amount than the light of one point of the front. Rays near rims have smaller weights, so that none comes or goes.
-    Where rims cut away light, the middle moves by up to that share of the ghost's radius as well. Such a movement is no
-    shift of the ghost, so the way is shortened by it.
+    Where rims cut away light, the middle moves by up to that share of the radius as well, and the way is shortened by
+    this, but not below `_SHORT` images of the side: edges of a ghost without a smear would be seen.
     """
     coarse = replace(grid, columns=min(grid.columns, _MOVED), rows=min(grid.rows, _MOVED))
 
     def seen(off: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, float] | None:
-        """Its middle, its radius and its light."""
         light = light_towards(patch.light.towards + off, patch.light.rgb, patch.light.distance_m)
         if light is None:
             return None
@@ -145,7 +145,7 @@ def ghost_moves(
         middle = place @ share
         return middle, math.sqrt(((place.T - middle) ** 2).sum(1) @ share), area * coarse.cell * whole
 
-    moves, changing = np.zeros((2, 2)), np.zeros(2)
+    moves, changing, efl = np.zeros((2, 2)), np.zeros(2), abs(float(first_order(tracer.lens).efl_mm))
     for along, side in zip(moves, patch.sides, strict=True):
         step = _LONG / max(float(np.linalg.norm(side)), 1e-300)
         places = [(f, place) for f in (-step, step) if side.any() and (place := seen(f * side)) is not None]
@@ -154,7 +154,8 @@ def ghost_moves(
         if len(places) == 2:
             (f, (one, radius, light)), (g, (other, _, end)) = places
             change, moved = 2 * abs((end - light) / ((end + light) * (g - f))), (other - one) / (g - f)
-            along[:] = moved * max(1 - change * radius / max(float(np.linalg.norm(moved)), 1e-300), 0)
+            way, short = max(float(np.linalg.norm(moved)), 1e-300), _SHORT * efl * _LONG / step
+            along[:] = moved * max(1 - change * radius / way, min(short / way, 1))
             changing = np.maximum(changing, 0.5 * (end + light) * np.array([change, 1]))
     return moves, changing
 

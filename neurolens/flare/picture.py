@@ -134,10 +134,8 @@ def ghost_layers(
 def _parts(
     tracer: GhostSource, light: Light, nm: Sequence[float], middle_nm: float, half_mm: tuple[float, float], cell: float
 ) -> Iterator[tuple[Patch, Pair, Grid, Doubles]]:
-    """The patches of a light, and the ghosts of each with their grids and moves.
-
-    A ghost has finer patches where much of its light comes or goes over a patch, because rims cut it differently.
-    """
+    """The patches of a light, and the ghosts of each with their grids and moves. Patches are finer for a ghost much of
+    whose light comes or goes over a patch, because rims cut it differently there."""
     efl, needs = abs(float(first_order(tracer.lens).efl_mm)), dict.fromkeys(tracer.pairs, _PATCHES[0])
     for most in _PATCHES:
         pairs = [pair for pair in tracer.pairs if needs[pair] == most]
