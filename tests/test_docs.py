@@ -70,7 +70,7 @@ def rows_of(page: str) -> dict[str, dict[str, Row]]:
 
 def test_the_page_of_lens_files_has_every_key_that_the_reader_takes_and_no_other() -> None:
     rows = rows_of("lens-file.md")
-    assert set(rows["Top level"]) == set(lensfile.LENS_KEYS) - {"coating", "configuration", "aperture"}
+    assert set(rows["Top level"]) == set(lensfile.LENS_KEYS) - {"coating", "configuration", "aperture", "measured"}
     surface = {
         key
         for place in ("Shape and place", "Medium behind the surface", "Coating of the surface")
@@ -79,6 +79,7 @@ def test_the_page_of_lens_files_has_every_key_that_the_reader_takes_and_no_other
     assert surface == set(lensfile.SURFACE_KEYS)
     assert set(rows["configuration"]) == set(lensfile.CONFIGURATION_KEYS)
     assert set(rows["coating"]) == {"name", "layers"}
+    assert set(rows["measured"]) == {*lensfile.MEASURED_TEXTS, *lensfile.MEASURED_NUMBERS}
     assert set(rows["aperture"]) == {"blades", "rotation_deg", "curvature"}
     medium = rows["Top level"]["object_medium"]["meaning"]
     assert all(f"`{key}`" in medium for key in lensfile.MEDIUM_KEYS)

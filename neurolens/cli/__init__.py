@@ -62,6 +62,7 @@ def build_parser() -> Parser:
     from neurolens.cli.plan import Plan
     from neurolens.cli.projection import Projection
     from neurolens.cli.render import Render
+    from neurolens.cli.rims import Rims
     from neurolens.cli.stmap import StMap
     from neurolens.cli.survey import Survey
     from neurolens.cli.train import Train
@@ -69,7 +70,7 @@ def build_parser() -> Parser:
     from neurolens.cli.view import View
 
     groups: dict[str, tuple[type[Command], ...]] = {
-        "lenses": (Lens, Analyse, Verify, Convert, Glass, Library, Survey, View),
+        "lenses": (Lens, Analyse, Verify, Rims, Convert, Glass, Library, Survey, View),
         "camera models of a lens": (Train, Models, Evaluate),
         "pictures": (Demo, Plan, Render, Flare),
         "compositing and other programs": (StMap, Projection, Export, Blender, Mitsuba),

@@ -88,7 +88,7 @@ def _text(found: Verified, name: str, last: list[str]) -> str:
 
 
 def _row(c: Comparison) -> list[str]:
-    from neurolens.photographs.verify import near_f8
+    from neurolens.photographs.compare import near_f8
 
     cells = [f"{c.focal_mm:g}", number(c.distortion and c.distortion.rms, 2)]
     eight, widest = (c.light[near_f8(c.light)], c.light[min(c.light)]) if c.light else (None, None)

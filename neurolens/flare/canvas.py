@@ -200,7 +200,7 @@ def smeared(picture: Floats, kernel: Floats) -> Floats:
     """
     (down, across), (height, width) = kernel.shape, picture.shape[:2]
     whole = np.zeros((height + down - 1, width + across - 1, picture.shape[2]), np.float32)
-    lit = np.abs(picture).max(2) > 0
+    lit = np.abs(picture) @ np.ones(picture.shape[2], np.float32) > 0
     if lit.any():
         (top, below), (left, right) = ((v[0], v[-1] + 1) for v in (np.flatnonzero(lit.any(axis)) for axis in (1, 0)))
         part = picture[top:below, left:right].astype(np.float64)

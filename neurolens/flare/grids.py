@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from neurolens.flare.ghosts import GhostRays, GhostSource, Pair
 from neurolens.flare.lights import Light, Patch, light_towards, rays_across
 from neurolens.flare.steps import LOST, Floats
+from neurolens.lens.paraxial import first_order
 
 FEWEST, MOST = 320, 512  # lit cells, and cells along a side
 REACH = 16.0  # of `GhostTracer.follow`: rims are cut between rays inside and outside
@@ -26,7 +27,7 @@ _BAND = 0.02  # step of colour that may remain in one ghost, over the irradiance
 _NODES = 31  # wavelengths of scouts
 _FOLD = 2.0  # change of the logarithm of a ray's power, up and down together, from band to band
 _AT_ONCE = 128  # ghosts
-_MOVED, _LONG, _SOFT = 32, math.radians(0.25), 0.2  # for moves: cells a side, step, and soft edge in r^2 / R^2
+_MOVED, _LONG, _SOFT, _SHORT = 32, math.radians(0.25), 0.2, 2.5  # for moves: cells a side, step, soft edge in r^2 / R^2
 _ERROR, _WORST = 3.0, 0.25  # share of light beside its place, times the cells across half the film; at most
 
 
@@ -69,8 +70,9 @@ def grids_of(
     half_mm: tuple[float, float],
     cell_mm: float,
     wavelengths_nm: Sequence[float] = (400.0, 700.0),
+    only: Sequence[Pair] | None = None,
 ) -> dict[Pair, Grid]:
-    """The grids of all ghosts that reach the film.
+    """The grids of all ghosts, or of `only` some, that reach the film.
 
     A cell has one density, and a wavelength stands for its neighbours: both put light beside its place, a share a / n
     with n cells a side and b / k with k wavelengths. The work of a ghost is n k times its size on the film. For a given
@@ -88,8 +90,9 @@ def grids_of(
     few = np.ascontiguousarray(start.reshape(len(start), _SCOUTS + 1, -1)[:, ::_FEW, ::_FEW].reshape(len(start), -1))
     nodes = sorted({wavelengths_nm[round(at)] for at in np.linspace(0, len(wavelengths_nm) - 1, _NODES)})
     ghosts: list[tuple[Pair, NDArray[np.bool_], _Look]] = []
-    for k in range(0, len(tracer.pairs), _AT_ONCE):
-        some = tracer.pairs[k : k + _AT_ONCE]
+    pairs = tracer.pairs if only is None else only
+    for k in range(0, len(pairs), _AT_ONCE):
+        some = pairs[k : k + _AT_ONCE]
         rays = tracer.follow(start, wavelength_nm, only=some, reach=REACH)
         each = [tracer.follow(few, nm, only=some, reach=REACH).rows for nm in nodes]
         looks = zip(
@@ -115,34 +118,46 @@ def grids_of(
     }  # fmt: skip
 
 
-def ghost_moves(tracer: GhostSource, patch: Patch, pair: Pair, grid: Grid, wavelength_nm: float) -> NDArray[np.float64]:
-    """How far the middle of a ghost's light moves on the film (mm) along the sides of a light's patch, [2, 2].
+def ghost_moves(
+    tracer: GhostSource, patch: Patch, pair: Pair, grid: Grid, wavelength_nm: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """How far the middle of a ghost's light moves on the film (mm) along the sides of a light's patch, [2, 2]; and how
+    much of its light comes or goes along the side where that is most, and its light, [2].
 
     The middle moves as the ghost's edges do, which are most often those of the stop: on the film these move by another
     amount than the light of one point of the front. Rays near rims have smaller weights, so that none comes or goes.
+    Where rims cut away light, the middle moves by up to that share of the radius as well, and the way is shortened by
+    this, but not below `_SHORT` images of the side: edges of a ghost without a smear would be seen.
     """
     coarse = replace(grid, columns=min(grid.columns, _MOVED), rows=min(grid.rows, _MOVED))
 
-    def middle(off: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    def seen(off: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, float] | None:
         light = light_towards(patch.light.towards + off, patch.light.rgb, patch.light.distance_m)
         if light is None:
             return None
-        start = tracer.start(rays_across(tracer.lens, light, coarse.places)[0])
-        x, y, power, worst = tracer.follow_each(start, [wavelength_nm], pair)[0].astype(np.float64)
+        rays, area = rays_across(tracer.lens, light, coarse.places)
+        x, y, power, worst = tracer.follow_each(tracer.start(rays), [wavelength_nm], pair)[0].astype(np.float64)
         weight = np.where(power > 0, power * np.clip((1 - worst) / _SOFT, 0, 1), 0)
-        lit = weight > 0
-        return np.stack([x, y])[:, lit] @ weight[lit] / weight.sum() if lit.any() else None
+        lit, whole = weight > 0, float(weight.sum())
+        if not lit.any():
+            return None
+        place, share = np.stack([x, y])[:, lit], weight[lit] / whole
+        middle = place @ share
+        return middle, math.sqrt(((place.T - middle) ** 2).sum(1) @ share), area * coarse.cell * whole
 
-    moves = np.zeros((2, 2))
+    moves, changing, efl = np.zeros((2, 2)), np.zeros(2), abs(float(first_order(tracer.lens).efl_mm))
     for along, side in zip(moves, patch.sides, strict=True):
         step = _LONG / max(float(np.linalg.norm(side)), 1e-300)
-        places = [(f, place) for f in (-step, step) if side.any() and (place := middle(f * side)) is not None]
+        places = [(f, place) for f in (-step, step) if side.any() and (place := seen(f * side)) is not None]
         if len(places) == 1:
-            places += [(0.0, place) for place in (middle(0 * side),) if place is not None]
+            places += [(0.0, place) for place in (seen(0 * side),) if place is not None]
         if len(places) == 2:
-            (f, one), (g, other) = places
-            along[:] = (other - one) / (g - f)
-    return moves
+            (f, (one, radius, light)), (g, (other, _, end)) = places
+            change, moved = 2 * abs((end - light) / ((end + light) * (g - f))), (other - one) / (g - f)
+            way, short = max(float(np.linalg.norm(moved)), 1e-300), _SHORT * efl * _LONG / step
+            along[:] = moved * max(1 - change * radius / way, min(short / way, 1))
+            changing = np.maximum(changing, 0.5 * (end + light) * np.array([change, 1]))
+    return moves, changing
 
 
 class _Look(NamedTuple):

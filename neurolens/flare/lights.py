@@ -151,7 +151,7 @@ def patches(light: Light, most_deg: float, most: int = CELLS // 2) -> list[Patch
         return [Patch(light, np.zeros((2, 3)), np.ones((1, 1)), False)]
     corners, weights, is_round = light.shape
     counts = [min(math.ceil(math.degrees(side) / most_deg + 1e-9), most) for side in _lengths(corners)]
-    if 1 < max(counts) and most < CELLS:
+    if 1 < max(counts) and most != CELLS:
         weights = weights.repeat(FADE, 0).repeat(FADE, 1)
         corners = ndimage.zoom(corners, [(len(weights) + 1) / len(corners)] * 2 + [1], order=1)
     middles = 0.25 * (corners[1:, 1:] + corners[:-1, 1:] + corners[1:, :-1] + corners[:-1, :-1])

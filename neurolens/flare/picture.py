@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -29,7 +30,7 @@ from neurolens.flare.canvas import (
 )
 from neurolens.flare.ghosts import GhostSource, Pair
 from neurolens.flare.grids import REACH, Grid, ghost_moves, grids_of
-from neurolens.flare.lights import Light, light_rays, patches, rays_across
+from neurolens.flare.lights import Light, Patch, light_rays, patches, rays_across
 from neurolens.flare.photons import LEVELS, Photons, PhotonTracer
 from neurolens.flare.steps import Floats
 from neurolens.lens.glass import inverse_square_um
@@ -48,6 +49,8 @@ _ROOM = 1 << 26  # bytes of edges that wait to be drawn
 _EDGES = 176  # bytes of a cell's edges
 FEWEST = 4  # wavelengths that stand for all
 _PATCH_DEG = 2.0  # of an extended light: see `patches`
+_PATCHES, _CELLS = (4, 6, 9), 48  # along a side, at most; cells of a ghost along a side, which many patches keep
+_UNEVEN, _FAINT = 0.6, 5e-4  # share of its light that may come or go over a patch; share of all light, of a faint ghost
 
 _T = TypeVar("_T")
 _R = TypeVar("_R")
@@ -106,15 +109,11 @@ def ghost_layers(
     unit = raster.per_mm**2 / axis_irradiance(lens, middle) / wavelengths
     half, nm = (raster.film_mm[0] / 2, raster.height / raster.per_mm / 2), spectral.centres_nm
     groups: dict[tuple[int, Smear | None], list[_Task]] = {}
-    for patch in (part for light in lights for part in patches(light, _PATCH_DEG)):
-        light, size = patch.light, 1.5 * float(np.abs(patch.sides).sum()) * abs(float(first_order(lens).efl_mm))
-        around = half[0] + size, half[1] + size  # a smear may bring ghosts from beside the film
-        grids = grids_of(tracer, light, middle, around, cell_px / raster.per_mm, nm.tolist())
-        response = np.asarray(unit * spectral.response * spectral.spectrum(light.rgb), np.float64).T
-        for pair, grid in grids.items():
-            moved = raster.per_mm * ghost_moves(tracer, patch, pair, grid, middle) * (-1, 1)
-            task = _Task(light, pair, grid, *_bands(nm, response, grid))
-            groups.setdefault((layer[pair], smear_of(patch, moved)), []).append(task)
+    for light in lights:
+        for patch, pair, grid, moves in _parts(tracer, light, nm.tolist(), middle, half, cell_px / raster.per_mm):
+            response = np.asarray(unit * spectral.response * spectral.spectrum(patch.light.rgb), np.float64).T
+            task = _Task(patch.light, pair, grid, *_bands(nm, response, grid))
+            groups.setdefault((layer[pair], smear_of(patch, raster.per_mm * moves * (-1, 1))), []).append(task)
     work = _Work(sum(map(len, groups.values())), done, threads)
     for number in sorted({number for number, _ in groups}):
         picture = np.zeros((raster.height, raster.width, 3), np.float32)
@@ -130,6 +129,31 @@ def ghost_layers(
             _draw(tracer, tasks, canvas, raster.per_mm / coarse, work)
             picture += enlarged(smeared(canvas, kernel) / np.float32(coarse**2), coarse, raster.height, raster.width)
         yield number, picture
+
+
+def _parts(
+    tracer: GhostSource, light: Light, nm: Sequence[float], middle_nm: float, half_mm: tuple[float, float], cell: float
+) -> Iterator[tuple[Patch, Pair, Grid, Doubles]]:
+    """The patches of a light, and the ghosts of each with their grids and moves. Patches are finer for a ghost much of
+    whose light comes or goes over a patch, because rims cut it differently there."""
+    efl, needs = abs(float(first_order(tracer.lens).efl_mm)), dict.fromkeys(tracer.pairs, _PATCHES[0])
+    for most in _PATCHES:
+        pairs = [pair for pair in tracer.pairs if needs[pair] == most]
+        found, sums = list[tuple[Patch, Pair, Grid, Doubles]](), dict.fromkeys(pairs, np.zeros(2))
+        for patch in patches(light, _PATCH_DEG * _PATCHES[0] / most, most) if pairs else ():
+            size = 1.5 * float(np.abs(patch.sides).sum()) * efl
+            around = half_mm[0] + size, half_mm[1] + size  # a smear may bring ghosts from beside the film
+            for pair, grid in grids_of(tracer, patch.light, middle_nm, around, cell, nm, pairs).items():
+                moves, lit = ghost_moves(tracer, patch, pair, grid, middle_nm)
+                columns, rows = (min(n, max(n * _PATCHES[0] // most, _CELLS)) for n in (grid.columns, grid.rows))
+                found.append((patch, pair, replace(grid, columns=columns, rows=rows), moves))
+                sums[pair] = sums[pair] + lit
+        if most == _PATCHES[0]:
+            least = _FAINT * sum(whole for _, whole in sums.values())
+            for pair, (changing, whole) in sums.items():
+                enough = (n for n in _PATCHES if whole <= least or changing * most <= _UNEVEN * whole * n)
+                needs[pair] = next(enough, _PATCHES[-1])
+        yield from (part for part in found if needs[part[1]] == most)
 
 
 def _draw(tracer: GhostSource, tasks: Sequence[_Task], canvas: Floats, per_mm: float, work: _Work) -> None:

@@ -7,14 +7,15 @@ there), and the light on the axis. The distance of the photographs is not stated
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline  # type: ignore[import-untyped]
 
+from neurolens.analysis.bundles import bundle, points
 from neurolens.analysis.field_curves import PROJECTIONS
 from neurolens.analysis.fields import Result, Scene
 from neurolens.lens.catalogue import nearest
@@ -27,13 +28,12 @@ from neurolens.setting.states import at_infinity, set_lens
 Array = NDArray[np.float64]
 
 _HEIGHTS, _FIELDS = 16, 26  # image heights that are compared, fields that are traced
+_FEWEST = 4  # fields with chief rays
 _INNER = 0.25  # share of half the diagonal from which shapes are compared
 _OUTER_MM = 20.0  # of full frame, to which
-_BANDS_NM = {
-    "red": (590.0, 605.0, 620.0, 640.0),
-    "green": (510.0, 530.0, 550.0, 570.0),
-    "blue": (440.0, 455.0, 470.0, 490.0),
-}
+_SIZES = np.linspace(0.97, 1.03, 13)  # of the picture, over that of crop factor and table
+# Broad bands of a camera: those at which rays agree best with lensfun's lateral colour.
+_BANDS_NM = {"red": (585.0, 600.0, 615.0), "green": (520.0, 540.0, 560.0), "blue": (465.0, 480.0, 495.0)}
 _IDEAL = {"equisolid": "equisolid, 2 f sin(theta/2)", "fisheye": "equidistant, f theta",
           "stereographic": "stereographic, 2 f tan(theta/2)", "orthographic": "orthographic, f sin"}  # fmt: skip
 _NEAR_N_D, _NEAR_V_D = 0.002, 1.0  # within which a glass of the catalogue stands for two figures of a table
@@ -66,7 +66,7 @@ class Comparison(Result):
 
     Attributes:
         focal_mm: of the profile.
-        distortion: percent of the image height, mean removed.
+        distortion: percent of the image height, mean removed. size: of the picture, for which it agrees best.
         red, blue: um of the image height beside green.
         light: by f-number, stops beside the axis.
     """
@@ -76,6 +76,7 @@ class Comparison(Result):
     red: Curve | None
     blue: Curve | None
     light: dict[float, Curve]
+    size: float = 1.0
 
 
 def heights_of(profile: Profile, lens: Lens) -> Array:
@@ -94,13 +95,16 @@ def at_focal_length(lens: Lens, focal_mm: float) -> Lens:
     return set_lens(lens)
 
 
-def stretch_of(lens: Lens, profile: Profile, height_mm: Array) -> Array:
-    """The image height over that of the profile's ideal projection, at image heights, to a scale."""
+def stretch_of(lens: Lens, profile: Profile, height_mm: Array) -> Callable[[Array], Array]:
+    """The image height over that of the profile's ideal projection, to a scale, as a function of image heights.
+
+    It is NaN beyond the last height whose chief ray exists.
+    """
     scene = Scene(lens)
     angle, real = _chief(scene, height_mm.max())
     name = _IDEAL.get(profile.projection, next(iter(PROJECTIONS)))
     ideal = PROJECTIONS[name](angle)
-    return _between(height_mm, real, real / ideal)
+    return partial(_between, known_mm=real, values=real / ideal)
 
 
 def _chief(scene: Scene, to_mm: float) -> tuple[Array, Array]:
@@ -117,6 +121,8 @@ def _chief(scene: Scene, to_mm: float) -> tuple[Array, Array]:
 
 def _between(height_mm: Array, known_mm: Array, values: Array) -> Array:
     """Values at heights between known ones; NaN beyond."""
+    if len(known_mm) < _FEWEST:
+        return np.full_like(height_mm, math.nan)
     return np.asarray(CubicSpline(known_mm, values)(np.where(height_mm <= known_mm[-1], height_mm, math.nan)))
 
 
@@ -126,11 +132,20 @@ def _without_mean(values: Array, others: Array) -> Array:
     return 100 * (values / values[both].mean() - 1) if both.any() else np.full_like(values, math.nan)
 
 
-def distortion_curve(lens: Lens, profile: Profile, radial: Radial) -> Curve:
-    """The shape of the distortion, measured and computed."""
+def distortion_curve(lens: Lens, profile: Profile, radial: Radial) -> tuple[Curve, float]:
+    """The shape of the distortion, measured and computed, and the size of the picture for which both agree best.
+
+    Crop factors are rounded, and a patent's example is seldom of the product's very focal length: heights are free by
+    some percent.
+    """
     height = heights_of(profile, lens)
-    measured, ours = profile.stretch(radial, height), stretch_of(lens, profile, height)
-    return Curve(height, _without_mean(measured, ours), _without_mean(ours, measured))
+    measured, known = profile.stretch(radial, height), stretch_of(lens, profile, height * max(_SIZES))
+    found = []
+    for size in _SIZES:
+        ours = known(height * size)
+        curve = Curve(height, _without_mean(measured, ours), _without_mean(ours, measured))
+        found.append((-int(np.isfinite(ours).sum()), curve.rms, abs(size - 1), curve, float(size)))
+    return min(found, key=lambda f: f[:3])[3:]
 
 
 def with_real_glasses(lens: Lens) -> Lens:
@@ -151,17 +166,20 @@ def _glass_like(n_d: float, V_d: float) -> str | None:
     return str(found) if near else None
 
 
-def colour_curve(lens: Lens, profile: Profile, radial: Radial, band: str) -> Curve:
-    """How much farther from the axis a colour lies than green, in um, over broad bands as a camera's."""
+def colour_curves(lens: Lens, profile: Profile, radials: Mapping[str, Radial | None]) -> dict[str, Curve | None]:
+    """How much farther from the axis red and blue lie than green, in um, over broad bands as a camera's."""
     height, scene = heights_of(profile, lens), Scene(with_real_glasses(lens))
-    angle, real = _chief(scene, float(height.max()))
-    fields = np.degrees(angle)
-
-    def mean(name: str) -> Array:
-        return np.mean([scene.chief_rays(fields, nm).height_mm.numpy() for nm in _BANDS_NM[name]], axis=0)
-
-    ours = _between(height, real, 1000 * (mean(band) - mean("green")))
-    return Curve(height, profile.shift_um(radial, height), ours)
+    angle, _ = _chief(scene, float(height.max()))
+    waves = [nm for band in _BANDS_NM.values() for nm in band]
+    chief = bundle(scene.open, np.degrees(angle).tolist(), waves, points([0.0], [0.0]))
+    beside = 1000 * chief.tangential_mm[..., 0].numpy()
+    red, green, blue = (part.mean(axis=1) for part in np.split(beside, len(_BANDS_NM), axis=1))
+    real = chief.chief_height_mm.numpy()
+    found: dict[str, Curve | None] = {}
+    for band, ours in (("red", red - green), ("blue", blue - green)):
+        radial = radials[band]
+        found[band] = radial and Curve(height, profile.shift_um(radial, height), _between(height, real, ours))
+    return found
 
 
 def stop_for(lens: Lens, f_number: float) -> float:
@@ -169,6 +187,11 @@ def stop_for(lens: Lens, f_number: float) -> float:
     if f_number <= _STOP_SLACK * lens.f_number:
         return lens.stop_radius_mm
     return float(stop_radius_mm(at_infinity(lens), f_number))
+
+
+def near_f8(f_numbers: Iterable[float]) -> float:
+    """The aperture nearest to f/8, at which hardly any rim of a lens is seen."""
+    return min(f_numbers, key=lambda f: abs(math.log(f / 8)))
 
 
 def light_curves(lens: Lens, profile: Profile, lights: Sequence[Light]) -> dict[float, Curve]:
@@ -194,11 +217,8 @@ def compare(lens: Lens, profile: Profile, focal_mm: float) -> Comparison:
     def row(rows: Sequence[Radial]) -> Radial | None:
         return next((r for r in rows if r.focal_mm == focal_mm), None)
 
-    distortion, red, blue = row(profile.distortion), row(profile.red), row(profile.blue)
-    return Comparison(
-        focal_mm,
-        None if distortion is None else distortion_curve(placed, profile, distortion),
-        None if red is None else colour_curve(placed, profile, red, "red"),
-        None if blue is None else colour_curve(placed, profile, blue, "blue"),
-        light_curves(placed, profile, profile.light_at(focal_mm)) if profile.light else {},
-    )
+    radial, red, blue = row(profile.distortion), row(profile.red), row(profile.blue)
+    distortion, size = (None, 1.0) if radial is None else distortion_curve(placed, profile, radial)
+    colours = colour_curves(placed, profile, {"red": red, "blue": blue}) if red or blue else {}
+    light = light_curves(placed, profile, profile.light_at(focal_mm)) if profile.light else {}
+    return Comparison(focal_mm, distortion, colours.get("red"), colours.get("blue"), light, size)

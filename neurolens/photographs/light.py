@@ -22,7 +22,7 @@ from neurolens.trace.rays import trace
 
 Array = NDArray[np.float64]
 
-_COARSE, _FINE = 24, 48  # points a side of the grids that find what is lit, and that measure it
+_COARSE, _FINE = 24, 40  # points a side of the grids that find what is lit, and that measure it
 _WIDER = 1.5  # cells by which what is lit may reach beyond the lit points of a grid
 _FLATTEST = 1e-3  # a slope over the steeper one, below which it makes no difference
 
@@ -34,7 +34,8 @@ class OpenLight:
     Attributes:
         radius_mm: [S, F, G, G] distance from the axis on each surface, inf where the ray does not get there.
         slopes_mm: [2, S, F, G, G] by how much it changes along the sides of a grid cell, above 0.
-        light: [F, G, G] light of a whole cell, cos^4 of the angle of its ray times its area.
+        light: [F, G, G] irradiance by a whole cell of radiance 1: cos^4 of its angle times the solid angle in
+            which the axis sees it.
     """
 
     radius_mm: Array
@@ -43,8 +44,12 @@ class OpenLight:
 
     def at(self, rims_mm: Array) -> Array:
         """The light [F] of the film points with rims of these radii [S], the stop's among them."""
-        inside = _covered(rims_mm[:, None, None, None] - self.radius_mm, *self.slopes_mm).min(axis=0)
+        inside = np.min([self.inside(k, radius) for k, radius in enumerate(rims_mm)], axis=0)
         return np.asarray((inside * self.light).sum(axis=(1, 2)))
+
+    def inside(self, surface: int, rim_mm: float) -> Array:
+        """The part of every cell [F, G, G] that a rim of this radius lets through."""
+        return _covered(rim_mm - self.radius_mm[surface], *self.slopes_mm[:, surface])
 
 
 def _covered(margin: Array, a: Array, b: Array) -> Array:
@@ -52,9 +57,9 @@ def _covered(margin: Array, a: Array, b: Array) -> Array:
 
     It is the convolution of two boxes as wide as the slopes, integrated up to the value.
     """
-    with np.errstate(invalid="ignore"):
-        corners = (np.maximum(margin + x * a + y * b, 0) ** 2 * (4 * x * y) for x in (-0.5, 0.5) for y in (-0.5, 0.5))
-        return np.asarray(np.clip(np.nan_to_num(sum(corners) / (2 * a * b)), 0, 1))
+    margin = np.clip(np.nan_to_num(margin, neginf=-np.inf), -0.5 * (a + b), 0.5 * (a + b))
+    corners = (np.maximum(margin + x * a + y * b, 0) ** 2 * (4 * x * y) for x in (-0.5, 0.5) for y in (-0.5, 0.5))
+    return np.asarray(np.clip(sum(corners) / (2 * a * b), 0, 1))
 
 
 def with_rims(lens: Lens, rims_mm: Array) -> Lens:
@@ -63,21 +68,22 @@ def with_rims(lens: Lens, rims_mm: Array) -> Lens:
     return replace(lens, surfaces=tuple(replace(s, diameter_mm=2 * float(radius)) for s, radius in rows))
 
 
-def open_light(lens: Lens, height_mm: Array, rims_mm: Array, wavelength_nm: float = LINE_D_NM) -> OpenLight:
+def open_light(lens: Lens, height_mm: Array, rims_mm: Array, rear: tuple[float, float] | None = None) -> OpenLight:
     """Trace the rays of film points at heights [F] of a lens whose film is placed.
 
     Args:
         rims_mm: [S] the widest radii of rims and stop that will be asked for.
+        rear: radius and z of the disc through which all light comes to the film; None: the last of these rims.
     """
     bare = without_rims(replace(lens, aperture=None))
     film = float(lens.film_z_mm if lens.film_z_mm is not None else lens.vertices_mm[-1])
-    reach, plane = rear_opening_mm(with_rims(lens, rims_mm), film)
+    reach, plane = rear or rear_opening_mm(with_rims(lens, rims_mm), film)
     box = np.broadcast_to(np.array([-reach, reach])[:, None, None], (2, 2, len(height_mm)))
     for side in (_COARSE, _COARSE, _FINE):
         u, v, cell = _grid(box, side)
-        found = _traced(bare, film, plane, height_mm, u, v, wavelength_nm)
+        found = _traced(bare, film, plane, height_mm, u, v)
         if side == _FINE:
-            return _measured(*found, cell)
+            return _measured(*found, cell / (film - plane))
         box = _around(np.all(found[0] <= rims_mm[:, None, None, None], axis=0), u, v, box)
     raise AssertionError
 
@@ -96,16 +102,14 @@ def _grid(box: Array, side: int) -> tuple[Array, Array, Array]:
     )
 
 
-def _traced(
-    lens: Lens, film: float, plane: float, height_mm: Array, u: Array, v: Array, nm: float
-) -> tuple[Array, Array]:
+def _traced(lens: Lens, film: float, plane: float, height_mm: Array, u: Array, v: Array) -> tuple[Array, Array]:
     """Distances from the axis [S, F, G, G] at the surfaces, and cos^4 of the rays."""
     shape = u.shape
     x = np.broadcast_to(height_mm[:, None, None], shape)
     flat = [torch.from_numpy(np.ascontiguousarray(a).reshape(-1)) for a in (x, np.zeros(shape), u, v)]
     rays = camera_rays(flat[0], flat[1], film, flat[2], flat[3], plane)
     with torch.no_grad():
-        out = trace(lens, rays, nm, record=range(len(lens.surfaces)))
+        out = trace(lens, rays, LINE_D_NM, record=range(len(lens.surfaces)))
     radius = np.empty((len(lens.surfaces), *shape))
     dead = torch.zeros(rays.x.shape, dtype=torch.bool)
     for k in range(len(lens.surfaces))[::-1]:

@@ -15,7 +15,7 @@ from neurolens.analysis.fields import Result
 from neurolens.base.errors import InputError
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.compare import Comparison, compare, heights_of
+from neurolens.photographs.compare import Comparison, compare, heights_of, near_f8
 from neurolens.photographs.profiles import Match, Profile, matches, name_of, profile_named
 from neurolens.setting.states import at_infinity
 
@@ -72,11 +72,6 @@ class Verified(Result):
         return {"profile": self.profile, "match": self.certainty, **kept}
 
 
-def near_f8(f_numbers: Iterable[float]) -> float:
-    """The aperture nearest to f/8, at which hardly any rim of a lens is seen."""
-    return min(f_numbers, key=lambda f: abs(math.log(f / 8)))
-
-
 def _median(values: Iterable[float]) -> float:
     known = [v for v in values if math.isfinite(v)]
     return median(known) if known else math.nan
@@ -92,11 +87,12 @@ def found_for(lens: Lens, wanted: str | None = None) -> tuple[Match, list[Profil
     """The profile for a lens, all profiles of that name, and the names of others that are likely.
 
     Raises:
-        InputError: no profile for the lens, or none of the name that is wanted.
+        InputError: no profile for the lens; none of the name that is wanted, or of no focal length of the lens.
     """
     if wanted is not None:
-        same = profile_named(wanted)
-        return Match(same[0], 1.0), _by_film(same, lens), ()
+        same = _by_film(profile_named(wanted), lens)
+        _check_focal_length(lens, same[0])
+        return Match(same[0], 1.0), same, ()
     found = [m for m in matches(names_of(lens)) if m.certainty != "uncertain"]
     if not found:
         known = [name for name in names_of(lens) if name_of(name)]
@@ -105,7 +101,9 @@ def found_for(lens: Lens, wanted: str | None = None) -> tuple[Match, list[Profil
     best = found[0]
     same = [m.profile for m in found if (m.profile.maker, m.profile.model) == (best.profile.maker, best.profile.model)]
     also = dict.fromkeys(m.profile.model for m in found if m.likeness == best.likeness and m.profile not in same)
-    return best, _by_film(same, lens), tuple(also)
+    same = _by_film(same, lens)
+    _check_focal_length(lens, same[0])
+    return best, same, tuple(also)
 
 
 def _by_film(profiles: Sequence[Profile], lens: Lens) -> list[Profile]:
@@ -124,7 +122,6 @@ def verify(lens: Lens, profile: str | None = None) -> Verified:
         raise InputError(lens.path, "cylinder", "(an anamorphic lens)", "a lens that is symmetric about its axis")
     match, profiles, also = found_for(lens, profile)
     used = profiles[0]
-    _check_focal_length(lens, used)
     whole = [compare(lens, used, focal) for focal in used.focal_mm]
     name = used.model if used.maker.split()[0].lower() in used.model.lower() else f"{used.maker} {used.model}"
     bare = Verified(name, match.certainty, also, used.crop, tuple(whole), _spread(profiles, lens), ())

@@ -207,3 +207,20 @@ def test_photons_of_a_disc_come_from_all_of_it() -> None:
     total = picture.sum()
     assert picture[r > 1.1 * edge].sum() < 0.01 * total
     assert picture[r < edge / 2].sum() == pytest.approx(total / 4, rel=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not CASE.is_file(), reason=f"{CASE} is not there")
+@pytest.mark.parametrize("name", ["g02-00", "g12-04"])
+def test_ghosts_that_rims_cut_have_fine_patches(name: str) -> None:
+    """The case's softbox in its brightest ghost, which fills the film, and in a small one: rims cut both differently
+    for each part of the light. Held against rays at random, whose noise is 2%, over squares of 2.5 mm: 19 of 20 places
+    are right to 5%; 4 x 4 patches left 17 and 15%."""
+    scene, lens = load_scene(CASE), hexagonal("laikin_double_gauss_50", focus_m=3.0)
+    (light,) = SceneLights(scene).seen(scene, lens.film_z_mm)
+    (pair,), raster = [pair for pair in ghost_pairs(lens) if pair.name == name], Raster((36.0, 20.25), 160, 90)
+    right = uniform_filter(ghost_by_chance(lens, light, pair, raster, 1 << 21), 11)
+    picture = ghost_picture(GhostTracer(lens, [pair]), [light], raster, wavelengths=1, threads=1)[0].sum(-1)
+    found, inside = uniform_filter(picture.astype(np.float64), 11), right > 0.3 * right.max()
+    off = found[inside] / right[inside] * right[inside].sum() / found[inside].sum() - 1
+    assert np.quantile(np.abs(off), 0.95) < 0.05

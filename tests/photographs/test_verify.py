@@ -94,7 +94,7 @@ def test_no_light_passes_a_closed_stop_or_a_film_point_beyond_all_rays() -> None
     opened = open_light(lens, np.array([0.0, 500.0]), rims)
     assert opened.at(rims)[1] == 0 < opened.at(rims)[0]
     rims[lens.stop_index] = 0.0
-    assert not opened.at(rims).any()
+    assert opened.at(rims).max() < 1e-20
 
 
 def test_two_figures_of_a_glass_become_that_of_the_catalogue() -> None:

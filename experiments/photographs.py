@@ -1,0 +1,195 @@
+"""A public collection of lens files against photographs: distortion, lateral colour and light, lens by lens.
+
+The collection is OpticsDatabase (github.com/amegahed/OpticsDatabase, MIT licence): clone it, and name its folder. The
+photographs are lensfun's profiles (package lensfunpy; CC BY-SA 3.0). A file counts where the match of its name with a
+profile is certain or likely; `neurolens verify` says the same of one file. Writes photographs.md, photographs.json and
+photographs.csv (a row for each file).
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+import warnings
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.stats import spearmanr  # type: ignore[import-untyped]
+
+from experiments import lab
+from experiments.lab import Row
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
+from neurolens.base.files import atomic_write_text
+from neurolens.lens.prescription import Lens
+from neurolens.photographs.profiles import Profile, database
+from neurolens.photographs.rims import fit_rims
+from neurolens.photographs.verify import DOUBTFUL_PERCENT, Verified, found_for, verify
+from neurolens.readers.any_format import read_any
+
+PERCENTILES = (10, 25, 50, 75, 90)
+BANDS = ("red", "blue")
+WORSE = 0.02  # stops by which an aperture that was left out gets worse
+
+OPTIONS = (
+    lab.option("folder", metavar="FOLDER", type=Path, help="clone of github.com/amegahed/OpticsDatabase"),
+    lab.count("workers", 1, "processes of a thread each (default: 1)"), lab.ONLY, lab.out(),
+)  # fmt: skip
+
+
+def row_of(file: Path) -> Row | None:
+    """What photographs say of a file; None where there is no profile for it, or it cannot be read."""
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore", NeurolensWarning)
+    row: Row = {"file": file.stem}
+    try:
+        lens = read_any(file)
+        match, profiles, _ = found_for(lens)
+        row |= {"profile": match.profile.model, "match": match.certainty, "f_number": lens.f_number}
+        row["aspheres"] = sum(bool(s.asphere or s.conic) for s in lens.surfaces)
+        began = time.process_time()
+        found = verify(lens)
+    except NeurolensError as error:
+        return row | {"reason": str(error).removeprefix(f"{file}: ")} if "match" in row else None
+    row |= {"seconds": time.process_time() - began} | figures(found)
+    return row if row["zoom"] else row | fitted(lens, profiles[0])
+
+
+def figures(found: Verified) -> Row:
+    """The residuals of a lens: medians over the focal lengths of its profile; figures at the largest height."""
+    curves = [c.distortion for c in found.comparisons if c.distortion is not None]
+    focal = [c.focal_mm for c in found.comparisons]
+    row: Row = {
+        "crop": found.crop, "focal_mm": focal, "zoom": len(focal) > 1, "distortion": found.distortion_percent,
+        "each": [c.rms for c in curves], "itself": _median([float(np.std(c.measured)) for c in curves]),
+        "size": _median([c.size for c in found.comparisons]), "own": found.uncertainty_percent,
+        "f8": found.light_stops(widest=False), "widest": found.light_stops(widest=True),
+    }  # fmt: skip
+    for band in ("red", "blue"):
+        both = [c for c in (getattr(c, band) for c in found.comparisons) if c is not None]
+        row[band] = [_median([float(getattr(c, kind)[-1]) for c in both]) for kind in ("measured", "ours")]
+    return row
+
+
+def fitted(lens: Lens, profile: Profile) -> Row:
+    """Residuals of light at the two widest apertures: before, with rims fitted to all, and with it left out."""
+    try:
+        whole = fit_rims(lens, profile)
+    except InputError:
+        return {}
+    found: Row = {"front": whole.front, "rear": whole.rear, "rings": len(whole.rings)}
+    found["fitted"] = [(f, whole.before[f], whole.after[f]) for f in whole.before]
+    widest = sorted(whole.before)[:2]
+    if len(whole.before) > 2:
+        found["unused"] = [(f, whole.before[f], fit_rims(lens, profile, [f]).after[f]) for f in widest]
+    return found
+
+
+def _median(values: Sequence[float]) -> float:
+    known = [v for v in values if np.isfinite(v)]
+    return float(np.median(known)) if known else float("nan")
+
+
+def _line(name: str, values: Iterable[float], form: str = ".3f") -> list[str]:
+    known = np.array([v for v in values if np.isfinite(v)])
+    found = [format(v, form) for v in np.percentile(known, PERCENTILES)] if len(known) else ["-"] * len(PERCENTILES)
+    return [name, str(len(known)), *found]
+
+
+def _table_of(name: str, some: list[Row]) -> str:
+    """The percentiles of all comparisons of primes, or of zooms."""
+    certain = [r for r in some if r["match"] == "certain"]
+    sound = [r for r in certain if r["distortion"] <= DOUBTFUL_PERCENT]
+    lines = [
+        _line("distortion, % of the height", (r["distortion"] for r in some)),
+        _line("the same, certain matches", (r["distortion"] for r in certain)),
+        _line("... that `verify` does not doubt", (r["distortion"] for r in sound)),
+        _line("the distortion itself", (r["itself"] for r in certain)),
+        _line("two cameras with one lens", (r["own"] for r in certain)),
+        _line("light near f/8, stops", (r["f8"] for r in certain)),
+        _line("light at the widest aperture", (r["widest"] for r in certain)),
+        *(_line(f"{band} beside green, µm", (abs(r[band][0] - r[band][1]) for r in sound), ".1f") for band in BANDS),
+        *(_line(f"{band} itself, µm", (abs(r[band][0]) for r in sound), ".1f") for band in BANDS),
+    ]
+    alike = []
+    for band in BANDS:
+        pairs = np.array([r[band] for r in sound if np.isfinite(r[band]).all()])
+        if len(pairs) > 2:
+            alike.append(f"{band} {spearmanr(*pairs.T).statistic:.2f}")
+    header = "what|lenses|" + "|".join(f"{q}%" for q in PERCENTILES)
+    ranks = f"Rank correlation of measured and computed lateral colour: {', '.join(alike)}."
+    return lab.page(f"## {name}", lab.table(header, lines), ranks if alike else "")
+
+
+def _rims_of(some: list[Row]) -> str:
+    """What fitted rims are worth, at apertures that they were fitted to and at others."""
+    fits = [r["fitted"] for r in some if r.get("fitted")]
+    unused = [r["unused"] for r in some if r.get("unused")]
+    names = ("widest aperture", "next aperture")
+    lines = []
+    for k, name in enumerate(names):
+        lines.append(_line(f"{name}: before", (f[k][1] for f in fits if len(f) > k)))
+        lines.append(_line(f"{name}: fitted to all", (f[k][2] for f in fits if len(f) > k)))
+        lines.append(_line(f"{name}: fitted to all others", (u[k][2] for u in unused)))
+    worse = [after > before + WORSE for u in unused for _, before, after in u]
+    share = f"{100 * np.mean(worse):.0f}% of {len(worse)} apertures that were left out get worse by over {WORSE} stops."
+    rings = sum(r["rings"] > 0 for r in some if r.get("fitted"))
+    header = "light, stops (root mean square over heights)|lenses|" + "|".join(f"{q}%" for q in PERCENTILES)
+    told = f"{share} {rings} of {len(fits)} lenses get a ring." if worse else ""
+    return lab.page("## Rims fitted to photographs (primes)", lab.table(header, lines), told)
+
+
+def page(rows: list[Row]) -> str:
+    """The tables of percentiles, and the lenses that differ most."""
+    good = [r for r in rows if "reason" not in r]
+    primes, zooms = [r for r in good if not r["zoom"]], [r for r in good if r["zoom"]]
+    seconds = np.array([r["seconds"] / len(r["focal_mm"]) for r in good])
+    worst = sorted((r for r in good if np.isfinite(r["distortion"])), key=lambda r: -r["distortion"])[:20]
+    told = [[r["file"], r["profile"], r["match"], f"{r['distortion']:.2f}", f"{r['itself']:.2f}"] for r in worst]
+    refused = [[r["file"], r["profile"], r["reason"]] for r in rows if "reason" in r]
+    return lab.page(
+        "# A public collection against photographs",
+        f"`python -m experiments photographs FOLDER`: {len(good)} lenses of OpticsDatabase with a profile of lensfun "
+        f"({len(primes)} primes, {len(zooms)} zooms); {np.median(seconds):.1f} s of CPU a lens and focal length "
+        f"(median), {seconds.max():.1f} at most; {lab.machine_line()}",
+        "Differences are root mean squares over image heights; of a zoom, medians over focal lengths. Colour is that "
+        "at the largest height, of lenses whose distortion `verify` does not doubt.",
+        _table_of("Primes", primes), _table_of("Zooms", zooms), _rims_of(primes),
+        "## The twenty that differ most in distortion",
+        lab.table("file|profile|match|difference, %|distortion itself, %", told),
+        "## Not compared" if refused else "", lab.table("file|profile|why", refused) if refused else "",
+    )  # fmt: skip
+
+
+COLUMNS = lab.columns(
+    ("file", "file"), ("profile", "profile"), ("match", "match"), ("crop", "crop", ".3g"),
+    ("focal lengths mm", lambda r: " ".join(f"{f:g}" for f in r.get("focal_mm", ()))), ("aspheres", "aspheres"),
+    ("distortion %", "distortion", ".3f"), ("itself %", "itself", ".3f"),
+    ("size", "size", ".3f"), ("two cameras %", "own", ".3f"),
+    ("light f/8", "f8", ".3f"), ("light widest", "widest", ".3f"),
+    *((f"{band} {kind} um", lambda r, b=band, k=k: r[b][k] if b in r else None, ".1f")
+      for band in BANDS for k, kind in enumerate(("measured", "ours"))),
+    *((f"light {name} {which}", lambda r, k=k, j=j: r["fitted"][k][j] if len(r.get("fitted", ())) > k else None, ".3f")
+      for k, name in enumerate(("widest", "next")) for j, which in ((1, "before"), (2, "fitted"))),
+    *((f"light {name} left out", lambda r, k=k: r["unused"][k][2] if r.get("unused") else None, ".3f")
+      for k, name in enumerate(("widest", "next"))),
+    ("front rims", "front", ".3f"), ("rear rims", "rear", ".3f"), ("rings", "rings"),
+    ("reason", "reason"),
+)  # fmt: skip
+
+
+def run(args: argparse.Namespace) -> None:
+    """Compare every file that has a profile, and write."""
+    files = sorted(p for p in args.folder.rglob("*") if p.suffix.lower() == ".zmx")
+    if not files:
+        raise InputError(args.folder, "files", "(no .zmx)", "a clone of OpticsDatabase")
+    files = lab.chosen(files, lambda p: p.stem, args.only, "photographs")
+    database()  # once, for all processes
+    with ProcessPoolExecutor(args.workers, mp_context=get_context("fork")) as pool:
+        found = pool.map(row_of, files, chunksize=4)
+        rows = [row for _ in lab.counted(files, "files", args.quiet) if (row := next(found)) is not None]
+    print(lab.write_results(args.out, "photographs", page(rows), {"machine": lab.machine(), "rows": rows}))
+    atomic_write_text(args.out / "photographs.csv", lab.csv_text(COLUMNS, rows))

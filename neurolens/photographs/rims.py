@@ -1,0 +1,245 @@
+"""Rims from photographs: those for which the light over image height is the measured one at all apertures together.
+
+On each side of the stop either the rims are scaled by one factor, or a ring of the mount is put in front of the lens or
+behind it, which a patent does not have and a product does. Nothing cuts the beam of the axis at the lens's widest
+aperture, and no rim is wider than its neighbours allow. What is left is the sensor's own shading, or a pupil that
+differs from the product's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from neurolens.analysis.fields import Result
+from neurolens.base.errors import InputError
+from neurolens.lens.prescription import Configuration, Lens, Surface
+from neurolens.photographs.compare import Array, at_focal_length, near_f8, stop_for
+from neurolens.photographs.light import open_light, with_rims
+from neurolens.photographs.profiles import Light, Profile
+from neurolens.setting.pupils import rear_opening_mm
+from neurolens.setting.rims import narrowed_rims
+
+_FACTORS = (0.4, 1.2)  # of rims, that are tried
+_FRONT = (0.15, 0.3, 0.5, 0.8, 1.2)  # places of rings in front of the lens, over the length of the lens
+_REAR = (0.2, 0.45, 0.7)  # behind it, over the distance from the last vertex to the film
+_RIMS = -1  # the way of a side whose rims are scaled; others are the numbers of its rings
+_TRIED, _ROUNDS, _LEVELS, _CLOSER = 9, 3, 2, 4.0  # values at a time, rounds over both sides, closer looks, how close
+_PREFERENCE = 2e-3  # stops for which a value twice as far from 1 is not worth it
+_FIRST, _HEIGHTS = 0.2, 11  # of the heights to the film's corner: the first as a share of the last
+_RING = 0.01  # stops by which a ring must be better than scaled rims
+_CLOSED = 11.5  # f-number beyond which no rim is seen
+_WIDE_MM = 1e5  # the radius of a ring that is not there
+_DARK = -4.0  # stops that stand for no light
+
+
+class Ring(NamedTuple):
+    """An opening of the mount: a plane in air.
+
+    Attributes:
+        before: the surface of the table in front of which it lies; the number of surfaces: behind the last.
+        distance_mm: from the vertex of that surface; of one behind the last, from the last.
+        radius_mm: of the opening.
+    """
+
+    before: int
+    distance_mm: float
+    radius_mm: float
+
+
+@dataclass(frozen=True)
+class FittedRims(Result):
+    """Rims that were fitted to photographs.
+
+    Attributes:
+        front, rear: factors of the rims in front of the stop and behind it.
+        rings: of the mount, at most one a side.
+        rims_mm: [S] radii.
+        before, after: residual of the light by f-number, root mean square over heights in stops.
+        unused: f-numbers that the fit did not use.
+    """
+
+    front: float
+    rear: float
+    rings: tuple[Ring, ...]
+    rims_mm: Array
+    before: dict[float, float]
+    after: dict[float, float]
+    unused: tuple[float, ...]
+
+    @property
+    def closed(self) -> float:
+        """The aperture nearest to f/8, at which hardly any rim is seen."""
+        return near_f8(self.after)
+
+
+class RimLight:
+    """The light of a lens by aperture, for other rims and for rings of the mount."""
+
+    def __init__(self, lens: Lens, profile: Profile, lights: Sequence[Light]) -> None:
+        """`lens`: focused at infinity, its stop open."""
+        self.rims, self.count = np.array(lens.semi_diameters_mm), len(lens.surfaces)
+        self.rings, ringed = _with_rings(lens)
+        self._sides: dict[tuple[bool, float], Array] = {}
+        rows = [k for k, s in enumerate(ringed.surfaces) if s.diameter_mm < _WIDE_MM]
+        self.place = np.array(rows)  # of the table's surfaces among those with the rings
+        self.stop, self.stop_place = lens.stop_index, rows[lens.stop_index]
+        widest = np.full(len(ringed.surfaces), _WIDE_MM)
+        widest[self.place] = _FACTORS[1] * self.rims
+        widest[self.stop_place] = self.rims[self.stop]
+        half = min(profile.half_diagonal_mm, lens.image_radius_mm or math.inf)
+        height = half * np.linspace(_FIRST, 1, _HEIGHTS)
+        self.f_numbers = [row.f_number for row in lights]
+        self.measured = np.stack([profile.stops(row, height) for row in lights])
+        reach, plane = rear_opening_mm(with_rims(lens, widest[self.place]), float(lens.film_z_mm or 0.0))
+        rear = reach, plane + float(ringed.film_z_mm or 0.0) - float(lens.film_z_mm or 0.0)
+        self.opened = open_light(ringed, np.concatenate([[0.0], height]), widest, rear)
+        radii = [stop_for(lens, f_number) for f_number in self.f_numbers]
+        self.stops = [self.opened.inside(self.stop_place, radius) for radius in radii]
+        # The beam of the axis, as the table's own rims let it through: beyond them rays may fold back into the stop.
+        tabled = np.full(len(widest), math.inf)
+        tabled[self.place] = self.rims
+        axis = self.opened.radius_mm[:, 0]
+        beam = np.all(axis <= tabled[:, None, None], axis=0) & np.isfinite(axis).all(axis=0)
+        self.beam_mm = np.where(beam, axis, 0.0).max(axis=(1, 2))
+        lit = np.min([self.opened.inside(k, r) for k, r in enumerate(widest)], axis=0) > 0
+        self.lit_mm = np.where(lit, np.where(np.isfinite(self.opened.radius_mm), self.opened.radius_mm, 0), 0).max(
+            axis=(1, 2, 3)
+        )
+        limit = np.array(narrowed_rims(with_rims(lens, widest[self.place])).semi_diameters_mm)
+        self.limit_mm = np.maximum(np.maximum(limit, self.beam_mm[self.place]), self.rims)
+
+    def scaled(self, front: float, rear: float) -> Array:
+        """The radii of the rims for factors of both sides of the stop."""
+        factor = np.where(np.arange(self.count) < self.stop, front, rear)
+        radii = np.clip(factor * self.rims, self.beam_mm[self.place], self.limit_mm)
+        radii[self.stop] = self.rims[self.stop]
+        return radii
+
+    def ring(self, number: int, value: float) -> Ring:
+        """A ring between the beam of the axis (0) and what is lit (1)."""
+        place, ring = self.rings[number]
+        low, high = self.beam_mm[place], self.lit_mm[place]
+        return ring._replace(radius_mm=float(low + value * (high - low)))
+
+    def side(self, front: bool, way: int, value: float) -> Array:
+        """What one side lets through, [F, G, G], with scaled rims or a ring."""
+        if way != _RIMS:
+            ring = self.opened.inside(self.rings[way][0], self.ring(way, value).radius_mm)
+            return np.minimum(self.side(front, _RIMS, 1.0), ring)
+        if (front, value) not in self._sides:
+            radii = self.scaled(value, value)
+            surfaces = range(self.stop) if front else range(self.stop + 1, self.count)
+            parts = [self.opened.inside(self.place[k], radii[k]) for k in surfaces]
+            self._sides[front, value] = np.min(parts or [np.ones(self.opened.light.shape)], axis=0)
+        return self._sides[front, value]
+
+    def residuals(self, front: Array, rear: Array) -> Array:
+        """Root mean square over heights [A] of computed less measured light, for what both sides let through."""
+        both = np.minimum(front, rear)
+        light = np.stack([(np.minimum(both, stop) * self.opened.light).sum(axis=(1, 2)) for stop in self.stops])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            stops = np.log2(light[:, 1:] / light[:, :1])
+        off = np.where(stops > _DARK, stops, _DARK) - self.measured
+        return np.asarray(np.sqrt(np.nanmean(off**2, axis=1)))
+
+    def fit(self, used: Sequence[int]) -> list[tuple[int, float]]:
+        """The way and value of the front and of the rear, one side after the other, then by closer looks."""
+        chosen = [(_RIMS, 1.0), (_RIMS, 1.0)]
+        ways = [[k for k, (_, ring) in enumerate(self.rings) if (ring.before == 0) == front] for front in (True, False)]
+        sides = [self.side(True, *chosen[0]), self.side(False, *chosen[1])]
+        for turn in range(2 * (_ROUNDS + _LEVELS)):
+            side, closer = turn % 2, max(turn // 2 - _ROUNDS + 1, 0)
+            best = (math.inf, *chosen[side])
+            for way in [_RIMS, *ways[side]] if not closer else [chosen[side][0]]:
+                low, high = _FACTORS if way == _RIMS else (0.0, 1.0)
+                if closer:
+                    reach = (high - low) / (_TRIED - 1) / _CLOSER ** (closer - 1)
+                    low, high = max(low, chosen[side][1] - reach), min(high, chosen[side][1] + reach)
+                for value in np.linspace(low, high, _TRIED):
+                    open_ = self.side(side == 0, way, value)
+                    each = self.residuals(open_, sides[1]) if side == 0 else self.residuals(sides[0], open_)
+                    error = float(np.sqrt(np.mean(each[used] ** 2))) + _PREFERENCE * abs(value - 1)
+                    best = min(best, (error + _RING * (way != _RIMS), way, float(value)))
+            chosen[side] = best[1:]
+            sides[side] = self.side(side == 0, *chosen[side])
+        return chosen
+
+
+def with_ring(lens: Lens, ring: Ring) -> Lens:
+    """The lens with a ring as a plane surface in air; states of a zoom follow."""
+    at, gap = ring.before, ring.distance_mm
+    row = Surface(math.inf, gap, 2 * ring.radius_mm)
+    surfaces = list(lens.surfaces)
+    if at:
+        before = surfaces[at - 1]
+        row = replace(row, thickness_mm=before.thickness_mm - gap)
+        surfaces[at - 1] = replace(before, thickness_mm=gap)
+    surfaces.insert(at, row)
+
+    def moved(gaps: tuple[tuple[int, Any], ...]) -> tuple[tuple[int, Any], ...]:
+        return tuple((k + 1, t - gap) if k == at - 1 else (k + (k >= at), t) for k, t in gaps)
+
+    def of_state(c: Configuration) -> Configuration:
+        nearer = None if c.object_distance_mm is None else c.object_distance_mm - (0 if at else gap)
+        return replace(c, thickness_mm=moved(c.thickness_mm), object_distance_mm=nearer)
+
+    states = tuple(map(of_state, lens.configurations))
+    film = lens.film_z_mm if at or lens.film_z_mm is None else lens.film_z_mm + gap
+    infinity = moved(lens.infinity_mm)
+    return replace(lens, surfaces=tuple(surfaces), configurations=states, film_z_mm=film, infinity_mm=infinity)
+
+
+def _with_rings(lens: Lens) -> tuple[list[tuple[int, Ring]], Lens]:
+    """The rings that are tried, each with its place among the surfaces of a lens that has them all, and that lens."""
+    z = [float(v) for v in lens.vertices_mm]
+    _, rear_z = rear_opening_mm(lens, float(lens.film_z_mm or z[-1]))
+    last = min(range(len(lens.surfaces)), key=lambda k: abs(z[k] - rear_z))
+    front = [share * z[-2] for share in _FRONT]
+    rear = [share * float(lens.surfaces[last].thickness_mm) for share in _REAR] if lens.surfaces[last].n_d == 1 else []
+    ringed, near = lens, 0.0
+    for distance in rear[::-1]:
+        ringed = with_ring(ringed, Ring(last + 1, distance, _WIDE_MM))
+    for distance in front:
+        ringed, near = with_ring(ringed, Ring(0, distance - near, _WIDE_MM)), distance
+    count = len(front)
+    rings = [(count - 1 - k, Ring(0, distance, _WIDE_MM)) for k, distance in enumerate(front)]
+    rings += [(count + last + 1 + k, Ring(last + 1, distance, _WIDE_MM)) for k, distance in enumerate(rear)]
+    return rings, ringed
+
+
+def fit_rims(lens: Lens, profile: Profile, unused: Collection[float] = ()) -> FittedRims:
+    """Fit the rims of a lens to the light of a profile, of a zoom at its shortest focal length, but for some f-numbers.
+
+    Raises:
+        InputError: a lens with cylinders; a profile without light at apertures of this lens.
+    """
+    if lens.anamorphic:
+        raise InputError(lens.path, "cylinder", "(an anamorphic lens)", "a lens that is symmetric about its axis")
+    focal_mm = min((row.focal_mm for row in profile.light), default=math.nan)
+    lights = [row for row in profile.light_at(focal_mm) if row.f_number <= _CLOSED]
+    if not [row for row in lights if row.f_number not in unused]:
+        raise InputError(lens.path, "profile", profile.model, "one with light up to f/11, at apertures that are used")
+    light = RimLight(at_focal_length(lens, focal_mm), profile, lights)
+    before = light.residuals(light.side(True, _RIMS, 1.0), light.side(False, _RIMS, 1.0))
+    chosen = light.fit([k for k, f_number in enumerate(light.f_numbers) if f_number not in unused])
+    after = light.residuals(light.side(True, *chosen[0]), light.side(False, *chosen[1]))
+    factors = [value if way == _RIMS else 1.0 for way, value in chosen]
+    rings = tuple(light.ring(way, value) for way, value in chosen if way != _RIMS and value < 1)
+    residuals = [dict(zip(light.f_numbers, map(float, values), strict=True)) for values in (before, after)]
+    radii = light.scaled(factors[0], factors[1])
+    return FittedRims(factors[0], factors[1], rings, radii, residuals[0], residuals[1], tuple(sorted(unused)))
+
+
+def with_fitted_rims(lens: Lens, found: FittedRims) -> Lens:
+    """The lens of a file with fitted rims and rings; its stop stays."""
+    pairs = zip(lens.surfaces, found.rims_mm, strict=True)
+    radii = [s.semi_diameter_mm if s.stop else round(float(radius), 4) for s, radius in pairs]
+    lens = replace(with_rims(lens, np.array(radii)), rims="photographs")
+    for ring in sorted(found.rings, key=lambda ring: -ring.before):
+        lens = with_ring(lens, ring)
+    return lens
