@@ -277,6 +277,10 @@ def test_distortion_of_the_summilux_28() -> None:
     states until the tabled film is in focus at 0.70 m, it has pincushion, 1.0% in the corner, and the scale of the
     instructions, 1:21.9 at 0.7 m. The near state itself, said to be of an object at 653.68 mm, is in focus for one at
     849 mm, 0.28 mm of film away: it is 1 / 1.37 of that way.
+
+    No slip of one digit, sign or power of ten explains pincushion at infinity: of 1,949 such changes, tried once, 1,175
+    keep focal length and film, and those among them with 0.6% of pincushion or more at 37 degrees have the tangential
+    focus more than 2 mm from the film at 33.
     """
     error = distortion(Scene(set_lens(_summilux())), edge_deg=37.727).error_percent[RECTILINEAR]
     assert error.min() == pytest.approx(-1.48, abs=0.005) and error[-1] == pytest.approx(-1.27, abs=0.005)
