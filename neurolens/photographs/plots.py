@@ -14,10 +14,8 @@ _MOST = 6  # apertures, or focal lengths, that are drawn
 
 def plot_verified(found: Verified, path: Path, title: str) -> None:
     """Draw distortion, lateral colour and light over image height; of a zoom, some of its focal lengths."""
-    some = _spread(list(found.comparisons))
-    subtitle = f"points: photographs, lensfun's {found.profile} ({found.certainty}); lines: rays.\n" + "; ".join(
-        found.verdict
-    )
+    head = f"points: photographs, lensfun's {found.profile} ({found.certainty}); lines: rays."
+    subtitle = f"{head}\n{'; '.join(found.verdict)}"
     with drawing(path, 13.5, 5.2, title, subtitle) as figure:
         left, middle, right = figure.subplots(1, 3)
         for axes, label in (
@@ -27,14 +25,14 @@ def plot_verified(found: Verified, path: Path, title: str) -> None:
         ):
             axes.grid(True)
             axes.set(xlabel="image height, mm", ylabel=label)
-        for colour, c in zip(FIELD_COLOURS, some, strict=False):
-            if c.distortion is not None:
-                _both(left, c.distortion, colour, f"{c.focal_mm:g} mm")
+        bent = [(c.focal_mm, c.distortion) for c in found.comparisons if c.distortion is not None]
+        for colour, (focal, curve) in zip(FIELD_COLOURS, _spread(bent), strict=False):
+            _both(left, curve, colour, f"{focal:g} mm")
         for name, colour in (("red", "#d55e00"), ("blue", "#0072b2")):
-            curve = getattr(some[-1], name)
-            if curve is not None:
-                _both(middle, curve, colour, f"{name}, {some[-1].focal_mm:g} mm")
-        lit = [c for c in some if c.light]
+            fringes = [(c.focal_mm, getattr(c, name)) for c in found.comparisons if getattr(c, name) is not None]
+            for focal, curve in fringes[:1]:
+                _both(middle, curve, colour, f"{name}, {focal:g} mm")
+        lit = [c for c in found.comparisons if c.light]
         if lit:
             for colour, f_number in zip(FIELD_COLOURS, _spread(sorted(lit[0].light)), strict=False):
                 _both(right, lit[0].light[f_number], colour, f"f/{f_number:g}")

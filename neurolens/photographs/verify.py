@@ -125,7 +125,7 @@ def verify(lens: Lens, profile: str | None = None) -> Verified:
     whole = [compare(lens, used, focal) for focal in used.focal_mm]
     name = used.model if used.maker.split()[0].lower() in used.model.lower() else f"{used.maker} {used.model}"
     bare = Verified(name, match.certainty, also, used.crop, tuple(whole), _spread(profiles, lens), ())
-    return Verified(**{**vars(bare), "verdict": tuple(_said(bare))})
+    return Verified(**{**vars(bare), "verdict": tuple(_said(bare, lens.rims == "photographs"))})
 
 
 def _check_focal_length(lens: Lens, profile: Profile) -> None:
@@ -151,8 +151,8 @@ def _spread(profiles: Sequence[Profile], lens: Lens) -> float:
     return _median(each)
 
 
-def _said(found: Verified) -> list[str]:
-    """The verdict in sentences."""
+def _said(found: Verified, fitted: bool) -> list[str]:
+    """The verdict in sentences; `fitted`: whether the rims are fitted to photographs already."""
     off, slack = found.distortion_percent, found.uncertainty_percent
     lines = []
     if math.isnan(off):
@@ -161,13 +161,13 @@ def _said(found: Verified) -> list[str]:
         own = f" (two cameras differ by {slack:.2g}%)" if math.isfinite(slack) else ""
         sound = "agree" if off <= SOUND_PERCENT else "roughly agree" if off <= DOUBTFUL_PERCENT else "disagree"
         lines.append(f"the figures {sound} with the photographs: distortion within {off:.2g}% of the image height{own}")
-    lines.append(_said_of_light(found))
+    lines.append(_said_of_light(found, fitted))
     if found.certainty != "certain":
         lines.append(f"the match of the names is only {found.certainty}")
     return lines
 
 
-def _said_of_light(found: Verified) -> str:
+def _said_of_light(found: Verified, fitted: bool) -> str:
     closed, wide = found.light_stops(widest=False), found.light_stops(widest=True)
     if math.isnan(wide):
         return "light was not measured"
@@ -177,4 +177,5 @@ def _said_of_light(found: Verified) -> str:
     word = "darker" if _median(float(np.nanmean(c.measured - c.ours)) for c in curves) < 0 else "brighter"
     if closed > SOUND_STOPS:
         return f"the real lens is {word} by {wide:.2g} stops, at f/8 by {closed:.2g}: rims alone cannot explain that"
-    return f"the real lens is {word} wide open by {wide:.2g} stops: its rims are others (see neurolens rims)"
+    cause = "more than rims can explain" if fitted else "its rims are others (see neurolens rims)"
+    return f"the real lens is {word} wide open by {wide:.2g} stops: {cause}"
