@@ -19,6 +19,8 @@ from neurolens.photographs.profiles import FULL_FRAME_MM, Light, Profile, Radial
 from neurolens.photographs.verify import names_of, verify
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
+from neurolens.surrogates.domain import domain_of
+from neurolens.surrogates.export import lens_facts
 
 ROOT = Path(__file__).parents[2]
 SONNAR = ROOT / "lenses" / "sony_sonnar_55.toml"
@@ -124,6 +126,8 @@ def test_the_command_prints_draws_and_writes(tmp_path: Path, capsys: pytest.Capt
     assert "Sony FE 55mm f/1.8 ZA" in text and "the figures agree" in text and "neurolens rims" in text
     assert picture.read_bytes().startswith(b"\x89PNG")
     again = read_lens(written)
+    card = lens_facts(again, domain_of(set_lens(again), focus_m=(math.inf, math.inf)))
+    assert card["measured"] == dict(again.measured) and card["believed_to_be"] == again.believed_to_be
     assert dict(again.measured)["profile"] == "Sony FE 55mm f/1.8 ZA" and again.sha256 == read_lens(SONNAR).sha256
     assert main(["verify", str(written), "--json"]) == 0
     data = json.loads(capsys.readouterr().out)
