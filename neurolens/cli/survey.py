@@ -35,6 +35,7 @@ DIR holds survey.html (a table with sections of the lenses, to sort and filter),
     folder: Path = setting(..., "folder of lens files", positional=True, metavar="FOLDER")
     out: Path = output_path("DIR", "default: runs/survey", Path("runs/survey"))
     no_fit: bool = setting(False, "read and check only")
+    verify: bool = setting(False, "hold each lens against photographs (neurolens verify; extra photographs)")
     terms: int = setting(64, "coefficients (default 64)", within=(1, 400))
     rays: int = setting(30_000, "to fit and to measure (default 30000)", within=(1000, 10**6))
     seed: int = setting(1, "of the rays (default 1)", kind=whole(0))
@@ -56,7 +57,7 @@ DIR holds survey.html (a table with sections of the lenses, to sort and filter),
         if self.out.resolve() == self.folder.resolve():
             self.refuse("--output", str(self.out), "a folder other than that of the lenses")
         collection = collection_of(self.folder)
-        settings = SurveySettings(not self.no_fit, self.terms, self.rays, self.seed, self.half_field)
+        settings = SurveySettings(not self.no_fit, self.terms, self.rays, self.seed, self.half_field, self.verify)
         glasses = [(file.name, read_bytes(file, MAX_BYTES, "a glass catalogue")) for file in self.glass]
         limit_s = TIME_LIMIT_S
         with Processes(self.jobs, limit_s) if self.dask is None else Dask(self.dask, limit_s) as executor:

@@ -48,6 +48,7 @@ from neurolens.base.records import plain, versions
 from neurolens.base.tasks import Failed, run_each
 from neurolens.cameras.model import load_model
 from neurolens.lens.prescription import Lens
+from neurolens.photographs.verify import verify
 from neurolens.readers.any_format import Collection, kind_of, read_any
 from neurolens.readers.glasses import more_glasses
 from neurolens.readers.source import MAX_BYTES, ReadOptions
@@ -82,6 +83,7 @@ class SurveySettings:
         rays: to fit, and to measure; four times as many test what passes.
         seed: of the rays of the fit.
         half_field_deg: assumed, with a note, where a file gives neither rims nor field.
+        verify: whether lenses are held against photographs.
     """
 
     fit: bool = True
@@ -89,6 +91,7 @@ class SurveySettings:
     rays: int = 30_000
     seed: int = 1
     half_field_deg: float = 15.0
+    verify: bool = False
 
 
 @dataclass(frozen=True)
@@ -175,6 +178,11 @@ def _survey(task: Task, file: Path, record: dict[str, Any]) -> None:
     if assumed:
         record["verdict"], record["doubts"] = "doubtful", [*assumed, *record["doubts"]]
     record |= {"sha256": lens.sha256, "layout": None, "fit": None}
+    if task.settings.verify:
+        try:
+            record["photographs"] = verify(lens).measured
+        except InputError as error:
+            record["notes"].append(f"no photographs: {error.field}: got {error.value}, expected {error.expected}")
     lens = set_lens(lens.with_aperture(None))
     domain = DomainChoice(focus_m=(math.inf, math.inf), wavelength_nm=_WAVELENGTHS_NM).of(lens)
     if lens.half_field_deg is None and lens.image_radius_mm is None:
@@ -318,6 +326,9 @@ COLUMNS = (
     Column("refractions", "refractions"),
     Column("aspheres", "aspheres", about="surfaces that are no sphere, plane or cylinder"),
     Column("states", "states", about="zoom and focus states of the file; the table's own is fitted"),
+    Column("distortion off (%)", "photographs.distortion_percent", about="residual of the distortion's shape "
+           "beside photographs, of the image height (--verify)"),
+    Column("light off (stops)", "photographs.light_widest_stops", about="the same of the light at the widest aperture"),
     Column("direction (°)", "fit.direction_rms_deg", about="angle between exact and modelled ray, root mean square "
            f"over fresh rays; goal {GOALS['direction_rms_deg']:g}"),
     Column("error (µm)", "fit.rms_um", about="distance on the film that the error makes, root mean square"),
@@ -417,13 +428,13 @@ def _csv(records: Sequence[Mapping[str, Any]]) -> str:
     """Texts, then the figures by their keys, then lists, their items parted by " | ", a row for each record."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    fits = sorted({key for r in records for key, v in (r.get("fit") or {}).items() if not isinstance(v, list | dict)})
-    plain = [c.key for c in COLUMNS if not c.key.startswith("fit.")]
-    writer.writerow([*_TEXTS, *plain, *fits, *_LISTS, "broken"])
-    for r in records:
-        fit = r.get("fit") or {}
-        lists = [*(r.get(key) or () for key in _LISTS), fit.get("broken", ())]
-        figures = [*(r.get(key) for key in plain), *(fit.get(key) for key in fits)]
+    inner = [{**(r.get("photographs") or {}), **(r.get("fit") or {})} for r in records]
+    keys = sorted({key for found in inner for key, v in found.items() if not isinstance(v, list | dict)})
+    plain = [c.key for c in COLUMNS if "." not in c.key]
+    writer.writerow([*_TEXTS, *plain, *keys, *_LISTS, "broken"])
+    for r, found in zip(records, inner, strict=True):
+        lists = [*(r.get(key) or () for key in _LISTS), found.get("broken", ())]
+        figures = [*(r.get(key) for key in plain), *(found.get(key) for key in keys)]
         row = [*(r.get(key, "") for key in _TEXTS), *figures, *(" | ".join(items) for items in lists)]
         writer.writerow([_plain_cell(value) for value in row])
     return stream.getvalue()

@@ -167,3 +167,17 @@ def test_light_alone_and_another_film(monkeypatch: pytest.MonkeyPatch) -> None:
     (c,) = verify(lens).comparisons
     assert c.distortion is not None and c.distortion.height_mm.max() <= (lens.image_radius_mm or math.inf) * 1.02
     assert names_of(lens)[0] == "Some 50mm f/1.8"
+
+
+def test_a_survey_holds_lenses_against_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("lensfunpy")
+    folder = tmp_path / "lenses"
+    folder.mkdir()
+    for name in ("sony_sonnar_55", "thorlabs_lb1471_biconvex_50"):
+        (folder / f"{name}.toml").write_bytes((ROOT / "lenses" / f"{name}.toml").read_bytes())
+    out = tmp_path / "found"
+    assert main(["survey", str(folder), "--no-fit", "--verify", "--jobs", "1", "--quiet", "-o", str(out)]) == 0
+    records = {r["file"]: r for r in json.loads((out / "survey.json").read_text())["lenses"]}
+    assert records["sony_sonnar_55.toml"]["photographs"]["profile"] == "Sony FE 55mm f/1.8 ZA"
+    assert any("no photographs" in note for note in records["thorlabs_lb1471_biconvex_50.toml"]["notes"])
+    assert "distortion_percent" in (out / "survey.csv").read_text().splitlines()[0]
