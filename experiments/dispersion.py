@@ -116,7 +116,8 @@ def run(args: argparse.Namespace) -> None:
         asked = argparse.Namespace(**{name: getattr(args, name) for name in ("samples", "seeds", "width")})
         found = pool.map(partial(case, args=asked), cases)
         rows = [next(found) for _ in lab.counted(cases, "cases", args.quiet)]
-    head = f"`python -m experiments dispersion`: {args.samples} samples, {args.seeds} seeds, {args.width} pixels wide; "
+    head = f"`python -m experiments dispersion`: {args.samples} samples, {args.seeds} seeds, {args.width} pixels wide, "
+    head += f"{args.workers} pictures at a time; "
     parts = [head + lab.machine_line(), _ABOUT, lab.table(_COLUMNS, rows)]
     pairs = [(r["four"], r["off"]) for r in rows]
     light = _range([four["mean"] / off["mean"] for four, off in pairs])
