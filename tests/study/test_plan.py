@@ -236,13 +236,13 @@ def test_noise_of_weights_is_how_many_times_the_rays_it_takes() -> None:
 def fitted_once() -> Iterator[None]:
     """The shader of a lens, whose pupil takes many seconds to fit, is the same in all tests."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tried, "lens_of", lambda file, zoom, report: shader_of(file, zoom))
+        patch.setattr(tried, "lens_of", lambda file, zoom, report: shader_of(file.name, zoom))
         yield
 
 
 @cache
-def shader_of(file: Path, zoom: str | None = None) -> tuple[str, OslLens, list[str]]:
-    return lens_of(file, zoom, lambda done, left=None: None)
+def shader_of(name: str, zoom: str | None) -> tuple[str, OslLens, list[str]]:
+    return lens_of(Path("lenses") / name, zoom, lambda done, left=None: None)
 
 
 @cache
@@ -265,7 +265,7 @@ def test_shaders_cost_what_cycles_took() -> None:
     rows = json.loads(Path("experiments/results/osl_speed.json").read_text(encoding="utf-8"))["rows"]
     (measured,) = (r for r in rows if (r["scene"], r["camera"]) == ("sky", "exact, 12 refractions"))
     found = garden()
-    lens = shader_of(Path(GAUSS))[1]
+    lens = shader_of(Path(GAUSS).name, None)[1]
     asked = found.asked
     ns, times = shader_cost(lens, found.places, asked.shot.film_mm, asked.f_number, asked.shot.focus_m)
     count = sum(osl_program(lens, {"count": 0.0}).count().values())
@@ -283,7 +283,8 @@ def test_shaders_cost_what_cycles_took() -> None:
 def test_a_warped_pinhole_lacks_the_blur_alone() -> None:
     """A wall in focus: places and light are right, so that its error is the RMS radius of the lens's footprints."""
     scene, lens = scene_from_tables(wall(3.0)), set_lens(read_lens(GAUSS))
-    choices, found = {c.name: c for c in plan(scene, lens, 1e9, explain=True).choices}, probe(scene, lens)
+    made = plan(scene, lens, 1e9, explain=True)
+    choices, found = {c.name: c for c in made.choices}, made.probed
     blur = np.percentile(blur_mm(found.seen, found.places.share) / 2, 95) / found.asked.pixel_mm
     assert choices["pinhole + ST map"].error_px == pytest.approx(blur, rel=0.02)
     assert choices["thick + ST map"].error_px == pytest.approx(blur, rel=0.02)  # in focus it is a point
