@@ -5,6 +5,7 @@ import io
 import json
 import os
 import re
+import runpy
 import socket
 import subprocess
 import sys
@@ -397,7 +398,8 @@ def test_the_documented_script_renders_one_picture_in_three_ways(
     Path("lights.toml").write_text(LAMP)
     # A cluster that runs already instead of one that the script starts, whose worker would import all of it again.
     script = script.replace("experiments/scenes/", "").replace('"local:2"', f'"{cluster}"')
-    exec(compile(script, "farm.py", "exec"), {"__name__": "__main__"})
+    Path("farm.py").write_text(script)
+    runpy.run_path("farm.py", run_name="__main__")
     one, *others = (read_channels(Path(f"{name}.exr"))[0] for name in ("one", "tiled", "farm"))
     assert one["ghosts.G"].any() and {"R", "Z", "rest.B"} <= one.keys()
     for other in others:

@@ -18,7 +18,6 @@ from neurolens.base.kept import Kept
 from neurolens.base.progress import Progress
 from neurolens.cameras.model import load_model
 from neurolens.cli import main
-from neurolens.graph import compiler
 from neurolens.study import measure
 from neurolens.study.experiment import default_experiment, read_experiment
 from neurolens.study.measure import fit_and_measure
@@ -73,7 +72,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     (folder / "small.toml").write_text(SMALL.replace("ROOT", os.path.relpath(ROOT, folder)))
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder.parent)
-        patch.setattr(compiler, "FLAGS", ("-std=c99", "-O1", "-march=native"))  # compiled with less effort
         experiment = read_experiment(Path(folder.name) / "small.toml")
         return folder, run_experiment(experiment, Path(folder.name) / "out", progress=Progress(quiet=True))
 
