@@ -54,8 +54,12 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture(autouse=True, scope="session")
 def quick_races() -> Iterator[None]:
-    """The command line is made once; races are of few rays and samples, for no test judges a clock."""
+    """The command line is made once; races are of few rays and samples, their C compiled with less effort, for no test
+    judges a clock."""
+    flags = ("-std=c99", "-O1", "-march=native")
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("neurolens.study.speed.CompiledSource.__init__.__defaults__", (flags,))
+        patch.setattr("neurolens.study.speed.program_candidate.__defaults__", (None, flags))
         patch.setattr(cli.main, "__defaults__", (None, cache(cli.build_parser)))
         patch.setattr("neurolens.study.speed.POOL", 16384)
         patch.setattr("neurolens.study.speed._SAMPLES", 1)

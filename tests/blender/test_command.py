@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import zipfile
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -28,9 +29,26 @@ LENS = "laikin_double_gauss_50"
 HUGE = "operations: got 20000"
 
 
+_MADE: dict[tuple[Any, ...], Any] = {}
+
+
+def once(make: Callable[..., Any]) -> Callable[..., Any]:
+    """What is made of a lens, made once for all tests."""
+
+    def made(lens: Any, *more: Any) -> Any:
+        key = (make.__name__, lens.name, *more)
+        if key not in _MADE:
+            _MADE[key] = make(lens, *more)
+        return _MADE[key]
+
+    return made
+
+
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of three models and their lens file, and shaders that cost nothing."""
+    for name in ("field_table", "thumbnail"):
+        monkeypatch.setattr(blender_lenses, name, once(getattr(blender_lenses, name)))
 
     def written(file: Path, *, zoom: str | None = None, quiet: bool = False) -> Shader:
         if file.stem == "huge":

@@ -24,7 +24,7 @@ from neurolens.readers.lensfile import read_lens
 from neurolens.setting.pupils import pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.shaders import blender_shader as shaders
-from neurolens.shaders import lowtests, osl, pupil_fit
+from neurolens.shaders import lowtests, osl, pupil_fit, stop_image
 from neurolens.shaders.blender_shader import _smallest, exact_lens
 from neurolens.shaders.pupil import Blades, PupilCircles, PupilDisc, unit_disc
 from neurolens.shaders.pupil_fit import fit_pupil
@@ -135,8 +135,8 @@ def test_an_exact_lens_keeps_its_tests() -> None:
 
 @cache
 def zoom(name: str, *, knots: tuple[float, float]) -> osl.OslLens:
-    """A part of a zoom's range, with three nodes."""
-    model, axis = load_model(ROOT / "models" / f"{name}.onnx"), Axis("zoom", "mm", knots, 2)
+    """A part of a zoom's range, with a node at each end."""
+    model, axis = load_model(ROOT / "models" / f"{name}.onnx"), Axis("zoom", "mm", knots, 1)
     states = [osl.shader_lens(model.at(*state)) for state in product([axis])]
     between = [(weights([axis], s), osl.shader_lens(model.at(*s))) for s in osl.states_between([axis])]
     return osl.osl_lens(states, lambda share: None, (axis,), between)
@@ -146,18 +146,20 @@ def zoom(name: str, *, knots: tuple[float, float]) -> osl.OslLens:
 def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     """A quick fit of the pupil, where it is not the pupil that is tested."""
     monkeypatch.setattr(pupil_fit, "_RAYS", 3000)
+    monkeypatch.setattr(pupil_fit, "_FIRST", 15_000)
+    monkeypatch.setattr(stop_image, "_RAYS", 4000)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_rays")
 def test_zoom_is_an_input() -> None:
     file = ROOT / "models" / "nikon_zoom_80_200-range.states-64.onnx"
-    made = zoom(file.stem, knots=(95.0, 125.0))
+    made = zoom(file.stem, knots=(95.0, 98.0))
     program = osl.osl_program(made)
     assert min(made.passing().values()) > 0.94
     rng = np.random.default_rng(8)
     film, square = np.repeat([[9.0], [-5.0]], 16_000, 1), rng.random((2, 16_000))
-    for zoom_mm in (96.0, 121.0):
+    for zoom_mm in (96.0, 97.4):
         given = inputs(film, square, f_number=4.0, asked_m=5.0, in_colour=0)
         rows = {name: value[0] for name, value in given.items()}
         found = program.evaluate(rows | {"zoom_mm": np.float32(zoom_mm)})
@@ -174,8 +176,8 @@ def test_zoom_is_an_input() -> None:
 @pytest.mark.slow
 def test_a_zoom_whose_stop_changes_and_whose_rims_cut_on_both_sides() -> None:
     """One set of operations serves its states, and hardly any ray that passes is lost, between nodes either."""
-    made = zoom("nikon_zoom_70_200-range.states-64", knots=(90.0, 130.0))
-    assert len({c.lens.stop_radius_mm for c in made.nodes}) == 3
+    made = zoom("nikon_zoom_70_200-range.states-64", knots=(90.0, 110.0))
+    assert len({c.lens.stop_radius_mm for c in made.nodes}) == 2
     for shown, pupil in made.states()[1:]:
         assert isinstance(pupil, PupilCircles) and len(pupil.numbers) >= 2
         counts, missed = missed_by_zone(shown, pupil, 0.8 * reach_of(shown))
@@ -186,10 +188,10 @@ def test_a_zoom_whose_stop_changes_and_whose_rims_cut_on_both_sides() -> None:
 @pytest.mark.usefixtures("few_rays")
 def test_groups_of_a_lens_file_move_where_the_camera_is_focused(monkeypatch: pytest.MonkeyPatch) -> None:
     file = ROOT / "lenses" / "tajima_retrofocus_24.toml"
-    monkeypatch.setattr(states, "gap_axis", lambda axis, _: (replace(axis, knots=(1.7, axis.knots[-1]), degree=2), 0))
-    _, made, _ = exact_lens(file, None, lambda share: None)  # of the near half of its range
+    monkeypatch.setattr(states, "gap_axis", lambda axis, _: (replace(axis, knots=(2.4, axis.knots[-1]), degree=1), 0))
+    _, made, _ = exact_lens(file, None, lambda share: None)  # of the near part of its range
     assert made.near_m == pytest.approx((0.3, 0.3), rel=1e-6)
-    program, focus_m = osl.osl_program(made), 0.45
+    program, focus_m = osl.osl_program(made), 0.34
     square = np.random.default_rng(9).random((2, 3000))
     film = np.repeat([[7.0], [10.0]], 3000, 1)
     rows = inputs(film, square, f_number=4.0, asked_m=focus_m, in_colour=0)
@@ -254,7 +256,7 @@ BICONVEX = "thorlabs_lb1471_biconvex_50.ols-64"  # far off its axis two parts of
 def test_pupils_of_high_order_pass_and_keep_the_light(name: str, least: float) -> None:
     """Against samples all over a box on the pupil plane: light of film points on all sides, stop open and closed."""
     lens, pupil = fitted(name)
-    rng, count, reach = np.random.default_rng(12), 200_000, reach_of(lens)
+    rng, count, reach = np.random.default_rng(12), 100_000, reach_of(lens)
     assert isinstance(pupil, PupilDisc) == (name == BICONVEX)
     assert min(passing_share(lens, pupil).values()) >= least
     for share, turn, field in ((1.0, 0.5, 0.6), (1.0, 1.2, 0.6), (0.5, 0.3, 0.6), (0.5, 0.9, 0.9)):

@@ -235,7 +235,7 @@ def test_rendered_frames_have_the_same_lights_and_layers(tmp_path: Path) -> None
         .replace("bins = 3", "bins = 6")
     )
     text = text.replace("[2.0, 1.0, 0.5]", "[3.0, 0.0, 0.0]").replace("brightest = 2", "brightest = 3")
-    scene.write_text(text + "most = 1\n")
+    scene.write_text(text + "most = 1\ncell_px = 16.0\n")
     words = ["render", str(scene), "--camera", "lenses/cooke_triplet_50.toml", "--layers", "beauty", "--quiet"]
     keys = [
         "--key",

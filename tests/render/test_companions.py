@@ -35,7 +35,7 @@ LENSES: dict[str, tuple[tuple[float, float], float]] = {
     "merte_biotar_100": (FILM, 1.4),
     "cooke_anamorphic_42": ((20.6, 17.3), 2.4),
 }
-LARGE: dict[str, Any] = {"width": 180, "height": 120, "threads": 1}
+LARGE: dict[str, Any] = {"width": 120, "height": 80, "threads": 1}
 WAYS: tuple[Any, ...] = ("auto", "one", "hero")
 NARROW = {
     "sodium": {"spectrum": [[380, 0.0], [580, 0.0], [589, 1.0], [598, 0.0], [780, 0.0]]},
@@ -136,32 +136,31 @@ def blocks(picture: np.ndarray) -> np.ndarray:
     return np.stack([p.mean(axis=(0, 1)) for p in (picture[h:-h, w:-w], np.concatenate(corners))])
 
 
-def both_modes(camera: Any, samples: int, light: str = "D65", **tables: Any) -> list[np.ndarray]:
+def in_modes(camera: Any, samples: int, light: str = "D65", modes: Any = ("one", "hero"), **tables: Any) -> Any:
     made = scene(environment=WHITE | {"illuminant": light}, illuminants=NARROW, **tables)
     made = replace(made, settings=replace(made.settings, camera=replace(made.settings.camera, film_mm=camera.film_mm)))
     size = LARGE | {"height": round(LARGE["width"] * camera.film_mm[1] / camera.film_mm[0])}
-    found = [
-        render(made, camera, samples=samples, film=FilmSettings(wavelengths=mode), **size) for mode in ("one", "hero")
-    ]
-    assert [f.stats["wavelengths"] for f in found] == ["one", "companions"]
+    found = [render(made, camera, samples=samples, film=FilmSettings(wavelengths=mode), **size) for mode in modes]
+    assert [f.stats["wavelengths"] for f in found] == ["one", "companions"][-len(modes) :]
     return [f.rgb.astype(np.float64) for f in found]
 
 
 @pytest.mark.parametrize("name", LENSES)
 def test_white_surroundings_look_the_same_in_the_middle_and_in_corners(name: str) -> None:
-    one, several = both_modes(compiled(lens_camera(name)), 16)
-    assert blocks(several) == pytest.approx(blocks(one), rel=3e-3)
-    assert several.mean(axis=(0, 1)) == pytest.approx(one.mean(axis=(0, 1)), rel=1e-3)
+    one, several = in_modes(compiled(lens_camera(name)), 16)
+    # From seed to seed a block's mean scatters by up to 0.2% in either mode.
+    assert blocks(several) == pytest.approx(blocks(one), rel=4.5e-3)
+    assert several.mean(axis=(0, 1)) == pytest.approx(one.mean(axis=(0, 1)), rel=1.5e-3)
 
 
 @pytest.mark.parametrize("light", NARROW)
 def test_light_of_a_line_or_of_a_lamp_is_conserved(light: str) -> None:
-    one, several = both_modes(compiled(model_camera()), 64, light)
+    one, several = in_modes(compiled(model_camera()), 64, light)
     assert several.mean(axis=(0, 1)) == pytest.approx(one.mean(axis=(0, 1)), rel=5e-3, abs=2e-3)
 
 
 def test_without_vignetting_white_stays_white() -> None:
-    several = both_modes(model_camera("none"), 32)[1]
+    (several,) = in_modes(model_camera("none"), 32, modes=["hero"])
     assert several @ [0.2126, 0.7152, 0.0722] == pytest.approx(np.ones(several.shape[:2]), abs=0.25)
     assert blocks(several) @ [0.2126, 0.7152, 0.0722] == pytest.approx([1, 1], abs=4e-3)
 
@@ -169,7 +168,7 @@ def test_without_vignetting_white_stays_white() -> None:
 def test_glass_that_parts_the_wavelengths_loses_nothing() -> None:
     flint = {"kind": "glass", "n_d": 1.9, "V_d": 12.0}
     ball = {"centre_m": [0, 0, -1.0], "radius_m": 0.5, "material": "flint"}
-    one, several = both_modes(compiled(model_camera()), 16, materials={"flint": flint}, spheres=[ball])
+    one, several = in_modes(compiled(model_camera()), 16, materials={"flint": flint}, spheres=[ball])
     assert several.mean(axis=(0, 1)) == pytest.approx(one.mean(axis=(0, 1)), rel=6e-3)
 
 
@@ -211,7 +210,7 @@ def test_any_number_of_workers_and_an_interruption_give_the_same_picture(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr("neurolens.render.film.BATCH", 16 * 700)
-    options: dict[str, Any] = LARGE | {"samples": 20, "width": 120, "height": 80}
+    options: dict[str, Any] = LARGE | {"samples": 20}
     monkeypatch.setattr("neurolens.render.job._LITTLE_PX", 0.0)
     made, camera, part = edges(), compiled(model_camera()), tmp_path / "a.part"
     whole = render(made, camera, **options)

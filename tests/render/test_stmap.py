@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from functools import cache
 from pathlib import Path
+from shutil import which
 from typing import Any, get_args, get_type_hints
 
 import numpy as np
@@ -143,12 +144,12 @@ def test_a_render_undistorted_by_the_map_is_the_pinholes(tmp_path: Path) -> None
     field = field_of(lens, 2.0)
     plates = plates_of([field], WIDE, FILM)
     undistort = undistort_map(field, plates)
-    pictures = [
-        read_through(render(scene, lens, width=WIDE[0], height=WIDE[1], samples=32, threads=1).rgb[..., 1], undistort),
-        render(scene, make_camera(f"pinhole:{GAUSS}", shot), width=WIDE[0], height=WIDE[1], samples=32, threads=1).rgb[
-            ..., 1
-        ],
-    ]
+    seen = lens.compiled() if which("cc") else lens  # type: ignore[attr-defined]
+    one, other = (
+        render(scene, camera, width=WIDE[0], height=WIDE[1], samples=16, threads=1).rgb[..., 1]
+        for camera in (seen, make_camera(f"pinhole:{GAUSS}", shot))
+    )
+    pictures = [read_through(one, undistort), other]
     pixel, off = FILM[0] / WIDE[0], []
     for x, y in places:
         image = np.array([x, -y]) * field.frame.reach_mm[0] / (2000 - field.frame.pupil_mm[0]) * 1000 / pixel

@@ -51,7 +51,7 @@ method = "mlp"
 units = 8
 steps = 20
 [evaluation]
-vignetting_rays = 20000
+vignetting_rays = 8000
 rounds = 1
 compile_exact = false
 [render]
