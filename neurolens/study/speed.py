@@ -281,7 +281,7 @@ def exact_candidates(
         return (*points, wavelength) if build_rays else (camera_rays(*points, domain.pupil_z_mm), wavelength)
 
     run: Callable[..., Traced] = whole if build_rays else tracing
-    fast = compile_tracing(run, fullgraph=True)
+    fast = compile_tracing(run, fullgraph=True) if compiled else run
 
     def prepare_compiled(rays: FilmRays) -> Call:
         call = partial(fast, *arguments(rays))
