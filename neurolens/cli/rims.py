@@ -19,9 +19,9 @@ class Rims(Glasses, Answering):
     """Fit the rims of a lens file to photographs: on each side of the stop either the rims are scaled, or a ring of the
     mount is added, so that the light over image height is the measured one at all apertures together.
 
-    Nothing cuts the beam of the axis, and no rim is wider than its neighbours allow. What is left is no matter
-    of rims: the sensor's shading, or a product that differs from the table. The profile is found as `neurolens verify`
-    finds it. Needs the extras "train" and "photographs"."""
+    Nothing cuts the beam of the axis, and no rim is wider than its neighbours allow. What is left has other causes: the
+    sensor's shading, or a product that differs from the table. The profile is found as `neurolens verify` finds it.
+    Needs the extras "train" and "photographs"."""
 
     about: ClassVar[str] = "fit the rims of a lens file to photographs of the product"
     epilog: ClassVar[str] = """\

@@ -122,10 +122,20 @@ def verify(lens: Lens, profile: str | None = None) -> Verified:
         raise InputError(lens.path, "cylinder", "(an anamorphic lens)", "a lens that is symmetric about its axis")
     match, profiles, also = found_for(lens, profile)
     used = profiles[0]
-    whole = [compare(lens, used, focal) for focal in used.focal_mm]
+    whole, missed = [], dict[float, InputError]()
+    for focal in used.focal_mm:
+        try:
+            whole.append(compare(lens, used, focal))
+        except InputError as error:  # a zoom that has no such position between its states
+            missed[focal] = error
+    if not whole:
+        raise next(iter(missed.values()))
     name = used.model if used.maker.split()[0].lower() in used.model.lower() else f"{used.maker} {used.model}"
     bare = Verified(name, match.certainty, also, used.crop, tuple(whole), _spread(profiles, lens), ())
-    return Verified(**{**vars(bare), "verdict": tuple(_said(bare, lens.rims == "photographs"))})
+    told = _said(bare, lens.rims == "photographs")
+    if missed:
+        told.append(f"not compared at {', '.join(f'{f:g}' for f in missed)} mm: {next(iter(missed.values()))}")
+    return Verified(**{**vars(bare), "verdict": tuple(told)})
 
 
 def _check_focal_length(lens: Lens, profile: Profile) -> None:
