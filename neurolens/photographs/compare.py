@@ -34,8 +34,9 @@ _OUTER_MM = 20.0  # of full frame, to which
 _SIZES = np.linspace(0.97, 1.03, 13)  # of the picture, over that of crop factor and table
 # Broad bands of a camera: those at which rays agree best with lensfun's lateral colour.
 _BANDS_NM = {"red": (585.0, 600.0, 615.0), "green": (520.0, 540.0, 560.0), "blue": (465.0, 480.0, 495.0)}
-_IDEAL = {"equisolid": "equisolid, 2 f sin(theta/2)", "fisheye": "equidistant, f theta",
+IDEAL = {"equisolid": "equisolid, 2 f sin(theta/2)", "fisheye": "equidistant, f theta",
           "stereographic": "stereographic, 2 f tan(theta/2)", "orthographic": "orthographic, f sin"}  # fmt: skip
+RECTILINEAR = next(iter(PROJECTIONS))
 _NEAR_N_D, _NEAR_V_D = 0.002, 1.0  # within which a glass of the catalogue stands for two figures of a table
 _STOP_SLACK = 1.03  # an aperture named in a profile counts as full where the lens's own is that near
 
@@ -102,8 +103,7 @@ def stretch_of(lens: Lens, profile: Profile, height_mm: Array) -> Callable[[Arra
     """
     scene = Scene(lens)
     angle, real = _chief(scene, height_mm.max())
-    name = _IDEAL.get(profile.projection, next(iter(PROJECTIONS)))
-    ideal = PROJECTIONS[name](angle)
+    ideal = PROJECTIONS[IDEAL.get(profile.projection, RECTILINEAR)](angle)
     return partial(_between, known_mm=real, values=real / ideal)
 
 
@@ -146,6 +146,27 @@ def distortion_curve(lens: Lens, profile: Profile, radial: Radial) -> tuple[Curv
         curve = Curve(height, _without_mean(measured, ours), _without_mean(ours, measured))
         found.append((-int(np.isfinite(ours).sum()), curve.rms, abs(size - 1), curve, float(size)))
     return min(found, key=lambda f: f[:3])[3:]
+
+
+def residual_of(height_mm: Array, measured: Array, real_mm: Array, stretch: Array) -> float:
+    """The residual of `distortion_curve`, percent, by the stretch at the image heights of chief rays.
+
+    Infinite where too few heights have one.
+    """
+    real_mm = np.where(np.isfinite(stretch), real_mm, math.nan)
+    rising = int(np.argmin(np.diff(real_mm, append=-math.inf) > 0)) + 1
+    if not real_mm[0] > 0:
+        return math.inf
+    ours = _between(np.outer(height_mm, _SIZES), real_mm[:rising], stretch[:rising])
+    known = np.isfinite(ours) & np.isfinite(measured)[:, None]
+    most = known.sum(axis=0)
+    if most.max() < _FEWEST:
+        return math.inf
+    ours, known = ours[:, most == most.max()], known[:, most == most.max()]
+    a, b = (
+        np.where(known, v, 0.0) / (np.where(known, v, 0.0).sum(axis=0) / most.max()) for v in (measured[:, None], ours)
+    )
+    return 100 * float(np.sqrt(((a - b) ** 2).sum(axis=0) / most.max()).min())
 
 
 def with_real_glasses(lens: Lens) -> Lens:

@@ -83,15 +83,20 @@ def names_of(lens: Lens) -> list[str]:
     return [name for name in (lens.believed_to_be, f"{lens.designer} {lens.name}", stem) if name.strip()]
 
 
-def found_for(lens: Lens, wanted: str | None = None) -> tuple[Match, list[Profile], tuple[str, ...]]:
+def found_for(
+    lens: Lens, wanted: str | None = None, *, any_focal: bool = False
+) -> tuple[Match, list[Profile], tuple[str, ...]]:
     """The profile for a lens, all profiles of that name, and the names of others that are likely.
+
+    `any_focal`: also where the table's focal length is another, for tables that are doubted.
 
     Raises:
         InputError: no profile for the lens; none of the name that is wanted, or of no focal length of the lens.
     """
     if wanted is not None:
         same = _by_film(profile_named(wanted), lens)
-        _check_focal_length(lens, same[0])
+        if not any_focal:
+            _check_focal_length(lens, same[0])
         return Match(same[0], 1.0), same, ()
     found = [m for m in matches(names_of(lens)) if m.certainty != "uncertain"]
     if not found:
@@ -102,7 +107,8 @@ def found_for(lens: Lens, wanted: str | None = None) -> tuple[Match, list[Profil
     same = [m.profile for m in found if (m.profile.maker, m.profile.model) == (best.profile.maker, best.profile.model)]
     also = dict.fromkeys(m.profile.model for m in found if m.likeness == best.likeness and m.profile not in same)
     same = _by_film(same, lens)
-    _check_focal_length(lens, same[0])
+    if not any_focal:
+        _check_focal_length(lens, same[0])
     return best, same, tuple(also)
 
 
