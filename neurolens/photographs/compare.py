@@ -148,25 +148,24 @@ def distortion_curve(lens: Lens, profile: Profile, radial: Radial) -> tuple[Curv
     return min(found, key=lambda f: f[:3])[3:]
 
 
-def residual_of(height_mm: Array, measured: Array, real_mm: Array, stretch: Array) -> float:
-    """The residual of `distortion_curve`, percent, by the stretch at the image heights of chief rays.
+def shape_off(height_mm: Array, measured: Array, real_mm: Array, stretch: Array) -> Array:
+    """The difference of `distortion_curve`, percent, by the stretch at the image heights of chief rays.
 
-    Infinite where too few heights have one.
+    NaN at heights that no chief ray reaches, and everywhere where too few do.
     """
     real_mm = np.where(np.isfinite(stretch), real_mm, math.nan)
     rising = int(np.argmin(np.diff(real_mm, append=-math.inf) > 0)) + 1
     if not real_mm[0] > 0:
-        return math.inf
+        return np.full_like(height_mm, math.nan)
     ours = _between(np.outer(height_mm, _SIZES), real_mm[:rising], stretch[:rising])
-    known = np.isfinite(ours) & np.isfinite(measured)[:, None]
-    most = known.sum(axis=0)
+    theirs = np.where(np.isfinite(ours), measured[:, None], math.nan)
+    ours = np.where(np.isfinite(theirs), ours, math.nan)
+    most = np.isfinite(ours).sum(axis=0)
     if most.max() < _FEWEST:
-        return math.inf
-    ours, known = ours[:, most == most.max()], known[:, most == most.max()]
-    a, b = (
-        np.where(known, v, 0.0) / (np.where(known, v, 0.0).sum(axis=0) / most.max()) for v in (measured[:, None], ours)
-    )
-    return 100 * float(np.sqrt(((a - b) ** 2).sum(axis=0) / most.max()).min())
+        return np.full_like(height_mm, math.nan)
+    ours, theirs = (v[:, most == most.max()] for v in (ours, theirs))
+    off = 100 * (theirs / np.nanmean(theirs, axis=0) - ours / np.nanmean(ours, axis=0))
+    return np.asarray(off[:, np.argmin(np.nansum(off**2, axis=0))])
 
 
 def with_real_glasses(lens: Lens) -> Lens:

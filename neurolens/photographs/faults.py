@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 from neurolens.analysis.fields import Result
 from neurolens.lens.prescription import Lens
 from neurolens.photographs.compare import at_focal_length
-from neurolens.photographs.figures import Measures, measures
+from neurolens.photographs.figures import Found, Measures, measure
 from neurolens.photographs.profiles import Profile
 
 Array = NDArray[np.float64]
 
 # What nearly all sound tables keep: experiments/results/faults.md.
-ALARM = Measures(distortion=0.75, blur=55.0, focus=1.0, colour=0.9, lateral=0.32, focal=5.5, back=0.4)
+ALARM = Measures(*map(np.array, (0.75, 55.0, 1.0, 0.9, 0.32, 5.5, 0.4)))
 _UNITS = {10.0: "centimetres", 25.4: "inches"}
-_SAG_MM = (0.002, 0.005, 0.012, 0.03, 0.07, 0.16, 0.4, 1.0)  # at the rim, of an asphere that may be missing
-_CLOSER, _STEPS, _GRID = 5, (0.5, 0.5, 0.25, 0.12), (-1.0, -0.5, 0.0, 0.5, 1.0)  # surfaces and steps of a closer search
+_POWERS, _ROUNDS = (4, 6, 8, 10), 6  # of an asphere that may be missing; rounds of the search for its terms
+_NEAR_MM, _DAMPED = 1e-5, (1e-9, 1e-7, 1e-5, 1e-3, 1e-1)  # of sags at the rim, for slopes; shares of their squares
 _CLEARLY = 3.0  # times by which the score is less after a change that is told
 _WORDS = {
     "distortion": ("distortion", "%"), "blur": ("blur of the axis times the f-number", " µm"),
@@ -40,7 +40,8 @@ class Change(NamedTuple):
     lens: Lens
 
 
-def _with(lens: Lens, k: int, **fields: Any) -> Lens:
+def changed(lens: Lens, k: int, **fields: Any) -> Lens:
+    """The lens with other figures in one row."""
     rows = lens.surfaces
     return replace(lens, surfaces=(*rows[:k], replace(rows[k], **fields), *rows[k + 1 :]))
 
@@ -69,14 +70,14 @@ def glasses(lens: Lens) -> list[int]:
 def swapped(lens: Lens, k: int, j: int) -> Lens:
     """The lens with the glasses of two rows swapped."""
     a, b = ({f: getattr(lens.surfaces[n], f) for f in ("n_d", "V_d", "glass", "material")} for n in (k, j))
-    return _with(_with(lens, k, **b), j, **a)
+    return changed(changed(lens, k, **b), j, **a)
 
 
 def changes(lens: Lens) -> Iterator[Change]:
     """All single changes of a table that are tried, but for aspheres that may be missing."""
     for k, s in enumerate(lens.surfaces):
         if math.isfinite(s.radius_mm):
-            yield Change(f"the sign of the radius of surface {k}", _with(lens, k, radius_mm=-s.radius_mm))
+            yield Change(f"the sign of the radius of surface {k}", changed(lens, k, radius_mm=-s.radius_mm))
         for n, (power, a) in enumerate(s.asphere):
             for factor, what in (
                 (-1.0, "the sign"),
@@ -85,7 +86,7 @@ def changes(lens: Lens) -> Iterator[Change]:
             ):
                 asphere = (*s.asphere[:n], (power, factor * a), *s.asphere[n + 1 :])
                 yield Change(
-                    f"{what} of the coefficient of power {power} of surface {k}", _with(lens, k, asphere=asphere)
+                    f"{what} of the coefficient of power {power} of surface {k}", changed(lens, k, asphere=asphere)
                 )
         fields = ["radius_mm", "thickness_mm"] + ["n_d"] * (s.glass is None)
         for field in fields:
@@ -93,7 +94,7 @@ def changes(lens: Lens) -> Iterator[Change]:
             for new in transposed(old):
                 if field != "n_d" or 1.3 < new < 2.3:
                     said = f"transposed digits: {field} of surface {k} {new:g} instead of {old:.6g}"
-                    yield Change(said, _with(lens, k, **{field: new}))
+                    yield Change(said, changed(lens, k, **{field: new}))
     for k, j in pairwise(glasses(lens)):
         yield Change(f"swapped glasses after surfaces {k} and {j}", swapped(lens, k, j))
     for factor, name in _UNITS.items():
@@ -115,47 +116,55 @@ class Tried(NamedTuple):
     """A change with the figures of the table that has it."""
 
     change: Change
-    found: Measures
+    found: Found
 
     @property
     def score(self) -> float:
         """See `score`; less is better."""
-        return float(score(self.found)[0])
+        return float(score(self.found.figures)[0])
+
+    @property
+    def sound(self) -> bool:
+        """Whether the table raises no alarm."""
+        return bool(alarm(self.found.figures)[0] <= 1)
 
 
 def _best(tried: Sequence[Change], profile: Profile, focal_mm: float) -> Tried:
-    found = measures([change.lens for change in tried], profile, focal_mm)
-    n = int(np.argmin(score(found)))
-    return Tried(tried[n], Measures(*(v[n : n + 1] for v in found)))
+    figures, off = measure([change.lens for change in tried], profile, focal_mm)
+    n = int(np.argmin(score(figures)))
+    one = slice(n, n + 1)
+    return Tried(tried[n], Found(Measures(*(v[one] for v in figures)), (off[0][one], off[1][one], off[2][one])))
 
 
-def missing_asphere(lens: Lens, profile: Profile, focal_mm: float) -> list[Tried]:
-    """The surfaces at which terms of powers 4 and 6 help most, best first; that of power 4 alone is tried at all."""
+def missing_asphere(lens: Lens, k: int, profile: Profile, focal_mm: float) -> Tried:
+    """The terms of powers 4 to 10 at a surface for which the figures are best, by damped least squares."""
+    terms, rim = dict(lens.surfaces[k].asphere), lens.surfaces[k].semi_diameter_mm
 
-    def with_sags(k: int, four: float, six: float) -> Change:
+    def with_sags(sags: Array) -> Change:
         """Terms that are so many mm deep at the rim, beside those of the table."""
-        rim, terms = lens.surfaces[k].semi_diameter_mm, dict(lens.surfaces[k].asphere)
-        more = {p: terms.get(p, 0.0) + sag / rim**p for p, sag in ((4, four), (6, six))}
-        return Change(
-            f"an asphere is missing at surface {k}", _with(lens, k, asphere=tuple(sorted((terms | more).items())))
-        )
+        more = {p: terms.get(p, 0.0) + float(sag) / rim**p for p, sag in zip(_POWERS, sags, strict=True)}
+        asphere = tuple(sorted((terms | more).items()))
+        return Change(f"an asphere is missing at surface {k}", changed(lens, k, asphere=asphere))
 
-    def search(k: int, pairs: Sequence[tuple[float, float]]) -> tuple[Tried, tuple[float, float]]:
-        each = [with_sags(k, *pair) for pair in pairs]
-        best = _best(each, profile, focal_mm)
-        return best, pairs[[c is best.change for c in each].index(True)]
-
-    bent = [k for k, s in enumerate(lens.surfaces) if not s.stop and 0 < s.semi_diameter_mm < math.inf]
-    coarse = {k: search(k, [(sign * sag, 0.0) for sag in _SAG_MM for sign in (1, -1)]) for k in bent}
-    found = []
-    for k in sorted(coarse, key=lambda k: coarse[k][0].score)[:_CLOSER]:
-        best, (four, six) = coarse[k]
-        for step in _STEPS:
-            reach = step * max(abs(four), abs(six))
-            pairs = [(four + reach * i, six + reach * j) for i in _GRID for j in _GRID]
-            best, (four, six) = search(k, pairs)
-        found.append(best)
-    return sorted(found, key=lambda tried: tried.score)
+    sags = np.zeros(len(_POWERS))
+    best = _best([with_sags(sags)], profile, focal_mm)
+    for _ in range(_ROUNDS):
+        beside = measure(
+            [with_sags(s).lens for s in (sags, *(sags + _NEAR_MM * np.eye(len(sags))))], profile, focal_mm
+        ).off
+        weighed = [v / most / math.sqrt(v.shape[1]) for v, most in zip(beside, ALARM[:3], strict=True)]
+        off = np.nan_to_num(np.concatenate(weighed, axis=1))
+        slope = (off[1:] - off[0]) / _NEAR_MM
+        square, pull = slope @ slope.T, slope @ off[0]
+        each = [
+            sags - np.linalg.solve(square + d * np.trace(square) * np.eye(len(sags)) + 1e-12, pull) for d in _DAMPED
+        ]
+        tried = [with_sags(s) for s in each]
+        better = _best(tried, profile, focal_mm)
+        if not better.score < best.score:
+            break
+        best, sags = better, each[[t is better.change for t in tried].index(True)]
+    return best
 
 
 @dataclass(frozen=True)
@@ -189,33 +198,36 @@ def check(lens: Lens, profile: Profile) -> Checked:
     focal = known[len(known) // 2]
     placed = at_focal_length(lens, focal)
     now = _best([Change("", placed)], profile, focal)
-    before = _named(now.found)
-    if alarm(now.found)[0] <= 1:
+    before = _named(now)
+    if now.sound:
         return Checked(
             False, None, before, None, (f"the table is sound, and no change is called for: {_told(before)}",)
         )
     beyond = {name: v for name, v in before.items() if not v <= getattr(ALARM, name)}
-    said = [f"the table is doubtful: {_told(beyond, limits=True)}"]
-    best = min(
-        [_best(list(changes(placed)), profile, focal), *missing_asphere(placed, profile, focal)[:1]],
-        key=lambda t: t.score,
-    )
-    after = _named(best.found)
-    if alarm(best.found)[0] <= 1 and best.score <= now.score / _CLEARLY:
-        moved = {name: v for name, v in after.items() if name in beyond}
-        return Checked(
-            True,
-            best.change.said,
-            before,
-            after,
-            (*said, f"one change makes it sound, {best.change.said}: {_told(moved)}"),
-        )
-    nearest = f"no single change makes it sound; the nearest is {best.change.said}"
-    return Checked(True, None, before, None, (*said, nearest))
+    said = f"the table is doubtful: {_told(beyond, limits=True)}"
+    best = _best(list(changes(placed)), profile, focal)
+    others = ""
+    if not _helps(best, now):  # terms of an asphere can imitate other changes, so that they come last
+        bent = [k for k, s in enumerate(placed.surfaces) if not s.stop and 0 < s.semi_diameter_mm < math.inf]
+        aspheres = sorted((missing_asphere(placed, k, profile, focal) for k in bent), key=lambda tried: tried.score)
+        best = min(best, aspheres[0], key=lambda tried: tried.score)
+        others = "".join(f" or at surface {t.change.said.split()[-1]}" for t in aspheres[1:] if _helps(t, now))
+    if not _helps(best, now):
+        nearest = f"no single change makes it sound; the nearest is: {best.change.said}"
+        return Checked(True, None, before, None, (said, nearest))
+    after = _named(best)
+    moved = _told({name: after[name] for name in beyond})
+    change = best.change.said + others
+    told = f"one change makes it sound, {change}: {moved}"
+    return Checked(True, change, before, after, (said, told))
 
 
-def _named(found: Measures) -> dict[str, float]:
-    return {name: float(v[0]) for name, v in found._asdict().items()}
+def _helps(tried: Tried, now: Tried) -> bool:
+    return tried.sound and tried.score <= now.score / _CLEARLY
+
+
+def _named(tried: Tried) -> dict[str, float]:
+    return {name: float(v[0]) for name, v in tried.found.figures._asdict().items()}
 
 
 def _told(figures: dict[str, float], *, limits: bool = False) -> str:

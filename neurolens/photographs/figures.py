@@ -19,7 +19,7 @@ from neurolens.analysis.field_curves import PROJECTIONS
 from neurolens.lens.glass import LINE_C_NM, LINE_F_NM, index_of
 from neurolens.lens.paraxial import System
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.compare import IDEAL, RECTILINEAR, heights_of, residual_of
+from neurolens.photographs.compare import IDEAL, RECTILINEAR, heights_of, shape_off
 from neurolens.photographs.profiles import Profile
 from neurolens.trace.arithmetic import NUMPY
 from neurolens.trace.shapes import Figure, without_rim
@@ -170,34 +170,42 @@ class Measures(NamedTuple):
     back: Array
 
 
-def measures(lenses: Sequence[Lens], profile: Profile, focal_mm: float) -> Measures:
-    """The figures of tables that have the same rows; those of a lens are placed at a focal length of the profile."""
+class Found(NamedTuple):
+    """The figures of tables, and what three of them are root mean squares of: [T, N] of distortion, blur and focus."""
+
+    figures: Measures
+    off: tuple[Array, Array, Array]
+
+
+def measure(lenses: Sequence[Lens], profile: Profile, focal_mm: float) -> Found:
+    """The figures of tables that have the same rows, placed at a focal length of the profile."""
     tables, height, f_number = Tables.of(lenses), heights_of(profile, lenses[0]), lenses[0].f_number
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of tables whose foci are all unknown
         efl, film, reach, _ = _first_order(tables)
         slope = np.minimum(_FARTHER * height.max() / np.abs(reach), _STEEPEST) * np.linspace(0.02, 1, _SLOPES)
         chief = chief_rays(tables, film, slope)
-        foci = np.concatenate([chief.tangential_mm, chief.sagittal_mm], axis=1)
-        foci = np.where(np.isfinite(foci).sum(axis=1) >= len(_SHARES), np.nanstd(foci, axis=1), math.inf)
+        foci = 100 / focal_mm * np.concatenate([chief.tangential_mm, chief.sagittal_mm], axis=1)
+        foci -= np.nanmean(foci, axis=1, keepdims=True)
+        shape = np.zeros((len(lenses), len(height)))
+        for radial in (r for r in profile.distortion if r.focal_mm == focal_mm):
+            measured = profile.stretch(radial, height)
+            ideal = PROJECTIONS[IDEAL.get(profile.projection, RECTILINEAR)](chief.angle)
+            rows = zip(chief.height_mm, chief.height_mm / ideal, strict=True)
+            shape = np.array([shape_off(height, measured, real, values) for real, values in rows])
+        axis = 1000 * profile.crop * f_number * _on_axis_mm(tables, film, focal_mm / (2 * f_number))
         blue, red = (_first_order(tables, nm, film) for nm in (LINE_F_NM, LINE_C_NM))
-        radial = next((r for r in profile.distortion if r.focal_mm == focal_mm), None)
-        seen = np.zeros(len(lenses))
-        if radial is not None:
-            measured, ideal = profile.stretch(radial, height), PROJECTIONS[IDEAL.get(profile.projection, RECTILINEAR)]
-            rows = zip(chief.height_mm, chief.height_mm / ideal(chief.angle), strict=True)
-            seen = np.array([residual_of(height, measured, real, values) for real, values in rows])
         film_mm = _column(lens.surfaces[-1].thickness_mm for lens in lenses)
         found = Measures(
-            distortion=seen,
-            blur=1000 * profile.crop * f_number * _blur_mm(tables, film, focal_mm / (2 * f_number)),
-            focus=100 * foci / focal_mm,
+            distortion=np.sqrt(np.nanmean(shape**2, axis=1)),
+            blur=np.sqrt(np.mean(axis**2, axis=1)),
+            focus=np.where(2 * np.isfinite(foci).sum(axis=1) >= foci.shape[1], np.nanstd(foci, axis=1), math.nan),
             colour=100 * np.abs((blue[1] - red[1]) / efl)[:, 0],
             lateral=100 * np.abs(blue[2] / blue[3] / (red[2] / red[3]) - 1)[:, 0],
             focal=100 * np.abs(efl / focal_mm - 1)[:, 0],
             back=100 * np.abs((film_mm - film) / efl)[:, 0],
         )
-    return Measures(*(np.where(np.isfinite(v), v, math.inf) for v in found))
+    return Found(Measures(*(np.where(np.isfinite(v), v, math.inf) for v in found)), (shape, axis, foci))
 
 
 def _first_order(tables: Tables, nm: float | None = None, film_mm: Array | None = None) -> tuple[Array, ...]:
@@ -213,8 +221,8 @@ def _first_order(tables: Tables, nm: float | None = None, film_mm: Array | None 
     return efl, film, rear.y[-1] + rear.after[-1] * (film if film_mm is None else film_mm), scene
 
 
-def _blur_mm(tables: Tables, film_mm: Array, radius_mm: float) -> Array:
-    """Root mean square height of rays from a distant point of the axis, over the pupil, where the film is best."""
+def _on_axis_mm(tables: Tables, film_mm: Array, radius_mm: float) -> Array:
+    """Heights of rays [T, R] from a distant point of the axis, over the pupil, where the film is best."""
     y = np.broadcast_to(radius_mm * _ZONES, (len(film_mm), len(_ZONES)))
     zero = np.zeros_like(y)
     start = Rays(zero, y, zero - 2 * radius_mm, zero, zero, zero + 1)
@@ -222,4 +230,4 @@ def _blur_mm(tables: Tables, film_mm: Array, radius_mm: float) -> Array:
     tilt = out.dy / out.dz
     height = out.y + (film_mm - out.z) * tilt
     best = -(height * tilt).sum(axis=1, keepdims=True) / (tilt * tilt).sum(axis=1, keepdims=True)
-    return np.asarray(np.sqrt(np.mean((height + best * tilt) ** 2, axis=1)))
+    return np.asarray(height + best * tilt)
