@@ -1,4 +1,4 @@
-"""Lens tables broken on purpose: whether `neurolens verify --check` finds the fault, and names the change that mends it.
+"""Lens tables broken on purpose: whether `neurolens verify --check` finds the fault, and names the right change.
 
 The tables are the primes of OpticsDatabase (github.com/amegahed/OpticsDatabase, MIT licence; its folder is to be named)
 whose match with a profile of lensfun is certain and whose distortion was measured. Each is broken once in every kind
@@ -36,8 +36,8 @@ SEEN = 0.3  # percent by which a dropped asphere changes distortion, from which 
 
 OPTIONS = (
     lab.option("folder", metavar="FOLDER", type=Path, help="clone of github.com/amegahed/OpticsDatabase"),
-    lab.count("lenses", 40, "lenses whose faults are to be named (default: 40)"), lab.count("seed", 1, "of the choices"),
-    lab.ONLY, lab.out(),
+    lab.count("lenses", 40, "lenses whose faults are to be named (default: 40)"),
+    lab.count("seed", 1, "of the choices"), lab.ONLY, lab.out(),
 )  # fmt: skip
 
 
@@ -47,28 +47,30 @@ def broken(lens: Lens, some: random.Random) -> Iterator[tuple[str, str, Lens]]:
     curved = [k for k, s in enumerate(rows) if math.isfinite(s.radius_mm) and not s.stop]
     aspheric = [k for k, s in enumerate(rows) if s.asphere or s.conic]
     k = some.choice(curved)
-    yield "sign of a radius", f"sign of the radius of surface {k}:", changed(lens, k, radius_mm=-rows[k].radius_mm)
+    yield "sign of a radius", f"sign of the radius of surface {k} ", changed(lens, k, radius_mm=-rows[k].radius_mm)
     for k in some.sample(aspheric, len(aspheric)):
-        yield "asphere dropped", f"at surface {k}", changed(lens, k, asphere=(), conic=0.0)
+        yield "asphere dropped", f"at surface {k} ", changed(lens, k, asphere=(), conic=0.0)
     if len(aspheric) > 1:
         plain = [replace(s, asphere=(), conic=0.0) for s in rows]
         yield "all of several aspheres dropped", "(no single change)", replace(lens, surfaces=tuple(plain))
     for k in [k for k in some.sample(aspheric, len(aspheric)) if rows[k].asphere][:1]:
         n = some.randrange(len(rows[k].asphere))
         (power, a), factor = rows[k].asphere[n], some.choice((0.1, 10.0))
-        where = f"of the coefficient of power {power} of surface {k}:"
-        for kind, word, value in (("sign", "sign", -a), ("exponent", "exponent", a * factor)):
+        where, back = f"of the coefficient of power {power} of surface {k} ", "10 times" if factor < 1 else "a tenth"
+        for kind, word, value in (("sign", "sign", -a), ("exponent", f"({back})", a * factor)):
             terms = (*rows[k].asphere[:n], (power, value), *rows[k].asphere[n + 1 :])
             yield f"{kind} of an asphere's term", f"{word} {where}", changed(lens, k, asphere=terms)
     pairs = [(a, b) for a, b in pairwise(glasses(lens)) if float(rows[a].n_d) != float(rows[b].n_d)]
     for a, b in some.sample(pairs, min(1, len(pairs))):
-        yield "glasses swapped", f"glasses after surfaces {a} and {b}:", swapped(lens, a, b)
+        yield "glasses swapped", f"glasses after surfaces {a} and {b} ", swapped(lens, a, b)
     for field in ("radius_mm", "thickness_mm", "n_d"):
         each = [(k, v) for k, s in enumerate(rows) if not s.stop for v in transposed(float(getattr(s, field)))]
         each = [(k, v) for k, v in each if field != "n_d" or (1.3 < v < 2.3 and rows[k].glass is None)]
         for k, v in some.sample(each, min(1, len(each))):
-            yield f"digits of {field}", f"digits: {field} of surface {k} ", changed(lens, k, **{field: v})
-    yield "units", "units: the figures", lens.scaled(some.choice((0.1, 1 / 25.4)))
+            before = float(f"{float(getattr(rows[k], field)):.6g}")
+            yield f"digits of {field}", f"digits: {field} of surface {k} {before:g} ", changed(lens, k, **{field: v})
+    unit, factor = some.choice((("centimetres", 0.1), ("inches", 1 / 25.4)))
+    yield "units", f"units: the figures are {unit} ", lens.scaled(factor)
 
 
 def of_folder(folder: Path, only: str, quiet: bool) -> list[tuple[str, str, Lens, Profile]]:
@@ -123,8 +125,8 @@ def rows_of(lens: Lens, profile: Profile, seed: str, named: bool) -> list[Row]:
 def _line(kind: str, rows: Sequence[Row]) -> list[str]:
     found, asked = [r for r in rows if r["alarm"] > 1], [r for r in rows if "said" in r]
     sound = [r for r in asked if r["change"]]
-    right = [r for r in sound if r["right"] in f"{r['change']}:"]
-    first = [r for r in right if r["right"] in f"{r['change'].split(' or at')[0]}:"]
+    right = [r for r in sound if r["right"] in f"{r['change']} "]
+    first = [r for r in right if r["right"] in f"{r['change'].split(' or at')[0]} "]
     share = f"{100 * len(found) / max(len(rows), 1):.0f}%"
     return [
         kind,
@@ -159,8 +161,8 @@ def page(groups: dict[str, list[list[Row]]]) -> str:
             for name, column in zip(Measures._fields, figures.T, strict=True)]  # fmt: skip
     return lab.page(
         "# Lens tables broken on purpose",
-        f"`python -m experiments photographs-faults FOLDER`: what `neurolens verify --check` finds; {lab.machine_line()}",
-        "## Faults", lab.table("kind|tables|found|asked for a change|told one|the right one is among those told|told first", lines),
+        f"`python -m experiments photographs-faults FOLDER`: what `verify --check` finds; {lab.machine_line()}",
+        "## Faults", lab.table("kind|tables|found|asked for|told|the right one among them|it is first", lines),
         "The right change of a dropped asphere is that at its surface. Only tables that raise no alarm are broken.",
         "## Alarms of tables as they are", lab.table("tables|tables|alarms", alarms),
         "## Figures of tables as they are (certain matches)", lab.table("figure|50%|90%|95%|98%", told),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline  # type: ignore[import-untyped]
 
 from neurolens.analysis.bundles import bundle, points
-from neurolens.analysis.field_curves import PROJECTIONS
+from neurolens.analysis.field_curves import PROJECTIONS, RECTILINEAR
 from neurolens.analysis.fields import Result, Scene
 from neurolens.lens.catalogue import nearest
 from neurolens.lens.paraxial import stop_radius_mm
@@ -36,7 +36,6 @@ _SIZES = np.linspace(0.97, 1.03, 13)  # of the picture, over that of crop factor
 _BANDS_NM = {"red": (585.0, 600.0, 615.0), "green": (520.0, 540.0, 560.0), "blue": (465.0, 480.0, 495.0)}
 IDEAL = {"equisolid": "equisolid, 2 f sin(theta/2)", "fisheye": "equidistant, f theta",
           "stereographic": "stereographic, 2 f tan(theta/2)", "orthographic": "orthographic, f sin"}  # fmt: skip
-RECTILINEAR = next(iter(PROJECTIONS))
 _NEAR_N_D, _NEAR_V_D = 0.002, 1.0  # within which a glass of the catalogue stands for two figures of a table
 _STOP_SLACK = 1.03  # an aperture named in a profile counts as full where the lens's own is that near
 

@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.analysis.field_curves import PROJECTIONS
+from neurolens.analysis.field_curves import PROJECTIONS, RECTILINEAR
 from neurolens.lens.glass import LINE_C_NM, LINE_F_NM, index_of
 from neurolens.lens.paraxial import System
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.compare import IDEAL, RECTILINEAR, heights_of, shape_off
+from neurolens.photographs.compare import IDEAL, heights_of, shape_off
 from neurolens.photographs.profiles import Profile
 from neurolens.trace.arithmetic import NUMPY
 from neurolens.trace.shapes import Figure, without_rim
@@ -27,9 +27,9 @@ from neurolens.trace.surfaces import Medium, Rays, cross, medium
 
 Array = NDArray[np.float64]
 
-_SLOPES, _SHARES = 25, (0.25, 0.4, 0.55, 0.7)  # chief rays; those with neighbours, as shares of the largest slope
+_SLOPES, SHARES = 25, (0.25, 0.4, 0.55, 0.7)  # chief rays; those with neighbours, as shares of the largest slope
 _FARTHER, _STEEPEST = 1.4, 2.0  # than the paraxial slope of the greatest height; the steepest slope in the stop
-_NEAR = 1e-4  # mm and slope by which a neighbouring ray differs
+_NEAR = 1e-6  # mm and slope by which a neighbouring ray differs
 _ZONES = np.sqrt((np.arange(8) + 0.5) / 8)  # of the pupil, of equal areas
 
 
@@ -104,7 +104,7 @@ def _figure(row: Sequence[Any]) -> Figure:
 
 
 class ChiefRays(NamedTuple):
-    """[T, R] field angles (rad), image heights (mm), and at `_SHARES` the places of the foci behind the film, mm:
+    """[T, R] field angles (rad), image heights (mm), and at `SHARES` the places of the foci behind the film, mm:
     tangential and sagittal, NaN where there is no ray."""
 
     angle: Array
@@ -119,7 +119,7 @@ def chief_rays(tables: Tables, film_mm: Array, slope: Array) -> ChiefRays:
     `film_mm`: [T, 1] from the last vertex. A neighbour of a chief ray starts beside it, another turned; together they
     make the pair that is parallel in the scene.
     """
-    some = slope[:, -1:] * np.array(_SHARES)
+    some = slope[:, -1:] * np.array(SHARES)
     zero, near = np.zeros_like(some), np.full_like(some, _NEAR)
     starts = [(0 * slope, 0 * slope, slope, 0 * slope), (zero, zero, some, zero), (zero, near, some, zero)]
     starts += [(zero, zero, some + near, zero), (near, zero, some, zero), (zero, zero, some, near)]
@@ -134,7 +134,7 @@ def chief_rays(tables: Tables, film_mm: Array, slope: Array) -> ChiefRays:
     way = (film_mm - film.z) / film.dz
     px, py = film.x + way * film.dx, film.y + way * film.dy
     angle = np.arctan2(-scene.dy, -scene.dz)
-    m, f = slope.shape[1], len(_SHARES)
+    m, f = slope.shape[1], len(SHARES)
 
     def foci(beside: int, turned: int, values: tuple[Array, Array, Array]) -> Array:
         seen, place, tilt = (
