@@ -149,16 +149,16 @@ def missing_asphere(lens: Lens, k: int, profile: Profile, focal_mm: float) -> Tr
     sags = np.zeros(len(_POWERS))
     best = _best([with_sags(sags)], profile, focal_mm)
     for _ in range(_ROUNDS):
-        beside = measure(
-            [with_sags(s).lens for s in (sags, *(sags + _NEAR_MM * np.eye(len(sags))))], profile, focal_mm
-        ).off
-        weighed = [v / most / math.sqrt(v.shape[1]) for v, most in zip(beside, ALARM[:3], strict=True)]
-        off = np.nan_to_num(np.concatenate(weighed, axis=1))
-        slope = (off[1:] - off[0]) / _NEAR_MM
-        square, pull = slope @ slope.T, slope @ off[0]
-        each = [
-            sags - np.linalg.solve(square + d * np.trace(square) * np.eye(len(sags)) + 1e-12, pull) for d in _DAMPED
-        ]
+        near = [with_sags(s).lens for s in (sags, *(sags + _NEAR_MM * np.eye(len(sags))))]
+        off = measure(near, profile, focal_mm).off
+        weighed = [v / most / math.sqrt(v.shape[1]) for v, most in zip(off, ALARM[:3], strict=True)]
+        found = np.nan_to_num(np.concatenate(weighed, axis=1))
+        slope = (found[1:] - found[0]) / _NEAR_MM
+        square, pull, one = slope @ slope.T, slope @ found[0], np.eye(len(sags))
+        most = np.trace(square)
+        if not 0 < most < math.inf:
+            break
+        each = [sags - np.linalg.solve(square + damped * most * one, pull) for damped in _DAMPED]
         tried = [with_sags(s) for s in each]
         better = _best(tried, profile, focal_mm)
         if not better.score < best.score:
@@ -210,7 +210,7 @@ def check(lens: Lens, profile: Profile) -> Checked:
     if not _helps(best, now):  # terms of an asphere can imitate other changes, so that they come last
         bent = [k for k, s in enumerate(placed.surfaces) if not s.stop and 0 < s.semi_diameter_mm < math.inf]
         aspheres = sorted((missing_asphere(placed, k, profile, focal) for k in bent), key=lambda tried: tried.score)
-        best = min(best, aspheres[0], key=lambda tried: tried.score)
+        best = min([best, *aspheres[:1]], key=lambda tried: tried.score)
         others = "".join(f" or at surface {t.change.said.split()[-1]}" for t in aspheres[1:] if _helps(t, now))
     if not _helps(best, now):
         nearest = f"no single change makes it sound; the nearest is: {best.change.said}"
