@@ -24,6 +24,7 @@ ALARM = Measures(*map(np.array, (0.75, 55.0, 1.0, 0.9, 0.32, 5.5, 0.4)))
 _UNITS = {10.0: "centimetres", 25.4: "inches"}
 _POWERS, _ROUNDS = (4, 6, 8, 10), 6  # of an asphere that may be missing; rounds of the search for its terms
 _NEAR_MM, _DAMPED = 1e-5, (1e-9, 1e-7, 1e-5, 1e-3, 1e-1)  # of sags at the rim, for slopes; shares of their squares
+_ALIKE = 4  # surfaces named at most for an asphere that is missing
 _CLEARLY = 3.0  # times by which the score is less after a change that is told
 _WORDS = {
     "distortion": ("distortion", "%"), "blur": ("blur of the axis times the f-number", " µm"),
@@ -211,7 +212,8 @@ def check(lens: Lens, profile: Profile) -> Checked:
         bent = [k for k, s in enumerate(placed.surfaces) if not s.stop and 0 < s.semi_diameter_mm < math.inf]
         aspheres = sorted((missing_asphere(placed, k, profile, focal) for k in bent), key=lambda tried: tried.score)
         best = min([best, *aspheres[:1]], key=lambda tried: tried.score)
-        others = "".join(f" or at surface {t.change.said.split()[-1]}" for t in aspheres[1:] if _helps(t, now))
+        alike = [t for t in aspheres[1:_ALIKE] if _helps(t, now) and t.score <= 2 * best.score]
+        others = "".join(f" or at surface {t.change.said.split()[-1]}" for t in alike)
     if not _helps(best, now):
         nearest = f"no single change makes it sound; the nearest is: {best.change.said}"
         return Checked(True, None, before, None, (said, nearest))
