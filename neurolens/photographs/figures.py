@@ -57,7 +57,7 @@ class Tables:
 
     def system(self, nm: float | None = None) -> System:
         """The tables to first order, at a wavelength other than that of reference where one is given."""
-        curvature = [f.curvature + 2 * f.terms[0] if f.terms and f.even else f.curvature for f in self.figures]
+        curvature = [f.curvature + 2 * f.terms[0] if f.terms else f.curvature for f in self.figures]
         index = [m.n for m in self.media] if nm is None else _indices(self.lenses, nm)
         return System(curvature, list(self.gap_mm[:-1]), index, [0.0] * len(self.figures))
 
