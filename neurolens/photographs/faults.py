@@ -24,7 +24,7 @@ ALARM = Measures(*map(np.array, (0.75, 55.0, 1.0, 0.9, 0.32, 5.5, 0.4)))
 _UNITS = {10.0: "centimetres", 25.4: "inches"}
 _POWERS, _ROUNDS = (4, 6, 8, 10), 6  # of an asphere that may be missing; rounds of the search for its terms
 _NEAR_MM, _DAMPED = 1e-5, (1e-9, 1e-7, 1e-5, 1e-3, 1e-1)  # of sags at the rim, for slopes; shares of their squares
-_ALIKE = 4  # surfaces named at most for an asphere that is missing
+_LIKELY, _ALIKE = 7, 4  # surfaces that are searched to the end, and named at most, for an asphere that is missing
 _CLEARLY = 3.0  # times by which the score is less after a change that is told
 _WORDS = {
     "distortion": ("distortion", "%"), "blur": ("blur of the axis times the f-number", " µm"),
@@ -137,7 +137,7 @@ def _best(tried: Sequence[Change], profile: Profile, focal_mm: float) -> Tried:
     return Tried(tried[n], Found(Measures(*(v[one] for v in figures)), (off[0][one], off[1][one], off[2][one])))
 
 
-def missing_asphere(lens: Lens, k: int, profile: Profile, focal_mm: float) -> Tried:
+def missing_asphere(lens: Lens, k: int, profile: Profile, focal_mm: float, rounds: int = _ROUNDS) -> Tried:
     """The terms of powers 4 to 10 at a surface for which the figures are best, by damped least squares."""
     terms, rim = dict(lens.surfaces[k].asphere), lens.surfaces[k].semi_diameter_mm
 
@@ -149,7 +149,7 @@ def missing_asphere(lens: Lens, k: int, profile: Profile, focal_mm: float) -> Tr
 
     sags = np.zeros(len(_POWERS))
     best = _best([with_sags(sags)], profile, focal_mm)
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         near = [with_sags(s).lens for s in (sags, *(sags + _NEAR_MM * np.eye(len(sags))))]
         off = measure(near, profile, focal_mm).off
         weighed = [v / most / math.sqrt(v.shape[1]) for v, most in zip(off, ALARM[:3], strict=True)]
@@ -210,7 +210,9 @@ def check(lens: Lens, profile: Profile) -> Checked:
     others = ""
     if not _helps(best, now):  # terms of an asphere can imitate other changes, so that they come last
         bent = [k for k, s in enumerate(placed.surfaces) if not s.stop and 0 < s.semi_diameter_mm < math.inf]
-        aspheres = sorted((missing_asphere(placed, k, profile, focal) for k in bent), key=lambda tried: tried.score)
+        first = {k: missing_asphere(placed, k, profile, focal, rounds=1).score for k in bent}
+        likely = sorted(bent, key=first.__getitem__)[:_LIKELY]
+        aspheres = sorted((missing_asphere(placed, k, profile, focal) for k in likely), key=lambda tried: tried.score)
         best = min([best, *aspheres[:1]], key=lambda tried: tried.score)
         alike = [t for t in aspheres[1:_ALIKE] if _helps(t, now) and t.score <= 2 * best.score]
         others = "".join(f" or at surface {t.change.said.split()[-1]}" for t in alike)
