@@ -56,11 +56,11 @@ examples:
         from neurolens.readers.any_format import read_any
 
         tabled = read_any(self.file)
-        checked = _checked(tabled, self.profile) if self.check else None
+        checked = _checked(tabled, self.profile) if self.check and not tabled.anamorphic else None
         try:
             found = verify(tabled, self.profile)
         except InputError as error:
-            if checked is None or not checked.doubtful:
+            if checked is None or not checked.doubtful or self.out or self.lens_file:
                 raise
             # A table so wrong that its focal length is another's: what the check says is the answer.
             lines = [tabled.name, str(error), *(f"- {sentence}" for sentence in checked.said)]
