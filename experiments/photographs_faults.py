@@ -153,8 +153,8 @@ def page(groups: dict[str, list[list[Row]]]) -> str:
     alarms = []
     words = {"certain": "primes, certain match: the limits were set by them", "likely": "primes, likely match",
              "zoom": "zooms, certain match, at one focal length"}  # fmt: skip
-    for group, text in words.items():
-        each = [r for found in groups.get(group, []) for r in found if r["kind"] == "sound"]
+    for group, text in ((group, words[group]) for group in words if group in groups):
+        each = [r for found in groups[group] for r in found if r["kind"] == "sound"]
         count = sum(r["alarm"] > 1 for r in each)
         alarms.append([text, str(len(each)), f"{count} ({100 * count / max(len(each), 1):.0f}%)"])
     figures = np.array([r["figures"] for found in groups["certain"] for r in found if r["kind"] == "sound"])
