@@ -51,6 +51,7 @@ NAMES = {
     "dask": ("cluster", "a Dask cluster: speed-up, overhead a task, 100,000 tasks by simulation"),
     "transmittance": ("transmittance", "what averaging over polarisation at every surface would cost"),
     "photographs": ("photographs", "that collection against photographs: distortion, colour, light, fitted rims"),
+    "photographs-faults": ("photographs_faults", "lens tables broken on purpose: faults found, changes named"),
     "collection": ("collection", "a public collection of lens files: read, refused, agreement with ray-optics"),
     "optiland": ("compare_optiland", "speed of the exact tracer beside Optiland"),
 }

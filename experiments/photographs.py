@@ -60,7 +60,7 @@ def row_of(file: Path) -> Row | None:
 
 def figures(found: Verified) -> Row:
     """The residuals of a lens: medians over the focal lengths of its profile; figures at the largest height."""
-    curves = [c.distortion for c in found.comparisons if c.distortion is not None]
+    curves = [c.distortion_percent for c in found.comparisons if c.distortion_percent is not None]
     focal = [c.focal_mm for c in found.comparisons]
     row: Row = {
         "crop": found.crop, "focal_mm": focal, "zoom": len(focal) > 1, "distortion": found.distortion_percent,
@@ -69,8 +69,8 @@ def figures(found: Verified) -> Row:
         "f8": found.light_stops(widest=False), "widest": found.light_stops(widest=True),
     }  # fmt: skip
     for band in ("red", "blue"):
-        both = [c for c in (getattr(c, band) for c in found.comparisons) if c is not None]
-        row[band] = [_median([float(getattr(c, kind)[-1]) for c in both]) for kind in ("measured", "ours")]
+        both = [c for c in (getattr(c, f"{band}_um") for c in found.comparisons) if c is not None]
+        row[band] = [_median([float(getattr(c, kind)[-1]) for c in both]) for kind in ("measured", "computed")]
     return row
 
 
@@ -81,10 +81,10 @@ def fitted(lens: Lens, profile: Profile) -> Row:
     except InputError:
         return {}
     found: Row = {"front": whole.front, "rear": whole.rear, "rings": len(whole.rings)}
-    found["fitted"] = [(f, whole.before[f], whole.after[f]) for f in whole.before]
-    widest = sorted(whole.before)[:2]
-    if len(whole.before) > 2:
-        found["unused"] = [(f, whole.before[f], fit_rims(lens, profile, [f]).after[f]) for f in widest]
+    found["fitted"] = [(f, whole.before_stops[f], whole.after_stops[f]) for f in whole.before_stops]
+    widest = sorted(whole.before_stops)[:2]
+    if len(whole.before_stops) > 2:
+        found["unused"] = [(f, whole.before_stops[f], fit_rims(lens, profile, [f]).after_stops[f]) for f in widest]
     return found
 
 
@@ -171,7 +171,7 @@ COLUMNS = lab.columns(
     ("size", "size", ".3f"), ("two cameras %", "own", ".3f"),
     ("light f/8", "f8", ".3f"), ("light widest", "widest", ".3f"),
     *((f"{band} {kind} um", lambda r, b=band, k=k: r[b][k] if b in r else None, ".1f")
-      for band in BANDS for k, kind in enumerate(("measured", "ours"))),
+      for band in BANDS for k, kind in enumerate(("measured", "computed"))),
     *((f"light {name} {which}", lambda r, k=k, j=j: r["fitted"][k][j] if len(r.get("fitted", ())) > k else None, ".3f")
       for k, name in enumerate(("widest", "next")) for j, which in ((1, "before"), (2, "fitted"))),
     *((f"light {name} left out", lambda r, k=k: r["unused"][k][2] if r.get("unused") else None, ".3f")

@@ -19,7 +19,15 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs" / "pages").rglob("*.md")), R
 BLOCK = re.compile(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```|^ {4}(\S[^\n]*)$|`([^`\n]+)`', re.MULTILINE | re.DOTALL)
 PROGRAMS = re.compile(r"(neurolens|python -m experiments|make) (?=[a-z-])")
 PARSER = build_parser()
-WRITTEN = {"out", "output", "layout", "layouts", "breathing", "fit"}  # what options name that a command writes
+WRITTEN = {
+    "out",
+    "output",
+    "lens_file",
+    "layout",
+    "layouts",
+    "breathing",
+    "fit",
+}  # what options name that a command writes
 
 
 def lines_of(page: Path) -> Iterator[tuple[str, bool]]:

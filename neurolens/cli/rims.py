@@ -61,8 +61,13 @@ examples:
 
 def _text(found: FittedRims, head: str) -> str:
     rows = [
-        [f"f/{f:g}", f"{found.before[f]:.3f}", f"{found.after[f]:.3f}", "left out" if f in found.unused else ""]
-        for f in found.before
+        [
+            f"f/{f:g}",
+            f"{found.before_stops[f]:.3f}",
+            f"{found.after_stops[f]:.3f}",
+            "left out" if f in found.unused else "",
+        ]
+        for f in found.before_stops
     ]
     lines = [head, table(("aperture", "before", "after (stops RMS)", ""), rows)]
     for name, factor in (("in front of the stop", found.front), ("behind it", found.rear)):
@@ -70,8 +75,6 @@ def _text(found: FittedRims, head: str) -> str:
     for ring in found.rings:
         place = "in front of the lens" if ring.before == 0 else f"behind surface {ring.before - 1}"
         lines.append(f"ring {ring.distance_mm:.1f} mm {place}, {2 * ring.radius_mm:.2f} mm wide")
-    left = max(found.after.values())
-    lines.append(
-        f"left: at most {left:.2f} stops; rims cannot explain what is left at f/8 ({found.after[found.closed]:.2f})"
-    )
+    left, closed = max(found.after_stops.values()), found.after_stops[found.closed]
+    lines.append(f"left: at most {left:.2f} stops; rims cannot explain what is left at f/8 ({closed:.2f})")
     return "\n".join(lines)

@@ -6,12 +6,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from neurolens.base.errors import InputError
 from neurolens.base.settings import setting
 from neurolens.cli.arguments import Answering, Glasses, check_suffix, lens, output_path
 from neurolens.cli.output import number, table
 
 if TYPE_CHECKING:
+    from neurolens.lens.prescription import Lens
     from neurolens.photographs.compare import Comparison, Curve
+    from neurolens.photographs.faults import Checked
     from neurolens.photographs.verify import Verified
 
 
@@ -30,10 +33,12 @@ class Verify(Glasses, Answering):
 examples:
   neurolens verify lenses/sony_sonnar_55.toml -o sonnar.png
   neurolens verify "Nikon AF Nikkor 28mm f1.4D.zmx" --json
+  neurolens verify my_lens.toml --check
   neurolens verify my_lens.toml --profile "Canon EF 50mm f/1.2L USM" --lens-file my_verified_lens.toml"""
     kept: ClassVar[str] = "only a finished picture or lens file is written"
 
     file: Path = lens(positional=True)
+    check: bool = setting(False, "look for wrong figures in the table, and try single changes that make it sound")
     profile: str | None = setting(None, "lensfun's name of the lens, where it is not found by itself", metavar="NAME")
     out: Path | None = output_path("OUT.png", "draw measured points and computed curves (png, pdf, svg)", None)
     lens_file: Path | None = setting(
@@ -51,7 +56,16 @@ examples:
         from neurolens.readers.any_format import read_any
 
         tabled = read_any(self.file)
-        found = verify(tabled, self.profile)
+        checked = _checked(tabled, self.profile) if self.check and not tabled.anamorphic else None
+        try:
+            found = verify(tabled, self.profile)
+        except InputError as error:
+            if checked is None or not checked.doubtful or self.out or self.lens_file:
+                raise
+            # A table so wrong that its focal length is another's: what the check says is the answer.
+            lines = [tabled.name, str(error), *(f"- {sentence}" for sentence in checked.said)]
+            data = {"file": str(self.file), "name": tabled.name, "reason": str(error), "check": checked.to_dict()}
+            return self.answer(data, lambda: "\n".join(lines))
         if self.out is not None:
             from neurolens.photographs.plots import plot_verified
 
@@ -62,7 +76,16 @@ examples:
             write_lens(replace(tabled, measured=tuple(found.measured.items())), self.lens_file)
         files = [str(path) for path in (self.out, self.lens_file) if path is not None]
         data = {"file": str(self.file), "name": tabled.name, **found.to_dict(), "measured": found.measured}
-        return self.answer({**data, "free": FREE, "files": files}, lambda: _text(found, tabled.name, [FREE, *files]))
+        data |= {"check": checked.to_dict()} if checked else {}
+        last = [*(f"- {sentence}" for sentence in (checked.said if checked else ())), FREE, *files]
+        return self.answer({**data, "free": FREE, "files": files}, lambda: _text(found, tabled.name, last))
+
+
+def _checked(tabled: Lens, profile: str | None) -> Checked:
+    from neurolens.photographs.faults import check
+    from neurolens.photographs.verify import found_for
+
+    return check(tabled, found_for(tabled, profile, any_focal=True)[1][0])
 
 
 def _text(found: Verified, name: str, last: list[str]) -> str:
@@ -90,13 +113,15 @@ def _text(found: Verified, name: str, last: list[str]) -> str:
 def _row(c: Comparison) -> list[str]:
     from neurolens.photographs.compare import near_f8
 
-    cells = [f"{c.focal_mm:g}", number(c.distortion and c.distortion.rms, 2)]
-    eight, widest = (c.light[near_f8(c.light)], c.light[min(c.light)]) if c.light else (None, None)
-    for curve, digits in ((c.red, 2), (c.blue, 2), (eight, 3), (widest, 3)):
+    cells = [f"{c.focal_mm:g}", number(c.distortion_percent and c.distortion_percent.rms, 2)]
+    eight, widest = (
+        (c.light_stops[near_f8(c.light_stops)], c.light_stops[min(c.light_stops)]) if c.light_stops else (None, None)
+    )
+    for curve, digits in ((c.red_um, 2), (c.blue_um, 2), (eight, 3), (widest, 3)):
         cells += [number(v, digits) for v in _last(curve)]
     return cells
 
 
 def _last(curve: Curve | None) -> tuple[Any, Any]:
     """The computed and the measured figure at the largest height."""
-    return (None, None) if curve is None else (float(curve.ours[-1]), float(curve.measured[-1]))
+    return (None, None) if curve is None else (float(curve.computed[-1]), float(curve.measured[-1]))

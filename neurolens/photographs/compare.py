@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline  # type: ignore[import-untyped]
 
 from neurolens.analysis.bundles import bundle, points
-from neurolens.analysis.field_curves import PROJECTIONS
+from neurolens.analysis.field_curves import PROJECTIONS, RECTILINEAR
 from neurolens.analysis.fields import Result, Scene
 from neurolens.lens.catalogue import nearest
 from neurolens.lens.paraxial import stop_radius_mm
@@ -34,7 +34,7 @@ _OUTER_MM = 20.0  # of full frame, to which
 _SIZES = np.linspace(0.97, 1.03, 13)  # of the picture, over that of crop factor and table
 # Broad bands of a camera: those at which rays agree best with lensfun's lateral colour.
 _BANDS_NM = {"red": (585.0, 600.0, 615.0), "green": (520.0, 540.0, 560.0), "blue": (465.0, 480.0, 495.0)}
-_IDEAL = {"equisolid": "equisolid, 2 f sin(theta/2)", "fisheye": "equidistant, f theta",
+IDEAL = {"equisolid": "equisolid, 2 f sin(theta/2)", "fisheye": "equidistant, f theta",
           "stereographic": "stereographic, 2 f tan(theta/2)", "orthographic": "orthographic, f sin"}  # fmt: skip
 _NEAR_N_D, _NEAR_V_D = 0.002, 1.0  # within which a glass of the catalogue stands for two figures of a table
 _STOP_SLACK = 1.03  # an aperture named in a profile counts as full where the lens's own is that near
@@ -45,17 +45,17 @@ class Curve(Result):
     """One measured and one computed figure over image height; what the profile leaves free is taken out.
 
     Attributes:
-        height_mm, measured, ours: [H], NaN beyond what either knows.
+        height_mm, measured, computed: [H], NaN beyond what either knows.
     """
 
     height_mm: Array
     measured: Array
-    ours: Array
+    computed: Array
 
     @property
     def rms(self) -> float:
         """Root mean square of the difference; NaN where there is none."""
-        off = self.measured - self.ours
+        off = self.measured - self.computed
         off = off[np.isfinite(off)]
         return float(np.sqrt(np.mean(off**2))) if len(off) else math.nan
 
@@ -66,16 +66,16 @@ class Comparison(Result):
 
     Attributes:
         focal_mm: of the profile.
-        distortion: percent of the image height, mean removed. size: of the picture, for which it agrees best.
-        red, blue: um of the image height beside green.
-        light: by f-number, stops beside the axis.
+        distortion_percent: of the image height, mean removed. size: of the picture, for which it agrees best.
+        red_um, blue_um: beside green.
+        light_stops: by f-number, beside the axis.
     """
 
     focal_mm: float
-    distortion: Curve | None
-    red: Curve | None
-    blue: Curve | None
-    light: dict[float, Curve]
+    distortion_percent: Curve | None
+    red_um: Curve | None
+    blue_um: Curve | None
+    light_stops: dict[float, Curve]
     size: float = 1.0
 
 
@@ -102,8 +102,7 @@ def stretch_of(lens: Lens, profile: Profile, height_mm: Array) -> Callable[[Arra
     """
     scene = Scene(lens)
     angle, real = _chief(scene, height_mm.max())
-    name = _IDEAL.get(profile.projection, next(iter(PROJECTIONS)))
-    ideal = PROJECTIONS[name](angle)
+    ideal = PROJECTIONS[IDEAL.get(profile.projection, RECTILINEAR)](angle)
     return partial(_between, known_mm=real, values=real / ideal)
 
 
@@ -146,6 +145,26 @@ def distortion_curve(lens: Lens, profile: Profile, radial: Radial) -> tuple[Curv
         curve = Curve(height, _without_mean(measured, ours), _without_mean(ours, measured))
         found.append((-int(np.isfinite(ours).sum()), curve.rms, abs(size - 1), curve, float(size)))
     return min(found, key=lambda f: f[:3])[3:]
+
+
+def shape_off(height_mm: Array, measured: Array, real_mm: Array, stretch: Array) -> Array:
+    """The difference of `distortion_curve`, percent, by the stretch at the image heights of chief rays.
+
+    NaN at heights that no chief ray reaches, and everywhere where too few do.
+    """
+    real_mm = np.where(np.isfinite(stretch), real_mm, math.nan)
+    rising = int(np.argmin(np.diff(real_mm, append=-math.inf) > 0)) + 1
+    if not real_mm[0] > 0:
+        return np.full_like(height_mm, math.nan)
+    ours = _between(np.outer(height_mm, _SIZES), real_mm[:rising], stretch[:rising])
+    theirs = np.where(np.isfinite(ours), measured[:, None], math.nan)
+    ours = np.where(np.isfinite(theirs), ours, math.nan)
+    most = np.isfinite(ours).sum(axis=0)
+    if most.max() < _FEWEST:
+        return np.full_like(height_mm, math.nan)
+    ours, theirs = (v[:, most == most.max()] for v in (ours, theirs))
+    off = 100 * (theirs / np.nanmean(theirs, axis=0) - ours / np.nanmean(ours, axis=0))
+    return np.asarray(off[:, np.argmin(np.nansum(off**2, axis=0))])
 
 
 def with_real_glasses(lens: Lens) -> Lens:

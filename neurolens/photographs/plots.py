@@ -25,17 +25,21 @@ def plot_verified(found: Verified, path: Path, title: str) -> None:
         ):
             axes.grid(True)
             axes.set(xlabel="image height, mm", ylabel=label)
-        bent = [(c.focal_mm, c.distortion) for c in found.comparisons if c.distortion is not None]
+        bent = [(c.focal_mm, c.distortion_percent) for c in found.comparisons if c.distortion_percent is not None]
         for colour, (focal, curve) in zip(FIELD_COLOURS, _spread(bent), strict=False):
             _both(left, curve, colour, f"{focal:g} mm")
         for name, colour in (("red", "#d55e00"), ("blue", "#0072b2")):
-            fringes = [(c.focal_mm, getattr(c, name)) for c in found.comparisons if getattr(c, name) is not None]
+            fringes = [
+                (c.focal_mm, getattr(c, f"{name}_um"))
+                for c in found.comparisons
+                if getattr(c, f"{name}_um") is not None
+            ]
             for focal, curve in fringes[:1]:
                 _both(middle, curve, colour, f"{name}, {focal:g} mm")
-        lit = [c for c in found.comparisons if c.light]
+        lit = [c for c in found.comparisons if c.light_stops]
         if lit:
-            for colour, f_number in zip(FIELD_COLOURS, _spread(sorted(lit[0].light)), strict=False):
-                _both(right, lit[0].light[f_number], colour, f"f/{f_number:g}")
+            for colour, f_number in zip(FIELD_COLOURS, _spread(sorted(lit[0].light_stops)), strict=False):
+                _both(right, lit[0].light_stops[f_number], colour, f"f/{f_number:g}")
             right.set_title(f"{lit[0].focal_mm:g} mm", loc="right", fontsize=9, color=INK)
         for axes in (left, middle, right):
             if axes.lines:
@@ -45,7 +49,7 @@ def plot_verified(found: Verified, path: Path, title: str) -> None:
 
 
 def _both(axes: Any, curve: Curve, colour: str, label: str) -> None:
-    axes.plot(curve.height_mm, curve.ours, color=colour, label=label)
+    axes.plot(curve.height_mm, curve.computed, color=colour, label=label)
     axes.plot(curve.height_mm, curve.measured, "o", color=colour, markersize=3.5)
 
 

@@ -59,7 +59,7 @@ class FittedRims(Result):
         front, rear: factors of the rims in front of the stop and behind it.
         rings: of the mount, at most one a side.
         rims_mm: [S] radii.
-        before, after: residual of the light by f-number, root mean square over heights in stops.
+        before_stops, after_stops: residual of the light by f-number, root mean square over heights.
         unused: f-numbers that the fit did not use.
     """
 
@@ -67,14 +67,14 @@ class FittedRims(Result):
     rear: float
     rings: tuple[Ring, ...]
     rims_mm: Array
-    before: dict[float, float]
-    after: dict[float, float]
+    before_stops: dict[float, float]
+    after_stops: dict[float, float]
     unused: tuple[float, ...]
 
     @property
     def closed(self) -> float:
         """The aperture nearest to f/8, at which hardly any rim is seen."""
-        return near_f8(self.after)
+        return near_f8(self.after_stops)
 
 
 class RimLight:

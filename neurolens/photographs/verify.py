@@ -50,14 +50,14 @@ class Verified(Result):
     @property
     def distortion_percent(self) -> float:
         """Median over focal lengths of the residual; NaN where distortion was not measured."""
-        return _median(c.distortion.rms for c in self.comparisons if c.distortion is not None)
+        return _median(c.distortion_percent.rms for c in self.comparisons if c.distortion_percent is not None)
 
     def light_stops(self, *, widest: bool) -> float:
         """Median over focal lengths of the residual of light, at the widest aperture or at the one nearest to f/8."""
         each = []
-        for c in (c for c in self.comparisons if c.light):
-            f_number = min(c.light) if widest else near_f8(c.light)
-            each.append(c.light[f_number].rms)
+        for c in (c for c in self.comparisons if c.light_stops):
+            f_number = min(c.light_stops) if widest else near_f8(c.light_stops)
+            each.append(c.light_stops[f_number].rms)
         return _median(each)
 
     @property
@@ -83,15 +83,20 @@ def names_of(lens: Lens) -> list[str]:
     return [name for name in (lens.believed_to_be, f"{lens.designer} {lens.name}", stem) if name.strip()]
 
 
-def found_for(lens: Lens, wanted: str | None = None) -> tuple[Match, list[Profile], tuple[str, ...]]:
+def found_for(
+    lens: Lens, wanted: str | None = None, *, any_focal: bool = False
+) -> tuple[Match, list[Profile], tuple[str, ...]]:
     """The profile for a lens, all profiles of that name, and the names of others that are likely.
+
+    `any_focal`: also where the table's focal length is another, for tables that are doubted.
 
     Raises:
         InputError: no profile for the lens; none of the name that is wanted, or of no focal length of the lens.
     """
     if wanted is not None:
         same = _by_film(profile_named(wanted), lens)
-        _check_focal_length(lens, same[0])
+        if not any_focal:
+            _check_focal_length(lens, same[0])
         return Match(same[0], 1.0), same, ()
     found = [m for m in matches(names_of(lens)) if m.certainty != "uncertain"]
     if not found:
@@ -102,7 +107,8 @@ def found_for(lens: Lens, wanted: str | None = None) -> tuple[Match, list[Profil
     same = [m.profile for m in found if (m.profile.maker, m.profile.model) == (best.profile.maker, best.profile.model)]
     also = dict.fromkeys(m.profile.model for m in found if m.likeness == best.likeness and m.profile not in same)
     same = _by_film(same, lens)
-    _check_focal_length(lens, same[0])
+    if not any_focal:
+        _check_focal_length(lens, same[0])
     return best, same, tuple(also)
 
 
@@ -183,8 +189,8 @@ def _said_of_light(found: Verified, fitted: bool) -> str:
         return "light was not measured"
     if wide <= SOUND_STOPS:
         return f"the rims agree with the photographs: light wide open within {wide:.2g} stops"
-    curves = [c.light[min(c.light)] for c in found.comparisons if c.light]
-    word = "darker" if _median(float(np.nanmean(c.measured - c.ours)) for c in curves) < 0 else "brighter"
+    curves = [c.light_stops[min(c.light_stops)] for c in found.comparisons if c.light_stops]
+    word = "darker" if _median(float(np.nanmean(c.measured - c.computed)) for c in curves) < 0 else "brighter"
     if closed > SOUND_STOPS:
         return f"the real lens is {word} by {wide:.2g} stops, at f/8 by {closed:.2g}: rims alone cannot explain that"
     cause = "more than rims can explain" if fitted else "its rims are others (see neurolens rims)"

@@ -63,13 +63,13 @@ def axis_light(lens: Lens) -> float:
 @pytest.mark.parametrize(("front", "rear"), [(0.95, 1.0), (1.0, 0.9), (1.05, 0.95)])
 def test_rims_of_the_lens_that_was_photographed_are_found_again(front: float, rear: float) -> None:
     found = fit_rims(gauss(), photographs_of(scaled(gauss(), front, rear)))
-    assert max(found.after.values()) < max(0.05, max(found.before.values()) / 5)
+    assert max(found.after_stops.values()) < max(0.05, max(found.before_stops.values()) / 5)
     assert axis_light(with_fitted_rims(gauss(), found)) == pytest.approx(axis_light(gauss()), rel=0.01)
 
 
 def test_an_aperture_that_was_left_out_agrees_too() -> None:
     found = fit_rims(gauss(), photographs_of(scaled(gauss(), 0.95, 0.9)), unused=(2.8,))
-    assert found.unused == (2.8,) and found.after[2.8] < 0.1 < found.before[2.8]
+    assert found.unused == (2.8,) and found.after_stops[2.8] < 0.1 < found.before_stops[2.8]
 
 
 def test_a_ring_of_the_mount_is_found() -> None:
@@ -77,7 +77,7 @@ def test_a_ring_of_the_mount_is_found() -> None:
     ring = Ring(0, 0.4 * float(gauss().vertices_mm[-2]), 22.0)
     found = fit_rims(gauss(), photographs_of(with_ring(gauss(), ring)))
     assert [r.before for r in found.rings] == [0]
-    assert np.mean(list(found.after.values())) < np.mean(list(found.before.values())) / 4
+    assert np.mean(list(found.after_stops.values())) < np.mean(list(found.before_stops.values())) / 4
 
 
 def test_light_that_no_rim_can_explain_does_not_cut_the_axis() -> None:
@@ -85,7 +85,7 @@ def test_light_that_no_rim_can_explain_does_not_cut_the_axis() -> None:
     dark = tuple(row._replace(k=(-0.9, 0.0, 0.0)) for row in profile.light)
     found = fit_rims(gauss(), replace(profile, light=dark))
     assert axis_light(with_fitted_rims(gauss(), found)) == pytest.approx(axis_light(gauss()), rel=0.02)
-    assert found.after[8.0] > 0.3  # and this is said
+    assert found.after_stops[8.0] > 0.3  # and this is said
 
 
 @pytest.mark.parametrize(
@@ -119,8 +119,8 @@ def test_the_sonnar_goes_from_a_stop_in_the_corner_to_a_third(
     from neurolens.photographs.verify import verify
 
     (c,) = verify(lens).comparisons
-    for curve in c.light.values():
-        assert abs(curve.measured[-1] - curve.ours[-1]) < 0.35
+    for curve in c.light_stops.values():
+        assert abs(curve.measured[-1] - curve.computed[-1]) < 0.35
 
 
 @pytest.mark.parametrize(

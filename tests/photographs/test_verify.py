@@ -56,9 +56,9 @@ def test_a_profile_of_the_lens_itself_agrees(name: str) -> None:
     lens = lens_of(name)
     focal = float(Scene(set_lens(lens)).first_order.efl_mm)
     found = compare(lens, own_profile(lens, focal, (lens.f_number, 8.0)), focal)
-    assert found.distortion is not None and found.distortion.rms < 0.005
-    assert np.ptp(found.distortion.measured) > 0.1  # there is something to agree with
-    for curve in found.light.values():
+    assert found.distortion_percent is not None and found.distortion_percent.rms < 0.005
+    assert np.ptp(found.distortion_percent.measured) > 0.1  # there is something to agree with
+    for curve in found.light_stops.values():
         assert curve.rms < 0.03  # three terms do not hold the lens's curve better
 
 
@@ -67,7 +67,7 @@ def test_aspheres_that_are_left_out_are_seen() -> None:
     lens = lens_of("sony_sonnar_55")
     focal = float(Scene(set_lens(lens)).first_order.efl_mm)
     plain = replace(lens, surfaces=tuple(replace(s, asphere=()) for s in lens.surfaces))
-    found = compare(plain, own_profile(lens, focal), focal).distortion
+    found = compare(plain, own_profile(lens, focal), focal).distortion_percent
     both = [Scene(set_lens(x)) for x in (lens, plain)]
     fields = both[0].fields_at(list(np.linspace(6, 20, 8)))
     ratio = np.divide(*(scene.chief_rays(fields).height_mm.numpy() for scene in both))
@@ -113,9 +113,9 @@ def test_the_shipped_sonnar_against_photographs() -> None:
     assert found.profile == "Sony FE 55mm f/1.8 ZA" and found.certainty == "certain"
     assert found.distortion_percent < 0.1
     (c,) = found.comparisons
-    assert c.blue is not None and abs(c.blue.measured[-1] - c.blue.ours[-1]) < 3
-    widest = c.light[1.8]
-    assert widest.measured[-1] - widest.ours[-1] == pytest.approx(-0.9, abs=0.15)
+    assert c.blue_um is not None and abs(c.blue_um.measured[-1] - c.blue_um.computed[-1]) < 3
+    widest = c.light_stops[1.8]
+    assert widest.measured[-1] - widest.computed[-1] == pytest.approx(-0.9, abs=0.15)
 
 
 def test_the_command_prints_draws_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -132,7 +132,9 @@ def test_the_command_prints_draws_and_writes(tmp_path: Path, capsys: pytest.Capt
     assert main(["verify", str(written), "--json"]) == 0
     data = json.loads(capsys.readouterr().out)
     assert data["measured"] == pytest.approx(dict(again.measured))
-    assert len(data["comparisons"][0]["distortion"]["ours"]) == len(data["comparisons"][0]["distortion"]["height_mm"])
+    assert len(data["comparisons"][0]["distortion_percent"]["computed"]) == len(
+        data["comparisons"][0]["distortion_percent"]["height_mm"]
+    )
 
 
 @pytest.mark.parametrize(
@@ -165,7 +167,10 @@ def test_light_alone_and_another_film(monkeypatch: pytest.MonkeyPatch) -> None:
     assert math.isnan(found.distortion_percent) and "distortion was not measured" in found.verdict
     monkeypatch.setattr(profiles, "database", lambda: (replace(whole, crop=0.5),))
     (c,) = verify(lens).comparisons
-    assert c.distortion is not None and c.distortion.height_mm.max() <= (lens.image_radius_mm or math.inf) * 1.02
+    assert (
+        c.distortion_percent is not None
+        and c.distortion_percent.height_mm.max() <= (lens.image_radius_mm or math.inf) * 1.02
+    )
     assert names_of(lens)[0] == "Some 50mm f/1.8"
 
 

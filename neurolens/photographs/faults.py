@@ -1,0 +1,243 @@
+"""Single changes that make a doubtful table sound: wrong signs and digits, swapped glasses, missing aspheres."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.analysis.fields import Result
+from neurolens.lens.prescription import Lens
+from neurolens.photographs.compare import at_focal_length
+from neurolens.photographs.figures import Found, Measures, measure
+from neurolens.photographs.profiles import Profile
+
+Array = NDArray[np.float64]
+
+# What nearly all sound tables keep: experiments/results/faults.md.
+ALARM = Measures(*map(np.array, (0.75, 55.0, 1.0, 0.9, 0.32, 5.5, 0.4)))
+_UNITS = {10.0: "centimetres", 25.4: "inches"}
+_POWERS, _ROUNDS = (4, 6, 8, 10), 6  # of an asphere that may be missing; rounds of the search for its terms
+_NEAR_MM, _DAMPED = 1e-5, (1e-9, 1e-7, 1e-5, 1e-3, 1e-1)  # of sags at the rim, for slopes; shares of their squares
+_LIKELY, _ALIKE = 7, 4  # surfaces that are searched to the end, and named at most, for an asphere that is missing
+_CLEARLY = 3.0  # times by which the score is less after a change that is told
+_WORDS = {
+    "distortion": ("distortion", "%"), "blur": ("blur of the axis times the f-number", " µm"),
+    "focus": ("scatter of the foci over the field", "% of the focal length"),
+    "colour": ("foci of F and C apart", "%"), "lateral": ("images in F and C apart", "%"),
+    "focal": ("focal length off", "%"), "back": ("film off the focus", "% of the focal length"),
+}  # fmt: skip
+
+
+class Change(NamedTuple):
+    """One change of a table: what it is, in words, and the table with it."""
+
+    said: str
+    lens: Lens
+
+
+def changed(lens: Lens, k: int, **fields: Any) -> Lens:
+    """The lens with other figures in one row."""
+    rows = lens.surfaces
+    return replace(lens, surfaces=(*rows[:k], replace(rows[k], **fields), *rows[k + 1 :]))
+
+
+def transposed(value: float) -> list[float]:
+    """A figure with two neighbouring digits of its first five transposed, where that changes it."""
+    text = f"{value:.6g}"
+    if "e" in text or not math.isfinite(value):
+        return []
+    places = [i for i, c in enumerate(text) if c.isdigit()]
+    first = next((n for n, i in enumerate(places) if text[i] != "0"), 0)
+    found = []
+    for i, j in list(pairwise(places))[first : first + 4]:
+        if text[i] != text[j]:
+            digits = list(text)
+            digits[i], digits[j] = digits[j], digits[i]
+            found.append(float("".join(digits)))
+    return found
+
+
+def glasses(lens: Lens) -> list[int]:
+    """The rows that are followed by glass."""
+    return [k for k, s in enumerate(lens.surfaces) if float(s.n_d) != 1 or s.glass]
+
+
+def swapped(lens: Lens, k: int, j: int) -> Lens:
+    """The lens with the glasses of two rows swapped."""
+    a, b = ({f: getattr(lens.surfaces[n], f) for f in ("n_d", "V_d", "glass", "material")} for n in (k, j))
+    return changed(changed(lens, k, **b), j, **a)
+
+
+def changes(lens: Lens) -> Iterator[Change]:
+    """All single changes of a table that are tried, but for aspheres that may be missing."""
+    for k, s in enumerate(lens.surfaces):
+        if math.isfinite(s.radius_mm):
+            yield Change(f"the sign of the radius of surface {k}", changed(lens, k, radius_mm=-s.radius_mm))
+        for n, (power, a) in enumerate(s.asphere):
+            for factor, what in (
+                (-1.0, "the sign"),
+                (10.0, "the exponent (10 times)"),
+                (0.1, "the exponent (a tenth)"),
+            ):
+                asphere = (*s.asphere[:n], (power, factor * a), *s.asphere[n + 1 :])
+                yield Change(
+                    f"{what} of the coefficient of power {power} of surface {k}", changed(lens, k, asphere=asphere)
+                )
+        fields = ["radius_mm", "thickness_mm"] + ["n_d"] * (s.glass is None)
+        for field in fields:
+            old = float(getattr(s, field))
+            for new in transposed(old):
+                if field != "n_d" or 1.3 < new < 2.3:
+                    said = f"transposed digits: {field} of surface {k} {new:g} instead of {old:.6g}"
+                    yield Change(said, changed(lens, k, **{field: new}))
+    for k, j in pairwise(glasses(lens)):
+        yield Change(f"swapped glasses after surfaces {k} and {j}", swapped(lens, k, j))
+    for factor, name in _UNITS.items():
+        yield Change(f"units: the figures are {name}", lens.scaled(factor))
+        yield Change(f"units: the figures were taken for {name}", lens.scaled(1 / factor))
+
+
+def alarm(found: Measures) -> Array:
+    """The largest figure of each table over what nearly all sound tables keep; above 1 a table is doubtful."""
+    return np.asarray(np.max([m / most for m, most in zip(found, ALARM, strict=True)], axis=0))
+
+
+def score(found: Measures) -> Array:
+    """The figures of each table over what nearly all sound tables keep, as a root of the sum of squares."""
+    return np.sqrt(np.sum([(m / most) ** 2 for m, most in zip(found, ALARM, strict=True)], axis=0))
+
+
+class Tried(NamedTuple):
+    """A change with the figures of the table that has it."""
+
+    change: Change
+    found: Found
+
+    @property
+    def score(self) -> float:
+        """See `score`; less is better."""
+        return float(score(self.found.figures)[0])
+
+    @property
+    def sound(self) -> bool:
+        """Whether the table raises no alarm."""
+        return bool(alarm(self.found.figures)[0] <= 1)
+
+
+def _best(tried: Sequence[Change], profile: Profile, focal_mm: float) -> Tried:
+    figures, off = measure([change.lens for change in tried], profile, focal_mm)
+    n = int(np.argmin(score(figures)))
+    one = slice(n, n + 1)
+    return Tried(tried[n], Found(Measures(*(v[one] for v in figures)), (off[0][one], off[1][one], off[2][one])))
+
+
+def missing_asphere(lens: Lens, k: int, profile: Profile, focal_mm: float, rounds: int = _ROUNDS) -> Tried:
+    """The terms of powers 4 to 10 at a surface for which the figures are best, by damped least squares."""
+    terms, rim = dict(lens.surfaces[k].asphere), lens.surfaces[k].semi_diameter_mm
+
+    def with_sags(sags: Array) -> Change:
+        """Terms that are so many mm deep at the rim, beside those of the table."""
+        more = {p: terms.get(p, 0.0) + float(sag) / rim**p for p, sag in zip(_POWERS, sags, strict=True)}
+        asphere = tuple(sorted((terms | more).items()))
+        return Change(f"an asphere is missing at surface {k}", changed(lens, k, asphere=asphere))
+
+    sags = np.zeros(len(_POWERS))
+    best = _best([with_sags(sags)], profile, focal_mm)
+    for _ in range(rounds):
+        near = [with_sags(s).lens for s in (sags, *(sags + _NEAR_MM * np.eye(len(sags))))]
+        off = measure(near, profile, focal_mm).off
+        weighed = [v / most / math.sqrt(v.shape[1]) for v, most in zip(off, ALARM[:3], strict=True)]
+        found = np.nan_to_num(np.concatenate(weighed, axis=1))
+        slope = (found[1:] - found[0]) / _NEAR_MM
+        square, pull, one = slope @ slope.T, slope @ found[0], np.eye(len(sags))
+        most = np.trace(square)
+        if not 0 < most < math.inf:
+            break
+        each = [sags - np.linalg.solve(square + damped * most * one, pull) for damped in _DAMPED]
+        tried = [with_sags(s) for s in each]
+        better = _best(tried, profile, focal_mm)
+        if not better.score < best.score:
+            break
+        best, sags = better, each[[t is better.change for t in tried].index(True)]
+    return best
+
+
+@dataclass(frozen=True)
+class Checked(Result):
+    """A table by its figures, and the single change that makes it sound.
+
+    Attributes:
+        doubtful: whether any figure is beyond what nearly all sound tables keep.
+        change: in words; None where none is called for or none helps. after: the figures with it.
+        before: by name, see `Measures`.
+        said: all of it in sentences.
+    """
+
+    doubtful: bool
+    change: str | None
+    before: dict[str, float]
+    after: dict[str, float] | None
+    said: tuple[str, ...]
+
+
+def check(lens: Lens, profile: Profile) -> Checked:
+    """Look for figures of a lens that no sound table has, and for one change after which they are gone.
+
+    A zoom is checked at one focal length of the profile, that in the middle.
+
+    Raises:
+        InputError: ideal lenses, of which there is no table.
+    """
+    lens.require_glass("check")
+    known = sorted({r.focal_mm for r in profile.distortion} or set(profile.focal_mm))
+    focal = known[len(known) // 2]
+    placed = at_focal_length(lens, focal)
+    now = _best([Change("", placed)], profile, focal)
+    before = _named(now)
+    if now.sound:
+        return Checked(
+            False, None, before, None, (f"the table is sound, and no change is called for: {_told(before)}",)
+        )
+    beyond = {name: v for name, v in before.items() if not v <= getattr(ALARM, name)}
+    said = f"the table is doubtful: {_told(beyond, limits=True)}"
+    best = _best(list(changes(placed)), profile, focal)
+    others = ""
+    if not _helps(best, now):  # terms of an asphere can imitate other changes, so that they come last
+        bent = [k for k, s in enumerate(placed.surfaces) if not s.stop and 0 < s.semi_diameter_mm < math.inf]
+        first = {k: missing_asphere(placed, k, profile, focal, rounds=1).score for k in bent}
+        likely = sorted(bent, key=first.__getitem__)[:_LIKELY]
+        aspheres = sorted((missing_asphere(placed, k, profile, focal) for k in likely), key=lambda tried: tried.score)
+        best = min([best, *aspheres[:1]], key=lambda tried: tried.score)
+        alike = [t for t in aspheres[1:_ALIKE] if _helps(t, now) and t.score <= 2 * best.score]
+        others = "".join(f" or at surface {t.change.said.split()[-1]}" for t in alike)
+    if not _helps(best, now):
+        nearest = f"no single change makes it sound; the nearest is: {best.change.said}"
+        return Checked(True, None, before, None, (said, nearest))
+    after = _named(best)
+    moved = _told({name: after[name] for name in beyond})
+    change = best.change.said + others
+    told = f"one change makes it sound, {change}: {moved}"
+    return Checked(True, change, before, after, (said, told))
+
+
+def _helps(tried: Tried, now: Tried) -> bool:
+    return tried.sound and tried.score <= now.score / _CLEARLY
+
+
+def _named(tried: Tried) -> dict[str, float]:
+    return {name: float(v[0]) for name, v in tried.found.figures._asdict().items()}
+
+
+def _told(figures: dict[str, float], *, limits: bool = False) -> str:
+    each = []
+    for name, value in figures.items():
+        text, unit = _WORDS[name]
+        figure = f"{value:.2g}{unit}" if math.isfinite(value) else "not known, for rays do not get through"
+        each.append(f"{text} {figure}" + (f" (sound tables: below {getattr(ALARM, name):g})" if limits else ""))
+    return ", ".join(each)

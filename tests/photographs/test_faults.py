@@ -1,0 +1,139 @@
+"""Tables broken on purpose are found, the right change is named, and sound ones raise no alarm."""
+
+import json
+import re
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from neurolens.analysis import field_curves
+from neurolens.analysis.fields import Scene
+from neurolens.cli import main
+from neurolens.lens.prescription import Lens
+from neurolens.photographs.compare import compare
+from neurolens.photographs.faults import Checked, alarm, changed, check, swapped, transposed
+from neurolens.photographs.figures import SHARES, Tables, chief_rays, measure
+from neurolens.photographs.profiles import Profile
+from neurolens.photographs.verify import found_for
+from neurolens.readers.lensfile import read_lens
+from neurolens.setting.states import set_lens
+
+ROOT = Path(__file__).parents[2]
+SONNAR = ROOT / "lenses" / "sony_sonnar_55.toml"
+
+
+@cache
+def lens_of(name: str) -> Lens:
+    return set_lens(read_lens(ROOT / "lenses" / f"{name}.toml"))
+
+
+@cache
+def measured() -> Profile:
+    pytest.importorskip("lensfunpy")
+    return found_for(read_lens(SONNAR))[1][0]
+
+
+def checked(**fields: dict[int, object]) -> Checked:
+    """The Sonnar with other fields, by row."""
+    lens = read_lens(SONNAR)
+    for name, rows in fields.items():
+        for k, value in rows.items():
+            lens = changed(lens, k, **{name: value})
+    return check(lens, measured())
+
+
+@pytest.mark.parametrize(
+    ("name", "steepest"),
+    [("sony_sonnar_55", 0.4), ("horimoto_fisheye_16", 0.5), ("phone_lens_6", 0.5), ("tajima_retrofocus_24", 0.4)],
+)
+def test_chief_rays_and_foci_without_aiming_are_those_of_the_scene(
+    name: str, steepest: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(field_curves, "_CLOSE", 1e-5)  # its own error is 0.7 um for the phone lens otherwise
+    lens = lens_of(name)
+    scene = Scene(lens)
+    film = np.full((2, 1), scene.film_z_mm - float(lens.vertices_mm[-2]))
+    slope = np.linspace(0.05, steepest, 9) * np.ones((2, 1))
+    found = chief_rays(Tables.of([lens, lens]), film, slope)
+    expected = scene.chief_rays(np.degrees(found.angle[0])).height_mm.numpy()
+    assert np.isfinite(expected).all() and expected[-1] > 0.5 * (lens.image_radius_mm or 1)
+    np.testing.assert_allclose(found.height_mm[1], expected, rtol=0, atol=1e-9)
+    beside = chief_rays(Tables.of([lens]), film[:1], steepest * np.array([[*SHARES, 1.0]])).angle[0, :-1]
+    for k, angle in enumerate(np.degrees(beside)):
+        curves = field_curves.curvature(scene, fields=2, edge_deg=float(angle))
+        assert found.tangential_mm[0, k] == pytest.approx(curves.tangential_mm[1], abs=1e-4)  # mm; both are differences
+        assert found.sagittal_mm[0, k] == pytest.approx(curves.sagittal_mm[1], abs=1e-4)  # mm; both are differences
+
+
+def test_the_residual_is_that_of_the_comparison() -> None:
+    lens = changed(lens_of("sony_sonnar_55"), 10, asphere=())
+    (found,) = measure([lens], measured(), 55.0).figures.distortion
+    expected = compare(lens, measured(), 55.0).distortion_percent
+    assert expected is not None and found == pytest.approx(expected.rms, rel=1e-3) and found > 0.5
+
+
+def test_the_sound_table_raises_no_alarm() -> None:
+    found = checked()
+    assert not found.doubtful and found.change is None and "no change is called for" in found.said[0]
+    assert found.before["distortion"] < 0.1
+
+
+def test_a_wrong_sign_is_named() -> None:
+    found = checked(radius_mm={0: 46.604})
+    assert found.doubtful and found.change == "the sign of the radius of surface 0"
+    assert found.after is not None and found.after["distortion"] == pytest.approx(0.052, abs=0.005)
+    assert found.before["distortion"] > 1
+
+
+def test_swapped_glasses_are_named() -> None:
+    lens = swapped(read_lens(SONNAR), 3, 4)
+    assert check(lens, measured()).change == "swapped glasses after surfaces 3 and 4"
+
+
+@pytest.mark.parametrize(("field", "k", "value"), [("radius_mm", 1, 43.097), ("n_d", 4, 1.786015)])
+def test_transposed_digits_are_named(field: str, k: int, value: float) -> None:
+    found = checked(**{field: {k: value}})
+    assert found.change is not None and found.change.startswith(f"transposed digits: {field} of surface {k} ")
+
+
+def test_a_wrong_exponent_and_a_wrong_sign_of_an_asphere_are_named() -> None:
+    ((power, a), *rest) = read_lens(SONNAR).surfaces[8].asphere
+    found = checked(asphere={8: ((power, 10 * a), *rest)})
+    assert found.change == "the exponent (a tenth) of the coefficient of power 4 of surface 8"
+    found = checked(asphere={8: ((power, -a), *rest)})
+    assert found.change == "the sign of the coefficient of power 4 of surface 8"
+
+
+def test_a_dropped_asphere_is_missed_at_its_surface_and_all_dropped_ones_are_found() -> None:
+    found = checked(asphere={10: ()})
+    assert found.change is not None and re.match(r"an asphere is missing at surface 10\b", found.change)
+    rows = tuple(replace(s, asphere=()) for s in lens_of("sony_sonnar_55").surfaces)
+    assert alarm(measure([replace(lens_of("sony_sonnar_55"), surfaces=rows)], measured(), 55.0).figures)[0] > 5
+
+
+def test_digits_that_may_be_transposed() -> None:
+    assert transposed(46.604) == [64.604, 46.064, 46.64]
+    assert transposed(-0.0123) == [-0.0213, -0.0132]
+    assert transposed(11.0) == transposed(float("inf")) == transposed(1e-9) == []
+
+
+def test_the_command_says_it_also_where_the_focal_length_is_that_of_no_profile(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("lensfunpy")
+    text, broken = SONNAR.read_text().split("[[configuration]]")[0], tmp_path / "sonnar.toml"
+    broken.write_text(text.replace("radius_mm = -46.604", "radius_mm =  46.604"))
+    assert main(["verify", str(broken), "--check", "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["check"]["change"] == "the sign of the radius of surface 0" and "55 mm" in data["reason"]
+    assert main(["verify", str(broken)]) == main(["verify", str(broken), "--check", "-o", str(tmp_path / "x.png")]) == 2
+    assert main(["verify", str(SONNAR), "--check"]) == 0
+    assert "no change is called for" in capsys.readouterr().out
+
+
+def test_rays_that_do_not_get_through_are_an_alarm() -> None:
+    lens = changed(lens_of("sony_sonnar_55"), 12, radius_mm=3.0)
+    assert alarm(measure([lens], measured(), 55.0).figures)[0] == np.inf
