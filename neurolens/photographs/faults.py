@@ -19,8 +19,8 @@ from neurolens.photographs.profiles import Profile
 
 Array = NDArray[np.float64]
 
-# What nearly all sound tables keep (experiments/results/faults.md), and half as much again: limits that just hold for the
-# tables that set them would refuse twice as many others.
+# What nearly all sound tables keep (experiments/results/faults.md), and half as much again: limits that just hold for
+# the tables that set them would refuse twice as many others.
 ALARM = Measures(*(1.5 * np.array(most) for most in (0.75, 55.0, 1.0, 0.9, 0.32, 5.5, 0.4)))
 _UNITS = {10.0: "centimetres", 25.4: "inches"}
 _POWERS, _ROUNDS = (4, 6, 8, 10), 6  # of an asphere that may be missing; rounds of the search for its terms

@@ -169,7 +169,7 @@ BAD_HEADS = [
     ("f_number = 4.0", "f_number = 0", ["f_number", "got 0", "above 0"]),
     ("f_number = 4.0", 'f_number = "f/4"', ["f_number", "'f/4'"]),
     ('rims = "source"', 'rims = "guessed"', ["rims", "'guessed'", '"estimated"']),
-    ('rims = "source"', "", ["rims", "(missing)", '"source", "estimated" or "derived"']),
+    ('rims = "source"', "", ["rims", "(missing)", '"source", "estimated", "derived" or "photographs"']),
     ("surfaces = [", "rows = [", ["rows", "unknown key"]),
     # zoom states
     ('name = "near"', "", ["configuration 0, name", "(missing)"]),
