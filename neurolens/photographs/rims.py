@@ -216,10 +216,8 @@ def fit_rims(lens: Lens, profile: Profile, unused: Collection[float] = ()) -> Fi
     """Fit the rims of a lens to the light of a profile, of a zoom at its shortest focal length, but for some f-numbers.
 
     Raises:
-        InputError: a lens with cylinders; a profile without light at apertures of this lens.
+        InputError: a profile without light at apertures of this lens.
     """
-    if lens.anamorphic:
-        raise InputError(lens.path, "cylinder", "(an anamorphic lens)", "a lens that is symmetric about its axis")
     focal_mm = min((row.focal_mm for row in profile.light), default=math.nan)
     lights = [row for row in profile.light_at(focal_mm) if row.f_number <= _CLOSED]
     if not [row for row in lights if row.f_number not in unused]:

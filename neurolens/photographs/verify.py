@@ -91,8 +91,11 @@ def found_for(
     `any_focal`: also where the table's focal length is another, for tables that are doubted.
 
     Raises:
-        InputError: no profile for the lens; none of the name that is wanted, or of no focal length of the lens.
+        InputError: a lens with cylinders, which has two distortions; no profile; none of the name that is wanted, or of
+            no focal length of the lens.
     """
+    if lens.anamorphic:
+        raise InputError(lens.path, "cylinder", "(an anamorphic lens)", "a lens that is symmetric about its axis")
     if wanted is not None:
         same = _by_film(profile_named(wanted), lens)
         if not any_focal:
@@ -122,10 +125,8 @@ def verify(lens: Lens, profile: str | None = None) -> Verified:
     """Compare a lens of a file with the profile that its name finds, at every focal length of the profile.
 
     Raises:
-        InputError: no profile; a lens with cylinders, which has two distortions; one of another focal length.
+        InputError: as `found_for`; a lens that reaches none of the profile's focal lengths.
     """
-    if lens.anamorphic:
-        raise InputError(lens.path, "cylinder", "(an anamorphic lens)", "a lens that is symmetric about its axis")
     match, profiles, also = found_for(lens, profile)
     used = profiles[0]
     whole, missed = [], dict[float, InputError]()
