@@ -15,14 +15,12 @@ from neurolens.analysis.bundles import bundle, hexapolar, points
 from neurolens.analysis.fields import Array, Result, Scene, on_plane
 from neurolens.analysis.pupil_nodes import LitPart, converged, lit_nodes, lit_part
 from neurolens.base.errors import InputError
-from neurolens.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM
+from neurolens.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM, LINE_G_NM
 from neurolens.lens.paraxial import PathOfRay, System, system_of
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.setting.pupils import camera_rays, pupil_plane_z_mm
 from neurolens.trace.rays import passing
 from neurolens.trace.surfaces import Rays
-
-LINE_G_NM = 435.8343  # mercury, the usual fourth line
 
 # Share of the stop's radius that stands for the paraxial ray: its error grows with the square.
 PARAXIAL = 1e-3

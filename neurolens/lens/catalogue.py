@@ -21,9 +21,10 @@ import numpy as np
 from neurolens.base.errors import InputError
 from neurolens.lens.film_plane import LINE_D_NM
 
-# Fraunhofer lines, nm (helium d; hydrogen F and C).
+# Fraunhofer lines, nm (helium d; hydrogen F and C; mercury g).
 LINE_F_NM = 486.1327
 LINE_C_NM = 656.2725
+LINE_G_NM = 435.8343
 
 
 @dataclass(frozen=True, eq=False)  # compared by identity: the catalogue has one object per glass

@@ -243,7 +243,8 @@ class Lens:
         rows = [_figures(s) for s in self.surfaces]
         rows[-1][1] = None
         if self.object_medium != Medium():
-            rows.append([float(self.object_medium.n_d), self.object_medium.V_d, self.object_medium.glass])
+            m = self.object_medium
+            rows.append([float(m.n_d), m.V_d, m.glass, *_terms(m)])
         return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
 
     @property
@@ -320,6 +321,11 @@ def same_medium(surfaces: Sequence[Surface], k: int, in_front: Medium | None = N
     return before == (s.n_d, s.V_d, s.glass) and s.focal_mm is None
 
 
+def _terms(m: Surface | Medium) -> list[int]:
+    """The number of terms of `glass.cauchy`, two in earlier versions, where it makes the index of a medium."""
+    return [3] if m.V_d is not None and m.glass is None else []
+
+
 def _figures(s: Surface) -> list[Any]:
     """List the figures of a surface that decide where rays go, for the hash; default values are left out."""
     radius = float(s.radius_mm)
@@ -338,6 +344,7 @@ def _figures(s: Surface) -> list[Any]:
         "across": s.across,
         "focal_mm": s.focal_mm,
         "glass": s.glass,
+        "cauchy": _terms(s),
         "absorption_per_mm": float(s.absorption_per_mm),
         "coating": s.coating and [[float(v) for v in layer] for layer in s.coating.layers],
     }

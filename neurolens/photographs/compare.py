@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cache, partial
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,6 @@ from scipy.interpolate import CubicSpline  # type: ignore[import-untyped]
 from neurolens.analysis.bundles import bundle, points
 from neurolens.analysis.field_curves import PROJECTIONS, RECTILINEAR
 from neurolens.analysis.fields import Result, Scene
-from neurolens.lens.catalogue import nearest
 from neurolens.lens.paraxial import stop_radius_mm
 from neurolens.lens.prescription import Lens
 from neurolens.photographs.light import open_light
@@ -36,7 +35,6 @@ _SIZES = np.linspace(0.97, 1.03, 13)  # of the picture, over that of crop factor
 _BANDS_NM = {"red": (585.0, 600.0, 615.0), "green": (520.0, 540.0, 560.0), "blue": (465.0, 480.0, 495.0)}
 IDEAL = {"equisolid": "equisolid, 2 f sin(theta/2)", "fisheye": "equidistant, f theta",
           "stereographic": "stereographic, 2 f tan(theta/2)", "orthographic": "orthographic, f sin"}  # fmt: skip
-_NEAR_N_D, _NEAR_V_D = 0.002, 1.0  # within which a glass of the catalogue stands for two figures of a table
 _STOP_SLACK = 1.03  # an aperture named in a profile counts as full where the lens's own is that near
 
 
@@ -167,27 +165,9 @@ def shape_off(height_mm: Array, measured: Array, real_mm: Array, stretch: Array)
     return np.asarray(off[:, np.argmin(np.nansum(off**2, axis=0))])
 
 
-def with_real_glasses(lens: Lens) -> Lens:
-    """The lens with a glass of the catalogue where the table gives n_d and V_d of one.
-
-    Two numbers leave the secondary spectrum open, on which the place of blue depends more than on anything else.
-    """
-    rows = [
-        replace(s, glass=_glass_like(float(s.n_d), s.V_d)) if s.glass is None and s.V_d else s for s in lens.surfaces
-    ]
-    return replace(lens, surfaces=tuple(rows))
-
-
-@cache
-def _glass_like(n_d: float, V_d: float) -> str | None:
-    found = nearest(n_d, V_d, 1)[0]
-    near = abs(found.n_d - n_d) <= _NEAR_N_D and abs(found.V_d - V_d) <= _NEAR_V_D
-    return str(found) if near else None
-
-
 def colour_curves(lens: Lens, profile: Profile, radials: Mapping[str, Radial | None]) -> dict[str, Curve | None]:
     """How much farther from the axis red and blue lie than green, in um, over broad bands as a camera's."""
-    height, scene = heights_of(profile, lens), Scene(with_real_glasses(lens))
+    height, scene = heights_of(profile, lens), Scene(lens)
     angle, _ = _chief(scene, float(height.max()))
     waves = [nm for band in _BANDS_NM.values() for nm in band]
     chief = bundle(scene.open, np.degrees(angle).tolist(), waves, points([0.0], [0.0]))

@@ -35,6 +35,7 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import read_bytes
 from neurolens.base.tomlfile import suggestion
 from neurolens.cameras.contract import FloatArray
+from neurolens.lens.glass import index_at
 from neurolens.render.scenetables import Vector
 
 Matrix = NDArray[np.float64]
@@ -47,7 +48,6 @@ _KELVIN = re.compile(r"([0-9]{1,9}(?:\.[0-9]{0,9})?) ?K")
 COLDEST_K, HOTTEST_K = 500.0, 1e5
 _SECOND_RADIATION_CONSTANT = 1.438776877e-2  # h c / k, m K
 _MOST_ROWS, _LARGEST_FILE = 10_000, 1_000_000
-_DFC_NM = 587.5618, 486.1327, 656.2725  # Fraunhofer lines d, F and C
 # Beyond this condition number the three responses are too similar: separating them would only amplify noise.
 _LARGEST_CONDITION = 30.0
 _DEFENSIVE = 0.1  # share of the wavelengths drawn uniformly, independent of the importance
@@ -398,12 +398,8 @@ class SpectralRange:
         return (np.asarray(rgb, np.float64) @ self.basis).astype(np.float32)
 
     def refractive_index(self, n_d: float, v_d: float | None) -> FloatArray:
-        """Index [bins], Cauchy's A + B / lambda^2 through n_d and n_F - n_C = (n_d - 1) / V_d; constant without V_d."""
-        if v_d is None:
-            return np.full(self.bins, n_d, np.float32)
-        d, f, c = (1 / nm**2 for nm in _DFC_NM)
-        b = (n_d - 1) / v_d / (f - c)
-        return (n_d + b * (self.centres_nm**-2.0 - d)).astype(np.float32)
+        """Index [bins] of a glass (`glass.index_at`)."""
+        return np.full(self.bins, index_at(n_d, v_d, self.centres_nm), np.float32)
 
 
 class Palette:

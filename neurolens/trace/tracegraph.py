@@ -12,7 +12,7 @@ import numpy as np
 
 from neurolens.base import status as st
 from neurolens.graph.ir import Graph, Value
-from neurolens.lens.glass import absorption_of, glass_of, index_at, index_of
+from neurolens.lens.glass import absorption_of, cauchy, glass_of, index_at, index_of
 from neurolens.lens.prescription import Lens
 from neurolens.trace.arithmetic import Graphs, is_number, times
 from neurolens.trace.coatings import times_film
@@ -129,9 +129,7 @@ class GraphPassage(Passage):
         s: tuple[Value | float, ...] = (1.0, 0.0, 0.0, 1.0)
         p = s
         for n_d, thickness_nm, *V_d in reversed(coating.layers):
-            at_1000, at_500 = (float(index_at(n_d, V_d[0] if V_d else None, nm)) for nm in (1000.0, 500.0))
-            rise = (at_500 - at_1000) / 3  # of Cauchy's index by 1 / lambda^2 in um
-            index = g.series(inverse_um * inverse_um, [at_1000 - rise, rise])
+            index = g.series(inverse_um * inverse_um, [float(v) for v in cauchy(n_d, V_d[0])] if V_d else [float(n_d)])
             phase_per_q = inverse_um * (2e-3 * math.pi * float(thickness_nm))
             q2 = before * before + (index - n1) * (index + n1)
             numbers = [float(index_at(n_d, V_d[0] if V_d else None, nm)) for nm in self.range_nm]

@@ -13,7 +13,7 @@ from neurolens.analysis.field_curves import illumination
 from neurolens.analysis.fields import Scene
 from neurolens.cli import main
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.compare import compare, with_real_glasses
+from neurolens.photographs.compare import compare
 from neurolens.photographs.light import open_light
 from neurolens.photographs.profiles import FULL_FRAME_MM, Light, Profile, Radial
 from neurolens.photographs.verify import names_of, verify
@@ -97,13 +97,6 @@ def test_no_light_passes_a_closed_stop_or_a_film_point_beyond_all_rays() -> None
     assert opened.at(rims)[1] == 0 < opened.at(rims)[0]
     rims[lens.stop_index] = 0.0
     assert opened.at(rims).max() < 1e-20
-
-
-def test_two_figures_of_a_glass_become_that_of_the_catalogue() -> None:
-    lens = with_real_glasses(lens_of("sony_sonnar_55"))
-    assert all(s.glass is not None for s in lens.surfaces if s.n_d != 1)
-    odd = replace(lens.surfaces[0], n_d=1.9, V_d=90.0, glass=None)
-    assert with_real_glasses(replace(lens, surfaces=(odd, *lens.surfaces[1:]))).surfaces[0].glass is None
 
 
 def test_the_shipped_sonnar_against_photographs() -> None:
