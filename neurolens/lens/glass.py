@@ -37,8 +37,8 @@ def cauchy(n_d: Any, V_d: float) -> tuple[Any, Any, Any]:
     """A, B (um^2) and C (um^4) of Cauchy's A + B / lambda^2 + C / lambda^4 for an index and an Abbe number.
 
     n(d) = n_d, n_F - n_C = (n_d - 1) / V_d, and n_g - n_F = P_gF (n_F - n_C). P_gF is a parabola in V_d, by least
-    squares through the catalogue's glasses up to n_d = 2.1: its residual is 0.004, that of a straight "normal line" 0.011,
-    that of A + B / lambda^2 up to 0.09. All three are linear in n_d.
+    squares through the catalogue's glasses up to n_d = 2.1: its residual is 0.004, that of a straight "normal line"
+    0.011, that of A + B / lambda^2 up to 0.09. All three are linear in n_d.
     """
     d, f, c, g = (inverse_square_um(nm) for nm in (LINE_D_NM, LINE_F_NM, LINE_C_NM, LINE_G_NM))
     within = min(max(V_d, _GLASSES_V_D[0]), _GLASSES_V_D[1])
