@@ -53,6 +53,7 @@ NAMES = {
     "photographs": ("photographs", "that collection against photographs: distortion, colour, light, fitted rims"),
     "photographs-faults": ("photographs_faults", "lens tables broken on purpose: faults found, changes named"),
     "collection": ("collection", "a public collection of lens files: read, refused, agreement with ray-optics"),
+    "named-lenses": ("named_lenses", "write the lens files of real lenses by name from that collection"),
     "optiland": ("compare_optiland", "speed of the exact tracer beside Optiland"),
 }
 _DESCRIPTION = """\

@@ -16,7 +16,7 @@ import statistics
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -86,20 +86,49 @@ class Entry:
 
 
 @dataclass(frozen=True)
+class More:
+    """Models that some lenses of a folder have besides those of all, by the names of their files."""
+
+    lenses: tuple[str, ...]
+    models: tuple[ModelSettings, ...]
+
+
+@dataclass(frozen=True)
 class WholeFolder:
     """Every lens file of a folder in its default state, unless an entry has it: best polynomial, best network."""
 
     folder: Path
     models: tuple[ModelSettings, ...] = field(default_factory=_default_models)
+    more: More | None = None
+
+    def entries(self, root: Path, named: Collection[str]) -> Iterator[Entry]:
+        """The lenses of the folder that `named` does not have.
+
+        Raises:
+            InputError: a lens with more models that the folder does not have.
+        """
+        files = lens_files(root / self.folder)
+        more = self.more or More((), ())
+        unknown = {*more.lenses} - {file.stem for file in files}
+        if unknown:
+            raise InputError("settings", "lenses.more.lenses", sorted(unknown), f"names of lens files of {self.folder}")
+        for file in files:
+            if file.stem not in named:
+                models = self.models + (more.models if file.stem in more.lenses else ())
+                yield Entry(LensChoice(file), models=models, best=True, promise=False)
 
 
 @dataclass(frozen=True)
 class Library:
-    """All entries, the ray pairs of each, and whether the compiled exact tracer is timed (half a minute per lens)."""
+    """All entries, the ray pairs of each, whether models are timed, and whether the compiled exact tracer is, too.
+
+    That takes minutes a lens; without it models keep the times of those of their name before.
+    """
 
     entry: tuple[Entry, ...] = ()
     lenses: WholeFolder | None = None
     pairs: PairSettings = field(default_factory=PairSettings)
+    timed: bool = True
     compile_exact: bool = True
 
     def __post_init__(self) -> None:
@@ -118,11 +147,7 @@ def read_list(path: str | Path) -> Library:
     library, folder = read_config(Library, path), Path(path).parent
     entries = [replace(e, lens=replace(e.lens, file=folder / e.lens.file)) for e in library.entry]
     if library.lenses is not None:
-        models = library.lenses.models
-        named = {e.state for e in entries}
-        for file in lens_files(folder / library.lenses.folder):
-            if file.stem not in named:
-                entries.append(Entry(LensChoice(file), models=models, best=True, promise=False))
+        entries += library.lenses.entries(folder, {e.state for e in entries})
     return replace(library, entry=tuple(entries), lenses=None)
 
 
@@ -228,7 +253,7 @@ def make_models(
     todo = [e for e in entries if again or not _stands(e, library.pairs, known, out)]
     for entry in todo:
         progress.plan({f"{entry.state}: {m.label}": 40.0 if m.method in NETWORKS else 10.0 for m in entry.models})
-        progress.plan({f"{entry.state}: race": 60.0})
+        progress.plan({f"{entry.state}: race": 60.0} if library.timed else {})
     for entry in todo:
         made, reason = list[Row](), ""
         try:
@@ -319,8 +344,8 @@ def _make_of_one_state(entry: Entry, library: Library, out: Path, progress: Prog
                 measured.append(made)
         measured = best_of_each_kind(measured) if entry.best else measured
         files = {m.settings.label: m.file for m in measured}
-        times = _times(entry, library, lens, domain, files, progress)
-        rows = [_row(entry, lens, domain, m) | times[m.settings.label] for m in measured]
+        times = _times(entry, library, lens, domain, files, progress) if library.timed else _times_before(entry, out)
+        rows = [_row(entry, lens, domain, m) | times.get(m.settings.label, _UNTIMED) for m in measured]
         return [_shipped(row, m.file, out) for row, m in zip(rows, measured, strict=True)]
 
 
@@ -343,6 +368,16 @@ def _times(
             "promised_speedup": round(PROMISE * speedup["min"], 2) if speedup and entry.promise else None,
         }
     return found
+
+
+_TIMES = "ns_per_ray fused_ns_per_ray exact_compiled_ns_per_ray speedup_over_compiled promised_speedup".split()
+_UNTIMED: Row = dict.fromkeys(_TIMES)
+
+
+def _times_before(entry: Entry, out: Path) -> dict[str, Row]:
+    """The times of the models of an entry that are there, by their labels."""
+    mine = (row for row in _known(out)[0] if row["entry"] == entry.state)
+    return {row["model"]: {key: row.get(key) for key in _TIMES} for row in mine}
 
 
 def time_models(library: Library, entries: Sequence[Entry], out: Path, progress: Progress) -> list[str]:
@@ -410,6 +445,7 @@ def _make_of_many_states(entry: Entry, library: Library, out: Path, progress: Pr
     with warnings.catch_warnings(), tempfile.TemporaryDirectory() as scratch:
         warnings.simplefilter("ignore", NeurolensWarning)
         space = experiment.states()
+        before = {label: times["ns_per_ray"] for label, times in _times_before(entry, out).items()}
         for m in entry.models:
             settings = state_settings(m, library.pairs.train, library.pairs.seed)
             with progress.stage(f"{entry.state}: {m.label}") as report:
@@ -420,7 +456,7 @@ def _make_of_many_states(entry: Entry, library: Library, out: Path, progress: Pr
                 broken = [p.key for p in check_states(model, space, count=_CHECKED)[1] if not p.holds]
                 domain = Domain.from_dict(model.card["domain"])
                 candidate = model_candidate(m.label, model, domain.stop_radius_mm)
-                timed = race([candidate], domain, rounds=10).timing(m.label)
+                timed = race([candidate], domain, rounds=10).timing(m.label) if library.timed else before.get(m.label)
             row = {
                 "file": f"{entry.state}.{settings.label}.onnx",
                 "sha256": sha256_of(file),
@@ -451,6 +487,7 @@ OPTIONS = (
     lab.option("lenses", metavar="LENS", nargs="*", help="entries whose name starts so (default: all)"),
     lab.option("--list", metavar="FILE", type=Path, default=_LIST, help="list (default: experiments/models.toml)"),
     lab.option("--restart", old=("--again",), action="store_true", help="make the chosen entries again"),
+    lab.option("--untimed", action="store_true", help="models keep the times of those of their name before"),
     lab.option("--times", action="store_true", help="only time the models that are there (on a quiet machine)"),
     lab.out(lab.MODELS, "folder"),
 )
@@ -458,7 +495,7 @@ OPTIONS = (
 
 def run(args: argparse.Namespace) -> int:
     """Make what is missing; 1 where something failed."""
-    library = read_list(args.list)
+    library = replace(read_list(args.list), timed=not args.untimed)
     args.out.mkdir(parents=True, exist_ok=True)
     entries = chosen(library, args.lenses)
     progress = Progress(quiet=args.quiet)

@@ -234,10 +234,10 @@ def fit_rims(lens: Lens, profile: Profile, unused: Collection[float] = ()) -> Fi
 
 
 def with_fitted_rims(lens: Lens, found: FittedRims) -> Lens:
-    """The lens of a file with fitted rims and rings; its stop stays."""
+    """The lens of a file with fitted rims, which neighbours that touch trim, and rings; its stop stays."""
     pairs = zip(lens.surfaces, found.rims_mm, strict=True)
     radii = [s.semi_diameter_mm if s.stop else round(float(radius), 4) for s, radius in pairs]
-    lens = replace(with_rims(lens, np.array(radii)), rims="photographs")
+    lens = replace(narrowed_rims(with_rims(lens, np.array(radii))), rims="photographs")
     for ring in sorted(found.rings, key=lambda ring: -ring.before):
         lens = with_ring(lens, ring)
     return lens

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 
 from neurolens.analysis.fields import Scene
+from neurolens.base.errors import InputError
 from neurolens.cli import main
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
 from neurolens.photographs.light import open_light, with_rims
 from neurolens.photographs.profiles import FULL_FRAME_MM, Light, Profile
-from neurolens.photographs.rims import Ring, fit_rims, with_fitted_rims, with_ring
+from neurolens.photographs.rims import FittedRims, Ring, fit_rims, with_fitted_rims, with_ring
 from neurolens.readers.lensfile import read_lens
+from neurolens.setting.rims import check_states
 from neurolens.setting.states import set_lens
 
 ROOT = Path(__file__).parents[2]
@@ -86,6 +88,19 @@ def test_light_that_no_rim_can_explain_does_not_cut_the_axis() -> None:
     found = fit_rims(gauss(), replace(profile, light=dark))
     assert axis_light(with_fitted_rims(gauss(), found)) == pytest.approx(axis_light(gauss()), rel=0.02)
     assert found.after_stops[8.0] > 0.3  # and this is said
+
+
+def test_rims_that_would_collide_are_trimmed() -> None:
+    """Elements that all but touch: rims that are found too wide for them make no file that is refused."""
+    lens = gauss()
+    rows = [replace(s, diameter_mm=0.9 * s.diameter_mm) for s in lens.surfaces]
+    rows[1] = replace(rows[1], thickness_mm=0.02)
+    close = replace(lens, surfaces=tuple(rows))
+    wide = np.array([1.4 * s.semi_diameter_mm for s in rows])
+    found = FittedRims(1.4, 1.4, (), wide, {8.0: 0.0}, {8.0: 0.0}, ())
+    with pytest.raises(InputError, match="overlap"):
+        check_states(with_rims(close, wide))
+    check_states(with_fitted_rims(close, found))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,48 @@
+"""The lenses by name: what their files say of the product, against its name and what photographs measured."""
+
+import math
+import re
+
+import pytest
+from shipped import NAMES, focused, tabled
+
+from neurolens.lens.paraxial import first_order
+from neurolens.photographs.verify import DOUBTFUL_PERCENT, verify
+
+NAMED = [name for name in NAMES if tabled(name).believed_to_be]
+_ENGRAVED = re.compile(r"([\d.]+)(?:-[\d.]+)? ?mm.*?[fT]/?([\d.]+)")
+
+
+def test_there_are_as_many_as_promised() -> None:
+    assert len(NAMED) >= 150
+    measured = [name for name in NAMED if tabled(name).measured]
+    assert len(measured) >= 100
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_the_table_has_what_is_engraved_on_the_product(name: str) -> None:
+    """Focal length within 9% (makers round, and photographs give 46 mm to a "40 mm"), the f-number within 10%."""
+    lens, engraved = tabled(name), _ENGRAVED.search(tabled(name).believed_to_be)
+    if engraved is None:
+        pytest.skip(f"no focal length in {lens.believed_to_be!r}")
+    efl_mm = float(first_order(focused(name)).efl_mm)
+    assert efl_mm == pytest.approx(float(engraved[1]), rel=0.09)
+    assert lens.f_number == pytest.approx(float(engraved[2]), rel=0.1)
+    assert re.search(r"\d{3}", lens.source), "a patent has a number"
+
+
+def test_no_lens_contradicts_its_photographs_in_silence() -> None:
+    for lens in map(tabled, NAMED):
+        measured = dict(lens.measured)
+        if measured and measured.get("distortion_percent", 0.0) > DOUBTFUL_PERCENT:
+            assert "disagree" in lens.notes and measured["match"] != "certain", lens.name
+
+
+@pytest.mark.parametrize("name", ["canon_ef_50mm_f1_4_usm", "nikon_nikkor_z_35mm_f1_8_s"])
+def test_the_verdict_of_a_file_is_that_of_the_command(name: str) -> None:
+    pytest.importorskip("lensfunpy")
+    lens = tabled(name)
+    for key, value in verify(lens).measured.items():
+        kept = dict(lens.measured)[key]
+        assert kept == (value if isinstance(value, str) else pytest.approx(value, abs=2e-3)), key
+        assert isinstance(value, str) or math.isfinite(value)
