@@ -143,7 +143,7 @@ def trace_all(folder: Path, item: str, count: int) -> None:
     import torch
 
     tracer = sys.modules[find("trace_differentials").__module__]
-    files = sorted(Path("lenses").glob("*.toml"))
+    files = [file for file in sorted(Path("lenses").glob("*.toml")) if "OpticsDatabase" not in file.read_text()]
     for number, file in enumerate(progress(files, item)):
         if (folder / f"{file.stem}.npz").exists():
             continue

@@ -253,6 +253,6 @@ def run(args: argparse.Namespace) -> None:
         except InputError as error:
             return {"lens": file.stem, "refused": str(error).removeprefix(f"{lab.ROOT}/")}
 
-    files = lab.chosen(sorted(lab.LENSES.glob("*.toml")), lambda f: f.stem, args.only, "inverse")
+    files = lab.chosen(lab.historical(), lambda f: f.stem, args.only, "inverse")
     chosen = {file.stem: file for file in files}
     lab.resume(args, "inverse", chosen, measured, lambda r: r["lens"], page, listed="lenses", again=args.restart)

@@ -47,6 +47,11 @@ def lens_of(name: str | Path, **state: Any) -> Lens:
     return set_lens(read_lens(name if isinstance(name, Path) else LENSES / f"{name}.toml"), **state)
 
 
+def historical() -> list[Path]:
+    """The lens files over which tables range: those of lenses/ but the lenses by name (`named_lenses`)."""
+    return [file for file in sorted(LENSES.glob("*.toml")) if "OpticsDatabase" not in file.read_text(encoding="utf-8")]
+
+
 # ---- Options. --------------------------------------------------------------------------------------------------------
 
 Option = Callable[[argparse.ArgumentParser], object]

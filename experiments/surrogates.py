@@ -29,7 +29,6 @@ from neurolens.base.records import plain, versions
 from neurolens.base.settings import add_options, whole
 from neurolens.cli.arguments import Glasses, check_ids, check_run_folder, named_lens
 from neurolens.graph.scalars import MOST_WEIGHTS
-from neurolens.study.describe import lens_files
 from neurolens.study.experiment import DomainChoice, EvaluationChoice, LensChoice
 from neurolens.study.pages import DASH, Column, Record, number, show
 from neurolens.study.plots import Kinds, trade_plot
@@ -93,7 +92,7 @@ def _lenses(args: argparse.Namespace) -> list[Path]:
     if args.library:
         if args.lenses:
             raise InputError("experiments surrogates", "LENS", args.lenses, "none beside --library")
-        return [Path(file) for file in lens_files(lab.LENSES)]
+        return lab.historical()
     files = args.lenses or [lab.LENSES / f"{name}.toml" for name in DEFAULT_LENSES]
     check_ids(files, "experiments surrogates", "LENS")
     return list(files)

@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> None:
     """Measure and write."""
     lab.quiet_glasses()
     rows = list[lab.Row]()
-    files = lab.chosen(sorted(lab.LENSES.glob("*.toml")), lambda file: file.stem, args.only, "transmittance")
+    files = lab.chosen(lab.historical(), lambda file: file.stem, args.only, "transmittance")
     for file in lab.counted(files, "lenses", args.quiet):
         lens = lab.lens_of(file.stem)
         domain = domain_of(lens, focus_m=(math.inf, math.inf))

@@ -4,12 +4,11 @@ import math
 import re
 
 import pytest
-from shipped import NAMES, focused, tabled
+from shipped import NAMED, focused, tabled
 
 from neurolens.lens.paraxial import first_order
 from neurolens.photographs.verify import DOUBTFUL_PERCENT, verify
 
-NAMED = [name for name in NAMES if tabled(name).believed_to_be]
 _ENGRAVED = re.compile(r"([\d.]+)(?:-[\d.]+)? ?mm.*?[fT]/?([\d.]+)")
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 from lens_models import LENSES
+from shipped import PATHS
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.model import load_model
@@ -84,7 +85,7 @@ def test_promises_of_the_default_domain_hold(name: str, tmp_path: Path) -> None:
 
 def test_defaults_of_the_whole_library() -> None:
     """Every lens: visible light, or the d line; an object in focus that lies before the front surface."""
-    for file in sorted(LENSES.glob("*.toml")):
+    for file in PATHS:
         lens = set_lens(read_lens(file))
         low, high = wavelengths_nm(lens)
         assert 380 <= low <= 400 and 700 <= high <= 780, file.name
