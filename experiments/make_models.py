@@ -201,16 +201,19 @@ _COLUMNS = lab.columns(
 )
 
 
-# Kinds of lens of the library besides round photographic lenses, by words in their names.
+_NAMED = "lenses by name"
+# Kinds of the other lenses besides round photographic ones, by words in their names.
 _OTHERS = {"anamorphic lenses": "anamorphic", "single elements": "edmund|thorlabs"}
 
 
 def errors_by_kind(rows: Sequence[Row], model: str) -> dict[str, list[float]]:
     """RMS errors (um on each lens's own film) of a model, by kind of lens; each lens once, as its file has it."""
-    found: dict[str, list[float]] = {"round photographic lenses": [], **{kind: [] for kind in _OTHERS}}
+    found: dict[str, list[float]] = {"round photographic lenses": [], **{kind: [] for kind in _OTHERS}, _NAMED: []}
+    named = {file.stem for file in lab.LENSES.glob("*.toml")} - {file.stem for file in lab.historical()}
     for row in rows:
         if row["model"] == model and row["rms_um"] is not None and row["entry"] == Path(row["lens_file"]).stem:
-            kinds = [kind for kind, words in _OTHERS.items() if re.search(words, row["entry"])]
+            kinds = [_NAMED] if row["entry"] in named else []
+            kinds += [kind for kind, words in _OTHERS.items() if re.search(words, row["entry"])]
             found[kinds[0] if kinds else "round photographic lenses"].append(row["rms_um"])
     return found
 
