@@ -28,12 +28,11 @@ from some_tasks import count
 from neurolens import __version__
 from neurolens.base import cluster as cluster_module
 from neurolens.base import tasks as tasks_module
-from neurolens.base.cluster import Dask
+from neurolens.base.cluster import Dask, packed, unpack, with_paths
 from neurolens.base.errors import NeurolensError
 from neurolens.base.files import noted_files, read_bytes
 from neurolens.base.lensname import Named
 from neurolens.base.tasks import Failed, Here, Processes, Shared, run_each
-from neurolens.base.travel import packed, unpack, with_paths
 from neurolens.cli import main
 from neurolens.frames.frame import Frame
 from neurolens.render.pictures import read_channels

@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from neurolens import __version__
-from neurolens.base.cluster import Dask
+from neurolens.base.cluster import Dask, run_remotely
 from neurolens.base.errors import NeurolensError, one_line
 from neurolens.base.files import fingerprint_of, sha256_of
 from neurolens.base.lensname import lens_id_of
 from neurolens.base.progress import Progress
 from neurolens.base.records import NOISY, noisy
 from neurolens.base.settings import setting, whole
-from neurolens.base.travel import run_remotely
 from neurolens.cli.arguments import (
     Glasses,
     Reporting,
