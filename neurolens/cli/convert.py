@@ -1,4 +1,4 @@
-"""`neurolens convert FILE -o lens.toml`: a lens file of another program in our own format; and `neurolens glass NAME`."""
+"""`neurolens convert FILE -o lens.toml`: a lens file of another program in our own format; and `neurolens glass`."""
 
 from __future__ import annotations
 
