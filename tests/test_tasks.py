@@ -362,7 +362,7 @@ def read_model(file: Path) -> tuple[bytes, dict[str, Any]]:
 def test_records_of_a_survey_are_those_of_one_machine(
     cluster: str, lenses: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("neurolens.cli.survey.Processes", lambda *_: Here())
+    monkeypatch.setattr("neurolens.cli.train.Processes", lambda *_: Here())
     found = []
     for place, more in (("here", ()), ("there", ("--dask", cluster))):
         out = tmp_path / place

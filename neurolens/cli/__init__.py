@@ -62,8 +62,7 @@ def build_parser() -> Parser:
     from neurolens.cli.projection import Projection
     from neurolens.cli.render import Demo, Render
     from neurolens.cli.stmap import StMap
-    from neurolens.cli.survey import Survey
-    from neurolens.cli.train import Train
+    from neurolens.cli.train import Survey, Train
     from neurolens.cli.view import View
 
     groups: dict[str, tuple[type[Command], ...]] = {
