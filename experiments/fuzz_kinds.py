@@ -365,7 +365,7 @@ def shorten() -> None:
     from neurolens.base.tasks import Here
     from neurolens.blender.pack import Form
     from neurolens.cameras.onnxlens import load_model
-    from neurolens.cli import blender_lenses, flare_run, survey
+    from neurolens.cli import blender_lenses, flare_run, train
 
     def form_of(file: Path, **_: Any) -> Form:
         card = load_model(file).card
@@ -383,7 +383,7 @@ def shorten() -> None:
         return fields[key]
 
     flare_run.Shots._field = field  # type: ignore[assignment,method-assign]
-    survey.Processes = lambda *_: Here()  # type: ignore[assignment,misc]
+    train.Processes = lambda *_: Here()  # type: ignore[assignment,misc]
     blender_lenses.form_of = form_of
 
 

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import settings
 
 from neurolens import cli
+from neurolens.graph import compiler
 
 # A ball in white light.
 SCENE = """\
@@ -58,6 +59,7 @@ def quick_races() -> Iterator[None]:
     judges a clock."""
     flags = ("-std=c99", "-O1", "-march=native")
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compiler, "FLAGS", tuple(flag.replace("-O3", "-O1") for flag in compiler.FLAGS))
         patch.setattr("neurolens.study.speed.CompiledSource.__init__.__defaults__", (flags,))
         patch.setattr("neurolens.study.speed.program_candidate.__defaults__", (None, flags))
         patch.setattr(cli.main, "__defaults__", (None, cache(cli.build_parser)))

@@ -28,12 +28,11 @@ from some_tasks import count
 from neurolens import __version__
 from neurolens.base import cluster as cluster_module
 from neurolens.base import tasks as tasks_module
-from neurolens.base.cluster import Dask
+from neurolens.base.cluster import Dask, packed, unpack, with_paths
 from neurolens.base.errors import NeurolensError
 from neurolens.base.files import noted_files, read_bytes
 from neurolens.base.lensname import Named
 from neurolens.base.tasks import Failed, Here, Processes, Shared, run_each
-from neurolens.base.travel import packed, unpack, with_paths
 from neurolens.cli import main
 from neurolens.frames.frame import Frame
 from neurolens.render.pictures import read_channels
@@ -363,7 +362,7 @@ def read_model(file: Path) -> tuple[bytes, dict[str, Any]]:
 def test_records_of_a_survey_are_those_of_one_machine(
     cluster: str, lenses: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("neurolens.cli.survey.Processes", lambda *_: Here())
+    monkeypatch.setattr("neurolens.cli.train.Processes", lambda *_: Here())
     found = []
     for place, more in (("here", ()), ("there", ("--dask", cluster))):
         out = tmp_path / place

@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from neurolens.analysis.fields import ChiefRays, Scene, on_plane
-from neurolens.analysis.pupil_nodes import LitPart, lit_nodes, lit_part
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
+from neurolens.setting.pupil_nodes import LitPart, lit_nodes, lit_part
 from neurolens.trace.aiming import without_rims
 from neurolens.trace.rays import trace
 from neurolens.trace.surfaces import Rays, media

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,13 +12,12 @@ from torch import Tensor
 
 from neurolens.analysis.bundles import bundle, hexapolar, points
 from neurolens.analysis.fields import Array, Result, Scene, on_plane
-from neurolens.analysis.pupil_nodes import LitPart, converged, lit_nodes, lit_part
 from neurolens.base.errors import InputError
 from neurolens.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM, LINE_G_NM
 from neurolens.lens.paraxial import PathOfRay, System, system_of
 from neurolens.lens.prescription import Lens, Surface
-from neurolens.setting.pupils import camera_rays, pupil_plane_z_mm
-from neurolens.trace.rays import passing
+from neurolens.setting.pupil_nodes import FilmLight, converged
+from neurolens.setting.pupils import pupil_plane_z_mm
 from neurolens.trace.surfaces import Rays
 
 # Share of the stop's radius that stands for the paraxial ray: its error grows with the square.
@@ -227,7 +225,7 @@ def illumination(scene: Scene, *, fields: int = 21) -> Illumination:
     angles, nm = np.linspace(0, scene.edge.field_deg, fields), scene.lens.reference_nm
     rays = bundle(scene.open, angles.tolist(), [nm], hexapolar(6))
     pupil = on_plane(Rays(*(c[:, 0] for c in rays.film)), pupil_plane_z_mm(scene.lens))
-    both = [_FilmLight(scene, lens, rays.chief_height_mm, pupil) for lens in (scene.open.traced, scene.lens)]
+    both = [_film_light(scene, lens, rays.chief_height_mm, pupil) for lens in (scene.open.traced, scene.lens)]
 
     def shares(light: list[Array]) -> dict[str, tuple[Array, Array | float]]:
         whole, seen = light
@@ -235,54 +233,33 @@ def illumination(scene: Scene, *, fields: int = 21) -> Illumination:
             found = seen / (seen[0] or np.nan), whole / (whole[0] or np.nan), seen / whole
         return {k: (v, 1.0) for k, v in zip(("relative", "unvignetted", "passed"), found, strict=True)}
 
-    light, spread = converged(lambda level, some: [b.only(some).sums(level) for b in both], shares, fields)
+    height = rays.chief_height_mm.numpy()
+    known = np.where(np.isfinite(height), 1.0, np.nan)
+    light, spread = converged(
+        lambda level, some: [known[some] * b.only(some).sums(level) for b in both], shares, fields
+    )
     cos4 = np.where(angles < 90, np.cos(np.radians(angles)), 0.0) ** 4
     relative, unvignetted, passed = (values for values, _ in shares(light).values())
-    height = rays.chief_height_mm.numpy()
     return Illumination(nm, angles, height, relative, unvignetted, passed, cos4, spread)
 
 
-class _FilmLight:
-    """Light that film points at F heights see through a lens, on the plane of the pupil."""
-
-    def __init__(self, scene: Scene, lens: Lens, height_mm: Tensor, pupil: Rays) -> None:
-        """`pupil`: rays [F, P] that fill the pupil of each film point, on its plane."""
-        self.scene, self.lens, self.height_mm = scene, lens, height_mm
-        self.plane_z_mm = pupil_plane_z_mm(scene.lens)
-        # Where no ray meets the edge of the stop, the rear surface bounds the light, as seen from the film point.
-        zero = torch.zeros_like(height_mm)
-        film = torch.stack((-height_mm, zero) if scene.axis == "x" else (zero, -height_mm), 1)
-        rear_mm, rear_z_mm = scene.lens.surfaces[-1].semi_diameter_mm, float(scene.lens.vertices_mm[-2])
-        farther = (scene.film_z_mm - self.plane_z_mm) / (scene.film_z_mm - rear_z_mm)
-        rear = [film + (edge - film) * farther for edge in (-rear_mm, rear_mm)]
-        places = torch.stack([pupil.x, pupil.y], 2)
-        sound = torch.isfinite(places)
-        low = torch.where(sound, places, torch.minimum(*rear)[:, None]).amin(1)
-        high = torch.where(sound, places, torch.maximum(*rear)[:, None]).amax(1)
-        margin = _MARGIN * (high - low)
-        near = torch.where(sound, places, 0.0).sum(1) / sound.sum(1).clamp_min(1)
-        self.part = lit_part(self._passes, low - margin, high + margin, near)
-
-    def only(self, fields: list[int]) -> _FilmLight:
-        """The same for some of the film points."""
-        found = copy(self)
-        found.height_mm, found.part = self.height_mm[fields], LitPart(*(c[fields] for c in self.part))
-        return found
-
-    def _rays(self, u: Tensor, v: Tensor) -> Rays:
-        h, zero = (-self.height_mm)[:, None].expand(u.shape).reshape(-1), torch.zeros(u.numel(), dtype=torch.float64)
-        x, y = (h, zero) if self.scene.axis == "x" else (zero, h)
-        return camera_rays(x, y, self.scene.film_z_mm, u.reshape(-1), v.reshape(-1), self.plane_z_mm)
-
-    def _passes(self, u: Tensor, v: Tensor) -> Tensor:
-        return passing(self.lens, self._rays(u, v), self.scene.lens.reference_nm).reshape(u.shape)
-
-    def sums(self, level: int) -> Array:
-        """Integral [F] of cos^4 over what is lit, NaN for a film point without a chief ray."""
-        nodes = lit_nodes(self._passes, self.part, level)
-        cos4 = self._rays(*nodes[:2]).dz.reshape(nodes.u.shape) ** 4
-        light = (nodes.area * cos4 * self._passes(*nodes[:2])).sum(1)
-        return np.asarray(light.where(torch.isfinite(self.height_mm), torch.nan).numpy())
+def _film_light(scene: Scene, lens: Lens, height_mm: Tensor, pupil: Rays) -> FilmLight:
+    """Light through a lens on the plane of the pupil; `pupil`: rays [F, P] that fill it for each film point, there."""
+    plane_z_mm = pupil_plane_z_mm(scene.lens)
+    # Where no ray meets the edge of the stop, the rear surface bounds the light, as seen from the film point.
+    zero = torch.zeros_like(height_mm)
+    x, y = (-height_mm, zero) if scene.axis == "x" else (zero, -height_mm)
+    film = torch.stack((x, y), 1)
+    rear_mm, rear_z_mm = scene.lens.surfaces[-1].semi_diameter_mm, float(scene.lens.vertices_mm[-2])
+    farther = (scene.film_z_mm - plane_z_mm) / (scene.film_z_mm - rear_z_mm)
+    rear = [film + (edge - film) * farther for edge in (-rear_mm, rear_mm)]
+    places = torch.stack([pupil.x, pupil.y], 2)
+    sound = torch.isfinite(places)
+    low = torch.where(sound, places, torch.minimum(*rear)[:, None]).amin(1)
+    high = torch.where(sound, places, torch.maximum(*rear)[:, None]).amax(1)
+    margin = _MARGIN * (high - low)
+    near = torch.where(sound, places, 0.0).sum(1) / sound.sum(1).clamp_min(1)
+    return FilmLight(lens, (x, y), scene.film_z_mm, plane_z_mm, low - margin, high + margin, near)
 
 
 SUMS = ("S1 spherical", "S2 coma", "S3 astigmatism", "S4 Petzval", "S5 distortion", "C1 axial colour", "C2 lateral")

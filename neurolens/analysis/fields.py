@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neurolens.base.errors import InputError
+from neurolens.base.records import plain
 from neurolens.lens.glass import LINE_C_NM, LINE_D_NM, LINE_F_NM
 from neurolens.lens.paraxial import FirstOrder, first_order, is_pinhole
 from neurolens.lens.prescription import Lens
@@ -35,17 +36,8 @@ class Result:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain lists, numbers and strings by field name; NaN and infinities stay floats."""
-        return {key: _plain(value) for key, value in asdict(self).items()}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    return value
+        found: dict[str, Any] = plain(asdict(self), strict=False)
+        return found
 
 
 DEFAULT_NM = (LINE_D_NM, LINE_F_NM, LINE_C_NM)

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from neurolens.analysis.bundles import Bundle, Filled, bundle, fan, hexapolar
 from neurolens.analysis.fields import Array, Result, Scene
-from neurolens.analysis.pupil_nodes import LEVELS, converged
 from neurolens.lens.paraxial import is_pinhole
+from neurolens.setting.pupil_nodes import LEVELS, converged
 
 _RINGS = 16
 _SHIFTS = 21

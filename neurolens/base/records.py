@@ -116,18 +116,18 @@ def write_results(path: str | Path, results: Results) -> None:
     write_json(path, {"schema_version": SCHEMA_VERSION, **plain(asdict(results))})
 
 
-def plain(value: Any) -> Any:
+def plain(value: Any, strict: bool = True) -> Any:
     """`value` with only what JSON knows: scalars and arrays of numpy and torch as numbers and lists, paths as text.
 
-    Infinity is the text "infinity" or "-infinity", NaN is null.
+    Infinity is the text "infinity" or "-infinity", NaN is null; unless `strict` both stay floats.
     """
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): plain(item, strict) for key, item in value.items()}
     if hasattr(value, "tolist"):
-        return plain(value.tolist())
+        return plain(value.tolist(), strict)
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
+        return [plain(item, strict) for item in value]
+    if strict and isinstance(value, float) and not math.isfinite(value):
         return None if math.isnan(value) else "infinity" if value > 0 else "-infinity"
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 

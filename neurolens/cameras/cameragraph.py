@@ -29,7 +29,7 @@ UNIT_SLACK = 1e-3
 _NO_AREA = 1e-30
 # Outputs of a lens's graph with derivatives by the film point.
 D_FILM = tuple(derivative("scene_ray", by) for by in FILM_X_Y)
-_METRES = [1e-3, 1e-3, 1e-3, 1.0, 1.0, 1.0]
+METRES = [1e-3, 1e-3, 1e-3, 1.0, 1.0, 1.0]
 _AHEAD = np.array([[0], [0], [0], [0], [0], [-1]], np.float32)
 
 
@@ -83,11 +83,11 @@ def weight_graph(
     cos2 = 1.0 / (1.0 + g.square((pupil - film) * per_distance))
     weight = through.maximum(0.0) * area * cos2 * cos2 * scale
     place = g.concat(g.constant([0.0, 0.0]), film_z * -1e-3, g.constant([0.0, 0.0, 0.0]))
-    g.outputs["ray"] = ray * _METRES + place
+    g.outputs["ray"] = ray * METRES + place
     g.outputs["weight"] = g.select(passed, weight, 0.0)
     g.outputs["status"] = g.select(lit, status, float(st.OUTSIDE_DOMAIN)).whole()
     for name in derivatives:
-        g.outputs[name] = g.input(name, 6) * _METRES
+        g.outputs[name] = g.input(name, 6) * METRES
     return g
 
 

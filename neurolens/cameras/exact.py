@@ -14,7 +14,7 @@ import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from neurolens.base import status as st
 from neurolens.base.files import atomic_path, cache_folder, fingerprint_of, keep_newest, seal, sealed_bytes, sha256_of
 from neurolens.base.progress import Progress
-from neurolens.cameras.cameragraph import LensGraph
+from neurolens.cameras.cameragraph import D_FILM, METRES, LensGraph
 from neurolens.cameras.contract import FilmPoints, FloatArray
 from neurolens.cameras.front_aim import FrontAim, front_aim
 from neurolens.cameras.lenscamera import GraphRun, Kind, LensCamera, LensFilm, Runtime, SceneRays, axial_transmittance
@@ -33,6 +33,8 @@ from neurolens.cameras.pupil_outline import PupilOutline, wavelength_between
 from neurolens.cameras.pupil_search import COARSE, COARSE_TIGHT, FINE, Detail, PupilTable, outline_of
 from neurolens.cameras.sampling import arrived, lens_state
 from neurolens.graph.interpret import evaluate
+from neurolens.graph.ir import Graph
+from neurolens.graph.loworder import with_film_derivatives
 from neurolens.lens.film_plane import PupilBounds
 from neurolens.lens.glass import LINE_D_NM, index_of
 from neurolens.lens.paraxial import chief_reach_mm, first_order
@@ -42,7 +44,7 @@ from neurolens.setting.focusing import at_infinity
 from neurolens.setting.pupils import camera_rays, passes_at_any_azimuth, pupil_bounds, pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.surrogates.assemble import SCALARS, Form
-from neurolens.trace.rays import Rays, film_derivatives, trace, trace_differentials
+from neurolens.trace.rays import Rays, trace
 from neurolens.trace.tracegraph import exact_graph
 
 
@@ -115,10 +117,24 @@ class ExactCamera(LensCamera):
     def _run(self, kind: Kind) -> GraphRun:
         if self.runtime != "trace":
             return super()._run(kind)
-        if kind == "companion":
-            return self._companion
-        scene = self._with_differentials if kind == "differentials" else None
-        return lambda rays: self.film.outputs(rays["film_mm"], rays["square"], rays["wavelength_nm"][0], scene)
+        return {"companion": self._companion, "differentials": self._moved}.get(kind, self._traced)
+
+    def _traced(self, rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
+        return self.film.outputs(rays["film_mm"], rays["square"], rays["wavelength_nm"][0])
+
+    def _moved(self, rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
+        """Traced rays with the derivatives of the lens's graph, in float64."""
+        found = self._traced(rays)
+        through = np.concatenate([rays["film_mm"], found["pupil_mm"], rays["wavelength_nm"]]).astype(np.float64)
+        call = {name: np.array([[value]]) for name, value in self._of_the_lens().items()}
+        with np.errstate(all="ignore"):  # of rays that do not pass
+            moved = evaluate(self._moves, {"rays": through} | call)
+        d_film = np.stack([moved[name] for name in D_FILM], 1) * np.array(METRES)[:, None, None]
+        return found | {"d_film": np.nan_to_num(d_film, posinf=0.0, neginf=0.0).astype(np.float32)}
+
+    @cached_property
+    def _moves(self) -> Graph:
+        return with_film_derivatives(self.lens_graph().graph)
 
     def _companion(self, rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
         assert self._shift is not None
@@ -182,15 +198,6 @@ class ExactCamera(LensCamera):
         assert done.transmittance is not None
         scene = torch.stack(list(done.rays)).to(torch.float32).numpy()
         return SceneRays(scene, done.transmittance.to(torch.float32).numpy(), done.status.numpy())
-
-    def _with_differentials(self, film: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> SceneRays:
-        fx, fy, px, py, wavelength = _tensors(torch.float64, *film, *pupil, wavelength_nm)
-        rays = camera_rays(fx, fy, self._film_z_mm, px, py, self._pupil_z_mm)
-        gap = self._film_z_mm - self._pupil_z_mm
-        distance = torch.sqrt((fx - px) ** 2 + (fy - py) ** 2 + gap * gap)
-        moves = trace_differentials(self.lens, rays, film_derivatives(rays, distance), wavelength).derivatives
-        d_film = torch.stack([torch.stack(list(m)) for m in moves], 1).to(torch.float32).numpy()
-        return self._scene(film, pupil, wavelength_nm)._replace(d_film=d_film)
 
     def _passes(self, film: FloatArray, pupil: FloatArray, wavelength_nm: float) -> NDArray[np.bool_]:
         """Test whether light passes from film points (r, 0) through pupil points; see `passes_at_any_azimuth`."""

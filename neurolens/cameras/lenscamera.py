@@ -53,15 +53,11 @@ _QUADRATURE = 256
 
 
 class SceneRays(NamedTuple):
-    """Scene-side rays: scene_ray [6, N] (x, y, z mm, unit direction; lens frame), transmittance [N], status [N].
-
-    `d_film`: derivatives [6, 2, N] of scene_ray by the film point's x and y (per mm), where they were asked for.
-    """
+    """Scene-side rays: scene_ray [6, N] (x, y, z mm, unit direction; lens frame), transmittance [N], status [N]."""
 
     scene_ray: FloatArray
     transmittance: FloatArray
     status: NDArray[np.int32]
-    d_film: FloatArray | None = None
 
 
 # Film points [2, N] mm, pupil points [2, N] mm and wavelengths [N] nm to scene-side rays.
@@ -96,18 +92,12 @@ class LensFilm:
         """Rays for film points [2, N] in mm, random numbers [2, N] in [0, 1) and wavelengths [N] in nm."""
         return camera_rays(self.outputs(film_mm, square, wavelength_nm))
 
-    def outputs(
-        self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray, scene: SceneFunction | None = None
-    ) -> dict[str, NDArray[Any]]:
-        """The outputs of the camera's graph, with `pupil_mm` and `transmittance`, for the inputs of `sample`.
-
-        `scene` stands in for the lens's own function, for one that gives more (`SceneRays.d_film`).
-        """
-        scene = scene or self.scene
+    def outputs(self, film_mm: FloatArray, square: FloatArray, wavelength_nm: FloatArray) -> dict[str, NDArray[Any]]:
+        """The outputs of the camera's graph, with `pupil_mm` and `transmittance`, for the inputs of `sample`."""
         pupil, area = self.outline.sample(film_mm, square, wavelength_nm)
         lit = (area > 0) & is_light(wavelength_nm)
         some = np.flatnonzero(lit)  # a film point that nothing reaches is dark: no ray is traced
-        found = self._weighted(scene, film_mm[:, some], pupil[:, some], area[some], wavelength_nm[some])
+        found = self._weighted(film_mm[:, some], pupil[:, some], area[some], wavelength_nm[some])
         whole = {name: np.zeros((*part.shape[:-1], lit.size), part.dtype) for name, part in found.items()}
         whole["status"][:] = st.OUTSIDE_DOMAIN
         for name, part in found.items():
@@ -115,18 +105,14 @@ class LensFilm:
         return whole | {"pupil_mm": pupil}
 
     def _weighted(
-        self, scene: SceneFunction, film: FloatArray, pupil: FloatArray, area: FloatArray, wavelength_nm: FloatArray
+        self, film: FloatArray, pupil: FloatArray, area: FloatArray, wavelength_nm: FloatArray
     ) -> dict[str, NDArray[Any]]:
         """The input of `camera_rays` for lit film points [2, N] through pupil points [2, N], densities 1 / area [N]."""
-        out = scene(film, pupil, wavelength_nm)
+        out = self.scene(film, pupil, wavelength_nm)
         given = {"film_mm": film, "pupil_mm": pupil, "area_mm2": area[None], "scene_ray": out.scene_ray}
         given |= {"transmittance": out.transmittance[None], "lens_status": out.status[None].astype(np.float32)}
-        given |= {} if out.d_film is None else dict(zip(D_FILM, np.moveaxis(out.d_film, 1, 0), strict=True))
         given |= {name: np.array([[value]], np.float32) for name, value in self.numbers.items()}
-        found = evaluate(weight_graph(() if out.d_film is None else D_FILM), given)
-        found["transmittance"] = out.transmittance[None]
-        moves = [found.pop(name) for name in D_FILM if name in found]
-        return found | ({"d_film": np.stack(moves, 1)} if moves else {})
+        return evaluate(weight_graph(), given) | {"transmittance": out.transmittance[None]}
 
     @property
     def numbers(self) -> dict[str, float]:

@@ -26,85 +26,12 @@ from numpy.typing import NDArray
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints, FloatArray, RayDifferentials, towards
-from neurolens.cameras.sampling import ahead, arrived, ideal_state, positive, sound
+from neurolens.cameras.contract import MANY_RAYS_A_CALL, CameraRays, FilmPoints, FloatArray, RayDifferentials
+from neurolens.cameras.sampling import arrived, ideal_state, positive, sound
 from neurolens.lens.shot import check_film
 
 Array = NDArray[Any]
 Function = Callable[[Array], Array]
-
-
-class Pinhole:
-    """A hole at distance `focal_length_mm` from the film.
-
-    The hole stands for a lens of the nominal f-number, E = pi L / (4 N^2) on the axis, so the weight is cos^4 of the
-    angle to the axis, 1 on the axis; `f_number` is kept in the settings and changes no ray.
-
-    Args:
-        focal_length_mm: distance from hole to film.
-        film_mm: width and height of the film.
-        f_number: nominal.
-
-    Raises:
-        InputError: a length or the f-number is not a finite number above 0.
-    """
-
-    name = "pinhole"
-    dispersive = False
-    achromatic = True
-    rays_a_call = MANY_RAYS_A_CALL
-    wavelength_nm: tuple[float, float] | None = None
-
-    def __init__(
-        self, focal_length_mm: float, film_mm: tuple[float, float] = (36.0, 24.0), f_number: float = 8.0
-    ) -> None:
-        self.focal_length_mm = positive("focal_length_mm", focal_length_mm)
-        self.film_mm = check_film(film_mm)
-        self.f_number = positive("f_number", f_number)
-        self.settings: dict[str, Any] = {
-            "camera": self.name,
-            "efl_mm": self.focal_length_mm,
-            "f_number": self.f_number,
-            "focus_m": None,
-            "film_mm": list(self.film_mm),
-            "lens_state": ideal_state(self.focal_length_mm, f_number, self.focal_length_mm),
-        }
-
-    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Rays through the hole for film points [2, N] in mm; pupil and wavelength change nothing."""
-        count = film_mm.shape[1]
-        direction = np.empty((3, count), np.float32)
-        np.divide(film_mm, np.float32(-self.focal_length_mm), out=direction[:2])
-        direction[2] = -1.0
-        with np.errstate(over="ignore", invalid="ignore"):
-            cos2 = 1.0 / (1.0 + direction[0] ** 2 + direction[1] ** 2)
-            direction *= np.sqrt(cos2)
-        origin = np.zeros((3, count), np.float32)
-        origin[2] = -1e-3 * self.focal_length_mm
-        rays = CameraRays(origin, direction, (cos2 * cos2).astype(np.float32), np.zeros(count, np.int32))
-        return sound(rays, cos2, pupil, wavelength_nm)
-
-    def sample_differentials(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
-        """Sample rays as `sample` does, with their differentials; all rays start at the hole."""
-        rays = self.sample(film_mm, pupil, wavelength_nm)
-        slope = np.zeros((3, 2, film_mm.shape[1]), np.float32)
-        slope[0, 0] = slope[1, 1] = -1 / self.focal_length_mm
-        return replace(rays, differentials=towards(rays.direction / -rays.direction[2], slope, rays.origin_m))
-
-    def natural(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FloatArray:
-        """The whole weight: a point has no vignetting but the cosine's."""
-        return self.sample(film_mm, pupil, wavelength_nm).weight
-
-    def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
-        """Film points of scene points [3, N] in m through the hole; pupil and wavelength change nothing."""
-        origin = np.array([[0.0], [0.0], [-1e-3 * self.focal_length_mm]]) + np.zeros((1, point_m.shape[1]))
-        with np.errstate(all="ignore"):
-            way = point_m - origin
-            squared = np.einsum("in,in->n", way, way)
-            film = self.focal_length_mm * way[:2] / way[2]
-            # A' / E0 of a small hole is the square of its distance from the film.
-            weight = self.focal_length_mm**2 * -way[2] / squared**1.5
-        return arrived(film, origin, point_m, weight, ahead(-way[2]), wavelength_nm)
 
 
 @dataclass(frozen=True)
@@ -146,6 +73,9 @@ PROJECTIONS = {
         np.arcsin, lambda rho: 1 / np.sqrt((1 - rho) * (1 + rho)), np.sin, np.ones_like, 1.0, flat=True
     ),
 }
+_RECTILINEAR = Projection(
+    np.arctan, lambda rho: 1 / (1 + rho * rho), np.tan, lambda theta: np.cos(theta) ** 4, math.inf, flat=True
+)
 
 
 class Fisheye:
@@ -179,14 +109,17 @@ class Fisheye:
             raise InputError("camera", "projection", projection, f"one of: {', '.join(PROJECTIONS)}")
         self.name = f"fisheye-{projection}"
         self.projection = PROJECTIONS[projection]
-        self.focal_length_mm, self.film_mm = positive("focal_length_mm", focal_length_mm), check_film(film_mm)
         self.widest_rad = check_field(projection, field_deg)
+        self._set(focal_length_mm, film_mm, f_number, field_deg=2 * math.degrees(self.widest_rad))
+
+    def _set(self, focal_length_mm: float, film_mm: tuple[float, float], f_number: float, **more: float) -> None:
+        self.focal_length_mm, self.film_mm = positive("focal_length_mm", focal_length_mm), check_film(film_mm)
         self.settings: dict[str, Any] = {
             "camera": self.name,
             "efl_mm": self.focal_length_mm,
             "f_number": positive("f_number", f_number),
             "focus_m": None,
-            "field_deg": 2 * math.degrees(self.widest_rad),
+            **more,
             "film_mm": list(self.film_mm),
             "lens_state": ideal_state(self.focal_length_mm, f_number, self.focal_length_mm),
         }
@@ -235,9 +168,10 @@ class Fisheye:
             film = -self.focal_length_mm * self.projection.radius(theta) * way[:2] / np.where(side > 0, side, 1)
             # A' / E0 of a small hole is the square of its distance from the film, where it faces the ray.
             weight = self.focal_length_mm**2 / squared * (np.cos(theta) if self.projection.flat else 1)
-        out = np.where(theta > self.widest_rad, st.blocked(0, st.MISSED), st.OUTSIDE_DOMAIN)
+        beyond = (theta > self.widest_rad) | (self.projection.flat & (way[2] >= 0))
+        out = np.where(beyond, st.blocked(0, st.MISSED), st.OUTSIDE_DOMAIN)
         # Straight behind, the projection has no direction to lay the point in.
-        lit = (theta <= self.widest_rad) & (self.projection.radius(theta) < self.projection.end) & (theta < math.pi)
+        lit = ~beyond & (self.projection.radius(theta) < self.projection.end) & (theta < math.pi)
         status = np.where(lit, st.PASSED, out).astype(np.int32)
         return arrived(film, origin, point_m, weight, status, wavelength_nm)
 
@@ -250,6 +184,44 @@ class Fisheye:
         rho = np.where(lit, rho, np.float32(0))
         towards = np.where(lit, scaled, np.float32(0)) / np.where(rho > 0, rho, np.float32(1))
         return rho.astype(np.float32, copy=False), towards.astype(np.float32, copy=False), np.asarray(lit)
+
+
+class Pinhole(Fisheye):
+    """A hole at distance `focal_length_mm` from the film.
+
+    The hole stands for a lens of the nominal f-number, E = pi L / (4 N^2) on the axis, so the weight is cos^4 of the
+    angle to the axis, 1 on the axis; `f_number` is kept in the settings and changes no ray.
+
+    Args:
+        focal_length_mm: distance from hole to film.
+        film_mm: width and height of the film.
+        f_number: nominal.
+
+    Raises:
+        InputError: a length or the f-number is not a finite number above 0.
+    """
+
+    rays_a_call = MANY_RAYS_A_CALL
+
+    def __init__(
+        self, focal_length_mm: float, film_mm: tuple[float, float] = (36.0, 24.0), f_number: float = 8.0
+    ) -> None:
+        self.name, self.projection, self.widest_rad = "pinhole", _RECTILINEAR, math.pi / 2
+        self._set(focal_length_mm, film_mm, f_number)
+
+    def sample(self, film_mm: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> CameraRays:
+        """Rays through the hole, without the angles that the other projections need."""
+        count = film_mm.shape[1]
+        direction = np.empty((3, count), np.float32)
+        np.divide(film_mm, np.float32(-self.focal_length_mm), out=direction[:2])
+        direction[2] = -1.0
+        with np.errstate(over="ignore", invalid="ignore"):
+            cos2 = 1.0 / (1.0 + direction[0] ** 2 + direction[1] ** 2)
+            direction *= np.sqrt(cos2)
+        origin = np.zeros((3, count), np.float32)
+        origin[2] = -1e-3 * self.focal_length_mm
+        rays = CameraRays(origin, direction, (cos2 * cos2).astype(np.float32), np.zeros(count, np.int32))
+        return sound(rays, cos2, pupil, wavelength_nm)
 
 
 def check_field(projection: str, field_deg: float | None) -> float:

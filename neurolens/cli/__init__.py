@@ -49,24 +49,20 @@ def build_parser() -> Parser:
     """
     from neurolens.cli.analyse import Analyse
     from neurolens.cli.blender import Blender
-    from neurolens.cli.convert import Convert
-    from neurolens.cli.demo import Demo
+    from neurolens.cli.convert import Convert, Glass
     from neurolens.cli.evaluate import Evaluate
     from neurolens.cli.export import Export
     from neurolens.cli.flare import Flare
-    from neurolens.cli.glass import Glass
     from neurolens.cli.lens import Lens
     from neurolens.cli.library import Library
     from neurolens.cli.mitsuba import Mitsuba
     from neurolens.cli.models import Models
+    from neurolens.cli.photographs import Rims, Verify
     from neurolens.cli.plan import Plan
     from neurolens.cli.projection import Projection
-    from neurolens.cli.render import Render
-    from neurolens.cli.rims import Rims
+    from neurolens.cli.render import Demo, Render
     from neurolens.cli.stmap import StMap
-    from neurolens.cli.survey import Survey
-    from neurolens.cli.train import Train
-    from neurolens.cli.verify import Verify
+    from neurolens.cli.train import Survey, Train
     from neurolens.cli.view import View
 
     groups: dict[str, tuple[type[Command], ...]] = {

@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurolens import __version__
+from neurolens.base.cluster import absolute, packed, run_with_files, unpack
 from neurolens.base.errors import NeurolensError
 from neurolens.base.files import noted_files
 from neurolens.base.progress import Progress
 from neurolens.base.tasks import Failed, Shared, run_each
-from neurolens.base.travel import absolute, packed, run_with_files, unpack
 from neurolens.frames.frame import Frame, Prepared, flare_choice, prepare, render_frame
 from neurolens.render.film import digest
 from neurolens.render.tiles import read_tile, tile_path, write_picture

@@ -18,8 +18,7 @@ import numpy as np
 from neurolens.analysis.fields import Result
 from neurolens.base.errors import InputError
 from neurolens.lens.prescription import Configuration, Lens, Surface
-from neurolens.photographs.compare import Array, at_focal_length, near_f8, stop_for
-from neurolens.photographs.light import open_light, with_rims
+from neurolens.photographs.compare import Array, at_focal_length, near_f8, open_light, stop_for, with_rims
 from neurolens.photographs.profiles import Light, Profile
 from neurolens.setting.pupils import rear_opening_mm
 from neurolens.setting.rims import narrowed_rims

@@ -18,7 +18,8 @@ from neurolens.base.errors import InputError
 from neurolens.lens.paraxial import FirstOrder, first_order
 from neurolens.lens.prescription import Configuration, Lens
 from neurolens.setting.focusing import axial_rays, best_focus_z_mm
-from neurolens.setting.pupils import camera_rays, pupil_plane_z_mm
+from neurolens.setting.pupil_nodes import FilmLight
+from neurolens.setting.pupils import pupil_plane_z_mm
 from neurolens.setting.rims import end_mm
 from neurolens.setting.states import in_state
 from neurolens.trace.aiming import aim_at_stop
@@ -205,7 +206,7 @@ def _corner(lens: Lens) -> Iterator[Check]:
     yield Check("illumination of the corner", share, None, doubt)
 
 
-_FAN, _SEARCH = 1001, 64
+_FAN = 1001
 _PUPIL = 3.0  # paraxial exit pupils within which the pupil of every film point lies
 
 
@@ -270,39 +271,12 @@ def corner_illumination(lens: Lens, radius_mm: float) -> float:
     The corner of an anamorphic lens lies halfway between its planes of symmetry.
     """
     across = math.sqrt(0.5) if lens.anamorphic else 0.0
-    middle, corner = _light(lens, 0.0, 0.0), _light(lens, radius_mm * math.sqrt(1 - across**2), radius_mm * across)
-    return corner / middle if middle > 0 else 0.0
-
-
-def _light(lens: Lens, x_mm: float, y_mm: float) -> float:
-    """Return the film irradiance in arbitrary units: the passing rays' cos^4 integrated over the pupil's plane."""
-    data = first_order(lens)
-    plane, film_z = pupil_plane_z_mm(lens), data.rear_focal_z_mm
-    rear = lens.surfaces[-1].semi_diameter_mm
+    x, y = (torch.tensor([0.0, radius_mm * share], dtype=torch.float64) for share in (math.sqrt(1 - across**2), across))
+    data, plane = first_order(lens), pupil_plane_z_mm(lens)
     # Seen from the corner the pupil is distorted, but not by more than this.
-    half = _PUPIL * data.exit_pupil_diameter_mm / 2 if plane == data.exit_pupil_z_mm else rear
-    box = (-half, half, -half, half)
-    total = 0.0
-    for _ in range(2):  # the whole plane, then the box of what passed
-        total, found = _look(lens, (x_mm, y_mm, film_z), plane, box)
-        if found is None:
-            return 0.0
-        box = found
-    return total
-
-
-def _look(
-    lens: Lens, film: tuple[float, float, float], plane: float, box: tuple[float, float, float, float]
-) -> tuple[float, tuple[float, float, float, float] | None]:
-    """Return the integral over a box of the plane, and the box, a step wider, of the points from which light comes."""
-    du, dv = (box[1] - box[0]) / _SEARCH, (box[3] - box[2]) / _SEARCH
-    steps = torch.arange(_SEARCH, dtype=torch.float64) + 0.5
-    u, v = (t.reshape(-1) for t in torch.meshgrid(box[0] + du * steps, box[2] + dv * steps, indexing="ij"))
-    start = camera_rays(torch.full_like(u, film[0]), torch.full_like(u, film[1]), film[2], u, v, plane)
-    with torch.no_grad():
-        passed = trace(lens, start).status == st.PASSED
-    if not passed.any():
-        return 0.0, None
-    total = float((start.dz**4)[passed].sum()) * du * dv
-    u, v = u[passed], v[passed]
-    return total, (float(u.min()) - du, float(u.max()) + du, float(v.min()) - dv, float(v.max()) + dv)
+    half = _PUPIL * data.exit_pupil_diameter_mm / 2
+    half = half if plane == data.exit_pupil_z_mm else lens.surfaces[-1].semi_diameter_mm
+    high = torch.full((2, 2), half, dtype=torch.float64)
+    light = FilmLight(lens, (x, y), data.rear_focal_z_mm, plane, -high, high, torch.zeros_like(high))
+    middle, corner = light.sums(0).tolist()
+    return corner / middle if middle > 0 else 0.0

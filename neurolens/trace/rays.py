@@ -1,4 +1,4 @@
-"""The exact tracer, in either direction, and ray differentials: the reference for surrogates.
+"""The exact tracer, in either direction: the reference for surrogates.
 
 Rays are separate tensors of shape [N]; float64 for truth, float32 for speed. A ray that cannot go on carries a
 status and stays finite.
@@ -376,65 +376,3 @@ def sound_wavelength(
         return wavelength_nm, None
     sound = (wavelength_nm > 0) & (wavelength_nm < math.inf)
     return torch.where(sound, wavelength_nm, glass.LINE_D_NM).to(dtype), sound if lens.dispersive else None
-
-
-class Differentials(NamedTuple):
-    """A traced ray and its derivatives.
-
-    Attributes:
-        traced: as `trace` gives it.
-        derivatives: for every parameter, the derivatives of the resulting ray: x, y, z (mm per unit of it) and
-            direction, each [N]; 0 for rays that do not go on. Points move on the last surface.
-    """
-
-    traced: Traced
-    derivatives: tuple[Rays, ...]
-
-
-def trace_differentials(
-    lens: Lens, rays: Rays, derivatives: Sequence[Rays], wavelength_nm: Tensor | float | None = None
-) -> Differentials:
-    """Trace camera rays together with their derivatives.
-
-    Args:
-        derivatives: of the rays with respect to some parameters, one `Rays` each (components [N]), such as those of
-            `film_derivatives`; the rest as for `trace`.
-
-    Raises:
-        InputError: as `trace`, and a derivative whose components have not the shape and dtype of the rays.
-    """
-    for n, derivative in enumerate(derivatives):
-        for name, c, r in zip(Rays._fields, derivative, rays, strict=True):
-            if c.shape != r.shape or c.dtype != r.dtype:
-                found, expected = (f"{tuple(t.shape)}, {t.dtype}" for t in (c, r))
-                raise InputError("trace", f"derivatives[{n}].{name}", f"({found})", f"like the rays: {expected}")
-    traced, carried = None, []
-    for derivative in derivatives:
-        with forward_ad.dual_level():
-            pairs = zip(rays, derivative, strict=True)
-            dual = Rays(*(forward_ad.make_dual(r.contiguous(), t.contiguous()) for r, t in pairs))
-            out = trace(lens, dual, wavelength_nm)
-            parts = [forward_ad.unpack_dual(c) for c in out.rays]
-            moved = (torch.zeros_like(p.primal) if p.tangent is None else p.tangent for p in parts)
-            # A lost ray was replaced by one along the axis, whose derivative is 0 already; others may carry NaN.
-            carried.append(Rays(*(torch.nan_to_num(s, 0.0, 0.0, 0.0) for s in moved)))
-            traced = out._replace(rays=Rays(*(p.primal for p in parts)))
-    traced = trace(lens, rays, wavelength_nm) if traced is None else traced
-    return Differentials(traced, tuple(carried))
-
-
-def film_derivatives(rays: Rays, distance_mm: Tensor | float) -> tuple[Rays, Rays]:
-    """Return the derivatives of camera rays with respect to the film point's x and y (mm), the pupil point held.
-
-    Args:
-        rays: from the film point towards the pupil point, unit directions, each [N].
-        distance_mm: from film point to pupil point along the ray, positive, number or [N].
-
-    With d = (P - F) / |P - F|, dd/dF_x = (d d_x - e_x) / |P - F|.
-    """
-
-    def moved(along: Tensor, e: tuple[float, float, float]) -> Rays:
-        directions = ((c * along - k) / distance_mm for c, k in zip(rays[3:], e, strict=True))
-        return Rays(*(torch.full_like(rays.x, k) for k in e), *directions)
-
-    return moved(rays.dx, (1.0, 0.0, 0.0)), moved(rays.dy, (0.0, 1.0, 0.0))

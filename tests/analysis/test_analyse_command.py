@@ -43,6 +43,8 @@ def test_every_analysis_as_text_picture_and_json(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made, computed = list[Any](), dict[str, Any]()
+    for key in ("figure.dpi", "savefig.dpi"):  # small pictures
+        monkeypatch.setitem(plots._STYLE, key, 50)
     new_figure, usual = plots.new_figure, analyse.analysis_of
     monkeypatch.setattr(plots, "new_figure", lambda *s: made.append(new_figure(*s)) or made[-1])
 
@@ -55,7 +57,8 @@ def test_every_analysis_as_text_picture_and_json(
         return usual(what)._replace(compute=compute)
 
     monkeypatch.setattr(analyse, "analysis_of", once)
-    assert main(["analyse", str(TESSAR), "--f-number", "5.6", "-o", str(tmp_path)]) == 0
+    two = ("--f-number", "5.6", "--field-points", "0", "13")  # a row of a picture each
+    assert main(["analyse", str(TESSAR), *two, "-o", str(tmp_path)]) == 0
     assert "11 pictures drawn" in capsys.readouterr().out
     assert {path.name for path in tmp_path.iterdir()} == {f"brendel_tessar_100_{what}.png" for what in WHATS}
     for path in tmp_path.iterdir():
@@ -65,9 +68,9 @@ def test_every_analysis_as_text_picture_and_json(
         words = " ".join(t.get_text() for t in figure.findobj(lambda a: hasattr(a, "get_text")))
         assert "Tessar" in words and any(unit in words for unit in ("(mm)", "(µm)", "(%)", "(cycles/mm)"))
         assert what == "psf" or figure.legends or any(a.get_legend() for a in figure.axes)
-    data = run_json(capsys, "analyse", TESSAR, "--f-number", 5.6)
+    data = run_json(capsys, "analyse", TESSAR, *two)
     assert set(WHATS) <= set(data) and data["notes"] == []
-    assert len(data["spots"]["rms_um"]) == 5 and "tangential_um" not in data["spots"]
+    assert len(data["spots"]["rms_um"]) == 2 and "tangential_um" not in data["spots"]
     assert data["distortion"]["scale_mm"] == pytest.approx(100, rel=0.01)
     assert data["mtf"]["working_f_number"] == pytest.approx(5.6, rel=0.02)
     assert len(data["seidel"]["surfaces"]) == 8 and data["focus_m"] == "infinity"
@@ -126,10 +129,10 @@ def test_no_light_is_one_error_or_a_gap(tmp_path: Path, capsys: pytest.CaptureFi
     dark = replace(given, lens=replace(given.lens, surfaces=tuple(rows), film_z_mm=given.film_z_mm + 10.0))
     # Through this hole passes the chief ray alone, and off the axis nothing.
     fields = [5.0]
-    assert math.isnan(spots(dark, fields).geometric_um[0]) and np.isnan(mtf(dark, fields).tangential).all()
-    image = psf(dark, fields)
+    spot, image = spots(dark, fields), psf(dark, fields)
+    assert math.isnan(spot.geometric_um[0]) and np.isnan(mtf(dark, fields).tangential).all()
     assert np.isnan(image.half_width_um).all() and image.pupil_points[0] == 0
-    plot_spots(spots(dark, fields), tmp_path / "spots.png", "", "")
+    plot_spots(spot, tmp_path / "spots.png", "", "")
     plot_psf(image, tmp_path / "psf.png", "", "")
     assert "field 80: got (no light" in failure(capsys, "analyse", GAUSS, "spots", "--field-points", 0, 80)
     assert "expected at most 2" in failure(capsys, "analyse", GAUSS, "mtf", "--field-points", 80)
@@ -139,7 +142,8 @@ def test_a_stop_beyond_all_glass_warns_of_no_division(tmp_path: Path, capsys: py
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         lens = LENSES / "muller_fisheye_100.toml"
-        data = run_json(capsys, "analyse", lens, "vignetting", "spots", "--f-number", 0.3, "-o", tmp_path)
+        options = ("--f-number", 0.3, "--field-points", 0, 40, "-o", tmp_path)
+        data = run_json(capsys, "analyse", lens, "vignetting", "spots", *options)
     assert data["vignetting"]["relative"][0] in (None, 1.0)
     assert data["spots"]["working_f_number"] == pytest.approx(4, rel=0.02)
     assert any("V_d is not given" in w for w in data["warnings"])
@@ -149,6 +153,7 @@ def test_a_pinhole_has_no_focus(pinhole: Path, capsys: pytest.CaptureFixture[str
     data = run_json(capsys, "analyse", pinhole)
     assert data["spots"]["working_f_number"] == pytest.approx(50 / 0.4)
     assert data["spots"]["geometric_um"][0] == pytest.approx(200, rel=1e-5)
+    assert len(data["spots"]["rms_um"]) == len(data["mtf"]["field_deg"]) == 5  # where no fields are asked for
     assert data["spots"]["best_shift_mm"][0] is None
     assert not {"colour", "curvature", "psf", "seidel"} & set(data) and len(data["notes"]) == 4
     for what in ("colour", "curvature", "psf"):

@@ -11,10 +11,10 @@ from test_bundles import D, moved
 
 from neurolens.analysis.bundles import Bundle, Filled, bundle
 from neurolens.analysis.fields import Scene
-from neurolens.analysis.pupil_nodes import LEVELS, converged, lit_nodes, lit_part
 from neurolens.analysis.spots import diffraction_image, diffraction_mtf, mtf, mtf_over_height, spots, working_f_number
 from neurolens.cli.analyse import _three
 from neurolens.readers.lensfile import read_lens
+from neurolens.setting.pupil_nodes import LEVELS, converged, lit_nodes, lit_part
 
 FUJINON = Path(__file__).parents[1] / "data" / "fujinon_35.toml"
 Tensor = torch.Tensor

@@ -12,7 +12,7 @@ from neurolens.base.errors import InputError
 from neurolens.cli import main
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.light import open_light, with_rims
+from neurolens.photographs.compare import open_light, with_rims
 from neurolens.photographs.profiles import FULL_FRAME_MM, Light, Profile
 from neurolens.photographs.rims import FittedRims, Ring, fit_rims, with_fitted_rims, with_ring
 from neurolens.readers.lensfile import read_lens

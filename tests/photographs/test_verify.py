@@ -13,8 +13,7 @@ from neurolens.analysis.field_curves import illumination
 from neurolens.analysis.fields import Scene
 from neurolens.cli import main
 from neurolens.lens.prescription import Lens
-from neurolens.photographs.compare import compare
-from neurolens.photographs.light import open_light
+from neurolens.photographs.compare import compare, open_light
 from neurolens.photographs.profiles import FULL_FRAME_MM, Light, Profile, Radial
 from neurolens.photographs.verify import names_of, verify
 from neurolens.readers.lensfile import read_lens

@@ -17,9 +17,11 @@ from torch import Tensor
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError, ModelError
+from neurolens.cameras.cameragraph import D_FILM
 from neurolens.cameras.model import load_model
 from neurolens.cameras.onnxmaps import load_inverse
-from neurolens.setting.pupils import camera_rays
+from neurolens.graph.interpret import evaluate
+from neurolens.graph.loworder import with_film_derivatives
 from neurolens.surrogates.card import MODEL_KEY
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.export import export_inverse, export_onnx
@@ -28,9 +30,9 @@ from neurolens.surrogates.inverse import InverseModel, InverseRays
 from neurolens.surrogates.inverse_fit import convergence, fit_inverse
 from neurolens.surrogates.model import LensModel
 from neurolens.surrogates.pairs import PairSet, trace_pairs
-from neurolens.trace.rays import film_derivatives, trace_differentials
 from neurolens.trace.shapes import sag_and_derivatives
 from neurolens.trace.surfaces import Rays
+from neurolens.trace.tracegraph import exact_graph
 
 GAUSS, FISHEYE, ASPHERE = "laikin_double_gauss_50", "horimoto_fisheye_16", "canon_aspheric_50"
 
@@ -250,13 +252,11 @@ def test_differentials_are_those_of_the_exact_lens_to_one_percent(name: str) -> 
     m = fit_model(known, ModelSettings("ols", terms=64, planes=False))
     rays = known.pairs.train.inputs.select(slice(0, 2000))
     d_film = m.differentiate(rays)[1][:, :2]
-    plane = m.domain.pupil_z_mm
-    start = camera_rays(rays.film_x, rays.film_y, rays.film_z, rays.pupil_x, rays.pupil_y, plane)
-    distance = torch.sqrt(
-        (rays.film_x - rays.pupil_x) ** 2 + (rays.film_y - rays.pupil_y) ** 2 + (rays.film_z - plane) ** 2
-    )
-    exact = trace_differentials(m.lens, start, film_derivatives(start, distance), rays.wavelength_nm)
-    wanted = torch.stack([torch.stack(list(t)) for t in exact.derivatives], 1)  # [6, 2, N]
+    graph = with_film_derivatives(exact_graph(m.lens, m.domain.pupil_z_mm, m.domain.wavelength_nm))
+    points = np.stack([c.numpy() for c in (rays.film_x, rays.film_y, rays.pupil_x, rays.pupil_y, rays.wavelength_nm)])
+    given = {"rays": points, "film_z_mm": rays.film_z.numpy()[None]}
+    exact = evaluate(graph, given | {"stop_radius_mm": np.array([[m.lens.stop_radius_mm]])})
+    wanted = torch.from_numpy(np.stack([exact[name] for name in D_FILM], 1))  # [6, 2, N]
     for rows in (slice(0, 3), slice(3, 6)):
         off = (d_film - wanted)[rows].square().mean().sqrt() / wanted[rows].square().mean().sqrt()
         assert float(off) < 0.01, (name, rows)

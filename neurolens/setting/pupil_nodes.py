@@ -10,12 +10,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+
+from neurolens.lens.prescription import Lens
+from neurolens.setting.pupils import camera_rays
+from neurolens.trace.rays import passing
+from neurolens.trace.surfaces import Rays
 
 Array = NDArray[np.float64]
 Passes = Callable[[Tensor, Tensor], Tensor]
@@ -101,6 +107,42 @@ def lit_nodes(passes: Passes, part: LitPart, level: int) -> Nodes:
     radius = torch.cat([end[..., None] * torch.sqrt((nodes + 1) / 2), low[..., None]], 2)
     area = (end**2)[..., None] * torch.cat([weights / 2, torch.zeros(1, dtype=torch.float64)]) * (math.pi / spokes)
     return Nodes(*places(radius), area.flatten(1))
+
+
+class FilmLight:
+    """The light that F film points see through a lens, without losses in glass, on a plane.
+
+    Args:
+        film_mm: [F] x and [F] y of the points. film_z_mm, plane_z_mm: where film and plane are.
+        low, high, near: as of `lit_part`.
+    """
+
+    def __init__(
+        self, lens: Lens, film_mm: tuple[Tensor, Tensor], film_z_mm: float, plane_z_mm: float, low: Tensor,
+        high: Tensor, near: Tensor,
+    ) -> None:  # fmt: skip
+        self.lens, self.film_mm, self.film_z_mm, self.plane_z_mm = lens, film_mm, film_z_mm, plane_z_mm
+        self.part = lit_part(self._passes, low, high, near)
+
+    def only(self, fields: list[int]) -> FilmLight:
+        """The same for some of the film points."""
+        found = copy(self)
+        found.film_mm = self.film_mm[0][fields], self.film_mm[1][fields]
+        found.part = LitPart(*(c[fields] for c in self.part))
+        return found
+
+    def _rays(self, u: Tensor, v: Tensor) -> Rays:
+        x, y = (c[:, None].expand(u.shape).reshape(-1) for c in self.film_mm)
+        return camera_rays(x, y, self.film_z_mm, u.reshape(-1), v.reshape(-1), self.plane_z_mm)
+
+    def _passes(self, u: Tensor, v: Tensor) -> Tensor:
+        return passing(self.lens, self._rays(u, v), self.lens.reference_nm).reshape(u.shape)
+
+    def sums(self, level: int) -> Array:
+        """Integral [F] of cos^4 over what is lit."""
+        nodes = lit_nodes(self._passes, self.part, level)
+        cos4 = self._rays(*nodes[:2]).dz.reshape(nodes.u.shape) ** 4
+        return np.asarray((nodes.area * cos4 * self._passes(*nodes[:2])).sum(1).numpy())
 
 
 def converged(
