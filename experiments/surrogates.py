@@ -29,7 +29,7 @@ from neurolens.base.records import plain, versions
 from neurolens.base.settings import add_options, whole
 from neurolens.cli.arguments import Glasses, check_ids, check_run_folder, named_lens
 from neurolens.graph.scalars import MOST_WEIGHTS
-from neurolens.study.describe import lens_files
+from neurolens.readers.any_format import lens_files
 from neurolens.study.experiment import DomainChoice, EvaluationChoice, LensChoice
 from neurolens.study.pages import DASH, Column, Record, number, show
 from neurolens.study.plots import Kinds, trade_plot

@@ -31,8 +31,6 @@ FACTS, SCHEMA = "lenses.json", 1
 _ID = "neurolens"
 _CODE = ("__init__.py", "camera.py", "library.py", "needs.py", "panel.py", "blender_manifest.toml")
 _THEN = (1980, 1, 1, 0, 0, 0)  # the zip of the same lenses is the same, byte for byte
-_YEAR = re.compile(r"\b(1[89]\d\d|20\d\d)\b(?!,?\d)|\bS\.(\d\d)-\d")  # S.53 of a Japanese patent: Showa 53, 1978
-_SHOWA = 1925
 _LARGEST = 1 << 26
 
 
@@ -104,12 +102,6 @@ def extension_library() -> ModuleType:
     sys.modules[spec.name] = module  # where dataclasses look their module up
     spec.loader.exec_module(module)
     return module
-
-
-def year_of(source: str) -> int | None:
-    """The first year that a source names: the lens's own stands before that of a book that reprints it."""
-    found = _YEAR.search(source)
-    return None if found is None else int(found[1] or _SHOWA + int(found[2]))
 
 
 def write_pack(out: Path, lenses: Iterable[PackedLens]) -> None:

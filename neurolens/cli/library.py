@@ -45,7 +45,7 @@ examples:
 
     def run(self) -> int:
         """Write the pages; 1 where a lens could not be shown."""
-        from neurolens.study.describe import lens_files
+        from neurolens.readers.any_format import lens_files
 
         folder = self.out
         check_run_folder(folder, self.called, "--output")
@@ -98,7 +98,7 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
     """Draw a lens and write its page; returns what the index shows."""
     from neurolens.analysis.layout import thumbnail
     from neurolens.base.html import html
-    from neurolens.blender.pack import year_of
+    from neurolens.base.lensname import year_of
     from neurolens.cli.models import models_in
     from neurolens.readers.source import read_text
     from neurolens.setting.check import check_lens
