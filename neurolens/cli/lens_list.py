@@ -72,7 +72,8 @@ def list_text(rows: list[dict[str, Any]], sort: str | None) -> str:
     header = (*_BEGIN, *middle, *_END)
     text = table(header, [_cells(row, sort in CHARACTER, len(header)) for row in rows], left=3)
     doubtful = [row for row in rows if row["doubts"]]
-    found = f"\n\n{len(rows)} lenses, {len(doubtful)} of them doubtful or unreadable"
+    guess = "\n\n~ follows rims that the source does not state" if sort in CHARACTER and "~" in text else ""
+    found = f"{guess}\n\n{len(rows)} lenses, {len(doubtful)} of them doubtful or unreadable"
     lines = [f"  {row['lens']}: {doubt}" for row in doubtful for doubt in row["doubts"]]
     return text + found + (":\n" + "\n".join(lines) if lines else "")
 

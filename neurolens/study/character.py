@@ -12,6 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from neurolens.analysis.bundles import Filled
@@ -60,12 +61,14 @@ class Discs:
     """Light of the points of `FIELDS`; tangential and sagittal are the first axis but one of [F, 2, P].
 
     Attributes:
-        place_mm: on the film, from the centre of the light. slope: of the rays at the film. weight: [F, P], energy.
+        place_mm: on the film, from the centre of the light. slope: of the rays at the film. weight: [F, P], energy: 0 on
+            the outline, too. passed: [F, P], whether a ray reaches the film.
     """
 
     place_mm: Array
     slope: Array
     weight: Array
+    passed: NDArray[np.bool_]
 
 
 def character(lens: Lens) -> tuple[Character, Discs]:
@@ -106,7 +109,8 @@ def discs_of(lens: Lens, field_deg: list[float]) -> Discs:
     places = np.stack([rays.tangential_mm[:, 0].numpy(), rays.sagittal_mm[:, 0].numpy()], 1)
     slopes = np.stack([c[:, 0].numpy() for c in rays.slopes], 1)
     places, slopes = np.nan_to_num(places), np.nan_to_num(slopes)
-    return Discs(places - _mean(places, weight), slopes - _mean(slopes, weight), weight)
+    passed = rays.passed[:, 0].numpy()
+    return Discs(places - _mean(places, weight), slopes - _mean(slopes, weight), weight, passed)
 
 
 def _mean(values: Array, weight: Array) -> Array:
@@ -118,9 +122,9 @@ def _mean(values: Array, weight: Array) -> Array:
 def cats_eye(discs: Discs) -> float:
     """See `Character`. The disc of a light far out of focus has the shape of the rays' slopes."""
     areas = []
-    for slope, weight in ((discs.slope[k], discs.weight[k]) for k in (0, -1)):
+    for k in (0, -1):
         try:
-            areas.append(ConvexHull(slope[:, weight > 0].T).volume)
+            areas.append(ConvexHull(discs.slope[k][:, discs.passed[k]].T).volume)
         except (QhullError, ValueError):  # no light, or a line
             return math.nan
     return float(areas[1] / areas[0])
@@ -134,8 +138,8 @@ def swirl(discs: Discs) -> float:
 
 def bubble(discs: Discs) -> float:
     """See `Character`."""
-    weight, r2 = discs.weight[0], (discs.place_mm[0] ** 2).sum(0)
-    share = np.where(weight > 0, r2, 0.0) / r2[weight > 0].max()
+    weight, r2 = discs.weight[0], np.where(discs.passed[0], (discs.place_mm[0] ** 2).sum(0), 0.0)
+    share = r2 / r2.max()
     return float((_POWER + 1) * (weight * share**_POWER).sum() / weight.sum())
 
 
@@ -143,7 +147,7 @@ def picture(discs: Discs) -> bytes:
     """The discs side by side as a grey PNG of 96 by 32 pixels, the film's radius upwards; what reaches further is cut."""
     from PIL import Image
 
-    radii = np.where(discs.weight > 0, np.sqrt((discs.place_mm**2).sum(1)), 0.0).max(1)
+    radii = np.where(discs.passed, np.sqrt((discs.place_mm**2).sum(1)), 0.0).max(1)
     scale = _DISC * _SIDE / 2 / min(radii.max(), _WIDEST * radii[0])
     grey = np.zeros((len(radii), _SIDE, _SIDE))
     for disc, place, weight in zip(grey, discs.place_mm, discs.weight, strict=True):
