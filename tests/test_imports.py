@@ -32,7 +32,7 @@ PARTS = {
     "render": "lens cameras",
     "mitsuba": "lens cameras render",
     "flare": "graph lens trace analysis surrogates cameras render",
-    "study": "graph lens trace setting readers analysis surrogates cameras render photographs",
+    "study": "graph lens trace setting readers analysis surrogates cameras render flare photographs",
     "plan": "graph lens setting analysis surrogates cameras shaders render flare study",
     "view": "graph lens trace analysis cameras shaders flare",
     "blender": "",

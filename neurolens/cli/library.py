@@ -30,8 +30,8 @@ _COLOURS = 96  # in the palette of a picture
 class Library(Reporting):
     """Write a folder of pages: of each lens its section, spots, MTF, distortion, vignetting, colour, breathing and
     bokeh at three points of the field, its models with error and cost, its source and what is doubtful about it; and an
-    index with search, sorted by year, focal length, speed, error, and character (`neurolens lens --sort`). A lens whose page is there, from the same file
-    by the same version, is kept. Needs the extra "train" (torch)."""
+    index with search, sorted by year, focal length, speed, error and character. A lens whose page is there, from the
+    same file by the same version, is kept. Needs the extra "train" (torch)."""
 
     about: ClassVar[str] = "pages of lenses: pictures, figures, models"
     epilog: ClassVar[str] = """\

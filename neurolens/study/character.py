@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 
 from neurolens.analysis.bundles import Filled
 from neurolens.analysis.fields import Array, Result, Scene
@@ -42,8 +41,8 @@ class Character(Result):
             rim cuts it.
         swirl: how much narrower that disc is along the picture's radius than across it, compared with the axis: 1 less
             the ratio of the standard deviations of its light; 0 for a round one.
-        bubble: light near the rim of the disc on the axis behind the focus over that of an even disc, where light counts
-            by the eighth power of its distance from the centre: 1 for an even disc, up to 5 for a bright rim alone.
+        bubble: light near the rim of the disc on the axis behind the focus over that of an even disc, where light
+            counts by the eighth power of its distance from the centre: 1 if even, up to 5 for a bright rim alone.
         softness_um: RMS radius of a white point on the axis at the best focus, on a picture 43.2 mm across its corners.
         flare: light of all ghosts of two reflections on the film's plane over that of the image, of a light at half
             the field; glass without a coating in the file is bare.
@@ -58,11 +57,9 @@ class Character(Result):
 
 @dataclass(frozen=True)
 class Discs:
-    """Light of the points of `FIELDS`; tangential and sagittal are the first axis but one of [F, 2, P].
+    """Rays of F fields, tangential and sagittal [F, 2, P] from their centre: places on the film, and slopes there.
 
-    Attributes:
-        place_mm: on the film, from the centre of the light. slope: of the rays at the film. weight: [F, P], energy: 0 on
-            the outline, too. passed: [F, P], whether a ray reaches the film.
+    `weight` [F, P] is their energy, 0 on the outline, too; `passed` tells whether they reach the film.
     """
 
     place_mm: Array
@@ -106,11 +103,9 @@ def discs_of(lens: Lens, field_deg: list[float]) -> Discs:
     scene = Scene(set_lens(lens, focus_m=near, focus_mode="best"))
     rays = Filled(scene, field_deg, scene.waves_nm[:1]).bundle(_LEVEL)
     weight = rays.weight[:, 0].numpy()
-    places = np.stack([rays.tangential_mm[:, 0].numpy(), rays.sagittal_mm[:, 0].numpy()], 1)
-    slopes = np.stack([c[:, 0].numpy() for c in rays.slopes], 1)
-    places, slopes = np.nan_to_num(places), np.nan_to_num(slopes)
-    passed = rays.passed[:, 0].numpy()
-    return Discs(places - _mean(places, weight), slopes - _mean(slopes, weight), weight, passed)
+    both = (rays.tangential_mm, rays.sagittal_mm), rays.slopes
+    place, slope = (np.nan_to_num(np.stack([c[:, 0].numpy() for c in pair], 1)) for pair in both)
+    return Discs(place - _mean(place, weight), slope - _mean(slope, weight), weight, rays.passed[:, 0].numpy())
 
 
 def _mean(values: Array, weight: Array) -> Array:
@@ -122,12 +117,11 @@ def _mean(values: Array, weight: Array) -> Array:
 def cats_eye(discs: Discs) -> float:
     """See `Character`. The disc of a light far out of focus has the shape of the rays' slopes."""
     areas = []
-    for k in (0, -1):
-        try:
-            areas.append(ConvexHull(discs.slope[k][:, discs.passed[k]].T).volume)
-        except (QhullError, ValueError):  # no light, or a line
-            return math.nan
-    return float(areas[1] / areas[0])
+    for slope, outline in zip(discs.slope, discs.passed & (discs.weight == 0), strict=True):
+        x, y = slope[:, outline]
+        x, y = (c[np.argsort(np.arctan2(y, x))] for c in (x, y))
+        areas.append(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2)
+    return areas[-1] / areas[0] if areas[0] > 0 and areas[-1] > 0 else math.nan
 
 
 def swirl(discs: Discs) -> float:
@@ -144,7 +138,7 @@ def bubble(discs: Discs) -> float:
 
 
 def picture(discs: Discs) -> bytes:
-    """The discs side by side as a grey PNG of 96 by 32 pixels, the film's radius upwards; what reaches further is cut."""
+    """The discs side by side as a grey PNG of 96 by 32 pixels, cut where they are wider; the film's radius is upwards."""
     from PIL import Image
 
     radii = np.where(discs.passed, np.sqrt((discs.place_mm**2).sum(1)), 0.0).max(1)

@@ -209,10 +209,10 @@ _STATED = ("name", "believed_to_be", "stated_efl_mm", "half_field_deg", "image_r
 def lens_row(lens: Lens, checks: list[Check] | None) -> dict[str, Any]:
     """A lens as read from its file, in a table of many, with its `check_lens` or (None) without.
 
-    Returns: name, believed_to_be, maker and year by the source, efl_mm and efl_x_mm computed (the latter of an anamorphic lens only), stated_efl_mm, back_focus_mm,
-        f_number of the stop, half_field_deg as stated, image_radius_mm as stated, refractions, aspheres, cylinders,
-        states (zoom or focus), rims, verdict ("ok" or "doubtful"; without checks "read"), doubts, and checks: a list of
-        {state, quantity, computed, stated, doubt}.
+    Returns: name, believed_to_be, maker, year, efl_mm and efl_x_mm computed (the latter of an anamorphic lens only),
+        stated_efl_mm, back_focus_mm, f_number of the stop, half_field_deg as stated, image_radius_mm as stated,
+        refractions, aspheres, cylinders, states (zoom or focus), rims, verdict ("ok" or "doubtful"; without checks
+        "read"), doubts, and checks: a list of {state, quantity, computed, stated, doubt}.
     """
     data, cylinders = first_order(lens), sum(s.cylinder is not None for s in lens.surfaces)
     return {

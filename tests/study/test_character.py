@@ -188,7 +188,8 @@ def test_keys_are_those_of_the_command() -> None:
 
 
 def test_makers_stand_last_among_designers() -> None:
-    assert [maker_of(t) for t in ("Canon", "Ikuo Mori, Nippon Kogaku", "", "A, B, C ")] == ["Canon", "Nippon Kogaku", "", "C"]
+    makers = {"Canon": "Canon", "Ikuo Mori, Nippon Kogaku": "Nippon Kogaku", "": "", "A, B, C ": "C"}
+    assert {text: maker_of(text) for text in makers} == makers
 
 
 def test_a_folder_of_ones_own_is_sorted_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

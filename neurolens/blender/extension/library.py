@@ -109,7 +109,8 @@ class LensFacts:
         """What an order of `ORDERS` looks at; None where it is not known."""
         if order in CHARACTER:
             return self.character.get(order)
-        return {"speed": self.f_number, "year": self.year, "maker": self.maker.casefold() or None}.get(order, self.efl_mm)
+        known = {"speed": self.f_number, "year": self.year, "maker": self.maker.casefold() or None}
+        return known.get(order, self.efl_mm)
 
     def entry(self, order: str) -> str:
         """The text of menus in an order."""

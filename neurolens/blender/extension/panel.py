@@ -10,21 +10,8 @@ import bpy
 import bpy.utils.previews
 
 from . import camera as on_camera
-from .library import (
-    CHARACTER,
-    KINDS,
-    ORDERS,
-    LensError,
-    LensFacts,
-    error_px,
-    notes,
-    ordered,
-    outside,
-    read_library,
-    refusals,
-    refused,
-    too_large,
-)  # fmt: skip
+from . import library as facts
+from .library import KINDS, LensError, LensFacts, error_px, notes, outside, read_library, refusals, refused, too_large
 from .needs import needs
 
 _FIRST = ("f_number", "focus_m", "zoom_mm")  # of the settings, before the others
@@ -63,9 +50,9 @@ class Library:
         self.items = {
             order: [
                 (lens.lens_id, lens.entry(order), lens.source, icons[lens.lens_id], lens.number)
-                for lens in ordered(self.lenses.values(), order)
+                for lens in facts.ordered(self.lenses.values(), order)
             ]
-            for order in ORDERS
+            for order in facts.ORDERS
         }
 
     def _icon(self, name: str, picture: Path | None) -> int:
@@ -111,7 +98,7 @@ class CameraSettings(bpy.types.PropertyGroup):
         "order": bpy.props.EnumProperty(
             name="Sort By",
             description="Order of the menu of lenses; of a character the strongest come first",
-            items=[(key, text, "", number) for number, (key, text) in enumerate(ORDERS.items())],
+            items=[(key, text, "", number) for number, (key, text) in enumerate(facts.ORDERS.items())],
         ),
         "kind": bpy.props.EnumProperty(
             name="Form",
@@ -271,7 +258,7 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
         if LIBRARY.bokeh.get(lens.lens_id):
             layout.template_icon(icon_value=LIBRARY.bokeh[lens.lens_id], scale=4.0)
         if lens.character:
-            told = (f"{CHARACTER[key].lower()} {value:.2g}" for key, value in lens.character.items())
+            told = (f"{facts.CHARACTER[key].lower()} {value:.2g}" for key, value in lens.character.items())
             _wrapped(layout, ", ".join(told).capitalize(), "LIGHT")
         row = layout.row(align=True)
         row.use_property_split = False  # else the first form's name stands beside its button
