@@ -138,7 +138,7 @@ def bubble(discs: Discs) -> float:
 
 
 def picture(discs: Discs) -> bytes:
-    """The discs side by side as a grey PNG of 96 by 32 pixels, cut where they are wider; the film's radius is upwards."""
+    """The discs side by side as a grey PNG of 96 by 32 pixels, the film's radius upwards; wide ones are cut."""
     from PIL import Image
 
     radii = np.where(discs.passed, np.sqrt((discs.place_mm**2).sum(1)), 0.0).max(1)

@@ -152,7 +152,7 @@ def test_menu_is_sorted_and_a_chosen_lens_stays_chosen(scene: Any) -> None:
     props, module = scene.camera.data.neurolens, sys.modules[f"{MODULE}.panel"]
     props.lens = "zoom"
     firsts = {}
-    for order in module.ORDERS:
+    for order in module.facts.ORDERS:
         props.order = order
         assert props.lens == "zoom"
         firsts[order] = module._lens_items(props, bpy.context)[0][:2]
