@@ -22,7 +22,9 @@ from neurolens.cli import main, view_run
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.osl import urgent
+from neurolens.lens.prescription import VISIBLE_NM, Lens, Surface
 from neurolens.readers.lensfile import read_lens
+from neurolens.setting.pupils import pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.trace.rays import trace
 from neurolens.trace.surfaces import Rays
@@ -306,3 +308,13 @@ def test_two_files_of_ghosts_of_one_lens_are_refused(
         file.touch()
     assert main(["view", LENS, *map(str, files), "-o", str(tmp_path / "view.html")]) == 2
     assert f"ghosts of {LENS}: got '{files[1]}', expected one file a lens" in capsys.readouterr().err
+
+
+def test_a_paraboloid_has_a_path() -> None:
+    """The cosine of its slope holds no distance until the asphere's terms come: a constant, which no graph carries."""
+    rows = (
+        Surface(30.0, 5.0, 16.0, 1.5, 60.0, conic=-1.0, asphere=((4, 1e-7),), stop=True), Surface(-200.0, 55.0, 16.0)
+    )  # fmt: skip
+    lens = set_lens(Lens("paraboloid", "", rows, 4.0, half_field_deg=5.0))
+    text, outputs = shaders.path_glsl(lens, pupil_plane_z_mm(lens), VISIBLE_NM)
+    assert "lens_path" in text and len(outputs) > 4
