@@ -45,9 +45,16 @@ def view(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def data_of(text: str) -> Any:
-    """The page's JSON."""
+    """The page's JSON, with the facts of every lens."""
     size, letters = re.findall(r'id="data" data-bytes="(\d+)">([^<]*)<', text)[0]
-    return json.loads(unpacked(letters, int(size)))
+    data = json.loads(unpacked(letters, int(size)))
+    for lens in data["lenses"]:
+        stream, length = lens["stream"]
+        assert lens.keys() == {"key", "name", "stream", "parts"}  # all else waits in the stream until it is chosen
+        whole = unpacked(re.findall(rf'id="{stream}">([^<]*)<', text)[0], length)
+        ((start, count),) = [(start, count) for name, start, count, _ in lens["parts"] if name == "facts"]
+        lens |= json.loads(whole[start : start + count])
+    return data
 
 
 def unpacked(letters: str, size: int) -> bytes:
