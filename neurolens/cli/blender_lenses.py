@@ -45,7 +45,7 @@ from neurolens.shaders.blender_shader import shader_of
 from neurolens.surrogates.card import read_card
 
 _KEPT = 4096  # kept files, of some 30 kB: five a lens
-_SIDE_IN, _DOTS, _MARGIN = 2.56, 100, 1.08  # of a thumbnail: 256 pixels; its side over the glass's
+_SIDE_IN, _DOTS, _MARGIN, _COLOURS = 2.56, 100, 1.08, 64  # of a thumbnail: 256 pixels; its side over the glass's
 _RADII, _NEAR = (0.0, 0.35, 0.6, 0.8, 0.97), 20.0  # of a field: shares of the picture's radius; focal lengths
 Forms = dict[Path, Form]
 
@@ -284,6 +284,8 @@ def thumbnail(lens: Lens) -> bytes | None:
 
     if find_spec("torch") is None or find_spec("matplotlib") is None:
         return None
+    from PIL import Image
+
     from neurolens.analysis.fields import Scene
     from neurolens.analysis.layout import draw_section, layout_profile
     from neurolens.analysis.plots import new_figure, style
@@ -302,7 +304,9 @@ def thumbnail(lens: Lens) -> bytes | None:
         axes.set_axis_off()
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=_DOTS, facecolor="white", metadata={"Software": None})
-    return buffer.getvalue()
+    small = io.BytesIO()
+    Image.open(buffer).convert("RGB").quantize(_COLOURS, dither=Image.Dither.NONE).save(small, "png", optimize=True)
+    return small.getvalue()
 
 
 def kind_of(card: Mapping[str, Any]) -> str:
