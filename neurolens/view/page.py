@@ -30,7 +30,7 @@ from neurolens.view.shaders import Ghosts, call_of, shared_glsl
 SCRIPTS = ("packed.js", "gl.js", "scene.js", "engine.js", "ghosts.js", "layout.js", "main.js")
 SHADERS = ("random.glsl", "scene.glsl", "rays.glsl")
 # A form's download that would carry the page beyond this, or beyond so much for each lens, is left out.
-MOST_BYTES, MOST_A_LENS = 3_000_000, 60_000
+MOST_BYTES, MOST_A_LENS = 3_000_000, 40_000
 _TOGETHER = 6  # lenses of a stream: each says less for those before, and takes longer to unpack
 _AIR, _ARC = 1.01, 4  # a medium of a smaller index is drawn as air; of 65 points of an arc every fourth is drawn
 _CONSTANT = re.compile(r"^const float ([A-Z][A-Z0-9_]*_(?:MM|NM)) = ", re.MULTILINE)
