@@ -25,6 +25,7 @@ NAMES = {
     "fused": ("fused_speed", "models as C against the exact lens as C"),
     "gpu": ("gpu", "lenses and models as GLSL compute shaders, on a GPU or by software OpenGL"),
     "models": ("make_models", "make the models that ship"),
+    "lens-index": ("lens_index", "the index of lenses/: their data and character for `neurolens lens list`"),
     "inverse": ("inverse", "inverse maps: how often they arrive"),
     "plans": ("plans", "plans of scenes: whether budgets are kept, and what the cheapest camera costs"),
     "plan-times": ("plan_times", "seconds that plans print beside those of renders to equal noise"),

@@ -33,9 +33,9 @@ from neurolens.base.records import versions
 from neurolens.base.settings import read_config
 from neurolens.cameras.model import load_model
 from neurolens.lens.prescription import Lens
+from neurolens.readers.any_format import lens_files
 from neurolens.setting.pupils import image_radius_mm
 from neurolens.study.check import check_model, check_states
-from neurolens.study.describe import lens_files
 from neurolens.study.experiment import DomainChoice, Experiment, LensChoice, check_names
 from neurolens.study.measure import Measured, fit_and_measure, shared_rays
 from neurolens.study.rays import REFERENCE_RADIUS_MM

@@ -31,7 +31,8 @@ from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.cameras.model import load_model
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens
-from neurolens.study.describe import lens_files, read_quietly
+from neurolens.readers.any_format import lens_files
+from neurolens.study.describe import read_quietly
 from neurolens.study.experiment import DomainChoice, LensChoice
 from neurolens.study.measure import onnx_predictor
 from neurolens.study.rays import SEED, false_shares, relative_illumination

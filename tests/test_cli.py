@@ -606,6 +606,8 @@ def test_the_library_is_pages_of_lenses_and_an_index_that_are_kept(
         and "data:image/svg+xml,%3Csvg" in index
         and not re.search("(src|href)=.http", index)
     )
+    assert 'src="./thorlabs_lb1471_biconvex_50/discs.png"' in index and ">cat&#39;s eye<" in index
+    assert (folder / "discs.png").stat().st_size < 2048 and found["lenses"][0]["character"]["bubble"] < 0.9
     before = (folder / "layout.png").stat().st_mtime_ns
     assert main([str(word) for word in command]) == 0 and (folder / "layout.png").stat().st_mtime_ns == before
     (tmp_path / "bad.toml").write_text("schema = 1\n")

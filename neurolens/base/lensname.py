@@ -25,6 +25,8 @@ FUSED = "fused:"  # compiled by the system's C compiler
 IDEAL_OF = ("thick:", "thin:", "pinhole:")  # ideal cameras that are framed as a lens is
 FISHEYES = tuple(f"fisheye-{name}" for name in ("equidistant", "equisolid", "stereographic", "orthographic"))
 IDEAL = ("thin", "pinhole", *FISHEYES)
+_YEAR = re.compile(r"\b(1[89]\d\d|20\d\d)\b(?!,?\d)|\bS\.(\d\d)-\d")  # S.53 of a Japanese patent: Showa 53, 1978
+_SHOWA = 1925
 _FORMATS = "a lens file of any format (see neurolens convert --help)"
 
 
@@ -52,6 +54,17 @@ def is_model(file: str | Path) -> bool:
 def lens_id_of(file: str | Path) -> str:
     """The id of a lens by the name of its file: letters, digits, "-" and "_", so that it can begin any file's name."""
     return re.sub(r"[^\w-]+", "_", Path(file).stem).strip("_") or "lens"
+
+
+def year_of(source: str) -> int | None:
+    """The first year that a source names: the lens's own stands before that of a book that reprints it."""
+    found = _YEAR.search(source)
+    return None if found is None else int(found[1] or _SHOWA + int(found[2]))
+
+
+def maker_of(designer: str) -> str:
+    """The maker among those whom a lens file names as designers, who stand before the company."""
+    return designer.rpartition(",")[2].strip()
 
 
 def resolve(text: str | Path, *, models: bool = True, cameras: bool = True) -> Named:

@@ -3,7 +3,7 @@
 blender_manifest.toml, *.py     the extension, neurolens/blender/extension
 lenses.json                     facts of every lens, see `extension.library`
 shaders/NAME.osl                one a form of a lens
-thumbnails/NAME.png             its section
+thumbnails/NAME.png             its section; NAME.bokeh.png three discs of light
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from typing import Any
 
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_path, place_inside, read_bytes, safe_name
+from neurolens.base.lensname import year_of
 from neurolens.base.tomlfile import parse_json
 
 EXTENSION = Path(__file__).parent / "extension"
@@ -31,9 +32,7 @@ FACTS, SCHEMA = "lenses.json", 1
 _ID = "neurolens"
 _CODE = ("__init__.py", "camera.py", "library.py", "needs.py", "panel.py", "blender_manifest.toml")
 _THEN = (1980, 1, 1, 0, 0, 0)  # the zip of the same lenses is the same, byte for byte
-_YEAR = re.compile(r"\b(1[89]\d\d|20\d\d)\b(?!,?\d)|\bS\.(\d\d)-\d")  # S.53 of a Japanese patent: Showa 53, 1978
-_SHOWA = 1925
-_LARGEST = 1 << 26
+_LARGEST = 1 << 28  # of a library: 200 lenses unpacked are some 80 MB
 
 
 @dataclass(frozen=True)
@@ -53,8 +52,8 @@ class Form:
 
 @dataclass(frozen=True)
 class PackedLens:
-    """A lens of the menu, whose files are named by `lens_id`. `picture` is a PNG, `lens_field` an
-    `extension.library.Field` as a table."""
+    """A lens of the menu, whose files are named by `lens_id`. `picture` and `bokeh` are PNGs, `lens_field` is an
+    `extension.library.Field` as a table, `character` has the keys of `extension.library.CHARACTER`."""
 
     lens_id: str
     name: str
@@ -64,12 +63,15 @@ class PackedLens:
     picture: bytes | None
     forms: list[Form]
     lens_field: dict[str, Any] | None = None
+    maker: str = ""
+    character: Mapping[str, float | None] | None = None
+    bokeh: bytes | None = None
 
     def files(self) -> dict[str, bytes]:
         """The contents of its files, by their places in the extension."""
         found = {f"shaders/{self._stem(f)}.osl": f.osl.encode() for f in self.forms}
-        if self.picture is not None:
-            found[f"thumbnails/{safe_name(self.lens_id)}.png"] = self.picture
+        pictures = {self._picture(): self.picture, self._picture(".bokeh"): self.bokeh}
+        found |= {name: data for name, data in pictures.items() if data is not None}
         return found
 
     def facts(self) -> dict[str, Any]:
@@ -85,10 +87,16 @@ class PackedLens:
             "f_number": self.f_number,
             "year": year_of(self.source),
             "source": self.source,
-            "picture": None if self.picture is None else f"thumbnails/{safe_name(self.lens_id)}.png",
+            "picture": None if self.picture is None else self._picture(),
+            "maker": self.maker,
+            "character": self.character,
+            "bokeh": None if self.bokeh is None else self._picture(".bokeh"),
             "variants": variants,
             "field": self.lens_field,
         }
+
+    def _picture(self, what: str = "") -> str:
+        return f"thumbnails/{safe_name(self.lens_id)}{what}.png"
 
     def _stem(self, form: Form) -> str:
         """A safe name of files: the model's name is a text of its card, which anybody may have written."""
@@ -104,12 +112,6 @@ def extension_library() -> ModuleType:
     sys.modules[spec.name] = module  # where dataclasses look their module up
     spec.loader.exec_module(module)
     return module
-
-
-def year_of(source: str) -> int | None:
-    """The first year that a source names: the lens's own stands before that of a book that reprints it."""
-    found = _YEAR.search(source)
-    return None if found is None else int(found[1] or _SHOWA + int(found[2]))
 
 
 def write_pack(out: Path, lenses: Iterable[PackedLens]) -> None:
@@ -234,7 +236,7 @@ def _merged(known: Iterable[dict[str, Any]], lens: PackedLens) -> list[dict[str,
             others.append(entry)
             continue
         mine["variants"] += [v for v in entry["variants"] if v["kind"] not in kinds]
-        mine["picture"] = mine["picture"] or entry.get("picture")
+        mine |= {name: mine[name] or entry.get(name) for name in ("picture", "bokeh", "character")}
     return [*others, mine]
 
 

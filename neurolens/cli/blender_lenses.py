@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+from base64 import b64decode, b64encode
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, replace
@@ -31,7 +32,7 @@ from neurolens.base.files import (
     sha256_of,
     write_kept,
 )
-from neurolens.base.lensname import is_model, lens_id_of
+from neurolens.base.lensname import is_model, lens_id_of, maker_of
 from neurolens.base.tasks import Failed, Here, Processes, run_each
 from neurolens.blender.pack import Form, PackedLens
 from neurolens.cameras.build import ideal_as, make_camera
@@ -43,8 +44,8 @@ from neurolens.readers.lensfile import read_lens
 from neurolens.shaders.blender_shader import shader_of
 from neurolens.surrogates.card import read_card
 
-_KEPT = 512  # kept files of some 100 kB
-_SIDE_IN, _DOTS, _MARGIN = 2.56, 100, 1.08  # of a thumbnail: 256 pixels; its side over the glass's
+_KEPT = 4096  # kept files, of some 30 kB: five a lens
+_SIDE_IN, _DOTS, _MARGIN, _COLOURS = 2.56, 100, 1.08, 64  # of a thumbnail: 256 pixels; its side over the glass's
 _RADII, _NEAR = (0.0, 0.35, 0.6, 0.8, 0.97), 20.0  # of a field: shares of the picture's radius; focal lengths
 Forms = dict[Path, Form]
 
@@ -175,13 +176,26 @@ def packed_of(
         lens = set_lens(read_any(first), zoom=None if zoom == RANGE else zoom)
         data = first_order(lens)
         name, efl, f_number, source = lens.name, data.efl_mm, data.f_number, lens.source
-    picture = None if lens is None else thumbnail(lens)
-    table = None
+    picture, table, own = None if lens is None else thumbnail(lens), None, dict[str, Any]()
+    designer = facts.get("designer") if lens is None else lens.designer
+    if lens is not None and find_spec("torch") is not None:
+        name = f"{lens.believed_to_be}, any zoom" if lens.believed_to_be and ranged else lens.believed_to_be or name
+        own = _kept(Path(lens.path), "character", str(float(efl)), make=lambda: _character(lens))
     if lens is not None and forms and not ranged:
         radius = min(form.film_radius_mm for form in forms)
         more = str(first_order(lens).efl_mm), str(radius)
         table = _kept(Path(lens.path), "field", *more, make=lambda: {"table": field_table(lens, radius)})["table"]
-    return PackedLens(key_of(first), str(name), float(efl), float(f_number), source, picture, list(forms), table)
+    return PackedLens(
+        key_of(first), str(name), float(efl), float(f_number), source, picture, list(forms), table,
+        maker_of(str(designer or "")), own.get("character"), b64decode(own["bokeh"]) if own.get("bokeh") else None,
+    )  # fmt: skip
+
+
+def _character(lens: Lens) -> dict[str, Any]:
+    from neurolens.study.character import character_or_none
+
+    figures, discs = character_or_none(lens)
+    return {"character": figures, "bokeh": None if discs is None else b64encode(discs).decode()}
 
 
 def stated_lens(model: Path, lenses: Path) -> Lens | None:
@@ -270,6 +284,8 @@ def thumbnail(lens: Lens) -> bytes | None:
 
     if find_spec("torch") is None or find_spec("matplotlib") is None:
         return None
+    from PIL import Image
+
     from neurolens.analysis.fields import Scene
     from neurolens.analysis.layout import draw_section, layout_profile
     from neurolens.analysis.plots import new_figure, style
@@ -288,7 +304,9 @@ def thumbnail(lens: Lens) -> bytes | None:
         axes.set_axis_off()
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=_DOTS, facecolor="white", metadata={"Software": None})
-    return buffer.getvalue()
+    small = io.BytesIO()
+    Image.open(buffer).convert("RGB").quantize(_COLOURS, dither=Image.Dither.NONE).save(small, "png", optimize=True)
+    return small.getvalue()
 
 
 def kind_of(card: Mapping[str, Any]) -> str:

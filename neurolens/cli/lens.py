@@ -6,9 +6,9 @@ import math
 import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from neurolens.base.errors import one_line, warned
+from neurolens.base.errors import warned
 from neurolens.base.files import library
 from neurolens.base.lensname import resolve
 from neurolens.base.settings import changed, setting
@@ -21,6 +21,7 @@ from neurolens.cli.arguments import (
     lens_state,
     output_path,
 )  # fmt: skip
+from neurolens.cli.lens_list import list_rows, list_text
 from neurolens.cli.output import number, table
 
 if TYPE_CHECKING:
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
     from neurolens.setting.rims import Rim
 
 _LAYOUT_SUFFIXES = (".png", ".pdf", ".svg")
+_Sort = Literal[
+    "maker", "focal-length", "speed", "year", "cats-eye", "swirl", "bubbles", "softness", "flare"
+]  # those of `cli.lens_list`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +54,7 @@ examples:
   neurolens lens lenses/ogawa_zoom_70_200.toml --zoom 135mm --json
   neurolens lens downloads/ --json
   neurolens lens list --layouts lenses.png
+  neurolens lens list --sort swirl
   neurolens lens lenses/brendel_tessar_100.toml --derive-rims -o tessar.toml"""
     kept: ClassVar[str] = "only a finished --layout picture is written"
     intermixed: ClassVar[bool] = True
@@ -64,6 +69,10 @@ examples:
         metavar="OUT.png",
     )  # fmt: skip
     layouts: Path | None = setting(None, "of several files: draw all lenses in section on one sheet", metavar="OUT.png")
+    sort: _Sort | None = setting(
+        None, "of several files: the order; the last five are figures of bokeh and flare, the strongest first, which "
+        "take seconds a lens that is not of lenses/",
+    )  # fmt: skip
     derive_rims: bool = setting(
         False, "compute the diameters from the f-number and the field, and print them beside those of the file",
         title="rims",
@@ -95,14 +104,14 @@ examples:
         """Refuse the options of other modes."""
         anywhere = {"--glass", "--json"}
         if several:
-            modes, allowed = "with one lens file", {"--layouts"}
+            modes, allowed = "with one lens file", {"--layouts", "--sort"}
         elif self.derive_rims:
             modes, allowed = "with one lens file alone", {"--derive-rims", "--edge-pupil", "--half-field", "--output"}
         else:
             modes, allowed = "with --derive-rims", {*changed(self.state), "--layout", "--breathing"}
         for option in changed(self):
             if option not in allowed | anywhere:
-                where = 'with "list", a folder or several files' if option == "--layouts" else modes
+                where = 'with "list", a folder or several files' if option in ("--layouts", "--sort") else modes
                 self.refuse(option, "(given)", f"this option only {where}")
 
     def _describe(self, file: Path) -> int:
@@ -151,19 +160,20 @@ examples:
 
     def _list(self, paths: tuple[Path, ...], checked: bool) -> int:
         """Print a table of lenses, and draw their sections."""
-        from neurolens.study.describe import lens_files, library_row, section
+        from neurolens.readers.any_format import lens_files
 
         if self.layouts is not None:
             check_folder(self.layouts, "--layouts")
-        files = (lens_files(path) if path.is_dir() else [_file(path)] for path in paths)
-        rows = [library_row(file, checked) for folder in files for file in folder]
+        files = [file for path in paths for file in (lens_files(path) if path.is_dir() else [_file(path)])]
+        rows = list_rows(files, checked=checked, sort=self.sort, kept=not self.glass, quiet=self.json)
         if self.layouts is not None:
             from neurolens.analysis.layout import sheet
+            from neurolens.study.describe import section
 
             sheet([section(Path(r["file"])) for r in rows if "name" in r], self.layouts)
         note = "" if self.layouts is None else f"\n\nSections drawn in {self.layouts}"
         data = {"lenses": rows, "layouts": self.layouts and str(self.layouts)}
-        return self.answer(data, lambda: _list_text(rows) + note)
+        return self.answer(data, lambda: list_text(rows, self.sort) + note)
 
     def _derive(self, file: Path) -> int:
         """Print the table of rims; write the lens with derived rims only where -o asks for it."""
@@ -314,30 +324,6 @@ def _surface_words(row: dict[str, Any]) -> str:
         f"absorbs {row['absorption_per_mm']:.3g}/mm" if row["absorption_per_mm"] else "",
     ]
     return ", ".join(word for word in words if word)
-
-
-_LIST_HEADER = (
-    *("lens", "name", "EFL mm", "back mm", "f/", "half field", "film mm", "refr.", "asph.", "cyl.", "states", "rims"),
-    "verdict",
-)
-
-
-def _list_text(rows: list[dict[str, Any]]) -> str:
-    text = table(_LIST_HEADER, [_cells(row) for row in rows], left=2)
-    doubtful = [row for row in rows if row["doubts"]]
-    found = f"\n\n{len(rows)} lenses, {len(doubtful)} of them doubtful or unreadable"
-    lines = [f"  {row['lens']}: {doubt}" for row in doubtful for doubt in row["doubts"]]
-    return text + found + (":\n" + "\n".join(lines) if lines else "")
-
-
-def _cells(row: dict[str, Any]) -> list[str]:
-    if "name" not in row:
-        return [row["lens"], *["-"] * (len(_LIST_HEADER) - 2), row["verdict"]]
-    efl = number(row["efl_mm"]) + ("" if row["efl_x_mm"] is None else f" / {number(row['efl_x_mm'], 3)}")
-    field = "-" if row["half_field_deg"] is None else f"{row['half_field_deg']:.4g}°"
-    counts = [str(row[key] or "-") for key in ("refractions", "aspheres", "cylinders", "states")]
-    figures = [efl, number(row["back_focus_mm"]), number(row["f_number"], 3), field, number(row["image_radius_mm"])]
-    return [row["lens"], one_line(row["name"], 40), *figures, *counts, row["rims"], row["verdict"]]
 
 
 def _rims_text(lens: prescription.Lens, data: dict[str, Any], rims: list[Rim]) -> str:

@@ -13,6 +13,7 @@ from neurolens.base.errors import InputError, NeurolensError
 from neurolens.base.files import atomic_path, atomic_write_text, library, read_kept, safe_name, write_kept
 from neurolens.base.lensname import lens_id_of
 from neurolens.cli.arguments import Reporting, check_run_folder, lens, output_path
+from neurolens.cli.lens_list import CHARACTER
 
 if TYPE_CHECKING:
     from neurolens.lens.prescription import Lens
@@ -22,7 +23,6 @@ _SHOWN = {
     "mtf-height": "MTF against image height", "distortion": "Distortion", "vignetting": "Vignetting",
     "colour": "Colour",
 }  # fmt: skip
-_BOKEH_FOCUS, _BOKEH_FIELDS = 30, (0.0, 0.6, 0.95)  # focal lengths; shares of the field
 _COLOURS = 96  # in the palette of a picture
 
 
@@ -30,8 +30,8 @@ _COLOURS = 96  # in the palette of a picture
 class Library(Reporting):
     """Write a folder of pages: of each lens its section, spots, MTF, distortion, vignetting, colour, breathing and
     bokeh at three points of the field, its models with error and cost, its source and what is doubtful about it; and an
-    index with search, sorted by year, focal length, speed, error. A lens whose page is there, from the same file
-    by the same version, is kept. Needs the extra "train" (torch)."""
+    index with search, sorted by year, focal length, speed, error and character. A lens whose page is there, from the
+    same file by the same version, is kept. Needs the extra "train" (torch)."""
 
     about: ClassVar[str] = "pages of lenses: pictures, figures, models"
     epilog: ClassVar[str] = """\
@@ -45,7 +45,7 @@ examples:
 
     def run(self) -> int:
         """Write the pages; 1 where a lens could not be shown."""
-        from neurolens.study.describe import lens_files
+        from neurolens.readers.any_format import lens_files
 
         folder = self.out
         check_run_folder(folder, self.called, "--output")
@@ -98,11 +98,11 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
     """Draw a lens and write its page; returns what the index shows."""
     from neurolens.analysis.layout import thumbnail
     from neurolens.base.html import html
-    from neurolens.blender.pack import year_of
     from neurolens.cli.models import models_in
     from neurolens.readers.source import read_text
     from neurolens.setting.check import check_lens
     from neurolens.study import pages
+    from neurolens.study.character import character_or_none
     from neurolens.study.describe import lens_row, rim_doubts, section
 
     row = lens_row(lens, check_lens(lens))
@@ -131,10 +131,15 @@ def _page(lens: Lens, file: Path, folder: Path) -> dict[str, Any]:
     )
     atomic_write_text(folder / "index.html", page)
     best = min((m["rms_um"] for m in models if m["rms_um"] is not None), default=None)
-    keys = ("name", "efl_mm", "f_number", "half_field_deg", "refractions", "states")
+    keys = ("name", "year", "efl_mm", "f_number", "half_field_deg", "refractions", "states")
     times = [pages.number(m, "fused_ns_per_ray.min") or pages.number(m, "ns_per_ray.min") for m in models]
     fastest = min((t for t in times if t), default=None)
-    more = {"ns": fastest, "year": year_of(lens.source), "designer": lens.designer, "rms_um": best, "doubts": doubts}
+    more = {"ns": fastest, "designer": lens.designer, "rms_um": best, "doubts": doubts}
+    more["character"], discs = character_or_none(lens)
+    if discs is not None:
+        more["discs"] = "discs.png"
+        with atomic_path(folder / "discs.png") as part:
+            part.write_bytes(discs)
     return {**{k: row[k] for k in keys}, **more, "layout": thumbnail(section(file))}
 
 
@@ -146,6 +151,7 @@ def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
     from neurolens.analysis.spots import spots
     from neurolens.cli.analyse import analysis_of
     from neurolens.setting.states import set_lens
+    from neurolens.study.character import FIELDS, FOCUS
 
     scene = Scene(set_lens(lens, focus_m=math.inf, focus_mode="best"))
 
@@ -159,10 +165,10 @@ def _drawings(lens: Lens) -> Iterator[tuple[str, str, Any]]:
 
     def bokeh(path: Path) -> None:
         """Lights at infinity, the lens focused near; at three points of the field."""
-        near = 1e-3 * _BOKEH_FOCUS * abs(scene.first_order.efl_mm)
+        near = 1e-3 * FOCUS * abs(scene.first_order.efl_mm)
         edge = max(scene.default_fields())
         blurred = Scene(set_lens(lens, focus_m=near, focus_mode="best"))
-        found = spots(blurred, [share * edge for share in _BOKEH_FIELDS], rings=20, shift_mm=[0.0])
+        found = spots(blurred, [share * edge for share in FIELDS], rings=20, shift_mm=[0.0])
         analysis_of("spots").draw(replace(found, airy_um=math.nan), path, lens.name, f"focused at {near:.3g} m")
 
     yield from ((what, title, drawn(what)) for what, title in _SHOWN.items())
@@ -203,7 +209,8 @@ def _index(records: Sequence[Mapping[str, Any]]) -> str:
         Column("half field (°)", "half_field_deg"), Column("refractions", "refractions"), Column("states", "states"),
         Column("fastest model (ns)", "ns", about="a ray, one core, as C where that was timed"),
         Column("best model (µm)", "rms_um", about="film-equivalent RMS"),
+        *(Column(heading, f"character.{figure}") for figure, heading in CHARACTER.values()),
     )  # fmt: skip
-    missing = {"fault": "", "designer": "", "layout": "", "doubts": ()}
+    missing = {"fault": "", "designer": "", "layout": "", "discs": "", "doubts": ()}
     rows = [{"name": r["lens"], **missing, **r} for r in records]
     return html("library.html", title="Lenses", records=rows, columns=columns)

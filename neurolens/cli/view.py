@@ -48,8 +48,8 @@ examples:
     out: Path = output_path("FILE.html", "page (default: view.html)", Path("view.html"))
     downloads: Sequence[str] = setting(
         _DOWNLOADS, "of glsl, onnx, c, osl what the page brings as files of each form (default: all; osl takes seconds "
-        "a form, a minute of a zoom, once); the last are left out where the page grows beyond 3 MB, exact lenses' "
-        "first", kind=_kinds, metavar="KINDS",
+        "a form, a minute of a zoom, once); the last are left out where the page grows beyond 3 MB, or 40 kB a lens, "
+        "exact lenses' first", kind=_kinds, metavar="KINDS",
     )  # fmt: skip
     jobs: int = setting_of(Build, "jobs", Build.jobs)
 

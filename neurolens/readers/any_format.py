@@ -143,3 +143,8 @@ def collection_of(folder: Path) -> Collection:
         known = ", ".join(sorted(SUFFIXES))
         raise InputError(folder, "FOLDER", f"({sum(others.values())} files of other kinds)", f"lens files: {known}")
     return Collection(folder, tuple(names), others)
+
+
+def lens_files(folder: Path) -> list[Path]:
+    """The lens files of a folder and of its folders, by name; raises InputError as `collection_of`."""
+    return [folder / name for name in collection_of(folder).names]

@@ -14,14 +14,16 @@ from neurolens.analysis.fields import Scene
 from neurolens.analysis.spots import working_f_number
 from neurolens.base import status as st
 from neurolens.base.errors import NeurolensError, warned
+from neurolens.base.lensname import maker_of, year_of
 from neurolens.lens.glass import glass_of
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens
-from neurolens.readers.any_format import collection_of, read_any
+from neurolens.readers.any_format import read_any
 from neurolens.setting.check import Check, check_lens, doubts, film_edge_mm, verdict
 from neurolens.setting.focusing import at_infinity
 from neurolens.setting.pupils import camera_rays, image_radius_mm
 from neurolens.setting.states import set_lens
+from neurolens.study.character import character_or_none
 from neurolens.surrogates.domain import sample_domain
 from neurolens.surrogates.model import Domain
 from neurolens.trace.rays import trace
@@ -179,46 +181,44 @@ def layout_profile(lens: Lens, domain: Domain) -> layout.Layout:
     return layout.layout_profile(Scene(lens, domain.focus_m[0]), domain.film_radius_mm)
 
 
-def lens_files(folder: Path) -> list[Path]:
-    """The lens files of a folder and of its folders, by name; raises InputError as `collection_of`."""
-    return [folder / name for name in collection_of(folder).names]
-
-
 def read_quietly(path: Path) -> Lens:
     """A lens read without warnings, which its check repeats."""
     with warned():
         return read_any(path)
 
 
-def library_row(path: Path, checked: bool = True) -> dict[str, Any]:
+def library_row(path: Path, checked: bool = True, characters: bool = False) -> dict[str, Any]:
     """A lens file in a table of many.
 
-    Returns: lens, file, notes (the warnings of its reader), and `lens_row`, checked or not; of a file that cannot be
-        read the verdict "unreadable" with the error as its doubt.
+    Returns: lens, file, notes (the warnings of its reader), `lens_row`, checked or not, and its character, None unless
+        asked for; of a file that cannot be read the verdict "unreadable" with the error as its doubt.
     """
     with warned(path) as notes:
         try:
             lens = read_any(path)
             row = lens_row(lens, check_lens(lens) if checked else None)
+            row["character"] = character_or_none(lens)[0] if characters else None
         except NeurolensError as error:
             row = {"verdict": "unreadable", "doubts": [str(error).removeprefix(f"{path}: ")]}
     return {"lens": path.stem, "file": str(path), **row, "notes": notes}
 
 
-_STATED = ("name", "stated_efl_mm", "half_field_deg", "image_radius_mm", "refractions", "rims")
+_STATED = ("name", "believed_to_be", "stated_efl_mm", "half_field_deg", "image_radius_mm", "refractions", "rims")
 
 
 def lens_row(lens: Lens, checks: list[Check] | None) -> dict[str, Any]:
     """A lens as read from its file, in a table of many, with its `check_lens` or (None) without.
 
-    Returns: name, efl_mm and efl_x_mm computed (the latter of an anamorphic lens only), stated_efl_mm, back_focus_mm,
-        f_number of the stop, half_field_deg as stated, image_radius_mm as stated, refractions, aspheres, cylinders,
-        states (zoom or focus), rims, verdict ("ok" or "doubtful"; without checks "read"), doubts, and checks: a list of
-        {state, quantity, computed, stated, doubt}.
+    Returns: name, believed_to_be, maker, year, efl_mm and efl_x_mm computed (the latter of an anamorphic lens only),
+        stated_efl_mm, back_focus_mm, f_number of the stop, half_field_deg as stated, image_radius_mm as stated,
+        refractions, aspheres, cylinders, states (zoom or focus), rims, verdict ("ok" or "doubtful"; without checks
+        "read"), doubts, and checks: a list of {state, quantity, computed, stated, doubt}.
     """
     data, cylinders = first_order(lens), sum(s.cylinder is not None for s in lens.surfaces)
     return {
         **{key: getattr(lens, key) for key in _STATED},
+        "maker": maker_of(lens.designer),
+        "year": year_of(lens.source),
         **{key: float(getattr(data, key)) for key in ("efl_mm", "back_focus_mm", "f_number")},
         "efl_x_mm": float(first_order(lens, meridian="x").efl_mm) if cylinders else None,
         "aspheres": sum(s.conic != 0 or bool(s.asphere) for s in lens.surfaces),

@@ -280,7 +280,8 @@ def _followed(o: Arithmetic, figure: Figure, h2: Any, order: int, steepest: floa
     c = figure.curvature
     if is_number(c) and c == 0:
         return Depth(times(h2, sag), slope + o.like(h2, 0.0), 0.0, None)
-    cos2 = o.fma(h2, -(figure.stretch * c * c), 1.0)
+    even = is_number(figure.stretch) and figure.stretch == 0  # a paraboloid
+    cos2 = o.like(h2, 1.0) if even else o.fma(h2, -(figure.stretch * c * c), 1.0)
     cos = o.held_root(cos2, steepest)
     if order == 1:
         return Depth(0.0, c / cos + slope, 0.0, cos2)

@@ -29,8 +29,8 @@ from neurolens.view.shaders import Ghosts, call_of, shared_glsl
 
 SCRIPTS = ("packed.js", "gl.js", "scene.js", "engine.js", "ghosts.js", "layout.js", "main.js")
 SHADERS = ("random.glsl", "scene.glsl", "rays.glsl")
-# A form's download that would carry the page beyond this is left out.
-MOST_BYTES = 3_000_000
+# A form's download that would carry the page beyond this, or beyond so much for each lens, is left out.
+MOST_BYTES, MOST_A_LENS = 3_000_000, 40_000
 _TOGETHER = 6  # lenses of a stream: each says less for those before, and takes longer to unpack
 _AIR, _ARC = 1.01, 4  # a medium of a smaller index is drawn as air; of 65 points of an arc every fourth is drawn
 _CONSTANT = re.compile(r"^const float ([A-Z][A-Z0-9_]*_(?:MM|NM)) = ", re.MULTILINE)
@@ -97,7 +97,7 @@ class ViewLens:
 
 
 def write_page(
-    out: Path, lenses: Sequence[ViewLens], kinds: Sequence[str], most_bytes: int = MOST_BYTES
+    out: Path, lenses: Sequence[ViewLens], kinds: Sequence[str], most_bytes: int | None = None
 ) -> dict[str, Any]:
     """Write the page with these `kinds` of downloads, "glsl" first.
 
@@ -110,6 +110,7 @@ def write_page(
     """
     if not lenses:
         raise InputError(out, "lenses", "(none)", "at least one lens")
+    most_bytes = most_bytes or max(MOST_BYTES, MOST_A_LENS * len(lenses))
     for count in range(len(kinds), 0, -1):
         last, left = kinds[count - 1], list(kinds[count:])
         for given, of_exact in ((lenses, []), (_without_exact(lenses, last), [f"{last} of exact lenses"])):
@@ -142,7 +143,7 @@ def _page(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> str:
         for lens in group:
             own = f"{lens.key}/"
             places = [(name.removeprefix(own), *place) for name, *place in index if name.startswith(own)]
-            entries.append(_entry(lens, kinds) | {"stream": stream, "parts": places})
+            entries.append({"key": lens.key, "name": lens.name, "stream": stream, "parts": places})
     shared = {
         "version": __version__,
         "functions": {name: {"text": text, "call": call} for name, (text, call) in shared_glsl().items()},
@@ -156,8 +157,8 @@ def _page(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> str:
     return html("view.html", title=title, streams=elements, scripts=SCRIPTS)
 
 
-def _entry(lens: ViewLens, kinds: Sequence[str]) -> dict[str, Any]:
-    """The facts that the menu and the first picture need."""
+def _facts(lens: ViewLens, kinds: Sequence[str]) -> dict[str, Any]:
+    """What the controls and the first picture of a lens need, which the page unpacks when the lens is chosen."""
     found = {k: v for k, v in asdict(lens).items() if k not in ("forms", "path", "section", "ghosts")}
     forms = [
         {"kind": f.kind, "method": f.method, **f.program(), "card": f.card, "files": _kept(f, kinds)}
@@ -173,6 +174,8 @@ def _kept(form: Form, kinds: Sequence[str]) -> list[str]:
 
 def _parts(lenses: Sequence[ViewLens], kinds: Sequence[str]) -> Iterator[tuple[str, str | bytes]]:
     """Yield texts and files of lenses, first those that a picture needs: the page unpacks no further than it must."""
+    for lens in lenses:
+        yield f"{lens.key}/facts", json.dumps(_facts(lens, kinds), allow_nan=False).encode()
     for lens in lenses:
         text, outputs = lens.path or ("", ())
         yield f"{lens.key}/lens", json.dumps({"section": lens.section, "outputs": list(outputs)}).encode()

@@ -87,6 +87,10 @@ def test_zip_holds_the_best_of_each_kind_and_takes_more(place: Path, capsys: pyt
     assert {f"shaders/{LENS}.{form}.osl" for form in ("ols-60", "mlp-10x1", "exact")} < names
     assert {"__init__.py", "blender_manifest.toml", "shaders/own.exact.osl"} < names
     entry = next(e for e in facts["lenses"] if e["id"] == LENS)
+    assert entry["maker"] == "Laikin" and 0.4 < entry["character"]["cats_eye"] < 0.7
+    with zipfile.ZipFile(out) as packed:
+        assert {packed.read(entry[name])[:4] for name in ("picture", "bokeh")} == {b"\x89PNG"}
+        assert sum(len(packed.read(entry[name])) for name in ("picture", "bokeh")) < 16_000
     assert (entry["year"], entry["name"]) == (1995, "Double Gauss 50 mm f/1.8") and entry["efl_mm"] == pytest.approx(
         49.64, abs=0.01
     )

@@ -47,7 +47,10 @@ def packed(lens_id: str = "gauss", osl: str = SHADER, picture: bytes | None = No
     ]
     rows: dict[str, Any] = {"distortion_um": [[0.0, 50.0]] * 2, "blur_um": [[9.0, 20.0]] * 2, "light": [[1.0, 0.6]] * 2}
     field = {"radius_mm": [0.0, 21.0], "near_m": 1.0} | rows
-    return PackedLens(lens_id, f"Lens {lens_id}", 49.6, 1.8, "US 2,701,982 (Angenieux, 1955)", picture, forms, field)
+    return PackedLens(
+        lens_id, f"Lens {lens_id}", 49.6, 1.8, "US 2,701,982 (Angenieux, 1955)", picture, forms, field,
+        "Angenieux" if picture else "", {"swirl": 0.4, "bubble": 1.2} if picture else None, picture,
+    )  # fmt: skip
 
 
 def phone() -> PackedLens:
@@ -133,14 +136,29 @@ def test_zip_is_one_that_blender_accepts_and_shows(installed: Path) -> None:
     menu = bpy.data.cameras.new("c").neurolens.bl_rna.properties["lens"]
     assert menu.type == "ENUM"
     module = sys.modules[f"{MODULE}.panel"]
-    assert [item[:2] for item in module.LIBRARY.items] == [
+    assert [item[:2] for item in module.LIBRARY.items["focal_length"]] == [
         ("phone", "Phone lens (5.9 mm f/2.4)"),
         ("broken", "Lens broken (49.6 mm f/1.8, 1955)"),
         ("gauss", "Lens gauss (49.6 mm f/1.8, 1955)"),
         ("zoom", "Lens zoom (49.6 mm f/1.8, 1955)"),
     ]
     pictures = module.LIBRARY.pictures  # without a screen they have no numbers to draw by
-    assert pictures.keys() == {"gauss"} and tuple(pictures["gauss"].image_size) == (8, 8)
+    assert pictures.keys() == {"gauss", "bokeh of gauss"}
+    assert {tuple(pictures[name].image_size) for name in pictures} == {(8, 8)}
+
+
+def test_menu_is_sorted_and_a_chosen_lens_stays_chosen(scene: Any) -> None:
+    """Files keep numbers of lenses, not places in the menu."""
+    props, module = scene.camera.data.neurolens, sys.modules[f"{MODULE}.panel"]
+    props.lens = "zoom"
+    firsts = {}
+    for order in module.facts.ORDERS:
+        props.order = order
+        assert props.lens == "zoom"
+        firsts[order] = module._lens_items(props, bpy.context)[0][:2]
+    assert firsts["focal_length"] == ("phone", "Phone lens (5.9 mm f/2.4)")
+    assert firsts["maker"] == ("gauss", "Angenieux: Lens gauss (49.6 mm f/1.8, 1955)")
+    assert firsts["swirl"] == ("gauss", "Lens gauss (49.6 mm f/1.8, 1955), swirl 0.4")
 
 
 def test_put_on_and_taken_back_leaves_no_trace(scene: Any) -> None:
@@ -412,6 +430,9 @@ class Paper:
     def template_icon_view(self, *args: Any, **look: Any) -> None:
         self.lines.append("[picture]")
 
+    def template_icon(self, icon_value: int, scale: float) -> None:
+        self.lines.append("[bokeh]")
+
     def row(self, align: bool = False) -> Paper:
         return self
 
@@ -429,10 +450,14 @@ def panel(scene: Any) -> list[str]:
     return paper.lines
 
 
-def test_panel_shows_lens_settings_error_and_what_leaves_the_domain(scene: Any) -> None:
+def test_panel_shows_lens_settings_error_and_what_leaves_the_domain(
+    scene: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scene.camera.data.neurolens.lens = "gauss"
+    monkeypatch.setitem(sys.modules[f"{MODULE}.panel"].LIBRARY.bokeh, "gauss", 1)  # 0 without a screen
     lines = panel(scene)
-    assert {"[picture]", "49.6 mm f/1.8, 1955", "<kind:polynomial>", "<kind:exact>", "(neurolens.apply)"} <= set(lines)
+    assert {"<order>", "[bokeh]", "Swirl 0.4, soap bubbles 1.2", "Angenieux, 49.6 mm f/1.8, 1955"} <= set(lines)
+    assert {"[picture]", "<kind:polynomial>", "<kind:exact>", "(neurolens.apply)"} <= set(lines)
     bpy.ops.neurolens.apply()
     camera = scene.camera.data
     camera.cycles_custom["f_number"] = 1.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import os
@@ -13,6 +14,7 @@ from typing import Any
 import pytest
 
 from neurolens.base.errors import InputError
+from neurolens.base.lensname import year_of
 from neurolens.blender.pack import (
     Form,
     PackedLens,
@@ -21,7 +23,6 @@ from neurolens.blender.pack import (
     extension_library,
     user_folders,
     write_pack,
-    year_of,
 )
 
 library = extension_library()
@@ -248,3 +249,42 @@ def test_user_folder_is_where_blender_keeps_it(tmp_path: Path, monkeypatch: pyte
         (place / "blender_manifest.toml").touch()
     assert [p.relative_to(tmp_path).parts[1] for p in user_folders()] == ["10.1", "5.0", "4.5"]
     assert user_folders()[0].parts[-3:] == (".user", "user_default", "neurolens")
+
+
+def facts(lens_id: str, **more: Any) -> Any:
+    """The facts of a lens as the extension has them."""
+    values = {"name": lens_id, "efl_mm": 50.0, "f_number": 2.0, "year": None, "source": "", "picture": None}
+    return library.LensFacts(lens_id=lens_id, variants={}, **{**values, **more})
+
+
+def test_menus_are_sorted_by_each_order() -> None:
+    """By data rising, by character the strongest first, what is not known last; equal lenses keep their order."""
+    some = [
+        facts("a", efl_mm=100.0, f_number=1.4, maker="Zeiss", year=1950, character={"swirl": 0.2, "cats_eye": 0.5}),
+        facts("b", efl_mm=35.0, maker="canon", year=2001, character={"swirl": 0.6, "cats_eye": 0.9}),
+        facts("c", f_number=1.2),
+    ]
+    expected = {
+        "focal_length": "bca", "speed": "cab", "year": "abc", "maker": "bac", "swirl": "bac", "cats_eye": "abc",
+        "bubble": "abc", "softness_um": "abc", "flare": "abc",
+    }  # fmt: skip
+    assert expected.keys() == library.ORDERS.keys()
+    assert {o: "".join(f.lens_id for f in library.ordered(some, o)) for o in library.ORDERS} == expected
+    assert some[1].entry("maker") == "canon: b (35 mm f/2, 2001)" and some[2].entry("maker") == "c (50 mm f/1.2)"
+    assert some[1].entry("swirl") == "b (35 mm f/2, 2001), swirl 0.6"
+    assert some[2].entry("swirl") == some[2].entry("year")
+
+
+def test_maker_character_and_bokeh_go_into_the_zip(tmp_path: Path) -> None:
+    told = dataclasses.replace(lens(), maker="Laikin", character={"swirl": 0.4, "flare": None}, bokeh=b"discs")
+    add_to_folder(tmp_path, told)
+    found = library.read_library([tmp_path])[0]["gauss"]
+    assert (found.maker, found.character, found.bokeh.read_bytes()) == ("Laikin", {"swirl": 0.4}, b"discs")
+    add_to_folder(tmp_path, lens("gauss", ("exact",)))  # another form keeps what it does not bring
+    assert library.read_library([tmp_path])[0]["gauss"].bokeh == found.bokeh
+
+
+def test_characters_are_those_of_the_table() -> None:
+    from neurolens.cli.lens_list import CHARACTER  # no module of Blender's environment needs more than this file
+
+    assert {figure for figure, _ in CHARACTER.values()} == library.CHARACTER.keys()

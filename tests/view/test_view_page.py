@@ -22,7 +22,9 @@ from neurolens.cli import main, view_run
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
 from neurolens.graph.osl import urgent
+from neurolens.lens.prescription import VISIBLE_NM, Lens, Surface
 from neurolens.readers.lensfile import read_lens
+from neurolens.setting.pupils import pupil_plane_z_mm
 from neurolens.setting.states import set_lens
 from neurolens.trace.rays import trace
 from neurolens.trace.surfaces import Rays
@@ -43,9 +45,16 @@ def view(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def data_of(text: str) -> Any:
-    """The page's JSON."""
+    """The page's JSON, with the facts of every lens."""
     size, letters = re.findall(r'id="data" data-bytes="(\d+)">([^<]*)<', text)[0]
-    return json.loads(unpacked(letters, int(size)))
+    data = json.loads(unpacked(letters, int(size)))
+    for lens in data["lenses"]:
+        stream, length = lens["stream"]
+        assert lens.keys() == {"key", "name", "stream", "parts"}  # all else waits in the stream until it is chosen
+        whole = unpacked(re.findall(rf'id="{stream}">([^<]*)<', text)[0], length)
+        ((start, count),) = [(start, count) for name, start, count, _ in lens["parts"] if name == "facts"]
+        lens |= json.loads(whole[start : start + count])
+    return data
 
 
 def unpacked(letters: str, size: int) -> bytes:
@@ -306,3 +315,13 @@ def test_two_files_of_ghosts_of_one_lens_are_refused(
         file.touch()
     assert main(["view", LENS, *map(str, files), "-o", str(tmp_path / "view.html")]) == 2
     assert f"ghosts of {LENS}: got '{files[1]}', expected one file a lens" in capsys.readouterr().err
+
+
+def test_a_paraboloid_has_a_path() -> None:
+    """The cosine of its slope holds no distance until the asphere's terms come: a constant, which no graph carries."""
+    rows = (
+        Surface(30.0, 5.0, 16.0, 1.5, 60.0, conic=-1.0, asphere=((4, 1e-7),), stop=True), Surface(-200.0, 55.0, 16.0)
+    )  # fmt: skip
+    lens = set_lens(Lens("paraboloid", "", rows, 4.0, half_field_deg=5.0))
+    text, outputs = shaders.path_glsl(lens, pupil_plane_z_mm(lens), VISIBLE_NM)
+    assert "lens_path" in text and len(outputs) > 4

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,10 @@ FACTS = "lenses.json"  # beside shaders/ and thumbnails/, in the extension and i
 SCHEMA = 1
 PASSES = ("alpha", "cryptomatte", "vector")  # passes that differ from those of Blender's own camera
 KINDS = {"polynomial": "Polynomial", "network": "Network", "exact": "Exact"}
+CHARACTER = {  # figures of `neurolens lens list`
+    "cats_eye": "Cat's Eye", "swirl": "Swirl", "bubble": "Soap Bubbles", "softness_um": "Softness", "flare": "Flare",
+}  # fmt: skip
+ORDERS = {"focal_length": "Focal Length", "speed": "Speed", "year": "Year", "maker": "Maker", **CHARACTER}  # of menus
 OLDEST = (4, 5, 0)  # the first Blender whose Cycles runs cameras written in OSL
 BEYOND = 1.02  # a film of 36 x 24 mm over an image circle of 43.2 mm is as lenses are engraved
 NOMINAL = 1.02  # and so is f/1.8 for f/1.83
@@ -76,7 +81,10 @@ class Field:
 
 @dataclass(frozen=True)
 class LensFacts:
-    """One lens of the menu; `variants` by kind; `picture` and `field` are None if there is none."""
+    """One lens of the menu; `variants` by kind, `character` by the keys of `CHARACTER`.
+
+    `picture`, `bokeh` (three discs of light, from the axis outwards) and `field` are None if there is none.
+    """
 
     lens_id: str
     name: str
@@ -87,12 +95,29 @@ class LensFacts:
     picture: Path | None
     variants: dict[str, Variant]
     field: Field | None = None
+    maker: str = ""
+    character: dict[str, float] = dataclasses.field(default_factory=dict)
+    bokeh: Path | None = None
 
     @property
     def line(self) -> str:
         """Focal length, f-number and year."""
         year = "" if self.year is None else f", {self.year}"
         return f"{self.efl_mm:.3g} mm f/{self.f_number:.2g}{year}"
+
+    def value(self, order: str) -> float | str | None:
+        """What an order of `ORDERS` looks at; None where it is not known."""
+        if order in CHARACTER:
+            return self.character.get(order)
+        known = {"speed": self.f_number, "year": self.year, "maker": self.maker.casefold() or None}
+        return known.get(order, self.efl_mm)
+
+    def entry(self, order: str) -> str:
+        """The text of menus in an order."""
+        text, value = f"{self.name} ({self.line})", self.value(order)
+        if order == "maker" and value is not None:
+            return f"{self.maker}: {text}"
+        return text if order not in CHARACTER or value is None else f"{text}, {CHARACTER[order].lower()} {value:.2g}"
 
     @property
     def number(self) -> int:
@@ -122,6 +147,15 @@ def read_library(folders: Sequence[Path]) -> tuple[dict[str, LensFacts], list[st
     return dict(sorted(found.items(), key=lambda item: (item[1].efl_mm, item[0]))), wrong
 
 
+def ordered(lenses: Iterable[LensFacts], order: str) -> list[LensFacts]:
+    """Lenses in an order of `ORDERS`, of a character the strongest first; those where it is not known last."""
+    values = {lens.lens_id: lens.value(order) for lens in lenses}
+    falling = order in CHARACTER and order != "cats_eye"  # of which less is left the more is cut
+    known = [lens for lens in lenses if values[lens.lens_id] is not None]
+    known.sort(key=lambda lens: values[lens.lens_id], reverse=falling)  # type: ignore[arg-type, return-value]
+    return known + [lens for lens in lenses if values[lens.lens_id] is None]
+
+
 def lens_of(folder: Path, entry: dict[str, Any]) -> LensFacts:
     """A lens from its entry in the facts of a folder; raises `DAMAGED` if it is none."""
     variants = {}
@@ -139,7 +173,7 @@ def lens_of(folder: Path, entry: dict[str, Any]) -> LensFacts:
             poor=tuple(map(str, v.get("poor") or ())),
             notes=tuple(map(str, v.get("notes") or ())),
         )
-    picture = entry.get("picture")
+    picture, bokeh = (entry.get(name) and _inside(folder, entry[name]) for name in ("picture", "bokeh"))
     return LensFacts(
         lens_id=str(entry["id"]),
         name=str(entry["name"]),
@@ -147,9 +181,12 @@ def lens_of(folder: Path, entry: dict[str, Any]) -> LensFacts:
         f_number=float(entry["f_number"]),
         year=None if entry.get("year") is None else int(entry["year"]),
         source=str(entry.get("source") or ""),
-        picture=None if picture is None else _inside(folder, picture),
+        picture=picture or None,
         variants=variants,
         field=None if entry.get("field") is None else _field(entry["field"]),
+        maker=str(entry.get("maker") or ""),
+        character={k: float(v) for k, v in (entry.get("character") or {}).items() if k in CHARACTER and v is not None},
+        bokeh=bokeh or None,
     )
 
 

@@ -10,6 +10,7 @@ import bpy
 import bpy.utils.previews
 
 from . import camera as on_camera
+from . import library as facts
 from .library import KINDS, LensError, LensFacts, error_px, notes, outside, read_library, refusals, refused, too_large
 from .needs import needs
 
@@ -30,7 +31,8 @@ class Library:
     def __init__(self) -> None:
         self.lenses: dict[str, LensFacts] = {}
         self.wrong: list[str] = []
-        self.items: list[tuple[str, str, str, int, int]] = []  # kept: Blender does not hold the texts of menus
+        self.items: dict[str, list[tuple[str, str, str, int, int]]] = {}  # kept: Blender does not hold menus' texts
+        self.bokeh: dict[str, int] = {}
         self.pictures: Any = None
 
     def load(self) -> None:
@@ -43,12 +45,20 @@ class Library:
             pass  # not run as an extension
         self.lenses, self.wrong = read_library(folders)
         self.pictures = bpy.utils.previews.new()
-        self.items = []
-        for lens_id, lens in self.lenses.items():
-            icon = 0
-            if lens.picture is not None and lens.picture.is_file():
-                icon = self.pictures.load(lens_id, str(lens.picture), "IMAGE").icon_id
-            self.items.append((lens_id, f"{lens.name} ({lens.line})", lens.source, icon, lens.number))
+        icons = {name: self._icon(name, lens.picture) for name, lens in self.lenses.items()}
+        self.bokeh = {name: self._icon(f"bokeh of {name}", lens.bokeh) for name, lens in self.lenses.items()}
+        self.items = {
+            order: [
+                (lens.lens_id, lens.entry(order), lens.source, icons[lens.lens_id], lens.number)
+                for lens in facts.ordered(self.lenses.values(), order)
+            ]
+            for order in facts.ORDERS
+        }
+
+    def _icon(self, name: str, picture: Path | None) -> int:
+        """The number of a picture, which Blender reads when it is first shown; 0 without one."""
+        shown = picture is not None and picture.is_file()
+        return self.pictures.load(name, str(picture), "IMAGE").icon_id if shown else 0
 
     def close(self) -> None:
         """Let go of the thumbnails."""
@@ -60,8 +70,8 @@ class Library:
 LIBRARY = Library()
 
 
-def _lens_items(_props: Any, _context: Any) -> list[tuple[str, str, str, int, int]]:
-    return LIBRARY.items or [("NONE", "no lenses", "the extension holds none", 0, 0)]
+def _lens_items(props: Any, _context: Any) -> list[tuple[str, str, str, int, int]]:
+    return LIBRARY.items.get(props.order) or [("NONE", "no lenses", "the extension holds none", 0, 0)]
 
 
 def _changed(props: Any, context: Any) -> None:
@@ -85,6 +95,11 @@ class CameraSettings(bpy.types.PropertyGroup):
 
     __annotations__ = {
         "lens": bpy.props.EnumProperty(name="Lens", items=_lens_items, update=_changed),
+        "order": bpy.props.EnumProperty(
+            name="Sort By",
+            description="Order of the menu of lenses; of a character the strongest come first",
+            items=[(key, text, "", number) for number, (key, text) in enumerate(facts.ORDERS.items())],
+        ),
         "kind": bpy.props.EnumProperty(
             name="Form",
             items=[
@@ -230,6 +245,7 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
         for line in LIBRARY.wrong:
             layout.label(text=line, icon="ERROR")
         props = camera.neurolens
+        layout.prop(props, "order")
         layout.template_icon_view(props, "lens", show_labels=True, scale=6.0)
         layout.prop(props, "lens", text="")
         try:
@@ -238,7 +254,12 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
             layout.label(text=str(error), icon="ERROR")
             return
         kind = kind_of(props, lens)
-        layout.label(text=lens.line)
+        layout.label(text=f"{lens.maker}, {lens.line}" if lens.maker else lens.line)
+        if LIBRARY.bokeh.get(lens.lens_id):
+            layout.template_icon(icon_value=LIBRARY.bokeh[lens.lens_id], scale=4.0)
+        if lens.character:
+            told = (f"{facts.CHARACTER[key].lower()} {value:.2g}" for key, value in lens.character.items())
+            _wrapped(layout, ", ".join(told).capitalize(), "LIGHT")
         row = layout.row(align=True)
         row.use_property_split = False  # else the first form's name stands beside its button
         for name in lens.variants:

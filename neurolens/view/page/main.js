@@ -20,6 +20,7 @@ const focusEnds = () => [set.lens.nearest_m, Math.max(100 * set.lens.nearest_m, 
 
 /** The lens's own start: forms, focus on the subject, widest stop. */
 function chooseLens(lens) {
+  if (!lens.forms) Object.assign(lens, jsonOf(lens, "facts"));
   const kinds = lens.forms.map((f) => f.kind), best = ["polynomial", "network", "exact"].find((k) => kinds.includes(k));
   const last = kinds.includes("exact") && best !== "exact" ? "exact" : kinds.find((k) => k !== best) ?? "thin";
   Object.assign(set, { lens, a: kinds.includes(set.a) || set.a === "thin" ? set.a : best, clicked: null, lamp: null });

@@ -1,0 +1,41 @@
+"""The library's index: of each lens its row of `neurolens lens list`, with its character, which take 2 CPU s a lens.
+
+Lenses whose files have not changed keep their rows, unless --restart is given, as after changes of the code. Writes
+lenses/index.jsonl, a line a lens.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from typing import Any
+
+from experiments import lab
+from neurolens.base.files import atomic_write_text, library, sha256_of
+from neurolens.cli.lens_list import INDEX, kept_row, read_index
+from neurolens.readers.any_format import lens_files
+from neurolens.study.describe import library_row
+
+OPTIONS = (lab.AGAIN, lab.QUIET)
+
+
+def rounded(value: Any) -> Any:
+    """Numbers with six digits, which every machine agrees on."""
+    if isinstance(value, dict):
+        return {key: rounded(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [rounded(each) for each in value]
+    return float(f"{value:.6g}") if isinstance(value, float) and math.isfinite(value) else value
+
+
+def run(args: argparse.Namespace) -> None:
+    """Write the index."""
+    folder, kept = library() / "lenses", {} if args.restart else read_index()
+    lines = []
+    for file in lab.counted(lens_files(folder), "lenses", args.quiet):
+        row = kept_row(file, kept) or rounded(library_row(file, characters=True))
+        row = {key: value for key, value in row.items() if key not in ("lens", "file")}
+        lines.append(json.dumps({"file": file.name, "sha256": sha256_of(file), "row": row}, ensure_ascii=False))
+    atomic_write_text(folder / INDEX, "\n".join(lines) + "\n")
+    print(f"{folder / INDEX}: {len(lines)} lenses, {(folder / INDEX).stat().st_size / 1e3:.0f} kB")
