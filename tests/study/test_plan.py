@@ -276,7 +276,7 @@ def test_shaders_cost_what_cycles_took() -> None:
     asked = found.asked
     ns, times = shader_cost(lens, found.places, asked.shot.film_mm, asked.f_number, asked.shot.focus_m)
     count = sum(osl_program(lens, {"count": 0.0}).count().values())
-    assert count == pytest.approx(measured["operations"], rel=0.005)  # a few more have not moved the time since
+    assert count == pytest.approx(measured["operations"], rel=0.01)  # one more a glass since, by its partial dispersion
     assert ns == pytest.approx(measured["ns_min"], rel=0.02)
     place = (np.arange(1000) + 0.5) / 1000
     colour = np.stack([3 * (1 - place) ** 2, 6 * place * (1 - place), 3 * place**2])
