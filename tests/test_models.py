@@ -33,8 +33,8 @@ ROOT = Path(__file__).parents[1]
 MODELS = ROOT / "models"
 INDEX: dict[str, Any] = json.loads((ROOT / "models" / "index.json").read_text(encoding="utf-8"))
 ROWS: list[dict[str, Any]] = INDEX["models"]
-# What is promised: file, figure, limit. Coefficients count A and B terms of one vector output. Polynomials of the double
-# Gauss were promised 2, 1 and 0.25 um while its glasses had no partial dispersion: its colour takes more terms now.
+# What is promised: file, figure, limit. Coefficients count A and B terms of one vector output. Polynomials of the
+# double Gauss were promised 2, 1 and 0.25 um while its glasses had no partial dispersion: its colour takes more terms.
 PROMISED = [
     ("laikin_double_gauss_50.ols-28.onnx", "rms_um", 2.5),
     ("laikin_double_gauss_50.ols-28.onnx", "coefficients_per_vector", 40),
