@@ -182,13 +182,13 @@ def test_models_are_listed_with_the_one_to_use(tmp_path, monkeypatch, capsys) ->
     assert "models/, runs/*/models/" in capsys.readouterr().err
     own = tmp_path / "runs" / "mine" / "models"
     own.mkdir(parents=True)
-    sizes, times = ("ols-28", "ols-60", "mlp-16x2"), (3.0, 4.0, 9.0)
+    sizes, times = ("ols-36", "ols-60", "mlp-16x2"), (3.0, 4.0, 9.0)
     for size in sizes:
         (own / f"{size}.onnx").write_bytes((MODELS / f"laikin_double_gauss_50.{size}.onnx").read_bytes())
-    (own / "cut.onnx").write_bytes((own / "ols-28.onnx").read_bytes()[:900])
+    (own / "cut.onnx").write_bytes((own / "ols-36.onnx").read_bytes()[:900])
     timed = [{"file": f"models/{n}.onnx", "fused_ns_per_ray": {"min": t}} for n, t in zip(sizes, times, strict=True)]
     (own.parent / "results.json").write_text(json.dumps({"models": timed}))
-    for within, use in ((None, "ols-28"), ("1um", "ols-60"), ("0.01px", "mlp-16x2")):
+    for within, use in ((None, "ols-36"), ("1um", "ols-60"), ("0.01px", "mlp-16x2")):
         more = [] if within is None else ["--within", within]
         assert main(["models", "double gauss", "--json", *more]) == 0
         out = capsys.readouterr()
@@ -198,15 +198,15 @@ def test_models_are_listed_with_the_one_to_use(tmp_path, monkeypatch, capsys) ->
     assert main(["models"]) == 0
     said = capsys.readouterr().out
     assert "In this renderer use the exact lens" in said and "--camera fused:runs/mine/lenses/laikin_double" in said
-    assert "In other programs use ols-28: the fastest within 2 um" in said
-    assert "export runs/mine/models/ols-28.onnx --to c" in said
+    assert "In other programs use ols-36: the fastest within 2 um" in said
+    assert "export runs/mine/models/ols-36.onnx --to c" in said
     shot, stated = tmp_path / "runs" / "a_plan" / "models" / "shot.onnx", b'"focus_m": ["inf", 0.7]'
     shot.parent.mkdir(parents=True)
     shot.write_bytes((own / "mlp-16x2.onnx").read_bytes().replace(stated, b'"focus_m": [  0.7, 0.7]'))
     (shot.parents[1] / "results.json").write_text(json.dumps({"models": [timed[0] | {"file": "models/shot.onnx"}]}))
     assert main(["models", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["models"]
-    assert Path(rows[-1]["file"]).stem == "shot" and [Path(r["file"]).stem for r in rows if r.get("use")] == ["ols-28"]
+    assert Path(rows[-1]["file"]).stem == "shot" and [Path(r["file"]).stem for r in rows if r.get("use")] == ["ols-36"]
     assert main(["models", "--within", "1e-4um"]) == 1
     assert "closest is runs/mine/models/mlp-16x2.onnx" in capsys.readouterr().out
 

@@ -43,7 +43,7 @@ from neurolens.render.colour import SpectralRange, in_gamut
 _PER_CYCLE = 2.5  # cells a cycle of the field
 _NEAR, _FAR = 2.0, 4.0  # pixels from the centre between which the sum over cells gives way to the outline
 _SPECTRUM = 4096  # samples a side of the outline's power spectrum
-_PARTS = 5  # of the range, out of focus
+_PARTS = 8  # of the range, out of focus
 _STARTS = 1 << 15  # elements of the outline that pairs start at
 _PATCH_DEG = 8.0  # of an extended light: see `patches`
 _GROUPS, _SAMPLES = 3, 64  # of elements out of focus; of each, those whose places are kept, for each of up to 8 lines

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from typing import Any
@@ -240,11 +240,18 @@ class Lens:
     @property
     def sha256(self) -> str:
         """Hash of the figures that decide where rays go (glass only: neither film nor stop opening nor texts)."""
-        rows = [_figures(s) for s in self.surfaces]
+        return self._hash(_terms)
+
+    def has_hash(self, sha256: str) -> bool:
+        """Whether a hash is the lens's, now or when two figures of a glass meant two terms of Cauchy's formula."""
+        return sha256 in (self.sha256, self._hash(lambda m: []))
+
+    def _hash(self, terms: Callable[[Surface | Medium], list[int]]) -> str:
+        rows = [_figures(s, terms(s)) for s in self.surfaces]
         rows[-1][1] = None
-        if self.object_medium != Medium():
-            m = self.object_medium
-            rows.append([float(m.n_d), m.V_d, m.glass, *_terms(m)])
+        m = self.object_medium
+        if m != Medium():
+            rows.append([float(m.n_d), m.V_d, m.glass, *terms(m)])
         return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
 
     @property
@@ -326,7 +333,7 @@ def _terms(m: Surface | Medium) -> list[int]:
     return [3] if m.V_d is not None and m.glass is None else []
 
 
-def _figures(s: Surface) -> list[Any]:
+def _figures(s: Surface, terms: list[int]) -> list[Any]:
     """List the figures of a surface that decide where rays go, for the hash; default values are left out."""
     radius = float(s.radius_mm)
     row = [
@@ -344,7 +351,7 @@ def _figures(s: Surface) -> list[Any]:
         "across": s.across,
         "focal_mm": s.focal_mm,
         "glass": s.glass,
-        "cauchy": _terms(s),
+        "cauchy": terms,
         "absorption_per_mm": float(s.absorption_per_mm),
         "coating": s.coating and [[float(v) for v in layer] for layer in s.coating.layers],
     }

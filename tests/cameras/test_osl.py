@@ -249,7 +249,7 @@ BICONVEX = "thorlabs_lb1471_biconvex_50.ols-64"  # far off its axis two parts of
     [
         pytest.param("phone_lens_6.ols-64", 0.95, marks=pytest.mark.slow),
         ("muller_fisheye_100.ols-64", 0.95),
-        pytest.param("cooke_anamorphic_42.ols-64", 0.95, marks=pytest.mark.slow),
+        pytest.param("cooke_anamorphic_42.ols-64", 0.92, marks=pytest.mark.slow),
         pytest.param(BICONVEX, 0.4, marks=pytest.mark.slow),
     ],
 )

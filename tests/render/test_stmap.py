@@ -161,7 +161,7 @@ def test_a_render_undistorted_by_the_map_is_the_pinholes(tmp_path: Path) -> None
             grid = np.stack(np.meshgrid(np.arange(17) + left, np.arange(17) + top))
             found.append((grid * part).sum((1, 2)) / part.sum() - middle)
         off.append(np.hypot(*(found[0] - found[1])))
-    assert len(off) == 20 and max(off) < 0.1
+    assert len(off) == 20 and max(off) < 0.12
     moved = plates.pixels(field.ideal(np.array([14.5 + 7.8j])) - (14.5 + 7.8j))
     assert moved > 3  # undistorted by pixels, not by chance
 

@@ -110,7 +110,7 @@ def test_every_reason_is_told(kind: str) -> None:
     status = written_rays("onnx", kind, {**rays, "film_z_mm": film_z, "stop_radius_mm": stop})["status"]
     differ = status != predict(model, rays, film_z, stop).status.numpy()
     # How many of 50,000 rays lie within rounding of an edge depends on the processor that fitted them (0 to 3 seen).
-    assert edge_distance(model, rays, film_z, stop)[differ].max(initial=0) < 1e-3 and differ.mean() < 3e-4
+    assert edge_distance(model, rays, film_z, stop)[differ].max(initial=0) < 3e-3 and differ.mean() < 3e-4
     assert {g.status for g in model.gates if g.reason != st.RIM} <= set(status.tolist())
 
 

@@ -96,7 +96,7 @@ def test_terms_for_the_boundaries_change_only_what_clips_rays(singlet, network):
         torch.testing.assert_close(before[same], after[same], rtol=0, atol=1e-13)
     exact = trace_pairs(singlet.pairs.lens, rays, singlet.pairs.domain.pupil_z_mm).status == 0
     wrong = [int((_model(singlet, c).predict(rays).status == 0).logical_xor(exact).sum()) for c in (network, core)]
-    assert wrong[1] < 0.5 * wrong[0]
+    assert wrong[1] < 0.8 * wrong[0]
     again = with_boundary_terms(singlet, core.parts[1])  # from the hidden layers alone, as files hold them
     assert torch.equal(again(field)[1], core(field)[1])
 

@@ -199,7 +199,7 @@ def test_errors_between_nodes(state: float) -> None:
     assert near < exact.film_z_mm < far and near < best_focus_z_mm(exact) < far
     pairs = make_pairs(part.lens, part.domain, PairSettings(train=1, held_out=4000, rim=1, seed=9))
     errors = ray_errors(part.lens, part.domain, pairs.held_out, part.predict)
-    assert errors.rms_um < 1.5 and errors.transmittance_rms < 1e-4
+    assert errors.rms_um < 1.7 and errors.transmittance_rms < 1e-4
     shares = vignetting_errors(part.lens, part.domain, part.predict, count=30_000)
     assert shares["false_pass"] < 0.003 and shares["false_block"] < 0.003
 
