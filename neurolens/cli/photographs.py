@@ -189,5 +189,5 @@ def _rims_text(found: FittedRims, head: str) -> str:
         place = "in front of the lens" if ring.before == 0 else f"behind surface {ring.before - 1}"
         lines.append(f"ring {ring.distance_mm:.1f} mm {place}, {2 * ring.radius_mm:.2f} mm wide")
     left, closed = max(found.after_stops.values()), found.after_stops[found.closed]
-    lines.append(f"left: at most {left:.2f} stops; rims cannot explain what is left at f/8 ({closed:.2f})")
+    lines.append(f"the light still differs by at most {left:.2f} stops; no rim explains the {closed:.2f} stops at f/8")
     return "\n".join(lines)

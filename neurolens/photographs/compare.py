@@ -84,7 +84,7 @@ def open_light(lens: Lens, height_mm: Array, rims_mm: Array, rear: tuple[float, 
     """Trace the rays of film points at heights [F] of a lens whose film is placed.
 
     Args:
-        rims_mm: [S] the widest radii of rims and stop that will be asked for.
+        rims_mm: [S] the widest radii of rims and stop for which light will be computed.
         rear: radius and z of the disc through which all light comes to the film; None: the last of these rims.
     """
     bare = without_rims(replace(lens, aperture=None))
