@@ -450,6 +450,17 @@ def panel(scene: Any) -> list[str]:
     return paper.lines
 
 
+def test_menus_sorted_by_character_show_bokeh(monkeypatch: pytest.MonkeyPatch, scene: Any) -> None:
+    library = sys.modules[f"{MODULE}.panel"].Library
+    monkeypatch.setattr(library, "_icon", lambda self, name, picture: {"gauss": 3, "bokeh of gauss": 7}.get(name, 1))
+    read = library()
+    read.load()
+    icons = {order: {lens_id: icon for lens_id, _, _, icon, _ in rows} for order, rows in read.items.items()}
+    read.close()
+    assert icons["speed"]["gauss"] == icons["year"]["gauss"] == 3
+    assert icons["swirl"]["gauss"] == icons["bubble"]["gauss"] == 7
+
+
 def test_panel_shows_lens_settings_error_and_what_leaves_the_domain(
     scene: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -47,9 +47,14 @@ class Library:
         self.pictures = bpy.utils.previews.new()
         icons = {name: self._icon(name, lens.picture) for name, lens in self.lenses.items()}
         self.bokeh = {name: self._icon(f"bokeh of {name}", lens.bokeh) for name, lens in self.lenses.items()}
+
+        def shown(order: str, lens_id: str) -> int:
+            """The picture of a lens in a menu: its section; its bokeh where lenses are sorted by their character."""
+            return (self.bokeh[lens_id] if order in facts.CHARACTER else 0) or icons[lens_id]
+
         self.items = {
             order: [
-                (lens.lens_id, lens.entry(order), lens.source, icons[lens.lens_id], lens.number)
+                (lens.lens_id, lens.entry(order), lens.source, shown(order, lens.lens_id), lens.number)
                 for lens in facts.ordered(self.lenses.values(), order)
             ]
             for order in facts.ORDERS
