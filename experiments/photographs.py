@@ -13,6 +13,7 @@ import time
 import warnings
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -25,14 +26,17 @@ from experiments.lab import Row
 from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.base.files import atomic_write_text
 from neurolens.lens.prescription import Lens
+from neurolens.photographs.compare import at_focal_length, light_curves
 from neurolens.photographs.profiles import Profile, database
 from neurolens.photographs.rims import fit_rims
 from neurolens.photographs.verify import DOUBTFUL_PERCENT, Verified, found_for, verify
 from neurolens.readers.any_format import read_any
+from neurolens.setting.rims import RimRule, derive_rims
 
 PERCENTILES = (10, 25, 50, 75, 90)
 BANDS = ("red", "blue")
 WORSE = 0.02  # stops by which an aperture that was left out gets worse
+SHARES = (0.3, 0.4, 0.45, 0.5, 0.55, 0.6, 0.7)  # of the pupil's height at the edge of the field, for derived rims
 
 OPTIONS = (
     lab.option("folder", metavar="FOLDER", type=Path, help="clone of github.com/amegahed/OpticsDatabase"),
@@ -55,7 +59,7 @@ def row_of(file: Path) -> Row | None:
     except NeurolensError as error:
         return row | {"reason": str(error).removeprefix(f"{file}: ")} if "match" in row else None
     row |= {"seconds": time.process_time() - began} | figures(found)
-    return row if row["zoom"] else row | fitted(lens, profiles[0])
+    return row if row["zoom"] else row | fitted(lens, profiles[0]) | derived(lens, profiles[0])
 
 
 def figures(found: Verified) -> Row:
@@ -86,6 +90,24 @@ def fitted(lens: Lens, profile: Profile) -> Row:
     if len(whole.before_stops) > 2:
         found["unused"] = [(f, whole.before_stops[f], fit_rims(lens, profile, [f]).after_stops[f]) for f in widest]
     return found
+
+
+def derived(lens: Lens, profile: Profile) -> Row:
+    """Light at the widest aperture with rims by the rule, by share: root mean square and mean difference, stops."""
+    if not profile.light:
+        return {}
+    focal_mm = profile.light[0].focal_mm
+    lens, lights = at_focal_length(lens, focal_mm), profile.light_at(focal_mm)[:1]
+    edged = replace(lens, image_radius_mm=lens.image_radius_mm or profile.half_diagonal_mm)
+    found = []
+    for share in SHARES:
+        try:
+            ruled = replace(derive_rims(edged, RimRule(share))[0], film_z_mm=lens.film_z_mm)
+            curve = light_curves(ruled, profile, lights)[lights[0].f_number]
+        except InputError:  # a field that no chief ray reaches
+            return {}
+        found.append((curve.rms, float(np.nanmean(curve.computed - curve.measured))))
+    return {"derived": found}
 
 
 def _median(values: Sequence[float]) -> float:
@@ -134,12 +156,29 @@ def _rims_of(some: list[Row]) -> str:
         lines.append(_line(f"{name}: before", (f[k][1] for f in fits if len(f) > k)))
         lines.append(_line(f"{name}: fitted to all", (f[k][2] for f in fits if len(f) > k)))
         lines.append(_line(f"{name}: fitted to all others", (u[k][2] for u in unused)))
-    worse = [after > before + WORSE for u in unused for _, before, after in u]
-    share = f"{100 * np.mean(worse):.0f}% of {len(worse)} apertures that were left out get worse by over {WORSE} stops."
+    worse = [[after > before + WORSE for _, before, after in u] for u in unused]
     rings = sum(r["rings"] > 0 for r in some if r.get("fitted"))
     header = "light, stops (root mean square over heights)|lenses|" + "|".join(f"{q}%" for q in PERCENTILES)
-    told = f"{share} {rings} of {len(fits)} lenses get a ring." if worse else ""
+    told = ""
+    if worse:
+        share = " and ".join(f"{100 * v:.0f}% ({n})" for v, n in zip(np.mean(worse, axis=0), names, strict=True))
+        told = (
+            f"Of {len(worse)} apertures that were left out, {share} get worse by over {WORSE} stops: between others "
+            f"light is interpolated; wider than all others it is not known. {rings} of {len(fits)} lenses get a ring."
+        )
     return lab.page("## Rims fitted to photographs (primes)", lab.table(header, lines), told)
+
+
+def _derived_of(some: list[Row]) -> str:
+    """What the rule for tables without diameters is worth, by the share of the pupil that it keeps."""
+    known = [r for r in some if r["match"] == "certain" and np.isfinite(r.get("derived", np.nan)).all()]
+    lines = [_line("the collection's own rims", (r["widest"] for r in known))]
+    for k, share in enumerate(SHARES):
+        lines.append(_line(f"share {share:g}", (r["derived"][k][0] for r in known)))
+        lines.append(_line(f"share {share:g}: computed less measured", (r["derived"][k][1] for r in known)))
+    header = "light at the widest aperture, stops|lenses|" + "|".join(f"{q}%" for q in PERCENTILES)
+    told = "The share of the pupil's height is that at the edge of the field; the rule takes 0.5."
+    return lab.page("## Rims derived by the rule (primes, certain matches)", lab.table(header, lines), told)
 
 
 def page(rows: list[Row]) -> str:
@@ -157,7 +196,7 @@ def page(rows: list[Row]) -> str:
         f"(median), {seconds.max():.1f} at most; {lab.machine_line()}",
         "Differences are root mean squares over image heights; of a zoom, medians over focal lengths. Colour is that "
         "at the largest height, of lenses whose distortion `verify` does not doubt.",
-        _table_of("Primes", primes), _table_of("Zooms", zooms), _rims_of(primes),
+        _table_of("Primes", primes), _table_of("Zooms", zooms), _rims_of(primes), _derived_of(primes),
         "## The twenty that differ most in distortion",
         lab.table("file|profile|match|difference, %|distortion itself, %", told),
         "## Not compared" if refused else "", lab.table("file|profile|why", refused) if refused else "",

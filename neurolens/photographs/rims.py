@@ -123,7 +123,7 @@ class RimLight:
         """A ring between the beam of the axis (0) and what is lit (1)."""
         place, ring = self.rings[number]
         low, high = self.beam_mm[place], self.lit_mm[place]
-        return ring._replace(radius_mm=float(low + value * (high - low)))
+        return ring._replace(radius_mm=round(float(low + value * (high - low)), 4))
 
     def side(self, front: bool, way: int, value: float) -> Array:
         """What one side lets through, [F, G, G], with scaled rims or a ring."""
@@ -176,7 +176,7 @@ def with_ring(lens: Lens, ring: Ring) -> Lens:
     surfaces = list(lens.surfaces)
     if at:
         before = surfaces[at - 1]
-        row = replace(row, thickness_mm=before.thickness_mm - gap)
+        row = replace(row, thickness_mm=round(before.thickness_mm - gap, 9))
         surfaces[at - 1] = replace(before, thickness_mm=gap)
     surfaces.insert(at, row)
 
@@ -198,8 +198,9 @@ def _with_rings(lens: Lens) -> tuple[list[tuple[int, Ring]], Lens]:
     z = [float(v) for v in lens.vertices_mm]
     _, rear_z = rear_opening_mm(lens, float(lens.film_z_mm or z[-1]))
     last = min(range(len(lens.surfaces)), key=lambda k: abs(z[k] - rear_z))
-    front = [share * z[-2] for share in _FRONT]
-    rear = [share * float(lens.surfaces[last].thickness_mm) for share in _REAR] if lens.surfaces[last].n_d == 1 else []
+    front = [round(share * z[-2], 2) for share in _FRONT]
+    gap = float(lens.surfaces[last].thickness_mm)
+    rear = [round(share * gap, 2) for share in _REAR] if lens.surfaces[last].n_d == 1 else []
     ringed, near = lens, 0.0
     for distance in rear[::-1]:
         ringed = with_ring(ringed, Ring(last + 1, distance, _WIDE_MM))

@@ -89,7 +89,7 @@ def test_a_lens_does_what_its_source_says(name: str) -> None:
     assert verdict(list(checks)) == ("doubtful" if expected else "ok")
     assert len(found) == len(expected), found
     assert all(any(words in doubt for doubt in found) for words in expected), found
-    assert lens.source and lens.rims in ("source", "estimated", "derived")
+    assert lens.source and lens.rims in ("source", "estimated", "derived", "photographs")
     efl = [c for c in checks if c.quantity.startswith("focal length") and c.stated is not None]
     assert all(abs((c.computed or 0) / (c.stated or 1) - 1) < 0.02 for c in efl)
     if lens.rims == "derived":
