@@ -50,6 +50,7 @@ _LOADED = (
     *("neurolens.surrogates.export", "neurolens.render.renderer", "neurolens.render.scene", "neurolens.cameras.build"),
     *("neurolens.cameras.model", "neurolens.render.pictures", "neurolens.setting.check", "neurolens.flare.layers"),
     *("neurolens.cli.render", "neurolens.study.survey", "neurolens.analysis.spots"),
+    "neurolens.photographs.rims",
 )
 OPTIONS = (
     lab.count("cases", 1000, "cases (default 1000)"),

@@ -80,6 +80,8 @@ def _of_lens(chance: Chance, folder: Path) -> Words:
             (2, _flare("lens.toml", *light)[:4]),
             (0.5, ("models", "lens.toml")),
             (0.1, ("survey", "fold", "--no-fit", "-o", "new", "--jobs", "1", "--quiet")),
+            (1, ("verify", "lens.toml", "--profile", "Canon EF 50mm f/1.8", "--lens-file", "out.toml")),
+            (0.5, ("rims", "lens.toml", "--profile", "Canon EF 50mm f/1.4 USM", "-o", "out.toml")),
         ),
     )
 
@@ -237,7 +239,7 @@ def _of_words(chance: Chance, folder: Path) -> Words:
         ["blender", "add", "model.onnx", "--extension", "pack.zip", "--quiet"],
         ["view", "model.onnx", "--downloads", "glsl"],
         ["survey", "fold", "--no-fit", "-o", "new", "--quiet"], ["plan", "scene.toml", "--lens", "missing"],
-        ["train", "missing.toml"], ["mitsuba", "cornell-box"],
+        ["train", "missing.toml"], ["mitsuba", "cornell-box"], ["verify", "lens.toml"], ["rims", "lens.toml"],
     )  # fmt: skip
     words = list(chance.choice(fine))
     options = [o for o in parsers()[words[0]] if o not in _LONG]

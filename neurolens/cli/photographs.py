@@ -139,7 +139,7 @@ class Rims(Glasses, Answering):
     about: ClassVar[str] = "fit the rims of a lens file to photographs of the product"
     epilog: ClassVar[str] = """\
 examples:
-  neurolens rims lenses/sony_sonnar_55.toml -o sonnar.toml
+  neurolens rims lenses/nikon_zoom_70_200.toml -o zoom.toml
   neurolens rims my_lens.toml --profile "Canon EF 50mm f/1.2L USM" --unused 1.4 2"""
     kept: ClassVar[str] = "only a finished lens file is written"
 

@@ -49,6 +49,8 @@ COMMANDS = {
     "experiment": "train EXPERIMENT -o NAME",
     "library": "library {} -o NAME",
     "evaluate": "evaluate MODEL --lens {}",
+    "verify": "verify {} -o NAME.png",
+    "fitted rims": "rims {} -o NAME.toml",
 }
 
 

@@ -1,0 +1,268 @@
+"""Lens cameras for torch: the rays of film points as tensors, with gradients.
+
+Rays are computed without torch's record: as compiled C on the CPU in float32 where the machine has a compiler, else by
+evaluating the camera's graph. Where a gradient is asked for, the graph is evaluated again, for the rays that pass.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neurolens.base import status as st
+from neurolens.base.errors import InputError
+from neurolens.cameras.build import make_camera
+from neurolens.cameras.cameragraph import whole_camera
+from neurolens.cameras.lenscamera import LensCamera as _Camera
+from neurolens.graph.compiler import has_compiler
+from neurolens.graph.interpret import evaluate
+from neurolens.lens.film_plane import LINE_D_NM
+from neurolens.lens.shot import Shot
+
+_SHARE, _LEAST = 0.03, 3e-3  # steps of derivatives by settings: a share of the setting, and 1/m of focus at least
+_AWAY = 2.0  # steps from the shot's setting, beyond which rays are no longer taken as linear in it
+
+
+class LensRays(NamedTuple):
+    """Rays of N film points, in the camera's frame (metres, origin at the film's centre, looking along -z, y up) or, of
+    a camera with a pose, in the world.
+
+    Attributes:
+        origin: [N, 3]. direction: [N, 3] of unit length; along the axis where the ray did not pass.
+        weight: [N] of the ray's radiance: the film value is the mean of the products over the pupil. 0 where it did
+            not pass.
+        status: [N] int32, see `neurolens.base.status`.
+    """
+
+    origin: Tensor
+    direction: Tensor
+    weight: Tensor
+    status: Tensor
+
+
+class LensCamera:
+    """The camera of a lens or of its model, for torch::
+
+        camera = LensCamera("models/laikin_double_gauss_50.ols-60.onnx", Shot((36.0, 24.0), focus_m=2.0))
+        film = camera.film_points(torch.tensor([[320.0, 240.0]]), (960, 640))
+        rays = camera(film, torch.rand(1, 2), pose=torch.eye(4))
+
+    Rays are differentiable once by film points, random numbers, wavelengths and poses, and by the settings of a call:
+    `focus_m`, `f_number` and `zoom`. A setting moves the pupil, too, whose points the random numbers fill; its
+    derivative is the difference of the rays of two cameras, set 3% to both sides. Away from the shot's own
+    setting rays are linear in it (of focus in 1 / distance, of the stop in 1 / f-number), up to 6%.
+
+    Args:
+        camera: a lens file, a model, or what else `make_camera` takes for one of these.
+        shot: the settings of the camera.
+        device, dtype: of the tensors; float64 on the CPU is for checks.
+
+    Raises:
+        InputError, ModelError: as `make_camera`; a camera without a lens.
+    """
+
+    def __init__(
+        self, camera: str | Path, shot: Shot, *, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float32
+    ) -> None:
+        self.spec, self.shot = str(camera), shot
+        self.device, self.dtype = torch.device(device), dtype
+        self._sides: dict[tuple[str, float], tuple[_Lens, _Lens, float]] = {}
+        self._lens = self._made(shot)
+
+    def film_points(self, pixels: Tensor, size: tuple[int, int]) -> Tensor:
+        """Film points [N, 2] in mm of places [N, 2] in a picture of `size` (width, height) pixels, from its upper left.
+
+        The middle of the first pixel is at (0.5, 0.5); the picture on the film stands on its head.
+        """
+        width, height = self.shot.film_mm
+        half = pixels.new_tensor([width / 2, -height / 2])
+        return half - pixels * pixels.new_tensor([width / size[0], -height / size[1]])
+
+    def __call__(
+        self,
+        film_mm: Tensor,
+        square: Tensor,
+        wavelength_nm: Tensor | float = LINE_D_NM,
+        *,
+        pose: Tensor | None = None,
+        **settings: Tensor | float,
+    ) -> LensRays:
+        """The rays of film points.
+
+        Args:
+            film_mm: [N, 2], lens frame: x right and y up as the camera looks.
+            square: [N, 2] random numbers from 0 to 1 that choose the point in the pupil.
+            wavelength_nm: [N], or one number.
+            pose: [3, 4] or [4, 4], or one for each ray, from the camera's frame to the world.
+            settings: `focus_m`, `f_number`, `zoom` (mm), each one number, in place of the shot's.
+
+        Raises:
+            InputError: tensors of other shapes; a setting that the camera does not have, or over 6% from the shot's.
+        """
+        count = len(film_mm)
+        light = torch.as_tensor(wavelength_nm, dtype=self.dtype, device=self.device).expand(count)
+        for name, tensor in (("film_mm", film_mm), ("square", square)):
+            if tensor.shape != (count, 2):
+                raise InputError("LensCamera", name, tuple(tensor.shape), f"a tensor of shape ({count}, 2)")
+        names = tuple(settings)
+        moves = [self._coordinate(name, settings[name]) for name in names]
+        given = [t.to(self.device, self.dtype) for t in (film_mm, square)]
+        found = _Rays.apply(self, names, *given, light, *moves)  # type: ignore[no-untyped-call]
+        origin, direction, weight, status = found[0].T, found[1].T, *found[2:]
+        if settings:  # linear steps make directions longer
+            direction = torch.nn.functional.normalize(direction, dim=1)
+        if pose is not None:
+            turn, place = pose[..., :3, :3], pose[..., :3, 3]
+            origin = (turn @ origin[..., None])[..., 0] + place
+            direction = (turn @ direction[..., None])[..., 0]
+        return LensRays(origin, direction, weight, status)
+
+    def _coordinate(self, name: str, value: Tensor | float) -> Tensor:
+        """How far a setting is from the shot's, in the coordinate in which rays are linear."""
+        if name not in ("focus_m", "f_number", "zoom"):
+            raise InputError("LensCamera", name, value, "one of focus_m, f_number, zoom")
+        number = torch.as_tensor(value, dtype=torch.float64, device=self.device)
+        start, step = self._start(name), self._step(name)
+        moved = (number if name == "zoom" else 1 / number) - start
+        if not abs(float(moved.detach())) <= _AWAY * step * (1 + 1e-6):
+            expected = f"a number within {_AWAY * _SHARE:.0%} of the shot's; make another camera"
+            raise InputError("LensCamera", name, float(number.detach()), expected)
+        return moved
+
+    def _start(self, name: str) -> float:
+        if name == "focus_m":
+            return 1 / self.shot.focus_m
+        if name == "zoom":
+            if not isinstance(self.shot.zoom, (int, float)):
+                raise InputError("LensCamera", "zoom", self.shot.zoom, "a shot whose zoom is a focal length in mm")
+            return float(self.shot.zoom)
+        return 1 / float(self._lens.camera.settings["f_number"])
+
+    def _step(self, name: str) -> float:
+        return max(_SHARE * abs(self._start(name)), _LEAST if name == "focus_m" else 0.0)
+
+    def _beside(self, name: str) -> tuple[_Lens, _Lens, float]:
+        """The lenses on both sides of a setting and the difference of their coordinates; made once."""
+        start, step = self._start(name), self._step(name)
+        if (name, start) not in self._sides:
+            found, ends = [], []
+            for sign in (-1, 1):
+                try:
+                    found.append(self._made(self._at(name, start + sign * step)))
+                    ends.append(sign * step)
+                except InputError:  # beyond what the lens or its model can do
+                    found.append(self._lens)
+                    ends.append(0.0)
+            if ends[0] == ends[1]:
+                raise InputError("LensCamera", name, "(at its only value)", "a setting that this camera can change")
+            self._sides[name, start] = found[0], found[1], ends[1] - ends[0]
+        return self._sides[name, start]
+
+    def _at(self, name: str, coordinate: float) -> Shot:
+        if name == "zoom":
+            return replace(self.shot, zoom=coordinate)
+        if coordinate < 0:
+            raise InputError("LensCamera", name, coordinate, "at most infinity")
+        value = 1 / coordinate if coordinate else math.inf
+        return replace(self.shot, focus_m=value) if name == "focus_m" else replace(self.shot, f_number=value)
+
+    def _made(self, shot: Shot) -> _Lens:
+        return _Lens(self.spec, shot, self.device, self.dtype)
+
+
+class _Lens:
+    """The camera of one shot: its compiled form, or its graph with what that takes of a call."""
+
+    def __init__(self, spec: str, shot: Shot, device: torch.device, dtype: torch.dtype) -> None:
+        camera = make_camera(spec, shot)
+        if not isinstance(camera, _Camera):
+            raise InputError(
+                "LensCamera", "camera", spec, "a lens file or a model, with all of its dispersion and light"
+            )
+        compiled = device.type == "cpu" and dtype == torch.float32 and has_compiler()
+        self.camera = camera.compiled() if compiled else camera
+        self.compiled = compiled
+        lens = camera.lens_graph()
+        self.graph, numbers = whole_camera(camera.film, lens, mask_too=True)
+        self.call = {name: torch.full((1, 1), value, dtype=dtype, device=device) for name, value in numbers.items()}
+        tables = {"outline": camera.film.outline.table}
+        if lens.aperture is not None and lens.aperture.mask is not None:
+            tables["mask"] = lens.aperture.table
+        self.call |= {name: _columns(table, device, dtype) for name, table in tables.items()}
+
+    def outputs(self, film: Tensor, square: Tensor, light: Tensor) -> tuple[Tensor, ...]:
+        """Origins and directions [3, N], weights and status [N] for [N, 2], [N, 2] and [N]; without a record."""
+        if self.compiled:  # numpy turns arrays of two columns ten times as fast as torch
+            rows = [np.ascontiguousarray(t.numpy().T) for t in (film, square)]
+            rays = self.camera.sample(*rows, np.ascontiguousarray(light.numpy()))
+            return tuple(map(torch.from_numpy, (rays.origin_m, rays.direction, rays.weight, rays.status)))
+        origin, direction, weight, status = self.recorded(film, square, light)
+        passed, ahead = status == st.PASSED, film.new_tensor([[0], [0], [-1]])
+        return torch.where(passed, origin, 0.0), torch.where(passed, direction, ahead), weight, status
+
+    def recorded(self, film: Tensor, square: Tensor, light: Tensor) -> tuple[Tensor, ...]:
+        """The same by torch, which follows its gradients."""
+        rays: Mapping[str, Any] = {"film_mm": film.T, "square": square.T, "wavelength_nm": light[None]}
+        found = evaluate(self.graph, rays | self.call)
+        return found["ray"][:3], found["ray"][3:], found["weight"][0], found["status"][0]
+
+
+def _columns(table: Any, device: torch.device, dtype: torch.dtype) -> Tensor:
+    """A table [cells, columns] whose columns are contiguous."""
+    return torch.as_tensor(np.ascontiguousarray(table.T), dtype=dtype, device=device).T
+
+
+class _Rays(torch.autograd.Function):
+    """What `_Lens.outputs` gives, for inputs of its camera and for how far settings are from the shot's."""
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any,
+        camera: LensCamera,
+        names: tuple[str, ...],
+        film: Tensor,
+        square: Tensor,
+        light: Tensor,
+        *moves: Tensor,
+    ) -> tuple[Tensor, ...]:
+        given = [t.detach() for t in (film, square, light)]
+        *found, status = camera._lens.outputs(*given)
+        slopes = []
+        for name, moved in zip(names, moves, strict=True):
+            low, high, apart = camera._beside(name)
+            (*before, status_before), (*after, status_after) = low.outputs(*given), high.outputs(*given)
+            passed = (status_before == st.PASSED) & (status_after == st.PASSED) & (status == st.PASSED)
+            slope = [torch.where(passed, (b - a) / apart, 0.0) for a, b in zip(before, after, strict=True)]
+            found = [value + float(moved) * by for value, by in zip(found, slope, strict=True)]
+            slopes += slope
+        ctx.lens = camera._lens
+        ctx.save_for_backward(*given, status, *slopes)
+        ctx.mark_non_differentiable(status)
+        return *found, status
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, *outer: Tensor) -> tuple[Any, ...]:
+        *given, status = ctx.saved_tensors[:4]
+        slopes, outer = ctx.saved_tensors[4:], outer[:3]
+        wanted: list[Tensor | None] = [None, None, None]
+        needed = [k for k in range(3) if ctx.needs_input_grad[2 + k]]
+        if needed:
+            passed = torch.nonzero(status == st.PASSED)[:, 0]
+            with torch.enable_grad():
+                some = [t[passed].requires_grad_(k in needed) for k, t in enumerate(given)]
+                *found, _ = ctx.lens.recorded(*some)
+            by_found = [o[..., passed] for o in outer]
+            each = torch.autograd.grad(found, [some[k] for k in needed], by_found, allow_unused=True)
+            for k, part in zip(needed, each, strict=True):
+                whole = torch.zeros_like(given[k])
+                wanted[k] = whole if part is None else whole.index_copy(0, passed, part)
+        totals = [(by * o).sum().double() for by, o in zip(slopes, outer * (len(slopes) // 3), strict=True)]
+        return None, None, *wanted, *(sum(totals[k : k + 3]) for k in range(0, len(totals), 3))
