@@ -167,8 +167,8 @@ def chosen(library: Library, names: Sequence[str]) -> tuple[Entry, ...]:
 _HEAD = """# Models that ship
 
 Made by `python -m experiments models` from experiments/models.toml: of every lens of lenses/ the best polynomial of at most
-64 coefficients per vector output, and of the historical ones the best network of two layers of 16 units after 600 iterations,
-over the whole lit film, full aperture, focus from infinity to near and all wavelengths for which the glasses are known;
+64 coefficients per vector output, and of the historical ones and of 34 by name the best network of two layers of 16 units after
+600 iterations, over the whole lit film, full aperture, focus from infinity to near and all wavelengths for which the glasses are known;
 of a few lenses also faster ones. Errors on held-out rays (`neurolens.study.rays`), micrometres at an image radius of
 21.6 mm; every card was checked on fresh rays. Times on one core in onnxruntime and as C compiled here, with stop, rims and transmittance;
 speed-up of onnxruntime over the compiled exact tracer doing the same work in the same run; "–" was not timed, and the times of the others are

@@ -158,13 +158,14 @@ def test_stopped_down_needs_no_new_fit(closed: int) -> None:
 
 
 def test_every_lens_ships_a_polynomial_and_many_a_network() -> None:
-    """A network of every historical lens."""
+    """A network of every historical lens, and of thirty by name."""
     kinds: dict[str, set[bool]] = {}
     for row in ROWS:
         kinds.setdefault(Path(row["lens_file"]).stem, set()).add("mlp" in row["model"])
     assert set(kinds) | set(INDEX["left_out"]) >= {*NAMES, *NAMED} and len(INDEX["left_out"]) <= 3
     assert all(False in found for found in kinds.values())
     assert all(True in kinds[name] for name in NAMES if name in kinds)
+    assert sum(True in kinds[name] for name in NAMED if name in kinds) >= 30
 
 
 def test_the_folder_is_small_and_holds_what_the_index_says() -> None:
