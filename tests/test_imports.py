@@ -75,7 +75,7 @@ LEAN_MODULES = {
 
 
 # Lines of Python that the package may have; a feature that needs more pays by what it replaces.
-MOST_LINES, MOST_MODULES = 59295, 246
+MOST_LINES, MOST_MODULES = 59265, 246
 
 
 def module_name(path: Path) -> str:
