@@ -280,5 +280,5 @@ def kept_outline(key: str, search: Callable[[], PupilOutline | None]) -> PupilOu
 
     if not (found := kept_in_cache(f"{key}.outline", _KEPT, searched)):
         return None
-    arrays = {name: np.array(found.pop(name), np.float32) for name in ("centre", "x", "y")}
+    arrays: dict[str, Any] = {name: np.array(found.pop(name), np.float32) for name in ("centre", "x", "y")}
     return PupilOutline(wavelength_nm=tuple(found.pop("wavelength_nm")), **found, **arrays)
