@@ -19,7 +19,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +43,7 @@ from neurolens.render.settings import FilmSettings
 FOCAL_MM = 50.0
 FOCUS_M, F_NUMBER = 3.9, 2.0
 ROULETTE_FROM = 3  # segments in Mitsuba's count: what our integrator does after two surfaces
-_TRIANGLES = f"triangles ({'Embree' if find_spec('embreex') else 'own tree'})"
+_TRIANGLES = "triangles (Embree)"
 VARIANTS = ("scalar_rgb", "scalar_spectral", "llvm_ad_rgb", "llvm_ad_spectral")
 
 

@@ -17,10 +17,8 @@ from concurrent.futures import Executor, as_completed
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
-import onnx
 import pytest
 from command_line import failure
 from some_tasks import count
@@ -305,10 +303,6 @@ def test_a_lost_scheduler_leaves_what_is_done(
     assert 1 <= len(seen) < 8 and not (tmp_path / "a.exr.tiles").exists()
 
 
-# A file's bytes count the digits of the time in its card, and the checksum covers all of them.
-UNTIMED = re.compile(rb'"(fit_s|load_s|bytes)": [^,]*,|"checksum": "[0-9a-f]{64}"')
-
-
 @pytest.fixture
 def lenses(tmp_path: Path) -> list[Path]:
     """Two lenses that are soon fitted, one beside the other."""
@@ -326,37 +320,17 @@ SMALL = ("pairs.train=1500", "pairs.held_out=1000", "evaluation.vignetting_rays=
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_plots")
-def test_models_of_many_lenses_are_those_of_one_machine(
-    cluster: str,
-    lenses: list[Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+def test_a_lens_that_fails_is_a_line_and_the_others_are_trained(
+    lenses: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     small = [word for each in SMALL for word in ("--set", each)]
-    name, broken = str(lenses[0].relative_to(tmp_path)), tmp_path / "no.toml"
-    broken.write_text("name = 5")
-    there = ("train", "--output", "there", "--rounds", "0", "--quiet", "--dask", cluster, *small, "--lens", name)
-    assert main([*there, "no.toml"]) == 2
+    Path("no.toml").write_text("name = 5")
+    named = ("--lens", "no.toml", str(lenses[0]))
+    assert main(["train", "--output", "runs", "--rounds", "0", "--quiet", *small, *named]) == 2
     err = capsys.readouterr().err
-    assert f"neurolens: no: {broken}: schema: got (missing)" in err and err.count("\n") == 1
-    assert main(["train", "--lens", name, "--output", "here/one", "--rounds", "0", "--quiet", *small]) == 0
-    runs = [tmp_path / place / "one" for place in ("here", "there")]
-    graphs, cards = zip(*(read_model(run / "models" / "ols-12.onnx") for run in runs), strict=True)
-    assert graphs[0] == graphs[1] and cards[0] == cards[1]
-    assert (runs[0] / "config.toml").read_text() == (runs[1] / "config.toml").read_text()
-    before = (runs[1] / "results.json").stat().st_mtime_ns
-    assert main([*there]) == 0
-    assert (runs[1] / "results.json").stat().st_mtime_ns == before
-
-
-def read_model(file: Path) -> tuple[bytes, dict[str, Any]]:
-    """Graph and card, without how long the fit took."""
-    model = onnx.load(file)
-    (card,) = (json.loads(each.value) for each in model.metadata_props if each.key == "neurolens")
-    assert card["fit"].pop("seconds") > 0
-    return model.graph.SerializeToString(deterministic=True), card
+    assert "neurolens: no: no.toml: schema: got (missing)" in err and err.count("\n") == 1
+    assert Path("runs/one/models/ols-12.onnx").is_file()
 
 
 def test_records_of_a_survey_are_those_of_one_machine(

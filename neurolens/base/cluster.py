@@ -17,7 +17,7 @@ import time
 import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import redirect_stdout, suppress
 from dataclasses import fields, is_dataclass, replace
 from functools import cache, lru_cache
@@ -27,7 +27,7 @@ from typing import Any, TypeVar
 from neurolens import __version__
 from neurolens.base.errors import NeurolensError, one_line
 from neurolens.base.files import TemporaryFolder, atomic_path, cache_folder, place_inside
-from neurolens.base.tasks import Failed, Lost, Shared, answer_of, cores, failure, run_each
+from neurolens.base.tasks import Failed, Lost, Shared, answer_of, cores, failure
 
 R = TypeVar("R")
 _MOST = 4096  # tasks in flight: each has a thread here that waits for it
@@ -239,7 +239,6 @@ class _Cluster:
 
 
 T = TypeVar("T")
-_TEXTS = (".json", ".toml", ".html", ".md", ".csv")
 _THEN = (1980, 1, 1, 0, 0, 0)  # the same files are the same bytes
 
 
@@ -290,8 +289,7 @@ def absolute(task: T) -> T:
 def run_with_files(work: Callable[[Any], object], files: Shared, task: Any) -> bytes:
     """Run `work(task)` beside files that were packed by their absolute paths; the files that it wrote, packed.
 
-    Progress and warnings go nowhere. Paths in text files, and in the message of a NeurolensError, are those of the
-    machine that asked.
+    Progress and warnings go nowhere. Paths in the message of a NeurolensError are those of the machine that asked.
     """
     root = Path(_unpacked(files.data).name)
     task = with_paths(task, lambda path: root / str(path).lstrip("/"))
@@ -303,9 +301,6 @@ def run_with_files(work: Callable[[Any], object], files: Shared, task: Any) -> b
             warnings.simplefilter("ignore")
             work(task)
         made = [path for path in sorted(folder.rglob("*")) if path.is_file() and path not in before]
-        for path in made:
-            if path.suffix in _TEXTS:
-                path.write_bytes(path.read_bytes().replace(f"{root}/".encode(), b"/"))
         return packed({str(path.relative_to(folder)): path for path in made})
     except NeurolensError as error:
         raise NeurolensError(str(error).replace(str(root), "")) from None
@@ -320,25 +315,3 @@ def _unpacked(files: bytes) -> TemporaryFolder:
     folder = TemporaryFolder()
     unpack(files, Path(folder.name))
     return folder
-
-
-def run_remotely(
-    executor: Executor, work: Callable[[Any], object], tasks: Mapping[str, Any], common: Iterable[Path], folder: Path,
-    report: Callable[[float], object],
-) -> dict[str, str]:  # fmt: skip
-    """Run `work` for tasks by name, and write what they made below a folder; the reasons of those that failed.
-
-    Args:
-        tasks: each writes another `out`. common: files that they read. report: called with the fraction that is done.
-    """
-    failed: dict[str, str] = {}
-    travelling = {name: absolute(task) for name, task in tasks.items()}
-    names = {task.out: name for name, task in travelling.items()}
-    done = run_each(executor, run_with_files, travelling.values(), work, Shared(packed(common)))
-    for count, (task, answer) in enumerate(done, start=1):
-        if isinstance(answer, Failed):
-            failed[names[task.out]] = answer.reason
-        else:
-            unpack(answer, folder)
-        report(count / len(tasks))
-    return failed

@@ -15,7 +15,7 @@ import stat
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import cache
@@ -337,6 +337,20 @@ def read_kept(path: Path) -> dict[str, Any] | None:
         return data if data.pop(_CHECKSUM) == fingerprint_of([data]) else None
     except (InputError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
+
+
+def kept_in_cache(name: str, most: int, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """The data that an earlier run has kept in the cache under this name, else new data, kept if they can be.
+
+    Of files with this suffix the cache holds the newest `most`.
+    """
+    place = cache_folder() / name
+    if (data := read_kept(place)) is None:
+        data = make()
+        with suppress(OSError, ValueError):  # ValueError: a number is not finite
+            write_kept(place, data)
+        keep_newest(place, most)
+    return data
 
 
 def read_rows(path: Path, what: str) -> list[Mapping[str, Any]]:

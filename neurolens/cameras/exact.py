@@ -5,14 +5,9 @@ These are the only cameras that need torch. They sample the outline of the light
 
 from __future__ import annotations
 
-import io
 import math
 import os
-import struct
-import zipfile
-import zlib
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import asdict
 from functools import cache, cached_property
 from pathlib import Path
@@ -23,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base import status as st
-from neurolens.base.files import atomic_path, cache_folder, fingerprint_of, keep_newest, seal, sealed_bytes, sha256_of
+from neurolens.base.files import fingerprint_of, kept_in_cache, sha256_of
 from neurolens.base.progress import Progress
 from neurolens.cameras.cameragraph import D_FILM, METRES, LensGraph
 from neurolens.cameras.contract import FilmPoints, FloatArray
@@ -248,9 +243,7 @@ def placed_settings(lens: Lens, film_mm: tuple[float, float], focus_m: float) ->
     }
 
 
-_KEPT = 256  # files of 5 to 40 kB
-_LARGEST = 1 << 20  # bytes
-_DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, struct.error, zipfile.BadZipFile, zlib.error)
+_KEPT = 256  # outlines in the cache, of 100 kB or less
 
 
 def search_key(lens: Lens, wavelength_nm: tuple[float, float], shares: tuple[float, ...], *settings: Any) -> str:
@@ -279,37 +272,13 @@ def _code() -> list[str]:
 
 
 def kept_outline(key: str, search: Callable[[], PupilOutline | None]) -> PupilOutline | None:
-    """The outline of a key: from the cache, else what `search` finds, which is kept if a file can be written.
+    """The outline of a key: from the cache, else what `search` finds, which takes seconds."""
 
-    The search takes seconds. Of two runs that write at once either one's file stays; both are right.
-    """
-    file = cache_folder() / f"{key[:32]}.npz"
-    outline = _read(file, key)
-    if outline is not None:
-        return outline
-    outline = search()
-    if outline is not None:
-        with suppress(OSError), atomic_path(file) as temporary:
-            with temporary.open("wb") as stream:
-                arrays: dict[str, Any] = {"key": key} | asdict(outline)
-                np.savez(stream, **arrays)
-            seal(temporary)
-        keep_newest(file, _KEPT)
-    return outline
+    def searched() -> dict[str, Any]:
+        outline = search()
+        return {k: np.asarray(v).tolist() for k, v in asdict(outline).items()} if outline is not None else {}
 
-
-def _read(file: Path, key: str) -> PupilOutline | None:
-    """The outline in a file of this key; None where the file is damaged, of another key, or of another user."""
-    data = sealed_bytes(file)
-    if data is None or len(data) > _LARGEST:
+    if not (found := kept_in_cache(f"{key}.outline", _KEPT, searched)):
         return None
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as file_arrays:
-            arrays = dict(file_arrays)
-        if str(arrays.pop("key")) == key:
-            plane_mm, radius_mm = (arrays.pop(name).item() for name in ("pupil_z_mm", "film_radius_mm"))
-            waves_nm = tuple(np.atleast_1d(arrays.pop("wavelength_nm")).tolist())
-            return PupilOutline(plane_mm, radius_mm, waves_nm, **arrays)
-    except _DAMAGED:
-        pass
-    return None
+    arrays: dict[str, Any] = {name: np.array(found.pop(name), np.float32) for name in ("centre", "x", "y")}
+    return PupilOutline(wavelength_nm=tuple(found.pop("wavelength_nm")), **found, **arrays)

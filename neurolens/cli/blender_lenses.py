@@ -23,15 +23,7 @@ import numpy as np
 import neurolens
 from neurolens.base.bounds import RANGE
 from neurolens.base.errors import InputError, NeurolensError
-from neurolens.base.files import (
-    cache_folder,
-    fingerprint_of,
-    keep_newest,
-    read_kept,
-    safe_name,
-    sha256_of,
-    write_kept,
-)
+from neurolens.base.files import fingerprint_of, kept_in_cache, safe_name, sha256_of
 from neurolens.base.lensname import is_model, lens_id_of, maker_of
 from neurolens.base.tasks import Failed, Here, Processes, run_each
 from neurolens.blender.pack import Form, PackedLens
@@ -80,13 +72,8 @@ def _made_form(file: Path, zoom: str | None, quiet: bool) -> Form:
 def _kept(file: Path, *more: str | None, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """A table that is made from a file and from `more`: the one kept by an earlier run, else a new one, which is
     kept if it can be."""
-    place = cache_folder() / f"{fingerprint_of([_code(), file.name, sha256_of(file), *more])}.form"
-    if (data := read_kept(place)) is None:
-        data = make()
-        with suppress(OSError, ValueError):  # ValueError: a number is not finite
-            write_kept(place, data)
-        keep_newest(place, _KEPT)
-    return data
+    name = f"{fingerprint_of([_code(), file.name, sha256_of(file), *more])}.form"
+    return kept_in_cache(name, _KEPT, make)
 
 
 @cache

@@ -6,7 +6,7 @@ import argparse
 import re
 import shlex
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -14,7 +14,6 @@ from neurolens.base.files import atomic_write_text, library, write_json
 from neurolens.base.records import NOISY, plain, program
 from neurolens.base.settings import setting, setting_of
 from neurolens.cli.arguments import Glasses, Reporting, check_run_folder, lens, output_path
-from neurolens.cli.keys import Frames, frames_group, frames_of
 from neurolens.cli.output import number, table
 from neurolens.cli.trade import answer_trade
 from neurolens.lens.shot import Dispersion, Shot
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
     from neurolens.lens.prescription import Lens
     from neurolens.plan import plan as plans
     from neurolens.plan.candidates import Choice
-    from neurolens.plan.frames import FramesPlan
     from neurolens.render.scene import Scene
 
 
@@ -81,7 +79,6 @@ class Plan(Glasses, Reporting):
 examples:
   neurolens plan experiments/scenes/garden.toml --lens laikin_double_gauss_50 --budget 0.25px
   neurolens plan scene.toml --lens my_lens.toml --budget 1px --for onnx --explain -o runs/plan
-  neurolens plan scene.toml --lens my_lens.toml --frames 1:48 --key focus=1:0.8,48:3
   neurolens plan experiments/scenes/garden.toml --lens laikin_double_gauss_50 --trade
 
 -o leaves plan.json (all of it), effects.png (effects, and where in the picture those are that a camera needs),
@@ -122,13 +119,8 @@ the table), trade.png, trade.json and models/ with what was fitted."""
         False, "draw every camera by its error in pixels and by its seconds to equal noise on one page, with pictures"
     )
     samples: int | None = setting(None, "per pixel, of the pictures of --trade (default: 16)", within=(1, 4096))
-    sample_map: bool = setting(
-        False, "write samples.exr, too, of the scene's size: the diameter of each pixel's blur in pixels (layer blur, "
-        "and R, G and B) and its depth in m (Z), for samplers that give more samples where blur is wide",
-    )  # fmt: skip
     no_fit: bool = setting(False, "fit nothing for the shot")
     out: Path | None = output_path("FOLDER", "for the plan (default: runs/plan-SCENE-LENS)", None)
-    frames: Frames = frames_group("one plan for these frames, whose models are reused: the fewest that keep the budget")
 
     def run(self) -> int:
         """Plan, write, print; 1 where no camera for this target is within the budget."""
@@ -153,38 +145,23 @@ the table), trade.png, trade.json and models/ with what was fitted."""
                 traded = trade(scene, lens, self.budget, **look)
             names = {"scene": str(self.scene), "lens": str(self.lens), "target": self.target}
             return answer_trade(self, traded, folder, f"{scene.name} through {lens.name}", names)
-        if self.frames.frames is not None:
-            return self._plan_frames(self.frames.frames, scene, lens, folder, look)
         return self._plan(scene, lens, folder, look)
 
     def _check(self) -> None:
         """Refuse options that exclude each other."""
-        in_pixels, several = not isinstance(self.budget, (Seconds, Flip)), self.frames.frames is not None
-        if self.trade:
-            others = {
-                "--explain": self.explain, "--sample-map": self.sample_map, "--frames": self.frames.frames,
-                "--key": self.frames.key,
-            }  # fmt: skip
-            for option, value in others.items():
-                if value:
-                    self.refuse(option, "(beside --trade)", "one or the other")
-            if not in_pixels:
-                self.refuse("--budget", f"{self.budget:g}", "pixels, as 0.25px, beside --trade")
-        elif self.samples is not None:
-            self.refuse("--samples", self.samples, "--trade beside it (a map: --sample-map)")
-        if several and (self.zoom is not None or not in_pixels):
-            expected = "a budget in pixels, and the zoom as a key, with --frames"
-            self.refuse("--budget, --zoom", f"{self.budget:g}, {self.zoom}", expected)
-        if several and (self.sample_map or self.explain):
-            self.refuse("--frames", "(with --sample-map or --explain)", "plans of one frame for these")
+        if self.trade and self.explain:
+            self.refuse("--explain", "(beside --trade)", "one or the other")
+        if self.trade and isinstance(self.budget, (Seconds, Flip)):
+            self.refuse("--budget", f"{self.budget:g}", "pixels, as 0.25px, beside --trade")
+        if self.samples is not None and not self.trade:
+            self.refuse("--samples", self.samples, "--trade beside it")
 
     def _plan(self, scene: Scene, lens: Lens, folder: Path, look: Mapping[str, Any]) -> int:
-        """Plan one frame."""
+        """Plan, write and print."""
         from neurolens.plan.plan import plan, plan_seen, plan_within
         from neurolens.plan.plots import plot_effects
 
-        progress = self.progress({"plan": 10} | ({"map of samples": 2} if self.sample_map else {}))
-        with progress.stage("plan") as report:
+        with self.progress({"plan": 10}).stage("plan") as report:
             more = {**look, "zoom": self.zoom, "report": report}
             if isinstance(self.budget, Seconds):
                 result = plan_within(scene, lens, self.budget, **more)
@@ -192,35 +169,12 @@ the table), trade.png, trade.json and models/ with what was fitted."""
                 result = plan_seen(scene, lens, self.budget, **more)
             else:
                 result = plan(scene, lens, self.budget, explain=self.explain, **more)
-        data = self._write(folder, result.to_dict())
+        data: dict[str, Any] = plain({"scene": str(self.scene), "lens": str(self.lens), **result.to_dict()})
+        write_json(folder / "plan.json", data)
         if result.best:
             atomic_write_text(folder / "plan.toml", result.to_toml(lens, folder))
         plot_effects(result, folder / "effects.png", f"{scene.name} through {lens.name}")
-        if self.sample_map:
-            with progress.stage("map of samples"):
-                _write_samples(result, folder / "samples.exr")
         return self.answer(data, lambda: _text(self, result, folder), 0 if result.best else 1)
-
-    def _plan_frames(self, numbers: range, scene: Scene, lens: Lens, folder: Path, look: Mapping[str, Any]) -> int:
-        """Plan an animation; 1 where a frame has no camera within the budget."""
-        from neurolens.plan.frames import Frame, plan_frames
-        from neurolens.render.scene import seen_from
-
-        frames = []
-        for frame, _, at in frames_of(numbers, self.frames.key, {"zoom": self.zoom}, self.called):
-            there = seen_from(scene, self.scene, at.get("position_m"), at.get("look_at_m"))
-            camera = replace(there.settings.camera, **{k: at[k] for k in ("f_number", "focus_m") if k in at})
-            frames.append(Frame(frame, replace(there, settings=replace(there.settings, camera=camera)), at.get("zoom")))
-        with self.progress({"plan": 10}).stage("plan") as report:
-            result = plan_frames(frames, lens, self.budget, report=report, **look)
-        data = self._write(folder, result.to_dict())
-        return self.answer(data, lambda: _frames_text(self, result, folder), 0 if result.cost is not None else 1)
-
-    def _write(self, folder: Path, plan: Mapping[str, Any]) -> dict[str, Any]:
-        """Write plan.json; its content."""
-        data: dict[str, Any] = plain({"scene": str(self.scene), "lens": str(self.lens), **plan})
-        write_json(folder / "plan.json", data)
-        return data
 
 
 def shipped_models(lens: Lens, zoom: str | None) -> list[Path]:
@@ -232,17 +186,6 @@ def shipped_models(lens: Lens, zoom: str | None) -> list[Path]:
     files = sorted((library() / "models").glob(f"{name}.*.onnx"))
     figures = set_lens(lens, zoom=zoom).sha256 if files else ""
     return [file for file in files if read_card(file)["lens"]["sha256"] == figures]
-
-
-def _write_samples(result: plans.Plan, path: Path) -> None:
-    from neurolens.plan.footprints import blur_map
-    from neurolens.render.pictures import standard_attributes, write_exr
-
-    blur, depth = blur_map(result.probed)
-    attributes = standard_attributes(result.probed.exact.settings, *blur.shape[::-1])
-    meaning = {"blur": "diameter in pixels of the disc whose light is as far from its middle, RMS"}
-    rgb = blur[..., None].repeat(3, -1)
-    write_exr(path, rgb, metadata={"meaning": meaning}, layers={"blur": blur, "depth": depth}, attributes=attributes)
 
 
 def _text(command: Plan, result: plans.Plan, folder: Path) -> str:
@@ -308,7 +251,7 @@ def _text(command: Plan, result: plans.Plan, folder: Path) -> str:
         parts.append(
             "\n".join([f"{sentence}{', ' + best.how if best.how else ''}", *_commands(command, result, best, folder)])
         )
-    written = ["plan.json", "effects.png", *["plan.toml"] * bool(best), *["samples.exr"] * command.sample_map]
+    written = ["plan.json", "effects.png", *["plan.toml"] * bool(best)]
     return "\n\n".join([*parts, f"Written: {folder}/{', '.join(written)}"])
 
 
@@ -340,33 +283,3 @@ def _commands(command: Plan, result: plans.Plan, best: Choice, folder: Path) -> 
                 f"{request.f_number:.6g}",
             ]
     return [f"  {program()} {shlex.join(words)}"]
-
-
-def _frames_text(command: Plan, result: FramesPlan, folder: Path) -> str:
-    effects = [
-        (e.name, number(e.worth, 3), "px" if e.unit == "px" else "of light", f"{100 * e.over:.0f}%", e.why)
-        for e in result.effects
-    ]
-    runs = [
-        (f"{r.first}-{r.last}", *(("no camera", "", "", "") if (c := r.choice) is None else
-         (c.name, number(c.error_px, 3), number(c.cost, 3), c.how)))
-        for r in result.runs
-    ]  # fmt: skip
-    models = "no model is" if not result.fits else "1 model is" if result.fits == 1 else f"{result.fits} models are"
-    sentence = f"{models} fitted; probed: frames {', '.join(map(str, result.probed))}"
-    if result.cost is not None:
-        sentence += f"; {number(result.cost, 3)} {result.unit} of a camera on a path times noise, mean of all frames"
-    parts = [
-        table(("effect", "worth", "", "beyond", ""), effects),
-        table(("frames", "camera", "px", result.unit, ""), runs, left=2),
-        sentence,
-    ]
-    if result.target == "render":
-        keys = [word for key in command.frames.key for word in ("--key", key)]
-        for r in result.runs:
-            if r.choice is not None:
-                words = ["render", str(command.scene), "--camera", r.choice.camera, *keys]
-                parts.append(
-                    f"  {program()} {shlex.join([*words, '--frames', f'{r.first}:{r.last}', '-o', 'render.exr'])}"
-                )
-    return "\n\n".join([*parts, f"Written: {folder}/plan.json"])

@@ -30,12 +30,11 @@ class Projection(PictureCommand):
 
       opencv            fx fy cx cy, k1 k2 p1 p2 k3      opencv-rational   and k4 k5 k6
       kannala-brandt    OpenCV's fisheye, k1 k2 k3 k4    f-theta           NVIDIA's polynomials, both ways
-      table             radius over angle                two-axis       of lenses with cylinders: a polynomial an axis
 
     Directions are those of the light's centroid at this stop, from the lens's entrance pupil to what is in focus. With
     -o NAME: NAME.yaml for OpenCV's FileStorage, NAME.json for nerfstudio (its camera block; cx, cy from the corner of
     the first pixel, OpenCV's from its centre), NVIDIA's names for f-theta. A projection that turns back within the
-    field is said, and an error of a planar one beyond 85 degrees. Needs the extra "train" (torch)."""
+    field is said, and an error of a planar one beyond 85 degrees. Needs the extra "train" (scipy)."""
 
     about: ClassVar[str] = "fit a lens with a projection of OpenCV, nerfstudio or NVIDIA"
     epilog: ClassVar[str] = f"""{CAMERAS_HELP}
@@ -44,7 +43,7 @@ examples:
   neurolens projection laikin_double_gauss_50 --width 1920 --film 36x20.25 --projection opencv -o gauss
   neurolens projection models/NAME.onnx --width 1920 --film 36x24 --projection f-theta --focus 2 -o fisheye"""
 
-    projection: Literal["opencv", "opencv-rational", "kannala-brandt", "f-theta", "table", "two-axis"] = setting(
+    projection: Literal["opencv", "opencv-rational", "kannala-brandt", "f-theta"] = setting(
         ..., "the projection to fit", old=("model",)
     )
     out: Path | None = output_path("NAME", "write NAME.json and, for OpenCV's, NAME.yaml", None)
@@ -140,7 +139,7 @@ def _file_storage(fitted: projections.Projection, rms_px: float) -> str:
 
 
 def _block(fitted: projections.Projection) -> dict[str, Any]:
-    """The camera as nerfstudio, or NVIDIA's f-theta, or nobody but us has it."""
+    """The camera as nerfstudio, or NVIDIA's f-theta, or OpenCV has it."""
     size = {"w": fitted.size[0], "h": fitted.size[1]}
     if fitted.kind in ("opencv", "kannala-brandt"):
         cx, cy = (c + 0.5 for c in fitted.centre_px)
@@ -160,20 +159,16 @@ def _block(fitted: projections.Projection) -> dict[str, Any]:
             "max_angle": fitted.widest_rad,
             "linear_cde": [fitted.focal_px[0], 0.0, 0.0],
         }
-    if fitted.kind == "table":
-        steps = len(fitted.coefficients) - 1
-        angle = [math.degrees(fitted.widest_rad) * k / steps for k in range(steps + 1)]
-        return {**size, "angle_deg": angle, "radius_px": list(fitted.coefficients)}
     return {"camera_model": fitted.kind, **size, "focal_px": list(fitted.focal_px), **fitted.named}
 
 
 def _text(data: dict[str, Any], left: projections.Residual) -> str:
     numbers = ", ".join(f"{k} {number(v, 6)}" for k, v in data["coefficients"].items())
     focal, centre = (" x ".join(number(v, 7) for v in data[k]) for k in ("focal_px", "centre_px"))
-    radii = f"scale {focal}" if data["model"] in ("f-theta", "table") else f"focal length {focal}"
+    radii = f"scale {focal}" if data["model"] == "f-theta" else f"focal length {focal}"
     lines = [
         f"{data['camera']}, {data['model']}: {radii}, centre {centre} pixels",
-        *([numbers] if numbers else []),
+        numbers,
         f"leaves {left.rms_px:.3g} pixels RMS, at most {left.worst_px:.3g} (at {left.worst_at_deg:.3g} degrees)",
         table(
             ("field, degrees", "RMS px", "worst px"),

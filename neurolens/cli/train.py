@@ -10,10 +10,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-from neurolens import __version__
-from neurolens.base.cluster import Dask, run_remotely
+from neurolens.base.cluster import Dask
 from neurolens.base.errors import NeurolensError, one_line, printable
-from neurolens.base.files import fingerprint_of, read_bytes, sha256_of
+from neurolens.base.files import read_bytes
 from neurolens.base.lensname import lens_id_of
 from neurolens.base.progress import Progress
 from neurolens.base.records import NOISY, noisy
@@ -26,14 +25,11 @@ from neurolens.cli.arguments import (
     check_run_folder,
     dask,
     lens,
-    more_glasses,
     output_path,
     within,
 )  # fmt: skip
 from neurolens.cli.output import number, table
 from neurolens.study.advice import advice, ns_text
-
-_MARK = "task.sha256"  # in a run folder that came from a cluster
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +54,7 @@ examples:
   neurolens train experiments/quickstart.toml -o runs/try --set render.samples=4 --set pairs.seed=2
   neurolens train --lens lenses/cooke_triplet_50.toml
   neurolens train --lens lenses/cooke_triplet_50.toml --within 0.1px --rounds 0
-  neurolens train --lens lenses/*_50.toml -o runs/fifties --dask tcp://cluster:8786
+  neurolens train --lens lenses/*_50.toml -o runs/fifties
   neurolens train --lens lenses/nikon_zoom_70_200.toml --zoom-range -o runs/zoom
   neurolens train --lens lenses/brendel_tessar_100.toml -o runs/tessar \\
       --set lens.focal_length_mm=50
@@ -95,13 +91,12 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
     rounds: int | None = setting(
         None, "of the race, 0 for none (default: the setting's)", kind=whole(0), metavar="N", old={"no-race": 0}
     )
-    dask: str | None = dask()
     named: bool = True  # whether the command line names `out`
 
     def run(self) -> int:
         """Run the experiment, or one a lens, and print a summary."""
-        if self.dask is not None or (self.lens is not None and len(self.lens) > 1):
-            return self._run_many()
+        if self.lens is not None and len(self.lens) > 1:
+            return self._run_many(self.lens)
         one = self._one(None if self.lens is None else self.lens[0], self.out)
         folder, results = one.folder, one.train(self.progress())
         data = {"folder": str(folder), "report": str(folder / "report.html"), **results}
@@ -152,16 +147,6 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
             parts += ["--set", change]
         return shlex.join(parts)
 
-    @property
-    def files(self) -> list[Path]:
-        """The files that the command line names."""
-        return [*filter(None, [self.experiment]), *(self.lens or ()), *self.glass]
-
-    @property
-    def mark(self) -> str:
-        """Hash of everything that the models depend on: the lens, catalogues of glass, options, the version."""
-        return fingerprint_of([__version__, self.settings, *map(sha256_of, self.files)])
-
     def train(self, progress: Progress) -> dict[str, Any]:
         """Run one experiment; its results."""
         from neurolens.study.experiment import default_experiment, read_experiment
@@ -174,53 +159,20 @@ lenses/ (the lens file, for "neurolens evaluate"), models/ and pictures/."""
             experiment = read_experiment(self.experiment, self.settings)
         return run_experiment(experiment, self.folder, progress=progress, command=self.command)
 
-    def _run_many(self) -> int:
-        """One run a lens, here or on a cluster; a lens that fails is a line, and the exit code is 2 then."""
-        if self.lens is None:
-            self.refuse("--dask", self.dask, "--lens FILE ... beside it")
-        check_ids(self.lens, self.called, "--lens")
+    def _run_many(self, lenses: Sequence[Path]) -> int:
+        """One run a lens; a lens that fails is a line, and the exit code is 2 then."""
+        check_ids(lenses, self.called, "--lens")
         base = self.out if self.out is not None else Path("runs")
         check_run_folder(base, self.called, "--output")
-        progress, failed = self.progress(), dict[str, str]()
-        each = [self._one(file, base / lens_id_of(file)) for file in self.lens]
-        if self.dask is None:
-            for one in each:
-                try:
-                    one.train(progress)
-                except NeurolensError as error:
-                    failed[one.folder.name] = str(error)
-        else:
-            failed = _on_dask(self.dask, each, base, progress)
-        for name, why in failed.items():
-            print(f"neurolens: {one_line(f'{name}: {why}', 3000)}", file=sys.stderr)
-        done = [str(one.folder) for one in each if one.folder.name not in failed]
+        progress, failed, done = self.progress(), dict[str, str](), list[str]()
+        for one in [self._one(file, base / lens_id_of(file)) for file in lenses]:
+            try:
+                one.train(progress)
+                done.append(str(one.folder))
+            except NeurolensError as error:
+                failed[one.folder.name] = str(error)
+                print(f"neurolens: {one_line(f'{one.folder.name}: {error}', 3000)}", file=sys.stderr)
         return self.answer({"folders": done, "failed": failed}, lambda: "\n".join(done), 2 if failed else 0)
-
-
-def _on_dask(address: str, each: Sequence[Train], base: Path, progress: Progress) -> dict[str, str]:
-    """Run on a cluster what is not there yet; the reasons of what failed."""
-    missing = {one.folder.name: one for one in each if _marked(one.folder) != one.mark}
-    base.mkdir(parents=True, exist_ok=True)
-    with progress.stage(f"train {len(missing)} of {len(each)} lenses") as report:
-        if not missing:
-            return {}
-        files = {file for one in missing.values() for file in one.files}
-        with Dask(address) as executor:
-            return run_remotely(executor, train_alone, missing, files, base, report)
-
-
-def train_alone(one: Train) -> None:
-    """One lens, as a task of a cluster; the folder's mark, written last, says that it is whole, and of what."""
-    with more_glasses(one.glass):
-        one.train(Progress(quiet=True))
-    (one.folder / _MARK).write_text(one.mark)
-
-
-def _marked(folder: Path) -> str | None:
-    try:
-        return (folder / _MARK).read_text()
-    except OSError:
-        return None
 
 
 def _text(results: Mapping[str, Any], folder: Path) -> str:

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Literal
@@ -35,7 +35,6 @@ from neurolens.plan.footprints import Footprints
 from neurolens.plan.probe import COUNTED, LIGHT, Probe
 from neurolens.shaders.blender_shader import IDLE, lens_of
 from neurolens.study.experiment import DomainChoice
-from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import fit_model, prepare
 from neurolens.surrogates.fits.polynomial import fit_planes
@@ -331,17 +330,6 @@ def _costed(trial: Trial, tried: Sequence[_Judged]) -> Iterator[Choice]:
         yield trial.costed(j) if id(j) in asked else j.choice
 
 
-def model_choice(
-    probed: Probe, target: Target, file: Path, how: str, costed: bool, work: Work = ALONE
-) -> Choice | None:
-    """A model in the form that the target runs; None where it has none, or its domain is not the shot's."""
-    with warnings.catch_warnings():  # film beyond the end of its range: its error counts
-        warnings.simplefilter("ignore", NeurolensWarning)
-        trial = Trial(probed, target, work=work)
-        judged = next(_model(trial, file, how), None)
-        return None if judged is None else trial.costed(judged) if costed else judged.choice
-
-
 TERMS = (2, 4, 6, 8, 12, 16, 22, 28, 36, 48, 64, 90)  # of the polynomials that are fitted on the spot
 _FIT = ModelSettings("ols", planes=False, elimination=False, idle_gates=IDLE)
 _FIT_MIRROR = replace(_FIT, degree=5)  # of lenses with cylinders: more candidates cost ten times, for the same errors
@@ -359,18 +347,13 @@ def shot_terms(probed: Probe) -> list[int]:
     return [n for n in TERMS if n >= (4 if probed.lens.anamorphic else 2)]
 
 
-def shot_fits(
-    probed: Probe, folder: Path, choice: DomainChoice | None = None, name: str = "shot"
-) -> Callable[[int], tuple[Path, ModelSettings]]:
-    """A function that fits a polynomial of so many terms to a shot alone, or to another domain of its lens.
+def shot_fits(probed: Probe, folder: Path) -> Callable[[int], tuple[Path, ModelSettings]]:
+    """A function that fits a polynomial of so many terms to a shot alone.
 
     It returns the model's file, in the folder, and its settings.
     """
-    lens, domain = probed.lens.with_aperture(None), probed.domain
-    if choice is not None:
-        with suppress(InputError):  # a lens that goes no nearer
-            domain = domain_of(lens, **asdict(choice))
-    plain, model = prepare(make_pairs(lens, domain, PAIRS)), _FIT_MIRROR if lens.anamorphic else _FIT
+    lens = probed.lens.with_aperture(None)
+    plain, model = prepare(make_pairs(lens, probed.domain, PAIRS)), _FIT_MIRROR if lens.anamorphic else _FIT
     folder.mkdir(parents=True, exist_ok=True)
 
     @cache
@@ -378,7 +361,7 @@ def shot_fits(
         return replace(plain, encoding=fit_planes(plain.pairs, plain.encoding, _MOVED_TERMS[1], model.position_weight))
 
     def fit(terms: int) -> tuple[Path, ModelSettings]:
-        settings = replace(model, name=f"{name}-ols-{terms}", terms=terms)
+        settings = replace(model, name=f"shot-ols-{terms}", terms=terms)
         file = folder / f"{probed.lens.lens_id}.{settings.label}.onnx"
         planes = terms >= _MOVED_TERMS[0] and not lens.anamorphic
         export_onnx(fit_model(moved() if planes else plain, settings), file, errors={})

@@ -25,7 +25,6 @@ from neurolens.base.errors import InputError
 from neurolens.base.files import fingerprint_of
 from neurolens.base.kept import CHUNK_BYTES, read_arrays, write_arrays
 from neurolens.cameras.contract import Camera, FloatArray
-from neurolens.render.mesh import tracer
 from neurolens.render.settings import FilmSettings
 
 if TYPE_CHECKING:
@@ -249,8 +248,7 @@ class Film:
 def identity(job: Job) -> dict[str, Any]:
     """Everything that the sums of a film depend on, except the number of samples.
 
-    The scene is its tables, textures and meshes; the camera its settings and its results for some rays. The mesh
-    tracer is included, so that one picture does not mix two roundings.
+    The scene is its tables, textures and meshes; the camera its settings and its results for some rays.
     """
     scene, camera = job.scene, job.camera
     # Given separately, may differ from the scene's.
@@ -264,8 +262,6 @@ def identity(job: Job) -> dict[str, Any]:
         "film_mm": list(job.grid.film_mm),
         **job.picture_settings(),
     }
-    if scene.triangles:
-        identity["meshes traced by"] = tracer()
     return json.loads(json.dumps(identity, default=str))
 
 

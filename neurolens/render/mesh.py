@@ -1,12 +1,4 @@
-"""Triangle meshes: from the tables of a scene to what rays hit; and trees over many spheres or rectangles.
-
-A bounding-volume tree is traversed by whole batches of rays. Nodes have 16 children and leaves 8 shapes: few levels,
-and at each level one dense test of every (ray, node) pair against 16 boxes or 8 shapes, which suits numpy. Triangles
-carry the three planes of Havel and Herout 2010, "Yet faster ray-triangle intersection".
-
-Where the Python binding of Embree is installed (`pip install neurolens[embree]`), Embree takes the place of the tree.
-Hits agree within the rounding of float32.
-"""
+"""Triangle meshes: from the tables of a scene, or its files, to what rays hit, by Embree."""
 
 from __future__ import annotations
 
@@ -14,233 +6,47 @@ import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurolens.base.errors import InputError, NeurolensWarning
+from neurolens.base.errors import InputError, NeurolensError, NeurolensWarning
 from neurolens.cameras.contract import FloatArray
 from neurolens.render.meshfile import TriangleSet, read_file, read_library, read_triangles, whole_values
-from neurolens.render.primitives import NEAREST, FloatArray64, IntArray, Primitive, Rays, Spheres, slabs
+from neurolens.render.primitives import NEAREST, FloatArray64, IntArray, Rays, slabs
 from neurolens.render.scenetables import FARTHEST_M, SMALLEST_M, Material, MeshSettings, Texture, Vector
 
-_BRANCHES, _LEAF = 16, 8
 _LARGEST, _LARGEST_UV = 1e60, 1e6  # areas are finite; texture coordinates have pixels left in float32
-_PAIRS_AT_ONCE = 4096  # keeps the [pairs, 8] temporaries inside the L2 cache
 _STEP = np.float32(1e-5)  # m by which a ray that met its own start surface is moved on
 
 
-def _split(rows: NDArray[np.intp], centres: FloatArray64) -> list[NDArray[np.intp]]:
-    """Up to 16 groups of triangles: the largest group is halved at the median of its longest side, again and again."""
-    groups = [rows]
-    while len(groups) < _BRANCHES:
-        groups.sort(key=len)
-        group = groups.pop()
-        if len(group) <= _LEAF:
-            groups.append(group)
-            break
-        axis = int(np.argmax(np.ptp(centres[group], axis=0)))
-        order = group[np.argsort(centres[group, axis], kind="stable")]
-        # A left half of whole leaves keeps the leaves full.
-        half = max(_LEAF, len(order) // 2 // _LEAF * _LEAF)
-        groups += [order[:half], order[half:]]
-    return groups
+class Mesh:
+    """Triangles [T, 3 corners, 3] in m, for Embree; `each` of them in a row are one surface, from `first` on.
 
-
-def _tree(centres: FloatArray64, low: FloatArray64, high: FloatArray64) -> tuple[list, list, list]:
-    """A tree over triangles of some middles and bounds [T, 3]: of each node boxes [16, 6] and children [16]; leaves.
-
-    A child is a node number, or -1 - leaf number.
+    Raises:
+        NeurolensError: Embree is not installed.
     """
-    boxes: list[FloatArray64] = []
-    children: list[NDArray[np.int32]] = []
-    leaves: list[NDArray[np.intp]] = []
 
-    def build(rows: NDArray[np.intp]) -> int:
-        """Append the node over triangles `rows` and everything below; return its number."""
-        number = len(boxes)
-        box = np.full((_BRANCHES, 6), np.nan)  # no ray meets an empty child, as NaN fails every comparison
-        child = np.zeros(_BRANCHES, np.int32)
-        boxes.append(box)
-        children.append(child)
-        for k, group in enumerate(_split(rows, centres)):
-            box[k] = np.concatenate([low[group].min(axis=0), high[group].max(axis=0)])
-            if len(group) <= _LEAF:
-                child[k] = -1 - len(leaves)
-                leaves.append(np.resize(group, _LEAF))  # short leaves repeat their triangles
-            else:
-                child[k] = build(group)
-        return number
-
-    build(np.arange(len(centres)))
-    return boxes, children, leaves
-
-
-class Tree:
-    """Shapes within boxes, from `low` to `high` [T, 3] m, with a tree over them; shape k is surface `first` + k."""
-
-    def __init__(self, first: int, centres: FloatArray64, low: FloatArray64, high: FloatArray64) -> None:
-        self.first = first
-        boxes, children, leaves = _tree(centres, low, high)
-        self._low, self._high = low.min(axis=0).astype(np.float32), high.max(axis=0).astype(np.float32)
-        bounds = np.array(boxes)  # [nodes, 16, 6]
-        # Slightly wider, so that rounding to float32 never cuts a shape off.
-        grow = 1e-6 * max(1.0, float(np.abs(low).max()), float(np.abs(high).max()))
-        self._node_low = np.ascontiguousarray((bounds[..., :3] - grow).transpose(2, 0, 1), np.float32)
-        self._node_high = np.ascontiguousarray((bounds[..., 3:] + grow).transpose(2, 0, 1), np.float32)
-        self._children = np.array(children)
-        self._leaf_rows = np.array(leaves, np.int32)  # [L, 8]
-
-    def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
-        entry, exit_ = slabs(rays, self._low, self._high)
-        np.minimum(exit_, best, out=exit_)
-        np.maximum(entry, NEAREST, out=entry)
-        ray = np.flatnonzero(entry <= exit_)
-        node = np.zeros(len(ray), np.intp)
-        while ray.size:
-            pair, slot = np.divmod(np.flatnonzero(self._meets_children(rays, best, ray, node)), _BRANCHES)
-            child = self._children[node[pair], slot]
-            ray = ray[pair]
-            is_leaf = child < 0
-            leaf_ray, leaf = ray[is_leaf], -1 - child[is_leaf]
-            for start in range(0, len(leaf), _PAIRS_AT_ONCE):
-                part = slice(start, start + _PAIRS_AT_ONCE)
-                self._meet_leaves(rays, best, found, leaf_ray[part], leaf[part])
-            ray, node = ray[~is_leaf], child[~is_leaf].astype(np.intp)
-
-    def _meets_children(
-        self, rays: Rays, best: FloatArray, ray: NDArray[np.intp], node: NDArray[np.intp]
-    ) -> NDArray[np.bool_]:
-        """Which of the 16 children [pairs, 16] each ray enters before its nearest hit."""
-        entry = np.full((len(ray), _BRANCHES), NEAREST)
-        exit_ = np.repeat(best[ray][:, None], _BRANCHES, axis=1)
-        for k in range(3):
-            origin, inverse = rays.origin[k].take(ray)[:, None], rays.inverse[k].take(ray)[:, None]
-            to_low = self._node_low[k].take(node, axis=0)
-            to_low -= origin
-            to_low *= inverse
-            to_high = self._node_high[k].take(node, axis=0)
-            to_high -= origin
-            to_high *= inverse
-            np.maximum(entry, np.minimum(to_low, to_high), out=entry)
-            np.minimum(exit_, np.maximum(to_low, to_high), out=exit_)
-        return entry <= exit_
-
-    def _meet_leaves(
-        self, rays: Rays, best: FloatArray, found: IntArray, ray: NDArray[np.intp], leaf: IntArray
-    ) -> None:
-        """Test pairs of rays and leaves, and keep the nearest shape of each ray."""
-        raise NotImplementedError
-
-
-class SphereTree(Tree):
-    """Many spheres: a tree of boxes, and the exact test of `Spheres` for the pairs that it leaves over."""
-
-    def __init__(self, first: int, centres: FloatArray64, radii: FloatArray64) -> None:
-        super().__init__(first, centres, centres - radii[:, None], centres + radii[:, None])
-        self._spheres = Spheres(first, centres, radii)
-
-    def _meet_leaves(
-        self, rays: Rays, best: FloatArray, found: IntArray, ray: NDArray[np.intp], leaf: IntArray
-    ) -> None:
-        number = self._leaf_rows[leaf].astype(np.intp).ravel()
-        self._spheres.meet(rays, best, found, number, np.repeat(ray, _LEAF))
-
-
-class Mesh(Tree):
-    """Triangles of corners [T, 3, 3] in m, or rectangles, whose corner 0 lies between the other two."""
-
-    def __init__(self, first: int, corners: FloatArray64, rectangles: bool = False) -> None:
-        far = corners[:, 1:2] + corners[:, 2:] - corners[:, :1]
-        outline = np.concatenate([corners, far], axis=1) if rectangles else corners
-        super().__init__(first, outline.mean(axis=1), outline.min(axis=1), outline.max(axis=1))
-        self._rectangles = rectangles
-        planes = triangle_planes(corners).astype(np.float32)[self._leaf_rows]
-        self._leaf_planes = np.ascontiguousarray(planes.transpose(2, 3, 0, 1))  # [3, 4, leaves, 8]
-
-    def _meet_leaves(
-        self, rays: Rays, best: FloatArray, found: IntArray, ray: NDArray[np.intp], leaf: IntArray
-    ) -> None:
-        """Test pairs of rays and leaves, and keep the nearest triangle of each ray."""
-        origin = [rays.origin[k].take(ray)[:, None] for k in range(3)]
-        direction = [rays.direction[k].take(ray)[:, None] for k in range(3)]
-
-        def plane(index: int, vector: list[FloatArray], offset: bool) -> FloatArray:
-            a, b, c, d = self._leaf_planes[index]
-            value: FloatArray = a.take(leaf, axis=0)
-            value *= vector[0]
-            value += b.take(leaf, axis=0) * vector[1]
-            value += c.take(leaf, axis=0) * vector[2]
-            if offset:
-                value += d.take(leaf, axis=0)
-            return value
-
-        distance = plane(0, origin, True)
-        distance /= -(plane(0, direction, False) + np.float32(1e-30))
-        point = [origin[k] + distance * direction[k] for k in range(3)]
-        u, v = plane(1, point, True), plane(2, point, True)
-        # A sliver of overlap closes the seams that rounding opens between neighbours; NaN fails every comparison.
-        edge = np.float32(-5e-5)
-        most = np.maximum(u, v) if self._rectangles else u + v
-        ok = (distance > NEAREST) & (u >= edge) & (v >= edge) & (most <= 1 - edge)
-        distance[~ok] = np.inf
-        column = np.argmin(distance, axis=1)
-        nearest = distance[np.arange(len(ray)), column]
-        np.minimum.at(best, ray, nearest)
-        won = (nearest == best[ray]) & np.isfinite(nearest)
-        found[ray[won]] = self.first + self._leaf_rows[leaf[won], column[won]]
-
-
-def triangle_planes(corners: FloatArray64) -> FloatArray64:
-    """Plane and barycentric coordinates of triangles [T, 3, 3] as affine functions of a point, [T, 3, 4].
-
-    Row 0 is the distance from the plane, rows 1 and 2 the weights of corners 1 and 2.
-    """
-    a, edge_b, edge_c = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    normal = np.cross(edge_b, edge_c)
-    area2 = np.maximum(np.sum(normal**2, axis=1, keepdims=True), 1e-300)  # a triangle of less is never hit
-    unit = normal / np.sqrt(area2)
-    across_b, across_c = np.cross(edge_c, normal) / area2, np.cross(normal, edge_b) / area2
-    rows = [np.column_stack([n, -np.sum(n * a, axis=1)]) for n in (unit, across_b, across_c)]
-    return np.stack(rows, axis=1)
-
-
-def make_mesh(first: int, vertices: FloatArray64, faces: NDArray[np.int64]) -> Primitive:
-    """Triangles [T, 3] of vertices [V, 3] in m to hit, through Embree if it is installed."""
-    try:
-        return EmbreeMesh(first, vertices, faces)
-    except ImportError:
-        return Mesh(first, vertices[faces])
-
-
-def tracer() -> str:
-    """Name of the tracer that `make_mesh` uses: hits of tracers differ by rounding."""
-    try:
-        _library()
-    except ImportError:
-        return "the built-in tree"
-    return "Embree"
-
-
-def _library() -> tuple[Any, Any]:
-    """The modules of embreex, imported by name as they are untyped."""
-    return import_module("embreex.mesh_construction"), import_module("embreex.rtcore_scene")
-
-
-class EmbreeMesh:
-    """Triangles in an Embree scene, arguments as for `make_mesh`; ImportError where embreex is not installed."""
-
-    def __init__(self, first: int, vertices: FloatArray64, faces: NDArray[np.int64]) -> None:
-        mesh_construction, rtcore_scene = _library()
-        self.first = first
-        corners = np.ascontiguousarray(vertices[faces], np.float32)
+    def __init__(self, first: int, triangles: FloatArray64, each: int = 1) -> None:
+        try:
+            from embreex.mesh_construction import TriangleMesh
+            from embreex.rtcore_scene import EmbreeScene
+        except ImportError:
+            raise NeurolensError("meshes need Embree, which is not installed: pip install embreex") from None
+        self.first, self._each = first, each
+        corners = np.ascontiguousarray(triangles, np.float32)
         # Robust: watertight at the edges that triangles share.
-        self._scene = rtcore_scene.EmbreeScene(robust=True)
-        self._triangles = mesh_construction.TriangleMesh(self._scene, corners)
+        self._scene = EmbreeScene(robust=True)
+        self._triangles = TriangleMesh(self._scene, corners)
         self._low, self._high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+
+    @classmethod
+    def of_rectangles(cls, first: int, corners: FloatArray64) -> Mesh:
+        """Rectangles [T, 3 corners, 3], whose corner 0 lies between the other two: two triangles each."""
+        far = corners[:, 1] + corners[:, 2] - corners[:, 0]
+        others = np.stack([far, corners[:, 2], corners[:, 1]], axis=1)
+        return cls(first, np.stack([corners, others], axis=1).reshape(-1, 3, 3), each=2)
 
     def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
         entry, exit_ = slabs(rays, self._low, self._high)
@@ -259,10 +65,24 @@ class EmbreeMesh:
             distance = hit["tfar"][met] + moved[met]
             ok = (distance > NEAREST) & (distance < best[ray[met]])
             best[ray[met[ok]]] = distance[ok]
-            found[ray[met[ok]]] = self.first + hit["primID"][met[ok]]
+            found[ray[met[ok]]] = self.first + hit["primID"][met[ok]] // self._each
             again = met[distance <= NEAREST]
             ray, moved = ray[again], moved[again] + _STEP
             start = start.take(again, axis=1) + direction.take(again, axis=1) * _STEP
+
+
+def triangle_planes(corners: FloatArray64) -> FloatArray64:
+    """Plane and barycentric coordinates of triangles [T, 3, 3] as affine functions of a point, [T, 3, 4].
+
+    Row 0 is the distance from the plane, rows 1 and 2 the weights of corners 1 and 2.
+    """
+    a, edge_b, edge_c = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(edge_b, edge_c)
+    area2 = np.maximum(np.sum(normal**2, axis=1, keepdims=True), 1e-300)  # a triangle of less is never hit
+    unit = normal / np.sqrt(area2)
+    across_b, across_c = np.cross(edge_c, normal) / area2, np.cross(normal, edge_b) / area2
+    rows = [np.column_stack([n, -np.sum(n * a, axis=1)]) for n in (unit, across_b, across_c)]
+    return np.stack(rows, axis=1)
 
 
 def read_mesh(scene: Path, field: str, settings: MeshSettings, part: TriangleSet | None = None) -> TriangleSet:

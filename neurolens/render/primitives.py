@@ -209,6 +209,7 @@ def slabs(rays: Rays, low: FloatArray, high: FloatArray) -> tuple[FloatArray, Fl
     return entry, exit_
 
 
+MANY_SPHERES = 1024  # beyond, clusters are faster than testing all
 _LARGE_M = 1000.0  # in float32 the surface of larger spheres would lie behind the rays that leave it
 
 
@@ -222,10 +223,14 @@ class Spheres:
     Args:
         first: surface number of the first sphere.
         centres: [S, 3] m. radii: [S] m.
+        rows: numbers of these spheres [S] among all, where they are some of more.
     """
 
-    def __init__(self, first: int, centres: FloatArray64, radii: FloatArray64) -> None:
+    def __init__(
+        self, first: int, centres: FloatArray64, radii: FloatArray64, rows: NDArray[np.intp] | None = None
+    ) -> None:
         self.first = first
+        self._surfaces = first + (np.arange(len(radii)) if rows is None else rows)
         self._kind: type[np.floating[Any]] = np.float64 if radii.max() > _LARGE_M else np.float32
         self._centre: Any = centres.T.astype(self._kind)
         self._radius: Any = radii.astype(self._kind)
@@ -277,4 +282,44 @@ class Spheres:
         ray, distance = ray[hit], distance[hit].astype(np.float32, copy=False)
         np.minimum.at(best, ray, distance)
         won = distance == best.take(ray)
-        found[ray[won]] = self.first + number[hit[won]]
+        found[ray[won]] = self._surfaces[number[hit[won]]]
+
+
+class SphereClusters:
+    """Very many spheres, in clusters of neighbours: a ray is tested against those whose box it enters.
+
+    Arguments as of `Spheres`.
+    """
+
+    def __init__(self, first: int, centres: FloatArray64, radii: FloatArray64) -> None:
+        self.first = first
+        low, high = centres - radii[:, None], centres + radii[:, None]
+        # Boxes are slightly wider, so that rounding to float32 never cuts a sphere off.
+        margin = 1e-6 * max(1.0, float(np.abs(low).max()), float(np.abs(high).max()))
+        self._clusters = [
+            (
+                (low[rows].min(axis=0) - margin).astype(np.float32),
+                (high[rows].max(axis=0) + margin).astype(np.float32),
+                Spheres(first, centres[rows], radii[rows], rows),
+            )
+            for rows in _clusters(np.arange(len(radii)), centres)
+        ]
+
+    def nearer(self, rays: Rays, best: FloatArray, found: IntArray) -> None:
+        for low, high, spheres in self._clusters:
+            entry, exit_ = slabs(rays, low, high)
+            near = np.flatnonzero(np.maximum(entry, NEAREST) <= np.minimum(exit_, best))
+            if near.size:
+                some = Rays(*(rows.take(near, axis=1) for rows in (rays.origin, rays.direction, rays.inverse)))
+                nearest, surface = best[near], found[near]
+                spheres.nearer(some, nearest, surface)
+                best[near], found[near] = nearest, surface
+
+
+def _clusters(rows: NDArray[np.intp], centres: FloatArray64) -> list[NDArray[np.intp]]:
+    """Rows in groups of neighbours: halved at the median of their longest side until they are few enough."""
+    if len(rows) <= MANY_SPHERES:
+        return [rows]
+    axis = int(np.argmax(np.ptp(centres[rows], axis=0)))
+    halves = np.array_split(rows[np.argsort(centres[rows, axis], kind="stable")], 2)
+    return [group for half in halves for group in _clusters(half, centres)]

@@ -20,8 +20,20 @@ from neurolens.render.colour import Index, Palette, SpectralRange
 from neurolens.render.environment import SunLight, make_surroundings
 from neurolens.render.lights import FlatLights, Lights, LightSamples, PointLights, SphereLights
 from neurolens.render.materials import CoatTable
-from neurolens.render.mesh import Mesh, SphereTree, make_mesh, triangle_planes
-from neurolens.render.primitives import AxisQuad, Box, Disc, IntArray, Plane, Primitive, Quad, Rays, Spheres
+from neurolens.render.mesh import Mesh, triangle_planes
+from neurolens.render.primitives import (
+    MANY_SPHERES,
+    AxisQuad,
+    Box,
+    Disc,
+    IntArray,
+    Plane,
+    Primitive,
+    Quad,
+    Rays,
+    SphereClusters,
+    Spheres,
+)
 from neurolens.render.scene import Scene
 from neurolens.render.scenetables import BLACK, Emitter, Material, Texture, Vector
 
@@ -29,7 +41,7 @@ Frame = NDArray[np.float64]
 _STEEPEST = 1e25  # pictures or cells a metre; times the farthest point still finite in float32
 DIFFUSE, GLOSSY, MIRROR, GLASS, NOTHING = range(5)
 _KINDS = {"diffuse": DIFFUSE, "glossy": GLOSSY, "mirror": MIRROR, "glass": GLASS}
-_MANY_QUADS, _MANY_SPHERES = 128, 1024  # beyond, a tree is faster than testing one after the other
+_MANY_QUADS = 128  # beyond, a mesh is faster than testing one after the other
 
 
 def _frame(origin: Frame, u: Frame, v: Frame, size: tuple[float, float]) -> Frame:
@@ -200,7 +212,7 @@ class Assembly:
         if many:
             corners = np.array([(q.corner_m, q.edge_u_m, q.edge_v_m) for q in settings.quads], np.float64)
             corners[:, 1:] += corners[:, :1]
-            self.primitives.append(Mesh(self._count, corners, rectangles=True))
+            self.primitives.append(Mesh.of_rectangles(self._count, corners))
         for quad in settings.quads:
             corner, u, v = (np.array(x, np.float64) for x in (quad.corner_m, quad.edge_u_m, quad.edge_v_m))
             normal = np.cross(u, v) / np.linalg.norm(np.cross(u, v))
@@ -236,7 +248,7 @@ class Assembly:
     def _add_spheres(self) -> None:
         if spheres := self._scene.settings.spheres:
             centres, radii = np.array([s.centre_m for s in spheres]), np.array([s.radius_m for s in spheres])
-            make = SphereTree if len(spheres) > _MANY_SPHERES else Spheres
+            make = SphereClusters if len(spheres) > MANY_SPHERES else Spheres
             self.primitives.append(make(self._count, centres, radii))
         for sphere in spheres:
             self._add(np.zeros((1, 3)), sphere.material, None, sphere)
@@ -244,14 +256,15 @@ class Assembly:
     def _add_meshes(self) -> None:
         for mesh, triangles in zip(self._scene.settings.meshes, self._scene.triangles, strict=True):
             first = self._count
-            self.primitives.append(make_mesh(first, triangles.vertices, triangles.faces))
-            planes = triangle_planes(triangles.vertices[triangles.faces])
+            corners = triangles.vertices[triangles.faces]
+            self.primitives.append(Mesh(first, corners))
+            planes = triangle_planes(corners)
             uv = triangles.uv
             frames = None if uv is None else triangle_frames(planes, uv[triangles.faces])
             self._add(planes[:, 0, :3], mesh.material, frames)
             if triangles.normals is not None:
-                corners = triangles.normals[triangles.faces].astype(np.float32)
-                self.smooth.append((first, planes.astype(np.float32), corners))
+                normals = triangles.normals[triangles.faces].astype(np.float32)
+                self.smooth.append((first, planes.astype(np.float32), normals))
 
 
 _shared: ContextVar[list[World] | None] = ContextVar("worlds", default=None)

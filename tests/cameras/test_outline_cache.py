@@ -8,7 +8,7 @@ import lens_models
 import numpy as np
 import pytest
 
-from neurolens.base.files import atomic_path, cache_folder, seal
+from neurolens.base.files import cache_folder
 from neurolens.base.progress import Progress
 from neurolens.cameras import exact
 from neurolens.cameras.contract import FloatArray
@@ -81,34 +81,22 @@ def test_two_runs_that_search_at_once_agree(folder: Path) -> None:
         return outline()
 
     assert parts(kept_outline(KEY, beaten)) == parts(kept_outline(KEY, never)) == parts(outline())
-    assert [f.suffix for f in folder.iterdir()] == [".npz"]
+    assert [f.suffix for f in folder.iterdir()] == [".outline"]
 
 
-@pytest.mark.parametrize("harm", ["cut", "flipped", "empty", "link", "objects", "other key"])
-def test_damaged_files_are_made_again(folder: Path, tmp_path: Path, harm: str) -> None:
+@pytest.mark.parametrize("harm", ["cut", "flipped", "empty"])
+def test_damaged_files_are_made_again(folder: Path, harm: str) -> None:
     kept_outline(KEY, outline)
     (file,) = folder.iterdir()
     data = bytearray(file.read_bytes())
-    forged = {"key": np.array(KEY), **vars(outline())} | {
-        "objects": {"centre": np.array([{}, {}, {}], object)},
-        "other key": {"key": np.array("another")},
-    }.get(harm, {})
-    if harm == "link":
-        file.rename(tmp_path / "elsewhere")
-        file.symlink_to(tmp_path / "elsewhere")
-    elif harm in ("cut", "flipped", "empty"):
-        data[len(data) // 2] ^= 1
-        file.write_bytes({"cut": data[:-40], "flipped": data, "empty": b""}[harm])
-    else:
-        with atomic_path(file) as temporary:
-            np.savez(temporary, **forged)  # type: ignore[arg-type]
-            seal(temporary)
+    data[len(data) // 2] ^= 1
+    file.write_bytes({"cut": data[:-40], "flipped": data, "empty": b""}[harm])
     assert parts(kept_outline(KEY, lambda: outline(2.0))) == parts(outline(2.0))
     assert parts(kept_outline(KEY, never)) == parts(outline(2.0))
 
 
 def test_a_disk_that_takes_nothing_costs_the_cache_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("neurolens.cameras.exact.atomic_path", full)
+    monkeypatch.setattr("neurolens.base.files.atomic_path", full)
     assert parts(kept_outline(KEY, outline)) == parts(outline())
     assert kept_outline(KEY, lambda: None) is None
 

@@ -3,7 +3,6 @@
 import io
 import json
 import os
-import sys
 import zipfile
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -12,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from render_helpers import FILM, PINHOLE, SIZE, THIN, WHITE, diffuse, files_of_at_most, lit_scene, scene
+from render_helpers import FILM, PINHOLE, SIZE, THIN, files_of_at_most, lit_scene, scene
 
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.contract import CameraRays
@@ -184,20 +183,6 @@ def test_samples_that_are_not_finite_are_dropped_counted_and_remembered(mode: An
     spoilt = (found.stats["passed_fraction"] - black.stats["passed_fraction"]) * 32 * 36 * 24
     assert found.stats["dropped_samples"] == round(spoilt) > 100
     assert np.array_equal(found.layers.variance, black.layers.variance)
-
-
-def test_meshes_traced_by_something_else_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("embreex", reason="embreex is not installed")
-    triangle = {"vertices_m": [[-1, -1, -2], [1, -1, -2], [0, 1, -2]], "faces": [[0, 1, 2]], "material": "m"}
-    with_mesh = scene(environment=WHITE, materials={"m": diffuse(1, 1, 1)}, meshes=[triangle])
-    part, bare = tmp_path / "a.exr.part", tmp_path / "b.exr.part"
-    kept_render(part, scene=with_mesh)
-    kept_render(bare)
-    for name in ("embreex", "embreex.mesh_construction"):
-        monkeypatch.setitem(sys.modules, name, None)  # makes an import fail
-    with pytest.raises(InputError, match="meshes traced by: got 'Embree', expected 'the built-in tree' as asked now"):
-        kept_render(part, scene=with_mesh)
-    kept_render(bare)  # without meshes it is no matter
 
 
 def rewritten(part: Path, change: Callable[[dict[str, bytes]], None], compression: int = zipfile.ZIP_STORED) -> None:

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from render_helpers import diffuse, world
 
-from neurolens.render.mesh import EmbreeMesh, Mesh, SphereTree, make_mesh
-from neurolens.render.primitives import Quad, Rays, Spheres
+from neurolens.base.errors import NeurolensError
+from neurolens.render.mesh import Mesh
+from neurolens.render.primitives import Quad, Rays, SphereClusters, Spheres
 from neurolens.render.world import World
 
 RANDOM = np.random.default_rng(11)
@@ -176,24 +177,25 @@ def test_smooth_normals_follow_the_curve() -> None:
     assert np.sum(smooth * radial, axis=0).min() > 0.9995 > np.sum(flat * radial, axis=0).min()
 
 
-def test_trees_of_many_spheres_and_rectangles_hit_what_each_in_turn_does() -> None:
+def test_many_spheres_and_rectangles_are_hit_as_each_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neurolens.render.primitives.MANY_SPHERES", 10)
     batch, count = rays(4000), 300
     limit = np.where(RANDOM.random(4000) < 0.5, np.inf, RANDOM.uniform(0, 4, 4000)).astype(np.float32)
     centres, radii = RANDOM.normal(size=(count, 3)), RANDOM.uniform(0.01, 0.4, count)
-    (a, tree), (b, each) = (hits(made(7, centres, radii), batch, limit) for made in (SphereTree, Spheres))
-    assert np.array_equal(a, b) and np.array_equal(tree, each) and 0.2 < np.mean(tree >= 0) < 0.98
+    (a, clusters), (b, each) = (hits(made(7, centres, radii), batch, limit) for made in (SphereClusters, Spheres))
+    assert np.array_equal(a, b) and np.array_equal(clusters, each) and 0.2 < np.mean(each >= 0) < 0.98
     edges = RANDOM.normal(size=(count, 2, 3)) * 0.1
     edges[:, 1] -= (
         edges[:, 0] * np.sum(edges[:, 0] * edges[:, 1], axis=1, keepdims=True) / np.sum(edges[:, :1] ** 2, axis=2)
     )
     corners = np.stack([centres, centres + edges[:, 0], centres + edges[:, 1]], axis=1)
-    a, tree = hits(Mesh(7, corners, rectangles=True), batch, limit)
+    a, mesh = hits(Mesh.of_rectangles(7, corners), batch, limit)
     b, each = limit.copy(), np.full(4000, -1, np.int32)
     for k in range(count):
         Quad(7 + k, centres[k], edges[k, 0], edges[k, 1]).nearer(batch, b, each)
-    same = (tree == each) & np.isclose(a, b, rtol=1e-5, atol=1e-5)
-    same |= (tree == each) & np.isinf(a) & np.isinf(b)
-    assert np.mean(~same) < 2e-3 and np.mean(tree >= 0) > 0.1
+    same = (mesh == each) & np.isclose(a, b, rtol=1e-5, atol=1e-5)
+    same |= (mesh == each) & np.isinf(a) & np.isinf(b)
+    assert np.mean(~same) < 2e-3 and np.mean(mesh >= 0) > 0.1
 
 
 def test_a_scene_of_many_lights_is_hit_as_one_of_few(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -207,34 +209,31 @@ def test_a_scene_of_many_lights_is_hit_as_one_of_few(monkeypatch: pytest.MonkeyP
 
     batch, few = rays(4000), made()
     monkeypatch.setattr("neurolens.render.world._MANY_QUADS", 10)
-    monkeypatch.setattr("neurolens.render.world._MANY_SPHERES", 10)
+    monkeypatch.setattr("neurolens.render.world.MANY_SPHERES", 10)
     many = made()
-    assert [type(p).__name__ for p in many._primitives] == ["Mesh", "SphereTree"]
+    assert [type(p).__name__ for p in many._primitives] == ["Mesh", "SphereClusters"]
     (a, there), (b, here) = many.nearest(batch), few.nearest(batch)
     assert np.mean(there != here) < 1e-3 and np.mean(here >= 0) > 0.1
     same = there == here
     assert np.allclose(a[same], b[same], rtol=1e-4) and np.array_equal(many.light, few.light)
 
 
-def test_embree_and_the_tree_give_the_same_hits() -> None:
-    pytest.importorskip("embreex", reason="embreex is not installed: only the tree in numpy is tested")
-    centre = RANDOM.normal(size=(500, 1, 3))
-    corners = (centre + RANDOM.normal(size=(500, 3, 3)) * 0.2).reshape(-1, 3)
-    faces, batch = np.arange(1500).reshape(-1, 3), rays(20000)
+def test_meshes_are_hit_from_close_by_and_within_limits() -> None:
+    corners = RANDOM.normal(size=(500, 1, 3)) + RANDOM.normal(size=(500, 3, 3)) * 0.2
+    batch = rays(5000)
     # Rays that start just off a triangle, as shadow rays do, and limits that some hits are beyond.
-    on = corners[faces].mean(axis=1)[RANDOM.integers(500, size=5000)].T.astype(np.float32)
-    batch.origin[:, :5000] = on + batch.direction[:, :5000] * np.float32(1e-3)
-    limit = np.where(RANDOM.random(20000) < 0.5, np.inf, RANDOM.uniform(0, 12, 20000)).astype(np.float32)
-    (a, tree), (b, embree) = (
-        hits(made, batch, limit) for made in (Mesh(7, corners[faces]), EmbreeMesh(7, corners, faces))
-    )
-    # The tree's triangles are a hair larger.
-    same = (tree == embree) & ((tree < 0) | np.isclose(a, b, rtol=1e-5, atol=1e-5))
-    assert np.mean(~same) < 2e-3 and 0.2 < np.mean(tree >= 0) < 0.9
-    assert np.all(b[embree < 0] == limit[embree < 0]) and np.all(b <= limit)
+    on = corners.mean(axis=1)[RANDOM.integers(500, size=2000)].T.astype(np.float32)
+    batch.origin[:, :2000] = on + batch.direction[:, :2000] * np.float32(1e-3)
+    limit = np.where(RANDOM.random(5000) < 0.5, np.inf, RANDOM.uniform(0, 12, 5000)).astype(np.float32)
+    best, found = hits(Mesh(7, corners), batch, limit)
+    expected = meet_triangles(corners, batch)
+    near = expected < limit
+    assert np.mean((found >= 0) != near) < 2e-3 and 0.2 < np.mean(near) < 0.9
+    same = np.isclose(best, np.where(near, expected, limit), rtol=1e-4, atol=1e-4) | np.isinf(best)
+    assert np.mean(~same) < 2e-3 and np.all(best[found < 0] == limit[found < 0]) and np.all(best <= limit)
 
 
-def test_without_embree_the_tree_takes_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("embreex", "embreex.mesh_construction"):
-        monkeypatch.setitem(sys.modules, name, None)  # makes an import fail
-    assert isinstance(make_mesh(3, np.eye(3), np.array([[0, 1, 2]])), Mesh)
+def test_without_embree_a_mesh_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)  # makes its import fail
+    with pytest.raises(NeurolensError, match="pip install embreex"):
+        Mesh(3, np.eye(3)[None])
