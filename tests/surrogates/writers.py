@@ -48,7 +48,9 @@ def written_rays(language: str, kind: str, rays: Mapping[str, object]) -> Rows:
         return _in_torch(kind, rays)
     feeds = {name: np.float32([rays[name]]) for name in ("film_z_mm", "stop_radius_mm")}
     names = ["scene_ray", "transmittance", "stop_xy_mm", "status"]
-    scene, power, stop, status = _session(kind).run(names, {"rays": np.stack([rays[name] for name in COLUMNS]), **feeds})
+    scene, power, stop, status = _session(kind).run(
+        names, {"rays": np.stack([rays[name] for name in COLUMNS]), **feeds}
+    )
     assert [a.dtype for a in (scene, power, stop, status)] == [np.float32] * 3 + [np.int32]
     found = dict(zip(SCENE_RAY, scene, strict=True))
     return {**found, "transmittance": power, "stop_x_mm": stop[0], "stop_y_mm": stop[1], "status": status}
