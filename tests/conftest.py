@@ -65,6 +65,7 @@ def quick_races() -> Iterator[None]:
         patch.setattr(cli.main, "__defaults__", (None, cache(cli.build_parser)))
         patch.setattr("neurolens.study.speed.POOL", 16384)
         patch.setattr("neurolens.study.speed._SAMPLES", 1)
+        patch.setattr("neurolens.plan.costs._STRIP_PATHS", 12_000)
         yield
 
 

@@ -7,6 +7,7 @@ import tempfile
 import warnings
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from neurolens.lens.prescription import Lens, Surface
 from neurolens.lens.shot import Shot
 from neurolens.readers.lensfile import read_lens
 from neurolens.setting.states import set_lens
-from neurolens.surrogates.card import CARD_KEY, MODEL_KEY
+from neurolens.surrogates.card import CARD_KEY, MODEL_KEY, read_card
 from neurolens.surrogates.domain import domain_of
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.fit import ModelSettings, Prepared, as_model, fit_model, prepare
@@ -76,10 +77,13 @@ def prepared(name: str = GAUSS) -> Prepared:
 
 @cache
 def anamorphic() -> Prepared:
-    """Pairs of a lens with cylinders, focused at infinity: the search for its pupil takes seconds."""
+    """Pairs of a lens with cylinders, focused at infinity, where its shipped model knows the pupil, whose search takes
+    seconds."""
     lens = set_lens(read_lens(LENSES / "cooke_anamorphic_42.toml"))
-    domain = domain_of(lens, film_radius_mm=10.0, focus_m=(math.inf, math.inf))
-    return prepare(make_pairs(lens, domain, PairSettings(5000, 3000, 5000)))
+    known = Domain.from_dict(read_card(LENSES.with_name("models") / "cooke_anamorphic_42.ols-64.onnx")["domain"])
+    far = (known.film_z_mm[0],) * 2
+    shot = {"film_radius_mm": 10.0, "film_z_mm": far, "focus_m": (math.inf, math.inf), "wavelength_nm": (400.0, 700.0)}
+    return prepare(make_pairs(lens, replace(known, **shot), PairSettings(5000, 3000, 5000)))
 
 
 @cache

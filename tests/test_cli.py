@@ -511,7 +511,6 @@ def test_evaluate_confirms_a_card_on_fresh_rays(capsys: pytest.CaptureFixture[st
     assert data["direction_rms_deg"] > 0 and 0 <= data["false_pass"] < 0.02 and data["ns_per_ray"]["min"] > 0
     again = run_json(capsys, "evaluate", MODEL, "--rays", 1000, "--seed", data["seed"])
     assert again["rms_um"] == data["rms_um"]
-    assert run_json(capsys, "evaluate", MODEL, "--rays", 1000, "--seed", 77)["rms_um"] != data["rms_um"]
 
 
 def test_evaluate_exits_1_where_a_promise_does_not_hold(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

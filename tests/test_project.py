@@ -85,14 +85,6 @@ def test_what_is_imported_is_declared_and_what_is_declared_is_imported() -> None
     assert declared(*every) - used == set(), "nothing imports these: declare them no longer"
 
 
-def test_every_declared_package_says_why_it_is_needed() -> None:
-    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-    lines = [PROJECT["dependencies"], *PROJECT["optional-dependencies"].values()]
-    for requirement in (one for each in lines for one in each):
-        for line in (line for line in text.splitlines() if f'"{requirement}"' in line):
-            assert re.search(r"[],] *# \w.{8,}", line), f"{requirement}: no reason beside it"
-
-
 def test_licence_citation_and_changes_are_there_and_name_this_version() -> None:
     assert PROJECT["license"] == "MIT" and (ROOT / "LICENSE").read_text(encoding="utf-8").startswith("MIT License")
     assert "CC0" in (ROOT / "lenses" / "LICENSE").read_text(encoding="utf-8")

@@ -306,11 +306,10 @@ def test_a_lost_scheduler_leaves_what_is_done(
 @pytest.fixture
 def lenses(tmp_path: Path) -> list[Path]:
     """Two lenses that are soon fitted, one beside the other."""
-    text = (ROOT / "lenses" / "cooke_triplet_50.toml").read_text()
     found = [tmp_path / "lenses" / name for name in ("one.toml", "two.toml")]
     found[0].parent.mkdir()
-    for path in found:
-        path.write_text(text)
+    for path, lens in zip(found, ("cooke_triplet_50", "thorlabs_lb1471_biconvex_50"), strict=True):
+        path.write_text((ROOT / "lenses" / f"{lens}.toml").read_text())
     return found
 
 

@@ -161,6 +161,7 @@ def _coated(g: Graph, call: Value, cos_i: Value, cos_t: Value, n_step: Value) ->
     return reduce(lambda total, coefficient: total * u + coefficient, lower, highest).maximum(0.0).minimum(1.0)
 
 
+@lru_cache(maxsize=4096)  # the same for every frame, stop and tracer, and for surfaces that are coated alike
 def reflectance_fit(
     layers: coatings.Layers, n_before: float, n_after: float, wavelength_nm: float, sense: int
 ) -> list[float]:
@@ -268,7 +269,7 @@ class Stack:
             lens.aperture if s.stop else None,
         )
 
-    @lru_cache(maxsize=64)  # noqa: B019  it keeps a few stacks, which are small
+    @lru_cache(maxsize=256)  # noqa: B019  it keeps a few stacks, which are small
     def numbers(self, wavelength_nm: float) -> tuple[Floats, float]:
         """The numbers of all steps [surfaces, actions, width], and the distance from last surface to film (mm)."""
         lens, z = self.lens, [float(v) for v in self.lens.vertices_mm]
@@ -280,9 +281,8 @@ class Stack:
                 before, after = (k, k + 1) if sense > 0 else (k + 1, k)
                 # A ray arrives in the frame of the surface before; at the front and the rear in that of the surface.
                 gap = sense * (z[k] - z[k - sense]) if 0 <= k - sense < len(lens.surfaces) else 0.0
-                curvature = -sense * float(s.curvature)
                 step = (n[after] - n[before]) * (n[after] + n[before])
-                row = (gap, curvature, 1 / s.semi_diameter_mm**2, n[before], n[after], step, a[before])
+                row = gap, -sense * float(s.curvature), 1 / s.semi_diameter_mm**2, n[before], n[after], step, a[before]
                 numbers[k, which, : len(CALL)] = row
                 if k in self._figures:
                     figure = figure_numbers(self._figures[k], -sense)

@@ -15,15 +15,7 @@ from neurolens.analysis.bundles import Pattern, bundle, hexapolar, points
 from neurolens.analysis.field_curves import distortion, illumination
 from neurolens.analysis.fields import Scene
 from neurolens.analysis.layout import layout_profile
-from neurolens.analysis.spots import (
-    diffraction_image,
-    diffraction_mtf,
-    fans,
-    mtf,
-    psf,
-    spots,
-    working_f_number,
-)
+from neurolens.analysis.spots import diffraction_image, diffraction_mtf, fans, mtf, psf, spots, working_f_number
 from neurolens.base.errors import InputError
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.prescription import Lens, Surface

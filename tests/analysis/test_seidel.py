@@ -184,10 +184,7 @@ def _paraxial_shift(given: Scene) -> float:
 
 @pytest.mark.parametrize(
     ("name", "oracle"),
-    [
-        ("laikin_double_gauss_50", "laikin_double_gauss_50_f1.8"),
-        ("ogawa_zoom_70_200", "ogawa_canon_70_200_us5537259"),
-    ],
+    [("laikin_double_gauss_50", "laikin_double_gauss_50_f1.8"), ("ogawa_zoom_70_200", "ogawa_canon_70_200_us5537259")],
 )
 def test_scale_and_pupil_of_real_rays_are_the_oracle_s(name: str, oracle: str) -> None:
     """The focal length that rays see near the axis, and the entrance pupil at which chief rays aim."""

@@ -41,10 +41,7 @@ MODULE = "bl_ext.user_default.neurolens"
 
 
 def packed(lens_id: str = "gauss", osl: str = SHADER, picture: bytes | None = None) -> PackedLens:
-    forms = [
-        Form("polynomial", "ols-60", osl, 0.17, 21.6, 1.81, 0.7),
-        Form("exact", "", osl, None, 21.6, 1.81, None),
-    ]
+    forms = [Form("polynomial", "ols-60", osl, 0.17, 21.6, 1.81, 0.7), Form("exact", "", osl, None, 21.6, 1.81, None)]
     rows: dict[str, Any] = {"distortion_um": [[0.0, 50.0]] * 2, "blur_um": [[9.0, 20.0]] * 2, "light": [[1.0, 0.6]] * 2}
     field = {"radius_mm": [0.0, 21.0], "near_m": 1.0} | rows
     return PackedLens(

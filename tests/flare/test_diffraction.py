@@ -223,8 +223,7 @@ def test_no_seam_and_no_light_lost() -> None:
 
 
 @pytest.mark.parametrize(
-    ("aperture", "light"),
-    [(None, AXIS), (Aperture(blades=6), AXIS), (Aperture(blades=5), Light(0.0, 10.0))],
+    ("aperture", "light"), [(None, AXIS), (Aperture(blades=6), AXIS), (Aperture(blades=5), Light(0.0, 10.0))]
 )
 def test_star_out_of_focus(aperture: Aperture | None, light: Light) -> None:
     """1 mm out of focus at f/8: in rings, as bright as the sum over cells from the image on; no light is lost."""

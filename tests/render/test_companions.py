@@ -146,7 +146,7 @@ def in_modes(camera: Any, samples: int, light: str = "D65", modes: Any = ("one",
     return [f.rgb.astype(np.float64) for f in found]
 
 
-@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("name", [*LENSES][1:])  # the first by its model in all that follow
 def test_white_surroundings_look_the_same_in_the_middle_and_in_corners(name: str) -> None:
     one, several = in_modes(compiled(lens_camera(name)), 16)
     # From seed to seed a block's mean scatters by up to 0.2% in either mode.

@@ -66,13 +66,7 @@ def test_commands_and_readme_agree(refractions: int, use: str, monkeypatch: pyte
 
 
 def test_the_rule_at_its_edge() -> None:
-    for cost, rest, use in (
-        (1.0, 0.0, 1.0),
-        (1.001, 0.0, 1.5),
-        (0.9, 0.3, 0.9),
-        (0.95, 0.3, 1.5),
-        (0.0, 3.1, 1.5),
-    ):
+    for cost, rest, use in ((1.0, 0.0, 1.0), (1.001, 0.0, 1.5), (0.9, 0.3, 0.9), (0.95, 0.3, 1.5), (0.0, 3.1, 1.5)):
         assert recommended([cost, 2.0], float, 1.5, rest) == use == recommended([2.0, cost], float, SAVING, rest)
     assert recommended([], float, None) is None and recommended([], float, 3.0) == 3.0
     assert recommended([2.0, 1.0], float, None) == 1.0

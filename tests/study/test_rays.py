@@ -121,10 +121,7 @@ def test_a_ray_from_one_micrometre_beside_is_an_error_of_one_micrometre(
     rays = rays.select((rays.status == 0) & (rays.scene.dz < -0.6))
     inputs = rays.inputs
     cos, sin = (c / torch.hypot(inputs.film_x, inputs.film_y) for c in (inputs.film_x, inputs.film_y))
-    film_x, film_y = (
-        inputs.film_x + cos * radial - sin * tangential,
-        inputs.film_y + sin * radial + cos * tangential,
-    )
+    film_x, film_y = (inputs.film_x + cos * radial - sin * tangential, inputs.film_y + sin * radial + cos * tangential)
     beside = replace(inputs, film_x=film_x, film_y=film_y)
     moved = trace_pairs(lens, beside, domain.pupil_z_mm)
     errors = ray_errors(lens, domain, rays, lambda _: says(moved.scene, moved.transmittance))

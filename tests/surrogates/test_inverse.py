@@ -240,12 +240,7 @@ def test_derivatives_are_the_finite_differences_of_the_model(kind: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name",
-    [
-        "laikin_double_gauss_50",
-        "muller_fisheye_100",
-        pytest.param("canon_aspheric_50", marks=pytest.mark.slow),
-    ],
+    "name", ["laikin_double_gauss_50", "muller_fisheye_100", pytest.param("canon_aspheric_50", marks=pytest.mark.slow)]
 )
 def test_differentials_are_those_of_the_exact_lens_to_one_percent(name: str) -> None:
     known = prepared(name)

@@ -199,12 +199,7 @@ def test_a_thick_lens_is_the_limit_of_the_exact_lens() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "named"),
-    [
-        ({"terms": 1}, "terms"),
-        ({"method": "magic"}, "method"),
-        ({"basis": "zernike"}, "basis"),
-    ],
+    ("wrong", "named"), [({"terms": 1}, "terms"), ({"method": "magic"}, "method"), ({"basis": "zernike"}, "basis")]
 )
 def test_settings_that_are_none(wrong: dict[str, object], named: str) -> None:
     with pytest.raises(InputError, match=named):

@@ -46,10 +46,11 @@ def written_rays(language: str, kind: str, rays: Mapping[str, object]) -> Rows:
         return glsl_rays(program(kind), rays)
     if language == "torch":
         return _in_torch(kind, rays)
-    session = onnxruntime.InferenceSession(str(lens_models.exported(kind)), providers=["CPUExecutionProvider"])
     feeds = {name: np.float32([rays[name]]) for name in ("film_z_mm", "stop_radius_mm")}
     names = ["scene_ray", "transmittance", "stop_xy_mm", "status"]
-    scene, power, stop, status = session.run(names, {"rays": np.stack([rays[name] for name in COLUMNS]), **feeds})
+    scene, power, stop, status = _session(kind).run(
+        names, {"rays": np.stack([rays[name] for name in COLUMNS]), **feeds}
+    )
     assert [a.dtype for a in (scene, power, stop, status)] == [np.float32] * 3 + [np.int32]
     found = dict(zip(SCENE_RAY, scene, strict=True))
     return {**found, "transmittance": power, "stop_x_mm": stop[0], "stop_y_mm": stop[1], "status": status}
@@ -66,6 +67,11 @@ def _in_torch(kind: str, rays: Mapping[str, object]) -> Rows:
     assert [c.dtype for c in columns] == [torch.float32] * 9 + [torch.int32]
     names = (*SCENE_RAY, "transmittance", "stop_x_mm", "stop_y_mm", "status")
     return dict(zip(names, (c.numpy() for c in columns), strict=True))
+
+
+@cache
+def _session(kind: str) -> onnxruntime.InferenceSession:
+    return onnxruntime.InferenceSession(str(lens_models.exported(kind)), providers=["CPUExecutionProvider"])
 
 
 @cache

@@ -240,10 +240,7 @@ ACCEPTED = [
     ({"thickness_mm = 6.0": f"thickness_mm = {TOUCHING!r}"}, (0, "thickness_mm", TOUCHING)),
     ({BESIDE_STOP: BESIDE_STOP.replace("2.0", "-1.5", 1)}, (3, "thickness_mm", -1.5)),  # inside the next element
     # A half ball is a rim of the whole radius.
-    (
-        {ROW_5: ROW_5.replace("60.0", "-9.0"), "thickness_mm = 3.0, d": "thickness_mm = 11.0, d"},
-        (5, "radius_mm", -9.0),
-    ),
+    ({ROW_5: ROW_5.replace("60.0", "-9.0"), "thickness_mm = 3.0, d": "thickness_mm = 11.0, d"}, (5, "radius_mm", -9.0)),
     *(({"radius_mm = inf": f"radius_mm = {sign}inf"}, (3, "radius_mm", math.inf)) for sign in ("", "+", "-")),
 ]
 
