@@ -7,7 +7,6 @@ evaluating the camera's graph. Where a gradient is asked for, the graph is evalu
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -114,8 +113,8 @@ class LensCamera:
         names = tuple(settings)
         moves = [self._coordinate(name, settings[name]) for name in names]
         given = [t.to(self.device, self.dtype) for t in (film_mm, square)]
-        found = _Rays.apply(self, names, *given, light, *moves)  # type: ignore[no-untyped-call]
-        origin, direction, weight, status = found[0].T, found[1].T, *found[2:]
+        found: tuple[Tensor, ...] = _Rays.apply(self, names, *given, light, *moves)
+        origin, direction, weight, status = found[0].T, found[1].T, found[2], found[3]
         if settings:  # linear steps make directions longer
             direction = torch.nn.functional.normalize(direction, dim=1)
         if pose is not None:
@@ -187,7 +186,7 @@ class _Lens:
                 "LensCamera", "camera", spec, "a lens file or a model, with all of its dispersion and light"
             )
         compiled = device.type == "cpu" and dtype == torch.float32 and has_compiler()
-        self.camera = camera.compiled() if compiled else camera
+        self.camera: _Camera = camera.compiled() if compiled else camera
         self.compiled = compiled
         lens = camera.lens_graph()
         self.graph, numbers = whole_camera(camera.film, lens, mask_too=True)
@@ -200,8 +199,8 @@ class _Lens:
     def outputs(self, film: Tensor, square: Tensor, light: Tensor) -> tuple[Tensor, ...]:
         """Origins and directions [3, N], weights and status [N] for [N, 2], [N, 2] and [N]; without a record."""
         if self.compiled:  # numpy turns arrays of two columns ten times as fast as torch
-            rows = [np.ascontiguousarray(t.numpy().T) for t in (film, square)]
-            rays = self.camera.sample(*rows, np.ascontiguousarray(light.numpy()))
+            points, places = (np.ascontiguousarray(t.numpy().T) for t in (film, square))
+            rays = self.camera.sample(points, places, np.ascontiguousarray(light.numpy()))
             return tuple(map(torch.from_numpy, (rays.origin_m, rays.direction, rays.weight, rays.status)))
         origin, direction, weight, status = self.recorded(film, square, light)
         passed, ahead = status == st.PASSED, film.new_tensor([[0], [0], [-1]])
@@ -209,7 +208,7 @@ class _Lens:
 
     def recorded(self, film: Tensor, square: Tensor, light: Tensor) -> tuple[Tensor, ...]:
         """The same by torch, which follows its gradients."""
-        rays: Mapping[str, Any] = {"film_mm": film.T, "square": square.T, "wavelength_nm": light[None]}
+        rays = {"film_mm": film.T, "square": square.T, "wavelength_nm": light[None]}
         found = evaluate(self.graph, rays | self.call)
         return found["ray"][:3], found["ray"][3:], found["weight"][0], found["status"][0]
 
@@ -223,7 +222,7 @@ class _Rays(torch.autograd.Function):
     """What `_Lens.outputs` gives, for inputs of its camera and for how far settings are from the shot's."""
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any,
         camera: LensCamera,
         names: tuple[str, ...],
@@ -248,7 +247,7 @@ class _Rays(torch.autograd.Function):
         return *found, status
 
     @staticmethod
-    @torch.autograd.function.once_differentiable  # type: ignore[untyped-decorator]
+    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *outer: Tensor) -> tuple[Any, ...]:
         *given, status = ctx.saved_tensors[:4]
         slopes, outer = ctx.saved_tensors[4:], outer[:3]
