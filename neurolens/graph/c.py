@@ -214,7 +214,7 @@ class PartWriter(Writer):
     def value(self, argument: Argument) -> str:
         if not isinstance(argument, int) or argument in self.same or argument in self.here:
             return super().value(argument)
-        return f"s[{self.row[argument]}][i]" if argument in self.row else f"{super().value(argument)}[i]"
+        return f"waiting[{self.row[argument]}][i]" if argument in self.row else f"{super().value(argument)}[i]"
 
     def functions(self) -> tuple[str, str]:
         """The functions of the parts, and the loop that calls them."""
@@ -230,7 +230,7 @@ class PartWriter(Writer):
             free += [row for k, row in self.row.items() if last[k] == number]
             for k in (k for k in steps if last.get(k, -1) > number):
                 self.row[k] = free.pop() if free else (rows := rows + 1) - 1
-                lines.append(f"s[{self.row[k]}][i] = t{k};")
+                lines.append(f"waiting[{self.row[k]}][i] = t{k};")
             written.append(self._function(number, lines, made))
         calls = "\n".join(call for _, call in written)
         loop = part("parts.h", "in_parts", macro=self.macro, rows=max(1, rows), block=ROWS, calls=calls)
@@ -244,15 +244,19 @@ class PartWriter(Writer):
                 before.insert(0, f"    const float t{k} = {self.step(self.program.steps[k])};\n")
         words = set(re.findall(r"\w+", " ".join([*before, *lines])))
         rays, numbers = ([i for i in names if i in words] for names in (s.per_ray, s.per_call))
-        arguments = ["size_t n", f"float ({pointer} s)[{ROWS}]", *(f"const float {pointer} {i}" for i in rays)]
+        arguments = [
+            "size_t number",
+            f"float ({pointer} waiting)[{ROWS}]",
+            *(f"const float {pointer} {i}" for i in rays),
+        ]
         arguments += [f"float {i}" for i in numbers]
         arguments += [f"{'int' if o == 'status' else 'float'} {pointer} {o}" for o in made]
         text = part(
             "parts.h", "part",
-            name=self.name, macro=self.macro, number=number, arguments=",\n    ".join(arguments),
+            name=self.name, macro=self.macro, part=number, arguments=",\n    ".join(arguments),
             before="".join(before), lines="\n".join(f"        {line}" for line in lines),
         )  # fmt: skip
-        given = ", ".join(["n", "s", *(f"{i} + at" for i in rays), *numbers, *(f"{o} + at" for o in made)])
+        given = ", ".join(["number", "waiting", *(f"{i} + at" for i in rays), *numbers, *(f"{o} + at" for o in made)])
         return text, f"        {self.name}_part_{number}({given});"
 
 

@@ -168,19 +168,19 @@ ${loop}}
         const ${name}_ray ray = ${name}(${values});
 ${stores}
     }
-//// part: some steps of a block of rays; s has the numbers that wait between parts.
+//// part: some steps of a block of rays; `waiting` has the numbers that wait between parts.
 
-${macro}_PART void ${name}_part_${number}(
+${macro}_PART void ${name}_part_${part}(
     ${arguments})
 {
-    (void)s;
-${before}    for (size_t i = 0; i < n; i++) {
+    (void)waiting;
+${before}    for (size_t i = 0; i < number; i++) {
 ${lines}
     }
 }
 //// in_parts
-    ${macro}_ALIGNED float s[${rows}][${block}];
+    ${macro}_ALIGNED float waiting[${rows}][${block}];
     for (size_t at = 0; at < count; at += ${block}) {
-        const size_t n = count - at < ${block} ? count - at : ${block};
+        const size_t number = count - at < ${block} ? count - at : ${block};
 ${calls}
     }
