@@ -171,8 +171,8 @@ def test_the_first_failure_is_found_in_any_order_of_codes() -> None:
     """Codes of surfaces fall along the ray and those of one surface rise; a guard in front may have any."""
     rng = np.random.default_rng(2)
     for codes in (
-        [53, 54, 49, 50, 51, 45],
-        [1, 13, 14, 9, 10, 5],
+        [53, 54, 49, 50, 51, 45, *range(40, 20, -1)],
+        [1, 13, 14, 9, 10, 5, *range(40, 20, -1)],
         [3, 2, 1],
         [1, 2, 3],
         [7],
@@ -186,8 +186,10 @@ def test_the_first_failure_is_found_in_any_order_of_codes() -> None:
         rows[rng.uniform(size=rows.shape) < 0.02] = np.nan
         failed = ~(rows <= np.float32(0.8))
         wanted = np.where(failed.any(0), np.array(codes)[failed.argmax(0)], 0)
-        found = lower(g).evaluate({f"x_{k}" if len(codes) > 1 else "x": row for k, row in enumerate(rows)})["status"]
-        np.testing.assert_array_equal(found, wanted)
+        found = lower(g)
+        assert ("max" in found.count()) is (len(codes) > 16)  # many tests wait for no last one
+        given = {f"x_{k}" if len(codes) > 1 else "x": row for k, row in enumerate(rows)}
+        np.testing.assert_array_equal(found.evaluate(given)["status"], wanted)
 
 
 _CALL = """
