@@ -159,7 +159,7 @@ def measure(case: Case, rounds: int, report: lab.Report) -> list[Row]:
     rays = sample_domain(domain, max(FUSED_BATCHES), seed=3)
     rays = replace(rays, film_z=rays.film_z * 0 + domain.film_z_mm[0])
     names = ("film_x_mm", "film_y_mm", "film_z_mm", "pupil_x_mm", "pupil_y_mm", "wavelength_nm")
-    columns = dict(zip(names, map(np.asarray, rays.columns()), strict=False))
+    columns: dict[str, Any] = dict(zip(names, map(np.asarray, rays.columns()), strict=False))
     call = {"film_z_mm": domain.film_z_mm[0], "stop_radius_mm": domain.stop_radius_mm}
     ours = CompiledSource(programs["exact C"]).rays(columns | call)["status"]
     field, other = [program_candidate(name, p, domain) for name, p in programs.items()], dict.fromkeys(programs, 0)
@@ -181,7 +181,7 @@ def measure(case: Case, rounds: int, report: lab.Report) -> list[Row]:
         timing, ratio = timed.timing(name), timed.speedup(name, "exact C")
         count = sum(programs[name].count().values()) if name in programs else None
         known = None if timing is None else dict(timing), timed.unavailable.get(name), other.get(name)
-        rows.append(Row(lens.name, lens.refractions, name, count, *known, ratio and ratio["min"], load))
+        rows.append(Row(lens.name, lens.refractions, name, count, *known, ratio["min"] if ratio else None, load))
     return rows
 
 
