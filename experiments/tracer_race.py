@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import ctypes
+import json
 import math
 import os
 import shutil
@@ -91,6 +92,12 @@ def prescription(lens: Lens) -> str:
     return f"struct Lens {{\n{text}}};\n"
 
 
+def has_avx512() -> bool:
+    """Test whether this processor has AVX-512, by what Linux tells."""
+    told = Path("/proc/cpuinfo")
+    return told.is_file() and "avx512f" in told.read_text(encoding="utf-8")
+
+
 class Hand:
     """The hand-written tracer for a lens, compiled.
 
@@ -104,8 +111,7 @@ class Hand:
         two, three = "fma(set1(L::mb[m]),u,", "fma(fma(set1(L::mc[m]),u,set1(L::mb[m])),u,"
         text = (REFERENCE / "hand2.hpp").read_text(encoding="utf-8").replace("#pragma once", "")
         text = text.replace(two, three) + prescription(lens) + _RUN % f"{pupil_z_mm:.9e}"
-        wide = "avx512f" in Path("/proc/cpuinfo").read_text(encoding="utf-8")
-        avx2 = () if wide else ("-DUSE256", "-Dvsqrt1=vsqrt", "-Dvsqrt2=vsqrt")
+        avx2 = () if has_avx512() else ("-DUSE256", "-Dvsqrt1=vsqrt", "-Dvsqrt2=vsqrt")
         with tempfile.TemporaryDirectory(prefix="neurolens-hand-") as folder:
             library = Path(folder) / "hand.so"
             done = subprocess.run(
@@ -138,6 +144,7 @@ class Hand:
 class Row:
     """A candidate: its operations, times, how many rays have another status than ours, our time over its own."""
 
+    file: str
     lens: str
     refractions: int
     name: str
@@ -181,7 +188,9 @@ def measure(case: Case, rounds: int, report: lab.Report) -> list[Row]:
         timing, ratio = timed.timing(name), timed.speedup(name, "exact C")
         count = sum(programs[name].count().values()) if name in programs else None
         known = None if timing is None else dict(timing), timed.unavailable.get(name), other.get(name)
-        rows.append(Row(lens.name, lens.refractions, name, count, *known, ratio["min"] if ratio else None, load))
+        rows.append(
+            Row(case.file, lens.name, lens.refractions, name, count, *known, ratio["min"] if ratio else None, load)
+        )
     return rows
 
 
@@ -200,25 +209,39 @@ _COLUMNS = lab.columns(
     ("exact C takes, times this", "ours_over_it", ".2f"),
 )
 _NOTES = """\
-One thread, float32, {rounds} rounds in turn in one process (best; median in brackets), each tracer at its best batch.
+One thread, {wide}, float32, {rounds} rounds in turn in one process (best; median in brackets), each at its best batch.
 Rays uniform over film and pupil disc of the domain, blocked ones included; of {rays} of them those with another status
 than ours are counted. Load average meanwhile up to {load:.1f} on {cores} cores. Ours by {compiler} {flags}."""
 OPTIONS = (lab.ONLY, lab.ROUNDS, lab.out())
 
 
+def page(rows: Sequence[Row], known: dict[str, Any]) -> str:
+    """Return the whole page."""
+    load, compiler = max(row.load or 0.0 for row in rows), Path(find_compiler()).name
+    notes = _NOTES.format(**known, load=load, compiler=compiler, wide="AVX-512" if has_avx512() else "AVX2")
+    head = "# The exact lens as C beside a tracer written by hand", "`python -m experiments tracer`"
+    return lab.page(*head, notes, lab.machine_line(), lab.table(_COLUMNS, rows))
+
+
 def run(args: argparse.Namespace) -> None:
-    """Measure lens by lens."""
+    """Measure lens by lens; rows of other lenses from this machine are kept."""
     lab.quiet_glasses()
-    rounds, rows, text = int(args.rounds or 20), list[Row](), ""
+    known = {
+        "rounds": int(args.rounds or 20),
+        "rays": max(FUSED_BATCHES),
+        "cores": os.cpu_count(),
+        "flags": " ".join(FLAGS),
+    }
+    known |= {"machine": lab.machine()}
+    kept, text = dict[str, list[Row]](), ""
+    file = args.out / "tracer_race.json"
+    earlier = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    for row in earlier.get("rows", []) if earlier.get("machine") == known["machine"] else []:
+        kept.setdefault(row["file"], []).append(Row(**row))
     for case, report in lab.stages(
         lab.chosen(CASES, lambda c: c.file, args.only, "tracer"), lambda c: c.file, args.quiet
     ):
-        rows += measure(case, rounds, report)
-        known = {"rounds": rounds, "rays": max(FUSED_BATCHES), "cores": os.cpu_count(), "flags": " ".join(FLAGS)}
-        notes = _NOTES.format(**known, load=max(row.load or 0.0 for row in rows), compiler=Path(find_compiler()).name)
-        page = lab.page(
-            "# The exact lens as C beside a tracer written by hand", "`python -m experiments tracer`", notes,
-            lab.machine_line(), lab.table(_COLUMNS, rows),
-        )  # fmt: skip
-        text = lab.write_results(args.out, "tracer_race", page, {"machine": lab.machine(), **known, "rows": rows})
+        kept[case.file] = measure(case, known["rounds"], report)
+        rows = [row for case in CASES for row in kept.get(case.file, [])]
+        text = lab.write_results(args.out, "tracer_race", page(rows, known), {**known, "rows": rows})
     print(text)
