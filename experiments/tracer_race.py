@@ -226,7 +226,7 @@ def page(rows: Sequence[Row], known: dict[str, Any]) -> str:
 def run(args: argparse.Namespace) -> None:
     """Measure lens by lens; rows of other lenses from this machine are kept."""
     lab.quiet_glasses()
-    known = {
+    known: dict[str, Any] = {
         "rounds": int(args.rounds or 20),
         "rays": max(FUSED_BATCHES),
         "cores": os.cpu_count(),
