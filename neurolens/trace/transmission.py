@@ -191,6 +191,7 @@ class Passage:
             depth = path_mm(self._o, r, met, before) * absorbed
             self._depth = depth if self._depth is None else self._depth + depth
         surface = self.lens.surfaces[k]
+        self._skew = self._skew if is_plain(surface) and surface.focal_mm is None else None
         coated = bool(surface.coating and surface.coating.layers)
         if before is after and not coated and not reflected:
             return
@@ -205,7 +206,6 @@ class Passage:
             self._light = Light(share if self._light is None else self._light.power * share, 0.0)
             return
         normal = normal_at(self._o, met, surface.curvature)
-        self._skew = self._skew if is_plain(surface) else None
         turn = None if self._last is None else self._turn(k, normal, r, met, before)
         self._light = pass_surface(self._light, turn, shares)
         self._last = k, normal, met.q if reflected else q
