@@ -23,6 +23,7 @@ NAMES = {
     "clipping": ("vignetting:clipping", "rays that shipped models pass or block wrongly, networks beside polynomials"),
     "outside": ("outside", "random inputs through exported models"),
     "fused": ("fused_speed", "models as C against the exact lens as C"),
+    "tracer": ("tracer_race", "the exact lens as C beside a tracer written by hand"),
     "gpu": ("gpu", "lenses and models as GLSL compute shaders, on a GPU or by software OpenGL"),
     "models": ("make_models", "make the models that ship"),
     "lens-index": ("lens_index", "the index of lenses/: their data and character for `neurolens lens list`"),

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from neurolens.graph.program import Argument, Mixture, Program, Step
 
 BLOCK = 256  # rays
+PART, ROWS = 28, 128  # steps of a part, and rays that it does at a time: its numbers stay in the first cache
 
 
 @cache
@@ -198,6 +199,67 @@ class Writer:
         }
 
 
+class PartWriter(Writer):
+    """Writes a program as functions of few steps for a block of rays, with rows for the numbers that wait.
+
+    In one loop over whole rays a core mostly waits: each surface needs the ray from the one before, and the next rays
+    are farther off than it looks ahead. In loops of few steps it works on several rays at a time.
+    """
+
+    def __init__(self, program: Program, signature: Signature, macro: str) -> None:
+        super().__init__(program, signature.name)
+        self.signature, self.macro, self.same = signature, macro, program.same_for_all()
+        self.here, self.row = set[int](), dict[int, int]()  # the steps of this part; rows of numbers that wait
+
+    def value(self, argument: Argument) -> str:
+        if not isinstance(argument, int) or argument in self.same or argument in self.here:
+            return super().value(argument)
+        return f"waiting[{self.row[argument]}][i]" if argument in self.row else f"{super().value(argument)}[i]"
+
+    def functions(self) -> tuple[str, str]:
+        """The functions of the parts, and the loop that calls them."""
+        parts, free, rows = self.program.in_parts(PART), list[int](), 0
+        last = {a: n for n, steps in enumerate(parts) for k in steps for a in self.program.steps[k].arguments}
+        outputs, written = dict(self.program.outputs), list[tuple[str, str]]()
+        for number, steps in enumerate(parts):
+            self.here = set(steps)
+            lines = [f"const float t{k} = {self.step(self.program.steps[k])};" for k in steps]
+            # What no part makes is an input or a number, which the last part hands on.
+            made = [o for o, e in outputs.items() if e.argument in self.here or number == len(parts) - 1]
+            lines += [f"{o}[i] = {'(int)' * (o == 'status')}{self.value(outputs.pop(o).argument)};" for o in made]
+            free += [row for k, row in self.row.items() if last[k] == number]
+            for k in (k for k in steps if last.get(k, -1) > number):
+                self.row[k] = free.pop() if free else (rows := rows + 1) - 1
+                lines.append(f"waiting[{self.row[k]}][i] = t{k};")
+            written.append(self._function(number, lines, made))
+        calls = "\n".join(call for _, call in written)
+        loop = part("parts.h", "in_parts", macro=self.macro, rows=max(1, rows), block=ROWS, calls=calls)
+        return "".join(text for text, _ in written), loop
+
+    def _function(self, number: int, lines: Sequence[str], made: Sequence[str]) -> tuple[str, str]:
+        """The function of one part, and its call."""
+        s, pointer, before = self.signature, f"*{self.macro}_RESTRICT", list[str]()
+        for k in sorted(self.same, reverse=True):  # what others are made of comes before them
+            if self.program.steps[k].kind != "input" and re.search(rf"\bt{k}\b", " ".join([*before, *lines])):
+                before.insert(0, f"    const float t{k} = {self.step(self.program.steps[k])};\n")
+        words = set(re.findall(r"\w+", " ".join([*before, *lines])))
+        rays, numbers = ([i for i in names if i in words] for names in (s.per_ray, s.per_call))
+        arguments = [
+            "size_t number",
+            f"float ({pointer} waiting)[{ROWS}]",
+            *(f"const float {pointer} {i}" for i in rays),
+        ]
+        arguments += [f"float {i}" for i in numbers]
+        arguments += [f"{'int' if o == 'status' else 'float'} {pointer} {o}" for o in made]
+        text = part(
+            "parts.h", "part",
+            name=self.name, macro=self.macro, part=number, arguments=",\n    ".join(arguments),
+            before="".join(before), lines="\n".join(f"        {line}" for line in lines),
+        )  # fmt: skip
+        given = ", ".join(["number", "waiting", *(f"{i} + at" for i in rays), *numbers, *(f"{o} + at" for o in made)])
+        return text, f"        {self.name}_part_{number}({given});"
+
+
 def write_c(program: Program, name: str, comment: Sequence[str], extras: Extras = NOTHING) -> str:
     """The text of a header.
 
@@ -233,7 +295,9 @@ def write_c(program: Program, name: str, comment: Sequence[str], extras: Extras 
         rows = ",\n".join("    {" + ", ".join(literal(v) for v in row) + "}" for row in np.array(writer.table).T)
         text += f"\nstatic const float {name}_table[{program.tables}][{len(writer.table)}] = {{\n{rows}}};\n"
         body.insert(0, f"    const float *const c = {name}_table[band];")
-    return text + _functions(signature, macro, body, results)
+    in_parts = program.waits() and signature.bands == 1 and not signature.state and "lookup" not in kinds
+    runs = PartWriter(program, signature, macro).functions() if in_parts else None
+    return text + _functions(signature, macro, body, results, runs)
 
 
 def _numbers(name: str, rows: NDArray[np.float64]) -> str:
@@ -242,8 +306,8 @@ def _numbers(name: str, rows: NDArray[np.float64]) -> str:
     return f"\nstatic const float {name}[{rows.size}] = {{\n{lines}}};\n"
 
 
-def _functions(s: Signature, macro: str, body: list[str], results: list[str]) -> str:
-    """The struct of results, the function of one ray, and the one over arrays."""
+def _functions(s: Signature, macro: str, body: list[str], results: list[str], parts: tuple[str, str] | None) -> str:
+    """The struct of results, the function of one ray, and the one over arrays, which may be in parts."""
     pointer, band, guard, chosen = f"*{macro}_RESTRICT", list[str](), list[str](), list[str]()
     if s.state:
         band, chosen = [f"const {s.name}_state {pointer} state"], ["state"]
@@ -260,13 +324,14 @@ def _functions(s: Signature, macro: str, body: list[str], results: list[str]) ->
     rows = [f"const float {pointer} {i}" for i in s.per_ray]
     many = ",\n    ".join(["size_t count", *rows, *per_call, *(f"{kinds[o]} {pointer} {o}" for o in outputs)])
     values = [*(f"{i}[i]" for i in s.per_ray), *s.per_call, *(f"{t}, {t}_cells" for t in s.tables), *chosen]
+    stores = "\n".join(f"        {o}[i] = ray.{o};" for o in outputs)
+    each = part("parts.h", "each_ray", name=s.name, values=", ".join(values), stores=stores)
     return part(
         "parts.h", "functions",
-        name=s.name, macro=macro, one=one, many=many, values=", ".join(values),
+        name=s.name, macro=macro, one=one, many=many, parts=parts[0] if parts else "",
         fields="\n".join(f"    {kinds[o]} {o};" for o in outputs),
         unused="".join(f"    (void){i};\n" for i in s.inputs),
-        body="\n".join([*guard, *body, *results]),
-        stores="\n".join(f"        {o}[i] = ray.{o};" for o in outputs),
+        body="\n".join([*guard, *body, *results]), loop=parts[1] if parts else each,
     )  # fmt: skip
 
 

@@ -22,7 +22,11 @@ ${comment}
 #if defined(__GNUC__)
 #define ${macro}_INLINE static inline __attribute__((always_inline, unused))
 #define ${macro}_UNUSED __attribute__((unused))
+#define ${macro}_PART static __attribute__((noinline, unused))
+#define ${macro}_ALIGNED __attribute__((aligned(64)))
 #else
+#define ${macro}_PART static
+#define ${macro}_ALIGNED
 #define ${macro}_INLINE static inline
 #define ${macro}_UNUSED
 #endif
@@ -152,14 +156,31 @@ ${unused}    ${name}_ray ray;
 ${body}
     return ray;
 }
-
+${parts}
 ${macro}_UNUSED static inline void ${name}_rays(
     ${many})
 {
+${loop}}
+
+#endif
+//// each_ray: the loop of whole rays.
     for (size_t i = 0; i < count; i++) {
         const ${name}_ray ray = ${name}(${values});
 ${stores}
     }
-}
+//// part: some steps of a block of rays; `waiting` has the numbers that wait between parts.
 
-#endif
+${macro}_PART void ${name}_part_${part}(
+    ${arguments})
+{
+    (void)waiting;
+${before}    for (size_t i = 0; i < number; i++) {
+${lines}
+    }
+}
+//// in_parts
+    ${macro}_ALIGNED float waiting[${rows}][${block}];
+    for (size_t at = 0; at < count; at += ${block}) {
+        const size_t number = count - at < ${block} ? count - at : ${block};
+${calls}
+    }

@@ -325,6 +325,29 @@ class Program:
 
         return self._rewritten(shared)
 
+    def waits(self) -> bool:
+        """Whether a core that works on one ray, or one vector, after the other waits for results most of the time.
+
+        It does two operations a cycle where it finds them within the 128 that it looks ahead; a result takes 4 cycles,
+        a quotient or root 12.
+        """
+        ready, live = dict[int, int](), self.live()
+        for k in live:
+            takes = 12 if self.steps[k].kind in ("div", "sqrt") else 4
+            ready[k] = takes + max((ready[a] for a in self.steps[k].arguments if isinstance(a, int)), default=0)
+        return 2 * max(ready.values(), default=0) > len(live) + 128
+
+    def in_parts(self, size: int) -> list[list[int]]:
+        """The steps that differ between rays, in runs of about `size`; choices as soon as they can be made, because all
+        that a late one needs would wait for it."""
+        same, place = self.same_for_all(), dict[int, int]()
+        for k in self.live():
+            needed = [place[a] for a in self.steps[k].arguments if isinstance(a, int)]
+            place[k] = max(needed) if needed and self.steps[k].kind in ("select", "max", "min") else k
+        rays = [k for k in place if k not in same and self.steps[k].kind != "input"]
+        order = sorted(rays, key=lambda k: (place[k], k))
+        return [run.tolist() for run in np.array_split(order, max(1, round(len(order) / size)))]
+
     def _rewritten(
         self, rule: Callable[[int, Step, Sequence[Expr]], Expr | None] | None = None, order: Iterable[int] = ()
     ) -> Program:
@@ -387,20 +410,26 @@ class Program:
         before.outputs |= {name: Expr(self, int(name.removeprefix("step_"))) for name in names}
         return before, lookups, last
 
+    def same_for_all(self) -> set[int]:
+        """The live steps that are the same for all rays of a call."""
+        same = set[int]()
+        for k in self.live():
+            step = self.steps[k]
+            ready = all(a in same for a in step.arguments if isinstance(a, int))
+            if step.per_call if step.kind == "input" else step.kind != "lookup" and ready:
+                same.add(k)
+        return same
+
     def of_the_call(self) -> tuple[Program, Program]:
         """The steps that are the same for all rays of a call, with outputs `once_K`, and the rest, which takes these.
 
         Compilers do not vectorise loops that choose by a value that stays the same: such choices become `pick`.
         """
-        same = set[int]()
+        same = self.same_for_all()
 
         def of_call(arguments: Iterable[Argument]) -> bool:
             return all(not isinstance(a, int) or a in same for a in arguments)
 
-        for k in self.live():
-            step = self.steps[k]
-            if step.per_call if step.kind == "input" else step.kind != "lookup" and of_call(step.arguments):
-                same.add(k)
         once = replace(self, steps=list(self.steps), outputs={}, _known=dict(self._known))
 
         def varying(k: int, step: Step, given: Sequence[Expr]) -> Expr | None:

@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 Tests = list[tuple[Expr, Expr]]
 # Weights of matrices: each is a step, and compilers take minutes; onnxruntime multiplies larger matrices by blocks.
 MOST_WEIGHTS = 20_000
+_CHAIN = 16  # tests, of which the first failure is found from the last one on, with fewer operations
 _ROWS = 8  # of a matrix product at a time, of 16 registers; fewer would wait for one another
 
 
@@ -200,10 +201,24 @@ def _lookup(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Arr
 
 
 def _first_failure(at: _Lowering, node: Node, given: list[list[Expr]], arrays: list[Array]) -> list[Expr]:
-    status = at.program.literal(0.0)
-    for k in range(len(node.static) - 1, -1, -1):
-        status = at.program.select(given[2 * k][0], given[2 * k + 1][0], status, float(node.static[k]))
-    return [status]
+    tests = [(given[2 * k][0], given[2 * k + 1][0], float(code)) for k, code in enumerate(node.static)]
+    return [_first_of(at.program, tests)]
+
+
+def _first_of(p: Program, tests: list[tuple[Expr, Expr, float]]) -> Expr:
+    """The code of the first test that fails. Of many tests none should wait for the last: where all codes before a
+    place are above those behind it, the larger one is the first."""
+    status = p.literal(0.0)
+    if not tests:
+        return status
+    codes = [code for *_, code in tests]
+    ends = [k for k in range(1, len(tests)) if len(tests) > _CHAIN and min(codes[:k]) > max(codes[k:])]
+    if not ends:
+        low, high, code = tests[0]
+        return p.select(low, high, _first_of(p, tests[1:]), code)
+    for start, end in zip([0, *ends], [*ends, None], strict=True):
+        status = p.op("max", status, _first_of(p, tests[start:end])) if start else _first_of(p, tests[:end])
+    return status
 
 
 _RULES: dict[str, Callable[[_Lowering, Node, list[Any], list[Array]], list[Any]]] = {

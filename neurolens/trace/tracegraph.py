@@ -28,14 +28,16 @@ _HALVINGS = 12  # of a phase, at most: films of 500 waves
 
 
 def exact_graph(
-    lens: Lens, pupil_z_mm: float, wavelength_nm: tuple[float, float], *, whole: bool = True, path: bool = False
-) -> Graph:
+    lens: Lens, pupil_z_mm: float, wavelength_nm: tuple[float, float], *, whole: bool = True, path: bool = False,
+    polarised: bool = True,
+) -> Graph:  # fmt: skip
     """Film and pupil points in, scene ray and status out: inputs and outputs are those of a model's graph.
 
     Args:
         pupil_z_mm: plane of the pupil points. wavelength_nm: range of the light, for coatings and absorption; a single
             wavelength fixes the indices.
         whole: with stop, rims and transmittance; else the ray alone, and whether it gets through.
+        polarised: as in `Passage`.
         path: an output more, `path` [2 K]: z and y of the crossing with each surface, that next to the film first.
     """
     g = Graph()
@@ -45,7 +47,7 @@ def exact_graph(
     stop_square = None if stop_radius is None else stop_radius * stop_radius
     single = wavelength_nm[0] == wavelength_nm[1]
     mediums = media(lens, wavelength_nm[0] if single else rays[4])
-    power = GraphPassage(o, lens, rays[4], wavelength_nm) if whole else None
+    power = GraphPassage(o, lens, rays[4], wavelength_nm, polarised) if whole else None
     tests: list[tuple[Test, int]] = []  # in the order in which rays meet them, with their codes
     at_stop, crossings = rays[0:2], list[Value]()
     d = rays[2] - rays[0], rays[3] - rays[1], pupil_z_mm - film_z
@@ -95,8 +97,10 @@ class GraphPassage(Passage):
         wavelength_nm: the wavelength of the rays. range_nm: wavelengths from and to which it may lie.
     """
 
-    def __init__(self, o: Graphs, lens: Lens, wavelength_nm: Value, range_nm: tuple[float, float]) -> None:
-        super().__init__(o, lens, wavelength_nm)
+    def __init__(
+        self, o: Graphs, lens: Lens, wavelength_nm: Value, range_nm: tuple[float, float], polarised: bool = True
+    ) -> None:
+        super().__init__(o, lens, wavelength_nm, polarised)
         self.range_nm = range_nm
 
     def absorption(self, k: int) -> Value | None:

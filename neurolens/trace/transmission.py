@@ -20,7 +20,7 @@ from neurolens.lens.prescription import Lens
 from neurolens.trace.arithmetic import Arithmetic, times
 from neurolens.trace.coatings import Layers, power_amplitudes
 from neurolens.trace.shapes import is_plain
-from neurolens.trace.surfaces import Hit, Medium, Rays, normal_at
+from neurolens.trace.surfaces import Hit, Medium, Rays, nearest_approach, normal_at
 
 Vector = Any  # x, y, z in the lens frame: three tensors [N], or the rows of a value
 
@@ -119,14 +119,22 @@ def crossed(d: Vector, a: Vector, b: Vector) -> Any:
     return d[0] * (a[1] * b[2] - a[2] * b[1]) + d[1] * (a[2] * b[0] - a[0] * b[2]) + d[2] * (a[0] * b[1] - a[1] * b[0])
 
 
-def crossed_spheres(point: Vector, d: Vector, curvatures: tuple[Any, Any], gap_mm: Any) -> Any:
-    """`crossed` of the normals of two spheres with vertices on the axis, so far apart; the point is on the ray.
+def turned_spheres(
+    o: Arithmetic, near: Vector, d: Vector, medium: Medium, curvatures: tuple[Any, Any], gap_mm: Any, skew: Any
+) -> tuple[Any, Any]:
+    """`turned` of two spheres with vertices on the axis, so far apart, times the square of the index.
 
-    Their normals are (0, 0, 1) - c P for points P from the vertex: what is left is the ray's skewness, x dy - y dx, by
-    a number.
+    Their normals are (0, 0, 1) - c P for points P from the vertex, and the part of P along the ray drops out: with the
+    ray's point nearest to the second vertex, `near`, only terms remain that are small where angles are.
+
+    Args:
+        d: direction times the index. skew: x dy - y dx of any point of the ray.
     """
     first, second = curvatures
-    return (point[0] * d[1] - point[1] * d[0]) * (first - second + first * second * gap_mm)
+    ratio = 1.0 - first * gap_mm
+    bent = o.fma(near[2], -(ratio * second + first), times(o.dot(near, near), first * second))
+    along = o.fma(bent, medium.n2, times(o.dot(d[:2], d[:2]), ratio))
+    return along, times(times(medium.n, first - second * ratio), skew)
 
 
 def _plus(total: Any, a: Any, b: Any) -> Any:
@@ -154,6 +162,7 @@ class Passage:
         self._light: Light | None = None
         self._depth: Any = None
         self._last: tuple[int, Vector, Any] | None = None  # surface, its normal, n cos behind it
+        self._skew: Any = None
 
     def absorption(self, k: int) -> Any:
         """Return the Napierian absorption (1/mm) of the medium before surface k; None where there is none."""
@@ -182,6 +191,7 @@ class Passage:
             depth = path_mm(self._o, r, met, before) * absorbed
             self._depth = depth if self._depth is None else self._depth + depth
         surface = self.lens.surfaces[k]
+        self._skew = self._skew if is_plain(surface) and surface.focal_mm is None else None
         coated = bool(surface.coating and surface.coating.layers)
         if before is after and not coated and not reflected:
             return
@@ -207,10 +217,17 @@ class Passage:
         pair = self.lens.surfaces[last], self.lens.surfaces[k]
         if all(is_plain(s) for s in pair):
             gap = self.lens.vertices_mm[k] - self.lens.vertices_mm[last]
-            across = crossed_spheres(met, r[3:], (pair[0].curvature, pair[1].curvature), gap)
-        else:
-            across = crossed(r[3:], other, normal)
+            near = nearest_approach(self._o, r, before.inverse_n2)
+            curvatures = pair[0].curvature, pair[1].curvature
+            return turned_spheres(self._o, near, r[3:], before, curvatures, gap, self._skewness(r))
+        across = crossed(r[3:], other, normal)
         return turned([times(c, before.n2) for c in other], normal, q * met.q, times(across, before.n))
+
+    def _skewness(self, r: Rays) -> Any:
+        """Return x dy - y dx, with directions times the index, which surfaces round about the axis leave as it is."""
+        if self._skew is None:
+            self._skew = r.x * r.dy - r.y * r.dx
+        return self._skew
 
     def arrived(self, like: Any) -> Any:
         """Return the power of all rays, in the form of a value."""

@@ -8,8 +8,8 @@ import pytest
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
-from neurolens.graph.c import write_c
-from neurolens.graph.compiler import compile_c
+from neurolens.graph.c import ROWS, write_c
+from neurolens.graph.compiler import compile_c, has_compiler
 from neurolens.graph.derive import derivative
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph
@@ -104,6 +104,92 @@ def test_clamp_and_tanh_of_any_float_as_c_and_by_steps(tmp_path: Path) -> None:
     call(ctypes.c_size_t(given.size), *(ctypes.c_void_p(a.ctypes.data) for a in (given, held, tanh)))
     assert np.array_equal(held[number], wanted["held"][number]) and np.array_equal(np.abs(held[~number]), [2.5, 2.5])
     np.testing.assert_allclose(tanh, wanted["tanh"], rtol=3e-7, atol=0)
+
+
+def test_a_program_that_waits_does_its_rays_in_parts(tmp_path: Path) -> None:
+    """Each ray as the function of one ray has it, to the bit, at any count; nothing behind the last is written."""
+    p = Program()
+    x, y, s = p.input("x"), p.input("y"), p.input("s", per_call=True)
+    value, status = x, p.literal(0.0)
+    for k in range(20):
+        value = p.op("sqrt", p.fma(value, value, y * (k + 1.0))) / (value + s * s)
+        status = p.select(p.fma(value, 0.01, x), 0.2 * k, status, k + 1.0)
+    p.outputs = {
+        "value": value,
+        "early": x * s,
+        "same": s * 2.0,
+        "given": y,
+        "three": p.literal(3.0),
+        "status": status,
+    }
+    assert p.waits() and not program().waits()
+    parts, free = p.in_parts(10), p.same_for_all()
+    assert sorted(k for part in parts for k in part) == sorted(
+        k for k in p.live() if k not in free and p.steps[k].kind != "input"
+    )
+    made = {*free, x.argument, y.argument}
+    for k in (k for part in parts for k in part):
+        assert {a for a in p.steps[k].arguments if isinstance(a, int)} <= made
+        made.add(k)
+    text = write_c(p, "f", [])
+    assert "f_part_3(number, waiting" in text and "f_part_0" not in write_c(program(), "f", [])
+    if not has_compiler():
+        pytest.skip("there is no C compiler")
+    compile_c(text + _PARTS_CALL, tmp_path / "f.so")
+    call = ctypes.CDLL(str(tmp_path / "f.so")).call
+    for count in (0, 1, ROWS - 1, ROWS, ROWS + 1, 3 * ROWS + 17):
+        given = np.random.default_rng(1).uniform(0.1, 4.0, (2, count + 1)).astype(np.float32)
+        given[0, : count // 9] = np.nan
+        found = np.full((2, 6, count + 1), -7.0, np.float32)
+        call(ctypes.c_size_t(count), ctypes.c_float(1.1), *(ctypes.c_void_p(a.ctypes.data) for a in (*given, *found)))
+        many, one = found
+        np.testing.assert_array_equal(many[:, :count], one[:, :count])
+        np.testing.assert_array_equal(many[:, count], -7.0)
+        wanted = p.evaluate({"x": given[0], "y": given[1], "s": np.float32(1.1)})
+        for row, name in zip(one, p.outputs, strict=True):
+            np.testing.assert_allclose(row[:count], np.broadcast_to(wanted[name], count + 1)[:count], rtol=1e-6)
+    assert len(np.unique(one[5, :count])) > 4  # rays fail at many places
+
+
+_PARTS_CALL = """
+void call(size_t n, float s, const float *x, const float *y, float *many, float *one)
+{
+    const size_t m = n + 1;
+    int status[1000];
+    f_rays(n, x, y, s, many, many + m, many + 2 * m, many + 3 * m, many + 4 * m, status);
+    for (size_t i = 0; i < n; i++) {
+        const f_ray r = f(x[i], y[i], s);
+        many[5 * m + i] = (float)status[i];
+        one[i] = r.value, one[m + i] = r.early, one[2 * m + i] = r.same, one[3 * m + i] = r.given;
+        one[4 * m + i] = r.three, one[5 * m + i] = (float)r.status;
+    }
+}
+"""
+
+
+def test_the_first_failure_is_found_in_any_order_of_codes() -> None:
+    """Codes of surfaces fall along the ray and those of one surface rise; a guard in front may have any."""
+    rng = np.random.default_rng(2)
+    for codes in (
+        [53, 54, 49, 50, 51, 45, *range(40, 20, -1)],
+        [1, 13, 14, 9, 10, 5, *range(40, 20, -1)],
+        [3, 2, 1],
+        [1, 2, 3],
+        [7],
+        [4, 4, 2, 2],
+        [5, 9, 7, 3],
+    ):
+        g = Graph()
+        x = g.input("x", len(codes))
+        g.outputs["status"] = g.first_failure([(x[k], g.constant(0.8)) for k in range(len(codes))], codes)
+        rows = rng.uniform(0.0, 1.0, (len(codes), 400)).astype(np.float32)
+        rows[rng.uniform(size=rows.shape) < 0.02] = np.nan
+        failed = ~(rows <= np.float32(0.8))
+        wanted = np.where(failed.any(0), np.array(codes)[failed.argmax(0)], 0)
+        found = lower(g)
+        assert ("max" in found.count()) is (len(codes) > 16)  # many tests wait for no last one
+        given = {f"x_{k}" if len(codes) > 1 else "x": row for k, row in enumerate(rows)}
+        np.testing.assert_array_equal(found.evaluate(given)["status"], wanted)
 
 
 _CALL = """
