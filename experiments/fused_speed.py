@@ -205,8 +205,9 @@ Rays uniform over film and pupil disc of the domain, blocked ones included. "ray
 the front surface, direction and domain guard out. "whole": with stop, rims and transmittance.
 
 - exact C: the exact trace as C from the same writer as the models, compiled alike
-  ({flags}): the tracer to beat. Every surface is bare; "ray" tests no rim. Each
-  surface waits for the one before it (a division and two roots in a row), which costs more than its operations.
+  ({flags}): the tracer to beat. Every surface is bare; "ray" tests no rim. It
+  goes in loops of few steps over blocks of rays, so that a core works on several rays while each waits for a
+  division or a root; `python -m experiments tracer` holds it against a tracer that was written by hand.
 - exact torch: the project's own tracer compiled by torch, rims tested in both kinds of work.
 - onnxruntime, "ray": the part of the exported graph that gives position and direction, without the domain guard.
 - One ray at a time: the same function without vectors ({scalar}), as an integrator calls it. AVX2: without AVX-512.

@@ -35,9 +35,9 @@ class LensRays(NamedTuple):
 
     Attributes:
         origin: [N, 3]. direction: [N, 3] of unit length; along the axis where the ray did not pass.
-        weight: [N] of the ray's radiance: the film value is the mean of the products over the pupil. 0 where it did
-            not pass.
-        status: [N] int32, see `neurolens.base.status`.
+        weight: [N], the factor of the ray's radiance: a film point's value is the mean of weight times radiance over
+            its rays. 0 where the ray did not pass.
+        status: [N] int32, see `neurolens.base.status`; that of the shot, whatever settings a call changes.
     """
 
     origin: Tensor
@@ -55,13 +55,14 @@ class LensCamera:
 
     Rays are differentiable once by film points, random numbers, wavelengths and poses, and by the settings of a call:
     `focus_m`, `f_number` and `zoom`. A setting moves the pupil, too, whose points the random numbers fill; its
-    derivative is the difference of the rays of two cameras, set 3% to both sides. Away from the shot's own
-    setting rays are linear in it (of focus in 1 / distance, of the stop in 1 / f-number), up to 6%.
+    derivative is the difference between two cameras, one a step below and one a step above the shot. A step is 3% of
+    1 / f-number, of the zoom, or of 1 / focus (0.003 1/m at least). Within two steps rays are linear in the setting;
+    beyond, make another camera.
 
     Args:
         camera: a lens file, a model, or what else `make_camera` takes for one of these.
         shot: the settings of the camera.
-        device, dtype: of the tensors; float64 on the CPU is for checks.
+        device, dtype: of all results, to which what is given is converted; float64 on the CPU is for checks.
 
     Raises:
         InputError, ModelError: as `make_camera`; a camera without a lens.
@@ -72,7 +73,7 @@ class LensCamera:
     ) -> None:
         self.spec, self.shot = str(camera), shot
         self.device, self.dtype = torch.device(device), dtype
-        self._sides: dict[tuple[str, float], tuple[_Lens, _Lens, float]] = {}
+        self._sides: dict[str, _Sides] = {}
         self._lens = self._made(shot)
 
     def film_points(self, pixels: Tensor, size: tuple[int, int]) -> Tensor:
@@ -81,8 +82,9 @@ class LensCamera:
         The middle of the first pixel is at (0.5, 0.5); the picture on the film stands on its head.
         """
         width, height = self.shot.film_mm
-        half = pixels.new_tensor([width / 2, -height / 2])
-        return half - pixels * pixels.new_tensor([width / size[0], -height / size[1]])
+        places = pixels.to(self.device, self.dtype)
+        half = places.new_tensor([width / 2, -height / 2])
+        return half - places * places.new_tensor([width / size[0], -height / size[1]])
 
     def __call__(
         self,
@@ -103,17 +105,28 @@ class LensCamera:
             settings: `focus_m`, `f_number`, `zoom` (mm), each one number, in place of the shot's.
 
         Raises:
-            InputError: tensors of other shapes; a setting that the camera does not have, or over 6% from the shot's.
+            InputError: tensors of other shapes; a setting that the camera does not have, or that is too far from the
+                shot's.
         """
         count = len(film_mm)
-        light = torch.as_tensor(wavelength_nm, dtype=self.dtype, device=self.device).expand(count)
-        for name, tensor in (("film_mm", film_mm), ("square", square)):
-            if tensor.shape != (count, 2):
-                raise InputError("LensCamera", name, tuple(tensor.shape), f"a tensor of shape ({count}, 2)")
+        given = [torch.as_tensor(t, dtype=self.dtype, device=self.device) for t in (film_mm, square, wavelength_nm)]
+        shapes: dict[str, list[tuple[int, ...]]] = {
+            "film_mm": [(count, 2)],
+            "square": [(count, 2)],
+            "wavelength_nm": [(), (count,)],
+        }
+        if pose is not None:
+            pose = pose.to(self.device, self.dtype)
+            given.append(pose)
+            shapes["pose"] = [(*rays, rows, 4) for rays in ((), (count,)) for rows in (3, 4)]
+        for (name, allowed), tensor in zip(shapes.items(), given, strict=True):
+            if tuple(tensor.shape) not in allowed:
+                expected = "a tensor of shape " + " or ".join(map(str, allowed))
+                raise InputError("LensCamera", name, tuple(tensor.shape), expected)
         names = tuple(settings)
         moves = [self._coordinate(name, settings[name]) for name in names]
-        given = [t.to(self.device, self.dtype) for t in (film_mm, square)]
-        found: tuple[Tensor, ...] = _Rays.apply(self, names, *given, light, *moves)
+        film, places, light = given[:3]
+        found: tuple[Tensor, ...] = _Rays.apply(self, names, film, places, light.expand(count), *moves)
         origin, direction, weight, status = found[0].T, found[1].T, found[2], found[3]
         if settings:  # linear steps make directions longer
             direction = torch.nn.functional.normalize(direction, dim=1)
@@ -127,11 +140,15 @@ class LensCamera:
         """How far a setting is from the shot's, in the coordinate in which rays are linear."""
         if name not in ("focus_m", "f_number", "zoom"):
             raise InputError("LensCamera", name, value, "one of focus_m, f_number, zoom")
-        number = torch.as_tensor(value, dtype=torch.float64, device=self.device)
-        start, step = self._start(name), self._step(name)
+        number = torch.as_tensor(value).double().cpu()
+        if number.numel() != 1:
+            raise InputError("LensCamera", name, tuple(number.shape), "one number")
+        number, start = number.reshape(()), self._start(name)
         moved = (number if name == "zoom" else 1 / number) - start
-        if not abs(float(moved.detach())) <= _AWAY * step * (1 + 1e-6):
-            expected = f"a number within {_AWAY * _SHARE:.0%} of the shot's; make another camera"
+        low, high = (_AWAY * end for end in self._beside(name).ends)
+        if not low * (1 + 1e-6) <= float(moved.detach()) <= high * (1 + 1e-6):
+            ends = [v if name == "zoom" else 1 / v if v > 0 else math.inf for v in (start + low, start + high)]
+            expected = f"a number from {min(ends):.6g} to {max(ends):.6g}: beyond, make another camera"
             raise InputError("LensCamera", name, float(number.detach()), expected)
         return moved
 
@@ -147,30 +164,31 @@ class LensCamera:
     def _step(self, name: str) -> float:
         return max(_SHARE * abs(self._start(name)), _LEAST if name == "focus_m" else 0.0)
 
-    def _beside(self, name: str) -> tuple[_Lens, _Lens, float]:
-        """The lenses on both sides of a setting and the difference of their coordinates; made once."""
-        start, step = self._start(name), self._step(name)
-        if (name, start) not in self._sides:
+    def _beside(self, name: str) -> _Sides:
+        """The lenses below and above a setting; made once."""
+        if name not in self._sides:
+            start, step = self._start(name), self._step(name)
             found, ends = [], []
-            for sign in (-1, 1):
+            for end in (-step, step):
                 try:
-                    found.append(self._made(self._at(name, start + sign * step)))
-                    ends.append(sign * step)
+                    found.append(self._made(self._at(name, start + end)))
+                    ends.append(end)
                 except InputError:  # beyond what the lens or its model can do
                     found.append(self._lens)
                     ends.append(0.0)
             if ends[0] == ends[1]:
                 raise InputError("LensCamera", name, "(at its only value)", "a setting that this camera can change")
-            self._sides[name, start] = found[0], found[1], ends[1] - ends[0]
-        return self._sides[name, start]
+            self._sides[name] = _Sides(found[0], found[1], (ends[0], ends[1]))
+        return self._sides[name]
 
     def _at(self, name: str, coordinate: float) -> Shot:
+        shot = replace(self.shot, clamp_f_number=False)
         if name == "zoom":
-            return replace(self.shot, zoom=coordinate)
+            return replace(shot, zoom=coordinate)
         if coordinate < 0:
             raise InputError("LensCamera", name, coordinate, "at most infinity")
         value = 1 / coordinate if coordinate else math.inf
-        return replace(self.shot, focus_m=value) if name == "focus_m" else replace(self.shot, f_number=value)
+        return replace(shot, focus_m=value) if name == "focus_m" else replace(shot, f_number=value)
 
     def _made(self, shot: Shot) -> _Lens:
         return _Lens(self.spec, shot, self.device, self.dtype)
@@ -213,6 +231,14 @@ class _Lens:
         return found["ray"][:3], found["ray"][3:], found["weight"][0], found["status"][0]
 
 
+class _Sides(NamedTuple):
+    """Lenses below and above a setting, and how far they are from it: 0 where there is none, but the shot's own."""
+
+    low: _Lens
+    high: _Lens
+    ends: tuple[float, float]
+
+
 def _columns(table: Any, device: torch.device, dtype: torch.dtype) -> Tensor:
     """A table [cells, columns] whose columns are contiguous."""
     return torch.as_tensor(np.ascontiguousarray(table.T), dtype=dtype, device=device).T
@@ -235,10 +261,10 @@ class _Rays(torch.autograd.Function):
         *found, status = camera._lens.outputs(*given)
         slopes = []
         for name, moved in zip(names, moves, strict=True):
-            low, high, apart = camera._beside(name)
+            low, high, (start, end) = camera._beside(name)
             (*before, status_before), (*after, status_after) = low.outputs(*given), high.outputs(*given)
             passed = (status_before == st.PASSED) & (status_after == st.PASSED) & (status == st.PASSED)
-            slope = [torch.where(passed, (b - a) / apart, 0.0) for a, b in zip(before, after, strict=True)]
+            slope = [torch.where(passed, (b - a) / (end - start), 0.0) for a, b in zip(before, after, strict=True)]
             found = [value + float(moved) * by for value, by in zip(found, slope, strict=True)]
             slopes += slope
         ctx.lens = camera._lens
@@ -253,15 +279,16 @@ class _Rays(torch.autograd.Function):
         slopes, outer = ctx.saved_tensors[4:], outer[:3]
         wanted: list[Tensor | None] = [None, None, None]
         needed = [k for k in range(3) if ctx.needs_input_grad[2 + k]]
+        passed = torch.nonzero(status == st.PASSED)[:, 0]
+        by_found = [o[..., passed] for o in outer]
         if needed:
-            passed = torch.nonzero(status == st.PASSED)[:, 0]
             with torch.enable_grad():
                 some = [t[passed].requires_grad_(k in needed) for k, t in enumerate(given)]
                 *found, _ = ctx.lens.recorded(*some)
-            by_found = [o[..., passed] for o in outer]
             each = torch.autograd.grad(found, [some[k] for k in needed], by_found, allow_unused=True)
             for k, part in zip(needed, each, strict=True):
                 whole = torch.zeros_like(given[k])
                 wanted[k] = whole if part is None else whole.index_copy(0, passed, part)
-        totals = [(by * o).sum().double() for by, o in zip(slopes, outer * (len(slopes) // 3), strict=True)]
+        pairs = zip(slopes, by_found * (len(slopes) // 3), strict=True)
+        totals = [(by[..., passed] * o).sum().double().cpu() for by, o in pairs]
         return None, None, *wanted, *(sum(totals[k : k + 3]) for k in range(0, len(totals), 3))

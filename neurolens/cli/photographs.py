@@ -165,6 +165,8 @@ examples:
         found = fit_rims(tabled, profiles[0], self.unused)
         if self.out is not None:
             said = f"Rims are fitted by neurolens rims to lensfun's {match.profile.model} ({match.certainty})."
+            if any(ring.before == 0 for ring in found.rings):
+                said += " A ring in front is surface 0: numbers of surfaces that are named before are now one higher."
             lens = with_fitted_rims(tabled, found)
             write_lens(replace(lens, notes=" ".join(filter(None, (lens.notes, said)))), self.out)
         data = {"file": str(self.file), "profile": match.profile.model, "match": match.certainty, **found.to_dict()}

@@ -164,7 +164,7 @@ def _coated(g: Graph, call: Value, cos_i: Value, cos_t: Value, n_step: Value) ->
 @lru_cache(maxsize=4096)  # the same for every frame, stop and tracer, and for surfaces that are coated alike
 def reflectance_fit(
     layers: coatings.Layers, n_before: float, n_after: float, wavelength_nm: float, sense: int
-) -> list[float]:
+) -> tuple[float, ...]:
     """Coefficients, lowest first, of a coating's reflectance in 1 - c, c being the cosine on the lower index's side.
 
     They have the least relative squares at Chebyshev nodes, because ghosts live on the little that is left near normal
@@ -175,7 +175,7 @@ def reflectance_fit(
     there = np.sqrt(1 - (low / high) ** 2 * (1 - c * c))
     cos_i = torch.from_numpy(c if n_before <= n_after else there)
     exact = coatings.reflectance(cos_i, n_before, n_after, layers, wavelength_nm, sense).numpy()
-    return np.polynomial.polynomial.polyfit(1 - c, exact, DEGREE, w=1 / (exact + _FAINT)).tolist()
+    return tuple(np.polynomial.polynomial.polyfit(1 - c, exact, DEGREE, w=1 / (exact + _FAINT)).tolist())
 
 
 def _figure(shape: Shape, call: Value) -> Figure:

@@ -3,7 +3,8 @@
 ${comment}
  *
  * ${name}(...) takes one ray; ${name}_rays(...) takes arrays, one value a ray, that must not overlap. It has no
- * branches: gcc -O3 -march=native (clang alike) makes vectors of it. Results mean something where status is 0. The
+ * branches: gcc -O3 -march=native (clang alike) makes vectors of it. Where a ray's operations wait for each other,
+ * arrays go in blocks through several loops, whose numbers take some kilobytes of stack. Results mean something where status is 0. The
  * guard of the domain needs NaN: never compile this with -ffast-math or -ffinite-math-only.
  */
 #ifndef ${guard}

@@ -328,8 +328,8 @@ class Program:
     def waits(self) -> bool:
         """Whether a core that works on one ray, or one vector, after the other waits for results most of the time.
 
-        It does two operations a cycle where it finds them within the 128 that it looks ahead; a result takes 4 cycles,
-        a quotient or root 12.
+        Counted for a core that does two operations a cycle, gives a result after 4 cycles and a quotient or root after
+        12; that it looks 128 operations ahead was chosen by measuring exact lenses and models.
         """
         ready, live = dict[int, int](), self.live()
         for k in live:

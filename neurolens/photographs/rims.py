@@ -123,7 +123,8 @@ class RimLight:
         """A ring between the beam of the axis (0) and what is lit (1)."""
         place, ring = self.rings[number]
         low, high = self.beam_mm[place], self.lit_mm[place]
-        return ring._replace(radius_mm=round(float(low + value * (high - low)), 4))
+        radius_mm = float(low + value * (high - low))
+        return ring._replace(radius_mm=math.ceil(1e4 * radius_mm) / 1e4)  # up: never less than the beam
 
     def side(self, front: bool, way: int, value: float) -> Array:
         """What one side lets through, [F, G, G], with scaled rims or a ring."""

@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,11 @@ from neurolens.render.scenetables import FARTHEST_M, SMALLEST_M, Material, MeshS
 
 _LARGEST, _LARGEST_UV = 1e60, 1e6  # areas are finite; texture coordinates have pixels left in float32
 _STEP = np.float32(1e-5)  # m by which a ray that met its own start surface is moved on
+
+
+def has_embree() -> bool:
+    """Whether Embree is installed, which has no wheel for some machines."""
+    return find_spec("embreex") is not None
 
 
 class Mesh:

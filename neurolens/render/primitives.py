@@ -294,7 +294,7 @@ class SphereClusters:
     def __init__(self, first: int, centres: FloatArray64, radii: FloatArray64) -> None:
         self.first = first
         low, high = centres - radii[:, None], centres + radii[:, None]
-        # Boxes are slightly wider, so that rounding to float32 never cuts a sphere off.
+        # Boxes are slightly wider, so that rounding to float32 cuts no sphere off that rays near the scene meet.
         margin = 1e-6 * max(1.0, float(np.abs(low).max()), float(np.abs(high).max()))
         self._clusters = [
             (

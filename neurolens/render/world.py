@@ -20,7 +20,7 @@ from neurolens.render.colour import Index, Palette, SpectralRange
 from neurolens.render.environment import SunLight, make_surroundings
 from neurolens.render.lights import FlatLights, Lights, LightSamples, PointLights, SphereLights
 from neurolens.render.materials import CoatTable
-from neurolens.render.mesh import Mesh, triangle_planes
+from neurolens.render.mesh import Mesh, has_embree, triangle_planes
 from neurolens.render.primitives import (
     MANY_SPHERES,
     AxisQuad,
@@ -208,7 +208,7 @@ class Assembly:
 
     def _add_flat(self) -> None:
         settings = self._scene.settings
-        many = len(settings.quads) > _MANY_QUADS
+        many = len(settings.quads) > _MANY_QUADS and has_embree()
         if many:
             corners = np.array([(q.corner_m, q.edge_u_m, q.edge_v_m) for q in settings.quads], np.float64)
             corners[:, 1:] += corners[:, :1]

@@ -127,7 +127,7 @@ class RimRule:
 
     Attributes:
         vignetting: share of the stop's height that is kept at the edge of the field, above 0, at most 1. Of 99 primes
-            the light wide open is as measured with 0.5, in the mean (experiments/results/photographs.md).
+            computed and measured light wide open agree in the median with 0.5 (experiments/results/photographs.md).
         clear_edge: what a rim is wider than the rays need, relative to its diameter.
         half_field_deg: edge of the field; None: that of the lens or of its image circle.
     """

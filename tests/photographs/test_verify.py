@@ -111,7 +111,8 @@ def test_the_sonnar_against_photographs() -> None:
     assert widest.measured[-1] - widest.computed[-1] == pytest.approx(-0.9, abs=0.15)
     (c,) = verify(lens_of("sony_sonnar_55")).comparisons
     assert len(c.light_stops) > 10
-    assert all(abs(curve.measured[-1] - curve.computed[-1]) < 0.35 for curve in c.light_stops.values())
+    assert all(abs(curve.measured[-1] - curve.computed[-1]) < 0.15 for curve in c.light_stops.values())
+    assert all(curve.rms < 0.2 for curve in c.light_stops.values())
 
 
 def test_the_command_prints_draws_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

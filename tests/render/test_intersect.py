@@ -225,10 +225,13 @@ def test_meshes_are_hit_from_close_by_and_within_limits() -> None:
     on = corners.mean(axis=1)[RANDOM.integers(500, size=2000)].T.astype(np.float32)
     batch.origin[:, :2000] = on + batch.direction[:, :2000] * np.float32(1e-3)
     limit = np.where(RANDOM.random(5000) < 0.5, np.inf, RANDOM.uniform(0, 12, 5000)).astype(np.float32)
+    batch.origin[:, :200] = on[:, :200]  # and rays that start on one
     best, found = hits(Mesh(7, corners), batch, limit)
-    expected = meet_triangles(corners, batch)
+    each = np.stack([meet_triangles(some[None], batch) for some in corners])
+    expected = each.min(axis=0)
     near = expected < limit
     assert np.mean((found >= 0) != near) < 2e-3 and 0.2 < np.mean(near) < 0.9
+    assert np.mean(found[near] != 7 + each.argmin(axis=0)[near]) < 4e-3
     same = np.isclose(best, np.where(near, expected, limit), rtol=1e-4, atol=1e-4) | np.isinf(best)
     assert np.mean(~same) < 2e-3 and np.all(best[found < 0] == limit[found < 0]) and np.all(best <= limit)
 
