@@ -159,14 +159,15 @@ def _rims_of(some: list[Row]) -> str:
     worse = [[after > before + WORSE for _, before, after in u] for u in unused]
     rings = sum(r["rings"] > 0 for r in some if r.get("fitted"))
     header = "light, stops (root mean square over heights)|lenses|" + "|".join(f"{q}%" for q in PERCENTILES)
-    told = ""
+    note = ""
     if worse:
         share = " and ".join(f"{100 * v:.0f}% ({n})" for v, n in zip(np.mean(worse, axis=0), names, strict=True))
-        told = (
-            f"Of {len(worse)} apertures that were left out, {share} get worse by over {WORSE} stops: between others "
-            f"light is interpolated; wider than all others it is not known. {rings} of {len(fits)} lenses get a ring."
+        note = (
+            f"Each of the two widest apertures of {len(worse)} lenses was left out once: {share} of the lenses get "
+            f"worse there by over {WORSE} stops. The next-widest lies between apertures that were used, the widest lies "
+            f"beyond them. {rings} of {len(fits)} lenses get a ring."
         )
-    return lab.page("## Rims fitted to photographs (primes)", lab.table(header, lines), told)
+    return lab.page("## Rims fitted to photographs (primes)", lab.table(header, lines), note)
 
 
 def _derived_of(some: list[Row]) -> str:
@@ -177,8 +178,8 @@ def _derived_of(some: list[Row]) -> str:
         lines.append(_line(f"share {share:g}", (r["derived"][k][0] for r in known)))
         lines.append(_line(f"share {share:g}: computed less measured", (r["derived"][k][1] for r in known)))
     header = "light at the widest aperture, stops|lenses|" + "|".join(f"{q}%" for q in PERCENTILES)
-    told = "The share of the pupil's height is that at the edge of the field; the rule takes 0.5."
-    return lab.page("## Rims derived by the rule (primes, certain matches)", lab.table(header, lines), told)
+    note = "A share is the part of the pupil's height that the rule keeps at the edge of the field. It takes 0.5."
+    return lab.page("## Rims derived by the rule (primes, certain matches)", lab.table(header, lines), note)
 
 
 def page(rows: list[Row]) -> str:

@@ -93,9 +93,9 @@ def prescription(lens: Lens) -> str:
 
 
 def has_avx512() -> bool:
-    """Test whether this processor has AVX-512, by what Linux tells."""
-    told = Path("/proc/cpuinfo")
-    return told.is_file() and "avx512f" in told.read_text(encoding="utf-8")
+    """Test whether Linux lists AVX-512 among the features of this processor."""
+    file = Path("/proc/cpuinfo")
+    return file.is_file() and "avx512f" in file.read_text(encoding="utf-8")
 
 
 class Hand:

@@ -1,7 +1,8 @@
 """Lens cameras for torch: the rays of film points as tensors, with gradients.
 
-Rays are computed without torch's record: as compiled C on the CPU in float32 where the machine has a compiler, else by
-evaluating the camera's graph. Where a gradient is asked for, the graph is evaluated again, for the rays that pass.
+The forward pass runs the camera as compiled C, on the CPU in float32 where the machine has a compiler; elsewhere torch
+evaluates the camera's graph. The backward pass evaluates that graph once more, for the rays that passed, and lets
+torch differentiate it.
 """
 
 from __future__ import annotations
@@ -215,7 +216,7 @@ class _Lens:
         self.call |= {name: _columns(table, device, dtype) for name, table in tables.items()}
 
     def outputs(self, film: Tensor, square: Tensor, light: Tensor) -> tuple[Tensor, ...]:
-        """Origins and directions [3, N], weights and status [N] for [N, 2], [N, 2] and [N]; without a record."""
+        """Origins and directions [3, N], weights and status [N] for [N, 2], [N, 2] and [N]; without gradients."""
         if self.compiled:  # numpy turns arrays of two columns ten times as fast as torch
             points, places = (np.ascontiguousarray(t.numpy().T) for t in (film, square))
             rays = self.camera.sample(points, places, np.ascontiguousarray(light.numpy()))

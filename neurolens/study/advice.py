@@ -25,8 +25,8 @@ CLOSE_UM = 2.0  # a model within this RMS error counts as close: a quarter of a 
 SAVING = 1.5
 # Nanoseconds that a path takes besides its camera in the cheapest scene of experiments/results/render_times.
 PATH_NS = 190.0
-# Of the exact lens as C on the machine on which models/ was timed: 2.1 there, and 0.6 of that since arrays go in parts,
-# beside models in one run (experiments/results/fused_speed, before and after).
+# Nanoseconds of a refraction of the exact lens as C, on the machine that timed models/. It was 2.1 there; since C works
+# in parts, the exact lens takes 0.6 of its former time beside models (experiments/results/fused_speed).
 REFRACTION_NS = 1.3
 
 
