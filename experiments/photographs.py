@@ -164,8 +164,8 @@ def _rims_of(some: list[Row]) -> str:
         share = " and ".join(f"{100 * v:.0f}% ({n})" for v, n in zip(np.mean(worse, axis=0), names, strict=True))
         note = (
             f"Each of the two widest apertures of {len(worse)} lenses was left out once: {share} of the lenses get "
-            f"worse there by over {WORSE} stops. The next-widest lies between apertures that were used, the widest lies "
-            f"beyond them. {rings} of {len(fits)} lenses get a ring."
+            f"worse there by over {WORSE} stops. The next-widest lies between apertures that were used, the widest "
+            f"lies beyond them. {rings} of {len(fits)} lenses get a ring."
         )
     return lab.page("## Rims fitted to photographs (primes)", lab.table(header, lines), note)
 
