@@ -50,6 +50,7 @@ def build_parser() -> Parser:
     from neurolens.cli.analyse import Analyse
     from neurolens.cli.blender import Blender
     from neurolens.cli.convert import Convert, Glass
+    from neurolens.cli.defocus import Defocus
     from neurolens.cli.evaluate import Evaluate
     from neurolens.cli.export import Export
     from neurolens.cli.flare import Flare
@@ -69,7 +70,7 @@ def build_parser() -> Parser:
         "lenses": (Lens, Analyse, Verify, Rims, Convert, Glass, Library, Survey, View),
         "camera models of a lens": (Train, Models, Evaluate),
         "pictures": (Demo, Plan, Render, Flare),
-        "compositing and other programs": (StMap, Projection, Export, Blender, Mitsuba),
+        "compositing and other programs": (Defocus, StMap, Projection, Export, Blender, Mitsuba),
     }
     parser = Parser(
         prog="neurolens", usage="neurolens COMMAND ...", description=_DESCRIPTION, epilog=_EPILOG,

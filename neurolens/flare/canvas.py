@@ -1,12 +1,4 @@
-"""Light drawn on the film: areas of rays as edges, smears of extended lights, kernels, and the exposure.
-
-A ghost is drawn as the areas that the cells of a grid of rays cover on the film. So its picture has neither holes nor
-noise, and its sum is the light of the ghost, however the map from pupil to film stretches, folds or turns (Hullin et
-al. 2011, section 4.2, spread light over quads in this way). Rims cut cells where the largest r / R on the way is 1, by
-linear interpolation between rays. Pixels are covered exactly (`area.c`): an edge adds its height, times the step of
-density across it, to the pixels that it crosses, and sums along rows make the picture. Within whole cells the density
-is linear between the corners, where it is the mean of the cells that meet there. So no borders show where the density
-changes little from cell to cell, and each cell keeps its light, but for a part in 10,000 at its border pixels.
+"""Light drawn on the film: smears of extended lights, kernels, and the exposure; areas of rays in `areas.py`.
 
 Light adds up: the picture of an extended light is the integral over its points (Goodman, Introduction to Fourier
 Optics, section 6.1). Over a small patch a ghost, or a star, keeps its shape and moves with the point, so that the
@@ -15,10 +7,9 @@ integral is a convolution with the patch as large as the picture moves: of each 
 
 from __future__ import annotations
 
-import ctypes
 import math
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,15 +18,13 @@ from numpy.typing import NDArray
 from scipy import signal  # type: ignore[import-untyped]
 
 from neurolens.base.errors import InputError
+from neurolens.flare.areas import Floats, draw_edges
 from neurolens.flare.lights import CELLS, FADE, Patch, disc
-from neurolens.flare.steps import LOST, Floats
-from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.lens.prescription import Lens
 from neurolens.trace.rays import Rays, trace
 
 Doubles = NDArray[np.float64]
 _AXIS = 1 << 15  # rays of the exposure
-_PER_CELL = 8  # edges of two triangles that rims cut, at most
 _LEAST = 0.5  # pixels that a picture moves, below which a light is a point
 _STEP, _STEPS = 0.125, 256  # movements are rounded to so many pixels, and to such a part of themselves
 _CORNERS = 64  # of an ellipse
@@ -79,53 +68,6 @@ def axis_irradiance(lens: Lens, wavelength_nm: float) -> float:
     if not light > 0:
         raise InputError(lens.path, "surfaces", "(no ray passes on the axis)", "a lens that light can pass")
     return light
-
-
-def edges_of(rays: Floats, columns: int, size: tuple[int, int], per_mm: float) -> Doubles:
-    """The light of a grid of rays of one wavelength as edges for `draw_edges`; none if it misses the film.
-
-    Args:
-        rays: [4, N] film x, y (mm), power and worst, row after row, with one ray more than `columns` in each.
-        size: width and height of the film in pixels. per_mm: pixels per mm.
-
-    Raises:
-        InputError: there is no C compiler, or it fails.
-    """
-    rows = rays.shape[1] // (columns + 1) - 1
-    assert rays.dtype == np.float32 and rays.flags.c_contiguous and rays.shape == (4, (rows + 1) * (columns + 1))
-    edges, room = np.empty((_PER_CELL * rays.shape[1], 7)), np.zeros((15, rays.shape[1]))
-    pointers = [a.ctypes.data for a in (rays, room, edges)]
-    return edges[: _compiled().edges(columns, rows, *size, per_mm, *pointers)].copy()
-
-
-def draw_edges(picture: Floats, rows: range, edges: Doubles, counts: NDArray[np.int64], light: Doubles) -> None:
-    """Add light to some rows of a picture [H, W, 3], centred and upright (the film turned by 180 degrees).
-
-    A row is the same whether it is drawn by itself or with others.
-
-    Args:
-        edges: [N, 7], edges of several grids: x and y of both ends in pixels, then the step of density across the edge
-            (at the corner of the picture, and its slopes in x and y). An edge of two equal ends is light at a point.
-        counts: [K] number of edges of each grid. light: [K, 3] colour of a cell whose power is 1.
-
-    Raises:
-        InputError: as `edges_of`.
-    """
-    height, width, _ = picture.shape
-    assert picture.dtype == np.float32 and picture.flags.c_contiguous and rows.stop <= height
-    padded, sums = np.zeros((len(light), 4)), np.zeros((2, len(rows), width + 3, 4))
-    padded[:, :3] = light
-    pointers = [a.ctypes.data for a in (counts, edges, padded, sums, picture[rows.start :])]
-    _compiled().draw(width, rows.start, len(rows), len(light), *pointers)
-
-
-@cache
-def _compiled() -> ctypes.CDLL:
-    library = load_compiled(c_source("flare/area.c", LOST=LOST))
-    whole, real, pointer = ctypes.c_int, ctypes.c_double, ctypes.c_void_p
-    library.edges.argtypes, library.edges.restype = [*[whole] * 4, real, *[pointer] * 3], ctypes.c_size_t
-    library.draw.argtypes, library.draw.restype = [*[whole] * 4, *[pointer] * 5], None
-    return library
 
 
 class Smear(NamedTuple):

@@ -16,23 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurolens.base.kept import Kept
-from neurolens.flare.canvas import (
-    Doubles,
-    Raster,
-    Smear,
-    axis_irradiance,
-    draw_edges,
-    edges_of,
-    enlarged,
-    smear_of,
-    smeared,
-    spread,
-)
+from neurolens.flare.areas import Doubles, Floats, draw_edges, edges_of
+from neurolens.flare.canvas import Raster, Smear, axis_irradiance, enlarged, smear_of, smeared, spread
 from neurolens.flare.ghosts import GhostSource, Pair
 from neurolens.flare.grids import REACH, Grid, ghost_moves, grids_of
 from neurolens.flare.lights import Light, Patch, light_rays, patches, rays_across
 from neurolens.flare.photons import LEVELS, Photons, PhotonTracer
-from neurolens.flare.steps import Floats
 from neurolens.lens.glass import inverse_square_um
 from neurolens.lens.paraxial import first_order
 from neurolens.render.colour import SRGB, SpectralRange, in_gamut

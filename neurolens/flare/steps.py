@@ -21,6 +21,7 @@ import torch
 from numpy.typing import NDArray
 
 from neurolens.base.errors import InputError
+from neurolens.flare.areas import LOST, Floats
 from neurolens.graph.c import Signature, write_c
 from neurolens.graph.compiler import c_source, load_compiled
 from neurolens.graph.ir import Graph, Value
@@ -35,10 +36,8 @@ from neurolens.trace.surfaces import Medium, Rays, meet, normal_at, radius2, ref
 from neurolens.trace.tracegraph import transmitted
 from neurolens.trace.transmission import path_mm
 
-Floats = NDArray[np.float32]
 Action = Literal["T", "R"]
 STATE = 8  # rows of a ray: x, y, z (mm, this step's frame), direction, power, `worst` (largest r^2 / R^2 at a rim)
-LOST = 1e30  # `worst` of a ray that meets no surface, or is totally reflected where it should go on
 CALL = ("shift_mm", "curvature", "per_rim2", "n_before", "n_after", "n_step", "absorbed_per_mm")
 DEGREE = 10  # the degree of a coating's reflectance
 FIGURE = ("stretch", "start_c", "start_cz", "last_step_mm")  # see `shapes.Figure`; `across` and the terms follow

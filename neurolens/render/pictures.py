@@ -160,12 +160,12 @@ def read_channels(path: str | Path, wanted: Sequence[str] = ()) -> tuple[dict[st
         InputError: missing, no OpenEXR file, truncated, metadata that are no JSON object.
     """
     planes, header = decoded_channels(Path(path), path, "file", wanted)
-    return planes, _metadata(path, header)
+    return planes, metadata_of(path, header)
 
 
 def read_metadata(path: str | Path) -> dict[str, Any]:
     """The metadata of a picture alone, {} without ours; raises InputError as `read_channels`."""
-    return _metadata(path, _header(path, "file", Path(path)))
+    return metadata_of(path, header_of(path))
 
 
 def read_layers(path: str | Path) -> dict[str, FloatArray]:
@@ -183,7 +183,7 @@ def read_colour_space(path: str | Path) -> ColourSpace | None:
     Raises:
         InputError: as `read_channels`.
     """
-    stated = _header(path, "file", Path(path)).get("chromaticities")
+    stated = header_of(path).get("chromaticities")
     if not isinstance(stated, tuple) or len(stated) != len(SRGB.chromaticities):
         return None
     for space in COLOUR_SPACES.values():
@@ -195,7 +195,7 @@ def read_colour_space(path: str | Path) -> ColourSpace | None:
     return SRGB
 
 
-def _metadata(path: str | Path, header: Mapping[str, Any]) -> dict[str, Any]:
+def metadata_of(path: str | Path, header: Mapping[str, Any]) -> dict[str, Any]:
     """The settings in our attribute, which in a stranger's file may have any type of OpenEXR."""
     text = header.get(METADATA_KEY, "{}")
     with suppress(ValueError, RecursionError, InputError):
@@ -226,7 +226,7 @@ def decoded_channels(
         most: pixels a side. pixels: the most in all.
     """
     header = _header(file, field, path)
-    with _whole(file, field, path):
+    with whole_file(file, field, path):
         size = [int(last) + 1 - int(first) for first, last in zip(*header["dataWindow"], strict=True)]
         check_size(file, field, str(path), size, most, pixels)
         names = [c.name for c in header["channels"] if (c.xSampling, c.ySampling) == (1, 1)]
@@ -253,16 +253,21 @@ def check_size(file: str | Path, field: str, name: str, size: Sequence[int], mos
         raise InputError(file, field, name, f"at most {pixels} pixels: all pictures of a scene share a limit")
 
 
+def header_of(path: str | Path) -> dict[str, Any]:
+    """The header of a file's first part; raises InputError as `read_channels`."""
+    return _header(path, "file", Path(path))
+
+
 def _header(file: str | Path, field: str, path: Path) -> dict[str, Any]:
     """The header of the first part; `file` and `field` name the picture."""
-    with _whole(file, field, path), _silent():
+    with whole_file(file, field, path), _silent():
         open_regular(path).close()
         with OpenEXR.File(str(path), header_only=True) as header:
             return dict(header.parts[0].header)
 
 
 @contextmanager
-def _whole(file: str | Path, field: str, path: Path) -> Iterator[None]:
+def whole_file(file: str | Path, field: str, path: Path) -> Iterator[None]:
     """Turn errors of reading an OpenEXR file inside the block into InputError."""
     try:
         yield

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neurolens.flare.canvas import Raster, draw_edges, edges_of
+from neurolens.flare.areas import draw_edges, edges_of
+from neurolens.flare.canvas import Raster
 from neurolens.flare.ghosts import GhostTracer, coated, ghost_pairs
 from neurolens.flare.grids import REACH, grids_of
 from neurolens.flare.lights import Light, light_rays, rays_across

@@ -1,0 +1,1 @@
+"""Blur of a lens for pictures that were rendered sharp, and kernels of bokeh."""

@@ -1,0 +1,103 @@
+"""Pixels that are far brighter than their surroundings, spread over the film as clean discs.
+
+Few of a pixel's samples would find them, which is noise. Their light above that of the surroundings is taken out of the
+plate and spread by the lens's own kernels, one for all points of a place and a depth that are alike; from film pixels
+where something nearer hides a point it is left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage  # type: ignore[import-untyped]
+
+from neurolens.cameras.contract import Camera
+from neurolens.defocus.gather import compiled, radius_px
+from neurolens.defocus.kernels import kernel_at
+from neurolens.defocus.plate import Eye, FloatArray, Layer, as_structs
+
+_WINDOW = 33  # pixels about which surroundings are meant
+_BRIGHTER, _ABOVE = 8.0, 3.0  # than the geometric mean of the surroundings, and than their mean
+_LEAST_PX = 1.5  # radius of the blur: what is sharper has no noise
+_PLACES = 32  # kernels along the longer side of the film
+_FINE_PX, _FINE = 0.25, 0.03  # steps of the radius between kernels, absolute and relative
+_MOST_WORK = 4e9  # pixels of kernels
+_CELLS, _COLOURS = 24, 2
+
+
+@dataclass(frozen=True)
+class Highlights:
+    """Light [N, 3] taken out of a layer at places [N, 2] in its pixels, inverse depths [N], and radii of blur [N]."""
+
+    place_px: NDArray[np.float64]
+    inverse_depth: FloatArray
+    radius_px: NDArray[np.float64]
+    light: FloatArray
+
+
+def take_highlights(layer: Layer, spread: NDArray[np.float64], size: tuple[int, int]) -> Highlights:
+    """Take the highlights out of a layer, which is changed, for a film of `size` with such a spread at its nodes."""
+    rgb, w = layer.texel[..., :3], layer.texel[..., 3]
+    bright = rgb.max(axis=2)
+    log = np.log(np.maximum(bright, 1e-6 * max(float(bright.mean()), 1e-30)))
+    geometric = np.exp(ndimage.uniform_filter(log, _WINDOW, mode="nearest"))
+    mean = ndimage.uniform_filter(np.minimum(bright, _BRIGHTER * geometric), _WINDOW, mode="nearest")
+    cap = np.maximum(_BRIGHTER * geometric, _ABOVE * mean)
+    row, column = np.nonzero((bright > cap) & (w >= 0))
+    nodes = [
+        np.clip(((v + 0.5) / n * (k - 1)).round().astype(int), 0, k - 1)
+        for v, n, k in zip((row, column), w.shape, spread.shape[:2], strict=True)
+    ]
+    radius = radius_px(spread[nodes[0], nodes[1]], w[row, column])
+    wide = radius > _LEAST_PX
+    row, column, radius = row[wide], column[wide], radius[wide]
+    work = math.pi * radius**2
+    if work.sum() > _MOST_WORK:  # the brightest, as many as there is time for
+        order = np.argsort(-(bright / cap)[row, column])
+        kept = order[np.cumsum(work[order]) <= _MOST_WORK]
+        row, column, radius = row[kept], column[kept], radius[kept]
+    light = rgb[row, column] * (1 - cap[row, column] / bright[row, column])[:, None]
+    rgb[row, column] -= light
+    return Highlights(np.stack([column, row], axis=1) + 0.5, w[row, column], radius, light)
+
+
+def spread_highlights(
+    picture: FloatArray, found: Highlights, layers: list[Layer], eye: Eye, camera: Camera,
+    report: Callable[[float], None] = lambda _: None,
+) -> None:  # fmt: skip
+    """Add the light of highlights to a picture [H, W, 3]."""
+    height, width = picture.shape[:2]
+    plate = layers[0].size
+    scale = np.array([width / plate[0], height / plate[1]])
+    groups = defaultdict(list)
+    cell = (found.place_px / (max(plate) / _PLACES)).astype(int)
+    near = 4.0 * _FINE_PX / _FINE
+    step = np.where(
+        found.radius_px < near / 4, found.radius_px / _FINE_PX, near + np.log(np.maximum(found.radius_px, 1e-3)) / _FINE
+    ).round().astype(int)
+    side = np.sign(found.inverse_depth - np.median(found.inverse_depth)).astype(int)
+    for k, key in enumerate(zip(*cell.T.tolist(), step.tolist(), side.tolist(), strict=True)):
+        groups[key].append(k)
+    structs, kept = as_structs(layers)
+    for number, rows in enumerate(groups.values()):
+        place, w = found.place_px[rows].mean(axis=0), float(found.inverse_depth[rows].mean())
+        kernel = kernel_at(
+            camera, eye, (width, height), (place[0], place[1]), w, tuple(place * scale), _CELLS, _COLOURS
+        )
+        if kernel is not None:
+            points = np.empty((len(rows), 8), np.float32)
+            points[:, :2], points[:, 2] = found.place_px[rows], found.inverse_depth[rows]
+            points[:, 3:5] = kernel.corner_px + (found.place_px[rows] - place) @ kernel.turn.T
+            points[:, 5:] = found.light[rows]
+            sweep, light = np.ascontiguousarray(kernel.sweep, np.float32), np.ascontiguousarray(kernel.light)
+            compiled().splat(
+                structs, len(layers), points.ctypes.data, len(rows), light.ctypes.data, *light.shape[1::-1],
+                sweep.ctypes.data, width, height, picture.ctypes.data,
+            )  # fmt: skip
+        report((number + 1) / len(groups))
+    del kept

@@ -1,0 +1,169 @@
+"""The blur of points: where on the film the light of a scene point arrives, as a picture for each channel.
+
+A point is named by its place in a plate and its inverse depth. Each point of the pupil sends its light to the film
+point whose ray sees it there, found by Newton's method on the camera's own rays; cells of a grid of the pupil are drawn
+as the areas that they cover. So a kernel has no noise, and cat's eyes, coma and colour fringes are the lens's.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurolens.base.errors import InputError
+from neurolens.cameras.contract import Camera
+from neurolens.defocus.gather import LIGHT_NM, RayTable, channel_wavelengths
+from neurolens.defocus.plate import Eye, FloatArray
+from neurolens.flare.areas import LOST, draw_edges, edges_of
+
+Array = NDArray[np.float64]
+GRID = 48  # cells of the pupil along a side
+COLOURS = 5  # wavelengths of a channel
+_STEPS = 5  # of Newton's method
+_CLOSE = 0.01  # pixels by which a ray may miss the point
+_FAR = 0.02  # of the kernel's width: what misses by more is left out
+_LARGEST = 2048  # pixels a side of a kernel
+_RIM = 0.99  # of a pupil's outline, on which itself hardly a ray passes: beyond it places are extrapolated
+_MARGIN = 2  # pixels around it
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """The picture of a point.
+
+    Attributes:
+        light: [h, w, 3] the part of the radiance of one square pixel of the plate that arrives at each pixel.
+        corner_px: column and row in the film, of its first pixel; whole numbers.
+        turn: [2, 2] by how much the point's picture moves on the film as the point moves in the plate, pixels.
+        place_px: the point in the plate. sweep: [2, 3] how fast the ray from a film pixel to the point moves in the
+            plate as it comes nearer (pixels by 1/m): the constant, and the factors of column and row in the kernel.
+    """
+
+    light: FloatArray
+    corner_px: tuple[int, int]
+    turn: Array
+    place_px: tuple[float, float]
+    sweep: Array
+
+    @property
+    def energy(self) -> Array:
+        """The light of red, green and blue."""
+        return np.asarray(self.light.sum(axis=(0, 1), dtype=np.float64))
+
+
+def kernel_at(
+    camera: Camera, eye: Eye, size: tuple[int, int], place_px: tuple[float, float], inverse_depth: float,
+    guess_px: tuple[float, float], cells: int = GRID, colours: int = COLOURS,
+) -> Kernel | None:  # fmt: skip
+    """The kernel of a point at a place of the plate, in pixels of a film of `size`; None where no light arrives.
+
+    Args:
+        guess_px: about where the film shows the point. cells: of the pupil's grid. colours: wavelengths a channel.
+
+    Raises:
+        InputError: a kernel of over 2048 pixels a side.
+    """
+    side = 0.5 + _RIM * (np.arange(cells + 1) / cells - 0.5)
+    pupil = np.stack(np.meshgrid(side, side), 0).reshape(2, -1).astype(np.float32)
+    table = RayTable(camera, eye, size, pupil, np.zeros(pupil.shape[1], np.float32))
+    if len(table.nm) > 1:
+        low, high = (min(max(v, LIGHT_NM[0]), LIGHT_NM[1]) for v in camera.wavelength_nm or LIGHT_NM)
+        nm = channel_wavelengths((np.arange(colours, dtype=np.float32) + 0.5) / colours, low, high)
+    else:
+        nm = table.nm[:, :1]
+    aimed = _aimed(table, place_px, inverse_depth, guess_px, nm.reshape(-1))
+    aimed = aimed.widened(cells)
+    lit = aimed.weight > 0
+    if not lit.any():
+        return None
+    least, most = aimed.place[:, lit].min(axis=1), aimed.place[:, lit].max(axis=1)
+    corner = np.floor(least).astype(int) - _MARGIN
+    width, height = (np.ceil(most).astype(int) + _MARGIN - corner).tolist()
+    if max(width, height) > _LARGEST:
+        raise InputError("kernel", "size", f"({width} x {height} pixels)", f"at most {_LARGEST} a side: blur less")
+    light = np.zeros((height, width, 3), np.float32)
+    colour = np.eye(3) if len(nm) > 1 else np.ones((1, 3))
+    for k in range(nm.size):
+        aimed.draw(light, k, corner, cells, colour[[k // nm.shape[1]]] / (nm.shape[1] * cells**2))
+    return Kernel(
+        np.maximum(light, 0), (int(corner[0]), int(corner[1])), aimed.turn, place_px, aimed.sweep(corner)
+    )
+
+
+@dataclass(frozen=True)
+class _Aimed:
+    """Rays of a pupil's grid, of several wavelengths one after the other, that see a point: places [2, N] on the film in
+    pixels, weights [N], b [2, N] of their lines, and `turn` [2, 2], the mean derivatives of places by the point's."""
+
+    place: Array
+    weight: Array
+    slope: Array
+    turn: Array
+
+    def draw(self, light: FloatArray, number: int, corner: NDArray[np.int_], cells: int, colour: Array) -> None:
+        """Add the light of a wavelength to a kernel's picture, each quarter of the pupil with its cells cut along the
+        disk's diagonal."""
+        height, width = light.shape[:2]
+        own, half = slice(number * (cells + 1) ** 2, (number + 1) * (cells + 1) ** 2), cells // 2
+        here, weight = self.place[:, own] - corner[:, None], self.weight[own]
+        # `edges_of` turns film points in mm into pixels: one mm a pixel, from the middle.
+        rows = np.stack([width / 2 - here[0], here[1] - height / 2, weight, np.where(weight > 0, 0.0, LOST)])
+        rows[:2, weight <= 0] = 0
+        grid = rows.astype(np.float32).reshape(4, cells + 1, cells + 1)
+        halves = slice(0, half + 1), slice(half, cells + 1)
+        for across, down in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            part = grid[:, halves[down], halves[across]][..., :: 1 if across == down else -1]
+            edges = edges_of(np.ascontiguousarray(part.reshape(4, -1)), half, (width, height), 1.0)
+            draw_edges(light, range(height), edges, np.array([len(edges)]), colour)
+
+    def widened(self, cells: int) -> _Aimed:
+        """The rays with their places taken from `_RIM` to the outline itself, along the radii of the pupil."""
+        grid = self.place.reshape(2, -1, cells + 1, cells + 1)
+        side = np.linspace(-1, 1, cells + 1)
+        down, across = np.gradient(grid, side, side, axis=(2, 3))
+        more = (1 / _RIM - 1) * (side[:, None] * down + side * across)
+        return replace(self, place=(grid + more).reshape(2, -1))
+
+    def sweep(self, corner: NDArray[np.int_]) -> Array:
+        """See `Kernel.sweep`: a fit by least squares to the rays that pass."""
+        lit = self.weight > 0
+        basis = np.stack([np.ones(int(lit.sum())), *(self.place[:, lit] - corner[:, None])], axis=1)
+        return np.asarray(np.linalg.lstsq(basis, self.slope[:, lit].T, rcond=None)[0].T)
+
+
+def _aimed(table: RayTable, target: tuple[float, float], w: float, guess: tuple[float, float], nm: FloatArray) -> _Aimed:
+    """The rays of all points of the pupil that see a point of the plate, at each of some wavelengths."""
+    pupil, waves = np.tile(table.pupil, len(nm)), np.repeat(nm, table.pupil.shape[1])
+    wanted = np.array(target)[:, None]
+
+    def seen(place: Array) -> tuple[Array, Array, Array]:
+        lines = table.at(place, pupil, waves).T.astype(np.float64)
+        return lines[:2] + w * lines[2:4], lines[4], lines[2:4]
+
+    place = np.repeat(np.array(guess, np.float64)[:, None], len(waves), axis=1)
+    step = 0.01 * max(table.size)
+    at, weight, slope = seen(place)
+    moved = [seen(place + step * np.eye(2)[:, [k]]) for k in (0, 1)]
+    good = (weight > 0) & (moved[0][1] > 0) & (moved[1][1] > 0)
+    if not good.any():
+        return _Aimed(place, np.zeros(len(waves)), slope, np.eye(2))
+    turn = np.linalg.inv(np.stack([((m[0] - at) / step)[:, good].mean(axis=1) for m in moved], axis=1))
+    for _ in range(_STEPS):
+        off = wanted - at
+        # Rays that do not pass say nothing about where the point's light is: they move as the others do.
+        off[:, weight <= 0] = off[:, weight > 0].mean(axis=1, keepdims=True) if (weight > 0).any() else 0.0
+        place = place + turn @ off
+        at, weight, slope = seen(place)
+        if np.hypot(*(wanted - at))[weight > 0].max(initial=0.0) < _CLOSE:
+            break
+    # Each ray's own area: near the end of the light the pupil's outline moves fast with the film point.
+    ahead, behind = ([seen(place + d * np.eye(2)[:, [k]]) for k in (0, 1)] for d in (0.5, -0.5))
+    (xx, yx), (xy, yy) = (p[0] - q[0] for p, q in zip(ahead, behind, strict=True))
+    stretch = np.abs(xx * yy - xy * yx)
+    known = np.all([found[1] > 0 for found in (*ahead, *behind)], axis=0) & (stretch > 0)
+    area = np.where(known, 1 / np.where(known, stretch, 1), abs(float(np.linalg.det(turn))))
+    close = np.hypot(*(wanted - at)) < _FAR * max(1.0, float(np.ptp(place, axis=1).max()))
+    return _Aimed(place, np.where(close, weight, 0) * area, slope, turn)

@@ -1,0 +1,216 @@
+"""Plates from OpenEXR files: colours and depth in layers, and the pinhole that they were rendered through.
+
+A layer is what has red, green, blue and depth under one name: R, G, B, Z of the picture itself, "behind.R" and
+"behind.Z", or "ViewLayer.Combined.R" and "ViewLayer.Depth.Z" of Blender. Of a deep file the first sample of each pixel
+is one layer, the second the next. The picture's own layer is the front; a ray takes whatever it meets first.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+
+from neurolens.base.errors import InputError, warn
+from neurolens.cameras.field import Frame
+from neurolens.defocus.plate import Eye, FloatArray, Layer
+from neurolens.render.colour import SRGB, ColourSpace, conversion, converted
+from neurolens.render.pictures import COLOURS, decoded_channels, header_of, metadata_of, read_colour_space, whole_file
+
+Along = Literal["axis", "ray"]
+_DEPTHS = ("Z", "Depth.Z", "Depth.V", "depth.Z", "depth.V")  # after the name of a layer
+_COMBINED = ("Combined.", "combined.")
+_SKY_M = 1e9  # and beyond it
+_MOST_LAYERS = 8  # of a deep file
+_MOST_SAMPLES = 1 << 27
+_OPAQUE = 0.5  # opacity from which a deep sample hides what is behind it
+_SAME = 1e-3  # relative: shapes of plate and film
+
+
+@dataclass(frozen=True)
+class DepthSettings:
+    """What the depth of a plate means.
+
+    Attributes:
+        channel: its name; "" finds it. scale_m: metres of its unit. along: the camera's axis, or each pixel's ray.
+        from_film: whether it counts from the film, as pictures of `neurolens render` have it, or from the pinhole; None
+            asks the file.
+    """
+
+    channel: str = ""
+    scale_m: float = 1.0
+    along: Along = "axis"
+    from_film: bool | None = None
+
+
+@dataclass(frozen=True)
+class Plate:
+    """A plate: its layers, the front first, its eye, the size of the picture in pixels, and its colour space."""
+
+    layers: list[Layer]
+    eye: Eye
+    size: tuple[int, int]
+    space: ColourSpace
+
+
+def read_plate(
+    path: Path, film_mm: tuple[float, float], frame: Frame, depth: DepthSettings, behind: Sequence[Path] = ()
+) -> Plate:
+    """A plate for a camera of such a film and frame (`cameras.field.frame_of`).
+
+    The display window is the film; a larger data window is overscan. A picture of `neurolens render --camera pinhole`
+    says itself what its pinhole was. Any other is that of the camera's own frame: its hole in the paraxial entrance
+    pupil, its focal length the lens's paraxial size in the plane in focus, which `neurolens stmap` prints.
+
+    Args:
+        behind: files of the same size that show what is behind the things of the plate.
+
+    Raises:
+        InputError: no depth; depth that is negative, or from 0 to 1 only; a shape other than the film's; files of
+            different sizes.
+    """
+    header = header_of(path)
+    (left, top), (last, bottom) = header["displayWindow"]
+    size = int(last) - int(left) + 1, int(bottom) - int(top) + 1
+    if not math.isclose(size[0] / size[1], film_mm[0] / film_mm[1], rel_tol=_SAME + 1 / min(size)):
+        expected = f"a picture of the film's shape, {film_mm[0]:g} x {film_mm[1]:g} mm"
+        raise InputError(path, "displayWindow", f"({size[0]} x {size[1]} pixels)", expected)
+    ours = _pinhole(metadata_of(path, header))
+    reach, before = frame.reach_mm, frame.pupil_mm[1]
+    if ours is not None:
+        reach, before = (ours["efl_mm"], ours["efl_mm"]), ours["efl_mm"]
+    per_mm = size[0] / film_mm[0], size[1] / film_mm[1]
+    start = [int(v) for v in header["dataWindow"][0]]
+    centre = size[0] / 2 + int(left) - start[0], size[1] / 2 + int(top) - start[1]
+    eye = Eye((reach[0] * per_mm[0], reach[1] * per_mm[1]), centre, before)
+    from_film = ours is not None if depth.from_film is None else depth.from_film
+    space = read_colour_space(path) or SRGB
+    layers = []
+    for number, file in enumerate((path, *behind)):
+        for rgb, metres in _layers(file, depth, several=number == 0):
+            if layers and rgb.shape != layers[0].texel[..., :3].shape:
+                got = f"({rgb.shape[1]} x {rgb.shape[0]} pixels)"
+                raise InputError(file, "size", got, "the pixels of the plate, {} x {}".format(*layers[0].size))
+            w, cosine = _inverse_depth(file, metres, depth, eye, 1e-3 * before if from_film else 0.0)
+            light = np.maximum(_finite(file, rgb), 0)
+            light = light if space is SRGB else converted(light, conversion(space, SRGB)).astype(np.float32)
+            if ours is not None and ours.get("vignetting", "both") in ("both", "natural"):
+                light /= (cosine**4)[..., None]
+            layers.append(Layer(light, w))
+    return Plate(layers, eye, size, space)
+
+
+def _pinhole(metadata: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The settings of our pinhole, where it took the picture."""
+    camera = metadata.get("camera")
+    if not isinstance(camera, dict) or camera.get("camera") != "pinhole":
+        return None
+    focal = camera.get("efl_mm")
+    return camera if isinstance(focal, float | int) and 0 < focal < math.inf else None
+
+
+def _layers(path: Path, depth: DepthSettings, several: bool) -> list[tuple[FloatArray, FloatArray]]:
+    """Colours and depths of the layers of a file."""
+    if header_of(path)["type"] in (OpenEXR.deepscanline, OpenEXR.deeptile):
+        return _deep(path)
+    planes, _ = decoded_channels(path, path, "file")
+    found = []
+    for name in planes:
+        prefix = name.removesuffix("R")
+        if name != f"{prefix}R" or not {prefix + "G", prefix + "B"} <= planes.keys():
+            continue
+        root = next((prefix.removesuffix(end) for end in _COMBINED if prefix.endswith(end)), prefix)
+        channel = next((root + end for end in _DEPTHS if root + end in planes), None)
+        if depth.channel and not found:
+            if depth.channel not in planes:
+                raise InputError(path, "channel", depth.channel, f"one of: {', '.join(planes)}")
+            channel = depth.channel
+        if channel is not None:
+            found.append((prefix, channel))
+    if not found:
+        expected = "R, G, B and a channel Z with the depth in metres; --depth names another"
+        raise InputError(path, "channels", f"({', '.join(planes)[:200]})", expected)
+    found.sort(key=lambda pair: (pair[0] != "", not pair[0].endswith(_COMBINED)))
+    return [
+        (np.stack([planes[prefix + c] for c in COLOURS], axis=2), planes[channel])
+        for prefix, channel in (found if several else found[:1])
+    ]
+
+
+def _deep(path: Path) -> list[tuple[FloatArray, FloatArray]]:
+    """The layers of a deep file: the opaque samples of each pixel, sorted by depth."""
+    with whole_file(path, "file", path), OpenEXR.File(str(path), separate_channels=True) as file:
+        channels = {name: c.pixels for name, c in file.parts[0].channels.items()}
+    if not {*COLOURS, "Z"} <= channels.keys():
+        raise InputError(path, "channels", f"({', '.join(channels)[:200]})", "R, G, B and Z")
+    height, width = channels["Z"].shape
+    counts = np.array([[0 if v is None else len(v) for v in row] for row in channels["Z"]])
+    if counts.sum() > _MOST_SAMPLES:
+        raise InputError(path, "samples", int(counts.sum()), f"at most {_MOST_SAMPLES}")
+    flat = {
+        name: np.concatenate([np.asarray(v, np.float32) for v in channels[name].reshape(-1) if v is not None] or [[]])
+        for name in (*COLOURS, "Z", *(("A",) if "A" in channels else ()))
+    }
+    alpha = flat.get("A", np.ones_like(flat["Z"]))
+    pixel = np.repeat(np.arange(height * width), counts.reshape(-1))
+    kept = np.flatnonzero((alpha >= _OPAQUE) & np.isfinite(flat["Z"]))
+    kept = kept[np.lexsort((flat["Z"][kept], pixel[kept]))]
+    place = pixel[kept]
+    starts = np.flatnonzero(np.diff(place, prepend=-1))
+    rank = np.arange(len(place)) - np.repeat(starts, np.diff([*starts, len(place)]))
+    layers = []
+    for k in range(min(int(rank.max(initial=0)) + 1, _MOST_LAYERS)):
+        rows = kept[rank == k]
+        rgb, metres = np.zeros((height * width, 3), np.float32), np.full(height * width, -np.inf if k else np.inf, np.float32)
+        rgb[place[rank == k]] = np.stack([flat[c][rows] for c in COLOURS], axis=1) / alpha[rows, None]
+        metres[place[rank == k]] = flat["Z"][rows]
+        layers.append((rgb.reshape(height, width, 3), metres.reshape(height, width)))
+    return layers
+
+
+def _finite(path: Path, rgb: FloatArray) -> FloatArray:
+    """Colours without NaN and infinity, which become black, with a warning."""
+    bad = ~np.isfinite(rgb).all(axis=2)
+    if bad.any():
+        warn(f"{path}: {int(bad.sum())} of {bad.size} pixels are not finite; they are black")
+        rgb = np.where(bad[..., None], np.float32(0), rgb)
+    return rgb
+
+
+def _inverse_depth(
+    path: Path, metres: FloatArray, depth: DepthSettings, eye: Eye, eye_m: float
+) -> tuple[FloatArray, NDArray[np.float32]]:
+    """Inverse depth from the eye, 1/m, and the cosine of each pixel's ray; below 0 where a layer has nothing.
+
+    `eye_m`: the eye's distance before the place from which depth counts.
+    """
+    height, width = metres.shape
+    x, y = (
+        (np.arange(n, dtype=np.float32) + 0.5 - c) / r
+        for n, c, r in zip((width, height), eye.centre_px, eye.reach_px, strict=True)
+    )
+    cosine = 1 / np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2, dtype=np.float32)
+    nothing = np.isneginf(metres)
+    z = metres * np.float32(depth.scale_m)
+    solid = np.isfinite(z) & (z != 0) & (np.abs(z) < _SKY_M)
+    if missing := int(np.isnan(metres).sum()):
+        warn(f"{path}: the depth of {missing} of {z.size} pixels is not a number; they count as sky")
+    if solid.any():
+        least, most = float(z[solid].min()), float(z[solid].max())
+        if least < 0:
+            expected = "depth that grows away from the camera; --depth-scale -1 turns it"
+            raise InputError(path, "depth", f"({least:g} m)", expected)
+        if most <= 1 and not nothing.any():
+            expected = "depth in metres; this looks like inverse or normalised depth; --depth-scale sets a unit"
+            raise InputError(path, "depth", f"({least:g} to {most:g} m)", expected)
+    z = np.where(solid, z * cosine if depth.along == "ray" else z, 1) - np.float32(eye_m)
+    if (close := solid & (z <= 1e-3)).any():
+        raise InputError(path, "depth", f"({float(z[close].min()):g} m)", "more than 0 m before the pinhole")
+    w = np.divide(1, z, out=np.zeros_like(z), where=solid)
+    return np.where(nothing, np.float32(-1), w), cosine

@@ -1,0 +1,339 @@
+"""Blur for plates: closed forms of the thin lens, the exact lens's own rays, occlusion, layers, files and their errors."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from neurolens.cameras.build import make_camera
+from neurolens.cameras.field import field_of, frame_of
+from neurolens.cameras.ideal import ThinLens
+from neurolens.cameras.sampling import concentric_disk, stratified
+from neurolens.defocus.gather import gather, spread_over, turned
+from neurolens.defocus.highlights import spread_highlights, take_highlights
+from neurolens.defocus.kernels import kernel_at
+from neurolens.defocus.plate import Eye, Layer
+from neurolens.defocus.read import DepthSettings, read_plate
+from neurolens.graph.compiler import has_compiler
+from neurolens.lens.shot import Shot
+from neurolens.render.pictures import read_exr, write_channels
+from tests.command_line import failure, run_json
+
+ROOT = Path(__file__).parents[2]
+GAUSS = ROOT / "lenses" / "laikin_double_gauss_50.toml"
+FILM, SIZE = (36.0, 20.25), (384, 216)
+FOCUS_M = 2.0
+pytestmark = pytest.mark.skipif(not has_compiler(), reason="defocus takes a C compiler")
+
+
+def thin(f_number: float = 1.4, focus_m: float = FOCUS_M) -> ThinLens:
+    return ThinLens(50.0, f_number, focus_m, FILM)
+
+
+def eye_of(camera: object, size: tuple[int, int] = SIZE) -> Eye:
+    frame = frame_of(camera)
+    per_mm = size[0] / FILM[0]
+    reach = frame.reach_mm[0] * per_mm, frame.reach_mm[1] * per_mm
+    return Eye(reach, (size[0] / 2, size[1] / 2), frame.pupil_mm[0])
+
+
+def blurred(
+    camera: object, rgb: np.ndarray, w: np.ndarray, highlights: bool = False, samples: int = 512, **more: object
+) -> np.ndarray:
+    size = (w.shape[1], w.shape[0])
+    eye, layers = eye_of(camera, size), [Layer(rgb.astype(np.float32), np.asarray(w, np.float32))]
+    spread, taken = spread_over(camera, eye, size), None
+    if highlights:
+        taken = take_highlights(layers[0], spread, size)
+        assert len(taken.radius_px)
+    found = gather(layers, eye, camera, size, spread, samples, **more).rgb
+    if taken is not None:
+        spread_highlights(found, taken, layers, eye, camera)
+    return found
+
+
+def flat(value: float, inverse_depth: float, size: tuple[int, int] = SIZE) -> tuple[np.ndarray, np.ndarray]:
+    return np.full((size[1], size[0], 3), value), np.full((size[1], size[0]), inverse_depth)
+
+
+def in_focus(camera: ThinLens) -> float:
+    """The inverse depth from the lens of the plane in focus, 1/m."""
+    return 1 / (camera.focus_m - camera.image_distance_mm / 1000)
+
+
+def disc_px(camera: ThinLens, w: float, size: tuple[int, int] = SIZE) -> float:
+    """The radius of the blur of a point, in pixels: similar triangles."""
+    return camera.radius_mm * camera.image_distance_mm * abs(w - in_focus(camera)) / 1000 * size[0] / FILM[0]
+
+
+def test_points_of_the_square_turn_as_their_places_on_the_disk() -> None:
+    random = np.random.default_rng(1)
+    square, angle = random.random((2, 500)).astype(np.float32), random.uniform(-9, 9, 500)
+    before, after = concentric_disk(square), concentric_disk(turned(square, angle))
+    np.testing.assert_allclose(after[0] + 1j * after[1], (before[0] + 1j * before[1]) * np.exp(1j * angle), atol=1e-6)
+
+
+def test_even_light_takes_the_falloff_of_the_thin_lens_and_nothing_else() -> None:
+    camera = thin(11)
+    found = blurred(camera, *flat(0.7, 0.2), samples=64)[..., 1]
+    x = (np.arange(SIZE[0]) + 0.5) / SIZE[0] * FILM[0] - FILM[0] / 2
+    falloff = 1 / (1 + (x / camera.image_distance_mm) ** 2) ** 2
+    np.testing.assert_allclose(found[SIZE[1] // 2] / 0.7, falloff, rtol=1e-3)
+    assert np.abs(np.diff(found[SIZE[1] // 2], 2)).max() < 1e-3  # without noise
+
+
+def test_what_is_in_focus_stays_sharp() -> None:
+    camera = thin()
+    rgb, w = flat(0.0, in_focus(camera))
+    rgb[:, ::2] = 1.0
+    row = blurred(camera, rgb, w)[SIZE[1] // 2, 160:224, 1]
+    # Read between pixels, a comb of one pixel keeps half of its contrast.
+    assert row[::2].min() > 0.7 and row[1::2].max() < 0.3
+
+
+def thin_disc(camera: ThinLens, w: float) -> tuple[float, float]:
+    """The light of a point on the axis and its mean square radius in pixels, by quadrature: similar triangles, and cos^4
+    of the ray from film point to pupil point over its mean for the plane in focus."""
+    radius, v = camera.radius_mm, camera.image_distance_mm
+    u = radius * np.sqrt((np.arange(4000) + 0.5) / 4000)
+    x = u * v * (w - in_focus(camera)) / 1000  # in the lens frame, turned by 180 degrees
+    weight = [1 / (1 + ((u - moved) / v) ** 2) ** 2 for moved in (x, 0 * x)]
+    return weight[0].mean() / weight[1].mean(), np.average((x * SIZE[0] / FILM[0]) ** 2, weights=weight[0])
+
+
+@pytest.mark.parametrize("w", [0.0, 2.0])
+@pytest.mark.parametrize("side", [1, 21])  # a highlight, and a patch that is none
+def test_a_bright_spot_becomes_the_disc_of_the_thin_lens(w: float, side: int) -> None:
+    camera, highlight = thin(), side == 1
+    rgb, depth = flat(0.0, w)
+    half = side // 2
+    rgb[108 - half : 109 + half, 192 - half : 193 + half] = 1e4 / side**2
+    found = blurred(camera, rgb, depth, highlight, samples=512)[..., 1]
+    y, x = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
+    energy, moment = thin_disc(camera, w)
+    total, away = found.sum(), np.hypot(x - 192.5, y - 108.5)
+    assert total == pytest.approx(1e4 * energy, rel=0.003)
+    assert (found * x).sum() / total == pytest.approx(192.5, abs=0.05)
+    assert (found * y).sum() / total == pytest.approx(108.5, abs=0.05)
+    # The spot's own size adds, and a pixel's: 1/6 of a square one, and as much of reading between pixels.
+    expected = moment + (side**2 - 1) / 6 + (1 / 6 if highlight else 1 / 2)
+    assert (found * away**2).sum() / total == pytest.approx(expected, rel=0.01, abs=0.1)
+    if highlight:
+        ring = (away > 1.5) & (away < 3)
+        assert np.std(found[ring]) < 0.02 * np.mean(found[ring])  # without noise
+
+
+def test_a_blurred_edge_lets_the_light_behind_it_through_as_the_part_of_the_disc_beside_it() -> None:
+    """A black screen covers the left half, nearer than the white wall in focus: the share of the pupil beside it."""
+    camera = thin()
+    rgb, w = flat(1.0, in_focus(camera))
+    rgb[:, :192], w[:, :192] = 0.0, 2.0
+    found = blurred(camera, rgb, w)
+    falloff = blurred(camera, *flat(1.0, in_focus(camera)))
+    row = (found / falloff)[90:126, :, 1].mean(axis=0)
+    radius = disc_px(camera, 2.0)
+    away = np.clip((np.arange(SIZE[0]) + 0.5 - 192) / radius, -1, 1)
+    share = (math.pi - np.arccos(away) + away * np.sqrt(1 - away**2)) / math.pi
+    near = slice(192 - 2 * int(radius), 192 + 2 * int(radius))
+    np.testing.assert_allclose(row[near], share[near], atol=0.03)
+
+
+def test_a_sharp_screen_hides_the_blur_behind_it() -> None:
+    camera = thin()
+    rgb, w = flat(1.0, 0.0)
+    rgb[:, :192], w[:, :192] = 0.0, in_focus(camera)
+    row = blurred(camera, rgb, w)[SIZE[1] // 2, :, 1]
+    assert row[:191].max() < 0.01 and row[194:220].min() > 0.9
+
+
+def test_what_lies_behind_an_edge_comes_from_the_layer_behind() -> None:
+    """A near screen before a wall that is red where the screen hides it: only the layer behind knows."""
+    camera = thin()
+    eye, w_far = eye_of(camera), in_focus(camera)
+    rgb, w = flat(1.0, w_far)
+    rgb[:, :192], w[:, :192] = 0.0, 2.0
+    hidden, far = flat(1.0, w_far)
+    hidden[:, :192] = (1.0, 0.0, 0.0)
+    layers = [Layer(rgb.astype(np.float32), w.astype(np.float32))]
+    spread = spread_over(camera, eye, SIZE)
+    alone = gather(layers, eye, camera, SIZE, spread, 256)
+    both = gather([*layers, Layer(hidden.astype(np.float32), far.astype(np.float32))], eye, camera, SIZE, spread, 256)
+    assert alone.filled > 0.001 and both.filled < alone.filled / 20
+    left = 192 - int(disc_px(camera, 2.0) / 2)
+    assert alone.rgb[108, left, 1] > 0.15 and both.rgb[108, left, 1] < 0.02 < 0.15 < both.rgb[108, left, 0]
+
+
+def test_planes_that_recede_have_no_edges() -> None:
+    camera = thin()
+    rgb, w = flat(1.0, 0.0)
+    w[:] = np.linspace(0.05, 1.0, SIZE[1])[:, None]
+    eye = eye_of(camera)
+    found = gather([Layer(rgb.astype(np.float32), w.astype(np.float32))], eye, camera, SIZE, spread_over(camera, eye, SIZE), 64)
+    assert found.filled < 1e-4
+
+
+@pytest.fixture(scope="module")
+def exact() -> object:
+    return make_camera(f"fused:{GAUSS}", Shot(film_mm=FILM, focus_m=FOCUS_M, f_number=2.0))
+
+
+def test_a_lens_moves_things_as_its_distortion_says_and_dims_them_as_its_pupil_does(exact: object) -> None:
+    field = field_of(exact, FOCUS_M, "rectilinear", frame=frame_of(exact))
+    w = 1 / (FOCUS_M - frame_of(exact).pupil_mm[0] / 1000)
+    for place in ((192, 108), (320, 108), (360, 200)):
+        rgb, depth = flat(0.0, w)
+        rgb[place[1] - 2 : place[1] + 3, place[0] - 2 : place[0] + 3] = 1.0
+        found = blurred(exact, rgb, depth, samples=512)[..., 1]
+        y, x = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
+        centre = [(found * v).sum() / found.sum() for v in (x, y)]
+        mm = complex(centre[0] - SIZE[0] / 2, SIZE[1] / 2 - centre[1]) * FILM[0] / SIZE[0]
+        ideal = field.ideal(np.array([mm]))[0] * SIZE[0] / FILM[0]
+        assert abs(ideal - complex(place[0] + 0.5 - SIZE[0] / 2, SIZE[1] / 2 - place[1] - 0.5)) < 0.1
+
+
+@pytest.mark.parametrize("place", [(192.5, 108.5), (300.5, 108.5), (360.5, 197.5)])
+@pytest.mark.parametrize("w", [0.0, 2.0])
+def test_kernels_have_the_light_that_the_camera_takes_from_the_point(
+    exact: object, place: tuple[float, float], w: float
+) -> None:
+    """Against rays from the point through the front of the lens, traced the other way."""
+    eye = eye_of(exact)
+    kernel = kernel_at(exact, eye, SIZE, place, w, place)
+    assert kernel is not None
+    rgb, depth = flat(0.0, w)
+    row, column = int(place[1]), int(place[0])
+    rgb[row - 10 : row + 11, column - 10 : column + 11] = 1.0
+    gathered = blurred(exact, rgb, depth, samples=512)
+    np.testing.assert_allclose(kernel.energy, gathered.sum(axis=(0, 1)) / 441, rtol=0.01)
+    if w == 0:
+        return
+    z = 1 / w
+    slope = (place[0] - eye.centre_px[0]) / eye.reach_px[0], -(place[1] - eye.centre_px[1]) / eye.reach_px[1]
+    point = np.array([slope[0] * z, slope[1] * z, -z - eye.before_film_mm / 1000], np.float32)
+    square, _ = stratified(300, (500.0, 600.0))
+    count = square.shape[1]
+    hit = exact.to_film(np.repeat(point[:, None], count, 1), square, np.full(count, 549.0, np.float32))  # type: ignore[attr-defined]
+    weight = hit.weight / hit.weight.sum()
+    px = SIZE[0] / 2 - hit.film_mm[0] * SIZE[0] / FILM[0], SIZE[1] / 2 + hit.film_mm[1] * SIZE[0] / FILM[0]
+    green = kernel.light[..., 1] / kernel.light[..., 1].sum()
+    y, x = np.mgrid[: green.shape[0], : green.shape[1]] + 0.5
+    for mine, theirs, corner in zip((x, y), px, kernel.corner_px, strict=True):
+        mean, expected = (green * mine).sum() + corner, (weight * theirs).sum()
+        assert mean == pytest.approx(expected, abs=0.1)
+        spread = math.sqrt((green * (mine + corner - mean) ** 2).sum())
+        assert spread == pytest.approx(math.sqrt((weight * (theirs - expected) ** 2).sum()), rel=0.02, abs=0.1)
+
+
+def test_highlights_behind_something_near_are_hidden() -> None:
+    camera = thin()
+    rgb, w = flat(0.0, 0.0)
+    rgb[108, 194] = 1e4
+    w[:, :192] = in_focus(camera)
+    found = blurred(camera, rgb, w, highlights=True)[..., 1]
+    assert found[:, :191].max() < 1e-3 * found.max()
+    away = -2.5 / disc_px(camera, 0.0)  # of the screen from the disc's centre, in its radii
+    share = (math.pi - math.acos(away) + away * math.sqrt(1 - away**2)) / math.pi
+    share = 1 - share if share < 0.5 else share
+    free = blurred(camera, rgb, np.zeros_like(w), highlights=True)[..., 1]
+    assert found.sum() / free.sum() == pytest.approx(share, abs=0.02)
+
+
+def test_threads_and_empty_layers_change_nothing() -> None:
+    camera = thin()
+    random = np.random.default_rng(3)
+    rgb, w = random.random((54, 96, 3)), np.where(random.random((54, 96)) < 0.5, 0.2, 0.9)
+    one, three = (blurred(camera, rgb, w, samples=16, threads=n) for n in (1, 3))
+    np.testing.assert_array_equal(one, three)
+    assert np.isfinite(one).all() and one.min() >= 0
+
+
+def plate_file(path: Path, depth: np.ndarray | None, size: tuple[int, int] = SIZE, **channels: np.ndarray) -> Path:
+    planes = {c: np.full(size[::-1], 0.5, np.float32) for c in "RGB"}
+    planes |= {} if depth is None else {"Z": depth.astype(np.float32)}
+    write_channels(path, planes | {k: v.astype(np.float32) for k, v in channels.items()})
+    return path
+
+
+def command(plate: Path, out: Path, *more: str) -> list[str]:
+    return ["defocus", str(plate), "--lens", "thin", "--film", "36x20.25", "--focus", "2", "-o", str(out), *more]
+
+
+def test_the_command_writes_a_picture_with_its_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plate = plate_file(tmp_path / "plate.exr", np.full(SIZE[::-1], 3.0))
+    data = run_json(capsys, *command(plate, tmp_path / "out.exr", "--samples", "16"))
+    rgb, metadata = read_exr(tmp_path / "out.exr")
+    assert rgb.shape == (SIZE[1], SIZE[0], 3) and rgb[108, 192] == pytest.approx([0.5] * 3, rel=0.01)
+    assert metadata["camera"]["camera"] == "thin" and metadata["defocus"]["plate"] == "plate.exr"
+    assert data["layers"] == 1 and (tmp_path / "out.png").is_file()
+
+
+def test_layers_of_a_file_are_found_by_their_names(tmp_path: Path) -> None:
+    far = np.full(SIZE[::-1], 5.0)
+    names = {f"ViewLayer.Combined.{c}": far * 0.1 for c in "RGBA"} | {"ViewLayer.Depth.Z": far}
+    planes = {k: v.astype(np.float32) for k, v in names.items()}
+    write_channels(tmp_path / "blender.exr", planes)
+    frame = frame_of(thin())
+    plate = read_plate(tmp_path / "blender.exr", FILM, frame, DepthSettings())
+    assert len(plate.layers) == 1 and plate.layers[0].texel[0, 0, 3] == pytest.approx(0.2)
+    path = plate_file(tmp_path / "two.exr", far / 2, **{f"behind.{c}": far for c in "RGBZ"})
+    plate = read_plate(path, FILM, frame, DepthSettings(), [tmp_path / "blender.exr"])
+    assert [layer.texel[0, 0, 3] for layer in plate.layers] == pytest.approx([0.4, 0.2, 0.2])
+
+
+def test_samples_of_a_deep_file_are_layers(tmp_path: Path) -> None:
+    def samples(near: float, far: float) -> np.ndarray:
+        cells = np.empty(SIZE[::-1], object)
+        for j in range(SIZE[1]):
+            for i in range(SIZE[0]):
+                cells[j, i] = np.array([far, near][: 2 - (i < 192)], np.float32)
+        return cells
+
+    channels = {"R": samples(0.1, 0.9), "G": samples(0.1, 0.9), "B": samples(0.1, 0.9), "A": samples(1, 1)}
+    channels["Z"] = samples(1.0, 4.0)
+    header = {"compression": OpenEXR.ZIPS_COMPRESSION, "type": OpenEXR.deepscanline}
+    OpenEXR.File(header, channels).write(str(tmp_path / "deep.exr"))
+    front, behind = read_plate(tmp_path / "deep.exr", FILM, frame_of(thin()), DepthSettings()).layers
+    assert front.texel[5, 200] == pytest.approx([0.1, 0.1, 0.1, 1.0]) and front.texel[5, 9, 3] == pytest.approx(0.25)
+    assert behind.texel[5, 200] == pytest.approx([0.9, 0.9, 0.9, 0.25]) and behind.texel[5, 9, 3] < 0
+
+
+def test_overscan_is_beyond_the_film(tmp_path: Path) -> None:
+    """A plate with a border of 10 pixels, white outside the film: it is not seen where nothing blurs."""
+    border = 10
+    planes = {c: np.ones((SIZE[1] + 2 * border, SIZE[0] + 2 * border), np.float32) for c in "RGB"}
+    for plane in planes.values():
+        plane[border:-border, border:-border] = 0.0
+    window = {"displayWindow": ((0, 0), (SIZE[0] - 1, SIZE[1] - 1))}
+    window["dataWindow"] = ((-border, -border), (SIZE[0] + border - 1, SIZE[1] + border - 1))
+    planes["Z"] = np.full(planes["R"].shape, FOCUS_M - thin().image_distance_mm / 1000, np.float32)
+    as_arrays = {k: tuple(np.array(v, np.int32) for v in w) for k, w in window.items()}
+    write_channels(tmp_path / "wide.exr", planes, attributes=as_arrays)
+    plate = read_plate(tmp_path / "wide.exr", FILM, frame_of(thin()), DepthSettings())
+    assert plate.size == SIZE and plate.layers[0].size == (SIZE[0] + 20, SIZE[1] + 20)
+    camera = thin()
+    found = gather(plate.layers, plate.eye, camera, SIZE, spread_over(camera, plate.eye, SIZE), 16)
+    assert found.rgb[2:-2, 2:-2].max() < 1e-3 and found.beyond == 0
+
+
+@pytest.mark.parametrize(
+    ("depth", "more", "said"),
+    [
+        (None, [], "a channel Z with the depth"),
+        (np.full(SIZE[::-1], -3.0), [], "--depth-scale -1"),
+        (np.linspace(0, 1, SIZE[0] * SIZE[1]).reshape(SIZE[::-1]), [], "depth in metres"),
+        (np.full(SIZE[::-1], 3.0), ["--depth", "W"], "one of: "),
+        (np.full(SIZE[::-1], 3.0), ["--film", "36x36"], "a picture of the film's shape"),
+        (np.full(SIZE[::-1], 3.0), ["--lens", "fisheye-equidistant", "--focal-length", "8"], "a plate is a plane"),
+        (np.full(SIZE[::-1], 3.0), ["--depth-scale", "0"], "metres of a unit"),
+    ],
+)
+def test_bad_input_gets_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], depth: np.ndarray | None, more: list[str], said: str
+) -> None:
+    plate = plate_file(tmp_path / "plate.exr", depth)
+    assert said in failure(capsys, *command(plate, tmp_path / "out.exr", *more))
+    assert not (tmp_path / "out.exr").exists()
