@@ -34,6 +34,7 @@ NAMES = {
     "zoom": ("zoom", "models of whole zooms, of internal focus"),
     "equal-time": ("equal_time_page", "error over render time of every camera"),
     "render": ("render_times", "render time by camera and scene"),
+    "defocus": ("defocus", "the blur of a lens for sharp pictures, beside path-traced ones"),
     "dispersion": ("dispersion", "noise and time of lenses that disperse, beside a thin lens"),
     "mitsuba": ("mitsuba_speed", "speed of the renderer beside Mitsuba 3"),
     "osl": ("osl_speed", "cameras in Blender's Cycles: shaders of models beside its own"),

@@ -152,6 +152,7 @@ def _of_model(chance: Chance, folder: Path) -> Words:
             *((1, ("export", name, "--to", to, "-o", f"out.{to}", "--json")) for to in ("glsl", "onnx")),
             (0.3, ("export", name, "--to", "c", "-o", "out.h", "--json")),
             (0.1, ("stmap", name, *_FILM, "-o", "shot")),
+            (0.1, ("bokeh", name, *_FILM, "--distance", "2", "--fields", "1x1", "-o", "shot")),
             (0.1, ("view", name, "--downloads", "glsl", "-o", "out.html", "--json")),
             (0.1, ("blender", "add", name, "--extension", "pack.zip", "--quiet")),
         ),
@@ -191,6 +192,9 @@ def merging(*names: str) -> Words:
 def _of_plate(chance: Chance, folder: Path) -> Words:
     name = chance.choice(("plate.exr", "half.exr"))
     hurt(chance, folder, name)
+    if chance.random() < 0.3:
+        more = ("--depth", "R", "--samples", "8", "-o", "out.exr")
+        return ["defocus", name, "--lens", "thin", "--film", _PLATE_FILM, *more]
     return plate(name)
 
 

@@ -32,6 +32,7 @@ PARTS = {
     "render": "lens cameras",
     "mitsuba": "lens cameras render",
     "flare": "graph lens trace analysis surrogates cameras render",
+    "defocus": "graph lens cameras render flare",
     "study": "graph lens trace setting readers analysis surrogates cameras render flare photographs",
     "plan": "graph lens setting analysis surrogates cameras shaders render flare study",
     "view": "graph lens trace analysis cameras shaders flare",
@@ -39,7 +40,7 @@ PARTS = {
     "frames": "lens readers cameras render flare",
     "torch": "graph lens cameras",
     "cli": "graph lens trace setting readers analysis surrogates cameras shaders render mitsuba flare study plan view"
-    " blender frames photographs",
+    " blender frames photographs defocus",
 }
 # Packages from elsewhere that each part may import; what is not listed here is not restricted.
 PACKAGES = {
@@ -54,6 +55,7 @@ PACKAGES = {
     "cameras": {"numpy", "onnxruntime"},
     "shaders": {"numpy"},
     "render": {"numpy", "OpenEXR", "PIL", "embreex"},
+    "defocus": {"numpy", "OpenEXR"},
     "blender": {"bpy", "cycles"},  # of Blender's own Python, in the extension
 }
 EXCEPTIONS: dict[str, set[str]] = {
@@ -64,7 +66,7 @@ EXCEPTIONS: dict[str, set[str]] = {
 SLOW = {"neurolens.cameras.exact"}
 SLOW |= {"neurolens.cli.export_lens", "neurolens.cli.flare_run", "neurolens.cli.view_run"}
 # What loads in a base install: these folders, models from their files, and what converts lens files.
-LEAN = ("base", "graph", "lens", "readers", "cameras", "shaders", "render", "mitsuba", "frames", "cli")
+LEAN = ("base", "graph", "lens", "readers", "cameras", "shaders", "render", "mitsuba", "frames", "defocus", "cli")
 LEAN_MODULES = {
     *(f"neurolens.trace.{name}" for name in ("arithmetic", "shapes", "surfaces")),
     *(

@@ -49,6 +49,7 @@ def build_parser() -> Parser:
     """
     from neurolens.cli.analyse import Analyse
     from neurolens.cli.blender import Blender
+    from neurolens.cli.bokeh import Bokeh
     from neurolens.cli.convert import Convert, Glass
     from neurolens.cli.defocus import Defocus
     from neurolens.cli.evaluate import Evaluate
@@ -70,7 +71,7 @@ def build_parser() -> Parser:
         "lenses": (Lens, Analyse, Verify, Rims, Convert, Glass, Library, Survey, View),
         "camera models of a lens": (Train, Models, Evaluate),
         "pictures": (Demo, Plan, Render, Flare),
-        "compositing and other programs": (Defocus, StMap, Projection, Export, Blender, Mitsuba),
+        "compositing and other programs": (Defocus, Bokeh, StMap, Projection, Export, Blender, Mitsuba),
     }
     parser = Parser(
         prog="neurolens", usage="neurolens COMMAND ...", description=_DESCRIPTION, epilog=_EPILOG,

@@ -93,8 +93,9 @@ examples:
         given = {k: getattr(self, k) for k in ("film_offset_mm", "vignetting", "dispersion")}
         shot = self.state.shot(self.film, **{k: v for k, v in given.items() if v is not None})
         # Kernels ask for many rays: compiled, unless the argument says how.
-        compiled = FUSED if resolve(self.lens).kind == "" else ""
-        camera = make_camera(f"{compiled}{self.lens}", shot, progress)
+        named = resolve(self.lens)
+        fused = FUSED if not named.kind and named.file is not None else ""
+        camera = make_camera(f"{fused}{self.lens}", shot, progress)
         check_field(camera)
         starts = {"auto": None, "film": True, "pinhole": False}
         depth = DepthSettings(self.depth, self.depth_scale, self.depth_along, starts[self.depth_from])
@@ -115,5 +116,7 @@ examples:
 def _text(data: dict[str, Any]) -> str:
     said = [f"{data['file']}: {data['layers']} layer{'s' * (data['layers'] > 1)}"]
     said.append(f"{data['highlights']} highlights spread")
-    said.append(f"{100 * data['filled']:.2f}% of the light filled in, {100 * data['beyond']:.2f}% from beyond the plate")
+    said.append(
+        f"{100 * data['filled']:.2f}% of the light filled in, {100 * data['beyond']:.2f}% from beyond the plate"
+    )
     return ", ".join(said)

@@ -50,7 +50,7 @@ def _pixels(text: str) -> tuple[int, int]:
     raise argparse.ArgumentTypeError(f"got {text!r}, expected WIDTHxHEIGHT in pixels, each from 1 to {_LARGEST}")
 
 
-def _channels(text: str) -> tuple[float, ...]:
+def channels_nm(text: str) -> tuple[float, ...]:
     """Type of --wavelengths: those of red, green and blue."""
     waves = wavelengths_nm(text)
     if len(waves) == 3 and all(LIGHT_NM[0] <= nm <= LIGHT_NM[1] for nm in waves):
@@ -85,18 +85,23 @@ class PictureCommand(Glasses, Reporting):
             self.refuse("--width", "(missing)", "--width or --height of the lens's picture")
         return self.size or size_by_shape(self.film[0] / self.film[1], self.width, self.height)
 
-    def make(self, state: LensState, progress: Progress) -> tuple[Camera, Shot]:
+    def make(self, state: LensState, progress: Progress, compiled: bool = False) -> tuple[Camera, Shot]:
         """The camera in a state of its lens, and its settings; what the camera notes is a warning.
+
+        `compiled`: a lens or model is compiled, unless the argument says how it runs.
 
         Raises:
             InputError: a film whose shape is not that of the picture.
         """
+        from neurolens.base.lensname import FUSED, resolve
         from neurolens.cameras.build import make_camera
         from neurolens.render.film import PixelGrid
 
         PixelGrid(*self.picture, self.film)
         shot = state.shot(self.film, wavelength_nm=LIGHT_NM)
-        camera = make_camera(self.camera, shot, progress)
+        named = resolve(self.camera)
+        fused = FUSED if compiled and not named.kind and named.file is not None else ""
+        camera = make_camera(f"{fused}{self.camera}", shot, progress)
         for note in camera.settings.get("notes", ()):
             warn(note)
         return camera, shot
@@ -158,7 +163,7 @@ examples:
     )
     wavelengths: tuple[float, float, float] = setting(
         _CHANNELS_NM, "those of red, green and blue (default: 611.4,549.1,464.2 nm, the dominant ones of Rec. 709)",
-        kind=_channels, metavar="NM", old=("channels-nm",),
+        kind=channels_nm, metavar="NM", old=("channels-nm",),
     )  # fmt: skip
     frames: Frames = frames_group(
         "maps of these frames, SHOT.undistort.0001.exr and so on, all of one overscan", LENS_KEYS

@@ -1,11 +1,11 @@
-"""The picture that a camera takes of a plate: its rays followed to what the plate shows, with its blur, distortion,
-vignetting and colours.
+"""The picture that a camera takes of a plate: its rays, followed to what the plate shows.
 
-The camera is asked for its rays at nodes alone, a sixtieth of the film apart, for one set of points of the pupil; the rays of a
-pixel lie between those of the four nodes around it. Each channel has its own wavelengths, those that make its light
-from white surfaces, so that colours blur apart but have no noise of their own. What a ray meets is found in the plate's
-depth (`gather.c`). A pixel takes the more samples, the wider the lens blurs there, and weighs them so that even light
-stays even: the mean of radiance by weight, times the mean weight of the whole pupil.
+So the picture has the camera's blur, distortion, vignetting and colours. The camera is asked for its rays only at
+nodes, a sixtieth of the film apart, and for one set of points of the pupil; the rays of a pixel lie between those of
+the four nodes around it. Each channel has its own wavelengths, those that make its light from white surfaces, so that
+colours blur apart but have no noise of their own. What a ray meets is found in the plate's depth (`gather.c`). A pixel
+takes the more samples, the wider the lens blurs there, and weighs them so that even light stays even: the mean of
+radiance by weight, times the mean weight of the whole pupil.
 """
 
 from __future__ import annotations
@@ -58,7 +58,9 @@ class _Table(ctypes.Structure):
 
 @cache
 def compiled() -> ctypes.CDLL:
-    library = load_compiled(c_source("defocus/gather.c", NUMBERS=_NUMBERS, WEIGHT=_NUMBERS - 1, FINEST=FINEST, CLEAR=f"{_CLEAR}f"))
+    library = load_compiled(
+        c_source("defocus/gather.c", NUMBERS=_NUMBERS, WEIGHT=_NUMBERS - 1, FINEST=FINEST, CLEAR=f"{_CLEAR}f")
+    )
     whole, pointer = ctypes.c_int, ctypes.c_void_p
     library.splat.argtypes = [pointer, whole, pointer, whole, pointer, *[whole] * 2, pointer, *[whole] * 2, pointer]
     library.splat.restype = None
@@ -68,7 +70,7 @@ def compiled() -> ctypes.CDLL:
 
 
 def channel_wavelengths(sample: FloatArray, low_nm: float, high_nm: float) -> FloatArray:
-    """Wavelengths [3, N] that red, green and blue of a film take for uniform samples [N], by their share in its light."""
+    """Wavelengths [3, N] of red, green and blue for uniform samples [N], by their share in the film's light."""
     light = SpectralRange(low_nm, high_nm)
     found = []
     for part in np.maximum(light.response * light.basis, 0):
@@ -192,7 +194,10 @@ def _sizes(layers: list[Layer], spread: NDArray[np.float64], size: tuple[int, in
     """Binary logarithms [H, W] of the numbers of samples, by the widest disc that reaches a pixel."""
     width, height = size
     places = [np.minimum(np.arange(0, n, FINEST) + FINEST / 2, n - 1) for n in (height, width)]
-    nodes = [np.minimum((p / n * (k - 1)).round().astype(int), k - 1) for p, n, k in zip(places, (height, width), spread.shape[:2], strict=True)]
+    nodes = [
+        np.minimum((p / n * (k - 1)).round().astype(int), k - 1)
+        for p, n, k in zip(places, (height, width), spread.shape[:2], strict=True)
+    ]
     here = spread[np.ix_(*nodes)]
     widest = np.zeros(here.shape[:2])
     for layer in layers:
@@ -204,7 +209,10 @@ def _sizes(layers: list[Layer], spread: NDArray[np.float64], size: tuple[int, in
             for k in np.unique(level):
                 bounds = layer.bounds[k]
                 cell = FINEST << int(k)
-                rows, columns = (np.minimum((p * s / cell).astype(int), n - 1) for p, s, n in zip(places, scale, bounds.shape, strict=False))
+                rows, columns = (
+                    np.minimum((p * s / cell).astype(int), n - 1)
+                    for p, s, n in zip(places, scale, bounds.shape, strict=False)
+                )
                 least, most = _around(bounds[..., 0], np.minimum), _around(bounds[..., 1], np.maximum)
                 inside = level == k
                 low = np.where(inside, np.maximum(least[np.ix_(rows, columns)], 0), low)
@@ -249,8 +257,8 @@ def gather(
         first, stop = edges[j], edges[j + 1]
         sums = np.empty((stop - first, width, 8), np.float32)
         struct = _Table(
-            across + 1, 2, _SET, len(table.nm), rays.shape[3], width / across, height / down, rays.ctypes.data, jitter.ctypes.data,
-            first - j * height / down,
+            across + 1, 2, _SET, len(table.nm), rays.shape[3], width / across, height / down,
+            rays.ctypes.data, jitter.ctypes.data, first - j * height / down,
         )  # fmt: skip
         part = sizes[first:stop]
         compiled().gather(structs, len(layers), struct, width, first, stop - first, part.ctypes.data, sums.ctypes.data)

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage  # type: ignore[import-untyped]
 
 from neurolens.cameras.contract import Camera
 from neurolens.defocus.gather import compiled, radius_px
@@ -45,8 +44,8 @@ def take_highlights(layer: Layer, spread: NDArray[np.float64], size: tuple[int, 
     rgb, w = layer.texel[..., :3], layer.texel[..., 3]
     bright = rgb.max(axis=2)
     log = np.log(np.maximum(bright, 1e-6 * max(float(bright.mean()), 1e-30)))
-    geometric = np.exp(ndimage.uniform_filter(log, _WINDOW, mode="nearest"))
-    mean = ndimage.uniform_filter(np.minimum(bright, _BRIGHTER * geometric), _WINDOW, mode="nearest")
+    geometric = np.exp(_around(log))
+    mean = _around(np.minimum(bright, _BRIGHTER * geometric))
     cap = np.maximum(_BRIGHTER * geometric, _ABOVE * mean)
     row, column = np.nonzero((bright > cap) & (w >= 0))
     nodes = [
@@ -63,7 +62,18 @@ def take_highlights(layer: Layer, spread: NDArray[np.float64], size: tuple[int, 
         row, column, radius = row[kept], column[kept], radius[kept]
     light = rgb[row, column] * (1 - cap[row, column] / bright[row, column])[:, None]
     rgb[row, column] -= light
-    return Highlights(np.stack([column, row], axis=1) + 0.5, w[row, column], radius, light)
+    return Highlights(np.stack([column, row], axis=1) + np.float64(0.5), w[row, column], radius, light)
+
+
+def _around(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The mean of the window about each pixel; the picture's border goes on beyond it."""
+    found = values.astype(np.float64)
+    for axis in (0, 1):
+        found = np.pad(found, [(_WINDOW // 2 + 1, _WINDOW // 2) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
+        sums = np.cumsum(found, axis=axis)
+        count = sums.shape[axis] - _WINDOW
+        found = (sums.take(range(_WINDOW, _WINDOW + count), axis) - sums.take(range(count), axis)) / _WINDOW
+    return found
 
 
 def spread_highlights(
@@ -77,9 +87,15 @@ def spread_highlights(
     groups = defaultdict(list)
     cell = (found.place_px / (max(plate) / _PLACES)).astype(int)
     near = 4.0 * _FINE_PX / _FINE
-    step = np.where(
-        found.radius_px < near / 4, found.radius_px / _FINE_PX, near + np.log(np.maximum(found.radius_px, 1e-3)) / _FINE
-    ).round().astype(int)
+    step = (
+        np.where(
+            found.radius_px < near / 4,
+            found.radius_px / _FINE_PX,
+            near + np.log(np.maximum(found.radius_px, 1e-3)) / _FINE,
+        )
+        .round()
+        .astype(int)
+    )
     side = np.sign(found.inverse_depth - np.median(found.inverse_depth)).astype(int)
     for k, key in enumerate(zip(*cell.T.tolist(), step.tolist(), side.tolist(), strict=True)):
         groups[key].append(k)

@@ -49,6 +49,27 @@ class Kernel:
     sweep: Array
 
     @property
+    def middle_px(self) -> tuple[float, float]:
+        """The centroid of the green light, in the film."""
+        green = self.light[..., 1].astype(np.float64)
+        total = max(float(green.sum()), 1e-30)
+        x, y = (float(green.sum(axis=a) @ (np.arange(green.shape[1 - a]) + 0.5)) / total for a in (0, 1))
+        return self.corner_px[0] + x, self.corner_px[1] + y
+
+    def centred(self, side: int, middle_px: tuple[float, float]) -> FloatArray:
+        """The kernel of sum 1 in each channel on `side` pixels a side, whose centre is the film place `middle_px`.
+
+        Light that has no room is lost; the kernel moves by whole pixels.
+        """
+        found = np.zeros((side, side, 3), np.float32)
+        x, y = (c - math.floor(m) + side // 2 for c, m in zip(self.corner_px, middle_px, strict=True))
+        height, width = self.light.shape[:2]
+        rows, columns = slice(max(0, -y), min(height, side - y)), slice(max(0, -x), min(width, side - x))
+        part = self.light[rows, columns]
+        found[y + rows.start :, x + columns.start :][: part.shape[0], : part.shape[1]] = part
+        return np.asarray(found / np.maximum(self.energy, 1e-30), np.float32)
+
+    @property
     def energy(self) -> Array:
         """The light of red, green and blue."""
         return np.asarray(self.light.sum(axis=(0, 1), dtype=np.float64))
@@ -57,11 +78,13 @@ class Kernel:
 def kernel_at(
     camera: Camera, eye: Eye, size: tuple[int, int], place_px: tuple[float, float], inverse_depth: float,
     guess_px: tuple[float, float], cells: int = GRID, colours: int = COLOURS,
+    wavelengths_nm: tuple[float, float, float] | None = None,
 ) -> Kernel | None:  # fmt: skip
     """The kernel of a point at a place of the plate, in pixels of a film of `size`; None where no light arrives.
 
     Args:
         guess_px: about where the film shows the point. cells: of the pupil's grid. colours: wavelengths a channel.
+        wavelengths_nm: one wavelength for red, green and blue each, in place of those that make white light.
 
     Raises:
         InputError: a kernel of over 2048 pixels a side.
@@ -69,9 +92,12 @@ def kernel_at(
     side = 0.5 + _RIM * (np.arange(cells + 1) / cells - 0.5)
     pupil = np.stack(np.meshgrid(side, side), 0).reshape(2, -1).astype(np.float32)
     table = RayTable(camera, eye, size, pupil, np.zeros(pupil.shape[1], np.float32))
-    if len(table.nm) > 1:
+    if wavelengths_nm is not None:
+        nm = np.array(wavelengths_nm, np.float32)[:, None]
+    elif len(table.nm) > 1:
         low, high = (min(max(v, LIGHT_NM[0]), LIGHT_NM[1]) for v in camera.wavelength_nm or LIGHT_NM)
-        nm = channel_wavelengths((np.arange(colours, dtype=np.float32) + 0.5) / colours, low, high)
+        hue = ((np.arange(colours) + 0.5) / colours).astype(np.float32)
+        nm = channel_wavelengths(hue, low, high)
     else:
         nm = table.nm[:, :1]
     aimed = _aimed(table, place_px, inverse_depth, guess_px, nm.reshape(-1))
@@ -88,15 +114,17 @@ def kernel_at(
     colour = np.eye(3) if len(nm) > 1 else np.ones((1, 3))
     for k in range(nm.size):
         aimed.draw(light, k, corner, cells, colour[[k // nm.shape[1]]] / (nm.shape[1] * cells**2))
-    return Kernel(
-        np.maximum(light, 0), (int(corner[0]), int(corner[1])), aimed.turn, place_px, aimed.sweep(corner)
-    )
+    return Kernel(np.maximum(light, 0), (int(corner[0]), int(corner[1])), aimed.turn, place_px, aimed.sweep(corner))
 
 
 @dataclass(frozen=True)
 class _Aimed:
-    """Rays of a pupil's grid, of several wavelengths one after the other, that see a point: places [2, N] on the film in
-    pixels, weights [N], b [2, N] of their lines, and `turn` [2, 2], the mean derivatives of places by the point's."""
+    """Rays of a pupil's grid, of several wavelengths one after the other, that see a point.
+
+    Attributes:
+        place: [2, N] on the film in pixels. weight: [N]. slope: [2, N], b of their lines. turn: [2, 2] the mean
+            derivatives of places by the point's.
+    """
 
     place: Array
     weight: Array
@@ -125,6 +153,9 @@ class _Aimed:
         side = np.linspace(-1, 1, cells + 1)
         down, across = np.gradient(grid, side, side, axis=(2, 3))
         more = (1 / _RIM - 1) * (side[:, None] * down + side * across)
+        lit = np.pad((self.weight > 0).reshape(-1, cells + 1, cells + 1), ((0, 0), (1, 1), (1, 1)), mode="edge")
+        solid = np.all([lit[:, 1:-1, :-2], lit[:, 1:-1, 2:], lit[:, :-2, 1:-1], lit[:, 2:, 1:-1]], axis=0)
+        more *= solid & lit[:, 1:-1, 1:-1]
         return replace(self, place=(grid + more).reshape(2, -1))
 
     def sweep(self, corner: NDArray[np.int_]) -> Array:
@@ -134,7 +165,9 @@ class _Aimed:
         return np.asarray(np.linalg.lstsq(basis, self.slope[:, lit].T, rcond=None)[0].T)
 
 
-def _aimed(table: RayTable, target: tuple[float, float], w: float, guess: tuple[float, float], nm: FloatArray) -> _Aimed:
+def _aimed(
+    table: RayTable, target: tuple[float, float], w: float, guess: tuple[float, float], nm: FloatArray
+) -> _Aimed:
     """The rays of all points of the pupil that see a point of the plate, at each of some wavelengths."""
     pupil, waves = np.tile(table.pupil, len(nm)), np.repeat(nm, table.pupil.shape[1])
     wanted = np.array(target)[:, None]

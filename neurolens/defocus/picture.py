@@ -44,8 +44,8 @@ def defocus(
     """The picture that a camera takes of a plate.
 
     Args:
-        samples: of a pixel, at most, 8 to 512; rounded up to a power of two. highlights: spread pixels that are far brighter than their
-            surroundings as discs, without noise.
+        samples: of a pixel, at most, 8 to 512; rounded up to a power of two.
+        highlights: spread pixels that are far brighter than their surroundings as discs, without noise.
 
     Warns:
         NeurolensWarning: light that the plate does not have.
@@ -59,7 +59,9 @@ def defocus(
     if highlights:
         taken = [take_highlights(layer, spread, plate.size) for layer in plate.layers]
     with progress.stage(f"blur by {camera.name}") as report:
-        found = gather(plate.layers, plate.eye, camera, plate.size, spread, 1 << (samples - 1).bit_length(), threads, report)
+        found = gather(
+            plate.layers, plate.eye, camera, plate.size, spread, 1 << (samples - 1).bit_length(), threads, report
+        )
     for some in taken:
         if len(some.radius_px):
             with progress.stage(f"spread {len(some.radius_px)} highlights") as report:
@@ -104,4 +106,3 @@ def describe(found: Defocused, plate: Plate, path: Path) -> dict[str, Any]:
         "filled": found.filled,
         "beyond": found.beyond,
     }
-

@@ -48,8 +48,8 @@ class Layer:
     """One layer of a plate.
 
     Args:
-        rgb: [H, W, 3] linear radiance. inverse_depth: [H, W] 1/m from the eye, 0 for the sky, below 0 where the layer has
-            nothing.
+        rgb: [H, W, 3] linear radiance. inverse_depth: [H, W] 1/m from the eye, 0 for the sky, below 0 where the layer
+            has nothing.
     """
 
     def __init__(self, rgb: FloatArray, inverse_depth: FloatArray) -> None:

@@ -91,7 +91,7 @@ def read_plate(
     eye = Eye((reach[0] * per_mm[0], reach[1] * per_mm[1]), centre, before)
     from_film = ours is not None if depth.from_film is None else depth.from_film
     space = read_colour_space(path) or SRGB
-    layers = []
+    layers = list[Layer]()
     for number, file in enumerate((path, *behind)):
         for rgb, metres in _layers(file, depth, several=number == 0):
             if layers and rgb.shape != layers[0].texel[..., :3].shape:
@@ -120,7 +120,7 @@ def _layers(path: Path, depth: DepthSettings, several: bool) -> list[tuple[Float
     if header_of(path)["type"] in (OpenEXR.deepscanline, OpenEXR.deeptile):
         return _deep(path)
     planes, _ = decoded_channels(path, path, "file")
-    found = []
+    found = list[tuple[str, str]]()
     for name in planes:
         prefix = name.removesuffix("R")
         if name != f"{prefix}R" or not {prefix + "G", prefix + "B"} <= planes.keys():
@@ -154,7 +154,10 @@ def _deep(path: Path) -> list[tuple[FloatArray, FloatArray]]:
     if counts.sum() > _MOST_SAMPLES:
         raise InputError(path, "samples", int(counts.sum()), f"at most {_MOST_SAMPLES}")
     flat = {
-        name: np.concatenate([np.asarray(v, np.float32) for v in channels[name].reshape(-1) if v is not None] or [[]])
+        name: np.concatenate(
+            [np.asarray(v, np.float32) for v in channels[name].reshape(-1) if v is not None]
+            or [np.zeros(0, np.float32)]
+        )
         for name in (*COLOURS, "Z", *(("A",) if "A" in channels else ()))
     }
     alpha = flat.get("A", np.ones_like(flat["Z"]))
@@ -163,11 +166,14 @@ def _deep(path: Path) -> list[tuple[FloatArray, FloatArray]]:
     kept = kept[np.lexsort((flat["Z"][kept], pixel[kept]))]
     place = pixel[kept]
     starts = np.flatnonzero(np.diff(place, prepend=-1))
-    rank = np.arange(len(place)) - np.repeat(starts, np.diff([*starts, len(place)]))
+    rank = np.arange(len(place)) - np.repeat(starts, np.diff(starts, append=len(place)))
     layers = []
     for k in range(min(int(rank.max(initial=0)) + 1, _MOST_LAYERS)):
         rows = kept[rank == k]
-        rgb, metres = np.zeros((height * width, 3), np.float32), np.full(height * width, -np.inf if k else np.inf, np.float32)
+        rgb, metres = (
+            np.zeros((height * width, 3), np.float32),
+            np.full(height * width, -np.inf if k else np.inf, np.float32),
+        )
         rgb[place[rank == k]] = np.stack([flat[c][rows] for c in COLOURS], axis=1) / alpha[rows, None]
         metres[place[rank == k]] = flat["Z"][rows]
         layers.append((rgb.reshape(height, width, 3), metres.reshape(height, width)))
@@ -176,7 +182,7 @@ def _deep(path: Path) -> list[tuple[FloatArray, FloatArray]]:
 
 def _finite(path: Path, rgb: FloatArray) -> FloatArray:
     """Colours without NaN and infinity, which become black, with a warning."""
-    bad = ~np.isfinite(rgb).all(axis=2)
+    bad: NDArray[np.bool_] = np.asarray(~np.isfinite(rgb).all(axis=2))
     if bad.any():
         warn(f"{path}: {int(bad.sum())} of {bad.size} pixels are not finite; they are black")
         rgb = np.where(bad[..., None], np.float32(0), rgb)
@@ -185,7 +191,7 @@ def _finite(path: Path, rgb: FloatArray) -> FloatArray:
 
 def _inverse_depth(
     path: Path, metres: FloatArray, depth: DepthSettings, eye: Eye, eye_m: float
-) -> tuple[FloatArray, NDArray[np.float32]]:
+) -> tuple[FloatArray, FloatArray]:
     """Inverse depth from the eye, 1/m, and the cosine of each pixel's ray; below 0 where a layer has nothing.
 
     `eye_m`: the eye's distance before the place from which depth counts.
@@ -195,7 +201,7 @@ def _inverse_depth(
         (np.arange(n, dtype=np.float32) + 0.5 - c) / r
         for n, c, r in zip((width, height), eye.centre_px, eye.reach_px, strict=True)
     )
-    cosine = 1 / np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2, dtype=np.float32)
+    cosine = (1 / np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2)).astype(np.float32)
     nothing = np.isneginf(metres)
     z = metres * np.float32(depth.scale_m)
     solid = np.isfinite(z) & (z != 0) & (np.abs(z) < _SKY_M)
@@ -213,4 +219,4 @@ def _inverse_depth(
     if (close := solid & (z <= 1e-3)).any():
         raise InputError(path, "depth", f"({float(z[close].min()):g} m)", "more than 0 m before the pinhole")
     w = np.divide(1, z, out=np.zeros_like(z), where=solid)
-    return np.where(nothing, np.float32(-1), w), cosine
+    return np.where(nothing, np.float32(-1), w).astype(np.float32), cosine

@@ -1,4 +1,4 @@
-"""Blur for plates: closed forms of the thin lens, the exact lens's own rays, occlusion, layers, files and their errors."""
+"""Blur for plates: closed forms of the thin lens, the exact lens's own rays, occlusion, layers, files, bad input."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import OpenEXR
 import pytest
 
 from neurolens.cameras.build import make_camera
+from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import field_of, frame_of
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.sampling import concentric_disk, stratified
@@ -34,7 +35,7 @@ def thin(f_number: float = 1.4, focus_m: float = FOCUS_M) -> ThinLens:
     return ThinLens(50.0, f_number, focus_m, FILM)
 
 
-def eye_of(camera: object, size: tuple[int, int] = SIZE) -> Eye:
+def eye_of(camera: Camera, size: tuple[int, int] = SIZE) -> Eye:
     frame = frame_of(camera)
     per_mm = size[0] / FILM[0]
     reach = frame.reach_mm[0] * per_mm, frame.reach_mm[1] * per_mm
@@ -42,7 +43,7 @@ def eye_of(camera: object, size: tuple[int, int] = SIZE) -> Eye:
 
 
 def blurred(
-    camera: object, rgb: np.ndarray, w: np.ndarray, highlights: bool = False, samples: int = 512, **more: object
+    camera: Camera, rgb: np.ndarray, w: np.ndarray, highlights: bool = False, samples: int = 128, threads: int = 1
 ) -> np.ndarray:
     size = (w.shape[1], w.shape[0])
     eye, layers = eye_of(camera, size), [Layer(rgb.astype(np.float32), np.asarray(w, np.float32))]
@@ -50,7 +51,7 @@ def blurred(
     if highlights:
         taken = take_highlights(layers[0], spread, size)
         assert len(taken.radius_px)
-    found = gather(layers, eye, camera, size, spread, samples, **more).rgb
+    found = gather(layers, eye, camera, size, spread, samples, threads).rgb
     if taken is not None:
         spread_highlights(found, taken, layers, eye, camera)
     return found
@@ -96,8 +97,9 @@ def test_what_is_in_focus_stays_sharp() -> None:
 
 
 def thin_disc(camera: ThinLens, w: float) -> tuple[float, float]:
-    """The light of a point on the axis and its mean square radius in pixels, by quadrature: similar triangles, and cos^4
-    of the ray from film point to pupil point over its mean for the plane in focus."""
+    """The light of a point on the axis and its mean square radius in pixels, by quadrature.
+
+    By similar triangles, and cos^4 of the ray from film point to pupil point over its mean for the plane in focus."""
     radius, v = camera.radius_mm, camera.image_distance_mm
     u = radius * np.sqrt((np.arange(4000) + 0.5) / 4000)
     x = u * v * (w - in_focus(camera)) / 1000  # in the lens frame, turned by 180 degrees
@@ -160,8 +162,8 @@ def test_what_lies_behind_an_edge_comes_from_the_layer_behind() -> None:
     hidden[:, :192] = (1.0, 0.0, 0.0)
     layers = [Layer(rgb.astype(np.float32), w.astype(np.float32))]
     spread = spread_over(camera, eye, SIZE)
-    alone = gather(layers, eye, camera, SIZE, spread, 256)
-    both = gather([*layers, Layer(hidden.astype(np.float32), far.astype(np.float32))], eye, camera, SIZE, spread, 256)
+    alone = gather(layers, eye, camera, SIZE, spread, 128)
+    both = gather([*layers, Layer(hidden.astype(np.float32), far.astype(np.float32))], eye, camera, SIZE, spread, 128)
     assert alone.filled > 0.001 and both.filled < alone.filled / 20
     left = 192 - int(disc_px(camera, 2.0) / 2)
     assert alone.rgb[108, left, 1] > 0.15 and both.rgb[108, left, 1] < 0.02 < 0.15 < both.rgb[108, left, 0]
@@ -172,22 +174,24 @@ def test_planes_that_recede_have_no_edges() -> None:
     rgb, w = flat(1.0, 0.0)
     w[:] = np.linspace(0.05, 1.0, SIZE[1])[:, None]
     eye = eye_of(camera)
-    found = gather([Layer(rgb.astype(np.float32), w.astype(np.float32))], eye, camera, SIZE, spread_over(camera, eye, SIZE), 64)
+    found = gather(
+        [Layer(rgb.astype(np.float32), w.astype(np.float32))], eye, camera, SIZE, spread_over(camera, eye, SIZE), 64
+    )
     assert found.filled < 1e-4
 
 
 @pytest.fixture(scope="module")
-def exact() -> object:
+def exact() -> Camera:
     return make_camera(f"fused:{GAUSS}", Shot(film_mm=FILM, focus_m=FOCUS_M, f_number=2.0))
 
 
-def test_a_lens_moves_things_as_its_distortion_says_and_dims_them_as_its_pupil_does(exact: object) -> None:
+def test_a_lens_moves_things_as_its_distortion_says_and_dims_them_as_its_pupil_does(exact: Camera) -> None:
     field = field_of(exact, FOCUS_M, "rectilinear", frame=frame_of(exact))
     w = 1 / (FOCUS_M - frame_of(exact).pupil_mm[0] / 1000)
-    for place in ((192, 108), (320, 108), (360, 200)):
+    for place in ((320, 108), (360, 200)):
         rgb, depth = flat(0.0, w)
         rgb[place[1] - 2 : place[1] + 3, place[0] - 2 : place[0] + 3] = 1.0
-        found = blurred(exact, rgb, depth, samples=512)[..., 1]
+        found = blurred(exact, rgb, depth, samples=256)[..., 1]
         y, x = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
         centre = [(found * v).sum() / found.sum() for v in (x, y)]
         mm = complex(centre[0] - SIZE[0] / 2, SIZE[1] / 2 - centre[1]) * FILM[0] / SIZE[0]
@@ -195,10 +199,10 @@ def test_a_lens_moves_things_as_its_distortion_says_and_dims_them_as_its_pupil_d
         assert abs(ideal - complex(place[0] + 0.5 - SIZE[0] / 2, SIZE[1] / 2 - place[1] - 0.5)) < 0.1
 
 
-@pytest.mark.parametrize("place", [(192.5, 108.5), (300.5, 108.5), (360.5, 197.5)])
+@pytest.mark.parametrize("place", [(192.5, 108.5), (360.5, 197.5)])
 @pytest.mark.parametrize("w", [0.0, 2.0])
 def test_kernels_have_the_light_that_the_camera_takes_from_the_point(
-    exact: object, place: tuple[float, float], w: float
+    exact: Camera, place: tuple[float, float], w: float
 ) -> None:
     """Against rays from the point through the front of the lens, traced the other way."""
     eye = eye_of(exact)
@@ -207,7 +211,7 @@ def test_kernels_have_the_light_that_the_camera_takes_from_the_point(
     rgb, depth = flat(0.0, w)
     row, column = int(place[1]), int(place[0])
     rgb[row - 10 : row + 11, column - 10 : column + 11] = 1.0
-    gathered = blurred(exact, rgb, depth, samples=512)
+    gathered = blurred(exact, rgb, depth, samples=256)
     np.testing.assert_allclose(kernel.energy, gathered.sum(axis=(0, 1)) / 441, rtol=0.01)
     if w == 0:
         return
@@ -216,7 +220,7 @@ def test_kernels_have_the_light_that_the_camera_takes_from_the_point(
     point = np.array([slope[0] * z, slope[1] * z, -z - eye.before_film_mm / 1000], np.float32)
     square, _ = stratified(300, (500.0, 600.0))
     count = square.shape[1]
-    hit = exact.to_film(np.repeat(point[:, None], count, 1), square, np.full(count, 549.0, np.float32))  # type: ignore[attr-defined]
+    hit = exact.to_film(np.repeat(point[:, None], count, 1), square, np.full(count, 549.0, np.float32)) 
     weight = hit.weight / hit.weight.sum()
     px = SIZE[0] / 2 - hit.film_mm[0] * SIZE[0] / FILM[0], SIZE[1] / 2 + hit.film_mm[1] * SIZE[0] / FILM[0]
     green = kernel.light[..., 1] / kernel.light[..., 1].sum()
@@ -251,10 +255,10 @@ def test_threads_and_empty_layers_change_nothing() -> None:
     assert np.isfinite(one).all() and one.min() >= 0
 
 
-def plate_file(path: Path, depth: np.ndarray | None, size: tuple[int, int] = SIZE, **channels: np.ndarray) -> Path:
-    planes = {c: np.full(size[::-1], 0.5, np.float32) for c in "RGB"}
+def plate_file(path: Path, depth: np.ndarray | None, more: dict[str, np.ndarray] | None = None) -> Path:
+    planes = {c: np.full(SIZE[::-1], 0.5, np.float32) for c in "RGB"}
     planes |= {} if depth is None else {"Z": depth.astype(np.float32)}
-    write_channels(path, planes | {k: v.astype(np.float32) for k, v in channels.items()})
+    write_channels(path, planes | {k: v.astype(np.float32) for k, v in (more or {}).items()})
     return path
 
 
@@ -279,7 +283,7 @@ def test_layers_of_a_file_are_found_by_their_names(tmp_path: Path) -> None:
     frame = frame_of(thin())
     plate = read_plate(tmp_path / "blender.exr", FILM, frame, DepthSettings())
     assert len(plate.layers) == 1 and plate.layers[0].texel[0, 0, 3] == pytest.approx(0.2)
-    path = plate_file(tmp_path / "two.exr", far / 2, **{f"behind.{c}": far for c in "RGBZ"})
+    path = plate_file(tmp_path / "two.exr", far / 2, more={f"behind.{c}": far for c in "RGBZ"})
     plate = read_plate(path, FILM, frame, DepthSettings(), [tmp_path / "blender.exr"])
     assert [layer.texel[0, 0, 3] for layer in plate.layers] == pytest.approx([0.4, 0.2, 0.2])
 
@@ -337,3 +341,43 @@ def test_bad_input_gets_one_line(
     plate = plate_file(tmp_path / "plate.exr", depth)
     assert said in failure(capsys, *command(plate, tmp_path / "out.exr", *more))
     assert not (tmp_path / "out.exr").exists()
+
+
+def test_an_atlas_has_kernels_of_sum_one_about_the_middles_of_its_cells(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ["bokeh", GAUSS, "--width", 384, "--film", "36x20.25", "--focus", 2, "--f-number", 2]
+    data = run_json(capsys, *given, "--distance", 1, "--distance", "inf", "--fields", "3x1", "-o", tmp_path / "a")
+    side = data["kernel_px"]
+    assert [Path(f).name for f in data["files"]] == ["a.1m.exr", "a.inf.exr"] and side % 2
+    for file in data["files"]:
+        picture, metadata = read_exr(file)
+        assert picture.shape == (side, 3 * side, 3) and len(metadata["kernels"]) == 3
+        cells = picture.reshape(side, 3, side, 3).swapaxes(0, 1)
+        np.testing.assert_allclose(cells.sum(axis=(1, 2)), 1, rtol=1e-4)
+        middle = (cells[..., 1].sum(axis=1) * (np.arange(side) + 0.5)).sum(axis=1)
+        np.testing.assert_allclose(middle, side / 2, atol=0.6)
+        np.testing.assert_allclose(cells[0], cells[2][:, ::-1], atol=0.02 * cells.max())  # the lens is round
+    light = [k["light"][1] for k in data["kernels"][:3]]
+    assert light[0] == pytest.approx(light[2], rel=1e-3) and light[0] < 0.95 * light[1]
+
+
+def test_a_kernel_has_the_area_of_rays_traced_from_the_point(exact: Camera) -> None:
+    """Pixels above half of the mean, against a histogram of camera rays that see a small patch there."""
+    eye, place, w = eye_of(exact), (330.5, 150.5), 2.5
+    kernel = kernel_at(exact, eye, SIZE, place, w, place)
+    assert kernel is not None
+    height, width = kernel.light.shape[:2]
+    random, count = np.random.default_rng(5), 1_500_000
+    px = np.array(kernel.corner_px)[:, None] + np.array([[width], [height]]) * random.random((2, count))
+    film = np.stack([-(px[0] / SIZE[0] - 0.5) * FILM[0], (px[1] / SIZE[1] - 0.5) * FILM[1]]).astype(np.float32)
+    rays = exact.sample(film, random.random((2, count)).astype(np.float32), np.full(count, 549.0, np.float32)) 
+    lines = eye.lines(rays.origin_m, rays.direction)
+    seen = np.hypot(lines[0] + w * lines[2] - place[0], lines[1] + w * lines[3] - place[1]) < 1.5
+    weight = rays.weight * (seen & (rays.status == 0))
+    cells = [(px[k] - kernel.corner_px[k]).astype(int) for k in (0, 1)]
+    found = np.bincount(cells[1] * width + cells[0], weight, width * height).reshape(height, width)
+    areas = [(image > 0.5 * image[image > 0].mean()).sum() for image in (kernel.light[..., 1], found)]
+    assert areas[0] == pytest.approx(areas[1], rel=0.03)
+    mine = kernel.light[..., 1] / kernel.light[..., 1].sum()
+    assert np.abs(mine - found / found.sum()).sum() < 0.25  # a patch of 3 pixels softens the rim

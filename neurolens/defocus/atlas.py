@@ -1,0 +1,108 @@
+"""Kernels of bokeh over the field and distances, in pictures that compositing programs read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from neurolens.base.errors import InputError
+from neurolens.cameras.contract import Camera
+from neurolens.cameras.field import frame_of
+from neurolens.defocus.kernels import GRID, Kernel, kernel_at
+from neurolens.defocus.plate import Eye, FloatArray
+
+_LARGEST = 16384  # pixels a side of an atlas
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One kernel: its field (-1 to 1 from left to right and from bottom to top of the film), its distance from the film
+    in m, the film place that is its centre, and the kernel; None where no light arrives."""
+
+    field: tuple[float, float]
+    distance_m: float
+    place_px: tuple[float, float]
+    kernel: Kernel | None
+
+    @property
+    def width_px(self) -> int:
+        """Pixels a side, odd, that hold the kernel about its place."""
+        if self.kernel is None:
+            return 1
+        height, width = self.kernel.light.shape[:2]
+        reach = [
+            max(abs(corner - math.floor(middle)), abs(corner + length - 1 - math.floor(middle)))
+            for corner, length, middle in zip(self.kernel.corner_px, (width, height), self.place_px, strict=True)
+        ]
+        return 2 * max(reach) + 1
+
+
+def eye_of(camera: Camera, size: tuple[int, int]) -> Eye:
+    """The camera's own pinhole, whose picture has `size` pixels on its film: that of `neurolens stmap`."""
+    frame = frame_of(camera)
+    per_mm = [n / mm for n, mm in zip(size, camera.film_mm, strict=True)]
+    reach = frame.reach_mm[0] * per_mm[0], frame.reach_mm[1] * per_mm[1]
+    return Eye(reach, (size[0] / 2, size[1] / 2), frame.pupil_mm[1])
+
+
+def kernels_over(
+    camera: Camera, size: tuple[int, int], distances_m: Sequence[float], fields: tuple[int, int],
+    wavelengths_nm: tuple[float, float, float] | None = None, report: Callable[[float], None] = lambda _: None,
+) -> list[list[Cell]]:  # fmt: skip
+    """The kernels of each distance, row by row from the top of the picture.
+
+    Args:
+        size: of the picture in pixels. distances_m: from the film, along the axis; inf is far.
+        fields: columns and rows of places, in the middles of equal parts of the picture.
+        wavelengths_nm: as for `kernel_at`.
+
+    Raises:
+        InputError: a distance within the lens; kernels too large for memory.
+    """
+    eye, found = eye_of(camera, size), []
+    for number, distance in enumerate(distances_m):
+        ahead = distance - eye.before_film_mm / 1000
+        if not ahead > 0:
+            raise InputError(
+                "kernels", "distance_m", distance, f"above {eye.before_film_mm / 1000:g}, the entrance pupil"
+            )
+        cells = []
+        for j in range(fields[1]):
+            for i in range(fields[0]):
+                place = (i + 0.5) / fields[0] * size[0], (j + 0.5) / fields[1] * size[1]
+                kernel = kernel_at(camera, eye, size, place, 1 / ahead, place, GRID, wavelengths_nm=wavelengths_nm)
+                middle = place if kernel is None else kernel.middle_px
+                field = 2 * place[0] / size[0] - 1, 1 - 2 * place[1] / size[1]
+                cells.append(Cell(field, distance, middle, kernel))
+                report((number + len(cells) / (fields[0] * fields[1])) / len(distances_m))
+        found.append(cells)
+    return found
+
+
+def as_picture(cells: Sequence[Cell], columns: int, side: int) -> FloatArray:
+    """The atlas [rows side, columns side, 3] of the kernels of one distance, each of sum 1 in each channel."""
+    rows = len(cells) // columns
+    if max(rows, columns) * side > _LARGEST:
+        expected = f"at most {_LARGEST} pixels a side: fewer fields, or less blur"
+        raise InputError("kernels", "size", f"({columns * side} x {rows * side} pixels)", expected)
+    picture = np.zeros((rows * side, columns * side, 3), np.float32)
+    for k, cell in enumerate(cells):
+        j, i = divmod(k, columns)
+        if cell.kernel is not None:
+            picture[j * side :, i * side :][:side, :side] = cell.kernel.centred(side, cell.place_px)
+    return picture
+
+
+def as_preview(cells: Sequence[Cell], columns: int, side: int) -> FloatArray:
+    """The atlas with each kernel as bright as the others, to be looked at."""
+    picture = as_picture(cells, columns, side)
+    for k in range(len(cells)):
+        j, i = divmod(k, columns)
+        part = picture[j * side :, i * side :][:side, :side]
+        lit = part[part > 0]
+        if lit.size:
+            part /= float(np.percentile(lit, 90))
+    return picture
