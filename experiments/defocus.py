@@ -3,9 +3,9 @@
 Six scenes through a 50 mm f/1.4, wide open: a sharp plate (pinhole, 128 samples a pixel), the lens and the thin lens
 framed as it, path-traced (256 samples). FLIP (0 is equal) of the blurred plate against the path-traced lens, with
 highlights as discs and without, and of the path-traced thin lens against it. Rendered pictures stay in the folder
-`--pictures` and are taken from there by the next run; all take an hour of one slow core. The noise of both pictures is
-part of FLIP: that of two path-traced pictures of other seeds is its floor, measured on the first scene. Also a 4K plate,
-made of the first scene's by repeating pixels, for its time. Writes defocus.md and defocus.json.
+`--pictures` and are taken from there by the next run; all take an hour of one slow core. The noise of both pictures
+is part of FLIP: that of two path-traced pictures of other seeds is its floor, measured on the first scene. Also a 4K
+plate, made of the first scene's by repeating pixels, for its time. Writes defocus.md and defocus.json.
 """
 
 from __future__ import annotations
@@ -14,8 +14,6 @@ import argparse
 import time
 from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
 
 from experiments import lab
 from neurolens.cameras.build import make_camera
@@ -118,10 +116,10 @@ _COLUMNS = lab.columns(
     ("from beyond the plate", "beyond", ".2%"),
 )
 _NOTES = """\
-{lens} at f/{f_number:g}, {width} pixels wide; FLIP against the same lens path-traced with {samples} samples a pixel (goal 0.06).
-Two path-traced pictures of {first} with other seeds differ by FLIP {floor:.3f}. A plate of {first} at {wide} x {high} takes
-{large:.0f} s of one core (goal 60), {count} highlights among them. CPU seconds of a path-traced picture are empty where it was
-there already."""
+{lens} at f/{f_number:g}, {width} pixels wide; FLIP against the same lens path-traced with {samples} samples a pixel
+(goal 0.06). Two path-traced pictures of {first} with other seeds differ by FLIP {floor:.3f}. A plate of {first} at
+{wide} x {high} takes {large:.0f} s of one core (goal 60), {count} highlights among them. CPU seconds of a path-traced
+picture are empty where it was there already."""
 OPTIONS = (
     lab.ONLY,
     lab.option("--pictures", type=Path, default=Path("runs/defocus"), metavar="FOLDER", help="where renders are kept"),

@@ -220,7 +220,7 @@ def test_kernels_have_the_light_that_the_camera_takes_from_the_point(
     point = np.array([slope[0] * z, slope[1] * z, -z - eye.before_film_mm / 1000], np.float32)
     square, _ = stratified(300, (500.0, 600.0))
     count = square.shape[1]
-    hit = exact.to_film(np.repeat(point[:, None], count, 1), square, np.full(count, 549.0, np.float32)) 
+    hit = exact.to_film(np.repeat(point[:, None], count, 1), square, np.full(count, 549.0, np.float32))
     weight = hit.weight / hit.weight.sum()
     px = SIZE[0] / 2 - hit.film_mm[0] * SIZE[0] / FILM[0], SIZE[1] / 2 + hit.film_mm[1] * SIZE[0] / FILM[0]
     green = kernel.light[..., 1] / kernel.light[..., 1].sum()
@@ -371,7 +371,7 @@ def test_a_kernel_has_the_area_of_rays_traced_from_the_point(exact: Camera) -> N
     random, count = np.random.default_rng(5), 1_500_000
     px = np.array(kernel.corner_px)[:, None] + np.array([[width], [height]]) * random.random((2, count))
     film = np.stack([-(px[0] / SIZE[0] - 0.5) * FILM[0], (px[1] / SIZE[1] - 0.5) * FILM[1]]).astype(np.float32)
-    rays = exact.sample(film, random.random((2, count)).astype(np.float32), np.full(count, 549.0, np.float32)) 
+    rays = exact.sample(film, random.random((2, count)).astype(np.float32), np.full(count, 549.0, np.float32))
     lines = eye.lines(rays.origin_m, rays.direction)
     seen = np.hypot(lines[0] + w * lines[2] - place[0], lines[1] + w * lines[3] - place[1]) < 1.5
     weight = rays.weight * (seen & (rays.status == 0))
