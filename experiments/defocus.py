@@ -86,8 +86,8 @@ def measure(scene: str, folder: Path) -> Row:
     truth = read_exr(exact)[0]
     (found, cpu_s), (without, _) = (blurred(scene, plate, highlights) for highlights in (True, False))
     write_png(folder / f"{scene}.defocus.png", found.rgb)
-    flips = [flip(rgb, truth) for rgb in (found.rgb, without.rgb, read_exr(thin)[0])]
-    return Row(scene, *flips, cpu_s, seconds, found.highlights, found.filled, found.beyond)
+    best, noisy, thin_flip = (flip(rgb, truth) for rgb in (found.rgb, without.rgb, read_exr(thin)[0]))
+    return Row(scene, best, noisy, thin_flip, cpu_s, seconds, found.highlights, found.filled, found.beyond)
 
 
 def large_s(scene: str, folder: Path) -> tuple[float, int]:
