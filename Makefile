@@ -1,7 +1,8 @@
 # On a fresh machine with Python 3.11 or newer and make, each target does its own set-up in .venv; a second run starts at once.
 #
 #   make demo     train, evaluate and render the quickstart (4 CPU minutes after installing)
-#   make test     tests, then lint, format and types; NEUROLENS_WHOLE=1 for every lens and model in tests of each
+#   make test     tests, then lint, format and types
+#   make test-whole the tests with all their sweeps: every lens, model, kind and setting of what `make test` tries on a few
 #   make test-blender   the extension in Blender 5.0, in .venv-blender (Python 3.11; about 400 MB, once);
 #                       BLENDER=4.5.0 or 5.2.3 for another (from 5.1 on it needs Python 3.13)
 #   make test-web the pages that commands write, in headless Chromium (Debian: chromium; CHROMIUM=/path/to/another): what
@@ -40,7 +41,7 @@ export MPLBACKEND ?= Agg
 # Tests start Python hundreds of times: it compiles once, whatever the machine's habit.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-blender test-web docs bench models gallery lint format clean
+.PHONY: demo test test-whole test-blender test-web docs bench models gallery lint format clean
 .DELETE_ON_ERROR:
 
 demo: $(INSTALLED)
@@ -52,6 +53,9 @@ demo: $(INSTALLED)
 test: $(INSTALLED)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist worksteal --durations=10
 	$(MAKE) --no-print-directory lint
+
+test-whole:
+	NEUROLENS_WHOLE=1 $(MAKE) --no-print-directory test
 
 # Blender as a module wants one Python and, to 5.0, numpy 1: an environment of its own. On Debian without a desktop it also needs
 # libxkbcommon0 libsm6 libxi6 libxxf86vm1 libxfixes3 libgl1 libegl1.
