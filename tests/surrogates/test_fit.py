@@ -84,6 +84,7 @@ def direction_rms(settings: ModelSettings) -> float:
     return float((model.core(targets.field)[0][1] - targets.vectors[1]).square().sum(0).mean().sqrt())
 
 
+@pytest.mark.whole  # an ablation
 @pytest.mark.slow
 def test_every_part_of_the_fit_is_worth_something() -> None:
     whole = direction_rms(ModelSettings(terms=24))

@@ -158,6 +158,7 @@ def test_full_degree_fits_do_not_see_the_planes(shift: tuple[float, float]) -> N
     torch.testing.assert_close(found[0], found[1], rtol=0, atol=1e-9)
 
 
+@pytest.mark.whole  # an ablation
 def test_sparse_fits_gain() -> None:
     assert direction_rms(fitted(True)) < 0.7 * direction_rms(fitted(False))
 

@@ -48,7 +48,7 @@ def space() -> StateSpace:
 
 @cache
 def model() -> StateModel:
-    return fit_states(space(), StateSettings(terms=40, degree=5, rays=4000))
+    return fit_states(space(), StateSettings(terms=40, degree=5, rays=2500))
 
 
 @cache
@@ -142,6 +142,7 @@ def test_states_to_check_at_are_one_in_each_part_of_every_range() -> None:
         assert sorted(int(10 * (s[k] - low) / (high - low)) for s in states) == list(range(10))
 
 
+@pytest.mark.whole  # cameras/test_osl.py focuses groups inside
 def test_a_model_of_internal_focus_is_focused_as_its_lens_is(tmp_path: Path) -> None:
     """Its camera's film is that of the exact lens's best focus, and gives the exact lens its least spot."""
     lens = read_lens(lens_models.LENSES / "tajima_retrofocus_24.toml")
