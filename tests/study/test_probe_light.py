@@ -131,7 +131,8 @@ def test_flare_is_that_of_the_layers() -> None:
     assert not any(v.any() for v in stray_light(wall(), camera, small).values())
 
 
-def test_what_is_made_afterwards_is_not_asked() -> None:
+def test_what_is_made_afterwards_is_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neurolens.plan.candidates.TERMS", (8,))  # no polynomial is chosen
     lens = set_lens(read_lens(LENS))
     far = wall(500.0, {"f_number": 45.0, "focus_m": 500.0, "width": 1920, "height": 1080})
     without = plan(far, lens, 0.2, afterwards=["distortion"])

@@ -39,7 +39,7 @@ efl_mm = 50
 wavelength_nm = [400, 700]
 [pairs]
 train = 3000
-held_out = 2000
+held_out = 1000
 rim = 3000
 [[model]]
 method = "thick"
@@ -51,7 +51,7 @@ method = "mlp"
 units = 8
 steps = 20
 [evaluation]
-vignetting_rays = 8000
+vignetting_rays = 4000
 rounds = 1
 compile_exact = false
 [render]
@@ -233,6 +233,7 @@ def test_models_that_know_no_states(settings: ModelSettings) -> None:
         state_settings(settings, 1000, 1)
 
 
+@pytest.mark.whole  # as of one state
 def test_a_second_run_takes_the_model_that_is_there(tmp_path: Path) -> None:
     space = default_experiment(lens_models.LENSES / "nikon_zoom_80_200.toml", ['lens.zoom="range"']).states()
     space = replace(space, axes=(replace(space.axes[0], degree=1),), focus_m=(math.inf, math.inf))
@@ -261,6 +262,7 @@ main(sys.argv[1:])
 """
 
 
+@pytest.mark.whole  # test_mlp kills anywhere
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL on this system")
 @pytest.mark.usefixtures("no_plots")
 def test_a_training_that_was_killed_is_taken_up_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
