@@ -132,6 +132,7 @@ def test_cameras_of_a_foreign_file_send_the_same_rays(kind: str, files: dict[str
     assert (rays[0].status == 0).any()
 
 
+@pytest.mark.whole  # their cameras send the same rays
 def test_a_picture_and_source_of_a_foreign_file(
     files: dict[str, Path], scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
