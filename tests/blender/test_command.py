@@ -100,6 +100,7 @@ def test_zip_holds_the_best_of_each_kind_and_takes_more(place: Path, capsys: pyt
     assert picture.startswith(b"\x89PNG") and picture[16:24] == bytes([0, 0, 1, 0] * 2)
 
 
+@pytest.mark.whole  # it installs the package
 def test_an_installed_package_builds_in_any_folder(
     place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -264,6 +264,7 @@ SURF 3
 """
 
 
+@pytest.mark.whole  # all forms of a lens are made
 def test_a_lens_of_your_own_whose_glass_absorbs(tmp_path: Path) -> None:
     """All of its forms are written, and say what their transmittance is."""
     (tmp_path / "my_lens.zmx").write_text(ZMX)
