@@ -66,6 +66,9 @@ def quick_races() -> Iterator[None]:
     flags = ("-std=c99", "-O0", "-march=native")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compiler, "FLAGS", tuple(flag.replace("-O3", "-O1") for flag in compiler.FLAGS))
+        # What is compiled and searched for one test is there for the next, in both processes.
+        patch.setattr(compiler, "_KEPT", 4096)
+        patch.setattr("neurolens.cameras.exact._KEPT", 4096)
         patch.setattr("neurolens.study.speed.CompiledSource.__init__.__defaults__", (flags,))
         patch.setattr("neurolens.study.speed.program_candidate.__defaults__", (None, flags))
         patch.setattr(cli.main, "__defaults__", (None, cache(cli.build_parser)))

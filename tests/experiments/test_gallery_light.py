@@ -126,6 +126,7 @@ def paraxial_blur_mm(lens: Lens, distance_m: float, wavelength_nm: float = 550.0
     return float(data.entrance_pupil_diameter_mm) * magnification * abs(to_light - to_focus) / to_light
 
 
+@pytest.mark.whole  # test_two_stops_halve_the_blur is of its physics
 def test_blur_of_near_and_far_signs_is_first_order_when_stopped_down() -> None:
     efl_mm = 75.0
     lens = set_lens(
@@ -149,6 +150,7 @@ def test_blur_of_near_and_far_signs_is_first_order_when_stopped_down() -> None:
     assert ratio == pytest.approx(scale(thin, 1.0) / scale(thin, 2.0), rel=0.01)
 
 
+@pytest.mark.whole  # cameras/test_ideal.py frames them
 @pytest.mark.parametrize(("name", "panel"), [("depth-of-field", 5), ("series-focal-length", 0), ("pinhole", 0)])
 def test_the_ideal_cameras_of_a_panel_are_framed_as_its_lens(name: str, panel: int) -> None:
     """What is in focus has one size in all columns."""

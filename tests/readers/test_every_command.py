@@ -150,6 +150,7 @@ def test_a_picture_and_source_of_a_foreign_file(
     assert code[0] == code[1]
 
 
+@pytest.mark.whole  # study/test_odd_lenses.py evaluates a run folder
 @pytest.mark.usefixtures("no_plots")
 def test_a_run_keeps_the_lens_in_our_format_and_a_model_knows_its_lens(
     files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -363,6 +363,7 @@ def test_models_have_the_blades_of_the_lens_file() -> None:
     assert own.error_px < 0.05 and own.light_error < 0.01 and bare.error_px > 0.3
 
 
+@pytest.mark.whole  # another lens
 def test_a_zoom_is_planned_in_its_state() -> None:
     lens = read_lens("lenses/ogawa_zoom_70_200.toml")
     scene = scene_from_tables(wall(10.0, 5.6, focus_m=8.0))

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from neurolens.analysis import plots as style
 from neurolens.analysis.layout import Layout, Line, Section
@@ -22,12 +21,6 @@ def biconvex(**changes: Any) -> Layout:
     stop = Section(9.0, math.inf, 5.0, 1.0, stop=True)
     rays = [Line(np.array([[-20, y], [0, y], [6, 0.9 * y], [55, 0]]), f"{10 * k}°", k) for k in (0, 1) for y in (-4, 4)]
     return replace(Layout((front, back, stop), tuple(rays), 55.0, 20.0, "y", "B", ""), **changes)
-
-
-def contrast(path: Path) -> float:
-    with Image.open(path) as opened:
-        assert opened.format == "PNG"
-        return float(np.asarray(opened.convert("RGB")).std())
 
 
 @pytest.mark.parametrize(("radius", "h"), [(50.0, 12.0), (-30.0, 29.9), (math.inf, 7.0), (10.0, 10.0)])
@@ -45,17 +38,6 @@ def test_an_arc_lies_on_its_sphere_up_to_the_rim(radius: float, h: float) -> Non
 def test_a_surface_without_extent_is_refused(semi_diameter_mm: float) -> None:
     with pytest.raises(InputError, match="surface 0, semi_diameter_mm"):
         biconvex(surfaces=(Section(0.0, 5.0, semi_diameter_mm, 1.0),))
-
-
-@pytest.mark.whole  # test_train draws them
-def test_renders_and_illumination_of_several_cameras_are_whole_pictures(tmp_path: Path) -> None:
-    draw, path = np.random.default_rng(0), tmp_path / "a.png"
-    images = {f"camera {i}": draw.uniform(0, 1, (18, 32, 3)) for i in range(5)}
-    maps = {name: draw.uniform(0, 0.3, (18, 32)) for name in list(images)[1:]}
-    captions = dict.fromkeys(images, "FLIP 0.01\nrelMSE 0.02")
-    assert contrast(plots.side_by_side(images, maps, path, captions, title="Room")) > 5
-    light = Illumination([0.0, 10.0, 20.0], [1.0, 0.8, 0.5], [1.0, 0.81, 0.52], 0.02)
-    assert contrast(plots.illumination_plot({f"ols-{i}": light for i in range(3)}, path)) > 5
 
 
 def test_bad_images_are_refused(tmp_path: Path) -> None:

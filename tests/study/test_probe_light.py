@@ -72,11 +72,11 @@ def test_transmittance_is_that_of_the_axis() -> None:
 
 def test_vignetting_darkens_the_corner_as_traced_rays_say() -> None:
     """Rays of the corner's film point through a grid of the pupil, with the rims and without them; the stop in both."""
-    found = probe(wall(camera={"f_number": 2.0}), set_lens(read_lens("lenses/laikin_double_gauss_50.toml")))
+    found = probe(wall(camera={"f_number": 1.8}), set_lens(read_lens("lenses/laikin_double_gauss_50.toml")), across=8)
     unit, taken = found.camera_maps["vignetting"]
     fall = found.camera_maps["natural fall-off"][1]
     x, y = (mm * (0.5 / n - 0.5) for mm, n in zip(found.asked.shot.film_mm, taken.shape[::-1], strict=True))
-    side = torch.linspace(-35, 35, 801, dtype=torch.float64)
+    side = torch.linspace(-35, 35, 501, dtype=torch.float64)
     u, v = (a.reshape(-1) for a in torch.meshgrid(side, side, indexing="ij"))
     film = torch.full_like(u, x), torch.full_like(u, y), torch.full_like(u, found.lens.film_z_mm)
     rays = camera_rays(*film, u, v, found.domain.pupil_z_mm)
@@ -174,9 +174,9 @@ def test_extremes_have_an_answer(name: str) -> None:
 
 def test_lights_beyond_number_are_bounded() -> None:
     """Only the lights that are strongest at the lens are used: a near one among weak ones is found."""
-    place = np.random.default_rng(0).uniform([-9, -9, -60], [9, 9, -40], (20_000, 3))
+    place = np.random.default_rng(0).uniform([-9, -9, -60], [9, 9, -40], (10_000, 3))
     points = [{"position_m": [float(v) for v in p], "intensity": [1e-6] * 3} for p in place]
-    points[12_345] = {"position_m": [0.2, 0.1, -2.0], "intensity": [5.0] * 3}
+    points[6_789] = {"position_m": [0.2, 0.1, -2.0], "intensity": [5.0] * 3}
     scene = wall(100.0, points=points)
     seen = SceneLights(scene).seen(scene, 60.0, most=8)
     assert len(seen) <= 8 and max(a.rgb[0] for a in seen) == pytest.approx(5 / 2.01**2, rel=0.1)

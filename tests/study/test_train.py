@@ -12,6 +12,7 @@ from pathlib import Path
 import lens_models
 import numpy as np
 import pytest
+from shipped import whole
 
 from neurolens.base.errors import InputError
 from neurolens.base.kept import Kept
@@ -168,7 +169,7 @@ QUICK = """--rounds 0 --quiet --set pairs.train=1000 --set pairs.held_out=500 --
 RUNGS = "model=[{terms=3,planes=false},{terms=12,planes=false},{terms=20,planes=false}]"
 
 
-@pytest.mark.parametrize(("asked", "within_um", "tried"), [("um=2", 2.0, 2), ("px=1e-6", 1e-6 * 6.24, 3)])
+@pytest.mark.parametrize(("asked", "within_um", "tried"), [("px=1e-6", 1e-6 * 6.24, 3), *whole(("um=2", 2.0, 2))])
 @pytest.mark.usefixtures("no_plots")
 def test_models_are_fitted_until_one_has_the_error_asked_for(tmp_path, capsys, asked, within_um, tried) -> None:
     kind, _, value = asked.partition("=")

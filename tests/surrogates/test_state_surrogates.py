@@ -235,7 +235,7 @@ def test_states_out_of_range_are_outside_the_domain(bad: float) -> None:
 
 
 def test_random_states_and_rays_break_no_promise() -> None:
-    found = outside.send(loaded(), 200_000, seed=3)
+    found = outside.send(loaded(), 100_000, seed=3)
     assert found.broken == dict.fromkeys(found.broken, 0) and found.inside > 10_000 and found.passed > 3000
 
 
@@ -306,7 +306,6 @@ def test_cameras_zoom() -> None:
     low, high = loaded().axes[0].range
     assert OnnxCamera(loaded(), Shot(film, 10.0)).settings["state"] == {"zoom": low}
     assert OnnxCamera(loaded(), Shot(film, 10.0, zoom="200mm")).settings["state"] == {"zoom": high}
-    assert OnnxCamera(loaded(), Shot(film, 10.0, zoom=200.0)).settings["state"] == {"zoom": 200.0}
     assert OnnxCamera(loaded(), Shot(film, 10.0, zoom=80.0)).settings["state"] == {"zoom": low}
     square = np.random.default_rng(0).random((2, 500), np.float32)
     point = np.zeros((2, 500), np.float32)
