@@ -319,16 +319,17 @@ def test_compiled_equals_eager(whole_lens: bool) -> None:
         start = start._replace(z=start.z - 60.0, dz=-start.dz)
     wavelength = torch.linspace(400, 700, 1024)
     with torch.no_grad():
-        eager = trace(table, start, wavelength, transmittance=True, towards=towards)
+        eager = trace(table, start, wavelength, transmittance=whole_lens, towards=towards)
         with inductor_config.patch({"cpp.vec_isa_ok": True}):  # else trial programs are compiled first, for 6 s
-            compiled = compile_tracing(partial(trace, table, transmittance=True, towards=towards), table)(
-                start, wavelength
-            )
+            run = partial(trace, table, transmittance=whole_lens, towards=towards)
+            compiled = compile_tracing(run, table)(start, wavelength)
     assert int((eager.status != compiled.status).sum()) <= 1  # a ray may pass an edge closely
     both = (eager.status == 0) & (compiled.status == 0)
+    assert both.sum() > 100
     for a, b in zip(eager.rays, compiled.rays, strict=True):
         torch.testing.assert_close(a[both], b[both], rtol=0, atol=2e-5)
-    torch.testing.assert_close(eager.transmittance, compiled.transmittance, rtol=0, atol=2e-6)
+    if whole_lens:
+        torch.testing.assert_close(eager.transmittance, compiled.transmittance, rtol=0, atol=2e-6)
 
 
 ON_DEVICE = ["laikin_double_gauss_50", "canon_aspheric_50", "schneider_anamorphic_31", "shimizu_fisheye_220"]
