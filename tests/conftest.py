@@ -37,7 +37,9 @@ material = "grey"
 """
 
 # A busy machine is no failure: no example has a time limit.
-settings.register_profile("neurolens", settings.get_profile("default"), deadline=None)
+settings.register_profile(
+    "neurolens", settings.get_profile("default"), deadline=None, max_examples=100 if WHOLE else 30
+)
 settings.load_profile("neurolens")
 
 

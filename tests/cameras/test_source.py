@@ -182,7 +182,7 @@ def run_compiled(language: str, source: str, folder: Path, given: str = "", *arg
     compiler = shutil.which("c++" if language == "c++" else "cc")
     if compiler is None:
         pytest.skip("no compiler of C++ or C")
-    flags = ["-O1", "-Wall", "-Wextra", "-Werror", "-x", language, "-", "-o", str(folder / "a.out"), "-lm"]
+    flags = ["-O0", "-Wall", "-Wextra", "-Werror", "-x", language, "-", "-o", str(folder / "a.out"), "-lm"]
     done = subprocess.run([compiler, f"-I{folder}", *flags], input=source, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     command = [str(folder / "a.out"), *arguments]

@@ -166,11 +166,11 @@ def test_ghosts_have_the_light_of_their_rays(case: str, distance_m: float) -> No
 
 
 def test_any_number_of_threads_and_layers_is_one_picture() -> None:
-    lens, light = lens_of("laikin_double_gauss_50"), [Light(15.0, 8.0), Light(-4.0, 2.0, (0.1, 0.5, 0.2))]
+    lens, light = lens_of("cooke_triplet_50"), [Light(15.0, 8.0), Light(-4.0, 2.0, (0.1, 0.5, 0.2))]
     tracer, raster = GhostTracer(lens), Raster((36.0, 24.0), 48, 32)
     one = ghost_picture(tracer, light, raster, wavelengths=4, threads=1)
     assert np.array_equal(ghost_picture(tracer, light, raster, wavelengths=4, threads=3), one)
-    several = ghost_picture(tracer, light, raster, wavelengths=4, layers=[k % 3 for k in range(66)])
+    several = ghost_picture(tracer, light, raster, wavelengths=4, layers=[k % 3 for k in range(15)])
     np.testing.assert_allclose(several.sum(0), one[0], rtol=1e-4, atol=1e-7)
 
 

@@ -86,11 +86,11 @@ def test_photons_paint_the_ghosts(tmp_path: Path) -> None:
 def test_starburst_is_a_layer(tmp_path: Path) -> None:
     """What the module makes, added to the ghosts under its gain."""
     out = tmp_path / "star.exr"
-    words = ["laikin_double_gauss_50", "--light", "4,2,3", "--f-number", "11", "--blades", "5", "--width", "48"]
+    words = ["cooke_triplet_50", "--light", "4,2,3", "--f-number", "11", "--blades", "5", "--width", "48"]
     few = ["--bins", "2", "--cell", "20", "--quiet", "--starburst", "--gain", "starburst=2"]
     assert main(["flare", *words, *few, "-o", str(out)]) == 0
     layers, rgb = read_layers(out), read_exr(out)[0]
-    lens = read_lens("lenses/laikin_double_gauss_50.toml").with_aperture(Aperture(blades=5))
+    lens = read_lens("lenses/cooke_triplet_50.toml").with_aperture(Aperture(blades=5))
     lens = set_lens(lens, f_number=11.0, focus_m=math.inf, focus_mode="best")
     alone = starburst_picture(lens, [Light(4.0, 2.0, (3.0, 3.0, 3.0))], Raster((36, 24), 48, 32), wavelengths=2)
     np.testing.assert_allclose(layers["starburst.G"], 2 * alone[..., 1], rtol=1e-4, atol=1e-6 * alone.max())
@@ -103,18 +103,18 @@ SMALL = ["cooke_triplet_50", "--width", "36", "--cell", "4", "--bins", "2", "--q
 def test_frames_go_on_and_do_not_pop(tmp_path: Path) -> None:
     """A light that crosses: the energy changes evenly; frames that are there are kept, one that is not comes back."""
     lights, out = tmp_path / "lights.csv", tmp_path / "a.exr"
-    lights.write_text("light,frame,azimuth_deg,elevation_deg\nsun,1,-6,14\nsun,5,6,14.4\n")
-    words = ["flare", *SMALL, "--lights", str(lights), "--frames", "1:5", "--layers", "2", "-o", str(out)]
+    lights.write_text("light,frame,azimuth_deg,elevation_deg\nsun,1,-3,14\nsun,3,3,14.2\n")
+    words = ["flare", *SMALL, "--lights", str(lights), "--frames", "1:3", "--layers", "2", "-o", str(out)]
     assert main(words) == 0
-    files = [tmp_path / f"a.{frame:04d}.exr" for frame in range(1, 6)]
+    files = [tmp_path / f"a.{frame:04d}.exr" for frame in range(1, 4)]
     assert sorted(tmp_path.glob("*.exr")) == files
     energy = np.array([read_exr(file)[0][..., 1].sum() for file in files])
     assert np.abs(np.diff(energy)).max() < 0.1 * energy.mean()
     assert len({tuple(sorted(read_layers(file))) for file in files}) == 1
-    kept, before = files[1].stat().st_mtime_ns, files[3].read_bytes()
-    files[3].unlink()
+    kept, before = files[1].stat().st_mtime_ns, files[2].read_bytes()
+    files[2].unlink()
     assert main(words) == 0
-    assert files[1].stat().st_mtime_ns == kept and files[3].read_bytes() == before
+    assert files[1].stat().st_mtime_ns == kept and files[2].read_bytes() == before
 
 
 def test_noise_is_that_of_the_seed_in_every_frame(tmp_path: Path) -> None:
