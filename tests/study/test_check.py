@@ -25,7 +25,7 @@ from neurolens.study.rays import ZONES
 from neurolens.surrogates.export import export_onnx
 from neurolens.surrogates.pairs import PairSettings, make_pairs
 
-RAYS = 4000
+RAYS = 6000
 
 
 @pytest.fixture(autouse=True, scope="module")
