@@ -311,6 +311,7 @@ def test_lens_state_is_applied(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_json(capsys, "lens", GAUSS, "--efl", "35")["efl_mm"] == pytest.approx(35)
 
 
+@pytest.mark.whole  # trace/test_states.py has its figures
 def test_lens_zooms_between_states_focuses_inside_and_shows_its_breathing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -177,6 +177,7 @@ def test_distortion_names_the_projection_of_a_fisheye() -> None:
     json.dumps(found.to_dict())
 
 
+@pytest.mark.whole  # test_converged has dense sampling
 def test_spots_agree_with_their_own_points_through_focus() -> None:
     given = library("brendel_tessar_100")
     found = spots(given, [15.0], shift_mm=[-0.2, 0.0, 0.3])

@@ -161,6 +161,7 @@ def test_bad_input_is_one_line(
     assert not out.exists() and not (place / "user").exists()
 
 
+@pytest.mark.whole  # a second build
 def test_a_second_build_makes_no_shader_again(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given = ["blender", "build", "--models", str(place / "models"), "--jobs", "1", "--quiet", "-o"]
     stand_in, field_table, asked, fields = blender_lenses.shader_of, blender_lenses.field_table, [], []

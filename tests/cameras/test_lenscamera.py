@@ -188,7 +188,7 @@ def absorbing(design: str = "") -> Lens:
         pytest.param(absorbing(), FILM, "c", marks=pytest.mark.whole),
         (absorbing("three-layer"), FILM, "c"),
         pytest.param(lens_models.lens("canon_aspheric_50"), (20.0, 14.0), "c", marks=pytest.mark.whole),
-        (lens_models.lens("schneider_anamorphic_31"), (20.0, 14.0), "c"),
+        pytest.param(lens_models.lens("schneider_anamorphic_31"), (20.0, 14.0), "c", marks=pytest.mark.whole),
         (lens_models.lens("cooke_triplet_50"), FILM, "onnxruntime"),
     ],
     ids=["bare", "coated", "aspheres", "cylinders", "onnxruntime"],

@@ -552,6 +552,7 @@ def test_the_text_is_osl() -> None:
     assert used <= known
 
 
+@pytest.mark.whole  # the longest program
 def test_a_long_program_has_fewer_statements_than_the_compiler_takes() -> None:
     """10,000 in a block: its parser's stack. Of a lens of aspheres there are more steps."""
     g = Graph()

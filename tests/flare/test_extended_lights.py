@@ -142,6 +142,7 @@ def ghost_by_chance(lens: Lens, light: Light, pair: Pair, raster: Raster, count:
     return film
 
 
+@pytest.mark.whole  # the same oracle holds the patches of a large ghost below
 @pytest.mark.slow
 @pytest.mark.skipif(not CASE.is_file(), reason=f"{CASE} is not there")
 @pytest.mark.parametrize(("name", "most"), [("g12-08", 0.02), *whole(("g11-09", 0.03))])

@@ -118,6 +118,7 @@ def test_the_sonnar_against_photographs() -> None:
     assert all(curve.rms < 0.2 for curve in c.light_stops.values())
 
 
+@pytest.mark.whole  # what it prints is compared below
 def test_the_command_prints_draws_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("lensfunpy")
     picture, written = tmp_path / "sonnar.png", tmp_path / "sonnar.toml"

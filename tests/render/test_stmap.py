@@ -189,6 +189,7 @@ def test_lateral_colour_is_that_of_the_analysis() -> None:
     assert np.abs(found.lateral_um[3:8]).max() > 1  # there is some to be seen
 
 
+@pytest.mark.whole  # the maps of such a lens are below
 def test_both_meridians_of_an_anamorphic_lens_have_their_own_size(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fields, "_OTHER", (25, 24))
     camera = make_camera(ROOT / "lenses" / "cooke_anamorphic_42.toml", Shot(film_mm=(20.0, 16.0), focus_m=3.0))

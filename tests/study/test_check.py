@@ -164,6 +164,7 @@ def test_one_trace_serves_every_stop(state: str) -> None:
             assert {z: found.zones[state][z][key] for z in ZONES} == {z: apart["zones"][z][key] for z in ZONES}
 
 
+@pytest.mark.whole  # what is said of it
 def test_a_poor_fit_is_named_by_its_card_the_command_and_the_source_code(
     errors: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -175,6 +175,7 @@ def fitted(lens: Lens, domain: Domain, terms: int = 40, rays: PairSettings = RAY
     return fit_model(prepare(make_pairs(lens, domain, rays)), ModelSettings("ols", terms=terms, planes=False))
 
 
+@pytest.mark.whole  # as a tiny rim far in front
 def test_where_little_passes_rays_are_drawn_where_it_does() -> None:
     """The share that passes is known all the same, and no passing ray lies outside the boxes."""
     lens, domain = narrow()
