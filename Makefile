@@ -1,7 +1,8 @@
 # On a fresh machine with Python 3.11 or newer and make, each target does its own set-up in .venv; a second run starts at once.
 #
 #   make demo     train, evaluate and render the quickstart (4 CPU minutes after installing)
-#   make test     tests, then lint, format and types; NEUROLENS_WHOLE=1 for every lens and model in tests of each
+#   make test     tests, then lint, format and types
+#   make test-whole the tests with all their sweeps: every lens, model, kind and setting of what `make test` tries on a few
 #   make test-blender   the extension in Blender 5.0, in .venv-blender (Python 3.11; about 400 MB, once);
 #                       BLENDER=4.5.0 or 5.2.3 for another (from 5.1 on it needs Python 3.13)
 #   make test-web the pages that commands write, in headless Chromium (Debian: chromium; CHROMIUM=/path/to/another): what
@@ -40,7 +41,10 @@ export MPLBACKEND ?= Agg
 # Tests start Python hundreds of times: it compiles once, whatever the machine's habit.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-blender test-web docs bench models gallery lint format clean
+# A machine of one run compiles what it imports, which is a fraction of what pip would compile for a minute.
+PIP_INSTALL := $(BIN)/python -m pip install $(if $(CI),--no-compile) -c constraints.txt
+
+.PHONY: demo test test-whole test-blender test-web docs bench models gallery lint format clean
 .DELETE_ON_ERROR:
 
 demo: $(INSTALLED)
@@ -53,6 +57,9 @@ test: $(INSTALLED)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist worksteal --durations=10
 	$(MAKE) --no-print-directory lint
 
+test-whole:
+	NEUROLENS_WHOLE=1 $(MAKE) --no-print-directory test
+
 # Blender as a module wants one Python and, to 5.0, numpy 1: an environment of its own. On Debian without a desktop it also needs
 # libxkbcommon0 libsm6 libxi6 libxxf86vm1 libxfixes3 libgl1 libegl1.
 test-blender: $(BLENDER_INSTALLED) $(INSTALLED)
@@ -62,7 +69,7 @@ test-blender: $(BLENDER_INSTALLED) $(INSTALLED)
 # A browser is not for pip to bring; without one this says so. onnxruntime-web comes of npm, once, into build/web.
 test-web: $(INSTALLED)
 	@set -e; if [ -z "$(CHROMIUM)" ]; then echo "no browser: pages are not tested (Debian: apt-get install chromium)"; exit 0; fi; \
-	$(BIN)/python -m pip install -c constraints.txt -e '.[web]' --no-build-isolation; \
+	$(PIP_INSTALL) -e '.[web]' --no-build-isolation; \
 	if command -v npm >/dev/null; then npm install --silent --no-audit --no-fund --prefix build/web onnxruntime-web@$(ORT_WEB); \
 	else echo "no npm: models are not run in onnxruntime-web"; fi; \
 	ort=build/web/node_modules/onnxruntime-web/dist; \
@@ -71,7 +78,7 @@ test-web: $(INSTALLED)
 
 docs: $(INSTALLED) $(VENV)/.docs
 	$(BIN)/sphinx-build -q -W --keep-going -b html -c docs . build/docs
-	NEUROLENS_BROWSER="$(CHROMIUM)" OMP_NUM_THREADS=1 NEUROLENS_DOCS=1 $(BIN)/python -m pytest -q -n 2 -rs tests/test_docs.py
+	NEUROLENS_BROWSER="$(CHROMIUM)" OMP_NUM_THREADS=1 NEUROLENS_DOCS=1 $(BIN)/python -m pytest -q -n 2 -rs --durations=10 tests/test_docs.py
 	@echo "Look at build/docs/index.html"
 
 bench: $(INSTALLED)
@@ -111,13 +118,13 @@ $(INSTALLED): pyproject.toml constraints.txt
 	"$$found" -m venv $(VENV) || { echo "'$$found -m venv' failed: is the venv module installed (Debian: python3-venv)?" >&2; exit 1; }
 	@set -e; (while sleep 15 >/dev/null && kill -0 $$$$ 2>/dev/null; do \
 	    echo "  pip is at work: $(VENV) has $$(du -sm $(VENV) | cut -f1) MB"; done) & beat=$$!; \
-	$(BIN)/python -m pip install -c constraints.txt torch; \
-	$(BIN)/python -m pip install -c constraints.txt --no-build-isolation -e '.[train,dev]'; \
+	$(PIP_INSTALL) torch; \
+	$(PIP_INSTALL) --no-build-isolation -e '.[train,dev]'; \
 	kill $$beat
 	@touch $@
 
 $(VENV)/.docs: $(INSTALLED)
-	$(BIN)/python -m pip install -c constraints.txt --no-build-isolation -e '.[docs,web]'
+	$(PIP_INSTALL) --no-build-isolation -e '.[docs,web]'
 	@touch $@
 
 $(BLENDER_INSTALLED): Makefile

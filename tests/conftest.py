@@ -1,4 +1,5 @@
-"""Order of the tests: those marked slow run last in their file; races are short, and a small scene is at hand."""
+"""Order of the tests: slow ones are last in their file, sweeps run with NEUROLENS_WHOLE=1; races are short, and a small
+scene is at hand."""
 
 import gc
 from collections.abc import Iterator
@@ -7,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from shipped import WHOLE
 
 from neurolens import cli
 from neurolens.graph import compiler
@@ -35,7 +37,9 @@ material = "grey"
 """
 
 # A busy machine is no failure: no example has a time limit.
-settings.register_profile("neurolens", settings.get_profile("default"), deadline=None)
+settings.register_profile(
+    "neurolens", settings.get_profile("default"), deadline=None, max_examples=100 if WHOLE else 30
+)
 settings.load_profile("neurolens")
 
 
@@ -44,7 +48,11 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("filterwarnings", "ignore::neurolens.base.errors.NeurolensWarning")
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    left_out = [] if WHOLE else [item for item in items if item.get_closest_marker("whole")]
+    if left_out:
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if not item.get_closest_marker("whole")]
     files = {path: k for k, path in enumerate(dict.fromkeys(item.path for item in items))}
     items.sort(key=lambda item: (files[item.path], item.get_closest_marker("slow") is not None))
 
@@ -57,9 +65,12 @@ def pytest_collection_finish() -> None:
 def quick_races() -> Iterator[None]:
     """The command line is made once; races are of few rays and samples, their C compiled with less effort, for no test
     judges a clock."""
-    flags = ("-std=c99", "-O1", "-march=native")
+    flags = ("-std=c99", "-O0", "-march=native")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compiler, "FLAGS", tuple(flag.replace("-O3", "-O1") for flag in compiler.FLAGS))
+        # What is compiled and searched for one test is there for the next, in both processes.
+        patch.setattr(compiler, "_KEPT", 4096)
+        patch.setattr("neurolens.cameras.exact._KEPT", 4096)
         patch.setattr("neurolens.study.speed.CompiledSource.__init__.__defaults__", (flags,))
         patch.setattr("neurolens.study.speed.program_candidate.__defaults__", (None, flags))
         patch.setattr(cli.main, "__defaults__", (None, cache(cli.build_parser)))

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from command_line import failure, run_json
 from PIL import Image
+from shipped import whole
 
 from neurolens.cameras.contract import CameraRays
 from neurolens.cameras.ideal import ThinLens
@@ -58,7 +59,7 @@ def wait(condition: Any) -> None:
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="workers are forked on Linux")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL, *whole(signal.SIGTERM, signal.SIGHUP)])
 def test_a_signal_in_mid_render_loses_nothing(
     number: int, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

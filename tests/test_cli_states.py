@@ -101,6 +101,7 @@ def test_the_picture_keeps_the_state_of_its_lens(
     assert "100 mm" in camera["derived"]
 
 
+@pytest.mark.whole  # what is doubted is in trace/test_shipped_lenses.py
 def test_doubts_are_said_and_kept(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A slip of the pen in the table, and a film five times as wide as the picture; a film that fits is no doubt."""
     slip, out = tmp_path / "slip.toml", tmp_path / "a.exr"

@@ -36,6 +36,7 @@ TWICE = "{" + ",".join(f'"{k % 89_999}": 1' for k in range(90_000)) + "}"
 LENS_JSON = '{"name": "a", "source": "b", "notes": %s, "surfaces": [{}]}'
 
 
+@pytest.mark.whole  # python -m experiments fuzz; what it has found is in the tests below
 @pytest.mark.slow
 def test_40_hostile_cases_end_as_they_should(tmp_path: Path) -> None:
     """In a new process: cases are forks of it, and this one has grown large by other tests."""

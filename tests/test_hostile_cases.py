@@ -107,6 +107,7 @@ def test_a_refused_lens_is_text_in_the_librarys_index(capsys: pytest.CaptureFixt
     assert "<img" not in text and "<script>document.documentElement" not in text
 
 
+@pytest.mark.whole  # a page
 def test_lenses_of_one_stem_have_pages_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
     from neurolens.cli import library
 
@@ -121,6 +122,7 @@ def test_lenses_of_one_stem_have_pages_of_their_own(monkeypatch: pytest.MonkeyPa
     assert "./x/index.html" in index and "./x-2/index.html" in index
 
 
+@pytest.mark.whole  # flare/test_flare_extremes.py, in a process of its own
 @pytest.mark.slow
 def test_nested_rings_end_within_the_memory_of_one_picture(capsys: pytest.CaptureFixture[str]) -> None:
     """A thousand regions, each around the next, took 1.7 GB more than their picture of 48 MB."""

@@ -192,6 +192,7 @@ def test_help_of_the_command_line_loads_not_even_numpy() -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.whole  # how fast a camera starts
 def test_exact_cameras_start_without_torchs_compiler() -> None:
     """It takes longer to load than all the rest."""
     code = "import sys, neurolens.cameras.exact; assert 'torch._dynamo' not in sys.modules"

@@ -56,6 +56,7 @@ def own_environment(file: Path, tree: ast.Module, name: str) -> bool:
     return excluded or f"pip install {name}==" in (ast.get_docstring(tree) or "")
 
 
+@pytest.mark.whole  # it reads all files
 def test_what_is_imported_is_declared_and_what_is_declared_is_imported() -> None:
     def plain(name: str) -> str:
         return re.sub(r"[-_.]+", "-", name).lower()

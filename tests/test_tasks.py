@@ -39,14 +39,18 @@ Client = pytest.importorskip("distributed", reason="needs the extra dask").Clien
 
 ROOT = Path(__file__).parents[1]
 CLUSTER = """
-import logging, sys
+import logging, multiprocessing, sys
 from distributed import LocalCluster
+# Workers start with what their tasks import, which is imported once.
+multiprocessing.get_context("forkserver").set_forkserver_preload(["distributed", *sys.argv[2:]])
 if __name__ == "__main__":
     cluster = LocalCluster(n_workers=int(sys.argv[1]), threads_per_worker=1, dashboard_address=None, memory_limit=0,
                            silence_logs=logging.CRITICAL)
     print(cluster.scheduler_address, flush=True)
     sys.stdin.read()
 """
+
+IMPORTED = ("neurolens.frames.farm", "neurolens.render.renderer", "neurolens.study.survey", "neurolens.flare.layers")
 
 
 class Cluster:
@@ -55,9 +59,10 @@ class Cluster:
     def __init__(self, workers: int, folder: Path) -> None:
         (folder / "cluster.py").write_text(CLUSTER)
         more = {"PYTHONPATH": os.pathsep.join(sys.path), "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
+        more["DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD"] = "forkserver"
         self.process = subprocess.Popen(
-            [sys.executable, "cluster.py", str(workers)], cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL, text=True, env=os.environ | more,
+            [sys.executable, "cluster.py", str(workers), *IMPORTED], cwd=folder, stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=os.environ | more,
         )  # fmt: skip
         assert self.process.stdout is not None
         self.address = self.process.stdout.readline().strip()
@@ -277,6 +282,7 @@ def test_frames_of_a_cluster_are_those_of_one_machine(framed: Callable[..., dict
     assert not Path("there.exr.tiles").exists()
 
 
+@pytest.mark.whole  # a second cluster
 def test_a_lost_scheduler_leaves_what_is_done(
     framed: Callable[..., dict[str, bytes]], cluster: str, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
@@ -317,6 +323,7 @@ SMALL = ("pairs.train=1500", "pairs.held_out=1000", "evaluation.vignetting_rays=
          "render.scenes=[]", 'model=[{method="ols", terms=12}]')  # fmt: skip
 
 
+@pytest.mark.whole  # as surveys go on
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_plots")
 def test_a_lens_that_fails_is_a_line_and_the_others_are_trained(
@@ -332,6 +339,7 @@ def test_a_lens_that_fails_is_a_line_and_the_others_are_trained(
     assert Path("runs/one/models/ols-12.onnx").is_file()
 
 
+@pytest.mark.whole  # as frames are
 def test_records_of_a_survey_are_those_of_one_machine(
     cluster: str, lenses: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -358,6 +366,7 @@ cell_px = 64.0
 """
 
 
+@pytest.mark.whole  # make docs runs it too; frames and tiles by themselves below and in test_tiles
 @pytest.mark.slow
 def test_the_documented_script_renders_one_picture_in_three_ways(
     cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

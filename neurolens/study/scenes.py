@@ -170,10 +170,10 @@ def scene_gain(experiment: Experiment, folder: Path, progress: Progress) -> dict
                 candidate = model_candidate(f"{name}: {settings.label}", load_model(m.file), domain.stop_radius_mm)
                 candidates.append(replace(candidate, domain=domain))
         # One race, so that the times can be set against each other.
-        chosen = experiment.evaluation
-        timed = race(candidates, shot_domain, threads=chosen.threads, rounds=chosen.rounds)
-        for row, candidate in zip(rows, candidates, strict=True):
-            row["ns_per_ray"] = timed.timing(candidate.name)
+        if (chosen := experiment.evaluation).rounds:
+            timed = race(candidates, shot_domain, threads=chosen.threads, rounds=chosen.rounds)
+            for row, candidate in zip(rows, candidates, strict=True):
+                row["ns_per_ray"] = timed.timing(candidate.name)
     whole, same, half_row = rows
     text = ""
     if all(row.get("rms_um") for row in rows):

@@ -78,11 +78,11 @@ def test_every_analysis_as_text_picture_and_json(
 
 def test_an_anamorphic_lens_in_both_planes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scale = {}
-    for axis in "xy":
-        data = run_json(capsys, "analyse", ANAMORPHIC, "distortion", "layout", "--axis", axis, "-o", tmp_path)
+    for axis, more in (("x", ()), ("y", ("layout", "-o", tmp_path))):
+        data = run_json(capsys, "analyse", ANAMORPHIC, "distortion", "--axis", axis, *more)
         scale[axis] = data["distortion"]["scale_mm"]
     assert 1.2 < max(scale.values()) / min(scale.values()) < 2.5
-    assert len(list(tmp_path.iterdir())) == 4
+    assert len(list(tmp_path.iterdir())) == 2
     assert main(["analyse", str(ANAMORPHIC), "seidel"]) == 2
     assert "symmetric" in capsys.readouterr().err
 
@@ -138,11 +138,11 @@ def test_no_light_is_one_error_or_a_gap(tmp_path: Path, capsys: pytest.CaptureFi
     assert "expected at most 2" in failure(capsys, "analyse", GAUSS, "mtf", "--field-points", 80)
 
 
-def test_a_stop_beyond_all_glass_warns_of_no_division(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_stop_beyond_all_glass_warns_of_no_division(capsys: pytest.CaptureFixture[str]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         lens = LENSES / "muller_fisheye_100.toml"
-        options = ("--f-number", 0.3, "--field-points", 0, 40, "-o", tmp_path)
+        options = ("--f-number", 0.3, "--field-points", 0, 40)
         data = run_json(capsys, "analyse", lens, "vignetting", "spots", *options)
     assert data["vignetting"]["relative"][0] in (None, 1.0)
     assert data["spots"]["working_f_number"] == pytest.approx(4, rel=0.02)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from analysis_lenses import INF, cartesian, grid, library, scene, thin
 from path_difference import opd_mm
-from shipped import pinhole
+from shipped import pinhole, whole
 
 from neurolens.analysis.bundles import Pattern, bundle, hexapolar, points
 from neurolens.analysis.field_curves import distortion, illumination
@@ -26,7 +26,7 @@ from neurolens.trace.surfaces import Rays
 LENSES = ["laikin_double_gauss_50", "shimizu_fisheye_220", "ogawa_zoom_70_200", "phone_lens_6", "cooke_anamorphic_42"]
 
 
-@pytest.mark.parametrize("focus_m", [INF, 2.0])
+@pytest.mark.parametrize("focus_m", [2.0, *whole(INF)])
 @pytest.mark.parametrize("name", LENSES)
 def test_rays_meet_the_stop_where_they_were_aimed(name: str, focus_m: float) -> None:
     given = library(name, focus_m=focus_m)
@@ -177,6 +177,7 @@ def test_distortion_names_the_projection_of_a_fisheye() -> None:
     json.dumps(found.to_dict())
 
 
+@pytest.mark.whole  # test_converged has dense sampling
 def test_spots_agree_with_their_own_points_through_focus() -> None:
     given = library("brendel_tessar_100")
     found = spots(given, [15.0], shift_mm=[-0.2, 0.0, 0.3])

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from analysis_lenses import INF, library, scene
 from command_line import run_json
+from shipped import whole
 
 from neurolens.analysis import plots
 from neurolens.analysis.field_curves import distortion, illumination
@@ -23,7 +24,7 @@ FUJINON = Path(__file__).parents[1] / "data" / "fujinon_35.toml"
 CASE = Path(__file__).parents[3] / "shared" / "data" / "cases" / "04_field_cut_xf35.zmx"
 
 
-@pytest.mark.parametrize("file", [FUJINON, CASE])
+@pytest.mark.parametrize("file", [FUJINON, *whole(CASE)])
 def test_a_lens_of_steep_aspheres_reaches_the_edge_of_its_film(file: Path) -> None:
     """Case 04: r^20 aspheres. ray-optics 0.9.8 has 20 degrees at 12.1875 mm and 22 degrees at 13.3284 mm."""
     if not file.exists():

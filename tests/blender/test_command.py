@@ -100,6 +100,7 @@ def test_zip_holds_the_best_of_each_kind_and_takes_more(place: Path, capsys: pyt
     assert picture.startswith(b"\x89PNG") and picture[16:24] == bytes([0, 0, 1, 0] * 2)
 
 
+@pytest.mark.whole  # it installs the package
 def test_an_installed_package_builds_in_any_folder(
     place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -160,6 +161,7 @@ def test_bad_input_is_one_line(
     assert not out.exists() and not (place / "user").exists()
 
 
+@pytest.mark.whole  # a second build
 def test_a_second_build_makes_no_shader_again(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given = ["blender", "build", "--models", str(place / "models"), "--jobs", "1", "--quiet", "-o"]
     stand_in, field_table, asked, fields = blender_lenses.shader_of, blender_lenses.field_table, [], []

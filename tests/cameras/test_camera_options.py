@@ -7,6 +7,7 @@ import lens_models
 import numpy as np
 import pytest
 from camera_helpers import GAUSS, ROOT
+from shipped import whole
 
 from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
@@ -78,7 +79,7 @@ def sample(camera: Camera, point: tuple[float, float], count: int = 40_000) -> t
     return out.status, out.weight
 
 
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", ["five", *whole("curved", "star")])
 @pytest.mark.parametrize("point", [(0.0, 0.0), (8.0, -5.0)])
 def test_exact_lens_and_model_pass_the_same_share(name: str, point: tuple[float, float]) -> None:
     shape, shares = SHAPES[name], {}
@@ -122,6 +123,7 @@ def test_a_shot_shapes_every_camera_but_a_point() -> None:
         make_camera("pinhole", shot)
 
 
+@pytest.mark.whole  # trace/test_states.py has the lenses, test_state_surrogates the cameras
 def test_a_shot_zooms_and_focuses_inside() -> None:
     zoom = lens_models.LENSES / "nikon_zoom_70_200.toml"
     near = make_camera(zoom, Shot(FILM, 3.0, zoom=100.0, focus_mode="internal"))

@@ -11,6 +11,7 @@ from typing import Any
 import lens_models
 import numpy as np
 import pytest
+from shipped import whole
 
 from neurolens.base import status as st
 from neurolens.base.errors import InputError
@@ -132,7 +133,7 @@ def test_arrays_of_other_layouts_and_shapes() -> None:
             fused.sample(*bad)
 
 
-@pytest.mark.parametrize("aperture", [Aperture(blades=5, rotation_deg=20), Aperture(mask=BAND)])
+@pytest.mark.parametrize("aperture", [Aperture(mask=BAND), *whole(Aperture(blades=5, rotation_deg=20))])
 def test_blades_and_masks(aperture: Aperture) -> None:
     plain, fused = pair(5.6, aperture)
     given = numbers(20_000, seed=3)
@@ -184,10 +185,10 @@ def absorbing(design: str = "") -> Lens:
 @pytest.mark.parametrize(
     ("lens", "film_mm", "runtime"),
     [
-        (absorbing(), FILM, "c"),
+        pytest.param(absorbing(), FILM, "c", marks=pytest.mark.whole),
         (absorbing("three-layer"), FILM, "c"),
-        (lens_models.lens("canon_aspheric_50"), (20.0, 14.0), "c"),
-        (lens_models.lens("schneider_anamorphic_31"), (20.0, 14.0), "c"),
+        pytest.param(lens_models.lens("canon_aspheric_50"), (20.0, 14.0), "c", marks=pytest.mark.whole),
+        pytest.param(lens_models.lens("schneider_anamorphic_31"), (20.0, 14.0), "c", marks=pytest.mark.whole),
         (lens_models.lens("cooke_triplet_50"), FILM, "onnxruntime"),
     ],
     ids=["bare", "coated", "aspheres", "cylinders", "onnxruntime"],
@@ -216,7 +217,7 @@ def test_rays_that_are_lost_on_their_way_stay_finite() -> None:
     assert all(np.isfinite(a).all() for a in numbers) and (found.weight > 0).tolist() == [False, False, True]
 
 
-@pytest.mark.parametrize("length", [0.0, 1.01, math.nan])
+@pytest.mark.parametrize("length", [1.01, *whole(0.0, math.nan)])
 def test_directions_of_another_length_pass_nothing(length: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a poor network makes of a few rays, here of those of half the film."""
 

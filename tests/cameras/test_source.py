@@ -13,6 +13,7 @@ import torch
 from camera_helpers import film_rays
 from command_line import failure
 from numpy.typing import ArrayLike, NDArray
+from shipped import whole
 
 from neurolens.base import status as st
 from neurolens.cameras.build import make_camera
@@ -68,7 +69,7 @@ def test_a_camera_as_source_gives_its_own_rays(kind: str) -> None:
         assert np.abs(slopes - moves.direction.reshape(6, -1))[:, both].max() < 1e-5
 
 
-@pytest.mark.parametrize("name", ["laikin_double_gauss_50", "phone_lens_6"])
+@pytest.mark.parametrize("name", ["laikin_double_gauss_50", *whole("phone_lens_6")])
 def test_the_film_of_a_focus_and_stop_is_that_of_best_focus(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of an exact lens, within the error that is told; it rises as objects come nearer, and stays beyond the ends."""
     monkeypatch.setattr(focusing, "_RINGS", 96)  # rays of best focus, for the function as for what it is held to
@@ -147,6 +148,7 @@ def test_the_exact_lens_as_a_function(tmp_path: Path, monkeypatch: pytest.Monkey
     np.testing.assert_allclose(found[4][passed], wanted.transmittance[passed], rtol=1e-4)
 
 
+@pytest.mark.whole  # as of a model
 def test_the_zoom_of_an_exact_lens_is_an_argument() -> None:
     """Between the source's positions: rays of the tracer through the lens zoomed there."""
     lens = read_lens(LENS.with_name("nikon_zoom_70_200.toml"))
@@ -180,13 +182,14 @@ def run_compiled(language: str, source: str, folder: Path, given: str = "", *arg
     compiler = shutil.which("c++" if language == "c++" else "cc")
     if compiler is None:
         pytest.skip("no compiler of C++ or C")
-    flags = ["-O1", "-Wall", "-Wextra", "-Werror", "-x", language, "-", "-o", str(folder / "a.out"), "-lm"]
+    flags = ["-O0", "-Wall", "-Wextra", "-Werror", "-x", language, "-", "-o", str(folder / "a.out"), "-lm"]
     done = subprocess.run([compiler, f"-I{folder}", *flags], input=source, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     command = [str(folder / "a.out"), *arguments]
     return subprocess.run(command, input=given.encode(), capture_output=True, check=True).stdout.decode("latin-1")
 
 
+@pytest.mark.whole  # the rays of a written camera are above
 def test_an_integrator_in_c_plus_plus_sees_what_the_camera_sees(tmp_path: Path) -> None:
     """Its picture of three spheres, pixel by pixel, against rays of the camera and the same spheres in numpy."""
     file, width, height, samples = lens_models.exported("invariants"), 48, 32, 4

@@ -172,6 +172,7 @@ def test_rays_meet_where_the_lens_is_focused() -> None:
     assert float(focus.grad) == pytest.approx(1.0, rel=0.05)
 
 
+@pytest.mark.whole  # another lens
 def test_a_zoom_narrows_the_field() -> None:
     """The slope of chief rays goes with 1 / focal length."""
     camera = camera_of(RANGE, Shot(FILM, math.inf, zoom=100.0, f_number=8.0))

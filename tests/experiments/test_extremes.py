@@ -33,6 +33,7 @@ def test_no_nan_and_no_status_that_depends_on_the_precision(case: cases.Case) ->
     assert row.exact_mm < 1e-11
 
 
+@pytest.mark.whole
 def test_the_whole_library_once() -> None:
     rows = [measure(c, exact_rays=2) for c in cases.library(60)]
     assert len(rows) >= 2 * len(PATHS)

@@ -1,5 +1,8 @@
 """Each aberration of the gallery is measured as theory has it, a surrogate shows it as the exact lens does, and a thin
 lens does not.
+
+
+The effects that tests of the analysis know from closed forms as well run with NEUROLENS_WHOLE=1.
 """
 
 import math
@@ -51,6 +54,7 @@ def test_spherical_aberration_of_a_closed_singlet_is_third_order() -> None:
     assert spot(camera, (0.0, 0.0), 2.0, LINE_D_NM).widths_um == pytest.approx((expected, expected), rel=0.05)
 
 
+@pytest.mark.whole
 def test_core_and_rim_of_a_light_change_places_through_focus() -> None:
     effect = read_effect(GALLERY / "spherical-aberration.toml")
     found = {}
@@ -88,6 +92,7 @@ def test_comets_point_as_the_seidel_sum_says_and_as_the_surrogate_says(lens: str
     assert abs(found["thin"]["tail_um"]) < 0.01
 
 
+@pytest.mark.whole
 def test_widened_lenses_draw_comets_inward_and_outward() -> None:
     tails = {}
     for panel in read_effect(GALLERY / "coma.toml").panel:
@@ -97,6 +102,7 @@ def test_widened_lenses_draw_comets_inward_and_outward() -> None:
     assert tails["itoh_zoom_100_146"] > 100
 
 
+@pytest.mark.whole
 def test_rims_and_spokes_are_sharp_where_close_rays_meet() -> None:
     # The square of a spot's width is a parabola in the film's place; its vertex is the focus of that meridian.
     widths = {}
@@ -115,6 +121,7 @@ def test_rims_and_spokes_are_sharp_where_close_rays_meet() -> None:
         assert vertex == pytest.approx(float(np.interp(10.0, foci.height_mm, focus_mm)), abs=0.1)
 
 
+@pytest.mark.whole
 def test_the_field_of_a_singlet_is_curved_and_less_so_at_a_longer_focal_length() -> None:
     found = {}
     for focal in (50.0, 100.0):
@@ -139,6 +146,7 @@ def test_lines_bow_outward_behind_a_singlet_as_its_distortion_says() -> None:
     assert abs(found["thin"]["bow_um"]) < 0.05
 
 
+@pytest.mark.whole
 def test_lines_bow_inward_in_a_fisheye_and_its_surrogate() -> None:
     taken = shot("muller_fisheye_100", focal_length_mm=14, focus_m=2.0, f_number=16.0, model="-14mm.ols-100",
                  options={"x_mm": 12.0, "y_mm": 8.0})  # fmt: skip
@@ -148,6 +156,7 @@ def test_lines_bow_inward_in_a_fisheye_and_its_surrogate() -> None:
     assert abs(found["thin"]["bow_um"]) < 0.05
 
 
+@pytest.mark.whole
 def test_red_and_blue_fringes_change_sides_with_the_film() -> None:
     found = {}
     for offset in (-2.0, 2.0):
@@ -168,6 +177,7 @@ def test_red_and_blue_fringes_change_sides_with_the_film() -> None:
         assert found[offset]["exact"]["red_minus_blue_um"] == pytest.approx(expected, rel=0.1)
 
 
+@pytest.mark.whole
 def test_red_is_drawn_where_chief_rays_bring_it_at_the_edge_of_a_fisheye() -> None:
     taken = shot("horimoto_fisheye_16", focus_m=3.0, f_number=16.0, film_mm=(40.0, 6.0), model=".mlp-16x2",
                  options={"x_mm": 17.0, "y_mm": 0.0, "depth_m": 1.0}, wavelengths_nm=(450.0, 650.0))  # fmt: skip

@@ -77,6 +77,7 @@ def test_every_effect_reads_and_its_thin_lens_measures(name: str) -> None:
         assert found.get(key, value) == pytest.approx(value, rel=0.01, abs=0.2)
 
 
+@pytest.mark.whole
 def test_light_falls_off_faster_the_wider_the_stop() -> None:
     """A Tessar: rims alone at f/1, stop and rims at f/4, at f/8 the cosine law of its exit pupil and no more."""
     wide, four = (relative(camera("brendel_tessar_100.toml", n, MEDIUM, 10.0), 41.0)[-1] for n in (1.0, 4.0))
@@ -125,6 +126,7 @@ def paraxial_blur_mm(lens: Lens, distance_m: float, wavelength_nm: float = 550.0
     return float(data.entrance_pupil_diameter_mm) * magnification * abs(to_light - to_focus) / to_light
 
 
+@pytest.mark.whole  # test_two_stops_halve_the_blur is of its physics
 def test_blur_of_near_and_far_signs_is_first_order_when_stopped_down() -> None:
     efl_mm = 75.0
     lens = set_lens(
@@ -148,6 +150,7 @@ def test_blur_of_near_and_far_signs_is_first_order_when_stopped_down() -> None:
     assert ratio == pytest.approx(scale(thin, 1.0) / scale(thin, 2.0), rel=0.01)
 
 
+@pytest.mark.whole  # cameras/test_ideal.py frames them
 @pytest.mark.parametrize(("name", "panel"), [("depth-of-field", 5), ("series-focal-length", 0), ("pinhole", 0)])
 def test_the_ideal_cameras_of_a_panel_are_framed_as_its_lens(name: str, panel: int) -> None:
     """What is in focus has one size in all columns."""
@@ -159,6 +162,7 @@ def test_the_ideal_cameras_of_a_panel_are_framed_as_its_lens(name: str, panel: i
     assert hole.settings["efl_mm"] == pytest.approx(thin.image_distance_mm, rel=1e-9)
 
 
+@pytest.mark.whole
 def test_open_blur_of_lens_and_surrogate_agree_and_leave_first_order() -> None:
     """A shipped model, focused at 1.5 m: wide open its blur in focus is what the thin lens does not have."""
     film = (24.0, 16.0)
@@ -189,6 +193,7 @@ def test_a_pinhole_draws_itself_on_every_point() -> None:
     assert blur_mm(Pinhole(36.0), 0.5) == 0
 
 
+@pytest.mark.whole
 def test_fisheyes_bend_the_room_as_the_equisolid_projection() -> None:
     model = load_model(ROOT / "models" / "horimoto_fisheye_16.mlp-16x2.onnx")
     film = (36.4, 24.2667)

@@ -120,6 +120,7 @@ def test_a_lens_that_cannot_be_done_is_said_and_the_others_go_on(
     assert json.loads((tmp_path / "index.json").read_text())["left_out"] == {}
 
 
+@pytest.mark.whole  # a command of its own
 @pytest.mark.slow
 def test_an_entry_is_fitted_checked_and_timed(tmp_path: Path) -> None:
     (tmp_path / "list.toml").write_text(

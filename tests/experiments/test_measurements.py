@@ -9,6 +9,7 @@ import lens_models
 import numpy as np
 import pytest
 import torch
+from shipped import whole
 
 from experiments import lab
 from experiments import pupils as passage
@@ -46,7 +47,7 @@ def test_rows_of_an_earlier_run_are_kept_or_refused(tmp_path: Path) -> None:
             kept()
 
 
-@pytest.mark.parametrize("name", ["vignetting", "inverse", "zoom"])
+@pytest.mark.parametrize("name", ["inverse", "zoom", *whole("vignetting")])
 def test_results_of_another_kind_are_not_written_over(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -133,7 +134,7 @@ def measured(lens: str, f_number: float) -> lab.Row:
 
 
 @pytest.mark.parametrize(
-    ("lens", "f_number", "goal"), [("muller_fisheye_100", 5.6, 0.97), ("brendel_tessar_100", 4.0, 0.99)]
+    ("lens", "f_number", "goal"), [("muller_fisheye_100", 5.6, 0.97), *whole(("brendel_tessar_100", 4.0, 0.99))]
 )
 def test_ours_passes_most_and_loses_nothing(lens: str, f_number: float, goal: float) -> None:
     found = measured(lens, f_number)

@@ -75,6 +75,7 @@ def test_a_quick_run_has_a_row_of_every_method() -> None:
     assert len(quick) < 15 and {r.settings.method for r in quick} == {r.settings.method for r in chosen_rows([])}
 
 
+@pytest.mark.whole
 def test_one_record_a_method_with_every_figure(made: Path) -> None:
     found = records_of(made)
     assert found["thick"]["rms_um"] > 2 * found["ols-12"]["rms_um"] > 4 * found["ols-24"]["rms_um"] > 0

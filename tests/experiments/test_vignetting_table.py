@@ -24,6 +24,10 @@ from neurolens.surrogates.pairs import PairSettings, make_pairs
 LENSES = Path(__file__).parents[2] / "lenses"
 
 
+# A command of its own; stops of one fit are held against the lens in surrogates/test_polynomial.py.
+pytestmark = pytest.mark.whole
+
+
 @pytest.fixture(scope="module")
 def fisheye() -> LensModel:
     """A circular fisheye, whose film is dark beyond a circle."""

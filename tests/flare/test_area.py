@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from shipped import whole
 
 from neurolens.flare.areas import draw_edges, edges_of
 from neurolens.flare.canvas import Raster
@@ -136,7 +137,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize(("case", "distance_m"), [*((case, math.inf) for case in CASES), ("open", 0.6)])
+@pytest.mark.parametrize(
+    ("case", "distance_m"), [("blades", math.inf), ("open", 0.6), *whole(("open", math.inf), ("phone", math.inf))]
+)
 def test_ghosts_have_the_light_of_their_rays(case: str, distance_m: float) -> None:
     """Every ghost that counts: grid and low-discrepancy rays agree in the light that falls on the film."""
     lens, light = CASES[case](), Light(11.0, -6.0, distance_m=distance_m)
@@ -164,11 +167,11 @@ def test_ghosts_have_the_light_of_their_rays(case: str, distance_m: float) -> No
 
 
 def test_any_number_of_threads_and_layers_is_one_picture() -> None:
-    lens, light = lens_of("laikin_double_gauss_50"), [Light(15.0, 8.0), Light(-4.0, 2.0, (0.1, 0.5, 0.2))]
+    lens, light = lens_of("cooke_triplet_50"), [Light(15.0, 8.0), Light(-4.0, 2.0, (0.1, 0.5, 0.2))]
     tracer, raster = GhostTracer(lens), Raster((36.0, 24.0), 48, 32)
     one = ghost_picture(tracer, light, raster, wavelengths=4, threads=1)
     assert np.array_equal(ghost_picture(tracer, light, raster, wavelengths=4, threads=3), one)
-    several = ghost_picture(tracer, light, raster, wavelengths=4, layers=[k % 3 for k in range(66)])
+    several = ghost_picture(tracer, light, raster, wavelengths=4, layers=[k % 3 for k in range(15)])
     np.testing.assert_allclose(several.sum(0), one[0], rtol=1e-4, atol=1e-7)
 
 
@@ -211,14 +214,17 @@ def test_a_ghost_that_a_rim_cuts_by_colour_has_no_bands() -> None:
     assert np.abs(np.diff(picture[5], axis=0)).max() < 1.5 * np.abs(np.diff(fine[5], axis=0)).max()
 
 
-@pytest.mark.parametrize("coating", ["bare", "multi-layer"])
-def test_a_picture_of_all_ghosts_has_no_bands(coating: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "coating"),
+    [("cooke_triplet_50", "multi-layer"), *whole(*(("tajima_retrofocus_24", c) for c in ("bare", "multi-layer")))],
+)
+def test_a_picture_of_all_ghosts_has_no_bands(name: str, coating: str) -> None:
     """Ghosts that are seen beside the others get the wavelengths that they need; faint ones keep few.
 
-    With four wavelengths for every ghost one pixel in twenty is off by 26% of its own value where the lens is bare,
-    and by 34% where a coating reflects other shares of light at the wavelengths that a traced one stands for.
+    With four wavelengths for every ghost one pixel in twenty is off by 26% of its own value where the retrofocus is
+    bare, and by 34% where a coating reflects other shares of light at the wavelengths that a traced one stands for.
     """
-    lens = lens_of("tajima_retrofocus_24", f_number=8.0).with_aperture(Aperture(blades=6))
+    lens = lens_of(name, f_number=8.0).with_aperture(Aperture(blades=6))
     lens = coated(lens, coating)
     tracer, raster, light = GhostTracer(lens), Raster((36.0, 24.0), 180, 120), Light(13.7, 10.0)
     picture = ghost_picture(tracer, [light], raster, wavelengths=16)[0]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from path_difference import opd_mm
+from shipped import whole
 
 from experiments.starburst import light_of, streaks
 from neurolens.analysis.bundles import bundle
@@ -83,7 +84,7 @@ def test_wavefront_is_the_path_of_rays() -> None:
     assert np.ptp(found) > NM * 1e-6 / 10
 
 
-@pytest.mark.parametrize("light", [AXIS, Light(9.0, 12.0), Light(-10.0, 5.0, distance_m=2.0)])
+@pytest.mark.parametrize("light", [Light(-10.0, 5.0, distance_m=2.0), *whole(AXIS, Light(9.0, 12.0))])
 def test_light_of_the_pupil_is_that_of_rays(light: Light) -> None:
     lens = double_gauss(1.8, Aperture(blades=7))
     rays, area = light_rays(lens, light, 0, 1 << 17)
@@ -124,7 +125,7 @@ def test_polygons_near_and_far() -> None:
         assert mean == pytest.approx(expected_mean, rel=0.03, abs=6e-5 * streak)
 
 
-@pytest.mark.parametrize(("blades", "expected"), [(5, 10), (6, 6), (7, 14), (8, 8)])
+@pytest.mark.parametrize(("blades", "expected"), [(5, 10), (6, 6), *whole((7, 14), (8, 8))])
 def test_streaks(blades: int, expected: int) -> None:
     """2 n of an odd number of blades, n of an even one."""
     pupil, lines = made(16.0, Aperture(blades=blades, rotation_deg=7.0))
@@ -147,7 +148,7 @@ def test_slit() -> None:
     assert found.max() == pytest.approx(light_of(pupil, lines) / np.prod(fringe), rel=5e-3)
 
 
-@pytest.mark.parametrize("waves", [0.25, 0.5, 1.0, 1.5])
+@pytest.mark.parametrize("waves", [0.5, *whole(0.25, 1.0, 1.5)])
 def test_strehl_of_defocus(waves: float) -> None:
     """Defocus of W waves at the edge leaves sinc^2(W) of the peak."""
     pupil, lines = made(16.0)
@@ -223,7 +224,7 @@ def test_no_seam_and_no_light_lost() -> None:
 
 
 @pytest.mark.parametrize(
-    ("aperture", "light"), [(None, AXIS), (Aperture(blades=6), AXIS), (Aperture(blades=5), Light(0.0, 10.0))]
+    ("aperture", "light"), [(None, AXIS), (Aperture(blades=5), Light(0.0, 10.0)), *whole((Aperture(blades=6), AXIS))]
 )
 def test_star_out_of_focus(aperture: Aperture | None, light: Light) -> None:
     """1 mm out of focus at f/8: in rings, as bright as the sum over cells from the image on; no light is lost."""
@@ -247,7 +248,7 @@ def test_star_out_of_focus(aperture: Aperture | None, light: Light) -> None:
         assert np.abs(film - expected)[outside].sum() < 0.03 * expected[outside].sum()
 
 
-@pytest.mark.parametrize(("shift_mm", "rel"), [(0.0, 0.02), (1.0, 0.05)])
+@pytest.mark.parametrize(("shift_mm", "rel"), whole((0.0, 0.02), (1.0, 0.05)))
 def test_ends_of_the_range(shift_mm: float, rel: float) -> None:
     """At 400 and 700 nm rings are as bright as the sum over cells at that wavelength, in focus and 1 mm out of it; in
     focus, far from the centre, as bright as Airy's: 2 F_number lambda / (pi^2 r^2) of the light beyond r."""
@@ -279,8 +280,8 @@ def test_ends_of_the_range(shift_mm: float, rel: float) -> None:
 def test_picture_is_in_units_of_a_white_card() -> None:
     """The layer's sum is the light of the star over the card's; nothing is negative at one wavelength's grey."""
     lens, raster = double_gauss(22.0, Aperture(blades=6)), Raster((12.0, 8.0), 96, 64)
-    light = Light(3.0, 1.0, (2.0, 2.0, 2.0))
-    picture = d.starburst_picture(lens, [light], raster, wavelength_nm=(NM, NM), wavelengths=1)
+    light, more = (Light(3.0, 1.0, (rgb,) * 3) for rgb in (0.5, 1.5))  # their layers add up
+    picture = d.starburst_picture(lens, [light, more], raster, wavelength_nm=(NM, NM), wavelengths=1)
     assert picture.shape == (64, 96, 3) and picture.min() >= 0
     pupil = p.exit_pupil(lens, light, NM)
     assert pupil is not None
@@ -294,8 +295,6 @@ def test_picture_is_in_units_of_a_white_card() -> None:
     # The light stands to the right and above.
     assert brightest[1] == pytest.approx(48 + 8 * 49.6 * math.tan(math.radians(3)), abs=3)
     assert brightest[0] == pytest.approx(32 - 8 * 49.6 * math.tan(math.radians(1)), abs=3)
-    twice = d.starburst_picture(lens, [light, light], raster, wavelength_nm=(NM, NM), wavelengths=1, threads=1)
-    np.testing.assert_allclose(twice, 2 * picture, rtol=1e-5)
 
 
 def corner_mask() -> Aperture:
@@ -309,13 +308,15 @@ def corner_mask() -> Aperture:
     ("lens", "light", "lit"),
     [
         (lambda: double_gauss(45.0, Aperture(blades=9, curvature=1.0)), Light(5.0, 0.0), True),
-        (lambda: lens_of("edmund_asphere_30"), Light(1.0, 1.0), True),
-        (lambda: double_gauss(8.0, Aperture(blades=5)), Light(21.5, 0.0), True),  # off the frame
-        (lambda: lens_of("schneider_anamorphic_31"), Light(5.0, 3.0), True),
         (lambda: lens_of("shimizu_fisheye_220"), Light(70.0, 20.0), True),
         (lambda: double_gauss(2.0), Light(80.0, 0.0), False),
         (lambda: double_gauss(1.8, corner_mask()), Light(0.0, 20.0), False),
         (plate, Light(5.0, 0.0), False),
+        *whole(
+            (lambda: lens_of("edmund_asphere_30"), Light(1.0, 1.0), True),
+            (lambda: double_gauss(8.0, Aperture(blades=5)), Light(21.5, 0.0), True),  # off the frame
+            (lambda: lens_of("schneider_anamorphic_31"), Light(5.0, 3.0), True),
+        ),
     ],
 )
 def test_extremes(lens: Callable[[], Lens], light: Light, lit: bool) -> None:

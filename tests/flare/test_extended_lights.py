@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import uniform_filter, uniform_filter1d
 from scipy.stats import qmc
+from shipped import whole
 
 from neurolens.flare.canvas import Raster, Smear
 from neurolens.flare.diffraction import starburst_picture
@@ -78,7 +79,7 @@ def test_ghosts_of_a_disc_are_the_integral_over_it() -> None:
     tracer, raster = brightest(lens, light, 14), Raster((36.0, 24.0), 120, 80)
 
     def light_of(lights: list[Light]) -> np.ndarray:
-        return ghost_picture(tracer, lights, raster, wavelengths=2, threads=1)[0].sum(-1)
+        return ghost_picture(tracer, lights, raster, wavelengths=1, threads=1)[0].sum(-1)
 
     right = light_of(points_of(light, 2 * math.tan(math.radians(1.5)) * sides_across(light.towards), 7, True))
     disc, point = light_of([with_disc(light, 3.0)]), light_of([light])
@@ -87,6 +88,7 @@ def test_ghosts_of_a_disc_are_the_integral_over_it() -> None:
     assert off < 0.03 and off_of_point > 0.1
 
 
+@pytest.mark.whole
 @pytest.mark.skipif(not CASE.is_file(), reason=f"{CASE} is not there")
 def test_a_softbox_is_no_lattice_of_points() -> None:
     """The case's softbox, 11.5 by 7.8 degrees: ghosts as by 16 x 16 points, 2.4% of their light
@@ -140,9 +142,10 @@ def ghost_by_chance(lens: Lens, light: Light, pair: Pair, raster: Raster, count:
     return film
 
 
+@pytest.mark.whole  # the same oracle holds the patches of a large ghost below
 @pytest.mark.slow
 @pytest.mark.skipif(not CASE.is_file(), reason=f"{CASE} is not there")
-@pytest.mark.parametrize(("name", "most"), [("g11-09", 0.03), ("g12-08", 0.02)])
+@pytest.mark.parametrize(("name", "most"), [("g12-08", 0.02), *whole(("g11-09", 0.03))])
 def test_ghosts_in_focus_show_no_seams(name: str, most: float) -> None:
     """The case's softbox in the two ghosts that it draws sharply, a point as 0.15 and 0.17 mm: the means of columns and
     of rows, held against rays at random, have no lines; patches that ended at their cells' edges made some of 5%."""
@@ -189,7 +192,7 @@ def _falling(row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def test_stars_hold_no_negative_light() -> None:
     """Fringes of a point's star are of nearly one wavelength, beyond the gamut of sRGB, as a violet light is."""
     lens, raster = hexagonal("tajima_retrofocus_24"), Raster((4.5, 3.0), 60, 40)
-    lights = [Light(0.0, 0.0), Light(2.0, 1.0, (0.1, 0.0, 1.0)), with_disc(Light(-2.0, 1.0), 0.533)]
+    lights = [Light(2.0, 1.0, (0.1, 0.0, 1.0)), with_disc(Light(-2.0, 1.0), 0.533)]
     star = starburst_picture(lens, lights, raster, wavelengths=5, threads=1)
     assert star.min() >= 0 and (star.sum(-1) > 0).all()
 
@@ -211,7 +214,7 @@ def test_photons_of_a_disc_come_from_all_of_it() -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not CASE.is_file(), reason=f"{CASE} is not there")
-@pytest.mark.parametrize("name", ["g02-00", "g12-04"])
+@pytest.mark.parametrize("name", ["g02-00", *whole("g12-04")])
 def test_ghosts_that_rims_cut_have_fine_patches(name: str) -> None:
     """The case's softbox in its brightest ghost, which fills the film, and in a small one: rims cut both differently
     for each part of the light. Held against rays at random, whose noise is 2%, over squares of 2.5 mm: 19 of 20 places

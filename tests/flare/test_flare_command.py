@@ -2,6 +2,8 @@
 
 import json
 import math
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,9 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from neurolens.cli import main
+from neurolens.cameras.build import make_camera
+from neurolens.cameras.field import field_of
+from neurolens.cli import flare_run, main
 from neurolens.flare.canvas import Raster
 from neurolens.flare.diffraction import starburst_picture
 from neurolens.flare.ghosts import GhostTracer, coated
@@ -21,7 +25,6 @@ from neurolens.render.colour import ACESCG, COLOUR_SPACES, SRGB, conversion
 from neurolens.render.pictures import read_colour_space, read_exr, read_layers, write_channels, write_exr
 from neurolens.setting.states import set_lens
 
-GAUSS = ["flare", "laikin_double_gauss_50", "--light", "15,8", "--coating", "quarter-wave"]
 COOKE = ["flare", "cooke_triplet_50", "--width", "36", "--bins", "2"]
 
 
@@ -38,10 +41,10 @@ def test_table_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     said = capsys.readouterr().out
     assert "66 pairs" in said and "g12-11" in said
     drawn = tmp_path / "path.svg"
-    assert main(["flare", "laikin_double_gauss_50", "--light", "15,8", "--path", "g08-06", str(drawn)]) == 0
+    assert main(["flare", "cooke_triplet_50", "--light", "15,8", "--path", "g05-03", str(drawn)]) == 0
     assert drawn.read_text().startswith("<?xml")
     capsys.readouterr()
-    small = ["--width", "48", "--cell", "20", "--bins", "3", "--layers", "2", "--json"]
+    small = ["--width", "48", "--cell", "20", "--bins", "1", "--layers", "2", "--json"]
     assert main(["flare", "laikin_double_gauss_50", "--light", "15,8,0.5/0.4/0.3", "-o", str(out), *small]) == 0
     told = json.loads(capsys.readouterr().out)
     rgb, metadata = read_exr(out)
@@ -58,11 +61,22 @@ def test_table_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     np.testing.assert_allclose(sum(layers[f"{name}.R"] for name in (*top, "rest")), rgb[..., 0], rtol=1e-5, atol=1e-9)
 
 
+@pytest.fixture(autouse=True, scope="module")
+def seen_once() -> Iterator[None]:
+    """The directions that a plate's film sees are sought once for a lens and its state: they take a second."""
+    camera = cache(make_camera)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(flare_run, "make_camera", lambda file, shot, _: camera(file, shot))
+        patch.setattr(flare_run, "field_of", cache(field_of))
+        yield
+
+
+@pytest.mark.whole  # test_ghosts holds every ghost against photons
 def test_photons_paint_the_ghosts(tmp_path: Path) -> None:
     """The light of photons with two reflections at most is that of the ghosts, block by block, within its noise."""
     common = ["laikin_double_gauss_50", "--light", "12,5", "--width", "24", "--bins", "2", "--quiet"]
     blocks = []
-    for words in (["--cell", "2"], ["--photons", "400000", "--reflections", "2", "--kernel", "0"]):
+    for words in (["--cell", "2"], ["--photons", "200000", "--reflections", "2", "--kernel", "0"]):
         out = tmp_path / "one.exr"
         assert main(["flare", *common, *words, "-o", str(out)]) == 0
         blocks.append(read_exr(out)[0][..., 1].reshape(2, 8, 3, 8).sum((1, 3)))
@@ -72,11 +86,11 @@ def test_photons_paint_the_ghosts(tmp_path: Path) -> None:
 def test_starburst_is_a_layer(tmp_path: Path) -> None:
     """What the module makes, added to the ghosts under its gain."""
     out = tmp_path / "star.exr"
-    words = ["laikin_double_gauss_50", "--light", "4,2,3", "--f-number", "11", "--blades", "5", "--width", "48"]
+    words = ["cooke_triplet_50", "--light", "4,2,3", "--f-number", "11", "--blades", "5", "--width", "48"]
     few = ["--bins", "2", "--cell", "20", "--quiet", "--starburst", "--gain", "starburst=2"]
     assert main(["flare", *words, *few, "-o", str(out)]) == 0
     layers, rgb = read_layers(out), read_exr(out)[0]
-    lens = read_lens("lenses/laikin_double_gauss_50.toml").with_aperture(Aperture(blades=5))
+    lens = read_lens("lenses/cooke_triplet_50.toml").with_aperture(Aperture(blades=5))
     lens = set_lens(lens, f_number=11.0, focus_m=math.inf, focus_mode="best")
     alone = starburst_picture(lens, [Light(4.0, 2.0, (3.0, 3.0, 3.0))], Raster((36, 24), 48, 32), wavelengths=2)
     np.testing.assert_allclose(layers["starburst.G"], 2 * alone[..., 1], rtol=1e-4, atol=1e-6 * alone.max())
@@ -89,18 +103,18 @@ SMALL = ["cooke_triplet_50", "--width", "36", "--cell", "4", "--bins", "2", "--q
 def test_frames_go_on_and_do_not_pop(tmp_path: Path) -> None:
     """A light that crosses: the energy changes evenly; frames that are there are kept, one that is not comes back."""
     lights, out = tmp_path / "lights.csv", tmp_path / "a.exr"
-    lights.write_text("light,frame,azimuth_deg,elevation_deg\nsun,1,-6,14\nsun,5,6,14.4\n")
-    words = ["flare", *SMALL, "--lights", str(lights), "--frames", "1:5", "--layers", "2", "-o", str(out)]
+    lights.write_text("light,frame,azimuth_deg,elevation_deg\nsun,1,-3,14\nsun,3,3,14.2\n")
+    words = ["flare", *SMALL, "--lights", str(lights), "--frames", "1:3", "--layers", "2", "-o", str(out)]
     assert main(words) == 0
-    files = [tmp_path / f"a.{frame:04d}.exr" for frame in range(1, 6)]
+    files = [tmp_path / f"a.{frame:04d}.exr" for frame in range(1, 4)]
     assert sorted(tmp_path.glob("*.exr")) == files
     energy = np.array([read_exr(file)[0][..., 1].sum() for file in files])
     assert np.abs(np.diff(energy)).max() < 0.1 * energy.mean()
     assert len({tuple(sorted(read_layers(file))) for file in files}) == 1
-    kept, before = files[1].stat().st_mtime_ns, files[3].read_bytes()
-    files[3].unlink()
+    kept, before = files[1].stat().st_mtime_ns, files[2].read_bytes()
+    files[2].unlink()
     assert main(words) == 0
-    assert files[1].stat().st_mtime_ns == kept and files[3].read_bytes() == before
+    assert files[1].stat().st_mtime_ns == kept and files[2].read_bytes() == before
 
 
 def test_noise_is_that_of_the_seed_in_every_frame(tmp_path: Path) -> None:
@@ -232,28 +246,28 @@ def test_rendered_frames_have_the_same_lights_and_layers(tmp_path: Path) -> None
     text = (
         text.replace('colour_space = "ACEScg"', "")
         .replace('white_balance = "2900 K"', "")
-        .replace("bins = 3", "bins = 2")
+        .replace("bins = 3", "bins = 1")
     )
     text = text.replace("[2.0, 1.0, 0.5]", "[3.0, 0.0, 0.0]").replace("brightest = 2", "brightest = 3")
-    scene.write_text(text + "most = 1\ncell_px = 24.0\n")
+    scene.write_text(text + "most = 1\ncell_px = 64.0\n")
     words = ["render", str(scene), "--camera", "lenses/cooke_triplet_50.toml", "--layers", "beauty", "--quiet"]
     keys = [
         "--key",
-        "look-at=1:-0.3/1.3/0,3:0.5/1/0",
+        "look-at=1:-0.3/1.3/0,2:0.5/1/0",
         "--key",
-        "position=1:-0.3/1.3/2,3:0.5/1/2",
+        "position=1:-0.3/1.3/2,2:0.5/1/2",
         "--key",
-        "focus=1:2,3:1",
+        "focus=1:2,2:1",
     ]
     names, red = [], []
-    for frame in ("1:1", "3:3", "1:3"):
+    for frame in ("1:1", "2:2", "1:2"):
         assert main([*words, *keys, "--frames", frame, "-o", str(out), "--restart"]) == 0
         found = [read_layers(file) for file in sorted(tmp_path.glob("a.*.exr"))]
         names.append([sorted(layers) for layers in found])
         red.append([layers["ghosts.R"].sum() > layers["ghosts.B"].sum() for layers in found])
         for file in tmp_path.glob("a.*"):
             file.unlink()
-    assert names[2][0] == names[2][1] == names[2][2] and len(names[2][0]) == 15
+    assert names[2][0] == names[2][1] and len(names[2][0]) == 15
     assert red[0] == [True] and red[1] == [False] and len(set(red[2])) == 1
     assert names[0][0] != names[1][0]  # so the choice matters
 
@@ -321,20 +335,21 @@ def test_numbers_have_bounds(option: str, value: str, capsys: pytest.CaptureFixt
 
 
 def test_layers_are_the_ghosts_with_the_greatest_peaks_on_the_film(tmp_path: Path) -> None:
-    """Of the README's case: each ghost's own picture beside the layers, with the light of the sun that is meant."""
-    out, raster = tmp_path / "flare.exr", Raster((36.0, 24.0), 60, 40)
-    assert main([*GAUSS, "--layers", "8", "--width", "60", "-o", str(out)]) == 0
-    lens = set_lens(read_lens("lenses/laikin_double_gauss_50.toml"), focus_m=math.inf, focus_mode="best")
+    """Each ghost's own picture beside the layers, with the light of the sun that is meant."""
+    out, raster = tmp_path / "flare.exr", Raster((36.0, 24.0), 36, 24)
+    words = ["--light", "-10,5", "--coating", "quarter-wave", "--layers", "12", "-o", str(out)]
+    assert main([*COOKE[:-2], *words]) == 0
+    lens = set_lens(read_lens("lenses/cooke_triplet_50.toml"), focus_m=math.inf, focus_mode="best")
     tracer = GhostTracer(coated(lens, "quarter-wave"))
-    sun = with_disc(Light(15, 8, (math.pi,) * 3), 0.533)
+    sun = with_disc(Light(-10, 5, (math.pi,) * 3), 0.533)
     each = ghost_picture(tracer, [sun], raster, layers=range(len(tracer.pairs)))
     order = np.argsort(-each.max((1, 2, 3)))
     found = layers_of(out)
-    assert set(found) == {"ghosts", "rest", *(tracer.pairs[k].name for k in order[:8])}
-    for k in order[:8]:
+    assert set(found) == {"ghosts", "rest", *(tracer.pairs[k].name for k in order[:12])}
+    for k in order[:12]:
         np.testing.assert_allclose(found[tracer.pairs[k].name], each[k], rtol=1e-4, atol=1e-6 * each[k].max())
     assert found["rest"].max() < found["ghosts"].max() / 20
-    np.testing.assert_allclose(found["rest"], each[order[8:]].sum(0), rtol=1e-3, atol=1e-4 * each.max())
+    np.testing.assert_allclose(found["rest"], each[order[12:]].sum(0), rtol=1e-3, atol=1e-4 * each.max())
 
 
 def test_no_layer_is_black(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -149,6 +149,7 @@ def test_frames_end_when_asked_and_are_whole(tmp_path: Path, capsys: pytest.Capt
     assert all(read_exr(file)[0].any() for file in files)
 
 
+@pytest.mark.whole  # a large input
 def test_memory_does_not_grow_with_lights() -> None:
     """Twelve lights take what two take: films under way are bounded."""
     lens = set_lens(read_lens("lenses/cooke_triplet_50.toml"), focus_m=math.inf)

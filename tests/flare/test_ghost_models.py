@@ -195,6 +195,7 @@ def test_pictures_are_those_of_traced_ghosts(model: GhostModel, distance_m: floa
     assert np.abs(blocks[1] - blocks[0]).sum() < 0.04 * blocks[0].sum()
 
 
+@pytest.mark.whole  # another kind of lens
 def test_lenses_with_cylinders(tmp_path: Path) -> None:
     """Against the exact ghosts of a light that the fit never saw, also stopped down; compiled for one direction and for
     any, from the file and in onnxruntime; mirrored light is a mirrored ghost, light turned by 90 degrees another."""

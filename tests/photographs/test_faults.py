@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from shipped import whole
 
 from neurolens.analysis import field_curves
 from neurolens.analysis.fields import Scene
@@ -47,7 +48,10 @@ def checked(**fields: dict[int, object]) -> Checked:
 
 @pytest.mark.parametrize(
     ("name", "steepest"),
-    [("sony_sonnar_55", 0.4), ("horimoto_fisheye_16", 0.5), ("phone_lens_6", 0.5), ("tajima_retrofocus_24", 0.4)],
+    [
+        ("horimoto_fisheye_16", 0.5),
+        *whole(("sony_sonnar_55", 0.4), ("phone_lens_6", 0.5), ("tajima_retrofocus_24", 0.4)),
+    ],
 )
 def test_chief_rays_and_foci_without_aiming_are_those_of_the_scene(
     name: str, steepest: float, monkeypatch: pytest.MonkeyPatch

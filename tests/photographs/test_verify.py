@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from shipped import whole
 
 from neurolens.analysis.field_curves import illumination
 from neurolens.analysis.fields import Scene
@@ -74,7 +75,9 @@ def test_aspheres_that_are_left_out_are_seen() -> None:
     assert found.rms == pytest.approx(100 * np.std(ratio), rel=0.35)  # the heights are others
 
 
-@pytest.mark.parametrize("name", ["sony_sonnar_55", "horimoto_fisheye_16", "phone_lens_6", "laikin_double_gauss_50"])
+@pytest.mark.parametrize(
+    "name", ["horimoto_fisheye_16", "laikin_double_gauss_50", *whole("sony_sonnar_55", "phone_lens_6")]
+)
 def test_light_of_one_trace_is_that_of_a_trace_for_every_stop(name: str) -> None:
     """Beside `illumination`, which searches the outline of what is lit and integrates over it."""
     lens = lens_of(name)
@@ -115,6 +118,7 @@ def test_the_sonnar_against_photographs() -> None:
     assert all(curve.rms < 0.2 for curve in c.light_stops.values())
 
 
+@pytest.mark.whole  # what it prints is compared below
 def test_the_command_prints_draws_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("lensfunpy")
     picture, written = tmp_path / "sonnar.png", tmp_path / "sonnar.toml"
@@ -171,6 +175,7 @@ def test_light_alone_and_another_film(monkeypatch: pytest.MonkeyPatch) -> None:
     assert names_of(lens)[0] == "Some 50mm f/1.8"
 
 
+@pytest.mark.whole  # the command does
 def test_a_survey_holds_lenses_against_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("lensfunpy")
     folder = tmp_path / "lenses"

@@ -133,6 +133,7 @@ def test_cameras_of_a_foreign_file_send_the_same_rays(kind: str, files: dict[str
     assert (rays[0].status == 0).any()
 
 
+@pytest.mark.whole  # their cameras send the same rays
 def test_a_picture_and_source_of_a_foreign_file(
     files: dict[str, Path], scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
@@ -150,6 +151,7 @@ def test_a_picture_and_source_of_a_foreign_file(
     assert code[0] == code[1]
 
 
+@pytest.mark.whole  # study/test_odd_lenses.py evaluates a run folder
 @pytest.mark.usefixtures("no_plots")
 def test_a_run_keeps_the_lens_in_our_format_and_a_model_knows_its_lens(
     files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]

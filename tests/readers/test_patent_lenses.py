@@ -43,7 +43,7 @@ def read(table: dict[str, Any], folder: Path) -> Lens:
 
 
 @pytest.mark.parametrize(
-    "table", TABLES if WHOLE else TABLES[::4], ids=lambda table: table["file"].removesuffix(".zmx")
+    "table", TABLES if WHOLE else TABLES[::10], ids=lambda table: table["file"].removesuffix(".zmx")
 )
 def test_a_patent_reads_and_traces_as_in_ray_optics(table: dict[str, Any], tmp_path: Path) -> None:
     lens = read(table, tmp_path)
@@ -66,12 +66,16 @@ def test_a_patent_reads_and_traces_as_in_ray_optics(table: dict[str, Any], tmp_p
 
 def test_a_folder_of_files_is_one_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Their first-order data in one command, and what kinds of lenses they are."""
-    for table in TABLES:
+    tables = TABLES if WHOLE else TABLES[5::20]
+    for table in tables:
         (tmp_path / table["file"]).write_bytes(TEXTS[table["file"]])
     rows = run_json(capsys, "lens", tmp_path)["lenses"]
-    assert {row["verdict"] for row in rows} == {"read"} and len(rows) == len({t["source"] for t in TABLES}) == 200
-    expected = {Path(table["file"]).stem: table["efl_mm"] for table in TABLES}
+    assert {row["verdict"] for row in rows} == {"read"} and len(rows) == len({t["source"] for t in tables})
+    expected = {Path(table["file"]).stem: table["efl_mm"] for table in tables}
     assert [row["efl_mm"] for row in rows] == pytest.approx([expected[row["lens"]] for row in rows], abs=AGREE_MM)
+    if not WHOLE:
+        return
+    assert len(rows) == 200
     f_numbers, focal = [row["f_number"] for row in rows], [row["efl_mm"] for row in rows]
     assert min(f_numbers) < 0.96 and max(f_numbers) > 13
     assert min(focal) < 0 and min(f for f in focal if f > 0) < 5 and max(focal) > 1000

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from render_helpers import FILM, PINHOLE, SIZE, THIN, files_of_at_most, lit_scene, scene
+from shipped import whole
 
 from neurolens.base.errors import InputError, NeurolensError
 from neurolens.cameras.contract import CameraRays
@@ -45,7 +46,7 @@ def small_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("small_tiles")
-@pytest.mark.parametrize(("first", "then", "mode"), [(1, 2, "auto"), (2, 1, "hero"), (2, 3, "one")])
+@pytest.mark.parametrize(("first", "then", "mode"), [(1, 2, "auto"), *whole((2, 1, "hero"), (2, 3, "one"))])
 def test_what_a_failed_render_had_goes_on_to_the_same_picture(first: int, then: int, mode: Any, tmp_path: Path) -> None:
     part, camera = tmp_path / "a.exr.part", Failing(50.0, 2.0, 3.0, FILM)
     options: dict[str, Any] = SIZE | {"samples": 40, "film": FilmSettings(wavelengths=mode)}

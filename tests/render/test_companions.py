@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from render_helpers import FILM, WHITE, scene
+from shipped import whole
 
 from neurolens.base import status as st
 from neurolens.cameras.build import make_camera
@@ -29,8 +30,9 @@ from neurolens.trace.rays import Rays, trace
 ROOT = Path(__file__).parents[2]
 MODEL = ROOT / "models" / "laikin_double_gauss_50.ols-60.onnx"
 # Two with strong lateral colour, one wide open that vignettes, one with cylinders.
+GAUSS = "laikin_double_gauss_50"
 LENSES: dict[str, tuple[tuple[float, float], float]] = {
-    "laikin_double_gauss_50": (FILM, 1.8),
+    GAUSS: (FILM, 1.8),
     "horimoto_fisheye_16": (FILM, 2.8),
     "merte_biotar_100": (FILM, 1.4),
     "cooke_anamorphic_42": ((20.6, 17.3), 2.4),
@@ -75,7 +77,7 @@ def samples_of(camera: Any, count: int, seed: int = 0) -> tuple[np.ndarray, np.n
     return film.astype(np.float32), random.random((2, count), np.float32), waves.astype(np.float32)
 
 
-@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("name", [GAUSS, "cooke_anamorphic_42", *whole("horimoto_fisheye_16", "merte_biotar_100")])
 def test_companions_are_where_the_lens_brings_the_scene_ray(name: str) -> None:
     """The oracle traces the scene ray backwards, at the wavelength of each companion."""
     camera = lens_camera(name)
@@ -146,7 +148,8 @@ def in_modes(camera: Any, samples: int, light: str = "D65", modes: Any = ("one",
     return [f.rgb.astype(np.float64) for f in found]
 
 
-@pytest.mark.parametrize("name", [*LENSES][1:])  # the first by its model in all that follow
+# The first by its model in all that follow.
+@pytest.mark.parametrize("name", ["horimoto_fisheye_16", *whole("merte_biotar_100", "cooke_anamorphic_42")])
 def test_white_surroundings_look_the_same_in_the_middle_and_in_corners(name: str) -> None:
     one, several = in_modes(compiled(lens_camera(name)), 16)
     # From seed to seed a block's mean scatters by up to 0.2% in either mode.
@@ -154,7 +157,7 @@ def test_white_surroundings_look_the_same_in_the_middle_and_in_corners(name: str
     assert several.mean(axis=(0, 1)) == pytest.approx(one.mean(axis=(0, 1)), rel=1.5e-3)
 
 
-@pytest.mark.parametrize("light", NARROW)
+@pytest.mark.parametrize("light", ["sodium", *whole("led")])
 def test_light_of_a_line_or_of_a_lamp_is_conserved(light: str) -> None:
     one, several = in_modes(compiled(model_camera()), 64, light)
     assert several.mean(axis=(0, 1)) == pytest.approx(one.mean(axis=(0, 1)), rel=5e-3, abs=2e-3)
@@ -211,20 +214,19 @@ def test_any_number_of_workers_and_an_interruption_give_the_same_picture(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr("neurolens.render.film.BATCH", 16 * 700)
-    options: dict[str, Any] = LARGE | {"samples": 20}
+    options: dict[str, Any] = LARGE | {"samples": 10}
     monkeypatch.setattr("neurolens.render.job._LITTLE_PX", 0.0)
     made, camera, part = edges(), compiled(model_camera()), tmp_path / "a.part"
-    whole = render(made, camera, **options)
-    assert whole.stats["wavelengths"] == "companions"
-    for threads in (2, 3):
-        assert same(render(made, camera, **options | {"threads": threads}), whole)
+    all_of_it = render(made, camera, **options)
+    assert all_of_it.stats["wavelengths"] == "companions"
+    assert same(render(made, camera, **options | {"threads": 3}), all_of_it)
     calls = iter([False] * 3)
     watch = Watch(checkpoint=part, stop=lambda: next(calls, True))
     first = render(made, camera, **options | {"threads": 2}, watch=watch)
     assert not first.stats["complete"]
-    assert same(render(made, camera, watch=Watch(checkpoint=part), **options), whole)
+    assert same(render(made, camera, watch=Watch(checkpoint=part), **options), all_of_it)
     rows = [render(made, camera, rows=rows, **options).rgb for rows in ((0, 27), (27, 28), (28, 80))]
-    assert np.array_equal(np.concatenate(rows), whole.rgb)
+    assert np.array_equal(np.concatenate(rows), all_of_it.rgb)
 
 
 def test_one_pixel_one_line_and_no_light_end_well() -> None:
@@ -292,6 +294,7 @@ def test_all_visible_light_from_380_to_780_nm() -> None:
     assert 0.02 < np.abs(found.film_mm - found.film_mm[0]).max() < 0.25  # lateral colour of tens of micrometres
 
 
+@pytest.mark.whole  # another lens
 def test_a_lens_set_for_a_zoom_has_companions_too() -> None:
     lens = read_lens(ROOT / "lenses" / "ogawa_zoom_70_200.toml")
     camera = ExactCamera(lens, Shot(FILM, 8.0, 5.6, zoom=next(iter(lens.configurations)).name))
@@ -300,7 +303,7 @@ def test_a_lens_set_for_a_zoom_has_companions_too() -> None:
     assert weight.sum(axis=0).mean() == pytest.approx(alone.mean(), rel=0.01)
 
 
-@pytest.mark.parametrize("shape", [Aperture(blades=5, rotation_deg=20.0), Aperture(mask=np.eye(7, dtype=bool))])
+@pytest.mark.parametrize("shape", [Aperture(mask=np.eye(7, dtype=bool)), *whole(Aperture(blades=5, rotation_deg=20.0))])
 def test_shapes_of_the_stop_block_companions_as_they_block_heroes(shape: Aperture) -> None:
     """Summed over many rays, heroes and companions carry as much light as heroes alone, compiled or not."""
     plain = make_camera(MODEL, Shot(FILM, 2.0, 2.8, aperture=shape))

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from shipped import whole
 
 from neurolens import __version__
 from neurolens.cameras.build import make_camera
@@ -47,7 +48,7 @@ def seen(made: Camera, height_mm: float) -> tuple[float, float]:
     return -height_mm / slope, -1e3 * at_film / slope
 
 
-@pytest.mark.parametrize("focus_m", [math.inf, 1.0])
+@pytest.mark.parametrize("focus_m", [1.0, *whole(math.inf)])
 @pytest.mark.parametrize("spec", [LENS, MODEL])
 def test_lens_state_is_what_rays_close_to_the_axis_do(spec: str, focus_m: float) -> None:
     made = camera(spec, focus_m, 32.0)
@@ -73,7 +74,7 @@ def test_pupil_moves_away_from_the_film_as_the_lens_is_focused_closer() -> None:
     assert lengths[1] > lengths[0] + 1
 
 
-@pytest.mark.parametrize("spec", ANAMORPHIC)
+@pytest.mark.parametrize("spec", [ANAMORPHIC[1], *whole(ANAMORPHIC[0])])
 def test_squeeze_is_measured_and_shapes_the_pixels(spec: str) -> None:
     made = make_camera(spec, Shot(film_mm=(20.0, 15.0), focus_m=math.inf))
     squeeze = made.settings["lens_state"]["squeeze"]
@@ -99,7 +100,7 @@ def test_pixels_that_are_not_square_have_no_pitch() -> None:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("spec", [LENS, MODEL])
+@pytest.mark.parametrize("spec", [MODEL, *whole(LENS)])
 def test_another_reader_finds_the_standard_attributes(spec: str, tmp_path: Path) -> None:
     made = camera(spec, 2.5, 2.8)
     given = standard_attributes(made.settings, 72, 48, frame=7)
@@ -128,6 +129,7 @@ def test_another_reader_finds_the_standard_attributes(spec: str, tmp_path: Path)
     assert read_exr(tmp_path / "a.exr")[1] == {"camera": 1}
 
 
+@pytest.mark.whole  # another state
 def test_frames_of_a_command_carry_their_own_focus(tmp_path: Path) -> None:
     out = tmp_path / "pull.exr"
     args = (

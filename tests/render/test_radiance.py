@@ -137,6 +137,7 @@ print(high)
 """
 
 
+@pytest.mark.whole  # a large input
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="no /proc tells the most memory of a process")
 def test_an_environment_of_8192_pixels_takes_less_than_2_gb(tmp_path: Path) -> None:
     planes = (bytes([128 + n, value]) for value in (192, 128, 64, 128) for n in [127] * 64 + [64])

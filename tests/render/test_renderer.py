@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from render_helpers import FILM, PINHOLE, SIZE, THIN, WHITE, diffuse, lit_scene, scene
+from shipped import whole
 
 from neurolens.base.errors import InputError, ModelError, NeurolensError
 from neurolens.cameras.contract import CameraRays
@@ -119,8 +120,8 @@ class Raising(Pinhole):
     ("error", "said"),
     [
         (ModelError("a.onnx: cannot run it"), "a.onnx: cannot run it"),
-        (MemoryError("2 TB"), "a render worker ran out of memory (2 TB)"),
-        (ValueError("x" * 10_000), "a render worker failed: ValueError: xxx"),
+        *whole((MemoryError("2 TB"), "a render worker ran out of memory (2 TB)")),
+        *whole((ValueError("x" * 10_000), "a render worker failed: ValueError: xxx")),
         (RuntimeError("no rays today"), "a render worker failed: RuntimeError: no rays today (test_renderer.py:"),
     ],
 )

@@ -189,8 +189,9 @@ def test_lateral_colour_is_that_of_the_analysis() -> None:
     assert np.abs(found.lateral_um[3:8]).max() > 1  # there is some to be seen
 
 
+@pytest.mark.whole  # the maps of such a lens are below
 def test_both_meridians_of_an_anamorphic_lens_have_their_own_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fields, "_OTHER", (33, 32))
+    monkeypatch.setattr(fields, "_OTHER", (25, 24))
     camera = make_camera(ROOT / "lenses" / "cooke_anamorphic_42.toml", Shot(film_mm=(20.0, 16.0), focus_m=3.0))
     assert not fields.is_round(camera)
     field = field_of(camera, 3.0)
@@ -234,9 +235,6 @@ def test_maps_of_an_anamorphic_lens_tell_their_pixels_shape_and_both_pupils(
     for kind in ("undistort", "redistort", "illumination"):
         header = OpenEXR.File(str(tmp_path / f"a.{kind}.exr"), header_only=True).parts[0].header
         assert header["pixelAspectRatio"] == pytest.approx(row["pixel_aspect"])
-    run_json(capsys, "stmap", MODEL, "--width", "96", "--film", "36x20.25", "--quiet", "-o", tmp_path / "round")
-    header = OpenEXR.File(str(tmp_path / "round.undistort.exr"), header_only=True).parts[0].header
-    assert header["pixelAspectRatio"] == 1
 
 
 def test_the_command_writes_maps_of_one_size_for_all_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -256,6 +254,8 @@ def test_the_command_writes_maps_of_one_size_for_all_frames(tmp_path: Path, caps
     red, blue = pictures["a.redistort.red.0001.exr"][0], pictures["a.redistort.blue.0001.exr"][0]
     assert 0 < np.abs(red - blue).max() * 96 < 1
     assert list(read_layers(tmp_path / "a.illumination.0001.exr")) == ["Y"]
+    header = OpenEXR.File(str(tmp_path / "a.undistort.0001.exr"), header_only=True).parts[0].header
+    assert header["pixelAspectRatio"] == 1
     # Top left: s small, t near 1; the plate's pixel centres lie inside the undistorted picture.
     first = pictures["a.redistort.0001.exr"][0]
     assert first[0, 0, 0] < 0.1 and first[0, 0, 1] > 0.9 and first[..., 2].min() == 1

@@ -12,6 +12,7 @@ import OpenEXR
 import pytest
 from command_line import failure, run_json
 from PIL import Image
+from shipped import whole
 
 from neurolens.cli import main
 from neurolens.render.pictures import METADATA_KEY, read_channels
@@ -63,7 +64,9 @@ def metadata(path: Path) -> dict[str, Any]:
     return told | {"render": {key: value for key, value in told["render"].items() if key not in timed}}
 
 
-@pytest.mark.parametrize(("kind", "count"), [*((kind, 3) for kind in KINDS), ("plain", 1), ("plain", 18)])
+@pytest.mark.parametrize(
+    ("kind", "count"), [("companions", 3), ("plain", 1), *whole(*((kind, 3) for kind in KINDS), ("plain", 18))]
+)
 def test_merged_tiles_are_the_picture_of_one_run(
     kind: str, count: int, render: Render, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -116,14 +119,16 @@ def test_a_tile_lies_in_its_place_for_other_programs(render: Render) -> None:
     ("options", "said"),
     [
         (("--seed", "7"), "seed: got 7, expected 0 as in"),
-        (("--f-number", "8"), "camera.f_number: got 8.0, expected"),
-        (("--samples", "3"), "samples: got 3, expected 2 as in"),
         (("--half",), "half: got True, expected False as in"),
-        (("--colour-space", "ACEScg"), "colour.space: got 'ACEScg', expected 'sRGB' as in"),
-        (("--channels", "beauty"), "layers: got [], expected ['blocked', 'depth', 'samples', 'variance'] as in"),
         (("--focus", "3"), "camera.focus_m: got 3.0, expected"),
-        (("--wavelength-mode", "one"), "wavelengths: got 'one', expected 'auto' as in"),
-        (("--max-depth", "1"), "max_depth: got 1, expected"),
+        *whole(
+            (("--f-number", "8"), "camera.f_number: got 8.0, expected"),
+            (("--samples", "3"), "samples: got 3, expected 2 as in"),
+            (("--colour-space", "ACEScg"), "colour.space: got 'ACEScg', expected 'sRGB' as in"),
+            (("--channels", "beauty"), "layers: got [], expected ['blocked', 'depth', 'samples', 'variance'] as in"),
+            (("--wavelength-mode", "one"), "wavelengths: got 'one', expected 'auto' as in"),
+            (("--max-depth", "1"), "max_depth: got 1, expected"),
+        ),
     ],
 )
 def test_tiles_of_other_settings_are_named(

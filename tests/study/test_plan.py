@@ -10,6 +10,7 @@ from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
+from shipped import whole
 
 from neurolens.base.errors import InputError
 from neurolens.base.lensname import resolve
@@ -165,7 +166,7 @@ def test_what_a_shot_needs_falls_with_its_stop() -> None:
     assert small["diffraction"] > 3 * wide["diffraction"]
 
 
-@pytest.mark.parametrize("lens", ["canon_gauss_35", "cooke_anamorphic_42"])
+@pytest.mark.parametrize("lens", ["canon_gauss_35", *whole("cooke_anamorphic_42")])
 def test_a_warped_pinhole_shows_what_is_in_focus_where_the_lens_does(lens: str) -> None:
     shot = Shot((18.0, 10.0), 2.0, f_number=16.0)
     exact, hole = make_camera(f"lenses/{lens}.toml", shot), make_camera(f"pinhole:lenses/{lens}.toml", shot)
@@ -201,7 +202,9 @@ def planned(budget: float, distance_m: float, f_number: float | None) -> Plan:
     return plan(scene, set_lens(read_lens(LENS)), budget, target="c")
 
 
-@pytest.mark.parametrize(("budget", "distance_m", "f_number"), [(0.0, 4.0, None), (1e9, 4.0, 45.0), (1e9, 0.12, 45.0)])
+@pytest.mark.parametrize(
+    ("budget", "distance_m", "f_number"), [(0.0, 4.0, None), (1e9, 0.12, 45.0), *whole((1e9, 4.0, 45.0))]
+)
 def test_budgets_at_the_extremes(budget: float, distance_m: float, f_number: float | None) -> None:
     """No budget leaves the exact lens; any budget, a point whose picture is warped, for it costs least as C. Where the
     rest of a path takes many times what a camera does, the exact lens stays, unless its dispersion adds noise."""
@@ -299,7 +302,7 @@ def test_shaders_cost_what_cycles_took() -> None:
 def test_a_warped_pinhole_lacks_the_blur_alone() -> None:
     """A wall in focus: places and light are right, so that its error is the RMS radius of the lens's footprints."""
     scene, lens = scene_from_tables(wall(3.0)), set_lens(read_lens(GAUSS))
-    found = probe(scene, lens)
+    found = probe(scene, lens, across=8)
     choices = {c.name: c for c in candidates(found, (0.0,), "render")}
     blur = np.percentile(blur_mm(found.seen, found.places.share) / 2, 95) / found.asked.pixel_mm
     assert choices["pinhole + ST map"].error_px == pytest.approx(blur, rel=0.02)
@@ -350,7 +353,7 @@ def test_a_plan_s_file_names_cameras_that_nothing_is_fitted_for(tmp_path: Path) 
 
 def test_models_have_the_blades_of_the_lens_file() -> None:
     shaped = read_lens(GAUSS).with_aperture(Aperture(blades=5, rotation_deg=20.0))
-    found = probe(scene_from_tables(wall(1.0, 4.0)), shaped)
+    found = probe(scene_from_tables(wall(1.0, 4.0)), shaped, across=6)
     model = Path("models/laikin_double_gauss_50.ols-60.onnx")
     asked = replace(found.asked, shot=replace(found.asked.shot, aperture=None))
     own, bare = (
@@ -360,6 +363,7 @@ def test_models_have_the_blades_of_the_lens_file() -> None:
     assert own.error_px < 0.05 and own.light_error < 0.01 and bare.error_px > 0.3
 
 
+@pytest.mark.whole  # another lens
 def test_a_zoom_is_planned_in_its_state() -> None:
     lens = read_lens("lenses/ogawa_zoom_70_200.toml")
     scene = scene_from_tables(wall(10.0, 5.6, focus_m=8.0))

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from shipped import whole
 
 from neurolens.analysis.fields import Scene as Fields
 from neurolens.base.errors import InputError
@@ -72,11 +73,11 @@ def test_transmittance_is_that_of_the_axis() -> None:
 
 def test_vignetting_darkens_the_corner_as_traced_rays_say() -> None:
     """Rays of the corner's film point through a grid of the pupil, with the rims and without them; the stop in both."""
-    found = probe(wall(camera={"f_number": 2.0}), set_lens(read_lens("lenses/laikin_double_gauss_50.toml")))
+    found = probe(wall(camera={"f_number": 1.8}), set_lens(read_lens("lenses/laikin_double_gauss_50.toml")), across=8)
     unit, taken = found.camera_maps["vignetting"]
     fall = found.camera_maps["natural fall-off"][1]
     x, y = (mm * (0.5 / n - 0.5) for mm, n in zip(found.asked.shot.film_mm, taken.shape[::-1], strict=True))
-    side = torch.linspace(-35, 35, 801, dtype=torch.float64)
+    side = torch.linspace(-35, 35, 501, dtype=torch.float64)
     u, v = (a.reshape(-1) for a in torch.meshgrid(side, side, indexing="ij"))
     film = torch.full_like(u, x), torch.full_like(u, y), torch.full_like(u, found.lens.film_z_mm)
     rays = camera_rays(*film, u, v, found.domain.pupil_z_mm)
@@ -131,7 +132,8 @@ def test_flare_is_that_of_the_layers() -> None:
     assert not any(v.any() for v in stray_light(wall(), camera, small).values())
 
 
-def test_what_is_made_afterwards_is_not_asked() -> None:
+def test_what_is_made_afterwards_is_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neurolens.plan.candidates.TERMS", (8,))  # no polynomial is chosen
     lens = set_lens(read_lens(LENS))
     far = wall(500.0, {"f_number": 45.0, "focus_m": 500.0, "width": 1920, "height": 1080})
     without = plan(far, lens, 0.2, afterwards=["distortion"])
@@ -163,7 +165,7 @@ EXTREMES: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", EXTREMES)
+@pytest.mark.parametrize("name", [*(name for name in EXTREMES if name != "one pixel"), *whole("one pixel")])
 def test_extremes_have_an_answer(name: str) -> None:
     found = probe(wall(**EXTREMES[name]), set_lens(read_lens(LENS)), across=3)
     effects = effects_of(found, 0.25)
@@ -173,9 +175,9 @@ def test_extremes_have_an_answer(name: str) -> None:
 
 def test_lights_beyond_number_are_bounded() -> None:
     """Only the lights that are strongest at the lens are used: a near one among weak ones is found."""
-    place = np.random.default_rng(0).uniform([-9, -9, -60], [9, 9, -40], (20_000, 3))
+    place = np.random.default_rng(0).uniform([-9, -9, -60], [9, 9, -40], (10_000, 3))
     points = [{"position_m": [float(v) for v in p], "intensity": [1e-6] * 3} for p in place]
-    points[12_345] = {"position_m": [0.2, 0.1, -2.0], "intensity": [5.0] * 3}
+    points[6_789] = {"position_m": [0.2, 0.1, -2.0], "intensity": [5.0] * 3}
     scene = wall(100.0, points=points)
     seen = SceneLights(scene).seen(scene, 60.0, most=8)
     assert len(seen) <= 8 and max(a.rgb[0] for a in seen) == pytest.approx(5 / 2.01**2, rel=0.1)

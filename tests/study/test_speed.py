@@ -75,6 +75,7 @@ def test_what_cannot_run_is_reported_with_its_reason(domain: Domain) -> None:
     assert result.timing("absent") is None and result.speedup("pinhole", "absent") is None
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_without_a_compiler_the_compiled_tracer_is_unavailable(domain: Domain) -> None:
     import torch._inductor.config as inductor

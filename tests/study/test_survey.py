@@ -158,6 +158,7 @@ def test_summary_counts_goals_and_takes_a_missing_figure_for_the_worst() -> None
     assert summary_of(records[1:])["median"]["direction_rms_deg"] is None
 
 
+@pytest.mark.whole  # its records are above
 def test_the_command_says_what_it_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = _folder(tmp_path)
     assert main(["survey", str(folder), "--no-fit", "--output", str(tmp_path / "o"), "--jobs", "1"]) == 0

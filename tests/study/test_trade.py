@@ -72,6 +72,7 @@ def test_what_is_shown_holds_the_ends_and_the_chosen_one() -> None:
     assert beside in spread(many, beside, 6) and spread(many[:2], beside) == [*many[:2], beside]
 
 
+@pytest.mark.whole  # the choice itself is below
 def test_a_trade_leaves_one_page_that_needs_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file, lens, folder = tmp_path / "scene.toml", tmp_path / "own.toml", tmp_path / "trade"
     film = {"film_width_mm": 18.0, "film_height_mm": 10.125, "samples": 4, "f_number": 5.6}
@@ -97,6 +98,7 @@ def test_a_trade_leaves_one_page_that_needs_nothing_else(tmp_path: Path, capsys:
     assert chosen["seconds"] <= 1.2 * min(held)  # nothing within the budget is surely faster to equal noise
 
 
+@pytest.mark.whole  # the choice itself is above
 def test_a_plan_for_a_time_takes_the_most_faithful_camera_that_fits(tmp_path: Path) -> None:
     file = tmp_path / "scene.toml"
     file.write_text(format_toml(scene(width=64, height=36, film_width_mm=18.0, film_height_mm=10.125, samples=4)))

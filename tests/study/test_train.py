@@ -12,6 +12,7 @@ from pathlib import Path
 import lens_models
 import numpy as np
 import pytest
+from shipped import whole
 
 from neurolens.base.errors import InputError
 from neurolens.base.kept import Kept
@@ -39,7 +40,7 @@ efl_mm = 50
 wavelength_nm = [400, 700]
 [pairs]
 train = 3000
-held_out = 2000
+held_out = 1000
 rim = 3000
 [[model]]
 method = "thick"
@@ -51,8 +52,8 @@ method = "mlp"
 units = 8
 steps = 20
 [evaluation]
-vignetting_rays = 8000
-rounds = 1
+vignetting_rays = 4000
+rounds = 0
 compile_exact = false
 [render]
 scenes = ["ROOT/experiments/scenes/grid.toml"]
@@ -104,7 +105,6 @@ def test_errors_are_in_the_order_that_physics_gives_and_hold_when_stopped_down(r
 
 def test_less_to_model_is_modelled_better(run: tuple[Path, dict]) -> None:
     whole, shot, half = run[1]["domain_gain"]["rows"]
-    assert all(row["ns_per_ray"]["min"] > 0 for row in (whole, shot, half))
     assert whole["nearest_m"] is None and 0.5 < shot["nearest_m"] < 10
     assert shot["film_radius_mm"] < whole["film_radius_mm"]
     assert shot["rms_um"] < whole["rms_um"]
@@ -168,7 +168,7 @@ QUICK = """--rounds 0 --quiet --set pairs.train=1000 --set pairs.held_out=500 --
 RUNGS = "model=[{terms=3,planes=false},{terms=12,planes=false},{terms=20,planes=false}]"
 
 
-@pytest.mark.parametrize(("asked", "within_um", "tried"), [("um=2", 2.0, 2), ("px=1e-6", 1e-6 * 6.24, 3)])
+@pytest.mark.parametrize(("asked", "within_um", "tried"), [("px=1e-6", 1e-6 * 6.24, 3), *whole(("um=2", 2.0, 2))])
 @pytest.mark.usefixtures("no_plots")
 def test_models_are_fitted_until_one_has_the_error_asked_for(tmp_path, capsys, asked, within_um, tried) -> None:
     kind, _, value = asked.partition("=")
@@ -233,6 +233,7 @@ def test_models_that_know_no_states(settings: ModelSettings) -> None:
         state_settings(settings, 1000, 1)
 
 
+@pytest.mark.whole  # as of one state
 def test_a_second_run_takes_the_model_that_is_there(tmp_path: Path) -> None:
     space = default_experiment(lens_models.LENSES / "nikon_zoom_80_200.toml", ['lens.zoom="range"']).states()
     space = replace(space, axes=(replace(space.axes[0], degree=1),), focus_m=(math.inf, math.inf))
@@ -261,6 +262,7 @@ main(sys.argv[1:])
 """
 
 
+@pytest.mark.whole  # test_mlp kills anywhere
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL on this system")
 @pytest.mark.usefixtures("no_plots")
 def test_a_training_that_was_killed_is_taken_up_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,6 +12,7 @@ import lens_models
 import numpy as np
 import pytest
 import torch
+from shipped import whole
 from writers import COLUMNS, HEADS, Rows, compiled, glsl_rays, program, rays_of, shader, written_rays
 
 from neurolens.base import status as st
@@ -32,19 +33,16 @@ COUNT = 20_000
 CORES = (*lens_models.KINDS, "zones")
 # Of a fisheye those whose forms differ for it: a dense and a sparse one, a series, cells.
 OF_FISHEYE = tuple(f"{method} fisheye" for method in ("hanika", "schrade", "taylor", "cells"))
-PUBLISHED = (*lens_models.PUBLISHED, *OF_FISHEYE)
-MODELS = (*CORES, *lens_models.GATED, "residual", "laser", *PUBLISHED)
+# Each kind of core, a fisheye whose rays graze its front, and lost rays; others and published methods in the whole run.
+MODELS = ("invariants", "network", "fisheye", "zones", "hemisphere", "residual")
 FORMS = [
-    *(("onnx", kind) for kind in MODELS),
-    *(("c", kind) for kind in MODELS if kind not in OF_FISHEYE),
+    *((form, kind) for form in ("onnx", "c") for kind in MODELS),
     *(("glsl", kind) for kind in lens_models.KINDS),
     *(("torch", kind) for kind in (*lens_models.KINDS, "residual")),
-    *(
-        pytest.param(form, kind, marks=pytest.mark.slow)
-        for form in ("onnx", "c")
-        for kind in ("cylinders", "cylinders network")
-    ),
+    *(pytest.param(form, "cylinders", marks=pytest.mark.slow) for form in ("onnx", "c")),
 ]
+OTHERS = ("raw", "thick", "singlet", "laser", *lens_models.PUBLISHED, "cylinders network")
+OTHER_FORMS = whole(*((form, kind) for form in ("onnx", "c") for kind in OTHERS))
 # A ray within rounding of a cut may take the other cell; on the axis, rounding decides a ray's meridian.
 CUT = ("zones", "cells", "neurolens2017", "rtf", "ray-lut")
 STRANGE = [math.nan, math.inf, -math.inf, 1e-42, -1e-42, 0.0, 3.4e38, -3.4e38, 1.9e19, 1e10, 1e3, -1e3]
@@ -105,7 +103,7 @@ def agree(kind: str, model: LensModel, found: Rows, film_z: float, stop: float) 
         assert np.quantile(np.abs(off)[:, passed], 1.0 if not cut else 0.999) < 1e-4
 
 
-@pytest.mark.parametrize(("form", "kind"), FORMS)
+@pytest.mark.parametrize(("form", "kind"), [*FORMS, *OTHER_FORMS, *whole(*(("onnx", kind) for kind in OF_FISHEYE))])
 def test_every_form_agrees_with_the_model(form: str, kind: str) -> None:
     model = lens_models.model(kind)
     d, rays = model.domain, rays_of(model, COUNT, seed=3)
@@ -125,7 +123,7 @@ def test_every_reason_is_told(kind: str) -> None:
     assert {g.status for g in model.gates if g.reason != st.RIM} <= set(status.tolist())
 
 
-OUTSIDE = [case for case in FORMS if case[0] != "glsl" and case[1] not in OF_FISHEYE]
+OUTSIDE = [*(case for case in FORMS if case[0] != "glsl"), *OTHER_FORMS]
 
 
 @pytest.mark.parametrize(("form", "kind"), OUTSIDE)
@@ -244,7 +242,8 @@ WAVES_NM = (450.0, 550.0, 650.0)
 
 
 @pytest.mark.parametrize(
-    ("form", "kind"), [("c", "invariants"), ("c", "network"), ("c", "raw"), ("c", "zones"), ("glsl", "invariants")]
+    ("form", "kind"),
+    [("c", "network"), ("c", "zones"), ("glsl", "invariants"), *whole(("c", "invariants"), ("c", "raw"))],
 )
 def test_wavelengths_film_and_stop_fixed(form: str, kind: str) -> None:
     model, (steps, at), free = lens_models.model(kind), fixed(kind), sum(program(kind).count().values())
@@ -289,7 +288,7 @@ def tables(value: Any) -> list[np.ndarray]:
     return [t for part in parts if isinstance(part, (tuple, np.ndarray, Core)) for t in tables(part)]
 
 
-@pytest.mark.parametrize("kind", [*CORES, "residual", "laser", *lens_models.PUBLISHED])
+@pytest.mark.parametrize("kind", [*CORES, "residual", "laser", *whole(*lens_models.PUBLISHED)])
 def test_what_is_stored_is_exact_in_float32(kind: str, tmp_path: Path) -> None:
     model = lens_models.model(kind)
     read = read_model(lens_models.exported(kind)).at()
@@ -306,7 +305,7 @@ def test_what_is_stored_is_exact_in_float32(kind: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["invariants", "raw", "network", "zones", "residual"])
-@pytest.mark.parametrize("wavelength_nm", [400.0, 587.6])
+@pytest.mark.parametrize("wavelength_nm", [400.0, *whole(587.6)])
 def test_one_wavelength(kind: str, wavelength_nm: float, tmp_path: Path) -> None:
     model = lens_models.model(kind)
     s = sample_domain(model.domain, 5000, 3)

@@ -56,6 +56,7 @@ def test_raw_candidates_are_bounded_by_their_number() -> None:
     assert 2 * len(invariant_exponents(ModelSettings(degree=16).degree)) <= 5000
 
 
+@pytest.mark.whole  # test_mlp has checkpoints
 def test_checkpoints_of_zones_are_kept_apart_and_removed_together(tmp_path: Path) -> None:
     file = tmp_path / "m.training.npz"
     settings = ModelSettings("mlp", units=3, layers=1, steps=4, partitions=2)
@@ -84,6 +85,7 @@ def direction_rms(settings: ModelSettings) -> float:
     return float((model.core(targets.field)[0][1] - targets.vectors[1]).square().sum(0).mean().sqrt())
 
 
+@pytest.mark.whole  # an ablation
 @pytest.mark.slow
 def test_every_part_of_the_fit_is_worth_something() -> None:
     whole = direction_rms(ModelSettings(terms=24))
@@ -113,6 +115,7 @@ def rms_deg(model: LensModel) -> float:
     return math.degrees(float(((out.dx - held.scene.dx) ** 2 + (out.dy - held.scene.dy) ** 2).mean().sqrt()))
 
 
+@pytest.mark.whole  # zones are held against their model in test_contract
 def test_zones_lower_the_error(zoned: LensModel) -> None:
     whole = fit_model(prepared(), ModelSettings(method="adaptive", terms=16))
     assert isinstance(zoned.core, Partitioned) and len(zoned.core.parts) == 3

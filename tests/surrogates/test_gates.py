@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from lens_models import gated
+from shipped import whole
 from vignetting_oracle import vignetting_errors
 
 from neurolens.base import status as st
@@ -73,8 +74,8 @@ def test_where_no_ray_is_lost_there_are_rims_alone() -> None:
     [
         ("hemisphere", "ols", 0.005),
         ("singlet", ModelSettings("dense", basis="raw", degree=4), 0.03),
+        *whole(("singlet", ModelSettings("mlp", units=12, steps=15), 0.03)),
         ("hemisphere", ModelSettings("dense", basis="raw", degree=4), 0.03),
-        ("singlet", ModelSettings("mlp", units=12, steps=15), 0.03),
         ("singlet", ModelSettings("thick"), 0.06),
         ("hemisphere", ModelSettings("thick"), 0.06),
     ],
@@ -89,6 +90,7 @@ def test_lost_rays_no_longer_pass(name: str, method: ModelSettings | str, most: 
     assert false_blocks(model, rays) < false_blocks(before, rays) + most
 
 
+@pytest.mark.whole  # as without zones
 @pytest.mark.slow
 def test_zones_have_the_gates_too() -> None:
     model = fit_model(gated("singlet"), ModelSettings("ols", terms=16, degree=5, partitions=2, planes=False))
@@ -173,6 +175,7 @@ def fitted(lens: Lens, domain: Domain, terms: int = 40, rays: PairSettings = RAY
     return fit_model(prepare(make_pairs(lens, domain, rays)), ModelSettings("ols", terms=terms, planes=False))
 
 
+@pytest.mark.whole  # as a tiny rim far in front
 def test_where_little_passes_rays_are_drawn_where_it_does() -> None:
     """The share that passes is known all the same, and no passing ray lies outside the boxes."""
     lens, domain = narrow()
@@ -199,6 +202,7 @@ def test_rays_of_the_boxes_pass_uniformly() -> None:
         assert apart < 1.95 * math.sqrt(1 / len(a) + 1 / len(b))  # Kolmogorov and Smirnov, one in a thousand
 
 
+@pytest.mark.whole  # as a tiny rim far in front
 @pytest.mark.slow
 def test_a_lens_where_almost_no_ray_passes() -> None:
     lens, domain = narrow()
@@ -305,7 +309,7 @@ POOR = {
 }
 
 
-@pytest.mark.parametrize("method", ["ols", "adaptive"])
+@pytest.mark.parametrize("method", ["ols", *whole("adaptive")])
 @pytest.mark.parametrize("kind", POOR)
 def test_poor_data_are_fitted_as_far_as_they_tell(kind: str, method: str) -> None:
     """Finite, sound in float32, and right on the rays that there were."""

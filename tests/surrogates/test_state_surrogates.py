@@ -48,7 +48,7 @@ def space() -> StateSpace:
 
 @cache
 def model() -> StateModel:
-    return fit_states(space(), StateSettings(terms=40, degree=5, rays=4000))
+    return fit_states(space(), StateSettings(terms=40, degree=5, rays=2500))
 
 
 @cache
@@ -142,6 +142,7 @@ def test_states_to_check_at_are_one_in_each_part_of_every_range() -> None:
         assert sorted(int(10 * (s[k] - low) / (high - low)) for s in states) == list(range(10))
 
 
+@pytest.mark.whole  # cameras/test_osl.py focuses groups inside
 def test_a_model_of_internal_focus_is_focused_as_its_lens_is(tmp_path: Path) -> None:
     """Its camera's film is that of the exact lens's best focus, and gives the exact lens its least spot."""
     lens = read_lens(lens_models.LENSES / "tajima_retrofocus_24.toml")
@@ -234,7 +235,7 @@ def test_states_out_of_range_are_outside_the_domain(bad: float) -> None:
 
 
 def test_random_states_and_rays_break_no_promise() -> None:
-    found = outside.send(loaded(), 200_000, seed=3)
+    found = outside.send(loaded(), 100_000, seed=3)
     assert found.broken == dict.fromkeys(found.broken, 0) and found.inside > 10_000 and found.passed > 3000
 
 
@@ -305,7 +306,6 @@ def test_cameras_zoom() -> None:
     low, high = loaded().axes[0].range
     assert OnnxCamera(loaded(), Shot(film, 10.0)).settings["state"] == {"zoom": low}
     assert OnnxCamera(loaded(), Shot(film, 10.0, zoom="200mm")).settings["state"] == {"zoom": high}
-    assert OnnxCamera(loaded(), Shot(film, 10.0, zoom=200.0)).settings["state"] == {"zoom": 200.0}
     assert OnnxCamera(loaded(), Shot(film, 10.0, zoom=80.0)).settings["state"] == {"zoom": low}
     square = np.random.default_rng(0).random((2, 500), np.float32)
     point = np.zeros((2, 500), np.float32)

@@ -85,12 +85,12 @@ def _compiled(kind: str) -> CompiledSource:
 
 
 def compiled(program: Program) -> CompiledSource:
-    """Without optimisation beyond -O1, quick to compile; that -O3 gives the same is a test of its own."""
+    """Without optimisation, quick to compile; that -O3 gives the same is a test of its own."""
     try:
         find_compiler()
     except InputError as reason:
         pytest.skip(f"the C form is not compiled here: {reason}")
-    return CompiledSource(program, ("-std=c99", "-O1", "-march=native", "-Wall", "-Wextra", "-Werror"))
+    return CompiledSource(program, ("-std=c99", "-O0", "-march=native", "-Wall", "-Wextra", "-Werror"))
 
 
 def shader(program: Program, head: str, band: int = 0, state: Sequence[float] = ()) -> str:

@@ -212,15 +212,6 @@ def test_no_kink_where_a_film_turns_evanescent():
     assert cos_i.grad[0].item() == pytest.approx(cos_i.grad[2].item(), rel=1e-4)
 
 
-def test_it_is_one_graph_for_the_compiler():
-    compiled = torch.compile(power_amplitudes, backend="eager", fullgraph=True)
-    cos_i = cosines(0, 30, 60, dtype=torch.float32)
-    index = torch.full_like(cos_i, 1.52)
-    for stack in (STACKS["broadband"], STACKS["air gap"]):
-        arguments = (cos_i, index, index + 0.1, stack, torch.full_like(cos_i, LAM_NM))
-        torch.testing.assert_close(compiled(*arguments), power_amplitudes(*arguments))
-
-
 # Designs
 
 

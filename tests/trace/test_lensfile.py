@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from shipped import PATHS
+from shipped import PATHS, SOME
 
 from neurolens.base.errors import InputError, NeurolensWarning
 from neurolens.lens.prescription import Coating, Configuration, Lens, Surface
@@ -297,7 +297,7 @@ def test_known_dispersion_is_no_warning(tmp_path: Path) -> None:
 
 
 # Round trip
-@pytest.mark.parametrize("path", PATHS, ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", [p for p in PATHS if p.stem in SOME], ids=lambda p: p.stem)
 def test_every_shipped_lens_reads_and_comes_back_exactly(path: Path, tmp_path: Path) -> None:
     lens = read_lens(path)
     assert lens.source and lens.lens_id == path.stem

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from film_light import film_light
-from shipped import SOME, focused, tabled
+from shipped import SOME, focused, tabled, whole
 
 from experiments.pupil_methods import (
     RadialPupil,
@@ -165,8 +165,13 @@ def rate_and_light(some: Lens, pupil: RadialPupil, count: int = 20_000) -> tuple
     return float(passed.mean()), float((passed * area * cos2**2).mean() / distance**2)
 
 
-@pytest.mark.parametrize("name", METHODS)
-@pytest.mark.parametrize("case", [("tronnier_double_gauss_100", 100.0, 4.0), ("muller_fisheye_100", 14.0, 5.6)])
+GAUSS, FISHEYE = ("tronnier_double_gauss_100", 100.0, 4.0), ("muller_fisheye_100", 14.0, 5.6)
+
+
+@pytest.mark.parametrize(
+    ("name", "case"),
+    [("hull", GAUSS), ("boxes", FISHEYE), *whole(*((name, case) for name in METHODS for case in (GAUSS, FISHEYE)))],
+)
 def test_no_light_is_lost(name: str, case: tuple[str, float, float]) -> None:
     some = lens(*case)
     rate, light = rate_and_light(some, METHODS[name](some, FILM_RADIUS))

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as hs
-from shipped import turned
+from shipped import WHOLE, turned
 
 from experiments.extreme_cases import Case, disc, unit
 from experiments.extremes import measure
@@ -76,7 +76,7 @@ def gap_mm(a: Surface, b: Surface) -> float:
 
 
 SETTINGS = settings(
-    max_examples=60,
+    max_examples=60 if WHOLE else 20,
     derandomize=True,
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],

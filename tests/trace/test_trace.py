@@ -3,13 +3,14 @@
 import math
 import shutil
 import sysconfig
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import mpmath
 import pytest
 import torch
-from shipped import SOME, backwards, focused, rays, turned
+from shipped import SOME, backwards, focused, rays, turned, whole
 from torch import Tensor
 
 from experiments.extreme_cases import from_film, generator
@@ -17,7 +18,7 @@ from neurolens.base import status as st
 from neurolens.lens.paraxial import first_order
 from neurolens.lens.prescription import Lens, Surface
 from neurolens.setting.pupils import camera_rays, pupil_plane_z_mm
-from neurolens.trace.rays import CHUNK, Rays, Towards, Traced, compile_tracing, passing, trace
+from neurolens.trace.rays import CHUNK, Rays, Towards, compile_tracing, passing, trace
 
 INF = math.inf
 WIDE = 1000.0
@@ -302,7 +303,8 @@ def test_passing_is_status_0_without_the_lost_rays(name: str, towards: Towards) 
 
 
 @pytest.mark.slow
-def test_compiled_equals_eager() -> None:
+@pytest.mark.parametrize("whole_lens", [False, *whole(True)])  # a minute, and of one surface a quarter of it
+def test_compiled_equals_eager(whole_lens: bool) -> None:
     """Skipped without what torch compiles with, which the project does not need."""
     if not any(map(shutil.which, ("c++", "g++", "clang++"))):
         pytest.skip("no C++ compiler")
@@ -310,18 +312,24 @@ def test_compiled_equals_eager() -> None:
         pytest.skip("no Python.h (Debian: python3-dev)")
     from torch._inductor import config as inductor_config  # the compiler: nothing else here needs it
 
-    singlet = focused("thorlabs_lb1471_biconvex_50")
-    start = Rays(*(c.float() for c in bundle(singlet, 1024)))
+    table, towards = focused("thorlabs_lb1471_biconvex_50"), "scene"
+    start = Rays(*(c.float() for c in bundle(table, 1024)))
+    if not whole_lens:
+        table, towards = replace(lens(Surface(50.0, 40.0, 20.0, 1.6, stop=True)), film_z_mm=40.0), "film"
+        start = start._replace(z=start.z - 60.0, dz=-start.dz)
     wavelength = torch.linspace(400, 700, 1024)
     with torch.no_grad():
-        eager = trace(singlet, start, wavelength, transmittance=True)
+        eager = trace(table, start, wavelength, transmittance=whole_lens, towards=towards)
         with inductor_config.patch({"cpp.vec_isa_ok": True}):  # else trial programs are compiled first, for 6 s
-            compiled = compile_tracing(partial(trace, singlet, transmittance=True), singlet)(start, wavelength)
+            run = partial(trace, table, transmittance=whole_lens, towards=towards)
+            compiled = compile_tracing(run, table)(start, wavelength)
     assert int((eager.status != compiled.status).sum()) <= 1  # a ray may pass an edge closely
     both = (eager.status == 0) & (compiled.status == 0)
+    assert both.sum() > 100
     for a, b in zip(eager.rays, compiled.rays, strict=True):
         torch.testing.assert_close(a[both], b[both], rtol=0, atol=2e-5)
-    torch.testing.assert_close(eager.transmittance, compiled.transmittance, rtol=0, atol=2e-6)
+    if whole_lens:
+        torch.testing.assert_close(eager.transmittance, compiled.transmittance, rtol=0, atol=2e-6)
 
 
 ON_DEVICE = ["laikin_double_gauss_50", "canon_aspheric_50", "schneider_anamorphic_31", "shimizu_fisheye_220"]
@@ -335,23 +343,6 @@ def device_rays(lens: Lens, count: int, dtype: torch.dtype) -> tuple[Rays, torch
 
 def on(device: str, rays: Rays, wavelength_nm: torch.Tensor) -> tuple[Rays, torch.Tensor]:
     return Rays(*(c.to(device) for c in rays)), wavelength_nm.to(device)
-
-
-def tensors(out: Traced) -> list[torch.Tensor]:
-    crossings = [c for crossing in out.crossings.values() for c in crossing]
-    return [*out.rays, out.status, *([] if out.transmittance is None else [out.transmittance]), *crossings]
-
-
-@pytest.mark.parametrize("name", ON_DEVICE)
-@pytest.mark.parametrize("options", [{}, {"transmittance": True, "record": [0, 3]}])
-def test_the_host_decides_nothing(name: str, options: dict[str, object]) -> None:
-    """Rays without values go through the whole lens, in one chunk and in several."""
-    lens = focused(name)
-    for count in (100, CHUNK + 100):
-        start = on("meta", *device_rays(lens, count, torch.float32))
-        out = trace(lens, *start, **options)  # type: ignore[arg-type]
-        assert {t.device.type for t in tensors(out)} == {"meta"}
-        assert all(t.shape == (count,) for t in tensors(out))
 
 
 @needs_cuda
@@ -369,17 +360,3 @@ def test_the_same_results_on_cuda(name: str, dtype: torch.dtype) -> None:
     for a, b in zip(there.rays, here.rays, strict=True):
         assert (a.cpu() - b)[passed].abs().max() < (1e-3 if dtype == torch.float32 else 1e-11)
     assert (there.transmittance.cpu() - here.transmittance)[passed].abs().max() < 1e-4
-
-
-@needs_cuda
-@pytest.mark.parametrize("name", ON_DEVICE)
-def test_no_synchronisation_on_cuda(name: str) -> None:
-    lens = focused(name)
-    start = on("cuda", *device_rays(lens, 3 * CHUNK + 5, torch.float32))
-    trace(lens, *start, transmittance=True)  # what is set up once
-    torch.cuda.synchronize()
-    torch.cuda.set_sync_debug_mode("error")
-    try:
-        trace(lens, *start, transmittance=True)
-    finally:
-        torch.cuda.set_sync_debug_mode("default")

@@ -86,27 +86,6 @@ def test_it_fetches_nothing(view: Path) -> None:
     assert policy is not None and policy.startswith("default-src 'none'")
 
 
-def test_it_is_whole(view: Path) -> None:
-    text = view.read_text(encoding="utf-8")
-    data = data_of(text)
-    (lens,) = data["lenses"]
-    assert {form["kind"] for form in lens["forms"]} == {"polynomial", "network", "exact"}
-    for form in lens["forms"]:
-        assert f"{form['kind']}/glsl" in [name for name, *_ in lens["parts"]]
-        assert {"efl_mm", "film_z_mm", "pupil_z_mm", "pupil_radius_mm", "stop_radius_max_mm"} <= set(form["values"])
-
-
-def test_every_control_has_a_label(view: Path) -> None:
-    elements = Elements()
-    text = view.read_text(encoding="utf-8")
-    elements.feed(text)
-    for tag, given in elements.found:
-        if tag in ("input", "select"):
-            assert re.search(
-                rf"<label[^>]*>(?:(?!</label>).)*{re.escape(given.get('id') or given.get('value') or '')}", text
-            )
-
-
 @pytest.mark.skipif(not (GLSLANG and NODE), reason="no glslangValidator or no node")
 def test_shaders_compile(view: Path, tmp_path: Path) -> None:
     """As the page's own script puts them together."""
@@ -264,6 +243,7 @@ SURF 3
 """
 
 
+@pytest.mark.whole  # all forms of a lens are made
 def test_a_lens_of_your_own_whose_glass_absorbs(tmp_path: Path) -> None:
     """All of its forms are written, and say what their transmittance is."""
     (tmp_path / "my_lens.zmx").write_text(ZMX)

@@ -160,6 +160,7 @@ def test_cells_give_each_ray_the_polynomial_of_its_cell() -> None:
         assert torch.allclose(vectors[..., k : k + 1], by_hand(core, torch.tensor([k])), atol=1e-13)
 
 
+@pytest.mark.whole
 def test_cells_and_terms_leave_less() -> None:
     few, more, cells = (
         fit_any(lens_models.prepared(), PublishedSettings("zheng-adaptive", basis="raw", terms=terms, partitions=zones))
@@ -169,6 +170,7 @@ def test_cells_and_terms_leave_less() -> None:
     assert rms_um(more) > 1.1 * rms_um(cells)
 
 
+@pytest.mark.whole
 def test_growth_reaches_degrees_that_no_list_of_candidates_was_cut_at() -> None:
     prepared = lens_models.prepared()
     polynomial = fit_adaptive(RawData.of(prepared), 24, 1)
@@ -192,6 +194,7 @@ def by_hand(layers: Layers, h: np.ndarray) -> np.ndarray:
     return h
 
 
+@pytest.mark.whole
 def test_networks_are_averaged_and_chosen_by_film_radius() -> None:
     core = lens_models.model("neurolens2017").core
     assert isinstance(core, Averaged)
@@ -214,6 +217,7 @@ def test_networks_are_averaged_and_chosen_by_film_radius() -> None:
     assert not np.array_equal(other.networks[1][2][0][0], one.networks[1][2][0][0])
 
 
+@pytest.mark.whole
 def test_networks_learn_rays_and_who_passes() -> None:
     prepared = lens_models.prepared()
     short, longer = (fit_any(prepared, replace(NETWORKS, units=32, partitions=1, steps=steps)) for steps in (30, 700))
