@@ -206,6 +206,7 @@ class _Writer:
                     frame.fields[""], frame.camera, frame.focus_m, self.plates.picture, command.film,
                     (command.wavelengths[0], command.wavelengths[2]),
                     lambda f, state=state: command.make(replace(state, f_number=f), progress)[0],
+                    found[0].model if found else None,
                 )  # fmt: skip
                 found.append(entry)
                 self._worse("lensfun_px", entry.distortion_px)

@@ -1,10 +1,10 @@
 """The two lookup pictures of NVIDIA's schema OmniLensDistortionLutAPI, by which a USD camera has a lens's projection.
 
-`enter`, of the picture's size: the direction that a pixel sees, as R, G and B; x right, y up, -z forward; where no light
-arrives 0, 0, 1, which is behind the camera. `exit`, a square: where the picture shows a direction, as R and G from 0 to
-1 from its upper left corner; -1 where it shows none. Directions are folded onto the square as onto an octahedron, with
-forward in its middle; x grows to the right, and y, which is up, from the first row to the last. The side is odd: so the
-folds run through centres of pixels, where pictures that are read between pixels are exact.
+`enter`, of the picture's size: the direction that a pixel sees, as R, G and B; x right, y up, -z forward; where no
+light arrives 0, 0, 1, which is behind the camera. `exit`, a square: where the picture shows a direction, as R and G
+from 0 to 1 from its upper left corner; -1 where it shows none. Directions are folded onto the square as onto an
+octahedron, with forward in its middle; x grows to the right, and y, which is up, from the first row to the last. The
+side is odd: so the folds run through centres of pixels, where pictures that are read between pixels are exact.
 
 NVIDIA's renderer traces rays by the first; the second serves what it projects, such as motion vectors.
 """
