@@ -3,14 +3,14 @@
 Templates, styles and scripts are files of `templates/` and of `view/page/`. A template puts a style or a script of
 theirs into the page as it is, by `text(name) | safe`. A link needs more than escaping: see `local_url`. Every value of
 HTML and XML is escaped. Templates of other languages (NAME.jinja) take numbers as they are, and refuse a text that no
-filter has quoted: `literal` for Python, USD and JSON, `tcl` for Nuke, `line` for a line of Markdown.
+filter has quoted: `literal` for Python, USD and JSON, `line` for a line of Markdown or of a comment.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -40,25 +40,14 @@ def _templates() -> Environment:
         lstrip_blocks=True, keep_trailing_newline=True, finalize=_checked,
     )  # fmt: skip
     environment.filters["quoted"] = lambda svg: quote(svg, safe=" /:=(),;.")
-    environment.filters["literal"] = _literal
-    environment.filters["tcl"] = _backslashed(r"[\\\"$\[\]{}]")
-    environment.filters["line"] = _backslashed(r"[\\`*_|<\[]")
+    environment.filters["literal"] = lambda value: _Quoted(json.dumps(value))  # escapes what is not ASCII
+    environment.filters["line"] = lambda text: _Quoted(re.sub(r"([\\`*_|<\[])", r"\\\1", one_line(str(text), 1000)))
     environment.globals["text"] = text_of
     return environment
 
 
 class _Quoted(str):
     """A text that no language reads as anything else."""
-
-
-def _literal(value: Any) -> _Quoted:
-    text = one_line(value, 1000).encode("ascii", "replace").decode() if isinstance(value, str) else value
-    return _Quoted(json.dumps(text))
-
-
-def _backslashed(pattern: str) -> Callable[[Any], _Quoted]:
-    """A filter that puts backslashes before characters of a text on one line."""
-    return lambda text: _Quoted(re.sub(f"({pattern})", r"\\\1", one_line(str(text), 1000)))
 
 
 def _is_markup(name: str | None) -> bool:

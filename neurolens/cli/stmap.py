@@ -133,7 +133,7 @@ class StMap(PictureCommand):
     it holds every pixel of the plate. Render CG of that size with a pinhole camera of the focal length and place
     that are printed: the lens's paraxial size in the plane in focus, seen from its entrance pupil. Things at other
     distances are off by what is printed as parallax, for a lens's pupil moves with the field: --distance makes maps
-    for another plane.
+    for another plane. Maps that an earlier run of the same settings left stay.
 
     The place of a thing in the picture is the centroid of its light at this stop, over pupil and wavelengths as the
     eye weighs them. Lenses with cylinders keep their squeeze: each meridian has its own focal length and its own
@@ -147,8 +147,6 @@ examples:
   neurolens stmap models/NAME.onnx --width 1920 --film 24x13.5 --frames 1:48 --key focus=1:1.2,48:3 -o pull
   neurolens stmap lenses/NAME.toml --width 1920 --film 36x20.25 --lateral-colour -o shot   # and per channel
   neurolens stmap lenses/isshiki_fisheye_10.toml --width 2000 --film 18x18 --projection equidistant -o fisheye"""
-
-    resumes: ClassVar[bool] = False
 
     out: Path = output_path("SHOT", "start of the files' names")
     projection: Literal["rectilinear", "equidistant", "equisolid", "stereographic", "orthographic"] = setting(
@@ -178,10 +176,7 @@ examples:
         self.frames.check(self.called)
         progress = self.progress()
         frames, plates = self.traced(progress)
-        files = []
-        with progress.stage("write the maps") as report:
-            for k, frame in enumerate(frames):
-                files += self.written(frame, plates, part_of(report, k, len(frames)))
+        files = self.maps(frames, plates, progress, self.out)
         data = self.data_of(frames, plates) | {"files": files}
         return self.answer(data, lambda: _text(data))
 
@@ -219,10 +214,13 @@ examples:
         }  # fmt: skip
         return TracedFrame(digits, shot.focus_m, camera, fields)
 
-    @property
-    def start(self) -> Path:
-        """The start of the maps' names."""
-        return self.out
+    def maps(self, frames: list[TracedFrame], plates: Plates, progress: Progress, start: Path) -> list[str]:
+        """Write the maps of all frames; their names, which begin with `start`."""
+        files = []
+        with progress.stage("write the maps") as report:
+            for k, frame in enumerate(frames):
+                files += self._written(frame, plates, start, _part(report, k, len(frames)))
+        return files
 
     def jobs(self, frame: TracedFrame) -> list[tuple[str, str, Maker]]:
         """The maps of a frame: kind, colour ("" for the mean one), and what makes the channels."""
@@ -232,7 +230,7 @@ examples:
         pairs = [(kind, name, make) for name in frame.fields for kind, make in makers.items()]
         return [*pairs, ("illumination", "", illumination_map)]
 
-    def written(self, frame: TracedFrame, plates: Plates, report: Callable[[float], None]) -> list[str]:
+    def _written(self, frame: TracedFrame, plates: Plates, start: Path, report: Callable[[float], None]) -> list[str]:
         """Write the maps of one frame, but those that an earlier run of the same settings left; their names."""
         from neurolens.render.pictures import standard_attributes, write_channels
 
@@ -242,13 +240,16 @@ examples:
         about: dict[str, Any] = {"version": __version__, "camera": str(self.camera), "name": frame.camera.name}
         about |= {"picture_px": list(plates.picture), "undistorted_px": list(plates.undistorted)}
         about |= {"film_mm": list(self.film), "focus_m": None if math.isinf(frame.focus_m) else frame.focus_m}
+        about["settings"] = fingerprint_of(plain([frame.camera.settings, self.distance, self.state.stop]))
         for k, (kind, name, make) in enumerate(jobs):
             field = frame.fields[name]
-            path = self.start.with_name(".".join(filter(None, (self.start.name, kind, name, frame.number, "exr"))))
+            path = start.with_name(".".join(filter(None, (start.name, kind, name, frame.number, "exr"))))
             facts = about | {"map": kind, "wavelengths_nm": field.spectrum[0].tolist(), **_ideal(field, plates)}
-            facts["key"] = fingerprint_of(plain([facts, frame.camera.settings, frame.number, self.distance]))
-            if not (self.resumes and _is_of(path, facts["key"])):
-                planes = make(field, plates, part_of(report, 2 * k, 2 * len(jobs)))
+            facts["key"] = fingerprint_of(
+                plain([facts, frame.camera.settings, frame.number, self.distance, self.state.stop])
+            )
+            if not _is_of(path, facts["key"]):
+                planes = make(field, plates, _part(report, 2 * k, 2 * len(jobs)))
                 write_channels(path, planes, None, facts, header)
             files.append(str(path))
             report((k + 1) / len(jobs))
@@ -283,16 +284,16 @@ examples:
         }
 
 
-def _is_of(path: Path, key: str) -> bool:
-    """Whether a map is there, whole, of the settings with this key."""
+def _is_of(path: Path, facts: dict[str, Any]) -> bool:
+    """Whether a map is there, whole, with this in its header."""
     from neurolens.render.pictures import read_metadata
 
     with suppress(InputError):
-        return read_metadata(path).get("key") == key
+        return read_metadata(path) == plain(facts)
     return False
 
 
-def part_of(report: Callable[[float], None], done: int, of: int) -> Callable[[float], None]:
+def _part(report: Callable[[float], None], done: int, of: int) -> Callable[[float], None]:
     """The report of the part of a stage that begins when `done` of so many are done."""
     return lambda share: report((done + share) / of)
 
