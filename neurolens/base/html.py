@@ -17,9 +17,11 @@ from typing import Any
 from urllib.parse import quote
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, pass_eval_context
+from jinja2.filters import do_mark_safe
 
 from neurolens.base.errors import one_line
 
+_SPECIAL = re.compile(r"([\\`*_|<\[])")  # characters of Markdown
 _FOLDERS = [Path(__file__).parents[1] / name for name in ("templates", "view/page")]
 
 
@@ -40,14 +42,12 @@ def _templates() -> Environment:
         lstrip_blocks=True, keep_trailing_newline=True, finalize=_checked,
     )  # fmt: skip
     environment.filters["quoted"] = lambda svg: quote(svg, safe=" /:=(),;.")
-    environment.filters["literal"] = lambda value: _Quoted(json.dumps(value))  # escapes what is not ASCII
-    environment.filters["line"] = lambda text: _Quoted(re.sub(r"([\\`*_|<\[])", r"\\\1", one_line(str(text), 1000)))
+    environment.filters["literal"] = lambda value: do_mark_safe(json.dumps(value))  # escapes what is not ASCII
+    environment.filters["line"] = lambda text: do_mark_safe(
+        re.sub(r"([\\`*_|<\[])", r"\\\1", one_line(str(text), 1000))
+    )
     environment.globals["text"] = text_of
     return environment
-
-
-class _Quoted(str):
-    """A text that no language reads as anything else."""
 
 
 def _is_markup(name: str | None) -> bool:

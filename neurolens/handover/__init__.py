@@ -1,4 +1,1 @@
-"""A lens as files of the programs that follow a render: each module writes one standard, `shot.py` what all share.
-
-The texts are templates of `templates/`, `handover.*.jinja`; the command is `cli/handover.py`.
-"""
+"""A lens as files of the programs that follow a render: one module a standard; their texts are templates."""

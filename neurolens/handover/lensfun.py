@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 
 from neurolens.cameras.contract import Camera
-from neurolens.cameras.field import Array, Field, spectrum_of, traced_light
-from neurolens.handover.shot import FAR_M, Handed, falloff, film_radii
+from neurolens.cameras.field import Array, Complex, Field, spectrum_of, traced_light
+from neurolens.handover.shot import FAR_M, Handed, falloff, film_points
 
 TYPES = {"equidistant": "fisheye"}  # other names are ours
 MOST_FRAMES = 9  # of an animation that a profile has
@@ -61,14 +61,14 @@ def entry_of(
     film_mm = shot.film_mm(picture)
     corner = math.hypot(picture[0] - 1, picture[1] - 1) / 2 * pixel
     unit = corner / math.hypot(1, max(film_mm) / min(film_mm))
-    shown = film_radii(field, film_mm, 257)
-    (size, a, b), left = _minimax(field.ideal(shown + 0j).real / unit, shown / unit, (1, 3, 5))
+    points = film_points(field, film_mm, 257)
+    (size, a, b), left = _minimax(field.ideal(points).real / unit, points.real / unit, (1, 3, 5))
     colours = []
     for nm in red_blue_nm:
-        light = traced_light(camera, shown + 0j, spectrum_of(camera, only_nm=nm), field.frame, field.target, focus_m)
+        light = traced_light(camera, points, spectrum_of(camera, only_nm=nm), field.frame, field.target, focus_m)
         # Where the mean colour shows what this one shows.
-        colours.append(_minimax(field.picture(light.place).real / unit, shown / unit, (1, 2, 3)))
-    lights, share = _lights(field, camera, focus_m, np.append(0.0, film_radii(field, film_mm)), corner, at_stop)
+        colours.append(_minimax(field.picture(light.place).real / unit, points.real / unit, (1, 2, 3)))
+    lights, share = _lights(field, camera, focus_m, points[::4], corner, at_stop)
     focal, px = field.frame.reach_mm[0], unit / pixel
     return Entry(
         focal, min(focus_m, FAR_M), focal * size, (a / size**3, b / size**5), colours[0][0], colours[1][0], lights,
@@ -79,29 +79,28 @@ def entry_of(
 def _minimax(x: Array, y: Array, powers: Sequence[int]) -> tuple[tuple[float, ...], float]:
     """Coefficients of a polynomial with the least worst distance from y, by Lawson's weights, and that distance."""
     rows, weight = np.stack([x**p for p in powers], 1), np.ones(x.size)
-    best, least = np.zeros(len(powers)), math.inf
+    best, least = tuple[float, ...](), math.inf
     for _ in range(_ROUNDS):
         root = np.sqrt(weight)
         found = np.linalg.lstsq(rows * root[:, None], y * root, rcond=None)[0]
         left = np.abs(rows @ found - y)
         if left.max() < least:
-            best, least = found, float(left.max())
+            best, least = tuple(found.tolist()), float(left.max())
         weight = weight * left + 1e-12
         weight = weight / weight.sum()
-    return tuple(best.tolist()), least
+    return best, least
 
 
 def _lights(
-    field: Field, camera: Camera, focus_m: float, radius: Array, corner: float, at_stop: AtStop
+    field: Field, camera: Camera, focus_m: float, points: Complex, corner: float, at_stop: AtStop
 ) -> tuple[tuple[tuple[float, ...], ...], float]:
-    """The light by aperture, the shot's own among them, and the worst share that the formula leaves; r is `radius`, the
-    axis first, over `corner`."""
+    """The light by aperture, the shot's own among them, and the worst share that the formula leaves."""
     own = float(camera.settings["lens_state"]["f_number"])
     further = [f for k in _SMALLER if (f := float(f"{own * 2 ** (k / 2):.3g}")) < _SMALLEST]
-    rows, worst = {}, 0.0
+    rows, worst, points = {}, 0.0, np.append(0j, points)
     for made in (at_stop(None), *map(at_stop, further), camera):
-        light = traced_light(made, radius + 0j, field.spectrum, field.frame, field.target, focus_m).light
-        k, left = falloff(light[1:] / light[0], radius[1:] / corner)
+        light = traced_light(made, points, field.spectrum, field.frame, field.target, focus_m).light
+        k, left = falloff(light[1:] / light[0], points.real[1:] / corner)
         f_number = float(made.settings["lens_state"]["f_number"])
         rows[f"{f_number:.3g}"] = (f_number, *k)
         worst = max(worst, left)

@@ -17,7 +17,7 @@ import numpy as np
 from neurolens.analysis import projections
 from neurolens.base.html import html
 from neurolens.cameras.field import Array, Field
-from neurolens.handover.shot import FAR_M, Handed, Pinhole, falloff, film_radii
+from neurolens.handover.shot import FAR_M, Handed, Pinhole, falloff, film_points
 
 MODELS = "Brown-Conrady D-U", "Brown-Conrady U-D"
 _POINTS = (61, 41), (50, 34)  # over the film: fitted, held out
@@ -28,8 +28,8 @@ def sample(field: Field, pinhole: Pinhole, shot: Handed) -> tuple[str, float | N
     """The sample of one frame as JSON, and the worst that its formulae leave: pixels, share of light."""
     plane = field.field_deg <= projections.WIDEST_DEG and pinhole.squeeze == 1
     distortion, left_px = _distortions(field, shot) if plane else ([], None)
-    radius = film_radii(field, shot.film_mm(shot.plates.picture, squeezed=True))
-    light, share = falloff(field.relative_light(np.asarray(radius, np.complex128)), radius)
+    points = film_points(field, shot.film_mm(shot.plates.picture, squeezed=True))
+    light, share = falloff(field.relative_light(points), points.real)
     squeeze = Fraction(pinhole.squeeze).limit_denominator(1000)
     values = {
         "shot": shot,

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from neurolens.cameras.field import Array, Field
+from neurolens.cameras.field import Array, Complex, Field
 from neurolens.render.stmap import Plates
 
 FAR_M = 1e6  # stands for infinity where a program takes no other number
@@ -97,6 +97,6 @@ def falloff(light: Array, radius: Array) -> tuple[tuple[float, ...], float]:
     return tuple(found.tolist()), float(np.abs(powers @ found + 1 - light[lit]).max())
 
 
-def film_radii(field: Field, film_mm: tuple[float, float], count: int = 65) -> Array:
-    """Radii from the axis to the film's corner, or where the light ends, without the axis, mm."""
-    return np.linspace(0, min(field.end_mm, math.hypot(*film_mm) / 2), count)[1:].astype(np.float64)
+def film_points(field: Field, film_mm: tuple[float, float], count: int = 65) -> Complex:
+    """Points from the axis, without it, to the film's corner, or where the light ends, mm."""
+    return np.linspace(0, min(field.end_mm, math.hypot(*film_mm) / 2), count)[1:].astype(np.complex128)

@@ -40,7 +40,7 @@ def enter_map(field: Field, plates: Plates, report: Report = lambda share: None)
 def exit_map(field: Field, plates: Plates, report: Report = lambda share: None) -> dict[str, FloatArray]:
     """The channels of the picture of places."""
     planes = {name: np.zeros((SIDE, SIDE), np.float32) for name in "RGB"}
-    across = (np.arange(SIDE) + 0.5) * (2 / SIDE) - 1
+    across = np.asarray((np.arange(SIDE) + 0.5) * (2 / SIDE) - 1, np.float64)
     for row, down in enumerate(across):
         place = place_of(field, plates, folded(across, np.full(SIDE, down)))
         planes["R"][row], planes["G"][row] = place
