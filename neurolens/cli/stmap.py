@@ -245,10 +245,7 @@ examples:
             field = frame.fields[name]
             path = start.with_name(".".join(filter(None, (start.name, kind, name, frame.number, "exr"))))
             facts = about | {"map": kind, "wavelengths_nm": field.spectrum[0].tolist(), **_ideal(field, plates)}
-            facts["key"] = fingerprint_of(
-                plain([facts, frame.camera.settings, frame.number, self.distance, self.state.stop])
-            )
-            if not _is_of(path, facts["key"]):
+            if not _is_of(path, facts):
                 planes = make(field, plates, _part(report, 2 * k, 2 * len(jobs)))
                 write_channels(path, planes, None, facts, header)
             files.append(str(path))

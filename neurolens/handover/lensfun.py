@@ -68,7 +68,7 @@ def entry_of(
         light = traced_light(camera, points, spectrum_of(camera, only_nm=nm), field.frame, field.target, focus_m)
         # Where the mean colour shows what this one shows.
         colours.append(_minimax(field.picture(light.place).real / unit, points.real / unit, (1, 2, 3)))
-    lights, share = _lights(field, camera, focus_m, points[::4], corner, at_stop)
+    lights, share = _lights(field, camera, focus_m, points[3::4], corner, at_stop)
     focal, px = field.frame.reach_mm[0], unit / pixel
     return Entry(
         focal, min(focus_m, FAR_M), focal * size, (a / size**3, b / size**5), colours[0][0], colours[1][0], lights,

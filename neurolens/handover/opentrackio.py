@@ -16,8 +16,8 @@ import numpy as np
 
 from neurolens.analysis import projections
 from neurolens.base.html import html
-from neurolens.cameras.field import Array, Field
-from neurolens.handover.shot import FAR_M, Handed, Pinhole, falloff, film_points
+from neurolens.cameras.field import Array, Complex, Field
+from neurolens.handover.shot import FAR_M, Handed, Pinhole, falloff
 
 MODELS = "Brown-Conrady D-U", "Brown-Conrady U-D"
 _POINTS = (61, 41), (50, 34)  # over the film: fitted, held out
@@ -28,8 +28,8 @@ def sample(field: Field, pinhole: Pinhole, shot: Handed) -> tuple[str, float | N
     """The sample of one frame as JSON, and the worst that its formulae leave: pixels, share of light."""
     plane = field.field_deg <= projections.WIDEST_DEG and pinhole.squeeze == 1
     distortion, left_px = _distortions(field, shot) if plane else ([], None)
-    points = film_points(field, shot.film_mm(shot.plates.picture, squeezed=True))
-    light, share = falloff(field.relative_light(points), points.real)
+    points = _lit(field, shot, _POINTS[0])
+    light, share = falloff(field.relative_light(points), np.abs(points))
     squeeze = Fraction(pinhole.squeeze).limit_denominator(1000)
     values = {
         "shot": shot,
@@ -46,12 +46,9 @@ def sample(field: Field, pinhole: Pinhole, shot: Handed) -> tuple[str, float | N
 
 def _distortions(field: Field, shot: Handed) -> tuple[list[tuple[str, list[float]]], float]:
     """Names of both directions with their coefficients, and the worst that they leave in pixels."""
-    focal, pixel, film = field.frame.reach_mm[0], shot.plates.pixel_mm[0], shot.film_mm(shot.plates.picture)
-    pairs = []
-    for across, up in _POINTS:
-        x, y = np.meshgrid(np.linspace(-0.5, 0.5, across) * film[0], np.linspace(-0.5, 0.5, up) * film[1])
-        point = (x + 1j * y).reshape(-1)
-        point = point[field.lit(point)]
+    focal, pixel, pairs = field.frame.reach_mm[0], shot.plates.pixel_mm[0], []
+    for counts in _POINTS:
+        point = _lit(field, shot, counts)
         way = field.directions(point)
         pairs.append([np.stack([point.real, point.imag], 1), focal * (way[:2] / way[2]).T])
     found, worst = [], 0.0
@@ -69,6 +66,14 @@ def _distortions(field: Field, shot: Handed) -> tuple[list[tuple[str, list[float
         found.append((model, [k / focal**n for k, n in ((k1, 2), (k4, 2), (k2, 4), (k5, 4), (k3, 6), (k6, 6))]))
         worst = max(worst, left)
     return found, worst
+
+
+def _lit(field: Field, shot: Handed, counts: tuple[int, int]) -> Complex:
+    """Points of the film that light reaches."""
+    film = shot.film_mm(shot.plates.picture, squeezed=True)
+    x, y = np.meshgrid(*(np.linspace(-0.5, 0.5, n) * side for n, side in zip(counts, film, strict=True)))
+    points = np.asarray(x + 1j * y, np.complex128).reshape(-1)
+    return points[field.lit(points)]
 
 
 def _ways(slope: Array) -> Any:

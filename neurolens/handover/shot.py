@@ -73,11 +73,6 @@ class Handed:
         return str(self.attributes.get("lensModel") or self.attributes["cameraModel"])
 
     @property
-    def animated(self) -> bool:
-        """Whether there are frames by number."""
-        return bool(self.frames[0].name)
-
-    @property
     def pixel_aspect(self) -> float:
         """The width of a pixel over its height in what it shows."""
         return float(f"{self.frames[0].squeeze * self.plates.pixel_mm[0] / self.plates.pixel_mm[1]:.6g}")
