@@ -26,7 +26,7 @@ from neurolens.cameras import field as fields
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.field import field_of, spectrum_of
 from neurolens.cli import main
-from neurolens.cli.handover import _rate
+from neurolens.cli.handover import _rate, _Writer
 from neurolens.handover import lensfun, opentrackio, usd
 from neurolens.handover.shot import Handed, Pinhole, falloff
 from neurolens.lens.paraxial import chief_reach_mm
@@ -518,7 +518,6 @@ def test_what_a_standard_cannot_say_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fields, "_ROUND", (65, 1))
-    monkeypatch.setattr(fields, "_OTHER", (9, 8))
     monkeypatch.setattr(usd, "SIDE", 65)
     small = ("--width", "64", "--quiet", "-o", tmp_path / "a")
     fisheye = ("fisheye-equidistant", "--film", "36x20.25")
@@ -544,18 +543,27 @@ def test_what_a_standard_cannot_say_is_one_line(
         "distortion" not in sample["lens"]
         and ElementTree.parse(tmp_path / "f" / "shot.lensfun.xml").findtext("lens/type") == "fisheye"
     )
-    lens = ROOT / "models" / "cooke_anamorphic_42.ols-64.onnx"
-    words = (lens, "--film", "20x16", "--focus", "3", "--size", "60x48", "--quiet", "-o", tmp_path / "squeezed")
-    told = run_json(capsys, "handover", *words)
-    assert told["not_written"] == ["shot.lensfun.xml: lensfun knows no anamorphic lens"]
-    sample = json.loads((tmp_path / "squeezed" / "shot.opentrackio.json").read_text())
-    squeeze = sample["static"]["camera"]["anamorphicSqueeze"]
-    assert (
-        squeeze["num"] / squeeze["denom"] == pytest.approx(told["frames"][0]["pixel_aspect"], rel=1e-3)
-        and 1.9 < squeeze["num"] / squeeze["denom"] < 2.1
-    )
-    assert not (tmp_path / "squeezed" / "shot.lensfun.xml").exists()
-    assert "lensfun knows no anamorphic lens" in (tmp_path / "squeezed" / "README.md").read_text()
+
+
+def test_an_anamorphic_lens_has_its_squeeze_where_a_standard_knows_one() -> None:
+    """The pinhole's film is as much wider, pixels have its ratio; what knows spherical lenses alone is left out."""
+    camera = make_camera("thin", Shot(film_mm=(20.0, 16.0), focus_m=3.0, focal_length_mm=42.0))
+    field = replace(field_of(camera, 3.0), frame=fields.Frame((21.0, 42.0), (40.0, 40.0)))
+    plates = plates_of([field], (60, 48), (20.0, 16.0))
+    pinhole = Pinhole.of("", field, camera.settings, 3.0)
+    shot = Handed({"cameraModel": "thin"}, "0", (24, 1), (pinhole,), plates, ())
+    assert pinhole.squeeze == shot.pixel_aspect == 2 and shot.film_mm((60, 48)) == pytest.approx((40, 16))
+    text, left_px, _ = opentrackio.sample(field, pinhole, shot)
+    sample = json.loads(text)
+    assert sample["static"]["camera"]["anamorphicSqueeze"] == {"num": 2, "denom": 1}
+    assert sample["static"]["camera"]["activeSensorPhysicalDimensions"] == pytest.approx({"width": 20, "height": 16})
+    assert "distortion" not in sample["lens"] and left_px is None
+    writer = _Writer(None, [], shot)  # type: ignore[arg-type]
+    assert writer._entries(None) == []  # type: ignore[arg-type]
+    assert writer.notes == ["shot.lensfun.xml: lensfun knows no anamorphic lens"]
+    values = hostile() | {"shot": shot, "entries": [], "notes": writer.notes}
+    assert "lensfun knows no anamorphic lens" in html("handover.README.md.jinja", **values)
+    assert '"60 48 0 0 60 48 2.0 neurolens_plate"' in html("handover.nk.jinja", **values)
 
 
 def test_rates_are_fractions() -> None:
