@@ -77,7 +77,7 @@ LEAN_MODULES = {
 
 
 # Lines of Python that the package may have; a feature that needs more pays by what it replaces.
-MOST_LINES, MOST_MODULES = 60358, 253
+MOST_LINES, MOST_MODULES = 60355, 253
 
 
 def module_name(path: Path) -> str:

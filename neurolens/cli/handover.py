@@ -179,11 +179,12 @@ class _Writer:
         with progress.stage("fit lensfun's profile") as report:
             for n in chosen:
                 frame, (_, state) = self.frames[rows[n]], states[rows[n]]
+                plane_m = frame.focus_m if command.distance is None else command.distance
 
                 def at_stop(f_number: float | None, state: Any = state) -> Camera:
                     return command.make(replace(state, f_number=f_number), progress)[0]
 
-                entry = entry_of(frame.fields[""], frame.camera, frame.focus_m, self.shot, red_blue, at_stop)
+                entry = entry_of(frame.fields[""], frame.camera, plane_m, self.shot, red_blue, at_stop)
                 found.append(entry)
                 self._worse("lensfun_px", entry.distortion_px)
                 self._worse("colour_px", entry.colour_px)

@@ -36,7 +36,7 @@ class Entry(NamedTuple):
     """The profile of a lens at one focal length.
 
     Attributes:
-        focal_mm, distance_m: of the pinhole, of what is in focus. corrected_mm: of lensfun's corrected picture.
+        focal_mm, distance_m: of the pinhole, of the plane in place. corrected_mm: of lensfun's corrected picture.
         distortion: k1, k2. red, blue: v, c, b. light: f-number, k1, k2, k3 by aperture.
         distortion_px, colour_px, light_share: the worst that the formulae leave.
     """
@@ -54,7 +54,7 @@ class Entry(NamedTuple):
 
 
 def entry_of(
-    field: Field, camera: Camera, focus_m: float, shot: Handed, red_blue_nm: tuple[float, float], at_stop: AtStop
+    field: Field, camera: Camera, plane_m: float, shot: Handed, red_blue_nm: tuple[float, float], at_stop: AtStop
 ) -> Entry:
     """The entry of one state of a round lens; `at_stop` makes its camera at another f-number, None for the widest."""
     picture, pixel = shot.plates.picture, shot.plates.pixel_mm[0]
@@ -65,13 +65,13 @@ def entry_of(
     (size, a, b), left = _minimax(field.ideal(points).real / unit, points.real / unit, (1, 3, 5))
     colours = []
     for nm in red_blue_nm:
-        light = traced_light(camera, points, spectrum_of(camera, only_nm=nm), field.frame, field.target, focus_m)
+        light = traced_light(camera, points, spectrum_of(camera, only_nm=nm), field.frame, field.target, plane_m)
         # Where the mean colour shows what this one shows.
         colours.append(_minimax(field.picture(light.place).real / unit, points.real / unit, (1, 2, 3)))
-    lights, share = _lights(field, camera, focus_m, points[3::4], corner, at_stop)
+    lights, share = _lights(field, camera, plane_m, points[3::4], corner, at_stop)
     focal, px = field.frame.reach_mm[0], unit / pixel
     return Entry(
-        focal, min(focus_m, FAR_M), focal * size, (a / size**3, b / size**5), colours[0][0], colours[1][0], lights,
+        focal, min(plane_m, FAR_M), focal * size, (a / size**3, b / size**5), colours[0][0], colours[1][0], lights,
         left * px, max(missed for _, missed in colours) * px, share,
     )  # fmt: skip
 
@@ -92,14 +92,14 @@ def _minimax(x: Array, y: Array, powers: Sequence[int]) -> tuple[tuple[float, ..
 
 
 def _lights(
-    field: Field, camera: Camera, focus_m: float, points: Complex, corner: float, at_stop: AtStop
+    field: Field, camera: Camera, plane_m: float, points: Complex, corner: float, at_stop: AtStop
 ) -> tuple[tuple[tuple[float, ...], ...], float]:
     """The light by aperture, the shot's own among them, and the worst share that the formula leaves."""
     own = float(camera.settings["lens_state"]["f_number"])
     further = [f for k in _SMALLER if (f := float(f"{own * 2 ** (k / 2):.3g}")) < _SMALLEST]
     rows, worst, points = {}, 0.0, np.append(0j, points)
     for made in (at_stop(None), *map(at_stop, further), camera):
-        light = traced_light(made, points, field.spectrum, field.frame, field.target, focus_m).light
+        light = traced_light(made, points, field.spectrum, field.frame, field.target, plane_m).light
         k, left = falloff(light[1:] / light[0], points.real[1:] / corner)
         f_number = float(made.settings["lens_state"]["f_number"])
         rows[f"{f_number:.3g}"] = (f_number, *k)
