@@ -1,19 +1,27 @@
-"""HTML from the templates of this package. Every value is escaped, so that no text of a stranger's file runs.
+"""HTML, and files of other programs, from the templates of this package, so that no text of a stranger's file runs.
 
 Templates, styles and scripts are files of `templates/` and of `view/page/`. A template puts a style or a script of
-theirs into the page as it is, by `text(name) | safe`. A link needs more than escaping: see `local_url`.
+theirs into the page as it is, by `text(name) | safe`. A link needs more than escaping: see `local_url`. Every value of
+HTML and XML is escaped. Templates of other languages (NAME.jinja) take numbers as they are, and refuse a text that no
+filter has quoted: `literal` for Python, USD and JSON, `line` for a line of Markdown or of a comment.
 """
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, pass_eval_context
+from jinja2.filters import do_mark_safe
 
+from neurolens.base.errors import one_line
+
+_SPECIAL = re.compile(r"([\\`*_|<\[])")  # characters of Markdown
 _FOLDERS = [Path(__file__).parents[1] / name for name in ("templates", "view/page")]
 
 
@@ -30,12 +38,28 @@ def html_parts(template: str, **values: Any) -> Iterator[str]:
 @cache
 def _templates() -> Environment:
     environment = Environment(
-        loader=FileSystemLoader(_FOLDERS), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-        lstrip_blocks=True, keep_trailing_newline=True,
+        loader=FileSystemLoader(_FOLDERS), autoescape=_is_markup, undefined=StrictUndefined, trim_blocks=True,
+        lstrip_blocks=True, keep_trailing_newline=True, finalize=_checked,
     )  # fmt: skip
     environment.filters["quoted"] = lambda svg: quote(svg, safe=" /:=(),;.")
+    environment.filters["literal"] = lambda value: do_mark_safe(json.dumps(value))  # escapes what is not ASCII
+    environment.filters["line"] = lambda text: do_mark_safe(
+        re.sub(r"([\\`*_|<\[])", r"\\\1", one_line(str(text), 1000))
+    )
     environment.globals["text"] = text_of
     return environment
+
+
+def _is_markup(name: str | None) -> bool:
+    return not str(name).endswith(".jinja") or str(name).endswith(".xml.jinja")
+
+
+@pass_eval_context
+def _checked(context: Any, value: Any) -> Any:
+    """The value of an expression, refused where it is a text that could be read as code."""
+    if not context.autoescape and type(value) is str:  # `safe` makes another type of it
+        raise TypeError(f"{value[:40]!r} needs a filter that quotes it")
+    return value
 
 
 def text_of(name: str) -> str:

@@ -316,13 +316,19 @@ class Field:
         return np.where(np.abs(point) <= self.end_mm * (1 + 1e-9), value, 0.0)
 
     def directions(self, point: Complex) -> Array:
-        """Unit vectors [3, N] (z towards the scene) of picture points, of a field laid out as `equidistant`."""
-        assert self.target == "equidistant"
+        """Unit vectors [3, N] (z towards the scene) of picture points, from the ideal camera's point."""
         place = self.ideal(point)
         place = place.real / self.frame.reach_mm[0] + 1j * (place.imag / self.frame.reach_mm[1])
-        angle = np.abs(place)
-        turn = place / np.where(angle > 0, angle, 1.0)
+        rho = np.abs(place)
+        angle = np.arctan(rho) if self.target == RECTILINEAR else PROJECTIONS[self.target].angle(rho)
+        turn = place / np.where(rho > 0, rho, 1.0)
         return np.stack([np.sin(angle) * turn.real, np.sin(angle) * turn.imag, np.cos(angle)])
+
+    def point(self, direction: Array) -> Complex:
+        """Picture points of directions [3, N], those back again: NaN where the ideal camera sees nothing."""
+        behind = direction[2] <= 0 if self.target == RECTILINEAR else direction[2] < -1 + 1e-9
+        with np.errstate(all="ignore"):
+            return self.picture(np.where(behind, np.nan, _undistorted(direction, self.frame, self.target)))
 
 
 def field_of(

@@ -55,6 +55,7 @@ def build_parser() -> Parser:
     from neurolens.cli.evaluate import Evaluate
     from neurolens.cli.export import Export
     from neurolens.cli.flare import Flare
+    from neurolens.cli.handover import Handover
     from neurolens.cli.lens import Lens
     from neurolens.cli.library import Library
     from neurolens.cli.mitsuba import Mitsuba
@@ -71,7 +72,7 @@ def build_parser() -> Parser:
         "lenses": (Lens, Analyse, Verify, Rims, Convert, Glass, Library, Survey, View),
         "camera models of a lens": (Train, Models, Evaluate),
         "pictures": (Demo, Plan, Render, Flare),
-        "compositing and other programs": (Defocus, Bokeh, StMap, Projection, Export, Blender, Mitsuba),
+        "compositing and other programs": (Defocus, Bokeh, Handover, StMap, Projection, Export, Blender, Mitsuba),
     }
     parser = Parser(
         prog="neurolens", usage="neurolens COMMAND ...", description=_DESCRIPTION, epilog=_EPILOG,

@@ -19,6 +19,7 @@ from neurolens.cli.stmap import LIGHT_NM, PictureCommand
 
 if TYPE_CHECKING:
     from neurolens.analysis import projections
+    from neurolens.cameras.field import Field
 
 _FITTED, _HELD_OUT = (61, 41), (50, 34)  # points over the film
 
@@ -57,45 +58,54 @@ examples:
                 self.refuse("--output", str(out), "a name")
             if out.suffix in (".json", ".yaml"):  # the name of a file that will be written
                 out = out.with_suffix("")
-        from neurolens.analysis.projections import fit, residual
         from neurolens.cameras.field import field_of, spectrum_of
 
-        progress, size, film = self.progress(), self.picture, self.film
+        progress = self.progress()
         camera, shot = self.make(self.state, progress)
         with progress.stage(f"trace the field of {self.camera}"):
             field = field_of(camera, shot.focus_m, "equidistant", spectrum=spectrum_of(camera, LIGHT_NM))
-        step = [side / count for side, count in zip(film, size, strict=True)]
-        focal = (field.frame.reach_mm[0] / step[0], field.frame.reach_mm[1] / step[1])
-        if math.isclose(*field.frame.reach_mm, rel_tol=1e-9) and math.isclose(*step, rel_tol=1e-9):
-            focal = focal[0], focal[0]
         with progress.stage(f"fit {self.projection}"):
-            fitted = fit(self.projection, *shown(field, size, film), size, focal, source=str(self.camera))
-            left = residual(fitted, *shown(field, size, film, _HELD_OUT))
-        rows = [dict(zip(("from_deg", "to_deg", "rms_px", "worst_px"), row, strict=True)) for row in left.by_field]
-        data: dict[str, Any] = {
-            "camera": str(self.camera),
-            "model": fitted.kind,
-            "size": list(fitted.size),
-            "focal_px": list(fitted.focal_px),
-            "centre_px": list(fitted.centre_px),
-            "coefficients": fitted.named,
-            "rms_px": left.rms_px,
-            "worst_px": left.worst_px,
-            "worst_at_deg": left.worst_at_deg,
-            "field_deg": left.field_deg,
-            "turns_back_at_deg": None if left.sound else left.fold_deg,
-            "by_field": rows,
-            "before_film_mm": list(field.frame.pupil_mm),
-        }
-        data["files"] = _write(out, fitted, data) if out is not None else []
+            fitted, left, data = fitted_to(self.projection, field, self.picture, self.film, str(self.camera))
+        data["files"] = write_projection(out, fitted, data) if out is not None else []
         if not left.sound:
             told = f"turns back at {left.fold_deg:.4g} degrees; the picture goes to {left.field_deg:.4g}"
             warn(f"{self.projection} {told}")
         return self.answer(data, lambda: _text(data, left))
 
 
+def fitted_to(
+    kind: str, field: Field, size: tuple[int, int], film_mm: tuple[float, float], source: str, keep_focal: bool = False
+) -> tuple[projections.Projection, projections.Residual, dict[str, Any]]:
+    """A projection fitted to a field, what it leaves, and both as data; raises InputError as `fit`."""
+    from neurolens.analysis.projections import fit, residual
+
+    step = [side / count for side, count in zip(film_mm, size, strict=True)]
+    focal = (field.frame.reach_mm[0] / step[0], field.frame.reach_mm[1] / step[1])
+    if math.isclose(*field.frame.reach_mm, rel_tol=1e-9) and math.isclose(*step, rel_tol=1e-9):
+        focal = focal[0], focal[0]
+    fitted = fit(kind, *shown(field, size, film_mm), size, focal, source, keep_focal)
+    left = residual(fitted, *shown(field, size, film_mm, _HELD_OUT))
+    rows = [dict(zip(("from_deg", "to_deg", "rms_px", "worst_px"), row, strict=True)) for row in left.by_field]
+    data: dict[str, Any] = {
+        "camera": source,
+        "model": fitted.kind,
+        "size": list(fitted.size),
+        "focal_px": list(fitted.focal_px),
+        "centre_px": list(fitted.centre_px),
+        "coefficients": fitted.named,
+        "rms_px": left.rms_px,
+        "worst_px": left.worst_px,
+        "worst_at_deg": left.worst_at_deg,
+        "field_deg": left.field_deg,
+        "turns_back_at_deg": None if left.sound else left.fold_deg,
+        "by_field": rows,
+        "before_film_mm": list(field.frame.pupil_mm),
+    }
+    return fitted, left, data
+
+
 def shown(
-    field: Any, size: tuple[int, int], film_mm: tuple[float, float], points: tuple[int, int] = _FITTED
+    field: Field, size: tuple[int, int], film_mm: tuple[float, float], points: tuple[int, int] = _FITTED
 ) -> tuple[Any, Any]:
     """Unit directions [N, 3] and pixels [N, 2], in OpenCV's frame, of points spread over the lit picture."""
     import numpy as np
@@ -108,7 +118,7 @@ def shown(
     return field.directions(point[lit]).T * [1, -1, 1], pixel[lit]
 
 
-def _write(out: Path, fitted: projections.Projection, data: dict[str, Any]) -> list[str]:
+def write_projection(out: Path, fitted: projections.Projection, data: dict[str, Any]) -> list[str]:
     """Write the files of a projection; their names."""
     files = {}
     if fitted.kind in ("opencv", "opencv-rational", "kannala-brandt"):

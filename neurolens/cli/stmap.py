@@ -5,13 +5,16 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from neurolens import __version__
-from neurolens.base.errors import warn
+from neurolens.base.errors import InputError, warn
+from neurolens.base.files import fingerprint_of
 from neurolens.base.progress import Progress
+from neurolens.base.records import plain
 from neurolens.base.settings import positive, setting
 from neurolens.cli.arguments import (
     CAMERAS_HELP,
@@ -30,11 +33,12 @@ from neurolens.cli.output import number
 from neurolens.render.settings import size_by_shape
 
 if TYPE_CHECKING:
-    from neurolens.cameras.contract import Camera
+    from neurolens.cameras.contract import Camera, FloatArray
     from neurolens.cameras.field import Field
     from neurolens.lens.shot import Shot
     from neurolens.render.stmap import Plates
 
+Maker = Callable[["Field", "Plates", Callable[[float], None]], "dict[str, FloatArray]"]
 _LARGEST = 16384  # pixels a side
 LIGHT_NM = (400.0, 700.0)
 # Dominant wavelengths of the primaries of Rec. 709 (and sRGB), for light of D65.
@@ -108,7 +112,7 @@ class PictureCommand(Glasses, Reporting):
 
 
 @dataclass(frozen=True)
-class _Frame:
+class TracedFrame:
     """One frame: its number in file names ("" for a single one), focus, camera, and fields by their maps' names."""
 
     number: str
@@ -134,7 +138,7 @@ class StMap(PictureCommand):
     it holds every pixel of the plate. Render CG of that size with a pinhole camera of the focal length and place
     that are printed: the lens's paraxial size in the plane in focus, seen from its entrance pupil. Things at other
     distances are off by what is printed as parallax, for a lens's pupil moves with the field: --distance makes maps
-    for another plane.
+    for another plane. Maps that an earlier run of the same settings left stay.
 
     The place of a thing in the picture is the centroid of its light at this stop, over pupil and wavelengths as the
     eye weighs them. Lenses with cylinders keep their squeeze: each meridian has its own focal length and its own
@@ -175,26 +179,31 @@ examples:
         if not self.out.name:
             self.refuse("--output", str(self.out), "the start of the files' names")
         self.frames.check(self.called)
+        progress = self.progress()
+        frames, plates = self.traced(progress)
+        files = self.maps(frames, plates, progress, self.out)
+        data = self.data_of(frames, plates) | {"files": files}
+        return self.answer(data, lambda: _text(data))
+
+    def states(self) -> list[tuple[str, LensState]]:
+        """The numbers of frames as file names have them, and the state of the lens there."""
+        if self.frames.frames is None:
+            return [("", self.state)]
+        keyed = frames_of(self.frames.frames, self.frames.key, vars(self.state), self.called, LENS_KEYS)
+        return [(digits, replace(self.state, **values)) for _, digits, values in keyed]
+
+    def traced(self, progress: Progress) -> tuple[list[TracedFrame], Plates]:
+        """All frames with their fields, and the pictures that hold what any of them shows."""
         from neurolens.render.stmap import plates_of
 
-        progress, states = self.progress(), [("", self.state)]
-        if self.frames.frames is not None:
-            keyed = frames_of(self.frames.frames, self.frames.key, vars(self.state), self.called, LENS_KEYS)
-            states = [(digits, replace(self.state, **values)) for _, digits, values in keyed]
-        frames = []
+        states, frames = self.states(), []
         with progress.stage(f"trace the field of {self.camera}") as report:
             for k, (digits, state) in enumerate(states):
                 frames.append(self._traced(state, digits, progress))
                 report((k + 1) / len(states))
-        plates = plates_of([f for frame in frames for f in frame.fields.values()], self.picture, self.film)
-        files = []
-        with progress.stage("write the maps") as report:
-            for k, frame in enumerate(frames):
-                files += self._written(frame, plates, _part(report, k, len(frames)))
-        data = self._data(frames, plates) | {"files": files}
-        return self.answer(data, lambda: _text(data))
+        return frames, plates_of([f for frame in frames for f in frame.fields.values()], self.picture, self.film)
 
-    def _traced(self, state: LensState, digits: str, progress: Progress) -> _Frame:
+    def _traced(self, state: LensState, digits: str, progress: Progress) -> TracedFrame:
         """The fields of one frame."""
         from neurolens.cameras.field import field_of, frame_of, spectrum_of
 
@@ -208,33 +217,47 @@ examples:
             )
             for name, nm in {"": None, **wavelengths}.items()
         }  # fmt: skip
-        return _Frame(digits, shot.focus_m, camera, fields)
+        return TracedFrame(digits, shot.focus_m, camera, fields)
 
-    def _written(self, frame: _Frame, plates: Plates, report: Callable[[float], None]) -> list[str]:
-        """Write the maps of one frame; their names."""
-        from neurolens.render.pictures import standard_attributes, write_channels
+    def maps(self, frames: list[TracedFrame], plates: Plates, progress: Progress, start: Path) -> list[str]:
+        """Write the maps of all frames; their names, which begin with `start`."""
+        files = []
+        with progress.stage("write the maps") as report:
+            for k, frame in enumerate(frames):
+                files += self._written(frame, plates, start, _part(report, k, len(frames)))
+        return files
+
+    def jobs(self, frame: TracedFrame) -> list[tuple[str, str, Maker]]:
+        """The maps of a frame: kind, colour ("" for the mean one), and what makes the channels."""
         from neurolens.render.stmap import illumination_map, redistort_map, undistort_map
 
         makers = {"undistort": undistort_map, "redistort": redistort_map}
-        jobs = [(kind, name, makers[kind]) for name in frame.fields for kind in makers]
-        jobs.append(("illumination", "", illumination_map))
-        files = []
+        pairs = [(kind, name, make) for name in frame.fields for kind, make in makers.items()]
+        return [*pairs, ("illumination", "", illumination_map)]
+
+    def _written(self, frame: TracedFrame, plates: Plates, start: Path, report: Callable[[float], None]) -> list[str]:
+        """Write the maps of one frame, but those that an earlier run of the same settings left; their names."""
+        from neurolens.render.pictures import standard_attributes, write_channels
+
+        jobs, files = self.jobs(frame), []
         header = standard_attributes(frame.camera.settings, frame=int(frame.number) if frame.number else None)
         header["pixelAspectRatio"] = _ideal(frame.fields[""], plates)["pixel_aspect"]
         about: dict[str, Any] = {"version": __version__, "camera": str(self.camera), "name": frame.camera.name}
         about |= {"picture_px": list(plates.picture), "undistorted_px": list(plates.undistorted)}
         about |= {"film_mm": list(self.film), "focus_m": None if math.isinf(frame.focus_m) else frame.focus_m}
+        about["settings"] = fingerprint_of(plain([frame.camera.settings, self.distance, self.state.stop]))
         for k, (kind, name, make) in enumerate(jobs):
             field = frame.fields[name]
-            planes = make(field, plates, _part(report, 2 * k, 2 * len(jobs)))
-            path = self.out.with_name(".".join(filter(None, (self.out.name, kind, name, frame.number, "exr"))))
-            facts = {"map": kind, "wavelengths_nm": field.spectrum[0].tolist(), **_ideal(field, plates)}
-            write_channels(path, planes, None, about | facts, header)
+            path = start.with_name(".".join(filter(None, (start.name, kind, name, frame.number, "exr"))))
+            facts = about | {"map": kind, "wavelengths_nm": field.spectrum[0].tolist(), **_ideal(field, plates)}
+            if not _is_of(path, facts):
+                planes = make(field, plates, _part(report, 2 * k, 2 * len(jobs)))
+                write_channels(path, planes, None, facts, header)
             files.append(str(path))
             report((k + 1) / len(jobs))
         return files
 
-    def _data(self, frames: list[_Frame], plates: Plates) -> dict[str, Any]:
+    def data_of(self, frames: list[TracedFrame], plates: Plates) -> dict[str, Any]:
         """The figures of the maps."""
         from neurolens.render.stmap import worst_px
 
@@ -261,6 +284,15 @@ examples:
             "film_undistorted_mm": [n * p for n, p in zip(plates.undistorted, plates.pixel_mm, strict=True)],
             "frames": rows,
         }
+
+
+def _is_of(path: Path, facts: dict[str, Any]) -> bool:
+    """Whether a map is there, whole, with this in its header."""
+    from neurolens.render.pictures import read_metadata
+
+    with suppress(InputError):
+        return read_metadata(path) == plain(facts)
+    return False
 
 
 def _part(report: Callable[[float], None], done: int, of: int) -> Callable[[float], None]:

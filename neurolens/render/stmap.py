@@ -93,7 +93,7 @@ def redistort_map(field: Field, plates: Plates, report: Report = lambda share: N
 def illumination_map(field: Field, plates: Plates, report: Report = lambda share: None) -> dict[str, FloatArray]:
     """Relative illumination of the lens's picture, 1 on the axis, as channel Y."""
     light = np.empty(plates.picture[::-1], np.float32)
-    for rows, point in _blocks(plates.picture, plates.pixel_mm, report):
+    for rows, point in blocks(plates.picture, plates.pixel_mm, report):
         light[rows] = field.relative_light(point)
     return {"Y": light}
 
@@ -106,7 +106,7 @@ def _channels(
     report: Report,
 ) -> dict[str, FloatArray]:
     planes = {name: np.empty(made[::-1], np.float32) for name in "RGB"}
-    for rows, point in _blocks(made, plates.pixel_mm, report):
+    for rows, point in blocks(made, plates.pixel_mm, report):
         place, lit = where(point)
         s = place.real / (read[0] * plates.pixel_mm[0]) + 0.5
         t = place.imag / (read[1] * plates.pixel_mm[1]) + 0.5
@@ -116,7 +116,7 @@ def _channels(
     return planes
 
 
-def _blocks(size: tuple[int, int], pixel_mm: tuple[float, float], report: Report) -> Iterator[tuple[slice, Complex]]:
+def blocks(size: tuple[int, int], pixel_mm: tuple[float, float], report: Report) -> Iterator[tuple[slice, Complex]]:
     """Rows from the top with the places of their pixels' centres, x + i y in mm."""
     width, height = size
     x = (np.arange(width) + 0.5 - width / 2) * pixel_mm[0]

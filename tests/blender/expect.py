@@ -1,7 +1,7 @@
 """What Blender must show, by neurolens's exact lenses: python tests/blender/expect.py FOLDER.
 
 Blender's Python cannot run neurolens. This writes shots.json, numbers for test_optics.py, the shaders named there, and
-maps of `neurolens stmap`.
+maps of `neurolens stmap`, and a lens handed over by `neurolens handover`.
 """
 
 from __future__ import annotations
@@ -213,6 +213,8 @@ def main(folder: Path) -> None:
         shots += [white_card(LENSES["rectilinear"], 1.83), white_card(LENSES["anamorphic"], 2.8)]
         shots += [white_card(LENSES["fisheye"], 2.8)]
     command_line(["stmap", _GAUSS, "--width", "120", "--film", "36x20.4", "-o", str(folder / "maps"), "--quiet"])
+    handed = ["handover", _GAUSS, "--width", "120", "--film", "36x20.4", "--focus", "2", "--f-number", "4", "--quiet"]
+    command_line([*handed, "--lateral-colour", "-o", str(folder / "handed")])
     (folder / "shots.json").write_text(json.dumps(shots, indent=1), encoding="utf-8")
 
 

@@ -1,0 +1,1 @@
+"""A lens as files of the programs that follow a render: one module a standard; their texts are templates."""
