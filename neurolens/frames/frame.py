@@ -195,14 +195,15 @@ class Prepared:
 
     Attributes:
         scene: with the camera in the frame's place. film: its [film] table with the frame's changes.
-        size: width and height of the whole picture in pixels. rows: the first row of the frame's tile and the one after
-            its last; None without a tile.
+        sensor: what counts the picture, None without. size: width and height of the whole picture in pixels.
+        rows: the first row of the frame's tile and the one after its last; None without a tile.
     """
 
     frame: Frame
     files: Files
     scene: Scene
     film: FilmSettings
+    sensor: SensorSettings | None
     camera: Camera
     size: tuple[int, int]
     rows: tuple[int, int] | None
@@ -245,12 +246,13 @@ def prepare(frame: Frame, out: Path, progress: Progress | None = None) -> Prepar
         check_name(frame.scene, "--white-balance", frame.white_balance, scene.illuminants)
     settings = scene.settings.camera
     shot, (width, height) = frame.shot(settings, scene.aperture), frame.size(settings)
+    film, sensor = frame.film(scene.settings.film), frame.reads(scene.settings.sensor)
     PixelGrid(width, height, shot.film_mm)  # checked before the slow make_camera
     rows = None if frame.tile is None else rows_of(height, frame.tile)
     camera = make_camera(str(frame.camera), shot, progress)
     for note in (*camera.settings.get("notes", ()), *_pixel_notes(camera, width)):
         warn(note)
-    return Prepared(frame, files, scene, frame.film(scene.settings.film), camera, (width, height), rows)
+    return Prepared(frame, files, scene, film, sensor, camera, (width, height), rows)
 
 
 def _pixel_notes(camera: Camera, width: int) -> list[str]:
@@ -376,7 +378,7 @@ def write_pictures(
     if frame.channels == "all" or not result.stats["complete"]:
         layers, metadata["layers"] = asdict(result.layers), MEANING
     rows = prepared.rows or (0, height)
-    if (sensor := frame.reads(prepared.scene.settings.sensor)) is not None:
+    if (sensor := prepared.sensor) is not None:
         added = (flare[name][slice(*rows)] for name in LAYERS if name in flare)  # it stands behind the lens, too
         layers |= expose(sum(added, start=result.rgb), sensor, frame.seed, rows[0])
         metadata["sensor"] = about(sensor, frame.seed)
