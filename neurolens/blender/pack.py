@@ -30,10 +30,7 @@ from neurolens.base.tomlfile import parse_json
 EXTENSION = Path(__file__).parent / "extension"
 FACTS, SCHEMA = "lenses.json", 1
 _ID = "neurolens"
-_CODE = (
-    *("__init__.py", "camera.py", "flare.py", "library.py", "lights.py", "needs.py", "panel.py"),
-    "blender_manifest.toml",
-)
+_CODE = (*sorted(path.name for path in EXTENSION.glob("*.py")), "blender_manifest.toml")
 _THEN = (1980, 1, 1, 0, 0, 0)  # the zip of the same lenses is the same, byte for byte
 _LARGEST = 1 << 28  # of a library: 200 lenses unpacked are some 80 MB
 

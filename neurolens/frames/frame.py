@@ -135,9 +135,9 @@ class Frame:
 
     def reads(self, settings: SensorSettings | None) -> SensorSettings | None:
         """The scene's [sensor] table with the changes of the frame; None: no sensor."""
-        if self.sensor is None or all(value is None for value in vars(self.sensor).values()):
-            return settings
-        return (settings or SensorSettings()).changed_by(self.sensor)
+        given = asdict(self.sensor) if self.sensor else {}
+        given = {name: value for name, value in given.items() if value is not None}
+        return replace(settings or SensorSettings(), **given) if given else settings
 
     def size(self, settings: CameraSettings) -> tuple[int, int]:
         """Width and height in pixels."""

@@ -128,10 +128,8 @@ class Job:
         pixel, sample = np.repeat(pixels, len(indices)), np.tile(indices, len(pixels))
         keys = self.sampler.keys(pixel, sample)
         hue = self.sampler.draw(keys, WAVELENGTH)
-        place = self.sampler.draw2(keys, FILM)
-        if (side := np.float32(math.sqrt(self.settings.fill_factor))) < 1:
-            place = 0.5 + side * (place - np.float32(0.5))
-        film_mm = self.grid.film_points(pixel, place)
+        place, side = self.sampler.draw2(keys, FILM), np.float32(math.sqrt(self.settings.fill_factor))
+        film_mm = self.grid.film_points(pixel, place if side == 1 else 0.5 + side * (place - np.float32(0.5)))
         pupil = self.sampler.draw2(keys, PUPIL)
 
         called = time.perf_counter()
@@ -412,8 +410,7 @@ def mode_for(
     """How paths carry wavelengths: see `Job`.
 
     Raises:
-        InputError: the settings ask for "hero", and the camera disperses but cannot place companions, or not all of
-            a pixel takes light.
+        InputError: the settings ask for "hero", and the camera disperses but cannot place companions in whole pixels.
     """
     if film.wavelengths == "one":
         return "one"

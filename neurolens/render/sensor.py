@@ -38,43 +38,28 @@ def expose(rgb: FloatArray, settings: SensorSettings, seed: int = 0, first_row: 
     if bad := int(np.count_nonzero(~np.isfinite(rgb))):
         raise InputError("sensor", "picture", f"({bad} values not finite)", "finite values")
     height, width = rgb.shape[:2]
-    if settings.mosaic == "none":
-        colours = {f"{RAW}.{name}": np.full((height, width), k) for k, name in enumerate("RGB")}
-    else:
+    colours = {f"{RAW}.{name}": np.full((height, width), k) for k, name in enumerate("RGB")}
+    if settings.mosaic != "none":
         cells = np.array(["RGB".index(name) for name in settings.mosaic]).reshape(2, 2)
         row, column = np.ogrid[first_row : first_row + height, :width]
         colours = {RAW: cells[row % 2, column % 2]}
-    most, scale = _scale(settings)
+    told, noisy = about(settings, seed), settings.noise == "all"
     full = settings.full_well + _SURE * settings.full_well**0.5 + _SURE**2
     planes = {name: np.empty((height, width), np.float32) for name in colours}
     for k in range(height):
         random = np.random.default_rng([seed, first_row + k])
         for name, colour in colours.items():
-            mean = np.take_along_axis(rgb[k], colour[k, :, None], 1)[:, 0] * float(settings.electrons)
-            counted = np.clip(mean, 0, full).astype(np.float64)
-            if settings.noise == "all":
-                counted = random.poisson(counted).astype(np.float64)
-            counted = np.minimum(counted, settings.full_well)
-            if settings.noise == "all":
-                counted += settings.read_noise * random.standard_normal(width)
-            planes[name][k] = np.clip(np.rint(settings.black_level + scale * counted), 0, most)
+            mean = np.take_along_axis(rgb[k], colour[k, :, None], 1)[:, 0].astype(np.float64) * settings.electrons
+            mean = mean.clip(0, full)
+            counted = np.minimum(random.poisson(mean) if noisy else mean, settings.full_well)
+            read = counted + (settings.read_noise * random.standard_normal(width) if noisy else 0.0)
+            numbers = np.rint(settings.black_level + read / told["electrons_per_number"])
+            planes[name][k] = numbers.clip(0, told["white_level"])
     return planes
 
 
-def _scale(settings: SensorSettings) -> tuple[int, float]:
-    """The largest number that is read, and numbers per electron."""
-    most = 2**settings.bits - 1
-    return most, (most - settings.black_level) / settings.full_well
-
-
 def about(settings: SensorSettings, seed: int) -> dict[str, Any]:
-    """The metadata of the channels: the settings, and what turns numbers into electrons and values."""
-    most, scale = _scale(settings)
-    return {
-        **asdict(settings),
-        "seed": seed,
-        "white_level": most,
-        "electrons_per_number": 1 / scale,
-        "unit": "number read; electrons = (number - black_level) * electrons_per_number; value = electrons / electrons "
-        "(of the settings)",
-    }
+    """The metadata of the channels: the settings, the largest number that is read, and the electrons of one."""
+    most = 2**settings.bits - 1
+    electrons = settings.full_well / (most - settings.black_level)
+    return {**asdict(settings), "seed": seed, "white_level": most, "electrons_per_number": electrons}

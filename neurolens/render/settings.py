@@ -12,6 +12,7 @@ from neurolens.base.settings import check_bounds, setting
 ColourSpaceName = Literal["sRGB", "ACEScg"]
 WavelengthMode = Literal["auto", "one", "hero"]
 WavelengthSampling = Literal["importance", "uniform"]
+Mosaic = Literal["none", "RGGB", "BGGR", "GRBG", "GBRG"]
 
 
 @dataclass(frozen=True)
@@ -25,9 +26,6 @@ class FilmSettings:
             point where the camera disperses; "auto", hero where the camera can at little cost, else one.
         wavelength_sampling: "importance", by the film's response times the light of the scene, or "uniform".
         fill_factor: share of a pixel that takes light, a square in its middle: the filter of a pixel is a box.
-
-    Raises:
-        InputError: a fill factor out of bounds.
     """
 
     colour_space: ColourSpaceName = setting("sRGB", "of the EXR, linear: sRGB (D65) or ACEScg (AP1, the white of ACES)")
@@ -35,11 +33,9 @@ class FilmSettings:
         None, "light that becomes neutral: A, D50, D65, E, '3200 K' or a measured one of the scene", metavar="LIGHT"
     )
     wavelengths: WavelengthMode = setting(
-        "auto",
-        "of a path: one; hero, four that share it; auto, hero where the camera can at little cost",
-        option="wavelength-mode",
-        old=("wavelengths",),
-    )
+        "auto", "of a path: one; hero, four that share it; auto, hero where the camera can at little cost",
+        option="wavelength-mode", old=("wavelengths",),
+    )  # fmt: skip
     wavelength_sampling: WavelengthSampling = setting(
         "importance", "by importance (film response times light) or uniform"
     )
@@ -49,9 +45,6 @@ class FilmSettings:
 
     def __post_init__(self) -> None:
         check_bounds(self, "film")
-
-
-Mosaic = Literal["none", "RGGB", "BGGR", "GRBG", "GBRG"]
 
 
 @dataclass(frozen=True)
@@ -70,9 +63,7 @@ class SensorSettings:
     """
 
     mosaic: Mosaic = setting("RGGB", "of colours from the top left (default: RGGB); none: a pixel counts all three")
-    electrons: float = setting(
-        2e4, "mean number in a pixel whose value is 1 (default: 20000)", within=(1e-6, 1e9), metavar="N"
-    )
+    electrons: float = setting(2e4, "of a pixel of value 1, mean (default: 20000)", within=(1e-6, 1e9), metavar="N")
     full_well: float = setting(3e4, "electrons that a pixel holds (default: 30000)", within=(1, 1e9), metavar="N")
     read_noise: float = setting(3.0, "in electrons, RMS, of reading (default: 3)", within=(0, 1e6), metavar="N")
     noise: Literal["all", "none"] = setting("all", "of photons and of reading, by --seed; or none (default: all)")
@@ -84,10 +75,6 @@ class SensorSettings:
         most = 2 ** (self.bits or 16) - 2
         if (self.black_level or 0) > most:
             raise InputError("sensor", "black_level", self.black_level, f"at most {most}, below the largest number")
-
-    def changed_by(self, given: SensorSettings) -> SensorSettings:
-        """These settings with those of `given` that are not None, as of options."""
-        return replace(self, **{name: value for name, value in vars(given).items() if value is not None})
 
 
 def size_by_shape(shape: float, width: int | None, height: int | None) -> tuple[int, int]:

@@ -243,16 +243,15 @@ def best_focused(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float] 
     return replace(lens, film_z_mm=best_focus_z_mm(lens, focus_m, wavelength_nm))
 
 
-_COVER = ("N-BK7", 1.5168, 64.17)  # glass of a cover glass, its n_d and V_d
-_COVER_AIR_MM = 0.5  # between it and the film
+_COVER, _COVER_AIR_MM = ("N-BK7", 1.5168, 64.17), 0.5  # its glass with n_d and V_d, and its distance from the film
 
 
 def with_cover_glass(
     lens: Lens, thickness_mm: float, focus_m: float, focus_mode: str, wavelength_nm: tuple[float, float]
 ) -> Lens:
-    """Return a lens whose film is placed with a plane plate before the film, and the film in focus again.
+    """Return a lens whose film is placed with a plane plate before the film, wherever: it does not matter for rays.
 
-    Where the plate stands does not matter for rays. None is added where it has no thickness.
+    The film is in focus again. No plate is added where it has no thickness.
 
     Raises:
         InputError: a plate that is thicker than the room behind the lens.
@@ -273,11 +272,8 @@ def with_cover_glass(
     back = Surface(math.inf, _COVER_AIR_MM, wide, last.n_d, last.V_d, last.material, glass=last.glass)
     place = len(lens.surfaces) - 1
     moved = tuple((k, room if k == place else gap) for k, gap in lens.infinity_mm)
-    covered = lens.with_gaps({place: room})
-    covered = replace(
-        covered, surfaces=(*covered.surfaces, front, back), infinity_mm=moved, film_z_mm=film_z,
-        derived=f"{lens.derived} A cover glass of {thickness_mm:g} mm.".strip(),
-    )  # fmt: skip
+    rows, told = lens.with_gaps({place: room}).surfaces, f"{lens.derived} A cover glass of {thickness_mm:g} mm.".strip()
+    covered = replace(lens, surfaces=(*rows, front, back), infinity_mm=moved, film_z_mm=film_z, derived=told)
     return covered if focus_mode == "paraxial" else best_focused(covered, focus_m, wavelength_nm)
 
 

@@ -26,7 +26,8 @@ _KINDS: dict[str, lights.Kind] = {"SUN": "distant", "AREA": "rectangle", "POINT"
 
 def _seen(data: Any, frame: Any, eye: Any) -> tuple[lights.Seen, Any]:
     """A light of Blender in its frame [4, 4] from a place, and its irradiance there [3]."""
-    kind, size = _KINDS[data.type], (data.angle if data.type == "SUN" else data.shadow_soft_size,)
+    kind = _KINDS[data.type]
+    size: tuple[float, ...] = (data.angle if kind == "distant" else data.shadow_soft_size,)
     if data.type == "AREA":
         size = (data.size, data.size_y if data.shape in ("RECTANGLE", "ELLIPSE") else data.size)
         kind = "disc" if data.shape in ("DISK", "ELLIPSE") else kind
@@ -39,8 +40,7 @@ def _seen(data: Any, frame: Any, eye: Any) -> tuple[lights.Seen, Any]:
         edge = math.cos(data.spot_size / 2)
         t = min(max((seen.cos - edge) / max((1 - edge) * data.spot_blend, 1e-9), 0.0), 1.0)
         power *= t * t * (3 - 2 * t)
-    tint = data.temperature_color if data.use_temperature else (1.0, 1.0, 1.0)
-    return seen, power * np.array(data.color) * np.array(tint)
+    return seen, power * np.array(data.color) * np.array(data.temperature_color if data.use_temperature else 1.0)
 
 
 def _is_free(scene: Any, graph: Any, start: Any, end: Any, near: float) -> bool:
@@ -49,15 +49,13 @@ def _is_free(scene: Any, graph: Any, start: Any, end: Any, near: float) -> bool:
     way, done = (end - start) / left, near
     for _ in range(_MOST_PASSED):
         if done >= left:
-            return True
+            break
         from_ = start + done * way
         hit, point, _normal, _face, thing, _frame = scene.ray_cast(graph, from_.tolist(), way, distance=left - done)
-        if not hit:
-            return True
-        if thing.visible_camera and not thing.hide_render:
-            return False
+        if not hit or (thing.visible_camera and not thing.hide_render):
+            return not hit
         done += float(np.linalg.norm(np.array(point) - from_)) * (1 + 1e-5) + 1e-6 * left
-    return False
+    return True
 
 
 def rows_now(context: Any, found: Any, frame: int, rays: int) -> Iterator[dict[str, Any]]:
@@ -66,8 +64,8 @@ def rows_now(context: Any, found: Any, frame: int, rays: int) -> Iterator[dict[s
     view = np.array(found.evaluated_get(graph).matrix_world)
     eye, setting = view[:3, 3], on_camera.setting_of(scene, found)
     opened = setting.f_number or (found.data.dof.aperture_fstop if found.data.dof.use_dof else math.inf)
-    across = (view[:3, :2] / np.linalg.norm(view[:3, :2], axis=0)).T
-    pupil = found.data.lens / (2000 * opened * setting.lens_unit_m) * across
+    across = found.data.lens / (2000 * opened * setting.lens_unit_m)
+    pupil = across * (view[:3, :2] / np.linalg.norm(view[:3, :2], axis=0)).T
     for instance in graph.object_instances:
         light = instance.object
         if light.type != "LIGHT" or light.hide_render:
@@ -77,15 +75,13 @@ def rows_now(context: Any, found: Any, frame: int, rays: int) -> Iterator[dict[s
         pairs = zip(*lights.ends(seen, eye, pupil, rays), strict=True)
         lit = rgb.any() and (seen.middle - eye) @ view[:3, 2] < 0
         free = sum(_is_free(scene, graph, *pair, found.data.clip_start) for pair in pairs) / rays if lit else 0.0
-        rgb = scene.cycles.film_exposure * rgb
+        rgb *= scene.cycles.film_exposure
         yield lights.row(light.name + number, frame, seen, view, setting.lens_unit_m, rgb, free)
 
 
 def write_lights(context: Any, found: Any, path: Path, rays: int) -> tuple[int, str]:
-    """Write the lights of all frames of the scene, and of a camera that carries a lens its keys, to PATH.keys.json.
-
-    Returns:
-        How many lights there are, and the arguments of `neurolens flare` for them.
+    """Write the lights of all frames of the scene, and of a camera that carries a lens its keys, to PATH.keys.json;
+    returns how many lights there are, and the arguments of `neurolens flare` for them.
 
     Raises:
         LensError: there is no light, or no such folder.

@@ -49,11 +49,10 @@ def see(kind: Kind, frame: Any, size: tuple[float, ...], normalized: bool, eye: 
         sides = size[0] * np.stack([first, np.cross(way, first)])
         solid = (0.25 if normalized else math.pi * size[0] ** 2) / far**2
         return Seen(middle, sides, math.asin(min(size[0] / far, 1.0)), solid, cos)
-    half_axes = frame[:3, :2].T * np.array(size)[:, None] / 2
-    half_axes = half_axes * (1.0 if kind == "disc" else math.sqrt(4 / math.pi))  # the ellipse of a rectangle's area
-    area = math.pi * float(np.linalg.norm(np.cross(*half_axes)))
+    sides = frame[:3, :2].T * np.array(size)[:, None] / (2 if kind == "disc" else math.sqrt(math.pi))  # of equal area
+    area = math.pi * float(np.linalg.norm(np.cross(*sides)))
     half = math.atan(math.sqrt(area * max(cos, 0.0) / math.pi) / far)
-    return Seen(middle, half_axes, half, (1.0 if normalized else area) * max(cos, 0.0) / far**2, cos)
+    return Seen(middle, sides, half, (1.0 if normalized else area) * max(cos, 0.0) / far**2, cos)
 
 
 def ends(seen: Seen, eye: Any, pupil: Any, count: int) -> tuple[Any, Any]:
@@ -62,16 +61,16 @@ def ends(seen: Seen, eye: Any, pupil: Any, count: int) -> tuple[Any, Any]:
     An edge before the light uncovers both a little at a time, so that even a light without size dims smoothly.
     """
     k = np.arange(count)
-    radius, angle = np.sqrt((k + 0.5) / count), k * _TURN
-    end = seen.middle + (radius * np.stack([np.cos(angle), np.sin(angle)])).T @ seen.sides
-    radius, angle = np.sqrt((k / _PLASTIC) % 1), 2 * math.pi * (k / _PLASTIC**2 % 1)
-    return eye + (radius * np.stack([np.cos(angle), np.sin(angle)])).T @ pupil, end
+    of_light = np.sqrt((k + 0.5) / count) * np.exp(1j * _TURN * k)
+    of_pupil = np.sqrt(k / _PLASTIC % 1) * np.exp(2j * math.pi * (k / _PLASTIC**2 % 1))
+    start, end = (np.stack([p.real, p.imag], 1) for p in (of_pupil, of_light))
+    return eye + start @ pupil, seen.middle + end @ seen.sides
 
 
 def row(name: str, frame: int, seen: Seen, view: Any, unit_m: float, rgb: Any, visible: float) -> dict[str, Any]:
     """A row of a list; `view` [4, 4] is the camera's frame, which looks along -z, and `rgb` the irradiance."""
     way = (seen.middle - view[:3, 3]) @ (view[:3, :3] / np.linalg.norm(view[:3, :3], axis=0))
-    far = float(np.linalg.norm(way))
+    far = max(float(np.linalg.norm(way)), 1e-9)
     return {
         "light": name, "frame": frame,
         "azimuth_deg": math.degrees(math.atan2(way[0], -way[2])),
@@ -84,8 +83,7 @@ def row(name: str, frame: int, seen: Seen, view: Any, unit_m: float, rgb: Any, v
 
 def in_every_frame(rows: list[dict[str, Any]], frames: range) -> list[dict[str, Any]]:
     """The rows of a light, with dark ones where it is missing: between keys and beyond them it would shine."""
-    known, last, found = {row["frame"]: row for row in rows}, rows[0], []
+    known, found = {row["frame"]: row for row in rows}, rows[:1]
     for frame in frames:
-        last = known.get(frame) or {**last, "frame": frame, "visible": 0.0}
-        found.append(last)
-    return found
+        found.append(known.get(frame) or {**found[-1], "frame": frame, "visible": 0.0})
+    return found[1:]
