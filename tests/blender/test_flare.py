@@ -16,7 +16,6 @@ import pytest
 bpy = pytest.importorskip("bpy", reason="Blender as a module (bpy) is not installed: make test-blender runs these")
 
 import numpy as np  # noqa: E402
-from mathutils import Vector  # noqa: E402
 from test_extension import packed  # noqa: E402
 
 from neurolens.blender.pack import write_pack  # noqa: E402
@@ -131,8 +130,9 @@ def test_irradiance_is_what_a_white_card_shows(kind: str, settings: dict[str, An
     material.node_tree.links.new(diffuse.outputs[0], out.inputs[0])
     card.data.materials.append(material)
     towards = way / np.linalg.norm(way)
+    turned = type(scene.camera.location)(towards).to_track_quat("Z", "Y")
     for thing in (card, scene.camera):
-        thing.rotation_mode, thing.rotation_quaternion = "QUATERNION", Vector(towards).to_track_quat("Z", "Y")
+        thing.rotation_mode, thing.rotation_quaternion = "QUATERNION", turned
     scene.camera.location = tuple(0.05 * towards)
     scene.camera.data.sensor_width, scene.camera.data.lens, scene.camera.data.dof.use_dof = 0.5, 50.0, False
     scene.camera.data.clip_start = 0.001
