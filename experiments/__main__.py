@@ -57,6 +57,7 @@ NAMES = {
     "photographs-faults": ("photographs_faults", "lens tables broken on purpose: faults found, changes named"),
     "collection": ("collection", "a public collection of lens files: read, refused, agreement with ray-optics"),
     "named-lenses": ("named_lenses", "write the lens files of real lenses by name from that collection"),
+    "usd-lights": ("usd_lights", "the lights of a USD stage as a list for `neurolens flare --lights`"),
     "optiland": ("compare_optiland", "speed of the exact tracer beside Optiland"),
 }
 _DESCRIPTION = """\

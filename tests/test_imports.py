@@ -57,7 +57,7 @@ PACKAGES = {
     "shaders": {"numpy"},
     "render": {"numpy", "OpenEXR", "PIL", "embreex"},
     "defocus": {"numpy", "OpenEXR"},
-    "blender": {"bpy", "cycles"},  # of Blender's own Python, in the extension
+    "blender": {"bpy", "cycles", "numpy"},  # of Blender's own Python, in the extension
 }
 EXCEPTIONS: dict[str, set[str]] = {
     "neurolens.base.cluster": {"dask", "distributed"},  # where a cluster is asked for

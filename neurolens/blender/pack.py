@@ -30,7 +30,7 @@ from neurolens.base.tomlfile import parse_json
 EXTENSION = Path(__file__).parent / "extension"
 FACTS, SCHEMA = "lenses.json", 1
 _ID = "neurolens"
-_CODE = ("__init__.py", "camera.py", "library.py", "needs.py", "panel.py", "blender_manifest.toml")
+_CODE = (*sorted(path.name for path in EXTENSION.glob("*.py")), "blender_manifest.toml")
 _THEN = (1980, 1, 1, 0, 0, 0)  # the zip of the same lenses is the same, byte for byte
 _LARGEST = 1 << 28  # of a library: 200 lenses unpacked are some 80 MB
 
@@ -104,9 +104,9 @@ class PackedLens:
 
 
 @cache
-def extension_library() -> ModuleType:
-    """The module of the extension that reads facts, without its package, which needs Blender."""
-    spec = spec_from_file_location("neurolens_library", EXTENSION / "library.py")
+def extension_library(name: str = "library") -> ModuleType:
+    """A module of the extension that needs no Blender, without its package, which does: the reader of facts, lights."""
+    spec = spec_from_file_location(f"neurolens_{name}", EXTENSION / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = module_from_spec(spec)
     sys.modules[spec.name] = module  # where dataclasses look their module up

@@ -74,6 +74,7 @@ def _camera(spec: str, shot: Shot, progress: Progress | None) -> Camera:
 
 def _ideal(kind: str, shot: Shot) -> Camera:
     fisheye, point = kind in FISHEYES, kind != "thin"
+    refuse(kind, "cover_glass_mm", shot.cover_glass_mm or None, "left out: only a lens file takes a plate")
     refuse(kind, "zoom", shot.zoom, "left out: only a lens file has zoom states")
     internal = "internal" if shot.focus_mode == "internal" else None
     refuse(kind, "focus_mode", internal, "left out: only lens files have groups")

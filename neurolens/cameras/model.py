@@ -396,6 +396,7 @@ def _check_shot(model: OnnxLens, shot: Shot) -> None:
     axes, path = [a.name for a in model.axes], str(model.path)
     for field in ("focal_length_mm", "field_deg"):
         refuse(path, field, getattr(shot, field), "left out: a model is of one size of its lens")
+    refuse(path, "cover_glass_mm", shot.cover_glass_mm or None, "left out: only a lens file takes a plate")
     if "zoom" not in axes:
         refuse(path, "zoom", shot.zoom, "left out: the model is of one zoom position")
     if "focus" not in axes and shot.focus_mode == "internal":

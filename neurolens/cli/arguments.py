@@ -295,6 +295,7 @@ class LensState:
     zoom: str | None = setting_of(Shot, "zoom")
     field_deg: float | None = setting_of(Shot, "field_deg")
     focus_mode: FocusMode | None = setting_of(Shot, "focus_mode")
+    cover_glass_mm: float | None = setting_of(Shot, "cover_glass_mm")
     stop: StopShape = group("shape of the stop")
 
     def aperture(self) -> Aperture | None:
@@ -322,7 +323,7 @@ class LensState:
 
     def set_lens(self, tabled: Lens) -> Lens:
         """The lens of a file in this state; raises InputError as `setting.states.set_lens`."""
-        from neurolens.setting.focusing import best_focused
+        from neurolens.setting.focusing import best_focused, with_cover_glass
         from neurolens.setting.states import set_lens
 
         mode = self.focus_mode or "best"
@@ -331,7 +332,8 @@ class LensState:
             focal_length_mm=self.focal_length_mm, field_deg=self.field_deg, f_number=self.f_number,
             focus_m=self.focus_m, focus_mode=mode,
         )  # fmt: skip
-        return best_focused(lens, self.focus_of(tabled, lens)) if mode == "internal" else lens
+        lens = best_focused(lens, self.focus_of(tabled, lens)) if mode == "internal" else lens
+        return with_cover_glass(lens, self.cover_glass_mm or 0.0, self.focus_of(tabled, lens), mode, lens.light_nm)
 
     def focus_of(self, tabled: Lens, lens: Lens) -> float:
         """Film to object in metres: as given, else of the focus state that the zoom names, else inf.

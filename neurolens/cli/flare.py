@@ -97,7 +97,8 @@ examples:
     lights: tuple[Path, ...] = setting(
         (), "a scene (.toml), whose shapes that shine, points, spots and sun the camera of the scene sees; or a list, "
         "CSV or JSON, with azimuth_deg, elevation_deg, and where wanted light (a name), frame (keys), r, g, b, "
-        "diameter_deg (of a disc; the sun has 0.53), distance_m; repeatable", title=_LIGHTS,
+        "diameter_deg (of a disc; the sun has 0.53), distance_m, visible (share that shows); repeatable",
+        title=_LIGHTS,
     )  # fmt: skip
     image: Path | None = setting(
         None, "connected regions of this picture by the same lens, film and focus that reach --threshold, as lights "

@@ -212,8 +212,8 @@ class Shots:
         """The lights at a frame, where the lens and the camera of a scene are as `args` says."""
         at = "" if args.frame is None else f" at frame {args.frame}"
         of_lists = [track.at(args.frame or 0) for track in self._tracks]
-        lights = [*self._fixed, *(light for light in of_lists if light is not None)]
-        if behind := len(self._fixed) + len(of_lists) - len(lights):
+        lights = [*self._fixed, *(light for light in of_lists if light is not None and any(light.rgb))]
+        if behind := of_lists.count(None):
             warn(f"{behind} lights of lists stand behind the lens{at}")
         for path, scene, sources in self._scenes:
 

@@ -40,7 +40,7 @@ from neurolens.cli.arguments import (
 )  # fmt: skip
 from neurolens.cli.keys import Frames, frames_group, frames_of
 from neurolens.lens.shot import Dispersion, Shot, Vignetting
-from neurolens.render.settings import FilmSettings
+from neurolens.render.settings import FilmSettings, SensorSettings
 
 if TYPE_CHECKING:
     from neurolens.cameras.contract import FloatArray
@@ -129,6 +129,9 @@ examples:
     out: Path = output_path("OUT.exr", "picture to write; the preview is OUT.png")
     picture: Picture = group("picture")
     colour: FilmSettings = group("colour (left out: the scene's [film] table)", unset=True)
+    sensor: SensorSettings = group(
+        "sensor (any of these, or a scene's [sensor] table, adds what it reads as channels raw)", unset=True
+    )
     frames: Frames = frames_group(
         "render these frames to OUT.0001.exr and so on; a frame that exists is kept (--restart: none is), an "
         "interrupted one goes on; the seed grows by the frame's number; --json prints an object a frame"
@@ -194,7 +197,7 @@ examples:
         return Frame.of(
             self.scene[0], self.camera, **self.state.camera(), **vars(self.picture), **vars(self.colour),
             film_offset_mm=self.film_offset_mm, vignetting=self.vignetting, dispersion=self.dispersion,
-            glass_files=self.glass, tile=self.tile,
+            sensor=self.sensor, glass_files=self.glass, tile=self.tile,
         )  # fmt: skip
 
     def _by_file(self, frame: Frame) -> dict[Path, Frame]:

@@ -37,6 +37,7 @@ _COLUMNS: dict[str, tuple[float, float, float]] = {
     "b": (SUN, 0.0, 1e30),
     "diameter_deg": (0.0, 0.0, 90.0),
     "distance_m": (math.inf, 1e-6, math.inf),
+    "visible": (1.0, 0.0, 1.0),
 }
 CELLS = 8  # along each side of an extended light
 FADE = 8  # parts of a cell's side where patches of a light fade into each other
@@ -188,8 +189,8 @@ class Track:
     """A light over frames.
 
     Attributes:
-        name: of the light. keys: [K, 8] frame, azimuth and elevation in degrees, r, g, b, diameter in degrees,
-            1 / distance in 1/m; linear between keys, constant before the first and after the last.
+        name: of the light. keys: [K, 9] frame, azimuth and elevation in degrees, r, g, b, diameter in degrees,
+            1 / distance in 1/m, share that shows; linear between keys, constant before the first and after the last.
     """
 
     name: str
@@ -197,12 +198,13 @@ class Track:
 
     def at(self, frame: float) -> Light | None:
         """The light at a frame; None while it stands behind the lens."""
-        azimuth, elevation, r, g, b, diameter, near = (
+        azimuth, elevation, r, g, b, diameter, near, shown = (
             float(np.interp(frame, self.keys[:, 0], c)) for c in self.keys.T[1:]
         )
         if math.cos(math.radians(azimuth)) <= 1e-6 or abs(elevation) >= 90:
             return None
-        return with_disc(Light(azimuth, elevation, (r, g, b), 1 / near if near else math.inf), diameter)
+        rgb = shown * r, shown * g, shown * b
+        return with_disc(Light(azimuth, elevation, rgb, 1 / near if near else math.inf), diameter)
 
 
 def read_lights(path: Path) -> list[Track]:
@@ -210,7 +212,7 @@ def read_lights(path: Path) -> list[Track]:
 
     Columns or keys are azimuth_deg, elevation_deg and, with their defaults, light (a name; without it each row is a
     light), frame (rows of one light are its keys, frames increasing), r, g, b (irradiance, `SUN`), distance_m (inf),
-    and diameter_deg (of a round light, 0; the sun has 0.53).
+    diameter_deg (of a round light, 0; the sun has 0.53) and visible (the share of it that shows, 1).
 
     Raises:
         InputError: a column is unknown or missing, or a value is out of range, by file, row and column; no light, or
@@ -222,13 +224,13 @@ def read_lights(path: Path) -> list[Track]:
     for number, row in enumerate(rows):
         place = f"row {number + 1}, "
         reject_unknown(path, place, row, ["light", *_COLUMNS])
-        frame, *values, distance = (_value(path, place, name, row.get(name)) for name in _COLUMNS)
+        frame, *values, distance, shown = (_value(path, place, name, row.get(name)) for name in _COLUMNS)
         keys = lights.setdefault(str(row.get("light") or f"light {number + 1}"), [])
         if len(lights) > MOST_LIGHTS:
             raise InputError(path, "lights", f"(more than {MOST_LIGHTS})", f"at most {MOST_LIGHTS} lights in a list")
         if keys and not frame > keys[-1][0]:
             raise InputError(path, f"{place}frame", frame, f"a frame after {keys[-1][0]:g}, the light's key before")
-        keys.append([frame, *values, 1 / distance])
+        keys.append([frame, *values, 1 / distance, shown])
     return [Track(name, np.array(keys)) for name, keys in lights.items()]
 
 

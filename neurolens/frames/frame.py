@@ -31,9 +31,12 @@ from neurolens.render.job import MEANING
 from neurolens.render.pictures import standard_attributes
 from neurolens.render.renderer import RenderResult, Watch, render
 from neurolens.render.scene import CameraSettings, Scene, files_named, load_scene, seen_from
+from neurolens.render.sensor import about, expose
 from neurolens.render.settings import (
+    LAYERS,
     ColourSpaceName,
     FilmSettings,
+    SensorSettings,
     WavelengthMode,
     WavelengthSampling,
     size_by_shape,
@@ -57,13 +60,14 @@ class Frame:
 
     Attributes:
         scene: the scene file. camera: what `base.lensname.resolve` makes of a camera's name.
-        film_mm, focus_m, f_number, focal_length_mm, zoom, field_deg, focus_mode, aperture, film_offset_mm, vignetting,
-            dispersion: as in `lens.shot.Shot`.
+        film_mm, focus_m, f_number, focal_length_mm, zoom, field_deg, focus_mode, aperture, film_offset_mm,
+            cover_glass_mm, vignetting, dispersion: as in `lens.shot.Shot`.
         glass_files: catalogues of Zemax, whose glasses come before those that ship.
         position_m, look_at_m: where the camera stands, and a point on its optical axis.
         width, height: in pixels; one of them follows from the other and the film's shape. samples: in each pixel.
         seed: of the random numbers. max_depth: bounces of a path.
-        colour_space, white_balance, wavelengths, wavelength_sampling: as in `FilmSettings`.
+        colour_space, white_balance, wavelengths, wavelength_sampling, fill_factor: as in `FilmSettings`.
+        sensor: changes of the scene's [sensor] table, its fields of None none; with any the picture has its channels.
         half: whether the EXR has 16-bit floats. channels: "all", or "beauty" for colour alone.
         exposure: stops by which the preview is brighter.
         number: of the frame in an animation. tile: I and N, for the I-th of N bands of rows alone.
@@ -79,6 +83,7 @@ class Frame:
     focus_mode: FocusMode | None = None
     aperture: Aperture | None = None
     film_offset_mm: float | None = None
+    cover_glass_mm: float | None = None
     vignetting: Vignetting | None = None
     dispersion: Dispersion | None = None
     glass_files: tuple[Path, ...] = ()
@@ -94,6 +99,8 @@ class Frame:
     white_balance: str | None = None
     wavelengths: WavelengthMode | None = None
     wavelength_sampling: WavelengthSampling | None = None
+    fill_factor: float | None = None
+    sensor: SensorSettings | None = None
     half: bool = False
     channels: Literal["all", "beauty"] = "all"
     exposure: float = 0.0
@@ -122,9 +129,15 @@ class Frame:
 
     def film(self, settings: FilmSettings) -> FilmSettings:
         """The scene's [film] table with the changes of the frame."""
-        names = "colour_space", "white_balance", "wavelengths", "wavelength_sampling"
+        names = "colour_space", "white_balance", "wavelengths", "wavelength_sampling", "fill_factor"
         changes = {name: getattr(self, name) for name in names}
         return replace(settings, **{name: value for name, value in changes.items() if value is not None})
+
+    def reads(self, settings: SensorSettings | None) -> SensorSettings | None:
+        """The scene's [sensor] table with the changes of the frame; None: no sensor."""
+        given = asdict(self.sensor) if self.sensor else {}
+        given = {name: value for name, value in given.items() if value is not None}
+        return replace(settings or SensorSettings(), **given) if given else settings
 
     def size(self, settings: CameraSettings) -> tuple[int, int]:
         """Width and height in pixels."""
@@ -182,14 +195,15 @@ class Prepared:
 
     Attributes:
         scene: with the camera in the frame's place. film: its [film] table with the frame's changes.
-        size: width and height of the whole picture in pixels. rows: the first row of the frame's tile and the one after
-            its last; None without a tile.
+        sensor: what counts the picture, None without. size: width and height of the whole picture in pixels.
+        rows: the first row of the frame's tile and the one after its last; None without a tile.
     """
 
     frame: Frame
     files: Files
     scene: Scene
     film: FilmSettings
+    sensor: SensorSettings | None
     camera: Camera
     size: tuple[int, int]
     rows: tuple[int, int] | None
@@ -232,12 +246,13 @@ def prepare(frame: Frame, out: Path, progress: Progress | None = None) -> Prepar
         check_name(frame.scene, "--white-balance", frame.white_balance, scene.illuminants)
     settings = scene.settings.camera
     shot, (width, height) = frame.shot(settings, scene.aperture), frame.size(settings)
+    film, sensor = frame.film(scene.settings.film), frame.reads(scene.settings.sensor)
     PixelGrid(width, height, shot.film_mm)  # checked before the slow make_camera
     rows = None if frame.tile is None else rows_of(height, frame.tile)
     camera = make_camera(str(frame.camera), shot, progress)
     for note in (*camera.settings.get("notes", ()), *_pixel_notes(camera, width)):
         warn(note)
-    return Prepared(frame, files, scene, frame.film(scene.settings.film), camera, (width, height), rows)
+    return Prepared(frame, files, scene, film, sensor, camera, (width, height), rows)
 
 
 def _pixel_notes(camera: Camera, width: int) -> list[str]:
@@ -363,6 +378,10 @@ def write_pictures(
     if frame.channels == "all" or not result.stats["complete"]:
         layers, metadata["layers"] = asdict(result.layers), MEANING
     rows = prepared.rows or (0, height)
+    if (sensor := prepared.sensor) is not None:
+        added = (flare[name][slice(*rows)] for name in LAYERS if name in flare)  # it stands behind the lens, too
+        layers |= expose(sum(added, start=result.rgb), sensor, frame.seed, rows[0])
+        metadata["sensor"] = about(sensor, frame.seed)
     layers |= flare_channels({name: picture[slice(*rows)] for name, picture in flare.items()}, space)
     attributes = standard_attributes(settings["camera"], width, height, frame.number)
     if frame.tile is not None:

@@ -253,7 +253,7 @@ def identity(job: Job) -> dict[str, Any]:
     scene, camera = job.scene, job.camera
     # Given separately, may differ from the scene's.
     common = replace(scene.settings.camera, width=1, height=1, samples=1, max_depth=1, focus_m=1.0, f_number=None)
-    bare = replace(scene, name="", settings=replace(scene.settings, camera=common, film=FilmSettings()))
+    bare = replace(scene, name="", settings=replace(scene.settings, camera=common, film=FilmSettings(), sensor=None))
     kept = {key: value for key, value in camera.settings.items() if key not in _NO_MATTER}
     identity = {
         "neurolens": __version__,

@@ -128,7 +128,8 @@ class Job:
         pixel, sample = np.repeat(pixels, len(indices)), np.tile(indices, len(pixels))
         keys = self.sampler.keys(pixel, sample)
         hue = self.sampler.draw(keys, WAVELENGTH)
-        film_mm = self.grid.film_points(pixel, self.sampler.draw2(keys, FILM))
+        place, side = self.sampler.draw2(keys, FILM), np.float32(math.sqrt(self.settings.fill_factor))
+        film_mm = self.grid.film_points(pixel, place if side == 1 else 0.5 + side * (place - np.float32(0.5)))
         pupil = self.sampler.draw2(keys, PUPIL)
 
         called = time.perf_counter()
@@ -409,7 +410,7 @@ def mode_for(
     """How paths carry wavelengths: see `Job`.
 
     Raises:
-        InputError: the settings ask for "hero", and the camera disperses but cannot place companions.
+        InputError: the settings ask for "hero", and the camera disperses but cannot place companions in whole pixels.
     """
     if film.wavelengths == "one":
         return "one"
@@ -417,7 +418,8 @@ def mode_for(
     if shift <= _LITTLE_PX:
         return "hero"
     asked = film.wavelengths == "hero"
-    if (asked or not getattr(camera, "costly", False)) and getattr(camera, "companion_reach_mm", None) is not None:
+    placed = film.fill_factor == 1 and getattr(camera, "companion_reach_mm", None) is not None
+    if placed and (asked or not getattr(camera, "costly", False)):
         return "companions"
     if asked:
         expected = f"one: camera {camera.name} moves its picture by {shift:.2g} pixels with the wavelength"

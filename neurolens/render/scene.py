@@ -35,7 +35,7 @@ from neurolens.render.scenetables import (
     between,
     require,
 )
-from neurolens.render.settings import FilmSettings, FlareSettings
+from neurolens.render.settings import FilmSettings, FlareSettings, SensorSettings
 
 _SHAPES = ("planes", "quads", "discs", "spheres", "boxes", "rooms", "meshes")
 _FILM_MM = (36.0, 20.25)
@@ -93,6 +93,7 @@ class SceneSettings:
 
     camera: CameraSettings
     film: FilmSettings = FilmSettings()
+    sensor: SensorSettings | None = None
     flare: FlareSettings | None = None
     illuminants: dict[str, MeasuredSpectrum] = field(default_factory=dict)
     environment: tables.Environment = tables.Environment(colour=BLACK)

@@ -1,4 +1,4 @@
-"""The tables [film] and [flare] of a scene: also options of the command line, which has them before numpy is loaded."""
+"""The tables [film], [sensor] and [flare] of a scene: also options of commands, which load them before numpy."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from neurolens.base.settings import check_bounds, setting
 ColourSpaceName = Literal["sRGB", "ACEScg"]
 WavelengthMode = Literal["auto", "one", "hero"]
 WavelengthSampling = Literal["importance", "uniform"]
+Mosaic = Literal["none", "RGGB", "BGGR", "GRBG", "GBRG"]
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,7 @@ class FilmSettings:
         wavelengths: of a path: "one"; "hero", four that share the path (Wilkie et al. 2014), each with its own film
             point where the camera disperses; "auto", hero where the camera can at little cost, else one.
         wavelength_sampling: "importance", by the film's response times the light of the scene, or "uniform".
+        fill_factor: share of a pixel that takes light, a square in its middle: the filter of a pixel is a box.
     """
 
     colour_space: ColourSpaceName = setting("sRGB", "of the EXR, linear: sRGB (D65) or ACEScg (AP1, the white of ACES)")
@@ -31,14 +33,48 @@ class FilmSettings:
         None, "light that becomes neutral: A, D50, D65, E, '3200 K' or a measured one of the scene", metavar="LIGHT"
     )
     wavelengths: WavelengthMode = setting(
-        "auto",
-        "of a path: one; hero, four that share it; auto, hero where the camera can at little cost",
-        option="wavelength-mode",
-        old=("wavelengths",),
-    )
+        "auto", "of a path: one; hero, four that share it; auto, hero where the camera can at little cost",
+        option="wavelength-mode", old=("wavelengths",),
+    )  # fmt: skip
     wavelength_sampling: WavelengthSampling = setting(
         "importance", "by importance (film response times light) or uniform"
     )
+    fill_factor: float = setting(
+        1.0, "share of a pixel's area that takes light, a square in its middle", within=(0.01, 1), metavar="SHARE"
+    )
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "film")
+
+
+@dataclass(frozen=True)
+class SensorSettings:
+    """The [sensor] table of a scene: what a sensor counts of a linear picture, see `render.sensor`.
+
+    Attributes:
+        mosaic: colours of the pixels of two rows from the top left, or "none": every pixel counts all three.
+        electrons: mean number in a pixel whose value is 1, a white card of radiance 1 on the axis.
+        full_well: electrons that a pixel holds. read_noise: standard deviation in electrons.
+        noise: "none" leaves out both the noise of photons and of reading.
+        bits: of the converter, whose largest number is a full well. black_level: its number without any electron.
+
+    Raises:
+        InputError: a value out of bounds.
+    """
+
+    mosaic: Mosaic = setting("RGGB", "of colours from the top left (default: RGGB); none: a pixel counts all three")
+    electrons: float = setting(2e4, "of a pixel of value 1, mean (default: 20000)", within=(1e-6, 1e9), metavar="N")
+    full_well: float = setting(3e4, "electrons that a pixel holds (default: 30000)", within=(1, 1e9), metavar="N")
+    read_noise: float = setting(3.0, "in electrons, RMS, of reading (default: 3)", within=(0, 1e6), metavar="N")
+    noise: Literal["all", "none"] = setting("all", "of photons and of reading, by --seed; or none (default: all)")
+    bits: int = setting(14, "of the numbers that are read; the largest is a full well (default: 14)", within=(1, 16))
+    black_level: int = setting(512, "number that is read without light (default: 512)", within=(0, 65_534))
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "sensor")
+        most = 2 ** (self.bits or 16) - 2
+        if (self.black_level or 0) > most:
+            raise InputError("sensor", "black_level", self.black_level, f"at most {most}, below the largest number")
 
 
 def size_by_shape(shape: float, width: int | None, height: int | None) -> tuple[int, int]:

@@ -79,6 +79,7 @@ class Tile:
             "half": metadata["tile"]["half"],
             "colour": metadata["colour"],
             "layers": sorted(metadata.get("layers", ())),
+            "sensor": metadata.get("sensor"),
         }
         return {**metadata["tile"]["identity"], **chosen, **stored, "tiles": self.count}
 

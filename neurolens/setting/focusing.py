@@ -18,7 +18,7 @@ from torch import Tensor
 
 from neurolens.base.errors import InputError
 from neurolens.lens import film_plane, paraxial
-from neurolens.lens.prescription import Configuration, Lens
+from neurolens.lens.prescription import Configuration, Lens, Surface
 from neurolens.trace.rays import trace
 from neurolens.trace.surfaces import Rays
 
@@ -241,6 +241,40 @@ def best_focus_of_stops_mm(
 def best_focused(lens: Lens, focus_m: float, wavelength_nm: tuple[float, float] | None = None) -> Lens:
     """Return a lens that `set_lens` has placed, by film or groups, with its film where `best_focus_z_mm` says."""
     return replace(lens, film_z_mm=best_focus_z_mm(lens, focus_m, wavelength_nm))
+
+
+_COVER, _COVER_AIR_MM = ("N-BK7", 1.5168, 64.17), 0.5  # its glass with n_d and V_d, and its distance from the film
+
+
+def with_cover_glass(
+    lens: Lens, thickness_mm: float, focus_m: float, focus_mode: str, wavelength_nm: tuple[float, float]
+) -> Lens:
+    """Return a lens whose film is placed with a plane plate before the film, wherever: it does not matter for rays.
+
+    The film is in focus again. No plate is added where it has no thickness.
+
+    Raises:
+        InputError: a plate that is thicker than the room behind the lens.
+    """
+    if not thickness_mm:
+        return lens
+    assert lens.film_z_mm is not None
+    last, z_mm, (name, n_d, V_d) = lens.surfaces[-1], float(lens.vertices_mm[-2]), _COVER
+    film_z = lens.film_z_mm + thickness_mm * (1 - float(last.n_d) / n_d)
+    room = film_z - z_mm - _COVER_AIR_MM - thickness_mm
+    if room <= 0:
+        most = math.floor(100 * (thickness_mm + room * n_d / float(last.n_d))) / 100
+        expected = f"at most {most:g} mm: the film lies {lens.film_z_mm - z_mm:.3g} mm behind the last surface"
+        raise InputError(lens.path, "cover_glass_mm", thickness_mm, expected)
+    wide = last.diameter_mm + 2 * (film_z - z_mm)  # beyond all rays to the film
+    front = Surface(math.inf, thickness_mm, wide, n_d)
+    front = replace(front, V_d=V_d, material=name, glass=name) if lens.dispersive else front
+    back = Surface(math.inf, _COVER_AIR_MM, wide, last.n_d, last.V_d, last.material, glass=last.glass)
+    place = len(lens.surfaces) - 1
+    moved = tuple((k, room if k == place else gap) for k, gap in lens.infinity_mm)
+    rows, told = lens.with_gaps({place: room}).surfaces, f"{lens.derived} A cover glass of {thickness_mm:g} mm.".strip()
+    covered = replace(lens, surfaces=(*rows, front, back), infinity_mm=moved, film_z_mm=film_z, derived=told)
+    return covered if focus_mode == "paraxial" else best_focused(covered, focus_m, wavelength_nm)
 
 
 def _paraxial_film_z_mm(lens: Lens, focus_m: float) -> float:

@@ -28,6 +28,7 @@ from neurolens.setting.focusing import (
     gaps_mm,
     infinity_states,
     monotone,
+    with_cover_glass,
     zoom_state_of,
 )
 from neurolens.setting.pupils import image_radius_mm
@@ -127,6 +128,7 @@ def _set_for(lens: Lens, shot: Shot) -> Lens:
     lens = set_lens(lens, f_number=f_number, focus_m=shot.focus_m, focus_mode=shot.focus_mode, wavelength_nm=light_nm)
     if shot.focus_mode == "internal":
         lens = best_focused(lens, shot.focus_m, light_nm)
+    lens = with_cover_glass(lens, shot.cover_glass_mm, shot.focus_m, shot.focus_mode, light_nm)
     assert lens.film_z_mm is not None  # `set_lens` places the film
     return replace(lens, film_z_mm=lens.film_z_mm + shot.film_offset_mm) if shot.film_offset_mm else lens
 

@@ -28,6 +28,7 @@ KINDS = {
     "ACEScg, half": ("--half", "--colour-space", "ACEScg", "--white-balance", "A"),
     "companions": ("--camera", MODEL, "--samples", "17"),
     "colour alone": ("--channels", "beauty"),
+    "a sensor": ("--mosaic", "GBRG", "--fill-factor", "0.5"),
 }
 
 
@@ -129,6 +130,7 @@ def test_a_tile_lies_in_its_place_for_other_programs(render: Render) -> None:
             (("--wavelength-mode", "one"), "wavelengths: got 'one', expected 'auto' as in"),
             (("--max-depth", "1"), "max_depth: got 1, expected"),
         ),
+        (("--mosaic", "none"), "sensor"),
     ],
 )
 def test_tiles_of_other_settings_are_named(

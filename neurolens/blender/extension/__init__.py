@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import bpy
 
+from .flare import CLASSES as OF_FLARE
 from .panel import CLASSES, LIBRARY, CameraSettings, warn_of_black
 
 
 def register() -> None:
     """Add menu, operators and panel."""
-    for each in CLASSES:
+    for each in (*CLASSES, *OF_FLARE):
         bpy.utils.register_class(each)
     bpy.types.Camera.neurolens = bpy.props.PointerProperty(type=CameraSettings)
     bpy.types.Scene.neurolens_before = bpy.props.StringProperty(options={"HIDDEN"})
@@ -23,5 +24,5 @@ def unregister() -> None:
     LIBRARY.close()
     del bpy.types.Scene.neurolens_before
     del bpy.types.Camera.neurolens
-    for each in reversed(CLASSES):
+    for each in reversed((*CLASSES, *OF_FLARE)):
         bpy.utils.unregister_class(each)

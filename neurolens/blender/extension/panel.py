@@ -291,6 +291,7 @@ class NEUROLENS_PT_lens(bpy.types.Panel):
             layout.operator("neurolens.take_back", icon="LOOP_BACK")
             self._draw_settings(camera)
         layout.operator("neurolens.reload", icon="FILE_REFRESH")
+        layout.operator("neurolens.write_lights", icon="LIGHT")
         layout.prop(camera.neurolens, "tolerance_px")
         layout.operator("neurolens.needs", icon="QUESTION")
         for line in camera.neurolens.advice.splitlines():

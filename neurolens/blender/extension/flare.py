@@ -1,0 +1,134 @@
+"""The scene's lights in a list for `neurolens flare`, frame by frame.
+
+Irradiance is on the scale of the picture: in Cycles, too, a white card across the way of a light has the radiance
+irradiance / pi. How much of a light shows comes from rays, so that it dims smoothly as an edge passes before it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+from . import camera as on_camera
+from . import lights
+from .library import LensError
+from .panel import _Operator
+
+_MOST_PASSED = 64  # surfaces that no camera sees, on the way of a ray
+_KINDS: dict[str, lights.Kind] = {"SUN": "distant", "AREA": "rectangle", "POINT": "sphere", "SPOT": "sphere"}
+
+
+def _seen(data: Any, frame: Any, eye: Any) -> tuple[lights.Seen, Any]:
+    """A light of Blender in its frame [4, 4] from a place, and its irradiance there [3]."""
+    kind = _KINDS[data.type]
+    size: tuple[float, ...] = (data.angle if kind == "distant" else data.shadow_soft_size,)
+    if data.type == "AREA":
+        size = (data.size, data.size_y if data.shape in ("RECTANGLE", "ELLIPSE") else data.size)
+        kind = "disc" if data.shape in ("DISK", "ELLIPSE") else kind
+    seen = lights.see(kind, frame, size, data.normalize, eye)
+    power = seen.irradiance * data.energy * 2.0**data.exposure / (1.0 if kind == "distant" else math.pi)
+    if data.type == "AREA" and (half := data.spread / 2) < 0.4999 * math.pi:
+        across = math.sqrt(max(1 - seen.cos**2, 0.0)) / max(seen.cos, 1e-9)
+        power *= max(math.tan(half) - across, 0.0) / max(math.tan(half) - half, 1e-9)
+    if data.type == "SPOT":
+        edge = math.cos(data.spot_size / 2)
+        t = min(max((seen.cos - edge) / max((1 - edge) * data.spot_blend, 1e-9), 0.0), 1.0)
+        power *= t * t * (3 - 2 * t)
+    return seen, power * np.array(data.color) * np.array(data.temperature_color if data.use_temperature else 1.0)
+
+
+def _is_free(scene: Any, graph: Any, start: Any, end: Any, near: float) -> bool:
+    """Whether nothing that cameras see lies between two points, beyond `near` from the first."""
+    left = float(np.linalg.norm(end - start))
+    way, done = (end - start) / left, near
+    for _ in range(_MOST_PASSED):
+        if done >= left:
+            break
+        from_ = start + done * way
+        hit, point, _normal, _face, thing, _frame = scene.ray_cast(graph, from_.tolist(), way, distance=left - done)
+        if not hit or (thing.visible_camera and not thing.hide_render):
+            return not hit
+        done += float(np.linalg.norm(np.array(point) - from_)) * (1 + 1e-5) + 1e-6 * left
+    return True
+
+
+def rows_now(context: Any, found: Any, frame: int, rays: int) -> Iterator[dict[str, Any]]:
+    """The rows of all lights that renders have, at the scene's present frame."""
+    scene, graph = context.scene, context.evaluated_depsgraph_get()
+    view = np.array(found.evaluated_get(graph).matrix_world)
+    eye, setting = view[:3, 3], on_camera.setting_of(scene, found)
+    opened = setting.f_number or (found.data.dof.aperture_fstop if found.data.dof.use_dof else math.inf)
+    across = found.data.lens / (2000 * opened * setting.lens_unit_m)
+    pupil = across * (view[:3, :2] / np.linalg.norm(view[:3, :2], axis=0)).T
+    for instance in graph.object_instances:
+        light = instance.object
+        if light.type != "LIGHT" or light.hide_render:
+            continue
+        number = "".join(f".{k}" for k in instance.persistent_id[:2]) if instance.is_instance else ""
+        seen, rgb = _seen(light.data, np.array(instance.matrix_world), eye)
+        pairs = zip(*lights.ends(seen, eye, pupil, rays), strict=True)
+        lit = rgb.any() and (seen.middle - eye) @ view[:3, 2] < 0
+        free = sum(_is_free(scene, graph, *pair, found.data.clip_start) for pair in pairs) / rays if lit else 0.0
+        rgb *= scene.cycles.film_exposure
+        yield lights.row(light.name + number, frame, seen, view, setting.lens_unit_m, rgb, free)
+
+
+def write_lights(context: Any, found: Any, path: Path, rays: int) -> tuple[int, str]:
+    """Write the lights of all frames of the scene, and of a camera that carries a lens its keys, to PATH.keys.json;
+    returns how many lights there are, and the arguments of `neurolens flare` for them.
+
+    Raises:
+        LensError: there is no light, or no such folder.
+    """
+    scene, known, keys = context.scene, dict[str, list[dict[str, Any]]](), list[dict[str, Any]]()
+    before, frames = scene.frame_current, range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
+    custom = found.data.cycles_custom if on_camera.applied(found.data) else {}
+    try:
+        for frame in frames:
+            scene.frame_set(frame)
+            for row in rows_now(context, found, frame, rays):
+                known.setdefault(row["light"], []).append(row)
+            setting = on_camera.setting_of(scene, found)
+            values = {"focus": setting.focus_m, "f-number": setting.f_number, "zoom": custom.get("zoom_mm")}
+            keys.append({"frame": frame} | {name: value for name, value in values.items() if value is not None})
+    finally:
+        scene.frame_set(before)
+    if not known:
+        raise LensError("The scene has no light that is rendered")
+    files = {path: [row for rows in known.values() for row in lights.in_every_frame(rows, frames)]}
+    width, height = setting.sensor_mm
+    words = f"--lights {path.name} --frames {frames[0]}:{frames[-1]}:{frames.step} --film {width:g}x{height:g}"
+    words += f" --width {setting.pixels}"
+    if custom:
+        files[path.with_suffix(".keys.json")] = keys
+        words = f"{found.data.neurolens.on.partition('/')[0]} {words} --key {path.stem}.keys.json"
+    try:
+        for file, content in files.items():
+            file.write_text(json.dumps(content, indent=1), encoding="utf-8")
+    except OSError as error:
+        raise LensError(f"{error.filename or path} cannot be written: {error.strerror or error}") from None
+    return len(known), words
+
+
+class NEUROLENS_OT_write_lights(_Operator):
+    """Write the scene's lights in all frames, and how much of each shows, for `neurolens flare --lights`"""
+
+    bl_idname, bl_label = "neurolens.write_lights", "Write Lights for Flare"
+    __annotations__ = {
+        "filepath": bpy.props.StringProperty(name="File", subtype="FILE_PATH", default="//lights.json"),
+        "rays": bpy.props.IntProperty(name="Rays", description="To each light", default=64, min=1, max=4096),
+    }
+
+    def act(self, context: Any, found: Any, props: Any) -> None:
+        path = Path(bpy.path.abspath(self.filepath)).with_suffix(".json")
+        count, words = write_lights(context, found, path, self.rays)
+        self.report({"INFO"}, f"{count} lights in {path}: neurolens flare {words} -o flare.exr")
+
+
+CLASSES = (NEUROLENS_OT_write_lights,)

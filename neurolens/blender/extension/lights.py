@@ -1,0 +1,89 @@
+"""Lights as a camera sees them, for lists of `neurolens flare --lights`; of any program, without Blender."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+Kind = Literal["sphere", "rectangle", "disc", "distant"]
+FAR = 1e6  # units of the scene, to a distant light
+_TURN = math.pi * (3 - math.sqrt(5))  # of the sunflower's spiral
+_PLASTIC = 1.3247179572447460  # x^3 = x + 1, of the R2 sequence (Roberts 2018)
+
+
+class Seen(NamedTuple):
+    """A light from a place.
+
+    Attributes:
+        middle, sides: [3] and [2, 3], the ellipse that is seen: its middle and half axes. half_rad: of its cone.
+        irradiance: of a light of radiance 1, sr. cos: of the angle between its axis and the way from it.
+    """
+
+    middle: Any
+    sides: Any
+    half_rad: float
+    irradiance: float
+    cos: float
+
+
+def see(kind: Kind, frame: Any, size: tuple[float, ...], normalized: bool, eye: Any) -> Seen:
+    """A light that shines along -z of its frame [4, 4].
+
+    Args:
+        size: the radius of a sphere, both lengths of a rectangle or disc, the angle in rad of a distant light.
+        normalized: whether its radiance is divided by its area, or by the solid angle of a distant one (projected).
+    """
+    axes, middle = frame[:3, :3] / np.linalg.norm(frame[:3, :3], axis=0), frame[:3, 3]
+    if kind == "distant":
+        half, middle = size[0] / 2, eye + FAR * axes[:, 2]
+        solid = 1.0 if normalized else math.pi * math.sin(half) ** 2
+        return Seen(middle, FAR * math.tan(half) * axes.T[:2], half, solid, 1.0)
+    far = max(float(np.linalg.norm(middle - eye)), 1e-9)
+    way = (middle - eye) / far
+    cos = float(axes[:, 2] @ way)
+    if kind == "sphere":
+        first = np.cross(way, np.eye(3)[np.argmin(np.abs(way))])
+        first /= np.linalg.norm(first)
+        sides = size[0] * np.stack([first, np.cross(way, first)])
+        solid = (0.25 if normalized else math.pi * size[0] ** 2) / far**2
+        return Seen(middle, sides, math.asin(min(size[0] / far, 1.0)), solid, cos)
+    sides = frame[:3, :2].T * np.array(size)[:, None] / (2 if kind == "disc" else math.sqrt(math.pi))  # of equal area
+    area = math.pi * float(np.linalg.norm(np.cross(*sides)))
+    half = math.atan(math.sqrt(area * max(cos, 0.0) / math.pi) / far)
+    return Seen(middle, sides, half, (1.0 if normalized else area) * max(cos, 0.0) / far**2, cos)
+
+
+def ends(seen: Seen, eye: Any, pupil: Any, count: int) -> tuple[Any, Any]:
+    """Starts and ends [count, 3] of rays from the pupil, half axes [2, 3] about `eye`, to the light.
+
+    An edge before the light uncovers both a little at a time, so that even a light without size dims smoothly.
+    """
+    k = np.arange(count)
+    of_light = np.sqrt((k + 0.5) / count) * np.exp(1j * _TURN * k)
+    of_pupil = np.sqrt(k / _PLASTIC % 1) * np.exp(2j * math.pi * (k / _PLASTIC**2 % 1))
+    start, end = (np.stack([p.real, p.imag], 1) for p in (of_pupil, of_light))
+    return eye + start @ pupil, seen.middle + end @ seen.sides
+
+
+def row(name: str, frame: int, seen: Seen, view: Any, unit_m: float, rgb: Any, visible: float) -> dict[str, Any]:
+    """A row of a list; `view` [4, 4] is the camera's frame, which looks along -z, and `rgb` the irradiance."""
+    way = (seen.middle - view[:3, 3]) @ (view[:3, :3] / np.linalg.norm(view[:3, :3], axis=0))
+    far = max(float(np.linalg.norm(way)), 1e-9)
+    return {
+        "light": name, "frame": frame,
+        "azimuth_deg": math.degrees(math.atan2(way[0], -way[2])),
+        "elevation_deg": math.degrees(math.asin(max(-1.0, min(1.0, way[1] / far)))),
+        **{c: float(v) for c, v in zip("rgb", rgb, strict=True)}, "visible": visible,
+        "diameter_deg": min(math.degrees(2 * seen.half_rad), 90.0),
+        **({"distance_m": max(far * unit_m, 1e-6)} if far < FAR / 2 else {}),
+    }  # fmt: skip
+
+
+def in_every_frame(rows: list[dict[str, Any]], frames: range) -> list[dict[str, Any]]:
+    """The rows of a light, with dark ones where it is missing: between keys and beyond them it would shine."""
+    known, found = {row["frame"]: row for row in rows}, rows[:1]
+    for frame in frames:
+        found.append(known.get(frame) or {**found[-1], "frame": frame, "visible": 0.0})
+    return found[1:]
