@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from neurolens import __version__
-from neurolens.base.settings import setting, setting_of
+from neurolens.base.settings import group, setting, setting_of, whole
 from neurolens.cli.arguments import (
     CAMERAS_HELP,
     Glasses,
@@ -23,6 +23,7 @@ from neurolens.cli.arguments import (
     output_path,
 )  # fmt: skip
 from neurolens.lens.shot import Dispersion, Shot, Vignetting
+from neurolens.render.settings import SensorSettings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +41,8 @@ class Defocus(Glasses, Reporting):
     behind.G, behind.B, behind.Z in the file, or the files of --behind) and deep files have it; else what is beside
     an edge is put there, and the share of that light is said.
 
-    Pixels far brighter than their surroundings are spread as clean discs, without noise."""
+    Pixels far brighter than their surroundings are spread as clean discs, without noise. A sensor counts the
+    finished picture, as in `neurolens render`."""
 
     about: ClassVar[str] = "the blur of a lens for a sharp picture with depth"
     epilog: ClassVar[str] = f"""{CAMERAS_HELP}
@@ -73,6 +75,8 @@ examples:
     dispersion: Dispersion | None = setting_of(Shot, "dispersion")
     half: bool = setting(False, "16-bit floats in the EXR (default: 32-bit)")
     exposure: float = exposure()
+    sensor: SensorSettings = group("sensor (any of these adds what it reads as channels raw)", unset=True)
+    seed: int = setting(0, "of the sensor's noise (default: 0)", kind=whole(0))
     state: LensState = lens_state()
     threads: int = setting(2, "workers (default: 2)", within=(1, 256))
 
@@ -86,6 +90,7 @@ examples:
         from neurolens.defocus.picture import check_field, defocus, describe
         from neurolens.defocus.read import DepthSettings, read_plate
         from neurolens.render.pictures import standard_attributes, write_exr, write_png
+        from neurolens.render.sensor import about, expose
 
         if self.depth_scale == 0:
             self.refuse("--depth-scale", 0, "metres of a unit")
@@ -103,11 +108,15 @@ examples:
         found = defocus(plate, camera, self.samples, self.threads, not self.no_highlights, progress)
         data: dict[str, Any] = describe(found, plate, self.plate) | {"file": str(self.out)}
         metadata = {"version": __version__, "camera": camera.settings, "defocus": data}
+        layers = {}
+        if counted := {k: v for k, v in vars(self.sensor).items() if v is not None}:
+            sensor = SensorSettings(**counted)
+            layers, metadata["sensor"] = expose(found.rgb, sensor, self.seed), about(sensor, self.seed)
         focus = None if math.isinf(shot.focus_m) else shot.focus_m
         attributes = standard_attributes(camera.settings, *plate.size)
         write_exr(
             self.out, found.rgb, half=self.half, metadata=metadata | {"focus_m": focus}, space=plate.space,
-            attributes=attributes,
+            layers=layers, attributes=attributes,
         )  # fmt: skip
         write_png(self.out.with_suffix(".png"), found.rgb, self.exposure)
         return self.answer(data, lambda: _text(data))

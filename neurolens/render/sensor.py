@@ -43,7 +43,7 @@ def expose(rgb: FloatArray, settings: SensorSettings, seed: int = 0, first_row: 
         cells = np.array(["RGB".index(name) for name in settings.mosaic]).reshape(2, 2)
         row, column = np.ogrid[first_row : first_row + height, :width]
         colours = {RAW: cells[row % 2, column % 2]}
-    told, noisy = about(settings, seed), settings.noise == "all"
+    stated, noisy = about(settings, seed), settings.noise == "all"
     full = settings.full_well + _SURE * settings.full_well**0.5 + _SURE**2
     planes = {name: np.empty((height, width), np.float32) for name in colours}
     for k in range(height):
@@ -53,8 +53,8 @@ def expose(rgb: FloatArray, settings: SensorSettings, seed: int = 0, first_row: 
             mean = mean.clip(0, full)
             counted = np.minimum(random.poisson(mean) if noisy else mean, settings.full_well)
             read = counted + (settings.read_noise * random.standard_normal(width) if noisy else 0.0)
-            numbers = np.rint(settings.black_level + read / told["electrons_per_number"])
-            planes[name][k] = numbers.clip(0, told["white_level"])
+            numbers = np.rint(settings.black_level + read / stated["electrons_per_number"])
+            planes[name][k] = numbers.clip(0, stated["white_level"])
     return planes
 
 

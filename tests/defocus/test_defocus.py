@@ -21,7 +21,7 @@ from neurolens.defocus.plate import Eye, Layer
 from neurolens.defocus.read import DepthSettings, read_plate
 from neurolens.graph.compiler import has_compiler
 from neurolens.lens.shot import Shot
-from neurolens.render.pictures import read_exr, write_channels
+from neurolens.render.pictures import read_channels, read_exr, write_channels
 from tests.command_line import failure, run_json
 
 ROOT = Path(__file__).parents[2]
@@ -273,6 +273,10 @@ def test_the_command_writes_a_picture_with_its_camera(tmp_path: Path, capsys: py
     assert rgb.shape == (SIZE[1], SIZE[0], 3) and rgb[108, 192] == pytest.approx([0.5] * 3, rel=0.01)
     assert metadata["camera"]["camera"] == "thin" and metadata["defocus"]["plate"] == "plate.exr"
     assert data["layers"] == 1 and (tmp_path / "out.png").is_file()
+    run_json(capsys, *command(plate, tmp_path / "raw.exr", "--samples", "8", "--electrons", "1000", "--noise", "none"))
+    planes, metadata = read_channels(tmp_path / "raw.exr")
+    electrons = (planes["raw"] - metadata["sensor"]["black_level"]) * metadata["sensor"]["electrons_per_number"]
+    np.testing.assert_allclose(electrons, 1000 * planes["G"], atol=2)
 
 
 def test_layers_of_a_file_are_found_by_their_names(tmp_path: Path) -> None:
