@@ -208,7 +208,7 @@ def checked_name(language: str, lens_id: str, name: str | None) -> str:
         raise InputError("export", "to", language, f"one of {', '.join((*WRITERS, OSL))}")
     function_name = identifier(lens_id) if name is None else name
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,99}", function_name) or "__" in function_name or _taken(function_name):
-        expected = "letters, digits and single underscores, a letter first, no word of C, a shading language or the code"
+        expected = "letters, digits and single underscores, a letter first, no word of C, a shader or the code"
         raise InputError("export", "name", function_name, expected)
     return function_name
 
