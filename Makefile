@@ -7,6 +7,8 @@
 #                       BLENDER=4.5.0 or 5.2.3 for another (from 5.1 on it needs Python 3.13)
 #   make test-web the pages that commands write, in headless Chromium (Debian: chromium; CHROMIUM=/path/to/another): what
 #                 `neurolens view` draws, scripts in every text; its models in onnxruntime-web where npm is
+#   make test-shading  shading languages by their compilers: Slang's, naga with Vulkan in software (Debian: mesa-vulkan-drivers),
+#                 HLSL by glslang (glslang-tools), CUDA by nvcc where it is (5 CPU minutes)
 #   make bench    the tracer's speed, then models against it; fails when a promised ratio is lost
 #   make models   fit again every model of models/
 #   make gallery  what real lenses do: render and measure every effect
@@ -44,7 +46,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # A machine of one run compiles what it imports, which is a fraction of what pip would compile for a minute.
 PIP_INSTALL := $(BIN)/python -m pip install $(if $(CI),--no-compile) -c constraints.txt
 
-.PHONY: demo test test-whole test-blender test-web docs bench models gallery lint format clean
+.PHONY: demo test test-whole test-blender test-web test-shading docs bench models gallery lint format clean
 .DELETE_ON_ERROR:
 
 demo: $(INSTALLED)
@@ -75,6 +77,10 @@ test-web: $(INSTALLED)
 	ort=build/web/node_modules/onnxruntime-web/dist; \
 	NEUROLENS_BROWSER="$(CHROMIUM)" NEUROLENS_ORT="$$(test -d $$ort && echo $$ort)" \
 	    $(BIN)/python -m pytest -q -rs tests/view
+
+test-shading: $(INSTALLED)
+	$(BIN)/python -m pip install -c constraints.txt -e '.[shading]' --no-build-isolation
+	NEUROLENS_SHADING=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -rs tests/surrogates/test_languages.py
 
 docs: $(INSTALLED) $(VENV)/.docs
 	$(BIN)/sphinx-build -q -W --keep-going -b html -c docs . build/docs

@@ -150,7 +150,7 @@ def _of_model(chance: Chance, folder: Path) -> Words:
         chance,
         (
             (3, _render(name)),
-            *((1, ("export", name, "--to", to, "-o", f"out.{to}", "--json")) for to in ("glsl", "onnx")),
+            *((1, ("export", name, "--to", to, "-o", f"out.{to}", "--json")) for to in ("glsl", "vex", "wgsl", "onnx")),
             (0.3, ("export", name, "--to", "c", "-o", "out.h", "--json")),
             (0.1, ("stmap", name, *_FILM, "-o", "shot")),
             (0.1, ("bokeh", name, *_FILM, "--distance", "2", "--fields", "1x1", "-o", "shot")),

@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 from experiments import gl_compute, lab
 from neurolens.base import status as st
 from neurolens.graph.c import Signature
-from neurolens.graph.glsl import write_glsl
 from neurolens.graph.program import FILM_Z, RAY, STOP_RADIUS, WAVELENGTH, Program
 from neurolens.graph.scalars import lower
+from neurolens.graph.shading import write_glsl
 from neurolens.study.rays import ray_errors
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.file import read_model

@@ -28,18 +28,19 @@ _FIXED = ("wavelengths", "film_z", "focus", "stop", "f_number")
 @dataclass(frozen=True, kw_only=True)
 class Export(Answering):
     """Write an exported model in another form: a self-contained C99 header (one function for a ray, one for
-    arrays that compilers vectorise), a GLSL function, or an ONNX file. Domain guard, stop, rims,
+    arrays that compilers vectorise), a function in a shading language (GLSL, Slang, HLSL, WGSL, CUDA, VEX), or an
+    ONNX file. Domain guard, stop, rims,
     transmittance and status codes are those of the model; the card is a comment at the top. Constants
     (planes, ranges) and the film's position for a focus stand beside it. Of a model of a zoom's whole range
     (or of internal focus) the state is an argument. A lens file gives the exact lens.
     OSL is a camera of Blender's Cycles (4.5 and later): stop, focus, blades and more are its inputs, and the
     zoom of a model of its range, or of a lens file with --zoom range. Lens files focus as they say groups move.
     With --whole-camera, the whole camera for one focus and stop: film point and two random numbers in, weighted
-    ray out, its pupil's outline as a table in the file (of GLSL, the data of a texture beside it).
-    Needs the extra "train" (torch); without it C and GLSL are written from the graph in the file,
+    ray out, its pupil's outline as a table in the file (of shading languages but CUDA, data beside it).
+    Needs the extra "train" (torch); without it source code is written from the graph in the file,
     whole and with nothing fixed."""
 
-    about: ClassVar[str] = "source code (C, GLSL, OSL) of a model; fix what a scene fixes"
+    about: ClassVar[str] = "source code (C, shading languages) of a model; fix what a scene fixes"
     epilog: ClassVar[str] = """\
 values fixed by a scene are folded into fewer operations (--fix, repeatable):
   wavelengths=450,550,650   one coefficient table per wavelength, chosen by the argument band (a single one:
@@ -64,7 +65,7 @@ examples:
         also="; a run folder with one model, a file of neurolens plan; of --to onnx models alone", models=True,
         cameras=True, positional=True, metavar="MODEL",
     )  # fmt: skip
-    to: Literal["c", "glsl", "osl", "onnx"] = setting(..., "form to write")
+    to: Literal["c", "glsl", "slang", "hlsl", "wgsl", "cuda", "vex", "osl", "onnx"] = setting(..., "form to write")
     out: Path = output_path("FILE", "file to write")
     fix: tuple[str, ...] = setting((), "a value fixed by the scene (see below)", metavar="KEY=VALUE")
     only: str = setting(
@@ -76,7 +77,7 @@ examples:
     inverse: bool = setting(
         False, "of ONNX: the inverse maps too (film and stop point to ray; scene ray to film), fitted and checked"
     )
-    whole_camera: bool = setting(False, "the whole camera, of C and GLSL", old=("camera",), title=_CAMERA)
+    whole_camera: bool = setting(False, "the whole camera as source code", old=("camera",), title=_CAMERA)
     film: tuple[float, float] = setting(
         (36.0, 24.0), "film in mm (default: 36x24)", kind=film_size, metavar="WxH", title=_CAMERA
     )
@@ -113,7 +114,9 @@ examples:
         elif self.whole_camera or not is_model(file):
             if self.to == "onnx" or not whole:
                 what = "a camera" if self.whole_camera else "a lens file"
-                raise InputError(_COMMAND, str(file), f"({what})", "--to c or glsl, without --fix and --only")
+                raise InputError(
+                    _COMMAND, str(file), f"({what})", "source code (--to c, glsl ...), without --fix, --only"
+                )
             write = self._write_camera if self.whole_camera else self._write_lens
         else:
             write = partial(self._write_model, parts=parts, fixed=fixed)
@@ -132,7 +135,7 @@ examples:
 
         loaded = load_model(file)
         if loaded.axes and (self.to == "onnx" or fixed or set(parts) != set(_PARTS)):
-            expected = "--to c or glsl without --fix, --only"
+            expected = "source code (--to c, glsl ...), without --fix, --only"
             raise InputError(_COMMAND, str(file), "(a model of many states)", expected)
         fix, models = Fix(), loaded.file.nodes
         if fixed:
@@ -184,8 +187,9 @@ examples:
         lens = facts["lens"] if "lens" in facts else facts["card"]["lens"]
         name = checked_name(self.to, f"{lens['id']}_camera", self.name)
         graph = camera.lens_graph()
-        # Compilers of GLSL take minutes for an array of 43,000 constants: there the table is a texture of the caller.
-        program = camera_program(camera.film, graph, self.derivatives, own_table=self.to == "c")
+        # Compilers of shaders take minutes for an array of 43,000 constants: there the caller brings the table.
+        own_table = self.to in ("c", "cuda")
+        program = camera_program(camera.film, graph, self.derivatives, own_table=own_table)
         numbers = {key: facts[key] for key in ("efl_mm", "f_number", "film_z_mm", "stop_radius_mm")}
         constants = {"film_width_mm": self.film[0], "film_height_mm": self.film[1], **numbers}
         constants |= {"pupil_z_mm": camera.film.outline.pupil_z_mm, "exposure": camera.film.exposure}
@@ -195,14 +199,12 @@ examples:
             f"Lens data: sha256 {str(lens.get('sha256'))[:16]}. Focus {self.focus_m:g} m; {told}.",
             CAMERA_FRAME,
         ]
-        if self.to == "glsl":
+        if not own_table:
             table, beside = camera.film.outline.table, self.out.with_name(f"{self.out.name}.outline.f32")
             with atomic_path(beside) as temporary:
                 temporary.write_bytes(table.astype("<f4").tobytes())
             size = f"{table.shape[1]} wide, {len(table)} high"
-            comment.append(
-                f"outline: texture of one float a texel, {size}: {beside.name}, little-endian, line by line."
-            )
+            comment.append(f"outline: one float a texel, {size}: {beside.name}, little-endian, line by line.")
         return _about(write_program(program, self.out, self.to, name, lines_of(comment), Extras(constants)))
 
 

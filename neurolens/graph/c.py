@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -27,7 +27,7 @@ def _parts(file: str) -> dict[str, Template]:
 
 
 def part(file: str, key: str, /, **values: object) -> str:
-    """A text of `parts.h` or `parts.glsl`, which the line "//// KEY" precedes, with its ${places} filled."""
+    """A text of `parts.h` or `parts.shading`, which the line "//// KEY" precedes, with its ${places} filled."""
     return _parts(file)[key].substitute(values)
 
 
@@ -111,6 +111,8 @@ class Writer:
         table: coefficients that differ between tables, each a row of one value a table, in the order of their use.
         texts: an expression for each kind of step, of its arguments; {name} and {macro} are the function's.
         place: a coefficient of the table, by its number.
+        declared, kind: an argument and the word for a float. let: the words before a number's name. between: arguments.
+        header: of a function, by its name, arguments and kind.
         lookup: a number of a table of the caller. own_lookup: one of a table of the program, if that differs.
     """
 
@@ -130,6 +132,8 @@ class Writer:
         "fma": "{macro}_FMA({0}, {1}, {2})",
     }
     place = "c[{}]"
+    declared, kind, let, between = "{1} {0}", "float", "float", ", "
+    header = "{macro}_INLINE {2} {0}({1})"
     lookup = "{table}[{name}_cell({index}, {cells}) * {width} + {place}]"
     own_lookup = ""
 
@@ -170,15 +174,18 @@ class Writer:
     def steps(self) -> list[str]:
         """The steps of the program as lines."""
         steps = [(k, self.program.steps[k]) for k in self.program.live()]
-        return [f"    float t{k} = {self.step(step)};" for k, step in steps if step.kind != "input"]
+        return [f"    {self.let} t{k} = {self.step(step)};" for k, step in steps if step.kind != "input"]
 
     def one_number(self, name: str) -> str:
         """A function `name` of the inputs of the program that gives its one output."""
-        steps = [self.program.steps[k] for k in self.program.live()]
-        inputs = ", ".join(f"float {step.name}" for step in steps if step.kind == "input")
         (output,) = self.program.outputs
-        last = f"    return {self.output(output)};"
-        return "\n".join([f"float {name}({inputs})", "{", *self.steps(), last, "}\n"])
+        header = self.function(name, (self.program.steps[k] for k in self.program.live()), self.kind)
+        return "\n".join([header, "{", *self.steps(), f"    return {self.output(output)};", "}\n"])
+
+    def function(self, name: str, steps: Iterable[Step], kind: str) -> str:
+        """The header of a function of the inputs among these steps."""
+        inputs = self.between.join(self.declared.format(s.name, self.kind) for s in steps if s.kind == "input")
+        return self.header.format(name, inputs, kind, macro=self.name.upper())
 
     def state_parts(self, mixture: Mixture, table: Sequence[Sequence[float]]) -> dict[str, Any]:
         """The parts of the function that makes a state; this is the writer of `mixture.program`.
@@ -192,7 +199,7 @@ class Writer:
             "features": rows.shape[1],
             "size": rows.size,
             "rows": ",\n    ".join(", ".join(literal(v) for v in row) for row in rows),
-            "arguments": ", ".join(f"float {step.name}" for step in mixture.program.steps if step.kind == "input"),
+            "header": self.function(f"{self.name}_at", mixture.program.steps, f"{self.name}_state"),
             "steps": "\n".join(self.steps()),
             "made": ", ".join(self.output(name) for name in mixture.program.outputs if name != "inside"),
             "inside": self.output("inside"),
@@ -282,7 +289,7 @@ def write_c(program: Program, name: str, comment: Sequence[str], extras: Extras 
     text += "\n" * bool(extras.constants)
     text += "".join(f"#define {macro}_{key.upper()} {literal(v)}\n" for key, v in extras.constants.items())
     for key, function in extras.functions.items():
-        text += f"\n{macro}_INLINE {Writer(function, name).one_number(f'{name}_{key}')}"
+        text += f"\n{Writer(function, name).one_number(f'{name}_{key}')}"
     body = writer.steps()
     results = [f"    ray.{o} = {writer.output(o)};" for o in signature.outputs]
     if signature.status:

@@ -86,13 +86,13 @@ def write_osl(
     head += [f"output {_KINDS.get(o, 'vector')} {o} = 0.0" for o in outputs]
     tables = ""
     for table, numbers in program.own_tables.items():
-        values = ", ".join(_plain(literal(v)) for v in numbers.reshape(-1))
+        values = ", ".join(plain(literal(v)) for v in numbers.reshape(-1))
         tables += f"    float {name}_{table}[{numbers.size}] = {{{values}}};\n"
     steps = urgent(writer.steps())
-    body = _plain("\n".join(steps if len(steps) < _STATEMENTS else _together(steps)))
+    body = plain("\n".join(steps if len(steps) < _STATEMENTS else _together(steps)))
     results = ""
     for o in outputs:
-        rows = ", ".join(_plain(writer.output(f"{o}_{k}")) for k in range(3))
+        rows = ", ".join(plain(writer.output(f"{o}_{k}")) for k in range(3))
         results += f"    {o} = {_KINDS.get(o, 'vector')}({rows});\n"
     parts = ",\n    ".join(head)
     mixed = "" if program.mixture is None else _mixed(program.mixture, writer)
@@ -120,7 +120,7 @@ def _mixed(mixture: Mixture, writer: Writer) -> str:
     for k, row in enumerate(rows):
         terms = (f"{literal(v)} * {name}" for v, name in zip(row, names, strict=True) if v)
         text += f"\n    float c{k} = {' + '.join(terms) or '0.0'};"
-    return TEMPORARY.sub(r"s\1", _plain(text)) + "\n"
+    return TEMPORARY.sub(r"s\1", plain(text)) + "\n"
 
 
 def _together(lines: Sequence[str]) -> list[str]:
@@ -130,7 +130,7 @@ def _together(lines: Sequence[str]) -> list[str]:
     return ["    float " + ",\n      ".join(part) + ";" for part in parts]
 
 
-def _plain(text: str) -> str:
+def plain(text: str) -> str:
     """C's literals without the suffix."""
     return _SUFFIX.sub(r"\1", text)
 

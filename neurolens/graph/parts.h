@@ -99,7 +99,7 @@ typedef struct {
 static const float ${name}_nodes[${size}] = {
     ${rows}};
 
-${macro}_UNUSED static inline ${name}_state ${name}_at(${arguments})
+${header}
 {
 ${steps}
     const float feature[${features}] = {${made}};

@@ -125,8 +125,8 @@ _FOLDED: dict[str, Callable[..., Any]] = {
     "div": lambda a, b: a / b,
     "sqrt": np.sqrt,
     "floor": np.floor,
-    "max": np.maximum,
-    "min": np.minimum,
+    "max": lambda a, b: np.where(a > b, a, b),  # as sources have it: of NaN, the second
+    "min": lambda a, b: np.where(a < b, a, b),
     "clamp": lambda x, limit: np.where(np.abs(x) < limit, x, np.copysign(limit, x)),
     "fma": lambda a, b, c: a * b + c,
     "select": lambda a, b, x, y: np.where(a <= b, x, y),

@@ -1,4 +1,4 @@
-"""Source code of models: a C99 header or a GLSL function, the card as a comment on top; and what a scene fixes of them.
+"""Source code of models, C99 or a shading language, the card as a comment on top; and what a scene fixes of them.
 
 Only fixing needs torch.
 """
@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 import re
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,6 @@ import neurolens
 from neurolens.base.errors import InputError
 from neurolens.base.files import atomic_write_text
 from neurolens.graph.c import NOTHING, Extras, Signature, write_c
-from neurolens.graph.glsl import write_glsl
 from neurolens.graph.program import (
     FILM_Z,
     RAY,
@@ -30,17 +30,20 @@ from neurolens.graph.program import (
     Program,
 )
 from neurolens.graph.scalars import lower
+from neurolens.graph.shading import LANGUAGES, write_shading
 from neurolens.lens.glass import inverse_square_um
 from neurolens.surrogates.assemble import ALL, SCALARS, Parts, model_graph
 from neurolens.surrogates.axes import mixture_of, state_names
 from neurolens.surrogates.card import DOMAIN_SLACK, POLARISED, axes_of, transmittance_of
 from neurolens.surrogates.model import Domain, LensModel, with_one_angle
 
-WRITERS = {"c": write_c, "glsl": write_glsl}
+WRITERS: Mapping[str, Callable[..., str]] = {
+    "c": write_c, **{name: partial(write_shading, kind) for name, kind in LANGUAGES.items()}
+}  # fmt: skip
 OSL = "osl"  # of whole cameras: `shaders.osl`
 _WIDTH, _MOST_WAVELENGTHS = 110, 64
-# Keywords of C11, C++20 and GLSL 4.60 and words reserved there, types and functions of GLSL and OSL,
-# names of the code that is written.
+# Keywords of C11, C++20 and GLSL 4.60 and words reserved there, types and functions of GLSL and OSL, words of HLSL,
+# WGSL, CUDA and VEX, names of the code that is written.
 _WORDS = """
     alignas alignof and and_eq asm auto bitand bitor bool break case catch char char8_t char16_t char32_t class co_await
     co_return co_yield compl concept const const_cast consteval constexpr constinit continue decltype default delete do
@@ -55,10 +58,14 @@ _WORDS = """
     refract round sign step texture transpose radians degrees isnan isinf
     color point vector normal matrix string closure shader surface displacement volume light noise hash random emit
     size_t ptrdiff_t max_align_t offsetof linux unix errno signal
+    cbuffer compile groupshared line linear mad module pass select snorm technique triangle unorm property extension
+    override fn let var alias loop continuing diagnostic enable ptr array await become crate def delegate final
+    finally from function impl implements import instanceof is it macro match meta move mut nil null of on package
+    ref self set trait type unless use where with yield device grid cvex foreach gather len push resize sop texel
     ray rays i r c x y count band known band_first
 """.split()
 _PATTERNS = re.compile(
-    r"t\d+|gl_.*|[biud]?vec[234]|d?mat[234](x[234])?|[iu]?(sampler|image|texture|subpassInput)\w*|texel\w*|atomic\w*|hvec\d"
+    r"t\d+|[fiu](16|32|64)|gl_.*|[biud]?vec[234]|d?mat[234](x[234])?|[iu]?(sampler|image|texture|subpassInput)\w*|texel\w*|atomic\w*|hvec\d"
     r"|dmat\w*|fvec\d|u?int(8|16|32|64)?_t|u?int|float_t|double_t"
 )
 _ERRORS = ("rms_um", "p99_um", "max_um", "direction_rms_deg", "transmittance_rms", "false_pass", "false_block")
@@ -171,7 +178,7 @@ def export_source(
     Args:
         models: one; one for each wavelength; or one for every node of a card with states (zoom, internal focus): then
             the state is an argument, which NAME_at makes of numbers.
-        language: "c" or "glsl".
+        language: of `WRITERS`.
         card: of the model, for the comment.
         parts, fix: see `fused_program`.
         name: of the function; None takes the lens's id.
@@ -201,9 +208,7 @@ def checked_name(language: str, lens_id: str, name: str | None) -> str:
         raise InputError("export", "to", language, f"one of {', '.join((*WRITERS, OSL))}")
     function_name = identifier(lens_id) if name is None else name
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,99}", function_name) or "__" in function_name or _taken(function_name):
-        expected = (
-            "letters, digits and single underscores, a letter first, and no word of C, C++, GLSL or OSL or of the code"
-        )
+        expected = "letters, digits and single underscores, a letter first, no word of C, a shader or the code"
         raise InputError("export", "name", function_name, expected)
     return function_name
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from neurolens.cameras.cameragraph import weight_graph
 from neurolens.flare.ghostmodel import GhostModel, ghost_graph
 from neurolens.graph.c import Signature
-from neurolens.graph.glsl import write_glsl
 from neurolens.graph.ir import Graph
 from neurolens.graph.program import FILM_Z, STOP_RADIUS, WAVELENGTH, Program
 from neurolens.graph.scalars import lower
+from neurolens.graph.shading import write_glsl
 from neurolens.lens.prescription import Lens
 from neurolens.shaders.pupil import Blades
 from neurolens.trace.tracegraph import exact_graph

@@ -294,7 +294,7 @@ def test_states_of_a_zoom_are_chosen_when_a_camera_is_written(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--to", "onnx", "--camera"], "--to c or glsl"),
+        (["--to", "onnx", "--camera"], "--to c, glsl ..."),
         (["--to", "c", "--camera", "--fix", "focus=2"], "without --fix"),
         (["--to", "c", "--derivatives"], "--to onnx"),
         (["--to", "c", "--camera", "--zoom", "20"], "zoom"),

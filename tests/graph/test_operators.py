@@ -15,13 +15,13 @@ from neurolens.graph import derive
 from neurolens.graph.c import write_blocks, write_c
 from neurolens.graph.compiler import compile_c
 from neurolens.graph.derive import derivative, with_derivatives
-from neurolens.graph.glsl import write_glsl
 from neurolens.graph.interpret import evaluate
 from neurolens.graph.ir import Graph, Value, pruned
 from neurolens.graph.newton import determinant, limited_newton, solve
 from neurolens.graph.onnx import write_onnx
 from neurolens.graph.program import row_names
 from neurolens.graph.scalars import lower
+from neurolens.graph.shading import write_glsl
 
 Array = np.ndarray
 RNG = np.random.default_rng(0)

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from neurolens.base.errors import InputError
 from neurolens.graph.c import Signature, literal
 from neurolens.graph.compiler import find_compiler
-from neurolens.graph.glsl import write_glsl
 from neurolens.graph.program import SCENE_RAY, Program
+from neurolens.graph.shading import write_glsl
 from neurolens.study.speed import CompiledSource
 from neurolens.surrogates.domain import FilmRays, sample_domain
 from neurolens.surrogates.model import LensModel

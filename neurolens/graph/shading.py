@@ -1,0 +1,237 @@
+"""Programs in shading languages: one writer, and of each language the texts in which it differs from GLSL.
+
+The contract is that of the C header. The results of a ray are a structure NAME_ray where that is a language's habit,
+else arguments. Tables of the caller are textures of one float a texel, a cell a line, or buffers.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable, Sequence
+from functools import partial
+from typing import ClassVar
+
+import numpy as np
+
+from neurolens.base.errors import InputError
+from neurolens.graph.c import NOTHING, Extras, Signature, Writer, comment_of, literal, part
+from neurolens.graph.osl import plain
+from neurolens.graph.program import Mixture, Program
+
+_CAUTION = (
+    "Results mean something where status is 0. A language that may ignore NaN cannot promise the status of one: rays "
+    "handed in must be numbers."
+)
+
+
+class Glsl(Writer):
+    """GLSL; the other languages replace some of its texts.
+
+    Attributes:
+        about: for the comment at the top. head: what follows it, or a text of `parts.shading`. cell: another, which
+            lookups in tables of the caller need.
+        given, out: a declared argument and a declared result. table_of: a table of the caller as an argument.
+        ray: whether the results are a structure. field: of one. variable: a structure that is to be filled.
+        whole, truth, let_whole: the words for such numbers, and before the name of one. to_whole: a float as one.
+            band: one of so many.
+        number: a constant. array: of numbers, after the word `constant` or `local`. row: an array in a structure.
+        within: whether arrays stand within functions alone. loops: whether a state is made from an array of numbers,
+            which compilers of some languages copy for each ray, else by statements.
+    """
+
+    about = "For GLSL 3.30, GLSL ES 3.00 (with highp floats) and later."
+    # The macro of a b + c is that of C, so that the steps of both are the same lines.
+    head, cell = "#define {macro}_FMA(a, b, c) ((a) * (b) + (c))\n", ""
+    texts: ClassVar = Writer.texts | {
+        "sqrt": "sqrt({0})", "floor": "floor({0})", "clamp": "max(min({0}, {1}), -{1})"
+    }  # fmt: skip
+    # NaN is less than nothing in no language.
+    lookup = "texelFetch({table}, ivec2({place}, clamp(int({index}), 0, textureSize({table}, 0).y - 1)), 0).r"
+    own_lookup = "{table}[{width} * clamp(int({index}), 0, {cells} - 1) + {place}]"
+    header, given, out, table_of = "{2} {0}({1})", "in {}", "out {}", "in highp sampler2D {}"
+    ray, field, variable, row = False, "{};", "{};", "float {}[{}];"
+    whole, truth, let_whole = "int", "bool", "int"
+    to_whole, band = "int({})", "clamp(band, 0, {} - 1)"
+    number, array = "const float {} = {};", "float {0}[{1}] = float[{1}]({2});"
+    constant, local, within, loops = "const ", "", False, True
+
+    @property
+    def known(self) -> dict[str, str]:
+        return {"name": self.name, "macro": self.name.upper()}
+
+    def file(self, comment: Sequence[str], extras: Extras) -> str:
+        """The text of a file; arguments as in `c.write_c`."""
+        about = textwrap.wrap(f"{self.about} {_CAUTION}", 110)
+        return f"/*\n{comment_of([*comment, '', *about])}\n */\n{self.code(extras)}"
+
+    def code(self, extras: Extras) -> str:
+        """The text without the comment."""
+        program, kind, s = self.program, type(self), Signature.of(self.program, self.name)
+        self.place = "state.c[{}]" if s.state else f"{self.name}_table[band_first + {{}}]"
+        steps = self.steps()
+        arrays = {table: rows.reshape(-1) for table, rows in program.own_tables.items()}
+        if self.table and not s.state:
+            arrays["table"] = np.array(self.table).T.reshape(-1)
+        tables = [self.listed(f"{self.name}_{table}", map(literal, v)) for table, v in arrays.items()]
+        head = self.head.format(**self.known)
+        text = head if not head or head.endswith("\n") else part("parts.shading", head, **self.known)
+        text += part("parts.shading", self.cell, **self.known) if self.cell and s.tables else ""
+        text += "\n" * bool(extras.constants)
+        for key, value in extras.constants.items():
+            text += self.number.format(f"{self.name}_{key}".upper(), literal(value)) + "\n"
+        for key, function in extras.functions.items():
+            text += f"\n{kind(function, self.name).one_number(f'{self.name}_{key}')}"
+        text += "" if self.within else "".join(f"\n{table}\n" for table in tables)
+        if program.mixture is not None:
+            text += kind(program.mixture.program, self.name).state(program.mixture, self.table)
+        return text + self._ray(s, [f"    {table}" for table in tables if self.within] + steps)
+
+    def listed(self, name: str, texts: Iterable[str], before: str | None = None) -> str:
+        """An array; a constant, unless another word comes `before` it."""
+        values = [text.strip(" \n()") for text in texts]
+        rows = ",\n    ".join(", ".join(values[i : i + 8]) for i in range(0, len(values), 8))
+        word = self.constant.format(**self.known) if before is None else before
+        return word + self.array.format(name, len(values), rows)
+
+    def state(self, mixture: Mixture, table: Sequence[Sequence[float]]) -> str:
+        """The structure of a state and the function that makes it; arguments as in `c.Writer.state_parts`."""
+        parts = self.state_parts(mixture, table)
+        kind, numbers, features = f"{self.name}_state", parts["rows"].split(","), parts["features"]
+        fields = [self.field.format(self.declared.format("inside", self.truth)), self.row.format("c", parts["count"])]
+        nodes, sums = "", []
+        if self.loops:
+            nodes = self.listed(f"{self.name}_nodes", numbers) + "\n\n"
+            sums = [part("parts.shading", "sums", **self.known, **parts).rstrip()]
+        else:
+            for i in range(parts["count"]):
+                row = numbers[features * i : features * (i + 1)]
+                terms = (
+                    f"{number.strip()} * feature[{k}]" for k, number in enumerate(row) if float(number.strip("( f)\n"))
+                )
+                sums.append(f"    state.c[{i}] = {' + '.join(terms) or '0.0'};")
+        return part(
+            "parts.shading", "state", **self.known, **parts, struct=_struct(kind, fields), nodes=nodes,
+            state=self.variable.format(self.declared.format("state", kind)), sums="\n".join(sums),
+            feature=self.listed("feature", parts["made"].split(", "), self.local),
+        )  # fmt: skip
+
+    def _ray(self, s: Signature, body: list[str]) -> str:
+        """The function of a ray, and the structure of its results."""
+        place, values = "ray." * self.ray, {o: self.output(o) for o in s.outputs}
+        kinds = dict.fromkeys(s.outputs, self.kind)
+        if s.status:
+            kinds["status"], values["status"] = self.whole, self.to_whole.format(self.output("status"))
+        inputs = dict.fromkeys(s.inputs, self.kind)
+        body = [*body, *(f"    {place}{o} = {value};" for o, value in values.items())]
+        if s.state:
+            inputs["state"] = f"{s.name}_state"
+            body.append(f"    if (!state.inside) {{ {place}status = 1; }}")
+        elif s.bands > 1:
+            inputs["band"] = self.whole
+            band = self.band.format(s.bands, name=s.name)
+            body.insert(0, f"    {self.let_whole} band_first = {len(self.table)} * {band};")
+            body.append(f"    if (band < 0 || band >= {s.bands}) {{ {place}status = 1; }}")
+        outputs = [self.declared.format(o, kind) for o, kind in kinds.items()]
+        declared = [self.given.format(self.declared.format(i, kind)) for i, kind in inputs.items()]
+        declared[len(s.inputs) : len(s.inputs)] = [self.table_of.format(t) for t in s.tables]
+        kind, struct = "void", ""
+        if self.ray:
+            kind = f"{s.name}_ray"
+            struct = "\n" + _struct(kind, map(self.field.format, outputs))
+            body = [f"    {self.variable.format(self.declared.format('ray', kind))}", *body, "    return ray;"]
+        else:
+            declared += map(self.out.format, outputs)
+        parameters = "\n    " + f"{self.between.rstrip()}\n    ".join(declared)
+        header = self.header.format(s.name, parameters, kind, macro=s.name.upper())
+        return "\n".join([f"{struct}\n{header}", "{", *body, "}\n"])
+
+
+def _struct(name: str, fields: Iterable[str]) -> str:
+    return "\n".join([f"struct {name} {{", *(f"    {field}" for field in fields), "};\n"])
+
+
+class Hlsl(Glsl):
+    """HLSL, from shader model 5 on."""
+
+    about = "For HLSL of shader model 5 and later."
+    head, cell = "", "hlsl_cell"
+    texts: ClassVar = Glsl.texts | {"fma": "mad({0}, {1}, {2})"}
+    table_of, lookup = "Texture2D {}", "{table}.Load(int3({place}, {name}_cell({table}, {index}), 0)).r"
+    number, array, constant = "static const float {} = {};", "float {0}[{1}] = {{\n    {2}\n}};", "static const "
+    loops = False
+
+
+class Slang(Hlsl):
+    """Slang is HLSL to this extent; tables are buffers, which it has on every target."""
+
+    about, cell = "For Slang.", "slang_cell"
+    table_of = "StructuredBuffer<float> {}"
+    lookup = "{table}[{width} * {name}_cell({table}, {index}, {width}) + {place}]"
+
+
+class Wgsl(Glsl):
+    """WGSL, the language of WebGPU."""
+
+    about, head = "For WGSL (WebGPU).", ""
+    texts: ClassVar = Glsl.texts | {
+        "max": "select({1}, {0}, {0} > {1})", "min": "select({1}, {0}, {0} < {1})", "fma": "fma({0}, {1}, {2})",
+        "select": "select({3}, {2}, {0} <= {1})",
+    }  # fmt: skip
+    table_of = "{}: texture_2d<f32>"
+    lookup = "textureLoad({table}, vec2({place}, clamp(i32({index}), 0, i32(textureDimensions({table}).y) - 1)), 0).r"
+    own_lookup = "{table}[{width} * clamp(i32({index}), 0, {cells} - 1) + {place}]"
+    declared, kind, let, header, given = "{0}: {1}", "f32", "let", "fn {0}({1}) -> {2}", "{}"
+    ray, field, variable, row = True, "{},", "var {};", "{}: array<f32, {}>,"
+    whole, let_whole, to_whole, loops = "i32", "let", "i32({})", False
+    # Of an array that is `const` naga makes a copy for every number that is read.
+    number, array = "const {} = {};", "{0} = array<f32, {1}>(\n    {2}\n);"
+    constant, local = "var<private> ", "var "
+
+
+class Cuda(Glsl):
+    """CUDA, and C++ for the host."""
+
+    about = "For CUDA, and C++ on the host. Never compile it with --use_fast_math or -ffast-math."
+    head = "cuda_head"
+    texts: ClassVar = Glsl.texts | {
+        "sqrt": "sqrtf({0})", "floor": "floorf({0})", "clamp": "fmaxf(fminf({0}, {1}), -{1})",
+        "fma": "fmaf({0}, {1}, {2})",
+    }  # fmt: skip
+    table_of, lookup, own_lookup = "const float *{0}, int {0}_cells", Writer.lookup, Writer.lookup
+    header, given, ray = "{macro}_DEVICE {2} {0}({1})", "{}", True
+    band, to_whole = "{name}_cell(float(band), {})", "int({})"
+    number, array, constant = "#define {} {}", "float {0}[{1}] = {{\n    {2}\n}};", "{macro}_TABLE "
+
+
+class Vex(Glsl):
+    """VEX of Houdini, which has no constants outside functions."""
+
+    about, head = "For VEX. Houdini did not compile this: it is written after the reference of VEX.", ""
+    texts: ClassVar = Glsl.texts | {"fma": "{0} * {1} + {2}"}
+    table_of, given, out, between = "float {}[]", "{}", "export {}", "; "
+    lookup = "{table}[{width} * clamp(int({index}), 0, len({table}) / {width} - 1) + {place}]"
+    number, array, constant, within = "#define {} {}", "float {0}[] = {{\n    {2}\n}};", "", True
+
+    def code(self, extras: Extras) -> str:
+        """Literals have no suffix here."""
+        if self.program.mixture is not None:
+            expected = "one state (--zoom), or another language"
+            raise InputError("export", "to", "vex (of a range of zoom or focus)", expected)
+        return plain(super().code(extras))
+
+
+LANGUAGES = {"glsl": Glsl, "slang": Slang, "hlsl": Hlsl, "wgsl": Wgsl, "cuda": Cuda, "vex": Vex}
+
+
+def write_shading(
+    language: type[Glsl], program: Program, name: str, comment: Sequence[str], extras: Extras = NOTHING
+) -> str:
+    """The text of a file in a language; arguments as in `c.write_c`.
+
+    Raises:
+        InputError: a program of many states in VEX.
+    """
+    return language(program, name).file(comment, extras)
+
+
+write_glsl = partial(write_shading, Glsl)
