@@ -13,7 +13,7 @@ struct layer {
     int width, height, levels;
     const float *texel; /* [height, width, 4]: red, green, blue, inverse depth; below 0: there is nothing */
     const float *jump; /* [height, width]: steps of inverse depth to a neighbour that are no edge of a thing */
-    const float *bounds; /* least and largest inverse depth of cells of FINEST, 2 FINEST ... pixels, level by level */
+    const float *bounds; /* least and largest inverse depth of cells of 2^FINEST, twice that ... pixels, level by level */
     const int64_t *start; /* first cell of each level */
     float nearest; /* the largest inverse depth */
 };
@@ -48,11 +48,11 @@ ALWAYS void narrow(const struct layer *p, struct line r, float *low, float *high
         const int y0 = clamped(lesser(ya, yb), p->height), y1 = clamped(larger(ya, yb), p->height);
         const int span = x1 - x0 > y1 - y0 ? x1 - x0 : y1 - y0;
         int level = 0;
-        while (FINEST << level < span && level < p->levels - 1) level++;
-        const int cell = FINEST << level, wide = (p->width + cell - 1) / cell;
+        while (1 << (FINEST + level) < span && level < p->levels - 1) level++;
+        const int shift = FINEST + level, wide = (p->width + (1 << shift) - 1) >> shift;
         float least = INFINITY, most = -INFINITY;
-        for (int j = y0 / cell; j <= y1 / cell; j++)
-            for (int i = x0 / cell; i <= x1 / cell; i++) {
+        for (int j = y0 >> shift; j <= y1 >> shift; j++)
+            for (int i = x0 >> shift; i <= x1 >> shift; i++) {
                 const float *const b = p->bounds + 2 * (p->start[level] + (size_t)j * wide + i);
                 least = lesser(least, b[0]);
                 most = larger(most, b[1]);

@@ -31,7 +31,7 @@ _NUMBERS = 5  # of a line: ax, ay, bx, by, weight
 _NODES, _PITCH = 64, 8  # cells along the longer side of the film, and their least size in pixels
 _SET = 512  # points of the pupil
 _FEW = 128  # of them, to measure blur
-_LEAST = 8  # samples of a pixel
+_LEAST, _A_PIXEL = 8, 1  # samples of a pixel, and more for each pixel of the blur's radius: FLIP hardly gains by others
 _MIDDLE_NM = 550.0
 _CLEAR = 0.01  # of its inverse depth, by which what hides a point is nearer
 LIGHT_NM = (400.0, 700.0)
@@ -59,7 +59,13 @@ class _Table(ctypes.Structure):
 @cache
 def compiled() -> ctypes.CDLL:
     library = load_compiled(
-        c_source("defocus/gather.c", NUMBERS=_NUMBERS, WEIGHT=_NUMBERS - 1, FINEST=FINEST, CLEAR=f"{_CLEAR}f")
+        c_source(
+            "defocus/gather.c",
+            NUMBERS=_NUMBERS,
+            WEIGHT=_NUMBERS - 1,
+            FINEST=FINEST.bit_length() - 1,
+            CLEAR=f"{_CLEAR}f",
+        )
     )
     whole, pointer = ctypes.c_int, ctypes.c_void_p
     library.splat.argtypes = [pointer, whole, pointer, whole, pointer, *[whole] * 2, pointer, *[whole] * 2, pointer]
@@ -218,7 +224,9 @@ def _sizes(layers: list[Layer], spread: NDArray[np.float64], size: tuple[int, in
                 low = np.where(inside, np.maximum(least[np.ix_(rows, columns)], 0), low)
                 high = np.where(inside, np.maximum(most[np.ix_(rows, columns)], 0), high)
         widest = np.maximum(widest, np.maximum(radius_px(here, low), radius_px(here, high)))
-    wanted = np.clip(np.ceil(np.log2(4 + 4 * widest)), math.log2(_LEAST), math.log2(samples)).astype(np.uint8)
+    wanted = np.clip(np.ceil(np.log2(_LEAST / 2 + _A_PIXEL * widest)), math.log2(_LEAST), math.log2(samples)).astype(
+        np.uint8
+    )
     return np.ascontiguousarray(wanted.repeat(FINEST, 0).repeat(FINEST, 1)[:height, :width])
 
 
