@@ -65,8 +65,9 @@ def read_plate(
     """A plate for a camera of such a film and frame (`cameras.field.frame_of`).
 
     The display window is the film; a larger data window is overscan. A picture of `neurolens render --camera pinhole`
-    says itself what its pinhole was. Any other is that of the camera's own frame: its hole in the paraxial entrance
-    pupil, its focal length the lens's paraxial size in the plane in focus, which `neurolens stmap` prints.
+    says itself what its pinhole and its film were: a larger film is overscan, too. Any other is that of the camera's
+    own frame: its hole in the paraxial entrance pupil, its focal length the lens's paraxial size in the plane in focus,
+    which `neurolens stmap` prints.
 
     Args:
         behind: files of the same size that show what is behind the things of the plate.
@@ -78,14 +79,15 @@ def read_plate(
     header = header_of(path)
     (left, top), (last, bottom) = header["displayWindow"]
     size = int(last) - int(left) + 1, int(bottom) - int(top) + 1
-    if not math.isclose(size[0] / size[1], film_mm[0] / film_mm[1], rel_tol=_SAME + 1 / min(size)):
-        expected = f"a picture of the film's shape, {film_mm[0]:g} x {film_mm[1]:g} mm"
-        raise InputError(path, "displayWindow", f"({size[0]} x {size[1]} pixels)", expected)
     ours = _pinhole(metadata_of(path, header))
+    plate_mm = film_mm if ours is None else ours["film_mm"]
+    if not math.isclose(size[0] / size[1], plate_mm[0] / plate_mm[1], rel_tol=_SAME + 1 / min(size)):
+        expected = f"a picture of the film's shape, {plate_mm[0]:g} x {plate_mm[1]:g} mm"
+        raise InputError(path, "displayWindow", f"({size[0]} x {size[1]} pixels)", expected)
     reach, before = frame.reach_mm, frame.pupil_mm[1]
     if ours is not None:
         reach, before = (ours["efl_mm"], ours["efl_mm"]), ours["efl_mm"]
-    per_mm = size[0] / film_mm[0], size[1] / film_mm[1]
+    per_mm = size[0] / plate_mm[0], size[1] / plate_mm[1]
     start = [int(v) for v in header["dataWindow"][0]]
     centre = size[0] / 2 + int(left) - start[0], size[1] / 2 + int(top) - start[1]
     eye = Eye((reach[0] * per_mm[0], reach[1] * per_mm[1]), centre, before)
@@ -103,7 +105,7 @@ def read_plate(
             if ours is not None and ours.get("vignetting", "both") in ("both", "natural"):
                 light /= (cosine**4)[..., None]
             layers.append(Layer(light, w))
-    return Plate(layers, eye, size, space)
+    return Plate(layers, eye, (max(1, round(film_mm[0] * per_mm[0])), max(1, round(film_mm[1] * per_mm[1]))), space)
 
 
 def _pinhole(metadata: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -111,8 +113,9 @@ def _pinhole(metadata: Mapping[str, Any]) -> dict[str, Any] | None:
     camera = metadata.get("camera")
     if not isinstance(camera, dict) or camera.get("camera") != "pinhole":
         return None
-    focal = camera.get("efl_mm")
-    return camera if isinstance(focal, float | int) and 0 < focal < math.inf else None
+    film = camera.get("film_mm")
+    lengths = [camera.get("efl_mm"), *(film if isinstance(film, list) and len(film) == 2 else [None])]
+    return camera if all(isinstance(v, float | int) and 0 < v < math.inf for v in lengths) else None
 
 
 def _layers(path: Path, depth: DepthSettings, several: bool) -> list[tuple[FloatArray, FloatArray]]:

@@ -14,6 +14,7 @@ from neurolens.cameras.contract import Camera
 from neurolens.cameras.field import field_of, frame_of
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.sampling import concentric_disk, stratified
+from neurolens.cli import main
 from neurolens.defocus.gather import gather, spread_over, turned
 from neurolens.defocus.highlights import spread_highlights, take_highlights
 from neurolens.defocus.kernels import kernel_at
@@ -385,3 +386,21 @@ def test_a_kernel_has_the_area_of_rays_traced_from_the_point(exact: Camera) -> N
     assert areas[0] == pytest.approx(areas[1], rel=0.03)
     mine = kernel.light[..., 1] / kernel.light[..., 1].sum()
     assert np.abs(mine - found / found.sum()).sum() < 0.25  # a patch of 3 pixels softens the rim
+
+
+def test_a_plate_of_our_own_says_its_pinhole_and_its_film(tmp_path: Path, scene: Path) -> None:
+    """The same scene on a film twice as large is overscan: the same picture, and nothing from beyond it."""
+    given = ["render", scene, "--camera", "pinhole", "--samples", "4", "--quiet"]
+    assert main([*map(str, given), "--film", "36x20.25", "--width", "64", "-o", str(tmp_path / "a.exr")]) == 0
+    assert main([*map(str, given), "--film", "72x40.5", "--width", "128", "-o", str(tmp_path / "b.exr")]) == 0
+    camera = thin(1.0)
+    plates = [read_plate(tmp_path / f"{name}.exr", FILM, frame_of(camera), DepthSettings()) for name in "ab"]
+    assert [plate.size for plate in plates] == [(64, 36)] * 2 and plates[1].layers[0].size == (128, 72)
+    assert plates[0].eye.before_film_mm == 50.0
+    # Depth counts from the film, 50 mm behind the hole; the ball's front is 1.9 m from it, 0.4 m off the axis.
+    assert 1 / plates[0].layers[0].texel[..., 3].max() == pytest.approx(2.0 - 0.1 - 0.05, abs=0.02)
+    one, two = (gather(p.layers, p.eye, camera, p.size, spread_over(camera, p.eye, p.size), 64) for p in plates)
+    assert two.beyond == 0 and one.beyond > 0
+    np.testing.assert_allclose(one.rgb[4:-4, 4:-4].mean(axis=(0, 1)), two.rgb[4:-4, 4:-4].mean(axis=(0, 1)), rtol=0.01)
+    # The weight of the hole, cos^4, is taken out: what is left is the radiance of the white surroundings.
+    np.testing.assert_allclose(plates[0].layers[0].texel[:6, :6, :3].mean(axis=(0, 1)), 1, rtol=0.03)
