@@ -196,7 +196,9 @@ def radius_px(spread: NDArray[np.float64], w: NDArray[Any]) -> NDArray[np.float6
     return np.sqrt(np.maximum(2 * (a + (ab + b * w) * w), 0))
 
 
-def _sizes(layers: list[Layer], spread: NDArray[np.float64], size: tuple[int, int], samples: int) -> NDArray[np.uint8]:
+def _sizes(
+    layers: list[Layer], eye: Eye, spread: NDArray[np.float64], size: tuple[int, int], samples: int
+) -> NDArray[np.uint8]:
     """Binary logarithms [H, W] of the numbers of samples, by the widest disc that reaches a pixel."""
     width, height = size
     places = [np.minimum(np.arange(0, n, FINEST) + FINEST / 2, n - 1) for n in (height, width)]
@@ -207,7 +209,6 @@ def _sizes(layers: list[Layer], spread: NDArray[np.float64], size: tuple[int, in
     here = spread[np.ix_(*nodes)]
     widest = np.zeros(here.shape[:2])
     for layer in layers:
-        scale = [layer.size[1] / height, layer.size[0] / width]
         low, high = np.zeros(widest.shape), np.full(widest.shape, max(layer.nearest, 0.0))
         for _ in range(2):
             reach = np.maximum(radius_px(here, low), radius_px(here, high))
@@ -216,8 +217,8 @@ def _sizes(layers: list[Layer], spread: NDArray[np.float64], size: tuple[int, in
                 bounds = layer.bounds[k]
                 cell = FINEST << int(k)
                 rows, columns = (
-                    np.minimum((p * s / cell).astype(int), n - 1)
-                    for p, s, n in zip(places, scale, bounds.shape, strict=False)
+                    np.clip(((p + border) / cell).astype(int), 0, n - 1)
+                    for p, border, n in zip(places, eye.border_px(size)[::-1], bounds.shape, strict=False)
                 )
                 least, most = _around(bounds[..., 0], np.minimum), _around(bounds[..., 1], np.maximum)
                 inside = level == k
@@ -256,7 +257,7 @@ def gather(
     jitter = np.ascontiguousarray(points[2:4].T, np.float32)
     table = RayTable(camera, eye, size, points[:2].astype(np.float32), points[4].astype(np.float32))
     (across, down), (structs, kept) = table.cells, as_structs(layers)
-    sizes = _sizes(layers, spread, size, samples)
+    sizes = _sizes(layers, eye, spread, size, samples)
     rgb = np.empty((height, width, 3), np.float32)
     lost = np.zeros(3)
     edges = [round(j * height / down) for j in range(down + 1)]

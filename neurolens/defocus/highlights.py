@@ -39,7 +39,7 @@ class Highlights:
     light: FloatArray
 
 
-def take_highlights(layer: Layer, spread: NDArray[np.float64], size: tuple[int, int]) -> Highlights:
+def take_highlights(layer: Layer, eye: Eye, spread: NDArray[np.float64], size: tuple[int, int]) -> Highlights:
     """Take the highlights out of a layer, which is changed, for a film of `size` with such a spread at its nodes."""
     rgb, w = layer.texel[..., :3], layer.texel[..., 3]
     bright = rgb.max(axis=2)
@@ -49,8 +49,8 @@ def take_highlights(layer: Layer, spread: NDArray[np.float64], size: tuple[int, 
     cap = np.maximum(_BRIGHTER * geometric, _ABOVE * mean)
     row, column = np.nonzero((bright > cap) & (w >= 0))
     nodes = [
-        np.clip(((v + 0.5) / n * (k - 1)).round().astype(int), 0, k - 1)
-        for v, n, k in zip((row, column), w.shape, spread.shape[:2], strict=True)
+        np.clip(((v + 0.5 - border) / n * (k - 1)).round().astype(int), 0, k - 1)
+        for v, border, n, k in zip((row, column), eye.border_px(size)[::-1], size[::-1], spread.shape[:2], strict=True)
     ]
     radius = radius_px(spread[nodes[0], nodes[1]], w[row, column])
     wide = radius > _LEAST_PX
@@ -82,10 +82,9 @@ def spread_highlights(
 ) -> None:  # fmt: skip
     """Add the light of highlights to a picture [H, W, 3]."""
     height, width = picture.shape[:2]
-    plate = layers[0].size
-    scale = np.array([width / plate[0], height / plate[1]])
+    border = np.array(eye.border_px((width, height)))
     groups = defaultdict(list)
-    cell = (found.place_px / (max(plate) / _PLACES)).astype(int)
+    cell = (found.place_px / (max(width, height) / _PLACES)).astype(int)
     near = 4.0 * _FINE_PX / _FINE
     step = (
         np.where(
@@ -103,7 +102,7 @@ def spread_highlights(
     for number, rows in enumerate(groups.values()):
         place, w = found.place_px[rows].mean(axis=0), float(found.inverse_depth[rows].mean())
         kernel = kernel_at(
-            camera, eye, (width, height), (place[0], place[1]), w, tuple(place * scale), _CELLS, _COLOURS
+            camera, eye, (width, height), (place[0], place[1]), w, tuple(place - border), _CELLS, _COLOURS
         )
         if kernel is not None:
             points = np.empty((len(rows), 8), np.float32)

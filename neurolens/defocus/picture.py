@@ -57,7 +57,7 @@ def defocus(
     check_field(camera)
     spread, taken = spread_over(camera, plate.eye, plate.size), []
     if highlights:
-        taken = [take_highlights(layer, spread, plate.size) for layer in plate.layers]
+        taken = [take_highlights(layer, plate.eye, spread, plate.size) for layer in plate.layers]
     with progress.stage(f"blur by {camera.name}") as report:
         found = gather(
             plate.layers, plate.eye, camera, plate.size, spread, 1 << (samples - 1).bit_length(), threads, report

@@ -34,6 +34,10 @@ class Eye:
     centre_px: tuple[float, float]
     before_film_mm: float
 
+    def border_px(self, size: tuple[int, int]) -> tuple[float, float]:
+        """How far a plate's first pixel lies beyond that of a film of `size` whose pixels are as large: overscan."""
+        return self.centre_px[0] - size[0] / 2, self.centre_px[1] - size[1] / 2
+
     def lines(self, origin_m: FloatArray, direction: FloatArray) -> FloatArray:
         """Rays [3, N] in the camera frame as lines [4, N] in the plate: x = ax + bx w, y = ay + by w, w in 1/m."""
         slope = direction[:2] / -direction[2]

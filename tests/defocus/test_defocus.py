@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import OpenEXR
 import pytest
 
 from neurolens.cameras.build import make_camera
-from neurolens.cameras.contract import Camera
+from neurolens.cameras.contract import Camera, DifferentialCamera
 from neurolens.cameras.field import field_of, frame_of
 from neurolens.cameras.ideal import ThinLens
 from neurolens.cameras.sampling import concentric_disk, stratified
@@ -38,7 +39,7 @@ def thin(f_number: float = 1.4, focus_m: float = FOCUS_M) -> ThinLens:
 
 def eye_of(camera: Camera, size: tuple[int, int] = SIZE) -> Eye:
     frame = frame_of(camera)
-    per_mm = size[0] / FILM[0]
+    per_mm = size[0] / camera.film_mm[0]
     reach = frame.reach_mm[0] * per_mm, frame.reach_mm[1] * per_mm
     return Eye(reach, (size[0] / 2, size[1] / 2), frame.pupil_mm[0])
 
@@ -50,7 +51,7 @@ def blurred(
     eye, layers = eye_of(camera, size), [Layer(rgb.astype(np.float32), np.asarray(w, np.float32))]
     spread, taken = spread_over(camera, eye, size), None
     if highlights:
-        taken = take_highlights(layers[0], spread, size)
+        taken = take_highlights(layers[0], eye, spread, size)
         assert len(taken.radius_px)
     found = gather(layers, eye, camera, size, spread, samples, threads).rgb
     if taken is not None:
@@ -221,7 +222,9 @@ def test_kernels_have_the_light_that_the_camera_takes_from_the_point(
     point = np.array([slope[0] * z, slope[1] * z, -z - eye.before_film_mm / 1000], np.float32)
     square, _ = stratified(300, (500.0, 600.0))
     count = square.shape[1]
-    hit = exact.to_film(np.repeat(point[:, None], count, 1), square, np.full(count, 549.0, np.float32))
+    hit = cast(DifferentialCamera, exact).to_film(
+        np.repeat(point[:, None], count, 1), square, np.full(count, 549.0, np.float32)
+    )
     weight = hit.weight / hit.weight.sum()
     px = SIZE[0] / 2 - hit.film_mm[0] * SIZE[0] / FILM[0], SIZE[1] / 2 + hit.film_mm[1] * SIZE[0] / FILM[0]
     green = kernel.light[..., 1] / kernel.light[..., 1].sum()
@@ -326,6 +329,26 @@ def test_overscan_is_beyond_the_film(tmp_path: Path) -> None:
     camera = thin()
     found = gather(plate.layers, plate.eye, camera, SIZE, spread_over(camera, plate.eye, SIZE), 16)
     assert found.rgb[2:-2, 2:-2].max() < 1e-3 and found.beyond == 0
+
+
+def test_highlights_of_overscan_lie_where_they_are_seen() -> None:
+    """A light in the border, just off the film: its disc reaches the picture, as the closed form says."""
+    camera, border = thin(), 20
+    eye = eye_of(camera)
+    eye = Eye(eye.reach_px, (eye.centre_px[0] + border, eye.centre_px[1] + border), eye.before_film_mm)
+    rgb, w = flat(0.0, 2.0, (SIZE[0] + 2 * border, SIZE[1] + 2 * border))
+    rgb[108 + border, border - 5] = 1e4  # 4.5 pixels from the edge
+    rgb_before = rgb.copy()
+    layers, spread = [Layer(rgb.astype(np.float32), w.astype(np.float32))], spread_over(camera, eye, SIZE)
+    taken = take_highlights(layers[0], eye, spread, SIZE)
+    picture = np.zeros((SIZE[1], SIZE[0], 3), np.float32)
+    spread_highlights(picture, taken, layers, eye, camera)
+    # The same light within a film that is as much larger.
+    wide = ThinLens(50.0, 1.4, FOCUS_M, (FILM[0] * w.shape[1] / SIZE[0], FILM[1] * w.shape[0] / SIZE[1]))
+    whole = blurred(wide, rgb_before, w, highlights=True)[border:-border, border:-border]
+    np.testing.assert_allclose(picture, whole, atol=0.01 * whole.max())
+    rows = np.flatnonzero(picture[..., 1].sum(axis=1) > 1)
+    assert rows.mean() + 0.5 == pytest.approx(108.5, abs=0.6)
 
 
 @pytest.mark.parametrize(
