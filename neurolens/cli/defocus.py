@@ -54,7 +54,7 @@ examples:
     kept: ClassVar[str] = "no picture was written; older files of that name are untouched"
 
     plate: Path = setting(..., "OpenEXR file, sharp, with depth", positional=True, metavar="PLATE.exr")
-    lens: str = lens(models=True, cameras=True)
+    lens: str = lens(models=True, cameras=True, metavar="LENS")
     film: tuple[float, float] = setting(..., "size of the film in mm", kind=film_size, metavar="WxH")
     out: Path = output_path("OUT.exr", "picture to write; the preview is OUT.png")
     behind: tuple[Path, ...] = setting(
