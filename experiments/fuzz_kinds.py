@@ -153,7 +153,7 @@ def _of_model(chance: Chance, folder: Path) -> Words:
             *((1, ("export", name, "--to", to, "-o", f"out.{to}", "--json")) for to in ("glsl", "vex", "wgsl", "onnx")),
             (0.3, ("export", name, "--to", "c", "-o", "out.h", "--json")),
             (0.1, ("stmap", name, *_FILM, "-o", "shot")),
-            (0.1, ("bokeh", name, *_FILM, "--distance", "2", "--fields", "1x1", "-o", "shot")),
+            (0.1, ("bokeh", name, *_FILM, "--distance", "2", "--grid", "1x1", "-o", "shot")),
             (0.1, ("handover", name, *_FILM, "-o", "shot")),
             (0.1, ("view", name, "--downloads", "glsl", "-o", "out.html", "--json")),
             (0.1, ("blender", "add", name, "--extension", "pack.zip", "--quiet")),

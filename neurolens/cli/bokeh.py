@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 _MOST = 64  # fields along a side
 
 
-def _fields(text: str) -> tuple[int, int]:
-    """Type of --fields."""
+def _grid(text: str) -> tuple[int, int]:
+    """Type of --grid."""
     words = text.lower().split("x")
     if len(words) == 2 and all(w.isascii() and w.isdecimal() and 1 <= int(w[:9]) <= _MOST for w in words):
         return int(words[0]), int(words[1])
@@ -38,7 +38,7 @@ class Bokeh(PictureCommand):
     Every kernel has its field's cat's eye, coma and colour fringes, in pixels of the picture, and a sum of 1 in each
     channel. All cells have the same odd width, and the centroid of green is in the middle one of its pixels. How much
     light each field gets beside the axis, and how far its blur reaches, is in the metadata and printed with --json.
-    For a program that takes one kernel, --fields 1x1 gives the one of the axis."""
+    For a program that takes one kernel, --grid 1x1 gives the one of the axis."""
 
     about: ClassVar[str] = "kernels of a lens's blur over field and distance"
     epilog: ClassVar[str] = f"""{CAMERAS_HELP}
@@ -46,15 +46,15 @@ class Bokeh(PictureCommand):
 examples:
   neurolens bokeh lenses/laikin_double_gauss_50.toml --width 1920 --film 36x20.25 --focus 2 --f-number 2 \\
       --distance 0.8 --distance 5 --distance inf -o bokeh
-  neurolens bokeh models/NAME.onnx --width 3840 --film 36x24 --focus 1 --distance inf --fields 1x1 -o kernel"""
+  neurolens bokeh models/NAME.onnx --width 3840 --film 36x24 --focus 1 --distance inf --grid 1x1 -o kernel"""
 
     out: Path = output_path("OUT", "start of the files' names")
     distance: tuple[float, ...] = setting(
         ..., "of things from the film in metres, or inf (repeatable)",
         kind=positive("a distance in metres", infinite=True), metavar="M",
     )  # fmt: skip
-    fields: tuple[int, int] = setting(
-        (5, 3), "columns and rows of places in the picture (default: 5x3)", kind=_fields, metavar="CxR"
+    grid: tuple[int, int] = setting(
+        (5, 3), "columns and rows of places in the picture (default: 5x3)", kind=_grid, metavar="CxR"
     )
     wavelengths: tuple[float, float, float] | None = setting(
         None, "one wavelength for red, green and blue each (default: those that make each channel's light)",
@@ -74,7 +74,7 @@ examples:
         camera, shot = self.make(self.state, progress, compiled=True)
         check_field(camera)
         with progress.stage("find the kernels") as report:
-            found = kernels_over(camera, self.picture, self.distance, self.fields, self.wavelengths, report)
+            found = kernels_over(camera, self.picture, self.distance, self.grid, self.wavelengths, report)
         side = max(cell.width_px for cells in found for cell in cells)
         about: dict[str, Any] = {"version": __version__, "camera": camera.settings, "picture_px": list(self.picture)}
         about |= {"film_mm": list(self.film), "focus_m": None if math.isinf(shot.focus_m) else shot.focus_m}
@@ -82,13 +82,13 @@ examples:
         for cells in found:
             distance = "inf" if math.isinf(cells[0].distance_m) else f"{cells[0].distance_m:g}m"
             path = self.out.with_name(f"{self.out.name}.{distance}.exr")
-            picture = as_picture(cells, self.fields[0], side)
+            picture = as_picture(cells, self.grid[0], side)
             rows += (facts := [_facts(cell) for cell in cells])
-            more = {"kernel_px": side, "fields": list(self.fields), "kernels": facts}
+            more = {"kernel_px": side, "fields": list(self.grid), "kernels": facts}
             write_channels(path, {c: picture[..., k] for k, c in enumerate("RGB")}, None, about | more)
-            write_png(path.with_suffix(".png"), as_preview(cells, self.fields[0], side))
+            write_png(path.with_suffix(".png"), as_preview(cells, self.grid[0], side))
             files.append(str(path))
-        data = {"kernel_px": side, "fields": list(self.fields), "kernels": rows, "files": files}
+        data = {"kernel_px": side, "fields": list(self.grid), "kernels": rows, "files": files}
         return self.answer(data, lambda: _text(data))
 
 

@@ -375,7 +375,7 @@ def test_an_atlas_has_kernels_of_sum_one_about_the_middles_of_its_cells(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     given = ["bokeh", GAUSS, "--width", 384, "--film", "36x20.25", "--focus", 2, "--f-number", 2]
-    data = run_json(capsys, *given, "--distance", 1, "--distance", "inf", "--fields", "3x1", "-o", tmp_path / "a")
+    data = run_json(capsys, *given, "--distance", 1, "--distance", "inf", "--grid", "3x1", "-o", tmp_path / "a")
     side = data["kernel_px"]
     assert [Path(f).name for f in data["files"]] == ["a.1m.exr", "a.inf.exr"] and side % 2
     for file in data["files"]:

@@ -37,7 +37,7 @@ COMMANDS = {
     "plan": "plan SCENE --lens {}",
     "trade": "plan SCENE --lens {} --trade",
     "stmap": "stmap {} --size 30x20 --film 24x16 -o NAME",
-    "bokeh": "bokeh {} --width 30 --film 24x16 --distance inf --fields 1x1 -o NAME",
+    "bokeh": "bokeh {} --width 30 --film 24x16 --distance inf --grid 1x1 -o NAME",
     "handover": "handover {} --size 30x20 --film 24x16 -o NAME",
     "projection": "projection {} --size 30x20 --film 24x16 --model opencv",
     "render": "render SCENE --camera {} -o NAME.exr",
