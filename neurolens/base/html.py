@@ -42,7 +42,7 @@ def _templates() -> Environment:
         lstrip_blocks=True, keep_trailing_newline=True, finalize=_checked,
     )  # fmt: skip
     environment.filters["quoted"] = lambda svg: quote(svg, safe=" /:=(),;.")
-    environment.filters["literal"] = lambda value: do_mark_safe(json.dumps(value))  # escapes what is not ASCII
+    environment.filters["literal"] = lambda value, ascii=True: do_mark_safe(json.dumps(value, ensure_ascii=ascii))
     environment.filters["line"] = lambda text: do_mark_safe(
         re.sub(r"([\\`*_|<\[])", r"\\\1", one_line(str(text), 1000))
     )

@@ -37,7 +37,7 @@ class Bokeh(PictureCommand):
 
     Every kernel has its field's cat's eye, coma and colour fringes, in pixels of the picture, and a sum of 1 in each
     channel. All cells have the same odd width, and the centroid of green is in the middle one of its pixels. How much
-    light each field gets beside the axis, and how far its blur reaches, is in the metadata and printed with --json.
+    light each field gets relative to the axis, and how far its blur reaches, is in the metadata and with --json.
     For a program that takes one kernel, --grid 1x1 gives the one of the axis."""
 
     about: ClassVar[str] = "kernels of a lens's blur over field and distance"
@@ -74,13 +74,15 @@ examples:
         camera, shot = self.make(self.state, progress, compiled=True)
         check_field(camera)
         with progress.stage("find the kernels") as report:
-            found = kernels_over(camera, self.picture, self.distance, self.grid, self.wavelengths, report)
+            found = kernels_over(
+                camera, self.picture, tuple(dict.fromkeys(self.distance)), self.grid, self.wavelengths, report
+            )
         side = max(cell.width_px for cells in found for cell in cells)
         about: dict[str, Any] = {"version": __version__, "camera": camera.settings, "picture_px": list(self.picture)}
         about |= {"film_mm": list(self.film), "focus_m": None if math.isinf(shot.focus_m) else shot.focus_m}
         files, rows = [], []
         for cells in found:
-            distance = "inf" if math.isinf(cells[0].distance_m) else f"{cells[0].distance_m:g}m"
+            distance = "inf" if math.isinf(cells[0].distance_m) else f"{cells[0].distance_m:.10g}m"
             path = self.out.with_name(f"{self.out.name}.{distance}.exr")
             picture = as_picture(cells, self.grid[0], side)
             rows += (facts := [_facts(cell) for cell in cells])

@@ -61,22 +61,22 @@ examples:
         (), "OpenEXR file of what is behind the things of the plate, with depth (repeatable)", metavar="FILE.exr"
     )
     depth: str = setting("", "name of the channel with the depth (default: Z, or Depth.Z)", metavar="CHANNEL")
-    depth_scale: float = setting(1.0, "metres of a unit of depth (default: 1)", within=(-1e6, 1e6), metavar="M")
+    depth_scale: float | None = setting(None, "metres of a unit of depth (default: 1)", within=(-1e6, 1e6), metavar="M")
     depth_along: Literal["axis", "ray"] = setting("axis", "whether depth is along the axis or each ray (default: axis)")
     depth_from: Literal["auto", "film", "pinhole"] = setting(
         "auto", "where depth begins (default: auto, the film in pictures of neurolens, else the pinhole)"
     )
     samples: int = setting(
-        64, "of a pixel where blur is wide, rounded up to a power of two (default: 64)", within=(8, 512)
+        64, "most samples of a pixel, where blur is wide, rounded up to a power of two (default: 64)", within=(8, 512)
     )
-    no_highlights: bool = setting(False, "leave bright pixels among the others: noise instead of clean discs")
+    no_highlights: bool = setting(False, "do not spread very bright pixels as discs; their blur is then noisy")
     film_offset_mm: float | None = setting_of(Shot, "film_offset_mm")
     vignetting: Vignetting | None = setting_of(Shot, "vignetting")
     dispersion: Dispersion | None = setting_of(Shot, "dispersion")
     half: bool = setting(False, "16-bit floats in the EXR (default: 32-bit)")
     exposure: float = exposure()
     sensor: SensorSettings = group("sensor (any of these adds what it reads as channels raw)", unset=True)
-    seed: int = setting(0, "of the sensor's noise (default: 0)", kind=whole(0))
+    seed: int = setting(0, "seed of the sensor's noise, for each frame another (default: 0)", kind=whole(0))
     state: LensState = lens_state()
     threads: int = setting(2, "workers (default: 2)", within=(1, 256))
 
@@ -92,6 +92,8 @@ examples:
         from neurolens.render.pictures import standard_attributes, write_exr, write_png
         from neurolens.render.sensor import about, expose
 
+        if self.out.resolve() in {file.resolve() for file in (self.plate, *self.behind)}:
+            self.refuse("--output", str(self.out), "another file than those that are read")
         if self.depth_scale == 0:
             self.refuse("--depth-scale", 0, "metres of a unit")
         progress = self.progress()

@@ -77,17 +77,23 @@ def kernels_over(
                 middle = place if kernel is None else kernel.middle_px
                 field = 2 * place[0] / size[0] - 1, 1 - 2 * place[1] / size[1]
                 cells.append(Cell(field, distance, middle, kernel))
+                _check_size(fields, cells[-1].width_px)
                 report((number + len(cells) / (fields[0] * fields[1])) / len(distances_m))
         found.append(cells)
     return found
 
 
+def _check_size(fields: tuple[int, int], side: int) -> None:
+    """Refuse (InputError) an atlas of so many kernels of `side` pixels that no picture holds."""
+    if max(fields) * side > _LARGEST:
+        got = f"({fields[0] * side} x {fields[1] * side} pixels)"
+        raise InputError("kernels", "size", got, f"at most {_LARGEST} pixels a side: fewer fields, or less blur")
+
+
 def as_picture(cells: Sequence[Cell], columns: int, side: int) -> FloatArray:
     """The atlas [rows side, columns side, 3] of the kernels of one distance, each of sum 1 in each channel."""
     rows = len(cells) // columns
-    if max(rows, columns) * side > _LARGEST:
-        expected = f"at most {_LARGEST} pixels a side: fewer fields, or less blur"
-        raise InputError("kernels", "size", f"({columns * side} x {rows * side} pixels)", expected)
+    _check_size((columns, rows), side)
     picture = np.zeros((rows * side, columns * side, 3), np.float32)
     for k, cell in enumerate(cells):
         j, i = divmod(k, columns)

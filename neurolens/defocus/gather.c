@@ -185,10 +185,9 @@ void gather(
                     py = at_y;
                     p = layers + k;
                 }
-                if (met == NOTHING) continue;
                 for (int c = 0; c < 3; c++) {
                     const float *const q = ray + (t.channels > 1 ? NUMBERS * place[c] : 0);
-                    float value = p->texel[4 * ((size_t)py * p->width + px) + c];
+                    float value = met == NOTHING ? 0.0f : p->texel[4 * ((size_t)py * p->width + px) + c];
                     if (met == MET) value = colour(p, q[0] + q[2] * w, q[1] + q[3] * w, w, px, py, c);
                     sum[c] += q[4] * value;
                     sum[3 + c] += q[4];

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from neurolens.cameras.contract import Camera
 from neurolens.defocus.gather import compiled, radius_px
-from neurolens.defocus.kernels import kernel_at
+from neurolens.defocus.kernels import LARGEST, kernel_at
 from neurolens.defocus.plate import Eye, FloatArray, Layer, as_structs
 
 _WINDOW = 33  # pixels about which surroundings are meant
@@ -31,11 +31,13 @@ _CELLS, _COLOURS = 24, 2
 
 @dataclass(frozen=True)
 class Highlights:
-    """Light [N, 3] taken out of a layer at places [N, 2] in its pixels, inverse depths [N], and radii of blur [N]."""
+    """Light [N, 3] taken out of a layer at places [N, 2] in its pixels, inverse depths [N], radii of blur [N], and its
+    sign [N], by the side of the plane in focus."""
 
     place_px: NDArray[np.float64]
     inverse_depth: FloatArray
     radius_px: NDArray[np.float64]
+    side: NDArray[np.float64]
     light: FloatArray
 
 
@@ -53,16 +55,18 @@ def take_highlights(layer: Layer, eye: Eye, spread: NDArray[np.float64], size: t
         for v, border, n, k in zip((row, column), eye.border_px(size)[::-1], size[::-1], spread.shape[:2], strict=True)
     ]
     radius = radius_px(spread[nodes[0], nodes[1]], w[row, column])
-    wide = radius > _LEAST_PX
-    row, column, radius = row[wide], column[wide], radius[wide]
+    _, ab, b = np.moveaxis(spread[nodes[0], nodes[1]], -1, 0)
+    side = np.sign(ab + 2 * b * w[row, column])  # of the growth of the radius's square with the inverse depth
+    wide = (radius > _LEAST_PX) & (radius < LARGEST / 3)  # still larger discs have little noise
+    row, column, radius, side = row[wide], column[wide], radius[wide], side[wide]
     work = math.pi * radius**2
     if work.sum() > _MOST_WORK:  # the brightest, as many as there is time for
         order = np.argsort(-(bright / cap)[row, column])
         kept = order[np.cumsum(work[order]) <= _MOST_WORK]
-        row, column, radius = row[kept], column[kept], radius[kept]
+        row, column, radius, side = row[kept], column[kept], radius[kept], side[kept]
     light = rgb[row, column] * (1 - cap[row, column] / bright[row, column])[:, None]
     rgb[row, column] -= light
-    return Highlights(np.stack([column, row], axis=1) + np.float64(0.5), w[row, column], radius, light)
+    return Highlights(np.stack([column, row], axis=1) + np.float64(0.5), w[row, column], radius, side, light)
 
 
 def _around(values: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -95,8 +99,7 @@ def spread_highlights(
         .round()
         .astype(int)
     )
-    side = np.sign(found.inverse_depth - np.median(found.inverse_depth)).astype(int)
-    for k, key in enumerate(zip(*cell.T.tolist(), step.tolist(), side.tolist(), strict=True)):
+    for k, key in enumerate(zip(*cell.T.tolist(), step.tolist(), found.side.tolist(), strict=True)):
         groups[key].append(k)
     structs, kept = as_structs(layers)
     for number, rows in enumerate(groups.values()):

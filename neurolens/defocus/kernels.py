@@ -25,7 +25,7 @@ COLOURS = 5  # wavelengths of a channel
 _STEPS = 5  # of Newton's method
 _CLOSE = 0.01  # pixels by which a ray may miss the point
 _FAR = 0.02  # of the kernel's width: what misses by more is left out
-_LARGEST = 2048  # pixels a side of a kernel
+LARGEST = 2048  # pixels a side of a kernel
 _RIM = 0.99  # of a pupil's outline, on which itself hardly a ray passes: beyond it places are extrapolated
 _MARGIN = 2  # pixels around it
 
@@ -108,8 +108,8 @@ def kernel_at(
     least, most = aimed.place[:, lit].min(axis=1), aimed.place[:, lit].max(axis=1)
     corner = np.floor(least).astype(int) - _MARGIN
     width, height = (np.ceil(most).astype(int) + _MARGIN - corner).tolist()
-    if max(width, height) > _LARGEST:
-        raise InputError("kernel", "size", f"({width} x {height} pixels)", f"at most {_LARGEST} a side: blur less")
+    if max(width, height) > LARGEST:
+        raise InputError("kernel", "size", f"({width} x {height} pixels)", f"at most {LARGEST} a side: blur less")
     light = np.zeros((height, width, 3), np.float32)
     colour = np.eye(3) if len(nm) > 1 else np.ones((1, 3))
     for k in range(nm.size):

@@ -21,14 +21,23 @@ from neurolens.base.errors import InputError, warn
 from neurolens.cameras.field import Frame
 from neurolens.defocus.plate import Eye, FloatArray, Layer
 from neurolens.render.colour import SRGB, ColourSpace, conversion, converted
-from neurolens.render.pictures import COLOURS, decoded_channels, header_of, metadata_of, read_colour_space, whole_file
+from neurolens.render.pictures import (
+    COLOURS,
+    check_size,
+    decoded_channels,
+    header_of,
+    metadata_of,
+    read_colour_space,
+    whole_file,
+)
 
 Along = Literal["axis", "ray"]
 _DEPTHS = ("Z", "Depth.Z", "Depth.V", "depth.Z", "depth.V")  # after the name of a layer
 _COMBINED = ("Combined.", "combined.")
 _SKY_M = 1e9  # and beyond it
 _MOST_LAYERS = 8  # of a deep file
-_MOST_SAMPLES = 1 << 27
+_LARGEST, _MOST_PIXELS = 16384, 1 << 26  # pixels a side of a picture, and in all
+_MOST_DEEP = 1 << 25  # pixels of a deep file, which is read whole
 _OPAQUE = 0.5  # opacity from which a deep sample hides what is behind it
 _SAME = 1e-3  # relative: shapes of plate and film
 
@@ -38,13 +47,14 @@ class DepthSettings:
     """What the depth of a plate means.
 
     Attributes:
-        channel: its name; "" finds it. scale_m: metres of its unit. along: the camera's axis, or each pixel's ray.
+        channel: its name; "" finds it. scale_m: metres of its unit; None is 1, and refuses
+            what looks like no metres. along: the camera's axis, or each pixel's ray.
         from_film: whether it counts from the film, as pictures of `neurolens render` have it, or from the pinhole; None
             asks the file.
     """
 
     channel: str = ""
-    scale_m: float = 1.0
+    scale_m: float | None = None
     along: Along = "axis"
     from_film: bool | None = None
 
@@ -88,24 +98,31 @@ def read_plate(
     if ours is not None:
         reach, before = (ours["efl_mm"], ours["efl_mm"]), ours["efl_mm"]
     per_mm = size[0] / plate_mm[0], size[1] / plate_mm[1]
+    film_px = max(1, round(film_mm[0] * per_mm[0])), max(1, round(film_mm[1] * per_mm[1]))
+    for pixels in (size, film_px):
+        check_size(path, "displayWindow", f"({pixels[0]} x {pixels[1]} pixels)", pixels, _LARGEST, _MOST_PIXELS)
     start = [int(v) for v in header["dataWindow"][0]]
     centre = size[0] / 2 + int(left) - start[0], size[1] / 2 + int(top) - start[1]
     eye = Eye((reach[0] * per_mm[0], reach[1] * per_mm[1]), centre, before)
-    from_film = ours is not None if depth.from_film is None else depth.from_film
     space = read_colour_space(path) or SRGB
     layers = list[Layer]()
-    for number, file in enumerate((path, *behind)):
-        for rgb, metres in _layers(file, depth, several=number == 0):
-            if layers and rgb.shape != layers[0].texel[..., :3].shape:
-                got = f"({rgb.shape[1]} x {rgb.shape[0]} pixels)"
-                raise InputError(file, "size", got, "the pixels of the plate, {} x {}".format(*layers[0].size))
+    for file in (path, *behind):
+        own = header if file == path else header_of(file)
+        if any(
+            tuple(map(int, a)) != tuple(map(int, b))
+            for a, b in zip(own["dataWindow"], header["dataWindow"], strict=True)
+        ):
+            raise InputError(file, "dataWindow", f"({own['dataWindow']})".replace("\n", " "), "that of the plate")
+        pinhole, colours = _pinhole(metadata_of(file, own)), read_colour_space(file) or SRGB
+        from_film = pinhole is not None if depth.from_film is None else depth.from_film
+        for rgb, metres in _layers(file, depth, several=file == path):
             w, cosine = _inverse_depth(file, metres, depth, eye, 1e-3 * before if from_film else 0.0)
             light = np.maximum(_finite(file, rgb), 0)
-            light = light if space is SRGB else converted(light, conversion(space, SRGB)).astype(np.float32)
-            if ours is not None and ours.get("vignetting", "both") in ("both", "natural"):
+            light = light if colours is SRGB else converted(light, conversion(colours, SRGB)).astype(np.float32)
+            if pinhole is not None and pinhole.get("vignetting", "both") in ("both", "natural"):
                 light /= (cosine**4)[..., None]
             layers.append(Layer(light, w))
-    return Plate(layers, eye, (max(1, round(film_mm[0] * per_mm[0])), max(1, round(film_mm[1] * per_mm[1]))), space)
+    return Plate(layers, eye, film_px, space)
 
 
 def _pinhole(metadata: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -140,22 +157,27 @@ def _layers(path: Path, depth: DepthSettings, several: bool) -> list[tuple[Float
         expected = "R, G, B and a channel Z with the depth in metres; --depth names another"
         raise InputError(path, "channels", f"({', '.join(planes)[:200]})", expected)
     found.sort(key=lambda pair: (pair[0] != "", not pair[0].endswith(_COMBINED)))
-    return [
-        (np.stack([planes[prefix + c] for c in COLOURS], axis=2), planes[channel])
-        for prefix, channel in (found if several else found[:1])
-    ]
+    layers = []
+    for prefix, channel in found if several else found[:1]:
+        rgb, metres = np.stack([planes[prefix + c] for c in COLOURS], axis=2), planes[channel]
+        if (alpha := planes.get(prefix + "A")) is not None:  # colours are premultiplied
+            solid = alpha >= _OPAQUE
+            rgb = np.where(solid[..., None], rgb / np.where(solid, np.minimum(alpha, 1), 1)[..., None], 0)
+            metres = np.where(solid, metres, np.float32(-np.inf))
+        layers.append((rgb.astype(np.float32), metres))
+    return layers
 
 
 def _deep(path: Path) -> list[tuple[FloatArray, FloatArray]]:
     """The layers of a deep file: the opaque samples of each pixel, sorted by depth."""
+    size = [int(last) + 1 - int(first) for first, last in zip(*header_of(path)["dataWindow"], strict=True)]
+    check_size(path, "file", str(path), size, _LARGEST, _MOST_DEEP)
     with whole_file(path, "file", path), OpenEXR.File(str(path), separate_channels=True) as file:
         channels = {name: c.pixels for name, c in file.parts[0].channels.items()}
     if not {*COLOURS, "Z"} <= channels.keys():
         raise InputError(path, "channels", f"({', '.join(channels)[:200]})", "R, G, B and Z")
     height, width = channels["Z"].shape
     counts = np.array([[0 if v is None else len(v) for v in row] for row in channels["Z"]])
-    if counts.sum() > _MOST_SAMPLES:
-        raise InputError(path, "samples", int(counts.sum()), f"at most {_MOST_SAMPLES}")
     flat = {
         name: np.concatenate(
             [np.asarray(v, np.float32) for v in channels[name].reshape(-1) if v is not None]
@@ -165,7 +187,7 @@ def _deep(path: Path) -> list[tuple[FloatArray, FloatArray]]:
     }
     alpha = flat.get("A", np.ones_like(flat["Z"]))
     pixel = np.repeat(np.arange(height * width), counts.reshape(-1))
-    kept = np.flatnonzero((alpha >= _OPAQUE) & np.isfinite(flat["Z"]))
+    kept = np.flatnonzero((alpha >= _OPAQUE) & ~np.isnan(flat["Z"]) & ~np.isneginf(flat["Z"]))
     kept = kept[np.lexsort((flat["Z"][kept], pixel[kept]))]
     place = pixel[kept]
     starts = np.flatnonzero(np.diff(place, prepend=-1))
@@ -206,7 +228,7 @@ def _inverse_depth(
     )
     cosine = (1 / np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2)).astype(np.float32)
     nothing = np.isneginf(metres)
-    z = metres * np.float32(depth.scale_m)
+    z = metres * np.float32(depth.scale_m or 1.0)
     solid = np.isfinite(z) & (z != 0) & (np.abs(z) < _SKY_M)
     if missing := int(np.isnan(metres).sum()):
         warn(f"{path}: the depth of {missing} of {z.size} pixels is not a number; they count as sky")
@@ -215,8 +237,8 @@ def _inverse_depth(
         if least < 0:
             expected = "depth that grows away from the camera; --depth-scale -1 turns it"
             raise InputError(path, "depth", f"({least:g} m)", expected)
-        if most <= 1 and not nothing.any():
-            expected = "depth in metres; this looks like inverse or normalised depth; --depth-scale sets a unit"
+        if most <= 1 and depth.scale_m is None and not nothing.any():
+            expected = "depth in metres; this looks like inverse or normalised depth (--depth-scale 1: it is none)"
             raise InputError(path, "depth", f"({least:g} to {most:g} m)", expected)
     z = np.where(solid, z * cosine if depth.along == "ray" else z, 1) - np.float32(eye_m)
     if (close := solid & (z <= 1e-3)).any():

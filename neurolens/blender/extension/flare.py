@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -103,11 +104,14 @@ def write_lights(context: Any, found: Any, path: Path, rays: int) -> tuple[int, 
         raise LensError("The scene has no light that is rendered")
     files = {path: [row for rows in known.values() for row in lights.in_every_frame(rows, frames)]}
     width, height = setting.sensor_mm
-    words = f"--lights {path.name} --frames {frames[0]}:{frames[-1]}:{frames.step} --film {width:g}x{height:g}"
+    words = (
+        f"--lights {shlex.quote(path.name)} --frames {frames[0]}:{frames[-1]}:{frames.step} --film {width:g}x{height:g}"
+    )
     words += f" --width {setting.pixels}"
     if custom:
         files[path.with_suffix(".keys.json")] = keys
-        words = f"{found.data.neurolens.on.partition('/')[0]} {words} --key {path.stem}.keys.json"
+        lens = shlex.quote(found.data.neurolens.on.partition("/")[0])
+        words = f"{lens} {words} --key {shlex.quote(path.stem + '.keys.json')}"
     try:
         for file, content in files.items():
             file.write_text(json.dumps(content, indent=1), encoding="utf-8")
