@@ -119,18 +119,18 @@ def pupil_graph(segments: int, wavelengths: int) -> Graph:
     Inputs: `film_mm`, `square` [2], `wavelength_nm`; of the call the table `outline` (`PupilOutline.table`),
     `per_radius` (1 / the last film radius), `last_row`, and of two wavelengths `wave_first`, `wave_scale`: the share of
     the second is (1 / wavelength^2 - first) scale.
-    Outputs: `pupil_mm` [2], and `area_mm2`, that of `PupilOutline.sample`, but negative or NaN where nothing passes;
-    points mean nothing there.
+    Outputs: `pupil_mm` [2], and `area_mm2`, that of `PupilOutline.sample`, but 0, negative or NaN where nothing
+    passes; points mean nothing there.
     """
     g = Graph()
     film, square, wavelength = g.input("film_mm", 2), g.input("square", 2), g.input("wavelength_nm")
     per_radius, last_row = (g.input(name, per_call=True) for name in ("per_radius", "last_row"))
     radius = g.square(film).sqrt()
-    inner = 1.0 - radius * per_radius
-    place = (1.0 - inner.maximum(0.0).sqrt()) * last_row
+    inner = (1.0 - radius * per_radius).clip(0.0, 1.0)
+    place = (1.0 - inner.sqrt()) * last_row
     row = place.floor()
     step = place - row
-    a, b = g.split(square * 2.0 - 1.0, (1, 1))
+    a, b = g.split(square - 0.5, (1, 1))
     height = b.abs()
     size = a.abs().maximum(height)
     # Along the upper half of a concentric square, from 0 at +x over 2 at +y to 4 at -x; the centre has no place.
@@ -146,8 +146,9 @@ def pupil_graph(segments: int, wavelengths: int) -> Graph:
     products = vertex * g.affine([[0.0, 1.0], [1.0, 0.0]], side)
     area = g.affine([[float(segments), -float(segments)]], products).minimum(inner * 1e30)  # none beyond the end
     sign = (b * 1e30).clip(-1.0, 1.0)
-    point = (vertex + side * (along - edge)) * g.concat(size, size * sign)
-    x, y = g.split(point, (1, 1))
+    x, y = g.split(vertex + side * (along - edge), (1, 1))
+    size = size * 2.0
+    x, y = x * size, y * (size * sign)
     # Turned to the azimuth of the film point; on the axis (a hair beside it, far below rounding) that is 0.
     turn = (film + [_HAIR, 0.0]) * (1.0 / (radius + _HAIR))
     pupil = turn * (x + centre) + g.affine([[0.0, -1.0], [1.0, 0.0]], turn) * y

@@ -105,13 +105,15 @@ def add_outputs(
     if parts.stop:
         g.outputs["stop_xy_mm"] = values.vectors[STOP]
     status: Value | float = float(st.PASSED)
+    known = None
+    if series.sinc is not None and values.unit is None:
+        known = g.square(values.vectors[DIRECTION]), (series.kappa * series.angle) ** 2
     if parts.vignetting:
         radius = g.input("stop_radius_mm", per_call=True)
         inside = inside & radius.between(0.0, model.domain.stop_radius_mm * DOMAIN_SLACK)
-        status = _first_failure(model, values, radius, form)
-    if series.sinc is not None and values.unit is None:
-        known = g.square(values.vectors[DIRECTION]) <= (series.kappa * series.angle) ** 2  # false for NaN
-        status = g.select(known, status, g.value(status).maximum(float(st.OUTSIDE_DOMAIN)))
+        status = _first_failure(model, values, radius, known, form)
+    elif known is not None:
+        inside = inside & (known[0] <= known[1])  # false for NaN
     return g.select(inside, status, float(st.OUTSIDE_DOMAIN))
 
 
@@ -147,17 +149,23 @@ def wavelength_row(e: Encoding, wavelength_nm: Value) -> Value:
 def within_domain(model: LensModel, rays: Value, film_z: Value, form: Form) -> Value:
     """Whether film point, pupil point, wavelength and film position lie in the domain; false for NaN."""
     g, d = rays.graph, model.domain
-    squares = g.quadratic(rays[0:4], [((0, 0), (1, 1)), ((2, 2), (3, 3))])
-    within = squares <= np.square([d.film_radius_mm * DOMAIN_SLACK, d.pupil_radius_mm * DOMAIN_SLACK])
+    film, pupil = (
+        g.square(rays[k : k + 2]) <= (r * DOMAIN_SLACK) ** 2 for k, r in ((0, d.film_radius_mm), (2, d.pupil_radius_mm))
+    )
     near, far = d.film_z_mm
-    inside = within[0] & within[1] & film_z.between(near / DOMAIN_SLACK, far * DOMAIN_SLACK)
+    inside = film & pupil & film_z.between(near / DOMAIN_SLACK, far * DOMAIN_SLACK)
     if form.wavelength or model.encoding.w_half:
         inside = inside & rays[4].between(*model.wavelength_limits_nm)
     return inside
 
 
-def _first_failure(model: LensModel, values: CoreValues, radius: Value, form: Form) -> Value:
-    """Status of stop and rims, as camera rays meet them: the last surface first, at one surface as in `base.status`."""
+def _first_failure(
+    model: LensModel, values: CoreValues, radius: Value, known: tuple[Value, float] | None, form: Form
+) -> Value:
+    """Status of stop and rims, as camera rays meet them: the last surface first, at one surface as in `base.status`.
+
+    `known`: a value and its limit, beyond which rays that pass are outside the domain.
+    """
     g = radius.graph
     crossing, limit = g.square(values.vectors[STOP]), radius * radius
     if form.gate_scale != 1:
@@ -166,6 +174,8 @@ def _first_failure(model: LensModel, values: CoreValues, radius: Value, form: Fo
     if values.gates is not None:
         rows = [values.gates[k] for k in range(values.gates.rows)]
         tests += [((row, g.constant(0.0)), gate.status) for row, gate in zip(rows, model.gates, strict=True)]
+    if known is not None:
+        tests.append(((known[0] * form.gate_scale, g.constant(known[1] * form.gate_scale)), st.OUTSIDE_DOMAIN))
     tests.sort(key=lambda test: (-(test[1] // 4), test[1]))
     return g.first_failure([pair for pair, _ in tests], [code for _, code in tests])
 
