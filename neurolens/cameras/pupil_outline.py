@@ -119,15 +119,15 @@ def pupil_graph(segments: int, wavelengths: int) -> Graph:
     Inputs: `film_mm`, `square` [2], `wavelength_nm`; of the call the table `outline` (`PupilOutline.table`),
     `per_radius` (1 / the last film radius), `last_row`, and of two wavelengths `wave_first`, `wave_scale`: the share of
     the second is (1 / wavelength^2 - first) scale.
-    Outputs: `pupil_mm` [2], and `area_mm2`, that of `PupilOutline.sample`, but 0, negative or NaN where nothing
-    passes; points mean nothing there.
+    Outputs: `pupil_mm` [2], and `area_mm2`, that of `PupilOutline.sample`, but negative or NaN where nothing passes;
+    points mean nothing there.
     """
     g = Graph()
     film, square, wavelength = g.input("film_mm", 2), g.input("square", 2), g.input("wavelength_nm")
     per_radius, last_row = (g.input(name, per_call=True) for name in ("per_radius", "last_row"))
     radius = g.square(film).sqrt()
-    inner = (1.0 - radius * per_radius).clip(0.0, 1.0)
-    place = (1.0 - inner.sqrt()) * last_row
+    inner = 1.0 - radius * per_radius
+    place = (1.0 - inner.maximum(0.0).sqrt()) * last_row
     row = place.floor()
     step = place - row
     a, b = g.split(square - 0.5, (1, 1))

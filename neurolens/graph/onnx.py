@@ -22,7 +22,6 @@ from neurolens.graph.protobuf import FLOAT, INT32, INT64, ML, model_proto, node_
 Array = NDArray[np.float64]
 # Opset 17 and IR 8 are read by every onnxruntime since 1.12.
 OPSET, IR_VERSION = 17, 8
-_STEEP = 1e30  # a slope that takes every number but 0 beyond 1
 
 
 @dataclass(frozen=True)
@@ -136,7 +135,7 @@ class _Writer:
         rule = _RULES.get(node.kind)
         if rule is not None:
             return rule(self, number, node, arrays)
-        if node.kind in ("add", "sub", "mul") and (linear := self.shifted(number, node)):
+        if node.kind in ("add", "sub", "mul") and (linear := self.shifted(node)):
             return linear
         return self.op(_SIMPLE[node.kind], *(self.name(k) for k in node.inputs))
 
@@ -148,7 +147,7 @@ class _Writer:
             self.op("Reshape", value, self.const([*axes[:-1], -1], np.int64), out=name)
         self.results.append((name, INT32 if node.kind == "whole" else FLOAT, axes))
 
-    def shifted(self, number: int, node: Node) -> _Linear | None:
+    def shifted(self, node: Node) -> _Linear | None:
         """A sum or a product of a linear value and numbers; None for all else."""
         pair, kinds = [self.linear.get(k) for k in node.inputs], [self.graphs[0].nodes[k].kind for k in node.inputs]
         at = next((i for i in (0, 1) if pair[i] and kinds[1 - i] == "constant"), None)
@@ -169,7 +168,7 @@ class _Writer:
             _take_rows(self, number, range(self.graphs[0].nodes[number].rows)) if isinstance(value, _Longer) else value
         )
 
-    def op(self, kind: str, *inputs: str, out: str | None = None, domain: str = "", **attributes: float) -> str:
+    def op(self, kind: str, *inputs: str, out: str | None = None, domain: str = "", **attributes: int) -> str:
         """Append a node with one output and return its name."""
         name = out or f"{self.prefix}{kind}_{len(self.nodes)}"
         number = f"{self.prefix}n{len(self.nodes)}"
@@ -408,30 +407,7 @@ def _is_constant(w: _Writer, number: int, value: float) -> bool:
 
 
 def _clip(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
-    low, high = arrays[0][0]
-    if low == 0 and high == 1 and (line := _line(w, node.inputs[0])):
-        return w.op("HardSigmoid", line[0], alpha=line[1], beta=line[2])
-    if low == -1 and high == 1 and (line := _line(w, node.inputs[0])) and line[1] >= _STEEP and line[2] == 0:
-        return w.op("Sign", line[0])
     return w.op("Clip", w.name(node.inputs[0]), w.numbers(arrays[0][:, 0]), w.numbers(arrays[0][:, 1]))
-
-
-def _line(w: _Writer, number: int) -> tuple[str, float, float] | None:
-    """The value x, a and b where a value is a x + b, with numbers that all graphs share."""
-    scale, shift, nodes = 1.0, 0.0, w.graphs[0].nodes
-    while nodes[number].kind in ("add", "sub", "mul"):
-        node, pair = nodes[number], nodes[number].inputs
-        at = next((i for i in (0, 1) if nodes[pair[1 - i]].kind == "constant"), None)
-        if at is None or len(w.graphs) > 1 or nodes[pair[1 - at]].rows > 1:
-            break
-        value = float(nodes[pair[1 - at]].arrays[0][0])
-        if node.kind == "mul":
-            scale *= value
-        else:
-            shift += scale * value * (-1 if node.kind == "sub" and at == 0 else 1)
-            scale *= -1 if node.kind == "sub" and at == 1 else 1
-        number = pair[at]
-    return None if (scale, shift) == (1.0, 0.0) else (w.name(number), scale, shift)
 
 
 def _between(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
@@ -450,13 +426,7 @@ def _first_failure(w: _Writer, number: int, node: Node, arrays: list[Array]) -> 
     tests = zip(node.inputs[::2], node.inputs[1::2], node.static, strict=True)
     for value, limit, status in sorted(tests, key=lambda t: t[2]):
         zero = _is_constant(w, limit, 0.0)
-        difference = Node("sub", (value, limit), 1, False)
-        if zero:
-            test = w.name(value)
-        elif linear := w.shifted(value, difference):
-            test = w.affine(linear.weight, linear.value, linear.bias)
-        else:
-            test = w.op("Sub", w.name(value), w.name(limit))
+        test = w.name(value) if zero else w.op("Sub", w.name(value), w.name(limit))
         code = w.op("Clip", test, w.const(0.0), w.const(float(status)))
         surface = status // 4
         if surface in failed:

@@ -6,14 +6,13 @@ onnx.proto3 of the ONNX project; the format is that of the encoding guide of Pro
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from numpy.typing import NDArray
 
 _VARINT, _DOUBLE, _BYTES, _FLOAT = 0, 1, 2, 5  # wire types
-_FLOAT_ATTRIBUTE, _INT_ATTRIBUTE = 1, 2  # AttributeProto.AttributeType
+_INT_ATTRIBUTE = 2  # AttributeProto.AttributeType.INT
 FLOAT, INT32, INT64 = 1, 6, 7  # TensorProto.DataType
 ML = "ai.onnx.ml"  # the standard's second set of operators; version 1 is read by every onnxruntime
 _DATA_TYPES = {"f": FLOAT, "4": INT32, "8": INT64}
@@ -90,17 +89,13 @@ def _message(*fields: tuple[int, int | str | bytes]) -> bytes:
 
 
 def node_proto(
-    kind: str, inputs: Sequence[str], outputs: Sequence[str], name: str, domain: str = "", **attributes: float
+    kind: str, inputs: Sequence[str], outputs: Sequence[str], name: str, domain: str = "", **attributes: int
 ) -> bytes:
-    """A node of a graph: an operator, of the first set or the `domain`'s, with attributes."""
-    packed = [(5, _attribute(key, value)) for key, value in attributes.items()]
+    """A node of a graph: an operator, of the first set or the `domain`'s, with its whole-number attributes."""
+    packed: list[tuple[int, int | str | bytes]] = [
+        (5, _message((1, key), (3, value), (20, _INT_ATTRIBUTE))) for key, value in attributes.items()
+    ]
     return _message(*((1, i) for i in inputs), *((2, o) for o in outputs), (3, name), (4, kind), *packed, (7, domain))
-
-
-def _attribute(name: str, value: float) -> bytes:
-    if isinstance(value, int):
-        return _message((1, name), (3, value), (20, _INT_ATTRIBUTE))
-    return _message((1, name)) + message([(2, _FLOAT, struct.pack("<f", value))]) + _message((20, _FLOAT_ATTRIBUTE))
 
 
 def tensor_proto(array: NDArray[Any], name: str) -> bytes:

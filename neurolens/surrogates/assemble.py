@@ -105,15 +105,13 @@ def add_outputs(
     if parts.stop:
         g.outputs["stop_xy_mm"] = values.vectors[STOP]
     status: Value | float = float(st.PASSED)
-    known = None
-    if series.sinc is not None and values.unit is None:
-        known = g.square(values.vectors[DIRECTION]), (series.kappa * series.angle) ** 2
     if parts.vignetting:
         radius = g.input("stop_radius_mm", per_call=True)
         inside = inside & radius.between(0.0, model.domain.stop_radius_mm * DOMAIN_SLACK)
-        status = _first_failure(model, values, radius, known, form)
-    elif known is not None:
-        inside = inside & (known[0] <= known[1])  # false for NaN
+        status = _first_failure(model, values, radius, form)
+    if series.sinc is not None and values.unit is None:
+        known = g.square(values.vectors[DIRECTION]) <= (series.kappa * series.angle) ** 2  # false for NaN
+        status = g.select(known, status, g.value(status).maximum(float(st.OUTSIDE_DOMAIN)))
     return g.select(inside, status, float(st.OUTSIDE_DOMAIN))
 
 
@@ -159,13 +157,8 @@ def within_domain(model: LensModel, rays: Value, film_z: Value, form: Form) -> V
     return inside
 
 
-def _first_failure(
-    model: LensModel, values: CoreValues, radius: Value, known: tuple[Value, float] | None, form: Form
-) -> Value:
-    """Status of stop and rims, as camera rays meet them: the last surface first, at one surface as in `base.status`.
-
-    `known`: a value and its limit, beyond which rays that pass are outside the domain.
-    """
+def _first_failure(model: LensModel, values: CoreValues, radius: Value, form: Form) -> Value:
+    """Status of stop and rims, as camera rays meet them: the last surface first, at one surface as in `base.status`."""
     g = radius.graph
     crossing, limit = g.square(values.vectors[STOP]), radius * radius
     if form.gate_scale != 1:
@@ -174,8 +167,6 @@ def _first_failure(
     if values.gates is not None:
         rows = [values.gates[k] for k in range(values.gates.rows)]
         tests += [((row, g.constant(0.0)), gate.status) for row, gate in zip(rows, model.gates, strict=True)]
-    if known is not None:
-        tests.append(((known[0] * form.gate_scale, g.constant(known[1] * form.gate_scale)), st.OUTSIDE_DOMAIN))
     tests.sort(key=lambda test: (-(test[1] // 4), test[1]))
     return g.first_failure([pair for pair, _ in tests], [code for _, code in tests])
 
