@@ -34,12 +34,12 @@ _AHEAD = np.array([[0], [0], [0], [0], [0], [-1]], np.float32)
 
 
 @lru_cache(maxsize=16)
-def status_graph(aperture: Aperture | None = None, stopped: int = 0) -> Graph:
+def status_graph(aperture: Aperture | None = None, stopped: int = 0, unit: bool = False) -> Graph:
     """The status of rays: those that pass the lens must have a unit direction and cross the stop within its shape.
 
     Args:
         aperture: shape of the stop's opening, tested on the crossing `stop_xy_mm`; None: the round one of the lens.
-        stopped: status of rays that the shape stops.
+        stopped: status of rays that the shape stops. unit: directions are known to be of unit length, and not tested.
 
     Inputs: `scene_ray` [6], `lens_status`; for an aperture `stop_xy_mm` [2], of the call `stop_radius_mm`, of a mask
     the table `mask`. Output: `status`.
@@ -50,8 +50,10 @@ def status_graph(aperture: Aperture | None = None, stopped: int = 0) -> Graph:
         opened = aperture.opening(g, g.input("stop_xy_mm", 2), g.input("stop_radius_mm", per_call=True))
         shut = g.select(status <= float(st.PASSED), float(stopped), status)
         status = g.select(opened, status, shut)
-    unit = g.square(ray[3:]).between(1 - UNIT_SLACK, 1 + UNIT_SLACK)
-    g.outputs["status"] = g.select(unit, status, status.maximum(float(st.OUTSIDE_DOMAIN)))
+    if not unit:
+        of_one = g.square(ray[3:]).between(1 - UNIT_SLACK, 1 + UNIT_SLACK)
+        status = g.select(of_one, status, status.maximum(float(st.OUTSIDE_DOMAIN)))
+    g.outputs["status"] = status
     return g
 
 
@@ -66,7 +68,7 @@ def weight_graph(
 
     Args:
         derivatives: names of derivatives of `scene_ray`, inputs and outputs, too.
-        aperture, stopped: see `status_graph`. unit: directions are known to be of unit length, and not tested.
+        aperture, stopped, unit: see `status_graph`.
 
     Inputs: `film_mm`, `pupil_mm` [2], `area_mm2`, `scene_ray` [6] (mm, lens frame), `transmittance`, `lens_status`, and
     derivatives [6] of the ray; of the call `film_z_mm`, `per_distance` (1 / Z), `scale` (1 / (Z^2 exposure)).
@@ -76,16 +78,13 @@ def weight_graph(
     film, pupil, area, ray = g.input("film_mm", 2), g.input("pupil_mm", 2), g.input("area_mm2"), g.input("scene_ray", 6)
     through, status = g.input("transmittance"), g.input("lens_status")
     per_distance, scale, film_z = (g.input(name, per_call=True) for name in ("per_distance", "scale", "film_z_mm"))
-    if not unit:
-        status = g.inline(status_graph(aperture, stopped), {"scene_ray": ray, "lens_status": status})["status"]
-    lit = g.constant(_NO_AREA) <= area
-    passed = (status <= float(st.PASSED)) & lit
-    cos2 = 1.0 / (1.0 + g.square((pupil - film) * per_distance))
-    weight = through.maximum(0.0) * area * cos2 * cos2 * scale
-    place = g.concat(g.constant([0.0, 0.0]), film_z * -1e-3, g.constant([0.0, 0.0, 0.0]))
-    g.outputs["ray"] = ray * METRES + place
-    g.outputs["weight"] = g.select(passed, weight, 0.0)
-    g.outputs["status"] = g.select(lit, status, float(st.OUTSIDE_DOMAIN)).whole()
+    status = g.inline(status_graph(aperture, stopped, unit), {"scene_ray": ray, "lens_status": status})["status"]
+    status = g.select(g.constant(_NO_AREA) <= area, status, float(st.OUTSIDE_DOMAIN))
+    cos2 = scale.sqrt() / (1.0 + g.square(pupil - film) * (per_distance * per_distance))
+    weight = through.maximum(0.0) * area * cos2 * cos2
+    g.outputs["ray"] = g.concat(ray[0:2] * 1e-3, ray[2] * 1e-3 + film_z * -1e-3, ray[3:6])
+    g.outputs["weight"] = g.select(status <= float(st.PASSED), weight, 0.0)
+    g.outputs["status"] = status.whole()
     for name in derivatives:
         g.outputs[name] = g.input(name, 6) * METRES
     return g
@@ -100,12 +99,14 @@ class LensGraph(NamedTuple):
         stop_radius_mm: of its round stop.
         aperture: the shape of the opening, tested on the rays' crossings with the stop; None is round.
         stopped: status of rays that the shape blocks.
+        unit: whether directions are sure to be of unit length.
     """
 
     graph: Graph
     stop_radius_mm: float
     aperture: Aperture | None = None
     stopped: int = 0
+    unit: bool = False
 
     @property
     def blades(self) -> Aperture | None:
@@ -146,7 +147,7 @@ def whole_camera(
     found, aperture = lens_inside(g, lens, g.concat(film_mm, pupil["pupil_mm"], wavelength), mask_too)
     derivatives = tuple(name for name in found if "_by_" in name)
     given = {"film_mm": film_mm, **pupil, **found, "lens_status": unrounded(found["status"])}
-    g.outputs |= g.inline(weight_graph(derivatives, aperture, lens.stopped), given)
+    g.outputs |= g.inline(weight_graph(derivatives, aperture, lens.stopped, lens.unit), given)
     g.outputs |= {name: value for name, value in (pupil | found).items() if name in also}
     return g, film.outline.numbers | film.numbers | {"stop_radius_mm": lens.stop_radius_mm}
 

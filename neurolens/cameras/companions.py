@@ -124,7 +124,7 @@ def companion_graph(lens: LensGraph, shift: Graph, mask_too: bool) -> Graph:
     shifted = g.inline(shift, {})
     found, aperture = lens_inside(g, lens, g.concat(shifted["companion"], g.input("companion_nm")), mask_too)
     given = {**found, "lens_status": unrounded(found["status"])}
-    status = g.inline(status_graph(aperture, lens.stopped), given)["status"]
+    status = g.inline(status_graph(aperture, lens.stopped, lens.unit), given)["status"]
     status = g.select(shifted["known"], status, status.maximum(float(st.OUTSIDE_DOMAIN))).whole()
     g.outputs |= {"companion": shifted["companion"][:2], "transmittance": found["transmittance"], "status": status}
     return g

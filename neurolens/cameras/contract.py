@@ -56,7 +56,7 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float32]
 # A network in numpy or onnxruntime keeps hundreds of numbers a ray between its steps: more rays would leave the cache.
-RAYS_A_CALL = 8192
+RAYS_A_CALL = 8000
 MANY_RAYS_A_CALL = 32768  # for cameras that keep next to nothing, where a call costs as much as a thousand rays
 
 

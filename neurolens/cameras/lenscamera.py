@@ -295,13 +295,14 @@ class LensCamera:
             constants["mask"] = g.own_table(lens.aperture.table)
         g.outputs = g.inline(whole, constants)
         inputs = {n.name: ("tensor(float)", n.rows, None) for n in g.nodes if n.kind == "input"}
-        shapes = {name: _shape(name, value.rows) for name, value in g.outputs.items()}
-        path, names = self.path, tuple(shapes)
-        session = open_session(path, write_onnx(g, {}), inputs, shapes)
+        rows = {name: [value.rows] for name, value in g.outputs.items()}
+        shapes = {k: ("tensor(int32)" if k == "status" else "tensor(float)", *rows[k], None) for k in rows}
+        path, names = self.path, tuple(rows)
+        session = open_session(path, write_onnx(g, {}, shapes=rows), inputs, shapes)
 
         def run(rays: dict[str, FloatArray]) -> dict[str, NDArray[Any]]:
             done = run_batches(path, session, names, rays, {}, RAYS_A_CALL)
-            found = {name: np.atleast_2d(values) for name, values in zip(names, done, strict=True)}
+            found = dict(zip(names, done, strict=True))
             derivatives = [found.pop(name) for name in D_FILM if name in found]
             return found | ({"d_film": np.stack(derivatives, 1)} if derivatives else {})
 
@@ -324,11 +325,6 @@ class LensCamera:
         film, square = film.astype(np.float32), rng.random((2, _SAMPLES), np.float32)
         rays = np.stack([*film, *outline.sample(film, square, wavelength)[0], wavelength])
         return {"rays": rays} | {k: np.array([[value]], np.float32) for k, value in self._of_the_lens().items()}
-
-
-def _shape(name: str, rows: int) -> tuple[str | int | None, ...]:
-    """Type and dimensions of an output in ONNX: those of one row have one dimension."""
-    return ("tensor(int32)" if name == "status" else "tensor(float)", *((rows,) if rows > 1 else ()), None)
 
 
 def _compiled(graph: Graph, numbers: dict[str, float], film: LensFilm, lens: LensGraph) -> GraphRun:

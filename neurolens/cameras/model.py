@@ -32,7 +32,7 @@ from neurolens.graph.interpret import evaluate
 from neurolens.lens import film_plane
 from neurolens.lens.apertures import Aperture
 from neurolens.lens.shot import Shot
-from neurolens.surrogates.assemble import SCALARS, Form
+from neurolens.surrogates.assemble import ONNX, SCALARS, Form
 from neurolens.surrogates.card import DOMAIN_SLACK, state_for
 
 __all__ = ["LensRays", "OnnxCamera", "OnnxLens", "load_model"]
@@ -121,7 +121,9 @@ class OnnxCamera(LensCamera):
         """The graph of the model in the camera's state, with its stop."""
         scene = self.film.scene
         assert isinstance(scene, ModelScene)
-        return LensGraph(self.model.graph(form), scene.stop_radius_mm, scene.aperture, scene.stop_status)
+        # Series decode unit directions, and their range is tested; to test the length is eight passes in onnxruntime.
+        unit = form is ONNX and self.model.fitted.direction == "angle"
+        return LensGraph(self.model.graph(form), scene.stop_radius_mm, scene.aperture, scene.stop_status, unit)
 
     def to_film(self, point_m: FloatArray, pupil: FloatArray, wavelength_nm: FloatArray) -> FilmPoints:
         """Film points of scene points [3, N] in m through points of the front surface chosen by `pupil`.

@@ -93,7 +93,9 @@ def _padded(values: NDArray[np.float32]) -> NDArray[np.float32]:
     Rows a power of two apart share cache lines, which makes matrix products a third slower.
     """
     rows, count = values.shape
-    whole = np.zeros((rows, count + 16 if count % 1024 == 0 else count), np.float32)
+    if count % 1024:
+        return np.ascontiguousarray(values)
+    whole = np.zeros((rows, count + 16), np.float32)
     whole[:, :count] = values
     return whole
 

@@ -130,7 +130,7 @@ def pupil_graph(segments: int, wavelengths: int) -> Graph:
     place = (1.0 - inner.maximum(0.0).sqrt()) * last_row
     row = place.floor()
     step = place - row
-    a, b = g.split(square * 2.0 - 1.0, (1, 1))
+    a, b = g.split(square - 0.5, (1, 1))
     height = b.abs()
     size = a.abs().maximum(height)
     # Along the upper half of a concentric square, from 0 at +x over 2 at +y to 4 at -x; the centre has no place.
@@ -146,8 +146,9 @@ def pupil_graph(segments: int, wavelengths: int) -> Graph:
     products = vertex * g.affine([[0.0, 1.0], [1.0, 0.0]], side)
     area = g.affine([[float(segments), -float(segments)]], products).minimum(inner * 1e30)  # none beyond the end
     sign = (b * 1e30).clip(-1.0, 1.0)
-    point = (vertex + side * (along - edge)) * g.concat(size, size * sign)
-    x, y = g.split(point, (1, 1))
+    x, y = g.split(vertex + side * (along - edge), (1, 1))
+    size = size * 2.0
+    x, y = x * size, y * (size * sign)
     # Turned to the azimuth of the film point; on the axis (a hair beside it, far below rounding) that is 0.
     turn = (film + [_HAIR, 0.0]) * (1.0 / (radius + _HAIR))
     pupil = turn * (x + centre) + g.affine([[0.0, -1.0], [1.0, 0.0]], turn) * y

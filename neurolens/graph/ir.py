@@ -162,6 +162,10 @@ class Graph:
     ) -> Value:
         """Append a node of any kind; `per_call` None: where all of its inputs are."""
         numbers = tuple(v.number for v in inputs)
+        if kind == "and":
+            for one, other in (inputs, inputs[::-1]):
+                if one.rows <= other.rows and self._holds(one):
+                    return other
         if per_call is None:
             per_call = all(self.nodes[k].per_call for k in numbers)
         key = (kind, numbers, rows, name, static, *((a.shape, a.tobytes()) for a in arrays))
@@ -169,6 +173,13 @@ class Graph:
             self._known[key] = len(self.nodes)
             self.nodes.append(Node(kind, numbers, rows, per_call, name, tuple(arrays), static))
         return Value(self, self._known[key])
+
+    def _holds(self, truth: Value) -> bool:
+        """Whether a truth is the test of a number that lies between its limits."""
+        if truth.node.kind != "between" or (tested := self.inputs_of(truth.number)[0].node).kind != "constant":
+            return False
+        low, high = truth.node.arrays[0].T
+        return bool(((low <= tested.arrays[0]) & (tested.arrays[0] <= high)).all())
 
     def input(self, name: str, rows: int = 1, *, per_call: bool = False) -> Value:
         return self.add("input", (), rows, name=name, per_call=per_call)
@@ -213,13 +224,14 @@ class Graph:
     def take(self, x: Value, rows: Sequence[int]) -> Value:
         if list(rows) == list(range(x.rows)):
             return x
-        if x.node.kind == "concat":  # from the part that holds them all
-            start = 0
-            for k in x.node.inputs:
-                part = Value(self, k)
-                if all(start <= r < start + part.rows for r in rows):
-                    return self.take(part, [r - start for r in rows])
-                start += part.rows
+        if x.node.kind == "concat":  # from the part that holds them all, or the parts that they are
+            parts, ends = self.inputs_of(x.number), [0]
+            for part in parts:
+                if all(ends[-1] <= r < ends[-1] + part.rows for r in rows):
+                    return self.take(part, [r - ends[-1] for r in rows])
+                ends.append(ends[-1] + part.rows)
+            if list(rows) == list(range(rows[0], rows[-1] + 1)) and {rows[0], rows[-1] + 1} <= {*ends}:
+                return self.concat(*(part for part, start in zip(parts, ends, strict=False) if start in rows))
         if x.node.kind == "constant":
             return self.constant(x.node.arrays[0][list(rows)])
         if x.node.kind == "take":
@@ -289,7 +301,11 @@ class Graph:
         return self.add("series", (x,), x.rows, arrays=(np.asarray(coefficients, np.float64),))
 
     def select(self, truth: Value, then: Operand, otherwise: Operand) -> Value:
-        return self.each("select", truth, then, otherwise)
+        other = self.value(otherwise)
+        if isinstance(then, Value) and then.node.kind == "select" and then.node.inputs[2] == other.number:
+            inner, value, _ = self.inputs_of(then.number)
+            return self.each("select", truth & inner, value, other)
+        return self.each("select", truth, then, other)
 
     def first_failure(self, tests: Sequence[tuple[Value, Value]], codes: Sequence[int]) -> Value:
         """The status of a ray: the code of the first test for which value <= limit is false, as it is for NaN; else 0.
@@ -301,7 +317,11 @@ class Graph:
         return self.add("first_failure", flat, 1, static=tuple(int(c) for c in codes))
 
     def like(self, node: Node, inputs: Sequence[Value]) -> Value:
-        """Append the operation of a node of any graph to these inputs."""
+        """Append the operation of a node of any graph to these inputs, which may be numbers where its own were not."""
+        if node.kind in _FOLDED:
+            return self.each(node.kind, *inputs)
+        if node.kind == "select":
+            return self.select(*inputs)
         per_call = node.per_call if node.kind in ("input", "table", "constant", "lookup") else None
         return self.add(
             node.kind, inputs, node.rows, name=node.name, arrays=node.arrays, static=node.static, per_call=per_call

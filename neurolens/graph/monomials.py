@@ -101,7 +101,7 @@ def by_block(blocks: Sequence[Block], pairs: dict[Exponent, Pair]) -> list[dict[
 
 def blocks_alone(blocks: Sequence[Block]) -> int:
     """How many blocks matrix products take one by one; the others are joined, where copying costs less."""
-    copy_row, one_product = 0.07, 1.2  # ns a ray, measured in onnxruntime (12 outputs)
+    copy_row, one_product = 0.27, 2.5  # ns a ray, measured in onnxruntime (12 outputs)
     best, alone = math.inf, 0
     for first in range(len(blocks)):
         rows = sum(len(known) for _, known in blocks[first:])

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from neurolens.base.errors import InputError
 from neurolens.graph.ir import Graph, Node, pruned, same_structure
 from neurolens.graph.monomials import Block, Exponent, Pair, blocks_alone, by_block, plan_products
-from neurolens.graph.protobuf import FLOAT, INT32, model_proto, node_proto, tensor_proto, value_proto
+from neurolens.graph.protobuf import FLOAT, INT32, INT64, ML, model_proto, node_proto, tensor_proto, value_proto
 
 Array = NDArray[np.float64]
 # Opset 17 and IR 8 are read by every onnxruntime since 1.12.
@@ -54,7 +54,8 @@ def write_onnx(
     Raises:
         InputError: numbers that float32 cannot hold; graphs that differ in more than numbers.
     """
-    kept = [pruned(g) for g in ([graphs] if isinstance(graphs, Graph) else graphs)]
+    # Twice: what the first finds to be parts of other values leaves these without use.
+    kept = [pruned(pruned(g)) for g in ([graphs] if isinstance(graphs, Graph) else graphs)]
     if not same_structure(kept):
         raise InputError("export", "nodes", "(graphs that differ)", "models of one structure at every node")
     writer = _Writer(kept, mixing)
@@ -63,7 +64,7 @@ def write_onnx(
     ordered = sorted(inputs.values(), key=lambda n: (n.per_call, n.name == "state"))
     given = [value_proto(n.name, FLOAT, _shape(n)) for n in ordered]
     results = [value_proto(*result) for result in writer.results]
-    return model_proto(body, given, results, writer.tensors, metadata, (IR_VERSION, OPSET))
+    return model_proto(body, given, results, list(writer.tensors.values()), metadata, (IR_VERSION, OPSET))
 
 
 def _shape(node: Node) -> list[int | str]:
@@ -99,33 +100,43 @@ class _Writer:
 
     def __init__(self, graphs: Sequence[Graph], mixing: Mixing | None = None, prefix: str = "") -> None:
         self.graphs, self.mixing, self.prefix = graphs, mixing, prefix
-        self.nodes: list[bytes] = []
-        self.tensors: list[bytes] = []
+        self.nodes: list[tuple[Sequence[str], Sequence[str], bytes]] = []  # inputs, outputs, the node
+        self.tensors: dict[str, bytes] = {}
         self.results: list[tuple[str, int, list[int | str]]] = []
         self.known: dict[int, str | _Linear | _Longer] = {}
+        self.linear: dict[int, _Linear] = {}  # of known values, written or not
         self.inputs: dict[str, str] = {}
         self._constants: dict[tuple[bytes, str, tuple[int, ...]], str] = {}
         self._moved: dict[tuple[bytes, tuple[int, ...]], tuple[str, Array, tuple[int, ...]]] = {}
-        self._cuts: dict[int, dict[tuple[int, ...], str]] = {}
         self._squares: dict[int, tuple[str, dict[tuple[int, int], int]]] = {}  # rows of squares, of x_i and x_i + x_j
 
     def body(self, shapes: Mapping[str, Sequence[int]]) -> list[bytes]:
-        """All nodes, and with them the constants and results."""
+        """All nodes that the results need, and with them the constants and results."""
         if self.mixing is not None:
             names = {n.name for n in self.mixing.graph.nodes if n.kind == "input"}
             self.inputs = {name: f"{name}_in_state" for name in names & set(self.mixing.graph.outputs)}
         graph = self.graphs[0]
         for number, node in enumerate(graph.nodes):
-            self.known[number] = self._made(number, node)
+            self.known[number] = made = self._made(number, node)
+            if isinstance(made, _Linear):
+                self.linear[number] = made
         for name, value in graph.outputs.items():
             self._result(name, self.name(value.number), value.node, shapes.get(name))
-        return [*self._state(), *self.nodes]
+        needed, nodes = {name for name, *_ in self.results}, list[bytes]()
+        for inputs, outputs, written in reversed([*self._state(), *self.nodes]):  # onnxruntime would run all of them
+            if needed.intersection(outputs):
+                needed.update(inputs)
+                nodes.append(written)
+        self.tensors = {name: tensor for name, tensor in self.tensors.items() if name in needed}
+        return nodes[::-1]
 
     def _made(self, number: int, node: Node) -> str | _Linear | _Longer:
         arrays = [np.stack([g.nodes[number].arrays[i] for g in self.graphs]) for i in range(len(node.arrays))]
         rule = _RULES.get(node.kind)
         if rule is not None:
             return rule(self, number, node, arrays)
+        if node.kind in ("add", "sub", "mul") and (linear := self.shifted(node)):
+            return linear
         return self.op(_SIMPLE[node.kind], *(self.name(k) for k in node.inputs))
 
     def _result(self, name: str, value: str, node: Node, shape: Sequence[int] | None) -> None:
@@ -136,6 +147,18 @@ class _Writer:
             self.op("Reshape", value, self.const([*axes[:-1], -1], np.int64), out=name)
         self.results.append((name, INT32 if node.kind == "whole" else FLOAT, axes))
 
+    def shifted(self, node: Node) -> _Linear | None:
+        """A sum or a product of a linear value and numbers; None for all else."""
+        pair, kinds = [self.linear.get(k) for k in node.inputs], [self.graphs[0].nodes[k].kind for k in node.inputs]
+        at = next((i for i in (0, 1) if pair[i] and kinds[1 - i] == "constant"), None)
+        if at is None or (value := pair[at]) is None or node.rows != self.graphs[0].nodes[node.inputs[at]].rows:
+            return None
+        numbers = np.stack([g.nodes[node.inputs[1 - at]].arrays[0] for g in self.graphs])
+        if node.kind == "mul":
+            return _Linear(value.value, value.weight * numbers[:, :, None], value.bias * numbers)
+        own, other = (-1.0 if node.kind == "sub" and i == 1 else 1.0 for i in (at, 1 - at))
+        return _Linear(value.value, own * value.weight, own * value.bias + other * numbers)
+
     def name(self, number: int) -> str:
         """The tensor of a node's value."""
         value = self.known[number]
@@ -145,11 +168,11 @@ class _Writer:
             _take_rows(self, number, range(self.graphs[0].nodes[number].rows)) if isinstance(value, _Longer) else value
         )
 
-    def op(self, kind: str, *inputs: str, out: str | None = None, **attributes: int) -> str:
+    def op(self, kind: str, *inputs: str, out: str | None = None, domain: str = "", **attributes: int) -> str:
         """Append a node with one output and return its name."""
         name = out or f"{self.prefix}{kind}_{len(self.nodes)}"
         number = f"{self.prefix}n{len(self.nodes)}"
-        self.nodes.append(node_proto(kind, inputs, [name], number, **attributes))
+        self.nodes.append((inputs, [name], node_proto(kind, inputs, [name], number, domain, **attributes)))
         return name
 
     def const(self, value: ArrayLike, dtype: type = np.float32) -> str:
@@ -161,7 +184,7 @@ class _Writer:
         key = (array.tobytes(), array.dtype.str, array.shape)
         if key not in self._constants:
             self._constants[key] = f"c{len(self._constants)}"
-            self.tensors.append(tensor_proto(array, self._constants[key]))
+            self.tensors[self._constants[key]] = tensor_proto(array, self._constants[key])
         return self._constants[key]
 
     def numbers(self, stack: Array) -> str:
@@ -187,13 +210,17 @@ class _Writer:
         number = len(self.nodes)
         names = [f"{self.prefix}Split_{number}_{i}" for i in range(len(sizes))]
         inputs = [value, self.const(list(sizes), np.int64)]
-        self.nodes.append(node_proto("Split", inputs, names, f"{self.prefix}n{number}", axis=0))
+        self.nodes.append((inputs, names, node_proto("Split", inputs, names, f"{self.prefix}n{number}", axis=0)))
         return names
+
+    def rows(self, value: str, rows: Sequence[int]) -> str:
+        """Copy rows of a value; Split takes twice as long."""
+        return self.op("Gather", value, self.const(list(rows), np.int64), axis=0)
 
     def concat(self, names: Sequence[str]) -> str:
         return names[0] if len(names) == 1 else self.op("Concat", *names, axis=0)
 
-    def _state(self) -> list[bytes]:
+    def _state(self) -> list[tuple[Sequence[str], Sequence[str], bytes]]:
         """The nodes that make the values that follow the state: all of them by one product, cut and shaped."""
         if self.mixing is None:
             return []
@@ -230,23 +257,9 @@ def _input(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
 
 
 def _take_rows(w: _Writer, source: int, rows: Sequence[int]) -> str:
-    """Rows of a value; one cut serves all takes of consecutive rows of it that do not overlap."""
-    value, nodes = w.known[source], w.graphs[0].nodes
-    longer = value if isinstance(value, _Longer) else _Longer(w.name(source), nodes[source].rows, 0)
-    name, total, place = longer.name, nodes[source].rows + longer.sums, longer.place
-    if source not in w._cuts:
-        end = 0
-        cuts: list[tuple[int, ...]] = []
-        takes = {n.static for n in nodes if n.kind == "take" and n.inputs[0] == source}
-        for run in sorted(tuple(place(r) for r in take) for take in takes):
-            if run[0] >= end and run == tuple(range(run[0], run[-1] + 1)):
-                cuts += [tuple(range(end, run[0])), run]
-                end = run[-1] + 1
-        cuts = [c for c in (*cuts, tuple(range(end, total))) if c]
-        w._cuts[source] = dict(zip(cuts, w.split(name, [len(c) for c in cuts]), strict=True))
-    wanted = [place(r) for r in rows]
-    found = w._cuts[source].get(tuple(wanted))
-    return found or w.op("Gather", name, w.const(wanted, np.int64), axis=0)
+    value = w.known[source]
+    longer = value if isinstance(value, _Longer) else _Longer(w.name(source), w.graphs[0].nodes[source].rows, 0)
+    return w.rows(longer.name, [longer.place(r) for r in rows])
 
 
 def _concat(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
@@ -255,7 +268,9 @@ def _concat(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
     names = []
     for k in node.inputs:
         name = w.name(k)
-        if of_rays and nodes[k].per_call:  # repeated for every ray
+        if of_rays and nodes[k].per_call and nodes[k].rows == nodes[of_rays[0]].rows == 1:  # repeated for every ray
+            name = w.op("Clip", w.name(of_rays[0]), name, name)
+        elif of_rays and nodes[k].per_call:
             zeros = w.const(np.zeros((nodes[k].rows, nodes[of_rays[0]].rows)))
             name = w.op("Add", w.op("MatMul", zeros, w.name(of_rays[0])), name)
         elif nodes[k].per_call and nodes[k].rows == 1:  # [1], to stand in a column
@@ -422,20 +437,20 @@ def _first_failure(w: _Writer, number: int, node: Node, arrays: list[Array]) -> 
 
 
 def _lookup(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
-    """Whole cells are copied, then turned so that rays are the last axis: columns one by one take five times that."""
+    """Columns are taken one by one, so that rays are the last axis: Gather copies cells, three times as slow."""
     table, index, weights = (w.name(k) for k in node.inputs)
     nodes = [w.graphs[0].nodes[k] for k in node.inputs]
     (columns, indices, count), own = (n.rows for n in nodes), nodes[0].arrays
     groups, total = count // indices, ""
     # onnxruntime refuses an index beyond the table.
     if own:
-        last = w.const(len(own[0]) - 1, np.int32)
+        last = w.const(len(own[0]) - 1, np.int64)
     else:
-        cells = w.op("Gather", w.op("Shape", table), w.const(0, np.int64))
-        last = w.op("Cast", w.op("Sub", cells, w.const(1, np.int64)), to=INT32)
+        cells = w.op("Gather", w.op("Shape", table), w.const(1, np.int64))
+        last = w.op("Sub", cells, w.const(1, np.int64))
     for k, weight in zip(w.split(index, [1] * indices), w.split(weights, [groups] * indices), strict=True):
-        whole = w.op("Cast", w.op("Reshape", k, w.const([-1], np.int64)), to=INT32)
-        rows = w.op("Transpose", w.op("Gather", table, w.op("Clip", whole, w.const(0, np.int32), last), axis=0))
+        cell = w.op("Clip", w.op("Cast", k, to=INT64), w.const(0, np.int64), last)
+        rows = w.op("ArrayFeatureExtractor", table, cell, domain=ML)
         parts = w.op("Reshape", rows, w.const([groups, columns // groups, -1], np.int64))
         product = w.op("Mul", parts, w.op("Reshape", weight, w.const([groups, 1, -1], np.int64)))
         # Summed by a product with ones: ReduceSum takes seven times as long.
@@ -444,6 +459,11 @@ def _lookup(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
     total = w.op("Reshape", total, w.const([columns // groups, -1], np.int64))
     whole_row = node.static == tuple(range(columns // groups))
     return total if whole_row else w.op("Gather", total, w.const(list(node.static), np.int64), axis=0)
+
+
+def _table(w: _Writer, number: int, node: Node, arrays: list[Array]) -> str:
+    """A table by columns."""
+    return w.numbers(arrays[0].swapaxes(1, 2)) if arrays else w.op("Transpose", node.name)
 
 
 _SIMPLE = {
@@ -464,7 +484,7 @@ _RULES: dict[str, Callable[[_Writer, int, Node, list[Array]], str | _Linear | _L
     "clip": _clip,
     "between": _between,
     "first_failure": _first_failure,
-    "table": lambda w, number, node, arrays: w.numbers(arrays[0]) if arrays else node.name,
+    "table": _table,
     "lookup": _lookup,
     "whole": lambda w, number, node, arrays: w.op("Cast", w.name(node.inputs[0]), to=INT32),
 }

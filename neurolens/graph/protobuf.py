@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 _VARINT, _DOUBLE, _BYTES, _FLOAT = 0, 1, 2, 5  # wire types
 _INT_ATTRIBUTE = 2  # AttributeProto.AttributeType.INT
 FLOAT, INT32, INT64 = 1, 6, 7  # TensorProto.DataType
+ML = "ai.onnx.ml"  # the standard's second set of operators; version 1 is read by every onnxruntime
 _DATA_TYPES = {"f": FLOAT, "4": INT32, "8": INT64}
 
 
@@ -87,12 +88,14 @@ def _message(*fields: tuple[int, int | str | bytes]) -> bytes:
     return message(typed)
 
 
-def node_proto(kind: str, inputs: Sequence[str], outputs: Sequence[str], name: str, **attributes: int) -> bytes:
-    """A node of a graph: an operator with its whole-number attributes."""
+def node_proto(
+    kind: str, inputs: Sequence[str], outputs: Sequence[str], name: str, domain: str = "", **attributes: int
+) -> bytes:
+    """A node of a graph: an operator, of the first set or the `domain`'s, with its whole-number attributes."""
     packed: list[tuple[int, int | str | bytes]] = [
         (5, _message((1, key), (3, value), (20, _INT_ATTRIBUTE))) for key, value in attributes.items()
     ]
-    return _message(*((1, i) for i in inputs), *((2, o) for o in outputs), (3, name), (4, kind), *packed)
+    return _message(*((1, i) for i in inputs), *((2, o) for o in outputs), (3, name), (4, kind), *packed, (7, domain))
 
 
 def tensor_proto(array: NDArray[Any], name: str) -> bytes:
@@ -120,5 +123,7 @@ def model_proto(
     repeated = ((1, nodes), (5, constants), (11, inputs), (12, outputs))
     graph = _message((2, "neurolens"), *((number, part) for number, parts in repeated for part in parts))
     entries = ((14, _message((1, key), (2, text))) for key, text in metadata.items())
-    operators = _message((1, ""), (2, versions[1]))
-    return _message((1, versions[0]), (2, "neurolens"), (7, graph), (8, operators), *entries)
+    operators = [_message((1, ""), (2, versions[1]))]
+    if any(ML.encode() in node for node in nodes):
+        operators.append(_message((1, ML), (2, 1)))
+    return _message((1, versions[0]), (2, "neurolens"), (7, graph), *((8, o) for o in operators), *entries)

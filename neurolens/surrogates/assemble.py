@@ -147,10 +147,11 @@ def wavelength_row(e: Encoding, wavelength_nm: Value) -> Value:
 def within_domain(model: LensModel, rays: Value, film_z: Value, form: Form) -> Value:
     """Whether film point, pupil point, wavelength and film position lie in the domain; false for NaN."""
     g, d = rays.graph, model.domain
-    squares = g.quadratic(rays[0:4], [((0, 0), (1, 1)), ((2, 2), (3, 3))])
-    within = squares <= np.square([d.film_radius_mm * DOMAIN_SLACK, d.pupil_radius_mm * DOMAIN_SLACK])
+    film, pupil = (
+        g.square(rays[k : k + 2]) <= (r * DOMAIN_SLACK) ** 2 for k, r in ((0, d.film_radius_mm), (2, d.pupil_radius_mm))
+    )
     near, far = d.film_z_mm
-    inside = within[0] & within[1] & film_z.between(near / DOMAIN_SLACK, far * DOMAIN_SLACK)
+    inside = film & pupil & film_z.between(near / DOMAIN_SLACK, far * DOMAIN_SLACK)
     if form.wavelength or model.encoding.w_half:
         inside = inside & rays[4].between(*model.wavelength_limits_nm)
     return inside

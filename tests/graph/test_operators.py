@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 import torch
@@ -33,6 +34,9 @@ FORMS = [((0, 0), (1, 1)), ((0, 2), (1, 1), (2, 1)), ((1, 2),)]
 # Of x (3 rows, from 0.3 to 1.4, no two of a ray close), y (3 rows, likewise), and s of the call.
 CASES: dict[str, Callable[[Graph, Value, Value, Value], Value]] = {
     "take": lambda g, x, y, s: x[[2, 0, 0]] * y,
+    "take of whole parts": lambda g, x, y, s: (
+        g.concat(x[1], y * y, x, s)[1:7] * g.concat(x, y)[2:5][[0, 1, 2, 2, 1, 0]]
+    ),
     "concat": lambda g, x, y, s: g.concat(x[1], s, x * y),
     "affine": lambda g, x, y, s: g.affine(W, x * x, W[:, 0]),
     "affine of an input": lambda g, x, y, s: g.affine(W, x, W[:, 0]),
@@ -41,6 +45,9 @@ CASES: dict[str, Callable[[Graph, Value, Value, Value], Value]] = {
     "affine and added rows": lambda g, x, y, s: g.affine(W, y, added=g.affine(CHANGE, x * x)),
     "quadratic": lambda g, x, y, s: g.quadratic(x * y, FORMS, [1.0, 2.0, 3.0]),
     "quadratic of an input": lambda g, x, y, s: g.quadratic(x, FORMS),
+    "quadratic with numbers": lambda g, x, y, s: (
+        0.5 * (3.0 - g.quadratic(x, FORMS) * [1.0, 2.0, 3.0]) - 0.25 + g.square(x)
+    ),
     "quadratic of what follows the call": lambda g, x, y, s: g.quadratic(g.affine(W, x, moving=(s, CHANGE)), FORMS),
     "polynomial": lambda g, x, y, s: g.polynomial(EXPONENTS, COEFFICIENTS, x * y),
     "series": lambda g, x, y, s: g.series(x * y, [1.0, -2.0, 0.5, 0.25]),
@@ -62,6 +69,7 @@ CASES: dict[str, Callable[[Graph, Value, Value, Value], Value]] = {
     "lookup at two indices": lambda g, x, y, s: g.lookup(g.table("t", 6), x[[0, 2]] * 3.0, g.concat(x, y[0] * s)),
     "lookup in the graph's own table": lambda g, x, y, s: g.lookup(g.own_table(W), y[1] * 2.0, x[1]) * y,
     "select": lambda g, x, y, s: g.select(x <= y, x * x, y * s),
+    "select of a select": lambda g, x, y, s: g.select(x <= y, g.select(y.between(0.5, 1.2), x * y, 3.0), 3.0),
     "select by several": lambda g, x, y, s: g.select((x <= y) & x.between(0.5, 1.2), x * y, 3.0),
     "constant": lambda g, x, y, s: g.constant([1.0, 2.0]) + s * 0.0,
 }
@@ -120,6 +128,22 @@ def test_torch_and_single_steps_give_what_numpy_gives(name: str) -> None:
     rows = list(lower(graph).evaluate(steps | {"t": given["t"]}).values())
     for row, value in zip(rows, wanted, strict=True):
         np.testing.assert_allclose(row + 0 * value, value, rtol=0, atol=2e-6 * (1 + np.abs(value).max()))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_onnxruntime_gives_what_numpy_gives(name: str) -> None:
+    """For all rays, and one; every node that is written has a use."""
+    graph = graph_of(name)
+    data = write_onnx(graph, {})
+    session = onnxruntime.InferenceSession(data)
+    for count in (400, 1):
+        given = inputs(count)
+        known = {v.name: np.float32(given[v.name] if v.name != "s" else given["s"][0]) for v in session.get_inputs()}
+        found, wanted = session.run(["out"], known)[0], evaluate(graph, given)["out"]
+        rows = found.reshape(len(wanted), -1)
+        np.testing.assert_allclose(rows, wanted + 0 * rows, rtol=0, atol=4e-6 * (1 + np.abs(wanted).max()))
+    nodes = onnx.load_from_string(data).graph.node
+    assert {name for node in nodes for name in node.output} - {name for node in nodes for name in node.input} == {"out"}
 
 
 @pytest.mark.parametrize("name", CASES)
