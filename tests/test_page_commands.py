@@ -100,4 +100,5 @@ def test_commands_run_as_printed(page: Path, tmp_path: Path, monkeypatch: pytest
                 check(line, words, made)
             elif words != ["--help"]:
                 with suppress(NeurolensError):  # packages that a measurement brings in an environment of its own
-                    experiments_parser(words).parse_args(words)
+                    asked = experiments_parser(words).parse_args(words)
+                    made |= {Path(out)} if (out := getattr(asked, "out", None)) else set()

@@ -235,7 +235,7 @@ def test_states_out_of_range_are_outside_the_domain(bad: float) -> None:
 
 
 def test_random_states_and_rays_break_no_promise() -> None:
-    found = outside.send(loaded(), 100_000, seed=3)
+    found = outside.send(loaded(), 200_000, seed=3)
     assert found.broken == dict.fromkeys(found.broken, 0) and found.inside > 10_000 and found.passed > 3000
 
 
