@@ -101,4 +101,4 @@ def test_commands_run_as_printed(page: Path, tmp_path: Path, monkeypatch: pytest
             elif words != ["--help"]:
                 with suppress(NeurolensError):  # packages that a measurement brings in an environment of its own
                     asked = experiments_parser(words).parse_args(words)
-                    made |= {Path(out)} if (out := getattr(asked, "out", None)) else set()
+                    made |= {Path(asked.output)} if getattr(asked, "output", None) else set()
