@@ -42,7 +42,8 @@ Numbers = NDArray[np.float64]
 WAVELENGTH_NM = glass.LINE_D_NM
 
 
-class Face(NamedTuple):
+@dataclass(frozen=True)
+class Face:
     """A surface: z = c r^2 / (1 + sqrt(1 - (1 + conic) c^2 r^2)) + sum of even[k] r^(2 k + 2), all in mm.
 
     Attributes:
