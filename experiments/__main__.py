@@ -23,6 +23,7 @@ NAMES = {
     "clipping": ("vignetting:clipping", "rays that shipped models pass or block wrongly, networks beside polynomials"),
     "outside": ("outside", "random inputs through exported models"),
     "fused": ("fused_speed", "models as C against the exact lens as C"),
+    "rays": ("rays", "an open benchmark of lens rays: error and time, ours beside other programs"),
     "tracer": ("tracer_race", "the exact lens as C beside a tracer written by hand"),
     "gpu": ("gpu", "lenses and models as GLSL compute shaders, on a GPU or by software OpenGL"),
     "models": ("make_models", "make the models that ship"),
@@ -58,7 +59,6 @@ NAMES = {
     "collection": ("collection", "a public collection of lens files: read, refused, agreement with ray-optics"),
     "named-lenses": ("named_lenses", "write the lens files of real lenses by name from that collection"),
     "usd-lights": ("usd_lights", "the lights of a USD stage as a list for `neurolens flare --lights`"),
-    "optiland": ("compare_optiland", "speed of the exact tracer beside Optiland"),
 }
 _DESCRIPTION = """\
 Measure on this machine what the README reports, and write tables to runs/results (--commit: experiments/results).

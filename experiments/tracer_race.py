@@ -126,8 +126,8 @@ class Hand:
             self.run = ctypes.CDLL(str(library)).run
         self.run.argtypes = [ctypes.c_size_t, ctypes.c_float, ctypes.c_float, ctypes.c_void_p]
 
-    def prepared(self, rays: FilmRays, stop_radius_mm: float) -> tuple[Call, np.ndarray[Any, Any]]:
-        """A call that traces rays, and its statuses."""
+    def prepared(self, rays: FilmRays, stop_radius_mm: float) -> tuple[Call, list[np.ndarray[Any, Any]]]:
+        """A call that traces rays, and its results: point, direction, transmittance, crossing with the stop, status."""
         # It does whole sets of vectors, also behind the last ray.
         x, y, z, *rest = (np.pad(c.numpy().astype(np.float32), (0, 64), mode="edge") for c in rays.columns())
         status = np.empty(len(x), np.int32)
@@ -137,7 +137,7 @@ class Hand:
         def call(kept: Any = arrays) -> None:
             self.run(len(rays), float(z[0]), stop_radius_mm, pointers)
 
-        return call, status[: len(rays)]
+        return call, [a[: len(rays)] for a in arrays[5:]]
 
 
 @dataclass(frozen=True)
@@ -176,11 +176,11 @@ def measure(case: Case, rounds: int, report: lab.Report) -> list[Row]:
             made = cache(lambda vectors=vectors, options=options: Hand(lens, wide[0], (*options, f"-DW={vectors}")))
             field.append(hand_candidate(name, made, domain))
             try:
-                run, status = made().prepared(rays, domain.stop_radius_mm)
+                run, out = made().prepared(rays, domain.stop_radius_mm)
             except Unavailable:
                 continue
             run()
-            other[name] = int((status != ours).sum())
+            other[name] = int((out[-1] != ours).sum())
     timed = race(field, domain, rounds=rounds, report=report)
     load = max((v for v in (timed.load_before, timed.load_after) if v is not None), default=None)
     rows = []
