@@ -10,6 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from neurolens.base.errors import InputError
 from neurolens.cameras.build import make_camera
 from neurolens.cameras.contract import Camera, DifferentialCamera
 from neurolens.cameras.field import field_of, frame_of
@@ -427,3 +428,59 @@ def test_a_plate_of_our_own_says_its_pinhole_and_its_film(tmp_path: Path, scene:
     np.testing.assert_allclose(one.rgb[4:-4, 4:-4].mean(axis=(0, 1)), two.rgb[4:-4, 4:-4].mean(axis=(0, 1)), rtol=0.01)
     # The weight of the hole, cos^4, is taken out: what is left is the radiance of the white surroundings.
     np.testing.assert_allclose(plates[0].layers[0].texel[:6, :6, :3].mean(axis=(0, 1)), 1, rtol=0.03)
+
+
+def test_highlights_before_and_behind_the_focus_have_their_own_kernels() -> None:
+    """Two lights close together, as blurred as each other, one nearer and one farther than what is in focus."""
+    camera = thin()
+    rgb, w = flat(0.0, 0.0)
+    reach = in_focus(camera) * 0.9
+    rgb[108, 190], rgb[108, 194] = 1e4, 1e4
+    w[108, 190], w[108, 194] = in_focus(camera) - reach, in_focus(camera) + reach
+    found = blurred(camera, rgb, w, highlights=True)[..., 1]
+    assert found.max() < 3 * 1e4 / (math.pi * disc_px(camera, in_focus(camera) - reach) ** 2)
+
+
+def test_a_light_too_wide_for_a_kernel_stays_among_the_others() -> None:
+    camera = thin(0.7)
+    size = (96, 54)
+    eye = eye_of(camera, size)
+    layer = Layer(*(v.astype(np.float32) for v in flat(0.0, 400.0, size)))
+    layer.texel[20, 40, :3] = 1e4
+    assert not len(take_highlights(layer, eye, spread_over(camera, eye, size), size).radius_px)
+    assert layer.texel[20, 40, 0] == 1e4
+
+
+def test_alpha_says_where_a_layer_has_nothing(tmp_path: Path) -> None:
+    """A screen on a transparent film before a white wall; colours are premultiplied."""
+    solid = np.zeros(SIZE[::-1], np.float32)
+    solid[:, :192] = 0.8
+    planes = {"R": 0.4 * solid, "G": 0.4 * solid, "B": 0.4 * solid, "A": solid, "Z": np.where(solid > 0, 1.0, 1e10)}
+    far = {f"far.{c}": np.full(SIZE[::-1], 3.0 if c == "Z" else 1.0) for c in "RGBZ"}
+    write_channels(tmp_path / "a.exr", {k: v.astype(np.float32) for k, v in (planes | far).items()})
+    plate = read_plate(tmp_path / "a.exr", FILM, frame_of(thin()), DepthSettings())
+    front = plate.layers[0].texel
+    assert front[5, 9] == pytest.approx([0.4, 0.4, 0.4, 1.0]) and front[5, 300, 3] < 0
+    camera = thin()
+    alone, both = (
+        gather(layers, plate.eye, camera, SIZE, spread_over(camera, plate.eye, SIZE), 64).rgb[108, :, 1]
+        for layers in (plate.layers[:1], plate.layers)
+    )
+    assert alone[300] == 0 and both[300] == pytest.approx(0.97, abs=0.04)
+    assert alone[192] == pytest.approx(alone[60] / 2, rel=0.2)  # the edge fades into nothing
+
+
+@pytest.mark.parametrize("window", [(360000, 240000), (20000, 11250)])
+def test_a_picture_larger_than_memory_is_refused_before_it_is_made(tmp_path: Path, window: tuple[int, int]) -> None:
+    planes = {c: np.full((18, 32), 2.0, np.float32) for c in "RGBZ"}
+    box = tuple(np.array(v, np.int32) for v in ((0, 0), (window[0] - 1, window[1] - 1)))
+    data = tuple(np.array(v, np.int32) for v in ((0, 0), (31, 17)))
+    write_channels(tmp_path / "a.exr", planes, attributes={"displayWindow": box, "dataWindow": data})
+    with pytest.raises(InputError, match="pixels"):
+        read_plate(tmp_path / "a.exr", (36.0, 36.0 * window[1] / window[0]), frame_of(thin()), DepthSettings())
+
+
+def test_depth_below_a_metre_is_taken_where_its_unit_is_stated(tmp_path: Path) -> None:
+    plate = plate_file(tmp_path / "macro.exr", np.linspace(300, 700, SIZE[0] * SIZE[1]).reshape(SIZE[::-1]))
+    layer = read_plate(plate, FILM, frame_of(thin()), DepthSettings(scale_m=1e-3)).layers[0]
+    assert layer.texel[0, 0, 3] == pytest.approx(1 / 0.3, rel=1e-3)

@@ -393,6 +393,11 @@ def test_no_name_of_a_strangers_lens_is_read_as_code(animated: bool, tmp_path: P
     assert root.findtext("lens/model") == HOSTILE and root.find("lens/calibration") is not None
     body = ast.parse(texts["blender.py"]).body
     assert [n.names[0].name for n in body if isinstance(n, ast.Import)] == ["os", "bpy"]
+    # Python reads the encoding of a file from its first two lines, which a name must not reach.
+    encoded = html("handover.blender.py.jinja", **values | {"about": "coding: utf-7 +AAo-import os.path+AAo-#"})
+    assert ast.unparse(ast.parse(encoded.encode()).body[3]).startswith("ABOUT = 'coding: utf-7")
+    dashes = html("handover.lensfun.xml.jinja", **values | {"about": "a---b--"})
+    assert ElementTree.fromstring(dashes).findtext("lens/model") == HOSTILE
     assert len(nuke_nodes(texts["nk"])) == 21 and "\n}} </lens>" not in texts["nk"]
     assert "\n}} </lens>" not in texts["README.md"] and "<" not in texts["README.md"].replace("\\<", "")
     sample = html(
