@@ -46,6 +46,12 @@ def split_kind(text: str) -> tuple[str, str]:
     return kind, text.removeprefix(kind)
 
 
+def compiled(text: str) -> str:
+    """The camera that an argument names, compiled to C unless the argument says how it runs; raises as `resolve`."""
+    named = resolve(text)
+    return text if named.kind or named.file is None else f"{FUSED}{text}"
+
+
 def is_model(file: str | Path) -> bool:
     """True for a file that is an exported model by its name; any other file is read as a lens."""
     return Path(file).suffix.lower() == ".onnx"

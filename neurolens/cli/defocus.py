@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from neurolens import __version__
+from neurolens.base.errors import warn
 from neurolens.base.settings import group, setting, setting_of, whole
 from neurolens.cli.arguments import (
     CAMERAS_HELP,
@@ -84,7 +85,7 @@ examples:
         """Read the plate, blur it, write the picture."""
         check_suffix(self.out, "--output", (".exr",))
         check_folder(self.out, "--output")
-        from neurolens.base.lensname import FUSED, resolve
+        from neurolens.base.lensname import compiled
         from neurolens.cameras.build import make_camera
         from neurolens.cameras.field import frame_of
         from neurolens.defocus.picture import check_field, defocus, describe
@@ -100,9 +101,9 @@ examples:
         given = {k: getattr(self, k) for k in ("film_offset_mm", "vignetting", "dispersion")}
         shot = self.state.shot(self.film, **{k: v for k, v in given.items() if v is not None})
         # Kernels ask for many rays: compiled, unless the argument says how.
-        named = resolve(self.lens)
-        fused = FUSED if not named.kind and named.file is not None else ""
-        camera = make_camera(f"{fused}{self.lens}", shot, progress)
+        camera = make_camera(compiled(self.lens), shot, progress)
+        for note in camera.settings.get("notes", ()):
+            warn(note)
         check_field(camera)
         starts = {"auto": None, "film": True, "pinhole": False}
         depth = DepthSettings(self.depth, self.depth_scale, self.depth_along, starts[self.depth_from])

@@ -206,5 +206,5 @@ def _text(data: dict[str, Any]) -> str:
     names |= {"OpenTrackIO": "opentrackio_px", "lensfun": "lensfun_px", "lensfun, colours": "colour_px"}
     rows = [(name, f"{data['left'][key]:.2g}") for name, key in names.items() if key in data["left"]]
     rows += [(kind, f"{fit['worst_px']:.2g}") for kind, fit in data["projections"].items()]
-    told = f"{data['camera']}: {len(data['files'])} files, see README.md in their folder"
-    return f"{told}\n{table(('left at most', 'pixels'), rows)}"
+    heading = f"{data['camera']}: {len(data['files'])} files are written; README.md in their folder explains them"
+    return f"{heading}\n{table(('left at most', 'pixels'), rows)}"

@@ -97,15 +97,13 @@ class PictureCommand(Glasses, Reporting):
         Raises:
             InputError: a film whose shape is not that of the picture.
         """
-        from neurolens.base.lensname import FUSED, resolve
+        from neurolens.base import lensname
         from neurolens.cameras.build import make_camera
         from neurolens.render.film import PixelGrid
 
         PixelGrid(*self.picture, self.film)
         shot = state.shot(self.film, wavelength_nm=LIGHT_NM)
-        named = resolve(self.camera)
-        fused = FUSED if compiled and not named.kind and named.file is not None else ""
-        camera = make_camera(f"{fused}{self.camera}", shot, progress)
+        camera = make_camera(lensname.compiled(self.camera) if compiled else self.camera, shot, progress)
         for note in camera.settings.get("notes", ()):
             warn(note)
         return camera, shot

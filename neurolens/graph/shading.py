@@ -183,7 +183,7 @@ class Wgsl(Glsl):
     declared, kind, let, header, given = "{0}: {1}", "f32", "let", "fn {0}({1}) -> {2}", "{}"
     ray, field, variable, row = True, "{},", "var {};", "{}: array<f32, {}>,"
     whole, let_whole, to_whole, loops = "i32", "let", "i32({})", False
-    # Of an array that is `const` naga makes a copy for every number that is read.
+    # Arrays are not `const`: naga would copy a constant array for every number that is read.
     number, array = "const {} = {};", "{0} = array<f32, {1}>(\n    {2}\n);"
     constant, local = "var<private> ", "var "
 

@@ -272,8 +272,9 @@ def with_cover_glass(
     back = Surface(math.inf, _COVER_AIR_MM, wide, last.n_d, last.V_d, last.material, glass=last.glass)
     place = len(lens.surfaces) - 1
     moved = tuple((k, room if k == place else gap) for k, gap in lens.infinity_mm)
-    rows, told = lens.with_gaps({place: room}).surfaces, f"{lens.derived} A cover glass of {thickness_mm:g} mm.".strip()
-    covered = replace(lens, surfaces=(*rows, front, back), infinity_mm=moved, film_z_mm=film_z, derived=told)
+    rows = lens.with_gaps({place: room}).surfaces
+    derived = f"{lens.derived} A cover glass of {thickness_mm:g} mm was added.".strip()
+    covered = replace(lens, surfaces=(*rows, front, back), infinity_mm=moved, film_z_mm=film_z, derived=derived)
     return covered if focus_mode == "paraxial" else best_focused(covered, focus_m, wavelength_nm)
 
 

@@ -253,7 +253,7 @@ def write_exr(path: Path, channels: dict[str, float], size: int = 8) -> None:
 
 
 def test_layers_are_added_in_the_compositor_by_their_gains(scene: Any, tmp_path: Path) -> None:
-    """Of a sequence, each frame gets its own picture."""
+    """Each frame of a sequence gets its own picture of flare."""
     tool = importlib.import_module("experiments.flare_in_blender")
     for frame in (3, 4):
         layers = {

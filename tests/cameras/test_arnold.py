@@ -87,8 +87,8 @@ def test_the_node_gives_the_rays_of_the_camera_and_their_derivatives(tmp_path: P
     np.testing.assert_allclose(found[3:6, passed], wanted.direction[:, passed], atol=5e-6)
     np.testing.assert_allclose(found[18:21, passed], np.tile(wanted.weight[passed], (3, 1)), rtol=2e-4)
     assert not found[18:21, ~passed].any()
-    # By the pixel: those of the camera by the film point, and what twenty pixels change in the ray's own direction (the
-    # outline of the pupil moves with the film point, and changes the ray a little, too).
+    # Derivatives by the pixel agree with the camera's own by the film point, and with the change of the ray over twenty
+    # pixels; the outline of the pupil moves with the film point, too, and changes the ray a little.
     film, nm = np.float32(-18 * screen), np.full(COUNT, 587.56, np.float32)
     moves = made.sample_differentials(film, np.float32(square), nm).differentials
     for axis, slopes in ((0, [6, 7, 8, 12, 13, 14]), (1, [9, 10, 11, 15, 16, 17])):
