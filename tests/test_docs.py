@@ -125,6 +125,9 @@ def check_default(key: str, told: str | None, field: Any) -> None:
         assert told == f'`"{value}"`', key
 
 
+WEBGPU = "import wgpu; wgpu.gpu.request_adapter_sync()"
+
+
 @pytest.mark.skipif("NEUROLENS_DOCS" not in os.environ, reason="examples take minutes: make docs runs them")
 @pytest.mark.parametrize("page", EXAMPLES, ids=name_of)
 def test_examples_run(page: Path, tmp_path: Path) -> None:
@@ -136,7 +139,11 @@ def test_examples_run(page: Path, tmp_path: Path) -> None:
     if page.stem == "mitsuba" and "NEUROLENS_MITSUBA" not in os.environ:
         pytest.skip("Mitsuba was not run: NEUROLENS_MITSUBA is not set")
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    left_out = ""
     for language, title, code in blocks:
+        if "import wgpu" in code and subprocess.run([sys.executable, "-c", WEBGPU], capture_output=True).returncode:
+            left_out = "WebGPU was not run: no wgpu (pip install '.[shading]'), or no adapter of Vulkan"
+            continue
         if title:
             (tmp_path / title).write_text(code, encoding="utf-8")
         command = {"sh": ["sh", "-ec", code], "python": [sys.executable, "-c", code]}.get(language)
@@ -155,6 +162,8 @@ def test_examples_run(page: Path, tmp_path: Path) -> None:
             if done.returncode == 77:
                 pytest.skip("JavaScript was not run: npm or its registry is not there")
             assert done.returncode == 0, f"{code}\n{done.stdout}\n{done.stderr}"
+    if left_out:
+        pytest.skip(left_out)
 
 
 @pytest.fixture(scope="module")
